@@ -22,9 +22,9 @@ os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 from dmrl.messages import message
-from dmrl.pipeline.batch import over_folder, tasks_of
-from dmrl.pipeline.executor import executor
-from dmrl.pipeline.process_pool import cores
+from dmrl.pipeline.batch import build_tasks, run_over_folder
+from dmrl.pipeline.executor import open_executor
+from dmrl.pipeline.process_pool import count_cores
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.terminal.tables import print_table
 from dmrl.topics import attitude
@@ -62,17 +62,17 @@ def labels(flights: Path, out: Path) -> list[tuple[str, float, float]]:
     """Seconds of labelling all of it, and how many times faster than one process."""
     ways = {
         "one process": {"workers": 1},
-        f"{cores()} processes": {"workers": None},
-        f"Ray, {cores()} cores": {"workers": None, "on": "ray"},
+        f"{count_cores()} processes": {"workers": None},
+        f"Ray, {count_cores()} cores": {"workers": None, "on": "ray"},
     }
     took = {}
     for name, how in ways.items():
         took[name] = spent(
-            lambda name=name, how=how: over_folder("label", flights, out / name, **how)
+            lambda name=name, how=how: run_over_folder("label", flights, out / name, **how)
         )  # type: ignore[misc,arg-type]
     with nodes(2):
         took["Ray, two nodes"] = spent(
-            lambda: over_folder("label", flights, out / "nodes", workers=None, on="ray")
+            lambda: run_over_folder("label", flights, out / "nodes", workers=None, on="ray")
         )
     first_s = took["one process"][0]
     return [(name, wall_s, first_s / wall_s) for name, (wall_s, _) in took.items()]
@@ -87,11 +87,11 @@ def overhead(folder: Path, on: str | None) -> tuple[float, float]:
     found = {Path(f"{k}.mcap"): source for k in range(TASKS)}
     out = folder / (on or "here")
     out.mkdir()
-    tasks = tasks_of("trim", "recording", found, out)
-    with executor(on, None) as crew:
-        crew.give(tasks[0].line, alone=False).result()  # a process is there
+    tasks = build_tasks("trim", "recording", found, out)
+    with open_executor(on, None) as crew:
+        crew.submit(tasks[0].line, alone=False).result()  # a process is there
         wall_s, cpu_s = spent(
-            lambda: [one.result() for one in [crew.give(t.line, alone=False) for t in tasks[1:]]]
+            lambda: [one.result() for one in [crew.submit(t.line, alone=False) for t in tasks[1:]]]
         )
     return 1e3 * wall_s / TASKS, 1e3 * cpu_s / TASKS
 
@@ -104,8 +104,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         load = os.getloadavg()[0]
-        rows = [(f"here, {cores()} processes", *overhead(folder, None))]
-        rows.append((f"Ray, {cores()} cores", *overhead(folder, "ray")))
+        rows = [(f"here, {count_cores()} processes", *overhead(folder, None))]
+        rows.append((f"Ray, {count_cores()} cores", *overhead(folder, "ray")))
         print_table("a task", ("on", "ms by the clock", "ms of CPU here"), rows)
         title = f"label of {len(list(flights.glob('*.mcap')))} recordings, load {load:.1f}"
         print_table(title, ("with", "s", "times faster"), labels(flights, folder))

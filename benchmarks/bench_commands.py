@@ -27,6 +27,7 @@ from dmrl.geometry.frames import AIDECK
 from dmrl.images.codec import encode_jpeg
 from dmrl.rendering.sketch_renderer import draw
 from dmrl.rendering.sketch_scene import random_look, random_poses
+from dmrl.simulation.drawn_pictures import draw_picture
 from dmrl.stages import sketch
 
 SKETCHES = 40
@@ -55,7 +56,7 @@ def with_jpeg_ms(seed: int) -> float:
     settings = sketch.Settings(seed=seed, robots_max=1)
     begun = time.process_time()
     for k in range(SKETCHES):
-        encode_jpeg(sketch.sketch(settings, k).rgb)
+        encode_jpeg(draw_picture(settings, k).rgb)
     return (time.process_time() - begun) / SKETCHES * 1e3
 
 

@@ -27,8 +27,8 @@ from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.flight import NOISE, Flight, Scenario, Trajectory, simulate
 from dmrl.geometry.frames import AIDECK, Array, pixels_from_horizontal
-from dmrl.labelling.camera_bearings import sightings_of, with_sightings
-from dmrl.labelling.observer_log import Sight
+from dmrl.labelling.camera_bearings import add_bearings, detections_to_bearings
+from dmrl.labelling.observer_log import ObserverLog
 
 IMAGES_HZ = 10.0
 PIXEL_STD_PX, DISTANCE_RATIO, MISSED, FARTHEST_M = 1.5, 0.1, 0.15, 5.0
@@ -75,13 +75,13 @@ CASES = {
 }
 
 
-def sights(flight: Flight, wrong: float, seed: int) -> dict[str, Sight]:
+def sights(flight: Flight, wrong: float, seed: int) -> dict[str, ObserverLog]:
     """What every robot's camera shows to the detector."""
     rng = np.random.default_rng(seed + 10_000)
     return {robot: _sight(flight, robot, wrong, rng) for robot in flight.robots}
 
 
-def _sight(flight: Flight, robot: str, wrong: float, rng: np.random.Generator) -> Sight:
+def _sight(flight: Flight, robot: str, wrong: float, rng: np.random.Generator) -> ObserverLog:
     log, truth, clock = flight.robots[robot], flight.truth[robot], flight.clocks[robot]
     time_s = np.arange(log.time_s[0] + 0.05, log.time_s[-1], 1 / IMAGES_HZ)
     true_s = clock.true_time(time_s)
@@ -107,22 +107,23 @@ def _sight(flight: Flight, robot: str, wrong: float, rng: np.random.Generator) -
     measured = [np.interp(time_s, log.time_s, angle) for angle in (log.roll_rad, log.pitch_rad)]
     nothing = np.zeros((len(time_s), 3))
     attitude = np.column_stack(measured)
-    return Sight(
+    return ObserverLog(
         robot, AIDECK, time_ns, time_ns, detections, first, attitude, nothing, nothing[:, 0], {}, []
     )
 
 
-def ranges_alone(pairs: dict[Names, Pair], _: dict[str, Sight]) -> dict[Names, Estimate]:
+def ranges_alone(pairs: dict[Names, Pair], _: dict[str, ObserverLog]) -> dict[Names, Estimate]:
     """Every ordered pair, from ranges and odometry."""
     return _both(pairs)
 
 
-def one_solve(pairs: dict[Names, Pair], seen: dict[str, Sight]) -> dict[Names, Estimate]:
+def one_solve(pairs: dict[Names, Pair], seen: dict[str, ObserverLog]) -> dict[Names, Estimate]:
     """The same with detections in the solve."""
     found = {
-        robot: sightings_of(sight, 0, SAID_PX, ATTITUDE_STD_RAD) for robot, sight in seen.items()
+        robot: detections_to_bearings(sight, 0, SAID_PX, ATTITUDE_STD_RAD)
+        for robot, sight in seen.items()
     }
-    looking = with_sightings(pairs, found)
+    looking = add_bearings(pairs, found)
     estimates = _both(looking)
     again = told_apart(looking, estimates)
     return estimates | _both(again) if again else estimates
@@ -137,7 +138,7 @@ def _both(pairs: dict[Names, Pair]) -> dict[Names, Estimate]:
     return out
 
 
-WAYS: dict[str, Callable[[dict[Names, Pair], dict[str, Sight]], dict[Names, Estimate]]] = {
+WAYS: dict[str, Callable[[dict[Names, Pair], dict[str, ObserverLog]], dict[Names, Estimate]]] = {
     "without": ranges_alone,
     "with": one_solve,
 }

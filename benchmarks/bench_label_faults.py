@@ -21,9 +21,10 @@ from fault_cases import BAD, CASES
 from matplotlib.figure import Figure
 
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
+from dmrl.estimation.model.gate import GATE_M
 from dmrl.estimation.model.pair import RATE_HZ, Mask, Pair, usable_ranges
 from dmrl.estimation.model.position_metrics import CHI2_95_OF_2, GOOD_M, Judged, squared_distances
-from dmrl.estimation.model.status import GATE_M, OK, statuses
+from dmrl.estimation.model.status import OK, statuses
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.flight import NOISE, Flight, Scenario, simulate
 from dmrl.geometry.frames import Array

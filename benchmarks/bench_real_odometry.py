@@ -17,10 +17,11 @@ import numpy as np
 from bench_label_faults import times
 
 from dmrl.estimation.flight.pairs import estimate_pairs
+from dmrl.estimation.model.gate import GATE_M
 from dmrl.estimation.model.odometry import rotation
 from dmrl.estimation.model.pair import RATE_HZ, Pair, usable_ranges
 from dmrl.estimation.model.position_metrics import CHI2_95_OF_2, Judged, squared_distances
-from dmrl.estimation.model.status import GATE_M, OK
+from dmrl.estimation.model.status import OK
 from dmrl.flight import NOISE
 from dmrl.flight.sensors import pair_errors
 from dmrl.formats.base import Options

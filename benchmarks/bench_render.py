@@ -25,9 +25,10 @@ from pathlib import Path
 import numpy as np
 from render_exactness import grain, grey, reprojection
 
+from dmrl.render_recording import read_render_camera, read_render_settings
 from dmrl.rendering.blender_environment import ensure
 from dmrl.rendering.randomise import World, draw_scene
-from dmrl.stages.render import camera_of, run, settings_of
+from dmrl.stages.render import run
 from dmrl.terminal.progress import say
 
 PUBLISHED_WAY = Path(__file__).parent / "published_way.py"
@@ -64,10 +65,10 @@ def published_way(
     lean
         2 bounces and a filter as wide as the pixel, as dmrl has them, in place of 12 and a wider.
     """
-    settings = replace(settings_of("synthetic_paper"), images=images, robots_max=1)
+    settings = replace(read_render_settings("synthetic_paper"), images=images, robots_max=1)
     world = World(
         settings,
-        camera_of(settings),
+        read_render_camera(settings),
         0.1,
         ("none",),
         grey,
@@ -112,7 +113,7 @@ def ours(recipe: str, images: int, workers: int, **changes: object) -> dict[str,
         Settings over the recipe's.
     """
     with tempfile.TemporaryDirectory() as folder:
-        settings = settings_of(recipe, images=images, workers=workers, **changes)
+        settings = read_render_settings(recipe, images=images, workers=workers, **changes)
         before, own, begin = _children_s(), _own_s(), time.monotonic()
         run(Path(folder) / "out.mcap", settings)
         wall_s = time.monotonic() - begin

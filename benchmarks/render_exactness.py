@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.geometry.frames import Array, Camera, project
+from dmrl.render_recording import read_render_camera, read_render_settings
 from dmrl.rendering.backgrounds.photos import photos_in
 from dmrl.rendering.blender_environment import ensure
 from dmrl.rendering.camera.distortion import Picture, image_from_pinhole
@@ -16,7 +17,6 @@ from dmrl.rendering.renderer import Model, Renderer
 from dmrl.rendering.robots import crazyflie
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch_renderer import Pose
-from dmrl.stages.render import camera_of, settings_of
 from dmrl.terminal.progress import say
 
 MANY_SAMPLES = 512
@@ -54,8 +54,8 @@ def reprojection(recipe: str, images: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recipe.toml"
         path.write_text(f'kind = "render"\npreset = "{recipe}"\nempty_share = 0.0\n')
-        settings = settings_of(str(path), images=images)
-    camera = camera_of(settings)
+        settings = read_render_settings(str(path), images=images)
+    camera = read_render_camera(settings)
     model = Model(settings.model, settings.scale, settings.model_up)
     errors, middles = [], []
     with Renderer(ensure(say), model) as renderer:
@@ -104,9 +104,9 @@ def grain(recipe: str, images: int, backgrounds: Path) -> dict[str, float]:
     backgrounds
         Folder of photos.
     """
-    settings = settings_of(recipe, images=images, robots_max=1, empty_share=0.0)
+    settings = read_render_settings(recipe, images=images, robots_max=1, empty_share=0.0)
     photos = photos_in(backgrounds)
-    camera = camera_of(settings)
+    camera = read_render_camera(settings)
     shots: dict[str, list[Shot]] = {}
     for samples in (MANY_SAMPLES, 4, 8, 16):
         model = Model(None, settings.scale)

@@ -1,7 +1,7 @@
-"""Where a command ends: every error becomes one line on standard error and an exit status.
+"""Exit of a command: every error becomes one line on standard error and an exit status.
 
 =========================  ======  ==========================================================
-what happened              status  what is said
+event                      status  line
 =========================  ======  ==========================================================
 an error of the user's     1       the error, with the way out
 a refusal of the system    1       the file and the system's words
@@ -30,11 +30,11 @@ from dmrl import atomic_output
 from dmrl.errors import DmrlError, SettingError, one_line, words_of
 from dmrl.guards.safe_names import without_middle
 
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+TERMINATION_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Stopped(KeyboardInterrupt):
-    """The user, or the system, wants an end."""
+class Interrupted(KeyboardInterrupt):
+    """A signal asks for the end of the command."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -42,9 +42,9 @@ class Stopped(KeyboardInterrupt):
 
 
 def open_standard_streams() -> None:
-    """Give 0, 1 and 2 to what they are for: a closed one would be given to the next file opened.
+    """Open streams 0, 1 and 2 if they are closed: the next file would get their numbers.
 
-    A closed standard output then refuses what is written to it, as a full one does.
+    A closed standard output then refuses writes, as a full disk does.
     """
     for number in range(3):
         try:
@@ -57,67 +57,67 @@ def open_standard_streams() -> None:
         sys.stderr = io.TextIOWrapper(io.FileIO(2, "w"), encoding="utf-8", line_buffering=True)
 
 
-def end_by_signals() -> None:
-    """Let SIGINT, SIGTERM and SIGHUP end the command in order; a second one ends it at once."""
+def install_signal_handlers() -> None:
+    """Install handlers of SIGINT, SIGTERM and SIGHUP: one ends in order, a second one at once."""
 
     def stop(number: int, _: FrameType | None) -> None:
-        for ending in ENDING:
+        for ending in TERMINATION_SIGNALS:
             signal.signal(ending, signal.SIG_DFL)
-        raise Stopped(number)
+        raise Interrupted(number)
 
-    for number in ENDING:
+    for number in TERMINATION_SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, stop)
 
 
-def status_of(work: Callable[[], object]) -> int:
-    """Exit status of a command, once everything is said and written."""
-    status = _guarded(work)
+def run_to_status(work: Callable[[], object]) -> int:
+    """Run a command, flush its output, and return the exit status."""
+    status = _run_guarded(work)
     try:
         sys.stdout.flush()
     except OSError as e:
         # The interpreter would try once more, and say so with a traceback.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         if not status and not isinstance(e, BrokenPipeError):
-            return _end(words_of(e) or _bug(e))
+            return _print_error(words_of(e) or _report_bug(e))
         return status or 1
     return status
 
 
-def _guarded(work: Callable[[], object]) -> int:
+def _run_guarded(work: Callable[[], object]) -> int:
     try:
         _refuse_removed_folder()
         work()
     except SystemExit as e:
         return e.code if isinstance(e.code, int) else int(e.code is not None)
     except DmrlError as e:
-        return _end(str(e))
+        return _print_error(str(e))
     except KeyboardInterrupt as e:
-        return _end(_stopped(), 128 + getattr(e, "number", signal.SIGINT))
+        return _print_error(_interrupt_text(), 128 + getattr(e, "number", signal.SIGINT))
     except BrokenPipeError:
         return 1  # the reader of our output, such as `head`, has gone: nobody is left to tell
     except Exception as e:
         if os.environ.get("DMRL_DEBUG"):
             raise
-        return _end(words_of(e) or _bug(e))
+        return _print_error(words_of(e) or _report_bug(e))
     return 0
 
 
 def _refuse_removed_folder() -> None:
-    """Nothing, if the process is in a folder that is there: libraries abort where it is not."""
+    """Raise SettingError if the current folder was removed: libraries would abort."""
     try:
         Path.cwd()
     except FileNotFoundError:
         raise SettingError("the folder you are in was removed. Go to another: cd") from None
 
 
-def _end(text: str, status: int = 1) -> int:
+def _print_error(text: str, status: int = 1) -> int:
     with suppress(OSError):
         sys.stderr.write(f"dmrl: {without_middle(one_line(text))}\n")
     return status
 
 
-def _stopped() -> str:
+def _interrupt_text() -> str:
     try:
         whole = atomic_output.standing()
     except (DmrlError, OSError) as e:  # outputs may lie where nobody answers any more
@@ -127,8 +127,8 @@ def _stopped() -> str:
     return "stopped. Nothing stands under its final name"
 
 
-def _bug(error: Exception) -> str:
-    """What is said of an error that nobody foresaw; its traceback goes to a file."""
+def _report_bug(error: Exception) -> str:
+    """Return the line for an unexpected error, and write its traceback to a file."""
     kind = f"{type(error).__name__}: {str(error)[:200]}".rstrip(": ")
     text = "".join(traceback.format_exception(error))
     try:

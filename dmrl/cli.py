@@ -18,7 +18,6 @@ from cyclopts import (
     Parameter,
     Token,
     UnknownCommandError,
-    _convert,
     convert,
 )
 from rich.console import Console
@@ -27,9 +26,6 @@ from rich.text import Text
 from dmrl import __version__, boundary, plugins
 from dmrl.guards.safe_names import without_middle
 from dmrl.storage import path_of
-from dmrl.terminal import standins
-
-_convert._converters[Path] = path_of  # so that every argument may be s3://bucket/key
 
 # In the order of the work. The help line is the first line of the function's docstring;
 # it stands here too so that `dmrl --help` loads nothing (a test holds the two together).
@@ -43,7 +39,7 @@ COMMANDS = {
     "convert": "Convert a foreign file or folder into a recording, or a recording into files.",
     "record": "Record the logs and cameras of Crazyflies in flight, until Ctrl-C.",
     "fake-drone": "Send a simulated flight as Crazyflies and AI-decks do, to try record with.",
-    "calibrate": "Calibrate cameras by boards or flights, other sensors by what flights agree on.",
+    "calibrate": "Calibrate cameras by boards or flights, and other sensors by several flights.",
     "align": "Set clocks by each other: from ranges of pairs, images, or motion capture.",
     "label": "Find every robot's peers from ranges and odometry, and label the images with them.",
     "dataset": "Build an Arrow dataset and its card from recordings.",
@@ -55,13 +51,13 @@ COMMANDS = {
     "quantize": "Quantise a network to int8, and say what that costs.",
     "export": "Write a network as ONNX and as C.",
     "verify": "Prove that the C of an export computes the int8 network, bit for bit.",
-    "view": "Show recordings in rerun, or save what it would show.",
-    "doctor": "Say what is installed, what it is for, and how to get what is missing.",
-    "report": "Show what a folder comes to, as one HTML page that needs nothing else.",
-    "info": "Show what a recording holds and where it comes from.",
+    "view": "Show recordings in rerun, or save them as an .rrd file or a picture.",
+    "doctor": "List packages, programs and devices that dmrl uses, and how to get missing ones.",
+    "report": "Show the results in a folder as one HTML page that needs nothing else.",
+    "info": "Show the contents and the origin of a recording.",
     "check": "Check a recording: schemas, times, gaps, calibration, labels.",
-    "index": "List what a folder's recordings hold in one table, catalogue.parquet, for dmrl find.",
-    "find": "Find recordings by what they hold: what dmrl index wrote, asked in SQL.",
+    "index": "List a folder's recordings and their contents in catalogue.parquet, for dmrl find.",
+    "find": "Find recordings by their contents: the table of dmrl index, queried in SQL.",
     "recover": "Bring back the messages of a recording that was cut short.",
     "merge": "Merge recordings into one, by time.",
     "trim": "Keep a stretch of a recording, or some of its topics.",
@@ -69,8 +65,8 @@ COMMANDS = {
 COMPLETION = "--install-completion"
 
 
-def bad_command_line(error: CycloptsError) -> Text:
-    """What is printed for a command line that cannot be understood."""
+def format_usage_error(error: CycloptsError) -> Text:
+    """Return the line to print for a command line that cannot be parsed."""
     if isinstance(error, CoercionError) and get_origin(error.target_type) is dict and error.token:
         flag, value = error.token.keyword, error.token.value
         return Text(f"dmrl: {flag} {value} does not say of what. Try: {flag}.cf1 {value}")
@@ -78,23 +74,25 @@ def bad_command_line(error: CycloptsError) -> Text:
         return Text(f"dmrl: {without_middle(str(error))}")
     # The error's own text would load every command, and fail where an extra is missing.
     word = error.unused_tokens[0]
-    near = get_close_matches(word, [*COMMANDS, *plugins.found(plugins.STAGES)], n=1)
+    near = get_close_matches(word, [*COMMANDS, *plugins.find_plugins(plugins.STAGES)], n=1)
     hint = f"Did you mean {near[0]}?" if near else "Try: dmrl --help"
     return Text(f"dmrl: no command {word}. {hint}")
 
 
-def exact(kind: Any, tokens: Sequence[Token] | Sequence[str]) -> Any:
-    """A value as its type says; no number with a fraction where a whole one is asked for.
+def convert_strictly(kind: Any, tokens: Sequence[Token] | Sequence[str]) -> Any:
+    """Convert words to a type. A path may be ``s3://bucket/key``.
 
     Raises
     ------
     ValueError
-        If one is given: cyclopts would round it.
+        If a whole number is required and one with a fraction is given: cyclopts would round it.
     DmrlError
         If a path is refused. Of ``Path | None`` cyclopts would say only that it is neither.
     """
     if type(None) in (members := get_args(kind)) and len(members) == 2:
         kind = next(member for member in members if member is not type(None))
+    if Path in (kind, *get_args(kind)):
+        return convert(kind, tokens, converter=lambda _, word: path_of(word))
     words = [token if isinstance(token, str) else token.value for token in tokens]
     whole = int in (kind, *get_args(kind)) and float not in get_args(kind)
     if whole and any("." in word for word in words):
@@ -104,11 +102,11 @@ def exact(kind: Any, tokens: Sequence[Token] | Sequence[str]) -> Any:
 
 app = App(
     name="dmrl",
-    default_parameter=Parameter(converter=exact),
+    default_parameter=Parameter(converter=convert_strictly),
     help="Teach tiny camera drones to see each other: recordings in, recordings out.",
     version=__version__,
     help_format="plaintext",
-    error_formatter=bad_command_line,
+    error_formatter=format_usage_error,
     error_console=Console(stderr=True, soft_wrap=True),  # one line, however narrow a pipe is
     suppress_keyboard_interrupt=False,  # main says what stands
 )
@@ -120,12 +118,12 @@ for _order, (_name, _help) in enumerate(COMMANDS.items()):
     app.command(f"dmrl.stages.{_module}:command", name=_name, help=_help, sort_key=_order)
 
 
-def with_plugins() -> App:
-    """The command line with the commands of other packages.
+def add_plugin_commands() -> App:
+    """Add the commands of other packages to the command line.
 
-    `main` looks for them where dmrl has no such command: it takes 50 ms, a third of the start.
+    `main` does so only if dmrl has no such command: it takes 50 ms, a third of the start.
     """
-    for name, plugin in plugins.found(plugins.STAGES).items():
+    for name, plugin in plugins.find_plugins(plugins.STAGES).items():
         if name not in COMMANDS and name not in app:
             words = f"{plugin.summary} (of the package {plugin.package})".strip()
             app.command(f"dmrl.plugins:{name}", name=name, help=words, sort_key=len(COMMANDS))
@@ -135,20 +133,17 @@ def with_plugins() -> App:
 def main() -> NoReturn:
     """Run the command; turn errors into one line and an exit status."""
     boundary.open_standard_streams()
-    boundary.end_by_signals()
+    boundary.install_signal_handlers()
     name, *words = sys.argv[1:] or [""]
     if name not in COMMANDS:
-        with_plugins()
+        add_plugin_commands()
     wants_help = name in COMMANDS and not set(app.help_flags).isdisjoint(words)
-    if name == COMPLETION:
-        standins.install()  # every command is looked at, none is run
-    raise SystemExit(boundary.status_of((lambda: help_of(name)) if wants_help else app))
+    raise SystemExit(boundary.run_to_status((lambda: print_help(name)) if wants_help else app))
 
 
-def help_of(name: str) -> None:
+def print_help(name: str) -> None:
     """Print a command's help; load nothing that only its work needs."""
-    gc.disable()  # it prints a page and ends: what it loads is not worth looking through
-    standins.install()
+    gc.disable()  # it prints a page and ends: a collection would only cost time
     app.help_print([name])
 
 

@@ -21,7 +21,8 @@
 """
 
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 
 
@@ -157,6 +158,15 @@ class MissingExtra(DmrlError):
 
     def __init__(self, package: str, extra: str, what: str) -> None:
         super().__init__(f"{what} needs {package}. Install it with: pip install 'dmrl[{extra}]'")
+
+
+@contextmanager
+def optional_imports(extra: str, what: str) -> Iterator[None]:
+    """Raise MissingExtra if a package that is imported in the block is not installed."""
+    try:
+        yield
+    except ModuleNotFoundError as e:
+        raise MissingExtra(str(e.name), extra, what) from e
 
 
 class PluginError(DmrlError):

@@ -1,17 +1,18 @@
-"""What other packages add to dmrl, found by the entry points that they declare.
+"""Plug-ins: formats, networks and commands of other packages, and the classes that they build on.
 
 In the package's pyproject.toml::
 
     [project.entry-points."dmrl.formats"]
-    blackbox = "their_package.blackbox:FORMAT"     # a dmrl.formats.base.Format
+    blackbox = "their_package.blackbox:FORMAT"     # a dmrl.plugins.Format
     [project.entry-points."dmrl.networks"]
-    their-nano = "their_package.network:TheirNano" # a subclass of dmrl.learn.networks.architectures.Network
+    their-nano = "their_package.network:TheirNano" # a subclass of dmrl.plugins.Network
     [project.entry-points."dmrl.stages"]
     smooth = "their_package.smooth"                # a module with command(), as in dmrl/stages
 
-Nothing of it is imported before it is asked for by its name (a format: before no format of dmrl
-knows a source). A name that dmrl has itself stays dmrl's. What goes wrong in a plug-in is a
-`PluginError` that names its package, and harms no other command.
+A plug-in is imported when it is used by its name (a format: when no format of dmrl recognises a
+source). A name of dmrl's own stays dmrl's. An error in a plug-in becomes a `PluginError` that
+names its package, and affects no other command. The names of `PLACES` are imported from here, and
+each loads what it needs when it is used.
 """
 
 import re
@@ -24,29 +25,60 @@ from traceback import extract_tb
 from typing import TYPE_CHECKING, Any
 
 from dmrl.errors import DmrlError, PluginError
+from dmrl.guards.lazy_names import import_lazily
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
+    from dmrl.formats.base import Content as Content
+    from dmrl.formats.base import Format as Format
+    from dmrl.formats.base import Options as Options
+    from dmrl.learn.networks.architectures import ConvNorm as ConvNorm
+    from dmrl.learn.networks.architectures import Network as Network
+    from dmrl.pipeline.stage_command import stage_command as stage_command
+    from dmrl.samples.flight import in_order as in_order
+    from dmrl.samples.flight import nanoseconds as nanoseconds
+    from dmrl.samples.flight import ranges as ranges
+    from dmrl.samples.sample import Columns as Columns
+    from dmrl.samples.sample import Sample as Sample
+    from dmrl.samples.sample import image as image
+    from dmrl.terminal.closing import Closing as Closing
+
+PLACES = {
+    "Closing": "dmrl.terminal.closing",
+    "Columns": "dmrl.samples.sample",
+    "Content": "dmrl.formats.base",
+    "ConvNorm": "dmrl.learn.networks.architectures",
+    "Format": "dmrl.formats.base",
+    "Network": "dmrl.learn.networks.architectures",
+    "Options": "dmrl.formats.base",
+    "Sample": "dmrl.samples.sample",
+    "image": "dmrl.samples.sample",
+    "in_order": "dmrl.samples.flight",
+    "nanoseconds": "dmrl.samples.flight",
+    "ranges": "dmrl.samples.flight",
+    "stage_command": "dmrl.pipeline.stage_command",
+}
+"""Names that plug-ins import from here, and their modules, which may move."""
 FORMATS, NETWORKS, STAGES = "dmrl.formats", "dmrl.networks", "dmrl.stages"
 """The groups of entry points."""
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+PLUGIN_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
 
 @dataclass(frozen=True, slots=True)
 class Plugin:
-    """One thing that a package adds, not imported yet.
+    """A format, network or command of another package, which is not imported yet.
 
     Parameters
     ----------
     name
-        As users call it.
+        Name that users give.
     package
-        The distribution that brings it, as pip calls it.
+        Distribution of the package, as pip lists it.
     summary
-        What the package says of itself.
+        Summary in the package's metadata.
     entry
-        Where it is.
+        Entry point.
     """
 
     name: str
@@ -55,38 +87,32 @@ class Plugin:
     entry: "EntryPoint"
 
     def load(self) -> Any:
-        """What the entry point names, imported.
+        """Import the object of the entry point.
 
         Raises
         ------
         PluginError
             If it cannot be imported.
         """
-        with self.blamed("cannot be loaded"):
+        with self.naming_the_package("cannot be loaded"):
             try:
                 return self.entry.load()
             except SystemExit as e:
                 raise RuntimeError(f"it ends the program, with {e.code}") from e
 
     def require(self, fits: bool, what: str) -> None:
-        """Nothing, if what was loaded is what it should be.
-
-        Raises
-        ------
-        PluginError
-            If not; ``what`` says what it should be.
-        """
+        """Raise PluginError unless the object is of the right kind; ``what`` names the kind."""
         if not fits:
             raise self._error(f"is not {what}: {self.entry.value}")
 
     @contextmanager
-    def blamed(self, what: str) -> Iterator[None]:
-        """Errors that are not dmrl's own become one that names the package.
+    def naming_the_package(self, what: str) -> Iterator[None]:
+        """Turn errors that are not dmrl's own into one that names the package.
 
         Raises
         ------
         PluginError
-            For any other error inside the block; ``what`` says what went wrong.
+            For any other error inside the block; ``what`` is its text.
         """
         try:
             yield
@@ -106,26 +132,30 @@ class Plugin:
 
 
 @cache
-def found(group: str) -> dict[str, Plugin]:
-    """What installed packages add to a group, by name; two of one name: the first package's."""
+def find_plugins(group: str) -> dict[str, Plugin]:
+    """Return the plug-ins of a group by name; of two of one name, the first package's."""
     from importlib.metadata import entry_points  # noqa: PLC0415 - 30 ms of every start
 
-    every = [_plugin(entry) for entry in entry_points(group=group) if NAME.fullmatch(entry.name)]
+    every = [
+        _to_plugin(entry)
+        for entry in entry_points(group=group)
+        if PLUGIN_NAME.fullmatch(entry.name)
+    ]
     by_name: dict[str, Plugin] = {}
     for plugin in sorted(every, key=lambda plugin: (plugin.name, plugin.package)):
         by_name.setdefault(plugin.name, plugin)
     return by_name
 
 
-def _plugin(entry: "EntryPoint") -> Plugin:
+def _to_plugin(entry: "EntryPoint") -> Plugin:
     if entry.dist is None:
         return Plugin(entry.name, entry.module.split(".")[0], "", entry)
     # A missing key of the metadata is None.
     return Plugin(entry.name, entry.dist.name, entry.dist.metadata["Summary"] or "", entry)
 
 
-def stage_command(plugin: Plugin) -> Callable[..., Any]:
-    """The function that a stage's command line calls.
+def load_command(plugin: Plugin) -> Callable[..., Any]:
+    """Return the function that the command line calls for a stage.
 
     Raises
     ------
@@ -138,15 +168,18 @@ def stage_command(plugin: Plugin) -> Callable[..., Any]:
 
     @wraps(command)
     def called(*arguments: Any, **named: Any) -> Any:
-        with plugin.blamed("failed"):
+        with plugin.naming_the_package("failed"):
             return command(*arguments, **named)
 
     return called
 
 
-def __getattr__(name: str) -> Callable[..., Any]:
-    """The command of a stage: the command line finds it as ``dmrl.plugins:NAME``, when called."""
-    # Whoever imports this asks for __path__ as well.
-    if not NAME.fullmatch(name) or name not in found(STAGES):
-        raise AttributeError(name)
-    return stage_command(found(STAGES)[name])
+_import = import_lazily(__name__, PLACES)
+
+
+def __getattr__(name: str) -> Any:
+    """Return a name of `PLACES`, or the command of a stage: ``dmrl.plugins:NAME`` in cli.py."""
+    # An import of this module asks for __path__ as well.
+    if name in PLACES or not PLUGIN_NAME.fullmatch(name) or name not in find_plugins(STAGES):
+        return _import(name)
+    return load_command(find_plugins(STAGES)[name])

@@ -7,7 +7,7 @@ A recipe of one stage has ``kind`` and that stage's settings; for several stages
 import json
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, asdict, fields, replace
 from difflib import get_close_matches
 from functools import cache
 from importlib.resources import files
@@ -17,7 +17,7 @@ from typing import Any, TypeVar, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
 
-from dmrl.errors import RecipeError
+from dmrl.errors import RecipeError, SettingError
 from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.guards.paths import refuse_pipe
@@ -75,7 +75,7 @@ def text(name: str | Path) -> str:
         raise RecipeError(f"{name} cannot be read: {e}. Give a TOML text file") from e
 
 
-def load(name: str | Path, kind: str, schema: type[Settings]) -> Settings:
+def load(name: str | Path, kind: str, schema: type[Settings], flags: Any = None) -> Settings:
     """Load the settings of one stage from a recipe.
 
     Parameters
@@ -86,16 +86,26 @@ def load(name: str | Path, kind: str, schema: type[Settings]) -> Settings:
         Required kind, such as "train".
     schema
         Settings dataclass of the stage.
+    flags
+        Dataclass of settings that replace the recipe's, where they are not None.
 
     Raises
     ------
     RecipeError
         If the recipe does not exist, is not TOML, has another kind, or any key is wrong. Names
         all wrong keys.
+    SettingError
+        If a flag is out of range.
     """
     keys = read(name)
     check_kind(name, keys, kind)
-    return check(name, {k: v for k, v in keys.items() if k != "kind"}, schema)
+    settings: Any = check(name, {k: v for k, v in keys.items() if k != "kind"}, schema)
+    given = {} if flags is None else asdict(flags)
+    try:
+        loaded: Settings = replace(settings, **{k: v for k, v in given.items() if v is not None})
+    except ValueError as e:
+        raise SettingError(f"{e}. Give another value") from None
+    return loaded
 
 
 def check(name: str | Path, keys: Mapping[str, Any], schema: type[Settings]) -> Settings:

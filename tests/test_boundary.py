@@ -24,7 +24,7 @@ def _end_of(error: BaseException) -> int:
     def fail() -> None:
         raise error
 
-    return boundary.status_of(fail)
+    return boundary.run_to_status(fail)
 
 
 def test_a_bug_is_one_line_that_names_the_file_with_its_traceback(
@@ -76,7 +76,7 @@ def test_what_the_system_refuses_is_one_line(
 def test_a_link_to_itself_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (link := tmp_path / "a.mcap").symlink_to("a.mcap")
     words = ["merge", str(link), str(link), str(tmp_path / "b.mcap")]
-    assert boundary.status_of(lambda: app(words)) == 1
+    assert boundary.run_to_status(lambda: app(words)) == 1
     assert re.fullmatch(r"dmrl: .*a\.mcap.*\n", capsys.readouterr().err)
 
 
@@ -116,7 +116,7 @@ def test_what_is_whole_when_a_signal_comes_is_said(tmp_path: Path) -> None:
         "        with partial_file(Path(name)) as partial:\n"
         "            partial.write_text('x')\n"
         "            if name == 'b': os.kill(os.getpid(), signal.SIGTERM)\n"
-        "boundary.end_by_signals(); sys.exit(boundary.status_of(work))\n"
+        "boundary.install_signal_handlers(); sys.exit(boundary.run_to_status(work))\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
@@ -170,5 +170,5 @@ def test_a_working_folder_that_was_removed_is_said_before_a_library_aborts(
     (gone := tmp_path / "gone").mkdir()
     monkeypatch.chdir(gone)
     gone.rmdir()
-    assert boundary.status_of(lambda: app([name])) == 1
+    assert boundary.run_to_status(lambda: app([name])) == 1
     assert capsys.readouterr().err == "dmrl: the folder you are in was removed. Go to another: cd\n"

@@ -10,7 +10,7 @@ import pytest
 
 from dmrl.cli import COMMANDS, app
 from dmrl.estimation.model.status import EXPECTED_SHARE
-from dmrl.stages.doctor import EXTRAS
+from dmrl.installation import EXTRAS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [

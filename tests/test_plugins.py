@@ -1,5 +1,7 @@
 """What another package adds by entry points: it works, it is lazy, and broken it harms nobody."""
 
+import json
+import os
 import subprocess
 import sys
 import textwrap
@@ -21,8 +23,7 @@ Install = Callable[..., None]
 
 FORMAT = """
     from dmrl import topics
-    from dmrl.formats.base import Content, Format
-    from dmrl.samples.sample import Sample
+    from dmrl.plugins import Content, Format, Sample
 
     def recognises(source):
         return source.suffix == ".alt"
@@ -40,7 +41,7 @@ FORMAT = """
 NETWORK = """
     import torch
     from torch import nn
-    from dmrl.learn.networks.architectures import ConvNorm, Network
+    from dmrl.plugins import ConvNorm, Network
 
     class Tiny(Network):
         def __init__(self, extra=()):
@@ -80,7 +81,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     site = tmp_path / "site"
     site.mkdir()
     monkeypatch.syspath_prepend(site)
-    monkeypatch.setenv("PYTHONPATH", str(site))
+    monkeypatch.setenv("PYTHONPATH", str(site), prepend=os.pathsep)
 
     def installed(package: str, text: str, **entries: str) -> None:
         module = package.replace("-", "_")
@@ -93,10 +94,10 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         about.joinpath("entry_points.txt").write_text(
             "".join(f"[dmrl.{group}]\n{line}\n" for group, line in entries.items())
         )
-        plugins.found.cache_clear()
+        plugins.find_plugins.cache_clear()
 
     yield installed
-    plugins.found.cache_clear()
+    plugins.find_plugins.cache_clear()
     for path in site.glob("*.py"):
         sys.modules.pop(path.stem, None)
 
@@ -141,7 +142,7 @@ def test_dmrls_own_names_stay_dmrls(install: Install, tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("import nothing_like_it", "cannot be loaded: ModuleNotFoundError: No module named"),
-        ("FORMAT = 1", "is not a dmrl.formats.base.Format: alt_logs:FORMAT"),
+        ("FORMAT = 1", "is not a dmrl.plugins.Format: alt_logs:FORMAT"),
         (
             FORMAT.replace("source.suffix", "source.missing"),
             "fails to check .*flight.alt: AttributeError",
@@ -196,7 +197,7 @@ def test_a_network_of_another_package_is_built_saved_and_loaded(
     ("text", "said"),
     [
         ("1 / 0", "cannot be loaded: ZeroDivisionError"),
-        ("Tiny = dict", "is not a subclass of dmrl.learn.networks.architectures.Network"),
+        ("Tiny = dict", "is not a subclass of dmrl.plugins.Network"),
         (NETWORK.replace("ConvNorm(3", "ConvNrm(3"), "cannot be built: NameError"),
     ],
 )
@@ -223,6 +224,70 @@ def test_a_stage_of_another_package_is_a_command(entry: str, install: Install) -
     assert failed.returncode == 1
     assert "of the package stages-of-mine, failed: ValueError: over the edge" in failed.stderr
     assert failed.stderr.count("\n") == 1
+
+
+DECLARED = """
+    from dataclasses import dataclass
+    from pathlib import Path
+    from dmrl.plugins import Closing, stage_command
+
+    @dataclass(frozen=True)
+    class Settings:
+        \"\"\"How.\"\"\"
+
+        times: int = 1
+
+    def run(recording: Path, out: Path, settings: Settings) -> dict[str, int]:
+        \"\"\"Copy a name.
+
+        Parameters
+        ----------
+        recording
+            What to copy.
+        out
+            Where to.
+        \"\"\"
+        out.write_text(recording.name * settings.times)
+        return {"names": settings.times}
+
+    command = stage_command(
+        run,
+        Closing(columns=("what", "count"), path_key="recording"),
+        name="say-it",
+        folder="recording",
+    )
+"""
+
+
+@pytest.mark.heavy
+def test_a_stage_of_another_package_is_built_from_its_run(install: Install, tmp_path: Path) -> None:
+    install("stages-of-mine", DECLARED, stages="say-it = stages_of_mine")
+    out = tmp_path / "out.txt"
+    done = dmrl("say-it", "a.mcap", str(out), "--times", "2", "--json")
+    assert json.loads(done.stdout) == {"recording": str(out), "names": 2}
+    assert out.read_text() == "a.mcapa.mcap"
+    helped = dmrl("say-it", "--help").stdout
+    assert "What to copy." in helped and "--workers" in helped
+
+
+@pytest.mark.parametrize("name", plugins.PLACES)
+def test_every_name_for_plugins_is_at_its_place(name: str) -> None:
+    assert getattr(plugins, name).__module__ == plugins.PLACES[name]
+    listed = Path(plugins.__file__).read_text(encoding="utf-8")
+    assert f"from {plugins.PLACES[name]} import {name} as {name}\n" in listed
+
+
+def test_plugins_are_light_and_have_no_other_names() -> None:
+    code = (
+        "import sys, dmrl.plugins\n"
+        "print(sorted({'numpy', 'torch', 'pyarrow', 'cyclopts'} & set(sys.modules)))\n"
+        "try: dmrl.plugins.Former\n"
+        "except AttributeError as e: print(e)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded, said = done.stdout.splitlines()
+    assert loaded == "[]"
+    assert said.startswith("dmrl.plugins has no Former. It has: Closing, Columns, Content")
 
 
 @pytest.mark.heavy

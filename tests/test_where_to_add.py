@@ -227,10 +227,40 @@ def test_a_loss(clone: Clone) -> None:
 COMMAND = '''
     """hello: greet."""
 
+    from dataclasses import dataclass
 
-    def command(name: str, /) -> None:
-        """Greet somebody."""
-        print(f"hello {name}")
+    from dmrl.pipeline.stage_command import stage_command
+    from dmrl.terminal.closing import Closing
+
+
+    @dataclass(frozen=True, slots=True)
+    class Settings:
+        """Manners.
+
+        Parameters
+        ----------
+        loud
+            Shout.
+        """
+
+        loud: bool = False
+
+
+    def run(name: str, settings: Settings) -> dict[str, int]:
+        """Greet somebody.
+
+        Parameters
+        ----------
+        name
+            Whom to greet.
+        """
+        return {f"hello {name}".upper() if settings.loud else f"hello {name}": 1}
+
+
+    command = stage_command(
+        run,
+        Closing(lines=lambda greetings, _: list(greetings), document=lambda greetings, _: greetings),
+    )
 '''
 
 
@@ -238,8 +268,16 @@ def test_a_command(clone: Clone) -> None:
     clone.write("dmrl/stages/hello.py", COMMAND)
     clone.after("dmrl/cli.py", "COMMANDS = {\n", '    "hello": "Greet somebody.",\n')
     assert clone.touched() == promised("a command")
-    greeted, listed = clone.dmrl(["hello", "cf1"], ["--help"])
-    assert greeted == "hello cf1\n"
+    greeted, shouted, told, helped, listed = clone.dmrl(
+        ["hello", "cf1"],
+        ["hello", "cf1", "--loud"],
+        ["hello", "cf1", "--json"],
+        ["hello", "--help"],
+        ["--help"],
+    )
+    assert (greeted, shouted) == ("hello cf1\n", "HELLO CF1\n")
+    assert json.loads(told) == {"hello cf1": 1}
+    assert "Whom to greet." in helped and "Shout." in helped
     assert "Greet somebody." in listed
 
 
@@ -251,7 +289,8 @@ VIEW = '''
     from dmrl import topics
     from dmrl.viewer import layouts, plots
     from dmrl.viewer.scene import Draw, Scene
-    from dmrl.viewer.selection import Selection, Settings
+    from dmrl.viewer.selection import Selection
+from dmrl.viewer.settings import Settings
 
 
     def scene(selection: Selection, settings: Settings) -> Scene:

@@ -3,17 +3,38 @@
 * ``drawing`` converts the columns of a topic to archetypes; ``content`` joins several topics.
 * ``layouts`` arranges panels. Each file of ``views`` is a layout, ``browse`` the one of datasets.
 * ``session`` logs the images that ``selection`` chose. ``window`` runs rerun's viewer.
+
+A name is imported on first use: ``settings`` needs no rerun.
 """
 
-from dmrl.errors import MissingExtra
+from typing import TYPE_CHECKING
 
-try:
-    from dmrl.viewer.flag import flag
-    from dmrl.viewer.selection import Settings
+from dmrl.errors import MissingExtra
+from dmrl.guards.lazy_names import import_lazily
+from dmrl.viewer.settings import Settings, Web
+
+if TYPE_CHECKING:
+    from dmrl.viewer.flag_page import flag
     from dmrl.viewer.session import save
     from dmrl.viewer.window.desktop import screenshot, view
-    from dmrl.viewer.window.web_page import Page, Web, page, serve
-except ImportError as e:
-    raise MissingExtra("rerun-sdk", "view", "dmrl view") from e
+    from dmrl.viewer.window.web_page import Page, page, serve
 
 __all__ = ["Page", "Settings", "Web", "flag", "page", "save", "screenshot", "serve", "view"]
+
+_PLACES = {
+    "flag": "dmrl.viewer.flag_page",
+    "Page": "dmrl.viewer.window.web_page",
+    "page": "dmrl.viewer.window.web_page",
+    "save": "dmrl.viewer.session",
+    "screenshot": "dmrl.viewer.window.desktop",
+    "serve": "dmrl.viewer.window.web_page",
+    "view": "dmrl.viewer.window.desktop",
+}
+_import = import_lazily(__name__, _PLACES)
+
+
+def __getattr__(name: str) -> object:
+    try:
+        return _import(name)
+    except ImportError as e:
+        raise MissingExtra("rerun-sdk", "view", "dmrl view") from e

@@ -27,7 +27,7 @@ from dmrl.viewer.drawing.entity import Entity, image_frame
 from dmrl.viewer.drawing.label_overlay import labels
 from dmrl.viewer.drawing.legend import colour_bars, legend
 from dmrl.viewer.layouts import Eye, Plot
-from dmrl.viewer.selection import Settings
+from dmrl.viewer.settings import Settings
 from dmrl.viewer.show import Logged, Show
 
 TIMELINE = "rank"

@@ -3,17 +3,15 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from cyclopts import Parameter, validators
 from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
 from dmrl.recording import Summary, log_times, summary
 from dmrl.terminal.progress import say
-from dmrl.viewer.views import NAMES
+from dmrl.viewer.settings import Layout, Settings
 
 DURATION_BELOW_NS = 10 * 365 * 86400 * 10**9
 """Log times below this count from the start of a simulation, not from 1970."""
@@ -33,57 +31,8 @@ OF_IMAGES = ("image", "compare")
 MANY_PAIRS = 6
 """Largest number of pairs of robots that are shown without a choice."""
 
-if TYPE_CHECKING:
-    Layout = str
-else:
-    Layout = Literal[("auto", *NAMES, "dataset")]
 Times = NDArray[np.int64]
 Names = tuple[str, str]
-Pixels = Annotated[float | None, Parameter(validator=validators.Number(gte=0))]
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Images and layout of a viewer.
-
-    Parameters
-    ----------
-    layout
-        image: images and maps. flight: 3D, plots and images. compare: two models, one recording
-        each. dataset: a dataset, worst first. auto: chosen by content.
-    robot
-        Only images and measurements of this robot. Without it: every robot, in compare the first.
-    from_s
-        First image shown, seconds from the start of the earliest recording.
-    to_s
-        First image left out, seconds from the start.
-    every
-        Show one image in this many, with its labels and detections.
-    depth_max_m
-        Depth of the last colour of depth maps, metres. The first is 0 m.
-    overlay
-        Lay the maps over the image, scaled up smoothly.
-    most
-        dataset: largest number of rows shown.
-    split
-        dataset: only rows of this split.
-    error_from_px
-        dataset: only rows with an error of at least this, pixels.
-    error_to_px
-        dataset: only rows with a smaller error, pixels.
-    """
-
-    layout: Layout = "auto"
-    robot: str | None = None
-    from_s: Annotated[float | None, Parameter(name=["--from-s", "--from"])] = None
-    to_s: Annotated[float | None, Parameter(name=["--to-s", "--to"])] = None
-    every: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1
-    depth_max_m: Annotated[float, Parameter(validator=validators.Number(gt=0))] = 3.0
-    overlay: bool = False
-    most: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 200
-    split: str | None = None
-    error_from_px: Pixels = None
-    error_to_px: Pixels = None
 
 
 @dataclass(frozen=True, slots=True)

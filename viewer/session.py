@@ -15,7 +15,8 @@ import rerun as rr
 from dmrl.atomic_output import partial_file
 from dmrl.viewer.layouts import TIMELINE
 from dmrl.viewer.scene import Scene, logged
-from dmrl.viewer.selection import Settings, at_time, moment_ns, select
+from dmrl.viewer.selection import at_time, moment_ns, select
+from dmrl.viewer.settings import Settings
 from dmrl.viewer.show import Logger, Show, cursor_at, stream_of
 
 PIECE_BYTES = 1 << 20

@@ -27,8 +27,8 @@ HEAVY = (layout.PIXELS, layout.IMAGE, layout.MASKS, layout.CONFIDENCE, layout.DE
 class Rows:
     """The rows of one split: an image each, with its peers and grid labels.
 
-    It has what a map-style dataset of torch has, so a DataLoader takes it as it is; `loader`
-    gathers whole batches, which is faster.
+    It is a map-style dataset of torch, so a DataLoader accepts it; `loader` gathers whole batches,
+    which is faster.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Rows:
         return len(self._split)
 
     def __getitem__(self, index: int | slice) -> dict[str, NDArray[Any]]:
-        """A row as arrays; of a slice such as ``rows[:9]``, rows stacked as `gathered` does.
+        """Return a row as arrays; for a slice such as ``rows[:9]``, rows stacked by `gathered`.
 
         Returns
         -------
@@ -69,7 +69,7 @@ class Rows:
         return (self[index] for index in range(len(self)))
 
     def gathered(self, rows: Sequence[int]) -> dict[str, NDArray[Any]]:
-        """Some rows as arrays, stacked: as ``rows[index]``, with a first axis for the rows.
+        """Return some rows as arrays, stacked along a first axis.
 
         Raises
         ------
@@ -102,13 +102,13 @@ class Rows:
         return self._split.pixels
 
     def to_arrow(self) -> pa.Table:
-        """All columns, mapped from the files."""
+        """Return all columns, mapped from the files."""
         return self._split.table
 
     def to_pandas(self) -> "pd.DataFrame":
-        """A row per peer of an image, without pixels and grids; one, empty, of an image without.
+        """Return a row per peer of an image, or one per empty image, without pixels and grids.
 
-        ``source`` is the recording, ``label_source`` where the label comes from.
+        ``source`` is the recording, ``label_source`` the labeller.
 
         Raises
         ------
@@ -128,14 +128,14 @@ class Rows:
         return frame
 
     def torch(self) -> "TorchDataset[Any]":
-        """The same as a dataset of torch: images (3, H, W) uint8, grids float32.
+        """Return the rows as a dataset of torch: images (3, H, W) uint8, grids float32.
 
         Raises
         ------
         MissingExtra
             If torch is not installed.
         """
-        found: TorchDataset[Any] = _torch_rows().TorchRows(self)
+        found: TorchDataset[Any] = _import_torch_dataset().TorchRows(self)
         return found
 
     def loader(
@@ -147,18 +147,18 @@ class Rows:
         workers: int = 0,
         part: tuple[int, int] | None = None,
     ) -> "DataLoader[Any]":
-        """Batches for a training, as a DataLoader of torch; each is gathered at once.
+        """Return a DataLoader of torch that gathers each batch at once.
 
         Parameters
         ----------
         batch_size
             Rows of a batch; the last may have fewer.
         shuffle
-            In another order every epoch; of a large split, 8,192 rows at a time of shuffled blocks.
+            Change the order every epoch; in a large split, 8,192 rows at a time of shuffled blocks.
         seed
-            Of those orders.
+            Seed of the orders.
         workers
-            Processes that gather ahead; 0: this one.
+            Processes that gather batches ahead; 0: this one.
         part
             ``(k, n)``: this is process k of n, from 0, and reads its own part of the rows. None: as
             torchrun says (RANK, WORLD_SIZE), or all of them.
@@ -176,7 +176,7 @@ class Rows:
         SettingError
             If there is no such part.
         """
-        found: DataLoader[Any] = _torch_rows().loader_of(
+        found: DataLoader[Any] = _import_torch_dataset().loader_of(
             self, batch_size, shuffle=shuffle, seed=seed, workers=workers, part=part
         )
         return found
@@ -186,8 +186,8 @@ class Rows:
         return f"<split {self.name}: {len(self)} images of {width} x {height} px>"
 
     def _repr_html_(self) -> str:
-        shown = notebook_display.spread(len(self))
-        return notebook_display.pictures(repr(self)[1:-1], self._split.images(shown))
+        shown = notebook_display.spread_indices(len(self))
+        return notebook_display.html_images(repr(self)[1:-1], self._split.images(shown))
 
 
 class Data(Mapping[str, Rows]):
@@ -208,7 +208,7 @@ class Data(Mapping[str, Rows]):
         return self._found.path
 
     def __getitem__(self, split: str) -> Rows:
-        """A split.
+        """Return a split.
 
         Raises
         ------
@@ -225,11 +225,11 @@ class Data(Mapping[str, Rows]):
         return iter(self._found.splits)
 
     def __len__(self) -> int:
-        """Splits."""
+        """Return the number of splits."""
         return len(self._found.splits)
 
     def card(self) -> str:
-        """Its card, Markdown.
+        """Return the card, Markdown.
 
         Raises
         ------
@@ -243,7 +243,7 @@ class Data(Mapping[str, Rows]):
 
     def show(self) -> object:
         """Show it in rerun, row by row: in a notebook's cell, or else in a window."""
-        return notebook_display.shown([self.path], None)
+        return notebook_display.show_in_rerun([self.path], None)
 
     def __repr__(self) -> str:
         return f"<dataset {self.path}: {', '.join(self)}>"
@@ -253,7 +253,9 @@ class Data(Mapping[str, Rows]):
             (name, len(split), "{1} x {0}".format(*split._split.image_shape))
             for name, split in self.items()
         ]
-        return notebook_display.table(f"dataset {self.path}", ("split", "images", "size, px"), rows)
+        return notebook_display.html_table(
+            f"dataset {self.path}", ("split", "images", "size, px"), rows
+        )
 
 
 def dataset(path: str | os.PathLike[str]) -> Data:
@@ -278,7 +280,7 @@ def dataset(path: str | os.PathLike[str]) -> Data:
     return Data(open_dataset(Path(path)))
 
 
-def _torch_rows() -> Any:
+def _import_torch_dataset() -> Any:
     try:
         return import_module("dmrl.learn.data.torch_dataset")
     except ModuleNotFoundError as e:

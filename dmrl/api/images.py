@@ -1,4 +1,4 @@
-"""A camera's images in a recording: a sequence that decodes what is taken out of it."""
+"""Images of a camera in a recording, as a sequence that decodes an image when it is used."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,20 +19,20 @@ class Images(Sequence[Rgb]):
     """Images of one camera, (H, W, 3) uint8 RGB each, in log-time order.
 
     ``images[3]`` is an image, ``images[3:9]`` fewer images, ``images.between(1.0, 2.0)`` those
-    of a second. None is decoded before it is taken out.
+    of a second. Each is decoded when it is used.
 
     Parameters
     ----------
     path
         The recording.
     topic
-        Of the camera.
+        Topic of the camera.
     start_ns
         Log time from which seconds count, nanoseconds.
     time_ns
         (N,) log times of the images, sorted.
     kept
-        What keeps a temporary recording there as long as this.
+        Object that keeps a temporary recording alive.
     """
 
     path: Path
@@ -42,8 +42,8 @@ class Images(Sequence[Rgb]):
     kept: object = None
 
     @classmethod
-    def of(cls, path: Path, topic: str, start_ns: int, kept: object = None) -> "Images":
-        """All images on a topic."""
+    def load_topic(cls, path: Path, topic: str, start_ns: int, kept: object = None) -> "Images":
+        """Return all images on a topic."""
         return cls(path, topic, start_ns, log_times(path, [topic])[topic], kept)
 
     @property
@@ -59,7 +59,7 @@ class Images(Sequence[Rgb]):
     @overload
     def __getitem__(self, index: slice) -> "Images": ...
     def __getitem__(self, index: int | slice) -> "Rgb | Images":
-        """An image by its number, or fewer images.
+        """Return an image by its number, or fewer images.
 
         Raises
         ------
@@ -70,26 +70,28 @@ class Images(Sequence[Rgb]):
             return replace(self, time_ns=self.time_ns[index])
         time_ns = int(self.time_ns[index])
         place = index % len(self) - int(np.searchsorted(self.time_ns, time_ns))
-        every = list(self._pictures(time_ns, time_ns + 1))
+        every = list(self._iter_decoded(time_ns, time_ns + 1))
         return every[min(place, len(every) - 1)][1]
 
     def __iter__(self) -> Iterator[Rgb]:
-        """Images one by one, each chunk of the file read once."""
+        """Yield the images; each chunk of the file is read once."""
         if not len(self):
             return
         wanted = set(self.time_ns.tolist())
-        for time_ns, image in self._pictures(int(self.time_ns.min()), int(self.time_ns.max()) + 1):
+        for time_ns, image in self._iter_decoded(
+            int(self.time_ns.min()), int(self.time_ns.max()) + 1
+        ):
             if time_ns in wanted:
                 yield image
 
-    def _pictures(self, start_ns: int, end_ns: int) -> Iterator[tuple[int, Rgb]]:
+    def _iter_decoded(self, start_ns: int, end_ns: int) -> Iterator[tuple[int, Rgb]]:
         kind = message("CompressedImage")
         for raw in read_raw(self.path, self.topic, start_ns=start_ns, end_ns=end_ns):
             what = f"{self.path}: the image of {self.topic} at {raw.time_ns} ns"
             yield raw.time_ns, decode(parsed(raw, kind, self.path).data, what)
 
     def between(self, start_s: float | None = None, end_s: float | None = None) -> "Images":
-        """Images in [start_s, end_s), seconds from the start of the recording."""
+        """Return the images in [start_s, end_s), seconds from the start of the recording."""
         low = -np.inf if start_s is None else start_s
         high = np.inf if end_s is None else end_s
         # In whole nanoseconds, as they stand in the file.
@@ -98,7 +100,7 @@ class Images(Sequence[Rgb]):
         return replace(self, time_ns=self.time_ns[chosen])
 
     def nearest(self, time_s: float) -> Rgb:
-        """The image nearest to a time, seconds from the start of the recording.
+        """Return the image nearest to a time, seconds from the start of the recording.
 
         Raises
         ------
@@ -110,13 +112,13 @@ class Images(Sequence[Rgb]):
         return self[int(np.abs(self.time_s - time_s).argmin())]
 
     def to_numpy(self) -> NDArray[np.uint8]:
-        """(N, H, W, 3) all of them, in memory; of none, (0, 0, 0, 3)."""
+        """Return all images as (N, H, W, 3), in memory; (0, 0, 0, 3) if there are none."""
         return np.stack(list(self)) if len(self) else np.empty((0, 0, 0, 3), np.uint8)
 
     def __repr__(self) -> str:
         return f"<{len(self)} images of {self.topic} in {self.path}>"
 
     def _repr_html_(self) -> str:
-        return notebook_display.pictures(
-            repr(self)[1:-1], (self[k] for k in notebook_display.spread(len(self)))
+        return notebook_display.html_images(
+            repr(self)[1:-1], (self[k] for k in notebook_display.spread_indices(len(self)))
         )

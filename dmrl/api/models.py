@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.api import notebook_display
-from dmrl.deploy.detector import BackendName, Detector, open_detector
+from dmrl.deploy.backend_names import BackendName
+from dmrl.deploy.detector import Detector, open_detector
 from dmrl.errors import SettingError
 from dmrl.learn.inference.decode_grids import PER_DETECTION, Grids, decode
 from dmrl.learn.pretrained import resolved
 
 Rgb = NDArray[np.uint8]
-BATCH = 16
+BATCH_IMAGES = 16
 """Images that go through the network together."""
 
 
@@ -33,7 +34,7 @@ class Detection:
     confidence
         0 to 1.
     sigma_depth_m
-        Standard deviation of the depth, metres; 0 where the network does not say.
+        Standard deviation of the depth, metres; 0 if the network has no such output.
     class_id
         Number of its class, 0 for a network without classes.
     """
@@ -47,12 +48,12 @@ class Detection:
 
 
 class Model:
-    """A network, opened for one of the ways to compute it.
+    """A network, opened with a backend.
 
     Parameters
     ----------
     detector
-        What turns images into grids.
+        Backend that turns images into grids.
     """
 
     def __init__(self, detector: Detector) -> None:
@@ -65,7 +66,7 @@ class Model:
 
     @property
     def threshold(self) -> float:
-        """Confidence from which a detection is to be believed, 0 to 1."""
+        """Confidence from which a detection counts, 0 to 1."""
         return self._detector.threshold
 
     @property
@@ -76,7 +77,7 @@ class Model:
     def detect(
         self, images: Rgb | Sequence[Rgb], *, threshold: float | None = None, most: int = 20
     ) -> list[list[Detection]]:
-        """The robots in each image, the surest first.
+        """Return the robots in each image, the most confident first.
 
         Parameters
         ----------
@@ -84,9 +85,9 @@ class Model:
             (N, H, W, 3) RGB, uint8, or a sequence of (H, W, 3), such as `Recording.images`, which
             is decoded a batch at a time. One image, (H, W, 3), is a sequence of one.
         threshold
-            Leave out what is less sure, 0 to 1. None: the network's own threshold.
+            Least confidence, 0 to 1. None: the network's own threshold.
         most
-            At most so many of an image.
+            Most detections of an image.
 
         Raises
         ------
@@ -95,26 +96,26 @@ class Model:
         """
         if isinstance(images, np.ndarray) and images.ndim == 3:
             images = images[None]
-        return list(self._detected(images, threshold, most))
+        return list(self._iter_detections(images, threshold, most))
 
     def grids(self, images: Rgb) -> Grids:
-        """What the network says of (N, H, W, 3) RGB images, cell by cell.
+        """Return the output of the network for (N, H, W, 3) RGB images, cell by cell.
 
         Returns
         -------
         Grids
-            ``confidence`` and ``depth_m`` (N, rows, cols), and more where it says more.
+            ``confidence`` and ``depth_m`` (N, rows, cols), and more if the network has it.
         """
         _require_rgb(images)
         self._detector.require_size(images.shape[2], images.shape[1], "the images")
         return self._detector.grids(np.ascontiguousarray(images))
 
-    def _detected(
+    def _iter_detections(
         self, images: Rgb | Sequence[Rgb], threshold: float | None, most: int
     ) -> Iterator[list[Detection]]:
         least = self.threshold if threshold is None else threshold
         every = map(np.asarray, images)
-        while batch := list(islice(every, BATCH)):
+        while batch := list(islice(every, BATCH_IMAGES)):
             for image in batch:
                 _require_rgb(np.asarray(image)[None])
             if len({image.shape for image in batch}) > 1:
@@ -133,7 +134,7 @@ class Model:
 
     def _repr_html_(self) -> str:
         rows = [("threshold", self.threshold), ("side of a cell, px", self.stride_px)]
-        return notebook_display.table(f"model {self.name}", ("", ""), rows)
+        return notebook_display.html_table(f"model {self.name}", ("", ""), rows)
 
 
 def load(model: str | os.PathLike[str], *, backend: BackendName = "torch") -> Model:
@@ -145,7 +146,7 @@ def load(model: str | os.PathLike[str], *, backend: BackendName = "torch") -> Mo
         A run folder of dmrl train, a .safetensors, a Keras .h5, a quantised model, an export
         folder, or the name of one that ships with dmrl: "dmrl-nano".
     backend
-        What computes: "torch" and "onnx" are float, "onnx-int8", "integer" (NumPy) and "c" int8.
+        Backend: "torch" and "onnx" are float, "onnx-int8", "integer" (NumPy) and "c" int8.
 
     Raises
     ------

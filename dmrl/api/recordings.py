@@ -1,4 +1,4 @@
-"""A recording as an object: topics as tables, images and labels, and how it looks."""
+"""A recording as an object: topics as tables, images, labels and detections."""
 
 import os
 import shutil
@@ -13,7 +13,7 @@ import pyarrow as pa
 from dmrl import topics
 from dmrl.api import notebook_display
 from dmrl.api.images import Images
-from dmrl.api.topic import Topic, framed, log_time
+from dmrl.api.topic import Topic, to_data_frame, to_log_time
 from dmrl.errors import MissingTopic, SettingError
 from dmrl.export.csv_parquet import flat
 from dmrl.recording import (
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 PathLike = str | os.PathLike[str]
 
 
-class _Kept:
-    """A temporary folder, there as long as somebody holds this."""
+class _TemporaryFolder:
+    """A temporary folder that exists as long as this object."""
 
     def __init__(self, folder: Path) -> None:
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
@@ -59,7 +59,7 @@ class Recording:
     def __init__(self, path: PathLike, temporary: Path | None = None) -> None:
         self.path = Path(path)
         self._summary = summary(self.path)
-        self._kept = None if temporary is None else _Kept(temporary)
+        self._kept = None if temporary is None else _TemporaryFolder(temporary)
 
     def __fspath__(self) -> str:
         return str(self.path)
@@ -87,11 +87,11 @@ class Recording:
 
     @property
     def provenance(self) -> Provenance | None:
-        """How it was made; None for a recording that dmrl did not write."""
+        """Provenance; None for a recording that dmrl did not write."""
         return self._summary.provenance
 
     def __getitem__(self, topic: str) -> Topic:
-        """A topic.
+        """Return a topic.
 
         Raises
         ------
@@ -109,31 +109,31 @@ class Recording:
         return iter(self.topics)
 
     def __len__(self) -> int:
-        """Topics."""
+        """Return the number of topics."""
         return len(self.topics)
 
     def messages(
         self, *wanted: str, start_s: float | None = None, end_s: float | None = None
     ) -> Iterator[Stamped]:
-        """Messages one by one, in log-time order, of topics or patterns: ``/*/labels``.
+        """Yield messages in log-time order, of topics or patterns such as ``/*/labels``.
 
         Raises
         ------
         MissingTopic
             If one of them matches nothing.
         """
-        start_ns, end_ns = log_time(start_s, self.start_ns), log_time(end_s, self.start_ns)
+        start_ns, end_ns = to_log_time(start_s, self.start_ns), to_log_time(end_s, self.start_ns)
         return read(self.path, *wanted, start_ns=start_ns, end_ns=end_ns)
 
     def images(
         self, robot: str | None = None, *, start_s: float | None = None, end_s: float | None = None
     ) -> Images:
-        """A camera's images, decoded when they are used.
+        """Return a camera's images, decoded when they are used.
 
         Parameters
         ----------
         robot
-            Who carries the camera. None: the only one who does.
+            Robot that carries the camera. None: the only one with a camera.
         start_s, end_s
             Only images in [start_s, end_s), seconds from the start of the recording.
 
@@ -149,34 +149,36 @@ class Recording:
             raise SettingError(f"{self.path} has images of {', '.join(filming)}. Name one of them")
         topic = topics.camera_image(robot or (filming[0] if filming else "*"))
         matching(self.path, [topic])
-        return Images.of(self.path, topic, self.start_ns, self._kept).between(start_s, end_s)
+        return Images.load_topic(self.path, topic, self.start_ns, self._kept).between(
+            start_s, end_s
+        )
 
     def labels(self, robot: str | None = None) -> "pd.DataFrame":
-        """A row per labelled peer of an image: where it is, its sigmas, status and source.
+        """Return a row per labelled peer of an image: position, sigmas, status and source.
 
         Parameters
         ----------
         robot
-            Whose images. None: everybody's; the column ``robot`` tells.
+            Robot of the images. None: all robots; see the column ``robot``.
 
         Raises
         ------
         MissingTopic
             If there are no labels.
         """
-        return self._of_images(topics.LABELS, "peers", robot)
+        return self._read_per_image(topics.LABELS, "peers", robot)
 
     def detections(self, robot: str | None = None) -> "pd.DataFrame":
-        """A row per detection: where, how far, how sure, and the threshold of the network.
+        """Return a row per detection: position, depth, confidence, and the network's threshold.
 
         Raises
         ------
         MissingTopic
             If there are none.
         """
-        return self._of_images(topics.DETECTIONS, "detections", robot)
+        return self._read_per_image(topics.DETECTIONS, "detections", robot)
 
-    def _of_images(self, pattern: str, within: str, robot: str | None) -> "pd.DataFrame":
+    def _read_per_image(self, pattern: str, within: str, robot: str | None) -> "pd.DataFrame":
         found = sorted(matching(self.path, [topics.filled(pattern, robot=robot or "*")]))
         tables = []
         for topic in found:
@@ -185,26 +187,26 @@ class Recording:
             who = (topics.names(pattern, topic) or {})["robot"]
             column = pa.array([who] * len(table), pa.string())
             tables.append(table.rename_columns(names).append_column("robot", column))
-        return framed(pa.concat_tables(tables).sort_by("log_time"), self.start_ns)
+        return to_data_frame(pa.concat_tables(tables).sort_by("log_time"), self.start_ns)
 
     def check(self) -> list[Finding]:
-        """What is doubtful about it, as ``dmrl check`` finds it; best read as a table."""
+        """Return the findings of ``dmrl check``."""
         return list(check(self.path))
 
     def show(self, *, layout: str | None = None) -> object:
-        """Show it in rerun: in a notebook's cell, or else in a window until that is closed.
+        """Show the recording in rerun: in a notebook's cell, or else in a window.
 
         Parameters
         ----------
         layout
-            "image", "flight", "compare"; None: what fits.
+            "image", "flight", "compare"; None: chosen by the topics.
 
         Raises
         ------
         MissingExtra
             If rerun is not installed.
         """
-        return notebook_display.shown([self.path], layout)
+        return notebook_display.show_in_rerun([self.path], layout)
 
     def __repr__(self) -> str:
         count = self._summary.count
@@ -212,7 +214,7 @@ class Recording:
 
     def _repr_html_(self) -> str:
         rows = [(name, info.schema, info.count) for name, info in self.topics.items()]
-        return notebook_display.table(repr(self)[1:-1], ("topic", "message", "messages"), rows)
+        return notebook_display.html_table(repr(self)[1:-1], ("topic", "message", "messages"), rows)
 
     def _ipython_key_completions_(self) -> list[str]:
         return list(self.topics)

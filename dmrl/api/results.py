@@ -1,4 +1,4 @@
-"""What an evaluation found, as an object: figures by name, and a table in a notebook."""
+"""Result of an evaluation as an object: figures by name, and a table in a notebook."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
@@ -14,7 +14,7 @@ class Result(Mapping[str, Any]):
     Parameters
     ----------
     document
-        The figures: numbers, texts, lists and mappings; None where there was nothing to measure.
+        The figures: numbers, texts, lists and mappings; None if nothing could be measured.
     title, columns, rows
         The table that the command prints.
     """
@@ -30,7 +30,7 @@ class Result(Mapping[str, Any]):
         self._table = title, columns, rows
 
     def __getitem__(self, name: str) -> Any:
-        """A figure, or the figures below a name.
+        """Return a figure, or the figures below a name.
 
         Raises
         ------
@@ -43,7 +43,7 @@ class Result(Mapping[str, Any]):
         return iter(self._document)
 
     def __len__(self) -> int:
-        """Names."""
+        """Return the number of names."""
         return len(self._document)
 
     def __repr__(self) -> str:
@@ -52,19 +52,19 @@ class Result(Mapping[str, Any]):
         return "\n".join([title, *lines])
 
     def _repr_html_(self) -> str:
-        return notebook_display.table(*self._table)
+        return notebook_display.html_table(*self._table)
 
 
-def judged(recordings: Sequence[Path], settings: Any) -> Result:
-    """What ``dmrl.stages.evaluate`` finds in recordings."""
-    stage = import_module("dmrl.stages.evaluate")
-    found = stage.run(recordings, None, settings)
+def evaluate_recordings(recordings: Sequence[Path], settings: Any) -> Result:
+    """Return the result of ``dmrl.stages.evaluate`` for recordings."""
+    report = import_module("dmrl.evaluation.detection_report")
+    found = import_module("dmrl.stages.evaluate").run(recordings, None, settings)
     named = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
     if isinstance(found, dict):
-        kind = stage.tracks if "robots" in found else stage.positions
+        kind = import_module(f"dmrl.evaluation.{'tracks' if 'robots' in found else 'positions'}")
         columns = [kind.EACH, *(words for _, words, _ in kind.COLUMNS)]
         return Result(found, f"{named}: {kind.TITLE}", columns, kind.rows(found))
-    headers, rows = stage.by_band_table(found.bands)
-    document = stage.document(recordings, settings, found)
+    headers, rows = report.by_band_table(found.bands)
+    document = report.describe_evaluation(recordings, found)
     columns = ["label minus detection", *headers]
     return Result(document, f"{named}: {found.pairs.images} images", columns, rows)

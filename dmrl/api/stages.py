@@ -1,4 +1,4 @@
-"""Stages as functions: each does what the command of its name does, with the same settings.
+"""Stages as functions, with the settings of the commands of the same names.
 
 Settings are the fields of the stage's ``Settings``, and are checked as a recipe's keys are. A
 recording without a name for the output lives in a temporary folder as long as its object.
@@ -15,15 +15,15 @@ from dmrl import recipe as recipes
 from dmrl.api.data import Data, dataset
 from dmrl.api.models import Model, load
 from dmrl.api.recordings import PathLike, Recording
-from dmrl.api.results import Result, judged
+from dmrl.api.results import Result, evaluate_recordings
 from dmrl.errors import SettingError
-from dmrl.pipeline.stage_signature import interface_of
+from dmrl.pipeline.stage_signature import signature_of
 
 OneOrMore: TypeAlias = PathLike | Sequence[PathLike]
 
 
 def label(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
-    """Positions of peers and labels of images, from ranges and odometry: ``dmrl label``.
+    """Estimate positions of peers and label the images: ``dmrl label``.
 
     Parameters
     ----------
@@ -37,81 +37,81 @@ def label(recording: PathLike, out: PathLike | None = None, **settings: Any) -> 
     Raises
     ------
     DmrlError
-        As the command says it.
+        As the command.
     """
-    return _recording("label", out, settings, recording=Path(recording))
+    return _run_to_recording("label", out, settings, recording=Path(recording))
 
 
 def predict(
     model: PathLike, recording: PathLike, out: PathLike | None = None, **settings: Any
 ) -> Recording:
-    """Detections of a network in every image of a recording: ``dmrl predict``.
+    """Run a network on every image of a recording: ``dmrl predict``.
 
     Parameters, errors as `label`; ``model`` as `dmrl.load` takes it.
     """
     given = {"model": Path(model), "recording": Path(recording)}
-    return _recording("predict", out, settings, **given)
+    return _run_to_recording("predict", out, settings, **given)
 
 
 def track(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
-    """Detected peers followed over time: ``dmrl track``. Parameters, errors as `label`."""
-    return _recording("track", out, settings, recording=Path(recording))
+    """Track detected peers over time: ``dmrl track``. Parameters, errors as `label`."""
+    return _run_to_recording("track", out, settings, recording=Path(recording))
 
 
 def align(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
-    """Clocks set by each other: ``dmrl align``. Parameters, errors as `label`."""
-    return _recording("align", out, settings, recording=Path(recording))
+    """Align the clocks of robots and cameras: ``dmrl align``. Parameters, errors as `label`."""
+    return _run_to_recording("align", out, settings, recording=Path(recording))
 
 
 def trim(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
-    """A stretch of a recording, or some topics: ``dmrl trim``. Parameters, errors as `label`."""
-    return _recording("trim", out, settings, recording=Path(recording))
+    """Copy a part of a recording, or some topics: ``dmrl trim``. Parameters, errors as `label`."""
+    return _run_to_recording("trim", out, settings, recording=Path(recording))
 
 
 def merge(recordings: Sequence[PathLike], out: PathLike | None = None) -> Recording:
-    """Recordings in one, by time: ``dmrl merge``. Errors as `label`."""
-    named = _paths("merge", recordings)
+    """Merge recordings by time: ``dmrl merge``. Errors as `label`."""
+    named = _to_paths("merge", recordings)
     if len(named) < 2:
         raise SettingError("dmrl.merge wants two recordings or more. Name them in a list")
-    return _recording("merge", out, {}, recordings=named)
+    return _run_to_recording("merge", out, {}, recordings=named)
 
 
 def convert(source: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
-    """A foreign file or folder as a recording: ``dmrl convert``. Parameters, errors as `label`."""
-    return _recording("convert", out, settings, source=Path(source))
+    """Convert a foreign file or folder: ``dmrl convert``. Parameters, errors as `label`."""
+    return _run_to_recording("convert", out, settings, source=Path(source))
 
 
 def fly(
     out: PathLike | None = None, *, recipe: PathLike | None = None, **settings: Any
 ) -> Recording:
-    """A simulated flight: ``dmrl fly``.
+    """Simulate a flight: ``dmrl fly``.
 
     Parameters
     ----------
     out
         Recording to write. None: a temporary one.
     recipe
-        TOML file, or the name of one that ships with dmrl; ``settings`` go before it.
+        TOML file, or the name of one that ships with dmrl; ``settings`` override it.
     settings
         Fields of ``dmrl.stages.fly.Settings``.
 
     Raises
     ------
     DmrlError
-        As the command says it.
+        As the command.
     """
-    return _recording("fly", out, _keys("fly", recipe) | settings)
+    return _run_to_recording("fly", out, _recipe_keys("fly", recipe) | settings)
 
 
 def render(
     scene: PathLike = "synthetic_first_look", out: PathLike | None = None, **settings: Any
 ) -> Recording:
-    """Images of robots with exact labels, by Blender: ``dmrl render``.
+    """Render images of robots with exact labels, by Blender: ``dmrl render``.
 
     Parameters
     ----------
     scene
-        Recipe: a TOML file, or the name of one that ships with dmrl; ``settings`` go before it.
+        Recipe: a TOML file, or the name of one that ships with dmrl; ``settings`` override it.
     out
         Recording to write. None: a temporary one.
     settings
@@ -120,20 +120,20 @@ def render(
     Raises
     ------
     DmrlError
-        As the command says it.
+        As the command.
     """
-    return _recording("render", out, _keys("render", scene) | settings)
+    return _run_to_recording("render", out, _recipe_keys("render", scene) | settings)
 
 
 def sketch(out: PathLike, **settings: Any) -> Path:
-    """A folder of drawn pictures with exact labels: ``dmrl sketch``. Errors as `label`."""
-    return _made("sketch", Path(out), settings)
+    """Draw a folder of images with exact labels: ``dmrl sketch``. Errors as `label`."""
+    return _run_to_path("sketch", Path(out), settings)
 
 
 def make_dataset(recordings: OneOrMore, out: PathLike, **settings: Any) -> Data:
-    """A dataset of recordings, with its card: ``dmrl dataset``. Errors as `label`."""
-    given = _paths("make_dataset", recordings)
-    return dataset(_made("dataset", Path(out), settings, recordings=given))
+    """Build a dataset with its card: ``dmrl dataset``. Errors as `label`."""
+    given = _to_paths("make_dataset", recordings)
+    return dataset(_run_to_path("dataset", Path(out), settings, recordings=given))
 
 
 def train(
@@ -144,7 +144,7 @@ def train(
     init: PathLike | None = None,
     **settings: Any,
 ) -> Model:
-    """A network trained on a dataset: ``dmrl train``.
+    """Train a network on a dataset: ``dmrl train``.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def train(
     out
         Run folder to write.
     recipe
-        TOML file, or the name of one that ships with dmrl; ``settings`` go before it.
+        TOML file, or the name of one that ships with dmrl; ``settings`` override it.
     init
         Model to start from.
     settings
@@ -162,32 +162,32 @@ def train(
     Raises
     ------
     DmrlError
-        As the command says it.
+        As the command.
     """
     given = {"dataset": data.path if isinstance(data, Data) else Path(data)}
     if init is not None:
         given["init"] = Path(init)
-    return load(_made("train", Path(out), _keys("train", recipe) | settings, **given))
+    return load(_run_to_path("train", Path(out), _recipe_keys("train", recipe) | settings, **given))
 
 
 def quantize(model: PathLike, data: PathLike | Data, out: PathLike, **settings: Any) -> Model:
-    """An int8 network, with the float one beside it: ``dmrl quantize``. Errors as `label`."""
+    """Quantize a network to int8: ``dmrl quantize``. Errors as `label`."""
     images = data.path if isinstance(data, Data) else Path(data)
-    return load(_made("quantize", Path(out), settings, model=Path(model), dataset=images))
+    return load(_run_to_path("quantize", Path(out), settings, model=Path(model), dataset=images))
 
 
 def calibrate(sources: OneOrMore, out: PathLike, **settings: Any) -> Path:
-    """A camera file from chessboards or flights: ``dmrl calibrate``. Errors as `label`."""
-    return _made("calibrate", Path(out), settings, sources=_paths("calibrate", sources))
+    """Calibrate a camera by chessboards or flights: ``dmrl calibrate``. Errors as `label`."""
+    return _run_to_path("calibrate", Path(out), settings, sources=_to_paths("calibrate", sources))
 
 
 def evaluate(recordings: OneOrMore, **settings: Any) -> Result:
-    """How good detections, tracks or positions are: ``dmrl evaluate``.
+    """Evaluate detections, tracks or positions: ``dmrl evaluate``.
 
     Parameters
     ----------
     recordings
-        One, or several whose detections are judged together.
+        One, or several whose detections are evaluated together.
     settings
         Fields of ``dmrl.stages.evaluate.Settings``.
 
@@ -199,14 +199,14 @@ def evaluate(recordings: OneOrMore, **settings: Any) -> Result:
     Raises
     ------
     DmrlError
-        As the command says it.
+        As the command.
     """
-    named = _paths("evaluate", recordings)
-    return judged(named, _settings("evaluate", settings)["settings"])
+    named = _to_paths("evaluate", recordings)
+    return evaluate_recordings(named, _check_settings("evaluate", settings)["settings"])
 
 
-def _keys(kind: str, name: PathLike | None) -> dict[str, Any]:
-    """Keys of a recipe of this kind, but for the kind."""
+def _recipe_keys(kind: str, name: PathLike | None) -> dict[str, Any]:
+    """Return the keys of a recipe of this kind, without the kind."""
     if name is None:
         return {}
     keys = recipes.read(Path(name))
@@ -214,37 +214,37 @@ def _keys(kind: str, name: PathLike | None) -> dict[str, Any]:
     return {key: value for key, value in keys.items() if key != "kind"}
 
 
-def _paths(what: str, given: OneOrMore) -> list[Path]:
-    """One file or folder, or several; never none."""
+def _to_paths(what: str, given: OneOrMore) -> list[Path]:
+    """Return one path or several as a list. Raise SettingError if there is none."""
     several = [given] if isinstance(given, str | os.PathLike) else list(given)
     if not several:
         raise SettingError(f"dmrl.{what} was given an empty list. Name one file at least")
     return [Path(path) for path in several]
 
 
-def _recording(
+def _run_to_recording(
     stage: str, out: PathLike | None, settings: dict[str, Any], **given: Any
 ) -> Recording:
-    """What a stage that writes a recording has written."""
+    """Run a stage that writes a recording, and return it."""
     if out is not None:
-        return Recording(_made(stage, Path(out), settings, **given))
+        return Recording(_run_to_path(stage, Path(out), settings, **given))
     folder = Path(mkdtemp(prefix="dmrl-"))
     try:
-        return Recording(_made(stage, folder / f"{stage}.mcap", settings, **given), folder)
+        return Recording(_run_to_path(stage, folder / f"{stage}.mcap", settings, **given), folder)
     except BaseException:
         rmtree(folder)
         raise
 
 
-def _made(stage: str, out: Path, settings: dict[str, Any], **given: Any) -> Path:
-    """Run a stage; what it has written."""
-    interface_of(stage).run(out=out, **given, **_settings(stage, settings))
+def _run_to_path(stage: str, out: Path, settings: dict[str, Any], **given: Any) -> Path:
+    """Run a stage, and return the path that it wrote."""
+    signature_of(stage).run(out=out, **given, **_check_settings(stage, settings))
     return out
 
 
-def _settings(stage: str, keys: dict[str, Any]) -> dict[str, Any]:
-    """The argument ``settings`` of a stage, where it has one."""
-    face = interface_of(stage)
+def _check_settings(stage: str, keys: dict[str, Any]) -> dict[str, Any]:
+    """Return the argument ``settings`` of a stage, checked, if it has one."""
+    face = signature_of(stage)
     if face.settings is None:
         return {}
     checked = recipes.check(f"dmrl.{stage}", face.filled(recipes.plain(keys)), face.settings)

@@ -18,18 +18,18 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def log_time(time_s: float | None, start_ns: int) -> int | None:
-    """Nanoseconds of log time of seconds from a start; None stays None."""
+def to_log_time(time_s: float | None, start_ns: int) -> int | None:
+    """Return the log time, nanoseconds, of seconds from a start; None stays None."""
     return None if time_s is None else start_ns + round(time_s * 1e9)
 
 
-def framed(table: pa.Table, start_ns: int) -> "pd.DataFrame":
-    """A table with ``log_time`` as a data frame over ``time_s``; a status has its name.
+def to_data_frame(table: pa.Table, start_ns: int) -> "pd.DataFrame":
+    """Return a table as a data frame over ``time_s``; a status becomes its name.
 
     Parameters
     ----------
     table
-        Without nested messages.
+        Table with ``log_time``, without nested messages.
     start_ns
         Log time from which seconds count, nanoseconds.
 
@@ -59,13 +59,13 @@ class Topic:
     path
         The recording.
     name
-        Of the topic.
+        Name of the topic.
     info
         Its message type and number of messages.
     start_ns
         Log time from which seconds count, nanoseconds.
     kept
-        What keeps a temporary recording there as long as this.
+        Object that keeps a temporary recording alive.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class Topic:
         return self._info.schema
 
     def __len__(self) -> int:
-        """Messages on it."""
+        """Return the number of messages."""
         return self._info.count
 
     def to_arrow(
@@ -90,7 +90,7 @@ class Topic:
         start_s: float | None = None,
         end_s: float | None = None,
     ) -> pa.Table:
-        """An Arrow table with a column for each field of the message.
+        """Return an Arrow table with a column for each field of the message.
 
         Parameters
         ----------
@@ -110,7 +110,7 @@ class Topic:
         RecordingError
             If the recording is damaged.
         """
-        start_ns, end_ns = log_time(start_s, self._start_ns), log_time(end_s, self._start_ns)
+        start_ns, end_ns = to_log_time(start_s, self._start_ns), to_log_time(end_s, self._start_ns)
         return read_table(self.path, self.name, fields=fields, start_ns=start_ns, end_ns=end_ns)
 
     def to_pandas(
@@ -120,7 +120,7 @@ class Topic:
         start_s: float | None = None,
         end_s: float | None = None,
     ) -> "pd.DataFrame":
-        """A data frame over ``time_s``, seconds from the start of the recording.
+        """Return a data frame over ``time_s``, seconds from the start of the recording.
 
         Fields of a message within are columns of their own, ``pose.position.x``; of a list of
         messages, such as the peers of PeerLabels, each is a row.
@@ -133,7 +133,7 @@ class Topic:
             If the recording is damaged.
         """
         table = flat(self.to_arrow(fields=fields, start_s=start_s, end_s=end_s))
-        return framed(table, self._start_ns)
+        return to_data_frame(table, self._start_ns)
 
     def to_numpy(
         self,
@@ -142,7 +142,7 @@ class Topic:
         start_s: float | None = None,
         end_s: float | None = None,
     ) -> NDArray[np.void]:
-        """(N,) structured array: ``array["height_m"]`` is a field of all messages.
+        """Return an (N,) structured array: ``array["height_m"]`` is a field of all messages.
 
         Texts, bytes and lists are objects.
         """

@@ -1,4 +1,4 @@
-"""A recording of one's own: messages by topic and fields, images as arrays."""
+"""Writer of recordings: messages by topic and fields, images as arrays."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,22 +20,22 @@ from dmrl.messages import message
 from dmrl.recording import RecordingWriter, provenance
 from dmrl.samples import sample
 
-END_S = 9.2e9
+LATEST_TIME_S = 9.2e9
 """Beyond it whole nanoseconds do not fit into 64 bits; seconds, the year 2261."""
 
 
 @runtime_checkable
 class HasFields(Protocol):
-    """A message, as recordings give them."""
+    """A message of a recording."""
 
     DESCRIPTOR: Any
 
     def SerializeToString(self) -> bytes:  # noqa: N802 - protobuf's name
-        """Its bytes."""
+        """Return the message as bytes."""
 
 
-def _as_it_is(given: HasFields, kind: str) -> Any:
-    """The same message; TypeError if it is of another kind."""
+def _copy_message(given: HasFields, kind: str) -> Any:
+    """Return a copy of a message. Raise TypeError if it is of another kind."""
     wanted = message(kind)
     if given.DESCRIPTOR.full_name != wanted.DESCRIPTOR.full_name:
         raise TypeError(f"not a {given.DESCRIPTOR.full_name}")
@@ -43,14 +43,14 @@ def _as_it_is(given: HasFields, kind: str) -> Any:
 
 
 class Writer:
-    """Writes a recording; it has its name once the ``with`` block has ended without an error.
+    """Writes a recording, which gets its name when the ``with`` block ends without an error.
 
     Parameters
     ----------
     path
         File to write. Must not exist.
     settings
-        What made it, as plain values; they stand in its provenance.
+        Plain values for the provenance, such as the source of the data.
 
     Raises
     ------
@@ -74,25 +74,25 @@ class Writer:
             The sensor's time, seconds from 0.
         fields
             Of the message, as in its schema: ``{"height_m": 0.4}``. A message within is a
-            mapping, a repeated one a list of mappings. Or a message of another recording, as it is.
+            mapping, a repeated one a list of mappings. Or a message of another recording.
 
         Raises
         ------
         RecordingError
             If dmrl has no such topic, its message no such field, or no recording such a time.
         UnsafeName
-            If a robot in the topic is called what nobody can be called.
+            If the name of a robot in the topic cannot be one.
         SettingError
             If the ``with`` block has ended.
         """
-        kind, (time_ns,) = _message_of(topic), self._times(topic, [time_s])
+        kind, (time_ns,) = _find_message(topic), self._log_times(topic, [time_s])
         try:
             if isinstance(fields, HasFields):
-                made = _as_it_is(fields, kind)
+                made = _copy_message(fields, kind)
             else:
                 made = message(kind)(**fields)
         except (TypeError, ValueError) as e:
-            raise self._misfit(topic, kind, e) from e
+            raise self._misfit_error(topic, kind, e) from e
         self._sink.write(int(time_ns), topic, made)
 
     def write_columns(self, topic: str, time_s: ArrayLike, fields: Mapping[str, ArrayLike]) -> None:
@@ -122,11 +122,11 @@ class Writer:
             for time, row in zip(times.tolist(), rows, strict=True):
                 self.write(topic, time, dict(zip(columns, row, strict=True)))
             return
-        kind, time_ns = _message_of(topic), self._times(topic, times)
+        kind, time_ns = _find_message(topic), self._log_times(topic, times)
         try:
             self._sink.write_columns(topic, message(kind), time_ns, columns)
         except (TypeError, ValueError) as e:
-            raise self._misfit(topic, kind, e) from e
+            raise self._misfit_error(topic, kind, e) from e
 
     def image(
         self, robot: str, time_s: float, rgb: NDArray[np.uint8], *, quality: int | None = None
@@ -136,7 +136,7 @@ class Writer:
         Parameters
         ----------
         robot
-            Who carries the camera.
+            Robot that carries the camera.
         time_s
             Time of its exposure, seconds.
         rgb
@@ -147,7 +147,7 @@ class Writer:
         Raises
         ------
         SettingError
-            If it is no image, or has more pixels than are read again.
+            If it is no image, or has more pixels than dmrl reads.
         """
         grey = rgb.ndim == 2
         coloured = rgb.ndim == 3 and rgb.shape[2] == 3
@@ -165,11 +165,11 @@ class Writer:
         whole = np.ascontiguousarray(every)
         data = encode_png(whole) if quality is None else encode_jpeg(whole, quality)
         kind = "png" if quality is None else "jpeg"
-        (time_ns,) = self._times(topics.camera_image(robot), [time_s])
-        self._send(sample.image(int(time_ns), robot, data, kind))
+        (time_ns,) = self._log_times(topics.camera_image(robot), [time_s])
+        self._send_sample(sample.image(int(time_ns), robot, data, kind))
 
     def camera(self, robot: str, camera: Camera | PathLike, time_s: float = 0.0) -> None:
-        """Append the calibration of a robot's camera, or what a camera file says of it.
+        """Append the calibration of a robot's camera, or of a camera file.
 
         Raises
         ------
@@ -177,34 +177,34 @@ class Writer:
             If the file cannot be read.
         """
         known = camera if isinstance(camera, Camera) else read_camera(Path(camera))
-        (time_ns,) = self._times(topics.calibration(robot), [time_s])
-        self._send(sample.calibration(int(time_ns), robot, known))
+        (time_ns,) = self._log_times(topics.calibration(robot), [time_s])
+        self._send_sample(sample.calibration(int(time_ns), robot, known))
 
-    def _times(self, topic: str, time_s: ArrayLike) -> NDArray[np.int64]:
-        """(N,) log times, nanoseconds."""
+    def _log_times(self, topic: str, time_s: ArrayLike) -> NDArray[np.int64]:
+        """Return (N,) log times, nanoseconds."""
         if self._done:
             raise SettingError(f"{self.path} is written. Open another with dmrl.writer")
         times = np.asarray(time_s, float)
-        if not ((times >= 0) & (times < END_S)).all():
-            wrong = times[~((times >= 0) & (times < END_S))][0]
+        if not ((times >= 0) & (times < LATEST_TIME_S)).all():
+            wrong = times[~((times >= 0) & (times < LATEST_TIME_S))][0]
             raise RecordingError(
-                f"{self.path}: {topic} at {wrong:g} s. Give seconds from 0 to {END_S:g}"
+                f"{self.path}: {topic} at {wrong:g} s. Give seconds from 0 to {LATEST_TIME_S:g}"
             )
         return np.rint(times * 1e9).astype(np.int64)
 
-    def _misfit(self, topic: str, kind: str, error: Exception) -> RecordingError:
+    def _misfit_error(self, topic: str, kind: str, error: Exception) -> RecordingError:
         why = str(error).rstrip(".")
-        return RecordingError(f"{self.path}: {topic} carries {kind}: {why}. Mend its fields")
+        return RecordingError(f"{self.path}: {topic} carries {kind}: {why}. Fix its fields")
 
-    def _send(self, made: sample.Sample) -> None:
+    def _send_sample(self, made: sample.Sample) -> None:
         self._sink.write(made.time_ns, made.topic, message(made.message)(**made.fields))
 
     def flush(self) -> None:
-        """Hand everything to the system, so that a killed process loses none of it."""
+        """Write everything so far to the file, so that a killed process loses none of it."""
         self._sink.flush()
 
     def open(self) -> Recording:
-        """What was written, once the ``with`` block has ended."""
+        """Open the recording, after the ``with`` block has ended."""
         return Recording(self.path)
 
     def __enter__(self) -> Self:
@@ -222,7 +222,7 @@ class Writer:
 
 
 def writer(path: PathLike, /, **settings: Any) -> Writer:
-    """A recording to write; parameters and errors as those of `Writer`.
+    """Return a `Writer`, with the same parameters and errors.
 
     Examples
     --------
@@ -233,7 +233,7 @@ def writer(path: PathLike, /, **settings: Any) -> Writer:
     return Writer(path, settings)
 
 
-def _message_of(topic: str) -> str:
+def _find_message(topic: str) -> str:
     row = topics.row_of(topic)
     if row is None or row.message.endswith("*"):
         raise RecordingError(

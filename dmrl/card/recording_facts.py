@@ -10,7 +10,9 @@ from dmrl.card.sensor_facts import cameras_of, sensors_of
 from dmrl.datasets.writing.inputs import focal_lengths
 from dmrl.datasets.writing.near_duplicates import Seen
 from dmrl.datasets.writing.rows import Tally, count_images, label_source, sources_of
-from dmrl.recording import Contents, label_findings, licences
+from dmrl.recording import Contents, label_findings, splits
+from dmrl.recording.licences import licences_in
+from dmrl.recording.mcap.shared_file import share_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +27,10 @@ class About:
     findings: Sequence[str]
     licences: Mapping[str, str]
     cameras: Mapping[str, str]
+    splits: Mapping[str, Sequence[tuple[int, int]]]
 
 
-def read_about(path: Path, wanted: str) -> tuple[About, Contents]:
+def read_about(path: Path, wanted: str, *, with_splits: bool) -> tuple[About, Contents]:
     """Read the facts of a recording, and its labels, which may be needed again soon.
 
     Parameters
@@ -36,6 +39,8 @@ def read_about(path: Path, wanted: str) -> tuple[About, Contents]:
         Recording with images and labels.
     wanted
         Source of the labels; see `choose_label_source`.
+    with_splits
+        Whether to read the split that the source of the recording defines.
 
     Raises
     ------
@@ -44,19 +49,21 @@ def read_about(path: Path, wanted: str) -> tuple[About, Contents]:
     SettingError
         If the recording has no labels from that source.
     """
-    held = Contents(path, topics.LABELS, topics.CALIBRATION)
-    images = count_images(path)
-    source = label_source(held, wanted)
-    about = About(
-        source,
-        tuple(sorted(sources_of(held) - {source})),
-        images,
-        tuple(focal_lengths(held)),
-        tuple(sensors_of(held.topics)),
-        tuple(label_findings(held)),
-        licences([path]),
-        cameras_of([held]),
-    )
+    with share_file(path):
+        held = Contents(path, topics.LABELS, topics.CALIBRATION)
+        images = count_images(held)
+        source = label_source(held, wanted)
+        about = About(
+            source,
+            tuple(sorted(sources_of(held) - {source})),
+            images,
+            tuple(focal_lengths(held)),
+            tuple(sensors_of(held.topics)),
+            tuple(label_findings(held)),
+            dict(sorted(licences_in(held.summary))),
+            cameras_of([held]),
+            splits(path, held.summary) if with_splits else {},
+        )
     return about, held
 
 

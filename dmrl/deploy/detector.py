@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Literal
 
 import numpy as np
 
+from dmrl.deploy.backend_names import BackendName
 from dmrl.deploy.backends import Backend, Images, OnLevels, grids_of, integer
 from dmrl.deploy.c import c_name
 from dmrl.deploy.c.run.compiled import Compiled
@@ -24,8 +24,6 @@ from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_no_text, refuse_pipes
 from dmrl.learn import pretrained
 from dmrl.learn.inference.decode_grids import Grids
-
-BackendName = Literal["torch", "onnx", "onnx-int8", "integer", "c", "riscv32"]
 
 FLOAT_ONNX_NAME = "model.onnx"
 INT8_ONNX_NAME = "model.int8.onnx"

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from dmrl import topics
@@ -23,9 +22,11 @@ from dmrl.estimation.model.position_metrics import (
     overall,
 )
 from dmrl.geometry.frames import Array
-from dmrl.labelling.ground_truth import TOLD, true_pairs, true_path
+from dmrl.labelling.flight_log import TRUTH_TOPICS, FlightLog, read_flight
+from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
+from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.messages import STATUS_OK
-from dmrl.recording import Contents, input_of, summary
+from dmrl.recording import input_of, summary
 
 TITLE, EACH = "estimated positions against truth", "pair"
 Times = NDArray[np.int64]
@@ -106,8 +107,8 @@ def judge(recording: Path) -> list[Pair]:
     RecordingError
         If the recording cannot be read, or has no pair with both.
     """
-    held = Contents(recording, topics.POSITION, *TOLD)
-    estimated, known = _estimated(held.topics), true_pairs(held.topics)
+    held = read_flight(recording, topics.POSITION, *TRUTH_TOPICS)
+    estimated, known = _estimated(held.topics), list_true_pairs(held.topics)
     if not estimated:
         raise RecordingError(f"{recording} has no positions. Try: dmrl label {recording} OUT.mcap")
     pairs = [_judge(held, *names) for names in estimated if names in known]
@@ -128,7 +129,7 @@ class Paths(NamedTuple):
     ``started_ns`` the first log time of all its estimates.
     """
 
-    time_ns: Array
+    time_ns: Times
     estimate_m: Array
     true_m: Array
     covariance: Array
@@ -144,58 +145,43 @@ def paths(recording: Path) -> dict[tuple[str, str], Paths]:
     RecordingError
         If the recording cannot be read.
     """
-    held = Contents(recording, topics.POSITION, *TOLD)
-    known = true_pairs(held.topics)
+    held = read_flight(recording, topics.POSITION, *TRUTH_TOPICS)
+    known = list_true_pairs(held.topics)
     pairs = [pair for pair in _estimated(held.topics) if pair in known]
-    return {
-        pair: _matched(held.table(topics.position(*pair)), *true_path(held, *pair))
-        for pair in pairs
-    }
+    return {pair: _matched(held.positions[pair], *find_true_path(held, *pair)) for pair in pairs}
 
 
-def _matched(estimate: pa.Table, true_ns: Times, true_m: Array) -> Paths:
-    time_ns = _column(estimate, "log_time")
-    near = inside_truth(time_ns.astype(np.int64), true_ns)
+def _matched(estimate: PeerPositions, true_ns: Times, true_m: Array) -> Paths:
+    time_ns = estimate.time_ns
+    near = inside_truth(time_ns, true_ns)
     return Paths(
         time_ns[near],
-        np.stack([_column(estimate, axis)[near] for axis in "xy"], axis=1),
+        estimate.xyz_m[near, :2],
         np.stack([np.interp(time_ns[near], true_ns, axis) for axis in true_m.T[:2]], axis=1)
         if near.any()
         else np.empty((0, 2)),
-        _covariance(estimate)[near],
-        _column(estimate, "status")[near] == STATUS_OK,
+        estimate.covariance[near, :2, :2],
+        estimate.status[near] == STATUS_OK,
         float(time_ns[0]) if len(time_ns) else 0.0,
     )
 
 
-def _judge(held: Contents, robot: str, peer: str) -> Pair:
-    estimate = held.table(topics.position(robot, peer))
-    true_ns, true_m = true_path(held, robot, peer)
+def _judge(held: FlightLog, robot: str, peer: str) -> Pair:
+    estimate = held.positions[robot, peer]
+    true_ns, true_m = find_true_path(held, robot, peer)
     found = _matched(estimate, true_ns, true_m)
     judged = Judged(
-        time_s=(found.time_ns - found.started_ns) * 1e-9,
+        time_s=np.asarray((found.time_ns - found.started_ns) * 1e-9, float),
         error_m=found.estimate_m - found.true_m,
         covariance=found.covariance,
         distance_m=np.linalg.norm(found.true_m, axis=1),
         kept=found.kept,
     )
-    time_ns = _column(estimate, "log_time").astype(np.int64)
+    time_ns = estimate.time_ns
     covered = inside_truth(true_ns, time_ns)
     return Pair(
         robot, peer, judged, len(time_ns) - len(found.kept), len(covered), int(covered.sum())
     )
-
-
-def _column(table: pa.Table, name: str) -> Array:
-    values: Array = table.column(name).to_numpy()
-    return values
-
-
-def _covariance(table: pa.Table) -> Array:
-    """Read the covariances of x and y, (N, 2, 2); NaN where missing."""
-    rows = table.column("covariance").to_pylist()
-    full = np.array([row if len(row) == 9 else [np.nan] * 9 for row in rows]).reshape(-1, 3, 3)
-    return np.asarray(full[:, :2, :2], float)
 
 
 def lasts_s(pairs: list[Pair]) -> float:

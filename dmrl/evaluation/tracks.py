@@ -20,10 +20,11 @@ from dmrl.geometry.frames import (
     inside,
     pixels_from_horizontal,
 )
-from dmrl.labelling.ground_truth import TOLD, true_pairs, true_path
-from dmrl.labelling.observer_log import SEEN, Sight, read_sight
-from dmrl.labelling.recorded_camera import camera_of
-from dmrl.recording import Contents, input_of, summary
+from dmrl.labelling.flight_log import OBSERVER_TOPICS, TRUTH_TOPICS, FlightLog, read_flight
+from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
+from dmrl.labelling.observer_log import ObserverLog, read_observer_log
+from dmrl.labelling.recorded_camera import recorded_camera
+from dmrl.recording import input_of, summary
 
 TITLE, EACH = "tracks against truth", "observer"
 CAMERAS_METADATA = "dmrl.cameras"
@@ -37,7 +38,7 @@ def can_judge(recording: Path) -> bool:
 
 
 def _peers(held: list[str], robot: str) -> list[str]:
-    return [peer for observer, peer in true_pairs(held) if observer == robot]
+    return [peer for observer, peer in list_true_pairs(held) if observer == robot]
 
 
 def judge(recording: Path) -> list[Judged]:
@@ -54,12 +55,15 @@ def judge(recording: Path) -> list[Judged]:
     RecordingError
         If the recording cannot be read, or has no robot with both.
     """
-    held = list(summary(recording).topics)
-    robots = topics.robots(held, topics.TRACKS)
-    if not robots:
+    flight = read_flight(recording, *OBSERVER_TOPICS, topics.TRACKS, *TRUTH_TOPICS)
+    if not flight.tracks:
         raise RecordingError(f"{recording} has no tracks. Try: dmrl track {recording} OUT.mcap")
-    contents = Contents(recording, *SEEN, topics.TRACKS, *TOLD)
-    judged = [_judge(contents, robot, peers) for robot in robots if (peers := _peers(held, robot))]
+    held = list(flight.topics)
+    judged = [
+        _judge(flight, robot, peers)
+        for robot in sorted(flight.tracks)
+        if (peers := _peers(held, robot))
+    ]
     if not judged:
         raise RecordingError(
             f"{recording} has no true position of any peer. Use a simulated flight, or one with "
@@ -68,10 +72,10 @@ def judge(recording: Path) -> list[Judged]:
     return judged
 
 
-def _camera(held: Contents, robot: str) -> Camera:
-    """Return the tracker's camera, whose mount, delay and lens may differ from the recording's."""
-    used = held.summary.metadata.get(CAMERAS_METADATA, [{}])[-1].get(robot)
-    camera = parse_camera(used, held.path) if used else camera_of(held, robot)
+def _camera(held: FlightLog, robot: str) -> Camera:
+    """The camera that the tracks were made with: its mount, delay and lens may be other ones."""
+    used = held.metadata.get(CAMERAS_METADATA, [{}])[-1].get(robot)
+    camera = parse_camera(used, held.path) if used else recorded_camera(held, robot)
     if camera is None:
         raise MissingTopic(topics.calibration(robot), held.topics, held.path)
     return camera
@@ -88,12 +92,12 @@ class _Row(NamedTuple):
     covariance: Array
 
 
-def _judge(held: Contents, robot: str, peers: list[str]) -> Judged:
-    """Evaluate the tracks of one observer. A track is false if it is near no peer most of its life.
+def _judge(held: FlightLog, robot: str, peers: list[str]) -> Judged:
+    """Tracks of one observer. A track is false if for most of its life it is at no peer.
 
     The life of a track is counted in images. In an image, a track is astray if it is near no peer.
     """
-    sight = read_sight(held, robot, _camera(held, robot), 0.0)
+    sight = read_observer_log(held, robot, _camera(held, robot), 0.0)
     truth, shown = _truth(held, sight, peers)
     rows: list[_Row] = []
     lived: Counter[int] = Counter()
@@ -107,16 +111,16 @@ def _judge(held: Contents, robot: str, peers: list[str]) -> Judged:
     return _judged(sight, rows, false_tracks)
 
 
-def _by_image(held: Contents, sight: Sight) -> Iterator[tuple[int, list[Any]]]:
-    """Yield the index of an image and its tracks; times without an image are skipped."""
-    number = {int(time_ns): k for k, time_ns in enumerate(sight.logged_ns)}
-    for stamped in held.messages(topics.tracks(sight.robot)):
+def _by_image(held: FlightLog, sight: ObserverLog) -> Iterator[tuple[int, list[Any]]]:
+    """Number of an image, and the tracks at its time; times without an image are left out."""
+    number = {int(time_ns): k for k, time_ns in enumerate(sight.log_time_ns)}
+    for stamped in held.tracks[sight.robot]:
         if (k := number.get(stamped.time_ns)) is not None:
             yield k, list(stamped.message.tracks)
 
 
-def _judged(sight: Sight, rows: list[_Row], false_tracks: int) -> Judged:
-    """Convert rows to columns."""
+def _judged(sight: ObserverLog, rows: list[_Row], false_tracks: int) -> Judged:
+    """Rows as columns."""
     time_s = (sight.time_ns - sight.time_ns[:1]) * 1e-9
     return Judged(
         sight.robot,
@@ -132,7 +136,7 @@ def _judged(sight: Sight, rows: list[_Row], false_tracks: int) -> Judged:
 
 
 def _rows(
-    sight: Sight,
+    sight: ObserverLog,
     k: int,
     tracks: list[Any],
     truth_m: Array,
@@ -168,18 +172,14 @@ def _places(tracks: list[Any]) -> Array:
     return np.array([[t.x, t.y, t.z] for t in tracks]).reshape(-1, 3)
 
 
-def _truth(held: Contents, sight: Sight, peers: list[str]) -> tuple[Array, NDArray[np.bool_]]:
-    """Interpolate the true positions at the images.
-
-    Returns
-    -------
-    tuple[Array, NDArray[np.bool_]]
-        (J, K, 3) positions, metres, NaN where unknown; (J, K) True where inside the image.
-    """
+def _truth(
+    held: FlightLog, sight: ObserverLog, peers: list[str]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """(J, K, 3) true positions at the images, NaN where unknown; (J, K) whether in the image."""
     xyz = np.full((len(peers), len(sight.time_ns), 3), np.nan)
     shown = np.zeros(xyz.shape[:2], bool)
     for j, peer in enumerate(peers):
-        true_ns, true_m = true_path(held, sight.robot, peer)
+        true_ns, true_m = find_true_path(held, sight.robot, peer)
         known = inside_truth(sight.time_ns, true_ns)
         at = sight.time_ns[known]
         xyz[j, known] = np.column_stack([np.interp(at, true_ns, axis) for axis in true_m.T])

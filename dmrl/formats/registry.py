@@ -61,7 +61,7 @@ def format_of(source: Path, name: str | None = None) -> Format:
     PluginError
         If the plug-in with the given name cannot be loaded.
     """
-    added = {n: p for n, p in plugins.found(plugins.FORMATS).items() if n not in own()}
+    added = {n: p for n, p in plugins.find_plugins(plugins.FORMATS).items() if n not in own()}
     known = ", ".join([*own(), *added])
     if not source.exists():
         raise SourceError(f"no file or folder {source}. Pass one that exists")
@@ -116,19 +116,19 @@ def _plugged(plugin: Plugin) -> Format:
     """Load the format of another package. Its failures become errors that name the package."""
     loaded = plugin.load()
     form = getattr(loaded, "FORMAT", loaded)
-    plugin.require(isinstance(form, Format), "a dmrl.formats.base.Format")
+    plugin.require(isinstance(form, Format), "a dmrl.plugins.Format")
 
     def recognises(source: Path) -> bool:
-        with plugin.blamed(f"fails to check {source}"):
+        with plugin.naming_the_package(f"fails to check {source}"):
             return bool(form.recognises(source))
 
     def content(source: Path, options: Options) -> Content:
-        with plugin.blamed(f"fails to read {source}"):
+        with plugin.naming_the_package(f"fails to read {source}"):
             held: Content = form.content(source, options)
             return replace(held, samples=samples(source, held.samples))
 
     def samples(source: Path, given: Iterator[Sample]) -> Iterator[Sample]:
-        with plugin.blamed(f"fails to read {source}"):
+        with plugin.naming_the_package(f"fails to read {source}"):
             yield from given
 
     return Format(plugin.name, form.what, recognises, content)

@@ -1,4 +1,4 @@
-"""A camera's detections as the estimators want them; and heights corrected by them."""
+"""Convert a camera's detections to bearings, and correct heights by their elevations."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,29 +9,29 @@ from dmrl.estimation.filters.ou_smoother import faded
 from dmrl.estimation.model.bearings import claim, polar_of
 from dmrl.estimation.model.pair import Pair, Sightings
 from dmrl.geometry.frames import horizontal_from_pixels
-from dmrl.labelling.image_labels import Positions
-from dmrl.labelling.observer_log import Sight
+from dmrl.labelling.observer_log import ObserverLog
+from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.messages import STATUS_OK
 
 DISTANCE_RATIO = 0.25
-"""Error of a detection's distance over the distance, where the network does not say."""
-LEAST_RATIO = 0.05
-"""It is never smaller: networks are surer of distances than they should be."""
-HEIGHT_FADES_S = 4.0
-"""Time in which the error of a height fades to 1/e."""
+"""Error of a detection's distance over the distance, for networks that estimate none."""
+MIN_DISTANCE_RATIO = 0.05
+"""Smallest such error. Networks are overconfident about distances."""
+HEIGHT_ERROR_DECAY_S = 4.0
+"""Time in which the error of a height decays to 1/e, seconds."""
 
 Names = tuple[str, str]
 
 
-def sightings_of(
-    sight: Sight, start_ns: int, pixel_std_px: float, attitude_std_rad: float
+def detections_to_bearings(
+    observer: ObserverLog, start_ns: int, pixel_std_px: float, attitude_std_rad: float
 ) -> Sightings:
-    """What an observer detected, as bearings and distances.
+    """Return an observer's detections as bearings and distances.
 
     Parameters
     ----------
-    sight
-        Its detections.
+    observer
+        Its detections, attitude and camera.
     start_ns
         Log time of second zero.
     pixel_std_px
@@ -39,71 +39,73 @@ def sightings_of(
     attitude_std_rad
         Standard deviation of roll and pitch.
     """
-    image = np.repeat(np.arange(len(sight.time_ns)), np.diff(sight.first))
-    depth_m, sigma_m = sight.detections[:, 2:].T
-    roll_rad, pitch_rad = sight.attitude_rad[image].T
+    image = np.repeat(np.arange(len(observer.time_ns)), np.diff(observer.first_row))
+    depth_m, sigma_m = observer.detections[:, 2:].T
+    roll_rad, pitch_rad = observer.attitude_rad[image].T
     points_m = horizontal_from_pixels(
-        sight.detections[:, :2], depth_m, roll_rad, pitch_rad, sight.camera
+        observer.detections[:, :2], depth_m, roll_rad, pitch_rad, observer.camera
     )
     good = np.isfinite(points_m).all(axis=1)
     ratio = np.where(sigma_m > 0, sigma_m / depth_m, DISTANCE_RATIO)
     # Near the axis a pixel is an angle of 1 / focal length.
-    angle = pixel_std_px / ((sight.camera.fx_px + sight.camera.fy_px) / 2)
+    angle = pixel_std_px / ((observer.camera.fx_px + observer.camera.fy_px) / 2)
     std = np.column_stack(
         [
             np.full(len(ratio), angle),
             np.full(len(ratio), np.hypot(angle, attitude_std_rad)),
-            np.maximum(ratio, LEAST_RATIO),
+            np.maximum(ratio, MIN_DISTANCE_RATIO),
         ]
     )
     images, row, per_image = np.unique(image[good], return_inverse=True, return_counts=True)
     column = np.arange(len(row)) - (np.cumsum(per_image) - per_image)[row]
     out = np.full((2, len(images), max(per_image, default=0), 3), np.nan)
     out[0, row, column], out[1, row, column] = polar_of(points_m[good]), std[good]
-    return Sightings(np.asarray((sight.time_ns[images] - start_ns) * 1e-9), out[0], out[1])
+    return Sightings(np.asarray((observer.time_ns[images] - start_ns) * 1e-9), out[0], out[1])
 
 
-def with_sightings(
-    pairs: Mapping[Names, Pair], found: Mapping[str, Sightings]
+def add_bearings(
+    pairs: Mapping[Names, Pair], bearings: Mapping[str, Sightings]
 ) -> dict[Names, Pair]:
-    """Pairs with what the cameras of both showed.
+    """Return the pairs with the bearings of both robots' cameras.
 
     Parameters
     ----------
     pairs
         By names.
-    found
+    bearings
         By robot.
     """
     return {
-        (one, other): replace(pair, own_sees=found.get(one), peer_sees=found.get(other))
+        (one, other): replace(pair, own_sees=bearings.get(one), peer_sees=bearings.get(other))
         for (one, other), pair in pairs.items()
     }
 
 
-def levelled(found: Positions, start_ns: int, sees: Sightings) -> tuple[Positions, int]:
-    """Positions that are OK with heights by elevations, and how many images showed the peer.
+def correct_heights(
+    found: PeerPositions, start_ns: int, seen: Sightings
+) -> tuple[PeerPositions, int]:
+    """Correct the heights of OK positions by elevations; also return the number of used images.
 
-    The solve takes heights for known. What a camera saw where the solution has the peer tells
-    their error, which fades in seconds.
+    The solve assumes exact heights. The elevation of a detection at the solved position measures
+    the error, which decays in seconds.
 
     Parameters
     ----------
     found
-        Where a peer is, at the images among other times.
+        Positions of a peer, at the images among other times.
     start_ns
         Log time of second zero.
-    sees
-        What the observer detected.
+    seen
+        Bearings of the observer's detections.
     """
     good = np.flatnonzero(found.status == STATUS_OK)
     time_s = np.asarray((found.time_ns[good] - start_ns) * 1e-9)
-    place = np.minimum(np.searchsorted(time_s, sees.time_s - 1e-6), max(len(good) - 1, 0))
-    there = np.abs(time_s[place] - sees.time_s) < 1e-6 if len(good) else np.zeros(0, bool)
-    place = place[there]
+    place = np.minimum(np.searchsorted(time_s, seen.time_s - 1e-6), max(len(good) - 1, 0))
+    matched = np.abs(time_s[place] - seen.time_s) < 1e-6 if len(good) else np.zeros(0, bool)
+    place = place[matched]
     if not len(place):
         return found, 0
-    shown = Sightings(sees.time_s[there], sees.polar[there], sees.std[there])
+    shown = Sightings(seen.time_s[matched], seen.polar[matched], seen.std[matched])
     here_m = found.xyz_m[good[place]]
     best = claim(shown, here_m, found.covariance[good[place]])
     images = np.flatnonzero(best.agrees)
@@ -112,7 +114,7 @@ def levelled(found: Positions, start_ns: int, sees: Sightings) -> tuple[Position
     off_m = (shown.polar[at] - polar_of(here_m[images])[:, 1]) * level_m
     height_std_m = np.sqrt(found.covariance[good, 2, 2])
     error_m, variance = faded(
-        time_s, height_std_m, HEIGHT_FADES_S, place[images], off_m, shown.std[at] * level_m
+        time_s, height_std_m, HEIGHT_ERROR_DECAY_S, place[images], off_m, shown.std[at] * level_m
     )
     xyz, covariance = found.xyz_m.copy(), found.covariance.copy()
     xyz[good, 2] += error_m

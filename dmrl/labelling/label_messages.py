@@ -1,27 +1,32 @@
 """Positions and labels as messages."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.estimation.model.pair import Array
 from dmrl.geometry.frames import Camera
-from dmrl.labelling.image_labels import NEAREST_M, SOURCE, Look, Positions, anywhere, image_labels
-from dmrl.labelling.recorded_camera import camera_of
-from dmrl.labelling.sensor_logs import Logs
+from dmrl.labelling.flight_log import FlightLog, Times
+from dmrl.labelling.image_labels import (
+    MIN_DEPTH_M,
+    SOURCE,
+    CameraOptions,
+    label_anywhere,
+    label_images,
+)
+from dmrl.labelling.peer_positions import PeerPositions
+from dmrl.labelling.recorded_camera import recorded_camera
+from dmrl.labelling.sensor_logs import SensorLogs
 from dmrl.messages import message
-from dmrl.recording import Contents, Series, Timed
+from dmrl.recording import Series, Stamped, Timed
 from dmrl.recording.label_sources import looked_at
 
-Times = NDArray[np.int64]
 
-
-def position_series(observer: str, peer: str, found: Positions) -> Series:
-    """PeerPosition messages of one pair."""
+def build_position_series(observer: str, peer: str, found: PeerPositions) -> Series:
+    """Return the PeerPosition messages of one pair."""
     x, y, z = found.xyz_m.T
     fields = {
         "frame_id": f"{observer}/horizontal",
@@ -35,82 +40,99 @@ def position_series(observer: str, peer: str, found: Positions) -> Series:
     return Series(topic, message("PeerPosition"), found.time_ns, fields)
 
 
-def label_messages(
-    held: Contents,
-    logs: Logs,
+def build_label_messages(
+    flight: FlightLog,
+    logs: SensorLogs,
     robot: str,
-    positions: Mapping[str, Positions],
-    look: Look,
+    positions: Mapping[str, PeerPositions],
+    options: CameraOptions,
 ) -> Iterator[Timed]:
-    """PeerLabels of every image that has a position or had labels, in time order.
+    """Yield PeerLabels of every image that has a position or had labels, in time order.
 
-    Where any peer is located, every other that has a log is named too, as one that may be anywhere:
-    else the image would be one without it.
+    If any peer is located in an image, every other robot that has a log gets a label too, as one
+    that may be anywhere. Without it the image would count as one without that robot.
 
     Parameters
     ----------
-    held
-        Where the images, their labels and the calibration are.
+    flight
+        With images, their labels and the calibration.
     logs
-        Attitude of the robot.
+        With the attitude of the robot.
     robot
         It carries the camera.
     positions
         By peer.
-    look
-        How positions become pixels.
+    options
+        Options of the projection.
     """
-    kept, looked = _of_other_sources(held, topics.labels(robot))
-    camera = look.cameras.get(robot) or camera_of(held, robot)
-    images_ns = held.times(topics.camera_image(robot))
-    fresh = _fresh(logs, robot, positions, look, camera, images_ns) if camera else {}
+    kept, sources = _select_other_sources(flight.labels.get(robot, []))
+    camera = options.cameras.get(robot) or recorded_camera(flight, robot)
+    images_ns = flight.images_ns[robot]
+    fresh = _label_peers(logs, robot, positions, options, camera, images_ns) if camera else {}
     for time_ns in sorted({*kept, *fresh}):
         peers = [*kept.get(time_ns, []), *fresh.get(time_ns, [])]
-        sources = sorted(looked[time_ns] | ({SOURCE} if time_ns in fresh else set()))
-        made = message("PeerLabels")(peers=peers, sources=sources)
+        names = sorted(sources[time_ns] | ({SOURCE} if time_ns in fresh else set()))
+        made = message("PeerLabels")(peers=peers, sources=names)
         yield Timed(time_ns, topics.labels(robot), made)
 
 
-def _fresh(
-    logs: Logs,
+def select_estimated(made: Iterable[Timed]) -> Iterator[Timed]:
+    """Yield PeerLabels without the labels of other sources."""
+    for labels in made:
+        if SOURCE in labels.message.sources:
+            peers = [peer for peer in labels.message.peers if peer.source == SOURCE]
+            yield labels._replace(message=message("PeerLabels")(peers=peers, sources=[SOURCE]))
+
+
+def count_estimated(made: Iterable[Iterable[Timed]]) -> int:
+    """Return the number of estimated labels, without those of other sources."""
+    peers = (peer for messages in made for m in messages for peer in m.message.peers)
+    return sum(peer.source == SOURCE for peer in peers)
+
+
+def _label_peers(
+    logs: SensorLogs,
     robot: str,
-    positions: Mapping[str, Positions],
-    look: Look,
+    positions: Mapping[str, PeerPositions],
+    options: CameraOptions,
     camera: Camera,
     images_ns: Times,
 ) -> dict[int, list[Any]]:
-    """Entries of the images at which any peer has a position, by log time."""
-    exposures_ns = look.exposures_ns(robot, images_ns)
+    """Return the PeerLabel messages of the images at which any peer has a position."""
+    exposures_ns = options.exposures_ns(robot, images_ns)
     made: dict[int, list[Any]] = defaultdict(list)
     unknown: dict[int, set[str]] = defaultdict(lambda: {*logs.flying} - {robot})
     for peer, found in positions.items():
         at = np.isin(found.time_ns, exposures_ns)
-        mine = Positions(found.time_ns[at], found.xyz_m[at], found.covariance[at], found.status[at])
-        labels = image_labels(peer, mine, _attitude(logs, robot, mine.time_ns), camera, look)
+        mine = PeerPositions(
+            found.time_ns[at], found.xyz_m[at], found.covariance[at], found.status[at]
+        )
+        attitude = _interpolate_attitude(logs, robot, mine.time_ns)
+        labels = label_images(peer, mine, attitude, camera, options)
         stamps = images_ns[np.searchsorted(exposures_ns, mine.time_ns)].tolist()
         for time_ns, label in zip(stamps, labels, strict=True):
             made[time_ns] += [label] if label else []
             unknown[time_ns] -= {peer}
     for time_ns, peers in unknown.items():
-        made[time_ns] += [anywhere(peer, camera, NEAREST_M) for peer in sorted(peers)]
+        made[time_ns] += [label_anywhere(peer, camera, MIN_DEPTH_M) for peer in sorted(peers)]
     return {t: [message("PeerLabel")(**label) for label in labels] for t, labels in made.items()}
 
 
-def _of_other_sources(
-    held: Contents, topic: str
+def _select_other_sources(
+    before: Iterable[Stamped],
 ) -> tuple[dict[int, list[Any]], dict[int, set[str]]]:
-    """Entries of the labels that are there, and who looked, without earlier estimates."""
+    """Return labels and sources by time, without earlier estimates."""
     kept: dict[int, list[Any]] = defaultdict(list)
-    looked: dict[int, set[str]] = defaultdict(set)
-    for stamped in held.messages(topic) if topic in held.topics else ():
+    sources: dict[int, set[str]] = defaultdict(set)
+    for stamped in before:
         labels = stamped.message
         kept[stamped.time_ns] += [peer for peer in labels.peers if peer.source != SOURCE]
-        looked[stamped.time_ns] |= looked_at(labels) - {SOURCE}
-    return kept, looked
+        sources[stamped.time_ns] |= looked_at(labels) - {SOURCE}
+    return kept, sources
 
 
-def _attitude(logs: Logs, robot: str, time_ns: Times) -> Array:
-    """(N, 2) roll and pitch at log times, radians."""
+def _interpolate_attitude(logs: SensorLogs, robot: str, time_ns: Times) -> Array:
+    """Return (N, 2) roll and pitch at log times, radians."""
     at_s, values = logs.robots[robot].attitude
     time_s = (time_ns - logs.start_ns) * 1e-9
     return np.column_stack([np.interp(time_s, at_s, column) for column in values[:, :2].T])

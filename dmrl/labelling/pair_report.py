@@ -1,4 +1,4 @@
-"""What was estimated of each ordered pair, in numbers."""
+"""Report the estimate of each ordered pair in numbers, and explain rejected ones."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
@@ -17,15 +17,15 @@ from dmrl.estimation.solver.residuals import (
     PEER_GYRO,
     PEER_SCALE,
 )
-from dmrl.labelling.ground_truth import true_pairs, true_path
-from dmrl.labelling.image_labels import Positions
+from dmrl.labelling.flight_log import FlightLog
+from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
+from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
-from dmrl.recording import Contents
 
-TURNS_RADPS, LONGER_M, FASTER, LATER_S = 0.02, 0.2, 0.12, 0.05
-"""What was solved for is worth a line beyond these: several times what sensors in order have."""
+MAX_GYRO_BIAS_RADPS, MAX_RANGE_OFFSET_M, MAX_SCALE_ERROR, MAX_CLOCK_OFFSET_S = 0.02, 0.2, 0.12, 0.05
+"""Solved constants beyond these cause a warning: several times those of sound sensors."""
 
-WHY: dict[Refused, str] = {
+REFUSAL_TEXTS: dict[Refused, str] = {
     "still": "{observer} hardly moves, and then ranges tell no bearing. Let it fly about",
     "alike": "they move alike, and then ranges tell no bearing. Let them fly different ways",
     "silent": "ranges or a sensor were silent for most of the flight. Try: dmrl info",
@@ -34,7 +34,7 @@ WHY: dict[Refused, str] = {
     "imprecise": "a position is exact to {sigma_m:.2f} m, one sigma. Sensors may do better: see "
     "docs/labelling.md. A wider --gate-m takes more",
 }
-"""Why nothing of a flight is kept, and what to do about it."""
+"""By reason: why no position of a flight is kept, and what to do about it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class PairReport:
     observer, peer
         Their names.
     positions
-        How many.
+        Number of positions.
     ok_share, ambiguous_share
         Shares of them with that status, 0 to 1.
     range_bias_m
@@ -58,7 +58,7 @@ class PairReport:
     rmse_ok_m, rmse_m
         Horizontal error of those that are OK, and of all; None without truth.
     refused
-        Why nothing is OK, in a word; None where something is.
+        Why no position is OK, in a word; None if one is.
     """
 
     observer: str
@@ -75,35 +75,33 @@ class PairReport:
 
     @classmethod
     def columns(cls) -> tuple[str, ...]:
-        """Headers of a table of reports."""
+        """Return the headers of a table of reports."""
         return tuple(field.name for field in fields(cls))
 
     def row(self) -> tuple[Any, ...]:
-        """The values under the headers."""
+        """Return the values under the headers."""
         return tuple(getattr(self, name) for name in self.columns())
 
 
-def pair_report(
-    held: Contents,
+def report_pair(
+    flight: FlightLog,
     pair: tuple[str, str],
-    positions: Positions,
+    positions: PeerPositions,
     estimate: Estimate,
 ) -> PairReport:
-    """The report of one ordered pair.
+    """Return the report of one ordered pair.
 
     Parameters
     ----------
-    held
-        Where the truth may be.
+    flight
+        With the true positions, if there are any.
     pair
         Observer and peer.
-    positions
-        As written.
-    estimate
-        Where they come from.
+    positions, estimate
+        Positions as written, and the estimate that they were sampled from.
     """
     ok = positions.status == STATUS_OK
-    error = _errors(held, pair, positions)
+    error = _horizontal_errors(flight, pair, positions)
     sigma = np.sqrt(np.linalg.eigvalsh(positions.covariance[:, :2, :2])[:, -1])
     return PairReport(
         *pair,
@@ -119,13 +117,13 @@ def pair_report(
     )
 
 
-def reasons(
+def explain_refusals(
     pairs: Iterable[tuple[str, str]], estimates: Mapping[tuple[str, str], Estimate]
 ) -> list[str]:
-    """One line for each ordered pair of which nothing is kept, and for each sensor that is off.
+    """Return a line for each ordered pair without an OK position, and for each suspect sensor.
 
-    Where nothing is kept in either direction, what is off stands in those lines: it is the reason
-    that somebody can do something about.
+    If no position is OK in either direction, suspect sensors are named in those lines: they are
+    the causes that a user can fix.
 
     Parameters
     ----------
@@ -136,9 +134,9 @@ def reasons(
     """
     lines = []
     for pair in pairs:
-        off = doubts(pair, estimates[pair])
+        off = find_suspect_sensors(pair, estimates[pair])
         ways = [way for way in (pair, pair[::-1]) if way in estimates]
-        refused = {way: why for way in ways if (why := refusal(way, estimates[way]))}
+        refused = {way: why for way in ways if (why := explain_refusal(way, estimates[way]))}
         if len(refused) < len(ways):
             lines += [f"{'-'.join(pair)}: {text}" for text in off]
             off = []
@@ -149,8 +147,8 @@ def reasons(
     return lines
 
 
-def refusal(pair: tuple[str, str], estimate: Estimate) -> str | None:
-    """Why nothing of a pair is kept, and what to do; None where something is.
+def explain_refusal(pair: tuple[str, str], estimate: Estimate) -> str | None:
+    """Return why no position of a pair is OK, and what to do; None if one is.
 
     Parameters
     ----------
@@ -162,12 +160,12 @@ def refusal(pair: tuple[str, str], estimate: Estimate) -> str | None:
     if (estimate.status == OK).any():
         return None
     largest = np.linalg.eigvalsh(estimate.covariance[:, :2, :2])[:, -1]
-    why = WHY[estimate.refused or "imprecise"]
+    why = REFUSAL_TEXTS[estimate.refused or "imprecise"]
     return why.format(observer=pair[0], sigma_m=float(np.sqrt(np.median(largest))))
 
 
-def doubts(pair: tuple[str, str], estimate: Estimate) -> list[str]:
-    """What a solve found to be off, sensor by sensor, with what to do about it.
+def find_suspect_sensors(pair: tuple[str, str], estimate: Estimate) -> list[str]:
+    """Return a line for each sensor whose solved constants are unusual, with what to do.
 
     Parameters
     ----------
@@ -180,23 +178,23 @@ def doubts(pair: tuple[str, str], estimate: Estimate) -> list[str]:
     for robot, turn, scale in zip(
         pair, found[[OWN_GYRO, PEER_GYRO]], found[[OWN_SCALE, PEER_SCALE]], strict=True
     ):
-        if abs(turn) > TURNS_RADPS:
+        if abs(turn) > MAX_GYRO_BIAS_RADPS:
             said.append(
                 f"{robot}'s yaw rate seems biased by {turn:.2g} rad/s; it was solved for. "
                 "Let its gyroscope settle before the flight"
             )
-        if abs(scale) > FASTER:
+        if abs(scale) > MAX_SCALE_ERROR:
             said.append(
                 f"{robot}'s velocity seems {abs(scale):.0%} too "
                 f"{'large' if scale > 0 else 'small'}; it was solved for. Is its height right? "
                 "Where it is so in every flight: dmrl calibrate --sensors"
             )
-    if abs(found[BIAS]) > LONGER_M:
+    if abs(found[BIAS]) > MAX_RANGE_OFFSET_M:
         said.append(
             f"ranges seem {found[BIAS]:+.2f} m off; it was solved for. Measure it once, "
             "and give it with --range-offset-m, or let flights tell: dmrl calibrate --sensors"
         )
-    if abs(found[CLOCK]) > LATER_S:
+    if abs(found[CLOCK]) > MAX_CLOCK_OFFSET_S:
         said.append(f"{pair[1]}'s log seems {found[CLOCK]:+.2f} s off. Try: dmrl align")
     return said
 
@@ -208,11 +206,11 @@ def _rms(error: Any, chosen: Any) -> float | None:
     return float(np.sqrt(square.mean())) if len(square) else None
 
 
-def _errors(held: Contents, pair: tuple[str, str], positions: Positions) -> Any:
-    """(N,) horizontal errors, metres, NaN outside the truth; None where there is no truth."""
-    if pair not in true_pairs(held.topics):
+def _horizontal_errors(flight: FlightLog, pair: tuple[str, str], positions: PeerPositions) -> Any:
+    """Return (N,) errors, metres, NaN outside the truth; None if there is no truth."""
+    if pair not in list_true_pairs(flight.topics):
         return None
-    time_ns, true_m = true_path(held, *pair)
+    time_ns, true_m = find_true_path(flight, *pair)
     if len(time_ns) < 2:
         return None
     offsets = [

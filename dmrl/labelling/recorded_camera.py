@@ -1,64 +1,91 @@
-"""What a recording says of a robot's camera: its calibration, if none is given."""
+"""Read a robot's camera: from its recording, or from a calibration file."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from dmrl import topics
-from dmrl.errors import RecordingError, SettingError
+from dmrl.errors import MissingTopic, RecordingError, SettingError
 from dmrl.geometry.calibration import no_camera
 from dmrl.geometry.camera_file import read_camera
 from dmrl.geometry.frames import Camera
-from dmrl.images.codec import size
-from dmrl.recording import Contents, read
+from dmrl.labelling.flight_log import FlightLog
+from dmrl.recording import summary
 
-LENSES = ("", "plumb_bob", "rational_polynomial")
-"""Models of a lens that are the plumb bob's, the last if its further coefficients are 0."""
+PLUMB_BOB_MODELS = ("", "plumb_bob", "rational_polynomial")
+"""Names of lens models equal to plumb bob, the last if its further coefficients are 0."""
 
 
-def camera_of(held: Contents, robot: str) -> Camera | None:
-    """A robot's camera; None where the recording has no calibration.
+def recorded_camera(flight: FlightLog, robot: str) -> Camera | None:
+    """Return a robot's camera; None if the recording has no calibration.
 
     Raises
     ------
     RecordingError
-        If its lens is of a model that dmrl does not know, or its numbers are those of no camera.
+        If its lens model is unknown, or its numbers are invalid.
     """
-    topic = topics.calibration(robot)
-    first = next(held.messages(topic), None) if topic in held.topics else None
-    if first is None:
+    found = flight.calibrations.get(robot)
+    if found is None:
         return None
-    found = first.message
-    if found.distortion_model not in LENSES or any(found.D[5:]):
+    topic, way_out = topics.calibration(robot), "dmrl calibrate --board, then --camera"
+    if found.distortion_model not in PLUMB_BOB_MODELS or any(found.D[5:]):
         raise RecordingError(
-            f"{held.path}: {topic} has a lens of model {found.distortion_model!r} with "
+            f"{flight.path}: {topic} has a lens of model {found.distortion_model!r} with "
             f"{len(found.D)} coefficients, dmrl knows plumb_bob with 5. Give another calibration: "
-            "dmrl calibrate --board, then --camera"
+            f"{way_out}"
         )
     if why := no_camera(found.width, found.height, found.K, found.D):
-        raise RecordingError(
-            f"{held.path}: {topic} {why}. Give another calibration: dmrl calibrate --board, then "
-            "--camera"
-        )
+        raise RecordingError(f"{flight.path}: {topic} {why}. Give another calibration: {way_out}")
     fx, _, cx, _, fy, cy, *_ = found.K
     return Camera(found.width, found.height, fx, fy, cx, cy, tuple(found.D[:5]))
 
 
-def camera_given(held: Contents, robot: str, path: Path) -> Camera:
-    """The camera of a TOML file, for a robot's images.
+def read_robot_camera(flight: FlightLog, robot: str, path: Path) -> Camera:
+    """Read the camera of a TOML file, for a robot's images.
+
+    Parameters
+    ----------
+    flight
+        With the size of the robot's first image, if it has images.
+    robot, path
+        The robot, and the file.
 
     Raises
     ------
     SourceError
         If the file cannot be read.
     SettingError
-        If it is of images of another size.
+        If it is for images of another size.
     """
-    camera, topic = read_camera(path), topics.camera_image(robot)
-    first = next(read(held.path, topic), None) if topic in held.topics else None
-    if first is not None:
-        taken = size(first.message.data, f"{held.path}: the first image of {robot}")[:2]
-        if taken != (camera.width_px, camera.height_px):
-            raise SettingError(
-                f"{path} is for images of {camera.width_px}x{camera.height_px}, those of {robot} "
-                f"in {held.path} are {taken[0]}x{taken[1]}. Calibrate with such images"
-            )
+    camera = read_camera(path)
+    width_px, height_px = taken = flight.image_size_px.get(robot, (0, 0))
+    if any(taken) and taken != (camera.width_px, camera.height_px):
+        raise SettingError(
+            f"{path} is for images of {camera.width_px}x{camera.height_px}, those of {robot} "
+            f"in {flight.path} are {width_px}x{height_px}. Calibrate with such images"
+        )
     return camera
+
+
+def read_robot_cameras(flight: FlightLog, paths: Mapping[str, Path]) -> dict[str, Camera]:
+    """Read the cameras of TOML files by robot; raise as `read_robot_camera` does."""
+    return {robot: read_robot_camera(flight, robot, path) for robot, path in paths.items()}
+
+
+def choose_robot(source: Path, robot: str | None, pattern: str) -> str:
+    """Return the robot that was named, or the only one with a topic of a pattern.
+
+    Raises
+    ------
+    SettingError
+        If there are several and none was named.
+    MissingTopic
+        If there is none, or not the one that was named.
+    """
+    held = list(summary(source).topics)
+    robots = topics.robots(held, pattern)
+    if robot is None and len(robots) > 1:
+        raise SettingError(f"{source} has {', '.join(robots)}. Name one: --robot {robots[0]}")
+    robot = robot or (robots[0] if robots else "*")
+    if robot not in robots:
+        raise MissingTopic(pattern.format(robot=robot), held, source)
+    return robot

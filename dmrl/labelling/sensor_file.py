@@ -1,7 +1,7 @@
-"""What many flights of the same robots agree on of their sensors, and the TOML file it stands in.
+"""Sensor errors that are constant over many flights, and their TOML file.
 
-``dmrl calibrate --sensors`` writes it, ``dmrl label --sensors`` starts from it: what is known is
-taken out of the logs, and how exactly it is known goes to the solve.
+``dmrl calibrate --sensors`` writes it. ``dmrl label --sensors`` removes the means from the logs and
+takes the standard deviations as priors of the solve.
 """
 
 from collections.abc import Mapping
@@ -21,17 +21,17 @@ from dmrl.guards.paths import refuse_pipe
 
 Names = tuple[str, str]
 Value = tuple[float, float]
-"""A mean, and the standard deviation of the next flight about it."""
+"""A mean over flights, and the standard deviation of the next flight about it."""
 Values = Mapping[str, Value]
 
 _KEYS = ("yaw_rate_bias_radps", "velocity_scale", "vx_bias_mps", "vy_bias_mps")
 OF_ROBOT = {key: (place, SWAPPED[place]) for key, place in zip(_KEYS, OF_OBSERVER, strict=True)}
-"""Of one robot: places among ``GLOBALS`` where it is the observer, and where it is the peer."""
+"""Index into ``GLOBALS`` of a robot's constant as observer, and as peer."""
 OF_PAIR = {"range_offset_m": BIAS, "range_scale": SCALE}
-"""Of the ranges between two, in the order of their names. Clocks are another every time."""
+"""Index into ``GLOBALS`` of a pair's constant. Clock offsets differ in every flight."""
 SCALES = ("velocity_scale", "range_scale")
-MOST, MOST_SCALE = 60.0, 0.9
-"""No mean is larger."""
+MAX_MEAN, MAX_SCALE_MEAN = 60.0, 0.9
+"""Largest mean of a constant, and of a scale."""
 HEAD = """\
 # What flights agree on, for dmrl label --sensors: [mean, standard deviation of the next flight].
 # Logs show a velocity (1 + velocity_scale) v + bias and a range (1 + range_scale) d + offset.
@@ -39,8 +39,8 @@ HEAD = """\
 
 
 @dataclass(frozen=True, slots=True)
-class Sensors:
-    """Constants that are known, by robot and by pair of robots.
+class SensorConstants:
+    """Constant errors of sensors, by robot and by pair of robots.
 
     Parameters
     ----------
@@ -55,27 +55,27 @@ class Sensors:
 
     @property
     def names(self) -> list[str]:
-        """The robots of which something is known."""
+        """Return the robots that have any constant."""
         return sorted({*self.robots, *(name for pair in self.pairs for name in pair)})
 
-    def yaw_rate(self, robot: str, logged: Array) -> Array:
-        """Yaw rates without their bias, rad/s."""
-        return logged - _mean(self.robots.get(robot, {}), "yaw_rate_bias_radps")
+    def correct_yaw_rate(self, robot: str, logged: Array) -> Array:
+        """Remove the bias of yaw rates, rad/s."""
+        return logged - _get_mean(self.robots.get(robot, {}), "yaw_rate_bias_radps")
 
-    def velocity(self, robot: str, logged: Array) -> Array:
-        """(N, 2) velocities without their bias and scale, m/s."""
+    def correct_velocity(self, robot: str, logged: Array) -> Array:
+        """Remove bias and scale of (N, 2) velocities, m/s."""
         known = self.robots.get(robot, {})
-        bias = [_mean(known, "vx_bias_mps"), _mean(known, "vy_bias_mps")]
-        return np.asarray((logged - bias) / (1 + _mean(known, "velocity_scale")))
+        bias = [_get_mean(known, "vx_bias_mps"), _get_mean(known, "vy_bias_mps")]
+        return np.asarray((logged - bias) / (1 + _get_mean(known, "velocity_scale")))
 
-    def ranges(self, pair: Names, measured: Array) -> Array:
-        """Ranges without their offset and scale, metres."""
+    def correct_ranges(self, pair: Names, measured: Array) -> Array:
+        """Remove offset and scale of ranges, metres."""
         known = self.pairs.get(pair, {})
-        longer_m = _mean(known, "range_offset_m")
-        return np.asarray((measured - longer_m) / (1 + _mean(known, "range_scale")))
+        longer_m = _get_mean(known, "range_offset_m")
+        return np.asarray((measured - longer_m) / (1 + _get_mean(known, "range_scale")))
 
-    def std(self, pair: Names) -> Array | None:
-        """(G,) standard deviations of what is left, infinite where unknown; None: all of them."""
+    def to_prior_std(self, pair: Names) -> Array | None:
+        """Return (G,) prior standard deviations, infinite where unknown; None: all unknown."""
         out = np.full(len(GLOBALS), np.inf)
         for side, robot in enumerate(pair):
             for key, value in self.robots.get(robot, {}).items():
@@ -85,57 +85,63 @@ class Sensors:
         return out if np.isfinite(out).any() else None
 
 
-def _mean(known: Values, key: str) -> float:
+def _get_mean(known: Values, key: str) -> float:
     return known.get(key, (0.0, 0.0))[0]
 
 
-def write_sensors(sensors: Sensors) -> str:
-    """A TOML document that `read_sensors` reads."""
-    robots = [{"name": name, **_lists(v)} for name, v in sensors.robots.items()]
-    pairs = [{"robots": list(names), **_lists(v)} for names, v in sensors.pairs.items()]
+def write_sensors(sensors: SensorConstants) -> str:
+    """Write the TOML document that `read_sensors` reads."""
+    robots = [{"name": name, **_round_values(v)} for name, v in sensors.robots.items()]
+    pairs = [{"robots": list(names), **_round_values(v)} for names, v in sensors.pairs.items()]
     return HEAD + tomli_w.dumps({"robots": robots, "pairs": pairs})
 
 
-def _lists(values: Values) -> dict[str, list[float]]:
+def _round_values(values: Values) -> dict[str, list[float]]:
     return {key: [float(f"{part:.6g}") for part in value] for key, value in values.items()}
 
 
-def read_sensors(path: Path) -> Sensors:
-    """What a TOML file says is known of sensors.
+def read_sensors(path: Path) -> SensorConstants:
+    """Read a TOML file of sensor constants.
 
     Raises
     ------
     SourceError
-        If there is no such file, or it is none of what `write_sensors` writes.
+        If there is no such file, or `write_sensors` did not write it.
     """
     refuse_pipe(path)
     try:
         table = parse_toml(path.read_text(encoding="utf-8"))
         if wrong := set(table) - {"robots", "pairs"}:
             raise ValueError(f"it has {min(wrong)}, and not robots and pairs alone")
-        robots = {_name(one): _values(one, "name", OF_ROBOT) for one in _tables(table, "robots")}
-        pairs = {_names(one): _values(one, "robots", OF_PAIR) for one in _tables(table, "pairs")}
+        robots = {
+            _read_name(one): _read_values(one, "name", OF_ROBOT)
+            for one in _read_tables(table, "robots")
+        }
+        pairs = {
+            _read_names(one): _read_values(one, "robots", OF_PAIR)
+            for one in _read_tables(table, "pairs")
+        }
     except FileNotFoundError:
         raise SourceError(f"no file {path}. Write one: dmrl calibrate --sensors") from None
     except (OSError, ValueError) as e:
         raise SourceError(f"{path}: {e}. Write one: dmrl calibrate --sensors") from None
-    return Sensors(robots, pairs)
+    return SensorConstants(robots, pairs)
 
 
-def _tables(table: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
+def _read_tables(table: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
     found = table.get(key, [])
     if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
         raise ValueError(f"{key} is no list of tables [[{key}]]")
     return found
 
 
-def _name(one: Mapping[str, Any]) -> str:
+def _read_name(one: Mapping[str, Any]) -> str:
     if not isinstance(name := one.get("name"), str):
         raise ValueError("a table of robots has no name")
     return name
 
 
-def _names(one: Mapping[str, Any]) -> Names:
+def _read_names(one: Mapping[str, Any]) -> Names:
     found = one.get("robots")
     if not isinstance(found, list) or len(found) != 2 or not all(isinstance(n, str) for n in found):
         raise ValueError('a table of pairs has no robots = ["one", "other"]')
@@ -144,12 +150,12 @@ def _names(one: Mapping[str, Any]) -> Names:
     return found[0], found[1]
 
 
-def _values(one: Mapping[str, Any], name: str, known: Mapping[str, Any]) -> Values:
+def _read_values(one: Mapping[str, Any], name: str, known: Mapping[str, Any]) -> Values:
     given = {key: value for key, value in one.items() if key != name}
     for key, value in given.items():
         if key not in known:
             raise ValueError(f"{key} is none of {', '.join(known)}")
-        if not _is_value(value) or abs(value[0]) > (MOST_SCALE if key in SCALES else MOST):
+        if not _is_value(value) or abs(value[0]) > (MAX_SCALE_MEAN if key in SCALES else MAX_MEAN):
             raise ValueError(f"{key} is no [mean, standard deviation] of a sensor")
     return {key: (float(value[0]), float(value[1])) for key, value in given.items()}
 

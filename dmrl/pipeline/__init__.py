@@ -1,1 +1,1 @@
-"""Stages in processes of their own: pipelines of many steps, and one stage over a folder."""
+"""Pipelines of many steps, stages over folders, and the command line of stages."""

@@ -1,4 +1,4 @@
-"""What a pipeline's folder remembers: what every output was made from, and hashes of files.
+"""Build cache of a pipeline's folder: keys of outputs, and hashes of files.
 
 One JSON file. A file is hashed again when its size or one of its times has changed.
 """
@@ -20,17 +20,17 @@ from dmrl.storage import Remote
 
 
 @dataclass(slots=True)
-class Memory:
-    """What is known of outputs and files.
+class BuildCache:
+    """Keys of outputs, and hashes of files.
 
     Parameters
     ----------
     file
-        Where it is kept.
+        JSON file of the cache.
     begun
-        Key of what was begun last, by output.
+        Key of the last build that began, by output.
     done
-        Key and SHA-256 of what was made, by output.
+        Key and SHA-256 of the last build that ended, by output.
     hashes
         Size and times of a file, and its SHA-256, by path; of a folder's files together.
     """
@@ -41,8 +41,8 @@ class Memory:
     hashes: dict[str, list[str]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, file: Path) -> "Memory":
-        """What a file holds; nothing, if there is none.
+    def load(cls, file: Path) -> "BuildCache":
+        """Load a cache; an empty one, if there is no file.
 
         Raises
         ------
@@ -60,51 +60,51 @@ class Memory:
             ) from None
 
     def save(self) -> None:
-        """Write it, whole or not at all."""
+        """Write the cache, atomically."""
         kept = {key: value for key, value in asdict(self).items() if key != "file"}
         with rewritten_file(self.file) as partial:
             partial.write_text(json.dumps(kept, indent=0) + "\n", encoding="utf-8")
 
-    def sha256(self, path: Path) -> str:
-        """SHA-256 of a file, or of a folder's names and contents.
+    def get_sha256(self, path: Path) -> str:
+        """Return the SHA-256 of a file, or of a folder's names and contents.
 
         Raises
         ------
         OSError
-            If it is not there, or cannot be read.
+            If the path is missing, or cannot be read.
         """
-        looks = _looks(path)
+        looks = _fingerprint(path)
         known = self.hashes.get(str(path))
         if known is None or known[0] != looks:
             digest = sha256_of_folder(path) if path.is_dir() else sha256_of_file(path)
             self.hashes[str(path)] = known = [looks, digest]
         return known[1]
 
-    def know(self, path: Path, sha256: str) -> None:
-        """Note the hash of a file or folder as it is now."""
-        self.hashes[str(path)] = [_looks(path), sha256]
+    def set_sha256(self, path: Path, sha256: str) -> None:
+        """Set the hash of a file or folder as it is now."""
+        self.hashes[str(path)] = [_fingerprint(path), sha256]
 
-    def is_made(self, out: Path, key: str) -> bool:
-        """Whether an output was made with this key, and is as it was made."""
+    def is_up_to_date(self, out: Path, key: str) -> bool:
+        """Return whether an output was built with this key, and is unchanged."""
         known = self.done.get(out.name)
         if known is None or known[0] != key or not out.exists():
             return False
-        return self.sha256(out) == known[1]
+        return self.get_sha256(out) == known[1]
 
-    def forget_what_is_gone(self) -> None:
-        """Drop the hashes of files that are no more."""
+    def drop_missing_files(self) -> None:
+        """Remove the hashes of missing files."""
         self.hashes = {path: known for path, known in self.hashes.items() if Path(path).exists()}
 
 
-def key_of(stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]) -> str:
-    """What decides the bytes of an output, as one hash.
+def build_key(stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]) -> str:
+    """Return one hash of everything that determines the bytes of an output.
 
     Parameters
     ----------
     stage
         Command name.
     settings
-        All that matter, as values of JSON.
+        Settings that affect the output, as JSON values.
     inputs
         Name and SHA-256 of every input, by role.
     """
@@ -112,17 +112,17 @@ def key_of(stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]) -
     return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()
 
 
-def _looks(path: Path) -> str:
-    """Sizes and times of a file, or of all files of a folder."""
+def _fingerprint(path: Path) -> str:
+    """Return the sizes and times of a file, or of all files of a folder, as text."""
     if not path.is_dir():
-        return _look(path.stat())
+        return _stat_text(path.stat())
     digest = hashlib.sha256()
-    for name, found in sorted(_files(path)):
-        digest.update(f"{name}\0{_look(found)}\n".encode("utf-8", "surrogateescape"))
+    for name, found in sorted(_iter_files(path)):
+        digest.update(f"{name}\0{_stat_text(found)}\n".encode("utf-8", "surrogateescape"))
     return digest.hexdigest()
 
 
-def _files(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
+def _iter_files(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
     if isinstance(folder, Remote):
         for one in folder.below():
             yield str(one.relative_to(folder)), one.stat()
@@ -130,9 +130,9 @@ def _files(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
     for where, _, names in os.walk(folder):
         for name in names:
             path = Path(where, name)
-            if path.is_file():  # no link to nowhere, as what hashes a folder
+            if path.is_file():  # no broken link, as in the hash of a folder
                 yield str(path.relative_to(folder)), path.stat()
 
 
-def _look(found: os.stat_result) -> str:
+def _stat_text(found: os.stat_result) -> str:
     return f"{found.st_size} {found.st_mtime_ns} {found.st_ctime_ns}"

@@ -1,30 +1,30 @@
-"""Who does the tasks of a plan: processes of this machine, or a cluster."""
+"""Executors of tasks: processes of this machine, or a cluster."""
 
 from concurrent.futures import Future
 from types import TracebackType
 from typing import Protocol, Self
 
 from dmrl.errors import SettingError
-from dmrl.pipeline.job import Answer
-from dmrl.pipeline.process_pool import Crew
+from dmrl.pipeline.job import JobResult
+from dmrl.pipeline.process_pool import ProcessPool
 from dmrl.terminal.progress import Lines
 
 RAY, SLURM = "ray", "slurm"
 
 
 class Executor(Protocol):
-    """Who does tasks.
+    """An executor of tasks.
 
     Attributes
     ----------
     workers
-        Tasks at a time.
-    alone_blocks
-        Whether nothing else can be done beside a task that is alone.
+        Most tasks at a time.
+    exclusive_blocks
+        Whether an exclusive task keeps all others from running.
     """
 
     workers: int
-    alone_blocks: bool
+    exclusive_blocks: bool
 
     def __enter__(self) -> Self: ...
 
@@ -35,15 +35,15 @@ class Executor(Protocol):
         trace: TracebackType | None,
     ) -> None: ...
 
-    def nodes(self) -> Lines:
-        """A table of the machines that do tasks, its head first; empty: it is this one alone."""
+    def list_nodes(self) -> Lines:
+        """Return a table of the machines, its head first; empty: it is this one alone."""
 
-    def give(self, job: str, *, alone: bool) -> Future[Answer]:
-        """The answer to a job, once it is there."""
+    def submit(self, job: str, *, exclusive: bool) -> Future[JobResult]:
+        """Submit a job; return the future of its result."""
 
 
-def executor(on: str | None, workers: int | None, *, bars: bool = False) -> Executor:
-    """Who does tasks, as ``--on`` says.
+def open_executor(on: str | None, workers: int | None, *, bars: bool = False) -> Executor:
+    """Open the executor that ``--on`` names.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def executor(on: str | None, workers: int | None, *, bars: bool = False) -> Exec
     workers
         Processes here, at most. None: as many as there are cores.
     bars
-        See `Crew`.
+        See `ProcessPool`.
 
     Raises
     ------
@@ -64,12 +64,12 @@ def executor(on: str | None, workers: int | None, *, bars: bool = False) -> Exec
         If Ray is not installed.
     """
     if on is None:
-        return Crew(workers, bars=bars)
+        return ProcessPool(workers, bars=bars)
     if workers is not None:
-        raise SettingError("--workers are of this machine. Leave out --workers, or --on")
+        raise SettingError("--workers are processes of this machine. Leave out --workers, or --on")
     scheme, _, address = on.partition("://")
     if scheme != RAY or (address == "" and on != RAY):
         raise SettingError(f"--on {on}: this takes ray, or ray://HOST:PORT")
-    from dmrl.pipeline.cluster.ray_executor import Ray  # noqa: PLC0415 - an extra
+    from dmrl.pipeline.cluster.ray_executor import RayExecutor  # noqa: PLC0415 - an extra
 
-    return Ray(address)
+    return RayExecutor(address)

@@ -1,27 +1,27 @@
-"""One run of a stage as a line of JSON, which any process can do: see `dmrl.pipeline.job_worker`."""
+"""One run of a stage as a line of JSON; see `dmrl.pipeline.job_worker`."""
 
 import json
 from pathlib import Path
 from typing import Any
 
-Answer = dict[str, Any]
-"""What became of a job.
+JobResult = dict[str, Any]
+"""Result of a job.
 
-==========  ==================================================================
-key         is there
-==========  ==================================================================
-``sha256``  of the output, once it is made
-``result``  in place of it, where the job asked: what ``run`` gave back
-``there``   in place of both: the output was there, made of the same
-``error``   what a user can mend
-``again``   beside it, "elsewhere": another machine may do it, as where a disk is full;
-            "later": another process is at it
-``fault``   what only we can
-==========  ==================================================================
+==============  =============================================================
+key             content
+==============  =============================================================
+``sha256``      hash of the output
+``result``      in place of it, if the job asked for it: the result of ``run``
+``up_to_date``  in place of both: the output existed, made of the same inputs
+``error``       a failure that the user can fix
+``retry``       beside it, "elsewhere": another machine may do it, as where a disk
+                is full; "later": another process writes the output
+``bug``         a bug of dmrl
+==============  =============================================================
 """
 
 
-def job(
+def build_job(
     stage: str,
     out: Path | None,
     inputs: dict[str, Any],
@@ -30,28 +30,28 @@ def job(
     resume: bool = False,
     keep: bool = False,
 ) -> str:
-    """One line that `dmrl.pipeline.job_worker.perform` understands.
+    """Build a line for `dmrl.pipeline.job_worker.run_job`.
 
     Parameters
     ----------
     stage
         Command name, such as "label".
     out
-        What it writes; None: nothing.
+        Output; None: there is none.
     inputs
         Paths by the names of ``run``'s arguments.
     settings
-        Keys of its settings, and of other arguments.
+        Settings, and other arguments, by name.
     resume
-        Go on with what a killed run has left.
+        Whether to resume what a killed run left.
     keep
-        An output that was made of the same inputs by the same settings is left as it is. The
-        answer has the result then, and no hash of the output.
+        Whether an output that was made of the same inputs by the same settings stays. The result
+        then has the return value of ``run``, and no hash of the output.
     """
     told = {"stage": stage, "out": out, "inputs": inputs, "settings": settings}
     return json.dumps({**told, "resume": resume, "keep": keep}, default=str)
 
 
-def failed(answer: Answer) -> bool:
-    """Whether there is nothing to show for a job."""
-    return "error" in answer or "fault" in answer
+def has_failed(answer: JobResult) -> bool:
+    """Return whether a job failed."""
+    return "error" in answer or "bug" in answer

@@ -1,7 +1,7 @@
-"""A process that runs steps: one job a line on standard input, one answer a line back.
+"""Worker process: reads a job per line on standard input, and prints a result per line.
 
-Started by `crew`; nobody calls it by hand. It dies with the
-process that started it, and takes with it what its stage has started.
+Started by `process_pool`. It ends with the process that started it, and with it all processes
+that its stage has started.
 """
 
 import json
@@ -19,41 +19,41 @@ from typing import Any
 
 from dmrl import recipe as recipes
 from dmrl.errors import BusyOutput, FullDisk, MissingExtra, OutputError, words_of
-from dmrl.pipeline.job import Answer
-from dmrl.pipeline.stage_signature import Interface, interface_of
+from dmrl.pipeline.job import JobResult
+from dmrl.pipeline.stage_signature import StageSignature, signature_of
 from dmrl.recording import Provenance, provenance
 from dmrl.recording.provenance_inputs import input_of, sha256_of_file, sha256_of_folder
 from dmrl.storage import path_of
 
 
-def perform(line: str) -> Answer:
-    """Run a step: what came of it, what a user can mend, or that dmrl has a fault."""
+def run_job(line: str) -> JobResult:
+    """Run a job; return its result, an error that the user can fix, or a bug of dmrl."""
     told = json.loads(line)
     out = path_of(told["out"]) if told["out"] else None
     try:
-        takes = interface_of(told["stage"], writes=out is not None)
-        given = _arguments(told, takes)
+        takes = signature_of(told["stage"], writes=out is not None)
+        given = _parse_arguments(told, takes)
         if out is None:
-            return {"result": _plain(takes.run(**given))}
+            return {"result": _to_json(takes.run(**given))}
         if told["keep"] and out.exists():
-            _require_same(out, told["stage"], takes, given)
-            return {"there": True}
+            _require_same_origin(out, told["stage"], takes, given)
+            return {"up_to_date": True}
         result = takes.run(**given, out=out)
         if told["keep"]:
-            return {"result": _plain(result)}
+            return {"result": _to_json(result)}
         return {"sha256": sha256_of_folder(out) if out.is_dir() else sha256_of_file(out)}
     except BusyOutput as e:
-        return {"error": str(e), "again": "later"}
+        return {"error": str(e), "retry": "later"}
     except (FullDisk, MissingExtra) as e:
-        return {"error": str(e), "again": "elsewhere"}
+        return {"error": str(e), "retry": "elsewhere"}
     except Exception as e:
         if words := words_of(e):
             return {"error": words}
         traceback.print_exc()
-        return {"fault": f"{type(e).__name__}: {e}"}
+        return {"bug": f"{type(e).__name__}: {e}"}
 
 
-def _arguments(told: dict[str, Any], takes: Interface) -> dict[str, Any]:
+def _parse_arguments(told: dict[str, Any], takes: StageSignature) -> dict[str, Any]:
     found: dict[str, Any] = {
         role: [path_of(one) for one in given] if isinstance(given, list) else path_of(given)
         for role, given in told["inputs"].items()
@@ -68,8 +68,8 @@ def _arguments(told: dict[str, Any], takes: Interface) -> dict[str, Any]:
     return found
 
 
-def _plain(result: Any) -> Any:
-    """What a stage gives back, as values of JSON."""
+def _to_json(result: Any) -> Any:
+    """Return the result of a stage as JSON values."""
 
     def plain(value: Any) -> Any:
         return asdict(value) if is_dataclass(value) and not isinstance(value, type) else str(value)
@@ -77,18 +77,12 @@ def _plain(result: Any) -> Any:
     return json.loads(json.dumps(result, default=plain))
 
 
-def _require_same(out: Path, stage: str, takes: Interface, given: dict[str, Any]) -> None:
-    """Nothing, if an output was made of these inputs by these settings, as it says itself.
-
-    Raises
-    ------
-    OutputError
-        If not, or if it does not say.
-    RecordingError
-        If it is not whole.
-    """
+def _require_same_origin(
+    out: Path, stage: str, takes: StageSignature, given: dict[str, Any]
+) -> None:
+    """Raise OutputError unless the provenance of an output names these inputs and settings."""
     made = input_of(out).provenance
-    wanted = (takes.origin or partial(_origin, stage, takes))(**given)
+    wanted = (takes.origin or partial(_build_origin, stage, takes))(**given)
     same = (
         made is not None
         and made.stage == wanted.stage
@@ -97,46 +91,46 @@ def _require_same(out: Path, stage: str, takes: Interface, given: dict[str, Any]
     )
     if not same:
         raise OutputError(
-            f"{out} exists, and does not say that it was made of the same by the same settings. "
+            f"{out} exists, and its provenance names other inputs or settings. "
             "Remove it, or name another folder"
         )
 
 
-def _origin(stage: str, takes: Interface, **given: Any) -> Provenance:
-    """Provenance of what a stage would write, of everything that it is given to read."""
+def _build_origin(stage: str, takes: StageSignature, **given: Any) -> Provenance:
+    """Build the provenance of an output from all inputs and settings of its stage."""
     settings = given.get("settings")
     values = [given[role] for role in takes.roles if role in given]
     values += [getattr(settings, name) for name in takes.paths]
-    return provenance(stage, settings, [path for path in _paths(values) if path.exists()])
+    return provenance(stage, settings, [path for path in _iter_paths(values) if path.exists()])
 
 
-def _paths(value: Any) -> Iterator[Path]:
+def _iter_paths(value: Any) -> Iterator[Path]:
     if isinstance(value, Path):
         yield value
     elif isinstance(value, dict | list | tuple):
         for one in value.values() if isinstance(value, dict) else value:
-            yield from _paths(one)
+            yield from _iter_paths(one)
 
 
 def main() -> None:
-    """Answer jobs until there are no more."""
+    """Run jobs until there are no more."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what a library prints is no answer
+    os.dup2(2, 1)  # the output of a library is no result
     signal.signal(signal.SIGINT, signal.default_int_handler)
     jobs: queue.SimpleQueue[str] = queue.SimpleQueue()
-    threading.Thread(target=_listen, args=(jobs,), daemon=True).start()
+    threading.Thread(target=_read_jobs, args=(jobs,), daemon=True).start()
     print("ready", file=answers, flush=True)
     try:
         while True:
-            print(json.dumps(perform(jobs.get())), file=answers, flush=True)
+            print(json.dumps(run_job(jobs.get())), file=answers, flush=True)
     except KeyboardInterrupt:
         pass
-    # Not before the exception is gone, and with it the frames that hold what is half written.
+    # Only after the exception has gone, with the frames that hold unfinished outputs.
     os._exit(130)
 
 
-def _listen(jobs: "queue.SimpleQueue[str]") -> None:
+def _read_jobs(jobs: "queue.SimpleQueue[str]") -> None:
     for line in sys.stdin:
         jobs.put(line)
-    # Whoever gave us work is gone, perhaps killed: nobody would ever move what we write.
+    # The parent has ended, perhaps killed: nobody would use the outputs.
     os.killpg(0, signal.SIGKILL)

@@ -1,7 +1,7 @@
-"""One function of many things, in processes: for a stage whose own work is many alike parts.
+"""A parallel map: one function over many items, in processes.
 
-Stages on many recordings are jobs with names of files in and out, see `dmrl.pipeline.process_pool`. Here
-arrays go in and come out.
+For arrays in and out. Stages on many recordings are jobs with names of files, see
+`dmrl.pipeline.process_pool`.
 """
 
 import multiprocessing
@@ -19,31 +19,31 @@ from dmrl.pipeline.process_pool import ONE_THREAD
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
-AHEAD = 2
-"""Items for each process that may be begun before the first of them is taken."""
+ITEMS_AHEAD = 2
+"""Items per process that may start before the first result is taken."""
 
 
-def spread(
+def parallel_map(
     function: Callable[[Item], Made], items: Sequence[Item], workers: int
 ) -> Generator[Made]:
-    """``function`` of every item, in their order; closed early, it ends its processes.
+    """Yield ``function`` of every item, in order; ends its processes when it is closed early.
 
-    Each process has a pipe of its own, whose other end nobody else holds: one that is killed
-    within an answer closes it. A ``ProcessPoolExecutor`` waits for the rest of the answer for ever.
+    Each process has a pipe of its own, so a process that is killed within a result closes it. A
+    ``ProcessPoolExecutor`` would wait for the rest of the result forever.
 
     Parameters
     ----------
     function
-        That a module names, or a ``partial`` of one: new processes find it by its name.
+        Function of a module, or a ``partial`` of one: new processes find it by its name.
     items
-        What can be pickled.
+        Items that can be pickled.
     workers
-        Processes, at most. 1: none, it is done here.
+        Most processes. 1: no process is started.
 
     Raises
     ------
     SettingError
-        If a process was killed, as a system that is short of memory does.
+        If a process was killed, for lack of memory perhaps.
     """
     workers = min(workers, len(items))
     if workers <= 1:
@@ -52,8 +52,8 @@ def spread(
     crew: dict[Connection, BaseProcess] = {}
     try:
         for _ in range(workers):
-            _begin(function, crew)
-        yield from _in_order(items, list(crew))
+            _start_worker(function, crew)
+        yield from _iter_in_order(items, list(crew))
     finally:
         for process in crew.values():
             process.terminate()
@@ -62,19 +62,19 @@ def spread(
             pipe.close()
 
 
-def _begin(function: Callable[[Item], Made], crew: dict[Connection, BaseProcess]) -> None:
+def _start_worker(function: Callable[[Item], Made], crew: dict[Connection, BaseProcess]) -> None:
     context = multiprocessing.get_context("spawn")  # a fork would copy threads half-way
     here, there = context.Pipe()
-    process = context.Process(target=_work, args=(there,), daemon=True)
+    process = context.Process(target=_run_worker, args=(there,), daemon=True)
     process.start()
     crew[here] = process
     there.close()
-    here.send(function)  # what it needs is loaded once the process has its one core
+    here.send(function)  # its imports run after the process is limited to one core
 
 
-def _in_order(items: Sequence[Any], idle: list[Connection]) -> Generator[Any]:
-    """What processes make of the items; an item each, and not far ahead of who takes them."""
-    most, begun = AHEAD * len(idle), 0
+def _iter_in_order(items: Sequence[Any], idle: list[Connection]) -> Generator[Any]:
+    """Yield results in order; processes take an item each, not far ahead of the consumer."""
+    most, begun = ITEMS_AHEAD * len(idle), 0
     busy: dict[Connection, int] = {}
     answers: dict[int, tuple[bool, Any]] = {}
     for k in range(len(items)):
@@ -91,8 +91,7 @@ def _in_order(items: Sequence[Any], idle: list[Connection]) -> Generator[Any]:
                     del busy[pipe]
             except (EOFError, ConnectionError):
                 raise SettingError(
-                    "a process that was at work is gone, for want of memory perhaps. "
-                    "Try fewer --workers"
+                    "a process ended, for lack of memory perhaps. Try fewer --workers"
                 ) from None
         good, made = answers.pop(k)
         if not good:
@@ -100,23 +99,23 @@ def _in_order(items: Sequence[Any], idle: list[Connection]) -> Generator[Any]:
         yield made
 
 
-def _work(pipe: Connection) -> None:
-    """In a new process, before NumPy is loaded: one core, and no longer than its parent."""
+def _run_worker(pipe: Connection) -> None:
+    """Run items in a new process: on one core, no longer than its parent lives."""
     os.environ.update(ONE_THREAD)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent ends us
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
     function = pipe.recv()
     while True:
         item = pipe.recv()
         try:
             answer: tuple[bool, Any] = True, function(item)
-        except Exception as error:  # the caller's own, when its turn comes
+        except Exception as error:  # raised in the caller, at this item's turn
             error.add_note(traceback.format_exc())
             answer = False, error
         pipe.send(answer)
 
 
-def _end_with_parent() -> None:
+def _exit_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     wait([parent.sentinel])

@@ -1,6 +1,6 @@
-"""A recipe as steps that can be run: every stage, input, output and setting checked.
+"""Plan of a recipe: its steps, with every stage, input, output and setting checked.
 
-What is wrong is all found, and said in one line, before anything is done.
+All faults are found and reported in one line, before anything runs.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -17,14 +17,14 @@ from dmrl.evaluation import figure_specs
 from dmrl.geometry.camera_file import KNOWN
 from dmrl.guards.safe_names import file_name
 from dmrl.learn import pretrained
-from dmrl.pipeline.recipe_language import expanded
-from dmrl.pipeline.stage_signature import Interface, interface_of
+from dmrl.pipeline.recipe_language import expand_steps
+from dmrl.pipeline.stage_signature import StageSignature, signature_of
 
-KEYS = ("kind", "each", "defaults", "step", figure_specs.TITLE, figure_specs.KEY)
+RECIPE_KEYS = ("kind", "each", "defaults", "step", figure_specs.TITLE, figure_specs.KEY)
 STEP_KEYS = ("stage", "out", "optional", "recipe")
 DATA = "{data}"
 RECIPE_FILE, STATE_FILE, UNFINISHED = "recipe.toml", "pipeline.json", "unfinished"
-RESERVED = (RECIPE_FILE, STATE_FILE, UNFINISHED, "report.html")
+RESERVED_NAMES = (RECIPE_FILE, STATE_FILE, UNFINISHED, "report.html")
 
 Table = dict[str, Any]
 
@@ -44,7 +44,7 @@ class Step:
     settings
         Keys of its settings, and other arguments; those of a recipe filled in.
     optional
-        Go on without it where it cannot be done.
+        Whether the pipeline goes on if this step fails.
     """
 
     stage: str
@@ -54,19 +54,19 @@ class Step:
     optional: bool = False
 
     @property
-    def interface(self) -> Interface:
-        """What its stage takes."""
-        return interface_of(self.stage)
+    def signature(self) -> StageSignature:
+        """Signature of its stage."""
+        return signature_of(self.stage)
 
     @property
     def path_settings(self) -> Table:
         """Settings that name files or folders."""
-        return {k: v for k, v in self.settings.items() if k in self.interface.paths}
+        return {k: v for k, v in self.settings.items() if k in self.signature.paths}
 
     @property
     def names(self) -> list[str]:
-        """Everything that it reads, by name."""
-        return [*strings(list(self.inputs.values())), *strings(self.path_settings)]
+        """Names of all inputs."""
+        return [*iter_strings(list(self.inputs.values())), *iter_strings(self.path_settings)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,38 +84,40 @@ class Plan:
 
     @property
     def order(self) -> TopologicalSorter[str]:
-        """Which output is made of which."""
+        """Order of the outputs: each with those that it is made of."""
         outs = {step.out for step in self.steps}
-        return TopologicalSorter({step.out: makers(step.names, outs) for step in self.steps})
+        return TopologicalSorter(
+            {step.out: find_producers(step.names, outs) for step in self.steps}
+        )
 
 
-def strings(value: Any) -> Iterator[str]:
-    """Every text in a value of TOML."""
+def iter_strings(value: Any) -> Iterator[str]:
+    """Yield every text in a TOML value."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict | list):
         for one in value.values() if isinstance(value, dict) else value:
-            yield from strings(one)
+            yield from iter_strings(one)
 
 
-def mapped(value: Any, function: Callable[[str], Any]) -> Any:
-    """A value of TOML with ``function`` of every text in it."""
+def map_strings(value: Any, function: Callable[[str], Any]) -> Any:
+    """Return a TOML value with ``function`` applied to every text."""
     if isinstance(value, str):
         return function(value)
     if isinstance(value, list):
-        return [mapped(one, function) for one in value]
+        return [map_strings(one, function) for one in value]
     if isinstance(value, dict):
-        return {key: mapped(one, function) for key, one in value.items()}
+        return {key: map_strings(one, function) for key, one in value.items()}
     return value
 
 
-def makers(names: Iterable[str], outs: set[str]) -> list[str]:
-    """Outputs of steps that names lie in, each once."""
+def find_producers(names: Iterable[str], outs: set[str]) -> list[str]:
+    """Return the outputs that contain the named inputs, each once."""
     return list(dict.fromkeys(n.split("/")[0] for n in names if n.split("/")[0] in outs))
 
 
-def located(name: str, outs: set[str], folder: Path, data: Path | None) -> Path:
-    """Where something that a step reads lies."""
+def locate_input(name: str, outs: set[str], folder: Path, data: Path | None) -> Path:
+    """Return the path of an input."""
     if name.startswith(DATA) and data is not None:
         return data / name.removeprefix(DATA).lstrip("/")
     if name.split("/")[0] in outs:
@@ -123,8 +125,8 @@ def located(name: str, outs: set[str], folder: Path, data: Path | None) -> Path:
     return pretrained.SHIPPED / name if name in pretrained.names() else Path(name)
 
 
-def load(name: str | Path) -> Plan:
-    """Steps of a pipeline recipe, every fault of it found.
+def load_plan(name: str | Path) -> Plan:
+    """Load a pipeline recipe, and find all its faults.
 
     Parameters
     ----------
@@ -139,19 +141,19 @@ def load(name: str | Path) -> Plan:
         If a package that a stage needs is not installed.
     """
     text, keys = recipes.text(name), recipes.read(name)
-    return Plan(tuple(_steps(name, keys)), text, figure_specs.KEY in keys)
+    return Plan(tuple(_build_steps(name, keys)), text, figure_specs.KEY in keys)
 
 
-def _steps(name: str | Path, recipe: Table) -> list[Step]:
+def _build_steps(name: str | Path, recipe: Table) -> list[Step]:
     recipes.check_kind(name, recipe, "pipeline")
-    faults = [f"{k}: extra inputs are not permitted" for k in recipe if k not in KEYS]
+    faults = [f"{k}: extra inputs are not permitted" for k in recipe if k not in RECIPE_KEYS]
     found = []
-    for number, table in expanded(recipe, faults):
+    for number, table in expand_steps(recipe, faults):
         wrong: list[str] = []
-        step = _step(table, wrong)
+        step = _build_step(table, wrong)
         faults += [f"step.{number}.{fault}" for fault in wrong]
         found.append((number, step))
-    faults += _name_faults(found)
+    faults += _check_names(found)
     faults += figure_specs.faults(recipe, {step.out for _, step in found})
     if faults:
         raise recipes.faulty(name, dict.fromkeys(faults))
@@ -166,13 +168,13 @@ def _steps(name: str | Path, recipe: Table) -> list[Step]:
     return steps
 
 
-def _step(table: Table, faults: list[str]) -> Step:
-    """A step of a table; what is wrong with it is added to ``faults``."""
+def _build_step(table: Table, faults: list[str]) -> Step:
+    """Build a step from a table; add its faults to ``faults``."""
     stage, optional = table["stage"], table.get("optional", False)
     own = {key: value for key, value in table.items() if key not in STEP_KEYS}
     try:
-        takes = interface_of(stage)
-        theirs = _of_recipe(table.get("recipe", ""), stage)
+        takes = signature_of(stage)
+        theirs = _recipe_settings(table.get("recipe", ""), stage)
         own = dict(takes.filled({**theirs, **own}))
     except RecipeError as e:
         faults.append(f"stage: {e}")
@@ -180,31 +182,31 @@ def _step(table: Table, faults: list[str]) -> Step:
     if not isinstance(optional, bool):
         faults.append("optional: must be true or false")
     inputs = {key: own.pop(key) for key in list(own) if key in takes.roles}
-    faults += [f for role in takes.roles if (f := _input_fault(takes, role, inputs.get(role)))]
+    faults += [f for role in takes.roles if (f := _check_input(takes, role, inputs.get(role)))]
     inputs |= {k: [v] for k, v in inputs.items() if takes.roles[k].many and isinstance(v, str)}
     unknown = [key for key in own if key not in takes.keys]
-    faults += [f"{key}: {_no_key(stage, key, takes)}" for key in unknown]
+    faults += [f"{key}: {_unknown_key(stage, key, takes)}" for key in unknown]
     known = {key: value for key, value in own.items() if key not in unknown}
-    faults += _setting_faults(takes, known)
+    faults += _check_settings(takes, known)
     return Step(stage, table["out"], inputs, known, optional is True)
 
 
-def _of_recipe(name: Any, stage: str) -> Table:
-    """Settings of a stage's own recipe."""
+def _recipe_settings(name: Any, stage: str) -> Table:
+    """Return the settings of a stage's own recipe."""
     if not isinstance(name, str):
         raise RecipeError("recipe: must be a path, or the name of a shipped recipe")
-    return dict(_read(name, stage)) if name else {}
+    return dict(_read_settings(name, stage)) if name else {}
 
 
 @cache
-def _read(name: str, stage: str) -> Table:
+def _read_settings(name: str, stage: str) -> Table:
     keys = recipes.read(name)
     recipes.check_kind(name, keys, stage)
     return {key: value for key, value in keys.items() if key != "kind"}
 
 
-def _input_fault(takes: Interface, role: str, value: Any) -> str:
-    """What is wrong with what a step gives for an input; empty: nothing."""
+def _check_input(takes: StageSignature, role: str, value: Any) -> str:
+    """Return the fault of an input; empty: there is none."""
     many = takes.roles[role].many
     if value is None:
         return f"{role}: is required" if takes.roles[role].required else ""
@@ -216,13 +218,13 @@ def _input_fault(takes: Interface, role: str, value: Any) -> str:
     return "" if right else f"{role}: must be a name, or a list of names that is not empty"
 
 
-def _no_key(stage: str, key: str, takes: Interface) -> str:
+def _unknown_key(stage: str, key: str, takes: StageSignature) -> str:
     near = get_close_matches(key, takes.keys, n=1)
     hint = f"Did you mean {near[0]}?" if near else f"See: dmrl {stage} --help"
     return f"{stage} has no such input or setting. {hint}"
 
 
-def _setting_faults(takes: Interface, given: Table) -> list[str]:
+def _check_settings(takes: StageSignature, given: Table) -> list[str]:
     own = {key: value for key, value in given.items() if key not in takes.others}
     faults = recipes.faults(own, takes.settings) if takes.settings else []
     missing = [f"{key}: is required" for key in takes.others if key not in given]
@@ -234,35 +236,35 @@ def _setting_faults(takes: Interface, given: Table) -> list[str]:
     return [*faults, *missing, *others]
 
 
-def _name_faults(found: Sequence[tuple[int, Step]]) -> Iterator[str]:
-    """What is wrong with outputs' names, and with names of what is read."""
+def _check_names(found: Sequence[tuple[int, Step]]) -> Iterator[str]:
+    """Yield the faults of the names of outputs and inputs."""
     outs = {step.out for _, step in found}
     seen: dict[str, str] = {}
     for number, step in found:
         before = seen.setdefault(step.out.casefold(), step.out)
-        if wrong := _out_fault(step.out):
+        if wrong := _check_output_name(step.out):
             yield f"step.{number}.out: {wrong}"
         elif before is not step.out:
             yield f"step.{number}.out: {step.out} is written by two steps. Name another"
         for name in step.names:
-            if wrong := _source_fault(name, outs):
+            if wrong := _check_source_name(name, outs):
                 yield f"step.{number}: {step.stage} reads {name}, {wrong}"
 
 
-def _out_fault(name: str) -> str:
+def _check_output_name(name: str) -> str:
     try:
         file_name(name, "out")
     except UnsafeName:
         return f"{name[:80]!r} is no plain name. No slashes, no braces, no dot in front"
     if "{" in name or "}" in name:
         return f"{name[:80]!r} is no plain name. No slashes, no braces, no dot in front"
-    if name.casefold() in RESERVED or name.casefold().endswith(".partial"):
+    if name.casefold() in RESERVED_NAMES or name.casefold().endswith(".partial"):
         return f"{name} is a name that dmrl uses itself. Choose another"
     return ""
 
 
-def _source_fault(name: str, outs: set[str]) -> str:
-    """What is wrong with the name of something that a step reads; empty: nothing."""
+def _check_source_name(name: str, outs: set[str]) -> str:
+    """Return the fault of an input's name; empty: there is none."""
     head, *_ = name.split("/")
     if ".." in PurePosixPath(name).parts:
         return "which leads out of its folder. Write it without .."

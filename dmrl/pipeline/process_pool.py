@@ -1,4 +1,4 @@
-"""Processes that steps run in, side by side; each step has one for itself."""
+"""Pool of worker processes; each step runs in one of its own."""
 
 import json
 import os
@@ -11,20 +11,20 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
-from dmrl.pipeline.job import Answer, failed
+from dmrl.pipeline.job import JobResult, has_failed
 from dmrl.terminal.progress import Lines
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""A step has one core, however many run: so its sums, and its bytes, are always the same."""
-START = "from dmrl.pipeline.job_worker import main; main()"
+"""Each step has one core, however many run, so its sums and bytes are always the same."""
+WORKER_CODE = "from dmrl.pipeline.job_worker import main; main()"
 NO_BARS = {"TTY_COMPATIBLE": "0"}
 """Bars of several processes would overwrite each other."""
-LAST_WORDS_S = 20.0
-"""How long a process that is told to end may tidy up."""
+TERMINATE_TIMEOUT_S = 20.0
+"""Time that a process has to clean up before it is killed, seconds."""
 
 
-class Crew:
-    """Processes for as many steps at a time as there are workers.
+class ProcessPool:
+    """A pool of worker processes.
 
     Parameters
     ----------
@@ -35,12 +35,12 @@ class Crew:
     """
 
     def __init__(self, workers: int | None = None, *, bars: bool = True) -> None:
-        self.workers = workers = workers or cores()
-        self.alone_blocks = True
+        self.workers = workers = workers or count_cores()
+        self.exclusive_blocks = True
         self._bars = bars and workers == 1
         self._threads = ThreadPoolExecutor(workers)
-        self._idle: list[Process] = []
-        self._all: list[Process] = []
+        self._idle: list[WorkerProcess] = []
+        self._all: list[WorkerProcess] = []
         self._lock = threading.Lock()
         self._over = False
 
@@ -55,69 +55,69 @@ class Crew:
     ) -> None:
         with self._lock:
             self._over, self._idle, found = True, [], self._all
-        end(found, in_order=kind is not None)
+        stop_processes(found, in_order=kind is not None)
         self._threads.shutdown()
 
-    def nodes(self) -> Lines:
-        """No table: it is this machine alone."""
+    def list_nodes(self) -> Lines:
+        """Return no table: it is this machine alone."""
         return ()
 
-    def give(self, job: str, *, alone: bool) -> Future[Answer]:
-        """The answer to a job, once it is there.
+    def submit(self, job: str, *, exclusive: bool) -> Future[JobResult]:
+        """Submit a job; return the future of its result.
 
         Parameters
         ----------
         job
-            As `work.job` made it.
-        alone
-            Nothing else will run meanwhile: it may use all cores.
+            Line of `dmrl.pipeline.job.build_job`.
+        exclusive
+            Whether nothing else runs meanwhile, so that it may use all cores.
         """
-        return self._threads.submit(self._answer, job, alone=alone)
+        return self._threads.submit(self._run_job, job, exclusive=exclusive)
 
-    def _answer(self, job: str, *, alone: bool) -> Answer:
+    def _run_job(self, job: str, *, exclusive: bool) -> JobResult:
         process = None
         with self._lock:
-            if self._idle and not alone:
+            if self._idle and not exclusive:
                 process = self._idle.pop()
         if process is None:
-            process = self._new(environment(alone=alone, bars=self._bars))
-        answer = process.answer(job)
+            process = self._start_process(worker_environment(exclusive=exclusive, bars=self._bars))
+        answer = process.run_job(job)
         with self._lock:
             if self._over:
                 return answer
-            if not (failed(answer) or alone):
-                self._idle.append(process)  # one that failed may hold what it should not
+            if not (has_failed(answer) or exclusive):
+                self._idle.append(process)  # one that failed may hold resources
                 return answer
             self._all.remove(process)
-        end([process], in_order=False)
+        stop_processes([process], in_order=False)
         return answer
 
-    def _new(self, environment: dict[str, str]) -> "Process":
+    def _start_process(self, environment: dict[str, str]) -> "WorkerProcess":
         with self._lock:
             if self._over:
                 raise RuntimeError("no step begins any more")
-            process = Process(environment)
+            process = WorkerProcess(environment)
             self._all.append(process)
             return process
 
 
-class Process:
-    """A process that does jobs, one after the other.
+class WorkerProcess:
+    """A process that runs jobs, one after the other.
 
     Parameters
     ----------
     environment
-        Of the process.
+        Environment of the process.
     folder
-        That names are relative to. None: this one.
+        Folder that relative names start from. None: the current one.
     """
 
     ready = False
 
     def __init__(self, environment: dict[str, str], folder: str | None = None) -> None:
-        # A group of its own: Ctrl-C reaches us alone, and we end what the stage has started.
+        # A group of its own: Ctrl-C reaches the parent, which ends all that the stage started.
         self.popen = subprocess.Popen(
-            [sys.executable, "-P", "-c", START],
+            [sys.executable, "-P", "-c", WORKER_CODE],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=environment,
@@ -127,8 +127,8 @@ class Process:
             start_new_session=True,
         )
 
-    def answer(self, job: str) -> Answer:
-        """What became of a job; that the process died is one of the answers."""
+    def run_job(self, job: str) -> JobResult:
+        """Run a job and return its result; a process that died is an error."""
         assert self.popen.stdin is not None and self.popen.stdout is not None
         line = ""
         with suppress(BrokenPipeError):
@@ -137,28 +137,28 @@ class Process:
             self.ready = self.ready or bool(self.popen.stdout.readline())
             line = self.popen.stdout.readline()
         if line:
-            answer: Answer = json.loads(line)
+            answer: JobResult = json.loads(line)
             return answer
         number = self.popen.wait()
         how = f"was killed (signal {-number})" if number < 0 else f"ended with status {number}"
-        words = f"its process {how}, for want of memory perhaps. Try fewer --workers"
-        return {"error": words, "again": "elsewhere"}
+        words = f"its process {how}, for lack of memory perhaps. Try fewer --workers"
+        return {"error": words, "retry": "elsewhere"}
 
 
-def environment(*, alone: bool, bars: bool = False) -> dict[str, str]:
-    """What a process that does jobs is given: threads for one core, unless it is to be alone."""
-    return os.environ | ({} if alone else ONE_THREAD | ({} if bars else NO_BARS))
+def worker_environment(*, exclusive: bool, bars: bool = False) -> dict[str, str]:
+    """Return the environment of a worker: threads for one core, unless it is exclusive."""
+    return os.environ | ({} if exclusive else ONE_THREAD | ({} if bars else NO_BARS))
 
 
-def end(processes: list[Process], *, in_order: bool) -> None:
-    """End processes; in order, so that stages tidy up, or at once, where they do nothing."""
+def stop_processes(processes: list[WorkerProcess], *, in_order: bool) -> None:
+    """Stop processes; in order, so that stages clean up, or at once, if they are idle."""
     told = [process for process in processes if in_order and process.ready]
     for process in told:
         process.popen.send_signal(signal.SIGINT)
     for process in processes:
         if process in told:
             with suppress(subprocess.TimeoutExpired):
-                process.popen.wait(LAST_WORDS_S)
+                process.popen.wait(TERMINATE_TIMEOUT_S)
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(process.popen.pid, signal.SIGKILL)
         process.popen.wait()
@@ -168,6 +168,6 @@ def end(processes: list[Process], *, in_order: bool) -> None:
                     stream.close()
 
 
-def cores() -> int:
-    """Cores that this process may use."""
+def count_cores() -> int:
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

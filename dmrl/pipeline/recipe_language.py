@@ -1,8 +1,8 @@
-"""The language of pipeline recipes: what one table of a recipe stands for.
+"""Language of pipeline recipes: the steps that a table of a recipe expands to.
 
 ``[each]`` gives names a range ("1-144"), a list, or rows with values of their own. A name in a
-step's ``out`` repeats the step; one in another value alone gathers. Nothing of stages is known
-here: a step is a table that is filled in, see `plan` for what it means.
+step's ``out`` repeats the step; one in another value alone gathers. This module knows no stages: a
+step is a table that is filled in, and `plan` interprets it.
 """
 
 import re
@@ -18,58 +18,58 @@ from dmrl.guards import limits
 NAME = re.compile(r"\{([A-Za-z_]\w*)(?:\.([A-Za-z_]\w*))?\}")
 RANGE = re.compile(r"(0|[1-9]\d{0,8})-(0|[1-9]\d{0,8})")
 DATA = "data"
-"""``{data}`` is no name of a recipe: it stands for the folder given with ``--data``."""
+"""``{data}`` is no name of a recipe: it is the folder given with ``--data``."""
 
 Table = dict[str, Any]
 Values = Sequence[Any]
 Bound = Mapping[str, Any]
 
 
-NOTHING = object()
-"""What a row gives for a value that it does not have: a key that is this is left out."""
+MISSING_VALUE = object()
+"""Value that a row does not have: a key with it is left out."""
 
 
 class _NoStep(Exception):
-    """A row lacks what is amid a text of a step: it has no such step."""
+    """A row lacks a value within a text of a step, so the step is left out."""
 
 
-def expanded(recipe: Mapping[str, Any], faults: list[str]) -> list[tuple[int, Table]]:
-    """Every step that a recipe stands for, with the number of its table, from 1.
+def expand_steps(recipe: Mapping[str, Any], faults: list[str]) -> list[tuple[int, Table]]:
+    """Return every step of a recipe, with the number of its table, from 1.
 
     Parameters
     ----------
     recipe
         Its keys: ``step``, and ``each`` and ``defaults`` where it has them.
     faults
-        What is wrong is added here. Then some steps may be missing.
+        List that faults are added to. With faults, steps may be missing.
     """
-    each = _each(recipe.get("each", {}), faults)
-    defaults = _defaults(recipe.get("defaults", {}), faults)
+    each = _parse_each(recipe.get("each", {}), faults)
+    defaults = _parse_defaults(recipe.get("defaults", {}), faults)
     steps = recipe.get("step")
     if not isinstance(steps, list) or not steps:
         faults.append("step: at least one [[step]] is required")
         return []
     made: list[tuple[int, Table]] = []
     room = [limits.STEPS, limits.GATHERED, limits.STEP_CHARACTERS]
-    used = _used(steps, defaults)
+    used = _find_used_names(steps, defaults)
     for number, step in enumerate(steps, start=1):
         where = f"step.{number}"
-        if wrong := _unfit(step, each, room):
+        if wrong := _check_step(step, each, room):
             faults.append(where + wrong)
             continue
         usual = defaults.get(str(step.get("stage")), {})
-        made += [(number, one) for one in _repeated(step, usual, each)]
-    _unused(each, defaults, steps, used, faults)
+        made += [(number, one) for one in _repeat_step(step, usual, each)]
+    _report_unused(each, defaults, steps, used, faults)
     return made
 
 
-def _each(table: Any, faults: list[str]) -> dict[str, Values]:
+def _parse_each(table: Any, faults: list[str]) -> dict[str, Values]:
     if not isinstance(table, dict):
         faults.append('each: must be a table, such as [each] and flight = "1-144"')
         return {}
     found = {}
     for name, value in table.items():
-        values = _values(value)
+        values = _parse_values(value)
         if isinstance(values, str):
             faults.append(f"each.{name}: {values}")
         elif name == DATA or not NAME.fullmatch(f"{{{name}}}"):
@@ -79,17 +79,17 @@ def _each(table: Any, faults: list[str]) -> dict[str, Values]:
     return found
 
 
-def _values(value: Any) -> Values | str:
-    """What a name stands for, or what is wrong with it."""
+def _parse_values(value: Any) -> Values | str:
+    """Return the values of a name, or its fault."""
     if isinstance(value, str) and (match := RANGE.fullmatch(value)):
-        return _range(value, int(match[1]), int(match[2]))
+        return _parse_range(value, int(match[1]), int(match[2]))
     if not isinstance(value, list) or not value:
         return 'must be a range, such as "1-144", or a list that is not empty'
-    return _list_fault(value) or value
+    return _check_list(value) or value
 
 
-def _range(text: str, first: int, last: int) -> Values | str:
-    """The numbers from the first to the last, or what is wrong with them."""
+def _parse_range(text: str, first: int, last: int) -> Values | str:
+    """Return the numbers from the first to the last, or the fault."""
     if first > last:
         return f"{text} runs backwards. Write the smaller number first"
     if last - first >= limits.STEPS:
@@ -97,8 +97,8 @@ def _range(text: str, first: int, last: int) -> Values | str:
     return range(first, last + 1)
 
 
-def _list_fault(values: list[Any]) -> str:
-    """What is wrong with a list of values; empty: nothing."""
+def _check_list(values: list[Any]) -> str:
+    """Return the fault of a list of values; empty: there is none."""
     if len(values) > limits.STEPS:
         return f"is too long. A recipe may have {limits.STEPS} steps"
     plain = all(isinstance(v, int | float | str) and not isinstance(v, bool) for v in values)
@@ -110,46 +110,48 @@ def _list_fault(values: list[Any]) -> str:
     return ""
 
 
-def _defaults(table: Any, faults: list[str]) -> dict[str, Table]:
+def _parse_defaults(table: Any, faults: list[str]) -> dict[str, Table]:
     if isinstance(table, dict) and all(isinstance(v, dict) for v in table.values()):
         return table
     faults.append("defaults: must hold a table per stage, such as [defaults.train]")
     return {}
 
 
-def _strings(value: Any) -> Iterator[str]:
+def _iter_strings(value: Any) -> Iterator[str]:
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict | list):
         for one in value.values() if isinstance(value, dict) else value:
-            yield from _strings(one)
+            yield from _iter_strings(one)
 
 
-def _names(value: Any) -> dict[tuple[str, str | None], None]:
-    """Names in a value, each with its row's key or None, in the order they come."""
-    found = (m.groups() for text in _strings(value) for m in NAME.finditer(text))
+def _find_names(value: Any) -> dict[tuple[str, str | None], None]:
+    """Return the names in a value in order, each with its row's key or None."""
+    found = (m.groups() for text in _iter_strings(value) for m in NAME.finditer(text))
     return {(name, key): None for name, key in found if name != DATA}
 
 
-def _used(steps: list[Any], defaults: Mapping[str, Table]) -> set[tuple[str, str | None]]:
-    return {*_names(steps), *_names(defaults)}
+def _find_used_names(
+    steps: list[Any], defaults: Mapping[str, Table]
+) -> set[tuple[str, str | None]]:
+    return {*_find_names(steps), *_find_names(defaults)}
 
 
-def _unfit(step: Any, each: Mapping[str, Values], room: list[int]) -> str:
-    """Why a step cannot be repeated; empty: it can. Takes what it needs from ``room``."""
+def _check_step(step: Any, each: Mapping[str, Values], room: list[int]) -> str:
+    """Return why a step cannot be repeated; empty: it can. Subtract its needs from ``room``."""
     if not isinstance(step, dict):
         return ": must be a table"
     for key in ("stage", "out"):
         if not isinstance(step.get(key), str):
             return f".{key}: a text is required"
-    for name, field in _names(step):
-        if wrong := _unknown(name, field, each):
+    for name, field in _find_names(step):
+        if wrong := _check_name(name, field, each):
             return f".out: {wrong}"
-    repeats = {name for name, _ in _names(step["out"])}
+    repeats = {name for name, _ in _find_names(step["out"])}
     count = prod(len(each[name]) for name in repeats)
     gathered = sum(
-        prod(len(each[name]) for name in {n for n, _ in _names(text)} - repeats)
-        for text in _strings(step)
+        prod(len(each[name]) for name in {n for n, _ in _find_names(text)} - repeats)
+        for text in _iter_strings(step)
     )
     for k, needs in enumerate((count, count * gathered, count * len(str(step)))):
         if needs > room[k]:
@@ -158,7 +160,7 @@ def _unfit(step: Any, each: Mapping[str, Values], room: list[int]) -> str:
     return ""
 
 
-def _unknown(name: str, key: str | None, each: Mapping[str, Values]) -> str:
+def _check_name(name: str, key: str | None, each: Mapping[str, Values]) -> str:
     if name not in each:
         near = get_close_matches(name, each, n=1)
         return f"no {name} in [each]. " + (f"Did you mean {near[0]}?" if near else "Add it")
@@ -168,18 +170,18 @@ def _unknown(name: str, key: str | None, each: Mapping[str, Values]) -> str:
     if not rows and key is not None:
         return f"{{{name}.{key}}}: {name} has no rows. Write {{{name}}}"
     if rows and not any(key in row for row in each[name]):
-        return f"no row of {name} has {key}. Mend one of them"
+        return f"no row of {name} has {key}. Fix one of them"
     return ""
 
 
-def _unused(
+def _report_unused(
     each: Mapping[str, Values],
     defaults: Mapping[str, Table],
     steps: list[Any],
     used: set[tuple[str, str | None]],
     faults: list[str],
 ) -> None:
-    """What no step looks at is a slip of the pen."""
+    """Add a fault for each name and default that no step uses."""
     for name, values in each.items():
         keys = {k for row in values if isinstance(row, dict) for k in row} or {None}
         for key in sorted(keys - {k for n, k in used if n == name}, key=str):
@@ -189,59 +191,59 @@ def _unused(
     faults += [f"defaults.{s}: no step is of that stage" for s in sorted(set(defaults) - stages)]
 
 
-def _repeated(step: Table, usual: Table, each: Mapping[str, Values]) -> Iterator[Table]:
-    """A step for all values of the names in its ``out``, where their rows have what it names."""
-    names = list(dict.fromkeys(name for name, _ in _names(step["out"])))
+def _repeat_step(step: Table, usual: Table, each: Mapping[str, Values]) -> Iterator[Table]:
+    """Yield the step for all values of the names in its ``out``, where rows have these values."""
+    names = list(dict.fromkeys(name for name, _ in _find_names(step["out"])))
     for values in product(*(each[name] for name in names)):
         bound = dict(zip(names, values, strict=True))
         try:
-            own = _filled(step, bound, each)
-            known = _filled({k: v for k, v in usual.items() if k not in own}, bound, each)
+            own = _fill_names(step, bound, each)
+            known = _fill_names({k: v for k, v in usual.items() if k not in own}, bound, each)
         except _NoStep:
             continue
         if "out" in own:
             yield {**known, **own, "out": str(own["out"])}
 
 
-def _filled(value: Any, bound: Bound, each: Mapping[str, Values]) -> Any:
-    """A value with names replaced; what names a value that its row lacks is left out."""
+def _fill_names(value: Any, bound: Bound, each: Mapping[str, Values]) -> Any:
+    """Return a value with names replaced; parts that name a missing value are left out."""
     match value:
         case str():
-            return _text(value, bound, each)
+            return _fill_text(value, bound, each)
         case list():
             found: list[Any] = []
             for one in value:
-                made = _filled(one, bound, each)
+                made = _fill_names(one, bound, each)
                 found += made if isinstance(made, list) and isinstance(one, str) else [made]
-            kept = [one for one in found if one is not NOTHING]
-            return NOTHING if found and not kept else kept
+            kept = [one for one in found if one is not MISSING_VALUE]
+            return MISSING_VALUE if found and not kept else kept
         case dict():
-            filled = {key: _filled(one, bound, each) for key, one in value.items()}
-            return {key: one for key, one in filled.items() if one is not NOTHING}
+            filled = {key: _fill_names(one, bound, each) for key, one in value.items()}
+            return {key: one for key, one in filled.items() if one is not MISSING_VALUE}
     return value
 
 
-def _text(text: str, bound: Bound, each: Mapping[str, Values]) -> Any:
-    """A text with names replaced, a list of them where a name gathers, or a value itself."""
-    free = list(dict.fromkeys(name for name, _ in _names(text) if name not in bound))
+def _fill_text(text: str, bound: Bound, each: Mapping[str, Values]) -> Any:
+    """Return a text with names replaced, a list if a name gathers, or a value itself."""
+    free = list(dict.fromkeys(name for name, _ in _find_names(text) if name not in bound))
     if not free:
-        return _one(text, bound)
+        return _fill_bound(text, bound)
     found = []
     for choice in product(*(each[name] for name in free)):
         with suppress(_NoStep):
-            found.append(_one(text, {**bound, **dict(zip(free, choice, strict=True))}))
-    return [one for one in found if one is not NOTHING] or NOTHING
+            found.append(_fill_bound(text, {**bound, **dict(zip(free, choice, strict=True))}))
+    return [one for one in found if one is not MISSING_VALUE] or MISSING_VALUE
 
 
-def _one(text: str, bound: Bound) -> Any:
+def _fill_bound(text: str, bound: Bound) -> Any:
     def value(match: re.Match[str]) -> Any:
         name, key = match.groups()
         if name == DATA:
             return match[0]
-        return bound[name] if key is None else bound[name].get(key, NOTHING)
+        return bound[name] if key is None else bound[name].get(key, MISSING_VALUE)
 
     if whole := NAME.fullmatch(text):
         return value(whole)
-    if any(value(match) is NOTHING for match in NAME.finditer(text)):
+    if any(value(match) is MISSING_VALUE for match in NAME.finditer(text)):
         raise _NoStep
     return NAME.sub(lambda match: str(value(match)), text)

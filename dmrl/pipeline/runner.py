@@ -1,4 +1,4 @@
-"""Run the steps of a pipeline that are not up to date: in order, independent ones in parallel."""
+"""Runner of a pipeline: builds outdated outputs in order, independent ones in parallel."""
 
 import shutil
 from collections import deque
@@ -12,18 +12,18 @@ from dmrl import recipe as recipes
 from dmrl.atomic_output import note, partial_of
 from dmrl.errors import DmrlError, OutputError
 from dmrl.evaluation.pipeline_summary import Done
-from dmrl.pipeline.build_cache import Memory, key_of
+from dmrl.pipeline.build_cache import BuildCache, build_key
 from dmrl.pipeline.executor import Executor
-from dmrl.pipeline.job import Answer, job
-from dmrl.pipeline.plan import UNFINISHED, Plan, Step, located, makers, mapped
-from dmrl.pipeline.stage_signature import NO_CONTENT
+from dmrl.pipeline.job import JobResult, build_job
+from dmrl.pipeline.plan import UNFINISHED, Plan, Step, find_producers, locate_input, map_strings
+from dmrl.pipeline.stage_signature import SETTINGS_WITHOUT_EFFECT
 from dmrl.storage import Remote
 from dmrl.terminal.progress import say
 
 
 @dataclass(frozen=True, slots=True)
-class Running:
-    """A step at work: its key, and when it began."""
+class RunningStep:
+    """A running step, its key, and its start time."""
 
     step: Step
     key: str
@@ -36,47 +36,49 @@ class Runner:
     Parameters
     ----------
     plan
-        Its steps.
+        Steps of the pipeline.
     folder
-        Of all outputs.
+        Folder of all outputs.
     data
-        What ``{data}`` stands for.
+        Folder that replaces ``{data}``.
     memory
-        Of the folder.
+        Cache of the folder.
     crew
-        Who does the steps.
+        Executor of the steps.
     """
 
     def __init__(
-        self, plan: Plan, folder: Path, data: Path | None, memory: Memory, crew: Executor
+        self, plan: Plan, folder: Path, data: Path | None, memory: BuildCache, crew: Executor
     ) -> None:
         self.folder, self.data, self.memory, self.crew = folder, data, memory, crew
         self.steps = {step.out: step for step in plan.steps}
         self.outs = set(self.steps)
         self.order = plan.order
-        self.running: dict[Future[Answer], Running] = {}
+        self.running: dict[Future[JobResult], RunningStep] = {}
         self.done: dict[str, Done] = {}
         self.failed: list[DmrlError] = []
         self._places = {out: k for k, out in enumerate(self.steps)}
 
     def run(self) -> list[Done]:
-        """What became of every step, in the order of the recipe.
+        """Run all steps; return their outcomes in the order of the recipe.
 
         Raises
         ------
         DmrlError
-            What the first step that failed says. Steps beside it were finished.
+            The error of the first step that failed. Steps beside it were finished.
         """
         self.order.prepare()
         ready: deque[tuple[Step, str]] = deque()
         while self.order.is_active():
             while fresh := sorted(self.order.get_ready(), key=self._places.__getitem__):
-                ready.extend(found for out in fresh if (found := self._to_do(self.steps[out])))
-            while ready and not self.failed and self._has_room(ready[0][0]):
-                self._start(*ready.popleft())
+                ready.extend(
+                    found for out in fresh if (found := self._prepare_step(self.steps[out]))
+                )
+            while ready and not self.failed and self._can_start(ready[0][0]):
+                self._start_step(*ready.popleft())
             if self.running:
                 over = wait(self.running, return_when=FIRST_COMPLETED).done
-                self._finish(
+                self._finish_steps(
                     *sorted(over, key=lambda one: self._places[self.running[one].step.out])
                 )
             elif self.failed:
@@ -87,122 +89,126 @@ class Runner:
             raise self.failed[0]
         return [self.done[out] for out in self.steps]
 
-    def _to_do(self, step: Step) -> tuple[Step, str] | None:
-        """A step and its key; None, if there is nothing to do for it."""
+    def _prepare_step(self, step: Step) -> tuple[Step, str] | None:
+        """Return a step and its key; None, if it need not run."""
         out = self.folder / step.out
-        if missing := [n for n in makers(step.names, self.outs) if self.done[n].left_out]:
-            self._fail(step, f"reads {missing[0]}, which was left out. Mend that first")
+        if missing := [n for n in find_producers(step.names, self.outs) if self.done[n].left_out]:
+            self._fail_step(step, f"reads {missing[0]}, which was left out. Fix that first")
             return None
         try:
-            key = self._key(step)
-            made = self.memory.is_made(out, key)
+            key = self._build_key(step)
+            made = self.memory.is_up_to_date(out, key)
         except OSError as e:
-            self._fail(step, f"cannot read {e.filename}: {e.strerror}. Check it")
+            self._fail_step(step, f"cannot read {e.filename}: {e.strerror}. Check it")
             return None
         if made:
-            self._end(step, Done(step.stage, out, 0.0, skipped=True))
+            self._mark_done(step, Done(step.stage, out, 0.0, skipped=True))
             return None
         if out.exists() and not {step.out} & (self.memory.done.keys() | self.memory.begun.keys()):
-            raise OutputError(f"{out} is there, and not of this pipeline. Move it elsewhere")
+            raise OutputError(f"{out} exists but this pipeline did not write it. Move or rename it")
         return step, key
 
-    def _key(self, step: Step) -> str:
-        """What decides the bytes of a step's output."""
-        takes = step.interface
+    def _build_key(self, step: Step) -> str:
+        """Return the key of a step: it determines the bytes of the output."""
+        takes = step.signature
         own = {k: v for k, v in step.settings.items() if k not in takes.others}
         filled: dict[str, Any] = {k: step.settings[k] for k in takes.others}
         if takes.settings is not None:
             filled |= asdict(recipes.check(step.out, own, takes.settings))
-        filled |= mapped(step.path_settings, self._content)
-        matter = {k: v for k, v in recipes.plain(filled).items() if k not in NO_CONTENT}
-        return key_of(step.stage, matter, mapped(dict(step.inputs), self._content))
+        filled |= map_strings(step.path_settings, self._hash_input)
+        matter = {
+            k: v for k, v in recipes.plain(filled).items() if k not in SETTINGS_WITHOUT_EFFECT
+        }
+        return build_key(step.stage, matter, map_strings(dict(step.inputs), self._hash_input))
 
-    def _content(self, name: str) -> list[str]:
-        """Name and SHA-256 of what a step reads; the name alone, where it is known as such."""
-        path = self._located(name)
-        return [path.name, self.memory.sha256(path)] if path.exists() else [name]
+    def _hash_input(self, name: str) -> list[str]:
+        """Return name and SHA-256 of an input; for a built-in name, the name alone."""
+        path = self._locate(name)
+        return [path.name, self.memory.get_sha256(path)] if path.exists() else [name]
 
-    def _located(self, name: str) -> Path:
-        return located(name, self.outs, self.folder, self.data)
+    def _locate(self, name: str) -> Path:
+        return locate_input(name, self.outs, self.folder, self.data)
 
-    def _has_room(self, step: Step) -> bool:
-        blocks = self.crew.alone_blocks
-        if blocks and any(one.step.interface.alone for one in self.running.values()):
+    def _can_start(self, step: Step) -> bool:
+        blocks = self.crew.exclusive_blocks
+        if blocks and any(one.step.signature.exclusive for one in self.running.values()):
             return False
-        alone = blocks and step.interface.alone
-        return len(self.running) < (1 if alone else self.crew.workers)
+        exclusive = blocks and step.signature.exclusive
+        return len(self.running) < (1 if exclusive else self.crew.workers)
 
-    def _start(self, step: Step, key: str) -> None:
+    def _start_step(self, step: Step, key: str) -> None:
         place = self.folder / UNFINISHED / step.out
         same = self.memory.begun.get(step.out) == key
-        if place.exists() and same:  # whole, but we were killed before it had its name
-            self._adopt(Running(step, key, perf_counter()), self.memory.sha256(place))
+        if place.exists() and same:  # complete, but this process was killed before it got its name
+            self._install_output(
+                RunningStep(step, key, perf_counter()), self.memory.get_sha256(place)
+            )
             return
         partial = partial_of(place)
-        _remove(place)
-        if step.interface.resumes and not same:
-            _remove(partial)
+        _remove_path(place)
+        if step.signature.resumes and not same:
+            _remove_path(partial)
         self.memory.begun[step.out] = key
         self.memory.save()
         say(
             f"[{len(self.done) + len(self.running) + 1}/{len(self.steps)}] {step.stage}: {step.out}"
         )
-        line = job(
+        line = build_job(
             step.stage,
             place,
-            mapped(dict(step.inputs), lambda name: str(self._located(name))),
-            {**step.settings, **mapped(step.path_settings, lambda n: str(self._located(n)))},
+            map_strings(dict(step.inputs), lambda name: str(self._locate(name))),
+            {**step.settings, **map_strings(step.path_settings, lambda n: str(self._locate(n)))},
             resume=partial.exists(),
         )
-        future = self.crew.give(line, alone=step.interface.alone)
-        self.running[future] = Running(step, key, perf_counter())
+        future = self.crew.submit(line, exclusive=step.signature.exclusive)
+        self.running[future] = RunningStep(step, key, perf_counter())
 
-    def _finish(self, *futures: Future[Answer]) -> None:
+    def _finish_steps(self, *futures: Future[JobResult]) -> None:
         for future in futures:
             one = self.running.pop(future)
             answer = future.result()
             if "sha256" in answer:
-                self._adopt(one, answer["sha256"])
-            elif "fault" in answer:
-                raise RuntimeError(f"{one.step.out} ({one.step.stage}): {answer['fault']}")
+                self._install_output(one, answer["sha256"])
+            elif "bug" in answer:
+                raise RuntimeError(f"{one.step.out} ({one.step.stage}): {answer['bug']}")
             else:
-                self._fail(one.step, answer["error"])
+                self._fail_step(one.step, answer["error"])
 
-    def _adopt(self, one: Running, sha256: str) -> None:
-        """Give a whole output its name, in place of the one before."""
+    def _install_output(self, one: RunningStep, sha256: str) -> None:
+        """Rename a complete output to its name, in place of the one before."""
         out, new = self.folder / one.step.out, self.folder / UNFINISHED / one.step.out
         if isinstance(out, Remote):
             new.replace(out)
         elif out.is_dir() or (out.exists() and new.is_dir()):
             old = new.with_name(f"{new.name}.old")
-            _remove(old)
+            _remove_path(old)
             out.rename(old)
             new.rename(out)
-            _remove(old)
+            _remove_path(old)
         else:
             new.replace(out)
         note(out)
         self.memory.done[one.step.out] = [one.key, sha256]
-        self.memory.know(out, sha256)
+        self.memory.set_sha256(out, sha256)
         self.memory.save()
         seconds = perf_counter() - one.begun_s
-        self._end(one.step, Done(one.step.stage, out, seconds, skipped=False))
+        self._mark_done(one.step, Done(one.step.stage, out, seconds, skipped=False))
 
-    def _end(self, step: Step, done: Done) -> None:
+    def _mark_done(self, step: Step, done: Done) -> None:
         self.done[step.out] = done
         self.order.done(step.out)
 
-    def _fail(self, step: Step, words: str) -> None:
-        """Note that a step failed, or go on without it."""
+    def _fail_step(self, step: Step, words: str) -> None:
+        """Record that a step failed, or go on without it."""
         if not step.optional:
             self.failed.append(DmrlError(f"{step.out} ({step.stage}): {words}"))
             return
         say(f"{step.out} ({step.stage}) is left out. {words}")
         out = self.folder / step.out
-        self._end(step, Done(step.stage, out, 0.0, skipped=False, left_out=True))
+        self._mark_done(step, Done(step.stage, out, 0.0, skipped=False, left_out=True))
 
 
-def _remove(path: Path) -> None:
+def _remove_path(path: Path) -> None:
     if isinstance(path, Remote):
         path.remove_all()
     elif path.is_dir() and not path.is_symlink():

@@ -6,13 +6,13 @@ from typing import Any
 
 from dmrl.atomic_output import note
 from dmrl.errors import DmrlError, SettingError
-from dmrl.pipeline.batch import Task, differing, words_of
-from dmrl.pipeline.executor import SLURM, executor
-from dmrl.pipeline.job import failed, job
-from dmrl.pipeline.stage_signature import interface_of
+from dmrl.pipeline.batch import Task, changed_settings, error_text
+from dmrl.pipeline.executor import SLURM, open_executor
+from dmrl.pipeline.job import build_job, has_failed
+from dmrl.pipeline.stage_signature import signature_of
 
 
-def done_on(
+def run_on_cluster(
     on: str, stage: str, out: Path | None, inputs: Mapping[str, Any], settings: Any = None
 ) -> dict[str, Any] | None:
     """Run a stage once, on a cluster.
@@ -20,35 +20,35 @@ def done_on(
     Parameters
     ----------
     on
-        See `executor`.
+        See `open_executor`.
     stage, out
-        Command name, and what it writes.
+        Command name, and its output.
     inputs
-        Arguments of its ``run`` but for the settings, by name.
+        Arguments of its ``run`` without the settings, by name.
     settings
-        Its settings.
+        Settings of the stage.
 
     Returns
     -------
     dict or None
-        What ``run`` gave back, as values of JSON. None: the output was there, made of the same.
+        Result of ``run``, as JSON values. None: the output existed, made of the same inputs.
 
     Raises
     ------
     DmrlError
-        What the stage says.
+        If the stage fails.
     """
     if out is None:
         raise SettingError(
-            f"dmrl {stage} --on wants an output, a folder for its figures: --plots DIR"
+            f"dmrl {stage} --on needs an output. Name a folder for its figures: --plots DIR"
         )
-    line = job(stage, out, dict(inputs), differing(settings), keep=True)
+    line = build_job(stage, out, dict(inputs), changed_settings(settings), keep=True)
     task = Task(out, out, line)
     if on == SLURM:
         raise SettingError("--on slurm is for a folder of recordings. Name one, or --on ray")
-    with executor(on, None) as crew:
-        answer = crew.give(line, alone=interface_of(stage).alone).result()
-    if failed(answer):
-        raise DmrlError(words_of(task, answer))
+    with open_executor(on, None) as crew:
+        answer = crew.submit(line, exclusive=signature_of(stage).exclusive).result()
+    if has_failed(answer):
+        raise DmrlError(error_text(task, answer))
     note(out)
-    return None if "there" in answer else answer["result"]
+    return None if "up_to_date" in answer else answer["result"]

@@ -1,4 +1,4 @@
-"""What a stage takes, read from the signature of its ``run``.
+"""Signature of a stage: inputs, settings and other arguments of its ``run``.
 
 ==================================  ==========================================================
 an argument of ``run``              is, in a recipe
@@ -7,12 +7,12 @@ an argument of ``run``              is, in a recipe
 ``settings``                        keys of their own, one for each field
 annotated ``Path``                  an input; with a default one that may be left out
 annotated ``Sequence[Path]``        any number of inputs, but for none
-``resume``                          nothing: set where a killed run has left something
+``resume``                          nothing: set if a killed run left a partial output
 another without a default           a key, checked as its annotation says
 another with a default              nothing
 ==================================  ==========================================================
 
-Fields of settings that are annotated with ``Path``, in whatever, are inputs as well.
+Fields of settings whose annotation contains ``Path`` are inputs as well.
 """
 
 import inspect
@@ -23,31 +23,37 @@ from functools import cache
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, get_args, get_origin, get_type_hints
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 from dmrl import plugins
 from dmrl.errors import RecipeError
-from dmrl.recording import Provenance
 
-ALONE = ("processes", "workers")
-"""A stage with one of these settings keeps all cores busy by itself."""
-NO_CONTENT = ("workers",)
+if TYPE_CHECKING:
+    from dmrl.recording import Provenance
+
+if TYPE_CHECKING:
+    from dmrl.recording import Provenance
+
+EXCLUSIVE_SETTINGS = ("processes", "workers")
+"""Settings of stages that keep all cores busy by themselves."""
+SETTINGS_WITHOUT_EFFECT = ("workers",)
 """Settings that change no byte of any output."""
 
 Keys = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Role:
-    """An input of a stage: whether it takes many, and whether it must have it."""
+class InputRole:
+    """An input of a stage: whether it is a list, and whether it is required."""
 
     many: bool
     required: bool
 
 
 @dataclass(frozen=True, slots=True)
-class Interface:
-    """What a stage takes.
+class StageSignature:
+    """Inputs, settings and other arguments of a stage.
 
     Parameters
     ----------
@@ -56,49 +62,49 @@ class Interface:
     roles
         Inputs, by the name of the argument.
     settings
-        Dataclass of its settings; None: it has none.
+        Dataclass of the settings; None: there is none.
     others
         Annotations of other arguments, by name.
     paths
         Settings that name files or folders.
     resumes
-        Whether it can go on with what a killed run has left.
-    alone
+        Whether it can resume a killed run.
+    exclusive
         Whether it keeps all cores busy by itself.
     filled
-        Makes a recipe's keys settings, where a key stands for several: a preset.
+        Function that expands keys of a recipe, such as a preset, into settings.
     origin
-        Provenance of what ``run`` would write, given the same but ``out``. None: that of its
-        inputs and settings.
+        Function that builds the provenance of the output from the arguments of ``run`` without
+        ``out``. None: it follows from inputs and settings.
     """
 
     run: Callable[..., Any]
-    roles: dict[str, Role] = field(default_factory=dict)
+    roles: dict[str, InputRole] = field(default_factory=dict)
     settings: type[Any] | None = None
     others: dict[str, Any] = field(default_factory=dict)
     paths: frozenset[str] = frozenset()
     resumes: bool = False
-    alone: bool = False
+    exclusive: bool = False
     filled: Callable[[Keys], Keys] = dict
-    origin: Callable[..., Provenance] | None = None
+    origin: "Callable[..., Provenance] | None" = None
 
     @property
     def keys(self) -> list[str]:
-        """Every key that a step of this stage may have beside those of all steps."""
+        """Keys that a step of this stage may have beside those of all steps."""
         own = [f.name for f in fields(self.settings)] if self.settings else []
         return [*self.roles, *self.others, *own]
 
 
 @cache
-def interface_of(stage: str, *, writes: bool = True) -> Interface:
-    """What a stage takes.
+def signature_of(stage: str, *, writes: bool = True) -> StageSignature:
+    """Read the signature of a stage.
 
     Parameters
     ----------
     stage
         Command name.
     writes
-        Whether it must write something.
+        Whether it must have an output.
 
     Raises
     ------
@@ -107,40 +113,47 @@ def interface_of(stage: str, *, writes: bool = True) -> Interface:
     MissingExtra
         If a package that it needs is not installed.
     """
-    module = _module(stage)
+    module = _load_stage(stage)
     run = getattr(module, "run", None)
     if run is None or (writes and "out" not in inspect.signature(run).parameters):
         raise RecipeError(f"{stage} writes nothing, so it can be no step. Leave it out")
-    hints = get_type_hints(run)
+    hints = resolve_hints(run)
     roles, others = {}, {}
     for parameter in inspect.signature(run).parameters.values():
         hint, required = hints[parameter.name], parameter.default is parameter.empty
         if parameter.name in ("out", "settings", "resume"):
             continue
-        if (many := _paths(hint)) is not None:
-            roles[parameter.name] = Role(many, required)
+        if (many := _takes_paths(hint)) is not None:
+            roles[parameter.name] = InputRole(many, required)
         elif required:
             others[parameter.name] = hint
     settings = hints.get("settings")
     names = get_type_hints(settings) if settings else {}
-    return Interface(
+    return StageSignature(
         run,
         roles,
         settings,
         others,
         frozenset(name for name, hint in names.items() if _mentions_path(hint)),
         resumes="resume" in hints,
-        alone=any(name in names for name in ALONE),
+        exclusive=any(name in names for name in EXCLUSIVE_SETTINGS),
         filled=getattr(module, "filled", dict),
         origin=getattr(module, "origin", None),
     )
 
 
-def _module(stage: str) -> Any:
-    # By name, because stages stand above this room and not below it.
+def resolve_hints(run: Callable[..., Any], *, extras: bool = False) -> dict[str, Any]:
+    """Return the annotations of the arguments of ``run``, without that of its result."""
+    taken = {name: hint for name, hint in run.__annotations__.items() if name != "return"}
+    named = SimpleNamespace(__annotations__=taken)
+    return get_type_hints(named, run.__globals__, include_extras=extras)
+
+
+def _load_stage(stage: str) -> Any:
+    # By name, because stages are above this room.
     package = "dmrl.stages"
     known = [m.name.replace("_", "-") for m in iter_modules(import_module(package).__path__)]
-    added = plugins.found(plugins.STAGES)
+    added = plugins.find_plugins(plugins.STAGES)
     if stage not in known and stage in added:
         return added[stage].load()
     known += list(added)
@@ -151,16 +164,20 @@ def _module(stage: str) -> Any:
     return import_module(f"{package}.{stage.replace('-', '_')}")
 
 
-def _paths(hint: Any) -> bool | None:
-    """Whether an annotation is of many paths; False: of one; None: of none."""
-    kinds = [kind for kind in get_args(hint) if kind is not type(None)] if _union(hint) else [hint]
+def _takes_paths(hint: Any) -> bool | None:
+    """Return whether an annotation is a list of paths; False: one path; None: neither."""
+    kinds = (
+        [kind for kind in get_args(hint) if kind is not type(None)]
+        if _is_optional(hint)
+        else [hint]
+    )
     if kinds == [Path]:
         return False
     many = len(kinds) == 1 and get_origin(kinds[0]) in (list, tuple, Sequence)
     return True if many and get_args(kinds[0])[:1] == (Path,) else None
 
 
-def _union(hint: Any) -> bool:
+def _is_optional(hint: Any) -> bool:
     return type(None) in get_args(hint)
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from dmrl.recording.summary import summary
+from dmrl.recording.summary import Summary, summary
 
 LICENCES_METADATA = "dmrl.licences"
 NAMES = ("LICENSE", "LICENCE", "COPYING")
@@ -36,9 +36,10 @@ def licences(recordings: Sequence[Path]) -> dict[str, str]:
     RecordingError
         If a recording cannot be read.
     """
-    return dict(sorted(pair for path in recordings for pair in _told(path)))
+    return dict(sorted(pair for path in recordings for pair in licences_in(summary(path))))
 
 
-def _told(path: Path) -> Iterator[tuple[str, str]]:
-    for values in summary(path).metadata.get(LICENCES_METADATA, []):
+def licences_in(found: Summary) -> Iterator[tuple[str, str]]:
+    """Yield the name of a source, and its licence, for all that a recording was made from."""
+    for values in found.metadata.get(LICENCES_METADATA, []):
         yield from values.items()

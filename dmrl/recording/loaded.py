@@ -16,7 +16,7 @@ from dmrl.recording.mcap.message_batch import EMPTY, Block, Ints, joined
 from dmrl.recording.mcap.summary_index import TopicInfo, channel_on
 from dmrl.recording.protobuf.columns import apart, decoded
 from dmrl.recording.protobuf.message_types import descriptor_of, require_types
-from dmrl.recording.reader import Stamped, parsed
+from dmrl.recording.reader import Stamped, match_topics, parsed, read
 from dmrl.recording.summary import summary
 
 PART = re.compile(r"\\{\w+\\}")
@@ -105,6 +105,14 @@ class Contents:
         for number, time_ns, publish_ns, data in block.rows():
             raw = RawMessage(time_ns, publish_ns, channels[number], data)
             yield Stamped(time_ns, topic, parsed(raw, kinds[number], self.path))
+
+    def matching(self, *wanted: str) -> frozenset[str]:
+        """Return the topics that names and patterns ask for; raise what `reader.matching` does."""
+        return match_topics(self.path, self.topics, wanted)
+
+    def first(self, topic: str) -> Stamped | None:
+        """Return the first message of a topic, and load no other; None if it has none."""
+        return next(read(self.path, topic), None)
 
     def _of(self, topic: str) -> tuple[Block, dict[int, Channel]]:
         """Return the messages of a topic, and its channels by channel id."""

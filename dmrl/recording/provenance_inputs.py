@@ -1,6 +1,7 @@
 """Build the provenance of an output: hash its inputs and nest their provenance."""
 
 import hashlib
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -11,6 +12,7 @@ from dmrl.errors import RecordingError
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_pipe
 from dmrl.recording.mcap.file import expect_unchanged
+from dmrl.recording.mcap.shared_file import open_raw, share_file
 from dmrl.recording.provenance import FILE_NAME, Input, Provenance
 from dmrl.recording.summary import summary
 from dmrl.storage import Remote
@@ -90,17 +92,18 @@ def input_of(path: Path) -> Input:
     if not path.exists():
         raise RecordingError(f"no file or folder {path}. Check the name")
     refuse_pipe(path)  # a link in a folder may point to a device
-    if path.suffix == ".mcap" and path.is_file():
-        expect_unchanged(path)
-    digest = sha256_of_folder(path) if path.is_dir() else sha256_of_file(path)
-    return Input(path.resolve().name, digest, provenance_of(path))
+    with share_file(path):
+        if path.suffix == ".mcap" and path.is_file():
+            expect_unchanged(path)
+        digest = sha256_of_folder(path) if path.is_dir() else sha256_of_file(path)
+        return Input(path.resolve().name, digest, provenance_of(path))
 
 
 def sha256_of_file(path: Path) -> str:
     """Return the SHA-256 of a file, hexadecimal."""
     if isinstance(path, Remote):
         return path.sha256()
-    with path.open("rb") as stream:
+    with io.BufferedReader(open_raw(path)) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 

@@ -15,7 +15,7 @@ from dmrl.recording.mcap.batch_reader import blocks
 from dmrl.recording.mcap.channel import Channel, RawMessage
 from dmrl.recording.mcap.file import damaged
 from dmrl.recording.mcap.message_batch import EMPTY, Block, joined
-from dmrl.recording.mcap.summary_index import channel_on
+from dmrl.recording.mcap.summary_index import TopicInfo, channel_on
 from dmrl.recording.protobuf.columns import batch_of, by_topic, decoded
 from dmrl.recording.protobuf.message_types import descriptor_of, require_types
 from dmrl.recording.summary import summary
@@ -50,7 +50,13 @@ def matching(path: Path, wanted: Sequence[str]) -> frozenset[str]:
     RecordingError
         If one of dmrl's topics carries another message type.
     """
-    topics = summary(path).topics
+    return match_topics(path, summary(path).topics, wanted)
+
+
+def match_topics(
+    path: Path, topics: Mapping[str, TopicInfo], wanted: Sequence[str]
+) -> frozenset[str]:
+    """Return the topics that names and patterns ask for; raise what `matching` does."""
     found: set[str] = set()
     for want in wanted:
         hits = {want} & topics.keys()

@@ -13,6 +13,7 @@ from google.protobuf.descriptor import Descriptor
 
 from dmrl.atomic_output import as_output_error, partial_file
 from dmrl.errors import OutputError, RecordingError
+from dmrl.messages import message as message_class
 from dmrl.messages import schema_bytes
 from dmrl.recording.mcap.channel import Channel, RawMessage
 from dmrl.recording.mcap.chunk_builder import OpenChunk
@@ -21,6 +22,7 @@ from dmrl.recording.mcap.file_writer import Container
 from dmrl.recording.mcap.message_batch import HEAD_BYTES, Ints
 from dmrl.recording.protobuf.encode import Value, encode
 from dmrl.recording.provenance import METADATA_NAME, Provenance
+from dmrl.samples.sample import Sample
 from dmrl.topics import row_of
 
 SUFFIX = ".mcap"
@@ -110,6 +112,11 @@ class RecordingWriter:
         _, number, chunk = known
         publish_ns = time_ns if publish_ns is None else publish_ns
         self.chunks.add(number, chunk, time_ns, publish_ns, message.SerializeToString())
+
+    def write_sample(self, sample: Sample) -> None:
+        """Append one sample as a message; see `write`."""
+        built = message_class(sample.message)(**sample.fields)
+        self.write(sample.time_ns, sample.topic, built, publish_ns=sample.publish_ns)
 
     def write_columns(
         self,

@@ -3,15 +3,13 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from dmrl.atomic_output import partial_folder
-from dmrl.card import write_card
-from dmrl.terminal.arguments import Flat
-from dmrl.terminal.tables import print_line
+from dmrl.pipeline.stage_command import stage_command
+from dmrl.terminal.closing import Closing
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What a card says beyond what the data tells.
+    """Words of a card that do not follow from the data.
 
     Parameters
     ----------
@@ -26,11 +24,8 @@ class Settings:
     license: str | None = None
 
 
-DEFAULTS = Settings()
-
-
 def run(dataset: Path, settings: Settings, out: Path | None = None) -> Path:
-    """The card, written into the dataset's folder in place of the one before, or into ``out``.
+    """Write a dataset's card and figures again; your own words below its last line stay.
 
     Parameters
     ----------
@@ -41,6 +36,11 @@ def run(dataset: Path, settings: Settings, out: Path | None = None) -> Path:
     out
         Folder to write, card and figures in it. None: the dataset's own card is written again.
 
+    Returns
+    -------
+    Path
+        The card.
+
     Raises
     ------
     DatasetError
@@ -48,6 +48,9 @@ def run(dataset: Path, settings: Settings, out: Path | None = None) -> Path:
     OutputError
         If ``out`` exists.
     """
+    from dmrl.atomic_output import partial_folder
+    from dmrl.card import write_card
+
     if out is None:
         return write_card(dataset, title=settings.title, license_id=settings.license)
     with partial_folder(out) as folder:
@@ -55,17 +58,4 @@ def run(dataset: Path, settings: Settings, out: Path | None = None) -> Path:
     return out / card.name
 
 
-def command(
-    dataset: Path,
-    /,
-    *,
-    settings: Flat[Settings] = DEFAULTS,
-) -> None:
-    """Write a dataset's card and figures again; your own words below its last line stay.
-
-    Parameters
-    ----------
-    dataset
-        Folder of the dataset.
-    """
-    print_line(str(run(dataset, settings)))
+command = stage_command(run, Closing(lines=lambda card, _: [str(card)]), hidden=("out",))

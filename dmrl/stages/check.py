@@ -1,39 +1,49 @@
-"""``dmrl check``: whether recordings are what they should be."""
+"""``dmrl check``: findings about recordings."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dmrl.errors import SettingError
-from dmrl.pipeline.batch import Task, all_recordings, end, is_many, outcomes, tasks_of, words_of
-from dmrl.pipeline.executor import Executor, executor
-from dmrl.pipeline.job import Answer, failed
-from dmrl.recording import Finding, summary
-from dmrl.recording import check as findings_of
+from dmrl.pipeline.batch import (
+    Task,
+    build_tasks,
+    error_text,
+    find_all_recordings,
+    is_collection,
+    iter_results,
+    report_failures,
+)
+from dmrl.pipeline.executor import Executor, open_executor
+from dmrl.pipeline.job import JobResult, has_failed
 from dmrl.terminal.arguments import AsJson, In, On, Workers
 from dmrl.terminal.tables import print_json, print_line
+
+if TYPE_CHECKING:
+    from dmrl.recording import Finding
 
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """What a recording holds, and what is wrong with it."""
+    """Size of a recording, and the findings of its checks."""
 
     messages: int
     topics: int
-    findings: list[Finding]
+    findings: "list[Finding]"
 
 
 def run(recording: Path) -> Checked:
-    """What is wrong with a recording.
+    """Check a recording.
 
     Raises
     ------
     RecordingError
         If it is not a complete recording.
     """
-    findings = findings_of(recording)
-    held = summary(recording)
+    from dmrl.recording import check, summary
+
+    findings, held = check(recording), summary(recording)
     return Checked(held.count, len(held.topics), findings)
 
 
@@ -53,13 +63,11 @@ def command(
         A recording; or several, folders of them, or patterns in quotes: then one line for each.
     workers
         Recordings at a time, at most. Without it, as many as there are cores.
-    as_json
-        Print one JSON document instead of lines.
     """
     if not recordings:
         raise SettingError("check wants a recording, or a folder of them. Name one")
-    if len(recordings) > 1 or is_many(recordings[0]) or on is not None:
-        return _check_many(recordings, executor(on, workers), as_json=as_json)
+    if len(recordings) > 1 or is_collection(recordings[0]) or on is not None:
+        return _check_side_by_side(recordings, open_executor(on, workers), as_json=as_json)
     found = run(recordings[0])
     errors = sum(f.level == "error" for f in found.findings)
     if as_json:
@@ -76,16 +84,16 @@ def command(
     return 1 if errors else 0
 
 
-def _check_many(named: Sequence[Path], crew: Executor, *, as_json: bool) -> int:
-    """Check recordings side by side; 1 if one of them has an error or cannot be read."""
-    found = {path: path for path in all_recordings(named)}
-    tasks = tasks_of("check", "recording", found, None)
-    done: list[tuple[Task, Answer]] = []
+def _check_side_by_side(named: Sequence[Path], crew: Executor, *, as_json: bool) -> int:
+    """Check recordings side by side; return 1 if one has an error or cannot be read."""
+    found = {path: path for path in find_all_recordings(named)}
+    tasks = build_tasks("check", "recording", found, None)
+    done: list[tuple[Task, JobResult]] = []
     with crew:
-        for task, answer in outcomes(tasks, crew, "Checking"):
+        for task, answer in iter_results(tasks, crew, "Checking"):
             done.append((task, answer))
-            if not (as_json or failed(answer)):
-                print_line(f"{task.source}: {_line(answer['result'])}")
+            if not (as_json or has_failed(answer)):
+                print_line(f"{task.source}: {_summary_line(answer['result'])}")
     documents = [_document(task, answer) for task, answer in done]
     errors, warnings = (
         sum(one["level"] == level for each in documents for one in each["findings"])
@@ -100,17 +108,18 @@ def _check_many(named: Sequence[Path], crew: Executor, *, as_json: bool) -> int:
             f"{len(documents)} recordings: {sound} without errors; {errors} errors, "
             f"{warnings} warnings"
         )
-    end(done)
+    report_failures(done)
     return 0 if sound == len(documents) else 1
 
 
 def _is_sound(document: dict[str, Any]) -> bool:
+    """Return whether a recording could be read and has no error."""
     wrong = any(one["level"] == "error" for one in document["findings"])
     return not (wrong or "error" in document)
 
 
-def _line(found: dict[str, Any]) -> str:
-    """A recording in one line: how much it holds, and the worst of what is wrong with it."""
+def _summary_line(found: dict[str, Any]) -> str:
+    """Return the size of a recording and its worst finding, in one line."""
     findings = found["findings"]
     errors = sum(one["level"] == "error" for one in findings)
     worst = ""
@@ -123,8 +132,8 @@ def _line(found: dict[str, Any]) -> str:
     )
 
 
-def _document(task: Task, answer: Answer) -> dict[str, Any]:
+def _document(task: Task, answer: JobResult) -> dict[str, Any]:
     named = {"recording": str(task.source)}
-    if failed(answer):
-        return {**named, "error": words_of(task, answer), "findings": []}
+    if has_failed(answer):
+        return {**named, "error": error_text(task, answer), "findings": []}
     return {**named, **answer["result"]}

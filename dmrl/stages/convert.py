@@ -1,42 +1,26 @@
 """``dmrl convert``: foreign files and folders to a recording, and recordings to files.
 
-A new format is one file in ``dmrl/formats`` and one row in ``dmrl.formats.registry``.
+A new format is one file in ``dmrl/formats`` with a ``FORMAT``.
 """
 
-import json
 import re
-from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter, validators
 
 from dmrl.atomic_output import refuse_existing
-from dmrl.errors import SettingError, SourceError
-from dmrl.export.csv_parquet import write_tables
-from dmrl.export.ros2 import write_bag
-from dmrl.formats.base import Content, Options
-from dmrl.formats.registry import format_of
-from dmrl.geometry.camera_file import camera_named
+from dmrl.errors import SettingError
 from dmrl.guards.paths import refuse_pipes
-from dmrl.messages import message
-from dmrl.pipeline.batch import over_folder, recordings_in
-from dmrl.recording import (
-    LICENCES_METADATA,
-    SPLIT_METADATA,
-    RecordingWriter,
-    licence_beside,
-    licence_words,
-    provenance,
-    say_findings,
-    time_slices,
-)
-from dmrl.samples.sample import Sample
-from dmrl.terminal.arguments import AsJson, Flat, On, Workers
-from dmrl.terminal.progress import say, track
-from dmrl.terminal.tables import print_json, print_table
+from dmrl.pipeline.batch import find_recordings
+from dmrl.pipeline.stage_command import stage_command
+from dmrl.terminal.closing import Closing, Given
+from dmrl.terminal.tables import print_table
+
+if TYPE_CHECKING:
+    from dmrl.formats.base import Options
 
 ROBOT = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -47,12 +31,12 @@ Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How a source becomes a recording.
+    """Format of a source, and facts that it does not contain.
 
     Parameters
     ----------
     source_kind
-        What SOURCE is, as docs/sources.md names it. Guessed where it can be.
+        Format of SOURCE, as docs/sources.md names it. Guessed where it can be.
     robot
         Robot that carries the camera, or whose log it is.
     names
@@ -70,8 +54,8 @@ class Settings:
     height_px
         images: crop to the middle and scale to this height. Needs the width too.
     columns
-        TOML file that says what the columns of a CSV file are, with their units, frames and signs,
-        or nanobench.
+        TOML file that describes the columns of a CSV file, with their units, frames and signs, or
+        nanobench.
     raw
         images: grey pictures are as the AI-deck's colour sensor gave them; make them RGB.
     to
@@ -93,16 +77,23 @@ class Settings:
 
 
 def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
-    """Messages per topic of the recording, or rows of the tables, written to ``out``.
+    """Convert a foreign file or folder into a recording, or a recording into files.
 
     Parameters
     ----------
     source
-        A foreign file or folder; with ``settings.to``, a recording.
+        A foreign file or folder: pictures, flight logs, dumps of a camera deck, ROS bags. With a
+        folder as OUT, each thing in it is a source of its own.
     out
-        Recording, or folder, to write. Must not exist.
+        Recording to write, NAME.mcap; with --to, a folder. Must not exist. Another name: the folder
+        of recordings, one for each thing in SOURCE.
     settings
         See `Settings`.
+
+    Returns
+    -------
+    dict
+        Messages per topic of the recording, or rows of the tables.
 
     Raises
     ------
@@ -116,55 +107,32 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
     refuse_existing(out)
     refuse_pipes(source)
     if settings.to == "ros2":
+        from dmrl.export.ros2 import write_bag
+
         return write_bag(source, out)
     if settings.to is not None:
+        from dmrl.export.csv_parquet import write_tables
+
         return write_tables(source, out, settings.to)
-    options = _options(settings)
+    from dmrl.ingest.foreign_source import record_source
+
     kind = settings.source_kind or ("columns" if settings.columns else None)
-    content = format_of(source, kind).content(source, options)
-    given = (settings.labels, settings.camera, settings.columns)
-    read = [path for path in given if path and path.is_file()]
-    licence = licence_beside(source)
-    if licence is not None and source.is_file():
-        read.append(licence)
-    made = provenance("convert", settings, (source, *read), libraries=("pillow", "numpy"))
-    with RecordingWriter(out, made) as sink:
-        if licence is not None:
-            sink.add_metadata(LICENCES_METADATA, {source.name: licence_words(licence)})
-        counts = _write(content, sink)
-    say_findings(out)
-    return counts
+    files = (settings.labels, settings.camera, settings.columns)
+    options = _to_options(settings)
+    return record_source(source, out, kind, options, settings=settings, files=files)
 
 
-def _write(content: Content, sink: RecordingWriter) -> dict[str, int]:
-    counts: Counter[str] = Counter()
-    if content.split:
-        split = {name: json.dumps(times) for name, times in content.split.items()}
-        sink.add_metadata(SPLIT_METADATA, split)
-    single = content.others if content.series else content.samples
-    samples = iter(track(single, "Converting", content.total))
-    waiting = next(samples, None)
-    for first_ns, end_ns in time_slices([one.time_ns for one in content.series]):
-        for series in content.series:
-            part = series.between(first_ns, end_ns)
-            sink.write_columns(part.topic, message(part.message), part.time_ns, part.fields)
-            counts[part.topic] += len(part.time_ns)
-        while waiting is not None and waiting.time_ns < end_ns:
-            counts[_put(waiting, sink)] += 1
-            waiting = next(samples, None)
-    for sample in samples if waiting is None else chain([waiting], samples):
-        counts[_put(sample, sink)] += 1
-    return dict(sorted((+counts).items()))
+def _to_options(settings: Settings) -> "Options":
+    """Return the options of a format.
 
+    Raises
+    ------
+    SettingError
+        If a setting is out of range.
+    """
+    from dmrl.formats.base import Options
+    from dmrl.geometry.camera_file import camera_named
 
-def _put(sample: Sample, sink: RecordingWriter) -> str:
-    """Write a sample; returns its topic."""
-    made = message(sample.message)(**sample.fields)
-    sink.write(sample.time_ns, sample.topic, made, publish_ns=sample.publish_ns)
-    return sample.topic
-
-
-def _options(settings: Settings) -> Options:
     if not ROBOT.fullmatch(settings.robot):
         raise SettingError(f"--robot {settings.robot!r} cannot stand in a topic. Try: cf1")
     width_px, height_px = settings.width_px, settings.height_px
@@ -176,7 +144,7 @@ def _options(settings: Settings) -> Options:
         raise SettingError("--width-px and --height-px go together. Give both, or neither")
     return Options(
         robot=settings.robot,
-        names=_names(settings.names),
+        names=_parse_names(settings.names),
         rate_hz=settings.rate_hz,
         labels=settings.labels,
         camera=None if settings.camera is None else camera_named(settings.camera),
@@ -186,7 +154,8 @@ def _options(settings: Settings) -> Options:
     )
 
 
-def _names(text: str | None) -> dict[str, str]:
+def _parse_names(text: str | None) -> dict[str, str]:
+    """Return the robot of every name in ``OLD=NEW,...``."""
     found = {}
     for part in text.split(",") if text else []:
         old, _, new = part.strip().partition("=")
@@ -196,75 +165,26 @@ def _names(text: str | None) -> dict[str, str]:
     return found
 
 
-def _sources(source: Path, settings: Settings) -> dict[Path, Path]:
-    """What a folder holds that can be converted, by what is made of it."""
+def _find_many(given: Given) -> Mapping[Path, Path] | None:
+    """Return the sources in a folder, by the names of the outputs; None: it is one source."""
+    source, settings = given.source, given.settings
+    if not (source.is_dir() and (settings.to is not None or given.out.suffix != ".mcap")):
+        return None
     if settings.to is not None:
-        return {name.with_suffix(""): path for name, path in recordings_in(source).items()}
-    refuse_pipes(source)
-    found: dict[Path, Path] = {}
-    for path in sorted(source.iterdir()) if source.is_dir() else [source]:
-        try:
-            if path.name.startswith(".") or not format_of(path, settings.source_kind):
-                continue
-        except SourceError as e:
-            say(f"left out: {e}")
-            continue
-        name = Path(path.name if path.is_dir() else path.stem).with_suffix(".mcap")
-        if (twin := found.setdefault(name, path)) is not path:
-            raise SettingError(f"{twin} and {path} would both be {name}. Rename one")
-    if not found:
-        raise SourceError(
-            f"nothing in {source} is of a known kind. If it is one source, name one recording: "
-            "dmrl convert SOURCE OUT.mcap"
-        )
-    return found
+        return {name.with_suffix(""): path for name, path in find_recordings(source).items()}
+    from dmrl.ingest.foreign_source import find_sources
+
+    return find_sources(source, settings.source_kind)
 
 
-DEFAULTS = Settings()
+def _show(counts: dict[str, int], given: Given) -> None:
+    columns = ("topic", "rows" if given.settings.to else "messages")
+    print_table(str(given.out), columns, list(counts.items()))
 
 
-def command(
-    source: Path,
-    out: Path,
-    /,
-    *,
-    settings: Flat[Settings] = DEFAULTS,
-    workers: Workers = None,
-    on: On = None,
-    as_json: AsJson = False,
-) -> None:
-    """Convert a foreign file or folder into a recording, or a recording into files.
-
-    Parameters
-    ----------
-    source
-        A foreign file or folder: pictures, flight logs, dumps of a camera deck, ROS bags. With a
-        folder as OUT, each thing in it is a source of its own.
-    out
-        Recording to write, NAME.mcap; with --to, a folder. Must not exist. Another name: the folder
-        of recordings, one for each thing in SOURCE.
-    workers
-        Of a folder: sources at a time, at most. Without it, as many as there are cores. Changes
-        no byte.
-    as_json
-        Print one JSON document in place of the table.
-    """
-    many = source.is_dir() and (settings.to is not None or out.suffix != ".mcap")
-    if many or on is not None:
-        over_folder(
-            "convert",
-            source,
-            out if many else out.parent,
-            settings,
-            workers=workers,
-            on=on,
-            as_json=as_json,
-            role="source",
-            found=_sources(source, settings) if many else {Path(out.name): source},
-        )
-        return
-    counts = run(source, out, settings)
-    if as_json:
-        print_json({"recording": str(out), "messages": counts})
-        return
-    print_table(str(out), ("topic", "rows" if settings.to else "messages"), list(counts.items()))
+command = stage_command(
+    run,
+    Closing(show=_show, path_key="recording", result_key="messages"),
+    folder="source",
+    find=_find_many,
+)

@@ -1,10 +1,7 @@
-"""``dmrl demo``: the whole pipeline, small, on what ships with dmrl."""
+"""``dmrl demo``: the whole pipeline, small, on shipped data."""
 
 from pathlib import Path
 
-from dmrl.evaluation.pipeline_summary import report
-from dmrl.html_report import write
-from dmrl.pipeline import recipe_run as pipeline
 from dmrl.terminal.arguments import AsJson
 
 
@@ -24,19 +21,21 @@ def command(
     ----------
     out
         Folder for every output.
-    as_json
-        Print one JSON document in place of the table.
     """
+    from dmrl.evaluation.pipeline_summary import report
+    from dmrl.html_report import write
+    from dmrl.pipeline import recipe_run as pipeline
+
     report(pipeline.run("demo", out), as_json=as_json)
     page = write(out)
     if not as_json:
-        print(f"""{page}: open it in a browser; {_picture(out)} is a picture of it. Now try:
+        print(f"""{page}: open it in a browser; {_find_picture(out)} is a picture of it. Now try:
   dmrl view {out}/predictions.mcap       # the same in rerun, image by image
   dmrl fly fly_in_view flight.mcap && dmrl label flight.mcap labelled.mcap
   dmrl predict dmrl-nano YOUR.mcap found.mcap   # the network that ships, on your own images""")
 
 
-def _picture(out: Path) -> Path:
-    """What rerun drew; where it could not, what matplotlib did of the same images."""
+def _find_picture(out: Path) -> Path:
+    """Return the picture that rerun drew, or else the one that matplotlib drew."""
     drawn = out / "picture.png"
     return drawn if drawn.is_file() else out / "evaluation" / "examples.png"

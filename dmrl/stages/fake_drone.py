@@ -1,237 +1,38 @@
 """``dmrl fake-drone``: a simulated flight, sent as Crazyflies and AI-decks send theirs."""
 
-import re
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
-from urllib.parse import urlsplit
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
-from cyclopts import Parameter, validators
+from cyclopts import Parameter
 
-from dmrl import topics
-from dmrl.errors import RecordingError, SettingError
-from dmrl.geometry.frames import Array
-from dmrl.live.log_blocks import number_of
-from dmrl.live.simulated.aideck_server import FakeCamera, Sends
-from dmrl.live.simulated.crazyflie_server import FakeCrazyflie
-from dmrl.live.simulated.flight_source import FakeFlight, Faults, FlightClock, Pictures
-from dmrl.recording import read, read_table, summary
+from dmrl.simulation.settings import DroneSettings as Settings
 from dmrl.terminal.arguments import Flat
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_table
 
-LOOPBACK = "127.0.0.1"
+if TYPE_CHECKING:
+    from dmrl.simulation.drone_fleet import Fleet
+
 LINGER_S = 3.0
-"""For so long at most the drones answer after the flight, while somebody still listens."""
-DIES = re.compile(r"(?P<robot>[\w-]+)=(?P<first>\d+(\.\d+)?)(:(?P<last>\d+(\.\d+)?))?")
+"""Longest time that drones answer after the flight, while somebody still listens."""
 COLUMNS = ("from", "sent", "dropped")
+DEFAULTS = Settings()
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """What the drones send, and what goes wrong with them.
-
-    Parameters
-    ----------
-    sends
-        Form of the images: raw ones in Bitcraze's layout (plain), with its time stamp
-        (stamped) or in nanocockpit's (streamer); or jpeg.
-    drop
-        Share of log packets and images that are not sent, 0 to 1.
-    dies
-        ROBOT=S: that robot is silent from second S of the flight; ROBOT=S:T: until T, when
-        it starts anew. Repeat for more.
-    speed
-        Seconds of the flight per second.
-    boot_ms
-        What the drones' clocks show at take-off; they wrap after 16777216 ms.
-    drift_ppm
-        How much faster each drone's clock runs than the one before.
-    seed
-        Another seed drops others.
-    """
-
-    sends: Sends = "plain"
-    drop: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=1))] = 0.0
-    dies: Annotated[tuple[str, ...], Parameter(negative=())] = ()
-    speed: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=100))] = 1.0
-    boot_ms: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 12_340.0
-    drift_ppm: float = 0.0
-    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Fleet:
-    """Drones and cameras, listening."""
-
-    drones: tuple[FakeCrazyflie, ...]
-    cameras: tuple[FakeCamera, ...]
-    clock: FlightClock
-
-    def listened(self) -> bool:
-        """Whether any drone's log is still asked for."""
-        return any(drone.listened for drone in self.drones)
-
-    def sent(self) -> list[tuple[str, int, int]]:
-        """Who sent how much and dropped how much: a row of `COLUMNS` each."""
-        rows = [(drone.robot, drone.sent, drone.dropped) for drone in self.drones]
-        return rows + [(f"{c.robot} camera", c.sent, c.dropped) for c in self.cameras]
-
-
-@contextmanager
-def fleet(
-    flight: Path, uris: Sequence[str], cameras: Sequence[int], settings: Settings
-) -> Iterator[Fleet]:
-    """Drones that answer inside the block.
-
-    Parameters
-    ----------
-    flight
-        A recording with attitude, velocity, height and distances.
-    uris
-        Where each robot of the flight listens, in the order of their names.
-    cameras
-        Port of each robot's camera; 0: any.
-    settings
-        See `Settings`.
-
-    Raises
-    ------
-    SettingError
-        If there are more addresses than robots, or one cannot be had.
-    RecordingError
-        If the flight lacks what a drone logs, or a camera's pictures.
-    """
-    robots = _robots(flight, uris, cameras)
-    faults = _faults(robots, settings)
-    flights = {robot: _flight(flight, robot) for robot in robots}
-    clock = FlightClock(settings.speed, max(f.end_s for f in flights.values()))
-    start_ns = summary(flight).start_ns
-    drones: list[FakeCrazyflie] = []
-    eyes: list[FakeCamera] = []
-    # Each has its socket as soon as it is made, so what was made is ended if the next fails.
-    with ExitStack() as made:
-        made.callback(_end, drones, eyes)
-        for k, (robot, uri) in enumerate(zip(robots, uris, strict=False)):
-            seed = settings.seed * 1000 + k
-            behaves = flights[robot], clock, faults[robot], seed
-            drones.append(FakeCrazyflie(robot, address(uri), *behaves))
-        for k, (robot, port) in enumerate(zip(robots, cameras, strict=False)):
-            pictures, seed = _pictures(flight, robot, start_ns), settings.seed * 1000 + 500 + k
-            sends = pictures, clock, faults[robot], settings.sends, seed
-            eyes.append(FakeCamera(robot, (LOOPBACK, port), *sends))
-        for thread in (*drones, *eyes):
-            thread.start()
-        yield Fleet(tuple(drones), tuple(eyes), clock)
-
-
-def _end(drones: Sequence[FakeCrazyflie], cameras: Sequence[FakeCamera]) -> None:
-    """Stop all, then wait for each: they end at the same time."""
-    threads: tuple[FakeCrazyflie | FakeCamera, ...] = (*drones, *cameras)
-    for thread in threads:
-        thread.stop()
-    for thread in threads:
-        thread.close()
-        if thread.is_alive():
-            thread.join(timeout=5.0)
-
-
-def _robots(flight: Path, uris: Sequence[str], cameras: Sequence[int]) -> list[str]:
-    known = topics.robots(tuple(summary(flight).topics), topics.ATTITUDE)
-    if not known:
-        raise RecordingError(f"{flight} has no /<robot>/attitude. Make one: dmrl fly")
-    if not 0 < len(uris) <= len(known) or len(cameras) > len(uris):
-        raise SettingError(
-            f"{len(uris)} --uri and {len(cameras)} --camera for {len(known)} robots "
-            f"({', '.join(known)}). Give a --uri for each that shall fly, then their cameras"
-        )
-    if wrong := [port for port in cameras if not 0 <= port < 65536]:
-        raise SettingError(f"--camera {wrong[0]}: ports go from 1 to 65535. Name another")
-    pictured = topics.robots(tuple(summary(flight).topics))
-    if blind := [robot for robot in known[: len(cameras)] if robot not in pictured]:
-        raise RecordingError(f"{flight} has no pictures of {blind[0]}. Try: dmrl fly --camera")
-    return known[: len(uris)]
-
-
-def address(uri: str) -> tuple[str, int]:
-    """Host and port of "udp://HOST:PORT".
-
-    Raises
-    ------
-    SettingError
-        If it is not that.
-    """
-    try:
-        parts = urlsplit(uri)
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        host = port = None
-    if not uri.startswith("udp://") or not host or port is None:
-        raise SettingError(f"--uri {uri}: write udp://HOST:PORT, such as udp://127.0.0.1:19850")
-    return host, port
-
-
-def _faults(robots: Sequence[str], settings: Settings) -> dict[str, Faults]:
-    dead: dict[str, tuple[float, float]] = {}
-    for text in settings.dies:
-        found = DIES.fullmatch(text)
-        if found is None or found["robot"] not in robots:
-            raise SettingError(
-                f"--dies {text}: write ROBOT=S or ROBOT=S:T with one of {', '.join(robots)}"
-            )
-        last = float(found["last"]) if found["last"] else float("inf")
-        dead[found["robot"]] = float(found["first"]), last
-    alive = (float("inf"), float("inf"))
-    return {
-        robot: Faults(
-            settings.drop, dead.get(robot, alive), settings.boot_ms, k * settings.drift_ppm
-        )
-        for k, robot in enumerate(robots)
-    }
-
-
-def _flight(path: Path, robot: str) -> FakeFlight:
-    start_ns, held = summary(path).start_ns, summary(path).topics
-    numbered = (n for t in held if (n := topics.names(topics.RANGE, t)) and n["robot"] == robot)
-    peers = sorted(n["peer"] for n in numbered if number_of(n["peer"]) is not None)
-
-    def signal_of(topic: str, *fields: str) -> tuple[Array, Array]:
-        table = read_table(path, topic, fields=fields)
-        if not table.num_rows:
-            raise RecordingError(f"{path}: {topic} is empty. Take another flight")
-        values = np.column_stack([table[field].to_numpy() for field in fields]).astype(float)
-        return (table["log_time"].to_numpy() - start_ns) * 1e-9, values
-
-    angles = ("roll_rad", "pitch_rad", "yaw_rad", "yaw_rate_radps")
-    height_s, height = signal_of(topics.height(robot), "height_m")
-    ranges = {peer: signal_of(topics.uwb_range(robot, peer), "range_m") for peer in peers}
-    return FakeFlight(
-        signal_of(topics.attitude(robot), *angles),
-        signal_of(topics.velocity(robot), "vx_mps", "vy_mps"),
-        (height_s, height[:, 0]),
-        {peer: (time_s, range_m[:, 0]) for peer, (time_s, range_m) in ranges.items()},
-    )
-
-
-def _pictures(path: Path, robot: str, start_ns: int) -> Pictures:
-    for stamped in read(path, topics.camera_image(robot)):
-        yield (stamped.time_ns - start_ns) * 1e-9, stamped.message.data
-
-
-def run(flight: Path, uris: Sequence[str], cameras: Sequence[int], settings: Settings) -> Fleet:
-    """Fly until the flight is over, or Ctrl-C. What was sent.
+def run(flight: Path, uris: Sequence[str], cameras: Sequence[int], settings: Settings) -> "Fleet":
+    """Send the flight until it is over, or Ctrl-C; return the drones.
 
     Raises
     ------
     SettingError, RecordingError
-        As `fleet`.
+        As `dmrl.simulation.drone_fleet.fleet`.
     """
+    from dmrl.simulation.drone_fleet import LOOPBACK, fleet
+
     ended = threading.Event()
     with fleet(flight, uris, cameras, settings) as flying:
         previous = signal.signal(signal.SIGINT, lambda *_: ended.set())
@@ -248,9 +49,6 @@ def run(flight: Path, uris: Sequence[str], cameras: Sequence[int], settings: Set
         finally:
             signal.signal(signal.SIGINT, previous)
     return flying
-
-
-DEFAULTS = Settings()
 
 
 def command(

@@ -1,27 +1,25 @@
 """``dmrl index``: a folder of recordings as one table, which `dmrl find` asks."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import pyarrow as pa
-
-from dmrl.catalogue import Row, describe, open_catalogue, unread
-from dmrl.catalogue.table import rows_table, stamp
-from dmrl.pipeline.batch import outcomes, recordings_in, tasks_of, words_of
-from dmrl.pipeline.executor import Executor, executor
-from dmrl.pipeline.job import failed
+from dmrl.pipeline.batch import build_tasks, error_text, find_recordings, iter_results
+from dmrl.pipeline.executor import Executor, open_executor
+from dmrl.pipeline.job import has_failed
 from dmrl.terminal.arguments import AsJson, On, Workers
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line
 
-AT_ONCE = 500
-"""Rows that are held as Python's values."""
+if TYPE_CHECKING:
+    from dmrl.catalogue import Row
+    from dmrl.catalogue.row_buffer import RowBuffer
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """How many recordings there are, and how many of them were looked at, known, unreadable."""
+    """Number of recordings, and of those that were read, known before, gone and unreadable."""
 
     recordings: int
     looked_at: int
@@ -30,34 +28,15 @@ class Result:
     unread: int
 
 
-@dataclass(slots=True)
-class _Rows:
-    """Rows as they come, most of them as Arrow."""
+def run(recording: Path) -> "Row":
+    """Return the row of a recording; see `dmrl.catalogue.describe`."""
+    from dmrl.catalogue import describe
 
-    parts: list[pa.Table] = field(default_factory=lambda: [rows_table([])])
-    held: list[Row] = field(default_factory=list)
-
-    def add(self, row: Row) -> None:
-        self.held.append(row)
-        if len(self.held) >= AT_ONCE:
-            self._settle()
-
-    def table(self) -> pa.Table:
-        self._settle()
-        return pa.concat_tables(self.parts)
-
-    def _settle(self) -> None:
-        self.parts.append(rows_table(self.held))
-        self.held.clear()
-
-
-def run(recording: Path) -> Row:
-    """The row of a recording; see `dmrl.catalogue.describe`."""
     return describe(recording)
 
 
 def update(folder: Path, workers: int | None = None, on: str | None = None) -> Result:
-    """Bring the catalogue of a folder up to date; if it is stopped, what was seen is kept.
+    """Update the catalogue of a folder; if it is stopped, rows made so far are kept.
 
     Parameters
     ----------
@@ -78,19 +57,23 @@ def update(folder: Path, workers: int | None = None, on: str | None = None) -> R
     UnicodeEncodeError
         If a file's name is no text.
     """
+    from dmrl.catalogue import open_catalogue
+    from dmrl.catalogue.row_buffer import RowBuffer
+    from dmrl.catalogue.table import stamp
+
     before = open_catalogue(folder, new=True)
-    found = {name.as_posix(): path for name, path in recordings_in(folder).items()}
+    found = {name.as_posix(): path for name, path in find_recordings(folder).items()}
     for name in found:
         name.encode()  # what no table can hold is said before the work, not after
     stamps = {name: stamp(path) for name, path in found.items()}
     kept = before.unchanged(stamps)
-    rows = _Rows()
+    rows = RowBuffer()
     new = {name: path for name, path in found.items() if name not in kept}
     try:
         if new:
-            _look_at(new, stamps, rows, executor(on, workers))
+            _describe_all(new, stamps, rows, open_executor(on, workers))
     finally:
-        fresh = rows.table()
+        fresh = rows.to_table()
         after = before.with_rows(kept, fresh)
         if not after.table.equals(before.table) or not before.file.exists():
             after.save()
@@ -99,15 +82,17 @@ def update(folder: Path, workers: int | None = None, on: str | None = None) -> R
     return Result(after.table.num_rows, fresh.num_rows, len(kept), gone, bad)
 
 
-def _look_at(
-    new: Mapping[str, Path], stamps: Mapping[str, str], rows: _Rows, crew: Executor
+def _describe_all(
+    new: Mapping[str, Path], stamps: Mapping[str, str], rows: "RowBuffer", crew: Executor
 ) -> None:
     """Describe recordings side by side."""
+    from dmrl.catalogue import unread
+
     names = {path: name for name, path in new.items()}
-    tasks = tasks_of("index", "recording", {path: path for path in names}, None)
+    tasks = build_tasks("index", "recording", {path: path for path in names}, None)
     with crew:
-        for task, answer in outcomes(tasks, crew, "Indexing"):
-            row = unread(words_of(task, answer)) if failed(answer) else answer["result"]
+        for task, answer in iter_results(tasks, crew, "Indexing"):
+            row = unread(error_text(task, answer)) if has_failed(answer) else answer["result"]
             name = names[task.source]
             size = int(stamps[name].split()[0])
             rows.add({**row, "recording": name, "bytes": size, "stamp": stamps[name]})
@@ -116,7 +101,7 @@ def _look_at(
 def command(
     folder: Path, /, *, workers: Workers = None, on: On = None, as_json: AsJson = False
 ) -> None:
-    """List what a folder's recordings hold in one table, catalogue.parquet, for dmrl find.
+    """List a folder's recordings and their contents in catalogue.parquet, for dmrl find.
 
     Run it again when recordings came, went or changed: only those are looked at.
 
@@ -126,9 +111,9 @@ def command(
         Folder of recordings, searched to its depths. The table is written into it.
     workers
         Recordings at a time, at most. Without it, as many as there are cores.
-    as_json
-        Print one JSON document in place of the line.
     """
+    from dmrl.catalogue import open_catalogue
+
     result = update(folder, workers, on)
     catalogue = open_catalogue(folder)
     if as_json:

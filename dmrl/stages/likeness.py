@@ -1,105 +1,31 @@
-"""``dmrl likeness``: what one's own camera does to its pictures, as a recipe for renders."""
+"""``dmrl likeness``: a render recipe fitted to the images of a camera."""
 
-import math
-from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass
-from itertools import islice
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
-from cyclopts import Parameter, validators
+from cyclopts import Parameter
 
-from dmrl import recipe as recipes
-from dmrl import topics
-from dmrl.atomic_output import partial_file, partial_of, refuse_existing
-from dmrl.datasets.backgrounds import photos_of
-from dmrl.errors import RecordingError, SettingError
-from dmrl.formats.files.image_folder import list_pictures
-from dmrl.images.codec import Rgb, decode, size
-from dmrl.recording import read, summary
-from dmrl.rendering import settings as looks
-from dmrl.rendering.backgrounds.rooms import ROOMS
-from dmrl.rendering.camera.image_statistics import FIGURES, Likeness, Seen, seen
-from dmrl.rendering.contact_sheet import evenly, sheet
-from dmrl.rendering.preset_fitting import KNOBS, ROUNDS, fitted, pictures, scenes
-from dmrl.terminal.arguments import AsJson, Flat
-from dmrl.terminal.progress import say, track
-from dmrl.terminal.tables import print_json, print_line, print_table
+from dmrl.pipeline.stage_command import stage_command
+from dmrl.simulation.settings import LikenessSettings as Settings
+from dmrl.terminal.closing import Closing, Given
 
-LEAST_PX, MOST_PX = 48, 2_100_000
-"""Side of a frame, at least; pixels of one, at most."""
-TOGETHER_PX = 100_000_000
-"""Of all frames, at most; of large ones fewer are looked at."""
-FEW = 20
-WORDS = {
-    "brightness": "mean luma, 0 to 1",
-    "contrast": "contrast, of luma",
-    "cast": "red over blue",
-    "colour": "spread of colours",
-    "edge_px": "width of edges, px",
-    "corners": "corners over middle",
-    "grain": "grain, levels of 256",
-    "grain_correlation": "grain, neighbours alike",
-}
-SMALL, WHITE_NOISE = 0.1, 0.15
-"""A figure under it is compared by its difference: of hardly anything, per cent say nothing. A
-correlation under the second is that of white noise and its error."""
-FAR = 0.2
-WHITE, MUCH_WHITE = 250, 0.4
+if TYPE_CHECKING:
+    from dmrl.simulation.camera_likeness import Result
 
 
-Count = Annotated[int, Parameter(validator=validators.Number(gte=2))]
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """What is fitted, to how many frames.
-
-    Parameters
-    ----------
-    preset
-        Of dmrl render, to start from: plain, himax or published.
-    backgrounds
-        What stands for the scene: rooms, which are made by code, a folder of photos, or a dataset.
-    frames
-        Frames that are looked at, at most, evenly over all.
-    seed
-        Of the pictures that are made for comparison.
-    """
-
-    preset: str = "himax"
-    backgrounds: Path = Path(ROOMS)
-    frames: Count = 200
-    seed: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """Figures of real frames, of both their halves, of the preset's pictures and the fitted ones.
-
-    ``keys`` are the recipe's, ``notes`` what cannot be known, a sentence each.
-    """
-
-    frames: int
-    real: Likeness
-    halves: tuple[Likeness, ...]
-    preset: Likeness
-    fitted: Likeness
-    keys: dict[str, object]
-    notes: list[str]
-
-
-def run(real: Path, out: Path, settings: Settings) -> Result:
-    """Measure real frames, fit a preset to them, and write it as a recipe, with a picture beside.
+def run(
+    real: Path, out: Annotated[Path, Parameter(name="OUT.toml")], settings: Settings
+) -> "Result":
+    """Fit a render recipe to one's own frames, and show both beside each other.
 
     Parameters
     ----------
     real
         Folder of frames as the camera stores them, or a recording with images.
     out
-        Recipe to write; the picture is of the same name and ends in .png. Neither may exist.
+        Recipe to write. A picture of the same name, .png, shows two rows of real frames, two of
+        the preset's pictures, two of the recipe's.
     settings
         See `Settings`.
 
@@ -117,211 +43,21 @@ def run(real: Path, out: Path, settings: Settings) -> Result:
     OutputError
         If the recipe or the picture exists.
     """
-    if not out.name or out.suffix == ".png":
-        raise SettingError(f"{out} is no name of a recipe. Write one: OUT.toml")
-    picture = out.with_suffix(".png")
-    refuse_existing(out)
-    if not partial_of(out).exists():  # else one that was killed may have left the picture
-        refuse_existing(picture)
-    own = _frames(real, settings.frames)
-    preset = {"preset": settings.preset}
-    start = recipes.check(settings.preset, looks.filled(preset), looks.Settings)
-    photos = photos_of(settings.backgrounds)
-    measured = seen(own)
-    _refuse_nothing(real, own, measured)
-    size_px = (own[0].shape[1], own[0].shape[0])
-    there = scenes(photos, start, size_px, settings.seed)
-    *_, found = track(fitted(measured, start, there, settings.seed), "Fitting", ROUNDS)
-    fresh = settings.seed + 1  # what the fit has not seen
-    there = scenes(photos, start, size_px, fresh)
-    before, after = (list(pictures(way, there, fresh)) for way in (start, found))
-    keys = _keys(found, start)
-    _write(out, _recipe(settings.preset, keys), picture, sheet([own, before, after]))
-    middle = max(len(own) // 2, 1)
-    parts = (own[:middle], own[-middle:]) if len(own) > 1 else ()
-    wanted, got = measured.likeness(), seen(after).likeness()
-    return Result(
-        frames=len(own),
-        real=wanted,
-        halves=tuple(seen(part).likeness() for part in parts),
-        preset=seen(before).likeness(),
-        fitted=got,
-        keys=keys,
-        notes=_notes(real, own, wanted, got),
-    )
+    from dmrl.simulation.camera_likeness import fit_preset
+
+    return fit_preset(real, out, settings)
 
 
-def _refuse_nothing(real: Path, own: Sequence[Rgb], measured: Seen) -> None:
-    """Raise SettingError if frames are of two kinds, or none shows anything."""
-    grey = sum(bool(np.ptp(rgb, axis=2).max() == 0) for rgb in own)
-    if 0 < grey < len(own):
-        raise SettingError(
-            f"{real} holds {grey} grey frames and {len(own) - grey} with colours. Give frames of "
-            "one camera alone"
-        )
-    if not measured.values("contrast").max() > 0:
-        level = measured.middle("brightness") or 0.0
-        raise SettingError(
-            f"{real}: every frame is one plain colour, of brightness {level:.2f}: nothing to "
-            "measure. Give frames in which something is seen"
-        )
+def _document(result: "Result", given: Given) -> dict[str, Any]:
+    picture = given.out.with_suffix(".png")
+    return {"recipe": str(given.out), "picture": str(picture), **asdict(result)}
 
 
-def _notes(real: Path, own: Sequence[Rgb], wanted: Likeness, got: Likeness) -> list[str]:
-    """What of the frames cannot be known or was not reached, a sentence each."""
-    notes = []
-    if len(own) < FEW:
-        frames = "frame" if len(own) == 1 else "frames"
-        notes.append(f"{real} holds {len(own)} {frames}: few to know a camera by. {FEW} are better")
-    white = float(np.mean([(rgb.min(axis=2) >= WHITE).mean() for rgb in own]))
-    if white > MUCH_WHITE:
-        notes.append(
-            f"{white:.0%} of the pixels of {real} are white: overexposed, nothing is known there"
-        )
-    unknown = [WORDS[name] for name in FIGURES if getattr(wanted, name) is None]
-    if unknown:
-        notes.append(
-            f"{real} does not show {', '.join(unknown)}: it is left as the preset has it. Frames "
-            "with plain walls and sharp edges, neither black nor white, would show it"
-        )
-    off = {name: _apart(name, getattr(wanted, name), getattr(got, name))[0] for name in FIGURES}
-    if far := [WORDS[name] for name in FIGURES if abs(off[name]) > FAR]:
-        notes.append(
-            f"the fit is off by more than a fifth in {', '.join(far)}: no range of the preset "
-            "reaches it over these backgrounds. Photos nearer to the frames may: --backgrounds DIR"
-        )
-    return notes
-
-
-def _write(out: Path, recipe: str, picture: Path, sheet: bytes) -> None:
-    """Write the picture, then the recipe; an error leaves neither.
-
-    A process that is killed between the two leaves the picture: the same picture is no obstacle.
-    """
-    there = picture.is_file() and picture.read_bytes() == sheet
-    made = False
-    try:
-        with partial_file(out) as partial:
-            partial.write_text(recipe, encoding="utf-8")
-            if not there:
-                with partial_file(picture) as beside:
-                    beside.write_bytes(sheet)
-                made = True
-    except BaseException:
-        if made:
-            with suppress(OSError):
-                picture.unlink()
-        raise
-
-
-def _frames(real: Path, most: int) -> list[Rgb]:
-    """Frames of a folder or recording, at most so many, evenly over all."""
-    if real.is_dir():
-        paths = [path for _, path in list_pictures(real, 10.0)]
-        data = [(paths[k].read_bytes(), str(paths[k])) for k in evenly(len(paths), most)]
-    else:
-        held = summary(real).topics
-        topic = next((name for name in held if topics.names(topics.CAMERA_IMAGE, name)), None)
-        if topic is None:
-            raise RecordingError(f"{real} has no images. Give a folder of frames, or another")
-        chosen, count = set(evenly(held[topic].count, most)), held[topic].count
-        stream = enumerate(islice(read(real, topic), count))
-        data = [(bytes(s.message.data), f"{real}: image {k}") for k, s in stream if k in chosen]
-    sizes = sorted({size(content, name)[:2] for content, name in data})
-    if len(sizes) != 1:
-        words = ", ".join(f"{width}x{height}" for width, height in sizes)
-        raise SettingError(f"{real} holds frames of {words} px. Give frames of one camera alone")
-    ((width, height),) = sizes
-    if min(sizes[0]) < LEAST_PX or width * height > MOST_PX:
-        small = min(sizes[0]) < LEAST_PX
-        way = f"at least {LEAST_PX} px each way" if small else "1920x1080 at most, as flown"
-        raise SettingError(
-            f"{real}: frames of {width}x{height} px are too {'small' if small else 'large'} to "
-            f"measure. Give frames of {way}"
-        )
-    few = evenly(len(data), max(2, TOGETHER_PX // (width * height)))
-    return [decode(*data[k]) for k in few]
-
-
-def _keys(found: looks.Settings, start: looks.Settings) -> dict[str, object]:
-    """What the fit changed, as a recipe has it."""
-    names = [*(knob.key for knob in KNOBS), "bayer", "jpeg_quality", "image_format"]
-    changed = {name: getattr(found, name) for name in names}
-    return {
-        name: [_rounded(end) for end in value] if isinstance(value, tuple) else value
-        for name, value in changed.items()
-        if value != getattr(start, name)
-    }
-
-
-def _rounded(value: float) -> float:
-    """Three digits that count: more is not known."""
-    return value if not value else round(value, 2 - math.floor(math.log10(abs(value))))
-
-
-def _recipe(preset: str, keys: dict[str, object]) -> str:
-    own = [f"{name} = {_toml(value)}" for name, value in keys.items()]
-    lines = [
-        "# Renders that look like one's own frames, as dmrl likeness found.",
-        "# dmrl render THIS.toml renders.mcap --backgrounds rooms --camera camera.toml",
-        *("", 'kind = "render"', f'preset = "{preset}"', "", *own, ""),
-    ]
-    return "\n".join(lines)
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f'"{value}"' if isinstance(value, str) else str(value)
-
-
-DEFAULTS = Settings()
-
-
-def command(
-    real: Path,
-    out: Annotated[Path, Parameter(name="OUT.toml")],
-    /,
-    *,
-    settings: Flat[Settings] = DEFAULTS,
-    as_json: AsJson = False,
-) -> None:
-    """Fit a render recipe to one's own frames, and show both beside each other.
-
-    Parameters
-    ----------
-    real
-        Folder of frames as the camera stores them, or a recording with images.
-    out
-        Recipe to write. A picture of the same name, .png, shows two rows of real frames, two of
-        the preset's pictures, two of the recipe's.
-    as_json
-        Print one JSON document in place of the table.
-    """
-    result = run(real, out, settings)
-    for note in result.notes:
-        say(note)
-    if as_json:
-        print_json({"recipe": str(out), "picture": str(out.with_suffix(".png")), **asdict(result)})
-        return
-    head = ("figure", f"{result.frames} real", settings.preset, "fitted", "off", "halves of real")
-    rows = [(WORDS[name], *_row(result, name)) for name in FIGURES]
-    print_table(str(out), head, rows)
-    print_line(f"beside each other: {out.with_suffix('.png')}")
-
-
-def _row(result: Result, name: str) -> list[str]:
-    """A figure of all, how far the fit is off, and how far the halves of the frames are apart."""
-    three = [getattr(one, name) for one in (result.real, result.preset, result.fitted)]
-    halves = [getattr(half, name) for half in result.halves] or [None, None]
-    words = ["-" if value is None else f"{value:.3f}" for value in three]
-    return [*words, _apart(name, three[0], three[2])[1], _apart(name, *halves)[1]]
-
-
-def _apart(name: str, first: float | None, second: float | None) -> tuple[float, str]:
-    """How much more the second is: a share, or a difference where there is hardly any; in words."""
-    if first is None or second is None:
-        return 0.0, "-"
-    if abs(first) < (WHITE_NOISE if name == "grain_correlation" else SMALL):
-        return second - first, f"{second - first:+.3f}"
-    return second / first - 1, f"{second / first - 1:+.0%}"
+command = stage_command(
+    run,
+    Closing(
+        show=lambda result, given: result.print(given.out, given.settings.preset),
+        document=_document,
+    ),
+    warnings=lambda result, _: result.notes,
+)

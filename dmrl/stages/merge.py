@@ -7,13 +7,14 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl.errors import SettingError
-from dmrl.pipeline.batch import all_recordings
-from dmrl.recording import merge, say_findings
+from dmrl.pipeline.batch import find_all_recordings
 from dmrl.terminal.tables import print_line
 
 
 def run(recordings: Sequence[Path], out: Path) -> int:
-    """Messages of the recordings merged into ``out``; see `dmrl.recording.merge`."""
+    """Merge recordings into ``out``; return the number of messages. See `dmrl.recording.merge`."""
+    from dmrl.recording import merge, say_findings
+
     count = merge(recordings, out)
     say_findings(out)
     return count
@@ -33,10 +34,9 @@ def command(
     Of equal times, messages of the earlier named recording come first.
     """
     *named, out = recordings or [Path()]
-    inputs = all_recordings(named)
+    inputs = find_all_recordings(named)
     if len(inputs) < 2:
         raise SettingError(
             "merge wants two recordings or more and OUT: dmrl merge A.mcap B.mcap OUT.mcap"
         )
-    count = run(inputs, out)
-    print_line(f"{out}: {count} messages of {len(inputs)} recordings")
+    print_line(f"{out}: {run(inputs, out)} messages of {len(inputs)} recordings")

@@ -2,27 +2,16 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from dmrl.pipeline.batch import is_many, over_folder
-from dmrl.recording import Recovery, recover
-from dmrl.terminal.arguments import AsJson, On, Workers
-from dmrl.terminal.tables import print_json, print_line
+from dmrl.pipeline.stage_command import stage_command
+from dmrl.terminal.closing import Closing
 
-
-def run(recording: Path, out: Path) -> Recovery:
-    """What was brought back of ``recording`` into ``out``; see `dmrl.recording.recover`."""
-    return recover(recording, out)
+if TYPE_CHECKING:
+    from dmrl.recording import Recovery
 
 
-def command(
-    recording: Path,
-    out: Path,
-    /,
-    *,
-    workers: Workers = None,
-    on: On = None,
-    as_json: AsJson = False,
-) -> None:
+def run(recording: Path, out: Path) -> "Recovery":
     """Bring back the messages of a recording that was cut short.
 
     Every message that can be read is kept, bit for bit; a chunk that fails its CRC is left
@@ -33,26 +22,16 @@ def command(
     recording
         A damaged recording, or the .partial file of a killed run; or a folder of recordings.
     out
-        Recording to write. Must not exist. For a folder: the folder of what is made, under the
+        Recording to write. Must not exist. For a folder: the folder of the outputs, under the
         same names.
-    workers
-        Of a folder: recordings at a time, at most. Without it, as many as there are cores.
-        Changes no byte.
-    as_json
-        Print one JSON document instead of a line.
     """
-    if is_many(recording) or on is not None:
-        over_folder("recover", recording, out, workers=workers, on=on, as_json=as_json)
-        return
-    result = run(recording, out)
-    if as_json:
-        print_json(asdict(result))
-        return
-    print_line(f"{out}: {result.messages} messages brought back; {_lost(result)}")
+    from dmrl.recording import recover
+
+    return recover(recording, out)
 
 
-def _lost(result: Recovery) -> str:
-    """What was lost, in words."""
+def _losses(result: "Recovery") -> str:
+    """Describe everything that could not be brought back."""
     if result.whole:
         sure = "" if result.counted else " as far as can be told: it does not say what it had"
         return f"nothing was lost{sure}"
@@ -68,3 +47,15 @@ def _lost(result: Recovery) -> str:
         unknown * (not result.counted),
     )
     return ", ".join(part for part in parts if part)
+
+
+command = stage_command(
+    run,
+    Closing(
+        lines=lambda result, given: [
+            f"{given.out}: {result.messages} messages brought back; {_losses(result)}"
+        ],
+        document=lambda result, _: asdict(result),
+    ),
+    folder="recording",
+)

@@ -1,264 +1,24 @@
 """``dmrl train``: an Arrow dataset to a run folder with a trained network."""
 
-import time
-from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
-import pyarrow.compute as pc
 from cyclopts import Parameter
 
-from dmrl import recipe as recipes
-from dmrl.atomic_output import partial_folder, partial_of, refuse_existing
-from dmrl.datasets import Split, open_dataset
-from dmrl.errors import MissingExtra, ModelError, OutputError, SettingError
-from dmrl.learn.pretrained import resolved
-from dmrl.recording import provenance
+from dmrl.guards.lazy_names import import_lazily
 from dmrl.terminal.arguments import AsJson, Flat
-from dmrl.terminal.progress import track
-from dmrl.terminal.tables import print_json, print_table
+from dmrl.terminal.closing import Closing, Given
 
-try:
-    from dmrl.datasets.training_examples import material
-    from dmrl.learn.data.batches import Examples
-    from dmrl.learn.inference.confidence_calibration import Calibration, calibrate, calibration
-    from dmrl.learn.inference.loaded_model import (
-        PUBLISHED_THRESHOLD,
-        Model,
-        load_model,
-        mixed,
-        save_model,
-        set_weights,
-        weights_of,
-        with_channels,
-    )
-    from dmrl.learn.inference.threshold import best_threshold
-    from dmrl.learn.networks.architectures import Network
-    from dmrl.learn.training.checkpoint import has_checkpoint, remove_checkpoint
-    from dmrl.learn.training.config import AUTO, DEFAULT, FitSettings
-    from dmrl.learn.training.distributed import Group, in_group
-    from dmrl.learn.training.trainer import Step, Training, device_of, new_network
-    from dmrl.learn.training.validation import scores
-except ModuleNotFoundError as e:
-    raise MissingExtra(str(e.name), "train", "dmrl train") from e
-
-Settings = FitSettings
-LIBRARIES = ("torch", "numpy")
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """What a training came to: images, mean loss of the last epoch, seconds it took."""
-
-    images: int
-    loss: float
-    seconds: float
-    images_per_s: float
-
-
-def run(
-    dataset: Path,
-    out: Path,
-    settings: Settings,
-    *,
-    init: Path | None = None,
-    teacher: Path | None = None,
-    resume: bool = False,
-) -> Result:
-    """Train on the train split of ``dataset`` and write the run folder ``out``.
-
-    Confidence is calibrated, and the threshold chosen, on images held out: the split named val
-    or, where there is none, a share of the train split.
-
-    Parameters
-    ----------
-    dataset
-        Folder that ``dmrl dataset`` wrote.
-    out
-        Run folder to write. Until the training is done it is ``<out>.partial``.
-    settings
-        See `FitSettings`.
-    init
-        Model whose weights to start from. None: new weights, by the seed.
-    teacher
-        Model that is learnt from beside the labels. None: the labels alone.
-    resume
-        Go on with the interrupted training in ``<out>.partial``; from the start, if that had
-        not come to the end of its first epoch.
-
-    Raises
-    ------
-    OutputError
-        If ``out`` exists, or an interrupted training is in the way.
-    DatasetError
-        If ``dataset`` is not one, or has no train split.
-    ModelError
-        If ``init`` or ``teacher`` cannot be used, or there is nothing to resume.
-    SettingError
-        If the network cannot take the images, its grid is not the teacher's, or the loss is no
-        longer a number.
-    """
-    if settings.init_share and init is None:
-        raise SettingError("init_share: there is nothing to keep a share of. Give --init MODEL")
-    given = Given(init and resolved(init), teacher and resolved(teacher))
-    settings = _with_architecture(settings, given.init)
-    processes = settings.processes if device_of(settings.device).type == "cpu" else 1
-    return in_group(processes, partial(_run, dataset, out, settings, given, resume=resume))
-
-
-def _with_architecture(settings: Settings, init: Path | None) -> Settings:
-    """Settings whose network is named: of "auto", that of ``init`` or the default one."""
-    if settings.architecture != AUTO:
-        return settings
-    return replace(settings, architecture=load_model(init).architecture if init else DEFAULT)
-
-
-class Given(NamedTuple):
-    """Models that a training is given: whose weights to start from, and whose word to learn."""
-
-    init: Path | None
-    teacher: Path | None
-
-
-def _run(
-    dataset: Path, out: Path, settings: Settings, given: Given, group: Group, *, resume: bool
-) -> Result:
-    """One process of a training. All compute; the leading one alone writes and says."""
-    if group.leads:
-        refuse_existing(out)
-        _refuse_unfinished(partial_of(out), resume=resume)
-    data = open_dataset(dataset)
-    train = data.split("train")
-    examples, held_out, shares = material(data, settings)
-    network = _first_network(settings, examples, given.init)
-    first = {name: value.clone() for name, value in weights_of(network).items()}
-    teacher = _teacher(given.teacher, network) if given.teacher else None
-    inputs = [dataset, *filter(None, given)]
-    made = provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
-    identity = " ".join(source.sha256 for source in made.inputs)
-    mine = partial_folder(out, keep_on_error=True, resume=resume)
-    with mine if group.leads else nullcontext(partial_of(out)) as folder:
-        training = Training(
-            network,
-            examples,
-            settings,
-            folder,
-            validation=held_out,
-            shares=shares,
-            identity=identity,
-            teacher=teacher,
-            group=group,
-            resume=resume and has_checkpoint(folder),
-        )
-        if group.leads:
-            made.write(folder)
-        result = _train(training, settings, len(examples), group)
-        if group.leads:
-            mixed(training.network, first, settings.init_share)
-            judged = _judged(training.network, held_out, settings)
-            save_model(_model(training, settings, train, len(examples), judged), folder)
-            remove_checkpoint(folder)
-    return result
-
-
-def _refuse_unfinished(partial: Path, *, resume: bool) -> None:
-    if resume and not partial.is_dir():
-        raise ModelError(f"no {partial} to resume. Train without --resume")
-    if not resume and has_checkpoint(partial):
-        raise OutputError(
-            f"{partial} holds an interrupted training. Go on with --resume, or remove it"
-        )
-
-
-class Judged(NamedTuple):
-    """What the images held out said of a network: its threshold, and what its logits lacked."""
-
-    threshold: float
-    calibration: Calibration | None
-
-
-def _judged(network: Network, held_out: Examples | None, settings: Settings) -> Judged:
-    """Calibrate the network on the images held out, and choose its threshold there."""
-    if held_out is None:
-        return Judged(_or_published(settings.threshold), None)
-    scored = scores(network, held_out)
-    found = calibration(scored)
-    if found is not None and calibrate(network, found):
-        scored = scores(network, held_out)
-    else:
-        found = None
-    if settings.threshold is not None:
-        return Judged(settings.threshold, found)
-    return Judged(_or_published(best_threshold(scored, settings.false_alarms)), found)
-
-
-def _or_published(threshold: float | None) -> float:
-    return PUBLISHED_THRESHOLD if threshold is None else threshold
-
-
-def _first_network(settings: Settings, examples: Examples, init: Path | None) -> Network:
-    network = new_network(settings, examples)
-    if init is not None:
-        known = load_model(init)
-        if known.architecture != settings.architecture:
-            raise SettingError(
-                f"{init} is a {known.architecture}, not the {settings.architecture} to train. "
-                f'Set architecture = "{known.architecture}" in the recipe, or give another --init'
-            )
-        set_weights(network, with_channels(known.network, network), init)
-    return network
-
-
-def _teacher(path: Path, network: Network) -> Network:
-    teacher = load_model(path).network
-    if teacher.stride_px != network.stride_px:
-        raise SettingError(
-            f"{path} has cells of {teacher.stride_px} px, the network to train "
-            f"{network.stride_px} px. Give a teacher with the same grid"
-        )
-    return teacher
-
-
-def _train(training: Training, settings: Settings, images: int, group: Group) -> Result:
-    def words(step: Step) -> str:
-        return f"Epoch {step.epoch}/{settings.epochs}, loss {step.loss:.3f}"
-
-    left, begun = training.steps_left, time.perf_counter()
-    steps = training.steps()
-    for _ in track(steps, "Training", left, describe=words) if group.leads else steps:
-        pass
-    seconds = time.perf_counter() - begun
-    seen = left * min(settings.batch_size, images)
-    return Result(images, training.history[-1]["loss"], seconds, seen / seconds)
-
-
-def _model(
-    training: Training, settings: Settings, train: Split, images: int, judged: Judged
-) -> Model:
-    height_px, width_px = train.image_shape
-    peers = pc.list_flatten(train.table.column("peers"))
-    sources = pc.unique(pc.struct_field(peers, "source")).to_pylist()
-    return Model(
-        training.network,
-        settings.architecture,
-        width_px=width_px,
-        height_px=height_px,
-        threshold=judged.threshold,
-        label_source=", ".join(sorted(sources)),
-        training={
-            "images": images,
-            "calibration": judged.calibration and judged.calibration._asdict(),
-            "settings": asdict(settings),
-            "history": training.history,
-        },
-    )
+TRAINING = "dmrl.datasets.training"
+__getattr__ = import_lazily(
+    __name__, {"run": f"{TRAINING}:train_network", "Settings": f"{TRAINING}:FitSettings"}
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Flags:
-    """Settings of the recipe that a flag may overrule.
+    """Settings of the recipe that a flag overrules.
 
     Parameters
     ----------
@@ -286,20 +46,6 @@ class Flags:
     seed: int | None = None
     device: Literal["auto", "cpu", "cuda"] | None = None
     processes: int | None = None
-
-    def over(self, settings: Settings) -> Settings:
-        """The settings, with the flags that were given in their place.
-
-        Raises
-        ------
-        SettingError
-            If a value is out of range.
-        """
-        given = {name: value for name, value in asdict(self).items() if value is not None}
-        try:
-            return replace(settings, **given)
-        except ValueError as e:
-            raise SettingError(f"{e}. Give another value") from None
 
 
 NO_FLAGS = Flags()
@@ -334,14 +80,14 @@ def command(
         one, such as dmrl-large, trained on the same dataset.
     resume
         Go on with the interrupted training in OUT_DIR.partial.
-    as_json
-        Print one JSON document in place of the table.
     """
-    settings = flags.over(recipes.load(recipe, "train", Settings))
-    result = run(dataset, out, settings, init=init, teacher=teacher, resume=resume)
-    if as_json:
-        print_json({"model": str(out), **asdict(result)})
-        return
-    columns = ("images", "epochs", "last loss", "seconds", "images/s")
+    from dmrl import recipe as recipes
+    from dmrl.datasets.training import train_network
+    from dmrl.learn.training.config import FitSettings
+
+    settings = recipes.load(recipe, "train", FitSettings, flags)
+    result = train_network(dataset, out, settings, init=init, teacher=teacher, resume=resume)
     row = (result.images, settings.epochs, result.loss, result.seconds, result.images_per_s)
-    print_table(str(out), columns, [row])
+    columns = ("images", "epochs", "last loss", "seconds", "images/s")
+    closing = Closing(columns=columns, rows=lambda *_: [row], path_key="model")
+    closing.print(result, Given(out=out), as_json=as_json)

@@ -1,4 +1,4 @@
-"""``dmrl view``: recordings in rerun, or what it would show as a file or a picture."""
+"""``dmrl view``: recordings in rerun, as a file or as a picture."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ from cyclopts import Group, Parameter, validators
 from dmrl.errors import SettingError
 from dmrl.terminal.arguments import Flat
 from dmrl.terminal.tables import print_line
-from dmrl.viewer import Settings, Web, flag, save, screenshot, serve, view
+from dmrl.viewer.settings import Settings, Web
 
 DEFAULTS = Settings()
 WEB = Web()
@@ -28,6 +28,8 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> None:
     SettingError
         If ``out`` has another suffix, or no image lies in the time asked for.
     """
+    from dmrl.viewer import save, screenshot
+
     if out.suffix == ".png":
         screenshot(recordings, out, settings)
     elif out.suffix == ".rrd":
@@ -49,7 +51,7 @@ def command(
     web: Flat[Web] = WEB,
     settings: Flat[Settings] = DEFAULTS,
 ) -> None:
-    """Show recordings in rerun, or save what it would show.
+    """Show recordings in rerun, or save them as an .rrd file or a picture.
 
     Labels, detections and maps lie over the image they belong to; several recordings share
     one timeline. A dataset is shown row by row, worst first if recordings with a model's
@@ -73,6 +75,8 @@ def command(
     rank
         Take the picture of this row of a dataset; 1 is the worst.
     """
+    from dmrl.viewer import flag, save, screenshot, serve, view
+
     for path, suffix in ((save_to, ".rrd"), (screenshot_to, ".png"), (flag_to, ".html")):
         if path is not None and path.suffix != suffix:
             raise SettingError(

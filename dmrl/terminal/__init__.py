@@ -1,1 +1,1 @@
-"""What people read while a command runs: progress, tables, the ending."""
+"""Arguments, progress and printed results of commands."""

@@ -1,4 +1,4 @@
-"""Kinds of arguments that several commands take."""
+"""Types of arguments that several commands share."""
 
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -7,13 +7,16 @@ from cyclopts import Parameter, validators
 
 T = TypeVar("T")
 In = Annotated[Path, Parameter(name="IN")]
-"""What is read, called IN in the help."""
+"""Input, called IN in the help."""
 Flat = Annotated[T, Parameter(name="*")]
 """A dataclass, ``Flat[Settings]``: each of its fields is a flag."""
-AsJson = Annotated[bool, Parameter(name="--json", negative=())]
-"""Whether one JSON document is printed in place of the table."""
+AsJson = Annotated[
+    bool,
+    Parameter(name="--json", negative=(), help="Print one JSON document in place of the table."),
+]
+"""Whether the result is printed as JSON."""
 Seed = Annotated[int, Parameter(validator=validators.Number(gte=0))]
-"""Of everything drawn at random."""
+"""Seed of all random numbers."""
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))]
 On = Annotated[
     str | None,
@@ -22,6 +25,14 @@ On = Annotated[
         "machine alone), ray://HOST:PORT for another, slurm to write an array job. Changes no byte."
     ),
 ]
-"""Where it is done, if not here."""
+"""Cluster that runs the command; None: this machine."""
 Workers = Annotated[int | None, Parameter(validator=validators.Number(gte=1))]
-"""How many processes work side by side."""
+"""Number of processes side by side; None: one per core."""
+FolderWorkers = Annotated[
+    Workers,
+    Parameter(
+        help="Of a folder: recordings at a time, at most. Without it, as many as there are "
+        "cores. Changes no byte."
+    ),
+]
+"""`Workers` of a command that takes a folder."""

@@ -27,17 +27,17 @@ class _Progress(Progress):
     below: Callable[[], Lines] | None = None
 
     def get_renderables(self) -> Iterator[RenderableType]:
-        """What is drawn."""
+        """Yield the bars, and the table below them."""
         yield from super().get_renderables()
         lines = self.below() if self.below is not None else ()
         if len(lines) > 1:
-            shown = Table(*map(_cell, lines[0]), box=None, header_style="dim")
+            shown = Table(*map(_cell_text, lines[0]), box=None, header_style="dim")
             for line in lines[1:]:
-                shown.add_row(*map(_cell, line))
+                shown.add_row(*map(_cell_text, line))
             yield shown
 
 
-def _cell(value: object) -> str:
+def _cell_text(value: object) -> str:
     return escape(one_line(f"{value:.1f}" if isinstance(value, float) else str(value)))
 
 
@@ -49,7 +49,7 @@ def track(
     describe: Callable[[Item], str] | None = None,
     below: Callable[[], Lines] | None = None,
 ) -> Iterator[Item]:
-    """Items one by one, with a bar that says how many are done.
+    """Yield items unchanged, with a bar that shows how many are done.
 
     Parameters
     ----------
@@ -58,17 +58,17 @@ def track(
     what
         Words before the bar, such as "Rendering".
     total
-        Number of items. None: the length of ``items``, or not known.
+        Number of items. None: the length of ``items``, or unknown.
     describe
-        Words before the bar once an item is there, in place of ``what``.
+        Return the words before the bar for an item, in place of ``what``.
     below
-        Gives the rows of a table that is shown below the bar, its head first; asked ten times a
-        second, from another thread.
+        Return the rows of a table below the bar, its head first; called ten times a second, from
+        another thread.
 
     Yields
     ------
     Item
-        What ``items`` yields, unchanged.
+        The items, unchanged.
     """
     if total is None and isinstance(items, Sized):
         total = len(items)

@@ -1,6 +1,6 @@
-"""Ctrl-C, SIGTERM and SIGHUP as an event that a loop asks for.
+"""Ctrl-C, SIGTERM and SIGHUP as an event that a loop checks.
 
-Not as an exception: that comes at any line, where it can do harm or be lost.
+An exception could come at any line, do harm there, or be lost.
 """
 
 import signal
@@ -8,28 +8,28 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+TERMINATION_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @contextmanager
-def ended_by_signal(ended: threading.Event) -> Iterator[None]:
-    """Set when the user wants an end, as long as the block lasts.
+def set_on_signal(ended: threading.Event) -> Iterator[None]:
+    """Set an event on these signals, as long as the block lasts.
 
-    An exception amid a write would spoil the file, and one in a destructor Python drops.
+    An exception within a write would damage the file, and Python drops one in a destructor.
 
     Parameters
     ----------
     ended
-        Looked at often by what the block does.
+        Event that the block checks often.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    deaf = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # nohup
+    ignores_hangup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # nohup
     before = {
         number: signal.signal(number, lambda *_: ended.set())
-        for number in ENDING
-        if not (deaf and number is signal.SIGHUP)
+        for number in TERMINATION_SIGNALS
+        if not (ignores_hangup and number is signal.SIGHUP)
     }
     try:
         yield

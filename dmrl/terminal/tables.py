@@ -41,20 +41,20 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
         number = bool(cells) and all(isinstance(cell, int | float) for cell in cells)
         table.add_column(column, justify="right" if number else "left")
     for row in rows:
-        table.add_row(*[_text(cell) for cell in row])
+        table.add_row(*[_cell_text(cell) for cell in row])
     width = None if sys.stdout.isatty() else NOT_A_TERMINAL_COLUMNS
     # Markup and highlighting off: file names hold square brackets.
     Console(width=width, highlight=False, markup=False).print(table)
 
 
-def _text(cell: object) -> str:
+def _cell_text(cell: object) -> str:
     if cell is None:
         return ""
     return f"{cell:.4g}" if isinstance(cell, float) else one_line(str(cell))
 
 
 def print_line(line: str) -> None:
-    """Print one line of results, whatever the names in it hold."""
+    """Print one line of results, with control characters escaped."""
     sys.stdout.write(one_line(line) + "\n")
 
 

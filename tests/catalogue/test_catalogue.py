@@ -153,7 +153,7 @@ def test_only_what_changed_is_looked_at_again(flights: Path) -> None:
 def test_what_was_seen_before_a_stop_is_kept(
     flights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = index.outcomes
+    real = index.iter_results
 
     def stopped(*given: object) -> object:
         for k, one in enumerate(real(*given)):  # type: ignore[arg-type]
@@ -161,7 +161,7 @@ def test_what_was_seen_before_a_stop_is_kept(
                 raise KeyboardInterrupt
             yield one
 
-    monkeypatch.setattr(index, "outcomes", stopped)
+    monkeypatch.setattr(index, "iter_results", stopped)
     with pytest.raises(KeyboardInterrupt):
         index.update(flights, workers=1)
     monkeypatch.undo()
@@ -177,8 +177,8 @@ def test_a_name_that_no_table_can_hold_is_said_before_the_work(
         odd.write_bytes(b"")
     except (OSError, UnicodeError):
         return  # macOS refuses such names itself
-    monkeypatch.setattr(index, "outcomes", None)
-    assert boundary.status_of(lambda: app(["index", str(flights)])) == 1
+    monkeypatch.setattr(index, "iter_results", None)
+    assert boundary.run_to_status(lambda: app(["index", str(flights)])) == 1
     assert "Rename the file" in capsys.readouterr().err
 
 
@@ -205,7 +205,7 @@ def test_the_commands_print_tables_paths_and_json(
     flights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def said(*words: str) -> str:
-        assert boundary.status_of(lambda: app([*words], result_action="return_value")) == 0
+        assert boundary.run_to_status(lambda: app([*words], result_action="return_value")) == 0
         return capsys.readouterr().out
 
     assert "4 recordings; 4 looked at, 0 known" in said("index", str(flights), "--workers", "1")
@@ -226,7 +226,7 @@ def test_a_dataset_of_what_a_query_finds(
 
     def status(query: str) -> int:
         words = ["dataset", str(flights), str(out), "--from-index", query, "--workers", "1"]
-        return boundary.status_of(lambda: app(words, result_action="return_value"))
+        return boundary.run_to_status(lambda: app(words, result_action="return_value"))
 
     assert status("camera = 'cf9'") == 1
     assert "is true of no recording" in capsys.readouterr().err

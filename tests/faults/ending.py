@@ -4,7 +4,7 @@ import io
 from collections.abc import Callable
 from contextlib import nullcontext, redirect_stderr, redirect_stdout
 
-from dmrl.boundary import status_of
+from dmrl.boundary import run_to_status
 
 
 def ended(work: Callable[[], object], *, mute: bool = False) -> tuple[int, str]:
@@ -19,7 +19,7 @@ def ended(work: Callable[[], object], *, mute: bool = False) -> tuple[int, str]:
     """
     said = io.StringIO()
     with redirect_stderr(said), nullcontext() if mute else redirect_stdout(io.StringIO()):
-        status = status_of(work)
+        status = run_to_status(work)
     errors = [line for line in said.getvalue().splitlines() if line.startswith("dmrl: ")]
     text = errors[-1] if errors else ""
     assert "Traceback" not in said.getvalue(), said.getvalue()

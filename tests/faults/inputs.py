@@ -25,7 +25,7 @@ STAND_INS = {
     "render": (
         ("dmrl.rendering.renderer:", "Pool", "Painters"),
         ("dmrl.rendering.renderer:", "shipped_lights", "sky"),
-        ("dmrl.stages.render:", "ensure", "no_python"),
+        ("dmrl.render_recording:", "ensure", "no_python"),
     ),
     "run": (("dmrl.pipeline.process_pool:", "subprocess", "Processes"),),
     "trim": (("dmrl.pipeline.process_pool:", "subprocess", "Processes"),),
@@ -37,7 +37,7 @@ STAND_INS = {
     "report": (("matplotlib.figure:Figure", "draw", "blank"),),
     "dataset": (("dmrl.card:", "plots", "nothing"),),
     "card": (("dmrl.card:", "plots", "nothing"),),
-    "quantize": (("dmrl.stages.quantize:", "plots", "nothing"),),
+    "quantize": (("dmrl.evaluation.quantization_report:", "plots", "nothing"),),
 }
 """By command: where, what, and the name in stand_ins.py of what takes its place."""
 SHORT = """

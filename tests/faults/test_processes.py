@@ -14,6 +14,8 @@ import pytest
 
 from dmrl.atomic_output import partial_of
 from dmrl.recording import check, read_table, recover, summary
+from dmrl.simulation.drone_fleet import Fleet
+from dmrl.simulation.drone_fleet import fleet as fly_fleet
 from dmrl.stages import fake_drone, fly
 
 from .broken import Broken
@@ -142,7 +144,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def recorder(out: Path, fleet: fake_drone.Fleet) -> subprocess.Popen[bytes]:
+def recorder(out: Path, fleet: Fleet) -> subprocess.Popen[bytes]:
     named = [f"--robot={d.robot}=udp://127.0.0.1:{d.port}" for d in fleet.drones]
     command = [sys.executable, "-m", "dmrl.cli", "record", str(out), *named, "--json"]
     return subprocess.Popen(command, stdout=subprocess.PIPE, env=os.environ | {"TERM": "dumb"})
@@ -159,7 +161,7 @@ def test_a_soak_of_recording_loses_nothing_but_what_was_away(
     out = tmp_path / "out.mcap"
     uris = ("udp://127.0.0.1:0",) * 3
     settings = fake_drone.Settings(drop=0.01, dies=AWAY)
-    with fake_drone.fleet(flight, uris, (), settings) as fleet:
+    with fly_fleet(flight, uris, (), settings) as fleet:
         with recorder(out, fleet) as process:
             while not fleet.clock.landed and process.poll() is None:
                 time.sleep(0.2)

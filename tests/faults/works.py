@@ -110,16 +110,17 @@ def _card(i: Inputs, out: Path) -> None:
 def _verify(i: Inputs, out: Path) -> None:
     """As a step of a pipeline, once gcc has had its say: the command writes nothing."""
     verify, result = import_module("dmrl.stages.verify"), pickle.loads(i.proof.read_bytes())
+    proof = import_module("dmrl.deploy.c.run.proof")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(verify, "_tried", lambda *_: result)
+        patch.setattr(proof, "prove_export", lambda *_, **__: result)
         verify.run(i.c, verify.Settings(), out)
 
 
 def _record(i: Inputs, out: Path) -> None:
     """Two robots for a second, and the robots themselves."""
-    fake_drone = import_module("dmrl.stages.fake_drone")
+    drones = import_module("dmrl.simulation.drone_fleet")
     uris = ("udp://127.0.0.1:0",) * 2
-    with fake_drone.fleet(i.flight, uris, (), fake_drone.Settings()) as fleet:
+    with drones.fleet(i.flight, uris, (), drones.DroneSettings()) as fleet:
         named = [f"--robot={d.robot}=udp://127.0.0.1:{d.port}" for d in fleet.drones]
         cli("record", out, *named, "--duration-s", RECORD_S)
 

@@ -10,13 +10,13 @@ from dmrl.estimation.model.pair import Array
 from dmrl.geometry.frames import Camera, pixels_from_horizontal
 from dmrl.labelling.camera_bearings import (
     DISTANCE_RATIO,
-    LEAST_RATIO,
-    levelled,
-    sightings_of,
-    with_sightings,
+    MIN_DISTANCE_RATIO,
+    add_bearings,
+    correct_heights,
+    detections_to_bearings,
 )
-from dmrl.labelling.image_labels import Positions
-from dmrl.labelling.observer_log import Sight
+from dmrl.labelling.observer_log import ObserverLog
+from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
 
 from ..estimation.sighted_flights import still_pair
@@ -29,23 +29,25 @@ TRUE_M = np.column_stack([2 + 0 * SWAY, 0.3 * SWAY, 0.1 + 0 * SWAY])
 TILT = np.column_stack([0.25 * np.cos(SWAY), -0.15 + 0.05 * SWAY])
 
 
-def known(off_m: Array, status: int = STATUS_OK) -> Positions:
+def known(off_m: Array, status: int = STATUS_OK) -> PeerPositions:
     covariance = np.tile(np.diag([0.01, 0.01, 0.04]), (COUNT, 1, 1))
-    return Positions(TIME_NS, TRUE_M + off_m, covariance, np.full(COUNT, status, np.int8))
+    return PeerPositions(TIME_NS, TRUE_M + off_m, covariance, np.full(COUNT, status, np.int8))
 
 
-def seen(sigma_m: float = 0.0, every: int = 1) -> Sight:
+def seen(sigma_m: float = 0.0, every: int = 1) -> ObserverLog:
     """One candidate in each image, and none in the others."""
     uv, depth_m, _ = pixels_from_horizontal(TRUE_M, TILT[:, 0], TILT[:, 1], CAMERA)
     shown = np.arange(COUNT) % every == 0
     rows = np.column_stack([uv, depth_m, np.full(COUNT, sigma_m)])[shown]
     first = np.concatenate([[0], np.cumsum(shown)])
     nothing = np.zeros((COUNT, 3))
-    return Sight("cf1", CAMERA, TIME_NS, TIME_NS, rows, first, TILT, nothing, nothing[:, 0], {}, [])
+    return ObserverLog(
+        "cf1", CAMERA, TIME_NS, TIME_NS, rows, first, TILT, nothing, nothing[:, 0], {}, []
+    )
 
 
 def test_detections_are_directions_in_the_horizontal_frame() -> None:
-    found = sightings_of(seen(every=2), START_NS, 3.6, 0.015)
+    found = detections_to_bearings(seen(every=2), START_NS, 3.6, 0.015)
     assert found.time_s == pytest.approx(np.arange(0, COUNT, 2) * 0.1)
     assert found.polar[:, 0] == pytest.approx(polar_of(TRUE_M[::2]))
     wanted = [3.6 / 180, np.hypot(3.6 / 180, 0.015), DISTANCE_RATIO]
@@ -54,35 +56,40 @@ def test_detections_are_directions_in_the_horizontal_frame() -> None:
 
 def test_a_network_that_says_how_sure_it_is_of_a_distance_is_believed_to_a_limit() -> None:
     depth_m = seen().detections[:, 2]
-    assert sightings_of(seen(0.4), 0, 3.0, 0.01).std[:, 0, 2] == pytest.approx(0.4 / depth_m)
-    assert (sightings_of(seen(1e-3), 0, 3.0, 0.01).std[..., 2] == LEAST_RATIO).all()
+    assert detections_to_bearings(seen(0.4), 0, 3.0, 0.01).std[:, 0, 2] == pytest.approx(
+        0.4 / depth_m
+    )
+    assert (
+        detections_to_bearings(seen(1e-3), 0, 3.0, 0.01).std[..., 2] == MIN_DISTANCE_RATIO
+    ).all()
 
 
 def test_images_have_as_many_candidates_as_they_show() -> None:
     one = seen(every=4)
     # The first image that shows something gets a second candidate.
     rows = np.concatenate([one.detections[:1], one.detections])
-    first = one.first + (np.arange(COUNT + 1) > 0)
-    found = sightings_of(replace(one, detections=rows, first=first), START_NS, 3.0, 0.01)
+    first = one.first_row + (np.arange(COUNT + 1) > 0)
+    both = replace(one, detections=rows, first_row=first)
+    found = detections_to_bearings(both, START_NS, 3.0, 0.01)
     assert np.isfinite(found.polar[..., 0]).sum(axis=1).tolist() == [2] + [1] * 9
     assert found.polar[0, 0] == pytest.approx(found.polar[0, 1])
-    none = replace(one, detections=rows[:0], first=0 * first)
-    assert len(sightings_of(none, START_NS, 3.0, 0.01).time_s) == 0
+    none = replace(one, detections=rows[:0], first_row=0 * first)
+    assert len(detections_to_bearings(none, START_NS, 3.0, 0.01).time_s) == 0
 
 
 def test_both_robots_of_a_pair_get_what_their_cameras_showed() -> None:
     pair, _ = still_pair()
-    sees = sightings_of(seen(), START_NS, 3.0, 0.01)
-    pairs = with_sightings({("a", "b"): pair, ("b", "c"): pair}, {"b": sees})
+    sees = detections_to_bearings(seen(), START_NS, 3.0, 0.01)
+    pairs = add_bearings({("a", "b"): pair, ("b", "c"): pair}, {"b": sees})
     assert pairs["a", "b"].peer_sees is sees and pairs["a", "b"].own_sees is None
     assert pairs["b", "c"].own_sees is sees and pairs["b", "c"].peer_sees is None
     assert pairs["a", "b"].swapped().own_sees is sees
 
 
 def test_heights_go_to_where_the_peer_was_seen() -> None:
-    sees = sightings_of(seen(every=2), START_NS, 3.0, 0.005)
+    sees = detections_to_bearings(seen(every=2), START_NS, 3.0, 0.005)
     before = known(np.array([0.0, 0.02, 0.15]))
-    after, used = levelled(before, START_NS, sees)
+    after, used = correct_heights(before, START_NS, sees)
     assert used == COUNT // 2
     assert (after.xyz_m[:, :2] == before.xyz_m[:, :2]).all()
     assert np.abs(after.xyz_m - TRUE_M)[:, 2].max() < 0.03
@@ -91,17 +98,17 @@ def test_heights_go_to_where_the_peer_was_seen() -> None:
 
 
 def test_what_is_not_ok_or_was_not_seen_stays() -> None:
-    sees = sightings_of(seen(), START_NS, 3.0, 0.005)
+    sees = detections_to_bearings(seen(), START_NS, 3.0, 0.005)
     open_ones = known(np.array([0.0, 0.0, 0.15]), STATUS_AMBIGUOUS)
-    assert levelled(open_ones, START_NS, sees) == (open_ones, 0)
+    assert correct_heights(open_ones, START_NS, sees) == (open_ones, 0)
     elsewhere = known(np.array([0.0, 1.5, 0.15]))
-    after, used = levelled(elsewhere, START_NS, sees)
+    after, used = correct_heights(elsewhere, START_NS, sees)
     assert used == 0
     assert after.xyz_m == pytest.approx(elsewhere.xyz_m)
     assert after.covariance == pytest.approx(elsewhere.covariance)
     half = np.where(np.arange(COUNT) < 20, STATUS_AMBIGUOUS, STATUS_OK).astype(np.int8)
     mixed = replace(known(np.array([0.0, 0.0, 0.15])), status=half)
-    after, used = levelled(mixed, START_NS, sees)
+    after, used = correct_heights(mixed, START_NS, sees)
     assert used == 20
     assert (after.xyz_m[:20] == mixed.xyz_m[:20]).all()
     assert np.abs(after.xyz_m[20:] - TRUE_M[20:])[:, 2].max() < 0.03

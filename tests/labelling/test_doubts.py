@@ -6,7 +6,7 @@ import pytest
 from dmrl.estimation.model.pair import SWAPPED
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.estimation.solver.keyframes import GLOBALS, Noise
-from dmrl.labelling.pair_report import doubts, reasons, refusal
+from dmrl.labelling.pair_report import explain_refusal, explain_refusals, find_suspect_sensors
 
 
 def estimate(status: int = 0, **constants: float) -> Estimate:
@@ -16,7 +16,10 @@ def estimate(status: int = 0, **constants: float) -> Estimate:
 
 
 def test_sensors_in_order_are_not_worth_a_line() -> None:
-    assert doubts(("cf1", "cf2"), estimate(range_bias_m=0.1, own_velocity_scale=0.05)) == []
+    assert (
+        find_suspect_sensors(("cf1", "cf2"), estimate(range_bias_m=0.1, own_velocity_scale=0.05))
+        == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -32,29 +35,29 @@ def test_sensors_in_order_are_not_worth_a_line() -> None:
 def test_a_sensor_that_is_off_is_named_with_what_to_do(
     constant: str, value: float, words: str
 ) -> None:
-    (line,) = doubts(("cf1", "cf2"), estimate(**{constant: value}))
+    (line,) = find_suspect_sensors(("cf1", "cf2"), estimate(**{constant: value}))
     assert line.startswith(words)
 
 
 def test_a_flight_of_which_nothing_is_kept_says_why_and_what_to_do() -> None:
-    assert refusal(("cf1", "cf2"), estimate(status=0)) is None
+    assert explain_refusal(("cf1", "cf2"), estimate(status=0)) is None
     still = replace(estimate(status=2), refused="still")
-    assert str(refusal(("cf1", "cf2"), still)).startswith("cf1 hardly moves")
-    why = str(refusal(("cf1", "cf2"), estimate(status=1)))
+    assert str(explain_refusal(("cf1", "cf2"), still)).startswith("cf1 hardly moves")
+    why = str(explain_refusal(("cf1", "cf2"), estimate(status=1)))
     assert "exact to 1.00 m" in why and "--gate-m" in why
 
 
 def test_what_is_off_is_the_reason_where_nothing_is_kept_and_a_line_of_its_own_elsewhere() -> None:
     lost = estimate(status=1, peer_gyro_bias_radps=0.05)
     there = replace(lost, constants=lost.constants[SWAPPED])
-    here, back = reasons([("cf1", "cf2")], {("cf1", "cf2"): lost, ("cf2", "cf1"): there})
+    here, back = explain_refusals([("cf1", "cf2")], {("cf1", "cf2"): lost, ("cf2", "cf1"): there})
     assert here.startswith("cf1 sees cf2: nothing is kept: cf2's yaw rate seems biased by 0.05")
     assert "exact to 1.00 m" in here
     assert back.startswith("cf2 sees cf1: nothing is kept: cf2's yaw rate seems biased by 0.05")
 
     kept = replace(there, status=np.zeros(2, np.int8))
-    off, here = reasons([("cf1", "cf2")], {("cf1", "cf2"): lost, ("cf2", "cf1"): kept})
+    off, here = explain_refusals([("cf1", "cf2")], {("cf1", "cf2"): lost, ("cf2", "cf1"): kept})
     assert off.startswith("cf1-cf2: cf2's yaw rate seems biased by 0.05")
     assert here.startswith("cf1 sees cf2: nothing is kept: a position is exact to")
 
-    assert reasons([("cf1", "cf2")], {("cf1", "cf2"): estimate()}) == []
+    assert explain_refusals([("cf1", "cf2")], {("cf1", "cf2"): estimate()}) == []

@@ -5,14 +5,15 @@ from pathlib import Path
 import numpy as np
 
 from dmrl import topics
-from dmrl.labelling.ground_truth import true_pairs, true_path
+from dmrl.labelling.flight_log import FlightLog, read_flight
+from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
 from dmrl.messages import message
-from dmrl.recording import Contents, Provenance, RecordingWriter
+from dmrl.recording import Provenance, RecordingWriter
 
 PLACES = {"cf1": (1.0, 2.0, 0.5), "cf2": (1.0, 5.0, 0.9)}
 
 
-def captured(path: Path, lost: tuple[int, int] = (0, 0)) -> Contents:
+def captured(path: Path, lost: tuple[int, int] = (0, 0)) -> FlightLog:
     """cf1 looks along y, so cf2 stands 3 m in front; cf2's markers are lost for a while."""
     turn = {"z": np.sin(np.pi / 4), "w": np.cos(np.pi / 4)}
     with RecordingWriter(path, Provenance("test")) as sink:
@@ -23,21 +24,21 @@ def captured(path: Path, lost: tuple[int, int] = (0, 0)) -> Contents:
                 pose = {"position": dict(zip("xyz", place, strict=True)), "orientation": turn}
                 made = message("PoseInFrame")(frame_id="world", pose=pose)
                 sink.write(k * 20_000_000, topics.true_pose(robot), made)
-    return Contents(path)
+    return read_flight(path)
 
 
 def test_a_peer_is_where_the_robot_sees_it(tmp_path: Path) -> None:
     held = captured(tmp_path / "a.mcap")
-    assert true_pairs(held.topics) == [("cf1", "cf2"), ("cf2", "cf1")]
-    time_ns, xyz = true_path(held, "cf1", "cf2")
+    assert list_true_pairs(held.topics) == [("cf1", "cf2"), ("cf2", "cf1")]
+    time_ns, xyz = find_true_path(held, "cf1", "cf2")
     assert len(time_ns) == 100
     np.testing.assert_allclose(xyz, [[3.0, 0.0, 0.4]] * 100, atol=1e-9)
-    back = true_path(held, "cf2", "cf1")[1]
+    back = find_true_path(held, "cf2", "cf1")[1]
     np.testing.assert_allclose(back, [[-3.0, 0.0, -0.4]] * 100, atol=1e-9)
 
 
 def test_lost_markers_tell_nothing(tmp_path: Path) -> None:
     held = captured(tmp_path / "a.mcap", lost=(20, 60))
-    time_ns, _ = true_path(held, "cf1", "cf2")
+    time_ns, _ = find_true_path(held, "cf1", "cf2")
     gone = (time_ns > 19 * 20_000_000) & (time_ns < 60 * 20_000_000)
     assert not gone.any() and len(time_ns) == 60

@@ -9,24 +9,24 @@ import pytest
 from dmrl.geometry.frames import Array, Camera, pixels_from_horizontal
 from dmrl.labelling.image_labels import (
     MARGIN_SIGMAS,
-    NEAREST_M,
-    Look,
-    Positions,
-    anywhere,
-    image_labels,
+    MIN_DEPTH_M,
+    CameraOptions,
+    label_anywhere,
+    label_images,
 )
+from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED
 
 CAMERA = Camera(320, 224, 180.0, 190.0, 150.0, 100.0)
-SHARP = Look(attitude_std_rad=1e-9)
+SHARP = CameraOptions(attitude_std_rad=1e-9)
 EXACT = np.eye(3) * 1e-12
 
 
 def positions(
     *xyz_m: tuple[float, float, float], covariance: Array = EXACT, status: int = STATUS_OK
-) -> Positions:
+) -> PeerPositions:
     count = len(xyz_m)
-    return Positions(
+    return PeerPositions(
         np.arange(count),
         np.array(xyz_m),
         np.tile(covariance, (count, 1, 1)),
@@ -35,10 +35,10 @@ def positions(
 
 
 def labels(
-    found: Positions, look: Look = SHARP, camera: Camera = CAMERA, **tilt: float
+    found: PeerPositions, look: CameraOptions = SHARP, camera: Camera = CAMERA, **tilt: float
 ) -> list[Any]:
     attitude = np.tile([tilt.get("roll", 0.0), tilt.get("pitch", 0.0)], (len(found.time_ns), 1))
-    return list(image_labels("cf2", found, attitude, camera, look))
+    return list(label_images("cf2", found, attitude, camera, look))
 
 
 @pytest.mark.parametrize("left", [0.6, -0.6])
@@ -68,7 +68,7 @@ def test_sigmas_are_those_of_drawn_positions_and_attitudes(
 ) -> None:
     shape = np.array([[1.0, 0.3, 0.1], [0.3, 0.6, -0.2], [0.1, -0.2, 0.4]])
     found = positions((2.0, 0.5, -0.3), covariance=spread_m**2 * shape)
-    (label,) = labels(found, Look(attitude_std_rad), roll=0.1, pitch=-0.2)
+    (label,) = labels(found, CameraOptions(attitude_std_rad), roll=0.1, pitch=-0.2)
     rng, count = np.random.default_rng(0), 40_000
     drawn = rng.multivariate_normal(found.xyz_m[0], found.covariance[0], count)
     roll, pitch = rng.normal((0.1, -0.2), attitude_std_rad, (count, 2)).T
@@ -108,7 +108,7 @@ def test_a_margin_is_no_wider_than_three_images() -> None:
 
 
 def test_who_is_behind_or_too_near_is_not_in_view() -> None:
-    behind, near, ahead = labels(positions((-2.0, 0, 0), (NEAREST_M - 0.01, 0, 0), (0.06, 0, 0)))
+    behind, near, ahead = labels(positions((-2.0, 0, 0), (MIN_DEPTH_M - 0.01, 0, 0), (0.06, 0, 0)))
     assert behind is None
     assert near is None
     assert ahead["depth_m"] == pytest.approx(0.06)
@@ -117,13 +117,13 @@ def test_who_is_behind_or_too_near_is_not_in_view() -> None:
 @pytest.mark.parametrize("status", [STATUS_AMBIGUOUS, STATUS_UNCONVERGED])
 def test_who_is_not_located_may_be_anywhere(status: int) -> None:
     behind, ahead = labels(positions((-3.0, 4.0, 0.0), (2.0, 0.0, 0.0), status=status))
-    assert behind == anywhere("cf2", CAMERA, 5.0, status)
+    assert behind == label_anywhere("cf2", CAMERA, 5.0, status)
     assert (behind["u_px"], behind["v_px"], behind["depth_m"]) == (160, 112, 5.0)
     sigmas = [behind[f"sigma_{name}"] for name in ("u_px", "v_px", "depth_m")]
     assert sigmas == [320, 224, 5.0]
     assert (ahead["u_px"], ahead["status"]) == (pytest.approx(150), status)
-    assert anywhere("cf2", CAMERA, 0.0)["depth_m"] == NEAREST_M
-    assert anywhere("cf2", CAMERA, 0.0)["status"] == STATUS_UNCONVERGED
+    assert label_anywhere("cf2", CAMERA, 0.0)["depth_m"] == MIN_DEPTH_M
+    assert label_anywhere("cf2", CAMERA, 0.0)["status"] == STATUS_UNCONVERGED
 
 
 def test_undistorted_images_have_no_lens() -> None:
@@ -135,7 +135,7 @@ def test_undistorted_images_have_no_lens() -> None:
 
 
 def test_an_image_that_is_logged_late_was_taken_earlier() -> None:
-    look = Look(0.01, cameras={"cf1": replace(CAMERA, delay_s=0.25)})
+    look = CameraOptions(0.01, cameras={"cf1": replace(CAMERA, delay_s=0.25)})
     logged_ns = np.array([10**9, 2 * 10**9])
     assert look.exposures_ns("cf1", logged_ns).tolist() == [750_000_000, 1_750_000_000]
     assert look.exposures_ns("cf2", logged_ns).tolist() == logged_ns.tolist()

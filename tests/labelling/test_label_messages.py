@@ -10,11 +10,13 @@ import pytest
 
 from dmrl import topics
 from dmrl.geometry.frames import AIDECK, Camera, pixels_from_horizontal
-from dmrl.labelling.image_labels import NEAREST_M, Look, Positions
-from dmrl.labelling.label_messages import label_messages, position_series
-from dmrl.labelling.sensor_logs import Logs, RobotLog
+from dmrl.labelling.flight_log import read_flight
+from dmrl.labelling.image_labels import MIN_DEPTH_M, CameraOptions
+from dmrl.labelling.label_messages import build_label_messages, build_position_series
+from dmrl.labelling.peer_positions import PeerPositions
+from dmrl.labelling.sensor_logs import RobotLog, SensorLogs
 from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
-from dmrl.recording import Contents, Provenance, RecordingWriter, read
+from dmrl.recording import Provenance, RecordingWriter, read
 
 SECOND_NS = 1_000_000_000
 START_NS = 5 * SECOND_NS
@@ -28,8 +30,8 @@ def log() -> RobotLog:
     return RobotLog((TIMES_S, attitude), (TIMES_S, np.zeros((2, 2))), (TIMES_S, np.ones((2, 1))))
 
 
-def logs(flying: Sequence[str] = ("cf1", "cf2")) -> Logs:
-    return Logs(START_NS, {"cf1": log()}, {}, frozenset(flying), [])
+def logs(flying: Sequence[str] = ("cf1", "cf2")) -> SensorLogs:
+    return SensorLogs(START_NS, {"cf1": log()}, {}, frozenset(flying), [])
 
 
 def flight(path: Path, images_s: Sequence[float], labels: Sequence[Any] = ()) -> Path:
@@ -43,24 +45,26 @@ def flight(path: Path, images_s: Sequence[float], labels: Sequence[Any] = ()) ->
     return path
 
 
-def at(time_s: Sequence[float], status: int = STATUS_OK) -> Positions:
+def at(time_s: Sequence[float], status: int = STATUS_OK) -> PeerPositions:
     count = len(time_s)
     xyz_m = np.column_stack(
         [np.full(count, 2.0), np.linspace(-0.2, 0.2, count), np.full(count, 0.1)]
     )
     time_ns = START_NS + np.rint(np.array(time_s) * SECOND_NS).astype(np.int64)
     covariance = np.tile(np.diag([0.04, 0.03, 0.02]), (count, 1, 1))
-    return Positions(time_ns, xyz_m, covariance, np.full(count, status, np.int8))
+    return PeerPositions(time_ns, xyz_m, covariance, np.full(count, status, np.int8))
 
 
-def written(path: Path, found: dict[str, Positions], camera: Camera, known: Logs) -> list[Any]:
-    look = Look(0.01, cameras={"cf1": camera})
-    return list(label_messages(Contents(path), known, "cf1", found, look))
+def written(
+    path: Path, found: dict[str, PeerPositions], camera: Camera, known: SensorLogs
+) -> list[Any]:
+    look = CameraOptions(0.01, cameras={"cf1": camera})
+    return list(build_label_messages(read_flight(path), known, "cf1", found, look))
 
 
 def test_a_position_message_says_all_of_it(tmp_path: Path) -> None:
     found = at([1.0, 2.0], STATUS_UNCONVERGED)
-    series = position_series("cf1", "cf2", found)
+    series = build_position_series("cf1", "cf2", found)
     assert series.topic == "/cf1/peer/cf2/position"
     with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
         sink.write_columns(*series)
@@ -109,10 +113,12 @@ def test_who_flies_without_a_position_may_be_in_any_image_that_has_one(tmp_path:
     known, *unknown = only.message.peers
     assert (known.peer, known.status) == ("cf2", STATUS_OK)
     assert [(p.peer, p.status) for p in unknown] == [(f"cf{k}", STATUS_UNCONVERGED) for k in (3, 4)]
-    assert {(p.u_px, p.v_px, p.depth_m) for p in unknown} == {(160.0, 112.0, NEAREST_M)}
+    assert {(p.u_px, p.v_px, p.depth_m) for p in unknown} == {(160.0, 112.0, MIN_DEPTH_M)}
 
 
 def test_without_any_calibration_there_are_no_labels(tmp_path: Path) -> None:
     path = flight(tmp_path / "a.mcap", [2.0])
-    found = label_messages(Contents(path), logs(), "cf1", {"cf2": at([2.0])}, Look(0.01))
-    assert list(found) == []
+    made = build_label_messages(
+        read_flight(path), logs(), "cf1", {"cf2": at([2.0])}, CameraOptions(0.01)
+    )
+    assert list(made) == []

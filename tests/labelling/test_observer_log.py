@@ -11,9 +11,14 @@ import pytest
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
 from dmrl.geometry.frames import AIDECK
-from dmrl.labelling.observer_log import LONGEST_GAP_S, UNSAID, Sight, camera_flight, read_sight
+from dmrl.labelling.calibration.calibration_flight import (
+    DEFAULT_COVARIANCE,
+    read_calibration_flight,
+)
+from dmrl.labelling.flight_log import read_flight
+from dmrl.labelling.observer_log import LONGEST_GAP_S, ObserverLog, read_observer_log
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message
-from dmrl.recording import Contents, Provenance, RecordingWriter
+from dmrl.recording import Provenance, RecordingWriter
 
 SECOND_NS = 1_000_000_000
 Row = tuple[float, str, str, dict[str, Any]]
@@ -54,9 +59,9 @@ def recorded(path: Path, rows: Sequence[Row]) -> Path:
 
 def sight_of(
     path: Path, rows: Sequence[Row], threshold: float | None = None, **camera: Any
-) -> Sight:
+) -> ObserverLog:
     recorded(path, rows)
-    return read_sight(Contents(path), "cf1", replace(AIDECK, **camera), threshold)
+    return read_observer_log(read_flight(path), "cf1", replace(AIDECK, **camera), threshold)
 
 
 def test_detections_are_given_to_their_image(tmp_path: Path) -> None:
@@ -81,7 +86,7 @@ def test_a_threshold_that_is_given_counts_in_place_of_the_detectors(tmp_path: Pa
 
 def test_attitude_is_that_of_the_exposure(tmp_path: Path) -> None:
     sight = sight_of(tmp_path / "a.mcap", [seen(4.0), *motion()], delay_s=0.5)
-    assert (sight.logged_ns[0], sight.time_ns[0]) == (4 * SECOND_NS, 3.5 * SECOND_NS)
+    assert (sight.log_time_ns[0], sight.time_ns[0]) == (4 * SECOND_NS, 3.5 * SECOND_NS)
     view = sight.view(0)
     assert (view.roll_rad, view.pitch_rad) == pytest.approx((0.035, -0.07))
 
@@ -135,7 +140,7 @@ def test_what_a_camera_is_calibrated_with(tmp_path: Path) -> None:
     rows += [(1.0, topics.position("cf1", "cf3"), "PeerPosition", {**place, "status": STATUS_OK})]
     rows += [(1.0, topics.position("cf2", "cf3"), "PeerPosition", {**place, "status": STATUS_OK})]
     path = recorded(tmp_path / "a.mcap", rows)
-    flight = camera_flight(Contents(path), "cf1", None, topics.POSITION)
+    flight = read_calibration_flight(read_flight(path), "cf1", None, topics.POSITION)
     assert flight.image_s.tolist() == [1.0, 2.0, 3.0]
     assert flight.image.tolist() == [0, 0, 2]
     assert flight.uv.tolist() == [[10, 5], [20, 10], [30, 15]]
@@ -145,6 +150,6 @@ def test_what_a_camera_is_calibrated_with(tmp_path: Path) -> None:
     assert path_of.time_s.tolist() == [1.0, 2.0]
     assert path_of.xyz_m.tolist() == [[1, 2, 3], [1.5, 2, 3]]
     assert path_of.covariance[0].diagonal().tolist() == [0.04, 0.05, 0.06]
-    assert path_of.covariance[1].tolist() == UNSAID.tolist()
+    assert path_of.covariance[1].tolist() == DEFAULT_COVARIANCE.tolist()
     with pytest.raises(MissingTopic):
-        camera_flight(Contents(path), "cf1", None, topics.TRUTH)
+        read_calibration_flight(read_flight(path), "cf1", None, topics.TRUTH)

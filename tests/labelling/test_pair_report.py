@@ -9,23 +9,24 @@ import pytest
 from dmrl import topics
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.estimation.solver.residuals import BIAS, OWN_GYRO, PEER_GYRO
-from dmrl.labelling.image_labels import Positions
-from dmrl.labelling.pair_report import PairReport, pair_report
+from dmrl.labelling.flight_log import read_flight
+from dmrl.labelling.pair_report import PairReport, report_pair
+from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message
-from dmrl.recording import Contents, Provenance, RecordingWriter
+from dmrl.recording import Provenance, RecordingWriter
 
 SECOND_NS = 1_000_000_000
 STATUS = [STATUS_OK, STATUS_OK, STATUS_AMBIGUOUS, STATUS_UNCONVERGED, STATUS_OK]
 OFF_M = [(0.3, 0.4), (0.0, 0.0), (3.0, 4.0), (0.0, 1.0), (9.0, 9.0)]
 
 
-def found() -> Positions:
+def found() -> PeerPositions:
     """Beside the truth, which goes along x, by OFF_M; the last is after its end."""
     time_ns = np.array([1, 2, 3, 4, 60]) * SECOND_NS // 2
     true = np.column_stack([time_ns / SECOND_NS, np.zeros(5), np.ones(5)])
     xyz = true + np.column_stack([OFF_M, np.full(5, 7.0)])
     spread = [np.diag([0.01, 0.04, 9.0])] * 4 + [np.diag([0.25, 0.01, 9.0])]
-    return Positions(time_ns, xyz, np.array(spread), np.array(STATUS, np.int8))
+    return PeerPositions(time_ns, xyz, np.array(spread), np.array(STATUS, np.int8))
 
 
 def estimate() -> Estimate:
@@ -46,7 +47,7 @@ def flight(path: Path, truth_s: list[float]) -> Path:
 
 
 def report(path: Path) -> PairReport:
-    return pair_report(Contents(path), ("cf1", "cf2"), found(), estimate())
+    return report_pair(read_flight(path), ("cf1", "cf2"), found(), estimate())
 
 
 def test_a_report_says_how_sure_and_how_right(tmp_path: Path) -> None:

@@ -12,9 +12,10 @@ from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import AIDECK, Camera
 from dmrl.images.codec import encode_png
-from dmrl.labelling.recorded_camera import camera_given, camera_of
+from dmrl.labelling.flight_log import read_flight
+from dmrl.labelling.recorded_camera import read_robot_camera, recorded_camera
 from dmrl.messages import message
-from dmrl.recording import Contents, Provenance, RecordingWriter
+from dmrl.recording import Provenance, RecordingWriter
 
 
 def flight(path: Path, **lens: Any) -> Path:
@@ -32,8 +33,8 @@ def flight(path: Path, **lens: Any) -> Path:
 def test_a_calibration_is_read_as_it_was_written(tmp_path: Path, model: str) -> None:
     path = flight(tmp_path / "a.mcap", D=[0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0], distortion_model=model)
     lens = (0.1, 0.2, 0.3, 0.4, 0.5)
-    assert camera_of(Contents(path), "cf1") == Camera(320, 224, 181, 182, 150, 100, lens)
-    assert camera_of(Contents(path), "cf2") is None
+    assert recorded_camera(read_flight(path), "cf1") == Camera(320, 224, 181, 182, 150, 100, lens)
+    assert recorded_camera(read_flight(path), "cf2") is None
 
 
 @pytest.mark.parametrize(
@@ -42,7 +43,7 @@ def test_a_calibration_is_read_as_it_was_written(tmp_path: Path, model: str) -> 
 def test_a_lens_that_dmrl_does_not_know_is_refused(tmp_path: Path, lens: dict[str, Any]) -> None:
     path = flight(tmp_path / "a.mcap", **lens)
     with pytest.raises(RecordingError, match=r"coefficients, dmrl knows plumb_bob with 5"):
-        camera_of(Contents(path), "cf1")
+        recorded_camera(read_flight(path), "cf1")
 
 
 @pytest.mark.parametrize("lens", [{"K": []}, {"K": [1, 2]}, {"D": [float("inf")]}, {"width": 0}])
@@ -51,20 +52,20 @@ def test_numbers_of_no_camera_are_refused(tmp_path: Path, lens: dict[str, Any]) 
     with pytest.raises(
         RecordingError, match=r"a.mcap: /cf1/camera/calibration (has|is) .*dmrl cali"
     ):
-        camera_of(Contents(path), "cf1")
+        recorded_camera(read_flight(path), "cf1")
 
 
 def test_images_have_their_log_times(tmp_path: Path) -> None:
     path = flight(tmp_path / "a.mcap")
-    assert Contents(path).times("/cf1/camera/image").tolist() == [5, 9]
-    assert Contents(path).times("/cf2/camera/image").tolist() == []
+    found = read_flight(path).images_ns
+    assert {robot: times.tolist() for robot, times in found.items()} == {"cf1": [5, 9]}
 
 
 def test_a_file_for_images_of_another_size_is_refused(tmp_path: Path) -> None:
     path, file = flight(tmp_path / "a.mcap"), tmp_path / "camera.toml"
     file.write_text(write_camera(AIDECK))
-    assert camera_given(Contents(path), "cf1", file) == AIDECK
+    assert read_robot_camera(read_flight(path, sizes_of=["cf1"]), "cf1", file) == AIDECK
     file.write_text(write_camera(replace(AIDECK, width_px=224, height_px=320)))
     with pytest.raises(SettingError, match=r"for images of 224x320, those of cf1 .* are 320x224"):
-        camera_given(Contents(path), "cf1", file)
-    assert camera_given(Contents(path), "cf2", file).width_px == 224
+        read_robot_camera(read_flight(path, sizes_of=["cf1"]), "cf1", file)
+    assert read_robot_camera(read_flight(path, sizes_of=["cf2"]), "cf2", file).width_px == 224

@@ -7,14 +7,14 @@ import pytest
 from dmrl.errors import SourceError
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.solver.residuals import BIAS, CLOCK, OWN_GYRO, PEER_GYRO, PEER_SCALE
-from dmrl.labelling.sensor_file import Sensors, read_sensors, write_sensors
-from dmrl.labelling.sensor_logs import read_logs
-from dmrl.recording import Contents
+from dmrl.labelling.flight_log import read_flight
+from dmrl.labelling.sensor_file import SensorConstants, read_sensors, write_sensors
+from dmrl.labelling.sensor_logs import build_sensor_logs
 
 from ..estimation.flights import flown, pair_of
 from .test_sensor_logs import flight, logs, ranges
 
-KNOWN = Sensors(
+KNOWN = SensorConstants(
     {
         "cf1": {"yaw_rate_bias_radps": (0.01, 0.001)},
         "cf2": {
@@ -43,24 +43,26 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
 def test_logs_come_out_as_the_sensors_should_have_said() -> None:
     true = np.array([[0.4, -0.2], [0.0, 1.0]])
     logged = true * 1.15 + [0.02, -0.03]
-    assert KNOWN.velocity("cf2", logged) == pytest.approx(true)
-    assert KNOWN.velocity("cf1", logged) == pytest.approx(logged)
-    assert KNOWN.yaw_rate("cf2", np.array([0.25])) == pytest.approx([0.3])
-    assert KNOWN.ranges(("cf1", "cf2"), np.array([2.0 * 1.02 + 0.35])) == pytest.approx([2.0])
-    assert KNOWN.ranges(("cf1", "cf3"), np.array([2.0])) == pytest.approx([2.0])
+    assert KNOWN.correct_velocity("cf2", logged) == pytest.approx(true)
+    assert KNOWN.correct_velocity("cf1", logged) == pytest.approx(logged)
+    assert KNOWN.correct_yaw_rate("cf2", np.array([0.25])) == pytest.approx([0.3])
+    assert KNOWN.correct_ranges(("cf1", "cf2"), np.array([2.0 * 1.02 + 0.35])) == pytest.approx(
+        [2.0]
+    )
+    assert KNOWN.correct_ranges(("cf1", "cf3"), np.array([2.0])) == pytest.approx([2.0])
 
 
 def test_sigmas_stand_where_the_solve_looks_for_them() -> None:
-    std = KNOWN.std(("cf1", "cf2"))
+    std = KNOWN.to_prior_std(("cf1", "cf2"))
     assert std is not None
     told = std[[BIAS, OWN_GYRO, PEER_GYRO, PEER_SCALE]]
     assert told == pytest.approx([0.04, 0.001, 0.002, 0.01])
     assert np.isinf(std[CLOCK])
-    back = KNOWN.std(("cf2", "cf3"))
+    back = KNOWN.to_prior_std(("cf2", "cf3"))
     assert back is not None
     assert back[OWN_GYRO] == 0.002
     assert np.isinf(back[[PEER_GYRO, BIAS]]).all()
-    assert KNOWN.std(("cf3", "cf4")) is None
+    assert KNOWN.to_prior_std(("cf3", "cf4")) is None
 
 
 @pytest.mark.parametrize(
@@ -91,12 +93,12 @@ def test_a_file_of_something_else_is_one_line(tmp_path: Path, text: str, words: 
 
 def test_a_recording_is_read_without_what_is_known_to_be_off(tmp_path: Path) -> None:
     found = logs(tmp_path / "a.mcap", flight, ranges).pairs["cf1", "cf2"]
-    known = read_logs(Contents(tmp_path / "a.mcap"), 0.1, KNOWN).pairs["cf1", "cf2"]
+    known = build_sensor_logs(read_flight(tmp_path / "a.mcap"), 0.1, KNOWN).pairs["cf1", "cf2"]
     assert known.range_m == pytest.approx((found.range_m - 0.1 - 0.35) / 1.02)
     assert known.own.vx_mps == pytest.approx(found.own.vx_mps)
     assert known.peer.vx_mps == pytest.approx((found.peer.vx_mps - 0.02) / 1.15)
     assert known.own.yaw_rate_radps == pytest.approx(found.own.yaw_rate_radps - 0.01)
-    assert known.known_std == pytest.approx(KNOWN.std(("cf1", "cf2")))
+    assert known.known_std == pytest.approx(KNOWN.to_prior_std(("cf1", "cf2")))
     assert found.known_std is None
     swapped = known.swapped().known_std
     assert swapped is not None

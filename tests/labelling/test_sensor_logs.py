@@ -9,9 +9,10 @@ import pytest
 
 from dmrl import topics
 from dmrl.estimation.model.pair import RATE_HZ
-from dmrl.labelling.sensor_logs import LEAST_RANGES, Logs, RobotLog, read_logs
+from dmrl.labelling.flight_log import read_flight
+from dmrl.labelling.sensor_logs import MIN_RANGES, RobotLog, SensorLogs, build_sensor_logs
 from dmrl.messages import message
-from dmrl.recording import Contents, Provenance, RecordingWriter
+from dmrl.recording import Provenance, RecordingWriter
 
 START_NS = 7_000_000_000
 Write = Callable[[float, str, Any], None]
@@ -40,11 +41,11 @@ def ranges(write: Write, one: str = "cf1", other: str = "cf2", count: int = 40) 
         )
 
 
-def logs(path: Path, *parts: Callable[[Write], None], offset_m: float = 0.0) -> Logs:
+def logs(path: Path, *parts: Callable[[Write], None], offset_m: float = 0.0) -> SensorLogs:
     with RecordingWriter(path, Provenance("test")) as sink:
         for part in parts:
             part(lambda t, topic, m: sink.write(START_NS + round(t * 1e9), topic, m))
-    return read_logs(Contents(path), offset_m)
+    return build_sensor_logs(read_flight(path), offset_m)
 
 
 def test_a_pair_stands_on_one_grid_with_the_ranges_of_both(tmp_path: Path) -> None:
@@ -83,7 +84,7 @@ def test_heights_are_smoothed_over_half_a_second_without_bending_a_climb() -> No
     climb_m = 0.2 * time_s + 0.05 * time_s**2
     noise_m = rng.normal(0, 0.02, len(time_s))
     for extra_m, most_m in ((0 * noise_m, 1e-4), (noise_m, 0.012)):
-        track = RobotLog(still, still, (time_s, (climb_m + extra_m)[:, None])).track(time_s)
+        track = RobotLog(still, still, (time_s, (climb_m + extra_m)[:, None])).to_track(time_s)
         assert np.std((track.height_m - climb_m)[50:-50]) < most_m
 
 
@@ -127,8 +128,8 @@ def without(kind: str) -> Callable[[Write], None]:
             ["cf1-cf2: their logs share 4.3 s, under 5 s; left out. Do their clocks agree?"],
         ),
         (
-            [flight, lambda w: ranges(w, count=LEAST_RANGES - 1)],
-            [f"cf1-cf2: {LEAST_RANGES - 1} usable ranges, under {LEAST_RANGES}; left out"],
+            [flight, lambda w: ranges(w, count=MIN_RANGES - 1)],
+            [f"cf1-cf2: {MIN_RANGES - 1} usable ranges, under {MIN_RANGES}; left out"],
         ),
     ],
     ids=["no velocity", "short", "late and short", "few ranges"],
@@ -163,8 +164,8 @@ def test_a_sensor_that_only_says_nan_is_none(tmp_path: Path, kind: str) -> None:
 
 
 def test_enough_ranges_are_just_enough(tmp_path: Path) -> None:
-    found = logs(tmp_path / "a.mcap", flight, lambda w: ranges(w, count=LEAST_RANGES))
-    assert len(found.pairs["cf1", "cf2"].range_m) == LEAST_RANGES
+    found = logs(tmp_path / "a.mcap", flight, lambda w: ranges(w, count=MIN_RANGES))
+    assert len(found.pairs["cf1", "cf2"].range_m) == MIN_RANGES
 
 
 def test_silence_is_a_gap_of_that_robot(tmp_path: Path) -> None:
@@ -214,5 +215,5 @@ def test_samples_that_are_no_numbers_and_clocks_that_go_back_are_said(tmp_path: 
         )
         flight(late)
         ranges(late)
-    back = read_logs(Contents(tmp_path / "b.mcap")).warnings
+    back = build_sensor_logs(read_flight(tmp_path / "b.mcap")).warnings
     assert "/cf1/attitude: its clock goes back 1 times; samples overlap there" in back

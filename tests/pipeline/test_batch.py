@@ -14,7 +14,7 @@ import pytest
 from dmrl.errors import DmrlError, RecordingError
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
-from dmrl.pipeline.batch import is_many, over_folder, recordings_in
+from dmrl.pipeline.batch import find_recordings, is_collection, run_over_folder
 from dmrl.recording import Provenance, RecordingWriter, summary
 from dmrl.stages import check, convert, trim
 from dmrl.topics import attitude
@@ -52,23 +52,23 @@ def bytes_in(folder: Path) -> dict[str, bytes]:
 
 
 def trimmed(source: Path, out: Path, workers: int = 2, how: trim.Settings = KEPT) -> None:
-    over_folder("trim", source, out, how, workers=workers)
+    run_over_folder("trim", source, out, how, workers=workers)
 
 
 def test_every_recording_is_found_by_its_place_and_nothing_else(flights: Path) -> None:
     names = ["a.mcap", "b.mcap", "monday/a.mcap", "monday/c.mcap"]
-    assert [str(name) for name in recordings_in(flights)] == names
-    assert [str(name) for name in recordings_in(flights / "*" / "*.mcap")] == names[2:]
-    assert [str(name) for name in recordings_in(flights / "mon*")] == names[2:]
-    assert list(recordings_in(flights / "a.mcap").values()) == [flights / "a.mcap"]
+    assert [str(name) for name in find_recordings(flights)] == names
+    assert [str(name) for name in find_recordings(flights / "*" / "*.mcap")] == names[2:]
+    assert [str(name) for name in find_recordings(flights / "mon*")] == names[2:]
+    assert list(find_recordings(flights / "a.mcap").values()) == [flights / "a.mcap"]
     outs = flights / "outs"
     record(outs / "a.mcap")
-    assert [str(name) for name in recordings_in(flights, but=outs)] == names
+    assert [str(name) for name in find_recordings(flights, but=outs)] == names
 
 
 def test_signs_in_the_name_of_a_file_are_no_pattern(tmp_path: Path) -> None:
-    assert not is_many(record(tmp_path / "a[1].mcap"))
-    assert is_many(tmp_path / "b[1].mcap")
+    assert not is_collection(record(tmp_path / "a[1].mcap"))
+    assert is_collection(tmp_path / "b[1].mcap")
 
 
 @pytest.mark.heavy

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import RecordingError, SettingError
-from dmrl.pipeline.parallel_map import spread
+from dmrl.pipeline.parallel_map import parallel_map
 
 pytestmark = pytest.mark.heavy  # a process takes half a second to begin
 
@@ -56,7 +56,7 @@ def wait_there(folder: Path) -> None:
 
 
 def test_results_come_in_order_from_other_processes_of_one_core_each() -> None:
-    found = list(spread(twice, range(5), 2))
+    found = list(parallel_map(twice, range(5), 2))
     assert [one[0] for one in found] == [0, 2, 4, 6, 8]
     assert os.getpid() not in {one[1] for one in found}
     assert {one[2] for one in found} == {"1"}
@@ -64,11 +64,11 @@ def test_results_come_in_order_from_other_processes_of_one_core_each() -> None:
 
 def test_one_worker_or_one_thing_is_done_here() -> None:
     for items, workers in ((range(3), 1), (range(1), 4)):
-        assert {one[1] for one in spread(twice, items, workers)} == {os.getpid()}
+        assert {one[1] for one in parallel_map(twice, items, workers)} == {os.getpid()}
 
 
 def test_an_error_is_the_callers_own_when_its_turn_comes() -> None:
-    results = spread(refuse, range(4), 2)
+    results = parallel_map(refuse, range(4), 2)
     assert next(results) == 0
     with pytest.raises(RecordingError, match=r"one\.mcap is damaged"):
         next(results)
@@ -76,13 +76,13 @@ def test_an_error_is_the_callers_own_when_its_turn_comes() -> None:
 
 def test_a_process_that_was_killed_is_one_line() -> None:
     with pytest.raises(SettingError, match="Try fewer --workers"):
-        list(spread(die, range(2), 2))
+        list(parallel_map(die, range(2), 2))
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.01, 0.05])
 def test_processes_that_are_amid_an_answer_end_too(after_s: float) -> None:
     """Half of an answer in a pipe was waited for, for ever."""
-    results = spread(much, range(9), 2)
+    results = parallel_map(much, range(9), 2)
     assert len(next(results)) == 50_000_000
     time.sleep(after_s)
     results.close()

@@ -15,8 +15,8 @@ from dmrl.errors import DmrlError, OutputError, RecipeError, SettingError
 from dmrl.evaluation.pipeline_summary import report
 from dmrl.pipeline import job_worker as work
 from dmrl.pipeline import recipe_run as pipeline
-from dmrl.pipeline.job import job
-from dmrl.pipeline.process_pool import Crew
+from dmrl.pipeline.job import build_job
+from dmrl.pipeline.process_pool import ProcessPool
 
 SMALL = """
 kind = "pipeline"
@@ -119,8 +119,8 @@ def test_what_the_system_refuses_a_step_is_its_error_and_no_bug(
     def refused(*_: object, **__: object) -> None:
         raise OSError(errno.EIO, "Input/output error", "a.png")
 
-    monkeypatch.setattr(work, "interface_of", refused)
-    answer = work.perform(job("sketch", None, {}, {}))
+    monkeypatch.setattr(work, "signature_of", refused)
+    answer = work.run_job(build_job("sketch", None, {}, {}))
     assert answer == {
         "error": "cannot read or write a.png: Input/output error. Check its name, permissions and "
         "free space"
@@ -186,22 +186,22 @@ def test_no_process_outlives_a_run_that_is_stopped(tmp_path: Path, number: signa
 @pytest.mark.heavy
 def test_a_killed_worker_is_one_line(tmp_path: Path) -> None:
     before = set(children(os.getpid()))
-    with Crew(1) as crew:
-        line = job("sketch", tmp_path / "a", {}, {"images": 9000}, resume=False)
-        answer = crew.give(line, alone=False)
+    with ProcessPool(1) as crew:
+        line = build_job("sketch", tmp_path / "a", {}, {"images": 9000}, resume=False)
+        answer = crew.submit(line, exclusive=False)
         while not (tmp_path / "a.partial").exists():
             time.sleep(0.05)
         (worker,) = set(children(os.getpid())) - before
         os.kill(worker, signal.SIGKILL)
         assert answer.result()["error"].startswith("its process was killed (signal 9)")
-        line = job("sketch", tmp_path / "b", {}, {"images": 1}, resume=False)
-        assert crew.give(line, alone=False).result().keys() == {"sha256"}
+        line = build_job("sketch", tmp_path / "b", {}, {"images": 1}, resume=False)
+        assert crew.submit(line, exclusive=False).result().keys() == {"sha256"}
 
 
 @pytest.mark.heavy
 def test_what_a_user_can_mend_and_what_only_we_can_are_told_apart(tmp_path: Path) -> None:
-    with Crew(1) as crew:
-        wrong = job("convert", tmp_path / "a", {"source": tmp_path / "no"}, {}, resume=False)
-        assert crew.give(wrong, alone=False).result().keys() == {"error"}
-        broken = job("convert", tmp_path / "a", {"sauce": tmp_path / "no"}, {}, resume=False)
-        assert crew.give(broken, alone=False).result()["fault"].startswith("TypeError: ")
+    with ProcessPool(1) as crew:
+        wrong = build_job("convert", tmp_path / "a", {"source": tmp_path / "no"}, {}, resume=False)
+        assert crew.submit(wrong, exclusive=False).result().keys() == {"error"}
+        broken = build_job("convert", tmp_path / "a", {"sauce": tmp_path / "no"}, {}, resume=False)
+        assert crew.submit(broken, exclusive=False).result()["bug"].startswith("TypeError: ")

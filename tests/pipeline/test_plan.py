@@ -15,7 +15,7 @@ from dmrl import plugins, recipe
 from dmrl.errors import RecipeError, SettingError
 from dmrl.pipeline import recipe_run as pipeline
 from dmrl.pipeline.plan import Step
-from dmrl.pipeline.stage_signature import interface_of
+from dmrl.pipeline.stage_signature import signature_of
 from dmrl.stages.run import command as run_command
 
 from .chain import HEAD, PICTURES
@@ -31,7 +31,7 @@ out = "both.mcap"
 def load(folder: Path, text: str) -> pipeline.Plan:
     path = folder / "mine.toml"
     path.write_text(text, encoding="utf-8")
-    return pipeline.load(path)
+    return pipeline.load_plan(path)
 
 
 def test_inputs_go_by_role_and_what_is_none_is_a_setting(tmp_path: Path) -> None:
@@ -156,15 +156,15 @@ def test_a_wrong_step_is_one_line(tmp_path: Path, old: str, new: str, words: str
     ],
 )
 def test_every_command_that_writes_is_a_step(stage: str) -> None:
-    takes = interface_of(stage)
+    takes = signature_of(stage)
     own = takes.settings
     assert not set(takes.roles) & set(getattr(own, "__dataclass_fields__", {}))
 
 
 def of_interface(stage: str) -> tuple[Any, ...]:
-    takes = interface_of(stage)
+    takes = signature_of(stage)
     roles = {name: (role.many, role.required) for name, role in takes.roles.items()}
-    return roles, set(takes.paths), takes.resumes, takes.alone
+    return roles, set(takes.paths), takes.resumes, takes.exclusive
 
 
 def test_what_a_stage_takes_is_read_from_its_run() -> None:
@@ -174,7 +174,7 @@ def test_what_a_stage_takes_is_read_from_its_run() -> None:
     assert of_interface("calibrate") == ({"sources": many}, {"camera"}, False, False)
     assert of_interface("verify") == ({"folder": one}, {"dataset"}, False, False)
     assert of_interface("merge") == ({"recordings": many}, set(), False, False)
-    assert list(interface_of("record").others) == ["robots"]
+    assert list(signature_of("record").others) == ["robots"]
 
 
 def test_a_stage_that_a_package_adds_is_a_step(
@@ -183,7 +183,7 @@ def test_a_stage_that_a_package_adds_is_a_step(
     def run(recording: Path, out: Path) -> None: ...
 
     smooth = SimpleNamespace(load=lambda: SimpleNamespace(run=run))
-    monkeypatch.setattr(plugins, "found", lambda group: {"smooth": smooth} if group else {})
+    monkeypatch.setattr(plugins, "find_plugins", lambda group: {"smooth": smooth} if group else {})
     text = 'step = [{ stage = "smooth", recording = "{data}/f.mcap", out = "s.mcap" }]'
     assert load(tmp_path, HEAD + text).steps[0].inputs == {"recording": "{data}/f.mcap"}
     with pytest.raises(RecipeError, match=r"no stage 'smoth'\. Did you mean smooth\?"):
@@ -205,7 +205,7 @@ SELF_SUPERVISED = "b48563588f4cb89d31ea5f7cb9756e611f05039ee0a33cb01c6c5c916dba6
 
 def told(step: Step) -> dict[str, Any]:
     """A step with those of its settings that are not as they usually are."""
-    takes = step.interface
+    takes = step.signature
     assert takes.settings is not None
     usual = recipe.plain(asdict(takes.settings()))
     own = recipe.plain(asdict(recipe.check(step.out, step.settings, takes.settings)))
@@ -214,7 +214,7 @@ def told(step: Step) -> dict[str, Any]:
 
 
 def test_self_supervised_is_still_what_it_was() -> None:
-    steps = pipeline.load("self_supervised").steps
+    steps = pipeline.load_plan("self_supervised").steps
     assert len(recipe.text("self_supervised").splitlines()) <= 100
     assert Counter(step.stage for step in steps) == {
         **{"fly": 148, "label": 864, "predict": 748, "dataset": 7, "train": 7},
@@ -239,12 +239,12 @@ def test_recipes_of_the_page_can_be_loaded(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize("name", recipe.names())
 def test_every_shipped_pipeline_can_be_loaded(name: str) -> None:
     if recipe.read(name)["kind"] == "pipeline":
-        assert pipeline.load(name).steps
+        assert pipeline.load_plan(name).steps
 
 
 @pytest.mark.parametrize("name", ["paper", "published"])
 def test_recipes_of_the_paper_have_figures_that_name_their_steps(name: str) -> None:
-    assert pipeline.load(name).pictured
+    assert pipeline.load_plan(name).pictured
 
 
 def test_a_figure_of_what_no_step_writes_is_a_fault_of_the_recipe(tmp_path: Path) -> None:

@@ -6,19 +6,19 @@ from typing import Any
 import pytest
 
 from dmrl.guards import limits
-from dmrl.pipeline.recipe_language import expanded
+from dmrl.pipeline.recipe_language import expand_steps
 
 
 def steps(text: str) -> list[dict[str, Any]]:
     faults: list[str] = []
-    found = expanded(tomllib.loads(text), faults)
+    found = expand_steps(tomllib.loads(text), faults)
     assert not faults
     return [step for _, step in found]
 
 
 def faults(text: str) -> list[str]:
     found: list[str] = []
-    expanded(tomllib.loads(text), found)
+    expand_steps(tomllib.loads(text), found)
     return found
 
 
@@ -127,5 +127,5 @@ HUGE = [
 @pytest.mark.parametrize("text", HUGE)
 def test_what_stands_for_too_much_is_never_written_out(text: str) -> None:
     found: list[str] = []
-    assert not expanded(tomllib.loads(text), found)
+    assert not expand_steps(tomllib.loads(text), found)
     assert found

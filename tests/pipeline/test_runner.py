@@ -13,10 +13,10 @@ import pytest
 from dmrl.atomic_output import partial_of
 from dmrl.errors import DmrlError, OutputError
 from dmrl.evaluation.pipeline_summary import Done
-from dmrl.pipeline.build_cache import Memory
-from dmrl.pipeline.job import Answer
+from dmrl.pipeline.build_cache import BuildCache
+from dmrl.pipeline.job import JobResult
 from dmrl.pipeline.plan import Plan, Step
-from dmrl.pipeline.process_pool import Crew
+from dmrl.pipeline.process_pool import ProcessPool
 from dmrl.pipeline.runner import Runner
 from dmrl.recording.provenance_inputs import sha256_of_file
 from dmrl.terminal.progress import Lines
@@ -27,7 +27,7 @@ BOTH = Step("merge", "both", {"recordings": ["a", "b"]})
 LAST = Step("trim", "last", {"recording": "both"}, {"to_s": 3.0})
 
 
-class Pretender(Crew):
+class Pretender(ProcessPool):
     """Writes what it was told as the output, at once: content follows settings and inputs."""
 
     def __init__(self, fails: tuple[str, ...] = ()) -> None:
@@ -43,11 +43,11 @@ class Pretender(Crew):
     def nodes(self) -> Lines:
         return ()
 
-    def give(self, job: str, *, alone: bool) -> Future[Answer]:
+    def submit(self, job: str, *, exclusive: bool) -> Future[JobResult]:
         told = json.loads(job)
         self.jobs.append(told)
-        out, answer = Path(told["out"]), Future[Answer]()
-        self.alone += [out.name] * alone
+        out, answer = Path(told["out"]), Future[JobResult]()
+        self.alone += [out.name] * exclusive
         if out.name in self.fails:
             answer.set_result({"error": f"no {out.name} today. Wait"})
             return answer
@@ -71,7 +71,7 @@ def run(tmp_path: Path) -> Run:
 
     def runs(*steps: Step, data: Path | None = None, **how: Any) -> tuple[list[Done], Pretender]:
         with Pretender(**how) as crew:
-            memory = Memory.of(tmp_path / "pipeline.json")
+            memory = BuildCache.load(tmp_path / "pipeline.json")
             return Runner(Plan(steps, ""), tmp_path, data, memory, crew).run(), crew
 
     return runs
@@ -172,7 +172,7 @@ def test_an_optional_step_is_left_out_and_what_needs_it_is_not_made_of_the_old(
 
 def test_a_file_of_somebody_else_is_never_replaced(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a").write_text("my thesis")
-    with pytest.raises(OutputError, match=r"not of this pipeline\. Move it elsewhere"):
+    with pytest.raises(OutputError, match=r"this pipeline did not write it\. Move or rename it"):
         run(A)
     assert (tmp_path / "a").read_text() == "my thesis"
 
@@ -193,7 +193,7 @@ def test_a_killed_step_goes_on_where_it_was_unless_it_is_another(run: Run, tmp_p
     def render(seed: int) -> tuple[bool, bool]:
         step = Step("render", "r.mcap", settings={"seed": seed, "workers": seed})
         with pytest.raises(DmrlError), Pretender(fails=("r.mcap",)) as crew:
-            memory = Memory.of(tmp_path / "pipeline.json")
+            memory = BuildCache.load(tmp_path / "pipeline.json")
             Runner(Plan((step,), ""), tmp_path, None, memory, crew).run()
         return crew.jobs[0]["resume"], partial.exists()
 

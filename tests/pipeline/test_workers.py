@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from dmrl.cli import COMMANDS, app
-from dmrl.stages import evaluate, fly, predict
+from dmrl.evaluation import detection_report
+from dmrl.stages import fly, predict
 
 FLIGHT = fly.Settings(2, 24.0, camera=True, cameras_max=1, camera_rate_hz=1.0)
 CALLS: Mapping[str, tuple[str, ...]] = {
@@ -69,7 +70,7 @@ def test_any_number_of_workers_writes_the_same_bytes(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(evaluate, "WORTH_DRAWING", 0)  # even for so few images
+    monkeypatch.setattr(detection_report, "MIN_PARALLEL_DRAWS", 0)  # even for so few images
     found = []
     numbers = ("1", "2")
     for workers in numbers:  # links, all before the first run: `index` lists when a file changed

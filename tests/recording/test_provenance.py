@@ -7,8 +7,8 @@ import pytest
 
 from dmrl.guards import limits
 from dmrl.recording import Provenance
+from dmrl.recording.overview import ancestry_lines
 from dmrl.recording.provenance import Input
-from dmrl.stages.info import ancestry_lines
 
 
 def rounds(count: int, flights: int) -> Provenance:

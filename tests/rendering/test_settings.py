@@ -3,15 +3,15 @@
 import pytest
 
 from dmrl.errors import RecipeError
+from dmrl.render_recording import read_render_settings
 from dmrl.rendering.settings import PRESETS, Settings
-from dmrl.stages.render import settings_of
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_can_be_rendered(name: str, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.mktemp("recipe") / "r.toml"
     path.write_text(f'kind = "render"\npreset = "{name}"\nimages = 3\n')
-    assert settings_of(str(path)).images == 3
+    assert read_render_settings(str(path)).images == 3
 
 
 @pytest.mark.parametrize(
@@ -19,8 +19,8 @@ def test_every_preset_can_be_rendered(name: str, tmp_path_factory: pytest.TempPa
     [("synthetic_first_look", 40), ("synthetic_paper", 1000), ("synthetic_large", 20_000)],
 )
 def test_shipped_recipes_hold(name: str, images: int) -> None:
-    assert settings_of(name).images == images
-    assert settings_of(name, images=2, seed=None).images == 2
+    assert read_render_settings(name).images == images
+    assert read_render_settings(name, images=2, seed=None).images == 2
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def test_a_wrong_preset_or_kind_is_named(tmp_path_factory: pytest.TempPathFactor
     path = tmp_path_factory.mktemp("recipe") / "r.toml"
     path.write_text('kind = "render"\npreset = "himx"\n')
     with pytest.raises(RecipeError, match=r"no preset 'himx'. There are: himax"):
-        settings_of(str(path))
+        read_render_settings(str(path))
     path.write_text('kind = "train"\n')
     with pytest.raises(RecipeError, match="kind 'train'"):
-        settings_of(str(path))
+        read_render_settings(str(path))

@@ -108,7 +108,7 @@ def run_in(box: Box, capsys: pytest.CaptureFixture[str], *words: object) -> int:
 def said_in(box: Box, capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
     """The same, and what it said on standard error."""
     with untouched(box):
-        status = boundary.status_of(lambda: app([str(word) for word in words]))
+        status = boundary.run_to_status(lambda: app([str(word) for word in words]))
     said = capsys.readouterr()
     assert "internal error" not in said.err, said.err
     assert "\x1b" not in said.out + said.err

@@ -55,5 +55,5 @@ def inputs(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     quantised(root / "model", named)
     source = bad if request.param is ROBOTS else hostile(root / "named.mcap")
     made = ["dataset", str(source), str(root / "cards"), "--split", "recordings"]
-    assert boundary.status_of(lambda: app(made)) == 0
+    assert boundary.run_to_status(lambda: app(made)) == 0
     return root

@@ -129,7 +129,7 @@ def refused_by_export(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
     folder = box.root / "in" / "model"
     words = ["export", str(folder), str(box.out / "x")]
     with untouched(box):
-        assert boundary.status_of(lambda: app(words)) == 1
+        assert boundary.run_to_status(lambda: app(words)) == 1
     said = capsys.readouterr().err
     assert "internal error" not in said
     assert "Quantise" in said, said

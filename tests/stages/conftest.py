@@ -8,6 +8,7 @@ import torch
 
 from dmrl import card
 from dmrl.datasets import open_dataset
+from dmrl.evaluation import quantization_report
 from dmrl.images.codec import encode_png
 from dmrl.learn.inference.loaded_model import Model, save_model
 from dmrl.learn.networks.architectures import build, to_input
@@ -85,7 +86,7 @@ def quantised(settled: Path, dots_dataset: Path, tmp_path_factory: pytest.TempPa
     """The int8 form of ``settled``."""
     out = tmp_path_factory.mktemp("quantised") / settled.name
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quantize, "plots", None)
+        patch.setattr(quantization_report, "plots", None)
         quantize.run(settled, dots_dataset, out, quantize.Settings())
     return out
 

@@ -11,6 +11,7 @@ from dmrl.errors import RecordingError, SettingError
 from dmrl.images.codec import encode_jpeg
 from dmrl.messages import message
 from dmrl.recording import RecordingWriter, provenance, read_raw, read_table, summary
+from dmrl.simulation.settings import Preset
 from dmrl.stages import fly
 from dmrl.stages.align import METADATA, Settings, run
 
@@ -97,7 +98,7 @@ def test_a_camera_is_set_to_5_ms_over_5_minutes(tmp_path: Path) -> None:
     assert camera_error_s(tmp_path, 300.0) < 0.005
 
 
-def mocap_errors_s(folder: Path, duration_s: float, noise: fly.Preset) -> list[float]:
+def mocap_errors_s(folder: Path, duration_s: float, noise: Preset) -> list[float]:
     """By robot, after its log got a wrong clock and was set by motion capture's again."""
     true, spoilt, out = folder / "true.mcap", folder / "in.mcap", folder / "out.mcap"
     fly.run(true, fly.Settings(duration_s=duration_s, noise=noise, trajectory="random", seed=4))

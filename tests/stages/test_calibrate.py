@@ -12,6 +12,7 @@ from dmrl.geometry.frames import AIDECK, Camera
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, read
+from dmrl.simulation.flight_recording import START_NS
 from dmrl.stages import calibrate, fly, label
 from dmrl.stages.calibrate import Settings
 
@@ -181,7 +182,7 @@ def _seen(seed: int, folder: Path, camera: Camera) -> Path:
     fly.run(steps[0], fly.Settings(2, 60.0, noise="calibrated", seed=seed))
     label.run(steps[0], steps[1], label.Settings())
     true = simulate(Scenario(2, 60.0), NOISE["calibrated"], seed).truth["cf1"]
-    times_ns = fly.START_NS + np.rint(true.time_s * 1e9).astype(np.int64)
+    times_ns = START_NS + np.rint(true.time_s * 1e9).astype(np.int64)
     tilt = times_ns, true.roll, true.pitch
     return with_detections(steps[1], steps[2], "cf1", camera, seed, tilt, rate_hz=9.73)
 

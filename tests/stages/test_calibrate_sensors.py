@@ -7,8 +7,8 @@ import pytest
 
 from dmrl.errors import OutputError, RecordingError, SettingError
 from dmrl.flight import Fault
-from dmrl.labelling import sensor_calibration
-from dmrl.labelling.sensor_file import Sensors, read_sensors, write_sensors
+from dmrl.labelling.calibration import sensor_calibration
+from dmrl.labelling.sensor_file import SensorConstants, read_sensors, write_sensors
 from dmrl.recording import summary
 from dmrl.stages import calibrate, fly, label
 from dmrl.stages.calibrate import Settings
@@ -101,6 +101,6 @@ def test_flights_that_agree_on_nothing_leave_no_file(
 
 def test_a_file_of_other_robots_is_refused(flights: list[Path], tmp_path: Path) -> None:
     path = tmp_path / "sensors.toml"
-    path.write_text(write_sensors(Sensors({"cf7": {"velocity_scale": (0.1, 0.01)}})))
+    path.write_text(write_sensors(SensorConstants({"cf7": {"velocity_scale": (0.1, 0.01)}})))
     with pytest.raises(SettingError, match=r"is of cf7, and .* has cf1, cf2"):
         label.run(flights[0], tmp_path / "out.mcap", label.Settings(sensors=path))

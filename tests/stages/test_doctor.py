@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from dmrl import boundary
+from dmrl import boundary, installation
 from dmrl.cli import app
-from dmrl.stages import doctor
 
 ROOT = Path(__file__).parents[2]
 
@@ -33,7 +32,7 @@ def test_every_extra_is_named_with_what_it_is_for() -> None:
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     section = text.partition("[project.optional-dependencies]")[2].partition("\n\n")[0]
     said = dict(re.findall(r"^(\w+) = \[.*?#\s*(.+)$", section, re.MULTILINE))
-    assert said == doctor.EXTRAS
+    assert said == installation.EXTRAS
 
 
 def test_what_is_missing_or_too_old_is_said_with_the_line_to_type(
@@ -41,7 +40,9 @@ def test_what_is_missing_or_too_old_is_said_with_the_line_to_type(
 ) -> None:
     known = {"filterpy": "", "rosbags": "0.1"}
     real = importlib.metadata.version
-    monkeypatch.setattr(doctor, "_version", lambda name: known.get(name, real(name)))
+    monkeypatch.setattr(
+        installation, "_installed_version", lambda name: known.get(name, real(name))
+    )
     monkeypatch.setattr(shutil, "which", lambda _: None)
     said = _said(capsys)
     assert said["dmrl[label]"]["found"] == "no filterpy"
@@ -55,15 +56,17 @@ def test_a_base_that_does_not_work_is_an_error(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = importlib.metadata.version
-    monkeypatch.setattr(doctor, "_version", lambda name: "" if name == "mcap" else real(name))
-    assert boundary.status_of(lambda: app(["doctor"], result_action="return_value")) == 1
+    monkeypatch.setattr(
+        installation, "_installed_version", lambda name: "" if name == "mcap" else real(name)
+    )
+    assert boundary.run_to_status(lambda: app(["doctor"], result_action="return_value")) == 1
     assert capsys.readouterr().err == "dmrl: base packages: no mcap. Try: pip install dmrl\n"
 
 
 def test_no_vulkan_driver_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(doctor, "DRIVERS", (str(tmp_path),))
+    monkeypatch.setattr(installation, "DRIVERS", (str(tmp_path),))
     monkeypatch.setattr("platform.system", lambda: "Linux")
     monkeypatch.delenv("VK_ICD_FILENAMES", raising=False)
     monkeypatch.delenv("VK_DRIVER_FILES", raising=False)
-    assert not doctor._vulkan().there
-    assert doctor._vulkan().way == "apt-get install mesa-vulkan-drivers"
+    assert not installation._find_vulkan().there
+    assert installation._find_vulkan().way == "apt-get install mesa-vulkan-drivers"

@@ -8,11 +8,12 @@ import pytest
 
 from dmrl.cli import app
 from dmrl.errors import RecordingError, SettingError
+from dmrl.evaluation.detection_report import Evaluation, describe_evaluation
 from dmrl.images.codec import encode_png
 from dmrl.messages import STATUS_AMBIGUOUS, message
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
 from dmrl.stages import convert, evaluate, merge, predict
-from dmrl.stages.evaluate import Settings, document, run
+from dmrl.stages.evaluate import Settings, run
 
 Peers = Sequence[Mapping[str, Any]]
 PICTURE = message("CompressedImage")(data=encode_png(np.zeros((48, 64, 3), np.uint8)), format="png")
@@ -59,7 +60,7 @@ def write(tmp_path: Path) -> Callable[..., Path]:
 
 
 def figures(path: Path, settings: Settings = FAST) -> dict[str, Any]:
-    document_ = document([path], settings, run([path], None, settings))
+    document_ = describe_evaluation([path], run([path], None, settings))
     overall: dict[str, Any] = document_["overall"]
     return {k: v["value"] if isinstance(v, dict) else v for k, v in overall.items()}
 
@@ -190,9 +191,9 @@ def test_leaving_messages_out_does_not_flatter(
     assert figures(picked, partial)["ap_16_px"] == 1
     evaluate.command([picked], settings=partial)
     assert "1 images against truth, only those with detections" in capsys.readouterr().out
-    said = document([picked], partial, run([picked], None, partial))
+    said = describe_evaluation([picked], run([picked], None, partial))
     assert (said["partial"], said["images_without_detections"]) == (True, 0)
-    said = document([picked], FAST, run([picked], None, FAST))
+    said = describe_evaluation([picked], run([picked], None, FAST))
     assert (said["partial"], said["images_without_detections"]) == (False, 4)
 
 
@@ -237,7 +238,7 @@ def test_alarms_where_nobody_is_are_counted(
 ) -> None:
     empty: list[Any] = [([], [found(10, 10, 0.5), found(40, 30, 0.4)])] * 2 + [([], [])] * 6
     path = write({"cf1": empty}, threshold=0.45, looked=["truth"])
-    made = document([path], FAST, run([path], None, FAST))
+    made = describe_evaluation([path], run([path], None, FAST))
     assert (made["empty_images"], made["alarmed_images"], made["false_alarms"]) == (8, 2, 0.25)
     app(["evaluate", str(path), "--draws", "5"], result_action="return_value")
     assert "nobody in view: an alarm in 2 of 8 images, 0.250 an image" in capsys.readouterr().out
@@ -249,7 +250,7 @@ def test_the_threshold_of_a_rate_of_false_alarms(write: Callable[..., Path]) -> 
     path = write({"cf1": [*seen, *quiet]}, looked=["truth"])
     settings = Settings(draws=20, false_alarms=0.05)
     judged = run([path], None, settings)
-    assert isinstance(judged, evaluate.Evaluation)
+    assert isinstance(judged, Evaluation)
     assert judged.threshold == pytest.approx(0.55)
     few = write({"cf1": [*seen, *quiet[:5]]}, looked=["truth"], name="few.mcap")
     with pytest.raises(SettingError, match=r"there are 12 and 5\. Give --threshold"):

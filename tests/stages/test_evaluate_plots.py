@@ -7,7 +7,8 @@ import pytest
 from PIL import Image
 
 from dmrl.errors import MissingExtra, OutputError
-from dmrl.stages import evaluate, predict
+from dmrl.evaluation import evaluate_recordings
+from dmrl.stages import predict
 from dmrl.stages.evaluate import run
 
 from .test_evaluate import FAST
@@ -34,6 +35,6 @@ def test_plots_are_whole_and_the_same_again(dots: Path, model: Path, tmp_path: P
 def test_plots_without_matplotlib_name_the_extra(
     dots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(evaluate, "figures", None)
+    monkeypatch.setattr(evaluate_recordings, "figures", None)
     with pytest.raises(MissingExtra, match=r"pip install 'dmrl\[plot\]'"):
         run([dots], tmp_path / "plots", FAST)

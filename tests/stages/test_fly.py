@@ -132,7 +132,7 @@ def _rows_of_ranges(ranged_s: np.ndarray, logged_s: np.ndarray) -> list[tuple[in
 
 @pytest.mark.parametrize("name", ["fly_in_view", "fly_swarm"])
 def test_shipped_recipes_can_be_flown(name: str, tmp_path: Path) -> None:
-    settings = Flags(duration_s=1.0).over(recipes.load(name, "fly", Settings))
+    settings = recipes.load(name, "fly", Settings, Flags(duration_s=1.0))
     assert fly.run(tmp_path / "out.mcap", settings)["/tf"] == 20
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from dmrl.messages import message
 from dmrl.recording import Provenance, RecordingWriter, summary
-from dmrl.stages.info import topic_rows
+from dmrl.recording.overview import topic_rows
 
 
 def test_the_rate_of_a_topic_is_that_of_its_own_time(tmp_path: Path) -> None:

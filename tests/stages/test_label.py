@@ -6,11 +6,9 @@ import pytest
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, OutputError, SettingError
-from dmrl.estimation.model.pair import Pair, Track
-from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.keyframes import Noise
 from dmrl.flight import NOISE
 from dmrl.geometry.frames import AIDECK_PINHOLE, pixels_from_horizontal
+from dmrl.labelling import pair_estimation
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message
 from dmrl.recording import (
     Provenance,
@@ -257,41 +255,15 @@ def test_real_ranges_of_moving_robots_are_labelled_and_a_static_observer_is_not(
         assert found["5", peer].ok_share == 0.0
 
 
-def test_a_peer_above_is_above_at_each_time_by_the_sensors_of_heights() -> None:
-    time_s = np.arange(0, 10, 0.01)
-    none, gap = np.zeros(len(time_s)), np.zeros(len(time_s), bool)
-    own, peer = (
-        Track(none, none, none, high, gap) for high in (1 + 0 * time_s, 1.5 + 0.1 * time_s)
-    )
-    pair = Pair(time_s, own, peer, np.array([1.0]), np.array([2.0]))
-    state = np.column_stack([2 + time_s[::10], -time_s[::10], 0 * time_s[::10]])
-    spread = np.tile(np.diag([0.04, 0.09, 0.01]), (100, 1, 1))
-    status = np.zeros(100, np.int8)
-    noise = Noise(height_std_m=0.3)
-    found = Estimate(time_s[::10], state, spread, status, np.zeros(11), noise)
-    start_ns, images_ns = 7 * SECOND_NS + 20_000_000, np.array([5, 8, 99]) * SECOND_NS + 33
-    made = label._positions(start_ns, pair, found, images_ns)
-    later_s = (made.time_ns - start_ns) * 1e-9
-    assert made.xyz_m == pytest.approx(
-        np.column_stack([2 + later_s, -later_s, 0.5 + 0.1 * later_s])
-    )
-    assert made.covariance[7] == pytest.approx(np.diag([0.04, 0.09, 0.09]))
-    regular = np.flatnonzero(made.time_ns % (SECOND_NS // 20) == 0)
-    assert sorted(set(range(len(made.time_ns))) - set(regular.tolist())) == [
-        int(np.searchsorted(made.time_ns, 8 * SECOND_NS + 33))
-    ]
-    assert (made.time_ns[0], made.time_ns[-1]) == (7_050_000_000, 16_900_000_000)
-
-
 @pytest.mark.heavy
 def test_pairs_in_other_processes_change_no_byte(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flight = tmp_path / "f.mcap"
     fly.run(flight, fly.Settings(robots=4, duration_s=8.0, noise="calibrated"))
-    monkeypatch.setattr(label, "WORTH_S", 0.0)
+    monkeypatch.setattr(pair_estimation, "MIN_PARALLEL_S", 0.0)
     for workers in (1, 2):
         out = tmp_path / f"{workers}.mcap"
-        result = label.side_by_side(flight, out, label.Settings(), workers)
+        result = label.run(flight, out, label.Settings(), workers=workers)
         assert len(result.pairs) == 12
     assert (tmp_path / "1.mcap").read_bytes() == (tmp_path / "2.mcap").read_bytes()

@@ -18,13 +18,13 @@ from dmrl.errors import (
     SourceError,
 )
 from dmrl.images.codec import decode, encode_png
+from dmrl.render_recording import read_render_settings
 from dmrl.rendering import preset_fitting
 from dmrl.rendering import settings as looks
 from dmrl.rendering.backgrounds.rooms import rooms
 from dmrl.rendering.camera.image_statistics import FIGURES, Likeness
 from dmrl.rendering.preset_fitting import pictures, scenes
 from dmrl.stages.likeness import Settings, run
-from dmrl.stages.render import settings_of
 
 from ..faults.inputs import Inputs
 
@@ -61,7 +61,7 @@ def test_figures_of_the_fitted_preset_are_those_of_the_frames(camera: str, tmp_p
     assert result.frames == 32
     assert off(result.fitted, result.real) < 0.2
     assert off(result.preset, result.real) > 0.2
-    settings = settings_of(str(tmp_path / "own.toml"))
+    settings = read_render_settings(str(tmp_path / "own.toml"))
     assert settings.bayer == (camera == "colour")
     assert (settings.saturation[1] == 0) == (camera == "grey")
     sheet = decode((tmp_path / "own.png").read_bytes())

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from dmrl import prediction
 from dmrl.deploy.detector import fastest
 from dmrl.deploy.onnx import runtime as onnx_run
 from dmrl.errors import MissingTopic, ModelError, OutputError, SettingError, SourceError
@@ -143,8 +144,10 @@ def test_of_large_images_few_are_in_memory(
     dots: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sizes: list[int] = []
-    seen = predict._seen
-    monkeypatch.setattr(predict, "_seen", lambda p, *more: sizes.append(len(p)) or seen(p, *more))
+    detect = prediction.detect_images
+    monkeypatch.setattr(
+        prediction, "detect_images", lambda p, *more: sizes.append(len(p)) or detect(p, *more)
+    )
     run(model, dots, tmp_path / "a.mcap", Settings())
     monkeypatch.setattr("dmrl.guards.limits.FRAME_PIXELS", 4 * 64 * 48)
     run(model, dots, tmp_path / "b.mcap", Settings())

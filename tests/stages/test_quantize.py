@@ -10,6 +10,7 @@ from dmrl.cli import app
 from dmrl.deploy.int8.network import Conv
 from dmrl.deploy.int8.store import load
 from dmrl.errors import OutputError, SettingError
+from dmrl.evaluation import quantization_report
 from dmrl.images.codec import decode, encode_png
 from dmrl.learn.inference.loaded_model import load_model
 from dmrl.messages import message
@@ -67,7 +68,7 @@ def test_float_and_int8_maps_are_drawn(model: Path, dots_dataset: Path, tmp_path
 def test_a_grey_network_takes_one_channel(
     settled: Path, dots_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(quantize, "plots", None)
+    monkeypatch.setattr(quantization_report, "plots", None)
     result = run(settled, dots_dataset, tmp_path / "grey", Settings(grey=True))
     first = load(tmp_path / "grey").layers[0]
     assert isinstance(first, Conv)
@@ -114,7 +115,7 @@ def test_the_command_prints_layers_and_accuracies(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(quantize, "plots", None)
+    monkeypatch.setattr(quantization_report, "plots", None)
     flags = [str(settled), str(dots_dataset)]
     app(["quantize", *flags, str(tmp_path / "a")], result_action="return_value")
     printed = capsys.readouterr()

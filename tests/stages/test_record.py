@@ -16,12 +16,13 @@ import pytest
 
 from dmrl.errors import MissingExtra, MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.images.codec import decode
+from dmrl.ingest.live_session import Result
 from dmrl.live import crazyflie_link
 from dmrl.live.robot_options import Robot, robot_of
 from dmrl.recording import read, read_table, recover
+from dmrl.simulation import drone_fleet
+from dmrl.simulation.drone_fleet import Fleet
 from dmrl.stages import fake_drone, fly, record
-from dmrl.stages.fake_drone import Fleet
-from dmrl.stages.record import Result
 
 pytest.importorskip("cflib", reason="cflib (extra record) is not installed")
 
@@ -81,7 +82,7 @@ def test_all_that_was_sent_is_recorded_as_it_was_flown(flight: Path, tmp_path: P
     out = tmp_path / "out.mcap"
     # The clock of the drones wraps one second after take-off.
     settings = fake_drone.Settings(sends="streamer", boot_ms=float((1 << 24) - 1000))
-    with fake_drone.fleet(flight, ANY, (0, 0), settings) as fleet:
+    with drone_fleet.fleet(flight, ANY, (0, 0), settings) as fleet:
         result = recorded(out, fleet, lambda: fleet.clock.landed)
     got = by_source(result)
     for drone in fleet.drones:
@@ -138,7 +139,7 @@ def test_dropped_packets_are_counted_and_a_dead_drone_stops_nobody(
     flight: Path, tmp_path: Path
 ) -> None:
     settings = fake_drone.Settings(drop=0.05, dies=("cf2=1",), sends="stamped")
-    with fake_drone.fleet(flight, ANY, (0,), settings) as fleet:
+    with drone_fleet.fleet(flight, ANY, (0,), settings) as fleet:
         result = recorded(tmp_path / "out.mcap", fleet, lambda: fleet.clock.landed)
     cf1, cf2 = fleet.drones
     received, lost, _ = by_source(result)["cf1"]
@@ -164,7 +165,7 @@ def test_a_packet_that_cannot_be_read_costs_a_connection_not_the_recording(
 
     monkeypatch.setattr(crazyflie_link, "RETRY_S", 0.1)
     monkeypatch.setattr(crazyflie_link.Reading, "samples", once_wrong)
-    with fake_drone.fleet(flight, ANY[:1], (), fake_drone.Settings(speed=0.5)) as fleet:
+    with drone_fleet.fleet(flight, ANY[:1], (), fake_drone.Settings(speed=0.5)) as fleet:
         result = recorded(tmp_path / "out.mcap", fleet, lambda: fleet.clock.landed)
     said = "cf1: a packet could not be read (ValueError('no such number')) at udp://"
     assert said in capsys.readouterr().err
@@ -177,7 +178,7 @@ def test_a_drone_that_starts_anew_is_connected_again(
     for name, seconds in {"SILENT_S": 1.0, "FIRST_ANSWER_S": 0.5, "RETRY_S": 0.1}.items():
         monkeypatch.setattr(crazyflie_link, name, seconds)
     settings = fake_drone.Settings(dies=("cf1=0.5:0.8",), speed=0.3)
-    with fake_drone.fleet(flight, ANY[:1], (), settings) as fleet:
+    with drone_fleet.fleet(flight, ANY[:1], (), settings) as fleet:
         (drone,) = fleet.drones
         result = recorded(tmp_path / "out.mcap", fleet, lambda: drone.sent > 160)
     assert result.healths[0].connections >= 2
@@ -199,7 +200,7 @@ def attitudes_in(partial: Path, mended: Path) -> int:
 def test_a_killed_session_comes_back_to_its_last_second(flight: Path, tmp_path: Path) -> None:
     out, mended = tmp_path / "out.mcap", tmp_path / "mended.mcap"
     partial = tmp_path / "out.mcap.partial"
-    with fake_drone.fleet(flight, ANY, (0, 0), fake_drone.Settings()) as fleet:
+    with drone_fleet.fleet(flight, ANY, (0, 0), fake_drone.Settings()) as fleet:
         named = [
             f"--robot={r.name}={r.uri},camera={r.camera[0]}:{r.camera[1]}"
             for r in robots(fleet)
@@ -219,7 +220,7 @@ def test_a_killed_session_comes_back_to_its_last_second(flight: Path, tmp_path: 
 
 
 def test_ctrl_c_leaves_a_whole_recording(flight: Path, tmp_path: Path) -> None:
-    with fake_drone.fleet(flight, ANY[:1], (), fake_drone.Settings()) as fleet:
+    with drone_fleet.fleet(flight, ANY[:1], (), fake_drone.Settings()) as fleet:
         (drone,) = fleet.drones
 
         def interrupt() -> None:
@@ -291,7 +292,7 @@ def test_a_fleet_that_cannot_be_is_refused(
 ) -> None:
     with (
         pytest.raises(SettingError, match=why),
-        fake_drone.fleet(flight, uris, cameras, fake_drone.Settings(**settings)),
+        drone_fleet.fleet(flight, uris, cameras, fake_drone.Settings(**settings)),
     ):
         pass
 

@@ -16,6 +16,7 @@ from dmrl.geometry.camera_file import write_camera
 from dmrl.geometry.frames import Array, Camera, project
 from dmrl.images.codec import decode, encode_png
 from dmrl.recording import check, licences, read, summary
+from dmrl.render_recording import read_render_camera
 from dmrl.rendering.camera.distortion import image_from_pinhole
 from dmrl.rendering.image_messages import quaternion
 from dmrl.rendering.randomise import World, draw_scene
@@ -23,7 +24,7 @@ from dmrl.rendering.renderer import Model, Renderer
 from dmrl.rendering.robots import crazyflie
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Robot
-from dmrl.stages.render import camera_of, run
+from dmrl.stages.render import run
 
 SMALL = Settings(
     images=6,
@@ -127,7 +128,7 @@ def test_what_is_resumed_must_be_of_the_same_settings(recording: Path, tmp_path:
 @pytest.mark.slow
 def test_a_worker_killed_on_the_way_changes_no_pixel(blender: Path) -> None:
     settings = Settings(images=6, robots_max=2, empty_share=0.0, samples=2)
-    camera = camera_of(settings)
+    camera = read_render_camera(settings)
     grey = np.full((8, 16, 3), 0.3, np.float32)
     shots = []
     for kill in (False, True):
@@ -146,7 +147,7 @@ def test_a_worker_killed_on_the_way_changes_no_pixel(blender: Path) -> None:
 @pytest.mark.slow
 def test_boxes_are_where_the_mesh_is(blender: Path) -> None:
     settings = Settings(images=30, empty_share=0.0, depth_m=(0.3, 1.0), seed=1)
-    camera = camera_of(settings)
+    camera = read_render_camera(settings)
     grey = np.full((8, 16, 3), 0.3, np.float32)
     errors = []
     with Renderer(blender, Model()) as renderer:
@@ -193,7 +194,7 @@ def test_renders_are_taken_with_a_camera_of_the_user_s(blender: Path, tmp_path: 
     run(out, settings)
     calibration = next(iter(read(out, "/cf1/camera/calibration"))).message
     assert list(calibration.D)[:2] == [-0.28, 0.09]
-    assert camera_of(settings) == OWN
+    assert read_render_camera(settings) == OWN
     pictures = [decode(sample.message.data) for sample in read(out, "/cf1/camera/image")]
     assert {picture.shape for picture in pictures} == {(120, 160, 3)}
     made = summary(out).provenance
@@ -205,7 +206,7 @@ def test_a_lens_that_cannot_fill_its_image_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(write_camera(replace(OWN, distortion=(-0.9,))))
     with pytest.raises(SettingError, match="folds back before the corners"):
-        camera_of(Settings(camera=path))
+        read_render_camera(Settings(camera=path))
 
 
 def test_outputs_are_never_overwritten(tmp_path: Path) -> None:

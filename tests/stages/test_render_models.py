@@ -12,11 +12,12 @@ from dmrl.errors import BlenderError, OutputError, SettingError
 from dmrl.geometry.frames import Array
 from dmrl.images.codec import decode
 from dmrl.recording import read_table
+from dmrl.render_recording import read_render_settings
 from dmrl.rendering.renderer import Model, Renderer
 from dmrl.rendering.robot_preview import views
 from dmrl.rendering.robots import crazyflie
 from dmrl.rendering.settings import Settings
-from dmrl.stages.render import command, run, settings_of
+from dmrl.stages.render import command, run
 
 CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + (
     "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
@@ -93,7 +94,7 @@ def test_a_preview_is_refused_under_another_name_and_on_a_cluster(tmp_path: Path
 
 @pytest.mark.heavy
 def test_a_scale_for_a_model_that_is_not_given_asks_for_it(blender: Path, tmp_path: Path) -> None:
-    settings = settings_of("synthetic_published", images=1, workers=1)
+    settings = read_render_settings("synthetic_published", images=1, workers=1)
     with pytest.raises(SettingError, match=r"Pass the --model of this scale"):
         run(tmp_path / "out.mcap", settings)
 

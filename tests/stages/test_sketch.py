@@ -9,8 +9,9 @@ from dmrl.errors import OutputError, SettingError
 from dmrl.geometry.frames import AIDECK_PINHOLE
 from dmrl.images.codec import decode
 from dmrl.recording import SPLIT_METADATA, read, summary
+from dmrl.simulation.drawn_pictures import draw_picture
 from dmrl.stages import convert
-from dmrl.stages.sketch import Settings, run, sketch
+from dmrl.stages.sketch import Settings, run
 
 SMALL = Settings(images=12, seed=5, empty_share=0.3)
 
@@ -30,7 +31,7 @@ def test_every_picture_is_labelled_and_those_without_a_robot_say_so(folder: Path
         rows = list(csv.DictReader(stream))
     assert sorted({row["file"] for row in rows}) == names
     empty = {row["file"] for row in rows if not row["peer"]}
-    drawn = {f"{k:06d}.png" for k in range(12) if len(sketch(SMALL, k).depth_m)}
+    drawn = {f"{k:06d}.png" for k in range(12) if len(draw_picture(SMALL, k).depth_m)}
     assert empty == set(names) - drawn != set()
     assert [row["split"] for row in rows if row["file"] >= names[10]].count("train") == 0
 
@@ -42,7 +43,7 @@ def test_converted_labels_are_what_was_drawn(folder: Path, tmp_path: Path) -> No
     pictures = read(out, "/cf1/camera/image")
     labels = read(out, "/cf1/labels")
     for k, (picture, label) in enumerate(zip(pictures, labels, strict=True)):
-        drawn = sketch(SMALL, k)
+        drawn = draw_picture(SMALL, k)
         assert picture.time_ns == label.time_ns == k * 100_000_000
         np.testing.assert_array_equal(decode(picture.message.data), drawn.rgb)
         peers = label.message.peers
@@ -75,7 +76,7 @@ def test_the_same_seed_draws_the_same_bytes(folder: Path, tmp_path: Path) -> Non
 
 
 def test_a_picture_does_not_depend_on_how_many_are_drawn(folder: Path) -> None:
-    alone = sketch(Settings(images=1, seed=5, empty_share=0.3), 7)
+    alone = draw_picture(Settings(images=1, seed=5, empty_share=0.3), 7)
     np.testing.assert_array_equal(alone.rgb, decode((folder / "000007.png").read_bytes()))
 
 

@@ -8,8 +8,9 @@ import pytest
 from dmrl import topics
 from dmrl.errors import DmrlError, MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.geometry.camera_file import write_camera
-from dmrl.labelling.recorded_camera import camera_of
-from dmrl.recording import Contents, Provenance, RecordingWriter, read, read_raw, summary, trim
+from dmrl.labelling.flight_log import read_flight
+from dmrl.labelling.recorded_camera import recorded_camera
+from dmrl.recording import Provenance, RecordingWriter, read, read_raw, summary, trim
 from dmrl.recording.provenance_inputs import sha256_of_file
 from dmrl.stages import evaluate, fly, track
 from dmrl.stages.track import Settings
@@ -70,7 +71,7 @@ def test_tracks_are_judged_with_the_camera_that_made_them(
         for one in read(detected):
             seen = one.topic in (topics.detections("cf1"), topics.camera_image("cf1"))
             sink.write(one.time_ns + seen * 200_000_000, one.topic, one.message)
-    camera = camera_of(Contents(detected), "cf1")
+    camera = recorded_camera(read_flight(detected), "cf1")
     assert camera is not None
     path.write_text(write_camera(replace(camera, delay_s=0.2)))
     track.run(late, out, Settings(camera={"cf1": path}))

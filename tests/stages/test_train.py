@@ -298,7 +298,7 @@ def test_flags_win_over_the_recipe(dots_dataset: Path, tmp_path: Path) -> None:
 
 def test_a_flag_out_of_range_is_one_line() -> None:
     with pytest.raises(SettingError, match="epochs: must be at least 1"):
-        Flags(epochs=0).over(Settings())
+        recipe.load("dmrl_nano", "train", Settings, Flags(epochs=0))
 
 
 def test_json_names_the_model(

@@ -9,14 +9,13 @@ import pytest
 
 from dmrl.cli import app
 from dmrl.deploy.c import write_c
-from dmrl.deploy.c.run import compile_targets
+from dmrl.deploy.c.run import compile_targets, proof
 from dmrl.deploy.c.source_file import STACK_BYTES
 from dmrl.deploy.int8.network import Conv, IntegerNetwork
 from dmrl.deploy.int8.store import INTEGER_NAME, save
 from dmrl.deploy.samples import save_samples
 from dmrl.errors import DatasetError, ModelError, SettingError, ToolError
-from dmrl.stages import verify
-from dmrl.stages.verify import Settings, document, run
+from dmrl.stages.verify import Settings, run
 
 from ..deploy.networks import random_network
 
@@ -54,7 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def everything(folder: Path) -> dict[str, Any]:
     if absent := [tool for tool in TOOLS if shutil.which(tool) is None]:
         pytest.skip(f"no {absent[0]}")
-    return document(run(folder, Settings(images=2, noise=2)))
+    return run(folder, Settings(images=2, noise=2)).to_document()
 
 
 @pytest.mark.slow
@@ -79,7 +78,7 @@ def test_what_the_c_costs_is_measured(everything: dict[str, Any]) -> None:
 def test_counting_instructions_gives_the_same_number_again(
     everything: dict[str, Any], folder: Path
 ) -> None:
-    again = document(run(folder, replace(GCC, targets=())))
+    again = run(folder, replace(GCC, targets=())).to_document()
     assert again["instructions"] == everything["instructions"]
 
 
@@ -87,7 +86,7 @@ def test_counting_instructions_gives_the_same_number_again(
 def one_level(monkeypatch: pytest.MonkeyPatch) -> None:
     """The C is compiled once and its cost not counted: the slow tests do all of that."""
     monkeypatch.setattr(compile_targets, "LEVELS", ("-O0",))
-    monkeypatch.setattr(verify, "cost", lambda *_: None)
+    monkeypatch.setattr(proof, "cost", lambda *_: None)
 
 
 @pytest.mark.heavy

@@ -15,7 +15,7 @@ from dmrl.datasets import open_dataset
 from dmrl.errors import OutputError, StorageError, UnsafeName
 from dmrl.images.codec import encode_png
 from dmrl.messages import message
-from dmrl.pipeline.batch import recordings_in, tasks_of
+from dmrl.pipeline.batch import build_tasks, find_recordings
 from dmrl.recording import Contents, Provenance, RecordingWriter, columns, summary
 from dmrl.recording.mcap.chunk_reader import place_of
 from dmrl.recording.mcap.file import opened
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # of botocore and aiohttp
 def said(capsys: pytest.CaptureFixture[str], status: int, *words: object) -> Any:
     """What a command prints, if it ends as it should."""
     given = [str(word) for word in words]
-    found = boundary.status_of(lambda: app(given, result_action="return_value"))
+    found = boundary.run_to_status(lambda: app(given, result_action="return_value"))
     printed = capsys.readouterr()
     assert found == status, printed.err
     return printed
@@ -312,7 +312,7 @@ def test_outputs_for_keys_with_signs_of_a_shell_or_a_terminal_stay_in_their_fold
     hidden = ("../../up.mcap", "dir/../../../up.mcap", ".hidden.mcap")
     for name in (*names, *hidden):
         lab.call_s3("put_object", Bucket="lab", Key=f"signs/{name}", Body=b"")
-    found = recordings_in(path_of("s3://lab/signs"))
+    found = find_recordings(path_of("s3://lab/signs"))
     assert {str(name) for name in found} == set(names)
-    tasks = tasks_of("trim", "recording", found, tmp_path / "out")
+    tasks = build_tasks("trim", "recording", found, tmp_path / "out")
     assert {task.out for task in tasks} == {tmp_path / "out" / name for name in names}

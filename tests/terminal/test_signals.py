@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from dmrl.terminal.signals import ended_by_signal
+from dmrl.terminal.signals import set_on_signal
 
 
 class Destroyed:
@@ -21,7 +21,7 @@ class Destroyed:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_amid_a_destructor_is_not_lost(number: signal.Signals) -> None:
     ended, before = threading.Event(), signal.getsignal(number)
-    with ended_by_signal(ended):
+    with set_on_signal(ended):
         assert not ended.is_set()
         Destroyed(number)
         assert ended.is_set()
@@ -32,7 +32,7 @@ def test_outside_the_main_thread_signals_are_left_alone() -> None:
     before, seen = signal.getsignal(signal.SIGINT), []
 
     def block() -> None:
-        with ended_by_signal(threading.Event()):
+        with set_on_signal(threading.Event()):
             seen.append(signal.getsignal(signal.SIGINT))
 
     thread = threading.Thread(target=block)

@@ -84,7 +84,7 @@ def _refused(
     monkeypatch.chdir(folder)
     words = [command, *WORDS[command], *flags]
     try:
-        status = boundary.status_of(lambda: cli.app(words))
+        status = boundary.run_to_status(lambda: cli.app(words))
     except SystemExit as end:
         status = int(end.code or 0)
     said = capsys.readouterr()

@@ -68,7 +68,9 @@ def flight(folder: Path, column: str = "", factor: float = 1.0) -> Path:
 def said(source: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """What convert and check say besides their tables."""
     words = [["convert", str(source), str(out)], ["check", str(out)]]
-    status = [boundary.status_of(lambda w=w: app(w, result_action="return_value")) for w in words]
+    status = [
+        boundary.run_to_status(lambda w=w: app(w, result_action="return_value")) for w in words
+    ]
     printed = capsys.readouterr()
     assert status[0] == 0 or status == [1, 1]
     warnings = [line for line in printed.out.splitlines() if "warning" in line]

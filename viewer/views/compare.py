@@ -23,7 +23,8 @@ from dmrl.viewer.drawing.archetypes import Colour
 from dmrl.viewer.drawing.entity import Entity
 from dmrl.viewer.layouts import Plot
 from dmrl.viewer.scene import Scene, Still, bars, eyes_of, model_draws, picture_draws
-from dmrl.viewer.selection import Selection, Settings
+from dmrl.viewer.selection import Selection
+from dmrl.viewer.settings import Settings
 
 COLOURS = (RGB["detection"], SECOND_DETECTION)
 TABLE = "/models/table"

@@ -16,7 +16,8 @@ from dmrl.viewer.drawing import space, time_plots
 from dmrl.viewer.drawing.entity import WORLD, Entity, camera_frame, horizontal_frame, optical_frame
 from dmrl.viewer.layouts import Eye, Plot, Space
 from dmrl.viewer.scene import Draw, Scene, eyes_of, firsts, model_draws, picture_draws
-from dmrl.viewer.selection import MANY_PAIRS, Selection, Settings
+from dmrl.viewer.selection import MANY_PAIRS, Selection
+from dmrl.viewer.settings import Settings
 
 CAMERAS_MAX = 4
 DISTANCE = "distance, m"

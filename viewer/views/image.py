@@ -5,7 +5,8 @@ from dmrl.colours import RGB
 from dmrl.viewer import layouts
 from dmrl.viewer.drawing import archetypes
 from dmrl.viewer.scene import Scene, bars, eyes_of, model_draws, picture_draws
-from dmrl.viewer.selection import Selection, Settings
+from dmrl.viewer.selection import Selection
+from dmrl.viewer.settings import Settings
 
 
 def scene(selection: Selection, settings: Settings) -> Scene:

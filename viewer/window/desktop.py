@@ -14,12 +14,11 @@ from rerun.experimental import ViewerClient
 from dmrl.atomic_output import partial_file
 from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import decode, encode_png
-from dmrl.terminal.signals import ended_by_signal
-from dmrl.viewer.selection import Settings
+from dmrl.terminal.signals import set_on_signal
 from dmrl.viewer.session import prepare, write
+from dmrl.viewer.settings import LOOPBACK, Settings
 from dmrl.viewer.show import Show
 from dmrl.viewer.window.viewer_process import (
-    LOOPBACK,
     PATIENCE_S,
     Viewer,
     command,
@@ -55,7 +54,7 @@ def view(paths: Sequence[Path], settings: Settings) -> None:
     # The viewer starts while the recording's index is read.
     with running(command(LOOPBACK, "--port", str(port))) as viewer:
         show = prepare(paths, settings)
-        with ended_by_signal(viewer.ended):
+        with set_on_signal(viewer.ended):
             if listens(viewer, LOOPBACK, port):
                 stream_to(show, viewer, port)
             viewer.wait()

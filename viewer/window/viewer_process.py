@@ -16,9 +16,9 @@ from tempfile import TemporaryFile
 
 from dmrl.errors import SettingError
 from dmrl.viewer.session import log
+from dmrl.viewer.settings import LOOPBACK
 from dmrl.viewer.show import Show, stream_of
 
-LOOPBACK = "127.0.0.1"
 PATIENCE_S = 60.0
 """Timeout for the viewer to listen, to load and to receive data, seconds."""
 POLL_S = 0.1

@@ -6,20 +6,15 @@ The server listens on 127.0.0.1 only, unless another address is given.
 import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 from urllib.parse import quote
-
-from cyclopts import Parameter, validators
 
 from dmrl.errors import SettingError
 from dmrl.terminal.progress import say
-from dmrl.terminal.signals import ended_by_signal
-from dmrl.viewer.selection import Settings
+from dmrl.terminal.signals import set_on_signal
 from dmrl.viewer.session import prepare
+from dmrl.viewer.settings import LOOPBACK, Settings, Web
 from dmrl.viewer.window.viewer_process import (
-    LOOPBACK,
     Viewer,
     command,
     free_port,
@@ -31,22 +26,6 @@ from dmrl.viewer.window.viewer_process import (
 
 ANYWHERE = ("0.0.0.0", "::")
 FRAME_PX = 700
-
-
-@dataclass(frozen=True, slots=True)
-class Web:
-    """Address of the server.
-
-    Parameters
-    ----------
-    bind
-        Network address to listen on. Only 127.0.0.1 is closed to other computers.
-    port
-        Port of the page. None: any free port.
-    """
-
-    bind: str = LOOPBACK
-    port: Annotated[int | None, Parameter(validator=validators.Number(gte=1, lte=65535))] = None
 
 
 WEB = Web()
@@ -128,7 +107,7 @@ class Page:
     def serve(self) -> None:
         """Print the address, send the data and wait for Ctrl-C or a kill."""
         # An exception would be lost in a destructor of rerun's, which talks to the server.
-        with ended_by_signal(self._viewer.ended):
+        with set_on_signal(self._viewer.ended):
             say(f"{self.url} (Ctrl-C ends it)")
             self.fill()
             self._viewer.wait()

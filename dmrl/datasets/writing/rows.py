@@ -30,8 +30,9 @@ from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.frames import STRIDE_PX, grid_label
 from dmrl.images.codec import decode
 from dmrl.messages import STATUS_OK, status_name
-from dmrl.recording import Contents, Stamped, matching, read, summary
+from dmrl.recording import Contents, Stamped, read
 from dmrl.recording.label_sources import LOOKED, looked_at, sources_in
+from dmrl.recording.mcap.shared_file import share_file
 
 SOURCES = ("truth", "estimate", "hand", "published")
 """Sources of labels, best first."""
@@ -78,7 +79,7 @@ class Tally:
         }
 
 
-def count_images(path: Path) -> int:
+def count_images(held: Contents) -> int:
     """Count the images of a recording, labelled or not.
 
     Raises
@@ -88,9 +89,8 @@ def count_images(path: Path) -> int:
     RecordingError
         If one of these topics contains another message type.
     """
-    found = matching(path, PATTERNS)
-    present = summary(path).topics
-    return sum(present[t].count for t in found if topics.names(topics.CAMERA_IMAGE, t))
+    found = held.matching(*PATTERNS)
+    return sum(held.topics[t].count for t in found if topics.names(topics.CAMERA_IMAGE, t))
 
 
 def sources_of(held: Contents) -> set[str]:
@@ -199,7 +199,7 @@ def labelled_images(
     labels = _labels(held)
     wanted = [t for t in held.topics if topics.names(topics.CAMERA_IMAGE, t)]
     wanted += [t for t in held.topics if masks and topics.names(topics.MASKS, t)]
-    for _, same_time in groupby(read(held.path, *wanted), key=lambda stamped: stamped.time_ns):
+    for _, same_time in groupby(_read_once(held.path, wanted), key=lambda stamped: stamped.time_ns):
         images: list[Stamped] = []
         covered: dict[str, Stamped] = {}
         for stamped in same_time:
@@ -215,6 +215,11 @@ def labelled_images(
                 labels[robot].at(image.time_ns) if robot in labels else None,
                 covered.get(robot),
             )
+
+
+def _read_once(path: Path, wanted: list[str]) -> Iterator[Stamped]:
+    with share_file(path):
+        yield from read(path, *wanted)
 
 
 def _labels(held: Contents) -> dict[str, "_Series"]:

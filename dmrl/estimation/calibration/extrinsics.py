@@ -15,10 +15,10 @@ from scipy.optimize import least_squares
 
 from dmrl.errors import SettingError
 from dmrl.estimation.calibration.mount_solver import LARGEST, Mount, slopes_of, solve
+from dmrl.estimation.calibration.noise import Noise
 from dmrl.estimation.calibration.observations import (
     Flight,
     Matched,
-    Noise,
     View,
     match,
     median_px,

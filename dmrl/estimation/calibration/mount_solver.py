@@ -22,9 +22,9 @@ from scipy.sparse import (
 )
 from scipy.sparse.linalg import splu
 
+from dmrl.estimation.calibration.noise import Noise
 from dmrl.estimation.calibration.observations import (
     Matched,
-    Noise,
     View,
     expected,
     mounted,

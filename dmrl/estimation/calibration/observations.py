@@ -8,6 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from dmrl.estimation.calibration.noise import Noise
 from dmrl.geometry.frames import Array, Camera, inside, pixels_from_horizontal
 
 LONGEST_GAP_S = 0.25
@@ -125,14 +126,6 @@ def _around(values: Array, side: int) -> Array:
     """Return (N, C, 2 side + 1) windows around each of (N, C) values; the ends repeat."""
     padded = np.pad(values, ((side, side), (0, 0)), mode="edge")
     return sliding_window_view(padded, 2 * side + 1, axis=0)
-
-
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """Standard deviations: of a detection in pixels, of roll and pitch in radians."""
-
-    pixel_std_px: float = 4.0
-    attitude_std_rad: float = 0.015
 
 
 @dataclass(frozen=True, slots=True)

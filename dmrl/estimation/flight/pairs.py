@@ -12,10 +12,10 @@ from dmrl.estimation.flight.hypotheses import spread_of
 from dmrl.estimation.flight.initial_guesses import Starts, likely_starts
 from dmrl.estimation.flight.multi_start import distinct, solutions
 from dmrl.estimation.flight.segments import joined, mended, stretches
+from dmrl.estimation.model.gate import GATE_M
 from dmrl.estimation.model.pair import LONGEST_GAP_S, Array, Mask, Pair
 from dmrl.estimation.model.status import (
     AMBIGUOUS,
-    GATE_M,
     OK,
     UNCONVERGED,
     Statuses,

@@ -11,9 +11,9 @@ from scipy.ndimage import uniform_filter1d
 
 from dmrl.estimation.flight.pairs import unmoved, with_status
 from dmrl.estimation.flight.segments import contradicts
+from dmrl.estimation.model.gate import GATE_M
 from dmrl.estimation.model.odometry import QUARTER_TURN, odometry, rotate, rotation
 from dmrl.estimation.model.pair import SWAPPED, Array, Pair, Track
-from dmrl.estimation.model.status import GATE_M
 from dmrl.estimation.solver.covariance import RESTLESS_S, noise_energy, shrunk
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.estimation.solver.keyframes import GLOBALS, KEY_HZ, silence, unheard

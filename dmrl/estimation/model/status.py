@@ -13,9 +13,6 @@ from dmrl.estimation.model.pair import Array, Mask
 OK, UNCONVERGED, AMBIGUOUS = range(3)
 """Values of ``status``, equal to those of ``dmrl.v1.Status``."""
 
-GATE_M = 0.3
-"""Default of the largest horizontal error of a good position, metres. No record of how the value
-was chosen."""
 EXPECTED_SHARE = 0.045
 """Largest expected share of bad positions among the OK positions of a flight.
 

@@ -6,31 +6,20 @@ labelling.
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.images.codec import Rgb
 from dmrl.learn.inference.decode_grids import PER_DETECTION, Found
+from dmrl.learn.inference.tta_views import VIEWS as VIEWS
+from dmrl.learn.inference.tta_views import View as View
 
 Rows = NDArray[np.float64]
 
 ONE_ROBOT_PX = 16.0
 """Detections of different views closer than this, in pixels, belong to one robot."""
-
-
-class View(NamedTuple):
-    """A view of an image: mirrored or not, then shifted right and down by these parts of a cell."""
-
-    mirrored: bool
-    right: float
-    down: float
-
-
-SHIFTS = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (-0.25, 0.25), (0.25, -0.25))
-VIEWS = tuple(View(mirrored, *shift) for shift in SHIFTS for mirrored in (False, True))
-"""All views; the first is the unchanged image."""
 
 
 def shown(images: Rgb, view: View, stride_px: int) -> Rgb:

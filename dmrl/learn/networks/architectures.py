@@ -211,7 +211,7 @@ ARCHITECTURES: dict[str, type[Network]] = {
 
 def architecture_names() -> list[str]:
     """Return the names of all architectures, built in and from plug-ins, sorted."""
-    return sorted({*ARCHITECTURES, *plugins.found(plugins.NETWORKS)})
+    return sorted({*ARCHITECTURES, *plugins.find_plugins(plugins.NETWORKS)})
 
 
 def architecture(name: str) -> type[Network]:
@@ -226,14 +226,14 @@ def architecture(name: str) -> type[Network]:
     """
     if name in ARCHITECTURES:
         return ARCHITECTURES[name]
-    plugin = plugins.found(plugins.NETWORKS).get(name)
+    plugin = plugins.find_plugins(plugins.NETWORKS).get(name)
     if plugin is None:
         raise SettingError(
             f"no architecture {name}. Choose one of: {', '.join(architecture_names())}"
         )
     loaded = plugin.load()
     fits = isinstance(loaded, type) and issubclass(loaded, Network)
-    plugin.require(fits, "a subclass of dmrl.learn.networks.architectures.Network")
+    plugin.require(fits, "a subclass of dmrl.plugins.Network")
     return cast(type[Network], loaded)
 
 
@@ -256,10 +256,10 @@ def build(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Network:
     PluginError
         If it belongs to a plug-in that cannot be loaded.
     """
-    form, plugin = architecture(name), plugins.found(plugins.NETWORKS).get(name)
+    form, plugin = architecture(name), plugins.find_plugins(plugins.NETWORKS).get(name)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        with plugin.blamed("cannot be built") if plugin else nullcontext():
+        with plugin.naming_the_package("cannot be built") if plugin else nullcontext():
             network = form(extra)
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 

@@ -1,8 +1,8 @@
-"""Tasks on a Ray cluster: the same lines in the same processes, on whichever node is free.
+"""Executor that runs tasks on the nodes of a Ray cluster.
 
-Ray says where a task runs, and runs it again if its node dies. On the node it is given to a
-process like those of `crew`, with the same environment: so the bytes are the same. Nodes have to
-see the files by the same names, and to have the same version of dmrl.
+Ray chooses the node of a task, and restarts it if its node dies. The node runs it in a process
+like those of `process_pool`, with the same environment, so the bytes are the same. Nodes need
+access to the files by the same names, and the same version of dmrl.
 """
 
 import os
@@ -20,7 +20,7 @@ from typing import Any, Self
 
 from dmrl import __version__
 from dmrl.errors import ClusterError, MissingExtra
-from dmrl.pipeline.job import Answer, failed
+from dmrl.pipeline.job import JobResult, has_failed
 from dmrl.terminal.progress import Lines, say
 
 try:
@@ -31,22 +31,22 @@ try:
 except ModuleNotFoundError as e:
     raise MissingExtra("ray", "cluster", "dmrl --on ray") from e
 
-MOST_DEATHS = 5
-"""How often a task is begun again because its node or its process there died."""
-MOST_TRIES = 3
-"""How often one is tried on another node, after an error of the node's: a full disk."""
-BUSY_S = 60.0
-"""How long a task waits for an output that one before it may still be writing."""
-AHEAD = 4
-"""Tasks for each core that Ray is told of at a time."""
-ANSWER_S, LAST_WORDS_S, LOOK_S = 10.0, 30.0, 2.0
+MAX_RESTARTS = 5
+"""Most restarts of a task whose node or process died."""
+MAX_NODES_TRIED = 3
+"""Most nodes that a task is tried on, after an error of a node such as a full disk."""
+OUTPUT_WAIT_S = 60.0
+"""Longest wait, seconds, for an output that another task may still be writing."""
+TASKS_AHEAD_PER_CORE = 4
+"""Tasks per core that Ray is given at a time."""
+CONNECT_TIMEOUT_S, TERMINATE_TIMEOUT_S, NODE_POLL_S = 10.0, 30.0, 2.0
 HEAD = ("node", "", "done", "failed", "s of work")
 HERE, LOST = "there", "lost"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def _perform(line: str, version: str, folder: str, alone: bool) -> Answer:
-    """On a node. Sent as it stands, so that it can say that dmrl is another there, or missing."""
+def _run_on_node(line: str, version: str, folder: str, exclusive: bool) -> JobResult:
+    """Run a job on a node. Sent by value, so that it can report a missing or different dmrl."""
     import socket  # noqa: PLC0415
 
     import ray  # noqa: PLC0415
@@ -61,44 +61,44 @@ def _perform(line: str, version: str, folder: str, alone: bool) -> Answer:
         return {"error": words, "node": node}
     if not line:
         return {"result": "the same", "node": node}
-    from dmrl.pipeline.cluster.ray_worker import perform  # noqa: PLC0415
+    from dmrl.pipeline.cluster.ray_worker import run_job_here  # noqa: PLC0415
 
-    return {**perform(line, folder, alone=alone), "node": node}
+    return {**run_job_here(line, folder, exclusive=exclusive), "node": node}
 
 
-_perform.__module__ = "__main__"  # so that it is sent by value
+_run_on_node.__module__ = "__main__"  # so that it is sent by value
 
 
 @dataclass(slots=True)
-class _Given:
-    """A task that Ray has been given, or will be.
+class _RayTask:
+    """A task that waits for Ray, or runs there.
 
     Parameters
     ----------
-    line, alone
-        As `Ray.give` takes them.
+    line, exclusive
+        As `RayExecutor.submit` takes them.
     future
-        For who gave it.
+        Future of the result.
     tries
-        Nodes that it was tried on.
+        Number of nodes that were tried.
     until_s
-        When an output that is being written is waited for no longer.
+        End of the wait for an output that is being written.
     not_before_s
-        When it may be begun.
+        Earliest start.
     node
-        Id of the node that it is best done on; empty: any.
+        Id of the preferred node; empty: any.
     """
 
     line: str
-    alone: bool
-    future: Future[Answer] = field(default_factory=Future)
+    exclusive: bool
+    future: Future[JobResult] = field(default_factory=Future)
     tries: int = 1
     until_s: float = 0.0
     not_before_s: float = 0.0
     node: str = ""
 
 
-class Ray:
+class RayExecutor:
     """A cluster, for as many tasks at a time as it has cores.
 
     Parameters
@@ -113,20 +113,20 @@ class Ray:
         If nothing answers there, or a node has another version of dmrl.
     """
 
-    alone_blocks = False
+    exclusive_blocks = False
 
     def __init__(self, address: str = "") -> None:
         _connect(address)
         self._refuse_other_versions()
         self.workers = max(1, int(ray.cluster_resources().get("CPU", 1)))
-        self._waiting: deque[_Given] = deque()
-        self._running: dict[Any, _Given] = {}
+        self._waiting: deque[_RayTask] = deque()
+        self._running: dict[Any, _RayTask] = {}
         self._by_node: dict[str, tuple[int, int, float]] = {}
         self._known: dict[str, tuple[str, str]] = {}
         self._lock = threading.Lock()
-        self._look()
+        self._update_nodes()
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread = threading.Thread(target=self._run_loop, daemon=True)
         self._thread.start()
 
     def __enter__(self) -> Self:
@@ -142,15 +142,15 @@ class Ray:
         self._thread.join()
         with suppress(RayError, ConnectionError):
             if self._running:
-                _cancel(list(self._running))
-            self._look()
+                _cancel_tasks(list(self._running))
+            self._update_nodes()
         ray.shutdown()
-        for name, state, done, bad, work_s in self.nodes()[1:]:
+        for name, state, done, bad, work_s in self.list_nodes()[1:]:
             gone = ", lost" if state == LOST else ""
             say(f"node {name}: {done} done, {bad} failed, {work_s:.1f} s of work{gone}")
 
-    def nodes(self) -> Lines:
-        """Each node: its name, whether it is there, tasks done and failed, seconds of work."""
+    def list_nodes(self) -> Lines:
+        """Return name, state, tasks done and failed, and seconds of work of each node."""
         with self._lock:
             rows = [
                 (f"{name} ({node[:6]})", state, *self._by_node.get(node, (0, 0, 0.0)))
@@ -158,21 +158,21 @@ class Ray:
             ]
         return [HEAD, *rows]
 
-    def _look(self) -> None:
-        """See which nodes are there, and which are no more."""
+    def _update_nodes(self) -> None:
+        """Update the list of living and lost nodes."""
         found = {
             node["NodeID"]: (node["NodeManagerHostname"], HERE if node["Alive"] else LOST)
             for node in ray.nodes()
         }
         with self._lock:
-            # Of those that were lost before we came nobody needs to know.
+            # Nodes that were lost before this run are left out.
             self._known = {
                 node: told for node, told in found.items() if told[1] == HERE or node in self._known
             }
 
-    def give(self, job: str, *, alone: bool) -> Future[Answer]:
-        """The answer to a job, once it is there; see `Crew.give`."""
-        given = _Given(job, alone)
+    def submit(self, job: str, *, exclusive: bool) -> Future[JobResult]:
+        """Return the future of a job's result; see `ProcessPool.submit`."""
+        given = _RayTask(job, exclusive)
         with self._lock:
             self._waiting.append(given)
         return given.future
@@ -180,73 +180,76 @@ class Ray:
     def _refuse_other_versions(self) -> None:
         here = [node["NodeID"] for node in ray.nodes() if node["Alive"]]
         looks = [
-            _task(node, alone=False, cores=0).remote("", __version__, "", False) for node in here
+            _build_task(node, exclusive=False, cores=0).remote("", __version__, "", False)
+            for node in here
         ]
         for answer in ray.get(looks):
-            if failed(answer):
+            if has_failed(answer):
                 ray.shutdown()
                 raise ClusterError(answer["error"])
 
-    def _watch(self) -> None:
-        """Give Ray what waits, and hand on what it has done, until the end."""
+    def _run_loop(self) -> None:
+        """Start waiting tasks and deliver results, until the end."""
         looked_s = time.monotonic()
         while not self._over.is_set():
             try:
-                if time.monotonic() > looked_s + LOOK_S:
-                    self._look()
+                if time.monotonic() > looked_s + NODE_POLL_S:
+                    self._update_nodes()
                     looked_s = time.monotonic()
-                self._begin()
-                ready = self._ready()
+                self._start_waiting()
+                ready = self._wait_for_results()
             except (RayError, ConnectionError) as e:
-                return self._lost(e)
+                return self._fail_all(e)
             for ref in ready:
-                self._hand_on(self._running.pop(ref), ref)
+                self._deliver(self._running.pop(ref), ref)
         return None
 
-    def _begin(self) -> None:
+    def _start_waiting(self) -> None:
         now_s = time.monotonic()
         with self._lock:
             for _ in range(len(self._waiting)):
-                if len(self._running) >= AHEAD * self.workers:
+                if len(self._running) >= TASKS_AHEAD_PER_CORE * self.workers:
                     return
                 given = self._waiting.popleft()
                 if given.not_before_s > now_s:
                     self._waiting.append(given)
                     continue
-                task = _task(given.node, alone=given.alone)
-                ref = task.remote(given.line, __version__, str(Path.cwd()), given.alone)
+                task = _build_task(given.node, exclusive=given.exclusive)
+                ref = task.remote(given.line, __version__, str(Path.cwd()), given.exclusive)
                 self._running[ref] = given
 
-    def _ready(self) -> list[Any]:
+    def _wait_for_results(self) -> list[Any]:
         if not self._running:
             time.sleep(0.02)
             return []
         found: list[Any] = ray.wait(list(self._running), timeout=0.1)[0]
         return found
 
-    def _hand_on(self, given: _Given, ref: Any) -> None:
+    def _deliver(self, given: _RayTask, ref: Any) -> None:
         try:
-            answer: Answer = ray.get(ref)
+            answer: JobResult = ray.get(ref)
         except RayError as e:
             why = str(e).strip().splitlines()[0]
-            answer = {"error": f"it was lost {MOST_DEATHS + 1} times ({type(e).__name__}: {why})"}
-        if self._again(given, answer):
+            answer = {"error": f"it was lost {MAX_RESTARTS + 1} times ({type(e).__name__}: {why})"}
+        if self._retry(given, answer):
             return
         if node := answer.pop("node", ""):
-            seconds, bad = answer.pop("seconds", 0.0), int(failed(answer))
+            seconds, bad = answer.pop("seconds", 0.0), int(has_failed(answer))
             with self._lock:
                 done, worse, work_s = self._by_node.get(node, (0, 0, 0.0))
                 self._by_node[node] = (done + 1 - bad, worse + bad, work_s + seconds)
         given.future.set_result(answer)
 
-    def _again(self, given: _Given, answer: Answer) -> bool:
-        """Whether a task is tried once more: it waits for another, or its node was at fault."""
+    def _retry(self, given: _RayTask, answer: JobResult) -> bool:
+        """Return whether a task is tried again: an output was busy, or its node failed."""
         now_s = time.monotonic()
-        given.until_s = given.until_s or now_s + BUSY_S
-        match answer.get("again"):
+        given.until_s = given.until_s or now_s + OUTPUT_WAIT_S
+        match answer.get("retry"):
             case "later" if now_s < given.until_s:
                 given.not_before_s = now_s + 0.5
-            case "elsewhere" if given.tries < MOST_TRIES and (node := _other(answer["node"])):
+            case "elsewhere" if given.tries < MAX_NODES_TRIED and (
+                node := _find_other_node(answer["node"])
+            ):
                 given.tries, given.node = given.tries + 1, node
             case _:
                 return False
@@ -254,8 +257,8 @@ class Ray:
             self._waiting.append(given)
         return True
 
-    def _lost(self, error: Exception) -> None:
-        """The cluster is gone: so are all answers."""
+    def _fail_all(self, error: Exception) -> None:
+        """Fail all tasks: the cluster is lost."""
         why = (str(error).strip().splitlines() or [""])[0]
         with self._lock:
             given = [*self._running.values(), *self._waiting]
@@ -265,38 +268,38 @@ class Ray:
             one.future.set_result({"error": f"the cluster is lost ({type(error).__name__}: {why})"})
 
 
-def _task(node: str, *, alone: bool, cores: float = 1) -> Any:
-    """The function as a task, best on a node; one that is alone takes all cores of one."""
-    if alone:
+def _build_task(node: str, *, exclusive: bool, cores: float = 1) -> Any:
+    """Build the remote task, with a preferred node; an exclusive one takes all its cores."""
+    if exclusive:
         alive = [n for n in ray.nodes() if n["Alive"]]
         cores = max(n["Resources"].get("CPU", 1) for n in alive)
-    made = ray.remote(num_cpus=cores, max_retries=MOST_DEATHS)(_perform)
+    made = ray.remote(num_cpus=cores, max_retries=MAX_RESTARTS)(_run_on_node)
     if not node:
         return made
     return made.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=True))
 
 
-def _other(node: str) -> str:
-    """Id of another living node; empty: there is none."""
+def _find_other_node(node: str) -> str:
+    """Return the id of another living node; empty: there is none."""
     return next((n["NodeID"] for n in ray.nodes() if n["Alive"] and n["NodeID"] != node), "")
 
 
-def _cancel(running: list[Any]) -> None:
-    """End tasks: in order first, by force where that takes long."""
+def _cancel_tasks(running: list[Any]) -> None:
+    """Cancel tasks: in order first, by force after a timeout."""
     for ref in running:
         ray.cancel(ref)
-    _, left = ray.wait(running, num_returns=len(running), timeout=LAST_WORDS_S)
+    _, left = ray.wait(running, num_returns=len(running), timeout=TERMINATE_TIMEOUT_S)
     for ref in left:
         ray.cancel(ref, force=True)
 
 
 def _connect(address: str) -> None:
-    """Connect to a cluster; what Ray does to signals is undone.
+    """Connect to a cluster, and restore the signal handlers that Ray replaces.
 
     Raises
     ------
     ClusterError
-        If that cannot be done.
+        If the connection fails.
     """
     before = {number: signal.getsignal(number) for number in SIGNALS}
     quiet: dict[str, Any] = {
@@ -307,9 +310,9 @@ def _connect(address: str) -> None:
     try:
         if address:
             _require_answer(address)
-            ray.init(_kind(address), **quiet)
+            ray.init(_to_ray_address(address), **quiet)
         else:
-            _of_this_machine(quiet)
+            _connect_here(quiet)
     except (ConnectionError, RuntimeError, ValueError, OSError, RayError) as e:
         why = " ".join(str(e).split())[:160]
         raise ClusterError(
@@ -322,13 +325,13 @@ def _connect(address: str) -> None:
                 signal.signal(number, handler)
 
 
-def _of_this_machine(quiet: dict[str, Any]) -> None:
+def _connect_here(quiet: dict[str, Any]) -> None:
     try:
         ray.init(os.environ.get("RAY_ADDRESS", "auto"), **quiet)
     except ConnectionError:
         if "RAY_ADDRESS" in os.environ:
             raise
-        # Ray advertises the machine's own address unless it is told that it is alone.
+        # Ray advertises the machine's own address unless clusters are disabled.
         os.environ[ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR] = "0"
         ray_constants.ENABLE_RAY_CLUSTER = False
         ray.init("local", include_dashboard=False, _node_ip_address="127.0.0.1", **quiet)
@@ -338,12 +341,12 @@ def _require_answer(address: str) -> None:
     host, _, port = address.rpartition(":")
     if not (host and port.isdigit()):
         raise ClusterError(f"--on ray://{address} is not ray://HOST:PORT. Give both")
-    with socket.create_connection((host.strip("[]"), int(port)), ANSWER_S):
+    with socket.create_connection((host.strip("[]"), int(port)), CONNECT_TIMEOUT_S):
         pass
 
 
-def _kind(address: str) -> str:
-    """The address as Ray wants it: of a head as it is, of a client server with its scheme."""
+def _to_ray_address(address: str) -> str:
+    """Return the address for Ray: unchanged for a head, with a scheme for a client server."""
     known = {os.environ.get("RAY_ADDRESS"), *services.find_gcs_addresses()}
     if address in known:
         return address

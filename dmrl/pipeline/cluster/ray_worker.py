@@ -1,42 +1,46 @@
-"""A task on a node of a cluster: done by a process of the crew's kind, which stays for the next."""
+"""Tasks on a node of a cluster, in worker processes that stay for the next task."""
 
 import socket
 from pathlib import Path
 from time import perf_counter
 
-from dmrl.pipeline.job import Answer, failed
-from dmrl.pipeline.process_pool import Process, end, environment
+from dmrl.pipeline.job import JobResult, has_failed
+from dmrl.pipeline.process_pool import WorkerProcess, stop_processes, worker_environment
 
-_idle: list[Process] = []
+_idle: list[WorkerProcess] = []
 
 
-def perform(line: str, folder: str, *, alone: bool) -> Answer:
-    """What became of a job here.
+def run_job_here(line: str, folder: str, *, exclusive: bool) -> JobResult:
+    """Run a job on this node, and return its result.
 
     Parameters
     ----------
     line
-        As `dmrl.pipeline.job_worker.perform` takes it.
+        Line for `dmrl.pipeline.job_worker.run_job`.
     folder
-        That its names are relative to.
-    alone
-        It may use all cores.
+        Folder that relative names start from.
+    exclusive
+        Whether it may use all cores.
     """
     begun_s = perf_counter()
     if not Path(folder).is_dir():
         words = f"{socket.gethostname()} has no folder {folder}"
         return {
             "error": f"{words}. Nodes have to see files by the same names",
-            "again": "elsewhere",
+            "retry": "elsewhere",
         }
-    process = _idle.pop() if _idle and not alone else Process(environment(alone=alone), folder)
+    process = (
+        _idle.pop()
+        if _idle and not exclusive
+        else WorkerProcess(worker_environment(exclusive=exclusive), folder)
+    )
     try:
-        answer = process.answer(line)
+        answer = process.run_job(line)
     except KeyboardInterrupt:
-        end([process], in_order=True)
+        stop_processes([process], in_order=True)
         raise
-    if failed(answer) or alone:
-        end([process], in_order=False)  # it may hold what it should not
+    if has_failed(answer) or exclusive:
+        stop_processes([process], in_order=False)  # it may hold resources that it should have freed
     else:
         _idle.append(process)
     return {**answer, "seconds": perf_counter() - begun_s}

@@ -1,7 +1,7 @@
-"""A plan as an array job of Slurm: the same lines, each done by `main` here on a node of its own.
+"""Array jobs of Slurm: each line of a plan is run by `main` on a node of its own.
 
 Lines and the script are written beside the outputs. When the job has run, the same command without
-``--on`` says what became of each: what is whole is left as it is, what is not is made.
+``--on`` prints the result of each: complete outputs stay, missing ones are made.
 """
 
 import json
@@ -14,15 +14,14 @@ from typing import Protocol
 
 from dmrl.atomic_output import rewritten_file
 from dmrl.errors import OutputError, SettingError, one_line
-from dmrl.pipeline.job import failed
-from dmrl.pipeline.job_worker import perform
+from dmrl.pipeline.job import has_failed
 from dmrl.pipeline.process_pool import ONE_THREAD
 from dmrl.storage import Remote
 
-PLAIN = re.compile(r"[\w/.+@=-]+")
-"""Of a line for Slurm: a space would end the path, and a line end would begin a command."""
-MOST = 1000
-"""Elements of an array: Slurm takes 1,001 unless told. With more tasks, each does some."""
+SAFE_PATH = re.compile(r"[\w/.+@=-]+")
+"""Paths that are safe in Slurm's header: a space would end the path, a line end begin a command."""
+MAX_ELEMENTS = 1000
+"""Most elements of an array: Slurm's default limit is 1,001. With more tasks, each runs several."""
 SCRIPT = """#!/bin/sh
 #SBATCH --job-name=dmrl
 #SBATCH --array=0-{last}
@@ -34,21 +33,21 @@ exec {python} -P -m dmrl.pipeline.cluster.slurm {lines} "$SLURM_ARRAY_TASK_ID" {
 """
 
 
-class Line(Protocol):
+class HasLine(Protocol):
     """A task."""
 
     @property
     def line(self) -> str:
-        """As `dmrl.pipeline.job_worker.perform` takes it."""
+        """Line for `dmrl.pipeline.job_worker.run_job`."""
 
 
-def array_job(tasks: Sequence[Line], out: Path) -> str:
-    """Write the job of some tasks; the line to type.
+def write_array_job(tasks: Sequence[HasLine], out: Path) -> str:
+    """Write the array job of some tasks, and return the line to type.
 
     Parameters
     ----------
     tasks
-        What is to be done.
+        Tasks of the job.
     out
         Folder of the outputs.
 
@@ -61,13 +60,13 @@ def array_job(tasks: Sequence[Line], out: Path) -> str:
     """
     if isinstance(out, Remote):
         raise SettingError(f"Slurm's nodes read their tasks beside {out}. Name a folder they share")
-    if not PLAIN.fullmatch(str(out.absolute())):
+    if not SAFE_PATH.fullmatch(str(out.absolute())):
         raise OutputError(
             f"{out.absolute()}: Slurm takes paths of letters, digits and /._+@=- alone. "
             "Name another folder"
         )
     lines, script = out / ".dmrl-tasks.jsonl", out / ".dmrl-job.sh"
-    elements = min(len(tasks), MOST)
+    elements = min(len(tasks), MAX_ELEMENTS)
     text = SCRIPT.format(
         last=elements - 1,
         out=out.absolute(),
@@ -84,14 +83,16 @@ def array_job(tasks: Sequence[Line], out: Path) -> str:
 
 
 def main() -> int:
-    """Do the tasks of one element; their answers are printed, a line each."""
+    """Run the tasks of one element, and print a line for each result."""
+    from dmrl.pipeline.job_worker import run_job  # noqa: PLC0415 - heavy, and for nodes alone
+
     lines, element, elements = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
     bad = 0
     with lines.open(encoding="utf-8") as stream:
         for number, line in enumerate(stream):
             if number % elements == element:
-                answer = perform(line)
-                bad += failed(answer)
+                answer = run_job(line)
+                bad += has_failed(answer)
                 sys.stdout.write(one_line(json.dumps(answer)) + "\n")
     return 1 if bad else 0
 

@@ -13,6 +13,7 @@ from dmrl.recording.attachments import copy_extras
 from dmrl.recording.copying.chunk_copy import Wanted, adopt, copy, pieces, put
 from dmrl.recording.mcap.channel import RawMessage
 from dmrl.recording.mcap.message_batch import EVER_NS, ROWS, Ints
+from dmrl.recording.mcap.shared_file import share_file
 from dmrl.recording.protobuf.encode import Value
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.summary import summary
@@ -80,18 +81,19 @@ def rewrite(
     OutputError
         If ``out`` exists or cannot be written.
     """
-    held = summary(recording)
-    kept = frozenset(topic for topic in held.topics if topic not in without)
-    with RecordingWriter(out, made) as sink:
-        copy_extras(held, sink)
-        for name, values in (metadata or {}).items():
-            sink.add_metadata(name, values)
-        copy(recording, Wanted(kept), sink)
-        sink.flush()  # new messages start at the first time again, so they get their own chunks
-        for part in _by_time(series):
-            sink.write_columns(*part)
-        for item in heapq.merge(*fresh, key=lambda m: m.time_ns):
-            sink.write(item.time_ns, item.topic, item.message, publish_ns=item.publish_ns)
+    with share_file(recording):
+        held = summary(recording)
+        kept = frozenset(topic for topic in held.topics if topic not in without)
+        with RecordingWriter(out, made) as sink:
+            copy_extras(held, sink)
+            for name, values in (metadata or {}).items():
+                sink.add_metadata(name, values)
+            copy(recording, Wanted(kept), sink)
+            sink.flush()  # new messages start at the first time again, so they get their own chunks
+            for part in _by_time(series):
+                sink.write_columns(*part)
+            for item in heapq.merge(*fresh, key=lambda m: m.time_ns):
+                sink.write(item.time_ns, item.topic, item.message, publish_ns=item.publish_ns)
 
 
 def _by_time(series: Sequence[Series]) -> Iterator[Series]:

@@ -14,6 +14,7 @@ from mcap.stream_reader import CRCValidationError
 
 from dmrl.atomic_output import outputs_done
 from dmrl.errors import RecordingError
+from dmrl.recording.mcap.shared_file import open_raw
 from dmrl.storage import Remote
 from dmrl.storage.remote_stream import LEAST_BYTES
 
@@ -50,7 +51,7 @@ class Bounded(io.BufferedReader):
     def __init__(self, path: Path) -> None:
         self.ranged = path.ranged() if isinstance(path, Remote) else None
         if self.ranged is None:
-            super().__init__(io.FileIO(path, "r"))
+            super().__init__(open_raw(path))
         else:
             super().__init__(self.ranged, LEAST_BYTES)
         self.status = os.fstat(self.fileno()) if self.ranged is None else path.stat()

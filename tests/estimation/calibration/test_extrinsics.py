@@ -15,7 +15,8 @@ from dmrl.estimation.calibration.extrinsics import (
     calibrate,
 )
 from dmrl.estimation.calibration.mount_solver import Mount
-from dmrl.estimation.calibration.observations import Flight, Noise, PeerPath, match
+from dmrl.estimation.calibration.noise import Noise
+from dmrl.estimation.calibration.observations import Flight, PeerPath, match
 from dmrl.geometry.frames import AIDECK, Camera, inside, pixels_from_horizontal
 
 TRUE = replace(AIDECK, mount_rad=(0.02, 0.035, -0.03), delay_s=0.03)

@@ -26,9 +26,9 @@ from dmrl.estimation.calibration.mount_solver import (
     slopes_of,
     solve,
 )
+from dmrl.estimation.calibration.noise import Noise
 from dmrl.estimation.calibration.observations import (
     Matched,
-    Noise,
     View,
     expected,
     match,

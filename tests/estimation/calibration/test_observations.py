@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.calibration.extrinsics import WORST, _misfit
+from dmrl.estimation.calibration.noise import Noise
 from dmrl.estimation.calibration.observations import (
     Flight,
-    Noise,
     PeerPath,
     expected,
     match,

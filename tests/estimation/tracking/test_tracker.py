@@ -7,8 +7,9 @@ from numpy.random import default_rng
 from scipy.stats import chi2
 
 from dmrl.estimation.tracking.identity import Identity
-from dmrl.estimation.tracking.tracker import Tracker, Tuning
+from dmrl.estimation.tracking.tracker import Tracker
 from dmrl.estimation.tracking.tracker_input import Motion, View
+from dmrl.estimation.tracking.tuning import Tuning
 from dmrl.geometry.frames import (
     AIDECK,
     Array,

@@ -18,10 +18,10 @@ from typing import Any
 import pytest
 
 from dmrl.errors import ClusterError, DmrlError, SettingError
-from dmrl.pipeline.batch import over_folder
-from dmrl.pipeline.executor import executor
-from dmrl.pipeline.job import job
-from dmrl.pipeline.single_run import done_on
+from dmrl.pipeline.batch import run_over_folder
+from dmrl.pipeline.executor import open_executor
+from dmrl.pipeline.job import build_job
+from dmrl.pipeline.single_run import run_on_cluster
 from dmrl.stages import dataset, fly, trim
 
 from ..test_batch import bytes_in, record
@@ -84,19 +84,19 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def alone(flights: Path) -> dict[str, bytes]:
     """What one process here makes of them."""
     out = flights.parent / "alone"
-    over_folder("trim", flights, out, KEPT, workers=1)
+    run_over_folder("trim", flights, out, KEPT, workers=1)
     return bytes_in(out)
 
 
 def test_the_bytes_are_those_of_this_machine_and_each_node_is_told_of(
     nodes: Nodes, flights: Path, alone: dict[str, bytes], tmp_path: Path, capfd: Any
 ) -> None:
-    over_folder("trim", flights, tmp_path / "out", KEPT, workers=None, on="ray")
+    run_over_folder("trim", flights, tmp_path / "out", KEPT, workers=None, on="ray")
     assert bytes_in(tmp_path / "out") == alone
     told = [line for line in capfd.readouterr().err.splitlines() if line.startswith("node ")]
     assert len(told) == 2 and all(" 0 failed" in line for line in told)
     (tmp_path / "out" / "0" / "00.mcap").unlink()
-    over_folder("trim", flights, tmp_path / "out", KEPT, workers=None, on="ray")
+    run_over_folder("trim", flights, tmp_path / "out", KEPT, workers=None, on="ray")
     assert bytes_in(tmp_path / "out") == alone
     assert capfd.readouterr().out.count("was there") == COUNT - 1
 
@@ -115,9 +115,9 @@ def test_names_that_a_shell_or_a_line_would_read_otherwise_are_names(
     for k, name in enumerate(sorted(names)):
         record(tmp_path / "it's $(touch victim)\n" / name, roll_rad=k)
     source, out = tmp_path / "it's $(touch victim)\n", tmp_path / "-out\n"
-    over_folder("trim", source, out, KEPT, workers=None, on="ray")
+    run_over_folder("trim", source, out, KEPT, workers=None, on="ray")
     assert {path.name for path in out.glob("*.mcap")} == names
-    over_folder("trim", source, tmp_path / "here", KEPT, workers=1)
+    run_over_folder("trim", source, tmp_path / "here", KEPT, workers=1)
     assert bytes_in(out) == bytes_in(tmp_path / "here")
     assert not list(tmp_path.rglob("victim")) and not Path("victim").exists()
 
@@ -137,7 +137,7 @@ def test_a_node_that_dies_at_any_moment_loses_nothing(
 
     killer = threading.Thread(target=kill)
     killer.start()
-    over_folder("trim", flights, out, KEPT, workers=None, on="ray")
+    run_over_folder("trim", flights, out, KEPT, workers=None, on="ray")
     killer.join()
     assert nodes.other is None
     assert bytes_in(out) == alone
@@ -162,7 +162,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def labelled(flown: Path) -> Path:
     """What one process here makes of them."""
-    over_folder("label", flown, flown.parent / "labelled", workers=1)
+    run_over_folder("label", flown, flown.parent / "labelled", workers=1)
     return flown.parent / "labelled"
 
 
@@ -174,7 +174,7 @@ def test_labels_are_those_of_one_process_whenever_a_node_dies(
     out = tmp_path / "out"
     killer = threading.Thread(target=_kill_after, args=(nodes, out, seed))
     killer.start()
-    over_folder("label", flown, out, workers=None, on="ray")
+    run_over_folder("label", flown, out, workers=None, on="ray")
     killer.join()
     assert nodes.other is None
     assert bytes_in(out) == bytes_in(labelled) and len(bytes_in(out)) == COUNT
@@ -193,31 +193,31 @@ def test_a_dataset_of_the_cluster_is_the_one_of_here(
     nodes.whole()
     given, how = sorted(labelled.glob("*.mcap")), dataset.Settings(keep_all=True)
     dataset.run(given, tmp_path / "here", how, workers=1)
-    told = done_on("ray", "dataset", tmp_path / "there", {"recordings": given}, how)
+    told = run_on_cluster("ray", "dataset", tmp_path / "there", {"recordings": given}, how)
     assert told is not None and sum(told["images"].values()) >= COUNT
     assert bytes_in(tmp_path / "there") == bytes_in(tmp_path / "here")
-    assert done_on("ray", "dataset", tmp_path / "there", {"recordings": given}, how) is None
+    assert run_on_cluster("ray", "dataset", tmp_path / "there", {"recordings": given}, how) is None
 
 
 def test_the_table_of_nodes_counts_and_tells_of_one_that_is_lost(
     nodes: Nodes, flights: Path, tmp_path: Path, capfd: Any
 ) -> None:
     nodes.whole()
-    with executor("ray", None) as crew:
+    with open_executor("ray", None) as crew:
         assert (
-            crew.nodes()[0][0] == "node"
-            and [row[1:4] for row in crew.nodes()[1:]] == [("there", 0, 0)] * 2
+            crew.list_nodes()[0][0] == "node"
+            and [row[1:4] for row in crew.list_nodes()[1:]] == [("there", 0, 0)] * 2
         )
         lines = [
-            job("trim", tmp_path / f"{k}.mcap", {"recording": flights / "0" / "00.mcap"}, {})
+            build_job("trim", tmp_path / f"{k}.mcap", {"recording": flights / "0" / "00.mcap"}, {})
             for k in range(6)
         ]
-        for future in [crew.give(line, alone=False) for line in lines]:
+        for future in [crew.submit(line, exclusive=False) for line in lines]:
             assert "error" not in future.result()
-        assert sum(int(str(row[2])) for row in crew.nodes()[1:]) == 6
+        assert sum(int(str(row[2])) for row in crew.list_nodes()[1:]) == 6
         nodes.die()
         until_s = time.monotonic() + 30
-        while "lost" not in {row[1] for row in crew.nodes()} and time.monotonic() < until_s:
+        while "lost" not in {row[1] for row in crew.list_nodes()} and time.monotonic() < until_s:
             time.sleep(0.2)
     told = [line for line in capfd.readouterr().err.splitlines() if line.startswith("node ")]
     assert len(told) == 2 and sum(line.endswith(", lost") for line in told) == 1
@@ -226,22 +226,24 @@ def test_the_table_of_nodes_counts_and_tells_of_one_that_is_lost(
 def test_what_fails_on_one_node_is_tried_on_the_other(nodes: Nodes, tmp_path: Path) -> None:
     """A full disk is one node's: the answer says that another may do it."""
     nodes.whole()
-    with executor("ray", None) as crew:
+    with open_executor("ray", None) as crew:
         again = crew._again  # type: ignore[attr-defined]
         seen = []
 
         def watched(given: Any, answer: Any) -> bool:
             if not seen:
                 seen.append(answer["node"])
-                answer = {"error": "no space left", "again": "elsewhere", "node": answer["node"]}
+                answer = {"error": "no space left", "retry": "elsewhere", "node": answer["node"]}
             else:
                 seen.append(answer["node"])
             return bool(again(given, answer))
 
         crew._again = watched  # type: ignore[attr-defined]
         source = record(tmp_path / "a.mcap")
-        line = job("trim", tmp_path / "b.mcap", {"recording": source}, {"to_s": 1.0}, keep=True)
-        answer = crew.give(line, alone=False).result()
+        line = build_job(
+            "trim", tmp_path / "b.mcap", {"recording": source}, {"to_s": 1.0}, keep=True
+        )
+        answer = crew.submit(line, exclusive=False).result()
     assert "error" not in answer
     assert len(seen) == 2 and seen[0] != seen[1]
 
@@ -251,7 +253,7 @@ def test_one_that_fails_stops_no_other(nodes: Nodes, flights: Path, tmp_path: Pa
     shutil.copytree(flights / "0", few)
     (few / "torn.mcap").write_bytes(b"no recording")
     with pytest.raises(DmrlError, match="1 of 11 recordings failed"):
-        over_folder("trim", few, tmp_path / "out", KEPT, workers=None, on="ray")
+        run_over_folder("trim", few, tmp_path / "out", KEPT, workers=None, on="ray")
     assert len(bytes_in(tmp_path / "out")) == 10
 
 
@@ -260,10 +262,10 @@ def test_other_versions_and_wrong_addresses_are_one_line(
 ) -> None:
     monkeypatch.setattr("dmrl.pipeline.cluster.ray_executor.__version__", "9.9.9")
     with pytest.raises(ClusterError, match=r"has dmrl \S+, not 9\.9\.9\. Install the same"):
-        executor("ray", None)
+        open_executor("ray", None)
     monkeypatch.undo()
     with pytest.raises(ClusterError, match=r"no Ray cluster answers at 127\.0\.0\.1:1 "):
-        executor("ray://127.0.0.1:1", None)
+        open_executor("ray://127.0.0.1:1", None)
 
 
 def test_ctrl_c_ends_the_tasks(nodes: Nodes, flights: Path, tmp_path: Path) -> None:
@@ -291,8 +293,8 @@ def test_ctrl_c_ends_the_tasks(nodes: Nodes, flights: Path, tmp_path: Path) -> N
 def test_what_on_does_not_take_is_one_line() -> None:
     for on in ("spark", "ray://", "raytrace://host:1"):
         with pytest.raises(SettingError, match="this takes ray"):
-            executor(on, None)
+            open_executor(on, None)
     with pytest.raises(SettingError, match="Leave out --workers"):
-        executor("ray", 2)
+        open_executor("ray", 2)
     with pytest.raises(ClusterError, match=r"is not ray://HOST:PORT"):
-        executor("ray://nowhere", None)
+        open_executor("ray://nowhere", None)

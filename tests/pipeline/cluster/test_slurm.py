@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import OutputError, SettingError
-from dmrl.pipeline.batch import over_folder
+from dmrl.pipeline.batch import run_over_folder
 from dmrl.pipeline.cluster import slurm
-from dmrl.pipeline.single_run import done_on
+from dmrl.pipeline.single_run import run_on_cluster
 from dmrl.stages import trim
 
 from ..test_batch import bytes_in, record
@@ -40,7 +40,7 @@ def test_every_element_does_its_part_and_the_bytes_are_those_of_here(
 ) -> None:
     monkeypatch.setattr(slurm, "MOST", 2)
     out = tmp_path / "out"
-    over_folder("trim", flights, out, KEPT, workers=None, on="slurm")
+    run_over_folder("trim", flights, out, KEPT, workers=None, on="slurm")
     said = capsys.readouterr().out
     script = out / ".dmrl-job.sh"
     assert said == f"3 tasks in 2 elements. Now: sbatch {script}\n"
@@ -54,9 +54,9 @@ def test_every_element_does_its_part_and_the_bytes_are_those_of_here(
     assert bad.returncode == 1 and "error" in json.loads(bad.stdout)
     (flights / "gone").rename(flights / "1.mcap")
     assert run(script, 1).returncode == 0
-    over_folder("trim", flights, out, KEPT, workers=1)
+    run_over_folder("trim", flights, out, KEPT, workers=1)
     assert capsys.readouterr().out.count("was there") == 3
-    over_folder("trim", flights, tmp_path / "here", KEPT, workers=1)
+    run_over_folder("trim", flights, tmp_path / "here", KEPT, workers=1)
     made = {name: data for name, data in bytes_in(out).items() if name.endswith(".mcap")}
     assert made == bytes_in(tmp_path / "here")
 
@@ -75,7 +75,7 @@ def test_names_that_a_shell_would_run_are_names(
     monkeypatch.chdir(here)
     monkeypatch.setattr(slurm, "MOST", 1)
     out = tmp_path / "out"
-    over_folder("trim", Path("flights"), out, KEPT, workers=None, on="slurm")
+    run_over_folder("trim", Path("flights"), out, KEPT, workers=None, on="slurm")
     script = out / ".dmrl-job.sh"
     lines = script.read_text().splitlines()
     until = next(k for k, line in enumerate(lines) if not line.startswith("#"))
@@ -88,7 +88,7 @@ def test_names_that_a_shell_would_run_are_names(
 
 def test_one_output_is_no_array(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="--on slurm is for a folder"):
-        done_on("slurm", "fly", tmp_path / "a.mcap", {}, None)
+        run_on_cluster("slurm", "fly", tmp_path / "a.mcap", {}, None)
 
 
 @pytest.mark.parametrize("name", ["a b", "a\ntouch victim", "a%j", "a;b", "$(a)"])
@@ -98,5 +98,5 @@ def test_a_folder_whose_name_slurm_would_read_otherwise_is_refused(
     """What stands behind a line end in the script would be run."""
     (tmp_path / name).mkdir()
     with pytest.raises(OutputError, match="Name another folder"):
-        slurm.array_job([], tmp_path / name)
+        slurm.write_array_job([], tmp_path / name)
     assert list((tmp_path / name).iterdir()) == []

@@ -168,7 +168,9 @@ def test_a_pipeline_writes_by_suffix(
         out.write_bytes(bytes(2000))
 
     recording = make()
-    monkeypatch.setattr(stage, "screenshot", drawn)  # what it draws is looked at above
+    monkeypatch.setattr(
+        "dmrl.viewer.window.desktop.screenshot", drawn
+    )  # what it draws is looked at above
     for name in ("seen.rrd", "seen.png"):
         stage.run([recording], tmp_path / name, Settings())
         assert (tmp_path / name).stat().st_size > 1000

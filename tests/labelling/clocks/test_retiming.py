@@ -7,7 +7,7 @@ import pytest
 
 from dmrl import topics
 from dmrl.estimation.signals.clock_alignment import Clock
-from dmrl.labelling.retiming import MOCAP, Corrected
+from dmrl.labelling.clocks.retiming import MOCAP, Corrected
 from dmrl.messages import message
 from dmrl.recording import Contents, Provenance, RecordingWriter, read, read_raw
 

@@ -9,18 +9,18 @@ import pytest
 from dmrl import topics
 from dmrl.geometry.rotations import quaternion_zyx
 from dmrl.images.codec import encode_png
-from dmrl.labelling.time_alignment import (
-    MOCAP_STEP_S,
-    _increasing,
-    _of_pose,
-    _surest,
-    camera_clock,
-    mocap_clocks,
-    range_clocks,
-    ranging,
+from dmrl.labelling.clocks.time_alignment import (
+    MIN_MOCAP_STEP_S,
+    _keep_increasing,
+    _most_certain,
+    _pose_signals,
+    estimate_camera_clock,
+    estimate_mocap_clocks,
+    estimate_range_clocks,
 )
+from dmrl.labelling.flight_log import read_flight
 from dmrl.messages import message
-from dmrl.recording import Contents, Provenance, RecordingWriter
+from dmrl.recording import Provenance, RecordingWriter
 
 TIME_S = np.arange(0, 30, 0.05)
 LATE_S = 0.13
@@ -61,7 +61,7 @@ def mocap(path: Path, only: str, tf: bool = False) -> Any:
             own = dict(zip(names, [*angles[k, :2], rate], strict=True))
             sink.write(own_ns, topics.attitude("cf1"), message("Attitude")(**own))
             sink.write(own_ns, topics.height("cf1"), message("Height")(height_m=place["z"]))
-    return mocap_clocks(Contents(path))
+    return estimate_mocap_clocks(read_flight(path))
 
 
 @pytest.mark.parametrize("only", ["roll", "pitch", "yaw rate", "height"])
@@ -87,9 +87,9 @@ def test_ranges_both_ways_set_the_second_robots_clock(tmp_path: Path) -> None:
             heard = message("UwbRange")(range_m=3 + away[k] + rng.normal(0, 0.01))
             sink.write(round(stamp_s * 1e9), topics.uwb_range(*link), heard)
             sink.write(round(moment * 1e9), topics.uwb_range("cf1", "cf3"), heard)
-    held = Contents(path)
-    assert ranging(held) == {("cf1", "cf2"), ("cf2", "cf1"), ("cf1", "cf3")}
-    found = range_clocks(held)
+    held = read_flight(path)
+    assert held.ranges.keys() == {("cf1", "cf2"), ("cf2", "cf1"), ("cf1", "cf3")}
+    found = estimate_range_clocks(held)
     assert found.keys() == {("cf1", "cf2")}
     assert found["cf1", "cf2"].offset_s == pytest.approx(-LATE_S, abs=0.03)
     assert found["cf1", "cf2"].by == "ranges"
@@ -114,16 +114,16 @@ def test_a_camera_and_its_robot_turn_the_same_way(tmp_path: Path, axis: str) -> 
         for k, moment in enumerate(own_s.tolist()):
             turn = {"yaw_rate_radps": rate[k]} if axis == "yaw rate" else {"pitch_rad": own[k]}
             sink.write(round(moment * 1e9), topics.attitude("cf1"), message("Attitude")(**turn))
-    found = camera_clock(Contents(path), "cf1", {})
+    found = estimate_camera_clock(read_flight(path), "cf1", {})
     assert found is not None
     assert found.by == axis
     assert found.offset_s == pytest.approx(-LATE_S, abs=0.02)
-    assert camera_clock(Contents(path), "cf2", {}) is None
+    assert estimate_camera_clock(read_flight(path), "cf2", {}) is None
 
 
 def test_times_that_repeat_or_go_back_and_no_numbers_are_left_out() -> None:
     time_s = np.array([0.0, 1.0, 1.0, 0.5, 2.0, 3.0])
-    kept_s, kept = _increasing(time_s, np.array([5.0, 6.0, 7.0, 8.0, 9.0, np.nan]))
+    kept_s, kept = _keep_increasing(time_s, np.array([5.0, 6.0, 7.0, 8.0, 9.0, np.nan]))
     assert kept_s.tolist() == [0.0, 1.0, 2.0]
     assert kept.tolist() == [5.0, 6.0, 9.0]
 
@@ -134,7 +134,7 @@ def test_poses_tell_what_a_robot_measures_of_itself() -> None:
     angles = np.column_stack([0.8 * roll, 0.9 * pitch, 8 * yaw])
     assert np.abs(angles[:, 2]).max() > np.pi  # so that it wraps
     rows = np.column_stack([x, 2 * y, 1 + roll, quaternion_zyx(angles)])
-    found = _of_pose(time_s, rows)
+    found = _pose_signals(time_s, rows)
     assert found["roll"][1] == pytest.approx(0.8 * roll)
     assert found["pitch"][1] == pytest.approx(0.9 * pitch)
     assert found["height"][1] == pytest.approx(1 + roll)
@@ -147,9 +147,9 @@ def test_poses_tell_what_a_robot_measures_of_itself() -> None:
 
 def test_poses_that_are_too_near_to_each_other_are_left_out() -> None:
     rows = np.tile([0.0, 0, 1, 0, 0, 0, 1], (4, 1))
-    time_s = np.array([0.0, 0.5, 1.0, 1.5]) * MOCAP_STEP_S
-    assert _of_pose(time_s, rows)["height"][0].tolist() == [0.0, MOCAP_STEP_S]
-    assert _of_pose(time_s[:2], rows[:2]) == {}
+    time_s = np.array([0.0, 0.5, 1.0, 1.5]) * MIN_MOCAP_STEP_S
+    assert _pose_signals(time_s, rows)["height"][0].tolist() == [0.0, MIN_MOCAP_STEP_S]
+    assert _pose_signals(time_s[:2], rows[:2]) == {}
 
 
 def test_of_several_signals_the_one_with_least_doubt_counts() -> None:
@@ -158,7 +158,7 @@ def test_of_several_signals_the_one_with_least_doubt_counts() -> None:
     noisy = two + rng.normal(0, 0.2, len(two))
     reference = {"vague": (TIME_S, two), "sharp": (TIME_S, one), "alone": (TIME_S, one)}
     other = {"vague": (TIME_S + 0.1, noisy), "sharp": (TIME_S + LATE_S, one)}
-    found = _surest(reference, other)
+    found = _most_certain(reference, other)
     assert found is not None
     assert (found.by, found.offset_s) == ("sharp", pytest.approx(-LATE_S, abs=0.001))
-    assert _surest(reference, {}) is None
+    assert _most_certain(reference, {}) is None

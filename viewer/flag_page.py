@@ -23,7 +23,7 @@ from dmrl.errors import one_line
 from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
 from dmrl.terminal.progress import track
 from dmrl.viewer.browse import Ranked, image_size, ranked_of
-from dmrl.viewer.selection import Settings
+from dmrl.viewer.settings import Settings
 
 WIDE_PX = 240
 """Width of an image on the page, pixels."""

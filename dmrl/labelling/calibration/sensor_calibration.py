@@ -1,4 +1,4 @@
-"""What flights of the same robots agree on of their sensors: each is solved, and all are pooled."""
+"""Estimate constant sensor errors from many flights: solve each, then pool all."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,23 +14,23 @@ from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.estimation.solver.keyframes import GLOBALS, Noise
 from dmrl.estimation.solver.residuals import CLOCK
-from dmrl.labelling.sensor_file import OF_PAIR, OF_ROBOT, Names, Sensors, Value
-from dmrl.labelling.sensor_logs import SENSED, read_logs
-from dmrl.recording import Contents
+from dmrl.labelling.flight_log import SENSOR_TOPICS, read_flight
+from dmrl.labelling.sensor_file import OF_PAIR, OF_ROBOT, Names, SensorConstants, Value
+from dmrl.labelling.sensor_logs import build_sensor_logs
 
 Ints = NDArray[np.intp]
 Subject = tuple[str | Names, str]
 """A robot or both of a pair, and the name of a constant."""
 
-LEAST_FLIGHTS = 2
-"""One flight alone can't tell what stays from what was so that day."""
-WORTH, OFF = 0.8, 2.0
-"""What is kept is known better than this, against what is usual, or off by so many of its own
-standard deviations."""
+MIN_FLIGHTS = 2
+"""Fewest flights of a pair. One flight cannot separate lasting errors from those of a day."""
+MAX_STD_SHARE, MIN_SIGMAS = 0.8, 2.0
+"""A constant is kept if its std is below this share of the usual one, or its mean is more than so
+many of its own standard deviations from zero."""
 CLOCK_OFF = "clock_s"
-"""Solved for with the others and told, but not kept: clocks are another every time."""
-BLIND = ("still", "alike", "silent", "open")
-"""Flights that tell no bearing, or may have been solved the wrong way round."""
+"""Reported with the others, but not kept: clock offsets differ in every flight."""
+UNUSABLE = ("still", "alike", "silent", "open")
+"""Reasons of refusal after which a flight has no bearing, or perhaps a mirrored one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +46,9 @@ class Constant:
     mean, std
         Mean over flights, and standard deviation of the next one about it.
     flights
-        In how many it was solved for.
+        Number of flights that it was solved in.
     kept
-        Whether a flight that starts from it starts better.
+        Whether it improves the start of a flight.
     """
 
     of: str | Names
@@ -60,44 +60,46 @@ class Constant:
 
 
 @dataclass(frozen=True, slots=True)
-class Agreed:
-    """What is known, and every constant that was asked for."""
+class SensorCalibration:
+    """The kept constants, and every constant that was estimated."""
 
-    sensors: Sensors
+    sensors: SensorConstants
     constants: list[Constant]
 
 
-def agreed(sources: Sequence[Path], solved: Iterator[dict[Names, Estimate]]) -> Agreed:
-    """What flights agree on.
+def pool_flights(
+    sources: Sequence[Path], solved: Iterator[dict[Names, Estimate]]
+) -> SensorCalibration:
+    """Return the constants that flights of the same robots have in common.
 
     Parameters
     ----------
     sources
         The recordings, for errors.
     solved
-        Of each, its pairs as `solutions` finds them.
+        The estimates of each, by `solve_flight`.
 
     Raises
     ------
     RecordingError
-        If fewer than two flights of a pair tell where its robots were, or nothing is worth
-        keeping: a file without a constant would change no label.
+        If fewer than two flights of a pair can be used, or no constant is kept: a file without
+        a constant would change no label.
     """
     found = [one for flight in solved for one in flight.items()]
-    usable = [(names, one) for names, one in found if one.refused not in BLIND]
+    usable = [(names, one) for names, one in found if one.refused not in UNUSABLE]
     counts = {names: sum(n == names for n, _ in usable) for names, _ in usable}
-    twice = [(names, one) for names, one in usable if counts[names] >= LEAST_FLIGHTS]
+    twice = [(names, one) for names, one in usable if counts[names] >= MIN_FLIGHTS]
     if not twice:
         raise RecordingError(
             f"{sources[0]}: {len(sources)} recordings, and no pair of robots has "
-            f"{LEAST_FLIGHTS} flights that tell where both were. Give more flights of the same "
+            f"{MIN_FLIGHTS} flights that tell where both were. Give more flights of the same "
             "robots; dmrl label says what is wrong with each"
         )
-    place = {subject: place for names, _ in twice for subject, place in _places(names).items()}
+    place = {key: at for names, _ in twice for key, at in _index_constants(names).items()}
     number = {subject: k for k, subject in enumerate(place)}
-    flights = [told(one, _column(names, number)) for names, one in twice]
+    flights = [told(one, _number_constants(names, number)) for names, one in twice]
     kinds = np.array(list(place.values()))
-    out = _agreed(list(place), pooled(flights, kinds), Noise().prior_std()[kinds])
+    out = _select_constants(list(place), pooled(flights, kinds), Noise().prior_std()[kinds])
     if not out.sensors.names:
         raise RecordingError(
             f"{sources[0]}: {len(sources)} recordings agree on nothing of their sensors that is "
@@ -106,36 +108,38 @@ def agreed(sources: Sequence[Path], solved: Iterator[dict[Names, Estimate]]) -> 
     return out
 
 
-def solutions(source: Path) -> dict[Names, Estimate]:
-    """The pairs of a flight, in the order of their names, by the batch solve.
+def solve_flight(source: Path) -> dict[Names, Estimate]:
+    """Solve the pairs of a flight, in the order of their names, by the batch method.
 
     Raises
     ------
     RecordingError
         If the recording cannot be read.
     """
-    pairs = read_logs(Contents(source, *SENSED)).pairs
+    pairs = build_sensor_logs(read_flight(source, *SENSOR_TOPICS)).pairs
     return dict(zip(pairs, (here for here, _ in estimate_pairs(list(pairs.values()))), strict=True))
 
 
-def _places(names: Names) -> dict[Subject, int]:
-    """Every constant of a pair, and its place among ``GLOBALS``."""
+def _index_constants(names: Names) -> dict[Subject, int]:
+    """Return every constant of a pair with its index into ``GLOBALS``."""
     shared: dict[Subject, int] = {(names, key): place for key, place in OF_PAIR.items()}
     for side, robot in enumerate(names):
         shared |= {(robot, key): places[side] for key, places in OF_ROBOT.items()}
     return {(names, CLOCK_OFF): CLOCK, **shared}
 
 
-def _column(names: Names, number: Mapping[Subject, int]) -> Ints:
-    """(G,) the numbers of a pair's constants, in the order of ``GLOBALS``."""
+def _number_constants(names: Names, number: Mapping[Subject, int]) -> Ints:
+    """Return (G,) numbers of a pair's constants, in the order of ``GLOBALS``."""
     out = np.zeros(len(GLOBALS), np.intp)
-    for subject, place in _places(names).items():
+    for subject, place in _index_constants(names).items():
         out[place] = number[subject]
     return out
 
 
-def _agreed(subjects: Sequence[Subject], found: Pooled, usual: Array) -> Agreed:
-    better = (found.std < WORTH * usual) | (np.abs(found.mean) > OFF * found.std)
+def _select_constants(
+    subjects: Sequence[Subject], found: Pooled, usual: Array
+) -> SensorCalibration:
+    better = (found.std < MAX_STD_SHARE * usual) | (np.abs(found.mean) > MIN_SIGMAS * found.std)
     columns = (found.mean, found.std, found.flights, better)
     constants = [
         Constant(of, name, float(mean), float(std), int(flights), bool(kept) and name != CLOCK_OFF)
@@ -148,4 +152,4 @@ def _agreed(subjects: Sequence[Subject], found: Pooled, usual: Array) -> Agreed:
             robots.setdefault(one.of, {})[one.name] = one.mean, one.std
         else:
             pairs.setdefault(one.of, {})[one.name] = one.mean, one.std
-    return Agreed(Sensors(robots, pairs), constants)
+    return SensorCalibration(SensorConstants(robots, pairs), constants)

@@ -1,0 +1,208 @@
+"""Build a dataset from recordings, or add to one: shards, manifest, facts and card."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import NamedTuple
+
+from dmrl import recipe as recipes
+from dmrl.atomic_output import grown_folder, note, partial_folder
+from dmrl.card import write_card
+from dmrl.card.facts import FILE as FACTS
+from dmrl.card.facts import merged, read_facts
+from dmrl.card.front_matter import check_license
+from dmrl.card.recording_facts import About, facts_of, read_about
+from dmrl.datasets.huggingface_metadata import fingerprint_of, rewrite, write_names
+from dmrl.datasets.layout import MANIFEST
+from dmrl.datasets.manifest import Manifest, part_folder, read_manifest
+from dmrl.datasets.settings import Settings
+from dmrl.datasets.writing.append import Before, made_of, opened
+from dmrl.datasets.writing.builder import Wanted, explain, has_masks, rows, unused, warn_of_others
+from dmrl.datasets.writing.dataset_writer import write_shards
+from dmrl.datasets.writing.exclusions import read_flags
+from dmrl.datasets.writing.inputs import warn_of_lenses
+from dmrl.datasets.writing.near_duplicates import Seen
+from dmrl.datasets.writing.parts import splits_of
+from dmrl.datasets.writing.rows import Tally
+from dmrl.datasets.writing.splits import SplitOf
+from dmrl.errors import SettingError
+from dmrl.recording import Contents, Provenance, provenance
+from dmrl.recording.provenance import FILE_NAME as PROVENANCE
+from dmrl.recording.provenance_inputs import input_of
+from dmrl.storage import Remote
+from dmrl.terminal.progress import say
+
+MAX_HELD_IMAGES = 5_000
+"""Images whose labels stay in memory between their two reads. The labels of further ones are read
+twice, so that memory does not grow with the number of recordings."""
+
+
+class Written(NamedTuple):
+    """Images per split, label source per recording, and the images left out."""
+
+    images: dict[str, int]
+    sources: dict[str, str]
+    tally: Tally
+
+
+def build_dataset(
+    recordings: Sequence[Path], out: Path, settings: Settings, workers: int
+) -> Written:
+    """Write a dataset to ``out``; see ``dmrl.stages.dataset.run``."""
+    check_license(settings.license)
+    before = Before(manifest=Manifest(parquet=settings.parquet))
+    with partial_folder(out) as partial:
+        written = _write_part(partial, recordings, settings, before, workers)
+        _describe(partial)
+    return written
+
+
+def extend_dataset(
+    recordings: Sequence[Path],
+    out: Path,
+    settings: Settings,
+    given: Collection[str],
+    workers: int,
+) -> Written:
+    """Add recordings to the dataset ``out``; see ``dmrl.stages.dataset.add``.
+
+    Parameters
+    ----------
+    recordings, out, settings, workers
+        As there.
+    given
+        Names of the settings that are not the default ones.
+    """
+    settings = _settings_of(out, opened(out), settings, given)
+    written = Written({}, {}, Tally())
+    with grown_folder(out, MANIFEST) as partial:
+        before = opened(out)  # again: another may have added to it meanwhile
+        known = {one.sha256 for one in before.inputs}
+        fresh = [path for path in recordings if input_of(path).sha256 not in known]
+        if present := len(recordings) - len(fresh):
+            say(f"{present} of {len(recordings)} recordings are in {out} already")
+        if fresh:
+            written = _write_part(partial, fresh, settings, before, workers)
+    note(out)
+    _describe(out)
+    return written
+
+
+def _settings_of(out: Path, before: Before, settings: Settings, given: Collection[str]) -> Settings:
+    """Return the settings of a dataset, which those given must not contradict."""
+    made = before.made
+    assert made is not None
+    names = {f.name for f in fields(Settings)} - {"without"}
+    for name in sorted(names & set(given)):
+        if getattr(settings, name) != made.settings.get(name):
+            flag = f"--{name.replace('_', '-')}"
+            raise SettingError(
+                f"{out} was made with {flag} {made.settings.get(name)}. Leave out {flag}, or make "
+                "another dataset"
+            )
+    own = {name: value for name, value in made.settings.items() if name in names}
+    return replace(recipes.check(f"{out}/provenance.json", own, Settings), without=settings.without)
+
+
+def _write_part(
+    folder: Path, recordings: Sequence[Path], settings: Settings, before: Before, workers: int
+) -> Written:
+    """Write the shards of recordings, the manifest with them, and their facts."""
+    if settings.masks and not any(has_masks(path) for path in recordings):
+        raise SettingError(f"{recordings[0]} has no masks; renders have. Leave out --masks")
+    made = _provenance(recordings, settings)
+    known, held = _read_labels(recordings, settings)
+    sources = {path: one.source for path, one in known.items()}
+    warn_of_others(sources, {path: one.others for path, one in known.items()})
+    warn_of_lenses([px for one in known.values() for px in one.focal_px])
+    tally, seen = Tally(), Seen(before.seen())
+    found = rows(
+        held,
+        sources,
+        _assign_splits(known, made, settings, before),
+        tally,
+        _select_images(settings),
+        total=sum(one.images for one in known.values()),
+        size_px=before.size_px,
+        workers=workers,
+    )
+    shards = write_shards(
+        folder,
+        seen.new(found, tally.refuse_twin if before.made else None),
+        png=settings.png or settings.parquet,
+        shard_images=settings.shard_images,
+        before=before.manifest,
+    )
+    manifest = before.manifest.with_part(shards)
+    explain(recordings, manifest, tally, settings)
+    unused(settings, tally)
+    place = part_folder(folder, before.manifest.parts)
+    place.mkdir(parents=True)
+    made.write(place)
+    facts_of(known, tally, seen).write(place)
+    seen.write(place)
+    manifest.write(folder)  # last: from here on the part belongs to the dataset
+    images = {
+        name: sum(one.rows for one in shards[name]) for name in manifest.splits if name in shards
+    }
+    return Written(images, {path.name: source for path, source in sources.items()}, tally)
+
+
+def _assign_splits(
+    known: Mapping[Path, About], made: Provenance, settings: Settings, before: Before
+) -> dict[Path, SplitOf]:
+    return splits_of(
+        {path: one.splits for path, one in known.items()},
+        made,
+        whole=settings.split == "none",
+        val=settings.val,
+        test_share=settings.test_share,
+        seed=settings.seed,
+        there=before.inputs if before.made else None,
+    )
+
+
+def _select_images(settings: Settings) -> Wanted:
+    flagged = frozenset() if settings.without is None else read_flags(settings.without)
+    return Wanted(settings.keep_all, settings.masks, flagged)
+
+
+def _describe(folder: Path) -> None:
+    """Write the files that follow from manifest and parts: names, provenance, facts, card."""
+    manifest = read_manifest(folder)
+    assert manifest is not None
+    made = made_of(folder, manifest).to_json()  # a kilobyte for each recording: once
+    settings = made["settings"]
+    about = {"description": str(settings["title"]), "license": str(settings["license"])}
+    write_names(folder, manifest, fingerprint=fingerprint_of(made), about=about)
+    rewrite(folder / PROVENANCE, made)
+    del made
+    parts = [read_facts(part_folder(folder, k)) for k in range(manifest.parts)]
+    rewrite(folder / FACTS, asdict(merged([part for part in parts if part is not None])))
+    if isinstance(folder, Remote):
+        say(f"{folder}: the card is as it was; a bucket's would be read as a whole for it")
+    else:
+        write_card(folder)
+
+
+def _provenance(recordings: Sequence[Path], settings: Settings) -> Provenance:
+    flags = [] if settings.without is None else [settings.without]
+    inputs, libraries = [*recordings, *flags], ("pyarrow", "pillow")
+    return provenance("dataset", settings, inputs, seed=settings.seed, libraries=libraries)
+
+
+def _read_labels(
+    recordings: Sequence[Path], settings: Settings
+) -> tuple[dict[Path, About], dict[Path, Contents]]:
+    """Return the facts of recordings, and the labels of the first, which are not read again."""
+    known: dict[Path, About] = {}
+    held: dict[Path, Contents] = {}
+    images = 0
+    for path in recordings:
+        known[path], labels = read_about(
+            path, settings.labels, with_splits=settings.split == "auto"
+        )
+        images += known[path].images
+        if images <= MAX_HELD_IMAGES:
+            held[path] = labels
+    return known, held

@@ -1,0 +1,251 @@
+"""Training of a network on an Arrow dataset, to a run folder."""
+
+import time
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import pyarrow.compute as pc
+
+from dmrl.atomic_output import partial_folder, partial_of, refuse_existing
+from dmrl.datasets import Split, open_dataset
+from dmrl.errors import ModelError, OutputError, SettingError, optional_imports
+from dmrl.learn.pretrained import resolved
+from dmrl.recording import provenance
+from dmrl.terminal.progress import track
+
+with optional_imports("train", "dmrl train"):
+    from dmrl.datasets.training_examples import material
+    from dmrl.learn.data.batches import Examples
+    from dmrl.learn.inference.confidence_calibration import Calibration, calibrate, calibration
+    from dmrl.learn.inference.loaded_model import (
+        PUBLISHED_THRESHOLD,
+        Model,
+        load_model,
+        mixed,
+        save_model,
+        set_weights,
+        weights_of,
+        with_channels,
+    )
+    from dmrl.learn.inference.threshold import best_threshold
+    from dmrl.learn.networks.architectures import Network
+    from dmrl.learn.training.checkpoint import has_checkpoint, remove_checkpoint
+    from dmrl.learn.training.config import AUTO, DEFAULT, FitSettings
+    from dmrl.learn.training.distributed import Group, in_group
+    from dmrl.learn.training.trainer import Step, Training, device_of, new_network
+    from dmrl.learn.training.validation import scores
+
+LIBRARIES = ("torch", "numpy")
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """Number of images, mean loss of the last epoch, and time of a training."""
+
+    images: int
+    loss: float
+    seconds: float
+    images_per_s: float
+
+
+def train_network(
+    dataset: Path,
+    out: Path,
+    settings: FitSettings,
+    *,
+    init: Path | None = None,
+    teacher: Path | None = None,
+    resume: bool = False,
+) -> Result:
+    """Train on the train split of a dataset and write the run folder.
+
+    Confidence is calibrated, and the threshold chosen, on images held out: the split named val
+    or, where there is none, a share of the train split.
+
+    Parameters
+    ----------
+    dataset
+        Folder of the dataset.
+    out
+        Run folder to write. Until the training is done it is ``<out>.partial``.
+    settings
+        See `FitSettings`.
+    init
+        Model whose weights to start from. None: new weights, by the seed.
+    teacher
+        Model that is learnt from beside the labels. None: the labels alone.
+    resume
+        Go on with the interrupted training in ``<out>.partial``; from the start, if that had
+        not come to the end of its first epoch.
+
+    Raises
+    ------
+    OutputError
+        If ``out`` exists, or an interrupted training is in the way.
+    DatasetError
+        If ``dataset`` is not one, or has no train split.
+    ModelError
+        If ``init`` or ``teacher`` cannot be used, or there is nothing to resume.
+    SettingError
+        If the network cannot take the images, its grid is not the teacher's, or the loss is no
+        longer a number.
+    """
+    if settings.init_share and init is None:
+        raise SettingError("init_share: there is nothing to keep a share of. Give --init MODEL")
+    given = Given(init and resolved(init), teacher and resolved(teacher))
+    settings = _with_architecture(settings, given.init)
+    processes = settings.processes if device_of(settings.device).type == "cpu" else 1
+    return in_group(
+        processes, partial(_train_in_process, dataset, out, settings, given, resume=resume)
+    )
+
+
+def _with_architecture(settings: FitSettings, init: Path | None) -> FitSettings:
+    """Return settings that name a network: for "auto", that of ``init`` or the default one."""
+    if settings.architecture != AUTO:
+        return settings
+    return replace(settings, architecture=load_model(init).architecture if init else DEFAULT)
+
+
+class Given(NamedTuple):
+    """Models of a training: the one to start from, and the teacher."""
+
+    init: Path | None
+    teacher: Path | None
+
+
+def _train_in_process(
+    dataset: Path, out: Path, settings: FitSettings, given: Given, group: Group, *, resume: bool
+) -> Result:
+    """Train in one process of a group. All compute; the leading one alone writes and prints."""
+    if group.leads:
+        refuse_existing(out)
+        _refuse_unfinished(partial_of(out), resume=resume)
+    data = open_dataset(dataset)
+    train = data.split("train")
+    examples, held_out, shares = material(data, settings)
+    network = _build_network(settings, examples, given.init)
+    first = {name: value.clone() for name, value in weights_of(network).items()}
+    teacher = _load_teacher(given.teacher, network) if given.teacher else None
+    inputs = [dataset, *filter(None, given)]
+    made = provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
+    identity = " ".join(source.sha256 for source in made.inputs)
+    mine = partial_folder(out, keep_on_error=True, resume=resume)
+    with mine if group.leads else nullcontext(partial_of(out)) as folder:
+        training = Training(
+            network,
+            examples,
+            settings,
+            folder,
+            validation=held_out,
+            shares=shares,
+            identity=identity,
+            teacher=teacher,
+            group=group,
+            resume=resume and has_checkpoint(folder),
+        )
+        if group.leads:
+            made.write(folder)
+        result = _run_steps(training, settings, len(examples), group)
+        if group.leads:
+            mixed(training.network, first, settings.init_share)
+            judged = _calibrate(training.network, held_out, settings)
+            save_model(_to_model(training, settings, train, len(examples), judged), folder)
+            remove_checkpoint(folder)
+    return result
+
+
+def _refuse_unfinished(partial: Path, *, resume: bool) -> None:
+    if resume and not partial.is_dir():
+        raise ModelError(f"no {partial} to resume. Train without --resume")
+    if not resume and has_checkpoint(partial):
+        raise OutputError(
+            f"{partial} holds an interrupted training. Go on with --resume, or remove it"
+        )
+
+
+class Calibrated(NamedTuple):
+    """Threshold and calibration of a network, from the images held out."""
+
+    threshold: float
+    calibration: Calibration | None
+
+
+def _calibrate(network: Network, held_out: Examples | None, settings: FitSettings) -> Calibrated:
+    """Calibrate the network on the images held out, and choose its threshold there."""
+    if held_out is None:
+        return Calibrated(_or_published(settings.threshold), None)
+    scored = scores(network, held_out)
+    found = calibration(scored)
+    if found is not None and calibrate(network, found):
+        scored = scores(network, held_out)
+    else:
+        found = None
+    if settings.threshold is not None:
+        return Calibrated(settings.threshold, found)
+    return Calibrated(_or_published(best_threshold(scored, settings.false_alarms)), found)
+
+
+def _or_published(threshold: float | None) -> float:
+    return PUBLISHED_THRESHOLD if threshold is None else threshold
+
+
+def _build_network(settings: FitSettings, examples: Examples, init: Path | None) -> Network:
+    network = new_network(settings, examples)
+    if init is not None:
+        known = load_model(init)
+        if known.architecture != settings.architecture:
+            raise SettingError(
+                f"{init} is a {known.architecture}, not the {settings.architecture} to train. "
+                f'Set architecture = "{known.architecture}" in the recipe, or give another --init'
+            )
+        set_weights(network, with_channels(known.network, network), init)
+    return network
+
+
+def _load_teacher(path: Path, network: Network) -> Network:
+    teacher = load_model(path).network
+    if teacher.stride_px != network.stride_px:
+        raise SettingError(
+            f"{path} has cells of {teacher.stride_px} px, the network to train "
+            f"{network.stride_px} px. Give a teacher with the same grid"
+        )
+    return teacher
+
+
+def _run_steps(training: Training, settings: FitSettings, images: int, group: Group) -> Result:
+    def words(step: Step) -> str:
+        return f"Epoch {step.epoch}/{settings.epochs}, loss {step.loss:.3f}"
+
+    left, begun = training.steps_left, time.perf_counter()
+    steps = training.steps()
+    for _ in track(steps, "Training", left, describe=words) if group.leads else steps:
+        pass
+    seconds = time.perf_counter() - begun
+    seen = left * min(settings.batch_size, images)
+    return Result(images, training.history[-1]["loss"], seconds, seen / seconds)
+
+
+def _to_model(
+    training: Training, settings: FitSettings, train: Split, images: int, judged: Calibrated
+) -> Model:
+    height_px, width_px = train.image_shape
+    peers = pc.list_flatten(train.table.column("peers"))
+    sources = pc.unique(pc.struct_field(peers, "source")).to_pylist()
+    return Model(
+        training.network,
+        settings.architecture,
+        width_px=width_px,
+        height_px=height_px,
+        threshold=judged.threshold,
+        label_source=", ".join(sorted(sources)),
+        training={
+            "images": images,
+            "calibration": judged.calibration and judged.calibration._asdict(),
+            "settings": asdict(settings),
+            "history": training.history,
+        },
+    )

@@ -1,0 +1,57 @@
+"""Detect robots in images, over several views of each."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
+
+import numpy as np
+
+from dmrl.deploy.detector import Detector
+from dmrl.images.codec import Rgb
+from dmrl.learn.inference.decode_grids import Found, Grids
+from dmrl.learn.inference.decode_grids import decode as find
+from dmrl.learn.inference.tta import VIEWS, agreed, returned, shown
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionOptions:
+    """Options of the detection; see ``dmrl.stages.predict.Settings``."""
+
+    min_confidence: float
+    most: int
+    views: int
+
+
+def detect_images(
+    images: Iterable[Rgb], detector: Detector, options: DetectionOptions
+) -> Iterator[tuple[Found, Grids]]:
+    """Yield the detections and grids of each run of images of one size.
+
+    Parameters
+    ----------
+    images
+        (height, width, 3) RGB each.
+    detector
+        The opened model.
+    options
+        Limits on the detections, and the number of views.
+    """
+    for _, same_size in groupby(images, key=np.shape):
+        group = list(same_size)
+        grids = detector.grids(group)
+        yield _merge_views(group, grids, detector, options), grids
+
+
+def _merge_views(
+    images: list[Rgb], grids: Grids, detector: Detector, options: DetectionOptions
+) -> Found:
+    """Return the detections in images, whose grids are given, over all views."""
+    stride_px, (height_px, width_px, _) = detector.stride_px, images[0].shape
+    most, least = options.most, options.min_confidence
+    decode = partial(find, stride_px=stride_px, most=most, min_confidence=least)
+    found = [decode(*grids)]
+    for view in VIEWS[1 : options.views]:
+        again = decode(*detector.grids(shown(np.stack(images), view, stride_px)))
+        found.append(returned(again, view, stride_px, (height_px, width_px)))
+    return agreed(found, most=most, min_confidence=least) if len(found) > 1 else found[0]

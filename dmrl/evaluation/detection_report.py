@@ -1,0 +1,175 @@
+"""Evaluate detections against labels: figures by distance, as JSON values and as a table."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from dmrl.errors import SettingError
+from dmrl.evaluation.detections import Pairs, join
+from dmrl.evaluation.figure_tables import band_values, by_band_table, curve_values, finite
+from dmrl.learn.inference.detection_metrics import DEFINITIONS, BandFigures, Scored, by_band, score
+from dmrl.learn.inference.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
+from dmrl.recording import input_of
+from dmrl.terminal.tables import print_line, print_table
+
+Spread = Callable[[Callable[..., Any], Sequence[Any], int], Iterator[Any]]
+"""A function, its items and a number of processes to the results in their order."""
+
+MIN_PARALLEL_DRAWS = 2_000_000
+"""Images times draws from which more processes gain more time than they take to start."""
+DEFAULT_THRESHOLD = 0.33
+"""The published evaluation's threshold, for detectors that have none."""
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionCriteria:
+    """Labels, images and threshold of an evaluation; see ``dmrl.stages.evaluate.Settings``."""
+
+    against: str
+    split: str | None
+    partial: bool
+    threshold: float | None
+    false_alarms: float | None
+    draws: int
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Evaluated recordings.
+
+    Parameters
+    ----------
+    criteria
+        How they were evaluated.
+    pairs
+        Labels and detections.
+    scored
+        The same, matched.
+    bands
+        Figures over all distances, then by band.
+    threshold
+        The one that was used.
+    """
+
+    criteria: DetectionCriteria
+    pairs: Pairs
+    scored: Scored
+    bands: list[BandFigures]
+    threshold: float
+
+
+def evaluate_detections(
+    recordings: Sequence[Path], criteria: DetectionCriteria, workers: int, spread: Spread
+) -> Evaluation:
+    """Evaluate the detections of all recordings, image by image.
+
+    Parameters
+    ----------
+    recordings
+        With images, labels and detections.
+    criteria
+        Labels, images and threshold.
+    workers, spread
+        Most processes that draw the intervals, and the function that runs them.
+
+    Raises
+    ------
+    RecordingError
+        If a recording cannot be read, or has no detections, labels or images.
+    SettingError
+        If one has no labels of that source, no such split, or no image to evaluate.
+    """
+    pairs = join(recordings, criteria.against, criteria.split, partial=criteria.partial)
+    scored = score(pairs.images, pairs.labels, pairs.detections)
+    threshold = _choose_threshold(scored, pairs, criteria)
+    if pairs.images * criteria.draws < MIN_PARALLEL_DRAWS:
+        workers = 1
+    bands = by_band(
+        scored,
+        threshold=threshold,
+        draws=criteria.draws,
+        seed=criteria.seed,
+        across=lambda function, items: spread(function, items, workers),
+    )
+    return Evaluation(criteria, pairs, scored, bands, threshold)
+
+
+def _choose_threshold(scored: Scored, pairs: Pairs, criteria: DetectionCriteria) -> float:
+    """Return the given threshold, that of the rate of false alarms, or the detector's own."""
+    if criteria.false_alarms is None:
+        own = pairs.threshold or DEFAULT_THRESHOLD
+        return own if criteria.threshold is None else criteria.threshold
+    if criteria.threshold is not None:
+        raise SettingError("--threshold and --false-alarms are two answers. Give one of them")
+    empty = alarms(scored, 0.0).empty_images
+    chosen = best_threshold(scored, criteria.false_alarms)
+    if chosen is None or empty < LEAST_EMPTY:
+        raise SettingError(
+            f"--false-alarms wants {LEAST_LABELS} labels, some of them found, and {LEAST_EMPTY} "
+            f"images without a robot: there are {len(scored.labels)} and {empty}. Give --threshold"
+        )
+    return chosen
+
+
+def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> dict[str, Any]:
+    """Return all figures as JSON values; null where there was nothing to measure.
+
+    One recording is ``recording``, several are ``recordings``.
+    """
+    criteria = evaluation.criteria
+    sources = [{"name": s.name, "sha256": s.sha256} for s in map(input_of, recordings)]
+    overall, *bands = [band_values(band) for band in evaluation.bands]
+    return {
+        **({"recordings": sources} if len(sources) > 1 else {"recording": sources[0]}),
+        "against": criteria.against,
+        "split": criteria.split,
+        "threshold": evaluation.threshold,
+        "images": evaluation.pairs.images,
+        "labels": len(evaluation.pairs.labels),
+        "detections": len(evaluation.pairs.detections),
+        "partial": criteria.partial,
+        "images_without_detections": evaluation.pairs.unseen,
+        "left_out": evaluation.pairs.left_out,
+        **{
+            name: finite(value)
+            for name, value in asdict(alarms(evaluation.scored, evaluation.threshold)).items()
+        },
+        "bootstrap": {"draws": criteria.draws, "seed": criteria.seed},
+        "overall": overall,
+        "bands": bands,
+        "curves": curve_values(evaluation.scored),
+        "definitions": DEFINITIONS,
+    }
+
+
+def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None:
+    """Print the figures, one column per band that holds labels."""
+    criteria = evaluation.criteria
+    headers, rows = by_band_table(evaluation.bands)
+    split = f", split {criteria.split}" if criteria.split else ""
+    name = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
+    part = ", only those with detections" if criteria.partial else ""
+    title = f"{name}: {evaluation.pairs.images} images against {criteria.against}{split}{part}"
+    print_table(title, ["label minus detection", *headers], rows)
+    notes = [f"{count} {why}" for why, count in evaluation.pairs.left_out.items()]
+    if unmatched := evaluation.bands[0].unmatched:
+        notes.append(f"{unmatched} labels without any detection")
+    for note in notes:
+        print_line(f"left out: {note}")
+    if unseen := evaluation.pairs.unseen:
+        print_line(
+            f"{unseen} images have no Detections message: nothing was found there. "
+            "--partial leaves them out"
+        )
+    quiet = alarms(evaluation.scored, evaluation.threshold)
+    if quiet.empty_images:
+        print_line(
+            f"nobody in view: an alarm in {quiet.alarmed_images} of {quiet.empty_images} images, "
+            f"{quiet.false_alarms:.3f} an image"
+        )
+    print_line(
+        f"in brackets: 95 % intervals, bootstrap over images; precision, recall and F1 at "
+        f"confidence {evaluation.threshold:g}, within 16 px"
+    )

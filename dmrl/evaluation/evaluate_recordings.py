@@ -1,0 +1,137 @@
+"""Evaluate recordings: detections against labels, positions and tracks against the truth."""
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from dmrl import topics
+from dmrl.atomic_output import partial_folder, refuse_existing
+from dmrl.errors import MissingExtra, SettingError
+from dmrl.evaluation import positions, tracks
+from dmrl.evaluation.detection_report import (
+    DetectionCriteria,
+    Evaluation,
+    Spread,
+    describe_evaluation,
+    evaluate_detections,
+)
+from dmrl.recording import summary
+from dmrl.terminal.progress import say
+from dmrl.terminal.tables import print_line, print_table
+
+figures: ModuleType | None
+try:
+    from dmrl.evaluation import figures
+except MissingExtra:
+    figures = None
+
+Document = dict[str, Any]
+KINDS = {"positions": positions, "tracks": tracks}
+"""Modules that evaluate against true positions; both offer the same functions."""
+SETTLE_S, SHORT_FLIGHT_S = 20.0, 30.0
+"""Time to settle, seconds; for a flight shorter than the second, half of it."""
+
+
+def evaluate_recordings(
+    recordings: Sequence[Path],
+    out: Path | None,
+    what: str,
+    criteria: DetectionCriteria,
+    settle_s: float | None,
+    workers: int,
+    spread: Spread,
+) -> Evaluation | Document:
+    """Evaluate detections of all recordings together, or one recording's positions or tracks.
+
+    Parameters
+    ----------
+    recordings
+        With images, labels and detections; or one with true positions and tracks or estimates.
+    out
+        Folder to write plots and the figures to. None: nothing is written.
+    what
+        "auto", "detections", "positions" or "tracks".
+    criteria
+        Of detections.
+    settle_s
+        Errors of positions and tracks before it do not count, seconds.
+    workers, spread
+        Most processes that draw the intervals, and the function that runs them.
+
+    Raises
+    ------
+    SettingError
+        If several recordings are given of which positions or tracks are to be evaluated.
+    MissingExtra
+        If plots are wanted and matplotlib is not installed.
+    OutputError
+        If ``out`` exists.
+    """
+    if out is not None:
+        refuse_existing(out)
+        if figures is None:
+            raise MissingExtra("matplotlib", "plot", "dmrl evaluate --plots")
+    what = what if what != "auto" else _choose_kind(recordings[0])
+    if what == "detections":
+        evaluation = evaluate_detections(recordings, criteria, workers, spread)
+        if out is not None:
+            made = describe_evaluation(recordings, evaluation)
+            with _write_folder(out, "evaluation", made) as folder:
+                assert figures is not None
+                scored, threshold = evaluation.scored, evaluation.threshold
+                figures.draw(folder, evaluation.pairs, scored, criteria.against, threshold)
+        return evaluation
+    if len(recordings) > 1:
+        raise SettingError(
+            f"{what} are judged one recording at a time. Name one, or give --what detections"
+        )
+    return _evaluate_against_truth(what, recordings[0], out, settle_s)
+
+
+def _choose_kind(recording: Path) -> str:
+    """Return the kind of results that the last stage has written."""
+    if tracks.can_judge(recording):
+        return "tracks"
+    detected = topics.robots(list(summary(recording).topics), topics.DETECTIONS)
+    return "positions" if not detected and positions.has_positions(recording) else "detections"
+
+
+def _evaluate_against_truth(
+    what: str, recording: Path, out: Path | None, settle_s: float | None
+) -> Document:
+    kind = KINDS[what]
+    judged = kind.judge(recording)
+    lasts_s = kind.lasts_s(judged)
+    if settle_s is None:
+        settle_s = SETTLE_S if lasts_s >= SHORT_FLIGHT_S else round(lasts_s / 2, 3)
+    elif settle_s >= lasts_s:
+        say(
+            f"{recording}: nothing settles before it ends, after {lasts_s:.1f} s: give a smaller "
+            "--settle-s"
+        )
+    made: Document = kind.document(recording, judged, settle_s)
+    if out is not None:
+        with _write_folder(out, what, made) as folder:
+            assert figures is not None
+            figures.draw_errors(folder, judged)
+    return made
+
+
+@contextmanager
+def _write_folder(out: Path, stem: str, made: Document) -> Iterator[Path]:
+    """Write a folder: first the document, then what the block writes."""
+    with partial_folder(out) as folder:
+        text = json.dumps(made, indent=1, allow_nan=False)
+        (folder / f"{stem}.json").write_text(text + "\n", encoding="utf-8")
+        yield folder
+
+
+def print_document(recording: Path, made: Document) -> None:
+    """Print the figures of positions, one row per pair, or of tracks, one per observer."""
+    kind = tracks if "robots" in made else positions
+    headers = [words for _, words, _ in kind.COLUMNS]
+    print_table(f"{recording}: {kind.TITLE}", [kind.EACH, *headers], kind.rows(made))
+    print_line(kind.note(made))

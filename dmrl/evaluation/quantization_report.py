@@ -1,0 +1,268 @@
+"""Compare a float network with its int8 one on a dataset, and write both with a report."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dmrl.atomic_output import partial_folder
+from dmrl.datasets import Dataset, Split, open_dataset
+from dmrl.deploy.accuracy import argmax_kept, figures_of, points_of
+from dmrl.deploy.backends import Backend, Float, Outputs, grids_of, integer
+from dmrl.deploy.int8.layer_errors import LayerFigures, layer_figures
+from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.quantise_model import Quantised, spread_evenly
+from dmrl.deploy.int8.store import INTEGER_NAME, save
+from dmrl.deploy.samples import SAMPLES, save_samples
+from dmrl.errors import MissingExtra, SettingError
+from dmrl.evaluation.detections import labels_of_split
+from dmrl.learn.inference.detection_metrics import DEFINITIONS
+from dmrl.learn.inference.loaded_model import Model, load_model, save_model
+from dmrl.recording import Provenance
+from dmrl.terminal.progress import say, track
+from dmrl.terminal.tables import print_table
+
+plots: ModuleType | None
+try:
+    from dmrl import plots
+except MissingExtra:
+    plots = None
+
+REPORT_NAME = "quantisation.json"
+MAX_LAYER_IMAGES = 20
+"""Most images that the errors of layers are measured on."""
+MAX_DRAWN_IMAGES = 3
+"""Most images whose maps are drawn."""
+
+
+class QuantizationInputs(NamedTuple):
+    """A float model, and splits of a dataset to calibrate and to compare on."""
+
+    model: Model
+    calibration: Split
+    compared: Split
+
+
+@dataclass(frozen=True, slots=True)
+class QuantizationReport:
+    """Accuracy of a float network and of its int8 one.
+
+    Parameters
+    ----------
+    network
+        The int8 network.
+    layers
+        Errors of int8 in each layer and head, over a few images of the split.
+    calibration_images
+        Their number.
+    split, images
+        The images that both were compared on.
+    accuracy
+        "float" and "int8" to the figures of ``detection_metrics``; None where there was nothing
+        to measure.
+    argmax_kept
+        Share of images whose most confident cell is the same.
+    """
+
+    network: IntegerNetwork
+    layers: list[LayerFigures]
+    calibration_images: int
+    split: str
+    images: int
+    accuracy: dict[str, dict[str, float | None]]
+    argmax_kept: float
+
+
+def open_inputs(model: Path, dataset: Path, split: str | None) -> QuantizationInputs:
+    """Open a model, and the splits of a dataset of its image size.
+
+    Parameters
+    ----------
+    model
+        Run folder, .safetensors or Keras .h5.
+    dataset
+        Folder that ``dmrl dataset`` wrote.
+    split
+        Split to compare on. None: test, else val, else the first.
+
+    Raises
+    ------
+    ModelError
+        If the model cannot be used.
+    DatasetError
+        If the dataset cannot be used.
+    SettingError
+        If its images are of another size.
+    """
+    trained, data = load_model(model), open_dataset(dataset)
+    calibration = data.split(_first_split(data, "train"))
+    compared = data.split(split or _first_split(data, "test", "val"))
+    for one in (calibration, compared):
+        height_px, width_px = one.image_shape
+        if (height_px, width_px) != (trained.height_px, trained.width_px):
+            raise SettingError(
+                f"{dataset} holds images of {width_px} x {height_px} px, {trained.name} takes "
+                f"{trained.width_px} x {trained.height_px}. Make a dataset of that size"
+            )
+    return QuantizationInputs(trained, calibration, compared)
+
+
+def _first_split(data: Dataset, *names: str) -> str:
+    """Return the first of these splits that the dataset has; else its own first."""
+    return next(name for name in (*names, *data.splits) if name in data.splits)
+
+
+def write_quantized(
+    out: Path, origin: Provenance, inputs: QuantizationInputs, quantised: Quantised, most: int
+) -> QuantizationReport:
+    """Compare both networks, and write them with the report to a folder.
+
+    Parameters
+    ----------
+    out
+        Folder to write.
+    origin
+        Its provenance.
+    inputs, quantised
+        The float model and its data, and the int8 network.
+    most
+        Most images to compare on, evenly spread.
+    """
+    with partial_folder(out) as folder:
+        report = _compare(inputs, quantised, most, folder)
+        save_model(inputs.model, folder)
+        save(quantised.network, folder / INTEGER_NAME)
+        seen = inputs.calibration
+        rows = spread_evenly(len(seen), SAMPLES)
+        save_samples(np.stack(list(seen.images(rows))), folder)
+        text = json.dumps(describe_quantization(report), indent=1, allow_nan=False)
+        (folder / REPORT_NAME).write_text(text + "\n", encoding="utf-8")
+        origin.write(folder)
+    return report
+
+
+def _compare(
+    inputs: QuantizationInputs, quantised: Quantised, most: int, folder: Path
+) -> QuantizationReport:
+    """Compare float and int8 on the same images; draw a few of them into the folder."""
+    model, split, network = inputs.model, inputs.compared, quantised.network
+    rows = spread_evenly(len(split), most)
+    backends: dict[str, Backend] = {
+        "float": Float(quantised.graph, model.network.channels),
+        "int8": integer(network),
+    }
+    outputs = _compute_outputs(backends, split, rows)
+    labels = labels_of_split(split, rows)
+    few = [rows[k] for k in spread_evenly(len(rows), MAX_LAYER_IMAGES)]
+    if plots is None:
+        say("no picture of the maps: that needs matplotlib. pip install 'dmrl[plot]'")
+    else:
+        _draw_maps(split, rows, outputs, folder)
+    return QuantizationReport(
+        network,
+        layer_figures(quantised.graph, network, split.images(few)),
+        quantised.images,
+        split.name,
+        len(rows),
+        {
+            name: figures_of(len(rows), labels, points_of(each, network.stride_px), model.threshold)
+            for name, each in outputs.items()
+        },
+        argmax_kept(outputs["float"], outputs["int8"]),
+    )
+
+
+def _compute_outputs(
+    backends: Mapping[str, Backend], split: Split, rows: list[int]
+) -> dict[str, Outputs]:
+    """Return the output of every backend for the images of these rows."""
+    each: dict[str, list[Outputs]] = {name: [] for name in backends}
+    for image in track(split.images(rows), "Comparing", len(rows)):
+        for name, backend in backends.items():
+            each[name].append(backend.outputs(image[None]))
+    return {
+        name: {key: np.concatenate([one[key] for one in outputs]) for key in outputs[0]}
+        for name, outputs in each.items()
+    }
+
+
+def _draw_maps(split: Split, rows: list[int], outputs: dict[str, Outputs], folder: Path) -> None:
+    assert plots is not None
+    shown = spread_evenly(len(rows), MAX_DRAWN_IMAGES + 2)[1:-1] or [0]
+    grids = {name: grids_of(each) for name, each in outputs.items()}
+    pictures = [
+        plots.MapPair(
+            f"image {rows[k]} of {split.name}",
+            image,
+            {name: (each.confidence[k], each.depth_m[k]) for name, each in grids.items()},
+        )
+        for k, image in zip(shown, split.images([rows[k] for k in shown]), strict=True)
+    ]
+    plots.map_pairs(pictures, folder / "maps")
+
+
+def describe_quantization(result: QuantizationReport) -> dict[str, Any]:
+    """Return all figures as JSON values; null where there was nothing to measure."""
+    network = result.network
+    return {
+        "architecture": network.architecture,
+        "input": {
+            "width_px": network.width_px,
+            "height_px": network.height_px,
+            "channels": network.channels,
+        },
+        "macs": network.macs,
+        "calibration_images": result.calibration_images,
+        "split": result.split,
+        "images": result.images,
+        "argmax_kept": result.argmax_kept,
+        "accuracy": result.accuracy,
+        "layers": [asdict(layer) for layer in result.layers],
+        "definitions": DEFINITIONS,
+    }
+
+
+# Name of a figure, its words in the table, and its format.
+ROWS = (
+    ("median_px", "median error, px", ".2f"),
+    ("within_8_px", "within 8 px", ".1%"),
+    ("within_20_px", "within 20 px", ".1%"),
+    ("depth_mae_m", "depth MAE, m", ".4f"),
+    ("depth_rmse_m", "depth RMSE, m", ".4f"),
+    ("f1", "F1", ".3f"),
+    ("ap_16_px", "AP at 16 px", ".3f"),
+)
+
+
+def print_quantization(out: Path, result: QuantizationReport) -> None:
+    """Print the layers, then float beside int8."""
+    columns = ("layer", "kind", "output", "MMAC", "range", "SQNR, dB", "saturated")
+    rows = [
+        (
+            layer.name,
+            layer.kind,
+            " x ".join(map(str, layer.shape)),
+            f"{layer.products / 1e6:.2f}" if layer.products else "",
+            f"{layer.low:.3g} to {layer.high:.3g}",
+            "exact" if layer.sqnr_db is None else f"{layer.sqnr_db:.1f}",
+            f"{layer.saturated:.2%}",
+        )
+        for layer in result.layers
+    ]
+    print_table(f"{out}: {result.network.macs / 1e6:.1f} MMAC an image", columns, rows)
+    accuracy = result.accuracy
+    compared = [
+        [words, *(_format_figure(accuracy[name][key], form) for name in ("float", "int8"))]
+        for key, words, form in ROWS
+    ]
+    compared.append(["most confident cell kept", "", f"{result.argmax_kept:.1%}"])
+    title = f"{result.images} images of split {result.split}"
+    print_table(title, ("label minus detection", "float", "int8"), compared)
+
+
+def _format_figure(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)

@@ -1,0 +1,1 @@
+"""Foreign files and live robots, written as recordings."""

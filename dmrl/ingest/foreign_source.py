@@ -1,0 +1,123 @@
+"""Recordings of foreign files and folders, whose formats `dmrl.formats` reads."""
+
+import json
+from collections import Counter
+from collections.abc import Iterable
+from itertools import chain
+from pathlib import Path
+
+from dmrl.errors import SettingError, SourceError
+from dmrl.formats.base import Content, Options
+from dmrl.formats.registry import format_of
+from dmrl.guards.paths import refuse_pipes
+from dmrl.messages import message
+from dmrl.recording import (
+    LICENCES_METADATA,
+    SPLIT_METADATA,
+    RecordingWriter,
+    licence_beside,
+    licence_words,
+    provenance,
+    say_findings,
+    time_slices,
+)
+from dmrl.terminal.progress import say, track
+
+
+def record_source(
+    source: Path,
+    out: Path,
+    kind: str | None,
+    options: Options,
+    *,
+    settings: object,
+    files: Iterable[Path | None],
+) -> dict[str, int]:
+    """Write a foreign source as a recording; return the number of messages by topic.
+
+    Parameters
+    ----------
+    source
+        A file or folder.
+    out
+        Recording to write.
+    kind
+        Name of its format. None: the first one that recognises it.
+    options
+        Options of the format.
+    settings
+        Settings that the recording's provenance lists.
+    files
+        Files that the settings name; those that exist become inputs.
+
+    Raises
+    ------
+    SourceError
+        If the source is not what its format says: names the file, and the line.
+    """
+    content = format_of(source, kind).content(source, options)
+    read = [path for path in files if path and path.is_file()]
+    licence = licence_beside(source)
+    if licence is not None and source.is_file():
+        read.append(licence)
+    made = provenance("convert", settings, (source, *read), libraries=("pillow", "numpy"))
+    with RecordingWriter(out, made) as sink:
+        if licence is not None:
+            sink.add_metadata(LICENCES_METADATA, {source.name: licence_words(licence)})
+        counts = write_content(content, sink)
+    say_findings(out)
+    return counts
+
+
+def write_content(content: Content, sink: RecordingWriter) -> dict[str, int]:
+    """Write samples and series in time order; return the number of messages by topic."""
+    counts: Counter[str] = Counter()
+    if content.split:
+        split = {name: json.dumps(times) for name, times in content.split.items()}
+        sink.add_metadata(SPLIT_METADATA, split)
+    single = content.others if content.series else content.samples
+    samples = iter(track(single, "Converting", content.total))
+    waiting = next(samples, None)
+    for first_ns, end_ns in time_slices([one.time_ns for one in content.series]):
+        for series in content.series:
+            part = series.between(first_ns, end_ns)
+            sink.write_columns(part.topic, message(part.message), part.time_ns, part.fields)
+            counts[part.topic] += len(part.time_ns)
+        while waiting is not None and waiting.time_ns < end_ns:
+            sink.write_sample(waiting)
+            counts[waiting.topic] += 1
+            waiting = next(samples, None)
+    for sample in samples if waiting is None else chain([waiting], samples):
+        sink.write_sample(sample)
+        counts[sample.topic] += 1
+    return dict(sorted((+counts).items()))
+
+
+def find_sources(source: Path, kind: str | None) -> dict[Path, Path]:
+    """Return the sources in a folder by the names of their recordings.
+
+    Raises
+    ------
+    SourceError
+        If there is none.
+    SettingError
+        If two recordings would have the same name.
+    """
+    refuse_pipes(source)
+    found: dict[Path, Path] = {}
+    for path in sorted(source.iterdir()) if source.is_dir() else [source]:
+        try:
+            if path.name.startswith(".") or not format_of(path, kind):
+                continue
+        except SourceError as e:
+            say(f"left out: {e}")
+            continue
+        name = Path(path.name if path.is_dir() else path.stem).with_suffix(".mcap")
+        if (twin := found.setdefault(name, path)) is not path:
+            raise SettingError(f"{twin} and {path} would both be {name}. Rename one")
+    if not found:
+        raise SourceError(
+            f"nothing in {source} is of a known kind. If it is one source, name one recording: "
+            "dmrl convert SOURCE OUT.mcap"
+        )
+    return found

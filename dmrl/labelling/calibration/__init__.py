@@ -1,0 +1,1 @@
+"""Calibration of cameras, from pictures of a chessboard or from flights."""

@@ -1,0 +1,1 @@
+"""Clocks of robots and cameras: estimated, aligned, and applied to a recording."""

@@ -1,0 +1,100 @@
+"""Tracks of the peers that a robot's camera detects, as messages."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmrl import topics
+from dmrl.errors import MissingTopic
+from dmrl.estimation.tracking.identity import Identity
+from dmrl.estimation.tracking.tracker import Track, Tracker
+from dmrl.estimation.tracking.tuning import Tuning
+from dmrl.geometry.frames import Camera
+from dmrl.labelling.flight_log import FlightLog
+from dmrl.labelling.observer_log import ObserverLog, read_observer_log
+from dmrl.labelling.recorded_camera import read_robot_camera, recorded_camera
+from dmrl.messages import message
+from dmrl.recording import Timed
+from dmrl.terminal.progress import say, track
+
+
+@dataclass(frozen=True, slots=True)
+class RobotReport:
+    """Numbers of images and tracks of one robot; those named carry the name of a peer."""
+
+    robot: str
+    images: int
+    tracks: int
+    named: int
+    per_image: float
+
+
+def choose_camera(
+    flight: FlightLog, robot: str, given: Path | None, *, undistorted: bool = False
+) -> Camera:
+    """Return the camera of a robot: a file's, or else the recording's.
+
+    Raises
+    ------
+    MissingTopic
+        If there is neither.
+    """
+    camera = read_robot_camera(flight, robot, given) if given else recorded_camera(flight, robot)
+    if camera is None:
+        raise MissingTopic(topics.calibration(robot), flight.topics, flight.path)
+    return replace(camera, distortion=()) if undistorted else camera
+
+
+def track_peers(
+    flight: FlightLog, robot: str, camera: Camera, threshold: float | None, tuning: Tuning
+) -> tuple[list[Timed], RobotReport]:
+    """Return the Tracks messages of one robot, one per image, and their numbers.
+
+    Parameters
+    ----------
+    flight
+        A recording with detections and attitude.
+    robot
+        Robot that observes the peers.
+    camera
+        Its camera.
+    threshold
+        Least confidence of a detection. None: the recording's.
+    tuning
+        Errors that the tracker assumes.
+    """
+    sight = read_observer_log(flight, robot, camera, threshold)
+    for warning in sight.warnings:
+        say(f"{flight.path}: {warning}")
+    tracker, identity = Tracker(sight.camera, tuning), Identity()
+    made: list[Timed] = []
+    seen: dict[int, str] = {}
+    entries = 0
+    for k in track(range(len(sight.time_ns)), f"Following from {robot}"):
+        tracks = tracker.step(sight.motion(k), sight.view(k))
+        names = identity.names(tracks, sight.ranges(k), sight.motion(k).dt_s)
+        seen |= {t.number: names.get(t.number) or seen.get(t.number, "") for t in tracks}
+        entries += len(tracks)
+        made.append(_message(sight, k, tracks, names))
+    images = len(sight.time_ns)
+    named = sum(bool(name) for name in seen.values())
+    return made, RobotReport(robot, images, len(seen), named, round(entries / max(images, 1), 3))
+
+
+def _message(sight: ObserverLog, k: int, tracks: list[Track], names: dict[int, str]) -> Timed:
+    entries: list[dict[str, Any]] = []
+    for one in tracks:
+        numbers = [*one.position_m.tolist(), *one.velocity_mps.tolist()]
+        keys = ("x", "y", "z", "vx_mps", "vy_mps", "vz_mps")
+        entries.append(
+            {
+                "id": one.number,
+                "peer": names.get(one.number, ""),
+                **dict(zip(keys, numbers, strict=True)),
+                "covariance": np.ravel(one.covariance).tolist(),
+            }
+        )
+    made = message("Tracks")(frame_id=f"{sight.robot}/horizontal", tracks=entries)
+    return Timed(int(sight.log_time_ns[k]), topics.tracks(sight.robot), made)

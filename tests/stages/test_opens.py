@@ -1,0 +1,31 @@
+"""Commands open their input a few times: to read it, to hash it, to copy it."""
+
+import os
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from dmrl.stages import dataset, label
+
+OPENED: Counter[str] = Counter()
+
+
+def _count(event: str, arguments: tuple[Any, ...]) -> None:
+    if event == "open" and isinstance(arguments[0], str | os.PathLike):
+        OPENED[os.fspath(arguments[0])] += 1
+
+
+sys.addaudithook(_count)  # sees every way to open a file, and cannot be removed
+
+
+def test_label_opens_its_input_three_times(flight: Path, tmp_path: Path) -> None:
+    before = OPENED[str(flight)]
+    label.run(flight, tmp_path / "out.mcap", label.Settings())
+    assert OPENED[str(flight)] - before <= 3
+
+
+def test_dataset_opens_its_input_three_times(flight: Path, tmp_path: Path) -> None:
+    before = OPENED[str(flight)]
+    dataset.run([flight], tmp_path / "out", dataset.Settings())
+    assert OPENED[str(flight)] - before <= 3
