@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import plots
-from dmrl.deploy.backends import Backend, Float, Outputs, grids_of, integer
-from dmrl.deploy.int8.activation_ranges import calibrate
-from dmrl.deploy.int8.equalisation import equalise
-from dmrl.deploy.int8.graph import graph_of
-from dmrl.deploy.int8.quantise import About, quantise
-from dmrl.deploy.int8.rounding import moments_of
+from dmrl.deploy.backends import Backend, FloatBackend, Outputs, build_reference_backend, to_grids
+from dmrl.deploy.int8.activation_ranges import calibrate_ranges
+from dmrl.deploy.int8.equalisation import equalise_channels
+from dmrl.deploy.int8.graph import build_graph
+from dmrl.deploy.int8.quantise import NetworkInfo, quantise_network
+from dmrl.deploy.int8.rounding import measure_moments
 from dmrl.images.codec import decode
 from dmrl.learn.inference.loaded_model import load_model
-from dmrl.learn.networks.trace import operations
+from dmrl.learn.networks.trace import trace_operations
 
 STEP = 0.211
 JUDGED, CALIBRATION = ("00216", "00495"), ("00185", "00216", "00375", "00495")
@@ -61,15 +61,15 @@ def agreement(chip: NDArray[np.float64], ours: NDArray[np.floating]) -> Agreemen
 def backends(data: Path) -> dict[str, Backend]:
     """The published weights in float and in our int8."""
     model = load_model(data / "locanet-weights" / "real.h5")
-    graph = graph_of(operations(model.network))
+    graph = build_graph(trace_operations(model.network))
     seen = [image_of(data, name)[None] for name in CALIBRATION]
-    graph, ranges = equalise(graph, calibrate(graph, seen))
-    moments = moments_of(graph, (image[0] for image in seen))
+    graph, ranges = equalise_channels(graph, calibrate_ranges(graph, seen))
+    moments = measure_moments(graph, (image[0] for image in seen))
     network = model.network
-    about = About(model.name, "locanet", network.stride_px, network.channels, model.threshold)
+    about = NetworkInfo(model.name, "locanet", network.stride_px, network.channels, model.threshold)
     return {
-        "float": Float(graph, network.channels),
-        "int8": integer(quantise(graph, ranges, about, moments)),
+        "float": FloatBackend(graph, network.channels),
+        "int8": build_reference_backend(quantise_network(graph, ranges, about, moments)),
     }
 
 
@@ -98,7 +98,7 @@ def compare(data: Path) -> tuple[dict[tuple[str, str, str], Agreement], list[plo
 
 
 def _maps(outputs: Outputs) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    grids = grids_of(outputs)
+    grids = to_grids(outputs)
     return grids.confidence[0], grids.depth_m[0]
 
 
@@ -114,7 +114,7 @@ def main() -> None:
         numbers = f"{each.correlation:>12.3f}{each.mean_steps:>8.2f}{each.most_levels:>13}"
         print(f"{name:<8}{channel:<12}{who:<7}{numbers}")
     if asked.plot:
-        plots.map_pairs(pictures, asked.plot)
+        plots.plot_map_pairs(pictures, asked.plot)
 
 
 if __name__ == "__main__":

@@ -21,13 +21,13 @@ from pathlib import Path
 os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.pipeline.batch import build_tasks, run_over_folder
 from dmrl.pipeline.executor import open_executor
 from dmrl.pipeline.process_pool import count_cores
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.terminal.tables import print_table
-from dmrl.topics import attitude
+from dmrl.topics import ATTITUDE
 
 TASKS = 200
 
@@ -83,7 +83,7 @@ def overhead(folder: Path, on: str | None) -> tuple[float, float]:
     source = folder / "small.mcap"
     if not source.exists():
         with RecordingWriter(source, Provenance("bench")) as sink:
-            sink.write(0, attitude("cf1"), message("Attitude")())
+            sink.write(0, ATTITUDE("cf1"), message_class("Attitude")())
     found = {Path(f"{k}.mcap"): source for k in range(TASKS)}
     out = folder / (on or "here")
     out.mkdir()

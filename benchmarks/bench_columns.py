@@ -17,15 +17,15 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from dmrl.messages import message
-from dmrl.recording import Provenance, RecordingWriter, columns
+from dmrl.messages import message_class
+from dmrl.recording import Provenance, RecordingWriter, iter_columns
 
 TOPIC = "/cf1/attitude"
 
 
 def write(path: Path, messages: int) -> None:
     """A recording with that many attitudes at 100 Hz."""
-    attitude = message("Attitude")
+    attitude = message_class("Attitude")
     with RecordingWriter(path, Provenance("bench")) as out:
         for k in range(messages):
             out.write(k * 10_000_000, TOPIC, attitude(roll_rad=k * 1e-3, pitch_rad=0.1, yaw_rad=-k))
@@ -33,7 +33,7 @@ def write(path: Path, messages: int) -> None:
 
 def with_dmrl(path: Path) -> int:
     """Messages decoded to Arrow columns, batch by batch."""
-    return sum(batch.num_rows for batch in columns(path, TOPIC))
+    return sum(batch.num_rows for batch in iter_columns(path, TOPIC))
 
 
 def with_mcap(path: Path) -> int:

@@ -25,7 +25,7 @@ import numpy as np
 from dmrl.cli import COMMANDS
 from dmrl.geometry.frames import AIDECK
 from dmrl.images.codec import encode_jpeg
-from dmrl.rendering.sketch_renderer import draw
+from dmrl.rendering.sketch_renderer import render_sketch
 from dmrl.rendering.sketch_scene import random_look, random_poses
 from dmrl.simulation.drawn_pictures import draw_picture
 from dmrl.stages import sketch
@@ -47,7 +47,7 @@ def sketch_ms(seed: int) -> float:
     begun = time.process_time()
     for k in range(SKETCHES):
         rng = np.random.default_rng((seed, k))
-        draw(camera, random_poses(rng, camera, 3), random_look(rng, camera))
+        render_sketch(camera, random_poses(rng, camera, 3), random_look(rng, camera))
     return (time.process_time() - begun) / SKETCHES * 1e3
 
 

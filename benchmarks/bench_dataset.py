@@ -19,14 +19,14 @@ import numpy as np
 import torch
 
 from dmrl.datasets import Split, open_dataset
-from dmrl.datasets.training_examples import examples_of
+from dmrl.datasets.training_examples import build_examples
 from dmrl.images.codec import encode_jpeg
-from dmrl.learn.data.batches import gathered, order
-from dmrl.messages import message
+from dmrl.learn.data.batches import collate, epoch_indices
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.dataset import Settings, run
 from dmrl.terminal.tables import print_table
-from dmrl.topics import camera_image, labels
+from dmrl.topics import CAMERA_IMAGE, LABELS
 
 HEIGHT_PX, WIDTH_PX, BATCH, PASSES = 224, 320, 32, 3
 Batches = Callable[[], Iterator[torch.Tensor]]
@@ -40,10 +40,10 @@ def write_recording(path: Path, count: int) -> None:
         for k in range(count):
             noise = rng.integers(0, 50, (HEIGHT_PX, WIDTH_PX, 3))
             data = encode_jpeg((ramp + noise).astype(np.uint8))
-            picture = message("CompressedImage")(data=data, format="jpeg")
+            picture = message_class("CompressedImage")(data=data, format="jpeg")
             peer = {"peer": "cf2", "u_px": 160, "v_px": 112, "depth_m": 1, "source": "truth"}
-            sink.write(k * 10**8, camera_image("cf1"), picture)
-            sink.write(k * 10**8, labels("cf1"), message("PeerLabels")(peers=[peer]))
+            sink.write(k * 10**8, CAMERA_IMAGE("cf1"), picture)
+            sink.write(k * 10**8, LABELS("cf1"), message_class("PeerLabels")(peers=[peer]))
 
 
 def order_of(count: int) -> Iterator[np.ndarray]:
@@ -54,10 +54,10 @@ def order_of(count: int) -> Iterator[np.ndarray]:
 
 def from_dmrl(split: Split) -> Iterator[torch.Tensor]:
     """The loader that `dmrl train` uses; it gathers the robots as well."""
-    examples = examples_of(split)
-    chosen = order(len(examples), seed=1, epoch=0)
+    examples = build_examples(split)
+    chosen = epoch_indices(len(examples), seed=1, epoch=0)
     for start in range(0, len(chosen), BATCH):
-        yield gathered(examples, chosen[start : start + BATCH]).images
+        yield collate(examples, chosen[start : start + BATCH]).images
 
 
 def from_datasets_bytes(split: datasets.Dataset) -> Iterator[torch.Tensor]:

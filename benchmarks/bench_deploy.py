@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dmrl.deploy.backends import seen_by
-from dmrl.deploy.c.run.compiled import Compiled
-from dmrl.deploy.int8.store import load
+from dmrl.deploy.backends import to_network_input
+from dmrl.deploy.c.run.compiled import CompiledNetwork
+from dmrl.deploy.int8.store import load_network
 from dmrl.deploy.onnx.runtime import OnnxRun
 from dmrl.deploy.samples import load_samples
 
@@ -25,15 +25,15 @@ PEER = "onnxruntime int8"
 
 def ways(folder: Path) -> dict[str, Callable[[], object]]:
     """What runs one image, by name."""
-    network, image = load(folder), load_samples(folder)[0]
-    seen = seen_by(network, image)
+    network, image = load_network(folder), load_samples(folder)[0]
+    seen = to_network_input(network, image)
     out: dict[str, Callable[[], object]] = {}
     for name, file in ((PEER, "model.int8.onnx"), ("onnxruntime float", "model.onnx")):
         session = OnnxRun(folder / file, threads=1)
         out[name] = lambda session=session: session.outputs(image[None])
     for compiler in ("clang", "gcc"):
         if shutil.which(compiler):
-            compiled = Compiled(network, folder, compiler)
+            compiled = CompiledNetwork(network, folder, compiler)
             out[f"C, {compiler} -O3"] = lambda c=compiled: c.run(seen)
     return out
 

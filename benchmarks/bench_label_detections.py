@@ -19,10 +19,15 @@ import numpy as np
 from bench_label_faults import pair_of, times
 from fault_cases import CASES as FAULTS
 
-from dmrl.estimation.flight.data_association import told_apart
+from dmrl.estimation.flight.data_association import resolve_conflicts
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.model.pair import Pair
-from dmrl.estimation.model.position_metrics import CHI2_95_OF_2, GOOD_M, Judged, squared_distances
+from dmrl.estimation.model.position_metrics import (
+    CHI2_95_OF_2,
+    MAX_GOOD_ERROR_M,
+    EvaluatedPositions,
+    mahalanobis_squared,
+)
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.flight import NOISE, Flight, Scenario, Trajectory, simulate
@@ -84,7 +89,7 @@ def sights(flight: Flight, wrong: float, seed: int) -> dict[str, ObserverLog]:
 def _sight(flight: Flight, robot: str, wrong: float, rng: np.random.Generator) -> ObserverLog:
     log, truth, clock = flight.robots[robot], flight.truth[robot], flight.clocks[robot]
     time_s = np.arange(log.time_s[0] + 0.05, log.time_s[-1], 1 / IMAGES_HZ)
-    true_s = clock.true_time(time_s)
+    true_s = clock.to_true_time(time_s)
     roll, pitch = (np.interp(true_s, truth.time_s, angle) for angle in (truth.roll, truth.pitch))
     found: list[list[list[float]]] = [[] for _ in time_s]
     size = np.array([AIDECK.width_px, AIDECK.height_px])
@@ -125,7 +130,7 @@ def one_solve(pairs: dict[Names, Pair], seen: dict[str, ObserverLog]) -> dict[Na
     }
     looking = add_bearings(pairs, found)
     estimates = _both(looking)
-    again = told_apart(looking, estimates)
+    again = resolve_conflicts(looking, estimates)
     return estimates | _both(again) if again else estimates
 
 
@@ -199,24 +204,28 @@ def rows_of(name: str, noise: str, seeds: range) -> Iterator[Row]:
 
 def _judged(
     flight: Flight, pairs: dict[Names, Pair], found: dict[Names, Estimate]
-) -> Iterator[Judged]:
+) -> Iterator[EvaluatedPositions]:
     for (robot, peer), pair in pairs.items():
         if robot != "cf1":
             continue
         time_s = times(pair)
-        xy, spread, status = found[robot, peer].at(time_s)
-        true_s = flight.clocks[robot].true_time(time_s)
+        xy, spread, status = found[robot, peer].interpolate_at(time_s)
+        true_s = flight.clocks[robot].to_true_time(time_s)
         truth = flight.peer_in_horizontal(robot, peer, true_s)[:, :2]
         away = np.linalg.norm(truth, axis=1)
-        yield Judged(time_s - time_s[0], xy - truth, spread, away, status == OK)
+        yield EvaluatedPositions(time_s - time_s[0], xy - truth, spread, away, status == OK)
 
 
-def _row(case: str, way: str, flown: list[list[Judged]], cpu_s: float) -> Row:
+def _row(case: str, way: str, flown: list[list[EvaluatedPositions]], cpu_s: float) -> Row:
     every = [judged for here in flown for judged in here]
     late = [judged.time_s >= SETTLE_S for judged in every]
-    rmse = [float(np.sqrt(np.mean(j.size_m[at] ** 2))) for j, at in zip(every, late, strict=True)]
-    inside = [squared_distances(j)[at] <= CHI2_95_OF_2 for j, at in zip(every, late, strict=True)]
-    bad = [np.concatenate([j.size_m[j.kept] > GOOD_M for j in here]) for here in flown]
+    rmse = [
+        float(np.sqrt(np.mean(j.error_norm_m[at] ** 2))) for j, at in zip(every, late, strict=True)
+    ]
+    inside = [mahalanobis_squared(j)[at] <= CHI2_95_OF_2 for j, at in zip(every, late, strict=True)]
+    bad = [
+        np.concatenate([j.error_norm_m[j.kept] > MAX_GOOD_ERROR_M for j in here]) for here in flown
+    ]
     total = np.concatenate(bad)
     return Row(
         case,

@@ -22,9 +22,14 @@ from matplotlib.figure import Figure
 
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
 from dmrl.estimation.model.gate import GATE_M
-from dmrl.estimation.model.pair import RATE_HZ, Mask, Pair, usable_ranges
-from dmrl.estimation.model.position_metrics import CHI2_95_OF_2, GOOD_M, Judged, squared_distances
-from dmrl.estimation.model.status import OK, statuses
+from dmrl.estimation.model.pair import GRID_RATE_HZ, Mask, Pair, usable_ranges
+from dmrl.estimation.model.position_metrics import (
+    CHI2_95_OF_2,
+    MAX_GOOD_ERROR_M,
+    EvaluatedPositions,
+    mahalanobis_squared,
+)
+from dmrl.estimation.model.status import OK, classify_positions
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.flight import NOISE, Flight, Scenario, simulate
 from dmrl.geometry.frames import Array
@@ -45,7 +50,7 @@ def pair_of(flight: Flight, one: str, other: str) -> Pair:
     """A pair as `dmrl label` would read it from a recording of the flight."""
     logs = [_signals(flight, robot) for robot in (one, other)]
     start_s, end_s = max(log.start_s for log in logs), min(log.end_s for log in logs)
-    grid_s = start_s + np.arange(int((end_s - start_s) * RATE_HZ) + 1) / RATE_HZ
+    grid_s = start_s + np.arange(int((end_s - start_s) * GRID_RATE_HZ) + 1) / GRID_RATE_HZ
     ranges = [flight.ranges[link] for link in ((one, other), (other, one))]
     time_s, range_m = (
         np.concatenate([getattr(r, name) for r in ranges]) for name in ("time_s", "range_m")
@@ -76,13 +81,13 @@ def batch(pairs: list[Pair]) -> list[tuple[Found, Found]]:
 
 def published(pairs: list[Pair]) -> list[tuple[Found, Found]]:
     """The filter of Li et al. 2020, as ``dmrl label --method ekf``."""
-    both = [*pairs, *(pair.swapped() for pair in pairs)]
+    both = [*pairs, *(pair.swap_robots() for pair in pairs)]
     found = [_at(e, p) for e, p in zip(estimate_ekf(both, "published-sim"), both, strict=True)]
     return list(zip(found[: len(pairs)], found[len(pairs) :], strict=True))
 
 
 def _at(estimate: Estimate, pair: Pair) -> Found:
-    xy, spread, status = estimate.at(times(pair))
+    xy, spread, status = estimate.interpolate_at(times(pair))
     return xy, spread, status == OK
 
 
@@ -98,7 +103,7 @@ def graph(pairs: list[Pair]) -> list[tuple[Found, Found]]:
 
 
 def _of_graph(pair: Pair, key_s: Array, state: Array, covariance: Array) -> Found:
-    status, time_s = statuses(state, covariance, GATE_M), times(pair)
+    status, time_s = classify_positions(state, covariance, GATE_M), times(pair)
     at = np.clip(np.searchsorted(key_s, time_s), 0, len(key_s) - 1)
     xy = np.stack([np.interp(time_s, key_s, axis) for axis in state[:, :2].T], axis=1)
     return xy, covariance[at, :2, :2], status[at] == OK
@@ -156,12 +161,14 @@ class Row:
         ).rstrip()
 
 
-def judged(flight: Flight, robot: str, peer: str, time_s: Array, found: Found) -> Judged:
+def judged(
+    flight: Flight, robot: str, peer: str, time_s: Array, found: Found
+) -> EvaluatedPositions:
     """What was found beside the truth."""
     xy, covariance, kept = found
-    truth = flight.peer_in_horizontal(robot, peer, flight.clocks[robot].true_time(time_s))[:, :2]
+    truth = flight.peer_in_horizontal(robot, peer, flight.clocks[robot].to_true_time(time_s))[:, :2]
     distance = np.linalg.norm(truth, axis=1)
-    return Judged(time_s - time_s[0], xy - truth, covariance, distance, kept)
+    return EvaluatedPositions(time_s - time_s[0], xy - truth, covariance, distance, kept)
 
 
 def outside(flight: Flight, true_s: Array) -> Mask:
@@ -187,23 +194,32 @@ def rows_of(name: str, noise: str, seeds: range, methods: list[str]) -> list[Row
     return rows
 
 
-def _seen(flight: Flight, pair: Pair, found: tuple[Found, Found]) -> list[tuple[Judged, Mask]]:
+def _seen(
+    flight: Flight, pair: Pair, found: tuple[Found, Found]
+) -> list[tuple[EvaluatedPositions, Mask]]:
     """Both directions of a flight beside the truth, and where nothing goes wrong."""
     time_s = times(pair)
-    calm = outside(flight, flight.clocks["cf1"].true_time(time_s))
+    calm = outside(flight, flight.clocks["cf1"].to_true_time(time_s))
     both = zip((("cf1", "cf2"), ("cf2", "cf1")), found, strict=True)
     return [(judged(flight, *names, time_s, what), calm) for names, what in both]
 
 
 def _row(
-    name: str, noise: str, method: str, flown: list[list[tuple[Judged, Mask]]], cpu_s: float
+    name: str,
+    noise: str,
+    method: str,
+    flown: list[list[tuple[EvaluatedPositions, Mask]]],
+    cpu_s: float,
 ) -> Row:
     ways = [way for both in flown for way in both]
     late = [j.time_s >= SETTLE_S for j, _ in ways]
-    rmse = [_root(j.size_m[at]) for (j, _), at in zip(ways, late, strict=True)]
-    calm = [_root(j.size_m[at & quiet]) for (j, quiet), at in zip(ways, late, strict=True)]
-    inside = np.concatenate([squared_distances(j) <= CHI2_95_OF_2 for j, _ in ways])
-    bad = [np.concatenate([j.size_m[j.kept] > GOOD_M for j, _ in both]) for both in flown]
+    rmse = [_root(j.error_norm_m[at]) for (j, _), at in zip(ways, late, strict=True)]
+    calm = [_root(j.error_norm_m[at & quiet]) for (j, quiet), at in zip(ways, late, strict=True)]
+    inside = np.concatenate([mahalanobis_squared(j) <= CHI2_95_OF_2 for j, _ in ways])
+    bad = [
+        np.concatenate([j.error_norm_m[j.kept] > MAX_GOOD_ERROR_M for j, _ in both])
+        for both in flown
+    ]
     every = np.concatenate(bad)
     return _held(
         Row(

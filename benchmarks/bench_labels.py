@@ -16,10 +16,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
-from dmrl.estimation.model.pair import Mask, Pair, Track, usable_ranges
-from dmrl.estimation.model.position_metrics import GOOD_M, Figures, Judged, figures, overall
+from dmrl.estimation.model.pair import Mask, Pair, SensorTrack, usable_ranges
+from dmrl.estimation.model.position_metrics import (
+    MAX_GOOD_ERROR_M,
+    EvaluatedPositions,
+    PairFigures,
+    combine_figures,
+    compute_figures,
+)
 from dmrl.estimation.model.status import AMBIGUOUS, OK, probability_beyond
-from dmrl.estimation.signals.sensor_tracks import track as sensed
+from dmrl.estimation.signals.sensor_tracks import build_track as sensed
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.flight import NOISE, TRAJECTORIES, Flight, RobotLog, Scenario, simulate
 from dmrl.geometry.frames import Array
@@ -49,7 +55,7 @@ class Flown:
         (N,) whether it is.
     """
 
-    figures: Figures
+    figures: PairFigures
     probability: Array
     bad: Mask
 
@@ -66,7 +72,7 @@ def pair_of(flight: Flight, robot: str, peer: str) -> Pair:
     return Pair(grid_s, own, other, ranges.time_s[inside], ranges.range_m[inside])
 
 
-def track_of(log: RobotLog, grid_s: Array) -> Track:
+def track_of(log: RobotLog, grid_s: Array) -> SensorTrack:
     """A robot's log on a common time grid."""
     velocity = np.stack([log.vx_mps, log.vy_mps], axis=1)
     yaw_rate, height = log.yaw_rate_radps[:, None], log.height_m[:, None]
@@ -76,12 +82,16 @@ def track_of(log: RobotLog, grid_s: Array) -> Track:
 def judged(flight: Flight, robot: str, peer: str, estimate: Estimate) -> Flown:
     """An estimate beside the truth, 20 times a second."""
     time_s = np.arange(estimate.time_s[0], estimate.time_s[-1], 0.05)
-    position, covariance, status = estimate.at(time_s)
-    truth = flight.peer_in_horizontal(robot, peer, flight.clocks[robot].true_time(time_s))[:, :2]
+    position, covariance, status = estimate.interpolate_at(time_s)
+    truth = flight.peer_in_horizontal(robot, peer, flight.clocks[robot].to_true_time(time_s))[:, :2]
     distance = np.linalg.norm(truth, axis=1)
-    both = Judged(time_s - time_s[0], position - truth, covariance, distance, status == OK)
-    probability = np.where(status == AMBIGUOUS, np.inf, probability_beyond(covariance, GOOD_M))
-    return Flown(figures(both, SETTLE_S), probability, both.size_m > GOOD_M)
+    both = EvaluatedPositions(
+        time_s - time_s[0], position - truth, covariance, distance, status == OK
+    )
+    probability = np.where(
+        status == AMBIGUOUS, np.inf, probability_beyond(covariance, MAX_GOOD_ERROR_M)
+    )
+    return Flown(compute_figures(both, SETTLE_S), probability, both.error_norm_m > MAX_GOOD_ERROR_M)
 
 
 def best_gate(flown: list[Flown]) -> float:
@@ -119,7 +129,7 @@ def monte_carlo(
 def line(noise: str, trajectory: str, method: str, flown: list[Flown], cost_s: float) -> str:
     """One row of the table: medians over flights, shares of flights or of samples."""
     found = [f.figures for f in flown]
-    every, worst = overall(found), max(f.rmse_m for f in found)
+    every, worst = combine_figures(found), max(f.rmse_m for f in found)
     return (
         f"{noise:<11}{trajectory:<16}{method:<10}{every.rmse_m:7.3f}{every.p95_m:7.3f}"
         f"{worst:7.2f}{every.wrong_basin:7.0%}{every.nees:7.1f}{every.coverage_95:7.1%}"

@@ -24,15 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dmrl.formats.published.locanet import LocanetImage, read
+from dmrl.formats.published.locanet import LocanetImage, load_images
 from dmrl.geometry.frames import PUBLISHED_RENDER
 from dmrl.images.codec import Rgb, decode, encode_jpeg
 from dmrl.recording import read as read_messages
-from dmrl.rendering.backgrounds.photos import LIGHT_OF
-from dmrl.rendering.blender_environment import ensure
+from dmrl.rendering.backgrounds.photos import SRGB_TO_LINEAR
+from dmrl.rendering.blender_environment import ensure_environment
 from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.randomise import random_paint
-from dmrl.rendering.renderer import Model, Renderer
+from dmrl.rendering.renderer import Renderer, RobotModel
 from dmrl.rendering.robots.violet import VIOLET
 from dmrl.rendering.shot import Light, Look, Robot, Shot
 from dmrl.rendering.sketch_renderer import Pose
@@ -54,7 +54,7 @@ class Variant:
     """One way to render: its name, how the model is used, the light, and the look."""
 
     name: str
-    model: Model
+    model: RobotModel
     light: Light = LIGHT
     blur_px: float = 0.45
 
@@ -62,8 +62,8 @@ class Variant:
 def variants(path: Path | None) -> list[Variant]:
     """As the preset has it, and with one thing changed; without a model, as dmrl draws it."""
     if path is None:
-        return [Variant("drawn by dmrl", Model(None, DRAWN_SCALE, design=VIOLET))]
-    model = Model(path, SCALE, "y", "origin")
+        return [Variant("drawn by dmrl", RobotModel(None, DRAWN_SCALE, design=VIOLET))]
+    model = RobotModel(path, SCALE, "y", "origin")
     scene = replace(LIGHT, sun_camera=np.array([0.3, 0.3, 0.9]), sun_shadow=True)
     return [
         Variant("as published", model),
@@ -98,15 +98,17 @@ def shots(
     items: list[LocanetImage], pictures: list[Rgb], variant: Variant, masks: list[NDArray[np.uint8]]
 ) -> Iterator[Shot]:
     """Every drone rendered again, over its picture without it."""
-    with Renderer(ensure(say), variant.model, samples=16) as renderer:
+    with Renderer(ensure_environment(say), variant.model, samples=16) as renderer:
         light = replace(variant.light, name=renderer.lights[0])
         look = replace(LOOK, light=light, robot_blur_px=variant.blur_px)
         backs = (
-            LIGHT_OF[cv2.inpaint(rgb, mask, 3, cv2.INPAINT_TELEA)] if len(masks) else look.backdrop
+            SRGB_TO_LINEAR[cv2.inpaint(rgb, mask, 3, cv2.INPAINT_TELEA)]
+            if len(masks)
+            else look.backdrop
             for rgb, mask in zip(pictures, masks or pictures, strict=True)
         )
         scenes = zip(items, backs, strict=True)
-        yield from renderer.shots(
+        yield from renderer.render_shots(
             (PUBLISHED_RENDER, [robot_of(item)], replace(look, backdrop=back))
             for item, back in scenes
         )
@@ -121,7 +123,7 @@ def main() -> None:
     parser.add_argument("--plot", type=Path)
     parser.add_argument("--renders", type=Path)
     args = parser.parse_args()
-    items = [item for item in read(args.data) if item.split == "train"]
+    items = [item for item in load_images(args.data) if item.split == "train"]
     chosen = np.random.default_rng(0).permutation(len(items))[: args.images]
     items = [items[k] for k in chosen]
     pictures = [decode(item.path.read_bytes(), item.path) for item in items]

@@ -18,10 +18,10 @@ import numpy as np
 
 from dmrl import atomic_output
 from dmrl.images.codec import encode_png
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.terminal.tables import print_table
-from dmrl.topics import attitude, camera_image, labels
+from dmrl.topics import ATTITUDE, CAMERA_IMAGE, LABELS
 
 IMAGES, STEP_NS = 4, 100_000_000
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -39,12 +39,12 @@ def write_recordings(folder: Path, count: int) -> None:
         with RecordingWriter(place, Provenance("bench", {"number": number})) as sink:
             for k in range(IMAGES):
                 data = encode_png(rng.integers(0, 40, (48, 64, 3), np.uint8))
-                picture = message("CompressedImage")(data=data, format="png")
+                picture = message_class("CompressedImage")(data=data, format="png")
                 peer = {"peer": "cf9", "u_px": 20, "v_px": 20, "depth_m": 1.2, "source": "truth"}
                 at = begin_ns + k * STEP_NS
-                sink.write(at, camera_image(robot), picture)
-                sink.write(at, labels(robot), message("PeerLabels")(peers=[peer]))
-                sink.write(at + 1, attitude(robot), message("Attitude")(roll_rad=0.01 * k))
+                sink.write(at, CAMERA_IMAGE(robot), picture)
+                sink.write(at, LABELS(robot), message_class("PeerLabels")(peers=[peer]))
+                sink.write(at + 1, ATTITUDE(robot), message_class("Attitude")(roll_rad=0.01 * k))
 
 
 def cost(*words: str) -> tuple[float, float]:

@@ -27,7 +27,7 @@ import onnxruntime
 from dmrl.deploy.onnx.float_model import float_onnx_of
 from dmrl.images.codec import decode
 from dmrl.learn.inference.loaded_model import load_model
-from dmrl.learn.pretrained import resolved
+from dmrl.learn.pretrained import resolve_model_path
 from dmrl.recording import read
 from dmrl.stages import fly, predict
 
@@ -59,7 +59,7 @@ def plain_loops(model: Path, recording: Path) -> tuple[int, dict[str, Callable[[
 
 def measure(folder: Path, rounds: int) -> list[dict[str, Any]]:
     """A row for each: milliseconds of CPU an image, and their ratio to the plain loop's."""
-    model, recording = resolved(Path("dmrl-nano")), folder / "flight.mcap"
+    model, recording = resolve_model_path(Path("dmrl-nano")), folder / "flight.mcap"
     fly.run(recording, fly.Settings(2, DURATION_S, camera=True, camera_rate_hz=5.0, seed=1))
     count, work = plain_loops(model, recording)
     for backend in ("onnx", "torch"):

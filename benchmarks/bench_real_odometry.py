@@ -18,12 +18,16 @@ from bench_label_faults import times
 
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.model.gate import GATE_M
-from dmrl.estimation.model.odometry import rotation
-from dmrl.estimation.model.pair import RATE_HZ, Pair, usable_ranges
-from dmrl.estimation.model.position_metrics import CHI2_95_OF_2, Judged, squared_distances
+from dmrl.estimation.model.odometry import rotation_matrix
+from dmrl.estimation.model.pair import GRID_RATE_HZ, Pair, usable_ranges
+from dmrl.estimation.model.position_metrics import (
+    CHI2_95_OF_2,
+    EvaluatedPositions,
+    mahalanobis_squared,
+)
 from dmrl.estimation.model.status import OK
 from dmrl.flight import NOISE
-from dmrl.flight.sensors import pair_errors
+from dmrl.flight.sensors import draw_pair_errors
 from dmrl.formats.base import Options
 from dmrl.formats.files import mapped_csv
 from dmrl.geometry.frames import Array
@@ -64,7 +68,7 @@ class Flown:
 
 def read(path: Path) -> Flown:
     """A flight of a file, cut to what was in the air."""
-    series = {s.topic: s for s in mapped_csv.content(path, Options(robot="cf")).series}
+    series = {s.topic: s for s in mapped_csv.load_content(path, Options(robot="cf")).series}
     pose = series["/cf/pose/truth"]
     place, turn = pose.fields["pose"]["position"], pose.fields["pose"]["orientation"]
     place_m = np.column_stack([place[name] for name in "xyz"])
@@ -110,7 +114,7 @@ def beside(flown: Flown, rng: np.random.Generator) -> Flown:
     middle = flown.place_m[:, :2].mean(axis=0)
     away = rng.uniform(NEAR_M, FAR_M) * np.array([np.cos(bearing), np.sin(bearing)])
     place = flown.place_m.copy()
-    place[:, :2] = (place[:, :2] - middle) @ rotation(np.array([turn]))[0].T + middle + away
+    place[:, :2] = (place[:, :2] - middle) @ rotation_matrix(np.array([turn]))[0].T + middle + away
     return replace(flown, place_m=place, yaw_rad=flown.yaw_rad + turn)
 
 
@@ -121,7 +125,7 @@ def _at(flown: Flown, time_s: Array) -> Array:
 
 def measured(one: Flown, other: Flown, rng: np.random.Generator) -> tuple[Array, Array]:
     """Times and ranges of both directions, in order."""
-    noise, (bias_m, scale) = NOISE_OF_RANGES, pair_errors(rng, NOISE_OF_RANGES)
+    noise, (bias_m, scale) = NOISE_OF_RANGES, draw_pair_errors(rng, NOISE_OF_RANGES)
     end_s = min(one.time_s[-1], other.time_s[-1])
     time_s = np.sort(rng.uniform(0.0, end_s, int(2 * noise.ranging_rate_hz * end_s)))
     time_s = time_s[rng.random(len(time_s)) >= noise.ranging_loss]
@@ -136,7 +140,7 @@ def pair_of(one: Flown, other: Flown, rng: np.random.Generator) -> Pair:
     """What the estimators are given."""
     start_s = max(flown.log.start_s for flown in (one, other))
     end_s = min(flown.log.end_s for flown in (one, other))
-    grid_s = start_s + np.arange(int((end_s - start_s) * RATE_HZ) + 1) / RATE_HZ
+    grid_s = start_s + np.arange(int((end_s - start_s) * GRID_RATE_HZ) + 1) / GRID_RATE_HZ
     time_s, range_m = measured(one, other, rng)
     good = usable_ranges(time_s, range_m) & (time_s >= grid_s[0]) & (time_s <= grid_s[-1])
     return Pair(grid_s, one.log.track(grid_s), other.log.track(grid_s), time_s[good], range_m[good])
@@ -146,7 +150,7 @@ def truth(one: Flown, other: Flown, time_s: Array) -> Array:
     """(N, 2) places of the other in the horizontal frame of the one."""
     yaw = np.interp(time_s, one.time_s, one.yaw_rad)
     apart = (_at(other, time_s) - _at(one, time_s))[:, :2]
-    return np.asarray((rotation(-yaw) @ apart[..., None])[..., 0])
+    return np.asarray((rotation_matrix(-yaw) @ apart[..., None])[..., 0])
 
 
 def main() -> None:
@@ -191,12 +195,14 @@ def _row(one: Flown, other: Flown, rng: np.random.Generator) -> tuple[float, ...
     time_s, ways = times(pair), ((one, other), (other, one))
     seen = []
     for estimate, names in zip(both, ways, strict=True):
-        xy, spread, status = estimate.at(time_s)
+        xy, spread, status = estimate.interpolate_at(time_s)
         true = truth(*names, time_s)
         distance = np.linalg.norm(true, axis=1)
-        seen.append(Judged(time_s - time_s[0], xy - true, spread, distance, status == OK))
+        seen.append(
+            EvaluatedPositions(time_s - time_s[0], xy - true, spread, distance, status == OK)
+        )
     size = np.concatenate([one.size_m for one in seen])
-    inside = np.concatenate([squared_distances(one) <= CHI2_95_OF_2 for one in seen])
+    inside = np.concatenate([mahalanobis_squared(one) <= CHI2_95_OF_2 for one in seen])
     kept = np.concatenate([one.kept for one in seen])
     bad = float((size[kept] > GATE_M).mean()) if kept.any() else 0.0
     return float(np.sqrt((size**2).mean())), float(inside.mean()), float(kept.mean()), bad, spent_s

@@ -24,7 +24,7 @@ import numpy as np
 
 from dmrl import recipe
 from dmrl.learn.inference.loaded_model import load_model
-from dmrl.learn.training.validation import WATCHED
+from dmrl.learn.training.validation import VALIDATION_METRICS
 from dmrl.stages.train import Settings, run
 from dmrl.terminal.tables import print_table
 
@@ -97,7 +97,7 @@ def rows(
             [[epoch["validation_within_20_px"] for epoch in history] for history in histories],
             axis=0,
         ).tolist()
-        for figure in WATCHED:
+        for figure in VALIDATION_METRICS:
             values = [epoch[f"validation_{figure}"] for epoch in said]
             row[figure] = float(np.mean(values))
             row[f"{figure}_std"] = float(np.std(values, ddof=1)) if len(seeds) > 1 else math.nan
@@ -146,7 +146,7 @@ def main() -> None:
     shown = [
         (
             row["variant"],
-            *(_words(row, figure) for figure in WATCHED),
+            *(_words(row, figure) for figure in VALIDATION_METRICS),
             round(row["cpu_s"] / row["epochs"], 1),
             reached_s(row, goals[0]) if goals else "-",
         )

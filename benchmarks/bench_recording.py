@@ -25,8 +25,8 @@ from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 from rerun.chunk import McapReader
 
-from dmrl.messages import message, schema_bytes
-from dmrl.recording import Provenance, RecordingWriter, columns, rewrite, summary
+from dmrl.messages import message_class, serialize_schema
+from dmrl.recording import Provenance, RecordingWriter, iter_columns, read_summary, rewrite
 from dmrl.stages import fly
 
 TOPIC, KIND = "/cf1/attitude", "dmrl.v1.Attitude"
@@ -51,7 +51,7 @@ TIMES = np.arange(MESSAGES) * 10_000_000
 
 def messages() -> Any:
     """Time and bytes of each message, built one at a time as a driver would."""
-    attitude = message("Attitude")
+    attitude = message_class("Attitude")
     rows = zip(TIMES.tolist(), ROLL.tolist(), PITCH.tolist(), YAW.tolist(), strict=True)
     for time_ns, roll, pitch, yaw in rows:
         yield time_ns, attitude(roll_rad=roll, pitch_rad=pitch, yaw_rate_radps=yaw)
@@ -70,7 +70,7 @@ def write_columns(_: Path, out: Path) -> None:
     with RecordingWriter(out, MADE) as sink:
         for part in np.array_split(np.arange(MESSAGES), MESSAGES // 10_000):
             own = {name: values[part] for name, values in fields.items()}
-            sink.write_columns(TOPIC, message("Attitude"), TIMES[part], own)
+            sink.write_columns(TOPIC, message_class("Attitude"), TIMES[part], own)
 
 
 def write_mcap(_: Path, out: Path) -> None:
@@ -78,7 +78,7 @@ def write_mcap(_: Path, out: Path) -> None:
     with out.open("wb") as stream:
         writer = Writer(stream, chunk_size=256 * 1024)
         writer.start()
-        schema = writer.register_schema(KIND, "protobuf", schema_bytes("Attitude"))
+        schema = writer.register_schema(KIND, "protobuf", serialize_schema("Attitude"))
         channel = writer.register_channel(TOPIC, "protobuf", schema)
         for time_ns, made in messages():
             writer.add_message(channel, time_ns, made.SerializeToString(), time_ns)
@@ -88,7 +88,7 @@ def write_mcap(_: Path, out: Path) -> None:
 def write_foxglove(_: Path, out: Path) -> None:
     """By foxglove-sdk, which is written in Rust."""
     context = foxglove.Context()
-    schema = FoxgloveSchema(name=KIND, encoding="protobuf", data=schema_bytes("Attitude"))
+    schema = FoxgloveSchema(name=KIND, encoding="protobuf", data=serialize_schema("Attitude"))
     with foxglove.open_mcap(out, context=context):
         channel = FoxgloveChannel(
             TOPIC, schema=schema, message_encoding="protobuf", context=context
@@ -106,7 +106,7 @@ def build_only(_: Path, out: Path) -> None:
 
 def read_dmrl(path: Path, _: Path) -> int:
     """One topic to Arrow columns."""
-    return sum(batch.num_rows for batch in columns(path, TOPIC))
+    return sum(batch.num_rows for batch in iter_columns(path, TOPIC))
 
 
 def read_mcap(path: Path, _: Path) -> int:
@@ -184,7 +184,7 @@ def measure(folder: Path, rounds: int) -> list[dict[str, Any]]:
     spent = paired(writers, folder, out, rounds)
     found += rows(spent, "write attitudes", MESSAGES, 58 * MESSAGES)
     for name, path in flights(folder).items():
-        held, size = summary(path), path.stat().st_size
+        held, size = read_summary(path), path.stat().st_size
         assert read_dmrl(path, out) == read_mcap(path, out) == held.topics[TOPIC].count
         spent = paired(readers, path, out, rounds)
         found += rows(spent, f"read a topic of {name}", held.topics[TOPIC].count, size)

@@ -26,8 +26,8 @@ import numpy as np
 from render_exactness import grain, grey, reprojection
 
 from dmrl.render_recording import read_render_camera, read_render_settings
-from dmrl.rendering.blender_environment import ensure
-from dmrl.rendering.randomise import World, draw_scene
+from dmrl.rendering.blender_environment import ensure_environment
+from dmrl.rendering.randomise import SceneSource, draw_scene
 from dmrl.stages.render import run
 from dmrl.terminal.progress import say
 
@@ -66,7 +66,7 @@ def published_way(
         2 bounces and a filter as wide as the pixel, as dmrl has them, in place of 12 and a wider.
     """
     settings = replace(read_render_settings("synthetic_paper"), images=images, robots_max=1)
-    world = World(
+    world = SceneSource(
         settings,
         read_render_camera(settings),
         0.1,
@@ -89,7 +89,7 @@ def published_way(
         (Path(folder) / "job.json").write_text(json.dumps(job))
         before, begin = _children_s(), time.monotonic()
         subprocess.run(
-            [ensure(say), PUBLISHED_WAY, Path(folder) / "job.json"],
+            [ensure_environment(say), PUBLISHED_WAY, Path(folder) / "job.json"],
             check=True,
             stdout=subprocess.DEVNULL,
         )

@@ -13,7 +13,7 @@ from bench_label_faults import judged, pair_of, times
 
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.flight.swarm import estimate_swarm
-from dmrl.estimation.model.position_metrics import figures, overall
+from dmrl.estimation.model.position_metrics import combine_figures, compute_figures
 from dmrl.estimation.model.status import OK
 from dmrl.flight import NOISE, TRAJECTORIES, Scenario, simulate
 
@@ -48,10 +48,10 @@ def main() -> None:
             rows = []
             for names, estimate in estimates.items():
                 time_s = times(pairs[names] if names in pairs else pairs[names[::-1]])
-                xy, spread, status = estimate.at(time_s)
+                xy, spread, status = estimate.interpolate_at(time_s)
                 seen = judged(flight, *names, time_s, (xy, spread, status == OK))
-                rows.append(figures(seen, SETTLE_S))
-            every = overall(rows)
+                rows.append(compute_figures(seen, SETTLE_S))
+            every = combine_figures(rows)
             worst = np.nanmax([1 - row.precision for row in rows] or [np.nan])
             print(
                 f"{seed:6d} {method:<7}{every.rmse_m:6.3f}{max(r.rmse_m for r in rows):7.3f}"

@@ -19,63 +19,63 @@ import torch
 
 from dmrl import recipe
 from dmrl.datasets import open_dataset
-from dmrl.datasets.training_examples import examples_of
+from dmrl.datasets.training_examples import build_examples
 from dmrl.images.codec import encode_png
 from dmrl.learn.data.augment import Augmenter
-from dmrl.learn.data.batches import Batch, Examples, gathered, order
-from dmrl.learn.networks.depthwise import Depthwise
-from dmrl.learn.training.config import FitSettings
-from dmrl.learn.training.optimizer import new_optimizer
+from dmrl.learn.data.batches import Batch, ExampleSet, collate, epoch_indices
+from dmrl.learn.networks.depthwise import DepthwiseConv
+from dmrl.learn.training.config import TrainConfig
+from dmrl.learn.training.optimizer import build_optimizer
 from dmrl.learn.training.train_step import train_step
-from dmrl.learn.training.trainer import new_network
-from dmrl.messages import message
+from dmrl.learn.training.trainer import build_initial_network
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.dataset import Settings, run
 from dmrl.terminal.tables import print_table
-from dmrl.topics import camera_image, labels
+from dmrl.topics import CAMERA_IMAGE, LABELS
 
 HEIGHT_PX, WIDTH_PX = 224, 320
 STEPS, TURNS = 3, 8
 
 
-def build(folder: Path, count: int) -> Examples:
+def build(folder: Path, count: int) -> ExampleSet:
     """A dataset of smooth pictures, one peer each, opened as training opens it."""
     ramp = np.linspace(0, 200, WIDTH_PX)[None, :, None] + np.zeros((HEIGHT_PX, 1, 3))
     with RecordingWriter(folder / "flight.mcap", Provenance("bench")) as sink:
         for k in range(count):
             data = encode_png((ramp + k % 50).astype(np.uint8))
-            picture = message("CompressedImage")(data=data, format="png")
+            picture = message_class("CompressedImage")(data=data, format="png")
             u_px = 40 + k % 240
             peer = {"peer": "cf2", "u_px": u_px, "v_px": 112, "depth_m": 1, "source": "truth"}
             peer["box_px"] = [u_px - 20, 102, u_px + 20, 122]
-            sink.write(k * 10**8, camera_image("cf1"), picture)
-            sink.write(k * 10**8, labels("cf1"), message("PeerLabels")(peers=[peer]))
+            sink.write(k * 10**8, CAMERA_IMAGE("cf1"), picture)
+            sink.write(k * 10**8, LABELS("cf1"), message_class("PeerLabels")(peers=[peer]))
     run([folder / "flight.mcap"], folder / "dataset", Settings(split="none"))
-    return examples_of(open_dataset(folder / "dataset").split("train"))
+    return build_examples(open_dataset(folder / "dataset").split("train"))
 
 
-def endless(examples: Examples, settings: FitSettings) -> Iterator[Batch]:
+def endless(examples: ExampleSet, settings: TrainConfig) -> Iterator[Batch]:
     """Whole augmented batches, epoch after epoch."""
     augmenter, size, epoch = Augmenter(examples, settings.augmentation(0), seed=0), 0, 0
     size = settings.batch_size
     while True:
-        chosen = order(len(examples), seed=0, epoch=epoch)
+        chosen = epoch_indices(len(examples), seed=0, epoch=epoch)
         for index in range(len(chosen) // size):
             part = chosen[index * size : (index + 1) * size]
-            yield augmenter.batch(part, epoch=epoch, index=index)
+            yield augmenter.augment_batch(part, epoch=epoch, index=index)
         epoch += 1
 
 
-def ways(examples: Examples, settings: FitSettings) -> dict[str, Callable[[], object]]:
+def ways(examples: ExampleSet, settings: TrainConfig) -> dict[str, Callable[[], object]]:
     """What is measured, by name: functions that do one step."""
     fresh = endless(examples, settings)
     ready = next(fresh)
-    chosen = order(len(examples), seed=0, epoch=0)[: settings.batch_size]
+    chosen = epoch_indices(len(examples), seed=0, epoch=0)[: settings.batch_size]
 
     def stepper(change: dict[str, object], batches: Iterator[Batch] | None = None) -> object:
         mine = replace(settings, **change)  # type: ignore[arg-type]
-        network = new_network(mine, examples).train()
-        optimizer = new_optimizer(network, mine.optimizer, mine.weight_decay)
+        network = build_initial_network(mine, examples).train()
+        optimizer = build_optimizer(network, mine.optimizer, mine.weight_decay)
 
         def step() -> None:
             batch = ready if batches is None else next(batches)
@@ -86,12 +86,12 @@ def ways(examples: Examples, settings: FitSettings) -> dict[str, Callable[[], ob
     def torchs_own() -> Callable[[], object]:
         network, step = stepper({})  # type: ignore[misc]
         for layer in network.modules():
-            if isinstance(layer, Depthwise):
-                layer.forward = super(Depthwise, layer).forward  # type: ignore[method-assign]
+            if isinstance(layer, DepthwiseConv):
+                layer.forward = super(DepthwiseConv, layer).forward  # type: ignore[method-assign]
         return step
 
     return {
-        "loading alone": lambda: gathered(examples, chosen),
+        "loading alone": lambda: collate(examples, chosen),
         "loading and augmentation": lambda: next(fresh),
         "training, augmentation in turn": stepper({}, fresh)[1],  # type: ignore[index]
         "training in memory": stepper({})[1],  # type: ignore[index]
@@ -109,7 +109,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    settings = replace(recipe.load(args.recipe, "train", FitSettings), device="cpu")
+    settings = replace(recipe.load(args.recipe, "train", TrainConfig), device="cpu")
     spent: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as name:
         measured = ways(build(Path(name), args.images), settings)

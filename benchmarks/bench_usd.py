@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmrl.formats.crazyflie.usd_log import decode
+from dmrl.formats.crazyflie.usd_log import decode_log
 
 ROUNDS = 40
 KEPT_BYTES = 1 << 24
@@ -72,7 +72,7 @@ def agree(data: bytes) -> bool:
     wanted = plain(data)
     return all(
         np.array_equal(column, wanted[block.name][name].astype(column.dtype), equal_nan=True)
-        for block in decode(data).blocks
+        for block in decode_log(data).blocks
         for name, column in block.columns.items()
     )
 
@@ -84,9 +84,9 @@ def main(*logs: str) -> None:
     print("log, records, MB, plain ms, dmrl ms, ratio, equal")
     for name in logs:
         data = Path(name).read_bytes()
-        records = sum(len(block.time_ns) for block in decode(data).blocks)
+        records = sum(len(block.time_ns) for block in decode_log(data).blocks)
         rounds = [
-            (cpu_ms(plain, data), min(cpu_ms(decode, data) for _ in range(10)))
+            (cpu_ms(plain, data), min(cpu_ms(decode_log, data) for _ in range(10)))
             for _ in range(ROUNDS)
         ]
         slow, fast = np.min(rounds, axis=0)

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from dmrl import topics
-from dmrl.messages import message
-from dmrl.recording import Provenance, RecordingWriter, read, summary, trim
+from dmrl.messages import message_class
+from dmrl.recording import Provenance, RecordingWriter, read, read_summary, trim
 from dmrl.stages import fly
 from dmrl.viewer import Settings, save
 from dmrl.viewer.window.desktop import viewer_process
@@ -38,8 +38,8 @@ def write(path: Path, minutes: float) -> int:
     count = 0
     with RecordingWriter(path, Provenance("bench")) as sink:
         for stamped in read(flown):
-            names = topics.names(topics.CAMERA_IMAGE, stamped.topic)
-            labelled = topics.names(topics.LABELS, stamped.topic)
+            names = topics.parse_topic(topics.CAMERA_IMAGE, stamped.topic)
+            labelled = topics.parse_topic(topics.LABELS, stamped.topic)
             if names is None and labelled is None:
                 _copy(sink, stamped)
                 continue
@@ -58,16 +58,16 @@ def write(path: Path, minutes: float) -> int:
 
 def _copy(sink: RecordingWriter, stamped) -> None:  # noqa: ANN001
     sink.write(stamped.time_ns, stamped.topic, stamped.message)
-    names = topics.names(topics.TRUTH, stamped.topic)
+    names = topics.parse_topic(topics.TRUTH, stamped.topic)
     if names is not None:
-        guess = message("PeerPosition")()
+        guess = message_class("PeerPosition")()
         guess.CopyFrom(stamped.message)
         guess.covariance[:] = [0.01, 0, 0, 0, 0.02, 0, 0, 0, 0.002]
-        sink.write(stamped.time_ns, topics.position(**names), guess)
+        sink.write(stamped.time_ns, topics.POSITION(**names), guess)
 
 
 def _with_estimates(labels):  # noqa: ANN001, ANN202
-    both = message("PeerLabels")()
+    both = message_class("PeerLabels")()
     both.CopyFrom(labels)
     for label in labels.peers:
         sigmas = {"sigma_u_px": 15.0, "sigma_v_px": 8.0, "sigma_depth_m": 0.1}
@@ -83,9 +83,9 @@ def _predict(sink: RecordingWriter, time_ns: int, robot: str, rng: np.random.Gen
         for u, v, c in zip(*rng.uniform(0, [[320], [224], [1]], (3, 10)), strict=True)
     ]
     channels = ["confidence", "depth_m"]
-    grid = message("GridMap")(rows=ROWS, cols=COLS, channels=channels, data=cells.tobytes())
-    sink.write(time_ns, topics.detections(robot), message("Detections")(detections=found))
-    sink.write(time_ns, topics.grid(robot), grid)
+    grid = message_class("GridMap")(rows=ROWS, cols=COLS, channels=channels, data=cells.tobytes())
+    sink.write(time_ns, topics.DETECTIONS(robot), message_class("Detections")(detections=found))
+    sink.write(time_ns, topics.GRID(robot), grid)
 
 
 def with_dmrl(path: Path, out: Path, layout: str) -> dict[str, float]:
@@ -142,7 +142,7 @@ def main() -> None:
         long, half = given.recording or Path(scratch) / "long.mcap", Path(scratch) / "half.mcap"
         if given.recording is None:
             print(f"{write(long, given.minutes)} images", flush=True)
-        held = summary(long)
+        held = read_summary(long)
         middle_ns = (held.start_ns + held.end_ns) // 2
         trim(long, half, end_ns=middle_ns)
         print(f"{long.name}: {size_mb(long):.0f} MB, {(held.end_ns - held.start_ns) / 1e9:.0f} s")

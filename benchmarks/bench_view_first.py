@@ -55,7 +55,7 @@ def first_picture(path: Path, layout: str, *, kept: Path | None) -> dict[str, fl
     kept
         Where to write the first picture.
     """
-    port = viewer_process.free_port(viewer_process.LOOPBACK)
+    port = viewer_process.find_free_port(viewer_process.LOOPBACK)
     words = [sys.executable, "-c", COMMAND, str(port), "view", str(path), "--layout", layout]
     begun = time.monotonic()
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as running:
@@ -77,7 +77,7 @@ def _until_seen(running: subprocess.Popen[str], port: int) -> Rgb:
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline and running.poll() is None:
         try:
-            client = desktop.ViewerClient.connect(viewer_process.url_of(port))
+            client = desktop.ViewerClient.connect(viewer_process.build_proxy_url(port))
             rgb = decode(client.take_screenshot())
         except (OSError, RuntimeError):
             rgb = np.zeros((1, 1, 3), np.uint8)

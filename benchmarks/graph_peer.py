@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from gtsam import noiseModel
 
-from dmrl.estimation.model.odometry import Increments, odometry, rotation
+from dmrl.estimation.model.odometry import RelativeMotion, preintegrate, rotation_matrix
 from dmrl.estimation.model.pair import Pair
 from dmrl.geometry.frames import Array
 
@@ -37,7 +37,7 @@ def solve(pair: Pair) -> tuple[Solved, Solved]:
     """The peer seen by the observer, and the observer seen by the peer."""
     key_s = np.arange(pair.time_s[0], pair.time_s[-1], 1 / KEY_HZ)
     moves = [
-        odometry(track, pair.time_s).increments(key_s[:-1], key_s[1:])
+        preintegrate(track, pair.time_s).relative_motion(key_s[:-1], key_s[1:])
         for track in (pair.own, pair.peer)
     ]
     level_m = _level(pair, key_s)
@@ -80,7 +80,7 @@ def _level(pair: Pair, key_s: Array) -> Array:
     return np.sqrt(np.maximum(np.array(found) ** 2 - high**2, 0.05**2))
 
 
-def _graph(moves: list[Increments], level_m: Array, count: int) -> gtsam.NonlinearFactorGraph:
+def _graph(moves: list[RelativeMotion], level_m: Array, count: int) -> gtsam.NonlinearFactorGraph:
     """Odometry and ranges of the first keyframes."""
     graph = gtsam.NonlinearFactorGraph()
     graph.add(gtsam.PriorFactorPose2(_own(0), gtsam.Pose2(), ANCHOR))
@@ -94,7 +94,7 @@ def _graph(moves: list[Increments], level_m: Array, count: int) -> gtsam.Nonline
 
 
 def _optimised(
-    graph: gtsam.NonlinearFactorGraph, moves: list[Increments], count: int, start: gtsam.Pose2
+    graph: gtsam.NonlinearFactorGraph, moves: list[RelativeMotion], count: int, start: gtsam.Pose2
 ) -> gtsam.Values:
     """Poses of the first keyframes, from dead reckoning with the peer at a start."""
     values = gtsam.Values()
@@ -114,7 +114,7 @@ def _relative(
     apart = values.atPose2(here).between(values.atPose2(there))
     by_here, by_there = np.zeros((3, 3)), np.zeros((3, 3))
     by_here[:2, :2], by_here[:2, 2] = -np.eye(2), (apart.y(), -apart.x())
-    by_there[:2, :2] = rotation(np.array(apart.theta()))
+    by_there[:2, :2] = rotation_matrix(np.array(apart.theta()))
     by_here[2, 2], by_there[2, 2] = -1.0, 1.0
     rows = ((here, by_here), (there, by_there))
     spread = sum(a @ joint.at(i, j) @ b.T for i, a in rows for j, b in rows)

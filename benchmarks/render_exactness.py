@@ -8,12 +8,12 @@ import numpy as np
 
 from dmrl.geometry.frames import Array, Camera, project
 from dmrl.render_recording import read_render_camera, read_render_settings
-from dmrl.rendering.backgrounds.photos import photos_in
-from dmrl.rendering.blender_environment import ensure
-from dmrl.rendering.camera.distortion import Picture, image_from_pinhole
+from dmrl.rendering.backgrounds.photos import open_photos
+from dmrl.rendering.blender_environment import ensure_environment
+from dmrl.rendering.camera.distortion import FloatImage, image_from_pinhole
 from dmrl.rendering.camera.sensor import Sensor
-from dmrl.rendering.randomise import World, draw_scene
-from dmrl.rendering.renderer import Model, Renderer
+from dmrl.rendering.randomise import SceneSource, draw_scene
+from dmrl.rendering.renderer import Renderer, RobotModel
 from dmrl.rendering.robots import crazyflie
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch_renderer import Pose
@@ -56,21 +56,26 @@ def reprojection(recipe: str, images: int) -> dict[str, float]:
         path.write_text(f'kind = "render"\npreset = "{recipe}"\nempty_share = 0.0\n')
         settings = read_render_settings(str(path), images=images)
     camera = read_render_camera(settings)
-    model = Model(settings.model, settings.scale, settings.model_up)
+    model = RobotModel(settings.model, settings.scale, settings.model_up)
     errors, middles = [], []
-    with Renderer(ensure(say), model) as renderer:
-        world = World(
-            settings, camera, renderer.radius_m, tuple(renderer.lights), renderer.panorama, None
+    with Renderer(ensure_environment(say), model) as renderer:
+        world = SceneSource(
+            settings,
+            camera,
+            renderer.radius_m,
+            tuple(renderer.lights),
+            renderer.load_panorama,
+            None,
         )
         world = replace(world, panorama=grey)
         scenes = [draw_scene(world, k) for k in range(images)]
-        shots = renderer.shots((camera, scene.robots, scene.look) for scene in scenes)
+        shots = renderer.render_shots((camera, scene.robots, scene.look) for scene in scenes)
         for scene, shot in zip(scenes, shots, strict=True):
             for k, robot in enumerate(scene.robots):
                 if shot.visible_share[k] < 1 or np.isnan(shot.box_px[k]).any():
                     continue
                 turn = (robot.paint["rotor_first_rad"], robot.paint["rotor_sweep_rad"])
-                points = crazyflie.outline(settings.scale, *turn)
+                points = crazyflie.outline_points(settings.scale, *turn)
                 box = mesh_box(camera, robot.pose, points)
                 errors.append(shot.box_px[k] - box)
                 middles.append((shot.box_px[k] - box).reshape(2, 2).mean(axis=0))
@@ -105,25 +110,27 @@ def grain(recipe: str, images: int, backgrounds: Path) -> dict[str, float]:
         Folder of photos.
     """
     settings = read_render_settings(recipe, images=images, robots_max=1, empty_share=0.0)
-    photos = photos_in(backgrounds)
+    photos = open_photos(backgrounds)
     camera = read_render_camera(settings)
     shots: dict[str, list[Shot]] = {}
     for samples in (MANY_SAMPLES, 4, 8, 16):
-        model = Model(None, settings.scale)
-        with Renderer(ensure(say), model, workers=1, samples=samples) as renderer:
-            world = World(settings, camera, renderer.radius_m, tuple(renderer.lights), grey, photos)
+        model = RobotModel(None, settings.scale)
+        with Renderer(ensure_environment(say), model, workers=1, samples=samples) as renderer:
+            world = SceneSource(
+                settings, camera, renderer.radius_m, tuple(renderer.lights), grey, photos
+            )
             drawn = [draw_scene(world, k) for k in range(images)]
             calm = [replace(d.look, sensor=_noiseless(d.look.sensor)) for d in drawn]
             scenes = [(camera, d.robots, look) for d, look in zip(drawn, calm, strict=True)]
-            shots[f"paths_{samples}"] = list(renderer.shots(scenes))
+            shots[f"paths_{samples}"] = list(renderer.render_shots(scenes))
             if samples == MANY_SAMPLES:
                 noisy = [(camera, d.robots, d.look) for d in drawn]
-                shots["sensor"] = list(renderer.shots(noisy))
+                shots["sensor"] = list(renderer.render_shots(noisy))
     exact = shots.pop(f"paths_{MANY_SAMPLES}")
     return {name: _difference(found, exact) for name, found in shots.items()}
 
 
-def grey(name: str) -> Picture:
+def grey(name: str) -> FloatImage:
     """(8, 16, 3) a panorama of nothing."""
     return np.full((8, 16, 3), 0.3, np.float32)
 

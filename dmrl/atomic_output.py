@@ -14,42 +14,42 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dmrl.errors import FullDisk, OutputError
-from dmrl.guards.durability import empty, sync, sync_one
-from dmrl.guards.locks import is_held, refuse_locked, take_file, take_folder
-from dmrl.guards.paths import refuse_no_text
-from dmrl.storage import Remote, added_files, uploaded_file, uploaded_folder
+from dmrl.guards.durability import clear_folder, sync, sync_entry
+from dmrl.guards.locks import is_same_file, refuse_locked, take_file, take_folder
+from dmrl.guards.paths import require_text_path
+from dmrl.storage import RemotePath, upload_file, upload_folder, upload_into_folder
 from dmrl.storage.upload import require_bucket
 
-SUFFIX = ".partial"
-MOST_NAME_BYTES = 255 - len(SUFFIX)
+PARTIAL_SUFFIX = ".partial"
+NAME_BYTES_MAX = 255 - len(PARTIAL_SUFFIX)
 """Length of an output's name, bytes. File systems allow 255, and ``.partial`` is added to it."""
 
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
-_begun: list[Path] = []
-_ended: list[Path] = []
+_started_outputs: list[Path] = []
+_ended_outputs: list[Path] = []
 
 
-def partial_of(path: Path) -> Path:
+def to_partial_path(path: Path) -> Path:
     """Return ``<name>.partial`` next to ``path``."""
-    return path.with_name(path.name + SUFFIX)
+    return path.with_name(path.name + PARTIAL_SUFFIX)
 
 
-def note(path: Path) -> None:
+def register_output(path: Path) -> None:
     """Register an output that another process writes for this one."""
-    _begun.append(path)
+    _started_outputs.append(path)
 
 
-def standing() -> list[Path]:
+def list_finished_outputs() -> list[Path]:
     """Return the outputs of this process that are complete and have their final name."""
-    return [path for path in _begun if path.exists()]
+    return [path for path in _started_outputs if path.exists()]
 
 
-def outputs_done() -> int:
+def count_ended_outputs() -> int:
     """Return how many outputs of this process have ended, complete or not.
 
     Inputs may change afterwards.
     """
-    return len(_ended)
+    return len(_ended_outputs)
 
 
 def refuse_existing(path: Path) -> None:
@@ -61,35 +61,35 @@ def refuse_existing(path: Path) -> None:
         If the path exists, its folder does not, its name is too long or not text, or another
         process is writing it.
     """
-    _refuse_taken(path)
-    if not isinstance(path, Remote):
-        refuse_locked(partial_of(path))
+    _refuse_existing_name(path)
+    if not isinstance(path, RemotePath):
+        refuse_locked(to_partial_path(path))
 
 
-def _refuse_taken(path: Path) -> None:
-    refuse_no_text(path)
-    if len(os.fsencode(path.name)) > MOST_NAME_BYTES:
-        raise _name_too_long(path)
+def _refuse_existing_name(path: Path) -> None:
+    require_text_path(path)
+    if len(os.fsencode(path.name)) > NAME_BYTES_MAX:
+        raise _name_too_long_error(path)
     try:
-        if isinstance(path, Remote):
+        if isinstance(path, RemotePath):
             require_bucket(path)
-        taken = path.exists() or path.is_symlink()
-        homeless = not isinstance(path, Remote) and not path.parent.is_dir()
+        exists = path.exists() or path.is_symlink()
+        folder_missing = not isinstance(path, RemotePath) and not path.parent.is_dir()
     except OSError as e:
         raise as_output_error(path, e) from e
-    if taken:
+    if exists:
         raise OutputError(
             f"{path} exists. Outputs are never overwritten; remove it or name another"
         )
-    if homeless:
+    if folder_missing:
         raise OutputError(
             f"no folder {path.parent} to write {path.name} in. Try: mkdir -p {path.parent}"
         )
 
 
-def _name_too_long(path: Path) -> OutputError:
+def _name_too_long_error(path: Path) -> OutputError:
     return OutputError(
-        f"the name {path.name[:40]}... is too long. Give one of {MOST_NAME_BYTES} bytes at most"
+        f"the name {path.name[:40]}... is too long. Give one of {NAME_BYTES_MAX} bytes at most"
     )
 
 
@@ -98,12 +98,12 @@ def as_output_error(path: Path, error: OSError) -> OutputError:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return FullDisk(f"no space left for {path}. Free some, or write to another disk")
     if error.errno == errno.ENAMETOOLONG:
-        return _name_too_long(path)
+        return _name_too_long_error(path)
     return OutputError(f"cannot write {path}: {error.strerror or error}. Choose another place")
 
 
 @contextmanager
-def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
+def atomic_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
     """Yield a path to write to; it becomes ``path`` if the block ends without an error.
 
     Parameters
@@ -119,33 +119,33 @@ def partial_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
         If ``path`` exists, another process is writing it, or the system refuses a write.
     """
     refuse_existing(path)
-    if isinstance(path, Remote):
-        with _noted(path), uploaded_file(path) as here:
-            yield here
+    if isinstance(path, RemotePath):
+        with _register_remote(path), upload_file(path) as local:
+            yield local
         return
-    partial = partial_of(path)
-    with _refusals(path, partial):
-        held, kept = None, keep_on_error
+    partial = to_partial_path(path)
+    with _translate_errors(path, partial):
+        descriptor, keep = None, keep_on_error
         try:
-            held = take_file(partial)  # inside try: Ctrl-C can come between any two lines
-            _begin(path, partial)
+            descriptor = take_file(partial)  # inside try: Ctrl-C can come between any two lines
+            _register_output(path, partial)
             yield partial
             sync(partial)
-            _link(partial, path)
-        except _CameBetween:
-            kept = True
+            _publish_file(partial, path)
+        except _NameTaken:
+            keep = True
             raise
         finally:
-            if held is not None:
-                if not kept or is_held(path, held):
+            if descriptor is not None:
+                if not keep or is_same_file(path, descriptor):
                     with suppress(OSError):  # it would hide the original error
                         partial.unlink(missing_ok=True)
-                os.close(held)
-                _ended.append(path)
+                os.close(descriptor)
+                _ended_outputs.append(path)
 
 
 @contextmanager
-def rewritten_file(path: Path) -> Iterator[Path]:
+def replace_file(path: Path) -> Iterator[Path]:
     """Yield a path to write to; it replaces ``path`` if the block ends without an error.
 
     Only for the dataset card, which is rewritten in place and may be edited by hand meanwhile.
@@ -155,26 +155,26 @@ def rewritten_file(path: Path) -> Iterator[Path]:
     OutputError
         If another process is writing it, or the system refuses a write.
     """
-    if isinstance(path, Remote):
-        with uploaded_file(path) as here:
-            yield here
+    if isinstance(path, RemotePath):
+        with upload_file(path) as local:
+            yield local
         return
-    partial = partial_of(path)
-    with _refusals(path, partial):
-        held = take_file(partial)
+    partial = to_partial_path(path)
+    with _translate_errors(path, partial):
+        descriptor = take_file(partial)
         try:
             yield partial
             sync(partial)
             partial.replace(path)
-            sync_one(path.parent)
+            sync_entry(path.parent)
         finally:
             with suppress(OSError):
                 partial.unlink(missing_ok=True)
-            os.close(held)
+            os.close(descriptor)
 
 
 @contextmanager
-def partial_folder(
+def atomic_folder(
     path: Path, *, keep_on_error: bool = False, resume: bool = False
 ) -> Iterator[Path]:
     """Yield a folder to write in; it becomes ``path`` if the block ends without an error.
@@ -194,32 +194,32 @@ def partial_folder(
         If ``path`` exists, another process is writing it, or the system refuses a write.
     """
     refuse_existing(path)
-    if isinstance(path, Remote):
-        with _noted(path), uploaded_folder(path) as here:
-            yield here
+    if isinstance(path, RemotePath):
+        with _register_remote(path), upload_folder(path) as local:
+            yield local
         return
-    partial = partial_of(path)
-    with _refusals(path, partial):
-        held, kept = take_folder(partial), keep_on_error
+    partial = to_partial_path(path)
+    with _translate_errors(path, partial):
+        descriptor, keep = take_folder(partial), keep_on_error
         try:
-            _begin(path, partial)
+            _register_output(path, partial)
             if not resume:
-                empty(partial)
+                clear_folder(partial)
             yield partial
             sync(partial)
-            _rename(partial, path)
-        except _CameBetween:
-            kept = True
+            _publish_folder(partial, path)
+        except _NameTaken:
+            keep = True
             raise
         finally:
-            if not kept:
+            if not keep:
                 shutil.rmtree(partial, ignore_errors=True)
-            os.close(held)
-            _ended.append(path)
+            os.close(descriptor)
+            _ended_outputs.append(path)
 
 
 @contextmanager
-def grown_folder(path: Path, last: str) -> Iterator[Path]:
+def extend_folder(path: Path, last: str) -> Iterator[Path]:
     """Yield a folder to write in; its files move into the existing ``path`` at the end.
 
     The files are flushed to the disk and moved one by one. Their validity must depend on the file
@@ -237,24 +237,24 @@ def grown_folder(path: Path, last: str) -> Iterator[Path]:
     OutputError
         If another process is writing it, or the system refuses a write.
     """
-    if isinstance(path, Remote):
-        with added_files(path, last) as here:
-            yield here
+    if isinstance(path, RemotePath):
+        with upload_into_folder(path, last) as local:
+            yield local
         return
-    partial = partial_of(path)
-    with _refusals(path, partial):
-        held = take_folder(partial)
+    partial = to_partial_path(path)
+    with _translate_errors(path, partial):
+        descriptor = take_folder(partial)
         try:
-            empty(partial)
+            clear_folder(partial)
             yield partial
             sync(partial)
-            _move(partial, path, last)
+            _move_files(partial, path, last)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
-            os.close(held)
+            os.close(descriptor)
 
 
-def _move(partial: Path, path: Path, last: str) -> None:
+def _move_files(partial: Path, path: Path, last: str) -> None:
     files = [one.relative_to(partial) for one in sorted(partial.rglob("*")) if one.is_file()]
     for file in files:
         if file != Path(last):
@@ -262,35 +262,35 @@ def _move(partial: Path, path: Path, last: str) -> None:
             (partial / file).replace(path / file)
     for folder in {above for file in files for above in (path / file).parents}:
         if folder.is_relative_to(path):
-            sync_one(folder)
+            sync_entry(folder)
     if files:
         (partial / last).replace(path / last)
-        sync_one(path)
+        sync_entry(path)
 
 
 @contextmanager
-def _noted(path: Path) -> Iterator[None]:
+def _register_remote(path: Path) -> Iterator[None]:
     """Register an output in a bucket as started, and as ended after the block."""
-    _begun.append(path)
+    _started_outputs.append(path)
     try:
         yield
     finally:
-        _ended.append(path)
+        _ended_outputs.append(path)
 
 
-def _begin(path: Path, partial: Path) -> None:
+def _register_output(path: Path, partial: Path) -> None:
     """Register an output, unless another process has just finished one of that name."""
     try:
-        _refuse_taken(path)
+        _refuse_existing_name(path)
     except OutputError:
         with suppress(OSError):  # the new file; a folder only if it is empty
             partial.rmdir() if partial.is_dir() else partial.unlink()
         raise
-    _begun.append(path)
+    _started_outputs.append(path)
 
 
 @contextmanager
-def _refusals(path: Path, partial: Path) -> Iterator[None]:
+def _translate_errors(path: Path, partial: Path) -> Iterator[None]:
     """Turn system errors of this output into one line; pass on those of other files."""
     try:
         yield
@@ -304,7 +304,7 @@ def _refusals(path: Path, partial: Path) -> Iterator[None]:
         raise as_output_error(path, e) from e
 
 
-class _CameBetween(OutputError):
+class _NameTaken(OutputError):
     """The output's name was taken while it was written."""
 
     def __init__(self, partial: Path, path: Path) -> None:
@@ -313,34 +313,34 @@ class _CameBetween(OutputError):
         )
 
 
-def _link(partial: Path, path: Path) -> None:
+def _publish_file(partial: Path, path: Path) -> None:
     """Give a complete file its name, which must be free."""
     try:
         os.link(partial, path)
     except FileExistsError:
-        raise _CameBetween(partial, path) from None
+        raise _NameTaken(partial, path) from None
     except OSError as e:
         if e.errno not in _NO_LINKS:
             raise
-        _refuse_taken(path)  # FAT has no links: check, then rename
+        _refuse_existing_name(path)  # FAT has no links: check, then rename
         partial.rename(path)
     try:
-        sync_one(path.parent)
+        sync_entry(path.parent)
     except BaseException:
         path.unlink()  # it might be lost in a power loss, so remove it
         raise
 
 
-def _rename(partial: Path, path: Path) -> None:
+def _publish_folder(partial: Path, path: Path) -> None:
     """Give a complete folder its name; the system refuses if that is taken."""
     try:
         partial.rename(path)
     except OSError as e:
         if e.errno in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
-            raise _CameBetween(partial, path) from None
+            raise _NameTaken(partial, path) from None
         raise
     try:
-        sync_one(path.parent)
+        sync_entry(path.parent)
     except BaseException:
         path.rename(partial)
         raise

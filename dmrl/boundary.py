@@ -27,8 +27,8 @@ from pathlib import Path
 from types import FrameType
 
 from dmrl import atomic_output
-from dmrl.errors import DmrlError, SettingError, one_line, words_of
-from dmrl.guards.safe_names import without_middle
+from dmrl.errors import DmrlError, SettingError, describe_error, to_one_line
+from dmrl.guards.safe_names import truncate_middle
 
 TERMINATION_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -79,7 +79,7 @@ def run_to_status(work: Callable[[], object]) -> int:
         # The interpreter would try once more, and say so with a traceback.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         if not status and not isinstance(e, BrokenPipeError):
-            return _print_error(words_of(e) or _report_bug(e))
+            return _print_error(describe_error(e) or _report_bug(e))
         return status or 1
     return status
 
@@ -99,7 +99,7 @@ def _run_guarded(work: Callable[[], object]) -> int:
     except Exception as e:
         if os.environ.get("DMRL_DEBUG"):
             raise
-        return _print_error(words_of(e) or _report_bug(e))
+        return _print_error(describe_error(e) or _report_bug(e))
     return 0
 
 
@@ -113,13 +113,13 @@ def _refuse_removed_folder() -> None:
 
 def _print_error(text: str, status: int = 1) -> int:
     with suppress(OSError):
-        sys.stderr.write(f"dmrl: {without_middle(one_line(text))}\n")
+        sys.stderr.write(f"dmrl: {truncate_middle(to_one_line(text))}\n")
     return status
 
 
 def _interrupt_text() -> str:
     try:
-        whole = atomic_output.standing()
+        whole = atomic_output.list_finished_outputs()
     except (DmrlError, OSError) as e:  # outputs may lie where nobody answers any more
         return f"stopped. What has its final name is not known: {e}"
     if whole:

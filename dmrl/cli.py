@@ -24,8 +24,8 @@ from rich.console import Console
 from rich.text import Text
 
 from dmrl import __version__, boundary, plugins
-from dmrl.guards.safe_names import without_middle
-from dmrl.storage import path_of
+from dmrl.guards.safe_names import truncate_middle
+from dmrl.storage import to_path
 
 # In the order of the work. The help line is the first line of the function's docstring;
 # it stands here too so that `dmrl --help` loads nothing (a test holds the two together).
@@ -71,7 +71,7 @@ def format_usage_error(error: CycloptsError) -> Text:
         flag, value = error.token.keyword, error.token.value
         return Text(f"dmrl: {flag} {value} does not say of what. Try: {flag}.cf1 {value}")
     if not isinstance(error, UnknownCommandError) or not error.unused_tokens:
-        return Text(f"dmrl: {without_middle(str(error))}")
+        return Text(f"dmrl: {truncate_middle(str(error))}")
     # The error's own text would load every command, and fail where an extra is missing.
     word = error.unused_tokens[0]
     near = get_close_matches(word, [*COMMANDS, *plugins.find_plugins(plugins.STAGES)], n=1)
@@ -92,7 +92,7 @@ def convert_strictly(kind: Any, tokens: Sequence[Token] | Sequence[str]) -> Any:
     if type(None) in (members := get_args(kind)) and len(members) == 2:
         kind = next(member for member in members if member is not type(None))
     if Path in (kind, *get_args(kind)):
-        return convert(kind, tokens, converter=lambda _, word: path_of(word))
+        return convert(kind, tokens, converter=lambda _, word: to_path(word))
     words = [token if isinstance(token, str) else token.value for token in tokens]
     whole = int in (kind, *get_args(kind)) and float not in get_args(kind)
     if whole and any("." in word for word in words):

@@ -13,10 +13,10 @@ RGB = {
 }
 """Colours of the sources of positions, and of other measurements."""
 
-SECOND_DETECTION = (170, 230, 60)
+SECOND_DETECTION_RGB = (170, 230, 60)
 """Colour of a second model's detections, beside those of a first."""
 
-OWN, PEER = (240, 240, 240), (150, 150, 150)
+OWN_RGB, PEER_RGB = (240, 240, 240), (150, 150, 150)
 """Colours of a robot's own sensors, and of its peer's."""
 
 STATUS_RGB = {

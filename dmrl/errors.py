@@ -26,21 +26,21 @@ from contextlib import contextmanager
 from difflib import get_close_matches
 
 
-def one_line(text: str) -> str:
+def to_one_line(text: str) -> str:
     r"""Return the text in one line: control characters as ``\x1b``, line ends as spaces.
 
     Characters that control a terminal or the direction of text are escaped.
     """
-    return "".join(map(_shown, " ".join(text.splitlines())))
+    return "".join(map(_escape_character, " ".join(text.splitlines())))
 
 
-def _shown(character: str) -> str:
+def _escape_character(character: str) -> str:
     if unicodedata.category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp"):
         return character.encode("unicode_escape", "surrogatepass").decode("ascii")
     return character
 
 
-def words_of(error: Exception) -> str | None:
+def describe_error(error: Exception) -> str | None:
     """Return the message for an error of the user, disk or machine; None for a bug."""
     match error:
         case DmrlError():
@@ -65,7 +65,7 @@ class DmrlError(Exception):
 
     def __str__(self) -> str:
         """Return one line, whatever the names and library messages in it contain."""
-        return one_line(super().__str__())
+        return to_one_line(super().__str__())
 
 
 class OutputError(DmrlError):

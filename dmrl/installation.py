@@ -126,14 +126,14 @@ def _installed_version(package: str) -> str:
 
 def _find_programs() -> Iterator[Part]:
     try:
-        compiler = toolchain.host_compiler()
+        compiler = toolchain.find_host_compiler()
         yield Part("C compiler", True, compiler, "dmrl verify, predict --backend c")
     except ToolError:
         way = "apt-get install gcc"
         yield Part("C compiler", False, "", "dmrl verify, predict --backend c", way)
     for name in (toolchain.RISCV, toolchain.EMULATOR):
         path = shutil.which(name) or ""
-        way = "" if path else f"apt-get install {toolchain.PACKAGES[name]}"
+        way = "" if path else f"apt-get install {toolchain.DEBIAN_PACKAGES[name]}"
         yield Part(name, bool(path), path, "dmrl verify: proof on RISC-V", way)
 
 
@@ -153,15 +153,18 @@ def _find_vulkan() -> Part:
 
 def _find_blender() -> Part:
     serves = "dmrl render, fly --camera-renderer blender"
-    python = blender_environment.python()
+    python = blender_environment.find_python()
     lacking = [name for name in BLENDER_LIBRARIES if find_library(name) is None]
     if platform.system() == "Linux" and lacking:
-        way = f"apt-get install {blender_environment.LIBRARIES}"
+        way = f"apt-get install {blender_environment.SYSTEM_LIBRARIES}"
         return Part("Blender", False, f"no lib{lacking[0]}", serves, way)
     if python is None:
         return Part("Blender", False, "", serves, "dmrl render --setup")
     return Part(
-        "Blender", True, f"{blender_environment.BLENDER} in {blender_environment.folder()}", serves
+        "Blender",
+        True,
+        f"{blender_environment.BLENDER} in {blender_environment.environment_folder()}",
+        serves,
     )
 
 
@@ -171,7 +174,7 @@ def _find_gpu() -> Part:
         return Part("NVIDIA GPU", False, "", serves)
     try:
         asked = ("nvidia-smi", "--query-gpu=name", "--format=csv,noheader")
-        names = toolchain.run(asked, "the GPU's name").decode(errors="replace").split("\n")
+        names = toolchain.run_program(asked, "the GPU's name").decode(errors="replace").split("\n")
     except ToolError as e:
         return Part("NVIDIA GPU", False, str(e), serves)
     return Part("NVIDIA GPU", bool(names[0]), ", ".join(filter(None, names)), serves)

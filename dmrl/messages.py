@@ -26,12 +26,12 @@ PACKAGES = ("dmrl.v1", "foxglove")
 
 
 @cache
-def _pool() -> DescriptorPool:
+def _load_pool() -> DescriptorPool:
     data = files("dmrl.schemas").joinpath("dmrl.binpb").read_bytes()
-    return pool_of(data)
+    return build_pool(data)
 
 
-def pool_of(descriptor_set: bytes) -> DescriptorPool:
+def build_pool(descriptor_set: bytes) -> DescriptorPool:
     """Build a pool with every file of a serialized FileDescriptorSet.
 
     Raises
@@ -46,7 +46,7 @@ def pool_of(descriptor_set: bytes) -> DescriptorPool:
 
 
 @cache
-def descriptor(name: str) -> Descriptor:
+def find_descriptor(name: str) -> Descriptor:
     """Return the descriptor of a message of dmrl or foxglove.
 
     Parameters
@@ -61,15 +61,15 @@ def descriptor(name: str) -> Descriptor:
     """
     for full in (name, *(f"{package}.{name}" for package in PACKAGES)):
         try:
-            return _pool().FindMessageTypeByName(full)
+            return _load_pool().FindMessageTypeByName(full)
         except KeyError:
             continue
     raise KeyError(name)
 
 
-def status_name(number: int) -> str:
+def to_status_name(number: int) -> str:
     """Return the name of a label's or position's status; the number if the status is unknown."""
-    kind = descriptor("PeerLabel").fields_by_name["status"].enum_type
+    kind = find_descriptor("PeerLabel").fields_by_name["status"].enum_type
     known = kind.values_by_number if kind is not None else {}
     return str(known[number].name) if number in known else str(number)
 
@@ -110,7 +110,7 @@ class LogType:
         found: list[str] = []
         names = [variable for variable, _ in self.variables]
         for variable in names:
-            name = _identifier(variable)
+            name = _to_identifier(variable)
             while name in found or (name in names and name != variable):
                 name += "_"
             found.append(name)
@@ -119,17 +119,17 @@ class LogType:
 
 LOG_PACKAGE = "dmrl.log"
 _F = FieldDescriptorProto
-_OF_CODE = dict.fromkeys("BHI", _F.TYPE_UINT32) | dict.fromkeys("bhi", _F.TYPE_SINT32)
-_OF_CODE |= {"q": _F.TYPE_SINT64, "e": _F.TYPE_FLOAT, "f": _F.TYPE_FLOAT, "d": _F.TYPE_DOUBLE}
+_TYPE_BY_CODE = dict.fromkeys("BHI", _F.TYPE_UINT32) | dict.fromkeys("bhi", _F.TYPE_SINT32)
+_TYPE_BY_CODE |= {"q": _F.TYPE_SINT64, "e": _F.TYPE_FLOAT, "f": _F.TYPE_FLOAT, "d": _F.TYPE_DOUBLE}
 
 
-def _identifier(text: str) -> str:
+def _to_identifier(text: str) -> str:
     name = re.sub(r"[^A-Za-z0-9_]", "_", text)
     return name if name[:1].isalpha() else f"v_{name}"
 
 
-def _log_descriptor(kind: LogType) -> Descriptor:
-    name = _identifier(kind.name)
+def _build_log_descriptor(kind: LogType) -> Descriptor:
+    name = _to_identifier(kind.name)
     file = FileDescriptorProto(
         name=f"{LOG_PACKAGE}/{name}.proto", package=LOG_PACKAGE, syntax="proto3"
     )
@@ -141,7 +141,7 @@ def _log_descriptor(kind: LogType) -> Descriptor:
             name=field,
             json_name=variable,
             number=number,
-            type=_OF_CODE[code],
+            type=_TYPE_BY_CODE[code],
             label=_F.LABEL_OPTIONAL,
         )
     pool = DescriptorPool()
@@ -150,7 +150,7 @@ def _log_descriptor(kind: LogType) -> Descriptor:
 
 
 @cache
-def message(name: str | LogType) -> Any:
+def message_class(name: str | LogType) -> Any:
     """Return the class of a message: ``message_class("Height")(height_m=0.4)``.
 
     Parameters
@@ -163,11 +163,13 @@ def message(name: str | LogType) -> Any:
     KeyError
         If there is no such message.
     """
-    return GetMessageClass(_log_descriptor(name) if isinstance(name, LogType) else descriptor(name))
+    return GetMessageClass(
+        _build_log_descriptor(name) if isinstance(name, LogType) else find_descriptor(name)
+    )
 
 
 @cache
-def schema_bytes(name: str | Descriptor) -> bytes:
+def serialize_schema(name: str | Descriptor) -> bytes:
     """Serialize the FileDescriptorSet of a message and all its imports, as MCAP requires."""
     found: dict[str, FileDescriptor] = {}
 
@@ -176,7 +178,7 @@ def schema_bytes(name: str | Descriptor) -> bytes:
             visit(dependency)
         found.setdefault(file.name, file)
 
-    visit((descriptor(name) if isinstance(name, str) else name).file)
+    visit((find_descriptor(name) if isinstance(name, str) else name).file)
     out = FileDescriptorSet()
     for file in found.values():
         file.CopyToProto(out.file.add())

@@ -36,12 +36,12 @@ if TYPE_CHECKING:
     from dmrl.learn.networks.architectures import ConvNorm as ConvNorm
     from dmrl.learn.networks.architectures import Network as Network
     from dmrl.pipeline.stage_command import stage_command as stage_command
-    from dmrl.samples.flight import in_order as in_order
-    from dmrl.samples.flight import nanoseconds as nanoseconds
-    from dmrl.samples.flight import ranges as ranges
+    from dmrl.samples.flight import iter_ranges as iter_ranges
+    from dmrl.samples.flight import merge_by_time as merge_by_time
+    from dmrl.samples.flight import to_nanoseconds as to_nanoseconds
     from dmrl.samples.sample import Columns as Columns
     from dmrl.samples.sample import Sample as Sample
-    from dmrl.samples.sample import image as image
+    from dmrl.samples.sample import build_image as build_image
     from dmrl.terminal.closing import Closing as Closing
 
 PLACES = {

@@ -10,27 +10,27 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.deploy.backend_names import BackendName
-from dmrl.deploy.detector import LIBRARIES, Detector, fastest, open_detector
+from dmrl.deploy.detector import BACKEND_PACKAGES, Detector, open_detector, select_fastest_backend
 from dmrl.deploy.image_detection import DetectionOptions, detect_images
 from dmrl.errors import MissingTopic
 from dmrl.guards import limits
-from dmrl.images.codec import Opened, Rgb, opened, size
-from dmrl.images.prefetch import ahead
-from dmrl.learn.inference.decode_grids import PER_DETECTION, Found, Grids
-from dmrl.learn.pretrained import resolved
-from dmrl.messages import message
+from dmrl.images.codec import ImageHeader, Rgb, read_header, read_size
+from dmrl.images.prefetch import map_ahead
+from dmrl.learn.inference.decode_grids import DETECTION_COLUMNS, Detections, Grids
+from dmrl.learn.pretrained import resolve_model_path
+from dmrl.messages import message_class
 from dmrl.recording import (
-    Contents,
+    LoadedRecording,
     Provenance,
     RawMessage,
     Stamped,
-    Timed,
-    parsed,
-    provenance,
+    TimedMessage,
+    build_provenance,
+    parse_message,
     read_raw,
     rewrite,
 )
-from dmrl.recording.provenance_inputs import sha256_of_file
+from dmrl.recording.provenance_inputs import hash_file
 from dmrl.terminal.progress import say, track
 
 OUTPUT_TOPICS = (topics.DETECTIONS, topics.GRID)
@@ -45,23 +45,23 @@ def choose_backend(model: Path, recording: Path, given: BackendName | None) -> B
     MissingTopic
         If the recording has no images.
     """
-    held = Contents(recording)
-    robots = topics.robots(list(held.topics))
+    held = LoadedRecording(recording)
+    robots = topics.list_robots(list(held.topics))
     if not robots:
-        raise MissingTopic(topics.camera_image("*"), held.topics, recording)
-    images = (held.first(topics.camera_image(robot)) for robot in robots if given is None)
+        raise MissingTopic(topics.CAMERA_IMAGE("*"), held.topics, recording)
+    images = (held.first(topics.CAMERA_IMAGE(robot)) for robot in robots if given is None)
     first = min(filter(None, images), key=lambda image: image.time_ns, default=None)
     if first is None:
         return given or "torch"
-    width_px, height_px, _ = size(first.message.data, _name_image(recording, first))
-    backend = fastest(resolved(model), (width_px, height_px))
+    width_px, height_px, _ = read_size(first.message.data, _name_image(recording, first))
+    backend = select_fastest_backend(resolve_model_path(model), (width_px, height_px))
     say(f"{recording}: --backend {backend}")
     return backend
 
 
 def open_with_threshold(model: Path, backend: BackendName, threshold: float | None) -> Detector:
     """Open a model, with another threshold than its own if one is given."""
-    detector = open_detector(resolved(model), backend)
+    detector = open_detector(resolve_model_path(model), backend)
     return detector if threshold is None else replace(detector, threshold=threshold)
 
 
@@ -79,13 +79,15 @@ def describe_prediction(
     backend, detector
         The opened model.
     """
-    model = resolved(model)
-    made = provenance("predict", settings, (model, recording), libraries=LIBRARIES[backend])
+    model = resolve_model_path(model)
+    made = build_provenance(
+        "predict", settings, (model, recording), libraries=BACKEND_PACKAGES[backend]
+    )
     # It stands beside the weights, and in every message.
     made = replace(made, settings={**made.settings, "model_threshold": detector.threshold})
     if model.is_dir() and detector.file is not None:
         # A run folder holds the log of the training too; the weights alone decide the result.
-        weights = replace(made.inputs[0], sha256=sha256_of_file(detector.file))
+        weights = replace(made.inputs[0], sha256=hash_file(detector.file))
         made = replace(made, inputs=(weights, *made.inputs[1:]))
     return made
 
@@ -116,8 +118,8 @@ def write_detections(
     tuple
         Number of images, and of detections that reach the threshold.
     """
-    held = Contents(recording)
-    replaced = [t for t in held.topics if any(topics.names(own, t) for own in OUTPUT_TOPICS)]
+    held = LoadedRecording(recording)
+    replaced = [t for t in held.topics if any(topics.parse_topic(own, t) for own in OUTPUT_TOPICS)]
     tally = Counter[str]()
     found = _iter_messages(held, detector, options, batch_size, tally)
     rewrite(recording, out, origin, without=replaced, fresh=[found])
@@ -125,18 +127,18 @@ def write_detections(
 
 
 def _iter_messages(
-    held: Contents,
+    held: LoadedRecording,
     detector: Detector,
     options: DetectionOptions,
     batch_size: int,
     tally: Counter[str],
-) -> Iterator[Timed]:
+) -> Iterator[TimedMessage]:
     """Yield Detections and GridMap of every image, and count them on the way."""
-    images = [t for t in held.topics if topics.names(topics.CAMERA_IMAGE, t)]
+    images = [t for t in held.topics if topics.parse_topic(topics.CAMERA_IMAGE, t)]
     total = sum(held.topics[t].count for t in images)
     raws = track(read_raw(held.path, *images), "Predicting", total)
     batches = _iter_batches(raws, batch_size, detector, held.path)
-    for batch in ahead(_decode_batch, batches, threads=1, held=1):
+    for batch in map_ahead(_decode_batch, batches, threads=1, max_waiting=1):
         tally["images"] += len(batch)
         raw_messages = iter(batch)
         for found, grids in detect_images([rgb for _, rgb in batch], detector, options):
@@ -146,21 +148,23 @@ def _iter_messages(
                 tally["believed"] += sum(
                     d.confidence >= detector.threshold for d in made.detections
                 )
-                robot = (topics.names(topics.CAMERA_IMAGE, raw.topic) or {})["robot"]
-                yield Timed(raw.time_ns, topics.detections(robot), made, raw.publish_ns)
+                robot = (topics.parse_topic(topics.CAMERA_IMAGE, raw.topic) or {})["robot"]
+                yield TimedMessage(raw.time_ns, topics.DETECTIONS(robot), made, raw.publish_ns)
                 grid = _to_grid_map(grids, k, detector.stride_px)
-                yield Timed(raw.time_ns, topics.grid(robot), grid, raw.publish_ns)
+                yield TimedMessage(raw.time_ns, topics.GRID(robot), grid, raw.publish_ns)
 
 
 def _iter_batches(
     raws: Iterable[RawMessage], most: int, detector: Detector, recording: Path
-) -> Iterator[list[tuple[RawMessage, Opened]]]:
+) -> Iterator[list[tuple[RawMessage, ImageHeader]]]:
     """Yield so many images at a time; fewer where they are large, one at least."""
-    batch: list[tuple[RawMessage, Opened]] = []
+    batch: list[tuple[RawMessage, ImageHeader]] = []
     pixels = 0
     for raw in raws:
         name = _name_image(recording, raw)
-        image = opened(parsed(raw, message("CompressedImage"), recording).data, name)
+        image = read_header(
+            parse_message(raw, message_class("CompressedImage"), recording).data, name
+        )
         detector.require_size(image.width_px, image.height_px, name)
         pixels += image.width_px * image.height_px
         if len(batch) == most or (batch and pixels > limits.FRAME_PIXELS):
@@ -171,7 +175,7 @@ def _iter_batches(
         yield batch
 
 
-def _decode_batch(batch: list[tuple[RawMessage, Opened]]) -> list[tuple[RawMessage, Rgb]]:
+def _decode_batch(batch: list[tuple[RawMessage, ImageHeader]]) -> list[tuple[RawMessage, Rgb]]:
     return [(raw, image.decode(limits.FRAME_PIXELS)) for raw, image in batch]
 
 
@@ -179,16 +183,16 @@ def _name_image(recording: Path, image: RawMessage | Stamped) -> str:
     return f"{recording}: the image of {image.topic} at {image.time_ns} ns"
 
 
-def _to_detections(found: Found, image: int, threshold: float) -> Any:
-    columns = [getattr(found, name)[image, : found.count[image]] for name in PER_DETECTION]
+def _to_detections(found: Detections, image: int, threshold: float) -> Any:
+    columns = [getattr(found, name)[image, : found.count[image]] for name in DETECTION_COLUMNS]
     rows = zip(*(column.tolist() for column in columns), strict=True)
-    detections = [dict(zip(PER_DETECTION, row, strict=True)) for row in rows]
-    return message("Detections")(detections=detections, threshold=threshold)
+    detections = [dict(zip(DETECTION_COLUMNS, row, strict=True)) for row in rows]
+    return message_class("Detections")(detections=detections, threshold=threshold)
 
 
 def _to_grid_map(grids: Grids, image: int, stride_px: int) -> Any:
     maps = np.stack((grids.confidence[image], grids.depth_m[image]))
-    return message("GridMap")(
+    return message_class("GridMap")(
         rows=maps.shape[1],
         cols=maps.shape[2],
         channels=("confidence", "depth_m"),

@@ -23,20 +23,20 @@ from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.guards.paths import refuse_pipe
 
 Settings = TypeVar("Settings")
-MOST_BYTES = 4 * limits.TOML_CHARACTERS
+MAX_BYTES = 4 * limits.TOML_CHARACTERS
 """Maximum size of a recipe file, bytes."""
 PRETRAINED = "pretrained"
 """Folder of the recipes that trained the shipped networks, below the recipes for users."""
 
 
-def names() -> list[str]:
+def list_names() -> list[str]:
     """Return the names of the shipped recipes for users."""
-    return _names_in(_shipped())
+    return _names_in(_recipe_files())
 
 
 def pretrained_names() -> list[str]:
     """Return the names of the shipped recipes that trained the shipped networks."""
-    return _names_in(_shipped() / PRETRAINED)
+    return _names_in(_recipe_files() / PRETRAINED)
 
 
 def read(name: str | Path) -> dict[str, Any]:
@@ -47,10 +47,10 @@ def read(name: str | Path) -> dict[str, Any]:
     RecipeError
         If the recipe does not exist, or is not TOML.
     """
-    return _parse(name, text(name))
+    return _parse_recipe(name, read_text(name))
 
 
-def text(name: str | Path) -> str:
+def read_text(name: str | Path) -> str:
     """Read the text of a recipe, by path or by the name of a shipped one.
 
     Raises
@@ -63,12 +63,12 @@ def text(name: str | Path) -> str:
     source = path if path.suffix == ".toml" else _find_shipped(str(name))
     try:
         with source.open("rb") as stream:
-            content = stream.read(MOST_BYTES + 1)
-        if len(content) > MOST_BYTES:
-            raise RecipeError(f"{name} has more than {MOST_BYTES} bytes. Use a smaller recipe")
+            content = stream.read(MAX_BYTES + 1)
+        if len(content) > MAX_BYTES:
+            raise RecipeError(f"{name} has more than {MAX_BYTES} bytes. Use a smaller recipe")
         return content.decode("utf-8")
     except (FileNotFoundError, IsADirectoryError):
-        near = get_close_matches(path.stem, names() + pretrained_names(), n=1)
+        near = get_close_matches(path.stem, list_names() + pretrained_names(), n=1)
         hint = f"Did you mean {near[0]}?" if near else _list_shipped()
         raise RecipeError(f"no recipe {name}. {hint}") from None
     except (UnicodeDecodeError, OSError) as e:
@@ -116,12 +116,12 @@ def check(name: str | Path, keys: Mapping[str, Any], schema: type[Settings]) -> 
     RecipeError
         If keys are wrong. Names the recipe and all wrong keys.
     """
-    if wrong := faults(keys, schema):
-        raise faulty(name, wrong)
-    return _instance(keys, schema)
+    if wrong := find_faults(keys, schema):
+        raise recipe_error(name, wrong)
+    return _create_instance(keys, schema)
 
 
-def _shipped() -> Traversable:
+def _recipe_files() -> Traversable:
     return files("dmrl.recipes")
 
 
@@ -131,17 +131,17 @@ def _names_in(folder: Traversable) -> list[str]:
 
 def _find_shipped(name: str) -> Traversable:
     """Return the file of a shipped recipe, whether it exists or not."""
-    folder = _shipped() / PRETRAINED if name in pretrained_names() else _shipped()
+    folder = _recipe_files() / PRETRAINED if name in pretrained_names() else _recipe_files()
     return folder / f"{name}.toml"
 
 
 def _list_shipped() -> str:
     """Return the names of all shipped recipes as one line for errors."""
     others = ", ".join(pretrained_names())
-    return f"Shipped ones: {', '.join(names())}; those of the shipped networks: {others}"
+    return f"Shipped ones: {', '.join(list_names())}; those of the shipped networks: {others}"
 
 
-def _parse(name: str | Path, content: str) -> dict[str, Any]:
+def _parse_recipe(name: str | Path, content: str) -> dict[str, Any]:
     try:
         return parse_toml(content)
     except ValueError as e:
@@ -161,23 +161,23 @@ def check_kind(name: str | Path, keys: Mapping[str, Any], kind: str) -> None:
         raise RecipeError(f'{name} {has}. Use a recipe with: kind = "{kind}"')
 
 
-def faulty(name: str | Path, wrong: Iterable[str]) -> RecipeError:
+def recipe_error(name: str | Path, wrong: Iterable[str]) -> RecipeError:
     """Return the one-line error that names all faults of a recipe."""
     lines = list(wrong)
     keys = "1 wrong key" if len(lines) == 1 else f"{len(lines)} wrong keys"
     return RecipeError(f"{name} has {keys}: {'; '.join(lines)}. Fix them all")
 
 
-def argument_fault(value: Any, hint: Any) -> str:
+def find_argument_fault(value: Any, hint: Any) -> str:
     """Return the fault of a value for an argument of this annotation, or an empty text."""
     try:
-        argument(value, hint)
+        to_argument(value, hint)
     except ValidationError as e:
         return "; ".join(d["msg"].lower() for d in e.errors())
     return ""
 
 
-def argument(value: Any, hint: Any) -> Any:
+def to_argument(value: Any, hint: Any) -> Any:
     """Convert a TOML value to an argument of this annotation.
 
     Raises
@@ -188,13 +188,13 @@ def argument(value: Any, hint: Any) -> Any:
     return TypeAdapter(hint).validate_json(json.dumps(value, default=str), strict=True)
 
 
-def plain(values: Any) -> Any:
+def to_json_values(values: Any) -> Any:
     """Convert settings to JSON values."""
     return json.loads(json.dumps(values, default=str))
 
 
 @cache
-def _model(schema: type[Any]) -> type[BaseModel]:
+def _build_model(schema: type[Any]) -> type[BaseModel]:
     hints = get_type_hints(schema)
     required = {f.name for f in fields(schema) if f.default is f.default_factory is MISSING}
     keys = {n: (t, ... if n in required else None) for n, t in hints.items()}
@@ -206,26 +206,26 @@ def _model(schema: type[Any]) -> type[BaseModel]:
     return model
 
 
-def _validated(keys: Mapping[str, Any], schema: type[Any]) -> dict[str, Any]:
+def _validate_keys(keys: Mapping[str, Any], schema: type[Any]) -> dict[str, Any]:
     # JSON, because pydantic's strict mode accepts lists as tuples and text as paths only there.
-    model = _model(schema)  # type: ignore[arg-type] # a class has a hash
+    model = _build_model(schema)  # type: ignore[arg-type] # a class has a hash
     made = model.model_validate_json(json.dumps(keys, default=str))
     return {name: getattr(made, name) for name in keys}
 
 
-def faults(keys: Any, schema: type[Any]) -> list[str]:
+def find_faults(keys: Any, schema: type[Any]) -> list[str]:
     """List the faults in keys of a settings dataclass, one line each."""
     try:
-        values = _validated(keys, schema)
+        values = _validate_keys(keys, schema)
         schema(**values)
     except ValidationError as e:
-        return [f"{'.'.join(map(str, d['loc']))}: {_said(d['msg'])}" for d in e.errors()]
+        return [f"{'.'.join(map(str, d['loc']))}: {_plain_message(d['msg'])}" for d in e.errors()]
     except ValueError as e:
         return [str(e)]
-    return list(_out_of_range(values, schema))
+    return list(_iter_range_faults(values, schema))
 
 
-def _out_of_range(values: Mapping[str, Any], schema: type[Any]) -> Iterator[str]:
+def _iter_range_faults(values: Mapping[str, Any], schema: type[Any]) -> Iterator[str]:
     """Yield faults that a dataclass's command-line validators find."""
     hints = get_type_hints(schema, include_extras=True)
     for name, value in values.items():
@@ -237,10 +237,10 @@ def _out_of_range(values: Mapping[str, Any], schema: type[Any]) -> Iterator[str]
                     yield f"{name}: {str(e)[:1].lower()}{str(e)[1:].rstrip('.')}"
 
 
-def _said(message: str) -> str:
+def _plain_message(message: str) -> str:
     """Convert a pydantic message to plain words."""
     return message.removeprefix("Value error, ") if "Value error" in message else message.lower()
 
 
-def _instance(keys: Mapping[str, Any], schema: type[Settings]) -> Settings:
-    return schema(**_validated(keys, schema))
+def _create_instance(keys: Mapping[str, Any], schema: type[Settings]) -> Settings:
+    return schema(**_validate_keys(keys, schema))

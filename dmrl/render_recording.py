@@ -11,32 +11,32 @@ from typing import Any, NamedTuple
 
 from dmrl import recipe as recipes
 from dmrl import topics
-from dmrl.atomic_output import partial_file, refuse_existing
-from dmrl.datasets.backgrounds import photos_of
+from dmrl.atomic_output import atomic_file, refuse_existing
+from dmrl.datasets.backgrounds import open_backgrounds
 from dmrl.errors import OutputError, RecipeError
-from dmrl.geometry.camera_file import KNOWN, camera_named
+from dmrl.geometry.camera_file import NAMED_CAMERAS, find_camera
 from dmrl.geometry.frames import Camera
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import (
     LICENCES_METADATA,
     SPLIT_METADATA,
     Provenance,
     RecordingWriter,
-    columns,
-    interrupted,
-    licence_beside,
-    licence_words,
-    provenance,
+    build_provenance,
+    extract_licence_title,
+    find_licence_file,
+    iter_columns,
+    recover_interrupted,
 )
 from dmrl.rendering.backgrounds.rooms import ROOMS
-from dmrl.rendering.blender_environment import ensure
-from dmrl.rendering.camera.distortion import canvas_of
-from dmrl.rendering.image_messages import ROBOT, samples
-from dmrl.rendering.randomise import Drawn, World, draw_scene
-from dmrl.rendering.renderer import Model, Renderer, Scene, panoramas_in
+from dmrl.rendering.blender_environment import ensure_environment
+from dmrl.rendering.camera.distortion import pinhole_canvas
+from dmrl.rendering.image_messages import OBSERVER, build_samples
+from dmrl.rendering.randomise import RandomScene, SceneSource, draw_scene
+from dmrl.rendering.renderer import Renderer, RobotModel, Scene, list_panoramas
 from dmrl.rendering.robots.robot_models import DESIGNS
 from dmrl.rendering.settings import Settings, filled
-from dmrl.samples.sample import Sample, calibration, intervals
+from dmrl.samples.sample import Sample, build_calibration, find_intervals
 from dmrl.terminal.progress import say, track
 
 PREVIEW_SAMPLES = 64
@@ -85,50 +85,56 @@ def read_render_camera(settings: Settings) -> Camera:
     SettingError
         If its lens does not fill the image.
     """
-    camera = camera_named(settings.camera)
+    camera = find_camera(settings.camera)
     distortion = camera.distortion if settings.distorted else ()
     camera = replace(camera, distortion=distortion, mount_rad=(0.0, 0.0, 0.0), delay_s=0.0)
-    canvas_of(camera)  # an error comes now rather than after the first image
+    pinhole_canvas(camera)  # an error comes now rather than after the first image
     return camera
 
 
 def render_recording(out: Path, settings: Settings, *, resume: bool = False) -> Rendered:
     """Render and write the recording ``out``, as images arrive; see ``dmrl.stages.render.run``."""
     refuse_existing(out)
-    before = interrupted(out, resume=resume, pictured=True)
+    before = recover_interrupted(out, resume=resume, has_images=True)
     camera = read_render_camera(settings)
-    photos = None if settings.backgrounds is None else photos_of(settings.backgrounds)
+    photos = None if settings.backgrounds is None else open_backgrounds(settings.backgrounds)
     with ExitStack() as stack:
         renderer = stack.enter_context(_open_renderer(settings))
         made = _describe(settings, renderer.version)
-        before.check(made)
+        before.check_provenance(made)
         sink = stack.enter_context(RecordingWriter(out, made, keep_on_error=True))
         sink.add_metadata(SPLIT_METADATA, _assign_splits(settings))
         if beside := _read_licences(settings):
             sink.add_metadata(LICENCES_METADATA, beside)
-        done = before.copy(sink)
-        world = World(
+        done = before.copy_into(sink)
+        world = SceneSource(
             settings,
             camera,
             renderer.radius_m,
             tuple(renderer.lights),
-            cache(renderer.panorama),
+            cache(renderer.load_panorama),
             photos,
             DESIGNS[settings.design],
         )
         _write_images(world, renderer, sink, done)
-    before.forget()
+    before.delete_file()
     broken = photos.broken if photos is not None else 0
     return Rendered(settings.images, *_count_labels(out), broken, done)
 
 
 def _open_renderer(settings: Settings) -> Renderer:
     """Start Blender with the settings' robot and panoramas."""
-    lights = None if settings.lights is None else panoramas_in(settings.lights)
+    lights = None if settings.lights is None else list_panoramas(settings.lights)
     design = DESIGNS[settings.design]
-    model = Model(settings.model, settings.scale, settings.model_up, settings.model_centre, design)
+    model = RobotModel(
+        settings.model, settings.scale, settings.model_up, settings.model_centre, design
+    )
     return Renderer(
-        ensure(say), model, lights=lights, workers=settings.workers, samples=settings.samples
+        ensure_environment(say),
+        model,
+        lights=lights,
+        workers=settings.workers,
+        samples=settings.samples,
     )
 
 
@@ -161,11 +167,11 @@ def preview_robot(out: Path, settings: Settings) -> dict[str, float]:
     refuse_existing(out)
     if out.suffix.lower() != ".png":
         raise OutputError(f"{out} is not named .png. With --preview OUT is a picture: NAME.png")
-    from dmrl.rendering.robot_preview import preview  # noqa: PLC0415 - an extra
+    from dmrl.rendering.robot_preview import render_preview  # noqa: PLC0415 - an extra
 
     with _open_renderer(replace(settings, workers=1, samples=PREVIEW_SAMPLES)) as renderer:
-        seen = preview(renderer, settings, read_render_camera(settings))
-    with partial_file(out) as partial:
+        seen = render_preview(renderer, settings, read_render_camera(settings))
+    with atomic_file(out) as partial:
         partial.write_bytes(seen.png)
     sizes = {f"{axis}_m": round(size, 4) for axis, size in zip("xyz", seen.size_m, strict=True)}
     return {**sizes, "px_wide_at_1_m": round(seen.px_wide_at_1_m, 1)}
@@ -175,7 +181,7 @@ def _count_labels(out: Path) -> tuple[int, int]:
     """Return the number of labels, and of images without, of a recording."""
     numbers = [
         len(peers)
-        for batch in columns(out, topics.labels(ROBOT), fields=["peers"])
+        for batch in iter_columns(out, topics.LABELS(OBSERVER), fields=["peers"])
         for peers in batch["peers"].to_pylist()
     ]
     return sum(numbers), numbers.count(0)
@@ -184,10 +190,12 @@ def _count_labels(out: Path) -> tuple[int, int]:
 def _describe(settings: Settings, blender: str) -> Provenance:
     """Return the provenance; the number of workers changes nothing, so it is left out."""
     inputs = _list_sources(settings)
-    if str(settings.camera) not in KNOWN:
+    if str(settings.camera) not in NAMED_CAMERAS:
         inputs.append(settings.camera)
     plain = replace(settings, workers=0)
-    made = provenance("render", plain, inputs, seed=settings.seed, libraries=("numpy", "pillow"))
+    made = build_provenance(
+        "render", plain, inputs, seed=settings.seed, libraries=("numpy", "pillow")
+    )
     return replace(made, libraries={**made.libraries, "blender": blender})
 
 
@@ -199,14 +207,14 @@ def _list_sources(settings: Settings) -> list[Path]:
 
 def _read_licences(settings: Settings) -> dict[str, str]:
     """Read the licences beside photos, panoramas and model: they hold for the images too."""
-    found = {path.name: licence_beside(path) for path in _list_sources(settings)}
-    return {name: licence_words(path) for name, path in found.items() if path is not None}
+    found = {path.name: find_licence_file(path) for path in _list_sources(settings)}
+    return {name: extract_licence_title(path) for name, path in found.items() if path is not None}
 
 
 def _assign_splits(settings: Settings) -> dict[str, str]:
     first_test = settings.images - round(settings.images * settings.test_share)
     times = (_time_ns(settings, k) for k in range(settings.images))
-    found = intervals((t, "test" if k >= first_test else "train") for k, t in enumerate(times))
+    found = find_intervals((t, "test" if k >= first_test else "train") for k, t in enumerate(times))
     return {name: json.dumps(parts) for name, parts in found.items()}
 
 
@@ -214,23 +222,23 @@ def _time_ns(settings: Settings, index: int) -> int:
     return round(index * 1e9 / settings.rate_hz)
 
 
-def _write_images(world: World, renderer: Renderer, sink: RecordingWriter, done: int) -> None:
+def _write_images(world: SceneSource, renderer: Renderer, sink: RecordingWriter, done: int) -> None:
     """Write every image from number ``done`` on, in order, as it arrives."""
     settings, camera = world.settings, world.camera
     if not done:
-        _write(sink, calibration(0, ROBOT, camera))
-    drawn: deque[Drawn] = deque()
+        _write(sink, build_calibration(0, OBSERVER, camera))
+    drawn: deque[RandomScene] = deque()
 
     def scenes() -> Iterator[Scene]:
         for index in range(done, settings.images):
             drawn.append(draw_scene(world, index))
             yield camera, drawn[-1].robots, drawn[-1].look
 
-    shots = track(renderer.shots(scenes()), "Rendering", settings.images - done)
+    shots = track(renderer.render_shots(scenes()), "Rendering", settings.images - done)
     for index, shot in enumerate(shots, done):
-        for sample in samples(_time_ns(settings, index), settings, drawn.popleft(), shot):
+        for sample in build_samples(_time_ns(settings, index), settings, drawn.popleft(), shot):
             _write(sink, sample)
 
 
 def _write(sink: RecordingWriter, sample: Sample) -> None:
-    sink.write(sample.time_ns, sample.topic, message(sample.message)(**sample.fields))
+    sink.write(sample.time_ns, sample.topic, message_class(sample.message)(**sample.fields))

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
-from dmrl.guards.safe_names import topic_part
+from dmrl.guards.safe_names import check_topic_part
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class PlotSpec:
     """Plot of a sensor over time.
 
     Parameters
@@ -35,14 +35,14 @@ class Curve:
     length: bool = False
     name: str = ""
 
-    def lines(self, topic: str) -> dict[str, tuple[str, ...]]:
+    def list_lines(self, topic: str) -> dict[str, tuple[str, ...]]:
         """Return the path of each line of a topic in a view, and the fields that it shows."""
         if self.length or len(self.fields) == 1:
             return {topic: self.fields}
         return {f"{topic}/{field}": (field,) for field in self.fields}
 
 
-class Doubt(NamedTuple):
+class UnitCheck(NamedTuple):
     """Check for values in a wrong unit: a tenth of them is too large for a small robot.
 
     ``field`` of the message, in ``unit``; ``over`` is the largest plausible magnitude, and
@@ -92,16 +92,16 @@ class Topic:
     rate: str
     written_by: str
     sensor: bool = False
-    curve: Curve | None = None
+    curve: PlotSpec | None = None
     csv: tuple[str, ...] = ()
-    doubts: tuple[Doubt, ...] = ()
+    doubts: tuple[UnitCheck, ...] = ()
 
     @property
-    def of_pairs(self) -> bool:
+    def is_pairwise(self) -> bool:
         """Whether it describes a peer."""
         return "{peer}" in self.pattern
 
-    def carries(self, message: str) -> bool:
+    def accepts_message(self, message: str) -> bool:
         """Return whether a message of this full name may be on the topic."""
         if self.message.endswith("*"):
             return message.startswith(self.message[:-1])
@@ -115,7 +115,7 @@ class RobotTopic(str):
 
     def __call__(self, robot: str) -> str:
         """Return the topic of a robot."""
-        return filled(self, robot=robot)
+        return format_topic(self, robot=robot)
 
 
 class PairTopic(str):
@@ -125,7 +125,7 @@ class PairTopic(str):
 
     def __call__(self, robot: str, peer: str) -> str:
         """Return the topic of a robot and its peer."""
-        return filled(self, robot=robot, peer=peer)
+        return format_topic(self, robot=robot, peer=peer)
 
 
 class LogTopic(str):
@@ -135,7 +135,7 @@ class LogTopic(str):
 
     def __call__(self, robot: str, event: str) -> str:
         """Return the topic of a robot's log variables, as they were logged."""
-        return filled(self, robot=robot, event=event)
+        return format_topic(self, robot=robot, event=event)
 
 
 CAMERA_IMAGE = RobotTopic("/{robot}/camera/image")
@@ -193,9 +193,9 @@ TOPICS = (
         sensor=True,
         csv=("roll_rad", "pitch_rad", "yaw_rate_radps"),
         doubts=(
-            Doubt("roll_rad", 0.8, "rad", "degrees"),
-            Doubt("pitch_rad", 0.8, "rad", "degrees"),
-            Doubt("yaw_rate_radps", 5.0, "rad/s", "degrees per second"),
+            UnitCheck("roll_rad", 0.8, "rad", "degrees"),
+            UnitCheck("pitch_rad", 0.8, "rad", "degrees"),
+            UnitCheck("yaw_rate_radps", 5.0, "rad/s", "degrees per second"),
         ),
     ),
     Topic(
@@ -206,11 +206,11 @@ TOPICS = (
         "100 Hz",
         "convert, record, fly",
         sensor=True,
-        curve=Curve("speed, m/s", ("vx_mps", "vy_mps"), length=True),
+        curve=PlotSpec("speed, m/s", ("vx_mps", "vy_mps"), length=True),
         csv=("vx_mps", "vy_mps"),
         doubts=(
-            Doubt("vx_mps", 20.0, "m/s", "mm/s or cm/s"),
-            Doubt("vy_mps", 20.0, "m/s", "mm/s or cm/s"),
+            UnitCheck("vx_mps", 20.0, "m/s", "mm/s or cm/s"),
+            UnitCheck("vy_mps", 20.0, "m/s", "mm/s or cm/s"),
         ),
     ),
     Topic(
@@ -221,9 +221,9 @@ TOPICS = (
         "100 Hz",
         "convert, record, fly",
         sensor=True,
-        curve=Curve("height, m", ("height_m",)),
+        curve=PlotSpec("height, m", ("height_m",)),
         csv=("height_m",),
-        doubts=(Doubt("height_m", 30.0, "m", "mm or cm"),),
+        doubts=(UnitCheck("height_m", 30.0, "m", "mm or cm"),),
     ),
     Topic(
         RANGE,
@@ -233,9 +233,9 @@ TOPICS = (
         "50 Hz",
         "convert, record, fly",
         sensor=True,
-        curve=Curve("distance, m", ("range_m",), name="UWB"),
+        curve=PlotSpec("distance, m", ("range_m",), name="UWB"),
         csv=("range_m",),
-        doubts=(Doubt("range_m", 100.0, "m", "mm or cm"),),
+        doubts=(UnitCheck("range_m", 100.0, "m", "mm or cm"),),
     ),
     Topic(POSITION, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "20 Hz", "label"),
     Topic(
@@ -253,63 +253,43 @@ TOPICS = (
 )
 
 SENSORS = tuple(row for row in TOPICS if row.sensor)
-OWN_SENSORS = tuple(row for row in SENSORS if not row.of_pairs and row.pattern != CAMERA_IMAGE)
+OWN_SENSORS = tuple(row for row in SENSORS if not row.is_pairwise and row.pattern != CAMERA_IMAGE)
 """Sensors with which a robot measures itself."""
-PAIR_SENSORS = tuple(row for row in SENSORS if row.of_pairs)
+PAIR_SENSORS = tuple(row for row in SENSORS if row.is_pairwise)
 """Sensors with which a robot measures a peer."""
 
 
-def filled(pattern: str, **parts: str) -> str:
+def format_topic(pattern: str, **parts: str) -> str:
     """Fill a pattern. A part with a slash is rejected: it would change the topic and file name."""
-    return pattern.format(**{what: topic_part(name, what) for what, name in parts.items()})
-
-
-# Lower-case names of the patterns, for calls such as ``topics.height(robot)``.
-camera_image = CAMERA_IMAGE
-calibration = CALIBRATION
-attitude = ATTITUDE
-velocity = VELOCITY
-height = HEIGHT
-uwb_range = RANGE
-masks = MASKS
-depths = DEPTHS
-labels = LABELS
-detections = DETECTIONS
-grid = GRID
-tracks = TRACKS
-position = POSITION
-truth = TRUTH
-pose = POSE
-true_pose = TRUE_POSE
-log = LOG
+    return pattern.format(**{what: check_topic_part(name, what) for what, name in parts.items()})
 
 
 @cache
-def _expression(pattern: str) -> re.Pattern[str]:
+def _compile_pattern(pattern: str) -> re.Pattern[str]:
     return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(pattern)))
 
 
-def names(pattern: str, topic: str) -> dict[str, str] | None:
+def parse_topic(pattern: str, topic: str) -> dict[str, str] | None:
     """Return the values of a pattern's placeholders in a topic, or None if it does not match.
 
     Examples
     --------
-    >>> names(RANGE, "/cf1/range/cf2")
+    >>> parse_topic(RANGE, "/cf1/range/cf2")
     {'robot': 'cf1', 'peer': 'cf2'}
-    >>> names(RANGE, "/cf1/labels") is None
+    >>> parse_topic(RANGE, "/cf1/labels") is None
     True
     """
-    match = _expression(pattern).fullmatch(topic)
+    match = _compile_pattern(pattern).fullmatch(topic)
     return match.groupdict() if match else None
 
 
 @cache
-def row_of(topic: str) -> Topic | None:
+def find_topic(topic: str) -> Topic | None:
     """Return the table's row for a topic, or None for a topic that is not dmrl's."""
-    return next((row for row in TOPICS if names(row.pattern, topic) is not None), None)
+    return next((row for row in TOPICS if parse_topic(row.pattern, topic) is not None), None)
 
 
-def robots(topics: list[str] | tuple[str, ...], pattern: str = CAMERA_IMAGE) -> list[str]:
+def list_robots(topics: list[str] | tuple[str, ...], pattern: str = CAMERA_IMAGE) -> list[str]:
     """Return the robots that have a topic of this pattern, sorted."""
-    found = (names(pattern, topic) for topic in topics)
+    found = (parse_topic(pattern, topic) for topic in topics)
     return sorted({n["robot"] for n in found if n is not None})

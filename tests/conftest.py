@@ -46,7 +46,7 @@ def data() -> Path:
 @pytest.fixture(scope="session")
 def blender() -> Path:
     """Python of Blender's environment. Skips where it is not set up."""
-    python = blender_environment.python()
+    python = blender_environment.find_python()
     if python is None:
         pytest.skip("Blender is not set up; run: dmrl render --setup")
     return python

@@ -14,11 +14,11 @@ import pytest
 
 from dmrl.atomic_output import (
     as_output_error,
-    partial_file,
-    partial_folder,
-    partial_of,
+    atomic_file,
+    atomic_folder,
     refuse_existing,
-    rewritten_file,
+    replace_file,
+    to_partial_path,
 )
 from dmrl.errors import OutputError
 
@@ -28,7 +28,7 @@ PATIENCE_S = 120.0
 
 def test_a_file_takes_its_name_when_the_block_ends(tmp_path: Path) -> None:
     out = tmp_path / "a.mcap"
-    with partial_file(out) as partial:
+    with atomic_file(out) as partial:
         partial.write_text("whole")
         assert partial == tmp_path / "a.mcap.partial"
         assert not out.exists()
@@ -37,7 +37,7 @@ def test_a_file_takes_its_name_when_the_block_ends(tmp_path: Path) -> None:
 
 
 def test_a_failing_block_leaves_no_file(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), partial_file(tmp_path / "a") as partial:
+    with pytest.raises(ZeroDivisionError), atomic_file(tmp_path / "a") as partial:
         partial.write_text("half")
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
@@ -45,7 +45,7 @@ def test_a_failing_block_leaves_no_file(tmp_path: Path) -> None:
 
 def test_a_folder_takes_its_name_when_the_block_ends(tmp_path: Path) -> None:
     out = tmp_path / "set"
-    with partial_folder(out) as partial:
+    with atomic_folder(out) as partial:
         (partial / "a").write_text("whole")
         assert not out.exists()
     assert (out / "a").read_text() == "whole"
@@ -53,7 +53,7 @@ def test_a_folder_takes_its_name_when_the_block_ends(tmp_path: Path) -> None:
 
 
 def test_a_failing_block_leaves_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), partial_folder(tmp_path / "set") as partial:
+    with pytest.raises(KeyboardInterrupt), atomic_folder(tmp_path / "set") as partial:
         (partial / "a").write_text("half")
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
@@ -61,20 +61,20 @@ def test_a_failing_block_leaves_no_folder(tmp_path: Path) -> None:
 
 def test_work_that_can_be_resumed_is_kept_and_found_again(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    with pytest.raises(KeyboardInterrupt), partial_folder(out, keep_on_error=True) as partial:
+    with pytest.raises(KeyboardInterrupt), atomic_folder(out, keep_on_error=True) as partial:
         (partial / "epoch").write_text("3")
         raise KeyboardInterrupt
     assert not out.exists()
-    with partial_folder(out, keep_on_error=True, resume=True) as partial:
+    with atomic_folder(out, keep_on_error=True, resume=True) as partial:
         assert (partial / "epoch").read_text() == "3"
     assert (out / "epoch").read_text() == "3"
 
 
 def test_a_partial_folder_of_a_killed_run_is_cleared(tmp_path: Path) -> None:
     out = tmp_path / "set"
-    partial_of(out).mkdir()
-    (partial_of(out) / "stale").write_text("")
-    with partial_folder(out):
+    to_partial_path(out).mkdir()
+    (to_partial_path(out) / "stale").write_text("")
+    with atomic_folder(out):
         pass
     assert list(out.iterdir()) == []
 
@@ -88,7 +88,7 @@ def test_what_is_there_is_never_overwritten(tmp_path: Path, kind: str) -> None:
         "dangling link": lambda: out.symlink_to("nowhere"),
     }
     make[kind]()
-    for writer in (partial_file, partial_folder):
+    for writer in (atomic_file, atomic_folder):
         with pytest.raises(OutputError, match="never overwritten; remove it"), writer(out):
             pytest.fail("the block ran")
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
@@ -113,7 +113,7 @@ def test_refused_writes_are_one_line_with_the_way_out(code: int, words: str) -> 
     assert "\n" not in text
 
 
-@pytest.mark.parametrize("writer", [partial_file, partial_folder])
+@pytest.mark.parametrize("writer", [atomic_file, atomic_folder])
 def test_a_full_disk_is_an_output_error_and_leaves_nothing(writer: object, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="no space left"), writer(tmp_path / "a"):  # type: ignore[operator]
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -121,15 +121,15 @@ def test_a_full_disk_is_an_output_error_and_leaves_nothing(writer: object, tmp_p
 
 
 def test_errors_that_are_not_about_the_output_pass_unchanged(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="input"), partial_file(tmp_path / "a"):
+    with pytest.raises(FileNotFoundError, match="input"), atomic_file(tmp_path / "a"):
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), "input")
 
 
 def test_a_killed_process_leaves_only_the_partial_file(tmp_path: Path) -> None:
     code = (
         "import os, pathlib, signal, sys\n"
-        "from dmrl.atomic_output import partial_file\n"
-        "with partial_file(pathlib.Path(sys.argv[1])) as partial:\n"
+        "from dmrl.atomic_output import atomic_file\n"
+        "with atomic_file(pathlib.Path(sys.argv[1])) as partial:\n"
         "    partial.write_text('half')\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
@@ -145,7 +145,7 @@ WRITER = (
     "kind, out, word = sys.argv[1:]\n"
     "try:\n"
     "    with getattr(atomic_output, kind)(pathlib.Path(out)) as partial:\n"
-    "        inner = partial / 'a' if kind == 'partial_folder' else partial\n"
+    "        inner = partial / 'a' if kind == 'atomic_folder' else partial\n"
     "        inner.write_text(word)\n"
     "        print('begun', flush=True); sys.stdin.read()\n"
     "        inner.write_text(word * 2)\n"
@@ -169,7 +169,7 @@ def _writing(kind: str, out: Path, word: str) -> Iterator[subprocess.Popen[str]]
             process.kill()
 
 
-KINDS = pytest.mark.parametrize("kind", ["partial_file", "partial_folder"])
+KINDS = pytest.mark.parametrize("kind", ["atomic_file", "atomic_folder"])
 
 
 @KINDS
@@ -184,7 +184,7 @@ def test_a_second_writer_gets_one_line_and_the_first_its_output(
         if stopped:
             first.send_signal(signal.SIGSTOP)
         words = f"out is being written by another dmrl, process {first.pid}"
-        for writer in (partial_file, partial_folder):
+        for writer in (atomic_file, atomic_folder):
             with pytest.raises(OutputError, match=words), writer(out):
                 pytest.fail("the block ran")
         with pytest.raises(OutputError, match=words):
@@ -192,7 +192,7 @@ def test_a_second_writer_gets_one_line_and_the_first_its_output(
         first.send_signal(signal.SIGCONT)
         first.communicate("", timeout=PATIENCE_S)
         assert first.returncode == 0
-    inner = out / "a" if kind == "partial_folder" else out
+    inner = out / "a" if kind == "atomic_folder" else out
     assert inner.read_text() == "minemine"
     assert list(tmp_path.iterdir()) == [out]
 
@@ -211,7 +211,7 @@ def test_of_many_writers_one_wins_and_its_output_is_whole(kind: str, tmp_path: P
     said = [process.communicate(timeout=PATIENCE_S)[1] for process in started]
     won = [k for k, process in enumerate(started) if process.returncode == 0]
     assert len(won) == 1
-    inner = out / "a" if kind == "partial_folder" else out
+    inner = out / "a" if kind == "atomic_folder" else out
     assert inner.read_text() == words[won[0]] * 2
     assert list(tmp_path.iterdir()) == [out]
     lost = [text for k, text in enumerate(said) if k not in won]
@@ -235,27 +235,27 @@ def test_what_a_killed_writer_leaves_is_in_nobody_s_way(kind: str, tmp_path: Pat
 
 
 def test_what_is_left_over_is_not_emptied_under_another_name(tmp_path: Path) -> None:
-    partial_of(tmp_path / "a").write_text("whole, killed between its two names")
-    (tmp_path / "b").hardlink_to(partial_of(tmp_path / "a"))
-    with partial_file(tmp_path / "a") as partial:
+    to_partial_path(tmp_path / "a").write_text("whole, killed between its two names")
+    (tmp_path / "b").hardlink_to(to_partial_path(tmp_path / "a"))
+    with atomic_file(tmp_path / "a") as partial:
         partial.write_text("new")
     assert (tmp_path / "b").read_text().startswith("whole")
 
 
-@pytest.mark.parametrize("writer", [partial_file, rewritten_file])
+@pytest.mark.parametrize("writer", [atomic_file, replace_file])
 def test_a_link_in_place_of_the_partial_file_is_not_followed(
     writer: object, tmp_path: Path
 ) -> None:
     victim = tmp_path / "victim"
     victim.write_text("precious")
-    partial_of(tmp_path / "a").symlink_to(victim)
+    to_partial_path(tmp_path / "a").symlink_to(victim)
     with pytest.raises(OutputError, match="symbolic link"), writer(tmp_path / "a"):  # type: ignore[operator]
         pytest.fail("the block ran")
     assert victim.read_text() == "precious"
 
 
 def test_what_comes_between_is_not_replaced_and_the_work_is_kept(tmp_path: Path) -> None:
-    for writer in (partial_file, partial_folder):
+    for writer in (atomic_file, atomic_folder):
         out = tmp_path / writer.__name__
         with pytest.raises(OutputError, match="created by another program"), writer(out) as partial:
             if partial.is_dir():
@@ -265,10 +265,10 @@ def test_what_comes_between_is_not_replaced_and_the_work_is_kept(tmp_path: Path)
                 partial.write_text("mine")
                 out.write_text("theirs")
         assert partial.exists()
-    assert (tmp_path / "partial_file").read_text() == "theirs"
+    assert (tmp_path / "atomic_file").read_text() == "theirs"
 
 
-@pytest.mark.parametrize("writer", [partial_file, partial_folder])
+@pytest.mark.parametrize("writer", [atomic_file, atomic_folder])
 def test_a_read_only_disk_is_one_error(
     writer: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -288,7 +288,7 @@ def test_everything_is_on_the_disk_before_it_has_its_name(
     monkeypatch.setattr(
         os, "fsync", lambda fd: seen.append((Path(f"/proc/self/fd/{fd}").readlink(), out.exists()))
     )
-    with partial_folder(out) as partial:
+    with atomic_folder(out) as partial:
         (partial / "inner").mkdir()
         (partial / "inner" / "a").write_text("x")
     names = [(str(name.relative_to(tmp_path)), stood) for name, stood in seen]
@@ -300,7 +300,7 @@ def test_everything_is_on_the_disk_before_it_has_its_name(
     ]
 
 
-@pytest.mark.parametrize("writer", [partial_file, partial_folder])
+@pytest.mark.parametrize("writer", [atomic_file, atomic_folder])
 def test_a_disk_that_fails_to_sync_leaves_nothing(
     writer: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -331,7 +331,7 @@ def test_a_folder_that_cannot_be_opened_is_not_left_behind(
         return real(path, flags, *rest)
 
     monkeypatch.setattr(os, "open", refused)
-    with pytest.raises(OutputError, match="cannot write"), partial_folder(tmp_path / "set"):
+    with pytest.raises(OutputError, match="cannot write"), atomic_folder(tmp_path / "set"):
         pass
     assert list(tmp_path.iterdir()) == []
 
@@ -345,6 +345,6 @@ def test_a_name_too_long_is_said_before_any_work(tmp_path: Path) -> None:
 
 def test_a_folder_removed_while_it_is_written_is_said(tmp_path: Path) -> None:
     gone = pytest.raises(OutputError, match="was removed while it was written")
-    with gone, partial_folder(tmp_path / "set") as partial:
+    with gone, atomic_folder(tmp_path / "set") as partial:
         partial.rmdir()
         (partial / "a").write_text("x")

@@ -110,10 +110,10 @@ def test_a_signal_says_that_nothing_has_its_final_name(
 def test_what_is_whole_when_a_signal_comes_is_said(tmp_path: Path) -> None:
     code = (
         "import os, sys, signal; from pathlib import Path\n"
-        "from dmrl import boundary; from dmrl.atomic_output import partial_file\n"
+        "from dmrl import boundary; from dmrl.atomic_output import atomic_file\n"
         "def work():\n"
         "    for name in 'ab':\n"
-        "        with partial_file(Path(name)) as partial:\n"
+        "        with atomic_file(Path(name)) as partial:\n"
         "            partial.write_text('x')\n"
         "            if name == 'b': os.kill(os.getpid(), signal.SIGTERM)\n"
         "boundary.install_signal_handlers(); sys.exit(boundary.run_to_status(work))\n"

@@ -18,7 +18,7 @@ from rich.console import Console
 from dmrl import __version__, atomic_output, cli
 from dmrl.cli import COMMANDS, app
 from dmrl.errors import DmrlError, StorageError
-from dmrl.guards.safe_names import without_middle
+from dmrl.guards.safe_names import truncate_middle
 
 HEAVY = {
     *("bpy", "datasets", "h5py", "matplotlib", "mcap", "numpy", "pandas", "PIL", "pyarrow"),
@@ -227,10 +227,10 @@ def test_a_flag_that_wants_a_robot_says_so(tmp_path: Path) -> None:
 
 def test_a_line_that_is_far_too_long_keeps_its_file_and_its_way_out() -> None:
     line = f"flight.mcap has {'far ' * 500}too much. Try: dmrl trim"
-    short = without_middle(line)
+    short = truncate_middle(line)
     assert len(short) < 500
     assert short.startswith("flight.mcap has") and short.endswith("Try: dmrl trim")
-    assert without_middle("short") == "short"
+    assert truncate_middle("short") == "short"
 
 
 def _end_with(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> object:
@@ -246,7 +246,7 @@ def _end_with(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> object:
 def test_ctrl_c_ends_with_one_line_and_status_130(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(atomic_output, "_begun", [])
+    monkeypatch.setattr(atomic_output, "_started_outputs", [])
     assert _end_with(KeyboardInterrupt(), monkeypatch) == 130
     assert capsys.readouterr().err.count("\n") == 1
 
@@ -257,7 +257,7 @@ def test_ctrl_c_ends_so_where_an_output_s_storage_does_not_answer(
     def standing() -> list[Path]:
         raise StorageError("s3://lab/out: nobody answers")
 
-    monkeypatch.setattr(atomic_output, "standing", standing)
+    monkeypatch.setattr(atomic_output, "list_finished_outputs", standing)
     assert _end_with(KeyboardInterrupt(), monkeypatch) == 130
     said = "dmrl: stopped. What has its final name is not known: s3://lab/out: nobody answers\n"
     assert capsys.readouterr().err == said

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from dmrl import atomic_output
-from dmrl.atomic_output import partial_file, partial_folder, partial_of
+from dmrl.atomic_output import atomic_file, atomic_folder, to_partial_path
 from dmrl.errors import OutputError
 
 
@@ -24,7 +24,7 @@ def test_who_comes_just_after_another_leaves_nothing(
         return held
 
     monkeypatch.setattr(atomic_output, f"take_{kind}", taken_late)
-    write: Callable[..., object] = partial_file if kind == "file" else partial_folder
+    write: Callable[..., object] = atomic_file if kind == "file" else atomic_folder
     with pytest.raises(OutputError, match="exists"), write(out, keep_on_error=keep):  # type: ignore[attr-defined]
         raise AssertionError
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
@@ -34,14 +34,14 @@ def test_work_that_can_be_resumed_is_not_taken_away_by_who_comes_late(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, take = tmp_path / "out", atomic_output.take_folder
-    partial_of(out).mkdir()
-    (partial_of(out) / "epochs").write_text("a night")
+    to_partial_path(out).mkdir()
+    (to_partial_path(out) / "epochs").write_text("a night")
     monkeypatch.setattr(
         atomic_output, "take_folder", lambda partial: (out.touch(), take(partial))[1]
     )
     with (
         pytest.raises(OutputError, match="exists"),
-        partial_folder(out, keep_on_error=True, resume=True),
+        atomic_folder(out, keep_on_error=True, resume=True),
     ):
         raise AssertionError
-    assert (partial_of(out) / "epochs").read_text() == "a night"
+    assert (to_partial_path(out) / "epochs").read_text() == "a night"

@@ -13,7 +13,14 @@ from pathlib import Path
 import dmrl
 
 SOURCE = Path(dmrl.__file__).parent
-CHECKED = {"inside", "file_name", "split_name", "file_of_topic", "c_name", "shard_path"}
+CHECKED = {
+    "safe_join",
+    "check_file_name",
+    "check_split_name",
+    "to_topic_file_name",
+    "c_name",
+    "shard_path",
+}
 """Functions that give a name which can be that of a file, or a path that is made of one."""
 METHODS = {"resolve", "absolute", "expanduser", "with_name", "with_suffix", "relative_to"}
 CHECKED_BEFORE = "checked just before"
@@ -23,7 +30,7 @@ GIVEN = "a path of the user's, with an ending of ours"
 READ = "only read: names of files beside each other"
 REASONS = {
     "api/stages.py: f'{stage}.mcap'": OURS,
-    "guards/safe_names.py: file_name(name, what) + suffix": CHECKED_BEFORE,
+    "guards/safe_names.py: check_file_name(name, what) + suffix": CHECKED_BEFORE,
     "datasets/layout.py: f'data-{number}.arrow'": OURS,
     "datasets/layout.py: f'{split}-{number}.parquet'": CHECKED_BEFORE,
     "datasets/layout.py: split": CHECKED_BEFORE,
@@ -50,7 +57,7 @@ REASONS = {
     "learn/pretrained/__init__.py: model": LISTED,
     "atomic_output.py: file": "what we wrote ourselves just now",
     "atomic_output.py: last": OURS,
-    "atomic_output.py: path.name + SUFFIX": GIVEN,
+    "atomic_output.py: path.name + PARTIAL_SUFFIX": GIVEN,
     "html_report/collect.py: name": LISTED,
     "html_report/report_sections.py: name": LISTED,
     "html_report/recipe_figures.py: name": "only read, and nothing outside the folder",
@@ -149,7 +156,7 @@ class Paths:
                 elif isinstance(node, ast.withitem) and isinstance(node.optional_vars, ast.Name):
                     call = node.context_expr
                     made = isinstance(call, ast.Call) and ast.unparse(call.func).split(".")[-1]
-                    if made in ("partial_file", "partial_folder", "rewritten_file"):
+                    if made in ("atomic_file", "atomic_folder", "replace_file"):
                         found.add(node.optional_vars.id)
         return found
 

@@ -13,10 +13,10 @@ import pytest
 
 from dmrl import plugins
 from dmrl.errors import PluginError, SettingError, SourceError
-from dmrl.formats.registry import format_of
+from dmrl.formats.registry import find_format
 from dmrl.learn.inference.loaded_model import Model, load_model, save_model
-from dmrl.learn.networks.architectures import architecture_names, build
-from dmrl.recording import read_table, summary
+from dmrl.learn.networks.architectures import build_network, list_architectures
+from dmrl.recording import read_summary, read_table
 from dmrl.stages import convert
 
 Install = Callable[..., None]
@@ -30,7 +30,7 @@ FORMAT = """
 
     def content(source, options):
         rows = [line.split() for line in source.read_text().splitlines()]
-        topic = topics.height(options.robot)
+        topic = topics.HEIGHT(options.robot)
         return Content(
             Sample(int(time_ns), topic, "Height", {"height_m": float(high)})
             for time_ns, high in rows
@@ -116,7 +116,7 @@ def test_a_format_of_another_package_is_converted_from(
     source.write_text("1000 0.5\n2000 0.75\n")
     convert.run(source, out, convert.Settings(source_kind=kind))
     assert read_table(out, "/cf1/height")["height_m"].to_pylist() == [0.5, 0.75]
-    assert summary(out).topics["/cf1/height"].schema == "dmrl.v1.Height"
+    assert read_summary(out).topics["/cf1/height"].schema == "dmrl.v1.Height"
 
 
 def test_names_of_plugins_are_offered_and_none_is_imported_before(
@@ -125,7 +125,7 @@ def test_names_of_plugins_are_offered_and_none_is_imported_before(
     install("alt-logs", "raise AssertionError('imported')", formats="altitudes = alt_logs:FORMAT")
     (tmp_path / "flight.bin").write_bytes(b"\0\1")
     with pytest.raises(SourceError, match=r"Did you mean altitudes.* Formats: .*images, altitudes"):
-        format_of(tmp_path / "flight.bin", "altitude")
+        find_format(tmp_path / "flight.bin", "altitude")
     assert "alt_logs" not in sys.modules
 
 
@@ -134,8 +134,8 @@ def test_dmrls_own_names_stay_dmrls(install: Install, tmp_path: Path) -> None:
         "alt-logs", FORMAT, formats="csv = alt_logs:FORMAT", networks="locanet = alt_logs:FORMAT"
     )
     (tmp_path / "flight.alt").touch()
-    assert format_of(tmp_path, "csv").what == "a folder of flight logs"
-    assert type(build("locanet")).__name__ == "LocaNet"
+    assert find_format(tmp_path, "csv").what == "a folder of flight logs"
+    assert type(build_network("locanet")).__name__ == "LocaNet"
 
 
 @pytest.mark.parametrize(
@@ -157,10 +157,10 @@ def test_a_broken_format_is_said_and_passed_over(
     source = tmp_path / "flight.alt"
     source.write_text("1 1\n")
     with pytest.raises(PluginError, match=f"of the package alt-logs, {said}.*uninstall alt-logs"):
-        form = format_of(source, "altitudes")
+        form = find_format(source, "altitudes")
         form.recognises(source)
     with pytest.raises(SourceError, match="matches no known format"):
-        format_of(source)
+        find_format(source)
     (line,) = capsys.readouterr().err.splitlines()
     assert "of the package alt-logs" in line
 
@@ -184,8 +184,8 @@ def test_a_network_of_another_package_is_built_saved_and_loaded(
     install: Install, tmp_path: Path
 ) -> None:
     install("tiny-nets", NETWORK, networks="tiny = tiny_nets:Tiny")
-    assert "tiny" in architecture_names()
-    network = build("tiny", seed=3)
+    assert "tiny" in list_architectures()
+    network = build_network("tiny", seed=3)
     (tmp_path / "model").mkdir()
     save_model(Model(network.eval(), "tiny"), tmp_path / "model")
     loaded = load_model(tmp_path / "model")
@@ -206,10 +206,10 @@ def test_a_broken_network_is_one_line_and_others_are_built(
 ) -> None:
     install("tiny-nets", text, networks="tiny = tiny_nets:Tiny")
     with pytest.raises(PluginError, match=f"of the package tiny-nets, {said}"):
-        build("tiny")
-    assert build("locanet")
+        build_network("tiny")
+    assert build_network("locanet")
     with pytest.raises(SettingError, match=r"no architecture tin. Choose one of: .*tiny"):
-        build("tin")
+        build_network("tin")
 
 
 @pytest.mark.heavy

@@ -147,9 +147,9 @@ def test_a_file_too_long_for_a_recipe_is_not_read_to_its_end(tmp_path: Path) -> 
         recipe.read(path)
 
 
-@pytest.mark.parametrize("name", recipe.names() + recipe.pretrained_names())
+@pytest.mark.parametrize("name", recipe.list_names() + recipe.pretrained_names())
 def test_shipped_recipes_start_with_what_they_do_and_the_command(name: str) -> None:
-    head = recipe.text(name).partition("\n\n")[0].splitlines()
+    head = recipe.read_text(name).partition("\n\n")[0].splitlines()
     assert all(line.startswith("# ") for line in head)
     sentence = " ".join(line for line in head if not line.startswith("# dmrl "))
     assert sentence.endswith(".")
@@ -159,15 +159,17 @@ def test_shipped_recipes_start_with_what_they_do_and_the_command(name: str) -> N
 
 
 def test_shipped_recipes_are_those_of_the_folder() -> None:
-    assert recipe.names() == sorted(path.stem for path in RECIPES.glob("*.toml"))
+    assert recipe.list_names() == sorted(path.stem for path in RECIPES.glob("*.toml"))
     trained = sorted(path.stem for path in RECIPES.glob("pretrained/*.toml"))
     assert recipe.pretrained_names() == trained
-    assert not set(trained) & set(recipe.names())
+    assert not set(trained) & set(recipe.list_names())
 
 
 def test_recipes_of_the_shipped_networks_are_found_by_name_and_listed_apart() -> None:
     path = RECIPES / "pretrained/nano_clean.toml"
-    assert recipe.text("nano_clean") == recipe.text(path) == path.read_text(encoding="utf-8")
+    assert (
+        recipe.read_text("nano_clean") == recipe.read_text(path) == path.read_text(encoding="utf-8")
+    )
     with pytest.raises(RecipeError, match=r"no recipe nano_claen\. Did you mean nano_clean\?"):
         recipe.read("nano_claen")
     with pytest.raises(RecipeError, match=r"week; those of the shipped networks: nano_clean, "):

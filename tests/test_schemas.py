@@ -7,7 +7,7 @@ import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from dmrl import messages
-from dmrl.messages import descriptor, message, schema_bytes
+from dmrl.messages import find_descriptor, message_class, serialize_schema
 
 SCHEMAS = Path(__file__).parents[1] / "schemas"
 PROTOS = sorted(SCHEMAS.glob("dmrl/v1/*.proto"))
@@ -35,12 +35,12 @@ def test_the_descriptor_set_is_fresh() -> None:
 
 @pytest.mark.parametrize("name", CONTRACT)
 def test_contract_fields_are_there(name: str) -> None:
-    full = descriptor(f"dmrl.v1.{name}")
+    full = find_descriptor(f"dmrl.v1.{name}")
     assert set(CONTRACT[name].split()) <= {field.name for field in full.fields}
 
 
 def test_status_values_are_those_of_the_schema() -> None:
-    enum = descriptor("PeerLabel").fields_by_name["status"].enum_type
+    enum = find_descriptor("PeerLabel").fields_by_name["status"].enum_type
     values = {value.name: value.number for value in enum.values}
     assert values == {
         "OK": messages.STATUS_OK,
@@ -83,24 +83,24 @@ def test_a_file_is_named_after_its_last_message(path: Path) -> None:
 
 
 def test_short_names_mean_dmrl_first_and_foxglove_then() -> None:
-    assert descriptor("PeerLabels").full_name == "dmrl.v1.PeerLabels"
-    assert descriptor("CompressedImage").full_name == "foxglove.CompressedImage"
-    assert message("Height")(height_m=0.5).height_m == 0.5
+    assert find_descriptor("PeerLabels").full_name == "dmrl.v1.PeerLabels"
+    assert find_descriptor("CompressedImage").full_name == "foxglove.CompressedImage"
+    assert message_class("Height")(height_m=0.5).height_m == 0.5
 
 
 def test_an_unknown_message_is_a_key_error() -> None:
     with pytest.raises(KeyError, match="Altitude"):
-        message("Altitude")
+        message_class("Altitude")
 
 
 @pytest.mark.parametrize("name", ["PeerLabels", "FrameTransforms"])
 def test_schema_bytes_hold_all_that_a_message_imports_and_no_more(name: str) -> None:
-    data = schema_bytes(name)
+    data = serialize_schema(name)
     files = FileDescriptorSet.FromString(data).file
     listed = {file.name for file in files}
     assert {d for file in files for d in file.dependency} < listed
-    pool = messages.pool_of(data)
-    assert pool.FindMessageTypeByName(descriptor(name).full_name).name == name
+    pool = messages.build_pool(data)
+    assert pool.FindMessageTypeByName(find_descriptor(name).full_name).name == name
     assert len(listed) < len(
         FileDescriptorSet.FromString((SCHEMAS / "dmrl.binpb").read_bytes()).file
     )

@@ -134,7 +134,7 @@ FORMAT = '''
     def content(source: Path, options: Options) -> Content:
         """A sample a line."""
         rows = [line.split() for line in source.read_text().splitlines()]
-        topic = topics.height(options.robot)
+        topic = topics.HEIGHT(options.robot)
         return Content(Sample(int(t), topic, "Height", {"height_m": float(z)}) for t, z in rows)
 
 
@@ -183,8 +183,8 @@ def test_a_network(clone: Clone, tmp_path: Path) -> None:
         "from pathlib import Path\n"
         "from dmrl.cli import main\n"
         "from dmrl.learn.inference.loaded_model import Model, save_model\n"
-        "from dmrl.learn.networks.architectures import build\n"
-        f"save_model(Model(build('tiny').eval(), 'tiny'), Path({str(made)!r}))\n"
+        "from dmrl.learn.networks.architectures import build_network\n"
+        f"save_model(Model(build_network('tiny').eval(), 'tiny'), Path({str(made)!r}))\n"
         f"sys.argv = ['dmrl', 'export', {str(made)!r}, {str(out)!r}]\n"
         "main()\n",
     )
@@ -193,7 +193,7 @@ def test_a_network(clone: Clone, tmp_path: Path) -> None:
 
 LOSS = """
 
-def _certain(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
+def _certain(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Tensor:
     return out["confidence"].sigmoid().mean()
 
 """
@@ -204,22 +204,22 @@ def test_a_loss(clone: Clone) -> None:
     name = "dmrl/learn/training/losses.py"
     clone.after(name, "    classes: tuple[str, ...] = ()\n", "    certain_weight: float = 0.0\n")
     clone.after(name, "return class_loss(logits, wanted.class_id, wanted.weight)\n", LOSS)
-    term = '    Term("certain_loss", "certain_weight", ("confidence",), _certain),\n'
+    term = '    LossTerm("certain_loss", "certain_weight", ("confidence",), _certain),\n'
     clone.after(name, "TERMS = (\n", term)
     assert clone.touched() == promised("a loss")
     said = clone.python(
         "-c",
         "import torch\n"
         "from dmrl.learn.data.batches import Batch\n"
-        "from dmrl.learn.networks.architectures import build\n"
-        "from dmrl.learn.training.config import FitSettings\n"
-        "from dmrl.learn.training.train_step import LOSSES, losses\n"
+        "from dmrl.learn.networks.architectures import build_network\n"
+        "from dmrl.learn.training.config import TrainConfig\n"
+        "from dmrl.learn.training.train_step import LOSS_NAMES, compute_losses\n"
         "images = torch.zeros(1, 3, 32, 40, dtype=torch.uint8)\n"
         "batch = Batch(images, torch.full((1, 1, 11), torch.nan))\n"
-        "network = build('locanet').eval()\n"
+        "network = build_network('locanet').eval()\n"
         "for weight in (0.0, 3.0):\n"
-        "    parts = losses(network, batch, FitSettings(certain_weight=weight))\n"
-        "    print(float(parts.detach()[LOSSES.index('certain_loss')]) > 0)\n",
+        "    parts = compute_losses(network, batch, TrainConfig(certain_weight=weight))\n"
+        "    print(float(parts.detach()[LOSS_NAMES.index('certain_loss')]) > 0)\n",
     )
     assert said.split() == ["False", "True"]
 
@@ -295,12 +295,12 @@ from dmrl.viewer.settings import Settings
 
     def scene(selection: Selection, settings: Settings) -> Scene:
         """One panel."""
-        row = topics.row_of("/any/height")
+        row = topics.find_topic("/any/height")
         robots = [found["robot"] for found in selection.found(topics.HEIGHT)]
         draws = [
             Draw(path, partial(plots.sensor, path, row=row, robot=robot, own=True))
             for robot in robots
-            for path in [topics.height(robot)]
+            for path in [topics.HEIGHT(robot)]
         ]
         panel = layouts.Plot("heights alone, m", tuple(draw.topic for draw in draws))
         return Scene(layouts.window(layouts.plot_view(panel)), draws, [], [])

@@ -14,12 +14,22 @@ from dmrl.guards.lazy_names import import_lazily
 from dmrl.viewer.settings import Settings, Web
 
 if TYPE_CHECKING:
-    from dmrl.viewer.flag_page import flag
+    from dmrl.viewer.flag_page import write_flag_page
     from dmrl.viewer.session import save
-    from dmrl.viewer.window.desktop import screenshot, view
-    from dmrl.viewer.window.web_page import Page, page, serve
+    from dmrl.viewer.window.desktop import show_in_window, write_screenshot
+    from dmrl.viewer.window.web_page import Page, open_page, serve
 
-__all__ = ["Page", "Settings", "Web", "flag", "page", "save", "screenshot", "serve", "view"]
+__all__ = [
+    "Page",
+    "Settings",
+    "Web",
+    "open_page",
+    "save",
+    "serve",
+    "show_in_window",
+    "write_flag_page",
+    "write_screenshot",
+]
 
 _PLACES = {
     "flag": "dmrl.viewer.flag_page",

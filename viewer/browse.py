@@ -20,27 +20,32 @@ from dmrl.datasets import layout, open_dataset
 from dmrl.errors import DatasetError, SettingError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.viewer import layouts
-from dmrl.viewer.content.matched_detections import Found, Key, errors_of_rows, find
+from dmrl.viewer.content.matched_detections import (
+    MatchedDetections,
+    RowKey,
+    compute_row_errors,
+    find_detections,
+)
 from dmrl.viewer.drawing import archetypes, time_plots
-from dmrl.viewer.drawing.archetypes import Scale
+from dmrl.viewer.drawing.archetypes import ColourScale
 from dmrl.viewer.drawing.entity import Entity, image_frame
-from dmrl.viewer.drawing.label_overlay import labels
-from dmrl.viewer.drawing.legend import colour_bars, legend
-from dmrl.viewer.layouts import Eye, Plot
+from dmrl.viewer.drawing.label_overlay import draw_labels
+from dmrl.viewer.drawing.legend import draw_colour_bars, draw_legend
+from dmrl.viewer.layouts import CameraPanel, PlotPanel
 from dmrl.viewer.settings import Settings
-from dmrl.viewer.show import Logged, Show
+from dmrl.viewer.show import Show, TimedEntity
 
 TIMELINE = "rank"
 ROBOT = "row"
-FACTS, ERROR_PX, ERROR_M = "/row/facts", "/row/error_px", "/row/error_m"
-ROWS_AT_ONCE = 32
+FACTS_PATH, ERROR_PX_PATH, ERROR_M_PATH = "/row/facts", "/row/error_px", "/row/error_m"
+BATCH_ROWS = 32
 
-CHANNELS = {"confidence": layout.CONFIDENCE, "depth_m": layout.DEPTH}
+CHANNEL_COLUMNS = {"confidence": layout.CONFIDENCE, "depth_m": layout.DEPTH}
 """Channels of maps, and the columns with their ground truth."""
 
 
 @dataclass(frozen=True, slots=True)
-class Ranked:
+class RankedRows:
     """Rows of a dataset in display order.
 
     Parameters
@@ -59,7 +64,7 @@ class Ranked:
     of: int
     error_px: NDArray[np.float64]
     error_m: NDArray[np.float64]
-    found: Found | None
+    found: MatchedDetections | None
 
 
 def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Show:
@@ -83,14 +88,14 @@ def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Sh
     SettingError
         If no row is left, or another layout was requested.
     """
-    folder, ranked = ranked_of(paths, settings)
+    folder, ranked = rank_dataset(paths, settings)
     if rank is not None and not 1 <= rank <= len(ranked.rows):
         raise SettingError(
             f"{folder} shows {len(ranked.rows)} rows. Give --rank 1 to {len(ranked.rows)}"
         )
-    scales = archetypes.scales(settings.depth_max_m)
+    scales = archetypes.build_scales(settings.depth_max_m)
     rows, cols = grid_shape(ranked.rows)
-    eye = Eye(
+    eye = CameraPanel(
         ROBOT,
         folder.name,
         cols * STRIDE_PX,
@@ -103,24 +108,26 @@ def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Sh
     )
     plot = None
     if ranked.found is not None:
-        plot = Plot("error by rank, px", (ERROR_PX,))
+        plot = PlotPanel("error by rank, px", (ERROR_PX_PATH,))
     return Show(
         folder.name,
-        layouts.dataset(eye, scales, plot, FACTS, timeline=TIMELINE, overlay=settings.overlay),
-        partial(_logged, ranked, eye, scales, settings, rank),
+        layouts.build_dataset_layout(
+            eye, scales, plot, FACTS_PATH, timeline=TIMELINE, overlay=settings.overlay
+        ),
+        partial(_iter_entities, ranked, eye, scales, settings, rank),
         len(ranked.rows) if rank is None else 1,
         (TIMELINE, rank or 1),
         f"row {rank or 1} of {len(ranked.rows)}",
     )
 
 
-def ranked_of(paths: Sequence[Path], settings: Settings) -> tuple[Path, Ranked]:
+def rank_dataset(paths: Sequence[Path], settings: Settings) -> tuple[Path, RankedRows]:
     """Return the folder of a dataset, and its rows in display order; see `browse`."""
-    folder, recordings = _sorted_out(paths, settings)
-    return folder, _ranked(folder, recordings, settings)
+    folder, recordings = _split_paths(paths, settings)
+    return folder, _rank_rows(folder, recordings, settings)
 
 
-def _sorted_out(paths: Sequence[Path], settings: Settings) -> tuple[Path, list[Path]]:
+def _split_paths(paths: Sequence[Path], settings: Settings) -> tuple[Path, list[Path]]:
     folders = [path for path in dict.fromkeys(paths) if path.is_dir()]
     if settings.layout not in ("auto", "dataset"):
         raise SettingError(f"{folders[0]} is a dataset: leave --layout {settings.layout} out")
@@ -129,12 +136,12 @@ def _sorted_out(paths: Sequence[Path], settings: Settings) -> tuple[Path, list[P
     return folders[0], [path for path in dict.fromkeys(paths) if not path.is_dir()]
 
 
-def _ranked(folder: Path, recordings: Sequence[Path], settings: Settings) -> Ranked:
+def _rank_rows(folder: Path, recordings: Sequence[Path], settings: Settings) -> RankedRows:
     """Return the selected rows: by error if a model is given, else in their order."""
-    rows = _rows(folder, settings)
+    rows = _read_rows(folder, settings)
     filtered = settings.error_from_px is not None or settings.error_to_px is not None
     if recordings:
-        return _worst_first(folder, rows, recordings, settings, filtered=filtered)
+        return _rank_by_error(folder, rows, recordings, settings, filtered=filtered)
     if filtered:
         raise SettingError(
             "errors require a model: name its recording as well. "
@@ -142,10 +149,10 @@ def _ranked(folder: Path, recordings: Sequence[Path], settings: Settings) -> Ran
         )
     chosen = np.arange(len(rows))[:: settings.every][: settings.most]
     unknown = np.full(len(chosen), np.nan)
-    return Ranked(rows.take(chosen), len(rows), unknown, unknown, None)
+    return RankedRows(rows.take(chosen), len(rows), unknown, unknown, None)
 
 
-def _rows(folder: Path, settings: Settings) -> pa.Table:
+def _read_rows(folder: Path, settings: Settings) -> pa.Table:
     """Read the rows of the selected split and robot; of all by default."""
     dataset = open_dataset(folder)
     splits = dataset.splits if settings.split is None else (settings.split,)
@@ -158,11 +165,11 @@ def _rows(folder: Path, settings: Settings) -> pa.Table:
     return rows
 
 
-def _worst_first(
+def _rank_by_error(
     folder: Path, rows: pa.Table, recordings: Sequence[Path], settings: Settings, *, filtered: bool
-) -> Ranked:
-    found = find(recordings, folder, keys(rows))
-    error_px, error_m = errors_of_rows(rows, found, image_size(rows))
+) -> RankedRows:
+    found = find_detections(recordings, folder, row_keys(rows))
+    error_px, error_m = compute_row_errors(rows, found, image_size(rows))
     low = -1.0 if settings.error_from_px is None else settings.error_from_px
     high = np.inf if settings.error_to_px is None else settings.error_to_px
     # Images without a peer have no error; unless a range of errors is requested, they come last.
@@ -175,12 +182,12 @@ def _worst_first(
             f"{np.nanmax(error_px):.2f} px. Change --error-from-px or --error-to-px"
         )
     chosen = order[:: settings.every][: settings.most]
-    return Ranked(
-        rows.take(chosen), len(order), error_px[chosen], error_m[chosen], found.of(chosen)
+    return RankedRows(
+        rows.take(chosen), len(order), error_px[chosen], error_m[chosen], found.select_rows(chosen)
     )
 
 
-def keys(rows: pa.Table) -> list[Key]:
+def row_keys(rows: pa.Table) -> list[RowKey]:
     """Return the source recording, robot and log time of each row."""
     names = ("source", "robot", "log_time")
     return list(zip(*(rows[name].to_pylist() for name in names), strict=True))
@@ -198,39 +205,45 @@ def image_size(rows: pa.Table) -> tuple[int, int]:
     return wide * STRIDE_PX, high * STRIDE_PX
 
 
-def _logged(
-    ranked: Ranked, eye: Eye, scales: Mapping[str, Scale], settings: Settings, rank: int | None
-) -> Iterator[Logged]:
+def _iter_entities(
+    ranked: RankedRows,
+    eye: CameraPanel,
+    scales: Mapping[str, ColourScale],
+    settings: Settings,
+    rank: int | None,
+) -> Iterator[TimedEntity]:
     every = np.arange(len(ranked.rows))
     if ranked.found is not None:
         known = every[np.isfinite(ranked.error_px)]
         yield (
-            _ranks(known),
-            time_plots.line(ERROR_PX, ranked.error_px[known], "worst label", RGB["detection"]),
+            _rank_column(known),
+            time_plots.draw_line(
+                ERROR_PX_PATH, ranked.error_px[known], "worst label", RGB["detection"]
+            ),
         )
     named = {} if ranked.found is None else {"detection": RGB["detection"]}
     shown = {name: scales[name] for name in eye.channels}
-    for entity in colour_bars(ROBOT, shown, eye.width_px, eye.height_px):
+    for entity in draw_colour_bars(ROBOT, shown, eye.width_px, eye.height_px):
         yield None, entity
     sources: set[str] = set()
     chosen = every if rank is None else every[[rank - 1]]
-    for start in range(0, len(chosen), ROWS_AT_ONCE):
-        part = chosen[start : start + ROWS_AT_ONCE]
-        for entity in _drawn(ranked, part, eye, shown, sources, smooth=settings.overlay):
-            yield _ranks(part), entity
+    for start in range(0, len(chosen), BATCH_ROWS):
+        part = chosen[start : start + BATCH_ROWS]
+        for entity in _draw_rows(ranked, part, eye, shown, sources, smooth=settings.overlay):
+            yield _rank_column(part), entity
     colours = {name: RGB.get(name, RGB["other"]) for name in sorted(sources)} | named
-    yield None, legend(ROBOT, colours, eye.width_px, eye.height_px)
+    yield None, draw_legend(ROBOT, colours, eye.width_px, eye.height_px)
 
 
-def _ranks(rows: NDArray[np.int64]) -> rr.TimeColumn:
+def _rank_column(rows: NDArray[np.int64]) -> rr.TimeColumn:
     return rr.TimeColumn(TIMELINE, sequence=rows + 1)
 
 
-def _drawn(
-    ranked: Ranked,
+def _draw_rows(
+    ranked: RankedRows,
     part: NDArray[np.int64],
-    eye: Eye,
-    scales: Mapping[str, Scale],
+    eye: CameraPanel,
+    scales: Mapping[str, ColourScale],
     sources: set[str],
     *,
     smooth: bool,
@@ -238,24 +251,26 @@ def _drawn(
     rows = ranked.rows.take(part).combine_chunks()
     frame = image_frame(ROBOT)
     (batch,) = rows.to_batches()
-    yield _pictures(eye, batch)
-    yield from labels(
+    yield _draw_images(eye, batch)
+    yield from draw_labels(
         eye.labels, frame, batch.select(["peers"]), sources, (eye.width_px, eye.height_px)
     )
     maps = None
     if ranked.found is not None:
-        mine = ranked.found.of(part)
-        yield from archetypes.detections(eye.detections, frame, mine.detections(), eye.width_px)
-        maps = mine.maps()
-    yield from archetypes.grids(
-        eye.grid, frame, _true_maps(batch) if maps is None else maps, scales, smooth=smooth
+        mine = ranked.found.select_rows(part)
+        yield from archetypes.draw_detections(
+            eye.detections, frame, mine.to_detections(), eye.width_px
+        )
+        maps = mine.read_maps()
+    yield from archetypes.draw_grids(
+        eye.grid, frame, _build_true_maps(batch) if maps is None else maps, scales, smooth=smooth
     )
-    words = [_facts(ranked, int(k)) for k in part]
+    words = [_describe_row(ranked, int(k)) for k in part]
     columns = rr.TextDocument.columns(text=words, media_type=["text/markdown"] * len(words))
-    yield Entity(FACTS, columns)
+    yield Entity(FACTS_PATH, columns)
 
 
-def _pictures(eye: Eye, batch: pa.RecordBatch) -> Entity:
+def _draw_images(eye: CameraPanel, batch: pa.RecordBatch) -> Entity:
     frame = image_frame(ROBOT)
     if layout.PIXELS not in batch.schema.names:
         blobs = batch[layout.IMAGE].field("bytes").to_pylist()
@@ -270,11 +285,11 @@ def _pictures(eye: Eye, batch: pa.RecordBatch) -> Entity:
     )
 
 
-def _true_maps(batch: pa.RecordBatch) -> pa.RecordBatch:
+def _build_true_maps(batch: pa.RecordBatch) -> pa.RecordBatch:
     """Return the ground truth of the maps as columns of GridMap."""
     flat = [
         np.asarray(batch[column].flatten().flatten(), "<f4").reshape(batch.num_rows, -1)
-        for column in CHANNELS.values()
+        for column in CHANNEL_COLUMNS.values()
     ]
     high, wide = grid_shape(pa.Table.from_batches([batch]))
     data = [row.tobytes() for row in np.concatenate(flat, axis=1)]
@@ -282,14 +297,14 @@ def _true_maps(batch: pa.RecordBatch) -> pa.RecordBatch:
     columns: dict[str, Any] = {
         "rows": [high] * count,
         "cols": [wide] * count,
-        "channels": [list(CHANNELS)] * count,
+        "channels": [list(CHANNEL_COLUMNS)] * count,
         "data": data,
         "stride_px": [STRIDE_PX] * count,
     }
     return pa.RecordBatch.from_pydict(columns)
 
 
-def _facts(ranked: Ranked, row: int) -> str:
+def _describe_row(ranked: RankedRows, row: int) -> str:
     """Describe a row in Markdown."""
     one = {
         name: ranked.rows[name][row].as_py() for name in ("source", "robot", "log_time", "split")

@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.atomic_output import partial_file
+from dmrl.atomic_output import atomic_file
 from dmrl.colours import RGB
 from dmrl.datasets import layout
-from dmrl.datasets.writing.exclusions import NEEDED
-from dmrl.errors import one_line
+from dmrl.datasets.writing.exclusions import REQUIRED_COLUMNS
+from dmrl.errors import to_one_line
 from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
 from dmrl.terminal.progress import track
-from dmrl.viewer.browse import Ranked, image_size, ranked_of
+from dmrl.viewer.browse import RankedRows, image_size, rank_dataset
 from dmrl.viewer.settings import Settings
 
 WIDE_PX = 240
@@ -53,10 +53,10 @@ document.querySelector('button').addEventListener('click', () => {
   link.click();
 });
 show();
-""".replace("HEAD", json.dumps(",".join(NEEDED)))
+""".replace("HEAD", json.dumps(",".join(REQUIRED_COLUMNS)))
 
 
-def flag(paths: Sequence[Path], out: Path, settings: Settings) -> int:
+def write_flag_page(paths: Sequence[Path], out: Path, settings: Settings) -> int:
     """Write the page of a dataset's rows, and return their number.
 
     Parameters
@@ -77,17 +77,17 @@ def flag(paths: Sequence[Path], out: Path, settings: Settings) -> int:
     OutputError
         If ``out`` exists or cannot be written.
     """
-    folder, ranked = ranked_of(paths, settings)
-    with partial_file(out) as partial:
+    folder, ranked = rank_dataset(paths, settings)
+    with atomic_file(out) as partial:
         partial.write_text(page(folder.name, ranked), encoding="utf-8")
     return len(ranked.rows)
 
 
-def page(name: str, ranked: Ranked) -> str:
+def page(name: str, ranked: RankedRows) -> str:
     """Build the page, HTML; file names are escaped."""
     policy = (
         "default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
-        f"script-src 'sha256-{_digest(SCRIPT)}'"
+        f"script-src 'sha256-{_hash_script(SCRIPT)}'"
     )
     cells = "".join(track(_cells(ranked), "Drawing", len(ranked.rows)))
     more = f" of {ranked.of}" if ranked.of > len(ranked.rows) else ""
@@ -104,28 +104,28 @@ def page(name: str, ranked: Ranked) -> str:
 
 
 def _text(words: str) -> str:
-    return escape(one_line(words))
+    return escape(to_one_line(words))
 
 
-def _digest(script: str) -> str:
+def _hash_script(script: str) -> str:
     return b64encode(sha256(script.encode()).digest()).decode()
 
 
-def _cells(ranked: Ranked) -> Iterator[str]:
+def _cells(ranked: RankedRows) -> Iterator[str]:
     wide, high = image_size(ranked.rows)
     for k in range(len(ranked.rows)):
         row = ranked.rows.slice(k, 1).to_pylist()[0]
-        value = escape(json.dumps([row[name] for name in NEEDED]))
+        value = escape(json.dumps([row[name] for name in REQUIRED_COLUMNS]))
         error = ranked.error_px[k]
         judged = f", error {error:.1f} px" if np.isfinite(error) else ""
         words = f"{row['source']}, {row['robot']}, {row['log_time'] / 1e9:.2f} s{judged}"
         yield (
-            f'<label><input type="checkbox" value="{value}">{_drawing(row, wide, high)}'
+            f'<label><input type="checkbox" value="{value}">{_draw_thumbnail(row, wide, high)}'
             f"<small>{_text(words)}</small></label>"
         )
 
 
-def _drawing(row: dict[str, object], wide: int, high: int) -> str:
+def _draw_thumbnail(row: dict[str, object], wide: int, high: int) -> str:
     """Draw a small image with a circle around every labelled peer."""
     size = (WIDE_PX, max(1, round(high * WIDE_PX / wide)))
     small = encode_jpeg(crop_and_scale(_pixels(row, wide, high), (0, 0, wide, high), *size), 80)

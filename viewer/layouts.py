@@ -9,21 +9,21 @@ from dataclasses import dataclass
 import rerun as rr
 import rerun.blueprint as rrb
 
-from dmrl.viewer.drawing.archetypes import Scale, channel_path, texts_path
-from dmrl.viewer.drawing.entity import escaped, image_frame
-from dmrl.viewer.drawing.legend import HEIGHT_PX, bar_path, legend_path
+from dmrl.viewer.drawing.archetypes import ColourScale, channel_path, texts_path
+from dmrl.viewer.drawing.entity import escape_path, image_frame
+from dmrl.viewer.drawing.legend import LEGEND_HEIGHT_PX, bar_path, legend_path
 
 TIMELINE = "log_time"
 BACKGROUND = (24, 24, 24)
 # Labels have a translucent grey background and are unreadable over a bright image.
 IMAGE_OPACITY, BELOW_MAP_OPACITY = 0.75, 0.4
 MARGIN_PX = 4
-TRAIL_S = 4.0
+TRAIL_LENGTH_S = 4.0
 """Length of a trail in a 3D view, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
-class Eye:
+class CameraPanel:
     """Content of the panels of one camera.
 
     Parameters
@@ -52,7 +52,7 @@ class Eye:
 
 
 @dataclass(frozen=True, slots=True)
-class Space:
+class SpacePanel:
     """A 3D view.
 
     Parameters
@@ -75,7 +75,7 @@ class Space:
 
 
 @dataclass(frozen=True, slots=True)
-class Plot:
+class PlotPanel:
     """A panel with lines over time.
 
     Parameters
@@ -96,7 +96,9 @@ class Plot:
     band: bool = False
 
 
-def image(eyes: Sequence[Eye], scales: Mapping[str, Scale], *, overlay: bool) -> rrb.Blueprint:
+def build_image_layout(
+    eyes: Sequence[CameraPanel], scales: Mapping[str, ColourScale], *, overlay: bool
+) -> rrb.Blueprint:
     """Build a layout of images with labels and detections, and their maps beside them.
 
     Parameters
@@ -110,40 +112,42 @@ def image(eyes: Sequence[Eye], scales: Mapping[str, Scale], *, overlay: bool) ->
         Lay every map over the image.
     """
     if len(eyes) == 1:
-        views = eye_views(eyes[0], scales, both=not overlay, overlay=overlay)
+        views = build_camera_views(eyes[0], scales, both=not overlay, overlay=overlay)
         if len(views) == 3:
             beside = rrb.Vertical(*views[1:])
-            return window(rrb.Horizontal(views[0], beside, column_shares=[1.4, 1]))
-        return window(rrb.Grid(*views, grid_columns=min(len(views), 2)))
-    return window(_rows(eyes, scales, overlay=overlay))
+            return build_window(rrb.Horizontal(views[0], beside, column_shares=[1.4, 1]))
+        return build_window(rrb.Grid(*views, grid_columns=min(len(views), 2)))
+    return build_window(_build_rows(eyes, scales, overlay=overlay))
 
 
-def _rows(eyes: Sequence[Eye], scales: Mapping[str, Scale], *, overlay: bool) -> rrb.Container:
-    rows = [eye_views(eye, scales, overlay=overlay) for eye in eyes]
+def _build_rows(
+    eyes: Sequence[CameraPanel], scales: Mapping[str, ColourScale], *, overlay: bool
+) -> rrb.Container:
+    rows = [build_camera_views(eye, scales, overlay=overlay) for eye in eyes]
     return rrb.Vertical(*(rrb.Horizontal(*row) for row in rows))
 
 
-def compare(
-    eyes: Sequence[Eye],
-    scales: Mapping[str, Scale],
-    plots: Sequence[Plot],
+def build_compare_layout(
+    eyes: Sequence[CameraPanel],
+    scales: Mapping[str, ColourScale],
+    plots: Sequence[PlotPanel],
     table: str,
     *,
     overlay: bool,
 ) -> rrb.Blueprint:
     """Build a layout with a row per model; below them, their errors over time and a table."""
-    rows = _rows(eyes, scales, overlay=overlay)
+    rows = _build_rows(eyes, scales, overlay=overlay)
     if not plots:
-        return window(rows)
-    words = rrb.TextDocumentView(origin=escaped(table), name="both models")
-    below = rrb.Horizontal(*(plot_view(plot) for plot in plots), words)
-    return window(rrb.Vertical(rows, below, row_shares=[2.6, 1]))
+        return build_window(rows)
+    words = rrb.TextDocumentView(origin=escape_path(table), name="both models")
+    below = rrb.Horizontal(*(build_plot_view(plot) for plot in plots), words)
+    return build_window(rrb.Vertical(rows, below, row_shares=[2.6, 1]))
 
 
-def flight(
-    spaces: Sequence[Space],
-    eyes: Sequence[Eye],
-    plots: Mapping[str, Sequence[Plot]],
+def build_flight_layout(
+    spaces: Sequence[SpacePanel],
+    eyes: Sequence[CameraPanel],
+    plots: Mapping[str, Sequence[PlotPanel]],
 ) -> rrb.Blueprint:
     """Build a layout with 3D views and images above, and plots below.
 
@@ -156,50 +160,52 @@ def flight(
     plots
         Panels by tab.
     """
-    views = [eye_views(eye, {})[0] for eye in eyes]
-    spatial = rrb.Tabs(*(_space_view(space) for space in spaces))
+    views = [build_camera_views(eye, {})[0] for eye in eyes]
+    spatial = rrb.Tabs(*(_build_space_view(space) for space in spaces))
     above: rrb.Container = spatial
     if len(views) == 1:
         above = rrb.Horizontal(spatial, *views, column_shares=[1.2, 1])
     elif views:
         above = rrb.Horizontal(spatial, rrb.Grid(*views, grid_columns=2), column_shares=[1, 1.3])
     tabs = [
-        rrb.Grid(*map(plot_view, panels), grid_columns=_columns(len(panels)), name=name)
+        rrb.Grid(
+            *map(build_plot_view, panels), grid_columns=_choose_columns(len(panels)), name=name
+        )
         for name, panels in plots.items()
         if panels
     ]
     if not tabs:
-        return window(above)
-    return window(rrb.Vertical(above, rrb.Tabs(*tabs), row_shares=[1, 1]))
+        return build_window(above)
+    return build_window(rrb.Vertical(above, rrb.Tabs(*tabs), row_shares=[1, 1]))
 
 
-def _columns(panels: int) -> int:
+def _choose_columns(panels: int) -> int:
     """Choose the number of columns that leaves the fewest places of a grid of plots empty."""
     return min((4, 3, 5), key=lambda columns: -panels % columns) if panels > 4 else panels
 
 
-def dataset(
-    eye: Eye,
-    scales: Mapping[str, Scale],
-    plot: Plot | None,
+def build_dataset_layout(
+    eye: CameraPanel,
+    scales: Mapping[str, ColourScale],
+    plot: PlotPanel | None,
     facts: str,
     *,
     timeline: str,
     overlay: bool,
 ) -> rrb.Blueprint:
     """Build a layout for one row at a time: image and maps, facts about the row, and its error."""
-    views = eye_views(eye, scales, both=not overlay, overlay=overlay)
-    words = rrb.TextDocumentView(origin=escaped(facts), name="row")
-    side = [words] if plot is None else [words, plot_view(plot)]
+    views = build_camera_views(eye, scales, both=not overlay, overlay=overlay)
+    words = rrb.TextDocumentView(origin=escape_path(facts), name="row")
+    side = [words] if plot is None else [words, build_plot_view(plot)]
     panels = rrb.Horizontal(
         rrb.Grid(*views, grid_columns=2),
         rrb.Vertical(*side),
         column_shares=[3, 1],
     )
-    return window(panels, timeline=timeline)
+    return build_window(panels, timeline=timeline)
 
 
-def window(panels: rrb.Container, timeline: str = TIMELINE) -> rrb.Blueprint:
+def build_window(panels: rrb.Container, timeline: str = TIMELINE) -> rrb.Blueprint:
     """Build a window with these panels, paused at the start."""
     return rrb.Blueprint(
         panels,
@@ -212,19 +218,25 @@ def window(panels: rrb.Container, timeline: str = TIMELINE) -> rrb.Blueprint:
     )
 
 
-def eye_views(
-    eye: Eye, scales: Mapping[str, Scale], *, both: bool = False, overlay: bool = False
+def build_camera_views(
+    eye: CameraPanel,
+    scales: Mapping[str, ColourScale],
+    *,
+    both: bool = False,
+    overlay: bool = False,
 ) -> list[rrb.View]:
     """Build views of the image and of each map; ``both``: also confidence over the image."""
-    picture = escaped(eye.picture)
+    picture = escape_path(eye.picture)
     found = [eye.detections, texts_path(eye.detections)]
-    marks = [f"{escaped(eye.labels)}/**", *map(escaped, found)]
-    cell = escaped(f"{eye.grid}/best")
-    views = [_view(eye, "image", [picture, *marks, escaped(legend_path(eye.robot))])]
+    marks = [f"{escape_path(eye.labels)}/**", *map(escape_path, found)]
+    cell = escape_path(f"{eye.grid}/best")
+    views = [
+        _build_image_view(eye, "image", [picture, *marks, escape_path(legend_path(eye.robot))])
+    ]
     heat = {
         channel: [
-            escaped(channel_path(eye.grid, channel)),
-            f"{escaped(bar_path(eye.robot, channel))}/**",
+            escape_path(channel_path(eye.grid, channel)),
+            f"{escape_path(bar_path(eye.robot, channel))}/**",
             cell,
         ]
         for channel in eye.channels
@@ -235,15 +247,17 @@ def eye_views(
         contents = [picture, *heat[channel], *(marks if overlay else [])]
         what, comma, unit = scales[channel].title.partition(",")
         name = f"{what} over image{comma}{unit}"
-        views.append(_view(eye, name, contents, texts=False, opacity=BELOW_MAP_OPACITY))
+        views.append(_build_image_view(eye, name, contents, texts=False, opacity=BELOW_MAP_OPACITY))
     if not overlay:
         for channel, paths in heat.items():
-            views.append(_view(eye, scales[channel].title, [*paths, *marks], texts=False))
+            views.append(
+                _build_image_view(eye, scales[channel].title, [*paths, *marks], texts=False)
+            )
     return views
 
 
-def _view(
-    eye: Eye,
+def _build_image_view(
+    eye: CameraPanel,
     name: str,
     contents: list[str],
     *,
@@ -252,11 +266,11 @@ def _view(
 ) -> rrb.View:
     bounds = rrb.VisualBounds2D(
         x_range=(-MARGIN_PX, eye.width_px + MARGIN_PX),
-        y_range=(-MARGIN_PX, eye.height_px + HEIGHT_PX),
+        y_range=(-MARGIN_PX, eye.height_px + LEGEND_HEIGHT_PX),
     )
     kinds = () if texts else (rr.Points2D, rr.Boxes2D)
     return rrb.Spatial2DView(
-        origin=escaped(eye.robot),
+        origin=escape_path(eye.robot),
         name=f"{eye.title} {name}",
         contents=contents,
         visual_bounds=bounds,
@@ -270,12 +284,12 @@ def _view(
     )
 
 
-def _space_view(space: Space) -> rrb.View:
+def _build_space_view(space: SpacePanel) -> rrb.View:
     recent = rrb.VisibleTimeRanges(
         [
             rrb.VisibleTimeRange(
                 TIMELINE,
-                start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S),
+                start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_LENGTH_S),
                 end=rrb.TimeRangeBoundary.cursor_relative(),
             )
         ]
@@ -283,20 +297,20 @@ def _space_view(space: Space) -> rrb.View:
     return rrb.Spatial3DView(
         origin="/",
         name=f"space, {space.frame}, grid 1 m",
-        contents=[escaped(path) for path in space.contents],
+        contents=[escape_path(path) for path in space.contents],
         background=BACKGROUND,
         spatial_information=rrb.SpatialInformation(target_frame=space.frame),
         eye_controls=rrb.EyeControls3D(
             position=space.position, look_target=space.target, eye_up=(0, 0, 1)
         ),
         line_grid=rrb.LineGrid3D(spacing=1.0, color=[90, 90, 90]),
-        overrides={escaped(path): recent for path in space.trails},
+        overrides={escape_path(path): recent for path in space.trails},
     )
 
 
-def plot_view(plot: Plot) -> rrb.View:
+def build_plot_view(plot: PlotPanel) -> rrb.View:
     """Build a panel over time; all such panels share their time range."""
-    contents = [escaped(path) for path in plot.contents]
+    contents = [escape_path(path) for path in plot.contents]
     shared = rrb.archetypes.TimeAxis(link="LinkToGlobal")
     if plot.band:
         return rrb.StateTimelineView(

@@ -12,14 +12,14 @@ from typing import Any, cast
 
 import rerun as rr
 
-from dmrl.atomic_output import partial_file
+from dmrl.atomic_output import atomic_file
 from dmrl.viewer.layouts import TIMELINE
-from dmrl.viewer.scene import Scene, logged
-from dmrl.viewer.selection import at_time, moment_ns, select
+from dmrl.viewer.scene import Scene, iter_scene
+from dmrl.viewer.selection import choose_moment_ns, select_recordings, select_time
 from dmrl.viewer.settings import Settings
-from dmrl.viewer.show import Logger, Show, cursor_at, stream_of
+from dmrl.viewer.show import EntityLogger, Show, build_cursor, open_stream
 
-PIECE_BYTES = 1 << 20
+COPY_BYTES = 1 << 20
 """Size of the pieces in which an .rrd file is written."""
 
 
@@ -42,13 +42,13 @@ def save(paths: Sequence[Path], out: Path, settings: Settings) -> int:
     SettingError
         If the recordings are empty at the requested time, or the layout does not fit.
     """
-    show = prepare(paths, settings)
-    with partial_file(out) as unfinished:
-        write(show, unfinished)
+    show = prepare_show(paths, settings)
+    with atomic_file(out) as unfinished:
+        write_rrd(show, unfinished)
     return show.images
 
 
-def prepare(
+def prepare_show(
     paths: Sequence[Path],
     settings: Settings,
     *,
@@ -63,24 +63,24 @@ def prepare(
     As `save`.
     """
     if any(path.is_dir() for path in paths):
-        browse: Callable[..., Show] = _loaded(_DATASET)
+        browse: Callable[..., Show] = _load(_DATASET)
         return browse(paths, settings, rank=rank if picture else None)
-    selection = select(paths, settings)
+    selection = select_recordings(paths, settings)
     if picture:
-        selection = at_time(selection, time_s)
-    scene: Scene = _loaded(f"dmrl.viewer.views.{selection.layout}:scene")(selection, settings)
-    shown_ns = moment_ns(selection, time_s)
+        selection = select_time(selection, time_s)
+    scene: Scene = _load(f"dmrl.viewer.views.{selection.layout}:scene")(selection, settings)
+    shown_ns = choose_moment_ns(selection, time_s)
     return Show(
         " + ".join(recording.stem for recording in selection.recordings),
         scene.blueprint,
-        partial(logged, selection, scene),
+        partial(iter_scene, selection, scene),
         selection.images,
-        cursor_at(TIMELINE, shown_ns, selection.zero_ns),
+        build_cursor(TIMELINE, shown_ns, selection.zero_ns),
         f"at {(shown_ns - selection.start_ns) / 1e9:.3f} s",
     )
 
 
-def write(show: Show, path: Path) -> None:
+def write_rrd(show: Show, path: Path) -> None:
     """Write an .rrd file, and replace any file at ``path``.
 
     Raises
@@ -88,18 +88,18 @@ def write(show: Show, path: Path) -> None:
     OSError
         If writing fails.
     """
-    with _written_here(path) as (pipe, still_written):
-        stream = stream_of()
+    with _relay_to_file(path) as (pipe, still_written):
+        stream = open_stream()
         stream.save(pipe, default_blueprint=show.blueprint)
         try:
-            log(show, stream, still_written)
+            log_show(show, stream, still_written)
             stream.flush()
         finally:
             stream.disconnect()
 
 
 @contextmanager
-def _written_here(path: Path) -> Iterator[tuple[str, Callable[[], bool]]]:
+def _relay_to_file(path: Path) -> Iterator[tuple[str, Callable[[], bool]]]:
     """Yield a pipe that is copied to a file, and a function that is False after an error.
 
     rerun reports a failed write only on standard error, and may then wait for its writer for ever
@@ -112,10 +112,10 @@ def _written_here(path: Path) -> Iterator[tuple[str, Callable[[], bool]]]:
         with os.fdopen(ear, "rb", buffering=0) as stream:
             try:
                 with path.open("wb") as file:
-                    shutil.copyfileobj(stream, file, PIECE_BYTES)
+                    shutil.copyfileobj(stream, file, COPY_BYTES)
             except OSError as e:
                 refused.append(e)
-                while stream.read(PIECE_BYTES):
+                while stream.read(COPY_BYTES):
                     pass
 
     drained = Thread(target=drain, daemon=True)
@@ -130,19 +130,21 @@ def _written_here(path: Path) -> Iterator[tuple[str, Callable[[], bool]]]:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-def log(show: Show, stream: rr.RecordingStream, wanted: Callable[[], bool] = lambda: True) -> None:
+def log_show(
+    show: Show, stream: rr.RecordingStream, wanted: Callable[[], bool] = lambda: True
+) -> None:
     """Log everything to a stream, as long as it is wanted."""
     stream.send_recording_name(show.title)
-    logger = Logger(stream)
+    logger = EntityLogger(stream)
     for times, entity in show.logged():
         if not wanted():
             return
-        logger.log(times, entity)
+        logger.log_entity(times, entity)
 
 
 # Imported when they are shown: compare and dataset import model evaluation, which takes time.
 _DATASET = "dmrl.viewer.browse:browse"
 
 
-def _loaded(name: str) -> Callable[..., Any]:
+def _load(name: str) -> Callable[..., Any]:
     return cast(Callable[..., Any], resolve_name(name))

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter, validators
 
-from dmrl.viewer.views import NAMES
+from dmrl.viewer.views import LAYOUT_NAMES
 
 LOOPBACK = "127.0.0.1"
 if TYPE_CHECKING:
     Layout = str
 else:
-    Layout = Literal[("auto", *NAMES, "dataset")]
+    Layout = Literal[("auto", *LAYOUT_NAMES, "dataset")]
 Pixels = Annotated[float | None, Parameter(validator=validators.Number(gte=0))]
 
 

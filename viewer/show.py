@@ -8,9 +8,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from dmrl.viewer.content.robot_motion import Times
-from dmrl.viewer.drawing.entity import Entity, escaped
+from dmrl.viewer.drawing.entity import Entity, escape_path
 
-Logged = tuple[rr.TimeColumn | None, Entity]
+TimedEntity = tuple[rr.TimeColumn | None, Entity]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,22 +35,22 @@ class Show:
 
     title: str
     blueprint: rrb.Blueprint
-    logged: Callable[[], Iterator[Logged]]
+    logged: Callable[[], Iterator[TimedEntity]]
     images: int
     cursor: tuple[str, np.generic | int]
     moment: str
 
 
 @dataclass(slots=True)
-class Logger:
+class EntityLogger:
     """Log entities to a stream, the style of each once."""
 
     stream: rr.RecordingStream
     styled: set[str] = field(default_factory=set)
 
-    def log(self, times: rr.TimeColumn | None, entity: Entity) -> None:
+    def log_entity(self, times: rr.TimeColumn | None, entity: Entity) -> None:
         """Log some rows, or a static entity."""
-        path = escaped(entity.path)
+        path = escape_path(entity.path)
         if times is None or entity.path not in self.styled:
             self.styled.add(entity.path)
             for part in entity.style:
@@ -61,7 +61,7 @@ class Logger:
             self.stream.send_columns(path, [times], entity.columns)
 
 
-def stream_of() -> rr.RecordingStream:
+def open_stream() -> rr.RecordingStream:
     """Open a stream without a sink. From then on, misuse of rerun raises an error."""
     # The default logs a warning and continues.
     rr.set_strict_mode(True)
@@ -72,14 +72,14 @@ def stream_of() -> rr.RecordingStream:
     return stream
 
 
-def time_column(timeline: str, time_ns: Times, start_ns: int | None) -> rr.TimeColumn:
+def build_time_column(timeline: str, time_ns: Times, start_ns: int | None) -> rr.TimeColumn:
     """Convert log times to seconds from a start, as in ``--time``; without a start, to dates."""
     if start_ns is None:
         return rr.TimeColumn(timeline, timestamp=time_ns.astype("datetime64[ns]"))
     return rr.TimeColumn(timeline, duration=(time_ns - start_ns).astype("timedelta64[ns]"))
 
 
-def cursor_at(timeline: str, time_ns: int, start_ns: int | None) -> tuple[str, np.generic]:
+def build_cursor(timeline: str, time_ns: int, start_ns: int | None) -> tuple[str, np.generic]:
     """Convert a log time to the cursor of a `Show`."""
     if start_ns is None:
         return timeline, np.datetime64(time_ns, "ns")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dmrl.api import notebook_display
 from dmrl.datasets import Dataset, Split, layout, open_dataset
 from dmrl.errors import DatasetError, MissingExtra
-from dmrl.export.csv_parquet import flat
+from dmrl.export.csv_parquet import flatten_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -120,7 +120,7 @@ class Rows:
         table = self._split.table
         light = table.drop_columns([name for name in HEAVY if name in table.column_names])
         light = light.append_column("row", pa.array(np.arange(len(self))))
-        found = flat(light)
+        found = flatten_table(light)
         # The rows' own source is a recording.
         renamed = {"peers.source": "label_source"}
         names = [renamed.get(name, name.removeprefix("peers.")) for name in found.column_names]

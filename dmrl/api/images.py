@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from dmrl.api import notebook_display
 from dmrl.images.codec import Rgb, decode
-from dmrl.messages import message
-from dmrl.recording import log_times, parsed, read_raw
+from dmrl.messages import message_class
+from dmrl.recording import parse_message, read_log_times, read_raw
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Images(Sequence[Rgb]):
     @classmethod
     def load_topic(cls, path: Path, topic: str, start_ns: int, kept: object = None) -> "Images":
         """Return all images on a topic."""
-        return cls(path, topic, start_ns, log_times(path, [topic])[topic], kept)
+        return cls(path, topic, start_ns, read_log_times(path, [topic])[topic], kept)
 
     @property
     def time_s(self) -> NDArray[np.float64]:
@@ -85,10 +85,10 @@ class Images(Sequence[Rgb]):
                 yield image
 
     def _iter_decoded(self, start_ns: int, end_ns: int) -> Iterator[tuple[int, Rgb]]:
-        kind = message("CompressedImage")
+        kind = message_class("CompressedImage")
         for raw in read_raw(self.path, self.topic, start_ns=start_ns, end_ns=end_ns):
             what = f"{self.path}: the image of {self.topic} at {raw.time_ns} ns"
-            yield raw.time_ns, decode(parsed(raw, kind, self.path).data, what)
+            yield raw.time_ns, decode(parse_message(raw, kind, self.path).data, what)
 
     def between(self, start_s: float | None = None, end_s: float | None = None) -> "Images":
         """Return the images in [start_s, end_s), seconds from the start of the recording."""

@@ -13,8 +13,8 @@ from dmrl.api import notebook_display
 from dmrl.deploy.backend_names import BackendName
 from dmrl.deploy.detector import Detector, open_detector
 from dmrl.errors import SettingError
-from dmrl.learn.inference.decode_grids import PER_DETECTION, Grids, decode
-from dmrl.learn.pretrained import resolved
+from dmrl.learn.inference.decode_grids import DETECTION_COLUMNS, Grids, decode
+from dmrl.learn.pretrained import resolve_model_path
 
 Rgb = NDArray[np.uint8]
 BATCH_IMAGES = 16
@@ -122,10 +122,10 @@ class Model:
                 raise SettingError("images of more than one size. Give those of each size alone")
             grids = self.grids(np.stack(batch))
             found = decode(*grids, stride_px=self.stride_px, most=most, min_confidence=least)
-            columns = [getattr(found, name) for name in PER_DETECTION]
+            columns = [getattr(found, name) for name in DETECTION_COLUMNS]
             for k, count in enumerate(found.count.tolist()):
                 rows = zip(*(column[k, :count].tolist() for column in columns), strict=True)
-                made = [Detection(**dict(zip(PER_DETECTION, row, strict=True))) for row in rows]
+                made = [Detection(**dict(zip(DETECTION_COLUMNS, row, strict=True))) for row in rows]
                 # The decoder keeps the best of an image, however unsure.
                 yield [d for d in made if d.confidence >= least]
 
@@ -163,7 +163,7 @@ def load(model: str | os.PathLike[str], *, backend: BackendName = "torch") -> Mo
     >>> model = dmrl.load("dmrl-nano")  # doctest: +SKIP
     >>> model.detect(dmrl.open("flight.mcap").images("cf1"))  # doctest: +SKIP
     """
-    return Model(open_detector(resolved(Path(model)), backend))
+    return Model(open_detector(resolve_model_path(Path(model)), backend))
 
 
 def _require_rgb(images: Rgb) -> None:

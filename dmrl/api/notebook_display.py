@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dmrl.errors import one_line
+from dmrl.errors import to_one_line
 from dmrl.images.codec import Rgb, encode_jpeg
 
 MAX_ROWS, MAX_IMAGES = 200, 6
@@ -41,7 +41,7 @@ def html_images(title: str, shown: Iterable[Rgb]) -> str:
 
 
 def _cell_text(value: object) -> str:
-    return escape(f"{value:.4g}" if isinstance(value, float) else one_line(str(value)))
+    return escape(f"{value:.4g}" if isinstance(value, float) else to_one_line(str(value)))
 
 
 def is_in_notebook() -> bool:

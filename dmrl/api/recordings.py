@@ -15,16 +15,16 @@ from dmrl.api import notebook_display
 from dmrl.api.images import Images
 from dmrl.api.topic import Topic, to_data_frame, to_log_time
 from dmrl.errors import MissingTopic, SettingError
-from dmrl.export.csv_parquet import flat
+from dmrl.export.csv_parquet import flatten_table
 from dmrl.recording import (
     Finding,
     Provenance,
     Stamped,
     TopicInfo,
     check,
-    matching,
+    match_topics,
     read,
-    summary,
+    read_summary,
 )
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class Recording:
 
     def __init__(self, path: PathLike, temporary: Path | None = None) -> None:
         self.path = Path(path)
-        self._summary = summary(self.path)
+        self._summary = read_summary(self.path)
         self._kept = None if temporary is None else _TemporaryFolder(temporary)
 
     def __fspath__(self) -> str:
@@ -72,7 +72,7 @@ class Recording:
     @property
     def robots(self) -> list[str]:
         """Names of the robots that have a topic here."""
-        parts = (topics.names(row.pattern, t) for row in topics.TOPICS for t in self.topics)
+        parts = (topics.parse_topic(row.pattern, t) for row in topics.TOPICS for t in self.topics)
         return sorted({found["robot"] for found in parts if found and "robot" in found})
 
     @property
@@ -144,11 +144,11 @@ class Recording:
         SettingError
             If no robot is named and several have images.
         """
-        filming = topics.robots(list(self.topics))
+        filming = topics.list_robots(list(self.topics))
         if robot is None and len(filming) > 1:
             raise SettingError(f"{self.path} has images of {', '.join(filming)}. Name one of them")
-        topic = topics.camera_image(robot or (filming[0] if filming else "*"))
-        matching(self.path, [topic])
+        topic = topics.CAMERA_IMAGE(robot or (filming[0] if filming else "*"))
+        match_topics(self.path, [topic])
         return Images.load_topic(self.path, topic, self.start_ns, self._kept).between(
             start_s, end_s
         )
@@ -179,12 +179,12 @@ class Recording:
         return self._read_per_image(topics.DETECTIONS, "detections", robot)
 
     def _read_per_image(self, pattern: str, within: str, robot: str | None) -> "pd.DataFrame":
-        found = sorted(matching(self.path, [topics.filled(pattern, robot=robot or "*")]))
+        found = sorted(match_topics(self.path, [topics.format_topic(pattern, robot=robot or "*")]))
         tables = []
         for topic in found:
-            table = flat(self[topic].to_arrow())
+            table = flatten_table(self[topic].to_arrow())
             names = [name.removeprefix(f"{within}.") for name in table.column_names]
-            who = (topics.names(pattern, topic) or {})["robot"]
+            who = (topics.parse_topic(pattern, topic) or {})["robot"]
             column = pa.array([who] * len(table), pa.string())
             tables.append(table.rename_columns(names).append_column("robot", column))
         return to_data_frame(pa.concat_tables(tables).sort_by("log_time"), self.start_ns)

@@ -247,5 +247,7 @@ def _check_settings(stage: str, keys: dict[str, Any]) -> dict[str, Any]:
     face = signature_of(stage)
     if face.settings is None:
         return {}
-    checked = recipes.check(f"dmrl.{stage}", face.filled(recipes.plain(keys)), face.settings)
+    checked = recipes.check(
+        f"dmrl.{stage}", face.filled(recipes.to_json_values(keys)), face.settings
+    )
     return {"settings": checked}

@@ -10,8 +10,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dmrl.errors import MissingExtra
-from dmrl.export.csv_parquet import flat
-from dmrl.messages import status_name
+from dmrl.export.csv_parquet import flatten_table
+from dmrl.messages import to_status_name
 from dmrl.recording import TopicInfo, read_table
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def to_data_frame(table: pa.Table, start_ns: int) -> "pd.DataFrame":
     frame: pd.DataFrame = table.to_pandas()
     if "status" in frame.columns:
         known = frame["status"].notna()  # of an image without peers it is not
-        names = [status_name(int(number)) for number in frame["status"][known]]
+        names = [to_status_name(int(number)) for number in frame["status"][known]]
         frame["status"] = frame["status"].astype(object)
         frame.loc[known, "status"] = names
     frame.index = (frame["log_time"] - start_ns) / 1e9
@@ -132,7 +132,7 @@ class Topic:
         RecordingError
             If the recording is damaged.
         """
-        table = flat(self.to_arrow(fields=fields, start_s=start_s, end_s=end_s))
+        table = flatten_table(self.to_arrow(fields=fields, start_s=start_s, end_s=end_s))
         return to_data_frame(table, self._start_ns)
 
     def to_numpy(
@@ -146,7 +146,7 @@ class Topic:
 
         Texts, bytes and lists are objects.
         """
-        table = flat(self.to_arrow(fields=fields, start_s=start_s, end_s=end_s))
+        table = flatten_table(self.to_arrow(fields=fields, start_s=start_s, end_s=end_s))
         columns = {name: table[name].to_numpy() for name in table.column_names}
         out = np.empty(table.num_rows, [(name, c.dtype) for name, c in columns.items()])
         for name, column in columns.items():

@@ -14,10 +14,10 @@ from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.camera_file import read_camera
 from dmrl.geometry.frames import Camera
 from dmrl.guards import limits
-from dmrl.guards.safe_names import topic_part
+from dmrl.guards.safe_names import check_topic_part
 from dmrl.images.codec import encode_jpeg, encode_png
-from dmrl.messages import message
-from dmrl.recording import RecordingWriter, provenance
+from dmrl.messages import message_class
+from dmrl.recording import RecordingWriter, build_provenance
 from dmrl.samples import sample
 
 LATEST_TIME_S = 9.2e9
@@ -36,7 +36,7 @@ class HasFields(Protocol):
 
 def _copy_message(given: HasFields, kind: str) -> Any:
     """Return a copy of a message. Raise TypeError if it is of another kind."""
-    wanted = message(kind)
+    wanted = message_class(kind)
     if given.DESCRIPTOR.full_name != wanted.DESCRIPTOR.full_name:
         raise TypeError(f"not a {given.DESCRIPTOR.full_name}")
     return wanted.FromString(given.SerializeToString())
@@ -61,7 +61,7 @@ class Writer:
     def __init__(self, path: PathLike, settings: Mapping[str, Any]) -> None:
         self.path = Path(path)
         self._done = False
-        self._sink = RecordingWriter(self.path, provenance("python", dict(settings)))
+        self._sink = RecordingWriter(self.path, build_provenance("python", dict(settings)))
 
     def write(self, topic: str, time_s: float, fields: Mapping[str, Any] | HasFields) -> None:
         """Append a message. Times need not increase.
@@ -90,7 +90,7 @@ class Writer:
             if isinstance(fields, HasFields):
                 made = _copy_message(fields, kind)
             else:
-                made = message(kind)(**fields)
+                made = message_class(kind)(**fields)
         except (TypeError, ValueError) as e:
             raise self._misfit_error(topic, kind, e) from e
         self._sink.write(int(time_ns), topic, made)
@@ -124,7 +124,7 @@ class Writer:
             return
         kind, time_ns = _find_message(topic), self._log_times(topic, times)
         try:
-            self._sink.write_columns(topic, message(kind), time_ns, columns)
+            self._sink.write_columns(topic, message_class(kind), time_ns, columns)
         except (TypeError, ValueError) as e:
             raise self._misfit_error(topic, kind, e) from e
 
@@ -165,8 +165,8 @@ class Writer:
         whole = np.ascontiguousarray(every)
         data = encode_png(whole) if quality is None else encode_jpeg(whole, quality)
         kind = "png" if quality is None else "jpeg"
-        (time_ns,) = self._log_times(topics.camera_image(robot), [time_s])
-        self._send_sample(sample.image(int(time_ns), robot, data, kind))
+        (time_ns,) = self._log_times(topics.CAMERA_IMAGE(robot), [time_s])
+        self._send_sample(sample.build_image(int(time_ns), robot, data, kind))
 
     def camera(self, robot: str, camera: Camera | PathLike, time_s: float = 0.0) -> None:
         """Append the calibration of a robot's camera, or of a camera file.
@@ -177,8 +177,8 @@ class Writer:
             If the file cannot be read.
         """
         known = camera if isinstance(camera, Camera) else read_camera(Path(camera))
-        (time_ns,) = self._log_times(topics.calibration(robot), [time_s])
-        self._send_sample(sample.calibration(int(time_ns), robot, known))
+        (time_ns,) = self._log_times(topics.CALIBRATION(robot), [time_s])
+        self._send_sample(sample.build_calibration(int(time_ns), robot, known))
 
     def _log_times(self, topic: str, time_s: ArrayLike) -> NDArray[np.int64]:
         """Return (N,) log times, nanoseconds."""
@@ -197,7 +197,7 @@ class Writer:
         return RecordingError(f"{self.path}: {topic} carries {kind}: {why}. Fix its fields")
 
     def _send_sample(self, made: sample.Sample) -> None:
-        self._sink.write(made.time_ns, made.topic, message(made.message)(**made.fields))
+        self._sink.write(made.time_ns, made.topic, message_class(made.message)(**made.fields))
 
     def flush(self) -> None:
         """Write everything so far to the file, so that a killed process loses none of it."""
@@ -234,11 +234,11 @@ def writer(path: PathLike, /, **settings: Any) -> Writer:
 
 
 def _find_message(topic: str) -> str:
-    row = topics.row_of(topic)
+    row = topics.find_topic(topic)
     if row is None or row.message.endswith("*"):
         raise RecordingError(
             f"dmrl has no topic {topic} of a known message. Name one of the table in README.md"
         )
-    for what, name in (topics.names(row.pattern, topic) or {}).items():
-        topic_part(name, what)
+    for what, name in (topics.parse_topic(row.pattern, topic) or {}).items():
+        check_topic_part(name, what)
     return row.message

@@ -10,14 +10,14 @@ from types import ModuleType
 
 import numpy as np
 
-from dmrl.atomic_output import rewritten_file
+from dmrl.atomic_output import replace_file
 from dmrl.card import sections
-from dmrl.card.croissant import NAME as CROISSANT
-from dmrl.card.croissant import croissant
-from dmrl.card.facts import cautions, equipment, read_facts
-from dmrl.card.front_matter import check_license, front_matter, read_front
-from dmrl.card.leakage import leaks
-from dmrl.card.statistics import Counts, count, sigmas_of
+from dmrl.card.croissant import CROISSANT_FILE as CROISSANT
+from dmrl.card.croissant import build_croissant
+from dmrl.card.facts import read_facts, sensor_lines, warning_lines
+from dmrl.card.front_matter import build_front_matter, check_license, read_front_matter
+from dmrl.card.leakage import leakage_lines
+from dmrl.card.statistics import SplitCounts, count_split, summarize_sigmas
 from dmrl.datasets import Split, open_dataset
 from dmrl.errors import DatasetError, MissingExtra
 from dmrl.geometry.frames import STRIDE_PX
@@ -26,7 +26,7 @@ from dmrl.recording import Provenance
 from dmrl.recording.provenance import FILE_NAME
 from dmrl.terminal.progress import say
 
-YOURS = "<!-- What you write below this line stays when dmrl writes the card again. -->"
+USER_TEXT_MARK = "<!-- What you write below this line stays when dmrl writes the card again. -->"
 """Last line of the generated card. Cards written before contain it, so it never changes."""
 
 plots: ModuleType | None
@@ -65,28 +65,33 @@ def write_card(
         check_license(license_id)
     dataset = open_dataset(folder)
     splits = {name: dataset.split(name) for name in dataset.splits}
-    made = _provenance(folder)
+    made = _read_provenance(folder)
     old, readme = folder / "README.md", (into or folder) / "README.md"
-    yours = _yours(old)
-    before = read_front(old)
-    title = title or before.get("pretty_name") or made.settings.get("title") or _title(made)
+    yours = _read_user_text(old)
+    before = read_front_matter(old)
+    title = title or before.get("pretty_name") or made.settings.get("title") or _default_title(made)
     license_id = license_id or before.get("license") or made.settings.get("license", "unknown")
-    counts = {name: count(split) for name, split in splits.items()}
-    figures = _draw(readme.parent / "figures", counts, splits)
-    files = {name: [file.relative_to(folder) for file in dataset.files(name)] for name in splits}
+    counts = {name: count_split(split) for name, split in splits.items()}
+    figures = _draw_figures(readme.parent / "figures", counts, splits)
+    files = {
+        name: [file.relative_to(folder) for file in dataset.list_shards(name)] for name in splits
+    }
     packed = files if dataset.parquet else {}
-    text = [*front_matter(splits, str(title), str(license_id), packed)]
-    text += sections.about(splits, str(title), made)
-    text += sections.loading(splits, parquet=dataset.parquet)
+    text = [*build_front_matter(splits, str(title), str(license_id), packed)]
+    text += sections.intro_lines(splits, str(title), made)
+    text += sections.loading_lines(splits, parquet=dataset.parquet)
     facts = read_facts(folder)
-    text += [*sections.numbers(counts), *cautions(facts, sigmas_of(splits), leaks(splits))]
-    text += sections.limits(counts, made)
+    text += [
+        *sections.count_lines(counts),
+        *warning_lines(facts, summarize_sigmas(splits), leakage_lines(splits)),
+    ]
+    text += sections.limit_lines(counts, made)
     if facts is not None:
-        text += ["## Sensors and frames", "", *equipment(facts), *sections.FRAMES, ""]
-    text += [*figures, *sections.features(splits)]
-    text += ["## Provenance", "", *sections.ancestry(made), "", YOURS]
+        text += ["## Sensors and frames", "", *sensor_lines(facts), *sections.FRAMES, ""]
+    text += [*figures, *sections.column_lines(splits)]
+    text += ["## Provenance", "", *sections.ancestry_lines(made), "", USER_TEXT_MARK]
     written = "\n".join(text) + (yours or "\n")
-    about = croissant(
+    about = build_croissant(
         splits,
         made,
         title=str(title),
@@ -96,20 +101,26 @@ def write_card(
         parquet=dataset.parquet,
     )
     for path, content in ((readme, written), (readme.parent / CROISSANT, about)):
-        with rewritten_file(path) as partial:
+        with replace_file(path) as partial:
             partial.write_text(content, encoding="utf-8")
     return readme
 
 
-def _yours(readme: Path) -> str:
+def _read_user_text(readme: Path) -> str:
     """Return the text that a person wrote below the last line of the card; empty without any."""
     try:
-        return readme.read_text(encoding="utf-8").partition(YOURS)[2] if readme.is_file() else ""
+        return (
+            readme.read_text(encoding="utf-8").partition(USER_TEXT_MARK)[2]
+            if readme.is_file()
+            else ""
+        )
     except UnicodeDecodeError as e:
         raise DatasetError(f"{readme} is not UTF-8 ({e}). Save it as UTF-8, or remove it") from None
 
 
-def _draw(folder: Path, counts: dict[str, Counts], splits: dict[str, Split]) -> list[str]:
+def _draw_figures(
+    folder: Path, counts: dict[str, SplitCounts], splits: dict[str, Split]
+) -> list[str]:
     if plots is None:
         say("card without figures: pip install 'dmrl[plot]', then dmrl card")
         return []
@@ -129,7 +140,7 @@ def _draw(folder: Path, counts: dict[str, Counts], splits: dict[str, Split]) -> 
     return ["## Distributions", "", "Peers inside the images. Also as SVG.", "", *lines, ""]
 
 
-def _provenance(folder: Path) -> Provenance:
+def _read_provenance(folder: Path) -> Provenance:
     path = folder / FILE_NAME
     try:
         return Provenance.from_json(parse_json(path.read_text(encoding="utf-8")))
@@ -137,7 +148,7 @@ def _provenance(folder: Path) -> Provenance:
         raise DatasetError(f"{path} cannot be read ({e}). Make the dataset again") from None
 
 
-def _title(made: Provenance) -> str:
+def _default_title(made: Provenance) -> str:
     names = [source.name for source in made.inputs if not source.name.endswith(".csv")]
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
     return f"Peer robots in camera images: {names[0]}{more}" if names else "Peer robots"

@@ -10,12 +10,12 @@ from typing import Any
 
 import pyarrow as pa
 
-from dmrl.card.sections import MEANING
+from dmrl.card.sections import COLUMN_MEANINGS
 from dmrl.datasets import Split, layout
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.recording import Provenance
 
-NAME = "croissant.json"
+CROISSANT_FILE = "croissant.json"
 CONTEXT = {
     "@language": "en",
     "@vocab": "https://schema.org/",
@@ -36,10 +36,13 @@ CONTEXT = {
         *("replace", "samplingRate", "separator", "source", "subField", "transform"),
     )
 }
-KINDS = {"parquet": "application/x-parquet", "arrow": "application/vnd.apache.arrow.stream"}
+ENCODING_FORMATS = {
+    "parquet": "application/x-parquet",
+    "arrow": "application/vnd.apache.arrow.stream",
+}
 
 
-def croissant(
+def build_croissant(
     splits: Mapping[str, Split],
     made: Provenance,
     *,
@@ -82,53 +85,59 @@ def croissant(
             {"@type": "sc:CreativeWork", "name": name, "license": words}
             for name, words in sorted(licences.items())
         ],
-        "distribution": [_files(name, files[name], parquet=parquet) for name in splits],
-        "recordSet": [_rows(name, split) for name, split in splits.items()],
+        "distribution": [_describe_files(name, files[name], parquet=parquet) for name in splits],
+        "recordSet": [_describe_rows(name, split) for name, split in splits.items()],
     }
     return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
 
 
-def _files(split: str, files: Sequence[Path], *, parquet: bool) -> dict[str, Any]:
+def _describe_files(split: str, files: Sequence[Path], *, parquet: bool) -> dict[str, Any]:
     return {
         "@type": "cr:FileSet",
         "@id": f"{split}-shards",
         "name": f"{split}-shards",
         "description": f"Shards of the split {split}.",
-        "encodingFormat": KINDS["parquet" if parquet else "arrow"],
+        "encodingFormat": ENCODING_FORMATS["parquet" if parquet else "arrow"],
         "includes": [file.as_posix() for file in files],
     }
 
 
-def _rows(name: str, split: Split) -> dict[str, Any]:
+def _describe_rows(name: str, split: Split) -> dict[str, Any]:
     return {
         "@type": "cr:RecordSet",
         "@id": name,
         "name": name,
         "description": f"The {len(split)} images of the split {name}.",
-        "field": list(_fields(name, split)),
+        "field": list(_iter_fields(name, split)),
     }
 
 
-def _fields(name: str, split: Split) -> Iterator[dict[str, Any]]:
+def _iter_fields(name: str, split: Split) -> Iterator[dict[str, Any]]:
     height_px, width_px = split.image_shape
     sizes = {"height": height_px, "width": width_px, "stride": STRIDE_PX}
     for column in split.table.schema:
-        words = MEANING.get(column.name, "").format(**sizes)
-        field = _field(f"{name}/{column.name}", column.name, words)
+        words = COLUMN_MEANINGS.get(column.name, "").format(**sizes)
+        field = _describe_field(f"{name}/{column.name}", column.name, words)
         if pa.types.is_list(column.type) and pa.types.is_struct(column.type.value_type):
-            yield field | {"repeated": True, "subField": list(_peer(name, column, sizes))}
+            yield field | {
+                "repeated": True,
+                "subField": list(_iter_peer_fields(name, column, sizes)),
+            }
             continue
         if pa.types.is_fixed_size_list(column.type):
             field["repeated"] = True
         path = "bytes" if column.name == layout.IMAGE else ""
-        yield field | {"dataType": _kind(column), "source": _source(name, column.name, path)}
+        yield field | {
+            "dataType": _name_data_type(column),
+            "source": _describe_source(name, column.name, path),
+        }
 
 
-def _field(place: str, name: str, words: str) -> dict[str, Any]:
+def _describe_field(place: str, name: str, words: str) -> dict[str, Any]:
     return {"@type": "cr:Field", "@id": place, "name": name, "description": words}
 
 
-def _source(split: str, column: str, path: str) -> dict[str, Any]:
+def _describe_source(split: str, column: str, path: str) -> dict[str, Any]:
     source: dict[str, Any] = {
         "fileSet": {"@id": f"{split}-shards"},
         "extract": {"column": column},
@@ -136,19 +145,21 @@ def _source(split: str, column: str, path: str) -> dict[str, Any]:
     return source | ({"transform": {"jsonPath": path}} if path else {})
 
 
-def _peer(split: str, column: pa.Field, sizes: Mapping[str, int]) -> Iterator[dict[str, Any]]:
+def _iter_peer_fields(
+    split: str, column: pa.Field, sizes: Mapping[str, int]
+) -> Iterator[dict[str, Any]]:
     """Yield the fields of a column with several peers per row, each as a list."""
     for inner in column.type.value_type:
         where = f"{column.name}.{inner.name}"
-        field = _field(f"{split}/{column.name}/{inner.name}", inner.name, "")
-        field["description"] = MEANING.get(where, "").format(**sizes)
+        field = _describe_field(f"{split}/{column.name}/{inner.name}", inner.name, "")
+        field["description"] = COLUMN_MEANINGS.get(where, "").format(**sizes)
         yield field | {
-            "dataType": _kind(inner),
-            "source": _source(split, column.name, inner.name),
+            "dataType": _name_data_type(inner),
+            "source": _describe_source(split, column.name, inner.name),
         }
 
 
-def _kind(column: pa.Field) -> str:
+def _name_data_type(column: pa.Field) -> str:
     """Return the schema.org type of a column; for nested columns, of the values inside."""
     if column.name in (layout.IMAGE, layout.PIXELS):
         return "sc:ImageObject" if column.name == layout.IMAGE else "sc:Text"

@@ -6,30 +6,37 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dmrl import recipe as recipes
-from dmrl.atomic_output import grown_folder, note, partial_folder
+from dmrl.atomic_output import atomic_folder, extend_folder, register_output
 from dmrl.card import write_card
-from dmrl.card.facts import FILE as FACTS
-from dmrl.card.facts import merged, read_facts
+from dmrl.card.facts import FACTS_FILE as FACTS
+from dmrl.card.facts import merge_facts, read_facts
 from dmrl.card.front_matter import check_license
-from dmrl.card.recording_facts import About, facts_of, read_about
-from dmrl.datasets.huggingface_metadata import fingerprint_of, rewrite, write_names
-from dmrl.datasets.layout import MANIFEST
+from dmrl.card.recording_facts import RecordingFacts, build_facts, read_recording_facts
+from dmrl.datasets.huggingface_metadata import hash_document, write_json_if_changed, write_metadata
+from dmrl.datasets.layout import MANIFEST_FILE
 from dmrl.datasets.manifest import Manifest, part_folder, read_manifest
 from dmrl.datasets.settings import Settings
-from dmrl.datasets.writing.append import Before, made_of, opened
-from dmrl.datasets.writing.builder import Wanted, explain, has_masks, rows, unused, warn_of_others
+from dmrl.datasets.writing.append import ExistingDataset, open_existing, read_combined_provenance
+from dmrl.datasets.writing.builder import (
+    RowFilter,
+    has_masks,
+    iter_rows,
+    report_left_out,
+    warn_about_other_sources,
+    warn_about_unused_flags,
+)
 from dmrl.datasets.writing.dataset_writer import write_shards
 from dmrl.datasets.writing.exclusions import read_flags
-from dmrl.datasets.writing.inputs import warn_of_lenses
-from dmrl.datasets.writing.near_duplicates import Seen
-from dmrl.datasets.writing.parts import splits_of
-from dmrl.datasets.writing.rows import Tally
-from dmrl.datasets.writing.splits import SplitOf
+from dmrl.datasets.writing.inputs import warn_about_lenses
+from dmrl.datasets.writing.near_duplicates import ImageHashes
+from dmrl.datasets.writing.parts import assign_splits
+from dmrl.datasets.writing.rows import ExclusionCounts
+from dmrl.datasets.writing.splits import SplitLookup
 from dmrl.errors import SettingError
-from dmrl.recording import Contents, Provenance, provenance
+from dmrl.recording import LoadedRecording, Provenance, build_provenance
 from dmrl.recording.provenance import FILE_NAME as PROVENANCE
-from dmrl.recording.provenance_inputs import input_of
-from dmrl.storage import Remote
+from dmrl.recording.provenance_inputs import build_input
+from dmrl.storage import RemotePath
 from dmrl.terminal.progress import say
 
 MAX_HELD_IMAGES = 5_000
@@ -42,7 +49,7 @@ class Written(NamedTuple):
 
     images: dict[str, int]
     sources: dict[str, str]
-    tally: Tally
+    tally: ExclusionCounts
 
 
 def build_dataset(
@@ -50,8 +57,8 @@ def build_dataset(
 ) -> Written:
     """Write a dataset to ``out``; see ``dmrl.stages.dataset.run``."""
     check_license(settings.license)
-    before = Before(manifest=Manifest(parquet=settings.parquet))
-    with partial_folder(out) as partial:
+    before = ExistingDataset(manifest=Manifest(parquet=settings.parquet))
+    with atomic_folder(out) as partial:
         written = _write_part(partial, recordings, settings, before, workers)
         _describe(partial)
     return written
@@ -73,22 +80,24 @@ def extend_dataset(
     given
         Names of the settings that are not the default ones.
     """
-    settings = _settings_of(out, opened(out), settings, given)
-    written = Written({}, {}, Tally())
-    with grown_folder(out, MANIFEST) as partial:
-        before = opened(out)  # again: another may have added to it meanwhile
+    settings = _settings_of(out, open_existing(out), settings, given)
+    written = Written({}, {}, ExclusionCounts())
+    with extend_folder(out, MANIFEST_FILE) as partial:
+        before = open_existing(out)  # again: another may have added to it meanwhile
         known = {one.sha256 for one in before.inputs}
-        fresh = [path for path in recordings if input_of(path).sha256 not in known]
+        fresh = [path for path in recordings if build_input(path).sha256 not in known]
         if present := len(recordings) - len(fresh):
             say(f"{present} of {len(recordings)} recordings are in {out} already")
         if fresh:
             written = _write_part(partial, fresh, settings, before, workers)
-    note(out)
+    register_output(out)
     _describe(out)
     return written
 
 
-def _settings_of(out: Path, before: Before, settings: Settings, given: Collection[str]) -> Settings:
+def _settings_of(
+    out: Path, before: ExistingDataset, settings: Settings, given: Collection[str]
+) -> Settings:
     """Return the settings of a dataset, which those given must not contradict."""
     made = before.made
     assert made is not None
@@ -105,7 +114,11 @@ def _settings_of(out: Path, before: Before, settings: Settings, given: Collectio
 
 
 def _write_part(
-    folder: Path, recordings: Sequence[Path], settings: Settings, before: Before, workers: int
+    folder: Path,
+    recordings: Sequence[Path],
+    settings: Settings,
+    before: ExistingDataset,
+    workers: int,
 ) -> Written:
     """Write the shards of recordings, the manifest with them, and their facts."""
     if settings.masks and not any(has_masks(path) for path in recordings):
@@ -113,10 +126,10 @@ def _write_part(
     made = _provenance(recordings, settings)
     known, held = _read_labels(recordings, settings)
     sources = {path: one.source for path, one in known.items()}
-    warn_of_others(sources, {path: one.others for path, one in known.items()})
-    warn_of_lenses([px for one in known.values() for px in one.focal_px])
-    tally, seen = Tally(), Seen(before.seen())
-    found = rows(
+    warn_about_other_sources(sources, {path: one.others for path, one in known.items()})
+    warn_about_lenses([px for one in known.values() for px in one.focal_px])
+    tally, seen = ExclusionCounts(), ImageHashes(before.read_image_hashes())
+    found = iter_rows(
         held,
         sources,
         _assign_splits(known, made, settings, before),
@@ -128,18 +141,18 @@ def _write_part(
     )
     shards = write_shards(
         folder,
-        seen.new(found, tally.refuse_twin if before.made else None),
+        seen.filter_new(found, tally.count_duplicate if before.made else None),
         png=settings.png or settings.parquet,
         shard_images=settings.shard_images,
         before=before.manifest,
     )
     manifest = before.manifest.with_part(shards)
-    explain(recordings, manifest, tally, settings)
-    unused(settings, tally)
+    report_left_out(recordings, manifest, tally, settings)
+    warn_about_unused_flags(settings, tally)
     place = part_folder(folder, before.manifest.parts)
     place.mkdir(parents=True)
     made.write(place)
-    facts_of(known, tally, seen).write(place)
+    build_facts(known, tally, seen).write(place)
     seen.write(place)
     manifest.write(folder)  # last: from here on the part belongs to the dataset
     images = {
@@ -149,9 +162,12 @@ def _write_part(
 
 
 def _assign_splits(
-    known: Mapping[Path, About], made: Provenance, settings: Settings, before: Before
-) -> dict[Path, SplitOf]:
-    return splits_of(
+    known: Mapping[Path, RecordingFacts],
+    made: Provenance,
+    settings: Settings,
+    before: ExistingDataset,
+) -> dict[Path, SplitLookup]:
+    return assign_splits(
         {path: one.splits for path, one in known.items()},
         made,
         whole=settings.split == "none",
@@ -162,24 +178,28 @@ def _assign_splits(
     )
 
 
-def _select_images(settings: Settings) -> Wanted:
+def _select_images(settings: Settings) -> RowFilter:
     flagged = frozenset() if settings.without is None else read_flags(settings.without)
-    return Wanted(settings.keep_all, settings.masks, flagged)
+    return RowFilter(settings.keep_all, settings.masks, flagged)
 
 
 def _describe(folder: Path) -> None:
     """Write the files that follow from manifest and parts: names, provenance, facts, card."""
     manifest = read_manifest(folder)
     assert manifest is not None
-    made = made_of(folder, manifest).to_json()  # a kilobyte for each recording: once
+    made = read_combined_provenance(
+        folder, manifest
+    ).to_json()  # a kilobyte for each recording: once
     settings = made["settings"]
     about = {"description": str(settings["title"]), "license": str(settings["license"])}
-    write_names(folder, manifest, fingerprint=fingerprint_of(made), about=about)
-    rewrite(folder / PROVENANCE, made)
+    write_metadata(folder, manifest, fingerprint=hash_document(made), about=about)
+    write_json_if_changed(folder / PROVENANCE, made)
     del made
     parts = [read_facts(part_folder(folder, k)) for k in range(manifest.parts)]
-    rewrite(folder / FACTS, asdict(merged([part for part in parts if part is not None])))
-    if isinstance(folder, Remote):
+    write_json_if_changed(
+        folder / FACTS, asdict(merge_facts([part for part in parts if part is not None]))
+    )
+    if isinstance(folder, RemotePath):
         say(f"{folder}: the card is as it was; a bucket's would be read as a whole for it")
     else:
         write_card(folder)
@@ -188,18 +208,18 @@ def _describe(folder: Path) -> None:
 def _provenance(recordings: Sequence[Path], settings: Settings) -> Provenance:
     flags = [] if settings.without is None else [settings.without]
     inputs, libraries = [*recordings, *flags], ("pyarrow", "pillow")
-    return provenance("dataset", settings, inputs, seed=settings.seed, libraries=libraries)
+    return build_provenance("dataset", settings, inputs, seed=settings.seed, libraries=libraries)
 
 
 def _read_labels(
     recordings: Sequence[Path], settings: Settings
-) -> tuple[dict[Path, About], dict[Path, Contents]]:
+) -> tuple[dict[Path, RecordingFacts], dict[Path, LoadedRecording]]:
     """Return the facts of recordings, and the labels of the first, which are not read again."""
-    known: dict[Path, About] = {}
-    held: dict[Path, Contents] = {}
+    known: dict[Path, RecordingFacts] = {}
+    held: dict[Path, LoadedRecording] = {}
     images = 0
     for path in recordings:
-        known[path], labels = read_about(
+        known[path], labels = read_recording_facts(
             path, settings.labels, with_splits=settings.split == "auto"
         )
         images += known[path].images

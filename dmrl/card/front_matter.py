@@ -15,19 +15,19 @@ from dmrl.guards.bounded_parsing import parse_json
 HUB_LICENSES = ("unknown", "other", "odc-by", "odbl", "pddl", "c-uda")
 """Names of data licences that the Hub accepts and SPDX does not define."""
 
-SIZES = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M"}
+SIZE_CATEGORIES = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M"}
 
 
-def read_front(readme: Path) -> dict[str, str]:
+def read_front_matter(readme: Path) -> dict[str, str]:
     """Read the plain values of a card's front matter, by key; empty without a card."""
     if not readme.is_file():
         return {}
     lines = readme.read_text(encoding="utf-8").split("\n---\n")[0].splitlines()
     pairs = (line.partition(": ") for line in lines)
-    return {key: _scalar(value.strip()) for key, _, value in pairs if value}
+    return {key: _parse_scalar(value.strip()) for key, _, value in pairs if value}
 
 
-def _scalar(text: str) -> str:
+def _parse_scalar(text: str) -> str:
     # dmrl writes JSON strings; a person may have written a bare word.
     try:
         return str(parse_json(text))
@@ -59,7 +59,7 @@ def check_license(text: str) -> None:
         ) from None
 
 
-def front_matter(
+def build_front_matter(
     splits: dict[str, Split], title: str, license_id: str, files: Mapping[str, Sequence[Path]]
 ) -> Iterator[str]:
     """Yield the lines of the front matter, with the dashes around it.
@@ -75,7 +75,7 @@ def front_matter(
         other files, such as those of an interrupted ``--add``. Empty: Arrow dataset.
     """
     total = sum(map(len, splits.values()))
-    size = next((name for limit, name in SIZES.items() if total < limit), "n>1M")
+    size = next((name for limit, name in SIZE_CATEGORIES.items() if total < limit), "n>1M")
     schema = next(iter(splits.values())).table.schema
     sizes = [
         {"name": n, "num_bytes": s.table.nbytes, "num_examples": len(s)} for n, s in splits.items()
@@ -86,32 +86,32 @@ def front_matter(
         "task_categories": ["object-detection", "depth-estimation", "robotics"],
         "size_categories": [size],
         "tags": ["dmrl", "multi-robot", "relative-localization"],
-        "dataset_info": {"features": [_yaml_feature(f) for f in schema], "splits": sizes},
+        "dataset_info": {"features": [_to_yaml_feature(f) for f in schema], "splits": sizes},
     }
     if files:
         named = [{"split": name, "path": [p.as_posix() for p in files[name]]} for name in splits]
         front["configs"] = [{"config_name": "default", "data_files": named}]
-    yield from ("---", *_yaml(front), "---", "")
+    yield from ("---", *_format_yaml(front), "---", "")
 
 
-def _yaml_feature(column: pa.Field) -> dict[str, Any]:
+def _to_yaml_feature(column: pa.Field) -> dict[str, Any]:
     if column.name == layout.IMAGE:
         return {"name": column.name, "dtype": "image"}
-    inner = _yaml_type(column.type)
+    inner = _to_yaml_type(column.type)
     return {"name": column.name, **(inner if isinstance(inner, dict) else {"dtype": inner})}
 
 
-def _yaml_type(kind: pa.DataType) -> Any:
+def _to_yaml_type(kind: pa.DataType) -> Any:
     if pa.types.is_struct(kind):
-        return [_yaml_feature(f) for f in kind]
+        return [_to_yaml_feature(f) for f in kind]
     if pa.types.is_fixed_size_list(kind):
-        return {"list": _yaml_type(kind.value_type), "length": kind.list_size}
+        return {"list": _to_yaml_type(kind.value_type), "length": kind.list_size}
     if pa.types.is_list(kind):
-        return {"list": _yaml_type(kind.value_type)}
-    return layout.dtype_name(kind)
+        return {"list": _to_yaml_type(kind.value_type)}
+    return layout.to_dtype_name(kind)
 
 
-def _yaml(value: Any, indent: int = 0) -> Iterator[str]:
+def _format_yaml(value: Any, indent: int = 0) -> Iterator[str]:
     # JSON scalars are YAML; only blocks are laid out here.
     pad = " " * indent
     if isinstance(value, dict):
@@ -120,10 +120,10 @@ def _yaml(value: Any, indent: int = 0) -> Iterator[str]:
             yield (
                 f"{pad}{key}:" if block else f"{pad}{key}: {json.dumps(inner, ensure_ascii=False)}"
             )
-            yield from _yaml(inner, indent + 2) if block else ()
+            yield from _format_yaml(inner, indent + 2) if block else ()
     else:
         for item in value:
             block = isinstance(item, dict | list)
-            first, *rest = _yaml(item, indent + 2) if block else (json.dumps(item),)
+            first, *rest = _format_yaml(item, indent + 2) if block else (json.dumps(item),)
             yield f"{pad}- {first.lstrip()}"
             yield from rest

@@ -9,56 +9,56 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from dmrl.datasets import Split
-from dmrl.guards.safe_names import code, markdown
+from dmrl.guards.safe_names import escape_markdown, markdown_code
 
-NEAR_S = 1.0
+SIMILAR_WITHIN_S = 1.0
 """Two images of one camera within this time count as similar, seconds."""
-POSE = (1.0, 1.0, 0.01)
+SAME_POSE_LIMITS = (1.0, 1.0, 0.01)
 """Largest difference of equal poses: u and v, pixels, and depth, metres."""
 
 
-def leaks(splits: Mapping[str, Split]) -> Iterator[str]:
+def leakage_lines(splits: Mapping[str, Split]) -> Iterator[str]:
     """Yield Markdown lines on the content that each other split shares with train."""
     train = splits.get("train")
     for name, split in splits.items():
         if name == "train" or train is None or not len(split):
             continue
-        shared = sorted(set(_texts(split, "source")) & set(_texts(train, "source")))
-        place = ", ".join(map(code, shared)) or "no recording"
+        shared = sorted(set(_unique_texts(split, "source")) & set(_unique_texts(train, "source")))
+        place = ", ".join(map(markdown_code, shared)) or "no recording"
         yield (
-            f"- {markdown(name)} and train share {place}: images of one recording have similar "
+            f"- {escape_markdown(name)} and train share {place}: images of one recording have similar "
             "places, light and backgrounds."
         )
         yield (
-            f"- {near_in_time(split, train)} of {len(split)} images of {markdown(name)} were taken "
-            f"within {NEAR_S:g} s of one in train, by the same camera."
+            f"- {count_near_in_time(split, train)} of {len(split)} images of {escape_markdown(name)} were taken "
+            f"within {SIMILAR_WITHIN_S:g} s of one in train, by the same camera."
         )
-        shared_poses, poses = same_poses(split, train)
+        shared_poses, poses = count_same_poses(split, train)
         yield (
-            f"- {shared_poses} of {poses} labels of {markdown(name)} are within 1 px and 1 cm of "
+            f"- {shared_poses} of {poses} labels of {escape_markdown(name)} are within 1 px and 1 cm of "
             "one in train."
         )
 
 
-def _texts(split: Split, column: str) -> list[str]:
+def _unique_texts(split: Split, column: str) -> list[str]:
     return list(pc.unique(split.table[column]).to_pylist())
 
 
-def near_in_time(split: Split, train: Split) -> int:
+def count_near_in_time(split: Split, train: Split) -> int:
     """Count the images of a split within `SIMILAR_WITHIN_S` of one in train, by the same camera."""
     count = 0
-    known = _times(train)
-    for who, times in _times(split).items():
+    known = _sort_times(train)
+    for who, times in _sort_times(split).items():
         others = known.get(who)
         if others is not None:
             at = np.searchsorted(others, times)
             before = np.abs(times - others[np.maximum(at - 1, 0)])
             after = np.abs(times - others[np.minimum(at, len(others) - 1)])
-            count += int((np.minimum(before, after) <= NEAR_S * 1e9).sum())
+            count += int((np.minimum(before, after) <= SIMILAR_WITHIN_S * 1e9).sum())
     return count
 
 
-def _times(split: Split) -> dict[tuple[str, str], NDArray[np.int64]]:
+def _sort_times(split: Split) -> dict[tuple[str, str], NDArray[np.int64]]:
     """Return sorted log times by recording and robot."""
     names = list(zip(*(split.table[c].to_pylist() for c in ("source", "robot")), strict=True))
     times = split.table["log_time"].to_numpy()
@@ -68,25 +68,25 @@ def _times(split: Split) -> dict[tuple[str, str], NDArray[np.int64]]:
     return {who: np.sort(times[mine]) for who, mine in rows.items()}
 
 
-def same_poses(split: Split, train: Split) -> tuple[int, int]:
+def count_same_poses(split: Split, train: Split) -> tuple[int, int]:
     """Count the labels of a split whose pose is also in train, and all of its labels."""
-    mine, theirs = _values(split), _values(train)
+    mine, theirs = _collect_poses(split), _collect_poses(train)
     seen = np.zeros(len(mine), bool)
     # Two equal poses may lie on two sides of a cell's edge, so a grid shifted by half a cell counts
     # too.
     for shift in product((0.0, 0.5), repeat=3):
-        known, asked = (_boxes(values, shift) for values in (theirs, mine))
+        known, asked = (_name_pose_cells(values, shift) for values in (theirs, mine))
         seen |= np.isin(asked, known)
     return int(seen.sum()), len(mine)
 
 
-def _boxes(values: NDArray[np.float64], shift: tuple[float, ...]) -> NDArray[np.str_]:
+def _name_pose_cells(values: NDArray[np.float64], shift: tuple[float, ...]) -> NDArray[np.str_]:
     """Return the names of the cells that poses fall into, in a shifted grid."""
-    boxes = np.floor(values / POSE + shift).astype(np.int64)
+    boxes = np.floor(values / SAME_POSE_LIMITS + shift).astype(np.int64)
     return np.array([f"{u} {v} {depth}" for u, v, depth in boxes.tolist()], np.str_)
 
 
-def _values(split: Split) -> NDArray[np.float64]:
+def _collect_poses(split: Split) -> NDArray[np.float64]:
     """Return u, v and depth of all labels, (M, 3)."""
     flat = pa.chunked_array(split.table["peers"]).combine_chunks().flatten()
     return np.column_stack([pc.struct_field(flat, n) for n in ("u_px", "v_px", "depth_m")])

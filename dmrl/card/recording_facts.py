@@ -6,17 +6,22 @@ from pathlib import Path
 
 from dmrl import topics
 from dmrl.card.facts import Facts
-from dmrl.card.sensor_facts import cameras_of, sensors_of
-from dmrl.datasets.writing.inputs import focal_lengths
-from dmrl.datasets.writing.near_duplicates import Seen
-from dmrl.datasets.writing.rows import Tally, count_images, label_source, sources_of
-from dmrl.recording import Contents, label_findings, splits
+from dmrl.card.sensor_facts import describe_cameras, find_sensor_patterns
+from dmrl.datasets.writing.inputs import read_focal_lengths
+from dmrl.datasets.writing.near_duplicates import ImageHashes
+from dmrl.datasets.writing.rows import (
+    ExclusionCounts,
+    choose_label_source,
+    count_images,
+    find_label_sources,
+)
+from dmrl.recording import LoadedRecording, list_label_findings, read_splits
 from dmrl.recording.licences import licences_in
 from dmrl.recording.mcap.shared_file import share_file
 
 
 @dataclass(frozen=True, slots=True)
-class About:
+class RecordingFacts:
     """Facts about one recording for the stage and the card: a few short strings; see `Facts`."""
 
     source: str
@@ -30,7 +35,9 @@ class About:
     splits: Mapping[str, Sequence[tuple[int, int]]]
 
 
-def read_about(path: Path, wanted: str, *, with_splits: bool) -> tuple[About, Contents]:
+def read_recording_facts(
+    path: Path, wanted: str, *, with_splits: bool
+) -> tuple[RecordingFacts, LoadedRecording]:
     """Read the facts of a recording, and its labels, which may be needed again soon.
 
     Parameters
@@ -50,34 +57,36 @@ def read_about(path: Path, wanted: str, *, with_splits: bool) -> tuple[About, Co
         If the recording has no labels from that source.
     """
     with share_file(path):
-        held = Contents(path, topics.LABELS, topics.CALIBRATION)
+        held = LoadedRecording(path, topics.LABELS, topics.CALIBRATION)
         images = count_images(held)
-        source = label_source(held, wanted)
-        about = About(
+        source = choose_label_source(held, wanted)
+        about = RecordingFacts(
             source,
-            tuple(sorted(sources_of(held) - {source})),
+            tuple(sorted(find_label_sources(held) - {source})),
             images,
-            tuple(focal_lengths(held)),
-            tuple(sensors_of(held.topics)),
-            tuple(label_findings(held)),
+            tuple(read_focal_lengths(held)),
+            tuple(find_sensor_patterns(held.topics)),
+            tuple(list_label_findings(held)),
             dict(sorted(licences_in(held.summary))),
-            cameras_of([held]),
-            splits(path, held.summary) if with_splits else {},
+            describe_cameras([held]),
+            read_splits(path, held.summary) if with_splits else {},
         )
     return about, held
 
 
-def facts_of(known: Mapping[Path, About], tally: Tally, seen: Seen) -> Facts:
+def build_facts(
+    known: Mapping[Path, RecordingFacts], tally: ExclusionCounts, seen: ImageHashes
+) -> Facts:
     """Build the facts of a dataset from its recordings, exclusions and image hashes."""
-    near, compared, outside = seen.near()
+    near, compared, outside = seen.count_near_duplicates()
     sensors = {pattern for one in known.values() for pattern in one.sensors}
     return Facts(
-        {why: count for why, count in tally.left_out().items() if count},
+        {why: count for why, count in tally.count_by_reason().items() if count},
         {path.name: one.source for path, one in known.items()},
         {path.name: one.others for path, one in known.items() if one.others},
         {path.name: one.findings for path, one in known.items() if one.findings},
         dict(sorted(pair for one in known.values() for pair in one.licences.items())),
-        seen.twins(),
+        seen.count_exact_duplicates(),
         near,
         0 if compared == outside else compared,
         [row.pattern for row in topics.TOPICS if row.pattern in sensors],

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 import numpy as np
 import pyarrow as pa
 
-from dmrl.card.statistics import Counts
+from dmrl.card.statistics import SplitCounts
 from dmrl.datasets import Split, layout
 from dmrl.geometry.frames import STRIDE_PX
-from dmrl.guards.safe_names import code, markdown
+from dmrl.guards.safe_names import escape_markdown, markdown_code
 from dmrl.recording import Provenance
 
-MEANING = {
+COLUMN_MEANINGS = {
     layout.PIXELS: "image, {height} x {width} x 3 bytes, RGB, row by row from the top left",
     layout.IMAGE: "image, {height} x {width} px, PNG, RGB",
     layout.MASKS: "index of the peer in {height} x {width} pixels, from 1 in `peers`; 0: no peer",
@@ -38,17 +38,17 @@ MEANING = {
 """Meaning and unit of each column."""
 
 
-def about(splits: dict[str, Split], title: str, made: Provenance) -> list[str]:
+def intro_lines(splits: dict[str, Split], title: str, made: Provenance) -> list[str]:
     """Return the title and a summary of the dataset."""
     height_px, width_px = next(iter(splits.values())).image_shape
     rows, cols = next(iter(splits.values())).grid_shape
     return [
-        f"# {markdown(title)}",
+        f"# {escape_markdown(title)}",
         "",
         f"{sum(map(len, splits.values()))} camera images of {width_px} x {height_px} px, each with "
         "the pixel position and depth of the peer robots in it, and the same as grid labels of "
         f"{rows} x {cols} cells for training a network. Every row names its recording and time.",
-        f"Made with dmrl {markdown(made.dmrl_version)}.",
+        f"Made with dmrl {escape_markdown(made.dmrl_version)}.",
         "",
         "Pixels: u right, v down from the top-left corner, pixel-edge coordinates. Lengths in "
         "metres, times in nanoseconds. Depth is measured along the optical axis.",
@@ -56,13 +56,13 @@ def about(splits: dict[str, Split], title: str, made: Provenance) -> list[str]:
     ]
 
 
-def loading(splits: dict[str, Split], *, parquet: bool) -> list[str]:
+def loading_lines(splits: dict[str, Split], *, parquet: bool) -> list[str]:
     """Return code that opens the dataset with three packages; DATASET stands for its folder."""
     name, split = next(iter(splits.items()))
     png = layout.IMAGE in split.table.schema.names
     ways = {
-        "datasets": _with_datasets(name, split, png=png, parquet=parquet),
-        "pyarrow": _with_pyarrow(name, parquet=parquet),
+        "datasets": _datasets_snippet(name, split, png=png, parquet=parquet),
+        "pyarrow": _pyarrow_snippet(name, parquet=parquet),
         "dmrl": f"""from pathlib import Path
 
 from dmrl.datasets import open_dataset
@@ -82,7 +82,7 @@ rgb, confidence, depth = split.pixels[0][0], split.confidence[0], split.depth[0]
     return lines
 
 
-def _with_datasets(name: str, split: Split, *, png: bool, parquet: bool) -> str:
+def _datasets_snippet(name: str, split: Split, *, png: bool, parquet: bool) -> str:
     height_px, width_px = split.image_shape
     load = "load_dataset" if parquet else "load_from_disk"
     raw = f'np.frombuffer(row["pixels"], np.uint8).reshape({height_px}, {width_px}, 3)'
@@ -93,7 +93,7 @@ row = {load}("DATASET")["{name}"][0]
 rgb = {'np.asarray(row["image"])' if png else raw}"""
 
 
-def _with_pyarrow(name: str, *, parquet: bool) -> str:
+def _pyarrow_snippet(name: str, *, parquet: bool) -> str:
     if parquet:
         return f"""from glob import glob
 
@@ -108,23 +108,27 @@ shard = sorted(glob("DATASET/{name}/data-*.arrow"))[0]
 table = pa.ipc.open_stream(pa.memory_map(shard)).read_all()  # no copy"""
 
 
-def numbers(counts: dict[str, Counts]) -> list[str]:
+def count_lines(counts: dict[str, SplitCounts]) -> list[str]:
     """Return tables of images, peers and label sources, by split and by recording."""
     lines = ["## Numbers", "", "| split | images | with a peer | peers | depth, m | labels from |"]
     lines.append("|---|--:|--:|--:|--:|---|")
     for name, c in counts.items():
         low, high = (c.depth_m.min(), c.depth_m.max()) if c.depth_m.size else (0.0, 0.0)
         sources = ", ".join(
-            f"{markdown(source)} ({n})" for source, n in sorted(c.label_sources.items())
+            f"{escape_markdown(source)} ({n})" for source, n in sorted(c.label_sources.items())
         )
         lines.append(
-            f"| {markdown(name)} | {c.images} | {int((c.peers > 0).sum())} | {int(c.peers.sum())} "
+            f"| {escape_markdown(name)} | {c.images} | {int((c.peers > 0).sum())} | {int(c.peers.sum())} "
             f"| {low:.2f} to {high:.2f} | {sources} |"
         )
     lines += ["", "Peers and depths count peers inside the image, labels all of them.", ""]
     lines += ["| recording | split | images |", "|---|---|--:|"]
     rows = sorted((r, name, n) for name, c in counts.items() for r, n in c.recordings.items())
-    return [*lines, *(f"| {markdown(r)} | {markdown(name)} | {n} |" for r, name, n in rows), ""]
+    return [
+        *lines,
+        *(f"| {escape_markdown(r)} | {escape_markdown(name)} | {n} |" for r, name, n in rows),
+        "",
+    ]
 
 
 FRAMES = (
@@ -132,11 +136,15 @@ FRAMES = (
     "along the optical axis, y left, z up; depth is its x. Without distortion, a point lies focal "
     "length * (y, z) / x pixels from the centre of the lens.",
 )
-MADE_UP = {"render": "rendered", "sketch": "drawn by code", "fly": "from simulated flights"}
+SYNTHETIC_STAGES = {
+    "render": "rendered",
+    "sketch": "drawn by code",
+    "fly": "from simulated flights",
+}
 """Stages that make images without a camera, in words."""
 
 
-def limits(counts: dict[str, Counts], made: Provenance) -> list[str]:
+def limit_lines(counts: dict[str, SplitCounts], made: Provenance) -> list[str]:
     """Return the limits of a network that learns from the dataset."""
     depth_m = np.concatenate([c.depth_m for c in counts.values()])
     images = sum(c.images for c in counts.values())
@@ -154,50 +162,50 @@ def limits(counts: dict[str, Counts], made: Provenance) -> list[str]:
         f"- {empty} of {images} images show no peer. They train a network to avoid false alarms. "
         f"The largest number of peers in one image is {most}."
     )
-    stages = {one.stage for _, source in made.ancestry() if (one := source.provenance)}
-    if simulated := [words for stage, words in MADE_UP.items() if stage in stages]:
+    stages = {one.stage for _, source in made.iter_ancestors() if (one := source.provenance)}
+    if simulated := [words for stage, words in SYNTHETIC_STAGES.items() if stage in stages]:
         lines.append(f"- Images are {', or '.join(simulated)}. Those of a real camera differ.")
-    told = ", ".join(f"{markdown(name)} {n}" for name, n in sorted(statuses.items()))
+    told = ", ".join(f"{escape_markdown(name)} {n}" for name, n in sorted(statuses.items()))
     return [*lines, f"- Labels by status: {told or 'none'}.", ""]
 
 
-def features(splits: dict[str, Split]) -> list[str]:
+def column_lines(splits: dict[str, Split]) -> list[str]:
     """Return a table of the columns with type, unit and meaning."""
     split = next(iter(splits.values()))
     height_px, width_px = split.image_shape
     rows, cols = split.grid_shape
     values = {"height": height_px, "width": width_px, "stride": STRIDE_PX}
     lines = ["## Columns", "", "| column | type | meaning |", "|---|---|---|"]
-    for name, kind in _columns(split.table.schema):
+    for name, kind in _iter_columns(split.table.schema):
         text = "grid" if name in (layout.CONFIDENCE, layout.DEPTH) else str(kind)
-        kind_text = f"{rows} x {cols} float32" if text == "grid" else layout.dtype_name(kind)
-        meaning = MEANING.get(name, "").format(**values)
+        kind_text = f"{rows} x {cols} float32" if text == "grid" else layout.to_dtype_name(kind)
+        meaning = COLUMN_MEANINGS.get(name, "").format(**values)
         lines.append(f"| `{name}` | {kind_text.partition('<')[0]} | {meaning} |")
     return [*lines, ""]
 
 
-def _columns(schema: pa.Schema) -> Iterator[tuple[str, pa.DataType]]:
+def _iter_columns(schema: pa.Schema) -> Iterator[tuple[str, pa.DataType]]:
     for column in schema:
         yield column.name, column.type
         if column.name == "peers":
             yield from ((f"peers.{f.name}", f.type) for f in column.type.value_type)
 
 
-def ancestry(made: Provenance) -> Iterator[str]:
+def ancestry_lines(made: Provenance) -> Iterator[str]:
     """Yield a nested list of the stages: settings, versions, and the hash of every input."""
-    yield from _stage(made, "")
-    for depth, source in made.ancestry():
+    yield from _stage_lines(made, "")
+    for depth, source in made.iter_ancestors():
         pad = "  " * (2 * depth + 1)
-        yield f"{pad}- input {code(source.name)}, SHA-256 {code(source.sha256)}"
+        yield f"{pad}- input {markdown_code(source.name)}, SHA-256 {markdown_code(source.sha256)}"
         if source.provenance is not None:
-            yield from _stage(source.provenance, pad + "  ")
+            yield from _stage_lines(source.provenance, pad + "  ")
 
 
-def _stage(made: Provenance, pad: str) -> Iterator[str]:
+def _stage_lines(made: Provenance, pad: str) -> Iterator[str]:
     seed = "" if made.seed is None else f", seed {made.seed}"
     libraries = "".join(f", {name} {version}" for name, version in made.libraries.items())
-    versions = markdown(f", dmrl {made.dmrl_version}{seed}{libraries}")
-    yield f"{pad}- **{markdown(made.stage)}**{versions}"
+    versions = escape_markdown(f", dmrl {made.dmrl_version}{seed}{libraries}")
+    yield f"{pad}- **{escape_markdown(made.stage)}**{versions}"
     if made.settings:
         settings = ", ".join(f"{key} = {value!r}" for key, value in made.settings.items())
-        yield f"{pad}  - settings: {code(settings)}"
+        yield f"{pad}  - settings: {markdown_code(settings)}"

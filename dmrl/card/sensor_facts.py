@@ -5,33 +5,33 @@ from itertools import islice
 from typing import Any
 
 from dmrl import topics
-from dmrl.recording import Contents
+from dmrl.recording import LoadedRecording
 
-NEVER = (topics.CAMERA_IMAGE, topics.LABELS, topics.DETECTIONS, topics.GRID, topics.TRACKS)
+NOT_SENSORS = (topics.CAMERA_IMAGE, topics.LABELS, topics.DETECTIONS, topics.GRID, topics.TRACKS)
 """Topics that a dataset consists of, or that models compute: no sensors."""
 
 
-def sensors_of(names: Iterable[str]) -> list[str]:
+def find_sensor_patterns(names: Iterable[str]) -> list[str]:
     """Return the patterns of sensor topics among these topics, in the order of the table."""
     names = set(names)
-    patterns = (row.pattern for row in topics.TOPICS if row.pattern not in NEVER)
-    return [p for p in patterns if any(topics.names(p, name) is not None for name in names)]
+    patterns = (row.pattern for row in topics.TOPICS if row.pattern not in NOT_SENSORS)
+    return [p for p in patterns if any(topics.parse_topic(p, name) is not None for name in names)]
 
 
-def cameras_of(held: Iterable[Contents]) -> dict[str, str]:
+def describe_cameras(held: Iterable[LoadedRecording]) -> dict[str, str]:
     """Describe the first calibration of each robot's camera, by recording and robot."""
     found = {}
     for one in held:
         for topic in one.topics:
-            if (names := topics.names(topics.CALIBRATION, topic)) is None:
+            if (names := topics.parse_topic(topics.CALIBRATION, topic)) is None:
                 continue
-            for stamped in islice(one.messages(topic), 1):
-                if words := _camera(stamped.message):
+            for stamped in islice(one.iter_messages(topic), 1):
+                if words := _describe_camera(stamped.message):
                     found[f"{one.path.name}: {names['robot']}"] = words
     return found
 
 
-def _camera(calibration: Any) -> str:
+def _describe_camera(calibration: Any) -> str:
     """Describe a CameraCalibration in words; empty unless K is a row-major 3 x 3 matrix."""
     if len(calibration.K) != 9:
         return ""

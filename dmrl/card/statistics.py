@@ -10,11 +10,11 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from dmrl.datasets import Split
-from dmrl.geometry.frames import inside
+from dmrl.geometry.frames import is_inside
 
 
 @dataclass(frozen=True)
-class Counts:
+class SplitCounts:
     """Numbers of one split.
 
     Parameters
@@ -44,7 +44,9 @@ class Counts:
     statuses: Counter[str]
 
 
-def sigmas_of(splits: Mapping[str, Split]) -> dict[str, tuple[int, int, float, float, float]]:
+def summarize_sigmas(
+    splits: Mapping[str, Split],
+) -> dict[str, tuple[int, int, float, float, float]]:
     """Summarize the sigmas of labels by source.
 
     Returns
@@ -68,15 +70,15 @@ def sigmas_of(splits: Mapping[str, Split]) -> dict[str, tuple[int, int, float, f
     return found
 
 
-def count(split: Split) -> Counts:
+def count_split(split: Split) -> SplitCounts:
     """Count images, peers, sources, recordings and statuses of one split."""
     peers = pa.chunked_array(split.table["peers"]).combine_chunks()
     flat = peers.flatten()
     uv_px = np.column_stack([pc.struct_field(flat, name) for name in ("u_px", "v_px")])
     height_px, width_px = split.image_shape
-    seen = inside(uv_px, width_px, height_px)
+    seen = is_inside(uv_px, width_px, height_px)
     image = pc.list_parent_indices(peers).to_numpy()[seen]
-    return Counts(
+    return SplitCounts(
         images=len(split),
         peers=np.bincount(image, minlength=len(split)),
         uv_px=uv_px[seen],

@@ -4,7 +4,7 @@
 `query` filters them with SQL.
 """
 
-from dmrl.catalogue.describe import Row, describe, unread
-from dmrl.catalogue.table import NAME, Catalogue, open_catalogue
+from dmrl.catalogue.describe import Row, describe, unreadable_row
+from dmrl.catalogue.table import FILE_NAME, Catalogue, open_catalogue
 
-__all__ = ["NAME", "Catalogue", "Row", "describe", "open_catalogue", "unread"]
+__all__ = ["FILE_NAME", "Catalogue", "Row", "describe", "open_catalogue", "unreadable_row"]

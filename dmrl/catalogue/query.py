@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from dmrl.catalogue.table import NAME, Catalogue, open_catalogue, stamp
+from dmrl.catalogue.table import FILE_NAME, Catalogue, file_stamp, open_catalogue
 from dmrl.errors import MissingExtra, RecordingError, SettingError
 from dmrl.guards import limits
-from dmrl.guards.safe_names import inside
+from dmrl.guards.safe_names import safe_join
 
 try:
     import duckdb
 except ModuleNotFoundError as e:
     raise MissingExtra("duckdb", "index", "dmrl find") from e
 
-FLAT = """
+FLAT_QUERY = """
 WITH seen AS (SELECT recording, unnest(cameras) AS c FROM held),
 counted AS (SELECT recording, unnest(labels) AS l FROM held),
 labelled AS (
@@ -38,10 +38,10 @@ SELECT held.* REPLACE (
 FROM held LEFT JOIN seen ON seen.recording = held.recording
 LEFT JOIN labelled ON labelled.recording = held.recording AND labelled.camera = seen.c.camera
 """
-QUOTED = re.compile(r"""'(?:[^']|'')*'|"((?:[^"]|"")*)\"""")
+QUOTED_TEXT = re.compile(r"""'(?:[^']|'')*'|"((?:[^"]|"")*)\"""")
 
 
-def find(catalogue: Catalogue, query: str) -> pa.Table:
+def find_rows(catalogue: Catalogue, query: str) -> pa.Table:
     """Return the rows of matching recordings, in the order of their names.
 
     Parameters
@@ -68,17 +68,19 @@ def find(catalogue: Catalogue, query: str) -> pa.Table:
         "lock_configuration": True,
     }
     with duckdb.connect(config=own) as asked:
-        flat = asked.from_arrow(catalogue.table).query("held", FLAT)
+        flat = asked.from_arrow(catalogue.table).query("held", FLAT_QUERY)
         try:
-            chosen = flat.filter(_quoted(query, flat.columns)).project("recording").distinct()
+            chosen = (
+                flat.filter(_convert_quotes(query, flat.columns)).project("recording").distinct()
+            )
             names = {name for (name,) in chosen.fetchall()}
         except duckdb.Error as e:
-            raise SettingError(_wrong(query, str(e), flat.columns)) from None
+            raise SettingError(_query_error(query, str(e), flat.columns)) from None
     mask = pa.array([name in names for name in catalogue.table["recording"].to_pylist()])
     return catalogue.table.filter(mask.cast(pa.bool_()))
 
 
-def found_in(folder: Path, query: str) -> list[Path]:
+def find_recordings(folder: Path, query: str) -> list[Path]:
     """Return the matching recordings of a folder, in the order of their names.
 
     Raises
@@ -88,17 +90,17 @@ def found_in(folder: Path, query: str) -> list[Path]:
     SettingError, MissingExtra
         As `find_rows`.
     """
-    found = find(open_catalogue(folder), query)
+    found = find_rows(open_catalogue(folder), query)
     rows = zip(found["recording"].to_pylist(), found["stamp"].to_pylist(), strict=True)
-    return [_as_it_was(folder, name, was) for name, was in rows]
+    return [_check_unchanged(folder, name, was) for name, was in rows]
 
 
-def _as_it_was(folder: Path, name: str, was: str) -> Path:
+def _check_unchanged(folder: Path, name: str, was: str) -> Path:
     path = folder
     for part in name.split("/"):
-        path = inside(path, part, f"{folder / NAME}: a recording")
+        path = safe_join(path, part, f"{folder / FILE_NAME}: a recording")
     try:
-        same = stamp(path) == was
+        same = file_stamp(path) == was
     except OSError:
         same = False
     if not same:
@@ -106,18 +108,18 @@ def _as_it_was(folder: Path, name: str, was: str) -> Path:
     return path
 
 
-def _quoted(query: str, columns: list[str]) -> str:
+def _convert_quotes(query: str, columns: list[str]) -> str:
     """Convert texts in double quotes to SQL's single quotes."""
 
-    def single(found: re.Match[str]) -> str:
+    def to_single_quotes(found: re.Match[str]) -> str:
         name = found[1]
         if name is None or name in columns:
             return found[0]
         return "'" + name.replace('""', '"').replace("'", "''") + "'"
 
-    return QUOTED.sub(single, query)
+    return QUOTED_TEXT.sub(to_single_quotes, query)
 
 
-def _wrong(query: str, said: str, columns: list[str]) -> str:
+def _query_error(query: str, said: str, columns: list[str]) -> str:
     why = said.splitlines()[0].removesuffix("!") if said else "it cannot be answered"
     return f"the query {query!r}: {why}. Columns: {', '.join(columns)}"

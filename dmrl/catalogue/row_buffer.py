@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import pyarrow as pa
 
 from dmrl.catalogue.describe import Row
-from dmrl.catalogue.table import rows_table
+from dmrl.catalogue.table import to_table
 
 BUFFERED_ROWS = 500
 """Most rows that are held as Python values."""
@@ -15,7 +15,7 @@ BUFFERED_ROWS = 500
 class RowBuffer:
     """Rows in the order in which they were added."""
 
-    parts: list[pa.Table] = field(default_factory=lambda: [rows_table([])])
+    parts: list[pa.Table] = field(default_factory=lambda: [to_table([])])
     buffered: list[Row] = field(default_factory=list)
 
     def add(self, row: Row) -> None:
@@ -30,5 +30,5 @@ class RowBuffer:
         return pa.concat_tables(self.parts)
 
     def _flush(self) -> None:
-        self.parts.append(rows_table(self.buffered))
+        self.parts.append(to_table(self.buffered))
         self.buffered.clear()

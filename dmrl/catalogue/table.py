@@ -12,21 +12,21 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from dmrl.atomic_output import rewritten_file
+from dmrl.atomic_output import replace_file
 from dmrl.catalogue.describe import Row
 from dmrl.errors import RecordingError
-from dmrl.guards.memory import Bounded
+from dmrl.guards.memory import MemoryLimit
 
-NAME = "catalogue.parquet"
-MARK = {b"dmrl.catalogue": b"1"}
+FILE_NAME = "catalogue.parquet"
+FORMAT_MARK = {b"dmrl.catalogue": b"1"}
 """Metadata of the file that identifies a catalogue and its version."""
-SHA256 = ("sha256", pa.string())
+SHA256_COLUMN = ("sha256", pa.string())
 COLUMNS = pa.schema(
     [
         ("recording", pa.string()),
         ("bytes", pa.int64()),
         ("stamp", pa.string()),
-        SHA256,
+        SHA256_COLUMN,
         ("error", pa.string()),
         ("start_ns", pa.int64()),
         ("duration_s", pa.float64()),
@@ -68,7 +68,7 @@ COLUMNS = pa.schema(
         ("stage", pa.string()),
         ("dmrl_version", pa.string()),
         ("settings", pa.string()),
-        ("inputs", pa.list_(pa.struct([("name", pa.string()), SHA256]))),
+        ("inputs", pa.list_(pa.struct([("name", pa.string()), SHA256_COLUMN]))),
         ("errors", pa.int64()),
         ("warnings", pa.int64()),
         (
@@ -78,13 +78,13 @@ COLUMNS = pa.schema(
             ),
         ),
     ],
-    metadata=MARK,
+    metadata=FORMAT_MARK,
 )
 """One row per recording, with lists of structs for repeated items."""
 
-ALWAYS = ("recording", "bytes", "stamp")
+REQUIRED_COLUMNS = ("recording", "bytes", "stamp")
 """Columns without nulls."""
-PERHAPS = ("width_px", "height_px", "focal_px")
+OPTIONAL_FIELDS = ("width_px", "height_px", "focal_px")
 """Fields of a camera that may be null."""
 
 
@@ -106,9 +106,9 @@ class Catalogue:
     @property
     def file(self) -> Path:
         """Path of the Parquet file."""
-        return self.folder / NAME
+        return self.folder / FILE_NAME
 
-    def unchanged(self, stamps: Mapping[str, str]) -> set[str]:
+    def find_unchanged(self, stamps: Mapping[str, str]) -> set[str]:
         """Return the recordings with valid rows. Unreadable ones are never valid.
 
         Parameters
@@ -120,7 +120,7 @@ class Catalogue:
         rows = zip(*columns, strict=True)
         return {name for name, stamp, e in rows if e is None and stamps.get(name) == stamp}
 
-    def with_rows(self, kept: Iterable[str], fresh: pa.Table) -> "Catalogue":
+    def replace_rows(self, kept: Iterable[str], fresh: pa.Table) -> "Catalogue":
         """Return a catalogue with the kept rows and fresh rows."""
         kept_names = set(kept)
         mask = pa.array([name in kept_names for name in self.table["recording"].to_pylist()])
@@ -135,17 +135,17 @@ class Catalogue:
         OutputError
             If the file system rejects it.
         """
-        with rewritten_file(self.file) as partial:
+        with replace_file(self.file) as partial:
             pq.write_table(self.table.combine_chunks(), partial, compression="zstd")
 
 
-def stamp(path: Path) -> str:
+def file_stamp(path: Path) -> str:
     """Return size and times of a file, which change with its content."""
     found = path.stat()
     return f"{found.st_size} {found.st_mtime_ns} {found.st_ctime_ns}"
 
 
-def rows_table(rows: Iterable[Row]) -> pa.Table:
+def to_table(rows: Iterable[Row]) -> pa.Table:
     """Convert rows to a table. Missing values are null."""
     return pa.Table.from_pylist(list(rows), schema=COLUMNS)
 
@@ -165,24 +165,27 @@ def open_catalogue(folder: Path, *, new: bool = False) -> Catalogue:
     RecordingError
         If the folder or its catalogue does not exist, or the file is damaged or of another version.
     """
-    file = folder / NAME
+    file = folder / FILE_NAME
     if not folder.is_dir():
         raise RecordingError(f"no folder {folder}. Check the name")
     if not file.is_file():
         if new and not file.exists():
-            return Catalogue(folder, rows_table([]))
+            return Catalogue(folder, to_table([]))
         raise RecordingError(f"{folder} has no catalogue. Make it: dmrl index {folder}")
     try:
-        with Bounded(file.stat().st_size):
+        with MemoryLimit(file.stat().st_size):
             table = pq.read_table(file)
             table.validate(full=True)
-        _refuse_odd(table)
+        _check_table(table)
     except (pa.ArrowException, OSError, ValueError, MemoryError) as e:
         why = " ".join(str(e).split())
         raise RecordingError(
             f"{file} is damaged ({why}). Remove it, then: dmrl index {folder}"
         ) from None
-    if not table.schema.equals(COLUMNS) or (table.schema.metadata or {}).items() < MARK.items():
+    if (
+        not table.schema.equals(COLUMNS)
+        or (table.schema.metadata or {}).items() < FORMAT_MARK.items()
+    ):
         raise RecordingError(
             f"{file} is not a catalogue of this version of dmrl. Move it away, then: "
             f"dmrl index {folder}"
@@ -190,17 +193,17 @@ def open_catalogue(folder: Path, *, new: bool = False) -> Catalogue:
     return Catalogue(folder, table)
 
 
-def _lacks_inner(column: pa.Array) -> bool:
+def _has_inner_nulls(column: pa.Array) -> bool:
     """Return whether a list of the column, or a required field of its structs, has a null."""
     if not pa.types.is_list(column.type):
         return False
     inner = column.flatten()
     structs = pa.types.is_struct(inner.type)
-    fields = [f.name for f in inner.type if f.name not in PERHAPS] if structs else []
+    fields = [f.name for f in inner.type if f.name not in OPTIONAL_FIELDS] if structs else []
     return bool(inner.null_count or any(inner.field(name).null_count for name in fields))
 
 
-def _refuse_odd(table: pa.Table) -> None:
+def _check_table(table: pa.Table) -> None:
     """Raise ValueError unless required values exist and names stay inside the folder.
 
     Raises
@@ -212,7 +215,7 @@ def _refuse_odd(table: pa.Table) -> None:
         return  # written by another version
     for name in table.column_names:
         column = table[name].combine_chunks()
-        if (name in ALWAYS and column.null_count) or _lacks_inner(column):
+        if (name in REQUIRED_COLUMNS and column.null_count) or _has_inner_nulls(column):
             raise ValueError(f"{name} lacks values")
     focal_px = table["cameras"].combine_chunks().flatten().field("focal_px")
     for name, numbers in (("duration_s", table["duration_s"]), ("focal_px", focal_px)):

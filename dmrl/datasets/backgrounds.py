@@ -15,23 +15,23 @@ from dmrl.datasets import Split, is_dataset, open_dataset
 from dmrl.errors import SettingError
 from dmrl.images.bayer import load_opencv
 from dmrl.images.codec import Rgb
-from dmrl.rendering.backgrounds.photos import Photos, photos_in
-from dmrl.rendering.backgrounds.rooms import ROOMS, rooms
+from dmrl.rendering.backgrounds.photos import Photos, open_photos
+from dmrl.rendering.backgrounds.rooms import ROOMS, open_rooms
 
-MOST_HIDDEN = 0.15
+MAX_HIDDEN_SHARE = 0.15
 """Largest share of an image that may be painted over. Beyond it, too little background is left."""
-BEYOND_BOX = 0.15
+MARGIN_SHARE_OF_BOX = 0.15
 """Margin around a robot's box that is painted over as well, as a share of the box's longer side."""
-BEYOND_PX = 3.0
+MARGIN_PX = 3.0
 """Further margin, pixels, for the robot's blurred edge."""
-REACH_PX = 5.0
+INPAINT_RADIUS_PX = 5.0
 """Radius around a hidden pixel from which the inpainting takes colours."""
 
 Ellipse = tuple[float, float, float, float]
 """Centre u, v and half axes u, v, pixels."""
 
 
-def photos_of(folder: Path) -> Photos:
+def open_backgrounds(folder: Path) -> Photos:
     """Open the backgrounds of a folder, the built-in rooms, or the train split of a dataset.
 
     Robots in the images of a dataset are painted over.
@@ -44,50 +44,54 @@ def photos_of(folder: Path) -> Photos:
         If the dataset has no train split or is damaged.
     """
     if str(folder) == ROOMS:
-        return rooms()
+        return open_rooms()
     if not is_dataset(folder):
-        return photos_in(folder)
+        return open_photos(folder)
     split = open_dataset(folder).split("train")
-    robots = [_robots(peers) for peers in split.table.column("peers").to_pylist()]
+    robots = [_fit_ellipses(peers) for peers in split.table.column("peers").to_pylist()]
     height_px, width_px = split.image_shape
-    whole = MOST_HIDDEN * height_px * width_px
-    rows = [row for row, found in enumerate(robots) if found is not None and _area(found) <= whole]
+    whole = MAX_HIDDEN_SHARE * height_px * width_px
+    rows = [
+        row
+        for row, found in enumerate(robots)
+        if found is not None and _total_area_px(found) <= whole
+    ]
     if not rows:
         raise SettingError(
             f"{folder} has no image for a background: robots fill them, or have no box. "
             "Choose another --backgrounds"
         )
-    return Photos(lambda k: _without(split, rows[k], robots[rows[k]] or ()), len(rows))
+    return Photos(lambda k: _remove_robots(split, rows[k], robots[rows[k]] or ()), len(rows))
 
 
-def _robots(peers: Sequence[dict[str, Any]]) -> list[Ellipse] | None:
+def _fit_ellipses(peers: Sequence[dict[str, Any]]) -> list[Ellipse] | None:
     """Return an ellipse around every robot of an image; None if a robot has no box."""
     boxes = [peer["box_px"] for peer in peers]
-    return [_about(box) for box in boxes] if all(boxes) else None
+    return [_fit_ellipse(box) for box in boxes] if all(boxes) else None
 
 
-def _about(box_px: Sequence[float]) -> Ellipse:
+def _fit_ellipse(box_px: Sequence[float]) -> Ellipse:
     left, top, right, bottom = box_px
-    more = BEYOND_BOX * max(right - left, bottom - top) + BEYOND_PX
+    more = MARGIN_SHARE_OF_BOX * max(right - left, bottom - top) + MARGIN_PX
     # The corners of a box rarely show the robot. A slightly wider ellipse hides less background.
     half_u, half_v = (right - left) / 2 + more, (bottom - top) / 2 + more
     return (left + right) / 2, (top + bottom) / 2, half_u, half_v
 
 
-def _area(robots: Sequence[Ellipse]) -> float:
+def _total_area_px(robots: Sequence[Ellipse]) -> float:
     return sum(np.pi * half_u * half_v for _, _, half_u, half_v in robots)
 
 
-def _without(split: Split, row: int, robots: Sequence[Ellipse]) -> Rgb:
+def _remove_robots(split: Split, row: int, robots: Sequence[Ellipse]) -> Rgb:
     height_px, width_px = split.image_shape
     v, u = np.mgrid[:height_px, :width_px] + 0.5
     hidden: NDArray[np.bool_] = np.zeros((height_px, width_px), bool)
     for at_u, at_v, half_u, half_v in robots:
         hidden |= ((u - at_u) / half_u) ** 2 + ((v - at_v) / half_v) ** 2 < 1
-    return painted_over(next(split.images([row])), hidden)
+    return inpaint_hidden(next(split.images([row])), hidden)
 
 
-def painted_over(rgb: Rgb, hidden: NDArray[np.bool_]) -> Rgb:
+def inpaint_hidden(rgb: Rgb, hidden: NDArray[np.bool_]) -> Rgb:
     """Fill the hidden pixels of an image from their surroundings (Telea 2004).
 
     Parameters
@@ -104,4 +108,4 @@ def painted_over(rgb: Rgb, hidden: NDArray[np.bool_]) -> Rgb:
     """
     cv2 = load_opencv("train", "a dataset as --backgrounds")
     picture, mask = np.ascontiguousarray(rgb), hidden.astype(np.uint8)
-    return np.asarray(cv2.inpaint(picture, mask, REACH_PX, cv2.INPAINT_TELEA), np.uint8)
+    return np.asarray(cv2.inpaint(picture, mask, INPAINT_RADIUS_PX, cv2.INPAINT_TELEA), np.uint8)

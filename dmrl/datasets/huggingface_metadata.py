@@ -7,14 +7,14 @@ from typing import Any
 
 import pyarrow as pa
 
-from dmrl.atomic_output import rewritten_file
+from dmrl.atomic_output import replace_file
 from dmrl.datasets import layout
 from dmrl.datasets.manifest import Manifest
-from dmrl.datasets.shards import schema_of
-from dmrl.guards.safe_names import inside
+from dmrl.datasets.shards import read_schema
+from dmrl.guards.safe_names import safe_join
 
 
-def write_names(
+def write_metadata(
     folder: Path, manifest: Manifest, *, fingerprint: str, about: dict[str, str]
 ) -> None:
     """Write ``state.json`` and ``dataset_info.json`` of each split, then ``dataset_dict.json``.
@@ -33,27 +33,29 @@ def write_names(
     if manifest.parquet:
         return
     for name, shards in manifest.splits.items():
-        place = inside(folder, name, "a split")
-        schema = schema_of(manifest.place(folder, name, shards[0]))
-        rewrite(place / "state.json", _state(manifest, name, fingerprint))
-        rewrite(place / "dataset_info.json", _info(manifest, name, schema, about))
-    rewrite(folder / "dataset_dict.json", {"splits": list(manifest.splits)})
+        place = safe_join(folder, name, "a split")
+        schema = read_schema(manifest.shard_path(folder, name, shards[0]))
+        write_json_if_changed(place / "state.json", _build_state(manifest, name, fingerprint))
+        write_json_if_changed(
+            place / "dataset_info.json", _build_info(manifest, name, schema, about)
+        )
+    write_json_if_changed(folder / "dataset_dict.json", {"splits": list(manifest.splits)})
 
 
-def rewrite(path: Path, document: Any) -> None:
+def write_json_if_changed(path: Path, document: Any) -> None:
     """Write a JSON file atomically, unless it has this content already."""
-    text = layout.json_text(document)
+    text = layout.format_json(document)
     if not (path.is_file() and path.read_text(encoding="utf-8") == text):
-        with rewritten_file(path) as partial:
+        with replace_file(path) as partial:
             partial.write_text(text, encoding="utf-8")
 
 
-def fingerprint_of(document: Any) -> str:
+def hash_document(document: Any) -> str:
     """Return the SHA-256 hash of a JSON document."""
     return hashlib.sha256(json.dumps(document).encode()).hexdigest()
 
 
-def _state(manifest: Manifest, split: str, fingerprint: str) -> dict[str, Any]:
+def _build_state(manifest: Manifest, split: str, fingerprint: str) -> dict[str, Any]:
     digest = hashlib.sha256(f"{fingerprint} {split}".encode()).hexdigest()
     return {
         "_data_files": [{"filename": shard.file} for shard in manifest.splits[split]],
@@ -66,15 +68,15 @@ def _state(manifest: Manifest, split: str, fingerprint: str) -> dict[str, Any]:
     }
 
 
-def _info(
+def _build_info(
     manifest: Manifest, split: str, schema: pa.Schema, about: dict[str, str]
 ) -> dict[str, Any]:
     shards = manifest.splits[split]
     told = {
         "name": split,
         "num_bytes": sum(shard.bytes for shard in shards),
-        "num_examples": manifest.rows(split),
+        "num_examples": manifest.count_rows(split),
         "shard_lengths": [shard.rows for shard in shards],
         "dataset_name": None,
     }
-    return {**about, "features": layout.features(schema), "splits": {split: told}}
+    return {**about, "features": layout.describe_features(schema), "splits": {split: told}}

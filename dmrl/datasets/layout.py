@@ -22,14 +22,25 @@ from typing import Any
 import pyarrow as pa
 
 from dmrl.geometry.frames import STRIDE_PX
-from dmrl.guards.safe_names import split_name
+from dmrl.guards.safe_names import check_split_name
 
 PIXELS, IMAGE, MASKS = "pixels", "image", "masks"
 CONFIDENCE, DEPTH = "confidence", "depth"
-MANIFEST = "manifest.json"
-NAMES = (PIXELS, IMAGE, MASKS, "peers", CONFIDENCE, DEPTH, "robot", "source", "log_time", "split")
+MANIFEST_FILE = "manifest.json"
+COLUMN_NAMES = (
+    PIXELS,
+    IMAGE,
+    MASKS,
+    "peers",
+    CONFIDENCE,
+    DEPTH,
+    "robot",
+    "source",
+    "log_time",
+    "split",
+)
 
-PEER = pa.struct(
+PEER_TYPE = pa.struct(
     [
         ("peer", pa.string()),
         ("u_px", pa.float64()),
@@ -46,11 +57,13 @@ PEER = pa.struct(
 )
 """One peer of one image: the fields of ``dmrl.v1.PeerLabel``, with the name of the status."""
 
-PNG = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+PNG_TYPE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 """Storage type of the Image feature of ``datasets``."""
 
 
-def schema(height_px: int, width_px: int, *, png: bool = False, masks: bool = False) -> pa.Schema:
+def build_schema(
+    height_px: int, width_px: int, *, png: bool = False, masks: bool = False
+) -> pa.Schema:
     """Build the Arrow schema of a dataset; all images have one size.
 
     Parameters
@@ -69,7 +82,7 @@ def schema(height_px: int, width_px: int, *, png: bool = False, masks: bool = Fa
         With the features under the metadata key ``huggingface``, from which ``datasets`` takes the
         types of shards and Parquet files.
     """
-    picture = (IMAGE, PNG) if png else (PIXELS, pa.binary(height_px * width_px * 3))
+    picture = (IMAGE, PNG_TYPE) if png else (PIXELS, pa.binary(height_px * width_px * 3))
     row = pa.list_(pa.float32(), width_px // STRIDE_PX)
     grid = pa.list_(row, height_px // STRIDE_PX)
     covered = [(MASKS, pa.binary(height_px * width_px))] if masks else []
@@ -77,7 +90,7 @@ def schema(height_px: int, width_px: int, *, png: bool = False, masks: bool = Fa
         [
             picture,
             *covered,
-            ("peers", pa.list_(PEER)),
+            ("peers", pa.list_(PEER_TYPE)),
             (CONFIDENCE, grid),
             (DEPTH, grid),
             ("robot", pa.string()),
@@ -86,32 +99,35 @@ def schema(height_px: int, width_px: int, *, png: bool = False, masks: bool = Fa
             ("split", pa.string()),
         ]
     )
-    info = {"info": {"features": features(plain)}}
+    info = {"info": {"features": describe_features(plain)}}
     return plain.with_metadata({"huggingface": json.dumps(info)})
 
 
-def features(columns: pa.Schema) -> dict[str, Any]:
+def describe_features(columns: pa.Schema) -> dict[str, Any]:
     """Return the columns as ``datasets`` writes them in dataset_info.json.
 
     Fixed-size lists are written as "Sequence" and lists as ``[item]``, which ``datasets`` 3.6 and 5
     both read; "List" came with 4. Raw pixels require ``datasets`` 5.1, since earlier versions lack
     fixed_size_binary.
     """
-    return {f.name: {"_type": "Image"} if f.name == IMAGE else _feature(f.type) for f in columns}
+    return {
+        f.name: {"_type": "Image"} if f.name == IMAGE else _describe_feature(f.type)
+        for f in columns
+    }
 
 
-def _feature(kind: pa.DataType) -> Any:
+def _describe_feature(kind: pa.DataType) -> Any:
     if pa.types.is_struct(kind):
-        return {f.name: _feature(f.type) for f in kind}
+        return {f.name: _describe_feature(f.type) for f in kind}
     if pa.types.is_fixed_size_list(kind):
-        item = _feature(kind.value_type)
+        item = _describe_feature(kind.value_type)
         return {"feature": item, "length": kind.list_size, "_type": "Sequence"}
     if pa.types.is_list(kind):
-        return [_feature(kind.value_type)]
-    return {"dtype": dtype_name(kind), "_type": "Value"}
+        return [_describe_feature(kind.value_type)]
+    return {"dtype": to_dtype_name(kind), "_type": "Value"}
 
 
-def dtype_name(kind: pa.DataType) -> str:
+def to_dtype_name(kind: pa.DataType) -> str:
     """Return the name that ``datasets`` gives a plain Arrow type: ``float32``, not ``float``."""
     return {"float": "float32", "double": "float64"}.get(str(kind), str(kind))
 
@@ -119,12 +135,12 @@ def dtype_name(kind: pa.DataType) -> str:
 def shard_path(folder: Path, split: str, index: int, count: int, *, parquet: bool) -> Path:
     """Return the path of a shard, named as ``datasets`` and the Hub name it."""
     number = f"{index:05d}-of-{count:05d}"
-    split = split_name(split, f"{folder}: a split")
+    split = check_split_name(split, f"{folder}: a split")
     if parquet:
         return folder / "data" / f"{split}-{number}.parquet"
     return folder / split / f"data-{number}.arrow"
 
 
-def json_text(document: Any) -> str:
+def format_json(document: Any) -> str:
     """Format a small JSON document with sorted keys, so that equal content gives equal bytes."""
     return json.dumps(document, indent=1, sort_keys=True) + "\n"

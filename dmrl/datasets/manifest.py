@@ -13,9 +13,9 @@ from typing import Any
 from dmrl.datasets import layout
 from dmrl.errors import DatasetError
 from dmrl.guards.bounded_parsing import parse_json
-from dmrl.guards.safe_names import file_name, inside, split_name
+from dmrl.guards.safe_names import check_file_name, check_split_name, safe_join
 
-PARTS = "parts"
+PARTS_FOLDER = "parts"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,28 +51,30 @@ class Manifest:
         grown = {name: [*self.splits.get(name, ()), *added.get(name, ())] for name in names}
         return Manifest(grown, self.parts + 1, self.parquet)
 
-    def rows(self, split: str) -> int:
+    def count_rows(self, split: str) -> int:
         """Count the rows of a split."""
         return sum(shard.rows for shard in self.splits.get(split, ()))
 
-    def place(self, folder: Path, split: str, shard: Shard) -> Path:
+    def shard_path(self, folder: Path, split: str, shard: Shard) -> Path:
         """Return the path of a shard in the dataset's folder."""
         own = "data" if self.parquet else split
-        return inside(inside(folder, own, f"{folder}: a split"), shard.file, f"{folder}: a shard")
+        return safe_join(
+            safe_join(folder, own, f"{folder}: a split"), shard.file, f"{folder}: a shard"
+        )
 
     def write(self, folder: Path) -> None:
         """Write the manifest into the folder of a dataset."""
         splits = [
-            {"split": name, "shards": [_plain(shard) for shard in shards]}
+            {"split": name, "shards": [_shard_to_json(shard) for shard in shards]}
             for name, shards in self.splits.items()
         ]
         document = {"parquet": self.parquet, "parts": self.parts, "splits": splits}
-        (folder / layout.MANIFEST).write_text(layout.json_text(document), encoding="utf-8")
+        (folder / layout.MANIFEST_FILE).write_text(layout.format_json(document), encoding="utf-8")
 
 
 def part_folder(folder: Path, number: int) -> Path:
     """Return the folder of a part: 0 for the creation, then one for each addition."""
-    return folder / PARTS / f"{number:05d}"
+    return folder / PARTS_FOLDER / f"{number:05d}"
 
 
 def read_manifest(folder: Path) -> Manifest | None:
@@ -85,14 +87,14 @@ def read_manifest(folder: Path) -> Manifest | None:
     UnsafeName
         If the name of a split or a shard is not a valid file name.
     """
-    path = folder / layout.MANIFEST
+    path = folder / layout.MANIFEST_FILE
     if not path.is_file():
         return None
     try:
         said = parse_json(path.read_text(encoding="utf-8"))
         splits = {
-            split_name(one["split"], f"{path}: a split"): [
-                _shard(shard, path) for shard in one["shards"]
+            check_split_name(one["split"], f"{path}: a split"): [
+                _parse_shard(shard, path) for shard in one["shards"]
             ]
             for one in said["splits"]
         }
@@ -100,21 +102,21 @@ def read_manifest(folder: Path) -> Manifest | None:
             raise ValueError("a split is named twice")
         if any(len({shard.file for shard in own}) < len(own) for own in splits.values()):
             raise ValueError("a shard is named twice")
-        return Manifest(splits, _count(said["parts"]), said["parquet"] is True)
+        return Manifest(splits, _parse_count(said["parts"]), said["parquet"] is True)
     except (OSError, KeyError, TypeError, ValueError, AttributeError) as e:
         raise DatasetError(f"{path} is damaged ({e}). Make the dataset again") from e
 
 
-def _plain(shard: Shard) -> dict[str, Any]:
+def _shard_to_json(shard: Shard) -> dict[str, Any]:
     return {"file": shard.file, "rows": shard.rows, "bytes": shard.bytes}
 
 
-def _shard(said: Mapping[str, Any], path: Path) -> Shard:
-    name = file_name(said["file"], f"{path}: a shard")
-    return Shard(name, _count(said["rows"]), _count(said["bytes"]))
+def _parse_shard(said: Mapping[str, Any], path: Path) -> Shard:
+    name = check_file_name(said["file"], f"{path}: a shard")
+    return Shard(name, _parse_count(said["rows"]), _parse_count(said["bytes"]))
 
 
-def _count(value: Any) -> int:
+def _parse_count(value: Any) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**60:
         raise ValueError(f"{value!r} is not a count")
     return value

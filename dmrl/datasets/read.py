@@ -21,11 +21,11 @@ from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_json
-from dmrl.guards.paths import refuse_no_text, refuse_pipes
-from dmrl.guards.safe_names import inside, split_name
+from dmrl.guards.paths import refuse_pipes, require_text_path
+from dmrl.guards.safe_names import check_split_name, safe_join
 from dmrl.images.codec import decode
 
-PARQUET_NAME = re.compile(r"(?P<split>.+)-(?P<index>\d{5})-of-(?P<count>\d{5})\.parquet")
+PARQUET_NAME_PATTERN = re.compile(r"(?P<split>.+)-(?P<index>\d{5})-of-(?P<count>\d{5})\.parquet")
 
 
 @dataclass(frozen=True)
@@ -66,32 +66,32 @@ class Split:
         of PNGs is decoded once, as a whole, into memory.
         """
         if layout.PIXELS in self.table.schema.names:
-            return [self._view(chunk) for chunk in self.table[layout.PIXELS].chunks]
-        return [self._decoded(chunk) for chunk in self.table[layout.IMAGE].chunks]
+            return [self._view_bytes(chunk) for chunk in self.table[layout.PIXELS].chunks]
+        return [self._decode_images(chunk) for chunk in self.table[layout.IMAGE].chunks]
 
     def images(self, rows: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
         """Yield the images of these rows, (H, W, 3) each; PNGs of other rows are not decoded."""
         packed = layout.IMAGE in self.table.schema.names and "pixels" not in self.__dict__
-        for chunk, place in map(self._place, rows):
+        for chunk, place in map(self._locate_row, rows):
             if packed:
-                yield self._decoded(self.table[layout.IMAGE].chunk(chunk).slice(place, 1))[0]
+                yield self._decode_images(self.table[layout.IMAGE].chunk(chunk).slice(place, 1))[0]
             else:
                 yield self.pixels[chunk][place]
 
     def grids(self, name: str, rows: Sequence[int]) -> NDArray[np.float32]:
         """Return the grid labels of these rows alone, (n, rows, cols)."""
         out = np.empty((len(rows), *self.grid_shape), np.float32)
-        for grid, (chunk, place) in zip(out, map(self._place, rows), strict=True):
+        for grid, (chunk, place) in zip(out, map(self._locate_row, rows), strict=True):
             grid[:] = self._grids[name][chunk][place]
         return out
 
-    def _place(self, row: int) -> tuple[int, int]:
+    def _locate_row(self, row: int) -> tuple[int, int]:
         """Return the batch of a row, and the index of the row in that batch."""
-        chunk = bisect_right(self._ends, row)
-        return chunk, row - (self._ends[chunk - 1] if chunk else 0)
+        chunk = bisect_right(self._batch_ends, row)
+        return chunk, row - (self._batch_ends[chunk - 1] if chunk else 0)
 
     @cached_property
-    def _ends(self) -> list[int]:
+    def _batch_ends(self) -> list[int]:
         return list(accumulate(len(chunk) for chunk in self.table["source"].chunks))
 
     @cached_property
@@ -116,27 +116,27 @@ class Split:
         """
         if layout.MASKS not in self.table.schema.names:
             return []
-        return [self._view(chunk)[..., 0] for chunk in self.table[layout.MASKS].chunks]
+        return [self._view_bytes(chunk)[..., 0] for chunk in self.table[layout.MASKS].chunks]
 
     @cached_property
     def confidence(self) -> NDArray[np.float32]:
         """(N, rows, cols): 1 in the cell of a peer's centre, else 0."""
-        return self._grid(layout.CONFIDENCE)
+        return self._concatenate_grid(layout.CONFIDENCE)
 
     @cached_property
     def depth(self) -> NDArray[np.float32]:
         """(N, rows, cols): depth in metres where the confidence is 1, else 0."""
-        return self._grid(layout.DEPTH)
+        return self._concatenate_grid(layout.DEPTH)
 
-    def _view(self, chunk: pa.Array) -> NDArray[np.uint8]:
+    def _view_bytes(self, chunk: pa.Array) -> NDArray[np.uint8]:
         every = np.frombuffer(chunk.buffers()[1], np.uint8)
         width = chunk.type.byte_width
         mine = every[chunk.offset * width : (chunk.offset + len(chunk)) * width]
         return mine.reshape(len(chunk), *self.image_shape, -1)
 
-    def _decoded(self, chunk: pa.Array) -> NDArray[np.uint8]:
+    def _decode_images(self, chunk: pa.Array) -> NDArray[np.uint8]:
         shape = (len(chunk), *self.image_shape, 3)
-        if prod(shape) > limits.unpacked_bytes(chunk.nbytes):
+        if prod(shape) > limits.max_unpacked_bytes(chunk.nbytes):
             raise DatasetError(f"images of split {self.name} unpack to too much. Make it again")
         out = np.empty(shape, np.uint8)
         for image, data in zip(out, chunk.field("bytes"), strict=True):
@@ -148,7 +148,7 @@ class Split:
             image[:] = rgb
         return out
 
-    def _grid(self, name: str) -> NDArray[np.float32]:
+    def _concatenate_grid(self, name: str) -> NDArray[np.float32]:
         parts = self._grids[name]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
@@ -185,7 +185,7 @@ class Dataset:
         if name not in self.splits:
             present = ", ".join(self.splits)
             raise DatasetError(f"no split {name} in {self.path}. It has: {present}")
-        shards = self._shards(name)
+        shards = self._locate_shards(name)
         tables = [open_shard(path, rows) for path, rows in shards]
         for (path, _), table in zip(shards, tables, strict=True):
             if table.schema != tables[0].schema:
@@ -194,19 +194,19 @@ class Dataset:
             raise DatasetError(f"split {name} of {self.path} has no images. Make it again")
         return Split(name, pa.concat_tables(tables))
 
-    def files(self, name: str) -> list[Path]:
+    def list_shards(self, name: str) -> list[Path]:
         """Return the shards of a split, in the order of its rows."""
-        return [path for path, _ in self._shards(name)]
+        return [path for path, _ in self._locate_shards(name)]
 
-    def _shards(self, name: str) -> list[tuple[Path, int | None]]:
+    def _locate_shards(self, name: str) -> list[tuple[Path, int | None]]:
         """Return the shards of a split and their numbers of rows, None where not stored."""
         if self.manifest is not None:
             own = self.manifest.splits[name]
-            return [(self.manifest.place(self.path, name, shard), shard.rows) for shard in own]
-        return self._parquet_shards(name) if self.parquet else self._arrow_shards(name)
+            return [(self.manifest.shard_path(self.path, name, shard), shard.rows) for shard in own]
+        return self._find_parquet_shards(name) if self.parquet else self._read_arrow_shards(name)
 
-    def _arrow_shards(self, name: str) -> list[tuple[Path, int | None]]:
-        folder = inside(self.path, name, f"{self.path}: a split")
+    def _read_arrow_shards(self, name: str) -> list[tuple[Path, int | None]]:
+        folder = safe_join(self.path, name, f"{self.path}: a split")
         state, about = folder / "state.json", folder / "dataset_info.json"
         try:
             files = [str(item["filename"]) for item in _read_json(state)["_data_files"]]
@@ -219,10 +219,12 @@ class Dataset:
             raise DatasetError(
                 f"{state} or {about} is damaged ({e}). Make the dataset again"
             ) from None
-        return [(inside(folder, file, f"{folder}: a shard"), count) for file, count in named]
+        return [(safe_join(folder, file, f"{folder}: a shard"), count) for file, count in named]
 
-    def _parquet_shards(self, name: str) -> list[tuple[Path, int | None]]:
-        found = {index: count for split, index, count in _parquet_names(self.path) if split == name}
+    def _find_parquet_shards(self, name: str) -> list[tuple[Path, int | None]]:
+        found = {
+            index: count for split, index, count in _parse_parquet_names(self.path) if split == name
+        }
         count = max(found.values(), default=0)
         paths = [layout.shard_path(self.path, name, k, count, parquet=True) for k in range(count)]
         return [(path, None) for path in paths]
@@ -230,7 +232,7 @@ class Dataset:
 
 def is_dataset(path: Path) -> bool:
     """Return whether a folder has the files of a dataset; it may still be damaged."""
-    return (path / "dataset_dict.json").is_file() or bool(_parquet_names(path))
+    return (path / "dataset_dict.json").is_file() or bool(_parse_parquet_names(path))
 
 
 def open_dataset(path: Path) -> Dataset:
@@ -248,23 +250,25 @@ def open_dataset(path: Path) -> Dataset:
     UnsafeName
         If the name of a split is not a valid folder name, or the path is not valid text.
     """
-    refuse_no_text(path)
+    require_text_path(path)
     refuse_pipes(path)
     manifest = read_manifest(path)
     if manifest is not None and manifest.splits:
         return Dataset(path, tuple(manifest.splits), manifest.parquet, manifest)
     parquet = not (path / "dataset_dict.json").is_file()
     if not parquet:
-        splits = _splits(path / "dataset_dict.json")
+        splits = _read_split_names(path / "dataset_dict.json")
     else:
-        splits = tuple(sorted({split for split, _, _ in _parquet_names(path)}, reverse=True))
+        splits = tuple(sorted({split for split, _, _ in _parse_parquet_names(path)}, reverse=True))
     if not splits:
         what = "is not a dataset" if path.exists() else "does not exist"
         raise DatasetError(f"{path} {what}. Make one with: dmrl dataset RECORDING.mcap {path}")
-    return Dataset(path, tuple(split_name(name, f"{path}: a split") for name in splits), parquet)
+    return Dataset(
+        path, tuple(check_split_name(name, f"{path}: a split") for name in splits), parquet
+    )
 
 
-def _splits(file: Path) -> tuple[str, ...]:
+def _read_split_names(file: Path) -> tuple[str, ...]:
     said = _read_json(file)
     found = said.get("splits") if isinstance(said, dict) else None
     if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
@@ -272,8 +276,10 @@ def _splits(file: Path) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _parquet_names(folder: Path) -> list[tuple[str, int, int]]:
-    matches = (PARQUET_NAME.fullmatch(path.name) for path in (folder / "data").glob("*.parquet"))
+def _parse_parquet_names(folder: Path) -> list[tuple[str, int, int]]:
+    matches = (
+        PARQUET_NAME_PATTERN.fullmatch(path.name) for path in (folder / "data").glob("*.parquet")
+    )
     return [(m["split"], int(m["index"]), int(m["count"])) for m in matches if m]
 
 

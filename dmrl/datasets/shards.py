@@ -15,9 +15,9 @@ from dmrl.datasets import layout
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.guards import limits
-from dmrl.guards.memory import Bounded
+from dmrl.guards.memory import MemoryLimit
 
-AGAIN = "Make the dataset again, or copy it whole"
+REBUILD_HINT = "Make the dataset again, or copy it whole"
 """Way out at the end of every error about a shard."""
 
 
@@ -38,30 +38,30 @@ def open_shard(path: Path, rows: int | None) -> pa.Table:
         not follow the layout.
     """
     if path.exists() and not path.is_file():
-        raise DatasetError(f"shard {path} is not a file. {AGAIN}")
+        raise DatasetError(f"shard {path} is not a file. {REBUILD_HINT}")
     try:
-        with Bounded(path.stat().st_size):
-            table = _mapped(path)
+        with MemoryLimit(path.stat().st_size):
+            table = _map_table(path)
             table.validate(full=True)
     except FileNotFoundError:
-        raise DatasetError(f"shard {path} is missing. {AGAIN}") from None
+        raise DatasetError(f"shard {path} is missing. {REBUILD_HINT}") from None
     except MemoryError:
         raise DatasetError(
-            f"shard {path} unpacks to much more than its size explains. {AGAIN}"
+            f"shard {path} unpacks to much more than its size explains. {REBUILD_HINT}"
         ) from None
     except (pa.ArrowException, OSError, ValueError) as e:
         why = " ".join(str(e).split())
-        raise DatasetError(f"shard {path} is cut short or damaged: {why}. {AGAIN}") from None
+        raise DatasetError(f"shard {path} is cut short or damaged: {why}. {REBUILD_HINT}") from None
     # A stream that ends between two batches reads without an error.
     if rows is not None and table.num_rows != rows:
         found = f"{table.num_rows} of {rows} rows"
-        raise DatasetError(f"shard {path} is cut short: {found}. {AGAIN}")
-    if wrong := _not_laid_out(table):
+        raise DatasetError(f"shard {path} is cut short: {found}. {REBUILD_HINT}")
+    if wrong := _find_layout_error(table):
         raise DatasetError(f"shard {path} {wrong}. Make it with: dmrl dataset")
-    return table.select([name for name in table.schema.names if name in layout.NAMES])
+    return table.select([name for name in table.schema.names if name in layout.COLUMN_NAMES])
 
 
-def schema_of(path: Path) -> pa.Schema:
+def read_schema(path: Path) -> pa.Schema:
     """Read the columns of a shard from its header alone.
 
     Raises
@@ -75,20 +75,20 @@ def schema_of(path: Path) -> pa.Schema:
                 return pq.read_schema(stream)
             return pa.ipc.open_stream(stream).schema
     except FileNotFoundError:
-        raise DatasetError(f"shard {path} is missing. {AGAIN}") from None
+        raise DatasetError(f"shard {path} is missing. {REBUILD_HINT}") from None
     except (pa.ArrowException, OSError, ValueError) as e:
         raise DatasetError(
-            f"shard {path} is damaged: {' '.join(str(e).split())}. {AGAIN}"
+            f"shard {path} is damaged: {' '.join(str(e).split())}. {REBUILD_HINT}"
         ) from None
 
 
-def _mapped(path: Path) -> pa.Table:
+def _map_table(path: Path) -> pa.Table:
     if path.suffix == ".parquet":
         return pq.ParquetFile(os.fspath(path), memory_map=True).read()
     return pa.ipc.open_stream(pa.memory_map(os.fspath(path))).read_all()
 
 
-def _not_laid_out(table: pa.Table) -> str:
+def _find_layout_error(table: pa.Table) -> str:
     """Return the first difference between a table and the layout; empty if there is none."""
     names = table.schema.names
     if len(set(names)) < len(names):
@@ -104,7 +104,7 @@ def _not_laid_out(table: pa.Table) -> str:
     rows, cols = grid.list_size, grid.value_type.list_size
     if not 0 < rows * cols <= limits.PIXELS // STRIDE_PX**2:
         return f"has grids of {cols} x {rows}"
-    if wrong := _wrong_column(table, rows * STRIDE_PX, cols * STRIDE_PX):
+    if wrong := _find_column_error(table, rows * STRIDE_PX, cols * STRIDE_PX):
         return wrong
     if (pc.max(pc.utf8_length(table["source"])).as_py() or 0) > limits.NAME_CHARACTERS:
         return "has a source with a very long name"
@@ -112,11 +112,11 @@ def _not_laid_out(table: pa.Table) -> str:
     return f"has an image with {most} peers" if most > limits.PEERS else ""
 
 
-def _wrong_column(table: pa.Table, height_px: int, width_px: int) -> str:
+def _find_column_error(table: pa.Table, height_px: int, width_px: int) -> str:
     """Return an error if a column has the wrong type or nulls; empty if all are right."""
     names = table.schema.names
-    known = layout.schema(height_px, width_px, masks=layout.MASKS in names)
-    packed = layout.schema(height_px, width_px, png=True).field(layout.IMAGE)
+    known = layout.build_schema(height_px, width_px, masks=layout.MASKS in names)
+    packed = layout.build_schema(height_px, width_px, png=True).field(layout.IMAGE)
     for wanted in (*known, packed):
         if wanted.name not in names:
             continue

@@ -9,34 +9,43 @@ from typing import NamedTuple
 
 import pyarrow.compute as pc
 
-from dmrl.atomic_output import partial_folder, partial_of, refuse_existing
+from dmrl.atomic_output import atomic_folder, refuse_existing, to_partial_path
 from dmrl.datasets import Split, open_dataset
 from dmrl.errors import ModelError, OutputError, SettingError, optional_imports
-from dmrl.learn.pretrained import resolved
-from dmrl.recording import provenance
+from dmrl.learn.pretrained import resolve_model_path
+from dmrl.recording import build_provenance
 from dmrl.terminal.progress import track
 
 with optional_imports("train", "dmrl train"):
-    from dmrl.datasets.training_examples import material
-    from dmrl.learn.data.batches import Examples
-    from dmrl.learn.inference.confidence_calibration import Calibration, calibrate, calibration
+    from dmrl.datasets.training_examples import load_training_data
+    from dmrl.learn.data.batches import ExampleSet
+    from dmrl.learn.inference.confidence_calibration import (
+        PlattScaling,
+        apply_calibration,
+        fit_calibration,
+    )
     from dmrl.learn.inference.loaded_model import (
         PUBLISHED_THRESHOLD,
         Model,
+        get_weights,
+        interpolate_weights,
         load_model,
-        mixed,
         save_model,
         set_weights,
-        weights_of,
-        with_channels,
+        transfer_weights,
     )
-    from dmrl.learn.inference.threshold import best_threshold
+    from dmrl.learn.inference.threshold import select_threshold
     from dmrl.learn.networks.architectures import Network
     from dmrl.learn.training.checkpoint import has_checkpoint, remove_checkpoint
-    from dmrl.learn.training.config import AUTO, DEFAULT, FitSettings
-    from dmrl.learn.training.distributed import Group, in_group
-    from dmrl.learn.training.trainer import Step, Training, device_of, new_network
-    from dmrl.learn.training.validation import scores
+    from dmrl.learn.training.config import AUTO, DEFAULT_ARCHITECTURE, TrainConfig
+    from dmrl.learn.training.distributed import ProcessGroup, run_distributed
+    from dmrl.learn.training.trainer import (
+        StepProgress,
+        Trainer,
+        build_initial_network,
+        select_device,
+    )
+    from dmrl.learn.training.validation import score_examples
 
 LIBRARIES = ("torch", "numpy")
 
@@ -54,7 +63,7 @@ class Result:
 def train_network(
     dataset: Path,
     out: Path,
-    settings: FitSettings,
+    settings: TrainConfig,
     *,
     init: Path | None = None,
     teacher: Path | None = None,
@@ -95,19 +104,21 @@ def train_network(
     """
     if settings.init_share and init is None:
         raise SettingError("init_share: there is nothing to keep a share of. Give --init MODEL")
-    given = Given(init and resolved(init), teacher and resolved(teacher))
+    given = Given(init and resolve_model_path(init), teacher and resolve_model_path(teacher))
     settings = _with_architecture(settings, given.init)
-    processes = settings.processes if device_of(settings.device).type == "cpu" else 1
-    return in_group(
+    processes = settings.processes if select_device(settings.device).type == "cpu" else 1
+    return run_distributed(
         processes, partial(_train_in_process, dataset, out, settings, given, resume=resume)
     )
 
 
-def _with_architecture(settings: FitSettings, init: Path | None) -> FitSettings:
+def _with_architecture(settings: TrainConfig, init: Path | None) -> TrainConfig:
     """Return settings that name a network: for "auto", that of ``init`` or the default one."""
     if settings.architecture != AUTO:
         return settings
-    return replace(settings, architecture=load_model(init).architecture if init else DEFAULT)
+    return replace(
+        settings, architecture=load_model(init).architecture if init else DEFAULT_ARCHITECTURE
+    )
 
 
 class Given(NamedTuple):
@@ -118,24 +129,30 @@ class Given(NamedTuple):
 
 
 def _train_in_process(
-    dataset: Path, out: Path, settings: FitSettings, given: Given, group: Group, *, resume: bool
+    dataset: Path,
+    out: Path,
+    settings: TrainConfig,
+    given: Given,
+    group: ProcessGroup,
+    *,
+    resume: bool,
 ) -> Result:
     """Train in one process of a group. All compute; the leading one alone writes and prints."""
-    if group.leads:
+    if group.is_main:
         refuse_existing(out)
-        _refuse_unfinished(partial_of(out), resume=resume)
+        _refuse_unfinished(to_partial_path(out), resume=resume)
     data = open_dataset(dataset)
     train = data.split("train")
-    examples, held_out, shares = material(data, settings)
+    examples, held_out, shares = load_training_data(data, settings)
     network = _build_network(settings, examples, given.init)
-    first = {name: value.clone() for name, value in weights_of(network).items()}
+    first = {name: value.clone() for name, value in get_weights(network).items()}
     teacher = _load_teacher(given.teacher, network) if given.teacher else None
     inputs = [dataset, *filter(None, given)]
-    made = provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
+    made = build_provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
     identity = " ".join(source.sha256 for source in made.inputs)
-    mine = partial_folder(out, keep_on_error=True, resume=resume)
-    with mine if group.leads else nullcontext(partial_of(out)) as folder:
-        training = Training(
+    mine = atomic_folder(out, keep_on_error=True, resume=resume)
+    with mine if group.is_main else nullcontext(to_partial_path(out)) as folder:
+        training = Trainer(
             network,
             examples,
             settings,
@@ -147,11 +164,11 @@ def _train_in_process(
             group=group,
             resume=resume and has_checkpoint(folder),
         )
-        if group.leads:
+        if group.is_main:
             made.write(folder)
         result = _run_steps(training, settings, len(examples), group)
-        if group.leads:
-            mixed(training.network, first, settings.init_share)
+        if group.is_main:
+            interpolate_weights(training.network, first, settings.init_share)
             judged = _calibrate(training.network, held_out, settings)
             save_model(_to_model(training, settings, train, len(examples), judged), folder)
             remove_checkpoint(folder)
@@ -171,30 +188,30 @@ class Calibrated(NamedTuple):
     """Threshold and calibration of a network, from the images held out."""
 
     threshold: float
-    calibration: Calibration | None
+    calibration: PlattScaling | None
 
 
-def _calibrate(network: Network, held_out: Examples | None, settings: FitSettings) -> Calibrated:
+def _calibrate(network: Network, held_out: ExampleSet | None, settings: TrainConfig) -> Calibrated:
     """Calibrate the network on the images held out, and choose its threshold there."""
     if held_out is None:
         return Calibrated(_or_published(settings.threshold), None)
-    scored = scores(network, held_out)
-    found = calibration(scored)
-    if found is not None and calibrate(network, found):
-        scored = scores(network, held_out)
+    scored = score_examples(network, held_out)
+    found = fit_calibration(scored)
+    if found is not None and apply_calibration(network, found):
+        scored = score_examples(network, held_out)
     else:
         found = None
     if settings.threshold is not None:
         return Calibrated(settings.threshold, found)
-    return Calibrated(_or_published(best_threshold(scored, settings.false_alarms)), found)
+    return Calibrated(_or_published(select_threshold(scored, settings.false_alarms)), found)
 
 
 def _or_published(threshold: float | None) -> float:
     return PUBLISHED_THRESHOLD if threshold is None else threshold
 
 
-def _build_network(settings: FitSettings, examples: Examples, init: Path | None) -> Network:
-    network = new_network(settings, examples)
+def _build_network(settings: TrainConfig, examples: ExampleSet, init: Path | None) -> Network:
+    network = build_initial_network(settings, examples)
     if init is not None:
         known = load_model(init)
         if known.architecture != settings.architecture:
@@ -202,7 +219,7 @@ def _build_network(settings: FitSettings, examples: Examples, init: Path | None)
                 f"{init} is a {known.architecture}, not the {settings.architecture} to train. "
                 f'Set architecture = "{known.architecture}" in the recipe, or give another --init'
             )
-        set_weights(network, with_channels(known.network, network), init)
+        set_weights(network, transfer_weights(known.network, network), init)
     return network
 
 
@@ -216,13 +233,15 @@ def _load_teacher(path: Path, network: Network) -> Network:
     return teacher
 
 
-def _run_steps(training: Training, settings: FitSettings, images: int, group: Group) -> Result:
-    def words(step: Step) -> str:
+def _run_steps(
+    training: Trainer, settings: TrainConfig, images: int, group: ProcessGroup
+) -> Result:
+    def words(step: StepProgress) -> str:
         return f"Epoch {step.epoch}/{settings.epochs}, loss {step.loss:.3f}"
 
     left, begun = training.steps_left, time.perf_counter()
-    steps = training.steps()
-    for _ in track(steps, "Training", left, describe=words) if group.leads else steps:
+    steps = training.train_steps()
+    for _ in track(steps, "Training", left, describe=words) if group.is_main else steps:
         pass
     seconds = time.perf_counter() - begun
     seen = left * min(settings.batch_size, images)
@@ -230,7 +249,7 @@ def _run_steps(training: Training, settings: FitSettings, images: int, group: Gr
 
 
 def _to_model(
-    training: Training, settings: FitSettings, train: Split, images: int, judged: Calibrated
+    training: Trainer, settings: TrainConfig, train: Split, images: int, judged: Calibrated
 ) -> Model:
     height_px, width_px = train.image_shape
     peers = pc.list_flatten(train.table.column("peers"))

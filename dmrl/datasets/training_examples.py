@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from dmrl.datasets import Dataset, Split
 from dmrl.errors import DatasetError, SettingError
-from dmrl.learn.data.batches import BOX, CLASS_ID, FIELDS, Examples
-from dmrl.learn.training.config import FitSettings
+from dmrl.learn.data.batches import BOX, CLASS_ID, ROBOT_FIELDS, ExampleSet
+from dmrl.learn.training.config import TrainConfig
 
 
-class Material(NamedTuple):
+class TrainingData(NamedTuple):
     """Images to train on, images to validate on, and sampling weights.
 
     Parameters
@@ -30,12 +30,12 @@ class Material(NamedTuple):
         None: each once.
     """
 
-    examples: Examples
-    held_out: Examples | None
+    examples: ExampleSet
+    held_out: ExampleSet | None
     shares: NDArray[np.float64] | None
 
 
-def material(data: Dataset, settings: FitSettings) -> Material:
+def load_training_data(data: Dataset, settings: TrainConfig) -> TrainingData:
     """Load the training and the validation images that these settings choose.
 
     Raises
@@ -46,7 +46,7 @@ def material(data: Dataset, settings: FitSettings) -> Material:
         If the shares do not match the recordings, or the classes the peers.
     """
     train = data.split("train")
-    every = examples_of(train, settings.classes)
+    every = build_examples(train, settings.classes)
     if not np.isfinite(every.robots).any():
         raise DatasetError(
             f"{data.path} shows no robot in any of the {len(every)} images of its train split: a "
@@ -56,15 +56,15 @@ def material(data: Dataset, settings: FitSettings) -> Material:
     _require_classes(train, every, settings.classes)
     sources = np.array(train.table.column("source").to_pylist())
     held = np.zeros(len(every), bool)
-    watched = examples_of(data.split("val"), settings.classes) if "val" in data.splits else None
+    watched = build_examples(data.split("val"), settings.classes) if "val" in data.splits else None
     if watched is None and settings.validation_share:
-        held = _last_of_each(sources, settings.validation_share)
+        held = _select_last_share(sources, settings.validation_share)
         watched = every.select(held) if held.any() else None
     learnt = every.select(~held) if held.any() else every
-    return Material(learnt, watched, _shares(sources[~held], settings.shares))
+    return TrainingData(learnt, watched, _compute_sample_weights(sources[~held], settings.shares))
 
 
-def _require_classes(train: Split, every: Examples, classes: Sequence[str]) -> None:
+def _require_classes(train: Split, every: ExampleSet, classes: Sequence[str]) -> None:
     for number, pattern in enumerate(classes):
         if not (every.robots[..., CLASS_ID] == number).any():
             peers = pc.list_flatten(train.table.column("peers"))
@@ -75,7 +75,7 @@ def _require_classes(train: Split, every: Examples, classes: Sequence[str]) -> N
             )
 
 
-def _last_of_each(sources: NDArray[np.str_], share: float) -> NDArray[np.bool_]:
+def _select_last_share(sources: NDArray[np.str_], share: float) -> NDArray[np.bool_]:
     """Select the last share of the images of each recording."""
     held = np.zeros(len(sources), bool)
     for source in np.unique(sources):
@@ -84,7 +84,9 @@ def _last_of_each(sources: NDArray[np.str_], share: float) -> NDArray[np.bool_]:
     return held
 
 
-def _shares(sources: NDArray[np.str_], wanted: dict[str, float]) -> NDArray[np.float64] | None:
+def _compute_sample_weights(
+    sources: NDArray[np.str_], wanted: dict[str, float]
+) -> NDArray[np.float64] | None:
     """Return how often each image is drawn in an epoch, from the shares of the recordings.
 
     Raises
@@ -112,27 +114,27 @@ def _shares(sources: NDArray[np.str_], wanted: dict[str, float]) -> NDArray[np.f
     return shares
 
 
-def examples_of(split: Split, classes: Sequence[str] = ()) -> Examples:
+def build_examples(split: Split, classes: Sequence[str] = ()) -> ExampleSet:
     """Build training examples from a split; ``classes`` are patterns of peer names."""
     column = split.table.column("peers").combine_chunks()
     counts = pc.list_value_length(column).to_numpy(zero_copy_only=False).astype(np.int64)
     peers = column.flatten()
-    flat = np.full((len(peers), len(FIELDS)), np.nan, np.float32)
-    for index, name in enumerate(FIELDS[:6]):
+    flat = np.full((len(peers), len(ROBOT_FIELDS)), np.nan, np.float32)
+    for index, name in enumerate(ROBOT_FIELDS[:6]):
         flat[:, index] = pc.struct_field(peers, name).to_numpy(zero_copy_only=False)
     boxes = pc.struct_field(peers, "box_px")
     boxed = pc.list_value_length(boxes).to_numpy(zero_copy_only=False) == 4
     corners = boxes.filter(pa.array(boxed)).flatten().to_numpy(zero_copy_only=False)
-    flat[np.ix_(boxed, range(*BOX.indices(len(FIELDS))))] = corners.reshape(-1, 4)
-    flat[:, CLASS_ID] = _class_ids(pc.struct_field(peers, "peer"), classes)
-    robots = np.full((len(counts), max(int(counts.max(initial=0)), 1), len(FIELDS)), np.nan)
+    flat[np.ix_(boxed, range(*BOX.indices(len(ROBOT_FIELDS))))] = corners.reshape(-1, 4)
+    flat[:, CLASS_ID] = _assign_class_ids(pc.struct_field(peers, "peer"), classes)
+    robots = np.full((len(counts), max(int(counts.max(initial=0)), 1), len(ROBOT_FIELDS)), np.nan)
     image = np.repeat(np.arange(len(counts)), counts)
     place = np.arange(len(flat)) - np.repeat(np.cumsum(counts) - counts, counts)
     robots[image, place] = flat
-    return Examples(split.pixels, robots.astype(np.float32), split.masks)
+    return ExampleSet(split.pixels, robots.astype(np.float32), split.masks)
 
 
-def _class_ids(names: pa.Array, classes: Sequence[str]) -> NDArray[np.float32]:
+def _assign_class_ids(names: pa.Array, classes: Sequence[str]) -> NDArray[np.float32]:
     """Return the first matching pattern of each peer's name, (n,); NaN without a match."""
     known = pc.unique(names).to_pylist()
     place = np.array(pc.index_in(names, pa.array(known, names.type)).to_pylist(), np.int64)

@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from dmrl.deploy.backends import Outputs, grids_of
+from dmrl.deploy.backends import Outputs, to_grids
 from dmrl.learn.inference.decode_grids import decode
-from dmrl.learn.inference.detection_metrics import by_band, score
+from dmrl.learn.inference.detection_metrics import compute_band_metrics, score_detections
 from dmrl.learn.inference.matching import Points
 
 
-def points_of(outputs: Outputs, stride_px: int) -> Points:
+def decode_points(outputs: Outputs, stride_px: int) -> Points:
     """Decode the detections in N images."""
-    found = decode(*grids_of(outputs), stride_px=stride_px)
+    found = decode(*to_grids(outputs), stride_px=stride_px)
     kept = np.arange(found.u_px.shape[1]) < found.count[:, None]
     return Points(
         np.nonzero(kept)[0],
@@ -21,21 +21,23 @@ def points_of(outputs: Outputs, stride_px: int) -> Points:
     )
 
 
-def figures_of(
+def compute_accuracy(
     images: int, labels: Points, detections: Points, threshold: float
 ) -> dict[str, float | None]:
     """Compute the metrics over all distances; None: not measured.
 
     ``METRIC_DEFINITIONS`` of `detection_metrics` defines them.
     """
-    overall, *_ = by_band(score(images, labels, detections), threshold=threshold, draws=1)
+    overall, *_ = compute_band_metrics(
+        score_detections(images, labels, detections), threshold=threshold, draws=1
+    )
     return {
         name: figure.value if np.isfinite(figure.value) else None
         for name, figure in overall.figures.items()
     }
 
 
-def argmax_kept(wanted: Outputs, got: Outputs) -> float:
+def compare_peaks(wanted: Outputs, got: Outputs) -> float:
     """Return the fraction of images whose most confident cell is the same in both outputs."""
     best = [
         each["confidence"].reshape(len(each["confidence"]), -1).argmax(1) for each in (wanted, got)

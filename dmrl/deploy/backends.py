@@ -7,16 +7,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.int8 import reference
-from dmrl.deploy.int8.graph import Float32, Graph, grey_of, outputs_of, tensors_of, to_input
+from dmrl.deploy.int8.graph import (
+    Float32,
+    FloatGraph,
+    compute_tensors,
+    normalize_images,
+    rgb_to_grey,
+    select_outputs,
+)
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.deploy.int8.quantise import HEAD_OF
+from dmrl.deploy.int8.quantise import HEAD_OF_CHANNEL
 from dmrl.learn.inference.decode_grids import Grids
 
 Images = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 """(N, height, width, 3) RGB, or N images of one size."""
 Outputs = dict[str, Float32]
 """(N, rows, cols) by channel name, as in ``channels`` of the network's class."""
-Levels = dict[str, NDArray[np.int8]]
+Int8Grids = dict[str, NDArray[np.int8]]
 """(rows, cols) by the name of the head."""
 
 
@@ -27,7 +34,7 @@ class Backend(Protocol):
         """Compute the output for (N, height, width, 3) RGB images of the network's size."""
 
 
-def grids_of(outputs: Outputs) -> Grids:
+def to_grids(outputs: Outputs) -> Grids:
     """Convert the output for N images to `Grids`."""
     # Clip far beyond meaningful values, so that exp does not overflow.
     logit = np.clip(outputs["confidence"].astype(np.float64), -60, 60)
@@ -38,7 +45,7 @@ def grids_of(outputs: Outputs) -> Grids:
     return Grids((1 / (1 + np.exp(-logit))).astype(np.float32), depth_m, offset)
 
 
-class Float:
+class FloatBackend:
     """Float network in NumPy, batch normalisation folded.
 
     Parameters
@@ -49,19 +56,19 @@ class Float:
         Names of the channels of its output.
     """
 
-    def __init__(self, graph: Graph, channels: tuple[str, ...]) -> None:
+    def __init__(self, graph: FloatGraph, channels: tuple[str, ...]) -> None:
         self.graph = graph
         self.channels = channels
 
     def outputs(self, images: Images) -> Outputs:
         """Compute the output for (N, height, width, 3) RGB images."""
         stacked = np.asarray(images)
-        seen = grey_of(stacked) if self.graph.channels == 1 else stacked
-        output = outputs_of(self.graph, tensors_of(self.graph, to_input(seen)))
+        seen = rgb_to_grey(stacked) if self.graph.channels == 1 else stacked
+        output = select_outputs(self.graph, compute_tensors(self.graph, normalize_images(seen)))
         return dict(zip(self.channels, output.swapaxes(0, 1), strict=True))
 
 
-class OnLevels:
+class Int8Backend:
     """Int8 network, computed image by image.
 
     Parameters
@@ -73,32 +80,34 @@ class OnLevels:
         grids.
     """
 
-    def __init__(self, network: IntegerNetwork, run: Callable[[NDArray[np.uint8]], Levels]) -> None:
+    def __init__(
+        self, network: IntegerNetwork, run: Callable[[NDArray[np.uint8]], Int8Grids]
+    ) -> None:
         self.network = network
         self.run = run
 
     def outputs(self, images: Images) -> Outputs:
         """Compute the dequantized heads for (N, height, width, 3) RGB images."""
-        seen = [seen_by(self.network, image) for image in images]
-        return real_outputs(self.network, [self.run(image) for image in seen])
+        seen = [to_network_input(self.network, image) for image in images]
+        return dequantize_heads(self.network, [self.run(image) for image in seen])
 
 
-def integer(network: IntegerNetwork) -> OnLevels:
+def build_reference_backend(network: IntegerNetwork) -> Int8Backend:
     """Return the backend of the integer reference, in NumPy."""
-    return OnLevels(network, lambda image: reference.run(network, image))
+    return Int8Backend(network, lambda image: reference.run_network(network, image))
 
 
-def seen_by(network: IntegerNetwork, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def to_network_input(network: IntegerNetwork, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Convert a (height, width, 3) RGB image to the network's format: RGB, or grey."""
-    return grey_of(image[None])[0] if network.channels == 1 else image
+    return rgb_to_grey(image[None])[0] if network.channels == 1 else image
 
 
-def real_outputs(network: IntegerNetwork, levels: list[Levels]) -> Outputs:
+def dequantize_heads(network: IntegerNetwork, levels: list[Int8Grids]) -> Outputs:
     """Dequantize the int8 grids of N images."""
     return {
-        channel: reference.real(
+        channel: reference.dequantize(
             network.heads[head], np.stack([grids[head] for grids in levels])
         ).astype(np.float32)
-        for channel, head in HEAD_OF.items()
+        for channel, head in HEAD_OF_CHANNEL.items()
         if head in network.heads
     }

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 
 
-def mosaic(image: Image, *, red_row: int = 0, red_col: int = 0) -> Image:
+def to_mosaic(image: Image, *, red_row: int = 0, red_col: int = 0) -> Image:
     """Simulate the (H, W) Bayer mosaic of an (H, W, 3) RGB image, or of (H, W, 1) grey.
 
     Parameters

@@ -13,15 +13,15 @@ from types import ModuleType
 import numpy as np
 
 from dmrl.deploy.backend_names import BackendName
-from dmrl.deploy.backends import Backend, Images, OnLevels, grids_of, integer
+from dmrl.deploy.backends import Backend, Images, Int8Backend, build_reference_backend, to_grids
 from dmrl.deploy.c import c_name
-from dmrl.deploy.c.run.compiled import Compiled
-from dmrl.deploy.c.run.emulated import RISCV32, Emulated
+from dmrl.deploy.c.run.compiled import CompiledNetwork
+from dmrl.deploy.c.run.emulated import RISCV32, EmulatedNetwork
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.deploy.int8.store import INTEGER_NAME, load
+from dmrl.deploy.int8.store import INTEGER_NAME, load_network
 from dmrl.errors import MissingExtra, ModelError, SettingError
 from dmrl.guards.bounded_parsing import parse_json
-from dmrl.guards.paths import refuse_no_text, refuse_pipes
+from dmrl.guards.paths import refuse_pipes, require_text_path
 from dmrl.learn import pretrained
 from dmrl.learn.inference.decode_grids import Grids
 
@@ -29,8 +29,8 @@ FLOAT_ONNX_NAME = "model.onnx"
 INT8_ONNX_NAME = "model.int8.onnx"
 DESCRIPTION_NAME = "model.json"
 WEIGHTS_NAME = "model.safetensors"
-QUANTISE = "Make one with: dmrl quantize MODEL DATASET OUT"
-LIBRARIES: dict[BackendName, tuple[str, ...]] = {
+QUANTIZE_HINT = "Make one with: dmrl quantize MODEL DATASET OUT"
+BACKEND_PACKAGES: dict[BackendName, tuple[str, ...]] = {
     "torch": ("torch", "numpy"),
     "onnx": ("onnxruntime", "numpy"),
     "onnx-int8": ("onnxruntime", "numpy"),
@@ -112,16 +112,16 @@ def open_detector(model: Path, backend: BackendName) -> Detector:
     if not model.exists():
         raise ModelError(
             f"no model {model}. Give a run folder, a Keras .h5, an export folder, or the name of "
-            f"one that ships with dmrl: {', '.join(pretrained.names())}"
+            f"one that ships with dmrl: {', '.join(pretrained.list_pretrained())}"
         )
-    refuse_no_text(model)
+    require_text_path(model)
     refuse_pipes(model)
-    if backend not in OPENS:
-        raise SettingError(f"no backend {backend}. There are: {', '.join(OPENS)}")
-    return OPENS[backend](model, backend)
+    if backend not in OPENERS:
+        raise SettingError(f"no backend {backend}. There are: {', '.join(OPENERS)}")
+    return OPENERS[backend](model, backend)
 
 
-def fastest(model: Path, size_px: tuple[int, int]) -> BackendName:
+def select_fastest_backend(model: Path, size_px: tuple[int, int]) -> BackendName:
     """Return the fastest installed float backend that supports all outputs of a model.
 
     Parameters
@@ -143,15 +143,15 @@ def fastest(model: Path, size_px: tuple[int, int]) -> BackendName:
     return "onnx" if told and size_px == (learned.width_px, learned.height_px) else "torch"
 
 
-def _torch(model: Path, _backend: BackendName) -> Detector:
+def _open_torch(model: Path, _backend: BackendName) -> Detector:
     if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():
         raise ModelError(
             f"{model} is an export folder, which torch cannot run. Give --backend onnx, or the "
             "model that was exported"
         )
-    learned = _room("dmrl.learn.inference.loaded_model", "train", "--backend torch").load_model(
-        model
-    )
+    learned = _import_optional(
+        "dmrl.learn.inference.loaded_model", "train", "--backend torch"
+    ).load_model(model)
     file = model / WEIGHTS_NAME if model.is_dir() else None
     return Detector(
         model.name,
@@ -163,74 +163,78 @@ def _torch(model: Path, _backend: BackendName) -> Detector:
     )
 
 
-def _onnx(model: Path, _backend: BackendName) -> Detector:
-    room = _room("dmrl.deploy.onnx.runtime", "deploy", "--backend onnx")
+def _open_onnx(model: Path, _backend: BackendName) -> Detector:
+    room = _import_optional("dmrl.deploy.onnx.runtime", "deploy", "--backend onnx")
     file = model / FLOAT_ONNX_NAME
     if file.is_file():
         runs = room.OnnxRun(file, file)
-        stride_px, threshold = _described(model / DESCRIPTION_NAME)
+        stride_px, threshold = _parse_description(model / DESCRIPTION_NAME)
     else:
-        learned = _room("dmrl.learn.inference.loaded_model", "train", "a model to ONNX").load_model(
-            model
-        )
-        grey = (model / INTEGER_NAME).is_file() and load(model).channels == 1
-        export = _room("dmrl.deploy.onnx.float_model", "deploy", "--backend onnx")
+        learned = _import_optional(
+            "dmrl.learn.inference.loaded_model", "train", "a model to ONNX"
+        ).load_model(model)
+        grey = (model / INTEGER_NAME).is_file() and load_network(model).channels == 1
+        export = _import_optional("dmrl.deploy.onnx.float_model", "deploy", "--backend onnx")
         runs = room.OnnxRun(export.float_onnx_of(learned, grey=grey), model)
         stride_px, threshold = learned.network.stride_px, learned.threshold
         file = model / WEIGHTS_NAME
     size_px = (runs.width_px, runs.height_px)
     decides = file if file.is_file() else None
-    return Detector(model.name, _grids(runs), stride_px, threshold, size_px, decides)
+    return Detector(model.name, _grids_function(runs), stride_px, threshold, size_px, decides)
 
 
-def _onnx_int8(model: Path, backend: BackendName) -> Detector:
-    room = _room("dmrl.deploy.onnx.runtime", "deploy", "--backend onnx-int8")
-    network = _network(model, backend)
+def _open_onnx_int8(model: Path, backend: BackendName) -> Detector:
+    room = _import_optional("dmrl.deploy.onnx.runtime", "deploy", "--backend onnx-int8")
+    network = _load_int8_network(model, backend)
     file = model / INT8_ONNX_NAME
     if file.is_file():
-        return _of_network(model, network, room.OnnxRun(file, file), file)
-    written = _room("dmrl.deploy.onnx.graph_writer", "deploy", "--backend onnx-int8").int8_onnx(
-        network
-    )
-    return _of_network(model, network, room.OnnxRun(written, model), _integer_file(model))
+        return _build_detector(model, network, room.OnnxRun(file, file), file)
+    written = _import_optional(
+        "dmrl.deploy.onnx.graph_writer", "deploy", "--backend onnx-int8"
+    ).int8_onnx(network)
+    return _build_detector(model, network, room.OnnxRun(written, model), _integer_path(model))
 
 
-def _integer(model: Path, backend: BackendName) -> Detector:
-    network = _network(model, backend)
-    return _of_network(model, network, integer(network), _integer_file(model))
+def _open_integer(model: Path, backend: BackendName) -> Detector:
+    network = _load_int8_network(model, backend)
+    return _build_detector(model, network, build_reference_backend(network), _integer_path(model))
 
 
-def _c(model: Path, backend: BackendName) -> Detector:
-    network = _network(model, backend)
+def _open_c(model: Path, backend: BackendName) -> Detector:
+    network = _load_int8_network(model, backend)
     source = model / f"{c_name(network)}.c"
     exported = source.is_file()
-    kind = Emulated if backend == RISCV32 else Compiled
-    runs = OnLevels(network, kind(network, model if exported else None).run)
-    return _of_network(model, network, runs, source if exported else _integer_file(model))
+    kind = EmulatedNetwork if backend == RISCV32 else CompiledNetwork
+    runs = Int8Backend(network, kind(network, model if exported else None).run)
+    return _build_detector(model, network, runs, source if exported else _integer_path(model))
 
 
-def _network(model: Path, backend: BackendName) -> IntegerNetwork:
+def _load_int8_network(model: Path, backend: BackendName) -> IntegerNetwork:
     if model.is_file() and model.suffix != ".npz":
-        raise ModelError(f"{model} is float, --backend {backend} is int8. {QUANTISE}")
+        raise ModelError(f"{model} is float, --backend {backend} is int8. {QUANTIZE_HINT}")
     if model.is_dir() and not (model / INTEGER_NAME).is_file():
-        raise ModelError(f"{model} holds no int8 network, as --backend {backend} needs. {QUANTISE}")
-    return load(model)
+        raise ModelError(
+            f"{model} holds no int8 network, as --backend {backend} needs. {QUANTIZE_HINT}"
+        )
+    return load_network(model)
 
 
-def _integer_file(model: Path) -> Path:
+def _integer_path(model: Path) -> Path:
     return model / INTEGER_NAME if model.is_dir() else model
 
 
-def _of_network(model: Path, network: IntegerNetwork, runs: Backend, file: Path) -> Detector:
+def _build_detector(model: Path, network: IntegerNetwork, runs: Backend, file: Path) -> Detector:
     size_px = (network.width_px, network.height_px)
-    return Detector(model.name, _grids(runs), network.stride_px, network.threshold, size_px, file)
+    return Detector(
+        model.name, _grids_function(runs), network.stride_px, network.threshold, size_px, file
+    )
 
 
-def _grids(runs: Backend) -> Callable[[Images], Grids]:
-    return lambda images: grids_of(runs.outputs(images))
+def _grids_function(runs: Backend) -> Callable[[Images], Grids]:
+    return lambda images: to_grids(runs.outputs(images))
 
 
-def _described(file: Path) -> tuple[int, float]:
+def _parse_description(file: Path) -> tuple[int, float]:
     """Read stride and threshold from the description of an export folder."""
     try:
         said = parse_json(file.read_text(encoding="utf-8"))
@@ -242,18 +246,18 @@ def _described(file: Path) -> tuple[int, float]:
         raise ModelError(f"{file} is damaged: {e}. Export the model again") from None
 
 
-def _room(name: str, extra: str, what: str) -> ModuleType:
+def _import_optional(name: str, extra: str, what: str) -> ModuleType:
     try:
         return import_module(name)
     except ModuleNotFoundError as e:
         raise MissingExtra(str(e.name), extra, what) from None
 
 
-OPENS: dict[BackendName, Callable[[Path, BackendName], Detector]] = {
-    "torch": _torch,
-    "onnx": _onnx,
-    "onnx-int8": _onnx_int8,
-    "integer": _integer,
-    "c": _c,
-    "riscv32": _c,
+OPENERS: dict[BackendName, Callable[[Path, BackendName], Detector]] = {
+    "torch": _open_torch,
+    "onnx": _open_onnx,
+    "onnx-int8": _open_onnx_int8,
+    "integer": _open_integer,
+    "c": _open_c,
+    "riscv32": _open_c,
 }

@@ -5,11 +5,11 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from dmrl.deploy.backends import seen_by
-from dmrl.deploy.c import STACKS_BYTES, write_c
+from dmrl.deploy.backends import to_network_input
+from dmrl.deploy.c import CORE_STACKS_BYTES, write_c
 from dmrl.deploy.detector import DESCRIPTION_NAME, FLOAT_ONNX_NAME, INT8_ONNX_NAME, WEIGHTS_NAME
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.deploy.int8.store import INTEGER_NAME, load
+from dmrl.deploy.int8.store import INTEGER_NAME, load_network
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples
 from dmrl.errors import ModelError, optional_imports
 
@@ -62,13 +62,13 @@ def write_export(
         from dmrl.deploy.onnx.float_model import float_onnx_of  # noqa: PLC0415 - an extra
         from dmrl.learn.inference import loaded_model  # noqa: PLC0415 - an extra
     trained = loaded_model.load_model(model)
-    network = load(model) if (model / INTEGER_NAME).is_file() else None
+    network = load_network(model) if (model / INTEGER_NAME).is_file() else None
     grey = network is not None and network.channels == 1
     (folder / FLOAT_ONNX_NAME).write_bytes(float_onnx_of(trained, grey=grey))
     if network is not None:
-        near_bytes = None if l1_kb is None else l1_kb * 1024 - STACKS_BYTES
+        near_bytes = None if l1_kb is None else l1_kb * 1024 - CORE_STACKS_BYTES
         _write_int8(network, model, folder)
-        images = [seen_by(network, image) for image in load_samples(model)]
+        images = [to_network_input(network, image) for image in load_samples(model)]
         write_c(network, folder, images, bayer=bayer, refine=refine, near_bytes=near_bytes)
     described = loaded_model.describe(trained) | {"channels": 1 if grey else 3}
     text = json.dumps(described, indent=1) + "\n"

@@ -9,9 +9,9 @@ import numpy as np
 
 from dmrl.deploy.detector import Detector
 from dmrl.images.codec import Rgb
-from dmrl.learn.inference.decode_grids import Found, Grids
+from dmrl.learn.inference.decode_grids import Detections, Grids
 from dmrl.learn.inference.decode_grids import decode as find
-from dmrl.learn.inference.tta import VIEWS, agreed, returned, shown
+from dmrl.learn.inference.tta import TTA_VIEWS, apply_view, merge_views, undo_view
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class DetectionOptions:
 
 def detect_images(
     images: Iterable[Rgb], detector: Detector, options: DetectionOptions
-) -> Iterator[tuple[Found, Grids]]:
+) -> Iterator[tuple[Detections, Grids]]:
     """Yield the detections and grids of each run of images of one size.
 
     Parameters
@@ -45,13 +45,13 @@ def detect_images(
 
 def _merge_views(
     images: list[Rgb], grids: Grids, detector: Detector, options: DetectionOptions
-) -> Found:
+) -> Detections:
     """Return the detections in images, whose grids are given, over all views."""
     stride_px, (height_px, width_px, _) = detector.stride_px, images[0].shape
     most, least = options.most, options.min_confidence
     decode = partial(find, stride_px=stride_px, most=most, min_confidence=least)
     found = [decode(*grids)]
-    for view in VIEWS[1 : options.views]:
-        again = decode(*detector.grids(shown(np.stack(images), view, stride_px)))
-        found.append(returned(again, view, stride_px, (height_px, width_px)))
-    return agreed(found, most=most, min_confidence=least) if len(found) > 1 else found[0]
+    for view in TTA_VIEWS[1 : options.views]:
+        again = decode(*detector.grids(apply_view(np.stack(images), view, stride_px)))
+        found.append(undo_view(again, view, stride_px, (height_px, width_px)))
+    return merge_views(found, most=most, min_confidence=least) if len(found) > 1 else found[0]

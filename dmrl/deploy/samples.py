@@ -10,7 +10,7 @@ from dmrl.errors import ModelError
 from dmrl.guards.bounded_parsing import load_npz
 
 SAMPLES_NAME = "samples.npz"
-SAMPLES = 4
+SAMPLE_COUNT = 4
 """Number of images stored."""
 
 

@@ -6,11 +6,27 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.errors import SettingError
-from dmrl.evaluation.detections import Pairs, join
-from dmrl.evaluation.figure_tables import band_values, by_band_table, curve_values, finite
-from dmrl.learn.inference.detection_metrics import DEFINITIONS, BandFigures, Scored, by_band, score
-from dmrl.learn.inference.threshold import LEAST_EMPTY, LEAST_LABELS, alarms, best_threshold
-from dmrl.recording import input_of
+from dmrl.evaluation.detections import LabelledDetections, join_by_image
+from dmrl.evaluation.figure_tables import (
+    band_to_json,
+    build_band_table,
+    curves_to_json,
+    finite_or_none,
+)
+from dmrl.learn.inference.detection_metrics import (
+    METRIC_DEFINITIONS,
+    BandMetrics,
+    ScoredDetections,
+    compute_band_metrics,
+    score_detections,
+)
+from dmrl.learn.inference.threshold import (
+    MIN_EMPTY_IMAGES,
+    MIN_LABELS,
+    count_false_alarms,
+    select_threshold,
+)
+from dmrl.recording import build_input
 from dmrl.terminal.tables import print_line, print_table
 
 Spread = Callable[[Callable[..., Any], Sequence[Any], int], Iterator[Any]]
@@ -54,9 +70,9 @@ class Evaluation:
     """
 
     criteria: DetectionCriteria
-    pairs: Pairs
-    scored: Scored
-    bands: list[BandFigures]
+    pairs: LabelledDetections
+    scored: ScoredDetections
+    bands: list[BandMetrics]
     threshold: float
 
 
@@ -81,12 +97,12 @@ def evaluate_detections(
     SettingError
         If one has no labels of that source, no such split, or no image to evaluate.
     """
-    pairs = join(recordings, criteria.against, criteria.split, partial=criteria.partial)
-    scored = score(pairs.images, pairs.labels, pairs.detections)
+    pairs = join_by_image(recordings, criteria.against, criteria.split, partial=criteria.partial)
+    scored = score_detections(pairs.images, pairs.labels, pairs.detections)
     threshold = _choose_threshold(scored, pairs, criteria)
     if pairs.images * criteria.draws < MIN_PARALLEL_DRAWS:
         workers = 1
-    bands = by_band(
+    bands = compute_band_metrics(
         scored,
         threshold=threshold,
         draws=criteria.draws,
@@ -96,18 +112,20 @@ def evaluate_detections(
     return Evaluation(criteria, pairs, scored, bands, threshold)
 
 
-def _choose_threshold(scored: Scored, pairs: Pairs, criteria: DetectionCriteria) -> float:
+def _choose_threshold(
+    scored: ScoredDetections, pairs: LabelledDetections, criteria: DetectionCriteria
+) -> float:
     """Return the given threshold, that of the rate of false alarms, or the detector's own."""
     if criteria.false_alarms is None:
         own = pairs.threshold or DEFAULT_THRESHOLD
         return own if criteria.threshold is None else criteria.threshold
     if criteria.threshold is not None:
         raise SettingError("--threshold and --false-alarms are two answers. Give one of them")
-    empty = alarms(scored, 0.0).empty_images
-    chosen = best_threshold(scored, criteria.false_alarms)
-    if chosen is None or empty < LEAST_EMPTY:
+    empty = count_false_alarms(scored, 0.0).empty_images
+    chosen = select_threshold(scored, criteria.false_alarms)
+    if chosen is None or empty < MIN_EMPTY_IMAGES:
         raise SettingError(
-            f"--false-alarms wants {LEAST_LABELS} labels, some of them found, and {LEAST_EMPTY} "
+            f"--false-alarms wants {MIN_LABELS} labels, some of them found, and {MIN_EMPTY_IMAGES} "
             f"images without a robot: there are {len(scored.labels)} and {empty}. Give --threshold"
         )
     return chosen
@@ -119,8 +137,8 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
     One recording is ``recording``, several are ``recordings``.
     """
     criteria = evaluation.criteria
-    sources = [{"name": s.name, "sha256": s.sha256} for s in map(input_of, recordings)]
-    overall, *bands = [band_values(band) for band in evaluation.bands]
+    sources = [{"name": s.name, "sha256": s.sha256} for s in map(build_input, recordings)]
+    overall, *bands = [band_to_json(band) for band in evaluation.bands]
     return {
         **({"recordings": sources} if len(sources) > 1 else {"recording": sources[0]}),
         "against": criteria.against,
@@ -133,21 +151,23 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
         "images_without_detections": evaluation.pairs.unseen,
         "left_out": evaluation.pairs.left_out,
         **{
-            name: finite(value)
-            for name, value in asdict(alarms(evaluation.scored, evaluation.threshold)).items()
+            name: finite_or_none(value)
+            for name, value in asdict(
+                count_false_alarms(evaluation.scored, evaluation.threshold)
+            ).items()
         },
         "bootstrap": {"draws": criteria.draws, "seed": criteria.seed},
         "overall": overall,
         "bands": bands,
-        "curves": curve_values(evaluation.scored),
-        "definitions": DEFINITIONS,
+        "curves": curves_to_json(evaluation.scored),
+        "definitions": METRIC_DEFINITIONS,
     }
 
 
 def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None:
     """Print the figures, one column per band that holds labels."""
     criteria = evaluation.criteria
-    headers, rows = by_band_table(evaluation.bands)
+    headers, rows = build_band_table(evaluation.bands)
     split = f", split {criteria.split}" if criteria.split else ""
     name = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
     part = ", only those with detections" if criteria.partial else ""
@@ -163,7 +183,7 @@ def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None
             f"{unseen} images have no Detections message: nothing was found there. "
             "--partial leaves them out"
         )
-    quiet = alarms(evaluation.scored, evaluation.threshold)
+    quiet = count_false_alarms(evaluation.scored, evaluation.threshold)
     if quiet.empty_images:
         print_line(
             f"nobody in view: an alarm in {quiet.alarmed_images} of {quiet.empty_images} images, "

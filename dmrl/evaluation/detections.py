@@ -18,20 +18,20 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.datasets import Split
 from dmrl.errors import RecordingError, SettingError
-from dmrl.geometry.frames import inside
-from dmrl.images.codec import size
+from dmrl.geometry.frames import is_inside
+from dmrl.images.codec import read_size
 from dmrl.learn.inference.matching import Points
 from dmrl.messages import STATUS_OK
-from dmrl.recording import Contents, read, splits
-from dmrl.recording.label_sources import LOOKED, sources_in
-from dmrl.recording.provenance_inputs import refuse_twice
+from dmrl.recording import LoadedRecording, read, read_splits
+from dmrl.recording.label_sources import SOURCE_FIELDS, collect_sources
+from dmrl.recording.provenance_inputs import refuse_duplicates
 from dmrl.terminal.progress import track
 
 Mask = NDArray[np.bool_]
 Times = NDArray[np.int64]
 
 
-class At(NamedTuple):
+class ImageKey(NamedTuple):
     """Identifies an image: recording, robot, and log time in nanoseconds."""
 
     recording: Path
@@ -40,7 +40,7 @@ class At(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Pairs:
+class LabelledDetections:
     """Labels and detections of the same images.
 
     Parameters
@@ -59,7 +59,7 @@ class Pairs:
         Images without a Detections message, evaluated as images without detections.
     """
 
-    at: list[At]
+    at: list[ImageKey]
     labels: Points
     detections: Points
     threshold: float = 0.0
@@ -72,9 +72,9 @@ class Pairs:
         return len(self.at)
 
 
-def join(
+def join_by_image(
     recordings: Sequence[Path], against: str, split: str | None = None, *, partial: bool = False
-) -> Pairs:
+) -> LabelledDetections:
     """Join labels and detections of every image that can be evaluated, recording by recording.
 
     An image without a Detections message counts as one without detections: images that a detector
@@ -98,26 +98,30 @@ def join(
     SettingError
         If a recording has no labels from that source, no such split, or no image to evaluate.
     """
-    refuse_twice(recordings)
-    return _together(
-        [_join(path, against, split, partial) for path in track(recordings, "Reading")]
+    refuse_duplicates(recordings)
+    return _concatenate_parts(
+        [_join_recording(path, against, split, partial) for path in track(recordings, "Reading")]
     )
 
 
-def _join(recording: Path, against: str, split: str | None, partial: bool) -> Pairs:
-    held = Contents(recording, topics.LABELS, topics.DETECTIONS)
-    robots = topics.robots(list(held.topics), topics.DETECTIONS)
+def _join_recording(
+    recording: Path, against: str, split: str | None, partial: bool
+) -> LabelledDetections:
+    held = LoadedRecording(recording, topics.LABELS, topics.DETECTIONS)
+    robots = topics.list_robots(list(held.topics), topics.DETECTIONS)
     if robots and not partial:
-        labelled = topics.robots(list(held.topics), topics.LABELS)
-        pictured = topics.robots(list(held.topics), topics.CAMERA_IMAGE)
+        labelled = topics.list_robots(list(held.topics), topics.LABELS)
+        pictured = topics.list_robots(list(held.topics), topics.CAMERA_IMAGE)
         robots = sorted({*robots, *(robot for robot in labelled if robot in pictured)})
     if not robots:
         raise RecordingError(
             f"{recording} has no detections. Try: dmrl predict MODEL {recording} OUT.mcap"
         )
-    spans = _spans(recording, splits(recording, held.summary), split)
+    spans = _find_spans(recording, read_splits(recording, held.summary), split)
     _require_source(held, robots, against)
-    pairs = _together([_join_robot(held, robot, against, spans, partial) for robot in robots])
+    pairs = _concatenate_parts(
+        [_join_robot(held, robot, against, spans, partial) for robot in robots]
+    )
     if not pairs.images:
         seen = " and detections" if partial else ""
         where = f"in split {split}" if split else "in it"
@@ -128,20 +132,20 @@ def _join(recording: Path, against: str, split: str | None, partial: bool) -> Pa
     return pairs
 
 
-def labels_of_split(split: Split, rows: Sequence[int]) -> Points:
+def read_split_labels(split: Split, rows: Sequence[int]) -> Points:
     """Read the labels inside some images of a split; images are numbered by their position."""
     height_px, width_px = split.image_shape
-    entries = _column(split.table, "peers")
-    labels = _points(entries, None, np.array(rows, np.int64), np.arange(len(rows)))
-    return labels.select(_in_view(labels, width_px, height_px))
+    entries = _combine_column(split.table, "peers")
+    labels = _build_points(entries, None, np.array(rows, np.int64), np.arange(len(rows)))
+    return labels.select(_is_in_view(labels, width_px, height_px))
 
 
-def _in_view(labels: Points, width_px: int, height_px: int) -> Mask:
+def _is_in_view(labels: Points, width_px: int, height_px: int) -> Mask:
     uv = np.column_stack([labels.u_px, labels.v_px])
-    return inside(uv, width_px, height_px) & (labels.depth_m > 0)
+    return is_inside(uv, width_px, height_px) & (labels.depth_m > 0)
 
 
-def _spans(
+def _find_spans(
     recording: Path, own: dict[str, list[tuple[int, int]]], split: str | None
 ) -> list[tuple[int, int]] | None:
     if split is None:
@@ -152,11 +156,11 @@ def _spans(
     return own[split]
 
 
-def _require_source(held: Contents, robots: Iterable[str], against: str) -> None:
+def _require_source(held: LoadedRecording, robots: Iterable[str], against: str) -> None:
     present: set[str] = set()
     for robot in robots:
-        table = held.table(topics.labels(robot), LOOKED)
-        present |= sources_in(*(_column(table, name) for name in LOOKED))
+        table = held.get_table(topics.LABELS(robot), SOURCE_FIELDS)
+        present |= collect_sources(*(_combine_column(table, name) for name in SOURCE_FIELDS))
     if present and against not in present:
         has = ", ".join(sorted(present))
         raise SettingError(
@@ -165,65 +169,65 @@ def _require_source(held: Contents, robots: Iterable[str], against: str) -> None
 
 
 def _join_robot(
-    held: Contents,
+    held: LoadedRecording,
     robot: str,
     against: str,
     spans: list[tuple[int, int]] | None,
     partial: bool,
-) -> Pairs:
+) -> LabelledDetections:
     left_out: Counter[str] = Counter()
-    labelled = held.table(topics.labels(robot), LOOKED)
-    detected = _detected(held, robot)
-    times, (peers, looked) = _by_time(labelled)
-    seen_at = _column(detected, "log_time").to_numpy()
-    mine, usable = _usable(peers, looked, against, _within(times, spans), left_out)
+    labelled = held.get_table(topics.LABELS(robot), SOURCE_FIELDS)
+    detected = _read_detections(held, robot)
+    times, (peers, looked) = _merge_by_time(labelled)
+    seen_at = _combine_column(detected, "log_time").to_numpy()
+    mine, usable = _select_usable(peers, looked, against, _is_within(times, spans), left_out)
     seen = np.isin(times, seen_at)
     if partial:
         left_out["images without detections"] += int((usable & ~seen).sum())
     else:
-        seen |= np.isin(times, held.times(topics.camera_image(robot)))
+        seen |= np.isin(times, held.get_times(topics.CAMERA_IMAGE(robot)))
         left_out["labels without an image"] += int((usable & ~seen).sum())
     usable &= seen
     judged = times[usable]
     _, in_judged, in_detections = np.intersect1d(judged, seen_at, return_indices=True)
-    labels = _points(peers, mine, np.flatnonzero(usable), np.arange(len(judged)))
-    width_px, height_px = _image_size(held.path, robot)
-    shown = _in_view(labels, width_px, height_px)
+    labels = _build_points(peers, mine, np.flatnonzero(usable), np.arange(len(judged)))
+    width_px, height_px = _read_image_size(held.path, robot)
+    shown = _is_in_view(labels, width_px, height_px)
     left_out["labels outside their image"] += int((~shown).sum())
-    every = _column(detected, "detections")
-    detections = _points(every, None, in_detections, in_judged)
-    threshold = float(np.max(_column(detected, "threshold").to_numpy(), initial=0.0))
-    at = [At(held.path, robot, int(time_ns)) for time_ns in judged]
+    every = _combine_column(detected, "detections")
+    detections = _build_points(every, None, in_detections, in_judged)
+    threshold = float(np.max(_combine_column(detected, "threshold").to_numpy(), initial=0.0))
+    at = [ImageKey(held.path, robot, int(time_ns)) for time_ns in judged]
     unseen = len(judged) - len(in_judged)
-    return Pairs(at, labels.select(shown), detections, threshold, left_out, unseen)
+    return LabelledDetections(at, labels.select(shown), detections, threshold, left_out, unseen)
 
 
-def _detected(held: Contents, robot: str) -> pa.Table:
+def _read_detections(held: LoadedRecording, robot: str) -> pa.Table:
     """Read a robot's detections; an empty table if it has none."""
-    topic = topics.detections(robot)
+    topic = topics.DETECTIONS(robot)
     if topic in held.topics:
-        return held.table(topic)
-    other = topics.robots(list(held.topics), topics.DETECTIONS)[0]
-    return held.table(topics.detections(other)).slice(0, 0)
+        return held.get_table(topic)
+    other = topics.list_robots(list(held.topics), topics.DETECTIONS)[0]
+    return held.get_table(topics.DETECTIONS(other)).slice(0, 0)
 
 
-def _by_time(labelled: pa.Table) -> tuple[Times, list[pa.Array]]:
+def _merge_by_time(labelled: pa.Table) -> tuple[Times, list[pa.Array]]:
     """Merge messages of equal log time; return the times and the merged columns of `LOOKED`."""
-    times, first = np.unique(_column(labelled, "log_time").to_numpy(), return_index=True)
+    times, first = np.unique(_combine_column(labelled, "log_time").to_numpy(), return_index=True)
     found = []
-    for name in LOOKED:
-        entries = _column(labelled, name)
+    for name in SOURCE_FIELDS:
+        entries = _combine_column(labelled, name)
         ends = entries.offsets.to_numpy()
         starts = np.append(ends[first], ends[-1]) - ends[0]
         found.append(pa.ListArray.from_arrays(starts, entries.flatten()))
     return times, found
 
 
-def _usable(
+def _select_usable(
     peers: pa.Array, looked: pa.Array, against: str, within: Mask, left_out: Counter[str]
 ) -> tuple[Mask, Mask]:
     """Select the peers from one source, and the images that they can evaluate."""
-    image = _image_of(peers)
+    image = _image_indices(peers)
     flat = peers.flatten()
     mine = pc.equal(flat.field("source"), against).to_numpy(zero_copy_only=False)
     bad = mine & (flat.field("status").to_numpy(zero_copy_only=False) != STATUS_OK)
@@ -231,7 +235,7 @@ def _usable(
     own = np.bincount(image[mine], minlength=len(peers))
     not_ok = np.bincount(image[bad], minlength=len(peers)) > 0
     asked = pc.equal(looked.flatten(), against).to_numpy(zero_copy_only=False)
-    own += np.bincount(_image_of(looked)[asked], minlength=len(peers))
+    own += np.bincount(_image_indices(looked)[asked], minlength=len(peers))
     known = count + np.diff(looked.offsets.to_numpy()) > 0
     foreign = known & (own == 0)
     left_out["images with labels from other sources only"] += int((within & foreign).sum())
@@ -239,11 +243,11 @@ def _usable(
     return mine, within & ~foreign & ~not_ok
 
 
-def _points(entries: pa.Array, mine: Mask | None, rows: Times, numbers: Times) -> Points:
+def _build_points(entries: pa.Array, mine: Mask | None, rows: Times, numbers: Times) -> Points:
     """Build points from the entries of chosen rows of a list column, with these image numbers."""
     place = np.full(len(entries), -1, np.int64)
     place[rows] = numbers
-    image = place[_image_of(entries)]
+    image = place[_image_indices(entries)]
     keep = np.flatnonzero((image >= 0) if mine is None else (image >= 0) & mine)
     flat = entries.flatten()
     names = {flat.type.field(i).name for i in range(flat.type.num_fields)}
@@ -259,13 +263,13 @@ def _points(entries: pa.Array, mine: Mask | None, rows: Times, numbers: Times) -
     return Points(image[order], **{name: value[order] for name, value in values.items()})
 
 
-def _together(parts: list[Pairs]) -> Pairs:
+def _concatenate_parts(parts: list[LabelledDetections]) -> LabelledDetections:
     """Concatenate the images of several robots or recordings."""
     first = np.cumsum([0, *(part.images for part in parts)])
     left_out: Counter[str] = Counter()
     for part in parts:
         left_out.update(part.left_out)
-    return Pairs(
+    return LabelledDetections(
         [at for part in parts for at in part.at],
         Points.concatenate([p.labels for p in parts], first),
         Points.concatenate([p.detections for p in parts], first),
@@ -275,7 +279,7 @@ def _together(parts: list[Pairs]) -> Pairs:
     )
 
 
-def _within(times: Times, spans: list[tuple[int, int]] | None) -> Mask:
+def _is_within(times: Times, spans: list[tuple[int, int]] | None) -> Mask:
     if spans is None:
         return np.ones(len(times), bool)
     within = np.zeros(len(times), bool)
@@ -284,19 +288,21 @@ def _within(times: Times, spans: list[tuple[int, int]] | None) -> Mask:
     return within
 
 
-def _image_of(entries: pa.Array) -> Times:
+def _image_indices(entries: pa.Array) -> Times:
     """Return the row of a list column that each of its M entries belongs to, (M,)."""
     return np.repeat(np.arange(len(entries)), np.diff(entries.offsets.to_numpy()))
 
 
-def _column(table: pa.Table, name: str) -> pa.Array:
+def _combine_column(table: pa.Table, name: str) -> pa.Array:
     joined = table.column(name).combine_chunks()
     return pa.concat_arrays(joined.chunks) if isinstance(joined, pa.ChunkedArray) else joined
 
 
-def _image_size(recording: Path, robot: str) -> tuple[int, int]:
-    first = next(read(recording, topics.camera_image(robot)), None)
+def _read_image_size(recording: Path, robot: str) -> tuple[int, int]:
+    first = next(read(recording, topics.CAMERA_IMAGE(robot)), None)
     if first is None:
         raise RecordingError(f"{recording} has no image of {robot}. Give the whole recording")
-    width_px, height_px, _ = size(first.message.data, f"{recording}: the first image of {robot}")
+    width_px, height_px, _ = read_size(
+        first.message.data, f"{recording}: the first image of {robot}"
+    )
     return width_px, height_px

@@ -8,7 +8,7 @@ from types import ModuleType
 from typing import Any
 
 from dmrl import topics
-from dmrl.atomic_output import partial_folder, refuse_existing
+from dmrl.atomic_output import atomic_folder, refuse_existing
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation import positions, tracks
 from dmrl.evaluation.detection_report import (
@@ -18,7 +18,7 @@ from dmrl.evaluation.detection_report import (
     describe_evaluation,
     evaluate_detections,
 )
-from dmrl.recording import summary
+from dmrl.recording import read_summary
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_line, print_table
 
@@ -93,9 +93,9 @@ def evaluate_recordings(
 
 def _choose_kind(recording: Path) -> str:
     """Return the kind of results that the last stage has written."""
-    if tracks.can_judge(recording):
+    if tracks.has_tracks_and_truth(recording):
         return "tracks"
-    detected = topics.robots(list(summary(recording).topics), topics.DETECTIONS)
+    detected = topics.list_robots(list(read_summary(recording).topics), topics.DETECTIONS)
     return "positions" if not detected and positions.has_positions(recording) else "detections"
 
 
@@ -123,7 +123,7 @@ def _evaluate_against_truth(
 @contextmanager
 def _write_folder(out: Path, stem: str, made: Document) -> Iterator[Path]:
     """Write a folder: first the document, then what the block writes."""
-    with partial_folder(out) as folder:
+    with atomic_folder(out) as folder:
         text = json.dumps(made, indent=1, allow_nan=False)
         (folder / f"{stem}.json").write_text(text + "\n", encoding="utf-8")
         yield folder

@@ -12,15 +12,15 @@ from typing import Any, Literal
 
 from dmrl import recipe as recipes
 
-KEY, TITLE = "figure", "title"
-MOST = 40
+FIGURE_KEY, TITLE_KEY = "figure", "title"
+MAX_FIGURES = 40
 """Figures of one recipe, at most."""
-_FORM = re.compile(r",?(\.\d{1,2})?[efg%]")
+_FORMAT_PATTERN = re.compile(r",?(\.\d{1,2})?[efg%]")
 """Allowed number formats: no width, since a large one would need gigabytes of spaces."""
 
 
 @dataclass(frozen=True, slots=True)
-class Number:
+class ReportedValue:
     """A measured value beside a published one.
 
     Parameters
@@ -46,7 +46,7 @@ class Number:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class FigureSpec:
     """A figure of a recipe's report.
 
     Parameters
@@ -72,19 +72,19 @@ class Shown:
     of: tuple[str, ...] = ()
     named: tuple[str, ...] = ()
     words: str = ""
-    rows: tuple[Number, ...] = ()
+    rows: tuple[ReportedValue, ...] = ()
 
     @property
     def outputs(self) -> list[str]:
         """Outputs of steps that the figure reads."""
         return [*self.of, *(row.of for row in self.rows)]
 
-    def label(self, place: int) -> str:
+    def output_label(self, place: int) -> str:
         """Return the label of one of its outputs."""
         return self.named[place] if place < len(self.named) else self.of[place]
 
 
-def told(name: str | Path, recipe: Mapping[str, Any]) -> list[Shown]:
+def read_figures(name: str | Path, recipe: Mapping[str, Any]) -> list[FigureSpec]:
     """Read the figures of a recipe; empty if it defines none.
 
     Raises
@@ -92,12 +92,12 @@ def told(name: str | Path, recipe: Mapping[str, Any]) -> list[Shown]:
     RecipeError
         If a table is invalid.
     """
-    if wrong := list(faults(recipe)):
-        raise recipes.faulty(name, wrong)
-    return [recipes.check(name, table, Shown) for table in recipe.get(KEY, [])]
+    if wrong := list(iter_faults(recipe)):
+        raise recipes.recipe_error(name, wrong)
+    return [recipes.check(name, table, FigureSpec) for table in recipe.get(FIGURE_KEY, [])]
 
 
-def faults(recipe: Mapping[str, Any], outs: Set[str] | None = None) -> Iterator[str]:
+def iter_faults(recipe: Mapping[str, Any], outs: Set[str] | None = None) -> Iterator[str]:
     """Yield the errors in the figures of a recipe.
 
     Parameters
@@ -107,24 +107,26 @@ def faults(recipe: Mapping[str, Any], outs: Set[str] | None = None) -> Iterator[
     outs
         Outputs of its steps. None: unknown.
     """
-    if not isinstance(recipe.get(TITLE, ""), str):
-        yield f"{TITLE}: must be a text"
-    tables = recipe.get(KEY, [])
-    if not isinstance(tables, list) or len(tables) > MOST:
-        yield f"{KEY}: must be [[{KEY}]] tables, {MOST} at most"
+    if not isinstance(recipe.get(TITLE_KEY, ""), str):
+        yield f"{TITLE_KEY}: must be a text"
+    tables = recipe.get(FIGURE_KEY, [])
+    if not isinstance(tables, list) or len(tables) > MAX_FIGURES:
+        yield f"{FIGURE_KEY}: must be [[{FIGURE_KEY}]] tables, {MAX_FIGURES} at most"
         return
     for number, table in enumerate(tables, start=1):
-        where = f"{KEY}.{number}"
+        where = f"{FIGURE_KEY}.{number}"
         wrong = (
-            list(recipes.faults(table, Shown)) if isinstance(table, dict) else ["must be a table"]
+            list(recipes.find_faults(table, FigureSpec))
+            if isinstance(table, dict)
+            else ["must be a table"]
         )
         yield from (f"{where}.{fault}" for fault in wrong)
         if not wrong:
-            shown = recipes.check("", table, Shown)
-            yield from (f"{where}.{fault}" for fault in _slips(shown, outs))
+            shown = recipes.check("", table, FigureSpec)
+            yield from (f"{where}.{fault}" for fault in _iter_spec_faults(shown, outs))
 
 
-def _slips(shown: Shown, outs: Set[str] | None) -> Iterator[str]:
+def _iter_spec_faults(shown: FigureSpec, outs: Set[str] | None) -> Iterator[str]:
     needs, unused = ("rows", "of") if shown.shows == "numbers" else ("of", "rows")
     if not getattr(shown, needs) or getattr(shown, unused):
         yield f"{needs}: {shown.shows} needs {needs}, and no {unused}"
@@ -135,11 +137,11 @@ def _slips(shown: Shown, outs: Set[str] | None) -> Iterator[str]:
         if ".." in parts or (outs is not None and parts[0] not in outs):
             yield f"of: no step writes {name}. Name a step's out"
     for row in shown.rows:
-        if not _FORM.fullmatch(row.form):
+        if not _FORMAT_PATTERN.fullmatch(row.form):
             yield f"rows: {row.form} is not a number format. Try: .2f, .1%"
 
 
-def value_at(document: Any, at: str) -> float | int | str | None:
+def find_value(document: Any, at: str) -> float | int | str | None:
     """Return the value at a path of a JSON document; None if the path does not exist.
 
     Parameters
@@ -151,18 +153,18 @@ def value_at(document: Any, at: str) -> float | int | str | None:
     """
     for part in at.split("."):
         try:
-            inside = _of_list if isinstance(document, list) else _of_table
+            inside = _get_from_list if isinstance(document, list) else _get_from_table
             document = inside(document, part)
         except (KeyError, IndexError, TypeError, StopIteration):
             return None
     return document if isinstance(document, float | int | str) else None
 
 
-def _of_table(table: Any, part: str) -> Any:
+def _get_from_table(table: Any, part: str) -> Any:
     return table[part]
 
 
-def _of_list(rows: list[Any], part: str) -> Any:
+def _get_from_list(rows: list[Any], part: str) -> Any:
     if part.lstrip("-").isdecimal():
         return rows[int(part)]
     return next(row for row in rows if isinstance(row, dict) and part in row.values())

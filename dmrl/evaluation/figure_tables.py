@@ -5,10 +5,15 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from dmrl.learn.inference.detection_metrics import BandFigures, Figure, Scored, curves
+from dmrl.learn.inference.detection_metrics import (
+    BandMetrics,
+    MetricValue,
+    ScoredDetections,
+    compute_curves,
+)
 
 # Name of a figure, its words in the table, and its format.
-ROWS = (
+FIGURE_ROWS = (
     ("median_px", "median error, px", ".2f"),
     ("mean_px", "mean error, px", ".1f"),
     ("rmse_px", "RMS error, px", ".1f"),
@@ -27,7 +32,7 @@ ROWS = (
 )
 
 
-def by_band_table(bands: Sequence[BandFigures]) -> tuple[list[str], list[list[object]]]:
+def build_band_table(bands: Sequence[BandMetrics]) -> tuple[list[str], list[list[object]]]:
     """Build headers and rows: all labels, then each band of depth that has labels.
 
     Parameters
@@ -38,44 +43,46 @@ def by_band_table(bands: Sequence[BandFigures]) -> tuple[list[str], list[list[ob
     overall, *others = bands
     shown = [overall, *(band for band in others if band.labels)]
     rows: list[list[object]] = [["labels", *(str(band.labels) for band in shown)]]
-    for name, words, form in ROWS:
-        rows.append([words, *(_cell(band.figures[name], form) for band in shown)])
-    return ["all", *(_range(band) for band in shown[1:])], rows
+    for name, words, form in FIGURE_ROWS:
+        rows.append([words, *(_format_cell(band.figures[name], form) for band in shown)])
+    return ["all", *(_format_range(band) for band in shown[1:])], rows
 
 
-def _range(band: BandFigures) -> str:
+def _format_range(band: BandMetrics) -> str:
     to = f" to {band.to_m:g} m" if math.isfinite(band.to_m) else " m and more"
     return f"{band.from_m:g}{to}"
 
 
-def _cell(figure: Figure, form: str) -> str:
+def _format_cell(figure: MetricValue, form: str) -> str:
     if math.isnan(figure.value):
         return "-"
     low, high = format(figure.low, form), format(figure.high, form)
     return f"{figure.value:{form}} [{low.removesuffix('%')}, {high.removesuffix('%')}]"
 
 
-def band_values(band: BandFigures) -> dict[str, Any]:
+def band_to_json(band: BandMetrics) -> dict[str, Any]:
     """Return the metrics of one range of depth as JSON values."""
     return {
         "from_m": band.from_m,
-        "to_m": finite(band.to_m),
+        "to_m": finite_or_none(band.to_m),
         "labels": band.labels,
         "images": band.images,
         "unmatched_labels": band.unmatched,
         **{
-            name: {key: finite(value) for key, value in asdict(figure).items()}
+            name: {key: finite_or_none(value) for key, value in asdict(figure).items()}
             for name, figure in band.figures.items()
         },
     }
 
 
-def curve_values(scored: Scored) -> dict[str, list[float | None]]:
+def curves_to_json(scored: ScoredDetections) -> dict[str, list[float | None]]:
     """Return precision, recall and other curves over the confidence as JSON values."""
-    found = asdict(curves(scored))
-    return {name: [finite(value) for value in values.tolist()] for name, values in found.items()}
+    found = asdict(compute_curves(scored))
+    return {
+        name: [finite_or_none(value) for value in values.tolist()] for name, values in found.items()
+    }
 
 
-def finite(value: float) -> float | None:
+def finite_or_none(value: float) -> float | None:
     """Return a number if it is finite, else None: JSON has neither NaN nor infinity."""
     return value if math.isfinite(value) else None

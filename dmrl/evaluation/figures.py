@@ -9,22 +9,22 @@ from numpy.typing import NDArray
 
 from dmrl import plots, topics
 from dmrl.estimation.model.position_metrics import ErrorTrace
-from dmrl.evaluation.detections import At, Pairs
-from dmrl.guards.safe_names import inside
+from dmrl.evaluation.detections import ImageKey, LabelledDetections
+from dmrl.guards.safe_names import safe_join
 from dmrl.images.codec import decode
-from dmrl.learn.inference.detection_metrics import Scored
+from dmrl.learn.inference.detection_metrics import ScoredDetections
 from dmrl.learn.inference.matching import Points
-from dmrl.plots import Circled, Example
-from dmrl.recording import read, summary
+from dmrl.plots import Example, GalleryImage
+from dmrl.recording import read, read_summary
 
 Array = NDArray[np.float64]
 
-SHARES = (0.2, 0.5, 0.8, 0.95)
+EXAMPLE_QUANTILES = (0.2, 0.5, 0.8, 0.95)
 """Quantiles of the error at which examples are drawn: typical images, and the tail."""
 
-PLOTTED = 12
+MAX_ERROR_PLOTS = 12
 """Pairs or observers whose errors are plotted, at most."""
-GALLERY = 6
+GALLERY_IMAGES = 6
 """Images in the figure with circles."""
 
 
@@ -36,15 +36,17 @@ class HasErrors(Protocol):
         """Errors over time."""
 
 
-def draw_errors(folder: Path, judged: Sequence[HasErrors]) -> None:
+def draw_error_plots(folder: Path, judged: Sequence[HasErrors]) -> None:
     """Write error plots of the first `MAX_ERROR_PLOTS` pairs or observers into a folder."""
-    for one in judged[:PLOTTED]:
+    for one in judged[:MAX_ERROR_PLOTS]:
         trace = one.trace
-        stem = inside(folder, trace.name, "a trace")
-        plots.error_trace(trace.title, trace.time_s, trace.sigma_m, trace.errors_m, stem)
+        stem = safe_join(folder, trace.name, "a trace")
+        plots.plot_error_trace(trace.title, trace.time_s, trace.sigma_m, trace.errors_m, stem)
 
 
-def draw(folder: Path, pairs: Pairs, scored: Scored, source: str, threshold: float) -> None:
+def draw_figures(
+    folder: Path, pairs: LabelledDetections, scored: ScoredDetections, source: str, threshold: float
+) -> None:
     """Write every figure of an evaluation of detections into a folder.
 
     Parameters
@@ -61,26 +63,30 @@ def draw(folder: Path, pairs: Pairs, scored: Scored, source: str, threshold: flo
         Detections below this confidence are drawn over images only if a label is matched with them.
     """
     error, depth_m = scored.label_error, scored.labels.depth_m
-    plots.error_violins(error.u_px, error.v_px, error.depth_m, folder / "error-violins")
-    plots.error_by_distance(depth_m, error.norm_px, error.depth_m, folder / "error-by-distance")
-    if shown := _examples(pairs, error.norm_px, source, threshold):
-        plots.examples(shown, folder / "examples")
+    plots.plot_error_violins(error.u_px, error.v_px, error.depth_m, folder / "error-violins")
+    plots.plot_error_by_distance(
+        depth_m, error.norm_px, error.depth_m, folder / "error-by-distance"
+    )
+    if shown := _choose_examples(pairs, error.norm_px, source, threshold):
+        plots.plot_examples(shown, folder / "examples")
     if pairs.images:
-        plots.gallery(_spread(pairs, threshold), folder / "circles")
+        plots.plot_gallery(_choose_gallery(pairs, threshold), folder / "circles")
 
 
-def _spread(pairs: Pairs, threshold: float) -> list[Circled]:
+def _choose_gallery(pairs: LabelledDetections, threshold: float) -> list[GalleryImage]:
     """Return images evenly spread over all, with their detections above the threshold."""
-    places = np.unique(np.linspace(0, pairs.images - 1, GALLERY + 2)[1:-1].astype(int)).tolist()
+    places = np.unique(
+        np.linspace(0, pairs.images - 1, GALLERY_IMAGES + 2)[1:-1].astype(int)
+    ).tolist()
     mine = pairs.detections.select(pairs.detections.confidence >= threshold)
     shown = []
     for image in places:
         found = mine.select(mine.image == image)
         at = pairs.at[image]
         shown.append(
-            Circled(
-                f"{at.recording.stem}, {_moment(at)}",
-                _picture(at),
+            GalleryImage(
+                f"{at.recording.stem}, {_format_time(at)}",
+                _read_image(at),
                 np.column_stack([found.u_px, found.v_px]),
                 found.depth_m,
             )
@@ -88,54 +94,61 @@ def _spread(pairs: Pairs, threshold: float) -> list[Circled]:
     return shown
 
 
-def _moment(at: At) -> str:
+def _format_time(at: ImageKey) -> str:
     """Return the time of an image in the form of ``dmrl view --time``."""
-    return f"{(at.time_ns - summary(at.recording).start_ns) / 1e9:.2f} s"
+    return f"{(at.time_ns - read_summary(at.recording).start_ns) / 1e9:.2f} s"
 
 
-def _picture(at: At) -> NDArray[np.uint8]:
+def _read_image(at: ImageKey) -> NDArray[np.uint8]:
     recording, robot, time_ns = at
-    topic = topics.camera_image(robot)
+    topic = topics.CAMERA_IMAGE(robot)
     taken = next(read(recording, topic, start_ns=time_ns, end_ns=time_ns + 1))
     return decode(taken.message.data, what=f"{recording}: {topic} at {time_ns} ns")
 
 
-def _examples(pairs: Pairs, error_px: Array, source: str, threshold: float) -> list[Example]:
+def _choose_examples(
+    pairs: LabelledDetections, error_px: Array, source: str, threshold: float
+) -> list[Example]:
     """Return the images at fixed quantiles of their largest label error, best first."""
     worst_px = np.full(pairs.images, -1.0)
     np.maximum.at(worst_px, pairs.labels.image, error_px)
     labelled = np.flatnonzero(worst_px >= 0)
     order = labelled[np.argsort(worst_px[labelled], kind="stable")]
-    places = dict.fromkeys(int(share * (len(order) - 1)) for share in SHARES if len(order))
+    places = dict.fromkeys(
+        int(share * (len(order) - 1)) for share in EXAMPLE_QUANTILES if len(order)
+    )
     return [
-        _example(pairs, order[place], worst_px[order[place]], source, threshold) for place in places
+        _build_example(pairs, order[place], worst_px[order[place]], source, threshold)
+        for place in places
     ]
 
 
-def _example(pairs: Pairs, image: int, worst_px: float, source: str, threshold: float) -> Example:
+def _build_example(
+    pairs: LabelledDetections, image: int, worst_px: float, source: str, threshold: float
+) -> Example:
     at = pairs.at[image]
     recording, robot, time_ns = at
-    rgb = _picture(at)
-    maps = _maps(recording, robot, time_ns)
+    rgb = _read_image(at)
+    maps = _read_maps(recording, robot, time_ns)
     labels = pairs.labels.select(pairs.labels.image == image)
     labels_px = np.column_stack([labels.u_px, labels.v_px])
     several = len({at.recording for at in pairs.at}) > 1
     return Example(
-        title=f"{recording.stem}, " * several + f"{_moment(at)}, error {worst_px:.1f} px",
+        title=f"{recording.stem}, " * several + f"{_format_time(at)}, error {worst_px:.1f} px",
         rgb=rgb,
         confidence=maps["confidence"],
         depth_m=maps["depth_m"],
         labels_px=labels_px,
-        detections_px=_detected(pairs.detections, image, len(labels_px), threshold),
+        detections_px=_select_detections(pairs.detections, image, len(labels_px), threshold),
         source=source,
     )
 
 
-def _maps(recording: Path, robot: str, time_ns: int) -> dict[str, Array]:
+def _read_maps(recording: Path, robot: str, time_ns: int) -> dict[str, Array]:
     """Read the grid maps by channel; all NaN if the recording has none."""
     out = {name: np.full((1, 1), np.nan) for name in ("confidence", "depth_m")}
-    topic = topics.grid(robot)
-    if topic not in summary(recording).topics:
+    topic = topics.GRID(robot)
+    if topic not in read_summary(recording).topics:
         return out
     for grid in read(recording, topic, start_ns=time_ns, end_ns=time_ns + 1):
         values = np.frombuffer(grid.message.data, "<f4")
@@ -144,7 +157,7 @@ def _maps(recording: Path, robot: str, time_ns: int) -> dict[str, Array]:
     return out
 
 
-def _detected(points: Points, image: int, least: int, threshold: float) -> Array:
+def _select_detections(points: Points, image: int, least: int, threshold: float) -> Array:
     """Return the pixels of detections above the threshold or among the first ``least``."""
     mine = points.select(points.image == image)
     mine = mine.select((mine.confidence >= threshold) | (np.arange(len(mine)) < least))

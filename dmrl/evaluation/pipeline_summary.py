@@ -11,7 +11,7 @@ from dmrl.terminal.tables import print_json, print_line, print_table
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class StepOutcome:
     """Outcome of a step: made, up to date already, or left out because it could not be made."""
 
     stage: str
@@ -21,8 +21,8 @@ class Done:
     left_out: bool = False
 
 
-EVALUATION_NAME, POSITIONS_NAME = "evaluation.json", "positions.json"
-COLUMNS = {
+EVALUATION_FILE, POSITIONS_FILE = "evaluation.json", "positions.json"
+FIGURE_COLUMNS = {
     "median_px": ("median, px", ".1f"),
     "within_8_px": ("within 8 px", ".1%"),
     "within_20_px": ("within 20 px", ".1%"),
@@ -32,7 +32,7 @@ COLUMNS = {
 }
 
 
-def report(done: Sequence[Done], *, as_json: bool = False) -> None:
+def print_report(done: Sequence[StepOutcome], *, as_json: bool = False) -> None:
     """Print the results of a pipeline: a row per evaluation, and the paths of its images.
 
     Parameters
@@ -42,8 +42,11 @@ def report(done: Sequence[Done], *, as_json: bool = False) -> None:
     as_json
         Print one JSON document instead: seconds per step, evaluations, images.
     """
-    evaluations, judged = _documents(done, EVALUATION_NAME), _documents(done, POSITIONS_NAME)
-    pictures = [picture for d in done if _is_result(d) for picture in _pictures(d.out)]
+    evaluations, judged = (
+        _read_documents(done, EVALUATION_FILE),
+        _read_documents(done, POSITIONS_FILE),
+    )
+    pictures = [picture for d in done if _is_result(d) for picture in _list_images(d.out)]
     if as_json:
         print_json(
             {
@@ -58,15 +61,15 @@ def report(done: Sequence[Done], *, as_json: bool = False) -> None:
         headers = [words for _, words, _ in positions.COLUMNS]
         print_table(name, ["pair", *headers], positions.rows(document))
         print_line(positions.note(document))
-    rows = [(name, *_row(document)) for name, document in evaluations.items()]
-    headers = [words for words, _ in COLUMNS.values()]
+    rows = [(name, *_format_row(document)) for name, document in evaluations.items()]
+    headers = [words for words, _ in FIGURE_COLUMNS.values()]
     if rows:
         print_table("", ["evaluation", "against", "images", *headers], rows)
     for picture in pictures:
         print_line(str(picture))
 
 
-def _documents(done: Sequence[Done], name: str) -> dict[str, dict[str, Any]]:
+def _read_documents(done: Sequence[StepOutcome], name: str) -> dict[str, dict[str, Any]]:
     """Read the JSON documents of this name, by output folder."""
     return {
         d.out.name: parse_json((d.out / name).read_text(encoding="utf-8"))
@@ -75,19 +78,19 @@ def _documents(done: Sequence[Done], name: str) -> dict[str, dict[str, Any]]:
     }
 
 
-def _row(document: dict[str, Any]) -> list[str]:
+def _format_row(document: dict[str, Any]) -> list[str]:
     figures = document["overall"]
-    values = [(figures[name]["value"], form) for name, (_, form) in COLUMNS.items()]
+    values = [(figures[name]["value"], form) for name, (_, form) in FIGURE_COLUMNS.items()]
     cells = ["-" if value is None else format(value, form) for value, form in values]
     return [document["against"], str(document["images"]), *cells]
 
 
-def _is_result(done: Done) -> bool:
+def _is_result(done: StepOutcome) -> bool:
     # Images that sketch draws for training are data, not results.
     return done.stage != "sketch" and not done.left_out
 
 
-def _pictures(out: Path) -> list[Path]:
+def _list_images(out: Path) -> list[Path]:
     if out.is_dir():
         return sorted(out.rglob("*.png"))
     return [out] if out.suffix == ".png" and out.exists() else []

@@ -13,24 +13,24 @@ from dmrl import topics
 from dmrl.errors import RecordingError
 from dmrl.estimation.model.position_metrics import (
     DEFINITIONS,
-    GOOD_M,
+    MAX_GOOD_ERROR_M,
     ErrorTrace,
-    Figures,
-    Judged,
-    figures,
-    inside_truth,
-    overall,
+    EvaluatedPositions,
+    PairFigures,
+    combine_figures,
+    compute_figures,
+    is_covered_by_truth,
 )
 from dmrl.geometry.frames import Array
 from dmrl.labelling.flight_log import TRUTH_TOPICS, FlightLog, read_flight
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
 from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.messages import STATUS_OK
-from dmrl.recording import input_of, summary
+from dmrl.recording import build_input, read_summary
 
 TITLE, EACH = "estimated positions against truth", "pair"
 Times = NDArray[np.int64]
-COVERED = (
+COVERED_DEFINITION = (
     "share of the true positions that lie between two estimates close in time; all other metrics "
     "use the existing estimates only"
 )
@@ -38,7 +38,7 @@ COVERED = (
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class EvaluatedPair:
     """Evaluated estimates of one robot about one peer.
 
     Parameters
@@ -57,7 +57,7 @@ class Pair:
 
     robot: str
     peer: str
-    judged: Judged
+    judged: EvaluatedPositions
     without_truth: int
     true: int
     covered: int
@@ -85,15 +85,15 @@ class Pair:
 
 def has_positions(recording: Path) -> bool:
     """Return whether a recording has estimated positions."""
-    return bool(_estimated(summary(recording).topics))
+    return bool(_find_estimated_pairs(read_summary(recording).topics))
 
 
-def _estimated(held: Iterable[str]) -> list[tuple[str, str]]:
-    found = (topics.names(topics.POSITION, topic) for topic in held)
+def _find_estimated_pairs(held: Iterable[str]) -> list[tuple[str, str]]:
+    found = (topics.parse_topic(topics.POSITION, topic) for topic in held)
     return sorted((n["robot"], n["peer"]) for n in found if n is not None)
 
 
-def judge(recording: Path) -> list[Pair]:
+def judge(recording: Path) -> list[EvaluatedPair]:
     """Evaluate every pair with estimates and truth.
 
     Parameters
@@ -108,10 +108,10 @@ def judge(recording: Path) -> list[Pair]:
         If the recording cannot be read, or has no pair with both.
     """
     held = read_flight(recording, topics.POSITION, *TRUTH_TOPICS)
-    estimated, known = _estimated(held.topics), list_true_pairs(held.topics)
+    estimated, known = _find_estimated_pairs(held.topics), list_true_pairs(held.topics)
     if not estimated:
         raise RecordingError(f"{recording} has no positions. Try: dmrl label {recording} OUT.mcap")
-    pairs = [_judge(held, *names) for names in estimated if names in known]
+    pairs = [_evaluate_pair(held, *names) for names in estimated if names in known]
     pairs = [pair for pair in pairs if len(pair.judged.time_s)]
     if not pairs:
         raise RecordingError(
@@ -121,7 +121,7 @@ def judge(recording: Path) -> list[Pair]:
     return pairs
 
 
-class Paths(NamedTuple):
+class PairPaths(NamedTuple):
     """Estimates of one robot about one peer, at times with ground truth.
 
     ``time_ns`` (N,) log times, ``estimate_m`` and ``true_m`` (N, 2) in the robot's horizontal
@@ -137,7 +137,7 @@ class Paths(NamedTuple):
     started_ns: float
 
 
-def paths(recording: Path) -> dict[tuple[str, str], Paths]:
+def read_paths(recording: Path) -> dict[tuple[str, str], PairPaths]:
     """Read the estimated and the true path of every pair that has both.
 
     Raises
@@ -147,14 +147,16 @@ def paths(recording: Path) -> dict[tuple[str, str], Paths]:
     """
     held = read_flight(recording, topics.POSITION, *TRUTH_TOPICS)
     known = list_true_pairs(held.topics)
-    pairs = [pair for pair in _estimated(held.topics) if pair in known]
-    return {pair: _matched(held.positions[pair], *find_true_path(held, *pair)) for pair in pairs}
+    pairs = [pair for pair in _find_estimated_pairs(held.topics) if pair in known]
+    return {
+        pair: _match_truth(held.positions[pair], *find_true_path(held, *pair)) for pair in pairs
+    }
 
 
-def _matched(estimate: PeerPositions, true_ns: Times, true_m: Array) -> Paths:
+def _match_truth(estimate: PeerPositions, true_ns: Times, true_m: Array) -> PairPaths:
     time_ns = estimate.time_ns
-    near = inside_truth(time_ns, true_ns)
-    return Paths(
+    near = is_covered_by_truth(time_ns, true_ns)
+    return PairPaths(
         time_ns[near],
         estimate.xyz_m[near, :2],
         np.stack([np.interp(time_ns[near], true_ns, axis) for axis in true_m.T[:2]], axis=1)
@@ -166,11 +168,11 @@ def _matched(estimate: PeerPositions, true_ns: Times, true_m: Array) -> Paths:
     )
 
 
-def _judge(held: FlightLog, robot: str, peer: str) -> Pair:
+def _evaluate_pair(held: FlightLog, robot: str, peer: str) -> EvaluatedPair:
     estimate = held.positions[robot, peer]
     true_ns, true_m = find_true_path(held, robot, peer)
-    found = _matched(estimate, true_ns, true_m)
-    judged = Judged(
+    found = _match_truth(estimate, true_ns, true_m)
+    judged = EvaluatedPositions(
         time_s=np.asarray((found.time_ns - found.started_ns) * 1e-9, float),
         error_m=found.estimate_m - found.true_m,
         covariance=found.covariance,
@@ -178,44 +180,44 @@ def _judge(held: FlightLog, robot: str, peer: str) -> Pair:
         kept=found.kept,
     )
     time_ns = estimate.time_ns
-    covered = inside_truth(true_ns, time_ns)
-    return Pair(
+    covered = is_covered_by_truth(true_ns, time_ns)
+    return EvaluatedPair(
         robot, peer, judged, len(time_ns) - len(found.kept), len(covered), int(covered.sum())
     )
 
 
-def lasts_s(pairs: list[Pair]) -> float:
+def lasts_s(pairs: list[EvaluatedPair]) -> float:
     """Return the time from the first to the last estimate of the longest pair, seconds."""
     return max(float(pair.judged.time_s[-1]) for pair in pairs)
 
 
-def document(recording: Path, pairs: list[Pair], settle_s: float) -> dict[str, Any]:
+def document(recording: Path, pairs: list[EvaluatedPair], settle_s: float) -> dict[str, Any]:
     """Return all metrics as JSON values; null where a metric is undefined."""
-    source = input_of(recording)
-    each = [figures(pair.judged, settle_s) for pair in pairs]
+    source = build_input(recording)
+    each = [compute_figures(pair.judged, settle_s) for pair in pairs]
     return {
         "recording": {"name": source.name, "sha256": source.sha256},
         "settle_s": settle_s,
-        "overall": {"covered": _covered(pairs), **_values(overall(each))},
+        "overall": {"covered": _compute_coverage(pairs), **_to_json_values(combine_figures(each))},
         "pairs": [
             {
                 "robot": pair.robot,
                 "peer": pair.peer,
                 "without_truth": pair.without_truth,
-                "covered": _covered([pair]),
-                **_values(measured),
+                "covered": _compute_coverage([pair]),
+                **_to_json_values(measured),
             }
             for pair, measured in zip(pairs, each, strict=True)
         ],
-        "definitions": {**DEFINITIONS, "covered": COVERED},
+        "definitions": {**DEFINITIONS, "covered": COVERED_DEFINITION},
     }
 
 
-def _covered(pairs: list[Pair]) -> float:
+def _compute_coverage(pairs: list[EvaluatedPair]) -> float:
     return sum(pair.covered for pair in pairs) / sum(pair.true for pair in pairs)
 
 
-def _values(measured: Figures) -> dict[str, float | None]:
+def _to_json_values(measured: PairFigures) -> dict[str, float | None]:
     values = asdict(measured).items()
     return {name: value if math.isfinite(value) else None for name, value in values}
 
@@ -240,7 +242,7 @@ def note(made: Mapping[str, Any]) -> str:
     """Describe the columns of the table of a ``document``."""
     return (
         "errors are horizontal; covered: share of the truth that has an estimate; kept: status "
-        f"OK; good: error of {GOOD_M:g} m at most; these cover the whole flight. From "
+        f"OK; good: error of {MAX_GOOD_ERROR_M:g} m at most; these cover the whole flight. From "
         f"{made['settle_s']:g} s on: RMSE; 95 %: 95th percentile of the error; wrong: share of "
         "pairs with an error of half their distance; NEES: squared error over covariance, 2 if "
         "the covariance is right; in 95 %: share of the truth inside the 95 % ellipse"
@@ -253,9 +255,10 @@ def rows(made: Mapping[str, Any]) -> list[list[str]]:
     if len(named) > 1:
         named.append(("all", made["overall"]))
     return [
-        [name, *(_cell(values[key], form) for key, _, form in COLUMNS)] for name, values in named
+        [name, *(_format_cell(values[key], form) for key, _, form in COLUMNS)]
+        for name, values in named
     ]
 
 
-def _cell(value: float | None, form: str) -> str:
+def _format_cell(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)

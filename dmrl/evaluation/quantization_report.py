@@ -9,18 +9,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dmrl.atomic_output import partial_folder
+from dmrl.atomic_output import atomic_folder
 from dmrl.datasets import Dataset, Split, open_dataset
-from dmrl.deploy.accuracy import argmax_kept, figures_of, points_of
-from dmrl.deploy.backends import Backend, Float, Outputs, grids_of, integer
-from dmrl.deploy.int8.layer_errors import LayerFigures, layer_figures
+from dmrl.deploy.accuracy import compare_peaks, compute_accuracy, decode_points
+from dmrl.deploy.backends import Backend, FloatBackend, Outputs, build_reference_backend, to_grids
+from dmrl.deploy.int8.layer_errors import LayerErrorStats, compute_layer_errors
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.quantise_model import Quantised, spread_evenly
-from dmrl.deploy.int8.store import INTEGER_NAME, save
-from dmrl.deploy.samples import SAMPLES, save_samples
+from dmrl.deploy.int8.store import INTEGER_NAME, save_network
+from dmrl.deploy.samples import SAMPLE_COUNT, save_samples
 from dmrl.errors import MissingExtra, SettingError
-from dmrl.evaluation.detections import labels_of_split
-from dmrl.learn.inference.detection_metrics import DEFINITIONS
+from dmrl.evaluation.detections import read_split_labels
+from dmrl.learn.inference.detection_metrics import METRIC_DEFINITIONS
 from dmrl.learn.inference.loaded_model import Model, load_model, save_model
 from dmrl.recording import Provenance
 from dmrl.terminal.progress import say, track
@@ -69,7 +69,7 @@ class QuantizationReport:
     """
 
     network: IntegerNetwork
-    layers: list[LayerFigures]
+    layers: list[LayerErrorStats]
     calibration_images: int
     split: str
     images: int
@@ -132,12 +132,12 @@ def write_quantized(
     most
         Most images to compare on, evenly spread.
     """
-    with partial_folder(out) as folder:
+    with atomic_folder(out) as folder:
         report = _compare(inputs, quantised, most, folder)
         save_model(inputs.model, folder)
-        save(quantised.network, folder / INTEGER_NAME)
+        save_network(quantised.network, folder / INTEGER_NAME)
         seen = inputs.calibration
-        rows = spread_evenly(len(seen), SAMPLES)
+        rows = spread_evenly(len(seen), SAMPLE_COUNT)
         save_samples(np.stack(list(seen.images(rows))), folder)
         text = json.dumps(describe_quantization(report), indent=1, allow_nan=False)
         (folder / REPORT_NAME).write_text(text + "\n", encoding="utf-8")
@@ -152,11 +152,11 @@ def _compare(
     model, split, network = inputs.model, inputs.compared, quantised.network
     rows = spread_evenly(len(split), most)
     backends: dict[str, Backend] = {
-        "float": Float(quantised.graph, model.network.channels),
-        "int8": integer(network),
+        "float": FloatBackend(quantised.graph, model.network.channels),
+        "int8": build_reference_backend(network),
     }
     outputs = _compute_outputs(backends, split, rows)
-    labels = labels_of_split(split, rows)
+    labels = read_split_labels(split, rows)
     few = [rows[k] for k in spread_evenly(len(rows), MAX_LAYER_IMAGES)]
     if plots is None:
         say("no picture of the maps: that needs matplotlib. pip install 'dmrl[plot]'")
@@ -164,15 +164,17 @@ def _compare(
         _draw_maps(split, rows, outputs, folder)
     return QuantizationReport(
         network,
-        layer_figures(quantised.graph, network, split.images(few)),
+        compute_layer_errors(quantised.graph, network, split.images(few)),
         quantised.images,
         split.name,
         len(rows),
         {
-            name: figures_of(len(rows), labels, points_of(each, network.stride_px), model.threshold)
+            name: compute_accuracy(
+                len(rows), labels, decode_points(each, network.stride_px), model.threshold
+            )
             for name, each in outputs.items()
         },
-        argmax_kept(outputs["float"], outputs["int8"]),
+        compare_peaks(outputs["float"], outputs["int8"]),
     )
 
 
@@ -193,7 +195,7 @@ def _compute_outputs(
 def _draw_maps(split: Split, rows: list[int], outputs: dict[str, Outputs], folder: Path) -> None:
     assert plots is not None
     shown = spread_evenly(len(rows), MAX_DRAWN_IMAGES + 2)[1:-1] or [0]
-    grids = {name: grids_of(each) for name, each in outputs.items()}
+    grids = {name: to_grids(each) for name, each in outputs.items()}
     pictures = [
         plots.MapPair(
             f"image {rows[k]} of {split.name}",
@@ -222,7 +224,7 @@ def describe_quantization(result: QuantizationReport) -> dict[str, Any]:
         "argmax_kept": result.argmax_kept,
         "accuracy": result.accuracy,
         "layers": [asdict(layer) for layer in result.layers],
-        "definitions": DEFINITIONS,
+        "definitions": METRIC_DEFINITIONS,
     }
 
 

@@ -10,38 +10,44 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
-from dmrl.estimation.model.position_metrics import inside_truth
-from dmrl.estimation.tracking.track_metrics import DEFINITIONS, NEAR_M, Judged, assigned, figures
+from dmrl.estimation.model.position_metrics import is_covered_by_truth
+from dmrl.estimation.tracking.track_metrics import (
+    DEFINITIONS,
+    MAX_MATCH_M,
+    EvaluatedTracks,
+    compute_figures,
+    match_positions,
+)
 from dmrl.geometry.camera_file import parse_camera
 from dmrl.geometry.frames import (
     Array,
     Camera,
     horizontal_from_pixels,
-    inside,
+    is_inside,
     pixels_from_horizontal,
 )
 from dmrl.labelling.flight_log import OBSERVER_TOPICS, TRUTH_TOPICS, FlightLog, read_flight
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
 from dmrl.labelling.observer_log import ObserverLog, read_observer_log
 from dmrl.labelling.recorded_camera import recorded_camera
-from dmrl.recording import input_of, summary
+from dmrl.recording import build_input, read_summary
 
 TITLE, EACH = "tracks against truth", "observer"
 CAMERAS_METADATA = "dmrl.cameras"
 """Metadata record of a recording with tracks: the tracker's camera of each robot, as TOML."""
 
 
-def can_judge(recording: Path) -> bool:
+def has_tracks_and_truth(recording: Path) -> bool:
     """Return whether a recording has tracks and true positions of their peers."""
-    held = list(summary(recording).topics)
-    return any(_peers(held, robot) for robot in topics.robots(held, topics.TRACKS))
+    held = list(read_summary(recording).topics)
+    return any(_find_peers(held, robot) for robot in topics.list_robots(held, topics.TRACKS))
 
 
-def _peers(held: list[str], robot: str) -> list[str]:
+def _find_peers(held: list[str], robot: str) -> list[str]:
     return [peer for observer, peer in list_true_pairs(held) if observer == robot]
 
 
-def judge(recording: Path) -> list[Judged]:
+def judge(recording: Path) -> list[EvaluatedTracks]:
     """Evaluate every observer with tracks and true positions.
 
     Parameters
@@ -60,9 +66,9 @@ def judge(recording: Path) -> list[Judged]:
         raise RecordingError(f"{recording} has no tracks. Try: dmrl track {recording} OUT.mcap")
     held = list(flight.topics)
     judged = [
-        _judge(flight, robot, peers)
+        _evaluate_observer(flight, robot, peers)
         for robot in sorted(flight.tracks)
-        if (peers := _peers(held, robot))
+        if (peers := _find_peers(held, robot))
     ]
     if not judged:
         raise RecordingError(
@@ -72,16 +78,16 @@ def judge(recording: Path) -> list[Judged]:
     return judged
 
 
-def _camera(held: FlightLog, robot: str) -> Camera:
+def _read_camera(held: FlightLog, robot: str) -> Camera:
     """The camera that the tracks were made with: its mount, delay and lens may be other ones."""
     used = held.metadata.get(CAMERAS_METADATA, [{}])[-1].get(robot)
     camera = parse_camera(used, held.path) if used else recorded_camera(held, robot)
     if camera is None:
-        raise MissingTopic(topics.calibration(robot), held.topics, held.path)
+        raise MissingTopic(topics.CALIBRATION(robot), held.topics, held.path)
     return camera
 
 
-class _Row(NamedTuple):
+class _PeerRow(NamedTuple):
     """One peer in view of one image; see `Judged`."""
 
     image: int
@@ -92,26 +98,26 @@ class _Row(NamedTuple):
     covariance: Array
 
 
-def _judge(held: FlightLog, robot: str, peers: list[str]) -> Judged:
+def _evaluate_observer(held: FlightLog, robot: str, peers: list[str]) -> EvaluatedTracks:
     """Tracks of one observer. A track is false if for most of its life it is at no peer.
 
     The life of a track is counted in images. In an image, a track is astray if it is near no peer.
     """
-    sight = read_observer_log(held, robot, _camera(held, robot), 0.0)
-    truth, shown = _truth(held, sight, peers)
-    rows: list[_Row] = []
+    sight = read_observer_log(held, robot, _read_camera(held, robot), 0.0)
+    truth, shown = _interpolate_truth(held, sight, peers)
+    rows: list[_PeerRow] = []
     lived: Counter[int] = Counter()
     astray: Counter[int] = Counter()
-    for k, tracks in _by_image(held, sight):
-        rows += _rows(sight, k, tracks, truth[:, k], dict(enumerate(peers)), shown[:, k])
+    for k, tracks in _iter_image_tracks(held, sight):
+        rows += _build_rows(sight, k, tracks, truth[:, k], dict(enumerate(peers)), shown[:, k])
         lived.update(t.id for t in tracks)
-        at_peers = set(assigned(truth[:, k], _places(tracks), NEAR_M).tolist())
+        at_peers = set(match_positions(truth[:, k], _track_positions(tracks), MAX_MATCH_M).tolist())
         astray.update(t.id for i, t in enumerate(tracks) if i not in at_peers)
     false_tracks = sum(2 * astray[number] > lived[number] for number in lived)
-    return _judged(sight, rows, false_tracks)
+    return _collect_rows(sight, rows, false_tracks)
 
 
-def _by_image(held: FlightLog, sight: ObserverLog) -> Iterator[tuple[int, list[Any]]]:
+def _iter_image_tracks(held: FlightLog, sight: ObserverLog) -> Iterator[tuple[int, list[Any]]]:
     """Number of an image, and the tracks at its time; times without an image are left out."""
     number = {int(time_ns): k for k, time_ns in enumerate(sight.log_time_ns)}
     for stamped in held.tracks[sight.robot]:
@@ -119,10 +125,10 @@ def _by_image(held: FlightLog, sight: ObserverLog) -> Iterator[tuple[int, list[A
             yield k, list(stamped.message.tracks)
 
 
-def _judged(sight: ObserverLog, rows: list[_Row], false_tracks: int) -> Judged:
+def _collect_rows(sight: ObserverLog, rows: list[_PeerRow], false_tracks: int) -> EvaluatedTracks:
     """Rows as columns."""
     time_s = (sight.time_ns - sight.time_ns[:1]) * 1e-9
-    return Judged(
+    return EvaluatedTracks(
         sight.robot,
         np.asarray(time_s[np.array([row.image for row in rows], int)], float),
         [row.peer for row in rows],
@@ -135,27 +141,29 @@ def _judged(sight: ObserverLog, rows: list[_Row], false_tracks: int) -> Judged:
     )
 
 
-def _rows(
+def _build_rows(
     sight: ObserverLog,
     k: int,
     tracks: list[Any],
     truth_m: Array,
     peers: Mapping[int, str],
     shown: NDArray[np.bool_],
-) -> list[_Row]:
+) -> list[_PeerRow]:
     """Return the peers in view of image k, with their tracks and detections."""
     seen = np.flatnonzero(shown)
     view = sight.view(k)
     uv, depth_m = view.uv[: len(seen)], view.depth_m[: len(seen)]
     roll, pitch = (np.full(len(uv), angle) for angle in (view.roll_rad, view.pitch_rad))
     single = horizontal_from_pixels(uv, depth_m, roll, pitch, sight.camera)
-    found = _places(tracks)
+    found = _track_positions(tracks)
     rows = []
-    pairs = zip(assigned(truth_m[seen], found), assigned(truth_m[seen], single), strict=True)
+    pairs = zip(
+        match_positions(truth_m[seen], found), match_positions(truth_m[seen], single), strict=True
+    )
     for j, (mine, own) in zip(seen.tolist(), pairs, strict=True):
         nothing = np.full(3, np.nan)
         rows.append(
-            _Row(
+            _PeerRow(
                 k,
                 peers[j],
                 tracks[mine].peer if mine >= 0 else "",
@@ -167,12 +175,12 @@ def _rows(
     return rows
 
 
-def _places(tracks: list[Any]) -> Array:
+def _track_positions(tracks: list[Any]) -> Array:
     """Return the positions of Track messages, (D, 3), metres."""
     return np.array([[t.x, t.y, t.z] for t in tracks]).reshape(-1, 3)
 
 
-def _truth(
+def _interpolate_truth(
     held: FlightLog, sight: ObserverLog, peers: list[str]
 ) -> tuple[Array, NDArray[np.bool_]]:
     """(J, K, 3) true positions at the images, NaN where unknown; (J, K) whether in the image."""
@@ -180,27 +188,27 @@ def _truth(
     shown = np.zeros(xyz.shape[:2], bool)
     for j, peer in enumerate(peers):
         true_ns, true_m = find_true_path(held, sight.robot, peer)
-        known = inside_truth(sight.time_ns, true_ns)
+        known = is_covered_by_truth(sight.time_ns, true_ns)
         at = sight.time_ns[known]
         xyz[j, known] = np.column_stack([np.interp(at, true_ns, axis) for axis in true_m.T])
         roll, pitch = sight.attitude_rad.T
         uv, depth_m, _ = pixels_from_horizontal(xyz[j], roll, pitch, sight.camera)
-        shown[j] = inside(uv, sight.camera.width_px, sight.camera.height_px) & (depth_m > 0)
+        shown[j] = is_inside(uv, sight.camera.width_px, sight.camera.height_px) & (depth_m > 0)
     return xyz, shown
 
 
-def lasts_s(judged: list[Judged]) -> float:
+def lasts_s(judged: list[EvaluatedTracks]) -> float:
     """Return the time from the first to the last image of the longest observer, seconds."""
     return max(one.length_s for one in judged)
 
 
-def document(recording: Path, judged: list[Judged], settle_s: float) -> dict[str, Any]:
+def document(recording: Path, judged: list[EvaluatedTracks], settle_s: float) -> dict[str, Any]:
     """Return all metrics as JSON values; null where a metric is undefined."""
-    source = input_of(recording)
+    source = build_input(recording)
     return {
         "recording": {"name": source.name, "sha256": source.sha256},
         "settle_s": settle_s,
-        "robots": [{"robot": one.robot, **figures(one, settle_s)} for one in judged],
+        "robots": [{"robot": one.robot, **compute_figures(one, settle_s)} for one in judged],
         "definitions": DEFINITIONS,
     }
 
@@ -225,7 +233,7 @@ def note(made: Mapping[str, Any]) -> str:
     """Describe the columns of the table of a ``document``."""
     return (
         "3D errors of the peers in view; of images: errors of the detections in single images; "
-        f"followed, detected: share of peers with a track, a detection within {NEAR_M:g} m; "
+        f"followed, detected: share of peers with a track, a detection within {MAX_MATCH_M:g} m; "
         f"false: tracks near no peer; all but false from {made['settle_s']:g} s on"
     )
 
@@ -233,10 +241,10 @@ def note(made: Mapping[str, Any]) -> str:
 def rows(made: Mapping[str, Any]) -> list[list[str]]:
     """Return one row per observer of a ``document``."""
     return [
-        [one["robot"], *(_cell(one[key], form) for key, _, form in COLUMNS)]
+        [one["robot"], *(_format_cell(one[key], form) for key, _, form in COLUMNS)]
         for one in made["robots"]
     ]
 
 
-def _cell(value: float | None, form: str) -> str:
+def _format_cell(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)

@@ -22,21 +22,21 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from dmrl.atomic_output import partial_folder
+from dmrl.atomic_output import atomic_folder
 from dmrl.errors import MissingExtra, UnsafeName
-from dmrl.guards.safe_names import file_of_topic, inside
-from dmrl.recording import columns, read_table, summary
+from dmrl.guards.safe_names import safe_join, to_topic_file_name
+from dmrl.recording import iter_columns, read_summary, read_table
 from dmrl.terminal.progress import track
 
-Kind = Literal["csv", "parquet"]
+TableFormat = Literal["csv", "parquet"]
 TIME_DIGITS = 12  # as image_folder requires
-_FORMULA = "^(['=+@\t\r\n\uff1d\uff0b\uff0d\uff20-])"
+_FORMULA_START = "^(['=+@\t\r\n\uff1d\uff0b\uff0d\uff20-])"
 """Texts that a spreadsheet runs (OWASP, CSV injection). The apostrophe is among them, so that
 removing one from every text that begins with one restores the original.
 """
 
 
-def write_tables(recording: Path, out: Path, kind: Kind) -> dict[str, int]:
+def write_tables(recording: Path, out: Path, kind: TableFormat) -> dict[str, int]:
     """Write the tables to the folder ``out``; return rows per topic.
 
     Parameters
@@ -59,23 +59,25 @@ def write_tables(recording: Path, out: Path, kind: Kind) -> dict[str, int]:
     """
     if kind == "csv" and find_spec("pandas") is None:
         raise MissingExtra("pandas", "table", "convert --to csv")
-    found = summary(recording)
+    found = read_summary(recording)
     counts = {}
-    with partial_folder(out) as folder:
+    with atomic_folder(out) as folder:
         for topic, info in track(found.topics.items(), "Writing tables"):
-            path = inside(folder, file_of_topic(topic), f"{recording}: a topic", suffix=f".{kind}")
+            path = safe_join(
+                folder, to_topic_file_name(topic), f"{recording}: a topic", suffix=f".{kind}"
+            )
             if info.schema == "foxglove.CompressedImage":
-                table = _pictures(recording, topic, path.with_suffix(""))
+                table = _write_images(recording, topic, path.with_suffix(""))
             else:
                 table = read_table(recording, topic)
-            table = flat(table)
-            _refuse_taken(path, topic)
-            _write(table, path, kind)
+            table = flatten_table(table)
+            _check_free(path, topic)
+            _write_table(table, path, kind)
             counts[topic] = table.num_rows
     return counts
 
 
-def _refuse_taken(path: Path, topic: str) -> None:
+def _check_free(path: Path, topic: str) -> None:
     """Raise UnsafeName if two topics share a file, as on a disk that ignores case."""
     if path.exists():
         raise UnsafeName(
@@ -83,18 +85,18 @@ def _refuse_taken(path: Path, topic: str) -> None:
         )
 
 
-def _pictures(recording: Path, topic: str, folder: Path) -> pa.Table:
+def _write_images(recording: Path, topic: str, folder: Path) -> pa.Table:
     """Write images to files; return the table with their names in place of their bytes."""
-    _refuse_taken(folder, topic)
+    _check_free(folder, topic)
     folder.mkdir()
     batches, seen = [], Counter[str]()
-    for batch in columns(recording, topic):
+    for batch in iter_columns(recording, topic):
         names = []
         for time_ns, kind in zip(batch["log_time"], batch["format"], strict=True):
             stem = f"{time_ns.as_py():0{TIME_DIGITS}d}"
             seen[stem] += 1
             again = f"-{seen[stem]}" if seen[stem] > 1 else ""
-            names.append(f"{stem}{again}.{_suffix(kind.as_py())}")
+            names.append(f"{stem}{again}.{_image_suffix(kind.as_py())}")
         for name, data in zip(names, batch["data"], strict=True):
             (folder / name).write_bytes(data.as_buffer())
         at = batch.schema.get_field_index("data")
@@ -105,27 +107,27 @@ def _pictures(recording: Path, topic: str, folder: Path) -> pa.Table:
     return pa.Table.from_batches(batches)
 
 
-def _suffix(kind: str) -> str:
+def _image_suffix(kind: str) -> str:
     return kind if kind in ("png", "jpeg", "webp") else "bin"
 
 
-def flat(table: pa.Table) -> pa.Table:
+def flatten_table(table: pa.Table) -> pa.Table:
     """Convert lists of structs to rows and structs to columns, until none remain."""
     while True:
-        lists = [f.name for f in table.schema if _holds_structs(f.type)]
+        lists = [f.name for f in table.schema if _is_struct_list(f.type)]
         if lists:
-            table = _rows(table, lists[0])
+            table = _explode_list(table, lists[0])
         elif any(pa.types.is_struct(field.type) for field in table.schema):
             table = table.flatten()
         else:
             return table
 
 
-def _holds_structs(kind: pa.DataType) -> bool:
+def _is_struct_list(kind: pa.DataType) -> bool:
     return bool(pa.types.is_list(kind) and pa.types.is_struct(kind.value_type))
 
 
-def _rows(table: pa.Table, name: str) -> pa.Table:
+def _explode_list(table: pa.Table, name: str) -> pa.Table:
     """Return one row per item of a list, and one empty row per list without items."""
     column = table[name].combine_chunks()
     empty = pc.equal(pc.list_value_length(column), 0)
@@ -135,35 +137,35 @@ def _rows(table: pa.Table, name: str) -> pa.Table:
     return taken.append_column(name, pc.list_flatten(filled))
 
 
-def _write(table: pa.Table, path: Path, kind: Kind) -> None:
+def _write_table(table: pa.Table, path: Path, kind: TableFormat) -> None:
     if kind == "parquet":
         pq.write_table(table, path)
         return
-    frame = table.to_pandas(types_mapper=_nullable)
+    frame = table.to_pandas(types_mapper=_to_nullable_type)
     ends = "\n"
     for field in table.schema:
         if pa.types.is_list(field.type):
-            frame[field.name] = [_json(v) for v in table[field.name].to_pylist()]
+            frame[field.name] = [_to_json(v) for v in table[field.name].to_pylist()]
         elif pa.types.is_binary(field.type):
-            frame[field.name] = [_base64(v) for v in table[field.name].to_pylist()]
+            frame[field.name] = [_to_base64(v) for v in table[field.name].to_pylist()]
         elif pa.types.is_string(field.type):
-            shown = pc.replace_substring_regex(table[field.name], _FORMULA, r"'\1")
-            frame[field.name] = shown.to_pandas(types_mapper=_nullable)
+            shown = pc.replace_substring_regex(table[field.name], _FORMULA_START, r"'\1")
+            frame[field.name] = shown.to_pandas(types_mapper=_to_nullable_type)
             if pc.any(pc.match_substring(shown, "\r")).as_py():
                 ends = "\r\n"  # only then does csv quote a cell with \r, which also ends a line
     frame.to_csv(path, index=False, lineterminator=ends)
 
 
-def _nullable(kind: pa.DataType) -> Any:
+def _to_nullable_type(kind: pa.DataType) -> Any:
     """Return a pandas type that supports empty cells beside integers and nested values."""
     import pandas as pd  # noqa: PLC0415
 
     return pd.ArrowDtype(kind)
 
 
-def _json(value: list[Any] | None) -> str | None:
-    return None if value is None else json.dumps(value, default=_base64)
+def _to_json(value: list[Any] | None) -> str | None:
+    return None if value is None else json.dumps(value, default=_to_base64)
 
 
-def _base64(value: bytes | None) -> str | None:
+def _to_base64(value: bytes | None) -> str | None:
     return None if value is None else base64.b64encode(value).decode()

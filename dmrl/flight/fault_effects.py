@@ -9,23 +9,23 @@ from dataclasses import replace
 import numpy as np
 from numpy.random import Generator
 
-from dmrl.flight.faults import Happened
+from dmrl.flight.faults import FaultEvent
 from dmrl.flight.flight_arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth
 from dmrl.flight.trajectories import Motion
 from dmrl.geometry.frames import Array
 
-COAST_S = 0.3
+COAST_TIME_CONSTANT_S = 0.3
 """Time constant of the deceleration after a landing or crash begins."""
-SINK_MPS, FALL_MPS2 = 0.4, 5.0
-FLOOR_M = 0.02
-RUNAWAY_S = 2.0
+LANDING_SPEED_MPS, FALL_ACCELERATION_MPS2 = 0.4, 5.0
+FLOOR_HEIGHT_M = 0.02
+DIVERGENCE_TIME_CONSTANT_S = 2.0
 """Time constant of the diverging velocity estimate of a crashed robot."""
-OUTLIER_M = (-1.0, 3.0)
+OUTLIER_ERROR_M = (-1.0, 3.0)
 """Range of the uniform error of an outlier."""
-SHORTEST_RANGE_M = 0.01
+MIN_RANGE_M = 0.01
 
 
-def brought_down(way: Motion, height_m: Array, end: Happened) -> tuple[Motion, Array]:
+def land_or_crash(motion: Motion, height_m: Array, end: FaultEvent) -> tuple[Motion, Array]:
     """Return a robot's motion and height with a landing or a crash.
 
     The robot decelerates along its path and comes to rest. The path stays the same.
@@ -41,23 +41,25 @@ def brought_down(way: Motion, height_m: Array, end: Happened) -> tuple[Motion, A
     """
     time_s, start_s = np.arange(len(height_m)) / RATE_HZ, end.windows_s[0, 0]
     since = np.maximum(time_s - start_s, 0.0)
-    place_s = np.minimum(time_s, start_s) + COAST_S * (1 - np.exp(-since / COAST_S))
-    pace = np.exp(-since / COAST_S)
+    place_s = np.minimum(time_s, start_s) + COAST_TIME_CONSTANT_S * (
+        1 - np.exp(-since / COAST_TIME_CONSTANT_S)
+    )
+    pace = np.exp(-since / COAST_TIME_CONSTANT_S)
     high = float(np.interp(start_s, time_s, height_m))
     if end.fault.kind == "crash":
-        fallen = np.minimum(FALL_MPS2 * since**2 / 2, high - FLOOR_M)
+        fallen = np.minimum(FALL_ACCELERATION_MPS2 * since**2 / 2, high - FLOOR_HEIGHT_M)
     else:
-        part = np.minimum(since * SINK_MPS / (high - FLOOR_M), 1.0)
-        fallen = (high - FLOOR_M) * (1 - np.cos(np.pi * part)) / 2
+        part = np.minimum(since * LANDING_SPEED_MPS / (high - FLOOR_HEIGHT_M), 1.0)
+        fallen = (high - FLOOR_HEIGHT_M) * (1 - np.cos(np.pi * part)) / 2
     return Motion(
-        np.interp(place_s, time_s, way.position),
-        np.interp(place_s, time_s, way.velocity) * pace,
-        np.interp(place_s, time_s, way.yaw),
-        np.interp(place_s, time_s, way.yaw_rate) * pace,
+        np.interp(place_s, time_s, motion.position),
+        np.interp(place_s, time_s, motion.velocity) * pace,
+        np.interp(place_s, time_s, motion.yaw),
+        np.interp(place_s, time_s, motion.yaw_rate) * pace,
     ), np.where(since > 0, high - fallen, height_m)
 
 
-def clock_with(clock: Clock, faults: Sequence[Happened]) -> Clock:
+def apply_clock_faults(clock: Clock, faults: Sequence[FaultEvent]) -> Clock:
     """Apply clock faults to a robot's clock."""
     for one in faults:
         if one.fault.kind == "clock_drift":
@@ -67,10 +69,10 @@ def clock_with(clock: Clock, faults: Sequence[Happened]) -> Clock:
     return clock
 
 
-def log_with(rng: Generator, log: RobotLog, truth: Truth, one: Happened) -> RobotLog:
+def apply_sensor_fault(rng: Generator, log: RobotLog, truth: Truth, event: FaultEvent) -> RobotLog:
     """Apply a sensor fault to a robot's log. Missing measurements are NaN."""
-    at, amount = one.during(truth.time_s), one.fault.amount
-    match one.fault.kind:
+    at, amount = event.is_active(truth.time_s), event.fault.amount
+    match event.fault.kind:
         case "yaw_rate_bias":
             return replace(log, yaw_rate_radps=log.yaw_rate_radps + amount * at)
         case "height_step":
@@ -81,7 +83,7 @@ def log_with(rng: Generator, log: RobotLog, truth: Truth, one: Happened) -> Robo
             gain = 1 + amount * at
             return replace(log, vx_mps=gain * log.vx_mps, vy_mps=gain * log.vy_mps)
         case "velocity_stuck" | "velocity_gap":
-            reads = 0.0 if one.fault.kind == "velocity_stuck" else np.nan
+            reads = 0.0 if event.fault.kind == "velocity_stuck" else np.nan
             vx, vy = (np.where(at, reads, v) for v in (log.vx_mps, log.vy_mps))
             return replace(log, vx_mps=vx, vy_mps=vy)
         case "attitude_gap":
@@ -91,19 +93,22 @@ def log_with(rng: Generator, log: RobotLog, truth: Truth, one: Happened) -> Robo
             }
             return replace(log, **silent)
         case "crash":
-            since = np.maximum(truth.time_s - one.windows_s[0, 0], 0.0)
-            speed, way = amount * (1 - np.exp(-since / RUNAWAY_S)), rng.uniform(-np.pi, np.pi)
+            since = np.maximum(truth.time_s - event.windows_s[0, 0], 0.0)
+            speed, way = (
+                amount * (1 - np.exp(-since / DIVERGENCE_TIME_CONSTANT_S)),
+                rng.uniform(-np.pi, np.pi),
+            )
             vx, vy = log.vx_mps + speed * np.cos(way), log.vy_mps + speed * np.sin(way)
             return replace(log, vx_mps=vx, vy_mps=vy)
     return log
 
 
-def ranges_with(rng: Generator, ranges: Ranges, clock: Clock, one: Happened) -> Ranges:
+def apply_range_fault(rng: Generator, ranges: Ranges, clock: Clock, event: FaultEvent) -> Ranges:
     """Apply a range fault to the ranges from one robot to another."""
-    at, amount = one.during(clock.true_time(ranges.time_s)), one.fault.amount
-    if one.fault.kind == "range_gap":
+    at, amount = event.is_active(clock.to_true_time(ranges.time_s)), event.fault.amount
+    if event.fault.kind == "range_gap":
         return Ranges(ranges.time_s[~at], ranges.range_m[~at])
     wrong = amount * at
-    if one.fault.kind == "range_outliers":
-        wrong = rng.uniform(*OUTLIER_M, len(at)) * (at & (rng.random(len(at)) < amount))
-    return replace(ranges, range_m=np.maximum(ranges.range_m + wrong, SHORTEST_RANGE_M))
+    if event.fault.kind == "range_outliers":
+        wrong = rng.uniform(*OUTLIER_ERROR_M, len(at)) * (at & (rng.random(len(at)) < amount))
+    return replace(ranges, range_m=np.maximum(ranges.range_m + wrong, MIN_RANGE_M))

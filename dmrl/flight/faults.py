@@ -29,7 +29,7 @@ FaultKind = Literal[
     "landing",
     "crash",
 ]
-SIZES: dict[FaultKind, float] = {
+DEFAULT_SIZES: dict[FaultKind, float] = {
     "nlos": 1.0,
     "range_offset": 0.35,
     "range_outliers": 0.25,
@@ -43,7 +43,7 @@ SIZES: dict[FaultKind, float] = {
 """Default sizes. Unit by kind: metres, rad/s, seconds; a share of the ranges for outliers; a
 share of the velocity for its scale; ppm for drift. A crash has the speed in m/s that the robot's
 velocity estimate diverges to. Other kinds have no size."""
-WINDOWS_S: dict[FaultKind, float] = {
+DEFAULT_DURATIONS_S: dict[FaultKind, float] = {
     "nlos": 3.0,
     "range_gap": 30.0,
     "height_step": 2.0,
@@ -53,13 +53,13 @@ WINDOWS_S: dict[FaultKind, float] = {
     "attitude_gap": 5.0,
 }
 """Default durations. Other kinds last for the whole flight."""
-LINKS = ("nlos", "range_offset", "range_outliers", "range_gap")
+LINK_KINDS = ("nlos", "range_offset", "range_outliers", "range_gap")
 """Kinds that affect the ranges between two robots, in both directions."""
-CLOCKS = ("clock_drift", "clock_offset")
-ENDS = ("landing", "crash")
+CLOCK_KINDS = ("clock_drift", "clock_offset")
+END_KINDS = ("landing", "crash")
 """Kinds after which a robot lies on the floor."""
 
-END_S = 10.0
+DEFAULT_END_S = 10.0
 """Default time from a landing or crash to the end of the flight, seconds."""
 
 
@@ -100,8 +100,8 @@ class Fault:
 
     def __post_init__(self) -> None:
         for wrong, why in (
-            (self.peer and self.kind not in LINKS, "has no peer"),
-            (self.size is not None and self.kind not in SIZES, "has no size"),
+            (self.peer and self.kind not in LINK_KINDS, "has no peer"),
+            (self.size is not None and self.kind not in DEFAULT_SIZES, "has no size"),
             (not np.isfinite(self.size or 0.0), "needs a finite size"),
             (self.kind == "range_outliers" and not 0 < self.amount <= 1, "needs a size in (0, 1]"),
             (self.start_s is not None and not self.start_s >= 0, "cannot start before 0 s"),
@@ -109,8 +109,11 @@ class Fault:
             (self.number < 1, "must happen once or more"),
             (self.number > 1 and self.start_s is not None, "has a start_s or a number, not both"),
             (self.number > 1 and self.lasts_s is None, "happens several times: give duration_s"),
-            (self.kind in ENDS and self.duration_s is not None, "lasts to the end: no duration_s"),
-            (self.kind in CLOCKS and self._timed, "lasts for the whole flight"),
+            (
+                self.kind in END_KINDS and self.duration_s is not None,
+                "lasts to the end: no duration_s",
+            ),
+            (self.kind in CLOCK_KINDS and self._timed, "lasts for the whole flight"),
         ):
             if wrong:
                 raise ValueError(f"{self} {why}")
@@ -125,16 +128,18 @@ class Fault:
     @property
     def amount(self) -> float:
         """Size, or the default of the kind."""
-        return self.size if self.size is not None else SIZES.get(self.kind, 0.0)
+        return self.size if self.size is not None else DEFAULT_SIZES.get(self.kind, 0.0)
 
     @property
     def lasts_s(self) -> float | None:
         """Duration of each occurrence, or None to last until the end."""
-        return self.duration_s if self.duration_s is not None else WINDOWS_S.get(self.kind)
+        return (
+            self.duration_s if self.duration_s is not None else DEFAULT_DURATIONS_S.get(self.kind)
+        )
 
 
 @dataclass(frozen=True, slots=True)
-class Happened:
+class FaultEvent:
     """A fault with its times.
 
     Parameters
@@ -148,18 +153,18 @@ class Happened:
     fault: Fault
     windows_s: Array
 
-    def during(self, true_time_s: Array) -> Mask:
+    def is_active(self, true_time_s: Array) -> Mask:
         """Return (N,) whether the fault is active at these times."""
         start, end = self.windows_s.T[..., None]
         return np.asarray(((true_time_s >= start) & (true_time_s < end)).any(axis=0))
 
-    def befalls(self, link: tuple[str, str]) -> bool:
+    def affects_link(self, link: tuple[str, str]) -> bool:
         """Return whether the fault affects the ranges between two robots, in either direction."""
         fault = self.fault
-        return fault.kind in LINKS and fault.robot in link and fault.peer in ("", *link)
+        return fault.kind in LINK_KINDS and fault.robot in link and fault.peer in ("", *link)
 
 
-def check(faults: Sequence[Fault], names: Sequence[str], flight_s: float) -> None:
+def check_faults(faults: Sequence[Fault], names: Sequence[str], flight_s: float) -> None:
     """Raise SettingError unless all faults fit the flight.
 
     Parameters
@@ -194,11 +199,11 @@ def check(faults: Sequence[Fault], names: Sequence[str], flight_s: float) -> Non
             )
 
 
-def happened(rng: Generator, fault: Fault, flight_s: float) -> Happened:
+def schedule_fault(rng: Generator, fault: Fault, flight_s: float) -> FaultEvent:
     """Schedule a fault: at its start, or once at random in each equal part of the flight."""
     lasts_s = fault.lasts_s
-    if fault.kind in ENDS:
-        start = max(flight_s - END_S, 0.0) if fault.start_s is None else fault.start_s
+    if fault.kind in END_KINDS:
+        start = max(flight_s - DEFAULT_END_S, 0.0) if fault.start_s is None else fault.start_s
         starts, lasts_s = np.array([start]), np.inf
     elif fault.start_s is not None or lasts_s is None:
         starts, lasts_s = np.array([fault.start_s or 0.0]), lasts_s or np.inf
@@ -208,4 +213,4 @@ def happened(rng: Generator, fault: Fault, flight_s: float) -> Happened:
         starts += rng.uniform(0.0, part_s - lasts_s, fault.number)
     # The last sample of a flight belongs to a fault that lasts to the end.
     ends = np.where(starts + lasts_s >= flight_s, np.inf, starts + lasts_s)
-    return Happened(fault, np.stack([starts, ends], axis=1))
+    return FaultEvent(fault, np.stack([starts, ends], axis=1))

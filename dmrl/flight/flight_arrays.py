@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.flight.faults import Happened
+from dmrl.flight.faults import FaultEvent
 from dmrl.geometry.frames import Array
 
 RATE_HZ = 100.0
@@ -17,14 +17,14 @@ RATE_HZ = 100.0
 Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
 
-def numbers(values: NDArray[Any]) -> Iterator[Any]:
+def iter_numbers(values: NDArray[Any]) -> Iterator[Any]:
     """Iterate over an array as Python numbers, which take five times the memory in a list."""
     return map(values.item, range(len(values)))
 
 
-def scanned(step: Callable[[Any, Any], Any], values: Signal) -> Signal:
+def scan_values(step: Callable[[Any, Any], Any], values: Signal) -> Signal:
     """Apply a step to each value and the previous result, from zero. Return (N,) results."""
-    made = accumulate(numbers(values), step, initial=values.dtype.type(0).item())
+    made = accumulate(iter_numbers(values), step, initial=values.dtype.type(0).item())
     next(made)
     return np.fromiter(made, values.dtype, len(values))
 
@@ -44,11 +44,11 @@ class Clock:
     offset_s: float = 0.0
     drift: float = 0.0
 
-    def shows(self, true_time_s: Array) -> Array:
+    def to_clock_time(self, true_time_s: Array) -> Array:
         """Convert true times to clock times, seconds."""
         return self.offset_s + (1.0 + self.drift) * true_time_s
 
-    def true_time(self, time_s: Array) -> Array:
+    def to_true_time(self, time_s: Array) -> Array:
         """Convert clock times to true times, seconds."""
         return (time_s - self.offset_s) / (1.0 + self.drift)
 
@@ -150,7 +150,7 @@ class Flight:
     truth: dict[str, Truth]
     ranges: dict[tuple[str, str], Ranges]
     clocks: dict[str, Clock]
-    faults: tuple[Happened, ...] = ()
+    faults: tuple[FaultEvent, ...] = ()
 
     def peer_in_horizontal(self, i: str, j: str, time_s: Array) -> Array:
         """Return (N, 3) positions of robot ``j`` in ``i``'s horizontal frame, metres.

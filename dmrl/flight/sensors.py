@@ -3,20 +3,20 @@
 import numpy as np
 from numpy.random import Generator
 
-from dmrl.flight.flight_arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth, scanned
+from dmrl.flight.flight_arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth, scan_values
 from dmrl.flight.noise import Noise
 from dmrl.geometry.frames import Array
 
 
-def coloured(rng: Generator, samples: int, std: float, tau_s: float) -> Array:
+def draw_coloured_noise(rng: Generator, samples: int, std: float, tau_s: float) -> Array:
     """Draw (samples,) stationary first-order noise with time constant ``tau_s``."""
     keep = float(np.exp(-1.0 / (RATE_HZ * tau_s)))
     steps = rng.normal(0.0, std, samples)
     steps[1:] *= np.sqrt(1.0 - keep**2)
-    return scanned(lambda x, w: keep * x + w, steps)
+    return scan_values(lambda x, w: keep * x + w, steps)
 
 
-def robot_log(
+def simulate_log(
     rng: Generator, truth: Truth, yaw_rate: Array, clock: Clock, noise: Noise
 ) -> RobotLog:
     """Simulate the log of a robot.
@@ -36,22 +36,22 @@ def robot_log(
     """
     samples = len(truth.time_s)
 
-    def sensed(true: Array, white: float, bias: float) -> Array:
+    def measure(true: Array, white: float, bias: float) -> Array:
         return np.asarray(true + rng.normal(0.0, bias) + rng.normal(0.0, white, samples))
 
-    velocity = _velocity(rng, truth, noise)
+    velocity = _simulate_velocity(rng, truth, noise)
     return RobotLog(
-        time_s=clock.shows(truth.time_s),
-        roll_rad=sensed(truth.roll, noise.attitude_white_rad, noise.attitude_bias_rad),
-        pitch_rad=sensed(truth.pitch, noise.attitude_white_rad, noise.attitude_bias_rad),
-        yaw_rate_radps=sensed(yaw_rate, noise.yaw_rate_white_radps, noise.yaw_rate_bias_radps),
+        time_s=clock.to_clock_time(truth.time_s),
+        roll_rad=measure(truth.roll, noise.attitude_white_rad, noise.attitude_bias_rad),
+        pitch_rad=measure(truth.pitch, noise.attitude_white_rad, noise.attitude_bias_rad),
+        yaw_rate_radps=measure(yaw_rate, noise.yaw_rate_white_radps, noise.yaw_rate_bias_radps),
         vx_mps=velocity[0],
         vy_mps=velocity[1],
-        height_m=sensed(truth.position[:, 2], noise.height_white_m, noise.height_bias_m),
+        height_m=measure(truth.position[:, 2], noise.height_white_m, noise.height_bias_m),
     )
 
 
-def _velocity(rng: Generator, truth: Truth, noise: Noise) -> Array:
+def _simulate_velocity(rng: Generator, truth: Truth, noise: Noise) -> Array:
     """Simulate (2, N) velocities from optical flow, in the robot's horizontal frame."""
     samples = len(truth.time_s)
     x, y, _ = truth.velocity.T
@@ -60,19 +60,20 @@ def _velocity(rng: Generator, truth: Truth, noise: Noise) -> Array:
     bias = rng.normal(0.0, noise.velocity_bias_mps, (2, 1))
     white = rng.normal(0.0, noise.velocity_white_mps, (2, samples))
     slow = [
-        coloured(rng, samples, noise.velocity_coloured_mps, noise.velocity_tau_s) for _ in range(2)
+        draw_coloured_noise(rng, samples, noise.velocity_coloured_mps, noise.velocity_tau_s)
+        for _ in range(2)
     ]
     return np.asarray(scale * np.stack([c * x + s * y, c * y - s * x]) + bias + white + slow)
 
 
-def pair_errors(rng: Generator, noise: Noise) -> tuple[float, float]:
+def draw_pair_errors(rng: Generator, noise: Noise) -> tuple[float, float]:
     """Draw bias (metres) and scale (a factor) of one pair's ranges, for a flight."""
     return float(rng.normal(0.0, noise.uwb_bias_m)), float(1 + rng.normal(0.0, noise.uwb_scale))
 
 
-def ranges(
+def simulate_ranges(
     rng: Generator,
-    here: Truth,
+    observer: Truth,
     peer: Truth,
     clock: Clock,
     noise: Noise,
@@ -94,11 +95,11 @@ def ranges(
         Bias and scale of the pair.
     """
     period_s = 1.0 / noise.ranging_rate_hz
-    time_s = np.arange(rng.uniform(0.0, period_s), here.time_s[-1], period_s)
-    distance = np.linalg.norm(peer.position_at(time_s) - here.position_at(time_s), axis=1)
+    time_s = np.arange(rng.uniform(0.0, period_s), observer.time_s[-1], period_s)
+    distance = np.linalg.norm(peer.position_at(time_s) - observer.position_at(time_s), axis=1)
     bias_m, scale = errors
     detour = rng.exponential(noise.nlos_mean_m, len(time_s))
     detour *= rng.random(len(time_s)) < noise.nlos_share
     measured = scale * distance + bias_m + detour + rng.normal(0.0, noise.uwb_white_m, len(time_s))
     kept = rng.random(len(time_s)) >= noise.ranging_loss
-    return Ranges(clock.shows(time_s[kept]), np.maximum(measured[kept], 0.01))
+    return Ranges(clock.to_clock_time(time_s[kept]), np.maximum(measured[kept], 0.01))

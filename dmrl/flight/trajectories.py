@@ -12,7 +12,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from dmrl.flight.flight_arrays import RATE_HZ, Signal, Truth, numbers, scanned
+from dmrl.flight.flight_arrays import RATE_HZ, Signal, Truth, iter_numbers, scan_values
 from dmrl.geometry.frames import Array
 
 Plane = NDArray[np.complex128]
@@ -82,32 +82,32 @@ class Start:
 Mover = Callable[[Generator, Start, "Motion | None"], Motion]
 
 
-def lagged(commands: Signal, lag_s: float) -> Signal:
+def apply_lag(commands: Signal, lag_s: float) -> Signal:
     """Filter piecewise constant commands (N,) with a first-order lag, from rest."""
     share = 1.0 - np.exp(-1.0 / (RATE_HZ * lag_s))
-    return scanned(lambda v, u: v + share * (u - v), commands)
+    return scan_values(lambda v, u: v + share * (u - v), commands)
 
 
-def _integrated(rate: Signal, start: complex) -> Signal:
+def _integrate_rate(rate: Signal, start: complex) -> Signal:
     """Integrate (N,) rates by the trapezoid rule, whose central differences are the mean rates."""
     steps = (rate[1:] + rate[:-1]) / (2 * RATE_HZ)
     return np.concatenate([[start], start + np.cumsum(steps)]).astype(rate.dtype)
 
 
-def _motion(start: Start, velocity_own: Plane, yaw_rate: Array) -> Motion:
+def _integrate_motion(start: Start, velocity_own: Plane, yaw_rate: Array) -> Motion:
     """Integrate velocities in the robot's horizontal frame to a motion."""
-    yaw = np.real(_integrated(yaw_rate, start.yaw_rad))
+    yaw = np.real(_integrate_rate(yaw_rate, start.yaw_rad))
     velocity = velocity_own * np.exp(1j * yaw)
-    return Motion(_integrated(velocity, start.position), velocity, yaw, yaw_rate)
+    return Motion(_integrate_rate(velocity, start.position), velocity, yaw, yaw_rate)
 
 
-def _held(draws: Signal, hold_s: float, samples: int) -> Signal:
+def _repeat_draws(draws: Signal, hold_s: float, samples: int) -> Signal:
     """Repeat each draw for ``hold_s``, up to (samples,)."""
     held: Signal = draws[(np.arange(samples) / (RATE_HZ * hold_s)).astype(int)]
     return held
 
 
-def _draws(hold_s: float, samples: int) -> int:
+def _count_draws(hold_s: float, samples: int) -> int:
     return int(samples / (RATE_HZ * hold_s)) + 2
 
 
@@ -125,21 +125,21 @@ def back_and_forth(speed_mps: float, yaw_rate_radps: float, hold_s: float) -> Mo
     """
 
     def move(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
-        count = _draws(2 * hold_s, start.samples)
+        count = _count_draws(2 * hold_s, start.samples)
         vx, vy, turn = rng.uniform(-1.0, 1.0, (3, count))
         ways = np.array([1.0, -1.0])
         velocity = np.asarray(speed_mps * np.outer(vx + 1j * vy, ways).ravel(), complex)
         yaw_rate = np.asarray(yaw_rate_radps * np.outer(turn, ways).ravel(), float)
-        return _motion(
+        return _integrate_motion(
             start,
-            lagged(_held(velocity, hold_s, start.samples), VELOCITY_LAG_S),
-            lagged(_held(yaw_rate, hold_s, start.samples), YAW_RATE_LAG_S),
+            apply_lag(_repeat_draws(velocity, hold_s, start.samples), VELOCITY_LAG_S),
+            apply_lag(_repeat_draws(yaw_rate, hold_s, start.samples), YAW_RATE_LAG_S),
         )
 
     return move
 
 
-def in_view(yaw_rate_radps: float) -> Mover:
+def follow_in_view(yaw_rate_radps: float) -> Mover:
     """Return a mover that follows changing points in front of the leader.
 
     Parameters
@@ -150,35 +150,35 @@ def in_view(yaw_rate_radps: float) -> Mover:
 
     def move(rng: Generator, start: Start, leader: Motion | None) -> Motion:
         assert leader is not None
-        count = _draws(VIEW_REDRAW_S, start.samples)
-        points, turns = view_points(rng, count), rng.uniform(-1.0, 1.0, count)
-        ahead = _held(points, VIEW_REDRAW_S, start.samples) * np.exp(1j * leader.yaw)
-        turning = _held(turns, VIEW_REDRAW_S, start.samples) * yaw_rate_radps
-        yaw_rate = lagged(turning, YAW_RATE_LAG_S)
+        count = _count_draws(VIEW_REDRAW_S, start.samples)
+        points, turns = draw_view_points(rng, count), rng.uniform(-1.0, 1.0, count)
+        ahead = _repeat_draws(points, VIEW_REDRAW_S, start.samples) * np.exp(1j * leader.yaw)
+        turning = _repeat_draws(turns, VIEW_REDRAW_S, start.samples) * yaw_rate_radps
+        yaw_rate = apply_lag(turning, YAW_RATE_LAG_S)
         carried = leader.velocity + 1j * leader.yaw_rate * ahead
-        velocity = _following(leader.position + ahead, carried)
-        yaw = np.real(_integrated(yaw_rate, start.yaw_rad))
+        velocity = _follow_target(leader.position + ahead, carried)
+        yaw = np.real(_integrate_rate(yaw_rate, start.yaw_rad))
         first = complex(leader.position[0] + ahead[0])
-        return Motion(_integrated(velocity, first), velocity, yaw, yaw_rate)
+        return Motion(_integrate_rate(velocity, first), velocity, yaw, yaw_rate)
 
     return move
 
 
-def view_points(rng: Generator, count: int) -> Plane:
+def draw_view_points(rng: Generator, count: int) -> Plane:
     """Draw (count,) points in front of a robot, in its horizontal frame, metres."""
     distance = rng.uniform(*VIEW_DISTANCE_M, count)
     bearing = rng.uniform(-VIEW_BEARING_RAD, VIEW_BEARING_RAD, count)
     return np.asarray(distance * np.exp(1j * bearing))
 
 
-def _following(target: Plane, carried: Plane) -> Plane:
+def _follow_target(target: Plane, carried: Plane) -> Plane:
     """Return the (N,) world velocity of a robot that starts on a moving target and follows it."""
     share = 1.0 - np.exp(-1.0 / (RATE_HZ * VELOCITY_LAG_S))
     position, velocity = complex(target[0]), 0j
 
-    def flown() -> Iterator[complex]:
+    def iter_velocities() -> Iterator[complex]:
         nonlocal position, velocity
-        for goal, speed in zip(numbers(target), numbers(carried), strict=True):
+        for goal, speed in zip(iter_numbers(target), iter_numbers(carried), strict=True):
             wanted = speed + FOLLOW_GAIN_PER_S * (goal - position)
             wanted *= min(1.0, SPEED_MAX_MPS / max(abs(wanted), 1e-9))
             before = velocity
@@ -186,34 +186,34 @@ def _following(target: Plane, carried: Plane) -> Plane:
             position += (velocity + before) / (2 * RATE_HZ)
             yield velocity
 
-    return np.fromiter(flown(), complex, len(target))
+    return np.fromiter(iter_velocities(), complex, len(target))
 
 
-def still(_rng: Generator, start: Start, _leader: Motion | None) -> Motion:
+def stand_still(_rng: Generator, start: Start, _leader: Motion | None) -> Motion:
     """Return the motion of a robot that does not move."""
-    return _motion(start, np.zeros(start.samples, complex), np.zeros(start.samples))
+    return _integrate_motion(start, np.zeros(start.samples, complex), np.zeros(start.samples))
 
 
-def hover(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
+def hover_in_place(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
     """Return the motion of a hovering robot, with the drift of a small drone: a few centimetres."""
-    pushes = rng.normal(0.0, HOVER_SPEED_MPS, (2, _draws(1.0, start.samples)))
+    pushes = rng.normal(0.0, HOVER_SPEED_MPS, (2, _count_draws(1.0, start.samples)))
     # Differences, so that the pushes cancel and the robot stays in place.
     velocity = np.diff(pushes[0] + 1j * pushes[1], prepend=0.0)
-    return _motion(
+    return _integrate_motion(
         start,
-        lagged(_held(velocity, 1.0, start.samples), VELOCITY_LAG_S),
+        apply_lag(_repeat_draws(velocity, 1.0, start.samples), VELOCITY_LAG_S),
         np.zeros(start.samples),
     )
 
 
-def parallel(_rng: Generator, start: Start, leader: Motion | None) -> Motion:
+def fly_parallel(_rng: Generator, start: Start, leader: Motion | None) -> Motion:
     """Return the motion of a robot that copies the leader's motion beside it."""
     assert leader is not None
     position = leader.position + (start.position - leader.position[0])
     return Motion(position, leader.velocity, leader.yaw, leader.yaw_rate)
 
 
-def lawn_mower(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
+def fly_rows(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
     """Return the motion of a robot that flies rows in its own frame, then the same rows back."""
     speed = rng.uniform(0.3, 0.6)
     row, gap = ROW_M / speed, ROW_GAP_M / speed
@@ -223,24 +223,26 @@ def lawn_mower(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
     ends = np.cumsum([lasts for lasts, _ in round_trip])
     phase = (np.arange(start.samples) / RATE_HZ) % ends[-1]
     ways = np.array([way for _, way in round_trip])[np.searchsorted(ends, phase, side="right")]
-    return _motion(start, lagged(speed * ways, VELOCITY_LAG_S), np.zeros(start.samples))
+    return _integrate_motion(
+        start, apply_lag(speed * ways, VELOCITY_LAG_S), np.zeros(start.samples)
+    )
 
 
 TRAJECTORIES: dict[Trajectory, tuple[Mover, Mover]] = {
-    "in_view": (back_and_forth(0.5, 0.4, 1.5), in_view(0.8)),
+    "in_view": (back_and_forth(0.5, 0.4, 1.5), follow_in_view(0.8)),
     "random": (back_and_forth(1.0, 0.5, 1.0), back_and_forth(1.0, 0.5, 1.0)),
-    "lawn_mower": (lawn_mower, lawn_mower),
-    "hover": (hover, hover),
-    "parallel": (back_and_forth(0.5, 0.4, 1.5), parallel),
-    "observer_static": (still, in_view(0.8)),
-    "peer_static": (back_and_forth(0.5, 0.4, 1.5), still),
-    "no_yaw": (back_and_forth(0.5, 0.0, 1.5), in_view(0.0)),
-    "both_static": (still, still),
+    "lawn_mower": (fly_rows, fly_rows),
+    "hover": (hover_in_place, hover_in_place),
+    "parallel": (back_and_forth(0.5, 0.4, 1.5), fly_parallel),
+    "observer_static": (stand_still, follow_in_view(0.8)),
+    "peer_static": (back_and_forth(0.5, 0.4, 1.5), stand_still),
+    "no_yaw": (back_and_forth(0.5, 0.0, 1.5), follow_in_view(0.0)),
+    "both_static": (stand_still, stand_still),
 }
 """Mover of the first robot, and mover of all others."""
 
 
-def truth_of(motion: Motion, height_m: Array) -> Truth:
+def build_truth(motion: Motion, height_m: Array) -> Truth:
     """Build the ground truth of a robot from its motion and height, with the resulting tilt.
 
     Thrust points along the body's z axis. A robot that accelerates forward pitches nose down, and

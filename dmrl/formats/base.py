@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dmrl.geometry.frames import Camera
-from dmrl.samples.flight import in_order
+from dmrl.samples.flight import merge_by_time
 from dmrl.samples.sample import Columns, Intervals, Sample
 
 
@@ -38,15 +38,15 @@ class Content:
     others: Iterator[Sample] = field(default_factory=lambda: iter(()))
 
 
-def content_of(streams: Iterable[Iterable[Sample]]) -> Content:
+def build_content(streams: Iterable[Iterable[Sample]]) -> Content:
     """Build the content of several streams, of which some may be columns.
 
     The content can be iterated once: either ``samples``, or ``series`` and ``others``.
     """
     held = list(streams)
     series = tuple(stream for stream in held if isinstance(stream, Columns))
-    others = in_order(stream for stream in held if not isinstance(stream, Columns))
-    return Content(in_order(held), series=series, others=others)
+    others = merge_by_time(stream for stream in held if not isinstance(stream, Columns))
+    return Content(merge_by_time(held), series=series, others=others)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from dmrl.plugins import Plugin
 from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say
 
-FIRST = (
+GUESS_ORDER = (
     *("locanet", "csv", "uwb-tiers", "rosbag2", "nanocockpit", "cfclient"),
     *("cfusdlog", "aideck-stream", "hyperflash"),
 )
@@ -27,7 +27,7 @@ FIRST = (
 
 
 @cache
-def own() -> dict[str, Format]:
+def load_builtin_formats() -> dict[str, Format]:
     """Return the ``FORMAT`` of every file of this package by name: ``GUESS_ORDER``, then by name.
 
     Plain images come last, since any folder with images matches them.
@@ -37,14 +37,14 @@ def own() -> dict[str, Format]:
     found = [m.FORMAT for m in modules if isinstance(getattr(m, "FORMAT", None), Format)]
 
     def turn(form: Format) -> tuple[int, str]:
-        if form.name in FIRST:
-            return FIRST.index(form.name), ""
-        return len(FIRST) + (form.name == "images"), form.name
+        if form.name in GUESS_ORDER:
+            return GUESS_ORDER.index(form.name), ""
+        return len(GUESS_ORDER) + (form.name == "images"), form.name
 
     return {form.name: form for form in sorted(found, key=turn)}
 
 
-def format_of(source: Path, name: str | None = None) -> Format:
+def find_format(source: Path, name: str | None = None) -> Format:
     """Return the built-in or plug-in format of a source.
 
     Parameters
@@ -61,50 +61,54 @@ def format_of(source: Path, name: str | None = None) -> Format:
     PluginError
         If the plug-in with the given name cannot be loaded.
     """
-    added = {n: p for n, p in plugins.find_plugins(plugins.FORMATS).items() if n not in own()}
-    known = ", ".join([*own(), *added])
+    added = {
+        n: p
+        for n, p in plugins.find_plugins(plugins.FORMATS).items()
+        if n not in load_builtin_formats()
+    }
+    known = ", ".join([*load_builtin_formats(), *added])
     if not source.exists():
         raise SourceError(f"no file or folder {source}. Pass one that exists")
     if not (source.is_file() or source.is_dir()):
         raise SourceError(f"{source} is neither a file nor a folder. Save it to a file first")
-    if odd := next((p for p in _within(source) if _is_neither(p)), None):
+    if odd := next((p for p in _iter_contents(source) if _is_special_file(p)), None):
         raise SourceError(f"{odd} is neither a file nor a folder. Move it out of {source}")
     if name in added:
-        return _plugged(added[name])
-    if name is not None and name not in own():
-        near = get_close_matches(name, [*own(), *added], n=1)
+        return _load_plugin_format(added[name])
+    if name is not None and name not in load_builtin_formats():
+        near = get_close_matches(name, [*load_builtin_formats(), *added], n=1)
         hint = f"Did you mean {near[0]}? " if near else ""
         raise SourceError(f"--from {name}: no such format. {hint}Formats: {known}")
     if name is not None:
-        return own()[name]
+        return load_builtin_formats()[name]
     if source.is_file() and source.stat().st_size == 0:
         raise SourceError(f"{source} is empty, 0 bytes. Pass another file")
     if source.is_dir() and not any(source.iterdir()):
         raise SourceError(f"{source} is an empty folder. Pass one with files in it")
-    if guess := _guess(source, added.values()):
+    if guess := _guess_format(source, added.values()):
         return guess
     if source.suffix == ".mcap":
         raise SourceError(f"{source} is a recording already. Pass --to: csv, parquet, ros2")
     raise SourceError(f"{source} matches no known format. Pass --from: {known}")
 
 
-def _within(source: Path) -> Iterator[Path]:
+def _iter_contents(source: Path) -> Iterator[Path]:
     return source.rglob("*") if source.is_dir() else iter(())
 
 
-def _is_neither(path: Path) -> bool:
+def _is_special_file(path: Path) -> bool:
     """Return whether a path is a pipe, device or socket, which would block its reader."""
     return path.exists() and not (path.is_file() or path.is_dir())
 
 
-def _guess(source: Path, added: Iterable[Plugin]) -> Format | None:
+def _guess_format(source: Path, added: Iterable[Plugin]) -> Format | None:
     """Return the first format that matches a source. Plug-ins follow dmrl's own, before images."""
-    *first, pictures = own().values()
+    *first, pictures = load_builtin_formats().values()
     if found := next((f for f in first if f.recognises(source)), None):
         return found
     for plugin in added:
         try:
-            form = _plugged(plugin)
+            form = _load_plugin_format(plugin)
             if form.recognises(source):
                 return form
         except PluginError as e:
@@ -112,7 +116,7 @@ def _guess(source: Path, added: Iterable[Plugin]) -> Format | None:
     return pictures if pictures.recognises(source) else None
 
 
-def _plugged(plugin: Plugin) -> Format:
+def _load_plugin_format(plugin: Plugin) -> Format:
     """Load the format of another package. Its failures become errors that name the package."""
     loaded = plugin.load()
     form = getattr(loaded, "FORMAT", loaded)

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 Ints = NDArray[np.int64]
 
-EARLY = 0.3
+EARLY_TOLERANCE = 0.3
 """Largest earliness of an arrival, as a share of the period."""
-EARLIER, LATER = 0.3, 0.01
+EARLY_GAIN, LATE_GAIN = 0.3, 0.01
 """Shares of an early and of a late arrival's deviation by which the next due time is corrected."""
 
 
@@ -46,7 +46,7 @@ def unwrap(values: ArrayLike, bits: int) -> Ints:
     return np.concatenate([counts[:1], counts[:1] + np.cumsum(steps)])
 
 
-class Unwrapped:
+class CounterUnwrapper:
     """Unwrapper of a counter with few bits, one value at a time.
 
     Parameters
@@ -68,14 +68,14 @@ class Unwrapped:
 
         Examples
         --------
-        >>> unwrapped = Unwrapped(8)
+        >>> unwrapped = CounterUnwrapper(8)
         >>> [unwrapped(value) for value in (254, 255, 1, 0)]
         [254, 255, 257, 256]
         """
-        self._last = self.near(value)
+        self._last = self.find_nearest(value)
         return self._last
 
-    def near(self, value: int) -> int:
+    def find_nearest(self, value: int) -> int:
         """Return the unwrapped value without storing it. It may have more bits than the counter."""
         if self._last is None:
             return value
@@ -111,7 +111,7 @@ def dejitter(arrival_ns: ArrayLike, count: ArrayLike | None = None) -> Ints:
     arrival = np.asarray(arrival_ns, np.int64)
     if len(arrival) < 3:
         return arrival.copy()
-    number = _numbered(arrival) if count is None else np.asarray(count, np.int64)
+    number = _number_arrivals(arrival) if count is None else np.asarray(count, np.int64)
     # Relative: float64 resolves nanoseconds since 1970 to a quarter of a microsecond only.
     x, y = (number - number[0]).astype(float), (arrival - arrival[0]).astype(float)
     hull = _lower_hull(x, y)
@@ -124,17 +124,17 @@ def dejitter(arrival_ns: ArrayLike, count: ArrayLike | None = None) -> Ints:
     return np.asarray(arrival[0] + line.astype(np.int64))
 
 
-def _numbered(arrival: Ints) -> Ints:
+def _number_arrivals(arrival: Ints) -> Ints:
     """Assign numbers to the arrivals of a steady sender, with gaps for missing samples."""
     steps = np.diff(arrival)
     period = max(float(np.median(steps)), 1.0)
     period = float(steps[steps < 1.5 * period].mean())
     numbers, number, due = [0], 0, float(arrival[0])
     for moment in arrival[1:].tolist():
-        passed = max(int((moment - due) / period + EARLY), 1)
+        passed = max(int((moment - due) / period + EARLY_TOLERANCE), 1)
         number, due = number + passed, due + passed * period
         # Adapts fast to early arrivals, and slowly to a slower clock.
-        due += (moment - due) * (EARLIER if moment < due else LATER)
+        due += (moment - due) * (EARLY_GAIN if moment < due else LATE_GAIN)
         numbers.append(number)
     return np.array(numbers, np.int64)
 
@@ -156,39 +156,39 @@ def _lower_hull(x: NDArray[np.float64], y: NDArray[np.float64]) -> list[int]:
     return hull
 
 
-class SteadySender:
+class SteadyRateFilter:
     """Filter of arrival times from a sender that sends at a steady rate and has no clock.
 
     The next due time follows early arrivals at once and late ones slowly, since transmission only
     adds delay. A pause of several samples restarts the filter.
     """
 
-    MEMORY = 64
+    PERIOD_WINDOW = 64
     """Number of arrivals over which the period is measured."""
-    LEAST = 8
+    MIN_ARRIVALS = 8
     """Number of arrivals before the filter starts; earlier ones are returned unchanged."""
-    LATE = 0.02
+    LATE_SHARE = 0.02
     """Share of its lateness by which a late arrival delays the next due time."""
-    PAUSE = 4.0
+    PAUSE_PERIODS = 4.0
     """Lateness that restarts the filter, in periods."""
 
     def __init__(self) -> None:
-        self._arrivals: deque[int] = deque(maxlen=self.MEMORY)
+        self._arrivals: deque[int] = deque(maxlen=self.PERIOD_WINDOW)
         self._due_ns = 0.0
 
     def __call__(self, arrival_ns: int) -> int:
         """Return the send time of a sample that arrives now; never later than now."""
         self._arrivals.append(arrival_ns)
-        if len(self._arrivals) < self.LEAST:
+        if len(self._arrivals) < self.MIN_ARRIVALS:
             self._due_ns = arrival_ns
             return arrival_ns
         pace_ns = (self._arrivals[-1] - self._arrivals[0]) / (len(self._arrivals) - 1)
         self._due_ns += pace_ns
         late_ns = arrival_ns - self._due_ns
-        if late_ns > self.PAUSE * pace_ns:
+        if late_ns > self.PAUSE_PERIODS * pace_ns:
             self._arrivals.clear()
             self._arrivals.append(arrival_ns)
             self._due_ns = arrival_ns
         else:
-            self._due_ns += late_ns if late_ns < 0 else self.LATE * late_ns
+            self._due_ns += late_ns if late_ns < 0 else self.LATE_SHARE * late_ns
         return min(round(self._due_ns), arrival_ns)

@@ -4,11 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-LARGEST = 1e6
+MAX_VALUE = 1e6
 """Maximum of a focal length and a principal point, pixels, and of a coefficient."""
 
 
-def no_camera(width_px: int, height_px: int, k: Sequence[float], d: Sequence[float]) -> str:
+def find_calibration_fault(
+    width_px: int, height_px: int, k: Sequence[float], d: Sequence[float]
+) -> str:
     """Return the fault of a camera calibration, or an empty text if it is valid.
 
     Parameters
@@ -25,7 +27,7 @@ def no_camera(width_px: int, height_px: int, k: Sequence[float], d: Sequence[flo
         return "is not calibrated: K is zero or missing"
     if len(k) != 9:
         return f"has {len(k)} numbers in K, not 9"
-    if not np.isfinite([*k, *d]).all() or np.abs([*k, *d]).max() > LARGEST:
+    if not np.isfinite([*k, *d]).all() or np.abs([*k, *d]).max() > MAX_VALUE:
         return "has numbers in K or D that are not finite or too large"
     if min(k[0], k[4]) <= 0:
         return "has a focal length that is not above 0"

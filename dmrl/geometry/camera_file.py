@@ -8,20 +8,20 @@ from dmrl.geometry.frames import AIDECK, PUBLISHED_RENDER, Camera
 from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.guards.paths import refuse_pipe
 
-KNOWN = {"aideck": AIDECK, "published": PUBLISHED_RENDER}
+NAMED_CAMERAS = {"aideck": AIDECK, "published": PUBLISHED_RENDER}
 """Built-in cameras by name."""
 
-INTEGERS = ("width_px", "height_px")
-POSITIVE = (*INTEGERS, "fx_px", "fy_px")
-NEEDED = tuple(field.name for field in fields(Camera) if field.default is MISSING)
-LISTS = ("distortion", "mount_rad")
-COEFFICIENTS = 5
+INTEGER_KEYS = ("width_px", "height_px")
+POSITIVE_KEYS = (*INTEGER_KEYS, "fx_px", "fy_px")
+REQUIRED_KEYS = tuple(field.name for field in fields(Camera) if field.default is MISSING)
+LIST_KEYS = ("distortion", "mount_rad")
+MAX_COEFFICIENTS = 5
 """Maximum number of distortion coefficients: k1, k2, p1, p2, k3."""
 
-KEYS = (*NEEDED, *LISTS, "delay_s")
+KEYS = (*REQUIRED_KEYS, *LIST_KEYS, "delay_s")
 
 
-def write_camera(camera: Camera) -> str:
+def format_camera(camera: Camera) -> str:
     """Format a camera as a TOML document that ``read_camera`` can read."""
     values = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(camera).items()}
     lines = [f"{key} = {value}" for key, value in values.items()]
@@ -30,7 +30,7 @@ def write_camera(camera: Camera) -> str:
     )
 
 
-def camera_named(name: Path) -> Camera:
+def find_camera(name: Path) -> Camera:
     """Return the built-in camera with this name, or read a TOML file.
 
     Parameters
@@ -43,7 +43,7 @@ def camera_named(name: Path) -> Camera:
     SourceError
         As `read_camera`.
     """
-    return KNOWN.get(str(name)) or read_camera(name)
+    return NAMED_CAMERAS.get(str(name)) or read_camera(name)
 
 
 def read_camera(path: Path) -> Camera:
@@ -77,9 +77,9 @@ def parse_camera(text: str, path: Path) -> Camera:
     except ValueError as e:
         raise SourceError(f"{path} is not a TOML file: {e}. Keys: {', '.join(KEYS)}") from None
     wrong = [key for key in values if key not in KEYS]
-    wrong += [f"{key} (missing)" for key in NEEDED if key not in values]
-    wrong += [key for key in NEEDED if key in values and not _is_number(key, values[key])]
-    given = {key: values[key] for key in LISTS if key in values}
+    wrong += [f"{key} (missing)" for key in REQUIRED_KEYS if key not in values]
+    wrong += [key for key in REQUIRED_KEYS if key in values and not _is_number(key, values[key])]
+    given = {key: values[key] for key in LIST_KEYS if key in values}
     wrong += [key for key, value in given.items() if not _is_list(key, value)]
     wrong += ["delay_s"] * (not _is_number("", values.get("delay_s", 0.0)))
     if wrong:
@@ -90,11 +90,11 @@ def parse_camera(text: str, path: Path) -> Camera:
 def _is_list(key: str, value: object) -> bool:
     if not isinstance(value, list) or not all(_is_number("", one) for one in value):
         return False
-    return len(value) == 3 if key == "mount_rad" else len(value) <= COEFFICIENTS
+    return len(value) == 3 if key == "mount_rad" else len(value) <= MAX_COEFFICIENTS
 
 
 def _is_number(key: str, value: object) -> bool:
-    kinds = (int,) if key in INTEGERS else (int, float)
+    kinds = (int,) if key in INTEGER_KEYS else (int, float)
     if not isinstance(value, kinds) or isinstance(value, bool):
         return False
-    return abs(value) < float("inf") and (key not in POSITIVE or value > 0)
+    return abs(value) < float("inf") and (key not in POSITIVE_KEYS or value > 0)

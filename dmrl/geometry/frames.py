@@ -145,7 +145,7 @@ def project(xyz_camera: Array, image_from_optical: Array) -> tuple[Array, Array]
     return uvw[:, :2] / uvw[:, 2:], depth_m
 
 
-def inside(uv: Array, width_px: int, height_px: int) -> NDArray[np.bool_]:
+def is_inside(uv: Array, width_px: int, height_px: int) -> NDArray[np.bool_]:
     """Return (N,) whether pixels are in the image, [0, width) x [0, height).
 
     Parameters
@@ -158,7 +158,7 @@ def inside(uv: Array, width_px: int, height_px: int) -> NDArray[np.bool_]:
     return np.asarray(((uv >= 0) & (uv < (width_px, height_px))).all(axis=1))
 
 
-def grid_label(
+def build_grid_label(
     uv: Array, depth_m: Array, *, shape: tuple[int, int] = (28, 40), stride_px: int = STRIDE_PX
 ) -> NDArray[np.float32]:
     """Build confidence and depth maps of one image (paper eq. 4).
@@ -183,7 +183,7 @@ def grid_label(
     """
     rows, cols = shape
     grid = np.zeros((2, rows, cols), np.float32)
-    seen = inside(uv, cols * stride_px, rows * stride_px)
+    seen = is_inside(uv, cols * stride_px, rows * stride_px)
     uv, depth_m = uv[seen], depth_m[seen]
     order = np.argsort(-depth_m, kind="stable")  # far first, so that near overwrites
     col, row = (uv[order] // stride_px).astype(int).T
@@ -227,13 +227,13 @@ def pixels_from_horizontal(
     cr, sr, cp, sp = np.cos(roll_rad), np.sin(roll_rad), np.cos(pitch_rad), np.sin(pitch_rad)
     zero = np.zeros_like(cr)
 
-    def matrix(*entries: Array) -> Array:
+    def stack_matrices(*entries: Array) -> Array:
         return np.stack(entries, axis=-1).reshape(-1, 3, 3)
 
     # Rows of camera_from_horizontal, and of its derivatives.
-    turn = matrix(cp, zero, -sp, sp * sr, cr, cp * sr, sp * cr, -sr, cp * cr)
-    by_roll = matrix(zero, zero, zero, sp * cr, -sr, cp * cr, -sp * sr, -cr, -cp * sr)
-    by_pitch = matrix(-sp, zero, -cp, cp * sr, zero, -sp * sr, cp * cr, zero, -sp * cr)
+    turn = stack_matrices(cp, zero, -sp, sp * sr, cr, cp * sr, sp * cr, -sr, cp * cr)
+    by_roll = stack_matrices(zero, zero, zero, sp * cr, -sr, cp * cr, -sp * sr, -cr, -cp * sr)
+    by_pitch = stack_matrices(-sp, zero, -cp, cp * sr, zero, -sp * sr, cp * cr, zero, -sp * cr)
     if any(camera.mount_rad):
         turn, by_roll, by_pitch = (camera.camera_from_body @ m for m in (turn, by_roll, by_pitch))
     point = xyz_horizontal[:, :, None]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-ROUNDS = 8
+NEWTON_STEPS = 8
 """Newton steps of the inverse. Lenses of small cameras converge to 1e-9 in 4."""
 
 
@@ -69,7 +69,7 @@ def undistort(bent: Array, distortion: tuple[float, ...]) -> Array:
     """
     # Newton's method starts at the distorted place, because distortion is small.
     plane = np.array(bent, float)
-    for _ in range(ROUNDS if any(distortion) else 0):
+    for _ in range(NEWTON_STEPS if any(distortion) else 0):
         shown, jacobian = distort(plane, distortion)
         plane = plane - np.linalg.solve(jacobian, (shown - bent)[..., None])[..., 0]
     return plane

@@ -8,7 +8,7 @@ import numpy as np
 from dmrl.geometry.frames import Array
 
 
-def euler_zyx(quaternion: Array) -> Array:
+def quaternion_to_euler(quaternion: Array) -> Array:
     """Convert (N, 4) x, y, z, w to (N, 3) roll, pitch, yaw of Rz(yaw) Ry(pitch) Rx(roll)."""
     x, y, z, w = quaternion.T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -17,7 +17,7 @@ def euler_zyx(quaternion: Array) -> Array:
     return np.stack([roll, pitch, yaw], axis=1)
 
 
-def quaternion_zyx(angles: Array) -> Array:
+def euler_to_quaternion(angles: Array) -> Array:
     """Convert (N, 3) roll, pitch, yaw to (N, 4) x, y, z, w."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(angles / 2).T, np.sin(angles / 2).T
     xyzw = (

@@ -24,7 +24,7 @@ def parse_json(text: str | bytes) -> Any:
         If it is not JSON, nests deeper than the limit, or contains an integer over 64 bits.
     """
     try:
-        return _modest(json.loads(text))
+        return _check_limits(json.loads(text))
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
 
@@ -41,13 +41,13 @@ def parse_toml(text: str) -> dict[str, Any]:
     if len(text) > limits.TOML_CHARACTERS:
         raise ValueError(f"it has {len(text)} characters, more than {limits.TOML_CHARACTERS}")
     try:
-        table: dict[str, Any] = _modest(tomllib.loads(text))
+        table: dict[str, Any] = _check_limits(tomllib.loads(text))
         return table
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
 
 
-LEAKS = (
+ARCHIVE_ERRORS = (
     *(MemoryError, RuntimeError, LookupError, SyntaxError),
     *(struct.error, zlib.error, lzma.LZMAError),
 )
@@ -55,7 +55,7 @@ LEAKS = (
 _TOO_DEEP = f"it nests deeper than {limits.DEPTH}"
 
 
-def _modest(value: Any) -> Any:
+def _check_limits(value: Any) -> Any:
     """Return the value if its depth and its integers are within the limits.
 
     Later code recurses into it, and makes arrays of it.
@@ -88,11 +88,11 @@ def load_npz(path: Path) -> dict[str, NDArray[Any]]:
     with path.open("rb") as stream:
         with zipfile.ZipFile(stream) as archive:
             size = sum(member.file_size for member in archive.infolist())
-        if size > limits.archive_bytes(path.stat().st_size):
+        if size > limits.max_archive_bytes(path.stat().st_size):
             raise ValueError(f"it unpacks to {size / 1e6:.0f} MB")
         stream.seek(0)
         try:
             with np.load(stream, allow_pickle=False) as arrays:
                 return {name: np.asarray(arrays[name]) for name in arrays.files}
-        except LEAKS as e:
+        except ARCHIVE_ERRORS as e:
             raise ValueError(str(e)) from e

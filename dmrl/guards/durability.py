@@ -4,7 +4,7 @@ import os
 import shutil
 from pathlib import Path
 
-from dmrl.guards.locks import UNSUPPORTED
+from dmrl.guards.locks import UNSUPPORTED_ERRNOS
 
 
 def sync(path: Path) -> None:
@@ -19,22 +19,22 @@ def sync(path: Path) -> None:
         for inner in sorted(path.iterdir()):
             if not inner.is_symlink():
                 sync(inner)
-    sync_one(path)
+    sync_entry(path)
 
 
-def sync_one(path: Path) -> None:
+def sync_entry(path: Path) -> None:
     """Flush a file, or the list of names in a folder, to the disk."""
-    held = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(held)
+        os.fsync(descriptor)
     except OSError as e:
-        if e.errno not in UNSUPPORTED:
+        if e.errno not in UNSUPPORTED_ERRNOS:
             raise
     finally:
-        os.close(held)
+        os.close(descriptor)
 
 
-def empty(folder: Path) -> None:
+def clear_folder(folder: Path) -> None:
     """Remove everything in a folder. Links are removed, not their targets."""
     for inner in folder.iterdir():
         if inner.is_dir() and not inner.is_symlink():

@@ -71,7 +71,7 @@ TOML_CHARACTERS = 100_000
 STEPS = 10_000
 """Steps of a pipeline after ``[each]`` is expanded. The longest that ships has 1,805."""
 
-GATHERED = 200_000
+GATHERED_VALUES = 200_000
 """Values that all steps of a pipeline collect."""
 
 STEP_CHARACTERS = 50 * MB
@@ -81,16 +81,16 @@ ANCESTORS = 64
 """Depth of a provenance. Older ancestors keep their hash only."""
 
 
-def unpacked_bytes(size: int) -> int:
+def max_unpacked_bytes(size: int) -> int:
     """Return the limit for the decompressed size of a recording of ``size`` bytes."""
     return UNPACKED_BYTES + UNPACKED_TIMES * size
 
 
-def archive_bytes(size: int) -> int:
+def max_archive_bytes(size: int) -> int:
     """Return the limit for the decompressed size of an archive of ``size`` bytes, all in memory."""
     return UNPACKED_BYTES + MEMORY_TIMES * size
 
 
-def memory_bytes(size: int) -> int:
+def max_memory_bytes(size: int) -> int:
     """Return the memory that a library may use to read a file of ``size`` bytes."""
     return MEMORY_BYTES + MEMORY_TIMES * size

@@ -9,33 +9,33 @@ from pathlib import Path
 
 from dmrl.errors import BusyOutput, OutputError
 
-PATIENCE_S = 0.25
+LOCK_WAIT_S = 0.25
 """Time to wait for a lock. Another process may be testing it at this moment."""
-UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EBADF)
+UNSUPPORTED_ERRNOS = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EBADF)
 """Error numbers of file systems without locks, or that cannot sync a folder."""
 
 
 def refuse_locked(path: Path) -> None:
     """Raise OutputError if a living process has locked ``path``."""
     with suppress(OSError):  # nothing exists, or it cannot be locked
-        held = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:
-            _lock(held, path)
+            _lock(descriptor, path)
         finally:
-            os.close(held)
+            os.close(descriptor)
 
 
 def take_file(partial: Path) -> int:
     """Create a file locked by this process, and return its descriptor."""
     while True:
         try:
-            held = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+            descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         except FileExistsError:
             _remove_left_over(partial)
             continue
         try:
-            if _locked_still(held, partial):
-                return held
+            if _lock_if_same(descriptor, partial):
+                return descriptor
         except KeyboardInterrupt:
             partial.unlink(missing_ok=True)
             raise
@@ -47,7 +47,7 @@ def take_folder(partial: Path) -> int:
         with suppress(FileExistsError):
             partial.mkdir()
         try:
-            held = os.open(partial, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            descriptor = os.open(partial, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         except FileNotFoundError:
             continue  # finished by another process just now
         except NotADirectoryError:
@@ -56,72 +56,72 @@ def take_folder(partial: Path) -> int:
             with suppress(OSError):
                 partial.rmdir()  # a folder that was just created is empty
             raise
-        if _locked_still(held, partial):
-            return held
+        if _lock_if_same(descriptor, partial):
+            return descriptor
 
 
-def _locked_still(held: int, partial: Path) -> bool:
+def _lock_if_same(descriptor: int, partial: Path) -> bool:
     """Lock the descriptor; return whether it still has the name, else close it."""
     try:
-        _lock(held, partial)
+        _lock(descriptor, partial)
     except BaseException:
-        os.close(held)
+        os.close(descriptor)
         raise
-    if is_held(partial, held):
+    if is_same_file(partial, descriptor):
         return True
-    os.close(held)
+    os.close(descriptor)
     return False
 
 
 def _remove_left_over(partial: Path) -> None:
     """Remove a file of a killed process. It is not emptied: it may have another name by now."""
     try:
-        held = os.open(partial, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        descriptor = os.open(partial, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except FileNotFoundError:
         return
     except OSError as e:
         if e.errno == errno.ELOOP:
             raise OutputError(f"{partial} exists and is a symbolic link. Remove it") from None
         raise
-    if _locked_still(held, partial):
+    if _lock_if_same(descriptor, partial):
         try:
             if partial.is_dir():
                 raise OutputError(f"{partial} exists and is a folder. Remove it")
             partial.unlink()
         finally:
-            os.close(held)
+            os.close(descriptor)
 
 
-def _lock(held: int, partial: Path) -> None:
+def _lock(descriptor: int, partial: Path) -> None:
     """Lock an open file or folder until it is closed or this process ends.
 
     On a file system without locks this always succeeds; see docs/reliability.md.
     """
-    until = time.monotonic() + PATIENCE_S
+    until = time.monotonic() + LOCK_WAIT_S
     while True:
         try:
-            return fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if time.monotonic() > until:
-                raise _busy(held, partial) from None
-            time.sleep(PATIENCE_S / 10)
+                raise _busy_error(descriptor, partial) from None
+            time.sleep(LOCK_WAIT_S / 10)
         except OSError as e:
-            if e.errno not in UNSUPPORTED:
+            if e.errno not in UNSUPPORTED_ERRNOS:
                 raise
             return None
 
 
-def _busy(held: int, partial: Path) -> BusyOutput:
-    owner = _owner(held)
+def _busy_error(descriptor: int, partial: Path) -> BusyOutput:
+    owner = _find_owner(descriptor)
     number = "" if owner is None else f", process {owner}"
     return BusyOutput(
         f"{partial.with_suffix('')} is being written by another dmrl{number}. Name another output"
     )
 
 
-def _owner(held: int) -> int | None:
+def _find_owner(descriptor: int) -> int | None:
     """Return the id of the process with the lock, if the system lists it."""
-    found = os.fstat(held)
+    found = os.fstat(descriptor)
     device = f"{os.major(found.st_dev):02x}:{os.minor(found.st_dev):02x}"
     place = f"{device}:{found.st_ino}"
     with suppress(OSError, ValueError, IndexError):
@@ -132,9 +132,9 @@ def _owner(held: int) -> int | None:
     return None
 
 
-def is_held(path: Path, held: int) -> bool:
+def is_same_file(path: Path, descriptor: int) -> bool:
     """Return whether the path is that of the open file or folder."""
     try:
-        return os.path.samestat(os.lstat(path), os.fstat(held))
+        return os.path.samestat(os.lstat(path), os.fstat(descriptor))
     except OSError:
         return False

@@ -11,10 +11,10 @@ from pathlib import Path
 
 from dmrl.guards import limits
 
-_HELD = re.compile(r"VmData:\s*(\d+) kB")
+_VM_DATA = re.compile(r"VmData:\s*(\d+) kB")
 
 
-class Bounded:
+class MemoryLimit:
     """Limit the memory of this process within a block, by the size of the file that is read.
 
     Mapped files do not count. Written files have the same limit, as a library may unpack into the
@@ -33,10 +33,10 @@ class Bounded:
     """
 
     def __init__(self, size: int) -> None:
-        most = limits.memory_bytes(size)
+        most = limits.max_memory_bytes(size)
         self._bounds = {resource.RLIMIT_FSIZE: most}
         with suppress(OSError):
-            if found := _HELD.search(Path("/proc/self/status").read_text(encoding="ascii")):
+            if found := _VM_DATA.search(Path("/proc/self/status").read_text(encoding="ascii")):
                 self._bounds[resource.RLIMIT_DATA] = most + 1024 * int(found[1])
         self._before = {kind: resource.getrlimit(kind) for kind in self._bounds}
 
@@ -51,7 +51,7 @@ class Bounded:
             resource.setrlimit(kind, before)
 
 
-def size_of(path: Path) -> int:
+def measure_size(path: Path) -> int:
     """Return the size of a file, or of all files in a folder, bytes.
 
     Raises

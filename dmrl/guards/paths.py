@@ -8,7 +8,7 @@ from pathlib import Path
 from dmrl.errors import UnsafeName
 
 
-def refuse_no_text(path: Path) -> None:
+def require_text_path(path: Path) -> None:
     """Raise UnsafeName unless a path is valid UTF-8 without NUL.
 
     File systems accept any bytes. Libraries that write tables, figures and training logs need text,

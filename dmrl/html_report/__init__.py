@@ -4,8 +4,8 @@
 `html` builds a self-contained page, and `write_report` writes the file.
 """
 
-from dmrl.html_report.collect import Found, gather
-from dmrl.html_report.report_sections import page
-from dmrl.html_report.write_report import write
+from dmrl.html_report.collect import ReportInputs, collect_outputs
+from dmrl.html_report.report_sections import build_report
+from dmrl.html_report.write_report import write_html_report
 
-__all__ = ["Found", "gather", "page", "write"]
+__all__ = ["ReportInputs", "build_report", "collect_outputs", "write_html_report"]

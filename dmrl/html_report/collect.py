@@ -9,18 +9,18 @@ from typing import Any
 import pyarrow as pa
 
 from dmrl import recipe as recipes
-from dmrl.catalogue import NAME as CATALOGUE
+from dmrl.catalogue import FILE_NAME as CATALOGUE
 from dmrl.catalogue import open_catalogue
 from dmrl.datasets import is_dataset
 from dmrl.errors import DmrlError, SettingError
 from dmrl.evaluation import figure_specs as story
-from dmrl.evaluation.figure_specs import Shown
+from dmrl.evaluation.figure_specs import FigureSpec
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_pipes
-from dmrl.recording import Provenance, Summary, summary
-from dmrl.recording.provenance_inputs import provenance_of
+from dmrl.recording import Provenance, Summary, read_summary
+from dmrl.recording.provenance_inputs import read_provenance
 
-DOCUMENTS = {
+DOCUMENT_KINDS = {
     "evaluation.json": "evaluations",
     "positions.json": "positions",
     "tracks.json": "tracks",
@@ -28,17 +28,17 @@ DOCUMENTS = {
     "model.json": "models",
 }
 """Files that identify an output folder, and its kind in a report."""
-MOST_FILES, MOST_BYTES, DEEPEST = 20_000, 16 << 20, 6
+MAX_FILES, MAX_DOCUMENT_BYTES, MAX_FOLDER_DEPTH = 20_000, 16 << 20, 6
 """Limits of a search: files of a folder, bytes of a document, levels of folders."""
-MANY = 100
+MAX_OPENED_RECORDINGS = 100
 """Largest number of recordings in a catalogue that are opened one by one."""
-RECIPE = "recipe.toml"
+RECIPE_FILE = "recipe.toml"
 """The recipe that `dmrl.pipeline` leaves beside its outputs."""
-PICTURE_KINDS = (".png", ".jpg", ".jpeg", ".webp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class ReportInputs:
     """Contents of a folder, by path relative to it.
 
     Parameters
@@ -73,15 +73,15 @@ class Found:
     catalogues: dict[str, pa.Table] = field(default_factory=dict)
     made: dict[str, Provenance] = field(default_factory=dict)
     unread: dict[str, str] = field(default_factory=dict)
-    story: list[Shown] = field(default_factory=list)
+    story: list[FigureSpec] = field(default_factory=list)
     title: str = "The recipe's figures"
 
-    def of(self, kind: str) -> dict[str, Mapping[str, Any]]:
+    def documents_of_kind(self, kind: str) -> dict[str, Mapping[str, Any]]:
         """Return the documents of one kind."""
         return self.documents.get(kind, {})
 
 
-def gather(folder: Path) -> Found:
+def collect_outputs(folder: Path) -> ReportInputs:
     """Collect the contents of a folder for its report; links are not followed.
 
     Raises
@@ -94,17 +94,17 @@ def gather(folder: Path) -> Found:
             f"{folder} is not a folder. Name one with recordings, models, evaluations"
         )
     refuse_pipes(folder)
-    found = _told(folder)
-    files = list(_files(folder))
+    found = _iter_licences(folder)
+    files = list(_iter_files(folder))
     together: set[Path] = set()
     for path in sorted(files, key=lambda path: path.name != CATALOGUE):
         try:
             if path.name == CATALOGUE:
-                together |= _listed(found, path)
+                together |= _collect_catalogue(found, path)
             elif path not in together:
-                _take(found, path)
+                _collect_file(found, path)
         except (DmrlError, ValueError, OSError) as e:
-            found.unread[_name(found, path)] = str(e)
+            found.unread[_relative_name(found, path)] = str(e)
     if not (found.recordings or found.datasets or found.documents or found.catalogues):
         raise SettingError(
             f"{folder} contains no recording, dataset, model or evaluation. Try: dmrl demo"
@@ -112,78 +112,78 @@ def gather(folder: Path) -> Found:
     return found
 
 
-def _told(folder: Path) -> Found:
+def _iter_licences(folder: Path) -> ReportInputs:
     """Read the figures that the folder's recipe defines."""
-    recipe = folder / RECIPE
+    recipe = folder / RECIPE_FILE
     if not recipe.is_file() or recipe.is_symlink():
-        return Found(folder)
+        return ReportInputs(folder)
     try:
         keys = recipes.read(recipe)
-        title = str(keys.get(story.TITLE, Found.__dataclass_fields__["title"].default))
-        return Found(folder, story=story.told(recipe, keys), title=title)
+        title = str(keys.get(story.TITLE_KEY, ReportInputs.__dataclass_fields__["title"].default))
+        return ReportInputs(folder, story=story.read_figures(recipe, keys), title=title)
     except DmrlError as e:
-        return Found(folder, unread={RECIPE: str(e)})
+        return ReportInputs(folder, unread={RECIPE_FILE: str(e)})
 
 
-def _files(folder: Path) -> Iterator[Path]:
+def _iter_files(folder: Path) -> Iterator[Path]:
     """Yield the finished files below a folder, by name."""
     seen = 0
     for place, below, names in os.walk(folder):
         inside = Path(place)
-        if len(inside.relative_to(folder).parts) >= DEEPEST:
+        if len(inside.relative_to(folder).parts) >= MAX_FOLDER_DEPTH:
             below.clear()
         below[:] = sorted(n for n in below if not n.endswith(".partial") and n != "unfinished")
         for name in sorted(names):
             seen += 1
             path = inside / name
-            if seen <= MOST_FILES and not path.is_symlink() and path.is_file():
+            if seen <= MAX_FILES and not path.is_symlink() and path.is_file():
                 yield path
 
 
-def _take(found: Found, path: Path) -> None:
+def _collect_file(found: ReportInputs, path: Path) -> None:
     if path.suffix == ".mcap":
-        held = summary(path)
-        name = _name(found, path)
+        held = read_summary(path)
+        name = _relative_name(found, path)
         found.recordings[name] = held
         if held.provenance is not None:
             found.made[name] = held.provenance
-    elif path.name in DOCUMENTS:
-        name = _name(found, path.parent)
-        found.documents.setdefault(DOCUMENTS[path.name], {})[name] = _document(path)
-        _remember(found, path.parent)
+    elif path.name in DOCUMENT_KINDS:
+        name = _relative_name(found, path.parent)
+        found.documents.setdefault(DOCUMENT_KINDS[path.name], {})[name] = _read_document(path)
+        _store_provenance(found, path.parent)
     elif path.name == "dataset_dict.json" or path.suffix == ".parquet":
         # DATASET/dataset_dict.json, DATASET/data/SPLIT-00000.parquet
         root = path.parent.parent if path.suffix == ".parquet" else path.parent
         if is_dataset(root):
-            found.datasets[_name(found, root)] = root
-            _remember(found, root)
-    elif path.suffix.lower() in PICTURE_KINDS and path.parent == found.folder:
+            found.datasets[_relative_name(found, root)] = root
+            _store_provenance(found, root)
+    elif path.suffix.lower() in IMAGE_SUFFIXES and path.parent == found.folder:
         found.pictures.append(path)
 
 
-def _listed(found: Found, path: Path) -> set[Path]:
+def _collect_catalogue(found: ReportInputs, path: Path) -> set[Path]:
     """Store a catalogue, and return its recordings if they are too many to open."""
     table = open_catalogue(path.parent).table
-    found.catalogues[_name(found, path)] = table
-    names = table["recording"].to_pylist() if table.num_rows > MANY else []
+    found.catalogues[_relative_name(found, path)] = table
+    names = table["recording"].to_pylist() if table.num_rows > MAX_OPENED_RECORDINGS else []
     return {path.parent / name for name in names}
 
 
-def _remember(found: Found, output: Path) -> None:
+def _store_provenance(found: ReportInputs, output: Path) -> None:
     """Store the provenance of an output folder."""
-    made = provenance_of(output)
+    made = read_provenance(output)
     if made is not None:
-        found.made[_name(found, output)] = made
+        found.made[_relative_name(found, output)] = made
 
 
-def _document(path: Path) -> Mapping[str, Any]:
-    if path.stat().st_size > MOST_BYTES:
-        raise ValueError(f"{path.name} is larger than {MOST_BYTES >> 20} MB")
+def _read_document(path: Path) -> Mapping[str, Any]:
+    if path.stat().st_size > MAX_DOCUMENT_BYTES:
+        raise ValueError(f"{path.name} is larger than {MAX_DOCUMENT_BYTES >> 20} MB")
     document = parse_json(path.read_text(encoding="utf-8"))
     if not isinstance(document, dict):
         raise ValueError(f"{path.name} is not a table")
     return document
 
 
-def _name(found: Found, path: Path) -> str:
+def _relative_name(found: ReportInputs, path: Path) -> str:
     return path.relative_to(found.folder).as_posix() if path != found.folder else path.name

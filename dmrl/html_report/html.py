@@ -7,20 +7,20 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from dmrl.errors import DmrlError, one_line
+from dmrl.errors import DmrlError, to_one_line
 from dmrl.guards import limits
 from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
 
-MARK = "<!-- written by dmrl report -->"
+REPORT_MARK = "<!-- written by dmrl report -->"
 """Comment in every report: a file with it may be replaced."""
-MOST_BYTES = 9_000_000
+MAX_PAGE_BYTES = 9_000_000
 """Size of a page with its images, at most."""
-WRONG = (
+INVALID_DATA_ERRORS = (
     *(DmrlError, OSError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError),
     StopIteration,
 )
 """Errors that an invalid document or recording of another program may raise."""
-PLAIN_BYTES, WIDEST_PX = 250_000, 1400
+MAX_PLAIN_PNG_BYTES, MAX_IMAGE_WIDTH_PX = 250_000, 1400
 STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --paper: #ffffff; --line: #d0d7de;
   --soft: #57606a; --card: #f6f8fa; --link: #0969da }
@@ -43,19 +43,19 @@ figure img { max-width: 100%; height: auto; background: #fff; border-radius: 4px
 code { background: var(--card); padding: .1rem .3rem; border-radius: 4px; font-size: .85rem;
   overflow-wrap: anywhere }
 """
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+CONTENT_SECURITY_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
-def text(value: object) -> str:
+def to_html_text(value: object) -> str:
     """Convert any value to HTML text: one line, no markup."""
     if value is None:
         return ""
-    return escape(f"{value:.4g}" if isinstance(value, float) else one_line(str(value)))
+    return escape(f"{value:.4g}" if isinstance(value, float) else to_one_line(str(value)))
 
 
-def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+def build_table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """Build a table; columns of numbers, or of texts that begin with one, are right-aligned."""
-    body = [[text(cell) for cell in row] for row in rows]
+    body = [[to_html_text(cell) for cell in row] for row in rows]
     number = [
         bool(body) and all(row[k][:1].lstrip("-").isdigit() or not row[k] for row in body)
         for k in range(len(columns))
@@ -66,29 +66,29 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
         parts = (f'<{tag} class="{k}">{c}</{tag}>' for c, k in zip(cells, kind, strict=True))
         return f"<tr>{''.join(parts)}</tr>"
 
-    head = line("th", [text(column) for column in columns])
+    head = line("th", [to_html_text(column) for column in columns])
     return (
         f'<div class="wide"><table>{head}{"".join(line("td", row) for row in body)}</table></div>'
     )
 
 
-def chart(svg: str, caption: str, *, least_rem: int = 0) -> str:
+def build_chart(svg: str, caption: str, *, least_rem: int = 0) -> str:
     """Build a figure from SVG with a caption; ``least_rem`` wide at least, else it scrolls."""
-    words = f"<figcaption>{text(caption)}</figcaption>"
+    words = f"<figcaption>{to_html_text(caption)}</figcaption>"
     if not least_rem:
         return f"<figure>{svg}{words}</figure>"
     wide = f'<div class="wide"><div style="min-width: {least_rem}rem">{svg}</div></div>'
     return f'<figure class="full">{wide}{words}</figure>'
 
 
-def row(figures: Iterable[str]) -> str:
+def build_row(figures: Iterable[str]) -> str:
     """Place figures beside each other, as far as the page is wide enough. Empty without figures."""
     inside = "".join(figures)
     return f'<div class="row">{inside}</div>' if inside else ""
 
 
 @dataclass(slots=True)
-class Pictures:
+class ImageEmbedder:
     """Embed images in a page until it is full.
 
     Parameters
@@ -97,38 +97,38 @@ class Pictures:
         Bytes of the page that are left.
     """
 
-    room: int = MOST_BYTES
+    room: int = MAX_PAGE_BYTES
 
-    def figure(self, path: Path, caption: str, *, full: bool = False) -> str:
+    def build_figure(self, path: Path, caption: str, *, full: bool = False) -> str:
         """Build a figure with an embedded image and a caption; large images are scaled down."""
         try:
-            data, kind = _small(path)
+            data, kind = _read_scaled(path)
         except (DmrlError, OSError) as e:
-            return f"<p>{text(path.name)}: {text(e)}</p>"
+            return f"<p>{to_html_text(path.name)}: {to_html_text(e)}</p>"
         words = b64encode(data).decode()
         if len(words) > self.room:
-            return f"<p>{text(path.name)}: no room left in this page. Open the file instead</p>"
+            return f"<p>{to_html_text(path.name)}: no room left in this page. Open the file instead</p>"
         self.room -= len(words)
         where = f"data:image/{kind};base64,{words}"
-        image = f'<img src="{where}" alt="{text(caption)}" loading="lazy">'
+        image = f'<img src="{where}" alt="{to_html_text(caption)}" loading="lazy">'
         chosen = ' class="full"' if full else ""
-        return f"<figure{chosen}>{image}<figcaption>{text(caption)}</figcaption></figure>"
+        return f"<figure{chosen}>{image}<figcaption>{to_html_text(caption)}</figcaption></figure>"
 
 
-def _small(path: Path) -> tuple[bytes, str]:
+def _read_scaled(path: Path) -> tuple[bytes, str]:
     """Return an image's bytes and format; large images become JPEG."""
     data = path.read_bytes()
-    if len(data) <= PLAIN_BYTES and data.startswith(b"\x89PNG"):
+    if len(data) <= MAX_PLAIN_PNG_BYTES and data.startswith(b"\x89PNG"):
         return data, "png"
     rgb = decode(data, path, limits.PIXELS)
     height, width = rgb.shape[:2]
-    if width > WIDEST_PX:
-        to = (WIDEST_PX, max(1, round(height * WIDEST_PX / width)))
+    if width > MAX_IMAGE_WIDTH_PX:
+        to = (MAX_IMAGE_WIDTH_PX, max(1, round(height * MAX_IMAGE_WIDTH_PX / width)))
         rgb = crop_and_scale(rgb, (0, 0, width, height), *to)
     return encode_jpeg(rgb, 85), "jpeg"
 
 
-def html(title: str, lead: str, sections: Sequence[tuple[str, str]]) -> str:
+def build_page(title: str, lead: str, sections: Sequence[tuple[str, str]]) -> str:
     """Build the page.
 
     Parameters
@@ -141,16 +141,18 @@ def html(title: str, lead: str, sections: Sequence[tuple[str, str]]) -> str:
         (heading, HTML); sections without content are left out.
     """
     shown = [(words, body) for words, body in sections if body]
-    links = "".join(f'<a href="#s{k}">{text(words)}</a>' for k, (words, _) in enumerate(shown))
+    links = "".join(
+        f'<a href="#s{k}">{to_html_text(words)}</a>' for k, (words, _) in enumerate(shown)
+    )
     parts = "".join(
-        f'<section id="s{k}"><h2>{text(words)}</h2>{body}</section>'
+        f'<section id="s{k}"><h2>{to_html_text(words)}</h2>{body}</section>'
         for k, (words, body) in enumerate(shown)
     )
     return (
-        f'<!doctype html>\n{MARK}\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        f'<!doctype html>\n{REPORT_MARK}\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{CONTENT_SECURITY_POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{text(title)}</title><style>{STYLE}</style></head><body>"
-        f'<h1>{text(title)}</h1><p class="big">{text(lead)}</p><nav>{links}</nav>{parts}'
+        f"<title>{to_html_text(title)}</title><style>{STYLE}</style></head><body>"
+        f'<h1>{to_html_text(title)}</h1><p class="big">{to_html_text(lead)}</p><nav>{links}</nav>{parts}'
         "</body></html>\n"
     )

@@ -9,53 +9,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import plots, topics
-from dmrl.evaluation.figure_specs import Number, Shown, value_at
+from dmrl.evaluation.figure_specs import FigureSpec, ReportedValue, find_value
 from dmrl.guards.bounded_parsing import parse_json
-from dmrl.html_report.collect import MOST_BYTES, Found
-from dmrl.html_report.html import WRONG, Pictures, chart, row, table, text
+from dmrl.html_report.collect import MAX_DOCUMENT_BYTES, ReportInputs
+from dmrl.html_report.html import (
+    INVALID_DATA_ERRORS,
+    ImageEmbedder,
+    build_chart,
+    build_row,
+    build_table,
+    to_html_text,
+)
 from dmrl.images.codec import decode
 from dmrl.plots import charts
-from dmrl.recording import Contents, read, summary
+from dmrl.recording import LoadedRecording, read, read_summary
 
-PICTURE = {"images": "circles.png", "errors": "error-violins.png"}
-LOSSES = {"confidence_loss": "confidence loss", "depth_loss": "depth loss"}
-MOST_MAPS = 3
+IMAGE_FILES = {"images": "circles.png", "errors": "error-violins.png"}
+LOSS_LABELS = {"confidence_loss": "confidence loss", "depth_loss": "depth loss"}
+MAX_MAPS = 3
 """Images of a figure of maps, at most."""
 
 
-def story(found: Found, pictures: Pictures) -> str:
+def build_recipe_figures(found: ReportInputs, pictures: ImageEmbedder) -> str:
     """Build the HTML of a recipe's figures, in its order; a figure that fails shows its error."""
     parts = []
     for shown in found.story:
         try:
-            body = DRAWN[shown.shows](found, shown, pictures)
-        except WRONG as e:
-            body = f"<p>cannot be drawn: {text(str(e) or repr(e))}</p>"
-        words = f"<p>{text(shown.words)}</p>" if shown.words else ""
-        parts.append(f"<h3>{text(shown.title)}</h3>{words}{body}")
+            body = FIGURE_BUILDERS[shown.shows](found, shown, pictures)
+        except INVALID_DATA_ERRORS as e:
+            body = f"<p>cannot be drawn: {to_html_text(str(e) or repr(e))}</p>"
+        words = f"<p>{to_html_text(shown.words)}</p>" if shown.words else ""
+        parts.append(f"<h3>{to_html_text(shown.title)}</h3>{words}{body}")
     return "".join(parts)
 
 
-def _numbers(found: Found, shown: Shown, _: Pictures) -> str:
-    rows = [(one.what, one.published, _ours(found, one)) for one in shown.rows]
-    return table(("", "published", "here"), rows)
+def _build_numbers(found: ReportInputs, shown: FigureSpec, _: ImageEmbedder) -> str:
+    rows = [(one.what, one.published, _format_value(found, one)) for one in shown.rows]
+    return build_table(("", "published", "here"), rows)
 
 
-def _ours(found: Found, number: Number) -> str:
-    value = value_at(_document(found, number.of), number.at)
+def _format_value(found: ReportInputs, number: ReportedValue) -> str:
+    value = find_value(_read_document(found, number.of), number.at)
     if value is None or isinstance(value, str):
         return value or "-"
     return format(value, number.form)
 
 
-def _document(found: Found, name: str) -> Any:
-    path = _inside(found, name)
-    if path.stat().st_size > MOST_BYTES:
-        raise ValueError(f"{name} is larger than {MOST_BYTES >> 20} MB")
+def _read_document(found: ReportInputs, name: str) -> Any:
+    path = _resolve_output(found, name)
+    if path.stat().st_size > MAX_DOCUMENT_BYTES:
+        raise ValueError(f"{name} is larger than {MAX_DOCUMENT_BYTES >> 20} MB")
     return parse_json(path.read_text(encoding="utf-8"))
 
 
-def _inside(found: Found, name: str) -> Path:
+def _resolve_output(found: ReportInputs, name: str) -> Path:
     """Return the path of an output; reject paths outside the folder, and pipes, which never end."""
     path = found.folder / name
     if not path.resolve().is_relative_to(found.folder.resolve()):
@@ -65,38 +72,42 @@ def _inside(found: Found, name: str) -> Path:
     return path
 
 
-def _losses(found: Found, shown: Shown, _: Pictures) -> str:
+def _build_losses(found: ReportInputs, shown: FigureSpec, _: ImageEmbedder) -> str:
     drawn = []
-    for key, words in LOSSES.items():
+    for key, words in LOSS_LABELS.items():
         curves = {}
         for k, name in enumerate(shown.of):
-            history = _document(found, f"{name}/model.json")["training"]["history"]
-            curves[shown.label(k)] = [float(epoch[key]) for epoch in history]
-        drawn.append(chart(charts.losses(curves, words), f"{words} over the epochs"))
-    return row(drawn)
+            history = _read_document(found, f"{name}/model.json")["training"]["history"]
+            curves[shown.output_label(k)] = [float(epoch[key]) for epoch in history]
+        drawn.append(build_chart(charts.plot_losses(curves, words), f"{words} over the epochs"))
+    return build_row(drawn)
 
 
-def _pictured(found: Found, shown: Shown, pictures: Pictures) -> str:
+def _build_images(found: ReportInputs, shown: FigureSpec, pictures: ImageEmbedder) -> str:
     full = shown.shows == "images"
-    return row(
-        pictures.figure(_inside(found, f"{name}/{PICTURE[shown.shows]}"), shown.label(k), full=full)
+    return build_row(
+        pictures.build_figure(
+            _resolve_output(found, f"{name}/{IMAGE_FILES[shown.shows]}"),
+            shown.output_label(k),
+            full=full,
+        )
         for k, name in enumerate(shown.of)
     )
 
 
-def _maps(found: Found, shown: Shown, pictures: Pictures) -> str:
-    every = {shown.label(k): _inside(found, name) for k, name in enumerate(shown.of)}
+def _build_maps(found: ReportInputs, shown: FigureSpec, pictures: ImageEmbedder) -> str:
+    every = {shown.output_label(k): _resolve_output(found, name) for k, name in enumerate(shown.of)}
     names = {who: path for who, path in every.items() if path.exists()}  # some are optional
-    drawn = _rows_of_maps(names)
+    drawn = _read_map_pairs(names)
     if not drawn:
         raise ValueError(f"{', '.join(shown.of)} have no maps of the same images")
     with tempfile.TemporaryDirectory() as place:
-        plots.map_pairs(drawn, Path(place) / "maps")
-        picture = pictures.figure(Path(place) / "maps.png", ", ".join(names), full=True)
-    return row([picture, _agreement(drawn)])
+        plots.plot_map_pairs(drawn, Path(place) / "maps")
+        picture = pictures.build_figure(Path(place) / "maps.png", ", ".join(names), full=True)
+    return build_row([picture, _compare_maps(drawn)])
 
 
-def _agreement(drawn: Sequence[plots.MapPair]) -> str:
+def _compare_maps(drawn: Sequence[plots.MapPair]) -> str:
     """Build a table that compares the maps with those of the first recording."""
     first, *others = drawn[0].maps
     rows = []
@@ -106,23 +117,26 @@ def _agreement(drawn: Sequence[plots.MapPair]) -> str:
             a, b = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
             like = f"{np.corrcoef(a, b)[0, 1]:.3f}" if np.ptp(a) and np.ptp(b) else "-"
             rows.append((who, words, like, f"{np.abs(a - b).mean():.4f}"))
-    return table((f"against {first}", "map", "correlation", "mean difference"), rows)
+    return build_table((f"against {first}", "map", "correlation", "mean difference"), rows)
 
 
-def _rows_of_maps(names: Mapping[str, Path]) -> list[plots.MapPair]:
+def _read_map_pairs(names: Mapping[str, Path]) -> list[plots.MapPair]:
     """Return a few images of which all recordings have maps."""
     first = next(iter(names.values()))
-    robot = next(iter(topics.robots(list(Contents(first, topics.GRID).topics), topics.GRID)), None)
+    robot = next(
+        iter(topics.list_robots(list(LoadedRecording(first, topics.GRID).topics), topics.GRID)),
+        None,
+    )
     if robot is None:
         return []
-    grids = {who: dict(_grids(path, robot)) for who, path in names.items()}
+    grids = {who: dict(_iter_grids(path, robot)) for who, path in names.items()}
     times = sorted(set.intersection(*(set(one) for one in grids.values())))
-    start_ns = summary(first).start_ns  # as in dmrl view --time
-    chosen = times[:: max(1, -(-len(times) // MOST_MAPS))]
+    start_ns = read_summary(first).start_ns  # as in dmrl view --time
+    chosen = times[:: max(1, -(-len(times) // MAX_MAPS))]
     return [
         plots.MapPair(
             f"{robot}, {(time_ns - start_ns) / 1e9:.2f} s",
-            _picture(first, robot, time_ns),
+            _read_image(first, robot, time_ns),
             {who: one[time_ns] for who, one in grids.items()},
         )
         for time_ns in chosen
@@ -132,8 +146,8 @@ def _rows_of_maps(names: Mapping[str, Path]) -> list[plots.MapPair]:
 Maps = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def _grids(path: Path, robot: str) -> Iterator[tuple[int, Maps]]:
-    for stamped in read(path, topics.grid(robot)):
+def _iter_grids(path: Path, robot: str) -> Iterator[tuple[int, Maps]]:
+    for stamped in read(path, topics.GRID(robot)):
         grid = stamped.message
         shape = (len(grid.channels), grid.rows, grid.cols)
         values = np.frombuffer(grid.data, "<f4").reshape(shape).astype(float)
@@ -141,16 +155,16 @@ def _grids(path: Path, robot: str) -> Iterator[tuple[int, Maps]]:
         yield stamped.time_ns, (named["confidence"], named["depth_m"])
 
 
-def _picture(path: Path, robot: str, time_ns: int) -> NDArray[np.uint8]:
-    topic = topics.camera_image(robot)
+def _read_image(path: Path, robot: str, time_ns: int) -> NDArray[np.uint8]:
+    topic = topics.CAMERA_IMAGE(robot)
     taken = next(read(path, topic, start_ns=time_ns, end_ns=time_ns + 1))
     return decode(taken.message.data, what=f"{path}: {topic} at {time_ns} ns")
 
 
-DRAWN = {
-    "numbers": _numbers,
-    "losses": _losses,
-    "images": _pictured,
-    "errors": _pictured,
-    "maps": _maps,
+FIGURE_BUILDERS = {
+    "numbers": _build_numbers,
+    "losses": _build_losses,
+    "images": _build_images,
+    "errors": _build_images,
+    "maps": _build_maps,
 }

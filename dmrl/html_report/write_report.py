@@ -3,16 +3,16 @@
 import os
 from pathlib import Path
 
-from dmrl.atomic_output import partial_file, rewritten_file
+from dmrl.atomic_output import atomic_file, replace_file
 from dmrl.errors import OutputError
-from dmrl.html_report.collect import gather
-from dmrl.html_report.html import MARK
-from dmrl.html_report.report_sections import page
+from dmrl.html_report.collect import collect_outputs
+from dmrl.html_report.html import REPORT_MARK
+from dmrl.html_report.report_sections import build_report
 
-NAME = "report.html"
+REPORT_FILE = "report.html"
 
 
-def write(folder: Path, out: Path | None = None) -> Path:
+def write_html_report(folder: Path, out: Path | None = None) -> Path:
     """Write the report of a folder; an existing report is replaced.
 
     Parameters
@@ -31,13 +31,13 @@ def write(folder: Path, out: Path | None = None) -> Path:
     OutputError
         If another file has that name, or the report cannot be written.
     """
-    path = folder / NAME if out is None else out
+    path = folder / REPORT_FILE if out is None else out
     if path.suffix != ".html":
         raise OutputError(f"{path}: a report is HTML. Name it {path.stem or 'page'}.html")
     again = path.is_file() and not path.is_symlink()
-    if again and not path.read_bytes()[:200].decode(errors="replace").count(MARK):
+    if again and not path.read_bytes()[:200].decode(errors="replace").count(REPORT_MARK):
         raise OutputError(f"{path} exists and is not a report of dmrl. Choose another name")
-    text = page(gather(Path(os.fspath(folder))))  # a bucket's local copy
-    with rewritten_file(path) if again else partial_file(path) as unfinished:
+    text = build_report(collect_outputs(Path(os.fspath(folder))))  # a bucket's local copy
+    with replace_file(path) if again else atomic_file(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
     return path

@@ -28,7 +28,7 @@ def load_opencv(extra: str = "bayer", what: str = "a raw picture") -> ModuleType
     return cv2
 
 
-def rgb_of(raw: Grey) -> Rgb:
+def demosaic(raw: Grey) -> Rgb:
     """Convert a raw RGGB image to RGB, bilinearly, as OpenCV does.
 
     The AI-deck's sensor is RGGB: red at the first pixel, blue one down and one to the right. The
@@ -53,7 +53,7 @@ def rgb_of(raw: Grey) -> Rgb:
     return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2RGB), np.uint8)
 
 
-def mosaic(rgb: Rgb) -> Grey:
+def to_bayer(rgb: Rgb) -> Grey:
     """Convert RGB to a raw (H, W) uint8 RGGB image with one colour per pixel."""
     raw = rgb[..., 1].copy()
     raw[::2, ::2] = rgb[::2, ::2, 0]

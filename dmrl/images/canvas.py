@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 
 from dmrl.geometry.frames import Array
 
-Picture = NDArray[np.float32]
+FloatImage = NDArray[np.float32]
 Levels = NDArray[np.uint8]
 Colour = Array
 """(3,) red, green, blue."""
@@ -22,7 +22,7 @@ LEVELS = 255
 BAND_ROWS = 56
 
 
-def bands(rows: int) -> Iterator[slice]:
+def iter_bands(rows: int) -> Iterator[slice]:
     """Iterate over bands of an image's rows whose arrays fit in a processor's cache."""
     return (slice(k, min(k + BAND_ROWS, rows)) for k in range(0, rows, BAND_ROWS))
 
@@ -73,7 +73,7 @@ class Canvas:
         images = [self._rgb] if self._cover is None else [self._rgb, self._cover]
         self._over = [(ImageDraw.Draw(one), ImageDraw.Draw(one, "RGBA")) for one in images]
 
-    def fill(self, corners_px: Array, colour: Colour, opacity: float = 1.0) -> None:
+    def fill_polygon(self, corners_px: Array, colour: Colour, opacity: float = 1.0) -> None:
         """Draw a polygon over the existing content.
 
         Parameters
@@ -88,9 +88,11 @@ class Canvas:
         corners = ((corners_px - (self.left_px, self.top_px)) * self._fineness).ravel().tolist()
         scale = LEVELS / self._brightest
         levels = [min(max(round(value * scale), 0), LEVELS) for value in colour.tolist()]
-        self.draw((corners, (*levels, round(opacity * LEVELS))))
+        self.draw_outline((corners, (*levels, round(opacity * LEVELS))))
 
-    def outlines(self, corners_px: Array, colours: Array, opacity: float | Array) -> list[Outline]:
+    def make_outlines(
+        self, corners_px: Array, colours: Array, opacity: float | Array
+    ) -> list[Outline]:
         """Prepare polygons with equal numbers of corners for `draw_outline`.
 
         Parameters
@@ -110,7 +112,7 @@ class Canvas:
         corners = fine.reshape(len(fine), 2 * fine.shape[1]).tolist()
         return list(zip(corners, map(tuple, whole), strict=True))
 
-    def draw(self, outline: Outline) -> None:
+    def draw_outline(self, outline: Outline) -> None:
         """Draw one of `make_outlines` over the existing content."""
         corners, ink = outline
         whole = ink[3] == LEVELS
@@ -130,15 +132,15 @@ class Canvas:
             slice(self.left_px, self.left_px + self.width_px),
         )
 
-    def levels(self) -> Levels:
+    def to_levels(self) -> Levels:
         """Return (H, W, 3) colours, 255 at maximum. Without a background they are premultiplied."""
         return np.asarray(self._rgb.reduce(self._fineness))
 
-    def rgb(self) -> Picture:
+    def to_rgb(self) -> FloatImage:
         """Return `to_levels` as (H, W, 3) colours."""
-        return self.levels() * np.float32(self._brightest / LEVELS)
+        return self.to_levels() * np.float32(self._brightest / LEVELS)
 
-    def opacity(self) -> Picture:
+    def to_opacity(self) -> FloatImage:
         """Return the (H, W, 1) opacity, 0 to 1.
 
         Raises

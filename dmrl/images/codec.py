@@ -22,14 +22,14 @@ Grey = NDArray[np.uint8]
 
 FORMATS = ("PNG", "JPEG", "PPM", "BMP")
 # Exceptions that Pillow's decoders raise on broken images.
-BROKEN = (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError)
+DECODE_ERRORS = (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError)
 
 
 _spent = 0
 """Pixels of large images that this process decoded, in excess of their compressed size."""
 
 
-def _open(data: bytes, what: object) -> Image.Image:
+def _open_image(data: bytes, what: object) -> Image.Image:
     try:
         if data[:1] == b"P" and not _has_header(data):
             raise ValueError("a header without end")
@@ -38,8 +38,8 @@ def _open(data: bytes, what: object) -> Image.Image:
             warnings.simplefilter("ignore")
             return Image.open(BytesIO(data), formats=FORMATS)
     except Image.DecompressionBombError:
-        raise _too_many(what, limits.PIXELS) from None
-    except BROKEN:
+        raise _too_many_pixels(what, limits.PIXELS) from None
+    except DECODE_ERRORS:
         names = ", ".join(FORMATS)
         raise SourceError(f"{what} is not an image ({names}). Remove it or save it again") from None
 
@@ -50,18 +50,18 @@ def _has_header(data: bytes) -> bool:
     return len(words) >= (3 if data[:2] in (b"P1", b"P4") else 4)
 
 
-def _too_many(what: object, most: int) -> SourceError:
+def _too_many_pixels(what: object, most: int) -> SourceError:
     words = f"{most / 1e6:.0f} million pixels"
     return SourceError(f"{what} has more than {words}, or too many scans. Scale it down")
 
 
-def _decodable(image: Image.Image, data: bytes, what: object, most: int) -> None:
+def _check_decodable(image: Image.Image, data: bytes, what: object, most: int) -> None:
     """Raise SourceError if decoding exceeds the limits on time and memory."""
     pixels = image.width * image.height
     # Every scan of a progressive JPEG visits all pixels. FF DA starts a scan.
     scans = data.count(b"\xff\xda") if image.format == "JPEG" else 1
     if pixels > most or pixels * scans > limits.DECODED_PIXELS:
-        raise _too_many(what, most)
+        raise _too_many_pixels(what, most)
     if max(image.size) > limits.SIDE_PX:
         raise SourceError(f"{what} is {max(image.size)} px long. Cut it into pieces")
     global _spent
@@ -75,7 +75,7 @@ def _decodable(image: Image.Image, data: bytes, what: object, most: int) -> None
 
 
 @dataclass(frozen=True, slots=True)
-class Opened:
+class ImageHeader:
     """A PNG, JPEG, PPM or BMP whose header was read, but no pixel.
 
     Parameters
@@ -96,7 +96,7 @@ class Opened:
     def decode(self, most: int) -> Rgb:
         """Decode the pixels, once. The image may have at most ``most``: see `decode`."""
         with self._image as image:
-            _decodable(image, self._data, self._what, most)
+            _check_decodable(image, self._data, self._what, most)
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")
@@ -104,14 +104,14 @@ class Opened:
                         raise ValueError("its palette is missing")
                     # Converting an RGB image would copy it.
                     return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
-            except BROKEN as e:
+            except DECODE_ERRORS as e:
                 why = " ".join(str(e).split())
                 raise SourceError(
                     f"{self._what} cannot be decoded: {why}. Remove it or save it again"
                 ) from None
 
 
-def opened(data: bytes, what: object = "the image") -> Opened:
+def read_header(data: bytes, what: object = "the image") -> ImageHeader:
     """Read an image's header, with its size.
 
     Parameters
@@ -126,8 +126,8 @@ def opened(data: bytes, what: object = "the image") -> Opened:
     SourceError
         If the bytes do not start like such an image.
     """
-    image = _open(data, what)
-    return Opened(image.width, image.height, str(image.format).lower(), image, data, what)
+    image = _open_image(data, what)
+    return ImageHeader(image.width, image.height, str(image.format).lower(), image, data, what)
 
 
 def decode(data: bytes, what: object = "the image", most: int = limits.FRAME_PIXELS) -> Rgb:
@@ -152,10 +152,10 @@ def decode(data: bytes, what: object = "the image", most: int = limits.FRAME_PIX
     SourceError
         If the bytes are not such an image, are truncated, or exceed the limits.
     """
-    return opened(data, what).decode(most)
+    return read_header(data, what).decode(most)
 
 
-def size(data: bytes, what: object = "the image") -> tuple[int, int, str]:
+def read_size(data: bytes, what: object = "the image") -> tuple[int, int, str]:
     """Return width and height in pixels and format (png, jpeg, ppm, bmp), without decoding.
 
     Raises
@@ -163,7 +163,7 @@ def size(data: bytes, what: object = "the image") -> tuple[int, int, str]:
     SourceError
         If the bytes do not start like such an image.
     """
-    picture = opened(data, what)
+    picture = read_header(data, what)
     return picture.width_px, picture.height_px, picture.kind
 
 

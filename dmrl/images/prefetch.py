@@ -6,12 +6,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 Item = TypeVar("Item")
-Made = TypeVar("Made")
+Output = TypeVar("Output")
 
 
-def ahead(
-    function: Callable[[Item], Made], items: Iterable[Item], threads: int, *, held: int = 8
-) -> Iterator[Made]:
+def map_ahead(
+    function: Callable[[Item], Output], items: Iterable[Item], threads: int, *, max_waiting: int = 8
+) -> Iterator[Output]:
     """Yield ``function`` of every item, in their order, computed ahead in threads.
 
     Parameters
@@ -25,12 +25,12 @@ def ahead(
     max_waiting
         Results waiting per thread, at most. Bounds the memory.
     """
-    waiting: deque[Future[Made]] = deque()
+    waiting: deque[Future[Output]] = deque()
     pool = ThreadPoolExecutor(threads)
     try:
         for item in items:
             waiting.append(pool.submit(function, item))
-            if len(waiting) > threads * held:
+            if len(waiting) > threads * max_waiting:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()

@@ -8,18 +8,18 @@ from pathlib import Path
 
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats.base import Content, Options
-from dmrl.formats.registry import format_of
+from dmrl.formats.registry import find_format
 from dmrl.guards.paths import refuse_pipes
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import (
     LICENCES_METADATA,
     SPLIT_METADATA,
     RecordingWriter,
-    licence_beside,
-    licence_words,
-    provenance,
-    say_findings,
-    time_slices,
+    build_provenance,
+    extract_licence_title,
+    find_licence_file,
+    iter_time_slices,
+    print_findings,
 )
 from dmrl.terminal.progress import say, track
 
@@ -55,17 +55,17 @@ def record_source(
     SourceError
         If the source is not what its format says: names the file, and the line.
     """
-    content = format_of(source, kind).content(source, options)
+    content = find_format(source, kind).content(source, options)
     read = [path for path in files if path and path.is_file()]
-    licence = licence_beside(source)
+    licence = find_licence_file(source)
     if licence is not None and source.is_file():
         read.append(licence)
-    made = provenance("convert", settings, (source, *read), libraries=("pillow", "numpy"))
+    made = build_provenance("convert", settings, (source, *read), libraries=("pillow", "numpy"))
     with RecordingWriter(out, made) as sink:
         if licence is not None:
-            sink.add_metadata(LICENCES_METADATA, {source.name: licence_words(licence)})
+            sink.add_metadata(LICENCES_METADATA, {source.name: extract_licence_title(licence)})
         counts = write_content(content, sink)
-    say_findings(out)
+    print_findings(out)
     return counts
 
 
@@ -78,10 +78,10 @@ def write_content(content: Content, sink: RecordingWriter) -> dict[str, int]:
     single = content.others if content.series else content.samples
     samples = iter(track(single, "Converting", content.total))
     waiting = next(samples, None)
-    for first_ns, end_ns in time_slices([one.time_ns for one in content.series]):
+    for first_ns, end_ns in iter_time_slices([one.time_ns for one in content.series]):
         for series in content.series:
-            part = series.between(first_ns, end_ns)
-            sink.write_columns(part.topic, message(part.message), part.time_ns, part.fields)
+            part = series.crop_to_time(first_ns, end_ns)
+            sink.write_columns(part.topic, message_class(part.message), part.time_ns, part.fields)
             counts[part.topic] += len(part.time_ns)
         while waiting is not None and waiting.time_ns < end_ns:
             sink.write_sample(waiting)
@@ -107,7 +107,7 @@ def find_sources(source: Path, kind: str | None) -> dict[Path, Path]:
     found: dict[Path, Path] = {}
     for path in sorted(source.iterdir()) if source.is_dir() else [source]:
         try:
-            if path.name.startswith(".") or not format_of(path, kind):
+            if path.name.startswith(".") or not find_format(path, kind):
                 continue
         except SourceError as e:
             say(f"left out: {e}")

@@ -8,19 +8,19 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dmrl.atomic_output import partial_of, refuse_existing
+from dmrl.atomic_output import refuse_existing, to_partial_path
 from dmrl.errors import OutputError, RecordingError
 from dmrl.images.bayer import load_opencv
 from dmrl.ingest.settings import RecordSettings
 from dmrl.live.camera_link import CameraClient
 from dmrl.live.cflib_session import load_cflib
-from dmrl.live.crazyflie_link import Link
-from dmrl.live.links import cameras_of, check, end_all, links_of, nothing_came
-from dmrl.live.queue import Feed, Health, Received
-from dmrl.live.receive_clocks import HostTime
-from dmrl.live.robot_options import Robot
-from dmrl.live.status_table import LiveTable
-from dmrl.recording import RecordingWriter, provenance
+from dmrl.live.crazyflie_link import CrazyflieLink
+from dmrl.live.links import build_cameras, build_links, check_robots, describe_no_data, stop_all
+from dmrl.live.queue import LinkStatus, ReceivedSample, SampleQueue
+from dmrl.live.receive_clocks import HostClock
+from dmrl.live.robot_options import RobotOptions
+from dmrl.live.status_table import StatusTable
+from dmrl.recording import RecordingWriter, build_provenance
 from dmrl.terminal.signals import set_on_signal
 
 FLUSH_S = 1.0
@@ -34,18 +34,18 @@ class Result:
     """Messages by topic, and the health of every link and camera."""
 
     messages: dict[str, int]
-    healths: list[Health]
+    healths: list[LinkStatus]
     cpu_share: float
     """Processor time per time of the clock; 1 is one core."""
 
 
 def record_session(
     out: Path,
-    robots: Sequence[Robot],
+    robots: Sequence[RobotOptions],
     settings: RecordSettings,
     *,
     ended: threading.Event | None = None,
-    show: Callable[[Received], None] | None = None,
+    show: Callable[[ReceivedSample], None] | None = None,
 ) -> Result:
     """Record until the time is over, or Ctrl-C.
 
@@ -78,13 +78,15 @@ def record_session(
     load_cflib()
     if settings.pixels == "colour" and any(robot.camera for robot in robots):
         load_opencv("record", "the colours of a camera")
-    check(robots)
-    feed, now = Feed(), HostTime()
-    links = links_of(robots, settings.peer, settings.rate_hz, feed, now)
-    clients = cameras_of(robots, links, (settings.pixels, settings.images), feed, now)
-    threads: list[Link | CameraClient] = [*links.values(), *clients]
-    table = LiveTable(list(links.values()), [client.health for client in clients])
-    made = provenance("record", _to_provenance(robots, settings), libraries=("cflib", "numpy"))
+    check_robots(robots)
+    feed, now = SampleQueue(), HostClock()
+    links = build_links(robots, settings.peer, settings.rate_hz, feed, now)
+    clients = build_cameras(robots, links, (settings.pixels, settings.images), feed, now)
+    threads: list[CrazyflieLink | CameraClient] = [*links.values(), *clients]
+    table = StatusTable(list(links.values()), [client.health for client in clients])
+    made = build_provenance(
+        "record", _to_provenance(robots, settings), libraries=("cflib", "numpy")
+    )
     began_s, used_s = time.monotonic(), time.process_time()
     # What was received stays even if this process fails: flights are not repeated.
     with RecordingWriter(out, made, keep_on_error=True) as sink:
@@ -92,14 +94,14 @@ def record_session(
         counts = _write_samples(sink, feed, table, threads, (settings.duration_s, ended), show)
     if not counts:
         out.unlink()
-        raise RecordingError(nothing_came(out, [*links.values()]))
+        raise RecordingError(describe_no_data(out, [*links.values()]))
     passed_s = max(time.monotonic() - began_s, 1e-9)
     healths = [thread.health for thread in threads]
     return Result(counts, healths, (time.process_time() - used_s) / passed_s)
 
 
 def _refuse_unfinished(out: Path) -> None:
-    unfinished = partial_of(out)
+    unfinished = to_partial_path(out)
     if unfinished.exists():
         raise OutputError(
             f"{unfinished} is of a session that was cut off. Bring it back with dmrl recover "
@@ -107,7 +109,7 @@ def _refuse_unfinished(out: Path) -> None:
         )
 
 
-def _to_provenance(robots: Sequence[Robot], settings: RecordSettings) -> "_Recorded":
+def _to_provenance(robots: Sequence[RobotOptions], settings: RecordSettings) -> "_Recorded":
     return _Recorded(
         tuple(r.name for r in robots),
         tuple(r.uri for r in robots),
@@ -134,11 +136,11 @@ class _Recorded:
 
 def _write_samples(
     sink: RecordingWriter,
-    feed: Feed,
-    table: LiveTable,
-    threads: Sequence[Link | CameraClient],
+    feed: SampleQueue,
+    table: StatusTable,
+    threads: Sequence[CrazyflieLink | CameraClient],
     until: tuple[float | None, threading.Event],
-    show: Callable[[Received], None] | None,
+    show: Callable[[ReceivedSample], None] | None,
 ) -> dict[str, int]:
     """Write samples until the end; return the number of messages by topic."""
     duration_s, ended = until
@@ -146,10 +148,10 @@ def _write_samples(
 
     def take(timeout_s: float) -> bool:
         """Write samples and print texts that have come; return whether there were any."""
-        taken = feed.take(timeout_s)
+        taken = feed.get_batch(timeout_s)
         for item in taken:
             if isinstance(item, str):
-                table.say(item)
+                table.print_message(item)
                 continue
             _write_sample(sink, item)
             counts[item.sample.topic] += 1
@@ -159,7 +161,7 @@ def _write_samples(
 
     with ExitStack() as running:
         running.enter_context(table)
-        running.callback(end_all, threads)
+        running.callback(stop_all, threads)
         for thread in threads:
             thread.start()
         running.enter_context(set_on_signal(ended))
@@ -169,7 +171,7 @@ def _write_samples(
     return dict(sorted(counts.items()))
 
 
-def _write_sample(sink: RecordingWriter, item: Received) -> None:
+def _write_sample(sink: RecordingWriter, item: ReceivedSample) -> None:
     """Write a sample at its own time, with the time of its arrival."""
     sink.write_sample(replace(item.sample, publish_ns=item.arrival_ns))
 
@@ -188,6 +190,6 @@ def _poll_until(
             each()
 
 
-def _flush_and_show(sink: RecordingWriter, table: LiveTable, counts: Mapping[str, int]) -> None:
+def _flush_and_show(sink: RecordingWriter, table: StatusTable, counts: Mapping[str, int]) -> None:
     sink.flush()
     table.update(sum(counts.values()))

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from dmrl.estimation.filters.ou_smoother import faded
-from dmrl.estimation.model.bearings import claim, polar_of
-from dmrl.estimation.model.pair import Pair, Sightings
+from dmrl.estimation.filters.ou_smoother import smooth_ornstein_uhlenbeck
+from dmrl.estimation.model.bearings import associate, to_bearing
+from dmrl.estimation.model.pair import BearingMeasurements, Pair
 from dmrl.geometry.frames import horizontal_from_pixels
 from dmrl.labelling.observer_log import ObserverLog
 from dmrl.labelling.peer_positions import PeerPositions
@@ -25,7 +25,7 @@ Names = tuple[str, str]
 
 def detections_to_bearings(
     observer: ObserverLog, start_ns: int, pixel_std_px: float, attitude_std_rad: float
-) -> Sightings:
+) -> BearingMeasurements:
     """Return an observer's detections as bearings and distances.
 
     Parameters
@@ -59,12 +59,14 @@ def detections_to_bearings(
     images, row, per_image = np.unique(image[good], return_inverse=True, return_counts=True)
     column = np.arange(len(row)) - (np.cumsum(per_image) - per_image)[row]
     out = np.full((2, len(images), max(per_image, default=0), 3), np.nan)
-    out[0, row, column], out[1, row, column] = polar_of(points_m[good]), std[good]
-    return Sightings(np.asarray((observer.time_ns[images] - start_ns) * 1e-9), out[0], out[1])
+    out[0, row, column], out[1, row, column] = to_bearing(points_m[good]), std[good]
+    return BearingMeasurements(
+        np.asarray((observer.time_ns[images] - start_ns) * 1e-9), out[0], out[1]
+    )
 
 
 def add_bearings(
-    pairs: Mapping[Names, Pair], bearings: Mapping[str, Sightings]
+    pairs: Mapping[Names, Pair], bearings: Mapping[str, BearingMeasurements]
 ) -> dict[Names, Pair]:
     """Return the pairs with the bearings of both robots' cameras.
 
@@ -76,13 +78,15 @@ def add_bearings(
         By robot.
     """
     return {
-        (one, other): replace(pair, own_sees=bearings.get(one), peer_sees=bearings.get(other))
+        (one, other): replace(
+            pair, own_bearings=bearings.get(one), peer_bearings=bearings.get(other)
+        )
         for (one, other), pair in pairs.items()
     }
 
 
 def correct_heights(
-    found: PeerPositions, start_ns: int, seen: Sightings
+    found: PeerPositions, start_ns: int, seen: BearingMeasurements
 ) -> tuple[PeerPositions, int]:
     """Correct the heights of OK positions by elevations; also return the number of used images.
 
@@ -105,15 +109,15 @@ def correct_heights(
     place = place[matched]
     if not len(place):
         return found, 0
-    shown = Sightings(seen.time_s[matched], seen.polar[matched], seen.std[matched])
+    shown = BearingMeasurements(seen.time_s[matched], seen.bearing[matched], seen.std[matched])
     here_m = found.xyz_m[good[place]]
-    best = claim(shown, here_m, found.covariance[good[place]])
-    images = np.flatnonzero(best.agrees)
+    best = associate(shown, here_m, found.covariance[good[place]])
+    images = np.flatnonzero(best.is_consistent)
     at = images, best.nearest[images], 1
     level_m = np.hypot(*here_m[images, :2].T)
-    off_m = (shown.polar[at] - polar_of(here_m[images])[:, 1]) * level_m
+    off_m = (shown.bearing[at] - to_bearing(here_m[images])[:, 1]) * level_m
     height_std_m = np.sqrt(found.covariance[good, 2, 2])
-    error_m, variance = faded(
+    error_m, variance = smooth_ornstein_uhlenbeck(
         time_s, height_std_m, HEIGHT_ERROR_DECAY_S, place[images], off_m, shown.std[at] * level_m
     )
     xyz, covariance = found.xyz_m.copy(), found.covariance.copy()

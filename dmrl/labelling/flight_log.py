@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.estimation.model.pair import Array
-from dmrl.images.codec import size
+from dmrl.images.codec import read_size
 from dmrl.labelling.peer_positions import PeerPositions
-from dmrl.recording import Contents, Stamped, TopicInfo
+from dmrl.recording import LoadedRecording, Stamped, TopicInfo
 from dmrl.recording.mcap.shared_file import share_file
 
 SENSOR_FIELDS = {
@@ -145,19 +145,19 @@ def read_flight(path: Path, *wanted: str, sizes_of: Collection[str] = ()) -> Fli
     """
     wanted = wanted or (*READERS, topics.CAMERA_IMAGE, topics.TRANSFORMS)
     with share_file(path):
-        held = Contents(path, *(p for p in wanted if p != topics.CAMERA_IMAGE))
+        held = LoadedRecording(path, *(p for p in wanted if p != topics.CAMERA_IMAGE))
         log = to_flight_log(held, *wanted)
         images = _find_topics(log.topics, topics.CAMERA_IMAGE)
         if topics.CAMERA_IMAGE in wanted:
-            log.images_ns.update({robot: held.times(topic) for robot, topic in images.items()})
+            log.images_ns.update({robot: held.get_times(topic) for robot, topic in images.items()})
         for robot in images.keys() & sizes_of:
             if (first := held.first(images[robot])) is not None:
                 name = f"{path}: the first image of {robot}"
-                log.image_size_px[robot] = size(first.message.data, name)[:2]
+                log.image_size_px[robot] = read_size(first.message.data, name)[:2]
     return log
 
 
-def to_flight_log(held: Contents, *wanted: str) -> FlightLog:
+def to_flight_log(held: LoadedRecording, *wanted: str) -> FlightLog:
     """Convert loaded topics of a recording to arrays.
 
     Parameters
@@ -175,7 +175,7 @@ def to_flight_log(held: Contents, *wanted: str) -> FlightLog:
                 if (made := convert(held, topic)) is not None:
                     getattr(log, name)[key] = made
     if topics.TRANSFORMS in wanted and topics.TRANSFORMS in held.topics:
-        log.transforms.extend(held.messages(topics.TRANSFORMS))
+        log.transforms.extend(held.iter_messages(topics.TRANSFORMS))
     return log
 
 
@@ -183,7 +183,7 @@ def _find_topics(held: Collection[str], pattern: str) -> dict[Any, str]:
     """Return the topics of a pattern by robot, or by observer and peer."""
     found = {}
     for topic in held:
-        if names := topics.names(pattern, topic):
+        if names := topics.parse_topic(pattern, topic):
             found[(names["robot"], names["peer"]) if "peer" in names else names["robot"]] = topic
     return found
 
@@ -193,27 +193,27 @@ def _to_samples(table: pa.Table, columns: list[Any]) -> Samples:
     return Samples(table["log_time"].to_numpy(), table["publish_time"].to_numpy(), values)
 
 
-def _sample_reader(pattern: str) -> Callable[[Contents, str], Samples]:
+def _sample_reader(pattern: str) -> Callable[[LoadedRecording, str], Samples]:
     """Return a function that reads the fields of a sensor's topic."""
     fields = SENSOR_FIELDS[pattern]
 
-    def read_samples(held: Contents, topic: str) -> Samples:
-        table = held.table(topic, fields)
+    def read_samples(held: LoadedRecording, topic: str) -> Samples:
+        table = held.get_table(topic, fields)
         return _to_samples(table, [table[name] for name in fields])
 
     return read_samples
 
 
-def _read_poses(held: Contents, topic: str) -> Samples:
-    table = held.table(topic, ("pose",))
+def _read_poses(held: LoadedRecording, topic: str) -> Samples:
+    table = held.get_table(topic, ("pose",))
     pose = pa.Table.from_struct_array(table["pose"])
     place, turn = (pa.Table.from_struct_array(pose[n]) for n in ("position", "orientation"))
     return _to_samples(table, [place[n] for n in "xyz"] + [turn[n] for n in "xyzw"])
 
 
-def _read_positions(held: Contents, topic: str) -> PeerPositions:
+def _read_positions(held: LoadedRecording, topic: str) -> PeerPositions:
     """Read PeerPosition messages; a covariance that is missing becomes NaN."""
-    table = held.table(topic, ("x", "y", "z", "covariance", "status"))
+    table = held.get_table(topic, ("x", "y", "z", "covariance", "status"))
     lists = table["covariance"]
     lengths = pc.list_value_length(lists).to_numpy()
     full = lengths == 9
@@ -228,8 +228,8 @@ def _read_positions(held: Contents, topic: str) -> PeerPositions:
     )
 
 
-def _read_detections(held: Contents, topic: str) -> DetectionTable:
-    table = held.table(topic).combine_chunks()
+def _read_detections(held: LoadedRecording, topic: str) -> DetectionTable:
+    table = held.get_table(topic).combine_chunks()
     lists = table["detections"].combine_chunks()
     if hasattr(lists, "chunks"):
         lists = lists.chunk(0)
@@ -245,16 +245,16 @@ def _read_detections(held: Contents, topic: str) -> DetectionTable:
     return DetectionTable(table["log_time"].to_numpy(), threshold, first, np.column_stack(rows))
 
 
-def _read_first(held: Contents, topic: str) -> Any:
-    first = next(held.messages(topic), None)
+def _read_first(held: LoadedRecording, topic: str) -> Any:
+    first = next(held.iter_messages(topic), None)
     return None if first is None else first.message
 
 
-def _read_messages(held: Contents, topic: str) -> list[Stamped]:
-    return list(held.messages(topic))
+def _read_messages(held: LoadedRecording, topic: str) -> list[Stamped]:
+    return list(held.iter_messages(topic))
 
 
-READERS: dict[str, tuple[str, Callable[[Contents, str], Any]]] = {
+READERS: dict[str, tuple[str, Callable[[LoadedRecording, str], Any]]] = {
     topics.ATTITUDE: ("attitude", _sample_reader(topics.ATTITUDE)),
     topics.VELOCITY: ("velocity", _sample_reader(topics.VELOCITY)),
     topics.HEIGHT: ("height", _sample_reader(topics.HEIGHT)),

@@ -10,9 +10,9 @@ from collections.abc import Iterable
 import numpy as np
 
 from dmrl import topics
-from dmrl.estimation.model.position_metrics import inside_truth
+from dmrl.estimation.model.position_metrics import is_covered_by_truth
 from dmrl.geometry.frames import Array
-from dmrl.geometry.rotations import euler_zyx
+from dmrl.geometry.rotations import quaternion_to_euler
 from dmrl.labelling.flight_log import FlightLog, RobotPair, Times
 
 QUATERNION_TOLERANCE = 0.1
@@ -28,8 +28,8 @@ def list_true_pairs(held: Iterable[str]) -> list[RobotPair]:
         Topics of a recording.
     """
     held = list(held)
-    recorded = {(n["robot"], n["peer"]) for t in held if (n := topics.names(topics.TRUTH, t))}
-    captured = topics.robots(held, topics.TRUE_POSE)
+    recorded = {(n["robot"], n["peer"]) for t in held if (n := topics.parse_topic(topics.TRUTH, t))}
+    captured = topics.list_robots(held, topics.TRUE_POSE)
     return sorted(recorded | {(one, peer) for one in captured for peer in captured if one != peer})
 
 
@@ -54,7 +54,7 @@ def find_true_path(flight: FlightLog, robot: str, peer: str) -> tuple[Times, Arr
     time_ns, place, yaw = _finite_poses(flight, robot)
     peer_ns, peer_place, _ = _finite_poses(flight, peer)
     # Lost markers leave no straight line.
-    known = inside_truth(time_ns, peer_ns)
+    known = is_covered_by_truth(time_ns, peer_ns)
     time_ns, place, yaw = time_ns[known], place[known], yaw[known]
     if not len(time_ns):
         return time_ns, place
@@ -70,5 +70,5 @@ def _finite_poses(flight: FlightLog, robot: str) -> tuple[Times, Array, Array]:
     place, turn = rows[:, :3], rows[:, 3:]
     length = np.linalg.norm(turn, axis=1)
     good = np.isfinite(place).all(axis=1) & (np.abs(length - 1) < QUATERNION_TOLERANCE)
-    yaw = euler_zyx(turn[good] / length[good, None])[:, 2]
+    yaw = quaternion_to_euler(turn[good] / length[good, None])[:, 2]
     return time_ns[good], place[good], yaw

@@ -8,7 +8,7 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError, SettingError
-from dmrl.estimation.model.pair import Sightings
+from dmrl.estimation.model.pair import BearingMeasurements
 from dmrl.labelling.camera_bearings import add_bearings, correct_heights, detections_to_bearings
 from dmrl.labelling.flight_log import (
     OBSERVER_TOPICS,
@@ -32,7 +32,7 @@ from dmrl.labelling.peer_positions import PeerPositions, sample_positions
 from dmrl.labelling.recorded_camera import recorded_camera
 from dmrl.labelling.sensor_file import SensorConstants, read_sensors
 from dmrl.labelling.sensor_logs import SensorLogs, build_sensor_logs
-from dmrl.recording import Provenance, Timed, rewrite
+from dmrl.recording import Provenance, TimedMessage, rewrite
 from dmrl.terminal.progress import say
 
 
@@ -53,7 +53,7 @@ class LabelledFlight:
     """
 
     positions: dict[RobotPair, PeerPositions]
-    labels: dict[str, list[Timed]]
+    labels: dict[str, list[TimedMessage]]
     reports: list[PairReport]
     warnings: list[str]
 
@@ -120,7 +120,7 @@ def require_pairs(
 
 def read_bearings(
     flight: FlightLog, logs: SensorLogs, options: CameraOptions, method: str, pixel_std_px: float
-) -> dict[str, Sightings]:
+) -> dict[str, BearingMeasurements]:
     """Return the bearings of the detections of all robots in pairs.
 
     Parameters
@@ -144,12 +144,12 @@ def read_bearings(
     if method != "batch":
         raise SettingError(f"--detections goes with --method batch, not {method}")
     if not flight.detections:
-        raise MissingTopic(topics.detections("*"), flight.topics, flight.path)
+        raise MissingTopic(topics.DETECTIONS("*"), flight.topics, flight.path)
     out = {}
     for robot in (robot for robot in sorted(flight.detections) if robot in logs.robots):
         camera = options.cameras.get(robot) or recorded_camera(flight, robot)
         if camera is None:
-            raise MissingTopic(topics.calibration(robot), flight.topics, flight.path)
+            raise MissingTopic(topics.CALIBRATION(robot), flight.topics, flight.path)
         if not options.distorted:
             camera = replace(camera, distortion=())
         observer = read_observer_log(flight, robot, camera, None)
@@ -161,7 +161,7 @@ def read_bearings(
 def label_flight(
     flight: FlightLog,
     logs: SensorLogs,
-    bearings: Mapping[str, Sightings],
+    bearings: Mapping[str, BearingMeasurements],
     options: CameraOptions,
     solver: PairSolver,
     workers: int,
@@ -210,10 +210,10 @@ def _warn_without_camera(
 ) -> list[str]:
     """Return a warning for each robot whose images get no labels, as its camera is unknown."""
     return [
-        f"{robot}: no {topics.calibration(robot)}; its images get no labels. Give one: "
+        f"{robot}: no {topics.CALIBRATION(robot)}; its images get no labels. Give one: "
         f"--camera.{robot} FILE"
         for robot in filming
-        if robot not in cameras and topics.calibration(robot) not in flight.topics
+        if robot not in cameras and topics.CALIBRATION(robot) not in flight.topics
     ]
 
 
@@ -237,8 +237,8 @@ def write_labelled(
     """
     series = [build_position_series(*pair, found) for pair, found in labelled.positions.items()]
     if copy:
-        replaced = [topics.labels(robot) for robot in labelled.labels]
-        replaced += [topic for topic in flight.topics if topics.names(topics.POSITION, topic)]
+        replaced = [topics.LABELS(robot) for robot in labelled.labels]
+        replaced += [topic for topic in flight.topics if topics.parse_topic(topics.POSITION, topic)]
         fresh = list(labelled.labels.values())
     else:
         replaced = list(flight.topics)

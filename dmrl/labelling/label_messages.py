@@ -20,9 +20,9 @@ from dmrl.labelling.image_labels import (
 from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.labelling.recorded_camera import recorded_camera
 from dmrl.labelling.sensor_logs import SensorLogs
-from dmrl.messages import message
-from dmrl.recording import Series, Stamped, Timed
-from dmrl.recording.label_sources import looked_at
+from dmrl.messages import message_class
+from dmrl.recording import Series, Stamped, TimedMessage
+from dmrl.recording.label_sources import get_message_sources
 
 
 def build_position_series(observer: str, peer: str, found: PeerPositions) -> Series:
@@ -36,8 +36,8 @@ def build_position_series(observer: str, peer: str, found: PeerPositions) -> Ser
         "covariance": found.covariance.reshape(-1, 9),
         "status": found.status,
     }
-    topic = topics.position(observer, peer)
-    return Series(topic, message("PeerPosition"), found.time_ns, fields)
+    topic = topics.POSITION(observer, peer)
+    return Series(topic, message_class("PeerPosition"), found.time_ns, fields)
 
 
 def build_label_messages(
@@ -46,7 +46,7 @@ def build_label_messages(
     robot: str,
     positions: Mapping[str, PeerPositions],
     options: CameraOptions,
-) -> Iterator[Timed]:
+) -> Iterator[TimedMessage]:
     """Yield PeerLabels of every image that has a position or had labels, in time order.
 
     If any peer is located in an image, every other robot that has a log gets a label too, as one
@@ -72,19 +72,21 @@ def build_label_messages(
     for time_ns in sorted({*kept, *fresh}):
         peers = [*kept.get(time_ns, []), *fresh.get(time_ns, [])]
         names = sorted(sources[time_ns] | ({SOURCE} if time_ns in fresh else set()))
-        made = message("PeerLabels")(peers=peers, sources=names)
-        yield Timed(time_ns, topics.labels(robot), made)
+        made = message_class("PeerLabels")(peers=peers, sources=names)
+        yield TimedMessage(time_ns, topics.LABELS(robot), made)
 
 
-def select_estimated(made: Iterable[Timed]) -> Iterator[Timed]:
+def select_estimated(made: Iterable[TimedMessage]) -> Iterator[TimedMessage]:
     """Yield PeerLabels without the labels of other sources."""
     for labels in made:
         if SOURCE in labels.message.sources:
             peers = [peer for peer in labels.message.peers if peer.source == SOURCE]
-            yield labels._replace(message=message("PeerLabels")(peers=peers, sources=[SOURCE]))
+            yield labels._replace(
+                message=message_class("PeerLabels")(peers=peers, sources=[SOURCE])
+            )
 
 
-def count_estimated(made: Iterable[Iterable[Timed]]) -> int:
+def count_estimated(made: Iterable[Iterable[TimedMessage]]) -> int:
     """Return the number of estimated labels, without those of other sources."""
     peers = (peer for messages in made for m in messages for peer in m.message.peers)
     return sum(peer.source == SOURCE for peer in peers)
@@ -115,7 +117,9 @@ def _label_peers(
             unknown[time_ns] -= {peer}
     for time_ns, peers in unknown.items():
         made[time_ns] += [label_anywhere(peer, camera, MIN_DEPTH_M) for peer in sorted(peers)]
-    return {t: [message("PeerLabel")(**label) for label in labels] for t, labels in made.items()}
+    return {
+        t: [message_class("PeerLabel")(**label) for label in labels] for t, labels in made.items()
+    }
 
 
 def _select_other_sources(
@@ -127,7 +131,7 @@ def _select_other_sources(
     for stamped in before:
         labels = stamped.message
         kept[stamped.time_ns] += [peer for peer in labels.peers if peer.source != SOURCE]
-        sources[stamped.time_ns] |= looked_at(labels) - {SOURCE}
+        sources[stamped.time_ns] |= get_message_sources(labels) - {SOURCE}
     return kept, sources
 
 

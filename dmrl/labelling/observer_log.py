@@ -6,7 +6,7 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
-from dmrl.estimation.tracking.tracker_input import Motion, View
+from dmrl.estimation.tracking.tracker_input import EgoMotion, ImageDetections
 from dmrl.geometry.frames import Array, Camera
 from dmrl.labelling.flight_log import FlightLog, Samples, Times
 
@@ -54,22 +54,24 @@ class ObserverLog:
     range_m: dict[str, Array]
     warnings: list[str]
 
-    def motion(self, k: int) -> Motion:
+    def motion(self, k: int) -> EgoMotion:
         """Return the observer's motion between images k - 1 and k."""
         if k == 0:
-            return Motion(0.0, np.zeros(3), 0.0)
+            return EgoMotion(0.0, np.zeros(3), 0.0)
         # R(-yaw) turns the way into the observer's frame at the image before.
         c, s = np.cos(self.yaw_rad[k - 1]), np.sin(self.yaw_rad[k - 1])
         x, y, z = self.path_m[k] - self.path_m[k - 1]
         shift_m = np.array([c * x + s * y, -s * x + c * y, z])
         dt_s = float(self.time_ns[k] - self.time_ns[k - 1]) * 1e-9
-        return Motion(dt_s, shift_m, float(self.yaw_rad[k] - self.yaw_rad[k - 1]))
+        return EgoMotion(dt_s, shift_m, float(self.yaw_rad[k] - self.yaw_rad[k - 1]))
 
-    def view(self, k: int) -> View:
+    def view(self, k: int) -> ImageDetections:
         """Return the detections of image k."""
         rows = self.detections[self.first_row[k] : self.first_row[k + 1]]
         roll_rad, pitch_rad = self.attitude_rad[k]
-        return View(rows[:, :2], rows[:, 2], float(roll_rad), float(pitch_rad), rows[:, 3])
+        return ImageDetections(
+            rows[:, :2], rows[:, 2], float(roll_rad), float(pitch_rad), rows[:, 3]
+        )
 
     def ranges(self, k: int) -> dict[str, float]:
         """Return the distances measured near image k by peer, metres."""
@@ -129,7 +131,7 @@ def select_detections(
         If the robot has no detections.
     """
     if robot not in flight.detections:
-        raise MissingTopic(topics.detections(robot), flight.topics, flight.path)
+        raise MissingTopic(topics.DETECTIONS(robot), flight.topics, flight.path)
     found = flight.detections[robot]
     image = np.repeat(np.arange(len(found.time_ns)), np.diff(found.first))
     least = found.threshold if threshold is None else np.full(len(found.time_ns), threshold)
@@ -146,7 +148,7 @@ def finite_attitude(flight: FlightLog, robot: str) -> tuple[Times, Array]:
     RecordingError
         If the robot has no attitude, or none that is finite.
     """
-    topic = topics.attitude(robot)
+    topic = topics.ATTITUDE(robot)
     if robot not in flight.attitude:
         raise MissingTopic(topic, flight.topics, flight.path)
     found = _finite(flight.attitude[robot])
@@ -176,7 +178,7 @@ def _dead_reckon(
     path_m = np.zeros((len(time_ns), 3))
     moving = _finite(flight.velocity.get(robot))
     if moving is None:
-        warnings.append(f"{topics.velocity(robot)}: not there; {robot} is taken to stand still")
+        warnings.append(f"{topics.VELOCITY(robot)}: not there; {robot} is taken to stand still")
     else:
         # Velocities are in the robot's own frame: each is turned by its heading before they add up.
         yaw_rad = np.interp(moving[0], *heading)
@@ -186,7 +188,7 @@ def _dead_reckon(
             path_m[:, axis] = np.interp(time_ns, moving[0], along[:, axis])
     high = _finite(flight.height.get(robot))
     if high is None:
-        warnings.append(f"{topics.height(robot)}: not there; {robot} is taken to keep its height")
+        warnings.append(f"{topics.HEIGHT(robot)}: not there; {robot} is taken to keep its height")
     else:
         path_m[:, 2] = np.interp(time_ns, high[0], high[1][:, 0])
     return path_m

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from dmrl.estimation.flight.data_association import told_apart
+from dmrl.estimation.flight.data_association import resolve_conflicts
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
 from dmrl.estimation.flight.swarm import estimate_swarm
 from dmrl.estimation.model.pair import Pair
@@ -52,7 +52,7 @@ class PairSolver:
 
 def orient_pair(pairs: Mapping[RobotPair, Pair], name: RobotPair) -> Pair:
     """Return a pair with the first robot of its name as the observer."""
-    return pairs[name] if name in pairs else pairs[name[::-1]].swapped()
+    return pairs[name] if name in pairs else pairs[name[::-1]].swap_robots()
 
 
 def estimate_all(
@@ -70,7 +70,7 @@ def estimate_all(
         Most processes, and the function that runs them.
     """
     estimates = _estimate(pairs, solver, workers, spread)
-    if again := told_apart(pairs, estimates):
+    if again := resolve_conflicts(pairs, estimates):
         estimates |= _estimate(again, solver, workers, spread)
     return dict(sorted(estimates.items()))
 

@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from dmrl.estimation.model.position_metrics import inside_truth
+from dmrl.estimation.model.position_metrics import is_covered_by_truth
 from dmrl.estimation.model.status import OK
-from dmrl.estimation.solver.estimate import Estimate, Refused
+from dmrl.estimation.solver.estimate import Estimate, RejectionReason
 from dmrl.estimation.solver.residuals import (
-    BIAS,
     CLOCK,
     OWN_GYRO,
     OWN_SCALE,
     PEER_GYRO,
     PEER_SCALE,
+    RANGE_BIAS,
 )
 from dmrl.labelling.flight_log import FlightLog
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
@@ -25,7 +25,7 @@ from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
 MAX_GYRO_BIAS_RADPS, MAX_RANGE_OFFSET_M, MAX_SCALE_ERROR, MAX_CLOCK_OFFSET_S = 0.02, 0.2, 0.12, 0.05
 """Solved constants beyond these cause a warning: several times those of sound sensors."""
 
-REFUSAL_TEXTS: dict[Refused, str] = {
+REFUSAL_TEXTS: dict[RejectionReason, str] = {
     "still": "{observer} hardly moves, and then ranges tell no bearing. Let it fly about",
     "alike": "they move alike, and then ranges tell no bearing. Let them fly different ways",
     "silent": "ranges or a sensor were silent for most of the flight. Try: dmrl info",
@@ -71,7 +71,7 @@ class PairReport:
     sigma_m: float
     rmse_ok_m: float | None
     rmse_m: float | None
-    refused: Refused | None
+    refused: RejectionReason | None
 
     @classmethod
     def columns(cls) -> tuple[str, ...]:
@@ -108,12 +108,12 @@ def report_pair(
         positions=len(ok),
         ok_share=float(ok.mean()),
         ambiguous_share=float((positions.status == STATUS_AMBIGUOUS).mean()),
-        range_bias_m=float(estimate.constants[BIAS]),
+        range_bias_m=float(estimate.constants[RANGE_BIAS]),
         gyro_difference_radps=float(estimate.constants[PEER_GYRO] - estimate.constants[OWN_GYRO]),
         sigma_m=float(np.median(sigma)),
         rmse_ok_m=_rms(error, ok),
         rmse_m=_rms(error, np.ones_like(ok)),
-        refused=estimate.refused,
+        refused=estimate.rejection_reason,
     )
 
 
@@ -160,7 +160,7 @@ def explain_refusal(pair: tuple[str, str], estimate: Estimate) -> str | None:
     if (estimate.status == OK).any():
         return None
     largest = np.linalg.eigvalsh(estimate.covariance[:, :2, :2])[:, -1]
-    why = REFUSAL_TEXTS[estimate.refused or "imprecise"]
+    why = REFUSAL_TEXTS[estimate.rejection_reason or "imprecise"]
     return why.format(observer=pair[0], sigma_m=float(np.sqrt(np.median(largest))))
 
 
@@ -189,9 +189,9 @@ def find_suspect_sensors(pair: tuple[str, str], estimate: Estimate) -> list[str]
                 f"{'large' if scale > 0 else 'small'}; it was solved for. Is its height right? "
                 "Where it is so in every flight: dmrl calibrate --sensors"
             )
-    if abs(found[BIAS]) > MAX_RANGE_OFFSET_M:
+    if abs(found[RANGE_BIAS]) > MAX_RANGE_OFFSET_M:
         said.append(
-            f"ranges seem {found[BIAS]:+.2f} m off; it was solved for. Measure it once, "
+            f"ranges seem {found[RANGE_BIAS]:+.2f} m off; it was solved for. Measure it once, "
             "and give it with --range-offset-m, or let flights tell: dmrl calibrate --sensors"
         )
     if abs(found[CLOCK]) > MAX_CLOCK_OFFSET_S:
@@ -217,4 +217,4 @@ def _horizontal_errors(flight: FlightLog, pair: tuple[str, str], positions: Peer
         np.interp(positions.time_ns, time_ns, true) - values
         for true, values in zip(true_m.T[:2], positions.xyz_m.T[:2], strict=True)
     ]
-    return np.where(inside_truth(positions.time_ns, time_ns), np.hypot(*offsets), np.nan)
+    return np.where(is_covered_by_truth(positions.time_ns, time_ns), np.hypot(*offsets), np.nan)

@@ -55,7 +55,7 @@ def sample_positions(
     regular = np.arange(-(-first // period_ns), last // period_ns + 1) * period_ns
     time_ns = np.union1d(regular, images_ns[(images_ns >= first) & (images_ns <= last)])
     time_s = (time_ns - start_ns) * 1e-9
-    xy, spread, status = estimate.at(np.asarray(time_s, float))
+    xy, spread, status = estimate.interpolate_at(np.asarray(time_s, float))
     z = np.interp(time_s, pair.time_s, pair.peer.height_m - pair.own.height_m)
     covariance = np.zeros((len(time_ns), 3, 3))
     covariance[:, :2, :2] = spread

@@ -8,15 +8,15 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import MissingTopic
-from dmrl.estimation.tracking.identity import Identity
+from dmrl.estimation.tracking.identity import TrackIdentity
 from dmrl.estimation.tracking.tracker import Track, Tracker
 from dmrl.estimation.tracking.tuning import Tuning
 from dmrl.geometry.frames import Camera
 from dmrl.labelling.flight_log import FlightLog
 from dmrl.labelling.observer_log import ObserverLog, read_observer_log
 from dmrl.labelling.recorded_camera import read_robot_camera, recorded_camera
-from dmrl.messages import message
-from dmrl.recording import Timed
+from dmrl.messages import message_class
+from dmrl.recording import TimedMessage
 from dmrl.terminal.progress import say, track
 
 
@@ -43,13 +43,13 @@ def choose_camera(
     """
     camera = read_robot_camera(flight, robot, given) if given else recorded_camera(flight, robot)
     if camera is None:
-        raise MissingTopic(topics.calibration(robot), flight.topics, flight.path)
+        raise MissingTopic(topics.CALIBRATION(robot), flight.topics, flight.path)
     return replace(camera, distortion=()) if undistorted else camera
 
 
 def track_peers(
     flight: FlightLog, robot: str, camera: Camera, threshold: float | None, tuning: Tuning
-) -> tuple[list[Timed], RobotReport]:
+) -> tuple[list[TimedMessage], RobotReport]:
     """Return the Tracks messages of one robot, one per image, and their numbers.
 
     Parameters
@@ -68,13 +68,13 @@ def track_peers(
     sight = read_observer_log(flight, robot, camera, threshold)
     for warning in sight.warnings:
         say(f"{flight.path}: {warning}")
-    tracker, identity = Tracker(sight.camera, tuning), Identity()
-    made: list[Timed] = []
+    tracker, identity = Tracker(sight.camera, tuning), TrackIdentity()
+    made: list[TimedMessage] = []
     seen: dict[int, str] = {}
     entries = 0
     for k in track(range(len(sight.time_ns)), f"Following from {robot}"):
         tracks = tracker.step(sight.motion(k), sight.view(k))
-        names = identity.names(tracks, sight.ranges(k), sight.motion(k).dt_s)
+        names = identity.assign(tracks, sight.ranges(k), sight.motion(k).dt_s)
         seen |= {t.number: names.get(t.number) or seen.get(t.number, "") for t in tracks}
         entries += len(tracks)
         made.append(_message(sight, k, tracks, names))
@@ -83,7 +83,9 @@ def track_peers(
     return made, RobotReport(robot, images, len(seen), named, round(entries / max(images, 1), 3))
 
 
-def _message(sight: ObserverLog, k: int, tracks: list[Track], names: dict[int, str]) -> Timed:
+def _message(
+    sight: ObserverLog, k: int, tracks: list[Track], names: dict[int, str]
+) -> TimedMessage:
     entries: list[dict[str, Any]] = []
     for one in tracks:
         numbers = [*one.position_m.tolist(), *one.velocity_mps.tolist()]
@@ -96,5 +98,5 @@ def _message(sight: ObserverLog, k: int, tracks: list[Track], names: dict[int, s
                 "covariance": np.ravel(one.covariance).tolist(),
             }
         )
-    made = message("Tracks")(frame_id=f"{sight.robot}/horizontal", tracks=entries)
-    return Timed(int(sight.log_time_ns[k]), topics.tracks(sight.robot), made)
+    made = message_class("Tracks")(frame_id=f"{sight.robot}/horizontal", tracks=entries)
+    return TimedMessage(int(sight.log_time_ns[k]), topics.TRACKS(sight.robot), made)

@@ -5,11 +5,11 @@ from pathlib import Path
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError, SettingError
-from dmrl.geometry.calibration import no_camera
+from dmrl.geometry.calibration import find_calibration_fault
 from dmrl.geometry.camera_file import read_camera
 from dmrl.geometry.frames import Camera
 from dmrl.labelling.flight_log import FlightLog
-from dmrl.recording import summary
+from dmrl.recording import read_summary
 
 PLUMB_BOB_MODELS = ("", "plumb_bob", "rational_polynomial")
 """Names of lens models equal to plumb bob, the last if its further coefficients are 0."""
@@ -26,14 +26,14 @@ def recorded_camera(flight: FlightLog, robot: str) -> Camera | None:
     found = flight.calibrations.get(robot)
     if found is None:
         return None
-    topic, way_out = topics.calibration(robot), "dmrl calibrate --board, then --camera"
+    topic, way_out = topics.CALIBRATION(robot), "dmrl calibrate --board, then --camera"
     if found.distortion_model not in PLUMB_BOB_MODELS or any(found.D[5:]):
         raise RecordingError(
             f"{flight.path}: {topic} has a lens of model {found.distortion_model!r} with "
             f"{len(found.D)} coefficients, dmrl knows plumb_bob with 5. Give another calibration: "
             f"{way_out}"
         )
-    if why := no_camera(found.width, found.height, found.K, found.D):
+    if why := find_calibration_fault(found.width, found.height, found.K, found.D):
         raise RecordingError(f"{flight.path}: {topic} {why}. Give another calibration: {way_out}")
     fx, _, cx, _, fy, cy, *_ = found.K
     return Camera(found.width, found.height, fx, fy, cx, cy, tuple(found.D[:5]))
@@ -81,8 +81,8 @@ def choose_robot(source: Path, robot: str | None, pattern: str) -> str:
     MissingTopic
         If there is none, or not the one that was named.
     """
-    held = list(summary(source).topics)
-    robots = topics.robots(held, pattern)
+    held = list(read_summary(source).topics)
+    robots = topics.list_robots(held, pattern)
     if robot is None and len(robots) > 1:
         raise SettingError(f"{source} has {', '.join(robots)}. Name one: --robot {robots[0]}")
     robot = robot or (robots[0] if robots else "*")

@@ -13,9 +13,9 @@ import numpy as np
 import tomli_w
 
 from dmrl.errors import SourceError
-from dmrl.estimation.model.pair import SWAPPED, Array
+from dmrl.estimation.model.pair import GLOBALS_FROM_PEER, Array
 from dmrl.estimation.solver.keyframes import GLOBALS
-from dmrl.estimation.solver.residuals import BIAS, OF_OBSERVER, SCALE
+from dmrl.estimation.solver.residuals import OBSERVER_CONSTANTS, RANGE_BIAS, RANGE_SCALE
 from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.guards.paths import refuse_pipe
 
@@ -25,9 +25,12 @@ Value = tuple[float, float]
 Values = Mapping[str, Value]
 
 _KEYS = ("yaw_rate_bias_radps", "velocity_scale", "vx_bias_mps", "vy_bias_mps")
-OF_ROBOT = {key: (place, SWAPPED[place]) for key, place in zip(_KEYS, OF_OBSERVER, strict=True)}
+OF_ROBOT = {
+    key: (place, GLOBALS_FROM_PEER[place])
+    for key, place in zip(_KEYS, OBSERVER_CONSTANTS, strict=True)
+}
 """Index into ``GLOBALS`` of a robot's constant as observer, and as peer."""
-OF_PAIR = {"range_offset_m": BIAS, "range_scale": SCALE}
+OF_PAIR = {"range_offset_m": RANGE_BIAS, "range_scale": RANGE_SCALE}
 """Index into ``GLOBALS`` of a pair's constant. Clock offsets differ in every flight."""
 SCALES = ("velocity_scale", "range_scale")
 MAX_MEAN, MAX_SCALE_MEAN = 60.0, 0.9

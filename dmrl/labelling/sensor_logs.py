@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow as pa
 
 from dmrl import topics
-from dmrl.estimation.model.pair import RATE_HZ, Array, Pair, Track, usable_ranges
-from dmrl.estimation.signals.sensor_tracks import Signals, track
+from dmrl.estimation.model.pair import GRID_RATE_HZ, Array, Pair, SensorTrack, usable_ranges
+from dmrl.estimation.signals.sensor_tracks import Signals, build_track
 from dmrl.labelling.flight_log import SENSOR_FIELDS, FlightLog, RobotPair, Samples
 from dmrl.labelling.sensor_file import SensorConstants
-from dmrl.recording.checks.unit_checks import unit_doubts
+from dmrl.recording.checks.unit_checks import check_units
 
 MIN_DURATION_S = 5.0
 """Shortest common stretch of two logs that is estimated, seconds."""
@@ -53,10 +53,10 @@ class RobotLog:
         """Return when the first of the sensors ends, seconds."""
         return min(float(s[0][-1]) for s in (self.attitude, self.velocity, self.height))
 
-    def to_track(self, grid_s: Array) -> Track:
+    def to_track(self, grid_s: Array) -> SensorTrack:
         """Return the sensors on a time grid."""
         times, attitude = self.attitude
-        return track((times, attitude[:, 2:]), self.velocity, self.height, grid_s)
+        return build_track((times, attitude[:, 2:]), self.velocity, self.height, grid_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ def build_sensor_logs(
     pairs = {}
     for one, other in combinations(names, 2):
         found = [
-            _to_signals(flight, topics.RANGE, topics.uwb_range(*link), samples, warnings)
+            _to_signals(flight, topics.RANGE, topics.RANGE(*link), samples, warnings)
             for link in ((one, other), (other, one))
             if (samples := flight.ranges.get(link)) is not None
         ]
@@ -133,7 +133,9 @@ def build_sensor_logs(
 def _find_flying(flight: FlightLog) -> frozenset[str]:
     """Return the robots with a log of their own. They may be in view even without a position."""
     kinds = [row.pattern for row in topics.OWN_SENSORS]
-    return frozenset(name for kind in kinds for name in topics.robots(list(flight.topics), kind))
+    return frozenset(
+        name for kind in kinds for name in topics.list_robots(list(flight.topics), kind)
+    )
 
 
 def _build_robot_log(
@@ -164,7 +166,7 @@ def _to_signals(
     """Return the usable samples of a topic; None, with a warning, if there are none."""
     values = samples.values
     table = pa.table(dict(zip(SENSOR_FIELDS[pattern], values.T, strict=True)))
-    warnings += [f"{topic}: {doubt}" for doubt in unit_doubts(topic, table)]
+    warnings += [f"{topic}: {doubt}" for doubt in check_units(topic, table)]
     good = np.asarray((abs(values) < MAX_VALUE).all(axis=1))
     if bad := int((~good).sum()):
         warnings.append(
@@ -202,16 +204,16 @@ def _build_pair(
     measured = _select_ranges(name, ranges, start_s, end_s, warnings)
     if measured is None:
         return None
-    grid_s = start_s + np.arange(int((end_s - start_s) * RATE_HZ) + 1) / RATE_HZ
+    grid_s = start_s + np.arange(int((end_s - start_s) * GRID_RATE_HZ) + 1) / GRID_RATE_HZ
     tracks = [log.to_track(grid_s) for log in logs]
     for robot, one in zip(names, tracks, strict=True):
-        if one.gap.any():
-            silent_s = one.gap.sum() / RATE_HZ
+        if one.dropout.any():
+            silent_s = one.dropout.sum() / GRID_RATE_HZ
             warnings.append(f"{name}: {robot} is silent for {silent_s:.1f} s; unconverged there")
     time_s, range_m = measured
     on_grid = time_s <= grid_s[-1]  # which ends up to a step before the logs do
     ranged = time_s[on_grid], range_m[on_grid]
-    return Pair(grid_s, tracks[0], tracks[1], *ranged, known_std=known.to_prior_std(names))
+    return Pair(grid_s, tracks[0], tracks[1], *ranged, calibrated_std=known.to_prior_std(names))
 
 
 def _select_ranges(

@@ -7,27 +7,27 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from dmrl.errors import SettingError, SourceError
-from dmrl.formats.aideck.cpx import PORT, Image, ImageReader
-from dmrl.formats.timestamps import SteadySender
+from dmrl.formats.aideck.cpx import DEFAULT_PORT, Image, ImageReader
+from dmrl.formats.timestamps import SteadyRateFilter
 from dmrl.geometry.frames import AIDECK, AIDECK_SENSOR_PX, Camera
-from dmrl.live.image_assembly import Colours, Stored, encoded
-from dmrl.live.queue import Feed, Health, Received
-from dmrl.live.receive_clocks import HostTime, SenderClock
-from dmrl.samples.sample import calibration
-from dmrl.samples.sample import image as image_sample
+from dmrl.live.image_assembly import ColourMode, StoredFormat, encode_image
+from dmrl.live.queue import LinkStatus, ReceivedSample, SampleQueue
+from dmrl.live.receive_clocks import HostClock, SenderClock
+from dmrl.samples.sample import build_calibration
+from dmrl.samples.sample import build_image as image_sample
 
-US = 1_000
-CONNECT_S = 3.0
-SILENT_S = 3.0
-RETRY_S = 1.0
+NS_PER_US = 1_000
+CONNECT_TIMEOUT_S = 3.0
+RECEIVE_TIMEOUT_S = 3.0
+RETRY_DELAY_S = 1.0
 READ_BYTES = 1 << 16
-GARBAGE_BYTES = 1 << 20
+MAX_GARBAGE_BYTES = 1 << 20
 """Bytes without an image after which a connection is no image stream."""
 
 RobotTime = Callable[[float], int | None]
 
 
-def address(text: str) -> tuple[str, int]:
+def parse_address(text: str) -> tuple[str, int]:
     """Parse host and port of "HOST:PORT", or "HOST" for the AI-deck's own port.
 
     Raises
@@ -37,14 +37,14 @@ def address(text: str) -> tuple[str, int]:
     """
     host, colon, port = text.rpartition(":")
     if not colon:
-        host, port = text, str(PORT)
+        host, port = text, str(DEFAULT_PORT)
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise SettingError(f"camera={text} is no HOST:PORT. Use camera=192.168.4.1:{PORT}")
+        raise SettingError(f"camera={text} is no HOST:PORT. Use camera=192.168.4.1:{DEFAULT_PORT}")
     return host, int(port)
 
 
 @dataclass(slots=True)
-class _Times:
+class _ExposureTimes:
     """Times of exposure of one connection's images, on this computer's clock.
 
     The best available source is used: the robot's time of an image, else the camera's, else the
@@ -53,7 +53,7 @@ class _Times:
 
     robot_time: RobotTime
     clock: SenderClock = field(default_factory=SenderClock)
-    steady: SteadySender = field(default_factory=SteadySender)
+    steady: SteadyRateFilter = field(default_factory=SteadyRateFilter)
 
     def __call__(self, image: Image, arrival_ns: int) -> int:
         if image.robot_time_us is not None:
@@ -62,8 +62,8 @@ class _Times:
                 return known
         if image.time_us is None:
             return self.steady(arrival_ns)
-        self.clock.hear(image.time_us * US, arrival_ns)
-        return min(self.clock.host_ns(image.time_us * US), arrival_ns)
+        self.clock.add_sample(image.time_us * NS_PER_US, arrival_ns)
+        return min(self.clock.to_host_ns(image.time_us * NS_PER_US), arrival_ns)
 
 
 class CameraClient(threading.Thread):
@@ -94,16 +94,16 @@ class CameraClient(threading.Thread):
         robot: str,
         host: str,
         port: int,
-        feed: Feed,
-        now: HostTime,
+        feed: SampleQueue,
+        now: HostClock,
         *,
-        colours: Colours = "colour",
-        stored: Stored = "png",
+        colours: ColourMode = "colour",
+        stored: StoredFormat = "png",
         camera: Camera | None = None,
         robot_time: RobotTime = lambda _: None,
     ) -> None:
         super().__init__(name=f"camera {robot}", daemon=True)
-        self.health = Health(f"{robot} camera")
+        self.health = LinkStatus(f"{robot} camera")
         self.robot, self._where = robot, (host, port)
         self._feed, self._now = feed, now
         self._form = colours, stored
@@ -119,22 +119,24 @@ class CameraClient(threading.Thread):
     def run(self) -> None:
         """Connect and post images, again after each loss, until stopped."""
         while not self._stop_wanted.is_set():
-            why = self._connection()
+            why = self._run_connection()
             if self._stop_wanted.is_set():
                 break
             if self.health.state != why:
                 host, port = self._where
-                self._feed.say(f"{self.robot}: camera {why} at {host}:{port}; trying again")
+                self._feed.post_message(
+                    f"{self.robot}: camera {why} at {host}:{port}; trying again"
+                )
             self.health.state = why
-            self._stop_wanted.wait(RETRY_S)
+            self._stop_wanted.wait(RETRY_DELAY_S)
         self.health.state = "stopped"
 
-    def _connection(self) -> str:
+    def _run_connection(self) -> str:
         """Receive until the connection ends. Return the reason."""
         try:
-            with socket.create_connection(self._where, timeout=CONNECT_S) as connection:
+            with socket.create_connection(self._where, timeout=CONNECT_TIMEOUT_S) as connection:
                 connection.settimeout(0.2)
-                return self._listen(connection)
+                return self._receive_images(connection)
         except ConnectionRefusedError:
             return "refuses connections"
         except TimeoutError:
@@ -142,8 +144,8 @@ class CameraClient(threading.Thread):
         except OSError as e:
             return f"cannot be reached ({e.strerror or e})"
 
-    def _listen(self, connection: socket.socket) -> str:
-        reader, times = ImageReader(), _Times(self._robot_time)
+    def _receive_images(self, connection: socket.socket) -> str:
+        reader, times = ImageReader(), _ExposureTimes(self._robot_time)
         self.health.connections += 1
         broken, last_s, useless_bytes = 0, time.monotonic(), 0
         frame_id: int | None = None
@@ -151,7 +153,7 @@ class CameraClient(threading.Thread):
             try:
                 data = connection.recv(READ_BYTES)
             except TimeoutError:
-                if time.monotonic() - last_s > SILENT_S:
+                if time.monotonic() - last_s > RECEIVE_TIMEOUT_S:
                     return "is silent"
                 continue
             if not data:
@@ -160,49 +162,53 @@ class CameraClient(threading.Thread):
             useless_bytes += len(data)
             for image in reader.feed(data):
                 self.health.state, useless_bytes = "connected", 0
-                frame_id = self._count(image, frame_id)
-                self._hand_on(image, times(image, arrival_ns), arrival_ns)
+                frame_id = self._count_lost(image, frame_id)
+                self._post_image(image, times(image, arrival_ns), arrival_ns)
             self.health.broken += reader.broken - broken
             broken = reader.broken
-            if useless_bytes > GARBAGE_BYTES:
+            if useless_bytes > MAX_GARBAGE_BYTES:
                 return "sends no CPX images"
         return "stopped"
 
-    def _count(self, image: Image, before: int | None) -> int | None:
+    def _count_lost(self, image: Image, before: int | None) -> int | None:
         if image.frame_id is not None and before is not None:
             self.health.lost += image.frame_id - before - 1
         return image.frame_id
 
-    def _hand_on(self, image: Image, time_ns: int, arrival_ns: int) -> None:
+    def _post_image(self, image: Image, time_ns: int, arrival_ns: int) -> None:
         try:
-            data, kind = encoded(image, *self._form)
+            data, kind = encode_image(image, *self._form)
         except SourceError as e:
             self.health.broken += 1
-            self._warn(f"{self.robot}: {e}")
+            self._warn_once(f"{self.robot}: {e}")
             return
-        self._calibrate((image.width_px, image.height_px), time_ns, arrival_ns)
+        self._post_calibration((image.width_px, image.height_px), time_ns, arrival_ns)
         self.health.last_arrival_ns = arrival_ns
-        self._feed.put(Received(image_sample(time_ns, self.robot, data, kind), arrival_ns))
+        self._feed.post_sample(
+            ReceivedSample(image_sample(time_ns, self.robot, data, kind), arrival_ns)
+        )
         self.health.received += 1
 
-    def _calibrate(self, sent_px: tuple[int, int], time_ns: int, arrival_ns: int) -> None:
+    def _post_calibration(self, sent_px: tuple[int, int], time_ns: int, arrival_ns: int) -> None:
         """Post the calibration before the first image, if it matches the image size."""
         size_px = (AIDECK.width_px, AIDECK.height_px) if sent_px == AIDECK_SENSOR_PX else sent_px
         if size_px == self._size_px:
             return
         if self._size_px is not None:
-            self._warn(f"{self.robot}: images are {size_px} px now, {self._size_px} px before")
+            self._warn_once(f"{self.robot}: images are {size_px} px now, {self._size_px} px before")
         self._size_px = size_px
         camera = self._camera or AIDECK
         if (camera.width_px, camera.height_px) == size_px:
-            self._feed.put(Received(calibration(time_ns, self.robot, camera), arrival_ns))
+            self._feed.post_sample(
+                ReceivedSample(build_calibration(time_ns, self.robot, camera), arrival_ns)
+            )
             return
-        self._warn(
+        self._warn_once(
             f"{self.robot}: images are {size_px[0]} x {size_px[1]} px, the calibration is for "
             f"{camera.width_px} x {camera.height_px} px and left out; labels will need one"
         )
 
-    def _warn(self, line: str) -> None:
+    def _warn_once(self, line: str) -> None:
         if line not in self._warned:
             self._warned.add(line)
-            self._feed.say(line)
+            self._feed.post_message(line)

@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Any
 
 from dmrl.errors import MissingExtra, SettingError
-from dmrl.live.log_blocks import SLOW_PERIOD_MS, Block, Plan
+from dmrl.live.log_blocks import SLOW_PERIOD_MS, LogPlan, RequestedBlock
 
 UDP_BUFFER_BYTES = 1 << 22
 """Requested size of the receive buffer, so that a busy computer loses no packets. The system may
@@ -64,7 +64,7 @@ def check_uri(uri: str) -> None:
         )
 
 
-class Session:
+class CflibSession:
     """One session of a link: opened, started, closed.
 
     Parameters
@@ -96,9 +96,9 @@ class Session:
         # own.
         crazyflie.commander.send_setpoint = lambda *_: None
         crazyflie.connected.add_callback(lambda _: self.ready.set())
-        crazyflie.connection_failed.add_callback(self._gone)
-        crazyflie.connection_lost.add_callback(self._gone)
-        crazyflie.packet_received.add_callback(self._heard)
+        crazyflie.connection_failed.add_callback(self._on_lost)
+        crazyflie.connection_lost.add_callback(self._on_lost)
+        crazyflie.packet_received.add_callback(self._on_packet)
 
     def open(self, uri: str) -> None:
         """Start to connect; `ready` or `lost` reports the result."""
@@ -109,11 +109,11 @@ class Session:
             with suppress(OSError):  # closed already: `lost` reports it
                 link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_BUFFER_BYTES)
 
-    def silent_s(self) -> float:
+    def idle_time_s(self) -> float:
         """Return the seconds since the last packet."""
         return time.monotonic() - max(self.last_packet_s, self._opened_s)
 
-    def toc(self) -> dict[str, str]:
+    def list_variables(self) -> dict[str, str]:
         """Return the type of each log variable."""
         groups = self._drone.log.toc.toc
         return {
@@ -122,7 +122,7 @@ class Session:
             for name, element in elements.items()
         }
 
-    def start(self, wanted: Plan, take: Any) -> None:
+    def start_blocks(self, wanted: LogPlan, take: Any) -> None:
         """Request all blocks from the drone.
 
         Raises
@@ -131,9 +131,9 @@ class Session:
             If cflib rejects a block.
         """
         for number, block in enumerate(wanted.blocks):
-            config = self._config(number, block)
+            config = self._build_config(number, block)
             config.data_received_cb.add_callback(take)
-            config.error_cb.add_callback(self._refuse)
+            config.error_cb.add_callback(self._on_rejected)
             try:
                 self._drone.log.add_config(config)
             except (KeyError, AttributeError) as e:
@@ -141,7 +141,7 @@ class Session:
             config.start()
             self._configs.append(config)
 
-    def _config(self, number: int, block: Block) -> Any:
+    def _build_config(self, number: int, block: RequestedBlock) -> Any:
         from cflib.crazyflie.log import LogConfig  # noqa: PLC0415 - an extra
 
         name = "slow" if block.period_ms == SLOW_PERIOD_MS else f"block {number}"
@@ -156,11 +156,11 @@ class Session:
             config.stop()
         self._drone.close_link()
 
-    def _gone(self, _uri: str, why: str) -> None:
+    def _on_lost(self, _uri: str, why: str) -> None:
         self.lost = why or "lost"
 
-    def _refuse(self, _block: Any, why: str) -> None:
+    def _on_rejected(self, _block: Any, why: str) -> None:
         self.refused = why
 
-    def _heard(self, _packet: Any) -> None:
+    def _on_packet(self, _packet: Any) -> None:
         self.last_packet_s = time.monotonic()

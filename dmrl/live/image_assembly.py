@@ -9,12 +9,14 @@ from dmrl.formats.aideck.cpx import Image
 from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX
 from dmrl.images import bayer, codec
 
-Colours = Literal["colour", "grey"]
-Stored = Literal["png", "jpeg"]
+ColourMode = Literal["colour", "grey"]
+StoredFormat = Literal["png", "jpeg"]
 JPEG_QUALITY = 95
 
 
-def encoded(image: Image, colours: Colours, stored: Stored = "png") -> tuple[bytes, str]:
+def encode_image(
+    image: Image, colours: ColourMode, stored: StoredFormat = "png"
+) -> tuple[bytes, str]:
     """Return the encoded image, and "png" or "jpeg".
 
     Images of the whole sensor are cropped to the 320 x 224 px of the calibration. A JPEG that needs
@@ -36,7 +38,7 @@ def encoded(image: Image, colours: Colours, stored: Stored = "png") -> tuple[byt
     """
     whole = (image.width_px, image.height_px) == AIDECK_SENSOR_PX
     if image.encoding == "jpeg":
-        width_px, height_px, kind = codec.size(image.data, "the camera's JPEG")
+        width_px, height_px, kind = codec.read_size(image.data, "the camera's JPEG")
         if (width_px, height_px) != (image.width_px, image.height_px) or kind != "jpeg":
             raise SourceError(
                 f"the camera's {kind} is {width_px} x {height_px} px, not "
@@ -44,19 +46,21 @@ def encoded(image: Image, colours: Colours, stored: Stored = "png") -> tuple[byt
             )
         if not whole:
             return image.data, "jpeg"
-        return _stored(_cut(codec.decode(image.data, "the camera's JPEG")), stored), stored
+        return _encode_pixels(
+            _crop_to_calibration(codec.decode(image.data, "the camera's JPEG")), stored
+        ), stored
     pixels = np.frombuffer(image.data, np.uint8).reshape(image.height_px, image.width_px)
     if whole:
-        pixels = _cut(pixels)
-    return _stored(bayer.rgb_of(pixels) if colours == "colour" else pixels, stored), stored
+        pixels = _crop_to_calibration(pixels)
+    return _encode_pixels(bayer.demosaic(pixels) if colours == "colour" else pixels, stored), stored
 
 
-def _stored(pixels: codec.Rgb, stored: Stored) -> bytes:
+def _encode_pixels(pixels: codec.Rgb, stored: StoredFormat) -> bytes:
     if stored == "png":
         return codec.encode_png(pixels)
     return codec.encode_jpeg(pixels, JPEG_QUALITY)
 
 
-def _cut(pixels: codec.Rgb) -> codec.Rgb:
+def _crop_to_calibration(pixels: codec.Rgb) -> codec.Rgb:
     left, top = AIDECK_CORNER_PX
     return pixels[top : top + AIDECK.height_px, left : left + AIDECK.width_px]

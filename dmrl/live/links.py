@@ -7,15 +7,15 @@ from dmrl.errors import SettingError
 from dmrl.geometry.camera_file import read_camera
 from dmrl.live.camera_link import CameraClient
 from dmrl.live.cflib_session import check_uri
-from dmrl.live.crazyflie_link import Link
-from dmrl.live.image_assembly import Colours, Stored
-from dmrl.live.queue import Feed
-from dmrl.live.receive_clocks import HostTime
-from dmrl.live.robot_options import Robot, peers_of
+from dmrl.live.crazyflie_link import CrazyflieLink
+from dmrl.live.image_assembly import ColourMode, StoredFormat
+from dmrl.live.queue import SampleQueue
+from dmrl.live.receive_clocks import HostClock
+from dmrl.live.robot_options import RobotOptions, parse_peers
 from dmrl.terminal.progress import say
 
 
-def check(robots: Sequence[Robot]) -> None:
+def check_robots(robots: Sequence[RobotOptions]) -> None:
     """Raise SettingError unless these robots can be recorded together.
 
     Raises
@@ -32,9 +32,13 @@ def check(robots: Sequence[Robot]) -> None:
         check_uri(robot.uri)
 
 
-def links_of(
-    robots: Sequence[Robot], peer: Sequence[str], rate_hz: float, feed: Feed, now: HostTime
-) -> dict[str, Link]:
+def build_links(
+    robots: Sequence[RobotOptions],
+    peer: Sequence[str],
+    rate_hz: float,
+    feed: SampleQueue,
+    now: HostClock,
+) -> dict[str, CrazyflieLink]:
     """Build a link to each robot, by name, not yet started.
 
     Parameters
@@ -49,22 +53,24 @@ def links_of(
         See `CrazyflieLink`.
     """
     names, period_ms = [robot.name for robot in robots], 10 * max(round(100 / rate_hz), 1)
-    peers = {name: peers_of(name, names, peer) for name in names}
+    peers = {name: parse_peers(name, names, peer) for name in names}
     for name in names if len(names) > 1 else ():
         if not peers[name]:
             say(
                 f"{name}: the peer of its ranging.distance<N> is unknown, so no range of it is "
                 "recorded. Pass: --peer N=NAME"
             )
-    return {r.name: Link(r.name, r.uri, peers[r.name], period_ms, feed, now) for r in robots}
+    return {
+        r.name: CrazyflieLink(r.name, r.uri, peers[r.name], period_ms, feed, now) for r in robots
+    }
 
 
-def cameras_of(
-    robots: Sequence[Robot],
-    links: dict[str, Link],
-    form: tuple[Colours, Stored],
-    feed: Feed,
-    now: HostTime,
+def build_cameras(
+    robots: Sequence[RobotOptions],
+    links: dict[str, CrazyflieLink],
+    form: tuple[ColourMode, StoredFormat],
+    feed: SampleQueue,
+    now: HostClock,
 ) -> list[CameraClient]:
     """Build a client for each robot's camera, not yet started.
 
@@ -89,14 +95,14 @@ def cameras_of(
             colours=form[0],
             stored=form[1],
             camera=calibrations[robot.name],
-            robot_time=links[robot.name].robot_time,
+            robot_time=links[robot.name].to_host_time_ns,
         )
         for robot in robots
         if robot.camera
     ]
 
 
-def end_all(threads: Sequence[Link | CameraClient]) -> None:
+def stop_all(threads: Sequence[CrazyflieLink | CameraClient]) -> None:
     """Stop all threads, and wait for their end."""
     for thread in threads:
         thread.stop()
@@ -105,7 +111,7 @@ def end_all(threads: Sequence[Link | CameraClient]) -> None:
             thread.join(timeout=10.0)
 
 
-def nothing_came(out: object, links: Sequence[Link]) -> str:
+def describe_no_data(out: object, links: Sequence[CrazyflieLink]) -> str:
     """Return the error text for a recording without any sample."""
     states = ", ".join(f"{link.robot} at {link.uri}: {link.health.state}" for link in links)
     return f"no data for {out} ({states}). Check that the drone is on, and the address"

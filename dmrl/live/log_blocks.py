@@ -15,8 +15,8 @@ from dmrl.errors import SettingError
 from dmrl.samples.sample import Sample
 
 BLOCK_BYTES = 26
-BLOCKS_MAX = 16
-SIZES = {
+MAX_BLOCKS = 16
+VARIABLE_BYTES = {
     "uint8_t": 1,
     "int8_t": 1,
     "uint16_t": 2,
@@ -28,16 +28,16 @@ SIZES = {
 }
 """Bytes of a variable by its type, in cflib's names."""
 
-MOTION = ("roll", "pitch", "yaw", "vx", "vy")
-YAW_RATE, PITCH_RATE = "gyro.z", "gyro.y"
-HEIGHT, GROUND = "stateEstimate.z", "range.zrange"
-BATTERY = "pm.vbat"
+MOTION_VARIABLES = ("roll", "pitch", "yaw", "vx", "vy")
+YAW_RATE_VARIABLE, PITCH_RATE_VARIABLE = "gyro.z", "gyro.y"
+HEIGHT_VARIABLE, GROUND_VARIABLE = "stateEstimate.z", "range.zrange"
+BATTERY_VARIABLE = "pm.vbat"
 SLOW_PERIOD_MS = 1000
-RANGE_MAX_M = 60.0  # beyond the reach of UWB; radios report 65535 mm without an answer
+MAX_RANGE_M = 60.0  # beyond the reach of UWB; radios report 65535 mm without an answer
 
 
 @dataclass(frozen=True, slots=True)
-class Variable:
+class RequestedVariable:
     """A log variable, "group.name", and the type in which it is sent."""
 
     name: str
@@ -45,20 +45,20 @@ class Variable:
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class RequestedBlock:
     """Variables that are sent together."""
 
     period_ms: int
-    variables: tuple[Variable, ...]
+    variables: tuple[RequestedVariable, ...]
 
     @property
     def size(self) -> int:
         """Bytes of its variables."""
-        return sum(SIZES[variable.sent_as] for variable in self.variables)
+        return sum(VARIABLE_BYTES[variable.sent_as] for variable in self.variables)
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class LogPlan:
     """Log blocks requested from one drone.
 
     Parameters
@@ -71,20 +71,20 @@ class Plan:
         Distance variables in millimetres; others are in metres.
     """
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[RequestedBlock, ...]
     peers: Mapping[str, str]
     millimetres: frozenset[str]
 
 
-def number_of(robot: str) -> int | None:
+def parse_robot_number(robot: str) -> int | None:
     """Return the number at the end of a robot's name, its id in the firmware of others; or None."""
     found = re.search(r"\d+$", robot)
     return int(found.group()) if found else None
 
 
-def plan(
+def plan_blocks(
     toc: Mapping[str, str], peers: Mapping[int, str], period_ms: int, *, robot: str = "the drone"
-) -> Plan:
+) -> LogPlan:
     """Plan blocks with all variables that are needed and that the drone has.
 
     Parameters
@@ -103,43 +103,49 @@ def plan(
     SettingError
         If it lacks a required variable, or needs too many blocks.
     """
-    motion = [Variable(f"stateEstimate.{name}", "float") for name in MOTION]
-    motion.append(Variable(YAW_RATE, "float"))
-    height = HEIGHT if HEIGHT in toc else GROUND
+    motion = [RequestedVariable(f"stateEstimate.{name}", "float") for name in MOTION_VARIABLES]
+    motion.append(RequestedVariable(YAW_RATE_VARIABLE, "float"))
+    height = HEIGHT_VARIABLE if HEIGHT_VARIABLE in toc else GROUND_VARIABLE
     if missing := [name for name in (*(v.name for v in motion), height) if name not in toc]:
         raise SettingError(
             f"{robot} has no log variable {', '.join(missing)}. Use a Crazyflie's firmware"
         )
-    if PITCH_RATE in toc:
+    if PITCH_RATE_VARIABLE in toc:
         # As FP16 it fits into the block. It only corrects the yaw rate for tilt.
-        motion.append(Variable(PITCH_RATE, "FP16"))
+        motion.append(RequestedVariable(PITCH_RATE_VARIABLE, "FP16"))
     distances = {f"ranging.distance{number}": peer for number, peer in peers.items()}
     distances = {name: peer for name, peer in distances.items() if name in toc}
-    rest = [Variable(name, toc[name]) for name in (height, *distances)]
-    blocks = [Block(period_ms, tuple(motion)), *_packed(rest, period_ms)]
-    if BATTERY in toc:
-        blocks.append(Block(SLOW_PERIOD_MS, (Variable(BATTERY, toc[BATTERY]),)))
-    if len(blocks) > BLOCKS_MAX:
+    rest = [RequestedVariable(name, toc[name]) for name in (height, *distances)]
+    blocks = [RequestedBlock(period_ms, tuple(motion)), *_pack_blocks(rest, period_ms)]
+    if BATTERY_VARIABLE in toc:
+        blocks.append(
+            RequestedBlock(
+                SLOW_PERIOD_MS, (RequestedVariable(BATTERY_VARIABLE, toc[BATTERY_VARIABLE]),)
+            )
+        )
+    if len(blocks) > MAX_BLOCKS:
         raise SettingError(
-            f"{robot}: {len(distances)} distances need more than {BLOCKS_MAX} blocks. "
+            f"{robot}: {len(distances)} distances need more than {MAX_BLOCKS} blocks. "
             "Pass fewer with --peer"
         )
     millimetres = frozenset(name for name in distances if toc[name] not in ("float", "FP16"))
-    return Plan(tuple(blocks), distances, millimetres)
+    return LogPlan(tuple(blocks), distances, millimetres)
 
 
-def _packed(variables: Sequence[Variable], period_ms: int) -> Iterator[Block]:
-    held: list[Variable] = []
+def _pack_blocks(
+    variables: Sequence[RequestedVariable], period_ms: int
+) -> Iterator[RequestedBlock]:
+    held: list[RequestedVariable] = []
     for variable in variables:
-        if Block(period_ms, (*held, variable)).size > BLOCK_BYTES:
-            yield Block(period_ms, tuple(held))
+        if RequestedBlock(period_ms, (*held, variable)).size > BLOCK_BYTES:
+            yield RequestedBlock(period_ms, tuple(held))
             held = []
         held.append(variable)
-    yield Block(period_ms, tuple(held))
+    yield RequestedBlock(period_ms, tuple(held))
 
 
 @dataclass(slots=True)
-class Reading:
+class LogDecoder:
     """Decoder of a drone's block values to samples, one packet after the other.
 
     The log's pitch is positive nose up, and its velocity is along the axes of the take-off. In the
@@ -154,12 +160,12 @@ class Reading:
     """
 
     robot: str
-    plan: Plan
+    plan: LogPlan
     battery_v: float | None = None
     ranges_m: dict[str, float] = field(default_factory=dict)
     _known: dict[str, float] = field(default_factory=dict)
 
-    def samples(self, time_ns: int, values: Mapping[str, float]) -> Iterator[Sample]:
+    def iter_samples(self, time_ns: int, values: Mapping[str, float]) -> Iterator[Sample]:
         """Yield the samples of a packet.
 
         Parameters
@@ -169,38 +175,42 @@ class Reading:
         values
             Values by variable.
         """
-        if YAW_RATE in values:
-            yield from self._motion(time_ns, values)
-        for name, factor in ((HEIGHT, 1.0), (GROUND, 1e-3)):
+        if YAW_RATE_VARIABLE in values:
+            yield from self._iter_motion(time_ns, values)
+        for name, factor in ((HEIGHT_VARIABLE, 1.0), (GROUND_VARIABLE, 1e-3)):
             if name in values and math.isfinite(values[name]):
                 height = {"height_m": values[name] * factor}
-                yield Sample(time_ns, topics.height(self.robot), "Height", height)
+                yield Sample(time_ns, topics.HEIGHT(self.robot), "Height", height)
         for name in values.keys() & self.plan.peers.keys():
-            yield from self._distance(time_ns, name, values[name])
-        self.battery_v = values.get(BATTERY, self.battery_v)
+            yield from self._iter_range(time_ns, name, values[name])
+        self.battery_v = values.get(BATTERY_VARIABLE, self.battery_v)
 
-    def _motion(self, time_ns: int, values: Mapping[str, float]) -> Iterator[Sample]:
-        roll, pitch, yaw = (math.radians(values[f"stateEstimate.{n}"]) for n in MOTION[:3])
-        vx, vy = (values[f"stateEstimate.{name}"] for name in MOTION[3:])
-        about_y, about_z = (math.radians(values.get(n, 0.0)) for n in (PITCH_RATE, YAW_RATE))
+    def _iter_motion(self, time_ns: int, values: Mapping[str, float]) -> Iterator[Sample]:
+        roll, pitch, yaw = (
+            math.radians(values[f"stateEstimate.{n}"]) for n in MOTION_VARIABLES[:3]
+        )
+        vx, vy = (values[f"stateEstimate.{name}"] for name in MOTION_VARIABLES[3:])
+        about_y, about_z = (
+            math.radians(values.get(n, 0.0)) for n in (PITCH_RATE_VARIABLE, YAW_RATE_VARIABLE)
+        )
         if not all(map(math.isfinite, (roll, pitch, yaw, vx, vy, about_y, about_z))):
             return
         yaw_rate = (about_y * math.sin(roll) + about_z * math.cos(roll)) / math.cos(pitch)
         attitude = {"roll_rad": roll, "pitch_rad": -pitch, "yaw_rad": yaw}
         attitude["yaw_rate_radps"] = yaw_rate
-        yield Sample(time_ns, topics.attitude(self.robot), "Attitude", attitude)
+        yield Sample(time_ns, topics.ATTITUDE(self.robot), "Attitude", attitude)
         c, s = math.cos(yaw), math.sin(yaw)
         velocity = {"vx_mps": c * vx + s * vy, "vy_mps": c * vy - s * vx}
-        yield Sample(time_ns, topics.velocity(self.robot), "Velocity", velocity)
+        yield Sample(time_ns, topics.VELOCITY(self.robot), "Velocity", velocity)
 
-    def _distance(self, time_ns: int, name: str, value: float) -> Iterator[Sample]:
+    def _iter_range(self, time_ns: int, name: str, value: float) -> Iterator[Sample]:
         # The variable keeps its value until the next ranging: only a change is a measurement,
         # and the age of the first one is unknown.
         known = self._known.get(name)
         self._known[name] = value
         range_m = value / 1000 if name in self.plan.millimetres else value
-        if known is None or value == known or not 0 < range_m < RANGE_MAX_M:
+        if known is None or value == known or not 0 < range_m < MAX_RANGE_M:
             return
         peer = self.plan.peers[name]
         self.ranges_m[peer] = range_m
-        yield Sample(time_ns, topics.uwb_range(self.robot, peer), "UwbRange", {"range_m": range_m})
+        yield Sample(time_ns, topics.RANGE(self.robot, peer), "UwbRange", {"range_m": range_m})

@@ -7,7 +7,7 @@ from dmrl.samples.sample import Sample
 
 
 @dataclass(frozen=True, slots=True)
-class Received:
+class ReceivedSample:
     """A sample and its time of arrival on this computer, nanoseconds since 1970."""
 
     sample: Sample
@@ -15,7 +15,7 @@ class Received:
 
 
 @dataclass(slots=True)
-class Health:
+class LinkStatus:
     """Status of one link or camera. Written by its thread, read by others.
 
     Parameters
@@ -44,23 +44,23 @@ class Health:
     detail: str = ""
 
 
-class Feed:
+class SampleQueue:
     """Queue from many threads to one."""
 
     def __init__(self) -> None:
-        self._queue: SimpleQueue[Received | str] = SimpleQueue()
+        self._queue: SimpleQueue[ReceivedSample | str] = SimpleQueue()
 
-    def put(self, received: Received) -> None:
+    def post_sample(self, received: ReceivedSample) -> None:
         """Post a sample."""
         self._queue.put(received)
 
-    def say(self, line: str) -> None:
+    def post_message(self, line: str) -> None:
         """Post a message for the user."""
         self._queue.put(line)
 
-    def take(self, timeout_s: float) -> list[Received | str]:
+    def get_batch(self, timeout_s: float) -> list[ReceivedSample | str]:
         """Return all queued items; wait for the first at most ``timeout_s``."""
-        taken: list[Received | str] = []
+        taken: list[ReceivedSample | str] = []
         try:
             taken.append(self._queue.get(timeout=timeout_s))
             while len(taken) < 1000:

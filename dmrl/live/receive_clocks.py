@@ -10,7 +10,7 @@ from collections import deque
 SECOND_NS = 1_000_000_000
 
 
-class HostTime:
+class HostClock:
     """Clock of nanoseconds since 1970 that never steps back, unlike the system's clock."""
 
     def __init__(self) -> None:
@@ -35,8 +35,8 @@ class SenderClock:
     """
 
     WINDOW_S = 10
-    SLEW = 200e-6
-    OTHER_PACE_NS = SECOND_NS // 2
+    MAX_SLEW = 200e-6
+    MAX_OFFSET_CHANGE_NS = SECOND_NS // 2
     """Largest change of the offset that counts as drift. Ignores clocks at another rate."""
 
     def __init__(self, settle_s: float = 1.0) -> None:
@@ -50,11 +50,11 @@ class SenderClock:
         self._least: deque[tuple[int, int]] = deque(maxlen=self.WINDOW_S)
 
     @property
-    def heard(self) -> bool:
+    def has_samples(self) -> bool:
         """Whether a sample of the sender has arrived."""
         return self._first_ns is not None
 
-    def hear(self, sender_ns: int, arrival_ns: int) -> None:
+    def add_sample(self, sender_ns: int, arrival_ns: int) -> None:
         """Update the offset with a sample.
 
         Parameters
@@ -66,23 +66,23 @@ class SenderClock:
         """
         if self._first_ns is None:
             self._first_ns, self._last_ns = arrival_ns, sender_ns
-        self._note(sender_ns // SECOND_NS, arrival_ns - sender_ns)
+        self._update_minimum(sender_ns // SECOND_NS, arrival_ns - sender_ns)
         wanted = min(least for _, least in self._least)
         if self.settled:
-            reach = round(self.SLEW * max(sender_ns - self._last_ns, 0))
+            reach = round(self.MAX_SLEW * max(sender_ns - self._last_ns, 0))
             change = wanted - self._offset_ns
-            if abs(change) < self.OTHER_PACE_NS:
+            if abs(change) < self.MAX_OFFSET_CHANGE_NS:
                 self._offset_ns += min(max(change, -reach), reach)
         else:
             self._offset_ns = wanted
             self.settled = arrival_ns - self._first_ns >= self._settle_ns
         self._last_ns = max(sender_ns, self._last_ns)
 
-    def host_ns(self, sender_ns: int) -> int:
+    def to_host_ns(self, sender_ns: int) -> int:
         """Convert a time of the sender's clock to this computer's time; needs an earlier sample."""
         return sender_ns + self._offset_ns
 
-    def _note(self, second: int, difference_ns: int) -> None:
+    def _update_minimum(self, second: int, difference_ns: int) -> None:
         if self._least and self._least[-1][0] == second:
             difference_ns = min(difference_ns, self._least.pop()[1])
         self._least.append((second, difference_ns))

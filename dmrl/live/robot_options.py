@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dmrl.errors import SettingError
-from dmrl.live.camera_link import address
-from dmrl.live.log_blocks import number_of
+from dmrl.live.camera_link import parse_address
+from dmrl.live.log_blocks import parse_robot_number
 
-ROBOT = re.compile(r"[A-Za-z0-9_-]+")
+ROBOT_NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @dataclass(frozen=True, slots=True)
-class Robot:
+class RobotOptions:
     """One robot to record.
 
     Parameters
@@ -34,7 +34,7 @@ class Robot:
     calibration: Path | None = None
 
 
-def robot_of(text: str) -> Robot:
+def parse_robot(text: str) -> RobotOptions:
     """Parse a robot from the command line: ``cf1=URI[,camera=HOST:PORT][,calibration=FILE]``.
 
     Raises
@@ -44,19 +44,19 @@ def robot_of(text: str) -> Robot:
     """
     name, equals, rest = text.partition("=")
     uri, *options = rest.split(",")
-    if not equals or not ROBOT.fullmatch(name) or not uri:
+    if not equals or not ROBOT_NAME.fullmatch(name) or not uri:
         raise SettingError(
             f"--robot {text}: not NAME=URI. Use, for example, cf1=radio://0/80/2M/E7E7E7E7E7"
         )
     given = dict(option.partition("=")[::2] for option in options)
     if unknown := sorted(given.keys() - {"camera", "calibration"}):
         raise SettingError(f"--robot {text}: no option {unknown[0]}. Use camera or calibration")
-    camera = address(given["camera"]) if "camera" in given else None
+    camera = parse_address(given["camera"]) if "camera" in given else None
     calibration = Path(given["calibration"]) if "calibration" in given else None
-    return Robot(name, uri, camera, calibration)
+    return RobotOptions(name, uri, camera, calibration)
 
 
-def peers_of(robot: str, names: Sequence[str], given: Sequence[str]) -> dict[int, str]:
+def parse_peers(robot: str, names: Sequence[str], given: Sequence[str]) -> dict[int, str]:
     """Return the peers of a robot's ``ranging.distance<number>``, by number.
 
     Parameters
@@ -76,10 +76,10 @@ def peers_of(robot: str, names: Sequence[str], given: Sequence[str]) -> dict[int
     found: dict[int, str] = {}
     for text in given:
         number, equals, name = text.partition("=")
-        if not equals or not number.isdecimal() or not ROBOT.fullmatch(name):
+        if not equals or not number.isdecimal() or not ROBOT_NAME.fullmatch(name):
             raise SettingError(f"--peer {text}: not N=NAME. Use, for example, 1=cf2")
         found[int(number)] = name
     if not given:
-        numbers = {name: number_of(name) for name in names}
+        numbers = {name: parse_robot_number(name) for name in names}
         found = {number: name for name, number in numbers.items() if number is not None}
     return {number: name for number, name in found.items() if name != robot}

@@ -11,16 +11,16 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from dmrl.errors import one_line
-from dmrl.live.crazyflie_link import Link
-from dmrl.live.queue import Health
+from dmrl.errors import to_one_line
+from dmrl.live.crazyflie_link import CrazyflieLink
+from dmrl.live.queue import LinkStatus
 
-RATE_S = 1.0
+RATE_WINDOW_S = 1.0
 """Shortest window over which rates are measured."""
-LOW_BATTERY_V = 3.5
+BATTERY_LOW_V = 3.5
 
 
-class _Rate:
+class _RateMeter:
     """Rate at which a count increases, per second."""
 
     def __init__(self) -> None:
@@ -28,13 +28,13 @@ class _Rate:
 
     def update(self, count: int) -> float:
         passed_s = time.monotonic() - self._since_s
-        if passed_s >= RATE_S:
+        if passed_s >= RATE_WINDOW_S:
             self.per_s = (count - self._count) / passed_s
             self._since_s, self._count = time.monotonic(), count
         return self.per_s
 
 
-class LiveTable:
+class StatusTable:
     """Status table on a terminal; elsewhere only messages are printed.
 
     Parameters
@@ -45,10 +45,10 @@ class LiveTable:
         Status of the cameras.
     """
 
-    def __init__(self, links: Sequence[Link], cameras: Sequence[Health]) -> None:
+    def __init__(self, links: Sequence[CrazyflieLink], cameras: Sequence[LinkStatus]) -> None:
         self._links = links
         self._healths = [*(link.health for link in links), *cameras]
-        self._rates = {health.source: _Rate() for health in self._healths}
+        self._rates = {health.source: _RateMeter() for health in self._healths}
         self._console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
         self._live: Live | None = None
         self._started_s = time.monotonic()
@@ -68,9 +68,9 @@ class LiveTable:
         if self._live is not None:
             self._live.stop()
 
-    def say(self, line: str) -> None:
+    def print_message(self, line: str) -> None:
         """Print a message above the table."""
-        self._console.print(one_line(line))
+        self._console.print(to_one_line(line))
 
     def update(self, messages: int) -> None:
         """Draw the table again.
@@ -83,9 +83,9 @@ class LiveTable:
         rates = {h.source: self._rates[h.source].update(h.received) for h in self._healths}
         if self._live is not None:
             with suppress(BlockingIOError):
-                self._live.update(self._table(rates, messages), refresh=True)
+                self._live.update(self._build_table(rates, messages), refresh=True)
 
-    def _table(self, rates: dict[str, float], messages: int) -> Table:
+    def _build_table(self, rates: dict[str, float], messages: int) -> Table:
         passed_s = int(time.monotonic() - self._started_s)
         title = f"{passed_s // 60}:{passed_s % 60:02d}  {messages} messages  (Ctrl-C ends it)"
         table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
@@ -96,18 +96,18 @@ class LiveTable:
         for health in self._healths:
             rate = f"{rates[health.source]:.1f}"
             counts = (rate, str(health.lost), str(health.broken))
-            more = _of_robot(links[health.source]) if health.source in links else ("", "")
+            more = _describe_robot(links[health.source]) if health.source in links else ("", "")
             table.add_row(health.source, health.state, *counts, *more)
         return table
 
 
-def _of_robot(link: Link) -> tuple[str, str]:
+def _describe_robot(link: CrazyflieLink) -> tuple[str, str]:
     """Return battery and distances of a robot, as text."""
     reading = link.reading
     if reading is None:
         return "", ""
     battery = "" if reading.battery_v is None else f"{reading.battery_v:.2f} V"
-    if reading.battery_v is not None and reading.battery_v < LOW_BATTERY_V:
+    if reading.battery_v is not None and reading.battery_v < BATTERY_LOW_V:
         battery += " low"
     ranges = ", ".join(f"{peer} {value:.2f} m" for peer, value in sorted(reading.ranges_m.items()))
     return battery, ranges

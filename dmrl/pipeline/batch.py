@@ -13,13 +13,13 @@ from glob import has_magic
 from pathlib import Path
 from typing import Any
 
-from dmrl.atomic_output import note
+from dmrl.atomic_output import register_output
 from dmrl.errors import DmrlError, OutputError, RecordingError, SettingError
-from dmrl.guards.paths import refuse_no_text
+from dmrl.guards.paths import require_text_path
 from dmrl.pipeline.cluster.slurm import write_array_job
 from dmrl.pipeline.executor import SLURM, Executor, open_executor
 from dmrl.pipeline.job import JobResult, build_job, has_failed
-from dmrl.storage import Remote
+from dmrl.storage import RemotePath
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_line, print_table
 
@@ -100,9 +100,9 @@ def find_all_recordings(named: Iterable[Path], query: str | None = None) -> list
         If the query is wrong, or true of none.
     """
     if query is not None:
-        from dmrl.catalogue.query import found_in  # noqa: PLC0415 - an extra
+        from dmrl.catalogue.query import find_recordings as query_catalogue  # noqa: PLC0415 - an extra
 
-        found = [path for folder in named for path in found_in(folder, query)]
+        found = [path for folder in named for path in query_catalogue(folder, query)]
         if not found:
             raise SettingError(f"--from-index {query!r} is true of no recording. Ask: dmrl find")
         return found
@@ -110,7 +110,7 @@ def find_all_recordings(named: Iterable[Path], query: str | None = None) -> list
 
 
 def _list_below(folder: Path, but: Path | None) -> list[Path]:
-    if isinstance(folder, Remote):
+    if isinstance(folder, RemotePath):
         return list(_iter_remote(folder, but))
     found = []
     for where, folders, names in os.walk(folder):
@@ -121,7 +121,7 @@ def _list_below(folder: Path, but: Path | None) -> list[Path]:
     return found
 
 
-def _iter_remote(folder: Remote, but: Path | None) -> Iterator[Path]:
+def _iter_remote(folder: RemotePath, but: Path | None) -> Iterator[Path]:
     for path in folder.rglob("*.mcap"):
         hidden = any(part.startswith(".") for part in path.parts[len(folder.parts) :])
         if not (hidden or (but is not None and path.is_relative_to(but))):
@@ -193,12 +193,12 @@ def iter_results(
         answer = answers.pop(k).result()
         place = tasks[k].out
         if place is not None and not has_failed(answer):
-            note(place)
+            register_output(place)
         yield tasks[k], answer
 
 
 def _file_size(path: Path) -> int:
-    if isinstance(path, Remote):
+    if isinstance(path, RemotePath):
         return 0  # to ask would cost a request for each
     try:
         return path.stat().st_size
@@ -281,10 +281,10 @@ def _name_outputs(source: Path, out: Path) -> tuple[Mapping[Path, Path], Path]:
 
 def _make_folders(out: Path, tasks: Iterable[Task]) -> list[Path]:
     """Create the folders of all outputs; return the new ones, the deepest first."""
-    refuse_no_text(out)
+    require_text_path(out)
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file. Many recordings go into a folder: name one")
-    if isinstance(out, Remote):
+    if isinstance(out, RemotePath):
         return []  # a bucket has no folders
     if not out.parent.is_dir():
         raise OutputError(f"no folder {out.parent} to make {out.name} in. Try: mkdir -p {out}")

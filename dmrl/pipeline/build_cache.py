@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from dmrl import __version__
-from dmrl.atomic_output import rewritten_file
+from dmrl.atomic_output import replace_file
 from dmrl.errors import OutputError
 from dmrl.guards.bounded_parsing import parse_json
-from dmrl.recording.provenance_inputs import sha256_of_file, sha256_of_folder
-from dmrl.storage import Remote
+from dmrl.recording.provenance_inputs import hash_file, hash_folder
+from dmrl.storage import RemotePath
 
 
 @dataclass(slots=True)
@@ -62,7 +62,7 @@ class BuildCache:
     def save(self) -> None:
         """Write the cache, atomically."""
         kept = {key: value for key, value in asdict(self).items() if key != "file"}
-        with rewritten_file(self.file) as partial:
+        with replace_file(self.file) as partial:
             partial.write_text(json.dumps(kept, indent=0) + "\n", encoding="utf-8")
 
     def get_sha256(self, path: Path) -> str:
@@ -76,7 +76,7 @@ class BuildCache:
         looks = _fingerprint(path)
         known = self.hashes.get(str(path))
         if known is None or known[0] != looks:
-            digest = sha256_of_folder(path) if path.is_dir() else sha256_of_file(path)
+            digest = hash_folder(path) if path.is_dir() else hash_file(path)
             self.hashes[str(path)] = known = [looks, digest]
         return known[1]
 
@@ -123,8 +123,8 @@ def _fingerprint(path: Path) -> str:
 
 
 def _iter_files(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
-    if isinstance(folder, Remote):
-        for one in folder.below():
+    if isinstance(folder, RemotePath):
+        for one in folder.list_files():
             yield str(one.relative_to(folder)), one.stat()
         return
     for where, _, names in os.walk(folder):

@@ -18,18 +18,18 @@ from pathlib import Path
 from typing import Any
 
 from dmrl import recipe as recipes
-from dmrl.errors import BusyOutput, FullDisk, MissingExtra, OutputError, words_of
+from dmrl.errors import BusyOutput, FullDisk, MissingExtra, OutputError, describe_error
 from dmrl.pipeline.job import JobResult
 from dmrl.pipeline.stage_signature import StageSignature, signature_of
-from dmrl.recording import Provenance, provenance
-from dmrl.recording.provenance_inputs import input_of, sha256_of_file, sha256_of_folder
-from dmrl.storage import path_of
+from dmrl.recording import Provenance, build_provenance
+from dmrl.recording.provenance_inputs import build_input, hash_file, hash_folder
+from dmrl.storage import to_path
 
 
 def run_job(line: str) -> JobResult:
     """Run a job; return its result, an error that the user can fix, or a bug of dmrl."""
     told = json.loads(line)
-    out = path_of(told["out"]) if told["out"] else None
+    out = to_path(told["out"]) if told["out"] else None
     try:
         takes = signature_of(told["stage"], writes=out is not None)
         given = _parse_arguments(told, takes)
@@ -41,13 +41,13 @@ def run_job(line: str) -> JobResult:
         result = takes.run(**given, out=out)
         if told["keep"]:
             return {"result": _to_json(result)}
-        return {"sha256": sha256_of_folder(out) if out.is_dir() else sha256_of_file(out)}
+        return {"sha256": hash_folder(out) if out.is_dir() else hash_file(out)}
     except BusyOutput as e:
         return {"error": str(e), "retry": "later"}
     except (FullDisk, MissingExtra) as e:
         return {"error": str(e), "retry": "elsewhere"}
     except Exception as e:
-        if words := words_of(e):
+        if words := describe_error(e):
             return {"error": words}
         traceback.print_exc()
         return {"bug": f"{type(e).__name__}: {e}"}
@@ -55,12 +55,12 @@ def run_job(line: str) -> JobResult:
 
 def _parse_arguments(told: dict[str, Any], takes: StageSignature) -> dict[str, Any]:
     found: dict[str, Any] = {
-        role: [path_of(one) for one in given] if isinstance(given, list) else path_of(given)
+        role: [to_path(one) for one in given] if isinstance(given, list) else to_path(given)
         for role, given in told["inputs"].items()
     }
     given = dict(told["settings"])
     for name, hint in takes.others.items():
-        found[name] = recipes.argument(given.pop(name), hint)
+        found[name] = recipes.to_argument(given.pop(name), hint)
     if takes.settings is not None:
         found["settings"] = recipes.check(told["stage"], given, takes.settings)
     if takes.resumes:
@@ -81,7 +81,7 @@ def _require_same_origin(
     out: Path, stage: str, takes: StageSignature, given: dict[str, Any]
 ) -> None:
     """Raise OutputError unless the provenance of an output names these inputs and settings."""
-    made = input_of(out).provenance
+    made = build_input(out).provenance
     wanted = (takes.origin or partial(_build_origin, stage, takes))(**given)
     same = (
         made is not None
@@ -101,7 +101,9 @@ def _build_origin(stage: str, takes: StageSignature, **given: Any) -> Provenance
     settings = given.get("settings")
     values = [given[role] for role in takes.roles if role in given]
     values += [getattr(settings, name) for name in takes.paths]
-    return provenance(stage, settings, [path for path in _iter_paths(values) if path.exists()])
+    return build_provenance(
+        stage, settings, [path for path in _iter_paths(values) if path.exists()]
+    )
 
 
 def _iter_paths(value: Any) -> Iterator[Path]:

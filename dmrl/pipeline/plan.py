@@ -14,13 +14,13 @@ from typing import Any
 from dmrl import recipe as recipes
 from dmrl.errors import RecipeError, UnsafeName
 from dmrl.evaluation import figure_specs
-from dmrl.geometry.camera_file import KNOWN
-from dmrl.guards.safe_names import file_name
+from dmrl.geometry.camera_file import NAMED_CAMERAS
+from dmrl.guards.safe_names import check_file_name
 from dmrl.learn import pretrained
 from dmrl.pipeline.recipe_language import expand_steps
 from dmrl.pipeline.stage_signature import StageSignature, signature_of
 
-RECIPE_KEYS = ("kind", "each", "defaults", "step", figure_specs.TITLE, figure_specs.KEY)
+RECIPE_KEYS = ("kind", "each", "defaults", "step", figure_specs.TITLE_KEY, figure_specs.FIGURE_KEY)
 STEP_KEYS = ("stage", "out", "optional", "recipe")
 DATA = "{data}"
 RECIPE_FILE, STATE_FILE, UNFINISHED = "recipe.toml", "pipeline.json", "unfinished"
@@ -122,7 +122,7 @@ def locate_input(name: str, outs: set[str], folder: Path, data: Path | None) -> 
         return data / name.removeprefix(DATA).lstrip("/")
     if name.split("/")[0] in outs:
         return folder / name
-    return pretrained.SHIPPED / name if name in pretrained.names() else Path(name)
+    return pretrained.PRETRAINED_DIR / name if name in pretrained.list_pretrained() else Path(name)
 
 
 def load_plan(name: str | Path) -> Plan:
@@ -140,8 +140,8 @@ def load_plan(name: str | Path) -> Plan:
     MissingExtra
         If a package that a stage needs is not installed.
     """
-    text, keys = recipes.text(name), recipes.read(name)
-    return Plan(tuple(_build_steps(name, keys)), text, figure_specs.KEY in keys)
+    text, keys = recipes.read_text(name), recipes.read(name)
+    return Plan(tuple(_build_steps(name, keys)), text, figure_specs.FIGURE_KEY in keys)
 
 
 def _build_steps(name: str | Path, recipe: Table) -> list[Step]:
@@ -154,9 +154,9 @@ def _build_steps(name: str | Path, recipe: Table) -> list[Step]:
         faults += [f"step.{number}.{fault}" for fault in wrong]
         found.append((number, step))
     faults += _check_names(found)
-    faults += figure_specs.faults(recipe, {step.out for _, step in found})
+    faults += figure_specs.iter_faults(recipe, {step.out for _, step in found})
     if faults:
-        raise recipes.faulty(name, dict.fromkeys(faults))
+        raise recipes.recipe_error(name, dict.fromkeys(faults))
     steps = [step for _, step in found]
     try:
         Plan(tuple(steps), "").order.prepare()
@@ -226,12 +226,12 @@ def _unknown_key(stage: str, key: str, takes: StageSignature) -> str:
 
 def _check_settings(takes: StageSignature, given: Table) -> list[str]:
     own = {key: value for key, value in given.items() if key not in takes.others}
-    faults = recipes.faults(own, takes.settings) if takes.settings else []
+    faults = recipes.find_faults(own, takes.settings) if takes.settings else []
     missing = [f"{key}: is required" for key in takes.others if key not in given]
     others = [
         f"{key}: {fault}"
         for key, hint in takes.others.items()
-        if key in given and (fault := recipes.argument_fault(given[key], hint))
+        if key in given and (fault := recipes.find_argument_fault(given[key], hint))
     ]
     return [*faults, *missing, *others]
 
@@ -253,7 +253,7 @@ def _check_names(found: Sequence[tuple[int, Step]]) -> Iterator[str]:
 
 def _check_output_name(name: str) -> str:
     try:
-        file_name(name, "out")
+        check_file_name(name, "out")
     except UnsafeName:
         return f"{name[:80]!r} is no plain name. No slashes, no braces, no dot in front"
     if "{" in name or "}" in name:
@@ -268,7 +268,12 @@ def _check_source_name(name: str, outs: set[str]) -> str:
     head, *_ = name.split("/")
     if ".." in PurePosixPath(name).parts:
         return "which leads out of its folder. Write it without .."
-    if head in outs or head == DATA or name in KNOWN or name in pretrained.names():
+    if (
+        head in outs
+        or head == DATA
+        or name in NAMED_CAMERAS
+        or name in pretrained.list_pretrained()
+    ):
         return ""
     if name.startswith("/"):
         return "" if Path(name).exists() else "which is not there. Check the name"

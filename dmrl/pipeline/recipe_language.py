@@ -50,7 +50,7 @@ def expand_steps(recipe: Mapping[str, Any], faults: list[str]) -> list[tuple[int
         faults.append("step: at least one [[step]] is required")
         return []
     made: list[tuple[int, Table]] = []
-    room = [limits.STEPS, limits.GATHERED, limits.STEP_CHARACTERS]
+    room = [limits.STEPS, limits.GATHERED_VALUES, limits.STEP_CHARACTERS]
     used = _find_used_names(steps, defaults)
     for number, step in enumerate(steps, start=1):
         where = f"step.{number}"

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dmrl.atomic_output import as_output_error, partial_of, rewritten_file
+from dmrl.atomic_output import as_output_error, replace_file, to_partial_path
 from dmrl.errors import OutputError, SettingError
-from dmrl.evaluation.pipeline_summary import Done
-from dmrl.guards.paths import refuse_no_text
+from dmrl.evaluation.pipeline_summary import StepOutcome
+from dmrl.guards.paths import require_text_path
 from dmrl.pipeline.build_cache import BuildCache
 from dmrl.pipeline.executor import open_executor
 from dmrl.pipeline.plan import (
@@ -28,13 +28,13 @@ from dmrl.pipeline.plan import (
     locate_input,
 )
 from dmrl.pipeline.runner import Runner
-from dmrl.storage import Remote
+from dmrl.storage import RemotePath
 from dmrl.storage.upload import require_bucket
 from dmrl.terminal.progress import say
 
-__all__ = ["Done", "Plan", "Step", "load_plan", "read_recipe_text", "run"]
+__all__ = ["Plan", "Step", "StepOutcome", "load_plan", "read_recipe_text", "run"]
 
-LEFTOVER_NAMES = (UNFINISHED, partial_of(Path(STATE_FILE)).name)
+LEFTOVER_NAMES = (UNFINISHED, to_partial_path(Path(STATE_FILE)).name)
 """Files that remain if a disk failed before a pipeline began."""
 
 
@@ -45,7 +45,7 @@ def run(
     *,
     workers: int | None = None,
     on: str | None = None,
-) -> list[Done]:
+) -> list[StepOutcome]:
     """Run the steps of a pipeline recipe whose outputs are not there, or not up to date.
 
     Parameters
@@ -114,12 +114,12 @@ def _check_data(name: str | Path, plan: Plan, data: Path | None) -> None:
 @contextmanager
 def _lock_folder(out: Path) -> Iterator[Path]:
     """Lock the folder of outputs for this process; in a bucket nothing can be locked."""
-    if isinstance(out, Remote):
+    if isinstance(out, RemotePath):
         _refuse_foreign_folder(out)
         require_bucket(out)
         yield out
         return
-    refuse_no_text(out)
+    require_text_path(out)
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file. Name a folder: --out DIR")
     try:
@@ -172,5 +172,5 @@ def read_recipe_text(folder: Path) -> str | None:
 def _write_recipe(folder: Path, plan: Plan) -> None:
     """Write the recipe into the folder of its outputs."""
     kept = folder / RECIPE_FILE
-    with rewritten_file(kept) as partial:
+    with replace_file(kept) as partial:
         partial.write_text(plan.text, encoding="utf-8")

@@ -9,15 +9,15 @@ from time import perf_counter
 from typing import Any
 
 from dmrl import recipe as recipes
-from dmrl.atomic_output import note, partial_of
+from dmrl.atomic_output import register_output, to_partial_path
 from dmrl.errors import DmrlError, OutputError
-from dmrl.evaluation.pipeline_summary import Done
+from dmrl.evaluation.pipeline_summary import StepOutcome
 from dmrl.pipeline.build_cache import BuildCache, build_key
 from dmrl.pipeline.executor import Executor
 from dmrl.pipeline.job import JobResult, build_job
 from dmrl.pipeline.plan import UNFINISHED, Plan, Step, find_producers, locate_input, map_strings
 from dmrl.pipeline.stage_signature import SETTINGS_WITHOUT_EFFECT
-from dmrl.storage import Remote
+from dmrl.storage import RemotePath
 from dmrl.terminal.progress import say
 
 
@@ -55,11 +55,11 @@ class Runner:
         self.outs = set(self.steps)
         self.order = plan.order
         self.running: dict[Future[JobResult], RunningStep] = {}
-        self.done: dict[str, Done] = {}
+        self.done: dict[str, StepOutcome] = {}
         self.failed: list[DmrlError] = []
         self._places = {out: k for k, out in enumerate(self.steps)}
 
-    def run(self) -> list[Done]:
+    def run(self) -> list[StepOutcome]:
         """Run all steps; return their outcomes in the order of the recipe.
 
         Raises
@@ -102,7 +102,7 @@ class Runner:
             self._fail_step(step, f"cannot read {e.filename}: {e.strerror}. Check it")
             return None
         if made:
-            self._mark_done(step, Done(step.stage, out, 0.0, skipped=True))
+            self._mark_done(step, StepOutcome(step.stage, out, 0.0, skipped=True))
             return None
         if out.exists() and not {step.out} & (self.memory.done.keys() | self.memory.begun.keys()):
             raise OutputError(f"{out} exists but this pipeline did not write it. Move or rename it")
@@ -117,7 +117,9 @@ class Runner:
             filled |= asdict(recipes.check(step.out, own, takes.settings))
         filled |= map_strings(step.path_settings, self._hash_input)
         matter = {
-            k: v for k, v in recipes.plain(filled).items() if k not in SETTINGS_WITHOUT_EFFECT
+            k: v
+            for k, v in recipes.to_json_values(filled).items()
+            if k not in SETTINGS_WITHOUT_EFFECT
         }
         return build_key(step.stage, matter, map_strings(dict(step.inputs), self._hash_input))
 
@@ -144,7 +146,7 @@ class Runner:
                 RunningStep(step, key, perf_counter()), self.memory.get_sha256(place)
             )
             return
-        partial = partial_of(place)
+        partial = to_partial_path(place)
         _remove_path(place)
         if step.signature.resumes and not same:
             _remove_path(partial)
@@ -177,7 +179,7 @@ class Runner:
     def _install_output(self, one: RunningStep, sha256: str) -> None:
         """Rename a complete output to its name, in place of the one before."""
         out, new = self.folder / one.step.out, self.folder / UNFINISHED / one.step.out
-        if isinstance(out, Remote):
+        if isinstance(out, RemotePath):
             new.replace(out)
         elif out.is_dir() or (out.exists() and new.is_dir()):
             old = new.with_name(f"{new.name}.old")
@@ -187,14 +189,14 @@ class Runner:
             _remove_path(old)
         else:
             new.replace(out)
-        note(out)
+        register_output(out)
         self.memory.done[one.step.out] = [one.key, sha256]
         self.memory.set_sha256(out, sha256)
         self.memory.save()
         seconds = perf_counter() - one.begun_s
-        self._mark_done(one.step, Done(one.step.stage, out, seconds, skipped=False))
+        self._mark_done(one.step, StepOutcome(one.step.stage, out, seconds, skipped=False))
 
-    def _mark_done(self, step: Step, done: Done) -> None:
+    def _mark_done(self, step: Step, done: StepOutcome) -> None:
         self.done[step.out] = done
         self.order.done(step.out)
 
@@ -205,12 +207,12 @@ class Runner:
             return
         say(f"{step.out} ({step.stage}) is left out. {words}")
         out = self.folder / step.out
-        self._mark_done(step, Done(step.stage, out, 0.0, skipped=False, left_out=True))
+        self._mark_done(step, StepOutcome(step.stage, out, 0.0, skipped=False, left_out=True))
 
 
 def _remove_path(path: Path) -> None:
-    if isinstance(path, Remote):
-        path.remove_all()
+    if isinstance(path, RemotePath):
+        path.remove_tree()
     elif path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

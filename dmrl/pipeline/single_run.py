@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dmrl.atomic_output import note
+from dmrl.atomic_output import register_output
 from dmrl.errors import DmrlError, SettingError
 from dmrl.pipeline.batch import Task, changed_settings, error_text
 from dmrl.pipeline.executor import SLURM, open_executor
@@ -50,5 +50,5 @@ def run_on_cluster(
         answer = crew.submit(line, exclusive=signature_of(stage).exclusive).result()
     if has_failed(answer):
         raise DmrlError(error_text(task, answer))
-    note(out)
+    register_output(out)
     return None if "up_to_date" in answer else answer["result"]

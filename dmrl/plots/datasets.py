@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.plots.style import SIZE_INCHES, STYLE, Figure, MaxNLocator, mpl, save
+from dmrl.plots.style import SIZE_INCHES, STYLE, Figure, MaxNLocator, mpl, save_figure
 
 
-def depth_histogram(depth_m: Mapping[str, NDArray[np.float64]], stem: Path) -> None:
+def plot_depth_histogram(depth_m: Mapping[str, NDArray[np.float64]], stem: Path) -> None:
     """Plot a histogram of the peers' depths, one colour per split.
 
     Parameters
@@ -31,10 +31,10 @@ def depth_histogram(depth_m: Mapping[str, NDArray[np.float64]], stem: Path) -> N
         axes.set_title("Depth of the peers")
         axes.grid(axis="y", alpha=0.3)
         figure.legend(title="split (peers)", loc="outside right upper")
-    save(figure, stem)
+    save_figure(figure, stem)
 
 
-def position_heat(
+def plot_position_heat(
     uv_px: NDArray[np.float64], width_px: int, height_px: int, cell_px: int, stem: Path
 ) -> None:
     """Plot a heat map of the peers' positions in the image.
@@ -62,10 +62,10 @@ def position_heat(
         )
         axes.set_title(f"Peers per square of {cell_px} x {cell_px} px ({len(uv_px)} peers)")
         figure.colorbar(heat, label="peers", shrink=0.8, ticks=MaxNLocator(integer=True))
-    save(figure, stem)
+    save_figure(figure, stem)
 
 
-def peers_per_image(counts: Mapping[str, NDArray[np.int64]], stem: Path) -> None:
+def plot_peers_per_image(counts: Mapping[str, NDArray[np.int64]], stem: Path) -> None:
     """Plot a bar chart of the number of peers per image, one colour per split.
 
     Parameters
@@ -89,4 +89,4 @@ def peers_per_image(counts: Mapping[str, NDArray[np.int64]], stem: Path) -> None
         axes.set_title("Peers per image")
         axes.grid(axis="y", alpha=0.3)
         figure.legend(title="split (images)", loc="outside right upper")
-    save(figure, stem)
+    save_figure(figure, stem)

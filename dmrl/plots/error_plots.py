@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.plots.style import SIZE_INCHES, STYLE, Figure, mpl, plain_numbers, save
+from dmrl.plots.style import SIZE_INCHES, STYLE, Figure, mpl, save_figure, use_plain_numbers
 
 
-def error_violins(
+def plot_error_violins(
     u_px: NDArray[np.float64], v_px: NDArray[np.float64], depth_m: NDArray[np.float64], stem: Path
 ) -> None:
     """Plot violins of the errors in u, v and depth, as in the paper.
@@ -25,15 +25,15 @@ def error_violins(
     with mpl.rc_context(STYLE):
         figure = Figure(SIZE_INCHES, layout="constrained")
         pixels, metres = figure.subplots(1, 2, width_ratios=(2, 1))
-        _violins(pixels, {"u": u_px, "v": v_px}, 24.0)
+        _draw_violins(pixels, {"u": u_px, "v": v_px}, 24.0)
         pixels.set(ylabel="pixel error, px", title=f"{len(u_px)} labels")
-        _violins(metres, {"depth": depth_m}, 0.6)
+        _draw_violins(metres, {"depth": depth_m}, 0.6)
         metres.set(ylabel="depth error, m")
         figure.supxlabel("label minus detection; line: median, bar: middle half", fontsize=9)
-    save(figure, stem)
+    save_figure(figure, stem)
 
 
-def _violins(axes: Any, errors: Mapping[str, NDArray[np.float64]], least: float) -> None:
+def _draw_violins(axes: Any, errors: Mapping[str, NDArray[np.float64]], least: float) -> None:
     """Draw one violin per name over the values inside the axis, and count the others."""
     known = {name: values[np.isfinite(values)] for name, values in errors.items()}
     spread = [np.percentile(np.abs(values), 80) for values in known.values() if values.size]
@@ -54,7 +54,7 @@ def _violins(axes: Any, errors: Mapping[str, NDArray[np.float64]], least: float)
     axes.grid(axis="y", alpha=0.3)
 
 
-def error_trace(
+def plot_error_trace(
     title: str,
     time_s: NDArray[np.float64],
     sigma_m: NDArray[np.float64],
@@ -97,10 +97,10 @@ def error_trace(
         handles, names = figure.axes[0].get_legend_handles_labels()
         how = {"fontsize": 8, "markerscale": 4, "frameon": False, "ncols": 4}
         figure.legend(handles, names, loc="outside lower center", **how)
-    save(figure, stem)
+    save_figure(figure, stem)
 
 
-def error_by_distance(
+def plot_error_by_distance(
     distance_m: NDArray[np.float64],
     error_px: NDArray[np.float64],
     depth_error_m: NDArray[np.float64],
@@ -131,11 +131,11 @@ def error_by_distance(
         shown_px = np.maximum(error_px[found], 0.1)
         for axes, values in ((pixels, shown_px), (metres, depth_error_m[found])):
             axes.plot(distance_m[found], values, ".", alpha=0.5, label="label")
-            edges, medians = _medians(distance_m[found], values, step_m)
+            edges, medians = _medians_by_step(distance_m[found], values, step_m)
             axes.stairs(medians, edges, color="black", baseline=None, linewidth=2, label="median")
             axes.grid(alpha=0.3)
         pixels.set(yscale="log", ylabel="pixel error, px", title=f"{found.sum()} labels")
-        plain_numbers(pixels.yaxis)
+        use_plain_numbers(pixels.yaxis)
         for radius_px in (8, 20):
             pixels.axhline(radius_px, color="grey", linestyle=":", linewidth=1)
             pixels.annotate(
@@ -147,10 +147,10 @@ def error_by_distance(
         handles, names = metres.get_legend_handles_labels()
         how = {"fontsize": 9, "frameon": False, "ncols": 2}
         figure.legend(handles, names, loc="outside lower center", **how)
-    save(figure, stem)
+    save_figure(figure, stem)
 
 
-def _medians(
+def _medians_by_step(
     at: NDArray[np.float64], values: NDArray[np.float64], step: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return edges of equal bins from zero, and the median in each, NaN in empty ones."""

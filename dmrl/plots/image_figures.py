@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.colours import RGB
-from dmrl.plots.style import STYLE, Figure, mpl, save, withStroke
+from dmrl.plots.style import STYLE, Figure, mpl, save_figure, withStroke
 
 Box = tuple[float, float, float, float]
 CELL_INCHES = (3.4, 2.6)
 """Size of an image in a gallery."""
 CIRCLE_POINTS, TEXT_POINTS = (19.0, 19.0), (42.0, 11.0)
 """Width and height of a detection's circle and text in a gallery."""
-PLACES = [(x, y) for y in (0.0, -16.0, 16.0, -30.0, 30.0) for x in (33.0, -33.0, 0.0) if x or y]
+TEXT_OFFSETS_POINTS = [
+    (x, y) for y in (0.0, -16.0, 16.0, -30.0, 30.0) for x in (33.0, -33.0, 0.0) if x or y
+]
 """Offsets of the text's middle from a detection, points right and up, best first."""
 
 
@@ -47,7 +49,7 @@ class Example:
     source: str
 
 
-def examples(shown: Sequence[Example], stem: Path, *, depth_max_m: float = 3.0) -> None:
+def plot_examples(shown: Sequence[Example], stem: Path, *, depth_max_m: float = 3.0) -> None:
     """Plot one row per example: image with labels and detections, confidence map, depth map.
 
     Parameters
@@ -73,7 +75,7 @@ def examples(shown: Sequence[Example], stem: Path, *, depth_max_m: float = 3.0) 
                 row[2].imshow(example.depth_m, vmin=0, vmax=depth_max_m, cmap="turbo", **at),
             ]
             for axes in row:
-                _mark(axes, example)
+                _draw_markers(axes, example)
                 axes.set(xticks=[], yticks=[])
         for column, (image, name) in enumerate(
             zip(maps, ("confidence", "depth, m"), strict=True), start=1
@@ -81,10 +83,10 @@ def examples(shown: Sequence[Example], stem: Path, *, depth_max_m: float = 3.0) 
             figure.colorbar(image, ax=grid[:, column], location="bottom", shrink=0.8, label=name)
         handles, names = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower left", ncols=2, frameon=False)
-    save(figure, stem)
+    save_figure(figure, stem)
 
 
-def _mark(axes: Any, example: Example) -> None:
+def _draw_markers(axes: Any, example: Example) -> None:
     """Draw labels as squares and detections as crosses, in their colours with a dark rim."""
     marks = (
         (example.labels_px, "s", 9, example.source, f"label ({example.source})"),
@@ -105,7 +107,7 @@ def _mark(axes: Any, example: Example) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Circled:
+class GalleryImage:
     """An image with its detections.
 
     Parameters
@@ -126,7 +128,7 @@ class Circled:
     depth_m: NDArray[np.float64]
 
 
-def gallery(shown: Sequence[Circled], stem: Path, *, columns: int = 3) -> None:
+def plot_gallery(shown: Sequence[GalleryImage], stem: Path, *, columns: int = 3) -> None:
     """Plot images with a white circle around every detection, and its depth, as in the paper.
 
     Parameters
@@ -149,14 +151,14 @@ def gallery(shown: Sequence[Circled], stem: Path, *, columns: int = 3) -> None:
             height, width = example.rgb.shape[:2]
             axes.imshow(example.rgb, extent=(0, width, height, 0))
             axes.set_title(example.title, fontsize=8, loc="left")
-            _circles(axes, example, width, height)
+            _draw_circles(axes, example, width, height)
             axes.set(xlim=(0, width), ylim=(height, 0))
-    save(figure, stem)
+    save_figure(figure, stem)
 
 
-def _circles(axes: Any, example: Circled, width: int, height: int) -> None:
+def _draw_circles(axes: Any, example: GalleryImage, width: int, height: int) -> None:
     """Draw white circles with a black rim, and depths beside them where there is room."""
-    places = _text_places(example.uv_px, width, height)
+    places = _place_texts(example.uv_px, width, height)
     for (u, v), (text_u, text_v), depth_m in zip(
         example.uv_px.tolist(), places, example.depth_m.tolist(), strict=True
     ):
@@ -175,16 +177,16 @@ def _circles(axes: Any, example: Circled, width: int, height: int) -> None:
         )
 
 
-def _text_places(uv_px: NDArray[np.float64], width: int, height: int) -> list[tuple[float, float]]:
+def _place_texts(uv_px: NDArray[np.float64], width: int, height: int) -> list[tuple[float, float]]:
     """Place the middle of each text, pixels, avoiding circles and other texts where possible."""
     point_px = width / (72 * CELL_INCHES[0])
-    taken = [_box((u, v), point_px, CIRCLE_POINTS) for u, v in uv_px.tolist()]
+    taken = [_text_box((u, v), point_px, CIRCLE_POINTS) for u, v in uv_px.tolist()]
     out = []
     for u, v in uv_px.tolist():
         level = min(max(v, 8.0), height - 8.0)
-        tried = [(u + right * point_px, level - up * point_px) for right, up in PLACES]
-        boxes = [_box(middle, point_px, TEXT_POINTS) for middle in tried]
-        free = [_inside(box, width, height) and not _meets(box, taken) for box in boxes]
+        tried = [(u + right * point_px, level - up * point_px) for right, up in TEXT_OFFSETS_POINTS]
+        boxes = [_text_box(middle, point_px, TEXT_POINTS) for middle in tried]
+        free = [_is_inside(box, width, height) and not _overlaps_any(box, taken) for box in boxes]
         # Without any free place, use the side that is inside the image.
         best = free.index(True) if any(free) else int(u > 0.75 * width)
         taken.append(boxes[best])
@@ -192,17 +194,17 @@ def _text_places(uv_px: NDArray[np.float64], width: int, height: int) -> list[tu
     return out
 
 
-def _box(middle: tuple[float, float], point_px: float, size: tuple[float, float]) -> Box:
+def _text_box(middle: tuple[float, float], point_px: float, size: tuple[float, float]) -> Box:
     """Return the left, upper, right and lower edge, pixels, of a box of this size in points."""
     (u, v), (half_u, half_v) = middle, (0.5 * point_px * side for side in size)
     return u - half_u, v - half_v, u + half_u, v + half_v
 
 
-def _inside(box: Box, width: int, height: int) -> bool:
+def _is_inside(box: Box, width: int, height: int) -> bool:
     return box[0] >= 0 and box[1] >= 0 and box[2] <= width and box[3] <= height
 
 
-def _meets(box: Box, others: Sequence[Box]) -> bool:
+def _overlaps_any(box: Box, others: Sequence[Box]) -> bool:
     return any(
         box[0] < other[2] and other[0] < box[2] and box[1] < other[3] and other[1] < box[3]
         for other in others
@@ -228,7 +230,7 @@ class MapPair:
     maps: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 
-def map_pairs(shown: Sequence[MapPair], stem: Path) -> None:
+def plot_map_pairs(shown: Sequence[MapPair], stem: Path) -> None:
     """Plot one row per image: the image, then confidence, then depth, by network or backend.
 
     Colours range from 0 to the largest confidence, and to the largest depth, of all rows.
@@ -261,4 +263,4 @@ def map_pairs(shown: Sequence[MapPair], stem: Path) -> None:
             figure.colorbar(drawn, ax=block, location="bottom", shrink=0.6, label=name)
         for axes in grid.flat:
             axes.set(xticks=[], yticks=[])
-    save(figure, stem)
+    save_figure(figure, stem)

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from dmrl.plots.style import METADATA, STYLE, Figure, mpl, withStroke
 
 AXES = (("x forward", "#e00000"), ("y left", "#007a00"), ("z up", "#0030e0"))
-BOX = "#404040"
+BOX_COLOUR = "#404040"
 VIEW_INCHES = 3.6
 NAME_PX = np.array([46.0, 14.0])
 """Distance from the end of an axis to its name, if horizontal and if vertical."""
-SHORTEST_PX = 30
+MIN_AXIS_PX = 30
 """Minimum length of a drawn axis. One that points at the camera is only a dot."""
 
 
@@ -41,7 +41,7 @@ class Side:
     edges_px: NDArray[np.float64]
 
 
-def model_sides(sides: Sequence[Side], title: str, size_m: Sequence[float]) -> bytes:
+def plot_model_sides(sides: Sequence[Side], title: str, size_m: Sequence[float]) -> bytes:
     """Plot a robot from several sides as PNG.
 
     Parameters
@@ -62,21 +62,21 @@ def model_sides(sides: Sequence[Side], title: str, size_m: Sequence[float]) -> b
         for axes in places:
             axes.axis("off")
         for axes, side in zip(places, sides, strict=False):
-            _side(axes, side)
+            _draw_side(axes, side)
         stream = io.BytesIO()
         figure.savefig(stream, format="png", dpi=150, metadata=METADATA[".png"])
     return stream.getvalue()
 
 
-def _side(axes: Any, side: Side) -> None:
+def _draw_side(axes: Any, side: Side) -> None:
     height, width = side.rgb.shape[:2]
     axes.imshow(side.rgb, extent=(0, width, height, 0))
     axes.set_title(side.name, fontsize=9)
     for ends in side.edges_px:
-        axes.plot(*ends.T, color=BOX, linewidth=0.8, linestyle=(0, (4, 3)))
+        axes.plot(*ends.T, color=BOX_COLOUR, linewidth=0.8, linestyle=(0, (4, 3)))
     rim = [withStroke(linewidth=2.5, foreground="white")]
     for (name, colour), (start, end) in zip(AXES, side.axes_px, strict=True):
-        if np.hypot(*(end - start)) < SHORTEST_PX:
+        if np.hypot(*(end - start)) < MIN_AXIS_PX:
             continue
         arrow = {"arrowstyle": "-|>", "color": colour, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", xy=end, xytext=start, arrowprops=arrow)

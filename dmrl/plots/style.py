@@ -11,7 +11,7 @@ from dmrl.errors import MissingExtra
 
 
 @contextmanager
-def _any_backend() -> Iterator[None]:
+def _ignore_backend() -> Iterator[None]:
     """Ignore MPLBACKEND while matplotlib is imported.
 
     Figures are written to files and need no backend, but matplotlib cannot be imported if the
@@ -29,7 +29,7 @@ def _any_backend() -> Iterator[None]:
 
 
 try:
-    with _any_backend():
+    with _ignore_backend():
         import matplotlib as mpl
         from matplotlib.figure import Figure
         from matplotlib.patheffects import withStroke
@@ -43,8 +43,8 @@ __all__ = [
     "Figure",
     "MaxNLocator",
     "mpl",
-    "plain_numbers",
-    "save",
+    "save_figure",
+    "use_plain_numbers",
     "withStroke",
 ]
 
@@ -61,20 +61,20 @@ METADATA = {".png": {"Software": None}, ".svg": {"Date": None, "Creator": None}}
 SIZE_INCHES = (6.0, 3.6)
 
 
-class _Plain(LogFormatter):
+class _PlainFormatter(LogFormatter):
     """Formatter with matplotlib's choice of numbers, written plainly."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         return f"{x:g}" if super().__call__(x, pos) else ""
 
 
-def plain_numbers(axis: Any) -> None:
+def use_plain_numbers(axis: Any) -> None:
     """Set plain numbers on a logarithmic axis: formulas are disabled, see `STYLE`."""
-    axis.set_major_formatter(_Plain())
-    axis.set_minor_formatter(_Plain(minor_thresholds=(1.5, 0.5)))
+    axis.set_major_formatter(_PlainFormatter())
+    axis.set_minor_formatter(_PlainFormatter(minor_thresholds=(1.5, 0.5)))
 
 
-def save(figure: Figure, stem: Path) -> None:
+def save_figure(figure: Figure, stem: Path) -> None:
     """Write ``<stem>.png`` and ``<stem>.svg``."""
     for suffix, metadata in METADATA.items():
         with mpl.rc_context(STYLE):

@@ -4,43 +4,54 @@ Times are log times in nanoseconds. `reader` reads messages, `writer` writes a r
 `summary` reads its topics and metadata. No other package imports mcap.
 """
 
-from dmrl.recording.attachments import copy_extras, splits
-from dmrl.recording.checks.check_recording import check, label_findings, say_findings
+from dmrl.recording.attachments import copy_metadata_and_attachments, read_splits
+from dmrl.recording.checks.check_recording import check, list_label_findings, print_findings
 from dmrl.recording.checks.finding import Finding
 from dmrl.recording.copying.edit import merge, trim
-from dmrl.recording.copying.resume import Interrupted, interrupted
-from dmrl.recording.copying.rewrite import Series, Timed, retime, rewrite, time_slices
-from dmrl.recording.licences import LICENCES_METADATA, licence_beside, licence_words, licences
-from dmrl.recording.loaded import Contents
-from dmrl.recording.log_times import log_times
+from dmrl.recording.copying.resume import InterruptedRecording, recover_interrupted
+from dmrl.recording.copying.rewrite import (
+    Series,
+    TimedMessage,
+    iter_time_slices,
+    rewrite,
+    shift_times,
+)
+from dmrl.recording.licences import (
+    LICENCES_METADATA,
+    extract_licence_title,
+    find_licence_file,
+    read_licences,
+)
+from dmrl.recording.loaded import LoadedRecording
+from dmrl.recording.log_times import read_log_times
 from dmrl.recording.mcap.channel import Channel, RawMessage
 from dmrl.recording.mcap.summary_index import TopicInfo
-from dmrl.recording.preview import glance
+from dmrl.recording.preview import sample_topics
 from dmrl.recording.provenance import Input, Provenance
-from dmrl.recording.provenance_inputs import input_of, provenance
+from dmrl.recording.provenance_inputs import build_input, build_provenance
 from dmrl.recording.reader import (
     Stamped,
-    columns,
-    matching,
-    parsed,
+    iter_columns,
+    iter_topic_batches,
+    match_topics,
+    parse_message,
     read,
     read_raw,
     read_table,
-    stretches,
 )
 from dmrl.recording.recover import recover
 from dmrl.recording.recovery import Recovery
-from dmrl.recording.summary import SPLIT_METADATA, Summary, summary
+from dmrl.recording.summary import SPLIT_METADATA, Summary, read_summary
 from dmrl.recording.writer import RecordingWriter
 
 __all__ = [
     "LICENCES_METADATA",
     "SPLIT_METADATA",
     "Channel",
-    "Contents",
     "Finding",
     "Input",
-    "Interrupted",
+    "InterruptedRecording",
+    "LoadedRecording",
     "Provenance",
     "RawMessage",
     "RecordingWriter",
@@ -48,33 +59,33 @@ __all__ = [
     "Series",
     "Stamped",
     "Summary",
-    "Timed",
+    "TimedMessage",
     "TopicInfo",
+    "build_input",
+    "build_provenance",
     "check",
-    "columns",
-    "copy_extras",
-    "glance",
-    "input_of",
-    "interrupted",
-    "label_findings",
-    "licence_beside",
-    "licence_words",
-    "licences",
-    "log_times",
-    "matching",
+    "copy_metadata_and_attachments",
+    "extract_licence_title",
+    "find_licence_file",
+    "iter_columns",
+    "iter_time_slices",
+    "iter_topic_batches",
+    "list_label_findings",
+    "match_topics",
     "merge",
-    "parsed",
-    "provenance",
+    "parse_message",
+    "print_findings",
     "read",
+    "read_licences",
+    "read_log_times",
     "read_raw",
+    "read_splits",
+    "read_summary",
     "read_table",
     "recover",
-    "retime",
+    "recover_interrupted",
     "rewrite",
-    "say_findings",
-    "splits",
-    "stretches",
-    "summary",
-    "time_slices",
+    "sample_topics",
+    "shift_times",
     "trim",
 ]

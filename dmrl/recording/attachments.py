@@ -4,28 +4,28 @@ from pathlib import Path
 
 from dmrl.errors import RecordingError
 from dmrl.guards.bounded_parsing import parse_json
-from dmrl.guards.safe_names import split_name
+from dmrl.guards.safe_names import check_split_name
 from dmrl.recording.mcap import checksums
 from dmrl.recording.provenance import METADATA_NAME
 from dmrl.recording.summary import SPLIT_METADATA, Summary
 from dmrl.recording.writer import RECIPE_NAME, RecordingWriter
 
 
-def copy_extras(found: Summary, out: RecordingWriter) -> None:
+def copy_metadata_and_attachments(summary: Summary, out: RecordingWriter) -> None:
     """Copy a recording's metadata and attachments into another.
 
     Provenance and recipe are left out: the provenance of the new recording includes them.
     """
-    for name, records in found.metadata.items():
+    for name, records in summary.metadata.items():
         if name not in (METADATA_NAME, checksums.METADATA_NAME):
             for values in records:
                 out.add_metadata(name, values)
-    for name, data in found.attachments.items():
+    for name, data in summary.attachments.items():
         if name != RECIPE_NAME:
             out.add_attachment(name, "application/octet-stream", data)
 
 
-def splits(path: Path, found: Summary) -> dict[str, list[tuple[int, int]]]:
+def read_splits(path: Path, summary: Summary) -> dict[str, list[tuple[int, int]]]:
     """Return the split that the source defines: name to log times in [first, last], nanoseconds.
 
     Parameters
@@ -44,9 +44,9 @@ def splits(path: Path, found: Summary) -> dict[str, list[tuple[int, int]]]:
     """
     out: dict[str, list[tuple[int, int]]] = {}
     try:
-        for record in found.metadata.get(SPLIT_METADATA, []):
+        for record in summary.metadata.get(SPLIT_METADATA, []):
             for name, ranges in record.items():
-                split_name(name, f"{path}: a split")
+                check_split_name(name, f"{path}: a split")
                 out.setdefault(name, []).extend((int(a), int(b)) for a, b in parse_json(ranges))
     except (ValueError, TypeError) as e:
         raise RecordingError(

@@ -3,32 +3,34 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from dmrl.recording.summary import Summary, summary
+from dmrl.recording.summary import Summary, read_summary
 
 LICENCES_METADATA = "dmrl.licences"
-NAMES = ("LICENSE", "LICENCE", "COPYING")
+LICENCE_STEMS = ("LICENSE", "LICENCE", "COPYING")
 """Names of licence files without their suffix."""
-LINE_MAX = 100
+TITLE_CHARACTERS_MAX = 100
 """Longest licence title, characters."""
 
 
-def licence_beside(source: Path) -> Path | None:
+def find_licence_file(source: Path) -> Path | None:
     """Return the licence file in a folder, or next to a file; None if there is none."""
     folder = source if source.is_dir() else source.parent
     try:
-        return next((p for p in sorted(folder.iterdir()) if p.stem in NAMES and p.is_file()), None)
+        return next(
+            (p for p in sorted(folder.iterdir()) if p.stem in LICENCE_STEMS and p.is_file()), None
+        )
     except OSError:  # the folder cannot be listed
         return None
 
 
-def licence_words(path: Path) -> str:
+def extract_licence_title(path: Path) -> str:
     """Return the first line with text of a licence file, usually the licence's name."""
     text = path.read_text(encoding="utf-8", errors="replace")
     lines = (line.strip(" #*") for line in text.splitlines())
-    return next((line for line in lines if line), "empty")[:LINE_MAX]
+    return next((line for line in lines if line), "empty")[:TITLE_CHARACTERS_MAX]
 
 
-def licences(recordings: Sequence[Path]) -> dict[str, str]:
+def read_licences(recordings: Sequence[Path]) -> dict[str, str]:
     """Return the licences of the sources of some recordings, by source name.
 
     Raises
@@ -36,7 +38,7 @@ def licences(recordings: Sequence[Path]) -> dict[str, str]:
     RecordingError
         If a recording cannot be read.
     """
-    return dict(sorted(pair for path in recordings for pair in licences_in(summary(path))))
+    return dict(sorted(pair for path in recordings for pair in licences_in(read_summary(path))))
 
 
 def licences_in(found: Summary) -> Iterator[tuple[str, str]]:

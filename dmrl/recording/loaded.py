@@ -9,21 +9,21 @@ import pyarrow as pa
 from google.protobuf.message_factory import GetMessageClass
 
 from dmrl.errors import MissingTopic
-from dmrl.recording.log_times import log_times
-from dmrl.recording.mcap.batch_reader import blocks
+from dmrl.recording.log_times import read_log_times
+from dmrl.recording.mcap.batch_reader import iter_batches
 from dmrl.recording.mcap.channel import Channel, RawMessage
-from dmrl.recording.mcap.message_batch import EMPTY, Block, Ints, joined
-from dmrl.recording.mcap.summary_index import TopicInfo, channel_on
-from dmrl.recording.protobuf.columns import apart, decoded
-from dmrl.recording.protobuf.message_types import descriptor_of, require_types
-from dmrl.recording.reader import Stamped, match_topics, parsed, read
-from dmrl.recording.summary import summary
+from dmrl.recording.mcap.message_batch import EMPTY_BATCH, Ints, MessageBatch, concatenate_all
+from dmrl.recording.mcap.summary_index import TopicInfo, read_channel
+from dmrl.recording.protobuf.columns import decode_topic, group_by_topic
+from dmrl.recording.protobuf.message_types import find_channel_descriptor, require_types
+from dmrl.recording.reader import Stamped, parse_message, read, select_topics
+from dmrl.recording.summary import read_summary
 
-PART = re.compile(r"\\{\w+\\}")
+PLACEHOLDER = re.compile(r"\\{\w+\\}")
 """A placeholder of a topic pattern, escaped."""
 
 
-class Contents:
+class LoadedRecording:
     """A recording with the messages of some topics in memory.
 
     Messages are kept encoded and decoded on request. Other topics are read on request, each in a
@@ -44,30 +44,30 @@ class Contents:
     """
 
     def __init__(self, path: Path, *wanted: str) -> None:
-        self.path, self.summary = path, summary(path)
-        self._held: dict[str, tuple[Block, dict[int, Channel]]] = {}
-        patterns = [re.compile(PART.sub("[^/]+", re.escape(want))) for want in wanted]
+        self.path, self.summary = path, read_summary(path)
+        self._messages: dict[str, tuple[MessageBatch, dict[int, Channel]]] = {}
+        patterns = [re.compile(PLACEHOLDER.sub("[^/]+", re.escape(want))) for want in wanted]
         names = frozenset(t for t in self.topics if any(p.fullmatch(t) for p in patterns))
         require_types(path, self.topics, names)
-        self._read(names)
+        self._load_topics(names)
 
-    def _read(self, names: frozenset[str]) -> None:
-        parts: list[Block] = []
+    def _load_topics(self, names: frozenset[str]) -> None:
+        parts: list[MessageBatch] = []
         channels: dict[int, Channel] = {}
-        for block, own in blocks(self.path, names) if names else ():
-            parts.append(block)
+        for batch, own in iter_batches(self.path, names) if names else ():
+            parts.append(batch)
             channels = own
-        self.hold(names, parts, channels)
+        self.add_topics(names, parts, channels)
 
-    def hold(
-        self, names: frozenset[str], parts: Sequence[Block], channels: dict[int, Channel]
+    def add_topics(
+        self, names: frozenset[str], parts: Sequence[MessageBatch], channels: dict[int, Channel]
     ) -> None:
         """Keep all messages of these topics, which were read already."""
-        found = apart(joined(parts).sorted(), channels) if parts else {}
+        batches = group_by_topic(concatenate_all(parts).sort_by_time(), channels) if parts else {}
         for topic in names:
             own = {n: channel for n, channel in channels.items() if channel.topic == topic}
-            own = own or {0: channel_on(self.path, topic)}  # the topic has no messages
-            self._held[topic] = found.get(topic, EMPTY), own
+            own = own or {0: read_channel(self.path, topic)}  # the topic has no messages
+            self._messages[topic] = batches.get(topic, EMPTY_BATCH), own
 
     @property
     def topics(self) -> Mapping[str, TopicInfo]:
@@ -79,13 +79,13 @@ class Contents:
         """First log time of the recording, nanoseconds."""
         return self.summary.start_ns
 
-    def times(self, topic: str) -> Ints:
+    def get_times(self, topic: str) -> Ints:
         """Return the (N,) sorted log times of any topic from the index; empty if it is missing."""
-        if topic in self._held:
-            return self._held[topic][0].time_ns
-        return log_times(self.path, [topic]).get(topic, np.zeros(0, np.int64))
+        if topic in self._messages:
+            return self._messages[topic][0].time_ns
+        return read_log_times(self.path, [topic]).get(topic, np.zeros(0, np.int64))
 
-    def table(self, topic: str, fields: Sequence[str] | None = None) -> pa.Table:
+    def get_table(self, topic: str, fields: Sequence[str] | None = None) -> pa.Table:
         """Return one topic as an Arrow table, possibly without rows; see `iter_columns`.
 
         Raises
@@ -95,30 +95,32 @@ class Contents:
         RecordingError
             If a message is not of its type.
         """
-        block, channels = self._of(topic)
-        return pa.Table.from_batches([decoded(self.path, topic, block, channels, fields)])
+        batch, channels = self._get_messages(topic)
+        return pa.Table.from_batches([decode_topic(self.path, topic, batch, channels, fields)])
 
-    def messages(self, topic: str) -> Iterator[Stamped]:
+    def iter_messages(self, topic: str) -> Iterator[Stamped]:
         """Yield the decoded messages of a topic in log-time order; raise as `get_table`."""
-        block, channels = self._of(topic)
-        kinds = {n: GetMessageClass(descriptor_of(self.path, c)) for n, c in channels.items()}
-        for number, time_ns, publish_ns, data in block.rows():
+        batch, channels = self._get_messages(topic)
+        kinds = {
+            n: GetMessageClass(find_channel_descriptor(self.path, c)) for n, c in channels.items()
+        }
+        for number, time_ns, publish_ns, data in batch.iter_rows():
             raw = RawMessage(time_ns, publish_ns, channels[number], data)
-            yield Stamped(time_ns, topic, parsed(raw, kinds[number], self.path))
+            yield Stamped(time_ns, topic, parse_message(raw, kinds[number], self.path))
 
     def matching(self, *wanted: str) -> frozenset[str]:
         """Return the topics that names and patterns ask for; raise what `reader.matching` does."""
-        return match_topics(self.path, self.topics, wanted)
+        return select_topics(self.path, self.topics, wanted)
 
     def first(self, topic: str) -> Stamped | None:
         """Return the first message of a topic, and load no other; None if it has none."""
         return next(read(self.path, topic), None)
 
-    def _of(self, topic: str) -> tuple[Block, dict[int, Channel]]:
+    def _get_messages(self, topic: str) -> tuple[MessageBatch, dict[int, Channel]]:
         """Return the messages of a topic, and its channels by channel id."""
         if topic not in self.topics:
             raise MissingTopic(topic, self.topics, self.path)
-        if topic not in self._held:
+        if topic not in self._messages:
             require_types(self.path, self.topics, [topic])
-            self._read(frozenset([topic]))
-        return self._held[topic]
+            self._load_topics(frozenset([topic]))
+        return self._messages[topic]

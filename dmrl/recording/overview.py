@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.recording.log_times import log_times
+from dmrl.recording.log_times import read_log_times
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.summary import Summary
 from dmrl.terminal.tables import print_line, print_table
@@ -50,7 +50,7 @@ class Overview:
 
 def topic_rows(path: Path, found: Summary) -> list[tuple[str, str, int, float | None]]:
     """Return topic, message, count and mean rate of each topic, between its own messages."""
-    times = log_times(path, found.topics)
+    times = read_log_times(path, found.topics)
     return [
         (topic, info.schema, info.count, _rate_hz(times.get(topic)))
         for topic, info in found.topics.items()
@@ -69,7 +69,7 @@ def ancestry_lines(made: Provenance | None) -> list[str]:
         return ["made by: not known (no dmrl.provenance metadata)"]
     lines = [f"made by: {_origin(made)}"]
     listed: set[str] = set()
-    for depth, source in made.ancestry():
+    for depth, source in made.iter_ancestors():
         how = ", as above" if source.sha256 in listed else ""
         if source.provenance is not None:
             listed.add(source.sha256)

@@ -8,22 +8,22 @@ import pyarrow as pa
 from mcap.records import ChunkIndex
 from mcap.summary import Summary as McapSummary
 
-from dmrl.recording.mcap.batch_reader import blocks, chunks_between
+from dmrl.recording.mcap.batch_reader import iter_batches, select_chunks
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk_reader import in_chunk
-from dmrl.recording.mcap.file import opened
-from dmrl.recording.mcap.message_batch import Block, joined
-from dmrl.recording.mcap.record_scan import channel_of
-from dmrl.recording.mcap.summary_index import mcap_summary
-from dmrl.recording.protobuf.columns import by_topic
+from dmrl.recording.mcap.chunk_reader import read_chunk
+from dmrl.recording.mcap.file import open_mcap
+from dmrl.recording.mcap.message_batch import MessageBatch, concatenate_all
+from dmrl.recording.mcap.record_scan import build_channel
+from dmrl.recording.mcap.summary_index import read_summary_section
+from dmrl.recording.protobuf.columns import decode_by_topic
 from dmrl.recording.protobuf.message_types import require_types
-from dmrl.recording.summary import summary
+from dmrl.recording.summary import read_summary
 
-CHUNKS = 16
+CHUNKS_PER_CHANNEL_MAX = 16
 """Chunks that are read per channel, at most some 2 MB."""
 
 
-def glance(
+def sample_topics(
     path: Path, fields: Mapping[str, Sequence[str] | None], *, start_ns: int, end_ns: int
 ) -> dict[str, pa.RecordBatch]:
     """Read the messages of a few chunks, evenly spread over a time range.
@@ -49,56 +49,60 @@ def glance(
     RecordingError
         If the file is not a complete recording, or a message is not of its type.
     """
-    present = summary(path).topics
+    present = read_summary(path).topics
     names = frozenset(topic for topic in fields if topic in present)
     require_types(path, present, names)
-    held, channels = _spread(path, names, start_ns, end_ns)
-    missing = names - _topics(held, channels)
+    batches, channels = _sample_chunks(path, names, start_ns, end_ns)
+    missing = names - _list_topics(batches, channels)
     # Rare: the chunks have no message in the range, or the file has no index.
-    rest = blocks(path, missing, start_ns=start_ns, end_ns=end_ns) if missing else ()
-    for block, own in rest:
-        held.append(block)
+    rest = iter_batches(path, missing, start_ns=start_ns, end_ns=end_ns) if missing else ()
+    for batch, own in rest:
+        batches.append(batch)
         channels |= own
-        missing -= _topics([block], own)
+        missing -= _list_topics([batch], own)
         if not missing:
             break
-    return by_topic(path, joined(held).sorted(), channels, fields) if held else {}
+    return (
+        decode_by_topic(path, concatenate_all(batches).sort_by_time(), channels, fields)
+        if batches
+        else {}
+    )
 
 
-def _spread(
+def _sample_chunks(
     path: Path, names: frozenset[str], start_ns: int, end_ns: int
-) -> tuple[list[Block], dict[int, Channel]]:
+) -> tuple[list[MessageBatch], dict[int, Channel]]:
     """Read the chosen chunks; return their batches, and channels by channel id."""
-    with opened(path) as stream:
-        index = mcap_summary(path, stream)
+    with open_mcap(path) as stream:
+        index = read_summary_section(path, stream)
         if index is None:
             return [], {}
         channels = {
-            number: channel_of(number, index.channels, index.schemas)
+            number: build_channel(number, index.channels, index.schemas)
             for number, channel in index.channels.items()
             if channel.topic in names
         }
-        held = []
-        for chunk in _chosen(index, channels, start_ns, end_ns):
-            block = in_chunk(path, stream, chunk, channels, index)
-            block = block.take((block.time_ns >= start_ns) & (block.time_ns < end_ns))
-            held.append(block.compact())
-    return [block for block in held if len(block)], channels
+        batches = []
+        for chunk in _choose_chunks(index, channels, start_ns, end_ns):
+            batch = read_chunk(path, stream, chunk, channels, index)
+            batch = batch.take((batch.time_ns >= start_ns) & (batch.time_ns < end_ns))
+            batches.append(batch.compact())
+    return [block for block in batches if len(block)], channels
 
 
-def _chosen(
+def _choose_chunks(
     index: McapSummary, channels: Mapping[int, Channel], start_ns: int, end_ns: int
 ) -> list[ChunkIndex]:
     """Choose the first chunk of each channel, its last, and some between."""
-    found: dict[int, ChunkIndex] = {}
+    chosen: dict[int, ChunkIndex] = {}
     for number in channels:
-        candidates = chunks_between(index, {number}, start_ns, end_ns)
-        places = np.linspace(0, len(candidates) - 1, min(CHUNKS, len(candidates)))
+        candidates = select_chunks(index, {number}, start_ns, end_ns)
+        places = np.linspace(0, len(candidates) - 1, min(CHUNKS_PER_CHANNEL_MAX, len(candidates)))
         for place in places.round().astype(int).tolist():
             chunk = candidates[place]
-            found[chunk.chunk_start_offset] = chunk
-    return list(found.values())
+            chosen[chunk.chunk_start_offset] = chunk
+    return list(chosen.values())
 
 
-def _topics(held: Sequence[Block], channels: Mapping[int, Channel]) -> set[str]:
-    return {channels[n].topic for block in held for n in block.numbers()}
+def _list_topics(batches: Sequence[MessageBatch], channels: Mapping[int, Channel]) -> set[str]:
+    return {channels[n].topic for batch in batches for n in batch.list_channel_ids()}

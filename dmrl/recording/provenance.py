@@ -71,27 +71,27 @@ class Provenance:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries, lists and values, with each input's provenance nested once."""
-        return asdict(self._told_once())
+        return asdict(self._remove_repeats())
 
-    def _told_once(self) -> "Provenance":
+    def _remove_repeats(self) -> "Provenance":
         """Return a copy with the provenance of each input only at its first occurrence, by hash.
 
         Ancestors deeper than `limits.ANCESTORS` keep their hash without a provenance.
         """
-        told: set[str] = set()
+        hashes: set[str] = set()
 
-        def first_time(made: Provenance, depth: int) -> Provenance:
+        def keep_first(made: Provenance, depth: int) -> Provenance:
             inputs = []
             for source in made.inputs:
-                known = source.sha256 in told or depth >= limits.ANCESTORS
+                known = source.sha256 in hashes or depth >= limits.ANCESTORS
                 own = None if known else source.provenance
                 if own is not None:
-                    told.add(source.sha256)
-                    own = first_time(own, depth + 1)
+                    hashes.add(source.sha256)
+                    own = keep_first(own, depth + 1)
                 inputs.append(replace(source, provenance=own))
             return replace(made, inputs=tuple(inputs))
 
-        return first_time(self, 1)
+        return keep_first(self, 1)
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:
@@ -103,17 +103,17 @@ class Provenance:
             If the document is not a provenance.
         """
         try:
-            return cls._read(document, {})
+            return cls._parse(document, {})
         except RecursionError:
             raise ValueError("it is nested too deep") from None
 
     @classmethod
-    def _read(cls, document: Mapping[str, Any], known: dict[str, Self]) -> Self:
+    def _parse(cls, document: Mapping[str, Any], known: dict[str, Self]) -> Self:
         inputs = []
         for source in document["inputs"]:
             name, sha256, own = source["name"], source["sha256"], source["provenance"]
             if own:
-                known[sha256] = cls._read(own, known)
+                known[sha256] = cls._parse(own, known)
             inputs.append(Input(str(name), str(sha256), known.get(sha256)))
         made = cls(**{**document, "inputs": tuple(inputs)})
         if not (isinstance(made.settings, dict) and isinstance(made.libraries, dict)):
@@ -140,11 +140,11 @@ class Provenance:
 
     def to_recipe(self) -> str:
         """Return the settings as a TOML recipe that repeats the run."""
-        return tomli_w.dumps({"kind": self.stage, **_without_none(self.settings)})
+        return tomli_w.dumps({"kind": self.stage, **_drop_none(self.settings)})
 
-    def ancestry(self) -> Iterator[tuple[int, Input]]:
+    def iter_ancestors(self) -> Iterator[tuple[int, Input]]:
         """Yield depth and input for all direct and indirect inputs, each provenance once."""
-        yield from _nested(self._told_once(), 0)
+        yield from _iter_nested(self._remove_repeats(), 0)
 
     def write(self, folder: Path) -> None:
         """Write ``provenance.json`` into a dataset or run folder."""
@@ -152,15 +152,15 @@ class Provenance:
         (folder / FILE_NAME).write_text(text + "\n", encoding="utf-8")
 
 
-def _nested(made: Provenance, depth: int) -> Iterator[tuple[int, Input]]:
+def _iter_nested(made: Provenance, depth: int) -> Iterator[tuple[int, Input]]:
     for source in made.inputs:
         yield depth, source
         if source.provenance is not None:
-            yield from _nested(source.provenance, depth + 1)
+            yield from _iter_nested(source.provenance, depth + 1)
 
 
-def _without_none(value: Any) -> Any:
+def _drop_none(value: Any) -> Any:
     """Return the value without None, which TOML cannot express."""
     if isinstance(value, Mapping):
-        return {k: _without_none(v) for k, v in value.items() if v is not None}
-    return [_without_none(v) for v in value] if isinstance(value, list | tuple) else value
+        return {k: _drop_none(v) for k, v in value.items() if v is not None}
+    return [_drop_none(v) for v in value] if isinstance(value, list | tuple) else value

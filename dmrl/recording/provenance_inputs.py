@@ -14,20 +14,20 @@ from dmrl.guards.paths import refuse_pipe
 from dmrl.recording.mcap.file import expect_unchanged
 from dmrl.recording.mcap.shared_file import open_raw, share_file
 from dmrl.recording.provenance import FILE_NAME, Input, Provenance
-from dmrl.recording.summary import summary
-from dmrl.storage import Remote
+from dmrl.recording.summary import read_summary
+from dmrl.storage import RemotePath
 
-NO_CONTENT = ("README.md", "figures", "tensorboard")
+UNHASHED_NAMES = ("README.md", "figures", "tensorboard")
 """Files and folders that the hash of an output folder leaves out."""
 
 
-def refuse_twice(paths: Sequence[Path]) -> None:
+def refuse_duplicates(paths: Sequence[Path]) -> None:
     """Raise RecordingError if a recording is named twice."""
     if len({path.resolve() for path in paths}) != len(paths):
         raise RecordingError(f"{paths[0]}: a recording is given twice. Name each once")
 
 
-def provenance(
+def build_provenance(
     stage: str,
     settings: Any = None,
     inputs: Sequence[Path] = (),
@@ -58,19 +58,19 @@ def provenance(
     values = settings if isinstance(settings, dict) else asdict(settings) if settings else {}
     return Provenance(
         stage=stage,
-        settings=json.loads(json.dumps(values, default=_name)),
+        settings=json.loads(json.dumps(values, default=_to_json_value)),
         seed=seed,
-        inputs=tuple(input_of(path) for path in inputs),
-        libraries={name: _version(name) for name in libraries},
+        inputs=tuple(build_input(path) for path in inputs),
+        libraries={name: _find_version(name) for name in libraries},
     )
 
 
-def _name(value: object) -> str:
+def _to_json_value(value: object) -> str:
     # Only the name of a path: outputs do not depend on the location of files.
     return value.name if isinstance(value, Path) else str(value)
 
 
-def _version(package: str) -> str:
+def _find_version(package: str) -> str:
     from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415 - as in plugins
 
     try:
@@ -79,7 +79,7 @@ def _version(package: str) -> str:
         return "absent"
 
 
-def input_of(path: Path) -> Input:
+def build_input(path: Path) -> Input:
     """Return name, hash and provenance of a file or folder.
 
     Raises
@@ -95,34 +95,34 @@ def input_of(path: Path) -> Input:
     with share_file(path):
         if path.suffix == ".mcap" and path.is_file():
             expect_unchanged(path)
-        digest = sha256_of_folder(path) if path.is_dir() else sha256_of_file(path)
-        return Input(path.resolve().name, digest, provenance_of(path))
+        digest = hash_folder(path) if path.is_dir() else hash_file(path)
+        return Input(path.resolve().name, digest, read_provenance(path))
 
 
-def sha256_of_file(path: Path) -> str:
+def hash_file(path: Path) -> str:
     """Return the SHA-256 of a file, hexadecimal."""
-    if isinstance(path, Remote):
+    if isinstance(path, RemotePath):
         return path.sha256()
     with io.BufferedReader(open_raw(path)) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def sha256_of_folder(folder: Path) -> str:
+def hash_folder(folder: Path) -> str:
     """Return the SHA-256 of the sorted relative names and contents of a folder's files.
 
     In a folder that dmrl wrote, the card, which may be rewritten, and the training log, which
     contains times, are left out.
     """
-    left_out = NO_CONTENT if (folder / FILE_NAME).is_file() else ()
+    left_out = UNHASHED_NAMES if (folder / FILE_NAME).is_file() else ()
     digest = hashlib.sha256()
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         if path.relative_to(folder).parts[0] in left_out:
             continue
-        digest.update(f"{path.relative_to(folder).as_posix()}\0{sha256_of_file(path)}\n".encode())
+        digest.update(f"{path.relative_to(folder).as_posix()}\0{hash_file(path)}\n".encode())
     return digest.hexdigest()
 
 
-def provenance_of(path: Path) -> Provenance | None:
+def read_provenance(path: Path) -> Provenance | None:
     """Read the provenance of a recording or output folder; return None if it has none.
 
     Raises
@@ -131,7 +131,7 @@ def provenance_of(path: Path) -> Provenance | None:
         If the provenance is corrupt.
     """
     if path.suffix == ".mcap" and path.is_file():
-        return summary(path).provenance
+        return read_summary(path).provenance
     file = path / FILE_NAME
     if not file.is_file():
         return None

@@ -11,16 +11,16 @@ from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
 from dmrl.errors import MissingTopic
-from dmrl.recording.mcap.batch_reader import blocks
+from dmrl.recording.mcap.batch_reader import iter_batches
 from dmrl.recording.mcap.channel import Channel, RawMessage
-from dmrl.recording.mcap.file import damaged
-from dmrl.recording.mcap.message_batch import EMPTY, Block, joined
-from dmrl.recording.mcap.summary_index import TopicInfo, channel_on
-from dmrl.recording.protobuf.columns import batch_of, by_topic, decoded
-from dmrl.recording.protobuf.message_types import descriptor_of, require_types
-from dmrl.recording.summary import summary
+from dmrl.recording.mcap.file import corrupt_error
+from dmrl.recording.mcap.message_batch import EMPTY_BATCH, MessageBatch, concatenate_all
+from dmrl.recording.mcap.summary_index import TopicInfo, read_channel
+from dmrl.recording.protobuf.columns import decode_by_topic, decode_topic, to_record_batch
+from dmrl.recording.protobuf.message_types import find_channel_descriptor, require_types
+from dmrl.recording.summary import read_summary
 
-STRETCH_BYTES = 4 << 20
+BATCH_BYTES = 4 << 20
 """Bytes of messages that `iter_topic_batches` decodes at once: few calls, little memory."""
 
 
@@ -33,7 +33,7 @@ class Stamped:
     message: Any
 
 
-def matching(path: Path, wanted: Sequence[str]) -> frozenset[str]:
+def match_topics(path: Path, wanted: Sequence[str]) -> frozenset[str]:
     """Return the topics of a recording that match some names and patterns.
 
     Parameters
@@ -50,13 +50,13 @@ def matching(path: Path, wanted: Sequence[str]) -> frozenset[str]:
     RecordingError
         If one of dmrl's topics carries another message type.
     """
-    return match_topics(path, summary(path).topics, wanted)
+    return select_topics(path, read_summary(path).topics, wanted)
 
 
-def match_topics(
+def select_topics(
     path: Path, topics: Mapping[str, TopicInfo], wanted: Sequence[str]
 ) -> frozenset[str]:
-    """Return the topics that names and patterns ask for; raise what `matching` does."""
+    """Return the topics that names and patterns ask for; raise what `match_topics` does."""
     found: set[str] = set()
     for want in wanted:
         hits = {want} & topics.keys()
@@ -91,9 +91,9 @@ def read_raw(
     RecordingError
         If the file is not a complete recording.
     """
-    names = matching(path, topics) if topics else None
-    for block, channels in blocks(path, names, start_ns=start_ns, end_ns=end_ns):
-        for number, time_ns, publish_ns, data in block.rows():
+    names = match_topics(path, topics) if topics else None
+    for batch, channels in iter_batches(path, names, start_ns=start_ns, end_ns=end_ns):
+        for number, time_ns, publish_ns, data in batch.iter_rows():
             yield RawMessage(time_ns, publish_ns, channels[number], data)
 
 
@@ -122,19 +122,21 @@ def read(
     for raw in read_raw(path, *topics, start_ns=start_ns, end_ns=end_ns):
         kind = classes.get(raw.channel)
         if kind is None:
-            kind = classes[raw.channel] = GetMessageClass(descriptor_of(path, raw.channel))
-        yield Stamped(raw.time_ns, raw.channel.topic, parsed(raw, kind, path))
+            kind = classes[raw.channel] = GetMessageClass(
+                find_channel_descriptor(path, raw.channel)
+            )
+        yield Stamped(raw.time_ns, raw.channel.topic, parse_message(raw, kind, path))
 
 
-def parsed(raw: RawMessage, kind: Any, path: Path) -> Any:
+def parse_message(raw: RawMessage, kind: Any, path: Path) -> Any:
     """Parse the payload of a message; raise RecordingError if it is not of the class."""
     try:
         return kind.FromString(raw.data)
     except DecodeError as e:
-        raise damaged(path, f"{raw.topic} at {raw.time_ns} ns: {e}") from e
+        raise corrupt_error(path, f"{raw.topic} at {raw.time_ns} ns: {e}") from e
 
 
-def columns(
+def iter_columns(
     path: Path,
     topic: str,
     *,
@@ -168,11 +170,13 @@ def columns(
     RecordingError
         If the file is not a complete recording, or a message is not of its type.
     """
-    for block, channels in blocks(path, matching(path, [topic]), start_ns=start_ns, end_ns=end_ns):
-        yield decoded(path, topic, block, channels, fields)
+    for batch, channels in iter_batches(
+        path, match_topics(path, [topic]), start_ns=start_ns, end_ns=end_ns
+    ):
+        yield decode_topic(path, topic, batch, channels, fields)
 
 
-def stretches(
+def iter_topic_batches(
     path: Path,
     fields: Mapping[str, Sequence[str] | None],
     *,
@@ -200,20 +204,20 @@ def stretches(
     RecordingError
         If the file is not a complete recording, or a message is not of its type.
     """
-    present = summary(path).topics
+    present = read_summary(path).topics
     names = frozenset(topic for topic in fields if topic in present)
     require_types(path, present, names)
-    held: list[Block] = []
+    pending: list[MessageBatch] = []
     size = 0
     channels: dict[int, Channel] = {}
-    for block, channels in blocks(path, names, start_ns=start_ns, end_ns=end_ns):
-        held.append(block)
-        size += len(block.data)
-        if size >= STRETCH_BYTES:
-            yield by_topic(path, joined(held), channels, fields)
-            held, size = [], 0
-    if held:
-        yield by_topic(path, joined(held), channels, fields)
+    for batch, channels in iter_batches(path, names, start_ns=start_ns, end_ns=end_ns):
+        pending.append(batch)
+        size += len(batch.data)
+        if size >= BATCH_BYTES:
+            yield decode_by_topic(path, concatenate_all(pending), channels, fields)
+            pending, size = [], 0
+    if pending:
+        yield decode_by_topic(path, concatenate_all(pending), channels, fields)
 
 
 def read_table(
@@ -225,7 +229,11 @@ def read_table(
     end_ns: int | None = None,
 ) -> pa.Table:
     """Read one topic into an Arrow table, possibly without rows; see ``iter_columns``."""
-    batches = list(columns(path, topic, fields=fields, start_ns=start_ns, end_ns=end_ns))
+    batches = list(iter_columns(path, topic, fields=fields, start_ns=start_ns, end_ns=end_ns))
     if not batches:
-        batches = [batch_of(EMPTY, descriptor_of(path, channel_on(path, topic)), fields)]
+        batches = [
+            to_record_batch(
+                EMPTY_BATCH, find_channel_descriptor(path, read_channel(path, topic)), fields
+            )
+        ]
     return pa.Table.from_batches(batches)

@@ -5,14 +5,14 @@ from pathlib import Path
 
 from dmrl.errors import RecordingError
 from dmrl.recording.mcap import checksums
-from dmrl.recording.mcap.file import Bounded, opened
-from dmrl.recording.mcap.record_scan import channel_of, walked
+from dmrl.recording.mcap.file import BoundedReader, open_mcap
+from dmrl.recording.mcap.record_scan import build_channel, scan_file
 from dmrl.recording.mcap.summary_index import (
     TopicInfo,
-    mcap_summary,
-    metadata_of,
+    get_cached,
     read_attachment,
-    remembered,
+    read_metadata,
+    read_summary_section,
 )
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 
@@ -51,7 +51,7 @@ class Summary:
         return sum(topic.count for topic in self.topics.values())
 
 
-def summary(path: Path) -> Summary:
+def read_summary(path: Path) -> Summary:
     """Read the summary of a recording, its metadata and its attachments.
 
     Raises
@@ -59,20 +59,20 @@ def summary(path: Path) -> Summary:
     RecordingError
         If the file is absent, not MCAP, truncated or corrupt.
     """
-    with opened(path) as stream:
-        return remembered("summary", path, stream, lambda: _summary(path, stream))
+    with open_mcap(path) as stream:
+        return get_cached("summary", path, stream, lambda: _build_summary(path, stream))
 
 
-def _summary(path: Path, stream: Bounded) -> Summary:
-    found = mcap_summary(path, stream)
-    if found is None or found.statistics is None:
-        return _scanned(path, stream)
-    metadata = metadata_of(path, stream, found)
+def _build_summary(path: Path, stream: BoundedReader) -> Summary:
+    section = read_summary_section(path, stream)
+    if section is None or section.statistics is None:
+        return _build_summary_by_scan(path, stream)
+    metadata = read_metadata(path, stream, section)
     metadata.pop(checksums.METADATA_NAME, None)
-    statistics = found.statistics
+    statistics = section.statistics
     topics: dict[str, TopicInfo] = {}
-    for number in sorted(found.channels):
-        channel = channel_of(number, found.channels, found.schemas)
+    for number in sorted(section.channels):
+        channel = build_channel(number, section.channels, section.schemas)
         before = topics[channel.topic].count if channel.topic in topics else 0
         count = statistics.channel_message_counts.get(number, 0)
         topics[channel.topic] = TopicInfo(channel.schema_name, before + count)
@@ -81,32 +81,32 @@ def _summary(path: Path, stream: Bounded) -> Summary:
         start_ns=statistics.message_start_time,
         end_ns=statistics.message_end_time,
         metadata=metadata,
-        attachments=dict(read_attachment(path, stream, at) for at in found.attachment_indexes),
-        provenance=_provenance(path, metadata),
+        attachments=dict(read_attachment(path, stream, at) for at in section.attachment_indexes),
+        provenance=_parse_provenance(path, metadata),
     )
 
 
-def _scanned(path: Path, stream: Bounded) -> Summary:
+def _build_summary_by_scan(path: Path, stream: BoundedReader) -> Summary:
     """Build the summary of a complete file that has no Summary section."""
-    walk = walked(path, stream)
-    walk.metadata.pop(checksums.METADATA_NAME, None)
-    counts = walk.counts()
+    scanned = scan_file(path, stream)
+    scanned.metadata.pop(checksums.METADATA_NAME, None)
+    counts = scanned.count_messages()
     topics: dict[str, TopicInfo] = {}
-    for number, channel in walk.channels.items():
+    for number, channel in scanned.channels.items():
         before = topics[channel.topic].count if channel.topic in topics else 0
         topics[channel.topic] = TopicInfo(channel.schema_name, before + counts[number])
-    held = [block.time_ns for block in walk.blocks if len(block)]
+    held = [batch.time_ns for batch in scanned.batches if len(batch)]
     return Summary(
         dict(sorted(topics.items())),
         min((int(times.min()) for times in held), default=0),
         max((int(times.max()) for times in held), default=0),
-        walk.metadata,
-        walk.attachments,
-        _provenance(path, walk.metadata),
+        scanned.metadata,
+        scanned.attachments,
+        _parse_provenance(path, scanned.metadata),
     )
 
 
-def _provenance(path: Path, metadata: dict[str, list[dict[str, str]]]) -> Provenance | None:
+def _parse_provenance(path: Path, metadata: dict[str, list[dict[str, str]]]) -> Provenance | None:
     if METADATA_NAME not in metadata:
         return None
     try:

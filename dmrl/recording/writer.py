@@ -11,19 +11,19 @@ from typing import Any, Self
 
 from google.protobuf.descriptor import Descriptor
 
-from dmrl.atomic_output import as_output_error, partial_file
+from dmrl.atomic_output import as_output_error, atomic_file
 from dmrl.errors import OutputError, RecordingError
-from dmrl.messages import message as message_class
-from dmrl.messages import schema_bytes
+from dmrl.messages import message_class as message_class
+from dmrl.messages import serialize_schema
 from dmrl.recording.mcap.channel import Channel, RawMessage
-from dmrl.recording.mcap.chunk_builder import OpenChunk
-from dmrl.recording.mcap.chunk_writer import OLDEST, Assembly
-from dmrl.recording.mcap.file_writer import Container
-from dmrl.recording.mcap.message_batch import HEAD_BYTES, Ints
-from dmrl.recording.protobuf.encode import Value, encode
+from dmrl.recording.mcap.chunk_builder import ChunkBuilder
+from dmrl.recording.mcap.chunk_writer import OPEN_CHUNK_AGE_MAX, ChunkWriter
+from dmrl.recording.mcap.file_writer import McapFileWriter
+from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, Ints
+from dmrl.recording.protobuf.encode import ColumnValue, encode
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 from dmrl.samples.sample import Sample
-from dmrl.topics import row_of
+from dmrl.topics import find_topic
 
 SUFFIX = ".mcap"
 RECIPE_NAME = "recipe.toml"
@@ -65,14 +65,16 @@ class RecordingWriter:
         if SUFFIX not in path.suffixes:  # a resumed recording is out.mcap.kept for a while
             raise OutputError(f"{path} is not named like a recording. Use {path.name}{SUFFIX}")
         self._path = path
-        self._topics: dict[str, tuple[type, int, OpenChunk]] = {}
+        self._topics: dict[str, tuple[type, int, ChunkBuilder]] = {}
         self._resources = ExitStack()
-        partial = self._resources.enter_context(partial_file(path, keep_on_error=keep_on_error))
+        partial = self._resources.enter_context(atomic_file(path, keep_on_error=keep_on_error))
         try:
-            self._file = Container(partial, f"dmrl {provenance.dmrl_version}")
+            self._file = McapFileWriter(partial, f"dmrl {provenance.dmrl_version}")
             self._resources.callback(self._file.close)
             # Work that can be resumed leaves complete moments: images with their numbers.
-            self.chunks = Assembly(path, self._file, 1 if keep_on_error else OLDEST)
+            self.chunk_writer = ChunkWriter(
+                path, self._file, 1 if keep_on_error else OPEN_CHUNK_AGE_MAX
+            )
             self._file.add_metadata(METADATA_NAME, provenance.to_metadata())
             text = provenance.to_recipe() if recipe is None else recipe
             self.add_attachment(RECIPE_NAME, "application/toml", text.encode())
@@ -104,14 +106,16 @@ class RecordingWriter:
         RecordingError
             If dmrl's topic carries another message type, or the time is negative.
         """
-        known = self._topics.get(topic)
-        if known is None or known[0] is not type(message):
-            channel = channel_for(topic, message.DESCRIPTOR)
-            known = type(message), *self.chunks.begin(channel)
-            self._topics[topic] = known
-        _, number, chunk = known
+        cached = self._topics.get(topic)
+        if cached is None or cached[0] is not type(message):
+            channel = build_topic_channel(topic, message.DESCRIPTOR)
+            cached = type(message), *self.chunk_writer.define_channel(channel)
+            self._topics[topic] = cached
+        _, number, chunk = cached
         publish_ns = time_ns if publish_ns is None else publish_ns
-        self.chunks.add(number, chunk, time_ns, publish_ns, message.SerializeToString())
+        self.chunk_writer.add_message(
+            number, chunk, time_ns, publish_ns, message.SerializeToString()
+        )
 
     def write_sample(self, sample: Sample) -> None:
         """Append one sample as a message; see `write`."""
@@ -123,7 +127,7 @@ class RecordingWriter:
         topic: str,
         kind: Any,
         time_ns: Ints,
-        fields: Mapping[str, Value],
+        fields: Mapping[str, ColumnValue],
         *,
         publish_ns: Ints | None = None,
     ) -> None:
@@ -152,15 +156,15 @@ class RecordingWriter:
         """
         if not len(time_ns):
             return
-        channel = channel_for(topic, kind.DESCRIPTOR)
-        records, at = encode(kind.DESCRIPTOR, fields, len(time_ns), HEAD_BYTES)
+        channel = build_topic_channel(topic, kind.DESCRIPTOR)
+        records, at = encode(kind.DESCRIPTOR, fields, len(time_ns), MESSAGE_PREFIX_BYTES)
         publish_ns = time_ns if publish_ns is None else publish_ns
-        self.chunks.add_records(channel, records, at, time_ns, publish_ns)
+        self.chunk_writer.add_records(channel, records, at, time_ns, publish_ns)
 
     def write_raw(self, raw: RawMessage) -> None:
         """Append a message of another recording, its payload bit for bit."""
-        number, chunk = self.chunks.begin(raw.channel)
-        self.chunks.add(number, chunk, raw.time_ns, raw.publish_ns, raw.data)
+        number, chunk = self.chunk_writer.define_channel(raw.channel)
+        self.chunk_writer.add_message(number, chunk, raw.time_ns, raw.publish_ns, raw.data)
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
         """Append a metadata record, such as the split of the source."""
@@ -172,7 +176,7 @@ class RecordingWriter:
 
     def flush(self) -> None:
         """Write the open chunks, so that they survive a kill of the process."""
-        self.chunks.flush()
+        self.chunk_writer.flush()
 
     def _abandon(self, error: BaseException) -> None:
         self._resources.__exit__(type(error), error, error.__traceback__)
@@ -187,14 +191,14 @@ class RecordingWriter:
             self._resources.__exit__(kind, error, traceback)
             return
         try:
-            self.chunks.finish()
+            self.chunk_writer.finish()
         except OutputError as e:
             self._abandon(e)
             raise
         self._resources.close()
 
 
-def channel_for(topic: str, kind: Descriptor) -> Channel:
+def build_topic_channel(topic: str, kind: Descriptor) -> Channel:
     """Build the channel of a topic for a message type.
 
     Raises
@@ -203,7 +207,7 @@ def channel_for(topic: str, kind: Descriptor) -> Channel:
         If dmrl's topic carries another type.
     """
     schema_name = str(kind.full_name)
-    row = row_of(topic)
-    if row is not None and not row.carries(schema_name):
+    row = find_topic(topic)
+    if row is not None and not row.accepts_message(schema_name):
         raise RecordingError(f"{topic} carries {row.message}, not {schema_name}. Use its own topic")
-    return Channel(topic, schema_name, schema_bytes(kind))
+    return Channel(topic, schema_name, serialize_schema(kind))

@@ -6,18 +6,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array, Camera, project
-from dmrl.rendering.camera.distortion import Canvas, Picture, canvas_of, image_from_pinhole, sample
-from dmrl.rendering.camera.sensor import blur, expose
-from dmrl.rendering.shot import Layer, Look, Part, Robot, Shot
+from dmrl.rendering.camera.distortion import (
+    FloatImage,
+    PinholeCanvas,
+    image_from_pinhole,
+    pinhole_canvas,
+    sample_bilinear,
+)
+from dmrl.rendering.camera.sensor import expose, gaussian_blur
+from dmrl.rendering.shot import Layer, Look, Region, Robot, Shot
 
-COVERED = 1 / 255
+MIN_COVERED_OPACITY = 1 / 255
 """Opacity above which a pixel counts as covered by a robot."""
-TAPS_MAX = 24
+MAX_MOTION_SAMPLES = 24
 """Samples along the motion of a robot, at most."""
-FARTHEST_M = 65.0  # Blender writes 1e10 where the depth ray missed but other rays hit
+MAX_DEPTH_M = 65.0  # Blender writes 1e10 where the depth ray missed but other rays hit
 
 
-def compose(
+def compose_shot(
     camera: Camera, robots: Sequence[Robot], look: Look, layers: Mapping[int, Layer]
 ) -> Shot:
     """Return the image of a scene and its labels.
@@ -33,19 +39,19 @@ def compose(
     layers
         Rendered layers of the visible robots, by the robot's index.
     """
-    canvas = canvas_of(camera)
+    canvas = pinhole_canvas(camera)
     xyz = np.array([robot.pose.xyz_camera for robot in robots]).reshape(-1, 3)
     order = sorted(layers, key=lambda k: float(np.linalg.norm(xyz[k])))  # near hides far
-    visible, share = _visible(canvas, layers, order)
+    visible, share = _compute_visibility(canvas, layers, order)
     boxes = np.full((len(robots), 4), np.nan)
     opacity = np.zeros((len(robots), camera.height_px, camera.width_px), np.uint8)
     surface = np.zeros(opacity.shape[1:], np.float32)
     for k in order:
-        boxes[k] = _box(canvas, camera, layers[k], visible[k] > COVERED)
-        _mark(canvas, camera, layers[k], visible[k], opacity[k], surface)
+        boxes[k] = _bounding_box(canvas, camera, layers[k], visible[k] > MIN_COVERED_OPACITY)
+        _draw_masks(canvas, camera, layers[k], visible[k], opacity[k], surface)
     picture = look.backdrop.astype(np.float32)
     for k in reversed(order):
-        _paint(canvas, camera, robots[k], layers[k], look, picture)
+        _draw_robot(canvas, camera, robots[k], layers[k], look, picture)
     rgb = expose(picture, look.sensor, np.random.default_rng((look.seed, 1)))
     uv, depth_m = project(xyz, canvas.pinhole.image_from_optical)
     uv = image_from_pinhole(uv - canvas.shift_px, camera)
@@ -53,9 +59,9 @@ def compose(
     return Shot(rgb, uv, depth_m, boxes, all_share, opacity, surface)
 
 
-def _visible(
-    canvas: Canvas, layers: Mapping[int, Layer], order: Sequence[int]
-) -> tuple[dict[int, Picture], dict[int, float]]:
+def _compute_visibility(
+    canvas: PinholeCanvas, layers: Mapping[int, Layer], order: Sequence[int]
+) -> tuple[dict[int, FloatImage], dict[int, float]]:
     """Return the opacity that no nearer robot hides, and the visible share inside the image."""
     clear = canvas.inside.astype(np.float32)
     visible, share = {}, {}
@@ -68,15 +74,17 @@ def _visible(
     return visible, share
 
 
-def _box(canvas: Canvas, camera: Camera, layer: Layer, seen: NDArray[np.bool_]) -> Array:
+def _bounding_box(
+    canvas: PinholeCanvas, camera: Camera, layer: Layer, visible: NDArray[np.bool_]
+) -> Array:
     """Return the bounding box of the visible pixels after distortion, clipped to the image."""
-    if not seen.any():
+    if not visible.any():
         return np.full(4, np.nan)
-    rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-    width, height = seen.shape[1], seen.shape[0]
+    rows, cols = np.flatnonzero(visible.any(axis=1)), np.flatnonzero(visible.any(axis=0))
+    width, height = visible.shape[1], visible.shape[0]
     # The outermost pixels of each row and column suffice: distortion moves no other beyond them.
-    left, right = seen[rows].argmax(axis=1), width - seen[rows, ::-1].argmax(axis=1)
-    top, bottom = seen[:, cols].argmax(axis=0), height - seen[::-1, cols].argmax(axis=0)
+    left, right = visible[rows].argmax(axis=1), width - visible[rows, ::-1].argmax(axis=1)
+    top, bottom = visible[:, cols].argmax(axis=0), height - visible[::-1, cols].argmax(axis=0)
     u = np.concatenate([left, left, right, right, cols, cols + 1, cols, cols + 1])
     v = np.concatenate([rows, rows + 1, rows, rows + 1, top, top, bottom, bottom])
     outline = np.column_stack([u + layer.left_px, v + layer.top_px]) - canvas.shift_px
@@ -85,9 +93,9 @@ def _box(canvas: Canvas, camera: Camera, layer: Layer, seen: NDArray[np.bool_]) 
     return np.asarray(np.clip(box, 0, (camera.width_px, camera.height_px) * 2))
 
 
-def _place(
-    canvas: Canvas, camera: Camera, layer: Layer, spread_px: Array
-) -> tuple[Part, Picture] | None:
+def _find_image_region(
+    canvas: PinholeCanvas, camera: Camera, layer: Layer, margin_px: Array
+) -> tuple[Region, FloatImage] | None:
     """Return the image region that shows a blurred layer, and its pixels' places in the layer."""
     height, width = layer.depth_m.shape
     u, v = np.linspace(0, width, 9), np.linspace(0, height, 9)
@@ -95,7 +103,7 @@ def _place(
     rim = np.concatenate([rim, *(np.column_stack([u * 0 + x, v]) for x in (0, width))])
     corner = np.array([layer.left_px, layer.top_px])
     bent = image_from_pinhole(rim + corner - canvas.shift_px, camera)
-    reach = np.ceil(spread_px) + 1
+    reach = np.ceil(margin_px) + 1
     limit = (camera.width_px, camera.height_px)
     left, top = np.clip(np.floor(bent.min(axis=0) - reach), 0, limit).astype(int).tolist()
     right, bottom = np.clip(np.ceil(bent.max(axis=0) + reach), 0, limit).astype(int).tolist()
@@ -108,16 +116,16 @@ def _place(
     return part, canvas.places_px[part] - corner.astype(np.float32)
 
 
-def _mark(
-    canvas: Canvas,
+def _draw_masks(
+    canvas: PinholeCanvas,
     camera: Camera,
     layer: Layer,
-    visible: Picture,
+    visible: FloatImage,
     opacity: NDArray[np.uint8],
-    surface_m: Picture,
+    surface_m: FloatImage,
 ) -> None:
     """Write a robot's visible opacity, and the depth of its surface, into the image."""
-    found = _place(canvas, camera, layer, np.zeros(2))
+    found = _find_image_region(canvas, camera, layer, np.zeros(2))
     if found is None:
         return
     part, places = found
@@ -129,35 +137,40 @@ def _mark(
     alpha = (visible[v, u] * within).reshape(shape)
     depth = layer.depth_m[v, u].reshape(shape)
     opacity[part] = np.round(alpha * 255)
-    seen = (alpha > COVERED) & (depth < FARTHEST_M)
+    seen = (alpha > MIN_COVERED_OPACITY) & (depth < MAX_DEPTH_M)
     near = seen & ((surface_m[part] == 0) | (depth < surface_m[part]))
     surface_m[part] = np.where(near, depth, surface_m[part])
 
 
-def _paint(
-    canvas: Canvas, camera: Camera, robot: Robot, layer: Layer, look: Look, picture: Picture
+def _draw_robot(
+    canvas: PinholeCanvas,
+    camera: Camera,
+    robot: Robot,
+    layer: Layer,
+    look: Look,
+    picture: FloatImage,
 ) -> None:
     """Draw a robot over the image, with motion blur."""
-    move_px = _move_px(camera, robot)
-    found = _place(canvas, camera, layer, np.abs(move_px) / 2 + 3 * look.robot_blur_px)
+    move_px = _image_motion_px(camera, robot)
+    found = _find_image_region(canvas, camera, layer, np.abs(move_px) / 2 + 3 * look.robot_blur_px)
     if found is None:
         return
     part, places = found
-    light = blur(_smeared(layer.light, places, move_px), look.robot_blur_px)
+    light = gaussian_blur(_apply_motion_blur(layer.light, places, move_px), look.robot_blur_px)
     gain = np.float32(look.robot_gain)
     picture[part] = picture[part] * (1 - light[..., 3:]) + gain * light[..., :3]
 
 
-def _smeared(light: Picture, places: Picture, move_px: Array) -> Picture:
+def _apply_motion_blur(light: FloatImage, places: FloatImage, move_px: Array) -> FloatImage:
     length = float(np.hypot(*move_px))
-    taps = min(int(np.ceil(length)) + 1, TAPS_MAX) if length > 0.5 else 1
+    taps = min(int(np.ceil(length)) + 1, MAX_MOTION_SAMPLES) if length > 0.5 else 1
     total = np.zeros((*places.shape[:2], 4), np.float32)
     for share in (np.arange(taps) + 0.5) / taps - 0.5:
-        total += sample(light, places - (share * move_px).astype(np.float32))
+        total += sample_bilinear(light, places - (share * move_px).astype(np.float32))
     return np.asarray(total / np.float32(taps), np.float32)
 
 
-def _move_px(camera: Camera, robot: Robot) -> Array:
+def _image_motion_px(camera: Camera, robot: Robot) -> Array:
     half = robot.move_camera_m / 2
     ends = np.array([robot.pose.xyz_camera - half, robot.pose.xyz_camera + half])
     ends[:, 0] = np.maximum(ends[:, 0], 0.02)

@@ -10,12 +10,12 @@ TILE_PX, COLUMNS, ROWS = (192, 144), 8, 2
 GAP_PX = 8
 
 
-def evenly(count: int, most: int) -> list[int]:
+def even_indices(count: int, most: int) -> list[int]:
     """Return at most ``most`` indices from 0 to count - 1, evenly spaced."""
     return sorted({int(k) for k in np.linspace(0, count - 1, min(count, most)).round()})
 
 
-def sheet(ways: Sequence[Sequence[Rgb]]) -> bytes:
+def make_contact_sheet(image_sets: Sequence[Sequence[Rgb]]) -> bytes:
     """Return a PNG with two rows of evenly spaced images of each set.
 
     Parameters
@@ -24,10 +24,10 @@ def sheet(ways: Sequence[Sequence[Rgb]]) -> bytes:
         Sets of (H, W, 3) uint8 images, at least one image each.
     """
     rows = []
-    for way in ways:
+    for way in image_sets:
         tiles = [
             crop_and_scale(way[k], (0, 0, way[k].shape[1], way[k].shape[0]), *TILE_PX)
-            for k in evenly(len(way), ROWS * COLUMNS)
+            for k in even_indices(len(way), ROWS * COLUMNS)
         ]
         tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
         rows += [np.hstack(tiles[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]

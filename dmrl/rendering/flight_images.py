@@ -11,23 +11,23 @@ from typing import Any
 import numpy as np
 
 from dmrl.geometry.frames import Array, Camera
-from dmrl.rendering.backgrounds.photos import panorama_view, smeared
-from dmrl.rendering.camera.distortion import Picture
-from dmrl.rendering.camera.sensor import blur
-from dmrl.rendering.onboard_camera import View
-from dmrl.rendering.randomise import HIGHLIGHTS, random_paint, random_sensor
+from dmrl.rendering.backgrounds.photos import apply_motion_blur, render_panorama
+from dmrl.rendering.camera.distortion import FloatImage
+from dmrl.rendering.camera.sensor import gaussian_blur
+from dmrl.rendering.onboard_camera import CameraView
+from dmrl.rendering.randomise import HIGHLIGHT_LIMIT, random_paint, random_sensor
 from dmrl.rendering.renderer import Renderer, Scene
 from dmrl.rendering.robots.crazyflie import CRAZYFLIE
 from dmrl.rendering.settings import PRESETS, Settings
 from dmrl.rendering.shot import Light, Look, Robot, Shot
 
-GAIN = 0.6
+ROBOT_GAIN = 0.6
 """Light of the robots relative to the panorama. Robots fly where lamps are above and behind."""
-MIDDLE = 0.3
+NOMINAL_LEVEL = 0.3
 """Level of a panorama at which the gain applies as it is."""
 
 
-def himax() -> Settings:
+def himax_settings() -> Settings:
     """Return the settings of the AI-deck's camera."""
     keys: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value
@@ -36,7 +36,7 @@ def himax() -> Settings:
     return Settings(**keys)
 
 
-class Flight:
+class FlightRenderer:
     """Render the images of one flight.
 
     Parameters
@@ -49,12 +49,12 @@ class Flight:
 
     def __init__(self, renderer: Renderer, seed: int) -> None:
         self._renderer, self._seed = renderer, seed
-        self._settings = himax()
+        self._settings = himax_settings()
         rng = np.random.default_rng((seed, 0))
         self._place = renderer.lights[int(rng.integers(len(renderer.lights)))]
-        self._panorama = renderer.panorama(self._place)
+        self._panorama = renderer.load_panorama(self._place)
         self._turn_rad = float(rng.uniform(-np.pi, np.pi))
-        self._level = _level(self._panorama)
+        self._level = _ambient_level(self._panorama)
         towards = rng.normal((0.0, 0.0, 1.2), 1.0)
         self._sun_world = towards / np.linalg.norm(towards)
         self._sun: dict[str, Any] = {
@@ -63,19 +63,19 @@ class Flight:
             "sun_colour": (1.0, 1.0, 1.0),
             "sun_angle_rad": float(rng.uniform(0.05, 0.6)),
         }
-        self._paint = cache(self._paint_of)
+        self._paint = cache(self._draw_paint)
 
-    def __call__(self, camera: Camera, views: Iterable[View]) -> Iterator[Shot]:
+    def __call__(self, camera: Camera, views: Iterable[CameraView]) -> Iterator[Shot]:
         """Yield the shots of one robot's views, in their order."""
-        return self._renderer.shots(self._scene(camera, view) for view in views)
+        return self._renderer.render_shots(self._build_scene(camera, view) for view in views)
 
-    def _paint_of(self, name: str) -> dict[str, Any]:
+    def _draw_paint(self, name: str) -> dict[str, Any]:
         """Return the colours of a robot."""
         rng = np.random.default_rng((self._seed, 1, *name.encode()))
         wear = float(rng.uniform(*self._settings.wear))
         return random_paint(rng, CRAZYFLIE, wear, self._settings.colour_spread)
 
-    def _scene(self, camera: Camera, view: View) -> Scene:
+    def _build_scene(self, camera: Camera, view: CameraView) -> Scene:
         seed, number, _ = view.key
         ranges = self._settings
         rng = np.random.default_rng((seed, 2, number))  # the same for all images of a camera
@@ -85,20 +85,28 @@ class Flight:
         rng = np.random.default_rng(view.key)
         here = view.here
         turn = (here.roll_rad, here.pitch_rad, here.yaw_rad + self._turn_rad)
-        backdrop = blur(panorama_view(self._panorama, camera, turn), soft_px)
+        backdrop = gaussian_blur(render_panorama(self._panorama, camera, turn), soft_px)
         move_px = view.turning_rps * (camera.fx_px, camera.fy_px) * shutter_s
-        backdrop = smeared(np.minimum(backdrop, HIGHLIGHTS * self._level), move_px.tolist())
+        backdrop = apply_motion_blur(
+            np.minimum(backdrop, HIGHLIGHT_LIMIT * self._level), move_px.tolist()
+        )
         towards = here.body_from_world @ self._sun_world
         light = Light(name=self._place, turn_rad=turn, sun_camera=towards, **self._sun)
-        gain = GAIN * self._level / MIDDLE
+        gain = ROBOT_GAIN * self._level / NOMINAL_LEVEL
         look = Look(backdrop, light, sensor, gain, seed=int(rng.integers(2**31)))
         robots = [
-            Robot(pose, self._turned(name, rng, shutter_s), view.velocity_mps[name] * shutter_s)
+            Robot(
+                pose,
+                self._paint_with_rotors(name, rng, shutter_s),
+                view.velocity_mps[name] * shutter_s,
+            )
             for name, pose in view.poses.items()
         ]
         return camera, robots, look
 
-    def _turned(self, name: str, rng: np.random.Generator, shutter_s: float) -> dict[str, Any]:
+    def _paint_with_rotors(
+        self, name: str, rng: np.random.Generator, shutter_s: float
+    ) -> dict[str, Any]:
         """Return a robot's paint with the rotor angles of one image."""
         turns = float(rng.uniform(*self._settings.rotor_speed_rps)) * shutter_s
         first = float(rng.uniform(0, np.pi))
@@ -108,8 +116,8 @@ class Flight:
         }
 
 
-def _level(panorama: Picture) -> float:
+def _ambient_level(panorama: FloatImage) -> float:
     """Return the mean light of a panorama near the horizon, with lamps clipped."""
     rows = len(panorama)
     band: Array = panorama[rows // 3 : 2 * rows // 3].astype(float)
-    return max(float(np.minimum(band, HIGHLIGHTS * band.mean()).mean()), 1e-3)
+    return max(float(np.minimum(band, HIGHLIGHT_LIMIT * band.mean()).mean()), 1e-3)

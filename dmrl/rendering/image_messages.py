@@ -9,21 +9,23 @@ import numpy as np
 from dmrl import topics
 from dmrl.geometry.frames import Array, camera_from_horizontal
 from dmrl.images.codec import encode_jpeg, encode_png
-from dmrl.rendering.randomise import Drawn
+from dmrl.rendering.randomise import RandomScene
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Robot, Shot
-from dmrl.samples.sample import Sample, image, labels
+from dmrl.samples.sample import Sample, build_image, build_labels
 
-ROBOT = "cf1"
+OBSERVER = "cf1"
 """Name of the robot that carries the camera."""
 
 
-def peer(number: int, robot: Robot) -> str:
+def peer_name(number: int, robot: Robot) -> str:
     """Return the name of the robot with this index in an image, counted from 0."""
     return f"{robot.make}{number + 2}"
 
 
-def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Iterator[Sample]:
+def build_samples(
+    time_ns: int, settings: Settings, scene: RandomScene, shot: Shot
+) -> Iterator[Sample]:
     """Yield all samples of one rendered image.
 
     Parameters
@@ -43,31 +45,31 @@ def samples(time_ns: int, settings: Settings, scene: Drawn, shot: Shot) -> Itera
         if jpeg
         else encode_png(shot.rgb)
     )
-    yield labels(time_ns, ROBOT, list(_peers(scene, shot)), ["truth"])
+    yield build_labels(time_ns, OBSERVER, list(_iter_peer_labels(scene, shot)), ["truth"])
     attitude = {"roll_rad": scene.roll_rad, "pitch_rad": scene.pitch_rad}
-    yield Sample(time_ns, topics.attitude(ROBOT), "Attitude", attitude)
+    yield Sample(time_ns, topics.ATTITUDE(OBSERVER), "Attitude", attitude)
     horizontal_from_camera = camera_from_horizontal(scene.roll_rad, scene.pitch_rad).T
     for k, robot in enumerate(scene.robots):
         xyz = horizontal_from_camera @ robot.pose.xyz_camera
-        yield _truth(time_ns, peer(k, robot), xyz)
-    yield _transforms(time_ns, scene, horizontal_from_camera)
+        yield _truth_sample(time_ns, peer_name(k, robot), xyz)
+    yield _transforms_sample(time_ns, scene, horizontal_from_camera)
     # Images come last, so that a resumed recording gets identical chunks when it is copied.
-    yield image(time_ns, ROBOT, data, settings.image_format)
+    yield build_image(time_ns, OBSERVER, data, settings.image_format)
     if settings.masks:
-        mask = encode_png(_mask(shot))
-        yield replace(image(time_ns, ROBOT, mask, "png"), topic=topics.masks(ROBOT))
+        mask = encode_png(_instance_mask(shot))
+        yield replace(build_image(time_ns, OBSERVER, mask, "png"), topic=topics.MASKS(OBSERVER))
     if settings.depths:
         depth = encode_png(np.round(shot.surface_m * 1000).astype(np.uint16))
-        yield replace(image(time_ns, ROBOT, depth, "png"), topic=topics.depths(ROBOT))
+        yield replace(build_image(time_ns, OBSERVER, depth, "png"), topic=topics.DEPTHS(OBSERVER))
 
 
-def _peers(scene: Drawn, shot: Shot) -> Iterator[dict[str, Any]]:
+def _iter_peer_labels(scene: RandomScene, shot: Shot) -> Iterator[dict[str, Any]]:
     """Yield the labels of robots that are visible and whose centre the lens can project."""
     for k, share in enumerate(shot.visible_share.tolist()):
         if share <= 0 or np.isnan([*shot.box_px[k], *shot.uv_px[k]]).any():
             continue
         yield {
-            "peer": peer(k, scene.robots[k]),
+            "peer": peer_name(k, scene.robots[k]),
             "u_px": float(shot.uv_px[k, 0]),
             "v_px": float(shot.uv_px[k, 1]),
             "depth_m": float(shot.depth_m[k]),
@@ -77,7 +79,7 @@ def _peers(scene: Drawn, shot: Shot) -> Iterator[dict[str, Any]]:
         }
 
 
-def _mask(shot: Shot) -> Any:
+def _instance_mask(shot: Shot) -> Any:
     """Return an (H, W) uint8 mask: number of the peer that covers most of a pixel, 0 for none."""
     if not len(shot.opacity):
         return np.zeros(shot.rgb.shape[:2], np.uint8)
@@ -85,35 +87,37 @@ def _mask(shot: Shot) -> Any:
     return np.where(most > 0, shot.opacity.argmax(axis=0) + 2, 0).astype(np.uint8)
 
 
-def _truth(time_ns: int, name: str, xyz: Array) -> Sample:
+def _truth_sample(time_ns: int, name: str, xyz: Array) -> Sample:
     fields = dict(zip("xyz", xyz.tolist(), strict=True))
-    fields |= {"frame_id": f"{ROBOT}/horizontal", "covariance": [0.0] * 9}
-    return Sample(time_ns, topics.truth(ROBOT, name), "PeerPosition", fields)
+    fields |= {"frame_id": f"{OBSERVER}/horizontal", "covariance": [0.0] * 9}
+    return Sample(time_ns, topics.TRUTH(OBSERVER, name), "PeerPosition", fields)
 
 
-def _transforms(time_ns: int, scene: Drawn, horizontal_from_camera: Array) -> Sample:
+def _transforms_sample(time_ns: int, scene: RandomScene, horizontal_from_camera: Array) -> Sample:
     """Return the true poses of camera and peers. The observer's horizontal frame is the world."""
     seconds, nanos = divmod(time_ns, 1_000_000_000)
-    poses = [("world", f"{ROBOT}/horizontal", np.zeros(3), np.eye(3))]
-    poses.append((f"{ROBOT}/horizontal", f"{ROBOT}/camera", np.zeros(3), horizontal_from_camera))
+    poses = [("world", f"{OBSERVER}/horizontal", np.zeros(3), np.eye(3))]
+    poses.append(
+        (f"{OBSERVER}/horizontal", f"{OBSERVER}/camera", np.zeros(3), horizontal_from_camera)
+    )
     for k, robot in enumerate(scene.robots):
         xyz = horizontal_from_camera @ robot.pose.xyz_camera
         turn = horizontal_from_camera @ robot.pose.camera_from_body
-        poses.append((f"{ROBOT}/horizontal", peer(k, robot), xyz, turn))
+        poses.append((f"{OBSERVER}/horizontal", peer_name(k, robot), xyz, turn))
     transforms = [
         {
             "timestamp": {"seconds": seconds, "nanos": nanos},
             "parent_frame_id": parent,
             "child_frame_id": child,
             "translation": dict(zip("xyz", xyz.tolist(), strict=True)),
-            "rotation": dict(zip("xyzw", quaternion(turn), strict=True)),
+            "rotation": dict(zip("xyzw", to_quaternion(turn), strict=True)),
         }
         for parent, child, xyz, turn in poses
     ]
     return Sample(time_ns, topics.TRANSFORMS, "FrameTransforms", {"transforms": transforms})
 
 
-def quaternion(matrix: Array) -> list[float]:
+def to_quaternion(matrix: Array) -> list[float]:
     """Return the quaternion x, y, z, w of a rotation, with w >= 0.
 
     Parameters

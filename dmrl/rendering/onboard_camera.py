@@ -8,15 +8,15 @@ import numpy as np
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
 from dmrl.rendering.robots.quadrotor import RADIUS_M
 from dmrl.rendering.shot import Shot
-from dmrl.rendering.sketch_renderer import Pose, Sketch, draw
+from dmrl.rendering.sketch_renderer import Pose, Sketch, render_sketch
 from dmrl.rendering.sketch_scene import random_look
 
-NEAREST_M = 2 * RADIUS_M
+MIN_DEPTH_M = 2 * RADIUS_M
 """Minimum depth of a drawn robot, metres: nearer ones would touch the image plane."""
 
 
 @dataclass(frozen=True, slots=True)
-class Body:
+class WorldPose:
     """Pose of a robot in the world frame, z up.
 
     Parameters
@@ -45,22 +45,22 @@ class Body:
         return np.asarray(tilt @ self.horizontal_from_world)
 
 
-def pose_of(peer: Body, here: Body) -> Pose:
+def relative_pose(peer: WorldPose, observer: WorldPose) -> Pose:
     """Return the pose of a peer in the camera frame of ``observer``."""
-    camera_from_world = here.body_from_world
+    camera_from_world = observer.body_from_world
     return Pose(
-        camera_from_world @ (peer.xyz_world - here.xyz_world),
+        camera_from_world @ (peer.xyz_world - observer.xyz_world),
         camera_from_world @ peer.body_from_world.T,
     )
 
 
-def in_front(pose: Pose) -> bool:
+def is_in_front(pose: Pose) -> bool:
     """Return whether a pose is far enough in front of the camera to be drawn."""
-    return bool(pose.xyz_camera[0] > NEAREST_M)
+    return bool(pose.xyz_camera[0] > MIN_DEPTH_M)
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class CameraView:
     """Poses and motion of the peers in front of one camera at one time.
 
     Parameters
@@ -77,26 +77,26 @@ class View:
         Seed of the flight, index of the camera, index of the image.
     """
 
-    here: Body
+    here: WorldPose
     poses: Mapping[str, Pose]
     velocity_mps: Mapping[str, Array]
     turning_rps: Array
     key: tuple[int, int, int]
 
 
-Renderer = Callable[[Camera, Iterable[View]], Iterator[Sketch | Shot]]
+ViewRenderer = Callable[[Camera, Iterable[CameraView]], Iterator[Sketch | Shot]]
 """Function that renders the views of one robot's camera, in their order, with labels."""
 
-MOMENT_S = 0.005
+DIFFERENCE_STEP_S = 0.005
 """Half the step of the central differences that give velocities, seconds."""
 
 
-def view(
-    bodies: Callable[[float], Mapping[str, Body]],
+def build_view(
+    bodies: Callable[[float], Mapping[str, WorldPose]],
     robot: str,
     time_s: float,
     key: tuple[int, int, int],
-) -> View:
+) -> CameraView:
     """Return the view of a robot's camera.
 
     Parameters
@@ -110,24 +110,26 @@ def view(
     key
         See `CameraView`.
     """
-    before, now, after = (bodies(time_s + step) for step in (-MOMENT_S, 0.0, MOMENT_S))
-    peers = {name: pose_of(peer, now[robot]) for name, peer in now.items() if name != robot}
-    poses = {name: pose for name, pose in peers.items() if in_front(pose)}
+    before, now, after = (
+        bodies(time_s + step) for step in (-DIFFERENCE_STEP_S, 0.0, DIFFERENCE_STEP_S)
+    )
+    peers = {name: relative_pose(peer, now[robot]) for name, peer in now.items() if name != robot}
+    poses = {name: pose for name, pose in peers.items() if is_in_front(pose)}
     velocity = {
         name: (
-            pose_of(after[name], after[robot]).xyz_camera
-            - pose_of(before[name], before[robot]).xyz_camera
+            relative_pose(after[name], after[robot]).xyz_camera
+            - relative_pose(before[name], before[robot]).xyz_camera
         )
-        / (2 * MOMENT_S)
+        / (2 * DIFFERENCE_STEP_S)
         for name in poses
     }
     ahead = after[robot].body_from_world @ before[robot].body_from_world.T[:, 0]
-    turning = -ahead[1:] / ahead[0] / (2 * MOMENT_S)
-    return View(now[robot], poses, velocity, turning, key)
+    turning = -ahead[1:] / ahead[0] / (2 * DIFFERENCE_STEP_S)
+    return CameraView(now[robot], poses, velocity, turning, key)
 
 
-def sketched(camera: Camera, views: Iterable[View]) -> Iterator[Sketch]:
+def render_sketches(camera: Camera, views: Iterable[CameraView]) -> Iterator[Sketch]:
     """Yield a sketch of every view, each with its own random background."""
     for one in views:
         rng = np.random.default_rng(one.key)
-        yield draw(camera, list(one.poses.values()), random_look(rng, camera))
+        yield render_sketch(camera, list(one.poses.values()), random_look(rng, camera))

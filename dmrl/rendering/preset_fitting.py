@@ -12,24 +12,24 @@ import numpy as np
 
 from dmrl.geometry.frames import Array, Camera
 from dmrl.images.codec import Rgb, decode, encode_jpeg
-from dmrl.rendering.backgrounds.photos import LIGHT_OF, Photos
-from dmrl.rendering.camera.image_statistics import Seen, middle_of, seen
+from dmrl.rendering.backgrounds.photos import SRGB_TO_LINEAR, Photos
+from dmrl.rendering.camera.image_statistics import ImageMeasurements, mean_of_figure, measure_images
 from dmrl.rendering.camera.sensor import expose
-from dmrl.rendering.randomise import behind, random_sensor, without_highlights
+from dmrl.rendering.randomise import clip_highlights, process_backdrop, random_sensor
 from dmrl.rendering.settings import LIMITS, Settings
 
 COARSE, FINE = (8, 32), (5, 192)
 """Rounds and images of each stage: few images first, then enough to average out chance."""
 ROUNDS = COARSE[0] + FINE[0]
-PIXELS = 24_000_000
+MAX_ROUND_PIXELS = 24_000_000
 """Pixels of all images of a round, at most. Large images are fewer, but no fewer than `COARSE`."""
-FOCAL = 0.57
+FOCAL_OVER_WIDTH = 0.57
 """Focal length over the image width, as the AI-deck's. It scales motion blur."""
-GREY = 0.01
+GREY_MAX_COLOUR = 0.01
 """Colour statistic below which a camera counts as grey."""
-MOSAIC = 0.15
+MOSAIC_MIN_CORRELATION = 0.15
 """Noise correlation from which a Bayer mosaic is assumed."""
-QUALITIES = ((98, 100), (90, 96), (75, 90))
+JPEG_QUALITIES = ((98, 100), (90, 96), (75, 90))
 """Ranges of JPEG quality. A lower quality makes coarser noise."""
 
 
@@ -65,7 +65,7 @@ KNOBS = (
     Knob("read_noise", "grain", "factor", 0.8),
     Knob("shot_noise", "grain", "factor", 1.6),
 )
-LEAST = {
+MIN_VALUES = {
     "contrast_gamma": 1.0,  # of a sensor; the rest of the contrast belongs to the scene
     "read_noise": 2e-4,
     "shot_noise": 1e-6,
@@ -75,7 +75,9 @@ LEAST = {
 """Lower bounds of fitted ranges. A range at 0 would never move."""
 
 
-def scenes(photos: Photos, settings: Settings, size_px: tuple[int, int], seed: int) -> list[Rgb]:
+def sample_scenes(
+    photos: Photos, settings: Settings, size_px: tuple[int, int], seed: int
+) -> list[Rgb]:
     """Return crops of photos as test scenes, as many as `FINE` requires.
 
     Parameters
@@ -91,12 +93,12 @@ def scenes(photos: Photos, settings: Settings, size_px: tuple[int, int], seed: i
     """
     width_px, height_px = size_px
     camera = Camera(width_px, height_px, 1.0, 1.0, width_px / 2, height_px / 2)
-    count = int(np.clip(PIXELS // (width_px * height_px), COARSE[1], FINE[1]))
+    count = int(np.clip(MAX_ROUND_PIXELS // (width_px * height_px), COARSE[1], FINE[1]))
     rngs = (np.random.default_rng((seed, number, 0)) for number in range(count))
-    return [photos.part(rng, camera, rng.uniform(*settings.background_zoom)) for rng in rngs]
+    return [photos.random_crop(rng, camera, rng.uniform(*settings.background_zoom)) for rng in rngs]
 
 
-def pictures(settings: Settings, behind_all: Iterable[Rgb], seed: int) -> Iterator[Rgb]:
+def simulate_images(settings: Settings, backdrops: Iterable[Rgb], seed: int) -> Iterator[Rgb]:
     """Yield images of the scenes as the settings' camera takes them, without robots.
 
     Parameters
@@ -108,18 +110,18 @@ def pictures(settings: Settings, behind_all: Iterable[Rgb], seed: int) -> Iterat
     seed
         Seed of the noise and of all draws.
     """
-    for number, scene in enumerate(behind_all):
+    for number, scene in enumerate(backdrops):
         rng = np.random.default_rng((seed, number, 1))
-        move_px = FOCAL * scene.shape[1] * rng.uniform(*settings.shutter_s)
-        light = behind(settings, rng, np.take(LIGHT_OF, scene), move_px)
-        rgb = expose(without_highlights(light), random_sensor(settings, rng), rng)
+        move_px = FOCAL_OVER_WIDTH * scene.shape[1] * rng.uniform(*settings.shutter_s)
+        light = process_backdrop(settings, rng, np.take(SRGB_TO_LINEAR, scene), move_px)
+        rgb = expose(clip_highlights(light), random_sensor(settings, rng), rng)
         low, high = settings.jpeg_quality
         quality = int(rng.integers(low, high + 1))
         yield rgb if settings.image_format == "png" else decode(encode_jpeg(rgb, quality))
 
 
-def fitted(
-    real: Seen, settings: Settings, all_scenes: Sequence[Rgb], seed: int
+def iter_fits(
+    real: ImageMeasurements, settings: Settings, backdrops: Sequence[Rgb], seed: int
 ) -> Iterator[Settings]:
     """Yield settings that approach the statistics of real images, one per round.
 
@@ -134,44 +136,52 @@ def fitted(
     seed
         Seed of all draws.
     """
-    settings = _kind(settings, real)
+    settings = _detect_camera_type(settings, real)
     for turn in range(COARSE[0] + FINE[0]):  # with the same draws, so that steps are comparable
         count = COARSE[1] if turn < COARSE[0] else FINE[1]
-        have = seen(pictures(settings, all_scenes[:count], seed))
-        settings = _step(settings, real, have)
+        have = measure_images(simulate_images(settings, backdrops[:count], seed))
+        settings = _step_ranges(settings, real, have)
         if settings.image_format == "jpeg" and turn == COARSE[0] // 2:
-            settings = replace(settings, jpeg_quality=_quality(settings, real, have))
+            settings = replace(settings, jpeg_quality=_select_quality(settings, real, have))
         yield settings
 
 
-def _kind(settings: Settings, real: Seen) -> Settings:
+def _detect_camera_type(settings: Settings, real: ImageMeasurements) -> Settings:
     """Return settings with the camera's type: colour or grey, with or without a Bayer mosaic."""
-    colour, correlation = (real.middle(name) or 0.0 for name in ("colour", "grain_correlation"))
-    if colour < GREY:
+    colour, correlation = (
+        real.figure_mean(name) or 0.0 for name in ("colour", "grain_correlation")
+    )
+    if colour < GREY_MAX_COLOUR:
         settings = replace(settings, bayer=False, saturation=(0.0, 0.0), warmth=(1.0, 1.0))
-        return replace(settings, image_format="png" if correlation < MOSAIC else "jpeg")
-    return replace(settings, bayer=correlation > MOSAIC, image_format="jpeg")
+        return replace(
+            settings, image_format="png" if correlation < MOSAIC_MIN_CORRELATION else "jpeg"
+        )
+    return replace(settings, bayer=correlation > MOSAIC_MIN_CORRELATION, image_format="jpeg")
 
 
-def _step(settings: Settings, real: Seen, have: Seen) -> Settings:
+def _step_ranges(settings: Settings, real: ImageMeasurements, have: ImageMeasurements) -> Settings:
     """Return settings whose ranges are one step closer to their targets, in middle and width."""
     changed: dict[str, Any] = {}
     for knob in KNOBS:
         if knob.key in ("saturation", "warmth") and settings.saturation[1] == 0:
             continue
         limits = getattr(settings, knob.key)
-        changed[knob.key] = _moved(knob, limits, real.values(knob.figure), have.values(knob.figure))
+        changed[knob.key] = _step_range(
+            knob, limits, real.figure_values(knob.figure), have.figure_values(knob.figure)
+        )
     return replace(settings, **changed)
 
 
-def _moved(knob: Knob, limits: tuple[float, float], want: Array, got: Array) -> tuple[float, float]:
+def _step_range(
+    knob: Knob, limits: tuple[float, float], want: Array, got: Array
+) -> tuple[float, float]:
     """Return a range after one step: shifted by the difference, widened by the ratio of spreads."""
     if not len(want) or not len(got):
         return limits
     least, most = LIMITS[knob.key]
-    least = max(least, LEAST.get(knob.key, 0.0))
-    wanted, found = (max(middle_of(knob.figure, values), 1e-3) for values in (want, got))
-    ends = np.clip(limits, max(least, LEAST.get(knob.key, 0.02)), most)
+    least = max(least, MIN_VALUES.get(knob.key, 0.0))
+    wanted, found = (max(mean_of_figure(knob.figure, values), 1e-3) for values in (want, got))
+    ends = np.clip(limits, max(least, MIN_VALUES.get(knob.key, 0.02)), most)
     if knob.by == "factor":
         want, got = np.log(np.maximum(want, 1e-3)), np.log(np.maximum(got, 1e-3))
         bounds = np.log([max(least, 1e-9), most])
@@ -191,8 +201,14 @@ def _moved(knob: Knob, limits: tuple[float, float], want: Array, got: Array) -> 
     return float(low), float(high)
 
 
-def _quality(settings: Settings, real: Seen, have: Seen) -> tuple[int, int]:
+def _select_quality(
+    settings: Settings, real: ImageMeasurements, have: ImageMeasurements
+) -> tuple[int, int]:
     """Return the next lower quality where the noise correlates less than 1/1.2 of the real one."""
-    want, got = (one.middle("grain_correlation") or 0.0 for one in (real, have))
-    at = QUALITIES.index(settings.jpeg_quality) if settings.jpeg_quality in QUALITIES else 0
-    return QUALITIES[min(at + (want > 1.2 * got), len(QUALITIES) - 1)]
+    want, got = (one.figure_mean("grain_correlation") or 0.0 for one in (real, have))
+    at = (
+        JPEG_QUALITIES.index(settings.jpeg_quality)
+        if settings.jpeg_quality in JPEG_QUALITIES
+        else 0
+    )
+    return JPEG_QUALITIES[min(at + (want > 1.2 * got), len(JPEG_QUALITIES) - 1)]

@@ -9,24 +9,29 @@ from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
-from dmrl.rendering.backgrounds.photos import Photos, panorama_view, smeared, stretched
-from dmrl.rendering.camera.distortion import Picture, pinhole_from_image
-from dmrl.rendering.camera.sensor import Sensor, blur
+from dmrl.rendering.backgrounds.photos import (
+    Photos,
+    apply_motion_blur,
+    render_panorama,
+    stretch_contrast,
+)
+from dmrl.rendering.camera.distortion import FloatImage, pinhole_from_image
+from dmrl.rendering.camera.sensor import Sensor, gaussian_blur
 from dmrl.rendering.robots.crazyflie import CRAZYFLIE
-from dmrl.rendering.robots.primitives import Design
+from dmrl.rendering.robots.primitives import RobotDesign
 from dmrl.rendering.settings import Range, Settings
 from dmrl.rendering.shot import Light, Look, Robot
 from dmrl.rendering.sketch_renderer import Pose
 
-TRIES = 30
+MAX_TRIES_PER_ROBOT = 30
 """Attempts per robot to find a free place."""
-HIGHLIGHTS = 3.0
+HIGHLIGHT_LIMIT = 3.0
 """Clip panoramas at this multiple of their mean: suns and lamps would hide everything else."""
-BEHIND_THE_CAMERA = np.array([-1.0, 0.0, 0.0])
+BEHIND_CAMERA = np.array([-1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
-class World:
+class SceneSource:
     """Sources of random scenes.
 
     Parameters
@@ -51,13 +56,13 @@ class World:
     camera: Camera
     radius_m: float
     lights: tuple[str, ...]
-    panorama: Callable[[str], Picture]
+    panorama: Callable[[str], FloatImage]
     photos: Photos | None
-    design: Design = CRAZYFLIE
+    design: RobotDesign = CRAZYFLIE
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class RandomScene:
     """A scene: attitude of the camera, robots, look, and JPEG quality."""
 
     roll_rad: float
@@ -67,7 +72,7 @@ class Drawn:
     jpeg_quality: int
 
 
-def draw_scene(world: World, index: int) -> Drawn:
+def draw_scene(world: SceneSource, index: int) -> RandomScene:
     """Draw scene number ``index``, independently of all other scenes.
 
     Parameters
@@ -81,53 +86,53 @@ def draw_scene(world: World, index: int) -> Drawn:
     rng = np.random.default_rng((settings.seed, index))
     tilt_rad = np.radians(settings.camera_tilt_max_deg)
     roll, pitch = rng.uniform(-tilt_rad, tilt_rad, 2).tolist()
-    shutter_s = _between(rng, settings.shutter_s)
-    poses = _poses(world, rng, camera_from_horizontal(roll, pitch))
-    robots = tuple(_robot(world, rng, pose, shutter_s) for pose in poses)
-    look = _look(world, rng, (roll, pitch), shutter_s)
+    shutter_s = _draw_uniform(rng, settings.shutter_s)
+    poses = _draw_poses(world, rng, camera_from_horizontal(roll, pitch))
+    robots = tuple(_draw_robot(world, rng, pose, shutter_s) for pose in poses)
+    look = _draw_look(world, rng, (roll, pitch), shutter_s)
     low, high = settings.jpeg_quality
-    return Drawn(roll, pitch, robots, look, int(rng.integers(low, high + 1)))
+    return RandomScene(roll, pitch, robots, look, int(rng.integers(low, high + 1)))
 
 
-def _between(rng: Generator, limits: Range) -> float:
+def _draw_uniform(rng: Generator, limits: Range) -> float:
     return float(rng.uniform(*limits))
 
 
-def _factor(rng: Generator, limits: Range) -> float:
+def _draw_log_uniform(rng: Generator, limits: Range) -> float:
     """Draw a log-uniform number between limits."""
     return float(np.exp(rng.uniform(*np.log(limits))))
 
 
-def _poses(world: World, rng: Generator, tilt: Array) -> list[Pose]:
+def _draw_poses(world: SceneSource, rng: Generator, tilt: Array) -> list[Pose]:
     settings = world.settings
     empty = rng.random() < settings.empty_share
     count = 0 if empty else int(rng.integers(1, settings.robots_max + 1))
     poses: list[Pose] = []
-    for _ in range(count * TRIES):
+    for _ in range(count * MAX_TRIES_PER_ROBOT):
         if len(poses) == count:
             break
-        pose = Pose(_place(world, rng), tilt @ _attitude(settings, rng))
+        pose = Pose(_draw_position(world, rng), tilt @ _draw_attitude(settings, rng))
         apart = (np.linalg.norm(pose.xyz_camera - other.xyz_camera) for other in poses)
         if all(distance > 2 * world.radius_m for distance in apart):
             poses.append(pose)
     return poses
 
 
-def _place(world: World, rng: Generator) -> Array:
+def _draw_position(world: SceneSource, rng: Generator) -> Array:
     """Draw a position, uniform in a region of the distorted image."""
     camera, settings = world.camera, world.settings
     size = np.array([camera.width_px, camera.height_px])
     low, high = np.transpose([settings.place_u, settings.place_v]) * size
     uv = rng.uniform(low, high)
     u_px, v_px = pinhole_from_image(uv, camera)
-    draw = _between if settings.depth_spacing == "linear" else _factor
+    draw = _draw_uniform if settings.depth_spacing == "linear" else _draw_log_uniform
     depth_m = draw(rng, settings.depth_m)
     left = (camera.cx_px - u_px) / camera.fx_px
     up = (camera.cy_px - v_px) / camera.fy_px
     return np.array([depth_m, depth_m * left, depth_m * up])
 
 
-def _attitude(settings: Settings, rng: Generator) -> Array:
+def _draw_attitude(settings: Settings, rng: Generator) -> Array:
     """Draw the rotation horizontal_from_body."""
     tilt_rad = np.radians(settings.robot_tilt_max_deg)
     roll, pitch = rng.uniform(-tilt_rad, tilt_rad, 2).tolist()
@@ -138,23 +143,23 @@ def _attitude(settings: Settings, rng: Generator) -> Array:
     return np.asarray(turns.as_matrix())
 
 
-def _robot(world: World, rng: Generator, pose: Pose, shutter_s: float) -> Robot:
+def _draw_robot(world: SceneSource, rng: Generator, pose: Pose, shutter_s: float) -> Robot:
     settings, design = world.settings, world.design
     velocity = rng.normal(size=3)
     velocity *= settings.speed_max_mps * rng.random() / np.linalg.norm(velocity)
     stopped = rng.random() < settings.rotors_stopped_share
     # Without a shutter time, rotors are rendered as at 10 ms: a disc.
     open_s = shutter_s or 0.01
-    sweep = 0.0 if stopped else 2 * np.pi * _between(rng, settings.rotor_speed_rps) * open_s
-    paint = random_paint(rng, design, _between(rng, settings.wear), settings.colour_spread)
+    sweep = 0.0 if stopped else 2 * np.pi * _draw_uniform(rng, settings.rotor_speed_rps) * open_s
+    paint = random_paint(rng, design, _draw_uniform(rng, settings.wear), settings.colour_spread)
     painted = bool(settings.painted_share) and rng.random() < settings.painted_share
     if painted:
-        paint |= strong_colours(rng, design)
+        paint |= random_two_colours(rng, design)
     paint |= {"rotor_first_rad": float(rng.uniform(0, np.pi)), "rotor_sweep_rad": float(sweep)}
     return Robot(pose, paint, velocity * shutter_s, "painted" if painted else "cf")
 
 
-def random_paint(rng: Generator, design: Design, wear: float, spread: float) -> dict[str, Any]:
+def random_paint(rng: Generator, design: RobotDesign, wear: float, spread: float) -> dict[str, Any]:
     """Draw the colour and finish of every material, as properties of the worker's shaders.
 
     Parameters
@@ -187,7 +192,7 @@ def random_paint(rng: Generator, design: Design, wear: float, spread: float) -> 
     return paint | {f"finish_{k}": finishes[k] for k in range(parts)}
 
 
-def strong_colours(rng: Generator, design: Design) -> dict[str, Any]:
+def random_two_colours(rng: Generator, design: RobotDesign) -> dict[str, Any]:
     """Draw two colours for all parts that do not glow, as of a drone of another make.
 
     Parameters
@@ -204,30 +209,34 @@ def strong_colours(rng: Generator, design: Design) -> dict[str, Any]:
     return {f"colour_{k}": np.clip(shades[k], 0, 1).tolist() for k in dull}
 
 
-def _look(world: World, rng: Generator, tilt_rad: tuple[float, float], shutter_s: float) -> Look:
+def _draw_look(
+    world: SceneSource, rng: Generator, tilt_rad: tuple[float, float], shutter_s: float
+) -> Look:
     settings = world.settings
     name = world.lights[int(rng.integers(len(world.lights)))]
     turn = (*tilt_rad, float(rng.uniform(-np.pi, np.pi)))
-    zoom = _between(rng, settings.background_zoom)
+    zoom = _draw_uniform(rng, settings.background_zoom)
     pasted = settings.pasted and world.photos is not None
     if world.photos is not None:
-        backdrop = world.photos.backdrop(rng, world.camera, zoom, averaged=not pasted)
+        backdrop = world.photos.random_backdrop(rng, world.camera, zoom, averaged=not pasted)
         if settings.recoloured_share and rng.random() < settings.recoloured_share:
             backdrop = backdrop[..., rng.permutation(3)]
     else:
-        backdrop = panorama_view(world.panorama(name), world.camera, turn)
-    backdrop = behind(settings, rng, backdrop, world.camera.fx_px * shutter_s)
-    gain = _factor(rng, settings.robot_gain)
+        backdrop = render_panorama(world.panorama(name), world.camera, turn)
+    backdrop = process_backdrop(settings, rng, backdrop, world.camera.fx_px * shutter_s)
+    gain = _draw_log_uniform(rng, settings.robot_gain)
     if not pasted:
-        backdrop = without_highlights(backdrop)
+        backdrop = clip_highlights(backdrop)
         gain *= float(backdrop.mean()) / 0.3
     seed = int(rng.integers(2**31))
-    light = _light(settings, rng, name, turn, pasted=pasted)
+    light = _draw_light(settings, rng, name, turn, pasted=pasted)
     sensor = random_sensor(settings, rng, exposed=not pasted)
-    return Look(backdrop, light, sensor, gain, _between(rng, settings.robot_blur_px), seed)
+    return Look(backdrop, light, sensor, gain, _draw_uniform(rng, settings.robot_blur_px), seed)
 
 
-def behind(settings: Settings, rng: Generator, light: Picture, px_per_rps: float) -> Picture:
+def process_backdrop(
+    settings: Settings, rng: Generator, light: FloatImage, px_per_rps: float
+) -> FloatImage:
     """Return the light behind the robots with contrast, defocus and motion blur applied.
 
     Parameters
@@ -242,19 +251,19 @@ def behind(settings: Settings, rng: Generator, light: Picture, px_per_rps: float
         Image motion during the exposure of a camera that turns by one radian per second, pixels.
     """
     if settings.background_contrast != (1.0, 1.0):
-        light = stretched(light, _factor(rng, settings.background_contrast))
-    light = blur(light, _between(rng, settings.background_blur_px))
+        light = stretch_contrast(light, _draw_log_uniform(rng, settings.background_contrast))
+    light = gaussian_blur(light, _draw_uniform(rng, settings.background_blur_px))
     shake = rng.normal(size=2)
     shake *= np.radians(settings.shake_max_dps) * rng.random() / np.linalg.norm(shake)
-    return smeared(light, (shake * px_per_rps).tolist())
+    return apply_motion_blur(light, (shake * px_per_rps).tolist())
 
 
-def without_highlights(light: Picture) -> Picture:
+def clip_highlights(light: FloatImage) -> FloatImage:
     """Return (H, W, 3) light with suns and lamps clipped."""
-    return np.minimum(light, HIGHLIGHTS * max(float(light.mean()), 1e-3))
+    return np.minimum(light, HIGHLIGHT_LIMIT * max(float(light.mean()), 1e-3))
 
 
-def _light(
+def _draw_light(
     settings: Settings,
     rng: Generator,
     name: str,
@@ -268,26 +277,26 @@ def _light(
     return Light(
         name=name,
         turn_rad=turn,
-        strength=_between(rng, settings.light_strength),
-        sun_camera=BEHIND_THE_CAMERA if pasted else towards,
-        sun_strength=_between(rng, settings.sun_strength),
+        strength=_draw_uniform(rng, settings.light_strength),
+        sun_camera=BEHIND_CAMERA if pasted else towards,
+        sun_strength=_draw_uniform(rng, settings.sun_strength),
         sun_colour=(1.0, 1.0, 1.0) if pasted else (1 + warm, 1.0, 1 - warm),
-        sun_angle_rad=_between(rng, (0.01, 0.6)),
+        sun_angle_rad=_draw_uniform(rng, (0.01, 0.6)),
         sun_shadow=not pasted,
     )
 
 
 def random_sensor(settings: Settings, rng: Generator, *, exposed: bool = True) -> Sensor:
     """Draw a sensor from the ranges of the settings. Without ``exposed`` its exposure is fixed."""
-    warmth = _factor(rng, settings.warmth) ** 0.5
+    warmth = _draw_log_uniform(rng, settings.warmth) ** 0.5
     return Sensor(
-        brightness=_between(rng, settings.brightness) if exposed else None,
-        contrast_gamma=_between(rng, settings.contrast_gamma),
+        brightness=_draw_uniform(rng, settings.brightness) if exposed else None,
+        contrast_gamma=_draw_uniform(rng, settings.contrast_gamma),
         balance=(warmth, 1.0, 1 / warmth),
-        saturation=_between(rng, settings.saturation),
-        vignetting=_between(rng, settings.vignetting),
-        defocus_px=_between(rng, settings.defocus_px),
+        saturation=_draw_uniform(rng, settings.saturation),
+        vignetting=_draw_uniform(rng, settings.vignetting),
+        defocus_px=_draw_uniform(rng, settings.defocus_px),
         bayer=settings.bayer,
-        shot_noise=_between(rng, settings.shot_noise),
-        read_noise=_between(rng, settings.read_noise),
+        shot_noise=_draw_uniform(rng, settings.shot_noise),
+        read_noise=_draw_uniform(rng, settings.read_noise),
     )

@@ -15,26 +15,26 @@ import numpy as np
 
 from dmrl.errors import SettingError
 from dmrl.geometry.frames import Array, Camera
-from dmrl.rendering.camera.distortion import Picture
-from dmrl.rendering.compositing import compose
-from dmrl.rendering.robots.crazyflie import BETWEEN_ROTORS_RAD, BLADE_HALF_WIDTH_M, CRAZYFLIE
-from dmrl.rendering.robots.primitives import Design
-from dmrl.rendering.shot import Layer, Look, Robot, Shot, requests
-from dmrl.rendering.worker_pool import Pool, Start, Worker
+from dmrl.rendering.camera.distortion import FloatImage
+from dmrl.rendering.compositing import compose_shot
+from dmrl.rendering.robots.crazyflie import BLADE_HALF_WIDTH_M, CRAZYFLIE, ROTOR_STEP_RAD
+from dmrl.rendering.robots.primitives import RobotDesign
+from dmrl.rendering.shot import Layer, Look, Robot, Shot, build_requests
+from dmrl.rendering.worker_pool import Worker, WorkerPool, WorkerStart
 
-MODEL_KINDS = (".blend", ".glb", ".gltf", ".obj", ".stl")
+MODEL_SUFFIXES = (".blend", ".glb", ".gltf", ".obj", ".stl")
 """Suffixes of model files that Blender can import."""
-PANORAMA_KINDS = (".exr", ".hdr")
-SMALLEST_M, LARGEST_M = 0.01, 3.0
+PANORAMA_SUFFIXES = (".exr", ".hdr")
+MIN_ROBOT_SIZE_M, MAX_ROBOT_SIZE_M = 0.01, 3.0
 """Size of a robot, metres: smallest and largest."""
-SAMPLES = 8
-BOUNCES = 2
+DEFAULT_SAMPLES = 8
+LIGHT_BOUNCES = 2
 
 Scene = tuple[Camera, Sequence[Robot], Look]
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
+class RobotModel:
     """Shape of the robots.
 
     Parameters
@@ -55,13 +55,15 @@ class Model:
     scale: float = 1.0
     up: Literal["auto", "y", "z"] = "auto"
     centre: Literal["box", "origin"] = "box"
-    design: Design = CRAZYFLIE
+    design: RobotDesign = CRAZYFLIE
 
 
-def _start(python: Path, model: Model, lights: Sequence[str], samples: int) -> Start:
+def _build_start(
+    python: Path, model: RobotModel, lights: Sequence[str], samples: int
+) -> WorkerStart:
     head: dict[str, Any] = {
         "samples": samples,
-        "bounces": BOUNCES,
+        "bounces": LIGHT_BOUNCES,
         "lights": list(lights),
         "model": None if model.path is None else str(model.path),
         "model_scale": model.scale,
@@ -69,13 +71,13 @@ def _start(python: Path, model: Model, lights: Sequence[str], samples: int) -> S
         "model_centre": model.centre,
         "materials": model.design.materials,
         "blade_half_width_m": BLADE_HALF_WIDTH_M,
-        "between_rotors_rad": BETWEEN_ROTORS_RAD,
+        "between_rotors_rad": ROTOR_STEP_RAD,
     }
     if model.path is not None:
-        return Start(python, head)
-    mesh = model.design.mesh()
+        return WorkerStart(python, head)
+    mesh = model.design.build_mesh()
     arrays = {"vertices": mesh.vertices * model.scale, "faces": mesh.faces}
-    return Start(python, head, {**arrays, "material": mesh.material, "rotor": mesh.rotor})
+    return WorkerStart(python, head, {**arrays, "material": mesh.material, "rotor": mesh.rotor})
 
 
 class Renderer:
@@ -105,23 +107,27 @@ class Renderer:
     def __init__(
         self,
         python: Path,
-        model: Model,
+        model: RobotModel,
         *,
         lights: Sequence[Path] | None = None,
         workers: int = 0,
-        samples: int = SAMPLES,
+        samples: int = DEFAULT_SAMPLES,
     ) -> None:
         _check_model(model)
-        self.lights = [str(p) for p in (shipped_lights(python) if lights is None else lights)]
-        self._pool = Pool(_start(python, model, self.lights, samples), workers or _cores())
+        self.lights = [
+            str(p) for p in (list_shipped_panoramas(python) if lights is None else lights)
+        ]
+        self._pool = WorkerPool(
+            _build_start(python, model, self.lights, samples), workers or _count_cores()
+        )
         self.version = self._pool.version
-        self.points = _outermost(self._pool.points)
+        self.points = _hull_points(self._pool.points)
         self.box = np.array([self._pool.points.min(axis=0), self._pool.points.max(axis=0)])
         """(2, 3) minimum and maximum x, y and z of the robot, body frame, metres."""
         size_m = float(np.ptp(self.box, axis=0).max())
-        if not SMALLEST_M <= size_m <= LARGEST_M:
+        if not MIN_ROBOT_SIZE_M <= size_m <= MAX_ROBOT_SIZE_M:
             self._pool.__exit__()
-            raise SettingError(_why_not(model, size_m))
+            raise SettingError(_size_error(model, size_m))
 
     @property
     def radius_m(self) -> float:
@@ -129,11 +135,11 @@ class Renderer:
         return float(np.linalg.norm(self.points, axis=1).max())
 
     @property
-    def pool(self) -> Pool:
+    def pool(self) -> WorkerPool:
         """The worker processes."""
         return self._pool
 
-    def shots(self, scenes: Iterable[Scene]) -> Iterator[Shot]:
+    def render_shots(self, scenes: Iterable[Scene]) -> Iterator[Shot]:
         """Yield the shots of scenes, in their order. Few scenes are read ahead.
 
         Raises
@@ -141,14 +147,14 @@ class Renderer:
         BlenderError
             If Blender exits repeatedly on one scene.
         """
-        return self._pool.map(self._shot, scenes)
+        return self._pool.map(self._render_shot, scenes)
 
-    def _shot(self, worker: Worker, scene: Scene) -> Shot:
-        return shoot(worker, scene, self.points)
+    def _render_shot(self, worker: Worker, scene: Scene) -> Shot:
+        return render_shot(worker, scene, self.points)
 
-    def panorama(self, name: str) -> Picture:
+    def load_panorama(self, name: str) -> FloatImage:
         """Return the (H, W, 3) linear light of a panorama."""
-        _, arrays = self._pool.call(lambda worker: worker.ask({"panorama": name}))
+        _, arrays = self._pool.call(lambda worker: worker.request({"panorama": name}))
         return np.array(arrays["panorama"], np.float32)
 
     def __enter__(self) -> Self:
@@ -158,7 +164,7 @@ class Renderer:
         self._pool.__exit__()
 
 
-def shoot(worker: Worker, scene: Scene, points: Array) -> Shot:
+def render_shot(worker: Worker, scene: Scene, points: Array) -> Shot:
     """Render one shot with one worker.
 
     Parameters
@@ -177,21 +183,21 @@ def shoot(worker: Worker, scene: Scene, points: Array) -> Shot:
     """
     camera, robots, look = scene
     layers = {}
-    for number, asked in requests(camera, robots, look, points):
-        _, arrays = worker.ask(asked)
+    for number, asked in build_requests(camera, robots, look, points):
+        _, arrays = worker.request(asked)
         left, top, _, _ = asked["crop_px"]
         layers[number] = Layer(left, top, arrays["light"], arrays["depth"])
-    return compose(camera, robots, look, layers)
+    return compose_shot(camera, robots, look, layers)
 
 
-def _cores() -> int:
+def _count_cores() -> int:
     """Return the number of cores available to this process; all cores on macOS and Windows."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-def shipped_lights(python: Path) -> list[Path]:
+def list_shipped_panoramas(python: Path) -> list[Path]:
     """List the panoramas that ship with Blender, sorted."""
     found = python.parent.parent.glob(
         "lib/python*/site-packages/bpy/*/datafiles/studiolights/world"
@@ -199,7 +205,7 @@ def shipped_lights(python: Path) -> list[Path]:
     return sorted(path for folder in found for path in folder.glob("*.exr"))
 
 
-def panoramas_in(folder: Path) -> list[Path]:
+def list_panoramas(folder: Path) -> list[Path]:
     """List the panoramas of a folder, sorted.
 
     Raises
@@ -209,16 +215,16 @@ def panoramas_in(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise SettingError(f"no folder {folder} of panoramas. Check the key lights")
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PANORAMA_KINDS)
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PANORAMA_SUFFIXES)
     if not found:
-        kinds = ", ".join(PANORAMA_KINDS)
+        kinds = ", ".join(PANORAMA_SUFFIXES)
         raise SettingError(f"{folder} contains no panorama ({kinds}). Use another for lights")
     return found
 
 
-def _why_not(model: Model, size_m: float) -> str:
+def _size_error(model: RobotModel, size_m: float) -> str:
     """Return the error text for a robot of this size."""
-    limits = f"they must be {SMALLEST_M:g} to {LARGEST_M:g} m"
+    limits = f"they must be {MIN_ROBOT_SIZE_M:g} to {MAX_ROBOT_SIZE_M:g} m"
     if model.path is None:
         return (
             f"the robot that dmrl draws, {model.scale:g} times life size, is {size_m:.3g} m; "
@@ -230,17 +236,19 @@ def _why_not(model: Model, size_m: float) -> str:
     )
 
 
-def _check_model(model: Model) -> None:
+def _check_model(model: RobotModel) -> None:
     if model.path is not None:
         if not model.path.is_file():
             raise SettingError(f"no model {model.path}. Check --model")
-        if model.path.suffix.lower() not in MODEL_KINDS:
-            raise SettingError(f"{model.path} is not a model. Use one of {', '.join(MODEL_KINDS)}")
+        if model.path.suffix.lower() not in MODEL_SUFFIXES:
+            raise SettingError(
+                f"{model.path} is not a model. Use one of {', '.join(MODEL_SUFFIXES)}"
+            )
     if not np.isfinite(model.scale) or model.scale <= 0:
         raise SettingError(f"--scale {model.scale:g} is not above 0. Pass metres per unit")
 
 
-def _outermost(points: Array) -> Array:
+def _hull_points(points: Array) -> Array:
     """Return the farthest points in 400 directions. Their hull nearly contains all points."""
     k = np.arange(400) + 0.5  # directions on a golden spiral
     z, turn = 1 - 2 * k / 400, np.pi * (1 + 5**0.5) * k

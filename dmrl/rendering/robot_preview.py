@@ -6,32 +6,32 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmrl.geometry.frames import Array, Camera, project
-from dmrl.plots import Side, model_sides
+from dmrl.plots import Side, plot_model_sides
 from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.randomise import random_paint
 from dmrl.rendering.renderer import Renderer
-from dmrl.rendering.robots.primitives import Design
+from dmrl.rendering.robots.primitives import RobotDesign
 from dmrl.rendering.robots.robot_models import DESIGNS
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Light, Look, Robot
 from dmrl.rendering.sketch_renderer import Pose
 
 SIDE_PX = 480
-DISTANCE = 12.0
+DISTANCE_RADII = 12.0
 """Distance of the camera, in radii of the robot. A large distance avoids strong perspective."""
-FILLED = 0.68
+FILL_SHARE = 0.68
 """Share of the image that the robot's ball fills. The rest leaves room for the axes."""
-AXIS = 1.1
+AXIS_LENGTH = 1.1
 """Length of the axes, in halves of the box's longest side."""
-GREY = 0.5
-VIEWS = (
+WALL_GREY = 0.5
+SIDES = (
     ("from the front, its left and above", (1.6, 1.1, 1.0), (0.0, 0.0, 1.0)),
     ("from its left", (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     ("from the front", (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     ("from above", (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
 )
 """Name of each view, position of the camera, and the direction that is up; body frame."""
-EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1]
+BOX_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1]
 """Pairs of box corners joined by an edge. Corner k has the bits of x, y and z."""
 
 
@@ -54,7 +54,7 @@ class Preview:
     px_wide_at_1_m: float
 
 
-def preview(renderer: Renderer, settings: Settings, camera: Camera) -> Preview:
+def render_preview(renderer: Renderer, settings: Settings, camera: Camera) -> Preview:
     """Render the settings' robot from all sides, and compute its size.
 
     Parameters
@@ -70,12 +70,12 @@ def preview(renderer: Renderer, settings: Settings, camera: Camera) -> Preview:
     if settings.model is not None:
         words = f"{settings.model.name}, scale {settings.scale:g}, model_up {settings.model_up}"
     x_m, y_m, z_m = np.ptp(renderer.box, axis=0).tolist()
-    sides = list(views(renderer, DESIGNS[settings.design]))
-    png = model_sides(sides, words, (x_m, y_m, z_m))
+    sides = list(render_sides(renderer, DESIGNS[settings.design]))
+    png = plot_model_sides(sides, words, (x_m, y_m, z_m))
     return Preview(png, (x_m, y_m, z_m), camera.fx_px * y_m)
 
 
-def views(renderer: Renderer, design: Design) -> Iterator[Side]:
+def render_sides(renderer: Renderer, design: RobotDesign) -> Iterator[Side]:
     """Render the robot from four sides.
 
     Parameters
@@ -87,22 +87,27 @@ def views(renderer: Renderer, design: Design) -> Iterator[Side]:
     """
     box = renderer.box
     middle, radius_m = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
-    focal_px = FILLED * SIDE_PX / 2 * DISTANCE
+    focal_px = FILL_SHARE * SIDE_PX / 2 * DISTANCE_RADII
     camera = Camera(SIDE_PX, SIDE_PX, focal_px, focal_px, SIDE_PX / 2, SIDE_PX / 2)
-    poses = [_pose(side, up, middle, DISTANCE * radius_m) for _, side, up in VIEWS]
+    poses = [_look_at_pose(side, up, middle, DISTANCE_RADII * radius_m) for _, side, up in SIDES]
     corners = np.array([[box[k >> axis & 1, axis] for axis in range(3)] for k in range(8)])
-    edges = np.array([corners[list(pair)] for pair in EDGES])
-    length_m = AXIS * float((box[1] - box[0]).max()) / 2
+    edges = np.array([corners[list(pair)] for pair in BOX_EDGES])
+    length_m = AXIS_LENGTH * float((box[1] - box[0]).max()) / 2
     axes = np.stack([np.zeros((3, 3)), length_m * np.eye(3)], axis=1)
     paint = random_paint(np.random.default_rng(0), design, wear=0.0, spread=0.0)
     paint |= {"rotor_first_rad": 0.6, "rotor_sweep_rad": 0.0}
-    look = _look(renderer.lights[0])
-    shots = renderer.shots((camera, [Robot(pose, paint)], look) for pose in poses)
-    for (name, *_), pose, shot in zip(VIEWS, poses, shots, strict=True):
-        yield Side(name, shot.rgb, _pixels(axes, pose, camera), _pixels(edges, pose, camera))
+    look = _neutral_look(renderer.lights[0])
+    shots = renderer.render_shots((camera, [Robot(pose, paint)], look) for pose in poses)
+    for (name, *_), pose, shot in zip(SIDES, poses, shots, strict=True):
+        yield Side(
+            name,
+            shot.rgb,
+            _project_to_pixels(axes, pose, camera),
+            _project_to_pixels(edges, pose, camera),
+        )
 
 
-def _pose(
+def _look_at_pose(
     towards: tuple[float, float, float],
     upright: tuple[float, float, float],
     middle: Array,
@@ -116,16 +121,16 @@ def _pose(
     return Pose(np.array([distance_m, 0.0, 0.0]) - camera_from_body @ middle, camera_from_body)
 
 
-def _pixels(points: Array, pose: Pose, camera: Camera) -> Array:
+def _project_to_pixels(points: Array, pose: Pose, camera: Camera) -> Array:
     """Project (..., 3) points of the body to (..., 2) pixels."""
     xyz = points.reshape(-1, 3) @ pose.camera_from_body.T + pose.xyz_camera
     uv, _ = project(xyz, camera.image_from_optical)
     return np.asarray(uv.reshape(*points.shape[:-1], 2))
 
 
-def _look(light: str) -> Look:
+def _neutral_look(light: str) -> Look:
     """Return a fixed look: a grey wall, and a lamp above the camera's shoulder."""
-    backdrop = np.full((SIDE_PX, SIDE_PX, 3), GREY, np.float32)
+    backdrop = np.full((SIDE_PX, SIDE_PX, 3), WALL_GREY, np.float32)
     sun = np.array([-1.0, 0.5, 1.0]) / 1.5
     shine = Light(light, (0.0, 0.0, 0.0), 0.5, sun, 2.0, (1.0, 1.0, 1.0), 0.1)
     return Look(backdrop, shine, Sensor(brightness=None))

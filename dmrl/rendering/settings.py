@@ -234,11 +234,11 @@ class Settings:
     jpeg_subsampled: bool = False
 
     def __post_init__(self) -> None:
-        if faults := list(_faults(self)):
+        if faults := list(_find_faults(self)):
             raise ValueError("; ".join(faults))
 
 
-def _faults(settings: Settings) -> list[str]:
+def _find_faults(settings: Settings) -> list[str]:
     """List all values outside their limits and all reversed ranges."""
     faults = []
     for key in fields(settings):

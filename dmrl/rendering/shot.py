@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array, Camera, project
-from dmrl.rendering.camera.distortion import Canvas, Picture, canvas_of
+from dmrl.rendering.camera.distortion import FloatImage, PinholeCanvas, pinhole_canvas
 from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.sketch_renderer import Pose
 
-Part = tuple[slice, slice]
+Region = tuple[slice, slice]
 """Rows and columns of an image."""
-PAD_PX = 1
-NEAREST_M = 0.01
+CROP_MARGIN_PX = 1
+MIN_DEPTH_M = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ class Look:
         Seed of the renderer's and the sensor's noise.
     """
 
-    backdrop: Picture
+    backdrop: FloatImage
     light: Light
     sensor: Sensor
     robot_gain: float = 1.0
@@ -133,7 +133,7 @@ class Shot:
     box_px: Array
     visible_share: Array
     opacity: NDArray[np.uint8]
-    surface_m: Picture
+    surface_m: FloatImage
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,17 +142,17 @@ class Layer:
 
     left_px: int
     top_px: int
-    light: Picture
-    depth_m: Picture
+    light: FloatImage
+    depth_m: FloatImage
 
     @property
-    def part(self) -> Part:
+    def part(self) -> Region:
         """Rows and columns of the canvas that the layer covers."""
         height, width = self.depth_m.shape
         return np.s_[self.top_px : self.top_px + height, self.left_px : self.left_px + width]
 
 
-def crop_of(canvas: Canvas, pose: Pose, points: Array) -> tuple[int, int, int, int] | None:
+def find_crop(canvas: PinholeCanvas, pose: Pose, points: Array) -> tuple[int, int, int, int] | None:
     """Return left, top, right, bottom of the canvas region that can show a robot, or None.
 
     Parameters
@@ -166,20 +166,20 @@ def crop_of(canvas: Canvas, pose: Pose, points: Array) -> tuple[int, int, int, i
     """
     limit = np.array([canvas.pinhole.width_px, canvas.pinhole.height_px])
     xyz = points @ pose.camera_from_body.T + pose.xyz_camera
-    if (xyz[:, 0] < NEAREST_M).all():
+    if (xyz[:, 0] < MIN_DEPTH_M).all():
         return None
-    if (xyz[:, 0] < NEAREST_M).any():
+    if (xyz[:, 0] < MIN_DEPTH_M).any():
         return 0, 0, int(limit[0]), int(limit[1])
     uv, _ = project(xyz, canvas.pinhole.image_from_optical)
-    low = np.clip(np.floor(uv.min(axis=0)) - PAD_PX, 0, limit).astype(int)
-    high = np.clip(np.ceil(uv.max(axis=0)) + PAD_PX, 0, limit).astype(int)
+    low = np.clip(np.floor(uv.min(axis=0)) - CROP_MARGIN_PX, 0, limit).astype(int)
+    high = np.clip(np.ceil(uv.max(axis=0)) + CROP_MARGIN_PX, 0, limit).astype(int)
     if (low >= high).any():
         return None
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
-def request(
-    canvas: Canvas, crop: tuple[int, int, int, int], robot: Robot, look: Look, number: int
+def build_request(
+    canvas: PinholeCanvas, crop: tuple[int, int, int, int], robot: Robot, look: Look, number: int
 ) -> dict[str, Any]:
     """Build a worker's request for one robot."""
     camera = canvas.pinhole
@@ -200,11 +200,11 @@ def request(
         "sun_colour": light.sun_colour,
         "sun_angle_rad": light.sun_angle_rad,
         "sun_shadow": light.sun_shadow,
-        "sun_matrix": _pointing(light.sun_camera).tolist(),
+        "sun_matrix": _rotation_towards(light.sun_camera).tolist(),
     }
 
 
-def _pointing(towards: Array) -> Array:
+def _rotation_towards(towards: Array) -> Array:
     """Return a (4, 4) rotation whose z axis points towards ``towards``."""
     aside = np.cross(towards, (0.0, 0.0, 1.0) if abs(towards[2]) < 0.9 else (1.0, 0.0, 0.0))
     aside /= np.linalg.norm(aside)
@@ -213,7 +213,7 @@ def _pointing(towards: Array) -> Array:
     return matrix
 
 
-def requests(
+def build_requests(
     camera: Camera, robots: Sequence[Robot], look: Look, points: Array
 ) -> list[tuple[int, dict[str, Any]]]:
     """Build the requests for all robots that can be visible, with their indices.
@@ -225,10 +225,10 @@ def requests(
     points
         (N, 3) points whose convex hull contains a robot, body frame.
     """
-    canvas = canvas_of(camera)
-    crops = [crop_of(canvas, robot.pose, points) for robot in robots]
+    canvas = pinhole_canvas(camera)
+    crops = [find_crop(canvas, robot.pose, points) for robot in robots]
     return [
-        (k, request(canvas, crop, robots[k], look, k))
+        (k, build_request(canvas, crop, robots[k], look, k))
         for k, crop in enumerate(crops)
         if crop is not None
     ]

@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array, Camera, project
-from dmrl.images.canvas import Canvas, Levels, Picture, bands
+from dmrl.images.canvas import Canvas, FloatImage, Levels, iter_bands
 from dmrl.rendering.robots import quadrotor
 
-SEEN = 1 / 255
+MIN_COVERED_OPACITY = 1 / 255
 """Opacity from which a pixel counts as covered by a robot."""
-BRIGHTEST = 2.0
+MAX_BRIGHTNESS = 2.0
 """Maximum brightness of a robot in strong light."""
 CURVE_STEPS = 255 * 16 + 1
 """Input levels of the gamma curve. Fine enough for 255 output levels at any gamma."""
-SMALLEST_FACE_PX2 = 0.1
+MIN_FACE_PX2 = 0.1
 """Minimum area of a drawn face, square pixels. Distant robots have many smaller ones."""
 
 
@@ -83,7 +83,7 @@ class Look:
     gain: Array
     gamma: float
     noise_deviation: float
-    noise: Picture
+    noise: FloatImage
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ class Sketch:
     visible_share: Array
 
 
-def draw(camera: Camera, poses: Sequence[Pose], look: Look) -> Sketch:
+def render_sketch(camera: Camera, poses: Sequence[Pose], look: Look) -> Sketch:
     """Draw robots in front of a camera, and return the image with its labels.
 
     Parameters
@@ -137,20 +137,20 @@ def draw(camera: Camera, poses: Sequence[Pose], look: Look) -> Sketch:
     box_px, share = np.full((len(poses), 4), np.nan), np.zeros(len(poses))
     drawn = []
     for k in np.argsort(depth_m, kind="stable"):  # near first, each hides what follows
-        if (canvas := _robot(camera, poses[k], look)) is not None:
-            opacity = canvas.opacity()
-            box_px[k], share[k] = _visible(canvas, opacity[..., 0], clear[canvas.part])
+        if (canvas := _draw_robot(camera, poses[k], look)) is not None:
+            opacity = canvas.to_opacity()
+            box_px[k], share[k] = _visible_box(canvas, opacity[..., 0], clear[canvas.part])
             clear[canvas.part] *= 1 - opacity[..., 0]
             drawn.append((canvas, opacity))
     for canvas, opacity in reversed(drawn):
-        light = levels[canvas.part] * (1 - opacity) + 255 * canvas.rgb()
+        light = levels[canvas.part] * (1 - opacity) + 255 * canvas.to_rgb()
         levels[canvas.part] = np.minimum(light + np.float32(0.5), 255)
-    return Sketch(_sensor(levels, look), uv_px, depth_m, box_px, share)
+    return Sketch(_apply_sensor(levels, look), uv_px, depth_m, box_px, share)
 
 
-def _visible(canvas: Canvas, opacity: Picture, clear: Picture) -> tuple[Array, float]:
+def _visible_box(canvas: Canvas, opacity: FloatImage, clear: FloatImage) -> tuple[Array, float]:
     """Return the bounding box and the share of a robot's visible part."""
-    rows, cols = np.nonzero(opacity * clear >= SEEN)
+    rows, cols = np.nonzero(opacity * clear >= MIN_COVERED_OPACITY)
     if not rows.size:
         return np.full(4, np.nan), 0.0
     corner = np.array([canvas.left_px, canvas.top_px] * 2, float)
@@ -159,7 +159,7 @@ def _visible(canvas: Canvas, opacity: Picture, clear: Picture) -> tuple[Array, f
 
 
 @dataclass(frozen=True, slots=True)
-class _Outlines:
+class _Polygons:
     """Projected polygons of one kind: pixels (F, K, 2), distance (F,), colours (F, 3), opacity."""
 
     uv_px: Array
@@ -168,23 +168,23 @@ class _Outlines:
     opacity: float
 
 
-def _outlines(
+def _project_polygons(
     camera: Camera, pose: Pose, corners_body: Array, colours: Array, opacity: float
-) -> _Outlines:
+) -> _Polygons:
     corners = corners_body @ pose.camera_from_body.T + pose.xyz_camera
     uv, _ = project(corners.reshape(-1, 3), camera.image_from_optical)
     distance = np.linalg.norm(corners.mean(axis=1), axis=1)
-    return _Outlines(uv.reshape(*corners.shape[:2], 2), distance, colours, opacity)
+    return _Polygons(uv.reshape(*corners.shape[:2], 2), distance, colours, opacity)
 
 
-def _robot(camera: Camera, pose: Pose, look: Look) -> Canvas | None:
+def _draw_robot(camera: Camera, pose: Pose, look: Look) -> Canvas | None:
     """Draw one robot on a canvas of minimal size, or return None if it is outside the image."""
     dark = np.tile(0.08 * look.shine, (4, 1))
-    blades = quadrotor.blades(look.blade_rad)
+    blades = quadrotor.blade_outlines(look.blade_rad)
     groups = (
-        _body(camera, pose, look),
-        _outlines(camera, pose, quadrotor.DISCS, dark, look.rotor_opacity),
-        _outlines(camera, pose, blades, dark, 0.8),
+        _project_body(camera, pose, look),
+        _project_polygons(camera, pose, quadrotor.ROTOR_DISCS, dark, look.rotor_opacity),
+        _project_polygons(camera, pose, blades, dark, 0.8),
     )
     uv = np.concatenate([group.uv_px.reshape(-1, 2) for group in groups])
     limit = (camera.width_px, camera.height_px)
@@ -192,31 +192,33 @@ def _robot(camera: Camera, pose: Pose, look: Look) -> Canvas | None:
     right, bottom = np.clip(np.ceil(uv.max(axis=0)), 0, limit).astype(int).tolist()
     if left >= right or top >= bottom:
         return None
-    canvas = Canvas(left, top, right - left, bottom - top, brightest=BRIGHTEST)
+    canvas = Canvas(left, top, right - left, bottom - top, brightest=MAX_BRIGHTNESS)
     outlines = [
-        one for part in groups for one in canvas.outlines(part.uv_px, part.colours, part.opacity)
+        one
+        for part in groups
+        for one in canvas.make_outlines(part.uv_px, part.colours, part.opacity)
     ]
     distance_m = np.concatenate([part.distance_m for part in groups])
     for k in np.argsort(-distance_m, kind="stable").tolist():
-        canvas.draw(outlines[k])
+        canvas.draw_outline(outlines[k])
     return canvas
 
 
-def _body(camera: Camera, pose: Pose, look: Look) -> _Outlines:
+def _project_body(camera: Camera, pose: Pose, look: Look) -> _Polygons:
     """Project and light the body's faces that point to the camera and are large enough."""
     mesh = quadrotor.MESH
     lit = np.maximum(mesh.normals @ pose.camera_from_body.T @ look.light_camera, 0)
     lit = look.shine * (look.ambient + (1 - look.ambient) * lit)[:, None]
     colours = mesh.colours * np.where(mesh.glows[:, None], 1.0, lit)
-    faces = _outlines(camera, pose, mesh.corners, colours, 1.0)
+    faces = _project_polygons(camera, pose, mesh.corners, colours, 1.0)
     across = faces.uv_px[:, 2:] - faces.uv_px[:, :2]  # the two diagonals of each face
     # The corners' order in the image is reversed for faces that point away from the camera.
     area_px2 = (across[:, 0, 1] * across[:, 1, 0] - across[:, 0, 0] * across[:, 1, 1]) / 2
-    seen = area_px2 >= SMALLEST_FACE_PX2
-    return _Outlines(faces.uv_px[seen], faces.distance_m[seen], colours[seen], 1.0)
+    seen = area_px2 >= MIN_FACE_PX2
+    return _Polygons(faces.uv_px[seen], faces.distance_m[seen], colours[seen], 1.0)
 
 
-def _sensor(levels: Levels, look: Look) -> Levels:
+def _apply_sensor(levels: Levels, look: Look) -> Levels:
     """Apply the sensor's blur, vignetting, gain, gamma and noise. Return (H, W, 3) uint8."""
     height, width, _ = levels.shape
     # Gain and vignetting precede gamma: applied after it, each is raised to that power.
@@ -231,9 +233,9 @@ def _sensor(levels: Levels, look: Look) -> Levels:
     flat = levels.reshape(height, -1)
     flat = np.concatenate([flat[:1], flat, flat[-1:]])  # repeat the border rows
     out = np.empty((height, 3 * width), np.uint8)
-    for rows in bands(height):
+    for rows in iter_bands(height):
         near = flat[rows.start : rows.stop + 2]
-        band = curve.take(_blurred(near, look.blur), mode="clip")  # "clip" skips index checks
+        band = curve.take(_blur_rows(near, look.blur), mode="clip")  # "clip" skips index checks
         band *= gain
         band *= dim_v[rows]
         grains = noise[rows] * deviation
@@ -243,7 +245,7 @@ def _sensor(levels: Levels, look: Look) -> Levels:
     return out.reshape(levels.shape)
 
 
-def _blurred(near: Levels, blur: float) -> NDArray[np.intp]:
+def _blur_rows(near: Levels, blur: float) -> NDArray[np.intp]:
     """Combine rows with their 3 x 3 mean, and return indices of the curve, 16 per level.
 
     ``near`` also has the rows above and below. The border columns are repeated.

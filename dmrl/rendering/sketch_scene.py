@@ -6,14 +6,14 @@ import numpy as np
 from numpy.random import Generator
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
-from dmrl.images.canvas import Picture
-from dmrl.rendering.backgrounds.procedural import background, window
+from dmrl.images.canvas import FloatImage
+from dmrl.rendering.backgrounds.procedural import make_background, random_window
 from dmrl.rendering.robots.quadrotor import RADIUS_M
 from dmrl.rendering.sketch_renderer import Look, Pose
 
 DEPTH_M = (0.2, 2.0)
 TILT_MAX_RAD = float(np.radians(20))
-TRIES = 30
+MAX_TRIES_PER_ROBOT = 30
 
 
 def random_poses(rng: Generator, camera: Camera, count: int) -> list[Pose]:
@@ -33,16 +33,16 @@ def random_poses(rng: Generator, camera: Camera, count: int) -> list[Pose]:
     """
     tilt = camera_from_horizontal(*rng.uniform(-TILT_MAX_RAD, TILT_MAX_RAD, 2).tolist())
     poses: list[Pose] = []
-    for _ in range(count * TRIES):
+    for _ in range(count * MAX_TRIES_PER_ROBOT):
         if len(poses) == count:
             break
-        pose = Pose(_place(rng, camera), tilt @ _attitude(rng))
-        if all(_apart(pose.xyz_camera, other.xyz_camera) for other in poses):
+        pose = Pose(_draw_position(rng, camera), tilt @ _draw_attitude(rng))
+        if all(_are_apart(pose.xyz_camera, other.xyz_camera) for other in poses):
             poses.append(pose)
     return poses
 
 
-def _place(rng: Generator, camera: Camera) -> Array:
+def _draw_position(rng: Generator, camera: Camera) -> Array:
     u_px, v_px = rng.uniform((0, 0), (camera.width_px, camera.height_px))
     depth_m = np.exp(rng.uniform(*np.log(DEPTH_M)))
     left = (camera.cx_px - u_px) / camera.fx_px
@@ -50,7 +50,7 @@ def _place(rng: Generator, camera: Camera) -> Array:
     return np.array([depth_m, depth_m * left, depth_m * up])
 
 
-def _attitude(rng: Generator) -> Array:
+def _draw_attitude(rng: Generator) -> Array:
     """Draw the rotation horizontal_from_body: Rz(yaw) Ry(pitch) Rx(roll)."""
     roll, pitch = rng.uniform(-TILT_MAX_RAD, TILT_MAX_RAD, 2).tolist()
     yaw = rng.uniform(-np.pi, np.pi)
@@ -59,10 +59,10 @@ def _attitude(rng: Generator) -> Array:
     return np.asarray(turn @ camera_from_horizontal(roll, pitch).T)
 
 
-def _apart(one: Array, other: Array) -> bool:
+def _are_apart(first: Array, other: Array) -> bool:
     """Return whether two robots do not touch and neither hides the other's centre."""
-    slope = np.hypot(*(one[1:] / one[0] - other[1:] / other[0]))
-    return bool(slope > RADIUS_M / min(one[0], other[0]))
+    slope = np.hypot(*(first[1:] / first[0] - other[1:] / other[0]))
+    return bool(slope > RADIUS_M / min(first[0], other[0]))
 
 
 def random_look(rng: Generator, camera: Camera) -> Look:
@@ -77,9 +77,9 @@ def random_look(rng: Generator, camera: Camera) -> Look:
     """
     size = camera.width_px, camera.height_px
     towards = rng.normal((0.0, 0.0, 1.5), 1.0)
-    noise = window(rng, _static(*size), *size)
+    noise = random_window(rng, _noise_table(*size), *size)
     return Look(
-        background=background(rng, *size),
+        background=make_background(rng, *size),
         light_camera=towards / np.linalg.norm(towards),
         ambient=rng.uniform(0.3, 0.7),
         shine=rng.uniform(0.6, 1.6) * rng.normal(1, 0.06, 3),
@@ -95,7 +95,7 @@ def random_look(rng: Generator, camera: Camera) -> Look:
 
 
 @cache
-def _static(width_px: int, height_px: int) -> Picture:
+def _noise_table(width_px: int, height_px: int) -> FloatImage:
     """Return (2 H, 2 W * 3) grey white noise. Every image uses a random window of it."""
     rng = np.random.default_rng(0)
     return rng.standard_normal((2 * height_px, 2 * width_px), np.float32).repeat(3, axis=1)

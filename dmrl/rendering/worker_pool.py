@@ -14,9 +14,9 @@ from dmrl.errors import BlenderError
 from dmrl.geometry.frames import Array
 from dmrl.rendering.blender.protocol import Arrays, receive, send
 
-WORKER = Path(__file__).parent / "blender" / "worker.py"
-TRIES = 3
-AHEAD = 4
+WORKER_SCRIPT = Path(__file__).parent / "blender" / "worker.py"
+MAX_TRIES = 3
+MAX_QUEUED_JOBS = 4
 """Jobs in progress or waiting for the caller, per worker."""
 
 Task = TypeVar("Task")
@@ -24,7 +24,7 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class WorkerStart:
     """First message to a worker.
 
     Parameters
@@ -54,24 +54,26 @@ class Worker:
         If the process does not start, or cannot use the model. Contains the reason.
     """
 
-    def __init__(self, start: Start) -> None:
+    def __init__(self, start: WorkerStart) -> None:
         self._process = subprocess.Popen(
-            [str(start.python), str(WORKER)],
+            [str(start.python), str(WORKER_SCRIPT)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )
         self._last_words: deque[bytes] = deque(maxlen=20)
-        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener = threading.Thread(target=self._collect_errors, daemon=True)
         self._listener.start()
         try:
-            self.version, self.points = self._greet(start)
+            self.version, self.points = self._send_start(start)
         except (EOFError, OSError) as e:
             self.close()
-            raise BlenderError(f"Blender did not start: {self.why()}. {HINT}") from e
+            raise BlenderError(
+                f"Blender did not start: {self.failure_reason()}. {SETUP_HINT}"
+            ) from e
 
-    def _greet(self, start: Start) -> tuple[str, Array]:
-        head, arrays = self.ask(start.head, start.arrays)
+    def _send_start(self, start: WorkerStart) -> tuple[str, Array]:
+        head, arrays = self.request(start.head, start.arrays)
         if "error" in head:
             self.close()
             raise BlenderError(head["error"])
@@ -82,7 +84,7 @@ class Worker:
         """Process id."""
         return self._process.pid
 
-    def ask(self, head: dict[str, Any], arrays: Arrays | None = None) -> tuple[Any, Arrays]:
+    def request(self, head: dict[str, Any], arrays: Arrays | None = None) -> tuple[Any, Arrays]:
         """Send a request and return the reply.
 
         Raises
@@ -94,13 +96,13 @@ class Worker:
         send(self._process.stdin, head, arrays)
         return receive(self._process.stdout)
 
-    def _listen(self) -> None:
+    def _collect_errors(self) -> None:
         assert self._process.stderr is not None
         for line in self._process.stderr:
             if line.strip():
                 self._last_words.append(line)
 
-    def why(self) -> str:
+    def failure_reason(self) -> str:
         """Return its last line on standard error, or its exit status."""
         words = self._last_words[-1].decode(errors="replace").strip() if self._last_words else ""
         return words or f"exit {self._process.poll()}"
@@ -118,10 +120,10 @@ class Worker:
                     continue
 
 
-HINT = "Try: dmrl render --setup"
+SETUP_HINT = "Try: dmrl render --setup"
 
 
-class Pool:
+class WorkerPool:
     """Workers that run jobs as they become free. Results keep the order of the tasks.
 
     Parameters
@@ -137,13 +139,13 @@ class Pool:
         If the first worker does not start.
     """
 
-    def __init__(self, start: Start, count: int) -> None:
+    def __init__(self, start: WorkerStart, count: int) -> None:
         self._start = start
         self._count = count
         self._all: list[Worker] = []
         self._lock, self._closed = threading.Lock(), False
         self._idle: SimpleQueue[Worker | None] = SimpleQueue()
-        first = self._new()
+        first = self._start_worker()
         self.version, self.points = first.version, first.points
         self._idle.put(first)
         for _ in range(count - 1):
@@ -151,7 +153,7 @@ class Pool:
         self._threads = ThreadPoolExecutor(count)
         self.replaced = 0
 
-    def _new(self) -> Worker:
+    def _start_worker(self) -> Worker:
         worker = Worker(self._start)
         with self._lock:
             self._all.append(worker)
@@ -176,9 +178,9 @@ class Pool:
         worker = self._idle.get()
         why = ""
         try:
-            for _ in range(TRIES):
+            for _ in range(MAX_TRIES):
                 try:
-                    worker = worker or self._new()
+                    worker = worker or self._start_worker()
                     return job(worker)
                 except (EOFError, OSError):
                     if self._closed:
@@ -187,13 +189,13 @@ class Pool:
                         with self._lock:
                             self._all.remove(worker)
                         worker.close()
-                        why = worker.why()
+                        why = worker.failure_reason()
                     worker = None
                     self.replaced += 1
         finally:
             self._idle.put(worker)
         raise BlenderError(
-            f"Blender died {TRIES} times on one image: {why}. Free memory, use fewer --workers, "
+            f"Blender died {MAX_TRIES} times on one image: {why}. Free memory, use fewer --workers, "
             "or set up Blender again"
         )
 
@@ -208,7 +210,7 @@ class Pool:
         waiting: deque[Future[Result]] = deque()
         for task in tasks:
             waiting.append(self._threads.submit(self.call, lambda w, t=task: job(w, t)))
-            if len(waiting) >= AHEAD * self._count:
+            if len(waiting) >= MAX_QUEUED_JOBS * self._count:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()

@@ -28,23 +28,23 @@ LOG_COLUMNS = (
 )
 """Columns of a robot's log, as ``iter_robot_log`` needs them."""
 
-EXACT = [0.0] * 9
-STRETCH = 256
+ZERO_COVARIANCE = [0.0] * 9
+ROWS_PER_SLICE = 256
 """Rows converted to Python numbers at a time, which take ten times the memory of an array."""
 
 
-def stretches(count: int) -> Iterator[slice]:
+def iter_slices(count: int) -> Iterator[slice]:
     """Yield slices of a column, short enough for hundreds of streams in memory."""
-    return (slice(first, first + STRETCH) for first in range(0, count, STRETCH))
+    return (slice(first, first + ROWS_PER_SLICE) for first in range(0, count, ROWS_PER_SLICE))
 
 
-def rows_of(*columns: NDArray[Any]) -> Iterator[tuple[Any, ...]]:
+def iter_rows(*columns: NDArray[Any]) -> Iterator[tuple[Any, ...]]:
     """Yield rows of Python numbers from (N,) columns, converted slice by slice."""
-    for part in stretches(len(columns[0])):
+    for part in iter_slices(len(columns[0])):
         yield from zip(*(column[part].tolist() for column in columns), strict=True)
 
 
-def robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Iterator[Sample]:
+def iter_robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Iterator[Sample]:
     """Yield attitude, velocity and height of one robot, three samples per time.
 
     A sensor whose values are not all finite has no sample at that time. The yaw of the attitude is
@@ -65,9 +65,9 @@ def robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Itera
         rate = np.interp(time_ns, time_ns[turning], rate[turning])
     turned = np.diff(time_ns) * 1e-9 * (rate[1:] + rate[:-1]) / 2
     yaw = np.concatenate([[0.0], np.cumsum(turned)])
-    names = topics.attitude(robot), topics.velocity(robot), topics.height(robot)
+    names = topics.ATTITUDE(robot), topics.VELOCITY(robot), topics.HEIGHT(robot)
     series = [*(columns[name] for name in LOG_COLUMNS), yaw]
-    for moment, *row in rows_of(time_ns, *series):
+    for moment, *row in iter_rows(time_ns, *series):
         roll, pitch, yaw_rate, vx, vy, height, yaw_rad = row
         attitude = {"roll_rad": roll, "pitch_rad": pitch, "yaw_rad": yaw_rad}
         if isfinite(roll) and isfinite(pitch) and isfinite(yaw_rate):
@@ -78,33 +78,33 @@ def robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Itera
             yield Sample(moment, names[2], "Height", {"height_m": height})
 
 
-def ranges(robot: str, peer: str, time_ns: Times, range_m: Array) -> Iterator[Sample]:
+def iter_ranges(robot: str, peer: str, time_ns: Times, range_m: Array) -> Iterator[Sample]:
     """Yield UWB distances that a robot measured to a peer."""
-    topic = topics.uwb_range(robot, peer)
-    for moment, value in rows_of(time_ns, range_m):
+    topic = topics.RANGE(robot, peer)
+    for moment, value in iter_rows(time_ns, range_m):
         yield Sample(moment, topic, "UwbRange", {"range_m": value})
 
 
-def sensor(
+def iter_sensor(
     topic: str, message: str, time_ns: Times, columns: Mapping[str, Array]
 ) -> Iterator[Sample]:
     """Yield the messages of a sensor where all of its (N,) columns, named as fields, are finite."""
     values = np.stack(list(columns.values()), axis=1)
     known = np.isfinite(values).all(axis=1)
-    for moment, *row in rows_of(time_ns[known], *values[known].T):
+    for moment, *row in iter_rows(time_ns[known], *values[known].T):
         yield Sample(moment, topic, message, dict(zip(columns, row, strict=True)))
 
 
-def truth(robot: str, peer: str, time_ns: Times, xyz_m: Array) -> Iterator[Sample]:
+def iter_truth(robot: str, peer: str, time_ns: Times, xyz_m: Array) -> Iterator[Sample]:
     """Yield exact positions of a peer, (N, 3) in the robot's horizontal frame, metres."""
-    topic, frame = topics.truth(robot, peer), f"{robot}/horizontal"
-    for moment, x, y, z in rows_of(time_ns, *xyz_m.T):
-        fields = {"frame_id": frame, "x": x, "y": y, "z": z, "covariance": EXACT}
+    topic, frame = topics.TRUTH(robot, peer), f"{robot}/horizontal"
+    for moment, x, y, z in iter_rows(time_ns, *xyz_m.T):
+        fields = {"frame_id": frame, "x": x, "y": y, "z": z, "covariance": ZERO_COVARIANCE}
         yield Sample(moment, topic, "PeerPosition", fields)
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class RobotPose:
     """A robot in the world: centre (3,) in metres, attitude Rz(yaw) Ry(pitch) Rx(roll)."""
 
     xyz_world: Array
@@ -113,7 +113,7 @@ class Placed:
     pitch_rad: float
 
 
-def transforms(time_ns: int, robots: Mapping[str, Placed]) -> Sample:
+def build_transforms(time_ns: int, robots: Mapping[str, RobotPose]) -> Sample:
     """Build the horizontal, camera and optical frames of robots, as foxglove.FrameTransforms.
 
     The camera is assumed at the robot's centre, with its axis along the robot's x.
@@ -122,7 +122,7 @@ def transforms(time_ns: int, robots: Mapping[str, Placed]) -> Sample:
     frames = [
         {"timestamp": {"seconds": seconds, "nanos": nanos}, **frame}
         for robot, placed in robots.items()
-        for frame in _frames(robot, placed)
+        for frame in _iter_frames(robot, placed)
     ]
     return Sample(time_ns, topics.TRANSFORMS, "FrameTransforms", {"transforms": frames})
 
@@ -131,7 +131,7 @@ def transforms(time_ns: int, robots: Mapping[str, Placed]) -> Sample:
 CAMERA_FROM_OPTICAL = {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5}
 
 
-def _frames(robot: str, placed: Placed) -> Iterator[dict[str, Any]]:
+def _iter_frames(robot: str, placed: RobotPose) -> Iterator[dict[str, Any]]:
     cy, sy = np.cos(placed.yaw_rad / 2), np.sin(placed.yaw_rad / 2)
     cp, sp = np.cos(placed.pitch_rad / 2), np.sin(placed.pitch_rad / 2)
     cr, sr = np.cos(placed.roll_rad / 2), np.sin(placed.roll_rad / 2)
@@ -147,17 +147,17 @@ def _frames(robot: str, placed: Placed) -> Iterator[dict[str, Any]]:
         yield {**names, "translation": translation, "rotation": rotation}
 
 
-def in_order(streams: Iterable[Iterable[Sample]]) -> Iterator[Sample]:
+def merge_by_time(streams: Iterable[Iterable[Sample]]) -> Iterator[Sample]:
     """Merge several streams, each in time order, into one in time order."""
     return heapq.merge(*streams, key=lambda sample: sample.time_ns)
 
 
-def nanoseconds(time_s: Array) -> Times:
+def to_nanoseconds(time_s: Array) -> Times:
     """Convert (N,) seconds to whole nanoseconds."""
     return np.rint(time_s * 1e9).astype(np.int64)
 
 
-def from_poses(time_s: Array, xy_m: Array, yaw_rad: Array) -> dict[str, Array]:
+def log_from_poses(time_s: Array, xy_m: Array, yaw_rad: Array) -> dict[str, Array]:
     """Return the log of a robot that moved like this on level ground, by central differences.
 
     Parameters

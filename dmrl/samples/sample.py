@@ -59,22 +59,22 @@ class Columns:
     fields: Mapping[str, Any]
 
     def __iter__(self) -> Iterator[Sample]:
-        rows = _rows(self.fields, len(self.time_ns))
+        rows = _iter_rows(self.fields, len(self.time_ns))
         for moment, fields in zip(self.time_ns.tolist(), rows, strict=True):
             yield Sample(moment, self.topic, self.message, fields)
 
-    def between(self, first_ns: int, end_ns: int) -> "Columns":
+    def crop_to_time(self, first_ns: int, end_ns: int) -> "Columns":
         """Return the samples with log times in [first_ns, end_ns)."""
         there = (self.time_ns >= first_ns) & (self.time_ns < end_ns)
-        return replace(self, time_ns=self.time_ns[there], fields=_taken(self.fields, there))
+        return replace(self, time_ns=self.time_ns[there], fields=_select_rows(self.fields, there))
 
 
-def _rows(fields: Mapping[str, Any], count: int) -> Iterator[dict[str, Any]]:
+def _iter_rows(fields: Mapping[str, Any], count: int) -> Iterator[dict[str, Any]]:
     """Yield the fields of one sample after another."""
     columns: list[Iterable[Any]] = []
     for value in fields.values():
         if isinstance(value, Mapping):
-            columns.append(_rows(value, count))
+            columns.append(_iter_rows(value, count))
         else:
             columns.append(value.tolist() if isinstance(value, np.ndarray) else [value] * count)
     if not columns:
@@ -83,9 +83,9 @@ def _rows(fields: Mapping[str, Any], count: int) -> Iterator[dict[str, Any]]:
         yield dict(zip(fields, row, strict=True))
 
 
-def _taken(fields: Mapping[str, Any], there: NDArray[np.bool_]) -> dict[str, Any]:
+def _select_rows(fields: Mapping[str, Any], there: NDArray[np.bool_]) -> dict[str, Any]:
     return {
-        name: _taken(value, there)
+        name: _select_rows(value, there)
         if isinstance(value, Mapping)
         else value[there]
         if isinstance(value, np.ndarray)
@@ -94,7 +94,7 @@ def _taken(fields: Mapping[str, Any], there: NDArray[np.bool_]) -> dict[str, Any
     }
 
 
-def intervals(moments: Iterable[tuple[int, str | None]]) -> Intervals:
+def find_intervals(moments: Iterable[tuple[int, str | None]]) -> Intervals:
     """Return inclusive intervals of log time in which every moment has the same split.
 
     Parameters
@@ -104,7 +104,7 @@ def intervals(moments: Iterable[tuple[int, str | None]]) -> Intervals:
 
     Examples
     --------
-    >>> intervals([(0, "train"), (1, "train"), (2, None), (3, "train"), (4, "test")])
+    >>> find_intervals([(0, "train"), (1, "train"), (2, None), (3, "train"), (4, "test")])
     {'train': [(0, 1), (3, 3)], 'test': [(4, 4)]}
     """
     found: Intervals = {}
@@ -118,12 +118,12 @@ def intervals(moments: Iterable[tuple[int, str | None]]) -> Intervals:
     return found
 
 
-def _stamp(time_ns: int) -> dict[str, int]:
+def _to_timestamp(time_ns: int) -> dict[str, int]:
     seconds, nanos = divmod(time_ns, 1_000_000_000)
     return {"seconds": seconds, "nanos": nanos}
 
 
-def image(time_ns: int, robot: str, data: bytes, kind: str) -> Sample:
+def build_image(time_ns: int, robot: str, data: bytes, kind: str) -> Sample:
     """Build a sample of an encoded image, as foxglove.CompressedImage.
 
     Parameters
@@ -138,15 +138,15 @@ def image(time_ns: int, robot: str, data: bytes, kind: str) -> Sample:
         "png" or "jpeg".
     """
     fields = {
-        "timestamp": _stamp(time_ns),
+        "timestamp": _to_timestamp(time_ns),
         "frame_id": f"{robot}/optical",
         "data": data,
         "format": kind,
     }
-    return Sample(time_ns, topics.camera_image(robot), "CompressedImage", fields)
+    return Sample(time_ns, topics.CAMERA_IMAGE(robot), "CompressedImage", fields)
 
 
-def calibration(time_ns: int, robot: str, camera: Camera) -> Sample:
+def build_calibration(time_ns: int, robot: str, camera: Camera) -> Sample:
     """Build a sample of a camera, as foxglove.CameraCalibration, K and P in pixel-edge coordinates.
 
     In pixel-edge coordinates, cx and cy are 0.5 px larger than in OpenCV, where the centre of the
@@ -154,7 +154,7 @@ def calibration(time_ns: int, robot: str, camera: Camera) -> Sample:
     """
     k = camera.image_from_optical
     fields = {
-        "timestamp": _stamp(time_ns),
+        "timestamp": _to_timestamp(time_ns),
         "frame_id": f"{robot}/optical",
         "width": camera.width_px,
         "height": camera.height_px,
@@ -164,12 +164,12 @@ def calibration(time_ns: int, robot: str, camera: Camera) -> Sample:
         "R": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         "P": [value for row in k.tolist() for value in (*row, 0.0)],
     }
-    return Sample(time_ns, topics.calibration(robot), "CameraCalibration", fields)
+    return Sample(time_ns, topics.CALIBRATION(robot), "CameraCalibration", fields)
 
 
-def labels(
+def build_labels(
     time_ns: int, robot: str, peers: Sequence[Mapping[str, Any]], sources: Iterable[str]
 ) -> Sample:
     """Build the PeerLabels of one image with the labellers as sources; no peers: "none in view"."""
     fields = {"peers": list(peers), "sources": sorted(sources)}
-    return Sample(time_ns, topics.labels(robot), "PeerLabels", fields)
+    return Sample(time_ns, topics.LABELS(robot), "PeerLabels", fields)

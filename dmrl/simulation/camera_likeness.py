@@ -11,16 +11,21 @@ import numpy as np
 
 from dmrl import recipe as recipes
 from dmrl import topics
-from dmrl.atomic_output import partial_file, partial_of, refuse_existing
-from dmrl.datasets.backgrounds import photos_of
+from dmrl.atomic_output import atomic_file, refuse_existing, to_partial_path
+from dmrl.datasets.backgrounds import open_backgrounds
 from dmrl.errors import RecordingError, SettingError
-from dmrl.formats.files.image_folder import list_pictures
-from dmrl.images.codec import Rgb, decode, size
-from dmrl.recording import read, summary
+from dmrl.formats.files.image_folder import list_images
+from dmrl.images.codec import Rgb, decode, read_size
+from dmrl.recording import read, read_summary
 from dmrl.rendering import settings as looks
-from dmrl.rendering.camera.image_statistics import FIGURES, Likeness, Seen, seen
-from dmrl.rendering.contact_sheet import evenly, sheet
-from dmrl.rendering.preset_fitting import KNOBS, ROUNDS, fitted, pictures, scenes
+from dmrl.rendering.camera.image_statistics import (
+    FIGURES,
+    ImageMeasurements,
+    ImageStatistics,
+    measure_images,
+)
+from dmrl.rendering.contact_sheet import even_indices, make_contact_sheet
+from dmrl.rendering.preset_fitting import KNOBS, ROUNDS, iter_fits, sample_scenes, simulate_images
 from dmrl.simulation.settings import LikenessSettings
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_line, print_table
@@ -55,10 +60,10 @@ class Result:
     """
 
     frames: int
-    real: Likeness
-    halves: tuple[Likeness, ...]
-    preset: Likeness
-    fitted: Likeness
+    real: ImageStatistics
+    halves: tuple[ImageStatistics, ...]
+    preset: ImageStatistics
+    fitted: ImageStatistics
     keys: dict[str, object]
     notes: list[str]
 
@@ -93,37 +98,37 @@ def fit_preset(real: Path, out: Path, settings: LikenessSettings) -> Result:
         raise SettingError(f"{out} is no name of a recipe. Write one: OUT.toml")
     picture = out.with_suffix(".png")
     refuse_existing(out)
-    if not partial_of(out).exists():  # else one that was killed may have left the picture
+    if not to_partial_path(out).exists():  # else one that was killed may have left the picture
         refuse_existing(picture)
     own = _frames(real, settings.frames)
     preset = {"preset": settings.preset}
     start = recipes.check(settings.preset, looks.filled(preset), looks.Settings)
-    photos = photos_of(settings.backgrounds)
-    measured = seen(own)
+    photos = open_backgrounds(settings.backgrounds)
+    measured = measure_images(own)
     _refuse_nothing(real, own, measured)
     size_px = (own[0].shape[1], own[0].shape[0])
-    there = scenes(photos, start, size_px, settings.seed)
-    *_, found = track(fitted(measured, start, there, settings.seed), "Fitting", ROUNDS)
+    there = sample_scenes(photos, start, size_px, settings.seed)
+    *_, found = track(iter_fits(measured, start, there, settings.seed), "Fitting", ROUNDS)
     fresh = settings.seed + 1  # what the fit has not seen
-    there = scenes(photos, start, size_px, fresh)
-    before, after = (list(pictures(way, there, fresh)) for way in (start, found))
+    there = sample_scenes(photos, start, size_px, fresh)
+    before, after = (list(simulate_images(way, there, fresh)) for way in (start, found))
     keys = _keys(found, start)
-    _write(out, _recipe(settings.preset, keys), picture, sheet([own, before, after]))
+    _write(out, _recipe(settings.preset, keys), picture, make_contact_sheet([own, before, after]))
     middle = max(len(own) // 2, 1)
     parts = (own[:middle], own[-middle:]) if len(own) > 1 else ()
-    wanted, got = measured.likeness(), seen(after).likeness()
+    wanted, got = measured.to_statistics(), measure_images(after).to_statistics()
     return Result(
         frames=len(own),
         real=wanted,
-        halves=tuple(seen(part).likeness() for part in parts),
-        preset=seen(before).likeness(),
+        halves=tuple(measure_images(part).to_statistics() for part in parts),
+        preset=measure_images(before).to_statistics(),
         fitted=got,
         keys=keys,
         notes=_notes(real, own, wanted, got),
     )
 
 
-def _refuse_nothing(real: Path, own: Sequence[Rgb], measured: Seen) -> None:
+def _refuse_nothing(real: Path, own: Sequence[Rgb], measured: ImageMeasurements) -> None:
     """Raise SettingError if frames are of two kinds, or none shows anything."""
     grey = sum(bool(np.ptp(rgb, axis=2).max() == 0) for rgb in own)
     if 0 < grey < len(own):
@@ -131,15 +136,17 @@ def _refuse_nothing(real: Path, own: Sequence[Rgb], measured: Seen) -> None:
             f"{real} holds {grey} grey frames and {len(own) - grey} with colours. Give frames of "
             "one camera alone"
         )
-    if not measured.values("contrast").max() > 0:
-        level = measured.middle("brightness") or 0.0
+    if not measured.figure_values("contrast").max() > 0:
+        level = measured.figure_mean("brightness") or 0.0
         raise SettingError(
             f"{real}: every frame is one plain colour, of brightness {level:.2f}: nothing to "
             "measure. Give frames in which something is seen"
         )
 
 
-def _notes(real: Path, own: Sequence[Rgb], wanted: Likeness, got: Likeness) -> list[str]:
+def _notes(
+    real: Path, own: Sequence[Rgb], wanted: ImageStatistics, got: ImageStatistics
+) -> list[str]:
     """Return a sentence for each limit of the frames or the fit."""
     notes = []
     if len(own) < FEW:
@@ -173,10 +180,10 @@ def _write(out: Path, recipe: str, picture: Path, sheet: bytes) -> None:
     there = picture.is_file() and picture.read_bytes() == sheet
     made = False
     try:
-        with partial_file(out) as partial:
+        with atomic_file(out) as partial:
             partial.write_text(recipe, encoding="utf-8")
             if not there:
-                with partial_file(picture) as beside:
+                with atomic_file(picture) as beside:
                     beside.write_bytes(sheet)
                 made = True
     except BaseException:
@@ -189,17 +196,17 @@ def _write(out: Path, recipe: str, picture: Path, sheet: bytes) -> None:
 def _frames(real: Path, most: int) -> list[Rgb]:
     """Read at most so many frames of a folder or recording, evenly spaced."""
     if real.is_dir():
-        paths = [path for _, path in list_pictures(real, 10.0)]
-        data = [(paths[k].read_bytes(), str(paths[k])) for k in evenly(len(paths), most)]
+        paths = [path for _, path in list_images(real, 10.0)]
+        data = [(paths[k].read_bytes(), str(paths[k])) for k in even_indices(len(paths), most)]
     else:
-        held = summary(real).topics
-        topic = next((name for name in held if topics.names(topics.CAMERA_IMAGE, name)), None)
+        held = read_summary(real).topics
+        topic = next((name for name in held if topics.parse_topic(topics.CAMERA_IMAGE, name)), None)
         if topic is None:
             raise RecordingError(f"{real} has no images. Give a folder of frames, or another")
-        chosen, count = set(evenly(held[topic].count, most)), held[topic].count
+        chosen, count = set(even_indices(held[topic].count, most)), held[topic].count
         stream = enumerate(islice(read(real, topic), count))
         data = [(bytes(s.message.data), f"{real}: image {k}") for k, s in stream if k in chosen]
-    sizes = sorted({size(content, name)[:2] for content, name in data})
+    sizes = sorted({read_size(content, name)[:2] for content, name in data})
     if len(sizes) != 1:
         words = ", ".join(f"{width}x{height}" for width, height in sizes)
         raise SettingError(f"{real} holds frames of {words} px. Give frames of one camera alone")
@@ -211,7 +218,7 @@ def _frames(real: Path, most: int) -> list[Rgb]:
             f"{real}: frames of {width}x{height} px are too {'small' if small else 'large'} to "
             f"measure. Give frames of {way}"
         )
-    few = evenly(len(data), max(2, TOGETHER_PX // (width * height)))
+    few = even_indices(len(data), max(2, TOGETHER_PX // (width * height)))
     return [decode(*data[k]) for k in few]
 
 

@@ -8,7 +8,7 @@ from numpy.random import Generator
 from dmrl.formats.files.label_csv import LabelRow
 from dmrl.geometry.frames import AIDECK_PINHOLE, Camera
 from dmrl.images.codec import encode_png
-from dmrl.rendering.sketch_renderer import Sketch, draw
+from dmrl.rendering.sketch_renderer import Sketch, render_sketch
 from dmrl.rendering.sketch_scene import random_look, random_poses
 from dmrl.simulation.settings import SketchSettings
 
@@ -37,7 +37,7 @@ def draw_picture(settings: SketchSettings, index: int, camera: Camera = AIDECK_P
     """
     rng = np.random.default_rng((settings.seed, index))
     poses = random_poses(rng, camera, _robot_count(rng, settings))
-    return draw(camera, poses, random_look(rng, camera))
+    return render_sketch(camera, poses, random_look(rng, camera))
 
 
 def _robot_count(rng: Generator, settings: SketchSettings) -> int:

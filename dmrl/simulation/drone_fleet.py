@@ -12,11 +12,16 @@ import numpy as np
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.frames import Array
-from dmrl.live.log_blocks import number_of
-from dmrl.live.simulated.aideck_server import FakeCamera
-from dmrl.live.simulated.crazyflie_server import FakeCrazyflie
-from dmrl.live.simulated.flight_source import FakeFlight, Faults, FlightClock, Pictures
-from dmrl.recording import read, read_table, summary
+from dmrl.live.log_blocks import parse_robot_number
+from dmrl.live.simulated.aideck_server import SimulatedCamera
+from dmrl.live.simulated.crazyflie_server import SimulatedCrazyflie
+from dmrl.live.simulated.flight_source import (
+    FlightClock,
+    FlightImages,
+    SimulatedFaults,
+    SimulatedFlight,
+)
+from dmrl.recording import read, read_summary, read_table
 from dmrl.simulation.settings import DroneSettings
 
 LOOPBACK = "127.0.0.1"
@@ -27,13 +32,13 @@ DIES = re.compile(r"(?P<robot>[\w-]+)=(?P<first>\d+(\.\d+)?)(:(?P<last>\d+(\.\d+
 class Fleet:
     """Drones and cameras, listening."""
 
-    drones: tuple[FakeCrazyflie, ...]
-    cameras: tuple[FakeCamera, ...]
+    drones: tuple[SimulatedCrazyflie, ...]
+    cameras: tuple[SimulatedCamera, ...]
     clock: FlightClock
 
     def listened(self) -> bool:
         """Return whether a client still reads the log of a drone."""
-        return any(drone.listened for drone in self.drones)
+        return any(drone.is_logging for drone in self.drones)
 
     def sent(self) -> list[tuple[str, int, int]]:
         """Return a row per drone and camera: name, packets sent, packets dropped."""
@@ -69,28 +74,28 @@ def fleet(
     faults = _faults(robots, settings)
     flights = {robot: _flight(flight, robot) for robot in robots}
     clock = FlightClock(settings.speed, max(f.end_s for f in flights.values()))
-    start_ns = summary(flight).start_ns
-    drones: list[FakeCrazyflie] = []
-    eyes: list[FakeCamera] = []
+    start_ns = read_summary(flight).start_ns
+    drones: list[SimulatedCrazyflie] = []
+    eyes: list[SimulatedCamera] = []
     # Each has its socket as soon as it is made, so what was made is ended if the next fails.
     with ExitStack() as made:
         made.callback(_end, drones, eyes)
         for k, (robot, uri) in enumerate(zip(robots, uris, strict=False)):
             seed = settings.seed * 1000 + k
             behaves = flights[robot], clock, faults[robot], seed
-            drones.append(FakeCrazyflie(robot, address(uri), *behaves))
+            drones.append(SimulatedCrazyflie(robot, address(uri), *behaves))
         for k, (robot, port) in enumerate(zip(robots, cameras, strict=False)):
             pictures, seed = _pictures(flight, robot, start_ns), settings.seed * 1000 + 500 + k
             sends = pictures, clock, faults[robot], settings.sends, seed
-            eyes.append(FakeCamera(robot, (LOOPBACK, port), *sends))
+            eyes.append(SimulatedCamera(robot, (LOOPBACK, port), *sends))
         for thread in (*drones, *eyes):
             thread.start()
         yield Fleet(tuple(drones), tuple(eyes), clock)
 
 
-def _end(drones: Sequence[FakeCrazyflie], cameras: Sequence[FakeCamera]) -> None:
+def _end(drones: Sequence[SimulatedCrazyflie], cameras: Sequence[SimulatedCamera]) -> None:
     """Stop all, then wait for each: they end at the same time."""
-    threads: tuple[FakeCrazyflie | FakeCamera, ...] = (*drones, *cameras)
+    threads: tuple[SimulatedCrazyflie | SimulatedCamera, ...] = (*drones, *cameras)
     for thread in threads:
         thread.stop()
     for thread in threads:
@@ -100,7 +105,7 @@ def _end(drones: Sequence[FakeCrazyflie], cameras: Sequence[FakeCamera]) -> None
 
 
 def _robots(flight: Path, uris: Sequence[str], cameras: Sequence[int]) -> list[str]:
-    known = topics.robots(tuple(summary(flight).topics), topics.ATTITUDE)
+    known = topics.list_robots(tuple(read_summary(flight).topics), topics.ATTITUDE)
     if not known:
         raise RecordingError(f"{flight} has no /<robot>/attitude. Make one: dmrl fly")
     if not 0 < len(uris) <= len(known) or len(cameras) > len(uris):
@@ -110,7 +115,7 @@ def _robots(flight: Path, uris: Sequence[str], cameras: Sequence[int]) -> list[s
         )
     if wrong := [port for port in cameras if not 0 <= port < 65536]:
         raise SettingError(f"--camera {wrong[0]}: ports go from 1 to 65535. Name another")
-    pictured = topics.robots(tuple(summary(flight).topics))
+    pictured = topics.list_robots(tuple(read_summary(flight).topics))
     if blind := [robot for robot in known[: len(cameras)] if robot not in pictured]:
         raise RecordingError(f"{flight} has no pictures of {blind[0]}. Try: dmrl fly --camera")
     return known[: len(uris)]
@@ -134,7 +139,7 @@ def address(uri: str) -> tuple[str, int]:
     return host, port
 
 
-def _faults(robots: Sequence[str], settings: DroneSettings) -> dict[str, Faults]:
+def _faults(robots: Sequence[str], settings: DroneSettings) -> dict[str, SimulatedFaults]:
     dead: dict[str, tuple[float, float]] = {}
     for text in settings.dies:
         found = DIES.fullmatch(text)
@@ -146,17 +151,19 @@ def _faults(robots: Sequence[str], settings: DroneSettings) -> dict[str, Faults]
         dead[found["robot"]] = float(found["first"]), last
     alive = (float("inf"), float("inf"))
     return {
-        robot: Faults(
+        robot: SimulatedFaults(
             settings.drop, dead.get(robot, alive), settings.boot_ms, k * settings.drift_ppm
         )
         for k, robot in enumerate(robots)
     }
 
 
-def _flight(path: Path, robot: str) -> FakeFlight:
-    start_ns, held = summary(path).start_ns, summary(path).topics
-    numbered = (n for t in held if (n := topics.names(topics.RANGE, t)) and n["robot"] == robot)
-    peers = sorted(n["peer"] for n in numbered if number_of(n["peer"]) is not None)
+def _flight(path: Path, robot: str) -> SimulatedFlight:
+    start_ns, held = read_summary(path).start_ns, read_summary(path).topics
+    numbered = (
+        n for t in held if (n := topics.parse_topic(topics.RANGE, t)) and n["robot"] == robot
+    )
+    peers = sorted(n["peer"] for n in numbered if parse_robot_number(n["peer"]) is not None)
 
     def signal_of(topic: str, *fields: str) -> tuple[Array, Array]:
         table = read_table(path, topic, fields=fields)
@@ -166,16 +173,16 @@ def _flight(path: Path, robot: str) -> FakeFlight:
         return (table["log_time"].to_numpy() - start_ns) * 1e-9, values
 
     angles = ("roll_rad", "pitch_rad", "yaw_rad", "yaw_rate_radps")
-    height_s, height = signal_of(topics.height(robot), "height_m")
-    ranges = {peer: signal_of(topics.uwb_range(robot, peer), "range_m") for peer in peers}
-    return FakeFlight(
-        signal_of(topics.attitude(robot), *angles),
-        signal_of(topics.velocity(robot), "vx_mps", "vy_mps"),
+    height_s, height = signal_of(topics.HEIGHT(robot), "height_m")
+    ranges = {peer: signal_of(topics.RANGE(robot, peer), "range_m") for peer in peers}
+    return SimulatedFlight(
+        signal_of(topics.ATTITUDE(robot), *angles),
+        signal_of(topics.VELOCITY(robot), "vx_mps", "vy_mps"),
         (height_s, height[:, 0]),
         {peer: (time_s, range_m[:, 0]) for peer, (time_s, range_m) in ranges.items()},
     )
 
 
-def _pictures(path: Path, robot: str, start_ns: int) -> Pictures:
-    for stamped in read(path, topics.camera_image(robot)):
+def _pictures(path: Path, robot: str, start_ns: int) -> FlightImages:
+    for stamped in read(path, topics.CAMERA_IMAGE(robot)):
         yield (stamped.time_ns - start_ns) * 1e-9, stamped.message.data

@@ -17,15 +17,15 @@ from dmrl.errors import SettingError
 from dmrl.flight import NOISE, Clock, Fault, Flight, Scenario, Trajectory, Truth, simulate
 from dmrl.geometry.frames import AIDECK_PINHOLE, Array
 from dmrl.images.codec import encode_jpeg
-from dmrl.recording import Provenance, RecordingWriter, provenance
+from dmrl.recording import Provenance, RecordingWriter, build_provenance
 from dmrl.rendering import flight_images, renderer
-from dmrl.rendering.blender_environment import ensure
-from dmrl.rendering.onboard_camera import Body, Renderer, sketched, view
+from dmrl.rendering.blender_environment import ensure_environment
+from dmrl.rendering.onboard_camera import ViewRenderer, WorldPose, build_view, render_sketches
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch_renderer import Sketch
 from dmrl.samples import flight as samples
-from dmrl.samples.flight import Times, in_order, nanoseconds
-from dmrl.samples.sample import Sample, calibration, image, labels
+from dmrl.samples.flight import Times, merge_by_time, to_nanoseconds
+from dmrl.samples.sample import Sample, build_calibration, build_image, build_labels
 from dmrl.simulation.settings import CameraRenderer, Preset
 from dmrl.terminal.arguments import Seed
 from dmrl.terminal.progress import say, track
@@ -106,7 +106,7 @@ def record_flight(out: Path, settings: FlySettings) -> dict[str, int]:
     )
     flight = simulate(scenario, NOISE[settings.noise], settings.seed, settings.faults)
     _print_faults(flight)
-    made = provenance("fly", settings, seed=settings.seed, libraries=("numpy", "pillow"))
+    made = build_provenance("fly", settings, seed=settings.seed, libraries=("numpy", "pillow"))
     streams = [*_sensor_streams(flight), *_truth_streams(flight)]
     counts: Counter[str] = Counter()
     with ExitStack() as stack:
@@ -114,7 +114,7 @@ def record_flight(out: Path, settings: FlySettings) -> dict[str, int]:
             draw, made = _open_renderer(settings, made, stack)
             streams += _camera_streams(flight, settings, draw)
         sink = stack.enter_context(RecordingWriter(out, made))
-        for sample in track(in_order(streams), "Flying", _estimate_total(flight, settings)):
+        for sample in track(merge_by_time(streams), "Flying", _estimate_total(flight, settings)):
             sink.write_sample(sample)
             counts[_topic_pattern(sample.topic)] += 1
     return dict(sorted(counts.items()))
@@ -130,13 +130,13 @@ def _print_faults(flight: Flight) -> None:
 
 def _open_renderer(
     settings: FlySettings, made: Provenance, stack: ExitStack
-) -> tuple[Renderer, Provenance]:
+) -> tuple[ViewRenderer, Provenance]:
     """Return the renderer, closed with the stack, and the provenance with its version."""
     if settings.camera_renderer == "sketch":
-        return sketched, made
-    blender = stack.enter_context(renderer.Renderer(ensure(say), renderer.Model()))
+        return render_sketches, made
+    blender = stack.enter_context(renderer.Renderer(ensure_environment(say), renderer.RobotModel()))
     made = replace(made, libraries={**made.libraries, "blender": blender.version})
-    return flight_images.Flight(blender, settings.seed), made
+    return flight_images.FlightRenderer(blender, settings.seed), made
 
 
 def _check(settings: FlySettings) -> None:
@@ -147,7 +147,7 @@ def _check(settings: FlySettings) -> None:
 
 
 def _topic_pattern(topic: str) -> str:
-    row = topics.row_of(topic)
+    row = topics.find_topic(topic)
     return topic if row is None else row.pattern
 
 
@@ -165,16 +165,16 @@ def _estimate_total(flight: Flight, settings: FlySettings) -> int:
 
 def _log_times(clock: Clock, true_time_s: Array) -> Times:
     """Return the log times of true times: those of the robot's own clock."""
-    return START_NS + nanoseconds(clock.shows(true_time_s))
+    return START_NS + to_nanoseconds(clock.to_clock_time(true_time_s))
 
 
 def _sensor_streams(flight: Flight) -> Iterator[Iterator[Sample]]:
     for robot, log in flight.robots.items():
         columns = {name: getattr(log, name) for name in samples.LOG_COLUMNS}
-        yield samples.robot_log(robot, START_NS + nanoseconds(log.time_s), columns)
+        yield samples.iter_robot_log(robot, START_NS + to_nanoseconds(log.time_s), columns)
     for (robot, peer), ranges in flight.ranges.items():
-        time_ns = START_NS + nanoseconds(ranges.time_s)
-        yield samples.ranges(robot, peer, time_ns, ranges.range_m)
+        time_ns = START_NS + to_nanoseconds(ranges.time_s)
+        yield samples.iter_ranges(robot, peer, time_ns, ranges.range_m)
 
 
 def _truth_streams(flight: Flight) -> Iterator[Iterator[Sample]]:
@@ -186,26 +186,26 @@ def _truth_streams(flight: Flight) -> Iterator[Iterator[Sample]]:
 
 
 def _peer_truth(flight: Flight, robot: str, peer: str, true_time_s: Array) -> Iterator[Sample]:
-    for part in samples.stretches(len(true_time_s)):
+    for part in samples.iter_slices(len(true_time_s)):
         time_s = true_time_s[part]
         xyz = flight.peer_in_horizontal(robot, peer, time_s)
-        yield from samples.truth(robot, peer, _log_times(flight.clocks[robot], time_s), xyz)
+        yield from samples.iter_truth(robot, peer, _log_times(flight.clocks[robot], time_s), xyz)
 
 
 def _transforms(flight: Flight, true_time_s: float) -> Sample:
     """Return every robot's frames, on true time."""
     bodies = {robot: _body_at(truth, true_time_s) for robot, truth in flight.truth.items()}
     attitudes = {
-        robot: samples.Placed(b.xyz_world, b.yaw_rad, b.roll_rad, b.pitch_rad)
+        robot: samples.RobotPose(b.xyz_world, b.yaw_rad, b.roll_rad, b.pitch_rad)
         for robot, b in bodies.items()
     }
     time_ns = int(_log_times(Clock(), np.array([true_time_s]))[0])
-    return samples.transforms(time_ns, attitudes)
+    return samples.build_transforms(time_ns, attitudes)
 
 
-def _body_at(truth: Truth, true_time_s: float) -> Body:
+def _body_at(truth: Truth, true_time_s: float) -> WorldPose:
     at = np.array([true_time_s])
-    return Body(
+    return WorldPose(
         truth.position_at(at)[0],
         float(truth.yaw_at(at)[0]),
         float(np.interp(true_time_s, truth.time_s, truth.roll)),
@@ -214,32 +214,34 @@ def _body_at(truth: Truth, true_time_s: float) -> Body:
 
 
 def _camera_streams(
-    flight: Flight, settings: FlySettings, draw: Renderer
+    flight: Flight, settings: FlySettings, draw: ViewRenderer
 ) -> Iterator[Iterator[Sample]]:
     for k, robot in enumerate(list(flight.truth)[: settings.cameras_max]):
         yield _camera_stream(flight, robot, k, settings, draw)
 
 
 def _camera_stream(
-    flight: Flight, robot: str, number: int, settings: FlySettings, draw: Renderer
+    flight: Flight, robot: str, number: int, settings: FlySettings, draw: ViewRenderer
 ) -> Iterator[Sample]:
     """Yield the calibration of a robot's camera, then its images, each with its labels."""
     period_s = 1.0 / settings.camera_rate_hz
     time_s = np.arange(period_s / 2, settings.duration_s, period_s)
-    yield calibration(START_NS, robot, AIDECK_PINHOLE)
+    yield build_calibration(START_NS, robot, AIDECK_PINHOLE)
 
-    def bodies(moment_s: float) -> dict[str, Body]:
+    def bodies(moment_s: float) -> dict[str, WorldPose]:
         return {name: _body_at(truth, moment_s) for name, truth in flight.truth.items()}
 
     views = (
-        view(bodies, robot, moment_s, (settings.seed, number, k))
+        build_view(bodies, robot, moment_s, (settings.seed, number, k))
         for k, moment_s in enumerate(time_s.tolist())
     )
     seen_in, drawn = tee(views)  # which holds what is drawn ahead of what is written
     stamps = _log_times(flight.clocks[robot], time_s).tolist()
     for time_ns, seen, picture in zip(stamps, seen_in, draw(AIDECK_PINHOLE, drawn), strict=True):
-        yield image(time_ns, robot, encode_jpeg(picture.rgb, JPEG_QUALITY), "jpeg")
-        yield labels(time_ns, robot, list(_label_fields(list(seen.poses), picture)), ["truth"])
+        yield build_image(time_ns, robot, encode_jpeg(picture.rgb, JPEG_QUALITY), "jpeg")
+        yield build_labels(
+            time_ns, robot, list(_label_fields(list(seen.poses), picture)), ["truth"]
+        )
 
 
 def _label_fields(peers: Sequence[str], picture: Sketch | Shot) -> Iterator[dict[str, Any]]:

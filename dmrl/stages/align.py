@@ -73,18 +73,23 @@ def run(recording: In, out: Path, settings: Settings) -> "dict[str, Clock]":
     """
     from dmrl.estimation.signals.clock_alignment import Clock
     from dmrl.labelling.clocks.clock_alignment import SIGNALS, Sources, align_clocks, describe_clock
-    from dmrl.recording import Contents, RecordingWriter, copy_extras, provenance
+    from dmrl.recording import (
+        LoadedRecording,
+        RecordingWriter,
+        build_provenance,
+        copy_metadata_and_attachments,
+    )
 
     refuse_existing(out)
-    held = Contents(recording, *SIGNALS)
+    held = LoadedRecording(recording, *SIGNALS)
     clocks, corrected = align_clocks(held, Sources(**asdict(settings)))
     later_ns = max(0, -corrected.earliest_ns())
     if later_ns:
         say(f"{recording}: all times are moved by {later_ns / 1e9:.9g} s, as one would be before 0")
         clocks[ALL] = Clock(later_ns * 1e-9, by="no time before 0")
-    made = provenance("align", settings, [recording], libraries=("numpy",))
+    made = build_provenance("align", settings, [recording], libraries=("numpy",))
     with RecordingWriter(out, made) as sink:
-        copy_extras(held.summary, sink)
+        copy_metadata_and_attachments(held.summary, sink)
         described = {name: describe_clock(c, held.start_ns) for name, c in clocks.items()}
         sink.add_metadata(METADATA, {name: json.dumps(one) for name, one in described.items()})
         replace(corrected, later_ns=later_ns).write(sink)
@@ -93,9 +98,9 @@ def run(recording: In, out: Path, settings: Settings) -> "dict[str, Clock]":
 
 def _document(clocks: "dict[str, Clock]", given: Given) -> dict[str, Any]:
     from dmrl.labelling.clocks.clock_alignment import describe_clock
-    from dmrl.recording import summary
+    from dmrl.recording import read_summary
 
-    start_ns = summary(given.recording).start_ns
+    start_ns = read_summary(given.recording).start_ns
     described = {name: describe_clock(clock, start_ns) for name, clock in clocks.items()}
     return {"recording": str(given.out), "clocks": described}
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter, validators
 
-from dmrl.atomic_output import partial_file, refuse_existing
+from dmrl.atomic_output import atomic_file, refuse_existing
 from dmrl.errors import SettingError, optional_imports
 from dmrl.estimation.calibration.noise import Noise
 from dmrl.pipeline.stage_command import stage_command
@@ -104,7 +104,7 @@ def run(
         from dmrl.labelling.calibration.board import calibrate_by_board
         from dmrl.labelling.calibration.flights import calibrate_by_flights
         from dmrl.labelling.sensor_file import write_sensors
-    from dmrl.geometry.camera_file import write_camera
+    from dmrl.geometry.camera_file import format_camera
 
     refuse_existing(out)
     if settings.sensors:
@@ -130,8 +130,8 @@ def run(
             sources[0], settings.board, robot=settings.robot, every=settings.every
         )
         result = Result(camera, None, figures)
-    with partial_file(out) as partial:
-        text = write_camera(result.camera) if result.camera else ""
+    with atomic_file(out) as partial:
+        text = format_camera(result.camera) if result.camera else ""
         text = write_sensors(result.sensors) if result.sensors else text
         partial.write_text(text, encoding="utf-8")
     return result
@@ -139,14 +139,14 @@ def run(
 
 def _calibrate_sensors(sources: list[Path], workers: int) -> Result:
     """Solve flights side by side, and pool their sensor constants."""
-    from dmrl.labelling.calibration.sensor_calibration import pool_flights, solve_flight
+    from dmrl.labelling.calibration.sensor_calibration import pool_sensor_constants, solve_flight
     from dmrl.pipeline.parallel_map import parallel_map
-    from dmrl.recording.provenance_inputs import refuse_twice
+    from dmrl.recording.provenance_inputs import refuse_duplicates
     from dmrl.terminal.progress import track
 
-    refuse_twice(sources)
+    refuse_duplicates(sources)
     flights = track(parallel_map(solve_flight, sources, workers), "Solving flights", len(sources))
-    found = pool_flights(sources, flights)
+    found = pool_sensor_constants(sources, flights)
     constants = [
         {**asdict(one), "of": one.of if isinstance(one.of, str) else "-".join(one.of)}
         for one in found.constants

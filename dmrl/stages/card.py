@@ -48,12 +48,12 @@ def run(dataset: Path, settings: Settings, out: Path | None = None) -> Path:
     OutputError
         If ``out`` exists.
     """
-    from dmrl.atomic_output import partial_folder
+    from dmrl.atomic_output import atomic_folder
     from dmrl.card import write_card
 
     if out is None:
         return write_card(dataset, title=settings.title, license_id=settings.license)
-    with partial_folder(out) as folder:
+    with atomic_folder(out) as folder:
         card = write_card(dataset, title=settings.title, license_id=settings.license, into=folder)
     return out / card.name
 

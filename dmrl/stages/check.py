@@ -41,9 +41,9 @@ def run(recording: Path) -> Checked:
     RecordingError
         If it is not a complete recording.
     """
-    from dmrl.recording import check, summary
+    from dmrl.recording import check, read_summary
 
-    findings, held = check(recording), summary(recording)
+    findings, held = check(recording), read_summary(recording)
     return Checked(held.count, len(held.topics), findings)
 
 

@@ -131,7 +131,7 @@ def _to_options(settings: Settings) -> "Options":
         If a setting is out of range.
     """
     from dmrl.formats.base import Options
-    from dmrl.geometry.camera_file import camera_named
+    from dmrl.geometry.camera_file import find_camera
 
     if not ROBOT.fullmatch(settings.robot):
         raise SettingError(f"--robot {settings.robot!r} cannot stand in a topic. Try: cf1")
@@ -147,7 +147,7 @@ def _to_options(settings: Settings) -> "Options":
         names=_parse_names(settings.names),
         rate_hz=settings.rate_hz,
         labels=settings.labels,
-        camera=None if settings.camera is None else camera_named(settings.camera),
+        camera=None if settings.camera is None else find_camera(settings.camera),
         size_px=None if width_px is None or height_px is None else (width_px, height_px),
         raw=settings.raw,
         columns=settings.columns,

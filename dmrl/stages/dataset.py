@@ -16,7 +16,7 @@ from dmrl.terminal.arguments import AsJson, Flat, On, Workers
 from dmrl.terminal.tables import print_json, print_line, print_table
 
 if TYPE_CHECKING:
-    from dmrl.datasets.writing.rows import Tally
+    from dmrl.datasets.writing.rows import ExclusionCounts
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Result:
 
     images: dict[str, int]
     sources: dict[str, str]
-    tally: "Tally"
+    tally: "ExclusionCounts"
 
 
 def run(
@@ -132,13 +132,13 @@ def command(
     if on is None:
         result = (add if into else run)(named, out, settings, workers=workers)
     elif said := run_on_cluster(on, "dataset", out, {"recordings": named}, settings):
-        from dmrl.datasets.writing.rows import Tally
+        from dmrl.datasets.writing.rows import ExclusionCounts
 
-        result = Result(said["images"], said["sources"], Tally(**said["tally"]))
+        result = Result(said["images"], said["sources"], ExclusionCounts(**said["tally"]))
     if result is None:
         print_line(f"{out} was there, made of the same by the same settings")
         return
-    left_out = {why: count for why, count in result.tally.left_out().items() if count}
+    left_out = {why: count for why, count in result.tally.count_by_reason().items() if count}
     if as_json:
         document = {"dataset": str(out), "images": result.images}
         print_json({**document, "labels": result.sources, "left_out": left_out})

@@ -22,12 +22,12 @@ def command(
     out
         Folder for every output.
     """
-    from dmrl.evaluation.pipeline_summary import report
-    from dmrl.html_report import write
+    from dmrl.evaluation.pipeline_summary import print_report
+    from dmrl.html_report import write_html_report
     from dmrl.pipeline import recipe_run as pipeline
 
-    report(pipeline.run("demo", out), as_json=as_json)
-    page = write(out)
+    print_report(pipeline.run("demo", out), as_json=as_json)
+    page = write_html_report(out)
     if not as_json:
         print(f"""{page}: open it in a browser; {_find_picture(out)} is a picture of it. Now try:
   dmrl view {out}/predictions.mcap       # the same in rerun, image by image

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter, validators
 
-from dmrl.atomic_output import partial_folder, refuse_existing
+from dmrl.atomic_output import atomic_folder, refuse_existing
 from dmrl.errors import SettingError
-from dmrl.learn.pretrained import resolved
+from dmrl.learn.pretrained import resolve_model_path
 from dmrl.pipeline.stage_command import stage_command
 from dmrl.terminal.closing import Closing, Given
 from dmrl.terminal.progress import say
 
 if TYPE_CHECKING:
-    from dmrl.deploy.c.run.measure import Memory
+    from dmrl.deploy.c.run.measure import StateMemory
     from dmrl.deploy.export_folder import Written
 
 
@@ -66,17 +66,17 @@ def run(model: Path, out: Path, settings: Settings) -> "list[Written]":
         If two memories are wanted with ``refine``, or the near one is too small.
     """
     from dmrl.deploy.export_folder import list_files, refuse_export, write_export
-    from dmrl.recording import provenance
+    from dmrl.recording import build_provenance
 
     if settings.refine and settings.l1_kb is not None:
         raise SettingError(
             "--refine holds all that the last layer reads, in one memory. Leave out --l1-kb"
         )
     refuse_existing(out)
-    model = resolved(model)
+    model = resolve_model_path(model)
     refuse_export(model)
-    made = provenance("export", settings, (model,), libraries=("torch", "onnx", "numpy"))
-    with partial_folder(out) as folder:
+    made = build_provenance("export", settings, (model,), libraries=("torch", "onnx", "numpy"))
+    with atomic_folder(out) as folder:
         quantized = write_export(model, folder, **asdict(settings))
         made.write(folder)
     if not quantized:
@@ -84,12 +84,16 @@ def run(model: Path, out: Path, settings: Settings) -> "list[Written]":
     return list_files(out)
 
 
-def _measure_memory(written: "list[Written]", out: Path) -> "Memory | None":
+def _measure_memory(written: "list[Written]", out: Path) -> "StateMemory | None":
     """Return the memory that the C takes; None: there is no C."""
-    from dmrl.deploy.c.run.measure import memory_of
-    from dmrl.deploy.int8.store import INTEGER_NAME, load
+    from dmrl.deploy.c.run.measure import parse_state_memory
+    from dmrl.deploy.int8.store import INTEGER_NAME, load_network
 
-    return memory_of(load(out), out) if any(f.name == INTEGER_NAME for f in written) else None
+    return (
+        parse_state_memory(load_network(out), out)
+        if any(f.name == INTEGER_NAME for f in written)
+        else None
+    )
 
 
 def _document(written: "list[Written]", given: Given) -> dict[str, Any]:
@@ -99,7 +103,7 @@ def _document(written: "list[Written]", given: Given) -> dict[str, Any]:
 
 
 def _lines(written: "list[Written]", given: Given) -> Iterator[str]:
-    from dmrl.deploy.c import L1_FOR_STATE
+    from dmrl.deploy.c import MAX_L1_STATE_BYTES
 
     memory = _measure_memory(written, given.out)
     if memory is None:
@@ -107,7 +111,7 @@ def _lines(written: "list[Written]", given: Given) -> Iterator[str]:
     fit = "fits" if memory.fits_l1 else "does not fit"
     other = "" if memory.fits_l1 else "; --l1-kb 64 makes two memories of it"
     yield (
-        f"{memory.state_bytes:,} bytes of RAM, which {fit} a GAP8's L1: {L1_FOR_STATE:,} beside "
+        f"{memory.state_bytes:,} bytes of RAM, which {fit} a GAP8's L1: {MAX_L1_STATE_BYTES:,} beside "
         f"stacks{other}"
     )
     if memory.far_bytes:

@@ -31,9 +31,9 @@ def command(
     """
     from dmrl.catalogue import open_catalogue
     from dmrl.catalogue.display import HEADS, display_rows
-    from dmrl.catalogue.query import find
+    from dmrl.catalogue.query import find_rows
 
-    found = find(open_catalogue(folder), query)
+    found = find_rows(open_catalogue(folder), query)
     if as_json:
         print_json({"folder": str(folder), "recordings": found.to_pylist()})
     elif paths:

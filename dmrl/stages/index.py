@@ -59,14 +59,14 @@ def update(folder: Path, workers: int | None = None, on: str | None = None) -> R
     """
     from dmrl.catalogue import open_catalogue
     from dmrl.catalogue.row_buffer import RowBuffer
-    from dmrl.catalogue.table import stamp
+    from dmrl.catalogue.table import file_stamp
 
     before = open_catalogue(folder, new=True)
     found = {name.as_posix(): path for name, path in find_recordings(folder).items()}
     for name in found:
         name.encode()  # what no table can hold is said before the work, not after
-    stamps = {name: stamp(path) for name, path in found.items()}
-    kept = before.unchanged(stamps)
+    stamps = {name: file_stamp(path) for name, path in found.items()}
+    kept = before.find_unchanged(stamps)
     rows = RowBuffer()
     new = {name: path for name, path in found.items() if name not in kept}
     try:
@@ -74,7 +74,7 @@ def update(folder: Path, workers: int | None = None, on: str | None = None) -> R
             _describe_all(new, stamps, rows, open_executor(on, workers))
     finally:
         fresh = rows.to_table()
-        after = before.with_rows(kept, fresh)
+        after = before.replace_rows(kept, fresh)
         if not after.table.equals(before.table) or not before.file.exists():
             after.save()
     gone = sum(name not in found for name in before.table["recording"].to_pylist())
@@ -86,13 +86,15 @@ def _describe_all(
     new: Mapping[str, Path], stamps: Mapping[str, str], rows: "RowBuffer", crew: Executor
 ) -> None:
     """Describe recordings side by side."""
-    from dmrl.catalogue import unread
+    from dmrl.catalogue import unreadable_row
 
     names = {path: name for name, path in new.items()}
     tasks = build_tasks("index", "recording", {path: path for path in names}, None)
     with crew:
         for task, answer in iter_results(tasks, crew, "Indexing"):
-            row = unread(error_text(task, answer)) if has_failed(answer) else answer["result"]
+            row = (
+                unreadable_row(error_text(task, answer)) if has_failed(answer) else answer["result"]
+            )
             name = names[task.source]
             size = int(stamps[name].split()[0])
             rows.add({**row, "recording": name, "bytes": size, "stamp": stamps[name]})

@@ -18,10 +18,10 @@ def run(recording: Path) -> "Overview":
     recording
         A recording.
     """
-    from dmrl.recording import summary
+    from dmrl.recording import read_summary
     from dmrl.recording.overview import Overview
 
-    return Overview(recording, summary(recording))
+    return Overview(recording, read_summary(recording))
 
 
 command = stage_command(

@@ -109,7 +109,7 @@ def run(recording: In, out: Path, settings: Settings, *, workers: int = 1) -> Re
         from dmrl.labelling.image_labels import CameraOptions
         from dmrl.labelling.pair_estimation import PairSolver
         from dmrl.labelling.recorded_camera import read_robot_cameras
-        from dmrl.recording import provenance
+        from dmrl.recording import build_provenance
 
     refuse_existing(out)
     files, detections = settings.camera, settings.detections
@@ -122,7 +122,7 @@ def run(recording: In, out: Path, settings: Settings, *, workers: int = 1) -> Re
     solver = PairSolver(settings.method, settings.preset, settings.gate_m)
     made = labelling.label_flight(flight, logs, bearings, options, solver, workers, parallel_map)
     inputs = [recording, *files.values(), *filter(None, [settings.sensors])]
-    origin = provenance("label", settings, inputs, libraries=("numpy", "scipy"))
+    origin = build_provenance("label", settings, inputs, libraries=("numpy", "scipy"))
     labelling.write_labelled(flight, out, origin, made, copy=settings.copy)
     return Result(made.reports, made.count, made.warnings)
 

@@ -13,10 +13,10 @@ from dmrl.terminal.tables import print_line
 
 def run(recordings: Sequence[Path], out: Path) -> int:
     """Merge recordings into ``out``; return the number of messages. See `dmrl.recording.merge`."""
-    from dmrl.recording import merge, say_findings
+    from dmrl.recording import merge, print_findings
 
     count = merge(recordings, out)
-    say_findings(out)
+    print_findings(out)
     return count
 
 

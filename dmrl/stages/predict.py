@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter, validators
 
 from dmrl.deploy.backend_names import BackendName
-from dmrl.learn.inference.tta_views import VIEWS
+from dmrl.learn.inference.tta_views import TTA_VIEWS
 from dmrl.pipeline.stage_command import stage_command
 from dmrl.terminal.arguments import In
 from dmrl.terminal.closing import Closing
@@ -50,7 +50,7 @@ class Settings:
     threshold: Share | None = None
     min_confidence: Share = 0.01
     most: Positive = 20
-    views: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=len(VIEWS)))] = 1
+    views: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=len(TTA_VIEWS)))] = 1
     batch_size: Positive = 16
 
 

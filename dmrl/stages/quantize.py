@@ -71,14 +71,14 @@ def run(model: Path, dataset: Path, out: Path, settings: Settings) -> "Quantizat
     with optional_imports("train", "dmrl quantize"):
         from dmrl.deploy.int8.quantise_model import quantise_model
         from dmrl.evaluation.quantization_report import open_inputs, write_quantized
-        from dmrl.learn.pretrained import resolved
-        from dmrl.recording import provenance
+        from dmrl.learn.pretrained import resolve_model_path
+        from dmrl.recording import build_provenance
 
     refuse_existing(out)
-    model = resolved(model)
+    model = resolve_model_path(model)
     inputs = open_inputs(model, dataset, settings.split)
     made = quantise_model(inputs.model, inputs.calibration, settings.images, grey=settings.grey)
-    origin = provenance("quantize", settings, (model, dataset), libraries=("torch", "numpy"))
+    origin = build_provenance("quantize", settings, (model, dataset), libraries=("torch", "numpy"))
     return write_quantized(out, origin, inputs, made, settings.most)
 
 

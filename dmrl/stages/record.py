@@ -37,9 +37,9 @@ def command(
         Show it in rerun as it comes.
     """
     from dmrl.ingest.live_session import record_session
-    from dmrl.live.robot_options import robot_of
+    from dmrl.live.robot_options import parse_robot
 
-    robots = [robot_of(text) for text in robot]
+    robots = [parse_robot(text) for text in robot]
     with ExitStack() as window:
         show = None
         if view:

@@ -111,9 +111,9 @@ def command(
         Print one JSON document in place of the table.
     """
     if setup:
-        from dmrl.rendering.blender_environment import ensure
+        from dmrl.rendering.blender_environment import ensure_environment
 
-        python = ensure(say)
+        python = ensure_environment(say)
         if recipe is None:
             return print_json({"python": str(python)}) if as_json else say(f"Blender: {python}")
     if recipe is None or out is None:

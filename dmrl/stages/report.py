@@ -25,9 +25,9 @@ def run(folder: Path, out: Path | None = None) -> Path:
     Path
         The page.
     """
-    from dmrl.html_report import write
+    from dmrl.html_report import write_html_report
 
-    return write(folder, out)
+    return write_html_report(folder, out)
 
 
 def _document(page: Path, _: Any) -> dict[str, Any]:

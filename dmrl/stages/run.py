@@ -33,13 +33,13 @@ def command(
     workers
         Steps that run at a time, at most. Without it, as many as there are cores. Changes no byte.
     """
-    from dmrl.evaluation.pipeline_summary import report
+    from dmrl.evaluation.pipeline_summary import print_report
     from dmrl.pipeline import recipe_run as pipeline
 
     folder = Path(Path(recipe).stem) if out is None else out
     plan, before = pipeline.load_plan(recipe), pipeline.read_recipe_text(folder)
     done = pipeline.run(recipe, folder, data, workers=workers, on=on)
-    report(done, as_json=as_json)
+    print_report(done, as_json=as_json)
     changed = plan.text != before or not all(one.skipped for one in done)
     page = _write_page(folder, changed=changed) if plan.pictured else None
     if not as_json:
@@ -54,8 +54,8 @@ def _write_page(folder: Path, *, changed: bool) -> Path | None:
     if there.is_file() and not changed:
         return there
     try:
-        from dmrl.html_report import write
+        from dmrl.html_report import write_html_report
     except MissingExtra:
         say("no page: that needs matplotlib. pip install 'dmrl[plot]', then dmrl report")
         return None
-    return write(folder)
+    return write_html_report(folder)

@@ -8,7 +8,7 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 
-from dmrl.atomic_output import partial_folder
+from dmrl.atomic_output import atomic_folder
 from dmrl.errors import SettingError
 from dmrl.pipeline.parallel_map import parallel_map
 from dmrl.pipeline.stage_command import stage_command
@@ -44,11 +44,11 @@ def run(out: Path, settings: Settings, *, workers: int = 1) -> dict[str, int]:
     OutputError
         If ``out`` exists or cannot be written.
     """
-    from dmrl.formats.files.image_folder import CALIBRATION, LABELS
+    from dmrl.formats.files.image_folder import CALIBRATION_FILE, LABELS_FILE
     from dmrl.formats.files.label_csv import LabelRow, write_labels
-    from dmrl.geometry.camera_file import write_camera
+    from dmrl.geometry.camera_file import format_camera
     from dmrl.geometry.frames import AIDECK_PINHOLE
-    from dmrl.recording import provenance
+    from dmrl.recording import build_provenance
     from dmrl.simulation.drawn_pictures import draw_files
 
     _check(settings)
@@ -57,14 +57,16 @@ def run(out: Path, settings: Settings, *, workers: int = 1) -> dict[str, int]:
     parts = [numbers[k : k + PART_IMAGES] for k in range(0, len(numbers), PART_IMAGES)]
     drawn = parallel_map(partial(draw_files, settings=settings), parts, workers)
     # A signal may come between two parts: closing ends the processes, which would work on.
-    with partial_folder(out) as folder, closing(drawn):
+    with atomic_folder(out) as folder, closing(drawn):
         for name, png, labels in track(chain.from_iterable(drawn), "Drawing", settings.images):
             (folder / name).write_bytes(png)
             rows += labels
-        with (folder / LABELS).open("w", newline="", encoding="utf-8") as stream:
+        with (folder / LABELS_FILE).open("w", newline="", encoding="utf-8") as stream:
             write_labels(stream, rows)
-        (folder / CALIBRATION).write_text(write_camera(AIDECK_PINHOLE), encoding="utf-8")
-        made = provenance("sketch", settings, seed=settings.seed, libraries=("numpy", "pillow"))
+        (folder / CALIBRATION_FILE).write_text(format_camera(AIDECK_PINHOLE), encoding="utf-8")
+        made = build_provenance(
+            "sketch", settings, seed=settings.seed, libraries=("numpy", "pillow")
+        )
         made.write(folder)
     empty = sum(not row.peer for row in rows)
     return {"images": settings.images, "robots": len(rows) - empty, "empty images": empty}

@@ -88,8 +88,8 @@ def run(recording: In, out: Path, settings: Settings) -> "list[RobotReport]":
     OutputError
         If ``out`` exists.
     """
-    from dmrl.geometry.camera_file import write_camera
-    from dmrl.recording import provenance, rewrite
+    from dmrl.geometry.camera_file import format_camera
+    from dmrl.recording import build_provenance, rewrite
 
     with optional_imports("label", "dmrl track"):
         from dmrl.evaluation.tracks import CAMERAS_METADATA
@@ -100,7 +100,7 @@ def run(recording: In, out: Path, settings: Settings) -> "list[RobotReport]":
     flight = read_flight(recording, *OBSERVER_TOPICS, sizes_of=settings.camera)
     robots = sorted(flight.detections)
     if not robots:
-        raise MissingTopic(topics.detections("*"), flight.topics, recording)
+        raise MissingTopic(topics.DETECTIONS("*"), flight.topics, recording)
     if unknown := set(settings.camera) - set(robots):
         raise SettingError(f"--camera.{min(unknown)}: {recording} has {', '.join(robots)}")
     cameras = {
@@ -113,10 +113,10 @@ def run(recording: In, out: Path, settings: Settings) -> "list[RobotReport]":
         track_peers(flight, robot, camera, settings.threshold, settings.tuning)
         for robot, camera in cameras.items()
     ]
-    replaced = [topic for topic in flight.topics if topics.names(topics.TRACKS, topic)]
+    replaced = [topic for topic in flight.topics if topics.parse_topic(topics.TRACKS, topic)]
     inputs = [recording, *settings.camera.values()]
-    made = provenance("track", settings, inputs, libraries=("numpy", "scipy", "filterpy"))
-    metadata = {CAMERAS_METADATA: {robot: write_camera(c) for robot, c in cameras.items()}}
+    made = build_provenance("track", settings, inputs, libraries=("numpy", "scipy", "filterpy"))
+    metadata = {CAMERAS_METADATA: {robot: format_camera(c) for robot, c in cameras.items()}}
     fresh = [messages for messages, _ in tracked]
     rewrite(recording, out, made, without=replaced, fresh=fresh, metadata=metadata)
     return [report for _, report in tracked]

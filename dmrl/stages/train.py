@@ -83,9 +83,9 @@ def command(
     """
     from dmrl import recipe as recipes
     from dmrl.datasets.training import train_network
-    from dmrl.learn.training.config import FitSettings
+    from dmrl.learn.training.config import TrainConfig
 
-    settings = recipes.load(recipe, "train", FitSettings, flags)
+    settings = recipes.load(recipe, "train", TrainConfig, flags)
     result = train_network(dataset, out, settings, init=init, teacher=teacher, resume=resume)
     row = (result.images, settings.epochs, result.loss, result.seconds, result.images_per_s)
     columns = ("images", "epochs", "last loss", "seconds", "images/s")

@@ -79,18 +79,18 @@ def run(recording: Path, out: Path, settings: Settings) -> int:
 
 def origin(recording: Path, settings: Settings) -> "Provenance":
     """Return the provenance of what `run` would write."""
-    from dmrl.recording import provenance
+    from dmrl.recording import build_provenance
 
     low_ns, high_ns = _kept_ns(recording, settings)
     kept = {"start_ns": low_ns, "end_ns": high_ns, "topics": list(settings.topic)}
-    return provenance("trim", kept, [recording])
+    return build_provenance("trim", kept, [recording])
 
 
 def _kept_ns(recording: Path, settings: Settings) -> tuple[int | None, int | None]:
     """Return the first log time that is kept, and the first after it that is not."""
-    from dmrl.recording import summary
+    from dmrl.recording import read_summary
 
-    start_ns = summary(recording).start_ns
+    start_ns = read_summary(recording).start_ns
     low, high = (
         None if given is None else start_ns + round(given * 1e9)
         for given in (settings.from_s, settings.to_s)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter, validators
 
-from dmrl.atomic_output import partial_file
+from dmrl.atomic_output import atomic_file
 from dmrl.pipeline.stage_command import stage_command
 from dmrl.terminal.closing import Closing
 from dmrl.terminal.progress import say
@@ -91,7 +91,7 @@ def run(
 
     if out is None:
         return prove()
-    with partial_file(out) as partial:
+    with atomic_file(out) as partial:
         proof = prove()
         require_proof(folder, proof, all_targets=settings.require)
         text = json.dumps(proof.to_document(), indent=1, allow_nan=False)

@@ -4,7 +4,7 @@
 of `pathlib.Path`. A library that opens it by name gets a local copy.
 """
 
-from dmrl.storage.remote import SCHEMES, Remote, path_of
-from dmrl.storage.upload import added_files, uploaded_file, uploaded_folder
+from dmrl.storage.remote import SCHEMES, RemotePath, to_path
+from dmrl.storage.upload import upload_file, upload_folder, upload_into_folder
 
-__all__ = ["SCHEMES", "Remote", "added_files", "path_of", "uploaded_file", "uploaded_folder"]
+__all__ = ["SCHEMES", "RemotePath", "to_path", "upload_file", "upload_folder", "upload_into_folder"]

@@ -17,21 +17,21 @@ from typing import Any
 
 from dmrl.errors import StorageError
 from dmrl.guards.paths import refuse_pipe
-from dmrl.guards.safe_names import inside
-from dmrl.storage.remote_stream import STEP_BYTES, Ranged
-from dmrl.storage.system import system, told
+from dmrl.guards.safe_names import safe_join
+from dmrl.storage.remote_stream import WHOLE_FILE_STEP_BYTES, RangeReader
+from dmrl.storage.system import get_filesystem, translate_errors
 
 SCHEMES = ("s3", "gs", "gcs", "az", "abfs", "http", "https")
 """Schemes of a remote name, before ``://``."""
-UNFINISHED = ".dmrl-unfinished"
+UNFINISHED_MARK = ".dmrl-unfinished"
 """Mark in a folder that is being written. A folder with it counts as missing."""
-VERSION = "?versionId="
+VERSION_MARK = "?versionId="
 """Text that s3fs interprets as the end of a key."""
-METADATA = "dmrl-sha256"
+HASH_METADATA_KEY = "dmrl-sha256"
 """Metadata key of an object that dmrl wrote, with its hash, so that no reader has to compute it."""
 
 
-class Remote(PosixPath):
+class RemotePath(PosixPath):
     """A path such as ``s3://bucket/key``. Paths relative to one are plain paths."""
 
     @property
@@ -47,7 +47,7 @@ class Remote(PosixPath):
         return f"{self.scheme}://{rest}" if self.scheme.startswith("http") else rest
 
     @property
-    def bucket(self) -> "Remote":
+    def bucket(self) -> "RemotePath":
         """The bucket of this path."""
         return type(self)(*self.parts[:2])
 
@@ -56,11 +56,11 @@ class Remote(PosixPath):
         return plain.replace(":/", "://", 1) if self.scheme else plain
 
     def __fspath__(self) -> str:
-        return _copy(self) if self.scheme else super().__str__()
+        return _download(self) if self.scheme else super().__str__()
 
     def _info(self) -> dict[str, Any]:
-        with told(str(self)):
-            found: dict[str, Any] = system(self.scheme).info(self.key)
+        with translate_errors(str(self)):
+            found: dict[str, Any] = get_filesystem(self.scheme).info(self.key)
             return found
 
     def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
@@ -92,10 +92,10 @@ class Remote(PosixPath):
     def is_dir(self) -> bool:
         """Return whether objects exist below the path, and the folder is complete."""
         try:
-            there = self._info()["type"] == "directory"
+            is_directory = self._info()["type"] == "directory"
         except FileNotFoundError:
             return False
-        return there and not (self / UNFINISHED).is_file()
+        return is_directory and not (self / UNFINISHED_MARK).is_file()
 
     def is_symlink(self) -> bool:
         """Return False: buckets have no links."""
@@ -105,15 +105,15 @@ class Remote(PosixPath):
         """Return whether the other path has the same name."""
         return str(self) == str(other)
 
-    def resolve(self, strict: bool = False) -> "Remote":
+    def resolve(self, strict: bool = False) -> "RemotePath":
         """Return the path itself."""
         return self
 
-    def absolute(self) -> "Remote":
+    def absolute(self) -> "RemotePath":
         """Return the path itself."""
         return self
 
-    def below(self) -> list["Remote"]:
+    def list_files(self) -> list["RemotePath"]:
         """Return every file below the path, by name.
 
         Raises
@@ -121,15 +121,15 @@ class Remote(PosixPath):
         StorageError
             If no path can express a key. The path of ``a//b`` is that of ``a/b``, another object.
         """
-        with told(str(self)):
-            found = system(self.scheme).find(self.key)
+        with translate_errors(str(self)):
+            found = get_filesystem(self.scheme).find(self.key)
         head, paths = f"{self.scheme}://", []
         for name in sorted(found):
             key = name.removeprefix(head)
             if key.endswith("/"):
                 continue  # web consoles create such an object for an empty folder
             path = type(self)(head + key)
-            if path.key != key or VERSION in key:
+            if path.key != key or VERSION_MARK in key:
                 raise StorageError(
                     f"{self}: an object is called {key!r}, which cannot be a path. Rename it, or "
                     "name the files"
@@ -137,47 +137,51 @@ class Remote(PosixPath):
             paths.append(path)
         return paths
 
-    def iterdir(self) -> Iterator["Remote"]:  # type: ignore[override]
+    def iterdir(self) -> Iterator["RemotePath"]:  # type: ignore[override]
         """Yield the files and folders in the folder."""
         depth = len(self.parts) + 1
-        yield from dict.fromkeys(type(self)(*one.parts[:depth]) for one in self.below())
+        yield from dict.fromkeys(type(self)(*one.parts[:depth]) for one in self.list_files())
 
-    def glob(self, pattern: str, **_: Any) -> Iterator["Remote"]:  # type: ignore[override]
+    def glob(self, pattern: str, **_: Any) -> Iterator["RemotePath"]:  # type: ignore[override]
         """Yield the files below whose names match, part by part. ``**`` is not supported."""
         wanted = pattern.split("/")
-        for one in self.below():
+        for one in self.list_files():
             parts = one.parts[len(self.parts) :]
             if len(parts) == len(wanted) and all(map(fnmatchcase, parts, wanted)):
                 yield one
 
-    def rglob(self, pattern: str, **_: Any) -> Iterator["Remote"]:  # type: ignore[override]
+    def rglob(self, pattern: str, **_: Any) -> Iterator["RemotePath"]:  # type: ignore[override]
         """Yield the files below whose last part matches."""
-        return (one for one in self.below() if fnmatchcase(one.name, pattern))
+        return (one for one in self.list_files() if fnmatchcase(one.name, pattern))
 
     def open(self, mode: str = "r", *_: Any, encoding: str | None = None, **more: Any) -> Any:
         """Open a stream that reads by byte ranges. Writing is not supported."""
         if set(mode) - set("rbt"):
             raise io.UnsupportedOperation(f"{self} can only be opened for reading")
-        stream = io.BufferedReader(self.ranged())
+        stream = io.BufferedReader(self.open_ranges())
         if "b" in mode:
             return stream
         return io.TextIOWrapper(stream, encoding or "utf-8", more.get("errors"))
 
-    def ranged(self) -> Ranged:
+    def open_ranges(self) -> RangeReader:
         """Return a reader of byte ranges of the file."""
         info = self._info()
-        return Ranged(system(self.scheme), self.key, str(self), int(info.get("size") or 0))
+        return RangeReader(
+            get_filesystem(self.scheme), self.key, str(self), int(info.get("size") or 0)
+        )
 
     def sha256(self) -> str:
         """Return the hash from the object's metadata, or compute it from all its bytes."""
         if self.scheme == "s3":
-            with told(str(self)):
-                said = system("s3").metadata(self.key, refresh=True)
-            known = said.get(METADATA) or said.get(METADATA.replace("-", "_"))
-            if known and len(known) == 64:
-                return str(known)
-        digest, stream, at = hashlib.sha256(), self.ranged(), 0
-        while data := stream.fetch(at, STEP_BYTES):
+            with translate_errors(str(self)):
+                metadata = get_filesystem("s3").metadata(self.key, refresh=True)
+            stored_hash = metadata.get(HASH_METADATA_KEY) or metadata.get(
+                HASH_METADATA_KEY.replace("-", "_")
+            )
+            if stored_hash and len(stored_hash) == 64:
+                return str(stored_hash)
+        digest, stream, at = hashlib.sha256(), self.open_ranges(), 0
+        while data := stream.fetch(at, WHOLE_FILE_STEP_BYTES):
             digest.update(data)
             at += len(data)
         return digest.hexdigest()
@@ -191,40 +195,40 @@ class Remote(PosixPath):
     def unlink(self, missing_ok: bool = False) -> None:
         """Remove the file."""
         try:
-            with told(str(self)):
-                system(self.scheme).rm_file(self.key)
+            with translate_errors(str(self)):
+                get_filesystem(self.scheme).rm_file(self.key)
         except FileNotFoundError:
             if not missing_ok:
                 raise
 
-    def remove_all(self) -> None:
+    def remove_tree(self) -> None:
         """Remove the file, or everything below."""
-        with told(str(self)):
-            if system(self.scheme).exists(self.key):
-                system(self.scheme).rm(self.key, recursive=True)
+        with translate_errors(str(self)):
+            if get_filesystem(self.scheme).exists(self.key):
+                get_filesystem(self.scheme).rm(self.key, recursive=True)
 
     def replace(self, target: Any) -> Any:
         """Rename within the same store; the server copies the objects."""
-        files = [self] if self.is_file() else self.below()
+        files = [self] if self.is_file() else self.list_files()
         if not files:
             raise FileNotFoundError(2, "No such file", str(self))
         target.remove_all()
-        marks = [] if files == [self] else [target / UNFINISHED]
-        with told(str(self)):
+        marks = [] if files == [self] else [target / UNFINISHED_MARK]
+        with translate_errors(str(self)):
             for mark in marks:
-                system(self.scheme).pipe_file(mark.key, b"")
+                get_filesystem(self.scheme).pipe_file(mark.key, b"")
             for one in files:
                 to = target.joinpath(*one.parts[len(self.parts) :])
-                system(self.scheme).cp_file(one.key, to.key)
+                get_filesystem(self.scheme).cp_file(one.key, to.key)
         for mark in marks:
             mark.unlink()
-        self.remove_all()
+        self.remove_tree()
         return target
 
     rename = replace
 
 
-def path_of(name: str) -> Path:
+def to_path(name: str) -> Path:
     """Return a `RemotePath` for a name such as ``s3://bucket/key``, else a plain path.
 
     Raises
@@ -234,30 +238,30 @@ def path_of(name: str) -> Path:
     """
     scheme, mark, _ = name.partition("://")
     if mark and scheme in SCHEMES:
-        return Remote(name)
+        return RemotePath(name)
     refuse_pipe(Path(name))
     return Path(name)
 
 
 @cache
-def _kept() -> tempfile.TemporaryDirectory[str]:
+def _make_cache_folder() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="dmrl-remote-")
 
 
-def _copy(path: Remote) -> str:
+def _download(path: RemotePath) -> str:
     """Download a file, or a folder with all its files, and return the local path."""
     info = path._info()
     version = f"{path} {info.get('ETag')} {info.get('size')}"
-    place = Path(_kept().name) / hashlib.sha256(version.encode()).hexdigest()[:16]
-    place = inside(place, path.name, f"{path}: its name")
+    place = Path(_make_cache_folder().name) / hashlib.sha256(version.encode()).hexdigest()[:16]
+    place = safe_join(place, path.name, f"{path}: its name")
     is_file = info["type"] == "file"
     if is_file and place.exists():
         return str(place)
-    for one in [path] if is_file else path.below():
+    for one in [path] if is_file else path.list_files():
         to = place
         for part in () if is_file else one.parts[len(path.parts) :]:
-            to = inside(to, part, f"{path}: a file")
+            to = safe_join(to, part, f"{path}: a file")
         to.parent.mkdir(parents=True, exist_ok=True)
-        with told(str(one)):
-            system(path.scheme).get_file(one.key, str(to))
+        with translate_errors(str(one)):
+            get_filesystem(path.scheme).get_file(one.key, str(to))
     return str(place)

@@ -5,20 +5,20 @@ from collections.abc import Sequence
 from typing import Any
 
 from dmrl.errors import StorageError
-from dmrl.storage.system import told
+from dmrl.storage.system import translate_errors
 
-TOGETHER_BYTES, TOGETHER = 16 << 20, 64
+PREFETCH_BYTES_MAX, PREFETCH_RANGES_MAX = 16 << 20, 64
 """Bytes and ranges that are prefetched at a time, in parallel."""
-LEAST_BYTES = 512
+BUFFER_BYTES = 512
 """Buffer size of small reads. Larger ranges are fetched unbuffered."""
-STEP_BYTES = 8 << 20
+WHOLE_FILE_STEP_BYTES = 8 << 20
 """Bytes per request when a whole file is read."""
 
-Place = tuple[int, int]
+ByteRange = tuple[int, int]
 """Start and size of a range, bytes."""
 
 
-class Ranged(io.RawIOBase):
+class RangeReader(io.RawIOBase):
     """A file that is read by byte ranges.
 
     Parameters
@@ -37,18 +37,18 @@ class Ranged(io.RawIOBase):
         super().__init__()
         self._system, self._name, self._url, self._size = system, name, url, size
         self._at = 0
-        self._expected: list[Place] = []
-        self._held: dict[Place, bytes] = {}
+        self._expected: list[ByteRange] = []
+        self._prefetched: dict[ByteRange, bytes] = {}
 
-    def expect(self, places: Sequence[Place]) -> None:
+    def expect_reads(self, places: Sequence[ByteRange]) -> None:
         """Register the next reads, in order, so that they are fetched in groups."""
-        self._expected, self._held = list(reversed(places)), {}
+        self._expected, self._prefetched = list(reversed(places)), {}
 
-    def suits(self, start: int, size: int) -> bool:
+    def should_fetch(self, start: int, size: int) -> bool:
         """Return whether a range should be fetched unbuffered: it is large, or registered."""
         place = start, size
         expected = bool(self._expected) and self._expected[-1] == place
-        return size > LEAST_BYTES or place in self._held or expected
+        return size > BUFFER_BYTES or place in self._prefetched or expected
 
     def fetch(self, start: int, size: int) -> bytes:
         """Return the bytes of a range; fewer at the end of the file."""
@@ -56,15 +56,15 @@ class Ranged(io.RawIOBase):
         if not size:
             return b""
         place = start, size
-        if place not in self._held and self._expected and self._expected[-1] == place:
-            self._fetch_some()
-        if place in self._held:
-            return self._held.pop(place)
-        with told(self._url):
+        if place not in self._prefetched and self._expected and self._expected[-1] == place:
+            self._prefetch()
+        if place in self._prefetched:
+            return self._prefetched.pop(place)
+        with translate_errors(self._url):
             data = self._system.cat_file(self._name, start=start, end=start + size)
-        return self._whole(data, size)
+        return self._check_length(data, size)
 
-    def _whole(self, data: bytes, size: int) -> bytes:
+    def _check_length(self, data: bytes, size: int) -> bytes:
         """Return the bytes that a server sent for a range.
 
         Raises
@@ -79,20 +79,24 @@ class Ranged(io.RawIOBase):
             )
         return bytes(data)
 
-    def _fetch_some(self) -> None:
+    def _prefetch(self) -> None:
         """Fetch the next registered ranges in parallel."""
-        some: list[Place] = []
-        while self._expected and len(some) < TOGETHER:
-            if some and sum(size for _, size in some) + self._expected[-1][1] > TOGETHER_BYTES:
+        group: list[ByteRange] = []
+        while self._expected and len(group) < PREFETCH_RANGES_MAX:
+            if (
+                group
+                and sum(size for _, size in group) + self._expected[-1][1] > PREFETCH_BYTES_MAX
+            ):
                 break
-            some.append(self._expected.pop())
-        starts, ends = [s for s, _ in some], [s + n for s, n in some]
-        with told(self._url):
+            group.append(self._expected.pop())
+        starts, ends = [s for s, _ in group], [s + n for s, n in group]
+        with translate_errors(self._url):
             found = self._system.cat_ranges(
-                [self._name] * len(some), starts, ends, on_error="raise"
+                [self._name] * len(group), starts, ends, on_error="raise"
             )
-        self._held = {
-            place: self._whole(data, place[1]) for place, data in zip(some, found, strict=True)
+        self._prefetched = {
+            place: self._check_length(data, place[1])
+            for place, data in zip(group, found, strict=True)
         }
 
     def readable(self) -> bool:

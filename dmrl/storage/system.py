@@ -7,13 +7,13 @@ from typing import Any
 
 from dmrl.errors import MissingExtra, StorageError
 
-PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
-PACKAGES |= {"http": "aiohttp", "https": "aiohttp"}
+SCHEME_PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
+SCHEME_PACKAGES |= {"http": "aiohttp", "https": "aiohttp"}
 """Package that each scheme needs."""
 
 
 @cache
-def system(scheme: str) -> Any:
+def get_filesystem(scheme: str) -> Any:
     """Return the file system of a scheme, without a cache of listings.
 
     Raises
@@ -25,16 +25,16 @@ def system(scheme: str) -> Any:
         import fsspec  # noqa: PLC0415 - an extra
 
         if scheme in ("http", "https"):
-            from dmrl.storage.web import Web  # noqa: PLC0415 - aiohttp, the same extra
+            from dmrl.storage.web import WebFileSystem  # noqa: PLC0415 - aiohttp, the same extra
 
-            return Web(use_listings_cache=False)
+            return WebFileSystem(use_listings_cache=False)
         return fsspec.filesystem(scheme, use_listings_cache=False)
     except ImportError as e:
-        raise MissingExtra(PACKAGES[scheme], "storage", f"{scheme}://") from e
+        raise MissingExtra(SCHEME_PACKAGES[scheme], "storage", f"{scheme}://") from e
 
 
 @contextmanager
-def told(name: str) -> Iterator[None]:
+def translate_errors(name: str) -> Iterator[None]:
     """Turn errors of a server or its library into one line; pass on missing files.
 
     Raises
@@ -57,10 +57,10 @@ def told(name: str) -> Iterator[None]:
             f"{name}: the server refuses these credentials. Check them, and the name"
         ) from None
     except Exception as e:  # botocore, aiohttp and google define their own classes
-        raise StorageError(_words(name, e)) from e
+        raise StorageError(_describe_error(name, e)) from e
 
 
-def _words(name: str, error: Exception) -> str:
+def _describe_error(name: str, error: Exception) -> str:
     kind, text = type(error).__name__, " ".join(str(error).split())[:160]
     if "Credential" in kind or "credential" in text:
         return f"{name}: there are no credentials ({text}). Set AWS_ACCESS_KEY_ID and its secret"

@@ -12,23 +12,23 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.errors import StorageError
-from dmrl.guards.safe_names import inside
-from dmrl.storage.remote import METADATA, UNFINISHED, Remote
-from dmrl.storage.system import system, told
+from dmrl.guards.safe_names import safe_join
+from dmrl.storage.remote import HASH_METADATA_KEY, UNFINISHED_MARK, RemotePath
+from dmrl.storage.system import get_filesystem, translate_errors
 
 
-def require_bucket(path: Remote) -> None:
+def require_bucket(path: RemotePath) -> None:
     """Raise StorageError unless the bucket of a path exists and can be written."""
     if path.scheme.startswith("http"):
         raise StorageError(f"{path}: web servers are read only. Name a bucket, or a folder here")
-    with told(str(path)):
-        there = system(path.scheme).exists(path.bucket.key)
-    if not there:
+    with translate_errors(str(path)):
+        exists = get_filesystem(path.scheme).exists(path.bucket.key)
+    if not exists:
         raise StorageError(f"{path}: there is no such bucket. Check the name")
 
 
 @contextmanager
-def uploaded_file(path: Remote) -> Iterator[Path]:
+def upload_file(path: RemotePath) -> Iterator[Path]:
     """Yield a local path to write to, and upload the file if the block ends without an error.
 
     Raises
@@ -37,13 +37,13 @@ def uploaded_file(path: Remote) -> Iterator[Path]:
         If the server cannot be reached, or refuses.
     """
     with tempfile.TemporaryDirectory(prefix="dmrl-") as folder:
-        here = inside(Path(folder), path.name, f"{path}: its name")
-        yield here
-        _put(here, path)
+        local = safe_join(Path(folder), path.name, f"{path}: its name")
+        yield local
+        _upload(local, path)
 
 
 @contextmanager
-def uploaded_folder(path: Remote) -> Iterator[Path]:
+def upload_folder(path: RemotePath) -> Iterator[Path]:
     """Yield a local folder to write in; upload it if the block ends without an error.
 
     Files that a killed process had uploaded are removed first.
@@ -54,25 +54,25 @@ def uploaded_folder(path: Remote) -> Iterator[Path]:
         If the server cannot be reached, or refuses. Uploaded files are then removed.
     """
     with tempfile.TemporaryDirectory(prefix="dmrl-") as folder:
-        here = inside(Path(folder), path.name, f"{path}: its name")
-        here.mkdir()
-        yield here
-        mark = path / UNFINISHED
-        with told(str(path)):
-            path.remove_all()
-            system(path.scheme).pipe_file(mark.key, b"")
+        local = safe_join(Path(folder), path.name, f"{path}: its name")
+        local.mkdir()
+        yield local
+        mark = path / UNFINISHED_MARK
+        with translate_errors(str(path)):
+            path.remove_tree()
+            get_filesystem(path.scheme).pipe_file(mark.key, b"")
         try:
-            for file in sorted(one for one in here.rglob("*") if one.is_file()):
-                _put(file, path / file.relative_to(here).as_posix())
+            for file in sorted(one for one in local.rglob("*") if one.is_file()):
+                _upload(file, path / file.relative_to(local).as_posix())
         except BaseException:
             with suppress(StorageError, OSError):
-                path.remove_all()
+                path.remove_tree()
             raise
         mark.unlink()
 
 
 @contextmanager
-def added_files(path: Remote, last: str) -> Iterator[Path]:
+def upload_into_folder(path: RemotePath, last: str) -> Iterator[Path]:
     """Yield a local folder, and upload its files into an existing one, ``last`` as the last.
 
     Raises
@@ -81,17 +81,17 @@ def added_files(path: Remote, last: str) -> Iterator[Path]:
         If the server cannot be reached, or refuses.
     """
     with tempfile.TemporaryDirectory(prefix="dmrl-") as folder:
-        here = inside(Path(folder), path.name, f"{path}: its name")
-        here.mkdir()
-        yield here
-        files = [one.relative_to(here) for one in here.rglob("*") if one.is_file()]
+        local = safe_join(Path(folder), path.name, f"{path}: its name")
+        local.mkdir()
+        yield local
+        files = [one.relative_to(local) for one in local.rglob("*") if one.is_file()]
         for file in sorted(files, key=lambda one: (one == Path(last), one)):
-            _put(here / file, path / file.as_posix())
+            _upload(local / file, path / file.as_posix())
 
 
-def _put(here: Path, path: Remote) -> None:
-    with here.open("rb") as stream:
+def _upload(local: Path, path: RemotePath) -> None:
+    with local.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    more: dict[str, Any] = {"Metadata": {METADATA: digest}} if path.scheme == "s3" else {}
-    with told(str(path)):
-        system(path.scheme).put_file(str(here), path.key, **more)
+    more: dict[str, Any] = {"Metadata": {HASH_METADATA_KEY: digest}} if path.scheme == "s3" else {}
+    with translate_errors(str(path)):
+        get_filesystem(path.scheme).put_file(str(local), path.key, **more)

@@ -15,7 +15,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from dmrl.errors import one_line
+from dmrl.errors import to_one_line
 
 Item = TypeVar("Item")
 Lines = Sequence[Sequence[object]]
@@ -38,7 +38,7 @@ class _Progress(Progress):
 
 
 def _cell_text(value: object) -> str:
-    return escape(one_line(f"{value:.1f}" if isinstance(value, float) else str(value)))
+    return escape(to_one_line(f"{value:.1f}" if isinstance(value, float) else str(value)))
 
 
 def track(
@@ -95,4 +95,4 @@ def track(
 
 def say(line: str) -> None:
     """Print one line of news on standard error, terminal or not."""
-    Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(one_line(line))
+    Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(to_one_line(line))

@@ -9,7 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from dmrl.errors import one_line
+from dmrl.errors import to_one_line
 
 NOT_A_TERMINAL_COLUMNS = 200  # a pipe has no width; wrapped rows cannot be searched
 
@@ -34,7 +34,10 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
     if wrong := [row for row in rows if len(row) != len(columns)]:
         raise ValueError(f"a row of {len(wrong[0])} cells in a table of {len(columns)} columns")
     table = Table(
-        title=one_line(title) or None, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD
+        title=to_one_line(title) or None,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
     )
     for index, column in enumerate(columns):
         cells = [row[index] for row in rows if row[index] is not None]
@@ -50,12 +53,12 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
 def _cell_text(cell: object) -> str:
     if cell is None:
         return ""
-    return f"{cell:.4g}" if isinstance(cell, float) else one_line(str(cell))
+    return f"{cell:.4g}" if isinstance(cell, float) else to_one_line(str(cell))
 
 
 def print_line(line: str) -> None:
     """Print one line of results, with control characters escaped."""
-    sys.stdout.write(one_line(line) + "\n")
+    sys.stdout.write(to_one_line(line) + "\n")
 
 
 def print_json(document: Any) -> None:

@@ -12,15 +12,15 @@ import pyarrow.parquet as pq
 import pytest
 
 from dmrl import boundary, topics
-from dmrl.catalogue import NAME, open_catalogue
-from dmrl.catalogue.query import find
-from dmrl.catalogue.table import COLUMNS, Catalogue, rows_table
+from dmrl.catalogue import FILE_NAME, open_catalogue
+from dmrl.catalogue.query import find_rows
+from dmrl.catalogue.table import COLUMNS, Catalogue, to_table
 from dmrl.cli import app
 from dmrl.errors import RecordingError, SettingError
 from dmrl.guards import limits
-from dmrl.html_report import gather, page
+from dmrl.html_report import build_report, collect_outputs
 from dmrl.images.codec import encode_png
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.recording.provenance import Input
 from dmrl.stages import index
@@ -34,16 +34,18 @@ def record(path: Path, camera: str, images: int, statuses: tuple[int, ...]) -> P
     made = Provenance("label", {"k": 1}, inputs=(Input("raw.mcap", "0" * 64),))
     with RecordingWriter(path, made) as sink:
         matrix = [90, 0, 32, 0, 90, 24, 0, 0, 1]
-        calibration = message("CameraCalibration")(width=64, height=48, K=matrix)
-        sink.write(0, topics.calibration(camera), calibration)
+        calibration = message_class("CameraCalibration")(width=64, height=48, K=matrix)
+        sink.write(0, topics.CALIBRATION(camera), calibration)
         for k in range(images):
             data = encode_png(np.full((48, 64, 3), 10 * k, np.uint8))
             sink.write(
-                k * STEP_NS, topics.camera_image(camera), message("CompressedImage")(data=data)
+                k * STEP_NS,
+                topics.CAMERA_IMAGE(camera),
+                message_class("CompressedImage")(data=data),
             )
             truth = {"peer": "cf9", "u_px": 20, "v_px": 20, "depth_m": 1.0, "source": "truth"}
             peers = [truth, *({**truth, "source": "estimate", "status": s} for s in statuses)]
-            sink.write(k * STEP_NS, topics.labels(camera), message("PeerLabels")(peers=peers))
+            sink.write(k * STEP_NS, topics.LABELS(camera), message_class("PeerLabels")(peers=peers))
     return path
 
 
@@ -58,7 +60,7 @@ def flights(tmp_path: Path) -> Path:
 
 
 def names(folder: Path, query: str) -> list[str]:
-    found = find(open_catalogue(folder), query)["recording"].to_pylist()
+    found = find_rows(open_catalogue(folder), query)["recording"].to_pylist()
     return [str(name) for name in found]
 
 
@@ -66,7 +68,7 @@ def names(folder: Path, query: str) -> list[str]:
 def test_a_row_says_what_its_recording_holds(flights: Path) -> None:
     made = index.update(flights, workers=1)
     assert made == index.Result(recordings=4, looked_at=4, known=0, gone=0, unread=1)
-    table = pq.read_table(flights / NAME)
+    table = pq.read_table(flights / FILE_NAME)
     rows = {row["recording"]: row for row in table.to_pylist()}
     assert list(rows) == ["a.mcap", "monday/a.mcap", "monday/b.mcap", "torn.mcap"]
     row = rows["a.mcap"]
@@ -126,7 +128,7 @@ def test_a_query_that_cannot_be_answered_is_one_line_and_reads_nothing_else(
 ) -> None:
     (tmp_path / "a.csv").write_text("a\nprecious\n")
     with pytest.raises(SettingError, match="Columns: recording, bytes") as caught:
-        find(Catalogue(tmp_path, rows_table([])), query.replace("FOLDER", str(tmp_path)))
+        find_rows(Catalogue(tmp_path, to_table([])), query.replace("FOLDER", str(tmp_path)))
     assert "\n" not in str(caught.value) and "precious" not in str(caught.value)
     assert "install" not in str(caught.value)
     assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
@@ -135,13 +137,13 @@ def test_a_query_that_cannot_be_answered_is_one_line_and_reads_nothing_else(
 @pytest.mark.heavy
 def test_only_what_changed_is_looked_at_again(flights: Path) -> None:
     index.update(flights, workers=1)
-    before = (flights / NAME).stat().st_mtime_ns
+    before = (flights / FILE_NAME).stat().st_mtime_ns
     (flights / "torn.mcap").unlink()
     index.update(flights, workers=1)
     assert index.update(flights, workers=1) == index.Result(3, 0, 3, 0, 0)
-    unchanged = (flights / NAME).stat().st_mtime_ns
+    unchanged = (flights / FILE_NAME).stat().st_mtime_ns
     index.update(flights, workers=1)
-    assert (flights / NAME).stat().st_mtime_ns == unchanged > before
+    assert (flights / FILE_NAME).stat().st_mtime_ns == unchanged > before
     (flights / "a.mcap").unlink()
     record(flights / "a.mcap", "cf7", 3, ())
     (flights / "monday" / "b.mcap").rename(flights / "monday" / "c.mcap")
@@ -186,18 +188,18 @@ def test_a_name_that_no_table_can_hold_is_said_before_the_work(
 def test_a_file_that_is_no_catalogue_is_left_alone(flights: Path) -> None:
     with pytest.raises(RecordingError, match=r"has no catalogue\. Make it: dmrl index"):
         open_catalogue(flights)
-    (flights / NAME).write_text("my notes")
+    (flights / FILE_NAME).write_text("my notes")
     with pytest.raises(RecordingError, match="is damaged"):
         index.update(flights, workers=1)
-    pq.write_table(pq.read_table(_indexed(flights)).select(["recording"]), flights / NAME)
+    pq.write_table(pq.read_table(_indexed(flights)).select(["recording"]), flights / FILE_NAME)
     with pytest.raises(RecordingError, match="is no catalogue"):
         index.update(flights, workers=1)
 
 
 def _indexed(flights: Path) -> Path:
-    (flights / NAME).unlink()
+    (flights / FILE_NAME).unlink()
     index.update(flights, workers=1)
-    return flights / NAME
+    return flights / FILE_NAME
 
 
 @pytest.mark.heavy
@@ -245,20 +247,20 @@ def test_the_page_tells_of_a_catalogue_and_opens_no_thousand_recordings(
     flights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     index.update(flights, workers=1)
-    shown = page(gather(flights))
+    shown = build_report(collect_outputs(flights))
     assert "<h2>Catalogue</h2>" in shown and "4 recordings, 0.0 h" in shown
     assert "estimate" in shown and "cut short" in shown and "<h2>Recordings</h2>" in shown
     module = import_module("dmrl.html_report.collect")
     monkeypatch.setattr(module, "MANY", 3)
-    monkeypatch.setattr(module, "summary", None)
-    assert "<h2>Recordings</h2>" not in page(gather(flights))
+    monkeypatch.setattr(module, "read_summary", None)
+    assert "<h2>Recordings</h2>" not in build_report(collect_outputs(flights))
 
 
 def _edited(folder: Path, **values: Any) -> None:
     """Put values into the first row, as a stranger would."""
-    rows = pq.read_table(folder / NAME).to_pylist()
+    rows = pq.read_table(folder / FILE_NAME).to_pylist()
     rows[0].update(values)
-    pq.write_table(pa.Table.from_pylist(rows, schema=COLUMNS), folder / NAME)
+    pq.write_table(pa.Table.from_pylist(rows, schema=COLUMNS), folder / FILE_NAME)
 
 
 @pytest.mark.parametrize(
@@ -279,7 +281,7 @@ def _edited(folder: Path, **values: Any) -> None:
 def test_a_stranger_s_catalogue_is_one_line(
     tmp_path: Path, values: dict[str, Any], complaint: str
 ) -> None:
-    table = rows_table([{"recording": "a.mcap", "bytes": 1, "stamp": "1 2 3"}])
+    table = to_table([{"recording": "a.mcap", "bytes": 1, "stamp": "1 2 3"}])
     Catalogue(tmp_path, table).save()
     assert open_catalogue(tmp_path).table.num_rows == 1
     _edited(tmp_path, **values)
@@ -295,17 +297,17 @@ def test_a_query_takes_no_disk_and_little_memory(
     monkeypatch.setattr(limits, "MEMORY_BYTES", 20_000_000)
     many = "(select count(distinct range) from range(5_000_000)) > 1"
     with pytest.raises(SettingError, match="Out of Memory"):
-        find(Catalogue(tmp_path, rows_table([])), many)
+        find_rows(Catalogue(tmp_path, to_table([])), many)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.heavy
 def test_a_focal_length_that_is_no_number_is_not_known(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
-        said = message("CameraCalibration")(width=64, height=48, K=[float("nan")] * 9)
-        sink.write(0, topics.calibration("cf1"), said)
+        said = message_class("CameraCalibration")(width=64, height=48, K=[float("nan")] * 9)
+        sink.write(0, topics.CALIBRATION("cf1"), said)
         picture = encode_png(np.zeros((48, 64, 3), np.uint8))
-        sink.write(0, topics.camera_image("cf1"), message("CompressedImage")(data=picture))
+        sink.write(0, topics.CAMERA_IMAGE("cf1"), message_class("CompressedImage")(data=picture))
     index.update(tmp_path, 1)
     (row,) = open_catalogue(tmp_path).table.to_pylist()
     assert row["cameras"][0]["images"] == 1

@@ -9,9 +9,9 @@ import pytest
 
 from dmrl import card, topics
 from dmrl.images.codec import encode_png
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
-from dmrl.topics import camera_image, labels
+from dmrl.topics import CAMERA_IMAGE, LABELS
 
 HEIGHT_PX, WIDTH_PX = 48, 64
 STEP_NS = 100_000_000
@@ -29,7 +29,7 @@ def pixels_of(seed: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX) -
 def peer(**fields: Any) -> Any:
     """One peer of PeerLabels, inside the image unless told otherwise."""
     values = {"peer": "cf2", "u_px": 20.5, "v_px": 12.5, "depth_m": 1.5, "source": "truth"}
-    return message("PeerLabel")(**{**values, **fields})
+    return message_class("PeerLabel")(**{**values, **fields})
 
 
 @pytest.fixture(autouse=True)
@@ -60,13 +60,15 @@ def recorder(folder: Path) -> Record:
                 size_px = (sizes_px or {}).get(k, (HEIGHT_PX, WIDTH_PX))
                 at = begin_ns + k * STEP_NS
                 data = encode_png(pixels_of(1000 * seed + k, *size_px))
-                picture = message("CompressedImage")(data=data, format="png")
-                sink.write(at, camera_image("cf1"), picture)
+                picture = message_class("CompressedImage")(data=data, format="png")
+                sink.write(at, CAMERA_IMAGE("cf1"), picture)
                 if k in (masks or {}):
-                    covered = message("CompressedImage")(data=encode_png(masks[k]), format="png")
-                    sink.write(at, topics.masks("cf1"), covered)
+                    covered = message_class("CompressedImage")(
+                        data=encode_png(masks[k]), format="png"
+                    )
+                    sink.write(at, topics.MASKS("cf1"), covered)
                 if listed is not None:
-                    sink.write(at, labels("cf1"), message("PeerLabels")(peers=listed))
+                    sink.write(at, LABELS("cf1"), message_class("PeerLabels")(peers=listed))
         return path
 
     return write

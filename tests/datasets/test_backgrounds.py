@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.datasets.backgrounds import painted_over, photos_of
+from dmrl.datasets.backgrounds import inpaint_hidden, open_backgrounds
 from dmrl.errors import SettingError
 from dmrl.images.codec import encode_png
 from dmrl.stages import dataset
@@ -19,8 +19,8 @@ def test_robots_of_a_dataset_are_painted_over(record: Record, tmp_path: Path) ->
     filling = peer(box_px=[0.0, 0.0, 64.0, 48.0])
     recording = record(peers=[[peer(**BOX)], [], [filling], [peer()]])
     dataset.run([recording], tmp_path / "set", dataset.Settings())
-    photos = photos_of(tmp_path / "set")
-    changed = (photos.photo(0) != pixels_of(0)).any(axis=-1)
+    photos = open_backgrounds(tmp_path / "set")
+    changed = (photos.load_photo(0) != pixels_of(0)).any(axis=-1)
     assert changed[9:16, 16:25].mean() > 0.95
     v, u = np.nonzero(changed)
     assert u.min() > 8
@@ -28,14 +28,14 @@ def test_robots_of_a_dataset_are_painted_over(record: Record, tmp_path: Path) ->
     assert v.min() > 2
     assert v.max() < 24
     # Nobody in the second image; the third is all robot, and the robot of the fourth has no box.
-    assert (photos.photo(1) == pixels_of(1)).all()
-    assert (photos.photo(2) == photos.photo(0)).all()
+    assert (photos.load_photo(1) == pixels_of(1)).all()
+    assert (photos.load_photo(2) == photos.load_photo(0)).all()
 
 
 def test_a_dataset_whose_robots_have_no_box_is_refused(record: Record, tmp_path: Path) -> None:
     dataset.run([record()], tmp_path / "set", dataset.Settings())
     with pytest.raises(SettingError, match=r"no image for a background.*--backgrounds"):
-        photos_of(tmp_path / "set")
+        open_backgrounds(tmp_path / "set")
 
 
 def test_what_is_hidden_is_painted_with_what_is_around_it() -> None:
@@ -43,21 +43,21 @@ def test_what_is_hidden_is_painted_with_what_is_around_it() -> None:
     hidden = np.zeros((64, 96), bool)
     hidden[20:40, 30:60] = True
     rgb[hidden] = 255
-    off = np.abs(painted_over(rgb, hidden).astype(int) - (20, 120, 220))
+    off = np.abs(inpaint_hidden(rgb, hidden).astype(int) - (20, 120, 220))
     assert off.max() <= 4  # it rounds as it goes inwards
 
 
 def test_a_folder_of_photos_is_what_it_was(tmp_path: Path) -> None:
     photo = np.random.default_rng(0).integers(0, 255, (30, 40, 3), np.uint8)
     (tmp_path / "a.png").write_bytes(encode_png(photo))
-    assert (photos_of(tmp_path).photo(0) == photo).all()
+    assert (open_backgrounds(tmp_path).load_photo(0) == photo).all()
 
 
 def test_rooms_are_made_by_code_and_are_the_same_by_number() -> None:
-    photos = photos_of(Path("rooms"))
-    rooms = [photos.photo(k) for k in range(6)]
+    photos = open_backgrounds(Path("rooms"))
+    rooms = [photos.load_photo(k) for k in range(6)]
     assert {room.shape for room in rooms} == {(336, 480, 3)}
-    assert (photos_of(Path("rooms")).photo(3) == rooms[3]).all()
+    assert (open_backgrounds(Path("rooms")).load_photo(3) == rooms[3]).all()
     assert len({room.tobytes() for room in rooms}) == 6
     # Bright walls with dark things on them: both ends of the scale are there.
     levels = np.stack(rooms).mean(axis=-1)

@@ -15,7 +15,7 @@ from PIL import Image
 import dmrl
 from dmrl import card, plots
 from dmrl.card import write_card
-from dmrl.card.facts import Facts, equipment, told
+from dmrl.card.facts import Facts, provenance_lines, sensor_lines
 from dmrl.errors import DatasetError, SettingError
 from dmrl.images.codec import encode_png
 from dmrl.stages import convert
@@ -260,12 +260,12 @@ def test_many_recordings_are_a_few_lines_of_a_card() -> None:
     names = [f"{k:03d}.mcap" for k in range(100)]
     cameras = {f"{name}: cf1": "320 x 224 px" for name in names} | {"other.mcap: cf1": "64 x 48 px"}
     facts = Facts(used=dict.fromkeys(names, "truth"), findings={n: ["a bias"] for n in names})
-    lines = list(equipment(replace(facts, cameras=cameras)))
+    lines = list(sensor_lines(replace(facts, cameras=cameras)))
     assert lines[1:] == [
         "- Camera of `000.mcap: cf1`, `001.mcap: cf1`, `002.mcap: cf1` and 97 more: 320 x 224 px.",
         "- Camera of `other.mcap: cf1`: 64 x 48 px.",
     ]
-    found = [line for line in told(facts) if "a bias" in line or "more lines" in line]
+    found = [line for line in provenance_lines(facts) if "a bias" in line or "more lines" in line]
     assert len(found) == 21 and found[19] == "- `019.mcap`: a bias."
     assert found[20] == "- 80 more lines of this kind are in `facts.json`."
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageFilter
 
-from dmrl.card.leakage import near_in_time, same_poses
+from dmrl.card.leakage import count_near_in_time, count_same_poses
 from dmrl.datasets import open_dataset
-from dmrl.datasets.writing.near_duplicates import NEAR_BITS, perceptual_hash
+from dmrl.datasets.writing.near_duplicates import NEAR_DUPLICATE_BITS, compute_perceptual_hash
 from dmrl.stages.dataset import Settings, run
 
 from .conftest import Record, peer
@@ -20,7 +20,9 @@ def scene(seed: int) -> Image.Image:
 
 
 def apart(a: Image.Image, b: Image.Image) -> int:
-    return (perceptual_hash(np.asarray(a)) ^ perceptual_hash(np.asarray(b))).bit_count()
+    return (
+        compute_perceptual_hash(np.asarray(a)) ^ compute_perceptual_hash(np.asarray(b))
+    ).bit_count()
 
 
 def test_the_same_picture_brighter_noisier_or_smaller_looks_the_same() -> None:
@@ -28,9 +30,9 @@ def test_the_same_picture_brighter_noisier_or_smaller_looks_the_same() -> None:
         picture = scene(seed)
         noise = np.random.default_rng(seed).normal(0, 4, (224, 320, 3))
         noisy = Image.fromarray(np.clip(np.asarray(picture) * 0.8 + noise, 0, 255).astype(np.uint8))
-        assert apart(picture, noisy) <= NEAR_BITS
-        assert apart(picture, picture.filter(ImageFilter.GaussianBlur(2))) <= NEAR_BITS
-        assert apart(picture, picture.resize((160, 112))) <= NEAR_BITS
+        assert apart(picture, noisy) <= NEAR_DUPLICATE_BITS
+        assert apart(picture, picture.filter(ImageFilter.GaussianBlur(2))) <= NEAR_DUPLICATE_BITS
+        assert apart(picture, picture.resize((160, 112))) <= NEAR_DUPLICATE_BITS
 
 
 def test_a_small_drone_before_the_same_background_looks_the_same_and_another_place_does_not() -> (
@@ -39,8 +41,8 @@ def test_a_small_drone_before_the_same_background_looks_the_same_and_another_pla
     for seed in range(20):
         picture, moved = scene(seed), np.asarray(scene(seed)).copy()
         moved[100:112, 200:216] = 10
-        assert apart(picture, Image.fromarray(moved)) <= NEAR_BITS
-        assert apart(picture, scene(seed + 100)) > 2 * NEAR_BITS
+        assert apart(picture, Image.fromarray(moved)) <= NEAR_DUPLICATE_BITS
+        assert apart(picture, scene(seed + 100)) > 2 * NEAR_DUPLICATE_BITS
 
 
 def test_test_images_that_look_like_one_in_train_are_counted(
@@ -60,8 +62,8 @@ def test_moments_and_poses_that_train_has_too_are_counted(record: Record, tmp_pa
     run([path], tmp_path / "out", Settings())
     opened = open_dataset(tmp_path / "out")
     train, test = opened.split("train"), opened.split("test")
-    assert near_in_time(test, train) == 3
-    assert same_poses(test, train) == (1, 3)
+    assert count_near_in_time(test, train) == 3
+    assert count_same_poses(test, train) == (1, 3)
     text = (tmp_path / "out" / "README.md").read_text()
     assert "test and train share `flight.mcap`" in text
     assert "3 of 3 images of test were taken within 1 s" in text

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 
 from dmrl.datasets import open_dataset
-from dmrl.datasets.layout import schema
+from dmrl.datasets.layout import build_schema
 from dmrl.errors import DatasetError
 from dmrl.stages.dataset import Settings, run
 
@@ -38,7 +38,7 @@ def mapped_file(address: int) -> str:
 def test_datasets_opens_it_with_the_features_of_the_contract(built: Path) -> None:
     opened = datasets.load_from_disk(str(built))
     assert {name: len(split) for name, split in opened.items()} == {"train": 6, "test": 6}
-    arrow = schema(HEIGHT_PX, WIDTH_PX)
+    arrow = build_schema(HEIGHT_PX, WIDTH_PX)
     features = opened["train"].features
     assert features == datasets.Features.from_arrow_schema(arrow)
     assert features.arrow_schema.types == arrow.types
@@ -124,7 +124,7 @@ def test_datasets_reads_features_from_parquet(record: Record, tmp_path: Path) ->
     run(flights, tmp_path / "out", Settings(parquet=True))
     opened = datasets.load_dataset(str(tmp_path / "out"), cache_dir=str(tmp_path / "cache"))
     assert set(opened) == {"train", "test"}
-    wanted = datasets.Features.from_arrow_schema(schema(HEIGHT_PX, WIDTH_PX, png=True))
+    wanted = datasets.Features.from_arrow_schema(build_schema(HEIGHT_PX, WIDTH_PX, png=True))
     assert opened["train"].features == wanted
     assert isinstance(opened["train"].features["image"], datasets.Image)
     shown = opened["train"][3]
@@ -164,7 +164,7 @@ def test_a_cut_shard_is_named(built: Path, share: float) -> None:
 def test_a_shard_cut_between_two_batches_is_named(built: Path) -> None:
     shard = built / "train" / "data-00000-of-00002.arrow"
     with pa.OSFile(str(shard), "wb") as sink:
-        pa.ipc.new_stream(sink, schema(HEIGHT_PX, WIDTH_PX)).close()
+        pa.ipc.new_stream(sink, build_schema(HEIGHT_PX, WIDTH_PX)).close()
     with pytest.raises(DatasetError, match=f"{shard.name} is cut short: 0 of 4 rows"):
         open_dataset(built).split("train")
 

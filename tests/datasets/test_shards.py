@@ -12,7 +12,7 @@ import pytest
 
 from dmrl import card
 from dmrl.datasets import open_dataset
-from dmrl.datasets.layout import MANIFEST, schema
+from dmrl.datasets.layout import MANIFEST_FILE, build_schema
 from dmrl.datasets.shards import open_shard
 from dmrl.errors import DatasetError
 from dmrl.stages.dataset import Settings, run
@@ -150,10 +150,10 @@ def test_columns_that_dmrl_does_not_know_are_left_alone(shard: Path) -> None:
 
 
 def test_a_split_without_images_and_a_shard_named_twice_are_refused(shard: Path) -> None:
-    rewritten(shard, schema(HEIGHT_PX, WIDTH_PX).empty_table())
+    rewritten(shard, build_schema(HEIGHT_PX, WIDTH_PX).empty_table())
     state, folder = shard.parent / "state.json", shard.parents[1]
     (shard.parent / "dataset_info.json").write_text("{}")
-    (folder / MANIFEST).unlink()  # as another program leaves it
+    (folder / MANIFEST_FILE).unlink()  # as another program leaves it
     with pytest.raises(DatasetError, match="has no images"):
         open_dataset(folder).split("train")
     name = f'{{"filename": "{shard.name}"}}'
@@ -171,7 +171,7 @@ def test_pictures_of_another_size_than_their_labels_are_refused(
     run([record()], tmp_path / "set", Settings(split="none", png=True))
     path = tmp_path / "set" / SHARD
     table = table_of(path)
-    wide = schema(HEIGHT_PX, 2 * WIDTH_PX, png=True)
+    wide = build_schema(HEIGHT_PX, 2 * WIDTH_PX, png=True)
     grid = [[[0.0] * (2 * WIDTH_PX // 8)] * (HEIGHT_PX // 8)] * 6
     for name in ("confidence", "depth"):
         column = pa.array(grid, wide.field(name).type)

@@ -17,7 +17,7 @@ import dmrl
 from dmrl.datasets import open_dataset
 from dmrl.errors import SettingError
 from dmrl.learn.data import batches
-from dmrl.learn.data.torch_dataset import Part
+from dmrl.learn.data.torch_dataset import ProcessSampler
 from dmrl.stages.dataset import Settings, add, run
 
 from .conftest import Record
@@ -70,26 +70,31 @@ def test_datasets_streams_it_from_a_file_server(
 
 
 def test_parts_of_an_epoch_are_disjoint_and_equally_long() -> None:
-    for count in (1, 7, 100, 3 * batches.WINDOW + 17):
-        parts = [Part(count, (k, 3), shuffle=True, seed=5) for k in range(3)]
+    for count in (1, 7, 100, 3 * batches.SHUFFLE_WINDOW_IMAGES + 17):
+        parts = [ProcessSampler(count, (k, 3), shuffle=True, seed=5) for k in range(3)]
         first, second = ([list(part) for part in parts] for _ in range(2))
         assert [len(one) for one in first] == [count // 3] * 3 == [len(p) for p in parts]
         assert len({row for one in first for row in one}) == count // 3 * 3
         assert first != second or count < 7
-        whole = [row for k in range(3) for row in Part(count, (k, 3), shuffle=False, seed=0)]
+        whole = [
+            row for k in range(3) for row in ProcessSampler(count, (k, 3), shuffle=False, seed=0)
+        ]
         assert whole == list(range(count))
     with pytest.raises(SettingError, match="no process 3 of 3"):
-        Part(9, (3, 3), shuffle=True, seed=0)
+        ProcessSampler(9, (3, 3), shuffle=True, seed=0)
 
 
 def test_a_large_split_is_shuffled_in_windows_of_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batches, "WINDOW", 640)
-    rows = batches.order(10_007, seed=1, epoch=2)
+    monkeypatch.setattr(batches, "SHUFFLE_WINDOW_IMAGES", 640)
+    rows = batches.epoch_indices(10_007, seed=1, epoch=2)
     assert sorted(rows.tolist()) == list(range(10_007))
     for start in range(0, 10_007, 640):
-        assert len({row // batches.BLOCK for row in rows[start : start + 640].tolist()}) <= 12
-    assert not np.array_equal(rows, batches.order(10_007, seed=1, epoch=3))
-    assert np.array_equal(rows, batches.order(10_007, seed=1, epoch=2))
+        assert (
+            len({row // batches.SHUFFLE_BLOCK_IMAGES for row in rows[start : start + 640].tolist()})
+            <= 12
+        )
+    assert not np.array_equal(rows, batches.epoch_indices(10_007, seed=1, epoch=3))
+    assert np.array_equal(rows, batches.epoch_indices(10_007, seed=1, epoch=2))
     # Blocks come from everywhere, and images of a window in no order.
     assert np.ptp(rows[:640]) > 5_000 and (np.diff(rows[:640]) < 0).sum() > 200
 
@@ -106,7 +111,7 @@ def test_a_batch_decodes_its_own_pictures_alone(
     )
     batch = next(iter(rows.loader(3, shuffle=True, seed=2)))
     assert len(decoded) == 3
-    first = batches.order(18, seed=2, epoch=0)[:3]
+    first = batches.epoch_indices(18, seed=2, epoch=0)[:3]
     shown = np.concatenate(whole)[first].transpose(0, 3, 1, 2)
     assert np.array_equal(batch["image"].numpy(), shown)
     assert np.array_equal(batch["depth"].numpy(), rows.depth[first])

@@ -7,23 +7,23 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.activation_ranges import calibrate
-from dmrl.deploy.int8.equalisation import equalise
+from dmrl.deploy.int8.activation_ranges import calibrate_ranges
+from dmrl.deploy.int8.equalisation import equalise_channels
 from dmrl.deploy.int8.graph import (
     FloatAdd,
     FloatConv,
+    FloatGraph,
     FloatLayer,
     FloatPool,
-    Graph,
-    graph_of,
-    tensors_of,
-    to_input,
+    build_graph,
+    compute_tensors,
+    normalize_images,
 )
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.deploy.int8.quantise import About, quantise
-from dmrl.deploy.int8.rounding import moments_of
-from dmrl.learn.networks.architectures import build
-from dmrl.learn.networks.trace import operations
+from dmrl.deploy.int8.quantise import NetworkInfo, quantise_network
+from dmrl.deploy.int8.rounding import measure_moments
+from dmrl.learn.networks.architectures import build_network
+from dmrl.learn.networks.trace import trace_operations
 
 SUB_CELL = ("log_depth", "confidence", "offset_u", "offset_v")
 
@@ -33,16 +33,16 @@ class _Growing:
         self.rng = rng
         self.layers: list[FloatLayer] = []
         self.channels = images.shape[3]
-        self.input = to_input(images)
+        self.input = normalize_images(images)
 
     @property
-    def graph(self) -> Graph:
-        return Graph(tuple(self.layers), (), self.channels)
+    def graph(self) -> FloatGraph:
+        return FloatGraph(tuple(self.layers), (), self.channels)
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Channels, rows and columns of the last tensor."""
-        return tensors_of(self.graph, self.input)[-1].shape[1:]
+        return compute_tensors(self.graph, self.input)[-1].shape[1:]
 
     def conv(self, outs: int, kernel: int, *, depthwise: bool = False, stride: int = 1,
              dilation: int = 1, relu: bool = True) -> None:  # fmt: skip
@@ -90,7 +90,7 @@ class _Growing:
                 self.conv(int(rng.integers(2, 13)), 3, stride=stride)
 
 
-def random_graph(seed: int) -> tuple[Graph, tuple[str, ...], NDArray[np.uint8]]:
+def random_graph(seed: int) -> tuple[FloatGraph, tuple[str, ...], NDArray[np.uint8]]:
     """A float network, its channels, and (4, height, width, channels) images for it."""
     rng = np.random.default_rng(seed)
     height, width = (int(side) for side in rng.integers(12, 41, 2))
@@ -102,7 +102,7 @@ def random_graph(seed: int) -> tuple[Graph, tuple[str, ...], NDArray[np.uint8]]:
     net.conv(len(channels), 1, relu=False)
     tensor = len(net.layers)
     outputs = tuple((tensor, place) for place in range(len(channels)))
-    return Graph(tuple(net.layers), outputs, images.shape[3]), channels, images
+    return FloatGraph(tuple(net.layers), outputs, images.shape[3]), channels, images
 
 
 @cache
@@ -110,16 +110,16 @@ def quantised_network(seed: int) -> IntegerNetwork:
     """The int8 form of ``random_graph(seed)``, of at most 40 x 40 px."""
     graph, channels, images = random_graph(seed)
     rgb = np.repeat(images, 3, axis=3) if graph.channels == 1 else images
-    graph, ranges = equalise(graph, calibrate(graph, [rgb]))
-    about = About("random", "random", 8, channels, 0.3)
-    return quantise(graph, ranges, about, moments_of(graph, rgb))
+    graph, ranges = equalise_channels(graph, calibrate_ranges(graph, [rgb]))
+    about = NetworkInfo("random", "random", 8, channels, 0.3)
+    return quantise_network(graph, ranges, about, measure_moments(graph, rgb))
 
 
 def untrained(name: str, width_px: int = 320, height_px: int = 224) -> IntegerNetwork:
     """An architecture in int8."""
     with torch.random.fork_rng(devices=[]):
-        network = build(name).eval()
-    graph = graph_of(operations(network))
+        network = build_network(name).eval()
+    graph = build_graph(trace_operations(network))
     images = np.random.default_rng(0).integers(0, 256, (1, height_px, width_px, 3), np.uint8)
-    about = About(name, name, network.stride_px, network.channels, 0.3)
-    return quantise(graph, calibrate(graph, [images]), about)
+    about = NetworkInfo(name, name, network.stride_px, network.channels, 0.3)
+    return quantise_network(graph, calibrate_ranges(graph, [images]), about)

@@ -16,7 +16,7 @@ from dmrl.deploy.int8.network import (
     MaxPool,
     Shape,
 )
-from dmrl.deploy.int8.reference import accumulate, compute
+from dmrl.deploy.int8.reference import accumulate, compute_layer
 
 Rng = np.random.Generator
 
@@ -36,7 +36,7 @@ class _Growing:
 
     def grow(self, layer: AnyLayer) -> None:
         self.layers.append(layer)
-        self.tensors.append(compute(layer, *(self.tensors[k] for k in layer.sources)))
+        self.tensors.append(compute_layer(layer, *(self.tensors[k] for k in layer.sources)))
         self.signed.append(layer.signed)
 
     def conv(self, outs: int, kernel: int, *, depthwise: bool = False, stride: int = 1,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dmrl.deploy.accuracy import argmax_kept, figures_of, points_of
+from dmrl.deploy.accuracy import compare_peaks, compute_accuracy, decode_points
 from dmrl.learn.inference.matching import Points
 
 
@@ -17,19 +17,19 @@ def outputs(*best: tuple[int, int]) -> dict[str, np.ndarray]:
 
 def test_the_share_of_images_whose_best_cell_stays() -> None:
     wanted, got = outputs((0, 1), (2, 3), (3, 4), (1, 1)), outputs((0, 1), (2, 4), (3, 4), (0, 1))
-    assert argmax_kept(wanted, got) == 0.5
-    assert argmax_kept(wanted, wanted) == 1.0
+    assert compare_peaks(wanted, got) == 0.5
+    assert compare_peaks(wanted, wanted) == 1.0
 
 
 def test_detections_are_judged_as_those_of_any_network() -> None:
-    found = points_of(outputs((0, 1), (2, 3)), 8)
+    found = decode_points(outputs((0, 1), (2, 3)), 8)
     sure = found.confidence > 0.5
     assert found.image[sure].tolist() == [0, 1]
     assert (found.u_px[sure].tolist(), found.v_px[sure].tolist()) == ([12, 28], [4, 20])
     assert found.depth_m[sure] == pytest.approx(np.e)
     ones = np.ones(2)
     labels = Points(np.arange(2), np.array([12.0, 28.0]), np.array([4.0, 26.0]), 2 * ones, ones)
-    got = figures_of(2, labels, found, 0.5)
+    got = compute_accuracy(2, labels, found, 0.5)
     assert got["mean_px"] == pytest.approx(3.0)
     assert got["precision"] == got["recall"] == 1.0
     assert got["depth_mae_m"] == pytest.approx(np.e - 2)

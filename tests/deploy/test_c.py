@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 
 from dmrl.deploy.bayer_input import demosaic
 from dmrl.deploy.c import c_name, write_c
-from dmrl.deploy.c.harness import answers
-from dmrl.deploy.c.run.compile_targets import RISCV_FLAGS, SANITIZERS, Build, Target
-from dmrl.deploy.c.run.compiled import Compiled
-from dmrl.deploy.c.run.measure import cost
-from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, missing
-from dmrl.deploy.c.run.verification import TargetResult, expected, prove
-from dmrl.deploy.c.source_file import source
-from dmrl.deploy.c.templating import names_of
+from dmrl.deploy.c.harness import parse_results
+from dmrl.deploy.c.run.compile_targets import RISCV_FLAGS, SANITIZER_FLAGS, Build, Target
+from dmrl.deploy.c.run.compiled import CompiledNetwork
+from dmrl.deploy.c.run.measure import measure_cost
+from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, find_missing
+from dmrl.deploy.c.run.verification import TargetResult, compute_expected, verify_target
+from dmrl.deploy.c.source_file import generate_source
+from dmrl.deploy.c.templating import template_values
 from dmrl.deploy.int8.network import Conv, IntegerNetwork
-from dmrl.deploy.int8.reference import decode, run
+from dmrl.deploy.int8.reference import decode_detections, run_network
 from dmrl.errors import ModelError, SettingError, ToolError
 
 from .graphs import quantised_network, untrained
@@ -27,7 +27,7 @@ from .networks import random_network
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 QUICK = Target("gcc", (Build("-O0", "gcc", ("-O0",)),))
-CHECKED = Target("sanitizers", (Build("-O1", "gcc", SANITIZERS),))
+CHECKED = Target("sanitizers", (Build("-O1", "gcc", SANITIZER_FLAGS),))
 
 
 SMALLEST = min(map(random_network, range(20)), key=lambda network: network.macs)
@@ -49,7 +49,9 @@ def noise(network: IntegerNetwork, count: int, seed: int = 0) -> NDArray[np.uint
 
 def proved(network: IntegerNetwork, folder: Path, target: Target) -> TargetResult:
     write_c(network, folder, [])
-    return prove(network, folder, target, expected(network, list(noise(network, 3))))
+    return verify_target(
+        network, folder, target, compute_expected(network, list(noise(network, 3)))
+    )
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -90,12 +92,12 @@ def test_raw_mosaics_of_any_phase_are_seen_as_the_reference_sees_them(
     flags = tuple(f"-DRANDOM_RED_{axis}={k}" for axis, k in zip(("ROW", "COL"), phase, strict=True))
     build = Build("Bayer", "gcc", ("-O1", *flags), bayer=True)
     raw = noise(network, 1)[0, ..., 0]
-    command = build.program(network, tmp_path, tmp_path)
+    command = build.compile_program(network, tmp_path, tmp_path)
     said = subprocess.run(command, input=raw.tobytes(), check=True, capture_output=True)
     row, col = phase
     seen = demosaic(raw, channels=channels, red_row=row, red_col=col)
-    (answer,) = answers(network, said.stdout)
-    wanted = run(network, seen)
+    (answer,) = parse_results(network, said.stdout)
+    wanted = run_network(network, seen)
     assert all(np.array_equal(answer.grids[head], wanted[head]) for head in wanted)
 
 
@@ -216,18 +218,20 @@ def test_two_networks_go_into_one_program(tmp_path: Path) -> None:
 
 def test_the_same_network_gives_the_same_text() -> None:
     network = quantised_network(4)
-    one, two = (source(network, names_of(network), bayer=False) for _ in range(2))
+    one, two = (generate_source(network, template_values(network), bayer=False) for _ in range(2))
     assert one == two
 
 
 @pytest.mark.heavy
 def test_of_many_peaks_the_first_stay() -> None:
     network = replace(quantised_network(1), threshold=0.0)
-    compiled = Compiled(network)
+    compiled = CompiledNetwork(network)
     image = noise(network, 1)[0]
-    grids = run(network, image)
+    grids = run_network(network, image)
     for most in (0, 1, 2, 5):
-        assert compiled.answer(image, most).detections == decode(network, grids, most)
+        assert compiled.run_detections(image, most).detections == decode_detections(
+            network, grids, most
+        )
 
 
 def test_a_layer_that_the_c_cannot_carry_is_named() -> None:
@@ -240,7 +244,7 @@ def test_a_layer_that_the_c_cannot_carry_is_named() -> None:
     layers[at] = replace(conv, name="odd", weight=conv.weight[:, :, :1, :1], padding=0)
     odd = replace(network, layers=tuple(layers))
     with pytest.raises(ModelError, match="layer odd is a depthwise 1x1"):
-        source(odd, names_of(odd), bayer=False)
+        generate_source(odd, template_values(odd), bayer=False)
 
 
 def _depthwise(network: IntegerNetwork) -> int | None:
@@ -259,7 +263,7 @@ def test_without_a_compiler_the_package_to_install_is_named(
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ToolError, match="apt-get install gcc"):
-        Compiled(quantised_network(0))
+        CompiledNetwork(quantised_network(0))
 
 
 @pytest.mark.parametrize(
@@ -272,7 +276,7 @@ def test_without_a_compiler_the_package_to_install_is_named(
 )
 def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
     integers = untrained(name)
-    made = source(integers, names_of(integers), bayer=False)
+    made = generate_source(integers, template_values(integers), bayer=False)
     assert made.state_bytes + made.bayer_bytes <= bytes_
 
 
@@ -288,11 +292,11 @@ def test_the_architectures_come_through_bit_for_bit(name: str, tmp_path: Path) -
 def test_a_product_takes_few_instructions_of_a_riscv(
     name: str, most: float, tmp_path: Path
 ) -> None:
-    if missing(RISCV, EMULATOR):
+    if find_missing(RISCV, EMULATOR):
         pytest.skip("no RISC-V tools")
     integers = untrained(name)
     write_c(integers, tmp_path, [])
-    found = cost(integers, tmp_path, noise(integers, 1)[0])
+    found = measure_cost(integers, tmp_path, noise(integers, 1)[0])
     assert found is not None
     assert found.instructions is not None
     assert found.instructions / integers.macs < most

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 import torch
 
-from dmrl.deploy.backends import grids_of, integer, seen_by
-from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, missing
+from dmrl.deploy.backends import build_reference_backend, to_grids, to_network_input
+from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, find_missing
 from dmrl.deploy.detector import Detector, open_detector
-from dmrl.deploy.int8.graph import grey_of
-from dmrl.deploy.int8.store import INTEGER_NAME, save
+from dmrl.deploy.int8.graph import rgb_to_grey
+from dmrl.deploy.int8.store import INTEGER_NAME, save_network
 from dmrl.deploy.onnx.float_model import float_onnx_of
 from dmrl.errors import ModelError, SettingError, ToolError
 from dmrl.learn.inference.loaded_model import Model, load_model, save_model
-from dmrl.learn.networks.architectures import build
+from dmrl.learn.networks.architectures import build_network
 
 from .graphs import quantised_network
 
-needs_riscv = pytest.mark.skipif(bool(missing(RISCV, EMULATOR)), reason="no RISC-V tools")
+needs_riscv = pytest.mark.skipif(bool(find_missing(RISCV, EMULATOR)), reason="no RISC-V tools")
 
 
 @pytest.mark.heavy
@@ -29,7 +29,7 @@ needs_riscv = pytest.mark.skipif(bool(missing(RISCV, EMULATOR)), reason="no RISC
 )
 def test_an_int8_network_says_the_same_by_every_backend(backend: str, tmp_path: Path) -> None:
     network = replace(quantised_network(11), threshold=0.37)
-    save(network, tmp_path / INTEGER_NAME)
+    save_network(network, tmp_path / INTEGER_NAME)
     shape = (2, network.height_px, network.width_px, 3)
     images = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
     detector = open_detector(tmp_path, backend)  # type: ignore[arg-type]
@@ -37,7 +37,7 @@ def test_an_int8_network_says_the_same_by_every_backend(backend: str, tmp_path: 
     assert detector.threshold == pytest.approx(0.37)
     assert detector.size_px == (network.width_px, network.height_px)
     assert detector.file == tmp_path / INTEGER_NAME
-    wanted = grids_of(integer(network).outputs(images))
+    wanted = to_grids(build_reference_backend(network).outputs(images))
     got = detector.grids(images)
     np.testing.assert_allclose(got.confidence, wanted.confidence, atol=1e-6)
     np.testing.assert_allclose(
@@ -47,7 +47,7 @@ def test_an_int8_network_says_the_same_by_every_backend(backend: str, tmp_path: 
 
 def run_folder(folder: Path) -> Path:
     folder.mkdir()
-    network = build("locanet", seed=3).eval()
+    network = build_network("locanet", seed=3).eval()
     with torch.no_grad():
         for parameter in network.parameters():
             parameter += 0.03 * torch.randn(parameter.shape, generator=torch.manual_seed(1))
@@ -121,26 +121,26 @@ def test_grey_networks_are_shown_grey() -> None:
     networks = [quantised_network(seed) for seed in range(4)]
     assert {network.channels for network in networks} == {1, 3}
     for network in networks:
-        wanted = grey_of(image[None])[0] if network.channels == 1 else image
-        assert (seen_by(network, image) == wanted).all()
+        wanted = rgb_to_grey(image[None])[0] if network.channels == 1 else image
+        assert (to_network_input(network, image) == wanted).all()
 
 
 def test_logits_far_out_overflow_nothing() -> None:
     far = np.array([[[-1e9, 0.0, 1e9]]])
-    grids = grids_of({"confidence": far, "log_depth": far, "offset_u": far, "offset_v": 2 * far})
+    grids = to_grids({"confidence": far, "log_depth": far, "offset_u": far, "offset_v": 2 * far})
     assert grids.confidence[0, 0].tolist() == pytest.approx([0, 0.5, 1])
     assert grids.depth_m[0, 0, :2].tolist() == [0, 1]
     assert np.isfinite(grids.depth_m).all()
     assert grids.offset is not None
     assert (grids.offset[:, 0] == far).all()
     assert (grids.offset[:, 1] == 2 * far).all()
-    assert grids_of({"confidence": far, "log_depth": far, "offset_u": far}).offset is None
+    assert to_grids({"confidence": far, "log_depth": far, "offset_u": far}).offset is None
 
 
 def test_without_risc_v_tools_the_line_to_type_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    save(quantised_network(0), tmp_path / INTEGER_NAME)
+    save_network(quantised_network(0), tmp_path / INTEGER_NAME)
     monkeypatch.setenv("PATH", "")
     with pytest.raises(ToolError, match="apt-get install gcc-riscv64-unknown-elf"):
         open_detector(tmp_path, "riscv32")

@@ -8,27 +8,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.deploy.c import L1_FOR_STATE, write_c
-from dmrl.deploy.c.buffer_plan import Plan, plan
-from dmrl.deploy.c.memory_levels import split, traffic_bytes
-from dmrl.deploy.c.run.compile_targets import SANITIZERS, Build, Target
-from dmrl.deploy.c.run.measure import Memory, memory_of
-from dmrl.deploy.c.run.verification import TargetResult, expected, prove
+from dmrl.deploy.c import MAX_L1_STATE_BYTES, write_c
+from dmrl.deploy.c.buffer_plan import BufferPlan, plan_buffers
+from dmrl.deploy.c.memory_levels import assign_memories, count_copied_bytes
+from dmrl.deploy.c.run.compile_targets import SANITIZER_FLAGS, Build, Target
+from dmrl.deploy.c.run.measure import StateMemory, parse_state_memory
+from dmrl.deploy.c.run.verification import TargetResult, compute_expected, verify_target
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import SettingError
 
 from .graphs import quantised_network, untrained
 from .networks import random_network
 
-GUARDED = Target("sanitizers", (Build("-O1", "gcc", SANITIZERS),))
+GUARDED = Target("sanitizers", (Build("-O1", "gcc", SANITIZER_FLAGS),))
 no_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 
 
 def smallest(network: IntegerNetwork) -> int:
     """The least near memory that will do, as the error says; 0: all of it has to be near."""
-    whole = plan(network)
+    whole = plan_buffers(network)
     with pytest.raises(SettingError, match="at least") as error:
-        split(whole, 0)
+        assign_memories(whole, 0)
     least = int(re.findall(r"at least (\S+) bytes", str(error.value))[0].replace(",", ""))
     return least if least < whole.state_bytes(bayer=True) else 0
 
@@ -41,7 +41,7 @@ def splittable(seed: int) -> IntegerNetwork:
 
 def proved(network: IntegerNetwork, folder: Path, near_bytes: int) -> TargetResult:
     write_c(network, folder, [], near_bytes=near_bytes)
-    return prove(network, folder, GUARDED, expected(network, images(network)))
+    return verify_target(network, folder, GUARDED, compute_expected(network, images(network)))
 
 
 def images(network: IntegerNetwork) -> list[np.ndarray]:
@@ -58,7 +58,7 @@ def test_layers_touch_the_near_memory_alone_and_copy_as_much_as_is_stated(
     network = splittable(seed)
     result = proved(network, tmp_path, smallest(network))
     assert (result.error, result.mismatches) == ("", 0)
-    assert memory_of(network, tmp_path).far_bytes > 0
+    assert parse_state_memory(network, tmp_path).far_bytes > 0
 
 
 @no_gcc
@@ -79,7 +79,7 @@ def test_a_layer_that_works_in_the_far_memory_is_found_out(tmp_path: Path) -> No
     text = code.read_text()
     assert "    return to;" in text
     code.write_text(text.replace("    return to;", "    return from;"))
-    result = prove(network, tmp_path, GUARDED, expected(network, images(network)))
+    result = verify_target(network, tmp_path, GUARDED, compute_expected(network, images(network)))
     assert result.error
 
 
@@ -89,9 +89,11 @@ def test_less_copied_than_stated_is_found_out(tmp_path: Path) -> None:
     network = splittable(3)
     write_c(network, tmp_path, [], near_bytes=smallest(network))
     header = tmp_path / "random.h"
-    stated = memory_of(network, tmp_path).traffic_bytes
+    stated = parse_state_memory(network, tmp_path).traffic_bytes
     header.write_text(header.read_text().replace(f"({stated})", f"({stated + 1})"))
-    assert prove(network, tmp_path, GUARDED, expected(network, images(network))).error
+    assert verify_target(
+        network, tmp_path, GUARDED, compute_expected(network, images(network))
+    ).error
 
 
 @no_gcc
@@ -117,17 +119,17 @@ def test_the_self_test_passes_with_two_memories(tmp_path: Path) -> None:
 
 @pytest.mark.heavy
 def test_what_ships_fits_a_gap8_with_the_rings_of_long_reach_far() -> None:
-    nano, fine = plan(untrained("dmrl-nano")), plan(untrained("dmrl-nano-fine"))
+    nano, fine = plan_buffers(untrained("dmrl-nano")), plan_buffers(untrained("dmrl-nano-fine"))
     for whole, far in ((nano, {"body_5_0"}), (fine, {"body_1_0", "body_9_0"})):
-        two = split(whole, L1_FOR_STATE)
-        assert set(two.homes(far=True)) == far
-        assert two.state_bytes(bayer=True) <= L1_FOR_STATE
-    rows = traffic_bytes(split(nano, L1_FOR_STATE)) - tables(nano)
+        two = assign_memories(whole, MAX_L1_STATE_BYTES)
+        assert set(two.member_bytes(in_l2=True)) == far
+        assert two.state_bytes(bayer=True) <= MAX_L1_STATE_BYTES
+    rows = count_copied_bytes(assign_memories(nano, MAX_L1_STATE_BYTES)) - tables(nano)
     # A row of 40 x 48: five depthwise read three, five shortcuts one, five layers write one.
     assert rows == 28 * 40 * 48 * (5 * 3 + 5 + 5)
 
 
-def tables(whole: Plan) -> int:
+def tables(whole: BufferPlan) -> int:
     """Bytes of weights, biases, multipliers and gains that every row of every step takes."""
     total = 0
     for step, out in zip(whole.steps, whole.buffers[1:], strict=True):
@@ -138,22 +140,22 @@ def tables(whole: Plan) -> int:
 
 def test_of_all_that_fits_the_least_is_copied() -> None:
     network = splittable(5)
-    whole = plan(network)
+    whole = plan_buffers(network)
     least, most = smallest(network), whole.state_bytes(bayer=True)
-    assert split(whole, most) is whole
+    assert assign_memories(whole, most) is whole
     sizes = range(least, most, 64)
-    ways = [split(whole, size) for size in sizes]
-    copied = [traffic_bytes(way) for way in ways]
+    ways = [assign_memories(whole, size) for size in sizes]
+    copied = [count_copied_bytes(way) for way in ways]
     assert all(w.state_bytes(bayer=True) <= size for w, size in zip(ways, sizes, strict=True))
     assert copied == sorted(copied, reverse=True)
     with pytest.raises(SettingError, match=rf"at least {least:,} bytes .* {least - 4:,} are there"):
-        split(whole, least - 4)
+        assign_memories(whole, least - 4)
 
 
 def test_the_header_states_both_sizes(tmp_path: Path) -> None:
     network = splittable(1)
     write_c(network, tmp_path, [], near_bytes=smallest(network))
-    two = split(plan(network), smallest(network))
-    far = sum(two.homes(far=True).values())
-    wanted = Memory(two.state_bytes(bayer=False), far, traffic_bytes(two))
-    assert memory_of(network, tmp_path) == wanted
+    two = assign_memories(plan_buffers(network), smallest(network))
+    far = sum(two.member_bytes(in_l2=True).values())
+    wanted = StateMemory(two.state_bytes(bayer=False), far, count_copied_bytes(two))
+    assert parse_state_memory(network, tmp_path) == wanted

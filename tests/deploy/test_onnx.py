@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.deploy.backends import Float, integer
-from dmrl.deploy.int8.activation_ranges import calibrate
-from dmrl.deploy.int8.graph import FloatConv, Graph
+from dmrl.deploy.backends import FloatBackend, build_reference_backend
+from dmrl.deploy.int8.activation_ranges import calibrate_ranges
+from dmrl.deploy.int8.graph import FloatConv, FloatGraph
 from dmrl.deploy.int8.network import Add, Conv, IntegerNetwork
-from dmrl.deploy.int8.quantise import HEAD_OF, About, quantise
-from dmrl.deploy.onnx.graph_writer import float_onnx, int8_onnx
+from dmrl.deploy.int8.quantise import HEAD_OF_CHANNEL, NetworkInfo, quantise_network
+from dmrl.deploy.onnx.graph_writer import build_float_onnx, int8_onnx
 from dmrl.deploy.onnx.runtime import OnnxRun
 from dmrl.errors import ModelError
 
@@ -28,9 +28,9 @@ def rgb_images(seed: int) -> np.ndarray:
 def test_float_onnx_computes_the_float_network(seed: int) -> None:
     graph, channels, _ = random_graph(seed)
     images = rgb_images(seed)
-    wanted = Float(graph, channels).outputs(images)
+    wanted = FloatBackend(graph, channels).outputs(images)
     grid_shape = wanted["confidence"].shape[1:]
-    file = float_onnx(graph, channels, size_px=images.shape[1:3], grid_shape=grid_shape)
+    file = build_float_onnx(graph, channels, size_px=images.shape[1:3], grid_shape=grid_shape)
     got = OnnxRun(file, threads=1).outputs(images)
     assert set(got) == set(channels)
     for name, value in wanted.items():
@@ -43,10 +43,10 @@ def test_int8_onnx_gives_the_levels_of_the_reference(seed: int) -> None:
 
 
 def require_same_levels(network: IntegerNetwork, images: np.ndarray) -> None:
-    wanted = integer(network).outputs(images)
+    wanted = build_reference_backend(network).outputs(images)
     got = OnnxRun(int8_onnx(network), threads=1).outputs(images)
     for name, values in wanted.items():
-        head = network.heads[HEAD_OF[name]]
+        head = network.heads[HEAD_OF_CHANNEL[name]]
         np.testing.assert_array_equal(np.rint(got[name] / head.scale), np.rint(values / head.scale))
 
 
@@ -63,9 +63,9 @@ def test_heads_may_be_behind_a_shortcut() -> None:
         "first", (0,), rng.normal(0, 0.3, (4, 3, 3, 3)), np.zeros(4), padding=1, relu=True
     )
     head = FloatConv("head", (1, 1), rng.normal(0, 0.5, (4, 4, 1, 1)), np.zeros(4))
-    graph = Graph((first, head), tuple((2, place) for place in range(4)))
-    about = About("small", "small", 8, SUB_CELL, 0.3)
-    network = quantise(graph, calibrate(graph, [images]), about)
+    graph = FloatGraph((first, head), tuple((2, place) for place in range(4)))
+    about = NetworkInfo("small", "small", 8, SUB_CELL, 0.3)
+    network = quantise_network(graph, calibrate_ranges(graph, [images]), about)
     require_same_levels(network, images)
 
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from dmrl.deploy.c.buffer_plan import plan
-from dmrl.deploy.c.row_schedule import Step, play, rows_held, shared_ring
+from dmrl.deploy.c.buffer_plan import plan_buffers
+from dmrl.deploy.c.row_schedule import Step, count_ring_rows, schedule_rows, share_ring
 from dmrl.deploy.int8.network import Conv
 
 from .graphs import quantised_network, untrained
@@ -16,11 +16,11 @@ NETWORKS = [*map(random_network, range(12)), *map(quantised_network, range(24))]
 def test_what_is_still_needed_is_never_overwritten() -> None:
     joined = 0
     for network in [*NETWORKS, untrained("dmrl-nano", 64, 96)]:
-        planned = plan(network)
+        planned = plan_buffers(network)
         buffers = planned.buffers
         joined += sum(b.shift > 0 for b in buffers)
         held: dict[tuple[str, int], tuple[int, int]] = {}
-        for write in play(list(planned.steps), [b.rows for b in buffers]):
+        for write in schedule_rows(list(planned.steps), [b.rows for b in buffers]):
             b = buffers[write.buffer]
             held[b.home, (write.row + b.shift) % b.ring] = (write.buffer, write.row)
             for k, other in enumerate(buffers):
@@ -43,13 +43,13 @@ def test_a_convolution_reads_what_it_would_overwrite_so_two_in_a_row_gain_nothin
 ) -> None:
     spread = conv(dilation=dilation, padding=dilation)
     steps = [Step(f"s{k}", spread, pooled=False, sources=(k,)) for k in range(3)]
-    writes = play(steps, [20] * 4)
-    assert rows_held(writes, 4)[1:3] == [2 * dilation + 1] * 2
-    assert shared_ring([1, 2], writes) == (4 * dilation + 2, [0, 3 * dilation + 1])
+    writes = schedule_rows(steps, [20] * 4)
+    assert count_ring_rows(writes, 4)[1:3] == [2 * dilation + 1] * 2
+    assert share_ring([1, 2], writes) == (4 * dilation + 2, [0, 3 * dilation + 1])
 
 
 def test_rows_are_made_as_soon_as_they_can_be() -> None:
-    writes = play([Step("s", conv(stride=2), pooled=False, sources=(0,))], [6, 3])
+    writes = schedule_rows([Step("s", conv(stride=2), pooled=False, sources=(0,))], [6, 3])
     assert [(w.buffer, w.row) for w in writes] == [
         (0, 0), (0, 1), (1, 0), (0, 2), (0, 3), (1, 1), (0, 4), (0, 5), (1, 2),
     ]  # fmt: skip

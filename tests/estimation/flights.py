@@ -4,8 +4,8 @@ from functools import cache
 
 import numpy as np
 
-from dmrl.estimation.model.pair import Array, Pair, Track, usable_ranges
-from dmrl.estimation.signals.sensor_tracks import track as sensed
+from dmrl.estimation.model.pair import Array, Pair, SensorTrack, usable_ranges
+from dmrl.estimation.signals.sensor_tracks import build_track as sensed
 from dmrl.flight import NOISE, Flight, RobotLog, Scenario, Trajectory, simulate
 
 
@@ -14,7 +14,7 @@ def flown(trajectory: Trajectory, noise: str, seed: int, duration_s: float = 40.
     return simulate(Scenario(2, duration_s, trajectory), NOISE[noise], seed)
 
 
-def track(log: RobotLog, grid_s: Array) -> Track:
+def track(log: RobotLog, grid_s: Array) -> SensorTrack:
     velocity = np.column_stack([log.vx_mps, log.vy_mps])
     yaw_rate, height = log.yaw_rate_radps[:, None], log.height_m[:, None]
     return sensed(*((log.time_s, values) for values in (yaw_rate, velocity, height)), grid_s)
@@ -32,5 +32,5 @@ def pair_of(flight: Flight, own: str = "cf1", peer: str = "cf2") -> Pair:
 
 def truth_at(flight: Flight, time_s: Array, own: str = "cf1", peer: str = "cf2") -> Array:
     """(N, 2) where the peer truly is at times on the observer's clock."""
-    true_s = flight.clocks[own].true_time(time_s)
+    true_s = flight.clocks[own].to_true_time(time_s)
     return flight.peer_in_horizontal(own, peer, true_s)[:, :2]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.flight.data_association import told_apart
+from dmrl.estimation.flight.data_association import resolve_conflicts
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.model.pair import Pair
 from dmrl.estimation.model.status import AMBIGUOUS, OK
@@ -22,7 +22,7 @@ def looking(flight: Flight, wrong: float = 0.07) -> Pair:
         sightings(flight, own, (peer,), wrong=wrong)
         for own, peer in (("cf1", "cf2"), ("cf2", "cf1"))
     )
-    return replace(pair_of(flight), own_sees=mine, peer_sees=theirs)
+    return replace(pair_of(flight), own_bearings=mine, peer_bearings=theirs)
 
 
 def off_m(found: Estimate, flight: Flight, own: str = "cf1", peer: str = "cf2") -> float:
@@ -41,7 +41,7 @@ def test_a_camera_tells_the_bearing_of_flights_without_motion(trajectory: Trajec
     if trajectory != "observer_static":
         # Nobody sees how the observer stands before its peer, so that stays open.
         assert (there.status == AMBIGUOUS).all()
-        assert there.refused in ("still", "alike")
+        assert there.rejection_reason in ("still", "alike")
 
 
 @pytest.mark.heavy
@@ -52,7 +52,7 @@ def test_wrong_ones_take_nothing_from_a_flight_that_ranges_know() -> None:
         ((here, _),) = estimate_pairs([looking(flight, wrong)])
         assert off_m(here, flight) < 0.7 * off_m(blind, flight)
     lost = sightings(flight, "cf1", (), wrong=0.5)
-    ((here, _),) = estimate_pairs([replace(pair_of(flight), own_sees=lost)])
+    ((here, _),) = estimate_pairs([replace(pair_of(flight), own_bearings=lost)])
     assert off_m(here, flight) == pytest.approx(off_m(blind, flight), abs=0.02)
 
 
@@ -60,9 +60,9 @@ def test_wrong_ones_take_nothing_from_a_flight_that_ranges_know() -> None:
 def test_a_robot_at_rest_whose_camera_shows_other_things_stays_ambiguous() -> None:
     flight = flown("both_static", "calibrated", 3, 30.0)
     lost = sightings(flight, "cf1", (), wrong=0.5)
-    ((here, there),) = estimate_pairs([replace(pair_of(flight), own_sees=lost)])
+    ((here, there),) = estimate_pairs([replace(pair_of(flight), own_bearings=lost)])
     assert (here.status == AMBIGUOUS).all() and (there.status == AMBIGUOUS).all()
-    assert here.refused == "still"
+    assert here.rejection_reason == "still"
 
 
 @pytest.mark.heavy
@@ -71,11 +71,11 @@ def test_of_two_peers_at_rest_each_gets_its_own() -> None:
     flight = simulate(Scenario(3, 30.0, "both_static"), NOISE["calibrated"], 5)
     sees = sightings(flight, "cf1", ("cf2", "cf3"))
     names = [("cf1", "cf2"), ("cf1", "cf3")]
-    pairs = {both: replace(pair_of(flight, *both), own_sees=sees) for both in names}
+    pairs = {both: replace(pair_of(flight, *both), own_bearings=sees) for both in names}
     for _ in range(2):
         found = dict(zip(names, estimate_pairs([pairs[n] for n in names]), strict=True))
         ways = {k: v for n in names for k, v in ((n, found[n][0]), (n[::-1], found[n][1]))}
-        pairs |= told_apart(pairs, ways)
+        pairs |= resolve_conflicts(pairs, ways)
     for one, other in names:
         assert off_m(found[one, other][0], flight, one, other) < 0.25
         assert (found[one, other][0].status == OK).mean() > 0.5
@@ -85,6 +85,6 @@ def test_of_two_peers_at_rest_each_gets_its_own() -> None:
 def test_the_same_pair_the_other_way_round_is_the_same_solution() -> None:
     pair = looking(flown("in_view", "calibrated", 4, 20.0))
     ((here, there),) = estimate_pairs([pair])
-    ((back, forth),) = estimate_pairs([pair.swapped()])
+    ((back, forth),) = estimate_pairs([pair.swap_robots()])
     assert np.abs(here.state[:, :2] - forth.state[:, :2]).max() < 0.05
     assert np.abs(there.state[:, :2] - back.state[:, :2]).max() < 0.05

@@ -8,35 +8,37 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.evaluation.detections import Pairs, join
+from dmrl.evaluation.detections import LabelledDetections, join_by_image
 from dmrl.images.codec import encode_png
-from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message
+from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message_class
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
 
-PICTURE = message("CompressedImage")(data=encode_png(np.zeros((48, 64, 3), np.uint8)), format="png")
+PICTURE = message_class("CompressedImage")(
+    data=encode_png(np.zeros((48, 64, 3), np.uint8)), format="png"
+)
 Image = tuple[Sequence[Any], Sequence[Any], Sequence[str]]
 
 
 def label(u_px: float, v_px: float = 20.0, source: str = "truth", status: int = STATUS_OK) -> Any:
     fields = {"u_px": u_px, "v_px": v_px, "depth_m": 1.0, "source": source, "status": status}
-    return message("PeerLabel")(**fields)
+    return message_class("PeerLabel")(**fields)
 
 
 def found(u_px: float, confidence: float) -> Any:
     return {"u_px": u_px, "v_px": 20.0, "depth_m": 2.0, "confidence": confidence}
 
 
-def joined(path: Path, images: Sequence[Image], **options: Any) -> Pairs:
+def joined(path: Path, images: Sequence[Image], **options: Any) -> LabelledDetections:
     """Images with their labels, detections and who looked, one a nanosecond."""
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.add_metadata(SPLIT_METADATA, {"train": "[[0, 1]]", "test": "[[2, 2], [4, 9]]"})
         for k, (peers, detections, looked) in enumerate(images):
-            sink.write(k, topics.camera_image("cf1"), PICTURE)
-            labels = message("PeerLabels")(peers=peers, sources=looked)
-            sink.write(k, topics.labels("cf1"), labels)
-            seen = message("Detections")(detections=detections, threshold=0.4)
-            sink.write(k, topics.detections("cf1"), seen)
-    return join([path], "truth", **options)
+            sink.write(k, topics.CAMERA_IMAGE("cf1"), PICTURE)
+            labels = message_class("PeerLabels")(peers=peers, sources=looked)
+            sink.write(k, topics.LABELS("cf1"), labels)
+            seen = message_class("Detections")(detections=detections, threshold=0.4)
+            sink.write(k, topics.DETECTIONS("cf1"), seen)
+    return join_by_image([path], "truth", **options)
 
 
 def test_detections_come_best_first_however_they_were_written(tmp_path: Path) -> None:

@@ -5,23 +5,23 @@ from typing import Any
 import pytest
 
 from dmrl.errors import RecipeError
-from dmrl.evaluation.figure_specs import faults, told, value_at
+from dmrl.evaluation.figure_specs import find_value, iter_faults, read_figures
 
 OUTS = {"model", "judged", "a.mcap"}
 GOOD = {"title": "Losses", "shows": "losses", "of": ["model"]}
 
 
 def wrong(table: Any) -> str:
-    return "; ".join(faults({"figure": [table]}, OUTS))
+    return "; ".join(iter_faults({"figure": [table]}, OUTS))
 
 
 def test_a_good_figure_has_no_fault_and_is_read() -> None:
     rows = [{"what": "px", "of": "judged/evaluation.json", "at": "overall.median_px.value"}]
     numbers = {"title": "Numbers", "shows": "numbers", "rows": rows}
     recipe = {"title": "Mine", "figure": [GOOD, numbers]}
-    assert not list(faults(recipe, OUTS))
-    first, second = told("mine", recipe)
-    assert first.of == ("model",) and first.label(0) == "model"
+    assert not list(iter_faults(recipe, OUTS))
+    first, second = read_figures("mine", recipe)
+    assert first.of == ("model",) and first.output_label(0) == "model"
     assert second.rows[0].at == "overall.median_px.value" and second.rows[0].form == ".3g"
     assert second.outputs == ["judged/evaluation.json"]
 
@@ -51,11 +51,11 @@ def test_a_format_that_is_none_or_asks_for_a_gigabyte_is_a_fault(form: str) -> N
 
 
 def test_tables_that_are_none_are_faults() -> None:
-    assert "must be [[figure]] tables" in "".join(faults({"figure": 3}, OUTS))
+    assert "must be [[figure]] tables" in "".join(iter_faults({"figure": 3}, OUTS))
     assert "must be a table" in wrong("losses")
     with pytest.raises(RecipeError, match="must be"):
-        told("mine.toml", {"figure": 3})
-    assert "title: must be a text" in "".join(faults({"title": 3}, OUTS))
+        read_figures("mine.toml", {"figure": 3})
+    assert "title: must be a text" in "".join(iter_faults({"title": 3}, OUTS))
 
 
 @pytest.mark.parametrize(
@@ -74,4 +74,4 @@ def test_tables_that_are_none_are_faults() -> None:
 )
 def test_a_place_of_a_document_is_found_or_is_none(at: str, value: int | None) -> None:
     document = {"a": {"b": 3}, "rows": [{"name": "gcc", "x": 5}, {"name": "riscv32", "x": 6}]}
-    assert value_at(document, at) == value
+    assert find_value(document, at) == value

@@ -7,7 +7,7 @@ import pytest
 
 from dmrl import topics
 from dmrl.evaluation.positions import document, judge, lasts_s
-from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message
+from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message_class
 from dmrl.recording import Provenance, RecordingWriter
 
 SPREAD = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, 0.003], [0.002, 0.003, 0.25]])
@@ -15,16 +15,16 @@ SPREAD = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, 0.003], [0.002, 0.003, 0.25
 
 def test_each_axis_stands_beside_its_own(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    made = message("PeerPosition")
+    made = message_class("PeerPosition")
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(21):  # two seconds of truth; estimates from 0.5 s on, between its samples
             truth = made(x=1 + 0.1 * k, y=-2 + 0.3 * k, z=5.0)
-            sink.write(k * 100_000_000, topics.truth("cf1", "cf2"), truth)
+            sink.write(k * 100_000_000, topics.TRUTH("cf1", "cf2"), truth)
             if k >= 5:
                 status = STATUS_OK if k % 2 else STATUS_AMBIGUOUS
                 at = {"x": 1 + 0.1 * (k + 0.5) + 0.3, "y": -2 + 0.3 * (k + 0.5) - 0.4, "z": 0.0}
                 told = made(**at, covariance=SPREAD.ravel().tolist(), status=status)
-                sink.write(k * 100_000_000 + 50_000_000, topics.position("cf1", "cf2"), told)
+                sink.write(k * 100_000_000 + 50_000_000, topics.POSITION("cf1", "cf2"), told)
     (pair,) = judge(path)
     assert pair.judged.error_m == pytest.approx(np.tile([0.3, -0.4], (15, 1)))
     assert pair.judged.covariance == pytest.approx(np.tile(SPREAD[:2, :2], (15, 1, 1)))

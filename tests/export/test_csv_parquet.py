@@ -11,9 +11,9 @@ from dmrl.errors import OutputError, UnsafeName
 from dmrl.export import csv_parquet
 from dmrl.export.csv_parquet import write_tables
 from dmrl.images.codec import encode_png
-from dmrl.messages import message
-from dmrl.recording import Channel, RawMessage, RecordingWriter, provenance
-from dmrl.recording.writer import channel_for
+from dmrl.messages import message_class
+from dmrl.recording import Channel, RawMessage, RecordingWriter, build_provenance
+from dmrl.recording.writer import build_topic_channel
 
 PNG = encode_png(np.full((4, 4, 3), 7, np.uint8))
 
@@ -23,15 +23,15 @@ def recording(tmp_path: Path) -> Path:
     """A picture, labels with two peers, one and none, a pose and a map."""
     path = tmp_path / "in.mcap"
     peers = [{"peer": "cf2", "u_px": 1.5, "box_px": [1, 2, 3, 4]}, {"peer": "cf3", "u_px": 2.5}]
-    with RecordingWriter(path, provenance("test")) as sink:
+    with RecordingWriter(path, build_provenance("test")) as sink:
         for k in range(3):
-            labels = message("PeerLabels")(peers=peers[: 2 - k])
+            labels = message_class("PeerLabels")(peers=peers[: 2 - k])
             sink.write(10 * k, "/cf1/labels", labels, publish_ns=10 * k + 1)
-        picture = message("CompressedImage")(data=PNG, format="png")
+        picture = message_class("CompressedImage")(data=PNG, format="png")
         sink.write(5, "/cf1/camera/image", picture)
-        pose = message("PoseInFrame")(frame_id="world", pose={"position": {"x": 0.1}})
+        pose = message_class("PoseInFrame")(frame_id="world", pose={"position": {"x": 0.1}})
         sink.write(7, "/cf1/pose", pose)
-        sink.write(9, "/cf1/detections/grid", message("GridMap")(rows=1, data=b"\0\1"))
+        sink.write(9, "/cf1/detections/grid", message_class("GridMap")(rows=1, data=b"\0\1"))
     return path
 
 
@@ -69,13 +69,15 @@ def test_tables_hold_what_the_recording_holds(recording: Path, tmp_path: Path, k
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 def test_topics_that_look_alike_have_tables_of_their_own(tmp_path: Path, kind: str) -> None:
     path, out = tmp_path / "in.mcap", tmp_path / "out"
-    like = channel_for("/cf1/height", message("Height").DESCRIPTOR)
+    like = build_topic_channel("/cf1/height", message_class("Height").DESCRIPTOR)
     rows = {"/cf1/height": 2, "/cf1.height": 3, "cf1/height": 4}
-    with RecordingWriter(path, provenance("test")) as sink:
+    with RecordingWriter(path, build_provenance("test")) as sink:
         for topic, count in rows.items():
             channel = Channel(topic, like.schema_name, like.schema_data)
             for k in range(count):
-                sink.write_raw(RawMessage(k, k, channel, message("Height")().SerializeToString()))
+                sink.write_raw(
+                    RawMessage(k, k, channel, message_class("Height")().SerializeToString())
+                )
     assert write_tables(path, out, kind) == rows  # type: ignore[arg-type]
     read = pd.read_csv if kind == "csv" else pd.read_parquet
     assert sorted(len(read(file)) for file in out.iterdir()) == [2, 3, 4]
@@ -85,7 +87,7 @@ def test_topics_that_one_disk_would_put_into_one_table_are_refused(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As where A and a are one name of a file."""
-    monkeypatch.setattr(csv_parquet, "file_of_topic", lambda topic: topic[:4].strip("/"))
+    monkeypatch.setattr(csv_parquet, "to_topic_file_name", lambda topic: topic[:4].strip("/"))
     with pytest.raises(UnsafeName, match=r"/cf1/.* and another topic would both become"):
         write_tables(recording, tmp_path / "out", "csv")
     assert list(tmp_path.iterdir()) == [recording]
@@ -112,8 +114,8 @@ def test_topics_that_one_disk_would_put_into_one_table_are_refused(
 )
 def test_no_text_of_a_csv_is_a_formula(tmp_path: Path, kind: str, text: str) -> None:
     path = tmp_path / "in.mcap"
-    with RecordingWriter(path, provenance("test")) as sink:
-        labels = message("PeerLabels")(peers=[{"peer": text, "u_px": -1.5, "source": "hand"}])
+    with RecordingWriter(path, build_provenance("test")) as sink:
+        labels = message_class("PeerLabels")(peers=[{"peer": text, "u_px": -1.5, "source": "hand"}])
         sink.write(0, "/cf1/labels", labels)
     write_tables(path, tmp_path / "out", kind)  # type: ignore[arg-type]
     file = tmp_path / "out" / f"cf1.labels.{kind}"
@@ -129,9 +131,11 @@ def test_no_text_of_a_csv_is_a_formula(tmp_path: Path, kind: str, text: str) -> 
 
 def test_two_pictures_of_one_time_are_two_files(tmp_path: Path) -> None:
     path, pictures = tmp_path / "in.mcap", [PNG, encode_png(np.zeros((4, 4, 3), np.uint8))]
-    with RecordingWriter(path, provenance("test")) as sink:
+    with RecordingWriter(path, build_provenance("test")) as sink:
         for data in pictures:
-            sink.write(5, "/cf1/camera/image", message("CompressedImage")(data=data, format="png"))
+            sink.write(
+                5, "/cf1/camera/image", message_class("CompressedImage")(data=data, format="png")
+            )
     write_tables(path, tmp_path / "out", "csv")
     names = pd.read_csv(tmp_path / "out" / "cf1.camera.image.csv")["data"]
     assert [(tmp_path / "out" / name).read_bytes() for name in names] == pictures
@@ -139,9 +143,9 @@ def test_two_pictures_of_one_time_are_two_files(tmp_path: Path) -> None:
 
 def test_numbers_come_back_to_the_bit(tmp_path: Path) -> None:
     path, values = tmp_path / "in.mcap", np.random.default_rng(0).normal(size=50)
-    with RecordingWriter(path, provenance("test")) as sink:
+    with RecordingWriter(path, build_provenance("test")) as sink:
         for k, value in enumerate(values.tolist()):
-            sink.write(2**60 + k, "/cf1/height", message("Height")(height_m=value))
+            sink.write(2**60 + k, "/cf1/height", message_class("Height")(height_m=value))
     write_tables(path, tmp_path / "out", "csv")
     table = pd.read_csv(tmp_path / "out" / "cf1.height.csv")
     assert (table["height_m"] == values).all()

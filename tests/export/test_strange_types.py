@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from dmrl.errors import RecordingError
 from dmrl.export.csv_parquet import write_tables
 from dmrl.export.ros2 import write_bag
-from dmrl.recording import Channel, RawMessage, RecordingWriter, provenance
+from dmrl.recording import Channel, RawMessage, RecordingWriter, build_provenance
 
 OWN = {"type": F.TYPE_MESSAGE, "type_name": ".x.M"}
 MANY = {"label": F.LABEL_REPEATED}
@@ -30,7 +30,7 @@ def recorded(folder: Path, *fields: dict[str, Any], data: bytes = b"", name: str
         given = {"name": "a", "type": F.TYPE_DOUBLE, "label": F.LABEL_OPTIONAL, **field}
         kind.field.add(number=number, **given)
     channel = Channel("/cf1/m", f"x.{name}", FileDescriptorSet(file=[file]).SerializeToString())
-    with RecordingWriter(folder / "in.mcap", provenance("test")) as sink:
+    with RecordingWriter(folder / "in.mcap", build_provenance("test")) as sink:
         sink.write_raw(RawMessage(0, 0, channel, data))
     return folder / "in.mcap"
 

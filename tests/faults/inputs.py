@@ -13,9 +13,9 @@ import pytest
 
 from dmrl.cli import app
 from dmrl.images.codec import encode_png
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
-from dmrl.topics import attitude, camera_image, labels, uwb_range
+from dmrl.topics import ATTITUDE, CAMERA_IMAGE, LABELS, RANGE
 
 from ..pipeline.chain import CHAIN
 from ..stages.detector import with_detections
@@ -228,15 +228,15 @@ def _dots(path: Path, seed: int = 0) -> None:
             rgb = rng.integers(0, 40, (48, 64, 3), np.uint8)
             row, col = int(rng.integers(1, 5)), int(rng.integers(1, 7))
             rgb[8 * row + 1 : 8 * row + 7, 8 * col + 1 : 8 * col + 7] = 250
-            picture = message("CompressedImage")(data=encode_png(rgb), format="png")
+            picture = message_class("CompressedImage")(data=encode_png(rgb), format="png")
             truth = {"peer": "cf2", "u_px": 8 * col + 4, "v_px": 8 * row + 4, "depth_m": 1.2}
-            sink.write(k * STEP_NS, camera_image("cf1"), picture)
+            sink.write(k * STEP_NS, CAMERA_IMAGE("cf1"), picture)
             sink.write(
                 k * STEP_NS,
-                labels("cf1"),
-                message("PeerLabels")(peers=[{**truth, "source": "truth"}]),
+                LABELS("cf1"),
+                message_class("PeerLabels")(peers=[{**truth, "source": "truth"}]),
             )
-            sink.write(k * STEP_NS + 1, attitude("cf1"), message("Attitude")(roll_rad=k))
+            sink.write(k * STEP_NS + 1, ATTITUDE("cf1"), message_class("Attitude")(roll_rad=k))
             if k % 4 == 3:
                 sink.flush()
 
@@ -253,9 +253,9 @@ def _pair(path: Path) -> None:
     measured = 3 + 0.5 * np.sin(time) + 0.4 * np.sin(1.7 * time) + rng.normal(0, 0.05, len(time))
     with RecordingWriter(path, Provenance("test")) as sink:
         for at_s, value in zip(time.tolist(), measured.tolist(), strict=True):
-            ranged = message("UwbRange")(range_m=value)
-            sink.write(round(at_s * 1e9), uwb_range("cf1", "cf2"), ranged)
-            sink.write(round((at_s + 0.08) * 1e9), uwb_range("cf2", "cf1"), ranged)
+            ranged = message_class("UwbRange")(range_m=value)
+            sink.write(round(at_s * 1e9), RANGE("cf1", "cf2"), ranged)
+            sink.write(round((at_s + 0.08) * 1e9), RANGE("cf2", "cf1"), ranged)
 
 
 def _boards(folder: Path) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from dmrl.pipeline import job_worker
 from dmrl.rendering.blender.protocol import Arrays
 from dmrl.rendering.robots import crazyflie
-from dmrl.rendering.worker_pool import Start
+from dmrl.rendering.worker_pool import WorkerStart
 
 FEW = (2, 3)
 """In place of the rounds, and the pictures, that `dmrl likeness` fits a camera by."""
@@ -44,9 +44,9 @@ class Painter:
 class Painters:
     """In place of `dmrl.rendering.worker_pool.Pool`."""
 
-    def __init__(self, start: Start, count: int) -> None:
+    def __init__(self, start: WorkerStart, count: int) -> None:
         self.version = "0"
-        self.points = np.asarray(crazyflie.CRAZYFLIE.mesh().vertices, float)
+        self.points = np.asarray(crazyflie.CRAZYFLIE.build_mesh().vertices, float)
 
     def call(self, job: Callable[[Painter], Any]) -> Any:
         """What ``job`` makes of a painter."""

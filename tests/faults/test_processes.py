@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.atomic_output import partial_of
-from dmrl.recording import check, read_table, recover, summary
+from dmrl.atomic_output import to_partial_path
+from dmrl.recording import check, read_summary, read_table, recover
 from dmrl.simulation.drone_fleet import Fleet
 from dmrl.simulation.drone_fleet import fleet as fly_fleet
 from dmrl.stages import fake_drone, fly
@@ -68,10 +68,10 @@ def recovered(folder: Path) -> bool:
     """Whether anything of a recording that was cut off could be brought back, and is sound."""
     out = folder / RECORD.out
     assert not out.exists()
-    if not partial_of(out).exists():
+    if not to_partial_path(out).exists():
         return False
     mended = folder / "mended.mcap"
-    status, said = ended(lambda: recover(partial_of(out), mended))
+    status, said = ended(lambda: recover(to_partial_path(out), mended))
     if status:
         assert "nothing to recover" in said or "no recording" in said, said
         return False
@@ -175,5 +175,5 @@ def test_a_soak_of_recording_loses_nothing_but_what_was_away(
     received = sum(link["received"] for link in told["links"])
     assert all(link["connections"] > 1 for link in told["links"]), told["links"]
     assert received >= 0.99 * sent
-    assert sum(told["messages"].values()) == summary(out).count
+    assert sum(told["messages"].values()) == read_summary(out).count
     count("soak of record: packets sent, received", cases=sent, right=received)

@@ -19,18 +19,18 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 import dmrl.recording
 from dmrl.errors import DmrlError
-from dmrl.messages import message, schema_bytes
+from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
     check,
-    glance,
-    log_times,
+    iter_topic_batches,
     read,
+    read_log_times,
     read_raw,
+    read_summary,
     recover,
-    stretches,
-    summary,
+    sample_topics,
 )
 
 from .conftest import SEED, Count, cases_of
@@ -55,16 +55,20 @@ FOREIGN: tuple[dict[str, Any], ...] = (
 
 def fill(write: Callable[[int, str, Any], None]) -> None:
     for k in range(6):
-        write(10 * k, TOPICS[0], message("Height")(height_m=k))
+        write(10 * k, TOPICS[0], message_class("Height")(height_m=k))
         peer = {"peer": "cf2", "u_px": 5.0 * k, "v_px": 7.0, "depth_m": 1.0, "source": "truth"}
-        write(10 * k, TOPICS[1], message("PeerLabels")(peers=[peer] * (k % 3), sources=["truth"]))
+        write(
+            10 * k,
+            TOPICS[1],
+            message_class("PeerLabels")(peers=[peer] * (k % 3), sources=["truth"]),
+        )
 
 
 def ours(path: Path) -> bytes:
     with RecordingWriter(path, Provenance("test")) as sink:
         fill(sink.write)
         sink.flush()
-        sink.write(70, TOPICS[0], message("Height")(height_m=7))
+        sink.write(70, TOPICS[0], message_class("Height")(height_m=7))
         sink.add_metadata("dmrl.split", {"train": "[[0, 10]]"})
         sink.add_attachment("note.txt", "text/plain", b"seven")
     return path.read_bytes()
@@ -76,7 +80,7 @@ def foreign(path: Path, options: dict[str, Any]) -> bytes:
         writer.start()
         numbers = {}
         for topic, kind in zip(TOPICS, ("Height", "PeerLabels"), strict=True):
-            schema = writer.register_schema(f"dmrl.v1.{kind}", "protobuf", schema_bytes(kind))
+            schema = writer.register_schema(f"dmrl.v1.{kind}", "protobuf", serialize_schema(kind))
             numbers[topic] = writer.register_channel(topic, "protobuf", schema)
         fill(lambda t, topic, m: writer.add_message(numbers[topic], t, m.SerializeToString(), t))
         writer.add_metadata("dmrl.split", {"train": "[[0, 10]]"})
@@ -86,14 +90,14 @@ def foreign(path: Path, options: dict[str, Any]) -> bytes:
 
 def read_all(path: Path) -> None:
     """Every way to read."""
-    summary(path)
+    read_summary(path)
     for _ in read(path):
         pass
     wanted = dict.fromkeys(TOPICS)
-    for _ in stretches(path, wanted):
+    for _ in iter_topic_batches(path, wanted):
         pass
-    glance(path, wanted, start_ns=0, end_ns=100)
-    log_times(path, TOPICS)
+    sample_topics(path, wanted, start_ns=0, end_ns=100)
+    read_log_times(path, TOPICS)
     check(path)
 
 

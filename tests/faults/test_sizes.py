@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.formats.registry import own
+from dmrl.formats.registry import load_builtin_formats
 
 from ..formats.test_fuzz import SOURCES
 from .conftest import Count
@@ -41,7 +41,7 @@ def _text(name: str) -> Make:
     return make
 
 
-OTHERS = own().keys() - {name for name, _ in SOURCES.values()}
+OTHERS = load_builtin_formats().keys() - {name for name, _ in SOURCES.values()}
 ALL = {**SOURCES, **{name: (name, _text(name)) for name in sorted(OTHERS)}}
 
 

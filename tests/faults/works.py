@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.atomic_output import partial_of
+from dmrl.atomic_output import to_partial_path
 from dmrl.datasets import open_dataset
 
 from .inputs import Inputs, cli, flights
@@ -63,12 +63,12 @@ class Work:
 
 
 def _train(i: Inputs, out: Path) -> None:
-    more = ("--resume",) if partial_of(out).is_dir() else ()
+    more = ("--resume",) if to_partial_path(out).is_dir() else ()
     cli("train", i.set, out, *i.training, *more)
 
 
 def _render(i: Inputs, out: Path) -> None:
-    more = ("--resume",) if partial_of(out).is_file() else ()
+    more = ("--resume",) if to_partial_path(out).is_file() else ()
     cli("render", i.scene, out, *more)
 
 

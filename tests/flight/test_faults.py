@@ -33,7 +33,7 @@ def changed(flight: Flight) -> dict[str, np.ndarray]:
         kept = np.isin(before.time_s, ranges.time_s)
         other_value = np.ones(len(kept), bool)
         other_value[kept] = ranges.range_m != before.range_m[kept]
-        found[f"{one}-{other}"] = PLAIN.clocks[one].true_time(before.time_s[other_value])
+        found[f"{one}-{other}"] = PLAIN.clocks[one].to_true_time(before.time_s[other_value])
     return {name: times for name, times in found.items() if len(times)}
 
 
@@ -110,9 +110,9 @@ def test_a_clock_is_off_and_everything_else_is_as_it_was() -> None:
     flight = flown(*wrong)
     clock, before = flight.clocks["cf2"], PLAIN.clocks["cf2"]
     assert clock == Clock(before.offset_s + 0.1, before.drift + 2e-4)
-    assert np.allclose(flight.robots["cf2"].time_s, clock.shows(flight.truth["cf2"].time_s))
-    true_s = clock.true_time(flight.ranges["cf2", "cf1"].time_s)
-    assert np.allclose(true_s, before.true_time(PLAIN.ranges["cf2", "cf1"].time_s))
+    assert np.allclose(flight.robots["cf2"].time_s, clock.to_clock_time(flight.truth["cf2"].time_s))
+    true_s = clock.to_true_time(flight.ranges["cf2", "cf1"].time_s)
+    assert np.allclose(true_s, before.to_true_time(PLAIN.ranges["cf2", "cf1"].time_s))
     assert not changed(replace(flight, ranges=PLAIN.ranges))
 
 
@@ -129,7 +129,7 @@ def test_a_robot_comes_down_and_lies_still(kind: FaultKind) -> None:
     assert np.array_equal(flight.robots["cf1"].vx_mps, PLAIN.robots["cf1"].vx_mps)
     away = flight.truth["cf1"].position_at(np.array([14.0])) - truth.position_at(np.array([14.0]))
     last = flight.ranges["cf1", "cf3"]
-    at = flight.clocks["cf1"].true_time(last.time_s) > 13.0
+    at = flight.clocks["cf1"].to_true_time(last.time_s) > 13.0
     assert np.median(last.range_m[at]) == pytest.approx(np.linalg.norm(away), abs=0.8)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dmrl.flight import NOISE, Flight, Noise, Scenario, simulate
-from dmrl.flight.sensors import coloured, pair_errors
+from dmrl.flight.sensors import draw_coloured_noise, draw_pair_errors
 from dmrl.geometry.frames import Array
 
 PRESETS = ["calibrated", "realistic", "harsh"]
@@ -100,7 +100,9 @@ def test_velocity_scale_and_bias_are_those_of_the_table(name: str) -> None:
 
 
 def test_coloured_noise_is_steady_and_fades() -> None:
-    made = np.array([coloured(np.random.default_rng(k), 300, 0.1, 0.3) for k in range(800)])
+    made = np.array(
+        [draw_coloured_noise(np.random.default_rng(k), 300, 0.1, 0.3) for k in range(800)]
+    )
     assert made[:, 0].std() == pytest.approx(0.1, rel=0.08)
     assert made[:, -1].std() == pytest.approx(0.1, rel=0.08)
     fading = (made[:, 100] * made[:, 130]).mean() / 0.01
@@ -111,7 +113,7 @@ def range_errors(flight: Flight) -> tuple[Array, int]:
     """Measured less true for every range, and how many ranges there would be without loss."""
     found = []
     for (here, peer), ranges in flight.ranges.items():
-        time_s = flight.clocks[here].true_time(ranges.time_s)
+        time_s = flight.clocks[here].to_true_time(ranges.time_s)
         away = flight.peer_in_horizontal(here, peer, time_s)
         found.append(ranges.range_m - np.linalg.norm(away, axis=1))
     return np.concatenate(found), len(flight.ranges)
@@ -125,7 +127,7 @@ def test_ranges_have_the_noise_of_the_table(preset: Preset) -> None:
         error, _ = range_errors(noisy)
         every.append(error)
         for (here, peer), ranges in noisy.ranges.items():
-            time_s = noisy.clocks[here].true_time(ranges.time_s)
+            time_s = noisy.clocks[here].to_true_time(ranges.time_s)
             true = np.linalg.norm(noisy.peer_in_horizontal(here, peer, time_s), axis=1)
             slope, offset = np.polyfit(true, ranges.range_m, 1)
             rest = ranges.range_m - slope * true - offset
@@ -146,7 +148,7 @@ def test_the_share_of_lost_ranges_is_that_of_the_table(preset: Preset) -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_bias_and_scale_of_a_pair_are_those_of_the_table(name: str) -> None:
     noise = NOISE[name]
-    drawn = np.array([pair_errors(np.random.default_rng(k), noise) for k in range(2000)])
+    drawn = np.array([draw_pair_errors(np.random.default_rng(k), noise) for k in range(2000)])
     assert drawn[:, 0].std() == pytest.approx(noise.uwb_bias_m, rel=0.06)
     assert drawn[:, 1].std() == pytest.approx(noise.uwb_scale, rel=0.06)
     assert drawn[:, 1].mean() == pytest.approx(1.0, abs=0.005)

@@ -115,15 +115,17 @@ def test_random_robots_start_apart() -> None:
 def test_clocks_go_there_and_back() -> None:
     clock = Clock(0.03, 2e-5)
     time_s = np.linspace(0, 100, 7)
-    assert np.allclose(clock.true_time(clock.shows(time_s)), time_s)
-    assert clock.shows(np.array([100.0]))[0] == pytest.approx(100.032)
+    assert np.allclose(clock.to_true_time(clock.to_clock_time(time_s)), time_s)
+    assert clock.to_clock_time(np.array([100.0]))[0] == pytest.approx(100.032)
 
 
 def test_the_first_robot_has_the_right_time_and_others_theirs() -> None:
     flight = simulate(replace(SHORT, robots=4), NOISE["harsh"], 1)
     assert flight.clocks["cf1"] == Clock()
     for robot, log in flight.robots.items():
-        assert np.allclose(log.time_s, flight.clocks[robot].shows(flight.truth[robot].time_s))
+        assert np.allclose(
+            log.time_s, flight.clocks[robot].to_clock_time(flight.truth[robot].time_s)
+        )
     offsets = {clock.offset_s for clock in flight.clocks.values()}
     assert len(offsets) == 4
     assert max(map(abs, offsets)) <= 0.04

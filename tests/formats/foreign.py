@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from dmrl.formats.aideck.cpx import Image
 from dmrl.formats.aideck.cpx_encode import pack_image
-from dmrl.formats.aideck.cpx_state import State
+from dmrl.formats.aideck.cpx_state import RobotState
 from dmrl.images.codec import encode_jpeg, encode_png
 
 from . import plain_usd
@@ -65,7 +65,7 @@ def pictures(count: int, height: int = 24, width: int = 32) -> list[np.ndarray]:
 
 def stream() -> bytes:
     """A CPX stream of nanocockpit's and of Bitcraze's kind, one behind the other."""
-    state = State(1000, 990_000, (1.0, 2.0, 0.5), (0.1, 0.0, 0.0))
+    state = RobotState(1000, 990_000, (1.0, 2.0, 0.5), (0.1, 0.0, 0.0))
     made = b"".join(
         pack_image(
             Image(32, 24, "raw", raw.tobytes(), 1_000_000 + 50_000 * k, k, state), "streamer"

@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.formats.crazyflie.log_block import Series
-from dmrl.formats.crazyflie.log_variables import _pose
+from dmrl.formats.crazyflie.log_block import TimeSeries
+from dmrl.formats.crazyflie.log_variables import _combine_pose
 
 GROWING = st.lists(st.integers(0, 9), min_size=1, max_size=6).map(sorted)
 
@@ -14,9 +14,9 @@ GROWING = st.lists(st.integers(0, 9), min_size=1, max_size=6).map(sorted)
 def test_a_pose_takes_the_turn_of_its_own_time_or_the_next_one(
     places: list[int], turns: list[int]
 ) -> None:
-    place = Series(np.array(places), np.arange(3.0 * len(places)).reshape(-1, 3))
-    turn = Series(np.array(turns), -1 - np.arange(4.0 * len(turns)).reshape(-1, 4))
-    found = _pose(place, turn)
+    place = TimeSeries(np.array(places), np.arange(3.0 * len(places)).reshape(-1, 3))
+    turn = TimeSeries(np.array(turns), -1 - np.arange(4.0 * len(turns)).reshape(-1, 4))
+    found = _combine_pose(place, turn)
     assert found is not None
     if both := sorted(set(places) & set(turns)):
         wanted = [(t, places.index(t), turns.index(t)) for t in both]

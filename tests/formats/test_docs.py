@@ -7,16 +7,16 @@ import pytest
 
 from dmrl.errors import SourceError
 from dmrl.formats.base import Options
-from dmrl.formats.files.image_folder import SUFFIXES
+from dmrl.formats.files.image_folder import IMAGE_SUFFIXES
 from dmrl.formats.files.label_csv import COLUMNS
-from dmrl.formats.registry import own
-from dmrl.geometry.camera_file import KNOWN
+from dmrl.formats.registry import load_builtin_formats
+from dmrl.geometry.camera_file import NAMED_CAMERAS
 from dmrl.geometry.frames import Camera
 
 TEXT = (Path(__file__).parents[2] / "docs" / "sources.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("kind", own())
+@pytest.mark.parametrize("kind", load_builtin_formats())
 def test_every_kind_is_documented(kind: str) -> None:
     assert f"## `{kind}`" in TEXT
 
@@ -24,8 +24,8 @@ def test_every_kind_is_documented(kind: str) -> None:
 def test_every_column_key_and_suffix_is_documented() -> None:
     keys = [field.name for field in fields(Camera)]
     assert [name for name in (*COLUMNS, *keys) if f"`{name}`" not in TEXT] == []
-    assert all(name in TEXT for name in KNOWN)
-    assert " ".join(SUFFIXES) in TEXT
+    assert all(name in TEXT for name in NAMED_CAMERAS)
+    assert " ".join(IMAGE_SUFFIXES) in TEXT
 
 
 def test_the_worked_example_of_a_format_reads_what_it_says(tmp_path: Path) -> None:

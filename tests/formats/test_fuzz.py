@@ -12,8 +12,8 @@ import pytest
 
 from dmrl.errors import DmrlError
 from dmrl.formats.base import Options
-from dmrl.formats.registry import own
-from dmrl.messages import message
+from dmrl.formats.registry import load_builtin_formats
+from dmrl.messages import message_class
 
 from ..faults.mutate import mutated
 from . import foreign
@@ -109,8 +109,8 @@ SOURCES = {
 def convert(name: str, source: Path) -> int:
     """Messages of a source. DmrlError is the one error that may come."""
     count = 0
-    for sample in own()[name].content(source, Options()).samples:
-        message(sample.message)(**sample.fields).SerializeToString()
+    for sample in load_builtin_formats()[name].content(source, Options()).samples:
+        message_class(sample.message)(**sample.fields).SerializeToString()
         count += 1
     return count
 

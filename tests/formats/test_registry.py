@@ -11,7 +11,7 @@ from dmrl import plugins
 from dmrl.errors import PluginError, SourceError
 from dmrl.formats import registry
 from dmrl.formats.base import Content, Format, Options
-from dmrl.formats.registry import FIRST, format_of, own
+from dmrl.formats.registry import GUESS_ORDER, find_format, load_builtin_formats
 from dmrl.plugins import Plugin
 from dmrl.samples.sample import Sample
 
@@ -55,22 +55,22 @@ def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def test_formats_stand_in_the_order_in_which_they_are_tried() -> None:
-    names = list(own())
-    assert tuple(names[: len(FIRST)]) == FIRST
+    names = list(load_builtin_formats())
+    assert tuple(names[: len(GUESS_ORDER)]) == GUESS_ORDER
     assert names[-1] == "images"
-    assert names[len(FIRST) : -1] == sorted(names[len(FIRST) : -1]) != []
-    assert all(name == form.name for name, form in own().items())
+    assert names[len(GUESS_ORDER) : -1] == sorted(names[len(GUESS_ORDER) : -1]) != []
+    assert all(name == form.name for name, form in load_builtin_formats().items())
 
 
 def test_the_sources_of_each_are_known(tmp_path: Path) -> None:
     (tmp_path / "log").write_bytes(foreign.usd_log())
-    assert format_of(tmp_path / "log").name == "cfusdlog"
+    assert find_format(tmp_path / "log").name == "cfusdlog"
     folder = tmp_path / "pictures"
     folder.mkdir()
     for name, data in foreign.coloured().items():
         (folder / name).write_bytes(data)
-    assert format_of(folder).name == "images"
-    assert format_of(folder, "csv") is own()["csv"]  # who says so is believed
+    assert find_format(folder).name == "images"
+    assert find_format(folder, "csv") is load_builtin_formats()["csv"]  # who says so is believed
 
 
 @pytest.mark.parametrize(
@@ -84,22 +84,22 @@ def test_the_sources_of_each_are_known(tmp_path: Path) -> None:
 def test_what_is_no_source_is_said(name: str, data: bytes, said: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(data)
     with pytest.raises(SourceError) as e:
-        format_of(tmp_path / name)
+        find_format(tmp_path / name)
     assert said in str(e.value) and name in str(e.value)
 
 
 def test_folders_that_are_empty_and_things_that_are_not_there_are_said(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="is an empty folder"):
-        format_of(tmp_path)
+        find_format(tmp_path)
     with pytest.raises(SourceError, match=r"no file or folder .*nothing. Pass one"):
-        format_of(tmp_path / "nothing")
+        find_format(tmp_path / "nothing")
     (tmp_path / "below").mkdir()
     os.mkfifo(tmp_path / "below" / "pipe")
     for name in (None, "images"):
         with pytest.raises(SourceError, match=r"pipe is neither a file nor a folder. Move it out"):
-            format_of(tmp_path, name)
+            find_format(tmp_path, name)
     with pytest.raises(SourceError, match=r"pipe is neither a file nor a folder. Save it"):
-        format_of(tmp_path / "below" / "pipe")
+        find_format(tmp_path / "below" / "pipe")
 
 
 def test_a_kind_that_is_misspelled_is_told_the_near_one(
@@ -113,7 +113,7 @@ def test_a_kind_that_is_misspelled_is_told_the_near_one(
         ("zz", ""),
     ):
         with pytest.raises(SourceError) as e:
-            format_of(tmp_path / "a", name)
+            find_format(tmp_path / "a", name)
         assert f"--from {name}: no such format. {hint}Formats: locanet, csv" in str(e.value)
         assert str(e.value).endswith("images, theirs")
 
@@ -123,19 +123,19 @@ def test_a_plug_in_is_asked_after_our_own_and_by_its_name(
 ) -> None:
     plug(broken="BROKEN", theirs="FORMAT", none="NONE")
     (tmp_path / "a.theirs").write_bytes(b"x")
-    found = format_of(tmp_path / "a.theirs")
+    found = find_format(tmp_path / "a.theirs")
     assert (found.name, found.what) == ("theirs", "a log of theirs")
     assert found.recognises(tmp_path / "a.theirs") and not found.recognises(tmp_path / "a.txt")
     err = capsys.readouterr().err
     assert "of the package their-logs, fails to check" in err and "Not tried on" in err
     (tmp_path / "log").write_bytes(foreign.usd_log())
-    assert format_of(tmp_path / "log").name == "cfusdlog"
-    assert format_of(tmp_path / "log", "theirs").name == "theirs"
+    assert find_format(tmp_path / "log").name == "cfusdlog"
+    assert find_format(tmp_path / "log", "theirs").name == "theirs"
     assert capsys.readouterr().err == ""
     with pytest.raises(
         PluginError, match=r"none, of the package their-logs, is not a dmrl.formats"
     ):
-        format_of(tmp_path / "log", "none")
+        find_format(tmp_path / "log", "none")
 
 
 def test_what_fails_in_a_plug_in_names_its_package(
@@ -146,8 +146,8 @@ def test_what_fails_in_a_plug_in_names_its_package(
     with pytest.raises(
         PluginError, match=r"broken, of the package their-logs, fails to read .*Zero"
     ):
-        format_of(tmp_path / "a.late", "broken").content(tmp_path / "a.late", Options())
-    content = format_of(tmp_path / "a.late", "late").content(tmp_path / "a.late", Options())
+        find_format(tmp_path / "a.late", "broken").content(tmp_path / "a.late", Options())
+    content = find_format(tmp_path / "a.late", "late").content(tmp_path / "a.late", Options())
     assert content.total == 5
     assert next(content.samples).fields == {"height_m": 1.0}
     with pytest.raises(

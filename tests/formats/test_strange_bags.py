@@ -11,7 +11,7 @@ import zstandard
 
 from dmrl.errors import SourceError
 from dmrl.formats.base import Options
-from dmrl.formats.ros.bag import content
+from dmrl.formats.ros.bag import load_content
 from dmrl.guards import limits
 
 TOPICS = (
@@ -45,7 +45,7 @@ MD5 = "5c9fb1a886e81e3162a5c87bf55c072b"
 
 
 def read(path: Path) -> None:
-    for _ in content(path, Options()).samples:
+    for _ in load_content(path, Options()).samples:
         pass
 
 

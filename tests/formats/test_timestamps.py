@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmrl.formats.timestamps import (
-    SteadySender,
-    Unwrapped,
+    CounterUnwrapper,
+    SteadyRateFilter,
     _lower_hull,
-    _numbered,
+    _number_arrivals,
     dejitter,
     unwrap,
 )
@@ -50,9 +50,9 @@ def test_where_holes_and_jitter_cannot_be_told_apart_arrivals_stand() -> None:
 
 
 def test_counters_unwrap_forward_or_to_the_nearest() -> None:
-    frames = Unwrapped(8, forward=True)
+    frames = CounterUnwrapper(8, forward=True)
     assert [frames(value) for value in (250, 255, 0, 254, 253)] == [250, 255, 256, 510, 765]
-    times = Unwrapped(32)
+    times = CounterUnwrapper(32)
     assert [times(value) for value in (4294967290, 5, 4294967295)] == [
         4294967290,
         4294967301,
@@ -61,16 +61,16 @@ def test_counters_unwrap_forward_or_to_the_nearest() -> None:
 
 
 def test_a_counter_is_asked_for_values_of_more_bits_without_being_changed() -> None:
-    times = Unwrapped(24)
+    times = CounterUnwrapper(24)
     times(5)
-    assert times.near((7 << 24) + 8) == 8
-    assert times.near((1 << 24) - 2) == -2
+    assert times.find_nearest((7 << 24) + 8) == 8
+    assert times.find_nearest((1 << 24) - 2) == -2
     assert times(6) == 6
 
 
 def test_arrivals_of_a_steady_sender_are_evened_out_and_never_in_the_future() -> None:
     rng = np.random.default_rng(3)
-    sender, errors_ms, raw_ms, last = SteadySender(), [], [], 0
+    sender, errors_ms, raw_ms, last = SteadyRateFilter(), [], [], 0
     for k in range(1000):
         true_ns = 50 * MS * k
         last = arrival = max(true_ns + round(rng.exponential(15) * MS), last)
@@ -82,7 +82,7 @@ def test_arrivals_of_a_steady_sender_are_evened_out_and_never_in_the_future() ->
 
 
 def test_after_a_pause_arrivals_stand_as_they_are() -> None:
-    sender = SteadySender()
+    sender = SteadyRateFilter()
     for k in range(20):
         sender(50 * MS * k)
     assert sender(5000 * MS) == 5000 * MS
@@ -92,7 +92,7 @@ def test_after_a_pause_arrivals_stand_as_they_are() -> None:
 def test_half_of_a_counter_s_range_is_a_step_back_and_less_is_one_ahead() -> None:
     assert unwrap([3, 131, 3], 8).tolist() == [3, -125, -253]
     assert unwrap([3, 130], 8).tolist() == [3, 130]
-    ahead = Unwrapped(8)
+    ahead = CounterUnwrapper(8)
     assert [ahead(value) for value in (3, 130, 2, 129)] == [3, 130, 2, 129]
     assert ahead(1) == 1 and ahead(129) == -127
 
@@ -100,14 +100,14 @@ def test_half_of_a_counter_s_range_is_a_step_back_and_less_is_one_ahead() -> Non
 def test_a_hole_is_seen_from_seven_tenths_of_a_period_beyond_what_is_due() -> None:
     steady = [100 * k for k in range(10)]
     for last, number in ((1069, 10), (1072, 11), (1169, 11), (1172, 12), (2500, 25)):
-        assert _numbered(np.array([*steady, last])).tolist() == [*range(10), number]
+        assert _number_arrivals(np.array([*steady, last])).tolist() == [*range(10), number]
 
 
 def test_what_is_due_follows_early_arrivals_by_three_tenths() -> None:
     # Early by 20 of 100, then late by 6: due at 994, then 1094.06.
     steady = [*(100 * k for k in range(10)), 980, 1100]
     for last, number in ((1263, 12), (1265, 13)):
-        assert _numbered(np.array([*steady, last]))[-1] == number
+        assert _number_arrivals(np.array([*steady, last]))[-1] == number
 
 
 def test_the_lower_hull_bends_upwards_and_takes_the_lowest_of_one_place() -> None:
@@ -125,7 +125,7 @@ def test_times_lie_on_the_line_under_all_arrivals(count: list[int] | None) -> No
 
 
 def test_seven_arrivals_stand_and_the_eighth_is_where_their_pace_has_it() -> None:
-    sender = SteadySender()
+    sender = SteadyRateFilter()
     arrivals = [0, 60, 90, 160, 195, 260, 300]
     assert [sender(a * MS) for a in arrivals] == [a * MS for a in arrivals]
     # At a pace of 352 / 7 it is due 50.3 ms after the seventh, and a fiftieth of the rest later.
@@ -134,7 +134,7 @@ def test_seven_arrivals_stand_and_the_eighth_is_where_their_pace_has_it() -> Non
 
 
 def test_the_pace_is_that_of_the_last_64_arrivals() -> None:
-    sender, now = SteadySender(), 0
+    sender, now = SteadyRateFilter(), 0
     for step in [50] * 100 + [40] * 64:
         now += step * MS
         assert sender(now) == now  # early arrivals are followed at once
@@ -144,7 +144,7 @@ def test_the_pace_is_that_of_the_last_64_arrivals() -> None:
 
 @pytest.mark.parametrize(("late", "stands"), [(3.7, False), (4.6, True)])
 def test_a_pause_is_of_more_than_four_paces(late: float, stands: bool) -> None:
-    sender = SteadySender()
+    sender = SteadyRateFilter()
     for k in range(64):
         sender(50 * MS * k)
     # The pace itself grows a little: (62 + 1 + late) / 63 of what it was.
@@ -156,7 +156,7 @@ def test_a_pause_is_of_more_than_four_paces(late: float, stands: bool) -> None:
 
 def test_nothing_is_sent_after_it_arrived_on_a_clock_of_today() -> None:
     """Where a float is a quarter of a microsecond coarse."""
-    rng, sender = np.random.default_rng(4), SteadySender()
+    rng, sender = np.random.default_rng(4), SteadyRateFilter()
     steps = rng.integers(49 * MS, 51 * MS, 300)
     for arrival in (17 * 10**17 + np.cumsum(steps)).tolist():
         assert sender(arrival) <= arrival

@@ -3,22 +3,22 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import SourceError
-from dmrl.geometry.camera_file import camera_named, read_camera, write_camera
+from dmrl.geometry.camera_file import find_camera, format_camera, read_camera
 from dmrl.geometry.frames import AIDECK, PUBLISHED_RENDER, Camera
 
 
 @pytest.mark.parametrize("camera", [AIDECK, PUBLISHED_RENDER])
 def test_a_camera_comes_back_as_written(camera: Camera, tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
-    path.write_text(write_camera(camera))
+    path.write_text(format_camera(camera))
     assert read_camera(path) == camera
 
 
 def test_a_camera_has_a_name_or_a_file(tmp_path: Path) -> None:
-    assert camera_named(Path("published")) == PUBLISHED_RENDER
+    assert find_camera(Path("published")) == PUBLISHED_RENDER
     path = tmp_path / "camera.toml"
-    path.write_text(write_camera(AIDECK))
-    assert camera_named(path) == AIDECK
+    path.write_text(format_camera(AIDECK))
+    assert find_camera(path) == AIDECK
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def test_a_camera_has_a_name_or_a_file(tmp_path: Path) -> None:
 )
 def test_wrong_keys_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
     path = tmp_path / "camera.toml"
-    path.write_text(write_camera(AIDECK).replace(old, new, 1))
+    path.write_text(format_camera(AIDECK).replace(old, new, 1))
     with pytest.raises(SourceError, match=message) as e:
         read_camera(path)
     assert "\n" not in str(e.value)
@@ -66,7 +66,7 @@ def test_numbers_that_no_camera_has_are_refused(
     tmp_path: Path, key: str, value: str, good: bool
 ) -> None:
     path = tmp_path / "camera.toml"
-    lines = write_camera(AIDECK).splitlines()
+    lines = format_camera(AIDECK).splitlines()
     path.write_text("\n".join(f"{key} = {value}" if key in line else line for line in lines))
     if good:
         read_camera(path)

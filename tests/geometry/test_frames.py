@@ -15,10 +15,10 @@ from dmrl.geometry.frames import (
     AIDECK,
     PUBLISHED_RENDER,
     Array,
+    build_grid_label,
     camera_from_horizontal,
-    grid_label,
     horizontal_from_pixels,
-    inside,
+    is_inside,
     pixels_from_horizontal,
     project,
 )
@@ -137,11 +137,11 @@ def test_the_cameras_are_those_of_the_paper_and_of_the_published_images() -> Non
 
 def test_the_left_and_top_edge_belong_to_the_image_and_the_others_do_not() -> None:
     uv = np.array([[0, 0], [319.999, 223.999], [320, 100], [100, 224], [-0.001, 5]])
-    assert inside(uv, 320, 224).tolist() == [True, True, False, False, False]
+    assert is_inside(uv, 320, 224).tolist() == [True, True, False, False, False]
 
 
 def test_a_peer_marks_the_cell_at_row_v_and_column_u() -> None:
-    grid = grid_label(np.array([[100.0, 50.0]]), np.array([1.5]))
+    grid = build_grid_label(np.array([[100.0, 50.0]]), np.array([1.5]))
     assert grid.shape == (2, 28, 40)
     assert grid.dtype == np.float32
     assert np.argwhere(grid[0]).tolist() == [[50 // 8, 100 // 8]]
@@ -152,25 +152,25 @@ def test_a_peer_marks_the_cell_at_row_v_and_column_u() -> None:
 @pytest.mark.parametrize("order", [[0, 1], [1, 0]])
 def test_of_two_peers_in_a_cell_the_nearer_wins(order: list[int]) -> None:
     uv = np.array([[100.0, 50.0], [101.0, 51.0]])[order]
-    grid = grid_label(uv, np.array([1.5, 0.7])[order])
+    grid = build_grid_label(uv, np.array([1.5, 0.7])[order])
     assert grid[1, 6, 12] == np.float32(0.7)
     assert grid[0].sum() == 1
 
 
 def test_peers_outside_the_image_and_no_peers_leave_the_grid_empty() -> None:
     outside = np.array([[320.0, 5.0], [5.0, 224.0], [-1.0, 5.0], [5.0, -0.1]])
-    assert not grid_label(outside, np.ones(4)).any()
-    assert not grid_label(np.empty((0, 2)), np.empty(0)).any()
+    assert not build_grid_label(outside, np.ones(4)).any()
+    assert not build_grid_label(np.empty((0, 2)), np.empty(0)).any()
 
 
 def test_the_corner_pixels_mark_the_corner_cells() -> None:
     uv = np.array([[0.0, 0.0], [319.9, 223.9]])
-    grid = grid_label(uv, np.array([1.0, 2.0]))
+    grid = build_grid_label(uv, np.array([1.0, 2.0]))
     assert np.argwhere(grid[0]).tolist() == [[0, 0], [27, 39]]
 
 
 def test_other_grids_than_the_paper_s_work_too() -> None:
-    grid = grid_label(np.array([[30.0, 20.0]]), np.array([1.0]), shape=(2, 4), stride_px=16)
+    grid = build_grid_label(np.array([[30.0, 20.0]]), np.array([1.0]), shape=(2, 4), stride_px=16)
     assert np.argwhere(grid[0]).tolist() == [[1, 1]]
 
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmrl.geometry.frames import Array
-from dmrl.geometry.rotations import euler_zyx, quaternion_zyx
+from dmrl.geometry.rotations import euler_to_quaternion, quaternion_to_euler
 
 TILT = st.floats(-1.5, 1.5)
 TURN = st.floats(-3.1, 3.1)
@@ -32,7 +32,7 @@ def rotation(quaternion: Array) -> Array:
 
 @given(TURN, TILT, TURN)
 def test_roll_is_first_then_pitch_then_yaw(roll: float, pitch: float, yaw: float) -> None:
-    (quaternion,) = quaternion_zyx(np.array([[roll, pitch, yaw]]))
+    (quaternion,) = euler_to_quaternion(np.array([[roll, pitch, yaw]]))
     assert np.linalg.norm(quaternion) == pytest.approx(1)
     wanted = about(2, yaw) @ about(1, pitch) @ about(0, roll)
     np.testing.assert_allclose(rotation(quaternion), wanted, atol=1e-9)
@@ -43,7 +43,9 @@ def test_angles_come_back_from_either_quaternion(
     roll: float, pitch: float, yaw: float, sign: float
 ) -> None:
     angles = np.array([[roll, pitch, yaw], [0.1, 0.2, 0.3]])
-    np.testing.assert_allclose(euler_zyx(sign * quaternion_zyx(angles)), angles, atol=1e-6)
+    np.testing.assert_allclose(
+        quaternion_to_euler(sign * euler_to_quaternion(angles)), angles, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -59,9 +61,9 @@ def test_angles_come_back_from_either_quaternion(
 def test_turns_about_one_axis_by_hand(
     quaternion: tuple[float, ...], angles: tuple[float, float, float]
 ) -> None:
-    np.testing.assert_allclose(euler_zyx(np.array([quaternion]))[0], angles, atol=1e-7)
+    np.testing.assert_allclose(quaternion_to_euler(np.array([quaternion]))[0], angles, atol=1e-7)
 
 
 def test_rounding_beyond_straight_down_is_no_error() -> None:
     steep = np.array([[0.0, HALF + 1e-9, 0.0, HALF + 1e-9], [0.0, -HALF - 1e-9, 0.0, HALF + 1e-9]])
-    np.testing.assert_allclose(euler_zyx(steep)[:, 1], [np.pi / 2, -np.pi / 2])
+    np.testing.assert_allclose(quaternion_to_euler(steep)[:, 1], [np.pi / 2, -np.pi / 2])

@@ -12,26 +12,26 @@ from dmrl.datasets import open_dataset
 from dmrl.deploy.detector import open_detector
 from dmrl.deploy.int8 import store
 from dmrl.errors import UnsafeName
-from dmrl.formats.files.image_folder import list_pictures
+from dmrl.formats.files.image_folder import list_images
 from dmrl.geometry.camera_file import read_camera
-from dmrl.guards.paths import refuse_no_text, refuse_pipe, refuse_pipes
-from dmrl.html_report import gather
+from dmrl.guards.paths import refuse_pipe, refuse_pipes, require_text_path
+from dmrl.html_report import collect_outputs
 from dmrl.learn.inference.loaded_model import load_model
-from dmrl.recording.provenance_inputs import input_of
-from dmrl.rendering.backgrounds.photos import photos_in
+from dmrl.recording.provenance_inputs import build_input
+from dmrl.rendering.backgrounds.photos import open_photos
 from dmrl.stages import calibrate, convert
-from dmrl.storage import path_of
+from dmrl.storage import to_path
 
 OPENED: dict[str, Callable[[Path], object]] = {
     "a dataset": open_dataset,
     "a model": load_model,
-    "an int8 model": store.load,
+    "an int8 model": store.load_network,
     "a model for a backend": lambda path: open_detector(path, "onnx"),
-    "pictures": lambda path: list_pictures(path, 10.0),
-    "backgrounds": photos_in,
-    "outputs": gather,
+    "pictures": lambda path: list_images(path, 10.0),
+    "backgrounds": open_photos,
+    "outputs": collect_outputs,
     "logs": lambda path: convert.run(path, path.with_name("a.mcap"), convert.Settings()),
-    "an input": lambda path: input_of(path / "a.png"),
+    "an input": lambda path: build_input(path / "a.png"),
     "boards": lambda path: calibrate.run(
         [path], path.with_name("a.toml"), calibrate.Settings("7x5")
     ),
@@ -66,14 +66,14 @@ def test_pipes_and_links_to_devices_are_found_at_any_depth(folder: Path) -> None
 def test_what_is_no_folder_here_is_left_to_who_opens_it(folder: Path) -> None:
     refuse_pipes(folder / "a.txt")
     refuse_pipes(folder / "absent")
-    refuse_pipes(path_of("s3://bucket/key"))
+    refuse_pipes(to_path("s3://bucket/key"))
 
 
 @pytest.mark.parametrize(
     "reads",
     [
-        path_of,
-        recipe.text,
+        to_path,
+        recipe.read_text,
         lambda name: read_camera(Path(name)),
         lambda name: refuse_pipes(Path(name)),
     ],
@@ -113,14 +113,14 @@ def test_what_may_be_named_is_a_file_a_folder_or_nothing(tmp_path: Path) -> None
     for name in (tmp_path, tmp_path / "absent", Path("x" * 5000)):
         refuse_pipe(name)
     with pytest.raises(UnsafeName, match=r"no file can be called 'a\\x00b'"):
-        path_of("a\0b")
+        to_path("a\0b")
 
 
 @pytest.mark.parametrize("name", [os.fsdecode(b"\xff"), os.fsdecode(b"\xff/b"), "a\0b"])
 def test_a_name_that_is_no_text_is_said(name: str) -> None:
-    refuse_no_text(Path("\N{LATIN SMALL LETTER E WITH ACUTE} \n\x1b"))
+    require_text_path(Path("\N{LATIN SMALL LETTER E WITH ACUTE} \n\x1b"))
     with pytest.raises(UnsafeName, match=r"(Rename it|Check the name)$"):
-        refuse_no_text(Path(name))
+        require_text_path(Path(name))
 
 
 @pytest.mark.parametrize("what", ["a dataset", "a model", "a model for a backend"])

@@ -5,47 +5,47 @@ from pathlib import Path
 import pytest
 
 from dmrl import topics
-from dmrl.errors import RecordingError, UnsafeName, one_line
+from dmrl.errors import RecordingError, UnsafeName, to_one_line
 from dmrl.guards.safe_names import (
-    MOST_BYTES,
-    code,
-    file_of_topic,
-    inside,
-    markdown,
-    plain,
-    split_name,
+    NAME_BYTES_MAX,
+    check_split_name,
+    comment_safe,
+    escape_markdown,
+    markdown_code,
+    safe_join,
+    to_topic_file_name,
 )
 
 HOSTILE = (
     *("", ".", "..", "../x", "../../victim", "/etc/passwd", "a/b", "a\\b", ".hidden", "a/../b"),
-    *("a\nb", "a\0b", "a\x1b[31mb", "a\u202eb", "a" * (MOST_BYTES + 1), "ü" * MOST_BYTES),
+    *("a\nb", "a\0b", "a\x1b[31mb", "a\u202eb", "a" * (NAME_BYTES_MAX + 1), "ü" * NAME_BYTES_MAX),
 )
 
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_no_name_leads_out_of_its_folder(name: str, tmp_path: Path) -> None:
     with pytest.raises(UnsafeName) as error:
-        inside(tmp_path, name, "flight.mcap: the split")
+        safe_join(tmp_path, name, "flight.mcap: the split")
     assert str(error.value).startswith("flight.mcap: the split")
-    assert one_line(str(error.value)) == str(error.value)
+    assert to_one_line(str(error.value)) == str(error.value)
 
 
 @pytest.mark.parametrize("name", ["cf1", "Flug 3 (äöü)", "a.b", "x-1_2"])
 def test_honest_names_stay_what_they_are(name: str, tmp_path: Path) -> None:
-    assert inside(tmp_path, name, "it", suffix=".csv") == tmp_path / f"{name}.csv"
+    assert safe_join(tmp_path, name, "it", suffix=".csv") == tmp_path / f"{name}.csv"
 
 
 @pytest.mark.parametrize("name", [*HOSTILE, "data", "figures", "README.md", 'x"]; import os', "`"])
 def test_a_split_is_called_by_a_word(name: str) -> None:
     with pytest.raises(UnsafeName):
-        split_name(name, "it")
+        check_split_name(name, "it")
 
 
 @pytest.mark.parametrize("name", ["Data", "readme.MD", "con", "AUX", "nul.x", "Com1", "lpt9"])
 def test_a_split_has_a_folder_of_its_own_on_every_disk(name: str) -> None:
     with pytest.raises(UnsafeName, match="Rename it"):
-        split_name(name, "it")
-    assert split_name(f"x-{name}", "it") == f"x-{name}"
+        check_split_name(name, "it")
+    assert check_split_name(f"x-{name}", "it") == f"x-{name}"
 
 
 def test_every_topic_has_a_file_of_its_own() -> None:
@@ -54,7 +54,7 @@ def test_every_topic_has_a_file_of_its_own() -> None:
         *("/cf1/height/", "//cf1/height", "/cf1/../height", "/../../victim", "/", "/cf1 height"),
         *("/=cf1/height", "=cf1/height", "/%3Dcf1/height", "/cf1\\height", "/cf1\nheight"),
     ]
-    files = [file_of_topic(topic) for topic in known]
+    files = [to_topic_file_name(topic) for topic in known]
     assert len(set(files)) == len(known)
     assert not any(set("/\\\n") & set(name) for name in files)
     assert files[0] == "cf1.height"
@@ -63,23 +63,25 @@ def test_every_topic_has_a_file_of_its_own() -> None:
 @pytest.mark.parametrize("name", ["", "a/b", "a\nb", "a" * 300])
 def test_a_robot_s_name_is_one_part_of_a_topic(name: str) -> None:
     with pytest.raises(UnsafeName, match="a robot is called"):
-        topics.height(name)
+        topics.HEIGHT(name)
 
 
 @pytest.mark.parametrize(
     "text", ["*/ int x; /*", "a\nb", "a\\\nb", "??/\n", '"', "$(shell x)", "\r", "\u2028", "`x`"]
 )
 def test_nothing_ends_a_comment(text: str) -> None:
-    assert not set(plain(text)) & set("*/\\\n\r?\"'$`\u2028<>[]#")
+    assert not set(comment_safe(text)) & set("*/\\\n\r?\"'$`\u2028<>[]#")
 
 
 def test_markup_is_shown_and_not_obeyed() -> None:
-    assert markdown("a|b<img src=x>[x](http://y)\nc") == r"a\|b\<img src=x\>\[x\](http:\//y) c"
-    assert markdown("https://x WWW.y") == r"https:\//x WWW\.y"
-    assert code("a`b") == "``a`b``"
-    assert code("`") == "`` ` ``"
-    assert code("a\n\n# b") == "`a  # b`"
-    assert one_line("a\x1b]0;x\x07\u202eb\r\nc") == r"a\x1b]0;x\x07\u202eb c"
+    assert (
+        escape_markdown("a|b<img src=x>[x](http://y)\nc") == r"a\|b\<img src=x\>\[x\](http:\//y) c"
+    )
+    assert escape_markdown("https://x WWW.y") == r"https:\//x WWW\.y"
+    assert markdown_code("a`b") == "``a`b``"
+    assert markdown_code("`") == "`` ` ``"
+    assert markdown_code("a\n\n# b") == "`a  # b`"
+    assert to_one_line("a\x1b]0;x\x07\u202eb\r\nc") == r"a\x1b]0;x\x07\u202eb c"
 
 
 def test_an_error_is_one_line_whatever_it_quotes() -> None:

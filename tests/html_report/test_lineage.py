@@ -1,6 +1,6 @@
 """The graph of a provenance: one box a stage and round, arrows from what it was made from."""
 
-from dmrl.html_report.lineage import ancestry
+from dmrl.html_report.lineage import build_lineage
 from dmrl.recording import Input, Provenance
 
 
@@ -14,7 +14,7 @@ def test_a_chain_in_columns_with_counts_and_rounds() -> None:
     train = _made("train", Input("a", "10", label[0]), Input("b", "11", label[1]))
     again = _made("label", Input("f0", "0", fly[0]), Input("model", "20", train))
     made = dict(zip("abcdef", [*fly, *label, train, again], strict=True))
-    columns, arrows = ancestry(made)
+    columns, arrows = build_lineage(made)
     assert columns == [["fly x2"], ["label x2"], ["train"], ["label, round 2"]]
     assert set(arrows) == {
         ("fly x2", "label x2"),
@@ -25,12 +25,12 @@ def test_a_chain_in_columns_with_counts_and_rounds() -> None:
 
 
 def test_files_of_others_are_sources() -> None:
-    columns, arrows = ancestry({"a": _made("convert", Input("log.csv", "1"))})
+    columns, arrows = build_lineage({"a": _made("convert", Input("log.csv", "1"))})
     assert columns == [["file log.csv"], ["convert"]] and arrows == [("file log.csv", "convert")]
     many = _made("convert", *(Input(f"{k}.csv", f"{k}") for k in range(40)))
-    columns, _ = ancestry({"a": many})
+    columns, _ = build_lineage({"a": many})
     assert len(columns[0]) == 13 and columns[0][-1] == "more files"
 
 
 def test_nothing_made_is_an_empty_graph() -> None:
-    assert ancestry({}) == ([], [])
+    assert build_lineage({}) == ([], [])

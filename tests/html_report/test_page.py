@@ -12,10 +12,10 @@ import pytest
 
 import dmrl
 from dmrl.errors import OutputError, SettingError
-from dmrl.html_report import gather, page, write
+from dmrl.html_report import build_report, collect_outputs, write_html_report
 from dmrl.images.codec import encode_png
 from dmrl.plots import charts
-from dmrl.plots.image_figures import _text_places
+from dmrl.plots.image_figures import _place_texts
 
 Evaluation = Callable[..., dict[str, Any]]
 
@@ -45,7 +45,7 @@ class _Seen(HTMLParser):
 
 @pytest.mark.heavy
 def test_the_page_shows_what_is_there_and_fetches_nothing(outputs: Path) -> None:
-    html = page(gather(outputs))
+    html = build_report(collect_outputs(outputs))
     seen = _Seen(html)
     wanted = ["Detections", "Positions", "Training", "Images", "Recordings"]
     assert seen.headings == [*wanted, "Provenance"]
@@ -67,7 +67,7 @@ def test_pictures_have_every_figure_of_the_card_and_no_heading_for_positions(
     dmrl.make_dataset(tmp_path / "pictures.mcap", tmp_path / "dataset")
     drawn = {path.stem for path in (tmp_path / "dataset/figures").glob("*.png")}
     assert drawn
-    html = page(gather(tmp_path))
+    html = build_report(collect_outputs(tmp_path))
     assert all(f"dataset: {name}<" in html for name in drawn)
     assert "Positions" not in _Seen(html).headings
 
@@ -82,7 +82,7 @@ def test_names_and_documents_cannot_become_markup(outputs: Path, evaluation: Eva
     (outputs / "model/model.json").write_text(json.dumps(about))
     (outputs / "<img src=x>").mkdir()
     (outputs / "<img src=x>/evaluation.json").write_text(json.dumps(document))
-    seen = _Seen(page(gather(outputs)))
+    seen = _Seen(build_report(collect_outputs(outputs)))
     assert "script" not in seen.tags and "x" not in seen.places
 
 
@@ -106,7 +106,7 @@ def test_documents_that_are_not_as_they_should_be_leave_the_rest(
     for k, document in enumerate(odd):
         (outputs / f"odd{k}").mkdir()
         (outputs / f"odd{k}/evaluation.json").write_text(json.dumps(document))
-    html = page(gather(outputs))
+    html = build_report(collect_outputs(outputs))
     assert all(f"odd{k}" in html for k in range(len(odd)))
     assert "odd5 does not have dmrl's form" in html
     assert "evaluation.json is not a table" in html
@@ -117,7 +117,7 @@ def test_documents_that_are_not_as_they_should_be_leave_the_rest(
 def test_damaged_recordings_and_pictures_are_named_and_the_rest_is_shown(outputs: Path) -> None:
     (outputs / "cut.mcap").write_bytes((outputs / "flight.mcap").read_bytes()[:-20])
     (outputs / "odd.png").write_bytes(b"\xff\xd8 no picture" * 30_000)
-    html = page(gather(outputs))
+    html = build_report(collect_outputs(outputs))
     assert "cut.mcap" in html and "is cut short" in html and "Unreadable files" in html
     assert "odd.png" in html
 
@@ -128,37 +128,37 @@ def test_large_pictures_are_made_smaller_and_the_page_stays_small(outputs: Path)
     picture = encode_png(noise)
     for k in range(12):
         (outputs / f"large{k:02d}.png").write_bytes(picture)
-    html = page(gather(outputs))
+    html = build_report(collect_outputs(outputs))
     assert len(html) < 10_000_000
     assert "data:image/jpeg" in html and "no room left in this page" in html
 
 
 @pytest.mark.heavy
 def test_a_report_is_written_again_but_no_other_file(outputs: Path) -> None:
-    first = write(outputs)
+    first = write_html_report(outputs)
     assert first == outputs / "report.html"
     before = first.read_bytes()
-    assert write(outputs).read_bytes() == before
+    assert write_html_report(outputs).read_bytes() == before
     other = outputs / "mine.html"
     other.write_text("<p>mine</p>")
     with pytest.raises(OutputError, match="is not a report of dmrl"):
-        write(outputs, other)
+        write_html_report(outputs, other)
     with pytest.raises(OutputError, match=r"Name it page\.html"):
-        write(outputs, outputs / "page.pdf")
+        write_html_report(outputs, outputs / "page.pdf")
     with pytest.raises(OutputError, match=r"Name it page\.html"):
-        write(outputs, Path())
+        write_html_report(outputs, Path())
     assert other.read_text() == "<p>mine</p>"
 
 
 def test_a_folder_with_nothing_to_tell_of_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="contains no recording"):
-        write(tmp_path)
+        write_html_report(tmp_path)
     with pytest.raises(SettingError, match="is not a folder"):
-        write(tmp_path / "none")
+        write_html_report(tmp_path / "none")
 
 
 def test_numbers_of_logarithmic_axes_are_no_formulas_and_legends_cover_no_curve() -> None:
-    svg = charts.losses({"one": [2.0, 0.5, 0.05], "two": [1.0, 0.1, 0.02]})
+    svg = charts.plot_losses({"one": [2.0, 0.5, 0.05], "two": [1.0, 0.1, 0.02]})
     assert "mathdefault" not in svg and ">0.1<" in svg and ">1<" in svg
     legend = svg.index('id="legend_1"')
     assert svg.rindex('id="axes_1"') < legend and svg.count('id="legend_') == 1
@@ -168,7 +168,7 @@ def test_ranges_of_distance_stand_in_order_whoever_has_them() -> None:
     near, far, rest = (0.0, 0.5), (0.5, 1.0), (1.0, np.inf)
     few = [(*far, 5.0, 4.0, 6.0), (*rest, 7.0, 6.0, 9.0)]
     all_of_them = [(*near, 3.0, 2.0, 4.0), *few]
-    svg = charts.by_distance({"few": few, "all": all_of_them}, "median error, px")
+    svg = charts.plot_by_distance({"few": few, "all": all_of_them}, "median error, px")
     assert re.findall(r">(0-0\.5|0\.5-1|1-)<", svg) == ["0-0.5", "0.5-1", "1-"]
 
 
@@ -177,6 +177,6 @@ def test_no_depth_stands_on_another_or_outside_the_image() -> None:
     for _ in range(50):
         uv_px = rng.uniform([0, 0], [320, 224], (2, 2))
         uv_px[1] = np.clip(uv_px[0] + rng.uniform(-30, 30, 2), 0, [320, 224])
-        (u, v), (other_u, other_v) = _text_places(uv_px, 320, 224)
+        (u, v), (other_u, other_v) = _place_texts(uv_px, 320, 224)
         assert abs(u - other_u) >= 50 or abs(v - other_v) >= 14, uv_px
         assert 25 < u < 295 and 5 < v < 219

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.html_report import gather, page
+from dmrl.html_report import build_report, collect_outputs
 from dmrl.images.codec import encode_png
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 
 RECIPE = """
@@ -47,10 +47,12 @@ def maps(path: Path, factor: float) -> None:
     grid = np.linspace(0.1, 0.9, 12, dtype="<f4").reshape(3, 4) * factor
     picture = encode_png(np.zeros((24, 32, 3), np.uint8))
     with RecordingWriter(path, Provenance("test", {})) as sink:
-        sink.write(5, "/cf1/camera/image", message("CompressedImage")(data=picture, format="png"))
+        sink.write(
+            5, "/cf1/camera/image", message_class("CompressedImage")(data=picture, format="png")
+        )
         fields = {"rows": 3, "cols": 4, "channels": ("confidence", "depth_m"), "stride_px": 8}
         data = np.stack((grid, 2 * grid)).tobytes()
-        sink.write(5, "/cf1/detections/grid", message("GridMap")(data=data, **fields))
+        sink.write(5, "/cf1/detections/grid", message_class("GridMap")(data=data, **fields))
 
 
 @pytest.fixture
@@ -70,7 +72,7 @@ def pipeline(outputs: Path) -> Path:
 
 @pytest.mark.heavy
 def test_a_recipes_figures_come_first_in_its_order(pipeline: Path) -> None:
-    html = page(gather(pipeline))
+    html = build_report(collect_outputs(pipeline))
     story = html[html.index("The paper, again</h2>") : html.index("Detections</h2>")]
     places = [story.index(f"<h3>{t}") for t in ("In numbers", "Both losses", "Circles", "Chip")]
     assert places == sorted(places)
@@ -82,7 +84,7 @@ def test_a_recipes_figures_come_first_in_its_order(pipeline: Path) -> None:
 
 @pytest.mark.heavy
 def test_maps_say_how_far_they_are_from_the_first(pipeline: Path) -> None:
-    html = page(gather(pipeline))
+    html = build_report(collect_outputs(pipeline))
     grid = np.linspace(0.1, 0.9, 12)
     assert "against float" in html and ">1.000<" in html
     assert f"{np.abs(grid - 0.5 * grid).mean():.4f}" in html
@@ -95,7 +97,7 @@ def test_a_figure_that_cannot_be_drawn_says_why_and_the_rest_is_shown(pipeline: 
     (pipeline / "model/model.json").write_text("{")
     (pipeline / "judged/circles.png").write_bytes(b"no picture")
     (pipeline / "chip.mcap").write_bytes(b"no recording")
-    html = page(gather(pipeline))
+    html = build_report(collect_outputs(pipeline))
     story = html[html.index("The paper, again</h2>") :]
     assert story.count("cannot be drawn") == 2 and "circles.png" in story
     assert ">0.5<" in story
@@ -107,13 +109,13 @@ def test_what_leads_out_of_the_folder_is_not_shown(pipeline: Path, tmp_path: Pat
     secret.write_text('{"overall": "hidden words"}')
     recipe = RECIPE.replace("judged/evaluation.json", str(secret)).replace(".nothing", "")
     (pipeline / "recipe.toml").write_text(recipe)
-    assert "hidden words" not in page(gather(pipeline))
+    assert "hidden words" not in build_report(collect_outputs(pipeline))
 
 
 @pytest.mark.heavy
 def test_a_recipe_that_is_none_is_named_and_the_page_written(pipeline: Path) -> None:
     (pipeline / "recipe.toml").write_text("[[figure]]\nshows = 3\n")
-    html = page(gather(pipeline))
+    html = build_report(collect_outputs(pipeline))
     assert "recipe.toml" in html[html.index("Unreadable files</h2>") :]
     assert "Detections</h2>" in html
 
@@ -124,18 +126,18 @@ def test_what_a_stranger_wants_shown_is_shown_or_says_why(pipeline: Path) -> Non
     (pipeline / "chip.mcap").unlink()
     with RecordingWriter(pipeline / "chip.mcap", Provenance("test", {})) as sink:
         fields = {"rows": 1, "cols": 1, "channels": ("confidence", "depth_m"), "stride_px": 8}
-        grid = message("GridMap")(data=np.ones(2, "<f4").tobytes(), **fields)
+        grid = message_class("GridMap")(data=np.ones(2, "<f4").tobytes(), **fields)
         sink.write(5, "/cf1/detections/grid", grid)
     (pipeline / "judged" / "pipe.json").mkdir()
     maps_of = '[[figure]]\ntitle = "Maps"\nshows = "maps"\nof = ["{}"]\n'
     other = RECIPE.replace("judged/evaluation.json", "judged/pipe.json")
     more = maps_of.format("absent.mcap") + maps_of.format("chip.mcap")
     (pipeline / "recipe.toml").write_text(other + more)
-    shown = page(gather(pipeline))
+    shown = build_report(collect_outputs(pipeline))
     assert "judged/pipe.json is not a file" in shown
     assert shown.count("cannot be drawn") >= 3
 
 
 def test_figures_that_are_no_tables_are_named_on_the_page(pipeline: Path) -> None:
     (pipeline / "recipe.toml").write_text('kind = "pipeline"\nfigure = 3\n')
-    assert "must be [[figure]] tables" in gather(pipeline).unread["recipe.toml"]
+    assert "must be [[figure]] tables" in collect_outputs(pipeline).unread["recipe.toml"]

@@ -19,7 +19,7 @@ def rgb() -> codec.Rgb:
 
 def test_png_keeps_every_pixel(rgb: codec.Rgb) -> None:
     png = codec.encode_png(rgb)
-    assert codec.size(png) == (32, 24, "png")
+    assert codec.read_size(png) == (32, 24, "png")
     np.testing.assert_array_equal(codec.decode(png), rgb)
     assert codec.encode_png(rgb) == png
 
@@ -27,14 +27,14 @@ def test_png_keeps_every_pixel(rgb: codec.Rgb) -> None:
 def test_jpeg_is_near(rgb: codec.Rgb) -> None:
     smooth = np.broadcast_to(np.arange(24, dtype=np.uint8)[:, None, None] * 8, (24, 32, 3)).copy()
     jpeg = codec.encode_jpeg(smooth)
-    assert codec.size(jpeg) == (32, 24, "jpeg")
+    assert codec.read_size(jpeg) == (32, 24, "jpeg")
     assert np.abs(codec.decode(jpeg).astype(int) - smooth).max() < 6
 
 
 def test_ppm_may_hold_comments_and_junk() -> None:
     ppm = b"P6\n# a camera\n2 1\n# its name\n255\n" + bytes([1, 2, 3, 4, 5, 6]) + b"junk"
     np.testing.assert_array_equal(codec.decode(ppm), [[[1, 2, 3], [4, 5, 6]]])
-    assert codec.size(ppm) == (2, 1, "ppm")
+    assert codec.read_size(ppm) == (2, 1, "ppm")
 
 
 def test_real_frames_with_junk_behind_their_pixels(data: Path) -> None:
@@ -54,7 +54,7 @@ def test_a_cut_picture_is_named(rgb: codec.Rgb, share: float) -> None:
 
 @pytest.mark.parametrize("bad", [b"", b"GIF89a" + b"\0" * 40, b"\x89PNG\r\n\x1a\n" + b"\0" * 40])
 def test_what_is_no_picture_is_named(bad: bytes) -> None:
-    for function in (codec.decode, codec.size):
+    for function in (codec.decode, codec.read_size):
         with pytest.raises(SourceError, match=r"^a\.png is not an image \(PNG, JPEG"):
             function(bad, "a.png")
 

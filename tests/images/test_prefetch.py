@@ -2,16 +2,16 @@
 
 import pytest
 
-from dmrl.images.prefetch import ahead
+from dmrl.images.prefetch import map_ahead
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_results_come_in_the_order_of_the_items(threads: int) -> None:
-    assert list(ahead(lambda k: k * k, range(50), threads)) == [k * k for k in range(50)]
+    assert list(map_ahead(lambda k: k * k, range(50), threads)) == [k * k for k in range(50)]
 
 
 def test_an_error_comes_when_it_is_its_turn() -> None:
-    results = ahead(lambda k: 10 // (3 - k), range(6), 2)
+    results = map_ahead(lambda k: 10 // (3 - k), range(6), 2)
     assert [next(results) for _ in range(3)] == [3, 5, 10]
     with pytest.raises(ZeroDivisionError):
         next(results)
@@ -19,6 +19,6 @@ def test_an_error_comes_when_it_is_its_turn() -> None:
 
 def test_no_more_is_taken_than_may_wait() -> None:
     taken: list[int] = []
-    results = ahead(lambda k: k, (taken.append(k) or k for k in range(100)), 2, held=3)
+    results = map_ahead(lambda k: k, (taken.append(k) or k for k in range(100)), 2, max_waiting=3)
     assert next(results) == 0
     assert len(taken) == 7

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.model.bearings import polar_of
+from dmrl.estimation.model.bearings import to_bearing
 from dmrl.estimation.model.pair import Array
 from dmrl.geometry.frames import Camera, pixels_from_horizontal
 from dmrl.labelling.camera_bearings import (
@@ -49,7 +49,7 @@ def seen(sigma_m: float = 0.0, every: int = 1) -> ObserverLog:
 def test_detections_are_directions_in_the_horizontal_frame() -> None:
     found = detections_to_bearings(seen(every=2), START_NS, 3.6, 0.015)
     assert found.time_s == pytest.approx(np.arange(0, COUNT, 2) * 0.1)
-    assert found.polar[:, 0] == pytest.approx(polar_of(TRUE_M[::2]))
+    assert found.bearing[:, 0] == pytest.approx(to_bearing(TRUE_M[::2]))
     wanted = [3.6 / 180, np.hypot(3.6 / 180, 0.015), DISTANCE_RATIO]
     assert found.std == pytest.approx(np.tile(wanted, (COUNT // 2, 1, 1)))
 
@@ -71,8 +71,8 @@ def test_images_have_as_many_candidates_as_they_show() -> None:
     first = one.first_row + (np.arange(COUNT + 1) > 0)
     both = replace(one, detections=rows, first_row=first)
     found = detections_to_bearings(both, START_NS, 3.0, 0.01)
-    assert np.isfinite(found.polar[..., 0]).sum(axis=1).tolist() == [2] + [1] * 9
-    assert found.polar[0, 0] == pytest.approx(found.polar[0, 1])
+    assert np.isfinite(found.bearing[..., 0]).sum(axis=1).tolist() == [2] + [1] * 9
+    assert found.bearing[0, 0] == pytest.approx(found.bearing[0, 1])
     none = replace(one, detections=rows[:0], first_row=0 * first)
     assert len(detections_to_bearings(none, START_NS, 3.0, 0.01).time_s) == 0
 
@@ -81,9 +81,9 @@ def test_both_robots_of_a_pair_get_what_their_cameras_showed() -> None:
     pair, _ = still_pair()
     sees = detections_to_bearings(seen(), START_NS, 3.0, 0.01)
     pairs = add_bearings({("a", "b"): pair, ("b", "c"): pair}, {"b": sees})
-    assert pairs["a", "b"].peer_sees is sees and pairs["a", "b"].own_sees is None
-    assert pairs["b", "c"].own_sees is sees and pairs["b", "c"].peer_sees is None
-    assert pairs["a", "b"].swapped().own_sees is sees
+    assert pairs["a", "b"].peer_bearings is sees and pairs["a", "b"].own_bearings is None
+    assert pairs["b", "c"].own_bearings is sees and pairs["b", "c"].peer_bearings is None
+    assert pairs["a", "b"].swap_robots().own_bearings is sees
 
 
 def test_heights_go_to_where_the_peer_was_seen() -> None:

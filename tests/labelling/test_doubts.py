@@ -3,16 +3,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.model.pair import SWAPPED
+from dmrl.estimation.model.pair import GLOBALS_FROM_PEER
 from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.keyframes import GLOBALS, Noise
+from dmrl.estimation.solver.keyframes import GLOBALS, NoiseModel
 from dmrl.labelling.pair_report import explain_refusal, explain_refusals, find_suspect_sensors
 
 
 def estimate(status: int = 0, **constants: float) -> Estimate:
     found = np.array([constants.get(name, 0.0) for name in GLOBALS])
     state, covariance = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)
-    return Estimate(np.arange(2.0), state, covariance, np.full(2, status, np.int8), found, Noise())
+    return Estimate(
+        np.arange(2.0), state, covariance, np.full(2, status, np.int8), found, NoiseModel()
+    )
 
 
 def test_sensors_in_order_are_not_worth_a_line() -> None:
@@ -41,7 +43,7 @@ def test_a_sensor_that_is_off_is_named_with_what_to_do(
 
 def test_a_flight_of_which_nothing_is_kept_says_why_and_what_to_do() -> None:
     assert explain_refusal(("cf1", "cf2"), estimate(status=0)) is None
-    still = replace(estimate(status=2), refused="still")
+    still = replace(estimate(status=2), rejection_reason="still")
     assert str(explain_refusal(("cf1", "cf2"), still)).startswith("cf1 hardly moves")
     why = str(explain_refusal(("cf1", "cf2"), estimate(status=1)))
     assert "exact to 1.00 m" in why and "--gate-m" in why
@@ -49,7 +51,7 @@ def test_a_flight_of_which_nothing_is_kept_says_why_and_what_to_do() -> None:
 
 def test_what_is_off_is_the_reason_where_nothing_is_kept_and_a_line_of_its_own_elsewhere() -> None:
     lost = estimate(status=1, peer_gyro_bias_radps=0.05)
-    there = replace(lost, constants=lost.constants[SWAPPED])
+    there = replace(lost, constants=lost.constants[GLOBALS_FROM_PEER])
     here, back = explain_refusals([("cf1", "cf2")], {("cf1", "cf2"): lost, ("cf2", "cf1"): there})
     assert here.startswith("cf1 sees cf2: nothing is kept: cf2's yaw rate seems biased by 0.05")
     assert "exact to 1.00 m" in here

@@ -7,7 +7,7 @@ import pytest
 
 from dmrl import topics
 from dmrl.labelling.flight_log import SENSOR_TOPICS, read_flight
-from dmrl.messages import STATUS_AMBIGUOUS, message
+from dmrl.messages import STATUS_AMBIGUOUS, message_class
 from dmrl.recording import Provenance, RecordingWriter
 
 SECOND_NS = 1_000_000_000
@@ -17,18 +17,18 @@ SECOND_NS = 1_000_000_000
 def path(tmp_path: Path) -> Path:
     """A message of several topics, at second 2 and later."""
     rows = [
-        (topics.attitude("a"), "Attitude", {"roll_rad": 1, "pitch_rad": 2, "yaw_rate_radps": 3}),
-        (topics.velocity("a"), "Velocity", {"vx_mps": 4, "vy_mps": 5}),
-        (topics.uwb_range("a", "b"), "UwbRange", {"range_m": 6}),
-        (topics.position("a", "b"), "PeerPosition", {"x": 1, "covariance": np.arange(9.0)}),
-        (topics.position("a", "b"), "PeerPosition", {"y": 2, "status": STATUS_AMBIGUOUS}),
-        (topics.position("a", "b"), "PeerPosition", {"z": 3, "covariance": np.arange(12.0)}),
-        (topics.calibration("a"), "CameraCalibration", {"width": 320}),
-        (topics.calibration("a"), "CameraCalibration", {"width": 640}),
+        (topics.ATTITUDE("a"), "Attitude", {"roll_rad": 1, "pitch_rad": 2, "yaw_rate_radps": 3}),
+        (topics.VELOCITY("a"), "Velocity", {"vx_mps": 4, "vy_mps": 5}),
+        (topics.RANGE("a", "b"), "UwbRange", {"range_m": 6}),
+        (topics.POSITION("a", "b"), "PeerPosition", {"x": 1, "covariance": np.arange(9.0)}),
+        (topics.POSITION("a", "b"), "PeerPosition", {"y": 2, "status": STATUS_AMBIGUOUS}),
+        (topics.POSITION("a", "b"), "PeerPosition", {"z": 3, "covariance": np.arange(12.0)}),
+        (topics.CALIBRATION("a"), "CameraCalibration", {"width": 320}),
+        (topics.CALIBRATION("a"), "CameraCalibration", {"width": 640}),
     ]
     with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
         for k, (topic, kind, fields) in enumerate(rows, 2):
-            sink.write(k * SECOND_NS, topic, message(kind)(**fields), publish_ns=k)
+            sink.write(k * SECOND_NS, topic, message_class(kind)(**fields), publish_ns=k)
     return tmp_path / "a.mcap"
 
 

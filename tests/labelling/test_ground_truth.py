@@ -7,7 +7,7 @@ import numpy as np
 from dmrl import topics
 from dmrl.labelling.flight_log import FlightLog, read_flight
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 
 PLACES = {"cf1": (1.0, 2.0, 0.5), "cf2": (1.0, 5.0, 0.9)}
@@ -22,8 +22,8 @@ def captured(path: Path, lost: tuple[int, int] = (0, 0)) -> FlightLog:
                 if robot == "cf2" and lost[0] <= k < lost[1]:
                     continue
                 pose = {"position": dict(zip("xyz", place, strict=True)), "orientation": turn}
-                made = message("PoseInFrame")(frame_id="world", pose=pose)
-                sink.write(k * 20_000_000, topics.true_pose(robot), made)
+                made = message_class("PoseInFrame")(frame_id="world", pose=pose)
+                sink.write(k * 20_000_000, topics.TRUE_POSE(robot), made)
     return read_flight(path)
 
 

@@ -15,7 +15,7 @@ from dmrl.labelling.image_labels import MIN_DEPTH_M, CameraOptions
 from dmrl.labelling.label_messages import build_label_messages, build_position_series
 from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.labelling.sensor_logs import RobotLog, SensorLogs
-from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
+from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message_class
 from dmrl.recording import Provenance, RecordingWriter, read
 
 SECOND_NS = 1_000_000_000
@@ -36,12 +36,12 @@ def logs(flying: Sequence[str] = ("cf1", "cf2")) -> SensorLogs:
 
 def flight(path: Path, images_s: Sequence[float], labels: Sequence[Any] = ()) -> Path:
     with RecordingWriter(path, Provenance("test")) as sink:
-        sink.write(START_NS, topics.height("cf1"), message("Height")(height_m=1.0))
+        sink.write(START_NS, topics.HEIGHT("cf1"), message_class("Height")(height_m=1.0))
         for moment in images_s:
             time_ns = START_NS + round(moment * SECOND_NS)
-            sink.write(time_ns, topics.camera_image("cf1"), message("CompressedImage")())
+            sink.write(time_ns, topics.CAMERA_IMAGE("cf1"), message_class("CompressedImage")())
         for time_ns, entry in labels:
-            sink.write(time_ns, topics.labels("cf1"), entry)
+            sink.write(time_ns, topics.LABELS("cf1"), entry)
     return path
 
 
@@ -97,7 +97,7 @@ def test_a_label_stands_at_its_image_and_shows_when_that_was_taken(
 
 def test_labels_of_others_stay_and_estimates_of_before_go(tmp_path: Path) -> None:
     kinds = [{"peer": "cf2", "source": source, "depth_m": 1.0} for source in ("truth", "estimate")]
-    before = message("PeerLabels")(peers=kinds, sources=["truth", "estimate"])
+    before = message_class("PeerLabels")(peers=kinds, sources=["truth", "estimate"])
     image_ns, other_ns = START_NS + 2 * SECOND_NS, START_NS + 3 * SECOND_NS
     path = flight(tmp_path / "a.mcap", [2.0, 3.0], [(image_ns, before), (other_ns, before)])
     first, second = written(path, {"cf2": at([2.0])}, AIDECK, logs())

@@ -17,7 +17,7 @@ from dmrl.labelling.calibration.calibration_flight import (
 )
 from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.observer_log import LONGEST_GAP_S, ObserverLog, read_observer_log
-from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message
+from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message_class
 from dmrl.recording import Provenance, RecordingWriter
 
 SECOND_NS = 1_000_000_000
@@ -33,7 +33,7 @@ def found(u_px: float, confidence: float = 0.9, depth_m: float = 2.0, sigma_m: f
 
 def seen(time_s: float, *found_there: Any, threshold: float = 0.5) -> Row:
     fields = {"detections": list(found_there), "threshold": threshold}
-    return time_s, topics.detections("cf1"), "Detections", fields
+    return time_s, topics.DETECTIONS("cf1"), "Detections", fields
 
 
 def motion(velocity: bool = True, height: bool = True) -> list[Row]:
@@ -42,18 +42,18 @@ def motion(velocity: bool = True, height: bool = True) -> list[Row]:
     for time_s in np.arange(0, 10.05, 0.1).tolist():
         tilt = {"roll_rad": 0.01 * time_s, "pitch_rad": -0.02 * time_s}
         turn = {**tilt, "yaw_rate_radps": TURN_RADPS}
-        rows.append((time_s, topics.attitude("cf1"), "Attitude", turn))
+        rows.append((time_s, topics.ATTITUDE("cf1"), "Attitude", turn))
         if velocity:
-            rows.append((time_s, topics.velocity("cf1"), "Velocity", {"vx_mps": 1, "vy_mps": 0.5}))
+            rows.append((time_s, topics.VELOCITY("cf1"), "Velocity", {"vx_mps": 1, "vy_mps": 0.5}))
         if height:
-            rows.append((time_s, topics.height("cf1"), "Height", {"height_m": 0.3 * time_s}))
+            rows.append((time_s, topics.HEIGHT("cf1"), "Height", {"height_m": 0.3 * time_s}))
     return rows
 
 
 def recorded(path: Path, rows: Sequence[Row]) -> Path:
     with RecordingWriter(path, Provenance("test")) as sink:
         for time_s, topic, kind, fields in rows:
-            sink.write(round(time_s * SECOND_NS), topic, message(kind)(**fields))
+            sink.write(round(time_s * SECOND_NS), topic, message_class(kind)(**fields))
     return path
 
 
@@ -114,9 +114,9 @@ def test_without_velocity_or_height_it_stands_with_a_word(tmp_path: Path) -> Non
 def test_the_nearest_range_counts_in_time_and_then_in_length(tmp_path: Path) -> None:
     heard = [(0.97, 2.0), (1.05, 3.0), (5.0 + LONGEST_GAP_S - 0.01, 4.0), (7.2, 5.0)]
     rows = [seen(1.0), seen(1.02), seen(5.0), seen(7.0), *motion()]
-    rows += [(t, topics.uwb_range("cf1", "cf2"), "UwbRange", {"range_m": r}) for t, r in heard]
-    rows += [(5.0, topics.uwb_range("cf2", "cf1"), "UwbRange", {"range_m": 4.5})]
-    rows += [(7.0, topics.uwb_range("cf2", "cf3"), "UwbRange", {"range_m": 1.0})]
+    rows += [(t, topics.RANGE("cf1", "cf2"), "UwbRange", {"range_m": r}) for t, r in heard]
+    rows += [(5.0, topics.RANGE("cf2", "cf1"), "UwbRange", {"range_m": 4.5})]
+    rows += [(7.0, topics.RANGE("cf2", "cf3"), "UwbRange", {"range_m": 1.0})]
     sight = sight_of(tmp_path / "a.mcap", rows)
     assert [sight.ranges(k) for k in range(4)] == [{"cf2": 2.0}, {"cf2": 3.0}, {"cf2": 4.0}, {}]
 
@@ -124,7 +124,7 @@ def test_the_nearest_range_counts_in_time_and_then_in_length(tmp_path: Path) -> 
 def test_an_observer_without_attitude_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(MissingTopic, match="/cf1/attitude"):
         sight_of(tmp_path / "a.mcap", [seen(1.0)])
-    lost = (1.0, topics.attitude("cf1"), "Attitude", {"roll_rad": float("nan")})
+    lost = (1.0, topics.ATTITUDE("cf1"), "Attitude", {"roll_rad": float("nan")})
     with pytest.raises(RecordingError, match="/cf1/attitude holds no numbers"):
         sight_of(tmp_path / "b.mcap", [seen(1.0), lost])
 
@@ -132,13 +132,13 @@ def test_an_observer_without_attitude_is_an_error(tmp_path: Path) -> None:
 def test_what_a_camera_is_calibrated_with(tmp_path: Path) -> None:
     place = {"x": 1.0, "y": 2.0, "z": 3.0}
     spread = [0.04, 0, 0, 0, 0.05, 0, 0, 0, 0.06]
-    topic = topics.position("cf1", "cf2")
+    topic = topics.POSITION("cf1", "cf2")
     rows: list[Row] = [seen(1.0, found(10), found(20)), seen(2.0), seen(3.0, found(30)), *motion()]
     rows += [(1.0, topic, "PeerPosition", {**place, "covariance": spread, "status": STATUS_OK})]
     rows += [(1.5, topic, "PeerPosition", {**place, "status": STATUS_AMBIGUOUS})]
     rows += [(2.0, topic, "PeerPosition", {**place, "x": 1.5, "status": STATUS_OK})]
-    rows += [(1.0, topics.position("cf1", "cf3"), "PeerPosition", {**place, "status": STATUS_OK})]
-    rows += [(1.0, topics.position("cf2", "cf3"), "PeerPosition", {**place, "status": STATUS_OK})]
+    rows += [(1.0, topics.POSITION("cf1", "cf3"), "PeerPosition", {**place, "status": STATUS_OK})]
+    rows += [(1.0, topics.POSITION("cf2", "cf3"), "PeerPosition", {**place, "status": STATUS_OK})]
     path = recorded(tmp_path / "a.mcap", rows)
     flight = read_calibration_flight(read_flight(path), "cf1", None, topics.POSITION)
     assert flight.image_s.tolist() == [1.0, 2.0, 3.0]

@@ -8,11 +8,11 @@ import pytest
 
 from dmrl import topics
 from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.residuals import BIAS, OWN_GYRO, PEER_GYRO
+from dmrl.estimation.solver.residuals import OWN_GYRO, PEER_GYRO, RANGE_BIAS
 from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.pair_report import PairReport, report_pair
 from dmrl.labelling.peer_positions import PeerPositions
-from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message
+from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message_class
 from dmrl.recording import Provenance, RecordingWriter
 
 SECOND_NS = 1_000_000_000
@@ -30,19 +30,19 @@ def found() -> PeerPositions:
 
 
 def estimate() -> Estimate:
-    constants = np.zeros(max(BIAS, OWN_GYRO, PEER_GYRO) + 1)
-    constants[[BIAS, OWN_GYRO, PEER_GYRO]] = 0.35, 0.02, 0.05
+    constants = np.zeros(max(RANGE_BIAS, OWN_GYRO, PEER_GYRO) + 1)
+    constants[[RANGE_BIAS, OWN_GYRO, PEER_GYRO]] = 0.35, 0.02, 0.05
     made = object.__new__(Estimate)
     object.__setattr__(made, "constants", constants)
-    object.__setattr__(made, "refused", None)
+    object.__setattr__(made, "rejection_reason", None)
     return made
 
 
 def flight(path: Path, truth_s: list[float]) -> Path:
     with RecordingWriter(path, Provenance("test")) as sink:
         for moment in truth_s:
-            at = message("PeerPosition")(x=moment, y=0.0, z=1.0)
-            sink.write(round(moment * SECOND_NS), topics.truth("cf1", "cf2"), at)
+            at = message_class("PeerPosition")(x=moment, y=0.0, z=1.0)
+            sink.write(round(moment * SECOND_NS), topics.TRUTH("cf1", "cf2"), at)
     return path
 
 

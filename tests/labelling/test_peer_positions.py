@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.model.pair import Pair, Track
+from dmrl.estimation.model.pair import Pair, SensorTrack
 from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.keyframes import Noise
+from dmrl.estimation.solver.keyframes import NoiseModel
 from dmrl.labelling.peer_positions import sample_positions
 
 SECOND_NS = 1_000_000_000
@@ -15,13 +15,13 @@ def test_a_peer_above_is_above_at_each_time_by_the_sensors_of_heights() -> None:
     time_s = np.arange(0, 10, 0.01)
     none, gap = np.zeros(len(time_s)), np.zeros(len(time_s), bool)
     own, peer = (
-        Track(none, none, none, high, gap) for high in (1 + 0 * time_s, 1.5 + 0.1 * time_s)
+        SensorTrack(none, none, none, high, gap) for high in (1 + 0 * time_s, 1.5 + 0.1 * time_s)
     )
     pair = Pair(time_s, own, peer, np.array([1.0]), np.array([2.0]))
     state = np.column_stack([2 + time_s[::10], -time_s[::10], 0 * time_s[::10]])
     spread = np.tile(np.diag([0.04, 0.09, 0.01]), (100, 1, 1))
     status = np.zeros(100, np.int8)
-    noise = Noise(height_std_m=0.3)
+    noise = NoiseModel(height_std_m=0.3)
     found = Estimate(time_s[::10], state, spread, status, np.zeros(11), noise)
     start_ns, images_ns = 7 * SECOND_NS + 20_000_000, np.array([5, 8, 99]) * SECOND_NS + 33
     made = sample_positions(start_ns, pair, found, images_ns)

@@ -9,23 +9,23 @@ import pytest
 
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
-from dmrl.geometry.camera_file import write_camera
+from dmrl.geometry.camera_file import format_camera
 from dmrl.geometry.frames import AIDECK, Camera
 from dmrl.images.codec import encode_png
 from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.recorded_camera import read_robot_camera, recorded_camera
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 
 
 def flight(path: Path, **lens: Any) -> Path:
     fields = {"width": 320, "height": 224, "K": [181, 0, 150, 0, 182, 100, 0, 0, 1], **lens}
     with RecordingWriter(path, Provenance("test")) as sink:
-        sink.write(0, topics.calibration("cf1"), message("CameraCalibration")(**fields))
+        sink.write(0, topics.CALIBRATION("cf1"), message_class("CameraCalibration")(**fields))
         data = encode_png(np.zeros((224, 320, 3), np.uint8))
         for time_ns in (5, 9):
-            picture = message("CompressedImage")(data=data, format="png")
-            sink.write(time_ns, topics.camera_image("cf1"), picture)
+            picture = message_class("CompressedImage")(data=data, format="png")
+            sink.write(time_ns, topics.CAMERA_IMAGE("cf1"), picture)
     return path
 
 
@@ -63,9 +63,9 @@ def test_images_have_their_log_times(tmp_path: Path) -> None:
 
 def test_a_file_for_images_of_another_size_is_refused(tmp_path: Path) -> None:
     path, file = flight(tmp_path / "a.mcap"), tmp_path / "camera.toml"
-    file.write_text(write_camera(AIDECK))
+    file.write_text(format_camera(AIDECK))
     assert read_robot_camera(read_flight(path, sizes_of=["cf1"]), "cf1", file) == AIDECK
-    file.write_text(write_camera(replace(AIDECK, width_px=224, height_px=320)))
+    file.write_text(format_camera(replace(AIDECK, width_px=224, height_px=320)))
     with pytest.raises(SettingError, match=r"for images of 224x320, those of cf1 .* are 320x224"):
         read_robot_camera(read_flight(path, sizes_of=["cf1"]), "cf1", file)
     assert read_robot_camera(read_flight(path, sizes_of=["cf2"]), "cf2", file).width_px == 224

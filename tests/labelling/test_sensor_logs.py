@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.estimation.model.pair import RATE_HZ
+from dmrl.estimation.model.pair import GRID_RATE_HZ
 from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.sensor_logs import MIN_RANGES, RobotLog, SensorLogs, build_sensor_logs
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 
 START_NS = 7_000_000_000
@@ -28,16 +28,18 @@ def flight(
     for time_s in np.arange(from_s, until_s, 0.05).tolist():
         for robot in robots:
             turn = {"roll_rad": 0.01 * time_s, "pitch_rad": 0.02, "yaw_rate_radps": 0.03 * time_s}
-            write(time_s, topics.attitude(robot), message("Attitude")(**turn))
-            moving = message("Velocity")(vx_mps=0.1 * time_s, vy_mps=-0.2 * time_s)
-            write(time_s, topics.velocity(robot), moving)
-            write(time_s, topics.height(robot), message("Height")(height_m=1 + 0.1 * time_s))
+            write(time_s, topics.ATTITUDE(robot), message_class("Attitude")(**turn))
+            moving = message_class("Velocity")(vx_mps=0.1 * time_s, vy_mps=-0.2 * time_s)
+            write(time_s, topics.VELOCITY(robot), moving)
+            write(time_s, topics.HEIGHT(robot), message_class("Height")(height_m=1 + 0.1 * time_s))
 
 
 def ranges(write: Write, one: str = "cf1", other: str = "cf2", count: int = 40) -> None:
     for k in range(count):
         write(
-            0.1 + 0.15 * k, topics.uwb_range(one, other), message("UwbRange")(range_m=2.0 + k / 100)
+            0.1 + 0.15 * k,
+            topics.RANGE(one, other),
+            message_class("UwbRange")(range_m=2.0 + k / 100),
         )
 
 
@@ -58,7 +60,7 @@ def test_a_pair_stands_on_one_grid_with_the_ranges_of_both(tmp_path: Path) -> No
     assert (pair.range_m.min(), pair.range_m.max()) == pytest.approx((1.5, 1.89))
     # Each range stands at its time, whichever robot measured it.
     assert pair.range_m == pytest.approx(1.5 + (pair.range_time_s - 0.1) / 15)
-    assert np.diff(pair.time_s) == pytest.approx(1 / RATE_HZ)
+    assert np.diff(pair.time_s) == pytest.approx(1 / GRID_RATE_HZ)
     middle = slice(20, -20)
     time_s = pair.time_s[middle]
     for track in (pair.own, pair.peer):
@@ -66,7 +68,7 @@ def test_a_pair_stands_on_one_grid_with_the_ranges_of_both(tmp_path: Path) -> No
         assert track.vy_mps[middle] == pytest.approx(-0.2 * time_s, abs=0.01)
         assert track.yaw_rate_radps[middle] == pytest.approx(0.03 * time_s, abs=0.003)
         assert track.height_m[middle] == pytest.approx(1 + 0.1 * time_s, abs=0.01)
-        assert not track.gap.any()
+        assert not track.dropout.any()
 
 
 def test_a_log_lasts_as_long_as_all_of_its_sensors() -> None:
@@ -99,9 +101,9 @@ def test_heights_are_smoothed_over_half_a_second_without_bending_a_climb() -> No
 def test_degrees_are_suspected(tmp_path: Path, change: dict[str, float], said: list[str]) -> None:
     def steep(write: Write) -> None:
         for time_s in np.arange(0, 8, 0.05).tolist():
-            write(time_s, topics.attitude("cf1"), message("Attitude")(**change))
-            write(time_s, topics.velocity("cf1"), message("Velocity")())
-            write(time_s, topics.height("cf1"), message("Height")())
+            write(time_s, topics.ATTITUDE("cf1"), message_class("Attitude")(**change))
+            write(time_s, topics.VELOCITY("cf1"), message_class("Velocity")())
+            write(time_s, topics.HEIGHT("cf1"), message_class("Height")())
 
     only_cf2 = lambda write: flight(write, ("cf2",))  # noqa: E731
     warnings = logs(tmp_path / "a.mcap", steep, only_cf2, ranges).warnings
@@ -145,7 +147,7 @@ def test_a_grid_is_of_the_time_that_both_logs_share(tmp_path: Path) -> None:
     late = lambda write: flight(write, ("cf2",), until_s=9.0, from_s=2.0)  # noqa: E731
     found = logs(tmp_path / "a.mcap", early, late, ranges)
     time_s = found.pairs["cf1", "cf2"].time_s
-    assert (time_s[0], time_s[-1]) == pytest.approx((2.0, 7.95), abs=1.01 / RATE_HZ)
+    assert (time_s[0], time_s[-1]) == pytest.approx((2.0, 7.95), abs=1.01 / GRID_RATE_HZ)
 
 
 @pytest.mark.parametrize("kind", ["attitude", "velocity", "height"])
@@ -178,8 +180,8 @@ def test_silence_is_a_gap_of_that_robot(tmp_path: Path) -> None:
 
     found = logs(tmp_path / "a.mcap", silent, ranges)
     pair = found.pairs["cf1", "cf2"]
-    assert not pair.own.gap.any()
-    assert pair.peer.gap[np.abs(pair.time_s - 4.0) < 0.5].all()
+    assert not pair.own.dropout.any()
+    assert pair.peer.dropout[np.abs(pair.time_s - 4.0) < 0.5].all()
     (warning,) = found.warnings
     assert warning.startswith("cf1-cf2: cf2 is silent for ")
     assert warning.endswith(" s; unconverged there")
@@ -197,8 +199,8 @@ def test_who_has_a_log_and_no_pair_is_flying_and_said_so(tmp_path: Path) -> None
 def test_samples_that_are_no_numbers_and_clocks_that_go_back_are_said(tmp_path: Path) -> None:
     def bad(write: Write) -> None:
         for time_s, height_m in ((8.0, float("nan")), (8.01, -1e300)):
-            write(time_s, topics.height("cf1"), message("Height")(height_m=height_m))
-        write(8.0, topics.uwb_range("cf1", "cf2"), message("UwbRange")(range_m=70.0))
+            write(time_s, topics.HEIGHT("cf1"), message_class("Height")(height_m=height_m))
+        write(8.0, topics.RANGE("cf1", "cf2"), message_class("UwbRange")(range_m=70.0))
 
     path = tmp_path / "a.mcap"
     found = logs(path, flight, ranges, bad)

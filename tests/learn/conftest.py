@@ -2,11 +2,11 @@
 
 import pytest
 
-from dmrl.learn.data.batches import Examples
+from dmrl.learn.data.batches import ExampleSet
 
 from .fitting import dots
 
 
 @pytest.fixture
-def examples() -> Examples:
+def examples() -> ExampleSet:
     return dots(20)

@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 
 from dmrl import recipe
-from dmrl.learn.data.batches import FIELDS, Examples
+from dmrl.learn.data.batches import ROBOT_FIELDS, ExampleSet
 from dmrl.learn.inference.loaded_model import Model, save_model
 from dmrl.learn.networks.architectures import Network
 from dmrl.learn.training.checkpoint import remove_checkpoint
-from dmrl.learn.training.config import FitSettings
-from dmrl.learn.training.trainer import Training, new_network
+from dmrl.learn.training.config import TrainConfig
+from dmrl.learn.training.trainer import Trainer, build_initial_network
 
-PUBLISHED = recipe.load("locanet", "train", FitSettings)
+PUBLISHED = recipe.load("locanet", "train", TrainConfig)
 SETTINGS = replace(PUBLISHED, epochs=4, batch_size=3, warmup_epochs=1, device="cpu")
-EVERYTHING = FitSettings(
+EVERYTHING = TrainConfig(
     epochs=3,
     batch_size=4,
     warmup_epochs=1,
@@ -29,26 +29,26 @@ EVERYTHING = FitSettings(
 )
 
 
-def dots(count: int) -> Examples:
+def dots(count: int) -> ExampleSet:
     """Dark images with one bright square, labelled at its centre, depth 1.5 m."""
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 40, (count, 32, 48, 3), np.uint8)
-    robots = np.zeros((count, 1, len(FIELDS)), np.float32)
+    robots = np.zeros((count, 1, len(ROBOT_FIELDS)), np.float32)
     for k, cell in enumerate(rng.integers(0, 24, count)):
         row, col = divmod(int(cell), 6)
         pixels[k, 8 * row + 2 : 8 * row + 6, 8 * col + 2 : 8 * col + 6] = 250
         box = (8 * col + 2, 8 * row + 2, 8 * col + 6, 8 * row + 6)
         robots[k, 0] = (8 * col + 4, 8 * row + 4, 1.5, 0, 0, 0, *box, k % 2)
-    return Examples([pixels[:7], pixels[7:]], robots)
+    return ExampleSet([pixels[:7], pixels[7:]], robots)
 
 
 def trained(
-    examples: Examples, folder: Path, settings: FitSettings = SETTINGS, *, resume: bool = False
-) -> tuple[Training, Network]:
+    examples: ExampleSet, folder: Path, settings: TrainConfig = SETTINGS, *, resume: bool = False
+) -> tuple[Trainer, Network]:
     folder.mkdir(exist_ok=True)
-    network = new_network(settings, examples)
-    training = Training(network, examples, settings, folder, identity="dots", resume=resume)
-    for _ in training.steps():
+    network = build_initial_network(settings, examples)
+    training = Trainer(network, examples, settings, folder, identity="dots", resume=resume)
+    for _ in training.train_steps():
         pass
     kept = Model(training.network, settings.architecture, training={"history": training.history})
     save_model(kept, folder)

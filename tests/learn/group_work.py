@@ -6,25 +6,25 @@ import signal
 import torch
 from torch import distributed
 
-from dmrl.learn.training.distributed import Group
+from dmrl.learn.training.distributed import ProcessGroup
 
 
-def rank_sum(group: Group, more: int) -> int:
+def rank_sum(group: ProcessGroup, more: int) -> int:
     """Sum of the ranks, and some more."""
     ranks = torch.tensor([group.rank])
     distributed.all_reduce(ranks)
     return int(ranks) + more
 
 
-def half_dies(group: Group) -> None:
+def half_dies(group: ProcessGroup) -> None:
     """All but the first go, without a word."""
-    if not group.leads:
+    if not group.is_main:
         os.kill(os.getpid(), signal.SIGKILL)
     distributed.all_reduce(torch.zeros(1))
 
 
-def first_fails(group: Group) -> None:
+def first_fails(group: ProcessGroup) -> None:
     """The first raises, while the others wait for it."""
-    if group.leads:
+    if group.is_main:
         raise RuntimeError("a bug")
     distributed.all_reduce(torch.zeros(1))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from dmrl.learn.data.augment import Augmentation, Augmenter
-from dmrl.learn.data.batches import FIELDS, Batch, Examples
+from dmrl.learn.data.batches import ROBOT_FIELDS, Batch, ExampleSet
 
 GEOMETRY = Augmentation(
     flip_share=0.5, zoom=(0.6, 1.6), rotation_deg=15.0, mosaic_share=0.5, paste=1.0
@@ -12,23 +12,23 @@ SIDE_M = 12.0
 """A square of s pixels stands for a robot at a depth of SIDE_M / s."""
 
 
-def squares(count: int = 24, seed: int = 0) -> Examples:
+def squares(count: int = 24, seed: int = 0) -> ExampleSet:
     """Dark images with one bright square each; its side tells its depth."""
     rng = np.random.default_rng(seed)
     pixels = np.zeros((count, 112, 160, 3), np.uint8)
-    robots = np.full((count, 2, len(FIELDS)), np.nan, np.float32)
+    robots = np.full((count, 2, len(ROBOT_FIELDS)), np.nan, np.float32)
     for k in range(count):
         side = int(rng.integers(8, 25))
         left, top = int(rng.integers(2, 158 - side)), int(rng.integers(2, 110 - side))
         pixels[k, top : top + side, left : left + side] = 255
         centre = (left + side / 2, top + side / 2, SIDE_M / side, 1.0, 1.0, 0.1)
         robots[k, 0] = (*centre, left, top, left + side, top + side, 0)
-    return Examples([pixels], robots)
+    return ExampleSet([pixels], robots)
 
 
 def batches(settings: Augmentation, count: int = 10) -> list[Batch]:
     augmenter = Augmenter(squares(), settings, seed=0)
-    return [augmenter.batch(range(24), epoch=0, index=k) for k in range(count)]
+    return [augmenter.augment_batch(range(24), epoch=0, index=k) for k in range(count)]
 
 
 def augmenter(**settings: object) -> Augmenter:

@@ -4,25 +4,25 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dmrl.learn.data.batches import FIELDS
+from dmrl.learn.data.batches import ROBOT_FIELDS
 from dmrl.learn.data.crops import (
+    CropWindow,
     Intrinsics,
     Pixels,
     Point,
     Rect,
-    Window,
-    facing,
-    feather,
-    flat,
-    inside,
-    moved,
-    parts,
-    present,
-    sample,
-    slant,
-    through,
-    turned,
-    under,
+    apply_homography,
+    build_crop_homography,
+    build_feather_mask,
+    build_rotation_homography,
+    is_covered,
+    is_inside,
+    list_robots,
+    move_labels,
+    ray_length,
+    rotation_to_pixel,
+    sample_window,
+    tile_mosaic,
 )
 
 CAMERA = (120.0, 118.0, 160.0, 100.0)
@@ -40,7 +40,7 @@ def seen_at(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def robots_at(points: NDArray[np.float64]) -> NDArray[np.float32]:
-    out = np.full((len(points), len(FIELDS)), np.nan, np.float32)
+    out = np.full((len(points), len(ROBOT_FIELDS)), np.nan, np.float32)
     out[:, :2], out[:, 2], out[:, 3:6] = seen_at(points), points[:, 2], (1.0, 1.0, 0.1)
     return out
 
@@ -50,8 +50,8 @@ def pair(at: NDArray[np.float64]) -> Point:
     return u, v
 
 
-def shown_by(robots: NDArray[np.float32], window: Window, rect: Rect) -> NDArray[np.float64]:
-    return np.array(moved(robots.tolist(), window, rect))
+def shown_by(robots: NDArray[np.float32], window: CropWindow, rect: Rect) -> NDArray[np.float64]:
+    return np.array(move_labels(robots.tolist(), window, rect))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -61,9 +61,13 @@ def test_a_turned_camera_sees_points_where_and_as_deep_as_they_then_are(seed: in
     source = seen_at(points[:1])[0]
     shown = rng.uniform((60, 40), (260, 180))
     corner = np.array([7.0, 5.0])
-    matrix = turned(CAMERA, UPRIGHT, pair(source), pair(shown - corner), pair(corner))
-    got = shown_by(robots_at(points), Window(matrix, 1.0, CAMERA), (7, 5, 320, 224))
-    then = points @ (facing(CAMERA, pair(source)) @ facing(CAMERA, pair(shown)).T)
+    matrix = build_rotation_homography(
+        CAMERA, UPRIGHT, pair(source), pair(shown - corner), pair(corner)
+    )
+    got = shown_by(robots_at(points), CropWindow(matrix, 1.0, CAMERA), (7, 5, 320, 224))
+    then = points @ (
+        rotation_to_pixel(CAMERA, pair(source)) @ rotation_to_pixel(CAMERA, pair(shown)).T
+    )
     np.testing.assert_allclose(got[:, :2], seen_at(then), atol=1e-3)
     np.testing.assert_allclose(got[:, 2], then[:, 2], rtol=1e-5)
     np.testing.assert_allclose(got[0, :2], shown, atol=1e-4)
@@ -72,30 +76,32 @@ def test_a_turned_camera_sees_points_where_and_as_deep_as_they_then_are(seed: in
 
 def test_what_is_straight_above_stays_straight_above() -> None:
     post = np.array([[0.5, y, 1.0] for y in (-0.4, 0.0, 0.3)])
-    matrix = turned(CAMERA, UPRIGHT, pair(seen_at(post)[1]), (90.0, 100.0), (0.0, 0.0))
-    got = shown_by(robots_at(post), Window(matrix, 1.0, CAMERA), WHOLE)
+    matrix = build_rotation_homography(
+        CAMERA, UPRIGHT, pair(seen_at(post)[1]), (90.0, 100.0), (0.0, 0.0)
+    )
+    got = shown_by(robots_at(post), CropWindow(matrix, 1.0, CAMERA), WHOLE)
     np.testing.assert_allclose(got[:, 0], 90.0, atol=1e-3)
 
 
 def test_a_zoom_brings_the_point_it_is_about_nearer_by_as_much() -> None:
     point = np.array([[0.4, 0.1, 1.2]])
     at = pair(seen_at(point)[0])
-    matrix = turned(CAMERA, ((1 / 1.5, 0.0), (0.0, 1 / 1.5)), at, at, (0.0, 0.0))
-    got = shown_by(robots_at(point), Window(matrix, 1.5, CAMERA), WHOLE)
+    matrix = build_rotation_homography(CAMERA, ((1 / 1.5, 0.0), (0.0, 1 / 1.5)), at, at, (0.0, 0.0))
+    got = shown_by(robots_at(point), CropWindow(matrix, 1.5, CAMERA), WHOLE)
     np.testing.assert_allclose(got[0, :3], [*at, 1.2 / 1.5], rtol=1e-5)
 
 
 def test_what_is_behind_a_turned_camera_is_nowhere() -> None:
     away = np.array([[-3.0, 0.0, 1.0]])
-    matrix = turned(CAMERA, UPRIGHT, (318.0, 100.0), (0.0, 100.0), (0.0, 0.0))
-    got = shown_by(robots_at(away), Window(matrix, 1.0, CAMERA), WHOLE)
+    matrix = build_rotation_homography(CAMERA, UPRIGHT, (318.0, 100.0), (0.0, 100.0), (0.0, 0.0))
+    got = shown_by(robots_at(away), CropWindow(matrix, 1.0, CAMERA), WHOLE)
     assert np.isnan(got[0, :2]).all()
 
 
 def test_what_is_beside_the_camera_is_nowhere() -> None:
     sideways = np.eye(3)[[0, 1, 0]].tolist()
-    assert np.isnan(through(sideways, 0.0, 1.0)).all()
-    assert through(sideways, 2.0, 1.0) == (1.0, 0.5)
+    assert np.isnan(apply_homography(sideways, 0.0, 1.0)).all()
+    assert apply_homography(sideways, 2.0, 1.0) == (1.0, 0.5)
 
 
 def test_pixels_go_where_labels_go() -> None:
@@ -104,8 +110,12 @@ def test_pixels_go_where_labels_go() -> None:
     down, across = np.indices((224, 320)) + 0.5
     spot = 255 * np.exp(-((across - u) ** 2 + (down - v) ** 2) / 50)
     shown = (180.0, 90.0)
-    window = Window(turned(CAMERA, UPRIGHT, (u, v), shown, (0.0, 0.0)), 1.0, CAMERA)
-    image = sample(spot[..., None].astype(np.uint8), window, (224, 320))[..., 0].astype(float)
+    window = CropWindow(
+        build_rotation_homography(CAMERA, UPRIGHT, (u, v), shown, (0.0, 0.0)), 1.0, CAMERA
+    )
+    image = sample_window(spot[..., None].astype(np.uint8), window, (224, 320))[..., 0].astype(
+        float
+    )
     centre = np.array([(image * across).sum(), (image * down).sum()]) / image.sum()
     # A spot of 5 px is stretched a little to one side.
     np.testing.assert_allclose(centre, shown, atol=0.7)
@@ -114,10 +124,12 @@ def test_pixels_go_where_labels_go() -> None:
 
 def test_without_a_camera_a_window_is_cut_out() -> None:
     picture = (np.arange(40 * 60 * 3) % 251).astype(np.uint8).reshape(40, 60, 3)
-    window = Window(flat(UPRIGHT, (20.0, 10.0), (0.0, 0.0)), 1.0)
-    assert (sample(picture, window, (15, 25)) == picture[10:25, 20:45]).all()
-    mirror = Window(flat(((-1.0, 0.0), (0.0, 1.0)), (45.0, 10.0), (0.0, 0.0)), 1.0)
-    assert (sample(picture, mirror, (15, 25)) == picture[10:25, 20:45][:, ::-1]).all()
+    window = CropWindow(build_crop_homography(UPRIGHT, (20.0, 10.0), (0.0, 0.0)), 1.0)
+    assert (sample_window(picture, window, (15, 25)) == picture[10:25, 20:45]).all()
+    mirror = CropWindow(
+        build_crop_homography(((-1.0, 0.0), (0.0, 1.0)), (45.0, 10.0), (0.0, 0.0)), 1.0
+    )
+    assert (sample_window(picture, mirror, (15, 25)) == picture[10:25, 20:45][:, ::-1]).all()
 
 
 def natural(height: int, width: int) -> Pixels:
@@ -136,13 +148,13 @@ def steps(pixels: Pixels) -> float:
 
 def test_a_window_is_sharper_than_a_bilinear_one() -> None:
     picture = natural(112, 160)
-    window = Window(flat(UPRIGHT, (10.5, 10.5), (0.0, 0.0)), 1.0)
-    blurred = sample(picture, window, (80, 80), sharp=False)
+    window = CropWindow(build_crop_homography(UPRIGHT, (10.5, 10.5), (0.0, 0.0)), 1.0)
+    blurred = sample_window(picture, window, (80, 80), sharp=False)
     # Halfway between pixels: the mean of four.
     near = picture[10:91, 10:91].astype(float)
     mean = (near[1:, 1:] + near[:-1, 1:] + near[1:, :-1] + near[:-1, :-1]) / 4
     np.testing.assert_allclose(blurred, mean, atol=1)
-    assert steps(sample(picture, window, (80, 80))) > 1.15 * steps(blurred)
+    assert steps(sample_window(picture, window, (80, 80))) > 1.15 * steps(blurred)
 
 
 @pytest.mark.parametrize("camera", [None, CAMERA])
@@ -154,13 +166,15 @@ def test_a_window_shows_the_same_whether_of_a_whole_image_or_of_a_part(
         turn = tuple(map(tuple, (np.eye(2) + rng.uniform(-0.4, 0.4, (2, 2))).tolist()))
         seen, shown = (rng.uniform(low, high, 2).tolist() for low, high in ((20, 200), (0, 30)))
         matrix = (
-            turned(camera, turn, seen, shown, (9.0, 4.0)) if camera else flat(turn, seen, shown)
+            build_rotation_homography(camera, turn, seen, shown, (9.0, 4.0))
+            if camera
+            else build_crop_homography(turn, seen, shown)
         )
         size = (30, 30)
         whole = np.linalg.inv(_beyond(60)) @ matrix
         padded = np.pad(picture, ((60, 60), (60, 60), (0, 0)), mode="edge")
-        got = sample(picture, Window(matrix, 1.0), size).astype(int)
-        wanted = sample(padded, Window(whole, 1.0), size).astype(int)
+        got = sample_window(picture, CropWindow(matrix, 1.0), size).astype(int)
+        wanted = sample_window(padded, CropWindow(whole, 1.0), size).astype(int)
         # OpenCV rounds to 1/32 px, now and then to the other side.
         assert abs(got - wanted).max() <= 6 and abs(got - wanted).mean() < 0.2
 
@@ -171,25 +185,25 @@ def _beyond(margin_px: int) -> NDArray[np.float64]:
 
 def test_beyond_an_image_its_border_goes_on() -> None:
     picture = np.arange(40, dtype=np.uint8).reshape(4, 10)[..., None].repeat(3, axis=2)
-    window = Window(flat(UPRIGHT, (-5.0, 0.0), (0.0, 0.0)), 1.0)
-    shown = sample(picture, window, (4, 10), sharp=False)
+    window = CropWindow(build_crop_homography(UPRIGHT, (-5.0, 0.0), (0.0, 0.0)), 1.0)
+    shown = sample_window(picture, window, (4, 10), sharp=False)
     assert (shown[:, :6] == picture[:, :1]).all()
     assert (shown[:, 5:] == picture[:, :5]).all()
-    nowhere = Window(flat(UPRIGHT, (-50.0, 20.0), (0.0, 0.0)), 1.0)
-    assert (sample(picture, nowhere, (4, 10)) == picture[3, 0]).all()
+    nowhere = CropWindow(build_crop_homography(UPRIGHT, (-50.0, 20.0), (0.0, 0.0)), 1.0)
+    assert (sample_window(picture, nowhere, (4, 10)) == picture[3, 0]).all()
 
 
 def test_pixels_without_channels_have_one() -> None:
     mask = np.full((4, 6), 255, np.uint8)
     for zoom in (1, 2):
         turn = ((1 / zoom, 0.0), (0.0, 1 / zoom))
-        window = Window(flat(turn, (0.0, 0.0), (0.0, 0.0)), zoom)
+        window = CropWindow(build_crop_homography(turn, (0.0, 0.0), (0.0, 0.0)), zoom)
         shape = (4 * zoom, 6 * zoom)
-        assert sample(mask, window, shape).shape == (*shape, 1)
+        assert sample_window(mask, window, shape).shape == (*shape, 1)
 
 
 def centres(*uv: tuple[float, float]) -> NDArray[np.float32]:
-    out = np.full((len(uv), len(FIELDS)), np.nan, np.float32)
+    out = np.full((len(uv), len(ROBOT_FIELDS)), np.nan, np.float32)
     out[:, :2] = uv
     return out
 
@@ -197,7 +211,7 @@ def centres(*uv: tuple[float, float]) -> NDArray[np.float32]:
 def test_a_rectangle_is_cut_in_two_or_four_near_its_middle() -> None:
     rng, kinds = np.random.default_rng(0), set()
     for _ in range(60):
-        cut = parts((10, 20, 70, 110), rng)
+        cut = tile_mosaic((10, 20, 70, 110), rng)
         seen = np.zeros((120, 80), int)
         for left, top, right, bottom in cut:
             assert right - left >= 20 and bottom - top >= 30
@@ -208,7 +222,7 @@ def test_a_rectangle_is_cut_in_two_or_four_near_its_middle() -> None:
 
 
 def test_a_feathered_patch_grows_by_quarters_from_its_border() -> None:
-    found = feather(9, 12)[..., 0]
+    found = build_feather_mask(9, 12)[..., 0]
     down = np.array([0.25, 0.5, 0.75, 1, 1, 1, 0.75, 0.5, 0.25])
     across = np.array([0.25, 0.5, 0.75, *[1.0] * 6, 0.75, 0.5, 0.25])
     np.testing.assert_allclose(found, down[:, None] * across, rtol=1e-6)
@@ -217,27 +231,31 @@ def test_a_feathered_patch_grows_by_quarters_from_its_border() -> None:
 def test_a_rectangle_holds_its_left_and_upper_border() -> None:
     at = centres((5, 7), (4.9, 7), (5, 6.9), (14.9, 16.9), (15, 10), (10, 17))
     held = [True, False, False, True, False, False]
-    robots, rect = present(np.concatenate([at, centres((np.nan, 1))])), (5, 7, 15, 17)
+    robots, rect = list_robots(np.concatenate([at, centres((np.nan, 1))])), (5, 7, 15, 17)
     assert [robot[:2] for robot in robots] == at[:, :2].tolist()
-    assert [inside(robot, rect) for robot in robots] == held
+    assert [is_inside(robot, rect) for robot in robots] == held
     opacity = np.zeros((10, 10, 1), np.float32)
     opacity[0, 0], opacity[9, 9] = 0.51, 0.49
-    assert [under(robot, rect, opacity) for robot in robots] == [True] + [False] * 5
-    assert [under(robot, rect, None) for robot in robots] == held
+    assert [is_covered(robot, rect, opacity) for robot in robots] == [True] + [False] * 5
+    assert [is_covered(robot, rect, None) for robot in robots] == held
 
 
 def test_distance_over_depth_is_the_length_of_a_ray_one_deep() -> None:
     points = np.array([[0.0, 0, 2], [1, 0, 2], [0, -1.5, 3], [1, 2, 2]])
     wanted = np.linalg.norm(points, axis=1) / points[:, 2]
-    assert [slant(CAMERA, *pair(at)) for at in seen_at(points)] == pytest.approx(wanted)
+    assert [ray_length(CAMERA, *pair(at)) for at in seen_at(points)] == pytest.approx(wanted)
 
 
 def test_a_flat_window_is_a_turn_about_a_point() -> None:
-    matrix = flat(((0.0, -0.5), (0.5, 0.0)), (30.0, 40.0), (7.0, 9.0))
+    matrix = build_crop_homography(((0.0, -0.5), (0.5, 0.0)), (30.0, 40.0), (7.0, 9.0))
     shown = [(7.0, 9.0), (9.0, 9.0), (7.0, 11.0)]
-    assert [through(matrix.tolist(), *at) for at in shown] == [(30, 40), (30, 41), (29, 40)]
+    assert [apply_homography(matrix.tolist(), *at) for at in shown] == [
+        (30, 40),
+        (30, 41),
+        (29, 40),
+    ]
     robots = centres((30, 40), (30, 41))
     robots[:, 2:6] = 4.0, 1.0, 2.0, 0.5
-    got = shown_by(robots, Window(matrix, 2.0), (100, 200, 120, 220))
+    got = shown_by(robots, CropWindow(matrix, 2.0), (100, 200, 120, 220))
     assert got[:, :2].tolist() == [[107, 209], [109, 209]]
     assert got[:, 2:6].tolist() == [[2.0, 2.0, 4.0, 0.25]] * 2

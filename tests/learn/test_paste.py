@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dmrl.learn.data import augment
 from dmrl.learn.data.augment import Augmentation, Augmenter
-from dmrl.learn.data.batches import FIELDS, Examples
-from dmrl.learn.data.crops import Point, Robot, feather, through
+from dmrl.learn.data.batches import ROBOT_FIELDS, ExampleSet
+from dmrl.learn.data.crops import Point, RobotRow, apply_homography, build_feather_mask
 
 from .squares import GEOMETRY, augmenter, batches, squares
 
@@ -32,16 +32,16 @@ def test_pasted_robots_are_labelled_and_covered_ones_are_not(
 def test_a_robot_with_a_mask_is_pasted_without_what_was_around_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(augment, "DISTRACTOR_SHARE", 0.0)
+    monkeypatch.setattr(augment, "DISTRACTOR_FRACTION", 0.0)
     plain = squares()
     grey = np.maximum(plain.pixels[0], 60)
     masks = (grey[..., 0] == 255).astype(np.uint8)
     settings = replace(Augmentation(), paste=1.0)
     canvases = []
     for known in ([], [masks, np.zeros_like(masks)]):
-        examples = Examples([grey, np.zeros_like(grey)], squares_and_nothing(plain), known)
+        examples = ExampleSet([grey, np.zeros_like(grey)], squares_and_nothing(plain), known)
         canvases.append(
-            Augmenter(examples, settings, seed=0).batch(range(24, 48), epoch=0, index=0)
+            Augmenter(examples, settings, seed=0).augment_batch(range(24, 48), epoch=0, index=0)
         )
     around, cut = (batch.images[:, 0].numpy() for batch in canvases)
     assert ((around > 50) & (around < 70)).sum() > 500
@@ -52,16 +52,16 @@ def test_a_robot_with_a_mask_is_pasted_without_what_was_around_it(
             assert image[int(robot[1]), int(robot[0])] > 200
 
 
-def squares_and_nothing(plain: Examples) -> NDArray[np.float32]:
+def squares_and_nothing(plain: ExampleSet) -> NDArray[np.float32]:
     return np.concatenate([plain.robots, np.full_like(plain.robots, np.nan)])
 
 
 def test_no_more_robots_than_there_is_room_for_are_labelled() -> None:
     crowd = squares(1)
-    robots = np.repeat(crowd.robots[:, :1], augment.MAX_ROBOTS + 3, axis=1)
-    maker = Augmenter(Examples(crowd.pixels, robots), Augmentation(flip_share=0.5), seed=0)
-    batch = maker.batch([0], epoch=0, index=0)
-    assert batch.robots.shape == (1, augment.MAX_ROBOTS, len(FIELDS))
+    robots = np.repeat(crowd.robots[:, :1], augment.MAX_ROBOTS_PER_IMAGE + 3, axis=1)
+    maker = Augmenter(ExampleSet(crowd.pixels, robots), Augmentation(flip_share=0.5), seed=0)
+    batch = maker.augment_batch([0], epoch=0, index=0)
+    assert batch.robots.shape == (1, augment.MAX_ROBOTS_PER_IMAGE, len(ROBOT_FIELDS))
     assert torch.isfinite(batch.robots[..., 0]).all()
 
 
@@ -73,7 +73,7 @@ class Patches:
         self.sources: list[int] = []
         self.middles: list[Point] = []
         self.zooms: list[float] = []
-        self.mine: list[list[Robot]] = []
+        self.mine: list[list[RobotRow]] = []
 
         def show(*given: object) -> object:
             _, rect, source, window, mine, robots, _, opacity = given
@@ -81,32 +81,34 @@ class Patches:
             self.rects.append((left, top, right, bottom))
             self.sources.append(source)  # type: ignore[arg-type]
             matrix = window.matrix.tolist()  # type: ignore[attr-defined]
-            self.middles.append(through(matrix, (right - left) / 2, (bottom - top) / 2))
+            self.middles.append(apply_homography(matrix, (right - left) / 2, (bottom - top) / 2))
             self.zooms.append(window.zoom)  # type: ignore[attr-defined]
             self.mine.append(mine)  # type: ignore[arg-type]
             if len(self.rects) < 20:
-                np.testing.assert_array_equal(opacity, feather(bottom - top, right - left))
+                np.testing.assert_array_equal(
+                    opacity, build_feather_mask(bottom - top, right - left)
+                )
             return robots
 
-        monkeypatch.setattr(maker, "_show", show)
+        monkeypatch.setattr(maker, "_render_window", show)
         rng = np.random.default_rng(9)
         canvas = np.empty((112, 160, 3), np.uint8)
         for _ in range(300):
-            maker._patch(canvas, [], rng)
+            maker._paste_patch(canvas, [], rng)
 
 
-def boxed() -> Examples:
+def boxed() -> ExampleSet:
     """Two images; only in the second is a robot whose box is known, 24 x 10 px about (70, 33)."""
-    robots = np.full((2, 2, len(FIELDS)), np.nan, np.float32)
+    robots = np.full((2, 2, len(ROBOT_FIELDS)), np.nan, np.float32)
     robots[0, 0, :6] = 30, 30, 2, 0, 0, 0
     robots[1, 1, :10] = 71, 30, 2, 0, 0, 0, 58, 28, 82, 38
-    return Examples([np.zeros((2, 112, 160, 3), np.uint8)], robots)
+    return ExampleSet([np.zeros((2, 112, 160, 3), np.uint8)], robots)
 
 
 def test_a_patch_is_a_quarter_larger_than_its_robot_and_lies_anywhere(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(augment, "DISTRACTOR_SHARE", 0.0)
+    monkeypatch.setattr(augment, "DISTRACTOR_FRACTION", 0.0)
     found = Patches(Augmenter(boxed(), Augmentation(zoom=(0.5, 2.0)), seed=0), monkeypatch)
     assert len(found.rects) == 300 and set(found.sources) == {1}
     assert (min(found.zooms), max(found.zooms)) == pytest.approx((1 / 1.1, 1.1), abs=0.004)
@@ -125,7 +127,7 @@ def test_a_patch_is_a_quarter_larger_than_its_robot_and_lies_anywhere(
 
 
 def test_some_patches_show_any_place_of_any_image(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(augment, "DISTRACTOR_SHARE", 1.0)
+    monkeypatch.setattr(augment, "DISTRACTOR_FRACTION", 1.0)
     found = Patches(Augmenter(boxed(), Augmentation(), seed=0), monkeypatch)
     assert np.mean(found.sources) == pytest.approx(0.5, abs=0.06)
     assert {
@@ -137,7 +139,7 @@ def test_some_patches_show_any_place_of_any_image(monkeypatch: pytest.MonkeyPatc
     middles = np.array(found.middles)
     assert middles.min(axis=0) == pytest.approx([0, 0], abs=2)
     assert middles.max(axis=0) == pytest.approx([160, 112], abs=2)
-    monkeypatch.setattr(augment, "DISTRACTOR_SHARE", 0.25)
+    monkeypatch.setattr(augment, "DISTRACTOR_FRACTION", 0.25)
     shares = Patches(Augmenter(boxed(), Augmentation(), seed=0), monkeypatch)
     assert np.mean(shares.sources) == pytest.approx(1 - 0.25 / 2, abs=0.06)
 
@@ -155,11 +157,11 @@ def test_a_mosaic_shows_other_images_in_its_other_parts(monkeypatch: pytest.Monk
     monkeypatch.setattr(
         maker, "_layer", lambda _, rect, source, *rest: shown.append((rect, source))
     )
-    monkeypatch.setattr(maker, "_spoil", lambda *_: None)
+    monkeypatch.setattr(maker, "_degrade_image", lambda *_: None)
     counts = []
     for _ in range(300):
         shown.clear()
-        maker._draw(np.empty((112, 160, 3), np.uint8), 4, rng)
+        maker._draw_canvas(np.empty((112, 160, 3), np.uint8), 4, rng)
         counts.append(len(shown))
         assert shown[0][1] == 4
         area = sum((r - left) * (b - top) for (left, top, r, b), _ in shown)
@@ -171,9 +173,9 @@ def test_a_mosaic_shows_other_images_in_its_other_parts(monkeypatch: pytest.Monk
 
 def test_patches_come_as_often_as_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     maker, rng, asked = augmenter(paste=1.5), np.random.default_rng(3), []
-    monkeypatch.setattr(maker, "_patch", lambda canvas, robots, _: asked.append(1) or robots)
+    monkeypatch.setattr(maker, "_paste_patch", lambda canvas, robots, _: asked.append(1) or robots)
     for _ in range(400):
-        maker._draw(np.zeros((112, 160, 3), np.uint8), 0, rng)
+        maker._draw_canvas(np.zeros((112, 160, 3), np.uint8), 0, rng)
     assert len(asked) / 400 == pytest.approx(1.5, abs=0.15)
 
 

@@ -10,19 +10,19 @@ from dmrl.images.codec import decode
 from dmrl.learn import pretrained
 from dmrl.learn.inference.decode_grids import decode as find
 from dmrl.learn.inference.loaded_model import load_model
-from dmrl.learn.networks.architectures import parameter_count, product_count
+from dmrl.learn.networks.architectures import count_macs, count_parameters
 
 FRAMES = {"img00185.ppm": (174, 65), "img00375.ppm": (298, 139), "img00495.ppm": (98, 131)}
 """Where the drone is in real frames of the AI-deck, pixels, read off by eye."""
 
 
-@pytest.mark.parametrize("name", pretrained.names())
+@pytest.mark.parametrize("name", pretrained.list_pretrained())
 def test_they_load_by_name_are_small_and_have_a_card(name: str) -> None:
-    folder = pretrained.resolved(Path(name))
+    folder = pretrained.resolve_model_path(Path(name))
     model = load_model(folder)
     assert (folder / "model.safetensors").stat().st_size < 200_000
-    assert parameter_count(model.network) <= 25_000
-    assert product_count(model.network) <= 80_000_000
+    assert count_parameters(model.network) <= 25_000
+    assert count_macs(model.network) <= 80_000_000
     assert f"dmrl predict {name}" in (folder / "README.md").read_text(encoding="utf-8")
 
 
@@ -30,20 +30,20 @@ def test_a_path_of_the_same_name_comes_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert pretrained.resolved(Path("dmrl-nano")).is_absolute()
+    assert pretrained.resolve_model_path(Path("dmrl-nano")).is_absolute()
     (tmp_path / "dmrl-nano").mkdir()
-    assert pretrained.resolved(Path("dmrl-nano")) == Path("dmrl-nano")
+    assert pretrained.resolve_model_path(Path("dmrl-nano")) == Path("dmrl-nano")
 
 
 def test_an_unknown_name_is_refused_with_those_there_are(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"no model .*nano-dmrl.*ships with dmrl: dmrl-nano"):
-        load_model(pretrained.resolved(tmp_path / "nano-dmrl"))
+        load_model(pretrained.resolve_model_path(tmp_path / "nano-dmrl"))
 
 
 @pytest.mark.parametrize("name", FRAMES)
 def test_it_finds_the_drone_in_real_frames(data: Path, name: str) -> None:
     file = data / "aideck-frames" / name
-    model = load_model(pretrained.resolved(Path("dmrl-nano")))
+    model = load_model(pretrained.resolve_model_path(Path("dmrl-nano")))
     found = find(*model.grids(decode(file.read_bytes(), file)[None]), stride_px=8)
     seen = found.u_px[0, 0], found.v_px[0, 0]
     assert np.hypot(*np.subtract(seen, FRAMES[name])) < 16

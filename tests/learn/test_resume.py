@@ -7,22 +7,22 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import ModelError, SettingError
-from dmrl.learn.data.batches import Examples
+from dmrl.learn.data.batches import ExampleSet
 from dmrl.learn.training.checkpoint import has_checkpoint
-from dmrl.learn.training.config import FitSettings
-from dmrl.learn.training.trainer import Training, new_network
+from dmrl.learn.training.config import TrainConfig
+from dmrl.learn.training.trainer import Trainer, build_initial_network
 
 from .fitting import EVERYTHING, SETTINGS, dots, trained
 
 
 def stopped(
-    examples: Examples, folder: Path, epochs: int, steps: int, settings: FitSettings = SETTINGS
+    examples: ExampleSet, folder: Path, epochs: int, steps: int, settings: TrainConfig = SETTINGS
 ) -> None:
     """A training that dies some steps into an epoch."""
     folder.mkdir()
-    network = new_network(settings, examples)
-    training = Training(network, examples, settings, folder, identity="dots")
-    walk = training.steps()
+    network = build_initial_network(settings, examples)
+    training = Trainer(network, examples, settings, folder, identity="dots")
+    walk = training.train_steps()
     for _ in range(epochs * -(-len(examples) // settings.batch_size) + steps):
         next(walk)
     walk.close()  # type: ignore[attr-defined]
@@ -31,7 +31,7 @@ def stopped(
 @pytest.fixture(scope="module", params=[SETTINGS, EVERYTHING], ids=["published", "everything"])
 def whole(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[FitSettings, Path]:
+) -> tuple[TrainConfig, Path]:
     """A training that nothing stopped: its settings and its folder."""
     folder = tmp_path_factory.mktemp("whole")
     trained(dots(9), folder, request.param)
@@ -41,7 +41,7 @@ def whole(
 @pytest.mark.heavy
 @pytest.mark.parametrize("steps", [1, 3])
 def test_a_resumed_training_ends_with_the_same_bytes(
-    tmp_path: Path, steps: int, whole: tuple[FitSettings, Path]
+    tmp_path: Path, steps: int, whole: tuple[TrainConfig, Path]
 ) -> None:
     settings, folder = whole
     stopped(dots(9), tmp_path / "resumed", 2, steps, settings)
@@ -50,7 +50,7 @@ def test_a_resumed_training_ends_with_the_same_bytes(
         assert (folder / name).read_bytes() == (tmp_path / "resumed" / name).read_bytes()
 
 
-def test_another_training_is_not_resumed(examples: Examples, tmp_path: Path) -> None:
+def test_another_training_is_not_resumed(examples: ExampleSet, tmp_path: Path) -> None:
     stopped(examples, tmp_path / "run", 1, 1)
     text = r"was trained with learning_rate 0\.001, not 0\.01\. Resume with the settings"
     with pytest.raises(SettingError, match=text):
@@ -58,13 +58,13 @@ def test_another_training_is_not_resumed(examples: Examples, tmp_path: Path) -> 
 
 
 def test_without_a_checkpoint_there_is_nothing_to_resume(
-    examples: Examples, tmp_path: Path
+    examples: ExampleSet, tmp_path: Path
 ) -> None:
     with pytest.raises(ModelError, match=r"no checkpoint in .* Train without --resume"):
         trained(examples, tmp_path / "run", resume=True)
 
 
-def test_a_damaged_checkpoint_is_one_line(examples: Examples, tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_is_one_line(examples: ExampleSet, tmp_path: Path) -> None:
     stopped(examples, tmp_path / "run", 1, 1)
     (tensors,) = (tmp_path / "run").glob("checkpoint-*.safetensors")
     tensors.write_bytes(tensors.read_bytes()[:-9])
@@ -72,7 +72,9 @@ def test_a_damaged_checkpoint_is_one_line(examples: Examples, tmp_path: Path) ->
         trained(examples, tmp_path / "run", resume=True)
 
 
-def test_one_checkpoint_is_kept_and_none_after_the_end(examples: Examples, tmp_path: Path) -> None:
+def test_one_checkpoint_is_kept_and_none_after_the_end(
+    examples: ExampleSet, tmp_path: Path
+) -> None:
     stopped(examples, tmp_path / "run", 3, 1)
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {"checkpoint.json", "checkpoint-0003.safetensors", "tensorboard"}

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from dmrl.learn.data.batches import Batch, Examples, gathered
-from dmrl.learn.networks.architectures import Network, build
+from dmrl.learn.data.batches import Batch, ExampleSet, collate
+from dmrl.learn.networks.architectures import Network, build_network
 from dmrl.learn.training import trainer
-from dmrl.learn.training.train_step import LOSSES, train_step
-from dmrl.learn.training.trainer import Training, learning_rate_at, new_network
+from dmrl.learn.training.train_step import LOSS_NAMES, train_step
+from dmrl.learn.training.trainer import Trainer, build_initial_network, learning_rate_at
 
 from .fitting import PUBLISHED, SETTINGS, dots
 
@@ -27,10 +27,10 @@ def test_the_learning_rate_rises_for_two_epochs_and_falls_to_its_end() -> None:
     assert rates[-1] == pytest.approx(1e-6)
 
 
-def test_gradients_of_one_step_are_gone_before_the_next(examples: Examples) -> None:
-    network = build("locanet").train()
+def test_gradients_of_one_step_are_gone_before_the_next(examples: ExampleSet) -> None:
+    network = build_network("locanet").train()
     optimizer = torch.optim.SGD(network.parameters(), lr=0.0)
-    batch = gathered(examples, [0, 1])
+    batch = collate(examples, [0, 1])
     sizes = []
     for _ in range(2):
         train_step(network, optimizer, batch, SETTINGS, 0.0)
@@ -38,32 +38,34 @@ def test_gradients_of_one_step_are_gone_before_the_next(examples: Examples) -> N
     assert sizes[1] == pytest.approx(sizes[0], rel=1e-3)
 
 
-def test_every_epoch_has_an_order_of_its_own(examples: Examples, tmp_path: Path) -> None:
-    training = Training(new_network(SETTINGS, examples), examples, SETTINGS, tmp_path)
-    seen = [torch.cat([b.images for b in training._batches(epoch, None)]) for epoch in (0, 0, 1)]
+def test_every_epoch_has_an_order_of_its_own(examples: ExampleSet, tmp_path: Path) -> None:
+    training = Trainer(build_initial_network(SETTINGS, examples), examples, SETTINGS, tmp_path)
+    seen = [
+        torch.cat([b.images for b in training._iter_batches(epoch, None)]) for epoch in (0, 0, 1)
+    ]
     assert torch.equal(seen[0], seen[1])
     assert not torch.equal(seen[0], seen[2])
 
 
 def test_an_epoch_of_so_many_images_takes_as_many_steps_of_few(
-    examples: Examples, tmp_path: Path
+    examples: ExampleSet, tmp_path: Path
 ) -> None:
     settings = replace(SETTINGS, epochs=2, epoch_images=3 * SETTINGS.batch_size + 1)
     few = examples.select(np.arange(len(examples)) < 5)
-    training = Training(new_network(settings, few), few, settings, tmp_path)
+    training = Trainer(build_initial_network(settings, few), few, settings, tmp_path)
     assert training.steps_left == 8
-    sizes = [len(batch.images) for batch in training._batches(0, None)]
+    sizes = [len(batch.images) for batch in training._iter_batches(0, None)]
     assert sizes == [settings.batch_size] * 3 + [1]
-    assert [step.epoch for step in training.steps()] == [1] * 4 + [2] * 4
+    assert [step.epoch for step in training.train_steps()] == [1] * 4 + [2] * 4
     assert all(np.isfinite(epoch["loss"]) for epoch in training.history)
 
 
 def test_the_loss_that_is_shown_is_the_mean_over_the_images_since_the_last(
-    examples: Examples, tmp_path: Path
+    examples: ExampleSet, tmp_path: Path
 ) -> None:
     settings = replace(SETTINGS, epochs=2)
-    training = Training(new_network(settings, examples), examples, settings, tmp_path)
-    shown = [step.loss for step in training.steps()]
+    training = Trainer(build_initial_network(settings, examples), examples, settings, tmp_path)
+    shown = [step.loss for step in training.train_steps()]
     # Seven batches of an epoch, the last of two images: looked at once, at its end.
     assert [shown[6], shown[13]] == pytest.approx([epoch["loss"] for epoch in training.history])
 
@@ -80,10 +82,10 @@ def test_curves_stand_at_the_steps_of_what_they_show(
 
     monkeypatch.setattr(trainer.boards, "opened", opened)
     settings, images = replace(SETTINGS, epochs=2), dots(7)  # three steps, the last of one image
-    network = new_network(settings, images)
-    training = Training(network, images, settings, tmp_path, validation=dots(3))
+    network = build_initial_network(settings, images)
+    training = Trainer(network, images, settings, tmp_path, validation=dots(3))
     assert training.steps_left == 6
-    assert [step.epoch for step in training.steps()] == [1, 1, 1, 2, 2, 2]
+    assert [step.epoch for step in training.train_steps()] == [1, 1, 1, 2, 2, 2]
     assert training.steps_left == 0
     found = {name: [row[1:] for row in rows if row[0] == name] for name, *_ in rows}
     assert found.pop("first") == [(0.0, 1)]
@@ -109,24 +111,29 @@ def test_every_step_is_asked_for_as_the_recipe_says(
     """Nothing is computed here: what each step of three epochs would be given."""
     images, asked = dots(8), []
     settings = replace(SETTINGS, epochs=3, frozen_norm_epochs=1, ema_steps=5, hard_share=0.25)
-    teacher = build("dmrl-nano").train()
+    teacher = build_network("dmrl-nano").train()
 
     def step(network: Network, _: object, batch: Batch, *rest: object) -> torch.Tensor:
         norms = {m.training for m in network.modules() if isinstance(m, torch.nn.BatchNorm2d)}
         asked.append((batch.robots[:, 0, :2].tolist(), network.training, norms, rest))
-        return torch.full((len(LOSSES),), float(len(asked)))
+        return torch.full((len(LOSS_NAMES),), float(len(asked)))
 
     updated, hard = [], []
     monkeypatch.setattr(trainer, "train_step", step)
     monkeypatch.setattr(trainer, "save_checkpoint", lambda *_: None)
     monkeypatch.setattr(trainer.boards, "opened", lambda *_: nullcontext(lambda *_: None))
-    monkeypatch.setattr(trainer, "mined", lambda *given: hard.append(given))
-    monkeypatch.setattr(trainer.Average, "update", lambda _, at: updated.append(at))
+    monkeypatch.setattr(trainer, "mine_hard_negatives", lambda *given: hard.append(given))
+    monkeypatch.setattr(trainer.WeightEma, "update", lambda _, at: updated.append(at))
     shares = np.ones(8)
-    training = Training(
-        new_network(settings, images), images, settings, tmp_path, teacher=teacher, shares=shares
+    training = Trainer(
+        build_initial_network(settings, images),
+        images,
+        settings,
+        tmp_path,
+        teacher=teacher,
+        shares=shares,
     )
-    shown = [(step.epoch, step.loss) for step in training.steps()]
+    shown = [(step.epoch, step.loss) for step in training.train_steps()]
     assert updated == list(range(1, 10))
     assert [epoch for epoch, _ in shown] == [1, 1, 1, 2, 2, 2, 3, 3, 3]
     every = sorted(images.robots[:, 0, :2].tolist())
@@ -139,9 +146,9 @@ def test_every_step_is_asked_for_as_the_recipe_says(
         ends = np.array([3 * epoch + k for k in (1, 2, 3)])
         means = float((ends * [3, 3, 2]).sum() / 8)
         assert training.history[epoch] == pytest.approx(
-            {"loss": len(LOSSES) * means, **dict.fromkeys(LOSSES, means)}
+            {"loss": len(LOSS_NAMES) * means, **dict.fromkeys(LOSS_NAMES, means)}
         )
-        assert shown[3 * epoch + 2][1] == pytest.approx(len(LOSSES) * means)
+        assert shown[3 * epoch + 2][1] == pytest.approx(len(LOSS_NAMES) * means)
     for number, (*_, (given, rate, group, share, taught)) in enumerate(asked, start=1):
         assert (given, rate) == (settings, learning_rate_at(number, 3, settings))
         assert (group.size, share) == (1, 1.0)  # type: ignore[attr-defined]

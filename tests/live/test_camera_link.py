@@ -12,14 +12,14 @@ from dmrl.formats.aideck import cpx
 from dmrl.formats.aideck.cpx import Image
 from dmrl.formats.aideck.cpx_encode import pack_image
 from dmrl.formats.aideck.cpx_log import APP, GAP8, HOST, Packet, pack_packet
-from dmrl.formats.aideck.cpx_state import State
-from dmrl.live.camera_link import GARBAGE_BYTES, CameraClient, _Times, address
-from dmrl.live.queue import Feed, Received
-from dmrl.live.receive_clocks import HostTime
+from dmrl.formats.aideck.cpx_state import RobotState
+from dmrl.live.camera_link import MAX_GARBAGE_BYTES, CameraClient, _ExposureTimes, parse_address
+from dmrl.live.queue import ReceivedSample, SampleQueue
+from dmrl.live.receive_clocks import HostClock
 
 PATIENCE_S = 100.0
 RNG = np.random.default_rng(5)
-Start = Callable[[int], tuple[CameraClient, Feed]]
+Start = Callable[[int], tuple[CameraClient, SampleQueue]]
 RAW = Image(320, 224, "raw", RNG.bytes(320 * 224))
 
 
@@ -51,9 +51,9 @@ class Deck:
 def client() -> Iterator[Start]:
     started: list[CameraClient] = []
 
-    def start(port: int) -> tuple[CameraClient, Feed]:
-        feed = Feed()
-        started.append(CameraClient("cf1", "127.0.0.1", port, feed, HostTime()))
+    def start(port: int) -> tuple[CameraClient, SampleQueue]:
+        feed = SampleQueue()
+        started.append(CameraClient("cf1", "127.0.0.1", port, feed, HostClock()))
         started[-1].start()
         return started[-1], feed
 
@@ -64,9 +64,11 @@ def client() -> Iterator[Start]:
         one.join(timeout=PATIENCE_S)
 
 
-def taken(feed: Feed) -> tuple[list[Received], list[str]]:
-    items = feed.take(0.0)
-    return [i for i in items if isinstance(i, Received)], [i for i in items if isinstance(i, str)]
+def taken(feed: SampleQueue) -> tuple[list[ReceivedSample], list[str]]:
+    items = feed.get_batch(0.0)
+    return [i for i in items if isinstance(i, ReceivedSample)], [
+        i for i in items if isinstance(i, str)
+    ]
 
 
 def test_images_come_after_their_calibration_over_two_connections(client: Start) -> None:
@@ -90,7 +92,7 @@ def test_a_closed_port_is_said_once_and_tried_again(client: Start) -> None:
 
 
 def test_garbage_ends_the_connection_and_gives_no_image(client: Start) -> None:
-    deck = Deck(RNG.bytes(2 * GARBAGE_BYTES))
+    deck = Deck(RNG.bytes(2 * MAX_GARBAGE_BYTES))
     camera, feed = client(deck.port)
     wait(lambda: camera.health.state == "sends no CPX images")
     assert camera.health.received == 0
@@ -119,32 +121,32 @@ def test_images_of_another_size_come_without_a_calibration(client: Start) -> Non
 @pytest.mark.parametrize("text", ["", ":5000", "host:", "host:0", "host:70000", "host:x"])
 def test_what_is_no_address_is_refused(text: str) -> None:
     with pytest.raises(SettingError, match="HOST:PORT"):
-        address(text)
+        parse_address(text)
 
 
 def test_without_a_port_the_decks_own_is_taken() -> None:
-    assert address("192.168.4.1") == ("192.168.4.1", 5000)
+    assert parse_address("192.168.4.1") == ("192.168.4.1", 5000)
 
 
 def test_images_that_did_not_come_are_counted_by_their_numbers() -> None:
-    camera = CameraClient("cf1", "127.0.0.1", 5000, Feed(), HostTime())
+    camera = CameraClient("cf1", "127.0.0.1", 5000, SampleQueue(), HostClock())
     before = None
     for number in (None, 254, 255, 259, 260, None, 300):
-        before = camera._count(replace(RAW, frame_id=number), before)
+        before = camera._count_lost(replace(RAW, frame_id=number), before)
     assert camera.health.lost == 3  # 256, 257 and 258
     assert before == 300
 
 
 def test_the_best_clock_that_a_camera_tells_counts_and_nothing_is_of_the_future() -> None:
     known: dict[float, int] = {}
-    times = _Times(known.get)
+    times = _ExposureTimes(known.get)
     # Its robot's clock was at 4 ms when the camera's was at 0; the picture is of 1 ms later.
-    robot = replace(RAW, time_us=1_000, state=State(robot_ms=4, received_us=0))
+    robot = replace(RAW, time_us=1_000, state=RobotState(robot_ms=4, received_us=0))
     assert robot.robot_time_us == 5_000
     assert times(robot, 10**9) == 10**9  # the robot's clock is not known yet: the camera's own
     known[5.0] = 123_000_000
     assert times(robot, 2 * 10**9) == 123_000_000
-    own = _Times(known.get)
+    own = _ExposureTimes(known.get)
     first = own(replace(RAW, time_us=1_000_000), 5 * 10**9)
     assert first == 5 * 10**9
     # A second later by the camera; it came 0.4 s earlier than the first had let expect.

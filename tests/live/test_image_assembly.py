@@ -4,8 +4,8 @@ import pytest
 from dmrl.errors import SourceError
 from dmrl.formats.aideck.cpx import Image
 from dmrl.images import bayer, codec
-from dmrl.live.image_assembly import encoded
-from dmrl.live.simulated.aideck_server import whole_sensor
+from dmrl.live.image_assembly import encode_image
+from dmrl.live.simulated.aideck_server import pad_to_sensor
 
 RNG = np.random.default_rng(4)
 SMOOTH = np.clip(
@@ -14,24 +14,24 @@ SMOOTH = np.clip(
 
 
 def test_the_whole_sensor_is_cut_to_what_the_calibration_is_of() -> None:
-    raw = bayer.mosaic(whole_sensor(SMOOTH))
-    data, kind = encoded(Image(324, 244, "raw", raw.tobytes()), "colour")
+    raw = bayer.to_bayer(pad_to_sensor(SMOOTH))
+    data, kind = encode_image(Image(324, 244, "raw", raw.tobytes()), "colour")
     assert kind == "png"
     difference = np.abs(codec.decode(data).astype(int) - SMOOTH)
     assert difference[1:-1, 1:-1].max() <= 4
-    grey, _ = encoded(Image(324, 244, "raw", raw.tobytes()), "grey")
+    grey, _ = encode_image(Image(324, 244, "raw", raw.tobytes()), "grey")
     assert (codec.decode(grey)[..., 1] == raw[10:234, 2:322]).all()
 
 
 def test_a_jpeg_of_the_right_size_keeps_its_bytes() -> None:
     jpeg = codec.encode_jpeg(SMOOTH)
-    assert encoded(Image(320, 224, "jpeg", jpeg), "colour") == (jpeg, "jpeg")
-    whole = codec.encode_jpeg(whole_sensor(SMOOTH))
-    data, kind = encoded(Image(324, 244, "jpeg", whole), "colour", "jpeg")
-    assert codec.size(data) == (320, 224, kind)
+    assert encode_image(Image(320, 224, "jpeg", jpeg), "colour") == (jpeg, "jpeg")
+    whole = codec.encode_jpeg(pad_to_sensor(SMOOTH))
+    data, kind = encode_image(Image(324, 244, "jpeg", whole), "colour", "jpeg")
+    assert codec.read_size(data) == (320, 224, kind)
 
 
 def test_a_jpeg_of_another_size_than_was_said_is_refused() -> None:
     jpeg = codec.encode_jpeg(SMOOTH)
     with pytest.raises(SourceError, match="not 160 x 120 px as in its header"):
-        encoded(Image(160, 120, "jpeg", jpeg), "colour")
+        encode_image(Image(160, 120, "jpeg", jpeg), "colour")

@@ -2,10 +2,10 @@
 
 import pytest
 
-from dmrl.live.links import links_of
-from dmrl.live.queue import Feed
-from dmrl.live.receive_clocks import HostTime
-from dmrl.live.robot_options import Robot
+from dmrl.live.links import build_links
+from dmrl.live.queue import SampleQueue
+from dmrl.live.receive_clocks import HostClock
+from dmrl.live.robot_options import RobotOptions
 
 
 @pytest.mark.parametrize(
@@ -21,9 +21,10 @@ def test_ranges_that_are_nobodys_are_said(
     names: list[str], peer: list[str], said: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     robots = [
-        Robot(name, f"udp://127.0.0.1:{k}", None, None) for k, name in enumerate(names, 19850)
+        RobotOptions(name, f"udp://127.0.0.1:{k}", None, None)
+        for k, name in enumerate(names, 19850)
     ]
-    links = links_of(robots, peer, 100.0, Feed(), HostTime())
+    links = build_links(robots, peer, 100.0, SampleQueue(), HostClock())
     assert list(links) == names
     lines = capsys.readouterr().err.splitlines()
     assert [line for line in lines if "the peer of" in line] == lines

@@ -3,7 +3,14 @@ import math
 import pytest
 
 from dmrl.errors import SettingError
-from dmrl.live.log_blocks import BLOCK_BYTES, BLOCKS_MAX, SIZES, Reading, number_of, plan
+from dmrl.live.log_blocks import (
+    BLOCK_BYTES,
+    MAX_BLOCKS,
+    VARIABLE_BYTES,
+    LogDecoder,
+    parse_robot_number,
+    plan_blocks,
+)
 from dmrl.live.simulated.crazyflie_server import LOG_TYPES
 
 TOC = {
@@ -20,7 +27,7 @@ LEVEL = {f"stateEstimate.{name}": 0.0 for name in ("roll", "pitch", "yaw", "vx",
 
 @pytest.mark.parametrize("peers", [0, 1, 5, 12, 20])
 def test_blocks_fit_their_packet_and_hold_every_variable_once(peers: int) -> None:
-    wanted = plan(TOC, {k: f"cf{k}" for k in range(peers)}, 10)
+    wanted = plan_blocks(TOC, {k: f"cf{k}" for k in range(peers)}, 10)
     assert all(0 < block.size <= BLOCK_BYTES for block in wanted.blocks)
     names = [v.name for block in wanted.blocks for v in block.variables]
     assert len(names) == len(set(names)) == 7 + 1 + peers + 1
@@ -30,7 +37,7 @@ def test_blocks_fit_their_packet_and_hold_every_variable_once(peers: int) -> Non
 
 def test_types_are_as_long_as_cflib_says() -> None:
     elements = pytest.importorskip("cflib.crazyflie.log").LogTocElement.types
-    assert {name: size for name, _, size in elements.values()} == SIZES
+    assert {name: size for name, _, size in elements.values()} == VARIABLE_BYTES
     assert {name: kind for kind, (name, _, _) in elements.items()} == {
         name: kind for name, (kind, _) in LOG_TYPES.items()
     }
@@ -38,20 +45,22 @@ def test_types_are_as_long_as_cflib_says() -> None:
 
 def test_a_drone_without_a_state_estimate_is_refused() -> None:
     with pytest.raises(SettingError, match=r"cf7 has no log variable stateEstimate\.roll"):
-        plan({"pm.vbat": "float"}, {}, 10, robot="cf7")
+        plan_blocks({"pm.vbat": "float"}, {}, 10, robot="cf7")
 
 
 def test_without_a_height_estimate_the_laser_is_taken_in_millimetres() -> None:
-    reading = Reading("cf1", plan({k: v for k, v in TOC.items() if k != "stateEstimate.z"}, {}, 10))
-    (height,) = reading.samples(5, {"range.zrange": 432})
+    reading = LogDecoder(
+        "cf1", plan_blocks({k: v for k, v in TOC.items() if k != "stateEstimate.z"}, {}, 10)
+    )
+    (height,) = reading.iter_samples(5, {"range.zrange": 432})
     assert height.fields == {"height_m": 0.432}
 
 
 def test_pitch_changes_its_sign_and_velocity_turns_with_the_robot() -> None:
-    reading = Reading("cf1", plan(TOC, {}, 10))
+    reading = LogDecoder("cf1", plan_blocks(TOC, {}, 10))
     values = LEVEL | {"stateEstimate.pitch": 10.0, "stateEstimate.roll": 5.0}
     values |= {"stateEstimate.yaw": 90.0, "stateEstimate.vx": 0.0, "stateEstimate.vy": 2.0}
-    attitude, velocity = reading.samples(5, values)
+    attitude, velocity = reading.iter_samples(5, values)
     assert attitude.fields["pitch_rad"] == pytest.approx(-math.radians(10))
     assert attitude.fields["roll_rad"] == pytest.approx(math.radians(5))
     # Facing left of the take-off's x, it moves along its own x.
@@ -60,50 +69,50 @@ def test_pitch_changes_its_sign_and_velocity_turns_with_the_robot() -> None:
 
 
 def test_the_turning_rate_is_about_the_vertical_not_the_body() -> None:
-    reading = Reading("cf1", plan(TOC, {}, 10))
+    reading = LogDecoder("cf1", plan_blocks(TOC, {}, 10))
     roll, rate = math.radians(20), math.radians(60)
     # Turning about the vertical at 60 deg/s while rolled by 20 degrees.
     values = LEVEL | {"stateEstimate.roll": 20.0}
     values |= {"gyro.y": 60 * math.sin(roll), "gyro.z": 60 * math.cos(roll)}
-    attitude, _ = reading.samples(5, values)
+    attitude, _ = reading.iter_samples(5, values)
     assert attitude.fields["yaw_rate_radps"] == pytest.approx(rate)
 
 
 @pytest.mark.parametrize(("kind", "unit"), [("float", 1.0), ("uint16_t", 1000)])
 def test_only_a_changed_distance_is_a_ranging(kind: str, unit: float) -> None:
     toc = TOC | {"ranging.distance2": kind}
-    reading = Reading("cf1", plan(toc, {2: "cf2"}, 10))
+    reading = LogDecoder("cf1", plan_blocks(toc, {2: "cf2"}, 10))
     logged = [0.0, 1.5, 1.5, 1.25, 1.25, 65.535, 1.0]
     got = [
         sample.fields["range_m"]
         for value in logged
-        for sample in reading.samples(0, {"ranging.distance2": value * unit})
+        for sample in reading.iter_samples(0, {"ranging.distance2": value * unit})
     ]
     assert got == [1.5, 1.25, 1.0]
 
 
 def test_values_that_are_no_numbers_are_left_out() -> None:
-    reading = Reading("cf1", plan(TOC, {1: "cf1"}, 10))
+    reading = LogDecoder("cf1", plan_blocks(TOC, {1: "cf1"}, 10))
     values = LEVEL | {"stateEstimate.vx": math.nan, "stateEstimate.z": math.inf}
-    assert list(reading.samples(5, values)) == []
+    assert list(reading.iter_samples(5, values)) == []
 
 
 def test_robots_are_numbered_by_the_end_of_their_names() -> None:
-    assert [number_of(name) for name in ("cf2", "drone10", "leader")] == [2, 10, None]
+    assert [parse_robot_number(name) for name in ("cf2", "drone10", "leader")] == [2, 10, None]
 
 
 def test_a_block_is_as_long_as_cflib_lets_it_be() -> None:
     assert pytest.importorskip("cflib.crazyflie.log").LogConfig.MAX_LEN == BLOCK_BYTES
-    assert pytest.importorskip("cflib.crazyflie.log").Log.MAX_BLOCKS == BLOCKS_MAX
+    assert pytest.importorskip("cflib.crazyflie.log").Log.MAX_BLOCKS == MAX_BLOCKS
 
 
 def test_turning_about_the_vertical_is_found_at_any_tilt() -> None:
-    reading = Reading("cf1", plan(TOC, {}, 10))
+    reading = LogDecoder("cf1", plan_blocks(TOC, {}, 10))
     for roll_deg, pitch_deg in ((20.0, 0.0), (0.0, 15.0), (-25.0, 10.0)):
         # The log's pitch is nose up, and the body's rates are those of Ry(pitch) Rx(roll).
         roll, pitch = math.radians(roll_deg), -math.radians(pitch_deg)
         values = LEVEL | {"stateEstimate.roll": roll_deg, "stateEstimate.pitch": pitch_deg}
         values |= {"gyro.y": 60 * math.cos(pitch) * math.sin(roll)}
         values |= {"gyro.z": 60 * math.cos(pitch) * math.cos(roll)}
-        attitude, _ = reading.samples(5, values)
+        attitude, _ = reading.iter_samples(5, values)
         assert attitude.fields["yaw_rate_radps"] == pytest.approx(math.radians(60))

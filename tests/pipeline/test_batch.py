@@ -13,11 +13,11 @@ import pytest
 
 from dmrl.errors import DmrlError, RecordingError
 from dmrl.images.codec import encode_png
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.pipeline.batch import find_recordings, is_collection, run_over_folder
-from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.recording import Provenance, RecordingWriter, read_summary
 from dmrl.stages import check, convert, trim
-from dmrl.topics import attitude
+from dmrl.topics import ATTITUDE
 
 KEPT = trim.Settings(to_s=1.5)
 
@@ -26,8 +26,8 @@ def record(path: Path, messages: int = 20, roll_rad: float = 0.0) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(messages):
-            one = message("Attitude")(roll_rad=roll_rad + k)
-            sink.write(1_000_000_000 + k * 100_000_000, attitude("cf1"), one)
+            one = message_class("Attitude")(roll_rad=roll_rad + k)
+            sink.write(1_000_000_000 + k * 100_000_000, ATTITUDE("cf1"), one)
     return path
 
 
@@ -185,7 +185,7 @@ def test_sources_in_a_folder_become_recordings_of_their_names(
     convert.command(tmp_path / "sources", tmp_path / "out", workers=2)
     made = sorted((tmp_path / "out").iterdir())
     assert [path.name for path in made] == ["one.mcap", "two.mcap"]
-    assert all(summary(path).count == 1 for path in made)
+    assert all(read_summary(path).count == 1 for path in made)
     assert "README" in capsys.readouterr().err
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import DmrlError, OutputError, RecipeError, SettingError
-from dmrl.evaluation.pipeline_summary import report
+from dmrl.evaluation.pipeline_summary import print_report
 from dmrl.pipeline import job_worker as work
 from dmrl.pipeline import recipe_run as pipeline
 from dmrl.pipeline.job import build_job
@@ -59,7 +59,7 @@ def test_a_pipeline_gives_the_same_bytes_with_any_number_of_workers(
     again = pipeline.run(recipe, two)
     assert [d.skipped for d in again] == [True] * 6
     assert capsys.readouterr().err == "6 of 6 steps were up to date\n"
-    report(again, as_json=True)
+    print_report(again, as_json=True)
     assert len(json.loads(capsys.readouterr().out)["steps"]) == 6
 
 

@@ -207,15 +207,15 @@ def told(step: Step) -> dict[str, Any]:
     """A step with those of its settings that are not as they usually are."""
     takes = step.signature
     assert takes.settings is not None
-    usual = recipe.plain(asdict(takes.settings()))
-    own = recipe.plain(asdict(recipe.check(step.out, step.settings, takes.settings)))
+    usual = recipe.to_json_values(asdict(takes.settings()))
+    own = recipe.to_json_values(asdict(recipe.check(step.out, step.settings, takes.settings)))
     settings = {key: value for key, value in own.items() if value != usual[key]}
     return {**asdict(step), "settings": settings}
 
 
 def test_self_supervised_is_still_what_it_was() -> None:
     steps = pipeline.load_plan("self_supervised").steps
-    assert len(recipe.text("self_supervised").splitlines()) <= 100
+    assert len(recipe.read_text("self_supervised").splitlines()) <= 100
     assert Counter(step.stage for step in steps) == {
         **{"fly": 148, "label": 864, "predict": 748, "dataset": 7, "train": 7},
         **{"evaluate": 30, "view": 1},
@@ -236,7 +236,7 @@ def test_recipes_of_the_page_can_be_loaded(tmp_path: Path, text: str) -> None:
     assert len(load(tmp_path, text).steps) in (10, 5)
 
 
-@pytest.mark.parametrize("name", recipe.names())
+@pytest.mark.parametrize("name", recipe.list_names())
 def test_every_shipped_pipeline_can_be_loaded(name: str) -> None:
     if recipe.read(name)["kind"] == "pipeline":
         assert pipeline.load_plan(name).steps

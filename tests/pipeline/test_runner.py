@@ -10,15 +10,15 @@ from typing import Any
 
 import pytest
 
-from dmrl.atomic_output import partial_of
+from dmrl.atomic_output import to_partial_path
 from dmrl.errors import DmrlError, OutputError
-from dmrl.evaluation.pipeline_summary import Done
+from dmrl.evaluation.pipeline_summary import StepOutcome
 from dmrl.pipeline.build_cache import BuildCache
 from dmrl.pipeline.job import JobResult
 from dmrl.pipeline.plan import Plan, Step
 from dmrl.pipeline.process_pool import ProcessPool
 from dmrl.pipeline.runner import Runner
-from dmrl.recording.provenance_inputs import sha256_of_file
+from dmrl.recording.provenance_inputs import hash_file
 from dmrl.terminal.progress import Lines
 
 A = Step("sketch", "a", settings={"seed": 1})
@@ -53,7 +53,7 @@ class Pretender(ProcessPool):
             return answer
         read = [Path(p).read_text() for given in told["inputs"].values() for p in _list(given)]
         out.write_text(json.dumps([told["settings"], read]))
-        answer.set_result({"sha256": sha256_of_file(out)})
+        answer.set_result({"sha256": hash_file(out)})
         return answer
 
 
@@ -61,7 +61,7 @@ def _list(given: Any) -> list[str]:
     return given if isinstance(given, list) else [given]
 
 
-Run = Callable[..., tuple[list[Done], Pretender]]
+Run = Callable[..., tuple[list[StepOutcome], Pretender]]
 
 
 @pytest.fixture
@@ -69,7 +69,9 @@ def run(tmp_path: Path) -> Run:
     """Runs steps in one folder, as often as it is called."""
     (tmp_path / "unfinished").mkdir()
 
-    def runs(*steps: Step, data: Path | None = None, **how: Any) -> tuple[list[Done], Pretender]:
+    def runs(
+        *steps: Step, data: Path | None = None, **how: Any
+    ) -> tuple[list[StepOutcome], Pretender]:
         with Pretender(**how) as crew:
             memory = BuildCache.load(tmp_path / "pipeline.json")
             return Runner(Plan(steps, ""), tmp_path, data, memory, crew).run(), crew
@@ -188,7 +190,7 @@ def test_a_folder_takes_the_place_of_a_folder(run: Run, tmp_path: Path) -> None:
 
 
 def test_a_killed_step_goes_on_where_it_was_unless_it_is_another(run: Run, tmp_path: Path) -> None:
-    partial = partial_of(tmp_path / "unfinished" / "r.mcap")
+    partial = to_partial_path(tmp_path / "unfinished" / "r.mcap")
 
     def render(seed: int) -> tuple[bool, bool]:
         step = Step("render", "r.mcap", settings={"seed": seed, "workers": seed})

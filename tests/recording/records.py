@@ -6,7 +6,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
@@ -20,9 +20,9 @@ def small(path: Path) -> Path:
     """Seven messages on two topics in three chunks, with metadata and an attachment."""
     with RecordingWriter(path, Provenance("test", {"level": 1}, seed=3)) as sink:
         for k in range(4):
-            sink.write(10 * k, TOPICS[0], message("Height")(height_m=k))
+            sink.write(10 * k, TOPICS[0], message_class("Height")(height_m=k))
             if k:
-                sink.write(10 * k + 5, TOPICS[1], message("UwbRange")(range_m=k))
+                sink.write(10 * k + 5, TOPICS[1], message_class("UwbRange")(range_m=k))
             if k % 2:
                 sink.flush()
         sink.add_metadata("dmrl.split", {"train": "[[0, 10]]"})

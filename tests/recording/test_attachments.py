@@ -11,14 +11,23 @@ from mcap.reader import make_reader
 from mcap.writer import IndexType, Writer
 
 from dmrl.errors import RecordingError
-from dmrl.messages import message, schema_bytes
-from dmrl.recording import Provenance, RecordingWriter, check, merge, read_raw, summary, trim
-from dmrl.recording.attachments import copy_extras, splits
-from dmrl.recording.licences import LICENCES_METADATA, licence_beside, licence_words, licences
-from dmrl.recording.log_times import log_times
-from dmrl.recording.mcap.batch_reader import blocks, in_file_order, tally
-from dmrl.recording.mcap.message_index import INDEX, index_entries
-from dmrl.recording.mcap.summary_index import channel_on
+from dmrl.messages import message_class, serialize_schema
+from dmrl.recording import Provenance, RecordingWriter, check, merge, read_raw, read_summary, trim
+from dmrl.recording.attachments import copy_metadata_and_attachments, read_splits
+from dmrl.recording.licences import (
+    LICENCES_METADATA,
+    extract_licence_title,
+    find_licence_file,
+    read_licences,
+)
+from dmrl.recording.log_times import read_log_times
+from dmrl.recording.mcap.batch_reader import (
+    count_messages,
+    iter_batches,
+    iter_batches_in_file_order,
+)
+from dmrl.recording.mcap.message_index import MESSAGE_INDEX_STRUCT, parse_index_entries
+from dmrl.recording.mcap.summary_index import read_channel
 
 from .records import records
 
@@ -28,7 +37,7 @@ MADE = Provenance("test")
 def recording(path: Path, *metadata: tuple[str, dict[str, str]]) -> Path:
     with RecordingWriter(path, MADE, recipe="kind = 'test'\n") as sink:
         for k in range(10):
-            sink.write(10 * k, "/cf1/height", message("Height")(height_m=k))
+            sink.write(10 * k, "/cf1/height", message_class("Height")(height_m=k))
         for name, values in metadata:
             sink.add_metadata(name, values)
         sink.add_attachment("notes", "text/plain", b"hello")
@@ -41,7 +50,7 @@ def test_a_split_is_its_intervals_by_name(tmp_path: Path) -> None:
         ("dmrl.split", {"train": "[[0, 10], [30, 40]]", "test": "[[20, 25]]"}),
         ("dmrl.split", {"train": "[[50, 60]]"}),
     )
-    assert splits(path, summary(path)) == {
+    assert read_splits(path, read_summary(path)) == {
         "train": [(0, 10), (30, 40), (50, 60)],
         "test": [(20, 25)],
     }
@@ -51,7 +60,7 @@ def test_a_split_is_its_intervals_by_name(tmp_path: Path) -> None:
 def test_a_split_that_is_none_is_one_line(text: str, tmp_path: Path) -> None:
     path = recording(tmp_path / "a.mcap", ("dmrl.split", {"train": text}))
     with pytest.raises(RecordingError, match=r"a\.mcap: its split is not a list") as e:
-        splits(path, summary(path))
+        read_splits(path, read_summary(path))
     assert "\n" not in str(e.value)
 
 
@@ -59,28 +68,28 @@ def test_metadata_and_attachments_go_along_but_no_provenance_or_recipe(tmp_path:
     one = recording(tmp_path / "a.mcap", ("own", {"k": "v"}), ("own", {"k": "w"}))
     other = tmp_path / "b.mcap"
     with RecordingWriter(other, Provenance("other")) as sink:
-        copy_extras(summary(one), sink)
-    found = summary(other)
+        copy_metadata_and_attachments(read_summary(one), sink)
+    found = read_summary(other)
     assert found.metadata["own"] == [{"k": "v"}, {"k": "w"}]
     assert found.provenance is not None and found.provenance.stage == "other"
     assert len(found.metadata["dmrl.provenance"]) == 1
-    assert found.attachments.keys() - summary(one).attachments.keys() == set()
+    assert found.attachments.keys() - read_summary(one).attachments.keys() == set()
     assert found.attachments["notes"] == b"hello"
 
 
 def test_the_licence_beside_a_source_is_told_by_its_first_words(tmp_path: Path) -> None:
     source = tmp_path / "photo.jpg"
     source.write_bytes(b"x")
-    assert licence_beside(source) is None
+    assert find_licence_file(source) is None
     (tmp_path / "LICENSES").write_text("no")
     (tmp_path / "LICENCE.md").mkdir()
-    assert licence_beside(tmp_path) is None
+    assert find_licence_file(tmp_path) is None
     found = tmp_path / "LICENSE.txt"
     found.write_text("\n## " + "CC BY 4.0" + "x" * 200 + "\nmore\n")
-    assert licence_beside(source) == licence_beside(tmp_path) == found
-    assert licence_words(found) == ("CC BY 4.0" + "x" * 200)[:100]
+    assert find_licence_file(source) == find_licence_file(tmp_path) == found
+    assert extract_licence_title(found) == ("CC BY 4.0" + "x" * 200)[:100]
     found.write_text(" \n")
-    assert licence_words(found) == "empty"
+    assert extract_licence_title(found) == "empty"
 
 
 def test_licences_of_recordings_are_put_together(tmp_path: Path) -> None:
@@ -89,7 +98,7 @@ def test_licences_of_recordings_are_put_together(tmp_path: Path) -> None:
         recording(tmp_path / "b.mcap", (LICENCES_METADATA, {"a": "CC0"})),
         recording(tmp_path / "c.mcap"),
     ]
-    assert list(licences(paths).items()) == [("a", "CC0"), ("b", "MIT")]
+    assert list(read_licences(paths).items()) == [("a", "CC0"), ("b", "MIT")]
 
 
 @pytest.mark.parametrize("indexed", [True, False])
@@ -99,20 +108,20 @@ def test_a_topic_of_two_channels_is_one_topic(indexed: bool, tmp_path: Path) -> 
         kinds = IndexType.ALL if indexed else IndexType.NONE
         writer = Writer(stream, index_types=kinds, use_statistics=indexed)
         writer.start()
-        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", serialize_schema("Height"))
         for number, count in ((0, 3), (1, 4)):
             metadata = {"n": str(number)}
             channel = writer.register_channel("/cf1/height", "protobuf", schema, metadata)
             for k in range(count):
-                data = message("Height")(height_m=1.0).SerializeToString()
+                data = message_class("Height")(height_m=1.0).SerializeToString()
                 writer.add_message(channel, 5 + 10 * k + number, data, 0)
         writer.finish()
-    found = summary(path)
+    found = read_summary(path)
     assert (found.count, found.topics["/cf1/height"].count) == (7, 7)
     assert (found.start_ns, found.end_ns) == (5, 36)
-    assert channel_on(path, "/cf1/height").metadata == (("n", "0"),)
+    assert read_channel(path, "/cf1/height").metadata == (("n", "0"),)
     times = [5, 6, 15, 16, 25, 26, 36]
-    assert log_times(path, ["/cf1/height", "/none"]) == {"/cf1/height": pytest.approx(times)}
+    assert read_log_times(path, ["/cf1/height", "/none"]) == {"/cf1/height": pytest.approx(times)}
 
 
 @pytest.mark.parametrize("indexed", [True, False])
@@ -125,7 +134,7 @@ def test_a_time_that_no_signed_number_holds_is_said(
     with path.open("wb") as stream:
         writer = Writer(stream, index_types=IndexType.ALL if indexed else IndexType.NONE)
         writer.start()
-        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", serialize_schema("Height"))
         channel = writer.register_channel("/cf1/height", "protobuf", schema)
         writer.add_message(channel, 5, b"", publish_ns)
         writer.finish()
@@ -140,17 +149,17 @@ def test_a_time_after_every_other_is_said_by_all_that_read(log_ns: int, tmp_path
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
-        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", serialize_schema("Height"))
         writer.add_message(
             writer.register_channel("/cf1/height", "protobuf", schema), log_ns, b"", 5
         )
         writer.finish()
     out = tmp_path / "out.mcap"
     for read in (
-        summary,
+        read_summary,
         check,
         lambda p: list(read_raw(p)),
-        lambda p: log_times(p, ["/cf1/height"]),
+        lambda p: read_log_times(p, ["/cf1/height"]),
         lambda p: trim(p, out),
         lambda p: merge([p], out),
     ):
@@ -160,9 +169,9 @@ def test_a_time_after_every_other_is_said_by_all_that_read(log_ns: int, tmp_path
 
 def test_log_times_are_half_open(tmp_path: Path) -> None:
     path = recording(tmp_path / "a.mcap")
-    found = log_times(path, ["/cf1/height"], start_ns=20, end_ns=50)
+    found = read_log_times(path, ["/cf1/height"], start_ns=20, end_ns=50)
     assert found["/cf1/height"].tolist() == [20, 30, 40]
-    assert log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == list(range(0, 100, 10))
+    assert read_log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == list(range(0, 100, 10))
 
 
 def test_messages_of_a_stretch_come_in_blocks_of_it(tmp_path: Path) -> None:
@@ -172,31 +181,31 @@ def test_messages_of_a_stretch_come_in_blocks_of_it(tmp_path: Path) -> None:
         (None, 21, [0, 10, 20]),
         (71, None, [80, 90]),
     ):
-        found = blocks(path, start_ns=start, end_ns=end)
+        found = iter_batches(path, start_ns=start, end_ns=end)
         assert [t for block, _ in found for t in block.time_ns.tolist()] == times
-    assert [len(block) for block, _ in in_file_order(path)] == [10]
+    assert [len(block) for block, _ in iter_batches_in_file_order(path)] == [10]
     held: Counter[int] = Counter()
-    for block, _ in blocks(path):
-        tally(held, block)
+    for block, _ in iter_batches(path):
+        count_messages(held, block)
     assert list(held.values()) == [10]
 
 
 def test_an_index_is_of_its_channel_and_whole() -> None:
     pairs = np.array([[5, 0], [7, 40]], "<i8").tobytes()
-    raw = b"xy" + INDEX.pack(7, 6 + len(pairs), 3, len(pairs)) + pairs
-    found = index_entries(Path("a"), raw, {3: 2})
+    raw = b"xy" + MESSAGE_INDEX_STRUCT.pack(7, 6 + len(pairs), 3, len(pairs)) + pairs
+    found = parse_index_entries(Path("a"), raw, {3: 2})
     assert [column.tolist() for column in found] == [[3, 3], [5, 7], [0, 40], [2]]
     for wrong, at, number in (
         (raw, 2, 4),
         (raw, 3, 3),
         (raw, -len(raw) + 2, 3),
         (raw[:-1], 2, 3),
-        (b"xy" + INDEX.pack(8, 6 + len(pairs), 3, len(pairs)) + pairs, 2, 3),
-        (b"xy" + INDEX.pack(7, 7 + len(pairs), 3, len(pairs)) + pairs, 2, 3),
-        (b"xy" + INDEX.pack(7, 6 + 15, 3, 15) + pairs, 2, 3),
+        (b"xy" + MESSAGE_INDEX_STRUCT.pack(8, 6 + len(pairs), 3, len(pairs)) + pairs, 2, 3),
+        (b"xy" + MESSAGE_INDEX_STRUCT.pack(7, 7 + len(pairs), 3, len(pairs)) + pairs, 2, 3),
+        (b"xy" + MESSAGE_INDEX_STRUCT.pack(7, 6 + 15, 3, 15) + pairs, 2, 3),
     ):
         with pytest.raises(RecordingError, match="message index"):
-            index_entries(Path("a"), wrong, {number: at})
+            parse_index_entries(Path("a"), wrong, {number: at})
 
 
 @pytest.mark.parametrize("times", [[], [0], [5, 3, 9]])
@@ -204,7 +213,7 @@ def test_statistics_say_what_is_there(times: list[int], tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, MADE) as sink:
         for time_ns in times:
-            sink.write(time_ns, "/cf1/height", message("Height")())
+            sink.write(time_ns, "/cf1/height", message_class("Height")())
         sink.add_attachment("notes", "text/plain", b"hello")
     with path.open("rb") as stream:
         found = make_reader(stream).get_summary()
@@ -229,15 +238,15 @@ def test_times_of_a_message_index_are_those_of_its_chunk(time_ns: int, tmp_path:
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
-        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", serialize_schema("Height"))
         channel = writer.register_channel("/cf1/height", "protobuf", schema)
         for log_ns in (5, 6, 7):
             writer.add_message(channel, log_ns, b"", log_ns)
         writer.finish()
-    assert log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == [5, 6, 7]
+    assert read_log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == [5, 6, 7]
     data = bytearray(path.read_bytes())
     (at,) = (start for opcode, start, _ in records(data) if opcode == Opcode.MESSAGE_INDEX)
-    struct.pack_into("<Q", data, at + INDEX.size, time_ns)
+    struct.pack_into("<Q", data, at + MESSAGE_INDEX_STRUCT.size, time_ns)
     path.write_bytes(data)
     with pytest.raises(RecordingError, match="has times of another chunk"):
-        log_times(path, ["/cf1/height"])
+        read_log_times(path, ["/cf1/height"])

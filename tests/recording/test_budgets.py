@@ -16,11 +16,11 @@ from mcap.writer import Writer
 
 from dmrl.errors import RecordingError
 from dmrl.guards import limits
-from dmrl.messages import schema_bytes
-from dmrl.recording.mcap.chunk import unpacked
+from dmrl.messages import serialize_schema
+from dmrl.recording.mcap.chunk import decompress
 
 MAGIC = b"\x89MCAP0\r\n"
-HEIGHT = schema_bytes("Height")
+HEIGHT = serialize_schema("Height")
 SPARE_BYTES = 600_000_000
 """Address space that a refusal may take beyond what Python and its libraries hold."""
 
@@ -28,13 +28,13 @@ BOUNDED = """
 import resource, sys
 from pathlib import Path
 from dmrl.errors import DmrlError
-from dmrl.recording import check, recover, summary, trim
+from dmrl.recording import check, read_summary, recover, trim
 held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (held + int(sys.argv[1]), -1))
 resource.setrlimit(resource.RLIMIT_CPU, (30, 30))
 for path in map(Path, sys.argv[2:]):
     out = path.with_name("out.mcap")
-    for read in (check, summary, lambda p: trim(p, out), lambda p: recover(p, out)):
+    for read in (check, read_summary, lambda p: trim(p, out), lambda p: recover(p, out)):
         try:
             read(path)
             print("read")
@@ -108,7 +108,7 @@ def test_bombs_are_refused(tmp_path: Path) -> None:
 def test_a_chunk_has_a_budget_of_its_own_in_a_file_of_any_size() -> None:
     """A file of 10 MB may unpack to a GB, but not at once."""
     with pytest.raises(RecordingError, match="the chunk at byte 8 unpacks to 268 MB"):
-        unpacked(Path("a.mcap"), chunk(zeros(1 << 28), 1 << 28), 8)
+        decompress(Path("a.mcap"), chunk(zeros(1 << 28), 1 << 28), 8)
 
 
 @pytest.mark.heavy

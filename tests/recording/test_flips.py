@@ -13,13 +13,13 @@ from mcap.writer import Writer
 from dmrl.errors import RecordingError
 from dmrl.recording import (
     check,
-    glance,
-    log_times,
+    iter_topic_batches,
+    read_log_times,
     read_raw,
+    read_summary,
     read_table,
     recover,
-    stretches,
-    summary,
+    sample_topics,
     trim,
 )
 
@@ -33,15 +33,15 @@ def everything(path: Path) -> list[Any]:
     """What every way to read gives."""
     wanted = dict.fromkeys(TOPICS)
     return [
-        summary(path),
+        read_summary(path),
         [(raw.time_ns, raw.publish_ns, raw.channel, raw.data) for raw in read_raw(path)],
         [(raw.time_ns, raw.data) for raw in read_raw(path, start_ns=15, end_ns=26)],
         {topic: read_table(path, topic).to_pydict() for topic in TOPICS},
-        {topic: times.tolist() for topic, times in log_times(path, TOPICS).items()},
-        [{t: b.to_pydict() for t, b in seen.items()} for seen in stretches(path, wanted)],
+        {topic: times.tolist() for topic, times in read_log_times(path, TOPICS).items()},
+        [{t: b.to_pydict() for t, b in seen.items()} for seen in iter_topic_batches(path, wanted)],
         {
             topic: batch.to_pydict()
-            for topic, batch in glance(path, wanted, start_ns=0, end_ns=100).items()
+            for topic, batch in sample_topics(path, wanted, start_ns=0, end_ns=100).items()
         },
         check(path),
     ]
@@ -118,7 +118,7 @@ def test_recover_says_that_nothing_was_lost_only_if_nothing_was(step: int, tmp_p
             result = recover(path, out)
         except RecordingError:
             continue
-        found = summary(out)
+        found = read_summary(out)
         got = [(raw.time_ns, raw.topic, raw.data) for raw in read_raw(out)]
         assert result.messages == len(got)
         assert set(got) <= set(sound), at
@@ -144,7 +144,12 @@ def without_chunk(data: bytes, number: int) -> bytes:
 def test_a_removed_chunk_is_missed_by_topic(tmp_path: Path) -> None:
     path = small(tmp_path / "a.mcap")
     path.write_bytes(without_chunk(path.read_bytes(), 1))
-    for use in (summary, check, lambda p: list(read_raw(p)), lambda p: trim(p, tmp_path / "c")):
+    for use in (
+        read_summary,
+        check,
+        lambda p: list(read_raw(p)),
+        lambda p: trim(p, tmp_path / "c"),
+    ):
         with pytest.raises(RecordingError, match="dmrl recover"):
             use(path)
     result = recover(path, tmp_path / "b.mcap")
@@ -177,8 +182,8 @@ def test_sums_that_another_program_copied_say_nothing_of_its_file(tmp_path: Path
         for record in (*reader.iter_metadata(), Metadata("mine", {"a": "1"})):
             writer.add_metadata(record.name, record.metadata)
         writer.finish()
-    assert summary(copy).metadata["mine"] == [{"a": "1"}]
-    assert log_times(copy, ["/cf1/height"]).keys() == {"/cf1/height"}
+    assert read_summary(copy).metadata["mine"] == [{"a": "1"}]
+    assert read_log_times(copy, ["/cf1/height"]).keys() == {"/cf1/height"}
     assert not [finding for finding in check(copy) if finding.level == "error"]
     assert recover(copy, tmp_path / "c.mcap").whole
 

@@ -6,24 +6,26 @@ import pytest
 from mcap.writer import Writer
 
 from dmrl.errors import MissingTopic, RecordingError
-from dmrl.messages import schema_bytes
+from dmrl.messages import serialize_schema
 from dmrl.recording import read, read_table
-from dmrl.recording.loaded import Contents
+from dmrl.recording.loaded import LoadedRecording
 
 
 def test_what_is_held_is_what_is_read_whether_it_was_named_or_not(flight: Path) -> None:
     for wanted in (("/{robot}/attitude", "/{robot}/range/{peer}"), ()):
-        held = Contents(flight, *wanted)
+        held = LoadedRecording(flight, *wanted)
         for topic in ("/cf1/attitude", "/cf1/range/cf2", "/cf1/camera/calibration"):
-            assert held.table(topic) == read_table(flight, topic)
-            some = zip(held.messages(topic), read(flight, topic), range(50), strict=False)
+            assert held.get_table(topic) == read_table(flight, topic)
+            some = zip(held.iter_messages(topic), read(flight, topic), range(50), strict=False)
             assert all(one == other for one, other, _ in some)
-            assert held.times(topic).tolist() == read_table(flight, topic)["log_time"].to_pylist()
+            assert (
+                held.get_times(topic).tolist() == read_table(flight, topic)["log_time"].to_pylist()
+            )
         fields = ["roll_rad"]
-        assert held.table("/cf1/attitude", fields) == read_table(
+        assert held.get_table("/cf1/attitude", fields) == read_table(
             flight, "/cf1/attitude", fields=fields
         )
-        assert held.times("/nobody").tolist() == []
+        assert held.get_times("/nobody").tolist() == []
         assert (held.start_ns, held.topics.keys()) == (0, held.summary.topics.keys())
 
 
@@ -32,7 +34,7 @@ def broken(path: Path, topic: str, schema: str) -> Path:
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
-        number = writer.register_schema(f"dmrl.v1.{schema}", "protobuf", schema_bytes(schema))
+        number = writer.register_schema(f"dmrl.v1.{schema}", "protobuf", serialize_schema(schema))
         channel = writer.register_channel(topic, "protobuf", number)
         writer.add_message(channel, 7, b"\x08\x05", 7)
         writer.finish()
@@ -43,15 +45,15 @@ def test_errors_name_the_file_and_the_topic(tmp_path: Path, flight: Path) -> Non
     path = broken(tmp_path / "a.mcap", "/cf1/height", "Height")
     where = r"a\.mcap.*/cf1/height"
     for call in (
-        lambda: Contents(path).table("/cf1/height"),
-        lambda: Contents(path, "/{robot}/height").table("/cf1/height"),
+        lambda: LoadedRecording(path).get_table("/cf1/height"),
+        lambda: LoadedRecording(path, "/{robot}/height").get_table("/cf1/height"),
         lambda: read_table(path, "/cf1/height"),
     ):
         with pytest.raises(RecordingError, match=where):
             call()
     with pytest.raises(MissingTopic, match=r"no topic /cf1/heights .*flight\.mcap.*"):
-        Contents(flight).table("/cf1/heights")
+        LoadedRecording(flight).get_table("/cf1/heights")
     other = broken(tmp_path / "b.mcap", "/cf1/labels", "Height")
     for wanted in ((), ("/{robot}/labels",)):
         with pytest.raises(RecordingError, match=r"b\.mcap: /cf1/labels carries dmrl\.v1\.Height"):
-            Contents(other, *wanted).table("/cf1/labels")
+            LoadedRecording(other, *wanted).get_table("/cf1/labels")

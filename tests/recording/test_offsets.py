@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode
 
-from dmrl.recording import recover, summary
+from dmrl.recording import read_summary, recover
 
 from ..faults import parts
 from ..faults.ending import ended
@@ -60,8 +60,8 @@ def test_a_place_that_is_none_is_one_line_and_nothing_is_lost(
         status, said = ended(lambda: cli("trim", bad, out))
         assert (status == 0) == out.exists() and (status == 0 or "dmrl recover" in said), said
         if status == 0:
-            assert summary(out).topics == summary(sound).topics
+            assert read_summary(out).topics == read_summary(sound).topics
             out.unlink()
         recover(bad, out)
-        assert summary(out).topics == summary(sound).topics
+        assert read_summary(out).topics == read_summary(sound).topics
         out.unlink()

@@ -64,8 +64,8 @@ def test_the_oldest_of_a_long_ancestry_keep_their_hash_alone() -> None:
     for k in range(300):
         made = Provenance(f"step {k}", inputs=(Input(f"{k}.mcap", f"{k:064x}", made),))
     back = Provenance.from_metadata(made.to_metadata())
-    assert len(list(back.ancestry())) == limits.ANCESTORS
-    assert list(back.ancestry())[-1][1].provenance is None
+    assert len(list(back.iter_ancestors())) == limits.ANCESTORS
+    assert list(back.iter_ancestors())[-1][1].provenance is None
     assert Provenance.from_metadata(back.to_metadata()) == back
 
 

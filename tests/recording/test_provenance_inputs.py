@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import RecordingError
-from dmrl.recording import Provenance, RecordingWriter, provenance
+from dmrl.recording import Provenance, RecordingWriter, build_provenance
 from dmrl.recording.provenance import FILE_NAME
-from dmrl.recording.provenance_inputs import input_of, refuse_twice, sha256_of_folder
+from dmrl.recording.provenance_inputs import build_input, hash_folder, refuse_duplicates
 
 
 def folder(path: Path, **files: str) -> Path:
@@ -23,34 +23,34 @@ def folder(path: Path, **files: str) -> Path:
 def test_a_folder_is_its_names_and_contents(tmp_path: Path) -> None:
     here = folder(tmp_path / "a", one="1", sub__two="2", README_md="card", figures__plot="x")
     same = folder(tmp_path / "b", figures__plot="x", README_md="card", sub__two="2", one="1")
-    assert sha256_of_folder(here) == sha256_of_folder(same)
-    known = {sha256_of_folder(here)}
+    assert hash_folder(here) == hash_folder(same)
+    known = {hash_folder(here)}
     for change in ({"one": "2"}, {"three": ""}, {"README_md": "other"}, {"figures__plot": "y"}):
         folder(here, **change)
-        known.add(sha256_of_folder(here))
+        known.add(hash_folder(here))
     assert len(known) == 5  # a stranger's folder: all of it counts
 
 
 def test_of_a_folder_that_dmrl_wrote_the_card_is_no_content(tmp_path: Path) -> None:
     here = folder(tmp_path / "a", one="1", README_md="card", sub__README_md="text")
     (here / FILE_NAME).write_text("{}")
-    before = sha256_of_folder(here)
+    before = hash_folder(here)
     folder(here, README_md="written again", figures__plot="x", tensorboard__log="y")
-    assert sha256_of_folder(here) == before
+    assert hash_folder(here) == before
     folder(here, sub__README_md="other")
-    assert sha256_of_folder(here) != before
+    assert hash_folder(here) != before
 
 
 def test_an_input_is_named_hashed_and_tells_where_it_came_from(tmp_path: Path) -> None:
     made = Provenance("test", {"level": 1})
     with RecordingWriter(tmp_path / "a.mcap", made):
         pass
-    found = input_of(tmp_path / "a.mcap")
+    found = build_input(tmp_path / "a.mcap")
     assert (found.name, found.provenance) == ("a.mcap", made)
     assert found.sha256 == sha256((tmp_path / "a.mcap").read_bytes()).hexdigest()
-    assert input_of(folder(tmp_path / "b", one="1")).provenance is None
+    assert build_input(folder(tmp_path / "b", one="1")).provenance is None
     with pytest.raises(RecordingError, match="no file or folder"):
-        input_of(tmp_path / "none")
+        build_input(tmp_path / "none")
 
 
 @dataclass
@@ -60,19 +60,19 @@ class Settings:
 
 
 def test_settings_name_files_and_do_not_place_them() -> None:
-    made = provenance(
+    made = build_provenance(
         "test", Settings(2, Path("/somewhere/camera.toml")), seed=4, libraries=("no",)
     )
     assert made.settings == {"level": 2, "camera": "camera.toml"}
     assert (made.seed, made.libraries, made.inputs) == (4, {"no": "absent"}, ())
-    assert provenance("test", {"a": 1}).settings == {"a": 1}
-    assert provenance("test").settings == {}
+    assert build_provenance("test", {"a": 1}).settings == {"a": 1}
+    assert build_provenance("test").settings == {}
 
 
 def test_one_recording_under_two_names_is_given_twice(tmp_path: Path) -> None:
     one, link = tmp_path / "a.mcap", tmp_path / "b.mcap"
     one.touch()
     link.symlink_to(one)
-    refuse_twice([one, tmp_path / "c.mcap"])
+    refuse_duplicates([one, tmp_path / "c.mcap"])
     with pytest.raises(RecordingError, match="given twice"):
-        refuse_twice([one, link])
+        refuse_duplicates([one, link])

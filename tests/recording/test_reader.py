@@ -8,23 +8,23 @@ import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 
 from dmrl.errors import MissingTopic, RecordingError
-from dmrl.messages import message, schema_bytes
+from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
-    columns,
-    glance,
-    log_times,
+    iter_columns,
+    iter_topic_batches,
     read,
+    read_log_times,
     read_raw,
+    read_summary,
     read_table,
     reader,
-    stretches,
-    summary,
+    sample_topics,
 )
 from dmrl.recording.mcap import chunk_builder, chunk_reader
 
-HEIGHT = message("Height")
+HEIGHT = message_class("Height")
 
 
 def foreign(path: Path, times_ns: list[int], **options: object) -> Path:
@@ -32,7 +32,7 @@ def foreign(path: Path, times_ns: list[int], **options: object) -> Path:
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=200, **options)  # type: ignore[arg-type]
         writer.start()
-        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", serialize_schema("Height"))
         channel = writer.register_channel("/cf1/height", "protobuf", schema)
         for t in times_ns:
             writer.add_message(channel, t, HEIGHT(height_m=t).SerializeToString(), t)
@@ -63,8 +63,8 @@ def test_any_complete_file_is_read_in_time_order(
     path = foreign(tmp_path / "a.mcap", SHUFFLED, **options)
     assert [s.message.height_m for s in read(path)] == list(range(500))
     assert read_table(path, "/cf1/height")["height_m"].to_pylist() == list(range(500))
-    assert summary(path).topics["/cf1/height"].count == 500
-    seen = glance(path, {"/cf1/height": None}, start_ns=100, end_ns=400)["/cf1/height"]
+    assert read_summary(path).topics["/cf1/height"].count == 500
+    seen = sample_topics(path, {"/cf1/height": None}, start_ns=100, end_ns=400)["/cf1/height"]
     found = seen["height_m"].to_pylist()
     assert found == sorted(found)
     assert 100 <= found[0] < found[-1] < 400
@@ -73,7 +73,7 @@ def test_any_complete_file_is_read_in_time_order(
 def test_a_stretch_of_time_is_half_open(flight: Path) -> None:
     got = list(read(flight, "/cf1/range/cf2", start_ns=100_000_000, end_ns=300_000_000))
     assert [s.time_ns for s in got] == [100_000_000, 200_000_000]
-    (batch,) = columns(flight, "/cf1/range/cf2", start_ns=100_000_000, end_ns=300_000_000)
+    (batch,) = iter_columns(flight, "/cf1/range/cf2", start_ns=100_000_000, end_ns=300_000_000)
     assert batch["log_time"].to_pylist() == [100_000_000, 200_000_000]
 
 
@@ -124,7 +124,7 @@ def test_a_topic_with_another_schema_is_refused(tmp_path: Path) -> None:
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
-        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", serialize_schema("Height"))
         writer.add_message(writer.register_channel("/cf1/labels", "protobuf", schema), 0, b"", 0)
         writer.finish()
     with pytest.raises(
@@ -141,7 +141,7 @@ def test_a_type_unknown_to_dmrl_is_read_by_its_own_schema(tmp_path: Path) -> Non
         writer = Writer(stream, compression=CompressionType.NONE)
         writer.start()
         renamed = (
-            schema_bytes("Height").replace(b"Height", b"Weight").replace(b"dmrl.v1", b"else.v1")
+            serialize_schema("Height").replace(b"Height", b"Weight").replace(b"dmrl.v1", b"else.v1")
         )
         schema = writer.register_schema("else.v1.Weight", "protobuf", renamed)
         channel = writer.register_channel("/scale", "protobuf", schema)
@@ -169,14 +169,18 @@ def test_a_json_channel_is_copied_but_not_decoded(tmp_path: Path) -> None:
 def test_memory_stays_bounded_when_chunks_touch_in_time(tmp_path: Path) -> None:
     """Chunks that share their border time must not chain into one block."""
     path = foreign(tmp_path / "a.mcap", [t for k in range(300) for t in (k, k)])
-    assert max(len(batch) for batch in columns(path, "/cf1/height")) < 50
+    assert max(len(batch) for batch in iter_columns(path, "/cf1/height")) < 50
 
 
 @pytest.mark.parametrize("share", [0.9, 0.5, 0.1])
 def test_a_truncated_file_names_the_way_out(flight: Path, tmp_path: Path, share: float) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(flight.read_bytes()[: int(flight.stat().st_size * share)])
-    for use in (summary, lambda p: list(read(p)), lambda p: list(columns(p, "/cf1/attitude"))):
+    for use in (
+        read_summary,
+        lambda p: list(read(p)),
+        lambda p: list(iter_columns(p, "/cf1/attitude")),
+    ):
         with pytest.raises(RecordingError, match=r"cut short.*dmrl recover"):
             use(cut)
 
@@ -200,9 +204,9 @@ def test_what_is_no_recording_is_said_so(tmp_path: Path, content: bytes, complai
 
 def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no recording"):
-        summary(tmp_path / "none.mcap")
+        read_summary(tmp_path / "none.mcap")
     with pytest.raises(RecordingError, match="is a folder"):
-        summary(tmp_path)
+        read_summary(tmp_path)
 
 
 @pytest.mark.heavy
@@ -227,12 +231,12 @@ def test_a_bad_message_is_named(tmp_path: Path) -> None:
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
-        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", serialize_schema("Height"))
         channel = writer.register_channel("/cf1/height", "protobuf", schema)
         writer.add_message(channel, 0, struct.pack("<Bf", 9, 1.0), 0)  # a double cut in half
         writer.finish()
     with pytest.raises(RecordingError, match="/cf1/height"):
-        list(columns(path, "/cf1/height"))
+        list(iter_columns(path, "/cf1/height"))
     with pytest.raises(RecordingError, match="/cf1/height"):
         list(read(path))
 
@@ -242,7 +246,7 @@ def test_an_empty_recording_has_no_messages(tmp_path: Path) -> None:
     with RecordingWriter(path, Provenance("test")):
         pass
     assert list(read(path)) == []
-    assert summary(path).count == 0
+    assert read_summary(path).count == 0
     assert io.BytesIO(path.read_bytes()).read(8) == b"\x89MCAP0\r\n"
 
 
@@ -256,23 +260,23 @@ def test_a_stretch_without_messages_is_a_table_without_rows(flight: Path) -> Non
 def test_topics_are_read_in_one_pass_as_one_by_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reader, "STRETCH_BYTES", 10_000)
+    monkeypatch.setattr(reader, "BATCH_BYTES", 10_000)
     path = tmp_path / "two.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(20_000):
-            sink.write(k * 10, "/cf1/height", message("Height")(height_m=k))
+            sink.write(k * 10, "/cf1/height", message_class("Height")(height_m=k))
             if k % 3 == 0:
-                sink.write(k * 10, "/cf1/range/cf2", message("UwbRange")(range_m=-k))
+                sink.write(k * 10, "/cf1/range/cf2", message_class("UwbRange")(range_m=-k))
     wanted = {"/cf1/height": None, "/cf1/range/cf2": ("range_m",), "/cf9/height": None}
     found: dict[str, list[pa.RecordBatch]] = {}
-    for stretch in stretches(path, wanted, start_ns=100, end_ns=190_000):
+    for stretch in iter_topic_batches(path, wanted, start_ns=100, end_ns=190_000):
         for topic, batch in stretch.items():
             found.setdefault(topic, []).append(batch)
     assert sorted(found) == ["/cf1/height", "/cf1/range/cf2"]
     for topic, batches in found.items():
         alone = read_table(path, topic, start_ns=100, end_ns=190_000)
         assert pa.Table.from_batches(batches).equals(alone)
-    times = log_times(path, wanted, start_ns=100, end_ns=190_000)
+    times = read_log_times(path, wanted, start_ns=100, end_ns=190_000)
     assert sorted(times) == ["/cf1/height", "/cf1/range/cf2"]
     for topic, ns in times.items():
         assert ns.tolist() == [t for b in found[topic] for t in b["log_time"].to_pylist()]
@@ -288,14 +292,14 @@ def test_a_glance_sees_every_topic_all_over_the_recording_in_a_few_chunks(
             sink.write_raw(raw)
         # One message, in the middle of the file though not of the time.
         sink.write(39_000_000_000, "/cf2/height", HEIGHT(height_m=2.0))
-    unpacked, chunks = chunk_reader.unpacked, set()
+    unpacked, chunks = chunk_reader.decompress, set()
     monkeypatch.setattr(
         chunk_reader,
-        "unpacked",
+        "decompress",
         lambda path, chunk, at: chunks.add(at) or unpacked(path, chunk, at),
     )
     wanted = {"/cf1/attitude": ("roll_rad",), "/cf1/range/cf2": None, "/cf2/height": None}
-    seen = glance(path, {**wanted, "/cf9/height": None}, start_ns=0, end_ns=10**12)
+    seen = sample_topics(path, {**wanted, "/cf9/height": None}, start_ns=0, end_ns=10**12)
     assert seen.keys() == wanted.keys()
     assert seen["/cf2/height"]["height_m"].to_pylist() == [2.0]
     times = seen["/cf1/attitude"]["log_time"].to_numpy()
@@ -308,5 +312,7 @@ def test_a_glance_finds_what_the_chunks_it_takes_do_not_hold(tmp_path: Path) -> 
     # Chunks of a few messages each that all span the whole time.
     times = [time for k in range(1, 499) for time in (0, k, 499)]
     path = foreign(tmp_path / "a.mcap", times)
-    (time_ns,) = glance(path, {"/cf1/height": None}, start_ns=251, end_ns=252)["/cf1/height"][0]
+    (time_ns,) = sample_topics(path, {"/cf1/height": None}, start_ns=251, end_ns=252)[
+        "/cf1/height"
+    ][0]
     assert time_ns.as_py() == 251

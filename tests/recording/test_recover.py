@@ -9,7 +9,7 @@ from mcap.records import ChunkIndex
 from mcap.writer import Writer
 
 from dmrl.errors import RecordingError
-from dmrl.messages import message, schema_bytes
+from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import Provenance, RecordingWriter, read_raw, recover
 
 TOPICS = ("/cf1/height", "/cf2/height")
@@ -30,7 +30,7 @@ def broken(tmp_path: Path) -> tuple[Path, int]:
         for k in range(2700):
             if k in (900, 1800):
                 sink.flush()
-            height = message("Height")(height_m=sin(k))
+            height = message_class("Height")(height_m=sin(k))
             sink.write(k, TOPICS[k % 3 == 0], height)
     middle = chunks(path)[1]
     data = bytearray(path.read_bytes())
@@ -65,7 +65,7 @@ def test_a_file_that_is_cut_says_only_what_its_indexes_say(
 def test_metadata_that_fail_their_sum_are_kept_and_doubted(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
-        sink.write(0, TOPICS[0], message("Height")())
+        sink.write(0, TOPICS[0], message_class("Height")())
         sink.add_metadata("dmrl.split", {"train": "[[0, 10]]"})
     path.write_bytes(path.read_bytes().replace(b"[[0, 10]]", b"[[0, 90]]"))
     found = recover(path, tmp_path / "b.mcap")
@@ -77,7 +77,7 @@ def test_messages_beyond_2262_are_left_out_and_counted(tmp_path: Path) -> None:
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
-        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", serialize_schema("Height"))
         channel = writer.register_channel("/cf1/height", "protobuf", schema)
         late = ((2**63, 3), (4, 2**63), (2**63 - 1, 5), (2**63 - 2, 2**63 - 2))
         for log_ns, publish_ns in ((1, 2), *late):

@@ -10,14 +10,14 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, IndexType, Writer
 
 from dmrl.errors import RecordingError
-from dmrl.messages import message, schema_bytes
+from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import (
     check,
-    glance,
-    log_times,
+    read_log_times,
     read_raw,
+    read_summary,
     read_table,
-    summary,
+    sample_topics,
     trim,
 )
 from dmrl.recording.mcap.file import MAGIC
@@ -30,10 +30,12 @@ def foreign(path: Path, **options: Any) -> Path:
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=100, **options)
         writer.start()
-        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", serialize_schema("Height"))
         channel = writer.register_channel("/cf1/height", "protobuf", schema)
         for k in range(7):
-            writer.add_message(channel, k, message("Height")(height_m=k).SerializeToString(), k)
+            writer.add_message(
+                channel, k, message_class("Height")(height_m=k).SerializeToString(), k
+            )
         writer.finish()
     return path
 
@@ -57,8 +59,8 @@ def test_what_other_writers_leave_out_is_not_missed(
 ) -> None:
     path = foreign(tmp_path / "a.mcap", **options)
     assert [raw.time_ns for raw in read_raw(path)] == list(range(7))
-    assert summary(path).topics["/cf1/height"].count == 7
-    assert log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == list(range(7))
+    assert read_summary(path).topics["/cf1/height"].count == 7
+    assert read_log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == list(range(7))
     assert not [finding for finding in check(path) if finding.level == "error"]
 
 
@@ -145,7 +147,7 @@ def test_without_an_index_too_a_topic_has_one_name(renamed: str, tmp_path: Path)
     assert halves[renamed].count(b"/cf1/height") == 1
     halves[renamed] = halves[renamed].replace(b"/cf1/height", b"/cf1/heigst")
     path.write_bytes(halves["messages"] + halves["summary"])
-    for read in (summary, check, lambda path: list(read_raw(path))):
+    for read in (read_summary, check, lambda path: list(read_raw(path))):
         with pytest.raises(RecordingError, match="is defined twice"):
             read(path)
 
@@ -162,7 +164,7 @@ def test_a_summary_without_crc_that_renames_a_topic_is_noticed(tmp_path: Path) -
         lambda: list(read_raw(path)),
         lambda: trim(path, tmp_path / "b.mcap"),
         lambda: read_table(path, "/cf1/heigst"),
-        lambda: glance(path, {"/cf1/heigst": None}, start_ns=0, end_ns=10),
+        lambda: sample_topics(path, {"/cf1/heigst": None}, start_ns=0, end_ns=10),
     ):
         with pytest.raises(RecordingError, match=complaint):
             read()

@@ -12,11 +12,19 @@ from mcap.records import MessageIndex
 from mcap.stream_reader import StreamReader
 
 from dmrl.errors import OutputError, RecordingError
-from dmrl.messages import message
-from dmrl.recording import Provenance, RecordingWriter, read, read_raw, read_table, recover, summary
+from dmrl.messages import message_class
+from dmrl.recording import (
+    Provenance,
+    RecordingWriter,
+    read,
+    read_raw,
+    read_summary,
+    read_table,
+    recover,
+)
 from dmrl.recording.mcap import chunk_reader
 
-HEIGHT = message("Height")
+HEIGHT = message_class("Height")
 
 
 def write_heights(path: Path, times_ns: list[int]) -> Path:
@@ -72,7 +80,7 @@ def test_a_negative_time_is_refused(tmp_path: Path) -> None:
 
 
 def test_provenance_and_recipe_stand_before_the_first_message(flight: Path) -> None:
-    found = summary(flight)
+    found = read_summary(flight)
     assert found.provenance == Provenance("test", {"level": 1}, seed=3)
     assert found.attachments["recipe.toml"] == b'kind = "test"\nlevel = 1\n'
     data = flight.read_bytes()
@@ -93,15 +101,15 @@ KILLED = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 with RecordingWriter(Path(sys.argv[1]), Provenance("test")) as sink:
     k = 0
     while True:
-        sink.write(k, "/cf1/height", message("Height")(height_m=k * 0.1))
+        sink.write(k, "/cf1/height", message_class("Height")(height_m=k * 0.1))
         k += 1
         if k % 1000 == 0:
-            print(k, len(sink.chunks._numbers.data), flush=True)
+            print(k, len(sink.chunk_writer._numbers.data), flush=True)
 """
 
 
@@ -151,10 +159,10 @@ def filmed(path: Path, moments: int = 400) -> Path:
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(moments):
             if k % 5 == 0:
-                picture = message("CompressedImage")(data=rng.bytes(8000), format="jpeg")
+                picture = message_class("CompressedImage")(data=rng.bytes(8000), format="jpeg")
                 sink.write(k, "/cf1/camera/image", picture)
-                sink.write(k, "/cf1/detections/grid", message("GridMap")(rows=k))
-            sink.write(k, "/cf1/attitude", message("Attitude")(roll_rad=k))
+                sink.write(k, "/cf1/detections/grid", message_class("GridMap")(rows=k))
+            sink.write(k, "/cf1/attitude", message_class("Attitude")(roll_rad=k))
     return path
 
 
@@ -163,10 +171,10 @@ def test_pictures_stand_apart_and_numbers_are_read_without_them(
 ) -> None:
     path = filmed(tmp_path / "a.mcap")
     read_bytes: list[int] = []
-    unpacked = chunk_reader.unpacked
+    unpacked = chunk_reader.decompress
     monkeypatch.setattr(
         chunk_reader,
-        "unpacked",
+        "decompress",
         lambda *a: read_bytes.append(len(found := unpacked(*a))) or found,
     )
     assert len(read_table(path, "/cf1/attitude")) == 400
@@ -184,7 +192,7 @@ def test_mcaps_own_reader_sees_what_dmrl_sees(tmp_path: Path) -> None:
         found = reader.get_summary()
     assert [t for _, t, _ in theirs] == sorted(t for _, t, _ in theirs)
     ours = [(raw.topic, raw.time_ns, raw.data) for raw in read_raw(path)]
-    for topic in summary(path).topics:
+    for topic in read_summary(path).topics:
         assert [m for m in ours if m[0] == topic] == [m for m in theirs if m[0] == topic]
     assert found is not None
     assert found.statistics is not None
@@ -202,11 +210,11 @@ def test_what_is_rare_is_not_left_open_while_the_other_kind_is_written(
     rng = np.random.default_rng(0)
     with RecordingWriter(path, Provenance("test"), keep_on_error=keep) as sink:
         for k in range(60):
-            sink.write(k, "/cf1/labels", message("PeerLabels")())
-            picture = message("CompressedImage")(data=rng.bytes(130_000))
+            sink.write(k, "/cf1/labels", message_class("PeerLabels")())
+            picture = message_class("CompressedImage")(data=rng.bytes(130_000))
             sink.write(k, "/cf1/camera/image", picture)
         recover(tmp_path / "a.mcap.partial", mended)
-    kept = summary(mended).topics
+    kept = read_summary(mended).topics
     # Three pictures are a chunk at most; labels wait for so many chunks of them.
     assert kept["/cf1/camera/image"].count >= 57
     assert kept["/cf1/labels"].count >= 60 - 3 - chunks * 3

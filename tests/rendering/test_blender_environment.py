@@ -22,7 +22,7 @@ def test_without_python_311_and_uv_it_says_what_to_install(
     monkeypatch.setattr(shutil, "which", lambda _: None)
     monkeypatch.setattr(blender_environment, "_python_311", lambda: None)
     with pytest.raises(BlenderError, match=r"needs Python 3.11.*nor uv.*pip install uv"):
-        blender_environment.ensure(lambda _: None)
+        blender_environment.ensure_environment(lambda _: None)
     assert list((tmp_path / "dmrl").iterdir()) == []
 
 
@@ -35,13 +35,13 @@ def test_offline_it_says_so_and_leaves_nothing(
 
     monkeypatch.setattr(subprocess, "run", fail)
     with pytest.raises(BlenderError, match=r"No route to host. Check the connection"):
-        blender_environment.ensure(lambda _: None)
+        blender_environment.ensure_environment(lambda _: None)
     assert list((tmp_path / "dmrl").iterdir()) == []
 
 
 def test_an_environment_that_is_there_is_used(tmp_path: Path) -> None:
-    python = blender_environment.folder() / "bin" / "python"
+    python = blender_environment.environment_folder() / "bin" / "python"
     python.parent.mkdir(parents=True)
     python.symlink_to(sys.executable)
-    assert blender_environment.python() == python
-    assert blender_environment.ensure(lambda _: pytest.fail("nothing to say")) == python
+    assert blender_environment.find_python() == python
+    assert blender_environment.ensure_environment(lambda _: pytest.fail("nothing to say")) == python

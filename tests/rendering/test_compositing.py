@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from dmrl.geometry.frames import AIDECK, Camera
-from dmrl.rendering.camera.distortion import canvas_of, image_from_pinhole
+from dmrl.rendering.camera.distortion import image_from_pinhole, pinhole_canvas
 from dmrl.rendering.camera.sensor import Sensor
-from dmrl.rendering.compositing import compose
-from dmrl.rendering.shot import Layer, Light, Look, Robot, crop_of
+from dmrl.rendering.compositing import compose_shot
+from dmrl.rendering.shot import Layer, Light, Look, Robot, find_crop
 from dmrl.rendering.sketch_renderer import Pose
 
 PINHOLE = replace(AIDECK, distortion=())
@@ -31,7 +31,7 @@ def square(left: int, top: int, size: int, depth_m: float) -> Layer:
 
 
 def test_a_box_holds_exactly_the_covered_pixels() -> None:
-    shot = compose(PINHOLE, [robot(1.0)], look(PINHOLE), {0: square(100, 50, 20, 1.0)})
+    shot = compose_shot(PINHOLE, [robot(1.0)], look(PINHOLE), {0: square(100, 50, 20, 1.0)})
     assert shot.box_px[0].tolist() == [100, 50, 120, 70]
     assert shot.visible_share.tolist() == [1.0]
     assert shot.uv_px[0].tolist() == [PINHOLE.cx_px, PINHOLE.cy_px]
@@ -42,7 +42,7 @@ def test_a_box_holds_exactly_the_covered_pixels() -> None:
 
 def test_a_near_robot_hides_a_far_one_whatever_their_order() -> None:
     layers = {0: square(100, 50, 20, 2.0), 1: square(110, 50, 20, 1.0)}
-    shot = compose(PINHOLE, [robot(2.0), robot(1.0)], look(PINHOLE), layers)
+    shot = compose_shot(PINHOLE, [robot(2.0), robot(1.0)], look(PINHOLE), layers)
     assert shot.visible_share.tolist() == [0.5, 1.0]
     assert shot.box_px[0].tolist() == [100, 50, 110, 70]
     assert shot.surface_m[60, 115] == 1.0
@@ -52,8 +52,8 @@ def test_a_blurred_robot_reaches_past_its_edge_and_is_labelled_the_same() -> Non
     black = square(100, 50, 20, 1.0)
     black.light[..., :3] = 0
     layers = {0: black}
-    sharp = compose(PINHOLE, [robot(1.0)], look(PINHOLE), layers)
-    soft = compose(PINHOLE, [robot(1.0)], replace(look(PINHOLE), robot_blur_px=1.0), layers)
+    sharp = compose_shot(PINHOLE, [robot(1.0)], look(PINHOLE), layers)
+    soft = compose_shot(PINHOLE, [robot(1.0)], replace(look(PINHOLE), robot_blur_px=1.0), layers)
     across = soft.rgb[60, 95:125, 0].astype(float)
     assert across == pytest.approx(across[::-1], abs=1)
     assert soft.rgb[60, 110, 0] == sharp.rgb[60, 110, 0] == 0
@@ -65,16 +65,16 @@ def test_a_blurred_robot_reaches_past_its_edge_and_is_labelled_the_same() -> Non
 
 def test_a_robot_wholly_hidden_has_no_box() -> None:
     layers = {0: square(100, 50, 20, 2.0), 1: square(90, 40, 40, 1.0)}
-    shot = compose(PINHOLE, [robot(2.0), robot(1.0)], look(PINHOLE), layers)
+    shot = compose_shot(PINHOLE, [robot(2.0), robot(1.0)], look(PINHOLE), layers)
     assert shot.visible_share[0] == 0
     assert np.isnan(shot.box_px[0]).all()
 
 
 def test_the_lens_bends_box_and_centre_alike() -> None:
-    canvas = canvas_of(AIDECK)
+    canvas = pinhole_canvas(AIDECK)
     corner = np.array([30, 150])
     layer = square(*(corner + canvas.shift_px.astype(int)).tolist(), 20, 1.0)
-    shot = compose(AIDECK, [robot(1.0)], look(AIDECK), {0: layer})
+    shot = compose_shot(AIDECK, [robot(1.0)], look(AIDECK), {0: layer})
     edges = [(30.0, 150.0), (50.0, 150.0), (30.0, 170.0), (50.0, 170.0)]
     bent = image_from_pinhole(np.array(edges), AIDECK)
     wanted = [*bent.min(axis=0), *bent.max(axis=0)]
@@ -86,8 +86,8 @@ def test_the_lens_bends_box_and_centre_alike() -> None:
 
 def test_movement_smears_the_picture_and_no_label() -> None:
     layers = {0: square(150, 70, 10, 1.0)}
-    still = compose(PINHOLE, [robot(1.0)], look(PINHOLE), layers)
-    moved = compose(PINHOLE, [robot(1.0, (0.0, 0.05, 0.0))], look(PINHOLE), layers)
+    still = compose_shot(PINHOLE, [robot(1.0)], look(PINHOLE), layers)
+    moved = compose_shot(PINHOLE, [robot(1.0, (0.0, 0.05, 0.0))], look(PINHOLE), layers)
     assert np.array_equal(still.box_px, moved.box_px)
     bright = [
         np.count_nonzero(shot.rgb[75, :, 0] > shot.rgb[0, 0, 0] + 2) for shot in (still, moved)
@@ -97,16 +97,16 @@ def test_movement_smears_the_picture_and_no_label() -> None:
 
 
 def test_an_empty_scene_is_its_backdrop() -> None:
-    shot = compose(AIDECK, [], look(AIDECK), {})
+    shot = compose_shot(AIDECK, [], look(AIDECK), {})
     assert len(shot.uv_px) == len(shot.box_px) == 0
     assert np.ptp(shot.rgb) == 0
 
 
 def test_a_robot_behind_the_camera_or_outside_is_not_rendered() -> None:
     points = np.array([[-0.05, -0.05, -0.01], [0.05, 0.05, 0.01]])
-    canvas = canvas_of(PINHOLE)
-    assert crop_of(canvas, Pose(np.array([-1.0, 0.0, 0.0]), np.eye(3)), points) is None
-    assert crop_of(canvas, Pose(np.array([1.0, 5.0, 0.0]), np.eye(3)), points) is None
-    crop = crop_of(canvas, Pose(np.array([1.0, 0.0, 0.0]), np.eye(3)), points)
+    canvas = pinhole_canvas(PINHOLE)
+    assert find_crop(canvas, Pose(np.array([-1.0, 0.0, 0.0]), np.eye(3)), points) is None
+    assert find_crop(canvas, Pose(np.array([1.0, 5.0, 0.0]), np.eye(3)), points) is None
+    crop = find_crop(canvas, Pose(np.array([1.0, 0.0, 0.0]), np.eye(3)), points)
     assert crop is not None
     assert crop[0] < PINHOLE.cx_px < crop[2]

@@ -4,13 +4,13 @@ import os
 
 import pytest
 
-from dmrl.rendering.blender.core import one_core
+from dmrl.rendering.blender.core import limit_to_one_core
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
 def test_one_core_is_seen_inside_and_all_of_them_afterwards() -> None:
     before = os.sched_getaffinity(0)
-    with pytest.raises(ImportError), one_core():
+    with pytest.raises(ImportError), limit_to_one_core():
         assert len(os.sched_getaffinity(0)) == 1
         raise ImportError("no bpy")
     assert os.sched_getaffinity(0) == before
@@ -19,5 +19,5 @@ def test_one_core_is_seen_inside_and_all_of_them_afterwards() -> None:
 def test_nothing_happens_where_cores_cannot_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_setaffinity", raising=False)
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    with one_core():
+    with limit_to_one_core():
         pass

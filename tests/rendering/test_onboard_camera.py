@@ -4,52 +4,62 @@ import numpy as np
 import pytest
 
 from dmrl.geometry.frames import AIDECK, project
-from dmrl.rendering.onboard_camera import NEAREST_M, Body, View, in_front, pose_of, sketched, view
+from dmrl.rendering.onboard_camera import (
+    MIN_DEPTH_M,
+    CameraView,
+    WorldPose,
+    build_view,
+    is_in_front,
+    relative_pose,
+    render_sketches,
+)
 
 CAMERA = replace(AIDECK, distortion=())
 
 
-def body(x: float, y: float, z: float, yaw: float = 0, roll: float = 0, pitch: float = 0) -> Body:
-    return Body(np.array([x, y, z]), yaw, roll, pitch)
+def body(
+    x: float, y: float, z: float, yaw: float = 0, roll: float = 0, pitch: float = 0
+) -> WorldPose:
+    return WorldPose(np.array([x, y, z]), yaw, roll, pitch)
 
 
 def test_a_peer_ahead_is_at_the_principal_point_whatever_the_yaw() -> None:
     for yaw in (0.0, 1.0, 3.0):
         here = body(1, 2, 3, yaw)
-        pose = pose_of(body(1 + 2 * np.cos(yaw), 2 + 2 * np.sin(yaw), 3, yaw), here)
+        pose = relative_pose(body(1 + 2 * np.cos(yaw), 2 + 2 * np.sin(yaw), 3, yaw), here)
         assert pose.xyz_camera == pytest.approx((2, 0, 0))
         assert pose.camera_from_body == pytest.approx(np.eye(3))
 
 
 def test_nose_down_moves_the_peer_up_and_right_side_down_turns_it_anticlockwise() -> None:
     peer = body(2, 0, 0)
-    _, v_level = project(pose_of(peer, body(0, 0, 0)).xyz_camera[None], CAMERA.image_from_optical)[
-        0
-    ][0]
+    _, v_level = project(
+        relative_pose(peer, body(0, 0, 0)).xyz_camera[None], CAMERA.image_from_optical
+    )[0][0]
     _, v_down = project(
-        pose_of(peer, body(0, 0, 0, pitch=0.1)).xyz_camera[None], CAMERA.image_from_optical
+        relative_pose(peer, body(0, 0, 0, pitch=0.1)).xyz_camera[None], CAMERA.image_from_optical
     )[0][0]
     assert v_down < v_level
-    above = pose_of(body(2, 0, 0.5), body(0, 0, 0, roll=0.2)).xyz_camera
+    above = relative_pose(body(2, 0, 0.5), body(0, 0, 0, roll=0.2)).xyz_camera
     assert above[1] > 0  # to the left of where it was
 
 
 def test_a_peer_turns_against_the_camera() -> None:
-    pose = pose_of(body(2, 0, 0, yaw=0.7), body(0, 0, 0, yaw=0.2))
+    pose = relative_pose(body(2, 0, 0, yaw=0.7), body(0, 0, 0, yaw=0.2))
     assert pose.camera_from_body[:, 0] == pytest.approx((np.cos(0.5), np.sin(0.5), 0))
 
 
 def test_only_peers_ahead_are_drawn() -> None:
     here = body(0, 0, 0)
-    assert in_front(pose_of(body(0.5, 0, 0), here))
-    assert not in_front(pose_of(body(-0.5, 0, 0), here))
-    assert not in_front(pose_of(body(NEAREST_M / 2, 0, 0), here))
+    assert is_in_front(relative_pose(body(0.5, 0, 0), here))
+    assert not is_in_front(relative_pose(body(-0.5, 0, 0), here))
+    assert not is_in_front(relative_pose(body(MIN_DEPTH_M / 2, 0, 0), here))
 
 
 def test_a_sketch_shows_the_peer_where_it_is() -> None:
-    pose = pose_of(body(0.5, 0.05, -0.1), body(0, 0, 0))
-    seen = View(body(0, 0, 0), {"cf2": pose}, {"cf2": np.zeros(3)}, np.zeros(2), (0, 0, 0))
-    (picture,) = sketched(CAMERA, [seen])
+    pose = relative_pose(body(0.5, 0.05, -0.1), body(0, 0, 0))
+    seen = CameraView(body(0, 0, 0), {"cf2": pose}, {"cf2": np.zeros(3)}, np.zeros(2), (0, 0, 0))
+    (picture,) = render_sketches(CAMERA, [seen])
     uv, _ = project(pose.xyz_camera[None], CAMERA.image_from_optical)
     assert picture.uv_px == pytest.approx(uv)
     left, top, right, bottom = picture.box_px[0]
@@ -57,11 +67,11 @@ def test_a_sketch_shows_the_peer_where_it_is() -> None:
 
 
 def test_a_view_tells_how_peers_and_the_scene_move() -> None:
-    def bodies(time_s: float) -> dict[str, Body]:
+    def bodies(time_s: float) -> dict[str, WorldPose]:
         here = body(0, 0, 0, yaw=0.5 * time_s, pitch=0.2 * time_s)
         return {"cf1": here, "cf2": body(2, time_s, 0), "cf3": body(-2, 0, 0)}
 
-    seen = view(bodies, "cf1", 0.0, (0, 0, 0))
+    seen = build_view(bodies, "cf1", 0.0, (0, 0, 0))
     assert list(seen.poses) == ["cf2"]
     # It moves left at 1 m/s; the nose, to the left and down, lets it move right and up.
     assert seen.velocity_mps["cf2"] == pytest.approx((0, 1 - 2 * 0.5, 2 * 0.2), abs=1e-4)

@@ -9,9 +9,9 @@ import pytest
 
 from dmrl.geometry.frames import PUBLISHED_RENDER, Camera, project
 from dmrl.images.codec import encode_png
-from dmrl.rendering.backgrounds.photos import photos_in
+from dmrl.rendering.backgrounds.photos import open_photos
 from dmrl.rendering.camera.sensor import expose
-from dmrl.rendering.randomise import World, draw_scene, strong_colours
+from dmrl.rendering.randomise import SceneSource, draw_scene, random_two_colours
 from dmrl.rendering.robots.crazyflie import CRAZYFLIE
 from dmrl.rendering.settings import PRESETS, Settings
 
@@ -20,7 +20,7 @@ SMALL = Camera(40, 28, 15.0, 15.0, 20.0, 14.0)
 
 
 def test_strong_colours_are_two_hues_over_every_part_that_does_not_glow() -> None:
-    paint = strong_colours(np.random.default_rng(3), CRAZYFLIE)
+    paint = random_two_colours(np.random.default_rng(3), CRAZYFLIE)
     dull = {
         f"colour_{k}" for k, name in enumerate(CRAZYFLIE.materials) if not CRAZYFLIE.paint[name][3]
     }
@@ -31,19 +31,19 @@ def test_strong_colours_are_two_hues_over_every_part_that_does_not_glow() -> Non
 
 def test_two_robots_are_not_painted_alike() -> None:
     rng = np.random.default_rng(3)
-    assert strong_colours(rng, CRAZYFLIE) != strong_colours(rng, CRAZYFLIE)
+    assert random_two_colours(rng, CRAZYFLIE) != random_two_colours(rng, CRAZYFLIE)
 
 
-def world(settings: Settings, folder: Path, camera: Camera = PUBLISHED_RENDER) -> World:
+def world(settings: Settings, folder: Path, camera: Camera = PUBLISHED_RENDER) -> SceneSource:
     photo = np.full((224, 320, 3), (200, 100, 50), np.uint8)
     (folder / "photo.png").write_bytes(encode_png(photo))
-    return World(
+    return SceneSource(
         settings,
         camera,
         0.1,
         ("sky",),
         lambda _: np.ones((8, 16, 3), np.float32),
-        photos_in(folder),
+        open_photos(folder),
     )
 
 

@@ -10,7 +10,7 @@ from dmrl.geometry.frames import AIDECK
 from dmrl.rendering import worker_pool
 from dmrl.rendering.blender import protocol
 from dmrl.rendering.camera.sensor import Sensor
-from dmrl.rendering.renderer import Model, Renderer, Scene
+from dmrl.rendering.renderer import Renderer, RobotModel, Scene
 from dmrl.rendering.shot import Light, Look, Robot
 from dmrl.rendering.sketch_renderer import Pose
 
@@ -40,13 +40,13 @@ def scene(light: str, depth_m: float) -> Scene:
 def test_pixels_come_through_files_where_memory_is_shut(
     blender: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with Renderer(blender, Model(), workers=1, samples=2) as renderer:
+    with Renderer(blender, RobotModel(), workers=1, samples=2) as renderer:
         asked = [scene(renderer.lights[0], depth_m) for depth_m in (0.5, 1.0)]
-        expected = list(renderer.shots(asked))
+        expected = list(renderer.render_shots(asked))
     monkeypatch.setattr(worker_pool, "WORKER", tmp_path / "worker.py")
-    worker_pool.WORKER.write_text(SHUT)
-    with Renderer(blender, Model(), workers=1, samples=2) as renderer:
-        found = list(renderer.shots(asked))
+    worker_pool.WORKER_SCRIPT.write_text(SHUT)
+    with Renderer(blender, RobotModel(), workers=1, samples=2) as renderer:
+        found = list(renderer.render_shots(asked))
         assert renderer.pool.replaced == 0
     for one, other in zip(found, expected, strict=True):
         assert np.array_equal(one.rgb, other.rgb)
@@ -56,9 +56,9 @@ def test_pixels_come_through_files_where_memory_is_shut(
 
 @pytest.mark.heavy
 def test_what_was_rendered_before_changes_no_pixel(blender: Path) -> None:
-    with Renderer(blender, Model(), workers=1, samples=2) as renderer:
+    with Renderer(blender, RobotModel(), workers=1, samples=2) as renderer:
         first, second = renderer.lights[0], renderer.lights[1]
         asked = [scene(first, 0.5), scene(second, 0.3), scene(first, 0.5)]
-        shots = list(renderer.shots(asked))
+        shots = list(renderer.render_shots(asked))
     assert np.array_equal(shots[0].rgb, shots[2].rgb)
     assert not np.array_equal(shots[0].rgb, shots[1].rgb)

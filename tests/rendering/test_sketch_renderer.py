@@ -6,8 +6,8 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from dmrl.geometry.frames import AIDECK, Array, camera_from_horizontal, project
 from dmrl.images.canvas import Canvas
-from dmrl.rendering.robots.quadrotor import DISCS, MESH, RADIUS_M
-from dmrl.rendering.sketch_renderer import Look, Pose, Sketch, draw
+from dmrl.rendering.robots.quadrotor import MESH, RADIUS_M, ROTOR_DISCS
+from dmrl.rendering.sketch_renderer import Look, Pose, Sketch, render_sketch
 from dmrl.rendering.sketch_scene import random_look, random_poses
 
 CAMERA = replace(AIDECK, distortion=())
@@ -45,7 +45,7 @@ def dark(sketch: Sketch) -> Array:
 
 
 def test_a_robot_on_the_left_and_above_is_drawn_there(plain: Look) -> None:
-    sketch = draw(CAMERA, [at(1.0, 0.3, 0.1)], plain)
+    sketch = render_sketch(CAMERA, [at(1.0, 0.3, 0.1)], plain)
     np.testing.assert_allclose(
         sketch.uv_px, [[166.90 - 0.3 * 183.73, 77.51 - 0.1 * 184.12]], atol=1e-9
     )
@@ -57,7 +57,7 @@ def test_a_robot_on_the_left_and_above_is_drawn_there(plain: Look) -> None:
 
 def test_rolled_right_side_down_the_right_side_is_lower(plain: Look) -> None:
     turn = camera_from_horizontal(0.4, 0.0).T
-    u, v = dark(draw(CAMERA, [at(0.5, 0.0, 0.0, turn)], plain)).T
+    u, v = dark(render_sketch(CAMERA, [at(0.5, 0.0, 0.0, turn)], plain)).T
     assert np.corrcoef(u, v)[0, 1] > 0.3
 
 
@@ -66,17 +66,19 @@ def test_nose_down_its_top_shows_from_behind(plain: Look) -> None:
     heights = {}
     for pitch in (-0.4, 0.4):
         turn = camera_from_horizontal(0.0, pitch).T
-        far = (DISCS.mean(axis=1) @ turn.T)[DISCS.mean(axis=1)[:, 0] > 0]
+        far = (ROTOR_DISCS.mean(axis=1) @ turn.T)[ROTOR_DISCS.mean(axis=1)[:, 0] > 0]
         heights[pitch] = far[:, 2].mean()
     assert heights[0.4] < 0 < heights[-0.4]
-    down = draw(CAMERA, [at(0.5, 0.0, 0.0, camera_from_horizontal(0, 0.4).T)], plain)
-    level = draw(CAMERA, [at(0.5, 0.0, 0.0)], plain)
+    down = render_sketch(CAMERA, [at(0.5, 0.0, 0.0, camera_from_horizontal(0, 0.4).T)], plain)
+    level = render_sketch(CAMERA, [at(0.5, 0.0, 0.0)], plain)
     height = [s.box_px[0, 3] - s.box_px[0, 1] for s in (down, level)]
     assert height[0] > 1.5 * height[1]
 
 
 def test_twice_the_distance_is_half_the_size(plain: Look) -> None:
-    boxes = [draw(CAMERA, [at(x, 0.0, -0.1 * x)], plain).box_px[0] for x in (0.4, 0.8, 1.6)]
+    boxes = [
+        render_sketch(CAMERA, [at(x, 0.0, -0.1 * x)], plain).box_px[0] for x in (0.4, 0.8, 1.6)
+    ]
     widths = [box[2] - box[0] for box in boxes]
     np.testing.assert_allclose(widths, [widths[0], widths[0] / 2, widths[0] / 4], atol=2)
     # The two rotors in front, 0.0325 m nearer, set the width.
@@ -88,7 +90,7 @@ def test_the_box_holds_every_changed_pixel_and_no_more(plain: Look) -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
         (pose,) = random_poses(rng, CAMERA, 1)
-        sketch = draw(CAMERA, [pose], plain)
+        sketch = render_sketch(CAMERA, [pose], plain)
         changed = dark(sketch)
         edges = np.concatenate([changed.min(axis=0) - 0.5, changed.max(axis=0) + 0.5])
         assert np.abs(sketch.box_px[0] - edges).max() <= 1
@@ -96,7 +98,10 @@ def test_the_box_holds_every_changed_pixel_and_no_more(plain: Look) -> None:
 
 def test_the_nearer_robot_hides_the_farther(plain: Look) -> None:
     near, far = at(0.5, 0.0, 0.0), at(1.0, 0.05, 0.0)
-    one, other = draw(CAMERA, [near, far], plain), draw(CAMERA, [far, near], plain)
+    one, other = (
+        render_sketch(CAMERA, [near, far], plain),
+        render_sketch(CAMERA, [far, near], plain),
+    )
     np.testing.assert_array_equal(one.rgb, other.rgb)
     np.testing.assert_array_equal(one.visible_share, other.visible_share[::-1])
     assert one.visible_share[0] == 1.0
@@ -104,10 +109,10 @@ def test_the_nearer_robot_hides_the_farther(plain: Look) -> None:
 
 
 def test_half_outside_the_image_the_box_ends_there(plain: Look) -> None:
-    sketch = draw(CAMERA, [at(0.3, 0.27, 0.0)], plain)
+    sketch = render_sketch(CAMERA, [at(0.3, 0.27, 0.0)], plain)
     assert sketch.box_px[0, 0] == 0.0
     assert sketch.box_px[0, 2] < 60
-    outside = draw(CAMERA, [at(0.3, 2.0, 0.0)], plain)
+    outside = render_sketch(CAMERA, [at(0.3, 2.0, 0.0)], plain)
     assert np.isnan(outside.box_px).all()
     assert outside.visible_share.tolist() == [0.0]
     assert (outside.rgb == 255).all()
@@ -115,9 +120,9 @@ def test_half_outside_the_image_the_box_ends_there(plain: Look) -> None:
 
 def test_what_cannot_be_drawn_is_refused(plain: Look) -> None:
     with pytest.raises(ValueError, match="behind the camera"):
-        draw(CAMERA, [at(0.02, 0.0, 0.0)], plain)
+        render_sketch(CAMERA, [at(0.02, 0.0, 0.0)], plain)
     with pytest.raises(ValueError, match="without distortion"):
-        draw(AIDECK, [], plain)
+        render_sketch(AIDECK, [], plain)
 
 
 def test_faces_run_anticlockwise_seen_from_outside() -> None:
@@ -127,7 +132,7 @@ def test_faces_run_anticlockwise_seen_from_outside() -> None:
 
 
 def test_the_radius_holds_the_whole_quadrotor() -> None:
-    for corners in (MESH.corners, DISCS):
+    for corners in (MESH.corners, ROTOR_DISCS):
         assert np.linalg.norm(corners, axis=-1).max() <= RADIUS_M + 1e-9
 
 
@@ -141,10 +146,12 @@ def test_a_polygon_covers_its_area_in_its_place(opacity: float) -> None:
         c, s = np.cos(turn), np.sin(turn)
         at = rng.uniform((35, 45), (65, 55))
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        canvas.fill((signs * half) @ [[c, s], [-s, c]] + at, np.array([1.0, 0.5, 0.0]), opacity)
-        cover = canvas.opacity()[..., 0]
+        canvas.fill_polygon(
+            (signs * half) @ [[c, s], [-s, c]] + at, np.array([1.0, 0.5, 0.0]), opacity
+        )
+        cover = canvas.to_opacity()[..., 0]
         np.testing.assert_allclose(
-            canvas.rgb(), cover[..., None] * np.array([1.0, 0.5, 0.0]), atol=0.01
+            canvas.to_rgb(), cover[..., None] * np.array([1.0, 0.5, 0.0]), atol=0.01
         )
         excess.append((cover.sum() / opacity - 4 * half.prod()) / (4 * half.sum()))
         v, u = (np.indices(cover.shape) + 0.5).reshape(2, -1)
@@ -157,11 +164,11 @@ def test_a_polygon_covers_its_area_in_its_place(opacity: float) -> None:
 def test_what_is_drawn_on_a_ground_hides_it(plain: Look) -> None:
     ground = np.full((8, 8, 3), 64, np.uint8)
     canvas = Canvas(0, 0, 8, 8, ground=ground)
-    canvas.fill(np.array([[0, 0], [4, 0], [4, 8], [0, 8]]), np.ones(3), 0.5)
-    row = canvas.rgb()[3, :, 0]
+    canvas.fill_polygon(np.array([[0, 0], [4, 0], [4, 8], [0, 8]]), np.ones(3), 0.5)
+    row = canvas.to_rgb()[3, :, 0]
     np.testing.assert_allclose(row[[0, 1, 2, 5, 6, 7]], [0.625] * 3 + [0.25] * 3, atol=0.005)
     with pytest.raises(ValueError, match="no opacity"):
-        canvas.opacity()
+        canvas.to_opacity()
 
 
 def test_poses_fill_the_image_and_the_depths() -> None:
@@ -178,7 +185,7 @@ def test_poses_fill_the_image_and_the_depths() -> None:
 def test_the_same_random_numbers_give_the_same_picture() -> None:
     def picture(seed: int) -> Sketch:
         rng = np.random.default_rng(seed)
-        return draw(CAMERA, random_poses(rng, CAMERA, 2), random_look(rng, CAMERA))
+        return render_sketch(CAMERA, random_poses(rng, CAMERA, 2), random_look(rng, CAMERA))
 
     np.testing.assert_array_equal(picture(3).rgb, picture(3).rgb)
     assert (picture(3).rgb != picture(4).rgb).mean() > 0.9
@@ -187,4 +194,4 @@ def test_the_same_random_numbers_give_the_same_picture() -> None:
 @pytest.mark.benchmark(group="sketch")
 def test_speed_of_a_picture(benchmark: BenchmarkFixture) -> None:
     rng = np.random.default_rng(0)
-    benchmark(lambda: draw(CAMERA, random_poses(rng, CAMERA, 2), random_look(rng, CAMERA)))
+    benchmark(lambda: render_sketch(CAMERA, random_poses(rng, CAMERA, 2), random_look(rng, CAMERA)))

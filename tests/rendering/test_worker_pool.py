@@ -10,7 +10,7 @@ import pytest
 from dmrl.errors import BlenderError
 from dmrl.rendering import worker_pool
 from dmrl.rendering.blender import protocol
-from dmrl.rendering.worker_pool import Pool, Start, Worker
+from dmrl.rendering.worker_pool import Worker, WorkerPool, WorkerStart
 
 # Doubles numbers as a worker would; dies once of 5 and always of 13.
 FAKE = f"""
@@ -39,15 +39,15 @@ while True:
 
 
 @pytest.fixture
-def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Start:
+def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> WorkerStart:
     script = tmp_path / "worker.py"
     script.write_text(FAKE)
     monkeypatch.setattr(worker_pool, "WORKER", script)
-    return Start(Path(sys.executable), {"died": str(tmp_path / "died"), "model": None})
+    return WorkerStart(Path(sys.executable), {"died": str(tmp_path / "died"), "model": None})
 
 
 def double(worker: Worker, number: int) -> float:
-    _, arrays = worker.ask({"number": number}, {"in": np.array([float(number)])})
+    _, arrays = worker.request({"number": number}, {"in": np.array([float(number)])})
     return float(arrays["out"][0])
 
 
@@ -63,15 +63,15 @@ def test_messages_come_back_as_they_were_sent() -> None:
         protocol.receive(stream)
 
 
-def test_a_dead_worker_is_replaced_and_its_job_done_again(start: Start) -> None:
-    with Pool(start, 2) as workers:
+def test_a_dead_worker_is_replaced_and_its_job_done_again(start: WorkerStart) -> None:
+    with WorkerPool(start, 2) as workers:
         assert list(workers.map(double, range(12))) == [2.0 * k for k in range(12)]
         assert workers.replaced == 1
 
 
 @pytest.mark.heavy
-def test_no_worker_outlives_a_pool_that_is_left_early(start: Start) -> None:
-    with pytest.raises(KeyError), Pool(start, 4) as workers:
+def test_no_worker_outlives_a_pool_that_is_left_early(start: WorkerStart) -> None:
+    with pytest.raises(KeyError), WorkerPool(start, 4) as workers:
         for k, _ in enumerate(workers.map(double, range(100))):
             if k == 2:
                 started = workers.pids
@@ -80,18 +80,18 @@ def test_no_worker_outlives_a_pool_that_is_left_early(start: Start) -> None:
     assert not [pid for pid in {*started, *workers.pids} if Path(f"/proc/{pid}").exists()]
 
 
-def test_a_job_that_kills_every_worker_is_an_error(start: Start) -> None:
-    with Pool(start, 1) as workers, pytest.raises(BlenderError, match="died 3 times"):
+def test_a_job_that_kills_every_worker_is_an_error(start: WorkerStart) -> None:
+    with WorkerPool(start, 1) as workers, pytest.raises(BlenderError, match="died 3 times"):
         list(workers.map(double, [1, 13]))
 
 
-def test_what_the_worker_says_of_a_model_is_the_error(start: Start) -> None:
+def test_what_the_worker_says_of_a_model_is_the_error(start: WorkerStart) -> None:
     start.head["model"] = "bad"
     with pytest.raises(BlenderError, match="bad is no model"):
-        Pool(start, 1)
+        WorkerPool(start, 1)
 
 
-def test_a_worker_that_does_not_start_says_why(start: Start) -> None:
-    worker_pool.WORKER.write_text("import nothing_of_that_name")
+def test_a_worker_that_does_not_start_says_why(start: WorkerStart) -> None:
+    worker_pool.WORKER_SCRIPT.write_text("import nothing_of_that_name")
     with pytest.raises(BlenderError, match=r"nothing_of_that_name.*dmrl render --setup"):
-        Pool(start, 1)
+        WorkerPool(start, 1)

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dmrl.messages import LogType, message
+from dmrl.messages import LogType, message_class
 from dmrl.recording.protobuf.encode import encode
 from dmrl.samples.sample import Columns
 
@@ -31,14 +31,14 @@ LOGGED = {
     ids=["nested", "logged"],
 )
 def test_they_are_the_same_bytes(columns: Columns) -> None:
-    kind = message(columns.message)
+    kind = message_class(columns.message)
     rows = [kind(**sample.fields).SerializeToString() for sample in columns]
     data, at = encode(kind.DESCRIPTOR, columns.fields, len(TIMES_NS))
     assert rows == [data[a:b].tobytes() for a, b in pairwise(at)]
 
 
 def test_a_part_of_them_is_nested_too() -> None:
-    part = Columns("/a", "PoseInFrame", TIMES_NS, POSE).between(10, 30)
+    part = Columns("/a", "PoseInFrame", TIMES_NS, POSE).crop_to_time(10, 30)
     assert part.time_ns.tolist() == [10, 20]
     assert [sample.fields["timestamp"]["seconds"] for sample in part] == [1, 2]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dmrl.geometry.frames import OPTICAL_FROM_CAMERA, Array, camera_from_horizontal
-from dmrl.samples.flight import Placed, transforms
+from dmrl.samples.flight import RobotPose, build_transforms
 
 ANGLES = [(0.3, 0.2, 0.0), (-0.4, 0.1, 2.0), (0.2, -0.5, -1.0), (-0.3, -0.2, 3.0)]
 
@@ -20,7 +20,7 @@ def turn(rotation: dict[str, float]) -> Array:
 @pytest.mark.parametrize(("roll", "pitch", "yaw"), ANGLES)
 def test_frames_are_turned_as_geometry_turns_them(roll: float, pitch: float, yaw: float) -> None:
     place = np.array([1.0, 2.0, 0.5])
-    sample = transforms(3_000_000_007, {"cf1": Placed(place, yaw, roll, pitch)})
+    sample = build_transforms(3_000_000_007, {"cf1": RobotPose(place, yaw, roll, pitch)})
     world, camera, optical = sample.fields["transforms"]
     assert (sample.time_ns, world["timestamp"]) == (3_000_000_007, {"seconds": 3, "nanos": 7})
     assert (world["parent_frame_id"], world["child_frame_id"]) == ("world", "cf1/horizontal")

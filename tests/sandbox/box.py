@@ -15,14 +15,14 @@ import pytest
 from dmrl import boundary
 from dmrl.cli import app
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.deploy.int8.store import INTEGER_NAME, save
+from dmrl.deploy.int8.store import INTEGER_NAME, save_network
 from dmrl.deploy.samples import save_samples
 from dmrl.images.codec import encode_png
-from dmrl.learn.pretrained import resolved
-from dmrl.messages import message
+from dmrl.learn.pretrained import resolve_model_path
+from dmrl.messages import message_class
 from dmrl.recording import Channel, Provenance, RawMessage, RecordingWriter
 from dmrl.recording.provenance import Input
-from dmrl.recording.writer import channel_for
+from dmrl.recording.writer import build_topic_channel
 
 ROBOTS = ("cf1", "..", "a\\b", "$(touch victim)", "$x^{$y$", "`*/", "<img src=x>", "a.b")
 CONTROLS = ("cf1", "x\x1b[2J", "n\nm", "\u202ecf2", "-rf")
@@ -138,23 +138,23 @@ def hostile(
         for k in range(4):
             for robot in robots:
                 rgb = rng.integers(0, 255, (48, 64, 3), np.uint8)
-                picture = message("CompressedImage")(data=encode_png(rgb), format="../../x")
+                picture = message_class("CompressedImage")(data=encode_png(rgb), format="../../x")
                 peer = {"peer": PEERS[k], "u_px": 20, "v_px": 20, "depth_m": 1.0}
                 peers = [{**peer, "source": source} for source in ("truth", "../../victim/keep")]
                 found = [{"u_px": 20, "v_px": 20, "depth_m": 1.0, "confidence": 0.9}]
                 for topic, one in (
                     ("camera/image", picture),
-                    ("labels", message("PeerLabels")(peers=peers)),
-                    ("detections", message("Detections")(detections=found)),
-                    ("height", message("Height")(height_m=1.0)),
-                    ("attitude", message("Attitude")()),
-                    ("velocity", message("Velocity")()),
-                    (f"range/{robot}", message("UwbRange")(range_m=1.0 + k)),
+                    ("labels", message_class("PeerLabels")(peers=peers)),
+                    ("detections", message_class("Detections")(detections=found)),
+                    ("height", message_class("Height")(height_m=1.0)),
+                    ("attitude", message_class("Attitude")()),
+                    ("velocity", message_class("Velocity")()),
+                    (f"range/{robot}", message_class("UwbRange")(range_m=1.0 + k)),
                 ):
-                    channel = channel_for(f"/{robot}/{topic}", one.DESCRIPTOR)
+                    channel = build_topic_channel(f"/{robot}/{topic}", one.DESCRIPTOR)
                     time_ns = k * 100_000_000
                     sink.write_raw(RawMessage(time_ns, time_ns, channel, one.SerializeToString()))
-        height = message("Height")(height_m=2.0)
+        height = message_class("Height")(height_m=2.0)
         for topic in (
             "/../../victim/keep",
             "/cf1.height",
@@ -164,7 +164,7 @@ def hostile(
             "/..",
             "cf1/height",
         ):
-            like = channel_for("/cf1/height", height.DESCRIPTOR)
+            like = build_topic_channel("/cf1/height", height.DESCRIPTOR)
             channel = Channel(topic, like.schema_name, like.schema_data)
             sink.write_raw(RawMessage(0, 0, channel, height.SerializeToString()))
     return path
@@ -172,8 +172,8 @@ def hostile(
 
 def quantised(folder: Path, network: IntegerNetwork) -> Path:
     """A folder as ``dmrl quantize`` writes it, with this int8 network beside honest weights."""
-    shutil.copytree(resolved(Path("dmrl-nano")), folder)
-    save(network, folder / INTEGER_NAME)
+    shutil.copytree(resolve_model_path(Path("dmrl-nano")), folder)
+    save_network(network, folder / INTEGER_NAME)
     save_samples(np.zeros((1, network.height_px, network.width_px, 3), np.uint8), folder)
     return folder
 
@@ -197,21 +197,21 @@ unit = "m"
 
 def with_junk(path: Path, junk: str, calibration: dict[str, Any]) -> Path:
     """A recording in which the messages of one topic are not what their schema says."""
-    made = message("CameraCalibration")(width=64, height=48, **calibration)
+    made = message_class("CameraCalibration")(width=64, height=48, **calibration)
     picture = encode_png(np.full((48, 64, 3), 99, np.uint8))
     peers = [{"peer": "cf2", "u_px": 20, "v_px": 20, "depth_m": 1.0, "source": "truth"}]
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(6):
             for name, one in {
                 "camera/calibration": made,
-                "camera/image": message("CompressedImage")(data=picture, format="png"),
-                "labels": message("PeerLabels")(peers=peers),
-                "attitude": message("Attitude")(),
-                "height": message("Height")(height_m=1.0),
-                "velocity": message("Velocity")(),
-                "detections": message("Detections")(),
+                "camera/image": message_class("CompressedImage")(data=picture, format="png"),
+                "labels": message_class("PeerLabels")(peers=peers),
+                "attitude": message_class("Attitude")(),
+                "height": message_class("Height")(height_m=1.0),
+                "velocity": message_class("Velocity")(),
+                "detections": message_class("Detections")(),
             }.items():
                 data = b"\xff\xff\xff\xff" if name == junk else one.SerializeToString()
-                channel = channel_for(f"/cf1/{name}", one.DESCRIPTOR)
+                channel = build_topic_channel(f"/cf1/{name}", one.DESCRIPTOR)
                 sink.write_raw(RawMessage(k * 10**8, k * 10**8, channel, data))
     return path

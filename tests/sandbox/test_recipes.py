@@ -87,7 +87,7 @@ def test_every_setting_is_right_or_refused_in_one_line(
     for field in fields(settings):
         for value in VALUES:
             keys = {field.name: value}
-            wrong = recipe.faults(render.filled(keys) if kind == "render" else keys, settings)
-            assert "\n" not in str(recipe.faulty("a.toml", wrong))
+            wrong = recipe.find_faults(render.filled(keys) if kind == "render" else keys, settings)
+            assert "\n" not in str(recipe.recipe_error("a.toml", wrong))
             if isinstance(value, float) and not isfinite(value):
                 assert wrong, (field.name, value)

@@ -11,11 +11,11 @@ from dmrl.datasets import open_dataset
 from dmrl.evaluation import quantization_report
 from dmrl.images.codec import encode_png
 from dmrl.learn.inference.loaded_model import Model, save_model
-from dmrl.learn.networks.architectures import build, to_input
-from dmrl.messages import message
+from dmrl.learn.networks.architectures import build_network, normalize_images
+from dmrl.messages import message_class
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
 from dmrl.stages import dataset, fly, quantize
-from dmrl.topics import attitude, camera_image, labels
+from dmrl.topics import ATTITUDE, CAMERA_IMAGE, LABELS
 
 STEP_NS = 100_000_000
 
@@ -32,13 +32,13 @@ def dots(tmp_path_factory: pytest.TempPathFactory) -> Path:
             rgb = rng.integers(0, 40, (48, 64, 3), np.uint8)
             row, col = int(rng.integers(1, 5)), int(rng.integers(1, 7))
             rgb[8 * row + 1 : 8 * row + 7, 8 * col + 1 : 8 * col + 7] = 250
-            picture = message("CompressedImage")(data=encode_png(rgb), format="png")
+            picture = message_class("CompressedImage")(data=encode_png(rgb), format="png")
             truth = {"peer": "cf2", "u_px": 8 * col + 4, "v_px": 8 * row + 4, "depth_m": 1.2}
             off = {**truth, "v_px": truth["v_px"] + 8, "source": "published"}
-            peers = message("PeerLabels")(peers=[{**truth, "source": "truth"}, off])
-            sink.write(k * STEP_NS, camera_image("cf1"), picture, publish_ns=k * STEP_NS + 5)
-            sink.write(k * STEP_NS, labels("cf1"), peers)
-            sink.write(k * STEP_NS + 1, attitude("cf1"), message("Attitude")(roll_rad=k))
+            peers = message_class("PeerLabels")(peers=[{**truth, "source": "truth"}, off])
+            sink.write(k * STEP_NS, CAMERA_IMAGE("cf1"), picture, publish_ns=k * STEP_NS + 5)
+            sink.write(k * STEP_NS, LABELS("cf1"), peers)
+            sink.write(k * STEP_NS + 1, ATTITUDE("cf1"), message_class("Attitude")(roll_rad=k))
     return path
 
 
@@ -46,7 +46,7 @@ def dots(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder with an untrained network."""
     folder = tmp_path_factory.mktemp("model")
-    save_model(Model(build("locanet", seed=1).eval(), "locanet", threshold=0.4), folder)
+    save_model(Model(build_network("locanet", seed=1).eval(), "locanet", threshold=0.4), folder)
     return folder
 
 
@@ -65,9 +65,9 @@ def settled(
     request: pytest.FixtureRequest, dots_dataset: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """A run folder with random weights and normalisations that know the small flight."""
-    network = build(request.param, seed=1).train()
+    network = build_network(request.param, seed=1).train()
     images = np.concatenate(open_dataset(dots_dataset).split("train").pixels)
-    seen = to_input(torch.from_numpy(images).permute(0, 3, 1, 2))
+    seen = normalize_images(torch.from_numpy(images).permute(0, 3, 1, 2))
     for norm in network.modules():
         if isinstance(norm, torch.nn.BatchNorm2d):
             norm.momentum = 1.0  # what it keeps is what it saw last

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.geometry.frames import AIDECK, Array, Camera, inside, pixels_from_horizontal
-from dmrl.messages import message
-from dmrl.recording import Provenance, RecordingWriter, read_raw, read_table, summary
+from dmrl.geometry.frames import AIDECK, Array, Camera, is_inside, pixels_from_horizontal
+from dmrl.messages import message_class
+from dmrl.recording import Provenance, RecordingWriter, read_raw, read_summary, read_table
 
 RATE_HZ = 10.0
 
@@ -29,7 +29,7 @@ def with_detections(
     roll and pitch; without it, as the log does.
     """
     rng = np.random.default_rng(seed)
-    held = summary(flight)
+    held = read_summary(flight)
     span_ns = held.start_ns, held.end_ns
     times_ns = np.arange(span_ns[0] + 10**9, span_ns[1] - 10**9, round(1e9 / rate_hz))
     taken_ns = times_ns - round(camera.delay_s * 1e9)
@@ -37,14 +37,14 @@ def with_detections(
     roll, pitch = (np.interp(taken_ns, at_ns, angle) for angle in tilted)
     found: list[list[dict[str, float]]] = [[] for _ in times_ns]
     for topic in held.topics:
-        link = topics.names(topics.TRUTH, topic)
+        link = topics.parse_topic(topics.TRUTH, topic)
         if link is None or link["robot"] != robot:
             continue
         truth = read_table(flight, topic)
         true_ns = truth["log_time"].to_numpy()
         xyz = np.column_stack([np.interp(taken_ns, true_ns, truth[a].to_numpy()) for a in "xyz"])
         uv, depth_m, _ = pixels_from_horizontal(xyz, roll, pitch, camera)
-        shown = inside(uv, 320, 224) & (depth_m > 0) & (rng.random(len(uv)) < 5 / 6)
+        shown = is_inside(uv, 320, 224) & (depth_m > 0) & (rng.random(len(uv)) < 5 / 6)
         lasting = np.interp(times_ns, times_ns[::10], rng.normal(0, 0.08, len(times_ns[::10])))
         depth_m = depth_m * np.exp(lasting + rng.normal(0, 0.15, len(uv)))
         uv = uv + rng.normal(0, 3.0, uv.shape)
@@ -59,18 +59,18 @@ def with_detections(
         for raw in read_raw(flight):
             sink.write_raw(raw)
         k = np.ravel(AIDECK.image_from_optical).tolist()
-        calibration = message("CameraCalibration")(
+        calibration = message_class("CameraCalibration")(
             width=320, height=224, K=k, D=list(AIDECK.distortion), distortion_model="plumb_bob"
         )
-        sink.write(int(times_ns[0]), topics.calibration(robot), calibration)
+        sink.write(int(times_ns[0]), topics.CALIBRATION(robot), calibration)
         for time_ns, entries in zip(times_ns.tolist(), found, strict=True):
-            made = message("Detections")(detections=entries, threshold=0.3)
-            sink.write(time_ns, topics.detections(robot), made)
+            made = message_class("Detections")(detections=entries, threshold=0.3)
+            sink.write(time_ns, topics.DETECTIONS(robot), made)
     return out
 
 
 def _logged(flight: Path, robot: str) -> tuple[NDArray[np.int64], Array, Array]:
-    table = read_table(flight, topics.attitude(robot))
+    table = read_table(flight, topics.ATTITUDE(robot))
     columns = (table[name].to_numpy() for name in ("log_time", "roll_rad", "pitch_rad"))
     times_ns, roll, pitch = columns
     return times_ns, roll, pitch

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from dmrl.errors import RecordingError, SettingError
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import (
     RecordingWriter,
+    build_provenance,
     check,
-    provenance,
     read,
     read_raw,
+    read_summary,
     read_table,
-    summary,
 )
 from dmrl.stages.align import METADATA, Settings, run
 
@@ -25,17 +25,17 @@ def recording(tmp_path: Path) -> Path:
     path, rng = tmp_path / "in.mcap", np.random.default_rng(0)
     time = np.cumsum(rng.uniform(0.03, 0.05, 1500))
     measured = 3 + 0.5 * np.sin(time) + 0.4 * np.sin(1.7 * time) + rng.normal(0, 0.05, len(time))
-    with RecordingWriter(path, provenance("test")) as sink:
+    with RecordingWriter(path, build_provenance("test")) as sink:
         for moment, value in zip((time + 30).tolist(), measured.tolist(), strict=True):
             other = moment - 30 + 0.080 + 20e-6 * (moment - 60)
-            ranged = message("UwbRange")(range_m=value)
+            ranged = message_class("UwbRange")(range_m=value)
             sink.write(round(moment * 1e9), "/cf1/range/cf2", ranged)
             sink.write(round(other * 1e9), "/cf2/range/cf1", ranged)
-            sink.write(round(other * 1e9), "/cf2/height", message("Height")(height_m=moment))
-        picture = message("CompressedImage")(timestamp={"seconds": 1})
+            sink.write(round(other * 1e9), "/cf2/height", message_class("Height")(height_m=moment))
+        picture = message_class("CompressedImage")(timestamp={"seconds": 1})
         sink.write(10**9, "/cf2/camera/image", picture)
         frame = {"parent_frame_id": "world", "child_frame_id": "cf2/horizontal"}
-        sink.write(10**9, "/tf", message("FrameTransforms")(transforms=[frame]))
+        sink.write(10**9, "/tf", message_class("FrameTransforms")(transforms=[frame]))
     return path
 
 
@@ -54,7 +54,7 @@ def test_all_of_a_robot_is_set_by_the_other_s_clock(recording: Path, tmp_path: P
     assert frames.time_ns == image.time_ns
     before = read_table(recording, "/cf1/range/cf2")["log_time"]
     assert read_table(out, "/cf1/range/cf2")["log_time"].equals(before)
-    (told,) = summary(out).metadata[METADATA]
+    (told,) = read_summary(out).metadata[METADATA]
     assert told.keys() == {"cf1", "cf2"}
     assert not [f for f in check(out) if f.level == "error" and "image" not in f.topic]
 
@@ -64,7 +64,7 @@ def test_a_robot_that_would_begin_before_zero_takes_all_with_it(
 ) -> None:
     out = tmp_path / "out.mcap"
     run(recording, out, Settings(reference="cf2"))
-    assert summary(out).start_ns >= 0
+    assert read_summary(out).start_ns >= 0
     ranges = [
         read_table(out, t)["log_time"].to_numpy() for t in ("/cf1/range/cf2", "/cf2/range/cf1")
     ]
@@ -76,13 +76,13 @@ def test_times_stay_where_no_robot_would_begin_before_zero(
 ) -> None:
     """cf1's clock is behind by 30 s: its times move back, and begin at 10 s still."""
     late = tmp_path / "late.mcap"
-    with RecordingWriter(late, provenance("test")) as sink:
-        sink.write(10**9, "/cf2/height", message("Height")())
+    with RecordingWriter(late, build_provenance("test")) as sink:
+        sink.write(10**9, "/cf2/height", message_class("Height")())
         for raw in read_raw(recording, "/cf1/range/cf2", "/cf2/range/cf1"):
             sink.write_raw(replace(raw, time_ns=raw.time_ns + 10**10))
     out = tmp_path / "out.mcap"
     clocks = run(late, out, Settings(reference="cf2"))
-    assert clocks.keys() == summary(out).metadata[METADATA][0].keys() == {"cf1", "cf2"}
+    assert clocks.keys() == read_summary(out).metadata[METADATA][0].keys() == {"cf1", "cf2"}
     assert capsys.readouterr().err == ""
     before, after = (read_table(p, "/cf2/range/cf1", fields=())["log_time"] for p in (late, out))
     assert after.equals(before)
@@ -91,26 +91,26 @@ def test_times_stay_where_no_robot_would_begin_before_zero(
 def test_a_move_of_all_times_is_said_and_kept(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with RecordingWriter(tmp_path / "early.mcap", provenance("test")) as sink:
+    with RecordingWriter(tmp_path / "early.mcap", build_provenance("test")) as sink:
         for raw in read_raw(recording):
             sink.write_raw(raw)
-        sink.write(0, "/cf1/height", message("Height")())
+        sink.write(0, "/cf1/height", message_class("Height")())
     out = tmp_path / "out.mcap"
     clocks = run(tmp_path / "early.mcap", out, Settings(reference="cf2"))
     assert clocks["*"].offset_s == pytest.approx(29.92, abs=0.01)
     assert "all times are moved by 29.9" in capsys.readouterr().err
-    told = json.loads(summary(out).metadata[METADATA][0]["*"])
+    told = json.loads(read_summary(out).metadata[METADATA][0]["*"])
     assert told["offset_s"] == clocks["*"].offset_s
-    assert summary(out).start_ns == 0
+    assert read_summary(out).start_ns == 0
 
 
 def test_what_cannot_be_aligned_is_one_line(recording: Path, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"--reference cf9: no such robot .* Known: cf1"):
         run(recording, tmp_path / "out.mcap", Settings(reference="cf9"))
     alone = tmp_path / "alone.mcap"
-    with RecordingWriter(alone, provenance("test")) as sink:
+    with RecordingWriter(alone, build_provenance("test")) as sink:
         for k in range(30):
-            sink.write(k * 10**9, "/cf1/range/cf2", message("UwbRange")(range_m=1.0))
+            sink.write(k * 10**9, "/cf1/range/cf2", message_class("UwbRange")(range_m=1.0))
     with pytest.raises(RecordingError, match="no robot saw what cf1 saw"):
         run(alone, tmp_path / "out.mcap", Settings())
     assert not (tmp_path / "out.mcap").exists()
@@ -120,9 +120,9 @@ def test_pictures_stamped_on_arrival_get_even_times(tmp_path: Path) -> None:
     path, out, rng = tmp_path / "in.mcap", tmp_path / "out.mcap", np.random.default_rng(1)
     sent = 10**10 + np.arange(400) * 50_000_000
     arrival = sent + rng.exponential(2e6, 400).astype(int)
-    with RecordingWriter(path, provenance("test")) as sink:
+    with RecordingWriter(path, build_provenance("test")) as sink:
         for moment in arrival.tolist():
-            sink.write(moment, "/cf1/camera/image", message("CompressedImage")(data=b"x"))
+            sink.write(moment, "/cf1/camera/image", message_class("CompressedImage")(data=b"x"))
     assert run(path, out, Settings(steady_cameras=True)) == {}
     table = read_table(out, "/cf1/camera/image", fields=[])
     assert np.abs(table["log_time"].to_numpy() - sent).max() < 100_000
@@ -131,8 +131,8 @@ def test_pictures_stamped_on_arrival_get_even_times(tmp_path: Path) -> None:
 
 def test_labelled_pictures_keep_their_times(tmp_path: Path) -> None:
     path = tmp_path / "in.mcap"
-    with RecordingWriter(path, provenance("test")) as sink:
-        sink.write(1, "/cf1/camera/image", message("CompressedImage")(data=b"x"))
-        sink.write(1, "/cf1/labels", message("PeerLabels")())
+    with RecordingWriter(path, build_provenance("test")) as sink:
+        sink.write(1, "/cf1/camera/image", message_class("CompressedImage")(data=b"x"))
+        sink.write(1, "/cf1/labels", message_class("PeerLabels")())
     with pytest.raises(SettingError, match=r"has labels already\. Align before that"):
         run(path, tmp_path / "out.mcap", Settings(steady_cameras=True))

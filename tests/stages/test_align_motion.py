@@ -9,8 +9,8 @@ import pytest
 
 from dmrl.errors import RecordingError, SettingError
 from dmrl.images.codec import encode_jpeg
-from dmrl.messages import message
-from dmrl.recording import RecordingWriter, provenance, read_raw, read_table, summary
+from dmrl.messages import message_class
+from dmrl.recording import RecordingWriter, build_provenance, read_raw, read_summary, read_table
 from dmrl.simulation.settings import Preset
 from dmrl.stages import fly
 from dmrl.stages.align import METADATA, Settings, run
@@ -53,13 +53,13 @@ def looked_around(path: Path, duration_s: float, wrong: Wrong, rate_hz: float) -
     def rate(time_s: float) -> float:
         return sum(a * w * np.cos(w * time_s + p) for a, w, p in waves)
 
-    with RecordingWriter(path, provenance("test")) as sink:
+    with RecordingWriter(path, build_provenance("test")) as sink:
         for time_s in np.arange(1, duration_s + 1, 0.01).tolist():
             noisy = rate(time_s) + rng.normal(0, 0.02)
             sink.write(
                 round(time_s * 1e9),
                 "/cf1/attitude",
-                message("Attitude")(yaw_rate_radps=noisy, pitch_rad=rng.normal(0, 0.001)),
+                message_class("Attitude")(yaw_rate_radps=noisy, pitch_rad=rng.normal(0, 0.001)),
             )
         for time_s in np.arange(1, duration_s + 1, 1 / rate_hz).tolist():
             left = 512 - WIDTH_PX // 2 - FOCAL_PX * yaw(time_s)
@@ -70,7 +70,7 @@ def looked_around(path: Path, duration_s: float, wrong: Wrong, rate_hz: float) -
             view = seen[:, first % 1024] * (1 - part) + seen[:, (first + 1) % 1024] * part
             grey = np.clip(view * dim + rng.normal(0, 6, view.shape), 0, 255).astype(np.uint8)
             data = encode_jpeg(np.stack([grey] * 3, axis=2), 80)
-            picture = message("CompressedImage")(data=data, format="jpeg")
+            picture = message_class("CompressedImage")(data=data, format="jpeg")
             sink.write(round(wrong(time_s) * 1e9), "/cf1/camera/image", picture)
 
 
@@ -83,7 +83,7 @@ def camera_error_s(folder: Path, duration_s: float) -> float:
     assert worst_s(spoilt, out, "/cf1/attitude") == 0
     times = read_table(out, "/cf1/camera/image", fields=[])["log_time"].to_numpy()
     true = 1e9 * (1 + np.arange(len(times)) / 20.0)
-    (told,) = summary(out).metadata[METADATA]
+    (told,) = read_summary(out).metadata[METADATA]
     assert '"by": "yaw rate"' in told["cf1/camera"]
     return float(np.abs(times - true).max() * 1e-9)
 
@@ -103,7 +103,7 @@ def mocap_errors_s(folder: Path, duration_s: float, noise: Preset) -> list[float
     true, spoilt, out = folder / "true.mcap", folder / "in.mcap", folder / "out.mcap"
     fly.run(true, fly.Settings(duration_s=duration_s, noise=noise, trajectory="random", seed=4))
     wrong = wrong_in(duration_s)
-    with RecordingWriter(spoilt, provenance("test")) as sink:
+    with RecordingWriter(spoilt, build_provenance("test")) as sink:
         for raw in read_raw(true):
             is_log = raw.topic.split("/")[-1] in ("attitude", "velocity", "height")
             if is_log or raw.topic == "/tf":
@@ -130,11 +130,11 @@ def test_what_neither_camera_nor_motion_capture_can_tell_is_one_line(tmp_path: P
     with pytest.raises(SettingError, match=r"has labels already\. Align before that"):
         run(path, out, Settings(cameras=True))
     still = tmp_path / "still.mcap"
-    with RecordingWriter(still, provenance("test")) as sink:
+    with RecordingWriter(still, build_provenance("test")) as sink:
         data = encode_jpeg(np.zeros((48, 64, 3), np.uint8))
         for k in range(60):
-            sink.write(k * 10**9, "/cf1/attitude", message("Attitude")())
-            sink.write(k * 10**9, "/cf1/camera/image", message("CompressedImage")(data=data))
+            sink.write(k * 10**9, "/cf1/attitude", message_class("Attitude")())
+            sink.write(k * 10**9, "/cf1/camera/image", message_class("CompressedImage")(data=data))
     with pytest.raises(RecordingError, match="no camera saw its robot turn"):
         run(still, out, Settings(cameras=True))
     with pytest.raises(RecordingError, match=r"no poses of robots .* Leave out --mocap"):

@@ -7,10 +7,10 @@ from scipy.stats import chi2
 
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError, SourceError
 from dmrl.flight import NOISE, Scenario, simulate
-from dmrl.geometry.camera_file import read_camera, write_camera
+from dmrl.geometry.camera_file import format_camera, read_camera
 from dmrl.geometry.frames import AIDECK, Camera
 from dmrl.images.codec import encode_png
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter, read
 from dmrl.simulation.flight_recording import START_NS
 from dmrl.stages import calibrate, fly, label
@@ -64,7 +64,7 @@ def test_labels_made_with_it_lie_where_the_peer_was_seen(
 ) -> None:
     camera, _ = calibrated
     with_images = tmp_path / "images.mcap"
-    blank = message("CompressedImage")(
+    blank = message_class("CompressedImage")(
         data=encode_png(np.zeros((224, 320, 3), np.uint8)), format="png"
     )
     with RecordingWriter(with_images, Provenance("test")) as sink:
@@ -229,7 +229,7 @@ def test_three_flights_give_pitch_and_delay_from_any_start(
 ) -> None:
     # Estimated positions left pitch off by half, and the delay where it started.
     begin = tmp_path / "begin.toml"
-    begin.write_text(write_camera(replace(AIDECK, delay_s=start_s)), encoding="utf-8")
+    begin.write_text(format_camera(replace(AIDECK, delay_s=start_s)), encoding="utf-8")
     found = calibrate.run(three, tmp_path / "camera.toml", Settings(camera=begin)).camera
     assert np.degrees(found.mount_rad[1]) == pytest.approx(-2.86, abs=0.8)
     assert found.delay_s == pytest.approx(0.06, abs=0.004)

@@ -9,7 +9,7 @@ from dmrl.errors import OutputError, RecordingError, SettingError
 from dmrl.flight import Fault
 from dmrl.labelling.calibration import sensor_calibration
 from dmrl.labelling.sensor_file import SensorConstants, read_sensors, write_sensors
-from dmrl.recording import summary
+from dmrl.recording import read_summary
 from dmrl.stages import calibrate, fly, label
 from dmrl.stages.calibrate import Settings
 
@@ -58,7 +58,7 @@ def test_a_short_flight_starts_from_it_and_comes_out_right(known: Path, tmp_path
         assert after.rmse_ok_m is not None
         assert after.rmse_ok_m < 0.2
     assert better.warnings == []
-    assert known.name in [one.name for one in summary(out).provenance.inputs]
+    assert known.name in [one.name for one in read_summary(out).provenance.inputs]
 
 
 def test_a_file_that_is_wrong_is_found_out(known: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from dmrl.errors import DmrlError, OutputError, SettingError, SourceError, UnsafeName
 from dmrl.geometry.frames import AIDECK
 from dmrl.images.codec import decode, encode_png
-from dmrl.recording import SPLIT_METADATA, RecordingWriter, check, read, read_table, summary
+from dmrl.recording import SPLIT_METADATA, RecordingWriter, check, read, read_summary, read_table
 from dmrl.stages import fly, label, merge
 from dmrl.stages.convert import Settings, run
 
@@ -39,7 +39,7 @@ def test_pictures_become_a_recording(pictures: Path, tmp_path: Path) -> None:
     assert images[1].message.timestamp.nanos == 100_000_000
     first, second = (s.message.peers for s in read(out, "/cf1/labels"))
     assert (first[0].peer, first[0].source, len(second)) == ("cf2", "hand", 0)
-    (split,) = summary(out).metadata[SPLIT_METADATA]
+    (split,) = read_summary(out).metadata[SPLIT_METADATA]
     assert {k: json.loads(v) for k, v in split.items()} == {
         "train": [[0, 0]],
         "test": [[100_000_000, 100_000_000]],
@@ -63,7 +63,7 @@ def test_size_and_camera_follow_the_settings(pictures: Path, tmp_path: Path) -> 
     assert calibration.message.K[0] == pytest.approx(250)
     assert (calibration.message.K[2], calibration.message.K[5]) == pytest.approx((160, 112))
     assert decode(next(read(out, "/a-2/camera/image")).message.data).shape == (224, 320, 3)
-    made = summary(out).provenance
+    made = read_summary(out).provenance
     assert made is not None
     assert [i.name for i in made.inputs] == ["pictures", "mine.toml"]
 
@@ -85,7 +85,7 @@ def test_the_published_set_becomes_a_recording(data: Path, tmp_path: Path) -> No
     truth = next(read(out, "/cf1/peer/cf2/truth")).message
     assert truth.frame_id == "cf1/horizontal"
     assert list(truth.covariance) == [0.0] * 9
-    assert SPLIT_METADATA not in summary(out).metadata
+    assert SPLIT_METADATA not in read_summary(out).metadata
 
 
 def test_real_frames_take_the_camera_by_name(data: Path, tmp_path: Path) -> None:
@@ -302,6 +302,6 @@ def test_logs_are_written_as_columns(tmp_path: Path, monkeypatch: pytest.MonkeyP
     counts = run(log, tmp_path / "out.mcap", Settings())
     assert set(singly) == {"/tf"}
     assert counts["/cf1/log/state"] == counts["/cf1/attitude"] == counts["/cf1/pose"] == 500
-    assert summary(tmp_path / "out.mcap").topics["/cf1/attitude"].count == 500
+    assert read_summary(tmp_path / "out.mcap").topics["/cf1/attitude"].count == 500
     found = read_table(tmp_path / "out.mcap", "/cf1/attitude")
     assert found["pitch_rad"].to_numpy() == pytest.approx(-np.radians(2.0))

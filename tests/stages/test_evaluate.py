@@ -10,13 +10,15 @@ from dmrl.cli import app
 from dmrl.errors import RecordingError, SettingError
 from dmrl.evaluation.detection_report import Evaluation, describe_evaluation
 from dmrl.images.codec import encode_png
-from dmrl.messages import STATUS_AMBIGUOUS, message
+from dmrl.messages import STATUS_AMBIGUOUS, message_class
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
 from dmrl.stages import convert, evaluate, merge, predict
 from dmrl.stages.evaluate import Settings, run
 
 Peers = Sequence[Mapping[str, Any]]
-PICTURE = message("CompressedImage")(data=encode_png(np.zeros((48, 64, 3), np.uint8)), format="png")
+PICTURE = message_class("CompressedImage")(
+    data=encode_png(np.zeros((48, 64, 3), np.uint8)), format="png"
+)
 FAST = Settings(draws=20)
 
 
@@ -49,10 +51,12 @@ def write(tmp_path: Path) -> Callable[..., Path]:
                 for k, (peers, detections) in enumerate(images):
                     sink.write(k, f"/{robot}/camera/image", PICTURE)
                     if peers is not None:
-                        labels = message("PeerLabels")(peers=peers, sources=looked)
+                        labels = message_class("PeerLabels")(peers=peers, sources=looked)
                         sink.write(k, f"/{robot}/labels", labels)
                     if detections is not None:
-                        own = message("Detections")(detections=detections, threshold=threshold)
+                        own = message_class("Detections")(
+                            detections=detections, threshold=threshold
+                        )
                         sink.write(k, f"/{robot}/detections", own)
         return path
 
@@ -103,7 +107,7 @@ def test_two_messages_of_one_image_count_together(
     with RecordingWriter(hand, Provenance("test")) as sink:
         for k in range(3):
             marks = [peer(13, 14, source="hand")]
-            sink.write(k, "/cf1/labels", message("PeerLabels")(peers=marks, sources=["hand"]))
+            sink.write(k, "/cf1/labels", message_class("PeerLabels")(peers=marks, sources=["hand"]))
     for first, second in ((true, hand), (hand, true)):
         both = tmp_path / f"{first.stem}-first.mcap"
         merge.run([first, second], both)
@@ -210,7 +214,7 @@ def test_a_label_without_an_image_says_nothing_of_detections(
     path = write({"cf1": [([peer(10, 10)], [found(10, 10)])]})
     late = tmp_path / "late.mcap"
     with RecordingWriter(late, Provenance("test")) as sink:
-        sink.write(77, "/cf1/labels", message("PeerLabels")(peers=[peer(20, 20)]))
+        sink.write(77, "/cf1/labels", message_class("PeerLabels")(peers=[peer(20, 20)]))
     both = tmp_path / "both.mcap"
     merge.run([path, late], both)
     evaluation = run([both], None, FAST)

@@ -7,8 +7,8 @@ import pytest
 
 from dmrl.errors import OutputError, RecordingError, SettingError
 from dmrl.evaluation import positions
-from dmrl.evaluation.pipeline_summary import Done, report
-from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message
+from dmrl.evaluation.pipeline_summary import StepOutcome, print_report
+from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message_class
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages.evaluate import Settings, command, run
 
@@ -17,7 +17,7 @@ Make = Callable[..., Path]
 
 def position(x: float, y: float, std_m: float = 0.1, status: int = STATUS_OK) -> object:
     covariance = (np.eye(3) * std_m**2).ravel().tolist()
-    return message("PeerPosition")(x=x, y=y, covariance=covariance, status=status)
+    return message_class("PeerPosition")(x=x, y=y, covariance=covariance, status=status)
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def labelled(tmp_path: Path) -> Path:
             status = STATUS_UNCONVERGED if k < 200 else STATUS_OK
             here = position(1.1 + 0.001 * (k + 0.5), 0.5, status=status)
             sink.write(late, "/cf1/peer/cf2/position", here)
-            unknown = message("PeerPosition")(x=1.0 + 0.001 * k, y=0.5)
+            unknown = message_class("PeerPosition")(x=1.0 + 0.001 * k, y=0.5)
             sink.write(at, "/cf2/peer/cf1/position", unknown)
     return path
 
@@ -149,9 +149,9 @@ def test_a_pipeline_shows_judged_positions(
     labelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run([labelled], tmp_path / "positions", Settings())
-    done = [Done("evaluate", tmp_path / "positions", 1.0, skipped=False)]
-    report(done)
+    done = [StepOutcome("evaluate", tmp_path / "positions", 1.0, skipped=False)]
+    print_report(done)
     assert "cf1 sees cf2" in capsys.readouterr().out
-    report(done, as_json=True)
+    print_report(done, as_json=True)
     shown = json.loads(capsys.readouterr().out)
     assert shown["positions"]["positions"]["overall"]["samples"] == 1599

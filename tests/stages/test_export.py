@@ -7,7 +7,7 @@ import pytest
 from dmrl.cli import app
 from dmrl.deploy import detector
 from dmrl.errors import MissingExtra, ModelError, SettingError
-from dmrl.recording import read, summary
+from dmrl.recording import read, read_summary
 from dmrl.stages import predict
 from dmrl.stages.export import Settings, run
 
@@ -25,7 +25,7 @@ def grids(model: Path, recording: Path, out: Path, backend: str) -> np.ndarray:
     """(images, confidence and depth, rows, cols) that a backend gives."""
     file = out / f"{model.parent.name}-{backend}.mcap"
     predict.run(model, recording, file, predict.Settings(backend=backend))
-    made = summary(file).provenance
+    made = read_summary(file).provenance
     assert made is not None
     assert made.settings["backend"] == backend
     maps = [grid.message for grid in read(file, "/cf1/detections/grid")]
@@ -136,7 +136,7 @@ def test_a_missing_package_is_named_with_its_extra(
         detector.open_detector(settled, "onnx")
 
 
-@pytest.mark.parametrize("backend", detector.OPENS)
+@pytest.mark.parametrize("backend", detector.OPENERS)
 def test_no_model_is_said(tmp_path: Path, backend: str) -> None:
     with pytest.raises(ModelError, match=r"no model .*nowhere"):
         detector.open_detector(tmp_path / "nowhere", backend)

@@ -11,7 +11,7 @@ from dmrl.errors import OutputError, RecipeError, SettingError
 from dmrl.flight import NOISE, Fault, Scenario, simulate
 from dmrl.geometry.frames import AIDECK_PINHOLE
 from dmrl.images.codec import decode
-from dmrl.recording import check, read, read_table, summary
+from dmrl.recording import check, read, read_summary, read_table
 from dmrl.samples.flight import LOG_COLUMNS
 from dmrl.stages import convert, fly
 from dmrl.stages.fly import Flags, Settings
@@ -28,7 +28,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_topic_is_there_at_its_rate(seen: Path) -> None:
-    counts = {topic: info.count for topic, info in summary(seen).topics.items()}
+    counts = {topic: info.count for topic, info in read_summary(seen).topics.items()}
     assert counts["/cf3/attitude"] == counts["/cf3/velocity"] == counts["/cf3/height"] == 401
     assert counts["/cf2/peer/cf3/truth"] == counts["/tf"] == 80
     assert counts["/cf1/camera/image"] == counts["/cf1/labels"] == 20
@@ -157,7 +157,7 @@ def test_a_recipe_with_faults_is_flown_and_told(
     fly.run(out, recipes.load(path, "fly", Settings))
     told = capsys.readouterr().err.splitlines()
     assert told[:2] == ["height_gap of cf2: 2.0-3.0 s", "range_gap of cf1-cf2: 1.0-6.0 s"]
-    counts = {topic: info.count for topic, info in summary(out).topics.items()}
+    counts = {topic: info.count for topic, info in read_summary(out).topics.items()}
     assert (counts["/cf2/height"], counts["/cf1/height"]) == (501, 601)
     assert counts["/cf1/attitude"] == 501
     assert counts["/cf1/range/cf2"] < 60
@@ -165,7 +165,7 @@ def test_a_recipe_with_faults_is_flown_and_told(
     assert np.isfinite(yaw).all()
     assert [f for f in check(out) if f.level == "error"] == []
     again = tmp_path / "again.toml"
-    again.write_text(summary(out).provenance.to_recipe())
+    again.write_text(read_summary(out).provenance.to_recipe())
     fly.run(tmp_path / "again.mcap", recipes.load(again, "fly", Settings))
     assert (tmp_path / "again.mcap").read_bytes() == out.read_bytes()
 

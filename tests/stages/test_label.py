@@ -9,15 +9,15 @@ from dmrl.errors import MissingTopic, OutputError, SettingError
 from dmrl.flight import NOISE
 from dmrl.geometry.frames import AIDECK_PINHOLE, pixels_from_horizontal
 from dmrl.labelling import pair_estimation
-from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message
+from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message_class
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
     check,
     read,
     read_raw,
+    read_summary,
     read_table,
-    summary,
 )
 from dmrl.stages import convert, fly, label
 from dmrl.stages.label import Settings
@@ -34,7 +34,7 @@ def labelled(flight: Path) -> Path:
 
 
 def test_everything_else_is_copied_bit_for_bit(flight: Path, labelled: Path) -> None:
-    topics = [t for t in summary(flight).topics if t != "/cf1/labels"]
+    topics = [t for t in read_summary(flight).topics if t != "/cf1/labels"]
     assert list(read_raw(labelled, *topics)) == list(read_raw(flight, *topics))
     assert not [f for f in check(labelled) if f.level == "error"]
 
@@ -115,7 +115,7 @@ def test_what_a_network_saw_makes_labels_better(
     with RecordingWriter(seen, Provenance("test")) as sink:
         for stamped in read(flight):
             sink.write(stamped.time_ns, stamped.topic, stamped.message)
-            if stamped.topic != topics.labels("cf1"):
+            if stamped.topic != topics.LABELS("cf1"):
                 continue
             found = [
                 {
@@ -126,8 +126,8 @@ def test_what_a_network_saw_makes_labels_better(
                 }
                 for peer in stamped.message.peers
             ]
-            made = message("Detections")(detections=found, threshold=0.33)
-            sink.write(stamped.time_ns, topics.detections("cf1"), made)
+            made = message_class("Detections")(detections=found, threshold=0.33)
+            sink.write(stamped.time_ns, topics.DETECTIONS("cf1"), made)
     label.run(seen, tmp_path / "refined.mcap", replace(LENIENT, detections=True))
     assert off_px(tmp_path / "refined.mcap") < 0.6 * off_px(labelled)
     with pytest.raises(SettingError, match="--detections goes with --method batch, not ekf"):
@@ -140,7 +140,7 @@ def test_what_a_network_saw_makes_labels_better(
 def test_labelling_again_changes_no_position(labelled: Path, tmp_path: Path) -> None:
     out = tmp_path / "again.mcap"
     label.run(labelled, out, LENIENT)
-    assert summary(out).topics == summary(labelled).topics
+    assert read_summary(out).topics == read_summary(labelled).topics
     assert [s.message for s in read(out, "/*/peer/*/position", "/cf1/labels")] == [
         s.message for s in read(labelled, "/*/peer/*/position", "/cf1/labels")
     ]

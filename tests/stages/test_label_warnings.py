@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import RecordingError, SettingError, SourceError
-from dmrl.geometry.camera_file import write_camera
+from dmrl.geometry.camera_file import format_camera
 from dmrl.geometry.frames import AIDECK
 from dmrl.recording import (
     Provenance,
@@ -71,10 +71,10 @@ def test_a_robot_without_logs_is_left_out_with_a_word(changed: Callable[[Change]
 @pytest.mark.heavy
 def test_a_calibration_of_another_size_or_lens_is_refused(flight: Path, tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
-    path.write_text(write_camera(replace(AIDECK, width_px=160)))
+    path.write_text(format_camera(replace(AIDECK, width_px=160)))
     with pytest.raises(SettingError, match="is for images of 160x224, those of cf1"):
         label.run(flight, tmp_path / "out.mcap", replace(LENIENT, camera={"cf1": path}))
-    path.write_text(write_camera(replace(AIDECK, distortion=(0.1,) * 8)))
+    path.write_text(format_camera(replace(AIDECK, distortion=(0.1,) * 8)))
     with pytest.raises(SourceError, match="wrong keys distortion"):
         label.run(flight, tmp_path / "out.mcap", replace(LENIENT, camera={"cf1": path}))
     fisheye = tmp_path / "fisheye.mcap"

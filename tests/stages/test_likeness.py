@@ -21,9 +21,9 @@ from dmrl.images.codec import decode, encode_png
 from dmrl.render_recording import read_render_settings
 from dmrl.rendering import preset_fitting
 from dmrl.rendering import settings as looks
-from dmrl.rendering.backgrounds.rooms import rooms
-from dmrl.rendering.camera.image_statistics import FIGURES, Likeness
-from dmrl.rendering.preset_fitting import pictures, scenes
+from dmrl.rendering.backgrounds.rooms import open_rooms
+from dmrl.rendering.camera.image_statistics import FIGURES, ImageStatistics
+from dmrl.rendering.preset_fitting import sample_scenes, simulate_images
 from dmrl.stages.likeness import Settings, run
 
 from ..faults.inputs import Inputs
@@ -42,13 +42,13 @@ def frames(folder: Path, camera: str) -> Path:
     folder.mkdir()
     own = {"preset": "himax", "read_noise": [0.006, 0.007], **CAMERAS[camera]}
     settings = recipes.check(camera, looks.filled(own), looks.Settings)
-    there = scenes(rooms(), settings, SIZE_PX, seed=1234)[:32]
-    for k, rgb in enumerate(pictures(settings, there, seed=1234)):
+    there = sample_scenes(open_rooms(), settings, SIZE_PX, seed=1234)[:32]
+    for k, rgb in enumerate(simulate_images(settings, there, seed=1234)):
         (folder / f"{k:02d}.png").write_bytes(encode_png(rgb))
     return folder
 
 
-def off(found: Likeness, real: Likeness) -> float:
+def off(found: ImageStatistics, real: ImageStatistics) -> float:
     """The greatest error of a figure: relative, but of what is nearly nothing the plain one."""
     pairs = [(getattr(found, name), getattr(real, name)) for name in FIGURES]
     return max(abs(one - other) / (other if other > 0.1 else 1) for one, other in pairs)

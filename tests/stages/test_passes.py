@@ -9,9 +9,9 @@ import pytest
 from mcap.reader import make_reader
 
 from dmrl import card, topics
-from dmrl.messages import message
-from dmrl.recording import RecordingWriter, check, merge, provenance, summary, trim
-from dmrl.recording.copying.chunk_copy import Wanted, copy
+from dmrl.messages import message_class
+from dmrl.recording import RecordingWriter, build_provenance, check, merge, read_summary, trim
+from dmrl.recording.copying.chunk_copy import TopicSelection, copy_messages
 from dmrl.recording.mcap import chunk_builder, chunk_reader
 from dmrl.stages import dataset, evaluate, fly, label, track
 
@@ -29,14 +29,14 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
             flown,
             fly.Settings(2, 30.0, seed=1001, camera=True, cameras_max=1, camera_rate_hz=4.0),
         )
-        with RecordingWriter(out, provenance("test", inputs=[flown])) as sink:
-            copy(flown, Wanted(frozenset(summary(flown).topics)), sink)
+        with RecordingWriter(out, build_provenance("test", inputs=[flown])) as sink:
+            copy_messages(flown, TopicSelection(frozenset(read_summary(flown).topics)), sink)
             rng = np.random.default_rng(0)
             for time_ns in _times(flown, "/cf1/camera/image"):
                 found = {"u_px": rng.uniform(0, 320), "v_px": 100.0, "depth_m": 1.0}
                 seen = [{**found, "confidence": 0.9}]
-                made = message("Detections")(detections=seen, threshold=0.5)
-                sink.write(time_ns, topics.detections("cf1"), made)
+                made = message_class("Detections")(detections=seen, threshold=0.5)
+                sink.write(time_ns, topics.DETECTIONS("cf1"), made)
     return out
 
 
@@ -56,13 +56,13 @@ def _chunks(path: Path) -> int:
 def passes(monkeypatch: pytest.MonkeyPatch) -> Passes:
     """How often a recording was gone over since the last call."""
     opened: Counter[str] = Counter()
-    unpacked = chunk_reader.unpacked
+    unpacked = chunk_reader.decompress
 
     def counted(path: Path, *rest: object) -> object:
         opened[path.name] += 1
         return unpacked(path, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(chunk_reader, "unpacked", counted)
+    monkeypatch.setattr(chunk_reader, "decompress", counted)
     monkeypatch.setattr(card, "plots", None)
 
     def count(path: Path) -> float:
@@ -82,7 +82,7 @@ def test_a_check_is_one_pass(flight: Path, passes: Passes) -> None:
 
 @pytest.mark.heavy
 def test_a_trim_is_less_than_one_pass(flight: Path, passes: Passes, tmp_path: Path) -> None:
-    trim(flight, tmp_path / "a.mcap", end_ns=summary(flight).start_ns + 10**10)
+    trim(flight, tmp_path / "a.mcap", end_ns=read_summary(flight).start_ns + 10**10)
     assert 0.2 < passes(flight) < 0.5
     trim(flight, tmp_path / "b.mcap", topics=["/cf2/*"])
     assert passes(flight) <= 1.0
@@ -91,7 +91,7 @@ def test_a_trim_is_less_than_one_pass(flight: Path, passes: Passes, tmp_path: Pa
 @pytest.mark.heavy
 def test_a_merge_is_one_pass_over_each(flight: Path, passes: Passes, tmp_path: Path) -> None:
     parts = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
-    middle_ns = summary(flight).start_ns + 15 * 10**9
+    middle_ns = read_summary(flight).start_ns + 15 * 10**9
     trim(flight, parts[0], end_ns=middle_ns)
     trim(flight, parts[1], start_ns=middle_ns)
     passes(flight)

@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from dmrl import prediction
-from dmrl.deploy.detector import fastest
+from dmrl.deploy.detector import select_fastest_backend
 from dmrl.deploy.onnx import runtime as onnx_run
 from dmrl.errors import MissingTopic, ModelError, OutputError, SettingError, SourceError
-from dmrl.images.codec import Opened, decode, encode_png
+from dmrl.images.codec import ImageHeader, decode, encode_png
 from dmrl.learn.inference.loaded_model import Model, load_model, save_model
-from dmrl.learn.networks.architectures import build
-from dmrl.messages import message
-from dmrl.recording import Provenance, RecordingWriter, read, read_raw, summary
+from dmrl.learn.networks.architectures import build_network
+from dmrl.messages import message_class
+from dmrl.recording import Provenance, RecordingWriter, read, read_raw, read_summary
 from dmrl.stages import predict
 from dmrl.stages.predict import Settings, run
 
@@ -28,7 +28,7 @@ def recording(path: Path, *sizes_px: tuple[int, int], robot: str = "cf1") -> Pat
     with RecordingWriter(path, Provenance("test")) as sink:
         for k, (width_px, height_px) in enumerate(sizes_px):
             data = encode_png(np.full((height_px, width_px, 3), 40 * k, np.uint8))
-            picture = message("CompressedImage")(data=data, format="png")
+            picture = message_class("CompressedImage")(data=data, format="png")
             sink.write(k, f"/{robot}/camera/image", picture)
     return path
 
@@ -41,8 +41,8 @@ def test_everything_is_copied_bit_for_bit(dots: Path, model: Path, tmp_path: Pat
     assert sorted(copied, key=lambda raw: (raw.time_ns, raw.topic)) == sorted(
         read_raw(dots), key=lambda raw: (raw.time_ns, raw.topic)
     )
-    assert summary(out).metadata["dmrl.split"] == summary(dots).metadata["dmrl.split"]
-    made = summary(out).provenance
+    assert read_summary(out).metadata["dmrl.split"] == read_summary(dots).metadata["dmrl.split"]
+    made = read_summary(out).provenance
     assert made is not None
     assert [source.name for source in made.inputs] == [model.name, "dots.mcap"]
 
@@ -58,7 +58,7 @@ def test_detections_have_the_time_of_their_image(dots: Path, model: Path, tmp_pa
 def test_what_a_network_says_beyond_is_written_with_its_detections(
     dots: Path, tmp_path: Path
 ) -> None:
-    network = build("dmrl-nano", seed=1, extra=("log_spread", "class_0", "class_1")).eval()
+    network = build_network("dmrl-nano", seed=1, extra=("log_spread", "class_0", "class_1")).eval()
     with torch.no_grad():
         network.head.bias[4:] = torch.tensor([-1.0, 0.0, 9.0])  # type: ignore[union-attr, index]
         network.head.weight[4:] = 0  # type: ignore[union-attr, index, operator]
@@ -97,11 +97,11 @@ def test_the_grid_is_what_the_network_says_and_detections_are_its_peaks(
 def test_two_views_see_the_same_in_an_image_and_its_mirror_image(tmp_path: Path) -> None:
     model = tmp_path / "model"
     model.mkdir()
-    save_model(Model(build("dmrl-nano", seed=1).eval(), "dmrl-nano"), model)
+    save_model(Model(build_network("dmrl-nano", seed=1).eval(), "dmrl-nano"), model)
     image = np.random.default_rng(5).integers(0, 255, (48, 64, 3), np.uint8)
     with RecordingWriter(tmp_path / "in.mcap", Provenance("test")) as sink:
         for k, picture in enumerate((image, image[:, ::-1].copy())):
-            data = message("CompressedImage")(data=encode_png(picture), format="png")
+            data = message_class("CompressedImage")(data=encode_png(picture), format="png")
             sink.write(k, "/cf1/camera/image", data)
     run(model, tmp_path / "in.mcap", tmp_path / "one.mcap", Settings())
     run(model, tmp_path / "in.mcap", tmp_path / "two.mcap", Settings(views=2))
@@ -117,7 +117,7 @@ def test_two_views_see_the_same_in_an_image_and_its_mirror_image(tmp_path: Path)
 def test_detections_of_before_are_replaced(dots: Path, model: Path, tmp_path: Path) -> None:
     run(model, dots, tmp_path / "once.mcap", Settings())
     run(model, tmp_path / "once.mcap", tmp_path / "twice.mcap", Settings(threshold=0.9))
-    topics = summary(tmp_path / "twice.mcap").topics
+    topics = read_summary(tmp_path / "twice.mcap").topics
     assert {topics[topic].count for topic in OWN} == {30}
     assert next(read(tmp_path / "twice.mcap", OWN[0])).message.threshold == 0.9
 
@@ -130,7 +130,7 @@ def test_same_inputs_same_bytes(dots: Path, model: Path, tmp_path: Path) -> None
 
 def test_a_batch_may_be_larger_than_the_recording(dots: Path, model: Path, tmp_path: Path) -> None:
     assert run(model, dots, tmp_path / "out.mcap", Settings(batch_size=50)).images == 30
-    assert summary(tmp_path / "out.mcap").count == 150
+    assert read_summary(tmp_path / "out.mcap").count == 150
 
 
 def test_images_of_several_sizes_go_through(model: Path, tmp_path: Path) -> None:
@@ -160,11 +160,11 @@ def test_bad_input_is_one_line_and_leaves_nothing(dots: Path, model: Path, tmp_p
     with pytest.raises(SettingError, match=r"odd\.mcap: the image of .* 60 x 48 px do not divide"):
         run(model, odd, out, Settings())
     with RecordingWriter(tmp_path / "blind.mcap", Provenance("test")) as sink:
-        sink.write(0, "/cf1/attitude", message("Attitude")())
+        sink.write(0, "/cf1/attitude", message_class("Attitude")())
     with pytest.raises(MissingTopic, match=r"no topic /\*/camera/image in"):
         run(model, tmp_path / "blind.mcap", out, Settings())
     with RecordingWriter(tmp_path / "noise.mcap", Provenance("test")) as sink:
-        sink.write(0, "/cf1/camera/image", message("CompressedImage")(data=b"noise"))
+        sink.write(0, "/cf1/camera/image", message_class("CompressedImage")(data=b"noise"))
     with pytest.raises(SourceError, match=r"noise\.mcap: the image of .* is not an image"):
         run(model, tmp_path / "noise.mcap", out, Settings())
     with pytest.raises(ModelError, match="no model"):
@@ -201,7 +201,7 @@ def test_without_a_backend_the_fastest_is_taken_and_said(
     run(settled, dots, tmp_path / "named.mcap", Settings(backend="onnx"))
     assert "--backend" not in capsys.readouterr().err
     assert (tmp_path / "out.mcap").read_bytes() == (tmp_path / "named.mcap").read_bytes()
-    made = summary(tmp_path / "out.mcap").provenance
+    made = read_summary(tmp_path / "out.mcap").provenance
     assert made is not None and made.settings["backend"] == "onnx"
     assert "onnxruntime" in made.libraries
 
@@ -209,15 +209,17 @@ def test_without_a_backend_the_fastest_is_taken_and_said(
 def test_torch_is_taken_where_onnx_would_not_do(
     settled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert fastest(settled, (64, 48)) == "onnx"
-    assert fastest(settled, (72, 48)) == "torch"  # ONNX files are of one size
+    assert select_fastest_backend(settled, (64, 48)) == "onnx"
+    assert select_fastest_backend(settled, (72, 48)) == "torch"  # ONNX files are of one size
     (tmp_path / "more").mkdir()
-    network = build("dmrl-nano", seed=1, extra=("log_spread",)).eval()
+    network = build_network("dmrl-nano", seed=1, extra=("log_spread",)).eval()
     save_model(Model(network, "dmrl-nano", width_px=64, height_px=48), tmp_path / "more")
-    assert fastest(tmp_path / "more", (64, 48)) == "torch"  # which says the spread as well
+    assert (
+        select_fastest_backend(tmp_path / "more", (64, 48)) == "torch"
+    )  # which says the spread as well
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     monkeypatch.delitem(sys.modules, "dmrl.deploy.onnx.runtime", raising=False)
-    assert fastest(settled, (64, 48)) == "torch"
+    assert select_fastest_backend(settled, (64, 48)) == "torch"
 
 
 def test_onnxruntime_keeps_to_the_threads_of_a_worker(
@@ -241,11 +243,11 @@ def test_pictures_are_decoded_in_another_thread(
 ) -> None:
     threads: set[threading.Thread] = set()
 
-    def noted(picture: Opened, most: int) -> Any:
+    def noted(picture: ImageHeader, most: int) -> Any:
         threads.add(threading.current_thread())
         return decoded(picture, most)
 
-    decoded = Opened.decode
-    monkeypatch.setattr(Opened, "decode", noted)
+    decoded = ImageHeader.decode
+    monkeypatch.setattr(ImageHeader, "decode", noted)
     run(model, dots, tmp_path / "out.mcap", Settings(batch_size=3))
     assert threads and threading.main_thread() not in threads

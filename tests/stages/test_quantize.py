@@ -8,12 +8,12 @@ import pytest
 from dmrl import card
 from dmrl.cli import app
 from dmrl.deploy.int8.network import Conv
-from dmrl.deploy.int8.store import load
+from dmrl.deploy.int8.store import load_network
 from dmrl.errors import OutputError, SettingError
 from dmrl.evaluation import quantization_report
 from dmrl.images.codec import decode, encode_png
 from dmrl.learn.inference.loaded_model import load_model
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.stages import convert, dataset, quantize
 from dmrl.stages.quantize import Settings, run
@@ -24,14 +24,14 @@ def test_a_quantised_model_is_a_run_folder_with_more(quantised: Path, settled: P
     assert names >= {"integer.npz", "samples.npz", "quantisation.json", "provenance.json"}
     wanted, got = (load_model(path).network.state_dict() for path in (settled, quantised))
     assert all((wanted[name] == got[name]).all() for name in wanted)
-    network = load(quantised)
+    network = load_network(quantised)
     assert (network.width_px, network.height_px, network.channels) == (64, 48, 3)
     assert network.architecture == load_model(settled).architecture
 
 
 def test_the_report_has_every_layer_and_both_accuracies(quantised: Path) -> None:
     said = json.loads((quantised / "quantisation.json").read_text())
-    network = load(quantised)
+    network = load_network(quantised)
     heads = {head.tensor for head in network.heads.values()}
     assert len(said["layers"]) == len(network.layers) - len(heads) + len(network.heads)
     assert all(layer["sqnr_db"] > 10 for layer in said["layers"] if layer["sqnr_db"] is not None)
@@ -70,7 +70,7 @@ def test_a_grey_network_takes_one_channel(
 ) -> None:
     monkeypatch.setattr(quantization_report, "plots", None)
     result = run(settled, dots_dataset, tmp_path / "grey", Settings(grey=True))
-    first = load(tmp_path / "grey").layers[0]
+    first = load_network(tmp_path / "grey").layers[0]
     assert isinstance(first, Conv)
     assert first.weight.shape[1] == result.network.channels == 1
 
@@ -92,9 +92,11 @@ def test_constant_images_are_refused(
     with RecordingWriter(recording, Provenance("test")) as sink:
         for k in range(4):
             data = encode_png(np.full((48, 64, 3), 60 * k, np.uint8))
-            sink.write(k, "/cf1/camera/image", message("CompressedImage")(data=data, format="png"))
+            sink.write(
+                k, "/cf1/camera/image", message_class("CompressedImage")(data=data, format="png")
+            )
             peer = {"peer": "cf2", "u_px": 5, "v_px": 5, "depth_m": 1, "source": "truth"}
-            sink.write(k, "/cf1/labels", message("PeerLabels")(peers=[peer]))
+            sink.write(k, "/cf1/labels", message_class("PeerLabels")(peers=[peer]))
     dataset.run([recording], tmp_path / "plain", dataset.Settings())
     with pytest.raises(SettingError, match="calibration images is of a single colour"):
         run(settled, tmp_path / "plain", tmp_path / "out", Settings())

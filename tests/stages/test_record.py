@@ -18,7 +18,7 @@ from dmrl.errors import MissingExtra, MissingTopic, OutputError, RecordingError,
 from dmrl.images.codec import decode
 from dmrl.ingest.live_session import Result
 from dmrl.live import crazyflie_link
-from dmrl.live.robot_options import Robot, robot_of
+from dmrl.live.robot_options import RobotOptions, parse_robot
 from dmrl.recording import read, read_table, recover
 from dmrl.simulation import drone_fleet
 from dmrl.simulation.drone_fleet import Fleet
@@ -43,10 +43,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def robots(fleet: Fleet) -> list[Robot]:
+def robots(fleet: Fleet) -> list[RobotOptions]:
     ports = {camera.robot: camera.port for camera in fleet.cameras}
     return [
-        Robot(
+        RobotOptions(
             d.robot,
             f"udp://127.0.0.1:{d.port}",
             ("127.0.0.1", ports[d.robot]) if d.robot in ports else None,
@@ -123,7 +123,7 @@ def test_drones_stay_until_they_are_heard_out(flight: Path, tmp_path: Path) -> N
 
     def listen() -> None:
         out = tmp_path / "out.mcap"
-        results.append(record.run(out, [Robot("cf1", uri)], record.Settings(), ended=ended))
+        results.append(record.run(out, [RobotOptions("cf1", uri)], record.Settings(), ended=ended))
 
     recorder = threading.Thread(target=listen)
     recorder.start()
@@ -156,15 +156,15 @@ def test_a_packet_that_cannot_be_read_costs_a_connection_not_the_recording(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    samples, packets = crazyflie_link.Reading.samples, count()
+    samples, packets = crazyflie_link.LogDecoder.iter_samples, count()
 
-    def once_wrong(self: crazyflie_link.Reading, *packet: Any) -> Any:
+    def once_wrong(self: crazyflie_link.LogDecoder, *packet: Any) -> Any:
         if next(packets) == 20:
             raise ValueError("no such number")
         return samples(self, *packet)
 
-    monkeypatch.setattr(crazyflie_link, "RETRY_S", 0.1)
-    monkeypatch.setattr(crazyflie_link.Reading, "samples", once_wrong)
+    monkeypatch.setattr(crazyflie_link, "RETRY_DELAY_S", 0.1)
+    monkeypatch.setattr(crazyflie_link.LogDecoder, "iter_samples", once_wrong)
     with drone_fleet.fleet(flight, ANY[:1], (), fake_drone.Settings(speed=0.5)) as fleet:
         result = recorded(tmp_path / "out.mcap", fleet, lambda: fleet.clock.landed)
     said = "cf1: a packet could not be read (ValueError('no such number')) at udp://"
@@ -216,7 +216,7 @@ def test_a_killed_session_comes_back_to_its_last_second(flight: Path, tmp_path: 
     assert not out.exists()
     assert attitudes_in(partial, mended) >= 100  # of 290
     with pytest.raises(OutputError, match="cut off\\. Bring it back with dmrl recover"):
-        record.run(out, [Robot("cf1", "udp://127.0.0.1:9")], record.Settings())
+        record.run(out, [RobotOptions("cf1", "udp://127.0.0.1:9")], record.Settings())
 
 
 def test_ctrl_c_leaves_a_whole_recording(flight: Path, tmp_path: Path) -> None:
@@ -236,7 +236,7 @@ def test_ctrl_c_leaves_a_whole_recording(flight: Path, tmp_path: Path) -> None:
 
 def test_nobody_there_leaves_no_recording(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
-    nobody = [Robot("cf1", "udp://127.0.0.1:9")]
+    nobody = [RobotOptions("cf1", "udp://127.0.0.1:9")]
     with pytest.raises(RecordingError, match=r"no data for .* \(cf1 at udp://127.0.0.1:9"):
         record.run(out, nobody, record.Settings(duration_s=0.5))
     assert list(tmp_path.iterdir()) == []
@@ -253,17 +253,17 @@ def test_nobody_there_leaves_no_recording(tmp_path: Path) -> None:
 )
 def test_a_robot_that_cannot_be_understood_is_refused(text: str, why: str) -> None:
     with pytest.raises(SettingError, match=why):
-        robot_of(text)
+        parse_robot(text)
 
 
 @pytest.mark.parametrize("uri", ["cf1", "foo://bar", "udp://127.0.0.1", "udp://h:99999"])
 def test_an_address_of_no_driver_is_refused(uri: str, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="no address of a Crazyflie"):
-        record.run(tmp_path / "out.mcap", [Robot("cf1", uri)], record.Settings())
+        record.run(tmp_path / "out.mcap", [RobotOptions("cf1", uri)], record.Settings())
 
 
 def test_two_robots_of_one_name_are_refused(tmp_path: Path) -> None:
-    twice = [Robot("cf1", "udp://127.0.0.1:1"), Robot("cf1", "udp://127.0.0.1:2")]
+    twice = [RobotOptions("cf1", "udp://127.0.0.1:1"), RobotOptions("cf1", "udp://127.0.0.1:2")]
     with pytest.raises(SettingError, match="two robots with the name cf1"):
         record.run(tmp_path / "out.mcap", twice, record.Settings())
 
@@ -275,7 +275,9 @@ def test_without_cflib_the_line_says_what_to_install(
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "cflib", None)
     with pytest.raises(MissingExtra, match=re.escape("pip install 'dmrl[record]'")):
-        record.run(tmp_path / "out.mcap", [Robot("cf1", "udp://127.0.0.1:1")], record.Settings())
+        record.run(
+            tmp_path / "out.mcap", [RobotOptions("cf1", "udp://127.0.0.1:1")], record.Settings()
+        )
 
 
 @pytest.mark.parametrize(
@@ -301,7 +303,7 @@ def test_without_opencv_colours_are_refused_before_the_flight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with_camera = [Robot("cf1", "udp://127.0.0.1:1", ("127.0.0.1", 2))]
+    with_camera = [RobotOptions("cf1", "udp://127.0.0.1:1", ("127.0.0.1", 2))]
     with pytest.raises(MissingExtra, match=re.escape("pip install 'dmrl[record]'")):
         record.run(tmp_path / "out.mcap", with_camera, record.Settings())
     assert not list(tmp_path.iterdir())

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 from dmrl.errors import OutputError, RecordingError, SettingError
-from dmrl.geometry.camera_file import write_camera
+from dmrl.geometry.camera_file import format_camera
 from dmrl.geometry.frames import Array, Camera, project
 from dmrl.images.codec import decode, encode_png
-from dmrl.recording import check, licences, read, summary
+from dmrl.recording import check, read, read_licences, read_summary
 from dmrl.render_recording import read_render_camera
 from dmrl.rendering.camera.distortion import image_from_pinhole
-from dmrl.rendering.image_messages import quaternion
-from dmrl.rendering.randomise import World, draw_scene
-from dmrl.rendering.renderer import Model, Renderer
+from dmrl.rendering.image_messages import to_quaternion
+from dmrl.rendering.randomise import SceneSource, draw_scene
+from dmrl.rendering.renderer import Renderer, RobotModel
 from dmrl.rendering.robots import crazyflie
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Robot
@@ -49,7 +49,7 @@ def recording(blender: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.heavy
 def test_a_recording_holds_images_labels_and_truth(recording: Path) -> None:
-    found = summary(recording).topics
+    found = read_summary(recording).topics
     per_image = ("camera/image", "camera/masks", "camera/depth", "labels", "attitude")
     assert {found[f"/cf1/{name}"].count for name in per_image} == {6}
     assert found["/cf1/camera/calibration"].count == 1
@@ -132,13 +132,13 @@ def test_a_worker_killed_on_the_way_changes_no_pixel(blender: Path) -> None:
     grey = np.full((8, 16, 3), 0.3, np.float32)
     shots = []
     for kill in (False, True):
-        with Renderer(blender, Model(), workers=1) as renderer:
+        with Renderer(blender, RobotModel(), workers=1) as renderer:
             lights = tuple(renderer.lights)
-            world = World(settings, camera, renderer.radius_m, lights, lambda _: grey, None)
+            world = SceneSource(settings, camera, renderer.radius_m, lights, lambda _: grey, None)
             scenes = [draw_scene(world, k) for k in range(6)]
             if kill:
                 os.kill(renderer.pool.pids[0], signal.SIGKILL)
-            found = list(renderer.shots((camera, s.robots, s.look) for s in scenes))
+            found = list(renderer.render_shots((camera, s.robots, s.look) for s in scenes))
             assert renderer.pool.replaced == kill
         shots.append(np.stack([shot.rgb for shot in found]))
     assert np.array_equal(*shots)
@@ -150,11 +150,11 @@ def test_boxes_are_where_the_mesh_is(blender: Path) -> None:
     camera = read_render_camera(settings)
     grey = np.full((8, 16, 3), 0.3, np.float32)
     errors = []
-    with Renderer(blender, Model()) as renderer:
+    with Renderer(blender, RobotModel()) as renderer:
         lights = tuple(renderer.lights)
-        world = World(settings, camera, renderer.radius_m, lights, lambda _: grey, None)
+        world = SceneSource(settings, camera, renderer.radius_m, lights, lambda _: grey, None)
         scenes = [draw_scene(world, k) for k in range(30)]
-        shots = renderer.shots((camera, s.robots, s.look) for s in scenes)
+        shots = renderer.render_shots((camera, s.robots, s.look) for s in scenes)
         for scene, shot in zip(scenes, shots, strict=True):
             errors.append(shot.box_px[0] - _mesh_box(scene.robots[0], camera))
     assert np.median(np.abs(errors)) < 0.5
@@ -163,7 +163,7 @@ def test_boxes_are_where_the_mesh_is(blender: Path) -> None:
 
 def _mesh_box(robot: Robot, camera: Camera) -> Array:
     turns = (robot.paint["rotor_first_rad"], robot.paint["rotor_sweep_rad"])
-    points = crazyflie.outline(1.0, *turns)
+    points = crazyflie.outline_points(1.0, *turns)
     xyz = points @ robot.pose.camera_from_body.T + robot.pose.xyz_camera
     uv = image_from_pinhole(project(xyz, camera.image_from_optical)[0], camera)
     box = np.concatenate([uv.min(axis=0), uv.max(axis=0)])
@@ -183,13 +183,13 @@ def test_what_stands_beside_the_photos_stands_in_the_recording(
     for k in range(2):
         (photos / f"{k}.png").write_bytes(encode_png(np.full((240, 320, 3), 90 + k, np.uint8)))
     run(out, Settings(images=1, backgrounds=photos, samples=1, workers=1))
-    assert licences([out]) == {"hall": "CC BY-SA 3.0"}
+    assert read_licences([out]) == {"hall": "CC BY-SA 3.0"}
 
 
 @pytest.mark.heavy
 def test_renders_are_taken_with_a_camera_of_the_user_s(blender: Path, tmp_path: Path) -> None:
     path, out = tmp_path / "mine.toml", tmp_path / "out.mcap"
-    path.write_text(write_camera(replace(OWN, mount_rad=(0.0, 0.1, 0.0), delay_s=0.03)))
+    path.write_text(format_camera(replace(OWN, mount_rad=(0.0, 0.1, 0.0), delay_s=0.03)))
     settings = Settings(images=3, camera=path, empty_share=0.0, samples=2, workers=1)
     run(out, settings)
     calibration = next(iter(read(out, "/cf1/camera/calibration"))).message
@@ -197,14 +197,14 @@ def test_renders_are_taken_with_a_camera_of_the_user_s(blender: Path, tmp_path: 
     assert read_render_camera(settings) == OWN
     pictures = [decode(sample.message.data) for sample in read(out, "/cf1/camera/image")]
     assert {picture.shape for picture in pictures} == {(120, 160, 3)}
-    made = summary(out).provenance
+    made = read_summary(out).provenance
     assert made is not None
     assert [source.name for source in made.inputs] == ["mine.toml"]
 
 
 def test_a_lens_that_cannot_fill_its_image_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text(write_camera(replace(OWN, distortion=(-0.9,))))
+    path.write_text(format_camera(replace(OWN, distortion=(-0.9,))))
     with pytest.raises(SettingError, match="folds back before the corners"):
         read_render_camera(Settings(camera=path))
 
@@ -220,4 +220,4 @@ def test_a_quaternion_turns_as_its_matrix(angle_rad: float) -> None:
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     wanted = [0, 0, np.sin(angle_rad / 2), np.cos(angle_rad / 2)]
-    assert quaternion(turn) == pytest.approx(wanted, abs=1e-9)
+    assert to_quaternion(turn) == pytest.approx(wanted, abs=1e-9)

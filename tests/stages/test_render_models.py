@@ -13,8 +13,8 @@ from dmrl.geometry.frames import Array
 from dmrl.images.codec import decode
 from dmrl.recording import read_table
 from dmrl.render_recording import read_render_settings
-from dmrl.rendering.renderer import Model, Renderer
-from dmrl.rendering.robot_preview import views
+from dmrl.rendering.renderer import Renderer, RobotModel
+from dmrl.rendering.robot_preview import render_sides
 from dmrl.rendering.robots import crazyflie
 from dmrl.rendering.settings import Settings
 from dmrl.stages.render import command, run
@@ -37,7 +37,7 @@ def test_an_obj_stands_upright(
 ) -> None:
     path = tmp_path / "tower.obj"
     path.write_text(TOWER)
-    with Renderer(blender, Model(path, 0.1, up), workers=1) as renderer:
+    with Renderer(blender, RobotModel(path, 0.1, up), workers=1) as renderer:
         sides = np.ptp(renderer.points, axis=0)
     assert sides[2] == pytest.approx(height_m, abs=1e-6)
     assert sorted(sides) == pytest.approx([0.1, 0.2, 0.3], abs=1e-6)
@@ -50,8 +50,8 @@ def test_the_box_of_a_preview_is_about_what_it_shows(
 ) -> None:
     path = tmp_path / "tower.obj"
     path.write_text(TOWER)
-    with Renderer(blender, Model(path, 0.1, up), workers=1, samples=4) as renderer:
-        sides = {side.name: side for side in views(renderer, crazyflie.CRAZYFLIE)}
+    with Renderer(blender, RobotModel(path, 0.1, up), workers=1, samples=4) as renderer:
+        sides = {side.name: side for side in render_sides(renderer, crazyflie.CRAZYFLIE)}
         size_m = np.ptp(renderer.box, axis=0)
     for side in sides.values():
         rows, cols = np.nonzero(np.abs(side.rgb.astype(int) - side.rgb[0, 0]).max(axis=2) > 3)
@@ -75,7 +75,7 @@ def test_a_preview_is_a_picture_that_says_the_size(
     command("synthetic_first_look", out, preview=True, as_json=True)
     shown = json.loads(capsys.readouterr().out)
     assert shown["picture"] == str(out)
-    vertices = crazyflie.CRAZYFLIE.mesh().vertices
+    vertices = crazyflie.CRAZYFLIE.build_mesh().vertices
     assert [shown[f"{axis} m"] for axis in "xyz"] == pytest.approx(
         np.ptp(vertices, axis=0), abs=1e-4
     )
@@ -146,6 +146,6 @@ def test_a_file_that_is_no_model_is_refused(blender: Path, tmp_path: Path, kind:
 def test_models_of_other_kinds_are_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "m.txt").write_text("x")
     with pytest.raises(SettingError, match="not a model"):
-        Renderer(Path("none"), Model(tmp_path / "m.txt"))
+        Renderer(Path("none"), RobotModel(tmp_path / "m.txt"))
     with pytest.raises(SettingError, match="Check --model"):
-        Renderer(Path("none"), Model(tmp_path / "none.glb"))
+        Renderer(Path("none"), RobotModel(tmp_path / "none.glb"))

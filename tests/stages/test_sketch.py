@@ -8,7 +8,7 @@ import pytest
 from dmrl.errors import OutputError, SettingError
 from dmrl.geometry.frames import AIDECK_PINHOLE
 from dmrl.images.codec import decode
-from dmrl.recording import SPLIT_METADATA, read, summary
+from dmrl.recording import SPLIT_METADATA, read, read_summary
 from dmrl.simulation.drawn_pictures import draw_picture
 from dmrl.stages import convert
 from dmrl.stages.sketch import Settings, run
@@ -56,13 +56,13 @@ def test_converted_labels_are_what_was_drawn(folder: Path, tmp_path: Path) -> No
     np.testing.assert_array_equal(
         np.reshape(calibration.message.K, (3, 3)), AIDECK_PINHOLE.image_from_optical
     )
-    (split,) = summary(out).metadata[SPLIT_METADATA]
+    (split,) = read_summary(out).metadata[SPLIT_METADATA]
     assert json.loads(split["test"]) == [[1_000_000_000, 1_100_000_000]]
 
 
 def test_the_ancestry_reaches_back_to_the_seed(folder: Path, tmp_path: Path) -> None:
     convert.run(folder, tmp_path / "sketch.mcap", convert.Settings())
-    made = summary(tmp_path / "sketch.mcap").provenance
+    made = read_summary(tmp_path / "sketch.mcap").provenance
     assert made is not None
     source = made.inputs[0].provenance
     assert source is not None

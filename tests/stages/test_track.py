@@ -7,11 +7,11 @@ import pytest
 
 from dmrl import topics
 from dmrl.errors import DmrlError, MissingTopic, OutputError, RecordingError, SettingError
-from dmrl.geometry.camera_file import write_camera
+from dmrl.geometry.camera_file import format_camera
 from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.recorded_camera import recorded_camera
-from dmrl.recording import Provenance, RecordingWriter, read, read_raw, summary, trim
-from dmrl.recording.provenance_inputs import sha256_of_file
+from dmrl.recording import Provenance, RecordingWriter, read, read_raw, read_summary, trim
+from dmrl.recording.provenance_inputs import hash_file
 from dmrl.stages import evaluate, fly, track
 from dmrl.stages.track import Settings
 
@@ -44,8 +44,8 @@ def judged(tracked: Path) -> dict[str, Any]:
 
 
 def test_every_image_gets_its_tracks_in_the_observers_frame(tracked: Path) -> None:
-    made = list(read(tracked, topics.tracks("cf1")))
-    images = [one.time_ns for one in read(tracked, topics.detections("cf1"))]
+    made = list(read(tracked, topics.TRACKS("cf1")))
+    images = [one.time_ns for one in read(tracked, topics.DETECTIONS("cf1"))]
     assert [one.time_ns for one in made] == images
     assert {one.message.frame_id for one in made} == {"cf1/horizontal"}
     entries = [entry for one in made for entry in one.message.tracks]
@@ -69,11 +69,11 @@ def test_tracks_are_judged_with_the_camera_that_made_them(
     late, out, path = (tmp_path / name for name in ("late.mcap", "out.mcap", "camera.toml"))
     with RecordingWriter(late, Provenance("test")) as sink:
         for one in read(detected):
-            seen = one.topic in (topics.detections("cf1"), topics.camera_image("cf1"))
+            seen = one.topic in (topics.DETECTIONS("cf1"), topics.CAMERA_IMAGE("cf1"))
             sink.write(one.time_ns + seen * 200_000_000, one.topic, one.message)
     camera = recorded_camera(read_flight(detected), "cf1")
     assert camera is not None
-    path.write_text(write_camera(replace(camera, delay_s=0.2)))
+    path.write_text(format_camera(replace(camera, delay_s=0.2)))
     track.run(late, out, Settings(camera={"cf1": path}))
     now = evaluate.run([out], None, evaluate.Settings(settle_s=3.0))
     assert isinstance(now, dict)
@@ -88,17 +88,17 @@ def test_other_messages_stay_and_old_tracks_go(
     again = tmp_path / "again.mcap"
     track.run(tracked, again, Settings())
     kept = [raw.data for raw in read_raw(detected)]
-    others = [t for t in summary(again).topics if t != topics.tracks("cf1")]
+    others = [t for t in read_summary(again).topics if t != topics.TRACKS("cf1")]
     assert [raw.data for raw in read_raw(again, *others)] == kept
-    assert summary(again).topics[topics.tracks("cf1")].count == len(
-        list(read(detected, topics.detections("cf1")))
+    assert read_summary(again).topics[topics.TRACKS("cf1")].count == len(
+        list(read(detected, topics.DETECTIONS("cf1")))
     )
 
 
 def test_the_same_input_gives_the_same_bytes(detected: Path, tracked: Path, tmp_path: Path) -> None:
     out = tmp_path / tracked.name
     track.run(detected, out, Settings())
-    assert sha256_of_file(out) == sha256_of_file(tracked)
+    assert hash_file(out) == hash_file(tracked)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_the_same_input_gives_the_same_bytes(detected: Path, tracked: Path, tmp_
 )
 def test_what_is_missing_is_named(detected: Path, tmp_path: Path, topic: str, words: str) -> None:
     short = tmp_path / "short.mcap"
-    others = [t for t in summary(detected).topics if t != topic]
+    others = [t for t in read_summary(detected).topics if t != topic]
     trim(detected, short, topics=others)
     out = tmp_path / "out.mcap"
     with pytest.raises(MissingTopic, match=r"detections|attitude") as caught:
@@ -124,7 +124,7 @@ def test_without_velocity_and_height_it_warns_and_goes_on(
 ) -> None:
     short, out = tmp_path / "short.mcap", tmp_path / "out.mcap"
     gone = ("/cf1/velocity", "/cf1/height")
-    trim(detected, short, topics=[t for t in summary(detected).topics if t not in gone])
+    trim(detected, short, topics=[t for t in read_summary(detected).topics if t not in gone])
     track.run(short, out, Settings())
     said = capsys.readouterr().err
     assert "taken to stand still" in said
@@ -144,7 +144,7 @@ def test_a_camera_of_a_robot_that_is_not_there_is_named(detected: Path, tmp_path
 
 def test_tracks_without_truth_cannot_be_judged(tracked: Path, tmp_path: Path) -> None:
     short = tmp_path / "short.mcap"
-    kept = [t for t in summary(tracked).topics if not topics.names(topics.TRUTH, t)]
+    kept = [t for t in read_summary(tracked).topics if not topics.parse_topic(topics.TRUTH, t)]
     trim(tracked, short, topics=kept)
     with pytest.raises(RecordingError, match="no true position"):
         evaluate.run([short], None, evaluate.Settings(what="tracks"))

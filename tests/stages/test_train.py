@@ -15,10 +15,10 @@ import pytest
 from dmrl import recipe
 from dmrl.cli import app
 from dmrl.datasets import open_dataset
-from dmrl.datasets.training_examples import examples_of, material
+from dmrl.datasets.training_examples import build_examples, load_training_data
 from dmrl.errors import DatasetError, ModelError, OutputError, SettingError
 from dmrl.images.codec import encode_png
-from dmrl.learn.data.batches import FIELDS
+from dmrl.learn.data.batches import ROBOT_FIELDS
 from dmrl.learn.inference.loaded_model import load_model
 from dmrl.learn.training import trainer
 from dmrl.stages import convert, dataset, train
@@ -238,7 +238,7 @@ def test_the_shipped_recipe_is_the_default_and_the_published_one_is_the_papers()
     published = recipe.load("locanet", "train", Settings)
     assert published.augmentation(0).is_nothing
     assert (published.architecture, published.epochs, published.batch_size) == ("locanet", 15, 5)
-    for name in recipe.names() + recipe.pretrained_names():
+    for name in recipe.list_names() + recipe.pretrained_names():
         if recipe.read(name)["kind"] == "train":
             recipe.load(name, "train", Settings)
 
@@ -256,25 +256,28 @@ def test_the_threshold_is_chosen_on_images_held_out(dots_dataset: Path, tmp_path
 
 def test_examples_carry_every_peer_with_its_box(dots_dataset: Path) -> None:
     split = open_dataset(dots_dataset).split("train")
-    examples = examples_of(split)
+    examples = build_examples(split)
     for robots, peers in zip(examples.robots, split.table.column("peers").to_pylist(), strict=True):
         found = robots[np.isfinite(robots[:, 0])]
         assert len(found) == len(peers)
         for robot, peer in zip(found, peers, strict=True):
-            np.testing.assert_allclose(robot[:6], [peer[n] for n in FIELDS[:6]], rtol=1e-6)
+            np.testing.assert_allclose(robot[:6], [peer[n] for n in ROBOT_FIELDS[:6]], rtol=1e-6)
             if peer["box_px"]:
                 np.testing.assert_allclose(robot[6:], peer["box_px"], rtol=1e-6)
 
 
 def test_the_last_images_of_a_recording_are_held_out(dots_dataset: Path) -> None:
-    every = examples_of(open_dataset(dots_dataset).split("train"))
-    found = material(open_dataset(dots_dataset), Settings(validation_share=0.25))
+    every = build_examples(open_dataset(dots_dataset).split("train"))
+    found = load_training_data(open_dataset(dots_dataset), Settings(validation_share=0.25))
     assert (len(found.examples), found.shares) == (15, None)
     assert found.held_out is not None
     joined = np.concatenate([found.examples.robots, found.held_out.robots])
     np.testing.assert_array_equal(joined, every.robots)
-    np.testing.assert_array_equal(found.held_out.image(0), every.image(15))
-    assert material(open_dataset(dots_dataset), Settings(validation_share=0.0)).held_out is None
+    np.testing.assert_array_equal(found.held_out.get_image(0), every.get_image(15))
+    assert (
+        load_training_data(open_dataset(dots_dataset), Settings(validation_share=0.0)).held_out
+        is None
+    )
 
 
 def test_shares_are_of_recordings_by_name(dots_dataset: Path, tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ import pytest
 from dmrl.cli import app
 from dmrl.deploy.c import write_c
 from dmrl.deploy.c.run import compile_targets, proof
-from dmrl.deploy.c.source_file import STACK_BYTES
+from dmrl.deploy.c.source_file import MAX_STACK_BYTES
 from dmrl.deploy.int8.network import Conv, IntegerNetwork
-from dmrl.deploy.int8.store import INTEGER_NAME, save
+from dmrl.deploy.int8.store import INTEGER_NAME, save_network
 from dmrl.deploy.samples import save_samples
 from dmrl.errors import DatasetError, ModelError, SettingError, ToolError
 from dmrl.stages.verify import Settings, run
@@ -29,7 +29,7 @@ def export(network: IntegerNetwork, folder: Path, carries: IntegerNetwork | None
     """An export folder; its C may carry another network than it says."""
     folder.mkdir()
     write_c(carries or network, folder, [])
-    save(network, folder / INTEGER_NAME)
+    save_network(network, folder / INTEGER_NAME)
     shape = (3, network.height_px, network.width_px, 3)
     save_samples(np.random.default_rng(1).integers(0, 256, shape, np.uint8), folder)
     return folder
@@ -67,7 +67,7 @@ def test_every_target_computes_what_the_reference_does(everything: dict[str, Any
 @pytest.mark.slow
 def test_what_the_c_costs_is_measured(everything: dict[str, Any]) -> None:
     assert 500 < everything["code_bytes"] < 50_000
-    assert 0 < everything["stack_bytes"] <= STACK_BYTES
+    assert 0 < everything["stack_bytes"] <= MAX_STACK_BYTES
     # A multiplication and an addition at the least; small layers cost more around them.
     assert 2 < everything["instructions_per_mac"] < 60
     assert [e["images_per_s"] > 0 for e in everything["gap8_estimates"]] == [True, True]
@@ -85,7 +85,7 @@ def test_counting_instructions_gives_the_same_number_again(
 @pytest.fixture
 def one_level(monkeypatch: pytest.MonkeyPatch) -> None:
     """The C is compiled once and its cost not counted: the slow tests do all of that."""
-    monkeypatch.setattr(compile_targets, "LEVELS", ("-O0",))
+    monkeypatch.setattr(compile_targets, "OPTIMIZATION_LEVELS", ("-O0",))
     monkeypatch.setattr(proof, "cost", lambda *_: None)
 
 

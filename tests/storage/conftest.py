@@ -7,7 +7,7 @@ from urllib import request
 
 import pytest
 
-from dmrl.storage.system import system
+from dmrl.storage.system import get_filesystem
 
 
 @pytest.fixture(scope="module")
@@ -34,15 +34,15 @@ def _forget() -> None:
     """File systems keep the address that they were made with."""
     from s3fs import S3FileSystem  # noqa: PLC0415 - in tests of it alone
 
-    system.cache_clear()
+    get_filesystem.cache_clear()
     S3FileSystem.clear_instance_cache()
 
 
 @pytest.fixture(scope="module")
 def lab(server: str) -> Any:
     """fsspec's file system, with an empty bucket called lab."""
-    system("s3").mkdir("lab")
-    return system("s3")
+    get_filesystem("s3").mkdir("lab")
+    return get_filesystem("s3")
 
 
 @pytest.fixture

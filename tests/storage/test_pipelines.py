@@ -7,7 +7,7 @@ import pytest
 
 from dmrl import recipe as recipes
 from dmrl.pipeline import recipe_run as pipeline
-from dmrl.storage import path_of
+from dmrl.storage import to_path
 
 from ..pipeline.chain import CHAIN
 
@@ -17,11 +17,11 @@ def test_a_pipeline_keeps_its_folder_in_a_bucket(lab: Any, tmp_path: Path) -> No
     recipe = tmp_path / "chain.toml"
     recipe.write_text(CHAIN)
     pipeline.run(recipe, tmp_path / "here", workers=1)
-    made = pipeline.run(recipe, path_of("s3://lab/chain"), workers=1)
+    made = pipeline.run(recipe, to_path("s3://lab/chain"), workers=1)
     assert not any(one.skipped for one in made)
     for name in ("pictures.mcap", "short.mcap"):
         assert lab.cat_file(f"lab/chain/{name}") == (tmp_path / "here" / name).read_bytes()
-    assert all(one.skipped for one in pipeline.run(recipe, path_of("s3://lab/chain"), workers=1))
+    assert all(one.skipped for one in pipeline.run(recipe, to_path("s3://lab/chain"), workers=1))
     assert not [name for name in lab.find("lab/chain") if "unfinished" in name]
 
 
@@ -31,11 +31,11 @@ def test_the_demo_s_pipeline_with_all_it_makes_in_a_bucket_is_that_of_here(
     lab: Any, tmp_path: Path
 ) -> None:
     """Every step that ships but the picture of rerun, on fewer drawn pictures."""
-    text = recipes.text("demo").replace("images = 600", "images = 20")
+    text = recipes.read_text("demo").replace("images = 600", "images = 20")
     text = text.replace("epochs = 12", "epochs = 1")
     recipe = tmp_path / "small.toml"
     recipe.write_text(text[: text.index("[[step]]   # needs a Vulkan driver")])
-    there = path_of("s3://lab/demo")
+    there = to_path("s3://lab/demo")
     pipeline.run(recipe, tmp_path / "here", workers=1)
     made = pipeline.run(recipe, there, workers=1)
     assert [one.stage for one in made] == [

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from dmrl import boundary, topics
-from dmrl.atomic_output import partial_file, partial_folder, rewritten_file
+from dmrl.atomic_output import atomic_file, atomic_folder, replace_file
 from dmrl.cli import app
 from dmrl.datasets import open_dataset
 from dmrl.errors import OutputError, StorageError, UnsafeName
 from dmrl.images.codec import encode_png
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.pipeline.batch import build_tasks, find_recordings
-from dmrl.recording import Contents, Provenance, RecordingWriter, columns, summary
-from dmrl.recording.mcap.chunk_reader import place_of
-from dmrl.recording.mcap.file import opened
-from dmrl.recording.mcap.summary_section import section
-from dmrl.recording.provenance_inputs import input_of, sha256_of_file
-from dmrl.storage import Remote, path_of
-from dmrl.storage.remote import UNFINISHED
+from dmrl.recording import LoadedRecording, Provenance, RecordingWriter, iter_columns, read_summary
+from dmrl.recording.mcap.chunk_reader import locate_chunk
+from dmrl.recording.mcap.file import open_mcap
+from dmrl.recording.mcap.summary_section import read_verified_section
+from dmrl.recording.provenance_inputs import build_input, hash_file
+from dmrl.storage import RemotePath, to_path
+from dmrl.storage.remote import UNFINISHED_MARK
 
 from ..pipeline.test_batch import record
 from .conftest import _forget
@@ -47,26 +47,26 @@ def pictured(path: Path, *, seed: int = 0) -> Path:
             at = 1_000_000_000 + k * 10_000_000
             for robot in ("cf1", "cf2"):
                 roll, pitch = rng.normal(0, 0.1, 2).tolist()
-                one = message("Attitude")(roll_rad=roll, pitch_rad=pitch)
-                sink.write(at, topics.attitude(robot), one)
+                one = message_class("Attitude")(roll_rad=roll, pitch_rad=pitch)
+                sink.write(at, topics.ATTITUDE(robot), one)
             if k % 10 == 0:
                 data = encode_png(rng.integers(0, 255, (48, 64, 3), np.uint8))
-                image = message("CompressedImage")(data=data, format="png")
-                sink.write(at, topics.camera_image("cf1"), image)
+                image = message_class("CompressedImage")(data=data, format="png")
+                sink.write(at, topics.CAMERA_IMAGE("cf1"), image)
                 peer = {"peer": "cf2", "u_px": 20, "v_px": 20, "depth_m": 1.0, "source": "truth"}
-                sink.write(at, topics.labels("cf1"), message("PeerLabels")(peers=[peer]))
+                sink.write(at, topics.LABELS("cf1"), message_class("PeerLabels")(peers=[peer]))
     return path
 
 
 def test_names_of_buckets_are_paths_and_others_are_as_ever() -> None:
-    path = path_of("s3://lab/a/b.mcap")
-    assert isinstance(path, Remote) and str(path) == "s3://lab/a/b.mcap"
+    path = to_path("s3://lab/a/b.mcap")
+    assert isinstance(path, RemotePath) and str(path) == "s3://lab/a/b.mcap"
     assert str(path.parent / "c.mcap") == "s3://lab/a/c.mcap" and path.suffix == ".mcap"
     assert str(path.with_suffix("")) == "s3://lab/a/b" and path.key == "lab/a/b.mcap"
-    assert str(path.relative_to(path_of("s3://lab"))) == "a/b.mcap"
+    assert str(path.relative_to(to_path("s3://lab"))) == "a/b.mcap"
     assert str(pickle.loads(pickle.dumps(path))) == str(path)
     for plain in ("a.mcap", "/tmp/s3:/a", "s3:/lab/a", "c://a", "s3"):
-        assert type(path_of(plain)) is type(Path())
+        assert type(to_path(plain)) is type(Path())
 
 
 @pytest.mark.heavy
@@ -106,46 +106,46 @@ def test_numbers_are_read_without_the_pictures(
     lab: Any, tmp_path: Path, fetched: list[int]
 ) -> None:
     source = pictured(tmp_path / "a.mcap")
-    path = path_of("s3://lab/pictured.mcap")
-    with partial_file(path) as here:
+    path = to_path("s3://lab/pictured.mcap")
+    with atomic_file(path) as here:
         here.write_bytes(source.read_bytes())
     size = source.stat().st_size
-    topic = topics.attitude("cf1")
-    held = Contents(path, topics.ATTITUDE)
-    assert held.table(topic).equals(Contents(source, topics.ATTITUDE).table(topic))
-    numbers = sum(len(block.data) for block, _ in held._held.values())
+    topic = topics.ATTITUDE("cf1")
+    held = LoadedRecording(path, topics.ATTITUDE)
+    assert held.get_table(topic).equals(LoadedRecording(source, topics.ATTITUDE).get_table(topic))
+    numbers = sum(len(block.data) for block, _ in held._messages.values())
     assert sum(fetched) < 0.3 * size
     assert numbers
     fetched.clear()
-    assert sum(batch.num_rows for batch in columns(path, topics.camera_image("cf1"))) == 300
+    assert sum(batch.num_rows for batch in iter_columns(path, topics.CAMERA_IMAGE("cf1"))) == 300
     assert 0.6 * size < sum(fetched) < 1.1 * size
     fetched.clear()
-    assert input_of(path).sha256 == sha256_of_file(source)  # as the object says of itself
+    assert build_input(path).sha256 == hash_file(source)  # as the object says of itself
     assert sum(fetched) < 0.1 * size
-    assert summary(path).count == summary(source).count
+    assert read_summary(path).count == read_summary(source).count
 
 
 @pytest.mark.heavy
 def test_what_is_not_whole_is_not_there(lab: Any, tmp_path: Path) -> None:
-    file, folder = path_of("s3://lab/whole/a.bin"), path_of("s3://lab/whole/set")
-    with pytest.raises(RuntimeError), partial_file(file) as here:
+    file, folder = to_path("s3://lab/whole/a.bin"), to_path("s3://lab/whole/set")
+    with pytest.raises(RuntimeError), atomic_file(file) as here:
         here.write_bytes(b"half")
         raise RuntimeError
-    with pytest.raises(RuntimeError), partial_folder(folder) as here:
+    with pytest.raises(RuntimeError), atomic_folder(folder) as here:
         (here / "a").write_bytes(b"half")
         raise RuntimeError
     assert lab.find("lab/whole") == []
     # A process that was killed while it uploaded leaves the mark: the folder is not there.
-    lab.pipe_file(f"lab/whole/set/{UNFINISHED}", b"")
+    lab.pipe_file(f"lab/whole/set/{UNFINISHED_MARK}", b"")
     lab.pipe_file("lab/whole/set/old", b"x")
     assert not folder.exists() and not folder.is_dir()
-    with partial_folder(folder) as here:
+    with atomic_folder(folder) as here:
         (here / "in").mkdir()
         (here / "in" / "a").write_bytes(b"whole")
     assert folder.is_dir() and lab.find("lab/whole/set") == ["lab/whole/set/in/a"]
-    with pytest.raises(OutputError, match="exists"), partial_folder(folder):
+    with pytest.raises(OutputError, match="exists"), atomic_folder(folder):
         pass
-    with rewritten_file(folder / "in" / "a") as here:
+    with replace_file(folder / "in" / "a") as here:
         here.write_bytes(b"again")
     assert (folder / "in" / "a").read_text() == "again"
 
@@ -153,7 +153,7 @@ def test_what_is_not_whole_is_not_there(lab: Any, tmp_path: Path) -> None:
 def test_an_upload_that_fails_leaves_nothing(
     lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = path_of("s3://lab/torn")
+    folder = to_path("s3://lab/torn")
     real, count = lab.put_file, []
 
     def torn(*given: Any, **named: Any) -> None:
@@ -163,7 +163,7 @@ def test_an_upload_that_fails_leaves_nothing(
         real(*given, **named)
 
     monkeypatch.setattr(lab, "put_file", torn)
-    with pytest.raises(StorageError, match="the line is cut"), partial_folder(folder) as here:
+    with pytest.raises(StorageError, match="the line is cut"), atomic_folder(folder) as here:
         (here / "a").write_bytes(b"1")
         (here / "b").write_bytes(b"2")
     assert lab.find("lab/torn") == []
@@ -179,7 +179,7 @@ def test_a_dataset_is_made_and_opened_in_a_bucket(
     said(capsys, 0, "dataset", source, tmp_path / "set", *words)
     said(capsys, 0, "dataset", "s3://lab/sets/a.mcap", "s3://lab/sets/set", *words)
     here = open_dataset(tmp_path / "set").split("train")
-    there = open_dataset(path_of("s3://lab/sets/set")).split("train")
+    there = open_dataset(to_path("s3://lab/sets/set")).split("train")
     assert there.table.equals(here.table)
     made = (tmp_path / "set" / "train").glob("*.arrow")
     name = next(made)
@@ -207,7 +207,7 @@ def test_a_dataset_in_a_bucket_grows_and_nothing_else_is_written(
             assert lab.cat_file(f"lab/grows/set/{name}") == path.read_bytes(), name
     again = said(capsys, 0, "dataset", second, "s3://lab/grows/set", "--add")
     assert "1 of 1 recordings are in" in again.err
-    assert len(open_dataset(path_of("s3://lab/grows/set")).split("train")) == 600
+    assert len(open_dataset(to_path("s3://lab/grows/set")).split("train")) == 600
 
 
 @pytest.mark.heavy
@@ -249,7 +249,7 @@ def test_label_reads_little_more_than_the_numbers(
     words = ("--duration-s", 12, "--seed", 1, "--camera")
     said(capsys, 0, "fly", "fly_in_view", source, *words)
     said(capsys, 0, "trim", source, "s3://lab/flight.mcap")  # an object that knows its hash
-    path = path_of("s3://lab/flight.mcap")
+    path = to_path("s3://lab/flight.mcap")
     numbers, pictures = _sizes(path)
     assert pictures > 3 * numbers
     fetched.clear()
@@ -257,13 +257,13 @@ def test_label_reads_little_more_than_the_numbers(
     said(capsys, 0, "label", path, made, "--no-copy")
     assert sum(fetched) <= 1.2 * numbers, (sum(fetched), numbers, pictures)
     said(capsys, 0, "label", path, tmp_path / "all.mcap")
-    topic = topics.labels("cf1")
+    topic = topics.LABELS("cf1")
     ours = [m.peers for m in _estimates(tmp_path / "all.mcap", topic)]
     assert ours == [m.peers for m in _estimates(made, topic)]
 
 
 def _estimates(path: Path, topic: str) -> Any:
-    for stamped in Contents(path, topics.LABELS).messages(topic):
+    for stamped in LoadedRecording(path, topics.LABELS).iter_messages(topic):
         others = [k for k, p in enumerate(stamped.message.peers) if p.source != "estimate"]
         for k in reversed(others):
             del stamped.message.peers[k]
@@ -273,12 +273,12 @@ def _estimates(path: Path, topic: str) -> Any:
 def _sizes(path: Path) -> tuple[int, int]:
     """Bytes of the chunks of numbers and of those of pictures, as they lie in the file."""
     sizes = [0, 0]
-    with opened(path) as stream:
-        found = section(path, stream)
+    with open_mcap(path) as stream:
+        found = read_verified_section(path, stream)
         assert found is not None
         pictured = {n for n, c in found.channels.items() if "camera/image" in c.topic}
         for chunk in found.chunk_indexes:
-            sizes[bool(pictured & chunk.message_index_offsets.keys())] += place_of(chunk)[1]
+            sizes[bool(pictured & chunk.message_index_offsets.keys())] += locate_chunk(chunk)[1]
     return sizes[0], sizes[1]
 
 
@@ -286,9 +286,9 @@ def test_a_name_in_a_bucket_leads_nowhere_else_on_this_machine(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Keys may be any text; a copy of a folder must stay in its own."""
-    folder, hostile = Remote("s3://lab/set"), Remote("s3://lab/set/../../../victim")
-    monkeypatch.setattr(Remote, "_info", lambda self: {"type": "directory"})
-    monkeypatch.setattr(Remote, "below", lambda self: [hostile])
+    folder, hostile = RemotePath("s3://lab/set"), RemotePath("s3://lab/set/../../../victim")
+    monkeypatch.setattr(RemotePath, "_info", lambda self: {"type": "directory"})
+    monkeypatch.setattr(RemotePath, "list_files", lambda self: [hostile])
     with pytest.raises(UnsafeName, match="s3://lab/set: a file"):
         os.fspath(folder)
 
@@ -298,11 +298,15 @@ def test_a_key_that_no_path_stands_for_is_not_taken_for_another(key: str, lab: A
     folder = f"lab/odd-{len(key)}-{key[0] == '/'}"
     for name in (f"{folder}/b", f"{folder}/b.mcap", f"{folder}/x/b.mcap", f"{folder}/sub/"):
         lab.pipe_file(name, b"another")
-    assert [path.name for path in Remote(f"s3://{folder}").below()] == ["b", "b.mcap", "b.mcap"]
+    assert [path.name for path in RemotePath(f"s3://{folder}").list_files()] == [
+        "b",
+        "b.mcap",
+        "b.mcap",
+    ]
     lab.call_s3("put_object", Bucket="lab", Key=f"{folder.removeprefix('lab/')}/{key}", Body=b"odd")
-    for look in (Remote.below, lambda path: list(path.rglob("*.mcap")), os.fspath):
+    for look in (RemotePath.list_files, lambda path: list(path.rglob("*.mcap")), os.fspath):
         with pytest.raises(StorageError, match="cannot be a path"):
-            look(Remote(f"s3://{folder}"))
+            look(RemotePath(f"s3://{folder}"))
 
 
 def test_outputs_for_keys_with_signs_of_a_shell_or_a_terminal_stay_in_their_folder(
@@ -312,7 +316,7 @@ def test_outputs_for_keys_with_signs_of_a_shell_or_a_terminal_stay_in_their_fold
     hidden = ("../../up.mcap", "dir/../../../up.mcap", ".hidden.mcap")
     for name in (*names, *hidden):
         lab.call_s3("put_object", Bucket="lab", Key=f"signs/{name}", Body=b"")
-    found = find_recordings(path_of("s3://lab/signs"))
+    found = find_recordings(to_path("s3://lab/signs"))
     assert {str(name) for name in found} == set(names)
     tasks = build_tasks("trim", "recording", found, tmp_path / "out")
     assert {task.out for task in tasks} == {tmp_path / "out" / name for name in names}

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import StorageError
-from dmrl.recording import summary
-from dmrl.storage import path_of, web
-from dmrl.storage.system import system
+from dmrl.recording import read_summary
+from dmrl.storage import to_path, web
+from dmrl.storage.system import get_filesystem
 
 from ..faults.ending import ended
 from ..faults.inputs import Inputs, cli
@@ -157,7 +157,7 @@ def site(inputs: Inputs) -> Iterator[Site]:
         site.address = f"http://127.0.0.1:{server.server_port}"
         yield site
         server.shutdown()
-    system.cache_clear()
+    get_filesystem.cache_clear()
 
 
 def test_a_recording_on_a_web_server_is_that_of_here(
@@ -166,7 +166,7 @@ def test_a_recording_on_a_web_server_is_that_of_here(
     for name, source in (("here", inputs.dots), ("there", site.url)):
         out = tmp_path / f"{name}.mcap"
         cli("trim", source, out, "--to-s", 0.9)
-    here, there = (summary(tmp_path / f"{name}.mcap") for name in ("here", "there"))
+    here, there = (read_summary(tmp_path / f"{name}.mcap") for name in ("here", "there"))
     assert here.count == there.count > 10 and here.topics == there.topics
     assert here.provenance and there.provenance
     assert here.provenance.inputs[0].sha256 == there.provenance.inputs[0].sha256
@@ -205,14 +205,14 @@ def test_a_server_that_sends_what_was_not_asked_is_one_line(
 
 def test_a_server_that_drips_is_not_waited_for(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web, "PATIENCE_S", 0.3)
-    system.cache_clear()
-    web.Web.clear_instance_cache()
+    get_filesystem.cache_clear()
+    web.WebFileSystem.clear_instance_cache()
     site.wrong = "drips"
     status, said = ended(lambda: cli("info", site.url))
     assert status == 1 and "the server is too slow" in said, said
     monkeypatch.undo()
-    system.cache_clear()
-    web.Web.clear_instance_cache()  # its session has that patience
+    get_filesystem.cache_clear()
+    web.WebFileSystem.clear_instance_cache()  # its session has that patience
 
 
 @pytest.mark.parametrize("address", ["file:///etc/passwd", "s3://a/b", "http://127.0.0.1:1/a"])
@@ -222,7 +222,7 @@ def test_a_server_leads_to_no_file_of_this_machine(address: str, site: Site) -> 
         status, said = ended(lambda c=command: cli(c, site.url))
         assert status == 1 and site.url in said, said
     with pytest.raises((StorageError, FileNotFoundError)):
-        os.fspath(path_of(site.url))
+        os.fspath(to_path(site.url))
 
 
 @pytest.mark.parametrize(
@@ -241,18 +241,18 @@ def test_a_copy_is_what_the_server_said_and_no_more(
     """As of a model, which a library opens by its name."""
     site.wrong = wrong
     if said is None:
-        assert Path(os.fspath(path_of(site.url))).read_bytes() == site.data
+        assert Path(os.fspath(to_path(site.url))).read_bytes() == site.data
         assert site.most_sent < MOST_SENT
         return
     site.asked = 1
     with pytest.raises(StorageError, match=said):
-        os.fspath(path_of(site.url))
+        os.fspath(to_path(site.url))
 
 
 def test_a_folder_on_a_web_server_is_not_walked(site: Site, tmp_path: Path) -> None:
     site.wrong, out = "lists", tmp_path / "out"
     url = f"{site.address}/set"
-    assert list(path_of(url).glob("*.mcap")) == list(path_of(url).iterdir()) == []
+    assert list(to_path(url).glob("*.mcap")) == list(to_path(url).iterdir()) == []
     for words in (("convert", url, out), ("check", url)):
         status, _ = ended(lambda w=words: cli(*w))
         assert status == 1 and not out.exists()

@@ -10,7 +10,7 @@ import pytest
 
 from dmrl import topics
 from dmrl.images.codec import encode_jpeg, encode_png
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 
 Make = Callable[..., Path]
@@ -30,7 +30,7 @@ def make(tmp_path: Path) -> Make:
         without: tuple[str, ...] = (),
     ) -> Path:
         with RecordingWriter(tmp_path / name, Provenance("test")) as sink:
-            sink.write(start_ns, topics.attitude("cf1"), message("Attitude")())
+            sink.write(start_ns, topics.ATTITUDE("cf1"), message_class("Attitude")())
             for k in range(10):
                 for robot in robots:
                     for topic, sample in _messages(robot, k).items():
@@ -55,11 +55,13 @@ def _messages(robot: str, k: int) -> dict[str, Any]:
         {"u_px": 50, "v_px": 40, "depth_m": 2.0, "confidence": 0.1},
     ]
     return {
-        topics.camera_image(robot): message("CompressedImage")(data=picture[0], format=picture[1]),
+        topics.CAMERA_IMAGE(robot): message_class("CompressedImage")(
+            data=picture[0], format=picture[1]
+        ),
         # Nobody is labelled in the last image.
-        topics.labels(robot): message("PeerLabels")(peers=peers if k < 9 else []),
-        topics.detections(robot): message("Detections")(detections=found, threshold=0.5),
-        topics.grid(robot): message("GridMap")(
+        topics.LABELS(robot): message_class("PeerLabels")(peers=peers if k < 9 else []),
+        topics.DETECTIONS(robot): message_class("Detections")(detections=found, threshold=0.5),
+        topics.GRID(robot): message_class("GridMap")(
             rows=ROWS,
             cols=COLS,
             channels=["confidence", "depth_m"],
@@ -84,7 +86,7 @@ def fly(tmp_path: Path) -> Make:
         with RecordingWriter(tmp_path / name, Provenance("test")) as sink:
             for k in range(20):
                 for topic, sample in _flown(k, 0.05 * k * moving).items():
-                    late = moving and topic in (topics.TRANSFORMS, topics.truth("cf1", "cf2"))
+                    late = moving and topic in (topics.TRANSFORMS, topics.TRUTH("cf1", "cf2"))
                     if not any(word in topic for word in without):
                         sink.write(k * STEP_NS + late * STEP_NS // 3, topic, sample)
         return tmp_path / name
@@ -97,7 +99,7 @@ def _flown(k: int, way_m: float) -> dict[str, Any]:
     truth = {"x": 1.0 + way_m, "covariance": exact, "frame_id": "cf1/horizontal"}
     followed = {"id": 3, "peer": "cf2", "x": 1.0, "vx_mps": 0.5, "covariance": known}
     messages = {
-        topics.TRANSFORMS: message("FrameTransforms")(
+        topics.TRANSFORMS: message_class("FrameTransforms")(
             transforms=[
                 _frame(
                     "world", "cf1/horizontal", (1.0 + way_m, 2.0, 0.5), (0, 0, 0.5**0.5, 0.5**0.5)
@@ -105,21 +107,23 @@ def _flown(k: int, way_m: float) -> dict[str, Any]:
                 _frame("world", "cf2/horizontal", (1.0, 3.0 + 0.01 * k, 0.5), (0, 0, 0, 1)),
             ]
         ),
-        topics.truth("cf1", "cf2"): message("PeerPosition")(**truth),
-        topics.position("cf1", "cf2"): message("PeerPosition")(
+        topics.TRUTH("cf1", "cf2"): message_class("PeerPosition")(**truth),
+        topics.POSITION("cf1", "cf2"): message_class("PeerPosition")(
             **{**truth, "x": 1.1 + way_m, "covariance": known, "status": 0 if k > 4 else 1}
         ),
-        topics.uwb_range("cf1", "cf2"): message("UwbRange")(range_m=1.05),
-        topics.uwb_range("cf2", "cf1"): message("UwbRange")(range_m=1.0),
-        topics.tracks("cf1"): message("Tracks")(tracks=[followed] if k < 15 else []),
-        topics.calibration("cf1"): message("CameraCalibration")(
+        topics.RANGE("cf1", "cf2"): message_class("UwbRange")(range_m=1.05),
+        topics.RANGE("cf2", "cf1"): message_class("UwbRange")(range_m=1.0),
+        topics.TRACKS("cf1"): message_class("Tracks")(tracks=[followed] if k < 15 else []),
+        topics.CALIBRATION("cf1"): message_class("CameraCalibration")(
             width=WIDTH_PX, height=HEIGHT_PX, K=[40, 0, 32, 0, 40, 24, 0, 0, 1]
         ),
         **_messages("cf1", k),
     }
     for robot in ("cf1", "cf2"):
-        messages[topics.height(robot)] = message("Height")(height_m=0.5)
-        messages[topics.attitude(robot)] = message("Attitude")(roll_rad=0.1, yaw_rad=3.1 + 0.01 * k)
+        messages[topics.HEIGHT(robot)] = message_class("Height")(height_m=0.5)
+        messages[topics.ATTITUDE(robot)] = message_class("Attitude")(
+            roll_rad=0.1, yaw_rad=3.1 + 0.01 * k
+        )
     return messages
 
 

@@ -10,9 +10,9 @@ from dmrl import card, topics
 from dmrl.datasets import open_dataset
 from dmrl.errors import DatasetError, RecordingError, SettingError
 from dmrl.images.codec import encode_png
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
-from dmrl.recording import provenance as made_by
+from dmrl.recording import build_provenance as made_by
 from dmrl.stages import dataset as dataset_stage
 from dmrl.viewer import Settings, save
 
@@ -31,11 +31,11 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(5):
             rgb = np.full((48, 64, 3), 40 * k, np.uint8)
-            image = message("CompressedImage")(data=encode_png(rgb), format="png")
+            image = message_class("CompressedImage")(data=encode_png(rgb), format="png")
             label = {"peer": "cf2", "u_px": 20, "v_px": 12, "depth_m": 1.0, "source": "truth"}
-            sink.write(k * STEP_NS, topics.camera_image("cf1"), image)
+            sink.write(k * STEP_NS, topics.CAMERA_IMAGE("cf1"), image)
             peers = [label] if k < 4 else []
-            sink.write(k * STEP_NS, topics.labels("cf1"), message("PeerLabels")(peers=peers))
+            sink.write(k * STEP_NS, topics.LABELS("cf1"), message_class("PeerLabels")(peers=peers))
     return path
 
 
@@ -57,16 +57,16 @@ def found(pictures: Path) -> Path:
         for k, off_px in enumerate((*OFF_PX, 0.0)):
             seen = {"u_px": 20 + off_px, "v_px": 12, "depth_m": 1.5, "confidence": 0.9}
             cells = np.full((2, 6, 8), 0.1 * k, "<f4")
-            grid = message("GridMap")(
+            grid = message_class("GridMap")(
                 rows=6,
                 cols=8,
                 channels=["confidence", "depth_m"],
                 data=cells.tobytes(),
                 stride_px=8,
             )
-            detections = message("Detections")(detections=[seen], threshold=0.5)
-            sink.write(k * STEP_NS, topics.detections("cf1"), detections)
-            sink.write(k * STEP_NS, topics.grid("cf1"), grid)
+            detections = message_class("Detections")(detections=[seen], threshold=0.5)
+            sink.write(k * STEP_NS, topics.DETECTIONS("cf1"), detections)
+            sink.write(k * STEP_NS, topics.GRID("cf1"), grid)
     return path
 
 

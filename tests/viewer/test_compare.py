@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.colours import RGB, SECOND_DETECTION
+from dmrl.colours import RGB, SECOND_DETECTION_RGB
 from dmrl.errors import RecordingError
 from dmrl.viewer import Settings, save
 
@@ -31,7 +31,7 @@ def test_two_models_stand_below_each_other_in_their_colours(make: Make, rrd: Pat
     }
     assert colours == {
         "old": int.from_bytes(bytes(RGB["detection"])),
-        "new": int.from_bytes(bytes(SECOND_DETECTION)),
+        "new": int.from_bytes(bytes(SECOND_DETECTION_RGB)),
     }
     assert logged(rrd)["/new/cf1/detections/grid/confidence", "DepthImage"] == 10
     legend = column(rrd, "/cf1/legend/sources", "LineStrips2D:labels")

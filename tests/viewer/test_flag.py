@@ -13,7 +13,7 @@ import pytest
 from dmrl.errors import SettingError
 from dmrl.stages import dataset
 from dmrl.stages.view import command
-from dmrl.viewer import Settings, flag
+from dmrl.viewer import Settings, write_flag_page
 
 from .conftest import Make
 
@@ -57,7 +57,7 @@ def test_every_row_has_a_box_that_names_it_and_nothing_is_fetched(
 def test_what_the_page_names_is_left_out_and_provenance_says_so(
     built: Path, make: Make, tmp_path: Path
 ) -> None:
-    flag([built], tmp_path / "flag.html", Settings())
+    write_flag_page([built], tmp_path / "flag.html", Settings())
     marked = _Boxes((tmp_path / "flag.html").read_text()).values[2:4]
     with (tmp_path / "flags.csv").open("w", newline="") as stream:
         csv.writer(stream).writerows([["source", "robot", "log_time"], *marked])
@@ -73,7 +73,7 @@ def test_what_the_page_names_is_left_out_and_provenance_says_so(
 def test_names_of_recordings_cannot_become_markup(make: Make, tmp_path: Path) -> None:
     odd = make("a<img src=x onerror=alert(1)>.mcap")
     dataset.run([odd], tmp_path / "set", dataset.Settings(split="none", labels="truth"))
-    flag([tmp_path / "set"], tmp_path / "flag.html", Settings())
+    write_flag_page([tmp_path / "set"], tmp_path / "flag.html", Settings())
     assert "img" not in _Boxes((tmp_path / "flag.html").read_text()).tags
 
 
@@ -107,7 +107,7 @@ def shown(page: Path) -> str:
 @pytest.mark.skipif(CHROMIUM is None, reason="no browser; apt-get install chromium")
 def test_a_browser_runs_the_page_and_saves_what_was_clicked(built: Path, tmp_path: Path) -> None:
     page = tmp_path / "flag.html"
-    flag([built], page, Settings())
+    write_flag_page([built], page, Settings())
     assert ">0</output>" in shown(page)  # its policy lets its own script run
     loose = re.sub(r"script-src '[^']*'", "script-src 'unsafe-inline'", page.read_text())
     page.write_text(loose.replace("</body>", CLICKS))

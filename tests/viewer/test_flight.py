@@ -10,10 +10,10 @@ import pytest
 
 from dmrl.colours import RGB, STATUS_RGB
 from dmrl.errors import SettingError
-from dmrl.recording import glance, reader
+from dmrl.recording import reader, sample_topics
 from dmrl.recording.mcap import chunk_builder, chunk_reader
 from dmrl.viewer import Settings, save, scene
-from dmrl.viewer.session import prepare
+from dmrl.viewer.session import prepare_show
 
 from .rrd import column, columns, logged, panels
 
@@ -220,16 +220,16 @@ def test_images_come_first_and_wait_for_no_more_of_the_flight(
     fly: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(chunk_builder, "CHUNK_BYTES", 1)
-    monkeypatch.setattr(reader, "STRETCH_BYTES", 1)
-    monkeypatch.setattr(sys.modules[glance.__module__], "CHUNKS", 2)
+    monkeypatch.setattr(reader, "BATCH_BYTES", 1)
+    monkeypatch.setattr(sys.modules[sample_topics.__module__], "CHUNKS_PER_CHANNEL_MAX", 2)
     opened: list[int] = []
-    unpacked = chunk_reader.unpacked
+    unpacked = chunk_reader.decompress
     monkeypatch.setattr(
         chunk_reader,
-        "unpacked",
+        "decompress",
         lambda path, chunk, at: opened.append(at) or unpacked(path, chunk, at),
     )
-    show = prepare([fly()], Settings())
+    show = prepare_show([fly()], Settings())
     paths, before = [], None
     for times, entity in show.logged():
         if times is not None:
@@ -255,7 +255,7 @@ def test_trails_errors_and_ranges_do_not_depend_on_where_a_stretch_of_the_file_e
 
     whole = saved("whole")
     monkeypatch.setattr(chunk_builder, "CHUNK_BYTES", 1)
-    monkeypatch.setattr(reader, "STRETCH_BYTES", 1)
+    monkeypatch.setattr(reader, "BATCH_BYTES", 1)
     monkeypatch.setattr(scene, "ROWS_AT_ONCE", 1)
     pieces = saved("pieces")
     assert len(whole[f"{TRUTH}/trail", "LineStrips3D:strips"]) == 20

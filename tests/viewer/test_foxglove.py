@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from dmrl import topics
-from dmrl.colours import OWN, PEER, RGB
-from dmrl.messages import descriptor
+from dmrl.colours import OWN_RGB, PEER_RGB, RGB
+from dmrl.messages import find_descriptor
 
 LAYOUT: dict[str, Any] = json.loads(
     files("dmrl.viewer").joinpath("foxglove.json").read_text(encoding="utf-8")
@@ -36,9 +36,9 @@ def test_every_panel_stands_in_the_layout_once() -> None:
 @pytest.mark.parametrize("line", [line for _, line in LINES], ids=lambda line: line["value"])
 def test_every_line_is_a_field_of_a_message(line: dict[str, Any]) -> None:
     topic, _, path = line["value"].partition(".")
-    row = topics.row_of(topic)
+    row = topics.find_topic(topic)
     assert row is not None
-    kind: Any = descriptor(row.message)
+    kind: Any = find_descriptor(row.message)
     for part in re.sub(r"\[[^]]*\]|\{[^}]*\}", "", path).split("."):
         assert part in kind.fields_by_name
         kind = kind.fields_by_name[part].message_type
@@ -48,7 +48,7 @@ def test_images_and_frusta_are_topics_that_foxglove_draws() -> None:
     cameras = [panel["imageMode"] for name, panel in PANELS.items() if name.startswith("Image!")]
     named = [topic for mode in cameras for topic in mode.values()]
     named += PANELS["3D!space"]["topics"]
-    rows = [topics.row_of(topic) for topic in named]
+    rows = [topics.find_topic(topic) for topic in named]
     assert {row.message for row in rows if row is not None} == {
         "foxglove.CompressedImage",
         "foxglove.CameraCalibration",
@@ -57,7 +57,7 @@ def test_images_and_frusta_are_topics_that_foxglove_draws() -> None:
 
 
 def test_colours_mean_what_they_mean_elsewhere() -> None:
-    known = {f"#{bytes(colour).hex()}" for colour in (*RGB.values(), OWN, PEER)}
+    known = {f"#{bytes(colour).hex()}" for colour in (*RGB.values(), OWN_RGB, PEER_RGB)}
     assert {line["color"] for _, line in LINES if "color" in line} <= known
 
 

@@ -10,11 +10,11 @@ from rerun.chunk import RrdReader
 
 from dmrl.colours import RGB
 from dmrl.errors import OutputError, RecordingError, SettingError, SourceError
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter, read_table
 from dmrl.stages import view
 from dmrl.viewer import Settings, save
-from dmrl.viewer.session import prepare, write
+from dmrl.viewer.session import prepare_show, write_rrd
 
 from .rrd import column, logged, panels, queries
 
@@ -173,7 +173,9 @@ def test_a_robot_may_have_any_name(make: Make, rrd: Path) -> None:
 
 def test_an_unknown_source_of_labels_is_shown_too(tmp_path: Path, make: Make, rrd: Path) -> None:
     with RecordingWriter(tmp_path / "odd.mcap", Provenance("test")) as sink:
-        peers = message("PeerLabels")(peers=[{"peer": "cf9", "depth_m": 1, "source": "guess"}])
+        peers = message_class("PeerLabels")(
+            peers=[{"peer": "cf9", "depth_m": 1, "source": "guess"}]
+        )
         sink.write(0, "/cf1/labels", peers)
     pictures = make(without=("labels", "detections"))
     save([pictures, tmp_path / "odd.mcap"], rrd, Settings())
@@ -218,10 +220,10 @@ def test_an_output_is_never_overwritten(make: Make, rrd: Path) -> None:
 @pytest.mark.heavy
 def test_a_full_disk_ends_it_with_the_reason_and_never_hangs(make: Make) -> None:
     """rerun itself would say no reason, and now and then wait for ever."""
-    show = prepare([make()], Settings())
+    show = prepare_show([make()], Settings())
     for _ in range(20):
         with pytest.raises(OSError, match="/dev/full") as e:
-            write(show, Path("/dev/full"))
+            write_rrd(show, Path("/dev/full"))
         assert e.value.errno == errno.ENOSPC
 
 
@@ -235,7 +237,7 @@ def test_a_recording_that_is_cut_short_leaves_no_file(make: Make, rrd: Path) -> 
 
 def test_an_image_that_is_none_is_named(tmp_path: Path, rrd: Path) -> None:
     with RecordingWriter(tmp_path / "bad.mcap", Provenance("test")) as sink:
-        sink.write(0, IMAGES, message("CompressedImage")(data=b"no picture", format="png"))
+        sink.write(0, IMAGES, message_class("CompressedImage")(data=b"no picture", format="png"))
     with pytest.raises(SourceError, match="the first image of /cf1/camera/image"):
         save([tmp_path / "bad.mcap"], rrd, Settings())
 

@@ -92,14 +92,14 @@ class Bag:
         """All of the flight, robot by robot."""
         late_ns = round(self.late_s * 1e9)
         for robot, log in self.flight.robots.items():
-            true_s = self.flight.clocks[robot].true_time(log.time_s)
+            true_s = self.flight.clocks[robot].to_true_time(log.time_s)
             for k, odometry in self.odometry(robot, log):
                 arrived = self.ns(true_s[k]) + late_ns
                 yield f"/{robot}/odom", "nav_msgs/msg/Odometry", arrived, odometry
             yield from self.captured(robot)
         ranged = self.store.types["sensor_msgs/msg/Range"]
         for (robot, peer), measured in self.flight.ranges.items():
-            true_s = self.flight.clocks[robot].true_time(measured.time_s)
+            true_s = self.flight.clocks[robot].to_true_time(measured.time_s)
             for here_s, true, value in zip(measured.time_s, true_s, measured.range_m, strict=True):
                 head = self.header(here_s, f"{robot}_uwb", robot)
                 message = ranged(head, 0, 0.0, 0.1, 50.0, float(value))

@@ -41,10 +41,10 @@ def flight_logs(folder: Path) -> Made:
 
 def somebodys_csv(folder: Path) -> Made:
     """Fifty rows that have the columns of NanoBench."""
-    from dmrl.formats.files.column_map import read_map  # noqa: PLC0415
-    from dmrl.formats.files.mapped_csv import NANOBENCH  # noqa: PLC0415
+    from dmrl.formats.files.column_map import read_column_map  # noqa: PLC0415
+    from dmrl.formats.files.mapped_csv import NANOBENCH_TABLE  # noqa: PLC0415
 
-    names = sorted(read_map(NANOBENCH).names - {"t", "qw"})
+    names = sorted(read_column_map(NANOBENCH_TABLE).names - {"t", "qw"})
     rows = [f"{1772662978 + 0.01 * k:.9f},1," + ",".join(["0.01"] * len(names)) for k in range(50)]
     path = folder / "B7_oval.csv"
     path.write_text("\n".join([",".join(["t", "qw", *names]), *rows]) + "\n")

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import DmrlError
-from dmrl.formats.registry import format_of
-from dmrl.guards.safe_names import LINE_MAX
+from dmrl.formats.registry import find_format
+from dmrl.guards.safe_names import ERROR_CHARACTERS_MAX
 from dmrl.stages import convert
 
 from . import sources
@@ -35,7 +35,7 @@ def test_damage_is_refused_or_said(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     source, path = sources.KINDS[kind](tmp_path)
-    name = format_of(source).name if said_kind else None
+    name = find_format(source).name if said_kind else None
     whole = converted(source, tmp_path / "whole.mcap")
     capsys.readouterr()
     before = path.read_bytes()
@@ -45,7 +45,7 @@ def test_damage_is_refused_or_said(
         counts = converted(source, out, name)
     except DmrlError as e:
         assert not out.exists() and not [*tmp_path.glob("*.partial")]
-        assert "\n" not in str(e) and len(str(e)) <= LINE_MAX
+        assert "\n" not in str(e) and len(str(e)) <= ERROR_CHARACTERS_MAX
         assert path.name in str(e) or source.name in str(e)
         return
     said = capsys.readouterr().err

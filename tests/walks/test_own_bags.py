@@ -14,7 +14,7 @@ from dmrl.errors import SourceError
 from dmrl.flight.flight_arrays import Flight
 from dmrl.flight.noise import NOISE
 from dmrl.flight.simulate import Scenario, simulate
-from dmrl.recording import Contents, check, read_table, summary
+from dmrl.recording import LoadedRecording, check, read_summary, read_table
 from dmrl.stages import align, convert, evaluate, label
 
 from .own_bags import Bag
@@ -50,7 +50,7 @@ def test_monday_every_kind_of_bag_says_the_same(flight: Flight, tmp_path: Path, 
         for field in ("roll_rad", "pitch_rad", "yaw_rate_radps"):
             np.testing.assert_allclose(attitude[field], getattr(log, field)[every], atol=1e-5)
     # Two robots, two directions each, and none of a robot called "uwb".
-    links = [topic for topic in summary(out).topics if "/range/" in topic]
+    links = [topic for topic in read_summary(out).topics if "/range/" in topic]
     assert links == sorted(f"/{a}/range/{b}" for a in ROBOTS for b in ROBOTS if a != b)
 
 
@@ -76,12 +76,12 @@ def test_wednesday_robots_count_from_their_own_boot(
     assert [f for f in check(tmp_path / "flight.mcap") if "shares no time" in f.text]
     settings = align.Settings(reference=reference, mocap=reference == "mocap")
     clocks = align.run(tmp_path / "flight.mcap", tmp_path / "aligned.mcap", settings)
-    held = Contents(tmp_path / "aligned.mcap")
+    held = LoadedRecording(tmp_path / "aligned.mcap")
     born = {**born_s, "mocap": 1_772_000_000.0}
     for robot in set(clocks) & set(ROBOTS):
         error_s = clocks[robot].offset_s - (born[reference] - born_s[robot])
         assert abs(error_s) <= min(4 * clocks[robot].sigma_s, 0.05), robot
-    starts = {r: held.times(f"/{r}/attitude")[0] for r in ROBOTS}
+    starts = {r: held.get_times(f"/{r}/attitude")[0] for r in ROBOTS}
     assert max(starts.values()) - min(starts.values()) < 50_000_000
     if reference == "mocap":
         label.run(tmp_path / "aligned.mcap", tmp_path / "labelled.mcap", label.Settings())

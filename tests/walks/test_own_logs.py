@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.recording import check, read_table, summary
+from dmrl.recording import check, read_summary, read_table
 from dmrl.stages import align, convert, merge
 
 from ..formats import plain_usd
@@ -28,7 +28,7 @@ def test_monday_every_card_gives_motion_or_a_reason(
             assert (f"/cf7/{topic}" in counts) != (reason in said), (card.name, topic)
         # Whatever was logged is there, and the licence that lay beside it.
         assert counts["/cf7/log/fixedFrequency"] > 2500
-        assert summary(out).metadata["dmrl.licences"] == [{card.name: "MIT License"}]
+        assert read_summary(out).metadata["dmrl.licences"] == [{card.name: "MIT License"}]
         assert not [finding for finding in check(out) if finding.level == "error"]
 
 

@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import RecordingError
-from dmrl.geometry.frames import Array, inside
-from dmrl.learn.inference.matching import Points, errors
-from dmrl.recording import Provenance, stretches, summary
+from dmrl.geometry.frames import Array, is_inside
+from dmrl.learn.inference.matching import Points, compute_errors
+from dmrl.recording import Provenance, iter_topic_batches, read_summary
 
-Key = tuple[str, str, int]
+RowKey = tuple[str, str, int]
 """Source recording of a row, robot, log time in nanoseconds."""
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class MatchedDetections:
     """Detections of a model for the rows of a dataset.
 
     Parameters
@@ -36,11 +36,13 @@ class Found:
     place: NDArray[np.int64]
     where: tuple[tuple[Path, str, int] | None, ...]
 
-    def of(self, rows: NDArray[np.int64]) -> "Found":
+    def select_rows(self, rows: NDArray[np.int64]) -> "MatchedDetections":
         """Select some of the rows."""
-        return Found(self.messages, self.place[rows], tuple(self.where[k] for k in rows))
+        return MatchedDetections(
+            self.messages, self.place[rows], tuple(self.where[k] for k in rows)
+        )
 
-    def detections(self) -> pa.RecordBatch:
+    def to_detections(self) -> pa.RecordBatch:
         """Return the columns of Detections, with an empty list for rows without a message."""
         empty = self.messages.slice(0, 1).to_pylist()[0] | {"detections": []}
         blank = pa.Table.from_pylist([empty], self.messages.schema)
@@ -48,7 +50,7 @@ class Found:
         (batch,) = every.take(self.place % len(every)).combine_chunks().to_batches()
         return batch
 
-    def maps(self) -> pa.RecordBatch | None:
+    def read_maps(self) -> pa.RecordBatch | None:
         """Read the columns of GridMap; None unless every row has one."""
         if any(where is None for where in self.where):
             return None
@@ -57,7 +59,7 @@ class Found:
             times.setdefault((path, robot), []).append(time_ns)
         held = {}
         for (path, robot), wanted_ns in times.items():
-            for time_ns, row in _maps_at(path, robot, wanted_ns):
+            for time_ns, row in _iter_maps(path, robot, wanted_ns):
                 held[path, robot, time_ns] = row
         if not all(where in held for where in self.where):
             return None
@@ -66,19 +68,21 @@ class Found:
         return batch
 
 
-def _maps_at(
+def _iter_maps(
     path: Path, robot: str, wanted_ns: Sequence[int]
 ) -> Iterator[tuple[int, pa.RecordBatch]]:
     """Yield the log time and the row of a robot's GridMaps at some log times."""
-    topic = topics.grid(robot)
+    topic = topics.GRID(robot)
     span = {"start_ns": min(wanted_ns), "end_ns": max(wanted_ns) + 1}
-    for stretch in stretches(path, {topic: None}, **span):
+    for stretch in iter_topic_batches(path, {topic: None}, **span):
         times_ns = stretch[topic]["log_time"].to_numpy()
         for row in np.flatnonzero(np.isin(times_ns, wanted_ns)).tolist():
             yield int(times_ns[row]), stretch[topic].slice(row, 1)
 
 
-def find(recordings: Sequence[Path], folder: Path, wanted: Sequence[Key]) -> Found:
+def find_detections(
+    recordings: Sequence[Path], folder: Path, wanted: Sequence[RowKey]
+) -> MatchedDetections:
     """Find the detections of the images of a dataset.
 
     Parameters
@@ -98,10 +102,10 @@ def find(recordings: Sequence[Path], folder: Path, wanted: Sequence[Key]) -> Fou
     sources = {source for source, _, _ in wanted}
     parts: list[pa.RecordBatch] = []
     where: list[tuple[Path, str, int]] = []  # one for each row of the parts
-    at: dict[Key, int] = {}
+    at: dict[RowKey, int] = {}
     for path in recordings:
-        names, robots = _related(path, folder, sources)
-        for robot, batch in _detected(path, robots):
+        names, robots = _match_sources(path, folder, sources)
+        for robot, batch in _iter_detections(path, robots):
             for time_ns in batch["log_time"].to_pylist():
                 # The source of a row is this recording, or one that it was made from.
                 at |= {(name, robot, time_ns): len(where) for name in names}
@@ -111,24 +115,24 @@ def find(recordings: Sequence[Path], folder: Path, wanted: Sequence[Key]) -> Fou
     if not (place >= 0).any():
         raise RecordingError(f"no image of {folder} is in {recordings[0]}. Predict on its images")
     found = tuple(where[k] if k >= 0 else None for k in place.tolist())
-    return Found(pa.Table.from_batches(parts), place, found)
+    return MatchedDetections(pa.Table.from_batches(parts), place, found)
 
 
-def _detected(path: Path, robots: Sequence[str]) -> Iterator[tuple[str, pa.RecordBatch]]:
+def _iter_detections(path: Path, robots: Sequence[str]) -> Iterator[tuple[str, pa.RecordBatch]]:
     """Yield the robot and the columns of its detections, batch by batch."""
-    own = {topics.detections(robot): robot for robot in robots}
-    for stretch in stretches(path, dict.fromkeys(own)):
+    own = {topics.DETECTIONS(robot): robot for robot in robots}
+    for stretch in iter_topic_batches(path, dict.fromkeys(own)):
         for topic, batch in stretch.items():
             yield own[topic], batch
 
 
-def _related(path: Path, folder: Path, sources: set[str]) -> tuple[set[str], list[str]]:
+def _match_sources(path: Path, folder: Path, sources: set[str]) -> tuple[set[str], list[str]]:
     """Return the dataset's sources among a recording and its inputs, and robots with detections."""
-    kept = summary(path)
-    robots = topics.robots(list(kept.topics), topics.DETECTIONS)
+    kept = read_summary(path)
+    robots = topics.list_robots(list(kept.topics), topics.DETECTIONS)
     if not robots:
         raise RecordingError(f"{path} has no detections. Try: dmrl predict MODEL {path} OUT.mcap")
-    names = {path.name, *_ancestors(kept.provenance)} & sources
+    names = {path.name, *_collect_ancestors(kept.provenance)} & sources
     if not names:
         raise RecordingError(
             f"{folder} was not made from {path} or its inputs. "
@@ -137,40 +141,42 @@ def _related(path: Path, folder: Path, sources: set[str]) -> tuple[set[str], lis
     return names, robots
 
 
-def _ancestors(made: Provenance | None) -> set[str]:
+def _collect_ancestors(made: Provenance | None) -> set[str]:
     """Return the names of all files that a recording was made from."""
     if made is None:
         return set()
     return {i.name for i in made.inputs} | {
-        n for i in made.inputs for n in _ancestors(i.provenance)
+        n for i in made.inputs for n in _collect_ancestors(i.provenance)
     }
 
 
-def errors_of_rows(rows: pa.Table, found: Found, size_px: tuple[int, int]) -> tuple[Array, Array]:
+def compute_row_errors(
+    rows: pa.Table, found: MatchedDetections, size_px: tuple[int, int]
+) -> tuple[Array, Array]:
     """Compute the errors of each row's worst label, pixels and metres of depth; NaN if unknown."""
     peers = rows["peers"].combine_chunks()
-    labels = _points(peers, np.arange(len(peers)))
+    labels = _build_points(peers, np.arange(len(peers)))
     uv = np.stack([labels.u_px, labels.v_px], axis=1)
-    labels = labels.select(inside(uv, *size_px) & (labels.depth_m > 0))
+    labels = labels.select(is_inside(uv, *size_px) & (labels.depth_m > 0))
     messages = found.messages["detections"].combine_chunks()
     (known,) = np.nonzero(found.place >= 0)
-    detections = _points(messages.take(pa.array(found.place[known])), known)
+    detections = _build_points(messages.take(pa.array(found.place[known])), known)
     judged = np.isin(labels.image, known)
-    off = errors(labels.select(judged), detections)
+    off = compute_errors(labels.select(judged), detections)
     image = labels.image[judged]
     return (
-        _worst(len(peers), image, off.norm_px),
-        _worst(len(peers), image, abs(off.depth_m)),
+        _largest_per_image(len(peers), image, off.norm_px),
+        _largest_per_image(len(peers), image, abs(off.depth_m)),
     )
 
 
-def _worst(count: int, image: NDArray[np.int64], values: Array) -> Array:
+def _largest_per_image(count: int, image: NDArray[np.int64], values: Array) -> Array:
     out = np.full(count, -1.0)
     np.maximum.at(out, image, np.nan_to_num(values, nan=np.inf))
     return np.where(out < 0, np.nan, out)
 
 
-def _points(column: pa.ListArray, numbers: NDArray[np.int64]) -> Points:
+def _build_points(column: pa.ListArray, numbers: NDArray[np.int64]) -> Points:
     """Build points from the entries of a list column; ``numbers`` are the indices of its rows."""
     flat = column.flatten()
     image = np.repeat(numbers, column.value_lengths().to_numpy())

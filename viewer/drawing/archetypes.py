@@ -17,7 +17,7 @@ from dmrl.colours import RGB
 from dmrl.viewer.drawing.entity import (
     DETECTION_TEXT_WIDTH,
     FAINT_POINT_UI,
-    INVISIBLE,
+    INVISIBLE_RADIUS,
     LINE_UI,
     POINT_UI,
     TEXT_HEIGHT,
@@ -31,15 +31,15 @@ STRIDE_PX = 8
 
 MEDIA_TYPES = {"jpg": "image/jpeg"}
 CELL_COLOUR = (255, 255, 255)
-HALF_HEIGHT_M, FOCAL, NEAR_M = 0.03, 0.57, 0.1
+HALF_HEIGHT_M, FOCAL_WIDTHS, NEAR_M = 0.03, 0.57, 0.1
 """Offset of a text below a detection: half the height of a small drone, metres; focal length in
 image widths; smallest depth that is used, metres."""
-BELIEVED = 0.05
+MIN_DEPTH_CONFIDENCE = 0.05
 """Confidence below which a cell's depth is drawn dark, since it belongs to no robot."""
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class ColourScale:
     """Colours of a channel of the grid, the first at 0.
 
     Parameters
@@ -60,11 +60,11 @@ class Scale:
     unit: str
 
 
-def scales(depth_max_m: float) -> dict[str, Scale]:
+def build_scales(depth_max_m: float) -> dict[str, ColourScale]:
     """Return the colours of the channels that are shown, by name of the channel."""
     return {
-        "confidence": Scale("confidence", "inferno", 1.0, ""),
-        "depth_m": Scale("depth, m", "turbo", depth_max_m, " m"),
+        "confidence": ColourScale("confidence", "inferno", 1.0, ""),
+        "depth_m": ColourScale("depth, m", "turbo", depth_max_m, " m"),
     }
 
 
@@ -73,7 +73,7 @@ def channel_path(topic: str, channel: str) -> str:
     return f"{topic}/{channel}"
 
 
-def images(path: str, frame: str, batch: pa.RecordBatch) -> Iterator[Entity]:
+def draw_images(path: str, frame: str, batch: pa.RecordBatch) -> Iterator[Entity]:
     """Draw compressed images without decoding them."""
     formats = batch["format"].to_pylist()
     columns = rr.EncodedImage.columns(
@@ -83,7 +83,7 @@ def images(path: str, frame: str, batch: pa.RecordBatch) -> Iterator[Entity]:
     yield Entity(path, columns, frame=frame)
 
 
-def detections(
+def draw_detections(
     path: str,
     frame: str,
     batch: pa.RecordBatch,
@@ -98,18 +98,18 @@ def detections(
     column = batch["detections"]
     found = column.flatten()
     confidence, depth_m = (found.field(key).to_numpy() for key in ("confidence", "depth_m"))
-    row_of, uv_px = rows_of(column), points_px(found)
+    row_of, uv_px = row_indices(column), points_px(found)
     believed = confidence >= batch["threshold"].to_numpy()[row_of]
-    half_px = HALF_HEIGHT_M * FOCAL * width_px / np.fmax(depth_m, NEAR_M)
+    half_px = HALF_HEIGHT_M * FOCAL_WIDTHS * width_px / np.fmax(depth_m, NEAR_M)
     texts_px = uv_px + np.column_stack([np.zeros(len(uv_px)), half_px])
     (surest,) = np.nonzero(believed)
     surest = surest[np.lexsort([-confidence[surest], row_of[surest]])]
     told = np.zeros(len(uv_px), bool)
-    told[surest[_uncovered(texts_px[surest] / width_px, row_of[surest])]] = True
+    told[surest[_select_uncovered(texts_px[surest] / width_px, row_of[surest])]] = True
     texts = [f"conf {confidence[k]:.2f}, {depth_m[k]:.2f} m" for k in np.flatnonzero(told)]
     for where, kept, at_px, radius, words in (
         (path, believed, uv_px, POINT_UI, None),
-        (texts_path(path), told, texts_px, INVISIBLE, texts),
+        (texts_path(path), told, texts_px, INVISIBLE_RADIUS, texts),
         (weak_path(path), ~believed, uv_px, FAINT_POINT_UI, None),
     ):
         points = rr.Points2D.columns(positions=at_px[kept], labels=words)
@@ -127,7 +127,7 @@ def weak_path(path: str) -> str:
     return f"{path}/weak"
 
 
-def _uncovered(places: NDArray[np.float64], row_of: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _select_uncovered(places: NDArray[np.float64], row_of: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Select the texts that overlap none of those before them in their image, (N,).
 
     Parameters
@@ -150,11 +150,11 @@ def _detection_style(colour: Colour, radius: float) -> rr.Points2D:
     return rr.Points2D.from_fields(colors=[colour], radii=[radius], draw_order=40.0)
 
 
-def grids(
+def draw_grids(
     path: str,
     frame: str,
     batch: pa.RecordBatch,
-    scales: Mapping[str, Scale],
+    scales: Mapping[str, ColourScale],
     *,
     smooth: bool = False,
 ) -> Iterator[Entity]:
@@ -185,14 +185,14 @@ def grids(
     data = batch["data"].to_pylist()
 
     def buffers_of(channel: str) -> list[bytes]:
-        return [_share(one, names.index(channel), len(names)) for one in data]
+        return [_slice_channel(one, names.index(channel), len(names)) for one in data]
 
     for channel in filter(scales.__contains__, names):
         buffers = buffers_of(channel)
         if channel == "depth_m" and "confidence" in names:
             beliefs = buffers_of("confidence")
-            buffers = [_dimmed(*two) for two in zip(buffers, beliefs, strict=True)]
-        yield map_entity(
+            buffers = [_mask_depth(*two) for two in zip(buffers, beliefs, strict=True)]
+        yield draw_map(
             channel_path(path, channel),
             frame,
             scales[channel],
@@ -201,13 +201,13 @@ def grids(
             smooth=smooth,
         )
         if channel == "confidence":
-            yield _best_cells(f"{path}/best", frame, buffers, formats, stride_px)
+            yield _draw_best_cells(f"{path}/best", frame, buffers, formats, stride_px)
 
 
-def map_entity(
+def draw_map(
     path: str,
     frame: str,
-    scale: Scale,
+    scale: ColourScale,
     columns: Iterable[rr.ComponentColumn],
     *,
     stride_px: int = STRIDE_PX,
@@ -219,7 +219,7 @@ def map_entity(
     return Entity(path, columns, (map_style(scale, smooth=smooth), place), own)
 
 
-def _best_cells(
+def _draw_best_cells(
     path: str,
     frame: str,
     buffers: Sequence[bytes],
@@ -240,7 +240,7 @@ def _cell_style() -> rr.Boxes2D:
 
 
 @cache
-def map_style(scale: Scale, *, smooth: bool = False) -> rr.DepthImage:
+def map_style(scale: ColourScale, *, smooth: bool = False) -> rr.DepthImage:
     """Return the style of a map: a fixed range; sharp cells unless they are smoothed."""
     return rr.DepthImage.from_fields(
         colormap=scale.colormap,
@@ -249,27 +249,27 @@ def map_style(scale: Scale, *, smooth: bool = False) -> rr.DepthImage:
     )
 
 
-def _share(data: bytes, index: int, parts: int) -> bytes:
+def _slice_channel(data: bytes, index: int, parts: int) -> bytes:
     size = len(data) // parts
     return data[index * size : (index + 1) * size]
 
 
-def _dimmed(depth: bytes, confidence: bytes) -> bytes:
+def _mask_depth(depth: bytes, confidence: bytes) -> bytes:
     """Set the depth to 0 where the confidence is below ``MIN_DEPTH_CONFIDENCE``."""
-    believed = np.frombuffer(confidence, "<f4") >= BELIEVED
+    believed = np.frombuffer(confidence, "<f4") >= MIN_DEPTH_CONFIDENCE
     return np.where(believed, np.frombuffer(depth, "<f4"), np.float32(0)).tobytes()
 
 
-def rows_of(column: pa.ListArray) -> NDArray[np.intp]:
+def row_indices(column: pa.ListArray) -> NDArray[np.intp]:
     """Return the row of a column that each value of its lists belongs to."""
     return np.repeat(np.arange(len(column)), column.value_lengths().to_numpy())
 
 
 def points_px(points: pa.StructArray) -> NDArray[np.float64]:
     """Return the positions of labels or detections, (N, 2), pixels."""
-    return fields(points, ("u_px", "v_px"))
+    return stack_fields(points, ("u_px", "v_px"))
 
 
-def fields(points: pa.StructArray, names: Sequence[str]) -> NDArray[np.float64]:
+def stack_fields(points: pa.StructArray, names: Sequence[str]) -> NDArray[np.float64]:
     """Stack these fields of a column of structs, (N, k)."""
     return np.column_stack([points.field(name).to_numpy() for name in names])

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import rerun as rr
 
-WORLD = "world"
+WORLD_FRAME = "world"
 
 # rerun treats a negative radius as points of the screen, equal at every zoom.
 POINT_UI, FAINT_POINT_UI, LINE_UI = -4.0, -1.5, -1.0
-INVISIBLE = 0.01
+INVISIBLE_RADIUS = 0.01
 
 # Height and width of a text below a point, as shares of the image's width, in the smallest panel
 # that a layout opens.
@@ -46,7 +46,7 @@ class Entity:
     frame: str | None = None
 
 
-def escaped(path: str) -> str:
+def escape_path(path: str) -> str:
     """Convert a topic to an entity path of rerun; robots may have any name."""
     return rr.new_entity_path(path.strip("/").split("/"))
 

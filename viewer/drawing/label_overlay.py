@@ -10,11 +10,11 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from dmrl.colours import RGB
-from dmrl.geometry.frames import inside
-from dmrl.viewer.drawing.archetypes import fields, points_px, rows_of
+from dmrl.geometry.frames import is_inside
+from dmrl.viewer.drawing.archetypes import points_px, row_indices, stack_fields
 from dmrl.viewer.drawing.entity import (
     ELLIPSE_SIGMAS,
-    INVISIBLE,
+    INVISIBLE_RADIUS,
     LINE_UI,
     POINT_UI,
     TEXT_HEIGHT,
@@ -23,7 +23,7 @@ from dmrl.viewer.drawing.entity import (
 )
 
 
-def labels(
+def draw_labels(
     path: str,
     frame: str,
     batch: pa.RecordBatch,
@@ -46,24 +46,24 @@ def labels(
         cover the surroundings of the image.
     """
     column = batch["peers"]
-    row_of = rows_of(column)
+    row_of = row_indices(column)
     peers = column.flatten()
     source_of = np.array(peers.field("source").to_pylist(), dtype=object)
     sources.update(source_of)
-    ordered = sorted(sources, key=_order)
+    ordered = sorted(sources, key=_sort_key)
     places = np.array([ordered.index(source) for source in source_of], int)
     first = np.lexsort([places, row_of])
     texts_px = np.empty((len(peers), 2))
-    texts_px[first] = _text_places(_tops(peers)[first], row_of[first], size_px[0])
+    texts_px[first] = _place_texts(_top_centres(peers)[first], row_of[first], size_px[0])
     for source in ordered:
         (at,) = np.nonzero(source_of == source)
-        mine = _Labels(peers.take(at), row_of[at], texts_px[at], batch.num_rows, size_px)
-        for entity in mine.entities(f"{path}/{source}", source):
+        mine = _SourceLabels(peers.take(at), row_of[at], texts_px[at], batch.num_rows, size_px)
+        for entity in mine.iter_entities(f"{path}/{source}", source):
             yield replace(entity, frame=frame)
 
 
 @dataclass(frozen=True, slots=True)
-class _Labels:
+class _SourceLabels:
     """The labels of one source; ``row_of`` is the image of each."""
 
     peers: pa.StructArray
@@ -72,52 +72,52 @@ class _Labels:
     rows: int
     size_px: tuple[int, int]
 
-    def entities(self, path: str, source: str) -> Iterator[Entity]:
+    def iter_entities(self, path: str, source: str) -> Iterator[Entity]:
         dot, dust, outline, curve = _label_styles(source)
-        boxed, corners = _boxes(self.peers)
+        boxed, corners = _read_boxes(self.peers)
         centres = corners.mean(axis=1)
         uv_px = points_px(self.peers)
 
         points = rr.Points2D.columns(positions=uv_px)
         boxes = rr.Boxes2D.columns(centers=centres, half_sizes=(corners[:, 1] - corners[:, 0]) / 2)
-        yield Entity(f"{path}/points", self._rows(points), (dot,))
-        yield Entity(f"{path}/boxes", self._rows(boxes, boxed), (outline,))
-        yield Entity(f"{path}/texts", self._rows(self._texts()), (dust,))
-        sigmas_px = fields(self.peers, ("sigma_u_px", "sigma_v_px"))
-        unsure = (sigmas_px > 0).all(axis=1) & inside(uv_px, *self.size_px)
+        yield Entity(f"{path}/points", self._partition_rows(points), (dot,))
+        yield Entity(f"{path}/boxes", self._partition_rows(boxes, boxed), (outline,))
+        yield Entity(f"{path}/texts", self._partition_rows(self._build_texts()), (dust,))
+        sigmas_px = stack_fields(self.peers, ("sigma_u_px", "sigma_v_px"))
+        unsure = (sigmas_px > 0).all(axis=1) & is_inside(uv_px, *self.size_px)
         ellipses = rr.Ellipses2D.columns(
             centers=uv_px[unsure], half_sizes=ELLIPSE_SIGMAS * sigmas_px[unsure]
         )
-        yield Entity(f"{path}/sigmas", self._rows(ellipses, unsure), (curve,))
+        yield Entity(f"{path}/sigmas", self._partition_rows(ellipses, unsure), (curve,))
 
-    def _texts(self) -> rr.ComponentColumnList:
+    def _build_texts(self) -> rr.ComponentColumnList:
         names, depths_m = (self.peers.field(key).to_pylist() for key in ("peer", "depth_m"))
         texts = [f"{name} {depth_m:.2f} m" for name, depth_m in zip(names, depths_m, strict=True)]
         return rr.Points2D.columns(positions=self.texts_px, labels=texts)
 
-    def _rows(
+    def _partition_rows(
         self, columns: rr.ComponentColumnList, kept: NDArray[np.bool_] | None = None
     ) -> rr.ComponentColumnList:
         row_of = self.row_of if kept is None else self.row_of[kept]
         return columns.partition(np.bincount(row_of, minlength=self.rows))
 
 
-def _boxes(peers: pa.StructArray) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def _read_boxes(peers: pa.StructArray) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Return which labels have a box, (N,), and the corners of those, (M, 2, 2)."""
     edges = peers.field("box_px")
     boxed = edges.value_lengths().to_numpy() == 4
     return boxed, edges.filter(pa.array(boxed)).flatten().to_numpy().reshape(-1, 2, 2)
 
 
-def _tops(peers: pa.StructArray) -> NDArray[np.float64]:
+def _top_centres(peers: pa.StructArray) -> NDArray[np.float64]:
     """Return the middle of the upper edge of each label's box, (N, 2); without a box, the label."""
-    boxed, corners = _boxes(peers)
+    boxed, corners = _read_boxes(peers)
     out = points_px(peers)
     out[boxed] = np.column_stack([corners.mean(axis=1)[:, 0], corners[:, 0, 1]])
     return out
 
 
-def _text_places(
+def _place_texts(
     tops_px: NDArray[np.float64], row_of: NDArray[np.intp], width_px: int
 ) -> NDArray[np.float64]:
     """Place texts above their peers without overlap; the texts of detections are below.
@@ -138,11 +138,11 @@ def _text_places(
     for begin, end in zip(begins, ends, strict=True):
         for k in range(begin + 1, end):
             near = abs(out[begin:k, 0] - out[k, 0]) < wide_px
-            out[k, 1] = _free_place(out[k, 1], out[begin:k, 1][near], high_px)
+            out[k, 1] = _find_free_height(out[k, 1], out[begin:k, 1][near], high_px)
     return out
 
 
-def _free_place(wanted: float, taken: NDArray[np.float64], high: float) -> float:
+def _find_free_height(wanted: float, taken: NDArray[np.float64], high: float) -> float:
     """Find the nearest height at a distance of ``high`` from all in ``taken``; prefer above."""
     above, below = taken - high, taken + high
     tried = np.concatenate([[wanted], above[above >= 0], below])
@@ -157,10 +157,10 @@ def _label_styles(source: str) -> tuple[rr.Points2D, rr.Points2D, rr.Boxes2D, rr
     """Return the styles of points, texts, boxes and ellipses. Cached for later batches."""
     colour = RGB.get(source, RGB["other"])
     # Where two sources agree, the first one in the table is drawn on top.
-    order = 30.0 - _order(source)[0]
+    order = 30.0 - _sort_key(source)[0]
     dot, dust = (
         rr.Points2D.from_fields(colors=[colour], radii=[radius], draw_order=order)
-        for radius in (POINT_UI, INVISIBLE)
+        for radius in (POINT_UI, INVISIBLE_RADIUS)
     )
     outline = rr.Boxes2D.from_fields(colors=[colour], radii=[LINE_UI], draw_order=order - 10.0)
     curve = rr.Ellipses2D.from_fields(
@@ -169,6 +169,6 @@ def _label_styles(source: str) -> tuple[rr.Points2D, rr.Points2D, rr.Boxes2D, rr
     return dot, dust, outline, curve
 
 
-def _order(source: str) -> tuple[int, str]:
+def _sort_key(source: str) -> tuple[int, str]:
     """Return the index of a source in the table of colours; unknown sources come last."""
     return list(RGB).index(source if source in RGB else "other"), source

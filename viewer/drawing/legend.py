@@ -6,15 +6,15 @@ from itertools import takewhile
 import numpy as np
 import rerun as rr
 
-from dmrl.viewer.drawing.archetypes import Colour, Scale, map_style
+from dmrl.viewer.drawing.archetypes import Colour, ColourScale, map_style
 from dmrl.viewer.drawing.entity import LINE_UI, Entity, image_frame
 
-HEIGHT_PX = 26
+LEGEND_HEIGHT_PX = 26
 """Height of the legend and the colour bars below an image, pixels."""
 
 MARK_PX, BAR_PX, BAR_STEPS = 6, 6, 64
 TEXT_COLOUR = (220, 220, 220)
-CHARACTERS, AROUND = 50, 4
+MAX_CHARACTERS, GAP_CHARACTERS = 50, 4
 """Characters that fit side by side in a panel of a quarter of the window, and gap between names."""
 
 
@@ -28,11 +28,11 @@ def bar_path(robot: str, channel: str) -> str:
     return f"/{robot}/legend/{channel}"
 
 
-def legend(robot: str, colours: Mapping[str, Colour], width_px: int, height_px: int) -> Entity:
+def draw_legend(robot: str, colours: Mapping[str, Colour], width_px: int, height_px: int) -> Entity:
     """Draw a line in the colour of each source, with its name."""
-    names = _fitting(list(colours))
-    takes = np.array([len(name) + AROUND for name in names])
-    middle_px = (np.cumsum(takes) - takes / 2) * width_px / max(CHARACTERS, takes.sum())
+    names = _fit_names(list(colours))
+    takes = np.array([len(name) + GAP_CHARACTERS for name in names])
+    middle_px = (np.cumsum(takes) - takes / 2) * width_px / max(MAX_CHARACTERS, takes.sum())
     left_px, y_px = (middle_px - MARK_PX).tolist(), height_px + MARK_PX
     marks = rr.LineStrips2D(
         [[[x_px, y_px], [x_px + 2 * MARK_PX, y_px]] for x_px in left_px],
@@ -43,19 +43,22 @@ def legend(robot: str, colours: Mapping[str, Colour], width_px: int, height_px: 
     return Entity(legend_path(robot), style=(marks,), frame=image_frame(robot))
 
 
-def _fitting(names: Sequence[str]) -> list[str]:
+def _fit_names(names: Sequence[str]) -> list[str]:
     """Truncate names to fit side by side; long names keep the part in which they differ."""
     length = max(map(len, names), default=0)
-    while length > 3 and sum(min(len(name), length) + AROUND for name in names) > CHARACTERS:
+    while (
+        length > 3
+        and sum(min(len(name), length) + GAP_CHARACTERS for name in names) > MAX_CHARACTERS
+    ):
         length -= 1
     long = [name for name in names if len(name) > length]
-    first, last = _alike(long), _alike([name[::-1] for name in long])
+    first, last = _common_prefix_length(long), _common_prefix_length([name[::-1] for name in long])
     return [
-        name if len(name) <= length else _shortened(name, length, first, last) for name in names
+        name if len(name) <= length else _strip_common(name, length, first, last) for name in names
     ]
 
 
-def _alike(names: Sequence[str]) -> int:
+def _common_prefix_length(names: Sequence[str]) -> int:
     """Return the length of the common prefix of two or more names."""
     if len(names) < 2:
         return 0
@@ -63,15 +66,15 @@ def _alike(names: Sequence[str]) -> int:
     return sum(1 for _ in takewhile(lambda letters: len(set(letters)) == 1, columns))
 
 
-def _shortened(name: str, length: int, first: int, last: int) -> str:
+def _strip_common(name: str, length: int, first: int, last: int) -> str:
     """Remove the common prefix and suffix of a name, and truncate it if it is still too long."""
     own = name[first : len(name) - last]
     kept = f"{'…' * (first > 0)}{own}{'…' * (last > 0)}"
     return kept if len(kept) <= length else f"{kept[: length - 1]}…"
 
 
-def colour_bars(
-    robot: str, scales: Mapping[str, Scale], width_px: int, height_px: int
+def draw_colour_bars(
+    robot: str, scales: Mapping[str, ColourScale], width_px: int, height_px: int
 ) -> Iterator[Entity]:
     """Draw a bar with three ticks for each channel of the grid."""
     left_px, length_px = width_px / 10, width_px * 8 / 10

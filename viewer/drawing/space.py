@@ -12,10 +12,17 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from dmrl.colours import OWN, RGB, STATUS_RGB
+from dmrl.colours import OWN_RGB, RGB, STATUS_RGB
 from dmrl.geometry.frames import Array
 from dmrl.rendering.robots import crazyflie
-from dmrl.viewer.content.robot_motion import Names, Poses, Positions, Ranges, covariances, vectors
+from dmrl.viewer.content.robot_motion import (
+    Names,
+    Poses,
+    Positions,
+    Ranges,
+    read_covariances,
+    read_vectors,
+)
 from dmrl.viewer.drawing.entity import (
     ELLIPSE_SIGMAS,
     LINE_UI,
@@ -34,7 +41,7 @@ OPTICAL_XYZW = [-0.5, 0.5, -0.5, 0.5]
 """The rotation camera_from_optical, as in the /tf of a flight."""
 
 
-def transform(frame: str, poses: Poses) -> Entity:
+def draw_transform(frame: str, poses: Poses) -> Entity:
     """Draw the poses of a frame in its parent, at the log times of the poses."""
     count = len(poses.time_ns)
     columns = rr.Transform3D.columns(
@@ -46,7 +53,7 @@ def transform(frame: str, poses: Poses) -> Entity:
     return Entity(f"/tf/{frame}", columns)
 
 
-def still_frame(frame: str, parent: str, xyzw: Sequence[float] = (0, 0, 0, 1)) -> Entity:
+def build_fixed_frame(frame: str, parent: str, xyzw: Sequence[float] = (0, 0, 0, 1)) -> Entity:
     """Build a frame that is fixed in its parent."""
     turn = rr.Quaternion(xyzw=xyzw)
     place = rr.Transform3D(
@@ -55,7 +62,7 @@ def still_frame(frame: str, parent: str, xyzw: Sequence[float] = (0, 0, 0, 1)) -
     return Entity(f"/tf/{frame}", style=(place,))
 
 
-def attitude(robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
+def draw_attitude(robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
     """Draw the attitude of a robot's body relative to its horizontal frame."""
     roll, pitch = (batch[f"{name}_rad"].to_numpy() / 2 for name in ("roll", "pitch"))
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
@@ -67,9 +74,9 @@ def attitude(robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
     yield Entity(f"/tf/{camera_frame(robot)}", columns)
 
 
-def body(robot: str) -> Iterator[Entity]:
+def draw_body(robot: str) -> Iterator[Entity]:
     """Draw a robot's shape, axes and name."""
-    mesh = crazyflie.CRAZYFLIE.mesh()
+    mesh = crazyflie.CRAZYFLIE.build_mesh()
     shape = rr.Mesh3D(
         vertex_positions=mesh.vertices,
         triangle_indices=mesh.faces,
@@ -79,12 +86,16 @@ def body(robot: str) -> Iterator[Entity]:
         f"/{robot}/body", style=(shape, rr.TransformAxes3D(AXES_M)), frame=camera_frame(robot)
     )
     name = rr.Points3D(
-        [[0, 0, NAME_ABOVE_M]], radii=[LINE_UI / 10], colors=[OWN], labels=[robot], show_labels=True
+        [[0, 0, NAME_ABOVE_M]],
+        radii=[LINE_UI / 10],
+        colors=[OWN_RGB],
+        labels=[robot],
+        show_labels=True,
     )
     yield Entity(f"/{robot}/name", style=(name,), frame=horizontal_frame(robot))
 
 
-def frustum(robot: str, path: str, calibration: Mapping[str, Any]) -> Entity:
+def draw_frustum(robot: str, path: str, calibration: Mapping[str, Any]) -> Entity:
     """Draw a robot's field of view, with its image in it.
 
     Parameters
@@ -100,7 +111,7 @@ def frustum(robot: str, path: str, calibration: Mapping[str, Any]) -> Entity:
         image_from_camera=np.reshape(calibration["K"], (3, 3)),
         resolution=[calibration["width"], calibration["height"]],
         image_plane_distance=FRUSTUM_M,
-        color=OWN,
+        color=OWN_RGB,
         line_width=LINE_UI,
         parent_frame=optical_frame(robot),
         child_frame=image_frame(robot),
@@ -108,7 +119,7 @@ def frustum(robot: str, path: str, calibration: Mapping[str, Any]) -> Entity:
     return Entity(path, style=(pinhole,))
 
 
-def seen(path: str, pair: Names, positions: Positions, source: str) -> Iterator[Entity]:
+def draw_positions(path: str, pair: Names, positions: Positions, source: str) -> Iterator[Entity]:
     """Draw a peer's positions and covariance, at the log times of the positions.
 
     An estimate that is not OK has the colour of its status.
@@ -119,10 +130,12 @@ def seen(path: str, pair: Names, positions: Positions, source: str) -> Iterator[
     points = rr.Points3D.columns(positions=positions.xyz, colors=own)
     style = rr.Points3D.from_fields(radii=[POINT_UI])
     yield Entity(path, points, (style,), frame)
-    yield from _ellipsoids(f"{path}/covariance", frame, positions.xyz, positions.covariance, own)
+    yield from _draw_ellipsoids(
+        f"{path}/covariance", frame, positions.xyz, positions.covariance, own
+    )
 
 
-def _ellipsoids(
+def _draw_ellipsoids(
     path: str,
     frame: str,
     xyz: Array,
@@ -134,7 +147,7 @@ def _ellipsoids(
     known = np.isfinite(covariance).all(axis=(1, 2)) & covariance.any(axis=(1, 2))
     if lengths is None and not known.any():
         return
-    half_sizes, xyzw = _axes(covariance[known])
+    half_sizes, xyzw = _principal_axes(covariance[known])
     columns = rr.Ellipsoids3D.columns(
         centers=xyz[known], half_sizes=half_sizes, quaternions=xyzw, colors=colours[known]
     )
@@ -147,15 +160,15 @@ def _ellipsoids(
     yield Entity(path, columns, (style,), frame)
 
 
-def _axes(covariance: Array) -> tuple[Array, Array]:
+def _principal_axes(covariance: Array) -> tuple[Array, Array]:
     """Return half axes (N, 3), metres, and directions (N, 4), quaternions, of ellipsoids."""
     variance, axes = np.linalg.eigh(covariance)
     # A rotation, not a reflection.
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-    return ELLIPSE_SIGMAS * np.sqrt(np.maximum(variance, 0)), _quaternions(axes)
+    return ELLIPSE_SIGMAS * np.sqrt(np.maximum(variance, 0)), _to_quaternions(axes)
 
 
-def _quaternions(matrices: Array) -> Array:
+def _to_quaternions(matrices: Array) -> Array:
     """Convert rotations (N, 3, 3) to quaternions xyzw (N, 4), from the largest component."""
     m = matrices
     diagonal = np.einsum("nii->ni", m)
@@ -172,13 +185,13 @@ def _quaternions(matrices: Array) -> Array:
     return np.asarray(row / np.linalg.norm(row, axis=1, keepdims=True))
 
 
-def trail(path: str, frame: str, steps: Array, source: str) -> Entity:
+def draw_trail(path: str, frame: str, steps: Array, source: str) -> Entity:
     """Draw the step from each position to the next, (N, 2, 3); a view shows the last seconds."""
     style = rr.LineStrips3D.from_fields(colors=[RGB[source]], radii=[TRAIL_UI])
-    return Entity(path, rr.LineStrips3D.columns(strips=_strips(steps)), (style,), frame)
+    return Entity(path, rr.LineStrips3D.columns(strips=_build_strips(steps)), (style,), frame)
 
 
-def _strips(points: Array) -> pa.ListArray:
+def _build_strips(points: Array) -> pa.ListArray:
     """Convert (N, k, 3) points to N lines. rerun takes 20 us for each in a list of arrays."""
     kind = rr.components.LineStrip3DBatch([]).as_arrow_array().type
     flat = pa.array(points.astype(np.float32).reshape(-1))
@@ -187,7 +200,9 @@ def _strips(points: Array) -> pa.ListArray:
     return pa.ListArray.from_arrays(pa.array(offsets), inner, type=kind)
 
 
-def ranges(path: str, robot: str, measured: Ranges, towards: Positions | None) -> Iterator[Entity]:
+def draw_ranges(
+    path: str, robot: str, measured: Ranges, towards: Positions | None
+) -> Iterator[Entity]:
     """Draw ranges as lines to the estimated peer, or as spheres without an estimate.
 
     Parameters
@@ -212,21 +227,23 @@ def ranges(path: str, robot: str, measured: Ranges, towards: Positions | None) -
         )
         yield Entity(f"{path}/sphere", sphere, (thin,), frame)
         return
-    there = towards.at(measured.time_ns)
+    there = towards.interpolate(measured.time_ns)
     length = np.linalg.norm(there, axis=1, keepdims=True)
     known = np.isfinite(length[:, 0]) & (length[:, 0] > 0)
     ends = there[known] / length[known] * range_m[known, None]
-    lines = rr.LineStrips3D.columns(strips=_strips(np.stack([np.zeros_like(ends), ends], axis=1)))
+    lines = rr.LineStrips3D.columns(
+        strips=_build_strips(np.stack([np.zeros_like(ends), ends], axis=1))
+    )
     style = rr.LineStrips3D.from_fields(colors=[RGB["range"]], radii=[RANGE_UI])
     yield Entity(f"{path}/line", lines.partition(known.astype(int)), (style,), frame)
 
 
-def tracks(path: str, robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
+def draw_tracks(path: str, robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
     """Draw tracks of peers: position, name, velocity and covariance."""
     column, frame = batch["tracks"], horizontal_frame(robot)
     lengths = column.value_lengths().to_numpy()
     found = column.flatten()
-    xyz = vectors(found, "xyz")
+    xyz = read_vectors(found, "xyz")
     velocity = np.stack([found.field(f"v{axis}_mps").to_numpy() for axis in "xyz"], axis=1)
     names = [
         f"{peer or 'track'} {number}"
@@ -243,5 +260,5 @@ def tracks(path: str, robot: str, batch: pa.RecordBatch) -> Iterator[Entity]:
     thin = rr.Arrows3D.from_fields(colors=[colour], radii=[LINE_UI])
     yield Entity(f"{path}/velocity", arrows, (thin,), frame)
     colours = np.full((len(xyz), 3), colour, np.uint8)
-    covariance = covariances(found.field("covariance"))
-    yield from _ellipsoids(f"{path}/covariance", frame, xyz, covariance, colours, lengths)
+    covariance = read_covariances(found.field("covariance"))
+    yield from _draw_ellipsoids(f"{path}/covariance", frame, xyz, covariance, colours, lengths)

@@ -6,4 +6,4 @@ and the panels around them. A layout is imported when it is shown.
 
 from pkgutil import iter_modules
 
-NAMES = tuple(sorted(module.name for module in iter_modules(__path__)))
+LAYOUT_NAMES = tuple(sorted(module.name for module in iter_modules(__path__)))

@@ -8,27 +8,34 @@ import numpy as np
 import rerun as rr
 
 from dmrl import topics
-from dmrl.colours import RGB, SECOND_DETECTION
-from dmrl.datasets.writing.rows import label_source
+from dmrl.colours import RGB, SECOND_DETECTION_RGB
+from dmrl.datasets.writing.rows import choose_label_source
 from dmrl.errors import DmrlError, RecordingError, SettingError
 from dmrl.evaluation import detections
 from dmrl.geometry.frames import Array
-from dmrl.learn.inference.matching import errors
-from dmrl.recording import Contents
+from dmrl.learn.inference.matching import compute_errors
+from dmrl.recording import LoadedRecording
 from dmrl.terminal.progress import say
 from dmrl.viewer import layouts
 from dmrl.viewer.content.robot_motion import Times
 from dmrl.viewer.drawing import archetypes, time_plots
 from dmrl.viewer.drawing.archetypes import Colour
 from dmrl.viewer.drawing.entity import Entity
-from dmrl.viewer.layouts import Plot
-from dmrl.viewer.scene import Scene, Still, bars, eyes_of, model_draws, picture_draws
+from dmrl.viewer.layouts import PlotPanel
+from dmrl.viewer.scene import (
+    PreparedEntity,
+    Scene,
+    build_camera_panels,
+    build_colour_bars,
+    build_image_rules,
+    build_model_rules,
+)
 from dmrl.viewer.selection import Selection
 from dmrl.viewer.settings import Settings
 
-COLOURS = (RGB["detection"], SECOND_DETECTION)
-TABLE = "/models/table"
-ROWS: tuple[tuple[str, str, Callable[[Array], str]], ...] = (
+MODEL_COLOURS = (RGB["detection"], SECOND_DETECTION_RGB)
+TABLE_PATH = "/models/table"
+TABLE_ROWS: tuple[tuple[str, str, Callable[[Array], str]], ...] = (
     ("median error, px", "px", lambda v: f"{np.median(v):.2f}"),
     ("within 8 px", "px", lambda v: f"{np.mean(v <= 8):.1%}"),
     ("within 20 px", "px", lambda v: f"{np.mean(v <= 20):.1%}"),
@@ -37,7 +44,7 @@ ROWS: tuple[tuple[str, str, Callable[[Array], str]], ...] = (
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class ModelErrors:
     """Errors of one model: (N,) log times of labels, sorted, and errors of pixel and depth."""
 
     source: str
@@ -54,27 +61,35 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     RecordingError
         Unless exactly two recordings have detections of that robot.
     """
-    robot, models = _models(selection, settings.robot)
-    scales = archetypes.scales(settings.depth_max_m)
-    eyes = [eye for path in models for eye in eyes_of(selection, [robot], scales, model=path)]
-    judged = {path: found for path in models if (found := _judged(path, robot, selection))}
+    robot, models = _find_models(selection, settings.robot)
+    scales = archetypes.build_scales(settings.depth_max_m)
+    eyes = [
+        eye
+        for path in models
+        for eye in build_camera_panels(selection, [robot], scales, model=path)
+    ]
+    judged = {path: found for path in models if (found := _compute_errors(path, robot, selection))}
     scene = Scene(
-        layouts.compare(eyes, scales, _plots(models, judged), TABLE, overlay=settings.overlay),
-        picture_draws(eyes[0], set()),
-        [*bars(eyes[0], scales), *_stills(models, judged)],
+        layouts.build_compare_layout(
+            eyes, scales, _build_plots(models, judged), TABLE_PATH, overlay=settings.overlay
+        ),
+        build_image_rules(eyes[0], set()),
+        [*build_colour_bars(eyes[0], scales), *_iter_prepared_entities(models, judged)],
         eyes[:1],
     )
     sources = scene.sources.setdefault(robot, set())
-    scene.draws = picture_draws(eyes[0], sources)
-    for eye, path, colour in zip(eyes, models, COLOURS, strict=True):
-        scene.draws += model_draws(eye, scales, colour, smooth=settings.overlay, recording=path)
+    scene.draws = build_image_rules(eyes[0], sources)
+    for eye, path, colour in zip(eyes, models, MODEL_COLOURS, strict=True):
+        scene.draws += build_model_rules(
+            eye, scales, colour, smooth=settings.overlay, recording=path
+        )
         scene.named[path.stem] = colour
     return scene
 
 
-def _models(selection: Selection, wanted: str | None) -> tuple[str, list[Path]]:
+def _find_models(selection: Selection, wanted: str | None) -> tuple[str, list[Path]]:
     robot = wanted or min(selection.image_ns, default="")
-    topic = topics.detections(robot)
+    topic = topics.DETECTIONS(robot)
     models = [path for path, kept in selection.recordings.items() if topic in kept.topics]
     names = ", ".join(str(path) for path in selection.recordings)
     if len(models) != 2:
@@ -87,32 +102,32 @@ def _models(selection: Selection, wanted: str | None) -> tuple[str, list[Path]]:
     return robot, models
 
 
-def _judged(path: Path, robot: str, selection: Selection) -> Judged | None:
+def _compute_errors(path: Path, robot: str, selection: Selection) -> ModelErrors | None:
     """Compute the errors of a model; None, with a message, without labels to compare with."""
     try:
-        source = label_source(Contents(path, topics.LABELS), "best")
-        pairs = detections.join([path], source)
+        source = choose_label_source(LoadedRecording(path, topics.LABELS), "best")
+        pairs = detections.join_by_image([path], source)
     except DmrlError as e:
         say(f"no errors of {path.stem}: {e}")
         return None
-    found = errors(pairs.labels, pairs.detections)
+    found = compute_errors(pairs.labels, pairs.detections)
     whose = np.array([at.robot for at in pairs.at], object)[pairs.labels.image]
     time_ns = np.array([at.time_ns for at in pairs.at], np.int64)[pairs.labels.image]
     first_ns, end_ns = selection.shown_ns
     own = (whose == robot) & (time_ns >= first_ns) & (time_ns < end_ns)
-    return Judged(source, time_ns[own], found.norm_px[own], found.depth_m[own])
+    return ModelErrors(source, time_ns[own], found.norm_px[own], found.depth_m[own])
 
 
-def _prefix(path: Path) -> str:
+def _model_path(path: Path) -> str:
     return f"/models/{path.stem}"
 
 
-def _plots(models: Sequence[Path], judged: dict[Path, Judged]) -> list[Plot]:
+def _build_plots(models: Sequence[Path], judged: dict[Path, ModelErrors]) -> list[PlotPanel]:
     if not judged:
         return []
     source = next(iter(judged.values())).source
     return [
-        Plot(title, tuple(f"{_prefix(path)}/{name}" for path in models if path in judged))
+        PlotPanel(title, tuple(f"{_model_path(path)}/{name}" for path in models if path in judged))
         for title, name in (
             (f"pixel error against {source}, px", "error_px"),
             (f"depth error against {source}, m", "error_m"),
@@ -120,36 +135,41 @@ def _plots(models: Sequence[Path], judged: dict[Path, Judged]) -> list[Plot]:
     ]
 
 
-def _stills(models: Sequence[Path], judged: dict[Path, Judged]) -> Iterator[Still]:
-    for path, colour in zip(models, COLOURS, strict=True):
+def _iter_prepared_entities(
+    models: Sequence[Path], judged: dict[Path, ModelErrors]
+) -> Iterator[PreparedEntity]:
+    for path, colour in zip(models, MODEL_COLOURS, strict=True):
         if path in judged and len(judged[path].time_ns):
-            for entity in _lines(path, judged[path], colour):
+            for entity in _draw_error_lines(path, judged[path], colour):
                 yield np.unique(judged[path].time_ns), entity
     if judged:
         yield (
             None,
-            Entity(TABLE, style=(rr.TextDocument(_table(judged), media_type="text/markdown"),)),
+            Entity(
+                TABLE_PATH,
+                style=(rr.TextDocument(_format_table(judged), media_type="text/markdown"),),
+            ),
         )
 
 
-def _lines(path: Path, judged: Judged, colour: Colour) -> Iterator[Entity]:
+def _draw_error_lines(path: Path, judged: ModelErrors, colour: Colour) -> Iterator[Entity]:
     """Yield the error of the worst label of each image as lines."""
     _, row = np.unique(judged.time_ns, return_inverse=True)
     for name, values in (("error_px", judged.error_px), ("error_m", abs(judged.error_m))):
         worst = np.full(row.max() + 1, -np.inf)
         np.maximum.at(worst, row, np.nan_to_num(values, nan=np.inf))
         worst[~np.isfinite(worst)] = np.nan
-        yield time_plots.line(
-            f"{_prefix(path)}/{name}", worst, path.stem, colour, time_plots.THIN_UI
+        yield time_plots.draw_line(
+            f"{_model_path(path)}/{name}", worst, path.stem, colour, time_plots.THIN_UI
         )
 
 
-def _table(judged: dict[Path, Judged]) -> str:
+def _format_table(judged: dict[Path, ModelErrors]) -> str:
     names = [path.stem for path in judged]
     source = next(iter(judged.values())).source
     lines = [f"| against {source} | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
     lines.append(f"| labels | {' | '.join(str(len(j.time_ns)) for j in judged.values())} |")
-    for words, unit, form in ROWS:
+    for words, unit, form in TABLE_ROWS:
         cells = [
             form(j.error_px if unit == "px" else j.error_m) if len(j.time_ns) else "-"
             for j in judged.values()

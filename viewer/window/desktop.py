@@ -11,36 +11,36 @@ from typing import Any
 import numpy as np
 from rerun.experimental import ViewerClient
 
-from dmrl.atomic_output import partial_file
+from dmrl.atomic_output import atomic_file
 from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import decode, encode_png
 from dmrl.terminal.signals import set_on_signal
-from dmrl.viewer.session import prepare, write
+from dmrl.viewer.session import prepare_show, write_rrd
 from dmrl.viewer.settings import LOOPBACK, Settings
 from dmrl.viewer.show import Show
 from dmrl.viewer.window.viewer_process import (
-    PATIENCE_S,
-    Viewer,
-    command,
-    environment,
-    free_port,
+    VIEWER_TIMEOUT_S,
+    ViewerProcess,
+    build_command,
+    build_environment,
+    build_proxy_url,
+    find_free_port,
     last_line,
-    listens,
-    running,
+    run_viewer,
     stream_to,
-    url_of,
+    wait_until_listening,
 )
 
-BAR_PX = 36
+TOP_BAR_PX = 36
 """Height of the empty bar above rerun's panels, which holds the buttons of a window."""
-PICTURE_SIZE = f"1600x{1000 + BAR_PX}"
+SCREENSHOT_SIZE = f"1600x{1000 + TOP_BAR_PX}"
 
 # Parts of rerun's error messages without a Vulkan driver, and without a screen.
-NO_VULKAN = "render context"
-NO_SCREEN = "WAYLAND_DISPLAY"
+NO_VULKAN_MESSAGE = "render context"
+NO_SCREEN_MESSAGE = "WAYLAND_DISPLAY"
 
 
-def view(paths: Sequence[Path], settings: Settings) -> None:
+def show_in_window(paths: Sequence[Path], settings: Settings) -> None:
     """Show recordings in a window until it is closed. It opens while they are still being read.
 
     Raises
@@ -50,24 +50,24 @@ def view(paths: Sequence[Path], settings: Settings) -> None:
     SettingError
         If there is no screen, or the recordings are empty at the requested time.
     """
-    port = free_port(LOOPBACK)
+    port = find_free_port(LOOPBACK)
     # The viewer starts while the recording's index is read.
-    with running(command(LOOPBACK, "--port", str(port))) as viewer:
-        show = prepare(paths, settings)
+    with run_viewer(build_command(LOOPBACK, "--port", str(port))) as viewer:
+        show = prepare_show(paths, settings)
         with set_on_signal(viewer.ended):
-            if listens(viewer, LOOPBACK, port):
+            if wait_until_listening(viewer, LOOPBACK, port):
                 stream_to(show, viewer, port)
             viewer.wait()
-        said = viewer.said()
+        said = viewer.read_errors()
     if viewer.ended.is_set():
         return
-    if NO_SCREEN in said:
+    if NO_SCREEN_MESSAGE in said:
         raise SettingError("no screen for a window. Use --save, --screenshot or --serve")
     if viewer.process.returncode:
         raise SettingError(f"rerun's viewer stopped: {last_line(said)}. Use --save")
 
 
-def screenshot(
+def write_screenshot(
     paths: Sequence[Path],
     out: Path,
     settings: Settings,
@@ -105,10 +105,10 @@ def screenshot(
     SettingError
         If the recordings are empty at the requested time.
     """
-    show = prepare(paths, settings, picture=True, time_s=time_s, rank=rank)
-    with partial_file(out) as unfinished:
+    show = prepare_show(paths, settings, picture=True, time_s=time_s, rank=rank)
+    with atomic_file(out) as unfinished:
         try:
-            picture = _picture(show)
+            picture = _take_screenshot(show)
         except _ViewerStopped as e:
             raise OutputError(f"cannot draw {out}: {e}") from None
         unfinished.write_bytes(picture)
@@ -123,55 +123,55 @@ def open_window(*, headless: bool = False) -> tuple[subprocess.Popen[bytes], str
     headless
         Without a window.
     """
-    port = free_port(LOOPBACK)
-    extra = ("--headless", "--window-size", PICTURE_SIZE) if headless else ()
-    words = command(LOOPBACK, *extra, "--port", str(port))
+    port = find_free_port(LOOPBACK)
+    extra = ("--headless", "--window-size", SCREENSHOT_SIZE) if headless else ()
+    words = build_command(LOOPBACK, *extra, "--port", str(port))
     # Its own session: Ctrl-C ends the recording, not the window.
     process = subprocess.Popen(
-        words, env=environment(), stderr=subprocess.DEVNULL, start_new_session=True
+        words, env=build_environment(), stderr=subprocess.DEVNULL, start_new_session=True
     )
-    return process, url_of(port)
+    return process, build_proxy_url(port)
 
 
 class _ViewerStopped(Exception):
     """The viewer ended or hangs; the message has the reason and a way out."""
 
 
-def _picture(show: Show) -> bytes:
-    port = free_port(LOOPBACK)
+def _take_screenshot(show: Show) -> bytes:
+    port = find_free_port(LOOPBACK)
     # From a file: a viewer that waits for a stream draws a message over the panels.
     with TemporaryDirectory(prefix="dmrl-view-") as folder:
         path = Path(folder) / "view.rrd"
-        write(show, path)
-        where = ("--headless", "--window-size", PICTURE_SIZE, "--port", str(port), str(path))
-        with running(command(LOOPBACK, *where)) as viewer:
-            if picture := _settled(show, viewer, port):
-                return _without_bar(picture)
-            said = viewer.said()
-    if NO_VULKAN in said:
+        write_rrd(show, path)
+        where = ("--headless", "--window-size", SCREENSHOT_SIZE, "--port", str(port), str(path))
+        with run_viewer(build_command(LOOPBACK, *where)) as viewer:
+            if picture := _wait_for_screenshot(show, viewer, port):
+                return _crop_top_bar(picture)
+            said = viewer.read_errors()
+    if NO_VULKAN_MESSAGE in said:
         raise _ViewerStopped("no Vulkan driver. Install one: apt-get install mesa-vulkan-drivers")
     raise _ViewerStopped(f"rerun's viewer stopped: {last_line(said)}. Try: dmrl view --save")
 
 
-def _without_bar(picture: bytes) -> bytes:
+def _crop_top_bar(picture: bytes) -> bytes:
     """Remove the rows above the panels from a screenshot, if they are empty."""
     rgb = decode(picture, "rerun's picture")
     # The corners of the window are round.
-    bar = rgb[:BAR_PX, BAR_PX:-BAR_PX]
-    return encode_png(rgb[BAR_PX:]) if (bar == bar[:, :1]).all() else picture
+    bar = rgb[:TOP_BAR_PX, TOP_BAR_PX:-TOP_BAR_PX]
+    return encode_png(rgb[TOP_BAR_PX:]) if (bar == bar[:, :1]).all() else picture
 
 
-def _settled(show: Show, viewer: Viewer, port: int) -> bytes | None:
-    deadline = time.monotonic() + PATIENCE_S
+def _wait_for_screenshot(show: Show, viewer: ViewerProcess, port: int) -> bytes | None:
+    deadline = time.monotonic() + VIEWER_TIMEOUT_S
     previous = b""
     while time.monotonic() < deadline and viewer.alive:
         # Requests fail until the viewer listens; screenshots differ until all data is decoded.
         with suppress(OSError, RuntimeError):
-            client: Any = ViewerClient.connect(url_of(port))
+            client: Any = ViewerClient.connect(build_proxy_url(port))
             state = client.get_state()
             if state.active_recording and not state.loading:
                 timeline, value = show.cursor
-                client.set_time(timeline, play_state="paused", **{_kind(value): value})
+                client.set_time(timeline, play_state="paused", **{_time_argument(value): value})
                 picture = bytes(client.take_screenshot())
                 if picture == previous:
                     return picture
@@ -180,7 +180,7 @@ def _settled(show: Show, viewer: Viewer, port: int) -> bytes | None:
     return None
 
 
-def _kind(value: np.generic | int) -> str:
+def _time_argument(value: np.generic | int) -> str:
     if isinstance(value, np.datetime64):
         return "timestamp"
     return "duration" if isinstance(value, np.timedelta64) else "sequence"

@@ -13,19 +13,19 @@ import rerun.blueprint as rrb
 
 from dmrl import topics
 from dmrl.errors import SettingError
-from dmrl.live.queue import Received
+from dmrl.live.queue import ReceivedSample
 from dmrl.samples.sample import Sample
-from dmrl.viewer.drawing.entity import escaped
+from dmrl.viewer.drawing.entity import escape_path
 from dmrl.viewer.layouts import BACKGROUND, TIMELINE
 from dmrl.viewer.window.desktop import open_window
 
-PLOT_EVERY_NS = 100_000_000
+PLOT_INTERVAL_NS = 100_000_000
 """Interval between points of a curve: a shorter one is invisible and slows the recorder."""
 HISTORY_S = 30.0
 """Length of the curves, seconds."""
 
 
-def layout(robots: Sequence[str], cameras: Sequence[str]) -> rrb.Blueprint:
+def build_layout(robots: Sequence[str], cameras: Sequence[str]) -> rrb.Blueprint:
     """Build a layout with images on the left and curves of all robots on the right.
 
     Parameters
@@ -37,7 +37,7 @@ def layout(robots: Sequence[str], cameras: Sequence[str]) -> rrb.Blueprint:
     """
     pictures = [
         rrb.Spatial2DView(
-            origin=escaped(topics.camera_image(robot)), name=robot, background=BACKGROUND
+            origin=escape_path(topics.CAMERA_IMAGE(robot)), name=robot, background=BACKGROUND
         )
         for robot in cameras
     ]
@@ -50,7 +50,7 @@ def layout(robots: Sequence[str], cameras: Sequence[str]) -> rrb.Blueprint:
     for row in topics.SENSORS:
         if row.curve is not None:
             below = [row.pattern.format(robot=r, peer="*").split("/*")[0] for r in robots]
-            contents.setdefault(row.curve.title, []).extend(f"{escaped(b)}/**" for b in below)
+            contents.setdefault(row.curve.title, []).extend(f"{escape_path(b)}/**" for b in below)
     curves = [
         rrb.TimeSeriesView(name=title, contents=lines, time_ranges=window)
         for title, lines in contents.items()
@@ -81,27 +81,27 @@ class LiveView:
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
 
-    def show(self, received: Received) -> None:
+    def show(self, received: ReceivedSample) -> None:
         """Log one sample, if its topic is drawn."""
         sample = received.sample
-        if topics.names(topics.CAMERA_IMAGE, sample.topic):
+        if topics.parse_topic(topics.CAMERA_IMAGE, sample.topic):
             kind = sample.fields["format"]
-            self._log(
+            self._log_entity(
                 sample, rr.EncodedImage(contents=sample.fields["data"], media_type=f"image/{kind}")
             )
             return
-        row = topics.row_of(sample.topic)
-        late = sample.time_ns - self._drawn_ns.get(sample.topic, 0) >= PLOT_EVERY_NS
+        row = topics.find_topic(sample.topic)
+        late = sample.time_ns - self._drawn_ns.get(sample.topic, 0) >= PLOT_INTERVAL_NS
         if row is not None and row.curve is not None and late:
             self._drawn_ns[sample.topic] = sample.time_ns
-            for path, fields in row.curve.lines(sample.topic).items():
+            for path, fields in row.curve.list_lines(sample.topic).items():
                 values = [float(sample.fields[field]) for field in fields]
                 value = float(np.hypot.reduce(values)) if len(values) > 1 else values[0]
-                self._log(sample, rr.Scalars(value), path)
+                self._log_entity(sample, rr.Scalars(value), path)
 
-    def _log(self, sample: Sample, drawn: rr.AsComponents, path: str = "") -> None:
+    def _log_entity(self, sample: Sample, drawn: rr.AsComponents, path: str = "") -> None:
         self._stream.set_time(TIMELINE, timestamp=np.datetime64(sample.time_ns, "ns"))
-        self._stream.log(escaped(path or sample.topic), drawn)
+        self._stream.log(escape_path(path or sample.topic), drawn)
 
 
 class LiveWindow:
@@ -125,7 +125,7 @@ class LiveWindow:
     def __init__(
         self, robots: Sequence[str], cameras: Sequence[str], *, headless: bool = False
     ) -> None:
-        self._layout, self._headless = layout(robots, cameras), headless
+        self._layout, self._headless = build_layout(robots, cameras), headless
         self._process: subprocess.Popen[bytes] | None = None
         self.url = ""
 

@@ -15,32 +15,34 @@ from importlib.resources import files
 from tempfile import TemporaryFile
 
 from dmrl.errors import SettingError
-from dmrl.viewer.session import log
+from dmrl.viewer.session import log_show
 from dmrl.viewer.settings import LOOPBACK
-from dmrl.viewer.show import Show, stream_of
+from dmrl.viewer.show import Show, open_stream
 
-PATIENCE_S = 60.0
+VIEWER_TIMEOUT_S = 60.0
 """Timeout for the viewer to listen, to load and to receive data, seconds."""
-POLL_S = 0.1
+POLL_INTERVAL_S = 0.1
 
 # CI=1 turns rerun's usage statistics off. Its look-up of newer versions has no switch, so its proxy
 # is a closed port. RUST_LOG hides its warnings, which would be drawn over a screenshot.
-NOWHERE = f"http://{LOOPBACK}:9"
-PROXIES = ("all_proxy", "http_proxy", "https_proxy")
-QUIET = {name: NOWHERE for lower in PROXIES for name in (lower, lower.upper())} | {
+UNREACHABLE_PROXY = f"http://{LOOPBACK}:9"
+PROXY_VARIABLES = ("all_proxy", "http_proxy", "https_proxy")
+QUIET_ENVIRONMENT = {
+    name: UNREACHABLE_PROXY for lower in PROXY_VARIABLES for name in (lower, lower.upper())
+} | {
     "CI": "1",
     "NO_PROXY": LOOPBACK,
     "RUST_LOG": "error",
 }
 
 
-class Viewer:
+class ViewerProcess:
     """rerun's viewer as a child process."""
 
     def __init__(self, command: list[str]) -> None:
         # Lives as long as the viewer.
         self._errors = TemporaryFile()  # noqa: SIM115
-        self.process = subprocess.Popen(command, env=environment(), stderr=self._errors)
+        self.process = subprocess.Popen(command, env=build_environment(), stderr=self._errors)
         self.ended = threading.Event()
 
     @property
@@ -56,9 +58,9 @@ class Viewer:
     def wait(self) -> None:
         """Wait until the process ends or is asked to."""
         while self.wanted:
-            self.ended.wait(POLL_S)
+            self.ended.wait(POLL_INTERVAL_S)
 
-    def said(self) -> str:
+    def read_errors(self) -> str:
         """Read its messages on standard error."""
         self._errors.seek(0)
         return self._errors.read().decode(errors="replace")
@@ -71,18 +73,18 @@ class Viewer:
 
 
 @contextmanager
-def running(words: list[str]) -> Iterator[Viewer]:
+def run_viewer(words: list[str]) -> Iterator[ViewerProcess]:
     """Run a viewer until the end of the block."""
-    viewer = Viewer(words)
+    viewer = ViewerProcess(words)
     try:
         yield viewer
     finally:
         viewer.close()
 
 
-def listens(viewer: Viewer, host: str, port: int) -> bool:
+def wait_until_listening(viewer: ViewerProcess, host: str, port: int) -> bool:
     """Wait until the viewer listens; return False if it ends, is asked to end, or times out."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + VIEWER_TIMEOUT_S
     while viewer.wanted and time.monotonic() < deadline:
         with suppress(OSError), socket.create_connection((host, port), timeout=1):
             return True
@@ -90,14 +92,14 @@ def listens(viewer: Viewer, host: str, port: int) -> bool:
     return False
 
 
-def stream_to(show: Show, viewer: Viewer, port: int, host: str = LOOPBACK) -> None:
+def stream_to(show: Show, viewer: ViewerProcess, port: int, host: str = LOOPBACK) -> None:
     """Send everything to the viewer, unless it ends or is asked to end before."""
-    stream = stream_of()
-    stream.connect_grpc(url_of(port, host), default_blueprint=show.blueprint)
+    stream = open_stream()
+    stream.connect_grpc(build_proxy_url(port, host), default_blueprint=show.blueprint)
     try:
-        log(show, stream, wanted=lambda: viewer.wanted)
+        log_show(show, stream, wanted=lambda: viewer.wanted)
         if viewer.wanted:
-            stream.flush(timeout_sec=PATIENCE_S)
+            stream.flush(timeout_sec=VIEWER_TIMEOUT_S)
     except RuntimeError:
         if viewer.wanted:
             raise
@@ -105,23 +107,23 @@ def stream_to(show: Show, viewer: Viewer, port: int, host: str = LOOPBACK) -> No
         stream.disconnect()
 
 
-def command(bind: str, *arguments: str) -> list[str]:
+def build_command(bind: str, *arguments: str) -> list[str]:
     """Build the command line that starts the viewer."""
     program = files("rerun_cli").joinpath("rerun")
     return [str(program), "--bind", bind, "--hide-welcome-screen", *arguments]
 
 
-def environment() -> dict[str, str]:
+def build_environment() -> dict[str, str]:
     """Build the environment variables of the viewer."""
-    return os.environ | QUIET
+    return os.environ | QUIET_ENVIRONMENT
 
 
-def url_of(port: int, host: str = LOOPBACK) -> str:
+def build_proxy_url(port: int, host: str = LOOPBACK) -> str:
     """Return the URL at which a viewer receives data."""
     return f"rerun+http://{host}:{port}/proxy"
 
 
-def free_port(bind: str) -> int:
+def find_free_port(bind: str) -> int:
     """Find a free port.
 
     Raises
@@ -129,21 +131,21 @@ def free_port(bind: str) -> int:
     SettingError
         If the address is not one of this computer's.
     """
-    with _socket(bind) as probe:
-        return _bound(probe, bind, 0)
+    with _open_socket(bind) as probe:
+        return _bind_socket(probe, bind, 0)
 
 
-def require_free(bind: str, port: int) -> None:
+def require_free_port(bind: str, port: int) -> None:
     """Raise SettingError unless a port is free and the address is one of this computer's."""
-    with _socket(bind) as probe:
-        _bound(probe, bind, port)
+    with _open_socket(bind) as probe:
+        _bind_socket(probe, bind, port)
 
 
-def _socket(bind: str) -> socket.socket:
+def _open_socket(bind: str) -> socket.socket:
     return socket.socket(socket.AF_INET6 if ":" in bind else socket.AF_INET)
 
 
-def _bound(probe: socket.socket, bind: str, port: int) -> int:
+def _bind_socket(probe: socket.socket, bind: str, port: int) -> int:
     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         probe.bind((bind, port))

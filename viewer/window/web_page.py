@@ -12,26 +12,26 @@ from urllib.parse import quote
 from dmrl.errors import SettingError
 from dmrl.terminal.progress import say
 from dmrl.terminal.signals import set_on_signal
-from dmrl.viewer.session import prepare
+from dmrl.viewer.session import prepare_show
 from dmrl.viewer.settings import LOOPBACK, Settings, Web
 from dmrl.viewer.window.viewer_process import (
-    Viewer,
-    command,
-    free_port,
+    ViewerProcess,
+    build_command,
+    find_free_port,
     last_line,
-    listens,
-    require_free,
+    require_free_port,
     stream_to,
+    wait_until_listening,
 )
 
-ANYWHERE = ("0.0.0.0", "::")
-FRAME_PX = 700
+ANY_ADDRESS = ("0.0.0.0", "::")
+NOTEBOOK_HEIGHT_PX = 700
 
 
-WEB = Web()
+DEFAULT_ADDRESS = Web()
 
 
-def serve(paths: Sequence[Path], settings: Settings, web: Web = WEB) -> None:
+def serve(paths: Sequence[Path], settings: Settings, web: Web = DEFAULT_ADDRESS) -> None:
     """Show recordings in a browser until Ctrl-C. Prints the address.
 
     Raises
@@ -41,12 +41,14 @@ def serve(paths: Sequence[Path], settings: Settings, web: Web = WEB) -> None:
     SettingError
         If the recordings are empty at the requested time, or the port is in use.
     """
-    with suppress(KeyboardInterrupt), page(paths, settings, web) as shown:
+    with suppress(KeyboardInterrupt), open_page(paths, settings, web) as shown:
         shown.serve()
 
 
 @contextmanager
-def page(paths: Sequence[Path], settings: Settings, web: Web = WEB) -> Iterator["Page"]:
+def open_page(
+    paths: Sequence[Path], settings: Settings, web: Web = DEFAULT_ADDRESS
+) -> Iterator["Page"]:
     """Serve a page with recordings until the end of the block.
 
     Raises
@@ -77,22 +79,24 @@ class Page:
     As `serve`.
     """
 
-    def __init__(self, paths: Sequence[Path], settings: Settings, web: Web = WEB) -> None:
-        self._show = prepare(paths, settings)
-        self._data_port = free_port(web.bind)
-        port = web.port or free_port(web.bind)
-        require_free(web.bind, port)
-        host = socket.gethostname() if web.bind in ANYWHERE else web.bind
+    def __init__(
+        self, paths: Sequence[Path], settings: Settings, web: Web = DEFAULT_ADDRESS
+    ) -> None:
+        self._show = prepare_show(paths, settings)
+        self._data_port = find_free_port(web.bind)
+        port = web.port or find_free_port(web.bind)
+        require_free_port(web.bind, port)
+        host = socket.gethostname() if web.bind in ANY_ADDRESS else web.bind
         source = quote(f"rerun+http://{host}:{self._data_port}/proxy", safe="")
         self.url = f"http://{host}:{port}?url={source}"
         ports = ("--port", str(self._data_port), "--web-viewer-port", str(port))
         allowed = ("--cors-allow-origin", f"http://{host}:{port}", "--server-memory-limit", "75%")
-        words = command(web.bind, "--serve-web", *ports, *allowed)
-        self._host = LOOPBACK if web.bind in ANYWHERE else web.bind
-        self._viewer = Viewer(words)
+        words = build_command(web.bind, "--serve-web", *ports, *allowed)
+        self._host = LOOPBACK if web.bind in ANY_ADDRESS else web.bind
+        self._viewer = ViewerProcess(words)
         try:
-            if not listens(self._viewer, self._host, self._data_port):
-                said = last_line(self._viewer.said())
+            if not wait_until_listening(self._viewer, self._host, self._data_port):
+                said = last_line(self._viewer.read_errors())
                 raise SettingError(
                     f"rerun's server stopped: {said}. Choose another --port or --bind"
                 )
@@ -100,7 +104,7 @@ class Page:
             self.close()
             raise
 
-    def fill(self) -> None:
+    def send_data(self) -> None:
         """Send all data; the page shows the first meanwhile."""
         stream_to(self._show, self._viewer, self._data_port, self._host)
 
@@ -109,7 +113,7 @@ class Page:
         # An exception would be lost in a destructor of rerun's, which talks to the server.
         with set_on_signal(self._viewer.ended):
             say(f"{self.url} (Ctrl-C ends it)")
-            self.fill()
+            self.send_data()
             self._viewer.wait()
 
     def close(self) -> None:
@@ -117,5 +121,5 @@ class Page:
         self._viewer.close()
 
     def _repr_html_(self) -> str:
-        self.fill()
-        return f'<iframe src="{self.url}" width="100%" height="{FRAME_PX}"></iframe>'
+        self.send_data()
+        return f'<iframe src="{self.url}" width="100%" height="{NOTEBOOK_HEIGHT_PX}"></iframe>'

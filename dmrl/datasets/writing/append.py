@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.datasets import layout
-from dmrl.datasets.manifest import PARTS, Manifest, part_folder, read_manifest
-from dmrl.datasets.shards import schema_of
-from dmrl.datasets.writing.near_duplicates import read_seen
+from dmrl.datasets.manifest import PARTS_FOLDER, Manifest, part_folder, read_manifest
+from dmrl.datasets.shards import read_schema
+from dmrl.datasets.writing.near_duplicates import read_hashes
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.recording import Input, Provenance
-from dmrl.recording.provenance_inputs import provenance_of
+from dmrl.recording.provenance_inputs import read_provenance
 
 
 @dataclass(frozen=True, slots=True)
-class Before:
+class ExistingDataset:
     """A dataset before recordings are added to it.
 
     Parameters
@@ -43,7 +43,7 @@ class Before:
         """Files that the dataset was made from."""
         return self.made.inputs if self.made is not None else ()
 
-    def seen(self) -> list[NDArray[np.void]]:
+    def read_image_hashes(self) -> list[NDArray[np.void]]:
         """Read the hashes of its images, one array per part.
 
         Raises
@@ -53,16 +53,16 @@ class Before:
         """
         if self.folder is None:
             return []
-        found = [read_seen(part_folder(self.folder, k)) for k in range(self.manifest.parts)]
-        if sum(map(len, found)) != sum(map(self.manifest.rows, self.manifest.splits)):
+        found = [read_hashes(part_folder(self.folder, k)) for k in range(self.manifest.parts)]
+        if sum(map(len, found)) != sum(map(self.manifest.count_rows, self.manifest.splits)):
             raise DatasetError(
-                f"{self.folder / PARTS} has hashes of {sum(map(len, found))} images, which is not "
+                f"{self.folder / PARTS_FOLDER} has hashes of {sum(map(len, found))} images, which is not "
                 "the number in the shards. Make the dataset again"
             )
         return found
 
 
-def opened(folder: Path) -> Before:
+def open_existing(folder: Path) -> ExistingDataset:
     """Open a dataset to add recordings to it.
 
     Raises
@@ -73,16 +73,16 @@ def opened(folder: Path) -> Before:
     manifest = read_manifest(folder)
     if manifest is None or not manifest.parts or not any(manifest.splits.values()):
         raise DatasetError(
-            f"{folder} cannot be extended: it has no {layout.MANIFEST}. Make it again "
+            f"{folder} cannot be extended: it has no {layout.MANIFEST_FILE}. Make it again "
             "with dmrl dataset, without --add"
         )
     split, shards = next(one for one in manifest.splits.items() if one[1])
-    grid = schema_of(manifest.place(folder, split, shards[0])).field(layout.CONFIDENCE).type
+    grid = read_schema(manifest.shard_path(folder, split, shards[0])).field(layout.CONFIDENCE).type
     size_px = grid.value_type.list_size * STRIDE_PX, grid.list_size * STRIDE_PX
-    return Before(folder, manifest, made_of(folder, manifest), size_px)
+    return ExistingDataset(folder, manifest, read_combined_provenance(folder, manifest), size_px)
 
 
-def made_of(folder: Path, manifest: Manifest) -> Provenance:
+def read_combined_provenance(folder: Path, manifest: Manifest) -> Provenance:
     """Read the provenance of a dataset: settings of its creation, inputs of all parts.
 
     Raises
@@ -92,15 +92,15 @@ def made_of(folder: Path, manifest: Manifest) -> Provenance:
     """
     parts = []
     for k in range(manifest.parts):  # a damaged manifest can name any number: stop at the first gap
-        part = provenance_of(part_folder(folder, k))
+        part = read_provenance(part_folder(folder, k))
         if part is None:
             lost = part_folder(folder, k)
             raise DatasetError(f"{lost} has no provenance.json. Make the dataset again")
         parts.append(part)
-    return joined(parts)
+    return combine_provenance(parts)
 
 
-def joined(parts: Iterable[Provenance]) -> Provenance:
+def combine_provenance(parts: Iterable[Provenance]) -> Provenance:
     """Return the first provenance with the inputs of all, each once."""
     first, *more = parts
     inputs: dict[str, Input] = {}

@@ -8,30 +8,30 @@ from dmrl import topics
 from dmrl.datasets.manifest import Manifest
 from dmrl.datasets.settings import Settings
 from dmrl.datasets.writing.dataset_writer import Row
-from dmrl.datasets.writing.exclusions import Flag, read_flags
-from dmrl.datasets.writing.rows import Tally, rows_of
-from dmrl.datasets.writing.splits import SplitOf
+from dmrl.datasets.writing.exclusions import FlaggedImage, read_flags
+from dmrl.datasets.writing.rows import ExclusionCounts, iter_row_builders
+from dmrl.datasets.writing.splits import SplitLookup
 from dmrl.errors import RecordingError
-from dmrl.images.prefetch import ahead
-from dmrl.recording import Contents, summary
+from dmrl.images.prefetch import map_ahead
+from dmrl.recording import LoadedRecording, read_summary
 from dmrl.terminal.progress import say, track
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class RowFilter:
     """Filter and contents of the rows; see `iter_row_builders`."""
 
     keep_all: bool
     masks: bool
-    flagged: Set[Flag]
+    flagged: Set[FlaggedImage]
 
 
-def rows(
-    held: Mapping[Path, Contents],
+def iter_rows(
+    held: Mapping[Path, LoadedRecording],
     sources: Mapping[Path, str],
-    split_of: Mapping[Path, SplitOf],
-    tally: Tally,
-    wanted: Wanted,
+    split_of: Mapping[Path, SplitLookup],
+    tally: ExclusionCounts,
+    wanted: RowFilter,
     *,
     total: int,
     size_px: tuple[int, int] | None,
@@ -65,8 +65,8 @@ def rows(
     planned = (
         (path, row)
         for path, source in sources.items()
-        for row in rows_of(
-            held[path] if path in held else Contents(path, topics.LABELS),
+        for row in iter_row_builders(
+            held[path] if path in held else LoadedRecording(path, topics.LABELS),
             source,
             split_of[path],
             tally,
@@ -74,14 +74,14 @@ def rows(
             **how,
         )
     )
-    for path, kept in track(ahead(_made, planned, workers), "Writing images", total):
+    for path, kept in track(map_ahead(_decode_row, planned, workers), "Writing images", total):
         if kept is not None:
             size_px = size_px or kept[1].size_px
-            one_size(path, kept[1], size_px)
+            require_same_size(path, kept[1], size_px)
             yield kept
 
 
-def _made(
+def _decode_row(
     planned: tuple[Path, tuple[str, Callable[[], Row]] | None],
 ) -> tuple[Path, tuple[str, Row] | None]:
     path, kept = planned
@@ -90,10 +90,12 @@ def _made(
 
 def has_masks(recording: Path) -> bool:
     """Return whether a recording has masks."""
-    return any(topics.names(topics.MASKS, topic) for topic in summary(recording).topics)
+    return any(topics.parse_topic(topics.MASKS, topic) for topic in read_summary(recording).topics)
 
 
-def warn_of_others(sources: Mapping[Path, str], others: Mapping[Path, Sequence[str]]) -> None:
+def warn_about_other_sources(
+    sources: Mapping[Path, str], others: Mapping[Path, Sequence[str]]
+) -> None:
     """Report the source of labels used where both truth and estimates exist."""
     for path, used in sources.items():
         if {"truth", "estimate"} <= {*others[path], used}:
@@ -101,7 +103,7 @@ def warn_of_others(sources: Mapping[Path, str], others: Mapping[Path, Sequence[s
             say(f"{path}: labels from {used}, not from {other}, which it has too (--labels)")
 
 
-def one_size(path: Path, row: Row, size_px: tuple[int, int]) -> None:
+def require_same_size(path: Path, row: Row, size_px: tuple[int, int]) -> None:
     """Raise RecordingError unless a row's image has the size of the rows before it."""
     if row.size_px != size_px:
         width_px, height_px = row.size_px
@@ -112,7 +114,7 @@ def one_size(path: Path, row: Row, size_px: tuple[int, int]) -> None:
         )
 
 
-def unused(settings: Settings, tally: Tally) -> None:
+def warn_about_unused_flags(settings: Settings, tally: ExclusionCounts) -> None:
     """Report flags that match no image: they may belong to another recording."""
     if settings.without is not None:
         flags = len(read_flags(settings.without))
@@ -120,8 +122,8 @@ def unused(settings: Settings, tally: Tally) -> None:
             say(f"{settings.without}: {flags - tally.flagged} of {flags} flags name no image here")
 
 
-def explain(
-    recordings: Sequence[Path], manifest: Manifest, tally: Tally, settings: Settings
+def report_left_out(
+    recordings: Sequence[Path], manifest: Manifest, tally: ExclusionCounts, settings: Settings
 ) -> None:
     """Report the images left out, and a missing test split.
 
@@ -130,7 +132,7 @@ def explain(
     RecordingError
         If no image can be used.
     """
-    reasons = [f"{count} images {why}" for why, count in tally.left_out().items() if count]
+    reasons = [f"{count} images {why}" for why, count in tally.count_by_reason().items() if count]
     if not (tally.kept or tally.twice):
         names = ", ".join(str(path) for path in recordings)
         raise RecordingError(

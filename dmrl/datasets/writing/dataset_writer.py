@@ -15,9 +15,9 @@ from dmrl.datasets.manifest import Manifest, Shard
 from dmrl.errors import UnsafeName
 from dmrl.images.codec import encode_png
 
-BATCH_IMAGES = 64
+MAX_BATCH_IMAGES = 64
 """Rows per record batch: 14 MB of 320 x 224 pixels. A split keeps no more rows in memory."""
-BATCH_PIXELS = 20_000_000
+MAX_BATCH_PIXELS = 20_000_000
 """Pixels per record batch. Images larger than 640 x 480 make batches of fewer rows."""
 
 
@@ -93,7 +93,7 @@ class SplitWriter:
         """Add one row; every ``MAX_BATCH_IMAGES`` rows, or ``MAX_BATCH_PIXELS``, go to disk."""
         self._rows.append(row)
         room = self.shard_images - (self._lengths[-1] if self._sink else 0)
-        most = min(BATCH_IMAGES, room, max(1, 3 * BATCH_PIXELS // row.rgb.size))
+        most = min(MAX_BATCH_IMAGES, room, max(1, 3 * MAX_BATCH_PIXELS // row.rgb.size))
         if len(self._rows) >= most:
             self._flush()
             if self._lengths[-1] >= self.shard_images:
@@ -105,7 +105,7 @@ class SplitWriter:
             self._flush()
         self._close_shard()
         count = self.first + len(self._files)
-        names = [self._path(self.first + k, count) for k in range(len(self._files))]
+        names = [self._shard_path(self.first + k, count) for k in range(len(self._files))]
         for file, name in zip(self._files, names, strict=True):
             file.rename(name)
         sizes = [name.stat().st_size for name in names]
@@ -114,19 +114,19 @@ class SplitWriter:
             for name, *found in zip(names, self._lengths, sizes, strict=True)
         ]
 
-    def _path(self, index: int, count: int) -> Path:
+    def _shard_path(self, index: int, count: int) -> Path:
         return layout.shard_path(self.folder, self.name, index, count, parquet=self.parquet)
 
     def _flush(self) -> None:
         if self._sink is None:
             self._open_shard()
-        self._sink.write_batch(_record_batch(self._rows, self.schema, self.name))
+        self._sink.write_batch(_build_record_batch(self._rows, self.schema, self.name))
         self._lengths[-1] += len(self._rows)
         self._rows.clear()
 
     def _open_shard(self) -> None:
         # The number of shards is open until close(); until then the name contains 0.
-        path = self._path(self.first + len(self._files), 0)
+        path = self._shard_path(self.first + len(self._files), 0)
         path.parent.mkdir(exist_ok=True)
         if self.parquet:
             plain = {"compression": "zstd", "use_dictionary": False, "write_statistics": False}
@@ -173,15 +173,15 @@ def write_shards(
     writers: dict[str, SplitWriter] = {}
     for split, row in rows:
         if split not in writers:
-            _refuse_case(split, (*writers, *before.splits))
-            schema = layout.schema(*row.rgb.shape[:2], png=png, masks=row.mask is not None)
+            _reject_case_conflict(split, (*writers, *before.splits))
+            schema = layout.build_schema(*row.rgb.shape[:2], png=png, masks=row.mask is not None)
             first = len(before.splits.get(split, ()))
             writers[split] = SplitWriter(folder, split, schema, before.parquet, shard_images, first)
         writers[split].add(row)
     return {name: writer.close() for name, writer in writers.items()}
 
 
-def _refuse_case(split: str, others: Iterable[str]) -> None:
+def _reject_case_conflict(split: str, others: Iterable[str]) -> None:
     """Raise UnsafeName if two names differ only in case: macOS and Windows merge them."""
     for other in others:
         if other != split and other.casefold() == split.casefold():
@@ -191,35 +191,35 @@ def _refuse_case(split: str, others: Iterable[str]) -> None:
             )
 
 
-def _record_batch(rows: list[Row], schema: pa.Schema, split: str) -> pa.RecordBatch:
+def _build_record_batch(rows: list[Row], schema: pa.Schema, split: str) -> pa.RecordBatch:
     grid = np.stack([row.grid for row in rows]).astype(np.float32, copy=False)
     columns = {
         "peers": pa.array([row.peers for row in rows], schema.field("peers").type),
-        layout.CONFIDENCE: _grid_column(grid[:, 0]),
-        layout.DEPTH: _grid_column(grid[:, 1]),
+        layout.CONFIDENCE: _build_grid_column(grid[:, 0]),
+        layout.DEPTH: _build_grid_column(grid[:, 1]),
         "robot": pa.array([row.robot for row in rows]),
         "source": pa.array([row.source for row in rows]),
         "log_time": pa.array([row.time_ns for row in rows], pa.int64()),
         "split": pa.array([split] * len(rows)),
     }
     if layout.PIXELS in schema.names:
-        columns[layout.PIXELS] = _bytes_column(np.stack([row.rgb for row in rows]))
+        columns[layout.PIXELS] = _build_bytes_column(np.stack([row.rgb for row in rows]))
     else:
         pictures = [
             {"bytes": encode_png(row.rgb), "path": f"{row.robot}_{row.time_ns}.png"} for row in rows
         ]
-        columns[layout.IMAGE] = pa.array(pictures, layout.PNG)
+        columns[layout.IMAGE] = pa.array(pictures, layout.PNG_TYPE)
     if masks := [row.mask for row in rows if row.mask is not None]:
-        columns[layout.MASKS] = _bytes_column(np.stack(masks))
+        columns[layout.MASKS] = _build_bytes_column(np.stack(masks))
     return pa.record_batch([columns[name] for name in schema.names], schema=schema)
 
 
-def _bytes_column(values: NDArray[np.uint8]) -> pa.Array:
+def _build_bytes_column(values: NDArray[np.uint8]) -> pa.Array:
     kind = pa.binary(values[0].size)
     return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(values)])
 
 
-def _grid_column(grid: NDArray[np.float32]) -> pa.Array:
+def _build_grid_column(grid: NDArray[np.float32]) -> pa.Array:
     _, rows, cols = grid.shape
     flat = pa.array(np.ascontiguousarray(grid).ravel())
     row = pa.FixedSizeListArray.from_arrays(flat, cols)

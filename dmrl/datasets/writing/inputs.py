@@ -6,14 +6,16 @@ from pathlib import Path
 
 from dmrl import topics
 from dmrl.errors import SettingError
-from dmrl.recording import Contents, Input, Provenance
+from dmrl.recording import Input, LoadedRecording, Provenance
 from dmrl.terminal.progress import say
 
-SAME_LENS = 1.05
+MAX_FOCAL_RATIO = 1.05
 """Largest ratio of the focal lengths of one dataset without a warning."""
 
 
-def refuse_twins(recordings: Sequence[Path], made: Provenance, there: Sequence[Input] = ()) -> None:
+def reject_duplicates(
+    recordings: Sequence[Path], made: Provenance, there: Sequence[Input] = ()
+) -> None:
     """Raise SettingError if two recordings share a name, their bytes or their images.
 
     Parameters
@@ -36,11 +38,11 @@ def refuse_twins(recordings: Sequence[Path], made: Provenance, there: Sequence[I
             raise SettingError(f"{twin} and {path} hold the same bytes. Name only one of them")
     for path, source in zip(recordings, made.inputs, strict=False):
         # Both have the same images: one could be in train, the other in test.
-        for twin in (contents[sha] for sha in _shown_by(source) if sha in contents):
+        for twin in (contents[sha] for sha in _iter_source_hashes(source) if sha in contents):
             raise SettingError(f"{path} is made from {twin}. Name only one of them")
 
 
-def _shown_by(recording: Input) -> Iterator[str]:
+def _iter_source_hashes(recording: Input) -> Iterator[str]:
     """Yield the hashes of the files that a recording has its images from.
 
     Files behind a dataset are left out: renders over its images, and labels of a model that was
@@ -50,20 +52,20 @@ def _shown_by(recording: Input) -> Iterator[str]:
     if made is not None and made.stage != "dataset":
         for source in made.inputs:
             yield source.sha256
-            yield from _shown_by(source)
+            yield from _iter_source_hashes(source)
 
 
-def focal_lengths(held: Contents) -> list[float]:
+def read_focal_lengths(held: LoadedRecording) -> list[float]:
     """Return the focal lengths of a recording's calibrated cameras, pixels."""
     found = []
     for topic in held.topics:
-        if topics.names(topics.CALIBRATION, topic):
-            first = (stamped.message.K for stamped in islice(held.messages(topic), 1))
+        if topics.parse_topic(topics.CALIBRATION, topic):
+            first = (stamped.message.K for stamped in islice(held.iter_messages(topic), 1))
             found += [k[0] for k in first if len(k) == 9 and k[0] > 0]
     return found
 
 
-def warn_of_lenses(focal_px: Sequence[float]) -> None:
+def warn_about_lenses(focal_px: Sequence[float]) -> None:
     """Warn if the cameras differ: the size of a drone alone then gives no depth.
 
     Parameters
@@ -71,7 +73,7 @@ def warn_of_lenses(focal_px: Sequence[float]) -> None:
     focal_px
         Focal lengths of all cameras.
     """
-    if focal_px and max(focal_px) > SAME_LENS * min(focal_px):
+    if focal_px and max(focal_px) > MAX_FOCAL_RATIO * min(focal_px):
         say(
             f"the cameras have focal lengths from {min(focal_px):.0f} to {max(focal_px):.0f} px: "
             "a drone appears larger through the longer one, and a network estimates a smaller "

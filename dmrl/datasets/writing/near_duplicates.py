@@ -16,32 +16,32 @@ from numpy.typing import NDArray
 from dmrl.datasets.writing.dataset_writer import Row
 from dmrl.errors import DatasetError
 
-FILE = "seen.bin"
+HASHES_FILE = "seen.bin"
 """File of the hashes in the folder of a part."""
-NEAR_BITS = 6
+NEAR_DUPLICATE_BITS = 6
 """Largest difference of two 64-bit perceptual hashes that count as near duplicates.
 
 People cannot tell such images apart.
 """
-AT_ONCE = 64
+COMPARED_AT_ONCE = 64
 """Test images that are compared with all of train at a time."""
-MOST_PAIRS = 500_000_000
+MAX_COMPARED_PAIRS = 500_000_000
 """Pairs of a test and a train image that are compared, at most: one second. Beyond it, test images
 are sampled.
 """
-FRESH = 65_536
+MAX_UNSORTED_KEYS = 65_536
 """Keys that are collected in a set before they are merged into a sorted array.
 
 The array needs a twelfth of the memory.
 """
-DTYPE = np.dtype([("key", "<u8"), ("pixels", "<u8"), ("look", "<u8"), ("train", "?")])
+HASHES_DTYPE = np.dtype([("key", "<u8"), ("pixels", "<u8"), ("look", "<u8"), ("train", "?")])
 """Hash of an image's robot, time and pixels; hash of its pixels; perceptual hash; is it in
 train."""
 
 Hashes = NDArray[np.uint64]
 
 
-def perceptual_hash(rgb: NDArray[np.uint8]) -> int:
+def compute_perceptual_hash(rgb: NDArray[np.uint8]) -> int:
     """Return the 64-bit difference hash of an image, which changes little when the image does.
 
     The green channel is reduced to 8 x 9 means. Each bit is 1 if brightness rises from a mean to
@@ -63,7 +63,7 @@ def perceptual_hash(rgb: NDArray[np.uint8]) -> int:
     return int.from_bytes(bits.tobytes(), "big")
 
 
-class Seen:
+class ImageHashes:
     """Hashes of the images of a dataset, those stored before and those added now.
 
     Parameters
@@ -76,10 +76,10 @@ class Seen:
         self._before = before
         self._own = tuple(array("Q") for _ in range(3))
         self._train = bytearray()
-        self._sorted: Hashes = np.sort(self._known("key"))
+        self._sorted: Hashes = np.sort(self._concatenate_column("key"))
         self._fresh: set[int] = set()
 
-    def new(
+    def filter_new(
         self, rows: Iterable[tuple[str, Row]], refuse: Callable[[], None] | None
     ) -> Iterator[tuple[str, Row]]:
         """Yield the rows whose image is new, by robot, time and pixels, and store their hashes.
@@ -92,49 +92,49 @@ class Seen:
             Called for every duplicate, which is skipped. None: duplicates are yielded as well.
         """
         for split, row in rows:
-            pixels = _hash(np.ascontiguousarray(row.rgb).data)
-            key = _hash(f"{pixels} {row.time_ns} {row.robot}".encode())
-            if refuse is not None and self._has(key):
+            pixels = _hash_bytes(np.ascontiguousarray(row.rgb).data)
+            key = _hash_bytes(f"{pixels} {row.time_ns} {row.robot}".encode())
+            if refuse is not None and self._contains_key(key):
                 refuse()
                 continue
-            self._add(key)
+            self._add_key(key)
             for column, value in zip(
-                self._own, (key, pixels, perceptual_hash(row.rgb)), strict=True
+                self._own, (key, pixels, compute_perceptual_hash(row.rgb)), strict=True
             ):
                 column.append(value)
             self._train.append(split == "train")
             yield split, row
 
-    def _has(self, key: int) -> bool:
+    def _contains_key(self, key: int) -> bool:
         at = int(np.searchsorted(self._sorted, np.uint64(key)))
         return key in self._fresh or (at < len(self._sorted) and int(self._sorted[at]) == key)
 
-    def _add(self, key: int) -> None:
+    def _add_key(self, key: int) -> None:
         self._fresh.add(key)
-        if len(self._fresh) >= FRESH:
+        if len(self._fresh) >= MAX_UNSORTED_KEYS:
             fresh = np.fromiter(self._fresh, np.uint64, len(self._fresh))
             self._sorted = np.sort(np.concatenate([self._sorted, fresh]))
             self._fresh.clear()
 
-    def _known(self, column: str, *, train: bool | None = None) -> Hashes:
+    def _concatenate_column(self, column: str, *, train: bool | None = None) -> Hashes:
         """Return a column of all images, existing ones first; ``train`` selects the splits."""
-        every = (*self._before, self._mine())
+        every = (*self._before, self._collect_added())
         return np.concatenate(
             [one[column] if train is None else one[column][one["train"] == train] for one in every]
         )
 
-    def _mine(self) -> NDArray[np.void]:
-        found = np.empty(len(self._train), DTYPE)
-        for name, column in zip(DTYPE.names or (), (*self._own, self._train), strict=True):
+    def _collect_added(self) -> NDArray[np.void]:
+        found = np.empty(len(self._train), HASHES_DTYPE)
+        for name, column in zip(HASHES_DTYPE.names or (), (*self._own, self._train), strict=True):
             found[name] = column
         return found
 
-    def twins(self) -> int:
+    def count_exact_duplicates(self) -> int:
         """Count the images outside train whose pixels are in train as well."""
-        others = self._known("pixels", train=False)
-        return int(np.isin(others, self._known("pixels", train=True)).sum())
+        others = self._concatenate_column("pixels", train=False)
+        return int(np.isin(others, self._concatenate_column("pixels", train=True)).sum())
 
-    def near(self) -> tuple[int, int, int]:
+    def count_near_duplicates(self) -> tuple[int, int, int]:
         """Count the near duplicates of train images among the images outside train.
 
         Returns
@@ -142,21 +142,24 @@ class Seen:
         tuple[int, int, int]
             Near duplicates, compared images, and all images outside train.
         """
-        train = np.unique(self._known("look", train=True))
-        every = self._known("look", train=False)
-        others = every[:: max(1, -(-len(every) * len(train) // MOST_PAIRS))]
+        train = np.unique(self._concatenate_column("look", train=True))
+        every = self._concatenate_column("look", train=False)
+        others = every[:: max(1, -(-len(every) * len(train) // MAX_COMPARED_PAIRS))]
         if not len(train):
             return 0, len(every), len(every)
-        parts = (others[k : k + AT_ONCE, None] ^ train for k in range(0, len(others), AT_ONCE))
-        alike = (np.bitwise_count(one).min(axis=1) <= NEAR_BITS for one in parts)
+        parts = (
+            others[k : k + COMPARED_AT_ONCE, None] ^ train
+            for k in range(0, len(others), COMPARED_AT_ONCE)
+        )
+        alike = (np.bitwise_count(one).min(axis=1) <= NEAR_DUPLICATE_BITS for one in parts)
         return sum(int(one.sum()) for one in alike), len(others), len(every)
 
     def write(self, folder: Path) -> None:
         """Write the hashes of the added images into a part's folder."""
-        (folder / FILE).write_bytes(self._mine().tobytes())
+        (folder / HASHES_FILE).write_bytes(self._collect_added().tobytes())
 
 
-def read_seen(folder: Path) -> NDArray[np.void]:
+def read_hashes(folder: Path) -> NDArray[np.void]:
     """Map the hashes that `ImageHashes.write` wrote.
 
     Raises
@@ -164,15 +167,15 @@ def read_seen(folder: Path) -> NDArray[np.void]:
     DatasetError
         If the file is missing or damaged.
     """
-    path = folder / FILE
+    path = folder / HASHES_FILE
     try:
         if not path.stat().st_size:
-            return np.empty(0, DTYPE)  # an empty file cannot be mapped
-        return np.memmap(os.fspath(path), DTYPE, "r")
+            return np.empty(0, HASHES_DTYPE)  # an empty file cannot be mapped
+        return np.memmap(os.fspath(path), HASHES_DTYPE, "r")
     except (OSError, ValueError) as e:
         why = " ".join(str(e).split())
         raise DatasetError(f"{path} is missing or damaged ({why}). Make the dataset again") from e
 
 
-def _hash(data: bytes | memoryview) -> int:
+def _hash_bytes(data: bytes | memoryview) -> int:
     return int.from_bytes(hashlib.blake2b(data, digest_size=8).digest(), "big")

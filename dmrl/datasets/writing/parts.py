@@ -4,13 +4,18 @@ from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from dmrl.datasets.writing.inputs import refuse_twins
-from dmrl.datasets.writing.splits import SplitOf, held_out, held_out_alone, of_source
+from dmrl.datasets.writing.inputs import reject_duplicates
+from dmrl.datasets.writing.splits import (
+    SplitLookup,
+    build_split_lookup,
+    choose_test_independently,
+    choose_test_recordings,
+)
 from dmrl.errors import SettingError
 from dmrl.recording import Input, Provenance
 
 
-def splits_of(
+def assign_splits(
     recordings: Mapping[Path, Mapping[str, Sequence[tuple[int, int]]]],
     made: Provenance,
     *,
@@ -19,7 +24,7 @@ def splits_of(
     test_share: float,
     seed: int,
     there: Sequence[Input] | None = None,
-) -> dict[Path, SplitOf]:
+) -> dict[Path, SplitLookup]:
     """Return the split of every log time, by recording.
 
     Parameters
@@ -44,7 +49,7 @@ def splits_of(
         If a recording defines its splits in an invalid form.
     """
     hashes = {path: source.sha256 for path, source in zip(recordings, made.inputs, strict=False)}
-    refuse_twins(list(recordings), made, there or ())
+    reject_duplicates(list(recordings), made, there or ())
     watched = [path for path in recordings if fnmatchcase(path.name, val)]
     if val and not watched and there is None:
         names = ", ".join(path.name for path in recordings)
@@ -53,11 +58,15 @@ def splits_of(
     by_source = {path: recordings[path] for path in learnt if recordings[path]}
     rest = {path: hashes[path] for path in learnt if path not in by_source}
     share = 0.0 if whole else test_share
-    test = held_out(rest, share, seed) if there is None else held_out_alone(rest, share, seed)
-    named = {path: _constant("test" if path in test else "train") for path in rest}
-    named |= {path: of_source(path, parts) for path, parts in by_source.items()}
-    return named | {path: _constant("val") for path in watched}
+    test = (
+        choose_test_recordings(rest, share, seed)
+        if there is None
+        else choose_test_independently(rest, share, seed)
+    )
+    named = {path: _constant_split("test" if path in test else "train") for path in rest}
+    named |= {path: build_split_lookup(path, parts) for path, parts in by_source.items()}
+    return named | {path: _constant_split("val") for path in watched}
 
 
-def _constant(name: str) -> SplitOf:
+def _constant_split(name: str) -> SplitLookup:
     return lambda time_ns: name

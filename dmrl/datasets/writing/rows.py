@@ -22,35 +22,35 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.datasets.layout import PEER
+from dmrl.datasets.layout import PEER_TYPE
 from dmrl.datasets.writing.dataset_writer import Row
-from dmrl.datasets.writing.exclusions import Flag
-from dmrl.datasets.writing.splits import SplitOf
+from dmrl.datasets.writing.exclusions import FlaggedImage
+from dmrl.datasets.writing.splits import SplitLookup
 from dmrl.errors import RecordingError, SettingError
-from dmrl.geometry.frames import STRIDE_PX, grid_label
+from dmrl.geometry.frames import STRIDE_PX, build_grid_label
 from dmrl.images.codec import decode
-from dmrl.messages import STATUS_OK, status_name
-from dmrl.recording import Contents, Stamped, read
-from dmrl.recording.label_sources import LOOKED, looked_at, sources_in
+from dmrl.messages import STATUS_OK, to_status_name
+from dmrl.recording import LoadedRecording, Stamped, read
+from dmrl.recording.label_sources import SOURCE_FIELDS, collect_sources, get_message_sources
 from dmrl.recording.mcap.shared_file import share_file
 
-SOURCES = ("truth", "estimate", "hand", "published")
+LABEL_SOURCES = ("truth", "estimate", "hand", "published")
 """Sources of labels, best first."""
 
-TAUGHT = ("estimate", "truth", "hand", "published")
+TRAINING_SOURCES = ("estimate", "truth", "hand", "published")
 """Sources of labels in the order of training.
 
 Estimates come first: who labels a flight that has true positions wants to measure the estimates.
 """
 
-PATTERNS = (topics.camera_image("*"), topics.labels("*"))
+TOPIC_PATTERNS = (topics.CAMERA_IMAGE("*"), topics.LABELS("*"))
 
 Mask = NDArray[np.uint8]
 """(H, W) index of the peer that each pixel shows, from 1 among the labels; 0 for the background."""
 
 
 @dataclass(slots=True)
-class Tally:
+class ExclusionCounts:
     """Number of images kept, and of images left out by reason."""
 
     kept: int = 0
@@ -62,11 +62,11 @@ class Tally:
     flagged: int = 0
     twice: int = 0
 
-    def refuse_twin(self) -> None:
+    def count_duplicate(self) -> None:
         """Count an image as a duplicate that was counted as kept before."""
         self.kept, self.twice = self.kept - 1, self.twice + 1
 
-    def left_out(self) -> dict[str, int]:
+    def count_by_reason(self) -> dict[str, int]:
         """Return the number of images left out, by reason."""
         return {
             "had no labels": self.without_labels,
@@ -79,7 +79,7 @@ class Tally:
         }
 
 
-def count_images(held: Contents) -> int:
+def count_images(held: LoadedRecording) -> int:
     """Count the images of a recording, labelled or not.
 
     Raises
@@ -89,25 +89,25 @@ def count_images(held: Contents) -> int:
     RecordingError
         If one of these topics contains another message type.
     """
-    found = held.matching(*PATTERNS)
-    return sum(held.topics[t].count for t in found if topics.names(topics.CAMERA_IMAGE, t))
+    found = held.matching(*TOPIC_PATTERNS)
+    return sum(held.topics[t].count for t in found if topics.parse_topic(topics.CAMERA_IMAGE, t))
 
 
-def sources_of(held: Contents) -> set[str]:
+def find_label_sources(held: LoadedRecording) -> set[str]:
     """Return every source of labels that a recording has."""
     present: set[str] = set()
     for topic in held.topics:
-        if topics.names(topics.LABELS, topic):
-            table = held.table(topic, LOOKED).combine_chunks()
-            present.update(sources_in(*(_chunk(table, name) for name in LOOKED)))
+        if topics.parse_topic(topics.LABELS, topic):
+            table = held.get_table(topic, SOURCE_FIELDS).combine_chunks()
+            present.update(collect_sources(*(_first_chunk(table, name) for name in SOURCE_FIELDS)))
     return present
 
 
-def _chunk(table: pa.Table, name: str) -> pa.Array:
+def _first_chunk(table: pa.Table, name: str) -> pa.Array:
     return table.column(name).chunk(0)
 
 
-def label_source(held: Contents, wanted: str) -> str:
+def choose_label_source(held: LoadedRecording, wanted: str) -> str:
     """Choose the source whose labels are used for a recording.
 
     Parameters
@@ -123,8 +123,8 @@ def label_source(held: Contents, wanted: str) -> str:
     SettingError
         If the recording has labels, but none from that source.
     """
-    present = sources_of(held)
-    order = {"best": SOURCES, "auto": TAUGHT}.get(wanted, (wanted,))
+    present = find_label_sources(held)
+    order = {"best": LABEL_SOURCES, "auto": TRAINING_SOURCES}.get(wanted, (wanted,))
     if not present:
         return order[0]
     usable = [source for source in order if source in present]
@@ -134,15 +134,15 @@ def label_source(held: Contents, wanted: str) -> str:
     return usable[0]
 
 
-def rows_of(
-    held: Contents,
+def iter_row_builders(
+    held: LoadedRecording,
     source: str,
-    split_of: SplitOf,
-    tally: Tally,
+    split_of: SplitLookup,
+    tally: ExclusionCounts,
     *,
     keep_all: bool,
     masks: bool,
-    flagged: Set[Flag] = frozenset(),
+    flagged: Set[FlaggedImage] = frozenset(),
 ) -> Iterator[tuple[str, Callable[[], Row]] | None]:
     """Yield the split and a row builder for each image, in time order; None for one left out.
 
@@ -167,16 +167,16 @@ def rows_of(
     flagged
         Images that are left out.
     """
-    for image, labels, covered in labelled_images(held, masks=masks):
+    for image, labels, covered in iter_labelled_images(held, masks=masks):
         split = split_of(image.time_ns)
         mine = [] if labels is None else [one for one in labels.peers if one.source == source]
-        if flagged and (held.path.name, _robot(image), image.time_ns) in flagged:
+        if flagged and (held.path.name, _parse_robot(image), image.time_ns) in flagged:
             tally.flagged += 1
         elif labels is None:
             tally.without_labels += 1
         elif split is None:
             tally.in_no_split += 1
-        elif source not in (looked_at(labels) or {source}):
+        elif source not in (get_message_sources(labels) or {source}):
             tally.of_other_sources += 1
         elif masks and covered is None and mine:
             tally.without_mask += 1
@@ -184,35 +184,35 @@ def rows_of(
             tally.not_ok += 1
         else:
             tally.kept += 1
-            yield split, partial(_row, held.path, image, mine, covered, masks=masks)
+            yield split, partial(_build_row, held.path, image, mine, covered, masks=masks)
             continue
         yield None
 
 
-def labelled_images(
-    held: Contents, *, masks: bool = False
+def iter_labelled_images(
+    held: LoadedRecording, *, masks: bool = False
 ) -> Iterator[tuple[Stamped, Any, Stamped | None]]:
     """Yield each image with its PeerLabels and, on request, its masks, or None.
 
     Labels and masks have the robot and the log time of the image.
     """
-    labels = _labels(held)
-    wanted = [t for t in held.topics if topics.names(topics.CAMERA_IMAGE, t)]
-    wanted += [t for t in held.topics if masks and topics.names(topics.MASKS, t)]
+    labels = _group_labels(held)
+    wanted = [t for t in held.topics if topics.parse_topic(topics.CAMERA_IMAGE, t)]
+    wanted += [t for t in held.topics if masks and topics.parse_topic(topics.MASKS, t)]
     for _, same_time in groupby(_read_once(held.path, wanted), key=lambda stamped: stamped.time_ns):
         images: list[Stamped] = []
         covered: dict[str, Stamped] = {}
         for stamped in same_time:
-            if link := topics.names(topics.MASKS, stamped.topic):
+            if link := topics.parse_topic(topics.MASKS, stamped.topic):
                 covered[link["robot"]] = stamped
             else:
                 images.append(stamped)
-        _refuse_two_of_one_time(held.path, images)
+        _reject_duplicate_times(held.path, images)
         for image in images:
-            robot = _robot(image)
+            robot = _parse_robot(image)
             yield (
                 image,
-                labels[robot].at(image.time_ns) if robot in labels else None,
+                labels[robot].find_at(image.time_ns) if robot in labels else None,
                 covered.get(robot),
             )
 
@@ -222,20 +222,22 @@ def _read_once(path: Path, wanted: list[str]) -> Iterator[Stamped]:
         yield from read(path, *wanted)
 
 
-def _labels(held: Contents) -> dict[str, "_Series"]:
+def _group_labels(held: LoadedRecording) -> dict[str, "_LabelSeries"]:
     """Return the labels by robot."""
-    found = ((topic, topics.names(topics.LABELS, topic)) for topic in held.topics)
-    return {n["robot"]: _Series(held.messages(topic)) for topic, n in found if n is not None}
+    found = ((topic, topics.parse_topic(topics.LABELS, topic)) for topic in held.topics)
+    return {
+        n["robot"]: _LabelSeries(held.iter_messages(topic)) for topic, n in found if n is not None
+    }
 
 
-class _Series:
+class _LabelSeries:
     """Messages in time order, looked up at increasing times."""
 
     def __init__(self, messages: Iterator[Stamped]) -> None:
         self._groups = groupby(messages, key=lambda stamped: stamped.time_ns)
         self._next = next(self._groups, None)
 
-    def at(self, time_ns: int) -> Any:
+    def find_at(self, time_ns: int) -> Any:
         """Return all messages of a time merged into one, or None.
 
         Two recordings of the same images, merged, may have different sources.
@@ -251,7 +253,7 @@ class _Series:
         return first
 
 
-def _refuse_two_of_one_time(path: Path, images: list[Stamped]) -> None:
+def _reject_duplicate_times(path: Path, images: list[Stamped]) -> None:
     """Raise RecordingError if a camera has two images at one time: labels belong to one of them."""
     seen: set[str] = set()
     for image in images:
@@ -263,7 +265,7 @@ def _refuse_two_of_one_time(path: Path, images: list[Stamped]) -> None:
         seen.add(image.topic)
 
 
-def _mask(path: Path, row: Row, covered: Stamped | None) -> Mask:
+def _decode_mask(path: Path, row: Row, covered: Stamped | None) -> Mask:
     """Decode a mask, and replace the numbers in peers' names by indices into the row's peers."""
     shape = row.rgb.shape[:2]
     if covered is None:
@@ -282,16 +284,16 @@ def _mask(path: Path, row: Row, covered: Stamped | None) -> Mask:
     return place[numbers]
 
 
-def _robot(image: Stamped) -> str:
-    return (topics.names(topics.CAMERA_IMAGE, image.topic) or {})["robot"]
+def _parse_robot(image: Stamped) -> str:
+    return (topics.parse_topic(topics.CAMERA_IMAGE, image.topic) or {})["robot"]
 
 
-def _peer(label: Any) -> dict[str, Any]:
-    peer = {field.name: getattr(label, field.name) for field in PEER}
-    return {**peer, "box_px": list(label.box_px), "status": status_name(label.status)}
+def _peer_to_dict(label: Any) -> dict[str, Any]:
+    peer = {field.name: getattr(label, field.name) for field in PEER_TYPE}
+    return {**peer, "box_px": list(label.box_px), "status": to_status_name(label.status)}
 
 
-def _row(
+def _build_row(
     path: Path, image: Stamped, labels: list[Any], covered: Stamped | None, *, masks: bool
 ) -> Row:
     what = f"{path}: the image of {image.topic} at {image.time_ns} ns"
@@ -303,10 +305,10 @@ def _row(
             "Scale it: dmrl convert --from images --width-px 320 --height-px 224"
         )
     # A label with a sigma as large as the image gives no position.
-    peers = [peer for peer in map(_peer, labels) if peer["sigma_u_px"] < width_px]
+    peers = [peer for peer in map(_peer_to_dict, labels) if peer["sigma_u_px"] < width_px]
     uv_depth = np.array([[p["u_px"], p["v_px"], p["depth_m"]] for p in peers]).reshape(-1, 3)
     ahead = uv_depth[np.isfinite(uv_depth).all(axis=1) & (uv_depth[:, 2] > 0)]
     shape = (height_px // STRIDE_PX, width_px // STRIDE_PX)
-    grid = grid_label(ahead[:, :2], ahead[:, 2], shape=shape)
-    row = Row(rgb, peers, grid, _robot(image), path.name, image.time_ns)
-    return replace(row, mask=_mask(path, row, covered)) if masks else row
+    grid = build_grid_label(ahead[:, :2], ahead[:, 2], shape=shape)
+    row = Row(rgb, peers, grid, _parse_robot(image), path.name, image.time_ns)
+    return replace(row, mask=_decode_mask(path, row, covered)) if masks else row

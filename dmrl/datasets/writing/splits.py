@@ -12,11 +12,11 @@ from pathlib import Path
 
 from dmrl.errors import RecordingError
 
-SplitOf = Callable[[int], str | None]
+SplitLookup = Callable[[int], str | None]
 """Maps a log time, nanoseconds, to the name of a split; None for an image in no split."""
 
 
-def held_out(sha256: Mapping[Path, str], test_share: float, seed: int) -> set[Path]:
+def choose_test_recordings(sha256: Mapping[Path, str], test_share: float, seed: int) -> set[Path]:
     """Choose the recordings that become the test split, whole.
 
     Recordings are ordered by a hash of content and seed, independent of their names.
@@ -41,7 +41,9 @@ def held_out(sha256: Mapping[Path, str], test_share: float, seed: int) -> set[Pa
     return set(sorted(sha256, key=rank)[:count])
 
 
-def held_out_alone(sha256: Mapping[Path, str], test_share: float, seed: int) -> set[Path]:
+def choose_test_independently(
+    sha256: Mapping[Path, str], test_share: float, seed: int
+) -> set[Path]:
     """Choose the test recordings among those that are added; see `choose_test_recordings`.
 
     The hash of each recording decides alone, so the choice does not depend on other recordings.
@@ -54,7 +56,7 @@ def held_out_alone(sha256: Mapping[Path, str], test_share: float, seed: int) -> 
     return {path for path in sha256 if drawn(path) < test_share}
 
 
-def of_source(path: Path, own: Mapping[str, Sequence[tuple[int, int]]]) -> SplitOf:
+def build_split_lookup(path: Path, own: Mapping[str, Sequence[tuple[int, int]]]) -> SplitLookup:
     """Return the splits that a recording itself defines, as a function of log time.
 
     Parameters

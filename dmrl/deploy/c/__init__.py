@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.c.refinement_code import refinement
-from dmrl.deploy.c.self_test import MOST, vectors
-from dmrl.deploy.c.source_file import Source, source
-from dmrl.deploy.c.templating import c_name, fill, names_of
+from dmrl.deploy.c.refinement_code import generate_refinement
+from dmrl.deploy.c.self_test import MAX_DETECTIONS, generate_vectors
+from dmrl.deploy.c.source_file import CSource, generate_source
+from dmrl.deploy.c.templating import c_name, fill_template, template_values
 from dmrl.deploy.int8.network import IntegerNetwork
 
 __all__ = ["c_name", "write_c"]
 
-STACKS_BYTES = 8 * 1024
+CORE_STACKS_BYTES = 8 * 1024
 """Bytes of a GAP8's L1 for the stacks of eight cores, one kilobyte each."""
-L1_FOR_STATE = 64 * 1024 - STACKS_BYTES
+MAX_L1_STATE_BYTES = 64 * 1024 - CORE_STACKS_BYTES
 """Bytes of a GAP8's L1 available for the state."""
 
 
@@ -59,25 +59,27 @@ def write_c(
     SettingError
         If the near memory is too small.
     """
-    names, name = names_of(network), c_name(network)
-    made = source(network, names, bayer=bayer, features=refine, near_bytes=near_bytes)
-    files = refinement(network, names) if refine else {}
+    names, name = template_values(network), c_name(network)
+    made = generate_source(network, names, bayer=bayer, features=refine, near_bytes=near_bytes)
+    files = generate_refinement(network, names) if refine else {}
     files |= {
         f"{name}.c": made.code,
         f"{name}.h": made.header,
-        f"{name}_vectors.h": vectors(network, images, names, bayer=bayer),
-        "main.c": fill("main.c", **names, most=MOST),
-        "Makefile": fill("Makefile", **names),
-        "README.md": _readme(network, names, made, bayer=bayer),
+        f"{name}_vectors.h": generate_vectors(network, images, names, bayer=bayer),
+        "main.c": fill_template("main.c", **names, most=MAX_DETECTIONS),
+        "Makefile": fill_template("Makefile", **names),
+        "README.md": _generate_readme(network, names, made, bayer=bayer),
     }
     for file, text in files.items():
         (folder / file).write_text(text, encoding="utf-8")
     return list(files)
 
 
-def _readme(network: IntegerNetwork, names: dict[str, str], made: Source, *, bayer: bool) -> str:
+def _generate_readme(
+    network: IntegerNetwork, names: dict[str, str], made: CSource, *, bayer: bool
+) -> str:
     far = f"static {names['prefix']}_far_t away;" if made.far_bytes else ""
-    return fill(
+    return fill_template(
         "README.md",
         **names,
         state_bytes=made.state_bytes,
@@ -86,9 +88,11 @@ def _readme(network: IntegerNetwork, names: dict[str, str], made: Source, *, bay
         stack_bytes=made.stack_bytes,
         input="raw Bayer images" if bayer else "RGB" if network.channels == 3 else "grey",
         macs=f"{network.macs / 1e6:.1f}",
-        memory="L1" if made.state_bytes <= L1_FOR_STATE else "L2",
+        memory="L1" if made.state_bytes <= MAX_L1_STATE_BYTES else "L2",
         refs="&net, &away" if far else "&net",
         away=f"{far} /* {made.far_bytes} bytes, in a larger one */\n" if far else "",
         l2_away=f"PI_L2 {far}\n" if far else "",
-        far=fill("readme_far.md", **names, traffic_bytes=made.traffic_bytes) if far else "",
+        far=fill_template("readme_far.md", **names, traffic_bytes=made.traffic_bytes)
+        if far
+        else "",
     )

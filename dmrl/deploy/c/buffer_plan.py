@@ -7,11 +7,18 @@ steps is a ring buffer of its newest rows, see `row_schedule`.
 import re
 from dataclasses import dataclass, replace
 
-from dmrl.deploy.c.row_schedule import Step, Write, needed_together, play, rows_held, shared_ring
+from dmrl.deploy.c.row_schedule import (
+    RowEvent,
+    Step,
+    count_ring_rows,
+    find_overlaps,
+    schedule_rows,
+    share_ring,
+)
 from dmrl.deploy.int8.network import Conv, IntegerNetwork, MaxPool, Shape
 from dmrl.errors import ModelError
 
-LONGEST_SIDE = 4096
+MAX_SIDE_PX = 4096
 """Largest side of an image, pixels: rows are counted in int16, and chips are small."""
 
 
@@ -55,7 +62,7 @@ class Buffer:
     ring: int
     signed: bool
     shift: int = 0
-    far: bool = False
+    in_l2: bool = False
 
     @property
     def row_bytes(self) -> int:
@@ -74,7 +81,7 @@ class Buffer:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class BufferPlan:
     """Steps in order; step i reads buffers up to i and writes buffer i + 1."""
 
     network: IntegerNetwork
@@ -84,15 +91,15 @@ class Plan:
     """Buffer of every tensor of the network; -1 for a tensor inside a fused step."""
     whole: frozenset[int]
     """Buffers kept whole, since they are read after the last row."""
-    stage: int = 0
+    l1_scratch_bytes: int = 0
     """Bytes of scratch memory in L1 if there are two memories, see `memory_levels`; 0: one
     memory."""
 
-    def homes(self, *, far: bool) -> dict[str, int]:
+    def member_bytes(self, *, in_l2: bool) -> dict[str, int]:
         """Return the members of the near or the far state that contain rings, and their bytes."""
         return {
             name: max(b.size for b in self.buffers if b.home == name)
-            for name in dict.fromkeys(b.home for b in self.buffers if b.far == far)
+            for name in dict.fromkeys(b.home for b in self.buffers if b.in_l2 == in_l2)
         }
 
     @property
@@ -103,11 +110,11 @@ class Plan:
 
     def state_bytes(self, *, bayer: bool) -> int:
         """Return the bytes of the (near) state, with or without raw Bayer images."""
-        used = 2 * len(self.buffers) + sum(self.homes(far=False).values()) + self.pad_bytes
+        used = 2 * len(self.buffers) + sum(self.member_bytes(in_l2=False).values()) + self.pad_bytes
         used += 2 + 3 * self.network.width_px if bayer else 0
-        if not self.stage:
-            return up(used, 2)
-        return up(used + self.zero_bytes + self.stage, 4)
+        if not self.l1_scratch_bytes:
+            return round_up(used, 2)
+        return round_up(used + self.zero_bytes + self.l1_scratch_bytes, 4)
 
     @property
     def pad_bytes(self) -> int:
@@ -116,7 +123,7 @@ class Plan:
         return image.padded_bytes if image.above and image.pad_value else 0
 
 
-def plan(network: IntegerNetwork, *, features: bool = False) -> Plan:
+def plan_buffers(network: IntegerNetwork, *, features: bool = False) -> BufferPlan:
     """Plan the buffers of a network's C.
 
     Parameters
@@ -131,31 +138,33 @@ def plan(network: IntegerNetwork, *, features: bool = False) -> Plan:
     ModelError
         If the image is too large for the C.
     """
-    if max(network.height_px, network.width_px) > LONGEST_SIDE:
+    if max(network.height_px, network.width_px) > MAX_SIDE_PX:
         raise ModelError(
             f"{network.name} takes images of {network.width_px} x {network.height_px} px, the C "
-            f"at most {LONGEST_SIDE}. Train it on smaller images"
+            f"at most {MAX_SIDE_PX}. Train it on smaller images"
         )
-    steps, tensors = _steps(network)
+    steps, tensors = _build_steps(network)
     shapes = [network.shapes[tensors.index(k)] for k in range(len(steps) + 1)]
     whole = frozenset(tensors[h.tensor] for h in network.heads.values())
     if features:
         whole |= set(steps[-1].sources)
-    writes = play(steps, [rows for _, rows, _ in shapes])
-    rings = rows_held(writes, len(shapes))
-    drafts = [_buffer(k, shapes[k], rings[k], steps) for k in range(len(shapes))]
+    writes = schedule_rows(steps, [rows for _, rows, _ in shapes])
+    rings = count_ring_rows(writes, len(shapes))
+    drafts = [_build_buffer(k, shapes[k], rings[k], steps) for k in range(len(shapes))]
     drafts = [replace(d, ring=d.rows) if k in whole else d for k, d in enumerate(drafts)]
     passing = [
         k for k, d in enumerate(drafts) if k and k not in whole and d.ring == 1 and not d.gap
     ]
-    homes = _homes(passing, needed_together(writes))
+    homes = _share_members(passing, find_overlaps(writes))
     buffers = [replace(d, home=homes.get(k, d.name)) for k, d in enumerate(drafts)]
-    for chain in _chains(steps, buffers, whole):
-        buffers = _joined(buffers, chain, writes)
-    return Plan(network, tuple(steps), tuple(buffers), tuple(tensors), whole)
+    for chain in _find_chains(steps, buffers, whole):
+        buffers = _join_chain(buffers, chain, writes)
+    return BufferPlan(network, tuple(steps), tuple(buffers), tuple(tensors), whole)
 
 
-def _chains(steps: list[Step], buffers: list[Buffer], whole: frozenset[int]) -> list[list[int]]:
+def _find_chains(
+    steps: list[Step], buffers: list[Buffer], whole: frozenset[int]
+) -> list[list[int]]:
     """Return chains of buffers that may share a ring: each is computed from the one before.
 
     Their rows have equal size. A step with a shortcut is chained to the shortcut's buffer.
@@ -175,9 +184,9 @@ def _chains(steps: list[Step], buffers: list[Buffer], whole: frozenset[int]) -> 
     return chains
 
 
-def _joined(buffers: list[Buffer], chain: list[int], writes: list[Write]) -> list[Buffer]:
+def _join_chain(buffers: list[Buffer], chain: list[int], writes: list[RowEvent]) -> list[Buffer]:
     """Return the buffers, with those of a chain in one ring if that is smaller."""
-    ring, shifts = shared_ring(chain, writes)
+    ring, shifts = share_ring(chain, writes)
     gap, first = max(buffers[k].gap for k in chain), buffers[chain[0]]
     joined = {
         k: replace(buffers[k], home=first.home, gap=gap, ring=ring, shift=shift)
@@ -188,7 +197,7 @@ def _joined(buffers: list[Buffer], chain: list[int], writes: list[Write]) -> lis
     return [joined.get(k, b) for k, b in enumerate(buffers)]
 
 
-def _homes(passing: list[int], together: set[tuple[int, int]]) -> dict[int, str]:
+def _share_members(passing: list[int], together: set[tuple[int, int]]) -> dict[int, str]:
     """Assign members to buffers of one row; buffers with overlapping lifetimes never share one."""
     shared: list[list[int]] = []
     for k in passing:
@@ -198,27 +207,27 @@ def _homes(passing: list[int], together: set[tuple[int, int]]) -> dict[int, str]
                 break
         else:
             shared.append([k])
-    return {k: f"{SHARED}{index}" for index, home in enumerate(shared) for k in home}
+    return {k: f"{SHARED_PREFIX}{index}" for index, home in enumerate(shared) for k in home}
 
 
-def _steps(network: IntegerNetwork) -> tuple[list[Step], list[int]]:
+def _build_steps(network: IntegerNetwork) -> tuple[list[Step], list[int]]:
     """Return the steps, and the buffer of every tensor."""
     steps: list[Step] = []
     tensors = [0]
-    fused = _pools_to_fuse(network)
+    fused = _find_fusable_pools(network)
     for index, layer in enumerate(network.layers):
         if index in fused:
             before = steps.pop()
             steps.append(Step(before.name, before.layer, True, before.sources))
             tensors[-1] = -1
         else:
-            name = _identifier(layer.name, [s.name for s in steps])
+            name = _make_identifier(layer.name, [s.name for s in steps])
             steps.append(Step(name, layer, False, tuple(tensors[k] for k in layer.sources)))
         tensors.append(len(steps))
     return steps, tensors
 
 
-def _pools_to_fuse(network: IntegerNetwork) -> set[int]:
+def _find_fusable_pools(network: IntegerNetwork) -> set[int]:
     """Return the max-pools that follow a dense convolution with no other reader."""
     out = set()
     for index, layer in enumerate(network.layers[1:], 1):
@@ -230,33 +239,33 @@ def _pools_to_fuse(network: IntegerNetwork) -> set[int]:
     return out
 
 
-def _identifier(name: str, taken: list[str]) -> str:
+def _make_identifier(name: str, taken: list[str]) -> str:
     """Return a C identifier like ``name`` that is not in ``taken``."""
     plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower()[:60] or "layer"
-    plain = f"layer_{plain}" if plain.startswith(SHARED) or not plain[0].isalpha() else plain
-    reserved = {*taken, *RESERVED.split()}
+    plain = f"layer_{plain}" if plain.startswith(SHARED_PREFIX) or not plain[0].isalpha() else plain
+    reserved = {*taken, *RESERVED_IDENTIFIERS.split()}
     if plain not in reserved:
         return plain
     return next(f"{plain}_{k}" for k in range(2, 1000) if f"{plain}_{k}" not in reserved)
 
 
-RESERVED = """
+RESERVED_IDENTIFIERS = """
 image image_pad stage zeros done raw raw_rows auto break case char const continue default do double
 else enum extern float for goto if inline int long register restrict return short signed sizeof
 static struct switch typedef union unsigned void volatile while
 """
 """Keywords of C, and other members of the state."""
-SHARED = "passing_"
+SHARED_PREFIX = "passing_"
 """Prefix of members that several buffers share."""
 
 
-def along(conv: Conv) -> bool:
+def slides_along_row(conv: Conv) -> bool:
     """Return whether the C of a convolution slides along the row; it needs no padding columns."""
     same = conv.stride == 1 and conv.padding == conv.dilation
     return conv.depthwise and conv.kernel == 3 and same
 
 
-def taps_of(conv: Conv) -> int:
+def count_pointers(conv: Conv) -> int:
     """Return the number of row pointers of a convolution's kernel.
 
     A pointer refers to one row of the kernel, whose columns are adjacent in memory. With dilation
@@ -266,7 +275,7 @@ def taps_of(conv: Conv) -> int:
     return conv.kernel**2 if spread else conv.kernel
 
 
-def _buffer(index: int, shape: Shape, ring: int, steps: list[Step]) -> Buffer:
+def _build_buffer(index: int, shape: Shape, ring: int, steps: list[Step]) -> Buffer:
     channels, rows, cols = shape
     convs = [s.layer for s in steps if index == s.sources[0] and isinstance(s.layer, Conv)]
     name = steps[index - 1].name if index else "image"
@@ -276,7 +285,7 @@ def _buffer(index: int, shape: Shape, ring: int, steps: list[Step]) -> Buffer:
         channels=channels,
         rows=rows,
         cols=cols,
-        gap=max((conv.padding for conv in convs if not along(conv)), default=0),
+        gap=max((conv.padding for conv in convs if not slides_along_row(conv)), default=0),
         pad_value=convs[0].pad_value if convs else 0,
         above=any(c.padding for c in convs),
         ring=ring,
@@ -284,6 +293,6 @@ def _buffer(index: int, shape: Shape, ring: int, steps: list[Step]) -> Buffer:
     )
 
 
-def up(size: int, step: int) -> int:
+def round_up(size: int, step: int) -> int:
     """Round up to the next multiple of ``step``."""
     return -(-size // step) * step

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.c.templating import fill, names_of
+from dmrl.deploy.c.templating import fill_template, template_values
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.deploy.int8.reference import Detection
+from dmrl.deploy.int8.reference import IntegerDetection
 
-MOST = 20
+MAX_DETECTIONS = 20
 """Maximum number of detections per image."""
-DETECTION = np.dtype(
+DETECTION_DTYPE = np.dtype(
     [
         ("u_q4", "<i4"),
         ("v_q4", "<i4"),
@@ -24,7 +24,7 @@ DETECTION = np.dtype(
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class HarnessResult:
     """Output of the harness for one image.
 
     Parameters
@@ -38,16 +38,16 @@ class Answer:
     """
 
     grids: dict[str, NDArray[np.int8]]
-    detections: list[Detection]
+    detections: list[IntegerDetection]
     stack_bytes: int
 
 
-def harness(network: IntegerNetwork) -> str:
+def generate_harness(network: IntegerNetwork) -> str:
     """Generate the C of the harness."""
-    return fill("harness.c", **names_of(network), most=MOST)
+    return fill_template("harness.c", **template_values(network), most=MAX_DETECTIONS)
 
 
-def answers(network: IntegerNetwork, data: bytes) -> list[Answer]:
+def parse_results(network: IntegerNetwork, data: bytes) -> list[HarnessResult]:
     """Parse the output of the harness, image by image; a truncated one at the end is dropped."""
     out, at = [], 0
     shape = network.grid_shape
@@ -57,17 +57,17 @@ def answers(network: IntegerNetwork, data: bytes) -> list[Answer]:
         grids = np.frombuffer(data, np.int8, size * len(network.heads), at)
         stack, count = np.frombuffer(data, "<i4", 2, at + head - 8).tolist()
         at += head
-        if not 0 <= count <= MOST or at + count * DETECTION.itemsize > len(data):
+        if not 0 <= count <= MAX_DETECTIONS or at + count * DETECTION_DTYPE.itemsize > len(data):
             break
-        rows = np.frombuffer(data, DETECTION, count, at)
-        at += count * DETECTION.itemsize
+        rows = np.frombuffer(data, DETECTION_DTYPE, count, at)
+        at += count * DETECTION_DTYPE.itemsize
         parts = grids.reshape(len(network.heads), *shape)
         named = dict(zip(network.heads, parts, strict=True))
-        out.append(Answer(named, detections_of(rows), stack))
+        out.append(HarnessResult(named, to_detections(rows), stack))
     return out
 
 
-def detections_of(rows: NDArray[np.void]) -> list[Detection]:
+def to_detections(rows: NDArray[np.void]) -> list[IntegerDetection]:
     """Convert detections from the memory layout of the C."""
     names = ("u_q4", "v_q4", "depth_mm", "confidence")
-    return [Detection(*(int(row[name]) for name in names)) for row in rows]
+    return [IntegerDetection(*(int(row[name]) for name in names)) for row in rows]

@@ -1,25 +1,25 @@
 """C of each step: its kernel, its function of one row, and its constants."""
 
-from dmrl.deploy.c.buffer_plan import Plan
-from dmrl.deploy.c.convolutions import row_of_convolution, templates_of
-from dmrl.deploy.c.memory_levels import loads
+from dmrl.deploy.c.buffer_plan import BufferPlan
+from dmrl.deploy.c.convolutions import generate_convolution_row, kernel_templates
+from dmrl.deploy.c.memory_levels import staged_buffers
 from dmrl.deploy.c.row_addresses import (
-    RANGES,
-    TYPES,
-    Desk,
-    body,
-    marked_unused,
-    plus,
-    state_names,
-    suffixes,
+    C_RANGES,
+    C_TYPES,
+    StepAddresses,
+    indent_lines,
+    join_suffixes,
+    mark_unused,
+    plus_text,
+    state_arguments,
 )
 from dmrl.deploy.c.row_schedule import Step
-from dmrl.deploy.c.templating import array, fill
+from dmrl.deploy.c.templating import fill_template, format_array
 from dmrl.deploy.int8.network import Add, Conv, MaxPool
 from dmrl.errors import ModelError
 
 
-def require_carried(plan: Plan) -> None:
+def require_supported(plan: BufferPlan) -> None:
     """Raise ModelError unless the C has a kernel for every layer.
 
     Raises
@@ -35,42 +35,42 @@ def require_carried(plan: Plan) -> None:
             )
 
 
-def kernels(plan: Plan) -> str:
+def generate_kernels(plan: BufferPlan) -> str:
     """Generate the kernels that the steps call, each once."""
     pools = any(s.pooled or isinstance(s.layer, MaxPool) for s in plan.steps)
-    texts = [fill("largest.c")] if pools else []
+    texts = [fill_template("largest.c")] if pools else []
     for step in plan.steps:
         signed = [plan.buffers[k].signed for k in step.sources]
-        suffix, kind = TYPES[signed[0]]
-        other = TYPES[signed[-1]][1]
-        names = {"suffix": suffix, "type": kind, "suffixes": suffixes(signed), "other": other}
-        wanted = [fill(f, **names) for f in _templates(step)]
+        suffix, kind = C_TYPES[signed[0]]
+        other = C_TYPES[signed[-1]][1]
+        names = {"suffix": suffix, "type": kind, "suffixes": join_suffixes(signed), "other": other}
+        wanted = [fill_template(f, **names) for f in _step_templates(step)]
         texts += [text for text in wanted if text not in texts]
     return "".join(texts)
 
 
-def _templates(step: Step) -> list[str]:
+def _step_templates(step: Step) -> list[str]:
     if isinstance(step.layer, Conv):
-        return templates_of(step, step.layer)
+        return kernel_templates(step, step.layer)
     return ["pool.c" if isinstance(step.layer, MaxPool) else "add.c"]
 
 
-def row_function(plan: Plan, index: int, prefix: str) -> str:
+def generate_row_function(plan: BufferPlan, index: int, prefix: str) -> str:
     """Generate the C function that computes one output row of a step."""
-    step, desk = plan.steps[index], Desk(plan, loads(plan, index))
+    step, desk = plan.steps[index], StepAddresses(plan, staged_buffers(plan, index))
     if isinstance(step.layer, Conv):
-        text = row_of_convolution(desk, index)
+        text = generate_convolution_row(desk, index)
     else:
-        text = (_add_body if isinstance(step.layer, Add) else _pool_body)(desk, index)
-    names = state_names(plan, prefix)
-    unused = marked_unused(text, *names["args"].split(", "), "row")
+        text = (_generate_add if isinstance(step.layer, Add) else _generate_pool)(desk, index)
+    names = state_arguments(plan, prefix)
+    unused = mark_unused(text, *names["args"].split(", "), "row")
     return (
-        f"/* {describe(plan, index)}. */\n"
+        f"/* {describe_step(plan, index)}. */\n"
         f"APART void make_{step.name}({names['params']}, int row)\n{{\n{unused}{text}}}\n\n"
     )
 
 
-def describe(plan: Plan, index: int) -> str:
+def describe_step(plan: BufferPlan, index: int) -> str:
     """Describe a step in words, for comments."""
     step, out = plan.steps[index], plan.buffers[index + 1]
     source = plan.buffers[step.sources[0]]
@@ -91,57 +91,59 @@ def describe(plan: Plan, index: int) -> str:
     return f"{step.name}: {kind}{relu}{', 2x2 max-pool' if step.pooled else ''}, {size} -> {after}"
 
 
-def _add_body(desk: Desk, index: int) -> str:
+def _generate_add(desk: StepAddresses, index: int) -> str:
     step, out = desk.plan.steps[index], desk.plan.buffers[index + 1]
     inputs, layer = [desk.plan.buffers[k] for k in step.sources], step.layer
     assert isinstance(layer, Add)
-    rows = [desk.values(k, b) for k, b in enumerate(inputs)]
-    name = f"add_{suffixes([b.signed for b in inputs])}"
+    rows = [desk.values_address(k, b) for k, b in enumerate(inputs)]
+    name = f"add_{join_suffixes([b.signed for b in inputs])}"
     first, second = layer.multipliers
-    return body(
+    return indent_lines(
         [
             f"const uint8_t *const in[2] = {{{rows[0]}, {rows[1]}}};",
-            f"{name}(in, {desk.target(out)}, /* values */ {out.cols * out.channels},",
+            f"{name}(in, {desk.output_address(out)}, /* values */ {out.cols * out.channels},",
             f"{' ' * (len(name) + 1)}{first}, {second}, /* shift */ {layer.shift}, "
-            f"/* range */ {RANGES[layer.signed]});",
-            *desk.sent(out),
+            f"/* range */ {C_RANGES[layer.signed]});",
+            *desk.copy_out(out),
         ]
     )
 
 
-def _pool_body(desk: Desk, index: int) -> str:
+def _generate_pool(desk: StepAddresses, index: int) -> str:
     source, out = (desk.plan.buffers[k] for k in (desk.plan.steps[index].sources[0], index + 1))
-    start = plus(source.gap * source.channels)
-    rows = [desk.read(0, source, f"2 * row + {k}", f"{k}") + start for k in range(2)]
-    return body(
+    start = plus_text(source.gap * source.channels)
+    rows = [desk.input_address(0, source, f"2 * row + {k}", f"{k}") + start for k in range(2)]
+    return indent_lines(
         [
             f"const uint8_t *const in[2] = {{{rows[0]}, {rows[1]}}};",
-            f"pool_{TYPES[source.signed][0]}(in, {desk.target(out)}, /* cols */ {out.cols}, "
+            f"pool_{C_TYPES[source.signed][0]}(in, {desk.output_address(out)}, /* cols */ {out.cols}, "
             f"/* channels */ {out.channels});",
-            *desk.sent(out),
+            *desk.copy_out(out),
         ]
     )
 
 
-def constants(plan: Plan) -> tuple[str, int]:
+def generate_constants(plan: BufferPlan) -> tuple[str, int]:
     """Generate the weights and scales of every step; also return their size in bytes."""
     texts, size = [], 0
     for step in plan.steps:
         if isinstance(step.layer, Conv):
             conv = step.layer
             order = (0, 2, 3, 1)
-            texts.append(array("int8_t", f"{step.name}_weights", conv.weight.transpose(order)))
+            texts.append(
+                format_array("int8_t", f"{step.name}_weights", conv.weight.transpose(order))
+            )
             rows = zip(conv.bias, conv.multiplier, strict=True)
             scales = "".join(f"    {{{b}, {m}}},\n" for b, m in rows)
             name = f"{step.name}_scales[{conv.bias.size}]"
             texts.append(f"static const scale_t {name} = {{\n{scales}}};\n")
             size += conv.weight.size + 8 * conv.bias.size + 4 * conv.gain.size
             if conv.gain.size:
-                texts.append(array("int32_t", f"{step.name}_gains", conv.gain))
+                texts.append(format_array("int32_t", f"{step.name}_gains", conv.gain))
     return "\n".join(texts), size
 
 
-def declarations(plan: Plan) -> str:
+def generate_declarations(plan: BufferPlan) -> str:
     """Generate declarations of weights and scales, which are defined at the end of the file."""
     lines = []
     for step in plan.steps:

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from dmrl.deploy.c.buffer_plan import plan
-from dmrl.deploy.c.templating import fill, wrapped
+from dmrl.deploy.c.buffer_plan import plan_buffers
+from dmrl.deploy.c.templating import fill_template, wrap_words
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.deploy.int8.refinement import gains, last_layer
+from dmrl.deploy.int8.refinement import compute_gains, find_last_layer
 
 
-def refinement(network: IntegerNetwork, names: dict[str, str]) -> dict[str, str]:
+def generate_refinement(network: IntegerNetwork, names: dict[str, str]) -> dict[str, str]:
     """Generate the files of the refinement: name to text.
 
     Raises
@@ -16,19 +16,19 @@ def refinement(network: IntegerNetwork, names: dict[str, str]) -> dict[str, str]
     ModelError
         If the last layer cannot be refined.
     """
-    layer, planned = last_layer(network), plan(network, features=True)
+    layer, planned = find_last_layer(network), plan_buffers(network, features=True)
     features, grid = planned.buffers[planned.steps[-1].sources[0]], planned.buffers[-1]
     rows = [head.channel for head in network.heads.values()]
     weights = [f"{w}," for w in layer.weight[rows].ravel().tolist()]
-    numbers = np.column_stack([layer.bias[rows], layer.multiplier[rows], *gains(network)])
+    numbers = np.column_stack([layer.bias[rows], layer.multiplier[rows], *compute_gains(network)])
     offsets = "h == {}_OFFSET_U ? u_q4 % step : v_q4 % step".format(names["PREFIX"])
     size = {"features": features.channels}
     return {
-        f"{names['prefix']}_refine.h": fill("refine.h", **names, **size),
-        f"{names['prefix']}_refine.c": fill(
+        f"{names['prefix']}_refine.h": fill_template("refine.h", **names, **size),
+        f"{names['prefix']}_refine.c": fill_template(
             "refine.c",
             **names,
-            weights="\n".join(wrapped(weights, "    ")),
+            weights="\n".join(wrap_words(weights, "    ")),
             heads="".join(f"    {{{', '.join(map(str, each))}}},\n" for each in numbers.tolist()),
             member=features.home,
             row_bytes=features.row_bytes,

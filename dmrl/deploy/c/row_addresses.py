@@ -3,14 +3,14 @@
 import re
 from dataclasses import dataclass
 
-from dmrl.deploy.c.buffer_plan import Buffer, Plan
-from dmrl.deploy.c.memory_levels import Load
+from dmrl.deploy.c.buffer_plan import Buffer, BufferPlan
+from dmrl.deploy.c.memory_levels import StagedBuffer
 
-TYPES = {False: ("u8", "uint8_t"), True: ("s8", "int8_t")}
-RANGES = {False: "0, 255", True: "-128, 127"}
+C_TYPES = {False: ("u8", "uint8_t"), True: ("s8", "int8_t")}
+C_RANGES = {False: "0, 255", True: "-128, 127"}
 
 
-def state_names(plan: Plan, prefix: str) -> dict[str, str]:
+def state_arguments(plan: BufferPlan, prefix: str) -> dict[str, str]:
     """Return the state parameters and arguments of the generated functions.
 
     Returns
@@ -19,7 +19,7 @@ def state_names(plan: Plan, prefix: str) -> dict[str, str]:
         ``params``; ``reads``, the same with const; ``args``; ``refs``, the arguments of a caller
         that owns the state.
     """
-    kinds = {"net": f"{prefix}_t"} | ({"away": f"{prefix}_far_t"} if plan.stage else {})
+    kinds = {"net": f"{prefix}_t"} | ({"away": f"{prefix}_far_t"} if plan.l1_scratch_bytes else {})
     params = ", ".join(f"{kind} *{name}" for name, kind in kinds.items())
     return {
         "params": params,
@@ -29,19 +29,19 @@ def state_names(plan: Plan, prefix: str) -> dict[str, str]:
     }
 
 
-def suffixes(signed: list[bool]) -> str:
+def join_suffixes(signed: list[bool]) -> str:
     """Return the type suffix of kernels that read several tensors."""
-    return "_".join(TYPES[each][0] for each in signed)
+    return "_".join(C_TYPES[each][0] for each in signed)
 
 
-def target(out: Buffer) -> str:
+def output_address(out: Buffer) -> str:
     """Return the address of an output row, behind its padding."""
-    return f"{slot(out)}{plus(out.gap * out.channels)}"
+    return f"{row_address(out)}{plus_text(out.gap * out.channels)}"
 
 
-def slot(buffer: Buffer) -> str:
+def row_address(buffer: Buffer) -> str:
     """Return the address of row ``row`` in a ring, including its padding."""
-    home = f"{'away' if buffer.far else 'net'}->{buffer.home}"
+    home = f"{'away' if buffer.in_l2 else 'net'}->{buffer.home}"
     if buffer.ring == 1:
         return home
     place = f"row % {buffer.ring}"
@@ -52,13 +52,13 @@ def slot(buffer: Buffer) -> str:
     return f"{home} + {place} * {buffer.row_bytes}"
 
 
-def one_row(buffer: Buffer) -> bool:
+def keeps_one_row(buffer: Buffer) -> bool:
     """Return whether only the newest row is ever read."""
     return buffer.ring == 1 and not buffer.above
 
 
 @dataclass(frozen=True, slots=True)
-class Desk:
+class StepAddresses:
     """Addresses of a step's rows, tables and output: in the scratch buffer, or in place.
 
     Parameters
@@ -69,56 +69,60 @@ class Desk:
         Content of the scratch buffer for this step, by kind.
     """
 
-    plan: Plan
-    staged: dict[str, Load]
+    plan: BufferPlan
+    staged: dict[str, StagedBuffer]
 
-    def table(self, kind: str, name: str) -> str:
+    def table_address(self, kind: str, name: str) -> str:
         """Return the address of a table of the step."""
-        return brought(self.staged[kind], name) if kind in self.staged else name
+        return copy_in(self.staged[kind], name) if kind in self.staged else name
 
-    def read(self, number: int, buffer: Buffer, row: str, pointer: str = "0") -> str:
+    def input_address(self, number: int, buffer: Buffer, row: str, pointer: str = "0") -> str:
         """Return the address of row ``row`` of an input, or of its padding.
 
         ``number`` selects the input. A row of a far ring is first copied to place ``pointer``.
         """
-        args = state_names(self.plan, "")["args"]
-        place = slot(buffer) if one_row(buffer) else f"row_of_{buffer.name}({args}, {row})"
-        if not buffer.far:
+        args = state_arguments(self.plan, "")["args"]
+        place = (
+            row_address(buffer) if keeps_one_row(buffer) else f"row_of_{buffer.name}({args}, {row})"
+        )
+        if not buffer.in_l2:
             return place
-        return f"(const uint8_t *){brought(self.staged[f'{number}'], place, pointer)}"
+        return f"(const uint8_t *){copy_in(self.staged[f'{number}'], place, pointer)}"
 
-    def values(self, number: int, buffer: Buffer) -> str:
+    def values_address(self, number: int, buffer: Buffer) -> str:
         """Return the address of row ``row`` of an input, behind its padding."""
-        return f"{self.read(number, buffer, 'row')}{plus(buffer.gap * buffer.channels)}"
+        return (
+            f"{self.input_address(number, buffer, 'row')}{plus_text(buffer.gap * buffer.channels)}"
+        )
 
-    def target(self, out: Buffer) -> str:
+    def output_address(self, out: Buffer) -> str:
         """Return the address where the output row is computed."""
-        return f"at_stage(net, {self.staged['out'].at})" if out.far else target(out)
+        return f"at_stage(net, {self.staged['out'].at})" if out.in_l2 else output_address(out)
 
-    def sent(self, out: Buffer) -> list[str]:
+    def copy_out(self, out: Buffer) -> list[str]:
         """Return the statements that copy a computed output row to a far ring."""
-        if not out.far:
+        if not out.in_l2:
             return []
         load = self.staged["out"]
-        return [f"brought({target(out)}, at_stage(net, {load.at}), {load.size_bytes});"]
+        return [f"brought({output_address(out)}, at_stage(net, {load.at}), {load.size_bytes});"]
 
 
-def brought(load: Load, place: str, number: str = "0") -> str:
+def copy_in(load: StagedBuffer, place: str, number: str = "0") -> str:
     """Return a C expression that copies an item to the scratch buffer and gives its address."""
     at = f"{load.at}" if number == "0" else f"{load.at} + {number} * {load.size_bytes}"
     return f"brought(at_stage(net, {at}), {place}, {load.size_bytes})"
 
 
-def marked_unused(text: str, *names: str) -> str:
+def mark_unused(text: str, *names: str) -> str:
     """Return statements for those parameters that a function's text does not use."""
     return "".join(f"    (void){n};\n" for n in names if n not in re.findall(r"\w+", text))
 
 
-def plus(number: int) -> str:
+def plus_text(number: int) -> str:
     """Return C text that adds a constant; empty for 0."""
     return f" + {number}" if number > 0 else f" - {-number}" if number < 0 else ""
 
 
-def body(lines: list[str]) -> str:
+def indent_lines(lines: list[str]) -> str:
     """Indent the lines of a function."""
     return "".join(f"    {line}\n" for line in lines)

@@ -53,7 +53,7 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Write:
+class RowEvent:
     """Computation of one row.
 
     Parameters
@@ -72,7 +72,7 @@ class Write:
     oldest: tuple[int, ...]
 
 
-def play(steps: list[Step], rows: list[int]) -> list[Write]:
+def schedule_rows(steps: list[Step], rows: list[int]) -> list[RowEvent]:
     """Simulate the computation of an image; return every row in order.
 
     Parameters
@@ -84,7 +84,7 @@ def play(steps: list[Step], rows: list[int]) -> list[Write]:
     """
     done = [0] * len(rows)
     readers = [[k for k, s in enumerate(steps) if b in s.sources] for b in range(len(rows))]
-    writes: list[Write] = []
+    writes: list[RowEvent] = []
 
     def oldest_needed(buffer: int) -> int:
         pending = [k for k in readers[buffer] if done[k + 1] < rows[k + 1]]
@@ -93,17 +93,17 @@ def play(steps: list[Step], rows: list[int]) -> list[Write]:
 
     def write(buffer: int) -> None:
         oldest = tuple(oldest_needed(b) for b in range(len(rows)))
-        writes.append(Write(buffer, done[buffer], tuple(done), oldest))
+        writes.append(RowEvent(buffer, done[buffer], tuple(done), oldest))
         done[buffer] += 1
 
     for _ in range(rows[0]):
         write(0)
-        while (step := _deepest_ready(steps, rows, done)) is not None:
+        while (step := _find_ready_step(steps, rows, done)) is not None:
             write(step + 1)
     return writes
 
 
-def _deepest_ready(steps: list[Step], rows: list[int], done: list[int]) -> int | None:
+def _find_ready_step(steps: list[Step], rows: list[int], done: list[int]) -> int | None:
     for index in range(len(steps) - 1, -1, -1):
         step, row = steps[index], done[index + 1]
         if row < rows[index + 1] and all(
@@ -113,7 +113,7 @@ def _deepest_ready(steps: list[Step], rows: list[int], done: list[int]) -> int |
     return None
 
 
-def rows_held(writes: list[Write], count: int) -> list[int]:
+def count_ring_rows(writes: list[RowEvent], count: int) -> list[int]:
     """Return the ring size of each buffer: rows from the oldest required to the newest."""
     rings = [1] * count
     for w in writes:
@@ -121,7 +121,7 @@ def rows_held(writes: list[Write], count: int) -> list[int]:
     return rings
 
 
-def needed_together(writes: list[Write]) -> set[tuple[int, int]]:
+def find_overlaps(writes: list[RowEvent]) -> set[tuple[int, int]]:
     """Return pairs (a, b): a row of b was still required when a row of a was computed."""
     return {
         (w.buffer, other)
@@ -131,7 +131,7 @@ def needed_together(writes: list[Write]) -> set[tuple[int, int]]:
     }
 
 
-def shared_ring(chain: list[int], writes: list[Write]) -> tuple[int, list[int]]:
+def share_ring(chain: list[int], writes: list[RowEvent]) -> tuple[int, list[int]]:
     """Return the rows of a ring that buffers share, and the position of row 0 of each.
 
     Every row of a buffer replaces a row of the buffer before it that is no longer required: the
@@ -148,11 +148,11 @@ def shared_ring(chain: list[int], writes: list[Write]) -> tuple[int, list[int]]:
     for before, buffer in itertools.pairwise(chain):
         lag = max(w.row - w.oldest[before] + 1 for w in writes if w.buffer == buffer)
         behind[buffer] = behind[before] + lag
-    ring = max(_span(w, behind) for w in writes if w.buffer in behind)
+    ring = max(_ring_span(w, behind) for w in writes if w.buffer in behind)
     return ring, [-behind[buffer] % ring for buffer in chain]
 
 
-def _span(write: Write, behind: dict[int, int]) -> int:
+def _ring_span(write: RowEvent, behind: dict[int, int]) -> int:
     """Return the distance from the first to the last position in use, the new row included."""
     places = [write.row - behind[write.buffer]]
     for buffer, lag in behind.items():

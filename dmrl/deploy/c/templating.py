@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from dmrl import __version__
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.guards.safe_names import plain
+from dmrl.guards.safe_names import comment_safe
 
-OTHER_FILES = ("main", "harness", "count")
+RESERVED_FILE_NAMES = ("main", "harness", "count")
 """Names of other C files in the same folder, which a network must not use."""
-LONGEST_NAME = 40
-WIDTH = 100
+MAX_NAME_LENGTH = 40
+LINE_WIDTH = 100
 
 
-def fill(template: str, **values: object) -> str:
+def fill_template(template: str, **values: object) -> str:
     """Fill in a template of ``templates/``: replace its ``$names``.
 
     Untrusted values must be numbers or pass through `dmrl.guards.safe_names.comment_safe`: a value
@@ -32,7 +32,7 @@ def fill(template: str, **values: object) -> str:
     return Template(text).substitute(values)
 
 
-def array(kind: str, name: str, values: NDArray[np.integer]) -> str:
+def format_array(kind: str, name: str, values: NDArray[np.integer]) -> str:
     """Format the definition of a constant array.
 
     Raises
@@ -43,15 +43,15 @@ def array(kind: str, name: str, values: NDArray[np.integer]) -> str:
     if values.dtype.kind not in "iu":
         raise TypeError(f"{name} is of {values.dtype}, not of integers")
     words = [f"{v}," for v in values.ravel().tolist()]
-    body = "\n".join(wrapped(words, "    "))
+    body = "\n".join(wrap_words(words, "    "))
     return f"static const {kind} {name}[{values.size}] = {{\n{body}\n}};\n"
 
 
-def wrapped(words: list[str], indent: str) -> list[str]:
+def wrap_words(words: list[str], indent: str) -> list[str]:
     """Wrap words into lines of at most ``LINE_WIDTH`` characters."""
     lines, line = [], indent
     for word in words:
-        if len(line) + len(word) > WIDTH:
+        if len(line) + len(word) > LINE_WIDTH:
             lines.append(line.rstrip())
             line = indent
         line += word + " "
@@ -63,11 +63,15 @@ def c_name(network: IntegerNetwork) -> str:
 
     It has letters, digits and underscores only: dmrl-nano becomes dmrl_nano.
     """
-    name = re.sub(r"[^a-z0-9]+", "_", network.architecture.lower()).strip("_")[:LONGEST_NAME]
-    return name if name[:1].isalpha() and name not in OTHER_FILES else f"net_{name}".rstrip("_")
+    name = re.sub(r"[^a-z0-9]+", "_", network.architecture.lower()).strip("_")[:MAX_NAME_LENGTH]
+    return (
+        name
+        if name[:1].isalpha() and name not in RESERVED_FILE_NAMES
+        else f"net_{name}".rstrip("_")
+    )
 
 
-def names_of(network: IntegerNetwork) -> dict[str, str]:
+def template_values(network: IntegerNetwork) -> dict[str, str]:
     """Return the values that every template uses."""
     name = c_name(network)
     return {
@@ -75,7 +79,7 @@ def names_of(network: IntegerNetwork) -> dict[str, str]:
         "PREFIX": name.upper(),
         "version": __version__,
         "description": (
-            f"{plain(network.name)}: int8 network {plain(network.architecture)} for images of "
+            f"{comment_safe(network.name)}: int8 network {comment_safe(network.architecture)} for images of "
             f"{network.width_px} x {network.height_px} pixels, as portable C."
         ),
     }

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.graph import Graph, grey_of, tensors_of, to_input
+from dmrl.deploy.int8.graph import FloatGraph, compute_tensors, normalize_images, rgb_to_grey
 from dmrl.errors import SettingError
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ranges:
+class ActivationRanges:
     """Ranges measured on calibration images.
 
     Parameters
@@ -32,9 +32,9 @@ class Ranges:
     height_px: int
     width_px: int
 
-    def with_more(self, other: "Ranges") -> "Ranges":
+    def merge(self, other: "ActivationRanges") -> "ActivationRanges":
         """Return the ranges over both sets of images, which have one size."""
-        return Ranges(
+        return ActivationRanges(
             tuple(np.minimum(a, b) for a, b in zip(self.low, other.low, strict=True)),
             tuple(np.maximum(a, b) for a, b in zip(self.high, other.high, strict=True)),
             self.images + other.images,
@@ -43,7 +43,7 @@ class Ranges:
         )
 
 
-def calibrate(graph: Graph, batches: Iterable[NDArray[np.uint8]]) -> Ranges:
+def calibrate_ranges(graph: FloatGraph, batches: Iterable[NDArray[np.uint8]]) -> ActivationRanges:
     """Measure the range of every tensor over calibration images.
 
     Parameters
@@ -60,12 +60,12 @@ def calibrate(graph: Graph, batches: Iterable[NDArray[np.uint8]]) -> Ranges:
         If there are no images, each of them has a single colour, or a layer is zero for all of
         them.
     """
-    ranges: Ranges | None = None
+    ranges: ActivationRanges | None = None
     varied = False
     for batch in batches:
         varied = varied or bool((np.ptp(batch, axis=(1, 2)) > 0).any())
-        more = _ranges(graph, batch)
-        ranges = more if ranges is None else ranges.with_more(more)
+        more = _measure_ranges(graph, batch)
+        ranges = more if ranges is None else ranges.merge(more)
     if ranges is None:
         raise SettingError("no images to calibrate on. Give a dataset with images")
     if not varied:
@@ -82,10 +82,10 @@ def calibrate(graph: Graph, batches: Iterable[NDArray[np.uint8]]) -> Ranges:
     return ranges
 
 
-def _ranges(graph: Graph, images: NDArray[np.uint8]) -> Ranges:
-    seen = grey_of(images) if graph.channels == 1 else images
-    tensors = tensors_of(graph, to_input(seen))
-    return Ranges(
+def _measure_ranges(graph: FloatGraph, images: NDArray[np.uint8]) -> ActivationRanges:
+    seen = rgb_to_grey(images) if graph.channels == 1 else images
+    tensors = compute_tensors(graph, normalize_images(seen))
+    return ActivationRanges(
         tuple(tensor.min(axis=(0, 2, 3)).astype(np.float64) for tensor in tensors),
         tuple(tensor.max(axis=(0, 2, 3)).astype(np.float64) for tensor in tensors),
         len(images),

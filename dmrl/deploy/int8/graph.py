@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.int8.network import PIXEL_ZERO
-from dmrl.deploy.int8.windows import largest_of_blocks, taps_of
+from dmrl.deploy.int8.windows import extract_taps, max_pool_2x2
 from dmrl.errors import ModelError
 from dmrl.learn.networks.graph_ops import Op
 
@@ -61,7 +61,7 @@ FloatLayer = FloatConv | FloatPool | FloatAdd
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Graph:
+class FloatGraph:
     """A float network.
 
     Parameters
@@ -78,7 +78,7 @@ class Graph:
     outputs: tuple[tuple[int, int], ...]
     channels: int = 3
 
-    def grey(self) -> "Graph":
+    def to_grey(self) -> "FloatGraph":
         """Return the network for grey images; its output equals that for R = G = B."""
         layers = [
             replace(layer, weight=layer.weight.sum(axis=1, keepdims=True))
@@ -89,7 +89,7 @@ class Graph:
         return replace(self, layers=tuple(layers), channels=1)
 
 
-WAYS_OUT = {
+REPLACEMENTS = {
     "ConvTranspose2d": "a convolution at the finer stride",
     "AvgPool2d": "a strided convolution or a 2x2 max-pool",
     "AdaptiveAvgPool2d": "a strided convolution",
@@ -109,17 +109,17 @@ WAYS_OUT = {
     "mul": "a convolution, a residual sum or a 2x2 max-pool",
     "concatenate": "a residual sum (only outputs can be concatenated)",
 }
-CARRIED = "convolutions (1x1 or 3x3), BatchNorm2d, ReLU, sums and 2x2 max-pools"
+SUPPORTED_LAYERS = "convolutions (1x1 or 3x3), BatchNorm2d, ReLU, sums and 2x2 max-pools"
 
 
-class Cannot(ModelError):
+class UnsupportedLayer(ModelError):
     """Error for a layer that int8 does not support; the message contains a replacement."""
 
-    def __init__(self, name: str, what: str, instead: str = CARRIED) -> None:
+    def __init__(self, name: str, what: str, instead: str = SUPPORTED_LAYERS) -> None:
         super().__init__(f"layer {name} is {what}, which int8 does not support. Use {instead}")
 
 
-def graph_of(operations: Sequence[Op]) -> Graph:
+def build_graph(operations: Sequence[Op]) -> FloatGraph:
     """Build the layer graph of a network's operations.
 
     Parameters
@@ -132,13 +132,13 @@ def graph_of(operations: Sequence[Op]) -> Graph:
     ModelError
         If int8 does not support an operation; the message contains its name and a replacement.
     """
-    builder = _Builder(Counter(source for op in operations for source in op.sources))
+    builder = _GraphBuilder(Counter(source for op in operations for source in op.sources))
     for op in operations:
-        builder.take(op)
-    return Graph(tuple(builder.layers), builder.outputs, builder.channels)
+        builder.add_op(op)
+    return FloatGraph(tuple(builder.layers), builder.outputs, builder.channels)
 
 
-class _Builder:
+class _GraphBuilder:
     """Converts operations, in order, to layers."""
 
     def __init__(self, users: Counter[str]) -> None:
@@ -149,38 +149,42 @@ class _Builder:
         self.outputs: tuple[tuple[int, int], ...] = ()
         self.channels = 3
 
-    def take(self, op: Op) -> None:
+    def add_op(self, op: Op) -> None:
         """Convert the next operation."""
         for source in op.sources:
             if source in self.parts and op.kind != "output":
-                raise Cannot(source, "a concatenation inside the network", "a residual sum")
+                raise UnsupportedLayer(
+                    source, "a concatenation inside the network", "a residual sum"
+                )
         takes = {
-            "image": self._image,
-            "conv": self._conv,
-            "norm": self._norm,
-            "relu": self._relu,
-            "max_pool": self._pool,
-            "add": self._add,
-            "concatenate": self._concatenate,
-            "output": self._output,
+            "image": self._add_image,
+            "conv": self._add_conv,
+            "norm": self._fold_norm,
+            "relu": self._fuse_relu,
+            "max_pool": self._add_pool,
+            "add": self._add_sum,
+            "concatenate": self._add_concatenation,
+            "output": self._mark_outputs,
         }
         if op.kind not in takes:
             article = "an" if op.kind[0].lower() in "aeiou" else "a"
-            raise Cannot(op.name, f"{article} {op.kind}", WAYS_OUT.get(op.kind, CARRIED))
+            raise UnsupportedLayer(
+                op.name, f"{article} {op.kind}", REPLACEMENTS.get(op.kind, SUPPORTED_LAYERS)
+            )
         takes[op.kind](op)
 
-    def _put(self, op: Op, layer: FloatLayer) -> None:
+    def _append_layer(self, op: Op, layer: FloatLayer) -> None:
         self.layers.append(layer)
         self.tensor_of[op.name] = len(self.layers)
 
-    def _sources(self, op: Op) -> list[int]:
+    def _source_tensors(self, op: Op) -> list[int]:
         return [self.tensor_of[source] for source in op.sources]
 
-    def _image(self, op: Op) -> None:
+    def _add_image(self, op: Op) -> None:
         self.tensor_of[op.name] = 0
 
-    def _conv(self, op: Op) -> None:
-        (source,) = self._sources(op)
+    def _add_conv(self, op: Op) -> None:
+        (source,) = self._source_tensors(op)
         weight, asked = op.values["weight"], op.settings
         outs, ins, *kernel = weight.shape
         stride, dilation, padding, groups = (
@@ -188,13 +192,17 @@ class _Builder:
         )
         if kernel not in ([1, 1], [3, 3]):
             size = " x ".join(map(str, kernel))
-            raise Cannot(op.name, f"a {size} convolution", "1x1 or 3x3 convolutions")
+            raise UnsupportedLayer(op.name, f"a {size} convolution", "1x1 or 3x3 convolutions")
         if not all(isinstance(value, int) for value in (stride, dilation, padding)):
-            raise Cannot(op.name, "a convolution that differs by direction", "one stride both ways")
+            raise UnsupportedLayer(
+                op.name, "a convolution that differs by direction", "one stride both ways"
+            )
         if padding not in (0, dilation * (kernel[0] // 2)) or "padding_mode" in asked:
-            raise Cannot(op.name, f"a convolution with padding {padding}", "'same' zero padding")
+            raise UnsupportedLayer(
+                op.name, f"a convolution with padding {padding}", "'same' zero padding"
+            )
         if groups > 1 and (ins > 1 or outs != groups):
-            raise Cannot(
+            raise UnsupportedLayer(
                 op.name,
                 f"a convolution in {groups} groups",
                 "groups=1, or depthwise: as many groups as channels in and out",
@@ -202,15 +210,15 @@ class _Builder:
         if source == 0:
             self.channels = ins * groups
         bias = op.values["bias"]
-        self._put(
+        self._append_layer(
             op, FloatConv(op.name, (source,), weight, bias, stride, dilation, padding, groups)
         )
 
-    def _norm(self, op: Op) -> None:
-        (tensor,) = self._sources(op)
-        layer = self._own(op, tensor)
+    def _fold_norm(self, op: Op) -> None:
+        (tensor,) = self._source_tensors(op)
+        layer = self._exclusive_layer(op, tensor)
         if not isinstance(layer, FloatConv) or layer.relu or len(layer.sources) > 1:
-            raise Cannot(
+            raise UnsupportedLayer(
                 op.name, "a BatchNorm2d apart from a convolution", "a BatchNorm2d right after one"
             )
         factor, summand = op.values["factor"], op.values["summand"]
@@ -218,62 +226,64 @@ class _Builder:
         self.layers[tensor - 1] = replace(layer, weight=weight, bias=layer.bias * factor + summand)
         self.tensor_of[op.name] = tensor
 
-    def _relu(self, op: Op) -> None:
-        (tensor,) = self._sources(op)
-        layer = self._own(op, tensor)
+    def _fuse_relu(self, op: Op) -> None:
+        (tensor,) = self._source_tensors(op)
+        layer = self._exclusive_layer(op, tensor)
         if not isinstance(layer, FloatConv | FloatAdd):
-            raise Cannot(
+            raise UnsupportedLayer(
                 op.name, "a ReLU apart from a convolution or sum", "a ReLU right after one"
             )
         self.layers[tensor - 1] = replace(layer, relu=True)
         self.tensor_of[op.name] = tensor
 
-    def _own(self, op: Op, tensor: int) -> FloatLayer | None:
+    def _exclusive_layer(self, op: Op, tensor: int) -> FloatLayer | None:
         """Return the layer whose output only this operation reads, or None."""
         alone = self.users[op.sources[0]] == 1
         return self.layers[tensor - 1] if alone and tensor else None
 
-    def _pool(self, op: Op) -> None:
-        (source,) = self._sources(op)
+    def _add_pool(self, op: Op) -> None:
+        (source,) = self._source_tensors(op)
         plain = set(op.settings) == {"kernel", "stride"}
         if source == 0:
-            raise Cannot(op.name, "a max-pool of the image", "a convolution first")
+            raise UnsupportedLayer(op.name, "a max-pool of the image", "a convolution first")
         if not plain or any(side != 2 for side in op.settings.values()):
-            raise Cannot(op.name, f"a max-pool with {op.settings}", "2x2 max-pools with stride 2")
-        self._put(op, FloatPool(op.name, (source,)))
+            raise UnsupportedLayer(
+                op.name, f"a max-pool with {op.settings}", "2x2 max-pools with stride 2"
+            )
+        self._append_layer(op, FloatPool(op.name, (source,)))
 
-    def _add(self, op: Op) -> None:
-        a, b = self._sources(op)
+    def _add_sum(self, op: Op) -> None:
+        a, b = self._source_tensors(op)
         if 0 in (a, b):
-            raise Cannot(op.name, "a sum with the image", "a convolution first")
+            raise UnsupportedLayer(op.name, "a sum with the image", "a convolution first")
         parts = ((a, b, op.sources[0]), (b, a, op.sources[1]))
         for conv, shortcut, name in parts:
             layer = self.layers[conv - 1]
-            if conv == len(self.layers) and self.users[name] == 1 and takes_shortcut(layer):
+            if conv == len(self.layers) and self.users[name] == 1 and can_fuse_shortcut(layer):
                 self.layers[-1] = replace(layer, sources=(layer.sources[0], shortcut))
                 self.tensor_of[op.name] = conv
                 return
-        self._put(op, FloatAdd(op.name, (a, b)))
+        self._append_layer(op, FloatAdd(op.name, (a, b)))
 
-    def _concatenate(self, op: Op) -> None:
-        parts = [self._channels_of(source) for source in op.sources]
+    def _add_concatenation(self, op: Op) -> None:
+        parts = [self._output_channels(source) for source in op.sources]
         self.parts[op.name] = tuple(part for each in parts for part in each)
 
-    def _channels_of(self, name: str) -> tuple[tuple[int, int], ...]:
+    def _output_channels(self, name: str) -> tuple[tuple[int, int], ...]:
         tensor = self.tensor_of[name]
         layer = self.layers[tensor - 1] if tensor else None
         if not isinstance(layer, FloatConv) or layer.relu or len(layer.sources) > 1:
-            raise Cannot(
+            raise UnsupportedLayer(
                 name, "an output that is not a convolution's", "a convolution without ReLU"
             )
         return tuple((tensor, channel) for channel in range(len(layer.bias)))
 
-    def _output(self, op: Op) -> None:
+    def _mark_outputs(self, op: Op) -> None:
         (source,) = op.sources
-        self.outputs = self.parts.get(source) or self._channels_of(source)
+        self.outputs = self.parts.get(source) or self._output_channels(source)
 
 
-def takes_shortcut(layer: FloatLayer) -> TypeGuard[FloatConv]:
+def can_fuse_shortcut(layer: FloatLayer) -> TypeGuard[FloatConv]:
     """Return whether a layer can absorb a sum: a dense convolution that keeps the size."""
     return (
         isinstance(layer, FloatConv)
@@ -283,20 +293,20 @@ def takes_shortcut(layer: FloatLayer) -> TypeGuard[FloatConv]:
     )
 
 
-def to_input(images: NDArray[np.uint8]) -> Float32:
+def normalize_images(images: NDArray[np.uint8]) -> Float32:
     """Normalize (N, H, W, C) images to (N, C, H, W) input, ``x / 128 - 1``."""
     planes = images.transpose(0, 3, 1, 2).astype(np.float32)
     scaled: Float32 = planes / np.float32(PIXEL_ZERO) - np.float32(1)
     return scaled
 
 
-def grey_of(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def rgb_to_grey(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Convert (N, H, W, 3) RGB to (N, H, W, 1) grey: ``(77 R + 150 G + 29 B + 128) >> 8``."""
     weighted = images.astype(np.uint32) @ np.array([77, 150, 29], np.uint32)
     return ((weighted + 128) >> 8).astype(np.uint8)[..., None]
 
 
-def tensors_of(graph: Graph, images: Float32) -> list[Float32]:
+def compute_tensors(graph: FloatGraph, images: Float32) -> list[Float32]:
     """Compute the input and the output of every layer, each (N, channels, rows, cols)."""
     tensors = [images]
     for layer in graph.layers:
@@ -306,12 +316,12 @@ def tensors_of(graph: Graph, images: Float32) -> list[Float32]:
         elif isinstance(layer, FloatAdd):
             out = inputs[0] + inputs[1]
         else:
-            out = largest_of_blocks(inputs[0])
+            out = max_pool_2x2(inputs[0])
         tensors.append(np.maximum(out, 0) if layer.relu else out)
     return tensors
 
 
-def outputs_of(graph: Graph, tensors: list[Float32]) -> Float32:
+def select_outputs(graph: FloatGraph, tensors: list[Float32]) -> Float32:
     """Return the (N, channels, rows, cols) output of the network from its tensors."""
     return np.stack([tensors[tensor][:, channel] for tensor, channel in graph.outputs], axis=1)
 
@@ -319,7 +329,7 @@ def outputs_of(graph: Graph, tensors: list[Float32]) -> Float32:
 def _convolve(layer: FloatConv, x: Float32) -> Float32:
     padding = layer.padding
     padded = np.pad(x, ((0, 0), (0, 0), (padding, padding), (padding, padding)))
-    taps = taps_of(padded, layer.weight.shape[2], layer.stride, layer.dilation)
+    taps = extract_taps(padded, layer.weight.shape[2], layer.stride, layer.dilation)
     count, _, _, rows, cols = taps.shape
     outs = len(layer.bias)
     weight = layer.weight.reshape(outs, -1).astype(np.float32)

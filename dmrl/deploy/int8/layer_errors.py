@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from dmrl.deploy.int8 import graph as floats
 from dmrl.deploy.int8 import reference
-from dmrl.deploy.int8.graph import Float32, Graph, grey_of
+from dmrl.deploy.int8.graph import Float32, FloatGraph, rgb_to_grey
 from dmrl.deploy.int8.network import Conv, IntegerNetwork
-from dmrl.deploy.int8.reference import Quantised
+from dmrl.deploy.int8.reference import QuantizedTensor
 
 
 @dataclass(frozen=True, slots=True)
-class LayerFigures:
+class LayerErrorStats:
     """Quantization error of a layer.
 
     Parameters
@@ -45,13 +45,13 @@ class LayerFigures:
 
 
 @dataclass
-class _Sums:
+class _ErrorSums:
     signal: float = 0.0
     error: float = 0.0
     saturated: int = 0
     count: int = 0
 
-    def take(
+    def accumulate(
         self, wanted: Float32, got: NDArray[np.floating], levels: NDArray[np.integer], signed: bool
     ) -> None:
         self.signal += float((wanted.astype(np.float64) ** 2).sum())
@@ -65,9 +65,9 @@ class _Sums:
         return float(10 * np.log10(self.signal / self.error)) if self.signal * self.error else None
 
 
-def layer_figures(
-    graph: Graph, network: IntegerNetwork, images: Iterable[NDArray[np.uint8]]
-) -> list[LayerFigures]:
+def compute_layer_errors(
+    graph: FloatGraph, network: IntegerNetwork, images: Iterable[NDArray[np.uint8]]
+) -> list[LayerErrorStats]:
     """Compare every layer, then every head, of the int8 and the float network.
 
     Parameters
@@ -79,40 +79,40 @@ def layer_figures(
     images
         (height, width, 3) RGB images.
     """
-    layers = [_Sums() for _ in network.layers]
-    heads = {name: _Sums() for name in network.heads}
+    layers = [_ErrorSums() for _ in network.layers]
+    heads = {name: _ErrorSums() for name in network.heads}
     for image in images:
-        seen = grey_of(image[None])[0] if network.channels == 1 else image
-        wanted = floats.tensors_of(graph, floats.to_input(seen[None]))
-        got = list(reference.tensors_of(network, seen))
-        _take(network, [tensor[0] for tensor in wanted], got, layers, heads)
-    return [*_of_layers(network, layers), *_of_heads(network, heads)]
+        seen = rgb_to_grey(image[None])[0] if network.channels == 1 else image
+        wanted = floats.compute_tensors(graph, floats.normalize_images(seen[None]))
+        got = list(reference.iter_tensors(network, seen))
+        _accumulate_image(network, [tensor[0] for tensor in wanted], got, layers, heads)
+    return [*_summarise_layers(network, layers), *_summarise_heads(network, heads)]
 
 
-def _take(
+def _accumulate_image(
     network: IntegerNetwork,
     wanted: list[Float32],
-    got: list[Quantised],
-    layers: list[_Sums],
-    heads: dict[str, _Sums],
+    got: list[QuantizedTensor],
+    layers: list[_ErrorSums],
+    heads: dict[str, _ErrorSums],
 ) -> None:
     for sums, layer, real, levels in zip(layers, network.layers, wanted[1:], got[1:], strict=True):
-        sums.take(real, levels * layer.scale, levels, layer.signed)
+        sums.accumulate(real, levels * layer.scale, levels, layer.signed)
     for name, head in network.heads.items():
         levels = got[head.tensor][head.channel]
-        values = reference.real(head, levels.astype(np.int8))
-        heads[name].take(wanted[head.tensor][head.channel], values, levels, signed=True)
+        values = reference.dequantize(head, levels.astype(np.int8))
+        heads[name].accumulate(wanted[head.tensor][head.channel], values, levels, signed=True)
 
 
-def _of_layers(network: IntegerNetwork, sums: list[_Sums]) -> list[LayerFigures]:
+def _summarise_layers(network: IntegerNetwork, sums: list[_ErrorSums]) -> list[LayerErrorStats]:
     shapes = network.shapes
     of_heads = {head.tensor for head in network.heads.values()}
     return [
-        LayerFigures(
+        LayerErrorStats(
             layer.name,
             layer.kind,
             shapes[k + 1],
-            layer.macs((shapes[layer.source],)) if isinstance(layer, Conv) else 0,
+            layer.count_macs((shapes[layer.source],)) if isinstance(layer, Conv) else 0,
             -128 * layer.scale if layer.signed else 0.0,
             (127 if layer.signed else 255) * layer.scale,
             sums[k].sqnr_db,
@@ -123,20 +123,20 @@ def _of_layers(network: IntegerNetwork, sums: list[_Sums]) -> list[LayerFigures]
     ]
 
 
-def _of_heads(network: IntegerNetwork, sums: dict[str, _Sums]) -> list[LayerFigures]:
+def _summarise_heads(network: IntegerNetwork, sums: dict[str, _ErrorSums]) -> list[LayerErrorStats]:
     out = []
     for name, head in network.heads.items():
         layer = network.layers[head.tensor - 1]
         assert isinstance(layer, Conv)
         channels, *grid = network.shapes[head.tensor]
         source = network.shapes[layer.source]
-        low, high = reference.real(head, np.array([-128, 127], np.int8))
+        low, high = reference.dequantize(head, np.array([-128, 127], np.int8))
         out.append(
-            LayerFigures(
+            LayerErrorStats(
                 f"{layer.name}[{head.channel}] {name}",
                 "head",
                 (1, grid[0], grid[1]),
-                layer.macs((source,)) // channels,
+                layer.count_macs((source,)) // channels,
                 float(low),
                 float(high),
                 sums[name].sqnr_db,

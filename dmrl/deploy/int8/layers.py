@@ -49,7 +49,7 @@ class Layer(Protocol):
     def scale(self) -> float:
         """Real value of one step of its output. For heads, see `Head`."""
 
-    def shape(self, inputs: tuple[Shape, ...]) -> Shape:
+    def output_shape(self, inputs: tuple[Shape, ...]) -> Shape:
         """Return channels, rows and columns of its output."""
 
     def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
@@ -147,7 +147,7 @@ class Conv:
         near: Array = np.rint(np.maximum(1 / factor, 1)) / np.rint(np.maximum(factor, 1))
         return near
 
-    def shape(self, inputs: tuple[Shape, ...]) -> Shape:
+    def output_shape(self, inputs: tuple[Shape, ...]) -> Shape:
         """Return channels, rows and columns of its output."""
         reach = self.dilation * (self.kernel - 1) + 1
         rows, cols = (
@@ -155,9 +155,9 @@ class Conv:
         )
         return self.weight.shape[0], rows, cols
 
-    def macs(self, inputs: tuple[Shape, ...]) -> int:
+    def count_macs(self, inputs: tuple[Shape, ...]) -> int:
         """Return the multiply-accumulates per image."""
-        channels, rows, cols = self.shape(inputs)
+        channels, rows, cols = self.output_shape(inputs)
         return channels * rows * cols * int(np.prod(self.weight.shape[1:]))
 
     def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
@@ -165,25 +165,33 @@ class Conv:
         channels = inputs[0][0]
         outs, ins, *kernel = self.weight.shape
         if kernel not in ([1, 1], [3, 3]) or ins * self.groups != channels:
-            raise unsound(self, f"has weights {self.weight.shape} for {channels} channels")
+            raise invalid_layer_error(
+                self, f"has weights {self.weight.shape} for {channels} channels"
+            )
         if self.groups not in (1, channels) or (self.depthwise and outs != channels):
-            raise unsound(self, f"has {self.groups} groups of {channels} channels")
+            raise invalid_layer_error(self, f"has {self.groups} groups of {channels} channels")
         own = (self.bias, self.multiplier, *([self.gain] if len(inputs) > 1 else []))
         if any(one.shape != (outs,) for one in own):
-            raise unsound(self, f"lacks a bias, multiplier or gain for some of {outs} channels")
+            raise invalid_layer_error(
+                self, f"lacks a bias, multiplier or gain for some of {outs} channels"
+            )
         # Bound on the sum: the largest input value of the type times the sum of absolute weights.
         largest_input = 128 if signed[0] else 255
         largest = largest_input * np.abs(self.weight.astype(np.int64)).sum(axis=(1, 2, 3))
         if len(inputs) > 1:
-            if self.depthwise or inputs[1] != self.shape(inputs) or inputs[1][1:] != inputs[0][1:]:
-                raise unsound(self, f"adds {inputs[1]} to {self.shape(inputs)}")
+            if (
+                self.depthwise
+                or inputs[1] != self.output_shape(inputs)
+                or inputs[1][1:] != inputs[0][1:]
+            ):
+                raise invalid_layer_error(self, f"adds {inputs[1]} to {self.output_shape(inputs)}")
             if (self.gain < 0).any() or (self.gain >= 2**23).any():
-                raise unsound(self, "has a gain out of range")
+                raise invalid_layer_error(self, "has a gain out of range")
             largest += (128 if signed[1] else 255) * self.gain.astype(np.int64) >> GAIN_SHIFT
         if (largest + np.abs(self.bias.astype(np.int64))).max() >= 2**31:
-            raise unsound(self, "can overflow int32")
+            raise invalid_layer_error(self, "can overflow int32")
         if (self.multiplier < 1).any() or not 1 <= self.shift <= 32:
-            raise unsound(self, "has a multiplier or shift out of range")
+            raise invalid_layer_error(self, "has a multiplier or shift out of range")
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +209,7 @@ class MaxPool:
         """Tensors it reads."""
         return (self.source,)
 
-    def shape(self, inputs: tuple[Shape, ...]) -> Shape:
+    def output_shape(self, inputs: tuple[Shape, ...]) -> Shape:
         """Return channels, rows and columns of its output."""
         channels, rows, cols = inputs[0]
         return channels, rows // 2, cols // 2
@@ -209,7 +217,7 @@ class MaxPool:
     def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
         """Raise ModelError unless input and output have the same type."""
         if self.signed != signed[0]:
-            raise unsound(self, "changes the type of its input")
+            raise invalid_layer_error(self, "changes the type of its input")
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,22 +245,22 @@ class Add:
     signed: bool = False
     scale: float = 1.0
 
-    def shape(self, inputs: tuple[Shape, ...]) -> Shape:
+    def output_shape(self, inputs: tuple[Shape, ...]) -> Shape:
         """Return channels, rows and columns of its output."""
         return inputs[0]
 
     def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
         """Raise ModelError unless its inputs have one shape and its numbers are in range."""
         if inputs[0] != inputs[1]:
-            raise unsound(self, f"adds {inputs[0]} to {inputs[1]}")
+            raise invalid_layer_error(self, f"adds {inputs[0]} to {inputs[1]}")
         low, high = sorted(self.multipliers)
         if not (low >= 0 and 2**20 <= high < 2**21 and 1 <= self.shift <= 30):
-            raise unsound(self, "has a multiplier or shift out of range")
+            raise invalid_layer_error(self, "has a multiplier or shift out of range")
 
 
 AnyLayer = Conv | MaxPool | Add
 
 
-def unsound(layer: Layer, what: str) -> ModelError:
+def invalid_layer_error(layer: Layer, what: str) -> ModelError:
     """Return the error for a layer that violates an invariant."""
     return ModelError(f"layer {layer.name} {what}. Quantise the model again")

@@ -22,10 +22,10 @@ from dmrl.deploy.int8.layers import (
     Int32,
     MaxPool,
     Shape,
-    unsound,
+    invalid_layer_error,
 )
 from dmrl.errors import ModelError
-from dmrl.guards.safe_names import shortened
+from dmrl.guards.safe_names import truncate
 
 __all__ = [
     "CONFIDENCE_ONE",
@@ -127,7 +127,7 @@ class IntegerNetwork:
         """Channels, rows and columns of every tensor."""
         shapes: list[Shape] = [(self.channels, self.height_px, self.width_px)]
         for layer in self.layers:
-            shapes.append(layer.shape(tuple(shapes[k] for k in layer.sources)))
+            shapes.append(layer.output_shape(tuple(shapes[k] for k in layer.sources)))
         return tuple(shapes)
 
     @property
@@ -140,7 +140,9 @@ class IntegerNetwork:
         """Multiply-accumulates per image."""
         shapes = self.shapes
         return sum(
-            layer.macs((shapes[layer.source],)) for layer in self.layers if isinstance(layer, Conv)
+            layer.count_macs((shapes[layer.source],))
+            for layer in self.layers
+            if isinstance(layer, Conv)
         )
 
     @property
@@ -160,7 +162,7 @@ def require_sound(network: IntegerNetwork) -> None:
     """
     for index, layer in enumerate(network.layers):
         if not all(0 <= k <= index for k in layer.sources):
-            raise unsound(
+            raise invalid_layer_error(
                 layer, f"reads tensors {layer.sources}, which are not all computed before it"
             )
     shapes = network.shapes
@@ -168,7 +170,9 @@ def require_sound(network: IntegerNetwork) -> None:
     for layer, shape in zip(network.layers, shapes[1:], strict=True):
         inputs = tuple(shapes[k] for k in layer.sources)
         if min(shape) < 1:
-            raise unsound(layer, f"has no output for {inputs[0][2]} x {inputs[0][1]} inputs")
+            raise invalid_layer_error(
+                layer, f"has no output for {inputs[0][2]} x {inputs[0][1]} inputs"
+            )
         layer.require_sound(inputs, tuple(signed[k] for k in layer.sources))
     read = {k for layer in network.layers for k in layer.sources}
     for name, head in network.heads.items():
@@ -177,4 +181,4 @@ def require_sound(network: IntegerNetwork) -> None:
             raise ModelError(f"head {name} is not a signed tensor of the grid. Quantise again")
     named = Counter(layer.name for layer in network.layers)
     if twice := [name for name, count in named.items() if count > 1]:
-        raise ModelError(f"two layers are named {shortened(twice[0])!r}. Quantise the model again")
+        raise ModelError(f"two layers are named {truncate(twice[0])!r}. Quantise the model again")

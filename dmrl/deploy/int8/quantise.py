@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.activation_ranges import Ranges
+from dmrl.deploy.int8.activation_ranges import ActivationRanges
 from dmrl.deploy.int8.graph import (
     FloatAdd,
     FloatConv,
+    FloatGraph,
     FloatPool,
-    Graph,
 )
 from dmrl.deploy.int8.layers import GAIN_SHIFT, SIGNED_OFFSET
 from dmrl.deploy.int8.network import (
@@ -31,29 +31,29 @@ from dmrl.deploy.int8.network import (
     IntegerNetwork,
     MaxPool,
 )
-from dmrl.deploy.int8.rounding import Moments, rounded
+from dmrl.deploy.int8.rounding import InputMoments, round_weights
 from dmrl.errors import SettingError
 
 Array = NDArray[np.float64]
 
-HEAD_OF = {
+HEAD_OF_CHANNEL = {
     "log_depth": "depth",
     "confidence": "confidence",
     "offset_u": "offset_u",
     "offset_v": "offset_v",
 }
 """Head for each channel of a network's output; other channels are dropped."""
-HEAD_ROOM = 0.05
+HEAD_MARGIN = 0.05
 """Margin of a head at either end, as a fraction of its range, for values beyond calibration."""
-LEVELS = np.arange(-128.0, 128.0)
-SHORTCUT_LOSES = 0.5
+INT8_LEVELS = np.arange(-128.0, 128.0)
+SHORTCUT_ROUNDING_LOSS = 0.5
 """Mean loss of rounding down a shortcut, in steps of the sum; the bias compensates it."""
-GAIN_BITS = 16
+MAX_GAIN_BITS = 16
 """Significant bits of a shortcut's gain. Its product with 8 bits is then exact in float32, too."""
 
 
 @dataclass(frozen=True, slots=True)
-class About:
+class NetworkInfo:
     """Description of an integer network.
 
     Parameters
@@ -71,8 +71,11 @@ class About:
     threshold: float
 
 
-def quantise(
-    graph: Graph, ranges: Ranges, about: About, moments: Moments | None = None
+def quantise_network(
+    graph: FloatGraph,
+    ranges: ActivationRanges,
+    about: NetworkInfo,
+    moments: InputMoments | None = None,
 ) -> IntegerNetwork:
     """Quantize a float network to int8.
 
@@ -91,7 +94,7 @@ def quantise(
     SettingError
         If the network has no confidence or no depth.
     """
-    heads = _heads(graph, ranges, about)
+    heads = _build_heads(graph, ranges, about)
     layers: list[AnyLayer] = []
     # Scale and type of every tensor so far; the first is the image.
     scales = [1 / PIXEL_ZERO]
@@ -101,11 +104,11 @@ def quantise(
         own = [head for head in heads.values() if head.tensor == tensor]
         made: AnyLayer
         if isinstance(layer, FloatConv):
-            made = _conv(layer, scales, ranges, tensor, own, (moments or {}).get(index))
+            made = _quantise_conv(layer, scales, ranges, tensor, own, (moments or {}).get(index))
         elif isinstance(layer, FloatAdd):
-            made = _add(layer, scales, ranges, tensor)
+            made = _quantise_add(layer, scales, ranges, tensor)
         else:
-            made = _pool(layer, scales, signed)
+            made = _quantise_pool(layer, scales, signed)
         layers.append(made)
         scales.append(made.scale)
         signed.append(made.signed)
@@ -122,12 +125,16 @@ def quantise(
     )
 
 
-def _heads(graph: Graph, ranges: Ranges, about: About) -> dict[str, Head]:
+def _build_heads(
+    graph: FloatGraph, ranges: ActivationRanges, about: NetworkInfo
+) -> dict[str, Head]:
     """Build the heads of a network, by name."""
     heads = {
-        HEAD_OF[channel]: _head(graph, ranges, k, HEAD_OF[channel], about.stride_px)
+        HEAD_OF_CHANNEL[channel]: _build_head(
+            graph, ranges, k, HEAD_OF_CHANNEL[channel], about.stride_px
+        )
         for k, channel in enumerate(about.channels)
-        if channel in HEAD_OF
+        if channel in HEAD_OF_CHANNEL
     }
     if absent := sorted({"confidence", "depth"} - heads.keys()):
         raise SettingError(
@@ -136,54 +143,56 @@ def _heads(graph: Graph, ranges: Ranges, about: About) -> dict[str, Head]:
     return heads
 
 
-def _head(graph: Graph, ranges: Ranges, output: int, name: str, stride_px: int) -> Head:
+def _build_head(
+    graph: FloatGraph, ranges: ActivationRanges, output: int, name: str, stride_px: int
+) -> Head:
     """Build a head; its 256 levels cover its range, a margin, and 0.
 
     Each head has its own scale, since log depths and logits have different ranges.
     """
     tensor, channel = graph.outputs[output]
     least, most = ranges.low[tensor][channel], ranges.high[tensor][channel]
-    room = HEAD_ROOM * (most - least)
+    room = HEAD_MARGIN * (most - least)
     low, high = min(least - room, 0.0), max(most + room, 0.0)
     scale = float(high - low) / 255 or 1.0
     zero_point = int(np.clip(np.rint(-128 - low / scale), -128, 127))
-    meaning = MEANINGS[name](scale * (LEVELS - zero_point), stride_px)
+    meaning = HEAD_CONVERSIONS[name](scale * (INT8_LEVELS - zero_point), stride_px)
     return Head(tensor, channel, scale, zero_point, np.rint(meaning).astype(np.int32))
 
 
-def _confidence_of(logit: Array, _stride_px: int) -> Array:
+def _to_confidence_units(logit: Array, _stride_px: int) -> Array:
     confidence: Array = CONFIDENCE_ONE / (1 + np.exp(-np.clip(logit, -60, 60)))
     return confidence
 
 
-def _millimetres_of(log_depth: Array, _stride_px: int) -> Array:
+def _to_millimetres(log_depth: Array, _stride_px: int) -> Array:
     depth: Array = np.minimum(1000 * np.exp(np.minimum(log_depth, 20)), 65535)
     return depth
 
 
-def _place_of(offset: Array, stride_px: int) -> Array:
+def _to_subpixels(offset: Array, stride_px: int) -> Array:
     """Return the position in a cell, 1/16 px, of an offset from the cell centre in cells."""
     return np.clip((offset + 0.5) * stride_px * SUBPIXEL, -32768, 32767)
 
 
-MEANINGS: dict[str, Callable[[Array, int], Array]] = {
-    "confidence": _confidence_of,
-    "depth": _millimetres_of,
-    "offset_u": _place_of,
-    "offset_v": _place_of,
+HEAD_CONVERSIONS: dict[str, Callable[[Array, int], Array]] = {
+    "confidence": _to_confidence_units,
+    "depth": _to_millimetres,
+    "offset_u": _to_subpixels,
+    "offset_v": _to_subpixels,
 }
 
 
-def _activation_scale(ranges: Ranges, tensor: int, *, signed: bool) -> float:
+def _activation_scale(ranges: ActivationRanges, tensor: int, *, signed: bool) -> float:
     # Symmetric, zero point 0: the inner sum then needs no zero point terms.
     low, high = float(ranges.low[tensor].min()), float(ranges.high[tensor].max())
     return max(-low, high) / 127 if signed else high / 255
 
 
-def _conv(
+def _quantise_conv(
     layer: FloatConv,
     scales: list[float],
-    ranges: Ranges,
+    ranges: ActivationRanges,
     tensor: int,
     heads: list[Head],
     moments: Array | None,
@@ -196,11 +205,11 @@ def _conv(
         out_scale[head.channel] = head.scale
         zero[head.channel] += head.zero_point
     in_scales = [scales[source] for source in layer.sources]
-    weight, bias, gain, divisor = _integers(layer, in_scales, out_scale, zero, moments)
+    weight, bias, gain, divisor = _quantise_weights(layer, in_scales, out_scale, zero, moments)
     # Only the image has a zero point: sum(w * (q - 128)) = sum(w * q) - 128 * sum(w).
     if layer.sources[0] == 0:
         bias -= PIXEL_ZERO * weight.sum(axis=(1, 2, 3))
-    multiplier, shift = _fixed_point(divisor)
+    multiplier, shift = _to_fixed_point(divisor)
     return Conv(
         layer.name,
         layer.sources[0],
@@ -220,7 +229,7 @@ def _conv(
     )
 
 
-def _integers(
+def _quantise_weights(
     layer: FloatConv, in_scales: list[float], out_scale: Array, zero: Array, moments: Array | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Array]:
     """Return integer weights, bias, gain of a shortcut, and divisor of the sums, per channel.
@@ -238,22 +247,22 @@ def _integers(
     more += 2.0**GAIN_SHIFT * 255 * sum(beside)
     least = 2.0**-30 * out_scale / in_scale
     weight_scale = np.maximum.reduce([largest / 127, more / (in_scale * room), least])
-    divisor = _odd(out_scale / (in_scale * weight_scale))
+    divisor = _round_to_odd(out_scale / (in_scale * weight_scale))
     sum_scale = out_scale / divisor
     weight_scale = sum_scale / in_scale
     if moments is None:
         weight = np.rint(layer.weight / weight_scale[:, None, None, None]).astype(np.int64)
         bias = layer.bias
     else:
-        weight, bias = rounded(layer, weight_scale, moments)
-    steps = np.rint(bias / sum_scale + SHORTCUT_LOSES * len(beside))
+        weight, bias = round_weights(layer, weight_scale, moments)
+    steps = np.rint(bias / sum_scale + SHORTCUT_ROUNDING_LOSS * len(beside))
     steps += np.rint(zero * divisor) + divisor // 2
-    gains = [_shortened(2.0**GAIN_SHIFT * scale / sum_scale) for scale in beside]
+    gains = [_limit_bits(2.0**GAIN_SHIFT * scale / sum_scale) for scale in beside]
     gain = np.array(gains).ravel().astype(np.int64)
     return weight, np.clip(steps, -room, room).astype(np.int64), gain, divisor
 
 
-def _odd(divisor: Array) -> Array:
+def _round_to_odd(divisor: Array) -> Array:
     """Return the odd number at or below each divisor; below 1, one over a whole number.
 
     No sum then lies halfway between two levels. All implementations that round to nearest agree, in
@@ -263,14 +272,14 @@ def _odd(divisor: Array) -> Array:
     return odd / np.ceil(np.maximum(1 / divisor, 1))
 
 
-def _shortened(gain: Array) -> Array:
+def _limit_bits(gain: Array) -> Array:
     """Round to whole numbers with at most `MAX_GAIN_BITS` significant bits."""
-    unit = np.maximum(2.0 ** (np.frexp(gain)[1] - GAIN_BITS), 1.0)
+    unit = np.maximum(2.0 ** (np.frexp(gain)[1] - MAX_GAIN_BITS), 1.0)
     near: Array = np.rint(gain / unit) * unit
     return near
 
 
-def _fixed_point(divisor: Array) -> tuple[Int32, int]:
+def _to_fixed_point(divisor: Array) -> tuple[Int32, int]:
     """Return requantization factors as ``multiplier / 2^shift``, the largest in 30 bits.
 
     Integers give the same rounding on every machine, including those without floating point. The
@@ -282,7 +291,9 @@ def _fixed_point(divisor: Array) -> tuple[Int32, int]:
     return np.ceil(2.0**shift / divisor).astype(np.int32), shift
 
 
-def _add(layer: FloatAdd, scales: list[float], ranges: Ranges, tensor: int) -> Add:
+def _quantise_add(
+    layer: FloatAdd, scales: list[float], ranges: ActivationRanges, tensor: int
+) -> Add:
     signed = not layer.relu and bool((ranges.low[tensor] < 0).any())
     a, b = (scales[source] for source in layer.sources)
     # A sum that cancels may be small, but the shift must be at least 1.
@@ -304,6 +315,6 @@ def _add(layer: FloatAdd, scales: list[float], ranges: Ranges, tensor: int) -> A
     )
 
 
-def _pool(layer: FloatPool, scales: list[float], signed: list[bool]) -> MaxPool:
+def _quantise_pool(layer: FloatPool, scales: list[float], signed: list[bool]) -> MaxPool:
     source = layer.sources[0]
     return MaxPool(layer.name, source, signed=signed[source], scale=scales[source])

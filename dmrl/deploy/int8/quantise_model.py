@@ -6,14 +6,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.activation_ranges import calibrate
-from dmrl.deploy.int8.equalisation import equalise
-from dmrl.deploy.int8.graph import Graph, graph_of
+from dmrl.deploy.int8.activation_ranges import calibrate_ranges
+from dmrl.deploy.int8.equalisation import equalise_channels
+from dmrl.deploy.int8.graph import FloatGraph, build_graph
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.deploy.int8.quantise import About, quantise
-from dmrl.deploy.int8.rounding import moments_of
+from dmrl.deploy.int8.quantise import NetworkInfo, quantise_network
+from dmrl.deploy.int8.rounding import measure_moments
 from dmrl.learn.inference.loaded_model import Model
-from dmrl.learn.networks.trace import operations
+from dmrl.learn.networks.trace import trace_operations
 from dmrl.terminal.progress import track
 
 MAX_ROUNDING_IMAGES = 50
@@ -33,7 +33,7 @@ class ImageSource(Protocol):
 class Quantised(NamedTuple):
     """The float graph, equalised, the int8 network, and the number of calibration images."""
 
-    graph: Graph
+    graph: FloatGraph
     network: IntegerNetwork
     images: int
 
@@ -59,15 +59,17 @@ def quantise_model(model: Model, source: ImageSource, most: int, *, grey: bool) 
     SettingError
         If nothing can be learned from the images.
     """
-    graph = graph_of(operations(model.network))
-    graph = graph.grey() if grey else graph
+    graph = build_graph(trace_operations(model.network))
+    graph = graph.to_grey() if grey else graph
     rows = spread_evenly(len(source), most)
     calibration = track(source.images(rows), "Calibrating", len(rows))
-    ranges = calibrate(graph, (image[None] for image in calibration))
-    graph, ranges = equalise(graph, ranges)
+    ranges = calibrate_ranges(graph, (image[None] for image in calibration))
+    graph, ranges = equalise_channels(graph, ranges)
     rows = spread_evenly(len(source), min(most, MAX_ROUNDING_IMAGES))
-    moments = moments_of(graph, track(source.images(rows), "Rounding", len(rows)))
-    return Quantised(graph, quantise(graph, ranges, _describe(model), moments), ranges.images)
+    moments = measure_moments(graph, track(source.images(rows), "Rounding", len(rows)))
+    return Quantised(
+        graph, quantise_network(graph, ranges, _describe(model), moments), ranges.images
+    )
 
 
 def spread_evenly(count: int, most: int) -> list[int]:
@@ -76,7 +78,9 @@ def spread_evenly(count: int, most: int) -> list[int]:
     return numbers
 
 
-def _describe(model: Model) -> About:
+def _describe(model: Model) -> NetworkInfo:
     network = model.network
     name = model.name or model.architecture
-    return About(name, model.architecture, network.stride_px, network.channels, model.threshold)
+    return NetworkInfo(
+        name, model.architecture, network.stride_px, network.channels, model.threshold
+    )

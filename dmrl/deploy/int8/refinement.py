@@ -12,24 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.int8.network import SUBPIXEL, Conv, IntegerNetwork
-from dmrl.deploy.int8.reference import Quantised, convolve
+from dmrl.deploy.int8.reference import QuantizedTensor, convolve
 from dmrl.errors import ModelError
 
 Int64 = NDArray[np.int64]
 
-ONE = 4096
+UNIT_SLOPE = 4096
 """Fixed-point value of a slope of 1."""
-POINT = 65536
+FIXED_POINT_ONE = 65536
 """Fixed-point value of a step of an int8 weight, and of a learning rate of 1."""
-LARGEST, LARGEST_BIAS = 127 * POINT, 2**30
+MAX_WEIGHT, MAX_BIAS = 127 * FIXED_POINT_ONE, 2**30
 """Limits of learned weights and biases."""
-GAIN_ONE = 256
+UNIT_GAIN = 256
 """Fixed-point value of a gain of 1."""
-LARGEST_GAIN = 2**26
+MAX_GAIN = 2**26
 """Limit of gains, against overflow."""
 
 
-class Seen(NamedTuple):
+class RefinementLabel(NamedTuple):
     """Label of the robot in an image: its centre, 1/16 px, and depth; 0 mm: no robot."""
 
     u_q4: int
@@ -38,7 +38,7 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Learned:
+class LearnedWeights:
     """Weights of the last layer during refinement.
 
     Parameters
@@ -53,7 +53,7 @@ class Learned:
     bias: Int64
 
 
-def last_layer(network: IntegerNetwork) -> Conv:
+def find_last_layer(network: IntegerNetwork) -> Conv:
     """Return the layer that computes every head.
 
     Raises
@@ -74,18 +74,18 @@ def last_layer(network: IntegerNetwork) -> Conv:
     return layer
 
 
-def start(network: IntegerNetwork) -> Learned:
+def initial_weights(network: IntegerNetwork) -> LearnedWeights:
     """Return the exported weights."""
-    layer, rows = last_layer(network), _rows(network)
-    weight = layer.weight[rows, :, 0, 0].astype(np.int64) * POINT
-    return Learned(weight, layer.bias[rows].astype(np.int64))
+    layer, rows = find_last_layer(network), _head_channels(network)
+    weight = layer.weight[rows, :, 0, 0].astype(np.int64) * FIXED_POINT_ONE
+    return LearnedWeights(weight, layer.bias[rows].astype(np.int64))
 
 
-def _rows(network: IntegerNetwork) -> list[int]:
+def _head_channels(network: IntegerNetwork) -> list[int]:
     return [head.channel for head in network.heads.values()]
 
 
-def gains(network: IntegerNetwork) -> tuple[Int64, Int64]:
+def compute_gains(network: IntegerNetwork) -> tuple[Int64, Int64]:
     """Compute the update of weights and of biases for a slope and a rate of 1.
 
     Returns
@@ -93,29 +93,33 @@ def gains(network: IntegerNetwork) -> tuple[Int64, Int64]:
     tuple
         (heads,) for weights and (heads,) for biases, in 1/256.
     """
-    layer = last_layer(network)
+    layer = find_last_layer(network)
     in_scale = network.layers[layer.source - 1].scale
     out_scale = np.array([head.scale for head in network.heads.values()])
-    sum_scale = layer.multiplier[_rows(network)] / 2.0**layer.shift * out_scale
+    sum_scale = layer.multiplier[_head_channels(network)] / 2.0**layer.shift * out_scale
     weight_scale = sum_scale / in_scale
-    weight = GAIN_ONE * POINT / ONE * in_scale / weight_scale
-    limited = [np.minimum(np.rint(g), LARGEST_GAIN) for g in (weight, GAIN_ONE / sum_scale)]
+    weight = UNIT_GAIN * FIXED_POINT_ONE / UNIT_SLOPE * in_scale / weight_scale
+    limited = [np.minimum(np.rint(g), MAX_GAIN) for g in (weight, UNIT_GAIN / sum_scale)]
     return limited[0].astype(np.int64), limited[1].astype(np.int64)
 
 
-def with_learned(network: IntegerNetwork, learned: Learned) -> IntegerNetwork:
+def apply_weights(network: IntegerNetwork, learned: LearnedWeights) -> IntegerNetwork:
     """Return the network with refined weights, rounded to int8."""
-    layer, rows = last_layer(network), _rows(network)
+    layer, rows = find_last_layer(network), _head_channels(network)
     weight, bias = layer.weight.copy(), layer.bias.copy()
-    weight[rows, :, 0, 0] = (learned.weight + POINT // 2) >> 16
+    weight[rows, :, 0, 0] = (learned.weight + FIXED_POINT_ONE // 2) >> 16
     bias[rows] = learned.bias
     last = replace(layer, weight=weight, bias=bias)
     return replace(network, layers=(*network.layers[:-1], last))
 
 
-def learn(
-    network: IntegerNetwork, learned: Learned, features: Quantised, seen: Seen, rate: int
-) -> Learned:
+def take_gradient_step(
+    network: IntegerNetwork,
+    learned: LearnedWeights,
+    features: QuantizedTensor,
+    seen: RefinementLabel,
+    rate: int,
+) -> LearnedWeights:
     """Take one gradient step.
 
     Parameters
@@ -136,21 +140,25 @@ def learn(
     LearnedWeights
         Weights after the step.
     """
-    layer = last_layer(with_learned(network, learned))
+    layer = find_last_layer(apply_weights(network, learned))
     out = convolve(layer, features)
     weight, bias = learned.weight.copy(), learned.bias.copy()
-    for h, (gain, bias_gain) in enumerate(zip(*gains(network), strict=True)):
-        slope = _slope(network, list(network.heads)[h], out[_rows(network)[h]], seen)
+    for h, (gain, bias_gain) in enumerate(zip(*compute_gains(network), strict=True)):
+        slope = _output_gradient(
+            network, list(network.heads)[h], out[_head_channels(network)[h]], seen
+        )
         for row, col in np.argwhere(slope):
             x, by = features[:, row, col].astype(np.int64), slope[row, col]
             step = (by * x * rate * gain + (1 << 23)) >> 24
-            weight[h] = np.clip(weight[h] - step, -LARGEST, LARGEST)
+            weight[h] = np.clip(weight[h] - step, -MAX_WEIGHT, MAX_WEIGHT)
             step = (by * rate * bias_gain + (1 << 35)) >> 36
-            bias[h] = np.clip(bias[h] - step, -LARGEST_BIAS, LARGEST_BIAS)
-    return Learned(weight, bias)
+            bias[h] = np.clip(bias[h] - step, -MAX_BIAS, MAX_BIAS)
+    return LearnedWeights(weight, bias)
 
 
-def _slope(network: IntegerNetwork, name: str, out: Quantised, seen: Seen) -> Int64:
+def _output_gradient(
+    network: IntegerNetwork, name: str, out: QuantizedTensor, seen: RefinementLabel
+) -> Int64:
     """Return (rows, cols) the gradient of the loss by a head's output, times `UNIT_SLOPE`."""
     rows, cols = network.grid_shape
     step = SUBPIXEL * network.stride_px
@@ -159,9 +167,9 @@ def _slope(network: IntegerNetwork, name: str, out: Quantised, seen: Seen) -> In
     right = np.arange(cols)[None] - (seen.u_q4 // step if seen.depth_mm else -cols)
     here = (down == 0) & (right == 0)
     if name == "confidence":
-        off = value // 16 - ONE * here
+        off = value // 16 - UNIT_SLOPE * here
         around = (np.abs(down) < 2) & (np.abs(right) < 2) & ~here
-        return np.where(around, 0, np.sign(off) * (off * off // ONE))
+        return np.where(around, 0, np.sign(off) * (off * off // UNIT_SLOPE))
     places = {"offset_u": seen.u_q4 % step, "offset_v": seen.v_q4 % step, "depth": seen.depth_mm}
-    most = ONE if name == "depth" else ONE // 2
+    most = UNIT_SLOPE if name == "depth" else UNIT_SLOPE // 2
     return np.where(here, most * np.sign(value - places[name]), 0)

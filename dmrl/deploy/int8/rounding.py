@@ -10,39 +10,47 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.graph import FloatConv, Graph, grey_of, tensors_of, to_input
-from dmrl.deploy.int8.windows import taps_of
+from dmrl.deploy.int8.graph import (
+    FloatConv,
+    FloatGraph,
+    compute_tensors,
+    normalize_images,
+    rgb_to_grey,
+)
+from dmrl.deploy.int8.windows import extract_taps
 
 Array = NDArray[np.float64]
-Moments = dict[int, Array]
+InputMoments = dict[int, Array]
 """Second moments by layer index, (groups, n + 1, n + 1): mean products of any two of the n inputs
 of an output and of the constant 1, which is last and represents the bias."""
 
-LARGEST = 127
+MAX_LEVEL = 127
 """Largest integer weight."""
 DAMPING = 1e-4
 """Fraction of the inputs' mean square added to the diagonal. It limits the compensation."""
 
 
-def moments_of(graph: Graph, images: Iterable[NDArray[np.uint8]]) -> Moments:
+def measure_moments(graph: FloatGraph, images: Iterable[NDArray[np.uint8]]) -> InputMoments:
     """Measure the second moments of every convolution's inputs over (height, width, 3) images."""
-    sums: Moments = {}
+    sums: InputMoments = {}
     count = 0
     for image in images:
         seen = image[None]
-        tensors = tensors_of(graph, to_input(grey_of(seen) if graph.channels == 1 else seen))
+        tensors = compute_tensors(
+            graph, normalize_images(rgb_to_grey(seen) if graph.channels == 1 else seen)
+        )
         for index, layer in enumerate(graph.layers):
             if isinstance(layer, FloatConv):
-                more = _moments(layer, tensors[layer.sources[0]][0])
+                more = _layer_moments(layer, tensors[layer.sources[0]][0])
                 sums[index] = sums[index] + more if count else more
         count += 1
     return {index: total / count for index, total in sums.items()}
 
 
-def _moments(layer: FloatConv, x: NDArray[np.float32]) -> Array:
+def _layer_moments(layer: FloatConv, x: NDArray[np.float32]) -> Array:
     pad = layer.padding
     padded = np.pad(x, ((0, 0), (pad, pad), (pad, pad)))
-    taps = taps_of(padded, layer.weight.shape[2], layer.stride, layer.dilation)
+    taps = extract_taps(padded, layer.weight.shape[2], layer.stride, layer.dilation)
     places = taps.shape[2] * taps.shape[3]
     inputs = taps.reshape(layer.groups, -1, places)
     inputs = np.concatenate([inputs, np.ones_like(inputs[:, :1])], axis=1)
@@ -51,7 +59,9 @@ def _moments(layer: FloatConv, x: NDArray[np.float32]) -> Array:
     return mean
 
 
-def rounded(layer: FloatConv, scale: Array, moments: Array) -> tuple[NDArray[np.int64], Array]:
+def round_weights(
+    layer: FloatConv, scale: Array, moments: Array
+) -> tuple[NDArray[np.int64], Array]:
     """Round the weights of a convolution; return integer weights and the matching bias.
 
     Parameters
@@ -67,7 +77,7 @@ def rounded(layer: FloatConv, scale: Array, moments: Array) -> tuple[NDArray[np.
     wanted = np.column_stack([layer.weight.reshape(outs, -1) / scale[:, None], layer.bias / scale])
     each = outs // layer.groups
     parts = [
-        _rounded(wanted[group * each : (group + 1) * each], moment)
+        _round_rows(wanted[group * each : (group + 1) * each], moment)
         for group, moment in enumerate(moments)
     ]
     levels = np.concatenate(parts)
@@ -75,7 +85,7 @@ def rounded(layer: FloatConv, scale: Array, moments: Array) -> tuple[NDArray[np.
     return weight, levels[:, -1] * scale
 
 
-def _rounded(wanted: Array, moments: Array) -> Array:
+def _round_rows(wanted: Array, moments: Array) -> Array:
     """Round rows of weights, one column after another; the last column, the bias, stays real.
 
     The weights of the largest input are rounded first, since most other weights can still
@@ -90,7 +100,7 @@ def _rounded(wanted: Array, moments: Array) -> Array:
     factor = np.linalg.cholesky((inverse + inverse.T) / 2).T
     left = wanted[:, order]
     for j in range(last):
-        level = np.clip(np.rint(left[:, j]), -LARGEST, LARGEST)
+        level = np.clip(np.rint(left[:, j]), -MAX_LEVEL, MAX_LEVEL)
         lost = (left[:, j] - level) / factor[j, j]
         left[:, j] = level
         left[:, j + 1 :] -= lost[:, None] * factor[j, j + 1 :]

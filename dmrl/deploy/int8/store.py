@@ -19,11 +19,19 @@ from dmrl.guards.paths import refuse_pipes
 INTEGER_NAME = "integer.npz"
 """Name of the file in a quantised model and in an export folder."""
 FORMAT = 3
-KINDS: dict[str, type[AnyLayer]] = {kind.kind: kind for kind in (Conv, MaxPool, Add)}
-HEADS = ("confidence", "depth", "offset_u", "offset_v")
-PLAIN = ("name", "architecture", "channels", "height_px", "width_px", "stride_px", "threshold")
+LAYER_CLASSES: dict[str, type[AnyLayer]] = {kind.kind: kind for kind in (Conv, MaxPool, Add)}
+HEAD_NAMES = ("confidence", "depth", "offset_u", "offset_v")
+PLAIN_FIELDS = (
+    "name",
+    "architecture",
+    "channels",
+    "height_px",
+    "width_px",
+    "stride_px",
+    "threshold",
+)
 
-DAMAGES = (
+CORRUPTION_ERRORS = (
     *(TypeError, ValueError, LookupError, ArithmeticError, AttributeError, RecursionError),
     *(OSError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error),
 )
@@ -34,21 +42,21 @@ Arrays = dict[str, NDArray[Any]]
 Part = TypeVar("Part")
 
 
-def save(network: IntegerNetwork, path: Path) -> None:
+def save_network(network: IntegerNetwork, path: Path) -> None:
     """Write a network; equal networks give equal bytes."""
     arrays: Arrays = {}
     layers = [
-        {"kind": layer.kind, **_packed(layer, f"layer{k}", arrays)}
+        {"kind": layer.kind, **_pack_part(layer, f"layer{k}", arrays)}
         for k, layer in enumerate(network.layers)
     ]
-    heads = {name: _packed(head, name, arrays) for name, head in network.heads.items()}
-    plain = {name: getattr(network, name) for name in PLAIN}
+    heads = {name: _pack_part(head, name, arrays) for name, head in network.heads.items()}
+    plain = {name: getattr(network, name) for name in PLAIN_FIELDS}
     said = {"format": FORMAT, **plain, "layers": layers, "heads": heads}
     text = np.frombuffer(json.dumps(said).encode(), np.uint8)
     np.savez_compressed(path, allow_pickle=False, description=text, **arrays)
 
 
-def _packed(part: AnyLayer | Head, prefix: str, arrays: Arrays) -> dict[str, Any]:
+def _pack_part(part: AnyLayer | Head, prefix: str, arrays: Arrays) -> dict[str, Any]:
     """Return the plain fields of a part and add its arrays to ``arrays``."""
     plain = {}
     for field in fields(part):
@@ -60,7 +68,7 @@ def _packed(part: AnyLayer | Head, prefix: str, arrays: Arrays) -> dict[str, Any
     return plain
 
 
-def load(path: Path) -> IntegerNetwork:
+def load_network(path: Path) -> IntegerNetwork:
     """Load a network from a file written by `save_network`.
 
     Parameters
@@ -86,26 +94,26 @@ def load(path: Path) -> IntegerNetwork:
                 f"{file} has format {said['format']}, this dmrl reads {FORMAT}. Quantise the "
                 "model again with this dmrl: dmrl quantize"
             )
-        return _network(said, arrays)
-    except DAMAGES as e:
+        return _build_network(said, arrays)
+    except CORRUPTION_ERRORS as e:
         raise ModelError(f"{file} is damaged: {e!r:.200}. Quantise the model again") from None
 
 
-def _network(said: dict[str, Any], arrays: Arrays) -> IntegerNetwork:
+def _build_network(said: dict[str, Any], arrays: Arrays) -> IntegerNetwork:
     layers = tuple(
-        _checked(KINDS[layer.pop("kind")](**_unpacked(layer, f"layer{k}", arrays)))
+        _check_types(LAYER_CLASSES[layer.pop("kind")](**_unpack_part(layer, f"layer{k}", arrays)))
         for k, layer in enumerate(said["layers"])
     )
     heads = {
-        name: _checked(Head(**_unpacked(head, name, arrays)))
+        name: _check_types(Head(**_unpack_part(head, name, arrays)))
         for name, head in said["heads"].items()
-        if name in HEADS
+        if name in HEAD_NAMES
     }
-    fields: dict[str, Any] = {name: said[name] for name in PLAIN} | heads
-    return _checked(IntegerNetwork(layers=layers, **fields))
+    fields: dict[str, Any] = {name: said[name] for name in PLAIN_FIELDS} | heads
+    return _check_types(IntegerNetwork(layers=layers, **fields))
 
 
-def _unpacked(plain: dict[str, Any], prefix: str, arrays: Arrays) -> dict[str, Any]:
+def _unpack_part(plain: dict[str, Any], prefix: str, arrays: Arrays) -> dict[str, Any]:
     own = {
         name.removeprefix(f"{prefix}."): value
         for name, value in arrays.items()
@@ -115,7 +123,7 @@ def _unpacked(plain: dict[str, Any], prefix: str, arrays: Arrays) -> dict[str, A
     return {**tuples, **own}
 
 
-def _checked(part: Part) -> Part:
+def _check_types(part: Part) -> Part:
     """Return the part if its fields have their declared types; they become numbers and names in C.
 
     Raises
@@ -124,12 +132,14 @@ def _checked(part: Part) -> Part:
         If one does not.
     """
     for field, kind in get_type_hints(type(part)).items():
-        if field not in ("kind", "layers", *HEADS) and not _is_of(getattr(part, field), kind):
+        if field not in ("kind", "layers", *HEAD_NAMES) and not _has_type(
+            getattr(part, field), kind
+        ):
             raise TypeError(f"{field} is {str(getattr(part, field))[:40]!r}")
     return part
 
 
-def _is_of(value: Any, kind: Any) -> bool:
+def _has_type(value: Any, kind: Any) -> bool:
     if get_origin(kind) is np.ndarray:
         wanted = get_args(get_args(kind)[1])[0]
         return isinstance(value, np.ndarray) and value.dtype == wanted

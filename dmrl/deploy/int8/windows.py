@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 Number = TypeVar("Number", bound=np.generic)
 
 
-def taps_of(padded: NDArray[Number], kernel: int, stride: int, dilation: int) -> NDArray[Number]:
+def extract_taps(
+    padded: NDArray[Number], kernel: int, stride: int, dilation: int
+) -> NDArray[Number]:
     """Extract every input of every output of a convolution (im2col).
 
     Parameters
@@ -38,7 +40,7 @@ def taps_of(padded: NDArray[Number], kernel: int, stride: int, dilation: int) ->
     return np.stack(windows, axis=-3)
 
 
-def largest_of_blocks(x: NDArray[Number]) -> NDArray[Number]:
+def max_pool_2x2(x: NDArray[Number]) -> NDArray[Number]:
     """Return (..., rows // 2, cols // 2) the maximum of each 2x2 block."""
     rows, cols = x.shape[-2] // 2, x.shape[-1] // 2
     blocks = x[..., : 2 * rows, : 2 * cols].reshape(*x.shape[:-2], rows, 2, cols, 2)

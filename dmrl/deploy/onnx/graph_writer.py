@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.graph import FloatAdd, FloatConv, Graph
+from dmrl.deploy.int8.graph import FloatAdd, FloatConv, FloatGraph
 from dmrl.deploy.int8.layers import GAIN_SHIFT, SIGNED_OFFSET
 from dmrl.deploy.int8.network import PIXEL_ZERO, Add, Conv, Head, IntegerNetwork
-from dmrl.deploy.int8.quantise import HEAD_OF
+from dmrl.deploy.int8.quantise import HEAD_OF_CHANNEL
 from dmrl.errors import MissingExtra
 
 try:
@@ -22,7 +22,7 @@ try:
 except ImportError as e:
     raise MissingExtra("onnx", "deploy", "ONNX") from e
 
-IMAGE = "image"
+INPUT_NAME = "image"
 OUTPUT_OF = {
     "log_depth": "log_depth",
     "confidence": "confidence_logit",
@@ -33,32 +33,34 @@ OUTPUT_OF = {
 OPSET, IR_VERSION = 17, 8  # supported by every onnxruntime of the last years
 
 
-class _Writer:
+class _OnnxWriter:
     """Collects nodes and constants of a graph; values are identified by name."""
 
     def __init__(self) -> None:
         self.nodes: list[Any] = []
         self.constants: dict[str, Any] = {}
-        self.made: set[str] = set()
+        self.node_outputs: set[str] = set()
 
-    def constant(self, name: str, values: NDArray[Any]) -> str:
+    def add_constant(self, name: str, values: NDArray[Any]) -> str:
         """Add a constant unless its name exists; return the name."""
         if name not in self.constants:
             self.constants[name] = numpy_helper.from_array(values.copy(order="C"), name)
         return name
 
-    def node(self, kind: str, inputs: Sequence[str], output: str, **settings: Any) -> str:
+    def add_node(self, kind: str, inputs: Sequence[str], output: str, **settings: Any) -> str:
         """Append a node and return the name of its output."""
         self.nodes.append(helper.make_node(kind, list(inputs), [output], output, **settings))
-        self.made.add(output)
+        self.node_outputs.add(output)
         return output
 
-    def model(self, name: str, image: Sequence[int], outputs: dict[str, tuple[int, int]]) -> bytes:
+    def serialize_model(
+        self, name: str, image: Sequence[int], outputs: dict[str, tuple[int, int]]
+    ) -> bytes:
         """Serialize the graph as an ONNX file."""
         graph = helper.make_graph(
             self.nodes,
             name,
-            [helper.make_tensor_value_info(IMAGE, TensorProto.UINT8, ["N", *image])],
+            [helper.make_tensor_value_info(INPUT_NAME, TensorProto.UINT8, ["N", *image])],
             [
                 helper.make_tensor_value_info(output, TensorProto.FLOAT, ["N", *grid])
                 for output, grid in outputs.items()
@@ -74,7 +76,7 @@ class _Writer:
         return written
 
 
-class _Levels(NamedTuple):
+class _QuantizedTensor(NamedTuple):
     """Name, scale and zero point of a uint8 tensor."""
 
     name: str
@@ -82,8 +84,12 @@ class _Levels(NamedTuple):
     zero_point: int
 
 
-def float_onnx(
-    graph: Graph, channels: Sequence[str], *, size_px: tuple[int, int], grid_shape: tuple[int, int]
+def build_float_onnx(
+    graph: FloatGraph,
+    channels: Sequence[str],
+    *,
+    size_px: tuple[int, int],
+    grid_shape: tuple[int, int],
 ) -> bytes:
     """Build the ONNX file of a float network.
 
@@ -98,15 +104,15 @@ def float_onnx(
     grid_shape
         Rows and columns of the output.
     """
-    out = _Writer()
-    planes = out.node("Transpose", [IMAGE], "planes", perm=[0, 3, 1, 2])
-    pixels = out.node("Cast", [planes], "pixels", to=TensorProto.FLOAT)
-    zero = out.constant("pixel_zero", np.array(PIXEL_ZERO, np.float32))
-    centred = out.node("Sub", [pixels, zero], "pixels_centred")
+    out = _OnnxWriter()
+    planes = out.add_node("Transpose", [INPUT_NAME], "planes", perm=[0, 3, 1, 2])
+    pixels = out.add_node("Cast", [planes], "pixels", to=TensorProto.FLOAT)
+    zero = out.add_constant("pixel_zero", np.array(PIXEL_ZERO, np.float32))
+    centred = out.add_node("Sub", [pixels, zero], "pixels_centred")
     tensors = [centred]
-    if not _weights_scale(graph):
-        scale = out.constant("pixel_scale", np.array(1 / PIXEL_ZERO, np.float32))
-        tensors = [out.node("Mul", [centred, scale], "input")]
+    if not _can_fold_input_scale(graph):
+        scale = out.add_constant("pixel_scale", np.array(1 / PIXEL_ZERO, np.float32))
+        tensors = [out.add_node("Mul", [centred, scale], "input")]
     for layer in graph.layers:
         inputs = [tensors[k] for k in layer.sources]
         name = f"{layer.name}.sum" if layer.relu else layer.name
@@ -114,34 +120,36 @@ def float_onnx(
             weights = layer.weight.astype(np.float32)
             if inputs[0] == centred:
                 weights /= np.float32(PIXEL_ZERO)  # a power of two: bit-identical to scaled pixels
-            weight = out.constant(f"{layer.name}.weight", weights)
-            bias = out.constant(f"{layer.name}.bias", layer.bias.astype(np.float32))
+            weight = out.add_constant(f"{layer.name}.weight", weights)
+            bias = out.add_constant(f"{layer.name}.bias", layer.bias.astype(np.float32))
             value = f"{name}.conv" if inputs[1:] else name
-            out.node("Conv", [inputs[0], weight, bias], value, **_conv_settings(layer))
+            out.add_node("Conv", [inputs[0], weight, bias], value, **_conv_attributes(layer))
             if inputs[1:]:
-                value = out.node("Add", [value, inputs[1]], name)
+                value = out.add_node("Add", [value, inputs[1]], name)
         elif isinstance(layer, FloatAdd):
-            value = out.node("Add", inputs, name)
+            value = out.add_node("Add", inputs, name)
         else:
-            value = _max_pool(out, inputs[0], name)
-        tensors.append(out.node("Relu", [value], layer.name) if layer.relu else value)
+            value = _add_max_pool(out, inputs[0], name)
+        tensors.append(out.add_node("Relu", [value], layer.name) if layer.relu else value)
     names = {}
     for channel, (tensor, place) in zip(channels, graph.outputs, strict=True):
         if channel in OUTPUT_OF:
-            at = out.constant(f"channel{place}", np.array(place, np.int64))
-            names[channel] = out.node("Gather", [tensors[tensor], at], OUTPUT_OF[channel], axis=1)
+            at = out.add_constant(f"channel{place}", np.array(place, np.int64))
+            names[channel] = out.add_node(
+                "Gather", [tensors[tensor], at], OUTPUT_OF[channel], axis=1
+            )
     image = (*size_px, graph.channels)
-    return out.model("float", image, dict.fromkeys(names.values(), grid_shape))
+    return out.serialize_model("float", image, dict.fromkeys(names.values(), grid_shape))
 
 
-def _weights_scale(graph: Graph) -> bool:
+def _can_fold_input_scale(graph: FloatGraph) -> bool:
     """Return whether only convolutions read the image, so that weights can absorb its scale."""
     takes = [layer for layer in graph.layers if 0 in layer.sources]
     convolved = all(isinstance(one, FloatConv) and 0 not in one.sources[1:] for one in takes)
     return convolved and all(tensor for tensor, _ in graph.outputs)
 
 
-def _conv_settings(layer: FloatConv | Conv) -> dict[str, Any]:
+def _conv_attributes(layer: FloatConv | Conv) -> dict[str, Any]:
     return {
         "kernel_shape": list(layer.weight.shape[2:]),
         "strides": [layer.stride] * 2,
@@ -151,8 +159,8 @@ def _conv_settings(layer: FloatConv | Conv) -> dict[str, Any]:
     }
 
 
-def _max_pool(out: _Writer, source: str, name: str) -> str:
-    return out.node("MaxPool", [source], name, kernel_shape=[2, 2], strides=[2, 2])
+def _add_max_pool(out: _OnnxWriter, source: str, name: str) -> str:
+    return out.add_node("MaxPool", [source], name, kernel_shape=[2, 2], strides=[2, 2])
 
 
 def int8_onnx(network: IntegerNetwork) -> bytes:
@@ -165,9 +173,9 @@ def int8_onnx(network: IntegerNetwork) -> bytes:
     (integers that float32 represents exactly) is not scaled before the shortcut is added. An `Add`
     is rounded from floats.
     """
-    out = _Writer()
-    planes = out.node("Transpose", [IMAGE], "planes", perm=[0, 3, 1, 2])
-    tensors = [_Levels(planes, 1 / PIXEL_ZERO, PIXEL_ZERO)]
+    out = _OnnxWriter()
+    planes = out.add_node("Transpose", [INPUT_NAME], "planes", perm=[0, 3, 1, 2])
+    tensors = [_QuantizedTensor(planes, 1 / PIXEL_ZERO, PIXEL_ZERO)]
     of_heads = {head.tensor for head in network.heads.values()}
     for index, layer in enumerate(network.layers):
         inputs = [tensors[k] for k in layer.sources]
@@ -176,42 +184,52 @@ def int8_onnx(network: IntegerNetwork) -> bytes:
             tensors.append(inputs[0])  # read only by heads, which are written separately
         elif isinstance(layer, Conv):
             every = np.arange(len(layer.bias))
-            tensors.append(_convolved(out, layer, inputs, every, layer.scale, zero, layer.name))
+            tensors.append(
+                _add_convolution(out, layer, inputs, every, layer.scale, zero, layer.name)
+            )
         else:
-            reals = [_real(out, each) for each in inputs]
+            reals = [_add_dequantize(out, each) for each in inputs]
             if isinstance(layer, Add):
-                value = out.node("Add", reals, f"{layer.name}.sum")
+                value = out.add_node("Add", reals, f"{layer.name}.sum")
             else:
-                value = _max_pool(out, reals[0], f"{layer.name}.largest")
-            tensors.append(_quantised(out, value, layer.name, layer.scale, zero))
-    names = {OUTPUT_OF[channel]: name for channel, name in HEAD_OF.items() if name in network.heads}
+                value = _add_max_pool(out, reals[0], f"{layer.name}.largest")
+            tensors.append(_add_quantize(out, value, layer.name, layer.scale, zero))
+    names = {
+        OUTPUT_OF[channel]: name
+        for channel, name in HEAD_OF_CHANNEL.items()
+        if name in network.heads
+    }
     for output, name in names.items():
-        _head(out, network, network.heads[name], output, tensors)
+        _add_head(out, network, network.heads[name], output, tensors)
     image = (network.height_px, network.width_px, network.channels)
-    return out.model("int8", image, dict.fromkeys(names, network.grid_shape))
+    return out.serialize_model("int8", image, dict.fromkeys(names, network.grid_shape))
 
 
-def _head(
-    out: _Writer, network: IntegerNetwork, head: Head, name: str, tensors: list[_Levels]
+def _add_head(
+    out: _OnnxWriter,
+    network: IntegerNetwork,
+    head: Head,
+    name: str,
+    tensors: list[_QuantizedTensor],
 ) -> None:
     layer = network.layers[head.tensor - 1]
     assert isinstance(layer, Conv)
     inputs, chosen = [tensors[k] for k in layer.sources], np.array([head.channel])
     zero = head.zero_point + SIGNED_OFFSET
-    levels = _convolved(out, layer, inputs, chosen, head.scale, zero, f"{layer.name}.{name}")
-    axis = out.constant("channel_axis", np.array([1], np.int64))
-    out.node("Squeeze", [_real(out, levels), axis], name)
+    levels = _add_convolution(out, layer, inputs, chosen, head.scale, zero, f"{layer.name}.{name}")
+    axis = out.add_constant("channel_axis", np.array([1], np.int64))
+    out.add_node("Squeeze", [_add_dequantize(out, levels), axis], name)
 
 
-def _convolved(
-    out: _Writer,
+def _add_convolution(
+    out: _OnnxWriter,
     layer: Conv,
-    inputs: list[_Levels],
+    inputs: list[_QuantizedTensor],
     chosen: NDArray[np.integer],
     scale: float,
     zero_point: int,
     name: str,
-) -> _Levels:
+) -> _QuantizedTensor:
     """Add a convolution, limited to the chosen output channels, with its optional shortcut."""
     weight, divisor = layer.weight[chosen], layer.divisor[chosen]
     bias = layer.bias[chosen].astype(np.float64) - divisor // 2 - np.rint(zero_point * divisor)
@@ -221,72 +239,78 @@ def _convolved(
     source, *shortcut = inputs
     if shortcut:
         operands = [
-            _real(out, source._replace(scale=1.0)),
-            out.constant(f"{name}.weight", weight.astype(np.float32)),
-            out.constant(f"{name}.bias", bias.astype(np.float32)),
+            _add_dequantize(out, source._replace(scale=1.0)),
+            out.add_constant(f"{name}.weight", weight.astype(np.float32)),
+            out.add_constant(f"{name}.bias", bias.astype(np.float32)),
         ]
-        products = out.node("Conv", operands, f"{name}.products", **_conv_settings(layer))
-        both = [products, _gained(out, layer, shortcut[0], chosen, name)]
-        value = out.node("Add", both, f"{name}.sum")
-        levels = _levels_of(out, value, f"{name}.sum", divisor, zero_point)
-        return _Levels(levels, scale, zero_point)
+        products = out.add_node("Conv", operands, f"{name}.products", **_conv_attributes(layer))
+        both = [products, _add_shortcut(out, layer, shortcut[0], chosen, name)]
+        value = out.add_node("Add", both, f"{name}.sum")
+        levels = _add_quantize_per_channel(out, value, f"{name}.sum", divisor, zero_point)
+        return _QuantizedTensor(levels, scale, zero_point)
     operands = [
-        _real(out, source),
-        _constant_levels(out, f"{name}.weight", weight, scale / divisor / source.scale),
-        _constant_levels(out, f"{name}.bias", bias.astype(np.int32), scale / divisor),
+        _add_dequantize(out, source),
+        _add_dequantized_constant(out, f"{name}.weight", weight, scale / divisor / source.scale),
+        _add_dequantized_constant(out, f"{name}.bias", bias.astype(np.int32), scale / divisor),
     ]
-    value = out.node("Conv", operands, f"{name}.sum", **_conv_settings(layer))
-    return _quantised(out, value, name, scale, zero_point)
+    value = out.add_node("Conv", operands, f"{name}.sum", **_conv_attributes(layer))
+    return _add_quantize(out, value, name, scale, zero_point)
 
 
-def _gained(
-    out: _Writer, layer: Conv, shortcut: _Levels, chosen: NDArray[np.integer], name: str
+def _add_shortcut(
+    out: _OnnxWriter,
+    layer: Conv,
+    shortcut: _QuantizedTensor,
+    chosen: NDArray[np.integer],
+    name: str,
 ) -> str:
     """Add the nodes that scale a shortcut for the sums of the chosen channels."""
-    levels = _real(out, shortcut._replace(scale=1.0))
+    levels = _add_dequantize(out, shortcut._replace(scale=1.0))
     if len(chosen) < len(layer.bias):
-        places = out.constant(f"{name}.places", chosen.astype(np.int64))
-        levels = out.node("Gather", [levels, places], f"{name}.chosen", axis=1)
+        places = out.add_constant(f"{name}.places", chosen.astype(np.int64))
+        levels = out.add_node("Gather", [levels, places], f"{name}.chosen", axis=1)
     gain = layer.gain[chosen].reshape(-1, 1, 1) / 2.0**GAIN_SHIFT
-    gains = out.constant(f"{name}.gain", gain.astype(np.float32))
-    return out.node(
-        "Floor", [out.node("Mul", [levels, gains], f"{name}.gained")], f"{name}.shortcut"
+    gains = out.add_constant(f"{name}.gain", gain.astype(np.float32))
+    return out.add_node(
+        "Floor", [out.add_node("Mul", [levels, gains], f"{name}.gained")], f"{name}.shortcut"
     )
 
 
-def _constant_levels(
-    out: _Writer, name: str, levels: NDArray[Any], scale: NDArray[np.float64]
+def _add_dequantized_constant(
+    out: _OnnxWriter, name: str, levels: NDArray[Any], scale: NDArray[np.float64]
 ) -> str:
     """Add a dequantized constant with one scale per index of its first axis."""
     inputs = [
-        out.constant(f"{name}.levels", levels),
-        out.constant(f"{name}.scale", scale.astype(np.float32)),
-        out.constant(f"{name}.zero", np.zeros(len(scale), levels.dtype)),
+        out.add_constant(f"{name}.levels", levels),
+        out.add_constant(f"{name}.scale", scale.astype(np.float32)),
+        out.add_constant(f"{name}.zero", np.zeros(len(scale), levels.dtype)),
     ]
-    return out.node("DequantizeLinear", inputs, name, axis=0)
+    return out.add_node("DequantizeLinear", inputs, name, axis=0)
 
 
-def _real(out: _Writer, tensor: _Levels) -> str:
+def _add_dequantize(out: _OnnxWriter, tensor: _QuantizedTensor) -> str:
     """Add the dequantization of a tensor, once per scale."""
     name = f"{tensor.name}.by.{tensor.scale:.9g}"
-    if name not in out.made:
-        scale = out.constant(f"{name}.scale", np.array(tensor.scale, np.float32))
-        zero = out.constant(f"{name}.zero", np.array(tensor.zero_point, np.uint8))
-        out.node("DequantizeLinear", [tensor.name, scale, zero], name)
+    if name not in out.node_outputs:
+        scale = out.add_constant(f"{name}.scale", np.array(tensor.scale, np.float32))
+        zero = out.add_constant(f"{name}.zero", np.array(tensor.zero_point, np.uint8))
+        out.add_node("DequantizeLinear", [tensor.name, scale, zero], name)
     return name
 
 
-def _quantised(out: _Writer, value: str, name: str, scale: float, zero_point: int) -> _Levels:
-    scale_name = out.constant(f"{name}.scale", np.array(scale, np.float32))
-    zero_name = out.constant(f"{name}.zero", np.array(zero_point, np.uint8))
-    levels = out.node("QuantizeLinear", [value, scale_name, zero_name], f"{name}.levels")
-    return _Levels(levels, scale, zero_point)
+def _add_quantize(
+    out: _OnnxWriter, value: str, name: str, scale: float, zero_point: int
+) -> _QuantizedTensor:
+    scale_name = out.add_constant(f"{name}.scale", np.array(scale, np.float32))
+    zero_name = out.add_constant(f"{name}.zero", np.array(zero_point, np.uint8))
+    levels = out.add_node("QuantizeLinear", [value, scale_name, zero_name], f"{name}.levels")
+    return _QuantizedTensor(levels, scale, zero_point)
 
 
-def _levels_of(
-    out: _Writer, value: str, name: str, divisor: NDArray[np.float64], zero_point: int
+def _add_quantize_per_channel(
+    out: _OnnxWriter, value: str, name: str, divisor: NDArray[np.float64], zero_point: int
 ) -> str:
     """Add the quantization of sums with one divisor per channel."""
-    scale_name = out.constant(f"{name}.divisor", divisor.astype(np.float32))
-    zeros = out.constant(f"{name}.zero", np.full(len(divisor), zero_point, np.uint8))
-    return out.node("QuantizeLinear", [value, scale_name, zeros], f"{name}.levels", axis=1)
+    scale_name = out.add_constant(f"{name}.divisor", divisor.astype(np.float32))
+    zeros = out.add_constant(f"{name}.zero", np.full(len(divisor), zero_point, np.uint8))
+    return out.add_node("QuantizeLinear", [value, scale_name, zeros], f"{name}.levels", axis=1)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.deploy.backends import Images, Outputs
-from dmrl.deploy.int8.graph import grey_of
+from dmrl.deploy.int8.graph import rgb_to_grey
 from dmrl.errors import MissingExtra, ModelError
 
 try:
@@ -14,7 +14,7 @@ try:
 except ImportError as e:
     raise MissingExtra("onnxruntime", "deploy", "running ONNX") from e
 
-CHANNEL_OF = {"confidence_logit": "confidence"}
+CHANNEL_OF_OUTPUT = {"confidence_logit": "confidence"}
 """Channel of an ONNX output, if it differs from the output's name."""
 
 
@@ -65,10 +65,10 @@ class OnnxRun:
         # One by one: the layers of one image fit into the cache. A batch of 16 takes 1.3 times as
         # long per image and gives the same bits.
         ones = [image[None] for image in images] or [np.asarray(images)]
-        seen = map(grey_of, ones) if self.channels == 1 else map(np.ascontiguousarray, ones)
+        seen = map(rgb_to_grey, ones) if self.channels == 1 else map(np.ascontiguousarray, ones)
         each = [self._session.run(self.names, {"image": image}) for image in seen]
         return {
-            CHANNEL_OF.get(name, name): np.concatenate(values)
+            CHANNEL_OF_OUTPUT.get(name, name): np.concatenate(values)
             for name, values in zip(self.names, zip(*each, strict=True), strict=True)
         }
 

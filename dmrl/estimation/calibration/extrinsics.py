@@ -14,48 +14,53 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from dmrl.errors import SettingError
-from dmrl.estimation.calibration.mount_solver import LARGEST, Mount, slopes_of, solve
+from dmrl.estimation.calibration.mount_solver import (
+    MAX_VALUES,
+    MountEstimate,
+    pixel_jacobian,
+    solve_mount,
+)
 from dmrl.estimation.calibration.noise import Noise
 from dmrl.estimation.calibration.observations import (
-    Flight,
-    Matched,
-    View,
-    match,
-    median_px,
-    mounted,
-    residual,
+    CalibrationFlight,
+    Matches,
+    PeerView,
+    match_detections,
+    median_residual_px,
+    pixel_residuals,
+    with_mount,
 )
 from dmrl.geometry.frames import Array, Camera
 
-TRIED_S = np.arange(-5, 6) * 0.08
+TRIED_DELAYS_S = np.arange(-5, 6) * 0.08
 """Delays that are tried, seconds. Neighbours overlap in the images of a peer that crosses the view.
 """
-TRIED_IMAGES = 600
+RANKING_IMAGES = 600
 """Number of images, over all peers and flights, that rank the tried delays. No record of how the
 value was chosen."""
-WIDE_PX, RADII_PX = 60.0, (60.0, 60.0)
+RANKING_RADIUS_PX, MATCH_RADII_PX = 60.0, (60.0, 60.0)
 """Largest distance of a match, pixels: while delays are ranked, and in each round of refinement. A
 radius of 25 px had cut off one side of the errors."""
-WORST = 9.0
+MAX_SQUARED_RESIDUAL = 9.0
 """Largest squared whitened residual, that of a false detection. Three standard deviations; no other
 record of how the value was chosen."""
-ALIKE = 0.1
+MAX_MISFIT_EXCESS = 0.1
 """Candidates with a misfit larger than the best by this share are not refined. No record of how the
 value was chosen."""
-REFINED = 4
+MAX_REFINED = 4
 """Largest number of refined candidates. No record of how the value was chosen."""
-SAME_S = 0.015
+SAME_DELAY_S = 0.015
 """Delays closer than this are the same, seconds. No record of how the value was chosen."""
-LIKELY = 4.0
+MIN_LOG_LIKELIHOOD_GAP = 4.0
 """Smallest difference of the log likelihoods of two delays that are distinguishable: odds of one in
 fifty."""
-ASIDE, LEAST_WORSE = (-4.0, -2.0, 2.0, 4.0), 0.1
+PROBE_SIGMAS, MIN_COST_INCREASE = (-4.0, -2.0, 2.0, 4.0), 0.1
 """Offsets, in standard errors, at which the width of the likelihood of the delay is measured; and
 smallest increase of the cost there. No record of how the values were chosen."""
-SAMPLED = 0.25
+SAMPLING_STD_SHARE = 0.25
 """Lower bound of the delay's standard error, as a share of the interval between attitude samples.
 No record of how the value was chosen."""
-LEAST = 50
+MIN_MATCHES = 50
 """Fewest matched detections of a calibration. No record of how the value was chosen."""
 
 
@@ -88,14 +93,16 @@ class Calibration:
 
 
 @dataclass(frozen=True, slots=True)
-class _Try:
+class _Candidate:
     """Result of one initial delay: mount and delay, and misfit from 0 to `MAX_SQUARED_RESIDUAL`."""
 
     values: Array
     misfit: float
 
 
-def calibrate(flights: Sequence[Flight], camera: Camera, noise: Noise) -> Calibration | None:
+def calibrate_mount(
+    flights: Sequence[CalibrationFlight], camera: Camera, noise: Noise
+) -> Calibration | None:
     """Calibrate the mount's rotation and the delay; return None with too few matches.
 
     Parameters
@@ -112,118 +119,130 @@ def calibrate(flights: Sequence[Flight], camera: Camera, noise: Noise) -> Calibr
     SettingError
         If two delays explain the images alike.
     """
-    smooth = [flight.smoothed() for flight in flights]
+    smooth = [flight.smooth_attitude() for flight in flights]
     views = [(flight, peer) for flight in smooth for peer in flight.peers.values()]
     if not views:
         return None
     start = np.array([*camera.mount_rad, camera.delay_s])
-    tries = _tries(views, camera, start, noise)
+    tries = _rank_delays(views, camera, start, noise)
     if not tries:
         return None
-    ends = _ends(views, camera, tries, noise)
+    ends = _refine_candidates(views, camera, tries, noise)
     if not ends:
         return None
     found, matched = ends[0]
-    _refuse_alike([end for end, _ in ends])
+    _check_unambiguous([end for end, _ in ends])
     spread = np.sqrt(np.diag(found.covariance))
     return Calibration(
-        mounted(camera, found.values),
+        with_mount(camera, found.values),
         (float(spread[0]), float(spread[1]), float(spread[2])),
         _delay_std_s(views, camera, matched, found, noise),
         len(matched.time_s),
-        median_px(views, camera, matched, start),
-        median_px(views, camera, matched, found.values),
+        median_residual_px(views, camera, matched, start),
+        median_residual_px(views, camera, matched, found.values),
     )
 
 
-def _tries(views: Sequence[View], camera: Camera, start: Array, noise: Noise) -> list[_Try]:
+def _rank_delays(
+    views: Sequence[PeerView], camera: Camera, start: Array, noise: Noise
+) -> list[_Candidate]:
     """Fit every initial delay; return the candidates, best first."""
     found = []
-    views = [(flight.thinned(TRIED_IMAGES // len(views)), peer) for flight, peer in views]
-    for delay_s in (start[3], *TRIED_S):
+    views = [(flight.thin_images(RANKING_IMAGES // len(views)), peer) for flight, peer in views]
+    for delay_s in (start[3], *TRIED_DELAYS_S):
         values = np.array([*start[:3], delay_s])
-        matched = match(views, mounted(camera, values), WIDE_PX, noise)
-        if len(matched.time_s) >= LEAST:
-            values = _rough(views, camera, matched, values)
-            found.append(_Try(values, _misfit(views, camera, values, noise)))
+        matched = match_detections(views, with_mount(camera, values), RANKING_RADIUS_PX, noise)
+        if len(matched.time_s) >= MIN_MATCHES:
+            values = _fit_independent(views, camera, matched, values)
+            found.append(_Candidate(values, _mean_misfit(views, camera, values, noise)))
     return sorted(found, key=lambda one: one.misfit)
 
 
-def _misfit(views: Sequence[View], camera: Camera, values: Array, noise: Noise) -> float:
+def _mean_misfit(views: Sequence[PeerView], camera: Camera, values: Array, noise: Noise) -> float:
     """Return the mean squared residual of images with a peer, each at most `MAX_SQUARED_RESIDUAL`.
 
     An image without a nearby detection counts as the maximum. Otherwise a start that explains few
     images well would beat one that explains most.
     """
-    matched = match(views, mounted(camera, values), WIDE_PX, noise)
-    apart = (matched.whiten @ residual(views, camera, matched, values)[..., None])[..., 0]
+    matched = match_detections(views, with_mount(camera, values), RANKING_RADIUS_PX, noise)
+    apart = (matched.whiten @ pixel_residuals(views, camera, matched, values)[..., None])[..., 0]
     missed = matched.expected - len(apart)
-    fits = np.minimum((apart**2).sum(axis=1), WORST).sum()
-    return float((fits + WORST * missed) / max(matched.expected, 1))
+    fits = np.minimum((apart**2).sum(axis=1), MAX_SQUARED_RESIDUAL).sum()
+    return float((fits + MAX_SQUARED_RESIDUAL * missed) / max(matched.expected, 1))
 
 
-def _rough(views: Sequence[View], camera: Camera, matched: Matched, start: Array) -> Array:
+def _fit_independent(
+    views: Sequence[PeerView], camera: Camera, matched: Matches, start: Array
+) -> Array:
     """Fit mount and delay (4,) by maximum likelihood, as if all errors were new in every image."""
 
-    def white(values: Array) -> Array:
-        apart = residual(views, camera, matched, values)
+    def whiten_residuals(values: Array) -> Array:
+        apart = pixel_residuals(views, camera, matched, values)
         return np.asarray((matched.whiten @ apart[..., None]).ravel())
 
-    def slopes(values: Array) -> Array:
-        found = slopes_of(views, camera, matched, values)
+    def whiten_jacobian(values: Array) -> Array:
+        found = pixel_jacobian(views, camera, matched, values)
         return np.asarray(-(matched.whiten @ found).reshape(-1, 4))
 
-    start = np.clip(start, -0.99 * LARGEST, 0.99 * LARGEST)
+    start = np.clip(start, -0.99 * MAX_VALUES, 0.99 * MAX_VALUES)
     found = least_squares(
-        white, start, slopes, bounds=(-LARGEST, LARGEST), loss="cauchy", xtol=1e-4, max_nfev=10
+        whiten_residuals,
+        start,
+        whiten_jacobian,
+        bounds=(-MAX_VALUES, MAX_VALUES),
+        loss="cauchy",
+        xtol=1e-4,
+        max_nfev=10,
     )
     return np.asarray(found.x)
 
 
-def _apart(tries: Sequence[_Try]) -> list[_Try]:
+def _select_distinct(tries: Sequence[_Candidate]) -> list[_Candidate]:
     """Return the best candidates, one for each delay."""
-    kept: list[_Try] = []
+    kept: list[_Candidate] = []
     for one in tries:
-        alone = all(abs(one.values[3] - other.values[3]) > SAME_S for other in kept)
-        if alone and one.misfit < tries[0].misfit * (1 + ALIKE):
+        alone = all(abs(one.values[3] - other.values[3]) > SAME_DELAY_S for other in kept)
+        if alone and one.misfit < tries[0].misfit * (1 + MAX_MISFIT_EXCESS):
             kept.append(one)
-    return kept[:REFINED]
+    return kept[:MAX_REFINED]
 
 
-def _ends(
-    views: Sequence[View], camera: Camera, tries: Sequence[_Try], noise: Noise
-) -> list[tuple[Mount, Matched]]:
+def _refine_candidates(
+    views: Sequence[PeerView], camera: Camera, tries: Sequence[_Candidate], noise: Noise
+) -> list[tuple[MountEstimate, Matches]]:
     """Refine the best candidates; return the results, likeliest first.
 
     The likeliest result gives the error of a single detection. With it all candidates are solved
     again and compared.
     """
     spread_px = float(np.hypot(noise.pixel_std_px, noise.attitude_std_rad * camera.fx_px))
-    refined = [_refined(views, camera, one, noise, spread_px) for one in _apart(tries)]
+    refined = [
+        _refine_candidate(views, camera, one, noise, spread_px) for one in _select_distinct(tries)
+    ]
     ends = sorted((end for end in refined if end is not None), key=lambda end: end[0].cost)
     again = [
-        (solve(views, camera, matched, end.values, noise, ends[0][0].spread_px), matched)
+        (solve_mount(views, camera, matched, end.values, noise, ends[0][0].spread_px), matched)
         for end, matched in ends
     ]
     return sorted(again, key=lambda end: end[0].cost)
 
 
-def _refined(
-    views: Sequence[View], camera: Camera, one: _Try, noise: Noise, spread_px: float
-) -> tuple[Mount, Matched] | None:
+def _refine_candidate(
+    views: Sequence[PeerView], camera: Camera, one: _Candidate, noise: Noise, spread_px: float
+) -> tuple[MountEstimate, Matches] | None:
     """Refine one candidate with repeated matching; return None with too few matches."""
     values, end = one.values, None
-    for radius_px in RADII_PX:
-        matched = match(views, mounted(camera, values), radius_px, noise)
-        if len(matched.time_s) < LEAST:
+    for radius_px in MATCH_RADII_PX:
+        matched = match_detections(views, with_mount(camera, values), radius_px, noise)
+        if len(matched.time_s) < MIN_MATCHES:
             return None
-        found = solve(views, camera, matched, values, noise, spread_px)
+        found = solve_mount(views, camera, matched, values, noise, spread_px)
         values, end = found.values, (found, matched)
     return end
 
 
 def _delay_std_s(
-    views: Sequence[View], camera: Camera, matched: Matched, found: Mount, noise: Noise
+    views: Sequence[PeerView], camera: Camera, matched: Matches, found: MountEstimate, noise: Noise
 ) -> float:
     """Return the standard error of the delay, from the likelihood of nearby delays.
 
@@ -232,21 +251,23 @@ def _delay_std_s(
     """
     std_s = float(np.sqrt(found.covariance[3, 3]))
     widest_s = std_s
-    for apart in ASIDE:
+    for apart in PROBE_SIGMAS:
         beside = found.values + np.array([0.0, 0.0, 0.0, apart * std_s])
-        cost = solve(views, camera, matched, beside, noise, found.spread_px, held=True).cost
-        worse = max(cost - found.cost, LEAST_WORSE)
+        cost = solve_mount(
+            views, camera, matched, beside, noise, found.spread_px, fix_delay=True
+        ).cost
+        worse = max(cost - found.cost, MIN_COST_INCREASE)
         widest_s = max(widest_s, abs(apart) * std_s / float(np.sqrt(2 * worse)))
     sample_s = max(float(np.median(np.diff(flight.attitude_s))) for flight, _ in views)
-    return float(np.hypot(widest_s, SAMPLED * sample_s))
+    return float(np.hypot(widest_s, SAMPLING_STD_SHARE * sample_s))
 
 
-def _refuse_alike(ends: Sequence[Mount]) -> None:
+def _check_unambiguous(ends: Sequence[MountEstimate]) -> None:
     """Raise SettingError if another delay is about as likely as the best."""
     best = ends[0]
     for other in ends[1:]:
         apart_s = abs(float(other.values[3] - best.values[3]))
-        if other.cost < best.cost + LIKELY and apart_s > SAME_S:
+        if other.cost < best.cost + MIN_LOG_LIKELIHOOD_GAP and apart_s > SAME_DELAY_S:
             raise SettingError(
                 f"delays of {1e3 * best.values[3]:.0f} and {1e3 * other.values[3]:.0f} ms explain "
                 "the images alike. Add flights, best with peers that cross the image faster"

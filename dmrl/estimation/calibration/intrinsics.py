@@ -16,17 +16,17 @@ except ImportError as e:
 
 cv2.setNumThreads(1)  # threads would add in a random order and change the last digits
 
-LEAST_BOARDS = 5
+MIN_BOARDS = 5
 """Fewest views of a board. With fewer, focal length and distortion are up to chance."""
-WINDOW = 0.45
+WINDOW_SHARE = 0.45
 """Half the side of the refinement window of a corner, relative to the distance of its neighbours.
 It contains as much of the edges as possible and nothing of another corner."""
-LEAST_WINDOW_PX, LARGEST_WINDOW_PX = 2, 11
+MIN_WINDOW_PX, MAX_WINDOW_PX = 2, 11
 """Bounds of that half side, pixels. No record of how the values were chosen."""
-LARGE_PIXELS = 4_000_000
+MAX_DETECTION_PIXELS = 4_000_000
 """Largest image in which a board is detected, pixels. Larger ones are shrunk, as a blank one of
 8,000 x 8,000 kept the detector busy for minutes."""
-REFINED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
+SUBPIXEL_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
 """Stop criteria of the corner refinement: iterations and pixels."""
 
 
@@ -51,7 +51,7 @@ class Intrinsics:
     rms_px: float
 
 
-def corners(grey: NDArray[np.uint8], columns: int, rows: int) -> NDArray[np.float32] | None:
+def find_corners(grey: NDArray[np.uint8], columns: int, rows: int) -> NDArray[np.float32] | None:
     """Find the (columns x rows, 2) inner corners of a board in an image; None without a board.
 
     Parameters
@@ -67,7 +67,7 @@ def corners(grey: NDArray[np.uint8], columns: int, rows: int) -> NDArray[np.floa
         Pixel-edge coordinates: those of OpenCV plus half a pixel.
     """
     # Not CALIB_CB_NORMALIZE_IMAGE: it stretches flat backgrounds and hides boards in front of them.
-    small, times = _copy(grey)
+    small, times = _shrink_image(grey)
     found, at = cv2.findChessboardCornersSB(small, (columns, rows), flags=cv2.CALIB_CB_EXHAUSTIVE)
     if not found:
         return None
@@ -75,18 +75,18 @@ def corners(grey: NDArray[np.uint8], columns: int, rows: int) -> NDArray[np.floa
     # 2 px, all in the same way within a board. The gradients at a corner (Foerstner) are unbiased.
     rough = np.asarray(at, np.float32).reshape(rows, columns, 2)
     rough = rough * np.float32(times) + np.float32((times - 1) / 2)  # centres of pixels
-    half_px = int(np.clip(WINDOW * _spacing(rough), LEAST_WINDOW_PX, LARGEST_WINDOW_PX))
+    half_px = int(np.clip(WINDOW_SHARE * _min_spacing(rough), MIN_WINDOW_PX, MAX_WINDOW_PX))
     window = (half_px, half_px)
-    fine = cv2.cornerSubPix(grey, rough.reshape(-1, 1, 2), window, (-1, -1), REFINED)
+    fine = cv2.cornerSubPix(grey, rough.reshape(-1, 1, 2), window, (-1, -1), SUBPIXEL_CRITERIA)
     return np.asarray(fine, np.float32).reshape(-1, 2) + np.float32(0.5)
 
 
-def _copy(grey: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int]:
+def _shrink_image(grey: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int]:
     """Return a smaller copy of a large image, and the scale to the original.
 
     The detector takes a third of a second per million pixels.
     """
-    times = max(1, int(np.ceil(np.sqrt(grey.size / LARGE_PIXELS))))
+    times = max(1, int(np.ceil(np.sqrt(grey.size / MAX_DETECTION_PIXELS))))
     if times == 1 or min(grey.shape) < times:
         return grey, 1
     size = grey.shape[1] // times, grey.shape[0] // times
@@ -94,13 +94,13 @@ def _copy(grey: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int]:
     return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.uint8), times
 
 
-def _spacing(at: NDArray[np.float32]) -> float:
+def _min_spacing(at: NDArray[np.float32]) -> float:
     """Return the shortest distance between neighbours among (rows, columns, 2) corners, pixels."""
     steps = (np.linalg.norm(np.diff(at, axis=axis), axis=2).min() for axis in (0, 1))
     return float(min(steps))
 
 
-def intrinsics(
+def calibrate_intrinsics(
     boards: Iterable[NDArray[np.float32]],
     shape: tuple[int, int],
     size_px: tuple[int, int],

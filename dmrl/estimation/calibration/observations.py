@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from dmrl.estimation.calibration.noise import Noise
-from dmrl.geometry.frames import Array, Camera, inside, pixels_from_horizontal
+from dmrl.geometry.frames import Array, Camera, is_inside, pixels_from_horizontal
 
-LONGEST_GAP_S = 0.25
+MAX_GAP_S = 0.25
 """Longest gap over which positions are interpolated, seconds. No record of how the value was
 chosen."""
-WIDTH, APART, TIMES = 2.0, 3.0, 3
+SMOOTHING_STD_SAMPLES, SIMILARITY_SIGMAS, SMOOTHING_ROUNDS = 2.0, 3.0, 3
 """Attitude smoothing: std of the window, samples; similarity scale, std of the noise; iterations.
 
 At 100 Hz the noise moves a peer in the image further from sample to sample than the flight does. No
@@ -39,11 +39,11 @@ class PeerPath:
     xyz_m: Array
     covariance: Array
 
-    def at(self, at_s: Array) -> Array:
+    def interpolate_at(self, at_s: Array) -> Array:
         """Interpolate (N, 3) positions."""
         return np.column_stack([np.interp(at_s, self.time_s, axis) for axis in self.xyz_m.T])
 
-    def spread(self, at_s: Array) -> Array:
+    def nearest_covariance(self, at_s: Array) -> Array:
         """Return (N, 3, 3) covariances of the position at the nearest times."""
         return self.covariance[np.clip(np.searchsorted(self.time_s, at_s), 0, len(self.time_s) - 1)]
 
@@ -52,11 +52,11 @@ class PeerPath:
         after = np.searchsorted(self.time_s, at_s)
         known = (after > 0) & (after < len(self.time_s))
         after = np.clip(after, 1, len(self.time_s) - 1)
-        return np.asarray(known & (self.time_s[after] - self.time_s[after - 1] < LONGEST_GAP_S))
+        return np.asarray(known & (self.time_s[after] - self.time_s[after - 1] < MAX_GAP_S))
 
 
 @dataclass(frozen=True, slots=True)
-class Flight:
+class CalibrationFlight:
     """Detections of one observer, its attitude and the paths of its peers.
 
     Parameters
@@ -80,15 +80,15 @@ class Flight:
     attitude_rad: Array
     peers: Mapping[str, PeerPath]
 
-    def smoothed(self) -> "Flight":
+    def smooth_attitude(self) -> "CalibrationFlight":
         """Return the flight with smoothed attitude, edges preserved.
 
         A plain window would round the edges. A drone tilts at once and comes back slowly, so its
         tilts would appear late, or early.
         """
-        return replace(self, attitude_rad=_smoothed(self.attitude_rad))
+        return replace(self, attitude_rad=_smooth_bilateral(self.attitude_rad))
 
-    def thinned(self, most: int) -> "Flight":
+    def thin_images(self, most: int) -> "CalibrationFlight":
         """Return the flight with a limited number of evenly spaced images."""
         step = -(-len(self.image_s) // max(most, 1))
         kept = self.image % step == 0
@@ -100,7 +100,7 @@ class Flight:
         )
 
 
-def _smoothed(values: Array) -> Array:
+def _smooth_bilateral(values: Array) -> Array:
     """Smooth (N, C) values by an iterated bilateral filter (Tomasi and Manduchi 1998).
 
     The noise level comes from the median of the second differences, which is robust to jumps.
@@ -111,25 +111,25 @@ def _smoothed(values: Array) -> Array:
     # median of absolute values to a standard deviation.
     bends = np.median(np.abs(np.diff(values, n=2, axis=0)), axis=0)
     noise = np.maximum(1.4826 * bends / np.sqrt(6.0), 1e-9)[:, None]
-    side = np.ceil(3 * WIDTH).astype(int)
-    near = np.exp(-0.5 * (np.arange(-side, side + 1) / WIDTH) ** 2)
-    around = _around(values, side)
+    side = np.ceil(3 * SMOOTHING_STD_SAMPLES).astype(int)
+    near = np.exp(-0.5 * (np.arange(-side, side + 1) / SMOOTHING_STD_SAMPLES) ** 2)
+    around = _windows_around(values, side)
     smooth = median_filter(values, size=(3, 1), mode="nearest")
-    for _ in range(TIMES):
-        apart = (_around(smooth, side) - smooth[:, :, None]) / (APART * noise)
+    for _ in range(SMOOTHING_ROUNDS):
+        apart = (_windows_around(smooth, side) - smooth[:, :, None]) / (SIMILARITY_SIGMAS * noise)
         alike = near / (1 + apart**2) ** 2
         smooth = (alike * around).sum(axis=2) / alike.sum(axis=2)
     return np.asarray(smooth)
 
 
-def _around(values: Array, side: int) -> Array:
+def _windows_around(values: Array, side: int) -> Array:
     """Return (N, C, 2 side + 1) windows around each of (N, C) values; the ends repeat."""
     padded = np.pad(values, ((side, side), (0, 0)), mode="edge")
     return sliding_window_view(padded, 2 * side + 1, axis=0)
 
 
 @dataclass(frozen=True, slots=True)
-class Matched:
+class Matches:
     """Detections matched to their peers.
 
     Parameters
@@ -156,31 +156,35 @@ class Matched:
     radius_px: float
 
 
-View = tuple[Flight, PeerPath]
+PeerView = tuple[CalibrationFlight, PeerPath]
 """One peer in one flight."""
 
 
-def mounted(camera: Camera, values: Array) -> Camera:
+def with_mount(camera: Camera, values: Array) -> Camera:
     """Return the camera with (4,) roll, pitch, yaw (radians) and delay (seconds)."""
     roll, pitch, yaw, delay_s = values.tolist()
     return replace(camera, mount_rad=(roll, pitch, yaw), delay_s=delay_s)
 
 
-def expected(flight: Flight, camera: Camera, peer: PeerPath, time_s: Array) -> tuple[Array, Array]:
+def predict_pixels(
+    flight: CalibrationFlight, camera: Camera, peer: PeerPath, time_s: Array
+) -> tuple[Array, Array]:
     """Predict (N, 2) pixels of a peer in images with log times; also (N, 3, 5) derivatives."""
     at_s = time_s - camera.delay_s
-    xyz = peer.at(at_s)
+    xyz = peer.interpolate_at(at_s)
     roll, pitch = (np.interp(at_s, flight.attitude_s, a) for a in flight.attitude_rad.T)
     uv, _, jacobian = pixels_from_horizontal(xyz, roll, pitch, camera)
     return uv, jacobian
 
 
-def match(views: Sequence[View], camera: Camera, radius_px: float, noise: Noise) -> Matched:
+def match_detections(
+    views: Sequence[PeerView], camera: Camera, radius_px: float, noise: Noise
+) -> Matches:
     """Match every peer in every image to the nearest detection within a radius."""
     parts, count = [], 0
     for number, (flight, peer) in enumerate(views):
-        uv, jacobian = expected(flight, camera, peer, flight.image_s)
-        good = peer.covers(flight.image_s - camera.delay_s) & inside(
+        uv, jacobian = predict_pixels(flight, camera, peer, flight.image_s)
+        good = peer.covers(flight.image_s - camera.delay_s) & is_inside(
             uv, camera.width_px, camera.height_px
         )
         count += int(good.sum())
@@ -192,13 +196,15 @@ def match(views: Sequence[View], camera: Camera, radius_px: float, noise: Noise)
         nearest = nearest[apart_px[nearest] <= radius_px]
         image = flight.image[nearest]
         time_s = flight.image_s[image]
-        whiten = _whitening(jacobian[image, :2], peer.spread(time_s - camera.delay_s), noise)
+        whiten = _whitening_matrices(
+            jacobian[image, :2], peer.nearest_covariance(time_s - camera.delay_s), noise
+        )
         parts.append((time_s, flight.uv[nearest], np.full(len(image), number), whiten))
     time_s, uv, view, whiten = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Matched(time_s, uv, view, whiten, count, radius_px)
+    return Matches(time_s, uv, view, whiten, count, radius_px)
 
 
-def _whitening(jacobian: Array, covariance: Array, noise: Noise) -> Array:
+def _whitening_matrices(jacobian: Array, covariance: Array, noise: Noise) -> Array:
     """Return (N, 2, 2) matrices that whiten pixel errors."""
     joint = np.zeros((len(jacobian), 5, 5))
     joint[:, :3, :3] = covariance
@@ -208,17 +214,21 @@ def _whitening(jacobian: Array, covariance: Array, noise: Noise) -> Array:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(spread)))
 
 
-def residual(views: Sequence[View], camera: Camera, matched: Matched, values: Array) -> Array:
+def pixel_residuals(
+    views: Sequence[PeerView], camera: Camera, matched: Matches, values: Array
+) -> Array:
     """Return (N, 2) detections minus predictions, pixels."""
     out = np.empty_like(matched.uv)
     for number, (flight, peer) in enumerate(views):
         mine = matched.view == number
-        uv, _ = expected(flight, mounted(camera, values), peer, matched.time_s[mine])
+        uv, _ = predict_pixels(flight, with_mount(camera, values), peer, matched.time_s[mine])
         out[mine] = matched.uv[mine] - uv
     return np.nan_to_num(out)
 
 
-def median_px(views: Sequence[View], camera: Camera, matched: Matched, values: Array) -> float:
+def median_residual_px(
+    views: Sequence[PeerView], camera: Camera, matched: Matches, values: Array
+) -> float:
     """Return the median distance of detections from their predictions, pixels."""
-    apart = residual(views, camera, matched, values)
+    apart = pixel_residuals(views, camera, matched, values)
     return float(np.median(np.linalg.norm(apart, axis=1)))

@@ -11,7 +11,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 
 from dmrl.estimation.model.pair import Array, Mask, Pair
 
-SMALLEST_M = 1e-4
+RANGE_MARGIN_M = 1e-4
 """Added to every range, metres. It avoids a division by zero at the start (0, 0), as in the
 firmware."""
 
@@ -68,7 +68,7 @@ class Steps:
     dt_s: float
 
 
-def pair_steps(pair: Pair, preset: Preset) -> Steps:
+def build_steps(pair: Pair, preset: Preset) -> Steps:
     """Build the inputs of the filter for one pair, B = 1.
 
     Ranges go to the nearest step. If several fall on one step, as where both robots range, the last
@@ -85,7 +85,7 @@ def pair_steps(pair: Pair, preset: Preset) -> Steps:
     return Steps(inputs[:, None], height_m[:, None], range_m[:, None], pair.dt_s)
 
 
-def stack(steps: list[Steps]) -> Steps:
+def stack_pairs(steps: list[Steps]) -> Steps:
     """Stack pairs of equal length side by side."""
     return Steps(
         np.concatenate([s.inputs for s in steps], axis=1),
@@ -95,7 +95,7 @@ def stack(steps: list[Steps]) -> Steps:
     )
 
 
-def moved(state: Array, inputs: Array, dt_s: float) -> tuple[Array, Array, Array]:
+def propagate_state(state: Array, inputs: Array, dt_s: float) -> tuple[Array, Array, Array]:
     """Propagate B filters by one step; return the states and their Jacobians.
 
     Parameters
@@ -135,10 +135,10 @@ def moved(state: Array, inputs: Array, dt_s: float) -> tuple[Array, Array, Array
     return state + dt_s * rate, by_state, by_input
 
 
-def measured(state: Array, height_m: Array) -> tuple[Array, Array]:
+def predict_range(state: Array, height_m: Array) -> tuple[Array, Array]:
     """Return the predicted range (B,) of B states, metres, and its Jacobian (B, 3)."""
     x, y = state[:, 0], state[:, 1]
-    range_m = np.sqrt(x**2 + y**2 + height_m**2) + SMALLEST_M
+    range_m = np.sqrt(x**2 + y**2 + height_m**2) + RANGE_MARGIN_M
     return range_m, np.stack([x / range_m, y / range_m, np.zeros_like(x)], axis=-1)
 
 
@@ -148,7 +148,7 @@ def input_variance(preset: Preset) -> Array:
     return np.diag([v, v, r, v, v, r])
 
 
-class _Relative(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
+class _RelativeEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
     """Extended Kalman filter of filterpy with the relative motion as its prediction."""
 
     def __init__(self, preset: Preset, dt_s: float) -> None:
@@ -161,7 +161,7 @@ class _Relative(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no 
 
     def predict_x(self, u: Array) -> None:
         """Propagate the state. filterpy's ``predict`` calls this before it moves the covariance."""
-        state, by_state, by_input = moved(self.x[None], u[None], self._dt_s)
+        state, by_state, by_input = propagate_state(self.x[None], u[None], self._dt_s)
         self.F = by_state[0]
         self.Q = by_input[0] @ self._noise @ by_input[0].T
         self.x = state[0]
@@ -185,7 +185,7 @@ def filter_reference(steps: Steps, preset: Preset) -> tuple[Array, Array]:
     AssertionError
         If filterpy turned the state into a column, as it does with a state of another shape.
     """
-    ekf = _Relative(preset, steps.dt_s)
+    ekf = _RelativeEkf(preset, steps.dt_s)
     states, covariances = np.empty((len(steps.inputs), 3)), np.empty((len(steps.inputs), 3, 3))
     for k, (inputs, height_m, range_m) in enumerate(
         zip(steps.inputs[:, 0], steps.height_m[:, 0], steps.range_m[:, 0], strict=True)
@@ -195,8 +195,8 @@ def filter_reference(steps: Steps, preset: Preset) -> tuple[Array, Array]:
             height = np.array([height_m])
             ekf.update(
                 np.array([range_m]),
-                lambda x, h: measured(x[None], h)[1],
-                lambda x, h: measured(x[None], h)[0],
+                lambda x, h: predict_range(x[None], h)[1],
+                lambda x, h: predict_range(x[None], h)[0],
                 args=(height,),
                 hx_args=(height,),
             )
@@ -224,20 +224,20 @@ def filter_many(steps: Steps, preset: Preset) -> tuple[Array, Array]:
     states, covariances = np.empty((count, filters, 3)), np.empty((count, filters, 3, 3))
     arrived = np.isfinite(steps.range_m)
     for k in range(count):
-        state, by_state, by_input = moved(state, steps.inputs[k], steps.dt_s)
+        state, by_state, by_input = propagate_state(state, steps.inputs[k], steps.dt_s)
         covariance = by_state @ covariance @ by_state.swapaxes(1, 2)
         covariance = covariance + by_input @ noise @ by_input.swapaxes(1, 2)
         if arrived[k].any():
-            _update(state, covariance, steps, k, arrived[k], preset.range_std_m**2)
+            _update_ranges(state, covariance, steps, k, arrived[k], preset.range_std_m**2)
         states[k], covariances[k] = state, covariance
     return states, covariances
 
 
-def _update(
+def _update_ranges(
     state: Array, covariance: Array, steps: Steps, k: int, arrived: Mask, variance: float
 ) -> None:
     """Update the filters with the ranges of step k, in place (Joseph form)."""
-    expected, row = measured(state[arrived], steps.height_m[k, arrived])
+    expected, row = predict_range(state[arrived], steps.height_m[k, arrived])
     prior = covariance[arrived]
     cross = np.einsum("bij,bj->bi", prior, row)
     gain = cross / (np.einsum("bi,bi->b", row, cross) + variance)[:, None]

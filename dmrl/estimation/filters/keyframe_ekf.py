@@ -6,23 +6,23 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.estimation.filters.camera_update import NOTHING, Glances, glanced
-from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation
+from dmrl.estimation.filters.camera_update import NO_UPDATES, CameraUpdates, update_with_camera
+from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.keyframes import Noise, Problem
+from dmrl.estimation.solver.keyframes import KeyframeProblem, NoiseModel
 
-SIZE = 5
+STATE_SIZE = 5
 """Number of states: x, y, psi and the biases of both yaw rates."""
-SHADOWED_M = 0.3
+SHADOWED_RANGE_STD_M = 0.3
 """Standard deviation of a range after its step offset is removed, metres. No record of how the
 value was chosen."""
-INNOVATION_LIMIT = 2.0
+MAX_INNOVATION_SIGMAS = 2.0
 """Innovation beyond which an update is down-weighted, in standard deviations. No record of how the
 value was chosen."""
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs:
+class FilterInputs:
     """Inputs of B filters at K keyframes.
 
     Every keyframe has one range: the median, which is robust to an outlier.
@@ -57,49 +57,49 @@ class Inputs:
     peer_to_range_m: Array
     height_m: Array
 
-    def repeated(self, copies: int, keyframes: int) -> Self:
+    def repeat(self, copies: int, keyframes: int) -> Self:
         """Return the first keyframes, with every pair repeated ``copies`` times side by side."""
         columns = (getattr(self, field.name)[:keyframes] for field in fields(self))
         return type(self)(*(np.repeat(column, copies, axis=1) for column in columns))
 
 
-def inputs_of(problems: list[Problem], noise: Noise) -> Inputs:
+def build_inputs(problems: list[KeyframeProblem], noise: NoiseModel) -> FilterInputs:
     """Build the inputs of one filter per problem. All need the same number of keyframes."""
-    rows = [_inputs(problem, noise) for problem in problems]
-    return Inputs(*(np.stack(column, axis=1) for column in zip(*rows, strict=True)))
+    rows = [_pair_inputs(problem, noise) for problem in problems]
+    return FilterInputs(*(np.stack(column, axis=1) for column in zip(*rows, strict=True)))
 
 
-def _inputs(problem: Problem, noise: Noise) -> tuple[Array, ...]:
+def _pair_inputs(problem: KeyframeProblem, noise: NoiseModel) -> tuple[Array, ...]:
     """Return the columns of `Inputs` for one pair."""
-    count = len(problem.key_s)
-    per_key = np.bincount(problem.range_key, minlength=count)
+    count = len(problem.keyframe_s)
+    per_key = np.bincount(problem.range_keyframe, minlength=count)
     many = np.maximum(per_key, 1)
 
-    def mean(values: Array) -> Array:
-        return np.bincount(problem.range_key, values, minlength=count) / many
+    def mean_by_keyframe(values: Array) -> Array:
+        return np.bincount(problem.range_keyframe, values, minlength=count) / many
 
-    def means(values: Array) -> Array:
-        return np.column_stack([mean(column) for column in values.T])
+    def means_by_keyframe(values: Array) -> Array:
+        return np.column_stack([mean_by_keyframe(column) for column in values.T])
 
     # The variance of a median of n is pi/2 / n of a single one. 0.05 m: unknown range bias.
     variance = 1.5 * noise.range_std_m**2 / many + 0.05**2
     steps_s = np.append(problem.steps_s, 0.0)
     shifts = (problem.own.shift_m, problem.peer.shift_m, step_variance(problem, noise))
-    shadowed = problem.range_level_m
-    level = mean(shadowed)
+    shadowed = problem.range_offset_guess_m
+    level = mean_by_keyframe(shadowed)
     return (
         steps_s,
         *(np.append(turn, 0.0) for turn in (problem.own.turn_rad, problem.peer.turn_rad)),
         *(np.vstack([shift, 0.0 * shift[:1]]) for shift in shifts),
-        _medians(problem.range_key, problem.range_m - shadowed, per_key),
-        np.where(level != 0, SHADOWED_M**2, variance),
-        means(problem.own_to_range.shift_m),
-        means(problem.peer_to_range.shift_m),
-        mean(problem.height_m),
+        _medians_by_keyframe(problem.range_keyframe, problem.range_m - shadowed, per_key),
+        np.where(level != 0, SHADOWED_RANGE_STD_M**2, variance),
+        means_by_keyframe(problem.own_to_range.shift_m),
+        means_by_keyframe(problem.peer_to_range.shift_m),
+        mean_by_keyframe(problem.height_m),
     )
 
 
-def _medians(key: NDArray[np.intp], values: Array, per_key: NDArray[np.intp]) -> Array:
+def _medians_by_keyframe(key: NDArray[np.intp], values: Array, per_key: NDArray[np.intp]) -> Array:
     """Return (K,) the median of the values of each keyframe, NaN where there are none."""
     ordered = np.append(values[np.lexsort((values, key))], np.nan)
     first = np.cumsum(per_key) - per_key
@@ -107,16 +107,16 @@ def _medians(key: NDArray[np.intp], values: Array, per_key: NDArray[np.intp]) ->
     return np.where(per_key > 0, ordered[middle * (per_key > 0)].mean(axis=0), np.nan)
 
 
-def step_variance(problem: Problem, noise: Noise) -> Array:
+def step_variance(problem: KeyframeProblem, noise: NoiseModel) -> Array:
     """Return (K - 1, 5) variances that each step adds to x, y (m^2), psi (rad^2) and the biases."""
-    steps_s, gap_s = problem.steps_s, problem.gap_s
-    shift = 2 * noise.velocity_psd * steps_s + noise.gap_speed_mps**2 * gap_s
-    turn = 2 * noise.yaw_rate_psd * steps_s + noise.gap_turn_radps**2 * gap_s
+    steps_s, gap_s = problem.steps_s, problem.dropout_s
+    shift = 2 * noise.velocity_psd * steps_s + noise.dropout_speed_mps**2 * gap_s
+    turn = 2 * noise.yaw_rate_psd * steps_s + noise.dropout_turn_radps**2 * gap_s
     return np.column_stack([shift, shift, turn, np.zeros((len(turn), 2))])
 
 
 @dataclass(frozen=True, slots=True)
-class Filtered:
+class FilterResult:
     """Result of B filters over K keyframes.
 
     Parameters
@@ -140,7 +140,9 @@ class Filtered:
     log_likelihood: Array
 
 
-def run(inputs: Inputs, start: Array, start_std: Array, glances: Glances = NOTHING) -> Filtered:
+def run_filters(
+    inputs: FilterInputs, start: Array, start_std: Array, updates: CameraUpdates = NO_UPDATES
+) -> FilterResult:
     """Filter a flight from B initial states.
 
     Parameters
@@ -155,38 +157,38 @@ def run(inputs: Inputs, start: Array, start_std: Array, glances: Glances = NOTHI
         Camera updates by keyframe.
     """
     count, filters = inputs.range_m.shape
-    states = (np.empty((count, filters, SIZE)) for _ in range(2))
-    matrices = (np.empty((count, filters, SIZE, SIZE)) for _ in range(3))
+    states = (np.empty((count, filters, STATE_SIZE)) for _ in range(2))
+    matrices = (np.empty((count, filters, STATE_SIZE, STATE_SIZE)) for _ in range(3))
     (state, prior), (covariance, prior_covariance, step) = states, matrices
-    out = Filtered(state, covariance, prior, prior_covariance, step, np.zeros(filters))
-    state = np.concatenate([start, np.zeros((filters, SIZE - 3))], axis=1)
-    covariance = np.broadcast_to(np.diag(start_std**2), (filters, SIZE, SIZE)).copy()
+    out = FilterResult(state, covariance, prior, prior_covariance, step, np.zeros(filters))
+    state = np.concatenate([start, np.zeros((filters, STATE_SIZE - 3))], axis=1)
+    covariance = np.broadcast_to(np.diag(start_std**2), (filters, STATE_SIZE, STATE_SIZE)).copy()
     for k in range(count):
         out.prior[k], out.prior_covariance[k] = state, covariance
-        _update(state, covariance, inputs, k, out.log_likelihood)
-        for glance in glances.get(k, ()):
-            mine = slice(glance.first, glance.first + glance.copies)
+        _update_ranges(state, covariance, inputs, k, out.log_likelihood)
+        for glance in updates.get(k, ()):
+            mine = slice(glance.first_filter, glance.first_filter + glance.copies)
             given = state[mine], covariance[mine], inputs.height_m[k, mine]
-            glanced(*given, glance, out.log_likelihood[mine])
+            update_with_camera(*given, glance, out.log_likelihood[mine])
         out.state[k], out.covariance[k] = state, covariance
-        state, step = _moved(state, inputs, k)
+        state, step = _propagate(state, inputs, k)
         out.step[k] = step
         covariance = step @ covariance @ step.swapaxes(1, 2)
-        covariance += inputs.step_var[k][:, :, None] * np.eye(SIZE)
+        covariance += inputs.step_var[k][:, :, None] * np.eye(STATE_SIZE)
     return out
 
 
-def _moved(state: Array, inputs: Inputs, k: int) -> tuple[Array, Array]:
+def _propagate(state: Array, inputs: FilterInputs, k: int) -> tuple[Array, Array]:
     """Return (B, 5) states at the next keyframe and the (B, 5, 5) Jacobian."""
     seconds = inputs.step_s[k]
     own_turn = inputs.own_turn_rad[k] - seconds * state[:, 3]
     peer_turn = inputs.peer_turn_rad[k] - seconds * state[:, 4]
-    turned = rotate(rotation(state[:, 2]), inputs.peer_shift_m[k])
-    back = rotation(-own_turn)
+    turned = rotate(rotation_matrix(state[:, 2]), inputs.peer_shift_m[k])
+    back = rotation_matrix(-own_turn)
     after = state.copy()
     after[:, :2] = rotate(back, state[:, :2] + turned - inputs.own_shift_m[k])
     after[:, 2] += peer_turn - own_turn
-    step = np.zeros((len(state), SIZE, SIZE))
+    step = np.zeros((len(state), STATE_SIZE, STATE_SIZE))
     step[:, :2, :2] = back
     step[:, :2, 2] = rotate(back, turned @ QUARTER_TURN.T)
     step[:, :2, 3] = seconds[:, None] * (after[:, :2] @ QUARTER_TURN.T)
@@ -195,10 +197,12 @@ def _moved(state: Array, inputs: Inputs, k: int) -> tuple[Array, Array]:
     return after, step
 
 
-def _update(state: Array, covariance: Array, inputs: Inputs, k: int, log_likelihood: Array) -> None:
+def _update_ranges(
+    state: Array, covariance: Array, inputs: FilterInputs, k: int, log_likelihood: Array
+) -> None:
     """Update the filters with keyframe k's range, in place. Large innovations are down-weighted."""
     seen = np.isfinite(inputs.range_m[k])
-    peer = rotate(rotation(state[:, 2]), inputs.peer_to_range_m[k])
+    peer = rotate(rotation_matrix(state[:, 2]), inputs.peer_to_range_m[k])
     offset = state[:, :2] + peer - inputs.own_to_range_m[k]
     expected = np.sqrt((offset**2).sum(axis=1) + inputs.height_m[k] ** 2) + 1e-6
     towards = offset / expected[:, None]
@@ -207,7 +211,7 @@ def _update(state: Array, covariance: Array, inputs: Inputs, k: int, log_likelih
     spread = np.einsum("bi,bi->b", row, cross[:, :3]) + inputs.range_var[k]
     innovation = np.where(seen, inputs.range_m[k] - expected, 0.0)
     size = np.abs(innovation) / np.sqrt(spread)
-    softer = inputs.range_var[k] * np.maximum(1.0, size / INNOVATION_LIMIT) ** 2
+    softer = inputs.range_var[k] * np.maximum(1.0, size / MAX_INNOVATION_SIGMAS) ** 2
     log_likelihood -= seen * (0.5 * np.log(spread) + np.log1p(0.5 * size**2))
     spread += softer - inputs.range_var[k]
     gain = np.where(seen, 1 / spread, 0.0)[:, None] * cross
@@ -215,7 +219,7 @@ def _update(state: Array, covariance: Array, inputs: Inputs, k: int, log_likelih
     covariance -= gain[:, :, None] * cross[:, None, :]
 
 
-def smoothed(filtered: Filtered) -> tuple[Array, Array]:
+def smooth_rts(filtered: FilterResult) -> tuple[Array, Array]:
     """Smooth the filtered states (RTS); return states (K, B, 5) and covariances (K, B, 5, 5)."""
     state, covariance = filtered.state.copy(), filtered.covariance.copy()
     for k in range(len(state) - 2, -1, -1):

@@ -6,8 +6,13 @@ from numpy.typing import NDArray
 from dmrl.estimation.model.pair import Array
 
 
-def faded(
-    time_s: Array, std: Array, fade_s: float, rows: NDArray[np.intp], off: Array, noise: Array
+def smooth_ornstein_uhlenbeck(
+    time_s: Array,
+    std: Array,
+    time_constant_s: float,
+    rows: NDArray[np.intp],
+    offset: Array,
+    noise: Array,
 ) -> tuple[Array, Array]:
     """Smooth an Ornstein-Uhlenbeck error from sparse measurements.
 
@@ -30,9 +35,9 @@ def faded(
         (N,) each. Measurements may share an error, so the variance never falls below that of one
         measurement. It never exceeds the prior.
     """
-    fade = np.exp(-np.diff(time_s) / fade_s)
+    fade = np.exp(-np.diff(time_s) / time_constant_s)
     measured, spread = np.full(len(std), np.nan), np.ones(len(std))
-    measured[rows], spread[rows] = off, noise**2
+    measured[rows], spread[rows] = offset, noise**2
     mean, var, ahead = np.zeros(len(std)), np.ones(len(std)), np.ones(len(std))
     ahead_mean = mean.copy()
     for k in range(len(std)):  # in units of ``std``

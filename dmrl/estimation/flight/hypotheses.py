@@ -7,43 +7,43 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
 from dmrl.estimation.filters import keyframe_ekf
-from dmrl.estimation.filters.camera_update import NOTHING, Glances, repeated
-from dmrl.estimation.filters.keyframe_ekf import Inputs
+from dmrl.estimation.filters.camera_update import NO_UPDATES, CameraUpdates, repeat_updates
+from dmrl.estimation.filters.keyframe_ekf import FilterInputs
 from dmrl.estimation.model.odometry import QUARTER_TURN
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.levenberg_marquardt import near
+from dmrl.estimation.solver.levenberg_marquardt import is_same_solution
 
-BEARINGS, HEADINGS = 12, 8
+BEARING_COUNT, HEADING_COUNT = 12, 8
 """Number of bearings of the peer, and of headings for each bearing: 96 guesses. No record of how
 the values were chosen."""
-FIRST_S = 20.0
+SCORING_S = 20.0
 """Time over which all guesses are filtered, seconds. No record of how the value was chosen."""
-KEPT = 6
+KEPT_GUESSES = 6
 """Number of guesses that are filtered to the end. No record of how the value was chosen."""
-START_STD: Array = np.array([0.35, 0.35, 0.45, 0.01, 0.01])
+GUESS_STD: Array = np.array([0.35, 0.35, 0.45, 0.01, 0.01])
 """Initial standard deviations of x, y (m), psi (rad): roughly half the distance to the next guess.
 Then those of both yaw rate biases, rad/s."""
-APART_M, APART_RAD = 0.4, 0.5
+DISTINCT_M, DISTINCT_RAD = 0.4, 0.5
 """Guesses closer than both are the same, metres and radians. No record of how the values were
 chosen."""
-PASS_M = 0.35
+MAX_PASS_M = 0.35
 """Largest distance of a pass that leaves the side of the peer open, metres. Two such passes enclose
 a segment that may be mirrored. No record of how the value was chosen."""
-MIRRORED = 4
+MAX_MIRRORED_SEGMENTS = 4
 """Largest number of mirrored segments, shortest first. No record of how the value was chosen."""
-BESIDE_M, ROUND_M = 0.5, 0.4
+MAX_FLIP_M, FLIP_WIDTH_M = 0.5, 0.4
 """Largest distance of a pass whose side is flipped, metres; and increase of the distance, metres,
 at which the flip begins and ends. No record of how the values were chosen."""
-BESIDE = 6
+MAX_FLIPS = 6
 """Largest number of flipped passes, nearest first. No record of how the value was chosen."""
-COST_UNIT = 4.0
+COST_SCALE = 4.0
 """Cost difference at which a solution has 1 / e of the weight of the best one.
 
 Costs differ by this much without reason, because the robust loss and the noise model are
 approximations. No record of how the value was chosen."""
 
 
-def starts(range_m: float, height_m: float) -> Array:
+def range_circle_guesses(range_m: float, height_m: float) -> Array:
     """Return (96, 3) guesses x, y (m), psi (rad) of the peer around an observer.
 
     Parameters
@@ -54,14 +54,18 @@ def starts(range_m: float, height_m: float) -> Array:
         Peer's height minus the observer's, metres.
     """
     radius = np.sqrt(max(range_m**2 - height_m**2, 0.05**2))
-    bearing = np.repeat(np.arange(BEARINGS) * 2 * np.pi / BEARINGS, HEADINGS)
-    heading = np.tile(np.arange(HEADINGS) * 2 * np.pi / HEADINGS, BEARINGS)
+    bearing = np.repeat(np.arange(BEARING_COUNT) * 2 * np.pi / BEARING_COUNT, HEADING_COUNT)
+    heading = np.tile(np.arange(HEADING_COUNT) * 2 * np.pi / HEADING_COUNT, BEARING_COUNT)
     # The headings of neighbouring bearings are half a step apart, which fills the space better.
-    heading = heading + np.repeat(np.arange(BEARINGS) % 2, HEADINGS) * np.pi / HEADINGS
+    heading = (
+        heading + np.repeat(np.arange(BEARING_COUNT) % 2, HEADING_COUNT) * np.pi / HEADING_COUNT
+    )
     return np.column_stack([radius * np.cos(bearing), radius * np.sin(bearing), heading])
 
 
-def candidates(inputs: Inputs, rate_hz: float, glances: Glances = NOTHING) -> Array:
+def select_guesses(
+    inputs: FilterInputs, rate_hz: float, updates: CameraUpdates = NO_UPDATES
+) -> Array:
     """Select the likely and distinct guesses of P pairs, (P, KEPT_GUESSES, 3), best first.
 
     Parameters
@@ -73,29 +77,32 @@ def candidates(inputs: Inputs, rate_hz: float, glances: Glances = NOTHING) -> Ar
     updates
         Camera updates of each pair.
     """
-    keyframes = min(len(inputs.range_m), int(FIRST_S * rate_hz))
-    first = [_first(inputs, pair, keyframes) for pair in range(inputs.range_m.shape[1])]
-    count = BEARINGS * HEADINGS
-    given = inputs.repeated(count, keyframes), np.concatenate(first), START_STD
-    run = keyframe_ekf.run(*given, repeated(glances, count))
+    keyframes = min(len(inputs.range_m), int(SCORING_S * rate_hz))
+    first = [_pair_guesses(inputs, pair, keyframes) for pair in range(inputs.range_m.shape[1])]
+    count = BEARING_COUNT * HEADING_COUNT
+    given = inputs.repeat(count, keyframes), np.concatenate(first), GUESS_STD
+    run = keyframe_ekf.run_filters(*given, repeat_updates(updates, count))
     end = run.state[-1, :, :3].reshape(-1, count, 3)
     score = run.log_likelihood.reshape(-1, count)
     begun = np.stack(first)
     return np.stack(
-        [b[distinct(e, np.argsort(-s), KEPT)] for b, e, s in zip(begun, end, score, strict=True)]
+        [
+            b[select_distinct_states(e, np.argsort(-s), KEPT_GUESSES)]
+            for b, e, s in zip(begun, end, score, strict=True)
+        ]
     )
 
 
-def _first(inputs: Inputs, pair: int, keyframes: int) -> Array:
+def _pair_guesses(inputs: FilterInputs, pair: int, keyframes: int) -> Array:
     """Return the guesses of one pair, from its first ranges."""
     ranges = inputs.range_m[:keyframes, pair]
     seen = np.flatnonzero(np.isfinite(ranges))
     # The median of the first second: a single first range may be an outlier.
     start = float(np.median(ranges[seen[:10]])) if len(seen) else 1.0
-    return starts(start, float(inputs.height_m[seen[0], pair]) if len(seen) else 0.0)
+    return range_circle_guesses(start, float(inputs.height_m[seen[0], pair]) if len(seen) else 0.0)
 
 
-def distinct(states: Array, order: NDArray[np.intp], count: int) -> list[int]:
+def select_distinct_states(states: Array, order: NDArray[np.intp], count: int) -> list[int]:
     """Return the indices of ``count`` distinct states, in order. The last one fills up the rest.
 
     Parameters
@@ -109,7 +116,7 @@ def distinct(states: Array, order: NDArray[np.intp], count: int) -> list[int]:
     """
     kept: list[int] = []
     for number in order.tolist():
-        apart = [not alike(states[number], states[other]) for other in kept]
+        apart = [not is_same_state(states[number], states[other]) for other in kept]
         if all(apart):
             kept.append(number)
         if len(kept) == count:
@@ -117,13 +124,13 @@ def distinct(states: Array, order: NDArray[np.intp], count: int) -> list[int]:
     return kept + kept[-1:] * (count - len(kept))
 
 
-def alike(one: Array, other: Array) -> bool:
+def is_same_state(one: Array, other: Array) -> bool:
     """Return whether two states are the same solution."""
     turn = np.angle(np.exp(1j * (one[2] - other[2])))
-    return bool(np.hypot(*(one - other)[:2]) < APART_M and abs(turn) < APART_RAD)
+    return bool(np.hypot(*(one - other)[:2]) < DISTINCT_M and abs(turn) < DISTINCT_RAD)
 
 
-def spread_of(cost: Array, states: Array) -> Array:
+def between_solution_covariance(cost: Array, states: Array) -> Array:
     """Return the (K, 3, 3) covariance that the choice between solutions adds to the best one.
 
     Parameters
@@ -135,22 +142,22 @@ def spread_of(cost: Array, states: Array) -> Array:
     """
     kept: list[int] = []
     for number, state in enumerate(states):
-        if not any(near(state, states[other]) for other in kept):
+        if not any(is_same_solution(state, states[other]) for other in kept):
             kept.append(number)
-    share = np.exp((cost[0] - cost[kept]) / COST_UNIT)
+    share = np.exp((cost[0] - cost[kept]) / COST_SCALE)
     apart = states[kept] - states[0]
     apart[:, :, 2] = np.angle(np.exp(1j * apart[:, :, 2]))
     return np.asarray(np.einsum("s,ski,skj->kij", share / share.sum(), apart, apart))
 
 
-def _passes(state: Array, rate_hz: float, within_m: float) -> tuple[Array, NDArray[np.intp]]:
+def _find_passes(state: Array, rate_hz: float, within_m: float) -> tuple[Array, NDArray[np.intp]]:
     """Return (K,) distances of the peer, and the keyframes of local minima within a distance."""
     distance = np.hypot(*state[:, :2].T)
     least = minimum_filter1d(distance, 2 * round(rate_hz) + 1)
     return distance, np.flatnonzero((distance == least) & (distance < within_m))
 
 
-def mirrored(state: Array, rate_hz: float) -> list[Array]:
+def mirror_guesses(state: Array, rate_hz: float) -> list[Array]:
     """Mirror a solution between two close passes; return one copy for each such segment.
 
     Parameters
@@ -160,10 +167,10 @@ def mirrored(state: Array, rate_hz: float) -> list[Array]:
     rate_hz
         Keyframes per second.
     """
-    second, (_, passes) = round(rate_hz), _passes(state, rate_hz, PASS_M)
+    second, (_, passes) = round(rate_hz), _find_passes(state, rate_hz, MAX_PASS_M)
     between = sorted(pairwise(passes.tolist()), key=lambda ends: ends[1] - ends[0])
     out = []
-    for start, end in between[:MIRRORED]:
+    for start, end in between[:MAX_MIRRORED_SEGMENTS]:
         way = state[min(end + second // 2, len(state) - 1), :2] - state[end - second // 2, :2]
         aside = QUARTER_TURN @ way / max(float(np.hypot(*way)), 1e-6)
         copy = state.copy()
@@ -173,7 +180,7 @@ def mirrored(state: Array, rate_hz: float) -> list[Array]:
     return out
 
 
-def passed_by(state: Array, rate_hz: float) -> list[Array]:
+def flip_pass(state: Array, rate_hz: float) -> list[Array]:
     """Flip the side of each close pass; return one copy of the solution for each pass.
 
     Parameters
@@ -183,16 +190,16 @@ def passed_by(state: Array, rate_hz: float) -> list[Array]:
     rate_hz
         Keyframes per second.
     """
-    distance, passes = _passes(state, rate_hz, BESIDE_M)
+    distance, passes = _find_passes(state, rate_hz, MAX_FLIP_M)
     out = []
     for at in passes[np.argsort(distance[passes])].tolist():
-        farther = np.flatnonzero(distance > distance[at] + ROUND_M)
+        farther = np.flatnonzero(distance > distance[at] + FLIP_WIDTH_M)
         start = int(farther[farther < at].max(initial=-1)) + 1
         end = int(farther[farther > at].min(initial=len(state)))
         way = state[min(at + 2, len(state) - 1), :2] - state[max(at - 2, 0), :2]
         aside = QUARTER_TURN @ way / max(float(np.hypot(*way)), 1e-6)
         # Fully mirrored at the closest point and gradually less away from it, without a jump.
-        near = np.cos((distance[start:end] - distance[at]) / ROUND_M * np.pi / 2)
+        near = np.cos((distance[start:end] - distance[at]) / FLIP_WIDTH_M * np.pi / 2)
         copy = state.copy()
         copy[start:end, :2] -= np.outer(2 * near * (copy[start:end, :2] @ aside), aside)
         out.append(copy)

@@ -6,22 +6,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dmrl.estimation.filters import keyframe_ekf
-from dmrl.estimation.filters.camera_update import glances_of, repeated
-from dmrl.estimation.flight.hypotheses import KEPT, START_STD, candidates
+from dmrl.estimation.filters.camera_update import camera_updates, repeat_updates
+from dmrl.estimation.flight.hypotheses import GUESS_STD, KEPT_GUESSES, select_guesses
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.keyframes import KEY_HZ, Noise, Problem
+from dmrl.estimation.solver.keyframes import KEYFRAME_HZ, KeyframeProblem, NoiseModel
 
-SHORT_M, LIKELIER = 0.4, 10.0
+SHORT_RANGE_M, MIN_LIKELIHOOD_GAIN = 0.4, 10.0
 """Range offset that is tried, metres; and gain of the log likelihood that accepts it. Without a
 wrong side at a pass, log likelihoods differ by a few. Chosen on 24 simulated harsh flights of 100
 s: three of them had ended in a solution that circles the observer."""
-NEAR_SHARE, NEAR_M = 0.05, 0.6
+CLOSE_RANGE_SHARE, CLOSE_RANGE_M = 0.05, 0.6
 """Share of the ranges below a distance, metres, at which the offset is tried. Added with
 ``SHORT_RANGE_M``; no record of how the values were chosen."""
 
 
 @dataclass(frozen=True, slots=True)
-class Starts:
+class InitialGuesses:
     """Initial guesses of a flight of K keyframes.
 
     Parameters
@@ -39,10 +39,12 @@ class Starts:
     score: Array
     tracks: Array
     covariances: Array
-    offset_m: float = 0.0
+    range_offset_m: float = 0.0
 
 
-def likely_starts(problems: Sequence[Problem], noise: Noise) -> list[Starts]:
+def find_initial_guesses(
+    problems: Sequence[KeyframeProblem], noise: NoiseModel
+) -> list[InitialGuesses]:
     """Find the likely initial guesses of each flight.
 
     Ranges that are decimetres too short make passing robots seem to meet. A path around the
@@ -56,35 +58,39 @@ def likely_starts(problems: Sequence[Problem], noise: Noise) -> list[Starts]:
     noise
         Noise model of their sensors.
     """
-    found = _starts(problems, noise)
-    near = [n for n, flight in enumerate(problems) if _near(flight)]
-    longer = [replace(problems[n], range_m=problems[n].range_m + SHORT_M) for n in near]
-    for number, tried in zip(near, _starts(longer, noise), strict=True):
-        if tried.score.max() > found[number].score.max() + LIKELIER:
-            found[number] = replace(tried, offset_m=-SHORT_M)
+    found = _smooth_guesses(problems, noise)
+    near = [n for n, flight in enumerate(problems) if _has_close_pass(flight)]
+    longer = [replace(problems[n], range_m=problems[n].range_m + SHORT_RANGE_M) for n in near]
+    for number, tried in zip(near, _smooth_guesses(longer, noise), strict=True):
+        if tried.score.max() > found[number].score.max() + MIN_LIKELIHOOD_GAIN:
+            found[number] = replace(tried, range_offset_m=-SHORT_RANGE_M)
     return found
 
 
-def _near(flight: Problem) -> bool:
+def _has_close_pass(flight: KeyframeProblem) -> bool:
     """Return whether the ranges of a flight indicate a close pass."""
-    short = len(flight.range_m) > 0 and np.quantile(flight.range_m, NEAR_SHARE) < NEAR_M
+    short = (
+        len(flight.range_m) > 0 and np.quantile(flight.range_m, CLOSE_RANGE_SHARE) < CLOSE_RANGE_M
+    )
     return bool(short)
 
 
-def _starts(problems: Sequence[Problem], noise: Noise) -> list[Starts]:
+def _smooth_guesses(problems: Sequence[KeyframeProblem], noise: NoiseModel) -> list[InitialGuesses]:
     """Return the guesses of each flight. Flights of equal length are smoothed side by side."""
-    found: dict[int, Starts] = {}
-    lengths = np.array([len(p.key_s) for p in problems], int)
+    found: dict[int, InitialGuesses] = {}
+    lengths = np.array([len(p.keyframe_s) for p in problems], int)
     for length in np.unique(lengths):
         numbers = np.flatnonzero(lengths == length).tolist()
-        scores, states, covariances = _smoothed([problems[n] for n in numbers], noise)
+        scores, states, covariances = _smooth_flights([problems[n] for n in numbers], noise)
         for column, number in enumerate(numbers):
-            mine = slice(column * KEPT, (column + 1) * KEPT)
-            found[number] = Starts(scores[mine], states[:, mine], covariances[:, mine])
+            mine = slice(column * KEPT_GUESSES, (column + 1) * KEPT_GUESSES)
+            found[number] = InitialGuesses(scores[mine], states[:, mine], covariances[:, mine])
     return [found[number] for number in range(len(problems))]
 
 
-def _smoothed(problems: list[Problem], noise: Noise) -> tuple[Array, Array, Array]:
+def _smooth_flights(
+    problems: list[KeyframeProblem], noise: NoiseModel
+) -> tuple[Array, Array, Array]:
     """Filter and smooth P flights of one length.
 
     Returns
@@ -92,10 +98,10 @@ def _smoothed(problems: list[Problem], noise: Noise) -> tuple[Array, Array, Arra
     scores, states, covariances
         (P KEPT_GUESSES,), (K, P KEPT_GUESSES, 5) and (K, P KEPT_GUESSES, 5, 5).
     """
-    inputs = keyframe_ekf.inputs_of(problems, noise)
-    glances = glances_of([flight.looks for flight in problems])
-    start = candidates(inputs, KEY_HZ, glances).reshape(-1, 3)
-    count = len(problems[0].key_s)
-    given = inputs.repeated(KEPT, count), start, START_STD
-    filtered = keyframe_ekf.run(*given, repeated(glances, KEPT))
-    return filtered.log_likelihood, *keyframe_ekf.smoothed(filtered)
+    inputs = keyframe_ekf.build_inputs(problems, noise)
+    glances = camera_updates([flight.camera for flight in problems])
+    start = select_guesses(inputs, KEYFRAME_HZ, glances).reshape(-1, 3)
+    count = len(problems[0].keyframe_s)
+    given = inputs.repeat(KEPT_GUESSES, count), start, GUESS_STD
+    filtered = keyframe_ekf.run_filters(*given, repeat_updates(glances, KEPT_GUESSES))
+    return filtered.log_likelihood, *keyframe_ekf.smooth_rts(filtered)

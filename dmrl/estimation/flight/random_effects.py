@@ -14,23 +14,23 @@ from numpy.typing import NDArray
 
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.keyframes import GLOBALS, Noise
-from dmrl.estimation.solver.robust_loss import PRIOR, curvature_of, curved
+from dmrl.estimation.solver.keyframes import GLOBALS, NoiseModel
+from dmrl.estimation.solver.robust_loss import PRIOR_LOSS_SCALES, loss_curvature, prior_curvature
 
-FIRST_SHARE, FIRST_COUNT = 1 / 3, 2.0
+PRIOR_STD_SHARE, PRIOR_FLIGHTS = 1 / 3, 2.0
 """Prior of the change from flight to flight: share of the prior's standard deviation, and its
 weight in flights. It keeps two flights that agree by chance from making the change zero. No record
 of how the values were chosen."""
-ROUNDS, SETTLED = 200, 1e-3
+MAX_ROUNDS, TOLERANCE = 200, 1e-3
 """Largest number of EM iterations, and the relative change that ends them. No record of how the
 values were chosen."""
-KINDS = np.array([0, 1, 2, 2, 3, 3, 4, 4, 4, 4, 5])
+VARIATION_GROUPS = np.array([0, 1, 2, 2, 3, 3, 4, 4, 4, 4, 5])
 """Group of each constant, in the order of ``GLOBALS``. The constants of a group share one relative
 change."""
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class FlightInformation:
     """Information of one flight of a pair about its constants, without the prior.
 
     Parameters
@@ -44,12 +44,12 @@ class Told:
     """
 
     information: Array
-    pull: Array
+    information_vector: Array
     column: NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True)
-class Pooled:
+class PooledConstants:
     """Means of M constants over flights.
 
     Parameters
@@ -68,7 +68,7 @@ class Pooled:
     flights: NDArray[np.intp]
 
 
-def told(estimate: Estimate, column: NDArray[np.intp]) -> Told:
+def flight_information(estimate: Estimate, column: NDArray[np.intp]) -> FlightInformation:
     """Return the information of a batch solve about its constants, without their prior.
 
     Parameters
@@ -80,16 +80,16 @@ def told(estimate: Estimate, column: NDArray[np.intp]) -> Told:
     """
     assert estimate.constants_covariance is not None
     found, noise = estimate.constants, estimate.noise
-    bent = np.linalg.inv(estimate.constants_covariance) - np.diag(curvature_of(noise, found))
+    bent = np.linalg.inv(estimate.constants_covariance) - np.diag(prior_curvature(noise, found))
     values, vectors = np.linalg.eigh((bent + bent.T) / 2)
     information = (vectors * np.maximum(values, 0.0)) @ vectors.T
     # At the solution the gradients of likelihood and prior cancel.
     out = found / noise.prior_std()
-    prior = out / noise.prior_std() / (1 + out**2 / PRIOR)
-    return Told(information, information @ found + prior, column)
+    prior = out / noise.prior_std() / (1 + out**2 / PRIOR_LOSS_SCALES)
+    return FlightInformation(information, information @ found + prior, column)
 
 
-def pooled(flights: Sequence[Told], kind: NDArray[np.intp]) -> Pooled:
+def pool_flights(flights: Sequence[FlightInformation], kind: NDArray[np.intp]) -> PooledConstants:
     """Pool M constants over flights, with the standard deviation of the next flight.
 
     Parameters
@@ -99,30 +99,34 @@ def pooled(flights: Sequence[Told], kind: NDArray[np.intp]) -> Pooled:
     kind
         (M,) index of each constant among ``GLOBALS``; any of those in its group.
     """
-    usual, limit, group = Noise().prior_std()[kind], PRIOR[kind], KINDS[kind]
+    usual, limit, group = (
+        NoiseModel().prior_std()[kind],
+        PRIOR_LOSS_SCALES[kind],
+        VARIATION_GROUPS[kind],
+    )
     mean: Array = np.zeros(len(kind))
     change = usual.copy()
     counts = np.bincount(np.concatenate([flight.column for flight in flights]), minlength=len(kind))
-    for _ in range(ROUNDS):
-        information, pull = _total(flights, change)
+    for _ in range(MAX_ROUNDS):
+        information, pull = _total_information(flights, change)
         # The heavy-tailed prior of a single flight. If flights determine only the difference of
         # two robots, it attributes the whole error to one of them.
         weight = 1 / (1 + (mean / usual) ** 2 / limit) / usual**2
         mean = np.asarray(np.linalg.solve(information + np.diag(weight), pull), float)
-        bent = np.diag(curved((mean / usual) ** 2 / limit) / usual**2)
+        bent = np.diag(loss_curvature((mean / usual) ** 2 / limit) / usual**2)
         covariance = np.asarray(np.linalg.pinv(information + bent, hermitian=True), float)
-        squares = _squares(flights, mean, covariance, change)
+        squares = _sum_expected_squares(flights, mean, covariance, change)
         # A group has one standard deviation, relative to that of the prior.
         relative = np.bincount(group, squares / usual**2)
-        seen = np.bincount(group, counts) + FIRST_COUNT
-        share = np.sqrt((relative + FIRST_COUNT * FIRST_SHARE**2) / seen)
+        seen = np.bincount(group, counts) + PRIOR_FLIGHTS
+        share = np.sqrt((relative + PRIOR_FLIGHTS * PRIOR_STD_SHARE**2) / seen)
         before, change = change, share[group] * usual
-        if np.abs(change / before - 1).max() < SETTLED:
+        if np.abs(change / before - 1).max() < TOLERANCE:
             break
-    return Pooled(mean, np.sqrt(np.diag(covariance) + change**2), counts)
+    return PooledConstants(mean, np.sqrt(np.diag(covariance) + change**2), counts)
 
 
-def _total(flights: Sequence[Told], change: Array) -> tuple[Array, Array]:
+def _total_information(flights: Sequence[FlightInformation], change: Array) -> tuple[Array, Array]:
     """Return (M, M) information of all flights about the means, and its vector (M,).
 
     ``change`` (M,) is the standard deviation of each constant from flight to flight.
@@ -132,17 +136,19 @@ def _total(flights: Sequence[Told], change: Array) -> tuple[Array, Array]:
         spread = np.diag(change[flight.column] ** 2)
         kept = np.linalg.inv(np.eye(len(GLOBALS)) + flight.information @ spread)
         information[np.ix_(flight.column, flight.column)] += kept @ flight.information
-        pull[flight.column] += kept @ flight.pull
+        pull[flight.column] += kept @ flight.information_vector
     return information, pull
 
 
-def _squares(flights: Sequence[Told], mean: Array, covariance: Array, change: Array) -> Array:
+def _sum_expected_squares(
+    flights: Sequence[FlightInformation], mean: Array, covariance: Array, change: Array
+) -> Array:
     """Return (M,) sums over flights of the expected squared deviations from the means."""
     out = np.zeros(len(mean))
     for flight in flights:
         held = change[flight.column] ** -2.0
         spread = np.linalg.inv(flight.information + np.diag(held))
-        found = spread @ (flight.pull + held * mean[flight.column])
+        found = spread @ (flight.information_vector + held * mean[flight.column])
         # The covariance of the mean enters by the weight that the flight leaves to the mean.
         left = spread * held
         own = np.eye(len(held)) - left

@@ -6,14 +6,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.estimation.model.pair import Array, Mask, Sightings
+from dmrl.estimation.model.pair import Array, BearingMeasurements, Mask
 
-AGREES = 11.3
+ASSOCIATION_GATE = 11.3
 """Gate on the squared Mahalanobis distance of a candidate. The 99 % point of chi-square with three
 degrees of freedom."""
 
 
-def polar_of(xyz_m: Array) -> Array:
+def to_bearing(xyz_m: Array) -> Array:
     """Return (N, 3) azimuth, elevation (rad) and log distance of (N, 3) positions, metres."""
     x, y, z = xyz_m.T
     level2 = np.maximum(x * x + y * y, 1e-6)
@@ -21,7 +21,7 @@ def polar_of(xyz_m: Array) -> Array:
     return np.column_stack([np.arctan2(y, x), up, np.log(level2 + z * z) / 2])
 
 
-def polar_variance(xyz_m: Array, covariance: Array) -> Array:
+def bearing_variance(xyz_m: Array, covariance: Array) -> Array:
     """Return (N, 3) variances of azimuth, elevation and log distance of uncertain positions.
 
     Parameters
@@ -38,30 +38,30 @@ def polar_variance(xyz_m: Array, covariance: Array) -> Array:
     return np.asarray(np.einsum("nij,njk,nik->ni", slope, covariance, slope))
 
 
-def difference(there: Array, here: Array) -> Array:
+def subtract_bearings(first: Array, second: Array) -> Array:
     """Return (..., 3) differences of azimuth (wrapped to +-pi), elevation and log distance."""
-    off = np.asarray(there - here)
+    off = np.asarray(first - second)
     off[..., 0] = (off[..., 0] + np.pi) % (2 * np.pi) - np.pi
     return off
 
 
-class Claim(NamedTuple):
+class Association(NamedTuple):
     """Candidate of each of I images that is nearest to an expected position."""
 
     nearest: NDArray[np.intp]
     """(I,) index of the candidate."""
-    squared: Array
+    squared_distance: Array
     """(I,) squared Mahalanobis distance."""
     log_likelihood: Array
     """(I,) log likelihood of the association."""
 
     @property
-    def agrees(self) -> Mask:
+    def is_consistent(self) -> Mask:
         """(I,) whether the distance is inside the gate."""
-        return np.asarray(self.squared < AGREES)
+        return np.asarray(self.squared_distance < ASSOCIATION_GATE)
 
 
-def claim(sightings: Sightings, xyz_m: Array, covariance: Array) -> Claim:
+def associate(bearings: BearingMeasurements, xyz_m: Array, covariance: Array) -> Association:
     """Associate every image with the candidate nearest to an expected position.
 
     Parameters
@@ -72,16 +72,18 @@ def claim(sightings: Sightings, xyz_m: Array, covariance: Array) -> Claim:
         (I, 3) metres and (I, 3, 3), in the horizontal frame of the robot with the camera, at the
         times of the images.
     """
-    off = difference(sightings.polar, polar_of(xyz_m)[:, None])
-    variance = polar_variance(xyz_m, covariance)[:, None] + sightings.std**2
+    off = subtract_bearings(bearings.bearing, to_bearing(xyz_m)[:, None])
+    variance = bearing_variance(xyz_m, covariance)[:, None] + bearings.std**2
     squared = (off**2 / variance).sum(axis=2)
     squared = np.where(np.isnan(squared), np.inf, squared)
     nearest, images = squared.argmin(axis=1), np.arange(len(squared))
     least = squared[images, nearest]
-    return Claim(nearest, least, -(least + np.log(variance[images, nearest]).sum(axis=1)) / 2)
+    return Association(nearest, least, -(least + np.log(variance[images, nearest]).sum(axis=1)) / 2)
 
 
-def within(sightings: Sightings | None, start_s: float, end_s: float) -> Sightings | None:
+def crop_to_time(
+    bearings: BearingMeasurements | None, start_s: float, end_s: float
+) -> BearingMeasurements | None:
     """Crop bearing measurements to an interval; None stays None.
 
     Parameters
@@ -91,13 +93,17 @@ def within(sightings: Sightings | None, start_s: float, end_s: float) -> Sightin
     start_s, end_s
         First and last time of the interval, seconds.
     """
-    if sightings is None:
+    if bearings is None:
         return None
-    inside = (sightings.time_s >= start_s) & (sightings.time_s <= end_s)
-    return Sightings(sightings.time_s[inside], sightings.polar[inside], sightings.std[inside])
+    inside = (bearings.time_s >= start_s) & (bearings.time_s <= end_s)
+    return BearingMeasurements(
+        bearings.time_s[inside], bearings.bearing[inside], bearings.std[inside]
+    )
 
 
-def without(sightings: Sightings, images: Mask, candidates: NDArray[np.intp]) -> Sightings:
+def drop_candidates(
+    bearings: BearingMeasurements, images: Mask, candidates: NDArray[np.intp]
+) -> BearingMeasurements:
     """Remove one candidate from some images; drop images without any other candidate.
 
     Parameters
@@ -109,9 +115,9 @@ def without(sightings: Sightings, images: Mask, candidates: NDArray[np.intp]) ->
     candidates
         (I,) index of the candidate to remove.
     """
-    polar = sightings.polar.copy()
+    polar = bearings.bearing.copy()
     polar[np.flatnonzero(images), candidates[images]] = np.nan
     left = np.isfinite(polar[..., 0]).any(axis=1)
     return replace(
-        sightings, time_s=sightings.time_s[left], polar=polar[left], std=sightings.std[left]
+        bearings, time_s=bearings.time_s[left], bearing=polar[left], std=bearings.std[left]
     )

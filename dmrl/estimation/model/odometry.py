@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dmrl.estimation.model.pair import Array, Track
+from dmrl.estimation.model.pair import Array, SensorTrack
 
 QUARTER_TURN: Array = np.array([[0.0, -1.0], [1.0, 0.0]])
 """Rotation by 90 degrees. The derivative of a rotation by its angle is QUARTER_TURN @ rotation."""
 
 
-def rotation(angle_rad: Array) -> Array:
+def rotation_matrix(angle_rad: Array) -> Array:
     """Return (..., 2, 2) counter-clockwise rotation matrices of angles in radians."""
     out = np.empty((*np.shape(angle_rad), 2, 2))
     out[..., 0, 0] = out[..., 1, 1] = np.cos(angle_rad)
@@ -43,34 +43,38 @@ class Odometry:
     time_s: Array
     heading_rad: Array
     position_m: Array
-    drift_s: Array
+    bias_jacobian_s: Array
 
-    def at(self, time_s: Array) -> tuple[Array, Array, Array]:
+    def interpolate_at(self, time_s: Array) -> tuple[Array, Array, Array]:
         """Interpolate heading (N,), position (N, 2) and bias Jacobian (N, 2, 2) at times."""
         step = (time_s - self.time_s[0]) / (self.time_s[1] - self.time_s[0])
         low = np.clip(step.astype(int), 0, len(self.time_s) - 2)
         share = step - low
 
-        def between(values: Array) -> Array:
+        def blend_samples(values: Array) -> Array:
             part = share.reshape(-1, *[1] * (values.ndim - 1))
             return np.asarray(values[low] * (1 - part) + values[low + 1] * part)
 
-        return between(self.heading_rad), between(self.position_m), between(self.drift_s)
+        return (
+            blend_samples(self.heading_rad),
+            blend_samples(self.position_m),
+            blend_samples(self.bias_jacobian_s),
+        )
 
-    def increments(self, from_s: Array, to_s: Array) -> "Increments":
+    def relative_motion(self, from_s: Array, to_s: Array) -> "RelativeMotion":
         """Return the motion between pairs of times, in the robot's frame at the first of each."""
-        heading, position, drift = self.at(from_s)
-        later_heading, later, later_drift = self.at(to_s)
-        back = rotation(-heading)
-        return Increments(
+        heading, position, drift = self.interpolate_at(from_s)
+        later_heading, later, later_drift = self.interpolate_at(to_s)
+        back = rotation_matrix(-heading)
+        return RelativeMotion(
             turn_rad=later_heading - heading,
             shift_m=np.einsum("nij,nj->ni", back, later - position),
-            drift_s=back @ (later_drift - drift),
+            bias_jacobian_s=back @ (later_drift - drift),
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Increments:
+class RelativeMotion:
     """Relative motions of one robot.
 
     Parameters
@@ -85,10 +89,10 @@ class Increments:
 
     turn_rad: Array
     shift_m: Array
-    drift_s: Array
+    bias_jacobian_s: Array
 
 
-def odometry(track: Track, time_s: Array) -> Odometry:
+def preintegrate(track: SensorTrack, time_s: Array) -> Odometry:
     """Integrate a robot's velocity and yaw rate by the trapezoidal rule.
 
     Parameters
@@ -100,15 +104,15 @@ def odometry(track: Track, time_s: Array) -> Odometry:
     """
     dt_s = np.diff(time_s)
 
-    def integral(rate: Array) -> Array:
+    def integrate(rate: Array) -> Array:
         steps = 0.5 * (rate[1:] + rate[:-1]) * dt_s.reshape(-1, *[1] * (rate.ndim - 1))
         return np.concatenate([np.zeros((1, *rate.shape[1:])), np.cumsum(steps, axis=0)])
 
-    heading = integral(track.yaw_rate_radps)
-    turned = rotation(heading)
+    heading = integrate(track.yaw_rate_radps)
+    turned = rotation_matrix(heading)
     velocity = np.column_stack([track.vx_mps, track.vy_mps])
     return Odometry(
-        time_s, heading, integral(np.einsum("kij,kj->ki", turned, velocity)), integral(turned)
+        time_s, heading, integrate(np.einsum("kij,kj->ki", turned, velocity)), integrate(turned)
     )
 
 

@@ -8,19 +8,19 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-RATE_HZ = 100.0
+GRID_RATE_HZ = 100.0
 """Rate of the common time grid, Hz. No record of how the value was chosen."""
-LONGEST_GAP_S = 0.5
+MAX_DROPOUT_S = 0.5
 """Longest dropout that is interpolated without a warning, seconds. No record of how the value was
 chosen."""
-LONGEST_RANGE_M = 60.0
+MAX_RANGE_M = 60.0
 """Longest plausible UWB range, metres. It rejects 65535 and other fill values."""
-SWAPPED = [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, 10]
+GLOBALS_FROM_PEER = [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, 10]
 """Permutation of ``GLOBALS`` that exchanges observer and peer."""
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class SensorTrack:
     """Sensor signals of one robot on a uniform time grid of K samples.
 
     Parameters
@@ -41,16 +41,16 @@ class Track:
     vy_mps: Array
     yaw_rate_radps: Array
     height_m: Array
-    gap: Mask
-    height_gap: Mask | None = None
+    dropout: Mask
+    height_dropout: Mask | None = None
 
-    def values(self) -> tuple[Array, Array, Array, Array]:
+    def signals(self) -> tuple[Array, Array, Array, Array]:
         """Return vx, vy, yaw rate and height, (K,) each."""
         return self.vx_mps, self.vy_mps, self.yaw_rate_radps, self.height_m
 
 
 @dataclass(frozen=True, slots=True)
-class Sightings:
+class BearingMeasurements:
     """Candidate detections of the peer in one camera: I images with up to C candidates.
 
     Parameters
@@ -65,7 +65,7 @@ class Sightings:
     """
 
     time_s: Array
-    polar: Array
+    bearing: Array
     std: Array
 
 
@@ -98,13 +98,13 @@ class Pair:
     """
 
     time_s: Array
-    own: Track
-    peer: Track
+    own: SensorTrack
+    peer: SensorTrack
     range_time_s: Array
     range_m: Array
-    own_sees: Sightings | None = None
-    peer_sees: Sightings | None = None
-    known_std: Array | None = None
+    own_bearings: BearingMeasurements | None = None
+    peer_bearings: BearingMeasurements | None = None
+    calibrated_std: Array | None = None
 
     def __post_init__(self) -> None:
         count = len(self.time_s)
@@ -112,7 +112,7 @@ class Pair:
         if count < 2 or not np.allclose(steps, steps[0], rtol=1e-3) or steps[0] <= 0:
             raise ValueError("time_s: the grid is not uniform and increasing. Use `resample`")
         for name, track in (("own", self.own), ("peer", self.peer)):
-            for signal in (*track.values(), track.gap):
+            for signal in (*track.signals(), track.dropout):
                 if signal.shape != (count,) or not np.isfinite(signal).all():
                     raise ValueError(
                         f"{name}: signals are not {count} finite numbers each. Use `resample`"
@@ -136,11 +136,11 @@ class Pair:
         """Step of the grid, seconds."""
         return float(self.time_s[-1] - self.time_s[0]) / (len(self.time_s) - 1)
 
-    def swapped(self) -> "Pair":
+    def swap_robots(self) -> "Pair":
         """Return the pair with observer and peer exchanged."""
         ranges = self.range_time_s, self.range_m
-        sees = self.peer_sees, self.own_sees
-        known_std = None if self.known_std is None else self.known_std[SWAPPED]
+        sees = self.peer_bearings, self.own_bearings
+        known_std = None if self.calibrated_std is None else self.calibrated_std[GLOBALS_FROM_PEER]
         return Pair(self.time_s, self.peer, self.own, *ranges, *sees, known_std)
 
 
@@ -155,7 +155,7 @@ def usable_ranges(time_s: Array, range_m: Array) -> Mask:
         (R,) measured distances, metres.
     """
     latest = np.fmax.accumulate(np.concatenate([[-np.inf], time_s]))[:-1]
-    good = np.isfinite(range_m) & (range_m > 0) & (range_m <= LONGEST_RANGE_M)
+    good = np.isfinite(range_m) & (range_m > 0) & (range_m <= MAX_RANGE_M)
     return np.asarray(good & (time_s >= latest))
 
 
@@ -195,4 +195,4 @@ def resample(time_s: Array, values: Array, grid_s: Array) -> tuple[Array, Mask]:
     before_s = np.concatenate([[-np.inf], time_s])[after]
     after_s = np.concatenate([time_s, [np.inf]])[after]
     before_s = np.where(grid_s == after_s, grid_s, before_s)
-    return signal, np.asarray(after_s - before_s > LONGEST_GAP_S)
+    return signal, np.asarray(after_s - before_s > MAX_DROPOUT_S)

@@ -15,15 +15,15 @@ from dmrl.geometry.frames import Array
 Mask = NDArray[np.bool_]
 Times = NDArray[np.int64]
 
-GOOD_M = 0.3
+MAX_GOOD_ERROR_M = 0.3
 """Largest horizontal error of a good label, metres. No record of how the value was chosen; it
 equals ``GATE_M``."""
-WRONG_SHARE = 0.5
+WRONG_BASIN_SHARE = 0.5
 """A pair is in the wrong basin if its median error exceeds this share of the median distance. No
 record of how the value was chosen."""
 CHI2_95_OF_2 = 5.991
 """95 % point of chi-square with two degrees of freedom."""
-GAP_S = 0.25
+MAX_TRUTH_GAP_S = 0.25
 """Longest gap over which the truth is interpolated, seconds. No record of how the value was chosen.
 """
 
@@ -33,10 +33,10 @@ DEFINITIONS = {
     "wrong_basin": "median horizontal error over half the median distance, after settling",
     "nees": "mean of the squared horizontal error over its covariance; 2 if that is right",
     "coverage_95": "share of true positions inside the 95 % ellipse, after the settling time",
-    "good": f"share of all samples, from the start, with an error of at most {GOOD_M} m",
+    "good": f"share of all samples, from the start, with an error of at most {MAX_GOOD_ERROR_M} m",
     "kept": "share of all samples, from the start, with status OK",
-    "precision": f"share of the kept samples with an error of at most {GOOD_M} m",
-    "recall": f"share of the samples with an error of at most {GOOD_M} m that are kept",
+    "precision": f"share of the kept samples with an error of at most {MAX_GOOD_ERROR_M} m",
+    "recall": f"share of the samples with an error of at most {MAX_GOOD_ERROR_M} m that are kept",
     "kept_coverage_95": "share of true positions inside the 95 % ellipse, kept samples",
     "kept_rmse_m": "root of the mean squared horizontal error of the kept samples",
 }
@@ -67,7 +67,7 @@ class ErrorTrace:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class EvaluatedPositions:
     """Estimates of one pair beside the truth, (N, ...) each.
 
     Parameters
@@ -91,7 +91,7 @@ class Judged:
     kept: Mask
 
     @property
-    def size_m(self) -> Array:
+    def error_norm_m(self) -> Array:
         """(N,) Euclidean norm of the errors, metres."""
         return np.asarray(np.linalg.norm(self.error_m, axis=1))
 
@@ -102,7 +102,7 @@ class Judged:
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
+class PairFigures:
     """Values of the figures in ``DEFINITIONS``; NaN without data."""
 
     samples: int
@@ -119,7 +119,7 @@ class Figures:
     kept_rmse_m: float
 
 
-def figures(judged: Judged, settle_s: float) -> Figures:
+def compute_figures(positions: EvaluatedPositions, settle_s: float) -> PairFigures:
     """Compute the figures of one pair.
 
     Parameters
@@ -129,43 +129,43 @@ def figures(judged: Judged, settle_s: float) -> Figures:
     settle_s
         Settling time. Earlier errors count for the figures of the gate only.
     """
-    size_m, settled = judged.size_m, judged.time_s >= settle_s
-    late, distance = size_m[settled], judged.distance_m[settled]
-    squared = squared_distances(judged)
+    size_m, settled = positions.error_norm_m, positions.time_s >= settle_s
+    late, distance = size_m[settled], positions.distance_m[settled]
+    squared = mahalanobis_squared(positions)
     usable = np.isfinite(squared)
-    good, kept = size_m <= GOOD_M, judged.kept
-    return Figures(
+    good, kept = size_m <= MAX_GOOD_ERROR_M, positions.kept
+    return PairFigures(
         samples=len(size_m),
-        rmse_m=_root(late),
+        rmse_m=_root_mean_square(late),
         p95_m=float(np.percentile(late, 95)) if late.size else np.nan,
-        wrong_basin=float(np.median(late) > WRONG_SHARE * np.median(distance))
+        wrong_basin=float(np.median(late) > WRONG_BASIN_SHARE * np.median(distance))
         if late.size
         else np.nan,
-        nees=_mean(squared[usable & settled]),
-        coverage_95=_mean(squared[usable & settled] <= CHI2_95_OF_2),
-        good=_mean(good),
-        kept=_mean(kept),
-        precision=_mean(good[kept]),
-        recall=_mean(kept[good]),
-        kept_coverage_95=_mean(squared[usable & kept] <= CHI2_95_OF_2),
-        kept_rmse_m=_root(size_m[kept]),
+        nees=_mean_or_nan(squared[usable & settled]),
+        coverage_95=_mean_or_nan(squared[usable & settled] <= CHI2_95_OF_2),
+        good=_mean_or_nan(good),
+        kept=_mean_or_nan(kept),
+        precision=_mean_or_nan(good[kept]),
+        recall=_mean_or_nan(kept[good]),
+        kept_coverage_95=_mean_or_nan(squared[usable & kept] <= CHI2_95_OF_2),
+        kept_rmse_m=_root_mean_square(size_m[kept]),
     )
 
 
-def squared_distances(judged: Judged) -> Array:
+def mahalanobis_squared(positions: EvaluatedPositions) -> Array:
     """Return (N,) squared Mahalanobis distances of the errors.
 
     They are NaN where a covariance is not positive definite.
     """
-    (a, b), (_, d) = judged.covariance.transpose(1, 2, 0)
-    x, y = judged.error_m.T
+    (a, b), (_, d) = positions.covariance.transpose(1, 2, 0)
+    x, y = positions.error_m.T
     determinant = a * d - b * b
     with np.errstate(divide="ignore", invalid="ignore"):
         squared = (d * x * x - 2 * b * x * y + a * y * y) / determinant
     return np.where((a > 0) & (determinant > 0), squared, np.nan)
 
 
-def overall(pairs: list[Figures]) -> Figures:
+def combine_figures(pairs: list[PairFigures]) -> PairFigures:
     """Combine the figures of several pairs.
 
     RMSE and percentile are medians over pairs. The share of wrong basins counts pairs. Shares of
@@ -175,44 +175,44 @@ def overall(pairs: list[Figures]) -> Figures:
     kept = samples * [f.kept for f in pairs]
     good = samples * [f.good for f in pairs]
     both = good * np.nan_to_num([f.recall for f in pairs])
-    return Figures(
+    return PairFigures(
         samples=int(samples.sum()),
-        rmse_m=_median([f.rmse_m for f in pairs]),
-        p95_m=_median([f.p95_m for f in pairs]),
-        wrong_basin=_mean(_known([f.wrong_basin for f in pairs])),
-        nees=_mean(_known([f.nees for f in pairs])),
-        coverage_95=_mean(_known([f.coverage_95 for f in pairs])),
-        good=_ratio(good.sum(), samples.sum()),
-        kept=_ratio(kept.sum(), samples.sum()),
-        precision=_ratio(both.sum(), kept.sum()),
-        recall=_ratio(both.sum(), good.sum()),
-        kept_coverage_95=_mean(_known([f.kept_coverage_95 for f in pairs])),
-        kept_rmse_m=_median([f.kept_rmse_m for f in pairs]),
+        rmse_m=_median_or_nan([f.rmse_m for f in pairs]),
+        p95_m=_median_or_nan([f.p95_m for f in pairs]),
+        wrong_basin=_mean_or_nan(_drop_non_finite([f.wrong_basin for f in pairs])),
+        nees=_mean_or_nan(_drop_non_finite([f.nees for f in pairs])),
+        coverage_95=_mean_or_nan(_drop_non_finite([f.coverage_95 for f in pairs])),
+        good=_divide_or_nan(good.sum(), samples.sum()),
+        kept=_divide_or_nan(kept.sum(), samples.sum()),
+        precision=_divide_or_nan(both.sum(), kept.sum()),
+        recall=_divide_or_nan(both.sum(), good.sum()),
+        kept_coverage_95=_mean_or_nan(_drop_non_finite([f.kept_coverage_95 for f in pairs])),
+        kept_rmse_m=_median_or_nan([f.kept_rmse_m for f in pairs]),
     )
 
 
-def _ratio(part: float, whole: float) -> float:
+def _divide_or_nan(part: float, whole: float) -> float:
     return float(part / whole) if whole else float("nan")
 
 
-def _known(values: list[float]) -> Array:
+def _drop_non_finite(values: list[float]) -> Array:
     return np.array([value for value in values if np.isfinite(value)])
 
 
-def _mean(values: Array | Mask) -> float:
+def _mean_or_nan(values: Array | Mask) -> float:
     return float(np.mean(values)) if values.size else float("nan")
 
 
-def _median(values: list[float]) -> float:
-    known = _known(values)
+def _median_or_nan(values: list[float]) -> float:
+    known = _drop_non_finite(values)
     return float(np.median(known)) if known.size else float("nan")
 
 
-def _root(values: Array) -> float:
+def _root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
-def inside_truth(time_ns: Times, true_ns: Times) -> NDArray[np.bool_]:
+def is_covered_by_truth(time_ns: Times, true_ns: Times) -> NDArray[np.bool_]:
     """Return (N,) whether true positions exist shortly before and after a time."""
     if not len(true_ns):
         return np.zeros(len(time_ns), bool)
@@ -221,4 +221,4 @@ def inside_truth(time_ns: Times, true_ns: Times) -> NDArray[np.bool_]:
     between = (after > 0) & (after < len(true_ns))
     low = true_ns[np.maximum(after - 1, 0)]
     high = true_ns[np.minimum(after, len(true_ns) - 1)]
-    return np.asarray(exact | (between & (high - low <= GAP_S * 1e9)))
+    return np.asarray(exact | (between & (high - low <= MAX_TRUTH_GAP_S * 1e9)))

@@ -13,28 +13,28 @@ from dmrl.estimation.model.pair import Array, Mask
 OK, UNCONVERGED, AMBIGUOUS = range(3)
 """Values of ``status``, equal to those of ``dmrl.v1.Status``."""
 
-EXPECTED_SHARE = 0.045
+MAX_EXPECTED_BAD_SHARE = 0.045
 """Largest expected share of bad positions among the OK positions of a flight.
 
 Most flights with calibrated sensors are good throughout and use little of it: over all of them the
 share is below 1 %. Raised on simulated flights, where fewer positions were bad than expected."""
-WORST_SHARE = 0.12
+MAX_BAD_PROBABILITY = 0.12
 """Largest probability of being bad of an OK position. Raised together with ``EXPECTED_SHARE``."""
-OPEN_RAD, OPEN_FLIGHT_RAD = 0.35, 0.25
+MAX_BEARING_SIGMA_RAD, MAX_MEDIAN_BEARING_SIGMA_RAD = 0.35, 0.25
 """Largest sigma over distance of an observable bearing; and largest median of it over a flight.
 Above the median, the motion of the whole flight leaves the bearing open. No record of how the
 values were chosen."""
-NEAR_M = 0.5
+MIN_DISTANCE_M = 0.5
 """Smallest distance in sigma over distance, metres. Robots do not fly nearer, and the ratio would
 diverge. No record of how the value was chosen."""
-ANGLES = 64
+DIRECTION_COUNT = 64
 """Number of directions in the sum of `probability_beyond`. It gives three digits while one sigma is
 up to some twenty times the other."""
 
 Statuses = NDArray[np.int8]
 
 
-def statuses(state: Array, covariance: Array, gate_m: float) -> Statuses:
+def classify_positions(state: Array, covariance: Array, gate_m: float) -> Statuses:
     """Return (K,) the status of every position, from its covariance.
 
     Parameters
@@ -47,12 +47,12 @@ def statuses(state: Array, covariance: Array, gate_m: float) -> Statuses:
         Largest error of a good position, metres.
     """
     xy, spread = state[:, :2], covariance[:, :2, :2]
-    good = within_budget(probability_beyond(spread, gate_m), EXPECTED_SHARE)
+    good = select_within_budget(probability_beyond(spread, gate_m), MAX_EXPECTED_BAD_SHARE)
     status = np.where(good, OK, UNCONVERGED).astype(np.int8)
     sigma_m = np.sqrt(np.linalg.eigvalsh(spread)[:, -1])
-    bearing_rad = sigma_m / np.maximum(np.hypot(*xy.T), NEAR_M)
-    whole = not np.median(bearing_rad) < OPEN_FLIGHT_RAD
-    status[whole | ~(bearing_rad < OPEN_RAD)] = AMBIGUOUS
+    bearing_rad = sigma_m / np.maximum(np.hypot(*xy.T), MIN_DISTANCE_M)
+    whole = not np.median(bearing_rad) < MAX_MEDIAN_BEARING_SIGMA_RAD
+    status[whole | ~(bearing_rad < MAX_BEARING_SIGMA_RAD)] = AMBIGUOUS
     return status
 
 
@@ -71,14 +71,14 @@ def probability_beyond(covariance: Array, error_m: float) -> Array:
         The limit, metres.
     """
     small, large = np.maximum(np.linalg.eigvalsh(covariance), 1e-8).T[..., None]
-    angle = (np.arange(ANGLES) + 0.5) * np.pi / ANGLES
+    angle = (np.arange(DIRECTION_COUNT) + 0.5) * np.pi / DIRECTION_COUNT
     q = np.cos(angle) ** 2 / small + np.sin(angle) ** 2 / large
     weight = 1 / q
     beyond = (weight * np.exp(-q * error_m**2 / 2)).sum(axis=1)
     return np.asarray(beyond / weight.sum(axis=1))
 
 
-def within_budget(probability: Array, share: float) -> Mask:
+def select_within_budget(probability: Array, share: float) -> Mask:
     """Return (K,) the largest set of best positions whose mean probability is within the budget.
 
     Parameters
@@ -91,5 +91,5 @@ def within_budget(probability: Array, share: float) -> Mask:
     ordered = np.sort(probability)
     mean = np.cumsum(ordered) / np.arange(1, len(ordered) + 1)
     count = int(np.searchsorted(mean, share, "right"))
-    limit = min(float(ordered[count - 1]), WORST_SHARE) if count else -1.0
+    limit = min(float(ordered[count - 1]), MAX_BAD_PROBABILITY) if count else -1.0
     return np.asarray(probability <= limit)

@@ -9,17 +9,17 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-WIDTH_PX = 80
+TARGET_WIDTH_PX = 80
 """Approximate width of the shrunk images, pixels. Shrinking removes noise and keeps rotations. No
 record of how the value was chosen."""
-CHANCE = 7.0
+NOISE_PEAK = 7.0
 """Upper bound of the correlation peak of two noise images, times the root of their pixels. Chosen
 to reject chance matches at any image size."""
-LONGEST_S = 0.5
+MAX_INTERVAL_S = 0.5
 """Largest interval between two compared images, seconds. No record of how the value was chosen."""
 
 
-def small(pixels: NDArray[np.uint8]) -> Array:
+def shrink_image(pixels: NDArray[np.uint8]) -> Array:
     """Shrink an image to the input of `estimate_shift`.
 
     Parameters
@@ -33,13 +33,13 @@ def small(pixels: NDArray[np.uint8]) -> Array:
         (h, w) means of square blocks of pixels, about ``TARGET_WIDTH_PX`` wide.
     """
     grey = pixels.mean(axis=2) if pixels.ndim == 3 else pixels.astype(float)
-    side = max(round(grey.shape[1] / WIDTH_PX), 1)
+    side = max(round(grey.shape[1] / TARGET_WIDTH_PX), 1)
     height, width = (length // side for length in grey.shape)
     squares = grey[: height * side, : width * side].reshape(height, side, width, side)
     return np.asarray(squares.mean(axis=(1, 3)))
 
 
-def shift(before: Array, after: Array) -> tuple[float, float] | None:
+def estimate_shift(before: Array, after: Array) -> tuple[float, float] | None:
     """Estimate the shift of the scene from one image to the next.
 
     Parameters
@@ -63,15 +63,15 @@ def shift(before: Array, after: Array) -> tuple[float, float] | None:
     cross /= np.maximum(size, 0.01 * size.mean() + 1e-12)
     peaks = np.fft.irfft2(cross, s=before.shape)
     row, col = np.unravel_index(int(peaks.argmax()), peaks.shape)
-    if peaks[row, col] < CHANCE / np.sqrt(peaks.size):
+    if peaks[row, col] < NOISE_PEAK / np.sqrt(peaks.size):
         return None
     around = np.arange(-1, 2)
-    right = col + _vertex(peaks[row, (col + around) % width])
-    down = row + _vertex(peaks[(row + around) % height, col])
-    return _signed(right, width), _signed(down, height)
+    right = col + _parabola_peak(peaks[row, (col + around) % width])
+    down = row + _parabola_peak(peaks[(row + around) % height, col])
+    return _wrap_shift(right, width), _wrap_shift(down, height)
 
 
-def rates(time_s: Array, moved: Array) -> tuple[Array, Array]:
+def shift_rates(time_s: Array, moved: Array) -> tuple[Array, Array]:
     """Convert shifts to velocities of the scene in the image.
 
     Parameters
@@ -87,17 +87,17 @@ def rates(time_s: Array, moved: Array) -> tuple[Array, Array]:
         (M,) times halfway between two images, (M, 2) pixels per second, right and down.
     """
     step = np.diff(time_s)
-    good = np.isfinite(moved).all(axis=1) & (step > 0) & (step < LONGEST_S)
+    good = np.isfinite(moved).all(axis=1) & (step > 0) & (step < MAX_INTERVAL_S)
     return (time_s[:-1] + step / 2)[good], moved[good] / step[good, None]
 
 
-def _vertex(values: Array) -> float:
+def _parabola_peak(values: Array) -> float:
     """Return the peak of the parabola through three values, relative to the middle one."""
     left, middle, right = values.tolist()
     bend = left - 2 * middle + right
     return 0.0 if bend >= 0 else float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5))
 
 
-def _signed(place: float, length: int) -> float:
+def _wrap_shift(place: float, length: int) -> float:
     """Wrap a shift of a circular correlation to a signed one."""
     return place - length if place > length / 2 else place

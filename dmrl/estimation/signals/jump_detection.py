@@ -11,24 +11,24 @@ from scipy.ndimage import median_filter
 
 from dmrl.estimation.model.pair import Array
 
-BACK_SHARE = 0.5
+MIN_OFFSET_SHARE = 0.5
 """After a jump down, an offset below this share of the jump counts as zero. No record of how the
 value was chosen."""
-TREND_S = 1.0
+TREND_HALF_WINDOW_S = 1.0
 """Half the window of a signal's trend, seconds: a robot keeps its velocity for about that long. No
 record of how the value was chosen."""
-LONGEST_S = 30.0
+MAX_OFFSET_S = 30.0
 """Longest offset, seconds. A longer one was no jump, or its end was missed. No record of how the
 value was chosen."""
-HEIGHT_REACH_S, HEIGHT_NOISE_M = 0.05, 0.12
+HEIGHT_MEDIAN_S, MIN_HEIGHT_STEP_M = 0.05, 0.12
 """Length of the medians of a height before and after a step, seconds; and smallest step, metres, as
 smaller ones may be noise. No record of how the values were chosen."""
-NOISE_SIGMAS = 5.0
+MIN_STEP_SIGMAS = 5.0
 """Smallest jump, in standard deviations of a sample's change. No record of how the value was
 chosen."""
 
 
-def levels(values: Array, step_s: float, least: float, reach: int) -> Array:
+def step_offsets(values: Array, step_s: float, least: float, reach: int) -> Array:
     """Return (N,) the excess of a signal: piecewise constant, mostly 0.
 
     Parameters
@@ -45,41 +45,41 @@ def levels(values: Array, step_s: float, least: float, reach: int) -> Array:
     if len(values) < 4 * reach:
         return np.zeros(len(values))
     single = np.diff(values)
-    trend = median_filter(single, 2 * round(TREND_S / step_s) + 1, mode="mirror")
+    trend = median_filter(single, 2 * round(TREND_HALF_WINDOW_S / step_s) + 1, mode="mirror")
     noise = 1.5 * float(np.median(np.abs(single - trend))) / np.sqrt(min(reach, 3))
-    may = max(least, NOISE_SIGMAS * noise * np.sqrt(1.5))
+    may = max(least, MIN_STEP_SIGMAS * noise * np.sqrt(1.5))
     middle = np.median(sliding_window_view(np.pad(values, reach, mode="edge"), reach), axis=1)
     change = middle[1 + reach : reach + len(values)] - middle[1 : len(values)] - reach * trend
     change[:reach], change[-reach:] = 0.0, 0.0
     jumps = []
-    for first, last in _runs(np.abs(change) > may):
+    for first, last in _find_runs(np.abs(change) > may):
         jump = float(change[first + int(np.argmax(np.abs(change[first:last])))])
         jumps.append((first + int(np.argmax(np.sign(jump) * single[first:last])) + 1, jump))
-    return _between(jumps, len(values), round(LONGEST_S / step_s))
+    return _offsets_between_jumps(jumps, len(values), round(MAX_OFFSET_S / step_s))
 
 
-def _between(jumps: list[tuple[int, float]], count: int, longest: int) -> Array:
+def _offsets_between_jumps(jumps: list[tuple[int, float]], count: int, longest: int) -> Array:
     """Return (count,) offsets between jumps, given as the first sample after each and its size."""
     out, start = np.zeros(count), 0
     level = max(0.0, -jumps[0][1]) if jumps else 0.0  # the signal may begin with an offset
     for k, (at, jump) in enumerate(jumps):
         out[start:at] = level if at - start < longest else 0.0
         later = [one for when, one in jumps[k:] if when - at < longest]
-        level, start = _after(level, jump, _comes_down(level, later)), at
+        level, start = _offset_after_jump(level, jump, _returns_to_zero(level, later)), at
     out[start:] = level if count - start < longest else 0.0
     return out
 
 
-def _comes_down(level: float, jumps: list[float]) -> bool:
+def _returns_to_zero(level: float, jumps: list[float]) -> bool:
     """Return whether jumps on top of each other return to a correct signal."""
     for jump in jumps:
         level += jump
-        if level <= -BACK_SHARE * jump:
-            return level >= BACK_SHARE * jump
+        if level <= -MIN_OFFSET_SHARE * jump:
+            return level >= MIN_OFFSET_SHARE * jump
     return False
 
 
-def _after(level: float, jump: float, on_top: bool) -> float:
+def _offset_after_jump(level: float, jump: float, on_top: bool) -> float:
     """Return the offset after a jump, never negative.
 
     A second jump up adds to the first offset if both come down again. Otherwise the end of the
@@ -87,16 +87,16 @@ def _after(level: float, jump: float, on_top: bool) -> float:
     """
     if jump > 0:
         return level + jump if on_top else jump
-    return level + jump if level + jump > -BACK_SHARE * jump else 0.0
+    return level + jump if level + jump > -MIN_OFFSET_SHARE * jump else 0.0
 
 
-def _runs(marked: Array) -> list[tuple[int, int]]:
+def _find_runs(marked: Array) -> list[tuple[int, int]]:
     """Return start and end (exclusive) of each run of marked samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(int), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def levelled_height(time_s: Array, height_m: Array) -> Array:
+def remove_height_steps(time_s: Array, height_m: Array) -> Array:
     """Return (N,) heights above the floor, metres, with objects under the robot removed.
 
     Parameters
@@ -109,5 +109,5 @@ def levelled_height(time_s: Array, height_m: Array) -> Array:
     if len(time_s) < 3:
         return height_m
     step_s = max(float(np.median(np.diff(time_s))), 1e-3)
-    reach = max(1, round(HEIGHT_REACH_S / step_s))
-    return height_m + levels(-height_m, step_s, HEIGHT_NOISE_M, reach)
+    reach = max(1, round(HEIGHT_MEDIAN_S / step_s))
+    return height_m + step_offsets(-height_m, step_s, MIN_HEIGHT_STEP_M, reach)

@@ -3,22 +3,29 @@
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d
 
-from dmrl.estimation.model.pair import LONGEST_GAP_S, RATE_HZ, Array, Mask, Track, resample
-from dmrl.estimation.signals.jump_detection import levelled_height
+from dmrl.estimation.model.pair import (
+    GRID_RATE_HZ,
+    MAX_DROPOUT_S,
+    Array,
+    Mask,
+    SensorTrack,
+    resample,
+)
+from dmrl.estimation.signals.jump_detection import remove_height_steps
 
-SMOOTHED_S = 0.5
+HEIGHT_SMOOTHING_S = 0.5
 """Window of the parabolic smoothing of heights, seconds. The noise of a range finder is 2 cm in
 every sample, 4 px of a label at 1 m, and a drone climbs slowly."""
-FAST_MPS, FAST_RADPS, TIMES_USUAL, LASTING_S = 3.0, 5.0, 4.0, 0.2
+RUNAWAY_MPS, RUNAWAY_RADPS, RUNAWAY_RATIO, RUNAWAY_S = 3.0, 5.0, 4.0, 0.2
 """Limits of a runaway state estimate: speed, yaw rate, ratio to the flight's median, and duration.
 
 An estimate runs away after a crash. The robot then lies still, so its rates are set to zero and
 marked as dropout. In logs of real crashes the estimate reached 9 m/s. No record of how the values
 were chosen."""
-AROUND = 2 * round(RATE_HZ) + 1
+RUNAWAY_WINDOW = 2 * round(GRID_RATE_HZ) + 1
 """Window around a runaway estimate, samples: one second before and after, which may belong to the
 fall."""
-FROZEN_SHARE = 0.5
+MAX_REPEATED_SHARE = 0.5
 """A log that repeats more than this share of its samples is written that way. No record of how the
 value was chosen."""
 
@@ -26,7 +33,9 @@ Signals = tuple[Array, Array]
 """Times (N,), seconds, and (N, C) values."""
 
 
-def track(yaw_rate: Signals, velocity: Signals, height: Signals, grid_s: Array) -> Track:
+def build_track(
+    yaw_rate: Signals, velocity: Signals, height: Signals, grid_s: Array
+) -> SensorTrack:
     """Build the signals of one robot on a time grid.
 
     Parameters
@@ -42,18 +51,20 @@ def track(yaw_rate: Signals, velocity: Signals, height: Signals, grid_s: Array) 
     """
     turn, turn_gap = resample(*yaw_rate, grid_s)
     speed, gap = resample(*velocity, grid_s)
-    gap |= frozen(*velocity, grid_s)
-    level = levelled_height(height[0], height[1][:, 0])
+    gap |= find_frozen(*velocity, grid_s)
+    level = remove_height_steps(height[0], height[1][:, 0])
     above, height_gap = resample(height[0], level[:, None], grid_s)
-    smooth_m = _smoothed(above[:, 0], int(SMOOTHED_S * RATE_HZ / 2))
-    lost = wild(np.hypot(*speed.T), FAST_MPS) | wild(np.abs(turn[:, 0]), FAST_RADPS)
+    smooth_m = _smooth_parabola(above[:, 0], int(HEIGHT_SMOOTHING_S * GRID_RATE_HZ / 2))
+    lost = find_runaway(np.hypot(*speed.T), RUNAWAY_MPS) | find_runaway(
+        np.abs(turn[:, 0]), RUNAWAY_RADPS
+    )
     known = ~lost
     gap |= turn_gap | lost
     rates = (speed[:, 0] * known, speed[:, 1] * known, turn[:, 0] * known)
-    return Track(*rates, np.where(down(lost), 0.0, smooth_m), gap, height_gap)
+    return SensorTrack(*rates, np.where(find_crash(lost), 0.0, smooth_m), gap, height_gap)
 
 
-def wild(size: Array, fast: float) -> Mask:
+def find_runaway(size: Array, fast: float) -> Mask:
     """Return (K,) where a rate at 100 Hz ran away, with one second around.
 
     Parameters
@@ -63,12 +74,12 @@ def wild(size: Array, fast: float) -> Mask:
     fast
         Rate below which no estimate has run away.
     """
-    limit = max(fast, TIMES_USUAL * float(np.median(size)))
-    lasting = median_filter(size, round(LASTING_S * RATE_HZ), mode="mirror") > limit
-    return np.asarray(maximum_filter1d(lasting, AROUND))
+    limit = max(fast, RUNAWAY_RATIO * float(np.median(size)))
+    lasting = median_filter(size, round(RUNAWAY_S * GRID_RATE_HZ), mode="mirror") > limit
+    return np.asarray(maximum_filter1d(lasting, RUNAWAY_WINDOW))
 
 
-def down(lost: Mask) -> Mask:
+def find_crash(lost: Mask) -> Mask:
     """Return (K,) where a crashed robot lies on the floor, at a height of zero.
 
     Parameters
@@ -76,11 +87,11 @@ def down(lost: Mask) -> Mask:
     lost
         (K,) where its estimate ran away, and a second around, at 100 Hz.
     """
-    ran = minimum_filter1d(lost, AROUND)
+    ran = minimum_filter1d(lost, RUNAWAY_WINDOW)
     return np.asarray(np.logical_and.accumulate(ran[::-1])[::-1])
 
 
-def frozen(time_s: Array, values: Array, grid_s: Array) -> Mask:
+def find_frozen(time_s: Array, values: Array, grid_s: Array) -> Mask:
     """Return (K,) where a signal repeats one value for over half a second.
 
     Logs that mostly repeat values are written that way and count as not frozen.
@@ -95,17 +106,17 @@ def frozen(time_s: Array, values: Array, grid_s: Array) -> Mask:
         (K,) times to test, seconds.
     """
     same = (np.diff(values, axis=0) == 0).all(axis=1)
-    if len(time_s) < 2 or same.mean() > FROZEN_SHARE:
+    if len(time_s) < 2 or same.mean() > MAX_REPEATED_SHARE:
         return np.zeros(len(grid_s), bool)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]]))).reshape(-1, 2)
     out = np.zeros(len(grid_s), bool)
     for first, last in edges:
-        if time_s[last] - time_s[first] > LONGEST_GAP_S:
+        if time_s[last] - time_s[first] > MAX_DROPOUT_S:
             out |= (grid_s >= time_s[first]) & (grid_s <= time_s[last])
     return out
 
 
-def _smoothed(values: Array, reach: int) -> Array:
+def _smooth_parabola(values: Array, reach: int) -> Array:
     """Smooth (N,) values by a parabola through those within reach (Savitzky and Golay 1964)."""
     # Equal to SciPy's savgol_filter, whose package takes a second to import.
     weights = np.linalg.pinv(np.vander(np.arange(-reach, reach + 1), 3))[-1]

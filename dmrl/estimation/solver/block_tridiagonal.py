@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.camera_residuals import Looks, Seen
-from dmrl.estimation.solver.residuals import RANGED, Linear
-from dmrl.estimation.solver.robust_loss import Weights
+from dmrl.estimation.solver.camera_residuals import CameraMeasurements, CameraResiduals
+from dmrl.estimation.solver.residuals import RANGE_STATES, Linearization
+from dmrl.estimation.solver.robust_loss import IrlsWeights
 
 
 @dataclass(frozen=True, slots=True)
-class Normal:
+class NormalEquations:
     """Normal equations of a flight: J^T J and J^T e.
 
     Parameters
@@ -31,14 +31,16 @@ class Normal:
     """
 
     diagonal: Array
-    above: Array
-    border: Array
-    corner: Array
+    off_diagonal: Array
+    coupling: Array
+    globals_block: Array
     gradient: Array
-    corner_gradient: Array
+    globals_gradient: Array
 
 
-def normal(linear: Linear, range_key: NDArray[np.intp], weights: Weights, prior: Array) -> Normal:
+def assemble(
+    linear: Linearization, range_key: NDArray[np.intp], weights: IrlsWeights, prior: Array
+) -> NormalEquations:
     """Assemble the normal equations without the prior of the constants.
 
     Parameters
@@ -64,8 +66,8 @@ def normal(linear: Linear, range_key: NDArray[np.intp], weights: Weights, prior:
         gradient[keyframes] += products[:, rows, -1]
 
     weighted = ranges * weights.range[:, None]
-    keys, sums = _summed(range_key, weighted[:, :4, None] * ranges[:, None, :])
-    states = np.array(RANGED)
+    keys, sums = _sum_by_keyframe(range_key, weighted[:, :4, None] * ranges[:, None, :])
+    states = np.array(RANGE_STATES)
     diagonal[np.ix_(keys, states, states)] += sums[..., :4]
     border[np.ix_(keys, states, np.arange(2))] += sums[..., 4:6]
     gradient[np.ix_(keys, states)] += sums[..., 6]
@@ -74,10 +76,15 @@ def normal(linear: Linear, range_key: NDArray[np.intp], weights: Weights, prior:
     shared = [0, 1, -1]  # bias and scale of the ranges, and the residual
     rest[np.ix_(shared, shared)] += weighted[:, 4:].T @ ranges[:, 4:]
     above = products[:, :width, width : 2 * width]
-    return Normal(diagonal, above, border, rest[:-1, :-1], gradient, rest[:-1, -1])
+    return NormalEquations(diagonal, above, border, rest[:-1, :-1], gradient, rest[:-1, -1])
 
 
-def add_looks(equations: Normal, looks: Looks, found: Seen, weight: Array) -> None:
+def add_camera(
+    equations: NormalEquations,
+    camera: CameraMeasurements,
+    residuals: CameraResiduals,
+    weight: Array,
+) -> None:
     """Add the camera residuals to normal equations, in place.
 
     Parameters
@@ -91,21 +98,23 @@ def add_looks(equations: Normal, looks: Looks, found: Seen, weight: Array) -> No
     weight
         (I,) weights of their squares.
     """
-    products = found.rows[..., :3].swapaxes(1, 2) @ (found.rows * weight[:, None, None])
-    after = looks.part[:, None, None]
-    for key, part in ((looks.key, 1 - after), (looks.key + 1, after)):
+    products = residuals.rows[..., :3].swapaxes(1, 2) @ (residuals.rows * weight[:, None, None])
+    after = camera.fraction[:, None, None]
+    for key, part in ((camera.keyframe, 1 - after), (camera.keyframe + 1, after)):
         np.add.at(equations.diagonal[:, :3, :3], key, part**2 * products[..., :3])
         np.add.at(equations.gradient[:, :3], key, part[..., 0] * products[..., 3])
-    np.add.at(equations.above[:, :3, :3], looks.key, (1 - after) * after * products[..., :3])
+    np.add.at(
+        equations.off_diagonal[:, :3, :3], camera.keyframe, (1 - after) * after * products[..., :3]
+    )
 
 
-def _summed(key: NDArray[np.intp], parts: Array) -> tuple[NDArray[np.intp], Array]:
+def _sum_by_keyframe(key: NDArray[np.intp], parts: Array) -> tuple[NDArray[np.intp], Array]:
     """Return the distinct keyframes and the sum of the parts of each. Keyframes must be sorted."""
     first = np.flatnonzero(np.diff(key, prepend=-1))
     return key[first], np.add.reduceat(parts, first, axis=0) if len(key) else parts
 
 
-def bands(diagonal: Array, above: Array) -> Array:
+def to_upper_bands(diagonal: Array, above: Array) -> Array:
     """Return (2n, K n) upper bands of a matrix of (K, n, n) blocks, in the layout of SciPy."""
     size = diagonal.shape[1]
     width = 2 * size - 1
@@ -118,7 +127,7 @@ def bands(diagonal: Array, above: Array) -> Array:
     return out.reshape(width + 1, -1)
 
 
-def log_determinant(equations: Normal) -> float:
+def log_det(equations: NormalEquations) -> float:
     """Return the log determinant of the whole matrix, coupling and constants included.
 
     Raises
@@ -126,15 +135,15 @@ def log_determinant(equations: Normal) -> float:
     numpy.linalg.LinAlgError
         If the matrix is not positive definite.
     """
-    size = len(equations.corner)
-    factor = cholesky_banded(bands(equations.diagonal, equations.above))
-    border = equations.border.reshape(-1, size)
+    size = len(equations.globals_block)
+    factor = cholesky_banded(to_upper_bands(equations.diagonal, equations.off_diagonal))
+    border = equations.coupling.reshape(-1, size)
     solved = cho_solve_banded((factor, False), border)
-    rest = np.linalg.slogdet(equations.corner - border.T @ solved)[1]
+    rest = np.linalg.slogdet(equations.globals_block - border.T @ solved)[1]
     return float(2 * np.log(factor[-1]).sum() + rest)
 
 
-def solve(equations: Normal) -> tuple[Array, Array, Array, Array]:
+def solve_step(equations: NormalEquations) -> tuple[Array, Array, Array, Array]:
     """Solve for the Gauss-Newton step and the terms of the covariance.
 
     Returns
@@ -153,13 +162,13 @@ def solve(equations: Normal) -> tuple[Array, Array, Array, Array]:
     numpy.linalg.LinAlgError
         If the matrix is not positive definite.
     """
-    size, width = len(equations.corner), equations.diagonal.shape[1]
-    factor = cholesky_banded(bands(equations.diagonal, equations.above))
-    right = np.concatenate([equations.gradient[..., None], equations.border], axis=2)
+    size, width = len(equations.globals_block), equations.diagonal.shape[1]
+    factor = cholesky_banded(to_upper_bands(equations.diagonal, equations.off_diagonal))
+    right = np.concatenate([equations.gradient[..., None], equations.coupling], axis=2)
     solved = cho_solve_banded((factor, False), right.reshape(-1, size + 1))
-    border = equations.border.reshape(-1, size)
-    covariance = np.linalg.inv(equations.corner - border.T @ solved[:, 1:])
-    constants = -covariance @ (equations.corner_gradient - border.T @ solved[:, 0])
+    border = equations.coupling.reshape(-1, size)
+    covariance = np.linalg.inv(equations.globals_block - border.T @ solved[:, 1:])
+    constants = -covariance @ (equations.globals_gradient - border.T @ solved[:, 0])
     state = -solved[:, 0] - solved[:, 1:] @ constants
     return (
         state.reshape(-1, width),
@@ -169,7 +178,7 @@ def solve(equations: Normal) -> tuple[Array, Array, Array, Array]:
     )
 
 
-def block_inverse(diagonal: Array, above: Array) -> Array:
+def marginal_covariances(diagonal: Array, above: Array) -> Array:
     """Return (K, ..., n, n) diagonal blocks of the inverse of a block-tridiagonal matrix.
 
     The matrix is eliminated from both ends, for many matrices at once.

@@ -14,28 +14,36 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from dmrl.estimation.model.odometry import Increments, rotate, rotation
+from dmrl.estimation.model.odometry import RelativeMotion, rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.block_tridiagonal import Normal, block_inverse, solve
-from dmrl.estimation.solver.camera_residuals import Looks, Seen, picked
-from dmrl.estimation.solver.keyframes import Noise, Problem
-from dmrl.estimation.solver.levenberg_marquardt import Solution, equations_of
-from dmrl.estimation.solver.residuals import BIAS, SCALE, linearise
-from dmrl.estimation.solver.robust_loss import curvature_of, weights_of
+from dmrl.estimation.solver.block_tridiagonal import (
+    NormalEquations,
+    marginal_covariances,
+    solve_step,
+)
+from dmrl.estimation.solver.camera_residuals import (
+    CameraMeasurements,
+    CameraResiduals,
+    select_associated,
+)
+from dmrl.estimation.solver.keyframes import KeyframeProblem, NoiseModel
+from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, build_equations
+from dmrl.estimation.solver.residuals import RANGE_BIAS, RANGE_SCALE, linearize
+from dmrl.estimation.solver.robust_loss import irls_weights, prior_curvature
 
-CALM_S = 0.8
+SMOOTHING_S = 0.8
 """Window of the moving average of velocities, seconds. Robots do not change their velocity faster
 than this. No record of how the value was chosen."""
-RESTLESS_S = 1.5
+MOTION_WINDOW_S = 1.5
 """Window of the same average when the motion of a robot is measured, seconds. No record of how the
 value was chosen."""
-WINDOW_S = 10.0
+NOISE_WINDOW_S = 10.0
 """Window over which motion is compared with its noise, seconds. No record of how the value was
 chosen."""
-NOISE_FACTOR = 1.8
+MIN_ENERGY_RATIO = 1.8
 """Motion must exceed the energy of its noise by this factor. 10 s of pure noise reach it in a few
 per cent of all cases."""
-NOISE, CONSTANT_RANGE, CONSTANT = 1.25, 1.15, 1.4
+NOISE_INFLATION, RANGE_CONSTANT_INFLATION, CONSTANT_INFLATION = 1.25, 1.15, 1.4
 """Factors of the sigmas: of errors from noise, of offset and scale of the ranges, of all other
 constants.
 
@@ -45,7 +53,9 @@ velocities have larger scales and biases than their priors, and scales that diff
 for fewer bad labels among the kept ones on every simulated set."""
 
 
-def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Array, Array]:
+def compute_covariance(
+    problem: KeyframeProblem, noise: NoiseModel, solution: MapEstimate
+) -> tuple[Array, Array]:
     """Compute the covariances of a solution's keyframes and constants.
 
     Parameters
@@ -62,27 +72,29 @@ def covariance(problem: Problem, noise: Noise, solution: Solution) -> tuple[Arra
     constants : Array
         (G, G), in the order of ``GLOBALS``.
     """
-    if problem.looks is not None:
-        problem = replace(problem, looks=picked(problem.looks, solution.state))
-    at_solution = linearise(problem, noise, solution.state, solution.constants)
-    calm, state = calmed(problem, noise, solution.state)
-    linear = linearise(calm, noise, state, solution.constants)
+    if problem.camera is not None:
+        problem = replace(problem, camera=select_associated(problem.camera, solution.state))
+    at_solution = linearize(problem, noise, solution.state, solution.constants)
+    calm, state = denoise_for_covariance(problem, noise, solution.state)
+    linear = linearize(calm, noise, state, solution.constants)
     # The denoised copy does not fit the ranges, so their weights come from the solution.
     linear.ranges[:, -1] = at_solution.range
-    if linear.seen is not None and at_solution.seen is not None:
-        linear.seen.rows[..., -1] = at_solution.seen.rows[..., -1]
-        linear.seen.beyond[:] = at_solution.seen.beyond
-    equations = equations_of(calm, noise, linear, solution.constants)
-    weights = weights_of(linear, noise, solution.constants)
-    held = curvature_of(noise, solution.constants) - weights.prior * noise.prior_std() ** -2
-    equations.corner[...] += np.diag(held)
-    keyframes, constants = _inverse(equations)
-    if problem.looks is not None and linear.seen is not None and weights.seen is not None:
-        keyframes += _shared(equations, problem.looks, linear.seen, weights.seen)
+    if linear.camera is not None and at_solution.camera is not None:
+        linear.camera.rows[..., -1] = at_solution.camera.rows[..., -1]
+        linear.camera.excess[:] = at_solution.camera.excess
+    equations = build_equations(calm, noise, linear, solution.constants)
+    weights = irls_weights(linear, noise, solution.constants)
+    held = prior_curvature(noise, solution.constants) - weights.prior * noise.prior_std() ** -2
+    equations.globals_block[...] += np.diag(held)
+    keyframes, constants = _inflate_marginals(equations)
+    if problem.camera is not None and linear.camera is not None and weights.camera is not None:
+        keyframes += _camera_covariance(equations, problem.camera, linear.camera, weights.camera)
     return keyframes, constants
 
 
-def _shared(equations: Normal, looks: Looks, found: Seen, weight: Array) -> Array:
+def _camera_covariance(
+    equations: NormalEquations, looks: CameraMeasurements, found: CameraResiduals, weight: Array
+) -> Array:
     """Return (K, 6, 6) the covariance from an error that all images of a camera share.
 
     Such errors come from a mount or a network. They are considered, not solved for (Schmidt 1966):
@@ -90,28 +102,32 @@ def _shared(equations: Normal, looks: Looks, found: Seen, weight: Array) -> Arra
     """
     out = np.zeros_like(equations.diagonal)
     for side in (1, -1):
-        mine = weight * (looks.side == side)
+        mine = weight * (looks.observer_sign == side)
         gradient = np.zeros_like(equations.gradient)
-        pulled, part = found.rows[:, 0, :3] * mine[:, None], looks.part[:, None]
-        np.add.at(gradient[:, :3], looks.key, (1 - part) * pulled)
-        np.add.at(gradient[:, :3], looks.key + 1, part * pulled)
-        nothing = np.zeros_like(equations.corner_gradient)
-        moved = solve(replace(equations, gradient=gradient, corner_gradient=nothing))[0]
+        pulled, part = found.rows[:, 0, :3] * mine[:, None], looks.fraction[:, None]
+        np.add.at(gradient[:, :3], looks.keyframe, (1 - part) * pulled)
+        np.add.at(gradient[:, :3], looks.keyframe + 1, part * pulled)
+        nothing = np.zeros_like(equations.globals_gradient)
+        moved = solve_step(replace(equations, gradient=gradient, globals_gradient=nothing))[0]
         out += moved[:, :, None] * moved[:, None, :]
     return out
 
 
-def _inverse(equations: Normal) -> tuple[Array, Array]:
+def _inflate_marginals(equations: NormalEquations) -> tuple[Array, Array]:
     """Return inflated covariances of keyframes (K, n, n) and plain ones of the constants (G, G)."""
-    *_, response, constants = solve(equations)
-    keyframes = NOISE**2 * block_inverse(equations.diagonal, equations.above)
-    wider = np.full(len(constants), CONSTANT)
-    wider[[BIAS, SCALE]] = CONSTANT_RANGE
+    *_, response, constants = solve_step(equations)
+    keyframes = NOISE_INFLATION**2 * marginal_covariances(
+        equations.diagonal, equations.off_diagonal
+    )
+    wider = np.full(len(constants), CONSTANT_INFLATION)
+    wider[[RANGE_BIAS, RANGE_SCALE]] = RANGE_CONSTANT_INFLATION
     response = response * wider
     return keyframes + response @ constants @ response.swapaxes(1, 2), constants
 
 
-def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array]:
+def denoise_for_covariance(
+    problem: KeyframeProblem, noise: NoiseModel, state: Array
+) -> tuple[KeyframeProblem, Array]:
     """Return a flight and its solution without probable noise, for the linearization.
 
     Parameters
@@ -122,21 +138,23 @@ def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array
         (K, 6) states of the solution.
     """
     step_s = float(np.median(problem.steps_s))
-    own_heading, own = path_of(problem.own)
-    relative = rotate(rotation(own_heading), state[:, :2])
-    single = noise_energy(noise)
-    own_steps = shrunk(np.diff(own, axis=0) / step_s, single, step_s) * step_s
-    relative_steps = shrunk(np.diff(relative, axis=0) / step_s, 2 * single, step_s) * step_s
+    own_heading, own = integrate_path(problem.own)
+    relative = rotate(rotation_matrix(own_heading), state[:, :2])
+    single = velocity_noise_power(noise)
+    own_steps = shrink_to_signal(np.diff(own, axis=0) / step_s, single, step_s) * step_s
+    relative_steps = (
+        shrink_to_signal(np.diff(relative, axis=0) / step_s, 2 * single, step_s) * step_s
+    )
     path = np.concatenate([np.zeros((1, 2)), np.cumsum(relative_steps, axis=0)])
     path += relative.mean(axis=0) - path.mean(axis=0)
 
     out = np.zeros_like(state)
-    out[:, :2] = rotate(rotation(-own_heading), path)
+    out[:, :2] = rotate(rotation_matrix(-own_heading), path)
     out[:, 2] = state[:, 2]
-    own_shift = rotate(rotation(-own_heading[:-1]), own_steps)
+    own_shift = rotate(rotation_matrix(-own_heading[:-1]), own_steps)
     # The peer's own path is the observer's plus the relative one, rotated into the peer's frame.
     peer_heading = own_heading[:-1] + state[:-1, 2]
-    peer_shift = rotate(rotation(-peer_heading), own_steps + relative_steps)
+    peer_shift = rotate(rotation_matrix(-peer_heading), own_steps + relative_steps)
     return replace(
         problem,
         own=replace(problem.own, shift_m=own_shift),
@@ -144,15 +162,15 @@ def calmed(problem: Problem, noise: Noise, state: Array) -> tuple[Problem, Array
     ), out
 
 
-def noise_energy(noise: Noise) -> float:
+def velocity_noise_power(noise: NoiseModel) -> float:
     """Return the mean square of one velocity's noise after the average, both axes, (m/s)^2.
 
     It is at least that of the default model: motion that reveals good logs is sufficient motion.
     """
-    return 2 * max(noise.velocity_psd, Noise().velocity_psd) / CALM_S
+    return 2 * max(noise.velocity_psd, NoiseModel().velocity_psd) / SMOOTHING_S
 
 
-def shrunk(velocity: Array, energy: float, step_s: float) -> Array:
+def shrink_to_signal(velocity: Array, energy: float, step_s: float) -> Array:
     """Return (K - 1, 2) averaged velocities, shrunk towards zero by their share of noise.
 
     Parameters
@@ -164,15 +182,15 @@ def shrunk(velocity: Array, energy: float, step_s: float) -> Array:
     step_s
         Seconds between samples.
     """
-    slow = uniform_filter1d(velocity, max(1, round(CALM_S / step_s)), axis=0, mode="nearest")
-    window = max(1, round(WINDOW_S / step_s))
+    slow = uniform_filter1d(velocity, max(1, round(SMOOTHING_S / step_s)), axis=0, mode="nearest")
+    window = max(1, round(NOISE_WINDOW_S / step_s))
     seen = uniform_filter1d((slow**2).sum(axis=1), window, mode="nearest")
     # The energies of motion and noise add up to the measured one, so motion's share is the rest.
-    share = np.sqrt(np.maximum(1 - NOISE_FACTOR * energy / np.maximum(seen, 1e-12), 0.0))
+    share = np.sqrt(np.maximum(1 - MIN_ENERGY_RATIO * energy / np.maximum(seen, 1e-12), 0.0))
     return np.asarray(slow * share[:, None])
 
 
-def restlessness(problem: Problem, state: Array) -> tuple[float, float, float]:
+def motion_energy(problem: KeyframeProblem, state: Array) -> tuple[float, float, float]:
     """Return mean squares of the averaged own, peer and relative velocity.
 
     Parameters
@@ -188,20 +206,20 @@ def restlessness(problem: Problem, state: Array) -> tuple[float, float, float]:
         (m/s)^2, noise included.
     """
     step_s = float(np.median(problem.steps_s))
-    heading, own = path_of(problem.own)
-    relative = rotate(rotation(heading), state[:, :2])
+    heading, own = integrate_path(problem.own)
+    relative = rotate(rotation_matrix(heading), state[:, :2])
     energies = []
-    for path in (own, path_of(problem.peer)[1], relative):
+    for path in (own, integrate_path(problem.peer)[1], relative):
         velocity = np.diff(path, axis=0) / step_s
         slow = uniform_filter1d(
-            velocity, max(1, round(RESTLESS_S / step_s)), axis=0, mode="nearest"
+            velocity, max(1, round(MOTION_WINDOW_S / step_s)), axis=0, mode="nearest"
         )
         energies.append(float((slow**2).sum(axis=1).mean()))
     return energies[0], energies[1], energies[2]
 
 
-def path_of(moves: Increments) -> tuple[Array, Array]:
+def integrate_path(moves: RelativeMotion) -> tuple[Array, Array]:
     """Return heading (K,) and position (K, 2) of a robot in the frame of its first keyframe."""
     heading = np.concatenate([[0.0], np.cumsum(moves.turn_rad)])
-    steps = rotate(rotation(heading[:-1]), moves.shift_m)
+    steps = rotate(rotation_matrix(heading[:-1]), moves.shift_m)
     return heading, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])

@@ -5,13 +5,13 @@ from typing import Literal
 
 import numpy as np
 
-from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation
-from dmrl.estimation.model.pair import SWAPPED, Array
+from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation_matrix
+from dmrl.estimation.model.pair import GLOBALS_FROM_PEER, Array
 from dmrl.estimation.model.status import UNCONVERGED, Statuses
-from dmrl.estimation.solver.keyframes import Noise
+from dmrl.estimation.solver.keyframes import NoiseModel
 from dmrl.estimation.solver.residuals import CLOCK
 
-Refused = Literal["still", "alike", "silent", "open", "imprecise"]
+RejectionReason = Literal["still", "alike", "silent", "open", "imprecise"]
 """Reason why no position is OK.
 
 still: the observer hardly moves. alike: both robots move alike. silent: sensors dropped out for
@@ -51,12 +51,12 @@ class Estimate:
     covariance: Array
     status: Statuses
     constants: Array
-    noise: Noise
+    noise: NoiseModel
     range_error_m: Array | None = None
-    refused: Refused | None = None
+    rejection_reason: RejectionReason | None = None
     constants_covariance: Array | None = None
 
-    def at(self, time_s: Array) -> tuple[Array, Array, Statuses]:
+    def interpolate_at(self, time_s: Array) -> tuple[Array, Array, Statuses]:
         """Interpolate positions (N, 2), covariances (N, 2, 2) and statuses (N,) at times.
 
         Outside the flight the nearest end is used, and the status is UNCONVERGED at best.
@@ -72,23 +72,23 @@ class Estimate:
         return xy, spread, np.where(outside, np.maximum(status, UNCONVERGED), status)
 
 
-def from_peer(state: Array) -> Array:
+def transform_to_peer(state: Array) -> Array:
     """Return (K, 3) the states of the observer in the peer's horizontal frame."""
     out = -state
-    out[:, :2] = rotate(rotation(-state[:, 2]), out[:, :2])
+    out[:, :2] = rotate(rotation_matrix(-state[:, 2]), out[:, :2])
     return out
 
 
-def swapped(estimate: Estimate) -> Estimate:
+def seen_from_peer(estimate: Estimate) -> Estimate:
     """Return the same flight with the peer as observer. The status stays that of the observer."""
-    state = from_peer(estimate.state)
+    state = transform_to_peer(estimate.state)
     # In the peer's frame p' = -R(-psi) p and psi' = -psi. The derivative of p' by psi is -Q p',
     # with Q a quarter turn. To first order the covariance of the new state is J C J^T.
     by_state = np.zeros((len(state), 3, 3))
-    by_state[:, :2, :2], by_state[:, 2, 2] = -rotation(-estimate.state[:, 2]), -1.0
+    by_state[:, :2, :2], by_state[:, 2, 2] = -rotation_matrix(-estimate.state[:, 2]), -1.0
     by_state[:, :2, 2] = -state[:, :2] @ QUARTER_TURN.T
     covariance = by_state @ estimate.covariance @ by_state.swapaxes(1, 2)
-    constants = estimate.constants[SWAPPED]
+    constants = estimate.constants[GLOBALS_FROM_PEER]
     constants[CLOCK] *= -1  # the offset of the other clock has the opposite sign
     return replace(
         estimate,

@@ -5,26 +5,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.estimation.model.odometry import Increments, odometry
-from dmrl.estimation.model.pair import LONGEST_GAP_S, Array, Mask, Pair
-from dmrl.estimation.signals.jump_detection import levels
-from dmrl.estimation.solver.camera_residuals import Looks, looks_of
+from dmrl.estimation.model.odometry import RelativeMotion, preintegrate
+from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Mask, Pair
+from dmrl.estimation.signals.jump_detection import step_offsets
+from dmrl.estimation.solver.camera_residuals import CameraMeasurements, camera_measurements
 
-KEY_HZ = 10.0
+KEYFRAME_HZ = 10.0
 """Keyframes per second, Hz. No record of how the value was chosen."""
-BLOCK_S, REACH = 0.1, 3
+RANGE_BLOCK_S, RANGE_MEDIAN_BLOCKS = 0.1, 3
 """Length of the blocks of ranges, seconds, and the number of block medians on either side of a
 step. No record of how the values were chosen."""
-JUMP_M = 0.45
+MIN_RANGE_STEP_M = 0.45
 """Smallest detected step of the ranges, metres. Smaller steps are left to the solve. Added for
 bursts of long ranges; no record of how the value was chosen."""
-SHIFT_S = 0.02
+CLOCK_HALF_STEP_S = 0.02
 """Half the time difference of the numeric derivative by the peer's clock, seconds. No record of how
 the value was chosen."""
 
 
 @dataclass(frozen=True, slots=True)
-class Noise:
+class NoiseModel:
     """Noise model of the sensors; one standard deviation each unless a unit shows otherwise.
 
     Parameters
@@ -69,12 +69,12 @@ class Noise:
     velocity_white_psd: float = 2e-4
     yaw_rate_psd: float = 1e-5
     range_std_m: float = 0.12
-    cauchy_m: float = 0.15
+    range_loss_scale_m: float = 0.15
     range_error_std_m: float = 0.02
     range_tau_s: float = 200.0
-    jump: float = 1.0
-    free_m: float = 0.05
-    free_weight: float = 0.02
+    range_step_sigmas: float = 1.0
+    range_error_loss_scale_m: float = 0.05
+    range_error_weight: float = 0.02
     bias_std_m: float = 0.15
     scale_std: float = 0.02
     gyro_std_radps: float = 0.003
@@ -82,16 +82,16 @@ class Noise:
     velocity_bias_std_mps: float = 0.02
     clock_std_s: float = 0.02
     height_std_m: float = 0.04
-    gap_speed_mps: float = 0.5
-    gap_turn_radps: float = 0.5
-    known_std: tuple[float, ...] = ()
+    dropout_speed_mps: float = 0.5
+    dropout_turn_radps: float = 0.5
+    calibrated_std: tuple[float, ...] = ()
 
     @property
     def velocity_psd(self) -> float:
         """Low-frequency noise of either velocity: variance per second, m^2/s."""
         return 2 * self.velocity_tau_s * self.velocity_std_mps**2 + self.velocity_white_psd
 
-    def graded(self, grade: float, constants: float | None = None) -> "Noise":
+    def scaled_by(self, grade: float, constants: float | None = None) -> "NoiseModel":
         """Return the model with scaled velocity noise and scaled priors of the constants.
 
         Parameters
@@ -110,16 +110,20 @@ class Noise:
             velocity_scale_std=self.velocity_scale_std * worse,
         )
 
-    def with_range_noise(self, times: float) -> "Noise":
+    def with_range_noise(self, times: float) -> "NoiseModel":
         """Return the model with the white range noise multiplied by a factor."""
-        return replace(self, range_std_m=self.range_std_m * times, cauchy_m=self.cauchy_m * times)
+        return replace(
+            self,
+            range_std_m=self.range_std_m * times,
+            range_loss_scale_m=self.range_loss_scale_m * times,
+        )
 
     def prior_std(self) -> Array:
         """Return (11,) prior standard deviations of the constants, in the order of ``GLOBALS``."""
         pairwise = [self.gyro_std_radps] * 2 + [self.velocity_scale_std] * 2
         velocity = [self.velocity_bias_std_mps] * 4
         usual = [self.bias_std_m, self.scale_std, *pairwise, *velocity, self.clock_std_s]
-        return np.minimum(usual, self.known_std or np.inf)
+        return np.minimum(usual, self.calibrated_std or np.inf)
 
 
 GLOBALS = (
@@ -139,7 +143,7 @@ GLOBALS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class KeyframeProblem:
     """A pair cut into K keyframes, with R ranges.
 
     Parameters
@@ -172,29 +176,29 @@ class Problem:
         As in `Pair`.
     """
 
-    key_s: Array
-    own: Increments
-    peer: Increments
-    peer_by_clock: Array
-    gap_s: Array
-    silent: Mask
-    unheard: Mask
-    range_key: NDArray[np.intp]
+    keyframe_s: Array
+    own: RelativeMotion
+    peer: RelativeMotion
+    peer_clock_derivative: Array
+    dropout_s: Array
+    dropout: Mask
+    range_dropout: Mask
+    range_keyframe: NDArray[np.intp]
     range_m: Array
-    own_to_range: Increments
-    peer_to_range: Increments
-    range_level_m: Array
+    own_to_range: RelativeMotion
+    peer_to_range: RelativeMotion
+    range_offset_guess_m: Array
     height_m: Array
-    looks: Looks | None = None
-    known_std: Array | None = None
+    camera: CameraMeasurements | None = None
+    calibrated_std: Array | None = None
 
     @property
     def steps_s(self) -> Array:
         """(K - 1,) seconds between keyframes."""
-        return np.diff(self.key_s)
+        return np.diff(self.keyframe_s)
 
 
-def problem(pair: Pair, rate_hz: float = KEY_HZ) -> Problem:
+def build_keyframes(pair: Pair, rate_hz: float = KEYFRAME_HZ) -> KeyframeProblem:
     """Build the keyframes of a pair.
 
     Parameters
@@ -208,34 +212,36 @@ def problem(pair: Pair, rate_hz: float = KEY_HZ) -> Problem:
     count = max(2, int((grid[-1] - grid[0]) * rate_hz) + 1)
     key_s = grid[0] + np.arange(count) / rate_hz
     key_s = np.minimum(key_s, grid[-1])
-    own, peer = odometry(pair.own, grid), odometry(pair.peer, grid)
+    own, peer = preintegrate(pair.own, grid), preintegrate(pair.peer, grid)
     start, end = key_s[:-1], key_s[1:]
     range_key = np.clip(np.searchsorted(key_s, pair.range_time_s, "right") - 1, 0, count - 1)
-    early, late = (np.clip(edge - SHIFT_S, grid[0], grid[-1]) for edge in (start, end))
-    early_2, late_2 = (np.clip(edge + SHIFT_S, grid[0], grid[-1]) for edge in (start, end))
-    before, after = peer.increments(early, late), peer.increments(early_2, late_2)
-    gap = np.interp(end, grid, np.cumsum((pair.own.gap | pair.peer.gap) * pair.dt_s))
+    early, late = (np.clip(edge - CLOCK_HALF_STEP_S, grid[0], grid[-1]) for edge in (start, end))
+    early_2, late_2 = (
+        np.clip(edge + CLOCK_HALF_STEP_S, grid[0], grid[-1]) for edge in (start, end)
+    )
+    before, after = peer.relative_motion(early, late), peer.relative_motion(early_2, late_2)
+    gap = np.interp(end, grid, np.cumsum((pair.own.dropout | pair.peer.dropout) * pair.dt_s))
     height = pair.peer.height_m - pair.own.height_m
-    return Problem(
-        key_s=key_s,
-        own=own.increments(start, end),
-        peer=peer.increments(start, end),
-        peer_by_clock=(after.shift_m - before.shift_m) / (2 * SHIFT_S),
-        gap_s=np.diff(gap, prepend=0.0),
-        silent=silence(pair, key_s),
-        unheard=unheard(pair, key_s),
-        range_key=range_key,
+    return KeyframeProblem(
+        keyframe_s=key_s,
+        own=own.relative_motion(start, end),
+        peer=peer.relative_motion(start, end),
+        peer_clock_derivative=(after.shift_m - before.shift_m) / (2 * CLOCK_HALF_STEP_S),
+        dropout_s=np.diff(gap, prepend=0.0),
+        dropout=odometry_dropout(pair, key_s),
+        range_dropout=range_dropout(pair, key_s),
+        range_keyframe=range_key,
         range_m=pair.range_m,
-        own_to_range=own.increments(key_s[range_key], pair.range_time_s),
-        peer_to_range=peer.increments(key_s[range_key], pair.range_time_s),
-        range_level_m=range_levels(pair),
+        own_to_range=own.relative_motion(key_s[range_key], pair.range_time_s),
+        peer_to_range=peer.relative_motion(key_s[range_key], pair.range_time_s),
+        range_offset_guess_m=range_step_offsets(pair),
         height_m=np.interp(pair.range_time_s, grid, height),
-        looks=looks_of(pair, key_s, Noise().height_std_m),
-        known_std=pair.known_std,
+        camera=camera_measurements(pair, key_s, NoiseModel().height_std_m),
+        calibrated_std=pair.calibrated_std,
     )
 
 
-def silence(pair: Pair, time_s: Array) -> Mask:
+def odometry_dropout(pair: Pair, time_s: Array) -> Mask:
     """Return (K,) whether a sensor of either robot dropped out for over half a second.
 
     Parameters
@@ -245,15 +251,15 @@ def silence(pair: Pair, time_s: Array) -> Mask:
     time_s
         (K,) times to test, seconds.
     """
-    gap = pair.own.gap | pair.peer.gap
+    gap = pair.own.dropout | pair.peer.dropout
     for track in (pair.own, pair.peer):
-        if track.height_gap is not None:
-            gap = gap | track.height_gap
+        if track.height_dropout is not None:
+            gap = gap | track.height_dropout
     low = np.clip(np.searchsorted(pair.time_s, time_s, "right") - 1, 0, len(gap) - 2)
     return np.asarray(gap[low] | gap[low + 1])
 
 
-def unheard(pair: Pair, time_s: Array) -> Mask:
+def range_dropout(pair: Pair, time_s: Array) -> Mask:
     """Return (K,) whether the ranges dropped out for over half a second.
 
     Parameters
@@ -265,10 +271,10 @@ def unheard(pair: Pair, time_s: Array) -> Mask:
     """
     edges = np.concatenate([[-np.inf], pair.range_time_s, [np.inf]])
     after = np.clip(np.searchsorted(edges, time_s), 1, len(edges) - 1)
-    return np.asarray(edges[after] - edges[after - 1] > LONGEST_GAP_S)
+    return np.asarray(edges[after] - edges[after - 1] > MAX_DROPOUT_S)
 
 
-def range_levels(pair: Pair) -> Array:
+def range_step_offsets(pair: Pair) -> Array:
     """Return (R,) the detected step offset of every range, metres.
 
     Parameters
@@ -278,8 +284,8 @@ def range_levels(pair: Pair) -> Array:
     """
     if not len(pair.range_m):
         return pair.range_m
-    block = ((pair.range_time_s - pair.time_s[0]) / BLOCK_S).astype(int)
+    block = ((pair.range_time_s - pair.time_s[0]) / RANGE_BLOCK_S).astype(int)
     blocks, inverse = np.unique(block, return_inverse=True)
     ends = np.cumsum(np.bincount(inverse, minlength=len(blocks)))
     middle = np.array([np.median(part) for part in np.split(pair.range_m, ends[:-1])])
-    return levels(middle, BLOCK_S, JUMP_M, REACH)[inverse]
+    return step_offsets(middle, RANGE_BLOCK_S, MIN_RANGE_STEP_M, RANGE_MEDIAN_BLOCKS)[inverse]

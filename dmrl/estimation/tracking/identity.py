@@ -10,23 +10,23 @@ from dmrl.estimation.tracking.tracker import Track
 RANGE_STD_M = 0.2
 """Standard deviation of a UWB range, its bias included, metres. No record of how the value was
 chosen."""
-MEMORY_S = 2.0
+AVERAGING_S = 2.0
 """Time constant of the average misfit, seconds. No record of how the value was chosen."""
-WORST = 9.0
+MAX_MISFIT = 9.0
 """Largest misfit of a range, in variances. It bounds the effect of a detour. Three standard
 deviations; no other record of how the value was chosen."""
-FITS, CLEARER = 4.0, 1.5
+MAX_MEAN_MISFIT, MIN_MISFIT_MARGIN = 4.0, 1.5
 """Largest mean misfit of an accepted name; and margin by which every other name must fit worse. No
 record of how the values were chosen."""
 
 
-class Identity:
+class TrackIdentity:
     """Names of one observer's tracks, from the ranges to its peers."""
 
     def __init__(self) -> None:
         self._misfit: dict[tuple[int, str], float] = {}
 
-    def names(
+    def assign(
         self, tracks: Iterable[Track], range_m: Mapping[str, float], dt_s: float
     ) -> dict[int, str]:
         """Assign names to the tracks whose robot is unambiguous; return them by track number.
@@ -41,35 +41,35 @@ class Identity:
             Seconds since the last call.
         """
         tracks = list(tracks)
-        fresh = 1 - np.exp(-dt_s / MEMORY_S)
+        fresh = 1 - np.exp(-dt_s / AVERAGING_S)
         for track in tracks:
             for peer, measured_m in range_m.items():
                 key = track.number, peer
                 before = self._misfit.get(key)
-                now = _misfit(track, measured_m)
+                now = _range_misfit(track, measured_m)
                 self._misfit[key] = now if before is None else before + fresh * (now - before)
         alive = {track.number for track in tracks}
         self._misfit = {key: value for key, value in self._misfit.items() if key[0] in alive}
-        return self._assigned(tracks)
+        return self._assign_names(tracks)
 
-    def _assigned(self, tracks: list[Track]) -> dict[int, str]:
+    def _assign_names(self, tracks: list[Track]) -> dict[int, str]:
         """Assign names one to one by the total misfit, and keep the unambiguous ones."""
         peers = sorted({peer for _, peer in self._misfit})
-        cost = np.full((len(tracks), len(peers)), WORST)
+        cost = np.full((len(tracks), len(peers)), MAX_MISFIT)
         for k, track in enumerate(tracks):
             for j, peer in enumerate(peers):
-                cost[k, j] = self._misfit.get((track.number, peer), WORST)
+                cost[k, j] = self._misfit.get((track.number, peer), MAX_MISFIT)
         out = {}
         for k, j in zip(*linear_sum_assignment(cost), strict=True):
             others = np.delete(cost[k], j)
-            if cost[k, j] < FITS and (others > cost[k, j] + CLEARER).all():
+            if cost[k, j] < MAX_MEAN_MISFIT and (others > cost[k, j] + MIN_MISFIT_MARGIN).all():
                 out[tracks[k].number] = peers[j]
         return out
 
 
-def _misfit(track: Track, measured_m: float) -> float:
+def _range_misfit(track: Track, measured_m: float) -> float:
     """Return the squared difference of a range and the track's distance, over its variance."""
     distance_m = max(float(np.linalg.norm(track.position_m)), 1e-3)
     along = track.position_m / distance_m
     variance = RANGE_STD_M**2 + float(along @ track.covariance @ along)
-    return min((measured_m - distance_m) ** 2 / variance, WORST)
+    return min((measured_m - distance_m) ** 2 / variance, MAX_MISFIT)

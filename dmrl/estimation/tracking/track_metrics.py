@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 from dmrl.estimation.model.position_metrics import ErrorTrace
 from dmrl.geometry.frames import Array
 
-NEAR_M = 1.0
+MAX_MATCH_M = 1.0
 """Largest distance between a track and its peer, metres. Tracks farther from every peer are false.
 No record of how the value was chosen."""
 CHI2_95_OF_3 = 7.815
@@ -28,8 +28,8 @@ DEFINITIONS = {
     "coverage_95": "share of those peers inside their track's 95 % ellipsoid",
     "nees": "mean of the squared error over its covariance; 3 if that is right",
     "followed, detected": "share of the peers in view with a track, a detection within "
-    f"{NEAR_M:g} m",
-    "false_tracks_per_min": f"tracks more than {NEAR_M:g} m from every peer, in view or not, "
+    f"{MAX_MATCH_M:g} m",
+    "false_tracks_per_min": f"tracks more than {MAX_MATCH_M:g} m from every peer, in view or not, "
     "for more than half of their life, a minute",
     "named_right": "share of the named tracks of peers in view that have the right name",
 }
@@ -37,7 +37,7 @@ DEFINITIONS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class EvaluatedTracks:
     """Tracks of one observer beside the truth, one row for each peer in view of an image.
 
     Parameters
@@ -77,7 +77,9 @@ class Judged:
         return ErrorTrace(title, name, self.time_s, sigma_m, errors)
 
 
-def assigned(truth_m: Array, found_m: Array, radius_m: float = math.inf) -> NDArray[np.int64]:
+def match_positions(
+    truth_m: Array, found_m: Array, radius_m: float = math.inf
+) -> NDArray[np.int64]:
     """Match true and estimated positions; return (J,) indices of the estimates, -1 for none.
 
     Parameters
@@ -96,7 +98,7 @@ def assigned(truth_m: Array, found_m: Array, radius_m: float = math.inf) -> NDAr
     return out
 
 
-def figures(judged: Judged, settle_s: float) -> dict[str, float | None]:
+def compute_figures(tracks: EvaluatedTracks, settle_s: float) -> dict[str, float | None]:
     """Compute the figures of ``DEFINITIONS``; None without data.
 
     Parameters
@@ -106,39 +108,41 @@ def figures(judged: Judged, settle_s: float) -> dict[str, float | None]:
     settle_s
         Settling time. Earlier images count for false tracks only.
     """
-    late = judged.time_s >= settle_s
-    error_m, single_m = judged.error_m[late], judged.single_error_m[late]
+    late = tracks.time_s >= settle_s
+    error_m, single_m = tracks.error_m[late], tracks.single_error_m[late]
     size_m, single_size_m = (np.linalg.norm(e, axis=1) for e in (error_m, single_m))
     both = np.isfinite(size_m) & np.isfinite(single_size_m)
     tracked = np.isfinite(size_m)
-    inverse = np.linalg.inv(judged.covariance[late][tracked])
+    inverse = np.linalg.inv(tracks.covariance[late][tracked])
     squared = np.einsum("ni,nij,nj->n", error_m[tracked], inverse, error_m[tracked])
-    rmse_m, single_rmse_m = _root(size_m[both]), _root(single_size_m[both])
-    names = zip(judged.named, judged.peer, late, strict=True)
+    rmse_m, single_rmse_m = _root_mean_square(size_m[both]), _root_mean_square(single_size_m[both])
+    names = zip(tracks.named, tracks.peer, late, strict=True)
     values = {
         "in_view": float(late.sum()),
         "rmse_m": rmse_m,
         "single_rmse_m": single_rmse_m,
         "reduction": 1 - rmse_m / single_rmse_m if single_rmse_m else math.nan,
-        "median_m": _median(size_m[both]),
-        "single_median_m": _median(single_size_m[both]),
-        "coverage_95": _mean(squared <= CHI2_95_OF_3),
-        "nees": _mean(squared),
-        "followed": _mean(size_m <= NEAR_M),
-        "detected": _mean(single_size_m <= NEAR_M),
-        "false_tracks_per_min": judged.false_tracks / (judged.length_s / 60 or math.nan),
-        "named_right": _mean(np.array([name == peer for name, peer, ok in names if name and ok])),
+        "median_m": _median_or_nan(size_m[both]),
+        "single_median_m": _median_or_nan(single_size_m[both]),
+        "coverage_95": _mean_or_nan(squared <= CHI2_95_OF_3),
+        "nees": _mean_or_nan(squared),
+        "followed": _mean_or_nan(size_m <= MAX_MATCH_M),
+        "detected": _mean_or_nan(single_size_m <= MAX_MATCH_M),
+        "false_tracks_per_min": tracks.false_tracks / (tracks.length_s / 60 or math.nan),
+        "named_right": _mean_or_nan(
+            np.array([name == peer for name, peer, ok in names if name and ok])
+        ),
     }
     return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
-def _root(values: Array) -> float:
+def _root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
 
 
-def _median(values: Array) -> float:
+def _median_or_nan(values: Array) -> float:
     return float(np.median(values)) if len(values) else math.nan
 
 
-def _mean(values: NDArray[Any]) -> float:
+def _mean_or_nan(values: NDArray[Any]) -> float:
     return float(np.mean(values)) if len(values) else math.nan

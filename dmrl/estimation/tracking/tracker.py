@@ -17,19 +17,19 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
-from dmrl.estimation.tracking.tracker_input import Motion, View
+from dmrl.estimation.tracking.tracker_input import EgoMotion, ImageDetections
 from dmrl.estimation.tracking.tuning import Tuning
 from dmrl.geometry.frames import (
     Array,
     Camera,
     horizontal_from_pixels,
-    inside,
+    is_inside,
     pixels_from_horizontal,
 )
 
 P, V, BIAS = slice(0, 3), slice(3, 6), 6
 """Index of position, velocity and depth error in the state."""
-DEPTH_SPAN = np.log(20.0)
+LOG_DEPTH_SPAN = np.log(20.0)
 """Range of the log depth of false alarms, uniform from near to twenty times that. No record of how
 the value was chosen."""
 
@@ -102,11 +102,11 @@ class Tracker:
         self.camera, self.tuning = camera, tuning
         self.tracks: list[Track] = []
         self._born = 0
-        area = camera.width_px * camera.height_px * DEPTH_SPAN
+        area = camera.width_px * camera.height_px * LOG_DEPTH_SPAN
         self._false_density = tuning.false_per_image / area
         self._gate = float(chi2.ppf(tuning.gate, 3))
 
-    def step(self, motion: Motion, view: View) -> list[Track]:
+    def step(self, motion: EgoMotion, view: ImageDetections) -> list[Track]:
         """Return the confirmed tracks after the observer has moved and taken another image.
 
         Parameters
@@ -119,11 +119,11 @@ class Tracker:
         for track in self.tracks:
             self._predict(track, motion)
         free = self._associate(view)
-        self._bury()
-        self._bear(view, free)
+        self._delete_lost()
+        self._start_tracks(view, free)
         return [track for track in self.tracks if track.confirmed]
 
-    def _predict(self, track: Track, motion: Motion) -> None:
+    def _predict(self, track: Track, motion: EgoMotion) -> None:
         """Predict with constant velocity over ground, in a frame that moves and turns."""
         t, dt = self.tuning, motion.dt_s
         c, s = np.cos(motion.turn_rad), np.sin(motion.turn_rad)
@@ -149,7 +149,9 @@ class Tracker:
         shift[P] = -turn @ motion.shift_m
         ekf.predict(shift)
 
-    def _measured(self, track: Track, view: View) -> tuple[Array, Array, Array]:
+    def _predict_measurement(
+        self, track: Track, view: ImageDetections
+    ) -> tuple[Array, Array, Array]:
         """Predict u, v, log depth (3,), their Jacobian (3, 7) and the noise except the depth's."""
         t = self.tuning
         attitude = np.array([view.roll_rad]), np.array([view.pitch_rad])
@@ -163,7 +165,7 @@ class Tracker:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.array([*uv[0], np.log(depth_m[0]) + track.filter.x[BIAS]]), row, noise
 
-    def _of_depth(self, view: View) -> Array:
+    def _depth_noise(self, view: ImageDetections) -> Array:
         """Return (N, 3, 3) noise of each detection's log depth."""
         ratio = np.full(len(view.depth_m), self.tuning.depth_std_ratio)
         if view.sigma_depth_m is not None:
@@ -173,16 +175,16 @@ class Tracker:
         noise[:, 2, 2] = ratio**2
         return noise
 
-    def _associate(self, view: View) -> list[int]:
+    def _associate(self, view: ImageDetections) -> list[int]:
         """Update every track with its best detection; return the detections without a track."""
         seen = np.column_stack([view.uv, np.log(view.depth_m)])
-        of_depth = self._of_depth(view)
-        expected = [self._measured(track, view) for track in self.tracks]
+        of_depth = self._depth_noise(view)
+        expected = [self._predict_measurement(track, view) for track in self.tracks]
         gain = np.full((len(self.tracks), len(seen)), -np.inf)
         for k, (track, (mean, row, noise)) in enumerate(zip(self.tracks, expected, strict=True)):
             if np.isfinite(mean).all():
                 spread = row @ track.filter.P @ row.T + noise + of_depth
-                gain[k] = self._likelihood(seen - mean, spread)
+                gain[k] = self._log_likelihood_ratios(seen - mean, spread)
         free = set(range(len(seen)))
         # The solver rejects rows without any finite entry, so "never" is a large loss here.
         rows, columns = linear_sum_assignment(np.maximum(gain, -1e6), maximize=True)
@@ -198,7 +200,7 @@ class Tracker:
                 track.score += np.log1p(-self.tuning.detection_share)
         return sorted(free)
 
-    def _likelihood(self, difference: Array, spread: Array) -> Array:
+    def _log_likelihood_ratios(self, difference: Array, spread: Array) -> Array:
         """Return (N,) log likelihood ratios of detections and a track; -inf outside its gate."""
         squared = np.einsum("ni,nij,nj->n", difference, np.linalg.inv(spread), difference)
         density = -0.5 * (squared + np.linalg.slogdet(2 * np.pi * spread)[1])
@@ -206,13 +208,13 @@ class Tracker:
         return np.where(squared <= self._gate, ratio, -np.inf)
 
     def _in_view(self, mean: Array) -> bool:
-        return bool(inside(mean[None, :2], self.camera.width_px, self.camera.height_px)[0])
+        return bool(is_inside(mean[None, :2], self.camera.width_px, self.camera.height_px)[0])
 
     def _update(self, track: Track, seen: Array, mean: Array, row: Array, noise: Array) -> None:
         track.filter.update(seen, lambda _: row, lambda _: mean, R=noise)
         assert track.filter.x.shape == (7,), "filterpy changed the state's shape"
 
-    def _bury(self) -> None:
+    def _delete_lost(self) -> None:
         """Confirm tracks, and delete those whose peers are gone."""
         allowed = np.log(self.tuning.lost_odds)
         kept = []
@@ -226,11 +228,11 @@ class Tracker:
                 kept.append(track)
         self.tracks = kept
 
-    def _bear(self, view: View, free: Sequence[int]) -> None:
+    def _start_tracks(self, view: ImageDetections, free: Sequence[int]) -> None:
         """Start a track at every detection without one."""
         t = self.tuning
         attitude = np.array([view.roll_rad]), np.array([view.pitch_rad])
-        of_depth = self._of_depth(view)
+        of_depth = self._depth_noise(view)
         for k in free:
             at = view.uv[k : k + 1], view.depth_m[k : k + 1]
             xyz = horizontal_from_pixels(*at, *attitude, self.camera)[0]
@@ -240,7 +242,7 @@ class Tracker:
             ekf.P[V, V] = t.speed_std_mps**2 * np.eye(3)
             ekf.P[BIAS, BIAS] = t.depth_bias_ratio**2
             track = Track(self._born, ekf)
-            _, row, noise = self._measured(track, view)
+            _, row, noise = self._predict_measurement(track, view)
             noise += of_depth[k]
             noise[2, 2] += t.depth_bias_ratio**2
             # The first position inverts the measurement model: position = inverse of (seen - bias).

@@ -6,7 +6,7 @@ from dmrl.geometry.frames import Array
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class EgoMotion:
     """Motion of the observer between two images.
 
     Parameters
@@ -25,7 +25,7 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class ImageDetections:
     """Detections of one image, and the attitude of the observer.
 
     Parameters

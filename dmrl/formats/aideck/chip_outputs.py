@@ -16,13 +16,13 @@ from dmrl.geometry.frames import STRIDE_PX
 from dmrl.images import codec
 from dmrl.samples.sample import Sample
 
-FOLDER = "gap8-maps"
-STEP = 0.211
+MAPS_FOLDER = "gap8-maps"
+LEVEL_STEP = 0.211
 """Size of a quantization level of the published network on the GAP8."""
-NAMES = ("pos", "dep")
+MAP_PREFIXES = ("pos", "dep")
 
 
-def chip_maps(picture: Path, time_ns: int, robot: str) -> Sample | None:
+def load_chip_maps(picture: Path, time_ns: int, robot: str) -> Sample | None:
     """Load the maps of an image as a GridMap at its time; None if it has none.
 
     Parameters
@@ -38,10 +38,10 @@ def chip_maps(picture: Path, time_ns: int, robot: str) -> Sample | None:
         If one of the two maps is missing or cannot be read, or their sizes differ.
     """
     number = picture.stem.removeprefix("img")
-    files = [picture.parent / FOLDER / f"{name}{number}.ppm" for name in NAMES]
+    files = [picture.parent / MAPS_FOLDER / f"{name}{number}.ppm" for name in MAP_PREFIXES]
     if not any(file.is_file() for file in files):
         return None
-    logit, log_depth = (STEP * _levels(file) for file in files)
+    logit, log_depth = (LEVEL_STEP * _load_levels(file) for file in files)
     if logit.shape != log_depth.shape:
         raise SourceError(f"{files[1]} differs in size from {files[0].name}. Remove both")
     maps = np.stack((1 / (1 + np.exp(-logit)), np.exp(log_depth)))
@@ -52,10 +52,10 @@ def chip_maps(picture: Path, time_ns: int, robot: str) -> Sample | None:
         "data": maps.astype("<f4").tobytes(),
         "stride_px": STRIDE_PX,
     }
-    return Sample(time_ns, topics.grid(robot), "GridMap", fields)
+    return Sample(time_ns, topics.GRID(robot), "GridMap", fields)
 
 
-def _levels(file: Path) -> NDArray[np.float64]:
+def _load_levels(file: Path) -> NDArray[np.float64]:
     """Load the (rows, cols) levels of a map, -128 to 127."""
     try:
         data = file.read_bytes()

@@ -17,18 +17,18 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from dmrl.formats.aideck.cpx_log import APP, STREAMER, Packet, PacketReader
-from dmrl.formats.aideck.cpx_state import STATE_FORMAT, State, unpack_state
-from dmrl.formats.timestamps import Unwrapped
+from dmrl.formats.aideck.cpx_state import STATE_FORMAT, RobotState, unpack_state
+from dmrl.formats.timestamps import CounterUnwrapper
 
 Layout = Literal["plain", "stamped", "streamer"]
 Encoding = Literal["raw", "jpeg"]
 
-PORT = 5000
+DEFAULT_PORT = 5000
 
 HEADER = struct.Struct("<BHHBBI")
 STAMP = struct.Struct("<IhhhI")
-BEGIN = struct.Struct("<BBII2x")
-DATA = struct.Struct("<B3x")
+BEGIN_HEADER = struct.Struct("<BBII2x")
+DATA_HEADER = struct.Struct("<B3x")
 METADATA = struct.Struct(f"<BHHBBBII{STATE_FORMAT}IB3x64sIII4f")
 
 MAGIC = 0xBC
@@ -67,7 +67,7 @@ class Image:
     data: bytes
     time_us: int | None = None
     frame_id: int | None = None
-    state: State | None = None
+    state: RobotState | None = None
 
     @property
     def robot_time_us(self) -> int | None:
@@ -89,10 +89,10 @@ class ImageReader:
     def __init__(self) -> None:
         self.broken = 0
         self._packets = PacketReader()
-        self._begun: _Begun | None = None
-        self._time_ms, self._time_us = Unwrapped(32), Unwrapped(32)
-        self._state_us, self._robot_ms = Unwrapped(32), Unwrapped(32)
-        self._frame_id = Unwrapped(8, forward=True)
+        self._begun: _PartialImage | None = None
+        self._time_ms, self._time_us = CounterUnwrapper(32), CounterUnwrapper(32)
+        self._state_us, self._robot_ms = CounterUnwrapper(32), CounterUnwrapper(32)
+        self._frame_id = CounterUnwrapper(8, forward=True)
 
     @property
     def skipped_bytes(self) -> int:
@@ -102,7 +102,7 @@ class ImageReader:
     def feed(self, data: bytes) -> Iterator[Image]:
         """Yield the images that these bytes complete."""
         for packet in self._packets.feed(data):
-            image = self.take(packet)
+            image = self.add_packet(packet)
             if image is not None:
                 yield image
 
@@ -112,87 +112,91 @@ class ImageReader:
         self.broken += amid or self._begun is not None
         self._begun = None
 
-    def take(self, packet: Packet) -> Image | None:
+    def add_packet(self, packet: Packet) -> Image | None:
         """Add a packet; return the image that it completes, or None."""
         if packet.function == APP:
-            return self._take_app(packet.data)
+            return self._add_app_packet(packet.data)
         if packet.function == STREAMER and packet.data:
-            return self._take_streamer(packet.data)
+            return self._add_streamer_packet(packet.data)
         return None
 
-    def _take_app(self, data: bytes) -> Image | None:
+    def _add_app_packet(self, data: bytes) -> Image | None:
         begun = self._begun
         if len(data) not in (HEADER.size, HEADER.size + STAMP.size) or data[0] != MAGIC:
-            return self._append(data)
-        header = self._app_header(data)
+            return self._append_chunk(data)
+        header = self._parse_app_header(data)
         # Within an image, pixels may look like a header; before one, they are a broken header.
         if begun is not None and (header is None or len(data) == begun.missing):
-            return self._append(data)
-        self._begin(header)
+            return self._append_chunk(data)
+        self._start_image(header)
         return None
 
-    def _app_header(self, data: bytes) -> "_Begun | None":
+    def _parse_app_header(self, data: bytes) -> "_PartialImage | None":
         _, width_px, height_px, _, kind, size = HEADER.unpack_from(data)
-        if kind >= len(ENCODINGS) or not _sane(width_px, height_px, size):
+        if kind >= len(ENCODINGS) or not _is_plausible_size(width_px, height_px, size):
             return None
         if ENCODINGS[kind] == "raw" and size != width_px * height_px:
             return None
         time_us = None
         if len(data) > HEADER.size:
             time_us = 1000 * self._time_ms(STAMP.unpack_from(data, HEADER.size)[0])
-        return _Begun(size, Image(width_px, height_px, ENCODINGS[kind], b"", time_us))
+        return _PartialImage(size, Image(width_px, height_px, ENCODINGS[kind], b"", time_us))
 
-    def _take_streamer(self, data: bytes) -> Image | None:
+    def _add_streamer_packet(self, data: bytes) -> Image | None:
         command = data[0]
-        if command == STREAMER_BEGIN and len(data) >= BEGIN.size:
-            _, kind, size, checksum = BEGIN.unpack_from(data)
+        if command == STREAMER_BEGIN and len(data) >= BEGIN_HEADER.size:
+            _, kind, size, checksum = BEGIN_HEADER.unpack_from(data)
             if kind != STREAMER_IMAGE:
-                self._drop()
+                self._drop_image()
                 return None
             sane = METADATA.size < size <= IMAGE_MAX_BYTES
-            self._begin(_Begun(size, None, checksum) if sane else None)
-            return self._append(data[BEGIN.size :])
-        if command == STREAMER_DATA and len(data) >= DATA.size:
-            return self._append(data[DATA.size :])
-        self._drop()
+            self._start_image(_PartialImage(size, None, checksum) if sane else None)
+            return self._append_chunk(data[BEGIN_HEADER.size :])
+        if command == STREAMER_DATA and len(data) >= DATA_HEADER.size:
+            return self._append_chunk(data[DATA_HEADER.size :])
+        self._drop_image()
         return None
 
-    def _begin(self, begun: "_Begun | None") -> None:
-        self._drop()
+    def _start_image(self, begun: "_PartialImage | None") -> None:
+        self._drop_image()
         self._begun = begun
         self.broken += begun is None
 
-    def _drop(self) -> None:
+    def _drop_image(self) -> None:
         self.broken += self._begun is not None
         self._begun = None
 
-    def _append(self, data: bytes) -> Image | None:
+    def _append_chunk(self, data: bytes) -> Image | None:
         begun = self._begun
         if begun is None:
             return None
         # Only the streamer pads its last packet to a multiple of four.
         spare = 3 if begun.image is None else 0
         if len(data) > begun.missing + spare:
-            self._drop()
+            self._drop_image()
             return None
         begun.data += data[: begun.missing]
         if begun.missing:
             return None
         self._begun = None
-        image = self._finished(begun)
+        image = self._finish_image(begun)
         self.broken += image is None
         return image
 
-    def _finished(self, begun: "_Begun") -> Image | None:
+    def _finish_image(self, begun: "_PartialImage") -> Image | None:
         data = bytes(begun.data)
         if begun.image is None:
-            return self._streamed(data) if begun.checksum in (0, checksum(data)) else None
+            return (
+                self._parse_streamer_image(data)
+                if begun.checksum in (0, compute_checksum(data))
+                else None
+            )
         image = begun.image
         if image.encoding == "jpeg" and not data.startswith(b"\xff\xd8"):
             return None
         return replace(image, data=data)
 
-    def _streamed(self, data: bytes) -> Image | None:
+    def _parse_streamer_image(self, data: bytes) -> Image | None:
         version, width_px, height_px, _, _, frame_id, time_us, received_us, *rest = (
             METADATA.unpack_from(data)
         )
@@ -206,7 +210,7 @@ class ImageReader:
 
 
 @dataclass(slots=True)
-class _Begun:
+class _PartialImage:
     """Incomplete image; ``image`` is None while its chunks contain metadata."""
 
     size: int
@@ -219,7 +223,7 @@ class _Begun:
         return self.size - len(self.data)
 
 
-def _sane(width_px: int, height_px: int, size: int) -> bool:
+def _is_plausible_size(width_px: int, height_px: int, size: int) -> bool:
     return (
         0 < width_px <= SIDE_MAX_PX
         and 0 < height_px <= SIDE_MAX_PX
@@ -228,7 +232,7 @@ def _sane(width_px: int, height_px: int, size: int) -> bool:
     )
 
 
-def checksum(data: bytes) -> int:
+def compute_checksum(data: bytes) -> int:
     """Compute the CRC-32 of an image, as the streamer sends it."""
     # 0 means that there is no CRC, so a CRC of 0 is sent as all ones.
     return binascii.crc32(data) or 0xFFFFFFFF

@@ -8,7 +8,7 @@ from dmrl.formats.aideck.cpx_log import APP, GAP8, HOST, STREAMER, Packet, pack_
 from dmrl.formats.aideck.cpx_state import pack_state
 
 UINT32 = 1 << 32
-NO_STATE = (0,) * 14
+EMPTY_STATE = (0,) * 14
 
 
 def pack_image(image: Image, layout: Layout = "plain") -> bytes:
@@ -23,19 +23,19 @@ def pack_image(image: Image, layout: Layout = "plain") -> bytes:
         See ``cpx``.
     """
     if layout == "streamer":
-        chunks, function = _streamer_chunks(image), STREAMER
+        chunks, function = _iter_streamer_chunks(image), STREAMER
     else:
-        chunks, function = _app_chunks(image, layout), APP
+        chunks, function = _iter_app_chunks(image, layout), APP
     packets = (Packet(GAP8, HOST, function, chunk) for chunk in chunks)
     return b"".join(pack_packet(packet) for packet in packets)
 
 
-def _app_chunks(image: Image, layout: Layout) -> Iterator[bytes]:
+def _iter_app_chunks(image: Image, layout: Layout) -> Iterator[bytes]:
     kind = cpx.ENCODINGS.index(image.encoding)
     size = image.width_px, image.height_px, 1, kind, len(image.data)
     header = cpx.HEADER.pack(cpx.MAGIC, *size)
     if layout == "stamped":
-        state = pack_state(image.state) if image.state else NO_STATE
+        state = pack_state(image.state) if image.state else EMPTY_STATE
         time_ms = (image.time_us or 0) // 1000
         header += cpx.STAMP.pack(time_ms % UINT32, *state[1:4], state[10] % UINT32)
     yield header
@@ -44,9 +44,9 @@ def _app_chunks(image: Image, layout: Layout) -> Iterator[bytes]:
         yield image.data[start : start + cpx.CHUNK_BYTES]
 
 
-def _streamer_chunks(image: Image) -> Iterator[bytes]:
+def _iter_streamer_chunks(image: Image) -> Iterator[bytes]:
     received_us = image.state.received_us if image.state else 0
-    state = pack_state(image.state) if image.state else NO_STATE
+    state = pack_state(image.state) if image.state else EMPTY_STATE
     metadata = cpx.METADATA.pack(
         cpx.STREAMER_VERSION,
         image.width_px,
@@ -63,13 +63,13 @@ def _streamer_chunks(image: Image) -> Iterator[bytes]:
         *(0, 0, 0, 0.0, 0.0, 0.0, 0.0),
     )
     data = metadata + image.data
-    first = cpx.STREAMER_CHUNK_BYTES - cpx.BEGIN.size
-    begin = (cpx.STREAMER_BEGIN, cpx.STREAMER_IMAGE, len(data), cpx.checksum(data))
-    yield _padded(cpx.BEGIN.pack(*begin) + data[:first])
-    step = cpx.STREAMER_CHUNK_BYTES - cpx.DATA.size
+    first = cpx.STREAMER_CHUNK_BYTES - cpx.BEGIN_HEADER.size
+    begin = (cpx.STREAMER_BEGIN, cpx.STREAMER_IMAGE, len(data), cpx.compute_checksum(data))
+    yield _pad_to_word(cpx.BEGIN_HEADER.pack(*begin) + data[:first])
+    step = cpx.STREAMER_CHUNK_BYTES - cpx.DATA_HEADER.size
     for start in range(first, len(data), step):
-        yield _padded(cpx.DATA.pack(cpx.STREAMER_DATA) + data[start : start + step])
+        yield _pad_to_word(cpx.DATA_HEADER.pack(cpx.STREAMER_DATA) + data[start : start + step])
 
 
-def _padded(data: bytes) -> bytes:
+def _pad_to_word(data: bytes) -> bytes:
     return data + bytes(-len(data) % 4)

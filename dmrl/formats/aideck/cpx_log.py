@@ -17,7 +17,7 @@ ROUTE = struct.Struct("<HBB")
 PACKET_MAX_BYTES = 4094
 
 # Routes from any chip to the host, with a defined function and version 0: few other bytes match.
-PLAUSIBLE = re.compile(rb"[\x0b\x13\x23\x4b\x53\x63][\x01-\x06\x0e\x0f]")
+PLAUSIBLE_ROUTE = re.compile(rb"[\x0b\x13\x23\x4b\x53\x63][\x01-\x06\x0e\x0f]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class PacketReader:
         """Yield the packets that these bytes complete."""
         self._buffer += data
         at = 0
-        while (step := self._step(at)) is not None:
+        while (step := self._parse_at(at)) is not None:
             at, packet = step
             if packet is not None:
                 yield packet
@@ -63,20 +63,20 @@ class PacketReader:
         self.skipped_bytes += left
         return left > 0
 
-    def _step(self, at: int) -> tuple[int, Packet | None] | None:
+    def _parse_at(self, at: int) -> tuple[int, Packet | None] | None:
         """Return the offset after a step, with the packet at ``at`` if any; None: too few bytes."""
-        size = self._size(at)
+        size = self._parse_size(at)
         if size is None:
             return None
         end = at + ROUTE.size + size
         if size >= 0 and not self._in_step:
             # Four bytes may match a header by chance. Two headers at the right distance do not.
-            after = self._size(end)
+            after = self._parse_size(end)
             if after is None:
                 return None
             size = size if after >= 0 else -1
         if size < 0:
-            return self._skip(at)
+            return self._skip_to_header(at)
         if len(self._buffer) < end:
             return None
         _, route, function = ROUTE.unpack_from(self._buffer, at)
@@ -85,17 +85,19 @@ class PacketReader:
         data = bytes(self._buffer[at + ROUTE.size : end])
         return end, Packet(route >> 3 & 7, route & 7, function & 63, data, bool(route & 64))
 
-    def _size(self, at: int) -> int | None:
+    def _parse_size(self, at: int) -> int | None:
         """Return the data bytes behind a header; -1: no header, None: incomplete."""
         if len(self._buffer) < at + ROUTE.size:
             return None
         length, _, function = ROUTE.unpack_from(self._buffer, at)
         counted = 0 if self._streamer or function == STREAMER else 2
-        plausible = PLAUSIBLE.match(self._buffer, at + 2) and counted <= length <= PACKET_MAX_BYTES
+        plausible = (
+            PLAUSIBLE_ROUTE.match(self._buffer, at + 2) and counted <= length <= PACKET_MAX_BYTES
+        )
         return length - counted if plausible else -1
 
-    def _skip(self, at: int) -> tuple[int, None]:
-        found = PLAUSIBLE.search(self._buffer, at + 3)
+    def _skip_to_header(self, at: int) -> tuple[int, None]:
+        found = PLAUSIBLE_ROUTE.search(self._buffer, at + 3)
         end = found.start() - 2 if found else len(self._buffer) - ROUTE.size + 1
         self._in_step = False
         self.skipped_bytes += end - at

@@ -9,13 +9,13 @@ STATE_FORMAT = "I9hi3h"
 """``struct`` format: robot's time (ms), position (mm), velocity (mm/s), acceleration (mm/s^2),
 compressed quaternion, turning rates (mrad/s)."""
 
-MAGNITUDE = (1 << 9) - 1
+MAGNITUDE_MAX = (1 << 9) - 1
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class RobotState:
     """Last state that a robot sent to its camera.
 
     Parameters
@@ -41,7 +41,7 @@ class State:
     turning_radps: Vector = (0.0, 0.0, 0.0)
 
 
-def unpack_state(values: Sequence[int], robot_ms: int, received_us: int) -> State:
+def unpack_state(values: Sequence[int], robot_ms: int, received_us: int) -> RobotState:
     """Decode a state from its packed values (``STATE_FORMAT``; more may follow).
 
     Parameters
@@ -53,33 +53,33 @@ def unpack_state(values: Sequence[int], robot_ms: int, received_us: int) -> Stat
     """
     metres = [value / 1000 for value in values[1:10]]
     turning = [value / 1000 for value in values[11:14]]
-    return State(
+    return RobotState(
         robot_ms,
         received_us,
         (metres[0], metres[1], metres[2]),
         (metres[3], metres[4], metres[5]),
         (metres[6], metres[7], metres[8]),
-        quaternion(values[10]),
+        decompress_quaternion(values[10]),
         (turning[0], turning[1], turning[2]),
     )
 
 
-def pack_state(state: State) -> tuple[int, ...]:
+def pack_state(state: RobotState) -> tuple[int, ...]:
     """Encode a state as the values of ``STATE_FORMAT``."""
     vectors = (*state.position_m, *state.velocity_mps, *state.acceleration_mps2)
     return (
         state.robot_ms % (1 << 32),
-        *(_milli(value) for value in vectors),
-        compressed(state.quaternion_xyzw),
-        *(_milli(value) for value in state.turning_radps),
+        *(_to_milli(value) for value in vectors),
+        compress_quaternion(state.quaternion_xyzw),
+        *(_to_milli(value) for value in state.turning_radps),
     )
 
 
-def _milli(value: float) -> int:
+def _to_milli(value: float) -> int:
     return int(np.clip(round(value * 1000), -32768, 32767))
 
 
-def quaternion(packed: int) -> Quaternion:
+def decompress_quaternion(packed: int) -> Quaternion:
     """Return x, y, z, w of a 32-bit quaternion: index of the largest part, then the others.
 
     Each of the others has a sign and 9 bits. Follows the Crazyflie's ``quatcompress.h``. The
@@ -90,20 +90,20 @@ def quaternion(packed: int) -> Quaternion:
     parts = [0.0] * 4
     for k in (3, 2, 1, 0):
         if k != largest:
-            magnitude = (packed & MAGNITUDE) / MAGNITUDE * np.sqrt(0.5)
-            parts[k] = float(-magnitude if packed & (MAGNITUDE + 1) else magnitude)
+            magnitude = (packed & MAGNITUDE_MAX) / MAGNITUDE_MAX * np.sqrt(0.5)
+            parts[k] = float(-magnitude if packed & (MAGNITUDE_MAX + 1) else magnitude)
             packed >>= 10
     parts[largest] = float(np.sqrt(max(1 - sum(part * part for part in parts), 0.0)))
     return parts[0], parts[1], parts[2], parts[3]
 
 
-def compressed(xyzw: Quaternion) -> int:
+def compress_quaternion(xyzw: Quaternion) -> int:
     """Compress a unit quaternion to 32 bits, signed, as `decompress_quaternion` reads it."""
     largest = int(np.argmax(np.abs(xyzw)))
     packed = largest
     for k, part in enumerate(xyzw):
         if k != largest:
             negative = (part < 0) != (xyzw[largest] < 0)
-            magnitude = int(MAGNITUDE * abs(part) / np.sqrt(0.5) + 0.5)
-            packed = packed << 10 | negative << 9 | min(magnitude, MAGNITUDE)
+            magnitude = int(MAGNITUDE_MAX * abs(part) / np.sqrt(0.5) + 0.5)
+            packed = packed << 10 | negative << 9 | min(magnitude, MAGNITUDE_MAX)
     return packed - (1 << 32) if packed >> 31 else packed

@@ -16,17 +16,17 @@ from dmrl.formats.aideck import published_firmware
 from dmrl.formats.base import Content, Format, Options
 from dmrl.geometry.frames import AIDECK
 from dmrl.images import codec
-from dmrl.images.bayer import rgb_of
-from dmrl.samples.sample import Sample, calibration, image
+from dmrl.images.bayer import demosaic
+from dmrl.samples.sample import Sample, build_calibration, build_image
 from dmrl.terminal.progress import say
 
 HEIGHT_PX, WIDTH_PX = 224, 320
-PIXELS = HEIGHT_PX * WIDTH_PX
+PIXEL_COUNT = HEIGHT_PX * WIDTH_PX
 RECORD = np.dtype([("raw", "u1", (HEIGHT_PX, WIDTH_PX)), ("values", "<f4", (6,))])
 ERASED = b"\xff" * RECORD.itemsize
 
 
-def recognises(source: Path) -> bool:
+def can_read(source: Path) -> bool:
     """Return whether a file consists of records, the first plausible, and erased flash.
 
     The first record must have non-zero values, since the six floats of any file may be plausible.
@@ -34,14 +34,14 @@ def recognises(source: Path) -> bool:
     if not source.is_file() or source.stat().st_size < RECORD.itemsize:
         return False
     with source.open("rb") as stream:
-        stream.seek(PIXELS)
-        values = np.frombuffer(stream.read(RECORD.itemsize - PIXELS), "<f4").tolist()
+        stream.seek(PIXEL_COUNT)
+        values = np.frombuffer(stream.read(RECORD.itemsize - PIXEL_COUNT), "<f4").tolist()
         stream.seek(source.stat().st_size // RECORD.itemsize * RECORD.itemsize)
         rest = stream.read().strip(b"\xff")
     return published_firmware.is_plausible(values) and any(values) and not rest
 
 
-def records(stream: BinaryIO, what: object = None) -> Iterator[np.void]:
+def iter_records(stream: BinaryIO, what: object = None) -> Iterator[np.void]:
     """Yield whole records up to the end marker or the end; report the bytes left out.
 
     Parameters
@@ -59,7 +59,7 @@ def records(stream: BinaryIO, what: object = None) -> Iterator[np.void]:
         say(f"{what}: its last {len(data)} bytes are no whole record; left out")
 
 
-def content(source: Path, options: Options) -> Content:
+def load_content(source: Path, options: Options) -> Content:
     """Load the samples of a dump: images in RGB, attitude, and the firmware's estimate of the peer.
 
     Parameters
@@ -80,7 +80,9 @@ def content(source: Path, options: Options) -> Content:
     if not source.is_file():
         raise SourceError(f"{source} is not a file. Pass the dump of a flash")
     with source.open("rb") as stream:
-        plausible = [published_firmware.is_plausible(r["values"].tolist()) for r in records(stream)]
+        plausible = [
+            published_firmware.is_plausible(r["values"].tolist()) for r in iter_records(stream)
+        ]
     if not plausible:
         raise SourceError(f"{source} has no record of {RECORD.itemsize} bytes. Pass another dump")
     if 2 * sum(plausible) <= len(plausible):
@@ -88,24 +90,24 @@ def content(source: Path, options: Options) -> Content:
             f"{source}: {len(plausible) - sum(plausible)} of {len(plausible)} records have "
             "impossible numbers: it is not a dump, or its bytes are shifted. Pass another"
         )
-    rgb_of(np.zeros((4, 4), np.uint8))  # raises MissingExtra before anything is written
-    return Content(_samples(source, options), source.stat().st_size // RECORD.itemsize)
+    demosaic(np.zeros((4, 4), np.uint8))  # raises MissingExtra before anything is written
+    return Content(_iter_samples(source, options), source.stat().st_size // RECORD.itemsize)
 
 
-def _samples(source: Path, options: Options) -> Iterator[Sample]:
+def _iter_samples(source: Path, options: Options) -> Iterator[Sample]:
     camera, peer = options.camera or AIDECK, options.names.get("0", "cf2")
     odd = 0
-    yield calibration(0, options.robot, camera)
+    yield build_calibration(0, options.robot, camera)
     with source.open("rb") as stream:
-        for k, record in enumerate(records(stream, source)):
+        for k, record in enumerate(iter_records(stream, source)):
             time_ns = round(k * 1e9 / options.rate_hz)
-            png = codec.encode_png(rgb_of(record["raw"]))
-            yield image(time_ns, options.robot, png, "png")
+            png = codec.encode_png(demosaic(record["raw"]))
+            yield build_image(time_ns, options.robot, png, "png")
             values = record["values"].tolist()
             odd += not published_firmware.is_plausible(values)
-            yield from published_firmware.samples(time_ns, options.robot, peer, values, camera)
+            yield from published_firmware.iter_samples(time_ns, options.robot, peer, values, camera)
     if odd:
         say(f"{source}: {odd} images have impossible numbers; their labels are left out")
 
 
-FORMAT = Format("hyperflash", "a dump of the AI-deck's flash", recognises, content)
+FORMAT = Format("hyperflash", "a dump of the AI-deck's flash", can_read, load_content)

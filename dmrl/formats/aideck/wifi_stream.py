@@ -12,31 +12,31 @@ import numpy as np
 
 from dmrl.errors import SourceError
 from dmrl.formats.aideck.cpx import Image, ImageReader
-from dmrl.formats.aideck.cpx_state import State
+from dmrl.formats.aideck.cpx_state import RobotState
 from dmrl.formats.base import Content, Format, Options
 from dmrl.formats.crazyflie import log_variables
-from dmrl.formats.crazyflie.log_block import Block
+from dmrl.formats.crazyflie.log_block import LogBlock
 from dmrl.images import codec
-from dmrl.images.bayer import rgb_of
-from dmrl.samples.flight import in_order
-from dmrl.samples.sample import Sample, calibration, image
+from dmrl.images.bayer import demosaic
+from dmrl.samples.flight import merge_by_time
+from dmrl.samples.sample import Sample, build_calibration, build_image
 from dmrl.terminal.progress import say
 
-PIECE_BYTES = 1 << 16
-LOOK_BYTES = 1 << 18
+READ_BYTES = 1 << 16
+SNIFF_BYTES = 1 << 18
 
 
-def recognises(source: Path) -> bool:
+def can_read(source: Path) -> bool:
     """Return whether a whole image begins in the first 256 KiB of a file."""
     if not source.is_file() or source.suffix not in (".cpx", ".bin", ".raw", ""):
         return False
     reader = ImageReader()
     with source.open("rb") as stream:
-        found = next(reader.feed(stream.read(LOOK_BYTES)), None)
-    return found is not None and reader.skipped_bytes < PIECE_BYTES
+        found = next(reader.feed(stream.read(SNIFF_BYTES)), None)
+    return found is not None and reader.skipped_bytes < READ_BYTES
 
 
-def content(source: Path, options: Options) -> Content:
+def load_content(source: Path, options: Options) -> Content:
     """Load the samples of a stream: images in RGB, and the robot's state if the stream has it.
 
     Parameters
@@ -56,7 +56,7 @@ def content(source: Path, options: Options) -> Content:
     if not source.is_file():
         raise SourceError(f"{source} is not a file. Pass a recorded stream")
     times, states, reader = [], [], ImageReader()
-    for found in _images(source, reader):
+    for found in _iter_images(source, reader):
         times.append(found.time_us)
         states.append(found.state)
     if not times:
@@ -66,38 +66,42 @@ def content(source: Path, options: Options) -> Content:
             f"{source}: {reader.broken} images are broken or cut short and "
             f"{reader.skipped_bytes} bytes belong to no packet; left out"
         )
-    time_ns = _times_ns(times, options.rate_hz)
-    pictures = _pictures(source, time_ns, options)
+    time_ns = _to_times_ns(times, options.rate_hz)
+    pictures = _iter_image_samples(source, time_ns, options)
     told = [state for state in states if state is not None]
-    return Content(in_order([pictures, *_states(told, options, source)]))
+    return Content(merge_by_time([pictures, *_build_state_streams(told, options, source)]))
 
 
-def _images(source: Path, reader: ImageReader) -> Iterator[Image]:
+def _iter_images(source: Path, reader: ImageReader) -> Iterator[Image]:
     with source.open("rb") as stream:
-        while data := stream.read(PIECE_BYTES):
+        while data := stream.read(READ_BYTES):
             yield from reader.feed(data)
     reader.finish()
 
 
-def _times_ns(times_us: Sequence[int | None], rate_hz: float) -> list[int]:
+def _to_times_ns(times_us: Sequence[int | None], rate_hz: float) -> list[int]:
     """Return the camera's times, or nominal ones unless every image has one."""
     if any(time is None for time in times_us):
         return [round(k * 1e9 / rate_hz) for k in range(len(times_us))]
     return list(accumulate((1000 * (time or 0) for time in times_us), max))
 
 
-def _pictures(source: Path, time_ns: Sequence[int], options: Options) -> Iterator[Sample]:
-    for k, (moment, found) in enumerate(zip(time_ns, _images(source, ImageReader()), strict=True)):
+def _iter_image_samples(source: Path, time_ns: Sequence[int], options: Options) -> Iterator[Sample]:
+    for k, (moment, found) in enumerate(
+        zip(time_ns, _iter_images(source, ImageReader()), strict=True)
+    ):
         if k == 0 and options.camera is not None:
-            yield calibration(moment, options.robot, options.camera)
+            yield build_calibration(moment, options.robot, options.camera)
         if found.encoding == "jpeg":
-            yield image(moment, options.robot, found.data, "jpeg")
+            yield build_image(moment, options.robot, found.data, "jpeg")
             continue
         raw = np.frombuffer(found.data, np.uint8).reshape(found.height_px, found.width_px)
-        yield image(moment, options.robot, codec.encode_png(rgb_of(raw)), "png")
+        yield build_image(moment, options.robot, codec.encode_png(demosaic(raw)), "png")
 
 
-def _states(states: Sequence[State], options: Options, source: Path) -> list[log_variables.Stream]:
+def _build_state_streams(
+    states: Sequence[RobotState], options: Options, source: Path
+) -> list[log_variables.SampleStream]:
     """Build the streams of the robot's states, each state once."""
     fresh = list({state.received_us: state for state in states}.values())
     if not fresh:
@@ -114,8 +118,8 @@ def _states(states: Sequence[State], options: Options, source: Path) -> list[log
     turning = np.degrees([s.turning_radps for s in fresh]).T
     columns |= {f"gyro.{axis}": turning[k] for k, axis in enumerate("xyz")}
     time_ns = np.array([1000 * s.received_us for s in fresh], np.int64)
-    block = Block("cpx_state", time_ns, columns)
-    return log_variables.streams(options.robot, [block], options.names, source)
+    block = LogBlock("cpx_state", time_ns, columns)
+    return log_variables.build_streams(options.robot, [block], options.names, source)
 
 
-FORMAT = Format("aideck-stream", "a recorded CPX stream", recognises, content)
+FORMAT = Format("aideck-stream", "a recorded CPX stream", can_read, load_content)

@@ -16,27 +16,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.errors import SourceError
-from dmrl.formats.base import Content, Format, Options, content_of
+from dmrl.formats.base import Content, Format, Options, build_content
 from dmrl.formats.crazyflie import log_variables
-from dmrl.formats.crazyflie.log_block import Block
+from dmrl.formats.crazyflie.log_block import LogBlock
 from dmrl.formats.timestamps import unwrap
 from dmrl.geometry.frames import Array
 from dmrl.guards import limits
 from dmrl.terminal.progress import say
 
-TIME = "Timestamp"
+TIME_COLUMN = "Timestamp"
 NS_PER_MS = 1_000_000
-TIME_BITS = 24  # milliseconds in a log packet
-WHOLE = re.compile(r"\s*[+-]?\d+\s*")
-STAMP = re.compile(r"-\d{8}T\d{2}-\d{2}-\d{2}$")
+TIMESTAMP_BITS = 24  # milliseconds in a log packet
+INTEGER_CELL = re.compile(r"\s*[+-]?\d+\s*")
+DATE_SUFFIX = re.compile(r"-\d{8}T\d{2}-\d{2}-\d{2}$")
 
 
-def recognises(source: Path) -> bool:
+def can_read(source: Path) -> bool:
     """Return whether a source is a CSV file that begins with ``Timestamp``, or contains one."""
-    return bool(_robots(source, "cf1"))
+    return bool(_list_robot_files(source, "cf1"))
 
 
-def _robots(source: Path, robot: str) -> dict[str, list[Path]]:
+def _list_robot_files(source: Path, robot: str) -> dict[str, list[Path]]:
     """List the log files of each robot."""
     if source.is_file():
         return {robot: [source]} if _is_log(source) else {}
@@ -51,10 +51,10 @@ def _is_log(path: Path) -> bool:
     if path.suffix != ".csv":
         return False
     with path.open("rb") as stream:
-        return stream.read(len(TIME) + 1) == f"{TIME},".encode()
+        return stream.read(len(TIME_COLUMN) + 1) == f"{TIME_COLUMN},".encode()
 
 
-def content(source: Path, options: Options) -> Content:
+def load_content(source: Path, options: Options) -> Content:
     """Load the samples of the log blocks.
 
     Parameters
@@ -69,18 +69,20 @@ def content(source: Path, options: Options) -> Content:
     SourceError
         If there is no log file, or a line differs from its header: names the line.
     """
-    robots = _robots(source, options.robot)
+    robots = _list_robot_files(source, options.robot)
     if not robots:
-        raise SourceError(f"no CSV file that begins with {TIME} in {source}. Pass another source")
-    streams: list[log_variables.Stream] = []
+        raise SourceError(
+            f"no CSV file that begins with {TIME_COLUMN} in {source}. Pass another source"
+        )
+    streams: list[log_variables.SampleStream] = []
     for name, paths in robots.items():
         robot = options.names.get(name, name)
-        blocks = _of_one_clock([read_block(path) for path in paths])
-        streams += log_variables.streams(robot, blocks, options.names, source)
-    return content_of(streams)
+        blocks = _unwrap_between_blocks([read_block(path) for path in paths])
+        streams += log_variables.build_streams(robot, blocks, options.names, source)
+    return build_content(streams)
 
 
-def read_block(path: Path) -> Block:
+def read_block(path: Path) -> LogBlock:
     """Read one file. A last line that is cut short is left out and reported.
 
     Raises
@@ -97,9 +99,9 @@ def read_block(path: Path) -> Block:
         names = next(csv.reader(lines[:1]), [])
     except csv.Error as e:
         raise SourceError(f"{path}:1: {e}. Pass another file") from None
-    if names[:1] != [TIME] or len(set(names)) < len(names) or not all(names):
-        raise SourceError(f"{path}:1: not {TIME} and names of variables. Pass another file")
-    rows = [_row(line, len(names)) for line in lines[1:]]
+    if names[:1] != [TIME_COLUMN] or len(set(names)) < len(names) or not all(names):
+        raise SourceError(f"{path}:1: not {TIME_COLUMN} and names of variables. Pass another file")
+    rows = [_parse_row(line, len(names)) for line in lines[1:]]
     if rows and rows[-1] is None and not text.endswith("\n"):
         say(f"{path}: its last line is cut short; left out")
         rows.pop()
@@ -108,26 +110,26 @@ def read_block(path: Path) -> Block:
     if not rows:
         raise SourceError(f"{path} has no rows. Pass another file")
     values = np.array(rows, float).T
-    time_ns = unwrap(values[0], TIME_BITS) * NS_PER_MS
+    time_ns = unwrap(values[0], TIMESTAMP_BITS) * NS_PER_MS
     cells = zip(*(line.split(",")[1:] for line in lines[1 : len(rows) + 1]), strict=True)
     columns = {
-        name: _in_its_type(text, column)
+        name: _restore_type(text, column)
         for name, text, column in zip(names[1:], cells, values[1:], strict=True)
     }
-    return Block(STAMP.sub("", path.stem), time_ns, columns)
+    return LogBlock(DATE_SUFFIX.sub("", path.stem), time_ns, columns)
 
 
-def _in_its_type(cells: tuple[str, ...], values: Array) -> NDArray[Any]:
+def _restore_type(cells: tuple[str, ...], values: Array) -> NDArray[Any]:
     """Restore the type of a column: the client writes integers without a decimal point."""
-    whole = all(WHOLE.fullmatch(cell) for cell in cells)
+    whole = all(INTEGER_CELL.fullmatch(cell) for cell in cells)
     if whole and np.abs(values).max() < 2**31:
         return values.astype(np.int32)
     return values
 
 
-def _of_one_clock(blocks: list[Block]) -> list[Block]:
+def _unwrap_between_blocks(blocks: list[LogBlock]) -> list[LogBlock]:
     """Add missing wraps: blocks may start on different sides of a wrap of the clock."""
-    period_ns, start_ns = NS_PER_MS << TIME_BITS, blocks[0].time_ns[0]
+    period_ns, start_ns = NS_PER_MS << TIMESTAMP_BITS, blocks[0].time_ns[0]
     wraps = [round((start_ns - block.time_ns[0]) / period_ns) for block in blocks]
     return [  # relative to the earliest, so that no time is before 0
         replace(block, time_ns=block.time_ns + (count - min(wraps)) * period_ns)
@@ -135,7 +137,7 @@ def _of_one_clock(blocks: list[Block]) -> list[Block]:
     ]
 
 
-def _row(line: str, width: int) -> list[float] | None:
+def _parse_row(line: str, width: int) -> list[float] | None:
     if len(line) > limits.LINE_CHARACTERS:
         return None  # Python's own error would quote the whole line
     try:
@@ -145,4 +147,4 @@ def _row(line: str, width: int) -> list[float] | None:
     return row if len(row) == width and np.isfinite(row[0]) else None
 
 
-FORMAT = Format("cfclient", "log blocks of the Crazyflie client", recognises, content)
+FORMAT = Format("cfclient", "log blocks of the Crazyflie client", can_read, load_content)

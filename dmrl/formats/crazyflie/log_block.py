@@ -12,7 +12,7 @@ from dmrl.samples.flight import Times
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class LogBlock:
     """Variables that were logged together.
 
     Parameters
@@ -31,32 +31,32 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class TimeSeries:
     """Values over time: (N,) nanoseconds and (N, C) float64."""
 
     time_ns: Times
     values: Array
 
-    def part(self, column: int) -> "Series":
+    def select_column(self, column: int) -> "TimeSeries":
         """Return one of the values as a series, (N, 1)."""
-        return Series(self.time_ns, self.values[:, [column]])
+        return TimeSeries(self.time_ns, self.values[:, [column]])
 
-    def at(self, time_ns: Times) -> Array:
+    def interpolate(self, time_ns: Times) -> Array:
         """Interpolate (M, C) values at other times: linear, constant before and after."""
         return np.stack([np.interp(time_ns, self.time_ns, v) for v in self.values.T], axis=1)
 
 
-def series(blocks: Sequence[Block], names: Sequence[str]) -> Series | None:
+def find_series(blocks: Sequence[LogBlock], names: Sequence[str]) -> TimeSeries | None:
     """Return the columns of the first block with all these names, finite rows only; or None."""
     for block in blocks:
         if all(name in block.columns for name in names):
             values = np.stack([block.columns[name].astype(float) for name in names], axis=1)
             good = np.isfinite(values).all(axis=1)
-            return Series(block.time_ns[good], values[good]) if good.any() else None
+            return TimeSeries(block.time_ns[good], values[good]) if good.any() else None
     return None
 
 
-def unpacked_quaternion(packed: NDArray[np.int64]) -> Array:
+def unpack_quaternions(packed: NDArray[np.int64]) -> Array:
     """Return (N, 4) x, y, z, w of the firmware's 32-bit quaternions.
 
     Two bits give the index of the largest component, which is omitted and positive. The others

@@ -24,35 +24,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.formats.crazyflie.log_block import Block, Series, series
+from dmrl.formats.crazyflie.log_block import LogBlock, TimeSeries, find_series
 from dmrl.formats.crazyflie.state import (
     ANGLES,
-    angle_of,
-    attitude_of,
-    quaternions_of,
-    scaled,
-    turn_of,
-    yaw_rate_of,
+    compute_yaw_rate,
+    find_angle,
+    find_attitude,
+    find_in_metres,
+    find_orientation,
+    find_quaternions,
 )
 from dmrl.geometry.frames import Array
-from dmrl.geometry.rotations import euler_zyx
+from dmrl.geometry.rotations import quaternion_to_euler
 from dmrl.messages import LogType
 from dmrl.samples import flight
-from dmrl.samples.flight import Placed, Times
+from dmrl.samples.flight import RobotPose, Times
 from dmrl.samples.sample import Columns, Sample
 from dmrl.terminal.progress import say
 
-RANGE_MAX_M = 60.0
-ZRANGE_MAX_MM = 8000.0  # the sensor reports values such as 32766 where it detects no floor
+MAX_RANGE_M = 60.0
+MAX_ZRANGE_MM = 8000.0  # the sensor reports values such as 32766 where it detects no floor
 TF_PERIOD_NS = 50_000_000
-DISTANCE = re.compile(r"ranging\.distance(\d+)")
+DISTANCE_VARIABLE = re.compile(r"ranging\.distance(\d+)")
 
-Stream = Iterable[Sample]
+SampleStream = Iterable[Sample]
 
 
-def streams(
-    robot: str, blocks: Sequence[Block], names: Mapping[str, str], where: object = "the log"
-) -> list[Stream]:
+def build_streams(
+    robot: str, blocks: Sequence[LogBlock], names: Mapping[str, str], where: object = "the log"
+) -> list[SampleStream]:
     """Build the sample streams of a robot's log, each in time order.
 
     Parameters
@@ -66,80 +66,82 @@ def streams(
     where
         The source, for warnings.
     """
-    blocks = [_ordered(block) for block in blocks]
-    logged = [as_logged(robot, block) for block in blocks]
-    return logged + derived(robot, blocks, names, where)
+    blocks = [_sort_by_time(block) for block in blocks]
+    logged = [build_raw_stream(robot, block) for block in blocks]
+    return logged + derive_streams(robot, blocks, names, where)
 
 
-def derived(
-    robot: str, blocks: Sequence[Block], names: Mapping[str, str], where: object
-) -> list[Stream]:
+def derive_streams(
+    robot: str, blocks: Sequence[LogBlock], names: Mapping[str, str], where: object
+) -> list[SampleStream]:
     """Derive dmrl's own topics from blocks in time order; see the module."""
-    found: list[Stream] = []
-    attitude = attitude_of(blocks)
+    found: list[SampleStream] = []
+    attitude = find_attitude(blocks)
     if attitude is not None:
-        found.append(_attitude(robot, attitude, yaw_rate_of(blocks, attitude)))
-    found += _motion(robot, blocks, attitude, where)
-    found += ranges_of(robot, blocks, names, where)
-    found += _poses(robot, blocks)
+        found.append(_build_attitude(robot, attitude, compute_yaw_rate(blocks, attitude)))
+    found += _iter_motion_streams(robot, blocks, attitude, where)
+    found += iter_range_streams(robot, blocks, names, where)
+    found += _iter_pose_streams(robot, blocks)
     return found
 
 
-def _ordered(block: Block) -> Block:
+def _sort_by_time(block: LogBlock) -> LogBlock:
     if (np.diff(block.time_ns) >= 0).all():
         return block
     order = np.argsort(block.time_ns, kind="stable")
-    return Block(
+    return LogBlock(
         block.name, block.time_ns[order], {name: v[order] for name, v in block.columns.items()}
     )
 
 
-def as_logged(robot: str, block: Block) -> Stream:
+def build_raw_stream(robot: str, block: LogBlock) -> SampleStream:
     """Build the stream of a block's variables, exactly as they were logged."""
     codes = {name: values.dtype.char.replace("l", "i") for name, values in block.columns.items()}
     kind = LogType(block.name, tuple(codes.items()))
-    topic = topics.log(robot, re.sub(r"[^A-Za-z0-9_-]", "_", block.name))
+    topic = topics.LOG(robot, re.sub(r"[^A-Za-z0-9_-]", "_", block.name))
     fields = dict(zip(kind.fields, block.columns.values(), strict=True))
     return Columns(topic, kind, block.time_ns, fields)
 
 
-def _attitude(robot: str, attitude: Series, yaw_rate: Array) -> Stream:
+def _build_attitude(robot: str, attitude: TimeSeries, yaw_rate: Array) -> SampleStream:
     names = ("roll_rad", "pitch_rad", "yaw_rad", "yaw_rate_radps")
     rows = np.column_stack([attitude.values, yaw_rate])
-    return _samples(topics.attitude(robot), "Attitude", attitude.time_ns, names, rows)
+    return _build_columns(topics.ATTITUDE(robot), "Attitude", attitude.time_ns, names, rows)
 
 
-def _samples(topic: str, message: str, time_ns: Times, names: Sequence[str], rows: Array) -> Stream:
+def _build_columns(
+    topic: str, message: str, time_ns: Times, names: Sequence[str], rows: Array
+) -> SampleStream:
     return Columns(topic, message, time_ns, dict(zip(names, rows.T, strict=True)))
 
 
-def _motion(
-    robot: str, blocks: Sequence[Block], attitude: Series | None, where: object
-) -> Iterator[Stream]:
-    velocity = scaled(blocks, "vx vy vz") or scaled(blocks, "vx vy")
-    yaw = angle_of(blocks, "yaw") if attitude is None else attitude.part(2)
-    _say_what_lacks(robot, blocks, attitude, velocity, where)
+def _iter_motion_streams(
+    robot: str, blocks: Sequence[LogBlock], attitude: TimeSeries | None, where: object
+) -> Iterator[SampleStream]:
+    velocity = find_in_metres(blocks, "vx vy vz") or find_in_metres(blocks, "vx vy")
+    yaw = find_angle(blocks, "yaw") if attitude is None else attitude.select_column(2)
+    _report_missing(robot, blocks, attitude, velocity, where)
     if velocity is not None and yaw is not None:
-        turned = yaw.at(velocity.time_ns)[:, 0]
+        turned = yaw.interpolate(velocity.time_ns)[:, 0]
         x, y, *z = velocity.values.T
         c, s = np.cos(turned), np.sin(turned)
         rows = np.stack([c * x + s * y, c * y - s * x, *z], axis=1)
         names = ("vx_mps", "vy_mps", "vz_mps")[: rows.shape[1]]
-        yield _samples(topics.velocity(robot), "Velocity", velocity.time_ns, names, rows)
-    height = scaled(blocks, "z") or _flown_over(blocks, attitude)
+        yield _build_columns(topics.VELOCITY(robot), "Velocity", velocity.time_ns, names, rows)
+    height = find_in_metres(blocks, "z") or _derive_height(blocks, attitude)
     if height is not None:
         names = ("height_m",)
-        yield _samples(topics.height(robot), "Height", height.time_ns, names, height.values)
+        yield _build_columns(topics.HEIGHT(robot), "Height", height.time_ns, names, height.values)
 
 
-def _say_what_lacks(
+def _report_missing(
     robot: str,
-    blocks: Sequence[Block],
-    attitude: Series | None,
-    velocity: Series | None,
+    blocks: Sequence[LogBlock],
+    attitude: TimeSeries | None,
+    velocity: TimeSeries | None,
     where: object,
 ) -> None:
-    lacking = [name for name in ANGLES if attitude is None and angle_of(blocks, name) is None]
+    lacking = [name for name in ANGLES if attitude is None and find_angle(blocks, name) is None]
     reasons = []
     if lacking:
         reasons.append(f"no attitude: no usable stateEstimate {', '.join(lacking)}")
@@ -148,44 +150,46 @@ def _say_what_lacks(
     elif "yaw" in lacking:
         reasons.append("no velocity: no yaw to turn vx, vy by")
     if reasons:
-        say(f"{where}: {'; '.join(reasons)}. The log is kept on {topics.log(robot, '*')}")
+        say(f"{where}: {'; '.join(reasons)}. The log is kept on {topics.LOG(robot, '*')}")
 
 
-def _flown_over(blocks: Sequence[Block], attitude: Series | None) -> Series | None:
+def _derive_height(blocks: Sequence[LogBlock], attitude: TimeSeries | None) -> TimeSeries | None:
     """Derive height from the downward range, corrected for the robot's tilt."""
-    beam = series(blocks, ["range.zrange"])
+    beam = find_series(blocks, ["range.zrange"])
     if beam is None:
         return None
-    seen = (beam.values[:, 0] > 0) & (beam.values[:, 0] < ZRANGE_MAX_MM)
+    seen = (beam.values[:, 0] > 0) & (beam.values[:, 0] < MAX_ZRANGE_MM)
     time_ns, height = beam.time_ns[seen], beam.values[seen] * 1e-3
     if attitude is not None:
-        height = height * np.cos(attitude.at(time_ns)[:, :2]).prod(axis=1, keepdims=True)
-    return Series(time_ns, height) if len(time_ns) else None
+        height = height * np.cos(attitude.interpolate(time_ns)[:, :2]).prod(axis=1, keepdims=True)
+    return TimeSeries(time_ns, height) if len(time_ns) else None
 
 
-def ranges_of(
-    robot: str, blocks: Sequence[Block], names: Mapping[str, str], where: object
-) -> Iterator[Stream]:
+def iter_range_streams(
+    robot: str, blocks: Sequence[LogBlock], names: Mapping[str, str], where: object
+) -> Iterator[SampleStream]:
     """Yield streams of UWB distances. A repeated value is not a new measurement."""
-    for number, time_ns, range_m in _distances(blocks, where):
+    for number, time_ns, range_m in _iter_distances(blocks, where):
         peer = names.get(str(number), f"cf{number}")
-        usable = np.isfinite(range_m) & (range_m > 0) & (range_m < RANGE_MAX_M)
+        usable = np.isfinite(range_m) & (range_m > 0) & (range_m < MAX_RANGE_M)
         if refused := int((np.isfinite(range_m) & (range_m != 0) & ~usable).sum()):
             say(f"{where}: {refused} ranges to {peer} left out: not over 0 and under 60 m")
         if peer == robot or not usable.any():
             continue
-        topic = topics.uwb_range(robot, peer)
+        topic = topics.RANGE(robot, peer)
         yield Columns(topic, "UwbRange", time_ns[usable], {"range_m": range_m[usable]})
 
 
-def _distances(blocks: Sequence[Block], where: object) -> Iterator[tuple[int, Times, Array]]:
+def _iter_distances(
+    blocks: Sequence[LogBlock], where: object
+) -> Iterator[tuple[int, Times, Array]]:
     """Yield the number, times and distances in metres of each peer."""
     for block in blocks:
         for name, values in block.columns.items():
-            match = DISTANCE.fullmatch(name)
+            match = DISTANCE_VARIABLE.fullmatch(name)
             if match:
                 fresh = np.concatenate([[True], values[1:] != values[:-1]])
-                metres = values[fresh] * _metres_per_unit(values, f"{where}: {name}")
+                metres = values[fresh] * _detect_unit(values, f"{where}: {name}")
                 yield int(match[1]), block.time_ns[fresh], metres
         if block.name == "estDistance" and {"id", "distance"} <= block.columns.keys():
             numbers, metres = block.columns["id"], block.columns["distance"].astype(float)
@@ -194,37 +198,39 @@ def _distances(blocks: Sequence[Block], where: object) -> Iterator[tuple[int, Ti
                 yield int(number), block.time_ns[mine], metres[mine]
 
 
-def _metres_per_unit(values: NDArray[Any], what: str) -> float:
+def _detect_unit(values: NDArray[Any], what: str) -> float:
     """Detect the unit by type; whole floats too large for metres are millimetres as well."""
     valid = values[np.isfinite(values) & (values > 0)].astype(float)
     if values.dtype.kind != "f":
-        if valid.size and valid.max() < RANGE_MAX_M:
+        if valid.size and valid.max() < MAX_RANGE_M:
             say(f"{what} is read as mm, but is {valid.max():.0f} at most. Are they metres?")
         return 1e-3
     # A tool in between may have converted integers to floats.
-    if valid.size and valid.min() > RANGE_MAX_M and (valid % 1 == 0).all():
+    if valid.size and valid.min() > MAX_RANGE_M and (valid % 1 == 0).all():
         say(f"{what} has only whole numbers, {valid.min():.0f} or more: read as millimetres")
         return 1e-3
     return 1.0
 
 
-def _poses(robot: str, blocks: Sequence[Block]) -> Iterator[Stream]:
-    estimated = _pose(scaled(blocks, "x y z"), turn_of(blocks))
-    true = _pose(series(blocks, [f"locSrv.{n}" for n in "xyz"]), quaternions_of(blocks, "locSrv"))
+def _iter_pose_streams(robot: str, blocks: Sequence[LogBlock]) -> Iterator[SampleStream]:
+    estimated = _combine_pose(find_in_metres(blocks, "x y z"), find_orientation(blocks))
+    true = _combine_pose(
+        find_series(blocks, [f"locSrv.{n}" for n in "xyz"]), find_quaternions(blocks, "locSrv")
+    )
     if estimated is not None:
-        yield _pose_samples(topics.pose(robot), *estimated)
+        yield _build_pose_columns(topics.POSE(robot), *estimated)
     if true is not None:
         if not any(block.name == "estPose" for block in blocks):
             # A pose that is polled faster than it arrives is logged several times: keep one.
             time_ns, rows = true
             fresh = np.concatenate([[True], (np.diff(rows, axis=0) != 0).any(axis=1)])
             true = time_ns[fresh], rows[fresh]
-        yield _pose_samples(topics.true_pose(robot), *true)
+        yield _build_pose_columns(topics.TRUE_POSE(robot), *true)
     if (placed := true or estimated) is not None:
-        yield _transforms(robot, *placed)
+        yield _iter_transforms(robot, *placed)
 
 
-def _pose(place: Series | None, turn: Series | None) -> tuple[Times, Array] | None:
+def _combine_pose(place: TimeSeries | None, turn: TimeSeries | None) -> tuple[Times, Array] | None:
     """Return (N,) times and (N, 7) x, y, z, qx, qy, qz, qw; default attitude: level, along x."""
     if place is None:
         return None
@@ -240,7 +246,7 @@ def _pose(place: Series | None, turn: Series | None) -> tuple[Times, Array] | No
     return place.time_ns, np.column_stack([place.values, turn.values[nearest]])
 
 
-def _pose_samples(topic: str, time_ns: Times, rows: Array) -> Stream:
+def _build_pose_columns(topic: str, time_ns: Times, rows: Array) -> SampleStream:
     pose = {
         "position": dict(zip("xyz", rows.T[:3], strict=True)),
         "orientation": dict(zip("xyzw", rows.T[3:], strict=True)),
@@ -251,11 +257,11 @@ def _pose_samples(topic: str, time_ns: Times, rows: Array) -> Stream:
     return Columns(topic, "PoseInFrame", time_ns, fields)
 
 
-def _transforms(robot: str, time_ns: Times, rows: Array) -> Stream:
+def _iter_transforms(robot: str, time_ns: Times, rows: Array) -> SampleStream:
     """Yield the frames of the robot, every 50 ms."""
     first = np.unique(time_ns // TF_PERIOD_NS, return_index=True)[1]
-    angles = euler_zyx(rows[first, 3:])
+    angles = quaternion_to_euler(rows[first, 3:])
     for moment, row, (roll, pitch, yaw) in zip(
         time_ns[first].tolist(), rows[first], angles.tolist(), strict=True
     ):
-        yield flight.transforms(moment, {robot: Placed(row[:3], yaw, roll, pitch)})
+        yield flight.build_transforms(moment, {robot: RobotPose(row[:3], yaw, roll, pitch)})

@@ -16,25 +16,25 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.errors import SourceError
-from dmrl.formats.base import Content, Format, Options, content_of
+from dmrl.formats.base import Content, Format, Options, build_content
 from dmrl.formats.crazyflie import log_variables
-from dmrl.formats.crazyflie.log_block import Block
-from dmrl.formats.crazyflie.usd_records import Event, Rows, gather_records
+from dmrl.formats.crazyflie.log_block import LogBlock
+from dmrl.formats.crazyflie.usd_records import EventType, Rows, gather_records
 from dmrl.formats.timestamps import unwrap
 from dmrl.terminal.progress import say
 
 MAGIC = 0xBC
 VERSIONS = {1: ("<u4", 1_000_000), 2: ("<u8", 1_000)}
 """NumPy type of a time, and nanoseconds of its unit, by version."""
-CODES = "bBhHiIef"
-TYPES_MAX = 250
+TYPE_CODES = "bBhHiIef"
+MAX_EVENT_TYPES = 250
 CRC_BYTES = 4
-SAID = 3
+MAX_LISTED_FILES = 3
 """Largest number of skipped files that are listed by name."""
 
 
 @dataclass(frozen=True, slots=True)
-class Log:
+class UsdLog:
     """Content of a file.
 
     Parameters
@@ -48,23 +48,23 @@ class Log:
     """
 
     version: int
-    blocks: tuple[Block, ...]
+    blocks: tuple[LogBlock, ...]
     warnings: tuple[str, ...]
 
 
-def recognises(source: Path) -> bool:
+def can_read(source: Path) -> bool:
     """Return whether a file begins like a micro-SD log, or a folder contains one that does."""
     if source.is_dir():
-        return any(recognises(path) for path in source.iterdir() if path.is_file())
+        return any(can_read(path) for path in source.iterdir() if path.is_file())
     with source.open("rb") as stream:
         head = stream.read(5)
     if len(head) < 5 or head[0] != MAGIC:
         return False
     version, types = struct.unpack_from("<HH", head, 1)
-    return version in VERSIONS and 0 < types <= TYPES_MAX
+    return version in VERSIONS and 0 < types <= MAX_EVENT_TYPES
 
 
-def decode(data: bytes, what: object = "the log") -> Log:
+def decode_log(data: bytes, what: object = "the log") -> UsdLog:
     """Decode the records of a log to one array per variable.
 
     Parameters
@@ -81,7 +81,7 @@ def decode(data: bytes, what: object = "the log") -> Log:
     """
     if not data:
         raise SourceError(f"{what} is empty: the card was full, or removed. Pass another log")
-    version, events, body = _header(data, what)
+    version, events, body = _parse_header(data, what)
     sealed = len(data) - body >= CRC_BYTES and zlib.crc32(
         memoryview(data)[:-CRC_BYTES]
     ) == int.from_bytes(data[-CRC_BYTES:], "little")
@@ -91,45 +91,46 @@ def decode(data: bytes, what: object = "the log") -> Log:
     if left := stop - end:
         warnings.append(f"{what}: {left} bytes from byte {end} on are no whole record; left out")
     scale = VERSIONS[version][1]
-    blocks = [_block(e, rows[e.name], scale) for e in events if len(rows[e.name])]
-    return Log(version, tuple(blocks), tuple(warnings))
+    blocks = [_build_block(e, rows[e.name], scale) for e in events if len(rows[e.name])]
+    return UsdLog(version, tuple(blocks), tuple(warnings))
 
 
-def _header(data: bytes, what: object) -> tuple[int, list[Event], int]:
+def _parse_header(data: bytes, what: object) -> tuple[int, list[EventType], int]:
     """Parse the version, the event types, and the offset at which the records begin."""
     try:
         magic, version, types = struct.unpack_from("<BHH", data)
-        if magic != MAGIC or version not in VERSIONS or not 0 < types <= TYPES_MAX:
+        if magic != MAGIC or version not in VERSIONS or not 0 < types <= MAX_EVENT_TYPES:
             raise SourceError(f"{what} is no micro-SD log of version 1 or 2. Pass another file")
         at, events = 5, []
         for _ in range(types):
             (number,) = struct.unpack_from("<H", data, at)
-            name, at = _text(data, at + 2)
+            name, at = _parse_text(data, at + 2)
             (count,) = struct.unpack_from("<H", data, at)
             at += 2
             variables = []
             for _ in range(count):
-                text, at = _text(data, at)
+                text, at = _parse_text(data, at)
                 variables.append((text[:-3], text[-2:-1]))
-            events.append(Event(number, name, tuple(variables), VERSIONS[version][0]))
+            events.append(EventType(number, name, tuple(variables), VERSIONS[version][0]))
     except (struct.error, ValueError) as e:
         raise SourceError(
             f"{what} is damaged in its header, or ends there: {e}. Pass another log"
         ) from None
-    _check(events, what)
+    _check_events(events, what)
     return version, events, at
 
 
-def _text(data: bytes, at: int) -> tuple[str, int]:
+def _parse_text(data: bytes, at: int) -> tuple[str, int]:
     end = data.index(b"\0", at)
     return data[at:end].decode("ascii"), end + 1
 
 
-def _check(events: list[Event], what: object) -> None:
+def _check_events(events: list[EventType], what: object) -> None:
     for event in events:
         names = [name for name, _ in event.variables]
         if not all(
-            name.isprintable() and name and code and code in CODES for name, code in event.variables
+            name.isprintable() and name and code and code in TYPE_CODES
+            for name, code in event.variables
         ) or not (event.name.isprintable() and event.name and len(set(names)) == len(names)):
             raise SourceError(
                 f"{what}: event {event.name!r} has variables without name or known type in its "
@@ -140,14 +141,14 @@ def _check(events: list[Event], what: object) -> None:
             raise SourceError(f"{what}: two events have the same {kind}. Pass another log")
 
 
-def _block(event: Event, rows: Rows, scale_ns: int) -> Block:
+def _build_block(event: EventType, rows: Rows, scale_ns: int) -> LogBlock:
     count = rows["time"]
     ticks = unwrap(count, 32) if event.time == "<u4" else count.astype(np.int64)
     columns = {name: rows[f"v{k}"] for k, (name, _) in enumerate(event.variables)}
-    return Block(event.name, ticks * scale_ns, columns)
+    return LogBlock(event.name, ticks * scale_ns, columns)
 
 
-def content(source: Path, options: Options) -> Content:
+def load_content(source: Path, options: Options) -> Content:
     """Load the samples of a log, or of a folder with one log per robot, named after it.
 
     Parameters
@@ -163,16 +164,20 @@ def content(source: Path, options: Options) -> Content:
     SourceError
         If a log cannot be used. Empty files of a folder are left out and reported.
     """
-    streams = [s for robot, path in _files(source, options) for s in _streams(robot, path, options)]
-    return content_of(streams)
+    streams = [
+        s
+        for robot, path in _iter_logs(source, options)
+        for s in _load_streams(robot, path, options)
+    ]
+    return build_content(streams)
 
 
-def _files(source: Path, options: Options) -> Iterator[tuple[str, Path]]:
+def _iter_logs(source: Path, options: Options) -> Iterator[tuple[str, Path]]:
     if not source.is_dir():
         yield options.robot, source
         return
     paths = sorted(p for p in source.iterdir() if p.is_file() and p.name[0] != ".")
-    logs = [path for path in paths if path.stat().st_size and recognises(path)]
+    logs = [path for path in paths if path.stat().st_size and can_read(path)]
     if not logs:
         raise SourceError(f"no micro-SD log in {source}. Pass a folder with one file per robot")
     for path in paths:
@@ -181,19 +186,21 @@ def _files(source: Path, options: Options) -> Iterator[tuple[str, Path]]:
         elif path in logs:
             yield options.names.get(path.stem, path.stem), path
     if others := [path.name for path in paths if path.stat().st_size and path not in logs]:
-        more = f" and {len(others) - SAID} more" if len(others) > SAID else ""
-        say(f"{source}: left out, as no micro-SD log: {', '.join(others[:SAID])}{more}")
+        more = (
+            f" and {len(others) - MAX_LISTED_FILES} more" if len(others) > MAX_LISTED_FILES else ""
+        )
+        say(f"{source}: left out, as no micro-SD log: {', '.join(others[:MAX_LISTED_FILES])}{more}")
 
 
-def _streams(robot: str, path: Path, options: Options) -> list[log_variables.Stream]:
-    log = decode(path.read_bytes(), path)
+def _load_streams(robot: str, path: Path, options: Options) -> list[log_variables.SampleStream]:
+    log = decode_log(path.read_bytes(), path)
     for warning in log.warnings:
         say(warning)
     if not log.blocks:
         raise SourceError(f"{path} has a header, but no whole record. Pass another log")
-    return log_variables.streams(robot, log.blocks, options.names, path)
+    return log_variables.build_streams(robot, log.blocks, options.names, path)
 
 
 FORMAT = Format(
-    "cfusdlog", "a micro-SD log of a Crazyflie, or a folder of them", recognises, content
+    "cfusdlog", "a micro-SD log of a Crazyflie, or a folder of them", can_read, load_content
 )

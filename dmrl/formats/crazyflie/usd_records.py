@@ -14,7 +14,7 @@ Rows = NDArray[np.void]
 
 
 @dataclass(frozen=True)
-class Event:
+class EventType:
     """One type of record: its id, name, (name, ``struct`` letter) of each variable, time type."""
 
     number: int
@@ -30,7 +30,7 @@ class Event:
 
 
 def gather_records(
-    data: bytes, body: int, end: int, events: list[Event]
+    data: bytes, body: int, end: int, events: list[EventType]
 ) -> tuple[dict[str, Rows], int]:
     """Return the (N,) records of each event by name, and the end of the last whole record.
 
@@ -56,7 +56,7 @@ def gather_records(
     return {e.name: _gather(records, starts[ids == e.number], e.dtype) for e in events}, body + size
 
 
-def _list_possible_starts(records: NDArray[np.uint8], events: list[Event]) -> Ints:
+def _list_possible_starts(records: NDArray[np.uint8], events: list[EventType]) -> Ints:
     """Return the offsets with the id of an event to which the size of another record leads."""
     count = max(len(records) - 1, 0)
     is_id = np.zeros(count, bool)

@@ -29,27 +29,27 @@ from typing import Any
 from dmrl.errors import SourceError
 from dmrl.guards.bounded_parsing import parse_toml
 
-ANGLE = {"rad": 1.0, "deg": 0.017453292519943295}
-RATE = {"rad/s": 1.0, "deg/s": 0.017453292519943295}
-LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-SPEED = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3}
-TIME = {"s": 1_000_000_000.0, "ms": 1_000_000.0, "us": 1000.0, "ns": 1.0}
-PLAIN = {"1": 1.0}
+ANGLE_UNITS = {"rad": 1.0, "deg": 0.017453292519943295}
+RATE_UNITS = {"rad/s": 1.0, "deg/s": 0.017453292519943295}
+LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+SPEED_UNITS = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3}
+TIME_UNITS = {"s": 1_000_000_000.0, "ms": 1_000_000.0, "us": 1000.0, "ns": 1.0}
+NO_UNIT = {"1": 1.0}
 FRAMES = ("world", "horizontal", "body")
 
 QUANTITIES: dict[str, Mapping[str, float]] = {
-    "time": TIME,
-    **dict.fromkeys(("roll", "pitch", "yaw"), ANGLE),
-    **dict.fromkeys(("yaw_rate", "gyro_y", "gyro_z"), RATE),
-    **dict.fromkeys(("vx", "vy", "vz"), SPEED),
-    **dict.fromkeys(("x", "y", "z", "height"), LENGTH),
-    **dict.fromkeys(("qx", "qy", "qz", "qw"), PLAIN),
-    **dict.fromkeys(("true_x", "true_y", "true_z"), LENGTH),
-    **dict.fromkeys(("true_qx", "true_qy", "true_qz", "true_qw"), PLAIN),
+    "time": TIME_UNITS,
+    **dict.fromkeys(("roll", "pitch", "yaw"), ANGLE_UNITS),
+    **dict.fromkeys(("yaw_rate", "gyro_y", "gyro_z"), RATE_UNITS),
+    **dict.fromkeys(("vx", "vy", "vz"), SPEED_UNITS),
+    **dict.fromkeys(("x", "y", "z", "height"), LENGTH_UNITS),
+    **dict.fromkeys(("qx", "qy", "qz", "qw"), NO_UNIT),
+    **dict.fromkeys(("true_x", "true_y", "true_z"), LENGTH_UNITS),
+    **dict.fromkeys(("true_qx", "true_qy", "true_qz", "true_qw"), NO_UNIT),
 }
 """Quantities and their units, each with its size in dmrl's unit (time: in nanoseconds)."""
 
-TOGETHER = (
+REQUIRED_TOGETHER = (
     ("roll", "pitch"),
     ("vx", "vy"),
     ("x", "y", "z"),
@@ -58,7 +58,7 @@ TOGETHER = (
     ("true_qx", "true_qy", "true_qz", "true_qw"),
 )
 """Groups of quantities that are only meaningful together."""
-KEYS = ("name", "unit", "sign", "frame")
+COLUMN_KEYS = ("name", "unit", "sign", "frame")
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ class ColumnMap:
         return {column.name for column in (*self.columns.values(), *self.ranges.values())}
 
 
-def read_map(path: Path) -> ColumnMap:
+def read_column_map(path: Path) -> ColumnMap:
     """Read the column map from a TOML file.
 
     Raises
@@ -107,19 +107,21 @@ def read_map(path: Path) -> ColumnMap:
         raise SourceError(f"{path} is no table of columns in TOML: {e}. Fix it") from None
     ranges = values.pop("range", {})
     ranges = ranges if isinstance(ranges, dict) else {"": ranges}
-    faults = [fault for key, table in values.items() for fault in _faults(key, table)]
-    faults += [f for peer, table in ranges.items() for f in _faults(f"range.{peer}", table)]
-    faults += _missing(values)
+    faults = [fault for key, table in values.items() for fault in _iter_errors(key, table)]
+    faults += [f for peer, table in ranges.items() for f in _iter_errors(f"range.{peer}", table)]
+    faults += _iter_missing(values)
     if faults:
         raise SourceError(f"{path}: {'; '.join(faults)}. See docs/sources.md")
-    columns = {key: _column(QUANTITIES[key], table) for key, table in values.items()}
-    return ColumnMap(columns, {peer: _column(LENGTH, table) for peer, table in ranges.items()})
+    columns = {key: _build_column(QUANTITIES[key], table) for key, table in values.items()}
+    return ColumnMap(
+        columns, {peer: _build_column(LENGTH_UNITS, table) for peer, table in ranges.items()}
+    )
 
 
-def _missing(values: Mapping[str, Any]) -> Iterator[str]:
+def _iter_missing(values: Mapping[str, Any]) -> Iterator[str]:
     if "time" not in values:
         yield "no [time]"
-    for group in TOGETHER:
+    for group in REQUIRED_TOGETHER:
         given = [name for name in group if name in values]
         if given and len(given) < len(group):
             lacking = ", ".join(f"[{name}]" for name in group if name not in values)
@@ -131,38 +133,38 @@ def _missing(values: Mapping[str, Any]) -> Iterator[str]:
         yield "[height] and [z] are the same quantity; remove one"
 
 
-def _faults(key: str, table: Any) -> Iterator[str]:
+def _iter_errors(key: str, table: Any) -> Iterator[str]:
     """Yield the errors of a quantity's table."""
-    units = LENGTH if key.startswith("range.") else QUANTITIES.get(key)
+    units = LENGTH_UNITS if key.startswith("range.") else QUANTITIES.get(key)
     if units is None:
         near = get_close_matches(key, QUANTITIES, n=1)
         yield f"[{key}]: no such quantity" + (f", did you mean {near[0]}?" if near else "")
     elif not isinstance(table, dict):
         yield f"{key}: no table with name and unit"
     else:
-        wrong = {name: "no such key" for name in table if name not in KEYS}
-        wrong |= _wrong_values(units, table)
+        wrong = {name: "no such key" for name in table if name not in COLUMN_KEYS}
+        wrong |= _find_wrong_values(units, table)
         yield from (f"[{key}] {name}: {what}" for name, what in wrong.items())
 
 
-def _wrong_values(units: Mapping[str, float], table: Mapping[str, Any]) -> dict[str, str]:
+def _find_wrong_values(units: Mapping[str, float], table: Mapping[str, Any]) -> dict[str, str]:
     """Return the errors of the values of a quantity's table, by key."""
     wrong = {}
-    name, unit, sign, frame = (table.get(key) for key in KEYS)
+    name, unit, sign, frame = (table.get(key) for key in COLUMN_KEYS)
     if not (isinstance(name, str) and name):
         wrong["name"] = "not the name of a column"
-    has_unit = unit is not None or units is not PLAIN  # a plain number needs none
+    has_unit = unit is not None or units is not NO_UNIT  # a plain number needs none
     if has_unit and unit not in tuple(units):
         wrong["unit"] = f"not one of {', '.join(units)}"
     if "sign" in table and (isinstance(sign, bool) or sign not in (1, -1)):
         wrong["sign"] = "not 1 or -1"
-    if units is SPEED and frame not in FRAMES:
+    if units is SPEED_UNITS and frame not in FRAMES:
         wrong["frame"] = f"not one of {', '.join(FRAMES)}"
-    if units is not SPEED and "frame" in table:
+    if units is not SPEED_UNITS and "frame" in table:
         wrong["frame"] = "for velocities only"
     return wrong
 
 
-def _column(units: Mapping[str, float], table: Mapping[str, Any]) -> Column:
+def _build_column(units: Mapping[str, float], table: Mapping[str, Any]) -> Column:
     scale = units[table.get("unit", "1")] * table.get("sign", 1)
     return Column(table["name"], scale, table.get("frame", ""))

@@ -46,14 +46,14 @@ class Crop:
         top = (self.from_height_px - self.height_px / self.scale) / 2
         return max(left, 0.0), max(top, 0.0)
 
-    def pixels(self, rgb: codec.Rgb) -> codec.Rgb:
+    def crop_image(self, rgb: codec.Rgb) -> codec.Rgb:
         """Return the kept part of an image, (height_px, width_px, 3)."""
         left, top = self.corner_px
         right = min(left + self.width_px / self.scale, self.from_width_px)
         bottom = min(top + self.height_px / self.scale, self.from_height_px)
         return codec.crop_and_scale(rgb, (left, top, right, bottom), self.width_px, self.height_px)
 
-    def label(self, row: LabelRow) -> LabelRow:
+    def crop_label(self, row: LabelRow) -> LabelRow:
         """Return a label in the pixels of the result; its box is clipped, or empty if outside."""
         left, top = self.corner_px
         sigma_u, sigma_v, sigma_depth = row.sigmas
@@ -61,11 +61,11 @@ class Crop:
             row,
             u_px=(row.u_px - left) * self.scale,
             v_px=(row.v_px - top) * self.scale,
-            box_px=self._box(row.box_px),
+            box_px=self._crop_box(row.box_px),
             sigmas=(sigma_u * self.scale, sigma_v * self.scale, sigma_depth),
         )
 
-    def _box(self, box_px: tuple[float, ...]) -> tuple[float, ...]:
+    def _crop_box(self, box_px: tuple[float, ...]) -> tuple[float, ...]:
         if not box_px:
             return ()
         left, top = self.corner_px
@@ -73,7 +73,7 @@ class Crop:
         y0, y1 = (min(max((y - top) * self.scale, 0), self.height_px) for y in box_px[1::2])
         return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else ()
 
-    def camera(self, camera: Camera) -> Camera:
+    def crop_camera(self, camera: Camera) -> Camera:
         """Return the calibration of the result."""
         left, top = self.corner_px
         return replace(

@@ -29,18 +29,18 @@ from dmrl.formats.base import Content, Format, Options
 from dmrl.formats.files import image_folder
 from dmrl.geometry.frames import Array
 from dmrl.samples import flight
-from dmrl.samples.flight import LOG_COLUMNS, in_order, nanoseconds
+from dmrl.samples.flight import LOG_COLUMNS, merge_by_time, to_nanoseconds
 from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say
 from dmrl.topics import Topic
 
-TIME = "time_s"
-REQUIRED = (TIME, *LOG_COLUMNS)
-GAP_S = 1.0
-TIME_MAX_S = 9e9  # its nanoseconds fit 64 bits; the year 2255 if counted from 1970
-RANGE_MAX_M = 60.0  # beyond the reach of UWB; radios report 65535 mm without an answer
-OWN = {field for row in topics.OWN_SENSORS for field in row.csv}
-OTHERS = tuple(
+TIME_COLUMN = "time_s"
+REQUIRED_COLUMNS = (TIME_COLUMN, *LOG_COLUMNS)
+MIN_GAP_S = 1.0
+MAX_TIME_S = 9e9  # its nanoseconds fit 64 bits; the year 2255 if counted from 1970
+MAX_RANGE_M = 60.0  # beyond the reach of UWB; radios report 65535 mm without an answer
+OWN_SENSOR_COLUMNS = {field for row in topics.OWN_SENSORS for field in row.csv}
+OTHER_SENSORS = tuple(
     row
     for row in topics.SENSORS
     if row.csv and row.pattern != topics.RANGE and not set(row.csv) <= set(LOG_COLUMNS)
@@ -49,7 +49,7 @@ OTHERS = tuple(
 
 
 @dataclass(frozen=True, slots=True)
-class Log:
+class CsvLog:
     """One CSV file: path, (N,) columns with NaN for empty cells, and the line of each row."""
 
     path: Path
@@ -64,19 +64,19 @@ class Log:
     @property
     def time_s(self) -> Array:
         """(N,) times."""
-        return self.columns[TIME]
+        return self.columns[TIME_COLUMN]
 
     @property
-    def ranged(self) -> list[str]:
+    def range_peers(self) -> list[str]:
         """Peers to which it has ranges."""
         return [
             name[6:-2]
             for name in self.columns
-            if name.startswith("range_") and name[-2:] == "_m" and name not in OWN
+            if name.startswith("range_") and name[-2:] == "_m" and name not in OWN_SENSOR_COLUMNS
         ]
 
     @property
-    def seen(self) -> list[str]:
+    def truth_peers(self) -> list[str]:
         """Peers of which it has true positions."""
         return [
             name[:-4]
@@ -86,12 +86,14 @@ class Log:
         ]
 
 
-def recognises(source: Path) -> bool:
+def can_read(source: Path) -> bool:
     """Return whether a folder has a CSV file whose first column is ``time_s``."""
-    return source.is_dir() and any(_header(path)[:1] == [TIME] for path in source.glob("*.csv"))
+    return source.is_dir() and any(
+        _parse_header(path)[:1] == [TIME_COLUMN] for path in source.glob("*.csv")
+    )
 
 
-def _header(path: Path) -> list[str]:
+def _parse_header(path: Path) -> list[str]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             return [name.strip() for name in next(csv.reader(stream), [])]
@@ -99,7 +101,7 @@ def _header(path: Path) -> list[str]:
         return []
 
 
-def content(source: Path, options: Options | None = None) -> Content:
+def load_content(source: Path, options: Options | None = None) -> Content:
     """Load the samples of a flight, in time order. Reports suspicious values on stderr.
 
     Parameters
@@ -119,14 +121,16 @@ def content(source: Path, options: Options | None = None) -> Content:
     if not paths:
         raise SourceError(f"no <robot>.csv in {source}. Pass a folder with a file per robot")
     logs = [read_log(path) for path in paths]
-    _check_together(logs)
+    _check_overlap(logs)
     options = options or Options()
-    streams = [stream for log in logs for stream in _streams(log, options.names)]
-    streams += [stream for log in logs for stream in _pictures(source / log.robot, options)]
-    return Content(in_order(streams))
+    streams = [stream for log in logs for stream in _iter_streams(log, options.names)]
+    streams += [
+        stream for log in logs for stream in _iter_image_streams(source / log.robot, options)
+    ]
+    return Content(merge_by_time(streams))
 
 
-def read_log(path: Path) -> Log:
+def read_log(path: Path) -> CsvLog:
     """Read and check the file of one robot.
 
     Raises
@@ -134,8 +138,8 @@ def read_log(path: Path) -> Log:
     SourceError
         If a column is missing, a cell is no number, or time does not increase.
     """
-    names = _header(path)
-    if missing := [name for name in REQUIRED if name not in names]:
+    names = _parse_header(path)
+    if missing := [name for name in REQUIRED_COLUMNS if name not in names]:
         raise SourceError(f"{path} has no column {', '.join(missing)}. Add it, in SI units")
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -145,15 +149,15 @@ def read_log(path: Path) -> Log:
     except (OSError, UnicodeDecodeError, csv.Error) as e:
         raise SourceError(f"{path} cannot be read as CSV: {e}. Save it as CSV in UTF-8") from None
     lines = [line for line, _ in rows]
-    values = [_numbers(path, line, row, len(names)) for line, row in rows]
+    values = [_parse_numbers(path, line, row, len(names)) for line, row in rows]
     if len(rows) < 2:
         raise SourceError(f"{path} has fewer than two rows. Add rows, or remove it")
-    log = Log(path, dict(zip(names, np.array(values).T, strict=True)), lines)
-    _check(log)
+    log = CsvLog(path, dict(zip(names, np.array(values).T, strict=True)), lines)
+    _check_log(log)
     return log
 
 
-def _numbers(path: Path, line: int, row: list[str], width: int) -> list[float]:
+def _parse_numbers(path: Path, line: int, row: list[str], width: int) -> list[float]:
     if len(row) != width:
         raise SourceError(f"{path}:{line} has {len(row)} cells, not {width}. Fix the line")
     try:
@@ -162,8 +166,8 @@ def _numbers(path: Path, line: int, row: list[str], width: int) -> list[float]:
         raise SourceError(f"{path}:{line}: {e}. Fix the line, or leave the cell empty") from None
 
 
-def _check(log: Log) -> None:
-    for name in REQUIRED:
+def _check_log(log: CsvLog) -> None:
+    for name in REQUIRED_COLUMNS:
         if (bad := np.flatnonzero(~np.isfinite(log.columns[name]))).size:
             raise SourceError(
                 f"{log.path}:{log.lines[bad[0]]}: {name} is no number. Fill it, or remove the line"
@@ -174,20 +178,20 @@ def _check(log: Log) -> None:
             f"{log.path}:{log.lines[back[0] + 1]}: time goes back or stands still "
             f"({log.time_s[back[0] + 1]:.6f} s after {log.time_s[back[0]]:.6f} s). Sort the lines"
         )
-    if log.time_s[-1] > TIME_MAX_S:
+    if log.time_s[-1] > MAX_TIME_S:
         raise SourceError(
             f"{log.path}: time_s reaches {log.time_s[-1]:.3g}, which is no time in seconds. Are "
             "these ms, us or ns? Divide them"
         )
     if log.time_s[0] < 0:
         raise SourceError(f"{log.path} begins before time 0. Add a constant to time_s everywhere")
-    if (gaps := np.flatnonzero(steps > GAP_S)).size:
+    if (gaps := np.flatnonzero(steps > MIN_GAP_S)).size:
         at = log.time_s[gaps[0]]
         say(f"{log.path}: {gaps.size} gaps, the first of {steps[gaps[0]]:.1f} s after {at:.3f} s")
-    _warn_of_units(log)
+    _warn_about_units(log)
 
 
-def _warn_of_units(log: Log) -> None:
+def _warn_about_units(log: CsvLog) -> None:
     """Warn about columns of which a tenth is too large for any small robot."""
     for doubt in (doubt for row in topics.OWN_SENSORS for doubt in row.doubts):
         if doubt.field not in log.columns:
@@ -200,7 +204,7 @@ def _warn_of_units(log: Log) -> None:
             )
 
 
-def _check_together(logs: list[Log]) -> None:
+def _check_overlap(logs: list[CsvLog]) -> None:
     for one, other in combinations(logs, 2):
         apart = max(one.time_s[0], other.time_s[0]) - min(one.time_s[-1], other.time_s[-1])
         if apart > 0:
@@ -210,43 +214,47 @@ def _check_together(logs: list[Log]) -> None:
             )
     known = {log.robot for log in logs}
     for log in logs:
-        for peer in log.ranged:
+        for peer in log.range_peers:
             if peer not in known:
                 say(f"{log.path} has ranges to {peer}, but there is no {peer}.csv beside it")
 
 
-def _streams(log: Log, names: Mapping[str, str]) -> Iterator[Iterator[Sample]]:
+def _iter_streams(log: CsvLog, names: Mapping[str, str]) -> Iterator[Iterator[Sample]]:
     def name(robot: str) -> str:
         return names.get(robot, robot)
 
-    own, time_ns = name(log.robot), nanoseconds(log.time_s)
-    yield flight.robot_log(own, time_ns, log.columns)
-    for peer in log.ranged:
+    own, time_ns = name(log.robot), to_nanoseconds(log.time_s)
+    yield flight.iter_robot_log(own, time_ns, log.columns)
+    for peer in log.range_peers:
         range_m = log.columns[f"range_{peer}_m"]
         given = ~np.isnan(range_m)
-        usable = given & (range_m > 0) & (range_m < RANGE_MAX_M)
+        usable = given & (range_m > 0) & (range_m < MAX_RANGE_M)
         if refused := int((given & ~usable).sum()):
             say(f"{log.path}: {refused} ranges to {peer} left out: not over 0 and under 60 m")
-        yield flight.ranges(own, name(peer), time_ns[usable], range_m[usable])
-    for peer in log.seen:
+        yield flight.iter_ranges(own, name(peer), time_ns[usable], range_m[usable])
+    for peer in log.truth_peers:
         xyz = np.stack([log.columns[f"{peer}_{axis}_m"] for axis in "xyz"], axis=1)
         known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
-        yield flight.truth(own, name(peer), time_ns[known], xyz[known])
-    for row in OTHERS:
-        for peer, columns in _columns_of(row, log):
+        yield flight.iter_truth(own, name(peer), time_ns[known], xyz[known])
+    for row in OTHER_SENSORS:
+        for peer, columns in _iter_sensor_columns(row, log):
             who = {"robot": own} | ({"peer": name(peer)} if peer else {})
-            topic = topics.filled(row.pattern, **who)
-            yield flight.sensor(topic, row.message, time_ns, columns)
+            topic = topics.format_topic(row.pattern, **who)
+            yield flight.iter_sensor(topic, row.message, time_ns, columns)
 
 
-def _columns_of(row: Topic, log: Log) -> Iterator[tuple[str, dict[str, Array]]]:
+def _iter_sensor_columns(row: Topic, log: CsvLog) -> Iterator[tuple[str, dict[str, Array]]]:
     """Yield the columns of a sensor by the fields of its message, for each peer that has them."""
-    if not row.of_pairs:
+    if not row.is_pairwise:
         peers = [""]
     else:
         before, _, unit = row.csv[0].rpartition("_")
         found = re.compile(f"{before}_(.+)_{unit}")
-        peers = [m[1] for name in log.columns if name not in OWN and (m := found.fullmatch(name))]
+        peers = [
+            m[1]
+            for name in log.columns
+            if name not in OWN_SENSOR_COLUMNS and (m := found.fullmatch(name))
+        ]
     for peer in peers:
         named = {
             field: f"_{peer}_".join(field.rsplit("_", 1)) if peer else field for field in row.csv
@@ -255,19 +263,19 @@ def _columns_of(row: Topic, log: Log) -> Iterator[tuple[str, dict[str, Array]]]:
             yield peer, {field: log.columns[name] for field, name in named.items()}
 
 
-def _pictures(folder: Path, options: Options) -> Iterator[Iterator[Sample]]:
+def _iter_image_streams(folder: Path, options: Options) -> Iterator[Iterator[Sample]]:
     if not folder.is_dir():
         return
     for path in sorted(folder.iterdir()):
-        named = path.stem.isdecimal() and len(path.stem) >= image_folder.TIME_DIGITS
-        if path.suffix.lower() in image_folder.SUFFIXES and not named:
+        named = path.stem.isdecimal() and len(path.stem) >= image_folder.MIN_TIME_DIGITS
+        if path.suffix.lower() in image_folder.IMAGE_SUFFIXES and not named:
             raise SourceError(
-                f"{path} is not named by its time in nanoseconds, {image_folder.TIME_DIGITS} "
+                f"{path} is not named by its time in nanoseconds, {image_folder.MIN_TIME_DIGITS} "
                 "digits or more. Rename it"
             )
     robot = options.names.get(folder.name, folder.name)
     own = Options(robot=robot, camera=options.camera, size_px=options.size_px)
-    yield image_folder.content(folder, own).samples
+    yield image_folder.load_content(folder, own).samples
 
 
-FORMAT = Format("csv", "a folder of flight logs", recognises, content)
+FORMAT = Format("csv", "a folder of flight logs", can_read, load_content)

@@ -10,13 +10,13 @@ from typing import Any, TextIO
 
 from dmrl.errors import SourceError
 from dmrl.guards import limits
-from dmrl.guards.safe_names import split_name
+from dmrl.guards.safe_names import check_split_name
 
-POINT = ("u_px", "v_px", "depth_m")
-BOX = ("left_px", "top_px", "right_px", "bottom_px")
-SIGMAS = ("sigma_u_px", "sigma_v_px", "sigma_depth_m")
-NEEDED = ("file", "peer", *POINT)
-COLUMNS = (*NEEDED, *BOX, "visible_share", "source", "split", *SIGMAS)
+POINT_COLUMNS = ("u_px", "v_px", "depth_m")
+BOX_COLUMNS = ("left_px", "top_px", "right_px", "bottom_px")
+SIGMA_COLUMNS = ("sigma_u_px", "sigma_v_px", "sigma_depth_m")
+REQUIRED_COLUMNS = ("file", "peer", *POINT_COLUMNS)
+COLUMNS = (*REQUIRED_COLUMNS, *BOX_COLUMNS, "visible_share", "source", "split", *SIGMA_COLUMNS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +56,19 @@ class LabelRow:
     split: str | None = None
     sigmas: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def fields(self) -> dict[str, Any]:
+    def to_fields(self) -> dict[str, Any]:
         """Return the fields of a PeerLabel."""
-        point = {name: getattr(self, name) for name in ("peer", *POINT, "visible_share", "source")}
-        return point | dict(zip(SIGMAS, self.sigmas, strict=True)) | {"box_px": list(self.box_px)}
+        point = {
+            name: getattr(self, name)
+            for name in ("peer", *POINT_COLUMNS, "visible_share", "source")
+        }
+        return (
+            point
+            | dict(zip(SIGMA_COLUMNS, self.sigmas, strict=True))
+            | {"box_px": list(self.box_px)}
+        )
 
-    def cells(self) -> list[str]:
+    def to_cells(self) -> list[str]:
         """Return the cells of the row in the order of ``COLUMNS``; unknown values are empty."""
         if not self.peer:
             return [self.file, *[""] * 9, self.source, self.split or "", "", "", ""]
@@ -77,7 +84,7 @@ def write_labels(stream: TextIO, rows: Sequence[LabelRow]) -> None:
     """Write rows as ``read_labels`` reads them. The stream needs ``newline=""``."""
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)
-    writer.writerows(row.cells() for row in rows)
+    writer.writerows(row.to_cells() for row in rows)
 
 
 def read_labels(path: Path, files: Collection[str]) -> dict[str, list[LabelRow]]:
@@ -102,9 +109,9 @@ def read_labels(path: Path, files: Collection[str]) -> dict[str, list[LabelRow]]
             reader = csv.DictReader(stream, strict=True)
             _check_columns(path, reader.fieldnames or ())
             for cells in reader:
-                row = _row(f"{path}:{reader.line_num}", cells, files)
+                row = _parse_row(f"{path}:{reader.line_num}", cells, files)
                 others = found.setdefault(row.file, [])
-                _check_agrees(f"{path}:{reader.line_num}", row, others)
+                _check_consistent(f"{path}:{reader.line_num}", row, others)
                 others.append(row)
                 if len(others) > limits.PEERS:
                     raise SourceError(
@@ -124,16 +131,16 @@ def _check_columns(path: Path, columns: Sequence[str]) -> None:
             near = get_close_matches(column, COLUMNS, n=1)
             hint = f"Did you mean {near[0]}?" if near else f"Known are {', '.join(COLUMNS)}"
             raise SourceError(f"{path}:1: unknown column {column!r}. {hint}")
-    if missing := [column for column in NEEDED if column not in columns]:
+    if missing := [column for column in REQUIRED_COLUMNS if column not in columns]:
         raise SourceError(
             f"{path}:1: no column {', '.join(missing)}. The first line names the columns; "
-            f"needed are {', '.join(NEEDED)}"
+            f"needed are {', '.join(REQUIRED_COLUMNS)}"
         )
     if len(set(columns)) < len(columns):
         raise SourceError(f"{path}:1: a column appears twice. Delete one")
 
 
-def _texts(
+def _parse_cells(
     where: str, cells: Mapping[str | None, Any], files: Collection[str]
 ) -> Mapping[str, str]:
     """Return the cells of a line by column name. Each cell and the image must exist."""
@@ -147,17 +154,17 @@ def _texts(
     return row
 
 
-def _row(where: str, cells: Mapping[str | None, Any], files: Collection[str]) -> LabelRow:
-    row = _texts(where, cells, files)
+def _parse_row(where: str, cells: Mapping[str | None, Any], files: Collection[str]) -> LabelRow:
+    row = _parse_cells(where, cells, files)
     split = row.get("split") or None
     if split is not None:
-        split_name(split, f"{where}: the split")
+        check_split_name(split, f"{where}: the split")
     if not row["peer"]:
-        return _empty_row(where, row, split)
-    box = tuple(_number(where, row, name) for name in BOX if row.get(name))
-    u_px, v_px, depth_m = (_number(where, row, name) for name in POINT)
-    sigma_u, sigma_v, sigma_depth = (_number(where, row, name, 0.0) for name in SIGMAS)
-    share = _number(where, row, "visible_share", 0.0)
+        return _parse_empty_row(where, row, split)
+    box = tuple(_parse_number(where, row, name) for name in BOX_COLUMNS if row.get(name))
+    u_px, v_px, depth_m = (_parse_number(where, row, name) for name in POINT_COLUMNS)
+    sigma_u, sigma_v, sigma_depth = (_parse_number(where, row, name, 0.0) for name in SIGMA_COLUMNS)
+    share = _parse_number(where, row, "visible_share", 0.0)
     _check_values(where, depth_m, box, share, (sigma_u, sigma_v, sigma_depth))
     return LabelRow(
         file=row["file"],
@@ -173,15 +180,17 @@ def _row(where: str, cells: Mapping[str | None, Any], files: Collection[str]) ->
     )
 
 
-def _empty_row(where: str, row: Mapping[str, str], split: str | None) -> LabelRow:
-    if filled := [name for name in (*POINT, *BOX, *SIGMAS) if row.get(name)]:
+def _parse_empty_row(where: str, row: Mapping[str, str], split: str | None) -> LabelRow:
+    if filled := [name for name in (*POINT_COLUMNS, *BOX_COLUMNS, *SIGMA_COLUMNS) if row.get(name)]:
         raise SourceError(
             f"{where}: {filled[0]} without a peer. Name the peer, or leave the cells empty"
         )
     return LabelRow(row["file"], "", source=row.get("source") or "hand", split=split)
 
 
-def _number(where: str, row: Mapping[str, str], name: str, default: float | None = None) -> float:
+def _parse_number(
+    where: str, row: Mapping[str, str], name: str, default: float | None = None
+) -> float:
     cell = row.get(name, "")
     if not cell and default is not None:
         return default
@@ -201,7 +210,7 @@ def _check_values(
         raise SourceError(f"{where}: depth_m is {depth_m:g}; it must be over 0. Fix the cell")
     if box and not (len(box) == 4 and box[0] < box[2] and box[1] < box[3]):
         raise SourceError(
-            f"{where}: not a box. {', '.join(BOX)}: all or none, left < right, top < bottom"
+            f"{where}: not a box. {', '.join(BOX_COLUMNS)}: all or none, left < right, top < bottom"
         )
     if not 0 <= share <= 1:
         raise SourceError(f"{where}: visible_share is {share:g}. It must be from 0 to 1")
@@ -209,7 +218,7 @@ def _check_values(
         raise SourceError(f"{where}: a sigma is negative. Fix the cell")
 
 
-def _check_agrees(where: str, row: LabelRow, others: Sequence[LabelRow]) -> None:
+def _check_consistent(where: str, row: LabelRow, others: Sequence[LabelRow]) -> None:
     if others and (not row.peer or not others[0].peer):
         raise SourceError(
             f"{where}: {row.file} has a row with an empty peer, so it may have no other. Delete one"

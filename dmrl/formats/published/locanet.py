@@ -28,10 +28,10 @@ from dmrl.errors import SourceError
 from dmrl.formats.base import Content, Format, Options
 from dmrl.geometry.frames import PUBLISHED_RENDER, Array, camera_from_horizontal, project
 from dmrl.images import codec
-from dmrl.samples.sample import Sample, calibration, image, intervals, labels
+from dmrl.samples.sample import Sample, build_calibration, build_image, build_labels, find_intervals
 
-FOLDERS = ("synImgs", "synImgsMulti")
-STEP_NS = 1_000_000_000
+IMAGE_FOLDERS = ("synImgs", "synImgsMulti")
+IMAGE_PERIOD_NS = 1_000_000_000
 """Period of the nominal times: image n is at n seconds. The images are unrelated."""
 
 
@@ -71,25 +71,25 @@ class LocanetImage:
     split: str | None
 
 
-def recognises(source: Path) -> bool:
+def can_read(source: Path) -> bool:
     """Return whether a folder has the file names of the published set."""
-    folders = (source, *(source / name for name in FOLDERS))
+    folders = (source, *(source / name for name in IMAGE_FOLDERS))
     return any((folder / "posLabel.txt").is_file() for folder in folders) or any(
-        (source / name).is_dir() for name in FOLDERS
+        (source / name).is_dir() for name in IMAGE_FOLDERS
     )
 
 
 @dataclass(frozen=True, slots=True)
-class _Line:
+class _LabelLine:
     where: str
     head: tuple[float, ...]
     robots: Array
 
 
-Lines = Mapping[str, _Line]
+LabelLines = Mapping[str, _LabelLine]
 
 
-def read(source: Path) -> list[LocanetImage]:
+def load_images(source: Path) -> list[LocanetImage]:
     """Load the images of the set in the order of their numbers.
 
     Parameters
@@ -102,23 +102,25 @@ def read(source: Path) -> list[LocanetImage]:
     SourceError
         If posLabel.txt or an image is missing, or a line is malformed: names file and line.
     """
-    folder = _folder(source)
-    positions = _lines(folder / "posLabel.txt", head=2, width=6)
-    boxes = _lines(folder / "boxLabel.txt", head=0, width=5, optional=True)
-    train = _lines(folder / "train.txt", head=2, width=4, optional=True)
-    test = _lines(folder / "test.txt", head=2, width=4, optional=True)
+    folder = _find_folder(source)
+    positions = _parse_file(folder / "posLabel.txt", head=2, width=6)
+    boxes = _parse_file(folder / "boxLabel.txt", head=0, width=5, optional=True)
+    train = _parse_file(folder / "train.txt", head=2, width=4, optional=True)
+    test = _parse_file(folder / "test.txt", head=2, width=4, optional=True)
     if both := sorted(train.keys() & test.keys()):
         raise SourceError(
             f"{test[both[0]].where}: {both[0]} is in train.txt too. Delete one of the lines"
         )
     if not positions:
         raise SourceError(f"{folder / 'posLabel.txt'} is empty. Restore the file")
-    found = [_image(folder, name, line, boxes, train, test) for name, line in positions.items()]
+    found = [
+        _build_image(folder, name, line, boxes, train, test) for name, line in positions.items()
+    ]
     return sorted(found, key=lambda item: item.number)
 
 
-def _folder(source: Path) -> Path:
-    inner = [source / name for name in FOLDERS if (source / name).is_dir()]
+def _find_folder(source: Path) -> Path:
+    inner = [source / name for name in IMAGE_FOLDERS if (source / name).is_dir()]
     if len(inner) > 1:
         raise SourceError(f"{source} has two sets. Pass one: {inner[0]} or {inner[1]}")
     folder = inner[0] if inner else source
@@ -129,11 +131,11 @@ def _folder(source: Path) -> Path:
     return folder
 
 
-def _lines(path: Path, *, head: int, width: int, optional: bool = False) -> Lines:
+def _parse_file(path: Path, *, head: int, width: int, optional: bool = False) -> LabelLines:
     """Parse the lines of a label file by the file name of the image."""
     if optional and not path.is_file():
         return {}
-    found: dict[str, _Line] = {}
+    found: dict[str, _LabelLine] = {}
     try:
         texts = path.read_text(encoding="ascii").splitlines()
     except (OSError, UnicodeDecodeError) as e:
@@ -144,11 +146,11 @@ def _lines(path: Path, *, head: int, width: int, optional: bool = False) -> Line
         name = name.rsplit("/", 1)[-1]
         if name in found:
             raise SourceError(f"{where}: {name} has a line already. Delete one of them")
-        found[name] = _Line(where, *_numbers(where, words, head, width))
+        found[name] = _LabelLine(where, *_parse_numbers(where, words, head, width))
     return found
 
 
-def _numbers(
+def _parse_numbers(
     where: str, words: list[str], head: int, width: int
 ) -> tuple[tuple[float, ...], Array]:
     wanted = f"path {'roll,pitch ' if head else ''}and {width} numbers per robot"
@@ -163,8 +165,13 @@ def _numbers(
     return first, robots
 
 
-def _image(
-    folder: Path, name: str, line: _Line, boxes: Lines, train: Lines, test: Lines
+def _build_image(
+    folder: Path,
+    name: str,
+    line: _LabelLine,
+    boxes: LabelLines,
+    train: LabelLines,
+    test: LabelLines,
 ) -> LocanetImage:
     path = folder / name
     if not path.is_file():
@@ -181,13 +188,15 @@ def _image(
         pitch_rad=line.head[1],
         xyz_camera=line.robots[:, :3],
         attitude_rad=line.robots[:, 3:],
-        box_px=_box_px(_of_robots(name, line, boxes)) if boxes else np.empty((0, 4)),
-        published=_published(_of_robots(name, line, {name: label}) if label else np.empty((0, 4))),
+        box_px=_to_box_px(_match_robots(name, line, boxes)) if boxes else np.empty((0, 4)),
+        published=_to_published(
+            _match_robots(name, line, {name: label}) if label else np.empty((0, 4))
+        ),
         split="train" if name in train else "test" if name in test else None,
     )
 
 
-def _of_robots(name: str, line: _Line, other: Lines) -> Array:
+def _match_robots(name: str, line: _LabelLine, other: LabelLines) -> Array:
     """Return the rows of another file about the same robots, one each."""
     if name not in other:
         beside = next(iter(other.values())).where.rsplit(":", 1)[0]
@@ -200,17 +209,17 @@ def _of_robots(name: str, line: _Line, other: Lines) -> Array:
     return other[name].robots
 
 
-def _box_px(robots: Array) -> Array:
+def _to_box_px(robots: Array) -> Array:
     """Convert first and last pixels to edges; v is printed one too high."""
     limit = (PUBLISHED_RENDER.width_px, PUBLISHED_RENDER.height_px) * 2
     return np.clip(robots[:, :4] + (0.0, -1.0, 1.0, 0.0), 0.0, limit)
 
 
-def _published(robots: Array) -> Array:
+def _to_published(robots: Array) -> Array:
     return robots[:, :3] * (1.0, 1.0, 1e-3)
 
 
-def attitude_zyx(roll_rad: float, pitch_rad: float) -> tuple[float, float]:
+def to_attitude_zyx(roll_rad: float, pitch_rad: float) -> tuple[float, float]:
     """Convert roll and pitch of Rx(roll) Ry(pitch) to those of Rz(yaw) Ry(pitch) Rx(roll).
 
     The set uses the former, dmrl the latter. The yaw between the two, up to 7 degrees, is
@@ -220,7 +229,7 @@ def attitude_zyx(roll_rad: float, pitch_rad: float) -> tuple[float, float]:
     return float(np.arctan2(sr, cr * cp)), float(np.arcsin(cr * sp))
 
 
-def content(source: Path, options: Options | None = None) -> Content:
+def load_content(source: Path, options: Options | None = None) -> Content:
     """Load the samples of the set: every image with its true and its published labels.
 
     Parameters
@@ -236,31 +245,31 @@ def content(source: Path, options: Options | None = None) -> Content:
         If a file is missing or malformed: names file and line.
     """
     robot = (options or Options()).robot
-    items = read(source)
+    items = load_images(source)
     return Content(
-        samples=_samples(items, robot),
+        samples=_iter_samples(items, robot),
         total=1 + sum(3 + len(item.xyz_camera) for item in items),
-        split=intervals((item.number * STEP_NS, item.split) for item in items),
+        split=find_intervals((item.number * IMAGE_PERIOD_NS, item.split) for item in items),
     )
 
 
-def _samples(items: list[LocanetImage], robot: str) -> Iterator[Sample]:
-    yield calibration(items[0].number * STEP_NS, robot, PUBLISHED_RENDER)
+def _iter_samples(items: list[LocanetImage], robot: str) -> Iterator[Sample]:
+    yield build_calibration(items[0].number * IMAGE_PERIOD_NS, robot, PUBLISHED_RENDER)
     for item in items:
-        time_ns = item.number * STEP_NS
-        names = _peer_names(robot, len(item.xyz_camera))
-        yield image(time_ns, robot, _jpeg(item.path), "jpeg")
+        time_ns = item.number * IMAGE_PERIOD_NS
+        names = _name_peers(robot, len(item.xyz_camera))
+        yield build_image(time_ns, robot, _load_jpeg(item.path), "jpeg")
         sources = ["truth", *(["published"] if len(item.published) else [])]
-        yield labels(time_ns, robot, _peers(item, names), sources)
-        roll, pitch = attitude_zyx(item.roll_rad, item.pitch_rad)
+        yield build_labels(time_ns, robot, _build_labels(item, names), sources)
+        roll, pitch = to_attitude_zyx(item.roll_rad, item.pitch_rad)
         fields = {"roll_rad": roll, "pitch_rad": pitch}
-        yield Sample(time_ns, topics.attitude(robot), "Attitude", fields)
+        yield Sample(time_ns, topics.ATTITUDE(robot), "Attitude", fields)
         xyz_horizontal = item.xyz_camera @ camera_from_horizontal(roll, pitch)
         for peer, xyz in zip(names, xyz_horizontal.tolist(), strict=True):
-            yield _truth(time_ns, robot, peer, xyz)
+            yield _build_truth(time_ns, robot, peer, xyz)
 
 
-def _jpeg(path: Path) -> bytes:
+def _load_jpeg(path: Path) -> bytes:
     """Load the bytes of an image, which must decode to the size of the published renders."""
     data = path.read_bytes()
     height_px, width_px, _ = codec.decode(data, path).shape
@@ -272,20 +281,20 @@ def _jpeg(path: Path) -> bytes:
     return data
 
 
-def _peer_names(robot: str, count: int) -> list[str]:
+def _name_peers(robot: str, count: int) -> list[str]:
     names = [f"cf{k}" for k in range(2, count + 3)]
     return [name for name in names if name != robot][:count]
 
 
-def _truth(time_ns: int, robot: str, peer: str, xyz: list[float]) -> Sample:
+def _build_truth(time_ns: int, robot: str, peer: str, xyz: list[float]) -> Sample:
     fields = dict(zip("xyz", xyz, strict=True)) | {
         "frame_id": f"{robot}/horizontal",
         "covariance": [0.0] * 9,
     }
-    return Sample(time_ns, topics.truth(robot, peer), "PeerPosition", fields)
+    return Sample(time_ns, topics.TRUTH(robot, peer), "PeerPosition", fields)
 
 
-def _peers(item: LocanetImage, names: list[str]) -> list[dict[str, Any]]:
+def _build_labels(item: LocanetImage, names: list[str]) -> list[dict[str, Any]]:
     """Build the true label of every robot, each followed by the published one if there is one."""
     uv, depth_m = project(item.xyz_camera, PUBLISHED_RENDER.image_from_optical)
     true = np.column_stack([uv, depth_m])
@@ -300,4 +309,4 @@ def _peers(item: LocanetImage, names: list[str]) -> list[dict[str, Any]]:
     return found
 
 
-FORMAT = Format("locanet", "a folder of the published synthetic set", recognises, content)
+FORMAT = Format("locanet", "a folder of the published synthetic set", can_read, load_content)

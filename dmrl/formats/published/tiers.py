@@ -22,12 +22,12 @@ from dmrl.formats.base import Content, Format, Options
 from dmrl.geometry.frames import Array
 from dmrl.guards.bounded_parsing import load_npz
 from dmrl.samples import flight
-from dmrl.samples.flight import from_poses, in_order, nanoseconds
+from dmrl.samples.flight import log_from_poses, merge_by_time, to_nanoseconds
 from dmrl.samples.sample import Sample
 
 RATE_HZ = 10.0
 # Errors of zipfile, zlib and NumPy on damaged archives.
-BROKEN = (
+ARCHIVE_ERRORS = (
     OSError,
     ValueError,
     TypeError,
@@ -41,25 +41,25 @@ BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
 )
-POSE = re.compile(r"optitrack_turtle(\d{1,3})_pose_np")
-RANGE = re.compile(r"uwb_range_(\d{1,3})_(\d{1,3})_np")
-ROBOTS = 64
+POSE_ARRAY = re.compile(r"optitrack_turtle(\d{1,3})_pose_np")
+RANGE_ARRAY = re.compile(r"uwb_range_(\d{1,3})_(\d{1,3})_np")
+MAX_ROBOTS = 64
 """Largest number of robots, since every pair gets a topic."""
 
 
-def recognises(source: Path) -> bool:
+def can_read(source: Path) -> bool:
     """Return whether a file is an ``.npz`` with ranges and poses of these names."""
     if source.suffix != ".npz" or not zipfile.is_zipfile(source):
         return False
     try:
         with zipfile.ZipFile(source) as archive:
             names = [name.removesuffix(".npy") for name in archive.namelist()]
-    except BROKEN:
+    except ARCHIVE_ERRORS:
         return False
-    return any(map(POSE.fullmatch, names)) and any(map(RANGE.fullmatch, names))
+    return any(map(POSE_ARRAY.fullmatch, names)) and any(map(RANGE_ARRAY.fullmatch, names))
 
 
-def content(source: Path, _options: Options | None = None) -> Content:
+def load_content(source: Path, _options: Options | None = None) -> Content:
     """Load the samples of the file, robots named turtle1, turtle3, ...
 
     Parameters
@@ -72,44 +72,44 @@ def content(source: Path, _options: Options | None = None) -> Content:
     SourceError
         If it has no such arrays, or their shapes do not match.
     """
-    if not recognises(source):
+    if not can_read(source):
         raise SourceError(f"{source} has no uwb_range_*_np and optitrack_*_pose_np. Pass another")
-    arrays = _arrays(source)
-    poses = {int(m[1]): _pose(arrays, m[1]) for m in map(POSE.fullmatch, arrays) if m}
+    arrays = _load_arrays(source)
+    poses = {int(m[1]): _build_pose(arrays, m[1]) for m in map(POSE_ARRAY.fullmatch, arrays) if m}
     streams: list[Iterator[Sample]] = []
     for number, (time_s, xy_m, yaw) in sorted(poses.items()):
-        log = from_poses(time_s, xy_m, yaw)
-        streams.append(flight.robot_log(f"turtle{number}", nanoseconds(time_s), log))
+        log = log_from_poses(time_s, xy_m, yaw)
+        streams.append(flight.iter_robot_log(f"turtle{number}", to_nanoseconds(time_s), log))
         streams += [
-            flight.truth(
+            flight.iter_truth(
                 f"turtle{number}",
                 f"turtle{peer}",
-                nanoseconds(time_s),
-                _seen_from(xy_m, yaw, other),
+                to_nanoseconds(time_s),
+                _to_horizontal(xy_m, yaw, other),
             )
             for peer, (_, other, _) in sorted(poses.items())
             if peer != number
         ]
-    for match in filter(None, map(RANGE.fullmatch, arrays)):
-        streams.append(_ranges(match[1], match[2], arrays[match[0]]))
-    return Content(in_order(streams))
+    for match in filter(None, map(RANGE_ARRAY.fullmatch, arrays)):
+        streams.append(_iter_ranges(match[1], match[2], arrays[match[0]]))
+    return Content(merge_by_time(streams))
 
 
-def _arrays(source: Path) -> dict[str, Array]:
+def _load_arrays(source: Path) -> dict[str, Array]:
     try:
         found = {n: np.asarray(v, float) for n, v in load_npz(source).items() if v.itemsize >= 4}
-    except BROKEN as e:
+    except ARCHIVE_ERRORS as e:
         why = " ".join(str(e).split())
         raise SourceError(f"{source} cannot be read: {why}. Download it again") from e
-    ranges = [values for name, values in found.items() if RANGE.fullmatch(name)]
+    ranges = [values for name, values in found.items() if RANGE_ARRAY.fullmatch(name)]
     if not all(v.ndim for v in found.values()) or any(v.ndim != 1 for v in ranges):
         raise SourceError(f"{source} has arrays of wrong shapes. Download it again")
-    if sum(bool(POSE.fullmatch(name)) for name in found) > ROBOTS:
-        raise SourceError(f"{source} has more than {ROBOTS} robots. Download it again")
+    if sum(bool(POSE_ARRAY.fullmatch(name)) for name in found) > MAX_ROBOTS:
+        raise SourceError(f"{source} has more than {MAX_ROBOTS} robots. Download it again")
     return found
 
 
-def _pose(arrays: dict[str, Array], number: str) -> tuple[Array, Array, Array]:
+def _build_pose(arrays: dict[str, Array], number: str) -> tuple[Array, Array, Array]:
     xy_m = arrays[f"optitrack_turtle{number}_pose_np"]
     yaw = arrays.get(f"optitrack_turtle{number}_orientation_np", np.zeros(0))
     if xy_m.shape != (len(yaw), 2) or {len(a) for a in arrays.values()} != {len(yaw)}:
@@ -117,17 +117,19 @@ def _pose(arrays: dict[str, Array], number: str) -> tuple[Array, Array, Array]:
     return np.arange(len(yaw)) / RATE_HZ, xy_m, yaw
 
 
-def _seen_from(here: Array, yaw: Array, peer: Array) -> Array:
+def _to_horizontal(here: Array, yaw: Array, peer: Array) -> Array:
     """Return the (N, 3) peer in the horizontal frame of a robot on the same floor."""
     x, y = (peer - here).T
     c, s = np.cos(yaw), np.sin(yaw)
     return np.stack([c * x + s * y, c * y - s * x, np.zeros(len(yaw))], axis=1)
 
 
-def _ranges(one: str, other: str, range_m: Array) -> Iterator[Sample]:
-    time_ns = nanoseconds(np.arange(len(range_m)) / RATE_HZ)
+def _iter_ranges(one: str, other: str, range_m: Array) -> Iterator[Sample]:
+    time_ns = to_nanoseconds(np.arange(len(range_m)) / RATE_HZ)
     kept = np.isfinite(range_m) & (range_m > 0)
-    return flight.ranges(f"turtle{int(one)}", f"turtle{int(other)}", time_ns[kept], range_m[kept])
+    return flight.iter_ranges(
+        f"turtle{int(one)}", f"turtle{int(other)}", time_ns[kept], range_m[kept]
+    )
 
 
-FORMAT = Format("uwb-tiers", "ranges with motion capture", recognises, content)
+FORMAT = Format("uwb-tiers", "ranges with motion capture", can_read, load_content)

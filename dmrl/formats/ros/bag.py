@@ -27,19 +27,26 @@ from urllib.parse import quote
 from dmrl import topics
 from dmrl.errors import DmrlError, MissingExtra, SourceError
 from dmrl.formats.base import Content, Format, Options
-from dmrl.formats.ros.ros_messages import HANDLERS, OWN, Placed, own
-from dmrl.guards.memory import Bounded, size_of
+from dmrl.formats.ros.ros_messages import (
+    CONVERTERS,
+    DMRL_PREFIX,
+    MessageContext,
+    convert_dmrl_message,
+)
+from dmrl.guards.memory import MemoryLimit, measure_size
 from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say
 
 SUFFIXES = (".db3", ".bag", ".mcap")
-BEGINNING = b"#ROSBAG V2.0\n"
-NO_PICTURES = (topics.MASKS, topics.DEPTHS)
+ROS1_MAGIC = b"#ROSBAG V2.0\n"
+NON_CAMERA_TOPICS = (topics.MASKS, topics.DEPTHS)
 """Image topics of an exported render that are not images of a camera."""
-CAPTURE = re.compile(r"vrpn|mocap|optitrack|vicon|qualisys|natnet|motive|truth", re.IGNORECASE)
-ODD_TABLE = re.compile(r"\bVIRTUAL\b|\bGENERATED\b|\bAS\s*\(", re.IGNORECASE)
+MOTION_CAPTURE = re.compile(
+    r"vrpn|mocap|optitrack|vicon|qualisys|natnet|motive|truth", re.IGNORECASE
+)
+COMPUTED_TABLE = re.compile(r"\bVIRTUAL\b|\bGENERATED\b|\bAS\s*\(", re.IGNORECASE)
 # Parts of a topic that describe its content rather than name its robot.
-GENERIC = re.compile(
+GENERIC_PART = re.compile(
     r"odom\w*|odometry|pose\w*|imu\w*|data|raw|twist|velocity|image\w*|color|colour|camera\w*|rgb|"
     r"compressed|info|camera_info|filtered|local|vrpn_client_node|mavros|state|truth|calibration|"
     r"uwb\w*|rang(e|es|ing)|dist(ance|ances)?|peers?|to|from",
@@ -47,7 +54,7 @@ GENERIC = re.compile(
 )
 
 
-def recognises(source: Path) -> bool:
+def can_read(source: Path) -> bool:
     """Return whether a source is a ROS 1 bag, a rosbag2 folder, or the storage of one."""
     if source.is_dir():
         return (source / "metadata.yaml").is_file()
@@ -61,7 +68,7 @@ def recognises(source: Path) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class TopicPlan:
     """Conversion of one topic of a bag: its type, message count, robot and peer."""
 
     topic: str
@@ -71,7 +78,7 @@ class Line:
     peer: str = ""
 
 
-def content(source: Path, options: Options) -> Content:
+def load_content(source: Path, options: Options) -> Content:
     """Load the samples of a bag, in the bag's order.
 
     Parameters
@@ -89,18 +96,18 @@ def content(source: Path, options: Options) -> Content:
     MissingExtra
         If rosbags is not installed.
     """
-    lines, unknown = plan(_topics(source), options)
+    lines, unknown = plan_topics(_list_topics(source), options)
     if not lines:
-        known = ", ".join(sorted({*HANDLERS}))
+        known = ", ".join(sorted({*CONVERTERS}))
         raise SourceError(f"{source} has no topic of a known type: {known}. Pass another bag")
     if unknown:
         say(f"{source}: left out: {', '.join(sorted(unknown))}")
-    return Content(_samples(source, lines), sum(line.count for line in lines.values()))
+    return Content(_iter_samples(source, lines), sum(line.count for line in lines.values()))
 
 
-def plan(
+def plan_topics(
     held: list[tuple[str, str, int]], options: Options
-) -> tuple[dict[tuple[str, str], Line], list[str]]:
+) -> tuple[dict[tuple[str, str], TopicPlan], list[str]]:
     """Return the conversion of each topic, and the topics that are left out.
 
     Parameters
@@ -110,46 +117,48 @@ def plan(
     options
         See ``load_content``.
     """
-    lines: dict[tuple[str, str], Line] = {}
+    lines: dict[tuple[str, str], TopicPlan] = {}
     unknown = []
     for topic, kind, count in held:
-        line = _line(topic, kind, count, options)
+        line = _plan_topic(topic, kind, count, options)
         if line is None or not count:
             unknown += [topic] if count else []
         else:
             lines[topic, kind] = line
     # One topic per type and robot: two interleaved ones would contradict each other.
-    best: dict[tuple[str, str, str, bool], Line] = {}
+    best: dict[tuple[str, str, str, bool], TopicPlan] = {}
     for line in lines.values():
-        key = (line.kind, line.robot, line.peer, bool(CAPTURE.search(line.topic)))
-        if not line.kind.startswith(OWN) and (key not in best or best[key].count < line.count):
+        key = (line.kind, line.robot, line.peer, bool(MOTION_CAPTURE.search(line.topic)))
+        if not line.kind.startswith(DMRL_PREFIX) and (
+            key not in best or best[key].count < line.count
+        ):
             best[key] = line
     kept = {
         key: line
         for key, line in lines.items()
-        if line.kind.startswith(OWN) or line in best.values()
+        if line.kind.startswith(DMRL_PREFIX) or line in best.values()
     }
     return kept, unknown + [line.topic for key, line in lines.items() if key not in kept]
 
 
-def _line(topic: str, kind: str, count: int, options: Options) -> Line | None:
+def _plan_topic(topic: str, kind: str, count: int, options: Options) -> TopicPlan | None:
     def name(part: str) -> str:
         part = options.names.get(part, part)
         return re.sub(r"[^A-Za-z0-9_-]", "_", part)
 
-    if kind.startswith(OWN):
-        return Line(topic, kind, count, "")
-    if kind not in HANDLERS or any(topics.names(one, topic) for one in NO_PICTURES):
+    if kind.startswith(DMRL_PREFIX):
+        return TopicPlan(topic, kind, count, "")
+    if kind not in CONVERTERS or any(topics.parse_topic(one, topic) for one in NON_CAMERA_TOPICS):
         return None
-    own = [name(part) for part in topic.split("/") if part and not GENERIC.fullmatch(part)]
+    own = [name(part) for part in topic.split("/") if part and not GENERIC_PART.fullmatch(part)]
     if kind != "sensor_msgs/msg/Range":
-        return Line(topic, kind, count, own[-1] if own else options.robot)
+        return TopicPlan(topic, kind, count, own[-1] if own else options.robot)
     if len(own) < 2 or own[-2] == own[-1]:
         return None
-    return Line(topic, kind, count, own[-2], own[-1])
+    return TopicPlan(topic, kind, count, own[-2], own[-1])
 
 
-def _reader(source: Path) -> Any:
+def _open_reader(source: Path) -> Any:
     try:
         from rosbags.highlevel import AnyReader  # noqa: PLC0415
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
@@ -158,15 +167,15 @@ def _reader(source: Path) -> Any:
     return AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
 
-def _topics(source: Path) -> list[tuple[str, str, int]]:
+def _list_topics(source: Path) -> list[tuple[str, str, int]]:
     """List topic, type and number of messages of all connections of a bag."""
     found: Counter[tuple[str, str]] = Counter()
-    for connection in _guarded(source, lambda reader: iter(reader.connections)):
+    for connection in _iter_guarded(source, lambda reader: iter(reader.connections)):
         found[connection.topic, connection.msgtype] += connection.msgcount
     return [(topic, kind, count) for (topic, kind), count in found.items()]
 
 
-def _refuse_odd(source: Path) -> None:
+def _check_storage(source: Path) -> None:
     """Raise SourceError unless a bag's SQLite files have tables alone; a view can run any query.
 
     A ROS 1 bag must begin with its magic: rosbags reads its first line, however long it is.
@@ -174,27 +183,27 @@ def _refuse_odd(source: Path) -> None:
     for path in sorted(source.glob("*.db3")) if source.is_dir() else [source]:
         with path.open("rb") as stream:
             head = stream.read(16)
-        if path.suffix == ".bag" and not head.startswith(BEGINNING):
+        if path.suffix == ".bag" and not head.startswith(ROS1_MAGIC):
             raise SourceError(f"{path} does not begin as a ROS 1 bag 2.0. Pass another file")
         if not head.startswith(b"SQLite format 3"):
             continue
         where = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
         with closing(sqlite3.connect(where, uri=True)) as database:
             for kind, text in database.execute("SELECT type, sql FROM sqlite_master"):
-                if kind not in ("table", "index") or ODD_TABLE.search(text or ""):
+                if kind not in ("table", "index") or COMPUTED_TABLE.search(text or ""):
                     raise SourceError(f"{path} has more than tables. Record the bag again")
 
 
-def _guarded(source: Path, of: Any) -> Iterator[Any]:
+def _iter_guarded(source: Path, of: Any) -> Iterator[Any]:
     """Yield the items of ``of(reader)``, with any error of rosbags as one line.
 
     rosbags passes on the errors of sqlite, YAML, struct and its decompressors on damaged bags, so
     all exceptions are caught.
     """
     try:
-        bound = Bounded(size_of(source))
-        reader = _reader(source)
-        _refuse_odd(source)
+        bound = MemoryLimit(measure_size(source))
+        reader = _open_reader(source)
+        _check_storage(source)
         with bound:
             reader.open()
         with closing(reader):
@@ -216,7 +225,7 @@ def _guarded(source: Path, of: Any) -> Iterator[Any]:
         raise SourceError(f"{source} cannot be read as a ROS bag: {why}. Restore it") from e
 
 
-def _samples(source: Path, lines: Mapping[tuple[str, str], Line]) -> Iterator[Sample]:
+def _iter_samples(source: Path, lines: Mapping[tuple[str, str], TopicPlan]) -> Iterator[Sample]:
     calibrated: set[str] = set()
     unstamped: Counter[str] = Counter()
     fixed: set[str] = set()
@@ -228,23 +237,23 @@ def _samples(source: Path, lines: Mapping[tuple[str, str], Line]) -> Iterator[Sa
             line = lines[connection.topic, connection.msgtype]
             yield line, bag_ns, reader.deserialize(data, connection.msgtype)
 
-    for line, bag_ns, decoded in _guarded(source, messages):
-        captured, odometry = bool(CAPTURE.search(line.topic)), line.robot in moving
-        where = Placed(source, line.robot, line.peer, captured, odometry, fixed)
+    for line, bag_ns, decoded in _iter_guarded(source, messages):
+        captured, odometry = bool(MOTION_CAPTURE.search(line.topic)), line.robot in moving
+        where = MessageContext(source, line.robot, line.peer, captured, odometry, fixed)
         # Without a time in the header, the bag's own time is the best estimate.
-        time_ns = _stamp_ns(decoded)
+        time_ns = _header_time_ns(decoded)
         unstamped[line.topic] += time_ns == 0 < bag_ns
-        for sample in _of(line, decoded, time_ns or max(bag_ns, 0), where):
+        for sample in _convert_message(line, decoded, time_ns or max(bag_ns, 0), where):
             is_calibration = sample.message == "CameraCalibration"
             # A calibration is sent with every image and never changes: keep the first.
             if not (is_calibration and sample.topic in calibrated):
                 yield replace(sample, publish_ns=max(bag_ns, 0))
             if is_calibration:
                 calibrated.add(sample.topic)
-    _say_what_is_odd(source, fixed, unstamped)
+    _report_problems(source, fixed, unstamped)
 
 
-def _say_what_is_odd(source: Path, fixed: set[str], unstamped: Mapping[str, int]) -> None:
+def _report_problems(source: Path, fixed: set[str], unstamped: Mapping[str, int]) -> None:
     """Report velocities that were left out, and topics whose stamps are 0."""
     if fixed:
         say(
@@ -255,7 +264,7 @@ def _say_what_is_odd(source: Path, fixed: set[str], unstamped: Mapping[str, int]
         say(f"{source}: messages with a stamp of 0 get the bag's times: {', '.join(zeros)}")
 
 
-def _stamp_ns(message: Any) -> int | None:
+def _header_time_ns(message: Any) -> int | None:
     """Return the time in the header; 0: it is empty, None: there is no header."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     if stamp is None:
@@ -263,11 +272,13 @@ def _stamp_ns(message: Any) -> int | None:
     return max(int(stamp.sec * 1_000_000_000 + stamp.nanosec), 0)
 
 
-def _of(line: Line, message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
-    if not line.kind.startswith(OWN):
-        yield from HANDLERS[line.kind](message, time_ns, where)
-    elif (sample := own(message, line.topic, time_ns)) is not None:
+def _convert_message(
+    line: TopicPlan, message: Any, time_ns: int, where: MessageContext
+) -> Iterator[Sample]:
+    if not line.kind.startswith(DMRL_PREFIX):
+        yield from CONVERTERS[line.kind](message, time_ns, where)
+    elif (sample := convert_dmrl_message(message, line.topic, time_ns)) is not None:
         yield sample
 
 
-FORMAT = Format("rosbag2", "a ROS bag", recognises, content)
+FORMAT = Format("rosbag2", "a ROS bag", can_read, load_content)

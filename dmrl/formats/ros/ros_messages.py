@@ -11,23 +11,23 @@ import numpy as np
 from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.geometry.frames import Array
-from dmrl.geometry.rotations import euler_zyx
+from dmrl.geometry.rotations import quaternion_to_euler
 from dmrl.images import codec
-from dmrl.images.bayer import rgb_of
-from dmrl.messages import LogType, descriptor
-from dmrl.samples.sample import Sample, image
+from dmrl.images.bayer import demosaic
+from dmrl.messages import LogType, find_descriptor
+from dmrl.samples.sample import Sample, build_image
 
 HALF_PX = 0.5  # the origin is the first pixel's centre in ROS, its edge in dmrl
-RANGE_MAX_M = 60.0
-OWN = "dmrl_msgs/msg/"
-SIDE_MAX_PX = 10_000
-FIXED = ("odom", "map", "world", "earth")
+MAX_RANGE_M = 60.0
+DMRL_PREFIX = "dmrl_msgs/msg/"
+MAX_SIDE_PX = 10_000
+FIXED_FRAMES = ("odom", "map", "world", "earth")
 """Last parts of the names of frames that do not turn with a robot (REP 105)."""
 LETTERS = {"uint32": "I", "int32": "i", "float32": "f", "float64": "d"}
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class MessageContext:
     """Context of a message: its bag and robots.
 
     Parameters
@@ -53,12 +53,12 @@ class Placed:
     fixed: set[str] = field(default_factory=set)
 
 
-def _picture(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
-    rgb = _rgb(message, where.source)
-    yield image(time_ns, where.robot, codec.encode_png(rgb), "png")
+def _convert_image(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
+    rgb = _decode_image(message, where.source)
+    yield build_image(time_ns, where.robot, codec.encode_png(rgb), "png")
 
 
-def _rgb(message: Any, source: Path) -> codec.Rgb:
+def _decode_image(message: Any, source: Path) -> codec.Rgb:
     channels = {"mono8": 1, "8UC1": 1, "bayer_rggb8": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3}
     channels |= {"rgba8": 4, "bgra8": 4}
     height, width, step = message.height, message.width, message.step
@@ -66,26 +66,28 @@ def _rgb(message: Any, source: Path) -> codec.Rgb:
     if count is None:
         known = ", ".join(channels)
         raise SourceError(f"{source}: images of encoding {message.encoding!r}. Use {known}")
-    if not (4 <= height <= SIDE_MAX_PX and width * count <= step <= len(message.data) // height):
+    if not (4 <= height <= MAX_SIDE_PX and width * count <= step <= len(message.data) // height):
         raise SourceError(f"{source}: an image is not {width} x {height} pixels. Restore the bag")
     rows = message.data[: height * step].reshape(height, step)[:, : width * count]
     pixels = rows.reshape(height, width, count)
     if message.encoding == "bayer_rggb8":
-        return rgb_of(np.ascontiguousarray(pixels[..., 0]))
+        return demosaic(np.ascontiguousarray(pixels[..., 0]))
     if message.encoding.startswith("bgr"):
         pixels = pixels[..., [2, 1, 0]]
     return np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (height, width, 3)))
 
 
-def _compressed(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+def _convert_compressed_image(
+    message: Any, time_ns: int, where: MessageContext
+) -> Iterator[Sample]:
     data = message.data.tobytes()
-    kind = codec.size(data, f"an image in {where.source}")[2]
+    kind = codec.read_size(data, f"an image in {where.source}")[2]
     if kind not in ("png", "jpeg"):
         raise SourceError(f"{where.source}: images are {kind}. Save them as PNG or JPEG")
-    yield image(time_ns, where.robot, data, kind)
+    yield build_image(time_ns, where.robot, data, kind)
 
 
-def _camera_info(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+def _convert_camera_info(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
     k = np.array(message.k if hasattr(message, "k") else message.K, float)
     p = np.array(message.p if hasattr(message, "p") else message.P, float)
     d = message.d if hasattr(message, "d") else message.D
@@ -103,55 +105,55 @@ def _camera_info(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
         "R": np.asarray(message.r if hasattr(message, "r") else message.R, float).tolist(),
         "P": p.tolist(),
     }
-    yield Sample(time_ns, topics.calibration(where.robot), "CameraCalibration", fields)
+    yield Sample(time_ns, topics.CALIBRATION(where.robot), "CameraCalibration", fields)
 
 
-def _xyz(vector: Any) -> Array:
+def _to_array(vector: Any) -> Array:
     return np.array([vector.x, vector.y, vector.z])
 
 
-def _angles(q: Any) -> Array | None:
+def _to_euler(q: Any) -> Array | None:
     """Return roll, pitch, yaw; None if the quaternion is not a unit one."""
     values = np.array([q.x, q.y, q.z, q.w])
     norm = float(np.linalg.norm(values))
-    return euler_zyx(values[None] / norm)[0] if abs(norm - 1) < 0.1 else None
+    return quaternion_to_euler(values[None] / norm)[0] if abs(norm - 1) < 0.1 else None
 
 
-def _is_fixed(frame: str, parent: str = "") -> bool:
-    return bool(frame) and (frame == parent or frame.rsplit("/", 1)[-1] in FIXED)
+def _is_fixed_frame(frame: str, parent: str = "") -> bool:
+    return bool(frame) and (frame == parent or frame.rsplit("/", 1)[-1] in FIXED_FRAMES)
 
 
-def _attitude(robot: str, time_ns: int, angles: Array, yaw_rate: float) -> Sample:
+def _build_attitude(robot: str, time_ns: int, angles: Array, yaw_rate: float) -> Sample:
     roll, pitch, yaw = angles.tolist()
     fields = {"roll_rad": roll, "pitch_rad": pitch, "yaw_rad": yaw, "yaw_rate_radps": yaw_rate}
-    return Sample(time_ns, topics.attitude(robot), "Attitude", fields)
+    return Sample(time_ns, topics.ATTITUDE(robot), "Attitude", fields)
 
 
-def _yaw_rate(turning: Array, angles: Array) -> float:
+def _compute_yaw_rate(turning: Array, angles: Array) -> float:
     """Compute the yaw rate from angular rates about the body's axes."""
     roll, pitch, _ = angles.tolist()
     return float((turning[1] * math.sin(roll) + turning[2] * math.cos(roll)) / math.cos(pitch))
 
 
-def _velocity(robot: str, time_ns: int, level: Array) -> Sample:
+def _build_velocity(robot: str, time_ns: int, level: Array) -> Sample:
     fields = dict(zip(("vx_mps", "vy_mps", "vz_mps"), level.tolist(), strict=True))
-    return Sample(time_ns, topics.velocity(robot), "Velocity", fields)
+    return Sample(time_ns, topics.VELOCITY(robot), "Velocity", fields)
 
 
-def _levelled(body: Array, angles: Array) -> Array:
+def _rotate_from_body(body: Array, angles: Array) -> Array:
     """Rotate a vector from the body's frame to the robot's horizontal one."""
     roll, pitch, _ = angles.tolist()
     cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
     return np.array([[cp, sp * sr, sp * cr], [0, cr, -sr], [-sp, cp * sr, cp * cr]]) @ body
 
 
-def _turned_back(fixed: Array, angles: Array) -> Array:
+def _rotate_from_fixed(fixed: Array, angles: Array) -> Array:
     """Rotate a vector from the frame of the yaw to the robot's horizontal one."""
     c, s = math.cos(angles[2]), math.sin(angles[2])
     return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ fixed
 
 
-def pose(topic: str, time_ns: int, position: Any, orientation: Any) -> Sample:
+def build_pose(topic: str, time_ns: int, position: Any, orientation: Any) -> Sample:
     """Build a pose in the world frame from a geometry_msgs pose."""
     seconds, nanos = divmod(time_ns, 1_000_000_000)
     turn = {name: float(getattr(orientation, name)) for name in "xyzw"}
@@ -164,52 +166,52 @@ def pose(topic: str, time_ns: int, position: Any, orientation: Any) -> Sample:
     return Sample(time_ns, topic, "PoseInFrame", fields)
 
 
-def _odometry(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+def _convert_odometry(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
     held, twist = message.pose.pose, message.twist.twist
-    yield pose(topics.pose(where.robot), time_ns, held.position, held.orientation)
+    yield build_pose(topics.POSE(where.robot), time_ns, held.position, held.orientation)
     height = {"height_m": float(held.position.z)}
-    yield Sample(time_ns, topics.height(where.robot), "Height", height)
-    angles = _angles(held.orientation)
+    yield Sample(time_ns, topics.HEIGHT(where.robot), "Height", height)
+    angles = _to_euler(held.orientation)
     if angles is None:
         return
     # The twist is in the child's frame by definition; some drivers name a fixed one there.
-    fixed = _is_fixed(message.child_frame_id, message.header.frame_id)
-    turning, linear = _xyz(twist.angular), _xyz(twist.linear)
-    yaw_rate = float(turning[2]) if fixed else _yaw_rate(turning, angles)
-    yield _attitude(where.robot, time_ns, angles, yaw_rate)
-    level = _turned_back(linear, angles) if fixed else _levelled(linear, angles)
-    yield _velocity(where.robot, time_ns, level)
+    fixed = _is_fixed_frame(message.child_frame_id, message.header.frame_id)
+    turning, linear = _to_array(twist.angular), _to_array(twist.linear)
+    yaw_rate = float(turning[2]) if fixed else _compute_yaw_rate(turning, angles)
+    yield _build_attitude(where.robot, time_ns, angles, yaw_rate)
+    level = _rotate_from_fixed(linear, angles) if fixed else _rotate_from_body(linear, angles)
+    yield _build_velocity(where.robot, time_ns, level)
 
 
-def _imu(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
-    angles = _angles(message.orientation)
+def _convert_imu(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
+    angles = _to_euler(message.orientation)
     if angles is not None and not where.odometry:
-        yaw_rate = _yaw_rate(_xyz(message.angular_velocity), angles)
-        yield _attitude(where.robot, time_ns, angles, yaw_rate)
+        yaw_rate = _compute_yaw_rate(_to_array(message.angular_velocity), angles)
+        yield _build_attitude(where.robot, time_ns, angles, yaw_rate)
 
 
-def _twist(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+def _convert_twist(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
     if where.odometry:
         return
-    if _is_fixed(message.header.frame_id):
+    if _is_fixed_frame(message.header.frame_id):
         where.fixed.add(where.robot)
     else:
-        yield _velocity(where.robot, time_ns, _xyz(message.twist.linear))
+        yield _build_velocity(where.robot, time_ns, _to_array(message.twist.linear))
 
 
-def _pose_stamped(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
-    topic = topics.true_pose(where.robot) if where.captured else topics.pose(where.robot)
-    yield pose(topic, time_ns, message.pose.position, message.pose.orientation)
+def _convert_pose(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
+    topic = topics.TRUE_POSE(where.robot) if where.captured else topics.POSE(where.robot)
+    yield build_pose(topic, time_ns, message.pose.position, message.pose.orientation)
 
 
-def _range(message: Any, time_ns: int, where: Placed) -> Iterator[Sample]:
+def _convert_range(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
     value = float(message.range)
-    if 0 < value < RANGE_MAX_M:
-        topic = topics.uwb_range(where.robot, where.peer)
+    if 0 < value < MAX_RANGE_M:
+        topic = topics.RANGE(where.robot, where.peer)
         yield Sample(time_ns, topic, "UwbRange", {"range_m": value})
 
 
-def _transforms(message: Any, time_ns: int, _where: Placed) -> Iterator[Sample]:
+def _convert_transforms(message: Any, time_ns: int, _where: MessageContext) -> Iterator[Sample]:
     frames = []
     for entry in message.transforms:
         stamp, held = entry.header.stamp, entry.transform
@@ -226,10 +228,10 @@ def _transforms(message: Any, time_ns: int, _where: Placed) -> Iterator[Sample]:
     yield Sample(time_ns, topics.TRANSFORMS, "FrameTransforms", {"transforms": frames})
 
 
-def own(message: Any, topic: str, time_ns: int) -> Sample | None:
+def convert_dmrl_message(message: Any, topic: str, time_ns: int) -> Sample | None:
     """Convert a message of dmrl as it was exported; None for one of another version."""
-    name = message.__msgtype__.removeprefix(OWN)
-    if topics.names(topics.LOG, topic):
+    name = message.__msgtype__.removeprefix(DMRL_PREFIX)
+    if topics.parse_topic(topics.LOG, topic):
         # rosbags keeps the types of fields in their annotations only, so the values define them.
         fields = {k: v for k, v in vars(message).items() if isinstance(v, (int, float))}
         kind = LogType(
@@ -238,31 +240,31 @@ def own(message: Any, topic: str, time_ns: int) -> Sample | None:
         )
         return Sample(time_ns, topic, kind, fields)
     try:
-        known = {field.name for field in descriptor(name).fields}
+        known = {field.name for field in find_descriptor(name).fields}
     except KeyError:
         return None
-    return Sample(time_ns, topic, name, {k: v for k, v in _plain(message).items() if k in known})
+    return Sample(time_ns, topic, name, {k: v for k, v in _to_plain(message).items() if k in known})
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tobytes() if value.dtype == np.uint8 else value.tolist()
     if isinstance(value, list):
-        return [_plain(item) for item in value]
+        return [_to_plain(item) for item in value]
     if hasattr(value, "__msgtype__"):
         names = (name for name in vars(value) if not name.startswith("__"))
-        return {name: _plain(getattr(value, name)) for name in names}
+        return {name: _to_plain(getattr(value, name)) for name in names}
     return value
 
 
-HANDLERS: dict[str, Callable[[Any, int, Placed], Iterator[Sample]]] = {
-    "sensor_msgs/msg/Image": _picture,
-    "sensor_msgs/msg/CompressedImage": _compressed,
-    "sensor_msgs/msg/CameraInfo": _camera_info,
-    "nav_msgs/msg/Odometry": _odometry,
-    "sensor_msgs/msg/Imu": _imu,
-    "geometry_msgs/msg/TwistStamped": _twist,
-    "geometry_msgs/msg/PoseStamped": _pose_stamped,
-    "sensor_msgs/msg/Range": _range,
-    "tf2_msgs/msg/TFMessage": _transforms,
+CONVERTERS: dict[str, Callable[[Any, int, MessageContext], Iterator[Sample]]] = {
+    "sensor_msgs/msg/Image": _convert_image,
+    "sensor_msgs/msg/CompressedImage": _convert_compressed_image,
+    "sensor_msgs/msg/CameraInfo": _convert_camera_info,
+    "nav_msgs/msg/Odometry": _convert_odometry,
+    "sensor_msgs/msg/Imu": _convert_imu,
+    "geometry_msgs/msg/TwistStamped": _convert_twist,
+    "geometry_msgs/msg/PoseStamped": _convert_pose,
+    "sensor_msgs/msg/Range": _convert_range,
+    "tf2_msgs/msg/TFMessage": _convert_transforms,
 }

@@ -15,7 +15,7 @@ from dmrl.guards import limits
 from dmrl.guards.paths import refuse_pipes
 from dmrl.images.codec import decode
 from dmrl.labelling.recorded_camera import choose_robot
-from dmrl.recording import read, summary
+from dmrl.recording import read, read_summary
 from dmrl.terminal.progress import track
 
 PICTURES = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp")
@@ -57,15 +57,15 @@ def calibrate_by_board(
                 "Calibrate with pictures of one size"
             )
         pictures += 1
-        at = intrinsics.corners(np.asarray(rgb.mean(axis=2), np.uint8), columns, rows)
+        at = intrinsics.find_corners(np.asarray(rgb.mean(axis=2), np.uint8), columns, rows)
         views += [] if at is None else [at]
-    if len(views) < intrinsics.LEAST_BOARDS or size_px is None:
+    if len(views) < intrinsics.MIN_BOARDS or size_px is None:
         raise SourceError(
             f"{source}: a board of {columns}x{rows} inner corners in {len(views)} of {pictures} "
-            f"pictures; {intrinsics.LEAST_BOARDS} are needed. Check --board, and light and focus"
+            f"pictures; {intrinsics.MIN_BOARDS} are needed. Check --board, and light and focus"
             + (", or look at more: --every 1" if source.is_file() and every > 1 else "")
         )
-    found = intrinsics.intrinsics(views, (columns, rows), size_px)
+    found = intrinsics.calibrate_intrinsics(views, (columns, rows), size_px)
     figures = {
         "pictures": pictures,
         "with_board": len(views),
@@ -95,8 +95,8 @@ def _read_pictures(source: Path, robot: str | None, every: int) -> Iterator[tupl
         yield from ((str(path), path.read_bytes()) for path in track(paths, "Looking for boards"))
         return
     robot = choose_robot(source, robot, topics.CAMERA_IMAGE)
-    total = summary(source).topics[topics.camera_image(robot)].count
-    stamped = track(read(source, topics.camera_image(robot)), "Looking for boards", total)
+    total = read_summary(source).topics[topics.CAMERA_IMAGE(robot)].count
+    stamped = track(read(source, topics.CAMERA_IMAGE(robot)), "Looking for boards", total)
     for k, one in enumerate(stamped):
         if k % every == 0:
             yield f"{source}: the image at {one.time_ns} ns", one.message.data

@@ -4,7 +4,7 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import MissingTopic
-from dmrl.estimation.calibration.observations import Flight, PeerPath
+from dmrl.estimation.calibration.observations import CalibrationFlight, PeerPath
 from dmrl.labelling.flight_log import FlightLog
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
 from dmrl.labelling.observer_log import finite_attitude, select_detections
@@ -19,7 +19,7 @@ MOCAP_COVARIANCE = np.eye(3) * 0.01**2
 
 def read_calibration_flight(
     flight: FlightLog, robot: str, threshold: float | None, positions: str
-) -> Flight:
+) -> CalibrationFlight:
     """Return one observer's detections and the paths of its peers.
 
     Parameters
@@ -54,7 +54,7 @@ def read_calibration_flight(
         else _captured_path(flight, robot, peer)
         for peer in peers
     }
-    return Flight(
+    return CalibrationFlight(
         flight.to_seconds(time_ns),
         np.repeat(np.arange(len(time_ns)), np.diff(first)),
         detections[:, :2],

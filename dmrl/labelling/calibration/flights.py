@@ -7,7 +7,7 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError
-from dmrl.estimation.calibration.extrinsics import LEAST, Calibration, calibrate
+from dmrl.estimation.calibration.extrinsics import MIN_MATCHES, Calibration, calibrate_mount
 from dmrl.estimation.calibration.noise import Noise
 from dmrl.geometry.frames import Camera
 from dmrl.labelling.calibration.calibration_flight import read_calibration_flight
@@ -58,13 +58,13 @@ def calibrate_by_flights(
             camera = read_robot_camera(held, name, camera_file)
         camera = camera or recorded_camera(held, name)
         if camera is None:
-            raise MissingTopic(topics.calibration(name), held.topics, source)
+            raise MissingTopic(topics.CALIBRATION(name), held.topics, source)
         flights.append(read_calibration_flight(held, name, threshold, positions))
     assert camera is not None
-    found = calibrate(flights, camera, noise)
+    found = calibrate_mount(flights, camera, noise)
     if found is None:
         raise RecordingError(
-            f"{sources[0]}: fewer than {LEAST} detections of {robots[0]} lie near where its peers "
+            f"{sources[0]}: fewer than {MIN_MATCHES} detections of {robots[0]} lie near where its peers "
             "are. Was it the right model? Try: dmrl evaluate"
         )
     return found.camera, _figures(robots[0], found)

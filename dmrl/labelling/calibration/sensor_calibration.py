@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from dmrl.errors import RecordingError
 from dmrl.estimation.flight.pairs import estimate_pairs
-from dmrl.estimation.flight.random_effects import Pooled, pooled, told
+from dmrl.estimation.flight.random_effects import PooledConstants, flight_information, pool_flights
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.keyframes import GLOBALS, Noise
+from dmrl.estimation.solver.keyframes import GLOBALS, NoiseModel
 from dmrl.estimation.solver.residuals import CLOCK
 from dmrl.labelling.flight_log import SENSOR_TOPICS, read_flight
 from dmrl.labelling.sensor_file import OF_PAIR, OF_ROBOT, Names, SensorConstants, Value
@@ -67,7 +67,7 @@ class SensorCalibration:
     constants: list[Constant]
 
 
-def pool_flights(
+def pool_sensor_constants(
     sources: Sequence[Path], solved: Iterator[dict[Names, Estimate]]
 ) -> SensorCalibration:
     """Return the constants that flights of the same robots have in common.
@@ -86,7 +86,7 @@ def pool_flights(
         a constant would change no label.
     """
     found = [one for flight in solved for one in flight.items()]
-    usable = [(names, one) for names, one in found if one.refused not in UNUSABLE]
+    usable = [(names, one) for names, one in found if one.rejection_reason not in UNUSABLE]
     counts = {names: sum(n == names for n, _ in usable) for names, _ in usable}
     twice = [(names, one) for names, one in usable if counts[names] >= MIN_FLIGHTS]
     if not twice:
@@ -97,9 +97,11 @@ def pool_flights(
         )
     place = {key: at for names, _ in twice for key, at in _index_constants(names).items()}
     number = {subject: k for k, subject in enumerate(place)}
-    flights = [told(one, _number_constants(names, number)) for names, one in twice]
+    flights = [flight_information(one, _number_constants(names, number)) for names, one in twice]
     kinds = np.array(list(place.values()))
-    out = _select_constants(list(place), pooled(flights, kinds), Noise().prior_std()[kinds])
+    out = _select_constants(
+        list(place), pool_flights(flights, kinds), NoiseModel().prior_std()[kinds]
+    )
     if not out.sensors.names:
         raise RecordingError(
             f"{sources[0]}: {len(sources)} recordings agree on nothing of their sensors that is "
@@ -137,7 +139,7 @@ def _number_constants(names: Names, number: Mapping[Subject, int]) -> Ints:
 
 
 def _select_constants(
-    subjects: Sequence[Subject], found: Pooled, usual: Array
+    subjects: Sequence[Subject], found: PooledConstants, usual: Array
 ) -> SensorCalibration:
     better = (found.std < MAX_STD_SHARE * usual) | (np.abs(found.mean) > MIN_SIGMAS * found.std)
     columns = (found.mean, found.std, found.flights, better)

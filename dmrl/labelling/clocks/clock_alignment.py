@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
-from dmrl.estimation.signals.clock_alignment import Clock, connected
+from dmrl.estimation.signals.clock_alignment import Clock, connect_clocks
 from dmrl.formats.timestamps import dejitter
 from dmrl.labelling.clocks.retiming import MOCAP, Corrected
 from dmrl.labelling.clocks.time_alignment import (
@@ -14,7 +14,7 @@ from dmrl.labelling.clocks.time_alignment import (
     estimate_range_clocks,
 )
 from dmrl.labelling.flight_log import FlightLog, to_flight_log
-from dmrl.recording import Contents, read_table, splits
+from dmrl.recording import LoadedRecording, read_splits, read_table
 from dmrl.terminal.progress import say
 
 SIGNALS = (topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT, topics.RANGE, topics.TRUE_POSE)
@@ -43,7 +43,7 @@ class Sources:
     steady_cameras: bool = False
 
 
-def align_clocks(held: Contents, wanted: Sources) -> tuple[dict[str, Clock], Corrected]:
+def align_clocks(held: LoadedRecording, wanted: Sources) -> tuple[dict[str, Clock], Corrected]:
     """Return the correction of every clock, and the recording with corrected times.
 
     Raises
@@ -53,7 +53,7 @@ def align_clocks(held: Contents, wanted: Sources) -> tuple[dict[str, Clock], Cor
     SettingError
         If there is no such robot, or the recording has a split or labels, which are by time.
     """
-    if splits(held.path, held.summary):
+    if read_splits(held.path, held.summary):
         raise SettingError(f"{held.path} has a split by time already. Align before that")
     names = [*SIGNALS, *([topics.TRANSFORMS] if wanted.mocap else [])]
     flight = to_flight_log(held, *names)
@@ -80,7 +80,7 @@ def _robot_clocks(held: FlightLog, wanted: Sources) -> dict[str, Clock]:
         pairs |= {(MOCAP, robot): clock for robot, clock in seen.items() if clock is not None}
         robots |= {MOCAP, *seen}
     reference = _choose_reference(held, robots, wanted)
-    clocks = connected(pairs, reference)
+    clocks = connect_clocks(pairs, reference)
     if len(clocks) == 1 and not (wanted.cameras or wanted.steady_cameras):
         raise RecordingError(
             f"{held.path}: no robot saw what {reference} saw, for 20 s at least. Ranges of both "
@@ -120,7 +120,7 @@ def _camera_clocks(
                 "least; its camera's times stay with the robot's"
             )
             continue
-        found[f"{robot}/camera"] = clocks.get(robot, Clock(0.0)).after(clock)
+        found[f"{robot}/camera"] = clocks.get(robot, Clock(0.0)).compose_after(clock)
     if not found and len(clocks) < 2 and not steady:
         raise RecordingError(
             f"{held.path}: no camera saw its robot turn. Fly before a background with texture, "
@@ -129,7 +129,7 @@ def _camera_clocks(
     return found
 
 
-def _camera_topics(held: Contents | FlightLog) -> dict[str, str]:
+def _camera_topics(held: LoadedRecording | FlightLog) -> dict[str, str]:
     """Return the robot of every topic of images.
 
     Raises
@@ -137,7 +137,9 @@ def _camera_topics(held: Contents | FlightLog) -> dict[str, str]:
     SettingError
         If images have labels, detections or tracks already, which refer to their times.
     """
-    found = {t: n["robot"] for t in held.topics if (n := topics.names(topics.CAMERA_IMAGE, t))}
+    found = {
+        t: n["robot"] for t in held.topics if (n := topics.parse_topic(topics.CAMERA_IMAGE, t))
+    }
     for topic, robot in found.items():
         for made in (topics.LABELS, topics.DETECTIONS, topics.TRACKS):
             if made.format(robot=robot) in held.topics:
@@ -146,7 +148,7 @@ def _camera_topics(held: Contents | FlightLog) -> dict[str, str]:
     return found
 
 
-def _even_times(held: Contents) -> dict[str, dict[int, int]]:
+def _even_times(held: LoadedRecording) -> dict[str, dict[int, int]]:
     """Return even times by arrival times, for every topic of images stamped on arrival."""
     found = {}
     for topic in _camera_topics(held):

@@ -9,8 +9,15 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.estimation.signals.clock_alignment import Clock
-from dmrl.messages import message
-from dmrl.recording import Contents, RawMessage, RecordingWriter, parsed, read_raw, retime
+from dmrl.messages import message_class
+from dmrl.recording import (
+    LoadedRecording,
+    RawMessage,
+    RecordingWriter,
+    parse_message,
+    read_raw,
+    shift_times,
+)
 
 MOCAP = "mocap"
 """Stands where a robot's name does."""
@@ -35,7 +42,7 @@ class Corrected:
         Added to all times.
     """
 
-    held: Contents
+    held: LoadedRecording
     clocks: Mapping[str, Clock]
     steady: Mapping[str, Mapping[int, int]]
     later_ns: int = 0
@@ -48,7 +55,7 @@ class Corrected:
                 raws = read_raw(self.held.path, topic)
                 found += [self._of_transforms(raw).time_ns for raw in raws]
                 continue
-            times = self.held.times(topic)
+            times = self.held.get_times(topic)
             if len(times):
                 first = int(min(self.steady.get(topic, {}).values(), default=times.min()))
                 found.append(first + int(self._shift_ns(topic, np.array(first))))
@@ -58,7 +65,7 @@ class Corrected:
         """Copy the recording, corrected."""
         each = {topic: self._of_stamped for topic in self.held.topics if self._is_moved(topic)}
         each[topics.TRANSFORMS] = self._of_transforms
-        retime(self.held.path, sink, self._shift_ns, each)
+        shift_times(self.held.path, sink, self._shift_ns, each)
 
     def _is_moved(self, topic: str) -> bool:
         """Whether messages of a topic hold a time that changes."""
@@ -95,7 +102,7 @@ class Corrected:
         """A message of transforms: it is of the robot whose the first frame is."""
         robot = ""
         if _is_stamped(raw.schema_name):
-            frames = parsed(raw, message("FrameTransforms"), self.held.path).transforms
+            frames = parse_message(raw, message_class("FrameTransforms"), self.held.path).transforms
             robot = str(frames[0].child_frame_id.split("/")[0]) if frames else ""
         clock = self._clock_of(raw.topic, robot)
         shift_ns = int(self._lacking_ns(clock, np.array(raw.time_ns)))
@@ -106,7 +113,7 @@ class Corrected:
         data = raw.data
         if time_ns != raw.time_ns and _is_stamped(raw.schema_name):
             name = raw.schema_name.removeprefix("foxglove.")
-            decoded = parsed(raw, message(name), self.held.path)
+            decoded = parse_message(raw, message_class(name), self.held.path)
             parts: list[Any] = decoded.transforms if name == "FrameTransforms" else [decoded]
             for part in parts:
                 part.timestamp.seconds, part.timestamp.nanos = divmod(time_ns, 1_000_000_000)

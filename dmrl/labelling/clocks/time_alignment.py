@@ -11,10 +11,10 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.estimation.signals.clock_alignment import Clock, estimate_clock
-from dmrl.estimation.signals.image_motion import rates, shift, small
+from dmrl.estimation.signals.image_motion import estimate_shift, shift_rates, shrink_image
 from dmrl.estimation.signals.ranging_clocks import estimate_from_exchanges
 from dmrl.geometry.frames import Array
-from dmrl.geometry.rotations import euler_zyx
+from dmrl.geometry.rotations import quaternion_to_euler
 from dmrl.images import codec
 from dmrl.labelling.flight_log import FlightLog, Samples
 from dmrl.recording import read
@@ -73,22 +73,22 @@ def estimate_camera_clock(
     SourceError
         If an image cannot be decoded.
     """
-    topic = topics.camera_image(robot)
+    topic = topics.CAMERA_IMAGE(robot)
     if robot not in flight.attitude:
         return None
     times, moved, before = [], [], None
     count = flight.topics[topic].count
     for stamped in track(read(flight.path, topic), f"Turns of {robot}'s camera", count):
         at = f"{topic} at {stamped.time_ns} ns in {flight.path}"
-        after = small(codec.decode(stamped.message.data, at))
+        after = shrink_image(codec.decode(stamped.message.data, at))
         if before is not None:
-            moved.append(shift(before, after) or (np.nan, np.nan))
+            moved.append(estimate_shift(before, after) or (np.nan, np.nan))
         times.append(even_ns.get(stamped.time_ns, stamped.time_ns))
         before = after
     if len(times) < 2:
         return None
     # A shift between two images is the mean rate between them, so it belongs to the middle.
-    middle, speed = rates(flight.to_seconds(np.array(times)), np.array(moved))
+    middle, speed = shift_rates(flight.to_seconds(np.array(times)), np.array(moved))
     # A camera that turns left makes the scene move right; nose down, up.
     turns = {"yaw rate": (middle, speed[:, 0]), "pitch rate": (middle, -speed[:, 1])}
     return _most_certain(_attitude_turns(flight, robot), turns)
@@ -172,7 +172,7 @@ def _pose_signals(time_s: Array, rows: Array) -> Signals:
     time_s, rows = time_s[keep], rows[keep]
     if len(keep) < 2:
         return {}
-    roll, pitch, yaw = euler_zyx(rows[:, 3:]).T
+    roll, pitch, yaw = quaternion_to_euler(rows[:, 3:]).T
     yaw = np.unwrap(yaw)  # it jumps by a whole turn where it passes half of one; its rate must not
     middle, step = (time_s[1:] + time_s[:-1]) / 2, np.diff(time_s)
     return {

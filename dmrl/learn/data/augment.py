@@ -16,45 +16,45 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dmrl.learn.data.batches import BOX, DEPTH, FIELDS, Batch, Examples, U, V
+from dmrl.learn.data.batches import BOX, DEPTH, ROBOT_FIELDS, Batch, ExampleSet, U, V
 from dmrl.learn.data.crops import (
+    CropWindow,
     Intrinsics,
     Opacity,
     Pixels,
     Point,
     Rect,
     Rng,
-    Robot,
-    Turn,
-    Window,
-    blended,
-    defocused,
-    feather,
-    flat,
-    grained,
-    greyed,
-    inside,
-    levelled,
-    moved,
-    parts,
-    present,
-    sample,
-    turned,
-    under,
+    RobotRow,
+    StepMatrix,
+    add_noise,
+    alpha_blend,
+    blur_pixels,
+    build_crop_homography,
+    build_feather_mask,
+    build_rotation_homography,
+    is_covered,
+    is_inside,
+    list_robots,
+    move_labels,
+    sample_window,
+    scale_channels,
+    tile_mosaic,
+    to_luma,
 )
 
-MAX_ROBOTS = 12
+MAX_ROBOTS_PER_IMAGE = 12
 """Maximum number of labelled robots in one image."""
 PATCH_MARGIN = 1.25
 """Side of a pasted patch over the side of the robot's box."""
-DISTRACTOR_SHARE = 0.4
+DISTRACTOR_FRACTION = 0.4
 """Fraction of patches that show a random position of a random image."""
-FOCUS_SHARE = 0.8
+FOCUS_FRACTION = 0.8
 """Fraction of windows that contain a robot of their image; the others are placed at random."""
-LEAST_AHEAD = 0.25
+MIN_DEPTH_RATIO = 0.25
 """Minimum ratio of smallest to largest depth, along the source's axis, over a rotated view's
 corners."""
-DEPTH_SLACK = 1.1
+DEPTH_RANGE_FACTOR = 1.1
 """Factor by which zooming may move a robot beyond the nearest and the farthest label."""
 
 
@@ -100,12 +100,12 @@ class Augmentation:
     grey_share: float = 0.0
 
     @property
-    def plain(self) -> "Augmentation":
+    def without_geometry(self) -> "Augmentation":
         """The same without zoom, rotation, mosaic and pasted patches."""
         return replace(self, zoom=(1.0, 1.0), rotation_deg=0.0, mosaic_share=0.0, paste=0.0)
 
     @property
-    def is_nothing(self) -> bool:
+    def is_identity(self) -> bool:
         """Whether images stay unchanged."""
         return self == Augmentation()
 
@@ -123,14 +123,14 @@ class Augmenter:
         Seed. A batch depends only on the seed, the epoch and its index in the epoch.
     """
 
-    def __init__(self, examples: Examples, settings: Augmentation, *, seed: int) -> None:
+    def __init__(self, examples: ExampleSet, settings: Augmentation, *, seed: int) -> None:
         self._examples, self._settings, self._seed = examples, settings, seed
         self._height, self._width, _ = examples.image_shape
         robots = examples.robots
         there = np.isfinite(robots[..., U])
         depths = robots[..., DEPTH][there]
         self._depths = (
-            (float(depths.min()) / DEPTH_SLACK, float(depths.max()) * DEPTH_SLACK)
+            (float(depths.min()) / DEPTH_RANGE_FACTOR, float(depths.max()) * DEPTH_RANGE_FACTOR)
             if len(depths)
             else (0.0, math.inf)
         )
@@ -138,7 +138,9 @@ class Augmenter:
         numbers = 2 * self._height * self._width * 3 if settings.noise else 0
         self._grain = np.random.default_rng([seed, 1]).standard_normal(numbers, np.float32)
 
-    def batch(self, chosen: Sequence[int] | NDArray[np.int64], *, epoch: int, index: int) -> Batch:
+    def augment_batch(
+        self, chosen: Sequence[int] | NDArray[np.int64], *, epoch: int, index: int
+    ) -> Batch:
         """Return an augmented batch: one canvas for each of the chosen images.
 
         Parameters
@@ -150,51 +152,51 @@ class Augmenter:
         """
         rng = np.random.default_rng([self._seed, epoch, index])
         canvas = np.empty((len(chosen), self._height, self._width, 3), np.uint8)
-        robots = np.full((len(chosen), MAX_ROBOTS, len(FIELDS)), np.nan, np.float32)
+        robots = np.full((len(chosen), MAX_ROBOTS_PER_IMAGE, len(ROBOT_FIELDS)), np.nan, np.float32)
         for slot, number in enumerate(chosen):
-            if found := self._draw(canvas[slot], int(number), rng)[:MAX_ROBOTS]:
+            if found := self._draw_canvas(canvas[slot], int(number), rng)[:MAX_ROBOTS_PER_IMAGE]:
                 robots[slot, : len(found)] = found
         return Batch(torch.from_numpy(canvas).permute(0, 3, 1, 2), torch.from_numpy(robots))
 
-    def _draw(self, canvas: Pixels, number: int, rng: Rng) -> list[Robot]:
+    def _draw_canvas(self, canvas: Pixels, number: int, rng: Rng) -> list[RobotRow]:
         """Draw a canvas (H, W, 3) and return its robots."""
-        robots: list[Robot] = []
+        robots: list[RobotRow] = []
         whole = (0, 0, self._width, self._height)
         mosaic = rng.random() < self._settings.mosaic_share
-        rects = parts(whole, rng) if mosaic else [whole]
+        rects = tile_mosaic(whole, rng) if mosaic else [whole]
         others = rng.integers(len(self._examples), size=len(rects) - 1)
         for rect, source in zip(rects, (number, *others.tolist()), strict=True):
-            robots = self._layer(canvas, rect, source, robots, rng)
+            robots = self._draw_layer(canvas, rect, source, robots, rng)
         for _ in range(int(rng.poisson(self._settings.paste))):
-            robots = self._patch(canvas, robots, rng)
-        self._spoil(canvas, rng)
+            robots = self._paste_patch(canvas, robots, rng)
+        self._degrade_image(canvas, rng)
         return robots
 
-    def _layer(
-        self, canvas: Pixels, rect: Rect, source: int, robots: list[Robot], rng: Rng
-    ) -> list[Robot]:
+    def _draw_layer(
+        self, canvas: Pixels, rect: Rect, source: int, robots: list[RobotRow], rng: Rng
+    ) -> list[RobotRow]:
         """Draw a window of a source in a rectangle; return the robots of the canvas after it."""
         width, height = rect[2] - rect[0], rect[3] - rect[1]
-        mine = present(self._examples.robots[source])
+        mine = list_robots(self._examples.robots[source])
         focus = mine[int(rng.integers(len(mine)))] if mine else None
-        zoom = self._zoom(focus, rng)
+        zoom = self._sample_zoom(focus, rng)
         zoom = max(zoom, width / self._width, height / self._height)  # stay inside the source
-        held = focus if focus and rng.random() < FOCUS_SHARE else None
+        held = focus if focus and rng.random() < FOCUS_FRACTION else None
         seen = (
-            _looked_at(self._width, width / (2 * zoom), held[U] if held else None, rng),
-            _looked_at(self._height, height / (2 * zoom), held[V] if held else None, rng),
+            _sample_centre(self._width, width / (2 * zoom), held[U] if held else None, rng),
+            _sample_centre(self._height, height / (2 * zoom), held[V] if held else None, rng),
         )
         shown = (width / 2, height / 2)
-        turn = self._turn(zoom, rng)
+        turn = self._sample_rotation(zoom, rng)
         if focus:  # the camera rotation is exact at the robot's new position
-            at = _back(turn, focus[U] - seen[0], focus[V] - seen[1])
+            at = _step_to_canvas(turn, focus[U] - seen[0], focus[V] - seen[1])
             at = (at[0] + shown[0], at[1] + shown[1])
             if 0 <= at[0] < width and 0 <= at[1] < height:
                 seen, shown = (focus[U], focus[V]), at
-        window = self._window(turn, zoom, seen, shown, rect)
-        return self._show(canvas, rect, source, window, mine, robots, rng)
+        window = self._build_window(turn, zoom, seen, shown, rect)
+        return self._render_window(canvas, rect, source, window, mine, robots, rng)
 
-    def _patch(self, canvas: Pixels, robots: list[Robot], rng: Rng) -> list[Robot]:
+    def _paste_patch(self, canvas: Pixels, robots: list[RobotRow], rng: Rng) -> list[RobotRow]:
         """Paste a robot of another image, or sometimes a patch without one.
 
         The patch follows the robot's mask if there is one, else a box with a feathered border.
@@ -203,8 +205,8 @@ class Augmenter:
         if not len(self._pasteable):
             return robots
         source, which = self._pasteable[rng.integers(len(self._pasteable))].tolist()
-        robot: Robot = self._examples.robots[source, which].tolist()
-        zoom = self._zoom(robot, rng)
+        robot: RobotRow = self._examples.robots[source, which].tolist()
+        zoom = self._sample_zoom(robot, rng)
         west, north, east, south = robot[BOX]
         width = math.ceil(zoom * PATCH_MARGIN * (east - west)) + 8
         height = math.ceil(zoom * PATCH_MARGIN * (south - north)) + 8
@@ -213,23 +215,23 @@ class Augmenter:
         left = int(rng.uniform(0, self._width - width + 1))
         top = int(rng.uniform(0, self._height - height + 1))
         rect, shown = (left, top, left + width, top + height), (width / 2, height / 2)
-        mask = self._examples.mask(source, which)
+        mask = self._examples.get_mask(source, which)
         middle = ((west + east) / 2 + rng.uniform(-2, 2), (north + south) / 2 + rng.uniform(-2, 2))
         centre = middle
-        if rng.random() < DISTRACTOR_SHARE:
+        if rng.random() < DISTRACTOR_FRACTION:
             source = int(rng.integers(len(self._examples)))
             centre = (rng.uniform(0, self._width), rng.uniform(0, self._height))
-        turn = self._turn(zoom, rng)
-        window = self._window(turn, zoom, centre, shown, rect)
-        opacity = feather(height, width)
+        turn = self._sample_rotation(zoom, rng)
+        window = self._build_window(turn, zoom, centre, shown, rect)
+        opacity = build_feather_mask(height, width)
         if mask is not None:
-            about = self._window(turn, zoom, middle, shown, rect)
-            cut = sample(255 * mask, about, (height, width), sharp=False)
+            about = self._build_window(turn, zoom, middle, shown, rect)
+            cut = sample_window(255 * mask, about, (height, width), sharp=False)
             opacity = np.asarray(cut / np.float32(255), np.float32)
-        mine = present(self._examples.robots[source])
-        return self._show(canvas, rect, source, window, mine, robots, rng, opacity)
+        mine = list_robots(self._examples.robots[source])
+        return self._render_window(canvas, rect, source, window, mine, robots, rng, opacity)
 
-    def _zoom(self, robot: Robot | None, rng: Rng) -> float:
+    def _sample_zoom(self, robot: RobotRow | None, rng: Rng) -> float:
         """Sample a log-uniform magnification; the depth stays in the range of the labels."""
         low, high = self._settings.zoom
         if robot is not None:
@@ -238,7 +240,7 @@ class Augmenter:
             high = max(min(high, max(depth_m / self._depths[0], 1.0)), low)
         return math.exp(rng.uniform(math.log(low), math.log(high)))
 
-    def _turn(self, zoom: float, rng: Rng) -> Turn:
+    def _sample_rotation(self, zoom: float, rng: Rng) -> StepMatrix:
         """Sample the (2, 2) matrix from steps on the canvas to steps in the source."""
         most = math.radians(self._settings.rotation_deg)
         angle = rng.uniform(-most, most)
@@ -246,62 +248,66 @@ class Augmenter:
         along, across = math.cos(angle) / zoom, math.sin(angle) / zoom
         return (mirror * along, -across), (mirror * across, along)
 
-    def _window(self, turn: Turn, zoom: float, seen: Point, shown: Point, rect: Rect) -> Window:
+    def _build_window(
+        self, turn: StepMatrix, zoom: float, seen: Point, shown: Point, rect: Rect
+    ) -> CropWindow:
         """Build the window of a rectangle that maps a source point to one of its points."""
         camera = self._settings.intrinsics
         if camera:
-            matrix = turned(camera, turn, seen, shown, (rect[0], rect[1]))
+            matrix = build_rotation_homography(camera, turn, seen, shown, (rect[0], rect[1]))
             x, y, whole = matrix[2].tolist()
             right, down = x * (rect[2] - rect[0]), y * (rect[3] - rect[1])
             ahead = (whole, whole + right, whole + down, whole + right + down)
-            if min(ahead) > LEAST_AHEAD * max(ahead):
-                return Window(matrix, zoom, camera)
-        return Window(flat(turn, seen, shown), zoom)
+            if min(ahead) > MIN_DEPTH_RATIO * max(ahead):
+                return CropWindow(matrix, zoom, camera)
+        return CropWindow(build_crop_homography(turn, seen, shown), zoom)
 
-    def _show(
+    def _render_window(
         self,
         canvas: Pixels,
         rect: Rect,
         source: int,
-        window: Window,
-        mine: list[Robot],
-        robots: list[Robot],
+        window: CropWindow,
+        mine: list[RobotRow],
+        robots: list[RobotRow],
         rng: Rng,
         opacity: Opacity | None = None,
-    ) -> list[Robot]:
+    ) -> list[RobotRow]:
         """Render a window into the canvas; return the robots that are then visible."""
         left, top, right, bottom = rect
-        pixels = sample(self._examples.image(source), window, (bottom - top, right - left))
-        pixels = self._tinted(pixels, rng)
+        pixels = sample_window(
+            self._examples.get_image(source), window, (bottom - top, right - left)
+        )
+        pixels = self._jitter_colours(pixels, rng)
         place = canvas[top:bottom, left:right]
-        place[:] = pixels if opacity is None else blended(place, pixels, opacity)
+        place[:] = pixels if opacity is None else alpha_blend(place, pixels, opacity)
         whole = (0, 0, self._width, self._height)
-        new = moved([robot for robot in mine if inside(robot, whole)], window, rect)
-        kept = [robot for robot in robots if not under(robot, rect, opacity)]
-        return kept + [robot for robot in new if under(robot, rect, opacity)]
+        new = move_labels([robot for robot in mine if is_inside(robot, whole)], window, rect)
+        kept = [robot for robot in robots if not is_covered(robot, rect, opacity)]
+        return kept + [robot for robot in new if is_covered(robot, rect, opacity)]
 
-    def _tinted(self, pixels: Pixels, rng: Rng) -> Pixels:
+    def _jitter_colours(self, pixels: Pixels, rng: Rng) -> Pixels:
         """Return the pixels with random contrast, brightness and white balance."""
         spread = self._settings.colour
         if not spread:
             return pixels
         contrast, *white, light = rng.normal(0, spread, 5).tolist()
         gain = [math.exp(contrast + channel / 2) for channel in white]
-        return levelled(pixels, gain, [128 * (1 - times + light) for times in gain])
+        return scale_channels(pixels, gain, [128 * (1 - times + light) for times in gain])
 
-    def _spoil(self, canvas: Pixels, rng: Rng) -> None:
+    def _degrade_image(self, canvas: Pixels, rng: Rng) -> None:
         """Apply defocus, sensor noise and loss of colours, in place."""
         if rng.random() < self._settings.blur_share:
-            canvas[:] = defocused(canvas, rng.uniform(0.1, 1 / 3))
+            canvas[:] = blur_pixels(canvas, rng.uniform(0.1, 1 / 3))
         if self._settings.noise:
             at = int(rng.integers(len(self._grain) - canvas.size))
             grain = self._grain[at : at + canvas.size]
-            canvas[:] = grained(canvas, grain, 255 * self._settings.noise * rng.random())
+            canvas[:] = add_noise(canvas, grain, 255 * self._settings.noise * rng.random())
         if self._settings.grey_share and rng.random() < self._settings.grey_share:
-            canvas[:] = greyed(canvas)
+            canvas[:] = to_luma(canvas)
 
 
-def _looked_at(whole: float, half: float, held: float | None, rng: Rng) -> float:
+def _sample_centre(whole: float, half: float, held: float | None, rng: Rng) -> float:
     """Sample the centre of a window along an axis, given its half size.
 
     The window stays inside the image and, where ``held`` is a position, contains it.
@@ -312,7 +318,7 @@ def _looked_at(whole: float, half: float, held: float | None, rng: Rng) -> float
     return float(rng.uniform(low, high))
 
 
-def _back(turn: Turn, right: float, down: float) -> Point:
+def _step_to_canvas(turn: StepMatrix, right: float, down: float) -> Point:
     """Return a step in the source as a step on the canvas."""
     (a, b), (c, d) = turn
     area = a * d - b * c

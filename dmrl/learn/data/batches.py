@@ -20,7 +20,7 @@ from torch import Tensor
 Robots = NDArray[np.float32]
 """(..., 11): ``ROBOT_FIELDS`` of each robot; a row whose u is NaN is no robot."""
 
-FIELDS = (
+ROBOT_FIELDS = (
     *("u_px", "v_px", "depth_m", "sigma_u_px", "sigma_v_px", "sigma_depth_m"),
     *("left_px", "top_px", "right_px", "bottom_px"),
     "class_id",
@@ -28,7 +28,7 @@ FIELDS = (
 U, V, DEPTH, SIGMA_U, SIGMA_V, SIGMA_DEPTH = range(6)
 BOX, CLASS_ID = slice(6, 10), 10
 
-BLOCK, WINDOW = 64, 8192
+SHUFFLE_BLOCK_IMAGES, SHUFFLE_WINDOW_IMAGES = 64, 8192
 """Images of a block, contiguous on disk as one Arrow batch; and images shuffled at a time, the
 working set of reads: 1.8 GB at 320 x 224 pixels."""
 
@@ -46,7 +46,7 @@ class Batch(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Examples:
+class ExampleSet:
     """Images with their robots.
 
     Parameters
@@ -87,36 +87,36 @@ class Examples:
         height, width, channels = self.pixels[0].shape[1:]
         return height, width, channels
 
-    def select(self, chosen: NDArray[np.bool_]) -> "Examples":
+    def select(self, chosen: NDArray[np.bool_]) -> "ExampleSet":
         """Return the chosen images, one chunk each, not copied."""
         numbers = np.flatnonzero(chosen)
-        places = [self._at(index) for index in numbers.tolist()]
+        places = [self._locate_image(index) for index in numbers.tolist()]
         chunks = [self.pixels[chunk][place][None] for chunk, place in places]
         masks = [self.masks[chunk][place][None] for chunk, place in places if self.masks]
-        return Examples(chunks, self.robots[numbers], masks)
+        return ExampleSet(chunks, self.robots[numbers], masks)
 
-    def image(self, index: int) -> NDArray[np.uint8]:
+    def get_image(self, index: int) -> NDArray[np.uint8]:
         """Return the (H, W, 3) image at an index."""
-        chunk, place = self._at(index)
+        chunk, place = self._locate_image(index)
         found: NDArray[np.uint8] = self.pixels[chunk][place]
         return found
 
-    def mask(self, index: int, robot: int) -> NDArray[np.uint8] | None:
+    def get_mask(self, index: int, robot: int) -> NDArray[np.uint8] | None:
         """Return (H, W) 1 where an image shows this robot; None if its centre is not visible."""
         if not self.masks:
             return None
-        chunk, place = self._at(index)
+        chunk, place = self._locate_image(index)
         mine: NDArray[np.uint8] = (self.masks[chunk][place] == robot + 1).view(np.uint8)
         u, v = self.robots[index, robot, [U, V]]
         seen = 0 <= u < mine.shape[1] and 0 <= v < mine.shape[0] and mine[int(v), int(u)]
         return mine if seen else None
 
-    def _at(self, index: int) -> tuple[int, int]:
+    def _locate_image(self, index: int) -> tuple[int, int]:
         chunk = bisect_right(self._ends, index)
         return chunk, index - (self._ends[chunk - 1] if chunk else 0)
 
 
-def order(
+def epoch_indices(
     count: int,
     *,
     seed: int,
@@ -145,7 +145,11 @@ def order(
     rng = np.random.default_rng([seed, epoch])
     images = images or count
     if shares is None and images == count:
-        return _by_windows(count, rng) if count > WINDOW else rng.permutation(count)
+        return (
+            _shuffle_windows(count, rng)
+            if count > SHUFFLE_WINDOW_IMAGES
+            else rng.permutation(count)
+        )
     shares = np.ones(count) if shares is None else shares
     # Systematic sampling: every image appears floor or ceil of its share, and the sum is exact.
     ticks = np.floor(np.cumsum(shares[rng.permutation(count)]) * images / shares.sum() + 1e-9)
@@ -155,33 +159,35 @@ def order(
     return rng.permutation(np.repeat(rng.permutation(count), times))
 
 
-def _by_windows(count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    blocks = rng.permutation(-(-count // BLOCK))
-    rows = (blocks[:, None] * BLOCK + np.arange(BLOCK)).ravel()
+def _shuffle_windows(count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    blocks = rng.permutation(-(-count // SHUFFLE_BLOCK_IMAGES))
+    rows = (blocks[:, None] * SHUFFLE_BLOCK_IMAGES + np.arange(SHUFFLE_BLOCK_IMAGES)).ravel()
     rows = rows[rows < count]
-    starts = range(0, count, WINDOW)
-    return np.concatenate([rng.permutation(rows[start : start + WINDOW]) for start in starts])
+    starts = range(0, count, SHUFFLE_WINDOW_IMAGES)
+    return np.concatenate(
+        [rng.permutation(rows[start : start + SHUFFLE_WINDOW_IMAGES]) for start in starts]
+    )
 
 
-def batch_count(count: int, batch_size: int) -> int:
+def count_batches(count: int, batch_size: int) -> int:
     """Return the number of batches in an epoch; the last may be short."""
     return -(-count // batch_size)
 
 
-def gathered(examples: Examples, chosen: Sequence[int] | NDArray[np.int64]) -> Batch:
+def collate(examples: ExampleSet, chosen: Sequence[int] | NDArray[np.int64]) -> Batch:
     """Collate the chosen examples into a batch, without augmentation."""
-    images = np.stack([examples.image(int(index)) for index in chosen])
+    images = np.stack([examples.get_image(int(index)) for index in chosen])
     robots = torch.from_numpy(examples.robots[np.asarray(chosen)])
     return Batch(torch.from_numpy(images).permute(0, 3, 1, 2), robots)
 
 
-def in_order(examples: Examples, batch_size: int) -> Iterator[Batch]:
+def iter_batches(examples: ExampleSet, batch_size: int) -> Iterator[Batch]:
     """Yield batches of all examples in order."""
     for start in range(0, len(examples), batch_size):
-        yield gathered(examples, np.arange(start, min(start + batch_size, len(examples))))
+        yield collate(examples, np.arange(start, min(start + batch_size, len(examples))))
 
 
-def ahead(items: Iterator[T]) -> Iterator[T]:
+def prefetch(items: Iterator[T]) -> Iterator[T]:
     """Yield the items, computing the next one in a thread meanwhile."""
     with ThreadPoolExecutor(1) as pool:
         ends = object()

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from dmrl.learn.data.batches import CLASS_ID, DEPTH, SIGMA_DEPTH, SIGMA_U, SIGMA_V, U, V
-from dmrl.learn.networks.architectures import by_name
+from dmrl.learn.networks.architectures import unbind_channels
 
-PRESENT = 0.1
+MIN_PRESENCE = 0.1
 """Lower bound of g for cells that train depth and offset."""
-TOLERANCE_PX, TOLERANCE_DEPTH = 8.0, 0.1
+SIGMA_TOLERANCE_PX, SIGMA_TOLERANCE_DEPTH = 8.0, 0.1
 """Sigma (pixels; fraction of the depth) at which a label has half weight."""
 
 LabelNoise = Literal["ignore", "weight", "soften"]
@@ -52,7 +52,7 @@ class Targets(NamedTuple):
     class_id: Tensor
 
 
-def targets(
+def build_targets(
     robots: Tensor,
     shape: tuple[int, int],
     *,
@@ -83,19 +83,21 @@ def targets(
     # ``ahead`` removes robots by a product with 0, which NaN would survive.
     clean = torch.nan_to_num(robots, nan=0.0)
     sigma_px = (clean[..., SIGMA_U].square() + clean[..., SIGMA_V].square()).div(2).sqrt()
-    du, dv = _from_middles(clean[..., (U, V)] / stride_px, shape)
-    present = _presence(du, dv, sigma_cells, sigma_px / stride_px, soften=label_noise == "soften")
+    du, dv = _offsets_from_cells(clean[..., (U, V)] / stride_px, shape)
+    present = _compute_presence(
+        du, dv, sigma_cells, sigma_px / stride_px, soften=label_noise == "soften"
+    )
     present = present * ahead[..., None, None]
     # Slightly raise the presence of nearer robots, to break ties.
     rank = present * (1 + 1e-3 / (1 + clean[..., DEPTH, None, None]))
     best = rank.argmax(dim=1, keepdim=True)
     confidence = present.amax(dim=1)
-    near = confidence * (confidence >= PRESENT)
+    near = confidence * (confidence >= MIN_PRESENCE)
     trust_px, trust_depth = torch.ones_like(near), torch.ones_like(near)
     if label_noise == "weight":
         relative = clean[..., SIGMA_DEPTH] / clean[..., DEPTH].clamp(min=1e-3)
-        trust_px = _of(best, _trust(sigma_px / TOLERANCE_PX))
-        trust_depth = _of(best, _trust(relative / TOLERANCE_DEPTH))
+        trust_px = _gather_best(best, _label_weight(sigma_px / SIGMA_TOLERANCE_PX))
+        trust_depth = _gather_best(best, _label_weight(relative / SIGMA_TOLERANCE_DEPTH))
     found = near > 0
     class_id = torch.nan_to_num(robots[..., CLASS_ID, None, None], nan=-1.0)
     return Targets(
@@ -105,19 +107,19 @@ def targets(
         near * trust_depth,
         near * trust_px,
         # 1 m where there is no robot, so that the logarithm is finite; the weight there is 0.
-        torch.where(found, _of(best, clean[..., DEPTH, None, None]), 1.0),
-        torch.stack((_of(best, du), _of(best, dv)), dim=1) * found[:, None],
-        torch.where(found, _of(best, class_id), -1.0).to(torch.int64),
+        torch.where(found, _gather_best(best, clean[..., DEPTH, None, None]), 1.0),
+        torch.stack((_gather_best(best, du), _gather_best(best, dv)), dim=1) * found[:, None],
+        torch.where(found, _gather_best(best, class_id), -1.0).to(torch.int64),
     )
 
 
-def _from_middles(centre: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def _offsets_from_cells(centre: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Return the offsets (N, K, 1, cols) and (N, K, rows, 1) from cell to robot centres, cells."""
     rows, cols = (torch.arange(n, device=centre.device) + 0.5 for n in shape)
     return centre[..., 0, None, None] - cols, centre[..., 1, None, None] - rows[:, None]
 
 
-def _of(best: Tensor, values: Tensor) -> Tensor:
+def _gather_best(best: Tensor, values: Tensor) -> Tensor:
     """Return (N, rows, cols) the value of the robot with the highest presence in each cell.
 
     ``best`` is (N, 1, rows, cols), the index of that robot. ``values`` are (N, K, ...), broadcast
@@ -127,7 +129,7 @@ def _of(best: Tensor, values: Tensor) -> Tensor:
     return every.gather(1, best)[:, 0]
 
 
-def as_targets(channels: Sequence[str], output: Tensor, labelled: Targets) -> Targets:
+def build_teacher_targets(channels: Sequence[str], output: Tensor, labelled: Targets) -> Targets:
     """Build targets for N images from a teacher's output, for distillation (Hinton et al. 2015).
 
     The teacher's confidence is the target in all cells. Depth and offset are weighted by that
@@ -142,9 +144,9 @@ def as_targets(channels: Sequence[str], output: Tensor, labelled: Targets) -> Ta
     labelled
         Targets of the same images from their labels.
     """
-    out = by_name(channels, output)
+    out = unbind_channels(channels, output)
     confidence = out["confidence"].sigmoid()
-    near = confidence * (confidence >= PRESENT)
+    near = confidence * (confidence >= MIN_PRESENCE)
     offset = labelled.offset
     if "offset_u" in out:
         offset = torch.stack((out["offset_u"], out["offset_v"]), dim=1)
@@ -158,7 +160,7 @@ def as_targets(channels: Sequence[str], output: Tensor, labelled: Targets) -> Ta
     )
 
 
-def _presence(
+def _compute_presence(
     du: Tensor, dv: Tensor, sigma_cells: float, sigma_label: Tensor, *, soften: bool
 ) -> Tensor:
     """Return (N, K, rows, cols) the presence g of every robot in every cell."""
@@ -176,6 +178,6 @@ def _presence(
     return (scale * du.square()).exp() * (scale * dv.square()).exp() * height[..., None, None]
 
 
-def _trust(ratio: Tensor) -> Tensor:
+def _label_weight(ratio: Tensor) -> Tensor:
     """Return the weight of labels by the ratio of sigma and tolerance."""
     return (1 / (1 + ratio.square()))[..., None, None]

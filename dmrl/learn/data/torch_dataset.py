@@ -11,12 +11,12 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from dmrl.errors import SettingError
-from dmrl.learn.data.batches import order
+from dmrl.learn.data.batches import epoch_indices
 
-Item = dict[str, Tensor]
+TensorRow = dict[str, Tensor]
 
 
-class Source(Protocol):
+class RowSource(Protocol):
     """Protocol of a data source that reads many rows at a time."""
 
     def __len__(self) -> int: ...
@@ -26,7 +26,7 @@ class Source(Protocol):
         ...
 
 
-class TorchRows(Dataset[Item]):
+class TorchRows(Dataset[TensorRow]):
     """Torch dataset of rows: ``image`` (3, H, W) uint8, the other columns unchanged.
 
     Parameters
@@ -35,20 +35,20 @@ class TorchRows(Dataset[Item]):
         Source of the rows.
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: RowSource) -> None:
         self.source = source
 
     def __len__(self) -> int:
         return len(self.source)
 
-    def __getitem__(self, index: int) -> Item:
-        return {name: value[0] for name, value in self.batch([index]).items()}
+    def __getitem__(self, index: int) -> TensorRow:
+        return {name: value[0] for name, value in self.get_batch([index]).items()}
 
-    def __getitems__(self, indices: Sequence[int]) -> Item:
+    def __getitems__(self, indices: Sequence[int]) -> TensorRow:
         """Return a batch for a DataLoader: read at once, it needs no collation."""
-        return self.batch(indices)
+        return self.get_batch(indices)
 
-    def batch(self, indices: Sequence[int]) -> Item:
+    def get_batch(self, indices: Sequence[int]) -> TensorRow:
         """Return rows as stacked tensors."""
         arrays = self.source.gathered(indices)
         tensors = {
@@ -57,7 +57,7 @@ class TorchRows(Dataset[Item]):
         return tensors | {"image": tensors["image"].permute(0, 3, 1, 2)}
 
 
-class Part(Sampler[int]):
+class ProcessSampler(Sampler[int]):
     """Sampler of the rows that one of several processes reads in an epoch.
 
     Parameters
@@ -86,18 +86,18 @@ class Part(Sampler[int]):
         self.count, self.shuffle, self.seed, self.epoch = count, shuffle, seed, 0
 
     def __len__(self) -> int:
-        low, high = self._ends()
+        low, high = self._row_range()
         return high - low
 
     def __iter__(self) -> Iterator[int]:
-        low, high = self._ends()
+        low, high = self._row_range()
         if not self.shuffle:
             return iter(range(low, high))
-        rows = order(self.count, seed=self.seed, epoch=self.epoch)[low:high]
+        rows = epoch_indices(self.count, seed=self.seed, epoch=self.epoch)[low:high]
         self.epoch += 1
         return iter(rows.tolist())
 
-    def _ends(self) -> tuple[int, int]:
+    def _row_range(self) -> tuple[int, int]:
         if self.shuffle:
             each = self.count // self.parts
             return self.number * each, (self.number + 1) * each
@@ -105,7 +105,7 @@ class Part(Sampler[int]):
         return low, high
 
 
-def part_of_torchrun() -> tuple[int, int]:
+def get_torchrun_rank() -> tuple[int, int]:
     """Return rank and number of processes from torchrun; (0, 1) without it."""
     try:
         return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
@@ -114,14 +114,14 @@ def part_of_torchrun() -> tuple[int, int]:
 
 
 def loader_of(
-    source: Source,
+    source: RowSource,
     batch_size: int,
     *,
     shuffle: bool,
     seed: int,
     workers: int,
     part: tuple[int, int] | None,
-) -> DataLoader[Item]:
+) -> DataLoader[TensorRow]:
     """Build a DataLoader that reads each batch at once.
 
     ``part`` is as in `ProcessSampler`; None: that of torchrun.
@@ -129,12 +129,14 @@ def loader_of(
     return DataLoader(
         TorchRows(source),
         batch_size=batch_size,
-        sampler=Part(len(source), part or part_of_torchrun(), shuffle=shuffle, seed=seed),
+        sampler=ProcessSampler(
+            len(source), part or get_torchrun_rank(), shuffle=shuffle, seed=seed
+        ),
         num_workers=workers,
-        collate_fn=_as_it_is,
+        collate_fn=_identity_collate,
         generator=torch.Generator().manual_seed(seed),
     )
 
 
-def _as_it_is(batch: Any) -> Any:
+def _identity_collate(batch: Any) -> Any:
     return batch

@@ -12,28 +12,28 @@ import numpy as np
 import torch
 from torch import nn
 
-from dmrl.learn.inference.detection_metrics import Scored
+from dmrl.learn.inference.detection_metrics import ScoredDetections
 from dmrl.learn.inference.matching import Array
 from dmrl.learn.networks.architectures import Network
 
-LEAST = 30
+MIN_DETECTIONS = 30
 """Minimum number of correct detections, and of wrong ones, for a fit."""
-FAINTEST = 0.02
+MIN_CONFIDENCE = 0.02
 """Lower bound of the confidence of detections in the fit; fainter ones are irrelevant in use."""
-STEPS, CLOSE, RIDGE = 50, 1e-9, 1e-6
+NEWTON_STEPS, NEWTON_TOLERANCE, NEWTON_RIDGE = 50, 1e-9, 1e-6
 """Newton's method: most steps, tolerance of loss and step, and diagonal added to the Hessian."""
-SLOPES = (0.2, 10.0)
+SLOPE_RANGE = (0.2, 10.0)
 """Accepted slopes. Others come from too few detections or an uninformative confidence."""
 
 
-class Calibration(NamedTuple):
+class PlattScaling(NamedTuple):
     """Slope and offset of the confidence logit: slope * logit + offset."""
 
     slope: float
     offset: float
 
 
-def calibration(scored: Scored) -> Calibration | None:
+def fit_calibration(scored: ScoredDetections) -> PlattScaling | None:
     """Fit the slope and offset that make each confidence the fraction of correct detections.
 
     A detection is correct within 16 px of a label.
@@ -49,17 +49,17 @@ def calibration(scored: Scored) -> Calibration | None:
         None if there are too few detections, or the slope is outside `SLOPE_RANGE`.
     """
     confidence = scored.detections.confidence
-    seen = confidence >= FAINTEST
+    seen = confidence >= MIN_CONFIDENCE
     right = (scored.right_16_px >= 0)[seen].astype(np.float64)
-    if min(right.sum(), len(right) - right.sum()) < LEAST:
+    if min(right.sum(), len(right) - right.sum()) < MIN_DETECTIONS:
         return None
     p = np.clip(confidence[seen], 1e-7, 1 - 1e-7)
     rows = np.column_stack([np.log(p / (1 - p)), np.ones(len(p))])
-    slope, offset = _fitted(rows, right).tolist()
-    return Calibration(slope, offset) if SLOPES[0] <= slope <= SLOPES[1] else None
+    slope, offset = _fit_logistic(rows, right).tolist()
+    return PlattScaling(slope, offset) if SLOPE_RANGE[0] <= slope <= SLOPE_RANGE[1] else None
 
 
-def _fitted(rows: Array, right: Array) -> Array:
+def _fit_logistic(rows: Array, right: Array) -> Array:
     """Fit a logistic regression of (N,) labels on (N, K) rows; return (K,) weights.
 
     Newton's method with step halving, so that the loss never increases.
@@ -70,19 +70,19 @@ def _fitted(rows: Array, right: Array) -> Array:
         return float((np.logaddexp(0, odds) - right * odds).sum())
 
     found, before = np.zeros(rows.shape[1]), np.inf
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         said = 1 / (1 + np.exp(-np.clip(rows @ found, -50, 50)))
-        bend = (rows.T * (said * (1 - said))) @ rows + RIDGE * np.eye(len(found))
+        bend = (rows.T * (said * (1 - said))) @ rows + NEWTON_RIDGE * np.eye(len(found))
         step = np.linalg.solve(bend, rows.T @ (said - right))
-        while loss(found - step) > loss(found) and np.abs(step).max() > CLOSE:
+        while loss(found - step) > loss(found) and np.abs(step).max() > NEWTON_TOLERANCE:
             step = step / 2
         found = found - step
-        if before - (before := loss(found)) < CLOSE:
+        if before - (before := loss(found)) < NEWTON_TOLERANCE:
             break
     return found
 
 
-def calibrate(network: Network, found: Calibration) -> bool:
+def apply_calibration(network: Network, found: PlattScaling) -> bool:
     """Write a calibration into the last layer, ``head``; return False if the network has none.
 
     Parameters

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-PER_DETECTION = ("u_px", "v_px", "depth_m", "confidence", "sigma_depth_m", "class_id")
+DETECTION_COLUMNS = ("u_px", "v_px", "depth_m", "confidence", "sigma_depth_m", "class_id")
 """Columns of `Detections`, named as the fields of a Detection message."""
-SAME_PX = 8.0
+DUPLICATE_RADIUS_PX = 8.0
 """Detections closer than this, in pixels, belong to one robot."""
 
 
@@ -46,7 +46,7 @@ class Grids(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class Detections:
     """Detections of N images, most confident first, K columns wide.
 
     Parameters
@@ -70,7 +70,7 @@ class Found:
     count: NDArray[np.int64]
 
 
-def peaks(confidence: NDArray[np.floating]) -> NDArray[np.bool_]:
+def find_peaks(confidence: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return the local maxima of (N, rows, cols) grids.
 
     Of equal neighbours, the first in raster order is the maximum, so every grid has one.
@@ -98,7 +98,7 @@ def decode(
     stride_px: int = 8,
     most: int = 20,
     min_confidence: float = 0.01,
-) -> Found:
+) -> Detections:
     """Decode the output grids of a network to detections.
 
     Parameters
@@ -118,7 +118,7 @@ def decode(
         Drop peaks below this confidence, but always keep the best of an image.
     """
     images, rows, cols = confidence.shape
-    score = np.where(peaks(confidence), confidence, -1.0).reshape(images, rows * cols)
+    score = np.where(find_peaks(confidence), confidence, -1.0).reshape(images, rows * cols)
     best = np.argsort(-score, axis=1, kind="stable")[:, :most]
     kept = np.take_along_axis(score, best, axis=1)
     row, col = np.divmod(best, cols)
@@ -129,21 +129,23 @@ def decode(
         uv = np.clip(uv, 0, np.array([cols, rows])[:, None, None])
     uv *= stride_px
 
-    def there(grid: NDArray[Any] | None) -> NDArray[Any]:
+    def gather_cells(grid: NDArray[Any] | None) -> NDArray[Any]:
         """Return a grid's values at the detections, 0 if there is no grid."""
         if grid is None:
             return np.zeros(best.shape, np.int64)
         return np.take_along_axis(grid.reshape(images, -1), best, axis=1)
 
-    depth = there(depth_m).astype(np.float64)
+    depth = gather_cells(depth_m).astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):  # outputs can be arbitrarily large
-        sigma = np.sqrt(2) * depth * there(spread)  # Laplace
+        sigma = np.sqrt(2) * depth * gather_cells(spread)  # Laplace
     count = np.maximum((kept >= max(min_confidence, 0.0)).sum(axis=1), 1)
-    found = Found(uv[0], uv[1], depth, kept.astype(np.float64), sigma, there(class_id), count)
-    return found if offset is None else _without_doubles(found)
+    found = Detections(
+        uv[0], uv[1], depth, kept.astype(np.float64), sigma, gather_cells(class_id), count
+    )
+    return found if offset is None else _drop_duplicates(found)
 
 
-def _without_doubles(found: Found) -> Found:
+def _drop_duplicates(found: Detections) -> Detections:
     """Drop detections that are close to a more confident one."""
     wide = found.u_px.shape[1]
     stays = np.arange(wide) < found.count[:, None]
@@ -152,10 +154,10 @@ def _without_doubles(found: Found) -> Found:
             found.u_px[:, :k] - found.u_px[:, k : k + 1],
             found.v_px[:, :k] - found.v_px[:, k : k + 1],
         )
-        stays[:, k] &= ~((away_px < SAME_PX) & stays[:, :k]).any(axis=1)
+        stays[:, k] &= ~((away_px < DUPLICATE_RADIUS_PX) & stays[:, :k]).any(axis=1)
     # Kept detections first, in their order.
     first = np.argsort(~stays, axis=1, kind="stable")
     sorted_columns = {
-        name: np.take_along_axis(getattr(found, name), first, axis=1) for name in PER_DETECTION
+        name: np.take_along_axis(getattr(found, name), first, axis=1) for name in DETECTION_COLUMNS
     }
-    return Found(**sorted_columns, count=stays.sum(axis=1))
+    return Detections(**sorted_columns, count=stays.sum(axis=1))

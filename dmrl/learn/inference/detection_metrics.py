@@ -12,18 +12,25 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.learn.inference.matching import Array, Errors, Index, Points, errors, hits
+from dmrl.learn.inference.matching import (
+    Array,
+    Index,
+    LabelErrors,
+    Points,
+    compute_errors,
+    match_within_radius,
+)
 
-BANDS_M = ((0.0, np.inf), (0.0, 0.5), (0.5, 1.0), (1.0, 1.5), (1.5, 2.0), (2.0, np.inf))
+DEPTH_BANDS_M = ((0.0, np.inf), (0.0, 0.5), (0.5, 1.0), (1.0, 1.5), (1.5, 2.0), (2.0, np.inf))
 """Bands of the label's depth, metres, lower end included; the first contains all labels."""
 
 Band = tuple[float, float]
-Across = Callable[[Callable[[Band], "BandFigures"], Sequence[Band]], Iterable["BandFigures"]]
+BandMap = Callable[[Callable[[Band], "BandMetrics"], Sequence[Band]], Iterable["BandMetrics"]]
 
 SCORE_RADIUS_PX = 16.0
 """Radius within which a detection is correct, pixels."""
 
-DEFINITIONS = {
+METRIC_DEFINITIONS = {
     "error": "label minus detection; an image with N labels inside the image has its N most "
     "confident detections matched to them one-to-one with the least total distance",
     "median_px": "median length of the pixel error; a label without a detection is infinitely far",
@@ -48,7 +55,7 @@ DEFINITIONS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class MetricValue:
     """One metric with its 95 % interval; NaN if there is nothing to measure."""
 
     value: float
@@ -57,7 +64,7 @@ class Figure:
 
 
 @dataclass(frozen=True, slots=True)
-class BandFigures:
+class BandMetrics:
     """Metrics of the labels in one depth band.
 
     Parameters
@@ -75,11 +82,11 @@ class BandFigures:
     labels: int
     images: int
     unmatched: int
-    figures: dict[str, Figure]
+    figures: dict[str, MetricValue]
 
 
 @dataclass(frozen=True, slots=True)
-class Scored:
+class ScoredDetections:
     """Labels and detections of ``images`` images, matched.
 
     Parameters
@@ -95,26 +102,31 @@ class Scored:
     images: int
     labels: Points
     detections: Points
-    label_error: Errors
+    label_error: LabelErrors
     right_8_px: Index
     right_16_px: Index
 
 
-def score(images: int, labels: Points, detections: Points) -> Scored:
+def score_detections(images: int, labels: Points, detections: Points) -> ScoredDetections:
     """Match labels and detections."""
-    return Scored(
+    return ScoredDetections(
         images,
         labels,
         detections,
-        errors(labels, detections),
-        hits(labels, detections, 8.0),
-        hits(labels, detections, SCORE_RADIUS_PX),
+        compute_errors(labels, detections),
+        match_within_radius(labels, detections, 8.0),
+        match_within_radius(labels, detections, SCORE_RADIUS_PX),
     )
 
 
-def by_band(
-    scored: Scored, *, threshold: float, draws: int = 1000, seed: int = 0, across: Across = map
-) -> list[BandFigures]:
+def compute_band_metrics(
+    scored: ScoredDetections,
+    *,
+    threshold: float,
+    draws: int = 1000,
+    seed: int = 0,
+    across: BandMap = map,
+) -> list[BandMetrics]:
     """Compute the metrics over all distances, then for each band of ``DEPTH_BANDS_M``.
 
     Parameters
@@ -130,15 +142,18 @@ def by_band(
     across
         Function that maps over the bands in their order, such as `map` or a parallel map.
     """
-    one = partial(_band, scored=scored, threshold=threshold, draws=draws, seed=seed)
-    return list(across(one, BANDS_M))
+    one = partial(_bootstrap_band, scored=scored, threshold=threshold, draws=draws, seed=seed)
+    return list(across(one, DEPTH_BANDS_M))
 
 
-def _band(band: Band, scored: Scored, threshold: float, draws: int, seed: int) -> BandFigures:
+def _bootstrap_band(
+    band: Band, scored: ScoredDetections, threshold: float, draws: int, seed: int
+) -> BandMetrics:
     inside = _in_band(scored.labels.depth_m, band)
-    value = figures(scored, band, threshold, np.ones((1, scored.images)))
+    value = compute_metrics(scored, band, threshold, np.ones((1, scored.images)))
     blocks = [
-        figures(scored, band, threshold, weights) for weights in resamples(scored, draws, seed)
+        compute_metrics(scored, band, threshold, weights)
+        for weights in iter_bootstrap_weights(scored, draws, seed)
     ]
     out = {}
     for name, (point,) in value.items():
@@ -150,8 +165,8 @@ def _band(band: Band, scored: Scored, threshold: float, draws: int, seed: int) -
             if len(sample) and np.isfinite(point)
             else (np.nan, np.nan)
         )
-        out[name] = Figure(float(point), float(low), float(high))
-    return BandFigures(
+        out[name] = MetricValue(float(point), float(low), float(high))
+    return BandMetrics(
         *band,
         labels=int(inside.sum()),
         images=len(np.unique(scored.labels.image[inside])),
@@ -161,7 +176,7 @@ def _band(band: Band, scored: Scored, threshold: float, draws: int, seed: int) -
 
 
 @dataclass(frozen=True, slots=True)
-class Curves:
+class MetricCurves:
     """Precision-recall curve and reliability diagram.
 
     Parameters
@@ -181,7 +196,7 @@ class Curves:
     bin_count: Index
 
 
-def curves(scored: Scored, most: int = 200) -> Curves:
+def compute_curves(scored: ScoredDetections, most: int = 200) -> MetricCurves:
     """Compute precision over recall, and reliability; detections are correct within 16 px.
 
     Parameters
@@ -201,7 +216,7 @@ def curves(scored: Scored, most: int = 200) -> Curves:
     place = np.clip((confidence[order] * 10).astype(int), 0, 9)
     count = np.bincount(place, minlength=10)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return Curves(
+        return MetricCurves(
             confidence[order][last],
             found[last] / (last + 1.0),
             found[last] / np.float64(len(scored.labels)),
@@ -211,7 +226,7 @@ def curves(scored: Scored, most: int = 200) -> Curves:
         )
 
 
-def resamples(scored: Scored, draws: int, seed: int) -> Iterator[Array]:
+def iter_bootstrap_weights(scored: ScoredDetections, draws: int, seed: int) -> Iterator[Array]:
     """Yield bootstrap weights in blocks (b, images), ``draws`` rows in all.
 
     A weight is the number of times an image was drawn.
@@ -227,12 +242,14 @@ def resamples(scored: Scored, draws: int, seed: int) -> Iterator[Array]:
         yield counts.reshape(rows, scored.images).astype(np.float64)
 
 
-def figures(scored: Scored, band: Band, threshold: float, weights: Array) -> dict[str, Array]:
+def compute_metrics(
+    scored: ScoredDetections, band: Band, threshold: float, weights: Array
+) -> dict[str, Array]:
     """Compute every metric for (b, images) weights: name to (b,) values."""
     inside = _in_band(scored.labels.depth_m, band)
-    out = _error_figures(scored, inside, weights[:, scored.labels.image[inside]])
+    out = _error_metrics(scored, inside, weights[:, scored.labels.image[inside]])
     total = weights[:, scored.labels.image[inside]].sum(axis=1)
-    right, wrong = _judged(scored, scored.right_16_px, band, inside)
+    right, wrong = _classify_detections(scored, scored.right_16_px, band, inside)
     sure = scored.detections.confidence >= threshold
     seen = weights[:, scored.detections.image]
     true, false = seen @ (right & sure), seen @ (wrong & sure)
@@ -240,12 +257,14 @@ def figures(scored: Scored, band: Band, threshold: float, weights: Array) -> dic
         out["precision"], out["recall"] = true / (true + false), true / total
         out["f1"] = 2 * true / (true + false + total)
         for name, taken in (("ap_8_px", scored.right_8_px), ("ap_16_px", scored.right_16_px)):
-            judged = _judged(scored, taken, band, inside)
+            judged = _classify_detections(scored, taken, band, inside)
             out[name] = average_precision(scored.detections.confidence, *judged, seen, total)
     return out
 
 
-def _error_figures(scored: Scored, inside: NDArray[np.bool_], weights: Array) -> dict[str, Array]:
+def _error_metrics(
+    scored: ScoredDetections, inside: NDArray[np.bool_], weights: Array
+) -> dict[str, Array]:
     error = scored.label_error
     norm_px = error.norm_px[inside]
     found = np.isfinite(norm_px)
@@ -325,8 +344,8 @@ def average_precision(
     return area
 
 
-def _judged(
-    scored: Scored, taken: Index, band: Band, inside: NDArray[np.bool_]
+def _classify_detections(
+    scored: ScoredDetections, taken: Index, band: Band, inside: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return (D,) correct and (D,) wrong detections of a band; others belong to other bands."""
     free = taken < 0

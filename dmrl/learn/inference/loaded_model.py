@@ -19,42 +19,42 @@ from torch import Tensor
 from dmrl.errors import ModelError, SettingError
 from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_json
-from dmrl.guards.paths import refuse_no_text, refuse_pipes
+from dmrl.guards.paths import refuse_pipes, require_text_path
 from dmrl.learn import pretrained
 from dmrl.learn.inference.decode_grids import Grids
 from dmrl.learn.networks.architectures import (
-    CLASS,
-    SPREAD,
+    CLASS_PREFIX,
+    SPREAD_CHANNEL,
     Network,
-    architecture,
-    architecture_names,
-    build,
-    by_name,
-    parameter_count,
-    to_input,
+    build_network,
+    count_parameters,
+    find_architecture,
+    list_architectures,
+    normalize_images,
+    unbind_channels,
 )
-from dmrl.learn.networks.keras_weights import read_h5
+from dmrl.learn.networks.keras_weights import load_keras_weights
 
 WEIGHTS_NAME = "model.safetensors"
 DESCRIPTION_NAME = "model.json"
 PUBLISHED_THRESHOLD = 0.33
 """Confidence threshold of the published evaluation, 0 to 1."""
 
-Grid = NDArray[np.float32]
+GridArray = NDArray[np.float32]
 
 
-def grids_of(network: Network, images: Tensor) -> Grids:
+def predict_grids(network: Network, images: Tensor) -> Grids:
     """Run a network, in its present mode and on its device, on (N, 3, H, W) uint8 images."""
     device = next(network.parameters()).device
     with torch.inference_mode():
-        out = network(to_input(images.to(device))).cpu()
-    named = by_name(network.channels, out)
-    classes = [named[name] for name in network.channels if name.startswith(CLASS)]
+        out = network(normalize_images(images.to(device))).cpu()
+    named = unbind_channels(network.channels, out)
+    classes = [named[name] for name in network.channels if name.startswith(CLASS_PREFIX)]
     return Grids(
         named["confidence"].sigmoid().numpy(),
         named["log_depth"].exp().numpy(),
         np.stack([named["offset_u"], named["offset_v"]], axis=1) if "offset_u" in named else None,
-        named[SPREAD].exp().numpy() if SPREAD in named else None,
+        named[SPREAD_CHANNEL].exp().numpy() if SPREAD_CHANNEL in named else None,
         torch.stack(classes).argmax(dim=0).numpy() if classes else None,
     )
 
@@ -116,10 +116,10 @@ class Model:
         self.require_size(images.shape[2], images.shape[1], self.name or self.architecture)
         # torch accepts writable arrays only; a view of a mapped file is copied here.
         writable = np.require(images, requirements="W")
-        return grids_of(self.network, torch.from_numpy(writable).permute(0, 3, 1, 2))
+        return predict_grids(self.network, torch.from_numpy(writable).permute(0, 3, 1, 2))
 
 
-def weights_of(network: Network) -> dict[str, Tensor]:
+def get_weights(network: Network) -> dict[str, Tensor]:
     """Return every tensor of a network, contiguous, on the CPU.
 
     Batch counters are left out: normalisations with fixed momentum do not use them.
@@ -131,7 +131,7 @@ def weights_of(network: Network) -> dict[str, Tensor]:
     }
 
 
-def mixed(network: Network, first: dict[str, Tensor], share: float) -> None:
+def interpolate_weights(network: Network, first: dict[str, Tensor], share: float) -> None:
     """Interpolate a network's weights linearly towards others, in place.
 
     Parameters
@@ -149,12 +149,12 @@ def mixed(network: Network, first: dict[str, Tensor], share: float) -> None:
                 value.lerp_(first[name].to(value.device), share)
 
 
-def with_channels(known: Network, network: Network) -> dict[str, Tensor]:
+def transfer_weights(known: Network, network: Network) -> dict[str, Tensor]:
     """Return weights of one network for another with the same body and perhaps other channels.
 
     Channels that only the second network has keep its present weights.
     """
-    weights, fresh = weights_of(known), weights_of(network)
+    weights, fresh = get_weights(known), get_weights(network)
     for name in ("head.weight", "head.bias"):
         if known.channels == network.channels or name not in weights:
             continue
@@ -174,7 +174,7 @@ def set_weights(network: Network, weights: dict[str, Tensor], where: object) -> 
     ModelError
         If a tensor is missing, unknown, not finite or of another shape.
     """
-    wanted = weights_of(network)
+    wanted = get_weights(network)
     if odd := sorted(wanted.keys() ^ weights.keys()):
         verb = "lacks" if odd[0] in wanted else "has an unknown"
         raise ModelError(f"{where} {verb} tensor {odd[0]}. Use weights of this architecture")
@@ -203,7 +203,7 @@ def describe(model: Model) -> dict[str, Any]:
     """Return the content of ``model.json``."""
     return {
         "architecture": model.architecture,
-        "parameters": parameter_count(model.network),
+        "parameters": count_parameters(model.network),
         "width_px": model.width_px,
         "height_px": model.height_px,
         "stride_px": model.network.stride_px,
@@ -217,7 +217,7 @@ def describe(model: Model) -> dict[str, Any]:
 
 def save_model(model: Model, folder: Path) -> None:
     """Write ``model.safetensors`` and ``model.json`` into a folder."""
-    write_tensors(weights_of(model.network), folder / WEIGHTS_NAME)
+    write_tensors(get_weights(model.network), folder / WEIGHTS_NAME)
     text = json.dumps(describe(model), indent=1) + "\n"
     (folder / DESCRIPTION_NAME).write_text(text, encoding="utf-8")
 
@@ -233,20 +233,20 @@ def load_model(path: Path) -> Model:
         If the file has none of these formats, is damaged, or its tensors do not fit the
         architecture. A pickle is rejected without reading it.
     """
-    refuse_no_text(path)
+    require_text_path(path)
     refuse_pipes(path)
     if path.is_dir():
         return _load_safetensors(path / WEIGHTS_NAME, path / DESCRIPTION_NAME, path.name)
     if not path.is_file():
         raise ModelError(
             f"no model {path}. Give a run folder, a .safetensors, a Keras .h5, or the name of one "
-            f"that ships with dmrl: {', '.join(pretrained.names())}"
+            f"that ships with dmrl: {', '.join(pretrained.list_pretrained())}"
         )
     with path.open("rb") as stream:
         head = stream.read(16)
     if head.startswith(b"\x89HDF\r\n\x1a\n"):
-        network = build("locanet")
-        set_weights(network, read_h5(path), path)
+        network = build_network("locanet")
+        set_weights(network, load_keras_weights(path), path)
         return Model(network.eval(), "locanet", path.name)
     if head[4:9] != b"\0\0\0\0{":
         if head.startswith((b"PK\x03\x04", b"\x80")):
@@ -263,7 +263,7 @@ def _load_safetensors(weights: Path, description: Path, name: str) -> Model:
         if not file.is_file():
             raise ModelError(f"no {file.name} in {file.parent}. Give a run folder of dmrl train")
     said = _read_description(description)
-    network = build(said["architecture"], extra=_extra(said, description))
+    network = build_network(said["architecture"], extra=_extra_channels(said, description))
     try:
         tensors = load_file(weights)
     except (SafetensorError, OSError) as e:
@@ -273,13 +273,13 @@ def _load_safetensors(weights: Path, description: Path, name: str) -> Model:
     return Model(network.eval(), said["architecture"], name, **{k: said[k] for k in known})
 
 
-def _extra(said: dict[str, Any], path: Path) -> list[str]:
+def _extra_channels(said: dict[str, Any], path: Path) -> list[str]:
     """Return the channels of a description in addition to the architecture's own."""
-    own = list(architecture(said["architecture"]).own)
+    own = list(find_architecture(said["architecture"]).own)
     outputs = said.get("outputs", own)
     extra = outputs[len(own) :] if isinstance(outputs, list) else None
-    wanted = [name for name in extra or [] if name == SPREAD]
-    wanted += [f"{CLASS}{k}" for k in range(len(extra or []) - len(wanted))]
+    wanted = [name for name in extra or [] if name == SPREAD_CHANNEL]
+    wanted += [f"{CLASS_PREFIX}{k}" for k in range(len(extra or []) - len(wanted))]
     if extra is None or outputs != own + wanted:
         raise ModelError(f"{path} has no valid outputs. Give the model.json of dmrl train")
     return wanted
@@ -306,9 +306,9 @@ def _read_description(path: Path) -> dict[str, Any]:
         raise ModelError(f"{path} is for images of {size}. Give the model.json of dmrl train")
     if not math.isfinite(said["threshold"]):
         raise ModelError(f"{path} has no valid threshold. Give the model.json of dmrl train")
-    if said["architecture"] not in architecture_names():
+    if said["architecture"] not in list_architectures():
         raise ModelError(
             f"{path} requires architecture {said['architecture']}, this dmrl has "
-            f"{', '.join(architecture_names())}. Update dmrl, or install the package with it"
+            f"{', '.join(list_architectures())}. Update dmrl, or install the package with it"
         )
     return dict(said)

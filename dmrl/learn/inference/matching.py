@@ -40,7 +40,7 @@ class Points:
     def __len__(self) -> int:
         return len(self.image)
 
-    def ranks(self) -> Index:
+    def ranks_in_image(self) -> Index:
         """Return (M,) the position of each row within its image, from 0."""
         return np.arange(len(self), dtype=np.int64) - np.searchsorted(self.image, self.image)
 
@@ -67,7 +67,7 @@ class Points:
 
 
 @dataclass(frozen=True, slots=True)
-class Errors:
+class LabelErrors:
     """Label minus detection, one row per label; NaN if an image has too few detections.
 
     Parameters
@@ -87,9 +87,9 @@ class Errors:
         return np.where(np.isnan(length), np.inf, length)
 
 
-def errors(labels: Points, detections: Points) -> Errors:
+def compute_errors(labels: Points, detections: Points) -> LabelErrors:
     """Compute the localization error of every label, by the first rule of this module."""
-    rows = partners(labels, detections)
+    rows = assign_detections(labels, detections)
     missing = rows < 0
 
     def difference(label: Array, detection: Array) -> Array:
@@ -97,14 +97,14 @@ def errors(labels: Points, detections: Points) -> Errors:
             return np.full(len(label), np.nan)
         return np.where(missing, np.nan, label - detection[rows])
 
-    return Errors(
+    return LabelErrors(
         difference(labels.u_px, detections.u_px),
         difference(labels.v_px, detections.v_px),
         difference(labels.depth_m, detections.depth_m),
     )
 
 
-def partners(labels: Points, detections: Points) -> Index:
+def assign_detections(labels: Points, detections: Points) -> Index:
     """Return (M,) the row of the detection assigned to each label, -1 for none."""
     first = np.searchsorted(detections.image, labels.image)
     available = np.searchsorted(detections.image, labels.image, side="right") - first
@@ -112,7 +112,7 @@ def partners(labels: Points, detections: Points) -> Index:
         labels.image, labels.image
     )
     out = np.where(available > 0, first, -1).astype(np.int64)
-    ranks = labels.ranks()
+    ranks = labels.ranks_in_image()
     for start in np.flatnonzero((wanted > 1) & (available > 0) & (ranks == 0)):
         rows = slice(start, start + wanted[start])
         columns = slice(first[start], first[start] + min(wanted[start], available[start]))
@@ -126,16 +126,16 @@ def partners(labels: Points, detections: Points) -> Index:
     return out
 
 
-def hits(labels: Points, detections: Points, radius_px: float) -> Index:
+def match_within_radius(labels: Points, detections: Points, radius_px: float) -> Index:
     """Match each detection with a label within a radius; return (D,) label rows, -1 for none."""
     out = np.full(len(detections), -1, np.int64)
     if not len(labels):
         return out
-    places = labels.ranks()
+    places = labels.ranks_in_image()
     images = int(max(labels.image[-1], detections.image[-1] if len(detections) else 0)) + 1
     row_at = np.full((images, int(places.max()) + 1), -1, np.int64)
     row_at[labels.image, places] = np.arange(len(labels))
-    ranks = detections.ranks()
+    ranks = detections.ranks_in_image()
     for rank in range(int(ranks.max(initial=-1)) + 1):
         chosen = np.flatnonzero(ranks == rank)
         image = detections.image[chosen]

@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.images.codec import Rgb
-from dmrl.learn.inference.decode_grids import PER_DETECTION, Found
-from dmrl.learn.inference.tta_views import VIEWS as VIEWS
-from dmrl.learn.inference.tta_views import View as View
+from dmrl.learn.inference.decode_grids import DETECTION_COLUMNS, Detections
+from dmrl.learn.inference.tta_views import TTA_VIEWS as TTA_VIEWS
+from dmrl.learn.inference.tta_views import TtaView as TtaView
 
-Rows = NDArray[np.float64]
+DetectionRows = NDArray[np.float64]
 
-ONE_ROBOT_PX = 16.0
+MERGE_RADIUS_PX = 16.0
 """Detections of different views closer than this, in pixels, belong to one robot."""
 
 
-def shown(images: Rgb, view: View, stride_px: int) -> Rgb:
+def apply_view(images: Rgb, view: TtaView, stride_px: int) -> Rgb:
     """Apply a view to (N, H, W, 3) images; the border is repeated where it shifts in."""
     right_px, down_px = _shift_px(view, stride_px)
     reach = stride_px
@@ -33,18 +33,22 @@ def shown(images: Rgb, view: View, stride_px: int) -> Rgb:
     return np.ascontiguousarray(padded[:, rows, cols])
 
 
-def returned(found: Found, view: View, stride_px: int, size_px: tuple[int, int]) -> Found:
+def undo_view(
+    found: Detections, view: TtaView, stride_px: int, size_px: tuple[int, int]
+) -> Detections:
     """Map detections in a view back to the N images, which have this height and width."""
     height_px, width_px = size_px
     right_px, down_px = _shift_px(view, stride_px)
     u_px, v_px = found.u_px - right_px, found.v_px - down_px
     u_px = width_px - u_px if view.mirrored else u_px
-    columns = {name: getattr(found, name) for name in PER_DETECTION}
+    columns = {name: getattr(found, name) for name in DETECTION_COLUMNS}
     columns |= {"u_px": np.clip(u_px, 0, width_px), "v_px": np.clip(v_px, 0, height_px)}
-    return Found(**columns, count=found.count)
+    return Detections(**columns, count=found.count)
 
 
-def agreed(views: Sequence[Found], *, most: int = 20, min_confidence: float = 0.01) -> Found:
+def merge_views(
+    views: Sequence[Detections], *, most: int = 20, min_confidence: float = 0.01
+) -> Detections:
     """Merge the detections of several views of N images.
 
     Starting from the most confident detection, the nearest one of each other view within
@@ -59,42 +63,44 @@ def agreed(views: Sequence[Found], *, most: int = 20, min_confidence: float = 0.
         As in `decode`.
     """
     images = [
-        _best(list(_robots(_pooled(views, image), len(views))), most, min_confidence)
+        _select_best(
+            list(_iter_robots(_stack_views(views, image), len(views))), most, min_confidence
+        )
         for image in range(len(views[0].count))
     ]
     wide = max(map(len, images))
-    table = np.zeros((len(images), wide, len(PER_DETECTION)))
+    table = np.zeros((len(images), wide, len(DETECTION_COLUMNS)))
     for rows, mine in zip(table, images, strict=True):
         rows[: len(mine)] = mine
-    columns: dict[str, Any] = dict(zip(PER_DETECTION, np.moveaxis(table, 2, 0), strict=True))
+    columns: dict[str, Any] = dict(zip(DETECTION_COLUMNS, np.moveaxis(table, 2, 0), strict=True))
     columns["class_id"] = columns["class_id"].astype(np.int64)
-    return Found(**columns, count=np.array([len(mine) for mine in images]))
+    return Detections(**columns, count=np.array([len(mine) for mine in images]))
 
 
-def _shift_px(view: View, stride_px: int) -> tuple[int, int]:
+def _shift_px(view: TtaView, stride_px: int) -> tuple[int, int]:
     return round(view.right * stride_px), round(view.down * stride_px)
 
 
-def _pooled(views: Sequence[Found], image: int) -> Rows:
+def _stack_views(views: Sequence[Detections], image: int) -> DetectionRows:
     """Return (D, 1 + columns) view number and detections of one image, most confident first."""
     parts = [
         np.column_stack(
             [np.full(found.count[image], number)]
-            + [getattr(found, name)[image, : found.count[image]] for name in PER_DETECTION]
+            + [getattr(found, name)[image, : found.count[image]] for name in DETECTION_COLUMNS]
         )
         for number, found in enumerate(views)
     ]
     rows = np.concatenate(parts)
-    order = np.argsort(-rows[:, 1 + PER_DETECTION.index("confidence")], kind="stable")
+    order = np.argsort(-rows[:, 1 + DETECTION_COLUMNS.index("confidence")], kind="stable")
     return np.asarray(rows[order])
 
 
-def _robots(rows: Rows, views: int) -> Iterator[Rows]:
+def _iter_robots(rows: DetectionRows, views: int) -> Iterator[DetectionRows]:
     """Yield the merged row of each robot, (columns,)."""
-    confidence, class_id = map(PER_DETECTION.index, ("confidence", "class_id"))
+    confidence, class_id = map(DETECTION_COLUMNS.index, ("confidence", "class_id"))
     while len(rows):
         away_px = np.hypot(*(rows[:, 1:3] - rows[0, 1:3]).T)
-        near = np.flatnonzero(away_px <= ONE_ROBOT_PX)
+        near = np.flatnonzero(away_px <= MERGE_RADIUS_PX)
         near = near[np.argsort(away_px[near], kind="stable")]
         mine = near[np.unique(rows[near, 0], return_index=True)[1]]
         robot = np.median(rows[mine, 1:], axis=0)
@@ -104,10 +110,10 @@ def _robots(rows: Rows, views: int) -> Iterator[Rows]:
         rows = np.delete(rows, mine, axis=0)
 
 
-def _best(robots: list[Rows], most: int, min_confidence: float) -> Rows:
+def _select_best(robots: list[DetectionRows], most: int, min_confidence: float) -> DetectionRows:
     """Return (K, columns) rows, the most confident first; at least one."""
     table = np.stack(robots)
-    confidence = table[:, PER_DETECTION.index("confidence")]
+    confidence = table[:, DETECTION_COLUMNS.index("confidence")]
     order = np.argsort(-confidence, kind="stable")[:most]
     kept = max(int((confidence[order] >= min_confidence).sum()), 1)
     return np.asarray(table[order[:kept]])

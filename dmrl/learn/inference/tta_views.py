@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 
-class View(NamedTuple):
+class TtaView(NamedTuple):
     """A view of an image: mirrored or not, then shifted right and down by these parts of a cell."""
 
     mirrored: bool
@@ -11,6 +11,6 @@ class View(NamedTuple):
     down: float
 
 
-SHIFTS = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (-0.25, 0.25), (0.25, -0.25))
-VIEWS = tuple(View(mirrored, *shift) for shift in SHIFTS for mirrored in (False, True))
+VIEW_SHIFTS = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (-0.25, 0.25), (0.25, -0.25))
+TTA_VIEWS = tuple(TtaView(mirrored, *shift) for shift in VIEW_SHIFTS for mirrored in (False, True))
 """All views; the first is the unchanged image."""

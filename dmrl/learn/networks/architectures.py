@@ -17,9 +17,9 @@ from torch import Tensor, nn
 
 from dmrl import plugins
 from dmrl.errors import SettingError
-from dmrl.learn.networks.depthwise import Depthwise
+from dmrl.learn.networks.depthwise import DepthwiseConv
 
-CHANNELS = 3
+INPUT_CHANNELS = 3
 CHANNEL_MEANINGS = {
     "log_depth": "natural log of the depth, metres",
     "confidence": "logit of the confidence that a robot's centre lies in the cell",
@@ -28,11 +28,11 @@ CHANNEL_MEANINGS = {
     "log_spread": "natural log of the scale b of log depth's error, exp(-|error| / b)",
     "class_0": "logit that the robot is of class 0; class_1 and so on for the others",
 }
-DETECTION = ("log_depth", "confidence")
+DETECTION_CHANNELS = ("log_depth", "confidence")
 """Channels of a network that locates a robot to the cell."""
-SUB_CELL = (*DETECTION, "offset_u", "offset_v")
+SUB_CELL_CHANNELS = (*DETECTION_CHANNELS, "offset_u", "offset_v")
 """Channels of a network that also regresses the position within the cell."""
-SPREAD, CLASS = "log_spread", "class_"
+SPREAD_CHANNEL, CLASS_PREFIX = "log_spread", "class_"
 """Channels that a recipe may add to an architecture's own; class channels are numbered."""
 CONFIDENCE_BIAS = -4.0
 """Initial bias of the confidence logit. One cell in 1120 contains a robot. From a bias of 0, the
@@ -48,7 +48,7 @@ class Network(nn.Module, ABC):
     """
 
     stride_px: ClassVar[int] = 8
-    own: ClassVar[tuple[str, ...]] = DETECTION
+    own: ClassVar[tuple[str, ...]] = DETECTION_CHANNELS
 
     def __init__(self, extra: Sequence[str] = ()) -> None:
         super().__init__()
@@ -71,7 +71,7 @@ class LocaNet(Network):
 
     def __init__(self, extra: Sequence[str] = ()) -> None:
         super().__init__(extra)
-        ins = (CHANNELS, *self.widths)
+        ins = (INPUT_CHANNELS, *self.widths)
         self.convs = nn.ModuleList(
             nn.Conv2d(a, b, 3, padding=1, bias=False)
             for a, b in zip(ins, self.widths, strict=False)
@@ -79,13 +79,13 @@ class LocaNet(Network):
         # torch's momentum is the weight of the new batch: 0.01 equals Keras' 0.99.
         self.norms = nn.ModuleList(nn.BatchNorm2d(w, eps=1e-3, momentum=0.01) for w in self.widths)
         self.head = nn.Conv2d(self.widths[-1], len(self.channels), 1)
-        self._initialise()
+        self._init_weights()
 
-    def _initialise(self) -> None:
+    def _init_weights(self) -> None:
         for conv in (*self.convs, self.head):
             assert isinstance(conv, nn.Conv2d)
             nn.init.normal_(conv.weight, std=0.01)  # as in the published code
-        _start_empty(self.head, self.channels)
+        _init_head(self.head, self.channels)
 
     def forward(self, images: Tensor) -> Tensor:
         """Return (N, C, H/8, W/8) outputs, ordered as ``channels``, for (N, 3, H, W) images."""
@@ -98,7 +98,7 @@ class LocaNet(Network):
         return out
 
 
-def _start_empty(head: nn.Conv2d, channels: Sequence[str]) -> None:
+def _init_head(head: nn.Conv2d, channels: Sequence[str]) -> None:
     """Set the biases of a head so that it initially predicts nearly every cell to be empty."""
     assert head.bias is not None
     with torch.no_grad():
@@ -124,7 +124,7 @@ class ConvNorm(nn.Sequential):
         relu: bool = True,
     ) -> None:
         if depthwise:
-            conv: nn.Conv2d = Depthwise(ins, stride=stride, dilation=dilation)
+            conv: nn.Conv2d = DepthwiseConv(ins, stride=stride, dilation=dilation)
         else:
             conv = nn.Conv2d(ins, outs, kernel, stride, kernel // 2, bias=False)
         fan_out = kernel**2 * (1 if depthwise else outs)
@@ -133,7 +133,7 @@ class ConvNorm(nn.Sequential):
         super().__init__(conv, nn.BatchNorm2d(outs), *last)
 
 
-class Residual(nn.Module):
+class ResidualBlock(nn.Module):
     """Residual block: a dilated depthwise 3x3 and a 1x1 convolution beside a shortcut.
 
     The ReLU follows the sum.
@@ -158,7 +158,7 @@ class DmrlNano(Network):
     the four channels.
     """
 
-    own: ClassVar[tuple[str, ...]] = SUB_CELL
+    own: ClassVar[tuple[str, ...]] = SUB_CELL_CHANNELS
     widths: ClassVar[tuple[int, int, int]] = (16, 32, 48)
     dilations: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = ((1, 1), (1, 2, 4, 8, 1))
 
@@ -166,16 +166,16 @@ class DmrlNano(Network):
         super().__init__(extra)
         stem, fine, coarse = self.widths
         self.body = nn.Sequential(
-            ConvNorm(CHANNELS, stem, stride=2),
+            ConvNorm(INPUT_CHANNELS, stem, stride=2),
             ConvNorm(stem, fine, stride=2),
-            *(Residual(fine, dilation) for dilation in self.dilations[0]),
+            *(ResidualBlock(fine, dilation) for dilation in self.dilations[0]),
             ConvNorm(fine, fine, stride=2, depthwise=True),
             ConvNorm(fine, coarse, 1),
-            *(Residual(coarse, dilation) for dilation in self.dilations[1]),
+            *(ResidualBlock(coarse, dilation) for dilation in self.dilations[1]),
         )
         self.head = nn.Conv2d(coarse, len(self.channels), 1)
         nn.init.normal_(self.head.weight, std=0.01)
-        _start_empty(self.head, self.channels)
+        _init_head(self.head, self.channels)
 
     def forward(self, images: Tensor) -> Tensor:
         """Return (N, C, H/8, W/8) outputs, ordered as ``channels``, for (N, 3, H, W) images."""
@@ -209,12 +209,12 @@ ARCHITECTURES: dict[str, type[Network]] = {
 }
 
 
-def architecture_names() -> list[str]:
+def list_architectures() -> list[str]:
     """Return the names of all architectures, built in and from plug-ins, sorted."""
     return sorted({*ARCHITECTURES, *plugins.find_plugins(plugins.NETWORKS)})
 
 
-def architecture(name: str) -> type[Network]:
+def find_architecture(name: str) -> type[Network]:
     """Return the class of an architecture.
 
     Raises
@@ -229,7 +229,7 @@ def architecture(name: str) -> type[Network]:
     plugin = plugins.find_plugins(plugins.NETWORKS).get(name)
     if plugin is None:
         raise SettingError(
-            f"no architecture {name}. Choose one of: {', '.join(architecture_names())}"
+            f"no architecture {name}. Choose one of: {', '.join(list_architectures())}"
         )
     loaded = plugin.load()
     fits = isinstance(loaded, type) and issubclass(loaded, Network)
@@ -237,7 +237,7 @@ def architecture(name: str) -> type[Network]:
     return cast(type[Network], loaded)
 
 
-def build(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Network:
+def build_network(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Network:
     """Build a network with random weights, in channels-last memory format.
 
     Parameters
@@ -256,7 +256,7 @@ def build(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Network:
     PluginError
         If it belongs to a plug-in that cannot be loaded.
     """
-    form, plugin = architecture(name), plugins.find_plugins(plugins.NETWORKS).get(name)
+    form, plugin = find_architecture(name), plugins.find_plugins(plugins.NETWORKS).get(name)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         with plugin.naming_the_package("cannot be built") if plugin else nullcontext():
@@ -264,12 +264,12 @@ def build(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Network:
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 
-def by_name(channels: Sequence[str], output: Tensor) -> dict[str, Tensor]:
+def unbind_channels(channels: Sequence[str], output: Tensor) -> dict[str, Tensor]:
     """Split an output (N, C, rows, cols) into one (N, rows, cols) tensor per channel name."""
     return dict(zip(channels, output.unbind(1), strict=True))
 
 
-def to_input(images: Tensor) -> Tensor:
+def normalize_images(images: Tensor) -> Tensor:
     """Normalize uint8 images to network input, x / 128 - 1, float32; the memory format is kept.
 
     Parameters
@@ -280,7 +280,7 @@ def to_input(images: Tensor) -> Tensor:
     return images.to(torch.float32).mul_(1 / 128).sub_(1)
 
 
-def product_count(network: Network, height_px: int = 224, width_px: int = 320) -> int:
+def count_macs(network: Network, height_px: int = 224, width_px: int = 320) -> int:
     """Count the multiply-accumulates of all convolutions for one image."""
     total = 0
 
@@ -292,7 +292,7 @@ def product_count(network: Network, height_px: int = 224, width_px: int = 320) -
     hooks = [m.register_forward_hook(count) for m in network.modules() if isinstance(m, nn.Conv2d)]
     training = network.training
     with torch.inference_mode():
-        image = next(network.parameters()).new_zeros(1, CHANNELS, height_px, width_px)
+        image = next(network.parameters()).new_zeros(1, INPUT_CHANNELS, height_px, width_px)
         network.eval()(image)
     network.train(training)
     for hook in hooks:
@@ -300,6 +300,6 @@ def product_count(network: Network, height_px: int = 224, width_px: int = 320) -
     return total
 
 
-def parameter_count(network: Network) -> int:
+def count_parameters(network: Network) -> int:
     """Count the trainable parameters."""
     return sum(p.numel() for p in network.parameters())

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, pad
 
 
-class Depthwise(nn.Conv2d):
+class DepthwiseConv(nn.Conv2d):
     """Depthwise 3x3 convolution without bias that keeps the size or divides it by the stride."""
 
     def __init__(self, channels: int, *, stride: int = 1, dilation: int = 1) -> None:
@@ -34,11 +34,11 @@ class Depthwise(nn.Conv2d):
         weight = self.weight
         if torch.is_autocast_enabled("cpu"):
             x, weight = (t.to(torch.get_autocast_dtype("cpu")) for t in (x, weight))
-        out: Tensor = _Depthwise.apply(x, weight, stride, dilation)  # type: ignore[no-untyped-call]
+        out: Tensor = _DepthwiseFunction.apply(x, weight, stride, dilation)  # type: ignore[no-untyped-call]
         return out
 
 
-class _Depthwise(torch.autograd.Function):
+class _DepthwiseFunction(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, stride: int, dilation: int) -> Tensor:
         ctx.save_for_backward(x, weight)
@@ -56,7 +56,7 @@ class _Depthwise(torch.autograd.Function):
             spread[:, :, ::stride, ::stride] = grad
         of_x = conv2d(spread, weight.flip(2, 3), None, 1, dilation, dilation, len(weight))
         if dilation > 1 and stride == 1:
-            x, grad, dilation = _grids(x, dilation), _grids(grad, dilation), 1
+            x, grad, dilation = _space_to_batch(x, dilation), _space_to_batch(grad, dilation), 1
         of_weight = torch.ops.aten.convolution_backward(
             *(grad, x, weight, [0], [stride, stride], [dilation, dilation], [dilation, dilation]),
             *(False, [0, 0], len(weight), [False, True, False]),
@@ -64,7 +64,7 @@ class _Depthwise(torch.autograd.Function):
         return of_x, of_weight, None, None
 
 
-def _grids(x: Tensor, apart: int) -> Tensor:
+def _space_to_batch(x: Tensor, apart: int) -> Tensor:
     """Split images into (N * apart^2, C, rows, cols) grids of pixels ``apart`` from each other.
 
     Zeros pad the end of each grid.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-IMAGE = "image"
+IMAGE_NAME = "image"
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dmrl.errors import MissingExtra, ModelError
-from dmrl.guards.memory import Bounded
+from dmrl.guards.memory import MemoryLimit
 from dmrl.learn.networks.architectures import LocaNet
 
 try:
@@ -19,7 +19,7 @@ try:
 except ImportError:
     h5py = None
 
-NORM = {
+BATCH_NORM_VARIABLES = {
     "gamma": "weight",
     "beta": "bias",
     "moving_mean": "running_mean",
@@ -27,7 +27,7 @@ NORM = {
 }
 
 
-def read_h5(path: Path) -> dict[str, Tensor]:
+def load_keras_weights(path: Path) -> dict[str, Tensor]:
     """Read the weights of ``locanet`` from a Keras file, keyed by torch name.
 
     Parameters
@@ -46,29 +46,32 @@ def read_h5(path: Path) -> dict[str, Tensor]:
     if h5py is None:
         raise MissingExtra("h5py", "keras", f"{path.name}")
     try:
-        with Bounded(path.stat().st_size), h5py.File(path, "r") as file:
+        with MemoryLimit(path.stat().st_size), h5py.File(path, "r") as file:
             inner = file.get("model_weights", getlink=True)
             group = file["model_weights"] if isinstance(inner, h5py.HardLink) else file
-            return {name: _read(path, group, *where) for name, where in _places().items()}
+            return {
+                name: _load_variable(path, group, *where)
+                for name, where in _map_variables().items()
+            }
     except (OSError, RuntimeError, ValueError, TypeError, LookupError, MemoryError) as e:
         why = " ".join(str(e).split())
         raise ModelError(f"{path} cannot be read: {why}. Download it again") from None
 
 
-def _places() -> dict[str, tuple[str, str]]:
+def _map_variables() -> dict[str, tuple[str, str]]:
     """Map the name of every torch tensor to its layer and variable in the Keras file."""
     blocks = len(LocaNet.widths)
     numbered = [f"_{i}" if i else "" for i in range(blocks + 1)]
     places = {f"convs.{i}.weight": (f"conv2d{numbered[i]}", "kernel") for i in range(blocks)}
     for i in range(blocks):
-        for keras, ours in NORM.items():
+        for keras, ours in BATCH_NORM_VARIABLES.items():
             places[f"norms.{i}.{ours}"] = (f"batch_normalization{numbered[i]}", keras)
     places["head.weight"] = (f"conv2d{numbered[blocks]}", "kernel")
     places["head.bias"] = (f"conv2d{numbered[blocks]}", "bias")
     return places
 
 
-def _read(path: Path, group: "h5py.Group", layer: str, variable: str) -> Tensor:
+def _load_variable(path: Path, group: "h5py.Group", layer: str, variable: str) -> Tensor:
     found: h5py.Group | h5py.Dataset | None = group
     for part in (layer, layer, f"{variable}:0"):
         # A soft or external link could lead to any other file of this machine.

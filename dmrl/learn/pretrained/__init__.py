@@ -2,15 +2,15 @@
 
 from pathlib import Path
 
-SHIPPED = Path(__file__).parent
+PRETRAINED_DIR = Path(__file__).parent
 
 
-def names() -> list[str]:
+def list_pretrained() -> list[str]:
     """Return the names of the pretrained networks."""
-    return sorted(card.parent.name for card in SHIPPED.glob("*/README.md"))
+    return sorted(card.parent.name for card in PRETRAINED_DIR.glob("*/README.md"))
 
 
-def resolved(model: Path) -> Path:
+def resolve_model_path(model: Path) -> Path:
     """Return the path of a model: itself if it exists, else the pretrained network of this name.
 
     Parameters
@@ -19,4 +19,6 @@ def resolved(model: Path) -> Path:
         A path, or a name in `list_pretrained`. Anything else is returned unchanged, so that the
         function that opens it reports the error.
     """
-    return SHIPPED / model if not model.exists() and str(model) in names() else model
+    return (
+        PRETRAINED_DIR / model if not model.exists() and str(model) in list_pretrained() else model
+    )

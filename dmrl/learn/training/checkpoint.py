@@ -18,15 +18,15 @@ from torch.optim import Optimizer
 
 from dmrl.errors import ModelError, SettingError
 from dmrl.guards.bounded_parsing import parse_json
-from dmrl.guards.safe_names import inside
-from dmrl.learn.inference.loaded_model import set_weights, weights_of, write_tensors
+from dmrl.guards.safe_names import safe_join
+from dmrl.learn.inference.loaded_model import get_weights, set_weights, write_tensors
 from dmrl.learn.networks.architectures import Network
 
-STATE_NAME = "checkpoint.json"
+CHECKPOINT_NAME = "checkpoint.json"
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class TrainingProgress:
     """Progress of a training.
 
     Parameters
@@ -46,27 +46,27 @@ class State:
 
 def has_checkpoint(folder: Path) -> bool:
     """Return whether the folder contains a checkpoint."""
-    return (folder / STATE_NAME).is_file()
+    return (folder / CHECKPOINT_NAME).is_file()
 
 
 def save_checkpoint(
-    folder: Path, networks: Mapping[str, Network], optimizer: Optimizer, state: State
+    folder: Path, networks: Mapping[str, Network], optimizer: Optimizer, state: TrainingProgress
 ) -> None:
     """Write a checkpoint; the previous one remains until this one is complete."""
     tensors = {
         f"{role}.{name}": value
         for role, network in networks.items()
-        for name, value in weights_of(network).items()
+        for name, value in get_weights(network).items()
     }
     for index, moments in optimizer.state_dict()["state"].items():
         for name, value in moments.items():
             tensors[f"optimizer.{index}.{name}"] = value.detach().cpu().contiguous()
     name = f"checkpoint-{state.epochs_done:04d}.safetensors"
     write_tensors(tensors, folder / name)
-    unfinished = folder / f"{STATE_NAME}.partial"
+    unfinished = folder / f"{CHECKPOINT_NAME}.partial"
     document = {**asdict(state), "tensors": name}
     unfinished.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    unfinished.replace(folder / STATE_NAME)
+    unfinished.replace(folder / CHECKPOINT_NAME)
     for old in folder.glob("checkpoint-*.safetensors"):
         if old.name != name:
             old.unlink()
@@ -74,7 +74,7 @@ def save_checkpoint(
 
 def load_checkpoint(
     folder: Path, networks: Mapping[str, Network], optimizer: Optimizer, run: dict[str, Any]
-) -> State:
+) -> TrainingProgress:
     """Load a checkpoint into the networks (by role) and the optimizer, and return its progress.
 
     Raises
@@ -87,26 +87,30 @@ def load_checkpoint(
     if not has_checkpoint(folder):
         raise ModelError(f"no checkpoint in {folder} to resume from. Train without --resume")
     try:
-        said = parse_json((folder / STATE_NAME).read_text(encoding="utf-8"))
-        tensors = load_file(inside(folder, said.pop("tensors"), f"{folder}: the tensors"))
-        state = State(**said)
+        said = parse_json((folder / CHECKPOINT_NAME).read_text(encoding="utf-8"))
+        tensors = load_file(safe_join(folder, said.pop("tensors"), f"{folder}: the tensors"))
+        state = TrainingProgress(**said)
         if not isinstance(state.run, dict) or not isinstance(state.epochs_done, int):
             raise ValueError("run or epochs_done is missing")
     except (ValueError, KeyError, TypeError, OSError, SafetensorError) as e:
-        raise ModelError(f"{folder}/{STATE_NAME} is damaged: {e}. Train without --resume") from None
-    _require_same(state.run, run, folder)
+        raise ModelError(
+            f"{folder}/{CHECKPOINT_NAME} is damaged: {e}. Train without --resume"
+        ) from None
+    _require_same_run(state.run, run, folder)
     for role, network in networks.items():
         start = f"{role}."
         mine = {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
         set_weights(network, mine, folder)
     try:
-        _set_optimizer(optimizer, tensors)
+        _load_optimizer_state(optimizer, tensors)
     except (ValueError, LookupError, RuntimeError) as e:
-        raise ModelError(f"{folder}/{STATE_NAME} is damaged: {e}. Train without --resume") from None
+        raise ModelError(
+            f"{folder}/{CHECKPOINT_NAME} is damaged: {e}. Train without --resume"
+        ) from None
     return state
 
 
-def _require_same(before: dict[str, Any], now: dict[str, Any], folder: Path) -> None:
+def _require_same_run(before: dict[str, Any], now: dict[str, Any], folder: Path) -> None:
     """Raise SettingError unless two trainings have the same settings and data."""
     now = json.loads(json.dumps(now))
     different = sorted(k for k in before.keys() | now.keys() if before.get(k) != now.get(k))
@@ -118,7 +122,7 @@ def _require_same(before: dict[str, Any], now: dict[str, Any], folder: Path) -> 
         )
 
 
-def _set_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
+def _load_optimizer_state(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
     """Load the optimizer's state from the tensors of a checkpoint."""
     fresh = optimizer.state_dict()
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
@@ -136,5 +140,5 @@ def _set_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
 
 def remove_checkpoint(folder: Path) -> None:
     """Remove the checkpoint from a folder whose training has finished."""
-    for path in (folder / STATE_NAME, *folder.glob("checkpoint-*.safetensors")):
+    for path in (folder / CHECKPOINT_NAME, *folder.glob("checkpoint-*.safetensors")):
         path.unlink(missing_ok=True)

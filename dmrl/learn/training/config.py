@@ -6,15 +6,15 @@ from typing import Literal
 from dmrl.learn.data.augment import Augmentation
 from dmrl.learn.data.crops import Intrinsics
 from dmrl.learn.data.targets import LabelNoise
-from dmrl.learn.networks.architectures import CLASS, SPREAD
+from dmrl.learn.networks.architectures import CLASS_PREFIX, SPREAD_CHANNEL
 from dmrl.learn.training.losses import TERMS, LossSettings
 from dmrl.learn.training.optimizer import OptimizerName
 
-DEFAULT, AUTO = "dmrl-nano", "auto"
+DEFAULT_ARCHITECTURE, AUTO = "dmrl-nano", "auto"
 
 
 @dataclass(frozen=True, slots=True)
-class FitSettings(LossSettings):
+class TrainConfig(LossSettings):
     """Settings of a training run; those of the loss are in `LossSettings`.
 
     Parameters
@@ -111,7 +111,7 @@ class FitSettings(LossSettings):
         torchrun, its number of processes applies.
     """
 
-    architecture: str = DEFAULT
+    architecture: str = DEFAULT_ARCHITECTURE
     epochs: int = 60
     epoch_images: int = 0
     batch_size: int = 16
@@ -148,35 +148,35 @@ class FitSettings(LossSettings):
     processes: int = 1
 
     def __post_init__(self) -> None:
-        for name in AT_LEAST_ONE:
-            _refuse(getattr(self, name) < 1, f"{name}: must be at least 1")
+        for name in POSITIVE_SETTINGS:
+            _raise_if(getattr(self, name) < 1, f"{name}: must be at least 1")
         falls = 0 <= self.final_learning_rate <= self.learning_rate
-        _refuse(
+        _raise_if(
             self.learning_rate <= 0 or not falls,
             "learning_rate: must be over 0 and not below final_learning_rate",
         )
-        for name in NOT_NEGATIVE:
-            _refuse(getattr(self, name) < 0, f"{name}: must not be negative")
-        for name, most in MOST.items():
-            _refuse(getattr(self, name) > most, f"{name}: must be at most {most}")
-        for name in SHARES:
+        for name in NON_NEGATIVE_SETTINGS:
+            _raise_if(getattr(self, name) < 0, f"{name}: must not be negative")
+        for name, most in MAX_SETTINGS.items():
+            _raise_if(getattr(self, name) > most, f"{name}: must be at most {most}")
+        for name in FRACTION_SETTINGS:
             value = getattr(self, name)
-            _refuse(value is not None and not 0 <= value <= 1, f"{name}: must be between 0 and 1")
-        _refuse(self.validation_share > 0.5, "validation_share: must be at most 0.5")
+            _raise_if(value is not None and not 0 <= value <= 1, f"{name}: must be between 0 and 1")
+        _raise_if(self.validation_share > 0.5, "validation_share: must be at most 0.5")
         least, greatest = self.zoom
-        _refuse(not 0 < least <= greatest, "zoom: must be over 0, the lesser first")
+        _raise_if(not 0 < least <= greatest, "zoom: must be over 0, the lesser first")
         focal_px = self.intrinsics[:2] if self.intrinsics else (1.0,)
-        _refuse(min(focal_px) <= 0, "intrinsics: fx and fy must be over 0")
-        wide = max(map(abs, self.intrinsics or (0.0,))) > LARGE
-        _refuse(wide, f"intrinsics: must be at most {LARGE}")
-        beyond = any(not 0 <= share <= LARGE for share in self.shares.values())
-        _refuse(beyond, f"shares: must be between 0 and {LARGE}")
+        _raise_if(min(focal_px) <= 0, "intrinsics: fx and fy must be over 0")
+        wide = max(map(abs, self.intrinsics or (0.0,))) > MAX_SETTING
+        _raise_if(wide, f"intrinsics: must be at most {MAX_SETTING}")
+        beyond = any(not 0 <= share <= MAX_SETTING for share in self.shares.values())
+        _raise_if(beyond, f"shares: must be between 0 and {MAX_SETTING}")
 
     @property
-    def extra(self) -> tuple[str, ...]:
+    def extra_channels(self) -> tuple[str, ...]:
         """Channels of the network in addition to the architecture's own."""
-        classes = tuple(f"{CLASS}{k}" for k in range(len(self.classes)))
-        return (*([SPREAD] if self.spread_weight else []), *classes)
+        classes = tuple(f"{CLASS_PREFIX}{k}" for k in range(len(self.classes)))
+        return (*([SPREAD_CHANNEL] if self.spread_weight else []), *classes)
 
     def augmentation(self, epoch: int) -> Augmentation:
         """Return the augmentation of an epoch, counted from 0."""
@@ -192,25 +192,27 @@ class FitSettings(LossSettings):
             self.intrinsics,
             self.grey_share,
         )
-        return whole if epoch < self.epochs - self.plain_epochs else whole.plain
+        return whole if epoch < self.epochs - self.plain_epochs else whole.without_geometry
 
 
-SHARES = (
+FRACTION_SETTINGS = (
     *("validation_share", "threshold", "flip_share", "mosaic_share"),
     *("blur_share", "colour", "noise", "distill_share", "grey_share", "hard_share"),
     "init_share",
 )
-AT_LEAST_ONE = ("epochs", "batch_size", "processes")
-NOT_NEGATIVE = (
+POSITIVE_SETTINGS = ("epochs", "batch_size", "processes")
+NON_NEGATIVE_SETTINGS = (
     "epoch_images",
     *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus", "seed"),
     *(term.weight for term in TERMS),
     *("rotation_deg", "paste"),
     *("plain_epochs", "frozen_norm_epochs", "false_alarms"),
 )
-LARGE = 10_000_000
+MAX_SETTING = 10_000_000
 """Upper bound of settings without a tighter one."""
-MOST = dict.fromkeys(("learning_rate", *AT_LEAST_ONE, *NOT_NEGATIVE), LARGE) | {
+MAX_SETTINGS = dict.fromkeys(
+    ("learning_rate", *POSITIVE_SETTINGS, *NON_NEGATIVE_SETTINGS), MAX_SETTING
+) | {
     "processes": 256,
     "paste": 100,
     "seed": 2**63 - 1,
@@ -219,6 +221,6 @@ MOST = dict.fromkeys(("learning_rate", *AT_LEAST_ONE, *NOT_NEGATIVE), LARGE) | {
 start arbitrarily many processes, paste arbitrarily many patches, or overflow float32."""
 
 
-def _refuse(wrong: bool, why: str) -> None:
+def _raise_if(wrong: bool, why: str) -> None:
     if wrong:
         raise ValueError(why)

@@ -25,34 +25,34 @@ from torch._C._distributed_c10d import HashStore
 from dmrl.errors import DmrlError, SettingError
 from dmrl.learn.networks.architectures import Network
 
-Made = TypeVar("Made")
-Work = Callable[["Group"], Made]
+ResultT = TypeVar("ResultT")
+GroupWork = Callable[["ProcessGroup"], ResultT]
 """Function that each process of a group calls."""
 SPAWN = multiprocessing.get_context("spawn")
-MEETING_S = 60.0
+CONNECT_TIMEOUT_S = 60.0
 """Timeout for the processes of a group to connect, seconds. All have loaded by then."""
-WORK_S = 1800.0
+COLLECTIVE_TIMEOUT_S = 1800.0
 """Timeout of collective operations afterwards, seconds: rank 0 also validates and saves."""
-LAST_WORDS_S = 5.0
+EXIT_TIMEOUT_S = 5.0
 """Timeout for a finished or killed process to exit, seconds."""
 
 
-class Group:
+class ProcessGroup:
     """Processes of a training, and the rank of this one. Single process: rank 0 of 1."""
 
     def __init__(self, rank: int = 0, size: int = 1) -> None:
         self.rank, self.size = rank, size
 
     @property
-    def leads(self) -> bool:
+    def is_main(self) -> bool:
         """Whether this is rank 0, the process that writes."""
         return self.rank == 0
 
-    def part(self, items: NDArray[np.int64]) -> NDArray[np.int64]:
+    def select_part(self, items: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the items of this process; none if there are more processes than items."""
         return items[self.rank :: self.size]
 
-    def average(self, network: Network, losses: Tensor, share: float) -> Tensor:
+    def all_reduce_mean(self, network: Network, losses: Tensor, share: float) -> Tensor:
         """Average losses, gradients and running statistics over all processes (all-reduce).
 
         Parameters
@@ -72,7 +72,7 @@ class Group:
         """
         if self.size == 1:
             return losses
-        tensors = [losses, *(_gradient(p) for p in network.parameters())]
+        tensors = [losses, *(_gradient_or_zeros(p) for p in network.parameters())]
         tensors += [b for b in network.buffers() if b.is_floating_point()]
         flat = torch.cat([t.flatten() for t in tensors]).mul_(share)
         distributed.all_reduce(flat)
@@ -82,14 +82,14 @@ class Group:
         return losses
 
 
-def _gradient(parameter: torch.nn.Parameter) -> Tensor:
+def _gradient_or_zeros(parameter: torch.nn.Parameter) -> Tensor:
     """Return the gradient of a parameter; zeros if it has none yet."""
     if parameter.grad is None:
         parameter.grad = torch.zeros_like(parameter)
     return parameter.grad
 
 
-def in_group(processes: int, work: Work[Made]) -> Made:
+def run_distributed(processes: int, work: GroupWork[ResultT]) -> ResultT:
     """Call ``work(group)`` in every process of a group and return the result of rank 0.
 
     Under ``torchrun``, the group is the one of this process. Otherwise this process is rank 0 and
@@ -108,43 +108,43 @@ def in_group(processes: int, work: Work[Made]) -> Made:
         If another process is killed, or the processes do not connect.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        return _by_torchrun(work)
+        return _run_under_torchrun(work)
     if processes == 1:
-        return work(Group())
+        return work(ProcessGroup())
     threads = torch.get_num_threads()
     torch.set_num_threads(max(threads // processes, 1))
     try:
-        with _others(processes, work) as meeting:
-            return _member(meeting, 0, processes, work)
+        with _start_others(processes, work) as meeting:
+            return _join_group(meeting, 0, processes, work)
     finally:
         torch.set_num_threads(threads)
 
 
-def _by_torchrun(work: Work[Made]) -> Made:
+def _run_under_torchrun(work: GroupWork[ResultT]) -> ResultT:
     """Run in the group that ``torchrun`` started."""
     cuda = torch.cuda.is_available()
     if cuda:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
     distributed.init_process_group("nccl" if cuda else "gloo")
-    return _until_all_are_done(work)
+    return _run_and_wait(work)
 
 
-def _member(meeting: str, rank: int, size: int, work: Work[Made]) -> Made:
+def _join_group(meeting: str, rank: int, size: int, work: GroupWork[ResultT]) -> ResultT:
     """Join a group and run as one of its processes."""
-    wait = timedelta(seconds=MEETING_S)
+    wait = timedelta(seconds=CONNECT_TIMEOUT_S)
     try:
         distributed.init_process_group("gloo", meeting, timeout=wait, rank=rank, world_size=size)
     except RuntimeError as e:
-        _forget_failed_start()
+        _reset_group_count()
         raise SettingError(
-            f"the {size} processes did not find each other within {MEETING_S:g} s. "
+            f"the {size} processes did not find each other within {CONNECT_TIMEOUT_S:g} s. "
             "Try again on a less busy machine or with fewer --processes"
         ) from e
-    distributed.distributed_c10d._set_pg_timeout(timedelta(seconds=WORK_S))
-    return _until_all_are_done(work)
+    distributed.distributed_c10d._set_pg_timeout(timedelta(seconds=COLLECTIVE_TIMEOUT_S))
+    return _run_and_wait(work)
 
 
-def _forget_failed_start() -> None:
+def _reset_group_count() -> None:
     """Reset torch's count of process groups after a failed start.
 
     torch names a group by that count, and a failed start leaves it raised. The next group of this
@@ -155,10 +155,10 @@ def _forget_failed_start() -> None:
     distributed.destroy_process_group()
 
 
-def _until_all_are_done(work: Work[Made]) -> Made:
+def _run_and_wait(work: GroupWork[ResultT]) -> ResultT:
     """Run the work and wait for the other processes."""
     try:
-        made = work(Group(distributed.get_rank(), distributed.get_world_size()))
+        made = work(ProcessGroup(distributed.get_rank(), distributed.get_world_size()))
         # Not after an error: a process that fails alone would wait for those that wait for it.
         distributed.barrier()
         return made
@@ -167,7 +167,7 @@ def _until_all_are_done(work: Work[Made]) -> Made:
 
 
 @contextmanager
-def _others(size: int, work: Work[Any]) -> Iterator[str]:
+def _start_others(size: int, work: GroupWork[Any]) -> Iterator[str]:
     """Start all processes of a group but the first; yield the address where they connect.
 
     torch's launchers would start the first process as well. Here, progress, errors and Ctrl-C of
@@ -175,13 +175,13 @@ def _others(size: int, work: Work[Any]) -> Iterator[str]:
     """
     with tempfile.TemporaryDirectory() as folder:
         meeting = (Path(folder) / "meeting").as_uri()
-        started = [_start(meeting, rank, size, work) for rank in range(1, size)]
+        started = [_start_process(meeting, rank, size, work) for rank in range(1, size)]
         processes = [process for _, process in started]
         try:
             for ready, _ in started:
                 ready.recv()
             yield meeting
-            _wait_for(processes, LAST_WORDS_S)
+            _wait_for(processes, EXIT_TIMEOUT_S)
         except (EOFError, RuntimeError, SettingError) as e:
             # The error here may be the consequence of a killed process, which is then reported. A
             # process that raised has printed its error, or failed because this one did.
@@ -205,23 +205,29 @@ def _wait_for(processes: Sequence[SpawnProcess], seconds: float) -> None:
 
 def _any_killed(processes: Sequence[SpawnProcess]) -> bool:
     """Return whether a signal ended a process; its exit code is then negative."""
-    _wait_for(processes, LAST_WORDS_S / (len(processes) + 1))
+    _wait_for(processes, EXIT_TIMEOUT_S / (len(processes) + 1))
     return any((process.exitcode or 0) < 0 for process in processes)
 
 
-def _start(meeting: str, rank: int, size: int, work: Work[Any]) -> tuple[Connection, SpawnProcess]:
+def _start_process(
+    meeting: str, rank: int, size: int, work: GroupWork[Any]
+) -> tuple[Connection, SpawnProcess]:
     """Start one process and return the connection on which it reports that it has loaded."""
     here, there = SPAWN.Pipe(duplex=False)
-    process = SPAWN.Process(target=_follow, args=(there, meeting, rank, size, work), daemon=True)
+    process = SPAWN.Process(
+        target=_run_follower, args=(there, meeting, rank, size, work), daemon=True
+    )
     process.start()
     there.close()  # so that the other end detects the end of the process
     return here, process
 
 
-def _follow(ready: Connection, meeting: str, rank: int, size: int, work: Work[Any]) -> None:
+def _run_follower(
+    ready: Connection, meeting: str, rank: int, size: int, work: GroupWork[Any]
+) -> None:
     """Run as a process other than rank 0."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # rank 0 ends it
     torch.set_num_threads(max(torch.get_num_threads() // size, 1))
     ready.send(True)
     with suppress(DmrlError):  # rank 0 reports it
-        _member(meeting, rank, size, work)
+        _join_group(meeting, rank, size, work)

@@ -7,18 +7,18 @@ classifies as robots are worth repeating (Sung and Poggio 1998, Shrivastava et a
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.learn.data.batches import Examples, U, gathered
-from dmrl.learn.inference.loaded_model import grids_of
+from dmrl.learn.data.batches import ExampleSet, U, collate
+from dmrl.learn.inference.loaded_model import predict_grids
 from dmrl.learn.networks.architectures import Network
 
-LEAST = 0.05
+MIN_CONFIDENCE = 0.05
 """Lower bound of an image's confidence when it is weighted, so that every image still appears."""
-BATCH = 32
+BATCH_SIZE = 32
 """Images per forward pass."""
 
 
-def mined(
-    network: Network, examples: Examples, shares: NDArray[np.float64] | None, hard_share: float
+def mine_hard_negatives(
+    network: Network, examples: ExampleSet, shares: NDArray[np.float64] | None, hard_share: float
 ) -> NDArray[np.float64] | None:
     """Return how often each image shall appear in the next epoch, 1 on average.
 
@@ -43,30 +43,37 @@ def mined(
         (N,) weights; ``shares`` itself if there are no images of one of the two kinds.
     """
     before = np.ones(len(examples)) if shares is None else shares
-    empty = empties(examples)
+    empty = find_empty_images(examples)
     wanted = empty & (before > 0)  # weight 0: excluded from training
     if not wanted.any() or not before[~empty].sum():
         return shares
-    weight = np.maximum(beliefs(network, examples, np.flatnonzero(wanted)), LEAST) ** 2
+    weight = (
+        np.maximum(
+            compute_peak_confidences(network, examples, np.flatnonzero(wanted)), MIN_CONFIDENCE
+        )
+        ** 2
+    )
     out = before.copy()
     out[wanted] = hard_share * weight / weight.sum()
     out[~empty] *= (1 - hard_share) / before[~empty].sum()
     return np.asarray(out * len(examples))
 
 
-def empties(examples: Examples) -> NDArray[np.bool_]:
+def find_empty_images(examples: ExampleSet) -> NDArray[np.bool_]:
     """Return (N,) whether each image is labelled as containing no robot."""
     return np.asarray(np.isnan(examples.robots[..., U]).all(axis=1))
 
 
-def beliefs(network: Network, examples: Examples, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
+def compute_peak_confidences(
+    network: Network, examples: ExampleSet, chosen: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """Return (len(chosen),) the highest confidence in each of the chosen images, 0 to 1."""
     training = network.training
     network.eval()
     try:
         found = [
-            grids_of(network, gathered(examples, chosen[start : start + BATCH]).images)
-            for start in range(0, len(chosen), BATCH)
+            predict_grids(network, collate(examples, chosen[start : start + BATCH_SIZE]).images)
+            for start in range(0, len(chosen), BATCH_SIZE)
         ]
     finally:
         network.train(training)

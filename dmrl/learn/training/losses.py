@@ -13,12 +13,12 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, one_hot
 
 from dmrl.learn.data.targets import Targets
-from dmrl.learn.networks.architectures import CLASS, SPREAD
+from dmrl.learn.networks.architectures import CLASS_PREFIX, SPREAD_CHANNEL
 
 DepthLoss = Literal["squared", "log"]
-Outputs = Mapping[str, Tensor]
+OutputChannels = Mapping[str, Tensor]
 """Output of a network: (N, rows, cols) by channel name."""
-LEAST_LOG_SPREAD = math.log(0.01)
+MIN_LOG_SPREAD = math.log(0.01)
 """Lower bound of the predicted log spread: a hundredth of the depth."""
 
 
@@ -138,7 +138,7 @@ def spread_loss(log_spread: Tensor, log_depth: Tensor, depth_m: Tensor, weight: 
     there = weight > 0
     error = (log_depth.detach() - torch.where(there, depth_m, 1.0).log()).abs() * there
     # Without a lower bound, an exact depth would have an infinitely good loss.
-    log_b = log_spread.clamp(min=LEAST_LOG_SPREAD)
+    log_b = log_spread.clamp(min=MIN_LOG_SPREAD)
     return (weight * (error * (-log_b).exp() + log_b)).sum(dim=(1, 2)).mean()
 
 
@@ -161,7 +161,7 @@ def class_loss(logits: Tensor, class_id: Tensor, weight: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, slots=True)
-class Term:
+class LossTerm:
     """One term of the loss.
 
     Parameters
@@ -179,47 +179,47 @@ class Term:
     name: str
     weight: str
     channels: tuple[str, ...]
-    of: Callable[[Outputs, Targets, LossSettings], Tensor]
+    compute: Callable[[OutputChannels, Targets, LossSettings], Tensor]
 
 
-def _confidence(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
+def _confidence_term(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Tensor:
     weight = wanted.confidence_weight
     return confidence_loss(out["confidence"], wanted.confidence, weight, focus=settings.focus)
 
 
-def _depth(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
+def _depth_term(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Tensor:
     return depth_loss(out["log_depth"], wanted.depth_m, wanted.weight, settings.depth_loss)
 
 
-def _offset(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
+def _offset_term(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Tensor:
     both = torch.stack((out["offset_u"], out["offset_v"]), dim=1)
     return offset_loss(both, wanted.offset, wanted.offset_weight)
 
 
-def _spread(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
-    return spread_loss(out[SPREAD], out["log_depth"], wanted.depth_m, wanted.weight)
+def _spread_term(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Tensor:
+    return spread_loss(out[SPREAD_CHANNEL], out["log_depth"], wanted.depth_m, wanted.weight)
 
 
-def _class(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
-    logits = torch.stack([out[name] for name in out if name.startswith(CLASS)], dim=1)
+def _class_term(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Tensor:
+    logits = torch.stack([out[name] for name in out if name.startswith(CLASS_PREFIX)], dim=1)
     return class_loss(logits, wanted.class_id, wanted.weight)
 
 
 TERMS = (
-    Term("confidence_loss", "confidence_weight", ("confidence",), _confidence),
-    Term("depth_loss", "depth_weight", ("log_depth",), _depth),
-    Term("offset_loss", "offset_weight", ("offset_u", "offset_v"), _offset),
-    Term("spread_loss", "spread_weight", (SPREAD, "log_depth"), _spread),
-    Term("class_loss", "class_weight", (f"{CLASS}0",), _class),
+    LossTerm("confidence_loss", "confidence_weight", ("confidence",), _confidence_term),
+    LossTerm("depth_loss", "depth_weight", ("log_depth",), _depth_term),
+    LossTerm("offset_loss", "offset_weight", ("offset_u", "offset_v"), _offset_term),
+    LossTerm("spread_loss", "spread_weight", (SPREAD_CHANNEL, "log_depth"), _spread_term),
+    LossTerm("class_loss", "class_weight", (f"{CLASS_PREFIX}0",), _class_term),
 )
 """All terms of the loss; training minimises their weighted sum."""
 
 
-def weighted(out: Outputs, wanted: Targets, settings: LossSettings) -> Tensor:
+def compute_loss_terms(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Tensor:
     """Return every weighted term, in the order of ``TERMS``; 0 if its channels are missing."""
     none = out["confidence"].new_zeros(())
     parts = [
-        term.of(out, wanted, settings) if out.keys() >= set(term.channels) else none
+        term.compute(out, wanted, settings) if out.keys() >= set(term.channels) else none
         for term in TERMS
     ]
     factors = none.new_tensor([getattr(settings, term.weight) for term in TERMS])

@@ -6,23 +6,23 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from dmrl.learn.networks.architectures import CHANNELS, Network
+from dmrl.learn.networks.architectures import INPUT_CHANNELS, Network
 
 OptimizerName = Literal["muon", "adam"]
 
 ADAM_EPSILON = 1e-7
 """Denominator term of Adam: the default of Keras, which the paper used."""
-MOMENTUM = 0.95
+MUON_MOMENTUM = 0.95
 """Momentum of Muon, with Nesterov's look-ahead."""
-UPDATE_RMS = 0.2
+MUON_UPDATE_RMS = 0.2
 """Root mean square of a Muon update over the learning rate. About that of Adam, so that one
 learning rate suits both (Liu et al. 2025)."""
-NEWTON_SCHULZ = (3.4445, -4.7750, 2.0315)
+NEWTON_SCHULZ_COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 """Coefficients of the quintic iteration."""
 NEWTON_SCHULZ_STEPS = 5
 
 
-def new_optimizer(
+def build_optimizer(
     network: Network, name: OptimizerName, weight_decay: float
 ) -> torch.optim.Optimizer:
     """Build the optimizer of a training.
@@ -39,7 +39,7 @@ def new_optimizer(
     kernels = [p for p in network.parameters() if p.ndim > 1]
     others = [p for p in network.parameters() if p.ndim == 1]
     if name == "muon":
-        mixing = _mixing(network)
+        mixing = _mixing_kernels(network)
         rest = [p for p in kernels if not any(p is q for q in mixing)]
         return Muon(
             [
@@ -57,13 +57,13 @@ def new_optimizer(
     return torch.optim.AdamW(groups, eps=ADAM_EPSILON)
 
 
-def _mixing(network: Network) -> list[Tensor]:
+def _mixing_kernels(network: Network) -> list[Tensor]:
     """Return the kernels between hidden layers: no first layer, no depthwise layer, no head."""
     convs = [m for m in network.modules() if isinstance(m, nn.Conv2d)]
     return [
         conv.weight
         for conv in convs[:-1]
-        if conv.groups == 1 and conv.in_channels > CHANNELS and conv.out_channels > 1
+        if conv.groups == 1 and conv.in_channels > INPUT_CHANNELS and conv.out_channels > 1
     ]
 
 
@@ -91,11 +91,11 @@ class Muon(torch.optim.AdamW):
         for group in self.param_groups:
             if group["mixing"]:
                 for kernel in group["params"]:
-                    self._turn(kernel, group["lr"], group["weight_decay"])
+                    self._update_kernel(kernel, group["lr"], group["weight_decay"])
                     kernel.grad = None  # so that AdamW skips it
         return super().step(closure)
 
-    def _turn(self, kernel: Tensor, learning_rate: float, weight_decay: float) -> None:
+    def _update_kernel(self, kernel: Tensor, learning_rate: float, weight_decay: float) -> None:
         """Apply the Muon update to one kernel."""
         state = self.state[kernel]
         if not state:
@@ -103,14 +103,14 @@ class Muon(torch.optim.AdamW):
             state["step"] = torch.tensor(0.0)
             state["momentum"] = torch.zeros_like(kernel)
         assert kernel.grad is not None
-        momentum = state["momentum"].lerp_(kernel.grad, 1 - MOMENTUM)
-        ahead = torch.lerp(kernel.grad, momentum, MOMENTUM).flatten(1)  # Nesterov
-        update = orthogonal(ahead).reshape(kernel.shape)
+        momentum = state["momentum"].lerp_(kernel.grad, 1 - MUON_MOMENTUM)
+        ahead = torch.lerp(kernel.grad, momentum, MUON_MOMENTUM).flatten(1)  # Nesterov
+        update = orthogonalize(ahead).reshape(kernel.shape)
         kernel.mul_(1 - learning_rate * weight_decay)
-        kernel.add_(update, alpha=-learning_rate * UPDATE_RMS * max(ahead.shape) ** 0.5)
+        kernel.add_(update, alpha=-learning_rate * MUON_UPDATE_RMS * max(ahead.shape) ** 0.5)
 
 
-def orthogonal(matrix: Tensor) -> Tensor:
+def orthogonalize(matrix: Tensor) -> Tensor:
     """Orthogonalise a matrix: scale all singular values to about 1 (0.7 to 1.2).
 
     Five steps of a quintic Newton-Schulz iteration need only products, no decomposition.
@@ -118,7 +118,7 @@ def orthogonal(matrix: Tensor) -> Tensor:
     tall = matrix.shape[0] > matrix.shape[1]
     x: Tensor = matrix.T if tall else matrix
     x = x / (x.norm() + ADAM_EPSILON)
-    a, b, c = NEWTON_SCHULZ
+    a, b, c = NEWTON_SCHULZ_COEFFICIENTS
     for _ in range(NEWTON_SCHULZ_STEPS):
         square = x @ x.T
         x = a * x + (b * square + c * square @ square) @ x

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from torch.utils.tensorboard import SummaryWriter
 
-Board = Callable[[str, float, int], None]
+ScalarWriter = Callable[[str, float, int], None]
 """Function that logs the name of a curve, its value and the step."""
 
 
 @contextmanager
-def opened(folder: Path, first_step: int) -> Iterator[Board]:
+def open_log(folder: Path, first_step: int) -> Iterator[ScalarWriter]:
     """Open a TensorBoard log in ``folder``; earlier values from ``first_step`` on are dropped.
 
     Raises

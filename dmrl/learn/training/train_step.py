@@ -6,18 +6,18 @@ import torch
 from torch import Tensor
 
 from dmrl.learn.data.batches import Batch
-from dmrl.learn.data.targets import as_targets, targets
-from dmrl.learn.networks.architectures import Network, by_name, to_input
-from dmrl.learn.training.config import FitSettings
-from dmrl.learn.training.distributed import Group
-from dmrl.learn.training.losses import TERMS, weighted
+from dmrl.learn.data.targets import build_targets, build_teacher_targets
+from dmrl.learn.networks.architectures import Network, normalize_images, unbind_channels
+from dmrl.learn.training.config import TrainConfig
+from dmrl.learn.training.distributed import ProcessGroup
+from dmrl.learn.training.losses import TERMS, compute_loss_terms
 
-ALONE = Group()
-LOSSES = tuple(term.name for term in TERMS)
+SINGLE_PROCESS = ProcessGroup()
+LOSS_NAMES = tuple(term.name for term in TERMS)
 
 
-def losses(
-    network: Network, batch: Batch, settings: FitSettings, teacher: Network | None = None
+def compute_losses(
+    network: Network, batch: Batch, settings: TrainConfig, teacher: Network | None = None
 ) -> Tensor:
     """Compute the weighted losses of a batch, in the order of ``LOSSES``.
 
@@ -25,26 +25,28 @@ def losses(
     """
     device = next(network.parameters()).device
     images, robots = (t.to(device, non_blocking=True) for t in batch)
-    pixels = to_input(images)
-    out = _output(network, pixels, settings)
-    wanted = targets(
+    pixels = normalize_images(images)
+    out = _forward(network, pixels, settings)
+    wanted = build_targets(
         robots,
         (out.shape[2], out.shape[3]),
         sigma_cells=settings.target_sigma_cells,
         stride_px=network.stride_px,
         label_noise=settings.label_noise,
     )
-    named = by_name(network.channels, out)
-    parts = weighted(named, wanted, settings)
+    named = unbind_channels(network.channels, out)
+    parts = compute_loss_terms(named, wanted, settings)
     if teacher is None:
         return parts
     with torch.no_grad():
-        said = _output(teacher, pixels, settings)
-    taught = weighted(named, as_targets(teacher.channels, said, wanted), settings)
+        said = _forward(teacher, pixels, settings)
+    taught = compute_loss_terms(
+        named, build_teacher_targets(teacher.channels, said, wanted), settings
+    )
     return torch.lerp(parts, taught, settings.distill_share)
 
 
-def _output(network: Network, pixels: Tensor, settings: FitSettings) -> Tensor:
+def _forward(network: Network, pixels: Tensor, settings: TrainConfig) -> Tensor:
     """Run a network in the configured precision; return (N, C, rows, cols) float32."""
     half = settings.precision == "bfloat16"
     with torch.autocast(pixels.device.type, torch.bfloat16, enabled=half):
@@ -56,9 +58,9 @@ def train_step(
     network: Network,
     optimizer: torch.optim.Optimizer,
     batch: Batch,
-    settings: FitSettings,
+    settings: TrainConfig,
     learning_rate: float,
-    group: Group = ALONE,
+    group: ProcessGroup = SINGLE_PROCESS,
     share: float = 1.0,
     teacher: Network | None = None,
 ) -> Tensor:
@@ -88,15 +90,15 @@ def train_step(
     """
     for parameters in optimizer.param_groups:
         parameters["lr"] = learning_rate
-    parts = losses(network, batch, settings, teacher)
+    parts = compute_losses(network, batch, settings, teacher)
     optimizer.zero_grad(set_to_none=True)
     parts.sum().backward()  # type: ignore[no-untyped-call]
-    parts = group.average(network, parts.detach(), share)
+    parts = group.all_reduce_mean(network, parts.detach(), share)
     optimizer.step()
     return parts
 
 
-class Average:
+class WeightEma:
     """Exponential moving average (EMA) of the weights; it varies less than the weights do.
 
     The time constant is shorter in the first steps, so that the initial weights do not persist.

@@ -14,31 +14,38 @@ from torch import Tensor, nn
 
 from dmrl.errors import SettingError
 from dmrl.learn.data.augment import Augmenter
-from dmrl.learn.data.batches import Batch, Examples, ahead, batch_count, gathered, order
-from dmrl.learn.networks.architectures import Network, build
+from dmrl.learn.data.batches import (
+    Batch,
+    ExampleSet,
+    collate,
+    count_batches,
+    epoch_indices,
+    prefetch,
+)
+from dmrl.learn.networks.architectures import Network, build_network
 from dmrl.learn.training import tensorboard_log as boards
-from dmrl.learn.training.checkpoint import State, load_checkpoint, save_checkpoint
-from dmrl.learn.training.config import FitSettings
-from dmrl.learn.training.distributed import Group
-from dmrl.learn.training.hard_negatives import mined
-from dmrl.learn.training.optimizer import new_optimizer
-from dmrl.learn.training.train_step import ALONE, LOSSES, Average, train_step
-from dmrl.learn.training.validation import validation_figures
+from dmrl.learn.training.checkpoint import TrainingProgress, load_checkpoint, save_checkpoint
+from dmrl.learn.training.config import TrainConfig
+from dmrl.learn.training.distributed import ProcessGroup
+from dmrl.learn.training.hard_negatives import mine_hard_negatives
+from dmrl.learn.training.optimizer import build_optimizer
+from dmrl.learn.training.train_step import LOSS_NAMES, SINGLE_PROCESS, WeightEma, train_step
+from dmrl.learn.training.validation import validate
 
-Shares = NDArray[np.float64] | None
+SampleWeights = NDArray[np.float64] | None
 """(N,) how often each image appears in an epoch, 1 on average; None: once."""
-WATCH_STEPS = 10
+LOG_EVERY_STEPS = 10
 """Steps between two readings of the loss, since each reading synchronises an accelerator."""
 
 
-class Step(NamedTuple):
+class StepProgress(NamedTuple):
     """Progress after a training step: epoch from 1, and the mean loss of the last few steps."""
 
     epoch: int
     loss: float
 
 
-def device_of(name: str) -> torch.device:
+def select_device(name: str) -> torch.device:
     """Select the compute device.
 
     Raises
@@ -53,7 +60,7 @@ def device_of(name: str) -> torch.device:
     return torch.device(name)
 
 
-def learning_rate_at(step: int, steps_per_epoch: int, settings: FitSettings) -> float:
+def learning_rate_at(step: int, steps_per_epoch: int, settings: TrainConfig) -> float:
     """Return the learning rate of a step (from 1): linear warm-up, then a half cosine."""
     warmup = settings.warmup_epochs * steps_per_epoch
     if step < warmup:
@@ -64,7 +71,7 @@ def learning_rate_at(step: int, steps_per_epoch: int, settings: FitSettings) -> 
     return low + (settings.learning_rate - low) * share
 
 
-def new_network(settings: FitSettings, examples: Examples) -> Network:
+def build_initial_network(settings: TrainConfig, examples: ExampleSet) -> Network:
     """Build the network to train, with initial weights from the seed.
 
     Raises
@@ -72,7 +79,9 @@ def new_network(settings: FitSettings, examples: Examples) -> Network:
     SettingError
         If the architecture does not exist, there are no images, or it does not support their size.
     """
-    network = build(settings.architecture, seed=settings.seed, extra=settings.extra)
+    network = build_network(
+        settings.architecture, seed=settings.seed, extra=settings.extra_channels
+    )
     if not len(examples):
         raise SettingError("no images to train on. Use a dataset with a train split")
     height_px, width_px, _ = examples.image_shape
@@ -85,7 +94,7 @@ def new_network(settings: FitSettings, examples: Examples) -> Network:
     return network
 
 
-class Training:
+class Trainer:
     """Training loop: iterate ``steps()`` to the end, then use ``history`` and ``network``.
 
     Parameters
@@ -122,30 +131,30 @@ class Training:
     def __init__(
         self,
         network: Network,
-        examples: Examples,
-        settings: FitSettings,
+        examples: ExampleSet,
+        settings: TrainConfig,
         folder: Path,
         *,
-        validation: Examples | None = None,
+        validation: ExampleSet | None = None,
         shares: NDArray[np.float64] | None = None,
         identity: str = "",
         teacher: Network | None = None,
-        group: Group = ALONE,
+        group: ProcessGroup = SINGLE_PROCESS,
         resume: bool = False,
     ) -> None:
         self._group = group
-        self._learning = network.to(device_of(settings.device))
-        self._teacher = teacher and teacher.to(device_of(settings.device)).eval()
+        self._learning = network.to(select_device(settings.device))
+        self._teacher = teacher and teacher.to(select_device(settings.device)).eval()
         self._examples, self._validation, self._shares = examples, validation, shares
         self._settings, self._folder = settings, folder
-        self._optimizer = new_optimizer(network, settings.optimizer, settings.weight_decay)
-        self._average = Average(network, settings.ema_steps) if settings.ema_steps else None
+        self._optimizer = build_optimizer(network, settings.optimizer, settings.weight_decay)
+        self._average = WeightEma(network, settings.ema_steps) if settings.ema_steps else None
         self._epoch_images = settings.epoch_images or len(examples)
-        self._steps_per_epoch = batch_count(self._epoch_images, settings.batch_size)
+        self._steps_per_epoch = count_batches(self._epoch_images, settings.batch_size)
         run = {**asdict(settings), "data": identity}
-        self._state = State(run)
+        self._state = TrainingProgress(run)
         if resume:
-            self._state = load_checkpoint(folder, self._networks(), self._optimizer, run)
+            self._state = load_checkpoint(folder, self._networks_by_role(), self._optimizer, run)
 
     @property
     def network(self) -> Network:
@@ -162,7 +171,7 @@ class Training:
         """Number of steps that ``steps()`` will take."""
         return (self._settings.epochs - self._state.epochs_done) * self._steps_per_epoch
 
-    def steps(self) -> Iterator[Step]:
+    def train_steps(self) -> Iterator[StepProgress]:
         """Train, one step at a time.
 
         Yields
@@ -176,75 +185,83 @@ class Training:
             If the loss is not finite.
         """
         first = self._state.epochs_done
-        with self._board(first * self._steps_per_epoch + 1) as board:
+        with self._open_log(first * self._steps_per_epoch + 1) as board:
             for epoch in range(first, self._settings.epochs):
                 left = self._settings.epochs - epoch
                 frozen = left <= self._settings.frozen_norm_epochs
-                _for_training(self._learning, frozen_norms=frozen)
-                said = yield from self._epoch(epoch, board)
+                _set_train_mode(self._learning, frozen_norms=frozen)
+                said = yield from self._train_epoch(epoch, board)
                 self._learning.eval()
-                if self._validation is not None and self._group.leads:
-                    said |= validation_figures(self.network, self._validation, self._settings)
+                if self._validation is not None and self._group.is_main:
+                    said |= validate(self.network, self._validation, self._settings)
                     at = (epoch + 1) * self._steps_per_epoch
-                    for name in sorted(said.keys() - {"loss", *LOSSES}):
+                    for name in sorted(said.keys() - {"loss", *LOSS_NAMES}):
                         board(name.replace("_", "/", 1), said[name], at)
-                self._state = State(self._state.run, epoch + 1, [*self.history, said])
-                if self._group.leads:
-                    save_checkpoint(self._folder, self._networks(), self._optimizer, self._state)
+                self._state = TrainingProgress(self._state.run, epoch + 1, [*self.history, said])
+                if self._group.is_main:
+                    save_checkpoint(
+                        self._folder, self._networks_by_role(), self._optimizer, self._state
+                    )
 
     @contextmanager
-    def _board(self, first_step: int) -> Iterator[boards.Board]:
+    def _open_log(self, first_step: int) -> Iterator[boards.ScalarWriter]:
         """Open the TensorBoard log; only the first process writes one."""
-        if not self._group.leads:
+        if not self._group.is_main:
             yield lambda name, value, step: None
             return
-        with boards.opened(self._folder / "tensorboard", first_step) as board:
+        with boards.open_log(self._folder / "tensorboard", first_step) as board:
             yield board
 
-    def _networks(self) -> dict[str, Network]:
+    def _networks_by_role(self) -> dict[str, Network]:
         averaged = {"average": self._average.network} if self._average else {}
         return {"network": self._learning, **averaged}
 
-    def _batches(self, epoch: int, shares: Shares) -> Iterator[Batch]:
+    def _iter_batches(self, epoch: int, shares: SampleWeights) -> Iterator[Batch]:
         size, seed = self._settings.batch_size, self._settings.seed
-        indices = order(
+        indices = epoch_indices(
             len(self._examples), seed=seed, epoch=epoch, shares=shares, images=self._epoch_images
         )
         augmentation = self._settings.augmentation(epoch)
         augmenter = (
-            None if augmentation.is_nothing else Augmenter(self._examples, augmentation, seed=seed)
+            None if augmentation.is_identity else Augmenter(self._examples, augmentation, seed=seed)
         )
         for index, start in enumerate(range(0, len(indices), size)):
             whole = indices[start : start + size]
             # With more processes than images, the others compute an image of weight 0.
-            chosen = self._group.part(whole) if len(whole) >= self._group.size else whole[:1]
+            chosen = self._group.select_part(whole) if len(whole) >= self._group.size else whole[:1]
             if augmenter is None:
-                yield gathered(self._examples, chosen)
+                yield collate(self._examples, chosen)
             else:
-                yield augmenter.batch(
+                yield augmenter.augment_batch(
                     chosen, epoch=epoch, index=index * self._group.size + self._group.rank
                 )
 
-    def _epoch_shares(self) -> Shares:
+    def _epoch_weights(self) -> SampleWeights:
         """Return how often each image appears in the next epoch, with hard negatives if enabled."""
         share = self._settings.hard_share
-        return mined(self.network, self._examples, self._shares, share) if share else self._shares
+        return (
+            mine_hard_negatives(self.network, self._examples, self._shares, share)
+            if share
+            else self._shares
+        )
 
-    def _epoch(self, epoch: int, board: boards.Board) -> Generator[Step, None, dict[str, float]]:
+    def _train_epoch(
+        self, epoch: int, board: boards.ScalarWriter
+    ) -> Generator[StepProgress, None, dict[str, float]]:
         """Train one epoch and return its mean losses."""
         size = self._settings.batch_size
         seen: list[Tensor] = []
-        total, loss = torch.zeros(len(LOSSES)), math.nan
-        shares = self._epoch_shares()
-        for index, batch in enumerate(ahead(self._batches(epoch, shares)), start=1):
+        total, loss = torch.zeros(len(LOSS_NAMES)), math.nan
+        shares = self._epoch_weights()
+        for index, batch in enumerate(prefetch(self._iter_batches(epoch, shares)), start=1):
             step = epoch * self._steps_per_epoch + index
             rate = learning_rate_at(step, self._steps_per_epoch, self._settings)
             whole = min(size, self._epoch_images - (index - 1) * size)
-            parts = self._step(batch, rate, whole)
+            parts = self._train_batch(batch, rate, whole)
             if self._average:
                 self._average.update(step)
             seen.append(parts * whole)
-            if index % WATCH_STEPS == 0 or index == self._steps_per_epoch:
+            if index % LOG_EVERY_STEPS == 0 or index == self._steps_per_epoch:
                 recent = torch.stack(seen).cpu()
                 loss = float(recent.sum()) / ((len(seen) - 1) * size + whole)
                 _require_finite(loss, epoch + 1, index)
@@ -252,14 +269,14 @@ class Training:
                 board("learning_rate", rate, step)
                 total += recent.sum(dim=0)
                 seen.clear()
-            yield Step(epoch + 1, loss)
+            yield StepProgress(epoch + 1, loss)
         means = (total / self._epoch_images).tolist()
-        return {"loss": sum(means), **dict(zip(LOSSES, means, strict=True))}
+        return {"loss": sum(means), **dict(zip(LOSS_NAMES, means, strict=True))}
 
-    def _step(self, batch: Batch, rate: float, whole: int) -> Tensor:
+    def _train_batch(self, batch: Batch, rate: float, whole: int) -> Tensor:
         """Take one step on this process's part of a batch of ``whole`` images; return losses."""
         group = self._group
-        share = len(group.part(np.arange(whole))) / whole
+        share = len(group.select_part(np.arange(whole))) / whole
         return train_step(
             self._learning,
             self._optimizer,
@@ -272,7 +289,7 @@ class Training:
         )
 
 
-def _for_training(network: Network, *, frozen_norms: bool) -> None:
+def _set_train_mode(network: Network, *, frozen_norms: bool) -> None:
     """Set train mode; with frozen norms, batch normalisation keeps its running statistics."""
     network.train()
     if frozen_norms:

@@ -3,24 +3,26 @@
 import numpy as np
 import torch
 
-from dmrl.learn.data.batches import DEPTH, Examples, U, V, in_order
+from dmrl.learn.data.batches import DEPTH, ExampleSet, U, V, iter_batches
 from dmrl.learn.inference.decode_grids import decode
-from dmrl.learn.inference.detection_metrics import Scored, figures, score
-from dmrl.learn.inference.loaded_model import grids_of
+from dmrl.learn.inference.detection_metrics import (
+    ScoredDetections,
+    compute_metrics,
+    score_detections,
+)
+from dmrl.learn.inference.loaded_model import predict_grids
 from dmrl.learn.inference.matching import Points
 from dmrl.learn.networks.architectures import Network
-from dmrl.learn.training.config import FitSettings
-from dmrl.learn.training.train_step import losses
+from dmrl.learn.training.config import TrainConfig
+from dmrl.learn.training.train_step import compute_losses
 
-WATCHED = ("within_20_px", "median_px", "depth_mae_m", "ap_16_px")
+VALIDATION_METRICS = ("within_20_px", "median_px", "depth_mae_m", "ap_16_px")
 """Metrics of `detection_metrics` that are logged during a training."""
-EVERYWHERE = (0.0, np.inf)
+ALL_DEPTHS_M = (0.0, np.inf)
 """Depth band of all labels, metres."""
 
 
-def validation_figures(
-    network: Network, examples: Examples, settings: FitSettings
-) -> dict[str, float]:
+def validate(network: Network, examples: ExampleSet, settings: TrainConfig) -> dict[str, float]:
     """Compute loss and metrics on held-out images; each name begins with validation.
 
     Parameters
@@ -34,27 +36,31 @@ def validation_figures(
     """
     total = 0.0
     with torch.inference_mode():
-        for batch in in_order(examples, settings.batch_size):
-            total += float(losses(network, batch, settings).sum()) * len(batch.images)
-    scored = scores(network, examples)
-    found = figures(scored, EVERYWHERE, 0.5, np.ones((1, len(examples))))
-    watched = {f"validation_{name}": float(found[name][0]) for name in WATCHED}
+        for batch in iter_batches(examples, settings.batch_size):
+            total += float(compute_losses(network, batch, settings).sum()) * len(batch.images)
+    scored = score_examples(network, examples)
+    found = compute_metrics(scored, ALL_DEPTHS_M, 0.5, np.ones((1, len(examples))))
+    watched = {f"validation_{name}": float(found[name][0]) for name in VALIDATION_METRICS}
     return {"validation_loss": total / len(examples), **watched}
 
 
-def scores(network: Network, examples: Examples, batch_size: int = 16) -> Scored:
+def score_examples(
+    network: Network, examples: ExampleSet, batch_size: int = 16
+) -> ScoredDetections:
     """Detect robots in images and match the detections with the labels."""
     parts = []
-    for batch in in_order(examples, batch_size):
-        found = decode(*grids_of(network, batch.images), stride_px=network.stride_px)
+    for batch in iter_batches(examples, batch_size):
+        found = decode(*predict_grids(network, batch.images), stride_px=network.stride_px)
         image, place = np.nonzero(np.arange(found.u_px.shape[1]) < found.count[:, None])
         columns = (found.u_px, found.v_px, found.depth_m, found.confidence)
         parts.append(Points(image, *(column[image, place] for column in columns)))
     first = np.arange(0, len(examples), batch_size)
-    return score(len(examples), labels(examples), Points.concatenate(parts, first))
+    return score_detections(
+        len(examples), select_visible_labels(examples), Points.concatenate(parts, first)
+    )
 
 
-def labels(examples: Examples) -> Points:
+def select_visible_labels(examples: ExampleSet) -> Points:
     """Return the labels of robots whose centres are inside the images."""
     height_px, width_px, _ = examples.image_shape
     robots = examples.robots.astype(np.float64)

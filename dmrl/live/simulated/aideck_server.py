@@ -10,23 +10,23 @@ import numpy as np
 from dmrl.errors import SettingError
 from dmrl.formats.aideck.cpx import Image
 from dmrl.formats.aideck.cpx_encode import pack_image
-from dmrl.formats.aideck.cpx_state import State
+from dmrl.formats.aideck.cpx_state import RobotState
 from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX
 from dmrl.images import bayer, codec
-from dmrl.live.simulated.flight_source import Faults, FlightClock, Pictures
+from dmrl.live.simulated.flight_source import FlightClock, FlightImages, SimulatedFaults
 
-Sends = Literal["plain", "stamped", "streamer", "jpeg"]
+SentLayout = Literal["plain", "stamped", "streamer", "jpeg"]
 """The layouts of raw images, or plain JPEG."""
 
 POLL_S = 0.05
-CAMERA_BOOT_US = 3_210_000
+CAMERA_CLOCK_OFFSET_US = 3_210_000
 """Offset of the camera's clock from the robot's, since its chip starts at another time."""
-UART_US = 1_500
+UART_LATENCY_US = 1_500
 """Latency of a state on its way to the camera."""
 JPEG_QUALITY = 90
 
 
-class FakeCamera(threading.Thread):
+class SimulatedCamera(threading.Thread):
     """Thread of one simulated camera. Like the deck, it serves one client at a time.
 
     Parameters
@@ -56,10 +56,10 @@ class FakeCamera(threading.Thread):
         self,
         robot: str,
         address: tuple[str, int],
-        pictures: Pictures,
+        pictures: FlightImages,
         clock: FlightClock,
-        faults: Faults,
-        sends: Sends,
+        faults: SimulatedFaults,
+        sends: SentLayout,
         seed: int,
     ) -> None:
         super().__init__(name=f"fake camera {robot}", daemon=True)
@@ -69,9 +69,9 @@ class FakeCamera(threading.Thread):
         self._chance = np.random.default_rng(seed)
         self._stop_wanted = threading.Event()
         self._number = 0
-        self._listener = self._listen()
+        self._listener = self._open_listener()
 
-    def _listen(self) -> socket.socket:
+    def _open_listener(self) -> socket.socket:
         try:
             listener = socket.create_server(self._address)
         except OSError as e:
@@ -99,20 +99,20 @@ class FakeCamera(threading.Thread):
     def run(self) -> None:
         """Serve one client after the other with images, until stopped."""
         while not self._stop_wanted.is_set():
-            if self._faults.dead(self._clock.now_s()):
+            if self._faults.is_dead(self._clock.now_s()):
                 self._listener.close()
                 self._stop_wanted.wait(POLL_S)
                 continue
             if self._listener.fileno() < 0:
-                self._listener = self._listen()
+                self._listener = self._open_listener()
             with suppress(TimeoutError):
                 client, _ = self._listener.accept()
                 with client, suppress(OSError):
                     client.settimeout(1.0)
-                    self._serve(client)
+                    self._serve_client(client)
         self._listener.close()
 
-    def _serve(self, client: socket.socket) -> None:
+    def _serve_client(self, client: socket.socket) -> None:
         for time_s, picture in self._pictures:
             behind_s = self._clock.now_s() - time_s
             self._number += 1
@@ -123,7 +123,7 @@ class FakeCamera(threading.Thread):
             if self._chance.random() < self._faults.drop:
                 self.dropped += 1
                 continue
-            image = self._image(picture, time_s)
+            image = self._build_image(picture, time_s)
             client.sendall(pack_image(image, "plain" if self._sends == "jpeg" else self._sends))
             self.sent += 1
         while not self._stop_wanted.wait(POLL_S):
@@ -133,7 +133,7 @@ class FakeCamera(threading.Thread):
         """Wait for a time of the flight; return False if the robot died or the thread is to end."""
         while not self._stop_wanted.is_set():
             now_s = self._clock.now_s()
-            if self._faults.dead(now_s):
+            if self._faults.is_dead(now_s):
                 return False
             if self._clock.flying and now_s >= time_s:
                 return True
@@ -141,26 +141,26 @@ class FakeCamera(threading.Thread):
             self._stop_wanted.wait(min(left_s, POLL_S) if self._clock.flying else POLL_S)
         return False
 
-    def _image(self, picture: bytes, time_s: float) -> Image:
-        rgb = whole_sensor(codec.decode(picture))
+    def _build_image(self, picture: bytes, time_s: float) -> Image:
+        rgb = pad_to_sensor(codec.decode(picture))
         height_px, width_px = rgb.shape[:2]
         if self._sends == "jpeg":
             data = codec.encode_jpeg(rgb, JPEG_QUALITY)
             return Image(width_px, height_px, "jpeg", data)
         robot_us = round(1000 * self._faults.clock_ms(time_s))
-        time_us = robot_us + CAMERA_BOOT_US
-        data, layout = bayer.mosaic(rgb).tobytes(), self._sends
-        state = self._state(robot_us) if layout == "streamer" else None
+        time_us = robot_us + CAMERA_CLOCK_OFFSET_US
+        data, layout = bayer.to_bayer(rgb).tobytes(), self._sends
+        state = self._build_state(robot_us) if layout == "streamer" else None
         return Image(width_px, height_px, "raw", data, time_us, self._number, state)
 
     @staticmethod
-    def _state(robot_us: int) -> State:
+    def _build_state(robot_us: int) -> RobotState:
         """Build the last state that arrived before the exposure, at a whole millisecond."""
-        sent_ms = (robot_us - UART_US) // 1000
-        return State(sent_ms, 1000 * sent_ms + UART_US + CAMERA_BOOT_US)
+        sent_ms = (robot_us - UART_LATENCY_US) // 1000
+        return RobotState(sent_ms, 1000 * sent_ms + UART_LATENCY_US + CAMERA_CLOCK_OFFSET_US)
 
 
-def whole_sensor(rgb: codec.Rgb) -> codec.Rgb:
+def pad_to_sensor(rgb: codec.Rgb) -> codec.Rgb:
     """Pad (H, W, 3) of the calibrated area to the whole sensor; other sizes are unchanged."""
     if rgb.shape[:2] != (AIDECK.height_px, AIDECK.width_px):
         return rgb

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dmrl.errors import SettingError
-from dmrl.live.log_blocks import BLOCK_BYTES, BLOCKS_MAX
-from dmrl.live.simulated.flight_source import FakeFlight, Faults, FlightClock
+from dmrl.live.log_blocks import BLOCK_BYTES, MAX_BLOCKS
+from dmrl.live.simulated.flight_source import FlightClock, SimulatedFaults, SimulatedFlight
 
 PARAM, COMMANDER, MEMORY, LOG, GENERIC, PLATFORM, LINK = 2, 3, 4, 5, 7, 13, 15
 PROTOCOL_VERSION = 10
@@ -41,7 +41,7 @@ Address = tuple[str, int]
 
 
 @dataclass(slots=True)
-class _Block:
+class _ServedBlock:
     """A log block: (index of the variable, format in which it is sent) each, and its due time."""
 
     variables: list[tuple[int, str]] = field(default_factory=list)
@@ -54,7 +54,7 @@ class _Block:
         return struct.calcsize("<" + "".join(kind for _, kind in self.variables))
 
 
-class FakeCrazyflie(threading.Thread):
+class SimulatedCrazyflie(threading.Thread):
     """Thread of one simulated drone.
 
     Parameters
@@ -82,19 +82,19 @@ class FakeCrazyflie(threading.Thread):
         self,
         robot: str,
         address: Address,
-        flight: FakeFlight,
+        flight: SimulatedFlight,
         clock: FlightClock,
-        faults: Faults,
+        faults: SimulatedFaults,
         seed: int,
     ) -> None:
         super().__init__(name=f"fake {robot}", daemon=True)
         self.robot, self.sent, self.dropped, self.setpoints = robot, 0, 0, 0
-        self._variables = list(flight.variables().items())
+        self._variables = list(flight.build_variables().items())
         self._clock, self._faults = clock, faults
         self._chance = np.random.default_rng(seed)
-        self._blocks: dict[int, _Block] = {}
+        self._blocks: dict[int, _ServedBlock] = {}
         self._stop_wanted = threading.Event()
-        self._rows = [_row(name, LOG_TYPES[v.kind][0]) for name, v in self._variables]
+        self._rows = [_pack_toc_row(name, LOG_TYPES[v.kind][0]) for name, v in self._variables]
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind(address)
@@ -110,7 +110,7 @@ class FakeCrazyflie(threading.Thread):
         return int(self._socket.getsockname()[1])
 
     @property
-    def listened(self) -> bool:
+    def is_logging(self) -> bool:
         """Whether any of its blocks is started."""
         return any(block.period_ms for block in list(self._blocks.values()))
 
@@ -128,62 +128,62 @@ class FakeCrazyflie(threading.Thread):
         with self._socket:
             while not self._stop_wanted.is_set():
                 now_s = self._clock.now_s()
-                dead = self._faults.dead(now_s)
+                dead = self._faults.is_dead(now_s)
                 if dead:
                     self._blocks.clear()
-                self._socket.settimeout(self._wait_s(now_s))
+                self._socket.settimeout(self._next_due_s(now_s))
                 with suppress(TimeoutError, ConnectionError):  # the latter: a client is gone
                     packet, sender = self._socket.recvfrom(64)
                     if packet and not dead:
-                        self._answer(packet, sender)
+                        self._answer_packet(packet, sender)
                 if not dead:
-                    self._send_due()
+                    self._send_due_blocks()
 
-    def _wait_s(self, now_s: float) -> float:
+    def _next_due_s(self, now_s: float) -> float:
         running = [block.due_ms for block in self._blocks.values() if block.period_ms]
         if not running:
             return POLL_S
-        due_s = self._faults.reached_s(min(running), now_s)
+        due_s = self._faults.time_at_clock(min(running), now_s)
         return min(max((due_s - now_s) / self._clock.speed, 1e-4), POLL_S)
 
-    def _send_due(self) -> None:
+    def _send_due_blocks(self) -> None:
         now_s = self._clock.now_s()
         shown_ms = self._faults.clock_ms(now_s)
         for number, block in list(self._blocks.items()):
             while block.period_ms and block.due_ms <= shown_ms and now_s < self._clock.end_s:
-                self._log(number, block, self._faults.reached_s(block.due_ms, now_s))
+                self._send_block(number, block, self._faults.time_at_clock(block.due_ms, now_s))
                 block.due_ms += block.period_ms
 
-    def _log(self, number: int, block: _Block, time_s: float) -> None:
+    def _send_block(self, number: int, block: _ServedBlock, time_s: float) -> None:
         if self._chance.random() < self._faults.drop:
             self.dropped += 1
             return
         stamp = struct.pack("<I", int(block.due_ms) % (1 << 24))[:3]
         values = b"".join(
-            struct.pack("<" + kind, _fitting(kind, self._variables[index][1].at(time_s)))
+            struct.pack("<" + kind, _to_packable(kind, self._variables[index][1].value_at(time_s)))
             for index, kind in block.variables
         )
-        self._send(LOG, 2, bytes([number]) + stamp + values, block.to)
+        self._send_packet(LOG, 2, bytes([number]) + stamp + values, block.to)
         self.sent += 1
 
-    def _send(self, port: int, channel: int, data: bytes, to: Address) -> None:
+    def _send_packet(self, port: int, channel: int, data: bytes, to: Address) -> None:
         with suppress(ConnectionError):  # the client may be gone
             self._socket.sendto(bytes([port << 4 | 3 << 2 | channel]) + data, to)
 
-    def _answer(self, packet: bytes, sender: Address) -> None:
+    def _answer_packet(self, packet: bytes, sender: Address) -> None:
         """Send the firmware's answer, if it has one."""
         port, channel, data = packet[0] >> 4, packet[0] & 3, packet[1:]
-        reply = self._reply(port, channel, data, sender)
+        reply = self._build_reply(port, channel, data, sender)
         if reply is not None:
-            self._send(port, channel, reply, sender)
+            self._send_packet(port, channel, reply, sender)
 
-    def _reply(self, port: int, channel: int, data: bytes, sender: Address) -> bytes | None:
+    def _build_reply(self, port: int, channel: int, data: bytes, sender: Address) -> bytes | None:
         if port == LINK:
             return data if channel in (0, 3) else b"Bitcraze Crazyflie\0"
         if port == LOG:
-            return self._log_reply(channel, data, sender)
+            return self._build_log_reply(channel, data, sender)
         if port == PARAM:
-            return _parameter(channel, data)
+            return _answer_parameter(channel, data)
         question = port, channel, data[:1]
         if question == (PLATFORM, 1, b"\0"):
             return bytes([0, PROTOCOL_VERSION])
@@ -192,32 +192,32 @@ class FakeCrazyflie(threading.Thread):
         self.setpoints += port in (COMMANDER, GENERIC)
         return None
 
-    def _log_reply(self, channel: int, data: bytes, sender: Address) -> bytes | None:
+    def _build_log_reply(self, channel: int, data: bytes, sender: Address) -> bytes | None:
         if channel == 0:
-            return _contents(data, self._rows, zlib.crc32(b"".join(self._rows)))
-        return self._control(data, sender) if channel == 1 and data else None
+            return _answer_toc(data, self._rows, zlib.crc32(b"".join(self._rows)))
+        return self._run_log_command(data, sender) if channel == 1 and data else None
 
-    def _control(self, data: bytes, sender: Address) -> bytes:
+    def _run_log_command(self, data: bytes, sender: Address) -> bytes:
         """Execute a log command; return command, block, error number."""
         command, number = data[0], data[1] if len(data) > 1 else 0
         if command == 5:  # reset
             self._blocks.clear()
         elif command in (6, 7):  # create, append
-            return bytes([command, number, self._create(command == 6, number, data[2:])])
+            return bytes([command, number, self._create_block(command == 6, number, data[2:])])
         elif number not in self._blocks:
             return bytes([command, number, errno.ENOENT])
         elif command == 2:  # delete
             del self._blocks[number]
         elif command in (3, 4):  # start, stop
-            self._start(self._blocks[number], 10 * data[2] if command == 3 else 0, sender)
+            self._start_block(self._blocks[number], 10 * data[2] if command == 3 else 0, sender)
         return bytes([command, number, 0])
 
-    def _create(self, new: bool, number: int, data: bytes) -> int:
+    def _create_block(self, new: bool, number: int, data: bytes) -> int:
         if new and number in self._blocks:
             return errno.EEXIST
-        if new and len(self._blocks) >= BLOCKS_MAX:
+        if new and len(self._blocks) >= MAX_BLOCKS:
             return errno.ENOMEM
-        block = _Block() if new else self._blocks[number]
+        block = _ServedBlock() if new else self._blocks[number]
         for kind, index in struct.iter_unpack("<BH", data[: len(data) // 3 * 3]):
             if index >= len(self._variables) or kind & 15 not in FORMATS:
                 return errno.ENOENT
@@ -227,7 +227,7 @@ class FakeCrazyflie(threading.Thread):
         self._blocks[number] = block
         return 0
 
-    def _start(self, block: _Block, period_ms: int, sender: Address) -> None:
+    def _start_block(self, block: _ServedBlock, period_ms: int, sender: Address) -> None:
         if period_ms:
             self._clock.take_off()
         shown_ms = self._faults.clock_ms(self._clock.now_s())
@@ -235,28 +235,28 @@ class FakeCrazyflie(threading.Thread):
         block.period_ms, block.to = period_ms, sender
 
 
-def _fitting(kind: str, value: float) -> float | int:
+def _to_packable(kind: str, value: float) -> float | int:
     return value if kind in "fe" else round(value)
 
 
-def _row(name: str, kind: int) -> bytes:
+def _pack_toc_row(name: str, kind: int) -> bytes:
     return bytes([kind]) + name.replace(".", "\0").encode() + b"\0"
 
 
-def _contents(data: bytes, rows: list[bytes], crc: int) -> bytes | None:
+def _answer_toc(data: bytes, rows: list[bytes], crc: int) -> bytes | None:
     """Return the answer to a request for a table of contents, version 2."""
     if data[:1] == b"\3":
-        return struct.pack("<BHIBB", 3, len(rows), crc, BLOCKS_MAX, 128)
+        return struct.pack("<BHIBB", 3, len(rows), crc, MAX_BLOCKS, 128)
     if data[:1] == b"\2" and len(data) >= 3:
         index = struct.unpack_from("<H", data, 1)[0]
         return data[:3] + rows[index] if index < len(rows) else data[:3]
     return None
 
 
-def _parameter(channel: int, data: bytes) -> bytes | None:
+def _answer_parameter(channel: int, data: bytes) -> bytes | None:
     if channel == 0:
-        rows = [_row(name, kind) for name, kind, _ in PARAMETERS]
-        return _contents(data, rows, zlib.crc32(b"".join(rows)))
+        rows = [_pack_toc_row(name, kind) for name, kind, _ in PARAMETERS]
+        return _answer_toc(data, rows, zlib.crc32(b"".join(rows)))
     if channel in (1, 2) and len(data) >= 2:
         index = struct.unpack_from("<H", data)[0]
         if index >= len(PARAMETERS):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmrl.geometry.frames import Array
-from dmrl.live.log_blocks import number_of
+from dmrl.live.log_blocks import parse_robot_number
 
 Signal = tuple[Array, Array]
 """Times (N,), seconds since take-off, and values (N,)."""
@@ -18,20 +18,20 @@ BATTERY_FULL_V, BATTERY_EMPTY_V, BATTERY_S = 4.15, 3.3, 420.0
 
 
 @dataclass(frozen=True, slots=True)
-class Variable:
+class SimulatedVariable:
     """One log variable: its type in cflib's names, and its values over the flight."""
 
     kind: str
     signal: Signal
 
-    def at(self, time_s: float) -> float:
+    def value_at(self, time_s: float) -> float:
         """Return the last value before a time."""
         times, values = self.signal
         return float(values[max(int(np.searchsorted(times, time_s, side="right")) - 1, 0)])
 
 
 @dataclass(frozen=True, slots=True)
-class FakeFlight:
+class SimulatedFlight:
     """Measurements of one robot.
 
     Parameters
@@ -56,7 +56,7 @@ class FakeFlight:
         """Time of landing."""
         return float(self.attitude[0][-1])
 
-    def variables(self) -> dict[str, Variable]:
+    def build_variables(self) -> dict[str, SimulatedVariable]:
         """Return the log variables, with the units and signs of the Crazyflie's firmware."""
         time_s, (roll, pitch, yaw, yaw_rate) = self.attitude[0], self.attitude[1].T
         vx, vy = (np.interp(time_s, self.velocity[0], part) for part in self.velocity[1].T)
@@ -74,16 +74,20 @@ class FakeFlight:
             "stateEstimate.yaw": np.degrees((yaw + np.pi) % (2 * np.pi) - np.pi),
         }
         floats |= {f"gyro.{axis}": np.degrees(rate) for axis, rate in zip("xyz", body, strict=True)}
-        known = {name: Variable("float", (time_s, values)) for name, values in floats.items()}
-        known["stateEstimate.z"] = Variable("float", self.height)
+        known = {
+            name: SimulatedVariable("float", (time_s, values)) for name, values in floats.items()
+        }
+        known["stateEstimate.z"] = SimulatedVariable("float", self.height)
         millimetres = np.clip(np.rint(1000 * self.height[1]), 0, 65535)
-        known["range.zrange"] = Variable("uint16_t", (self.height[0], millimetres))
+        known["range.zrange"] = SimulatedVariable("uint16_t", (self.height[0], millimetres))
         for peer, (ranged_s, range_m) in self.ranges.items():
             # Before the first ranging, the firmware's variable is 0.
             distance = np.concatenate([[-math.inf], ranged_s]), np.concatenate([[0.0], range_m])
-            known[f"ranging.distance{number_of(peer)}"] = Variable("float", distance)
+            known[f"ranging.distance{parse_robot_number(peer)}"] = SimulatedVariable(
+                "float", distance
+            )
         left_v = BATTERY_FULL_V - (BATTERY_FULL_V - BATTERY_EMPTY_V) * time_s / BATTERY_S
-        known["pm.vbat"] = Variable("float", (time_s, np.maximum(left_v, BATTERY_EMPTY_V)))
+        known["pm.vbat"] = SimulatedVariable("float", (time_s, np.maximum(left_v, BATTERY_EMPTY_V)))
         return known
 
 
@@ -127,7 +131,7 @@ class FlightClock:
 
 
 @dataclass(frozen=True, slots=True)
-class Faults:
+class SimulatedFaults:
     """Simulated faults of a drone.
 
     Parameters
@@ -147,7 +151,7 @@ class Faults:
     boot_ms: float = 12_340.0
     drift_ppm: float = 0.0
 
-    def dead(self, time_s: float) -> bool:
+    def is_dead(self, time_s: float) -> bool:
         """Return whether it is dead at a time of the flight."""
         return self.dead_s[0] <= time_s < self.dead_s[1]
 
@@ -156,10 +160,10 @@ class Faults:
         began_s = self.dead_s[1] if time_s >= self.dead_s[1] else 0.0
         return self.boot_ms + 1000 * (time_s - began_s) * (1 + 1e-6 * self.drift_ppm)
 
-    def reached_s(self, clock_ms: float, time_s: float) -> float:
+    def time_at_clock(self, clock_ms: float, time_s: float) -> float:
         """Return the time of the flight, near ``time_s``, at which its clock has this value."""
         return time_s + (clock_ms - self.clock_ms(time_s)) / 1000 / (1 + 1e-6 * self.drift_ppm)
 
 
-Pictures = Iterator[tuple[float, bytes]]
+FlightImages = Iterator[tuple[float, bytes]]
 """Times, seconds since take-off, and encoded images, in order."""

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-from dmrl.atomic_output import rewritten_file
-from dmrl.errors import OutputError, SettingError, one_line
+from dmrl.atomic_output import replace_file
+from dmrl.errors import OutputError, SettingError, to_one_line
 from dmrl.pipeline.job import has_failed
 from dmrl.pipeline.process_pool import ONE_THREAD
-from dmrl.storage import Remote
+from dmrl.storage import RemotePath
 
 SAFE_PATH = re.compile(r"[\w/.+@=-]+")
 """Paths that are safe in Slurm's header: a space would end the path, a line end begin a command."""
@@ -58,7 +58,7 @@ def write_array_job(tasks: Sequence[HasLine], out: Path) -> str:
     SettingError
         If the outputs go into a bucket.
     """
-    if isinstance(out, Remote):
+    if isinstance(out, RemotePath):
         raise SettingError(f"Slurm's nodes read their tasks beside {out}. Name a folder they share")
     if not SAFE_PATH.fullmatch(str(out.absolute())):
         raise OutputError(
@@ -77,7 +77,7 @@ def write_array_job(tasks: Sequence[HasLine], out: Path) -> str:
         elements=elements,
     )
     for path, content in ((lines, "".join(f"{task.line}\n" for task in tasks)), (script, text)):
-        with rewritten_file(path) as partial:
+        with replace_file(path) as partial:
             partial.write_text(content, encoding="utf-8")
     return f"{len(tasks)} tasks in {elements} elements. Now: sbatch {shlex.quote(str(script))}"
 
@@ -93,7 +93,7 @@ def main() -> int:
             if number % elements == element:
                 answer = run_job(line)
                 bad += has_failed(answer)
-                sys.stdout.write(one_line(json.dumps(answer)) + "\n")
+                sys.stdout.write(to_one_line(json.dumps(answer)) + "\n")
     return 1 if bad else 0
 
 

@@ -11,22 +11,29 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.errors import RecordingError
-from dmrl.geometry.calibration import no_camera
-from dmrl.recording.checks.clock_checks import clocks
+from dmrl.geometry.calibration import find_calibration_fault
+from dmrl.recording.checks.clock_checks import check_clocks
 from dmrl.recording.checks.finding import Finding
-from dmrl.recording.checks.label_checks import labels
-from dmrl.recording.checks.scan import HELD, Seen, Size, carries, glimpse, look
-from dmrl.recording.checks.unit_checks import periods
-from dmrl.recording.loaded import Contents
+from dmrl.recording.checks.label_checks import check_labels
+from dmrl.recording.checks.scan import (
+    KEPT_TOPICS,
+    CheckData,
+    ImageSize,
+    carries_own_type,
+    collect,
+    collect_from_index,
+)
+from dmrl.recording.checks.unit_checks import check_periods
+from dmrl.recording.loaded import LoadedRecording
 from dmrl.recording.mcap.message_batch import Ints
 from dmrl.terminal.progress import say
-from dmrl.topics import CALIBRATION, CAMERA_IMAGE, calibration, names, row_of
+from dmrl.topics import CALIBRATION, CAMERA_IMAGE, find_topic, parse_topic
 
 GAP_PERIODS = 10
 """Length of a gap, in median periods of the topic."""
 GAP_MIN_S = 0.5
 """Shortest gap that is reported, seconds."""
-SAID = 2
+FINDINGS_PRINTED_MAX = 2
 """Findings that a stage prints about its output. ``dmrl check`` prints all."""
 
 
@@ -45,17 +52,30 @@ def check(path: Path, *, quick: bool = False) -> list[Finding]:
     RecordingError
         If the file is not a complete recording.
     """
-    rules: tuple[Callable[[Seen], Iterator[Finding]], ...] = (_times, _clocks, _units, labels)
-    seen = glimpse(Contents(path, *HELD)) if quick else look(path)
+    rules: tuple[Callable[[CheckData], Iterator[Finding]], ...] = (
+        _check_times,
+        _check_clocks,
+        _check_units,
+        check_labels,
+    )
+    data = collect_from_index(LoadedRecording(path, *KEPT_TOPICS)) if quick else collect(path)
     if not quick:
-        rules = _types, _times, _clocks, _units, _images, _calibrations, labels
-    findings = [finding for rule in rules for finding in rule(seen)]
-    if not seen.contents.summary.count:
+        rules = (
+            _check_types,
+            _check_times,
+            _check_clocks,
+            _check_units,
+            _check_images,
+            _check_calibrations,
+            check_labels,
+        )
+    findings = [finding for rule in rules for finding in rule(data)]
+    if not data.contents.summary.count:
         findings.append(Finding("error", "", "has no messages"))
     return sorted(findings, key=lambda f: f.level)
 
 
-def label_findings(contents: Contents) -> list[str]:
+def list_label_findings(contents: LoadedRecording) -> list[str]:
     """Return the findings about the labels of a recording, such as a bias, one line each.
 
     Parameters
@@ -68,10 +88,12 @@ def label_findings(contents: Contents) -> list[str]:
     RecordingError
         If the file is not a complete recording.
     """
-    return [f"{finding.topic}: {finding.text}" for finding in labels(glimpse(contents))]
+    return [
+        f"{finding.topic}: {finding.text}" for finding in check_labels(collect_from_index(contents))
+    ]
 
 
-def say_findings(path: Path) -> None:
+def print_findings(path: Path) -> None:
     """Print the first findings about a recording that was just written, on stderr.
 
     A failed check is printed as a warning: the recording itself is complete.
@@ -81,27 +103,27 @@ def say_findings(path: Path) -> None:
     except RecordingError as e:
         say(f"warning: {e}")
         return
-    for finding in findings[:SAID]:
+    for finding in findings[:FINDINGS_PRINTED_MAX]:
         say(f"{finding.level}: {finding.topic}: {finding.text}")
-    if len(findings) > SAID:
-        say(f"{len(findings) - SAID} more: dmrl check {path}")
+    if len(findings) > FINDINGS_PRINTED_MAX:
+        say(f"{len(findings) - FINDINGS_PRINTED_MAX} more: dmrl check {path}")
 
 
-def _types(seen: Seen) -> Iterator[Finding]:
+def _check_types(data: CheckData) -> Iterator[Finding]:
     """Report topics of a wrong message type, and messages that are not of their type."""
-    for topic, info in seen.contents.topics.items():
-        row = row_of(topic)
-        if row is not None and not carries(topic, info.schema):
+    for topic, info in data.contents.topics.items():
+        row = find_topic(topic)
+        if row is not None and not carries_own_type(topic, info.schema):
             yield Finding(
                 "error", topic, f"carries {info.schema or 'no schema'}, not {row.message}"
             )
-    for topic, why in seen.broken.items():
+    for topic, why in data.broken.items():
         yield Finding("error", topic, why)
 
 
-def _times(seen: Seen) -> Iterator[Finding]:
+def _check_times(data: CheckData) -> Iterator[Finding]:
     """Report times that go back or repeat in the file, and gaps in periodic topics."""
-    for topic, time_ns in seen.times.items():
+    for topic, time_ns in data.times.items():
         step_ns = np.diff(time_ns)
         if (back := step_ns[step_ns < 0]).size:
             yield Finding(
@@ -111,21 +133,25 @@ def _times(seen: Seen) -> Iterator[Finding]:
             )
         if repeated := int((step_ns == 0).sum()):
             yield Finding("warning", topic, f"{repeated} messages repeat the time before them")
-        yield from _gaps(topic, step_ns[step_ns > 0])
+        yield from _check_gaps(topic, step_ns[step_ns > 0])
 
 
-def _clocks(seen: Seen) -> Iterator[Finding]:
+def _check_clocks(data: CheckData) -> Iterator[Finding]:
     """Report clocks that do not fit together."""
-    return (Finding("warning", topic, text) for topic, text in clocks(seen))
+    return (Finding("warning", topic, text) for topic, text in check_clocks(data))
 
 
-def _units(seen: Seen) -> Iterator[Finding]:
+def _check_units(data: CheckData) -> Iterator[Finding]:
     """Report values and times that contradict the unit, frame or sign of their topic."""
-    for topic, text in (*seen.values.doubted(), *periods(seen.times), *seen.moved.doubted()):
+    for topic, text in (
+        *data.magnitudes.find_implausible_fields(),
+        *check_periods(data.times),
+        *data.motion.find_contradictions(),
+    ):
         yield Finding("warning", topic, text)
 
 
-def _gaps(topic: str, step_ns: Ints) -> Iterator[Finding]:
+def _check_gaps(topic: str, step_ns: Ints) -> Iterator[Finding]:
     if step_ns.size < GAP_PERIODS:
         return
     period_s = float(np.median(step_ns)) / 1e9
@@ -138,45 +164,49 @@ def _gaps(topic: str, step_ns: Ints) -> Iterator[Finding]:
         )
 
 
-def _images(seen: Seen) -> Iterator[Finding]:
+def _check_images(data: CheckData) -> Iterator[Finding]:
     """Report images that are unreadable, uncalibrated, or not of the calibrated size."""
-    for topic in seen.times:
-        parts = names(CAMERA_IMAGE, topic)
+    for topic in data.times:
+        parts = parse_topic(CAMERA_IMAGE, topic)
         if parts is None:
             continue
-        calibrated = calibration(parts["robot"])
-        if calibrated not in seen.times:
-            yield Finding("warning", topic, f"no calibration on {calibrated}")
-        if topic not in seen.broken:
-            yield from _sizes(seen, topic, calibrated, Counter(seen.sizes[topic]))
+        calibration_topic = CALIBRATION(parts["robot"])
+        if calibration_topic not in data.times:
+            yield Finding("warning", topic, f"no calibration on {calibration_topic}")
+        if topic not in data.broken:
+            yield from _check_sizes(data, topic, calibration_topic, Counter(data.sizes[topic]))
 
 
-def _sizes(seen: Seen, topic: str, calibrated: str, sizes: Counter[Size]) -> Iterator[Finding]:
+def _check_sizes(
+    data: CheckData, topic: str, calibration_topic: str, sizes: Counter[ImageSize]
+) -> Iterator[Finding]:
     if unreadable := sizes.pop(None, 0):
         yield Finding("error", topic, f"{unreadable} messages contain no readable image")
     listed = ", ".join(f"{w}x{h}" for w, h in sorted(k for k in sizes if k))
     if len(sizes) > 1:
         yield Finding("warning", topic, f"images of {len(sizes)} sizes: {listed}")
-    if calibrated not in seen.times or calibrated in seen.broken or not sizes:
+    if calibration_topic not in data.times or calibration_topic in data.broken or not sizes:
         return
-    table = seen.contents.table(calibrated, ["width", "height"])
-    known = set(zip(table["width"].to_pylist(), table["height"].to_pylist(), strict=True))
-    if known and not known & sizes.keys():
-        width, height = sorted(known)[0]
+    table = data.contents.get_table(calibration_topic, ["width", "height"])
+    calibrated_sizes = set(
+        zip(table["width"].to_pylist(), table["height"].to_pylist(), strict=True)
+    )
+    if calibrated_sizes and not calibrated_sizes & sizes.keys():
+        width, height = sorted(calibrated_sizes)[0]
         yield Finding(
             "error", topic, f"images of {listed}, but the calibration is for {width}x{height}"
         )
 
 
-def _calibrations(seen: Seen) -> Iterator[Finding]:
+def _check_calibrations(data: CheckData) -> Iterator[Finding]:
     """Report calibrations that no camera can have, and uncalibrated cameras."""
-    for topic, info in seen.contents.topics.items():
-        mine = names(CALIBRATION, topic) is not None and carries(topic, info.schema)
-        if not mine or topic in seen.broken:
+    for topic, info in data.contents.topics.items():
+        mine = parse_topic(CALIBRATION, topic) is not None and carries_own_type(topic, info.schema)
+        if not mine or topic in data.broken:
             continue
-        table = seen.contents.table(topic, ["width", "height", "K", "D"])
+        table = data.contents.get_table(topic, ["width", "height", "K", "D"])
         columns = [table[name].to_pylist() for name in ("width", "height", "K", "D")]
         for width_px, height_px, k, d in zip(*columns, strict=True):
-            if why := no_camera(width_px, height_px, k, d):
+            if why := find_calibration_fault(width_px, height_px, k, d):
                 yield Finding("error" if any(k) else "warning", topic, why)
                 break

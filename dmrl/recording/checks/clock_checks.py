@@ -6,76 +6,78 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.recording.checks.scan import Seen
-from dmrl.topics import CALIBRATION, TRANSFORMS, names
+from dmrl.recording.checks.scan import CheckData
+from dmrl.topics import CALIBRATION, TRANSFORMS, parse_topic
 
 Times = Mapping[str, NDArray[np.int64]]
-Found = Iterator[tuple[str, str]]
+Problems = Iterator[tuple[str, str]]
 Span = tuple[int, int]
 """Log times of a first and a last message, nanoseconds."""
 
-EPOCH_NS = 10**18
+UNIX_TIME_MIN_NS = 10**18
 """Smallest time that counts from 1970, nanoseconds. It is in 2001."""
-SPARSE = 2
+MESSAGES_MIN = 2
 """Minimum number of messages from which a topic indicates the span of its clock."""
 
 
-def clocks(seen: Seen) -> Found:
+def check_clocks(data: CheckData) -> Problems:
     """Yield robots, or topics of a robot, that share no time; and zero times and stamps."""
-    times = {topic: np.sort(t) for topic, t in seen.times.items() if len(t)}
-    yield from _zeros(times)
-    robots = _spans(times)
+    times = {topic: np.sort(t) for topic, t in data.times.items() if len(t)}
+    yield from _find_zero_times(times)
+    robots = _collect_spans(times)
     for spans in robots.values():
-        yield from _topics_apart(spans)
-    yield from _robots_apart({robot: _around(spans.values()) for robot, spans in robots.items()})
-    for topic, wrong in seen.unset.items():
+        yield from _find_separate_topics(spans)
+    yield from _find_separate_robots(
+        {robot: _enclose_spans(spans.values()) for robot, spans in robots.items()}
+    )
+    for topic, wrong in data.unset_stamps.items():
         if wrong:
             yield topic, f"{wrong} messages have a time stamp of 0"
 
 
-def _zeros(times: Times) -> Found:
-    if not times or max(int(t[-1]) for t in times.values()) < EPOCH_NS:
+def _find_zero_times(times: Times) -> Problems:
+    if not times or max(int(t[-1]) for t in times.values()) < UNIX_TIME_MIN_NS:
         return
     for topic, moments in times.items():
         if zeros := int((moments == 0).sum()):
             yield topic, f"{zeros} messages are at time 0, others of the recording after 2001"
 
 
-def _spans(times: Times) -> dict[str, dict[str, Span]]:
+def _collect_spans(times: Times) -> dict[str, dict[str, Span]]:
     """Return the first and last time of each topic, by robot."""
     robots: dict[str, dict[str, Span]] = {}
     for topic, moments in times.items():
         moments = moments[moments > 0]  # zeros are reported separately
         # A topic without a leading robot name has no clock to compare.
         of_a_robot = topic.startswith("/") and topic != TRANSFORMS
-        if of_a_robot and len(moments) >= SPARSE and not names(CALIBRATION, topic):
+        if of_a_robot and len(moments) >= MESSAGES_MIN and not parse_topic(CALIBRATION, topic):
             robot = topic.split("/")[1]
             robots.setdefault(robot, {})[topic] = (int(moments[0]), int(moments[-1]))
     return robots
 
 
-def _topics_apart(spans: Mapping[str, Span]) -> Found:
+def _find_separate_topics(spans: Mapping[str, Span]) -> Problems:
     """Yield topics that share no time with any other topic of their robot."""
     for topic, span in spans.items():
         others = [other for name, other in spans.items() if name != topic]
-        if others and (gap_s := _gap_s(span, _around(others))) > 0:
+        if others and (gap_s := _compute_gap_s(span, _enclose_spans(others))) > 0:
             yield topic, f"shares no time with the robot's other topics: {gap_s:.0f} s between"
 
 
-def _robots_apart(robots: Mapping[str, Span]) -> Found:
+def _find_separate_robots(robots: Mapping[str, Span]) -> Problems:
     """Yield pairs of robots that share no time."""
     for one, other in combinations(sorted(robots), 2):
-        if (gap_s := _gap_s(robots[one], robots[other])) > 0:
+        if (gap_s := _compute_gap_s(robots[one], robots[other])) > 0:
             between = f"shares no time with /{other}: {gap_s:.0f} s between"
             yield f"/{one}", f"{between}. Separate clocks? Try: dmrl align"
 
 
-def _around(spans: Iterable[Span]) -> Span:
+def _enclose_spans(spans: Iterable[Span]) -> Span:
     """Return the shortest span that contains all of these."""
     firsts, lasts = zip(*spans, strict=True)
     return min(firsts), max(lasts)
 
 
-def _gap_s(one: Span, other: Span) -> float:
+def _compute_gap_s(one: Span, other: Span) -> float:
     """Return the seconds between two spans; 0 or less if they overlap."""
     return (max(one[0], other[0]) - min(one[1], other[1])) * 1e-9

@@ -7,12 +7,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from dmrl.errors import RecordingError
-from dmrl.geometry.frames import inside
+from dmrl.geometry.frames import is_inside
 from dmrl.recording.checks.finding import Finding
-from dmrl.recording.checks.scan import Seen, first_size
-from dmrl.topics import LABELS, calibration, camera_image, names
+from dmrl.recording.checks.scan import CheckData, find_first_size
+from dmrl.topics import CALIBRATION, CAMERA_IMAGE, LABELS, parse_topic
 
-BIAS_MIN_LABELS = 20
+BIAS_LABELS_MIN = 20
 """Labels with boxes that are needed to measure a bias."""
 BIAS_MIN_PX = 1.5
 """Smallest bias that is reported, pixels.
@@ -22,59 +22,61 @@ true projection, the offset is 0.6 px.
 """
 BIAS_MIN_SIGMAS = 5.0
 """Smallest bias that is reported, in standard errors."""
-BORDER_PX = 1.0
+BORDER_MARGIN_PX = 1.0
 """Distance from the image border below which a box counts as cropped, pixels."""
 
 
-def labels(seen: Seen) -> Iterator[Finding]:
+def check_labels(data: CheckData) -> Iterator[Finding]:
     """Report labels without image, outside the image, with impossible values, or biased."""
-    found = seen.contents.topics
-    for topic in found:
-        parts = names(LABELS, topic)
-        if parts is None or topic in seen.broken or found[topic].schema != "dmrl.v1.PeerLabels":
+    topics = data.contents.topics
+    for topic in topics:
+        parts = parse_topic(LABELS, topic)
+        if parts is None or topic in data.broken or topics[topic].schema != "dmrl.v1.PeerLabels":
             continue
         try:
-            table = seen.contents.table(topic)
+            table = data.contents.get_table(topic)
         except RecordingError as e:
             yield Finding("error", topic, str(e))
             continue
-        yield from _without_image(seen, topic, camera_image(parts["robot"]), table)
-        peers = _flat(table["peers"])
-        bounds = _bounds(seen, parts["robot"])
+        yield from _check_images(data, topic, CAMERA_IMAGE(parts["robot"]), table)
+        peers = _flatten_peers(table["peers"])
+        bounds = _find_image_size(data, parts["robot"])
         for source in sorted(set(peers["source"].to_pylist())):
-            of_source = peers.filter(pc.equal(peers["source"], source))
-            yield from _values(topic, source, of_source, bounds)
-            yield from _bias(topic, source, of_source, bounds)
+            source_labels = peers.filter(pc.equal(peers["source"], source))
+            yield from _check_values(topic, source, source_labels, bounds)
+            yield from _check_bias(topic, source, source_labels, bounds)
 
 
-def _without_image(seen: Seen, topic: str, image: str, table: pa.Table) -> Iterator[Finding]:
-    if image not in seen.times:
+def _check_images(data: CheckData, topic: str, image: str, table: pa.Table) -> Iterator[Finding]:
+    if image not in data.times:
         yield Finding("error", topic, f"labels without any image on {image}")
         return
-    alone = int((~np.isin(table["log_time"].to_numpy(), seen.times[image])).sum())
-    if alone:
+    without_image = int((~np.isin(table["log_time"].to_numpy(), data.times[image])).sum())
+    if without_image:
         yield Finding(
-            "error", topic, f"{alone} of {table.num_rows} messages have no image at their time"
+            "error",
+            topic,
+            f"{without_image} of {table.num_rows} messages have no image at their time",
         )
 
 
-def _bounds(seen: Seen, robot: str) -> tuple[int, int] | None:
+def _find_image_size(data: CheckData, robot: str) -> tuple[int, int] | None:
     """Return width and height of the robot's images, from the calibration or the first image."""
-    topic, image = calibration(robot), camera_image(robot)
-    if len(seen.times.get(topic, ())):
-        known = seen.contents.table(topic, ["width", "height"])
-        return known["width"][0].as_py(), known["height"][0].as_py()
-    return first_size(seen, image) if image in seen.times else None
+    topic, image = CALIBRATION(robot), CAMERA_IMAGE(robot)
+    if len(data.times.get(topic, ())):
+        calibrated = data.contents.get_table(topic, ["width", "height"])
+        return calibrated["width"][0].as_py(), calibrated["height"][0].as_py()
+    return find_first_size(data, image) if image in data.times else None
 
 
-def _flat(peers: pa.ChunkedArray) -> pa.Table:
+def _flatten_peers(peers: pa.ChunkedArray) -> pa.Table:
     """Return a table with one row per peer and source."""
     flat = pc.list_flatten(peers)
     return pa.table({f.name: pc.struct_field(flat, f.name) for f in flat.type})
 
 
-def _values(
-    topic: str, source: str, peers: pa.Table, bounds: tuple[int, int] | None
+def _check_values(
+    topic: str, source: str, peers: pa.Table, image_size: tuple[int, int] | None
 ) -> Iterator[Finding]:
     uv = np.column_stack([peers["u_px"].to_numpy(), peers["v_px"].to_numpy()])
     depth_m = peers["depth_m"].to_numpy()
@@ -85,28 +87,30 @@ def _values(
             topic,
             f"{wrong} labels of source {source!r} have no pixel, or a depth that is not positive",
         )
-    if bounds is not None and (outside := int((~inside(uv, *bounds)).sum())):
+    if image_size is not None and (outside := int((~is_inside(uv, *image_size)).sum())):
         yield Finding(
             "warning",
             topic,
             f"{outside} of {len(uv)} labels of source {source!r} lie outside the "
-            f"{bounds[0]}x{bounds[1]} image",
+            f"{image_size[0]}x{image_size[1]} image",
         )
 
 
-def _bias(
-    topic: str, source: str, peers: pa.Table, bounds: tuple[int, int] | None
+def _check_bias(
+    topic: str, source: str, peers: pa.Table, image_size: tuple[int, int] | None
 ) -> Iterator[Finding]:
     """Report labels with a common offset from the middle of their boxes."""
-    boxed = peers.filter(pc.equal(pc.list_value_length(peers["box_px"]), 4))
-    if bounds is None or boxed.num_rows < BIAS_MIN_LABELS:
+    labels_with_box = peers.filter(pc.equal(pc.list_value_length(peers["box_px"]), 4))
+    if image_size is None or labels_with_box.num_rows < BIAS_LABELS_MIN:
         return
-    box = pc.list_flatten(boxed["box_px"]).to_numpy().reshape(-1, 4)
+    box = pc.list_flatten(labels_with_box["box_px"]).to_numpy().reshape(-1, 4)
     low, high = box[:, :2], box[:, 2:]
-    whole = (low > BORDER_PX).all(axis=1) & (high < np.array(bounds) - BORDER_PX).all(axis=1)
-    if whole.sum() < BIAS_MIN_LABELS:
+    whole = (low > BORDER_MARGIN_PX).all(axis=1) & (
+        high < np.array(image_size) - BORDER_MARGIN_PX
+    ).all(axis=1)
+    if whole.sum() < BIAS_LABELS_MIN:
         return
-    uv = np.column_stack([boxed["u_px"].to_numpy(), boxed["v_px"].to_numpy()])
+    uv = np.column_stack([labels_with_box["u_px"].to_numpy(), labels_with_box["v_px"].to_numpy()])
     offset = (uv - (low + high) / 2)[whole]
     middle = np.median(offset, axis=0)
     # Standard error of a median; the spread is estimated robustly from the MAD.

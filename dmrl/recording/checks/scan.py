@@ -10,29 +10,29 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from dmrl.errors import DmrlError, RecordingError
-from dmrl.images.codec import size
-from dmrl.recording.checks.odometry_checks import Moved
-from dmrl.recording.checks.unit_checks import Sizes
-from dmrl.recording.loaded import Contents
-from dmrl.recording.log_times import log_times
-from dmrl.recording.mcap.batch_reader import in_file_order
+from dmrl.images.codec import read_size
+from dmrl.recording.checks.odometry_checks import MotionSamples
+from dmrl.recording.checks.unit_checks import MagnitudeHistograms
+from dmrl.recording.loaded import LoadedRecording
+from dmrl.recording.log_times import read_log_times
+from dmrl.recording.mcap.batch_reader import iter_batches_in_file_order
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.message_batch import Block, Ints, joined
-from dmrl.recording.protobuf.columns import apart, decoded
-from dmrl.recording.reader import STRETCH_BYTES, columns
-from dmrl.topics import CALIBRATION, CAMERA_IMAGE, LABELS, names, row_of
+from dmrl.recording.mcap.message_batch import Ints, MessageBatch, concatenate_all
+from dmrl.recording.protobuf.columns import decode_topic, group_by_topic
+from dmrl.recording.reader import BATCH_BYTES, iter_columns
+from dmrl.topics import CALIBRATION, CAMERA_IMAGE, LABELS, find_topic, parse_topic
 
-STAMPED = ("CompressedImage", "PoseInFrame")
+STAMPED_TYPES = ("CompressedImage", "PoseInFrame")
 """Message types that contain a time stamp."""
-HELD = (LABELS, CALIBRATION)
+KEPT_TOPICS = (LABELS, CALIBRATION)
 """Topics whose messages are kept in memory."""
 
-Size = tuple[int, int] | None
+ImageSize = tuple[int, int] | None
 """Width and height of an image; None for data that are not an image."""
 
 
 @dataclass(slots=True)
-class Seen:
+class CheckData:
     """Data collected from a recording.
 
     Parameters
@@ -53,22 +53,22 @@ class Seen:
         Samples of odometry and poses.
     """
 
-    contents: Contents
+    contents: LoadedRecording
     times: dict[str, Ints]
     broken: dict[str, str] = field(default_factory=dict)
-    sizes: dict[str, Counter[Size]] = field(default_factory=lambda: defaultdict(Counter))
-    unset: Counter[str] = field(default_factory=Counter)
-    values: Sizes = field(default_factory=Sizes)
-    moved: Moved = field(default_factory=Moved)
+    sizes: dict[str, Counter[ImageSize]] = field(default_factory=lambda: defaultdict(Counter))
+    unset_stamps: Counter[str] = field(default_factory=Counter)
+    magnitudes: MagnitudeHistograms = field(default_factory=MagnitudeHistograms)
+    motion: MotionSamples = field(default_factory=MotionSamples)
 
 
-def carries(topic: str, schema: str) -> bool:
+def carries_own_type(topic: str, schema: str) -> bool:
     """Return whether a topic is one of dmrl's and has the right message type."""
-    row = row_of(topic)
-    return row is not None and row.carries(schema)
+    row = find_topic(topic)
+    return row is not None and row.accepts_message(schema)
 
 
-def look(path: Path) -> Seen:
+def collect(path: Path) -> CheckData:
     """Collect all data, decoding every message once.
 
     Raises
@@ -76,24 +76,24 @@ def look(path: Path) -> Seen:
     RecordingError
         If the file is not a complete recording.
     """
-    contents = Contents(path)
-    seen = Seen(contents, {})
+    contents = LoadedRecording(path)
+    data = CheckData(contents, {})
     times: dict[str, list[Ints]] = {topic: [np.empty(0, np.int64)] for topic in contents.topics}
-    kept: dict[str, list[Block]] = {t: [] for t in contents.topics if _held(contents, t)}
+    kept: dict[str, list[MessageBatch]] = {t: [] for t in contents.topics if _is_kept(contents, t)}
     channels: dict[int, Channel] = {}
-    for block, channels in _stretches(path):
-        for topic, mine in apart(block, channels).items():
+    for batch, channels in _iter_large_batches(path):
+        for topic, mine in group_by_topic(batch, channels).items():
             times[topic].append(mine.time_ns)
             if topic in kept:
                 kept[topic].append(mine.compact())
-            _decode(seen, topic, mine, channels)
-    seen.times = {topic: np.concatenate(parts) for topic, parts in times.items()}
-    parts = [block for blocks in kept.values() for block in blocks]
-    contents.hold(frozenset(kept), parts, channels)
-    return seen
+            _collect_from_messages(data, topic, mine, channels)
+    data.times = {topic: np.concatenate(parts) for topic, parts in times.items()}
+    parts = [block for batches in kept.values() for block in batches]
+    contents.add_topics(frozenset(kept), parts, channels)
+    return data
 
 
-def glimpse(contents: Contents) -> Seen:
+def collect_from_index(contents: LoadedRecording) -> CheckData:
     """Collect the log times from the index. No image is decoded.
 
     Parameters
@@ -106,59 +106,61 @@ def glimpse(contents: Contents) -> Seen:
     RecordingError
         If the file is not a complete recording.
     """
-    return Seen(contents, log_times(contents.path, contents.topics))
+    return CheckData(contents, read_log_times(contents.path, contents.topics))
 
 
-def first_size(seen: Seen, topic: str) -> Size:
+def find_first_size(data: CheckData, topic: str) -> ImageSize:
     """Return the size of the first image of a topic; None without an image."""
-    if topic not in seen.sizes and len(seen.times[topic]):
-        image = next(columns(seen.contents.path, topic, fields=["data"]))
-        seen.sizes[topic][_size(image["data"][0].as_buffer())] += 1
-    return next(iter(seen.sizes[topic]), None)
+    if topic not in data.sizes and len(data.times[topic]):
+        image = next(iter_columns(data.contents.path, topic, fields=["data"]))
+        data.sizes[topic][_decode_size(image["data"][0].as_buffer())] += 1
+    return next(iter(data.sizes[topic]), None)
 
 
-def _held(contents: Contents, topic: str) -> bool:
-    of_kind = any(names(pattern, topic) for pattern in HELD)
-    return of_kind and carries(topic, contents.topics[topic].schema)
+def _is_kept(contents: LoadedRecording, topic: str) -> bool:
+    of_kind = any(parse_topic(pattern, topic) for pattern in KEPT_TOPICS)
+    return of_kind and carries_own_type(topic, contents.topics[topic].schema)
 
 
-def _stretches(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
+def _iter_large_batches(path: Path) -> Iterator[tuple[MessageBatch, dict[int, Channel]]]:
     """Yield every message in file order, joining chunks so that few calls decode them."""
-    held: list[Block] = []
+    pending: list[MessageBatch] = []
     size = 0
     channels: dict[int, Channel] = {}
-    for block, channels in in_file_order(path):
-        held.append(block)
-        size += len(block.data)
-        if size >= STRETCH_BYTES:
-            yield joined(held), channels
-            held, size = [], 0
-    if held:
-        yield joined(held), channels
+    for batch, channels in iter_batches_in_file_order(path):
+        pending.append(batch)
+        size += len(batch.data)
+        if size >= BATCH_BYTES:
+            yield concatenate_all(pending), channels
+            pending, size = [], 0
+    if pending:
+        yield concatenate_all(pending), channels
 
 
-def _decode(seen: Seen, topic: str, block: Block, channels: dict[int, Channel]) -> None:
+def _collect_from_messages(
+    collected: CheckData, topic: str, messages: MessageBatch, channels: dict[int, Channel]
+) -> None:
     """Decode messages of a topic of dmrl's, and collect their data."""
-    path, schema = seen.contents.path, seen.contents.topics[topic].schema
-    stamped = schema.rpartition(".")[2] in STAMPED
-    if topic in seen.broken or not (carries(topic, schema) or stamped):
+    path, schema = collected.contents.path, collected.contents.topics[topic].schema
+    stamped = schema.rpartition(".")[2] in STAMPED_TYPES
+    if topic in collected.broken or not (carries_own_type(topic, schema) or stamped):
         return
-    fields = None if carries(topic, schema) else ["timestamp"]
+    fields = None if carries_own_type(topic, schema) else ["timestamp"]
     try:
-        batch = decoded(path, topic, block, channels, fields)
+        batch = decode_topic(path, topic, messages, channels, fields)
     except RecordingError as e:
         if fields is None:
-            seen.broken[topic] = str(e)
+            collected.broken[topic] = str(e)
         return
     if stamped and "timestamp" in batch.schema.names:
-        seen.unset[topic] += _unset(batch)
-    seen.values.add(topic, batch)
-    seen.moved.add(topic, batch)
-    if names(CAMERA_IMAGE, topic):
-        seen.sizes[topic].update(_size(data.as_buffer()) for data in batch["data"])
+        collected.unset_stamps[topic] += _count_unset_stamps(batch)
+    collected.magnitudes.add_batch(topic, batch)
+    collected.motion.add_batch(topic, batch)
+    if parse_topic(CAMERA_IMAGE, topic):
+        collected.sizes[topic].update(_decode_size(data.as_buffer()) for data in batch["data"])
 
 
-def _unset(batch: pa.RecordBatch) -> int:
+def _count_unset_stamps(batch: pa.RecordBatch) -> int:
     """Count the messages with time stamp 0 and another log time."""
     stamp = batch["timestamp"]
     zero = [pc.equal(pc.fill_null(pc.struct_field(stamp, n), 0), 0) for n in ("seconds", "nanos")]
@@ -167,9 +169,9 @@ def _unset(batch: pa.RecordBatch) -> int:
     return int(pc.sum(wrong).as_py() or 0)
 
 
-def _size(data: pa.Buffer) -> Size:
+def _decode_size(data: pa.Buffer) -> ImageSize:
     try:
-        width_px, height_px, _ = size(data.to_pybytes())
+        width_px, height_px, _ = read_size(data.to_pybytes())
     except (DmrlError, ValueError):
         return None
     return width_px, height_px

@@ -15,19 +15,19 @@ from mcap.records import Chunk, ChunkIndex
 from mcap.summary import Summary as McapSummary
 from numpy.typing import NDArray
 
-from dmrl.recording.mcap.batch_reader import chunks_between, compare, tally
+from dmrl.recording.mcap.batch_reader import check_counts, count_messages, select_chunks
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk_reader import place_of, whole_chunk
-from dmrl.recording.mcap.file import opened
-from dmrl.recording.mcap.message_batch import EVER_NS, Block
+from dmrl.recording.mcap.chunk_reader import locate_chunk, read_chunk_for_copy
+from dmrl.recording.mcap.file import open_mcap
+from dmrl.recording.mcap.message_batch import MAX_TIME_NS, MessageBatch
 from dmrl.recording.mcap.message_index import MessageIndex
-from dmrl.recording.mcap.record_scan import channel_of, walked
-from dmrl.recording.mcap.summary_index import mcap_summary
+from dmrl.recording.mcap.record_scan import build_channel, scan_file
+from dmrl.recording.mcap.summary_index import read_summary_section
 from dmrl.recording.writer import RecordingWriter
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class CopyUnit:
     """A chunk of a recording, or the messages outside of chunks.
 
     Parameters
@@ -42,7 +42,7 @@ class Piece:
         Verified message indexes of the chunk, or None.
     """
 
-    block: Block
+    batch: MessageBatch
     channels: Mapping[int, Channel]
     chunk: Chunk | None = None
     index: MessageIndex | None = None
@@ -50,11 +50,11 @@ class Piece:
     @property
     def start_ns(self) -> int:
         """First log time, nanoseconds."""
-        return int(self.block.time_ns.min(initial=EVER_NS))
+        return int(self.batch.time_ns.min(initial=MAX_TIME_NS))
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class TopicSelection:
     """Selection of messages by topic and time.
 
     Parameters
@@ -67,20 +67,20 @@ class Wanted:
 
     topics: frozenset[str]
     low_ns: int = 0
-    high_ns: int = EVER_NS
+    high_ns: int = MAX_TIME_NS
 
-    def rows(self, piece: Piece) -> NDArray[np.bool_]:
+    def mask_rows(self, unit: CopyUnit) -> NDArray[np.bool_]:
         """Return an (N,) mask of the selected messages of a unit."""
-        block, present = piece.block, piece.block.numbers()
-        topics = {number: piece.channels[number].topic for number in present}
-        of_time = np.asarray((block.time_ns >= self.low_ns) & (block.time_ns < self.high_ns))
-        if of_time.all() and self.topics.issuperset(topics.values()):
-            return of_time
-        mine = block.among([n for n, topic in topics.items() if topic in self.topics])
-        return np.asarray(mine & of_time)
+        batch, present = unit.batch, unit.batch.list_channel_ids()
+        topics = {number: unit.channels[number].topic for number in present}
+        in_range = np.asarray((batch.time_ns >= self.low_ns) & (batch.time_ns < self.high_ns))
+        if in_range.all() and self.topics.issuperset(topics.values()):
+            return in_range
+        mine = batch.mask_channels([n for n, topic in topics.items() if topic in self.topics])
+        return np.asarray(mine & in_range)
 
 
-def copy(path: Path, wanted: Wanted, sink: RecordingWriter) -> int:
+def copy_messages(path: Path, selection: TopicSelection, sink: RecordingWriter) -> int:
     """Copy messages into another recording, and return how many.
 
     Raises
@@ -90,38 +90,38 @@ def copy(path: Path, wanted: Wanted, sink: RecordingWriter) -> int:
     OutputError
         If the output cannot be written.
     """
-    adopt(path, wanted.topics, sink)
-    return sum(put(piece, wanted, sink) for piece in pieces(path, wanted))
+    adopt_channels(path, selection.topics, sink)
+    return sum(write_unit(piece, selection, sink) for piece in iter_units(path, selection))
 
 
-def adopt(path: Path, topics: Collection[str], sink: RecordingWriter) -> None:
+def adopt_channels(path: Path, topics: Collection[str], sink: RecordingWriter) -> None:
     """Assign the channel ids of a recording to its topics in the output, where they are free."""
-    with opened(path) as stream:
-        summary = mcap_summary(path, stream)
+    with open_mcap(path) as stream:
+        summary = read_summary_section(path, stream)
         if summary is not None:
-            channels = _channels(summary)
+            channels = _build_channels(summary)
             kept = {n: channel for n, channel in channels.items() if channel.topic in topics}
-            sink.chunks.adopt(kept, summary.channels)
+            sink.chunk_writer.adopt_channels(kept, summary.channels)
 
 
-def put(piece: Piece, wanted: Wanted | None, sink: RecordingWriter) -> int:
+def write_unit(unit: CopyUnit, selection: TopicSelection | None, sink: RecordingWriter) -> int:
     """Copy the selected messages of a unit (None: all), and return how many."""
-    block = piece.block
-    count = len(block)
-    if wanted is not None:
-        rows = wanted.rows(piece)
+    batch = unit.batch
+    count = len(batch)
+    if selection is not None:
+        rows = selection.mask_rows(unit)
         count = int(rows.sum())
         if not rows.all():
-            block, piece = block.take(rows), replace(piece, chunk=None)
-    whole, channels = piece.chunk, piece.channels
-    if whole is not None and sink.chunks.append_chunk(whole, block, channels, piece.index):
+            batch, unit = batch.take(rows), replace(unit, chunk=None)
+    whole, channels = unit.chunk, unit.channels
+    if whole is not None and sink.chunk_writer.append_chunk(whole, batch, channels, unit.index):
         return count
-    if len(block):
-        sink.chunks.append(block, piece.channels)
+    if len(batch):
+        sink.chunk_writer.append_batch(batch, unit.channels)
     return count
 
 
-def pieces(path: Path, wanted: Wanted) -> Iterator[Piece]:
+def iter_units(path: Path, selection: TopicSelection) -> Iterator[CopyUnit]:
     """Yield the chunks with selected messages, by time, each decompressed once and verified.
 
     Raises
@@ -129,33 +129,35 @@ def pieces(path: Path, wanted: Wanted) -> Iterator[Piece]:
     RecordingError
         If the file is not a complete recording, or a chunk is corrupt.
     """
-    with opened(path) as stream:
-        summary = mcap_summary(path, stream)
+    with open_mcap(path) as stream:
+        summary = read_summary_section(path, stream)
         if summary is None:
-            walk = walked(path, stream)
-            yield from (Piece(block, walk.channels) for block in walk.blocks)
+            walk = scan_file(path, stream)
+            yield from (CopyUnit(block, walk.channels) for block in walk.batches)
             return
-        channels = _channels(summary)
-        found: Counter[int] = Counter()
-        chunks = _chunks(summary, channels, wanted)
-        stream.expect([place_of(index) for index in chunks])
+        channels = _build_channels(summary)
+        counts: Counter[int] = Counter()
+        chunks = _select_chunks(summary, channels, selection)
+        stream.expect_reads([locate_chunk(index) for index in chunks])
         for index in chunks:
-            chunk, block, messages = whole_chunk(path, stream, index, channels, summary)
-            tally(found, block)
-            yield Piece(block, channels, chunk, messages)
-        if (wanted.low_ns, wanted.high_ns) == (0, EVER_NS):
-            kept = {n: channel for n, channel in channels.items() if channel.topic in wanted.topics}
-            compare(path, summary, kept, found)
+            chunk, batch, messages = read_chunk_for_copy(path, stream, index, channels, summary)
+            count_messages(counts, batch)
+            yield CopyUnit(batch, channels, chunk, messages)
+        if (selection.low_ns, selection.high_ns) == (0, MAX_TIME_NS):
+            kept = {
+                n: channel for n, channel in channels.items() if channel.topic in selection.topics
+            }
+            check_counts(path, summary, kept, counts)
 
 
-def _channels(summary: McapSummary) -> dict[int, Channel]:
-    return {n: channel_of(n, summary.channels, summary.schemas) for n in summary.channels}
+def _build_channels(summary: McapSummary) -> dict[int, Channel]:
+    return {n: build_channel(n, summary.channels, summary.schemas) for n in summary.channels}
 
 
-def _chunks(
-    summary: McapSummary, channels: Mapping[int, Channel], wanted: Wanted
+def _select_chunks(
+    summary: McapSummary, channels: Mapping[int, Channel], selection: TopicSelection
 ) -> list[ChunkIndex]:
     """Return the chunks that may contain selected messages, by time."""
-    mine = {n for n, channel in channels.items() if channel.topic in wanted.topics}
-    found = chunks_between(summary, mine, wanted.low_ns, wanted.high_ns)
+    mine = {n for n, channel in channels.items() if channel.topic in selection.topics}
+    found = select_chunks(summary, mine, selection.low_ns, selection.high_ns)
     return sorted(found, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))

@@ -7,16 +7,22 @@ from itertools import combinations
 from pathlib import Path
 
 from dmrl.errors import RecordingError
-from dmrl.recording.attachments import copy_extras
-from dmrl.recording.copying.chunk_copy import Piece, Wanted, adopt, pieces, put
-from dmrl.recording.log_times import log_times
+from dmrl.recording.attachments import copy_metadata_and_attachments
+from dmrl.recording.copying.chunk_copy import (
+    CopyUnit,
+    TopicSelection,
+    adopt_channels,
+    iter_units,
+    write_unit,
+)
+from dmrl.recording.log_times import read_log_times
 from dmrl.recording.mcap.channel import RawMessage
-from dmrl.recording.provenance_inputs import provenance, refuse_twice
-from dmrl.recording.reader import matching, read_raw
-from dmrl.recording.summary import Summary, summary
+from dmrl.recording.provenance_inputs import build_provenance, refuse_duplicates
+from dmrl.recording.reader import match_topics, read_raw
+from dmrl.recording.summary import Summary, read_summary
 from dmrl.recording.writer import RecordingWriter
 from dmrl.terminal.progress import say
-from dmrl.topics import CALIBRATION, names, row_of
+from dmrl.topics import CALIBRATION, find_topic, parse_topic
 
 
 def merge(paths: Sequence[Path], out: Path) -> int:
@@ -32,35 +38,39 @@ def merge(paths: Sequence[Path], out: Path) -> int:
     OutputError
         If ``out`` exists or cannot be written.
     """
-    refuse_twice(paths)
+    refuse_duplicates(paths)
     for one, other in combinations(paths, 2):
-        _warn_of_namesakes(one, other)
-    wanted = [Wanted(frozenset(summary(path).topics)) for path in paths]
-    with RecordingWriter(out, provenance("merge", inputs=paths)) as sink:
+        _warn_about_shared_sensors(one, other)
+    wanted = [TopicSelection(frozenset(read_summary(path).topics)) for path in paths]
+    with RecordingWriter(out, build_provenance("merge", inputs=paths)) as sink:
         for path, every in zip(paths, wanted, strict=True):
-            copy_extras(summary(path), sink)
-            adopt(path, every.topics, sink)
-        streams = [_timed(path, every) for path, every in zip(paths, wanted, strict=True)]
+            copy_metadata_and_attachments(read_summary(path), sink)
+            adopt_channels(path, every.topics, sink)
+        streams = [
+            _iter_timed_units(path, every) for path, every in zip(paths, wanted, strict=True)
+        ]
         by_time = heapq.merge(*streams, key=lambda item: item[0])
-        return sum(put(piece, every, sink) for _, piece, every in by_time)
+        return sum(write_unit(piece, every, sink) for _, piece, every in by_time)
 
 
-def _timed(path: Path, wanted: Wanted) -> Iterator[tuple[int, Piece, Wanted]]:
+def _iter_timed_units(
+    path: Path, wanted: TopicSelection
+) -> Iterator[tuple[int, CopyUnit, TopicSelection]]:
     """Yield the copy units of a recording with their first log times."""
-    return ((piece.start_ns, piece, wanted) for piece in pieces(path, wanted))
+    return ((piece.start_ns, piece, wanted) for piece in iter_units(path, wanted))
 
 
-def _warn_of_namesakes(one: Path, other: Path) -> None:
+def _warn_about_shared_sensors(one: Path, other: Path) -> None:
     """Warn if two recordings contain the same sensor of a robot.
 
     They may be different flights or robots. Consecutive parts of one recording do not warn.
     """
-    first, second = summary(one), summary(other)
+    first, second = read_summary(one), read_summary(other)
     for topic in sorted(set(first.topics) & set(second.topics)):
-        row = row_of(topic)
+        row = find_topic(topic)
         if row is None or not row.sensor:
             continue
-        (start, end), (from_, to) = (_span(path, topic) for path in (one, other))
+        (start, end), (from_, to) = (_find_time_span(path, topic) for path in (one, other))
         if start < to and from_ < end:
             say(
                 f"{one} and {other} both have {topic} at the same time: different flights, or one "
@@ -68,7 +78,7 @@ def _warn_of_namesakes(one: Path, other: Path) -> None:
                 "several recordings"
             )
             return
-        if not _sources(first) & _sources(second):
+        if not _collect_source_hashes(first) & _collect_source_hashes(second):
             say(
                 f"{one} and {other} both have {topic}, one after the other, and are one robot now. "
                 "If they are two robots, or two flights, give the robots different names: "
@@ -77,14 +87,18 @@ def _warn_of_namesakes(one: Path, other: Path) -> None:
             return
 
 
-def _sources(held: Summary) -> set[str]:
+def _collect_source_hashes(summary: Summary) -> set[str]:
     """Return the SHA-256 of every direct and indirect input of a recording."""
-    return {source.sha256 for _, source in held.provenance.ancestry()} if held.provenance else set()
+    return (
+        {source.sha256 for _, source in summary.provenance.iter_ancestors()}
+        if summary.provenance
+        else set()
+    )
 
 
-def _span(path: Path, topic: str) -> tuple[int, int]:
+def _find_time_span(path: Path, topic: str) -> tuple[int, int]:
     """Return the first and last log time of a topic, nanoseconds."""
-    times = log_times(path, [topic])[topic]
+    times = read_log_times(path, [topic])[topic]
     return (int(times[0]), int(times[-1])) if len(times) else (0, 0)
 
 
@@ -117,32 +131,32 @@ def trim(
     OutputError
         If ``out`` exists or cannot be written.
     """
-    found = summary(path)
-    wanted = matching(path, topics) if topics else frozenset(found.topics)
+    source = read_summary(path)
+    topics_to_keep = match_topics(path, topics) if topics else frozenset(source.topics)
     settings = {"start_ns": start_ns, "end_ns": end_ns, "topics": list(topics)}
-    low = found.start_ns if start_ns is None else max(start_ns, found.start_ns)
-    high = found.end_ns + 1 if end_ns is None else end_ns
-    with RecordingWriter(out, provenance("trim", settings, [path])) as sink:
-        copy_extras(found, sink)
-        adopt(path, wanted, sink)
-        for raw in _calibrations(path, wanted, low, high):
+    low = source.start_ns if start_ns is None else max(start_ns, source.start_ns)
+    high = source.end_ns + 1 if end_ns is None else end_ns
+    with RecordingWriter(out, build_provenance("trim", settings, [path])) as sink:
+        copy_metadata_and_attachments(source, sink)
+        adopt_channels(path, topics_to_keep, sink)
+        for raw in _iter_calibrations(path, topics_to_keep, low, high):
             sink.write_raw(raw)
-        within = Wanted(wanted, low, high)
-        count = sum(put(piece, within, sink) for piece in pieces(path, within))
+        selection = TopicSelection(topics_to_keep, low, high)
+        count = sum(write_unit(piece, selection, sink) for piece in iter_units(path, selection))
         if not count:
             raise RecordingError(
                 f"{path} has no message in that time range; it lasts "
-                f"{(found.end_ns - found.start_ns) / 1e9:.3f} s. Choose times within it"
+                f"{(source.end_ns - source.start_ns) / 1e9:.3f} s. Choose times within it"
             )
     return count
 
 
-def _calibrations(
+def _iter_calibrations(
     path: Path, wanted: frozenset[str], low_ns: int, high_ns: int
 ) -> Iterator[RawMessage]:
     """Yield each camera's last calibration before the range; if all come later, its first."""
-    topics = [topic for topic in wanted if names(CALIBRATION, topic) is not None]
-    for topic, times in sorted(log_times(path, topics).items()):
+    topics = [topic for topic in wanted if parse_topic(CALIBRATION, topic) is not None]
+    for topic, times in sorted(read_log_times(path, topics).items()):
         earlier = times[times <= low_ns]
         later = times[times >= high_ns]
         if len(earlier):

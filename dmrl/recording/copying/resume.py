@@ -5,19 +5,19 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from dmrl.atomic_output import partial_of
+from dmrl.atomic_output import to_partial_path
 from dmrl.errors import OutputError, RecordingError
-from dmrl.recording.log_times import log_times
-from dmrl.recording.mcap.channel import RawMessage, holds_pictures
+from dmrl.recording.log_times import read_log_times
+from dmrl.recording.mcap.channel import RawMessage, is_image_type
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.reader import read_raw
 from dmrl.recording.recover import recover
-from dmrl.recording.summary import summary
+from dmrl.recording.summary import read_summary
 from dmrl.recording.writer import RecordingWriter
 
 
 @dataclass(frozen=True, slots=True)
-class Interrupted:
+class InterruptedRecording:
     """The recovered part of a recording whose writing was interrupted.
 
     Parameters
@@ -29,26 +29,30 @@ class Interrupted:
     """
 
     path: Path | None
-    pictured: bool = False
+    has_images: bool = False
 
-    def moments(self) -> Iterator[tuple[int, list[RawMessage]]]:
+    def iter_moments(self) -> Iterator[tuple[int, list[RawMessage]]]:
         """Yield time and messages of every complete moment, numbers before images.
 
         The last moment of either kind may be incomplete, as they are in different chunks.
         """
         if self.path is None:
             return
-        end_ns = _whole_until_ns(self.path, pictured=self.pictured)
+        end_ns = _find_complete_until_ns(self.path, has_images=self.has_images)
         messages = read_raw(self.path, end_ns=end_ns)
         for time_ns, group in groupby(messages, key=lambda raw: raw.time_ns):
-            yield time_ns, sorted(group, key=lambda raw: raw.channel.pictured)
+            yield time_ns, sorted(group, key=lambda raw: raw.channel.carries_images)
 
-    def check(self, made: Provenance) -> None:
+    def check_provenance(self, made: Provenance) -> None:
         """Raise RecordingError unless it was made with the same settings, inputs and versions."""
         if self.path is None:
             return
-        found = summary(self.path).provenance
-        source = found.inputs[0].provenance if found is not None and found.inputs else None
+        source_provenance = read_summary(self.path).provenance
+        source = (
+            source_provenance.inputs[0].provenance
+            if source_provenance is not None and source_provenance.inputs
+            else None
+        )
         # Converted to text and back, as in the file: tuples become lists.
         same = Provenance.from_metadata(made.to_metadata())
         if source is None or source.to_metadata() != same.to_metadata():
@@ -57,22 +61,24 @@ class Interrupted:
                 "Use those, or remove it and start again"
             )
 
-    def copy(self, sink: RecordingWriter) -> int:
+    def copy_into(self, sink: RecordingWriter) -> int:
         """Copy every complete moment into the new recording, and return how many."""
         count = 0
-        for _, messages in self.moments():
+        for _, messages in self.iter_moments():
             for raw in messages:
                 sink.write_raw(raw)
             count += 1
         return count
 
-    def forget(self) -> None:
+    def delete_file(self) -> None:
         """Delete the recovered file, once the new recording contains all of it."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 
 
-def interrupted(out: Path, *, resume: bool, pictured: bool = False) -> Interrupted:
+def recover_interrupted(
+    out: Path, *, resume: bool, has_images: bool = False
+) -> InterruptedRecording:
     """Recover the interrupted recording of ``out`` as ``<out>.kept``.
 
     Parameters
@@ -91,44 +97,44 @@ def interrupted(out: Path, *, resume: bool, pictured: bool = False) -> Interrupt
     RecordingError
         If ``resume`` is true and there is nothing to continue.
     """
-    partial, kept = partial_of(out), out.with_name(out.name + ".kept")
+    partial, kept = to_partial_path(out), out.with_name(out.name + ".kept")
     if not resume:
         if left := [path for path in (partial, kept) if path.exists()]:
             raise OutputError(
                 f"{left[0]} is left from an interrupted run. Go on with --resume, or remove it"
             )
-        return Interrupted(None)
+        return InterruptedRecording(None)
     if not partial.exists() and not kept.exists():
         raise RecordingError(f"no {partial} to resume. Run without --resume")
-    _mend(partial, kept)
-    return Interrupted(kept if kept.exists() else None, pictured)
+    _recover_partial(partial, kept)
+    return InterruptedRecording(kept if kept.exists() else None, has_images)
 
 
-def _mend(partial: Path, kept: Path) -> None:
+def _recover_partial(partial: Path, kept: Path) -> None:
     """Recover ``partial`` into ``kept``, unless that already contains more messages."""
     if not partial.exists():
         return
-    mended = kept.with_name(kept.name + ".new")
-    mended.unlink(missing_ok=True)
+    recovered = kept.with_name(kept.name + ".new")
+    recovered.unlink(missing_ok=True)
     try:
-        recover(partial, mended)
+        recover(partial, recovered)
     except RecordingError:
         return  # it ends before its first complete chunk
-    if not kept.exists() or _count(mended) > _count(kept):
-        mended.replace(kept)
-    mended.unlink(missing_ok=True)
+    if not kept.exists() or _count_messages(recovered) > _count_messages(kept):
+        recovered.replace(kept)
+    recovered.unlink(missing_ok=True)
 
 
-def _count(path: Path) -> int:
-    return sum(info.count for info in summary(path).topics.values())
+def _count_messages(path: Path) -> int:
+    return sum(info.count for info in read_summary(path).topics.values())
 
 
-def _whole_until_ns(path: Path, *, pictured: bool) -> int:
+def _find_complete_until_ns(path: Path, *, has_images: bool) -> int:
     """Return the log time before which no message, image or number, is missing."""
     last: dict[bool, int] = {}
-    held = summary(path).topics
-    for topic, times in log_times(path, held).items():
-        picture = holds_pictures(held[topic].schema)
+    topics = read_summary(path).topics
+    for topic, times in read_log_times(path, topics).items():
+        picture = is_image_type(topics[topic].schema)
         last[picture] = max(last.get(picture, 0), int(times.max(initial=0)))
     # Images come with numbers that describe them, so a file with images alone has lost numbers.
-    return min(last.values()) if False in last and (True in last or not pictured) else 0
+    return min(last.values()) if False in last and (True in last or not has_images) else 0

@@ -9,18 +9,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dmrl.recording.attachments import copy_extras
-from dmrl.recording.copying.chunk_copy import Wanted, adopt, copy, pieces, put
+from dmrl.recording.attachments import copy_metadata_and_attachments
+from dmrl.recording.copying.chunk_copy import (
+    TopicSelection,
+    adopt_channels,
+    copy_messages,
+    iter_units,
+    write_unit,
+)
 from dmrl.recording.mcap.channel import RawMessage
-from dmrl.recording.mcap.message_batch import EVER_NS, ROWS, Ints
+from dmrl.recording.mcap.message_batch import MAX_TIME_NS, ROWS_AT_A_TIME, Ints
 from dmrl.recording.mcap.shared_file import share_file
-from dmrl.recording.protobuf.encode import Value
+from dmrl.recording.protobuf.encode import ColumnValue
 from dmrl.recording.provenance import Provenance
-from dmrl.recording.summary import summary
+from dmrl.recording.summary import read_summary
 from dmrl.recording.writer import RecordingWriter
 
 
-class Timed(NamedTuple):
+class TimedMessage(NamedTuple):
     """A message to write: log time, topic, message and, if it differs, publish time."""
 
     time_ns: int
@@ -35,9 +41,9 @@ class Series(NamedTuple):
     topic: str
     kind: Any
     time_ns: Ints
-    fields: Mapping[str, Value]
+    fields: Mapping[str, ColumnValue]
 
-    def between(self, first_ns: int, end_ns: int) -> "Series":
+    def slice_time(self, first_ns: int, end_ns: int) -> "Series":
         """Return the messages with log times in [first_ns, end_ns)."""
         rows = slice(*np.searchsorted(self.time_ns, (first_ns, end_ns)).tolist())
         parts = {
@@ -53,7 +59,7 @@ def rewrite(
     made: Provenance,
     *,
     without: Collection[str],
-    fresh: Iterable[Iterable[Timed]] = (),
+    fresh: Iterable[Iterable[TimedMessage]] = (),
     series: Sequence[Series] = (),
     metadata: Mapping[str, dict[str, str]] | None = None,
 ) -> None:
@@ -82,28 +88,28 @@ def rewrite(
         If ``out`` exists or cannot be written.
     """
     with share_file(recording):
-        held = summary(recording)
-        kept = frozenset(topic for topic in held.topics if topic not in without)
+        source = read_summary(recording)
+        kept = frozenset(topic for topic in source.topics if topic not in without)
         with RecordingWriter(out, made) as sink:
-            copy_extras(held, sink)
+            copy_metadata_and_attachments(source, sink)
             for name, values in (metadata or {}).items():
                 sink.add_metadata(name, values)
-            copy(recording, Wanted(kept), sink)
+            copy_messages(recording, TopicSelection(kept), sink)
             sink.flush()  # new messages start at the first time again, so they get their own chunks
-            for part in _by_time(series):
+            for part in _iter_by_time(series):
                 sink.write_columns(*part)
             for item in heapq.merge(*fresh, key=lambda m: m.time_ns):
                 sink.write(item.time_ns, item.topic, item.message, publish_ns=item.publish_ns)
 
 
-def _by_time(series: Sequence[Series]) -> Iterator[Series]:
+def _iter_by_time(series: Sequence[Series]) -> Iterator[Series]:
     """Yield the columns of all series, one time slice after another."""
-    for first_ns, end_ns in time_slices([one.time_ns for one in series]):
+    for first_ns, end_ns in iter_time_slices([one.time_ns for one in series]):
         for one in series:
-            yield one.between(first_ns, end_ns)
+            yield one.slice_time(first_ns, end_ns)
 
 
-def time_slices(times_ns: Sequence[Ints]) -> Iterator[tuple[int, int]]:
+def iter_time_slices(times_ns: Sequence[Ints]) -> Iterator[tuple[int, int]]:
     """Yield time ranges with a bounded number of messages each.
 
     Readers by time then hold few messages of every topic.
@@ -114,14 +120,14 @@ def time_slices(times_ns: Sequence[Ints]) -> Iterator[tuple[int, int]]:
         (N,) log times of each topic, nanoseconds.
     """
     times = np.sort(np.concatenate([np.empty(0, np.int64), *times_ns]))
-    yield from pairwise([*times[::ROWS].tolist(), EVER_NS])
+    yield from pairwise([*times[::ROWS_AT_A_TIME].tolist(), MAX_TIME_NS])
 
 
-def retime(
+def shift_times(
     recording: Path,
     sink: RecordingWriter,
-    corrected: Callable[[str, Ints], Ints],
-    each: Mapping[str, Callable[[RawMessage], RawMessage]],
+    compute_shift_ns: Callable[[str, Ints], Ints],
+    converters: Mapping[str, Callable[[RawMessage], RawMessage]],
 ) -> None:
     """Copy all messages of a recording with shifted times.
 
@@ -141,24 +147,27 @@ def retime(
     OutputError
         If the output cannot be written.
     """
-    every = Wanted(frozenset(summary(recording).topics))
-    adopt(recording, every.topics, sink)
-    for piece in pieces(recording, every):
-        block, topics = piece.block, {n: piece.channels[n].topic for n in piece.block.numbers()}
-        alone = [number for number, topic in topics.items() if topic in each]
-        later = np.zeros(len(block), np.int64)
-        for number in topics.keys() - alone:
-            rows = block.channel == number
-            later[rows] = corrected(topics[number], block.time_ns[rows])
-        if not alone and not later.any():
-            put(piece, every, sink)
+    every = TopicSelection(frozenset(read_summary(recording).topics))
+    adopt_channels(recording, every.topics, sink)
+    for unit in iter_units(recording, every):
+        batch, topics = (
+            unit.batch,
+            {n: unit.channels[n].topic for n in unit.batch.list_channel_ids()},
+        )
+        converted = [number for number, topic in topics.items() if topic in converters]
+        shift_ns = np.zeros(len(batch), np.int64)
+        for number in topics.keys() - converted:
+            rows = batch.channel == number
+            shift_ns[rows] = compute_shift_ns(topics[number], batch.time_ns[rows])
+        if not converted and not shift_ns.any():
+            write_unit(unit, every, sink)
             continue
         shifted = replace(
-            block,
-            time_ns=block.time_ns + later,
-            publish_ns=np.maximum(block.publish_ns + later, 0),
+            batch,
+            time_ns=batch.time_ns + shift_ns,
+            publish_ns=np.maximum(batch.publish_ns + shift_ns, 0),
         )
-        sink.chunks.append(shifted.take(~block.among(alone)), piece.channels)
-        for number, time_ns, publish_ns, data in block.of(alone).rows():
-            raw = RawMessage(time_ns, publish_ns, piece.channels[number], data)
-            sink.write_raw(each[raw.topic](raw))
+        sink.chunk_writer.append_batch(shifted.take(~batch.mask_channels(converted)), unit.channels)
+        for number, time_ns, publish_ns, data in batch.select_channels(converted).iter_rows():
+            raw = RawMessage(time_ns, publish_ns, unit.channels[number], data)
+            sink.write_raw(converters[raw.topic](raw))

@@ -14,22 +14,28 @@ from mcap.records import ChunkIndex
 from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk import of_channels
-from dmrl.recording.mcap.chunk_reader import in_chunk, place_of
-from dmrl.recording.mcap.file import Bounded, damaged, opened
-from dmrl.recording.mcap.message_batch import EMPTY, EVER_NS, Block, concatenate, joined
-from dmrl.recording.mcap.record_scan import channel_of, walked
-from dmrl.recording.mcap.summary_index import mcap_summary
-from dmrl.recording.mcap.summary_section import Section
+from dmrl.recording.mcap.chunk import select_channels
+from dmrl.recording.mcap.chunk_reader import locate_chunk, read_chunk
+from dmrl.recording.mcap.file import BoundedReader, corrupt_error, open_mcap
+from dmrl.recording.mcap.message_batch import (
+    EMPTY_BATCH,
+    MAX_TIME_NS,
+    MessageBatch,
+    concatenate,
+    concatenate_all,
+)
+from dmrl.recording.mcap.record_scan import build_channel, scan_file
+from dmrl.recording.mcap.summary_index import read_summary_section
+from dmrl.recording.mcap.summary_section import SummarySection
 
 
-def blocks(
+def iter_batches(
     path: Path,
     topics: frozenset[str] | None = None,
     *,
     start_ns: int | None = None,
     end_ns: int | None = None,
-) -> Iterator[tuple[Block, dict[int, Channel]]]:
+) -> Iterator[tuple[MessageBatch, dict[int, Channel]]]:
     """Yield messages in log-time order, some thousands at a time, with channels by channel id.
 
     Messages of equal log time are ordered: numbers before images, then by position in the file.
@@ -52,45 +58,45 @@ def blocks(
         If the file is not a complete recording, or a chunk's CRC does not match.
     """
     low = 0 if start_ns is None else start_ns
-    high = EVER_NS if end_ns is None else end_ns
-    with opened(path) as stream:
-        summary = mcap_summary(path, stream)
+    high = MAX_TIME_NS if end_ns is None else end_ns
+    with open_mcap(path) as stream:
+        summary = read_summary_section(path, stream)
         if summary is None:
-            yield _unindexed(path, stream, topics, low, high)
+            yield _scan_unindexed(path, stream, topics, low, high)
             return
         channels = {
-            number: channel_of(number, summary.channels, summary.schemas)
+            number: build_channel(number, summary.channels, summary.schemas)
             for number in summary.channels
             if topics is None or summary.channels[number].topic in topics
         }
-        found: Counter[int] = Counter()
-        for block in _in_time_order(path, stream, summary, channels, low, high):
-            tally(found, block)
-            yield block, channels
+        counts: Counter[int] = Counter()
+        for batch in _iter_in_time_order(path, stream, summary, channels, low, high):
+            count_messages(counts, batch)
+            yield batch, channels
         if start_ns is None and end_ns is None:
-            compare(path, summary, channels, found)
+            check_counts(path, summary, channels, counts)
 
 
-def tally(found: Counter[int], block: Block) -> None:
+def count_messages(counts: Counter[int], batch: MessageBatch) -> None:
     """Add the number of messages of a batch to the counts by channel id."""
-    for number, count in enumerate(np.bincount(block.channel).tolist()):
+    for number, count in enumerate(np.bincount(batch.channel).tolist()):
         if count:
-            found[number] += count
+            counts[number] += count
 
 
-def compare(
-    path: Path, summary: McapSummary, channels: dict[int, Channel], found: Counter[int]
+def check_counts(
+    path: Path, summary: McapSummary, channels: dict[int, Channel], counts: Counter[int]
 ) -> None:
     """Raise RecordingError unless the counts of messages equal those of the Statistics record."""
-    said = summary.statistics.channel_message_counts if summary.statistics else {}
-    for number, channel in channels.items() if said else ():
-        if found[number] != said.get(number, 0):
-            raise damaged(
-                path, f"{channel.topic} has {found[number]} of {said.get(number, 0)} messages"
+    expected = summary.statistics.channel_message_counts if summary.statistics else {}
+    for number, channel in channels.items() if expected else ():
+        if counts[number] != expected.get(number, 0):
+            raise corrupt_error(
+                path, f"{channel.topic} has {counts[number]} of {expected.get(number, 0)} messages"
             )
 
 
-def in_file_order(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
+def iter_batches_in_file_order(path: Path) -> Iterator[tuple[MessageBatch, dict[int, Channel]]]:
     """Yield every message in file order, chunk by chunk, unsorted.
 
     Raises
@@ -98,85 +104,89 @@ def in_file_order(path: Path) -> Iterator[tuple[Block, dict[int, Channel]]]:
     RecordingError
         As ``iter_batches``.
     """
-    with opened(path) as stream:
-        summary = mcap_summary(path, stream)
+    with open_mcap(path) as stream:
+        summary = read_summary_section(path, stream)
         if summary is None:
-            walk = walked(path, stream)
-            for block in walk.blocks:
-                yield block, walk.channels
+            walk = scan_file(path, stream)
+            for batch in walk.batches:
+                yield batch, walk.channels
             return
-        channels = {n: channel_of(n, summary.channels, summary.schemas) for n in summary.channels}
-        found: Counter[int] = Counter()
+        channels = {
+            n: build_channel(n, summary.channels, summary.schemas) for n in summary.channels
+        }
+        counts: Counter[int] = Counter()
         chunks = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
-        stream.expect([place_of(chunk) for chunk in chunks])
+        stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
         for chunk in chunks:
-            block = in_chunk(path, stream, chunk, channels, summary)
-            tally(found, block)
-            yield block, channels
-        compare(path, summary, channels, found)
+            batch = read_chunk(path, stream, chunk, channels, summary)
+            count_messages(counts, batch)
+            yield batch, channels
+        check_counts(path, summary, channels, counts)
 
 
-def _in_time_order(
+def _iter_in_time_order(
     path: Path,
-    stream: Bounded,
-    summary: Section,
+    stream: BoundedReader,
+    summary: SummarySection,
     channels: dict[int, Channel],
     low: int,
     high: int,
-) -> Iterator[Block]:
+) -> Iterator[MessageBatch]:
     """Yield batches in log-time order; hold messages back while a later chunk may precede them."""
-    chunks = chunks_between(summary, channels.keys(), low, high)
-    last = _pictured(channels)
-    held: Block | None = None
-    stream.expect([place_of(chunk) for chunk in chunks])
+    chunks = select_chunks(summary, channels.keys(), low, high)
+    last = _find_image_channels(channels)
+    pending: MessageBatch | None = None
+    stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
     for k, chunk in enumerate(chunks):
-        block = in_chunk(path, stream, chunk, channels, summary)
-        block = block.take((block.time_ns >= low) & (block.time_ns < high))
-        held = concatenate(held, block).sorted(last)
+        batch = read_chunk(path, stream, chunk, channels, summary)
+        batch = batch.take((batch.time_ns >= low) & (batch.time_ns < high))
+        pending = concatenate(pending, batch).sort_by_time(last)
         if k + 1 == len(chunks):
             break
         # A later chunk may still hold messages from its start time on.
-        split = int(np.searchsorted(held.time_ns, chunks[k + 1].message_start_time))
+        split = int(np.searchsorted(pending.time_ns, chunks[k + 1].message_start_time))
         if split:
-            yield held.take(np.arange(split))
-            held = held.take(np.arange(split, len(held))).compact()
-    if held is not None and len(held):
-        yield held
+            yield pending.take(np.arange(split))
+            pending = pending.take(np.arange(split, len(pending))).compact()
+    if pending is not None and len(pending):
+        yield pending
 
 
-def _pictured(channels: dict[int, Channel]) -> list[int]:
+def _find_image_channels(channels: dict[int, Channel]) -> list[int]:
     """Return the ids of channels with images; empty if all channels have images."""
-    found = [number for number, channel in channels.items() if channel.pictured]
-    return found if len(found) < len(channels) else []
+    image_channels = [number for number, channel in channels.items() if channel.carries_images]
+    return image_channels if len(image_channels) < len(channels) else []
 
 
-def chunks_between(
-    summary: McapSummary, numbers: Set[int], low: int, high: int
+def select_chunks(
+    summary: McapSummary, channel_ids: Set[int], low: int, high: int
 ) -> list[ChunkIndex]:
     """Return the chunks that may contain messages of these channels in [low, high), by time."""
 
-    def wanted(chunk: ChunkIndex) -> bool:
+    def may_contain(chunk: ChunkIndex) -> bool:
         seen = chunk.message_index_offsets
         return (
             chunk.message_end_time >= low
             and chunk.message_start_time < high
-            and (not seen or not numbers.isdisjoint(seen))
+            and (not seen or not channel_ids.isdisjoint(seen))
         )
 
     return sorted(
-        filter(wanted, summary.chunk_indexes),
+        filter(may_contain, summary.chunk_indexes),
         key=lambda c: (c.message_start_time, c.chunk_start_offset),
     )
 
 
-def _unindexed(
-    path: Path, stream: Bounded, topics: frozenset[str] | None, low: int, high: int
-) -> tuple[Block, dict[int, Channel]]:
+def _scan_unindexed(
+    path: Path, stream: BoundedReader, topics: frozenset[str] | None, low: int, high: int
+) -> tuple[MessageBatch, dict[int, Channel]]:
     """Read every message of a file without chunk indexes into one batch."""
-    walk = walked(path, stream)
+    walk = scan_file(path, stream)
     channels = {n: c for n, c in walk.channels.items() if topics is None or c.topic in topics}
     kept = []
-    for whole in walk.blocks:
-        block = of_channels(whole, channels, walk.channels)
-        kept.append(block.take((block.time_ns >= low) & (block.time_ns < high)))
-    return joined(kept).sorted(_pictured(channels)) if kept else EMPTY, channels
+    for whole in walk.batches:
+        batch = select_channels(whole, channels, walk.channels)
+        kept.append(batch.take((batch.time_ns >= low) & (batch.time_ns < high)))
+    return concatenate_all(kept).sort_by_time(
+        _find_image_channels(channels)
+    ) if kept else EMPTY_BATCH, channels

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from functools import cache
 
-PICTURES = ("Image", "Video", "GridMap", "Grid", "PointCloud", "PointCloud2")
+IMAGE_TYPE_SUFFIXES = ("Image", "Video", "GridMap", "Grid", "PointCloud", "PointCloud2")
 """Suffixes of the names of message types that hold images or other large arrays.
 
 Their messages are large and seldom read together with the rest.
@@ -23,17 +23,17 @@ class Channel:
     schema_encoding: str = "protobuf"
     encoding: str = "protobuf"
     metadata: tuple[tuple[str, str], ...] = ()
-    pictured: bool = field(init=False, repr=False, compare=False)
+    carries_images: bool = field(init=False, repr=False, compare=False)
     """Whether the messages are images. They are written into chunks of their own."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "pictured", holds_pictures(self.schema_name))
+        object.__setattr__(self, "carries_images", is_image_type(self.schema_name))
 
 
 @cache
-def holds_pictures(schema_name: str) -> bool:
+def is_image_type(schema_name: str) -> bool:
     """Return whether a message type holds images, masks, depths or network maps."""
-    return schema_name.endswith(PICTURES)
+    return schema_name.endswith(IMAGE_TYPE_SUFFIXES)
 
 
 @dataclass(frozen=True, slots=True)

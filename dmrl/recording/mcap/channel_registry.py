@@ -7,12 +7,12 @@ from mcap.records import Channel as McapChannel
 from mcap.records import Schema
 
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk import RECORD_HEADER, beside
-from dmrl.recording.mcap.file_writer import laid_out
-from dmrl.recording.mcap.message_batch import Block
+from dmrl.recording.mcap.chunk import RECORD_HEADER_BYTES, other_records
+from dmrl.recording.mcap.file_writer import serialize
+from dmrl.recording.mcap.message_batch import MessageBatch
 
 
-class Defined:
+class ChannelRegistry:
     """Channels and schemas of a file that is being written, by id.
 
     Ids are assigned on first use. `adopt_channels` keeps the ids of a recording that is copied.
@@ -24,18 +24,22 @@ class Defined:
     """
 
     def __init__(self) -> None:
-        self.begun: set[int] = set()
+        self.written: set[int] = set()
         self._channels: dict[int, McapChannel] = {}
         self._records: dict[tuple[int, int], bytes] = {}  # by opcode and id
-        self._begun_schemas: set[int] = {0}
-        self._numbers: dict[Channel, int] = {}
+        self._written_schemas: set[int] = {0}
+        self._channel_ids: dict[Channel, int] = {}
         # By identity: to hash a channel takes longer than to copy its messages. The reference to
         # each channel keeps its id() valid.
-        self._seen: dict[int, tuple[Channel, int]] = {}
-        self._alike: dict[int, Channel] = {}  # channels of copied files that have the same id
-        self._schema_numbers: dict[tuple[str, str, bytes], int] = {}
+        self._id_by_identity: dict[int, tuple[Channel, int]] = {}
+        self._same_id_channels: dict[
+            int, Channel
+        ] = {}  # channels of copied files that have the same id
+        self._schema_ids: dict[tuple[str, str, bytes], int] = {}
 
-    def adopt(self, channels: Mapping[int, Channel], records: Mapping[int, McapChannel]) -> None:
+    def adopt_channels(
+        self, channels: Mapping[int, Channel], records: Mapping[int, McapChannel]
+    ) -> None:
         """Assign the ids that channels have in a recording that is copied, where they are free.
 
         Parameters
@@ -46,37 +50,44 @@ class Defined:
             Channel records by channel id, with the schema ids.
         """
         for number, channel in channels.items():
-            if channel not in self._numbers and number not in self._channels:
-                self._define(channel, number, records[number].schema_id)
+            if channel not in self._channel_ids and number not in self._channels:
+                self._define_channel(channel, number, records[number].schema_id)
 
-    def number(self, channel: Channel) -> int:
+    def get_channel_id(self, channel: Channel) -> int:
         """Return the id of a channel; assign one if it has none."""
-        known = self._seen.get(id(channel))
-        if known is None:
-            found = self._numbers.get(channel)
-            number = self._define(channel, _free(self._channels), None) if found is None else found
-            known = self._seen[id(channel)] = channel, number
-        return known[1]
+        cached = self._id_by_identity.get(id(channel))
+        if cached is None:
+            found = self._channel_ids.get(channel)
+            number = (
+                self._define_channel(channel, _find_free_id(self._channels), None)
+                if found is None
+                else found
+            )
+            cached = self._id_by_identity[id(channel)] = channel, number
+        return cached[1]
 
-    def topic(self, number: int) -> str:
+    def get_topic(self, number: int) -> str:
         """Return the topic of a channel id."""
         return str(self._channels[number].topic)
 
-    def begin(self, number: int) -> bytes:
+    def definition_records(self, channel_id: int) -> bytes:
         """Return the records to write before the first message of a channel; empty later.
 
         The channel counts as written from then on.
         """
-        if number in self.begun:
+        if channel_id in self.written:
             return b""
-        self.begun.add(number)
-        schema_id, record = self._channels[number].schema_id, self._records[Opcode.CHANNEL, number]
-        if schema_id in self._begun_schemas:
+        self.written.add(channel_id)
+        schema_id, record = (
+            self._channels[channel_id].schema_id,
+            self._records[Opcode.CHANNEL, channel_id],
+        )
+        if schema_id in self._written_schemas:
             return record
-        self._begun_schemas.add(schema_id)
+        self._written_schemas.add(schema_id)
         return self._records[Opcode.SCHEMA, schema_id] + record
 
-    def begin_in(self, block: Block, channels: Mapping[int, Channel]) -> bool:
+    def can_copy_chunk(self, batch: MessageBatch, channels: Mapping[int, Channel]) -> bool:
         """Return whether a compressed chunk can be copied as it is; if so, mark its channels.
 
         This requires that every channel has the same id here, that the chunk or an earlier one
@@ -90,62 +101,62 @@ class Defined:
         channels
             By channel id in the chunk.
         """
-        numbers, alike = block.numbers(), self._alike
-        fresh = [number for number in numbers if alike.get(number) is not channels[number]]
-        if not all(self._same(number, channels[number]) for number in fresh):
+        numbers, alike = batch.list_channel_ids(), self._same_id_channels
+        unverified = [number for number in numbers if alike.get(number) is not channels[number]]
+        if not all(self._has_same_id(number, channels[number]) for number in unverified):
             return False
-        begun = set[int](), set[int]()
-        if (found := beside(block)) is None:
+        written_here = set[int](), set[int]()
+        if (others := other_records(batch)) is None:
             return False
-        for opcode, at, end in found.others:
-            record = found.data[at:end].tobytes()
-            number = int.from_bytes(record[RECORD_HEADER : RECORD_HEADER + 2], "little")
+        for opcode, at, end in others.others:
+            record = others.data[at:end].tobytes()
+            number = int.from_bytes(record[RECORD_HEADER_BYTES : RECORD_HEADER_BYTES + 2], "little")
             if self._records.get((opcode, number)) != record:
                 return False
-            begun[opcode == Opcode.CHANNEL].add(number)
-        schemas = begun[0] | self._begun_schemas
-        if not (begun[1] | self.begun).issuperset(numbers):
+            written_here[opcode == Opcode.CHANNEL].add(number)
+        schemas = written_here[0] | self._written_schemas
+        if not (written_here[1] | self.written).issuperset(numbers):
             return False
-        if any(self._channels[number].schema_id not in schemas for number in begun[1]):
+        if any(self._channels[number].schema_id not in schemas for number in written_here[1]):
             return False
-        self.begun |= begun[1]
-        self._begun_schemas |= begun[0]
+        self.written |= written_here[1]
+        self._written_schemas |= written_here[0]
         return True
 
-    def _same(self, number: int, channel: Channel) -> bool:
+    def _has_same_id(self, number: int, channel: Channel) -> bool:
         """Return whether a channel of another recording has the same id here."""
-        if self._numbers.get(channel) != number:
+        if self._channel_ids.get(channel) != number:
             return False
-        self._alike[number] = channel
+        self._same_id_channels[number] = channel
         return True
 
-    def all_begun(self) -> tuple[list[bytes], list[bytes]]:
+    def list_written_definitions(self) -> tuple[list[bytes], list[bytes]]:
         """Return the Schema and Channel records that are in a chunk, by id."""
-        schemas = [self._records[Opcode.SCHEMA, n] for n in sorted(self._begun_schemas - {0})]
-        return schemas, [self._records[Opcode.CHANNEL, n] for n in sorted(self.begun)]
+        schemas = [self._records[Opcode.SCHEMA, n] for n in sorted(self._written_schemas - {0})]
+        return schemas, [self._records[Opcode.CHANNEL, n] for n in sorted(self.written)]
 
-    def _define(self, channel: Channel, number: int, schema_number: int | None) -> int:
-        schema_id = self._schema_of(channel, schema_number)
+    def _define_channel(self, channel: Channel, number: int, schema_number: int | None) -> int:
+        schema_id = self._define_schema(channel, schema_number)
         metadata = dict(channel.metadata)
         made = McapChannel(number, channel.topic, channel.encoding, metadata, schema_id)
-        self._channels[number], self._records[Opcode.CHANNEL, number] = made, laid_out(made)
-        self._numbers[channel] = number
+        self._channels[number], self._records[Opcode.CHANNEL, number] = made, serialize(made)
+        self._channel_ids[channel] = number
         return number
 
-    def _schema_of(self, channel: Channel, number: int | None) -> int:
+    def _define_schema(self, channel: Channel, number: int | None) -> int:
         key = (channel.schema_name, channel.schema_encoding, channel.schema_data)
         if not any(key):
             return 0
-        if key not in self._schema_numbers:
-            taken = set(self._schema_numbers.values())
+        if key not in self._schema_ids:
+            taken = set(self._schema_ids.values())
             if not number or number in taken:
-                number = _free(taken)
+                number = _find_free_id(taken)
             made = Schema(number, channel.schema_data, key[1], key[0])
-            self._schema_numbers[key], self._records[Opcode.SCHEMA, number] = number, laid_out(made)
-        return self._schema_numbers[key]
+            self._schema_ids[key], self._records[Opcode.SCHEMA, number] = number, serialize(made)
+        return self._schema_ids[key]
 
 
-def _free(taken: Collection[int]) -> int:
+def _find_free_id(taken: Collection[int]) -> int:
     """Return the id after the greatest one, or the smallest that is free."""
     after = max(taken, default=0) + 1
     return after if after < 1 << 16 else next(k for k in range(1, 1 << 16) if k not in taken)

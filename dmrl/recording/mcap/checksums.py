@@ -13,7 +13,7 @@ METADATA_NAME = "dmrl.crc"
 
 
 @dataclass(slots=True)
-class Sums:
+class Checksums:
     """CRC-32 of the Metadata records and of the Message Index records, in file order."""
 
     metadata: int = 0
@@ -23,20 +23,24 @@ class Sums:
         """Add a complete Metadata record that was written."""
         self.metadata = zlib.crc32(record, self.metadata)
 
-    def add_indexes(self, records: bytes) -> None:
+    def add_message_indexes(self, records: bytes) -> None:
         """Add complete Message Index records that were written."""
         self.indexes = zlib.crc32(records, self.indexes)
 
     def to_metadata(self, at: int) -> dict[str, str]:
         """Return the values of the metadata record that starts at this byte."""
-        return {"metadata": text(self.metadata), "indexes": text(self.indexes), "at": str(at)}
+        return {
+            "metadata": format_crc(self.metadata),
+            "indexes": format_crc(self.indexes),
+            "at": str(at),
+        }
 
 
-def of_this_file(values: dict[str, str], at: int) -> bool:
+def belongs_to_file(values: dict[str, str], at: int) -> bool:
     """Return whether checksums at this byte belong to this file, not to a copied one."""
     return values.get("at", str(at)) == str(at)
 
 
-def text(crc: int) -> str:
+def format_crc(crc: int) -> str:
     """Format a CRC-32 as it is stored in a recording."""
     return f"{crc:08x}"

@@ -15,14 +15,23 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema
 
 from dmrl.guards import limits
-from dmrl.recording.mcap.file import DEFINITIONS, RECORD, damaged, too_large
-from dmrl.recording.mcap.file_writer import laid_out
-from dmrl.recording.mcap.message_batch import HEAD_BYTES, Block, Bytes, Ints, put_at, taken
+from dmrl.recording.mcap.file import DEFINITIONS, RECORD_STRUCT, corrupt_error, over_budget_error
+from dmrl.recording.mcap.file_writer import serialize
+from dmrl.recording.mcap.message_batch import (
+    MESSAGE_PREFIX_BYTES,
+    Bytes,
+    Ints,
+    MessageBatch,
+    gather,
+    scatter,
+)
 
-RECORD_HEADER = 1 + 8  # opcode, length
-MESSAGE = int(Opcode.MESSAGE)
-MESSAGE_HEADER = HEAD_BYTES - RECORD_HEADER  # channel id, sequence, log time, publish time
-HEAD = np.dtype(
+RECORD_HEADER_BYTES = 1 + 8  # opcode, length
+MESSAGE_OPCODE = int(Opcode.MESSAGE)
+MESSAGE_HEADER_BYTES = (
+    MESSAGE_PREFIX_BYTES - RECORD_HEADER_BYTES
+)  # channel id, sequence, log time, publish time
+MESSAGE_PREFIX_DTYPE = np.dtype(
     [
         ("opcode", "u1"),
         ("length", "<u8"),
@@ -35,7 +44,7 @@ HEAD = np.dtype(
 """Layout of a Message record up to its payload."""
 
 
-def unpacked(path: Path, chunk: Chunk, offset: int) -> Bytes:
+def decompress(path: Path, chunk: Chunk, offset: int) -> Bytes:
     """Decompress the records of a chunk and check their size and CRC.
 
     Raises
@@ -46,19 +55,19 @@ def unpacked(path: Path, chunk: Chunk, offset: int) -> Bytes:
     """
     size = chunk.uncompressed_size
     if size > limits.UNPACKED_BYTES:
-        raise too_large(path, f"the chunk at byte {offset} unpacks to {size / 1e6:.0f} MB")
+        raise over_budget_error(path, f"the chunk at byte {offset} unpacks to {size / 1e6:.0f} MB")
     try:
-        data = _decompressed(chunk.compression, chunk.data, size)
+        data = _decompress_bytes(chunk.compression, chunk.data, size)
     except (zstandard.ZstdError, RuntimeError, MemoryError, ValueError) as e:
-        raise damaged(path, f"chunk at byte {offset}: {e}") from e
+        raise corrupt_error(path, f"chunk at byte {offset}: {e}") from e
     if len(data) != size:
-        raise damaged(path, f"chunk at byte {offset} unpacks to another size than it states")
+        raise corrupt_error(path, f"chunk at byte {offset} unpacks to another size than it states")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise damaged(path, f"chunk at byte {offset} fails its CRC")
+        raise corrupt_error(path, f"chunk at byte {offset} fails its CRC")
     return np.frombuffer(data, np.uint8)
 
 
-def _decompressed(compression: str, data: bytes, size: int) -> bytes:
+def _decompress_bytes(compression: str, data: bytes, size: int) -> bytes:
     """Decompress to at most ``size`` bytes. Neither decoder reserves more memory than that."""
     if compression == "zstd":
         if zstandard.frame_content_size(data) > size:
@@ -73,21 +82,27 @@ def _decompressed(compression: str, data: bytes, size: int) -> bytes:
     raise ValueError(f"unknown compression {compression!r}")
 
 
-def messages_at(data: Bytes, at_record: Ints) -> Block:
+def build_batch_at(data: Bytes, offsets: Ints) -> MessageBatch:
     """Build a batch from the offsets of Message records, each at least a prefix before the end."""
-    heads = taken(data, HEAD, at_record)
-    return Block(
+    heads = gather(data, MESSAGE_PREFIX_DTYPE, offsets)
+    return MessageBatch(
         data,
         heads["channel"].astype(np.int64),
         heads["time"].astype(np.int64),
         heads["publish"].astype(np.int64),
-        at_record + HEAD_BYTES,
-        at_record + RECORD_HEADER + heads["length"].astype(np.int64),
+        offsets + MESSAGE_PREFIX_BYTES,
+        offsets + RECORD_HEADER_BYTES + heads["length"].astype(np.int64),
     )
 
 
-def set_heads(
-    records: Bytes, at: Ints, number: Ints, time_ns: Ints, publish_ns: Ints, *, fresh: bool = False
+def write_message_prefixes(
+    records: Bytes,
+    at: Ints,
+    channel_ids: Ints,
+    time_ns: Ints,
+    publish_ns: Ints,
+    *,
+    fresh: bool = False,
 ) -> None:
     """Write channel ids and times into Message records.
 
@@ -103,15 +118,19 @@ def set_heads(
         The prefixes are empty: write opcode and length as well.
     """
     at, size = at[:-1], np.diff(at)
-    heads = np.zeros(len(at), HEAD) if fresh else taken(records, HEAD, at)
-    heads["channel"], heads["time"], heads["publish"] = number, time_ns, publish_ns
+    heads = (
+        np.zeros(len(at), MESSAGE_PREFIX_DTYPE)
+        if fresh
+        else gather(records, MESSAGE_PREFIX_DTYPE, at)
+    )
+    heads["channel"], heads["time"], heads["publish"] = channel_ids, time_ns, publish_ns
     if fresh:
-        heads["opcode"], heads["length"] = MESSAGE, size - RECORD_HEADER
-    put_at(records, at, heads)
+        heads["opcode"], heads["length"] = MESSAGE_OPCODE, size - RECORD_HEADER_BYTES
+    scatter(records, at, heads)
 
 
 @dataclass(frozen=True, slots=True)
-class Scan:
+class ParsedChunk:
     """A chunk parsed record by record.
 
     Parameters
@@ -129,19 +148,19 @@ class Scan:
     others: list[tuple[int, int, int]]
 
     @property
-    def block(self) -> Block:
+    def batch(self) -> MessageBatch:
         """All messages of the chunk."""
-        return messages_at(self.data, np.array(self.messages, np.int64))
+        return build_batch_at(self.data, np.array(self.messages, np.int64))
 
-    def definitions(self) -> Iterator[Schema | Channel]:
+    def iter_definitions(self) -> Iterator[Schema | Channel]:
         """Yield the Schema and Channel records of the chunk."""
         for opcode, at, end in self.others:
             if opcode in DEFINITIONS:
-                body = BytesIO(self.data[at + RECORD_HEADER : end].tobytes())
+                body = BytesIO(self.data[at + RECORD_HEADER_BYTES : end].tobytes())
                 yield DEFINITIONS[opcode].read(ReadDataStream(body))
 
 
-def scanned(data: Bytes) -> Scan:
+def parse_records(data: Bytes) -> ParsedChunk:
     """Parse the records of a chunk one after the other, without its message indexes.
 
     Raises
@@ -149,16 +168,16 @@ def scanned(data: Bytes) -> Scan:
     McapError
         If a record runs beyond the chunk, or is too short.
     """
-    view, at, size, unpack = data.data, 0, len(data), RECORD.unpack_from
-    scan = Scan(data, [], [])
+    view, at, size, unpack = data.data, 0, len(data), RECORD_STRUCT.unpack_from
+    scan = ParsedChunk(data, [], [])
     while at < size:
-        if at + RECORD_HEADER > size:
+        if at + RECORD_HEADER_BYTES > size:
             raise McapError("a chunk ends within a record")
         opcode, length = unpack(view, at)
-        end = at + RECORD_HEADER + length
-        if end > size or (opcode == MESSAGE and length < MESSAGE_HEADER):
+        end = at + RECORD_HEADER_BYTES + length
+        if end > size or (opcode == MESSAGE_OPCODE and length < MESSAGE_HEADER_BYTES):
             raise McapError("a record in a chunk has a wrong length")
-        if opcode == MESSAGE:
+        if opcode == MESSAGE_OPCODE:
             scan.messages.append(at)
         else:
             scan.others.append((opcode, at, end))
@@ -166,26 +185,28 @@ def scanned(data: Bytes) -> Scan:
     return scan
 
 
-def beside(block: Block) -> Scan | None:
+def other_records(batch: MessageBatch) -> ParsedChunk | None:
     """Return the records of a chunk other than the messages of a batch, or None.
 
     The batch must hold all messages of the chunk. None: there are other messages, or some overlap.
     """
-    first = np.append(block.start - HEAD_BYTES, len(block.data))
-    last = np.concatenate([[0], block.end])
+    first = np.append(batch.start - MESSAGE_PREFIX_BYTES, len(batch.data))
+    last = np.concatenate([[0], batch.end])
     if (first < last).any():
         return None
-    found = Scan(block.data, [], [])
+    found = ParsedChunk(batch.data, [], [])
     for gap in np.flatnonzero(first != last).tolist():
         before = int(last[gap])
-        scan = scanned(block.data[before : first[gap]])
+        scan = parse_records(batch.data[before : first[gap]])
         if scan.messages:
             return None
         found.others.extend((opcode, before + at, before + end) for opcode, at, end in scan.others)
     return found
 
 
-def of_channels(block: Block, numbers: Collection[int], known: Collection[int]) -> Block:
+def select_channels(
+    batch: MessageBatch, channel_ids: Collection[int], defined: Collection[int]
+) -> MessageBatch:
     """Select the messages of some channels.
 
     Raises
@@ -194,22 +215,22 @@ def of_channels(block: Block, numbers: Collection[int], known: Collection[int]) 
         If the channel of a message is not in ``defined``, or a time is beyond the year 2262, the
         end of signed 64-bit nanoseconds.
     """
-    present = set(block.numbers())
-    if unknown := present - set(known):
+    present = set(batch.list_channel_ids())
+    if unknown := present - set(defined):
         raise McapError(f"messages of channel {min(unknown)}, which is not defined")
-    block = possible(block)
-    return block if present <= set(numbers) else block.of(numbers)
+    batch = require_valid_times(batch)
+    return batch if present <= set(channel_ids) else batch.select_channels(channel_ids)
 
 
-def possible(block: Block) -> Block:
+def require_valid_times(batch: MessageBatch) -> MessageBatch:
     """Return the batch; raise McapError if a time is beyond the year 2262."""
-    if not block.possible.all():
+    if not batch.has_valid_times.all():
         raise McapError("a message has a time beyond the year 2262")
-    return block
+    return batch
 
 
-def loose(messages: list[Message]) -> Block:
+def batch_from_messages(messages: list[Message]) -> MessageBatch:
     """Build a batch from messages that are outside of chunks."""
-    records = [laid_out(message) for message in messages]
+    records = [serialize(message) for message in messages]
     size = np.array([len(record) for record in records], np.int64)
-    return messages_at(np.frombuffer(b"".join(records), np.uint8), np.cumsum(size) - size)
+    return build_batch_at(np.frombuffer(b"".join(records), np.uint8), np.cumsum(size) - size)

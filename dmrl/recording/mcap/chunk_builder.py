@@ -7,26 +7,30 @@ from array import array
 import numpy as np
 import zstandard
 
-from dmrl.recording.mcap.chunk import MESSAGE, RECORD_HEADER, messages_at
-from dmrl.recording.mcap.file_writer import Packed
-from dmrl.recording.mcap.message_batch import HEAD_BYTES, Bytes, Ints
-from dmrl.recording.mcap.message_index import index_of
+from dmrl.recording.mcap.chunk import MESSAGE_OPCODE, RECORD_HEADER_BYTES, build_batch_at
+from dmrl.recording.mcap.file_writer import CompressedChunk
+from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, Bytes, Ints
+from dmrl.recording.mcap.message_index import build_message_index
 
 CHUNK_BYTES = 256 * 1024
 """Target size of a chunk, uncompressed bytes.
 
 Costs no file size against 1 MiB, and bounds the data that a crash can lose.
 """
-LEVEL = 1
+ZSTD_LEVEL = 1
 """zstd compression level.
 
 Takes half the time of the default 3, and sensor values do not get larger.
 """
-HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log and publish time
-BODY_BYTES = HEAD_BYTES - RECORD_HEADER  # part of the prefix that the record length counts
+MESSAGE_PREFIX_STRUCT = struct.Struct(
+    "<BQHIQQ"
+)  # opcode, length, channel, sequence, log and publish time
+PREFIX_BODY_BYTES = (
+    MESSAGE_PREFIX_BYTES - RECORD_HEADER_BYTES
+)  # part of the prefix that the record length counts
 
 
-class OpenChunk:
+class ChunkBuilder:
     """One chunk that is being filled, with messages of one kind: images or numbers.
 
     Attributes
@@ -43,13 +47,15 @@ class OpenChunk:
         """Whether the chunk has reached its target size."""
         return len(self.data) > CHUNK_BYTES
 
-    def define(self, record: bytes) -> None:
+    def add_definition(self, record: bytes) -> None:
         """Add a Schema or Channel record."""
         self.data += record
 
-    def add(self, number: int, time_ns: int, publish_ns: int, payload: bytes) -> None:
+    def add_message(self, channel_id: int, time_ns: int, publish_ns: int, payload: bytes) -> None:
         """Add one message."""
-        head = HEAD.pack(MESSAGE, len(payload) + BODY_BYTES, number, 0, time_ns, publish_ns)
+        head = MESSAGE_PREFIX_STRUCT.pack(
+            MESSAGE_OPCODE, len(payload) + PREFIX_BODY_BYTES, channel_id, 0, time_ns, publish_ns
+        )
         self.starts.append(len(self.data))
         self.data += head
         self.data += payload
@@ -72,11 +78,13 @@ class OpenChunk:
         self.data += records[at[0] : at[count]].data
         return count
 
-    def packed(self) -> Packed:
+    def compress(self) -> CompressedChunk:
         """Compress the chunk, build its message indexes, and start an empty chunk."""
         data = np.frombuffer(bytes(self.data), np.uint8)
-        block = messages_at(data, np.array(self.starts, np.int64))
-        squeezed = zstandard.ZstdCompressor(level=LEVEL).compress(data.data)
+        batch = build_batch_at(data, np.array(self.starts, np.int64))
+        compressed = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(data.data)
         crc = zlib.crc32(data.data)
         self.data, self.starts, self.age = bytearray(), array("q"), 0
-        return Packed("zstd", squeezed, len(data), crc, *block.span, index_of(block))
+        return CompressedChunk(
+            "zstd", compressed, len(data), crc, *batch.time_span_ns, build_message_index(batch)
+        )

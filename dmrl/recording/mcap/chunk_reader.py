@@ -8,34 +8,38 @@ from mcap.records import Chunk, ChunkIndex
 
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunk import (
-    HEAD,
-    RECORD_HEADER,
-    beside,
-    messages_at,
-    of_channels,
-    possible,
-    scanned,
-    unpacked,
+    MESSAGE_PREFIX_DTYPE,
+    RECORD_HEADER_BYTES,
+    build_batch_at,
+    decompress,
+    other_records,
+    parse_records,
+    require_valid_times,
+    select_channels,
 )
-from dmrl.recording.mcap.file import Bounded, damaged
-from dmrl.recording.mcap.file_writer import CHUNK
-from dmrl.recording.mcap.message_batch import HEAD_BYTES, Block, Bytes, taken
-from dmrl.recording.mcap.message_index import MessageIndex, index_entries, indexes_size
-from dmrl.recording.mcap.summary_section import Section
+from dmrl.recording.mcap.file import BoundedReader, corrupt_error
+from dmrl.recording.mcap.file_writer import CHUNK_STRUCT
+from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, Bytes, MessageBatch, gather
+from dmrl.recording.mcap.message_index import (
+    MessageIndex,
+    compute_indexes_size,
+    parse_index_entries,
+)
+from dmrl.recording.mcap.summary_section import SummarySection
 
 
-def place_of(chunk: ChunkIndex) -> tuple[int, int]:
+def locate_chunk(chunk: ChunkIndex) -> tuple[int, int]:
     """Return the offset of a chunk, and its size with its message indexes, bytes."""
     return chunk.chunk_start_offset, chunk.chunk_length + chunk.message_index_length
 
 
-def in_chunk(
+def read_chunk(
     path: Path,
-    stream: Bounded,
-    said: ChunkIndex,
+    stream: BoundedReader,
+    chunk_index: ChunkIndex,
     channels: dict[int, Channel],
-    summary: Section,
-) -> Block:
+    summary: SummarySection,
+) -> MessageBatch:
     """Read a chunk and return its messages of some channels, in chunk order.
 
     Parameters
@@ -54,19 +58,19 @@ def in_chunk(
     RecordingError
         If the chunk contradicts its Chunk Index, its Message Index or the Summary section.
     """
-    raw, _, data = _unpacked(path, stream, said)
-    if summary.must_confirm(said):
-        summary.confirm(path, scanned(data).definitions())
-    return _indexed(path, raw, data, said, channels, summary)[0]
+    raw, _, data = _load_chunk(path, stream, chunk_index)
+    if summary.needs_definition_check(chunk_index):
+        summary.check_definitions(path, parse_records(data).iter_definitions())
+    return _select_by_index(path, raw, data, chunk_index, channels, summary)[0]
 
 
-def whole_chunk(
+def read_chunk_for_copy(
     path: Path,
-    stream: Bounded,
-    said: ChunkIndex,
+    stream: BoundedReader,
+    chunk_index: ChunkIndex,
     channels: dict[int, Channel],
-    summary: Section,
-) -> tuple[Chunk, Block, MessageIndex | None]:
+    summary: SummarySection,
+) -> tuple[Chunk, MessageBatch, MessageIndex | None]:
     """Read a chunk for a copy: still compressed, with all its messages and message indexes.
 
     Parameters
@@ -91,79 +95,94 @@ def whole_chunk(
     RecordingError
         If the chunk contradicts its Chunk Index, its Message Index or the Summary section.
     """
-    raw, chunk, data = _unpacked(path, stream, said)
-    block, counts = _indexed(path, raw, data, said, channels, summary)
-    if summary.must_confirm(said):
-        summary.confirm(path, (beside(block) or scanned(data)).definitions())
-    records = raw[said.chunk_length :]
-    if not all(counts.values()) or len(records) != indexes_size(counts):
-        return chunk, block, None
-    after = said.chunk_start_offset + said.chunk_length
-    places = {n: at - after for n, at in said.message_index_offsets.items()}
-    return chunk, block, MessageIndex(records, places, counts)
+    raw, chunk, data = _load_chunk(path, stream, chunk_index)
+    batch, counts = _select_by_index(path, raw, data, chunk_index, channels, summary)
+    if summary.needs_definition_check(chunk_index):
+        summary.check_definitions(
+            path, (other_records(batch) or parse_records(data)).iter_definitions()
+        )
+    records = raw[chunk_index.chunk_length :]
+    if not all(counts.values()) or len(records) != compute_indexes_size(counts):
+        return chunk, batch, None
+    after = chunk_index.chunk_start_offset + chunk_index.chunk_length
+    places = {n: at - after for n, at in chunk_index.message_index_offsets.items()}
+    return chunk, batch, MessageIndex(records, places, counts)
 
 
-def _unpacked(path: Path, stream: Bounded, said: ChunkIndex) -> tuple[bytes, Chunk, Bytes]:
+def _load_chunk(
+    path: Path, stream: BoundedReader, chunk_index: ChunkIndex
+) -> tuple[bytes, Chunk, Bytes]:
     """Return a chunk's bytes with its message indexes, its record, and its decompressed data."""
-    at, size = place_of(said)
+    at, size = locate_chunk(chunk_index)
     stream.seek(at)
     raw = stream.read(size)
-    chunk = _chunk_record(path, raw, said)
-    return raw, chunk, unpacked(path, chunk, at)
+    chunk = _parse_chunk_record(path, raw, chunk_index)
+    return raw, chunk, decompress(path, chunk, at)
 
 
-def _indexed(
+def _select_by_index(
     path: Path,
     raw: bytes,
     data: Bytes,
-    said: ChunkIndex,
+    chunk_index: ChunkIndex,
     channels: dict[int, Channel],
-    summary: Section,
-) -> tuple[Block, dict[int, int]]:
+    summary: SummarySection,
+) -> tuple[MessageBatch, dict[int, int]]:
     """Return the messages of some channels, and the number that each message index lists."""
-    at = said.chunk_start_offset
-    if not said.message_index_offsets:
-        block = of_channels(scanned(data).block, channels, summary.channels)
-        return _within(path, said, block), {}
-    places = {n: place - at for n, place in said.message_index_offsets.items() if n in channels}
-    entries = index_entries(path, raw, places)
-    if len(entries.at) and not 0 <= entries.at.min() <= entries.at.max() <= len(data) - HEAD_BYTES:
-        raise damaged(path, f"index beyond the chunk at byte {at}")
+    at = chunk_index.chunk_start_offset
+    if not chunk_index.message_index_offsets:
+        batch = select_channels(parse_records(data).batch, channels, summary.channels)
+        return _check_time_range(path, chunk_index, batch), {}
+    places = {
+        n: place - at for n, place in chunk_index.message_index_offsets.items() if n in channels
+    }
+    entries = parse_index_entries(path, raw, places)
+    if (
+        len(entries.offset)
+        and not 0
+        <= entries.offset.min()
+        <= entries.offset.max()
+        <= len(data) - MESSAGE_PREFIX_BYTES
+    ):
+        raise corrupt_error(path, f"index beyond the chunk at byte {at}")
     # Message indexes have no CRC, so they are compared with the records they point at.
-    heads = taken(data, HEAD, entries.at)
-    block = messages_at(data, np.sort(entries.at.astype(np.uint32)).astype(np.int64))
+    heads = gather(data, MESSAGE_PREFIX_DTYPE, entries.offset)
+    batch = build_batch_at(data, np.sort(entries.offset.astype(np.uint32)).astype(np.int64))
     right = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == entries.channel)
     right &= heads["time"].view(np.int64) == entries.time_ns
-    if not (right & (block.end <= len(data))).all():
-        raise damaged(path, f"index of the chunk at byte {at} is wrong")
-    return _within(path, said, possible(block)), dict(
+    if not (right & (batch.end <= len(data))).all():
+        raise corrupt_error(path, f"index of the chunk at byte {at} is wrong")
+    return _check_time_range(path, chunk_index, require_valid_times(batch)), dict(
         zip(places, entries.counts.tolist(), strict=True)
     )
 
 
-def _within(path: Path, chunk: ChunkIndex, block: Block) -> Block:
+def _check_time_range(path: Path, chunk_index: ChunkIndex, batch: MessageBatch) -> MessageBatch:
     """Return the batch; raise RecordingError if its times exceed the range of its Chunk Index."""
-    low, high = chunk.message_start_time, chunk.message_end_time
-    if len(block) and not low <= block.span[0] <= block.span[1] <= high:
-        raise damaged(
+    low, high = chunk_index.message_start_time, chunk_index.message_end_time
+    if len(batch) and not low <= batch.time_span_ns[0] <= batch.time_span_ns[1] <= high:
+        raise corrupt_error(
             path,
-            f"messages in the chunk at byte {chunk.chunk_start_offset} are "
+            f"messages in the chunk at byte {chunk_index.chunk_start_offset} are "
             "outside the time range that it states",
         )
-    return block
+    return batch
 
 
-def _chunk_record(path: Path, raw: bytes, said: ChunkIndex) -> Chunk:
+def _parse_chunk_record(path: Path, raw: bytes, chunk_index: ChunkIndex) -> Chunk:
     """Parse the Chunk record at the start of some bytes and compare it with its Chunk Index."""
-    at = said.chunk_start_offset
-    if len(raw) < CHUNK.size or raw[0] != Opcode.CHUNK:
-        raise damaged(path, f"no chunk at byte {at}")
-    _, length, first, last, size, crc, name_bytes = CHUNK.unpack_from(raw)
-    begin = CHUNK.size + name_bytes + 8
-    compression = raw[CHUNK.size : begin - 8].decode()
+    at = chunk_index.chunk_start_offset
+    if len(raw) < CHUNK_STRUCT.size or raw[0] != Opcode.CHUNK:
+        raise corrupt_error(path, f"no chunk at byte {at}")
+    _, length, first, last, size, crc, name_bytes = CHUNK_STRUCT.unpack_from(raw)
+    begin = CHUNK_STRUCT.size + name_bytes + 8
+    compression = raw[CHUNK_STRUCT.size : begin - 8].decode()
     end = begin + int.from_bytes(raw[begin - 8 : begin], "little")
-    found = length + RECORD_HEADER, first, last, size, compression
-    listed = said.chunk_length, said.message_start_time, said.message_end_time
-    if found != (*listed, said.uncompressed_size, said.compression) or end > said.chunk_length:
-        raise damaged(path, f"the chunk at byte {at} differs from its index in the summary")
+    found = length + RECORD_HEADER_BYTES, first, last, size, compression
+    listed = chunk_index.chunk_length, chunk_index.message_start_time, chunk_index.message_end_time
+    if (
+        found != (*listed, chunk_index.uncompressed_size, chunk_index.compression)
+        or end > chunk_index.chunk_length
+    ):
+        raise corrupt_error(path, f"the chunk at byte {at} differs from its index in the summary")
     return Chunk(compression, raw[begin:end], last, first, crc, size)

@@ -11,21 +11,21 @@ from mcap.records import Chunk
 from dmrl.atomic_output import as_output_error
 from dmrl.errors import RecordingError
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.channel_registry import Defined
-from dmrl.recording.mcap.chunk import set_heads
-from dmrl.recording.mcap.chunk_builder import CHUNK_BYTES, OpenChunk
-from dmrl.recording.mcap.file_writer import Container, Packed
-from dmrl.recording.mcap.message_batch import Block, Bytes, Ints
-from dmrl.recording.mcap.message_index import MessageIndex, index_of
+from dmrl.recording.mcap.channel_registry import ChannelRegistry
+from dmrl.recording.mcap.chunk import write_message_prefixes
+from dmrl.recording.mcap.chunk_builder import CHUNK_BYTES, ChunkBuilder
+from dmrl.recording.mcap.file_writer import CompressedChunk, McapFileWriter
+from dmrl.recording.mcap.message_batch import Bytes, Ints, MessageBatch
+from dmrl.recording.mcap.message_index import MessageIndex, build_message_index
 
-OLDEST = 16
+OPEN_CHUNK_AGE_MAX = 16
 """Chunks of the other kind after which an open chunk is written.
 
 Numbers are rare beside images: few and large chunks of them are read faster.
 """
 
 
-class Assembly:
+class ChunkWriter:
     """Write the chunks of a recording.
 
     Parameters
@@ -38,13 +38,13 @@ class Assembly:
         A chunk is written, full or not, after this many later chunks of the other kind.
     """
 
-    def __init__(self, path: Path, file: Container, oldest: int = OLDEST) -> None:
-        self._path, self._file, self._oldest = path, file, oldest
-        self._defined = Defined()
-        self._numbers, self._pictures = OpenChunk(), OpenChunk()
+    def __init__(self, path: Path, file: McapFileWriter, age_max: int = OPEN_CHUNK_AGE_MAX) -> None:
+        self._path, self._file, self._age_max = path, file, age_max
+        self._registry = ChannelRegistry()
+        self._numbers, self._images = ChunkBuilder(), ChunkBuilder()
 
-    def add(
-        self, number: int, chunk: OpenChunk, time_ns: int, publish_ns: int, payload: bytes
+    def add_message(
+        self, channel_id: int, chunk: ChunkBuilder, time_ns: int, publish_ns: int, payload: bytes
     ) -> None:
         """Append one message of a channel that `define_channel` returned.
 
@@ -54,16 +54,18 @@ class Assembly:
             If a time is negative.
         """
         if time_ns < 0 or publish_ns < 0:
-            raise self._negative(time_ns, self._defined.topic(number))
-        chunk.add(number, time_ns, publish_ns, payload)
+            raise self._negative_time_error(time_ns, self._registry.get_topic(channel_id))
+        chunk.add_message(channel_id, time_ns, publish_ns, payload)
         if chunk.full:
-            self._close(chunk)
+            self._write_chunk(chunk)
 
-    def adopt(self, channels: Mapping[int, Channel], records: Mapping[int, McapChannel]) -> None:
+    def adopt_channels(
+        self, channels: Mapping[int, Channel], records: Mapping[int, McapChannel]
+    ) -> None:
         """Assign the channel ids of a recording that is copied; see `ChannelRegistry`."""
-        self._defined.adopt(channels, records)
+        self._registry.adopt_channels(channels, records)
 
-    def append(self, block: Block, channels: Mapping[int, Channel]) -> None:
+    def append_batch(self, batch: MessageBatch, channels: Mapping[int, Channel]) -> None:
         """Append a batch of messages, their payloads bit for bit.
 
         Parameters
@@ -78,34 +80,40 @@ class Assembly:
         RecordingError
             If a time is negative.
         """
-        present = block.numbers()
-        for pictured in (False, True):
-            own = [number for number in present if channels[number].pictured == pictured]
-            if own:
-                part = block if len(own) == len(present) else block.of(own)
-                self._append(part, {number: channels[number] for number in own})
+        present = batch.list_channel_ids()
+        for images in (False, True):
+            channel_ids = [
+                number for number in present if channels[number].carries_images == images
+            ]
+            if channel_ids:
+                part = (
+                    batch
+                    if len(channel_ids) == len(present)
+                    else batch.select_channels(channel_ids)
+                )
+                self._append_one_kind(part, {number: channels[number] for number in channel_ids})
 
-    def _append(self, block: Block, channels: Mapping[int, Channel]) -> None:
+    def _append_one_kind(self, batch: MessageBatch, channels: Mapping[int, Channel]) -> None:
         """Append messages that are all images, or all numbers."""
-        self._refuse_negative(block, channels)
+        self._require_nonnegative_times(batch, channels)
         numbers = np.zeros(max(channels) + 1, np.int64)
         for number, channel in channels.items():
-            numbers[number], chunk = self.begin(channel)
-        records, at = block.records()
-        set_heads(records, at, numbers[block.channel], block.time_ns, block.publish_ns)
-        self._fill(chunk, records, at)
+            numbers[number], chunk = self.define_channel(channel)
+        records, at = batch.copy_records()
+        write_message_prefixes(records, at, numbers[batch.channel], batch.time_ns, batch.publish_ns)
+        self._fill_chunks(chunk, records, at)
 
-    def _fill(self, chunk: OpenChunk, records: Bytes, at: Ints) -> None:
+    def _fill_chunks(self, chunk: ChunkBuilder, records: Bytes, at: Ints) -> None:
         """Add records to a chunk; write it and start another whenever it is full."""
         while len(at) > 1:
             at = at[chunk.fill(records, at) :]
             if chunk.full:
-                self._close(chunk)
+                self._write_chunk(chunk)
 
     def append_chunk(
         self,
         chunk: Chunk,
-        block: Block,
+        batch: MessageBatch,
         channels: Mapping[int, Channel],
         index: MessageIndex | None = None,
     ) -> bool:
@@ -135,24 +143,29 @@ class Assembly:
         """
         if chunk.uncompressed_size < CHUNK_BYTES // 4:
             return False
-        index = index_of(block) if index is None else index
-        pictured = {channels[number].pictured for number in index.counts}
-        if len(pictured) != 1 or not self._defined.begin_in(block, channels):
+        index = build_message_index(batch) if index is None else index
+        pictured = {channels[number].carries_images for number in index.counts}
+        if len(pictured) != 1 or not self._registry.can_copy_chunk(batch, channels):
             return False
-        self._refuse_negative(block, channels)
-        before = self._pictures if pictured.pop() else self._numbers
-        self._close(before)  # keeps the order of the messages
-        crc = chunk.uncompressed_crc or zlib.crc32(block.data.data)
+        self._require_nonnegative_times(batch, channels)
+        before = self._images if pictured.pop() else self._numbers
+        self._write_chunk(before)  # keeps the order of the messages
+        crc = chunk.uncompressed_crc or zlib.crc32(batch.data.data)
         size = chunk.uncompressed_size
-        self._put(Packed(chunk.compression, chunk.data, size, crc, *block.span, index), before)
+        self._write_compressed(
+            CompressedChunk(chunk.compression, chunk.data, size, crc, *batch.time_span_ns, index),
+            before,
+        )
         return True
 
-    def _refuse_negative(self, block: Block, channels: Mapping[int, Channel]) -> None:
-        earliest = np.minimum(block.time_ns, block.publish_ns)
+    def _require_nonnegative_times(
+        self, batch: MessageBatch, channels: Mapping[int, Channel]
+    ) -> None:
+        earliest = np.minimum(batch.time_ns, batch.publish_ns)
         if earliest.min() < 0:
             worst = int(np.argmin(earliest))
-            topic = channels[int(block.channel[worst])].topic
-            raise self._negative(int(block.time_ns[worst]), topic)
+            topic = channels[int(batch.channel[worst])].topic
+            raise self._negative_time_error(int(batch.time_ns[worst]), topic)
 
     def add_records(
         self, channel: Channel, records: Bytes, at: Ints, time_ns: Ints, publish_ns: Ints
@@ -176,16 +189,16 @@ class Assembly:
             If a time is negative.
         """
         if min(time_ns.min(), publish_ns.min()) < 0:
-            raise self._negative(int(time_ns.min()), channel.topic)
-        number, chunk = self.begin(channel)
+            raise self._negative_time_error(int(time_ns.min()), channel.topic)
+        number, chunk = self.define_channel(channel)
         numbers = np.full(len(time_ns), number)
-        set_heads(records, at, numbers, time_ns, publish_ns, fresh=True)
-        self._fill(chunk, records, at)
+        write_message_prefixes(records, at, numbers, time_ns, publish_ns, fresh=True)
+        self._fill_chunks(chunk, records, at)
 
     def flush(self) -> None:
         """Write the open chunks, so that they survive a kill of the process."""
-        for chunk in (self._numbers, self._pictures):
-            self._close(chunk)
+        for chunk in (self._numbers, self._images):
+            self._write_chunk(chunk)
 
     def finish(self) -> None:
         """Write the open chunks and the Summary section.
@@ -197,34 +210,34 @@ class Assembly:
         """
         self.flush()
         try:
-            self._file.finish(*self._defined.all_begun())
+            self._file.finish(*self._registry.list_written_definitions())
         except OSError as e:
             raise as_output_error(self._path, e) from e
 
-    def begin(self, channel: Channel) -> tuple[int, OpenChunk]:
+    def define_channel(self, channel: Channel) -> tuple[int, ChunkBuilder]:
         """Return a channel's id and its chunk; define the channel there if it is new."""
-        number = self._defined.number(channel)
-        chunk = self._pictures if channel.pictured else self._numbers
-        chunk.define(self._defined.begin(number))
+        number = self._registry.get_channel_id(channel)
+        chunk = self._images if channel.carries_images else self._numbers
+        chunk.add_definition(self._registry.definition_records(number))
         return number, chunk
 
-    def _close(self, chunk: OpenChunk) -> None:
+    def _write_chunk(self, chunk: ChunkBuilder) -> None:
         """Write a chunk, if it holds messages."""
         if chunk.starts:
-            self._put(chunk.packed(), chunk)
+            self._write_compressed(chunk.compress(), chunk)
 
-    def _put(self, packed: Packed, chunk: OpenChunk) -> None:
+    def _write_compressed(self, packed: CompressedChunk, chunk: ChunkBuilder) -> None:
         """Write a compressed chunk, then the open chunk of the other kind if that is old."""
         try:
             self._file.add_chunk(packed)
         except OSError as e:
             raise as_output_error(self._path, e) from e
-        other = self._pictures if chunk is self._numbers else self._numbers
+        other = self._images if chunk is self._numbers else self._numbers
         other.age += bool(other.starts)
-        if other.age >= self._oldest:
-            self._close(other)
+        if other.age >= self._age_max:
+            self._write_chunk(other)
 
-    def _negative(self, time_ns: int, topic: str) -> RecordingError:
+    def _negative_time_error(self, time_ns: int, topic: str) -> RecordingError:
         return RecordingError(
             f"{self._path}: time {time_ns} ns on {topic} is negative, which MCAP cannot hold. "
             "Shift the recording's times"

@@ -12,19 +12,19 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 from mcap.stream_reader import CRCValidationError
 
-from dmrl.atomic_output import outputs_done
+from dmrl.atomic_output import count_ended_outputs
 from dmrl.errors import RecordingError
 from dmrl.recording.mcap.shared_file import open_raw
-from dmrl.storage import Remote
-from dmrl.storage.remote_stream import LEAST_BYTES
+from dmrl.storage import RemotePath
+from dmrl.storage.remote_stream import BUFFER_BYTES
 
 MAGIC = b"\x89MCAP0\r\n"
-RECORD = struct.Struct("<BQ")  # opcode, length
+RECORD_STRUCT = struct.Struct("<BQ")  # opcode, length
 DEFINITIONS: dict[int, type[Schema] | type[Channel]] = {
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
 }
-DAMAGE = (
+CORRUPTION_ERRORS = (
     McapError,
     CRCValidationError,
     struct.error,
@@ -37,7 +37,7 @@ DAMAGE = (
 """Errors that the mcap package raises on corrupt lengths and strings."""
 
 
-class Bounded(io.BufferedReader):
+class BoundedReader(io.BufferedReader):
     """A file that raises on reads beyond its end, so that a corrupt length reserves no memory.
 
     Attributes
@@ -49,16 +49,16 @@ class Bounded(io.BufferedReader):
     """
 
     def __init__(self, path: Path) -> None:
-        self.ranged = path.ranged() if isinstance(path, Remote) else None
-        if self.ranged is None:
+        self.remote_stream = path.open_ranges() if isinstance(path, RemotePath) else None
+        if self.remote_stream is None:
             super().__init__(open_raw(path))
         else:
-            super().__init__(self.ranged, LEAST_BYTES)
-        self.status = os.fstat(self.fileno()) if self.ranged is None else path.stat()
+            super().__init__(self.remote_stream, BUFFER_BYTES)
+        self.status = os.fstat(self.fileno()) if self.remote_stream is None else path.stat()
         self.size = self.seek(0, io.SEEK_END)
         self.seek(0)
 
-    def expect(self, places: Sequence[tuple[int, int]]) -> None:
+    def expect_reads(self, places: Sequence[tuple[int, int]]) -> None:
         """Register the next reads, in order. A remote file then fetches many ranges at a time.
 
         Parameters
@@ -66,8 +66,8 @@ class Bounded(io.BufferedReader):
         places
             Start and size of each read, bytes.
         """
-        if self.ranged is not None:
-            self.ranged.expect(places)
+        if self.remote_stream is not None:
+            self.remote_stream.expect_reads(places)
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read exactly ``size`` bytes.
@@ -79,15 +79,19 @@ class Bounded(io.BufferedReader):
         """
         if size is not None and size > self.size - self.tell():
             raise McapError(f"a record at byte {self.tell()} runs beyond the end")
-        if self.ranged is not None and size and self.ranged.suits(self.tell(), size):
-            data = self.ranged.fetch(self.tell(), size)
+        if (
+            self.remote_stream is not None
+            and size
+            and self.remote_stream.should_fetch(self.tell(), size)
+        ):
+            data = self.remote_stream.fetch(self.tell(), size)
             self.seek(len(data), io.SEEK_CUR)
             return data
         return super().read(size)
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Bounded]:
+def open_mcap(path: Path) -> Iterator[BoundedReader]:
     """Open a file for reading, and check that it starts and ends as an MCAP file.
 
     Raises
@@ -100,23 +104,23 @@ def opened(path: Path) -> Iterator[Bounded]:
     if path.exists() and not path.is_file():  # opening a pipe waits for its other end
         raise RecordingError(f"{path} is not a regular file. Save it to one first")
     try:
-        with Bounded(path) as stream:
+        with BoundedReader(path) as stream:
             _refuse_changed(path, stream)
-            _check_ends(path, stream)
+            _check_magic(path, stream)
             yield stream
     except FileNotFoundError:
         raise RecordingError(f"no recording {path}. Check the name") from None
     except PermissionError:
         raise RecordingError(f"{path} cannot be read. Check its permissions") from None
-    except DAMAGE as e:
-        raise damaged(path, e) from e
+    except CORRUPTION_ERRORS as e:
+        raise corrupt_error(path, e) from e
 
 
-Stamp = tuple[int, int, int]
-_HASHED: dict[Path, tuple[int, Stamp]] = {}
+FileIdentity = tuple[int, int, int]
+_HASHED_INPUTS: dict[Path, tuple[int, FileIdentity]] = {}
 
 
-def _stamp(stream: Bounded) -> Stamp:
+def _identify_file(stream: BoundedReader) -> FileIdentity:
     status = stream.status
     return status.st_ino, status.st_size, status.st_mtime_ns
 
@@ -127,17 +131,17 @@ def expect_unchanged(path: Path) -> None:
     Called when its hash enters a provenance record, so that the data belong to that hash. Holds
     until this process has finished its next output.
     """
-    with Bounded(path) as stream:
-        _HASHED[path] = outputs_done(), _stamp(stream)
+    with BoundedReader(path) as stream:
+        _HASHED_INPUTS[path] = count_ended_outputs(), _identify_file(stream)
 
 
-def _refuse_changed(path: Path, stream: Bounded) -> None:
-    when, stamp = _HASHED.get(path, (-1, None))
-    if when == outputs_done() and stamp != _stamp(stream):
+def _refuse_changed(path: Path, stream: BoundedReader) -> None:
+    when, stamp = _HASHED_INPUTS.get(path, (-1, None))
+    if when == count_ended_outputs() and stamp != _identify_file(stream):
         raise RecordingError(f"{path} was changed while it was read. Run it again")
 
 
-def damaged(path: Path, cause: object) -> RecordingError:
+def corrupt_error(path: Path, cause: object) -> RecordingError:
     """Build the error for a file that starts as a recording but is corrupt."""
     return RecordingError(
         f"{path} is damaged ({cause or type(cause).__name__}). "
@@ -145,14 +149,14 @@ def damaged(path: Path, cause: object) -> RecordingError:
     )
 
 
-def too_large(path: Path, what: str) -> RecordingError:
+def over_budget_error(path: Path, what: str) -> RecordingError:
     """Build the error for a file that exceeds a limit of `dmrl.guards.limits`."""
     return RecordingError(
         f"{path}: {what}, over the limit. If you trust the file, rewrite it with smaller chunks"
     )
 
 
-def _check_ends(path: Path, stream: Bounded) -> None:
+def _check_magic(path: Path, stream: BoundedReader) -> None:
     start = stream.read(min(len(MAGIC), stream.size))
     if not start:
         raise RecordingError(f"{path} is empty. Make it again")

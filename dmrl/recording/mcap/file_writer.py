@@ -29,14 +29,14 @@ from mcap.records import (
 )
 
 from dmrl.recording.mcap import checksums
-from dmrl.recording.mcap.file import MAGIC, RECORD
+from dmrl.recording.mcap.file import MAGIC, RECORD_STRUCT
 from dmrl.recording.mcap.message_index import MessageIndex
 
-CHUNK = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of a name
-FOOTER = struct.Struct("<BQQQ")  # opcode, length, summary start, summary offset start
+CHUNK_STRUCT = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of a name
+FOOTER_STRUCT = struct.Struct("<BQQQ")  # opcode, length, summary start, summary offset start
 
 
-def laid_out(*records: McapRecord) -> bytes:
+def serialize(*records: McapRecord) -> bytes:
     """Serialize records to bytes."""
     builder = RecordBuilder()
     for record in records:
@@ -45,7 +45,7 @@ def laid_out(*records: McapRecord) -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class Packed:
+class CompressedChunk:
     """A compressed chunk and its message indexes.
 
     Parameters
@@ -62,14 +62,14 @@ class Packed:
 
     compression: str
     data: bytes
-    size: int
+    uncompressed_size: int
     crc: int
     first_ns: int
     last_ns: int
     index: MessageIndex
 
 
-class Container:
+class McapFileWriter:
     """An MCAP file that is being written.
 
     Every finished part is passed to the system at once, so that it survives a kill of the process.
@@ -85,19 +85,19 @@ class Container:
     def __init__(self, path: Path, library: str) -> None:
         self._stream = io.FileIO(path, "wb")
         self._at = self._crc = 0
-        self._sums = checksums.Sums()
-        self._said = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
+        self._checksums = checksums.Checksums()
+        self._statistics = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
         self._counts: Counter[int] = Counter()
         self._chunks: list[ChunkIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._attachments: list[AttachmentIndex] = []
         try:
-            self._put(MAGIC + laid_out(Header("dmrl", library)))
+            self._append(MAGIC + serialize(Header("dmrl", library)))
         except OSError:
             self.close()
             raise
 
-    def _put(self, data: bytes) -> int:
+    def _append(self, data: bytes) -> int:
         """Append bytes to the file and return the offset they start at."""
         at = self._at
         left = memoryview(data)
@@ -109,79 +109,85 @@ class Container:
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
         """Append a Metadata record."""
-        record = laid_out(Metadata(name, values))
-        self._sums.add_metadata(record)
-        self._metadata.append(MetadataIndex(self._put(record), len(record), name))
+        record = serialize(Metadata(name, values))
+        self._checksums.add_metadata(record)
+        self._metadata.append(MetadataIndex(self._append(record), len(record), name))
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Append an Attachment record."""
-        record = laid_out(Attachment(0, 0, name, media_type, data))
-        at = self._put(record)
+        record = serialize(Attachment(0, 0, name, media_type, data))
+        at = self._append(record)
         self._attachments.append(
             AttachmentIndex(at, len(record), 0, 0, len(data), name, media_type)
         )
 
-    def add_chunk(self, chunk: Packed) -> None:
+    def add_chunk(self, chunk: CompressedChunk) -> None:
         """Append a chunk and its message indexes."""
         first, last, index = chunk.first_ns, chunk.last_ns, chunk.index
         name = chunk.compression.encode()
-        length = CHUNK.size - RECORD.size + len(name) + 8 + len(chunk.data)
-        head = CHUNK.pack(Opcode.CHUNK, length, first, last, chunk.size, chunk.crc, len(name))
+        length = CHUNK_STRUCT.size - RECORD_STRUCT.size + len(name) + 8 + len(chunk.data)
+        head = CHUNK_STRUCT.pack(
+            Opcode.CHUNK, length, first, last, chunk.uncompressed_size, chunk.crc, len(name)
+        )
         head += name + struct.pack("<Q", len(chunk.data))
-        after = self._at + RECORD.size + length
-        self._sums.add_indexes(index.records)
+        after = self._at + RECORD_STRUCT.size + length
+        self._checksums.add_message_indexes(index.records)
         self._chunks.append(
             ChunkIndex(
-                chunk_length=RECORD.size + length,
-                chunk_start_offset=self._put(b"".join((head, chunk.data, index.records))),
+                chunk_length=RECORD_STRUCT.size + length,
+                chunk_start_offset=self._append(b"".join((head, chunk.data, index.records))),
                 compression=chunk.compression,
                 compressed_size=len(chunk.data),
                 message_end_time=last,
                 message_index_length=len(index.records),
-                message_index_offsets={n: after + at for n, at in index.places.items()},
+                message_index_offsets={n: after + at for n, at in index.offsets.items()},
                 message_start_time=first,
-                uncompressed_size=chunk.size,
+                uncompressed_size=chunk.uncompressed_size,
             )
         )
-        said = self._said
-        earlier = said.message_count > 0
-        said.message_start_time = min(said.message_start_time, first) if earlier else first
-        said.message_end_time = max(said.message_end_time, last)
-        said.message_count += sum(index.counts.values())
+        statistics = self._statistics
+        earlier = statistics.message_count > 0
+        statistics.message_start_time = (
+            min(statistics.message_start_time, first) if earlier else first
+        )
+        statistics.message_end_time = max(statistics.message_end_time, last)
+        statistics.message_count += sum(index.counts.values())
         self._counts.update(index.counts)
 
     def finish(self, schemas: Sequence[bytes], channels: Sequence[bytes]) -> None:
         """Write the checksums and the Summary section, which repeats these definitions."""
-        self.add_metadata(checksums.METADATA_NAME, self._sums.to_metadata(self._at))
-        self._put(laid_out(DataEnd(self._crc)))
-        said = self._said
-        said.schema_count, said.channel_count = len(schemas), len(channels)
-        said.chunk_count, said.metadata_count = len(self._chunks), len(self._metadata)
-        said.attachment_count = len(self._attachments)
-        said.channel_message_counts = dict(sorted(self._counts.items()))
+        self.add_metadata(checksums.METADATA_NAME, self._checksums.to_metadata(self._at))
+        self._append(serialize(DataEnd(self._crc)))
+        statistics = self._statistics
+        statistics.schema_count, statistics.channel_count = len(schemas), len(channels)
+        statistics.chunk_count, statistics.metadata_count = len(self._chunks), len(self._metadata)
+        statistics.attachment_count = len(self._attachments)
+        statistics.channel_message_counts = dict(sorted(self._counts.items()))
         start, body, offsets = self._at, b"", b""
-        chunks = b"".join(_chunk_index(chunk) for chunk in self._chunks)
-        before = b"".join(schemas), b"".join(channels), laid_out(said)
-        for records in (*before, chunks, laid_out(*self._attachments), laid_out(*self._metadata)):
+        chunks = b"".join(_serialize_chunk_index(chunk) for chunk in self._chunks)
+        before = b"".join(schemas), b"".join(channels), serialize(statistics)
+        for records in (*before, chunks, serialize(*self._attachments), serialize(*self._metadata)):
             if records:
                 at = start + len(body)
-                offsets += laid_out(SummaryOffset(records[0], at, len(records)))
+                offsets += serialize(SummaryOffset(records[0], at, len(records)))
             body += records
-        self._end(start, body, offsets)
+        self._write_summary(start, body, offsets)
 
-    def _end(self, start: int, body: bytes, offsets: bytes) -> None:
+    def _write_summary(self, start: int, body: bytes, offsets: bytes) -> None:
         """Write the Summary section, the Footer and the magic bytes."""
         places = start, start + len(body)
-        footer = FOOTER.pack(Opcode.FOOTER, FOOTER.size - RECORD.size + 4, *places)
+        footer = FOOTER_STRUCT.pack(
+            Opcode.FOOTER, FOOTER_STRUCT.size - RECORD_STRUCT.size + 4, *places
+        )
         crc = zlib.crc32(body + offsets + footer)
-        self._put(body + offsets + laid_out(Footer(*places, crc)) + MAGIC)
+        self._append(body + offsets + serialize(Footer(*places, crc)) + MAGIC)
 
     def close(self) -> None:
         """Close the file, complete or not."""
         self._stream.close()
 
 
-def _chunk_index(chunk: ChunkIndex) -> bytes:
+def _serialize_chunk_index(chunk: ChunkIndex) -> bytes:
     """Serialize a Chunk Index record.
 
     With hundreds of topics the mcap package takes longer for it than for the chunk.
@@ -199,4 +205,4 @@ def _chunk_index(chunk: ChunkIndex) -> bytes:
     )
     body += places + struct.pack("<QI", chunk.message_index_length, len(name)) + name
     body += struct.pack("<QQ", chunk.compressed_size, chunk.uncompressed_size)
-    return RECORD.pack(Opcode.CHUNK_INDEX, len(body)) + body
+    return RECORD_STRUCT.pack(Opcode.CHUNK_INDEX, len(body)) + body

@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 
-HEAD_BYTES = 31
+MESSAGE_PREFIX_BYTES = 31
 """Size of a Message record up to its payload.
 
 Contains opcode, length, channel id, sequence, log time and publish time.
 """
-ROWS = 10_000
+ROWS_AT_A_TIME = 10_000
 """Messages that are converted to Python objects at a time."""
-EVER_NS = int(np.iinfo(np.int64).max)
+MAX_TIME_NS = int(np.iinfo(np.int64).max)
 """End of the range of log times, nanoseconds. Serves as an open upper limit."""
 
 
-def taken(data: Bytes | bytes, dtype: np.dtype[Any] | str, at: Ints) -> NDArray[Any]:
+def gather(data: Bytes | bytes, dtype: np.dtype[Any] | str, at: Ints) -> NDArray[Any]:
     """Gather values of a type from byte offsets, aligned or not.
 
     Parameters
@@ -34,26 +34,26 @@ def taken(data: Bytes | bytes, dtype: np.dtype[Any] | str, at: Ints) -> NDArray[
         (N,) offset of each value, at least its size before the end.
     """
     kind = np.dtype(dtype)
-    return _every(data, kind)[at].view(kind)
+    return _view_every_byte(data, kind)[at].view(kind)
 
 
-def put_at(data: Bytes, at: Ints, values: NDArray[Any]) -> None:
+def scatter(data: Bytes, at: Ints, values: NDArray[Any]) -> None:
     """Write (N,) values to the byte offsets from which `gather` reads them."""
-    _every(data, values.dtype)[at] = values.view(_plain(values.dtype))
+    _view_every_byte(data, values.dtype)[at] = values.view(_to_void_dtype(values.dtype))
 
 
-def _every(data: Bytes | bytes, kind: np.dtype[Any]) -> NDArray[Any]:
+def _view_every_byte(data: Bytes | bytes, kind: np.dtype[Any]) -> NDArray[Any]:
     """Return the data as overlapping values, one starting at every byte."""
-    return np.ndarray((max(len(data) - kind.itemsize + 1, 0),), _plain(kind), data, 0, (1,))
+    return np.ndarray((max(len(data) - kind.itemsize + 1, 0),), _to_void_dtype(kind), data, 0, (1,))
 
 
-def _plain(kind: np.dtype[Any]) -> np.dtype[Any]:
+def _to_void_dtype(kind: np.dtype[Any]) -> np.dtype[Any]:
     """Return a void type of the same size. NumPy would copy a structured type field by field."""
     return np.dtype(f"V{kind.itemsize}")
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class MessageBatch:
     """Messages whose records are in one byte array.
 
     Parameters
@@ -76,9 +76,9 @@ class Block:
     def __len__(self) -> int:
         return len(self.start)
 
-    def take(self, rows: Ints | NDArray[np.bool_]) -> "Block":
+    def take(self, rows: Ints | NDArray[np.bool_]) -> "MessageBatch":
         """Return a batch of these rows over the same bytes."""
-        return Block(
+        return MessageBatch(
             self.data,
             self.channel[rows],
             self.time_ns[rows],
@@ -88,51 +88,58 @@ class Block:
         )
 
     @property
-    def span(self) -> tuple[int, int]:
+    def time_span_ns(self) -> tuple[int, int]:
         """First and last log time of a batch that is not empty, nanoseconds."""
         return int(self.time_ns.min()), int(self.time_ns.max())
 
     @property
-    def possible(self) -> NDArray[np.bool_]:
+    def has_valid_times(self) -> NDArray[np.bool_]:
         """(N,) whether the times fit signed 64 bits, and log times are below `MAX_TIME_NS`."""
-        return np.asarray((self.time_ns >= 0) & (self.publish_ns >= 0) & (self.time_ns < EVER_NS))
+        return np.asarray(
+            (self.time_ns >= 0) & (self.publish_ns >= 0) & (self.time_ns < MAX_TIME_NS)
+        )
 
-    def numbers(self) -> list[int]:
+    def list_channel_ids(self) -> list[int]:
         """Return the ids of the channels that have messages in this batch."""
         found: list[int] = np.flatnonzero(np.bincount(self.channel)).tolist()
         return found
 
-    def of(self, channels: Collection[int]) -> "Block":
+    def select_channels(self, channels: Collection[int]) -> "MessageBatch":
         """Return a batch of some channels over the same bytes."""
-        return self.take(self.among(channels))
+        return self.take(self.mask_channels(channels))
 
-    def among(self, channels: Collection[int]) -> NDArray[np.bool_]:
+    def mask_channels(self, channels: Collection[int]) -> NDArray[np.bool_]:
         """Return an (N,) mask of the messages of some channels."""
         chosen = np.zeros(max(max(channels, default=0), int(self.channel.max(initial=0))) + 1, bool)
         chosen[list(channels)] = True
         return np.asarray(chosen[self.channel])
 
-    def rows(self) -> Iterator[tuple[int, int, int, bytes]]:
+    def iter_rows(self) -> Iterator[tuple[int, int, int, bytes]]:
         """Yield channel id, log time, publish time and payload of every message."""
         view = self.data.data
-        for first in range(0, len(self), ROWS):
-            part = slice(first, first + ROWS)
+        for first in range(0, len(self), ROWS_AT_A_TIME):
+            part = slice(first, first + ROWS_AT_A_TIME)
             columns = (self.channel, self.time_ns, self.publish_ns, self.start, self.end)
             for number, time_ns, publish_ns, start, end in zip(
                 *(column[part].tolist() for column in columns), strict=True
             ):
                 yield number, time_ns, publish_ns, bytes(view[start:end])
 
-    def compact(self) -> "Block":
+    def compact(self) -> "MessageBatch":
         """Copy the batch without bytes between its records."""
-        records, at = self.records()
-        return Block(
-            records, self.channel, self.time_ns, self.publish_ns, at[:-1] + HEAD_BYTES, at[1:]
+        records, at = self.copy_records()
+        return MessageBatch(
+            records,
+            self.channel,
+            self.time_ns,
+            self.publish_ns,
+            at[:-1] + MESSAGE_PREFIX_BYTES,
+            at[1:],
         )
 
-    def records(self) -> tuple[Bytes, Ints]:
+    def copy_records(self) -> tuple[Bytes, Ints]:
         """Copy the records into one array; return it and the (N + 1,) offsets of their bounds."""
-        first = self.start - HEAD_BYTES
+        first = self.start - MESSAGE_PREFIX_BYTES
         at = np.concatenate([[0], np.cumsum(self.end - first)])
         # Adjacent records are copied together.
         breaks = np.flatnonzero(first[1:] != self.end[:-1]) + 1
@@ -142,7 +149,7 @@ class Block:
         view = self.data.data
         return np.frombuffer(bytearray().join(view[a:b] for a, b in runs), np.uint8), at
 
-    def sorted(self, last: Collection[int] = ()) -> "Block":
+    def sort_by_time(self, last: Collection[int] = ()) -> "MessageBatch":
         """Return the batch sorted by log time.
 
         The sort is stable, but at equal times messages of the channels ``last`` come last.
@@ -152,15 +159,15 @@ class Block:
             return self
         if not last:
             return self.take(np.argsort(self.time_ns, kind="stable"))
-        return self.take(np.lexsort((self.among(last), self.time_ns)))
+        return self.take(np.lexsort((self.mask_channels(last), self.time_ns)))
 
 
-def concatenate(first: Block | None, second: Block) -> Block:
+def concatenate(first: MessageBatch | None, second: MessageBatch) -> MessageBatch:
     """Join two batches over one byte array, keeping all bytes."""
     if first is None or not len(first):
         return second
     shift = len(first.data)
-    return Block(
+    return MessageBatch(
         np.concatenate([first.data, second.data]),
         np.concatenate([first.channel, second.channel]),
         np.concatenate([first.time_ns, second.time_ns]),
@@ -170,11 +177,11 @@ def concatenate(first: Block | None, second: Block) -> Block:
     )
 
 
-def joined(blocks: Sequence[Block]) -> Block:
+def concatenate_all(batches: Sequence[MessageBatch]) -> MessageBatch:
     """Join batches over one byte array; leave out unused bytes where they are the larger part."""
-    parts = [b.compact() if 2 * int((b.end - b.start).sum()) < len(b.data) else b for b in blocks]
+    parts = [b.compact() if 2 * int((b.end - b.start).sum()) < len(b.data) else b for b in batches]
     shift = np.cumsum([0, *(len(part.data) for part in parts)])
-    return Block(
+    return MessageBatch(
         np.concatenate([part.data for part in parts]),
         np.concatenate([part.channel for part in parts]),
         np.concatenate([part.time_ns for part in parts]),
@@ -184,5 +191,5 @@ def joined(blocks: Sequence[Block]) -> Block:
     )
 
 
-_NONE: Ints = np.empty(0, np.int64)
-EMPTY = Block(np.empty(0, np.uint8), _NONE, _NONE, _NONE, _NONE, _NONE)
+_NO_INTS: Ints = np.empty(0, np.int64)
+EMPTY_BATCH = MessageBatch(np.empty(0, np.uint8), _NO_INTS, _NO_INTS, _NO_INTS, _NO_INTS, _NO_INTS)

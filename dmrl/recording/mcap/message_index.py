@@ -9,13 +9,20 @@ from typing import NamedTuple
 import numpy as np
 from mcap.opcode import Opcode
 
-from dmrl.recording.mcap.file import damaged
-from dmrl.recording.mcap.message_batch import HEAD_BYTES, Block, Bytes, Ints, put_at, taken
+from dmrl.recording.mcap.file import corrupt_error
+from dmrl.recording.mcap.message_batch import (
+    MESSAGE_PREFIX_BYTES,
+    Bytes,
+    Ints,
+    MessageBatch,
+    gather,
+    scatter,
+)
 
-INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
+MESSAGE_INDEX_STRUCT = struct.Struct("<BQHI")  # opcode, length, channel, bytes of entries
 ENTRY_BYTES = 16  # log time, offset
-_HEAD = np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("size", "<u4")])
-_ENTRY = np.dtype([("time", "<i8"), ("at", "<i8")])
+_HEADER_DTYPE = np.dtype([("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("size", "<u4")])
+_ENTRY_DTYPE = np.dtype([("time", "<i8"), ("at", "<i8")])
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,47 +42,49 @@ class MessageIndex:
     """
 
     records: bytes
-    places: dict[int, int]
+    offsets: dict[int, int]
     counts: dict[int, int]
 
 
-def index_of(block: Block) -> MessageIndex:
+def build_message_index(batch: MessageBatch) -> MessageIndex:
     """Build the message indexes of a chunk that holds these messages."""
-    counts = np.bincount(block.channel)
+    counts = np.bincount(batch.channel)
     numbers = np.flatnonzero(counts)
     counts = counts[numbers]
-    ends = INDEX.size * np.arange(1, len(numbers) + 1) + ENTRY_BYTES * np.cumsum(counts)
-    starts = ends - ENTRY_BYTES * counts - INDEX.size
+    ends = MESSAGE_INDEX_STRUCT.size * np.arange(1, len(numbers) + 1) + ENTRY_BYTES * np.cumsum(
+        counts
+    )
+    starts = ends - ENTRY_BYTES * counts - MESSAGE_INDEX_STRUCT.size
     records: Bytes = np.empty(int(ends[-1]), np.uint8)
-    heads = np.empty(len(numbers), _HEAD)
+    heads = np.empty(len(numbers), _HEADER_DTYPE)
     heads["opcode"], heads["channel"] = Opcode.MESSAGE_INDEX, numbers
     heads["size"] = ENTRY_BYTES * counts
     heads["length"] = heads["size"] + 6
-    put_at(records, starts, heads)
+    scatter(records, starts, heads)
     # NumPy uses a radix sort for 16-bit integers.
-    order = np.argsort(block.channel.astype(np.uint16), kind="stable")
-    entries = np.empty(len(block), _ENTRY)
-    entries["time"] = block.time_ns[order]
-    entries["at"] = block.start[order] - HEAD_BYTES
-    put_at(records, _places_of_entries(starts, counts), entries)
+    order = np.argsort(batch.channel.astype(np.uint16), kind="stable")
+    entries = np.empty(len(batch), _ENTRY_DTYPE)
+    entries["time"] = batch.time_ns[order]
+    entries["at"] = batch.start[order] - MESSAGE_PREFIX_BYTES
+    scatter(records, _compute_entry_offsets(starts, counts), entries)
     places = zip(numbers.tolist(), starts.tolist(), strict=True)
     found = zip(numbers.tolist(), counts.tolist(), strict=True)
     return MessageIndex(records.tobytes(), dict(places), dict(found))
 
 
-def indexes_size(counts: Mapping[int, int]) -> int:
+def compute_indexes_size(counts: Mapping[int, int]) -> int:
     """Return the total size of message indexes from the message counts by channel, bytes."""
-    return INDEX.size * len(counts) + ENTRY_BYTES * sum(counts.values())
+    return MESSAGE_INDEX_STRUCT.size * len(counts) + ENTRY_BYTES * sum(counts.values())
 
 
-def _places_of_entries(starts: Ints, counts: Ints) -> Ints:
+def _compute_entry_offsets(starts: Ints, counts: Ints) -> Ints:
     """Return the offset of every entry of records with these offsets and entry counts."""
-    first = starts + INDEX.size - ENTRY_BYTES * (np.cumsum(counts) - counts)
+    first = starts + MESSAGE_INDEX_STRUCT.size - ENTRY_BYTES * (np.cumsum(counts) - counts)
     found: Ints = np.repeat(first, counts) + ENTRY_BYTES * np.arange(counts.sum())
     return found
 
 
-class Entries(NamedTuple):
+class IndexEntries(NamedTuple):
     """Entries of the message indexes of a chunk, channel by channel.
 
     Parameters
@@ -88,11 +97,11 @@ class Entries(NamedTuple):
 
     channel: Ints
     time_ns: Ints
-    at: Ints
+    offset: Ints
     counts: Ints
 
 
-def index_entries(path: Path, raw: bytes, places: Mapping[int, int]) -> Entries:
+def parse_index_entries(path: Path, raw: bytes, offsets: Mapping[int, int]) -> IndexEntries:
     """Parse the message indexes of some channels.
 
     Parameters
@@ -109,18 +118,18 @@ def index_entries(path: Path, raw: bytes, places: Mapping[int, int]) -> Entries:
     RecordingError
         If a record is truncated, or is not the Message Index of its channel.
     """
-    numbers = np.fromiter(places.keys(), np.int64, len(places))
-    at = np.fromiter(places.values(), np.int64, len(places))
-    if len(at) and not 0 <= at.min() <= at.max() <= len(raw) - INDEX.size:
-        raise damaged(path, "a message index is cut")
-    heads = taken(raw, _HEAD, at)
+    numbers = np.fromiter(offsets.keys(), np.int64, len(offsets))
+    at = np.fromiter(offsets.values(), np.int64, len(offsets))
+    if len(at) and not 0 <= at.min() <= at.max() <= len(raw) - MESSAGE_INDEX_STRUCT.size:
+        raise corrupt_error(path, "a message index is cut")
+    heads = gather(raw, _HEADER_DTYPE, at)
     size = heads["size"].astype(np.int64)
     right = (heads["opcode"] == Opcode.MESSAGE_INDEX) & (heads["channel"] == numbers)
     right &= (heads["length"] == size + 6) & (size % ENTRY_BYTES == 0)
     if not right.all():
-        raise damaged(path, f"message index of channel {numbers[~right][0]} is wrong")
-    if (at + INDEX.size + size > len(raw)).any():
-        raise damaged(path, "a message index is cut")
+        raise corrupt_error(path, f"message index of channel {numbers[~right][0]} is wrong")
+    if (at + MESSAGE_INDEX_STRUCT.size + size > len(raw)).any():
+        raise corrupt_error(path, "a message index is cut")
     counts = size // ENTRY_BYTES
-    entries = taken(raw, _ENTRY, _places_of_entries(at, counts))
-    return Entries(np.repeat(numbers, counts), entries["time"], entries["at"], counts)
+    entries = gather(raw, _ENTRY_DTYPE, _compute_entry_offsets(at, counts))
+    return IndexEntries(np.repeat(numbers, counts), entries["time"], entries["at"], counts)

@@ -12,13 +12,18 @@ from mcap.stream_reader import StreamReader
 
 from dmrl.guards import limits
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk import loose, of_channels, scanned, unpacked
-from dmrl.recording.mcap.file import Bounded, too_large
-from dmrl.recording.mcap.message_batch import Block
+from dmrl.recording.mcap.chunk import (
+    batch_from_messages,
+    decompress,
+    parse_records,
+    select_channels,
+)
+from dmrl.recording.mcap.file import BoundedReader, over_budget_error
+from dmrl.recording.mcap.message_batch import MessageBatch
 
 
 @dataclass(slots=True)
-class Walked:
+class ScannedFile:
     """The content of a recording.
 
     Parameters
@@ -32,20 +37,20 @@ class Walked:
     """
 
     channels: dict[int, Channel] = field(default_factory=dict)
-    blocks: list[Block] = field(default_factory=list)
+    batches: list[MessageBatch] = field(default_factory=list)
     metadata: dict[str, list[dict[str, str]]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
 
-    def counts(self) -> Counter[int]:
+    def count_messages(self) -> Counter[int]:
         """Count the messages of every channel id."""
         found: Counter[int] = Counter()
-        for block in self.blocks:
-            for number, count in zip(*np.unique(block.channel, return_counts=True), strict=True):
+        for batch in self.batches:
+            for number, count in zip(*np.unique(batch.channel, return_counts=True), strict=True):
                 found[int(number)] += int(count)
         return found
 
 
-def walked(path: Path, stream: Bounded) -> Walked:
+def scan_file(path: Path, stream: BoundedReader) -> ScannedFile:
     """Read everything in a complete recording, with or without an index.
 
     Raises
@@ -54,53 +59,59 @@ def walked(path: Path, stream: Bounded) -> Walked:
         If it is corrupt, or decompresses to more than the limit for its size.
     """
     stream.seek(0)
-    walk, schemas, messages, size = Walked(), dict[int, Schema](), list[Message](), 0
+    content, schemas, messages, size = ScannedFile(), dict[int, Schema](), list[Message](), 0
     records = StreamReader(
         stream, emit_chunks=True, validate_crcs=True, record_size_limit=stream.size
     ).records
     for record in records:
         if isinstance(record, Chunk):
             size += record.uncompressed_size
-            if size > limits.unpacked_bytes(stream.size):
-                raise too_large(path, f"it unpacks to more than {size / 1e6:.0f} MB")
-            scan = scanned(unpacked(path, record, stream.tell()))
-            for definition in scan.definitions():
-                _define(walk, schemas, definition)
-            walk.blocks.append(of_channels(scan.block, walk.channels, walk.channels))
+            if size > limits.max_unpacked_bytes(stream.size):
+                raise over_budget_error(path, f"it unpacks to more than {size / 1e6:.0f} MB")
+            scan = parse_records(decompress(path, record, stream.tell()))
+            for definition in scan.iter_definitions():
+                _register_definition(content, schemas, definition)
+            content.batches.append(select_channels(scan.batch, content.channels, content.channels))
         elif isinstance(record, Message):
             messages.append(record)
         elif isinstance(record, Statistics):
-            _compare(record, walk, messages)
+            _check_message_count(record, content, messages)
         else:
-            _define(walk, schemas, record)
+            _register_definition(content, schemas, record)
     if messages:
-        walk.blocks.append(of_channels(loose(messages), walk.channels, walk.channels))
-    return walk
+        content.batches.append(
+            select_channels(batch_from_messages(messages), content.channels, content.channels)
+        )
+    return content
 
 
-def _define(walk: Walked, schemas: dict[int, Schema], record: McapRecord) -> None:
+def _register_definition(
+    scanned: ScannedFile, schemas: dict[int, Schema], record: McapRecord
+) -> None:
     match record:
         case Schema():
             if schemas.setdefault(record.id, record) != record:
                 raise McapError(f"schema {record.id} is defined twice, as two kinds")
         case McapChannel():
-            channel = channel_of(record.id, {record.id: record}, schemas)
-            if walk.channels.setdefault(record.id, channel) != channel:
+            channel = build_channel(record.id, {record.id: record}, schemas)
+            if scanned.channels.setdefault(record.id, channel) != channel:
                 raise McapError(f"channel {record.id} is defined twice, as two topics")
         case Metadata():
-            walk.metadata.setdefault(record.name, []).append(dict(record.metadata))
+            scanned.metadata.setdefault(record.name, []).append(dict(record.metadata))
         case Attachment():
-            walk.attachments[record.name] = record.data
+            scanned.attachments[record.name] = record.data
 
 
-def _compare(said: Statistics, walk: Walked, messages: list[Message]) -> None:
-    found = walk.counts() + Counter(message.channel_id for message in messages)
-    if said.message_count != found.total():
-        raise McapError(f"{found.total()} of {said.message_count} messages are there")
+def _check_message_count(
+    statistics: Statistics, scanned: ScannedFile, messages: list[Message]
+) -> None:
+    found = scanned.count_messages() + Counter(message.channel_id for message in messages)
+    if statistics.message_count != found.total():
+        raise McapError(f"{found.total()} of {statistics.message_count} messages are there")
 
 
-def channel_of(
-    number: int, channels: dict[int, McapChannel], schemas: dict[int, Schema]
+def build_channel(
+    channel_id: int, channels: dict[int, McapChannel], schemas: dict[int, Schema]
 ) -> Channel:
     """Build the channel of a channel id from its Channel and Schema records.
 
@@ -109,7 +120,7 @@ def channel_of(
     McapError
         If the channel's schema is not among them.
     """
-    channel = channels[number]
+    channel = channels[channel_id]
     schema = schemas.get(channel.schema_id)
     if schema is None and channel.schema_id != 0:
         raise McapError(f"no schema for {channel.topic}")

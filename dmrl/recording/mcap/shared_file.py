@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from dmrl.storage import Remote
+from dmrl.storage import RemotePath
 
 _SHARED: dict[Path, int] = {}
 """Descriptors of the recordings that `share_file` holds open in this process."""
@@ -23,7 +23,7 @@ def share_file(path: Path) -> Iterator[None]:
     path
         The recording.
     """
-    if path in _SHARED or isinstance(path, Remote) or not path.is_file():
+    if path in _SHARED or isinstance(path, RemotePath) or not path.is_file():
         yield
         return
     try:

@@ -27,13 +27,20 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary as McapSummary
 
 from dmrl.guards import limits
-from dmrl.recording.mcap.file import DEFINITIONS, MAGIC, RECORD, Bounded, damaged, too_large
-from dmrl.recording.mcap.message_batch import EVER_NS
+from dmrl.recording.mcap.file import (
+    DEFINITIONS,
+    MAGIC,
+    RECORD_STRUCT,
+    BoundedReader,
+    corrupt_error,
+    over_budget_error,
+)
+from dmrl.recording.mcap.message_batch import MAX_TIME_NS
 
-FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, summary offset start, CRC
+FOOTER_STRUCT = struct.Struct("<BQQQI")  # opcode, length, summary start, summary offset start, CRC
 
 
-class Section(McapSummary):
+class SummarySection(McapSummary):
     """The Summary section of a recording.
 
     Attributes
@@ -43,24 +50,24 @@ class Section(McapSummary):
         compared with the section.
     """
 
-    proven: bool = False
-    _firsts: frozenset[int] | None = None
+    has_crc: bool = False
+    _first_chunks: frozenset[int] | None = None
 
-    def must_confirm(self, chunk: ChunkIndex) -> bool:
+    def needs_definition_check(self, chunk: ChunkIndex) -> bool:
         """Return whether the definitions in a chunk must be compared with this section.
 
         Without a CRC this applies to every chunk. With one, the first chunk of each channel is
         enough: it detects a file with two different definitions and valid CRCs, in which other
         readers would find other topics.
         """
-        if self._firsts is None:
+        if self._first_chunks is None:
             firsts: dict[int, int] = {}
             for one in sorted(self.chunk_indexes, key=lambda one: -one.chunk_start_offset):
                 firsts |= dict.fromkeys(one.message_index_offsets, one.chunk_start_offset)
-            self._firsts = frozenset(firsts.values())
-        return not self.proven or chunk.chunk_start_offset in self._firsts
+            self._first_chunks = frozenset(firsts.values())
+        return not self.has_crc or chunk.chunk_start_offset in self._first_chunks
 
-    def confirm(self, path: Path, definitions: Iterable[Schema | Channel]) -> None:
+    def check_definitions(self, path: Path, definitions: Iterable[Schema | Channel]) -> None:
         """Raise RecordingError unless schemas and channels equal those of this section.
 
         Raises
@@ -69,13 +76,13 @@ class Section(McapSummary):
             If a definition differs.
         """
         for one in definitions:
-            known = self.schemas if isinstance(one, Schema) else self.channels
-            if known.get(one.id, one) != one:
+            expected = self.schemas if isinstance(one, Schema) else self.channels
+            if expected.get(one.id, one) != one:
                 name = one.name if isinstance(one, Schema) else one.topic
-                raise damaged(path, f"the definition of {name} contradicts the summary")
+                raise corrupt_error(path, f"the definition of {name} contradicts the summary")
 
 
-def section(path: Path, stream: Bounded) -> Section | None:
+def read_verified_section(path: Path, stream: BoundedReader) -> SummarySection | None:
     """Read and verify the Summary section; return None if it does not index the messages.
 
     Parameters
@@ -90,18 +97,20 @@ def section(path: Path, stream: Bounded) -> Section | None:
     RecordingError
         If the section fails its CRC, contradicts itself or the file, or exceeds a limit.
     """
-    found, start = stated(path, stream)
-    if found is None or not _usable(found):
+    summary_section, start = read_raw_section(path, stream)
+    if summary_section is None or not _indexes_messages(summary_section):
         return None
-    _within_budget(path, stream, found)
-    _counted(path, found)
-    _before_the_end_of_time(path, found)
-    if not _placed(path, stream, found, start):
+    _check_budget(path, stream, summary_section)
+    _check_statistics(path, summary_section)
+    _check_times(path, summary_section)
+    if not _lists_all_messages(path, stream, summary_section, start):
         return None
-    return found
+    return summary_section
 
 
-def stated(path: Path, stream: Bounded, start: int | None = None) -> tuple[Section | None, int]:
+def read_raw_section(
+    path: Path, stream: BoundedReader, start: int | None = None
+) -> tuple[SummarySection | None, int]:
     """Read the Summary section and check only its CRC; return it and its offset.
 
     Parameters
@@ -116,108 +125,117 @@ def stated(path: Path, stream: Bounded, start: int | None = None) -> tuple[Secti
     RecordingError
         If there is no Footer, or the section fails its CRC.
     """
-    end = stream.size - len(MAGIC) - FOOTER.size
+    end = stream.size - len(MAGIC) - FOOTER_STRUCT.size
     if end < len(MAGIC):
-        raise damaged(path, "it has no footer")
+        raise corrupt_error(path, "it has no footer")
     stream.seek(end)
-    footer = stream.read(FOOTER.size)
-    opcode, length, said, _, crc = FOOTER.unpack(footer)
-    if (opcode, length) != (Opcode.FOOTER, FOOTER.size - RECORD.size):
-        raise damaged(path, "it has no footer")
-    if not said:
+    footer = stream.read(FOOTER_STRUCT.size)
+    opcode, length, summary_start, _, crc = FOOTER_STRUCT.unpack(footer)
+    if (opcode, length) != (Opcode.FOOTER, FOOTER_STRUCT.size - RECORD_STRUCT.size):
+        raise corrupt_error(path, "it has no footer")
+    if not summary_start:
         return None, end
-    start = said if start is None else start
+    start = summary_start if start is None else start
     if not len(MAGIC) <= start <= end:
-        raise damaged(path, "its footer points beyond it")
+        raise corrupt_error(path, "its footer points beyond it")
     stream.seek(start)
     body = stream.read(end - start)
     # The CRC covers everything before its own four bytes.
     if crc and zlib.crc32(footer[:-4], zlib.crc32(body)) != crc:
-        raise damaged(path, "its summary fails its CRC")
-    found = _parsed(body + footer + MAGIC)
-    found.proven = crc != 0
-    return found, start
+        raise corrupt_error(path, "its summary fails its CRC")
+    summary_section = _parse_section(body + footer + MAGIC)
+    summary_section.has_crc = crc != 0
+    return summary_section, start
 
 
-def _parsed(body: bytes) -> Section:
-    found = Section()
+def _parse_section(body: bytes) -> SummarySection:
+    summary_section = SummarySection()
     for record in StreamReader(BytesIO(body), skip_magic=True, record_size_limit=len(body)).records:
         match record:
             case Statistics():
-                found.statistics = record
+                summary_section.statistics = record
             case Schema():
-                if found.schemas.setdefault(record.id, record) != record:
+                if summary_section.schemas.setdefault(record.id, record) != record:
                     raise McapError(f"its summary has two message types {record.id}")
             case Channel():
-                if found.channels.setdefault(record.id, record) != record:
+                if summary_section.channels.setdefault(record.id, record) != record:
                     raise McapError(f"its summary has two channels {record.id}")
             case AttachmentIndex():
-                found.attachment_indexes.append(record)
+                summary_section.attachment_indexes.append(record)
             case ChunkIndex():
-                found.chunk_indexes.append(record)
+                summary_section.chunk_indexes.append(record)
             case MetadataIndex():
-                found.metadata_indexes.append(record)
-    return found
+                summary_section.metadata_indexes.append(record)
+    return summary_section
 
 
-def _usable(found: McapSummary) -> bool:
+def _indexes_messages(summary_section: McapSummary) -> bool:
     """Return whether the section repeats definitions and indexes chunks. Writers may omit both."""
-    some = found.statistics is None or found.statistics.message_count
-    defined = bool(found.channels) and (
-        bool(found.schemas) or not any(c.schema_id for c in found.channels.values())
+    some = summary_section.statistics is None or summary_section.statistics.message_count
+    defined = bool(summary_section.channels) and (
+        bool(summary_section.schemas)
+        or not any(c.schema_id for c in summary_section.channels.values())
     )
-    return (defined and bool(found.chunk_indexes)) or not some
+    return (defined and bool(summary_section.chunk_indexes)) or not some
 
 
-def _within_budget(path: Path, stream: Bounded, found: McapSummary) -> None:
-    if max(len(found.channels), len(found.schemas)) > limits.TOPICS:
-        raise too_large(path, f"it has more than {limits.TOPICS} topics or message types")
+def _check_budget(path: Path, stream: BoundedReader, summary_section: McapSummary) -> None:
+    if max(len(summary_section.channels), len(summary_section.schemas)) > limits.TOPICS:
+        raise over_budget_error(path, f"it has more than {limits.TOPICS} topics or message types")
     names = chain(
-        (c.topic for c in found.channels.values()), (s.name for s in found.schemas.values())
+        (c.topic for c in summary_section.channels.values()),
+        (s.name for s in summary_section.schemas.values()),
     )
     if longest := [name for name in names if len(name) > limits.NAME_CHARACTERS]:
-        raise too_large(path, f"the name {longest[0][:20]}... has {len(longest[0])} characters")
-    size = sum(chunk.uncompressed_size for chunk in found.chunk_indexes)
-    if size > limits.unpacked_bytes(stream.size):
-        raise too_large(
+        raise over_budget_error(
+            path, f"the name {longest[0][:20]}... has {len(longest[0])} characters"
+        )
+    size = sum(chunk.uncompressed_size for chunk in summary_section.chunk_indexes)
+    if size > limits.max_unpacked_bytes(stream.size):
+        raise over_budget_error(
             path, f"{stream.size / 1e6:.1f} MB of recording unpack to {size / 1e6:.0f} MB"
         )
 
 
-def _counted(path: Path, found: McapSummary) -> None:
+def _check_statistics(path: Path, summary_section: McapSummary) -> None:
     """Raise unless Statistics, chunk indexes and channels agree with each other."""
-    counts = found.statistics.channel_message_counts if found.statistics else {}
+    counts = summary_section.statistics.channel_message_counts if summary_section.statistics else {}
     mentioned = {number for number, count in counts.items() if count}
-    for chunk in found.chunk_indexes:
+    for chunk in summary_section.chunk_indexes:
         mentioned.update(chunk.message_index_offsets)
-    if unknown := mentioned - found.channels.keys():
-        raise damaged(path, f"its summary lacks channel {min(unknown)}")
-    for channel in found.channels.values():
-        if channel.schema_id and channel.schema_id not in found.schemas:
-            raise damaged(path, f"its summary lacks the message type of {channel.topic}")
-    said = found.statistics
-    if said is None:
+    if unknown := mentioned - summary_section.channels.keys():
+        raise corrupt_error(path, f"its summary lacks channel {min(unknown)}")
+    for channel in summary_section.channels.values():
+        if channel.schema_id and channel.schema_id not in summary_section.schemas:
+            raise corrupt_error(path, f"its summary lacks the message type of {channel.topic}")
+    statistics = summary_section.statistics
+    if statistics is None:
         return
-    if counts and sum(counts.values()) != said.message_count:
-        raise damaged(path, "its statistics contradict themselves")
+    if counts and sum(counts.values()) != statistics.message_count:
+        raise corrupt_error(path, "its statistics contradict themselves")
     for what, number, indexes in (
-        ("chunks", said.chunk_count, found.chunk_indexes),
-        ("metadata records", said.metadata_count, found.metadata_indexes),
-        ("attachments", said.attachment_count, found.attachment_indexes),
+        ("chunks", statistics.chunk_count, summary_section.chunk_indexes),
+        ("metadata records", statistics.metadata_count, summary_section.metadata_indexes),
+        ("attachments", statistics.attachment_count, summary_section.attachment_indexes),
     ):
         if indexes and len(indexes) != number:
-            raise damaged(path, f"its summary lists {len(indexes)} of {number} {what}")
+            raise corrupt_error(path, f"its summary lists {len(indexes)} of {number} {what}")
 
 
-def _before_the_end_of_time(path: Path, found: McapSummary) -> None:
-    latest = [chunk.message_end_time for chunk in found.chunk_indexes]
-    if found.statistics is not None:
-        latest += [found.statistics.message_start_time, found.statistics.message_end_time]
-    if max(latest, default=0) >= EVER_NS:
-        raise damaged(path, "a message has a time beyond the year 2262")
+def _check_times(path: Path, summary_section: McapSummary) -> None:
+    latest = [chunk.message_end_time for chunk in summary_section.chunk_indexes]
+    if summary_section.statistics is not None:
+        latest += [
+            summary_section.statistics.message_start_time,
+            summary_section.statistics.message_end_time,
+        ]
+    if max(latest, default=0) >= MAX_TIME_NS:
+        raise corrupt_error(path, "a message has a time beyond the year 2262")
 
 
-def _placed(path: Path, stream: Bounded, found: Section, end: int) -> bool:
+def _lists_all_messages(
+    path: Path, stream: BoundedReader, summary_section: SummarySection, end: int
+) -> bool:
     """Return whether all messages are in listed chunks.
 
     Raises
@@ -226,40 +244,42 @@ def _placed(path: Path, stream: Bounded, found: Section, end: int) -> bool:
         If a chunk is not listed, two records overlap, or one runs beyond the data section.
     """
     at = len(MAGIC)
-    for start, length in sorted(places(found)):
+    for start, length in sorted(iter_extents(summary_section)):
         if start < at:
-            raise damaged(path, f"its summary lists two records that overlap at byte {start}")
-        if not _between(path, stream, found, at, start):
+            raise corrupt_error(path, f"its summary lists two records that overlap at byte {start}")
+        if not _has_no_messages(path, stream, summary_section, at, start):
             return False
         at = start + length
     if at > end:
-        raise damaged(path, "its summary lists a record beyond the data section")
-    return _between(path, stream, found, at, end)
+        raise corrupt_error(path, "its summary lists a record beyond the data section")
+    return _has_no_messages(path, stream, summary_section, at, end)
 
 
-def places(found: McapSummary) -> Iterator[tuple[int, int]]:
+def iter_extents(summary_section: McapSummary) -> Iterator[tuple[int, int]]:
     """Yield offset and length of every record that the section lists."""
-    for chunk in found.chunk_indexes:
+    for chunk in summary_section.chunk_indexes:
         yield chunk.chunk_start_offset, chunk.chunk_length + chunk.message_index_length
-    for metadata in found.metadata_indexes:
+    for metadata in summary_section.metadata_indexes:
         yield metadata.offset, metadata.length
-    for attachment in found.attachment_indexes:
+    for attachment in summary_section.attachment_indexes:
         yield attachment.offset, attachment.length
 
 
-def _between(path: Path, stream: Bounded, found: Section, at: int, end: int) -> bool:
+def _has_no_messages(
+    path: Path, stream: BoundedReader, summary_section: SummarySection, at: int, end: int
+) -> bool:
     """Return whether the records from ``at`` to ``end`` contain no message."""
     while at < end:
         stream.seek(at)
-        opcode, length = RECORD.unpack(stream.read(RECORD.size))
+        opcode, length = RECORD_STRUCT.unpack(stream.read(RECORD_STRUCT.size))
         if opcode == Opcode.CHUNK:
-            raise damaged(path, f"its summary lacks the chunk at byte {at}")
+            raise corrupt_error(path, f"its summary lacks the chunk at byte {at}")
         if opcode == Opcode.MESSAGE:
             return False
-        if opcode in DEFINITIONS and not found.proven:
+        if opcode in DEFINITIONS and not summary_section.has_crc:
             body = ReadDataStream(BytesIO(stream.read(length)))
-            found.confirm(path, [DEFINITIONS[opcode].read(body)])
-        at += RECORD.size + length
+            summary_section.check_definitions(path, [DEFINITIONS[opcode].read(body)])
+        at += RECORD_STRUCT.size + length
     if at > end:
-        raise damaged(path, f"a record that ends at byte {at} overlaps the next one")
+        raise corrupt_error(path, f"a record that ends at byte {at} overlaps the next one")
     return True

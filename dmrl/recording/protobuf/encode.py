@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from dmrl.recording.mcap.message_batch import Bytes, Ints
 from dmrl.recording.protobuf.decode import DELIMITED, FIXED32, FIXED64, VARINT
-from dmrl.recording.protobuf.wire_values import FIXED, VARINTS
+from dmrl.recording.protobuf.wire_values import FIXED_DTYPES, VARINT_DTYPES
 
-Value = ArrayLike | Mapping[str, "Value"]
+ColumnValue = ArrayLike | Mapping[str, "ColumnValue"]
 """Values of a field.
 
 A column (N,), or (N, K) for a repeated field; a single value for all messages; for a sub-message,
@@ -35,7 +35,7 @@ class Cells(NamedTuple):
 
 
 def encode(
-    kind: Descriptor, fields: Mapping[str, Value], count: int, head_bytes: int = 0
+    kind: Descriptor, fields: Mapping[str, ColumnValue], count: int, prefix_bytes: int = 0
 ) -> tuple[Bytes, Ints]:
     """Encode columns to messages.
 
@@ -60,22 +60,24 @@ def encode(
     TypeError, ValueError
         If the type lacks a field, or a column has another type or length than the field needs.
     """
-    cells = _message(kind, fields, count)
-    if head_bytes:
-        cells = _side_by_side([_constant(bytes(head_bytes), count), cells], count)
+    cells = _encode_message(kind, fields, count)
+    if prefix_bytes:
+        cells = _concatenate_cells([_repeat_bytes(bytes(prefix_bytes), count), cells], count)
     ends = np.concatenate([[0], np.cumsum(cells.there.sum(axis=1))])
     return cells.data[cells.there], ends
 
 
-def _message(kind: Descriptor, fields: Mapping[str, Value], count: int) -> Cells:
+def _encode_message(kind: Descriptor, fields: Mapping[str, ColumnValue], count: int) -> Cells:
     known = kind.fields_by_name
     if unknown := [name for name in fields if name not in known]:
         raise ValueError(f"{kind.full_name} has no field {unknown[0]}")
     chosen = sorted((known[name] for name in fields), key=lambda field: int(field.number))
-    return _side_by_side([_field(field, fields[field.name], count) for field in chosen], count)
+    return _concatenate_cells(
+        [_encode_field(field, fields[field.name], count) for field in chosen], count
+    )
 
 
-def _side_by_side(parts: Sequence[Cells], count: int) -> Cells:
+def _concatenate_cells(parts: Sequence[Cells], count: int) -> Cells:
     nothing = np.empty((count, 0), np.uint8)
     return Cells(
         np.concatenate([nothing, *(part.data for part in parts)], axis=1),
@@ -83,55 +85,57 @@ def _side_by_side(parts: Sequence[Cells], count: int) -> Cells:
     )
 
 
-def _field(field: FieldDescriptor, value: Value, count: int) -> Cells:
+def _encode_field(field: FieldDescriptor, value: ColumnValue, count: int) -> Cells:
     if field.type == F.TYPE_MESSAGE:
         if field.is_repeated or not isinstance(value, Mapping) or field.message_type is None:
             raise TypeError(f"{field.full_name} needs a mapping of columns for its sub-message")
-        body = _message(field.message_type, value, count)
-        return _delimited(field, body, np.ones(count, bool))
+        body = _encode_message(field.message_type, value, count)
+        return _encode_delimited(field, body, np.ones(count, bool))
     if field.type in (F.TYPE_STRING, F.TYPE_BYTES):
-        return _text(field, value, count)
+        return _encode_text(field, value, count)
     array = np.asarray(value)
     if array.dtype.kind not in "biuf":
         raise TypeError(f"{field.full_name} takes numbers")
     if field.is_repeated:
-        body = _repeated(field, array, count)
-        return _delimited(field, body, np.asarray(body.there.any(axis=1)))
-    body, zero = _scalar(field, np.broadcast_to(array, count))
-    cells = _side_by_side([_constant(_tag(field, _wire(field)), count), body], count)
+        body = _encode_repeated(field, array, count)
+        return _encode_delimited(field, body, np.asarray(body.there.any(axis=1)))
+    body, zero = _encode_scalar(field, np.broadcast_to(array, count))
+    cells = _concatenate_cells(
+        [_repeat_bytes(_encode_tag(field, _find_wire_type(field)), count), body], count
+    )
     return cells._replace(there=cells.there & ~zero[:, None])
 
 
-def _scalar(field: FieldDescriptor, array: NDArray[np.generic]) -> tuple[Cells, Mask]:
+def _encode_scalar(field: FieldDescriptor, array: NDArray[np.generic]) -> tuple[Cells, Mask]:
     """Encode the values of a field, and return which of them are its default."""
-    if field.type in FIXED:
-        values = np.ascontiguousarray(array, dtype=FIXED[field.type])
+    if field.type in FIXED_DTYPES:
+        values = np.ascontiguousarray(array, dtype=FIXED_DTYPES[field.type])
         data = values.view(np.uint8).reshape(len(values), -1)
         # As in protobuf, -0.0 is not the default.
         return Cells(data, np.ones(data.shape, bool)), ~np.asarray(data.any(axis=1))
-    if field.type not in VARINTS:
+    if field.type not in VARINT_DTYPES:
         raise TypeError(f"{field.full_name} has a type that cannot be written from columns")
     with np.errstate(invalid="ignore"):  # NaN is rejected below
-        values = array.astype(VARINTS[field.type])
+        values = array.astype(VARINT_DTYPES[field.type])
     if not np.array_equal(values, array):
         raise ValueError(f"{field.full_name} takes integers within its range")
     signed = values.astype(np.int64)
     if field.type in (F.TYPE_SINT32, F.TYPE_SINT64):
         signed = (signed << 1) ^ (signed >> 63)
     bits = signed.view(np.uint64)
-    return _varint(bits), bits == 0
+    return _encode_varint(bits), bits == 0
 
 
-def _repeated(field: FieldDescriptor, array: NDArray[np.generic], count: int) -> Cells:
+def _encode_repeated(field: FieldDescriptor, array: NDArray[np.generic], count: int) -> Cells:
     """Encode a packed repeated field from (N, K) values."""
-    if field.type not in FIXED or array.ndim != 2 or len(array) != count:
+    if field.type not in FIXED_DTYPES or array.ndim != 2 or len(array) != count:
         raise ValueError(f"{field.full_name} takes {count} rows of numbers of fixed size")
-    values = np.ascontiguousarray(array, dtype=FIXED[field.type])
+    values = np.ascontiguousarray(array, dtype=FIXED_DTYPES[field.type])
     data = values.view(np.uint8).reshape(count, -1)
     return Cells(data, np.ones(data.shape, bool))
 
 
-def _text(field: FieldDescriptor, value: Value, count: int) -> Cells:
+def _encode_text(field: FieldDescriptor, value: ColumnValue, count: int) -> Cells:
     """Encode texts or bytes: one for all messages, or one for each."""
     if isinstance(value, Mapping):
         raise TypeError(f"{field.full_name} takes a text")
@@ -147,33 +151,35 @@ def _text(field: FieldDescriptor, value: Value, count: int) -> Cells:
     width = int(size.max(initial=0))
     data = np.frombuffer(b"".join(part.ljust(width, b"\0") for part in parts), np.uint8)
     body = Cells(data.reshape(count, width), np.arange(width) < size[:, None])
-    return _delimited(field, body, size > 0)
+    return _encode_delimited(field, body, size > 0)
 
 
-def _delimited(field: FieldDescriptor, body: Cells, there: Mask) -> Cells:
+def _encode_delimited(field: FieldDescriptor, body: Cells, there: Mask) -> Cells:
     """Put the tag and length of a field before its payloads."""
-    size = _varint(body.there.sum(axis=1).astype(np.uint64))
-    cells = _side_by_side([_constant(_tag(field, DELIMITED), len(there)), size, body], len(there))
+    size = _encode_varint(body.there.sum(axis=1).astype(np.uint64))
+    cells = _concatenate_cells(
+        [_repeat_bytes(_encode_tag(field, DELIMITED), len(there)), size, body], len(there)
+    )
     return cells._replace(there=cells.there & there[:, None])
 
 
-def _wire(field: FieldDescriptor) -> int:
-    if field.type in FIXED:
-        return FIXED64 if np.dtype(FIXED[field.type]).itemsize == 8 else FIXED32
+def _find_wire_type(field: FieldDescriptor) -> int:
+    if field.type in FIXED_DTYPES:
+        return FIXED64 if np.dtype(FIXED_DTYPES[field.type]).itemsize == 8 else FIXED32
     return VARINT
 
 
-def _tag(field: FieldDescriptor, wire: int) -> bytes:
-    cells = _varint(np.array([field.number << 3 | wire], np.uint64))
+def _encode_tag(field: FieldDescriptor, wire: int) -> bytes:
+    cells = _encode_varint(np.array([field.number << 3 | wire], np.uint64))
     return cells.data[cells.there].tobytes()
 
 
-def _constant(text: bytes, count: int) -> Cells:
+def _repeat_bytes(text: bytes, count: int) -> Cells:
     data = np.broadcast_to(np.frombuffer(text, np.uint8), (count, len(text)))
     return Cells(data, np.ones(data.shape, bool))
 
 
-def _varint(values: NDArray[np.uint64]) -> Cells:
+def _encode_varint(values: NDArray[np.uint64]) -> Cells:
     most = int(values.max(initial=0)).bit_length()
     width = max(1, -(-most // 7))
     shifted = values[:, None] >> (np.arange(width, dtype=np.uint64) * np.uint64(7))

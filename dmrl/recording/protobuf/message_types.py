@@ -10,11 +10,11 @@ from google.protobuf.descriptor import Descriptor
 from google.protobuf.message import DecodeError
 
 from dmrl.errors import RecordingError
-from dmrl.messages import descriptor, pool_of
+from dmrl.messages import build_pool, find_descriptor
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.file import damaged
+from dmrl.recording.mcap.file import corrupt_error
 from dmrl.recording.mcap.summary_index import TopicInfo
-from dmrl.topics import row_of
+from dmrl.topics import find_topic
 
 
 def require_types(path: Path, topics: Mapping[str, TopicInfo], chosen: Iterable[str]) -> None:
@@ -26,15 +26,15 @@ def require_types(path: Path, topics: Mapping[str, TopicInfo], chosen: Iterable[
         If a topic carries another type.
     """
     for topic in sorted(chosen):
-        row = row_of(topic)
-        if row is not None and not row.carries(topics[topic].schema):
+        row = find_topic(topic)
+        if row is not None and not row.accepts_message(topics[topic].schema):
             raise RecordingError(
                 f"{path}: {topic} carries {topics[topic].schema or 'no schema'}, not "
                 f"{row.message}. Convert the recording: dmrl convert --help"
             )
 
 
-def descriptor_of(path: Path, channel: Channel) -> Descriptor:
+def find_channel_descriptor(path: Path, channel: Channel) -> Descriptor:
     """Return the message type of a channel: dmrl's own if it has that name, else the recording's.
 
     Raises
@@ -48,16 +48,16 @@ def descriptor_of(path: Path, channel: Channel) -> Descriptor:
             "Leave it out, or convert it: dmrl convert --help"
         )
     try:
-        return descriptor(channel.schema_name)
+        return find_descriptor(channel.schema_name)
     except KeyError:
         pass
     try:
-        return pool_of(channel.schema_data).FindMessageTypeByName(channel.schema_name)
+        return build_pool(channel.schema_data).FindMessageTypeByName(channel.schema_name)
     except (DecodeError, TypeError, KeyError) as e:
-        raise damaged(path, f"schema {channel.schema_name}: {e}") from e
+        raise corrupt_error(path, f"schema {channel.schema_name}: {e}") from e
 
 
-def one_type(path: Path, topic: str, kinds: set[Descriptor]) -> Descriptor:
+def require_one_type(path: Path, topic: str, kinds: set[Descriptor]) -> Descriptor:
     """Return the common message type of a topic's channels. After a merge there can be several.
 
     Raises

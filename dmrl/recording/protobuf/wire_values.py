@@ -13,7 +13,7 @@ GATHER_BYTES = 64
 """Mean size of a text below which one gather of all bytes is faster than a slice per text."""
 
 F = FieldDescriptor
-FIXED = {
+FIXED_DTYPES = {
     F.TYPE_DOUBLE: "<f8",
     F.TYPE_FLOAT: "<f4",
     F.TYPE_FIXED64: "<u8",
@@ -21,7 +21,7 @@ FIXED = {
     F.TYPE_FIXED32: "<u4",
     F.TYPE_SFIXED32: "<i4",
 }
-VARINTS = {
+VARINT_DTYPES = {
     F.TYPE_INT64: "i8",
     F.TYPE_UINT64: "u8",
     F.TYPE_INT32: "i4",
@@ -37,7 +37,7 @@ class WireError(ValueError):
     """The bytes are not messages of the given type."""
 
 
-def varint(data: Bytes, at: Ints) -> tuple[NDArray[np.uint64], Ints]:
+def decode_varints(data: Bytes, at: Ints) -> tuple[NDArray[np.uint64], Ints]:
     """Read the varint at each offset; return values and the offsets after them."""
     try:
         byte = data[at]
@@ -61,7 +61,7 @@ def varint(data: Bytes, at: Ints) -> tuple[NDArray[np.uint64], Ints]:
     return value, at
 
 
-def unless_absent(
+def decode_present(
     present: NDArray[np.bool_] | None,
     start: Ints,
     read: Callable[[Ints], NDArray[np.generic]],
@@ -75,7 +75,7 @@ def unless_absent(
     return out
 
 
-def fixed(data: Bytes, at: Ints, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
+def decode_fixed(data: Bytes, at: Ints, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
     """Read (N,) values of fixed size.
 
     Raises
@@ -91,17 +91,17 @@ def fixed(data: Bytes, at: Ints, dtype: np.dtype[np.generic]) -> NDArray[np.gene
         raise WireError("a value runs beyond its message") from None
 
 
-def integers(
+def decode_integers(
     data: Bytes, at: Ints, dtype: np.dtype[np.generic], zigzag: bool
 ) -> NDArray[np.generic]:
     """Read (N,) integers, enums or booleans, stored as varints."""
-    value, _ = varint(data, at)
+    value, _ = decode_varints(data, at)
     if zigzag:
         value = (value >> np.uint64(1)) ^ (np.uint64(0) - (value & np.uint64(1)))
     return value.astype(np.bool_) if dtype == np.bool_ else value.view(np.int64).astype(dtype)
 
 
-def text(data: Bytes, start: Ints, end: Ints, kind: pa.DataType) -> pa.Array:
+def decode_strings(data: Bytes, start: Ints, end: Ints, kind: pa.DataType) -> pa.Array:
     """Read (N,) strings or bytes from spans.
 
     Raises

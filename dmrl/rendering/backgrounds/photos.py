@@ -13,23 +13,23 @@ from dmrl.geometry.frames import Array, Camera
 from dmrl.geometry.lens import undistort
 from dmrl.guards import limits
 from dmrl.guards.paths import refuse_pipes
-from dmrl.images.codec import Rgb, crop_and_scale, decode, size
-from dmrl.rendering.camera.distortion import Picture, between
+from dmrl.images.codec import Rgb, crop_and_scale, decode, read_size
+from dmrl.rendering.camera.distortion import FloatImage, interpolate_bilinear
 from dmrl.rendering.camera.sensor import LUMINANCE
 
-PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm")
-KEPT = 64
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm")
+MAX_CACHED_PHOTOS = 64
 """Decoded photos in the cache. Bounds the memory."""
 
 
-def _table() -> Picture:
+def _srgb_table() -> FloatImage:
     """Return the linear light of the 256 values of an sRGB photo."""
     value = np.arange(256) / 255
     low = value <= 0.04045
     return np.where(low, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-LIGHT_OF = _table()
+SRGB_TO_LINEAR = _srgb_table()
 
 
 class Photos:
@@ -48,14 +48,14 @@ class Photos:
     def __init__(self, load: Callable[[int], Rgb], count: int, broken: int = 0) -> None:
         self._count, self._left_out = count, broken
         self._broken: set[int] = set()
-        self._load = lru_cache(KEPT)(load)
+        self._load = lru_cache(MAX_CACHED_PHOTOS)(load)
 
     @property
     def broken(self) -> int:
         """Number of broken photos detected so far."""
         return self._left_out + len(self._broken)
 
-    def photo(self, number: int) -> Rgb:
+    def load_photo(self, number: int) -> Rgb:
         """Return the photo with this index, or the next one that is not broken.
 
         Raises
@@ -73,13 +73,15 @@ class Photos:
                 self._broken.add(here)
         raise SettingError("every photo is broken. Use another --backgrounds")
 
-    def backdrop(
+    def random_backdrop(
         self, rng: Generator, camera: Camera, zoom: float, *, averaged: bool = True
-    ) -> Picture:
+    ) -> FloatImage:
         """Return a random crop as (H, W, 3) linear light, see `random_crop`."""
-        return np.take(LIGHT_OF, self.part(rng, camera, zoom, averaged=averaged))
+        return np.take(SRGB_TO_LINEAR, self.random_crop(rng, camera, zoom, averaged=averaged))
 
-    def part(self, rng: Generator, camera: Camera, zoom: float, *, averaged: bool = True) -> Rgb:
+    def random_crop(
+        self, rng: Generator, camera: Camera, zoom: float, *, averaged: bool = True
+    ) -> Rgb:
         """Return a random (H, W, 3) uint8 crop of a random photo that fills the image.
 
         Parameters
@@ -94,7 +96,7 @@ class Photos:
             Whether a pixel averages the photo's pixels that it covers, or takes the middle one.
         """
         number, place_u, place_v, mirrored = rng.random(4)
-        photo = self.photo(int(number * self._count))
+        photo = self.load_photo(int(number * self._count))
         height, width, _ = photo.shape
         fit = min(width / camera.width_px, height / camera.height_px) / zoom
         part_u, part_v = camera.width_px * fit, camera.height_px * fit
@@ -103,11 +105,11 @@ class Photos:
         if averaged:
             rgb = crop_and_scale(photo, box, camera.width_px, camera.height_px, sharp=False)
         else:
-            rgb = _middles(photo, (left, top), fit, camera)
+            rgb = _sample_middles(photo, (left, top), fit, camera)
         return rgb[:, ::-1] if mirrored < 0.5 else rgb
 
 
-def photos_in(folder: Path) -> Photos:
+def open_photos(folder: Path) -> Photos:
     """Open all photos of a folder, in the order of their names.
 
     Raises
@@ -118,23 +120,23 @@ def photos_in(folder: Path) -> Photos:
     if not folder.is_dir():
         raise SettingError(f"no folder {folder} of backgrounds. Check --backgrounds")
     refuse_pipes(folder)
-    found = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_KINDS)
-    paths = [path for path in found if _begins(path)]
+    found = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES)
+    paths = [path for path in found if _has_valid_header(path)]
     broken = len(found) - len(paths)
     if not paths:
         why = f", {broken} are broken" if broken else ""
         raise SettingError(
             f"{folder} contains no readable photo{why} "
-            f"({', '.join(PHOTO_KINDS)}). Use another --backgrounds"
+            f"({', '.join(PHOTO_SUFFIXES)}). Use another --backgrounds"
         )
 
-    def photo(k: int) -> Rgb:
+    def load_photo(k: int) -> Rgb:
         return decode(paths[k].read_bytes(), paths[k], limits.PIXELS)
 
-    return Photos(photo, len(paths), broken)
+    return Photos(load_photo, len(paths), broken)
 
 
-def _middles(photo: Rgb, corner: tuple[float, float], fit: float, camera: Camera) -> Rgb:
+def _sample_middles(photo: Rgb, corner: tuple[float, float], fit: float, camera: Camera) -> Rgb:
     """Return a crop of a photo, sampled at the middles of pixels ``fit`` wide."""
     height, width, _ = photo.shape
     limits = zip(corner, (camera.width_px, camera.height_px), (width, height), strict=True)
@@ -145,17 +147,17 @@ def _middles(photo: Rgb, corner: tuple[float, float], fit: float, camera: Camera
     return np.asarray(photo[v].take(u, axis=1), np.uint8)
 
 
-def _begins(path: Path) -> bool:
+def _has_valid_header(path: Path) -> bool:
     try:
-        size(path.read_bytes(), path)
+        read_size(path.read_bytes(), path)
     except (SourceError, OSError):
         return False
     return True
 
 
-def panorama_view(
-    panorama: Picture, camera: Camera, turn_rad: tuple[float, float, float]
-) -> Picture:
+def render_panorama(
+    panorama: FloatImage, camera: Camera, turn_rad: tuple[float, float, float]
+) -> FloatImage:
     """Return the (H, W, 3) linear light of a panorama in a camera's view.
 
     Parameters
@@ -167,17 +169,17 @@ def panorama_view(
     turn_rad
         Roll and pitch of the camera, and the panorama's rotation about the vertical.
     """
-    x, y, z = _panorama_from_camera(turn_rad).astype(np.float32) @ _rays(camera)
+    x, y, z = _panorama_from_camera(turn_rad).astype(np.float32) @ _camera_rays(camera)
     height, width, _ = panorama.shape
     u = (0.5 - np.arctan2(y, x) / np.float32(2 * np.pi)) * width - 0.5
     v = (0.5 - np.arctan2(z, np.hypot(x, y)) / np.float32(np.pi)) * height - 0.5
     places = np.stack([u, np.clip(v, 0, height - 1.001)], axis=-1)
     shape = (camera.height_px, camera.width_px, 2)
-    return between(panorama, places.reshape(shape), around=True)
+    return interpolate_bilinear(panorama, places.reshape(shape), around=True)
 
 
 @cache
-def _rays(camera: Camera) -> Picture:
+def _camera_rays(camera: Camera) -> FloatImage:
     """Return the (3, H * W) rays of all pixels, camera frame."""
     v, u = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
     right = (u - camera.cx_px) / camera.fx_px
@@ -193,7 +195,7 @@ def _panorama_from_camera(turn_rad: tuple[float, float, float]) -> Array:
     return np.asarray(np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]]) @ tilt)
 
 
-def stretched(light: Picture, power: float) -> Picture:
+def stretch_contrast(light: FloatImage, power: float) -> FloatImage:
     """Return (H, W, 3) light with its brightness raised to a power, at the same mean.
 
     Parameters
@@ -206,12 +208,12 @@ def stretched(light: Picture, power: float) -> Picture:
     luminance = light @ LUMINANCE
     mean = max(float(luminance.mean()), 1e-6)
     share = np.power(np.maximum(luminance / mean, 1e-4), np.float32(power - 1))
-    other: Picture = light * share[..., None]
+    other: FloatImage = light * share[..., None]
     other *= np.float32(mean / max(float((other @ LUMINANCE).mean()), 1e-6))
     return other
 
 
-def smeared(picture: Picture, move_px: Sequence[float]) -> Picture:
+def apply_motion_blur(picture: FloatImage, move_px: Sequence[float]) -> FloatImage:
     """Return the (H, W, 3) image blurred by a motion in u and v during the exposure, pixels."""
     steps = int(np.ceil(math.hypot(*move_px)))
     if steps < 1:

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def one_core():
+def limit_to_one_core():
     """Limit this process to one core inside the context.
 
     Blender's libraries count the cores when they are loaded and start one thread per core. A

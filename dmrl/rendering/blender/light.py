@@ -13,7 +13,7 @@ import math
 
 import bpy
 import numpy as np
-from nodes import calc, node
+from nodes import add_math, add_node
 
 LIGHT_SIZE_PX = (32, 16)
 MEAN_LIGHT = 0.5
@@ -29,7 +29,9 @@ class Sky:
     def __init__(self, scene, lights):
         columns, rows = LIGHT_SIZE_PX
         atlas = bpy.data.images.new("light", columns, rows * len(lights), float_buffer=True)
-        atlas.pixels.foreach_set(np.concatenate([small(name) for name in lights]).ravel())
+        atlas.pixels.foreach_set(
+            np.concatenate([downsample_panorama(name) for name in lights]).ravel()
+        )
         self.numbers = {name: k for k, name in enumerate(lights)}
         scene.world = world = bpy.data.worlds.new("world")
         world.use_nodes = True
@@ -40,33 +42,33 @@ class Sky:
         tree = world.node_tree
         self.background = tree.nodes["Background"]
         place = tree.nodes.new("ShaderNodeTexCoord").outputs["Generated"]
-        self.turn = node(tree, "Mapping", place)
-        x, y, z = node(tree, "SeparateXYZ", self.turn.outputs[0]).outputs
-        turn = calc(tree, "DIVIDE", calc(tree, "ARCTAN2", y, x), -2 * math.pi)
-        height = calc(tree, "DIVIDE", calc(tree, "ARCSINE", z), math.pi)
+        self.turn = add_node(tree, "Mapping", place)
+        x, y, z = add_node(tree, "SeparateXYZ", self.turn.outputs[0]).outputs
+        turn = add_math(tree, "DIVIDE", add_math(tree, "ARCTAN2", y, x), -2 * math.pi)
+        height = add_math(tree, "DIVIDE", add_math(tree, "ARCSINE", z), math.pi)
         # Stay half a row from the edges, where the next panorama would be interpolated.
-        height = calc(tree, "MULTIPLY", calc(tree, "ADD", height, 0.5), (rows - 1) / rows)
-        height = calc(tree, "ADD", height, 0.5 / rows)
-        self.number = node(tree, "Math", height, 0.0, operation="ADD")
-        up = calc(tree, "DIVIDE", self.number.outputs[0], len(lights))
-        where = node(tree, "CombineXYZ", calc(tree, "ADD", turn, 0.5), up, 0.0)
-        picture = node(tree, "TexImage", where.outputs[0], image=atlas)
+        height = add_math(tree, "MULTIPLY", add_math(tree, "ADD", height, 0.5), (rows - 1) / rows)
+        height = add_math(tree, "ADD", height, 0.5 / rows)
+        self.number = add_node(tree, "Math", height, 0.0, operation="ADD")
+        up = add_math(tree, "DIVIDE", self.number.outputs[0], len(lights))
+        where = add_node(tree, "CombineXYZ", add_math(tree, "ADD", turn, 0.5), up, 0.0)
+        picture = add_node(tree, "TexImage", where.outputs[0], image=atlas)
         tree.links.new(picture.outputs["Color"], self.background.inputs["Color"])
 
-    def shine(self, name, turn_rad, strength):
+    def select_panorama(self, name, turn_rad, strength):
         """Select one panorama, rotated by XYZ angles."""
         self.number.inputs[1].default_value = self.numbers[name]
         self.turn.inputs["Rotation"].default_value = turn_rad
         self.background.inputs["Strength"].default_value = strength
 
 
-def small(name):
+def downsample_panorama(name):
     """Return a (rows, columns, 4) downsampled panorama of mean MEAN_LIGHT.
 
     Small bright lights would cause fireflies. The scene's sun replaces them.
     """
     columns, rows = LIGHT_SIZE_PX
-    wide = panorama(name)[::-1]
+    wide = load_panorama(name)[::-1]
     height, width, _ = wide.shape
     down, across = height // rows, width // columns
     if not (down and across):
@@ -78,7 +80,7 @@ def small(name):
     return np.dstack([small, np.ones((rows, columns, 1))]).astype(np.float32)
 
 
-def panorama(name):
+def load_panorama(name):
     """Load the (H, W, 3) linear light of a panorama, top row first."""
     image = bpy.data.images.load(name)
     width, height = image.size

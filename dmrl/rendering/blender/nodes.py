@@ -10,7 +10,7 @@
 """Helpers that create a shader node in one line."""
 
 
-def node(tree, kind, *inputs, **options):
+def add_node(tree, kind, *inputs, **options):
     """Create a node with its inputs linked or set, in order."""
     made = tree.nodes.new(f"ShaderNode{kind}")
     for name, value in options.items():
@@ -23,11 +23,11 @@ def node(tree, kind, *inputs, **options):
     return made
 
 
-def calc(tree, operation, *inputs):
+def add_math(tree, operation, *inputs):
     """Create a math node and return its output."""
-    return node(tree, "Math", *inputs, operation=operation).outputs[0]
+    return add_node(tree, "Math", *inputs, operation=operation).outputs[0]
 
 
-def of_object(tree, name):
+def add_property(tree, name):
     """Create a node that reads a property of the shaded object."""
-    return node(tree, "Attribute", attribute_name=name, attribute_type="OBJECT")
+    return add_node(tree, "Attribute", attribute_name=name, attribute_type="OBJECT")

@@ -19,25 +19,25 @@ from cycles import CyclesRender
 CHANNELS = {"Combined": 4, "Depth": 1}
 
 _render = CyclesRender.render
-_taken = {}
+_captured = {}
 
 
-def _render_and_take(engine, depsgraph):
+def _render_and_capture(engine, depsgraph):
     """Run Cycles' own render, then read the passes from memory."""
     _render(engine, depsgraph)
     try:
-        _take(engine.get_result())
+        _capture_passes(engine.get_result())
     except AttributeError:  # this Blender does not expose the passes
-        _taken.clear()
+        _captured.clear()
 
 
-def _take(result):
+def _capture_passes(result):
     for one in result.layers[0].passes:
         if one.name in CHANNELS:
             buffer = np.empty(result.resolution_x * result.resolution_y * one.channels, np.float32)
             one.rect.foreach_get(buffer)
             shape = (result.resolution_y, result.resolution_x, one.channels)
-            _taken[one.name] = buffer.reshape(shape)[::-1]
+            _captured[one.name] = buffer.reshape(shape)[::-1]
 
 
 class Passes:
@@ -50,18 +50,18 @@ class Passes:
     def __init__(self, scene):
         self.scene = scene
         self.folder = None
-        CyclesRender.render = _render_and_take
+        CyclesRender.render = _render_and_capture
 
     def render(self):
         """Return (H, W, 4) premultiplied light and opacity, and (H, W) depth, top row first."""
         if self.folder is None:
-            _taken.clear()
+            _captured.clear()
             bpy.ops.render.render()
-            if len(_taken) == len(CHANNELS):
-                return {"light": _taken["Combined"], "depth": _taken["Depth"][..., 0]}
+            if len(_captured) == len(CHANNELS):
+                return {"light": _captured["Combined"], "depth": _captured["Depth"][..., 0]}
             self._use_files()
         bpy.ops.render.render()
-        light, depth = (_read(self._path(name)) for name in CHANNELS)
+        light, depth = (_read_exr(self._path(name)) for name in CHANNELS)
         return {"light": light, "depth": depth[..., 0].copy()}
 
     def _use_files(self):
@@ -84,7 +84,7 @@ class Passes:
         return Path(self.folder.name) / f"{name}{self.scene.frame_current:04d}.exr"
 
 
-def _read(path):
+def _read_exr(path):
     image = bpy.data.images.load(str(path))
     try:
         width, height = image.size

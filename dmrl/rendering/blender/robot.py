@@ -13,12 +13,12 @@ import math
 
 import bpy
 import numpy as np
-from nodes import calc, node, of_object
+from nodes import add_math, add_node, add_property
 
-TURNED = (".glb", ".gltf", ".obj")
+ROTATED_SUFFIXES = (".glb", ".gltf", ".obj")
 
 
-def drawn(head, arrays):
+def build_mesh(head, arrays):
     """Build the mesh of the built-in robot: vertices in metres, triangles with a material each."""
     mesh = bpy.data.meshes.new("robot")
     mesh.from_pydata(arrays["vertices"].tolist(), [], arrays["faces"].tolist())
@@ -27,17 +27,17 @@ def drawn(head, arrays):
     polar.data.foreach_set("vector", arrays["rotor"].astype(np.float32).ravel())
     for k, name in enumerate(head["materials"]):
         material = bpy.data.materials.new(name)
-        _paint(material, k)
+        _build_material(material, k)
         if name == "rotor":
-            _show_blades(material, head)
+            _add_rotor_blur(material, head)
         mesh.materials.append(material)
     mesh.update()
     return mesh
 
 
-def loaded(path, scale, up, *, boxed):
+def load_mesh(path, scale, up, *, boxed):
     """Load the user's model as one mesh, centred on its bounding box or on the file's origin."""
-    meshes = _meshes(path)
+    meshes = _extract_meshes(path)
     robot = bpy.data.meshes.new("robot")
     corners, faces, indices, start = [], [], [], 0
     for mesh, matrix in meshes:
@@ -53,7 +53,7 @@ def loaded(path, scale, up, *, boxed):
     if not faces:
         raise ValueError("it has no surface")
     points = np.concatenate(corners) * scale
-    points = _upright(points, path.suffix.lower(), up)
+    points = _rotate_upright(points, path.suffix.lower(), up)
     if boxed:
         points -= (points.min(axis=0) + points.max(axis=0)) / 2
     robot.from_pydata(points.tolist(), [], faces)
@@ -62,88 +62,90 @@ def loaded(path, scale, up, *, boxed):
     return robot
 
 
-def _upright(points, kind, up):
+def _rotate_upright(points, kind, up):
     """Rotate points to z up, from the file's axis ``up``. auto uses the convention of its format.
 
     Blender's importers already rotate .obj and .glb, whose y is up by convention.
     """
     x, y, z = points.T
-    if kind in TURNED:
+    if kind in ROTATED_SUFFIXES:
         return np.column_stack([x, z, -y]) if up == "z" else points
     return np.column_stack([x, -z, y]) if up == "y" else points
 
 
-def _paint(material, number):
+def _build_material(material, number):
     """Create a material that reads its paint from object properties: no shader is rebuilt."""
     material.use_nodes = True
     material.cycles.emission_sampling = "NONE"
     tree = material.node_tree
     surface = tree.nodes["Principled BSDF"]
-    colour = of_object(tree, f"colour_{number}").outputs["Color"]
-    finish = node(tree, "SeparateXYZ", of_object(tree, f"finish_{number}").outputs["Vector"])
+    colour = add_property(tree, f"colour_{number}").outputs["Color"]
+    finish = add_node(tree, "SeparateXYZ", add_property(tree, f"finish_{number}").outputs["Vector"])
     tree.links.new(colour, surface.inputs["Base Color"])
     tree.links.new(colour, surface.inputs["Emission Color"])
     tree.links.new(finish.outputs[0], surface.inputs["Roughness"])
     tree.links.new(finish.outputs[1], surface.inputs["Metallic"])
     tree.links.new(finish.outputs[2], surface.inputs["Emission Strength"])
     # No material is brushed metal: a constant tangent avoids computing one for every ray.
-    tree.links.new(node(tree, "CombineXYZ").outputs[0], surface.inputs["Tangent"])
+    tree.links.new(add_node(tree, "CombineXYZ").outputs[0], surface.inputs["Tangent"])
 
 
-def _show_blades(material, head):
+def _add_rotor_blur(material, head):
     """Set the opacity of rotor discs: the share of the exposure in which a blade covers a point.
 
     The attribute "rotor" of a point is its place on the disc, x and y in metres, and the rotor's
     number. The robot has the first angle of rotor 0 and the rotation during the exposure.
     """
     tree = material.node_tree
-    place = node(tree, "Attribute", attribute_name="rotor", attribute_type="GEOMETRY")
-    x, y, number = node(tree, "SeparateXYZ", place.outputs["Vector"]).outputs
-    first = of_object(tree, "rotor_first_rad").outputs["Fac"]
-    sweep = of_object(tree, "rotor_sweep_rad").outputs["Fac"]
+    place = add_node(tree, "Attribute", attribute_name="rotor", attribute_type="GEOMETRY")
+    x, y, number = add_node(tree, "SeparateXYZ", place.outputs["Vector"]).outputs
+    first = add_property(tree, "rotor_first_rad").outputs["Fac"]
+    sweep = add_property(tree, "rotor_sweep_rad").outputs["Fac"]
     # Half a turn of two blades covers the whole disc.
-    sweep = calc(tree, "MINIMUM", calc(tree, "MAXIMUM", sweep, 0.02), math.pi)
-    first = calc(tree, "ADD", first, calc(tree, "MULTIPLY", number, head["between_rotors_rad"]))
-    angle = calc(tree, "SUBTRACT", calc(tree, "ARCTAN2", y, x), first)
-    after = calc(tree, "FLOORED_MODULO", angle, math.pi)
-    radius = node(tree, "VectorMath", place.outputs["Vector"], (1, 1, 0), operation="MULTIPLY")
-    radius = node(tree, "VectorMath", radius.outputs[0], operation="LENGTH").outputs["Value"]
-    half = calc(tree, "MAXIMUM", radius, 0.002)
-    half = calc(tree, "DIVIDE", head["blade_half_width_m"], half)
+    sweep = add_math(tree, "MINIMUM", add_math(tree, "MAXIMUM", sweep, 0.02), math.pi)
+    first = add_math(
+        tree, "ADD", first, add_math(tree, "MULTIPLY", number, head["between_rotors_rad"])
+    )
+    angle = add_math(tree, "SUBTRACT", add_math(tree, "ARCTAN2", y, x), first)
+    after = add_math(tree, "FLOORED_MODULO", angle, math.pi)
+    radius = add_node(tree, "VectorMath", place.outputs["Vector"], (1, 1, 0), operation="MULTIPLY")
+    radius = add_node(tree, "VectorMath", radius.outputs[0], operation="LENGTH").outputs["Value"]
+    half = add_math(tree, "MAXIMUM", radius, 0.002)
+    half = add_math(tree, "DIVIDE", head["blade_half_width_m"], half)
     total = None
-    for blade in (after, calc(tree, "SUBTRACT", after, math.pi)):
-        end = calc(tree, "MINIMUM", calc(tree, "ADD", blade, half), sweep)
-        begin = calc(tree, "MAXIMUM", calc(tree, "SUBTRACT", blade, half), 0.0)
-        share = calc(tree, "MAXIMUM", calc(tree, "SUBTRACT", end, begin), 0.0)
-        total = share if total is None else calc(tree, "ADD", total, share)
-    opacity = calc(tree, "MINIMUM", calc(tree, "DIVIDE", total, sweep), 1.0)
+    for blade in (after, add_math(tree, "SUBTRACT", after, math.pi)):
+        end = add_math(tree, "MINIMUM", add_math(tree, "ADD", blade, half), sweep)
+        begin = add_math(tree, "MAXIMUM", add_math(tree, "SUBTRACT", blade, half), 0.0)
+        share = add_math(tree, "MAXIMUM", add_math(tree, "SUBTRACT", end, begin), 0.0)
+        total = share if total is None else add_math(tree, "ADD", total, share)
+    opacity = add_math(tree, "MINIMUM", add_math(tree, "DIVIDE", total, sweep), 1.0)
     # A mix shader skips the side whose share is 0. Alpha would evaluate both.
-    clear = node(tree, "BsdfTransparent").outputs[0]
+    clear = add_node(tree, "BsdfTransparent").outputs[0]
     blade = tree.nodes["Principled BSDF"].outputs[0]
-    mixture = node(tree, "MixShader", opacity, clear, blade).outputs[0]
+    mixture = add_node(tree, "MixShader", opacity, clear, blade).outputs[0]
     tree.links.new(mixture, tree.nodes["Material Output"].inputs["Surface"])
 
 
-def _meshes(path):
+def _extract_meshes(path):
     """Return mesh and placement of every object of a file.
 
     The placement of a .blend is relative to the root object. Other importers convert y up to z up
     by the root's rotation, which is therefore kept.
     """
     kind, meshes = path.suffix.lower(), []
-    things = _imported(path, kind)
+    things = _import_objects(path, kind)
     for thing in things:
         if thing.type == "MESH":
             place = thing.matrix_world
             if kind == ".blend":
-                place = _root(thing).matrix_world.inverted() @ place
+                place = _root_object(thing).matrix_world.inverted() @ place
             meshes.append((thing.data, place.copy()))
     for thing in things:
         bpy.data.objects.remove(thing)
     return meshes
 
 
-def _imported(path, kind):
+def _import_objects(path, kind):
     """Import all objects of a file with updated matrices."""
     before = set(bpy.data.objects)
     if kind == ".blend":
@@ -159,7 +161,7 @@ def _imported(path, kind):
     return [thing for thing in bpy.data.objects if thing not in before]
 
 
-def _root(thing):
+def _root_object(thing):
     """Return the topmost parent of an object, or the object itself."""
     while thing.parent is not None:
         thing = thing.parent

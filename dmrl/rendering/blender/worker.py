@@ -18,56 +18,56 @@ import os
 import sys
 from pathlib import Path
 
-from core import one_core
+from core import limit_to_one_core
 
-with one_core():
+with limit_to_one_core():
     import bpy
 import numpy as np
-from light import Sky, panorama
+from light import Sky, load_panorama
 from mathutils import Matrix
 from passes import Passes
 from protocol import receive, send
-from robot import drawn, loaded
+from robot import build_mesh, load_mesh
 
 # Blender's camera points along its -z axis, y up.
 WORLD_FROM_CAMERA = Matrix(((0, 0, -1, 0), (-1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
 SENSOR_MM = 32.0
 # Offset of a crop's edges into the pixels, so that rounding cannot move them.
 NUDGE_PX = 0.25
-OUT_OF_SIGHT_M = -1000.0
+HIDDEN_OFFSET_M = -1000.0
 
 
-class Stage:
+class RenderScene:
     """Scene of one robot, one camera, a sun and a sky."""
 
     def __init__(self, head, arrays):
         bpy.ops.wm.read_factory_settings(use_empty=True)
         self.scene = bpy.context.scene
-        self.settings(head)
-        self.camera = self.add("camera", bpy.data.cameras.new("camera"))
+        self.configure_cycles(head)
+        self.camera = self.add_object("camera", bpy.data.cameras.new("camera"))
         self.camera.matrix_world = WORLD_FROM_CAMERA
         self.camera.data.sensor_fit = "HORIZONTAL"
         self.camera.data.sensor_width = SENSOR_MM
         self.camera.data.clip_start, self.camera.data.clip_end = 0.005, 100.0
         self.scene.camera = self.camera
-        self.sun = self.add("sun", bpy.data.lights.new("sun", "SUN"))
+        self.sun = self.add_object("sun", bpy.data.lights.new("sun", "SUN"))
         self.sky = Sky(self.scene, head["lights"])
         if head["model"] is None:
-            mesh = drawn(head, arrays)
+            mesh = build_mesh(head, arrays)
         else:
-            mesh = loaded(
+            mesh = load_mesh(
                 Path(head["model"]),
                 head["model_scale"],
                 head["model_up"],
                 boxed=head["model_centre"] == "box",
             )
-        self.robot = self.add("robot", mesh)
+        self.robot = self.add_object("robot", mesh)
         # Blender keeps a mesh that two objects share. It would transform the mesh of a single
         # object and rebuild its BVH whenever the robot or the sun change.
-        self.add("twin", mesh).matrix_world = Matrix.Translation((OUT_OF_SIGHT_M, 0, 0))
+        self.add_object("twin", mesh).matrix_world = Matrix.Translation((HIDDEN_OFFSET_M, 0, 0))
         self.passes = Passes(self.scene)
 
-    def settings(self, head):
+    def configure_cycles(self, head):
         """Set Cycles' options."""
         render, cycles = self.scene.render, self.scene.cycles
         render.engine = "CYCLES"
@@ -90,22 +90,22 @@ class Stage:
         self.scene.view_settings.view_transform = "Raw"
         self.scene.view_layers[0].use_pass_z = True
 
-    def add(self, name, data):
+    def add_object(self, name, data):
         """Add an object to the scene."""
         thing = bpy.data.objects.new(name, data)
         self.scene.collection.objects.link(thing)
         return thing
 
-    def points(self):
+    def read_vertices(self):
         """Return the (N, 3) vertices of the robot."""
         found = np.empty(3 * len(self.robot.data.vertices), np.float32)
         self.robot.data.vertices.foreach_get("co", found)
         return found.reshape(-1, 3)
 
-    def shoot(self, head):
+    def render_crop(self, head):
         """Return (H, W, 4) premultiplied light and opacity, and (H, W) depth of a crop."""
-        self.aim(head)
-        self.sky.shine(head["light"], head["light_turn_rad"], head["light_strength"])
+        self.aim_camera(head)
+        self.sky.select_panorama(head["light"], head["light_turn_rad"], head["light_strength"])
         self.sun.data.energy = head["sun_strength"]
         self.sun.data.color = head["sun_colour"]
         self.sun.data.angle = head["sun_angle_rad"]
@@ -119,7 +119,7 @@ class Stage:
         self.scene.cycles.seed = head["seed"]
         return self.passes.render()
 
-    def aim(self, head):
+    def aim_camera(self, head):
         """Set the camera's intrinsics and the crop."""
         width, height = head["size_px"]
         fx, fy, cx, cy = head["intrinsics_px"]
@@ -155,16 +155,16 @@ def main():
             return
         if stage is None:
             try:
-                stage = Stage(head, arrays)
+                stage = RenderScene(head, arrays)
             except (RuntimeError, ValueError, OSError) as error:
                 why = " ".join(str(error).split())
                 send(answers, {"error": f"{head['model']} is no model that Blender reads: {why}"})
                 return
-            send(answers, {"version": bpy.app.version_string}, {"points": stage.points()})
+            send(answers, {"version": bpy.app.version_string}, {"points": stage.read_vertices()})
         elif "panorama" in head:
-            send(answers, {}, {"panorama": panorama(head["panorama"])})
+            send(answers, {}, {"panorama": load_panorama(head["panorama"])})
         else:
-            send(answers, {}, stage.shoot(head))
+            send(answers, {}, stage.render_crop(head))
 
 
 if __name__ == "__main__":

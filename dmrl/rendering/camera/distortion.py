@@ -7,15 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.errors import SettingError
-from dmrl.geometry.frames import Array, Camera, inside
+from dmrl.geometry.frames import Array, Camera, is_inside
 from dmrl.geometry.lens import distort, undistort
 
-Picture = NDArray[np.float32]
-LONGEST_SIDE_PX = 4096
+FloatImage = NDArray[np.float32]
+MAX_SIDE_PX = 4096
 """Longest side of a rendered image, pixels. Four times the widest camera of small drones."""
 
 
-def _scale(camera: Camera) -> tuple[Array, Array]:
+def _focal_and_centre(camera: Camera) -> tuple[Array, Array]:
     return np.array([camera.fx_px, camera.fy_px]), np.array([camera.cx_px, camera.cy_px])
 
 
@@ -24,19 +24,19 @@ def image_from_pinhole(uv: Array, camera: Camera) -> Array:
 
     The result is NaN where the lens cannot project the point.
     """
-    focal, centre = _scale(camera)
+    focal, centre = _focal_and_centre(camera)
     bent, _ = distort((uv - centre) / focal, camera.distortion)
     return np.asarray(bent * focal + centre)
 
 
 def pinhole_from_image(uv: Array, camera: Camera) -> Array:
     """Convert pixels (..., 2) of the camera's image to undistorted pixels."""
-    focal, centre = _scale(camera)
+    focal, centre = _focal_and_centre(camera)
     return np.asarray(undistort((uv - centre) / focal, camera.distortion) * focal + centre)
 
 
 @dataclass(frozen=True, slots=True)
-class Canvas:
+class PinholeCanvas:
     """Pinhole image large enough to be distorted into a camera's image.
 
     Parameters
@@ -54,12 +54,12 @@ class Canvas:
 
     pinhole: Camera
     shift_px: Array
-    places_px: Picture | None
+    places_px: FloatImage | None
     inside: NDArray[np.bool_]
 
 
 @cache
-def canvas_of(camera: Camera) -> Canvas:
+def pinhole_canvas(camera: Camera) -> PinholeCanvas:
     """Return the canvas of a camera. The result is cached.
 
     Raises
@@ -67,14 +67,14 @@ def canvas_of(camera: Camera) -> Canvas:
     SettingError
         If its images are too large to render, or its distortion folds back before the corners.
     """
-    if max(camera.width_px, camera.height_px) > LONGEST_SIDE_PX:
+    if max(camera.width_px, camera.height_px) > MAX_SIDE_PX:
         raise SettingError(
             f"images of {camera.width_px}x{camera.height_px} px are too large to render: at most "
-            f"{LONGEST_SIDE_PX} px a side. Use a calibration of smaller ones"
+            f"{MAX_SIDE_PX} px a side. Use a calibration of smaller ones"
         )
     if not any(camera.distortion):
         everywhere = np.ones((camera.height_px, camera.width_px), bool)
-        return Canvas(replace(camera, distortion=()), np.zeros(2), None, everywhere)
+        return PinholeCanvas(replace(camera, distortion=()), np.zeros(2), None, everywhere)
     v, u = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
     places = pinhole_from_image(np.stack([u, v], axis=-1), camera)
     if np.isnan(places).any():
@@ -96,12 +96,12 @@ def canvas_of(camera: Camera) -> Canvas:
     )
     v, u = np.mgrid[: pinhole.height_px, : pinhole.width_px] + 0.5
     shown = image_from_pinhole(np.stack([u, v], axis=-1) + low, camera)
-    within = inside(shown.reshape(-1, 2), camera.width_px, camera.height_px)
+    within = is_inside(shown.reshape(-1, 2), camera.width_px, camera.height_px)
     places = (places - low).astype(np.float32)
-    return Canvas(pinhole, -low, places, within.reshape(u.shape))
+    return PinholeCanvas(pinhole, -low, places, within.reshape(u.shape))
 
 
-def sample(picture: Picture, places_px: Picture) -> Picture:
+def sample_bilinear(picture: FloatImage, places_px: FloatImage) -> FloatImage:
     """Sample an image bilinearly. Places outside it are 0.
 
     Parameters
@@ -119,10 +119,14 @@ def sample(picture: Picture, places_px: Picture) -> Picture:
     height, width, channels = picture.shape
     padded = np.zeros((height + 2, width + 2, channels), np.float32)
     padded[1:-1, 1:-1] = picture
-    return between(padded, np.clip(places_px + 0.5, 0, (width + 0.999, height + 0.999)))
+    return interpolate_bilinear(
+        padded, np.clip(places_px + 0.5, 0, (width + 0.999, height + 0.999))
+    )
 
 
-def between(picture: Picture, places_px: Picture, *, around: bool = False) -> Picture:
+def interpolate_bilinear(
+    picture: FloatImage, places_px: FloatImage, *, around: bool = False
+) -> FloatImage:
     """Interpolate an image bilinearly at places relative to its first pixel's centre.
 
     Parameters
@@ -146,13 +150,13 @@ def between(picture: Picture, places_px: Picture, *, around: bool = False) -> Pi
     column, row = corner[..., 0], corner[..., 1] * width
     left, right = (column % width, (column + 1) % width) if around else (column, column + 1)
     flat = picture.reshape(-1, channels)
-    above = _mixed(flat.take(row + left, axis=0), flat.take(row + right, axis=0), share_u)
+    above = _lerp_in_place(flat.take(row + left, axis=0), flat.take(row + right, axis=0), share_u)
     row += width
-    below = _mixed(flat.take(row + left, axis=0), flat.take(row + right, axis=0), share_u)
-    return _mixed(above, below, share_v)
+    below = _lerp_in_place(flat.take(row + left, axis=0), flat.take(row + right, axis=0), share_u)
+    return _lerp_in_place(above, below, share_v)
 
 
-def _mixed(first: Picture, second: Picture, share: Picture) -> Picture:
+def _lerp_in_place(first: FloatImage, second: FloatImage, share: FloatImage) -> FloatImage:
     """Interpolate linearly from the first to the second, in place."""
     second -= first
     second *= share

@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array
 from dmrl.images.codec import Rgb
-from dmrl.rendering.camera.distortion import Picture
-from dmrl.rendering.camera.sensor_noise import blocks_of, grain_of
+from dmrl.rendering.camera.distortion import FloatImage
+from dmrl.rendering.camera.sensor_noise import estimate_noise, measure_blocks
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-REACH_PX = 4
+EDGE_REACH_PX = 4
 """Search range for an edge, pixels to either side."""
 EDGE_SHARE = 0.02
 """Share of the pixels that count as edges: those with the largest step across."""
-CORNER, MIDDLE = 0.7, 0.1
+CORNER_RADIUS2, MIDDLE_RADIUS2 = 0.7, 0.1
 """Squared radii that bound the corners and the middle. The radius is 1 in the corners."""
 
 
 @dataclass(frozen=True, slots=True)
-class Likeness:
+class ImageStatistics:
     """Mean statistics of a set of images. None where the images do not determine one.
 
     Parameters
@@ -60,14 +60,14 @@ class Likeness:
     grain_correlation: float | None
 
 
-FIGURES = tuple(field.name for field in fields(Likeness))
-OF_ONE = FIGURES[:5]
+FIGURES = tuple(field.name for field in fields(ImageStatistics))
+IMAGE_FIGURES = FIGURES[:5]
 """Statistics that a single image has."""
 RATIOS = ("contrast", "cast", "edge_px")
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ImageMeasurements:
     """Measurements of a set of images.
 
     Parameters
@@ -84,28 +84,28 @@ class Seen:
     corners: Array
     blocks: NDArray[np.float32]
 
-    def values(self, figure: str) -> Array:
+    def figure_values(self, figure: str) -> Array:
         """Return (N,) determined values of a statistic of images, or (1,) of one of the set."""
-        if figure in OF_ONE:
-            column = self.rows[:, OF_ONE.index(figure)]
+        if figure in IMAGE_FIGURES:
+            column = self.rows[:, IMAGE_FIGURES.index(figure)]
         elif figure == "corners":
             corner, middle = self.corners.mean(axis=0)
             column = np.array([corner / max(middle, 1.0)])
         else:
-            column = np.array([getattr(grain_of(self.blocks), figure)])
+            column = np.array([getattr(estimate_noise(self.blocks), figure)])
         return np.asarray(column[np.isfinite(column)])
 
-    def middle(self, figure: str) -> float | None:
+    def figure_mean(self, figure: str) -> float | None:
         """Return the mean over images, geometric for ratios."""
-        found = self.values(figure)
-        return middle_of(figure, found) if len(found) else None
+        found = self.figure_values(figure)
+        return mean_of_figure(figure, found) if len(found) else None
 
-    def likeness(self) -> Likeness:
+    def to_statistics(self) -> ImageStatistics:
         """Return all statistics."""
-        return Likeness(*(self.middle(figure) for figure in FIGURES))
+        return ImageStatistics(*(self.figure_mean(figure) for figure in FIGURES))
 
 
-def middle_of(figure: str, values: Array) -> float:
+def mean_of_figure(figure: str, values: Array) -> float:
     """Return the mean of a statistic's values, geometric for ratios.
 
     Parameters
@@ -120,7 +120,7 @@ def middle_of(figure: str, values: Array) -> float:
     return float(values.mean())
 
 
-def seen(pictures: Iterable[Rgb]) -> Seen:
+def measure_images(pictures: Iterable[Rgb]) -> ImageMeasurements:
     """Measure images.
 
     Parameters
@@ -131,27 +131,27 @@ def seen(pictures: Iterable[Rgb]) -> Seen:
     rows, corners, blocks = [], [], []
     for picture in pictures:
         levels = picture.astype(np.float32)
-        luma: Picture = levels @ LUMA
-        rows.append(_of_one(levels, luma))
-        corners.append(_corners(luma))
-        blocks.append(blocks_of(luma))
-    return Seen(np.array(rows), np.array(corners), np.concatenate(blocks))
+        luma: FloatImage = levels @ LUMA
+        rows.append(_measure_image(levels, luma))
+        corners.append(_measure_corners(luma))
+        blocks.append(measure_blocks(luma))
+    return ImageMeasurements(np.array(rows), np.array(corners), np.concatenate(blocks))
 
 
-def _of_one(levels: Picture, luma: Picture) -> list[float]:
+def _measure_image(levels: FloatImage, luma: FloatImage) -> list[float]:
     """Return `IMAGE_FIGURES` of one image."""
     mean = max(float(luma.mean()), 1.0)
     red, blue = (levels[..., k] / max(float(levels[..., k].mean()), 1.0) for k in (0, 2))
     cast = max(float(levels[..., 0].mean()), 1.0) / max(float(levels[..., 2].mean()), 1.0)
     colour = float((red - blue).std())
-    return [mean / 255, float(luma.std()) / mean, cast, colour, _edge_px(luma)]
+    return [mean / 255, float(luma.std()) / mean, cast, colour, _edge_width_px(luma)]
 
 
-def _edge_px(luma: Picture) -> float:
+def _edge_width_px(luma: FloatImage) -> float:
     """Return the median width of the strongest edges, across and down, or NaN without any."""
     steps, slopes = [], []
     for lines in (luma, luma.T):
-        step = np.abs(lines[:, 2 * REACH_PX :] - lines[:, : -2 * REACH_PX])
+        step = np.abs(lines[:, 2 * EDGE_REACH_PX :] - lines[:, : -2 * EDGE_REACH_PX])
         slope = np.abs(np.diff(lines, axis=1))
         for reach in (1, 2, 4):  # the steepest of two, of four, of eight
             slope = np.maximum(slope[:, reach:], slope[:, :-reach])
@@ -164,14 +164,16 @@ def _edge_px(luma: Picture) -> float:
     return float(np.median(step[strong] / steep[strong]))
 
 
-def _corners(luma: Picture) -> list[float]:
+def _measure_corners(luma: FloatImage) -> list[float]:
     """Return the luma of the corners and of the middle."""
-    radius2 = radius2_of(*luma.shape)
-    return [float(luma[part].mean()) for part in (radius2 > CORNER, radius2 < MIDDLE)]
+    radius2 = radius_squared(*luma.shape)
+    return [
+        float(luma[part].mean()) for part in (radius2 > CORNER_RADIUS2, radius2 < MIDDLE_RADIUS2)
+    ]
 
 
 @cache
-def radius2_of(height: int, width: int) -> NDArray[np.float64]:
+def radius_squared(height: int, width: int) -> NDArray[np.float64]:
     """Return the (H, W) squared distance from the middle, 1 in the corners."""
     v, u = np.mgrid[:height, :width] + 0.5
     return np.asarray(((u / width * 2 - 1) ** 2 + (v / height * 2 - 1) ** 2) / 2)

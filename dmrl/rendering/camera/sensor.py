@@ -7,7 +7,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from dmrl.rendering.camera.distortion import Picture
+from dmrl.rendering.camera.distortion import FloatImage
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
@@ -51,7 +51,7 @@ class Sensor:
     read_noise: float = 0.0
 
 
-def expose(light: Picture, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
+def expose(light: FloatImage, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
     """Convert linear light to an (H, W, 3) uint8 image.
 
     Parameters
@@ -68,16 +68,16 @@ def expose(light: Picture, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
         target = sensor.brightness**sensor.contrast_gamma
         gain *= np.float32(target / max(float((light @ LUMINANCE).mean()), 1e-6))
     height, width, _ = light.shape
-    values = blur(_mixed(light, sensor.saturation), sensor.defocus_px)
+    values = gaussian_blur(_mix_channels(light, sensor.saturation), sensor.defocus_px)
     # Row by row: NumPy is ten times slower where the innermost axis is three colours.
     values = (values.reshape(height, -1) * np.tile(gain, width)).reshape(light.shape)
     if sensor.bayer:
-        values = mosaic(values)
+        values = apply_mosaic(values)
     if sensor.vignetting > 0:
-        falloff = 1 - np.float32(sensor.vignetting) * _radius2(height, width)
+        falloff = 1 - np.float32(sensor.vignetting) * _radius_squared(height, width)
         values *= falloff if sensor.bayer else falloff[..., None]
     grey = sensor.saturation == 0 and not sensor.bayer  # one value and one noise per pixel
-    values = _noisy(values[..., :1].copy() if grey else values, sensor, rng)
+    values = _add_noise(values[..., :1].copy() if grey else values, sensor, rng)
     if sensor.bayer:
         values = demosaic(values)
     elif grey:
@@ -89,7 +89,7 @@ def expose(light: Picture, sensor: Sensor, rng: Generator) -> NDArray[np.uint8]:
     return np.clip(levels, 0, 255, out=levels).astype(np.uint8)
 
 
-def _mixed(light: Picture, saturation: float) -> Picture:
+def _mix_channels(light: FloatImage, saturation: float) -> FloatImage:
     if saturation == 1:
         return light
     mix = np.float32(saturation) * np.eye(3, dtype=np.float32)
@@ -97,7 +97,7 @@ def _mixed(light: Picture, saturation: float) -> Picture:
     return light @ mix.T
 
 
-def _noisy(values: Picture, sensor: Sensor, rng: Generator) -> Picture:
+def _add_noise(values: FloatImage, sensor: Sensor, rng: Generator) -> FloatImage:
     """Clip values to 0 to 1 and add noise, in place."""
     np.clip(values, 0, 1, out=values)
     if sensor.shot_noise or sensor.read_noise:
@@ -108,14 +108,14 @@ def _noisy(values: Picture, sensor: Sensor, rng: Generator) -> Picture:
 
 
 @cache
-def _radius2(height: int, width: int) -> Picture:
+def _radius_squared(height: int, width: int) -> FloatImage:
     """Return the squared distance from the middle, 1 in the corners."""
     v, u = np.mgrid[:height, :width] + 0.5
     u, v = u / width * 2 - 1, v / height * 2 - 1
     return np.asarray((u * u + v * v) / 2, np.float32)
 
 
-def blur(picture: Picture, sigma_px: float) -> Picture:
+def gaussian_blur(picture: FloatImage, sigma_px: float) -> FloatImage:
     """Apply a Gaussian blur to an (H, W, C) image. Its edges are extended."""
     if sigma_px < 0.2:
         return picture
@@ -140,7 +140,7 @@ def blur(picture: Picture, sigma_px: float) -> Picture:
     return picture
 
 
-def mosaic(picture: Picture) -> Picture:
+def apply_mosaic(picture: FloatImage) -> FloatImage:
     """Convert (H, W, 3) to an (H, W) Bayer mosaic of red, green / green, blue squares."""
     raw = picture[..., 1].copy()
     raw[::2, ::2] = picture[::2, ::2, 0]
@@ -148,7 +148,7 @@ def mosaic(picture: Picture) -> Picture:
     return raw
 
 
-def demosaic(raw: Picture) -> Picture:
+def demosaic(raw: FloatImage) -> FloatImage:
     """Interpolate an (H, W, 3) image from a Bayer mosaic, linearly per colour."""
     height, width = raw.shape
     across = np.pad(raw, ((0, 0), (1, 1)), mode="reflect")

@@ -12,13 +12,13 @@ from dmrl.geometry.frames import Array
 from dmrl.rendering.robots.primitives import (
     ROTOR,
     Colour,
-    Design,
     Finish,
     Part,
-    box,
-    cylinder,
-    rounded,
-    turned,
+    RobotDesign,
+    make_box,
+    make_chamfered_box,
+    make_cylinder,
+    rotate_part,
 )
 
 ARM_M = 0.046
@@ -26,7 +26,7 @@ ROTOR_RADIUS_M = 0.0225
 HEIGHT_M = 0.029
 ROTOR_Z_M = HEIGHT_M / 2 - 0.0008
 BLADE_HALF_WIDTH_M = 0.0028
-BETWEEN_ROTORS_RAD = 1.7
+ROTOR_STEP_RAD = 1.7
 """Rotation of each rotor beyond the previous one."""
 BOARD_Z_M = -0.0035
 MOTOR_ANGLES_RAD = np.pi / 4 + np.pi / 2 * np.arange(4)
@@ -51,7 +51,7 @@ PAINT: Mapping[str, Finish] = {
     "rotor": ((0.012, 0.012, 0.012), 0.4, 0.0, 0.0),
 }
 # Alternative colours in which the parts are sold.
-OTHERS: Mapping[str, tuple[Colour, ...]] = {
+OTHER_COLOURS: Mapping[str, tuple[Colour, ...]] = {
     "deck": ((0.01, 0.02, 0.08), (0.01, 0.05, 0.02)),
     "battery": ((0.02, 0.02, 0.02), (0.05, 0.08, 0.3), (0.6, 0.6, 0.6)),
     "label": ((0.6, 0.1, 0.05), (0.05, 0.2, 0.5), (0.02, 0.02, 0.02)),
@@ -60,19 +60,19 @@ OTHERS: Mapping[str, tuple[Colour, ...]] = {
 }
 
 
-def _body() -> Iterator[Part]:
-    yield from _frame()
-    yield from _stack()
-    yield from _headers()
+def _body_parts() -> Iterator[Part]:
+    yield from _board_parts()
+    yield from _deck_parts()
+    yield from _header_parts()
     for k, angle in enumerate(MOTOR_ANGLES_RAD):
-        for part in _arm(k):
-            yield turned(part, angle)
+        for part in _arm_parts(k):
+            yield rotate_part(part, angle)
 
 
-def _frame() -> Iterator[Part]:
+def _board_parts() -> Iterator[Part]:
     """Yield the main board with its components."""
     z = BOARD_Z_M
-    yield rounded("board", (0, 0, z), (0.030, 0.030, 0.0010), 0.005)
+    yield make_chamfered_box("board", (0, 0, z), (0.030, 0.030, 0.0010), 0.005)
     for x, y, width, depth, height in (
         (0.002, 0.000, 0.0072, 0.0072, 0.0009),
         (-0.008, 0.004, 0.0050, 0.0050, 0.0009),
@@ -80,62 +80,62 @@ def _frame() -> Iterator[Part]:
         (-0.003, -0.009, 0.0040, 0.0030, 0.0011),
         (0.006, 0.009, 0.0028, 0.0020, 0.0012),
     ):
-        yield box("chip", (x, y, z + 0.0005 + height / 2), (width, depth, height))
-        yield box("chip", (-y, x, z - 0.0005 - height / 2), (depth, width, height))
-    yield box("connector", (0.0125, 0.0, z + 0.0018), (0.0052, 0.0075, 0.0026))  # USB
-    yield box("connector", (-0.0135, 0.004, z + 0.0022), (0.0040, 0.0060, 0.0034))  # battery's
-    yield box("antenna", (-0.0150, -0.006, z + 0.0009), (0.0030, 0.0080, 0.0008))
+        yield make_box("chip", (x, y, z + 0.0005 + height / 2), (width, depth, height))
+        yield make_box("chip", (-y, x, z - 0.0005 - height / 2), (depth, width, height))
+    yield make_box("connector", (0.0125, 0.0, z + 0.0018), (0.0052, 0.0075, 0.0026))  # USB
+    yield make_box("connector", (-0.0135, 0.004, z + 0.0022), (0.0040, 0.0060, 0.0034))  # battery's
+    yield make_box("antenna", (-0.0150, -0.006, z + 0.0009), (0.0030, 0.0080, 0.0008))
 
 
-def _stack() -> Iterator[Part]:
+def _deck_parts() -> Iterator[Part]:
     """Yield battery and decks: flow deck below, UWB and AI decks above."""
-    yield rounded("deck", (0, 0, -0.0100), (0.0285, 0.0280, 0.0009), 0.004)
-    yield box("chip", (0.003, 0, -0.0113), (0.006, 0.006, 0.0018))
-    yield cylinder("lens", (0.003, 0.0), 0.0017, -0.0130, -0.0122, 10)
-    yield box("chip", (-0.006, 0, -0.0110), (0.0045, 0.0025, 0.0010))
-    yield box("battery", (0.0, 0.0, 0.0018), (0.0330, 0.0170, 0.0068))
-    yield box("label", (0.0, 0.0, 0.0018), (0.0200, 0.01715, 0.00695))
-    yield box("wire", (-0.0172, 0.0030, 0.0005), (0.0016, 0.0012, 0.0060))
-    yield box("wire", (-0.0172, 0.0048, 0.0005), (0.0016, 0.0012, 0.0060))
-    yield rounded("deck", (0, 0, 0.0075), (0.0300, 0.0275, 0.0009), 0.003)
-    yield box("antenna", (-0.0105, 0.0, 0.0092), (0.0090, 0.0130, 0.0026))
-    yield box("chip", (-0.0020, 0.0060, 0.0085), (0.0060, 0.0060, 0.0010))
-    yield rounded("board", (0.0030, 0, 0.0108), (0.0300, 0.0275, 0.0009), 0.003)
-    yield box("antenna", (-0.0060, 0.0, 0.0122), (0.0120, 0.0160, 0.0020))
-    yield box("chip", (0.0065, 0.0050, 0.0119), (0.0070, 0.0070, 0.0012))
-    yield box("lens", (0.0180, 0.0, 0.0108), (0.0030, 0.0062, 0.0062))
-    yield box("chip", (0.0160, 0.0, 0.0108), (0.0022, 0.0080, 0.0072))
+    yield make_chamfered_box("deck", (0, 0, -0.0100), (0.0285, 0.0280, 0.0009), 0.004)
+    yield make_box("chip", (0.003, 0, -0.0113), (0.006, 0.006, 0.0018))
+    yield make_cylinder("lens", (0.003, 0.0), 0.0017, -0.0130, -0.0122, 10)
+    yield make_box("chip", (-0.006, 0, -0.0110), (0.0045, 0.0025, 0.0010))
+    yield make_box("battery", (0.0, 0.0, 0.0018), (0.0330, 0.0170, 0.0068))
+    yield make_box("label", (0.0, 0.0, 0.0018), (0.0200, 0.01715, 0.00695))
+    yield make_box("wire", (-0.0172, 0.0030, 0.0005), (0.0016, 0.0012, 0.0060))
+    yield make_box("wire", (-0.0172, 0.0048, 0.0005), (0.0016, 0.0012, 0.0060))
+    yield make_chamfered_box("deck", (0, 0, 0.0075), (0.0300, 0.0275, 0.0009), 0.003)
+    yield make_box("antenna", (-0.0105, 0.0, 0.0092), (0.0090, 0.0130, 0.0026))
+    yield make_box("chip", (-0.0020, 0.0060, 0.0085), (0.0060, 0.0060, 0.0010))
+    yield make_chamfered_box("board", (0.0030, 0, 0.0108), (0.0300, 0.0275, 0.0009), 0.003)
+    yield make_box("antenna", (-0.0060, 0.0, 0.0122), (0.0120, 0.0160, 0.0020))
+    yield make_box("chip", (0.0065, 0.0050, 0.0119), (0.0070, 0.0070, 0.0012))
+    yield make_box("lens", (0.0180, 0.0, 0.0108), (0.0030, 0.0062, 0.0062))
+    yield make_box("chip", (0.0160, 0.0, 0.0108), (0.0022, 0.0080, 0.0072))
 
 
-def _headers() -> Iterator[Part]:
+def _header_parts() -> Iterator[Part]:
     """Yield two rows of ten pins, 2 mm apart, through all decks."""
     for y in (-0.0110, 0.0110):
-        yield box("header", (0, y, -0.0068), (0.0200, 0.0021, 0.0045))
-        yield box("header", (0, y, 0.0040), (0.0200, 0.0021, 0.0060))
+        yield make_box("header", (0, y, -0.0068), (0.0200, 0.0021, 0.0045))
+        yield make_box("header", (0, y, 0.0040), (0.0200, 0.0021, 0.0060))
         for k in range(10):
-            yield box("pins", (-0.009 + 0.002 * k, y, 0.0007), (0.0005, 0.0005, 0.0270))
+            yield make_box("pins", (-0.009 + 0.002 * k, y, 0.0007), (0.0005, 0.0005, 0.0270))
 
 
-def _arm(number: int) -> Iterator[Part]:
+def _arm_parts(number: int) -> Iterator[Part]:
     """Yield arm, motor and LED along +x."""
     inner, z = 0.014, BOARD_Z_M
-    yield box("board", ((inner + ARM_M) / 2, 0, z), (ARM_M - inner, 0.0068, 0.0010))
+    yield make_box("board", ((inner + ARM_M) / 2, 0, z), (ARM_M - inner, 0.0068, 0.0010))
     mount = ((0.0047, -0.0145, -0.0105), (0.0053, -0.0105, -0.0015), (0.0046, -0.0015, 0.0010))
     for radius, low, high in mount:
-        yield cylinder("mount", (ARM_M, 0.0), radius, low, high)
-    yield box("mount", (ARM_M - 0.0075, 0, z - 0.0014), (0.009, 0.0080, 0.0018))
-    yield cylinder("motor", (ARM_M, 0.0), 0.0035, -0.0125, 0.0105)
-    yield cylinder("mount", (ARM_M, 0.0), 0.0024, 0.0105, HEIGHT_M / 2, 10)
-    yield box("wire", (ARM_M - 0.014, 0.0012, z + 0.0010), (0.016, 0.0007, 0.0007))
-    yield box("wire", (ARM_M - 0.014, -0.0012, z + 0.0010), (0.016, 0.0007, 0.0007))
+        yield make_cylinder("mount", (ARM_M, 0.0), radius, low, high)
+    yield make_box("mount", (ARM_M - 0.0075, 0, z - 0.0014), (0.009, 0.0080, 0.0018))
+    yield make_cylinder("motor", (ARM_M, 0.0), 0.0035, -0.0125, 0.0105)
+    yield make_cylinder("mount", (ARM_M, 0.0), 0.0024, 0.0105, HEIGHT_M / 2, 10)
+    yield make_box("wire", (ARM_M - 0.014, 0.0012, z + 0.0010), (0.016, 0.0007, 0.0007))
+    yield make_box("wire", (ARM_M - 0.014, -0.0012, z + 0.0010), (0.016, 0.0007, 0.0007))
     # LEDs of the Crazyflie: blue at the back, red and green in front.
     colour = ("green", "blue", "blue", "red")[number]
     for side in (-1, 1):
         at = (0.0245, 0.0, z + side * 0.0010)
-        yield box(colour, at, (0.0020, 0.0016, 0.0010))
+        yield make_box(colour, at, (0.0020, 0.0016, 0.0010))
 
 
-def _rotors() -> Iterator[Part]:
+def _rotor_parts() -> Iterator[Part]:
     """Yield the discs that the blades sweep. Their material shows the blades."""
     sides = 40
     turn = 2 * np.pi * np.arange(sides) / sides
@@ -147,10 +147,10 @@ def _rotors() -> Iterator[Part]:
         yield "rotor", np.column_stack([points, np.full(sides + 1, ROTOR_Z_M)]), fan
 
 
-CRAZYFLIE = Design(PAINT, OTHERS, lambda: (*_body(), *_rotors()))
+CRAZYFLIE = RobotDesign(PAINT, OTHER_COLOURS, lambda: (*_body_parts(), *_rotor_parts()))
 
 
-def outline(scale: float, first_rad: float, sweep_rad: float) -> Array:
+def outline_points(scale: float, first_rad: float, sweep_rad: float) -> Array:
     """Return (N, 3) points that span the visible robot: body and swept blades.
 
     Parameters
@@ -162,7 +162,7 @@ def outline(scale: float, first_rad: float, sweep_rad: float) -> Array:
     sweep_rad
         Rotation of all rotors during the exposure.
     """
-    whole = CRAZYFLIE.mesh()
+    whole = CRAZYFLIE.build_mesh()
     body = whole.vertices[
         np.unique(whole.faces[whole.material != CRAZYFLIE.materials.index(ROTOR)])
     ]
@@ -174,7 +174,7 @@ def outline(scale: float, first_rad: float, sweep_rad: float) -> Array:
     points = [body]
     for k, arm in enumerate(MOTOR_ANGLES_RAD):
         for blade in (0.0, np.pi):
-            turn = angle + first_rad + k * BETWEEN_ROTORS_RAD + blade
+            turn = angle + first_rad + k * ROTOR_STEP_RAD + blade
             x = np.cos(turn) * radius + np.cos(arm) * ARM_M
             y = np.sin(turn) * radius + np.sin(arm) * ARM_M
             points.append(np.column_stack([x, y, np.full(len(x), ROTOR_Z_M)]))

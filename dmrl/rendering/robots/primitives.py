@@ -44,7 +44,7 @@ class Mesh:
 
 
 @dataclass(frozen=True)
-class Design:
+class RobotDesign:
     """Built-in robot.
 
     Parameters
@@ -66,17 +66,17 @@ class Design:
         """Names in the order of the mesh's indices."""
         return tuple(self.paint)
 
-    def mesh(self) -> Mesh:
+    def build_mesh(self) -> Mesh:
         """Return the mesh of the whole robot. The arrays are cached: do not modify them."""
-        return _mesh(self.parts, self.materials)
+        return _build_mesh(self.parts, self.materials)
 
 
 @cache
-def _mesh(parts: Callable[[], Iterable[Part]], materials: tuple[str, ...]) -> Mesh:
-    return joined(parts(), materials)
+def _build_mesh(parts: Callable[[], Iterable[Part]], materials: tuple[str, ...]) -> Mesh:
+    return join_parts(parts(), materials)
 
 
-def joined(parts: Iterable[Part], materials: tuple[str, ...]) -> Mesh:
+def join_parts(parts: Iterable[Part], materials: tuple[str, ...]) -> Mesh:
     """Join parts into one surface.
 
     Parameters
@@ -99,7 +99,7 @@ def joined(parts: Iterable[Part], materials: tuple[str, ...]) -> Mesh:
     return Mesh(*(np.concatenate(one) for one in (vertices, faces, material, rotor)))
 
 
-def prism(outline: Array, low: float, high: float) -> tuple[Array, NDArray[np.int64]]:
+def make_prism(outline: Array, low: float, high: float) -> tuple[Array, NDArray[np.int64]]:
     """Make a prism of a convex (K, 2) outline, anticlockwise from above, between two heights."""
     count = len(outline)
     points = np.concatenate(
@@ -117,30 +117,32 @@ def prism(outline: Array, low: float, high: float) -> tuple[Array, NDArray[np.in
     return points, np.concatenate([fan[:, ::-1], fan + count, sides])
 
 
-def box(name: str, centre: tuple[float, float, float], size: tuple[float, float, float]) -> Part:
+def make_box(
+    name: str, centre: tuple[float, float, float], size: tuple[float, float, float]
+) -> Part:
     """Build a box with sides along the axes, metres."""
     x, y, z = centre
     outline = CORNERS * np.array(size[:2]) / 2 + (x, y)
-    return name, *prism(outline, z - size[2] / 2, z + size[2] / 2)
+    return name, *make_prism(outline, z - size[2] / 2, z + size[2] / 2)
 
 
-def cylinder(
+def make_cylinder(
     name: str, xy: tuple[float, float], radius: float, low: float, high: float, sides: int = 14
 ) -> Part:
     """Build an upright cylinder about ``xy``, from ``low`` to ``high``, metres."""
     turn = 2 * np.pi * np.arange(sides) / sides
     outline = np.column_stack([np.cos(turn), np.sin(turn)]) * radius + xy
-    return name, *prism(outline, low, high)
+    return name, *make_prism(outline, low, high)
 
 
-def turned(part: Part, angle: float) -> Part:
+def rotate_part(part: Part, angle: float) -> Part:
     """Rotate a part about the z axis."""
     name, points, faces = part
     c, s = np.cos(angle), np.sin(angle)
     return name, points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]), faces
 
 
-def rounded(
+def make_chamfered_box(
     name: str, centre: tuple[float, float, float], size: tuple[float, float, float], cut: float
 ) -> Part:
     """Build a box with chamfered upright edges, as circuit boards have."""
@@ -158,4 +160,4 @@ def rounded(
             (half_x - cut, -half_y),
         ]
     )
-    return name, *prism(outline + np.array([x, y]), z - size[2] / 2, z + size[2] / 2)
+    return name, *make_prism(outline + np.array([x, y]), z - size[2] / 2, z + size[2] / 2)

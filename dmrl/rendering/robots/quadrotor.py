@@ -19,10 +19,10 @@ DISC_CORNERS = 20
 ARM_ANGLES_RAD = np.pi / 4 + np.arange(4) * np.pi / 2
 
 # Corners of the six faces of a box. Corner k has the signs of the bits of k (x, y, z).
-FACES = np.array(
+BOX_FACES = np.array(
     [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
 )
-SIGNS = np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)]) * 2.0 - 1.0
+CORNER_SIGNS = np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)]) * 2.0 - 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Mesh:
     glows: NDArray[np.bool_]
 
 
-def _boxes() -> Iterator[tuple[tuple[float, float, float], Array, float, Array, bool]]:
+def _iter_boxes() -> Iterator[tuple[tuple[float, float, float], Array, float, Array, bool]]:
     """Yield centre, half sizes, yaw, colour and glow of every box."""
     black, dark = np.array([0.05, 0.05, 0.06]), np.array([0.12, 0.12, 0.13])
     metal, grey = np.array([0.45, 0.45, 0.47]), np.array([0.3, 0.31, 0.33])
@@ -71,44 +71,44 @@ def _boxes() -> Iterator[tuple[tuple[float, float, float], Array, float, Array, 
     yield (0.013, 0.0, -0.0085), np.array([0.003, 0.003, 0.003]), 0.0, dark, False
 
 
-def _mesh() -> Mesh:
+def _build_mesh() -> Mesh:
     corners, normals, colours, glows = [], [], [], []
-    for centre, half, yaw, colour, glow in _boxes():
+    for centre, half, yaw, colour, glow in _iter_boxes():
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        box = (SIGNS * half) @ turn.T
-        outward = box[FACES].mean(axis=1)
-        corners.append(box[FACES] + centre)
+        box = (CORNER_SIGNS * half) @ turn.T
+        outward = box[BOX_FACES].mean(axis=1)
+        corners.append(box[BOX_FACES] + centre)
         normals.append(outward / np.linalg.norm(outward, axis=1, keepdims=True))
-        colours.append(np.tile(colour, (len(FACES), 1)))
-        glows.append(np.full(len(FACES), glow))
+        colours.append(np.tile(colour, (len(BOX_FACES), 1)))
+        glows.append(np.full(len(BOX_FACES), glow))
     return Mesh(*(np.concatenate(part) for part in (corners, normals, colours, glows)))
 
 
-MESH = _mesh()
+MESH = _build_mesh()
 
 
-def blades(turn_rad: float) -> Array:
+def blade_outlines(turn_rad: float) -> Array:
     """Return (4, 4, 3) outlines of the blades. Each rotor is a quarter turn ahead of the last."""
     angle = turn_rad + ARM_ANGLES_RAD * 1.5
     along = np.stack([np.cos(angle), np.sin(angle), np.zeros(4)], axis=1) * ROTOR_RADIUS_M
     across = np.stack([-np.sin(angle), np.cos(angle), np.zeros(4)], axis=1) * BLADE_HALF_WIDTH_M
     outline = np.stack([along + across, along - across, -along - across, -along + across], axis=1)
-    return outline + _hubs()[:, None]
+    return outline + _rotor_hubs()[:, None]
 
 
-def _hubs() -> Array:
+def _rotor_hubs() -> Array:
     x, y = np.cos(ARM_ANGLES_RAD) * ARM_M, np.sin(ARM_ANGLES_RAD) * ARM_M
     return np.stack([x, y, np.full(4, ROTOR_Z_M)], axis=1)
 
 
-def _discs() -> Array:
+def _disc_outlines() -> Array:
     turn = np.arange(DISC_CORNERS) * 2 * np.pi / DISC_CORNERS
     rim = np.stack([np.cos(turn), np.sin(turn), np.zeros(DISC_CORNERS)], axis=1) * ROTOR_RADIUS_M
-    return rim + _hubs()[:, None]
+    return rim + _rotor_hubs()[:, None]
 
 
-DISCS = _discs()
+ROTOR_DISCS = _disc_outlines()
 """(4, DISC_CORNERS, 3) outlines of the discs that the rotors sweep."""
 
 RADIUS_M = float(np.hypot(ARM_M + ROTOR_RADIUS_M, ROTOR_Z_M))

@@ -9,12 +9,12 @@ from dmrl.datasets import open_dataset
 from dmrl.datasets.writing import dataset_writer
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.images.codec import encode_png
-from dmrl.messages import STATUS_AMBIGUOUS, STATUS_UNCONVERGED, message, schema_bytes
+from dmrl.messages import STATUS_AMBIGUOUS, STATUS_UNCONVERGED, message_class, serialize_schema
 from dmrl.recording import Channel, Provenance, RawMessage, RecordingWriter, read
 from dmrl.stages import convert
 from dmrl.stages import dataset as stage
 from dmrl.stages.dataset import Settings, run
-from dmrl.topics import camera_image, labels
+from dmrl.topics import CAMERA_IMAGE, LABELS
 
 from ..conftest import HEIGHT_PX, STEP_NS, WIDTH_PX, Record, peer, pixels_of
 
@@ -160,7 +160,7 @@ def test_cameras_of_other_focal_lengths_are_said(
         flights.append(tmp_path / name)
         bare = record(f"of-{name}", seed=len(flights))
         with RecordingWriter(flights[-1], Provenance("test")) as sink:
-            made = message("CameraCalibration")(K=[focal_px, 0, 32, 0, focal_px, 24, 0, 0, 1])
+            made = message_class("CameraCalibration")(K=[focal_px, 0, 32, 0, focal_px, 24, 0, 0, 1])
             sink.write(0, "/cf1/camera/calibration", made)
             for stamped in read(bare):
                 sink.write(stamped.time_ns, stamped.topic, stamped.message)
@@ -222,7 +222,7 @@ def test_of_large_images_few_are_in_memory(
     record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[int] = []
-    batch = dataset_writer._record_batch
+    batch = dataset_writer._build_record_batch
     monkeypatch.setattr(
         dataset_writer,
         "_record_batch",
@@ -260,9 +260,9 @@ def test_a_recording_without_labels_is_refused_by_topic(record: Record, tmp_path
 def test_a_topic_with_another_message_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "odd.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
-        picture = message("CompressedImage")(data=encode_png(pixels_of(0)), format="png")
-        sink.write(0, camera_image("cf1"), picture)
-        odd = Channel(labels("cf1"), "dmrl.v1.Height", schema_bytes("Height"))
+        picture = message_class("CompressedImage")(data=encode_png(pixels_of(0)), format="png")
+        sink.write(0, CAMERA_IMAGE("cf1"), picture)
+        odd = Channel(LABELS("cf1"), "dmrl.v1.Height", serialize_schema("Height"))
         sink.write_raw(RawMessage(0, 0, odd, b""))
     with pytest.raises(RecordingError, match=r"/cf1/labels .*Height"):
         run([path], tmp_path / "out", PLAIN)

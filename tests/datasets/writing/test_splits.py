@@ -5,17 +5,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmrl.datasets import open_dataset
-from dmrl.datasets.writing.splits import held_out, of_source
+from dmrl.datasets.writing.splits import build_split_lookup, choose_test_recordings
 from dmrl.errors import RecordingError, SettingError
 from dmrl.recording import (
     SPLIT_METADATA,
     Provenance,
     RecordingWriter,
     Summary,
+    build_provenance,
     merge,
-    provenance,
     read,
-    splits,
+    read_splits,
     trim,
 )
 from dmrl.stages.dataset import Settings, run
@@ -87,26 +87,26 @@ def test_at_least_one_recording_is_held_out_and_one_stays(
     count: int, share: float, held: int
 ) -> None:
     hashes = {Path(f"{k}.mcap"): f"{k:064x}" for k in range(count)}
-    assert len(held_out(hashes, share, 0)) == held
+    assert len(choose_test_recordings(hashes, share, 0)) == held
 
 
 def test_the_choice_depends_on_content_and_seed_only() -> None:
     hashes = {Path(f"{k}.mcap"): f"{k:064x}" for k in range(20)}
     renamed = {Path(f"{99 - k}.mcap"): hashes[Path(f"{k}.mcap")] for k in reversed(range(20))}
-    chosen = {hashes[path] for path in held_out(hashes, 0.3, 0)}
-    assert chosen == {renamed[path] for path in held_out(renamed, 0.3, 0)}
-    assert chosen != {hashes[path] for path in held_out(hashes, 0.3, 1)}
+    chosen = {hashes[path] for path in choose_test_recordings(hashes, 0.3, 0)}
+    assert chosen == {renamed[path] for path in choose_test_recordings(renamed, 0.3, 0)}
+    assert chosen != {hashes[path] for path in choose_test_recordings(hashes, 0.3, 1)}
 
 
 @pytest.mark.parametrize("text", ["[[0]]", "[1, 2]", "train", "null", '[["a", 2]]'])
 def test_a_split_that_is_no_list_of_spans_is_refused(text: str) -> None:
     with pytest.raises(RecordingError, match=r"x.mcap: its split is not a list of \[start_ns"):
-        splits(Path("x.mcap"), Summary({}, 0, 0, {SPLIT_METADATA: [{"train": text}]}, {}))
+        read_splits(Path("x.mcap"), Summary({}, 0, 0, {SPLIT_METADATA: [{"train": text}]}, {}))
 
 
 def test_splits_that_share_a_time_are_refused() -> None:
     with pytest.raises(RecordingError, match=r"splits train and test share the time 5 ns"):
-        of_source(Path("x.mcap"), {"train": [(0, 5)], "test": [(5, 9)]})
+        build_split_lookup(Path("x.mcap"), {"train": [(0, 5)], "test": [(5, 9)]})
 
 
 def test_two_recordings_of_one_name_are_refused(record: Record, tmp_path: Path) -> None:
@@ -131,7 +131,7 @@ def test_a_recording_beside_one_that_knows_it_through_a_dataset(
     # As a render over its images does, or labels of a model that learned from it.
     flight, other = record("x.mcap"), tmp_path / "over.mcap"
     run([flight], tmp_path / "set", Settings())
-    with RecordingWriter(other, provenance("render", {}, [tmp_path / "set"])) as sink:
+    with RecordingWriter(other, build_provenance("render", {}, [tmp_path / "set"])) as sink:
         for stamped in read(flight):
             sink.write(stamped.time_ns + 1, stamped.topic, stamped.message)
     assert sum(run([flight, other], tmp_path / "out", Settings()).images.values()) == 12
@@ -173,7 +173,7 @@ def test_every_time_has_the_split_of_its_span(data: st.DataObject) -> None:
     own: dict[str, list[tuple[int, int]]] = {name: [] for name in names}
     for k in data.draw(st.permutations(range(len(spans)))):
         own[names[k]].append(spans[k])
-    split_of = of_source(Path("x.mcap"), own)
+    split_of = build_split_lookup(Path("x.mcap"), own)
     for time_ns in range(-1, 62):
         there = [n for n, (start, end) in zip(names, spans, strict=True) if start <= time_ns <= end]
         assert split_of(time_ns) == (there[0] if there else None)
@@ -184,7 +184,10 @@ def test_about_the_share_is_held_out_and_more_is_never_other_recordings(
     hashes: set[str], share: float
 ) -> None:
     content = {Path(f"{k}.mcap"): sha for k, sha in enumerate(sorted(hashes))}
-    held, more = held_out(content, share, 3), held_out(content, min(share + 0.2, 1), 3)
+    held, more = (
+        choose_test_recordings(content, share, 3),
+        choose_test_recordings(content, min(share + 0.2, 1), 3),
+    )
     assert held <= more <= content.keys()
     if share > 0 and len(content) > 1:
         assert 1 <= len(held) < len(content)

@@ -9,24 +9,24 @@ from torch import Tensor, nn
 
 from dmrl.deploy.int8.graph import (
     FloatAdd,
-    Graph,
-    graph_of,
-    grey_of,
-    outputs_of,
-    tensors_of,
-    to_input,
+    FloatGraph,
+    build_graph,
+    compute_tensors,
+    normalize_images,
+    rgb_to_grey,
+    select_outputs,
 )
 from dmrl.errors import ModelError
 from dmrl.learn.networks import architectures as networks
-from dmrl.learn.networks.architectures import Network, build
-from dmrl.learn.networks.trace import operations
+from dmrl.learn.networks.architectures import Network, build_network
+from dmrl.learn.networks.trace import trace_operations
 
 IMAGES = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3)).astype(np.uint8)
 
 
 def settled(name: str) -> Network:
     """A network with statistics of images behind its normalisations, as training leaves it."""
-    network = build(name, seed=1).train()
+    network = build_network(name, seed=1).train()
     with torch.no_grad():
         for parameter in network.parameters():
             parameter += 0.1 * torch.randn(parameter.shape, generator=torch.manual_seed(2))
@@ -36,11 +36,11 @@ def settled(name: str) -> Network:
 
 
 def torch_input(images: np.ndarray) -> Tensor:
-    return networks.to_input(torch.from_numpy(images).permute(0, 3, 1, 2))
+    return networks.normalize_images(torch.from_numpy(images).permute(0, 3, 1, 2))
 
 
-def outputs(graph: Graph, images: np.ndarray) -> np.ndarray:
-    return outputs_of(graph, tensors_of(graph, to_input(images)))
+def outputs(graph: FloatGraph, images: np.ndarray) -> np.ndarray:
+    return select_outputs(graph, compute_tensors(graph, normalize_images(images)))
 
 
 @pytest.mark.parametrize("name", ["locanet", "dmrl-nano", "dmrl-nano-fine"])
@@ -48,21 +48,21 @@ def test_the_layers_compute_what_torch_computes(name: str) -> None:
     network = settled(name)
     with torch.no_grad():
         wanted = network(torch_input(IMAGES)).numpy()
-    got = outputs(graph_of(operations(network)), IMAGES)
+    got = outputs(build_graph(trace_operations(network)), IMAGES)
     assert np.ptp(wanted) > 0.1
     np.testing.assert_allclose(got, wanted, atol=2e-5 * np.abs(wanted).max())
 
 
 def test_a_grey_network_gives_the_same_on_grey_images() -> None:
-    graph = graph_of(operations(settled("locanet")))
-    grey = grey_of(IMAGES)
+    graph = build_graph(trace_operations(settled("locanet")))
+    grey = rgb_to_grey(IMAGES)
     wanted = outputs(graph, np.repeat(grey, 3, axis=3))
-    np.testing.assert_allclose(outputs(graph.grey(), grey), wanted, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(outputs(graph.to_grey(), grey), wanted, rtol=1e-4, atol=1e-5)
 
 
 def test_grey_of_a_grey_picture_is_itself() -> None:
     levels = np.arange(256, dtype=np.uint8).reshape(1, 16, 16, 1)
-    np.testing.assert_array_equal(grey_of(np.repeat(levels, 3, axis=3)), levels)
+    np.testing.assert_array_equal(rgb_to_grey(np.repeat(levels, 3, axis=3)), levels)
 
 
 class Odd(Network):
@@ -101,7 +101,7 @@ def test_what_cannot_be_carried_is_named_with_what_to_use_instead(
     part: nn.Module | Callable[[Tensor], Tensor], words: str
 ) -> None:
     with pytest.raises(ModelError, match=words):
-        graph_of(operations(Odd(part)))
+        build_graph(trace_operations(Odd(part)))
 
 
 def test_heads_may_be_convolutions_of_their_own() -> None:
@@ -116,7 +116,7 @@ def test_heads_may_be_convolutions_of_their_own() -> None:
             return torch.cat([self.depth(x), self.confidence(x)], 1)
 
     network = TwoHeads().eval()
-    graph = graph_of(operations(network))
+    graph = build_graph(trace_operations(network))
     assert graph.outputs == ((2, 0), (3, 0))
     with torch.no_grad():
         wanted = network(torch_input(IMAGES)).numpy()
@@ -151,7 +151,7 @@ class Summed(Network):
 )
 def test_a_sum_is_part_of_the_dense_convolution_before_it(network: Network, sums: int) -> None:
     network.eval()
-    graph = graph_of(operations(network))
+    graph = build_graph(trace_operations(network))
     assert sum(isinstance(layer, FloatAdd) for layer in graph.layers) == sums
     with torch.no_grad():
         wanted = network(torch_input(IMAGES)).numpy()

@@ -105,9 +105,9 @@ def test_shapes_and_products_are_those_of_the_places_that_fit(
         return len([k for k in range(side + 2 * padding) if k % stride == 0 and k <= last])
 
     wanted = (2, places(8), places(10))
-    assert layer.shape((SHAPE,)) == wanted
-    assert layer.macs((SHAPE,)) == np.prod(wanted) * 3 * kernel**2
-    assert MaxPool("pool", 0).shape(((4, 9, 6),)) == (4, 4, 3)
+    assert layer.output_shape((SHAPE,)) == wanted
+    assert layer.count_macs((SHAPE,)) == np.prod(wanted) * 3 * kernel**2
+    assert MaxPool("pool", 0).output_shape(((4, 9, 6),)) == (4, 4, 3)
 
 
 def test_pools_keep_their_type_and_sums_are_of_one_shape() -> None:

@@ -7,19 +7,33 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.deploy.backends import Float, integer
+from dmrl.deploy.backends import FloatBackend, build_reference_backend
 from dmrl.deploy.int8 import reference
-from dmrl.deploy.int8.activation_ranges import calibrate
-from dmrl.deploy.int8.equalisation import equalise
-from dmrl.deploy.int8.graph import FloatConv, Graph, grey_of, outputs_of, tensors_of, to_input
-from dmrl.deploy.int8.layer_errors import layer_figures
+from dmrl.deploy.int8.activation_ranges import calibrate_ranges
+from dmrl.deploy.int8.equalisation import equalise_channels
+from dmrl.deploy.int8.graph import (
+    FloatConv,
+    FloatGraph,
+    compute_tensors,
+    normalize_images,
+    rgb_to_grey,
+    select_outputs,
+)
+from dmrl.deploy.int8.layer_errors import compute_layer_errors
 from dmrl.deploy.int8.network import Conv
-from dmrl.deploy.int8.quantise import MEANINGS, About, _fixed_point, _odd, _shortened, quantise
+from dmrl.deploy.int8.quantise import (
+    HEAD_CONVERSIONS,
+    NetworkInfo,
+    _limit_bits,
+    _round_to_odd,
+    _to_fixed_point,
+    quantise_network,
+)
 from dmrl.errors import ModelError, SettingError
 
 from ..graphs import quantised_network, random_graph
 
-ABOUT = About("small", "small", 8, ("log_depth", "confidence"), 0.3)
+ABOUT = NetworkInfo("small", "small", 8, ("log_depth", "confidence"), 0.3)
 NOISE = np.random.default_rng(1).integers(0, 256, (3, 16, 24, 3)).astype(np.uint8)
 
 
@@ -28,13 +42,13 @@ def rgb_images(seed: int) -> np.ndarray:
     return np.repeat(images, 3, axis=3) if images.shape[3] == 1 else images
 
 
-def small(weight: float = 1.0, bias: float = 0.0) -> Graph:
+def small(weight: float = 1.0, bias: float = 0.0) -> FloatGraph:
     """A 3x3 convolution with ReLU, then a head of two channels."""
     rng = np.random.default_rng(0)
     first = FloatConv("first", (0,), weight * rng.normal(0, 0.3, (4, 3, 3, 3)),
                       np.full(4, bias), padding=1, relu=True)  # fmt: skip
     head = FloatConv("head", (1,), rng.normal(0, 0.5, (2, 4, 1, 1)), np.array([0.1, -2.0]))
-    return Graph((first, head), ((2, 0), (2, 1)))
+    return FloatGraph((first, head), ((2, 0), (2, 1)))
 
 
 @pytest.mark.heavy
@@ -43,8 +57,8 @@ def test_int8_is_near_float_on_most_random_networks() -> None:
     for seed in range(60):
         graph, channels, _ = random_graph(seed)
         images = rgb_images(seed)
-        wanted = Float(graph, channels).outputs(images)
-        got = integer(quantised_network(seed)).outputs(images)
+        wanted = FloatBackend(graph, channels).outputs(images)
+        got = build_reference_backend(quantised_network(seed)).outputs(images)
         for name, value in wanted.items():
             error = ((value - got[name]) ** 2).mean()
             sqnr_db.append(10 * np.log10((value**2).mean() / error))
@@ -56,12 +70,12 @@ def test_equalising_changes_nothing_but_the_ranges() -> None:
     moved = 0
     for seed in range(30):
         graph, _, images = random_graph(seed)
-        ranges = calibrate(graph, [rgb_images(seed)])
-        even, even_ranges = equalise(graph, ranges)
-        wanted = outputs_of(graph, tensors_of(graph, to_input(images)))
-        tensors = tensors_of(even, to_input(images))
+        ranges = calibrate_ranges(graph, [rgb_images(seed)])
+        even, even_ranges = equalise_channels(graph, ranges)
+        wanted = select_outputs(graph, compute_tensors(graph, normalize_images(images)))
+        tensors = compute_tensors(even, normalize_images(images))
         np.testing.assert_allclose(
-            outputs_of(even, tensors), wanted, atol=1e-4 * np.abs(wanted).max()
+            select_outputs(even, tensors), wanted, atol=1e-4 * np.abs(wanted).max()
         )
         for tensor, high in zip(tensors, even_ranges.high, strict=True):
             np.testing.assert_allclose(tensor.max(axis=(0, 2, 3)), high, rtol=1e-3, atol=1e-4)
@@ -79,9 +93,9 @@ def test_channels_along_a_residual_block_have_like_ranges() -> None:
     block = FloatConv("block", (1, 1), size[:, None, None, None] * rng.normal(0, 1, (4, 4, 1, 1)),
                       np.zeros(4), relu=True)  # fmt: skip
     head = FloatConv("head", (2,), rng.normal(0, 0.5, (2, 4, 1, 1)), np.zeros(2))
-    graph = Graph((first, block, head), ((3, 0), (3, 1)))
-    ranges = calibrate(graph, [NOISE])
-    _, even = equalise(graph, ranges)
+    graph = FloatGraph((first, block, head), ((3, 0), (3, 1)))
+    ranges = calibrate_ranges(graph, [NOISE])
+    _, even = equalise_channels(graph, ranges)
     for tensor in (1, 2):
         before, after = (np.ptp(np.log(each.high[tensor])) for each in (ranges, even))
         assert before > 2.5
@@ -90,8 +104,8 @@ def test_channels_along_a_residual_block_have_like_ranges() -> None:
 
 def test_a_bias_that_outweighs_its_channel_still_fits() -> None:
     graph = small(weight=1e-7, bias=3.0)
-    network = quantise(graph, calibrate(graph, [NOISE]), ABOUT)
-    first, head = layer_figures(graph, network, NOISE)[0], network.layers[0]
+    network = quantise_network(graph, calibrate_ranges(graph, [NOISE]), ABOUT)
+    first, head = compute_layer_errors(graph, network, NOISE)[0], network.layers[0]
     assert isinstance(head, Conv)
     assert np.abs(head.bias.astype(np.int64)).max() < 2**31 - 1
     assert first.sqnr_db is not None
@@ -100,8 +114,8 @@ def test_a_bias_that_outweighs_its_channel_still_fits() -> None:
 
 def test_the_grid_of_levels_holds_the_range_and_zero() -> None:
     graph = small()
-    network = quantise(graph, calibrate(graph, [NOISE]), ABOUT)
-    wanted = outputs_of(graph, tensors_of(graph, to_input(NOISE)))
+    network = quantise_network(graph, calibrate_ranges(graph, [NOISE]), ABOUT)
+    wanted = select_outputs(graph, compute_tensors(graph, normalize_images(NOISE)))
     for head, values in ((network.depth, wanted[:, 0]), (network.confidence, wanted[:, 1])):
         ends = head.scale * (np.array([-128, 127]) - head.zero_point)
         assert ends[0] <= values.min() < values.max() <= ends[1]
@@ -109,7 +123,7 @@ def test_the_grid_of_levels_holds_the_range_and_zero() -> None:
 
 
 def test_tables_say_what_the_levels_mean() -> None:
-    network = quantise(small(), calibrate(small(), [NOISE]), ABOUT)
+    network = quantise_network(small(), calibrate_ranges(small(), [NOISE]), ABOUT)
     logit = network.confidence.scale * (np.arange(-128, 128) - network.confidence.zero_point)
     np.testing.assert_allclose(
         network.confidence.table / 65535, 1 / (1 + np.exp(-logit)), atol=1e-5
@@ -123,28 +137,28 @@ def test_tables_say_what_the_levels_mean() -> None:
 def test_images_of_one_colour_are_refused() -> None:
     plain = np.stack([np.full((16, 24, 3), level, np.uint8) for level in (0, 90, 255)])
     with pytest.raises(SettingError, match=r"the 3 calibration images is of a single colour"):
-        calibrate(small(), [plain])
-    assert calibrate(small(), [NOISE, plain]).images == 6  # one that varies will do
+        calibrate_ranges(small(), [plain])
+    assert calibrate_ranges(small(), [NOISE, plain]).images == 6  # one that varies will do
 
 
 def test_no_images_are_refused() -> None:
     with pytest.raises(SettingError, match="no images to calibrate on"):
-        calibrate(small(), [])
+        calibrate_ranges(small(), [])
 
 
 def test_a_layer_that_is_always_zero_is_named() -> None:
     with pytest.raises(SettingError, match="layer first is zero for all of the 3 calibration"):
-        calibrate(small(bias=-100.0), [NOISE])
+        calibrate_ranges(small(bias=-100.0), [NOISE])
 
 
 def test_a_network_without_confidence_is_refused() -> None:
-    ranges = calibrate(small(), [NOISE])
+    ranges = calibrate_ranges(small(), [NOISE])
     with pytest.raises(SettingError, match="gives no confidence"):
-        quantise(small(), ranges, replace(ABOUT, channels=("log_depth", "class")))
+        quantise_network(small(), ranges, replace(ABOUT, channels=("log_depth", "class")))
 
 
 def test_a_network_that_breaks_its_promises_is_refused() -> None:
-    network = quantise(small(), calibrate(small(), [NOISE]), ABOUT)
+    network = quantise_network(small(), calibrate_ranges(small(), [NOISE]), ABOUT)
     first = network.layers[0]
     assert isinstance(first, Conv)
     loud = replace(first, bias=np.full(4, 2**31 - 1, np.int32))
@@ -159,7 +173,7 @@ def test_a_network_that_breaks_its_promises_is_refused() -> None:
 def test_multipliers_are_31_bits_and_one_shift_that_rounds_no_sum_by_a_tenth_of_a_step(
     divisors: list[float],
 ) -> None:
-    multipliers, shift = _fixed_point(np.array(divisors))
+    multipliers, shift = _to_fixed_point(np.array(divisors))
     assert 1 <= shift <= 32
     for divisor, multiplier in zip(divisors, multipliers.tolist(), strict=True):
         assert 1 <= multiplier < 2**31
@@ -174,7 +188,7 @@ def test_multipliers_are_31_bits_and_one_shift_that_rounds_no_sum_by_a_tenth_of_
 def test_the_shift_is_32_where_the_high_word_will_do(
     divisor: float, wanted: tuple[int, int]
 ) -> None:
-    (multiplier,), shift = _fixed_point(np.array([divisor]))
+    (multiplier,), shift = _to_fixed_point(np.array([divisor]))
     assert (multiplier, shift) == wanted
 
 
@@ -182,16 +196,16 @@ def test_the_shift_is_32_where_the_high_word_will_do(
 def test_a_sum_by_its_multiplier_is_the_quotient_rounded_down(
     divisor: int, level: int, beside: int
 ) -> None:
-    (multiplier,), shift = _fixed_point(np.array([float(divisor)]))
+    (multiplier,), shift = _to_fixed_point(np.array([float(divisor)]))
     total = max(level * divisor + beside, 0)
     assert total * int(multiplier) >> shift == total // divisor
     assert np.rint((total - divisor // 2) / divisor) == total // divisor
 
 
 def test_divisors_are_odd_and_gains_have_16_bits() -> None:
-    divisors = _odd(np.array([0.3, 1.0, 2.9, 3.0, 100.2, 101.0]))
+    divisors = _round_to_odd(np.array([0.3, 1.0, 2.9, 3.0, 100.2, 101.0]))
     assert divisors.tolist() == [0.25, 1.0, 1.0, 3.0, 99.0, 101.0]
-    gains = _shortened(np.array([0.2, 3.4, 65535.0, 131_071.0, 8_388_000.0]))
+    gains = _limit_bits(np.array([0.2, 3.4, 65535.0, 131_071.0, 8_388_000.0]))
     assert gains.tolist() == [0.0, 3.0, 65535.0, 131_072.0, 8_387_968.0]
     for seed in range(10):
         for layer in quantised_network(seed).layers:
@@ -206,9 +220,9 @@ def test_sums_are_rounded_to_the_nearest_level(shortcut: bool) -> None:
     assert isinstance(first, FloatConv)
     sources = (1, 1) if shortcut else (1,)
     second = FloatConv("second", sources, np.eye(4)[:, :, None, None], np.zeros(4), relu=True)
-    graph = Graph((first, second, replace(head, sources=(2,))), ((3, 0), (3, 1)))
-    network = quantise(graph, calibrate(graph, [NOISE]), ABOUT)
-    _, before, after, _ = reference.tensors_of(network, NOISE[0])
+    graph = FloatGraph((first, second, replace(head, sources=(2,))), ((3, 0), (3, 1)))
+    network = quantise_network(graph, calibrate_ranges(graph, [NOISE]), ABOUT)
+    _, before, after, _ = reference.iter_tensors(network, NOISE[0])
     one, two = network.layers[:2]
     wanted = before * one.scale * (2 if shortcut else 1) / two.scale
     beside = (after - wanted)[(after > 0) & (after < 255)]
@@ -223,9 +237,9 @@ def test_the_largest_value_that_was_seen_has_the_last_level() -> None:
     assert isinstance(first, FloatConv)
     second = FloatConv("second", (1,), rng.normal(0, 0.5, (4, 4, 1, 1)), np.zeros(4))
     head = FloatConv("head", (2,), rng.normal(0, 0.5, (2, 4, 1, 1)), np.array([0.1, -2.0]))
-    graph = Graph((first, second, head), ((3, 0), (3, 1)))
-    network = quantise(graph, calibrate(graph, [NOISE]), ABOUT)
-    tensors = [list(reference.tensors_of(network, image)) for image in NOISE]
+    graph = FloatGraph((first, second, head), ((3, 0), (3, 1)))
+    network = quantise_network(graph, calibrate_ranges(graph, [NOISE]), ABOUT)
+    tensors = [list(reference.iter_tensors(network, image)) for image in NOISE]
     unsigned, signed = (np.stack([t[k] for t in tensors]) for k in (1, 2))
     assert (unsigned.min(), unsigned.max()) == (0, pytest.approx(255, abs=2))
     assert np.abs(signed).max() == pytest.approx(127, abs=2)
@@ -233,24 +247,29 @@ def test_the_largest_value_that_was_seen_has_the_last_level() -> None:
 
 
 def test_ranges_are_those_of_all_images_and_grey_networks_see_grey() -> None:
-    alone = calibrate(small(), [NOISE])
+    alone = calibrate_ranges(small(), [NOISE])
     for parts in ([NOISE[:1], NOISE[1:]], [NOISE[1:], NOISE[:1]], [NOISE[2:], NOISE[:2]]):
-        together = calibrate(small(), parts)
+        together = calibrate_ranges(small(), parts)
         for one, other in ((together.low, alone.low), (together.high, alone.high)):
             for a, b in zip(one, other, strict=True):
                 np.testing.assert_array_equal(a, b)
     assert (together.images, together.height_px, together.width_px) == (3, 16, 24)
-    grey = calibrate(small().grey(), [NOISE])
-    assert grey.high[0].tolist() == [float(to_input(grey_of(NOISE)).max())]
+    grey = calibrate_ranges(small().to_grey(), [NOISE])
+    assert grey.high[0].tolist() == [float(normalize_images(rgb_to_grey(NOISE)).max())]
 
 
 def test_meanings_are_those_of_their_names() -> None:
     """Of an offset from the middle of a cell: where from its edge, in sixteenths of a pixel."""
     for name in ("offset_u", "offset_v"):
-        assert MEANINGS[name](np.array([0.0, -0.5, 0.5, 1.0]), 8).tolist() == [64, 0, 128, 192]
-        assert MEANINGS[name](np.array([-1e6, 1e6]), 8).tolist() == [-32768, 32767]
+        assert HEAD_CONVERSIONS[name](np.array([0.0, -0.5, 0.5, 1.0]), 8).tolist() == [
+            64,
+            0,
+            128,
+            192,
+        ]
+        assert HEAD_CONVERSIONS[name](np.array([-1e6, 1e6]), 8).tolist() == [-32768, 32767]
     logits = np.array([0.0, 2.0, -1e3, 1e3])
     wanted = [32767.5, 65535 / (1 + np.exp(-2)), 0, 65535]
-    assert MEANINGS["confidence"](logits, 8) == pytest.approx(np.array(wanted), abs=1e-6)
-    depths = MEANINGS["depth"](np.array([0.0, np.log(2.5), 9.0, 99.0]), 8)
+    assert HEAD_CONVERSIONS["confidence"](logits, 8) == pytest.approx(np.array(wanted), abs=1e-6)
+    depths = HEAD_CONVERSIONS["depth"](np.array([0.0, np.log(2.5), 9.0, 99.0]), 8)
     assert depths == pytest.approx(np.array([1000, 2500, 65535, 65535]))

@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 
-from dmrl.deploy.backends import grids_of, integer
+from dmrl.deploy.backends import build_reference_backend, to_grids
 from dmrl.deploy.int8.network import Add, Conv, IntegerNetwork, MaxPool
-from dmrl.deploy.int8.reference import Detection, compute, decode, run
+from dmrl.deploy.int8.reference import (
+    IntegerDetection,
+    compute_layer,
+    decode_detections,
+    run_network,
+)
 from dmrl.learn.inference.decode_grids import decode as float_decode
 
 from ..graphs import quantised_network
@@ -14,7 +19,7 @@ from ..networks import random_network
 
 def by_hand(layer: Conv, x: np.ndarray, *shortcut: np.ndarray) -> np.ndarray:
     """A convolution in Python's own integers."""
-    outs, rows, cols = layer.shape((x.shape,))
+    outs, rows, cols = layer.output_shape((x.shape,))
     out = np.zeros((outs, rows, cols), np.int64)
     low, high = (-128, 127) if layer.signed else (0, 255)
     for o, r, c in np.ndindex(outs, rows, cols):
@@ -45,24 +50,24 @@ def test_every_convolution_is_what_it_is_by_hand(seed: int) -> None:
             for channels, rows, cols in shapes
         ]
         if isinstance(layer, Conv) and shape[0] * shapes[0][0] < 60:
-            np.testing.assert_array_equal(compute(layer, *inputs), by_hand(layer, *inputs))
+            np.testing.assert_array_equal(compute_layer(layer, *inputs), by_hand(layer, *inputs))
 
 
 def test_half_goes_up_on_either_side_of_zero() -> None:
     layer = Add("add", (0, 1), (2**20, 2**20), 21, signed=True)  # (a + b) / 2
     a, b = (np.array(v, np.int16).reshape(1, 1, -1) for v in ([3, -3, 1, -1], [0, 0, 0, 0]))
-    assert compute(layer, a, b).ravel().tolist() == [2, -1, 1, 0]
+    assert compute_layer(layer, a, b).ravel().tolist() == [2, -1, 1, 0]
 
 
 def test_unsigned_outputs_are_clamped_at_zero() -> None:
     layer = Add("add", (0, 1), (2**20, 2**20), 20)
     a = np.array([-5, 5, 200], np.int16).reshape(1, 1, 3)
-    assert compute(layer, a, a).ravel().tolist() == [0, 10, 255]
+    assert compute_layer(layer, a, a).ravel().tolist() == [0, 10, 255]
 
 
 def test_an_odd_last_row_is_left_out_of_a_pool() -> None:
     x = np.arange(15, dtype=np.int16).reshape(1, 3, 5)
-    assert compute(MaxPool("pool", 0), x).tolist() == [[[6, 8]]]
+    assert compute_layer(MaxPool("pool", 0), x).tolist() == [[[6, 8]]]
 
 
 def network_with(offsets: bool) -> IntegerNetwork:
@@ -83,15 +88,15 @@ def grids(network: IntegerNetwork, rng: np.random.Generator) -> dict[str, np.nda
 @pytest.mark.parametrize("offsets", [False, True])
 def test_integer_detections_are_the_float_ones(offsets: bool) -> None:
     network, rng = network_with(offsets), np.random.default_rng(3)
-    backend = integer(network)
+    backend = build_reference_backend(network)
     believed = 0
     for _ in range(50):
         levels = grids(network, rng)
         backend.run = lambda _, levels=levels: levels
         blank = np.zeros((1, network.height_px, network.width_px, 3), np.uint8)
-        found = float_decode(*grids_of(backend.outputs(blank)), stride_px=8)
+        found = float_decode(*to_grids(backend.outputs(blank)), stride_px=8)
         sure = found.confidence[0, : found.count[0]] >= 0.3
-        got = decode(network, levels)
+        got = decode_detections(network, levels)
         if offsets and len(got) != sure.sum():
             continue  # 1/16 px decided whether two are one
         assert len(got) == sure.sum()
@@ -108,11 +113,11 @@ def test_equal_neighbours_are_one_detection_the_first() -> None:
     network = network_with(offsets=False)
     levels = {name: np.full(network.grid_shape, -128, np.int8) for name in network.heads}
     levels["confidence"][1, 1:3] = 127
-    wanted = Detection(
+    wanted = IntegerDetection(
         12 * 16, 12 * 16, int(network.depth.table[0]), int(network.confidence.table[255])
     )
     assert network.threshold_q <= 127
-    assert decode(network, levels) == [wanted]
+    assert decode_detections(network, levels) == [wanted]
 
 
 def test_the_heads_are_channels_of_their_tensor() -> None:
@@ -120,7 +125,7 @@ def test_the_heads_are_channels_of_their_tensor() -> None:
     image = np.random.default_rng(0).integers(
         0, 256, (network.height_px, network.width_px, network.channels), np.uint8
     )
-    got = run(network, image)
+    got = run_network(network, image)
     assert set(got) == set(network.heads)
     assert all(grid.shape == network.grid_shape for grid in got.values())
 
@@ -131,4 +136,4 @@ def test_a_cell_that_reaches_the_threshold_is_believed() -> None:
     assert -128 < network.threshold_q <= 127
     for below, count in ((0, 1), (1, 0)):
         levels["confidence"][1, 2] = network.threshold_q - below
-        assert len(decode(network, levels)) == count
+        assert len(decode_detections(network, levels)) == count

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.deploy.backends import Float, integer
-from dmrl.deploy.int8.activation_ranges import calibrate
-from dmrl.deploy.int8.equalisation import equalise
-from dmrl.deploy.int8.graph import FloatConv, Graph, tensors_of, to_input
-from dmrl.deploy.int8.quantise import About, quantise
-from dmrl.deploy.int8.rounding import LARGEST, _rounded, moments_of, rounded
+from dmrl.deploy.backends import FloatBackend, build_reference_backend
+from dmrl.deploy.int8.activation_ranges import calibrate_ranges
+from dmrl.deploy.int8.equalisation import equalise_channels
+from dmrl.deploy.int8.graph import FloatConv, FloatGraph, compute_tensors, normalize_images
+from dmrl.deploy.int8.quantise import NetworkInfo, quantise_network
+from dmrl.deploy.int8.rounding import MAX_LEVEL, _round_rows, measure_moments, round_weights
 
 from ..graphs import random_graph
 
@@ -25,15 +25,15 @@ def layer(groups: int) -> FloatConv:
 
 
 def output(one: FloatConv) -> np.ndarray:
-    return tensors_of(Graph((one,), ()), to_input(SMOOTH))[1].astype(np.float64)
+    return compute_tensors(FloatGraph((one,), ()), normalize_images(SMOOTH))[1].astype(np.float64)
 
 
 @pytest.mark.parametrize(("groups", "gain"), [(1, 4), (3, 2)])
 def test_errors_cancel_where_nearest_weights_add_them_up(groups: int, gain: float) -> None:
     one = layer(groups)
     scale = np.abs(one.weight).max(axis=(1, 2, 3)) / 7  # four bits, so that it shows
-    moments = moments_of(Graph((one,), ()), SMOOTH)[0]
-    weight, bias = rounded(one, scale, moments)
+    moments = measure_moments(FloatGraph((one,), ()), SMOOTH)[0]
+    weight, bias = round_weights(one, scale, moments)
     steps = scale[:, None, None, None]
     nearest = replace(one, weight=np.rint(one.weight / steps) * steps)
     wanted = output(one)
@@ -44,8 +44,8 @@ def test_errors_cancel_where_nearest_weights_add_them_up(groups: int, gain: floa
 
 def test_moments_are_mean_products_of_inputs_and_one() -> None:
     one = layer(1)
-    moments = moments_of(Graph((one,), ()), SMOOTH)[0]
-    x = to_input(SMOOTH)
+    moments = measure_moments(FloatGraph((one,), ()), SMOOTH)[0]
+    x = normalize_images(SMOOTH)
     assert moments.shape == (1, 28, 28)
     # Tap 4 of 9 is the pixel itself; the last row is the mean.
     assert moments[0, 4, 9 + 4] == pytest.approx((x[:, 0] * x[:, 1]).mean(), rel=1e-4)
@@ -55,9 +55,9 @@ def test_moments_are_mean_products_of_inputs_and_one() -> None:
 
 def test_inputs_that_are_always_zero_do_no_harm() -> None:
     one = layer(1)
-    moments = moments_of(Graph((one,), ()), [np.full((8, 8, 3), 128, np.uint8)])[0]
-    scale = np.abs(one.weight).max(axis=(1, 2, 3)) / LARGEST
-    weight, bias = rounded(one, scale, moments)
+    moments = measure_moments(FloatGraph((one,), ()), [np.full((8, 8, 3), 128, np.uint8)])[0]
+    scale = np.abs(one.weight).max(axis=(1, 2, 3)) / MAX_LEVEL
+    weight, bias = round_weights(one, scale, moments)
     assert (weight == np.rint(one.weight / scale[:, None, None, None])).all()
     np.testing.assert_allclose(bias, one.bias)
 
@@ -67,17 +67,19 @@ def test_random_networks_lose_less_than_by_nearest_weights() -> None:
     for seed in range(40):
         graph, channels, images = random_graph(seed)
         rgb = np.repeat(images, 3, axis=3) if images.shape[3] == 1 else images
-        graph, ranges = equalise(graph, calibrate(graph, [rgb]))
-        about = About("random", "random", 8, channels, 0.3)
-        wanted = Float(graph, channels).outputs(rgb)
+        graph, ranges = equalise_channels(graph, calibrate_ranges(graph, [rgb]))
+        about = NetworkInfo("random", "random", 8, channels, 0.3)
+        wanted = FloatBackend(graph, channels).outputs(rgb)
         lost = [
             sum(
                 float(((value - got[name]) ** 2).mean() / (value**2).mean())
                 for name, value in wanted.items()
             )
             for got in (
-                integer(quantise(graph, ranges, about, moments)).outputs(rgb)
-                for moments in (None, moments_of(graph, rgb))
+                build_reference_backend(quantise_network(graph, ranges, about, moments)).outputs(
+                    rgb
+                )
+                for moments in (None, measure_moments(graph, rgb))
             )
         ]
         gained_db.append(10 * np.log10(lost[0] / lost[1]))
@@ -87,5 +89,5 @@ def test_random_networks_lose_less_than_by_nearest_weights() -> None:
 def test_weights_stay_within_seven_bits_and_a_sign() -> None:
     wanted = np.array([[-127.4, -127.4, -140.0, 200.0, 3.0]])
     together = np.full((5, 5), 0.9) + 0.1 * np.eye(5)  # what one lost, the next makes good
-    levels = _rounded(wanted, together)
-    assert np.abs(levels[:, :-1]).max() == LARGEST == 127
+    levels = _round_rows(wanted, together)
+    assert np.abs(levels[:, :-1]).max() == MAX_LEVEL == 127

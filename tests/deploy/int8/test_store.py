@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.deploy.int8 import reference
-from dmrl.deploy.int8.store import INTEGER_NAME, load, save
+from dmrl.deploy.int8.store import INTEGER_NAME, load_network, save_network
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples, save_samples
 from dmrl.errors import ModelError
 
@@ -17,35 +17,35 @@ from ..networks import random_network
 @pytest.mark.parametrize("seed", [0, 3, 8])
 def test_a_network_comes_back_as_it_was(seed: int, tmp_path: Path) -> None:
     network = random_network(seed)
-    save(network, tmp_path / INTEGER_NAME)
-    again = load(tmp_path)
+    save_network(network, tmp_path / INTEGER_NAME)
+    again = load_network(tmp_path)
     image = np.random.default_rng(0).integers(0, 256, (*network.shapes[0][1:], network.channels))
-    wanted = reference.run(network, image.astype(np.uint8))
-    got = reference.run(again, image.astype(np.uint8))
+    wanted = reference.run_network(network, image.astype(np.uint8))
+    got = reference.run_network(again, image.astype(np.uint8))
     for name, grid in wanted.items():
         np.testing.assert_array_equal(got[name], grid)
-    save(again, tmp_path / "again.npz")
+    save_network(again, tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / INTEGER_NAME).read_bytes()
 
 
 def test_no_network_is_said(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"no integer.npz in .*Make one with: dmrl quantize"):
-        load(tmp_path)
+        load_network(tmp_path)
 
 
 @pytest.mark.parametrize("kept", [0, 1, 100, 3000])
 def test_a_file_that_is_cut_short_is_said(kept: int, tmp_path: Path) -> None:
     file = tmp_path / INTEGER_NAME
-    save(quantised_network(0), file)
+    save_network(quantised_network(0), file)
     file.write_bytes(file.read_bytes()[:kept])
     with pytest.raises(ModelError, match=r"integer.npz is damaged"):
-        load(file)
+        load_network(file)
 
 
 def test_pickled_arrays_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / INTEGER_NAME, description=np.array([{"format": 1}], object))
     with pytest.raises(ModelError, match="damaged"):
-        load(tmp_path)
+        load_network(tmp_path)
 
 
 def test_samples_come_back(tmp_path: Path) -> None:

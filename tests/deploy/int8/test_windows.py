@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dmrl.deploy.int8.windows import largest_of_blocks, taps_of
+from dmrl.deploy.int8.windows import extract_taps, max_pool_2x2
 
 RNG = np.random.default_rng(0)
 
@@ -13,7 +13,7 @@ RNG = np.random.default_rng(0)
 @pytest.mark.parametrize("dilation", [1, 2])
 def test_every_tap_stands_in_raster_order(kernel: int, stride: int, dilation: int) -> None:
     x = RNG.integers(-9, 9, (2, 3, 11, 8))
-    found = taps_of(x, kernel, stride, dilation)
+    found = extract_taps(x, kernel, stride, dilation)
     reach = dilation * (kernel - 1)
     rows, cols = range(0, 11 - reach, stride), range(0, 8 - reach, stride)
     assert found.shape == (2, 3, kernel * kernel, len(rows), len(cols))
@@ -28,7 +28,7 @@ def test_every_tap_stands_in_raster_order(kernel: int, stride: int, dilation: in
 @pytest.mark.parametrize("shape", [(4, 6), (5, 7), (2, 3)])
 def test_the_largest_of_each_block_of_four(shape: tuple[int, int]) -> None:
     x = RNG.integers(-9, 9, (2, *shape))
-    found = largest_of_blocks(x)
+    found = max_pool_2x2(x)
     assert found.shape == (2, shape[0] // 2, shape[1] // 2)
     for row in range(shape[0] // 2):
         for col in range(shape[1] // 2):

@@ -6,23 +6,25 @@ import pytest
 from dmrl.errors import SettingError
 from dmrl.estimation.calibration import extrinsics
 from dmrl.estimation.calibration.extrinsics import (
-    ASIDE,
-    LIKELY,
-    SAME_S,
-    SAMPLED,
+    MIN_LOG_LIKELIHOOD_GAP,
+    PROBE_SIGMAS,
+    SAME_DELAY_S,
+    SAMPLING_STD_SHARE,
+    _check_unambiguous,
     _delay_std_s,
-    _refuse_alike,
-    calibrate,
+    calibrate_mount,
 )
-from dmrl.estimation.calibration.mount_solver import Mount
+from dmrl.estimation.calibration.mount_solver import MountEstimate
 from dmrl.estimation.calibration.noise import Noise
-from dmrl.estimation.calibration.observations import Flight, PeerPath, match
-from dmrl.geometry.frames import AIDECK, Camera, inside, pixels_from_horizontal
+from dmrl.estimation.calibration.observations import CalibrationFlight, PeerPath, match_detections
+from dmrl.geometry.frames import AIDECK, Camera, is_inside, pixels_from_horizontal
 
 TRUE = replace(AIDECK, mount_rad=(0.02, 0.035, -0.03), delay_s=0.03)
 
 
-def flight(seed: int, camera: Camera = TRUE, images: int = 400, outliers: float = 0.1) -> Flight:
+def flight(
+    seed: int, camera: Camera = TRUE, images: int = 400, outliers: float = 0.1
+) -> CalibrationFlight:
     """A peer that wanders in view; what the camera saw of it, 3 px off, now and then nonsense."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(0, images / 10 + 2, 0.05)
@@ -43,14 +45,14 @@ def flight(seed: int, camera: Camera = TRUE, images: int = 400, outliers: float 
     uv += rng.normal(0, 3.0, uv.shape)
     wild = rng.random(images) < outliers
     uv[wild] = rng.uniform((0, 0), (320, 224), (int(wild.sum()), 2))
-    seen = np.flatnonzero(inside(uv, 320, 224))
+    seen = np.flatnonzero(is_inside(uv, 320, 224))
     covariance = np.broadcast_to(0.01**2 * np.eye(3), (len(time_s), 3, 3))
     peers = {"cf2": PeerPath(time_s, xyz, covariance)}
-    return Flight(image_s, seen, uv[seen], time_s, attitude, peers)
+    return CalibrationFlight(image_s, seen, uv[seen], time_s, attitude, peers)
 
 
 def test_mount_and_delay_are_found_again() -> None:
-    found = calibrate([flight(0, images=1200)], AIDECK, Noise(3.0, 0.005))
+    found = calibrate_mount([flight(0, images=1200)], AIDECK, Noise(3.0, 0.005))
     assert found is not None
     assert np.degrees(found.camera.mount_rad) == pytest.approx(np.degrees(TRUE.mount_rad), abs=0.3)
     assert found.camera.delay_s == pytest.approx(TRUE.delay_s, abs=0.005)
@@ -61,7 +63,7 @@ def test_mount_and_delay_are_found_again() -> None:
 
 @pytest.mark.heavy
 def test_a_camera_that_is_right_is_left_as_it_is() -> None:
-    found = calibrate([flight(1, AIDECK)], AIDECK, Noise(3.0, 0.005))
+    found = calibrate_mount([flight(1, AIDECK)], AIDECK, Noise(3.0, 0.005))
     assert found is not None
     assert np.abs(np.degrees(found.camera.mount_rad)).max() < 0.3
     assert abs(found.camera.delay_s) < 0.005
@@ -69,14 +71,16 @@ def test_a_camera_that_is_right_is_left_as_it_is() -> None:
 
 @pytest.mark.heavy
 def test_several_flights_are_left_out_in_turn() -> None:
-    found = calibrate([flight(seed, images=150) for seed in range(4)], AIDECK, Noise(3.0, 0.005))
+    found = calibrate_mount(
+        [flight(seed, images=150) for seed in range(4)], AIDECK, Noise(3.0, 0.005)
+    )
     assert found is not None
     assert np.degrees(found.camera.mount_rad) == pytest.approx(np.degrees(TRUE.mount_rad), abs=0.3)
     assert 0 < max(found.mount_std_rad) < np.radians(0.5)
 
 
 def test_detections_that_fit_nothing_give_nothing() -> None:
-    assert calibrate([flight(2, outliers=1.0, images=60)], AIDECK, Noise()) is None
+    assert calibrate_mount([flight(2, outliers=1.0, images=60)], AIDECK, Noise()) is None
 
 
 @pytest.mark.heavy
@@ -85,7 +89,7 @@ def test_gaps_in_the_positions_are_not_bridged() -> None:
     peer = whole.peers["cf2"]
     keep = (peer.time_s < 10) | (peer.time_s > 25)
     holed = PeerPath(peer.time_s[keep], peer.xyz_m[keep], peer.covariance[keep])
-    found = calibrate([replace(whole, peers={"cf2": holed})], AIDECK, Noise(3.0, 0.005))
+    found = calibrate_mount([replace(whole, peers={"cf2": holed})], AIDECK, Noise(3.0, 0.005))
     assert found is not None
     assert found.matched < 300
 
@@ -100,7 +104,7 @@ def test_the_delay_does_not_hang_on_where_it_starts(delay_s: float) -> None:
     noisy = np.column_stack([np.interp(at_s, clean.attitude_s, a) for a in clean.attitude_rad.T])
     noisy += rng.normal(0, 0.01, noisy.shape)
     seen = replace(clean, attitude_s=at_s, attitude_rad=noisy)
-    found = calibrate([seen], replace(AIDECK, delay_s=delay_s), Noise(3.0, 0.01))
+    found = calibrate_mount([seen], replace(AIDECK, delay_s=delay_s), Noise(3.0, 0.01))
     assert found is not None
     assert found.camera.delay_s == pytest.approx(TRUE.delay_s, abs=0.008)
 
@@ -122,12 +126,12 @@ def test_tilts_that_come_at_once_do_not_shift_the_delay() -> None:
     peer = clean.peers["cf2"]
     taken_s = clean.image_s - TRUE.delay_s
     roll, pitch = (np.interp(taken_s, log_s, angle) for angle in _tilting(log_s).T)
-    uv, _, _ = pixels_from_horizontal(peer.at(taken_s), roll, pitch, TRUE)
-    seen = np.flatnonzero(inside(uv, 320, 224))
+    uv, _, _ = pixels_from_horizontal(peer.interpolate_at(taken_s), roll, pitch, TRUE)
+    seen = np.flatnonzero(is_inside(uv, 320, 224))
     uv = uv[seen] + rng.normal(0, 1.0, (len(seen), 2))
     logged = _tilting(log_s) + rng.normal(0, 0.005, (len(log_s), 2))
     shown = replace(clean, image=seen, uv=uv, attitude_s=log_s, attitude_rad=logged)
-    found = calibrate([shown], AIDECK, Noise(2.0, 0.005))
+    found = calibrate_mount([shown], AIDECK, Noise(2.0, 0.005))
     assert found is not None
     assert found.camera.delay_s == pytest.approx(TRUE.delay_s, abs=0.003)
 
@@ -141,7 +145,7 @@ def test_a_path_that_is_far_off_for_seconds_does_not_turn_the_mount() -> None:
     off_m[:, 1] = 0.25 * np.sign(np.sin(2 * np.pi * peer.time_s / 25.0) - 0.6)
     wide = np.broadcast_to(np.diag([0.02, 0.25, 0.02]) ** 2, peer.covariance.shape)
     moved = PeerPath(peer.time_s, peer.xyz_m + off_m, wide)
-    found = calibrate([replace(clean, peers={"cf2": moved})], AIDECK, Noise(3.0, 0.005))
+    found = calibrate_mount([replace(clean, peers={"cf2": moved})], AIDECK, Noise(3.0, 0.005))
     assert found is not None
     assert found.matched > 850
 
@@ -149,7 +153,7 @@ def test_a_path_that_is_far_off_for_seconds_does_not_turn_the_mount() -> None:
 @pytest.mark.heavy
 def test_how_far_single_detections_are_off_is_found() -> None:
     sharp, blunt = (
-        calibrate([flight(9, images=600, outliers=0.0)], AIDECK, Noise(pixels, 0.005))
+        calibrate_mount([flight(9, images=600, outliers=0.0)], AIDECK, Noise(pixels, 0.005))
         for pixels in (3.0, 9.0)
     )
     assert sharp is not None
@@ -157,9 +161,9 @@ def test_how_far_single_detections_are_off_is_found() -> None:
     assert blunt.mount_std_rad == pytest.approx(sharp.mount_std_rad, rel=0.05)
 
 
-def mount_of(values: np.ndarray, std_s: float, cost: float = 5.0) -> Mount:
+def mount_of(values: np.ndarray, std_s: float, cost: float = 5.0) -> MountEstimate:
     covariance = np.diag([1e-4, 1e-4, 1e-4, std_s**2])
-    return Mount(values, covariance, cost, 2.0)
+    return MountEstimate(values, covariance, cost, 2.0)
 
 
 @pytest.mark.parametrize(("true_s", "wanted_s"), [(0.003, 0.003), (0.0004, 0.001)])
@@ -171,32 +175,32 @@ def test_a_delay_is_as_sure_as_others_are_worse(
     asked = []
 
     def solve(views: object, camera: object, matched: object, start: np.ndarray, *rest: object,
-              held: bool) -> Mount:  # fmt: skip
-        assert held and start[:3].tolist() == values[:3].tolist() and rest[1] == 2.0
+              fix_delay: bool) -> MountEstimate:  # fmt: skip
+        assert fix_delay and start[:3].tolist() == values[:3].tolist() and rest[1] == 2.0
         asked.append(start[3] - values[3])
         return mount_of(start, 0.001, 5.0 + 0.5 * (asked[-1] / true_s) ** 2)
 
-    monkeypatch.setattr(extrinsics, "solve", solve)
+    monkeypatch.setattr(extrinsics, "solve_mount", solve)
     one = flight(0, images=20)
     views = [(one, one.peers["cf2"])]
-    matched = match(views, TRUE, 30.0, Noise())
+    matched = match_detections(views, TRUE, 30.0, Noise())
     found = _delay_std_s(views, TRUE, matched, mount_of(values, 0.001), Noise())
     sample_s = float(np.median(np.diff(one.attitude_s)))
-    assert found == pytest.approx(np.hypot(wanted_s, SAMPLED * sample_s), rel=1e-6)
-    assert np.array(asked) == pytest.approx(0.001 * np.array(ASIDE))
+    assert found == pytest.approx(np.hypot(wanted_s, SAMPLING_STD_SHARE * sample_s), rel=1e-6)
+    assert np.array(asked) == pytest.approx(0.001 * np.array(PROBE_SIGMAS))
 
 
 def test_two_delays_that_explain_the_images_alike_are_refused() -> None:
     best = mount_of(np.array([0, 0, 0, 0.05]), 0.001)
     for apart_s, worse, refused in (
-        (1.01 * SAME_S, 0.99 * LIKELY, True),
-        (-1.01 * SAME_S, 0.99 * LIKELY, True),
-        (0.99 * SAME_S, 0.0, False),
-        (1.01 * SAME_S, 1.01 * LIKELY, False),
+        (1.01 * SAME_DELAY_S, 0.99 * MIN_LOG_LIKELIHOOD_GAP, True),
+        (-1.01 * SAME_DELAY_S, 0.99 * MIN_LOG_LIKELIHOOD_GAP, True),
+        (0.99 * SAME_DELAY_S, 0.0, False),
+        (1.01 * SAME_DELAY_S, 1.01 * MIN_LOG_LIKELIHOOD_GAP, False),
     ):
         other = mount_of(np.array([0, 0, 0, 0.05 + apart_s]), 0.001, 5.0 + worse)
         if refused:
             with pytest.raises(SettingError, match=r"delays of 50 and .* ms explain"):
-                _refuse_alike([best, other])
+                _check_unambiguous([best, other])
         else:
-            _refuse_alike([best, other])
+            _check_unambiguous([best, other])

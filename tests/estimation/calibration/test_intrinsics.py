@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import chi2
 
 from dmrl.estimation.calibration import intrinsics as board
-from dmrl.estimation.calibration.intrinsics import Intrinsics, corners, intrinsics
+from dmrl.estimation.calibration.intrinsics import Intrinsics, calibrate_intrinsics, find_corners
 from dmrl.geometry.frames import AIDECK, Array, Camera
 
 from ..boards import COLUMNS, ROWS, Look, corners_of, lens, picture, pose
@@ -18,7 +18,7 @@ def shown(camera: Camera, rng: np.random.Generator, views: int) -> list[tuple[Ar
     for _ in range(views):
         at = pose(rng, camera)
         look = Look(rng.uniform(0.3, 1.2), rng.uniform(0.5, 4.0), rng.uniform(15, 50))
-        found = corners(picture(*at, camera, look, rng), COLUMNS, ROWS)
+        found = find_corners(picture(*at, camera, look, rng), COLUMNS, ROWS)
         true = corners_of(*at, camera)
         if found is not None:
             turned = np.abs(found[0] - true[0]).max() > np.abs(found[-1] - true[0]).max()
@@ -28,7 +28,7 @@ def shown(camera: Camera, rng: np.random.Generator, views: int) -> list[tuple[Ar
 
 def calibrated(camera: Camera, pairs: list[tuple[Array, Array]]) -> Intrinsics:
     boards = [np.ascontiguousarray(found, np.float32) for found, _ in pairs]
-    return intrinsics(boards, (COLUMNS, ROWS), (camera.width_px, camera.height_px))
+    return calibrate_intrinsics(boards, (COLUMNS, ROWS), (camera.width_px, camera.height_px))
 
 
 def normalised(camera: Camera, made: Intrinsics) -> Array:
@@ -45,7 +45,7 @@ def test_the_same_boards_give_the_same_digits_each_time() -> None:
     rng = np.random.default_rng(0)
     seen = [corners_of(*pose(rng)) for _ in range(8)]
     views = [(at + rng.normal(0, 0.1, at.shape)).astype(np.float32) for at in seen]
-    made = [intrinsics(views, (COLUMNS, ROWS), (320, 224)) for _ in range(50)]
+    made = [calibrate_intrinsics(views, (COLUMNS, ROWS), (320, 224)) for _ in range(50)]
     assert len({one.camera for one in made}) == 1
 
 
@@ -85,13 +85,13 @@ def test_a_large_picture_is_looked_at_smaller_and_measured_whole(
     rng = np.random.default_rng(1)
     at = pose(rng)
     grey = picture(*at)
-    whole = corners(grey, COLUMNS, ROWS)
-    monkeypatch.setattr(board, "LARGE_PIXELS", grey.size // 3)
+    whole = find_corners(grey, COLUMNS, ROWS)
+    monkeypatch.setattr(board, "MAX_DETECTION_PIXELS", grey.size // 3)
     monkeypatch.setattr(board.cv2, "findChessboardCornersSB", _only(grey.size // 4 + 1))
-    found = corners(grey, COLUMNS, ROWS)
+    found = find_corners(grey, COLUMNS, ROWS)
     assert whole is not None and found is not None
     assert np.abs(found - whole).max() < 0.05
-    assert corners(grey[:1], COLUMNS, ROWS) is None
+    assert find_corners(grey[:1], COLUMNS, ROWS) is None
 
 
 def _only(pixels: int) -> Callable[..., Any]:
@@ -119,4 +119,4 @@ def test_sigmas_of_thirty_lenses_hold() -> None:
 
 def test_a_picture_without_a_board_has_no_corners() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (224, 320), np.uint8)
-    assert corners(noise, COLUMNS, ROWS) is None
+    assert find_corners(noise, COLUMNS, ROWS) is None

@@ -6,34 +6,41 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.calibration import mount_solver
-from dmrl.estimation.calibration.extrinsics import ALIKE, REFINED, SAME_S, _apart, _rough, _Try
+from dmrl.estimation.calibration.extrinsics import (
+    MAX_MISFIT_EXCESS,
+    MAX_REFINED,
+    SAME_DELAY_S,
+    _Candidate,
+    _fit_independent,
+    _select_distinct,
+)
 from dmrl.estimation.calibration.mount_solver import (
-    CAUCHY,
-    FADES,
-    FADES_S,
-    KNOT_S,
-    LEVEL,
-    NOTHING,
-    STAYS,
-    TURNS,
-    _axes,
-    _chain,
-    _charge,
-    _Errors,
-    _left,
-    _paths,
-    _step,
-    slopes_of,
-    solve,
+    CAUCHY_SIGMAS,
+    CONSTANT_SHARE,
+    CONSTANT_TILT_SHARE,
+    DECAY_S,
+    DECAYING_SHARE,
+    KNOT_SPACING_S,
+    ROTATION_SHARE,
+    WEAK_INFORMATION,
+    _cauchy_cost,
+    _error_axes,
+    _linearize_paths,
+    _markov_information,
+    _Nuisance,
+    _remaining_residuals,
+    _solve_step,
+    pixel_jacobian,
+    solve_mount,
 )
 from dmrl.estimation.calibration.noise import Noise
 from dmrl.estimation.calibration.observations import (
-    Matched,
-    View,
-    expected,
-    match,
-    mounted,
-    residual,
+    Matches,
+    PeerView,
+    match_detections,
+    pixel_residuals,
+    predict_pixels,
+    with_mount,
 )
 from dmrl.geometry.frames import AIDECK, Array
 
@@ -43,28 +50,30 @@ VALUES = np.array([*TRUE.mount_rad, TRUE.delay_s])
 NOISE = Noise(3.0, 0.02)
 
 
-def seen(images: int = 30) -> tuple[list[View], Matched]:
+def seen(images: int = 30) -> tuple[list[PeerView], Matches]:
     """Two flights of a peer each, and a third whose peer nobody saw."""
     spread = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.002], [0.0, 0.002, 0.01]])
-    views: list[View] = []
+    views: list[PeerView] = []
     for seed in range(3):
         one = flight(seed, images=images, outliers=0.0)
         path = one.peers["cf2"]
         wide = np.broadcast_to((1 + 0.2 * seed) * spread, path.covariance.shape)
         views.append((one, replace(path, covariance=wide)))
     views[1] = (replace(views[1][0], image=views[1][0].image[:0], uv=np.zeros((0, 2))), views[1][1])
-    return views, match(views, TRUE, 40.0, NOISE)
+    return views, match_detections(views, TRUE, 40.0, NOISE)
 
 
 VIEWS, MATCHED = seen()
 
 
 def test_slopes_are_those_of_small_steps() -> None:
-    found = slopes_of(VIEWS, AIDECK, MATCHED, VALUES)
+    found = pixel_jacobian(VIEWS, AIDECK, MATCHED, VALUES)
     assert found.shape == (len(MATCHED.time_s), 2, 4)
     for k in range(4):
         step = 1e-5 * np.eye(4)[k]
-        ahead, behind = (residual(VIEWS, AIDECK, MATCHED, VALUES + s * step) for s in (1, -1))
+        ahead, behind = (
+            pixel_residuals(VIEWS, AIDECK, MATCHED, VALUES + s * step) for s in (1, -1)
+        )
         slope = (behind - ahead) / 2e-5  # of what is expected: left is what was seen, less that
         assert found[:, :, k] == pytest.approx(slope, rel=0.02, abs=0.02 * np.abs(slope).max())
 
@@ -72,7 +81,7 @@ def test_slopes_are_those_of_small_steps() -> None:
 def test_axes_lie_along_the_line_of_sight_across_it_and_up() -> None:
     xyz = np.array([[3.0, 4.0, 1.0], [-2.0, 0.0, -0.5], [0.03, 0.04, 1.0]])
     spread = np.array([np.diag([0.04, 0.09, 0.01]) + 0.01] * 3)
-    axes, turn = _axes(xyz, spread)
+    axes, turn = _error_axes(xyz, spread)
     ways = np.array(
         [[[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]], [[-1, 0, 0], [0, -1, 0], [0, 0, 1]]]
     )
@@ -84,48 +93,48 @@ def test_axes_lie_along_the_line_of_sight_across_it_and_up() -> None:
     sideways = np.array([[-0.8, 0.6, 0], [0, -1, 0], [-0.4, 0.3, 0]])
     across = np.sqrt(np.einsum("ni,nij,nj->n", sideways, spread, sideways))
     assert axes[:, :, 1] == pytest.approx(across[:, None] * sideways, abs=1e-6)
-    assert turn * across == pytest.approx(TURNS**0.5 * np.median(across / level) * level)
+    assert turn * across == pytest.approx(ROTATION_SHARE**0.5 * np.median(across / level) * level)
 
 
 def test_knots_vary_as_a_process_that_fades() -> None:
-    covariance = np.linalg.inv(_chain(6).toarray())
-    away_s = KNOT_S * np.abs(np.subtract.outer(np.arange(6), np.arange(6)))
-    assert covariance == pytest.approx(np.exp(-away_s / FADES_S))
+    covariance = np.linalg.inv(_markov_information(6).toarray())
+    away_s = KNOT_SPACING_S * np.abs(np.subtract.outer(np.arange(6), np.arange(6)))
+    assert covariance == pytest.approx(np.exp(-away_s / DECAY_S))
 
 
 def test_errors_of_a_path_show_where_the_moved_path_would_be_seen() -> None:
-    paths = _paths(VIEWS, TRUE, MATCHED, VALUES)
+    paths = _linearize_paths(VIEWS, TRUE, MATCHED, VALUES)
     assert [path.flight for path in paths] == [0, 1]  # of those that were seen
     for path, number in zip(paths, (0, 2), strict=True):
         one, peer = VIEWS[number]
         assert (MATCHED.view[path.rows] == number).all()
-        time_s, camera = MATCHED.time_s[path.rows], mounted(TRUE, VALUES)
-        before, _ = expected(one, camera, peer, time_s)
-        axes, turn = _axes(peer.xyz_m, peer.covariance)
+        time_s, camera = MATCHED.time_s[path.rows], with_mount(TRUE, VALUES)
+        before, _ = predict_pixels(one, camera, peer, time_s)
+        axes, turn = _error_axes(peer.xyz_m, peer.covariance)
         size = 1e-3
-        moves = [size * np.sqrt(STAYS[k]) * axes[:, :, k] for k in range(3)]
+        moves = [size * np.sqrt(CONSTANT_SHARE[k]) * axes[:, :, k] for k in range(3)]
         moves += [size * turn[:, None] * axes[:, :, 1]]
         for column, move in enumerate(moves):
             moved = replace(peer, xyz_m=peer.xyz_m + move)
-            shift = (expected(one, camera, moved, time_s)[0] - before).ravel() / size
+            shift = (predict_pixels(one, camera, moved, time_s)[0] - before).ravel() / size
             shown = path.errors[:, [column]].toarray().ravel()
             assert shown == pytest.approx(shift, abs=0.06 * np.abs(shift).max())
         # All knots together are one shift across the line of sight.
-        moved = replace(peer, xyz_m=peer.xyz_m + size * np.sqrt(FADES) * axes[:, :, 1])
-        shift = (expected(one, camera, moved, time_s)[0] - before).ravel() / size
+        moved = replace(peer, xyz_m=peer.xyz_m + size * np.sqrt(DECAYING_SHARE) * axes[:, :, 1])
+        shift = (predict_pixels(one, camera, moved, time_s)[0] - before).ravel() / size
         every = path.errors[:, 4:].sum(axis=1)
         assert every == pytest.approx(shift, abs=0.06 * np.abs(shift).max())
         for k in range(2):
             tilted = replace(one, attitude_rad=one.attitude_rad + size * np.eye(2)[k])
-            shift = (expected(tilted, camera, peer, time_s)[0] - before).ravel() / size
+            shift = (predict_pixels(tilted, camera, peer, time_s)[0] - before).ravel() / size
             assert path.level[:, k] == pytest.approx(shift, abs=0.06 * np.abs(shift).max())
 
 
 def test_between_knots_an_error_goes_along_a_line() -> None:
-    for path in _paths(VIEWS, TRUE, MATCHED, VALUES):
+    for path in _linearize_paths(VIEWS, TRUE, MATCHED, VALUES):
         since_s = MATCHED.time_s[path.rows] - MATCHED.time_s[path.rows[0]]
         fading = path.errors[:, 4:]
-        knots_s = KNOT_S * (np.arange(fading.shape[1]) - 1)
+        knots_s = KNOT_SPACING_S * (np.arange(fading.shape[1]) - 1)
         along, even = fading @ knots_s, fading.sum(axis=1)
         assert along == pytest.approx(np.asarray(even).ravel() * np.repeat(since_s, 2))
 
@@ -133,20 +142,20 @@ def test_between_knots_an_error_goes_along_a_line() -> None:
 @pytest.mark.parametrize("held", [False, True])
 def test_a_step_is_that_of_the_dense_equations(held: bool) -> None:
     rng = np.random.default_rng(4)
-    paths = _paths(VIEWS, TRUE, MATCHED, VALUES)
+    paths = _linearize_paths(VIEWS, TRUE, MATCHED, VALUES)
     starts = [0.3 * rng.normal(size=path.prior.shape[0]) for path in paths]
-    errors = _Errors(list(starts), 0.01 * rng.normal(size=(2, 2)))
+    errors = _Nuisance(list(starts), 0.01 * rng.normal(size=(2, 2)))
     levels = errors.levels.copy()
-    apart = residual(VIEWS, TRUE, MATCHED, VALUES)
-    slopes = slopes_of(VIEWS, TRUE, MATCHED, VALUES)
+    apart = pixel_residuals(VIEWS, TRUE, MATCHED, VALUES)
+    slopes = pixel_jacobian(VIEWS, TRUE, MATCHED, VALUES)
     if held:
         slopes[:, :, 3] = 0
-    weight = 1 / (LEVEL * NOISE.attitude_std_rad) ** 2
+    weight = 1 / (CONSTANT_TILT_SHARE * NOISE.attitude_std_rad) ** 2
     sizes = [len(one) for one in starts]
     count = 4 + sum(sizes) + 4
     normal, right = np.zeros((count, count)), np.zeros(count)
-    normal[3, 3] = NOTHING
-    left = _left(paths, errors, apart)
+    normal[3, 3] = WEAK_INFORMATION
+    left = _remaining_residuals(paths, errors, apart)
     for k, path in enumerate(paths):
         own = slice(4 + sum(sizes[:k]), 4 + sum(sizes[: k + 1]))
         tilt = slice(count - 4 + 2 * k, count - 2 + 2 * k)
@@ -155,7 +164,7 @@ def test_a_step_is_that_of_the_dense_equations(held: bool) -> None:
         design[:, own], design[:, tilt] = path.errors.toarray(), path.level
         explained = path.errors @ starts[k] + path.level @ levels[k]
         assert left[path.rows].ravel() == pytest.approx(apart[path.rows].ravel() - explained)
-        far = (left[path.rows] ** 2).sum(axis=1) / (CAUCHY * 3.0) ** 2
+        far = (left[path.rows] ** 2).sum(axis=1) / (CAUCHY_SIGMAS * 3.0) ** 2
         counts = np.repeat(1 / (9.0 * (1 + far)), 2)
         normal += design.T @ (counts[:, None] * design)
         right += design.T @ (counts * left[path.rows].ravel())
@@ -164,7 +173,7 @@ def test_a_step_is_that_of_the_dense_equations(held: bool) -> None:
         normal[tilt, tilt] += weight * np.eye(2)
         right[tilt] -= weight * levels[k]
     wanted = np.linalg.solve(normal, right)
-    information, step = _step(paths, errors, weight, apart, slopes, 3.0)
+    information, step = _solve_step(paths, errors, weight, apart, slopes, 3.0)
     assert step == pytest.approx(wanted[:4], rel=1e-6, abs=1e-9)
     assert np.linalg.inv(information) == pytest.approx(np.linalg.inv(normal)[:4, :4], rel=1e-5)
     for k, own in enumerate(starts):
@@ -174,22 +183,26 @@ def test_a_step_is_that_of_the_dense_equations(held: bool) -> None:
 
 
 def test_a_charge_is_half_a_square_that_is_small_and_hardly_grows_later() -> None:
-    assert _charge(np.array([1e-4, 3e-4])) == pytest.approx(2e-4, rel=1e-3)
-    assert _charge(np.array([CAUCHY**2])) == pytest.approx(0.5 * CAUCHY**2 * np.log(2))
+    assert _cauchy_cost(np.array([1e-4, 3e-4])) == pytest.approx(2e-4, rel=1e-3)
+    assert _cauchy_cost(np.array([CAUCHY_SIGMAS**2])) == pytest.approx(
+        0.5 * CAUCHY_SIGMAS**2 * np.log(2)
+    )
 
 
 def test_a_mount_is_found_its_delay_held_or_not_and_what_was_missed_costs() -> None:
     off = VALUES + np.array([0.01, -0.01, 0.01, 0.02])
-    found = solve(VIEWS, TRUE, MATCHED, off, NOISE, 3.0)
+    found = solve_mount(VIEWS, TRUE, MATCHED, off, NOISE, 3.0)
     sigma = np.sqrt(np.diag(found.covariance))
     assert (np.abs(found.values - VALUES) < 4 * sigma).all()
     assert (sigma[:3] < 0.2).all() and sigma[3] < 0.05
     assert found.spread_px == pytest.approx(3.0, rel=0.35)
-    kept = solve(VIEWS, TRUE, MATCHED, VALUES, NOISE, 3.0, held=True)
-    assert kept.values[3] == VALUES[3] and kept.covariance[3, 3] == pytest.approx(1 / NOTHING)
+    kept = solve_mount(VIEWS, TRUE, MATCHED, VALUES, NOISE, 3.0, fix_delay=True)
+    assert kept.values[3] == VALUES[3] and kept.covariance[3, 3] == pytest.approx(
+        1 / WEAK_INFORMATION
+    )
     more = replace(MATCHED, expected=MATCHED.expected + 5)
-    missed = solve(VIEWS, TRUE, more, off, NOISE, 3.0)
-    one = 0.5 * CAUCHY**2 * np.log1p((MATCHED.radius_px / 3.0 / CAUCHY) ** 2)
+    missed = solve_mount(VIEWS, TRUE, more, off, NOISE, 3.0)
+    one = 0.5 * CAUCHY_SIGMAS**2 * np.log1p((MATCHED.radius_px / 3.0 / CAUCHY_SIGMAS) ** 2)
     assert missed.cost - found.cost == pytest.approx(5 * one)
     assert found.cost > 0
 
@@ -197,37 +210,40 @@ def test_a_mount_is_found_its_delay_held_or_not_and_what_was_missed_costs() -> N
 def test_what_a_mount_costs_is_the_loss_of_what_is_left_in_sigmas(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(mount_solver, "ROUNDS", 0)
+    monkeypatch.setattr(mount_solver, "MAX_ROUNDS", 0)
     every = replace(MATCHED, expected=len(MATCHED.time_s))
-    found = solve(VIEWS, TRUE, every, VALUES, NOISE, 5.0)
-    square = (residual(VIEWS, TRUE, every, VALUES) ** 2).sum(axis=1) / 5.0**2
-    assert found.cost == pytest.approx(_charge(square))
+    found = solve_mount(VIEWS, TRUE, every, VALUES, NOISE, 5.0)
+    square = (pixel_residuals(VIEWS, TRUE, every, VALUES) ** 2).sum(axis=1) / 5.0**2
+    assert found.cost == pytest.approx(_cauchy_cost(square))
 
 
 def test_a_mount_that_nobody_would_build_is_at_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mount_solver, "LARGEST", np.array([0.01, 0.35, 0.35, 0.5]))
-    found: Array = solve(VIEWS, TRUE, MATCHED, VALUES, NOISE, 3.0).values
+    monkeypatch.setattr(mount_solver, "MAX_VALUES", np.array([0.01, 0.35, 0.35, 0.5]))
+    found: Array = solve_mount(VIEWS, TRUE, MATCHED, VALUES, NOISE, 3.0).values
     assert abs(found[0]) <= 0.01
 
 
 def test_a_rough_search_comes_near_from_some_degrees_off() -> None:
     off = np.array([0.03, -0.03, 0.03, 0.08])
     for sign in (1, -1):
-        found = _rough(VIEWS, TRUE, MATCHED, VALUES + sign * off)
+        found = _fit_independent(VIEWS, TRUE, MATCHED, VALUES + sign * off)
         assert np.abs(found - VALUES)[:3].max() < 0.012
         assert abs(found[3] - VALUES[3]) < 0.03
 
 
 def test_of_tries_that_are_about_as_good_one_of_each_delay_is_refined() -> None:
-    def one(delay_s: float, misfit: float) -> _Try:
-        return _Try(np.array([0.0, 0, 0, delay_s]), misfit)
+    def one(delay_s: float, misfit: float) -> _Candidate:
+        return _Candidate(np.array([0.0, 0, 0, delay_s]), misfit)
 
     first, same, other, worse = (
         one(0.0, 1.0),
-        one(0.99 * SAME_S, 1.0),
-        one(1.01 * SAME_S, 0.99 + ALIKE),
-        one(0.5, 1.01 + ALIKE),
+        one(0.99 * SAME_DELAY_S, 1.0),
+        one(1.01 * SAME_DELAY_S, 0.99 + MAX_MISFIT_EXCESS),
+        one(0.5, 1.01 + MAX_MISFIT_EXCESS),
     )
-    assert [try_.values[3] for try_ in _apart([first, same, other, worse])] == [0.0, 1.01 * SAME_S]
-    many = [one(k * 0.1, 1.0) for k in range(REFINED + 2)]
-    assert _apart(many) == many[:REFINED]
+    assert [try_.values[3] for try_ in _select_distinct([first, same, other, worse])] == [
+        0.0,
+        1.01 * SAME_DELAY_S,
+    ]
+    many = [one(k * 0.1, 1.0) for k in range(MAX_REFINED + 2)]
+    assert _select_distinct(many) == many[:MAX_REFINED]

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.calibration.extrinsics import WORST, _misfit
+from dmrl.estimation.calibration.extrinsics import MAX_SQUARED_RESIDUAL, _mean_misfit
 from dmrl.estimation.calibration.noise import Noise
 from dmrl.estimation.calibration.observations import (
-    Flight,
+    CalibrationFlight,
     PeerPath,
-    expected,
-    match,
-    median_px,
-    mounted,
-    residual,
+    match_detections,
+    median_residual_px,
+    pixel_residuals,
+    predict_pixels,
+    with_mount,
 )
 from dmrl.geometry.frames import AIDECK, Array, pixels_from_horizontal
 
@@ -27,8 +27,8 @@ CAMERA = replace(AIDECK, mount_rad=(0.02, -0.03, 0.05), delay_s=0.25)
 IMAGES_S = np.array([1.0, 2.0, 3.05, 4.0])
 
 
-def flight(image: list[int], uv: Array) -> Flight:
-    return Flight(IMAGES_S, np.array(image), uv, TIME_S, ATTITUDE, {"cf2": PATH})
+def flight(image: list[int], uv: Array) -> CalibrationFlight:
+    return CalibrationFlight(IMAGES_S, np.array(image), uv, TIME_S, ATTITUDE, {"cf2": PATH})
 
 
 def seen() -> Array:
@@ -40,10 +40,10 @@ def seen() -> Array:
 
 
 def test_a_peer_is_expected_where_it_was_at_the_exposure() -> None:
-    uv, jacobian = expected(flight([], np.zeros((0, 2))), CAMERA, PATH, IMAGES_S)
+    uv, jacobian = predict_pixels(flight([], np.zeros((0, 2))), CAMERA, PATH, IMAGES_S)
     assert uv == pytest.approx(seen(), abs=1e-6)
     assert jacobian.shape == (4, 3, 5)
-    assert mounted(AIDECK, np.array([0.02, -0.03, 0.05, 0.25])) == CAMERA
+    assert with_mount(AIDECK, np.array([0.02, -0.03, 0.05, 0.25])) == CAMERA
 
 
 def test_positions_are_known_between_samples_that_are_near() -> None:
@@ -51,40 +51,42 @@ def test_positions_are_known_between_samples_that_are_near() -> None:
     path = PeerPath(times, XYZ[:6], np.stack([k * np.eye(3) for k in range(6)]))
     at_s = np.array([-0.1, 0.0, 0.05, 0.3, 0.5, 0.75, 0.8, 0.9])
     assert path.covers(at_s).tolist() == [False, False, True, True, False, True, True, False]
-    assert path.at(np.array([0.32]))[0] == pytest.approx((XYZ[2] + XYZ[3]) / 2)
-    assert path.spread(at_s)[:, 0, 0].tolist() == [0, 0, 1, 3, 4, 5, 5, 5]
+    assert path.interpolate_at(np.array([0.32]))[0] == pytest.approx((XYZ[2] + XYZ[3]) / 2)
+    assert path.nearest_covariance(at_s)[:, 0, 0].tolist() == [0, 0, 1, 3, 4, 5, 5, 5]
 
 
 def test_the_nearest_detection_within_reach_is_the_peers() -> None:
     uv = seen()
     off = np.array([[3.0, 0], [0, -2.0], [90.0, 0], [0, 9.0], [0, 30.5]])
     here = flight([0, 0, 1, 2, 3], uv[[0, 0, 1, 2, 3]] + off)
-    found = match([(here, PATH)], CAMERA, 30.0, Noise())
+    found = match_detections([(here, PATH)], CAMERA, 30.0, Noise())
     assert found.time_s.tolist() == [1.0, 3.05]
     assert found.uv == pytest.approx(uv[[0, 2]] + off[[1, 3]])
     assert (found.expected, found.view.tolist()) == (4, [0, 0])
-    wide = match([(here, PATH)], CAMERA, 30.5, Noise())
+    wide = match_detections([(here, PATH)], CAMERA, 30.5, Noise())
     assert len(wide.time_s) == 3
     values = np.array([*CAMERA.mount_rad, CAMERA.delay_s])
-    assert residual([(here, PATH)], AIDECK, found, values) == pytest.approx(off[[1, 3]], abs=1e-6)
-    assert median_px([(here, PATH)], AIDECK, found, values) == pytest.approx(5.5)
+    assert pixel_residuals([(here, PATH)], AIDECK, found, values) == pytest.approx(
+        off[[1, 3]], abs=1e-6
+    )
+    assert median_residual_px([(here, PATH)], AIDECK, found, values) == pytest.approx(5.5)
     outside = replace(PATH, xyz_m=XYZ * [1, 1, 0] + [0, 0, 5.0])
-    assert match([(here, outside)], CAMERA, 900.0, Noise()).expected == 0
+    assert match_detections([(here, outside)], CAMERA, 900.0, Noise()).expected == 0
 
 
 def test_a_peer_is_expected_where_its_path_is_known_at_the_exposure() -> None:
     """The path lasts from 0 to 9.9 s, and images are stamped a quarter of a second late."""
     one = flight([2], np.array([[178.0, 91.0]]))
     late = replace(one, image_s=np.array([0.1, 0.2, 5.0, 10.0]))
-    assert match([(late, PATH)], CAMERA, 30.0, Noise()).expected == 2
+    assert match_detections([(late, PATH)], CAMERA, 30.0, Noise()).expected == 2
 
 
 def test_whitened_errors_have_the_variance_of_one() -> None:
     here = flight([0, 1, 2, 3], seen())
     noise = Noise(5.0, 0.02)
-    found = match([(here, PATH)], CAMERA, 30.0, noise)
+    found = match_detections([(here, PATH)], CAMERA, 30.0, noise)
     rng, at_s = np.random.default_rng(0), IMAGES_S[1] - 0.25
-    centre = PATH.at(np.array([at_s]))[0]
+    centre = PATH.interpolate_at(np.array([at_s]))[0]
     xyz = rng.multivariate_normal(centre, SPREAD, 20_000)
     roll, pitch = rng.normal([[0.01 * at_s], [-0.02 * at_s]], 0.02, (2, 20_000))
     uv, _, _ = pixels_from_horizontal(xyz, roll, pitch, CAMERA)
@@ -94,11 +96,11 @@ def test_whitened_errors_have_the_variance_of_one() -> None:
 
 def test_a_thinner_flight_keeps_detections_with_their_images() -> None:
     uv = np.arange(10.0).reshape(5, 2)
-    thin = flight([0, 1, 2, 2, 3], uv).thinned(2)
+    thin = flight([0, 1, 2, 2, 3], uv).thin_images(2)
     assert thin.image_s.tolist() == [1.0, 3.05]
     assert thin.image.tolist() == [0, 1, 1]
     assert thin.uv.tolist() == uv[[0, 2, 3]].tolist()
-    assert flight([0, 1, 2, 2, 3], uv).thinned(4).image.tolist() == [0, 1, 2, 2, 3]
+    assert flight([0, 1, 2, 2, 3], uv).thin_images(4).image.tolist() == [0, 1, 2, 2, 3]
 
 
 def test_attitude_loses_its_noise_and_keeps_its_motion() -> None:
@@ -107,7 +109,7 @@ def test_attitude_loses_its_noise_and_keeps_its_motion() -> None:
     noise = np.random.default_rng(0).normal(0, 0.02, slow.shape)
     rough = replace(flight([], np.zeros((0, 2))), attitude_s=at_s, attitude_rad=slow + noise)
     for added, most_rad in ((noise, 0.6 * 0.02), (0 * noise, 0.002)):
-        found = replace(rough, attitude_rad=slow + added).smoothed()
+        found = replace(rough, attitude_rad=slow + added).smooth_attitude()
         left = [
             np.interp(at_s, found.attitude_s, one) - wanted
             for one, wanted in zip(found.attitude_rad.T, slow.T, strict=True)
@@ -121,7 +123,10 @@ def test_attitude_that_jumps_loses_its_noise_and_keeps_its_jumps() -> None:
     true = np.column_stack([0.1 * np.exp(-since_s / 0.25), -0.05 * np.exp(-since_s / 0.25)])
     noise = rng.normal(0, 0.005, true.shape)
     here = flight([], np.zeros((0, 2)))
-    left = replace(here, attitude_s=at_s, attitude_rad=true + noise).smoothed().attitude_rad - true
+    left = (
+        replace(here, attitude_s=at_s, attitude_rad=true + noise).smooth_attitude().attitude_rad
+        - true
+    )
     assert np.std(left, axis=0).max() < 0.6 * 0.005
     jumps = np.flatnonzero(np.diff(since_s) < 0)
     for beside in (jumps, jumps + 1):
@@ -133,18 +138,18 @@ def test_of_white_noise_the_window_leaves_what_a_bell_of_two_samples_leaves() ->
     noise = np.random.default_rng(2).normal(0, 0.01, (5000, 2))
     here = replace(flight([], np.zeros((0, 2))), attitude_s=np.arange(5e3), attitude_rad=noise)
     bell = 1 / np.sqrt(2 * np.sqrt(np.pi) * 2.0)
-    assert here.smoothed().attitude_rad.std() == pytest.approx(0.01 * bell, rel=0.06)
+    assert here.smooth_attitude().attitude_rad.std() == pytest.approx(0.01 * bell, rel=0.06)
 
 
 def test_attitude_of_two_samples_stays_as_it_is() -> None:
     two = np.array([[0.1, 0.2], [0.3, 0.4]])
     here = replace(flight([], np.zeros((0, 2))), attitude_s=np.arange(2.0), attitude_rad=two)
-    assert here.smoothed().attitude_rad.tolist() == two.tolist()
+    assert here.smooth_attitude().attitude_rad.tolist() == two.tolist()
 
 
 @pytest.mark.parametrize("found", [1, 2, 4])
 def test_images_without_a_detection_near_are_the_worst_there_are(found: int) -> None:
     views, values = [(flight(list(range(found)), seen()[:found]), PATH)], np.zeros(4)
-    misfit = _misfit(views, CAMERA, np.array([*CAMERA.mount_rad, CAMERA.delay_s]), Noise())
-    assert misfit == pytest.approx(WORST * (4 - found) / 4, abs=1e-6)
-    assert 0 < _misfit(views, CAMERA, values, Noise()) <= WORST
+    misfit = _mean_misfit(views, CAMERA, np.array([*CAMERA.mount_rad, CAMERA.delay_s]), Noise())
+    assert misfit == pytest.approx(MAX_SQUARED_RESIDUAL * (4 - found) / 4, abs=1e-6)
+    assert 0 < _mean_misfit(views, CAMERA, values, Noise()) <= MAX_SQUARED_RESIDUAL

@@ -5,27 +5,27 @@ from filterpy.kalman import ExtendedKalmanFilter
 from dmrl.estimation.filters.ekf import (
     PRESETS,
     Steps,
+    build_steps,
     filter_many,
     filter_reference,
     input_variance,
-    measured,
-    moved,
-    pair_steps,
-    stack,
+    predict_range,
+    propagate_state,
+    stack_pairs,
 )
-from dmrl.estimation.model.pair import Pair, Track
+from dmrl.estimation.model.pair import Pair, SensorTrack
 
 from ..flights import flown, pair_of
 
 
 def steps_of(seed: int, preset: str) -> Steps:
-    return pair_steps(pair_of(flown("in_view", "realistic", seed, 8.0)), PRESETS[preset])
+    return build_steps(pair_of(flown("in_view", "realistic", seed, 8.0)), PRESETS[preset])
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_twin_agrees_with_filterpy(preset: str) -> None:
     flights = [steps_of(seed, preset) for seed in (1000, 1001)]
-    state, covariance = filter_many(stack(flights), PRESETS[preset])
+    state, covariance = filter_many(stack_pairs(flights), PRESETS[preset])
     for k, steps in enumerate(flights):
         reference, reference_covariance = filter_reference(steps, PRESETS[preset])
         assert np.abs(state[:, k] - reference).max() < 1e-9
@@ -44,24 +44,24 @@ def test_the_published_filter_starts_at_zero_and_first_predicts() -> None:
     steps = steps_of(1000, "published-sim")
     silent = Steps(steps.inputs, steps.height_m, steps.range_m * np.nan, steps.dt_s)
     state, _ = filter_many(silent, PRESETS["published-sim"])
-    expected, _, _ = moved(np.zeros((1, 3)), steps.inputs[0], steps.dt_s)
+    expected, _, _ = propagate_state(np.zeros((1, 3)), steps.inputs[0], steps.dt_s)
     assert np.allclose(state[0], expected)
 
 
 def test_the_jacobians_are_those_of_finite_differences() -> None:
     rng = np.random.default_rng(0)
     state, inputs, step = rng.normal(size=(5, 3)), rng.normal(size=(5, 6)), 1e-6
-    _, by_state, by_input = moved(state, inputs, 0.01)
+    _, by_state, by_input = propagate_state(state, inputs, 0.01)
     for column in range(3):
         change = step * np.eye(3)[column]
-        ahead, behind = (moved(state + s * change, inputs, 0.01)[0] for s in (1, -1))
+        ahead, behind = (propagate_state(state + s * change, inputs, 0.01)[0] for s in (1, -1))
         assert np.allclose((ahead - behind) / (2 * step), by_state[:, :, column], atol=1e-8)
-        ahead, behind = (measured(state + s * change, np.ones(5))[0] for s in (1, -1))
-        row = measured(state, np.ones(5))[1][:, column]
+        ahead, behind = (predict_range(state + s * change, np.ones(5))[0] for s in (1, -1))
+        row = predict_range(state, np.ones(5))[1][:, column]
         assert np.allclose((ahead - behind) / (2 * step), row, atol=1e-3)
     for column in range(6):
         change = step * np.eye(6)[column]
-        ahead, behind = (moved(state, inputs + s * change, 0.01)[0] for s in (1, -1))
+        ahead, behind = (propagate_state(state, inputs + s * change, 0.01)[0] for s in (1, -1))
         assert np.allclose((ahead - behind) / (2 * step), by_input[:, :, column], atol=1e-8)
 
 
@@ -72,7 +72,7 @@ def test_the_simulation_preset_ignores_heights() -> None:
 
 def test_a_range_is_the_length_of_all_three_sides() -> None:
     states = np.array([[3.0, 4.0, 0.7], [0.0, 0.0, 0.1]])
-    range_m, by_state = measured(states, np.array([12.0, -2.0]))
+    range_m, by_state = predict_range(states, np.array([12.0, -2.0]))
     assert range_m == pytest.approx([13.0, 2.0], abs=1e-3)
     assert by_state[0] == pytest.approx([3 / 13, 4 / 13, 0.0], abs=1e-3)
 
@@ -80,11 +80,11 @@ def test_a_range_is_the_length_of_all_three_sides() -> None:
 def test_steps_are_what_either_robot_measured_and_ranges_go_to_the_nearest() -> None:
     time_s = 7 + np.arange(50) / 100
     own, peer = (
-        Track(*(k + 10 * n + 0.01 * np.arange(50) for k in range(4)), np.zeros(50, bool))
+        SensorTrack(*(k + 10 * n + 0.01 * np.arange(50) for k in range(4)), np.zeros(50, bool))
         for n in (1, 2)
     )
     pair = Pair(time_s, own, peer, np.array([7.004, 7.006, 7.012, 7.49]), np.array([1.0, 2, 3, 4]))
-    steps = pair_steps(pair, PRESETS["published-firmware"])
+    steps = build_steps(pair, PRESETS["published-firmware"])
     assert steps.dt_s == pytest.approx(0.01)
     assert steps.height_m[:, 0] == pytest.approx(peer.height_m - own.height_m)
     columns = [peer.vx_mps, peer.vy_mps, peer.yaw_rate_radps]
@@ -93,7 +93,7 @@ def test_steps_are_what_either_robot_measured_and_ranges_go_to_the_nearest() -> 
     heard = {0: 1.0, 1: 3.0, 49: 4.0}  # of two of one step the last
     for k, range_m in enumerate(steps.range_m[:, 0]):
         assert range_m == heard[k] if k in heard else np.isnan(range_m)
-    twice = stack([steps, steps])
+    twice = stack_pairs([steps, steps])
     assert twice.inputs.shape == (50, 2, 6) and twice.range_m.shape == (50, 2)
 
 

@@ -5,12 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.flight.data_association import told_apart
-from dmrl.estimation.model.bearings import claim, polar_of, polar_variance, within, without
-from dmrl.estimation.model.pair import Array, Pair, Sightings
+from dmrl.estimation.flight.data_association import resolve_conflicts
+from dmrl.estimation.model.bearings import (
+    associate,
+    bearing_variance,
+    crop_to_time,
+    drop_candidates,
+    to_bearing,
+)
+from dmrl.estimation.model.pair import Array, BearingMeasurements, Pair
 from dmrl.estimation.model.status import OK
-from dmrl.estimation.solver.estimate import Estimate, swapped
-from dmrl.estimation.solver.keyframes import GLOBALS, Noise
+from dmrl.estimation.solver.estimate import Estimate, seen_from_peer
+from dmrl.estimation.solver.keyframes import GLOBALS, NoiseModel
 
 from ..sighted_flights import STD, still_pair
 
@@ -19,10 +25,12 @@ LEFT, RIGHT = 0.5, -0.5
 Names = tuple[str, str]
 
 
-def candidates(*bearings_rad: float) -> Sightings:
+def candidates(*bearings_rad: float) -> BearingMeasurements:
     polar = [[bearing, 0.0, np.log(2.0)] for bearing in bearings_rad]
     shape = len(TIMES_S), 1, 1
-    return Sightings(TIMES_S, np.tile(polar, shape), np.tile(STD, (len(TIMES_S), len(polar), 1)))
+    return BearingMeasurements(
+        TIMES_S, np.tile(polar, shape), np.tile(STD, (len(TIMES_S), len(polar), 1))
+    )
 
 
 def at(bearing_rad: float, sigma_m: float = 0.1) -> Estimate:
@@ -33,78 +41,86 @@ def at(bearing_rad: float, sigma_m: float = 0.1) -> Estimate:
     covariance = np.tile(sigma_m**2 * np.eye(3), (101, 1, 1))
     status = np.full(101, OK, np.int8)
     time_s = np.linspace(pair.time_s[0], pair.time_s[-1], 101)
-    return Estimate(time_s, state, covariance, status, np.zeros(len(GLOBALS)), Noise())
+    return Estimate(time_s, state, covariance, status, np.zeros(len(GLOBALS)), NoiseModel())
 
 
 def both_ways(found: dict[Names, Estimate]) -> dict[Names, Estimate]:
-    return found | {names[::-1]: swapped(one) for names, one in found.items()}
+    return found | {names[::-1]: seen_from_peer(one) for names, one in found.items()}
 
 
-def pairs_of(sees: Sightings) -> dict[Names, Pair]:
+def pairs_of(sees: BearingMeasurements) -> dict[Names, Pair]:
     pair, _ = still_pair()
-    return {("a", "b"): replace(pair, own_sees=sees), ("a", "c"): replace(pair, own_sees=sees)}
+    return {
+        ("a", "b"): replace(pair, own_bearings=sees),
+        ("a", "c"): replace(pair, own_bearings=sees),
+    }
 
 
-def bearings(sees: Sightings | None) -> Array:
+def bearings(sees: BearingMeasurements | None) -> Array:
     assert sees is not None
-    return np.unique(sees.polar[np.isfinite(sees.polar[..., 0]), 0])
+    return np.unique(sees.bearing[np.isfinite(sees.bearing[..., 0]), 0])
 
 
 def test_who_took_another_s_candidates_is_solved_again_without_them() -> None:
     pairs = pairs_of(candidates(LEFT, RIGHT))
     found = both_ways({("a", "b"): at(LEFT), ("a", "c"): at(LEFT - 0.08)})
-    (again,) = told_apart(pairs, found).items()
+    (again,) = resolve_conflicts(pairs, found).items()
     assert again[0] == ("a", "c")
-    assert bearings(again[1].own_sees) == pytest.approx([RIGHT])
-    assert bearings(pairs["a", "c"].own_sees) == pytest.approx([RIGHT, LEFT])
+    assert bearings(again[1].own_bearings) == pytest.approx([RIGHT])
+    assert bearings(pairs["a", "c"].own_bearings) == pytest.approx([RIGHT, LEFT])
 
 
 def test_a_vague_solution_s_claim_is_the_weaker_one() -> None:
     pairs = pairs_of(candidates(LEFT, RIGHT))
     found = both_ways({("a", "b"): at(LEFT, 0.5), ("a", "c"): at(LEFT, 0.1)})
-    assert list(told_apart(pairs, found)) == [("a", "b")]
+    assert list(resolve_conflicts(pairs, found)) == [("a", "b")]
 
 
 def test_robots_that_each_have_their_own_are_left_alone() -> None:
     pairs = pairs_of(candidates(LEFT, RIGHT))
-    assert not told_apart(pairs, both_ways({("a", "b"): at(LEFT), ("a", "c"): at(RIGHT)}))
-    blind = {names: replace(pair, own_sees=None) for names, pair in pairs.items()}
-    assert not told_apart(blind, both_ways({("a", "b"): at(LEFT), ("a", "c"): at(LEFT)}))
+    assert not resolve_conflicts(pairs, both_ways({("a", "b"): at(LEFT), ("a", "c"): at(RIGHT)}))
+    blind = {names: replace(pair, own_bearings=None) for names, pair in pairs.items()}
+    assert not resolve_conflicts(blind, both_ways({("a", "b"): at(LEFT), ("a", "c"): at(LEFT)}))
 
 
 def test_the_camera_of_a_robot_that_is_second_by_name_counts_as_well() -> None:
     pair, _ = still_pair()
     sees = candidates(LEFT, RIGHT)
-    pairs = {("a", "c"): replace(pair, peer_sees=sees), ("b", "c"): replace(pair, peer_sees=sees)}
+    pairs = {
+        ("a", "c"): replace(pair, peer_bearings=sees),
+        ("b", "c"): replace(pair, peer_bearings=sees),
+    }
     ways = {("c", "a"): at(LEFT), ("c", "b"): at(LEFT + 0.08)}
-    (again,) = told_apart(pairs, both_ways(ways)).items()
+    (again,) = resolve_conflicts(pairs, both_ways(ways)).items()
     assert again[0] == ("b", "c")
-    assert bearings(again[1].peer_sees) == pytest.approx([RIGHT])
-    assert again[1].own_sees is None
+    assert bearings(again[1].peer_bearings) == pytest.approx([RIGHT])
+    assert again[1].own_bearings is None
 
 
 def test_images_without_a_candidate_left_are_no_images() -> None:
     sees = candidates(LEFT)
     gone = np.arange(len(TIMES_S)) < 3
-    left = without(sees, gone, np.zeros(len(TIMES_S), np.intp))
+    left = drop_candidates(sees, gone, np.zeros(len(TIMES_S), np.intp))
     assert left.time_s.tolist() == TIMES_S[3:].tolist()
-    assert within(sees, 1.0, 2.0).time_s.tolist() == [1.0, 1.5, 2.0]  # type: ignore[union-attr]
-    assert within(None, 1.0, 2.0) is None
+    assert crop_to_time(sees, 1.0, 2.0).time_s.tolist() == [1.0, 1.5, 2.0]  # type: ignore[union-attr]
+    assert crop_to_time(None, 1.0, 2.0) is None
 
 
 def test_directions_are_as_uncertain_as_the_place_is() -> None:
     rng, place = np.random.default_rng(0), np.array([[1.5, -0.8, 0.4]])
     spread = np.diag([0.02, 0.01, 0.015]) ** 2
-    drawn = polar_of(place + rng.multivariate_normal(np.zeros(3), spread, 50_000))
-    assert polar_variance(place, spread[None])[0] == pytest.approx(drawn.var(axis=0), rel=0.05)
+    drawn = to_bearing(place + rng.multivariate_normal(np.zeros(3), spread, 50_000))
+    assert bearing_variance(place, spread[None])[0] == pytest.approx(drawn.var(axis=0), rel=0.05)
 
 
 def test_a_claim_is_the_density_of_what_was_seen() -> None:
     place, spread = np.array([[2.0, 0.0, 0.0]]), 0.1**2 * np.eye(3)[None]
     sees = candidates(0.1, 0.3)
-    one = Sightings(sees.time_s[:1], sees.polar[:1], sees.std[:1])
-    found = claim(one, place, spread)
+    one = BearingMeasurements(sees.time_s[:1], sees.bearing[:1], sees.std[:1])
+    found = associate(one, place, spread)
     variance = STD**2 + 0.05**2
     assert found.nearest.tolist() == [0]
-    assert found.squared == pytest.approx([0.1**2 / variance[0]])
-    assert found.log_likelihood == pytest.approx(-(found.squared + np.log(variance).sum()) / 2)
+    assert found.squared_distance == pytest.approx([0.1**2 / variance[0]])
+    assert found.log_likelihood == pytest.approx(
+        -(found.squared_distance + np.log(variance).sum()) / 2
+    )

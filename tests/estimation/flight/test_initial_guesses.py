@@ -7,16 +7,22 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.flight import initial_guesses
-from dmrl.estimation.flight.initial_guesses import LIKELIER, NEAR_M, SHORT_M, Starts, likely_starts
+from dmrl.estimation.flight.initial_guesses import (
+    CLOSE_RANGE_M,
+    MIN_LIKELIHOOD_GAIN,
+    SHORT_RANGE_M,
+    InitialGuesses,
+    find_initial_guesses,
+)
 from dmrl.estimation.flight.pairs import estimate_pairs
-from dmrl.estimation.solver.keyframes import Noise, Problem, problem
+from dmrl.estimation.solver.keyframes import KeyframeProblem, NoiseModel, build_keyframes
 
 from ..flights import flown, pair_of, truth_at
 
 
-def ranging(*ranges_m: float) -> Problem:
+def ranging(*ranges_m: float) -> KeyframeProblem:
     """A flight whose ranges begin with these, and are long afterwards."""
-    flight = problem(pair_of(flown("in_view", "ideal", 1000, 1.0)))
+    flight = build_keyframes(pair_of(flown("in_view", "ideal", 1000, 1.0)))
     range_m = np.full(len(flight.range_m), 3.0)
     range_m[: len(ranges_m)] = ranges_m
     return replace(flight, range_m=range_m)
@@ -25,35 +31,42 @@ def ranging(*ranges_m: float) -> Problem:
 def likelier_by(gain: float, asked: list[float]) -> object:
     """Starts that are so much likelier with longer ranges. Adds what was asked for first ranges."""
 
-    def made(flights: Sequence[Problem], _: Noise) -> list[Starts]:
+    def made(flights: Sequence[KeyframeProblem], _: NoiseModel) -> list[InitialGuesses]:
         firsts = [float(flight.range_m[0]) for flight in flights]
         asked.extend(firsts)
         return [
-            Starts(np.array([0.0, gain * (first > SHORT_M)]), np.zeros((1, 2, 5)), np.zeros(0))
+            InitialGuesses(
+                np.array([0.0, gain * (first > SHORT_RANGE_M)]), np.zeros((1, 2, 5)), np.zeros(0)
+            )
             for first in firsts
         ]
 
     return made
 
 
-@pytest.mark.parametrize(("gain", "offset_m"), [(LIKELIER - 1, 0.0), (LIKELIER + 1, -SHORT_M)])
+@pytest.mark.parametrize(
+    ("gain", "offset_m"),
+    [(MIN_LIKELIHOOD_GAIN - 1, 0.0), (MIN_LIKELIHOOD_GAIN + 1, -SHORT_RANGE_M)],
+)
 def test_longer_ranges_are_believed_if_the_flight_is_clearly_likelier(
     monkeypatch: pytest.MonkeyPatch, gain: float, offset_m: float
 ) -> None:
-    monkeypatch.setattr(initial_guesses, "_starts", likelier_by(gain, []))
-    (found,) = likely_starts([ranging(*[0.1] * 20)], Noise())
-    assert found.offset_m == offset_m
+    monkeypatch.setattr(initial_guesses, "_smooth_guesses", likelier_by(gain, []))
+    (found,) = find_initial_guesses([ranging(*[0.1] * 20)], NoiseModel())
+    assert found.range_offset_m == offset_m
     assert found.score.max() == (gain if offset_m else 0.0)
 
 
 def test_they_are_tried_where_robots_come_close_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[float] = []
-    monkeypatch.setattr(initial_guesses, "_starts", likelier_by(0.0, asked))
-    far, near = ranging(*[NEAR_M + 0.1] * 20), ranging(*[NEAR_M - 0.1] * 20)
+    monkeypatch.setattr(initial_guesses, "_smooth_guesses", likelier_by(0.0, asked))
+    far, near = ranging(*[CLOSE_RANGE_M + 0.1] * 20), ranging(*[CLOSE_RANGE_M - 0.1] * 20)
     none = replace(far, range_m=far.range_m[:0] + 0.0)
-    likely_starts([far, near], Noise())
-    assert asked == pytest.approx([NEAR_M + 0.1, NEAR_M - 0.1, NEAR_M - 0.1 + SHORT_M])
-    assert not initial_guesses._near(none)
+    find_initial_guesses([far, near], NoiseModel())
+    assert asked == pytest.approx(
+        [CLOSE_RANGE_M + 0.1, CLOSE_RANGE_M - 0.1, CLOSE_RANGE_M - 0.1 + SHORT_RANGE_M]
+    )
+    assert not initial_guesses._has_close_pass(none)
 
 
 @pytest.mark.heavy

@@ -8,14 +8,14 @@ import pytest
 
 from dmrl import messages
 from dmrl.estimation.flight import pairs as entrance
-from dmrl.estimation.flight.initial_guesses import Starts
+from dmrl.estimation.flight.initial_guesses import InitialGuesses
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
 from dmrl.estimation.model import status as room
-from dmrl.estimation.model.pair import Pair, Track
-from dmrl.estimation.solver.estimate import Estimate, from_peer, swapped
-from dmrl.estimation.solver.keyframes import GLOBALS, Noise
-from dmrl.estimation.solver.levenberg_marquardt import Solution
-from dmrl.estimation.solver.residuals import BIAS
+from dmrl.estimation.model.pair import Pair, SensorTrack
+from dmrl.estimation.solver.estimate import Estimate, seen_from_peer, transform_to_peer
+from dmrl.estimation.solver.keyframes import GLOBALS, NoiseModel
+from dmrl.estimation.solver.levenberg_marquardt import MapEstimate
+from dmrl.estimation.solver.residuals import RANGE_BIAS
 from dmrl.flight import Trajectory
 
 from ..flights import flown, pair_of, truth_at
@@ -51,14 +51,18 @@ def test_spreads_grow_with_what_else_may_be(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Two solutions of one cost, 1 m apart."""
-    ends = [Solution(np.zeros((3, 6)), np.zeros(len(GLOBALS)), 0.0) for _ in range(2)]
+    ends = [MapEstimate(np.zeros((3, 6)), np.zeros(len(GLOBALS)), 0.0) for _ in range(2)]
     ends[1].state[:, 0] = 1.0
     known = np.tile(np.eye(6), (3, 1, 1))
-    for name, given in (("solutions", ends), ("_weighed", ends), ("covariance", (known, None))):
+    for name, given in (
+        ("find_solutions", ends),
+        ("_rank_solutions", ends),
+        ("compute_covariance", (known, None)),
+    ):
         monkeypatch.setattr(entrance, name, lambda *_, given=given: given)
-    flight = SimpleNamespace(key_s=np.arange(3.0), looks=None, known_std=None)
-    found = entrance._from_batch(flight, Noise(), Starts(*np.zeros((3, 1))), [])  # type: ignore[arg-type]
-    wanted = entrance.INFLATION**2 * np.eye(3) + np.diag([0.5, 0.0, 0.0])
+    flight = SimpleNamespace(keyframe_s=np.arange(3.0), camera=None, calibrated_std=None)
+    found = entrance._estimate_by_batch(flight, NoiseModel(), InitialGuesses(*np.zeros((3, 1))), [])  # type: ignore[arg-type]
+    wanted = entrance.SIGMA_INFLATION**2 * np.eye(3) + np.diag([0.5, 0.0, 0.0])
     assert found.covariance == pytest.approx(np.tile(wanted, (3, 1, 1)))
 
 
@@ -66,22 +70,27 @@ def test_a_smoother_s_spread_is_its_own_and_that_between_its_tracks() -> None:
     tracks = np.zeros((3, 2, 5))
     tracks[:, 1, 0] = 1.0
     known = np.tile(np.eye(5), (3, 2, 1, 1))
-    flight = SimpleNamespace(key_s=np.arange(3.0))
-    starts = Starts(np.zeros(2), tracks, known, offset_m=-0.4)
-    found = entrance._from_smoother(flight, Noise(), starts)  # type: ignore[arg-type]
-    assert found.constants[BIAS] == -0.4
-    wanted = entrance.SMOOTHER_INFLATION**2 * np.eye(3) + np.diag([0.5, 0.0, 0.0])
+    flight = SimpleNamespace(keyframe_s=np.arange(3.0))
+    starts = InitialGuesses(np.zeros(2), tracks, known, range_offset_m=-0.4)
+    found = entrance._estimate_by_smoother(flight, NoiseModel(), starts)  # type: ignore[arg-type]
+    assert found.constants[RANGE_BIAS] == -0.4
+    wanted = entrance.SMOOTHER_SIGMA_INFLATION**2 * np.eye(3) + np.diag([0.5, 0.0, 0.0])
     assert found.covariance == pytest.approx(np.tile(wanted, (3, 1, 1)))
 
 
 def test_the_gate_makes_no_allowance_for_sensors_worse_than_any_that_were_tried() -> None:
-    usual = Noise()
-    grades = [entrance.gate_sigma(usual.graded(grade)) for grade in (0.55, 1.0, 1.3, 1.5, 3.0)]
-    assert grades[:2] == [entrance.GATE_SIGMA] * 2
-    assert entrance.GATE_SIGMA < grades[2] < 1.0
+    usual = NoiseModel()
+    grades = [
+        entrance.gate_sigma_factor(usual.scaled_by(grade)) for grade in (0.55, 1.0, 1.3, 1.5, 3.0)
+    ]
+    assert grades[:2] == [entrance.GATE_SIGMA_FACTOR] * 2
+    assert entrance.GATE_SIGMA_FACTOR < grades[2] < 1.0
     assert grades[3:] == [1.0, 1.0]
-    assert entrance.gate_sigma(replace(usual, range_error_std_m=0.06)) == entrance.GATE_SIGMA
-    assert entrance.gate_sigma(replace(usual, range_error_std_m=0.12)) == 1.0
+    assert (
+        entrance.gate_sigma_factor(replace(usual, range_error_std_m=0.06))
+        == entrance.GATE_SIGMA_FACTOR
+    )
+    assert entrance.gate_sigma_factor(replace(usual, range_error_std_m=0.12)) == 1.0
 
 
 def test_the_statuses_are_those_of_the_schema() -> None:
@@ -119,8 +128,8 @@ def test_only_sensors_that_look_calibrated_are_taken_to_have_small_scales() -> N
 def test_both_directions_come_from_one_solve() -> None:
     here, there = solved("in_view", "calibrated", 1001)
     assert rmse(there, 1001, own="cf2") < 0.35
-    assert np.allclose(from_peer(there.state), here.state)
-    again = swapped(swapped(here))
+    assert np.allclose(transform_to_peer(there.state), here.state)
+    again = seen_from_peer(seen_from_peer(here))
     assert np.allclose(again.covariance, here.covariance)
     assert np.allclose(again.constants, here.constants)
 
@@ -140,7 +149,7 @@ def test_motion_that_leaves_the_bearing_open_is_never_ok(
 ) -> None:
     (estimate, _) = solved(trajectory, noise, 1000)
     assert (estimate.status == room.AMBIGUOUS).mean() > 0.9
-    assert estimate.refused == {"parallel": "alike"}.get(trajectory, "still")
+    assert estimate.rejection_reason == {"parallel": "alike"}.get(trajectory, "still")
 
 
 @pytest.mark.slow
@@ -156,7 +165,7 @@ def test_nor_is_it_in_other_flights(trajectory: Trajectory, noise: str, seed: in
 def test_where_a_sensor_is_silent_nothing_is_ok() -> None:
     pair = pair_of(flown("random", "calibrated", 1001, LONG_S))
     gap = (pair.time_s > 30) & (pair.time_s < 33)
-    held = Track(*(np.where(gap, 0.0, signal) for signal in pair.own.values()), gap)
+    held = SensorTrack(*(np.where(gap, 0.0, signal) for signal in pair.own.signals()), gap)
     ((estimate, _),) = estimate_pairs(
         [Pair(pair.time_s, held, pair.peer, pair.range_time_s, pair.range_m)]
     )
@@ -221,9 +230,9 @@ def test_between_keyframes_positions_are_interpolated_and_outside_unconverged() 
         np.stack([np.eye(3), 3 * np.eye(3)]),
         none,
         np.zeros(len(GLOBALS)),
-        Noise(),
+        NoiseModel(),
     )
-    xy, covariance, status = estimate.at(np.array([0.5, 2.0]))
+    xy, covariance, status = estimate.interpolate_at(np.array([0.5, 2.0]))
     assert xy.tolist() == [[0.5, 1.0], [1.0, 2.0]]
     assert covariance[0].tolist() == (2 * np.eye(2)).tolist()
     assert status.tolist() == [room.OK, room.UNCONVERGED]
@@ -234,13 +243,19 @@ def test_between_two_statuses_the_worse_counts_and_turned_covariances_are_those_
     state = np.array([[1.0, 0.5, 0.4], [1.0, 0.5, 0.4]])
     status = np.array([room.OK, room.AMBIGUOUS], np.int8)
     constants = np.arange(11.0)
-    estimate = Estimate(np.arange(2.0), state, np.stack([spread] * 2), status, constants, Noise())
-    assert estimate.at(np.array([0.0, 0.5, 1.0, 1.5]))[2].tolist() == [room.AMBIGUOUS] * 4
-    back = swapped(estimate)
+    estimate = Estimate(
+        np.arange(2.0), state, np.stack([spread] * 2), status, constants, NoiseModel()
+    )
+    assert (
+        estimate.interpolate_at(np.array([0.0, 0.5, 1.0, 1.5]))[2].tolist() == [room.AMBIGUOUS] * 4
+    )
+    back = seen_from_peer(estimate)
     # Own and peer change places, and what a clock is late by the other is early by.
     assert back.constants.tolist() == [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, -10]
     drawn = np.random.default_rng(0).multivariate_normal(state[0], 1e-4 * spread, 100_000)
-    seen = np.cov(from_peer(drawn).T) * 1e4
+    seen = np.cov(transform_to_peer(drawn).T) * 1e4
     assert back.covariance[0] == pytest.approx(seen, abs=3e-4)
     # A peer 1 m ahead that faces left sees the observer 1 m to its left.
-    assert from_peer(np.array([[1.0, 0.0, np.pi / 2]]))[0] == pytest.approx([0, 1, -np.pi / 2])
+    assert transform_to_peer(np.array([[1.0, 0.0, np.pi / 2]]))[0] == pytest.approx(
+        [0, 1, -np.pi / 2]
+    )

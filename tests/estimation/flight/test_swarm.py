@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.flight.pairs import estimate_pairs
-from dmrl.estimation.flight.segments import contradicts
+from dmrl.estimation.flight.segments import is_inconsistent
 from dmrl.estimation.flight.swarm import estimate_swarm
 from dmrl.estimation.model.pair import Pair
 from dmrl.estimation.model.status import AMBIGUOUS, OK
@@ -116,6 +116,6 @@ def test_shadowed_ranges_of_one_pair_do_not_bend_the_others() -> None:
 def test_one_solve_that_contradicts_a_sure_pair_is_not_believed() -> None:
     *_, pairwise, swarm = solved("in_view", "calibrated")
     names = ("cf1", "cf2")
-    assert not contradicts(swarm[names], pairwise[names])
+    assert not is_inconsistent(swarm[names], pairwise[names])
     bent = replace(swarm[names], state=swarm[names].state + np.array([0.5, 0.0, 0.0]))
-    assert contradicts(bent, pairwise[names])
+    assert is_inconsistent(bent, pairwise[names])

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.model.pair import Pair, Track, resample, usable_ranges
+from dmrl.estimation.model.pair import Pair, SensorTrack, resample, usable_ranges
 
 GRID = np.arange(200) / 100
-STILL = Track(*np.zeros((4, 200)), np.zeros(200, bool))
+STILL = SensorTrack(*np.zeros((4, 200)), np.zeros(200, bool))
 
 
 def test_ranges_that_no_radio_gives_are_not_usable() -> None:
@@ -36,16 +36,16 @@ def test_a_pair_takes_only_what_is_finite_and_forward() -> None:
         with pytest.raises(ValueError, match="not uniform and increasing"):
             uneven = np.where(np.arange(200) == 10, at, GRID)
             Pair(uneven, STILL, STILL, np.array([0.5]), np.array([1.0]))
-    broken = Track(np.full(200, np.nan), *np.zeros((3, 200)), np.zeros(200, bool))
-    short = Track(*np.zeros((4, 199)), np.zeros(199, bool))
+    broken = SensorTrack(np.full(200, np.nan), *np.zeros((3, 200)), np.zeros(200, bool))
+    short = SensorTrack(*np.zeros((4, 199)), np.zeros(199, bool))
     for odd in (broken, short):
         with pytest.raises(ValueError, match="peer: signals are not 200 finite numbers"):
             Pair(GRID, STILL, odd, np.array([0.5]), np.array([1.0]))
 
 
 def test_a_pair_seen_from_the_peer_has_the_same_ranges() -> None:
-    fast = Track(np.ones(200), *np.zeros((3, 200)), np.zeros(200, bool))
-    pair = Pair(GRID, STILL, fast, np.array([0.5]), np.array([1.0])).swapped()
+    fast = SensorTrack(np.ones(200), *np.zeros((3, 200)), np.zeros(200, bool))
+    pair = Pair(GRID, STILL, fast, np.array([0.5]), np.array([1.0])).swap_robots()
     assert pair.own is fast
     assert pair.peer is STILL
     assert pair.dt_s == pytest.approx(0.01)

@@ -5,20 +5,20 @@ import pytest
 
 from dmrl.estimation.model.position_metrics import (
     DEFINITIONS,
-    Figures,
-    Judged,
-    figures,
-    inside_truth,
-    overall,
-    squared_distances,
+    EvaluatedPositions,
+    PairFigures,
+    combine_figures,
+    compute_figures,
+    is_covered_by_truth,
+    mahalanobis_squared,
 )
 from dmrl.geometry.frames import Array
 
 
-def judged(error_m: Array, std_m: float = 0.1, kept: bool | Array = True) -> Judged:
+def judged(error_m: Array, std_m: float = 0.1, kept: bool | Array = True) -> EvaluatedPositions:
     """Errors at 10 Hz, one and a half metres away."""
     count = len(error_m)
-    return Judged(
+    return EvaluatedPositions(
         time_s=np.arange(count) / 10,
         error_m=error_m,
         covariance=np.tile(np.eye(2) * std_m**2, (count, 1, 1)),
@@ -32,14 +32,14 @@ def test_an_honest_estimator_has_a_nees_of_two_and_covers_95_percent() -> None:
     covariance = np.array([[0.04, 0.015], [0.015, 0.01]])
     errors = rng.multivariate_normal(np.zeros(2), covariance, 20_000)
     honest = judged(errors)
-    honest = Judged(
+    honest = EvaluatedPositions(
         honest.time_s,
         errors,
         np.tile(covariance, (20_000, 1, 1)),
         honest.distance_m,
         honest.kept,
     )
-    found = figures(honest, 0.0)
+    found = compute_figures(honest, 0.0)
     assert found.nees == pytest.approx(2.0, rel=0.03)
     assert found.coverage_95 == pytest.approx(0.95, abs=0.005)
     assert found.rmse_m == pytest.approx(np.sqrt(0.05), rel=0.02)
@@ -49,7 +49,7 @@ def test_errors_before_settling_count_for_the_gate_only() -> None:
     errors = np.zeros((100, 2))
     errors[:50, 0] = 5.0
     kept = np.arange(100) >= 40
-    found = figures(judged(errors, kept=kept), settle_s=5.0)
+    found = compute_figures(judged(errors, kept=kept), settle_s=5.0)
     assert (found.rmse_m, found.p95_m, found.wrong_basin, found.nees) == (0.0, 0.0, 0.0, 0.0)
     assert (found.kept, found.good) == (0.6, 0.5)
     assert found.precision == pytest.approx(50 / 60)
@@ -58,30 +58,30 @@ def test_errors_before_settling_count_for_the_gate_only() -> None:
 
 
 def test_a_mirrored_solution_is_a_wrong_basin() -> None:
-    found = figures(judged(np.tile([0.0, 2.0], (100, 1))), 0.0)
+    found = compute_figures(judged(np.tile([0.0, 2.0], (100, 1))), 0.0)
     assert found.wrong_basin == 1.0
-    assert figures(judged(np.tile([0.0, 0.5], (100, 1))), 0.0).wrong_basin == 0.0
+    assert compute_figures(judged(np.tile([0.0, 0.5], (100, 1))), 0.0).wrong_basin == 0.0
 
 
 def test_covariances_that_are_unknown_or_exact_are_not_judged() -> None:
     for std_m in (0.0, np.nan):
-        found = figures(judged(np.full((10, 2), 0.1), std_m), 0.0)
+        found = compute_figures(judged(np.full((10, 2), 0.1), std_m), 0.0)
         assert np.isnan(found.nees)
         assert np.isnan(found.coverage_95)
         assert found.kept == 1.0
 
 
 def test_nothing_to_measure_is_not_a_number() -> None:
-    found = figures(judged(np.ones((10, 2)), kept=False), settle_s=100.0)
+    found = compute_figures(judged(np.ones((10, 2)), kept=False), settle_s=100.0)
     assert np.isnan([found.rmse_m, found.wrong_basin, found.precision, found.recall]).all()
-    assert np.isnan(overall([found]).precision)
+    assert np.isnan(combine_figures([found]).precision)
 
 
 def test_over_all_pairs_every_sample_counts_once() -> None:
-    one = figures(judged(np.zeros((100, 2))), 0.0)
-    other = figures(judged(np.full((300, 2), 0.5), kept=np.arange(300) < 60), 0.0)
-    none = figures(judged(np.zeros((100, 2)), kept=False), 0.0)
-    every = overall([one, other, none])
+    one = compute_figures(judged(np.zeros((100, 2))), 0.0)
+    other = compute_figures(judged(np.full((300, 2), 0.5), kept=np.arange(300) < 60), 0.0)
+    none = compute_figures(judged(np.zeros((100, 2)), kept=False), 0.0)
+    every = combine_figures([one, other, none])
     assert every.samples == 500
     assert every.kept == pytest.approx(160 / 500)
     assert every.precision == pytest.approx(100 / 160)
@@ -90,22 +90,22 @@ def test_over_all_pairs_every_sample_counts_once() -> None:
 
 
 def test_every_figure_is_defined() -> None:
-    assert set(DEFINITIONS) == set(Figures.__dataclass_fields__) - {"samples"}
+    assert set(DEFINITIONS) == set(PairFigures.__dataclass_fields__) - {"samples"}
 
 
 def test_truth_reaches_as_far_as_it_is_dense() -> None:
     true_ns = np.array([0, 200, 450, 701, 1000]) * 1_000_000  # gaps of 0.2, 0.25, 0.251, 0.299 s
     at_ns = np.array([-1, 0, 100, 200, 300, 450, 500, 701, 900, 1000, 1001]) * 1_000_000
     near = [False, True, True, True, True, True, False, True, False, True, False]
-    assert inside_truth(at_ns, true_ns).tolist() == near
-    assert not inside_truth(at_ns, true_ns[:0]).any()
+    assert is_covered_by_truth(at_ns, true_ns).tolist() == near
+    assert not is_covered_by_truth(at_ns, true_ns[:0]).any()
 
 
 def test_figures_are_those_of_a_plain_count() -> None:
     rng = np.random.default_rng(5)
     count, settle_s = 101, 3.0  # one sample stands at the border, and counts
     root = rng.normal(size=(count, 2, 2)) * 0.2
-    found = Judged(
+    found = EvaluatedPositions(
         np.arange(count) / 10,
         rng.normal(size=(count, 2)) * 0.25,
         root @ root.swapaxes(1, 2),
@@ -135,16 +135,16 @@ def test_figures_are_those_of_a_plain_count() -> None:
         "kept_coverage_95": np.mean([squared[k] <= 5.991 for k in kept]),
         "kept_rmse_m": np.sqrt(np.mean([size[k] ** 2 for k in kept])),
     }
-    assert asdict(figures(found, settle_s)) == pytest.approx(wanted)
+    assert asdict(compute_figures(found, settle_s)) == pytest.approx(wanted)
     assert found.sigma_m == pytest.approx(np.sqrt([np.diag(c) for c in found.covariance]))
 
 
 @pytest.mark.parametrize(("share", "wrong"), [(0.49, 0.0), (0.51, 1.0)])
 def test_half_the_distance_is_a_wrong_basin(share: float, wrong: float) -> None:
     errors = np.tile([0.0, 1.5 * share], (9, 1))
-    assert figures(judged(errors), 0.0).wrong_basin == wrong
+    assert compute_figures(judged(errors), 0.0).wrong_basin == wrong
     errors[:4] = 1.5 * (1 - share)  # fewer than half of them say nothing
-    assert figures(judged(errors), 0.0).wrong_basin == wrong
+    assert compute_figures(judged(errors), 0.0).wrong_basin == wrong
 
 
 @pytest.mark.parametrize(
@@ -153,16 +153,16 @@ def test_half_the_distance_is_a_wrong_basin(share: float, wrong: float) -> None:
 )
 def test_what_is_no_covariance_gives_no_distance(covariance: list[list[float]]) -> None:
     one = replace(judged(np.array([[1.0, 0.0]])), covariance=np.array([covariance], float))
-    assert np.isnan(squared_distances(one)).all()
+    assert np.isnan(mahalanobis_squared(one)).all()
 
 
 def test_figures_over_all_pairs_are_means_medians_or_shares() -> None:
-    def pair(k: float, samples: int) -> Figures:
-        return Figures(samples, k, 2 * k, k, 3 * k, k / 4, 0.5, k / 3, 0.5, k / 3, k / 5, 4 * k)
+    def pair(k: float, samples: int) -> PairFigures:
+        return PairFigures(samples, k, 2 * k, k, 3 * k, k / 4, 0.5, k / 3, 0.5, k / 3, k / 5, 4 * k)
 
-    one, two, nan = pair(0.3, 100), pair(0.9, 300), Figures(50, *[float("nan")] * 5, *[0.0] * 2,
+    one, two, nan = pair(0.3, 100), pair(0.9, 300), PairFigures(50, *[float("nan")] * 5, *[0.0] * 2,
                                                            *[float("nan")] * 4)  # fmt: skip
-    found = overall([one, two, nan])
+    found = combine_figures([one, two, nan])
     assert found.samples == 450
     assert (found.rmse_m, found.p95_m, found.kept_rmse_m) == pytest.approx((0.6, 1.2, 2.4))
     assert (found.wrong_basin, found.nees) == pytest.approx((0.6, 1.8))

@@ -7,9 +7,9 @@ from dmrl.estimation.model.status import (
     OK,
     UNCONVERGED,
     probability_beyond,
-    within_budget,
+    select_within_budget,
 )
-from dmrl.estimation.model.status import statuses as statuses_of
+from dmrl.estimation.model.status import classify_positions as statuses_of
 
 
 def spread(*sigmas_m: float) -> Array:
@@ -32,7 +32,7 @@ def test_the_probability_of_a_long_error_is_that_of_samples() -> None:
 def test_a_flight_keeps_its_best_until_the_budget_is_spent() -> None:
     probability = np.array([0.1, 0.0, 0.06, 0.05, 0.0])
     for share, count in ((0.01, 2), (0.02, 3)):
-        kept = within_budget(probability, share)
+        kept = select_within_budget(probability, share)
         assert kept.sum() == count
         assert probability[kept].mean() <= share
         worse = np.sort(probability[~kept])[:1]
@@ -41,8 +41,8 @@ def test_a_flight_keeps_its_best_until_the_budget_is_spent() -> None:
 
 def test_no_budget_pays_for_a_position_that_may_be_anywhere() -> None:
     probability = np.append(np.zeros(1000), 0.5)
-    assert within_budget(probability, 0.2).tolist() == [True] * 1000 + [False]
-    assert not within_budget(np.full(10, 0.5), 0.6).any()
+    assert select_within_budget(probability, 0.2).tolist() == [True] * 1000 + [False]
+    assert not select_within_budget(np.full(10, 0.5), 0.6).any()
 
 
 def test_a_bearing_that_is_open_is_ambiguous_and_a_blurred_one_unconverged() -> None:

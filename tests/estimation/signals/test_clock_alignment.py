@@ -4,14 +4,14 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from dmrl.estimation.signals.clock_alignment import (
-    OVERLAP_S,
-    SLOW_S,
-    STEP_S,
+    GRID_STEP_S,
+    MIN_OVERLAP_S,
+    TREND_WINDOW_S,
     Clock,
+    _running_mean,
     _Series,
-    _slow,
-    _smooth,
-    connected,
+    _smooth_gaussian,
+    connect_clocks,
     estimate_clock,
 )
 from dmrl.estimation.signals.ranging_clocks import estimate_from_exchanges
@@ -55,7 +55,7 @@ def worst_s(clock: Clock | None) -> float:
     """Largest error of the corrected clock in the five minutes."""
     assert clock is not None
     time = np.linspace(0, 300, 61)
-    return float(np.abs(clock.corrected(wrong(time)) - time).max())
+    return float(np.abs(clock.correct_times(wrong(time)) - time).max())
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -113,9 +113,13 @@ def test_what_was_not_seen_twice_is_no_clock() -> None:
 def test_clocks_chain_and_undo() -> None:
     one, two = Clock(0.5, 1e-5, 100.0, 0.003), Clock(-2.0, -3e-5, 40.0, 0.004)
     time = np.linspace(0, 300, 7)
-    chained = two.after(one)
-    np.testing.assert_allclose(chained.corrected(time), two.corrected(one.corrected(time)))
-    np.testing.assert_allclose(one.inverse().corrected(one.corrected(time)), time, atol=1e-9)
+    chained = two.compose_after(one)
+    np.testing.assert_allclose(
+        chained.correct_times(time), two.correct_times(one.correct_times(time))
+    )
+    np.testing.assert_allclose(
+        one.inverted().correct_times(one.correct_times(time)), time, atol=1e-9
+    )
     assert chained.sigma_s == pytest.approx(0.005)
 
 
@@ -126,7 +130,7 @@ def test_the_surest_links_are_taken() -> None:
         ("a", "c"): Clock(99.0, sigma_s=0.1),
         ("d", "e"): Clock(7.0),
     }
-    found = connected(pairs, "a")
+    found = connect_clocks(pairs, "a")
     assert found.keys() == {"a", "b", "c"}
     assert found["c"].offset_s == pytest.approx(1.0 - 5.0)
 
@@ -137,9 +141,11 @@ TIMES_S = np.linspace(-500, 500, 5)
 
 @given(CLOCKS, CLOCKS)
 def test_any_clocks_chain_and_undo(one: Clock, two: Clock) -> None:
-    both = two.after(one).corrected(TIMES_S)
-    np.testing.assert_allclose(both, two.corrected(one.corrected(TIMES_S)), atol=1e-8)
-    np.testing.assert_allclose(one.inverse().corrected(one.corrected(TIMES_S)), TIMES_S, atol=1e-8)
+    both = two.compose_after(one).correct_times(TIMES_S)
+    np.testing.assert_allclose(both, two.correct_times(one.correct_times(TIMES_S)), atol=1e-8)
+    np.testing.assert_allclose(
+        one.inverted().correct_times(one.correct_times(TIMES_S)), TIMES_S, atol=1e-8
+    )
 
 
 @settings(max_examples=12, phases=[Phase.generate])
@@ -152,7 +158,7 @@ def test_any_offset_and_drift_come_back(
     values = scale * distance(also_s, seed) + 1.0
     clock = estimate_clock(seen_s, distance(seen_s, seed), stamps, values)
     assert clock is not None
-    assert np.abs(clock.corrected(stamps) - also_s).max() < 0.01
+    assert np.abs(clock.correct_times(stamps) - also_s).max() < 0.01
 
 
 @pytest.mark.parametrize("cut_s", [12.0, -12.0])
@@ -163,7 +169,7 @@ def test_clocks_need_not_begin_together(cut_s: float) -> None:
     stamps = also_s + 3.3
     clock = estimate_clock(seen_s, distance(seen_s, 4), stamps, distance(also_s, 4))
     assert clock is not None
-    assert np.abs(clock.corrected(stamps) - also_s).max() < 0.01
+    assert np.abs(clock.correct_times(stamps) - also_s).max() < 0.01
     assert also_s[0] - 1 < clock.at_s - 3.3 < also_s[-1] + 1
 
 
@@ -180,11 +186,11 @@ def test_the_deviations_of_offset_and_drift_are_each_its_own() -> None:
 def test_a_chain_is_as_sure_as_its_parts_together() -> None:
     one = Clock(1.0, 1e-5, 5.0, 0.003, 4e-6, 0.9, "ranges")
     two = Clock(2.0, 2e-5, 7.0, 0.004, 3e-6, 0.8, "turns")
-    both = two.after(one)
+    both = two.compose_after(one)
     assert (both.sigma_s, both.sigma_drift) == pytest.approx((0.005, 5e-6))
     assert (both.correlation, both.by, both.at_s) == (0.8, "ranges, turns", 5.0)
-    assert both.after(both).by == "ranges, turns"
-    back = one.inverse()
+    assert both.compose_after(both).by == "ranges, turns"
+    back = one.inverted()
     assert (back.sigma_s, back.sigma_drift, back.correlation, back.by) == (
         0.003,
         4e-6,
@@ -199,53 +205,55 @@ def test_single_outliers_are_not_heard_and_holes_are_known() -> None:
     values = np.sin(time_s / 3)
     spoilt = values.copy()
     spoilt[7:-7:9] += 5.0
-    clean, heard = (_Series.of(time_s, v) for v in (values, spoilt))
+    clean, heard = (_Series.from_samples(time_s, v) for v in (values, spoilt))
     assert clean is not None and heard is not None
     assert np.abs(heard.values - clean.values).max() < 0.05
     inner = slice(30, -30)  # the ends stand for what lies beyond them
     assert clean.values[inner] == pytest.approx(np.sin(clean.time_s[inner] / 3), abs=0.08)
-    assert clean.time_s[0] == 0.0 and np.diff(clean.time_s) == pytest.approx(STEP_S)
+    assert clean.time_s[0] == 0.0 and np.diff(clean.time_s) == pytest.approx(GRID_STEP_S)
     unknown = clean.time_s[~clean.known]
-    assert unknown[[0, -1]] == pytest.approx([29.9, 32.0], abs=2 * STEP_S)
-    assert len(unknown) == pytest.approx(2.1 / STEP_S, abs=3)
+    assert unknown[[0, -1]] == pytest.approx([29.9, 32.0], abs=2 * GRID_STEP_S)
+    assert len(unknown) == pytest.approx(2.1 / GRID_STEP_S, abs=3)
 
 
 @pytest.mark.parametrize(("gap_s", "unknown"), [(0.95, False), (1.05, True)])
 def test_a_second_without_samples_is_not_known(gap_s: float, unknown: bool) -> None:
     time_s = np.concatenate([np.arange(0, 30, 0.1), 29.9 + gap_s + np.arange(0, 30, 0.1)])
-    found = _Series.of(time_s, np.sin(time_s / 3))
+    found = _Series.from_samples(time_s, np.sin(time_s / 3))
     assert found is not None
     assert (~found.known).any() == unknown
 
 
 def test_clocks_that_are_told_are_exact() -> None:
-    both = Clock(0.5).after(Clock(0.25))
+    both = Clock(0.5).compose_after(Clock(0.25))
     assert (both.offset_s, both.sigma_s, both.sigma_drift) == (0.75, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(("lasts_s", "enough"), [(OVERLAP_S - 0.5, False), (OVERLAP_S + 0.5, True)])
+@pytest.mark.parametrize(
+    ("lasts_s", "enough"), [(MIN_OVERLAP_S - 0.5, False), (MIN_OVERLAP_S + 0.5, True)]
+)
 def test_a_series_lasts_twenty_seconds_at_least(lasts_s: float, enough: bool) -> None:
     time_s = np.arange(0, lasts_s, 0.1)
-    assert (_Series.of(time_s, np.sin(time_s)) is not None) == enough
+    assert (_Series.from_samples(time_s, np.sin(time_s)) is not None) == enough
 
 
 @given(st.lists(st.floats(-5, 5), min_size=1, max_size=30))
 def test_a_slow_part_is_a_running_mean_of_whole_windows(values: list[float]) -> None:
     """Of series shorter than its window here: the mean of what lies around, ends repeated."""
     array = np.array(values)
-    width = min(int(SLOW_S / STEP_S), len(array)) | 1
+    width = min(int(TREND_WINDOW_S / GRID_STEP_S), len(array)) | 1
     padded = [array[0]] * (width // 2) + values + [array[-1]] * (width // 2)
     wanted = [np.mean(padded[k : k + width]) for k in range(len(values))]
-    assert _slow(array) == pytest.approx(np.array(wanted), abs=1e-9)
+    assert _running_mean(array) == pytest.approx(np.array(wanted), abs=1e-9)
 
 
 def test_smoothing_keeps_what_is_even_and_spreads_a_point_as_a_bell() -> None:
-    assert _smooth(np.full(50, 3.0), 0.3) == pytest.approx(np.full(50, 3.0))
+    assert _smooth_gaussian(np.full(50, 3.0), 0.3) == pytest.approx(np.full(50, 3.0))
     point = np.zeros(401)
     point[200] = 1.0
-    bell = _smooth(point, 0.3)
-    away_s = (np.arange(401) - 200) * STEP_S
+    bell = _smooth_gaussian(point, 0.3)
+    away_s = (np.arange(401) - 200) * GRID_STEP_S
     assert bell.sum() == pytest.approx(1.0)
     assert (bell * away_s).sum() == pytest.approx(0.0, abs=1e-12)
     assert (bell * away_s**2).sum() ** 0.5 == pytest.approx(0.3, rel=0.01)
-    assert np.abs(away_s[bell > 0]).max() == pytest.approx(4 * 0.3, abs=1.01 * STEP_S)
+    assert np.abs(away_s[bell > 0]).max() == pytest.approx(4 * 0.3, abs=1.01 * GRID_STEP_S)

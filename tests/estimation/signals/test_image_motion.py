@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.signals.image_motion import rates, shift, small
+from dmrl.estimation.signals.image_motion import estimate_shift, shift_rates, shrink_image
 
 RNG = np.random.default_rng(2)
 
@@ -18,26 +18,26 @@ def scene(right: float, down: float) -> np.ndarray:
 @pytest.mark.parametrize("moved", [(0.0, 0.0), (3.4, -1.7), (-12.3, 5.5), (0.2, 9.0)])
 def test_a_shift_is_found_to_a_fifth_of_a_pixel(moved: tuple[float, float]) -> None:
     noise = RNG.normal(0, 0.2, (2, 56, 80))
-    found = shift(scene(0, 0) + noise[0], scene(*moved) + noise[1])
+    found = estimate_shift(scene(0, 0) + noise[0], scene(*moved) + noise[1])
     assert found == pytest.approx(moved, abs=0.2)
 
 
 def test_pictures_with_nothing_in_common_have_no_shift() -> None:
-    assert shift(*RNG.normal(size=(2, 56, 80))) is None
-    assert shift(np.zeros((56, 80)), np.zeros((56, 80))) is None
-    assert shift(np.zeros((56, 80)), np.zeros((56, 81))) is None
+    assert estimate_shift(*RNG.normal(size=(2, 56, 80))) is None
+    assert estimate_shift(np.zeros((56, 80)), np.zeros((56, 80))) is None
+    assert estimate_shift(np.zeros((56, 80)), np.zeros((56, 81))) is None
 
 
 def test_pictures_are_shrunk_by_means_whatever_their_size() -> None:
-    assert small(np.full((244, 324, 3), 7, np.uint8)).shape == (61, 81)
+    assert shrink_image(np.full((244, 324, 3), 7, np.uint8)).shape == (61, 81)
     picture = RNG.integers(0, 256, (224, 320), np.uint8)
-    assert small(picture)[3, 5] == picture[12:16, 20:24].mean()
-    assert small(np.zeros((10, 12), np.uint8)).shape == (10, 12)
+    assert shrink_image(picture)[3, 5] == picture[12:16, 20:24].mean()
+    assert shrink_image(np.zeros((10, 12), np.uint8)).shape == (10, 12)
 
 
 def test_rates_leave_out_gaps_and_what_was_not_found() -> None:
     time = np.array([0.0, 0.1, 0.2, 0.3, 2.0])
     moved = np.array([[1.0, 2.0], [np.nan, np.nan], [-1.0, 0.0], [5.0, 5.0]])
-    middle, speed = rates(time, moved)
+    middle, speed = shift_rates(time, moved)
     np.testing.assert_allclose(middle, [0.05, 0.25])
     np.testing.assert_allclose(speed, [[10, 20], [-10, 0]])

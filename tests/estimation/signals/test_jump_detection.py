@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.signals.jump_detection import levelled_height, levels
+from dmrl.estimation.signals.jump_detection import remove_height_steps, step_offsets
 
 TIME_S = np.arange(0, 60, 0.01)
 
@@ -15,7 +15,7 @@ def climbing(noise_m: float) -> np.ndarray:
 def test_heights_over_a_box_are_heights_above_the_floor(noise_m: float) -> None:
     floor = climbing(noise_m)
     over = ((TIME_S > 10) & (TIME_S < 12)) | ((TIME_S > 30) & (TIME_S < 31.5))
-    found = levelled_height(TIME_S, floor - 0.35 * over)
+    found = remove_height_steps(TIME_S, floor - 0.35 * over)
     off = np.abs(found - floor)
     assert np.quantile(off, 0.99) < 0.06
     assert (off > 0.1).mean() < 0.001
@@ -24,13 +24,13 @@ def test_heights_over_a_box_are_heights_above_the_floor(noise_m: float) -> None:
 def test_heights_that_do_not_jump_stay_as_they_are() -> None:
     for noise_m in (0.0, 0.02, 0.05):
         height = climbing(noise_m)
-        assert (levelled_height(TIME_S, height) == height).all()
+        assert (remove_height_steps(TIME_S, height) == height).all()
 
 
 def test_a_signal_that_begins_and_one_that_ends_too_large() -> None:
     values = np.zeros(400)
     values[:50], values[380:] = 1.0, 2.0
-    found = levels(values, 0.1, 0.45, 3)
+    found = step_offsets(values, 0.1, 0.45, 3)
     assert np.allclose(found[:50], 1.0)
     assert np.allclose(found[50:380], 0.0)
     assert np.allclose(found[380:], 2.0)
@@ -39,14 +39,14 @@ def test_a_signal_that_begins_and_one_that_ends_too_large() -> None:
 def test_what_never_comes_back_is_no_level() -> None:
     values = np.zeros(800)
     values[300:] = 1.0
-    assert not levels(values, 0.1, 0.45, 3).any()
+    assert not step_offsets(values, 0.1, 0.45, 3).any()
 
 
 @pytest.mark.parametrize(("jump", "seen"), [(0.44, False), (0.46, True)])
 def test_a_jump_is_larger_than_the_least(jump: float, seen: bool) -> None:
     values = np.zeros(400)
     values[100:150] = jump
-    found = levels(values, 0.1, 0.45, 3)
+    found = step_offsets(values, 0.1, 0.45, 3)
     assert found.any() == seen
     if seen:
         assert np.flatnonzero(found)[[0, -1]].tolist() == [100, 149]
@@ -57,10 +57,10 @@ def test_a_jump_is_larger_than_the_least(jump: float, seen: bool) -> None:
 def test_a_level_lasts_30_s_at_most(lasts: int, level: bool) -> None:
     values = np.zeros(800)
     values[100 : 100 + lasts] = 1.0
-    assert levels(values, 0.1, 0.45, 3).any() == level
+    assert step_offsets(values, 0.1, 0.45, 3).any() == level
     late = np.zeros(800)
     late[800 - lasts :] = 1.0  # and has not come back when the signal ends
-    assert levels(late, 0.1, 0.45, 3).any() == level
+    assert step_offsets(late, 0.1, 0.45, 3).any() == level
 
 
 @pytest.mark.parametrize(("back", "left"), [(0.6, 0.4), (0.7, 0.0)])
@@ -68,32 +68,32 @@ def test_less_than_half_of_a_jump_is_none_after_it(back: float, left: float) -> 
     values = np.zeros(400)
     values[100:150] = 1.0
     values[150:250] = 1.0 - back
-    found = levels(values, 0.1, 0.3, 3)
+    found = step_offsets(values, 0.1, 0.3, 3)
     assert found[100:150] == pytest.approx(np.ones(50))
     assert found[200] == pytest.approx(left)
 
 
 def test_what_climbs_does_not_jump_and_a_jump_on_the_way_is_no_larger() -> None:
     climb = 0.4 * np.arange(400) * 0.1
-    assert not levels(climb, 0.1, 0.45, 3).any()
+    assert not step_offsets(climb, 0.1, 0.45, 3).any()
     over = climb.copy()
     over[100:150] += 0.8
-    assert levels(over, 0.1, 0.45, 3)[120] == pytest.approx(0.8, abs=1e-6)
+    assert step_offsets(over, 0.1, 0.45, 3)[120] == pytest.approx(0.8, abs=1e-6)
 
 
 def test_how_fast_a_signal_climbs_is_no_noise() -> None:
     over = 1.5 * np.arange(400) * 0.1
     climb = over.copy()
     over[100:150] += 0.8
-    assert levels(over, 0.1, 0.45, 3) == pytest.approx(over - climb, abs=1e-6)
+    assert step_offsets(over, 0.1, 0.45, 3) == pytest.approx(over - climb, abs=1e-6)
 
 
 def test_few_samples_are_left_as_they_are() -> None:
     for count, seen in ((11, False), (12, True)):
         values = np.zeros(count)
         values[5:] = 1.0
-        assert levels(values, 0.1, 0.45, 3).any() == seen
-    assert levelled_height(TIME_S[:2], np.ones(2)).tolist() == [1, 1]
+        assert step_offsets(values, 0.1, 0.45, 3).any() == seen
+    assert remove_height_steps(TIME_S[:2], np.ones(2)).tolist() == [1, 1]
 
 
 def steps(*changes: tuple[int, float]) -> np.ndarray:
@@ -109,12 +109,12 @@ def test_a_box_on_a_table_and_two_that_overlap() -> None:
         steps((100, 0.7), (120, 0.7), (150, -0.7), (180, -0.7)),
         steps((100, 0.7), (120, 0.6), (150, -1.3)),
     ):
-        assert levels(values, 0.1, 0.45, 3) == pytest.approx(values)
+        assert step_offsets(values, 0.1, 0.45, 3) == pytest.approx(values)
 
 
 def test_where_a_way_back_was_missed_the_next_jump_begins_anew() -> None:
     values = steps((100, 1.0), (300, 0.8), (340, -0.8))
     ramp = np.interp(np.arange(600), [130, 160], [0.0, -1.0])  # too slow for a jump
-    found = levels(values + ramp, 0.1, 0.45, 3)
+    found = step_offsets(values + ramp, 0.1, 0.45, 3)
     assert found[310] == pytest.approx(0.8)
     assert not found[360:].any()

@@ -6,11 +6,11 @@ import pytest
 from dmrl.estimation.signals import ranging_clocks
 from dmrl.estimation.signals.clock_alignment import Clock
 from dmrl.estimation.signals.ranging_clocks import (
-    POLLED_S,
-    SAME_M,
-    SAME_S,
-    _line,
-    _same_exchange,
+    MAX_RANGE_DIFFERENCE_M,
+    MAX_TIME_DIFFERENCE_S,
+    MIN_JITTER_S,
+    _fit_line,
+    _match_exchanges,
     estimate_from_exchanges,
 )
 
@@ -22,23 +22,23 @@ def test_a_line_is_found_under_outliers_with_the_deviations_of_its_parts() -> No
         rng = np.random.default_rng(seed)
         y = 0.05 + 3e-4 * x + rng.normal(0, 0.02, len(x))
         y[rng.random(len(x)) < 0.03] += 0.2
-        slope, middle, (slope_std, middle_std) = _line(x, y)
+        slope, middle, (slope_std, middle_std) = _fit_line(x, y)
         off.append(((slope - 3e-4) / slope_std, (middle - 0.05) / middle_std))
     # The line's own: sigma / sqrt(n), and that over the spread of x.
     assert middle_std == pytest.approx(0.02 / np.sqrt(len(x)), rel=0.4)
     assert middle_std / slope_std == pytest.approx(x.std(), rel=0.05)
     assert np.sqrt(np.mean(np.square(off), axis=0)[0]) == pytest.approx(1.0, abs=0.4)
-    assert POLLED_S < 0.02
+    assert MIN_JITTER_S < 0.02
 
 
 def test_what_both_logged_is_told_by_value_and_time() -> None:
     time_s = np.arange(0, 10, 0.1)
     value = 1 + 0.01 * np.arange(100)
     late = time_s + 0.05
-    late[[3, 40]] += [2 * SAME_S, 0.2]  # out of reach, and beside the others
+    late[[3, 40]] += [2 * MAX_TIME_DIFFERENCE_S, 0.2]  # out of reach, and beside the others
     seen = value.copy()
-    seen[[7, 8]] += [1.5 * SAME_M, 0.5 * SAME_M]
-    found, apart_s = _same_exchange(late, seen, time_s, value)
+    seen[[7, 8]] += [1.5 * MAX_RANGE_DIFFERENCE_M, 0.5 * MAX_RANGE_DIFFERENCE_M]
+    found, apart_s = _match_exchanges(late, seen, time_s, value)
     assert set(range(100)) - set(found.tolist()) == {3, 7, 40}
     assert apart_s == pytest.approx(np.full(97, 0.05))
 
@@ -67,4 +67,4 @@ def test_what_a_rough_clock_is_off_by_single_exchanges_put_right(
     monkeypatch.setattr(ranging_clocks, "estimate_clock", lambda *_: Clock(0.05, -1e-4, at_s=40.0))
     clock = estimate_from_exchanges(time_s, range_m, time_s, range_m)
     assert clock is not None
-    assert clock.corrected(time_s) == pytest.approx(time_s, abs=1e-6)
+    assert clock.correct_times(time_s) == pytest.approx(time_s, abs=1e-6)

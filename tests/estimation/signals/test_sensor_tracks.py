@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.signals.sensor_tracks import frozen, track, wild
+from dmrl.estimation.signals.sensor_tracks import build_track, find_frozen, find_runaway
 
 GRID_S = np.arange(0, 20, 0.01)
 
@@ -15,22 +15,22 @@ def test_flow_that_reads_zero_is_silence() -> None:
     stuck = (GRID_S > 5) & (GRID_S < 9)
     velocity[stuck] = 0.0
     height = np.ones((len(GRID_S), 1))
-    found = track((GRID_S, height), (GRID_S, velocity), (GRID_S, height), GRID_S)
-    assert (found.gap == stuck).mean() > 0.99
+    found = build_track((GRID_S, height), (GRID_S, velocity), (GRID_S, height), GRID_S)
+    assert (found.dropout == stuck).mean() > 0.99
 
 
 def test_a_log_that_repeats_its_samples_or_stands_still_is_not_frozen() -> None:
     slow = np.repeat(noisy()[::20], 20, axis=0)
-    assert not frozen(GRID_S, slow, GRID_S).any()
-    assert not frozen(GRID_S, np.zeros((len(GRID_S), 2)), GRID_S).any()
+    assert not find_frozen(GRID_S, slow, GRID_S).any()
+    assert not find_frozen(GRID_S, np.zeros((len(GRID_S), 2)), GRID_S).any()
 
 
 def test_an_estimate_that_runs_away_at_the_end_is_cut_off() -> None:
     velocity, turn, height = noisy(), np.zeros((len(GRID_S), 1)), np.ones((len(GRID_S), 1))
     crash = GRID_S > 16
     velocity[crash] += np.minimum(9, 6 * (GRID_S[crash] - 16))[:, None]
-    found = track((GRID_S, turn), (GRID_S, velocity), (GRID_S, height), GRID_S)
-    assert found.gap[GRID_S > 16].all() and not found.gap[GRID_S < 14].any()
+    found = build_track((GRID_S, turn), (GRID_S, velocity), (GRID_S, height), GRID_S)
+    assert found.dropout[GRID_S > 16].all() and not found.dropout[GRID_S < 14].any()
     assert not found.vx_mps[crash].any()
     # Its height says 1 m still, but it lies on the floor.
     assert not found.height_m[GRID_S > 17].any()
@@ -40,7 +40,7 @@ def test_an_estimate_that_runs_away_at_the_end_is_cut_off() -> None:
 def test_fast_flight_and_single_outliers_do_not_run_away() -> None:
     speed = 2.5 + noisy()[:, 0]
     speed[::50] = 20.0
-    assert not wild(speed, 3.0).any()
+    assert not find_runaway(speed, 3.0).any()
 
 
 def test_each_sensor_stands_in_its_place_and_any_ones_silence_is_a_gap() -> None:
@@ -48,26 +48,26 @@ def test_each_sensor_stands_in_its_place_and_any_ones_silence_is_a_gap() -> None
     turn = np.full((len(GRID_S), 1), 0.3)
     high = np.ones((len(GRID_S), 1))
     every = (GRID_S, turn), (GRID_S, forward), (GRID_S, high)
-    found = track(*every, GRID_S)
+    found = build_track(*every, GRID_S)
     assert found.vx_mps.mean() == pytest.approx(1.0, abs=0.01)
     assert found.vy_mps.mean() == pytest.approx(-0.5, abs=0.01)
     assert (found.yaw_rate_radps.mean(), found.height_m.mean()) == pytest.approx((0.3, 1.0))
-    assert not found.gap.any()
+    assert not found.dropout.any()
     heard = (GRID_S < 8) | (GRID_S > 9)
-    for silent, names in ((0, "gap"), (1, "gap"), (2, "height_gap")):
+    for silent, names in ((0, "dropout"), (1, "dropout"), (2, "height_dropout")):
         logs = [(s[heard], v[heard]) if k == silent else (s, v) for k, (s, v) in enumerate(every)]
-        found = track(*logs, GRID_S)
+        found = build_track(*logs, GRID_S)
         assert (getattr(found, names) == ~heard).mean() > 0.99
-        assert not (found.gap.any() and silent == 2)
+        assert not (found.dropout.any() and silent == 2)
 
 
 def test_a_robot_that_spins_is_lost_for_a_second_around() -> None:
     turn, high = np.full((len(GRID_S), 1), 0.2), np.ones((len(GRID_S), 1))
     turn[(GRID_S > 10) & (GRID_S < 11)] = 9.0
-    found = track((GRID_S, turn), (GRID_S, noisy()), (GRID_S, high), GRID_S)
-    assert GRID_S[found.gap].min() == pytest.approx(9.0, abs=0.12)
-    assert GRID_S[found.gap].max() == pytest.approx(12.0, abs=0.12)
-    assert not found.yaw_rate_radps[found.gap].any()
+    found = build_track((GRID_S, turn), (GRID_S, noisy()), (GRID_S, high), GRID_S)
+    assert GRID_S[found.dropout].min() == pytest.approx(9.0, abs=0.12)
+    assert GRID_S[found.dropout].max() == pytest.approx(12.0, abs=0.12)
+    assert not found.yaw_rate_radps[found.dropout].any()
     assert found.height_m == pytest.approx(1.0)  # it flies on
 
 
@@ -87,7 +87,7 @@ def test_what_runs_away_is_fast_and_four_times_the_usual_and_lasts(
 ) -> None:
     size = np.full(len(GRID_S), usual)
     size[1000 : 1000 + round(100 * lasts_s)] = speed
-    found = wild(size, 3.0)
+    found = find_runaway(size, 3.0)
     assert found.any() == lost
     if lost and lasts_s == 1.0:  # and a second around
         assert GRID_S[found][[0, -1]] == pytest.approx([9.0, 11.99], abs=0.02)
@@ -97,7 +97,7 @@ def test_what_runs_away_is_fast_and_four_times_the_usual_and_lasts(
 def test_silence_is_longer_than_half_a_second(lasts_s: float, stuck: bool) -> None:
     values = noisy()
     values[500 : 500 + round(100 * lasts_s) + 1] = values[500]
-    found = frozen(GRID_S, values, GRID_S)
+    found = find_frozen(GRID_S, values, GRID_S)
     assert found.any() == stuck
     if stuck:
         assert GRID_S[found][[0, -1]] == pytest.approx([5.0, 5.0 + lasts_s])
@@ -107,7 +107,7 @@ def test_silence_is_longer_than_half_a_second(lasts_s: float, stuck: bool) -> No
 def test_what_repeats_itself_more_often_than_not_is_written_so(share: float, told: bool) -> None:
     values = noisy()
     values[: round(share * len(values))] = 1.0
-    assert frozen(GRID_S, values, GRID_S).any() == told
+    assert find_frozen(GRID_S, values, GRID_S).any() == told
 
 
 def test_heights_are_smoothed_by_parabolas_over_half_a_second() -> None:
@@ -115,11 +115,11 @@ def test_heights_are_smoothed_by_parabolas_over_half_a_second() -> None:
     still = np.zeros((len(GRID_S), 1))
     logs = (GRID_S, still), (GRID_S, noisy())
     inner = slice(30, -30)
-    found = track(*logs, (GRID_S, high[:, None]), GRID_S).height_m
+    found = build_track(*logs, (GRID_S, high[:, None]), GRID_S).height_m
     assert found[inner] == pytest.approx(high[inner])
     spike = np.ones(len(GRID_S))
     spike[1000] += 0.01
     reach = np.flatnonzero(
-        np.abs(track(*logs, (GRID_S, spike[:, None]), GRID_S).height_m - 1) > 1e-9
+        np.abs(build_track(*logs, (GRID_S, spike[:, None]), GRID_S).height_m - 1) > 1e-9
     )
     assert (reach.min(), reach.max()) == (975, 1025)

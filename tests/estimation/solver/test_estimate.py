@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmrl.estimation.model.status import AMBIGUOUS, OK, UNCONVERGED
-from dmrl.estimation.solver.estimate import Estimate, from_peer, swapped
-from dmrl.estimation.solver.keyframes import GLOBALS, Noise
+from dmrl.estimation.solver.estimate import Estimate, seen_from_peer, transform_to_peer
+from dmrl.estimation.solver.keyframes import GLOBALS, NoiseModel
 from dmrl.estimation.solver.residuals import CLOCK
 
 COUNT = 4
@@ -25,14 +25,14 @@ def estimate(seed: int = 0) -> Estimate:
         root @ root.swapaxes(1, 2),
         np.full(COUNT, OK, np.int8),
         rng.normal(size=len(GLOBALS)),
-        Noise(),
+        NoiseModel(),
     )
 
 
 @given(st.floats(3, 4.5))
 def test_between_keyframes_all_goes_over_evenly(time_s: float) -> None:
     found = estimate()
-    xy, spread, status = found.at(np.array([time_s]))
+    xy, spread, status = found.interpolate_at(np.array([time_s]))
     for got, columns in ((xy, found.state[:, :2]), (spread, found.covariance[:, :2, :2])):
         flat = columns.reshape(COUNT, -1).T
         wanted = [np.interp(time_s, found.time_s, column) for column in flat]
@@ -42,7 +42,7 @@ def test_between_keyframes_all_goes_over_evenly(time_s: float) -> None:
 
 def test_outside_a_flight_its_ends_are_held_and_not_ok() -> None:
     found = replace(estimate(), status=np.array([OK, OK, AMBIGUOUS, AMBIGUOUS], np.int8))
-    xy, _, status = found.at(np.array([2.99, 3.0, 3.49, 3.51, 4.5, 4.51]))
+    xy, _, status = found.interpolate_at(np.array([2.99, 3.0, 3.49, 3.51, 4.5, 4.51]))
     assert status.tolist() == [UNCONVERGED, OK, OK, AMBIGUOUS, AMBIGUOUS, AMBIGUOUS]
     assert xy[[0, 1, 4, 5]] == pytest.approx(found.state[[0, 0, -1, -1], :2])
 
@@ -55,17 +55,20 @@ def test_the_observer_is_where_its_peer_sees_it() -> None:
         xy = (place[other] - place[one]) * np.exp(-1j * heading[one])
         return np.column_stack([xy.real, xy.imag, heading[other] - heading[one]])
 
-    assert from_peer(seen(0, 1)) == pytest.approx(seen(1, 0))
+    assert transform_to_peer(seen(0, 1)) == pytest.approx(seen(1, 0))
 
 
 def test_a_covariance_seen_from_the_peer_is_that_of_states_seen_from_there() -> None:
     found = estimate(2)
-    other = swapped(found)
-    assert other.state == pytest.approx(from_peer(found.state))
+    other = seen_from_peer(found)
+    assert other.state == pytest.approx(transform_to_peer(found.state))
     step = 1e-6
     by_state = np.stack(
         [
-            (from_peer(found.state + step * axis) - from_peer(found.state - step * axis))
+            (
+                transform_to_peer(found.state + step * axis)
+                - transform_to_peer(found.state - step * axis)
+            )
             / (2 * step)
             for axis in np.eye(3)
         ],
@@ -78,14 +81,14 @@ def test_a_covariance_seen_from_the_peer_is_that_of_states_seen_from_there() -> 
 def test_seen_from_the_peer_own_constants_are_the_peer_s() -> None:
     found = estimate(3)
     values = dict(zip(GLOBALS, found.constants.tolist(), strict=True))
-    other = dict(zip(GLOBALS, swapped(found).constants.tolist(), strict=True))
+    other = dict(zip(GLOBALS, seen_from_peer(found).constants.tolist(), strict=True))
     turned = {"own": "peer", "peer": "own"}
     for name, value in other.items():
         first, _, rest = name.partition("_")
         of = "_".join([turned.get(first, first), rest]) if rest else name
         sign = -1 if GLOBALS.index(name) == CLOCK else 1
         assert value == sign * values[of if of in values else name]
-    again = swapped(swapped(found))
+    again = seen_from_peer(seen_from_peer(found))
     for field in fields(Estimate):
         if field.name in ("state", "covariance", "constants"):
             assert getattr(again, field.name) == pytest.approx(getattr(found, field.name))

@@ -9,16 +9,16 @@ from dmrl.estimation.model.pair import Pair
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver import noise_selection
 from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.keyframes import GLOBALS, Noise, Problem
-from dmrl.estimation.solver.levenberg_marquardt import Solution
+from dmrl.estimation.solver.keyframes import GLOBALS, KeyframeProblem, NoiseModel
+from dmrl.estimation.solver.levenberg_marquardt import MapEstimate
 from dmrl.estimation.solver.noise_selection import (
-    DOUBT,
-    FADING_S,
-    GRADES,
-    ONE,
-    TAKEN,
-    UNMEASURED,
-    excess,
+    NOISE_SCALES,
+    NOMINAL_MEAN_SQUARE,
+    RANGE_CORRELATION_S,
+    SCALE_PRIOR_TABLE,
+    SHORT_FLIGHT_PENALTY,
+    UNCALIBRATED_STD,
+    range_noise_ratio,
 )
 from dmrl.flight import NOISE, Fault, Scenario, simulate
 
@@ -47,26 +47,32 @@ def test_a_grade_between_those_tried_is_where_the_evidence_peaks(
     A flight that tells it worse than one of 100 s does is taken for a worse one.
     """
 
-    def likely(_: Problem, noise: Noise, __: Solution) -> float:
-        grade = noise.velocity_std_mps / Noise().velocity_std_mps
+    def likely(_: KeyframeProblem, noise: NoiseModel, __: MapEstimate) -> float:
+        grade = noise.velocity_std_mps / NoiseModel().velocity_std_mps
         return float(-((np.log(grade) - np.log(likeliest)) ** 2) / (2 * std**2))
 
-    some = Solution(np.zeros((1, 6)), np.zeros(len(GLOBALS)), 0.0)
-    monkeypatch.setattr(noise_selection, "solve_batch", lambda *_, **__: some)
-    monkeypatch.setattr(noise_selection, "evidence", likely)
-    found, nearest, _, _ = noise_selection._graded(SimpleNamespace(), Noise(), some)  # type: ignore[arg-type]
-    assert GRADES[nearest] == min(GRADES, key=lambda grade: abs(np.log(grade / likeliest)))
-    taken_for = likeliest * np.exp(DOUBT * doubted)
-    velocity, scales, offset_m = (np.interp(taken_for, TAKEN[0], taken) for taken in TAKEN[1:])
-    assert found.velocity_std_mps == pytest.approx(velocity * Noise().velocity_std_mps)
-    assert found.velocity_scale_std == pytest.approx(scales * Noise().velocity_scale_std)
+    some = MapEstimate(np.zeros((1, 6)), np.zeros(len(GLOBALS)), 0.0)
+    monkeypatch.setattr(noise_selection, "solve", lambda *_, **__: some)
+    monkeypatch.setattr(noise_selection, "laplace_log_evidence", likely)
+    found, nearest, _, _ = noise_selection._search_scale(SimpleNamespace(), NoiseModel(), some)  # type: ignore[arg-type]
+    assert NOISE_SCALES[nearest] == min(
+        NOISE_SCALES, key=lambda grade: abs(np.log(grade / likeliest))
+    )
+    taken_for = likeliest * np.exp(SHORT_FLIGHT_PENALTY * doubted)
+    velocity, scales, offset_m = (
+        np.interp(taken_for, SCALE_PRIOR_TABLE[0], taken) for taken in SCALE_PRIOR_TABLE[1:]
+    )
+    assert found.velocity_std_mps == pytest.approx(velocity * NoiseModel().velocity_std_mps)
+    assert found.velocity_scale_std == pytest.approx(scales * NoiseModel().velocity_scale_std)
     assert found.bias_std_m == pytest.approx(offset_m)
 
 
 def test_evidence_that_bends_up_or_hardly_at_all_tells_no_grade_that_is_better() -> None:
-    assert noise_selection._likely((0.4, 0.55, 0.75), (3.0, 1.0, 2.0)) is None
+    assert noise_selection._interpolate_peak((0.4, 0.55, 0.75), (3.0, 1.0, 2.0)) is None
     flat = [-1e-9 * np.log(grade / 0.5) ** 2 for grade in (0.4, 0.55, 0.75)]
-    assert noise_selection._likely((0.4, 0.55, 0.75), flat) == pytest.approx(TAKEN[0][-1])
+    assert noise_selection._interpolate_peak((0.4, 0.55, 0.75), flat) == pytest.approx(
+        SCALE_PRIOR_TABLE[0][-1]
+    )
 
 
 @pytest.mark.heavy
@@ -75,7 +81,7 @@ def test_errors_of_ranges_that_fade_are_noticed_and_the_ellipse_holds_them() -> 
     plain = pair_of(flight)
     both = [plain, reflected(plain, 0.08, 1.0, 5)]
     (clean, _), (found, _) = (estimate_pairs([pair])[0] for pair in both)
-    assert clean.noise.range_tau_s > FADING_S == found.noise.range_tau_s
+    assert clean.noise.range_tau_s > RANGE_CORRELATION_S == found.noise.range_tau_s
     error = found.state[:, :2] - truth_at(flight, found.time_s)
     assert inside(found, error) > 0.85
     kept = found.status == OK
@@ -101,27 +107,27 @@ def test_errors_that_stay_for_a_second_tell_as_much_less(
     seconds = 4000
     residual = np.repeat(rng.normal(0, 1, seconds * 10 // alike), alike)
     key_s = np.arange(seconds * 10) / 10 + 3.0
-    flight = SimpleNamespace(key_s=key_s, range_key=np.arange(seconds * 10))
+    flight = SimpleNamespace(keyframe_s=key_s, range_keyframe=np.arange(seconds * 10))
     monkeypatch.setattr(
-        noise_selection, "linearise", lambda *_: SimpleNamespace(range=times * residual)
+        noise_selection, "linearize", lambda *_: SimpleNamespace(range=times * residual)
     )
     solution = SimpleNamespace(state=None, constants=None)
-    found = excess(flight, Noise(), solution)  # type: ignore[arg-type]
+    found = range_noise_ratio(flight, NoiseModel(), solution)  # type: ignore[arg-type]
     assert found == pytest.approx(wanted, rel=0.06)
 
 
 def test_seconds_of_three_ranges_are_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     for many, found in ((3, 1.0), (4, None)):
         key_s = np.repeat(np.arange(50.0), many) + np.tile(np.arange(many) / 10, 50)
-        flight = SimpleNamespace(key_s=key_s, range_key=np.arange(len(key_s)))
+        flight = SimpleNamespace(keyframe_s=key_s, range_keyframe=np.arange(len(key_s)))
         monkeypatch.setattr(
             noise_selection,
-            "linearise",
+            "linearize",
             lambda *_: SimpleNamespace(range=np.full(len(key_s), 2.0)),  # noqa: B023
         )
         solution = SimpleNamespace(state=None, constants=None)
-        got = excess(flight, Noise(), solution)  # type: ignore[arg-type]
-        assert got == (found or pytest.approx(2.0 / ONE**0.5, rel=1e-6))
+        got = range_noise_ratio(flight, NoiseModel(), solution)  # type: ignore[arg-type]
+        assert got == (found or pytest.approx(2.0 / NOMINAL_MEAN_SQUARE**0.5, rel=1e-6))
 
 
 def test_seconds_are_counted_from_the_flight_s_first_keyframe(
@@ -129,12 +135,12 @@ def test_seconds_are_counted_from_the_flight_s_first_keyframe(
 ) -> None:
     """Eight ranges a second have one error. A clock that began elsewhere tells the same."""
     residual = np.repeat(np.random.default_rng(9).normal(0, 1, 50), 8)
-    monkeypatch.setattr(noise_selection, "linearise", lambda *_: SimpleNamespace(range=residual))
+    monkeypatch.setattr(noise_selection, "linearize", lambda *_: SimpleNamespace(range=residual))
     solution, key = SimpleNamespace(state=None, constants=None), np.arange(len(residual))
     found = set()
     for began in (0.0, 0.5, 77.25):
-        flight = SimpleNamespace(key_s=key / 8 + began, range_key=key)
-        found.add(excess(flight, Noise(), solution))  # type: ignore[arg-type]
+        flight = SimpleNamespace(keyframe_s=key / 8 + began, range_keyframe=key)
+        found.add(range_noise_ratio(flight, NoiseModel(), solution))  # type: ignore[arg-type]
     assert len(found) == 1 and found.pop() > 2
 
 
@@ -151,9 +157,9 @@ def test_a_yaw_rate_that_is_far_off_tells_that_nobody_measured_the_sensors() -> 
         ],
     )
     found = estimate_pairs([pair_of(flight)])[0][0]
-    assert found.noise.bias_std_m == pytest.approx(UNMEASURED[0])
-    assert found.noise.velocity_scale_std >= UNMEASURED[1]
+    assert found.noise.bias_std_m == pytest.approx(UNCALIBRATED_STD[0])
+    assert found.noise.velocity_scale_std >= UNCALIBRATED_STD[1]
     off_m = np.hypot(*(found.state[:, :2] - truth_at(flight, found.time_s)).T)
     assert ((off_m > 0.3) & (found.status == OK)).mean() < 0.05
     usual = estimate_pairs([pair_of(flown("in_view", "calibrated", 15000))])[0][0]
-    assert usual.noise.velocity_scale_std < UNMEASURED[1]
+    assert usual.noise.velocity_scale_std < UNCALIBRATED_STD[1]

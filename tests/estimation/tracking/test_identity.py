@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from dmrl.estimation.tracking.identity import MEMORY_S, RANGE_STD_M, Identity
+from dmrl.estimation.tracking.identity import AVERAGING_S, RANGE_STD_M, TrackIdentity
 
 
 @dataclass
@@ -24,9 +24,9 @@ class Track:
 
 
 def names(tracks: list[Track], times: int = 1, **range_m: float) -> dict[int, str]:
-    identity = Identity()
+    identity = TrackIdentity()
     for _ in range(times):
-        found = identity.names(tracks, range_m, 0.1)  # type: ignore[arg-type]
+        found = identity.assign(tracks, range_m, 0.1)  # type: ignore[arg-type]
     return found
 
 
@@ -49,19 +49,19 @@ def test_two_tracks_share_the_names_as_they_fit_together() -> None:
 
 
 def test_one_detour_is_forgotten_and_counts_no_more_than_the_worst() -> None:
-    identity = Identity()
+    identity = TrackIdentity()
     track: list[Track] = [Track(1, 2.0)]
-    steps = round(3 * MEMORY_S / 0.1)
+    steps = round(3 * AVERAGING_S / 0.1)
     for k in range(steps):
         ranges = {"cf2": 2.0 if k else 60.0, "cf3": 9.0}
-        found = identity.names(track, ranges, 0.1)  # type: ignore[arg-type]
-        if k == round(0.5 * MEMORY_S / 0.1):
+        found = identity.assign(track, ranges, 0.1)  # type: ignore[arg-type]
+        if k == round(0.5 * AVERAGING_S / 0.1):
             assert not found  # 9 e^-0.5 is still more than 4
     assert found == {1: "cf2"}
 
 
 def test_a_track_that_is_gone_and_one_that_no_one_ranged_have_no_name() -> None:
-    identity = Identity()
-    assert identity.names([Track(1, 2.0)], {"cf2": 2.0}, 0.1) == {1: "cf2"}  # type: ignore[list-item]
-    assert identity.names([], {}, 0.1) == {}
-    assert identity.names([Track(1, 9.0)], {}, 0.1) == {}  # type: ignore[list-item]
+    identity = TrackIdentity()
+    assert identity.assign([Track(1, 2.0)], {"cf2": 2.0}, 0.1) == {1: "cf2"}  # type: ignore[list-item]
+    assert identity.assign([], {}, 0.1) == {}
+    assert identity.assign([Track(1, 9.0)], {}, 0.1) == {}  # type: ignore[list-item]

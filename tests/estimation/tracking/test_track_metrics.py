@@ -5,16 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.tracking.track_metrics import NEAR_M, Judged, assigned, figures
+from dmrl.estimation.tracking.track_metrics import (
+    MAX_MATCH_M,
+    EvaluatedTracks,
+    compute_figures,
+    match_positions,
+)
 
 NOTHING = [np.nan] * 3
 ERRORS = np.array([[0.3, 0.0, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 1.2], NOTHING])
 SINGLES = np.array([[0.6, 0.0, 0.0], [0.0, 0.8, 0.0], NOTHING, [2.0, 0.0, 0.0]])
 
 
-def judged() -> Judged:
+def judged() -> EvaluatedTracks:
     """Four peers in view, one a second; the third without a detection, the fourth without track."""
-    return Judged(
+    return EvaluatedTracks(
         "cf1",
         np.arange(4.0),
         ["cf2", "cf2", "cf3", "cf3"],
@@ -28,7 +33,7 @@ def judged() -> Judged:
 
 
 def test_every_figure_is_what_it_says() -> None:
-    found = figures(judged(), 0.0)
+    found = compute_figures(judged(), 0.0)
     assert found["in_view"] == 4
     assert found["rmse_m"] == pytest.approx(np.sqrt((0.09 + 0.16) / 2))  # of those with both
     assert found["single_rmse_m"] == pytest.approx(np.sqrt((0.36 + 0.64) / 2))
@@ -42,15 +47,15 @@ def test_every_figure_is_what_it_says() -> None:
 
 
 def test_before_it_settles_nothing_counts_but_false_tracks() -> None:
-    found = figures(judged(), 1.0)
+    found = compute_figures(judged(), 1.0)
     assert (found["in_view"], found["rmse_m"]) == (3, pytest.approx(0.4))
     assert (found["named_right"], found["false_tracks_per_min"]) == (0.0, pytest.approx(2.0))
-    nothing = figures(judged(), 9.0)
+    nothing = compute_figures(judged(), 9.0)
     assert {name: value for name, value in nothing.items() if value is not None} == {
         "in_view": 0.0,
         "false_tracks_per_min": pytest.approx(2.0),
     }
-    assert figures(replace(judged(), length_s=0.0), 0.0)["false_tracks_per_min"] is None
+    assert compute_figures(replace(judged(), length_s=0.0), 0.0)["false_tracks_per_min"] is None
 
 
 def test_the_ellipsoid_is_that_of_95_percent_in_three_dimensions() -> None:
@@ -58,8 +63,8 @@ def test_the_ellipsoid_is_that_of_95_percent_in_three_dimensions() -> None:
     shape = np.array([[0.04, 0.01, 0.0], [0.01, 0.02, -0.01], [0.0, -0.01, 0.03]])
     errors = rng.multivariate_normal(np.zeros(3), shape, 4000)
     covariance, names = np.tile(shape, (4000, 1, 1)), [""] * 4000
-    many = Judged("a", np.zeros(4000), names, names, errors, errors, covariance, 0, 1.0)
-    found = figures(many, 0.0)
+    many = EvaluatedTracks("a", np.zeros(4000), names, names, errors, errors, covariance, 0, 1.0)
+    found = compute_figures(many, 0.0)
     assert found["coverage_95"] == pytest.approx(0.95, abs=0.01)
     assert found["nees"] == pytest.approx(3.0, rel=0.05)
 
@@ -67,8 +72,8 @@ def test_the_ellipsoid_is_that_of_95_percent_in_three_dimensions() -> None:
 def test_positions_are_matched_one_to_one_within_a_radius() -> None:
     truth = np.array([[0.0, 0, 0], [2.0, 0, 0], [np.nan] * 3])
     found = np.array([[1.1, 0, 0], [0.2, 0, 0]])
-    assert assigned(truth, found).tolist() == [1, 0, -1]
-    assert assigned(truth, found, NEAR_M).tolist() == [1, 0, -1]
-    assert assigned(truth, found, 0.9).tolist() == [1, 0, -1]
-    assert assigned(truth, found, 0.89).tolist() == [1, -1, -1]
-    assert assigned(truth, np.zeros((0, 3))).tolist() == [-1, -1, -1]
+    assert match_positions(truth, found).tolist() == [1, 0, -1]
+    assert match_positions(truth, found, MAX_MATCH_M).tolist() == [1, 0, -1]
+    assert match_positions(truth, found, 0.9).tolist() == [1, 0, -1]
+    assert match_positions(truth, found, 0.89).tolist() == [1, -1, -1]
+    assert match_positions(truth, np.zeros((0, 3))).tolist() == [-1, -1, -1]

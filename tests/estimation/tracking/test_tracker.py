@@ -6,15 +6,15 @@ import pytest
 from numpy.random import default_rng
 from scipy.stats import chi2
 
-from dmrl.estimation.tracking.identity import Identity
+from dmrl.estimation.tracking.identity import TrackIdentity
 from dmrl.estimation.tracking.tracker import Tracker
-from dmrl.estimation.tracking.tracker_input import Motion, View
+from dmrl.estimation.tracking.tracker_input import EgoMotion, ImageDetections
 from dmrl.estimation.tracking.tuning import Tuning
 from dmrl.geometry.frames import (
     AIDECK,
     Array,
     horizontal_from_pixels,
-    inside,
+    is_inside,
     pixels_from_horizontal,
 )
 
@@ -31,11 +31,11 @@ class Detector:
     share: float = TUNING.detection_share
     false_per_image: float = TUNING.false_per_image
 
-    def view(self, peers: Array, bias: Array) -> View:
+    def view(self, peers: Array, bias: Array) -> ImageDetections:
         uv, depth_m, _ = pixels_from_horizontal(
             peers, np.zeros(len(peers)), np.zeros(len(peers)), AIDECK
         )
-        seen = inside(uv, 320, 224) & (depth_m > 0) & (self.rng.random(len(peers)) < self.share)
+        seen = is_inside(uv, 320, 224) & (depth_m > 0) & (self.rng.random(len(peers)) < self.share)
         noise = self.rng.normal(size=(len(peers), 3))
         tilt_px = TUNING.attitude_std_rad * AIDECK.fx_px * self.rng.normal(size=2)
         uv = uv + TUNING.pixel_std_px * noise[:, :2] + tilt_px
@@ -43,7 +43,7 @@ class Detector:
         alarms = self.rng.poisson(self.false_per_image)
         false_uv = self.rng.uniform((0, 0), (320, 224), (alarms, 2))
         false_m = 0.3 * np.exp(self.rng.uniform(0, np.log(20), alarms))
-        return View(
+        return ImageDetections(
             np.concatenate([uv[seen], false_uv]),
             np.concatenate([depth_m[seen], false_m]),
             0.0,
@@ -88,7 +88,7 @@ def followed(seed: int, starts: Array, steps: int = 600) -> Outcome:
     for biases in depth_biases(rng, steps, len(starts)):
         truth = np.array([next(path) for path in paths])
         view = detector.view(truth, biases)
-        tracks = tracker.step(Motion(DT_S, np.zeros(3), 0.0), view)
+        tracks = tracker.step(EgoMotion(DT_S, np.zeros(3), 0.0), view)
         level = np.zeros(len(view.uv))
         single = horizontal_from_pixels(view.uv, view.depth_m, level, level, AIDECK)
         for track in tracks:
@@ -152,14 +152,14 @@ def test_depths_count_by_what_the_detections_say_of_them() -> None:
     assert np.mean(np.array(squared) <= chi2.ppf(0.95, 3)) >= 0.88
 
 
-def view_of(xyz: Array, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> View:
+def view_of(xyz: Array, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> ImageDetections:
     angles = np.full(len(xyz), roll_rad), np.full(len(xyz), pitch_rad)
     uv, depth_m, _ = pixels_from_horizontal(xyz, *angles, AIDECK)
-    return View(uv, depth_m, roll_rad, pitch_rad)
+    return ImageDetections(uv, depth_m, roll_rad, pitch_rad)
 
 
-NOTHING = View(np.zeros((0, 2)), np.zeros(0), 0.0, 0.0)
-STILL = Motion(DT_S, np.zeros(3), 0.0)
+NOTHING = ImageDetections(np.zeros((0, 2)), np.zeros(0), 0.0, 0.0)
+STILL = EgoMotion(DT_S, np.zeros(3), 0.0)
 
 
 def test_a_standing_peer_has_no_velocity_whatever_the_observer_does() -> None:
@@ -173,7 +173,7 @@ def test_a_standing_peer_has_no_velocity_whatever_the_observer_does() -> None:
         c, s = np.cos(yaw), np.sin(yaw)
         x, y, z = peer - own
         here = np.array([[c * x + s * y, -s * x + c * y, z]])
-        tracks = tracker.step(Motion(DT_S, step, turn), view_of(here, 0.1, -0.05))
+        tracks = tracker.step(EgoMotion(DT_S, step, turn), view_of(here, 0.1, -0.05))
     (track,) = tracks
     assert np.allclose(track.position_m, here[0], atol=0.02)
     assert np.abs(track.velocity_mps).max() < 0.05
@@ -184,7 +184,7 @@ def test_a_peer_that_is_gone_is_given_up_and_one_out_of_view_is_not_at_once() ->
     for _ in range(10):
         tracker.step(STILL, view_of(np.array([[1.5, 0.0, 0.0]])))
     assert len(tracker.step(STILL, NOTHING)) == 1
-    turned = Motion(DT_S, np.zeros(3), 1.5)  # the peer is now beside the image
+    turned = EgoMotion(DT_S, np.zeros(3), 1.5)  # the peer is now beside the image
     assert len(tracker.step(turned, NOTHING)) == 1
     assert all(len(tracker.step(STILL, NOTHING)) == 1 for _ in range(3))
     for _ in range(100):
@@ -202,13 +202,13 @@ def test_single_false_alarms_never_become_tracks() -> None:
 
 
 def test_two_peers_keep_their_numbers_and_get_their_names_by_range() -> None:
-    tracker, identity = Tracker(AIDECK, TUNING), Identity()
+    tracker, identity = Tracker(AIDECK, TUNING), TrackIdentity()
     peers = np.array([[1.0, 0.3, 0.0], [2.2, -0.4, 0.1]])
     distances = dict(zip(("cf2", "cf3"), np.linalg.norm(peers, axis=1).tolist(), strict=True))
     numbers = set()
     for _ in range(40):
         tracks = tracker.step(STILL, view_of(peers))
-        names = identity.names(tracks, distances, DT_S)
+        names = identity.assign(tracks, distances, DT_S)
         numbers |= {track.number for track in tracks}
     assert len(numbers) == 2
     for track in tracks:
@@ -217,10 +217,10 @@ def test_two_peers_keep_their_numbers_and_get_their_names_by_range() -> None:
 
 
 def test_a_track_that_no_range_fits_has_no_name() -> None:
-    tracker, identity = Tracker(AIDECK, TUNING), Identity()
+    tracker, identity = Tracker(AIDECK, TUNING), TrackIdentity()
     for _ in range(40):
         tracks = tracker.step(STILL, view_of(np.array([[1.0, 0.0, 0.0]])))
-        names = identity.names(tracks, {"cf2": 4.0, "cf3": 5.0}, DT_S)
+        names = identity.assign(tracks, {"cf2": 4.0, "cf3": 5.0}, DT_S)
     assert tracks
     assert not names
 
@@ -228,7 +228,7 @@ def test_a_track_that_no_range_fits_has_no_name() -> None:
 def test_an_image_without_detections_and_one_behind_the_lens_s_fold_are_taken() -> None:
     tracker = Tracker(AIDECK, TUNING)
     assert tracker.step(STILL, NOTHING) == []
-    far_out = View(np.array([[5000.0, 5000.0]]), np.ones(1), 0.0, 0.0)
+    far_out = ImageDetections(np.array([[5000.0, 5000.0]]), np.ones(1), 0.0, 0.0)
     assert tracker.step(STILL, far_out) == []
 
 
@@ -236,11 +236,11 @@ def test_what_is_not_seen_grows_as_unsure_as_the_tuning_says() -> None:
     tracker = Tracker(AIDECK, TUNING)
     xyz = np.array([[1.5, 0.2, -0.1]])
     uv, depth_m, _ = pixels_from_horizontal(xyz, LEVEL, LEVEL, AIDECK)
-    tracker.step(Motion(0.0, np.zeros(3), 0.0), View(uv, depth_m, 0.0, 0.0))
+    tracker.step(EgoMotion(0.0, np.zeros(3), 0.0), ImageDetections(uv, depth_m, 0.0, 0.0))
     (track,) = tracker.tracks
     assert track.position_m == pytest.approx(xyz[0], abs=1e-6)
     before, dt_s = track.filter.P.copy(), 0.2
-    tracker._predict(track, Motion(dt_s, np.zeros(3), 0.0))
+    tracker._predict(track, EgoMotion(dt_s, np.zeros(3), 0.0))
     after = track.filter.P
     power = TUNING.acceleration_std_mps2**2
     moved = before[:3, :3] + dt_s**2 * before[3:6, 3:6]
@@ -262,18 +262,20 @@ def test_what_is_not_seen_grows_as_unsure_as_the_tuning_says() -> None:
 def test_a_track_moves_against_the_observer() -> None:
     tracker = Tracker(AIDECK, TUNING)
     uv, depth_m, _ = pixels_from_horizontal(np.array([[2.0, 0.3, 0.1]]), LEVEL, LEVEL, AIDECK)
-    tracker.step(Motion(0.0, np.zeros(3), 0.0), View(uv, depth_m, 0.0, 0.0))
+    tracker.step(EgoMotion(0.0, np.zeros(3), 0.0), ImageDetections(uv, depth_m, 0.0, 0.0))
     (track,) = tracker.tracks
     track.filter.x[3:6] = 0.5, 0.0, -0.2  # over ground, along the axes before the turn
-    tracker._predict(track, Motion(0.5, np.array([0.4, 0.1, 0.05]), np.pi / 2))
+    tracker._predict(track, EgoMotion(0.5, np.array([0.4, 0.1, 0.05]), np.pi / 2))
     # Ahead by 2 + 0.25 - 0.4 and left by 0.3 - 0.1; after a quarter turn left that is right.
     assert track.position_m == pytest.approx([0.2, -1.85, -0.05])
     assert track.velocity_mps == pytest.approx([0.0, -0.5, -0.2])
 
 
 def test_a_depth_s_own_deviation_counts_by_its_share_of_the_depth() -> None:
-    view = View(np.zeros((3, 2)), np.array([2.0, 4.0, 1.0]), 0.0, 0.0, np.array([0.3, 0.3, 0.0]))
-    noise = Tracker(AIDECK, TUNING)._of_depth(view)
+    view = ImageDetections(
+        np.zeros((3, 2)), np.array([2.0, 4.0, 1.0]), 0.0, 0.0, np.array([0.3, 0.3, 0.0])
+    )
+    noise = Tracker(AIDECK, TUNING)._depth_noise(view)
     assert np.sqrt(noise[:, 2, 2]) == pytest.approx([0.15, 0.075, TUNING.depth_std_ratio])
     assert noise[:, :2].max() == noise[:, 2, :2].max() == 0.0
 
@@ -282,7 +284,7 @@ def test_a_new_track_is_as_unsure_as_detections_that_are_drawn() -> None:
     tracker, rng, count = Tracker(AIDECK, replace(TUNING, pixel_std_px=2.0)), default_rng(0), 4_000
     true, tilt = np.array([[1.6, 0.3, -0.2]]), np.array([0.1, -0.05])
     uv, depth_m, _ = pixels_from_horizontal(true, tilt[:1], tilt[1:], AIDECK)
-    tracker.step(STILL, View(uv, depth_m, *tilt.tolist()))
+    tracker.step(STILL, ImageDetections(uv, depth_m, *tilt.tolist()))
     (track,) = tracker.tracks
     bias = rng.normal(0, TUNING.depth_bias_ratio, count)
     white = rng.normal(0, TUNING.depth_std_ratio, count)
@@ -301,10 +303,10 @@ def test_the_gate_lets_its_share_of_a_peer_s_own_detections_through() -> None:
     tracker, rng = Tracker(AIDECK, replace(TUNING, gate=0.9)), default_rng(1)
     spread = np.array([[16.0, 3.0, 0.1], [3.0, 9.0, 0.0], [0.1, 0.0, 0.02]])
     off = rng.multivariate_normal(np.zeros(3), spread, 5000)
-    gain = tracker._likelihood(off, np.tile(spread, (5000, 1, 1)))
+    gain = tracker._log_likelihood_ratios(off, np.tile(spread, (5000, 1, 1)))
     assert np.isfinite(gain).mean() == pytest.approx(0.9, abs=0.015)
     # At its middle: how much likelier a detection is from a track than a false alarm.
-    best = tracker._likelihood(np.zeros((1, 3)), spread[None])
+    best = tracker._log_likelihood_ratios(np.zeros((1, 3)), spread[None])
     alarms = TUNING.false_per_image / (AIDECK.width_px * AIDECK.height_px * np.log(20))
     wanted = TUNING.detection_share / alarms / np.sqrt(np.linalg.det(2 * np.pi * spread))
     assert best == pytest.approx(np.log(wanted))

@@ -7,7 +7,7 @@ import pytest
 
 import dmrl
 from dmrl.errors import SourceError
-from dmrl.formats.aideck.chip_outputs import chip_maps
+from dmrl.formats.aideck.chip_outputs import load_chip_maps
 from dmrl.images.codec import encode_png
 
 
@@ -53,8 +53,8 @@ def test_half_a_pair_and_pairs_of_two_sizes_are_refused(frames: Path, tmp_path: 
 
 
 def test_maps_of_one_picture_are_its_own(frames: Path) -> None:
-    assert chip_maps(frames / "img00007.png", 5, "cf7") is None
-    found = chip_maps(frames / "img00009.png", 5, "cf7")
+    assert load_chip_maps(frames / "img00007.png", 5, "cf7") is None
+    found = load_chip_maps(frames / "img00009.png", 5, "cf7")
     assert found is not None
     assert (found.time_ns, found.topic, found.message) == (5, "/cf7/detections/grid", "GridMap")
     sizes = {name: found.fields[name] for name in ("rows", "cols", "stride_px", "channels")}

@@ -15,7 +15,7 @@ from dmrl.formats.aideck.cpx_log import (
     PacketReader,
     pack_packet,
 )
-from dmrl.formats.aideck.cpx_state import State, compressed, quaternion
+from dmrl.formats.aideck.cpx_state import RobotState, compress_quaternion, decompress_quaternion
 
 from .test_cpx_log import app_packet
 
@@ -66,7 +66,7 @@ def test_streamer_images_keep_number_times_and_state_over_their_wraps() -> None:
     sent = []
     for k in range(600):
         time_us = (1 << 32) - 10_000_000 + 50_000 * k
-        state = State(4_294_967_000 + 50 * k, time_us - 4_000, (0.25, -1.5, 0.4))
+        state = RobotState(4_294_967_000 + 50 * k, time_us - 4_000, (0.25, -1.5, 0.4))
         sent.append(raw(16, 12, time_us=time_us, frame_id=250 + k, state=state))
     got, reader = read(b"".join(pack_image(image, "streamer") for image in sent))
     assert [g.time_us for g in got] == [s.time_us for s in sent]
@@ -135,7 +135,7 @@ def test_console_text_and_other_functions_are_passed_over() -> None:
 def test_quaternions_come_back_to_a_quarter_of_a_degree() -> None:
     for xyzw in RNG.normal(size=(50, 4)):
         xyzw /= np.linalg.norm(xyzw)
-        back = np.array(quaternion(compressed(tuple(xyzw))))
+        back = np.array(decompress_quaternion(compress_quaternion(tuple(xyzw))))
         angle_rad = 2 * np.arccos(min(abs(float(back @ xyzw)), 1.0))
         assert angle_rad < np.deg2rad(0.25)
 
@@ -151,15 +151,15 @@ def test_what_a_camera_does_not_tell_is_sent_as_nothing() -> None:
 
 
 def test_a_stamp_tells_milliseconds_and_where_the_robot_is() -> None:
-    state = State(5, 6, (0.1, -0.2, 0.3), quaternion_xyzw=(1.0, 0.0, 0.0, 0.0))
+    state = RobotState(5, 6, (0.1, -0.2, 0.3), quaternion_xyzw=(1.0, 0.0, 0.0, 0.0))
     data = pack_image(raw(8, 8, time_us=(2**32 + 5) * 1000 + 999, state=state), "stamped")
     assert cpx.STAMP.unpack_from(data, 4 + cpx.HEADER.size) == (5, 100, -200, 300, 0)
 
 
 def test_streamer_metadata_stands_where_the_firmware_has_it() -> None:
-    state = State(5, 2**32 + 6, (0.1, -0.2, 0.3))
+    state = RobotState(5, 2**32 + 6, (0.1, -0.2, 0.3))
     image = raw(10, 12, time_us=2**32 + 9, frame_id=258, state=state)
-    data = pack_image(image, "streamer")[4 + cpx.BEGIN.size :]
+    data = pack_image(image, "streamer")[4 + cpx.BEGIN_HEADER.size :]
     assert struct.unpack_from("<BHHBBBIII3h", data) == (
         *(10, 10, 12, 1, 0, 2, 9, 6),
         *(5, 100, -200, 300),
@@ -169,7 +169,7 @@ def test_streamer_metadata_stands_where_the_firmware_has_it() -> None:
 
 
 def test_a_robot_s_time_is_the_camera_s_by_when_it_last_told_it() -> None:
-    image = raw(8, 8, time_us=10_000, state=State(7, 4_000))
+    image = raw(8, 8, time_us=10_000, state=RobotState(7, 4_000))
     assert image.robot_time_us == 7_000 + 6_000
 
 
@@ -277,7 +277,7 @@ def test_streamer_metadata_is_of_version_10_and_of_as_many_pixels(
 ) -> None:
     data = bytearray(pack_image(raw(10, 10), "streamer"))
     data[10:14] = bytes(4)  # no checksum
-    data[4 + cpx.BEGIN.size + at] = value
+    data[4 + cpx.BEGIN_HEADER.size + at] = value
     got, reader = read(bytes(data))
     assert (len(got), reader.broken) == (whole, not whole)
 
@@ -288,7 +288,7 @@ def test_streamer_metadata_is_of_version_10_and_of_as_many_pixels(
 )
 def test_where_a_streamer_header_ends_to_be_one(kind: int, size: int, broken: int) -> None:
     reader = ImageReader()
-    begin = cpx.BEGIN.pack(cpx.STREAMER_BEGIN, kind, size, 0)
+    begin = cpx.BEGIN_HEADER.pack(cpx.STREAMER_BEGIN, kind, size, 0)
     list(reader.feed(pack_packet(Packet(GAP8, HOST, STREAMER, begin))))
     assert reader.broken == broken
     reader.finish()

@@ -7,9 +7,9 @@ import pytest
 from dmrl.errors import SourceError
 from dmrl.formats.aideck import hyperflash
 from dmrl.formats.base import Options
-from dmrl.formats.registry import format_of
+from dmrl.formats.registry import find_format
 from dmrl.geometry.frames import AIDECK
-from dmrl.images.bayer import mosaic, rgb_of
+from dmrl.images.bayer import demosaic, to_bayer
 from dmrl.images.codec import Rgb, decode
 from dmrl.samples.sample import Sample
 
@@ -36,13 +36,13 @@ def known_pictures() -> list[Rgb]:
 def dump(tmp_path: Path) -> Path:
     """Three records and an end marker."""
     path = tmp_path / "flash.bin"
-    path.write_bytes(foreign.flash_dump([mosaic(p) for p in known_pictures()], VALUES))
+    path.write_bytes(foreign.flash_dump([to_bayer(p) for p in known_pictures()], VALUES))
     return path
 
 
 def samples(path: Path, message: str, options: Options | None = None) -> list[Sample]:
     """Samples of one message type, or of the log."""
-    found = hyperflash.content(path, options or Options()).samples
+    found = hyperflash.load_content(path, options or Options()).samples
     return [s for s in found if (s.message if isinstance(s.message, str) else "log") == message]
 
 
@@ -53,8 +53,8 @@ def test_pictures_come_back_to_the_pixel(dump: Path) -> None:
     np.testing.assert_array_equal(found[0], plain)
     # What a colour filter keeps comes back as it was, at every pixel of every picture.
     for got, known in zip(found, (plain, ramp, halves), strict=True):
-        np.testing.assert_array_equal(mosaic(got)[1:-1, 1:-1], mosaic(known)[1:-1, 1:-1])
-        np.testing.assert_array_equal(got, rgb_of(mosaic(known)))
+        np.testing.assert_array_equal(to_bayer(got)[1:-1, 1:-1], to_bayer(known)[1:-1, 1:-1])
+        np.testing.assert_array_equal(got, demosaic(to_bayer(known)))
     np.testing.assert_array_equal(found[2][:, :158], halves[:, :158])
 
 
@@ -107,7 +107,7 @@ def test_a_dump_without_end_marker_ends_with_the_file(
 
 def test_impossible_numbers_make_no_label(dump: Path, capsys: pytest.CaptureFixture[str]) -> None:
     values = ((float("nan"), 0, 1, 0, 0, 1), *VALUES[1:])
-    dump.write_bytes(foreign.flash_dump([mosaic(p) for p in known_pictures()], values))
+    dump.write_bytes(foreign.flash_dump([to_bayer(p) for p in known_pictures()], values))
     assert len(samples(dump, "CompressedImage")) == 3
     assert "1 images have impossible numbers" in capsys.readouterr().err
     assert len(samples(dump, "PeerLabels")) == 2
@@ -117,14 +117,14 @@ def test_an_erased_flash_holds_no_record(tmp_path: Path) -> None:
     path = tmp_path / "flash.bin"
     path.write_bytes(b"\xff" * 71_704 * 2)
     with pytest.raises(SourceError, match="has no record of 71704 bytes"):
-        hyperflash.content(path, Options())
+        hyperflash.load_content(path, Options())
 
 
 def test_it_is_known_by_its_numbers(dump: Path) -> None:
-    assert format_of(dump).name == "hyperflash"
+    assert find_format(dump).name == "hyperflash"
     noise = np.random.default_rng(0).integers(0, 256, 100_000, np.uint8).tobytes()
     dump.write_bytes(noise)
-    assert not hyperflash.recognises(dump)
+    assert not hyperflash.can_read(dump)
 
 
 def test_bytes_of_something_else_are_refused(dump: Path) -> None:
@@ -132,25 +132,25 @@ def test_bytes_of_something_else_are_refused(dump: Path) -> None:
     for other in (noise, b"?" + dump.read_bytes()):
         (path := dump.with_name("other.bin")).write_bytes(other)
         with pytest.raises(SourceError, match=r"other\.bin: \d of \d records have impossible"):
-            hyperflash.content(path, Options())
+            hyperflash.load_content(path, Options())
 
 
 def test_real_frames_are_behind_the_filters_that_are_assumed(data: Path) -> None:
     for number in ("00216", "00375", "00495"):
         rgb = decode((data / "aideck-frames" / f"img{number}.ppm").read_bytes())
-        again = rgb_of(mosaic(rgb))[2:-2, 2:-2].astype(int)
+        again = demosaic(to_bayer(rgb))[2:-2, 2:-2].astype(int)
         assert np.abs(again - rgb[2:-2, 2:-2]).max() <= 1
 
 
 @pytest.mark.parametrize(("odd", "of", "taken"), [(1, 3, True), (1, 2, False), (2, 3, False)])
 def test_most_records_of_a_dump_are_plausible(odd: int, of: int, taken: bool, dump: Path) -> None:
     values = [*[(1e9,) * 6] * odd, *[VALUES[0]] * (of - odd)]
-    dump.write_bytes(foreign.flash_dump([mosaic(p) for p in known_pictures()[:of]], values))
+    dump.write_bytes(foreign.flash_dump([to_bayer(p) for p in known_pictures()[:of]], values))
     if taken:
         assert len(samples(dump, "CompressedImage")) == of
     else:
         with pytest.raises(SourceError, match=f"{odd} of {of} records have impossible"):
-            hyperflash.content(dump, Options())
+            hyperflash.load_content(dump, Options())
 
 
 def test_a_dump_is_whole_records_and_erased_flash_of_numbers_not_all_zero(dump: Path) -> None:
@@ -163,15 +163,15 @@ def test_a_dump_is_whole_records_and_erased_flash_of_numbers_not_all_zero(dump: 
         (whole[:-24] + bytes(24), False),
     ):
         dump.write_bytes(data)
-        assert hyperflash.recognises(dump) == known
+        assert hyperflash.can_read(dump) == known
 
 
 def test_the_camera_comes_first_and_peers_are_named(dump: Path) -> None:
-    first, *rest = hyperflash.content(dump, Options(robot="me", names={"0": "you"})).samples
+    first, *rest = hyperflash.load_content(dump, Options(robot="me", names={"0": "you"})).samples
     assert (first.topic, first.time_ns) == ("/me/camera/calibration", 0)
     assert first.fields["K"][2] == AIDECK.cx_px
     assert {s.topic for s in rest if "range" in s.topic} == {"/me/range/you"}
     camera = replace(AIDECK, cx_px=99.5)
-    first, *_ = hyperflash.content(dump, Options(camera=camera)).samples
+    first, *_ = hyperflash.load_content(dump, Options(camera=camera)).samples
     assert first.fields["K"][2] == 99.5
-    assert hyperflash.content(dump, Options()).total == 4  # records, and the erased one
+    assert hyperflash.load_content(dump, Options()).total == 4  # records, and the erased one

@@ -7,9 +7,9 @@ import pytest
 from dmrl.errors import SourceError
 from dmrl.formats.aideck import nanocockpit
 from dmrl.formats.base import Options
-from dmrl.formats.registry import format_of
+from dmrl.formats.registry import find_format
 from dmrl.geometry.frames import AIDECK
-from dmrl.images.bayer import rgb_of
+from dmrl.images.bayer import demosaic
 from dmrl.images.codec import decode, encode_jpeg, encode_png
 from dmrl.samples.sample import Sample
 
@@ -25,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
 def samples(folder: Path) -> dict[str, list[Sample]]:
     """Samples by topic."""
     found: dict[str, list[Sample]] = {}
-    for sample in nanocockpit.content(folder, Options()).samples:
+    for sample in nanocockpit.load_content(folder, Options()).samples:
         found.setdefault(sample.topic, []).append(sample)
     return found
 
@@ -36,7 +36,7 @@ def test_pictures_have_the_camera_s_time_unwrapped(
     found = samples(folder)["/cf1/camera/image"]
     assert np.diff([s.time_ns for s in found]).tolist() == [50_000_000] * 5
     for sample, raw in zip(found, foreign.pictures(6), strict=True):
-        np.testing.assert_array_equal(decode(sample.fields["data"]), rgb_of(raw))
+        np.testing.assert_array_equal(decode(sample.fields["data"]), demosaic(raw))
     assert capsys.readouterr().err == ""
 
 
@@ -80,13 +80,13 @@ def test_a_table_that_does_not_fit_is_one_line(folder: Path, old: str, new: str,
 
 
 def test_it_is_known_by_its_table(folder: Path) -> None:
-    assert format_of(folder).name == "nanocockpit"
+    assert find_format(folder).name == "nanocockpit"
 
 
 def test_differences_of_counts_that_wrap_are_the_short_way() -> None:
     ticks = np.array([5, -5, 2**31 - 1, 2**31, -(2**31), 2**32 - 3, 3 - 2**32])
     short = [5, -5, 2**31 - 1, -(2**31), -(2**31), -3, 3]
-    assert nanocockpit._nearest(ticks).tolist() == short
+    assert nanocockpit._wrap_to_int32(ticks).tolist() == short
 
 
 def test_a_state_that_stands_counts_once_and_none_before_the_first(folder: Path) -> None:
@@ -108,7 +108,7 @@ def test_a_state_that_stands_counts_once_and_none_before_the_first(folder: Path)
 
 def test_a_camera_that_is_given_stands_before_the_pictures(folder: Path) -> None:
     camera = replace(AIDECK, width_px=32, height_px=24)
-    first, *rest = nanocockpit.content(folder, Options(robot="me", camera=camera)).samples
+    first, *rest = nanocockpit.load_content(folder, Options(robot="me", camera=camera)).samples
     while first.topic != "/me/camera/calibration":  # a state may have come before
         first, *rest = rest
     images = [s.time_ns for s in rest if s.topic == "/me/camera/image"]
@@ -126,7 +126,7 @@ def test_colour_pictures_stand_in_for_raw_ones_as_they_are(folder: Path) -> None
     found = samples(folder)["/cf1/camera/image"]
     assert [s.fields["data"] for s in found] == jpegs
     assert {s.fields["format"] for s in found} == {"jpeg"}
-    assert nanocockpit.recognises(folder)
+    assert nanocockpit.can_read(folder)
 
 
 @pytest.mark.parametrize(("size", "fits"), [((4, 4), True), ((3, 8), False), ((8, 3), False)])

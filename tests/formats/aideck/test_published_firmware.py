@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dmrl.formats.aideck.published_firmware import FARTHEST_M, is_plausible, samples
+from dmrl.formats.aideck.published_firmware import MAX_DISTANCE_M, is_plausible, iter_samples
 from dmrl.geometry.frames import AIDECK, Camera, pixels_from_horizontal
 
 VALUES = (10.0, 20.0, 2.0, 0.3, -0.1, 2.5)
@@ -11,7 +11,7 @@ VALUES = (10.0, 20.0, 2.0, 0.3, -0.1, 2.5)
 
 @pytest.mark.parametrize("place", range(6))
 def test_numbers_that_no_drone_has_are_not_plausible(place: int) -> None:
-    limit = 180.0 if place < 2 else FARTHEST_M
+    limit = 180.0 if place < 2 else MAX_DISTANCE_M
     for value, plausible in ((limit, True), (-limit, True), (limit + 0.1, False)):
         assert is_plausible([*VALUES[:place], value, *VALUES[place + 1 :]]) == plausible
     for value in (np.nan, np.inf, -limit - 0.1):
@@ -19,7 +19,7 @@ def test_numbers_that_no_drone_has_are_not_plausible(place: int) -> None:
 
 
 def test_degrees_nose_up_become_radians_nose_down() -> None:
-    logged, attitude, position, heard, labels = samples(7, "cf1", "cf2", VALUES, AIDECK)
+    logged, attitude, position, heard, labels = iter_samples(7, "cf1", "cf2", VALUES, AIDECK)
     assert logged.fields == dict(zip(("roll", "pitch", "x", "y", "z", "d"), VALUES, strict=True))
     tilt = {"roll_rad": np.radians(10), "pitch_rad": -np.radians(20)}
     assert attitude.fields == pytest.approx(tilt)
@@ -35,14 +35,14 @@ def test_degrees_nose_up_become_radians_nose_down() -> None:
 
 
 def test_what_is_not_plausible_is_only_logged_and_no_range_is_no_range() -> None:
-    assert len(list(samples(7, "cf1", "cf2", (*VALUES[:5], 1e9), AIDECK))) == 1
-    kinds = [s.message for s in samples(7, "cf1", "cf2", (*VALUES[:5], 0.0), None)]
+    assert len(list(iter_samples(7, "cf1", "cf2", (*VALUES[:5], 1e9), AIDECK))) == 1
+    kinds = [s.message for s in iter_samples(7, "cf1", "cf2", (*VALUES[:5], 0.0), None)]
     assert kinds[1:] == ["Attitude", "PeerPosition"]
 
 
 def test_who_is_out_of_view_has_no_label() -> None:
     for xyz in ((-2.0, 0.0, 0.0), (1.0, 5.0, 0.0), (1.0, 0.0, -5.0)):
-        *_, labels = samples(7, "cf1", "cf2", (0.0, 0.0, *xyz, 0.0), AIDECK)
+        *_, labels = iter_samples(7, "cf1", "cf2", (0.0, 0.0, *xyz, 0.0), AIDECK)
         assert labels.fields["peers"] == []
 
 
@@ -52,7 +52,7 @@ def test_a_label_ends_at_the_picture_s_edges() -> None:
 
     def seen(x: float, u: float, v: float) -> list[dict[str, float]]:
         place = (x, (50.0 - u) * x / 40.0, (40.0 - v) * x / 50.0)
-        *_, labels = samples(7, "cf1", "cf2", (0.0, 0.0, *place, 0.0), camera)
+        *_, labels = iter_samples(7, "cf1", "cf2", (0.0, 0.0, *place, 0.0), camera)
         found: list[dict[str, float]] = labels.fields["peers"]
         return found
 
@@ -72,5 +72,5 @@ def test_a_picture_s_first_edges_are_in_it_and_its_last_are_not() -> None:
     camera = Camera(128, 64, 32.0, 32.0, 64.0, 32.0, ())
     for u, v, count in ((0, 0, 1), (128, 32, 0), (64, 64, 0), (127, 63, 1)):
         place = (1.0, (64 - u) / 32, (32 - v) / 32)
-        *_, labels = samples(7, "cf1", "cf2", (0.0, 0.0, *place, 0.0), camera)
+        *_, labels = iter_samples(7, "cf1", "cf2", (0.0, 0.0, *place, 0.0), camera)
         assert len(labels.fields["peers"]) == count

@@ -7,11 +7,11 @@ from dmrl.errors import SourceError
 from dmrl.formats.aideck import wifi_stream
 from dmrl.formats.aideck.cpx import Image, Layout
 from dmrl.formats.aideck.cpx_encode import pack_image
-from dmrl.formats.aideck.cpx_state import State
+from dmrl.formats.aideck.cpx_state import RobotState
 from dmrl.formats.base import Options
-from dmrl.formats.registry import format_of
+from dmrl.formats.registry import find_format
 from dmrl.geometry.frames import AIDECK
-from dmrl.images.bayer import rgb_of
+from dmrl.images.bayer import demosaic
 from dmrl.images.codec import decode, encode_jpeg
 from dmrl.samples.sample import Sample
 
@@ -22,7 +22,7 @@ def samples(path: Path, data: bytes, options: Options | None = None) -> dict[str
     """Samples by topic of a stream of these bytes."""
     path.write_bytes(data)
     found: dict[str, list[Sample]] = {}
-    for sample in wifi_stream.content(path, options or Options()).samples:
+    for sample in wifi_stream.load_content(path, options or Options()).samples:
         found.setdefault(sample.topic, []).append(sample)
     return found
 
@@ -33,8 +33,8 @@ def test_raw_pictures_get_their_colours_and_nominal_times(tmp_path: Path) -> Non
     found = samples(tmp_path / "a.cpx", data, Options(rate_hz=20))["/cf1/camera/image"]
     assert [s.time_ns for s in found] == [0, 50_000_000, 100_000_000]
     for sample, pixels in zip(found, raw, strict=True):
-        np.testing.assert_array_equal(decode(sample.fields["data"]), rgb_of(pixels))
-    assert format_of(tmp_path / "a.cpx").name == "aideck-stream"
+        np.testing.assert_array_equal(decode(sample.fields["data"]), demosaic(pixels))
+    assert find_format(tmp_path / "a.cpx").name == "aideck-stream"
 
 
 def test_a_camera_that_is_given_comes_once_before_the_pictures(tmp_path: Path) -> None:
@@ -58,7 +58,7 @@ def test_the_camera_s_clock_and_the_robot_s_state_are_used(tmp_path: Path) -> No
     data = b""
     for k, raw in enumerate(foreign.pictures(4)):
         time = start + 50_000 * k
-        state = State(1000 + 50 * k, time - 4_000, (0.1 * k, 0.0, 0.7), (0.0, 0.5, 0.0))
+        state = RobotState(1000 + 50 * k, time - 4_000, (0.1 * k, 0.0, 0.7), (0.0, 0.5, 0.0))
         data += pack_image(Image(32, 24, "raw", raw.tobytes(), time, k, state), "streamer")
     found = samples(tmp_path / "a.cpx", data)
     assert np.diff([s.time_ns for s in found["/cf1/camera/image"]]).tolist() == [50_000_000] * 3
@@ -81,7 +81,7 @@ def test_a_stream_that_was_cut_gives_what_is_whole_and_says_so(
 def test_a_file_without_a_picture_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="has no whole image of a CPX stream"):
         samples(tmp_path / "a.cpx", b"\0" * 1000)
-    assert not wifi_stream.recognises(tmp_path / "a.cpx")
+    assert not wifi_stream.can_read(tmp_path / "a.cpx")
 
 
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.99])
@@ -96,16 +96,16 @@ def test_a_stream_that_was_cut_says_so(
     whole = b"".join(pack_image(image, layout) for image in images)
     path = tmp_path / "flight.cpx"
     path.write_bytes(whole[: int(len(whole) * share)])
-    found = wifi_stream.content(path, Options()).samples
+    found = wifi_stream.load_content(path, Options()).samples
     assert len([s for s in found if s.message == "CompressedImage"]) == int(3 * share)
     assert "1 images are broken or cut short" in capsys.readouterr().err
     path.write_bytes(whole)
-    list(wifi_stream.content(path, Options()).samples)
+    list(wifi_stream.load_content(path, Options()).samples)
     assert not capsys.readouterr().err
 
 
 def test_times_of_a_camera_that_does_not_always_tell_are_nominal_and_none_goes_back() -> None:
-    of = wifi_stream._times_ns
+    of = wifi_stream._to_times_ns
     assert of([5, 3, 9], 10.0) == [5000, 5000, 9000]
     assert of([5, None, 9], 4.0) == [0, 250_000_000, 500_000_000]
     assert of([0, 1], 4.0) == [0, 1000]
@@ -118,13 +118,13 @@ def test_a_stream_is_known_by_a_whole_picture_near_its_start(
     image = pack_image(Image(32, 24, "raw", foreign.pictures(1)[0].tobytes()))
     path = tmp_path / "flight.cpx"
     path.write_bytes(bytes(garbage) + image * 2)
-    assert wifi_stream.recognises(path) == known
+    assert wifi_stream.can_read(path) == known
     path.rename(tmp_path / "flight.txt")
-    assert not wifi_stream.recognises(tmp_path / "flight.txt")
+    assert not wifi_stream.can_read(tmp_path / "flight.txt")
 
 
 def test_the_robot_s_turning_is_told_in_radians(tmp_path: Path) -> None:
-    state = State(1000, 5_000_000, (0.0, 0.0, 0.7), turning_radps=(0.1, 0.2, 0.5))
+    state = RobotState(1000, 5_000_000, (0.0, 0.0, 0.7), turning_radps=(0.1, 0.2, 0.5))
     raw = foreign.pictures(1)[0].tobytes()
     data = pack_image(Image(32, 24, "raw", raw, 5_004_000, 1, state), "streamer")
     (attitude,) = samples(tmp_path / "a.cpx", data)["/cf1/attitude"]
@@ -133,7 +133,7 @@ def test_the_robot_s_turning_is_told_in_radians(tmp_path: Path) -> None:
 
 
 def test_a_state_is_logged_in_the_order_of_its_names(tmp_path: Path) -> None:
-    state = State(
+    state = RobotState(
         *(1000, 5_000_000, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
         turning_radps=tuple(np.radians((7.0, 8.0, 9.0)).tolist()),
     )

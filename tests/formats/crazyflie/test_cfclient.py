@@ -6,7 +6,7 @@ import pytest
 from dmrl.errors import SourceError
 from dmrl.formats.base import Options
 from dmrl.formats.crazyflie import cfclient
-from dmrl.formats.registry import format_of
+from dmrl.formats.registry import find_format
 from dmrl.samples.sample import Sample
 
 
@@ -36,13 +36,13 @@ def swarm(tmp_path: Path) -> Path:
 def samples(source: Path) -> dict[str, list[Sample]]:
     """Samples by topic."""
     found: dict[str, list[Sample]] = {}
-    for sample in cfclient.content(source, Options()).samples:
+    for sample in cfclient.load_content(source, Options()).samples:
         found.setdefault(sample.topic, []).append(sample)
     return found
 
 
 def test_a_folder_of_folders_is_a_swarm(swarm: Path) -> None:
-    assert format_of(swarm).name == "cfclient"
+    assert find_format(swarm).name == "cfclient"
     found = samples(swarm)
     assert {topic: len(v) for topic, v in found.items() if topic.startswith("/cf1")} == {
         "/cf1/attitude": 10,
@@ -181,7 +181,7 @@ def test_a_header_without_end_is_one_line(tmp_path: Path, text: str, complaint: 
     path = tmp_path / "log.csv"
     path.write_text(text)
     with pytest.raises(SourceError, match=complaint):
-        cfclient.content(path, Options())
+        cfclient.load_content(path, Options())
 
 
 def test_a_log_of_very_many_variables_is_refused(tmp_path: Path) -> None:
@@ -190,7 +190,7 @@ def test_a_log_of_very_many_variables_is_refused(tmp_path: Path) -> None:
     names = ",".join(f"a{k}" for k in range(1001))
     path.write_text(f"Timestamp,{names}\n" + f"{'1,' * 1001}1\n" * 2)
     with pytest.raises(SourceError, match="1001 variables, more than 1000"):
-        list(cfclient.content(path, Options()).samples)
+        list(cfclient.load_content(path, Options()).samples)
 
 
 @pytest.mark.parametrize(

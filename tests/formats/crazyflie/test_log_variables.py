@@ -5,11 +5,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.formats.crazyflie.log_block import Block, Series, series, unpacked_quaternion
-from dmrl.formats.crazyflie.log_variables import _pose, attitude_of, streams, yaw_rate_of
-from dmrl.formats.crazyflie.state import quaternions_of, scaled, turn_of
+from dmrl.formats.crazyflie.log_block import LogBlock, TimeSeries, find_series, unpack_quaternions
+from dmrl.formats.crazyflie.log_variables import (
+    _combine_pose,
+    build_streams,
+    compute_yaw_rate,
+    find_attitude,
+)
+from dmrl.formats.crazyflie.state import find_in_metres, find_orientation, find_quaternions
 from dmrl.geometry.frames import Array, camera_from_horizontal
-from dmrl.geometry.rotations import euler_zyx, quaternion_zyx
+from dmrl.geometry.rotations import euler_to_quaternion, quaternion_to_euler
 from dmrl.samples.sample import Sample
 
 MS = 1_000_000
@@ -17,9 +22,9 @@ TIMES = np.arange(3) * 10 * MS
 ANGLE = st.floats(-1.4, 1.4)
 
 
-def block(name: str, **columns: list[float]) -> Block:
+def block(name: str, **columns: list[float]) -> LogBlock:
     values = {key.replace("__", "."): np.array(v, np.float32) for key, v in columns.items()}
-    return Block(name, TIMES[: len(next(iter(values.values())))], values)
+    return LogBlock(name, TIMES[: len(next(iter(values.values())))], values)
 
 
 def turned(quaternion: Array) -> Array:
@@ -38,9 +43,11 @@ def body(roll: float, pitch: float, yaw: float) -> Array:
 
 @given(ANGLE, ANGLE, st.floats(-3, 3))
 def test_quaternions_and_angles_are_one_rotation(roll: float, pitch: float, yaw: float) -> None:
-    (quaternion,) = quaternion_zyx(np.array([[roll, pitch, yaw]]))
+    (quaternion,) = euler_to_quaternion(np.array([[roll, pitch, yaw]]))
     np.testing.assert_allclose(turned(quaternion), body(roll, pitch, yaw), atol=1e-9)
-    np.testing.assert_allclose(euler_zyx(quaternion[None])[0], [roll, pitch, yaw], atol=1e-6)
+    np.testing.assert_allclose(
+        quaternion_to_euler(quaternion[None])[0], [roll, pitch, yaw], atol=1e-6
+    )
 
 
 @given(st.integers(0, 3), st.lists(st.integers(-511, 511), min_size=3, max_size=3))
@@ -52,35 +59,35 @@ def test_packed_quaternions_are_unpacked(largest: int, others: list[int]) -> Non
     packed = largest
     for value in others:
         packed = packed << 10 | (value < 0) << 9 | abs(value)
-    (found,) = unpacked_quaternion(np.array([packed]))
+    (found,) = unpack_quaternions(np.array([packed]))
     wanted = np.insert(small, largest, np.sqrt(rest))
     np.testing.assert_allclose(found, wanted, atol=1e-12)
 
 
 @given(ANGLE, ANGLE, st.floats(-3, 3))
 def test_a_steady_turn_is_found_in_the_body_rates(roll: float, pitch: float, rate: float) -> None:
-    attitude = Series(TIMES, np.tile([roll, pitch, 0.0], (3, 1)))
+    attitude = TimeSeries(TIMES, np.tile([roll, pitch, 0.0], (3, 1)))
     p, q, r = np.degrees(body(roll, pitch, 0.0).T @ [0.0, 0.0, rate])
     gyro = block("imu", gyro__x=[p] * 3, gyro__y=[q] * 3, gyro__z=[r] * 3)
-    np.testing.assert_allclose(yaw_rate_of([gyro], attitude), rate, atol=1e-5)
+    np.testing.assert_allclose(compute_yaw_rate([gyro], attitude), rate, atol=1e-5)
 
 
 def test_without_a_gyroscope_the_yaw_tells_its_rate() -> None:
-    yaw = Series(TIMES, np.column_stack([0 * TIMES, 0 * TIMES, 2e-9 * TIMES]))
-    assert yaw_rate_of([], yaw) == pytest.approx(2.0)
-    late = Series(17 * 10**17 + TIMES, yaw.values)  # as exactly on a clock of today
-    assert yaw_rate_of([], late) == pytest.approx(2.0, rel=1e-9)
+    yaw = TimeSeries(TIMES, np.column_stack([0 * TIMES, 0 * TIMES, 2e-9 * TIMES]))
+    assert compute_yaw_rate([], yaw) == pytest.approx(2.0)
+    late = TimeSeries(17 * 10**17 + TIMES, yaw.values)  # as exactly on a clock of today
+    assert compute_yaw_rate([], late) == pytest.approx(2.0, rel=1e-9)
     only_z = block("imu", gyro__z=[90.0] * 3)
-    assert yaw_rate_of([only_z], yaw) == pytest.approx(np.pi / 2)
+    assert compute_yaw_rate([only_z], yaw) == pytest.approx(np.pi / 2)
     packed = block("z", stateEstimateZ__rateYaw=[1500.0] * 3)
-    assert yaw_rate_of([packed], yaw) == pytest.approx(1.5)
-    assert yaw_rate_of([], Series(TIMES[:1], yaw.values[:1])).tolist() == [0.0]
+    assert compute_yaw_rate([packed], yaw) == pytest.approx(1.5)
+    assert compute_yaw_rate([], TimeSeries(TIMES[:1], yaw.values[:1])).tolist() == [0.0]
 
 
 def test_logged_degrees_are_nose_up_and_unwrapped() -> None:
     angles = {"roll": [10.0] * 3, "pitch": [20.0] * 3, "yaw": [170.0, -170.0, -150.0]}
     logged = block("a", **{f"stateEstimate__{name}": v for name, v in angles.items()})
-    found = attitude_of([logged])
+    found = find_attitude([logged])
     assert found is not None
     assert np.degrees(found.values[0]) == pytest.approx([10, -20, 170])
     assert np.degrees(found.values[:, 2]) == pytest.approx([170, 190, 210])
@@ -90,7 +97,7 @@ def test_velocity_is_turned_into_the_robots_own_axes() -> None:
     state = {"roll": [0.0] * 3, "pitch": [0.0] * 3, "yaw": [90.0] * 3}
     logged = {**state, "vx": [1.0] * 3, "vy": [2.0] * 3, "vz": [3.0] * 3, "z": [0.7] * 3}
     blocks = [block("a", **{f"stateEstimate__{name}": v for name, v in logged.items()})]
-    found = {s.topic: s.fields for stream in streams("cf1", blocks, {}) for s in stream}
+    found = {s.topic: s.fields for stream in build_streams("cf1", blocks, {}) for s in stream}
     assert found["/cf1/velocity"] == pytest.approx({"vx_mps": 2, "vy_mps": -1, "vz_mps": 3})
     assert found["/cf1/height"]["height_m"] == pytest.approx(0.7)
 
@@ -101,17 +108,19 @@ def test_a_leaning_beam_is_longer_than_the_height() -> None:
         block("a", **{f"stateEstimate__{name}": v for name, v in state.items()}),
         block("b", range__zrange=[1000.0, 8000.0, 2000.0]),
     ]
-    found = [s for stream in streams("cf1", blocks, {}) for s in stream if "height" in s.topic]
+    found = [
+        s for stream in build_streams("cf1", blocks, {}) for s in stream if "height" in s.topic
+    ]
     lean = np.cos(np.radians(30)) * np.cos(np.radians(20))
     assert [s.fields["height_m"] for s in found] == pytest.approx([lean, 2 * lean])
 
 
 def test_ranges_are_metres_and_fresh() -> None:
     floats = block("a", ranging__distance2=[1.5, 1.5, 2.5])
-    whole = Block("b", TIMES, {"ranging.distance3": np.array([1500, 61_000, 1200], np.uint16)})
+    whole = LogBlock("b", TIMES, {"ranging.distance3": np.array([1500, 61_000, 1200], np.uint16)})
     found = [
         (s.topic, s.time_ns, s.fields["range_m"])
-        for stream in streams("cf1", [floats, whole], {"3": "anchor"})
+        for stream in build_streams("cf1", [floats, whole], {"3": "anchor"})
         for s in stream
         if "range" in s.topic
     ]
@@ -124,9 +133,9 @@ def test_ranges_are_metres_and_fresh() -> None:
 
 
 def test_a_place_without_a_turn_is_level_and_looks_along_x() -> None:
-    place = Series(np.arange(3), np.arange(9.0).reshape(3, 3))
-    found = _pose(place, None)
-    assert found is not None and _pose(None, place) is None
+    place = TimeSeries(np.arange(3), np.arange(9.0).reshape(3, 3))
+    found = _combine_pose(place, None)
+    assert found is not None and _combine_pose(None, place) is None
     assert found[0].tolist() == [0, 1, 2]
     assert found[1].tolist() == [
         [0, 1, 2, 0, 0, 0, 1],
@@ -135,11 +144,11 @@ def test_a_place_without_a_turn_is_level_and_looks_along_x() -> None:
     ]
 
 
-def samples(*blocks: Block, **names: str) -> dict[str, list[Sample]]:
+def samples(*blocks: LogBlock, **names: str) -> dict[str, list[Sample]]:
     """Samples of cf1's log by topic; ``names`` are ``cf<number>``."""
     found: dict[str, list[Sample]] = {}
     numbers = {key.removeprefix("cf"): name for key, name in names.items()}
-    for stream in streams("cf1", blocks, numbers):
+    for stream in build_streams("cf1", blocks, numbers):
         for sample in stream:
             found.setdefault(sample.topic, []).append(sample)
     return found
@@ -147,19 +156,24 @@ def samples(*blocks: Block, **names: str) -> dict[str, list[Sample]]:
 
 def test_series_are_of_the_first_block_that_has_all_and_of_finite_rows() -> None:
     one, two = block("a", x=[1, 2, 3]), block("b", x=[4, np.nan, 6], y=[7, 8, 9])
-    found = series([one, two], ["y", "x"])
+    found = find_series([one, two], ["y", "x"])
     assert found is not None
     assert found.time_ns.tolist() == [0, 20 * MS]
     assert found.values.tolist() == [[7, 4], [9, 6]]
-    assert found.part(1).values.tolist() == [[4], [6]]
-    assert found.at(np.array([-5, 5, 10, 99]) * MS).tolist() == [[7, 4], [7.5, 4.5], [8, 5], [9, 6]]
-    assert series([one, two], ["x", "z"]) is None
-    assert series([block("a", x=[np.nan])], ["x"]) is None
+    assert found.select_column(1).values.tolist() == [[4], [6]]
+    assert found.interpolate(np.array([-5, 5, 10, 99]) * MS).tolist() == [
+        [7, 4],
+        [7.5, 4.5],
+        [8, 5],
+        [9, 6],
+    ]
+    assert find_series([one, two], ["x", "z"]) is None
+    assert find_series([block("a", x=[np.nan])], ["x"]) is None
 
 
 def test_rows_out_of_order_are_put_in_order_with_all_their_columns() -> None:
     times = np.array([30, 10, 20]) * MS
-    logged = Block("my block", times, {"a": np.array([3, 1, 2]), "b": np.array([30, 10, 20])})
+    logged = LogBlock("my block", times, {"a": np.array([3, 1, 2]), "b": np.array([30, 10, 20])})
     (found,) = samples(logged).values()
     assert {s.topic for s in found} == {"/cf1/log/my_block"}
     assert [(s.time_ns, s.fields["a"], s.fields["b"]) for s in found] == [
@@ -173,34 +187,34 @@ def test_rows_out_of_order_are_put_in_order_with_all_their_columns() -> None:
 def test_quaternions_a_tenth_from_unit_length_are_none(norm: float, kept: int) -> None:
     rows = [[0.0, norm], [0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
     names = ("stateEstimate__qx", "stateEstimate__qy", "stateEstimate__qz", "stateEstimate__qw")
-    found = quaternions_of([block("a", **dict(zip(names, rows, strict=True)))])
+    found = find_quaternions([block("a", **dict(zip(names, rows, strict=True)))])
     assert found is not None
     assert found.values.tolist() == [[0, 0, 1, 0], [1, 0, 0, 0]][: 1 + kept]
     assert found.time_ns.tolist() == [0, 10 * MS][: 1 + kept]
-    assert quaternions_of([block("a", **{name: [0.0] for name in names})]) is None
+    assert find_quaternions([block("a", **{name: [0.0] for name in names})]) is None
 
 
 def test_state_in_millimetres_is_taken_where_there_is_none_in_metres() -> None:
     packed = block("z", stateEstimateZ__x=[1500.0], stateEstimateZ__y=[-20.0])
     plain = block("p", stateEstimate__x=[3.0], stateEstimate__y=[4.0])
     for blocks, wanted in (([packed, plain], [[3.0, 4.0]]), ([packed], [[1.5, -0.02]])):
-        found = scaled(blocks, "x y")
+        found = find_in_metres(blocks, "x y")
         assert found is not None and found.values == pytest.approx(np.array(wanted))
-    assert scaled([packed, plain], "x y z") is None
+    assert find_in_metres([packed, plain], "x y z") is None
 
 
 def test_a_turn_of_which_only_a_part_is_logged_is_level_else() -> None:
-    found = turn_of([block("a", stateEstimate__yaw=[90.0], stateEstimate__pitch=[20.0])])
-    wanted = quaternion_zyx(np.array([[0.0, np.radians(-20), np.pi / 2]]))
+    found = find_orientation([block("a", stateEstimate__yaw=[90.0], stateEstimate__pitch=[20.0])])
+    wanted = euler_to_quaternion(np.array([[0.0, np.radians(-20), np.pi / 2]]))
     assert found is not None and found.values == pytest.approx(wanted)
-    assert turn_of([block("a", stateEstimate__x=[1.0])]) is None
+    assert find_orientation([block("a", stateEstimate__x=[1.0])]) is None
 
 
 def test_angles_of_the_estimate_come_before_the_stabilizer_s() -> None:
     both = block("a", stabilizer__roll=[10.0], stateEstimate__roll=[20.0])
-    found = turn_of([both])
+    found = find_orientation([both])
     assert found is not None
-    assert found.values == pytest.approx(quaternion_zyx(np.radians([[20.0, 0, 0]])), abs=1e-6)
+    assert found.values == pytest.approx(euler_to_quaternion(np.radians([[20.0, 0, 0]])), abs=1e-6)
 
 
 def test_ranges_end_at_60_m_and_nothing_heard_is_not_refused(
@@ -209,13 +223,13 @@ def test_ranges_end_at_60_m_and_nothing_heard_is_not_refused(
     # Alone, so that nothing else is logged.
     metres = [59.99, 60.0, 61.0, 0.0, -1.0, np.nan, 0.01]
     times = np.arange(7) * MS
-    found = samples(Block("r", times, {"ranging.distance2": np.array(metres)}))["/cf1/range/cf2"]
+    found = samples(LogBlock("r", times, {"ranging.distance2": np.array(metres)}))["/cf1/range/cf2"]
     assert [(s.time_ns, s.fields["range_m"]) for s in found] == [(0, 59.99), (6 * MS, 0.01)]
     assert "the log: 3 ranges to cf2 left out: not over 0 and under 60 m" in capsys.readouterr().err
 
 
 def test_events_tell_whose_distance_they_are_and_a_robot_ranges_to_no_self() -> None:
-    event = Block(
+    event = LogBlock(
         "estDistance",
         TIMES,
         {"id": np.array([2, 1, 2], np.uint8), "distance": np.array([1.5, 7, 2.5], np.float32)},
@@ -239,7 +253,7 @@ def test_events_tell_whose_distance_they_are_and_a_robot_ranges_to_no_self() -> 
 def test_the_unit_of_a_distance_is_told_by_its_type_and_size(
     values: np.ndarray, range_m: list[float], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = samples(Block("r", TIMES[:2], {"ranging.distance2": values}))["/cf1/range/cf2"]
+    found = samples(LogBlock("r", TIMES[:2], {"ranging.distance2": values}))["/cf1/range/cf2"]
     assert [s.fields["range_m"] for s in found] == pytest.approx(range_m)
     err = capsys.readouterr().err
     assert said in err and ("millimetres" in err, "metres?" in err) == (
@@ -261,14 +275,14 @@ def test_poses_take_the_nearest_turn_and_true_ones_that_stand_come_once() -> Non
     ]
     stamp = found["/cf1/pose/truth"][1].fields["timestamp"]
     assert (stamp["seconds"], stamp["nanos"]) == (0, 20 * MS)
-    event = Block("estPose", TIMES, place.columns)  # each comes when it is measured
+    event = LogBlock("estPose", TIMES, place.columns)  # each comes when it is measured
     assert len(samples(event, turn)["/cf1/pose/truth"]) == 3
 
 
 def test_frames_of_a_robot_are_told_every_50_ms() -> None:
     times = np.arange(0, 200, 20) * MS
     columns = {f"stateEstimate.{n}": np.arange(10.0) + k for k, n in enumerate("xyz")}
-    found = samples(Block("s", times, columns))["/tf"]
+    found = samples(LogBlock("s", times, columns))["/tf"]
     assert [s.time_ns // MS for s in found] == [0, 60, 100, 160]
 
 
@@ -279,11 +293,11 @@ def test_a_beam_of_8_m_and_more_saw_no_floor() -> None:
 
 
 def test_frames_and_poses_turn_as_what_was_logged() -> None:
-    (quaternion,) = quaternion_zyx(np.array([[0.3, -0.2, 1.1]]))
+    (quaternion,) = euler_to_quaternion(np.array([[0.3, -0.2, 1.1]]))
     names = [f"locSrv.{n}" for n in ("x", "y", "z", "qx", "qy", "qz", "qw")]
     times = np.array([1_700_000_000_123_456_789])
     rows = [np.array([value]) for value in (1.5, 2.5, 3.5, *quaternion)]
-    found = samples(Block("estPose", times, dict(zip(names, rows, strict=True))))
+    found = samples(LogBlock("estPose", times, dict(zip(names, rows, strict=True))))
     (pose,) = found["/cf1/pose/truth"]
     assert pose.fields["timestamp"] == {"seconds": 1_700_000_000, "nanos": 123_456_789}
     assert pose.fields["frame_id"] == "world"
@@ -303,23 +317,25 @@ def test_a_peer_of_which_nothing_was_heard_has_no_ranges(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     for kind in (np.uint16, np.float32):
-        silent = Block("r", TIMES, {"ranging.distance2": np.zeros(3, kind)})
+        silent = LogBlock("r", TIMES, {"ranging.distance2": np.zeros(3, kind)})
         assert samples(silent).keys() == {"/cf1/log/r"}
-        assert len(streams("cf1", [silent], {})) == 1
+        assert len(build_streams("cf1", [silent], {})) == 1
     assert "range" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("missing", ["roll", "pitch", "yaw"])
 def test_an_attitude_is_of_three_angles(missing: str) -> None:
     angles = {f"stabilizer__{n}": [5.0] * 3 for n in ("roll", "pitch", "yaw") if n != missing}
-    assert attitude_of([block("a", **angles)]) is None
-    assert attitude_of([block("a", **angles, **{f"stabilizer__{missing}": [5.0] * 3})]) is not None
+    assert find_attitude([block("a", **angles)]) is None
+    assert (
+        find_attitude([block("a", **angles, **{f"stabilizer__{missing}": [5.0] * 3})]) is not None
+    )
 
 
 @pytest.mark.parametrize("step_ns", [0, MS])
 def test_the_slope_of_a_yaw_needs_times_that_go_on(step_ns: int) -> None:
     yaw = np.column_stack([np.zeros(2), np.zeros(2), [0.0, 0.002]])
-    found = yaw_rate_of([], Series(np.array([5, 5 + step_ns]), yaw))
+    found = compute_yaw_rate([], TimeSeries(np.array([5, 5 + step_ns]), yaw))
     assert found == pytest.approx(2.0 if step_ns else 0.0)
 
 
@@ -329,7 +345,7 @@ def test_angles_that_were_logged_are_the_turn_of_a_pose(
 ) -> None:
     degrees = np.degrees([roll, -pitch, yaw])  # as the Crazyflie has them
     logged = {f"stateEstimate__{n}": [v] for n, v in zip(("roll", "pitch", "yaw"), degrees)}  # noqa: B905
-    found = turn_of([block("a", **logged)])
+    found = find_orientation([block("a", **logged)])
     assert found is not None
     np.testing.assert_allclose(turned(found.values[0]), body(roll, pitch, yaw), atol=1e-5)
 
@@ -337,8 +353,8 @@ def test_angles_that_were_logged_are_the_turn_of_a_pose(
 def test_quaternions_that_are_whole_come_before_packed_ones() -> None:
     whole = block("a", stateEstimate__qx=[0.0], stateEstimate__qy=[0.0])
     rest = {"stateEstimate.qz": np.array([1.0]), "stateEstimate.qw": np.array([0.0])}
-    whole = Block("a", whole.time_ns, {**whole.columns, **rest})
-    packed = Block("z", TIMES[:1], {"stateEstimateZ.quat": np.array([3 << 30])})  # level
+    whole = LogBlock("a", whole.time_ns, {**whole.columns, **rest})
+    packed = LogBlock("z", TIMES[:1], {"stateEstimateZ.quat": np.array([3 << 30])})  # level
     for blocks, wanted in (([whole, packed], [0, 0, 1, 0]), ([packed], [0, 0, 0, 1])):
-        found = quaternions_of(blocks)
+        found = find_quaternions(blocks)
         assert found is not None and found.values.tolist() == [wanted]

@@ -26,7 +26,7 @@ COUNTS = {
 }
 
 
-def same(log: usd_log.Log, data: bytes) -> None:
+def same(log: usd_log.UsdLog, data: bytes) -> None:
     """The log holds what the value-by-value decoder finds, bit for bit."""
     wanted = plain_usd.decode(data)
     unit = {1: 1_000_000, 2: 1000}[log.version]
@@ -43,7 +43,7 @@ def same(log: usd_log.Log, data: bytes) -> None:
 def test_real_logs_equal_an_independent_decode(data: Path, name: str) -> None:
     raw = (data / "crazyflie-usd" / name).read_bytes()
     assert zlib.crc32(raw[:-4]) == struct.unpack("<I", raw[-4:])[0]
-    log = usd_log.decode(raw)
+    log = usd_log.decode_log(raw)
     assert log.warnings == ()
     assert {b.name: len(b.time_ns) for b in log.blocks} == COUNTS[name]
     same(log, raw)
@@ -53,7 +53,7 @@ def test_rates_of_a_real_log_are_those_that_were_set(data: Path) -> None:
     raw = (data / "crazyflie-usd" / "eckart00_brushless_flights").read_bytes()
     rates = {
         b.name: (len(b.time_ns) - 1) / ((b.time_ns[-1] - b.time_ns[0]) * 1e-9)
-        for b in usd_log.decode(raw).blocks
+        for b in usd_log.decode_log(raw).blocks
     }
     assert rates["fixedFrequency"] == pytest.approx(505, abs=1)
     assert rates["estPose"] == pytest.approx(101, abs=1)
@@ -62,7 +62,7 @@ def test_rates_of_a_real_log_are_those_that_were_set(data: Path) -> None:
 @pytest.mark.parametrize("version", [1, 2])
 def test_both_versions_are_read(version: int) -> None:
     raw = foreign.usd_log(version)
-    log = usd_log.decode(raw)
+    log = usd_log.decode_log(raw)
     assert (log.version, log.warnings) == (version, ())
     same(log, raw)
 
@@ -72,7 +72,7 @@ def test_every_type_of_variable_is_read() -> None:
     numbers = (*values.values(), 0.5, 1.25)
     codes = [*values, "e", "f"]
     raw = plain_usd.encode({1: ("all", [(f"v.{c}", c) for c in codes])}, [(1, 7, numbers)])
-    (block,) = usd_log.decode(raw).blocks
+    (block,) = usd_log.decode_log(raw).blocks
     assert tuple(column[0] for column in block.columns.values()) == numbers
 
 
@@ -84,14 +84,14 @@ def test_a_log_cut_anywhere_gives_every_whole_record_and_a_warning(
         raw = foreign.usd_log()
     else:
         raw = (request.getfixturevalue("data") / "crazyflie-usd" / name).read_bytes()
-    body = usd_log._header(raw, name)[2]
-    whole = usd_log.decode(raw)
+    body = usd_log._parse_header(raw, name)[2]
+    whole = usd_log.decode_log(raw)
     sizes = {b.name: 10 + sum(c.itemsize for c in b.columns.values()) for b in whole.blocks}
     times = np.concatenate([b.time_ns for b in whole.blocks])
     size = np.concatenate([np.full(len(b.time_ns), sizes[b.name]) for b in whole.blocks])
     assert body + size.sum() + 4 == len(raw)
     for length in np.random.default_rng(7).integers(body, len(raw) - 4, 50).tolist():
-        log = usd_log.decode(raw[:length], name)
+        log = usd_log.decode_log(raw[:length], name)
         assert "no valid CRC" in log.warnings[0]
         got = sum(len(b.time_ns) * sizes[b.name] for b in log.blocks)
         # What is left is less than one record.
@@ -105,7 +105,7 @@ def test_a_log_cut_anywhere_gives_every_whole_record_and_a_warning(
 def test_an_empty_log_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "log00").write_bytes(b"")
     with pytest.raises(SourceError, match=r"log00 is empty.* Pass another log") as e:
-        usd_log.content(tmp_path / "log00", Options())
+        usd_log.load_content(tmp_path / "log00", Options())
     assert "\n" not in str(e.value)
 
 
@@ -121,12 +121,12 @@ def test_an_empty_log_is_one_line(tmp_path: Path) -> None:
 )
 def test_a_damaged_header_is_one_line(damage: object, text: str) -> None:
     with pytest.raises(SourceError, match=text):
-        usd_log.decode(damage(foreign.usd_log()), "log07")  # type: ignore[operator]
+        usd_log.decode_log(damage(foreign.usd_log()), "log07")  # type: ignore[operator]
 
 
 def test_an_id_that_is_unknown_ends_the_log_with_a_warning() -> None:
     raw = foreign.usd_log()
-    log = usd_log.decode(raw[:-4] + b"\x55\x55" + b"\0" * 30)
+    log = usd_log.decode_log(raw[:-4] + b"\x55\x55" + b"\0" * 30)
     assert [len(b.time_ns) for b in log.blocks] == [100, 20, 20]
     assert "32 bytes from byte" in log.warnings[1]
 
@@ -135,7 +135,7 @@ def test_bytes_that_look_like_ids_are_no_records() -> None:
     events = {7: ("a", [("x", "H"), ("y", "H")]), 9: ("b", [("z", "I")])}
     rows = [(7, 7 * 65536 + 9, (7, 9)) if k % 3 else (9, 7, (9 * 65536 + 7,)) for k in range(300)]
     raw = plain_usd.encode(events, rows)
-    same(usd_log.decode(raw), raw)
+    same(usd_log.decode_log(raw), raw)
 
 
 @pytest.mark.parametrize("code", ["H", "B"])
@@ -156,12 +156,12 @@ def test_events_in_any_order_are_told_apart(pattern: str, code: str) -> None:
     events = {ord(c) - 90: (c, [("x", "H"), ("y", code)]) for c in "abc"}
     rows = [(ord(c) - 90, 1000 * k, (k, 7)) for k, c in enumerate(pattern)]
     raw = plain_usd.encode(events, rows)
-    same(usd_log.decode(raw), raw)
+    same(usd_log.decode_log(raw), raw)
 
 
 def test_milliseconds_that_wrap_go_on() -> None:
     rows = [(1, (2**32 - 2 + k) % 2**32, (k,)) for k in range(5)]
-    (block,) = usd_log.decode(plain_usd.encode({1: ("a", [("x", "H")])}, rows, 1)).blocks
+    (block,) = usd_log.decode_log(plain_usd.encode({1: ("a", [("x", "H")])}, rows, 1)).blocks
     assert np.diff(block.time_ns).tolist() == [1_000_000] * 4
 
 
@@ -180,11 +180,11 @@ def test_milliseconds_that_wrap_go_on() -> None:
 )
 def test_a_log_is_known_by_five_bytes(head: bytes, known: bool, tmp_path: Path) -> None:
     (tmp_path / "log").write_bytes(head)
-    assert usd_log.recognises(tmp_path / "log") == known
-    assert usd_log.recognises(tmp_path) == known
+    assert usd_log.can_read(tmp_path / "log") == known
+    assert usd_log.can_read(tmp_path) == known
     if not known:
         with pytest.raises(SourceError, match="no micro-SD log in"):
-            usd_log.content(tmp_path, Options())
+            usd_log.load_content(tmp_path, Options())
 
 
 @pytest.mark.parametrize(
@@ -206,7 +206,7 @@ def test_variables_have_names_of_their_own_and_known_types(
         )
         head += b"".join(f"{variable}({code})".encode() + b"\0" for variable, code in variables)
     with pytest.raises(SourceError, match=words):
-        usd_log.decode(head + bytes(40))
+        usd_log.decode_log(head + bytes(40))
 
 
 @pytest.mark.parametrize("numbers", [(1, 257), (0x0102, 0xFF02), (0xFFFF, 0x00FF)])
@@ -216,19 +216,19 @@ def test_events_whose_numbers_end_alike_are_told_apart(numbers: tuple[int, int])
         (numbers[k % 3 == 0], 1000 * k, (k,) if k % 3 else (70_000 + k, 257)) for k in range(200)
     ]
     raw = plain_usd.encode(events, rows)
-    same(usd_log.decode(raw), raw)
+    same(usd_log.decode_log(raw), raw)
 
 
 def test_a_log_has_250_types_of_events_at_most_and_names_that_print() -> None:
     events = {k: (f"e{k}", [("x", "H")]) for k in range(251)}
     most = {k: events[k] for k in range(250)}
     raw = plain_usd.encode(most, [(k, k, (k,)) for k in range(250)])
-    assert len(usd_log.decode(raw).blocks) == 250
+    assert len(usd_log.decode_log(raw).blocks) == 250
     with pytest.raises(SourceError, match="no micro-SD log of version 1 or 2"):
-        usd_log.decode(plain_usd.encode(events, []))
+        usd_log.decode_log(plain_usd.encode(events, []))
     for name, variable in (("a\n", "x"), ("a", "x\n")):
         with pytest.raises(SourceError, match="without name or known type"):
-            usd_log.decode(plain_usd.encode({1: (name, [(variable, "H")])}, []))
+            usd_log.decode_log(plain_usd.encode({1: (name, [(variable, "H")])}, []))
     for head in (b"\xbc\2\0\0\0", b"\xbc\2\0"):
         with pytest.raises(SourceError):
-            usd_log.decode(head + bytes(9))
+            usd_log.decode_log(head + bytes(9))

@@ -15,7 +15,7 @@ from .. import foreign, plain_usd
 def samples(path: Path, options: Options | None = None) -> dict[str, list[Sample]]:
     """Samples by topic."""
     found: dict[str, list[Sample]] = {}
-    for sample in usd_log.content(path, options or Options()).samples:
+    for sample in usd_log.load_content(path, options or Options()).samples:
         found.setdefault(sample.topic, []).append(sample)
     return found
 
@@ -114,7 +114,7 @@ def test_a_folder_is_a_robot_per_file(tmp_path: Path, capsys: pytest.CaptureFixt
         (tmp_path / name).write_bytes(foreign.usd_log())
     (tmp_path / "cf3").write_bytes(b"")
     (tmp_path / "notes.txt").write_text("first flight")
-    assert usd_log.recognises(tmp_path)
+    assert usd_log.can_read(tmp_path)
     found = samples(tmp_path)
     assert {"/cf1/attitude", "/cf2/attitude"} <= found.keys()
     err = capsys.readouterr().err

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.formats.crazyflie.usd_records import Event, gather_records
+from dmrl.formats.crazyflie.usd_records import EventType, gather_records
 
 NUMBERS = st.lists(
     st.sampled_from([1, 2, 3, 255, 256, 257, 0x0201, 0xFF01, 0xFFFF]),
@@ -14,7 +14,9 @@ NUMBERS = st.lists(
 )
 
 
-def plain(data: bytes, body: int, end: int, events: list[Event]) -> tuple[dict[str, bytes], int]:
+def plain(
+    data: bytes, body: int, end: int, events: list[EventType]
+) -> tuple[dict[str, bytes], int]:
     """Bytes of the records of each event, and where the last whole one ends."""
     sizes = {event.number: event.dtype.itemsize for event in events}
     names = {event.number: event.name for event in events}
@@ -49,7 +51,7 @@ def test_records_are_those_of_a_walk_from_one_to_the_next(
     seed: int,
 ) -> None:
     events = [
-        Event(number, f"e{number}", tuple((f"v{k}", c) for k, c in enumerate(code)), time)
+        EventType(number, f"e{number}", tuple((f"v{k}", c) for k, c in enumerate(code)), time)
         for number, code in zip(numbers, codes, strict=False)
     ]
     order = [events[k % len(events)] for k in pattern * repeats]
@@ -71,7 +73,7 @@ def test_records_are_those_of_a_walk_from_one_to_the_next(
 
 
 def test_a_record_is_packed() -> None:
-    event = Event(1, "a", (("x", "B"), ("y", "I")), "<u8")
+    event = EventType(1, "a", (("x", "B"), ("y", "I")), "<u8")
     assert event.dtype.itemsize == 2 + 8 + 1 + 4
     assert list(event.dtype.fields or ()) == ["id", "time", "v0", "v1"]
     row = np.frombuffer(bytes(range(15)), event.dtype)[0]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SourceError
-from dmrl.formats.files.column_map import QUANTITIES, read_map
+from dmrl.formats.files.column_map import QUANTITIES, read_column_map
 
 from .test_mapped_csv import TABLE
 
@@ -38,7 +38,7 @@ def test_every_fault_of_a_table_is_named_in_one_line(tmp_path: Path) -> None:
         """)
     )
     with pytest.raises(SourceError) as e:
-        read_map(path)
+        read_column_map(path)
     text = str(e.value)
     assert "\n" not in text and "map.toml" in text
     for fault in (
@@ -62,7 +62,7 @@ def test_every_fault_of_a_table_is_named_in_one_line(tmp_path: Path) -> None:
 def test_what_is_no_table_is_one_line(text: str, tmp_path: Path) -> None:
     (tmp_path / "map.toml").write_text(text)
     with pytest.raises(SourceError, match=r"map\.toml"):
-        read_map(tmp_path / "map.toml")
+        read_column_map(tmp_path / "map.toml")
 
 
 def test_units_are_what_they_are_called() -> None:
@@ -100,9 +100,9 @@ def test_one_fault_of_a_table_is_said_and_no_other(
 ) -> None:
     path = tmp_path / "map.toml"
     path.write_text(TABLE)
-    read_map(path)
+    read_column_map(path)
     assert was in TABLE
     path.write_text(TABLE.replace(was, now, 1))
     with pytest.raises(SourceError) as e:
-        read_map(path)
+        read_column_map(path)
     assert fault in str(e.value)

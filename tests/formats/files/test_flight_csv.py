@@ -9,7 +9,7 @@ from dmrl.formats.base import Options
 from dmrl.formats.files import flight_csv
 from dmrl.geometry.frames import AIDECK
 from dmrl.images.codec import encode_png
-from dmrl.samples.flight import LOG_COLUMNS, from_poses
+from dmrl.samples.flight import LOG_COLUMNS, log_from_poses
 
 HEADER = ["time_s", *LOG_COLUMNS]
 Rows = list[list[object]]
@@ -41,8 +41,8 @@ def flight(tmp_path: Path) -> Path:
 
 
 def test_a_flight_becomes_samples_in_time_order(flight: Path) -> None:
-    assert flight_csv.recognises(flight)
-    samples = list(flight_csv.content(flight).samples)
+    assert flight_csv.can_read(flight)
+    samples = list(flight_csv.load_content(flight).samples)
     times = [s.time_ns for s in samples]
     assert times == sorted(times)
     assert times[0] == 1_000_000_000
@@ -72,7 +72,7 @@ def test_pictures_beside_the_log_come_along(flight: Path) -> None:
     (flight / "cf1").mkdir()
     picture = encode_png(np.zeros((8, 8, 3), np.uint8))
     (flight / "cf1" / "001005000000.png").write_bytes(picture)
-    images = [s for s in flight_csv.content(flight).samples if s.topic == "/cf1/camera/image"]
+    images = [s for s in flight_csv.load_content(flight).samples if s.topic == "/cf1/camera/image"]
     assert [(s.time_ns, s.fields["data"]) for s in images] == [(1_005_000_000, picture)]
 
 
@@ -81,7 +81,7 @@ def test_robots_get_the_names_that_are_asked_for(flight: Path) -> None:
     folder.mkdir()
     (folder / "0000001050000000.png").write_bytes(encode_png(np.zeros((224, 320, 3), np.uint8)))
     options = Options(names={"cf1": "left", "cf2": "right"}, camera=AIDECK)
-    found = {sample.topic for sample in flight_csv.content(flight, options).samples}
+    found = {sample.topic for sample in flight_csv.load_content(flight, options).samples}
     own = {"/left/range/right", "/left/peer/right/truth", "/left/camera/calibration"}
     assert own | {"/left/camera/image", "/right/height"} < found
     assert not [topic for topic in found if "cf" in topic]
@@ -91,12 +91,12 @@ def test_pictures_that_are_not_named_by_time_are_refused(flight: Path) -> None:
     (flight / "cf1").mkdir()
     (flight / "cf1" / "7.png").write_bytes(encode_png(np.zeros((8, 8, 3), np.uint8)))
     with pytest.raises(SourceError, match=r"7\.png is not named by its time"):
-        flight_csv.content(flight)
+        flight_csv.load_content(flight)
 
 
 def refused(folder: Path) -> str:
     with pytest.raises(SourceError) as caught:
-        list(flight_csv.content(folder).samples)
+        list(flight_csv.load_content(folder).samples)
     message = str(caught.value)
     assert "\n" not in message
     return message
@@ -142,7 +142,7 @@ def test_clocks_an_hour_apart_are_refused(flight: Path) -> None:
 
 
 def warned(folder: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    list(flight_csv.content(folder).samples)
+    list(flight_csv.load_content(folder).samples)
     return capsys.readouterr().err.splitlines()
 
 
@@ -176,7 +176,7 @@ def test_ranges_that_cannot_be_are_left_out(
 ) -> None:
     data: Rows = [[*row, value if k == 3 else 1.5] for k, row in enumerate(rows())]
     write(flight, "cf1", data, [*HEADER, "range_cf2_m"])
-    samples = [s for s in flight_csv.content(flight).samples if s.topic == "/cf1/range/cf2"]
+    samples = [s for s in flight_csv.load_content(flight).samples if s.topic == "/cf1/range/cf2"]
     assert [s.fields["range_m"] for s in samples] == [1.5] * 19
     (line,) = capsys.readouterr().err.splitlines()
     assert "1 ranges to cf2 left out" in line
@@ -193,14 +193,14 @@ def test_a_robot_without_its_file_is_warned_of(
 def test_other_folders_are_not_taken_for_flights(tmp_path: Path) -> None:
     (tmp_path / "labels.csv").write_text("file,peer\n")
     (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
-    assert not flight_csv.recognises(tmp_path)
+    assert not flight_csv.can_read(tmp_path)
 
 
 def test_odometry_from_poses_turns_with_the_robot() -> None:
     time_s = np.arange(0, 20, 0.01)
     yaw = 0.5 * time_s
     xy = np.stack([2 * np.sin(yaw), -2 * np.cos(yaw)], axis=1)  # a circle, driven forward
-    log = from_poses(time_s, xy, np.angle(np.exp(1j * yaw)))
+    log = log_from_poses(time_s, xy, np.angle(np.exp(1j * yaw)))
     assert np.allclose(log["vx_mps"][5:-5], 1.0, atol=1e-4)
     assert np.allclose(log["vy_mps"][5:-5], 0.0, atol=1e-4)
     assert np.allclose(log["yaw_rate_radps"], 0.5)
@@ -208,7 +208,7 @@ def test_odometry_from_poses_turns_with_the_robot() -> None:
 
 def test_logs_that_share_their_last_samples_are_taken(flight: Path) -> None:
     write(flight, "cf2", rows(1.18))
-    assert list(flight_csv.content(flight).samples)
+    assert list(flight_csv.load_content(flight).samples)
 
 
 def test_steps_of_a_second_are_no_gap_and_longer_ones_are(
@@ -228,13 +228,13 @@ def test_clocks_that_touch_share_a_time_and_the_order_of_files_does_not_matter(
         write(flight, robot, rows(1.20))
         assert "share no time: 0 s lie between them" in refused(flight)
         write(flight, robot, rows(1.19))
-        assert list(flight_csv.content(flight).samples)
+        assert list(flight_csv.load_content(flight).samples)
 
 
 def test_a_range_under_60_m_is_one(flight: Path) -> None:
     data: Rows = [[*row, 59.99 if k % 2 else 60.0] for k, row in enumerate(rows())]
     write(flight, "cf1", data, [*HEADER, "range_cf2_m"])
-    samples = [s for s in flight_csv.content(flight).samples if s.topic == "/cf1/range/cf2"]
+    samples = [s for s in flight_csv.load_content(flight).samples if s.topic == "/cf1/range/cf2"]
     assert [s.fields["range_m"] for s in samples] == [59.99] * 10
 
 
@@ -242,23 +242,25 @@ def test_where_a_peer_truly_is_needs_three_numbers(flight: Path) -> None:
     cells = [["1", "2", ""], ["", "2", "3"], ["1", "2", "3"]]
     data: Rows = [[*row, *cells[k % 3]] for k, row in enumerate(rows())]
     write(flight, "cf1", data, [*HEADER, "cf2_x_m", "cf2_y_m", "cf2_z_m"])
-    found = [s for s in flight_csv.content(flight).samples if s.topic.endswith("truth")]
+    found = [s for s in flight_csv.load_content(flight).samples if s.topic.endswith("truth")]
     assert [s.time_ns for s in found] == [1_000_000_000 + 10_000_000 * k for k in range(2, 20, 3)]
     write(flight, "cf1", [row[:-1] for row in data], [*HEADER, "cf2_x_m", "cf2_y_m"])
-    assert not [s for s in flight_csv.content(flight).samples if s.topic.endswith("truth")]
+    assert not [s for s in flight_csv.load_content(flight).samples if s.topic.endswith("truth")]
 
 
 def test_times_end_with_64_bits(flight: Path) -> None:
     for robot in ("cf1", "cf2"):
         write(flight, robot, [[9e9 - 19 + k, *row[1:]] for k, row in enumerate(rows())])
-    assert list(flight_csv.content(flight).samples)
+    assert list(flight_csv.load_content(flight).samples)
     write(flight, "cf2", [[9e9 - 18.9 + k, *row[1:]] for k, row in enumerate(rows())])
     assert "time_s reaches 9e+09" in refused(flight)
 
 
 def test_two_rows_are_a_flight(flight: Path) -> None:
     write(flight, "cf2", rows()[:2])
-    assert len([s for s in flight_csv.content(flight).samples if s.topic == "/cf2/height"]) == 2
+    assert (
+        len([s for s in flight_csv.load_content(flight).samples if s.topic == "/cf2/height"]) == 2
+    )
 
 
 def test_the_first_and_the_last_time_are_looked_at(flight: Path) -> None:
@@ -266,7 +268,7 @@ def test_the_first_and_the_last_time_are_looked_at(flight: Path) -> None:
     assert "begins before time 0" in refused(flight)
     for robot in ("cf1", "cf2"):
         write(flight, robot, rows(0.0))
-    assert next(flight_csv.content(flight).samples).time_ns == 0
+    assert next(flight_csv.load_content(flight).samples).time_ns == 0
     write(flight, "cf2", [*rows(0.0), [9.1e9, *rows()[0][1:]]])
     assert "time_s reaches 9.1e+09" in refused(flight)
 
@@ -274,7 +276,7 @@ def test_the_first_and_the_last_time_are_looked_at(flight: Path) -> None:
 def test_columns_that_only_look_like_ranges_are_none(flight: Path) -> None:
     data: Rows = [[*row, 1.5, 1.5, 1.5] for row in rows()]
     write(flight, "cf1", data, [*HEADER, "range_cf2_s", "range_cf2", "my_range_cf2_m"])
-    assert not [s for s in flight_csv.content(flight).samples if "range" in s.topic]
+    assert not [s for s in flight_csv.load_content(flight).samples if "range" in s.topic]
 
 
 def test_values_as_large_as_may_be_are_not_doubted(
@@ -290,10 +292,10 @@ def test_pictures_are_named_by_digits(flight: Path) -> None:
     picture = encode_png(np.zeros((8, 8, 3), np.uint8))
     (flight / "cf1" / "notes-of-the-flight.txt").write_text("no picture")
     (flight / "cf1" / "001005000000.png").write_bytes(picture)
-    assert list(flight_csv.content(flight).samples)
+    assert list(flight_csv.load_content(flight).samples)
     (flight / "cf1" / "a_dozen_and_one.png").write_bytes(picture)
     with pytest.raises(SourceError, match=r"in nanoseconds, 12 digits or more\. Rename it"):
-        flight_csv.content(flight)
+        flight_csv.load_content(flight)
 
 
 def test_other_sensors_are_read_by_their_row_of_the_table(
@@ -304,13 +306,13 @@ def test_other_sensors_are_read_by_their_row_of_the_table(
 
     pressure = row("/{robot}/pressure", "Pressure", "pressure_pa", "air_c")
     sonar = row("/{robot}/sonar/{peer}", "Sonar", "sonar_up_m", "echo_db")
-    monkeypatch.setattr(flight_csv, "OTHERS", (pressure, sonar))
+    monkeypatch.setattr(flight_csv, "OTHER_SENSORS", (pressure, sonar))
     names = ["pressure_pa", "air_c", "sonar_up_cf2_m", "echo_cf2_db", "sonar_up_cf3_m"]
     data: Rows = [
         [*one, 1e5 + k, 20.5, 1.5 + k if k % 2 else "", -3.5, 7.0] for k, one in enumerate(rows())
     ]
     write(flight, "cf1", data, [*HEADER, *names])
-    found = list(flight_csv.content(flight, Options(names={"cf1": "a", "cf2": "b"})).samples)
+    found = list(flight_csv.load_content(flight, Options(names={"cf1": "a", "cf2": "b"})).samples)
     of_air = [s for s in found if s.topic == "/a/pressure"]
     assert [s.fields for s in of_air] == [
         {"pressure_pa": 1e5 + k, "air_c": 20.5} for k in range(20)
@@ -322,4 +324,4 @@ def test_other_sensors_are_read_by_their_row_of_the_table(
         for k in range(1, 20, 2)
     ]
     write(flight, "cf1", [line[:-4] for line in data], [*HEADER, names[0]])  # one of two
-    assert not [s for s in flight_csv.content(flight).samples if "pressure" in s.topic]
+    assert not [s for s in flight_csv.load_content(flight).samples if "pressure" in s.topic]

@@ -8,9 +8,9 @@ import pytest
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats.base import Options
 from dmrl.formats.files import image_folder
-from dmrl.geometry.camera_file import write_camera
+from dmrl.geometry.camera_file import format_camera
 from dmrl.geometry.frames import AIDECK, project
-from dmrl.images.bayer import rgb_of
+from dmrl.images.bayer import demosaic
 from dmrl.images.codec import decode, encode_jpeg, encode_png
 from dmrl.samples.sample import Sample
 
@@ -32,7 +32,7 @@ def folder(tmp_path: Path) -> Path:
 
 def samples(folder: Path, kind: str, options: Options | None = None) -> list[Sample]:
     """Samples of one message type."""
-    found = image_folder.content(folder, options or Options()).samples
+    found = image_folder.load_content(folder, options or Options()).samples
     return [sample for sample in found if sample.message == kind]
 
 
@@ -66,7 +66,7 @@ def test_unlabelled_empty_and_seen_are_three_things(folder: Path) -> None:
         "a.png,cf3,70,20,1.5,,,,,,,train\n"
         "c.ppm,,,,,,,,,,,test\n"
     )
-    content = image_folder.content(folder, Options())
+    content = image_folder.load_content(folder, Options())
     found = [s for s in content.samples if s.message == "PeerLabels"]
     assert [s.time_ns for s in found] == [0, 200_000_000]
     first, second = found[0].fields["peers"]
@@ -169,13 +169,13 @@ def test_faults_name_the_file_and_the_way_out(
 ) -> None:
     spoil(folder)
     with pytest.raises(SourceError, match=message) as e:
-        list(image_folder.content(folder, Options()).samples)
+        list(image_folder.load_content(folder, Options()).samples)
     assert "\n" not in str(e.value)
 
 
 def test_a_label_file_that_was_named_must_be_there(folder: Path) -> None:
     with pytest.raises(SourceError, match=r"no label file .*mine\.csv\. Pass another"):
-        image_folder.content(folder, Options(labels=folder / "mine.csv"))
+        image_folder.load_content(folder, Options(labels=folder / "mine.csv"))
 
 
 def test_a_camera_of_another_size_is_refused(folder: Path) -> None:
@@ -187,7 +187,7 @@ def test_two_pictures_of_one_time_are_refused(tmp_path: Path) -> None:
     for name in ("0123456789012.png", "123456789012.png"):
         (tmp_path / name).write_bytes(b"")
     with pytest.raises(SourceError, match="have the same time"):
-        image_folder.list_pictures(tmp_path, 10.0)
+        image_folder.list_images(tmp_path, 10.0)
 
 
 def test_real_frames_convert(data: Path) -> None:
@@ -238,7 +238,7 @@ def test_raw_pictures_get_their_colours(tmp_path: Path) -> None:
     (grey,) = samples(tmp_path, "CompressedImage")
     np.testing.assert_array_equal(decode(grey.fields["data"])[..., 0], raw)
     (colour,) = samples(tmp_path, "CompressedImage", Options(raw=True))
-    np.testing.assert_array_equal(decode(colour.fields["data"]), rgb_of(raw))
+    np.testing.assert_array_equal(decode(colour.fields["data"]), demosaic(raw))
 
 
 def test_coloured_pictures_are_not_raw(folder: Path) -> None:
@@ -290,13 +290,13 @@ def test_how_much_there_will_be_is_told_before(folder: Path) -> None:
     (folder / "labels.csv").write_text(HEADER + "a.png,cf2,10,20,0.8\na.png,cf3,10,20,0.8\n")
     camera = replace(AIDECK, width_px=64, height_px=48)
     for options, more in ((Options(), 0), (Options(camera=camera), 1)):
-        content = image_folder.content(folder, options)
+        content = image_folder.load_content(folder, options)
         assert content.total == len(list(content.samples)) == 3 + 1 + more
 
 
 def test_a_camera_that_is_given_counts_before_the_one_beside_the_pictures(folder: Path) -> None:
     near = replace(AIDECK, width_px=64, height_px=48, cx_px=30.0)
-    (folder / "calibration.toml").write_text(write_camera(near))
+    (folder / "calibration.toml").write_text(format_camera(near))
     for camera, cx_px in ((None, 30.0), (replace(near, cx_px=31.0), 31.0)):
         (found,) = samples(folder, "CameraCalibration", Options(camera=camera))
         assert found.fields["K"][2] == cx_px
@@ -318,17 +318,17 @@ def test_labels_that_want_a_camera_are_said_where_there_are_no_others(
 def test_names_end_to_be_times_with_64_bits(tmp_path: Path) -> None:
     (tmp_path / f"{2**63 - 1}.png").write_bytes(b"")
     (tmp_path / "000000000007.png").write_bytes(b"")
-    found = image_folder.list_pictures(tmp_path, 10.0)
+    found = image_folder.list_images(tmp_path, 10.0)
     assert [time_ns for time_ns, _ in found] == [7, 2**63 - 1]
     (tmp_path / f"{2**63}.png").write_bytes(b"")
     with pytest.raises(SourceError, match="time after the year 2262"):
-        image_folder.list_pictures(tmp_path, 10.0)
+        image_folder.list_images(tmp_path, 10.0)
 
 
 @pytest.mark.parametrize(("digits", "timed"), [(11, False), (12, True)])
 def test_a_time_has_twelve_digits(digits: int, timed: bool, tmp_path: Path) -> None:
     (tmp_path / f"{5:0{digits}}.png").write_bytes(b"")
-    ((time_ns, _),) = image_folder.list_pictures(tmp_path, 10.0)
+    ((time_ns, _),) = image_folder.list_images(tmp_path, 10.0)
     assert time_ns == (5 if timed else 0)
 
 

@@ -49,7 +49,7 @@ def test_cells_stand_under_their_names_and_what_is_not_known_is_empty() -> None:
 
 
 def test_fields_are_those_of_a_label() -> None:
-    assert FULL.fields() == {
+    assert FULL.to_fields() == {
         **{"peer": "cf2", "u_px": 1.5, "v_px": -2.25, "depth_m": 0.75, "visible_share": 0.5},
         **{"source": "truth", "sigma_u_px": 0.5, "sigma_v_px": 1.5, "sigma_depth_m": 0.25},
         "box_px": [1, 2, 3, 4.5],
@@ -58,7 +58,7 @@ def test_fields_are_those_of_a_label() -> None:
 
 @given(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(0.01, 100))
 def test_a_point_is_kept_to_a_ten_thousandth_of_a_pixel(u: float, v: float, depth: float) -> None:
-    cells = LabelRow("a.png", "cf2", u, v, depth).cells()
+    cells = LabelRow("a.png", "cf2", u, v, depth).to_cells()
     assert [float(cell) for cell in cells[2:5]] == pytest.approx((u, v, depth), abs=5.1e-5)
 
 

@@ -9,8 +9,8 @@ from dmrl.errors import SourceError
 from dmrl.formats.base import Options
 from dmrl.formats.files import mapped_csv
 from dmrl.formats.files.column_map import QUANTITIES
-from dmrl.formats.registry import format_of
-from dmrl.geometry.rotations import euler_zyx, quaternion_zyx
+from dmrl.formats.registry import find_format
+from dmrl.geometry.rotations import euler_to_quaternion, quaternion_to_euler
 from dmrl.samples.sample import Sample
 
 TABLE = """
@@ -52,7 +52,7 @@ ROWS = ("1000;10;20;1.5707963;5;100;0;500;1500;ok", "1010.5;10;20;1.5707963;5;10
 def samples(source: Path, options: Options | None = None) -> dict[str, list[Sample]]:
     """Samples by topic."""
     found: dict[str, list[Sample]] = {}
-    for sample in mapped_csv.content(source, options or Options()).samples:
+    for sample in mapped_csv.load_content(source, options or Options()).samples:
         found.setdefault(sample.topic, []).append(sample)
     return found
 
@@ -155,7 +155,7 @@ def test_flights_of_nanobench_are_known_and_agree_with_vicon(
     name: str, data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = data / "nanobench" / f"{name}.csv"
-    assert format_of(source).name == "columns"
+    assert find_format(source).name == "columns"
     found = samples(source)
     assert capsys.readouterr().err == ""
     with source.open() as stream:
@@ -169,7 +169,7 @@ def test_flights_of_nanobench_are_known_and_agree_with_vicon(
     turned = np.array([[p["orientation"][axis] for axis in "xyzw"] for p in truth])
     place = np.array([[p["position"][axis] for axis in "xyz"] for p in truth])
     angles = rows("/cf1/attitude", "roll_rad", "pitch_rad", "yaw_rad")
-    off = angles - euler_zyx(turned)
+    off = angles - quaternion_to_euler(turned)
     off[:, 2] = (off[:, 2] + np.pi) % (2 * np.pi) - np.pi
     assert (np.median(np.abs(off), axis=0) < 0.06).all()
     time_s = np.array([s.time_ns for s in found["/cf1/velocity"]]) * 1e-9
@@ -274,7 +274,7 @@ def test_columns_are_parted_by_what_stands_there_most(separator: str, table: Pat
     other = "," if separator != "," else ";"
     text = log.read_text().replace(";", separator).replace("note", f'"a{other}b"')
     log.write_text("\ufeff" + text, encoding="utf-8")
-    assert mapped_csv._header(log)[1] == separator
+    assert mapped_csv._parse_header(log)[1] == separator
     assert len(samples(log, Options(columns=table))["/cf1/height"]) == 2
 
 
@@ -289,7 +289,7 @@ def test_every_quantity_of_a_table_comes_where_it_belongs(tmp_path: Path) -> Non
     )
     (tmp_path / "map.toml").write_text(text)
     row = dict(zip(names, (np.arange(len(names)) + 1) / 64, strict=True)) | {"time": 2.0}
-    (quaternion,) = quaternion_zyx(np.array([[0.4, -0.3, 1.2]]))
+    (quaternion,) = euler_to_quaternion(np.array([[0.4, -0.3, 1.2]]))
     row |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.tolist(), strict=True))
     row |= {"true_qx": 0.0, "true_qy": 0.6}
     row |= {"true_qz": 0.0, "true_qw": 0.8}

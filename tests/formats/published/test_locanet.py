@@ -33,7 +33,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_picture_has_its_rows_from_every_file(folder: Path) -> None:
-    first, _, last = locanet.read(folder)
+    first, _, last = locanet.load_images(folder)
     assert (first.path.name, first.number, first.split, last.split) == (
         "0000.jpg",
         0,
@@ -48,13 +48,13 @@ def test_a_picture_has_its_rows_from_every_file(folder: Path) -> None:
 
 
 def test_the_inner_folder_does_too(folder: Path) -> None:
-    assert len(locanet.read(folder / "synImgs")) == 3
-    assert locanet.recognises(folder) and locanet.recognises(folder / "synImgs")
-    assert not locanet.recognises(folder.parent)
+    assert len(locanet.load_images(folder / "synImgs")) == 3
+    assert locanet.can_read(folder) and locanet.can_read(folder / "synImgs")
+    assert not locanet.can_read(folder.parent)
 
 
 def test_true_and_published_labels_stand_side_by_side(folder: Path) -> None:
-    content = locanet.content(folder)
+    content = locanet.load_content(folder)
     samples = list(content.samples)
     assert len(samples) == content.total
     assert content.split == {"train": [(0, 10**9)], "test": [(2 * 10**9, 2 * 10**9)]}
@@ -68,7 +68,7 @@ def test_true_and_published_labels_stand_side_by_side(folder: Path) -> None:
 def test_the_robot_does_not_see_itself(folder: Path) -> None:
     peers = {
         s.topic
-        for s in locanet.content(folder, Options(robot="cf2")).samples
+        for s in locanet.load_content(folder, Options(robot="cf2")).samples
         if s.message == "PeerPosition"
     }
     assert peers == {"/cf2/peer/cf3/truth"}
@@ -82,7 +82,7 @@ def test_the_position_is_turned_by_the_whole_published_rotation(folder: Path) ->
     lines = ["0.3,0.0 1,1,0,0,0,0", "0.0,0.3 1,0,0,0,0,0", "0.3,-0.2 1,0.5,0.2,0,0,0"]
     text = "".join(f"p/{k:04d}.jpg {line}\n" for k, line in enumerate(lines))
     (inner / "posLabel.txt").write_text(text)
-    samples = locanet.content(folder).samples
+    samples = locanet.load_content(folder).samples
     xyz = [[s.fields[k] for k in "xyz"] for s in samples if s.message == "PeerPosition"]
     np.testing.assert_allclose(xyz[0], [1, np.cos(0.3), np.sin(0.3)])
     np.testing.assert_allclose(xyz[1], [np.cos(0.3), 0, -np.sin(0.3)], atol=1e-15)
@@ -94,24 +94,24 @@ def test_the_position_is_turned_by_the_whole_published_rotation(folder: Path) ->
 
 def test_the_attitude_differs_from_the_published_one_by_a_yaw_only() -> None:
     roll, pitch = 0.3, -0.25
-    tilt = camera_from_horizontal(*locanet.attitude_zyx(roll, pitch)).T
+    tilt = camera_from_horizontal(*locanet.to_attitude_zyx(roll, pitch)).T
     yaw = _rx(roll) @ _ry(pitch) @ tilt.T
     np.testing.assert_allclose(yaw[2], [0, 0, 1], atol=1e-15)
 
 
 def test_the_published_set_is_whole(data: Path) -> None:
-    images = locanet.read(data / "locanet-synthetic")
+    images = locanet.load_images(data / "locanet-synthetic")
     assert [i.number for i in images] == list(range(882))
     splits = [i.split for i in images]
     assert (splits.count("train"), splits.count("test")) == (784, 98)
-    several = locanet.read(data / "locanet-multi")
+    several = locanet.load_images(data / "locanet-multi")
     assert {len(i.xyz_camera) for i in several} == {1, 2, 3, 4}
     assert {i.split for i in several} == {None}
     assert sum(len(i.published) for i in several) == 0
 
 
 def test_true_projections_lie_in_the_middle_of_the_boxes(data: Path) -> None:
-    images = locanet.read(data / "locanet-synthetic")
+    images = locanet.load_images(data / "locanet-synthetic")
     edges = PUBLISHED_RENDER.width_px, PUBLISHED_RENDER.height_px
     whole = [i for i in images if (i.box_px[0, :2] > 0).all() and (i.box_px[0, 2:] < edges).all()]
     box = np.concatenate([i.box_px for i in whole])
@@ -127,7 +127,7 @@ def test_true_projections_lie_in_the_middle_of_the_boxes(data: Path) -> None:
 @pytest.mark.heavy
 def test_only_the_unnegated_attitudes_fit_the_outlines(data: Path) -> None:
     """The boxes show how robots are tilted in the picture, hence every sign at once."""
-    images = locanet.read(data / "locanet-synthetic")
+    images = locanet.load_images(data / "locanet-synthetic")
     edges = PUBLISHED_RENDER.width_px, PUBLISHED_RENDER.height_px
     whole = [i for i in images if (i.box_px[0, :2] > 0).all() and (i.box_px[0, 2:] < edges).all()]
     errors = {
@@ -222,7 +222,7 @@ def test_faults_name_file_and_line(
 ) -> None:
     spoil(folder / "synImgs")
     with pytest.raises(SourceError, match=message) as e:
-        locanet.read(folder)
+        locanet.load_images(folder)
     assert "\n" not in str(e.value)
 
 
@@ -230,40 +230,40 @@ def test_a_picture_that_is_cut_or_of_another_size_is_named(folder: Path) -> None
     path = folder / "synImgs" / "0001.jpg"
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(SourceError, match=r"0001\.jpg cannot be decoded"):
-        list(locanet.content(folder).samples)
+        list(locanet.load_content(folder).samples)
     path.write_bytes(encode_jpeg(np.zeros((240, 320, 3), np.uint8)))
     with pytest.raises(SourceError, match=r"0001\.jpg is 320x240, the set is 320x224"):
-        list(locanet.content(folder).samples)
+        list(locanet.load_content(folder).samples)
 
 
 def test_two_sets_in_one_folder_are_not_mixed(folder: Path) -> None:
     (folder / "synImgsMulti").mkdir()
     with pytest.raises(SourceError, match="has two sets"):
-        locanet.read(folder)
+        locanet.load_images(folder)
 
 
 def test_without_boxes_and_splits_a_set_is_read_all_the_same(folder: Path) -> None:
     for name in ("boxLabel.txt", "train.txt", "test.txt"):
         (folder / "synImgs" / name).unlink()
-        assert len(locanet.read(folder)) == 3
-    first = locanet.read(folder)[0]
+        assert len(locanet.load_images(folder)) == 3
+    first = locanet.load_images(folder)[0]
     assert (first.split, len(first.published)) == (None, 0)
 
 
 def test_peers_are_numbered_from_two_without_the_robot_itself() -> None:
-    assert locanet._peer_names("cf1", 3) == ["cf2", "cf3", "cf4"]
-    assert locanet._peer_names("cf3", 3) == ["cf2", "cf4", "cf5"]
-    assert locanet._peer_names("cf9", 0) == []
+    assert locanet._name_peers("cf1", 3) == ["cf2", "cf3", "cf4"]
+    assert locanet._name_peers("cf3", 3) == ["cf2", "cf4", "cf5"]
+    assert locanet._name_peers("cf9", 0) == []
 
 
 def test_boxes_end_at_the_picture_s_edges() -> None:
-    found = locanet._box_px(np.array([[-5.0, -4, 319, 224, 0], [0, 1, 400, 300, 0]]))
+    found = locanet._to_box_px(np.array([[-5.0, -4, 319, 224, 0], [0, 1, 400, 300, 0]]))
     assert found.tolist() == [[0, 0, 320, 224], [0, 0, 320, 224]]
 
 
 def test_the_whole_of_a_published_attitude_is_known_by_two_angles() -> None:
     for roll, pitch in ((0.3, 0.0), (0.0, -0.2), (0.3, -0.2), (-0.1, 0.25)):
-        found = locanet.attitude_zyx(roll, pitch)
+        found = locanet.to_attitude_zyx(roll, pitch)
         up = (_rx(roll) @ _ry(pitch)).T @ [0, 0, 1]  # seen from the camera
         assert camera_from_horizontal(*found) @ [0, 0, 1] == pytest.approx(up)
 
@@ -282,7 +282,7 @@ def test_a_picture_s_number_is_its_time_and_its_rows_are_its_own(folder: Path) -
         "p/0007.jpg 1,3,5,7,0\np/0012.jpg 10,20,30,40,0 50,60,70,80,0\n"
     )
     (inner / "train.txt").write_text("p/0012.jpg 0.2,0.1 1,2,3000,0 4,5,6000,0\n")
-    content = locanet.content(folder, Options(robot="cf2"))
+    content = locanet.load_content(folder, Options(robot="cf2"))
     first, *rest = content.samples
     assert (first.topic, first.time_ns) == ("/cf2/camera/calibration", 7 * 10**9)
     assert content.total == 1 + len(rest) == 10
@@ -314,10 +314,10 @@ def test_a_robot_at_the_camera_s_own_place_is_not_before_it(folder: Path) -> Non
     for x, fits in (("0.001", True), ("0", False)):
         _spoil("posLabel.txt", 1, f"p/0000.jpg 0.1,-0.2 {x},0,0,0,0,0")(inner)
         if fits:
-            assert locanet.read(folder)[0].xyz_camera[0, 0] == 0.001
+            assert locanet.load_images(folder)[0].xyz_camera[0, 0] == 0.001
         else:
             with pytest.raises(SourceError, match="behind the camera"):
-                locanet.read(folder)
+                locanet.load_images(folder)
 
 
 def test_an_empty_list_and_a_name_without_a_number_are_said(folder: Path) -> None:
@@ -325,7 +325,7 @@ def test_an_empty_list_and_a_name_without_a_number_are_said(folder: Path) -> Non
     (inner / "a7.jpg").write_bytes((inner / "0000.jpg").read_bytes())
     _spoil("posLabel.txt", 1, POSITION.format(0).replace("0000", "a7").strip())(inner)
     with pytest.raises(SourceError, match=r"a7\.jpg is not named by its number"):
-        locanet.read(folder)
+        locanet.load_images(folder)
     (inner / "posLabel.txt").write_text("")
     with pytest.raises(SourceError, match="is empty"):
-        locanet.read(folder)
+        locanet.load_images(folder)

@@ -26,8 +26,8 @@ def ranges(tmp_path: Path) -> Path:
 
 
 def test_ranges_odometry_and_truth_come_out(ranges: Path) -> None:
-    assert tiers.recognises(ranges)
-    samples = list(tiers.content(ranges).samples)
+    assert tiers.can_read(ranges)
+    samples = list(tiers.load_content(ranges).samples)
     times = [s.time_ns for s in samples]
     assert times == sorted(times)
     measured = [s for s in samples if s.topic == "/turtle3/range/turtle1"]
@@ -45,22 +45,22 @@ def test_ranges_odometry_and_truth_come_out(ranges: Path) -> None:
 def test_other_files_are_refused(ranges: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.npz"
     np.savez(other, speed=np.zeros(3))
-    assert not tiers.recognises(other)
+    assert not tiers.can_read(other)
     with pytest.raises(SourceError, match="has no uwb_range"):
-        tiers.content(other)
+        tiers.load_content(other)
     odd = tmp_path / "odd.npz"
     with np.load(ranges) as archive:
         arrays = dict(archive)
     np.savez(odd, **{**arrays, "uwb_range_3_1_np": np.zeros(4)})
     with pytest.raises(SourceError, match="differ in length"):
-        tiers.content(odd)
+        tiers.load_content(odd)
     cut = tmp_path / "cut.npz"
     cut.write_bytes(ranges.read_bytes()[:-100])
-    assert not tiers.recognises(cut)
+    assert not tiers.can_read(cut)
 
 
 def test_the_public_file_reads(data: Path) -> None:
-    samples = list(tiers.content(data / "uwb-tiers" / "4robots_data_01.npz").samples)
+    samples = list(tiers.load_content(data / "uwb-tiers" / "4robots_data_01.npz").samples)
     ranged = {s.topic for s in samples if s.message == "UwbRange"}
     assert len(ranged) == 6
     assert "/turtle5/range/turtle1" in ranged
@@ -86,14 +86,14 @@ def test_arrays_of_strange_shapes_and_numbers_are_one_line(
     np.savez(path, **arrays)
     strange = np.ndim(arrays["uwb_range_1_2_np"]) != 1
     with pytest.raises(SourceError, match="arrays of wrong shapes" if strange else None):
-        tiers.content(path)
+        tiers.load_content(path)
 
 
 @pytest.mark.parametrize("kind", ["f4", "f8", "i4"])
 def test_numbers_of_any_width_are_read(kind: str, ranges: Path) -> None:
     with np.load(ranges) as archive:
         np.savez(ranges, **{name: np.ceil(archive[name]).astype(kind) for name in archive})
-    found = [s for s in tiers.content(ranges).samples if s.message == "UwbRange"]
+    found = [s for s in tiers.load_content(ranges).samples if s.message == "UwbRange"]
     assert [s.fields["range_m"] for s in found] == [2.0] + [3.0] * 8
 
 
@@ -103,7 +103,7 @@ def test_poses_are_pairs_of_numbers(shape: tuple[int, ...], ranges: Path) -> Non
         arrays = dict(archive)
     np.savez(ranges, **{**arrays, "optitrack_turtle01_pose_np": np.zeros(shape)})
     with pytest.raises(SourceError, match="the arrays of turtle01 differ in length"):
-        tiers.content(ranges)
+        tiers.load_content(ranges)
 
 
 @pytest.mark.parametrize(("robots", "fits"), [(64, True), (65, False)])
@@ -113,10 +113,10 @@ def test_sixty_four_robots_are_the_most(robots: int, fits: bool, tmp_path: Path)
     turns = {f"optitrack_turtle{k}_orientation_np": np.zeros(2) for k in range(robots)}
     np.savez(path, **poses, **turns, uwb_range_1_2_np=np.ones(2))
     if fits:
-        assert tiers.content(path).total is None
+        assert tiers.load_content(path).total is None
     else:
         with pytest.raises(SourceError, match="has more than 64 robots"):
-            tiers.content(path)
+            tiers.load_content(path)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -1.0])
@@ -125,5 +125,5 @@ def test_a_range_that_is_none_is_left_out(value: float, ranges: Path) -> None:
         arrays = dict(archive)
     arrays["uwb_range_3_1_np"][4] = value
     np.savez(ranges, **arrays)
-    found = [s for s in tiers.content(ranges).samples if s.message == "UwbRange"]
+    found = [s for s in tiers.load_content(ranges).samples if s.message == "UwbRange"]
     assert [s.time_ns // 10**8 for s in found] == [0, 2, 3, *range(5, 10)]

@@ -8,9 +8,9 @@ import pytest
 from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats.base import Options
-from dmrl.formats.registry import format_of
+from dmrl.formats.registry import find_format
 from dmrl.formats.ros import bag as ros
-from dmrl.images.bayer import rgb_of
+from dmrl.images.bayer import demosaic
 from dmrl.images.codec import decode
 from dmrl.samples.sample import Sample
 
@@ -27,7 +27,7 @@ def bag(kind: str, folder: Path) -> Path:
 def samples(source: Path, options: Options | None = None) -> dict[str, list[Sample]]:
     """Samples by topic."""
     found: dict[str, list[Sample]] = {}
-    for sample in ros.content(source, options or Options()).samples:
+    for sample in ros.load_content(source, options or Options()).samples:
         found.setdefault(sample.topic, []).append(sample)
     return found
 
@@ -37,7 +37,7 @@ def test_bags_of_every_kind_give_the_same(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = bag(kind, tmp_path)
-    assert format_of(source).name == "rosbag2"
+    assert find_format(source).name == "rosbag2"
     found = samples(source)
     assert {topic: len(v) for topic, v in found.items()} == dict.fromkeys(
         [
@@ -56,7 +56,7 @@ def test_bags_of_every_kind_give_the_same(
     assert found["/cf1/velocity"][0].fields["vx_mps"] == 1.0
     assert found["/cf1/attitude"][0].fields["yaw_rate_radps"] == pytest.approx(0.2)
     pixels = decode(found["/cf1/camera/image"][0].fields["data"])
-    np.testing.assert_array_equal(pixels, rgb_of(foreign.pictures(1)[0]))
+    np.testing.assert_array_equal(pixels, demosaic(foreign.pictures(1)[0]))
     assert "left out: /chatter" in capsys.readouterr().err
 
 
@@ -82,7 +82,7 @@ def test_robots_are_named_as_the_user_wants(tmp_path: Path) -> None:
 
 
 def test_a_bag_without_anything_known_is_one_line(tmp_path: Path) -> None:
-    lines, unknown = ros.plan([("/chatter", "std_msgs/msg/String", 3)], Options())
+    lines, unknown = ros.plan_topics([("/chatter", "std_msgs/msg/String", 3)], Options())
     assert (lines, unknown) == ({}, ["/chatter"])
     path = tmp_path / "a.db3"
     path.write_bytes(b"SQLite format 3\0" + b"\0" * 100)
@@ -93,7 +93,9 @@ def test_a_bag_without_anything_known_is_one_line(tmp_path: Path) -> None:
 
 def test_of_two_odometries_of_a_robot_the_longer_counts() -> None:
     kind = "nav_msgs/msg/Odometry"
-    lines, unknown = ros.plan([("/cf1/odom", kind, 5), ("/vio/cf1/odom", kind, 50)], Options())
+    lines, unknown = ros.plan_topics(
+        [("/cf1/odom", kind, 5), ("/vio/cf1/odom", kind, 50)], Options()
+    )
     assert [line.topic for line in lines.values()] == ["/vio/cf1/odom"]
     assert unknown == ["/cf1/odom"]
 
@@ -102,7 +104,7 @@ def test_of_two_odometries_of_a_robot_the_longer_counts() -> None:
 def test_a_real_bag_of_ranges_odometry_and_motion_capture(data: Path) -> None:
     counts = Counter(
         sample.topic
-        for sample in ros.content(data / "uwb-tiers" / "shortbag.db3", Options()).samples
+        for sample in ros.load_content(data / "uwb-tiers" / "shortbag.db3", Options()).samples
     )
     assert counts["/n_2/range/n_5"] == 252
     assert counts["/turtlebot3_cap/pose/truth"] == 1032
@@ -121,7 +123,7 @@ def planned(
     *held: tuple[str, str, int], **names: str
 ) -> tuple[dict[str, tuple[str, str]], list[str]]:
     """Robot and peer of each topic that is taken, and what is left out."""
-    lines, unknown = ros.plan(list(held), Options(robot="me", names=names))
+    lines, unknown = ros.plan_topics(list(held), Options(robot="me", names=names))
     return {line.topic: (line.robot, line.peer) for line in lines.values()}, unknown
 
 
@@ -157,7 +159,7 @@ def test_a_pose_of_motion_capture_is_kept_beside_another_of_the_robot() -> None:
 
 
 def test_how_many_messages_there_will_be_is_told_before(tmp_path: Path) -> None:
-    content = ros.content(bag("sqlite3", tmp_path), Options())
+    content = ros.load_content(bag("sqlite3", tmp_path), Options())
     with_odometry = 4  # of one message come attitude, velocity, height and pose
     assert content.total == len(list(content.samples)) - 5 * (with_odometry - 1)
 
@@ -183,7 +185,7 @@ def test_ranges_of_both_directions_and_our_own_messages_are_all_kept() -> None:
         "/cf1/imu": ("cf1", ""),
     }
     assert unknown == ["/far/cf1/uwb/cf2/range"]
-    lines, _ = ros.plan(held, Options())
+    lines, _ = ros.plan_topics(held, Options())
     assert {line.topic: line.count for line in lines.values()} == {
         topic: count for topic, _, count in held if topic in found
     }
@@ -197,7 +199,7 @@ def test_a_header_s_stamp_is_whole_nanoseconds(
 ) -> None:
     held = stamp and SimpleNamespace(sec=stamp[0], nanosec=stamp[1])
     message = SimpleNamespace(header=SimpleNamespace(stamp=held)) if held else SimpleNamespace()
-    assert ros._stamp_ns(message) == time_ns
+    assert ros._header_time_ns(message) == time_ns
 
 
 @pytest.mark.parametrize(
@@ -217,7 +219,7 @@ def test_a_bag_is_known_by_its_first_bytes(
     name: str, head: bytes, known: bool, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_bytes(head)
-    assert ros.recognises(tmp_path / name) == known
-    assert not ros.recognises(tmp_path)
+    assert ros.can_read(tmp_path / name) == known
+    assert not ros.can_read(tmp_path)
     (tmp_path / "metadata.yaml").write_text("")
-    assert ros.recognises(tmp_path)
+    assert ros.can_read(tmp_path)

@@ -11,18 +11,18 @@ from hypothesis import strategies as st
 
 from dmrl.errors import SourceError
 from dmrl.formats.ros.ros_messages import (
-    HANDLERS,
-    Placed,
-    _angles,
-    _is_fixed,
-    _levelled,
-    _rgb,
-    _turned_back,
-    _yaw_rate,
+    CONVERTERS,
+    MessageContext,
+    _compute_yaw_rate,
+    _decode_image,
+    _is_fixed_frame,
+    _rotate_from_body,
+    _rotate_from_fixed,
+    _to_euler,
 )
 from dmrl.geometry.frames import camera_from_horizontal
-from dmrl.geometry.rotations import quaternion_zyx
-from dmrl.images.bayer import rgb_of
+from dmrl.geometry.rotations import euler_to_quaternion
+from dmrl.images.bayer import demosaic
 from dmrl.images.codec import decode, encode_jpeg, encode_png
 from dmrl.samples.sample import Sample
 
@@ -42,17 +42,17 @@ QUARTER = np.pi / 2
 def test_a_tilted_robot_s_vectors_are_levelled(
     angles: tuple[float, ...], body: tuple[float, ...], level: tuple[float, ...]
 ) -> None:
-    got = _levelled(np.array(body), np.array(angles))
+    got = _rotate_from_body(np.array(body), np.array(angles))
     assert got == pytest.approx(np.array(level), abs=1e-12)
 
 
 def test_a_fixed_frame_s_vectors_are_turned_by_the_heading() -> None:
     left = np.array([0.3, -0.2, QUARTER])  # whatever the tilt
     ahead, up = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    assert _turned_back(ahead, left) == pytest.approx(np.array([1.0, 0.0, 0.0]), abs=1e-12)
+    assert _rotate_from_fixed(ahead, left) == pytest.approx(np.array([1.0, 0.0, 0.0]), abs=1e-12)
     right = np.array([1.0, 0.0, 0.0])
-    assert _turned_back(right, left) == pytest.approx(np.array([0.0, -1.0, 0.0]), abs=1e-12)
-    assert _turned_back(up, left) == pytest.approx(up)
+    assert _rotate_from_fixed(right, left) == pytest.approx(np.array([0.0, -1.0, 0.0]), abs=1e-12)
+    assert _rotate_from_fixed(up, left) == pytest.approx(up)
 
 
 def xyzw(*values: float) -> SimpleNamespace:
@@ -61,12 +61,12 @@ def xyzw(*values: float) -> SimpleNamespace:
 
 def given(kind: str, message: object, **where: Any) -> list[Sample]:
     """Samples of a message of cf1."""
-    placed = Placed(Path("bag"), "cf1", **where)
-    return list(HANDLERS[kind](message, 1_500_000_000, placed))
+    placed = MessageContext(Path("bag"), "cf1", **where)
+    return list(CONVERTERS[kind](message, 1_500_000_000, placed))
 
 
 TILT = (0.3, -0.2, 0.5)
-TURN = xyzw(*quaternion_zyx(np.array([TILT]))[0])
+TURN = xyzw(*euler_to_quaternion(np.array([TILT]))[0])
 
 
 def odometry(child: str, linear: tuple[float, ...]) -> SimpleNamespace:
@@ -97,7 +97,7 @@ def test_odometry_in_the_robot_s_own_frame_is_levelled() -> None:
     # What turns the yaw is what the gyroscope has about the vertical, over how the robot leans.
     rate = (0.2 * np.sin(0.3) + 0.4 * np.cos(0.3)) / np.cos(-0.2)
     assert tuple(attitude.fields.values()) == pytest.approx((*TILT, rate))
-    level = _levelled(np.array([1.0, 2.0, 3.0]), np.array(TILT))
+    level = _rotate_from_body(np.array([1.0, 2.0, 3.0]), np.array(TILT))
     assert list(velocity.fields.values()) == pytest.approx(level.tolist())
     assert list(velocity.fields) == ["vx_mps", "vy_mps", "vz_mps"]
 
@@ -113,7 +113,7 @@ def test_odometry_in_a_fixed_frame_is_turned_by_the_yaw(child: str) -> None:
 
 @pytest.mark.parametrize(("norm", "there"), [(0.91, True), (0.89, False), (1.11, False)])
 def test_a_quaternion_a_tenth_from_unit_length_tells_no_angles(norm: float, there: bool) -> None:
-    found = _angles(xyzw(*(norm * value for value in vars(TURN).values())))
+    found = _to_euler(xyzw(*(norm * value for value in vars(TURN).values())))
     assert (found is not None) == there
     assert found is None or found == pytest.approx(np.array(TILT))
 
@@ -215,7 +215,7 @@ def picture(encoding: str, channels: int, spare: int = 0) -> SimpleNamespace:
 def test_pictures_of_every_encoding_have_their_colours(
     encoding: str, channels: int, order: tuple[int, ...], spare: int
 ) -> None:
-    rgb = _rgb(picture(encoding, channels, spare), Path("bag"))
+    rgb = _decode_image(picture(encoding, channels, spare), Path("bag"))
     v, u, k = np.meshgrid(np.arange(4), np.arange(5), order, indexing="ij")
     assert rgb.tolist() == (32 * v + channels * u + k).tolist()
 
@@ -227,7 +227,7 @@ def test_pictures_of_every_encoding_have_their_colours(
 def test_pictures_that_cannot_be_are_one_line(change: dict[str, Any]) -> None:
     message = SimpleNamespace(**vars(picture("rgb8", 3)) | change)
     with pytest.raises(SourceError, match="bag: "):
-        _rgb(message, Path("bag"))
+        _decode_image(message, Path("bag"))
 
 
 ANGLE = st.floats(-1.4, 1.4)
@@ -241,14 +241,14 @@ def test_vectors_and_rates_are_turned_as_the_robot_is(
 ) -> None:
     angles, body = np.array([roll, pitch, yaw]), np.array(vector)
     level = camera_from_horizontal(roll, pitch).T @ body
-    assert _levelled(body, angles) == pytest.approx(level)
+    assert _rotate_from_body(body, angles) == pytest.approx(level)
     c, s = np.cos(yaw), np.sin(yaw)
     heading = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    assert _turned_back(heading @ level, angles) == pytest.approx(level)
+    assert _rotate_from_fixed(heading @ level, angles) == pytest.approx(level)
     turn = camera_from_horizontal(roll, pitch) @ [0, 0, 0.7]  # a steady turn about the vertical
-    assert _yaw_rate(turn, angles) == pytest.approx(0.7)
-    (quaternion,) = quaternion_zyx(angles[None])
-    assert _angles(xyzw(*quaternion)) == pytest.approx(angles, abs=1e-6)
+    assert _compute_yaw_rate(turn, angles) == pytest.approx(0.7)
+    (quaternion,) = euler_to_quaternion(angles[None])
+    assert _to_euler(xyzw(*quaternion)) == pytest.approx(angles, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -267,7 +267,7 @@ def test_vectors_and_rates_are_turned_as_the_robot_is(
 def test_frames_that_do_not_turn_are_known_by_their_names(
     frame: str, parent: str, fixed: bool
 ) -> None:
-    assert _is_fixed(frame, parent) == fixed
+    assert _is_fixed_frame(frame, parent) == fixed
 
 
 def test_an_imu_that_knows_no_attitude_says_nothing() -> None:
@@ -293,11 +293,14 @@ def test_compressed_pictures_keep_their_bytes() -> None:
 def test_a_picture_is_the_robot_s_own() -> None:
     (found,) = given("sensor_msgs/msg/Image", picture("rgb8", 3))
     assert (found.topic, found.time_ns) == ("/cf1/camera/image", 1_500_000_000)
-    assert decode(found.fields["data"]).tolist() == _rgb(picture("rgb8", 3), Path("bag")).tolist()
+    assert (
+        decode(found.fields["data"]).tolist()
+        == _decode_image(picture("rgb8", 3), Path("bag")).tolist()
+    )
 
 
 def test_a_colour_sensor_s_picture_gets_its_colours() -> None:
     raw = np.random.default_rng(0).integers(0, 256, (4, 6), np.uint8)
     data = np.concatenate([raw, np.zeros((4, 2), np.uint8)], axis=1).ravel()
     message = SimpleNamespace(height=4, width=6, step=8, encoding="bayer_rggb8", data=data)
-    assert _rgb(message, Path("bag")).tolist() == rgb_of(raw).tolist()
+    assert _decode_image(message, Path("bag")).tolist() == demosaic(raw).tolist()

@@ -8,15 +8,15 @@ import pytest
 from dmrl import topics
 from dmrl.estimation.signals.clock_alignment import Clock
 from dmrl.labelling.clocks.retiming import MOCAP, Corrected
-from dmrl.messages import message
-from dmrl.recording import Contents, Provenance, RecordingWriter, read, read_raw
+from dmrl.messages import message_class
+from dmrl.recording import LoadedRecording, Provenance, RecordingWriter, read, read_raw
 
 SECOND = 1_000_000_000
-IMAGE, POSE, TRUTH = topics.camera_image("cf1"), topics.pose("cf1"), topics.true_pose("cf1")
+IMAGE, POSE, TRUTH = topics.CAMERA_IMAGE("cf1"), topics.POSE("cf1"), topics.TRUE_POSE("cf1")
 
 
 def frames(child: str) -> Any:
-    return message("FrameTransforms")(transforms=[{"child_frame_id": child}])
+    return message_class("FrameTransforms")(transforms=[{"child_frame_id": child}])
 
 
 @pytest.fixture
@@ -27,11 +27,11 @@ def recording(tmp_path: Path) -> Path:
         for k in (10, 11, 12):
             stamp = {"seconds": 1}
             for topic, made in (
-                (topics.height("cf1"), message("Height")(height_m=k)),
-                (topics.height("cf2"), message("Height")(height_m=k)),
-                (IMAGE, message("CompressedImage")(timestamp=stamp, format="png")),
-                (POSE, message("PoseInFrame")(timestamp=stamp)),
-                (TRUTH, message("PoseInFrame")(timestamp=stamp)),
+                (topics.HEIGHT("cf1"), message_class("Height")(height_m=k)),
+                (topics.HEIGHT("cf2"), message_class("Height")(height_m=k)),
+                (IMAGE, message_class("CompressedImage")(timestamp=stamp, format="png")),
+                (POSE, message_class("PoseInFrame")(timestamp=stamp)),
+                (TRUTH, message_class("PoseInFrame")(timestamp=stamp)),
                 (topics.TRANSFORMS, frames("cf2/horizontal")),
             ):
                 sink.write(k * SECOND, topic, made, publish_ns=k * SECOND + 7)
@@ -54,11 +54,11 @@ def test_each_clock_corrects_its_own_by_offset_and_drift(recording: Path, tmp_pa
         "cf1/camera": Clock(-0.25),
         MOCAP: Clock(2.0),
     }
-    held = Corrected(Contents(recording), clocks, {})
+    held = Corrected(LoadedRecording(recording), clocks, {})
     out = written(held, tmp_path / "b.mcap")
     own = [10_400_000_000, 11_500_000_000, 12_600_000_000]
-    assert times(out, topics.height("cf1")) == times(out, POSE) == own
-    assert times(out, topics.height("cf2")) == [10 * SECOND, 11 * SECOND, 12 * SECOND]
+    assert times(out, topics.HEIGHT("cf1")) == times(out, POSE) == own
+    assert times(out, topics.HEIGHT("cf2")) == [10 * SECOND, 11 * SECOND, 12 * SECOND]
     assert times(out, IMAGE) == [9_750_000_000, 10_750_000_000, 11_750_000_000]
     assert times(out, TRUTH) == times(out, topics.TRANSFORMS)
     assert times(out, TRUTH) == [12 * SECOND, 13 * SECOND, 14 * SECOND]
@@ -71,10 +71,10 @@ def test_each_clock_corrects_its_own_by_offset_and_drift(recording: Path, tmp_pa
 
 
 def test_transforms_are_of_the_robot_that_they_turn(recording: Path, tmp_path: Path) -> None:
-    held = Corrected(Contents(recording), {"cf2": Clock(-3.0)}, {})
+    held = Corrected(LoadedRecording(recording), {"cf2": Clock(-3.0)}, {})
     out = written(held, tmp_path / "b.mcap")
     assert times(out, topics.TRANSFORMS) == [7 * SECOND, 8 * SECOND, 9 * SECOND]
-    assert times(out, topics.height("cf1"))[0] == 10 * SECOND
+    assert times(out, topics.HEIGHT("cf1"))[0] == 10 * SECOND
     (first, *_) = read(out, topics.TRANSFORMS)
     assert first.message.transforms[0].timestamp.seconds == 7
     assert held.earliest_ns() == 7 * SECOND
@@ -84,10 +84,10 @@ def test_even_times_come_before_clocks_and_all_move_together(
     recording: Path, tmp_path: Path
 ) -> None:
     even = {IMAGE: {10 * SECOND: 9_900_000_000, 11 * SECOND: 10_900_000_000}}
-    held = Corrected(Contents(recording), {"cf1": Clock(1.0)}, even, later_ns=5 * SECOND)
+    held = Corrected(LoadedRecording(recording), {"cf1": Clock(1.0)}, even, later_ns=5 * SECOND)
     out = written(held, tmp_path / "b.mcap")
     assert times(out, IMAGE) == [15_900_000_000, 16_900_000_000, 18 * SECOND]
-    assert times(out, topics.height("cf1"))[0] == 16 * SECOND
-    assert times(out, topics.height("cf2"))[0] == 15 * SECOND
+    assert times(out, topics.HEIGHT("cf1"))[0] == 16 * SECOND
+    assert times(out, topics.HEIGHT("cf2"))[0] == 15 * SECOND
     assert times(out, topics.TRANSFORMS)[0] == 15 * SECOND
     assert held.earliest_ns() == 15 * SECOND

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.geometry.rotations import quaternion_zyx
+from dmrl.geometry.rotations import euler_to_quaternion
 from dmrl.images.codec import encode_png
 from dmrl.labelling.clocks.time_alignment import (
     MIN_MOCAP_STEP_S,
@@ -19,7 +19,7 @@ from dmrl.labelling.clocks.time_alignment import (
     estimate_range_clocks,
 )
 from dmrl.labelling.flight_log import read_flight
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 
 TIME_S = np.arange(0, 30, 0.05)
@@ -43,7 +43,7 @@ def mocap(path: Path, only: str, tf: bool = False) -> Any:
     angles = np.column_stack(
         [moves["roll"] * roll, moves["pitch"] * pitch, moves["yaw rate"] * yaw]
     )
-    turns = quaternion_zyx(angles)
+    turns = euler_to_quaternion(angles)
     with RecordingWriter(path, Provenance("test")) as sink:
         for k, time_s in enumerate(TIME_S.tolist()):
             time_ns, own_ns = round(time_s * 1e9), round((time_s + LATE_S) * 1e9)
@@ -51,16 +51,16 @@ def mocap(path: Path, only: str, tf: bool = False) -> Any:
             place = {"x": 0.0, "y": 0.0, "z": 1 + moves["height"] * high[k]}
             if tf:
                 frame = {"child_frame_id": "cf1/horizontal", "translation": place, "rotation": turn}
-                transforms = message("FrameTransforms")(transforms=[frame])
+                transforms = message_class("FrameTransforms")(transforms=[frame])
                 sink.write(time_ns, topics.TRANSFORMS, transforms)
             else:
-                pose = message("PoseInFrame")(pose={"position": place, "orientation": turn})
-                sink.write(time_ns, topics.true_pose("cf1"), pose)
+                pose = message_class("PoseInFrame")(pose={"position": place, "orientation": turn})
+                sink.write(time_ns, topics.TRUE_POSE("cf1"), pose)
             rate = moves["yaw rate"] * yaw_rate[k]
             names = ("roll_rad", "pitch_rad", "yaw_rate_radps")
             own = dict(zip(names, [*angles[k, :2], rate], strict=True))
-            sink.write(own_ns, topics.attitude("cf1"), message("Attitude")(**own))
-            sink.write(own_ns, topics.height("cf1"), message("Height")(height_m=place["z"]))
+            sink.write(own_ns, topics.ATTITUDE("cf1"), message_class("Attitude")(**own))
+            sink.write(own_ns, topics.HEIGHT("cf1"), message_class("Height")(height_m=place["z"]))
     return estimate_mocap_clocks(read_flight(path))
 
 
@@ -84,9 +84,9 @@ def test_ranges_both_ways_set_the_second_robots_clock(tmp_path: Path) -> None:
         for k, moment in enumerate(time_s.tolist()):
             link = ("cf1", "cf2") if k % 2 else ("cf2", "cf1")
             stamp_s = moment + (0.0 if k % 2 else LATE_S)
-            heard = message("UwbRange")(range_m=3 + away[k] + rng.normal(0, 0.01))
-            sink.write(round(stamp_s * 1e9), topics.uwb_range(*link), heard)
-            sink.write(round(moment * 1e9), topics.uwb_range("cf1", "cf3"), heard)
+            heard = message_class("UwbRange")(range_m=3 + away[k] + rng.normal(0, 0.01))
+            sink.write(round(stamp_s * 1e9), topics.RANGE(*link), heard)
+            sink.write(round(moment * 1e9), topics.RANGE("cf1", "cf3"), heard)
     held = read_flight(path)
     assert held.ranges.keys() == {("cf1", "cf2"), ("cf2", "cf1"), ("cf1", "cf3")}
     found = estimate_range_clocks(held)
@@ -109,11 +109,13 @@ def test_a_camera_and_its_robot_turn_the_same_way(tmp_path: Path, axis: str) -> 
             turned = (0, px) if axis == "yaw rate" else (-px, 0)
             seen = np.roll(scene, turned, (0, 1))[16:128, 16:176]
             rgb = np.repeat(seen[..., None], 3, axis=2)
-            picture = message("CompressedImage")(data=encode_png(rgb), format="png")
-            sink.write(round((moment + LATE_S) * 1e9), topics.camera_image("cf1"), picture)
+            picture = message_class("CompressedImage")(data=encode_png(rgb), format="png")
+            sink.write(round((moment + LATE_S) * 1e9), topics.CAMERA_IMAGE("cf1"), picture)
         for k, moment in enumerate(own_s.tolist()):
             turn = {"yaw_rate_radps": rate[k]} if axis == "yaw rate" else {"pitch_rad": own[k]}
-            sink.write(round(moment * 1e9), topics.attitude("cf1"), message("Attitude")(**turn))
+            sink.write(
+                round(moment * 1e9), topics.ATTITUDE("cf1"), message_class("Attitude")(**turn)
+            )
     found = estimate_camera_clock(read_flight(path), "cf1", {})
     assert found is not None
     assert found.by == axis
@@ -133,7 +135,7 @@ def test_poses_tell_what_a_robot_measures_of_itself() -> None:
     (roll, _), (pitch, _), (yaw, yaw_rate), (x, vx), (y, vy) = (smooth(k, time_s) for k in range(5))
     angles = np.column_stack([0.8 * roll, 0.9 * pitch, 8 * yaw])
     assert np.abs(angles[:, 2]).max() > np.pi  # so that it wraps
-    rows = np.column_stack([x, 2 * y, 1 + roll, quaternion_zyx(angles)])
+    rows = np.column_stack([x, 2 * y, 1 + roll, euler_to_quaternion(angles)])
     found = _pose_signals(time_s, rows)
     assert found["roll"][1] == pytest.approx(0.8 * roll)
     assert found["pitch"][1] == pytest.approx(0.9 * pitch)

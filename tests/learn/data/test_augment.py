@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from dmrl.learn.data import augment
 from dmrl.learn.data.augment import Augmentation, Augmenter
-from dmrl.learn.data.batches import FIELDS, Batch, Examples
-from dmrl.learn.data.crops import Robot, facing, through
-from dmrl.learn.training.config import FitSettings
+from dmrl.learn.data.batches import ROBOT_FIELDS, Batch, ExampleSet
+from dmrl.learn.data.crops import RobotRow, apply_homography, rotation_to_pixel
+from dmrl.learn.training.config import TrainConfig
 
 from ..squares import GEOMETRY, SIDE_M, augmenter, batches, squares
 
@@ -70,34 +70,36 @@ def test_a_batch_depends_on_seed_epoch_and_place_alone() -> None:
     examples = squares()
     everything = replace(GEOMETRY, colour=0.1, noise=0.05, blur_share=0.5)
     first, again = (Augmenter(examples, everything, seed=3) for _ in range(2))
-    first.batch([5], epoch=0, index=0)
-    a, b = (x.batch([1, 2], epoch=2, index=7) for x in (first, again))
+    first.augment_batch([5], epoch=0, index=0)
+    a, b = (x.augment_batch([1, 2], epoch=2, index=7) for x in (first, again))
     assert torch.equal(a.images, b.images)
     assert torch.equal(a.robots.nan_to_num(), b.robots.nan_to_num())
-    other = again.batch([1, 2], epoch=2, index=8)
+    other = again.augment_batch([1, 2], epoch=2, index=8)
     assert not torch.equal(a.images, other.images)
 
 
 def test_images_without_robots_or_boxes_can_be_varied_too() -> None:
-    empty = Examples(
-        [np.zeros((2, 112, 160, 3), np.uint8)], np.full((2, 1, len(FIELDS)), np.nan, np.float32)
+    empty = ExampleSet(
+        [np.zeros((2, 112, 160, 3), np.uint8)],
+        np.full((2, 1, len(ROBOT_FIELDS)), np.nan, np.float32),
     )
-    batch = Augmenter(empty, GEOMETRY, seed=0).batch([0, 1], epoch=0, index=0)
+    batch = Augmenter(empty, GEOMETRY, seed=0).augment_batch([0, 1], epoch=0, index=0)
     assert not torch.isfinite(batch.robots[..., 0]).any()
     assert batch.images.shape == (2, 3, 112, 160)
 
 
 def test_nothing_is_nothing() -> None:
-    assert Augmentation().is_nothing
-    assert not replace(Augmentation(), flip_share=0.1).is_nothing
+    assert Augmentation().is_identity
+    assert not replace(Augmentation(), flip_share=0.1).is_identity
 
 
 def test_every_epoch_varies_images_anew_and_noise_is_no_louder_than_asked_for() -> None:
-    grey = Examples(
-        [np.full((1, 112, 160, 3), 128, np.uint8)], np.full((1, 1, len(FIELDS)), np.nan, np.float32)
+    grey = ExampleSet(
+        [np.full((1, 112, 160, 3), 128, np.uint8)],
+        np.full((1, 1, len(ROBOT_FIELDS)), np.nan, np.float32),
     )
     maker = Augmenter(grey, Augmentation(noise=0.05), seed=0)
-    first, second = (maker.batch([0] * 8, epoch=epoch, index=0).images for epoch in (0, 1))
+    first, second = (maker.augment_batch([0] * 8, epoch=epoch, index=0).images for epoch in (0, 1))
     assert not torch.equal(first, second)
     loud = first.float().sub(128).std(dim=(1, 2, 3)) / 255
     assert 0.5 * 0.05 < loud.max() < 1.02 * 0.05  # anything up to what is asked for
@@ -116,7 +118,7 @@ def test_every_key_of_a_recipe_varies_what_it_is_called() -> None:
         "intrinsics": (1.0, 2.0, 3.0, 4.0),
         "grey_share": 0.77,
     }
-    made = FitSettings(**values).augmentation(0)  # type: ignore[arg-type]
+    made = TrainConfig(**values).augmentation(0)  # type: ignore[arg-type]
     assert {field.name: getattr(made, field.name) for field in fields(made)} == values
 
 
@@ -129,8 +131,8 @@ def test_a_grey_share_of_images_has_no_colours() -> None:
     assert (whole.amax(dim=1) == whole.amin(dim=1)).all()
 
 
-def at_depth(depth_m: float) -> Robot:
-    return [0.0, 0.0, depth_m, *[0.0] * (len(FIELDS) - 3)]
+def at_depth(depth_m: float) -> RobotRow:
+    return [0.0, 0.0, depth_m, *[0.0] * (len(ROBOT_FIELDS) - 3)]
 
 
 @pytest.mark.parametrize(
@@ -149,7 +151,7 @@ def test_zooms_keep_a_robot_among_the_depths_of_the_labels(
 ) -> None:
     maker, rng = augmenter(zoom=(0.25, 8.0)), np.random.default_rng(1)
     robot = None if depth_m is None else at_depth(depth_m)
-    drawn = np.log([maker._zoom(robot, rng) for _ in range(2000)])
+    drawn = np.log([maker._sample_zoom(robot, rng) for _ in range(2000)])
     assert np.exp(drawn.min()) == pytest.approx(low, rel=0.02)
     assert np.exp(drawn.max()) == pytest.approx(high, rel=0.02)
     assert drawn.mean() == pytest.approx((np.log(low) + np.log(high)) / 2, abs=0.1)
@@ -157,7 +159,7 @@ def test_zooms_keep_a_robot_among_the_depths_of_the_labels(
 
 def test_turns_go_either_way_and_some_are_mirrored() -> None:
     maker, rng = augmenter(rotation_deg=20.0, flip_share=0.25), np.random.default_rng(2)
-    turns = np.array([maker._turn(2.0, rng) for _ in range(2000)])
+    turns = np.array([maker._sample_rotation(2.0, rng) for _ in range(2000)])
     assert np.linalg.det(turns) == pytest.approx(np.where(np.linalg.det(turns) > 0, 0.25, -0.25))
     assert (np.linalg.det(turns) < 0).mean() == pytest.approx(0.25, abs=0.03)
     # The second column is turned and not mirrored.
@@ -171,7 +173,7 @@ def test_a_tint_changes_contrast_about_the_middle_and_brightness() -> None:
     grey, bright = [], []
     for _ in range(3000):
         pixels = np.array([[[128] * 3, [178] * 3]], np.uint8)
-        pixels = maker._tinted(pixels, rng).astype(float)
+        pixels = maker._jitter_colours(pixels, rng).astype(float)
         grey.append(pixels[0, 0])
         bright.append((pixels[0, 1] - pixels[0, 0]) / 50)
     assert np.std(grey, axis=0) == pytest.approx([12.8] * 3, rel=0.06)
@@ -188,7 +190,7 @@ def test_defocus_spreads_a_point_over_its_neighbours_alike() -> None:
     for _ in range(600):
         canvas = np.zeros((7, 9, 3), np.uint8)
         canvas[3, 4] = 250
-        maker._spoil(canvas, rng)
+        maker._degrade_image(canvas, rng)
         seen = canvas[..., 0].astype(int)
         assert seen.sum() == pytest.approx(250, abs=4.5)  # nine that are rounded
         assert (seen == seen[::-1]).all() and (seen == seen[:, ::-1]).all()
@@ -202,7 +204,7 @@ def test_defocus_spreads_a_point_over_its_neighbours_alike() -> None:
 def test_plain_is_whole_images_in_other_colours() -> None:
     every = replace(GEOMETRY, colour=0.1, noise=0.2, blur_share=0.3, grey_share=0.4)
     wanted = Augmentation(flip_share=0.5, colour=0.1, noise=0.2, blur_share=0.3, grey_share=0.4)
-    assert every.plain == wanted
+    assert every.without_geometry == wanted
 
 
 def test_a_camera_is_turned_no_further_than_a_quarter_of_the_depth_is_left() -> None:
@@ -215,13 +217,16 @@ def test_a_camera_is_turned_no_further_than_a_quarter_of_the_depth_is_left() -> 
         size = np.array([rect[2] - left, rect[3] - top])
         seen = (rng.uniform(-100, 260), rng.uniform(-100, 210))
         shown = (size[0] * rng.random(), size[1] * rng.random())
-        turn = facing(camera, seen) @ facing(camera, (shown[0] + left, shown[1] + top)).T
+        turn = (
+            rotation_to_pixel(camera, seen)
+            @ rotation_to_pixel(camera, (shown[0] + left, shown[1] + top)).T
+        )
         corners = np.array([[x, y, 1.0] for x in (left, rect[2]) for y in (top, rect[3])])
         ahead = (turn @ np.linalg.inv(k) @ corners.T)[2]
-        window = maker._window(((1.0, 0.0), (0.0, 1.0)), 1.0, seen, shown, rect)
+        window = maker._build_window(((1.0, 0.0), (0.0, 1.0)), 1.0, seen, shown, rect)
         kept.append(window.camera is not None)
         assert kept[-1] == (ahead.min() > 0.25 * ahead.max())
-        found = through(window.matrix.tolist(), *shown)
+        found = apply_homography(window.matrix.tolist(), *shown)
         assert found == pytest.approx(seen, abs=1e-6)  # as far as it is shown where it should be
     assert 0.2 < np.mean(kept) < 0.9
 
@@ -234,12 +239,12 @@ def test_a_window_is_turned_about_where_the_robot_comes_to_be(
         np.random.default_rng(6),
         [],
     )
-    made = maker._window
-    monkeypatch.setattr(maker, "_window", lambda *given: asked.append(given) or made(*given))
+    made = maker._build_window
+    monkeypatch.setattr(maker, "_build_window", lambda *given: asked.append(given) or made(*given))
     robot, whole = maker._examples.robots[0, 0], (0, 0, 160, 112)
     shown_at = []
     for _ in range(60):
-        found = maker._layer(np.empty((112, 160, 3), np.uint8), whole, 0, [], rng)
+        found = maker._draw_layer(np.empty((112, 160, 3), np.uint8), whole, 0, [], rng)
         _, _, seen, shown, _ = asked[-1]
         if len(found):
             np.testing.assert_allclose(seen, robot[:2])
@@ -253,21 +258,21 @@ def layered(
     maker: Augmenter, rect: tuple[int, int, int, int], monkeypatch: pytest.MonkeyPatch, focus: float
 ) -> list[tuple[float, NDArray[np.float64], NDArray[np.float64]]]:
     """Zoom of many windows of the first image, what they show of it, and where its robot comes."""
-    monkeypatch.setattr(augment, "FOCUS_SHARE", focus)
+    monkeypatch.setattr(augment, "FOCUS_FRACTION", focus)
     asked: list[tuple[NDArray[np.float64], float, NDArray[np.float64], NDArray[np.float64]]] = []
-    made = maker._window
+    made = maker._build_window
 
     def window(*given: object) -> object:
         asked.append(given[:4])  # type: ignore[arg-type]
         return made(*given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(maker, "_window", window)
-    monkeypatch.setattr(maker, "_show", lambda *given: given[5])
+    monkeypatch.setattr(maker, "_build_window", window)
+    monkeypatch.setattr(maker, "_render_window", lambda *given: given[5])
     rng = np.random.default_rng(8)
     size = np.array([rect[2] - rect[0], rect[3] - rect[1]])
     found, canvas = [], np.empty((112, 160, 3), np.uint8)
     for _ in range(300):
-        maker._layer(canvas, rect, 0, [], rng)
+        maker._draw_layer(canvas, rect, 0, [], rng)
         turn, zoom, seen, shown = map(np.asarray, asked[-1])
         corners = np.array([seen + turn @ (at - shown) for at in (0 * size, size)])
         robot = maker._examples.robots[0, 0, :2]
@@ -320,7 +325,7 @@ def test_grain_of_noise_begins_anywhere() -> None:
     canvases = []
     for _ in range(40):
         canvases.append(np.full((112, 160, 3), 128, np.uint8))
-        maker._spoil(canvases[-1], rng)
+        maker._degrade_image(canvases[-1], rng)
     noise = np.array(canvases).reshape(40, -1) - 128.0
     assert np.abs(noise.mean(axis=1)).max() < 0.5  # rounded, not cut off
     loud = noise.std(axis=1) / 25.5

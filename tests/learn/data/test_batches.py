@@ -5,21 +5,29 @@ import pytest
 import torch
 
 from dmrl.learn.data import batches
-from dmrl.learn.data.batches import FIELDS, Examples, ahead, batch_count, gathered, in_order, order
+from dmrl.learn.data.batches import (
+    ROBOT_FIELDS,
+    ExampleSet,
+    collate,
+    count_batches,
+    epoch_indices,
+    iter_batches,
+    prefetch,
+)
 
 
-def numbered(*sizes: int) -> Examples:
+def numbered(*sizes: int) -> ExampleSet:
     """Images and robots whose every value is the image's number."""
     count = sum(sizes)
     images = np.arange(count, dtype=np.uint8)[:, None, None, None] + np.zeros((8, 16, 3), np.uint8)
-    robots = np.repeat(np.arange(count, dtype=np.float32), 2 * len(FIELDS))
-    robots = robots.reshape(count, 2, len(FIELDS))
-    return Examples(np.split(images, np.cumsum(sizes)[:-1]), robots)
+    robots = np.repeat(np.arange(count, dtype=np.float32), 2 * len(ROBOT_FIELDS))
+    robots = robots.reshape(count, 2, len(ROBOT_FIELDS))
+    return ExampleSet(np.split(images, np.cumsum(sizes)[:-1]), robots)
 
 
 def test_every_image_comes_once_with_its_own_robots() -> None:
     seen: list[int] = []
-    for images, robots in in_order(numbered(5, 0, 7, 1), 4):
+    for images, robots in iter_batches(numbered(5, 0, 7, 1), 4):
         numbers = images[:, 0, 0, 0].tolist()
         assert (images == images[:, :1, :1, :1]).all()
         assert robots[:, 1, 9].tolist() == numbers
@@ -28,10 +36,10 @@ def test_every_image_comes_once_with_its_own_robots() -> None:
 
 
 def test_batches_are_uint8_channels_last_and_the_last_is_short() -> None:
-    batches = [(len(b.images), b.images.dtype) for b in in_order(numbered(10), 4)]
+    batches = [(len(b.images), b.images.dtype) for b in iter_batches(numbered(10), 4)]
     assert batches == [(4, torch.uint8), (4, torch.uint8), (2, torch.uint8)]
-    assert batch_count(10, 4) == 3
-    first = gathered(numbered(10), [3, 1]).images
+    assert count_batches(10, 4) == 3
+    first = collate(numbered(10), [3, 1]).images
     assert first.shape == (2, 3, 8, 16)
     assert first[:, 0, 0, 0].tolist() == [3, 1]
     assert first.is_contiguous(memory_format=torch.channels_last)
@@ -39,22 +47,28 @@ def test_batches_are_uint8_channels_last_and_the_last_is_short() -> None:
 
 def test_selected_images_keep_their_robots() -> None:
     some = numbered(3, 4).select(np.array([False, True, False, False, True, True, False]))
-    assert [int(some.image(k)[0, 0, 0]) for k in range(3)] == [1, 4, 5]
+    assert [int(some.get_image(k)[0, 0, 0]) for k in range(3)] == [1, 4, 5]
     assert some.robots[:, 0, 0].tolist() == [1, 4, 5]
 
 
 def test_the_order_depends_on_seed_and_epoch_alone() -> None:
-    np.testing.assert_array_equal(order(50, seed=1, epoch=2), order(50, seed=1, epoch=2))
-    assert not np.array_equal(order(50, seed=1, epoch=2), order(50, seed=1, epoch=3))
-    assert not np.array_equal(order(50, seed=1, epoch=2), order(50, seed=2, epoch=2))
-    assert sorted(order(50, seed=1, epoch=2)) == list(range(50))
+    np.testing.assert_array_equal(
+        epoch_indices(50, seed=1, epoch=2), epoch_indices(50, seed=1, epoch=2)
+    )
+    assert not np.array_equal(
+        epoch_indices(50, seed=1, epoch=2), epoch_indices(50, seed=1, epoch=3)
+    )
+    assert not np.array_equal(
+        epoch_indices(50, seed=1, epoch=2), epoch_indices(50, seed=2, epoch=2)
+    )
+    assert sorted(epoch_indices(50, seed=1, epoch=2)) == list(range(50))
 
 
 def test_images_come_as_often_as_their_shares_say() -> None:
     shares = np.array([4.0] * 10 + [0.25] * 40)
     seen = np.zeros(50)
     for epoch in range(40):
-        drawn = order(50, seed=0, epoch=epoch, shares=shares)
+        drawn = epoch_indices(50, seed=0, epoch=epoch, shares=shares)
         assert len(drawn) == 50
         np.add.at(seen, drawn, 1)
     np.testing.assert_allclose(seen[:10] / 40, 4.0, atol=0.03)
@@ -69,7 +83,7 @@ def test_items_made_ahead_come_in_order_and_their_error_comes_through() -> None:
 
     got = []
     with pytest.raises(ZeroDivisionError):
-        for item in ahead(items()):
+        for item in prefetch(items()):
             got.append(item)
     assert got == [0, 1, 2, 3, 4]
 
@@ -77,35 +91,35 @@ def test_items_made_ahead_come_in_order_and_their_error_comes_through() -> None:
 def test_robots_that_do_not_match_the_images_are_refused() -> None:
     good = numbered(4)
     with pytest.raises(ValueError, match="4 images with robots of 3"):
-        Examples(good.pixels, good.robots[:3])
+        ExampleSet(good.pixels, good.robots[:3])
     with pytest.raises(ValueError, match="more than one size"):
-        Examples(
+        ExampleSet(
             [np.zeros((1, 8, 8, 3), np.uint8), np.zeros((1, 8, 16, 3), np.uint8)],
             good.robots[:2],
         )
-    assert len(FIELDS) == good.robots.shape[-1]
+    assert len(ROBOT_FIELDS) == good.robots.shape[-1]
 
 
 def test_a_mask_is_of_a_robot_whose_centre_it_shows() -> None:
-    robots = np.full((2, 3, len(FIELDS)), np.nan, np.float32)
+    robots = np.full((2, 3, len(ROBOT_FIELDS)), np.nan, np.float32)
     robots[1, :, :2] = (2.5, 1.5), (7.0, 3.0), (-1.0, 1.0)
     masks = np.zeros((2, 4, 8), np.uint8)
     masks[1, 1, 2], masks[1, 3, 6], masks[1, 1, 7] = 1, 2, 3
-    examples = Examples([np.zeros((2, 4, 8, 3), np.uint8)], robots, [masks])
-    mine = examples.mask(1, 0)
+    examples = ExampleSet([np.zeros((2, 4, 8, 3), np.uint8)], robots, [masks])
+    mine = examples.get_mask(1, 0)
     assert mine is not None and np.argwhere(mine).tolist() == [[1, 2]]
-    assert examples.mask(1, 1) is None  # something else stands at its centre
-    assert examples.mask(1, 2) is None  # it is outside
-    assert examples.mask(0, 0) is None  # there is none
-    assert Examples(examples.pixels, robots).mask(1, 0) is None
+    assert examples.get_mask(1, 1) is None  # something else stands at its centre
+    assert examples.get_mask(1, 2) is None  # it is outside
+    assert examples.get_mask(0, 0) is None  # there is none
+    assert ExampleSet(examples.pixels, robots).get_mask(1, 0) is None
     chosen = examples.select(np.array([False, True]))
-    assert chosen.mask(0, 0) is not None
+    assert chosen.get_mask(0, 0) is not None
     with pytest.raises(ValueError, match="masks that do not fit"):
-        Examples(examples.pixels, robots, [masks[:, :3]])
+        ExampleSet(examples.pixels, robots, [masks[:, :3]])
 
 
 def test_a_batch_is_no_longer_than_the_images_and_counts_are_rounded_up() -> None:
-    assert [batch_count(count, 4) for count in (0, 1, 4, 5, 8)] == [0, 1, 1, 2, 2]
+    assert [count_batches(count, 4) for count in (0, 1, 4, 5, 8)] == [0, 1, 1, 2, 2]
     assert numbered(5).image_shape == (8, 16, 3)
     assert len(numbered(5, 2)) == 7
 
@@ -114,9 +128,9 @@ def test_a_batch_is_no_longer_than_the_images_and_counts_are_rounded_up() -> Non
 def test_of_very_many_images_those_of_a_while_lie_together(
     count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batches, "WINDOW", 16)
-    monkeypatch.setattr(batches, "BLOCK", 4)
-    found = [order(count, seed=3, epoch=epoch) for epoch in range(6)]
+    monkeypatch.setattr(batches, "SHUFFLE_WINDOW_IMAGES", 16)
+    monkeypatch.setattr(batches, "SHUFFLE_BLOCK_IMAGES", 4)
+    found = [epoch_indices(count, seed=3, epoch=epoch) for epoch in range(6)]
     assert all(sorted(one) == list(range(count)) for one in found)
     assert len({one.tobytes() for one in found}) == 6
     if count == 16:
@@ -132,26 +146,29 @@ def test_of_very_many_images_those_of_a_while_lie_together(
 def test_shares_come_to_whole_images_at_the_border() -> None:
     shares = np.array([0.5, 0.5, 2.0, 1.0])
     for epoch in range(20):
-        drawn = np.bincount(order(4, seed=0, epoch=epoch, shares=shares), minlength=4)
+        drawn = np.bincount(epoch_indices(4, seed=0, epoch=epoch, shares=shares), minlength=4)
         assert drawn.sum() == 4 and drawn[2] == 2 and drawn[3] == 1 and drawn[:2].sum() == 1
 
 
 def test_an_epoch_has_as_many_images_as_it_is_asked_for() -> None:
     """A few come often and alike, of many each comes once at most, and all come in time."""
-    often = np.bincount(order(3, seed=0, epoch=0, images=10), minlength=3)
+    often = np.bincount(epoch_indices(3, seed=0, epoch=0, images=10), minlength=3)
     assert often.sum() == 10 and set(often.tolist()) == {3, 4}
     shares = np.array([3.0, 1.0, 0.0])
-    assert np.bincount(order(3, seed=0, epoch=0, shares=shares, images=8)).tolist() == [6, 2]
-    some = [order(1000, seed=0, epoch=epoch, images=100) for epoch in range(60)]
+    assert np.bincount(epoch_indices(3, seed=0, epoch=0, shares=shares, images=8)).tolist() == [
+        6,
+        2,
+    ]
+    some = [epoch_indices(1000, seed=0, epoch=epoch, images=100) for epoch in range(60)]
     assert all(len(one) == len(set(one.tolist())) == 100 for one in some)
     assert len(set(np.concatenate(some).tolist())) > 990
-    assert sorted(order(50, seed=1, epoch=2, images=50)) == list(range(50))
+    assert sorted(epoch_indices(50, seed=1, epoch=2, images=50)) == list(range(50))
 
 
 def test_a_robot_at_the_rim_has_a_mask_within_the_image() -> None:
-    robots = np.full((1, 4, len(FIELDS)), np.nan, np.float32)
+    robots = np.full((1, 4, len(ROBOT_FIELDS)), np.nan, np.float32)
     robots[0, :, :2] = (0.0, 0.0), (7.9, 3.9), (3.0, 4.0), (8.0, 2.0)
     masks = np.zeros((1, 4, 8), np.uint8)
     masks[0, 0, 0], masks[0, 3, 7], masks[0, 3, 3], masks[0, 2, 7] = 1, 2, 3, 4
-    examples = Examples([np.zeros((1, 4, 8, 3), np.uint8)], robots, [masks])
-    assert [examples.mask(0, k) is not None for k in range(4)] == [True, True, False, False]
+    examples = ExampleSet([np.zeros((1, 4, 8, 3), np.uint8)], robots, [masks])
+    assert [examples.get_mask(0, k) is not None for k in range(4)] == [True, True, False, False]

@@ -2,16 +2,16 @@ import numpy as np
 import pytest
 import torch
 
-from dmrl.geometry.frames import grid_label
-from dmrl.learn.data.batches import CLASS_ID, FIELDS
-from dmrl.learn.data.targets import LabelNoise, as_targets, targets
+from dmrl.geometry.frames import build_grid_label
+from dmrl.learn.data.batches import CLASS_ID, ROBOT_FIELDS
+from dmrl.learn.data.targets import LabelNoise, build_targets, build_teacher_targets
 
 SHAPE = (28, 40)
 
 
 def robots(*rows: tuple[float, ...]) -> torch.Tensor:
     """(1, K, 11) from u, v, depth and, where given, sigmas."""
-    out = torch.full((1, len(rows), len(FIELDS)), float("nan"))
+    out = torch.full((1, len(rows), len(ROBOT_FIELDS)), float("nan"))
     for k, row in enumerate(rows):
         out[0, k, 3:6] = 0
         out[0, k, : len(row)] = torch.tensor(row)
@@ -24,15 +24,15 @@ def test_without_width_they_are_the_grid_labels_of_the_paper() -> None:
         found = np.c_[rng.uniform(-20, 340, 6), rng.uniform(-20, 240, 6), rng.uniform(0.2, 2, 6)]
         found[0, :2] = 64, 80  # on a border
         found[2, :2] = found[1, :2]  # two in one cell
-        got = targets(robots(*found), SHAPE, sigma_cells=0)
-        confidence, depth_m = grid_label(found[:, :2], found[:, 2])
+        got = build_targets(robots(*found), SHAPE, sigma_cells=0)
+        confidence, depth_m = build_grid_label(found[:, :2], found[:, 2])
         np.testing.assert_array_equal(got.confidence[0], confidence)
         np.testing.assert_array_equal(got.weight[0], confidence)
         np.testing.assert_allclose(got.depth_m[0].numpy() * confidence, depth_m, rtol=1e-6)
 
 
 def test_with_width_the_offset_leads_from_every_near_cell_to_the_centre() -> None:
-    got = targets(robots((101.5, 50.25, 1.3)), SHAPE, sigma_cells=0.7)
+    got = build_targets(robots((101.5, 50.25, 1.3)), SHAPE, sigma_cells=0.7)
     rows, cols = torch.nonzero(got.weight[0], as_tuple=True)
     assert len(rows) > 4
     u = (cols + 0.5 + got.offset[0, 0, rows, cols]) * 8
@@ -44,12 +44,12 @@ def test_with_width_the_offset_leads_from_every_near_cell_to_the_centre() -> Non
 
 
 def test_each_cell_belongs_to_the_nearest_centre() -> None:
-    got = targets(robots((100, 100, 1.0), (116, 100, 2.0)), SHAPE, sigma_cells=0.7)
+    got = build_targets(robots((100, 100, 1.0), (116, 100, 2.0)), SHAPE, sigma_cells=0.7)
     assert got.depth_m[0, 12, 11:16].tolist() == pytest.approx([1, 1, 1, 2, 2])
 
 
 def test_no_robot_is_no_presence_and_no_weight() -> None:
-    got = targets(robots((float("nan"), 0, 0), (50, 50, -1)), SHAPE, sigma_cells=0.7)
+    got = build_targets(robots((float("nan"), 0, 0), (50, 50, -1)), SHAPE, sigma_cells=0.7)
     assert all((x == 0).all() for x in (got.confidence, got.weight, got.offset))
     assert (got.confidence_weight == 1).all()
     assert all(torch.isfinite(x).all() for x in got)
@@ -57,15 +57,15 @@ def test_no_robot_is_no_presence_and_no_weight() -> None:
 
 def test_a_noisy_label_weighs_less_or_is_spread_out() -> None:
     exact, noisy = (100.0, 100.0, 1.0), (100.0, 100.0, 1.0, 8.0, 8.0, 0.1)
-    plain = targets(robots(noisy), SHAPE, sigma_cells=0.7)
-    for one, other in zip(plain, targets(robots(exact), SHAPE, sigma_cells=0.7), strict=True):
+    plain = build_targets(robots(noisy), SHAPE, sigma_cells=0.7)
+    for one, other in zip(plain, build_targets(robots(exact), SHAPE, sigma_cells=0.7), strict=True):
         torch.testing.assert_close(one, other)
-    weighted = targets(robots(noisy), SHAPE, sigma_cells=0.7, label_noise="weight")
+    weighted = build_targets(robots(noisy), SHAPE, sigma_cells=0.7, label_noise="weight")
     torch.testing.assert_close(weighted.weight, plain.weight / 2)
     torch.testing.assert_close(weighted.offset_weight, plain.weight / 2)
     assert weighted.confidence_weight[0, 12, 12] == 0.5
     assert weighted.confidence_weight[0, 0, 0] == 1
-    softened = targets(robots(noisy), SHAPE, sigma_cells=0.7, label_noise="soften")
+    softened = build_targets(robots(noisy), SHAPE, sigma_cells=0.7, label_noise="soften")
     assert softened.confidence.max() < 0.5 * plain.confidence.max()
     # Spread, not lost: the sum over cells stays.
     torch.testing.assert_close(softened.confidence.sum(), plain.confidence.sum(), rtol=1e-2, atol=0)
@@ -74,18 +74,18 @@ def test_a_noisy_label_weighs_less_or_is_spread_out() -> None:
 def test_every_cell_of_a_robot_knows_its_class() -> None:
     near, far, strange = robots((100, 100, 1.0), (116, 100, 2.0), (200, 50, 1.0))[0].unbind()
     near[CLASS_ID], far[CLASS_ID] = 0, 1
-    got = targets(torch.stack((near, far, strange))[None], SHAPE, sigma_cells=0.7)
+    got = build_targets(torch.stack((near, far, strange))[None], SHAPE, sigma_cells=0.7)
     assert got.class_id[0, 12, 11:16].tolist() == [0, 0, 0, 1, 1]
     assert (got.class_id[0, :8] == -1).all()  # neither the strange one nor empty cells
     assert got.weight[0, 6, 25] > 0
 
 
 def test_a_teacher_is_learnt_where_it_sees_a_robot_and_where_it_doubts() -> None:
-    labelled = targets(robots((100, 100, 1.0)), SHAPE, sigma_cells=0.7)
+    labelled = build_targets(robots((100, 100, 1.0)), SHAPE, sigma_cells=0.7)
     said = torch.full((1, 4, *SHAPE), -6.0)
     said[0, :, 3, 5] = torch.tensor([0.5, 2.0, 0.2, -0.1])
     said[0, 1, 9, 9] = -3.0
-    got = as_targets(("log_depth", "confidence", "offset_u", "offset_v"), said, labelled)
+    got = build_teacher_targets(("log_depth", "confidence", "offset_u", "offset_v"), said, labelled)
     assert got.confidence[0, 3, 5] == pytest.approx(1 / (1 + np.exp(-2)))
     assert got.confidence[0, 9, 9] == pytest.approx(1 / (1 + np.exp(3)))
     assert torch.nonzero(got.weight[0]).tolist() == [[3, 5]]
@@ -94,7 +94,7 @@ def test_a_teacher_is_learnt_where_it_sees_a_robot_and_where_it_doubts() -> None
 
 
 def test_presence_is_a_gaussian_of_the_distance_in_cells() -> None:
-    got = targets(robots((100.0, 100.0, 1.0)), SHAPE, sigma_cells=0.7).confidence[0]
+    got = build_targets(robots((100.0, 100.0, 1.0)), SHAPE, sigma_cells=0.7).confidence[0]
     for row, col in ((12, 12), (12, 13), (11, 11), (13, 10)):
         away = np.hypot(8 * (col + 0.5) - 100, 8 * (row + 0.5) - 100) / 8
         assert got[row, col] == pytest.approx(np.exp(-0.5 * (away / 0.7) ** 2), rel=1e-5)
@@ -103,8 +103,8 @@ def test_presence_is_a_gaussian_of_the_distance_in_cells() -> None:
 @pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
 def test_a_label_counts_by_the_square_of_its_sigma(times: float) -> None:
     noisy = robots((100.0, 100.0, 2.0, 8 * times, 8 * times, 0.3))
-    exact = targets(noisy, SHAPE, sigma_cells=0.7)
-    got = targets(noisy, SHAPE, sigma_cells=0.7, label_noise="weight")
+    exact = build_targets(noisy, SHAPE, sigma_cells=0.7)
+    got = build_targets(noisy, SHAPE, sigma_cells=0.7, label_noise="weight")
     torch.testing.assert_close(got.offset_weight, exact.offset_weight / (1 + times**2))
     # 0.3 m of 2 m is one and a half times what counts half.
     torch.testing.assert_close(got.weight, exact.weight / (1 + 1.5**2))
@@ -114,7 +114,7 @@ def test_cells_below_a_tenth_of_presence_learn_no_depth() -> None:
     """At a width of one cell, exp(-d^2 / 2) is a tenth at d = 2.146 cells."""
     for off_cells, counts in ((2.1, True), (2.2, False)):
         centre = 100.0 + 8 * off_cells  # of the cell whose middle is at 100
-        got = targets(robots((centre, 100.0, 2.0)), SHAPE, sigma_cells=1.0)
+        got = build_targets(robots((centre, 100.0, 2.0)), SHAPE, sigma_cells=1.0)
         presence = np.exp(-(off_cells**2) / 2)
         assert float(got.confidence[0, 12, 12]) == pytest.approx(presence, rel=1e-4)
         assert float(got.weight[0, 12, 12]) == pytest.approx(presence * counts, rel=1e-4)
@@ -126,7 +126,7 @@ def test_a_depth_s_sigma_counts_by_its_share_and_only_for_the_depth() -> None:
     exact, blurred = (100.0, 100.0, 2.0, 0, 0, 0.0), (100.0, 100.0, 2.0, 0, 0, 0.2)
     for label_noise, depth, other in (("weight", 0.5, 1.0), ("ignore", 1.0, 1.0)):
         plain, noisy = (
-            targets(robots(row), SHAPE, sigma_cells=0.7, label_noise=label_noise)  # type: ignore[arg-type]
+            build_targets(robots(row), SHAPE, sigma_cells=0.7, label_noise=label_noise)  # type: ignore[arg-type]
             for row in (exact, blurred)
         )
         torch.testing.assert_close(noisy.weight, depth * plain.weight)
@@ -137,13 +137,13 @@ def test_a_depth_s_sigma_counts_by_its_share_and_only_for_the_depth() -> None:
 def test_a_sigma_in_pixels_is_the_root_mean_square_of_both_ways() -> None:
     exact, blurred = (100.0, 100.0, 2.0, 0, 0, 0), (100.0, 100.0, 2.0, 8 * 2**0.5, 0, 0)
     plain, noisy = (
-        targets(robots(row), SHAPE, sigma_cells=0.7, label_noise="weight")
+        build_targets(robots(row), SHAPE, sigma_cells=0.7, label_noise="weight")
         for row in (exact, blurred)
     )
     torch.testing.assert_close(noisy.offset_weight, 0.5 * plain.offset_weight)
     assert noisy.confidence_weight[0, 12, 12] == pytest.approx(0.5)
     assert noisy.confidence_weight[0, 0, 0] == 1  # that nobody is there is sure
-    soft = targets(robots(blurred), SHAPE, sigma_cells=0.7, label_noise="soften")
+    soft = build_targets(robots(blurred), SHAPE, sigma_cells=0.7, label_noise="soften")
     wider = (0.49 + 1.0) ** 0.5
     assert float(soft.confidence[0, 12, 12] / soft.confidence[0, 12, 14]) == pytest.approx(
         np.exp(2**2 / (2 * wider**2)), rel=1e-3
@@ -155,13 +155,15 @@ def test_a_sigma_in_pixels_is_the_root_mean_square_of_both_ways() -> None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_targets_are_those_of_a_look_at_every_cell(label_noise: LabelNoise, seed: int) -> None:
     rng, shape, sigma_cells = np.random.default_rng(seed), (5, 7), 0.8
-    rows = np.full((2, 4, len(FIELDS)), np.nan, np.float32)
+    rows = np.full((2, 4, len(ROBOT_FIELDS)), np.nan, np.float32)
     for image in rows:
         for robot in image[: rng.integers(1, 5)]:
             robot[:2] = rng.uniform((-6, -6), (62, 46))
             robot[2:6] = *rng.uniform(0.4, 3, 1), *rng.uniform(0, 9, 2), rng.uniform(0, 0.4)
             robot[CLASS_ID] = rng.integers(3) if rng.random() < 0.7 else np.nan
-    got = targets(torch.from_numpy(rows), shape, sigma_cells=sigma_cells, label_noise=label_noise)
+    got = build_targets(
+        torch.from_numpy(rows), shape, sigma_cells=sigma_cells, label_noise=label_noise
+    )
     for n, row, col in np.ndindex(2, *shape):
         best = (0.0, 0.0, 0.0, 0.0, 1.0, 1.0, -1.0)
         for robot in rows[n]:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from dmrl.errors import SettingError
-from dmrl.learn.data.torch_dataset import Part, TorchRows, loader_of, part_of_torchrun
+from dmrl.learn.data.torch_dataset import ProcessSampler, TorchRows, get_torchrun_rank, loader_of
 
 
 class Rows:
@@ -33,37 +33,37 @@ class Rows:
 )
 def test_parts_count_from_0(number: int, parts: int, there: int) -> None:
     if there:
-        assert Part(5, (number, parts), shuffle=False, seed=0).number == number
+        assert ProcessSampler(5, (number, parts), shuffle=False, seed=0).number == number
         return
     with pytest.raises(SettingError, match=f"no process {number} of {parts}"):
-        Part(5, (number, parts), shuffle=False, seed=0)
+        ProcessSampler(5, (number, parts), shuffle=False, seed=0)
 
 
 @pytest.mark.parametrize("parts", [1, 3, 4])
 def test_in_order_each_row_is_read_once(parts: int) -> None:
-    mine = [Part(10, (k, parts), shuffle=False, seed=0) for k in range(parts)]
+    mine = [ProcessSampler(10, (k, parts), shuffle=False, seed=0) for k in range(parts)]
     assert [row for part in mine for row in part] == list(range(10))
     assert [len(part) for part in mine] == [len(list(part)) for part in mine]
     assert max(map(len, mine)) - min(map(len, mine)) <= 1
 
 
 def test_shuffled_all_read_equally_many_and_none_twice() -> None:
-    mine = [Part(10, (k, 3), shuffle=True, seed=1) for k in range(3)]
+    mine = [ProcessSampler(10, (k, 3), shuffle=True, seed=1) for k in range(3)]
     first, second = ([list(part) for part in mine] for _ in range(2))
     for read in (first, second):
         rows = [row for part in read for row in part]
         assert len(set(rows)) == len(rows) == 9
         assert {len(part) for part in read} == {3}
     assert first != second and len(mine[0]) == 3
-    again = Part(10, (0, 3), shuffle=True, seed=1)
+    again = ProcessSampler(10, (0, 3), shuffle=True, seed=1)
     assert list(again) == first[0] and list(again) == second[0]
-    assert list(Part(10, (0, 3), shuffle=True, seed=2)) != first[0]
+    assert list(ProcessSampler(10, (0, 3), shuffle=True, seed=2)) != first[0]
 
 
 def test_images_are_channels_first_and_one_row_is_of_a_batch() -> None:
     rows = TorchRows(Rows(7))
     assert len(rows) == 7
-    batch = rows.batch([5, 3])
+    batch = rows.get_batch([5, 3])
     assert batch["image"].shape == (2, 3, 4, 6) and batch["image"].dtype == torch.uint8
     assert batch["image"][:, :, 1, 2].tolist() == [[5, 55, 105], [3, 53, 103]]
     assert batch["number"].tolist() == [5, 3]
@@ -87,10 +87,10 @@ def test_a_loader_gives_batches_of_its_part(shuffle: bool) -> None:
 def test_torchrun_tells_which_process_this_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RANK", raising=False)
     monkeypatch.delenv("WORLD_SIZE", raising=False)
-    assert part_of_torchrun() == (0, 1)
+    assert get_torchrun_rank() == (0, 1)
     monkeypatch.setenv("RANK", "2")
     monkeypatch.setenv("WORLD_SIZE", "4")
-    assert part_of_torchrun() == (2, 4)
+    assert get_torchrun_rank() == (2, 4)
     monkeypatch.setenv("RANK", "x")
     with pytest.raises(SettingError, match="RANK and WORLD_SIZE are no numbers"):
-        part_of_torchrun()
+        get_torchrun_rank()

@@ -5,63 +5,72 @@ import pytest
 import torch
 
 from dmrl.learn.inference.confidence_calibration import (
-    FAINTEST,
-    LEAST,
-    Calibration,
-    _fitted,
-    calibrate,
-    calibration,
+    MIN_CONFIDENCE,
+    MIN_DETECTIONS,
+    PlattScaling,
+    _fit_logistic,
+    apply_calibration,
+    fit_calibration,
 )
-from dmrl.learn.inference.detection_metrics import Curves, Scored, curves, score
+from dmrl.learn.inference.detection_metrics import (
+    MetricCurves,
+    ScoredDetections,
+    compute_curves,
+    score_detections,
+)
 from dmrl.learn.inference.matching import Points
-from dmrl.learn.networks.architectures import build
+from dmrl.learn.networks.architectures import build_network
 
 
-def scored(slope: float, offset: float, count: int = 4000) -> Scored:
+def scored(slope: float, offset: float, count: int = 4000) -> ScoredDetections:
     """Detections whose chance to be right is that of their logit times slope plus offset."""
     rng = np.random.default_rng(3)
     logits = rng.uniform(-3.5, 2, count)
     right = rng.random(count) < 1 / (1 + np.exp(-slope * logits - offset))
     image, u = np.arange(count), np.full(count, 50.0)
     truth = Points(image, np.where(right, u, 150.0), u, np.ones(count), np.ones(count))
-    return score(count, truth, Points(image, u, u, np.ones(count), 1 / (1 + np.exp(-logits))))
+    return score_detections(
+        count, truth, Points(image, u, u, np.ones(count), 1 / (1 + np.exp(-logits)))
+    )
 
 
-def expected_error(found: Curves) -> float:
+def expected_error(found: MetricCurves) -> float:
     """Of confidence against the share that is right, over all detections."""
     gap = np.abs(found.bin_confidence - found.bin_right)
     return float(np.nansum(gap * found.bin_count) / found.bin_count.sum())
 
 
 def test_the_slope_and_offset_are_found() -> None:
-    found = calibration(scored(2.5, 1.0))
+    found = fit_calibration(scored(2.5, 1.0))
     assert found is not None
     assert found == pytest.approx((2.5, 1.0), abs=0.2)
 
 
 def test_confidence_is_the_share_that_is_right_afterwards() -> None:
     before = scored(2.5, 1.0)
-    found = calibration(before)
+    found = fit_calibration(before)
     assert found is not None
     old = before.detections.confidence
     new = 1 / (1 + np.exp(-found.slope * np.log(old / (1 - old)) - found.offset))
-    after = score(before.images, before.labels, replace(before.detections, confidence=new))
-    gaps = [expected_error(curves(one)) for one in (before, after)]
+    after = score_detections(
+        before.images, before.labels, replace(before.detections, confidence=new)
+    )
+    gaps = [expected_error(compute_curves(one)) for one in (before, after)]
     assert gaps[0] > 0.1
     assert gaps[1] < 0.03
 
 
 def test_too_little_to_tell_or_no_sense_in_it_is_no_calibration() -> None:
-    assert calibration(scored(2.5, 1.0, count=40)) is None
-    assert calibration(scored(-1.0, 0.0)) is None
+    assert fit_calibration(scored(2.5, 1.0, count=40)) is None
+    assert fit_calibration(scored(-1.0, 0.0)) is None
 
 
 def test_the_last_layer_carries_it_and_nothing_else_changes() -> None:
-    network = build("dmrl-nano", seed=1).eval()
+    network = build_network("dmrl-nano", seed=1).eval()
     images = torch.rand(2, 3, 64, 96)
     with torch.inference_mode():
         before = network(images).clone()
-        assert calibrate(network, Calibration(1.5, -0.25))
+        assert apply_calibration(network, PlattScaling(1.5, -0.25))
         after = network(images)
     row = network.channels.index("confidence")
     torch.testing.assert_close(after[:, row], before[:, row] * 1.5 - 0.25)
@@ -70,34 +79,40 @@ def test_the_last_layer_carries_it_and_nothing_else_changes() -> None:
 
 
 def test_a_network_with_another_last_layer_is_left_as_it_is() -> None:
-    network = build("locanet")
+    network = build_network("locanet")
     network.head = torch.nn.Identity()  # type: ignore[assignment]
-    assert not calibrate(network, Calibration(2.0, 0.0))
+    assert not apply_calibration(network, PlattScaling(2.0, 0.0))
 
 
-def told(confidence: list[float], right: list[bool]) -> Scored:
+def told(confidence: list[float], right: list[bool]) -> ScoredDetections:
     """One detection an image, of which it is known whether it is right."""
     image, u = np.arange(len(right)), np.full(len(right), 50.0)
     truth = Points(image, np.where(right, u, 150.0), u, np.ones(len(u)), np.ones(len(u)))
-    return score(len(u), truth, Points(image, u, u, np.ones(len(u)), np.array(confidence)))
+    return score_detections(
+        len(u), truth, Points(image, u, u, np.ones(len(u)), np.array(confidence))
+    )
 
 
 def test_thirty_of_each_are_needed_and_faint_ones_do_not_count() -> None:
-    for right, wrong, known in ((LEAST, LEAST, True), (LEAST - 1, 99, False), (99, 29, False)):
+    for right, wrong, known in (
+        (MIN_DETECTIONS, MIN_DETECTIONS, True),
+        (MIN_DETECTIONS - 1, 99, False),
+        (99, 29, False),
+    ):
         # Three in four of the sure ones are right.
         sure = [True] * (right * 3 // 4) + [False] * (wrong // 4)
         weak = [True] * (right - right * 3 // 4) + [False] * (wrong - wrong // 4)
         confidence = [0.8] * len(sure) + [0.3] * len(weak)
-        assert (calibration(told(confidence, sure + weak)) is not None) == known
-        below = [FAINTEST - 1e-3] * 200
+        assert (fit_calibration(told(confidence, sure + weak)) is not None) == known
+        below = [MIN_CONFIDENCE - 1e-3] * 200
         faint = told(confidence + below, sure + weak + [False] * 200)
-        assert calibration(faint) == calibration(told(confidence, sure + weak))
+        assert fit_calibration(faint) == fit_calibration(told(confidence, sure + weak))
 
 
 def test_two_confidences_become_the_shares_that_are_right() -> None:
     confidence = [0.8] * 100 + [0.3] * 100
     right = [True] * 90 + [False] * 10 + [True] * 40 + [False] * 60
-    found = calibration(told(confidence, right))
+    found = fit_calibration(told(confidence, right))
     assert found is not None
     said = [found.slope * np.log(p / (1 - p)) + found.offset for p in (0.8, 0.3)]
     assert said == pytest.approx([np.log(9), np.log(2 / 3)], abs=1e-3)
@@ -112,7 +127,7 @@ def test_a_slope_of_nothing_or_of_a_cliff_is_none(slope: float, known: bool) -> 
     right = [True] * round(share * count) + [False] * round((1 - share) * count)
     mirrored = [not one for one in right]
     confidence = [1 / (1 + np.exp(-logit))] * len(right) + [1 / (1 + np.exp(logit))] * len(right)
-    found = calibration(told(confidence, right + mirrored))
+    found = fit_calibration(told(confidence, right + mirrored))
     assert (found is not None) == known
     assert found is None or found == pytest.approx((slope, 0.0), abs=0.05)
 
@@ -121,5 +136,5 @@ def test_a_fit_is_where_the_likelihood_is_flat() -> None:
     rng = np.random.default_rng(0)
     rows = np.column_stack([rng.normal(size=500), np.ones(500)])
     right = (rng.random(500) < 1 / (1 + np.exp(-3 * rows[:, 0] + 1))).astype(float)
-    said = 1 / (1 + np.exp(-rows @ _fitted(rows, right)))
+    said = 1 / (1 + np.exp(-rows @ _fit_logistic(rows, right)))
     assert rows.T @ (said - right) == pytest.approx(np.zeros(2), abs=1e-4)

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dmrl.learn.inference.decode_grids import decode, peaks
+from dmrl.learn.inference.decode_grids import decode, find_peaks
 
 
 def test_peaks_come_best_first_at_the_cell_centre() -> None:
@@ -62,7 +62,7 @@ def test_no_more_than_asked_for() -> None:
 def test_equal_neighbours_give_one_peak_and_the_first_maximum_is_always_one(
     confidence: np.ndarray,
 ) -> None:
-    found = peaks(confidence)[0]
+    found = find_peaks(confidence)[0]
     assert found.flat[confidence.argmax()]
     rows, cols = np.nonzero(found)
     for a in range(len(rows)):

@@ -7,15 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmrl.learn.inference.detection_metrics import (
-    BANDS_M,
-    DEFINITIONS,
-    BandFigures,
+    DEPTH_BANDS_M,
+    METRIC_DEFINITIONS,
+    BandMetrics,
     average_precision,
-    by_band,
-    curves,
-    figures,
-    resamples,
-    score,
+    compute_band_metrics,
+    compute_curves,
+    compute_metrics,
+    iter_bootstrap_weights,
+    score_detections,
     weighted_quantile,
 )
 from dmrl.learn.inference.matching import Points
@@ -29,11 +29,13 @@ def scene(images: int, offset_px: float = 0.0, depth_m: float = 1.0) -> tuple[Po
     return Points(image, u, v, d, ones), Points(image, u - offset_px, v, d - 0.1, 0.9 * ones)
 
 
-def overall(labels: Points, found: Points, images: int, draws: int = 20) -> BandFigures:
-    return by_band(score(images, labels, found), threshold=0.33, draws=draws)[0]
+def overall(labels: Points, found: Points, images: int, draws: int = 20) -> BandMetrics:
+    return compute_band_metrics(
+        score_detections(images, labels, found), threshold=0.33, draws=draws
+    )[0]
 
 
-def values(band: BandFigures) -> dict[str, float]:
+def values(band: BandMetrics) -> dict[str, float]:
     return {name: figure.value for name, figure in band.figures.items()}
 
 
@@ -52,7 +54,7 @@ def test_curves_of_four_detections_by_hand() -> None:
     confidence = np.array([0.95, 0.85, 0.85, 0.15])
     depth = np.ones(4)
     found = Points(np.array([0, 1, 1, 2]), at, np.full(4, 50.0), depth, confidence)
-    got = curves(score(3, labels, found))
+    got = compute_curves(score_detections(3, labels, found))
     # Equal confidences are one point of the curve.
     assert got.confidence.tolist() == [0.95, 0.85, 0.15]
     assert got.precision == pytest.approx([1, 2 / 3, 3 / 4])
@@ -66,9 +68,9 @@ def test_curves_of_four_detections_by_hand() -> None:
 def test_curves_without_detections_or_labels_are_empty() -> None:
     labels, found = scene(3)
     none = found.select(found.image > 9)
-    assert curves(score(3, labels, none)).recall.size == 0
-    assert np.isnan(curves(score(3, none, found)).recall).all()
-    many = curves(score(3, *scene(3)), most=1)
+    assert compute_curves(score_detections(3, labels, none)).recall.size == 0
+    assert np.isnan(compute_curves(score_detections(3, none, found)).recall).all()
+    many = compute_curves(score_detections(3, *scene(3)), most=1)
     assert many.recall.tolist() == [1.0]
 
 
@@ -109,11 +111,11 @@ def test_below_the_threshold_is_not_claimed() -> None:
 
 def test_bands_hold_their_own_labels_and_empty_ones_say_nothing() -> None:
     labels, found = scene(10, depth_m=0.7)
-    bands = by_band(score(10, labels, found), threshold=0.33, draws=5)
-    assert [(b.from_m, b.to_m) for b in bands] == list(BANDS_M)
+    bands = compute_band_metrics(score_detections(10, labels, found), threshold=0.33, draws=5)
+    assert [(b.from_m, b.to_m) for b in bands] == list(DEPTH_BANDS_M)
     assert [b.labels for b in bands] == [10, 0, 10, 0, 0, 0]
     assert all(math.isnan(figure.value) for figure in bands[-1].figures.values())
-    assert set(bands[0].figures) == set(DEFINITIONS) - {"error", "band", "interval"}
+    assert set(bands[0].figures) == set(METRIC_DEFINITIONS) - {"error", "band", "interval"}
 
 
 def test_a_wrong_detection_counts_in_the_band_of_its_own_depth() -> None:
@@ -121,7 +123,7 @@ def test_a_wrong_detection_counts_in_the_band_of_its_own_depth() -> None:
     extra = Points(np.arange(10), np.zeros(10), np.zeros(10), np.full(10, 1.7), np.full(10, 0.8))
     order = np.argsort(np.concatenate([found.image, extra.image]), kind="stable")
     both = Points.concatenate([found, extra], np.zeros(2, np.int64)).select(order)
-    bands = by_band(score(10, labels, both), threshold=0.33, draws=5)
+    bands = compute_band_metrics(score_detections(10, labels, both), threshold=0.33, draws=5)
     assert [b.figures["precision"].value for b in bands[:3:2]] == [0.5, 1]
     assert bands[4].figures["precision"].value == 0
 
@@ -164,10 +166,10 @@ def test_the_seed_decides_the_intervals() -> None:
     rng = np.random.default_rng(1)
     labels, found = scene(40)
     off = Points(found.image, rng.random(40) * 200, found.v_px, found.depth_m, found.confidence)
-    scored = score(40, labels, off)
+    scored = score_detections(40, labels, off)
 
-    def figures(seed: int) -> list[BandFigures]:
-        return by_band(scored, threshold=0.33, draws=50, seed=seed)[:1]
+    def figures(seed: int) -> list[BandMetrics]:
+        return compute_band_metrics(scored, threshold=0.33, draws=50, seed=seed)[:1]
 
     assert figures(1) == figures(1) != figures(2)
 
@@ -194,7 +196,7 @@ def test_ten_thousand_images_take_seconds() -> None:
         found.confidence,
     )
     begun = time.process_time()
-    by_band(score(images, labels, off), threshold=0.33)
+    compute_band_metrics(score_detections(images, labels, off), threshold=0.33)
     assert time.process_time() - begun < 20
 
 
@@ -208,7 +210,9 @@ def test_an_interval_holds_the_middle_95_percent() -> None:
         found.depth_m,
         found.confidence,
     )
-    band = by_band(score(images, labels, half), threshold=0.33, draws=2000)[0]
+    band = compute_band_metrics(score_detections(images, labels, half), threshold=0.33, draws=2000)[
+        0
+    ]
     share = band.figures["within_8_px"]
     reach = 1.96 * math.sqrt(0.25 / images)  # of a share of one half
     assert share.value == 0.5
@@ -222,7 +226,7 @@ def off_by(*errors: tuple[float, float, float]) -> dict[str, float]:
     truth = Points(image, u, u / 2, u / 50, np.ones(len(off)))
     found = Points(image, u + off[:, 0], u / 2 + off[:, 1], u / 50 + off[:, 2], np.ones(len(off)))
     weights = np.ones((1, len(off)))
-    got = figures(score(len(off), truth, found), (0.0, np.inf), 0.5, weights)
+    got = compute_metrics(score_detections(len(off), truth, found), (0.0, np.inf), 0.5, weights)
     return {name: float(value[0]) for name, value in got.items()}
 
 
@@ -247,14 +251,16 @@ def test_an_error_of_the_radius_is_within_it(off_px: float, name: str) -> None:
 
 def test_a_band_holds_its_lower_end() -> None:
     for depth_m, held in ((0.5, 2), (0.499, 1), (1.0, 3), (1.5, 4), (2.0, 5)):
-        bands = by_band(score(1, *scene(1, depth_m=depth_m)), threshold=0.33, draws=2)
+        bands = compute_band_metrics(
+            score_detections(1, *scene(1, depth_m=depth_m)), threshold=0.33, draws=2
+        )
         assert [band.labels for band in bands] == [1, *(int(k == held) for k in range(1, 6))]
         assert bands[held].images == 1
 
 
 def test_resamples_draw_as_many_images_as_there_are() -> None:
     labels, found = scene(7)
-    rows = np.concatenate(list(resamples(score(7, labels, found), 500, 3)))
+    rows = np.concatenate(list(iter_bootstrap_weights(score_detections(7, labels, found), 500, 3)))
     assert rows.shape == (500, 7)
     assert (rows.sum(axis=1) == 7).all()
     assert rows.mean(axis=0) == pytest.approx(np.ones(7), abs=0.15)
@@ -278,7 +284,7 @@ def test_curves_are_thinned_evenly_and_full_confidence_is_in_the_last_bin() -> N
     labels, _ = scene(100)
     confidence = np.linspace(1.0, 0.01, 100)
     found = Points(labels.image, labels.u_px, labels.v_px, labels.depth_m, confidence)
-    got = curves(score(100, labels, found), most=5)
+    got = compute_curves(score_detections(100, labels, found), most=5)
     assert got.confidence == pytest.approx([1.0, 0.75, 0.5, 0.26, 0.01], abs=0.011)
     assert got.recall == pytest.approx([0.01, 0.26, 0.51, 0.75, 1.0], abs=0.011)
     assert got.bin_count[9] == 11 and got.bin_count.sum() == 100

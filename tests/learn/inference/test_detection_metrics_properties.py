@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from dmrl.learn.inference.detection_metrics import (
     average_precision,
-    figures,
-    score,
+    compute_metrics,
+    score_detections,
 )
 from dmrl.learn.inference.matching import Points
 
@@ -32,7 +32,7 @@ def anything(seed: int, images: int) -> tuple[Points, Points]:
 def test_weights_are_how_often_an_image_was_there(seed: int) -> None:
     images, rng = 9, np.random.default_rng(seed)
     labels, found = anything(seed, images)
-    scored = score(images, labels, found)
+    scored = score_detections(images, labels, found)
     weights = rng.integers(0, 4, images)
     weights[0] = 2
     drawn = np.repeat(np.arange(images), weights)
@@ -44,10 +44,10 @@ def test_weights_are_how_often_an_image_was_there(seed: int) -> None:
         return Points(np.repeat(np.arange(len(parts)), sizes), *(
             getattr(whole, n) for n in ("u_px", "v_px", "depth_m", "confidence")))  # fmt: skip
 
-    repeated = score(len(drawn), again(labels), again(found))
+    repeated = score_detections(len(drawn), again(labels), again(found))
     for band in ((0.0, np.inf), (0.5, 1.5)):
-        got = figures(scored, band, 0.4, weights[None].astype(float))
-        wanted = figures(repeated, band, 0.4, np.ones((1, len(drawn))))
+        got = compute_metrics(scored, band, 0.4, weights[None].astype(float))
+        wanted = compute_metrics(repeated, band, 0.4, np.ones((1, len(drawn))))
         assert {k: v.tolist() for k, v in got.items()} == {
             k: pytest.approx(v.tolist(), nan_ok=True) for k, v in wanted.items()
         }
@@ -79,9 +79,9 @@ def test_average_precision_is_that_of_every_threshold(
 @pytest.mark.parametrize("seed", range(3))
 def test_precision_and_recall_are_plain_shares(seed: int) -> None:
     labels, found = anything(seed, 12)
-    scored = score(12, labels, found)
+    scored = score_detections(12, labels, found)
     band, threshold = (0.5, 1.5), 0.35
-    got = figures(scored, band, threshold, np.ones((1, 12)))
+    got = compute_metrics(scored, band, threshold, np.ones((1, 12)))
     sure = found.confidence >= threshold
     mine = (labels.depth_m >= band[0]) & (labels.depth_m < band[1])
     taken = scored.right_16_px

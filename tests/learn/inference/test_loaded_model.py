@@ -11,14 +11,14 @@ from dmrl.errors import ModelError, SettingError
 from dmrl.learn.inference.loaded_model import (
     Model,
     describe,
+    get_weights,
+    interpolate_weights,
     load_model,
-    mixed,
     save_model,
     set_weights,
-    weights_of,
-    with_channels,
+    transfer_weights,
 )
-from dmrl.learn.networks.architectures import build
+from dmrl.learn.networks.architectures import build_network
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def run(tmp_path: Path) -> Path:
     """A run folder with an untrained network."""
     folder = tmp_path / "run"
     folder.mkdir()
-    network = build("locanet", seed=3).eval()
+    network = build_network("locanet", seed=3).eval()
     save_model(Model(network, "locanet", threshold=0.4, label_source="truth"), folder)
     return folder
 
@@ -43,7 +43,7 @@ class Bomb:
 
 def test_a_saved_model_sees_the_same_when_it_is_loaded(run: Path) -> None:
     images = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), np.uint8)
-    wanted = Model(build("locanet", seed=3).eval(), "locanet").grids(images)
+    wanted = Model(build_network("locanet", seed=3).eval(), "locanet").grids(images)
     for path in (run, run / "model.safetensors"):
         model = load_model(path)
         assert (model.threshold, model.label_source) == (0.4, "truth")
@@ -55,7 +55,7 @@ def test_a_saved_model_sees_the_same_when_it_is_loaded(run: Path) -> None:
 
 
 def test_dmrl_nano_says_where_in_the_cell(tmp_path: Path) -> None:
-    network = build("dmrl-nano", seed=1).eval()
+    network = build_network("dmrl-nano", seed=1).eval()
     with torch.no_grad():
         network.head.bias[2:] = torch.tensor([0.25, -0.5])  # type: ignore[union-attr, index]
         network.head.weight.zero_()  # type: ignore[union-attr, operator]
@@ -70,7 +70,7 @@ def test_dmrl_nano_says_where_in_the_cell(tmp_path: Path) -> None:
 
 def test_a_model_with_more_channels_comes_back_with_them(tmp_path: Path) -> None:
     extra = ("log_spread", "class_0", "class_1")
-    network = build("dmrl-nano", seed=1, extra=extra).eval()
+    network = build_network("dmrl-nano", seed=1, extra=extra).eval()
     with torch.no_grad():
         network.head.bias[4:] = torch.tensor([-1.0, 0.5, 0.6])  # type: ignore[union-attr, index]
         network.head.weight.zero_()  # type: ignore[union-attr, operator]
@@ -91,9 +91,12 @@ def test_a_description_with_strange_outputs_is_refused(run: Path) -> None:
 
 
 def test_a_known_network_lends_its_weights_to_one_with_more_channels() -> None:
-    known, fresh = build("dmrl-nano", seed=1), build("dmrl-nano", seed=2, extra=("log_spread",))
-    wanted, new = weights_of(known), weights_of(fresh)
-    got = with_channels(known, fresh)
+    known, fresh = (
+        build_network("dmrl-nano", seed=1),
+        build_network("dmrl-nano", seed=2, extra=("log_spread",)),
+    )
+    wanted, new = get_weights(known), get_weights(fresh)
+    got = transfer_weights(known, fresh)
     set_weights(fresh, got, "here")
     assert torch.equal(got["head.weight"][:4], wanted["head.weight"])
     assert torch.equal(got["head.weight"][4:], new["head.weight"][4:])
@@ -214,12 +217,12 @@ def test_weights_of_another_kind_than_numbers_with_a_point_are_refused(
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
 def test_weights_go_a_share_of_the_way_to_others(share: float) -> None:
-    network, first = build("locanet", seed=1), weights_of(build("locanet", seed=2))
-    before = {name: value.clone() for name, value in weights_of(network).items()}
+    network, first = build_network("locanet", seed=1), get_weights(build_network("locanet", seed=2))
+    before = {name: value.clone() for name, value in get_weights(network).items()}
     assert not any(name.endswith("num_batches_tracked") for name in before)
     del first["head.bias"]  # what others lack stays
-    mixed(network, first, share)
-    for name, value in weights_of(network).items():
+    interpolate_weights(network, first, share)
+    for name, value in get_weights(network).items():
         other = first.get(name, before[name])
         torch.testing.assert_close(value, (1 - share) * before[name] + share * other)
 
@@ -254,7 +257,7 @@ def test_a_description_is_of_images_and_numbers_that_can_be(
 
 
 def test_a_model_is_described_by_what_it_is() -> None:
-    network = build("dmrl-nano", extra=("log_spread",))
+    network = build_network("dmrl-nano", extra=("log_spread",))
     model = Model(network, "dmrl-nano", "n", 64, 48, 0.25, "truth", {"epochs": 3})
     assert describe(model) == {
         "architecture": "dmrl-nano",
@@ -272,7 +275,7 @@ def test_a_model_is_described_by_what_it_is() -> None:
 
 @pytest.mark.parametrize(("size", "fits"), [((64, 48), True), ((60, 48), False), ((64, 44), False)])
 def test_both_sides_of_an_image_are_whole_cells(size: tuple[int, int], fits: bool) -> None:
-    model = Model(build("locanet"), "locanet")
+    model = Model(build_network("locanet"), "locanet")
     if fits:
         model.require_size(*size, "here")
     else:

@@ -6,7 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dmrl.learn.inference.matching import Points, errors, hits, partners
+from dmrl.learn.inference.matching import (
+    Points,
+    assign_detections,
+    compute_errors,
+    match_within_radius,
+)
 
 
 def points(*rows: tuple[int, float, float, float, float]) -> Points:
@@ -25,7 +30,7 @@ def test_labels_and_detections_pair_at_the_least_total_distance(
 ) -> None:
     labels = points(*[(0, u, v, 1, 1) for u, v in label_px])
     found = points(*[(0, u, v, 1, 1) for u, v in found_px])
-    got = partners(labels, found)
+    got = assign_detections(labels, found)
     # Only as many detections as there are labels take part, the most confident ones.
     cost = np.hypot(*(label_px[:, None] - found_px[None, : len(label_px)]).transpose(2, 0, 1))
     paired = np.flatnonzero(got >= 0)
@@ -41,24 +46,24 @@ def test_labels_and_detections_pair_at_the_least_total_distance(
 def test_one_label_takes_the_most_confident_detection_not_the_nearest() -> None:
     labels = points((0, 10, 10, 1, 1))
     found = points((0, 100, 10, 2, 0.9), (0, 11, 10, 1, 0.8))
-    assert partners(labels, found).tolist() == [0]
-    assert errors(labels, found).u_px.tolist() == [-90.0]
-    assert errors(labels, found).depth_m.tolist() == [-1.0]
+    assert assign_detections(labels, found).tolist() == [0]
+    assert compute_errors(labels, found).u_px.tolist() == [-90.0]
+    assert compute_errors(labels, found).depth_m.tolist() == [-1.0]
 
 
 def test_two_labels_share_the_two_best_detections_by_least_total_distance() -> None:
     labels = points((3, 0, 0, 1, 1), (3, 10, 0, 1, 1))
     # Greedily the first label would take u = 4 and leave 30 to the second.
     found = points((3, 9, 0, 1, 0.9), (3, -20, 0, 1, 0.8), (3, 0, 0, 1, 0.7))
-    assert partners(labels, found).tolist() == [1, 0]
+    assert assign_detections(labels, found).tolist() == [1, 0]
 
 
 def test_a_label_without_a_detection_is_infinitely_far() -> None:
     labels = points((0, 0, 0, 1, 1), (1, 0, 0, 1, 1), (1, 50, 0, 1, 1))
     found = points((1, 49, 0, 1, 0.9))
-    assert partners(labels, found).tolist() == [-1, -1, 0]
-    assert errors(labels, found).norm_px.tolist() == [np.inf, np.inf, 1.0]
-    assert np.isnan(errors(labels, points()).depth_m).all()
+    assert assign_detections(labels, found).tolist() == [-1, -1, 0]
+    assert compute_errors(labels, found).norm_px.tolist() == [np.inf, np.inf, 1.0]
+    assert np.isnan(compute_errors(labels, points()).depth_m).all()
 
 
 def test_each_label_is_hit_once_in_order_of_confidence() -> None:
@@ -66,14 +71,16 @@ def test_each_label_is_hit_once_in_order_of_confidence() -> None:
     found = points(
         (0, 12, 10, 1, 0.9), (0, 11, 10, 1, 0.8), (0, 200, 10, 1, 0.7), (1, 10, 10, 1, 0.9)
     )
-    assert hits(labels, found, 16).tolist() == [0, 1, -1, -1]
-    assert hits(labels, found, 8).tolist() == [0, -1, -1, -1]
-    assert hits(points(), found, 16).tolist() == [-1] * 4
-    assert hits(labels, points(), 16).tolist() == []
+    assert match_within_radius(labels, found, 16).tolist() == [0, 1, -1, -1]
+    assert match_within_radius(labels, found, 8).tolist() == [0, -1, -1, -1]
+    assert match_within_radius(points(), found, 16).tolist() == [-1] * 4
+    assert match_within_radius(labels, points(), 16).tolist() == []
 
 
 def test_the_radius_itself_is_a_hit() -> None:
-    assert hits(points((0, 0, 0, 1, 1)), points((0, 0, 16, 1, 1)), 16).tolist() == [0]
+    assert match_within_radius(points((0, 0, 0, 1, 1)), points((0, 0, 16, 1, 1)), 16).tolist() == [
+        0
+    ]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -90,11 +97,11 @@ def test_images_do_not_touch_each_other(seed: int) -> None:
     first = np.arange(6)
     labels = Points.concatenate([a for a, _ in parts], first)
     found = Points.concatenate([b for _, b in parts], first)
-    together = errors(labels, found).norm_px
-    alone = np.concatenate([errors(a, b).norm_px for a, b in parts])
+    together = compute_errors(labels, found).norm_px
+    alone = np.concatenate([compute_errors(a, b).norm_px for a, b in parts])
     np.testing.assert_array_equal(together, alone)
-    together_hits = (hits(labels, found, 16) >= 0).tolist()
-    assert together_hits == [h >= 0 for a, b in parts for h in hits(a, b, 16)]
+    together_hits = (match_within_radius(labels, found, 16) >= 0).tolist()
+    assert together_hits == [h >= 0 for a, b in parts for h in match_within_radius(a, b, 16)]
 
 
 ROWS = st.lists(st.tuples(st.integers(0, 3), PIXELS, PIXELS), max_size=9).map(
@@ -120,4 +127,4 @@ def test_detections_take_the_nearest_label_that_is_free_one_after_the_other(
         distance, k = min(near, default=(np.inf, -1))
         wanted.append(k if distance <= radius_px else -1)
         free.discard(wanted[-1])
-    assert hits(labels, found, radius_px).tolist() == wanted
+    assert match_within_radius(labels, found, radius_px).tolist() == wanted

@@ -8,29 +8,29 @@ from dmrl.learn.networks.architectures import (
     ARCHITECTURES,
     CHANNEL_MEANINGS,
     LocaNet,
-    Residual,
-    build,
-    parameter_count,
-    product_count,
-    to_input,
+    ResidualBlock,
+    build_network,
+    count_macs,
+    count_parameters,
+    normalize_images,
 )
 
 
 def test_locanet_has_the_published_number_of_parameters() -> None:
-    assert parameter_count(build("locanet")) == 24_778
+    assert count_parameters(build_network("locanet")) == 24_778
 
 
 def test_the_small_networks_keep_to_their_budget() -> None:
-    assert parameter_count(build("dmrl-nano")) == 24_836
-    assert product_count(build("dmrl-nano")) == 57_720_320
-    assert parameter_count(build("dmrl-nano-fine")) == 24_740
-    assert product_count(build("dmrl-nano-fine")) == 75_102_720
-    assert product_count(build("locanet")) == 77_557_760
+    assert count_parameters(build_network("dmrl-nano")) == 24_836
+    assert count_macs(build_network("dmrl-nano")) == 57_720_320
+    assert count_parameters(build_network("dmrl-nano-fine")) == 24_740
+    assert count_macs(build_network("dmrl-nano-fine")) == 75_102_720
+    assert count_macs(build_network("locanet")) == 77_557_760
 
 
 @pytest.mark.parametrize(("name", "wide_px"), [("dmrl-nano", 287), ("dmrl-nano-fine", 311)])
 def test_how_far_a_network_sees(name: str, wide_px: int) -> None:
-    network = build(name).eval()
+    network = build_network(name).eval()
     for layer in network.modules():
         if isinstance(layer, torch.nn.Conv2d):
             layer.weight.data.abs_()
@@ -44,14 +44,14 @@ def test_how_far_a_network_sees(name: str, wide_px: int) -> None:
 @pytest.mark.parametrize("name", ARCHITECTURES)
 def test_layers_are_such_as_an_int8_path_carries(name: str) -> None:
     kinds = (torch.nn.Conv2d, torch.nn.BatchNorm2d, torch.nn.ReLU)
-    leaves = [m for m in build(name).modules() if not list(m.children())]
+    leaves = [m for m in build_network(name).modules() if not list(m.children())]
     assert all(isinstance(leaf, kinds) for leaf in leaves)
     assert {m.kernel_size for m in leaves if isinstance(m, kinds[0])} == {(1, 1), (3, 3)}
 
 
 @pytest.mark.parametrize("name", ARCHITECTURES)
 def test_every_network_gives_one_cell_per_stride(name: str) -> None:
-    network = build(name).eval()
+    network = build_network(name).eval()
     rows, cols = 224 // network.stride_px, 320 // network.stride_px
     with torch.no_grad():
         out = network(torch.zeros(2, 3, 224, 320))
@@ -65,9 +65,9 @@ def test_the_seed_decides_the_weights_and_leaves_torch_as_it_was() -> None:
     wanted = torch.rand(1)
     torch.manual_seed(7)
     first, again, other = (
-        build("locanet", seed=1),
-        build("locanet", seed=1),
-        build("locanet", seed=2),
+        build_network("locanet", seed=1),
+        build_network("locanet", seed=1),
+        build_network("locanet", seed=2),
     )
     assert torch.equal(torch.rand(1), wanted)
     assert torch.equal(first.convs[0].weight, again.convs[0].weight)  # type: ignore[union-attr, index, arg-type]
@@ -75,29 +75,31 @@ def test_the_seed_decides_the_weights_and_leaves_torch_as_it_was() -> None:
 
 
 def test_a_new_network_believes_in_nothing_yet() -> None:
-    network = build("locanet").eval()
+    network = build_network("locanet").eval()
     with torch.no_grad():
-        logit = network(to_input(torch.randint(0, 256, (1, 3, 64, 64), dtype=torch.uint8)))[:, 1]
+        logit = network(normalize_images(torch.randint(0, 256, (1, 3, 64, 64), dtype=torch.uint8)))[
+            :, 1
+        ]
     assert logit.sigmoid().max() < 0.05
 
 
 def test_input_is_scaled_to_about_one_and_stays_channels_last() -> None:
     images = torch.tensor([0, 128, 255], dtype=torch.uint8).reshape(1, 1, 1, 3).permute(0, 3, 1, 2)
-    assert to_input(images).flatten().tolist() == [-1.0, 0.0, 127 / 128]
+    assert normalize_images(images).flatten().tolist() == [-1.0, 0.0, 127 / 128]
     many = torch.zeros(2, 8, 8, 3, dtype=torch.uint8).permute(0, 3, 1, 2)
-    assert to_input(many).is_contiguous(memory_format=torch.channels_last)
+    assert normalize_images(many).is_contiguous(memory_format=torch.channels_last)
 
 
 def test_an_unknown_architecture_is_answered_with_the_known_ones() -> None:
     with pytest.raises(
         SettingError, match=r"no architecture resnet\. Choose one of: dmrl-large, dmrl-nano, "
     ):
-        build("resnet")
+        build_network("resnet")
 
 
 @pytest.mark.parametrize("name", [name for name in ARCHITECTURES if name != "locanet"])
 def test_kernels_begin_as_wide_as_keeps_the_size_of_gradients(name: str) -> None:
-    *convs, head = (m for m in build(name).modules() if isinstance(m, torch.nn.Conv2d))
+    *convs, head = (m for m in build_network(name).modules() if isinstance(m, torch.nn.Conv2d))
     for conv in convs:
         outs = conv.out_channels // conv.groups
         wanted = (2 / (conv.kernel_size[0] * conv.kernel_size[1] * outs)) ** 0.5
@@ -111,7 +113,7 @@ def test_kernels_begin_as_wide_as_keeps_the_size_of_gradients(name: str) -> None
 
 
 def test_locanet_is_layer_by_layer_what_was_published() -> None:
-    network = build("locanet", seed=4).eval()
+    network = build_network("locanet", seed=4).eval()
     assert isinstance(network, LocaNet)
     images = torch.randn(1, 3, 32, 40)
     x = images
@@ -131,7 +133,7 @@ def test_locanet_is_layer_by_layer_what_was_published() -> None:
 
 
 def test_a_block_adds_to_what_it_was_given() -> None:
-    block = Residual(4, 2).eval()
+    block = ResidualBlock(4, 2).eval()
     x = torch.randn(1, 4, 9, 11)
     wanted = (x + block.pointwise(block.depthwise(x))).clamp(min=0)
     torch.testing.assert_close(block(x), wanted)

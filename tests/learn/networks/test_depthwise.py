@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from dmrl.learn.networks.depthwise import Depthwise
+from dmrl.learn.networks.depthwise import DepthwiseConv
 
 
 @pytest.mark.heavy
@@ -12,7 +12,7 @@ from dmrl.learn.networks.depthwise import Depthwise
 )
 def test_gradients_are_those_of_torch(stride: int, dilation: int, shape: tuple[int, int]) -> None:
     torch.manual_seed(0)
-    layer = Depthwise(6, stride=stride, dilation=dilation).double()
+    layer = DepthwiseConv(6, stride=stride, dilation=dilation).double()
     x = torch.randn(3, 6, *shape, dtype=torch.double).requires_grad_()
     mine, torchs = layer(x), nn.Conv2d.forward(layer, x)
     torch.testing.assert_close(mine, torchs, rtol=1e-12, atol=1e-12)
@@ -24,7 +24,7 @@ def test_gradients_are_those_of_torch(stride: int, dilation: int, shape: tuple[i
 
 
 def test_an_odd_size_and_half_precision_work_too() -> None:
-    layer = Depthwise(6, stride=2)
+    layer = DepthwiseConv(6, stride=2)
     assert layer(torch.randn(1, 6, 7, 9)).shape == (1, 6, 4, 5)
     with torch.autocast("cpu", torch.bfloat16):
         out = layer(torch.randn(1, 6, 8, 10))
@@ -41,7 +41,7 @@ def test_any_size_gives_what_torch_gives(
     shape: tuple[int, int], stride: int, dilation: int, training: bool
 ) -> None:
     torch.manual_seed(1)
-    layer = Depthwise(2, stride=stride, dilation=dilation).double().train(training)
+    layer = DepthwiseConv(2, stride=stride, dilation=dilation).double().train(training)
     x = torch.randn(2, 2, *shape, dtype=torch.double).requires_grad_()
     mine, torchs = layer(x), nn.Conv2d.forward(layer, x)
     torch.testing.assert_close(mine, torchs)

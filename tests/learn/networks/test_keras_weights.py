@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from dmrl.errors import MissingExtra, ModelError
 from dmrl.learn.inference.loaded_model import load_model
 from dmrl.learn.networks import keras_weights
-from dmrl.learn.networks.architectures import to_input
-from dmrl.learn.networks.keras_weights import read_h5
+from dmrl.learn.networks.architectures import normalize_images
+from dmrl.learn.networks.keras_weights import load_keras_weights
 
 WIDTHS = (3, 8, 16, 32, 64)
 Variables = dict[str, NDArray[np.float32]]
@@ -66,7 +66,7 @@ def test_keras_weights_give_what_keras_would_compute(tmp_path: Path) -> None:
     network = load_model(write(tmp_path / "weights.h5", values)).network
     pixels = np.random.default_rng(1).integers(0, 256, (16, 24, 3), np.uint8)
     with torch.no_grad():
-        got = network(to_input(torch.from_numpy(pixels)[None].permute(0, 3, 1, 2)))[0]
+        got = network(normalize_images(torch.from_numpy(pixels)[None].permute(0, 3, 1, 2)))[0]
     wanted = by_hand(values, pixels / 128 - 1)
     np.testing.assert_allclose(got.permute(1, 2, 0).numpy(), wanted, rtol=1e-3, atol=1e-2)
 
@@ -77,7 +77,7 @@ def test_a_layer_of_another_shape_is_named_with_both_shapes(tmp_path: Path) -> N
     path = write(tmp_path / "weights.h5", values)
     text = r"conv2d_2/kernel has shape \(3, 3, 16, 48\), locanet needs \(3, 3, 16, 32\)"
     with pytest.raises(ModelError, match=text):
-        read_h5(path)
+        load_keras_weights(path)
 
 
 def test_a_missing_layer_is_named(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_a_missing_layer_is_named(tmp_path: Path) -> None:
     del values["batch_normalization_3/batch_normalization_3/gamma:0"]
     path = write(tmp_path / "weights.h5", values)
     with pytest.raises(ModelError, match="has no batch_normalization_3/gamma"):
-        read_h5(path)
+        load_keras_weights(path)
 
 
 def test_a_file_cut_short_is_one_line(tmp_path: Path) -> None:
@@ -130,4 +130,4 @@ def test_weights_that_stand_elsewhere_are_not_followed(tmp_path: Path, kind: str
             layout[:] = h5py.VirtualSource(str(ours), at, (2,))
             file.create_virtual_dataset(at, layout)
     with pytest.raises(ModelError, match=r"has no conv2d_4/bias"):
-        read_h5(path)
+        load_keras_weights(path)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool2d, relu
 
 from dmrl.learn.networks.architectures import Network
-from dmrl.learn.networks.trace import Op, operations
+from dmrl.learn.networks.trace import Op, trace_operations
 
 
 class Small(Network):
@@ -30,7 +30,7 @@ class Small(Network):
 
 def between(step: Any) -> list[Op]:
     """The operations of a step."""
-    image, first, *found, last, output = operations(Small(step))
+    image, first, *found, last, output = trace_operations(Small(step))
     assert (image.kind, first.sources, last.kind) == ("image", (image.name,), "conv")
     assert (output.kind, output.sources) == ("output", (last.name,))
     return found
@@ -82,7 +82,7 @@ def test_convolutions_and_norms_bring_their_numbers() -> None:
     network = Small(norm, bias=False)
     norm.running_mean.fill_(0.5)  # type: ignore[union-attr]
     norm.running_var.fill_(2.0)  # type: ignore[union-attr]
-    _, conv, found, *_ = operations(network)
+    _, conv, found, *_ = trace_operations(network)
     assert conv.settings == {"stride": 2, "dilation": 2, "padding": 2, "groups": 1}
     assert (conv.values["weight"] == network.first.weight.detach().numpy()).all()
     assert not conv.values["bias"].any()
@@ -96,7 +96,7 @@ def test_convolutions_and_norms_bring_their_numbers() -> None:
 def test_a_network_is_left_as_it_was() -> None:
     network = Small(nn.BatchNorm2d(4)).train()
     before = {name: value.clone() for name, value in network.state_dict().items()}
-    operations(network)
+    trace_operations(network)
     assert network.training
     assert all(torch.equal(before[name], value) for name, value in network.state_dict().items())
     assert not any(module._forward_hooks for module in network.modules())

@@ -4,42 +4,52 @@ from typing import Any
 
 import pytest
 
-from dmrl.learn.networks.architectures import CLASS, SPREAD
-from dmrl.learn.training.config import AT_LEAST_ONE, LARGE, MOST, NOT_NEGATIVE, SHARES, FitSettings
+from dmrl.learn.networks.architectures import CLASS_PREFIX, SPREAD_CHANNEL
+from dmrl.learn.training.config import (
+    FRACTION_SETTINGS,
+    MAX_SETTING,
+    MAX_SETTINGS,
+    NON_NEGATIVE_SETTINGS,
+    POSITIVE_SETTINGS,
+    TrainConfig,
+)
 from dmrl.learn.training.losses import TERMS
 
 
 def refused(**settings: Any) -> bool:
     try:
-        FitSettings(**settings)
+        TrainConfig(**settings)
     except ValueError as e:
         assert next(iter(settings)) in str(e) and "\n" not in str(e)
         return True
     return False
 
 
-@pytest.mark.parametrize("name", AT_LEAST_ONE)
+@pytest.mark.parametrize("name", POSITIVE_SETTINGS)
 def test_counts_begin_at_one(name: str) -> None:
     assert [refused(**{name: value}) for value in (0, 1)] == [True, False]
 
 
-@pytest.mark.parametrize("name", NOT_NEGATIVE)
+@pytest.mark.parametrize("name", NON_NEGATIVE_SETTINGS)
 def test_what_may_be_nothing_may_be_no_less(name: str) -> None:
     assert [refused(**{name: value}) for value in (-1e-9, 0)] == [True, False]
-    assert {term.weight for term in TERMS} <= set(NOT_NEGATIVE)
+    assert {term.weight for term in TERMS} <= set(NON_NEGATIVE_SETTINGS)
 
 
-@pytest.mark.parametrize("name", SHARES)
+@pytest.mark.parametrize("name", FRACTION_SETTINGS)
 def test_shares_are_from_nothing_to_all(name: str) -> None:
     most = 0.5 if name == "validation_share" else 1.0
     values = (-1e-9, 0.0, most, most + 1e-9)
     assert [refused(**{name: value}) for value in values] == [True, False, False, True]
 
 
-@pytest.mark.parametrize("name", MOST)
+@pytest.mark.parametrize("name", MAX_SETTINGS)
 def test_what_no_training_reaches_is_refused(name: str) -> None:
     """A recipe of a stranger: 2^63 images an epoch, a rate of 1e308, a billion patches."""
-    assert [refused(**{name: value}) for value in (MOST[name], MOST[name] + 1)] == [False, True]
+    assert [refused(**{name: value}) for value in (MAX_SETTINGS[name], MAX_SETTINGS[name] + 1)] == [
+        False,
+        True,
+    ]
 
 
 def test_rates_windows_and_cameras_that_cannot_be() -> None:
@@ -60,28 +70,28 @@ def test_rates_windows_and_cameras_that_cannot_be() -> None:
         ((1.0, 1.0, -1e308, 5.0), True),
     ):
         assert refused(intrinsics=intrinsics) == wrong
-    for share, wrong in ((0.0, False), (-1e-9, True), (LARGE, False), (1e308, True)):
+    for share, wrong in ((0.0, False), (-1e-9, True), (MAX_SETTING, False), (1e308, True)):
         assert refused(shares={"a": 1.0, "b": share}) == wrong
 
 
 def test_a_recipe_s_own_channels_are_the_spread_then_the_classes() -> None:
-    assert FitSettings().extra == ()
-    assert FitSettings(spread_weight=0.1, classes=("a", "b")).extra == (
-        SPREAD,
-        f"{CLASS}0",
-        f"{CLASS}1",
+    assert TrainConfig().extra_channels == ()
+    assert TrainConfig(spread_weight=0.1, classes=("a", "b")).extra_channels == (
+        SPREAD_CHANNEL,
+        f"{CLASS_PREFIX}0",
+        f"{CLASS_PREFIX}1",
     )
 
 
 def test_the_last_epochs_are_plain_where_that_is_asked_for() -> None:
-    settings = FitSettings(epochs=10, plain_epochs=3, rotation_deg=5.0)
+    settings = TrainConfig(epochs=10, plain_epochs=3, rotation_deg=5.0)
     turns = [settings.augmentation(epoch).rotation_deg for epoch in range(10)]
     assert turns == [5.0] * 7 + [0.0] * 3
     assert settings.augmentation(9).flip_share == settings.flip_share
 
 
 def test_what_nobody_asks_for_is_off() -> None:
-    plain = FitSettings()
+    plain = TrainConfig()
     for name in (
         *("init_share", "hard_share", "paste", "plain_epochs", "frozen_norm_epochs", "grey_share"),
         *("spread_weight", "seed"),
@@ -93,7 +103,7 @@ def test_what_nobody_asks_for_is_off() -> None:
 
 
 def test_defaults_are_those_that_docs_training_md_tells() -> None:
-    plain = FitSettings()
+    plain = TrainConfig()
     assert (plain.architecture, plain.epochs) == ("dmrl-nano", 60)
     assert (plain.validation_share, plain.false_alarms) == (0.1, 0.05)
     assert (plain.optimizer, plain.label_noise, plain.precision) == ("muon", "ignore", "float32")

@@ -12,7 +12,7 @@ from torch import distributed
 
 from dmrl.errors import SettingError
 from dmrl.learn.training import distributed as group
-from dmrl.learn.training.distributed import Group, in_group
+from dmrl.learn.training.distributed import ProcessGroup, run_distributed
 
 
 @pytest.fixture
@@ -30,20 +30,20 @@ def work(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_all_work_and_the_first_returns(work: ModuleType) -> None:
     threads = torch.get_num_threads()
-    assert in_group(2, partial(work.rank_sum, more=10)) == 11
+    assert run_distributed(2, partial(work.rank_sum, more=10)) == 11
     assert torch.get_num_threads() == threads
     assert not distributed.is_initialized()
 
 
 def test_one_that_was_killed_is_one_line(work: ModuleType) -> None:
     with pytest.raises(SettingError, match=r"one of the 2 processes was killed.*--resume"):
-        in_group(2, work.half_dies)
+        run_distributed(2, work.half_dies)
     assert not distributed.is_initialized()
 
 
 def test_the_others_end_with_the_first(work: ModuleType) -> None:
     with pytest.raises(RuntimeError, match="a bug"):
-        in_group(2, work.first_fails)
+        run_distributed(2, work.first_fails)
     assert not distributed.is_initialized()
 
 
@@ -51,17 +51,20 @@ def test_a_start_that_failed_leaves_nothing_to_the_next(
     work: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as short:
-        short.setattr(group, "MEETING_S", 0.1)
+        short.setattr(group, "CONNECT_TIMEOUT_S", 0.1)
         with pytest.raises(SettingError, match=r"the 2 processes did not find each other.*0\.1 s"):
-            group._member((tmp_path / "meeting").as_uri(), 0, 2, group.Group)
+            group._join_group((tmp_path / "meeting").as_uri(), 0, 2, group.ProcessGroup)
     assert not distributed.is_initialized()
-    assert in_group(2, partial(work.rank_sum, more=0)) == 1
+    assert run_distributed(2, partial(work.rank_sum, more=0)) == 1
 
 
 def test_once_they_have_met_one_may_wait_longer(tmp_path: Path) -> None:
-    def patience(_: Group) -> float:
+    def patience(_: ProcessGroup) -> float:
         found = distributed.distributed_c10d._get_default_group()
         backend = found._get_backend(torch.device("cpu"))
         return float(backend.options._timeout.total_seconds())
 
-    assert group._member((tmp_path / "meeting").as_uri(), 0, 1, patience) == group.WORK_S
+    assert (
+        group._join_group((tmp_path / "meeting").as_uri(), 0, 1, patience)
+        == group.COLLECTIVE_TIMEOUT_S
+    )

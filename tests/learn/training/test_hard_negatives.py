@@ -2,9 +2,13 @@ import numpy as np
 import pytest
 import torch
 
-from dmrl.learn.data.batches import FIELDS, Examples
-from dmrl.learn.networks.architectures import DETECTION, Network
-from dmrl.learn.training.hard_negatives import beliefs, empties, mined
+from dmrl.learn.data.batches import ROBOT_FIELDS, ExampleSet
+from dmrl.learn.networks.architectures import DETECTION_CHANNELS, Network
+from dmrl.learn.training.hard_negatives import (
+    compute_peak_confidences,
+    find_empty_images,
+    mine_hard_negatives,
+)
 
 
 class Bright(Network):
@@ -19,21 +23,21 @@ class Bright(Network):
         return torch.cat([light, self.scale * light], dim=1)
 
 
-def examples() -> Examples:
+def examples() -> ExampleSet:
     """Two images with a robot, then three without: dark, grey and bright."""
     pixels = np.zeros((5, 16, 24, 3), np.uint8)
     pixels[3], pixels[4] = 128, 255
-    robots = np.full((5, 1, len(FIELDS)), np.nan, np.float32)
+    robots = np.full((5, 1, len(ROBOT_FIELDS)), np.nan, np.float32)
     robots[:2, 0, :6] = (12, 8, 1, 0, 0, 0)
-    return Examples([pixels], robots)
+    return ExampleSet([pixels], robots)
 
 
 def test_what_the_network_believes_comes_more_often() -> None:
     network = Bright().train()
-    assert network.channels == DETECTION
-    believed = beliefs(network, examples(), np.arange(5))
+    assert network.channels == DETECTION_CHANNELS
+    believed = compute_peak_confidences(network, examples(), np.arange(5))
     assert (np.diff(believed[2:]) > 0).all()
-    shares = mined(network, examples(), None, 0.4)
+    shares = mine_hard_negatives(network, examples(), None, 0.4)
     assert shares is not None
     assert network.training
     assert shares.mean() == pytest.approx(1)
@@ -43,14 +47,14 @@ def test_what_the_network_believes_comes_more_often() -> None:
 
 
 def test_images_with_a_robot_keep_their_proportions() -> None:
-    shares = mined(Bright(), examples(), np.array([1.0, 3.0, 1.0, 0.5, 0.5]), 0.2)
+    shares = mine_hard_negatives(Bright(), examples(), np.array([1.0, 3.0, 1.0, 0.5, 0.5]), 0.2)
     assert shares is not None
     assert shares[1] == pytest.approx(3 * shares[0])
     assert shares[:2].sum() / shares.sum() == pytest.approx(0.8)
 
 
 def test_an_image_without_a_share_is_not_mined() -> None:
-    shares = mined(Bright(), examples(), np.array([1.0, 1.0, 1.0, 1.0, 0.0]), 0.4)
+    shares = mine_hard_negatives(Bright(), examples(), np.array([1.0, 1.0, 1.0, 1.0, 0.0]), 0.4)
     assert shares is not None
     assert shares[4] == 0
     assert shares[2:].sum() / shares.sum() == pytest.approx(0.4)
@@ -58,5 +62,5 @@ def test_an_image_without_a_share_is_not_mined() -> None:
 
 def test_without_images_of_either_kind_nothing_changes() -> None:
     full = examples().select(np.array([True, True, False, False, False]))
-    assert empties(full).tolist() == [False, False]
-    assert mined(Bright(), full, None, 0.4) is None
+    assert find_empty_images(full).tolist() == [False, False]
+    assert mine_hard_negatives(Bright(), full, None, 0.4) is None

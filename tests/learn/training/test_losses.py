@@ -5,19 +5,19 @@ import numpy as np
 import pytest
 import torch
 
-from dmrl.learn.data.targets import targets
-from dmrl.learn.networks.architectures import build, by_name
-from dmrl.learn.training.config import FitSettings
+from dmrl.learn.data.targets import build_targets
+from dmrl.learn.networks.architectures import build_network, unbind_channels
+from dmrl.learn.training.config import TrainConfig
 from dmrl.learn.training.losses import (
     TERMS,
     DepthLoss,
     LossSettings,
     class_loss,
+    compute_loss_terms,
     confidence_loss,
     depth_loss,
     offset_loss,
     spread_loss,
-    weighted,
 )
 
 
@@ -101,7 +101,7 @@ def test_class_loss_is_the_papers_and_only_where_the_class_is_known() -> None:
     assert float(class_loss(logits, class_id, weight)) == pytest.approx(-0.5 * 2 * math.log(p))
 
 
-WEIGHTS = [field.name for field in fields(FitSettings) if field.name.endswith("_weight")]
+WEIGHTS = [field.name for field in fields(TrainConfig) if field.name.endswith("_weight")]
 
 
 def test_every_weight_weighs_one_term() -> None:
@@ -111,14 +111,14 @@ def test_every_weight_weighs_one_term() -> None:
 
 @pytest.mark.parametrize("key", WEIGHTS)
 def test_every_weight_changes_the_loss_by_its_own_term(key: str) -> None:
-    settings = FitSettings(classes=("a", "b"), spread_weight=1.0)
-    network = build("dmrl-nano", extra=settings.extra).eval()
+    settings = TrainConfig(classes=("a", "b"), spread_weight=1.0)
+    network = build_network("dmrl-nano", extra=settings.extra_channels).eval()
     robots = torch.tensor([[[20.0, 12.0, 1.5, 1.0, 1.0, 0.1, 15.0, 8.0, 25.0, 16.0, 1.0]]])
-    wanted = targets(robots, (4, 5), sigma_cells=0.7)
+    wanted = build_targets(robots, (4, 5), sigma_cells=0.7)
     with torch.no_grad():
-        out = by_name(network.channels, network(torch.ones(1, 3, 32, 40)))
-    before = weighted(out, wanted, settings)
-    after = weighted(out, wanted, replace(settings, **{key: 3 * getattr(settings, key)}))
+        out = unbind_channels(network.channels, network(torch.ones(1, 3, 32, 40)))
+    before = compute_loss_terms(out, wanted, settings)
+    after = compute_loss_terms(out, wanted, replace(settings, **{key: 3 * getattr(settings, key)}))
     own = next(k for k, term in enumerate(TERMS) if term.weight == key)
     assert float(before[own]) != 0
     factors = torch.ones(len(TERMS))
@@ -127,12 +127,16 @@ def test_every_weight_changes_the_loss_by_its_own_term(key: str) -> None:
 
 
 def test_a_term_is_nothing_to_a_network_that_lacks_its_channels() -> None:
-    network = build("locanet").eval()
-    wanted = targets(torch.full((1, 1, 11), math.nan), (4, 5), sigma_cells=0.7)
+    network = build_network("locanet").eval()
+    wanted = build_targets(torch.full((1, 1, 11), math.nan), (4, 5), sigma_cells=0.7)
     with torch.no_grad():
-        out = by_name(network.channels, network(torch.ones(1, 3, 32, 40)))
+        out = unbind_channels(network.channels, network(torch.ones(1, 3, 32, 40)))
     parts = dict(
-        zip((term.name for term in TERMS), weighted(out, wanted, LossSettings()), strict=True)
+        zip(
+            (term.name for term in TERMS),
+            compute_loss_terms(out, wanted, LossSettings()),
+            strict=True,
+        )
     )
     assert {name for name, part in parts.items() if not part} >= {"offset_loss", "class_loss"}
     assert parts["confidence_loss"] > 0

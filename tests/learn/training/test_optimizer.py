@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from dmrl.learn.networks.architectures import build
-from dmrl.learn.training.optimizer import Muon, new_optimizer, orthogonal
+from dmrl.learn.networks.architectures import build_network
+from dmrl.learn.training.optimizer import Muon, build_optimizer, orthogonalize
 
 
 @pytest.mark.parametrize("shape", [(48, 48), (48, 32), (32, 144)])
@@ -11,7 +11,7 @@ def test_every_direction_of_an_update_is_of_about_the_same_size(shape: tuple[int
     torch.manual_seed(0)
     u, _, v = torch.linalg.svd(torch.randn(shape), full_matrices=False)
     before = torch.logspace(0, -2, min(shape))
-    after = orthogonal(u @ torch.diag(before) @ v)
+    after = orthogonalize(u @ torch.diag(before) @ v)
     torch.testing.assert_close(u.T @ after @ v.T, torch.diag((u.T @ after @ v.T).diagonal()))
     sizes = torch.linalg.svdvals(after)
     assert float(sizes.min()) > 0.6
@@ -19,8 +19,8 @@ def test_every_direction_of_an_update_is_of_about_the_same_size(shape: tuple[int
 
 
 def test_muon_takes_the_kernels_that_mix_channels() -> None:
-    network = build("dmrl-nano")
-    optimizer = new_optimizer(network, "muon", 0.01)
+    network = build_network("dmrl-nano")
+    optimizer = build_optimizer(network, "muon", 0.01)
     assert isinstance(optimizer, Muon)
     mixing = {id(p) for p in optimizer.param_groups[0]["params"]}
     names = [name for name, p in network.named_parameters() if id(p) in mixing]
@@ -35,8 +35,8 @@ def test_muon_takes_the_kernels_that_mix_channels() -> None:
 def test_a_step_of_muon_is_as_large_as_one_of_adam_and_downhill() -> None:
     sizes = {}
     for name in ("adam", "muon"):
-        network = build("dmrl-nano", seed=3)
-        optimizer = new_optimizer(network, name, 0.01)  # type: ignore[arg-type]
+        network = build_network("dmrl-nano", seed=3)
+        optimizer = build_optimizer(network, name, 0.01)  # type: ignore[arg-type]
         kernel = network.get_parameter("body.5.0.weight")
         before = kernel.detach().clone()
         torch.manual_seed(1)
@@ -54,14 +54,14 @@ def test_a_step_of_muon_is_as_large_as_one_of_adam_and_downhill() -> None:
 
 
 def test_without_weight_decay_adam_is_the_papers() -> None:
-    assert type(new_optimizer(build("locanet"), "adam", 0.0)) is torch.optim.Adam
-    assert type(new_optimizer(build("locanet"), "adam", 0.1)) is torch.optim.AdamW
+    assert type(build_optimizer(build_network("locanet"), "adam", 0.0)) is torch.optim.Adam
+    assert type(build_optimizer(build_network("locanet"), "adam", 0.1)) is torch.optim.AdamW
 
 
 @pytest.mark.parametrize("name", ["adam", "muon"])
 def test_only_kernels_decay(name: str) -> None:
-    network = build("dmrl-nano")
-    groups = new_optimizer(network, name, 0.01).param_groups  # type: ignore[arg-type]
+    network = build_network("dmrl-nano")
+    groups = build_optimizer(network, name, 0.01).param_groups  # type: ignore[arg-type]
     decays = {id(p): group["weight_decay"] for group in groups for p in group["params"]}
     for parameter in network.parameters():
         assert decays[id(parameter)] == (0.01 if parameter.ndim > 1 else 0.0)
@@ -111,11 +111,11 @@ def test_a_matrix_is_brought_to_even_singular_values_lying_or_standing(
     matrix = np.random.default_rng(rows).normal(size=(rows, columns)).astype(np.float32)
     lying = matrix.T if rows > columns else matrix
     wanted = plain_orthogonal(lying)
-    found = orthogonal(torch.from_numpy(matrix)).numpy()
+    found = orthogonalize(torch.from_numpy(matrix)).numpy()
     assert (found.T if rows > columns else found) == pytest.approx(wanted, abs=1e-4)
 
 
 def test_adam_s_epsilon_is_the_paper_s() -> None:
     for name, decay in (("adam", 0.0), ("adam", 0.1), ("muon", 0.1)):
-        optimizer = new_optimizer(build("dmrl-nano"), name, decay)  # type: ignore[arg-type]
+        optimizer = build_optimizer(build_network("dmrl-nano"), name, decay)  # type: ignore[arg-type]
         assert {group["eps"] for group in optimizer.param_groups} == {1e-7}

@@ -15,7 +15,10 @@ def test_a_full_disk_is_one_error_and_no_traceback_of_a_thread(
     def full(_: RecordWriter, data: bytes) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    with pytest.raises(OSError, match="No space left"), tensorboard_log.opened(tmp_path, 0) as add:
+    with (
+        pytest.raises(OSError, match="No space left"),
+        tensorboard_log.open_log(tmp_path, 0) as add,
+    ):
         monkeypatch.setattr(RecordWriter, "write", full)
         until = time.monotonic() + 60
         while time.monotonic() < until:

@@ -8,21 +8,21 @@ from numpy.typing import NDArray
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dmrl.errors import SettingError
-from dmrl.learn.data.batches import CLASS_ID, FIELDS, Examples, gathered
+from dmrl.learn.data.batches import CLASS_ID, ROBOT_FIELDS, ExampleSet, collate
 from dmrl.learn.inference.decode_grids import decode
 from dmrl.learn.inference.loaded_model import Model, save_model
-from dmrl.learn.inference.threshold import best_threshold
-from dmrl.learn.networks.architectures import build
-from dmrl.learn.training.config import FitSettings
-from dmrl.learn.training.train_step import LOSSES, Average, losses
-from dmrl.learn.training.trainer import Training, device_of, new_network
-from dmrl.learn.training.validation import scores
+from dmrl.learn.inference.threshold import select_threshold
+from dmrl.learn.networks.architectures import build_network
+from dmrl.learn.training.config import TrainConfig
+from dmrl.learn.training.train_step import LOSS_NAMES, WeightEma, compute_losses
+from dmrl.learn.training.trainer import Trainer, build_initial_network, select_device
+from dmrl.learn.training.validation import score_examples
 
 from ..fitting import EVERYTHING, SETTINGS, dots, trained
 
 
 @pytest.mark.heavy
-def test_same_seed_same_bytes_and_another_seed_others(examples: Examples, tmp_path: Path) -> None:
+def test_same_seed_same_bytes_and_another_seed_others(examples: ExampleSet, tmp_path: Path) -> None:
     weights = []
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         trained(examples, tmp_path / name, replace(SETTINGS, epochs=1, seed=seed))
@@ -48,14 +48,14 @@ def test_training_finds_the_dot(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_dmrl_nano_finds_the_dot_within_its_cell(tmp_path: Path) -> None:
     examples = dots(64)
-    settings = FitSettings(
+    settings = TrainConfig(
         epochs=20, batch_size=8, ema_steps=40, rotation_deg=0.0, blur_share=0.0, device="cpu"
     )
     _, network = trained(examples, tmp_path / "run", settings)
-    scored = scores(network, examples)
+    scored = score_examples(network, examples)
     assert np.median(scored.label_error.norm_px) < 1.0
     assert np.nanmean(np.abs(scored.label_error.depth_m)) < 0.15
-    threshold = best_threshold(scored)
+    threshold = select_threshold(scored)
     assert threshold is not None
     assert 0.05 < threshold < 0.95
 
@@ -73,7 +73,7 @@ def test_the_kept_weights_are_the_mean_of_those_of_many_steps(tmp_path: Path) ->
 
 
 def test_the_last_epochs_keep_images_whole() -> None:
-    settings = FitSettings(epochs=10, plain_epochs=3, paste=1.0)
+    settings = TrainConfig(epochs=10, plain_epochs=3, paste=1.0)
     assert settings.augmentation(6) == replace(settings, plain_epochs=0).augmentation(9)
     plain = settings.augmentation(7)
     assert (plain.mosaic_share, plain.paste, plain.rotation_deg) == (0, 0, 0)
@@ -83,12 +83,12 @@ def test_the_last_epochs_keep_images_whole() -> None:
 
 @pytest.mark.parametrize("frozen", [0, 1])
 def test_frozen_norms_are_learnt_but_not_measured(
-    examples: Examples, tmp_path: Path, frozen: int
+    examples: ExampleSet, tmp_path: Path, frozen: int
 ) -> None:
     settings = replace(SETTINGS, epochs=2, frozen_norm_epochs=frozen)
-    training = Training(new_network(settings, examples), examples, settings, tmp_path)
+    training = Trainer(build_initial_network(settings, examples), examples, settings, tmp_path)
     seen: list[dict[str, torch.Tensor]] = []
-    for number, _ in enumerate(training.steps(), start=1):
+    for number, _ in enumerate(training.train_steps(), start=1):
         if number % 7 == 0:  # the end of an epoch: 20 images by threes
             seen.append({k: v.clone() for k, v in training.network.state_dict().items()})
     first, second = seen
@@ -102,31 +102,31 @@ def test_frozen_norms_are_learnt_but_not_measured(
     assert not any(torch.equal(first[name], second[name]) for name in scales)
 
 
-def test_a_teacher_that_says_the_same_leaves_nothing_to_learn(examples: Examples) -> None:
-    settings = FitSettings(distill_share=1.0, device="cpu")
-    batch = gathered(examples, np.arange(8))
-    student = build("dmrl-nano", seed=1).eval()
-    teacher = build("dmrl-large", seed=2).eval()
+def test_a_teacher_that_says_the_same_leaves_nothing_to_learn(examples: ExampleSet) -> None:
+    settings = TrainConfig(distill_share=1.0, device="cpu")
+    batch = collate(examples, np.arange(8))
+    student = build_network("dmrl-nano", seed=1).eval()
+    teacher = build_network("dmrl-large", seed=2).eval()
     for network in (student, teacher):
         with torch.no_grad():
             network.head.bias[1] = 1.0  # type: ignore[union-attr, index, operator]
-    itself = losses(student, batch, settings, student)
-    other = losses(student, batch, settings, teacher)
+    itself = compute_losses(student, batch, settings, student)
+    other = compute_losses(student, batch, settings, teacher)
     assert itself.tolist() == pytest.approx([0.0] * 5, abs=1e-6)
     assert (other[:3] > 1e-3).all()
-    half = losses(student, batch, replace(settings, distill_share=0.5), teacher)
-    labels = losses(student, batch, settings)
+    half = compute_losses(student, batch, replace(settings, distill_share=0.5), teacher)
+    labels = compute_losses(student, batch, settings)
     torch.testing.assert_close(half, (other + labels) / 2)
 
 
 @pytest.mark.slow
-def test_classes_and_the_spread_are_learnt(examples: Examples, tmp_path: Path) -> None:
+def test_classes_and_the_spread_are_learnt(examples: ExampleSet, tmp_path: Path) -> None:
     # Squares of class 1 are grey: that is what tells them apart.
     pixels: NDArray[np.uint8] = np.concatenate(list(dots(64).pixels))
     robots = dots(64).robots
     grey = robots[:, 0, CLASS_ID] == 1
     pixels[grey] = np.minimum(pixels[grey], 120)
-    settings = FitSettings(
+    settings = TrainConfig(
         epochs=15,
         batch_size=8,
         ema_steps=20,
@@ -137,20 +137,20 @@ def test_classes_and_the_spread_are_learnt(examples: Examples, tmp_path: Path) -
         spread_weight=1.0,
         classes=("a", "b"),
     )
-    _, network = trained(Examples([pixels], robots), tmp_path / "run", settings)
+    _, network = trained(ExampleSet([pixels], robots), tmp_path / "run", settings)
     found = decode(*Model(network, "dmrl-nano").grids(pixels))
     assert (found.class_id[:, 0] == grey).mean() > 0.9
     error_m = np.abs(found.depth_m[:, 0] - 1.5)
     assert 0.2 < np.median(error_m) / np.median(found.sigma_depth_m[:, 0]) < 2
 
 
-def test_a_loss_that_is_no_number_stops_the_training(examples: Examples, tmp_path: Path) -> None:
+def test_a_loss_that_is_no_number_stops_the_training(examples: ExampleSet, tmp_path: Path) -> None:
     wild = replace(SETTINGS, learning_rate=1e7, warmup_epochs=0)
     with pytest.raises(SettingError, match=r"the loss is nan in epoch 1, step 7\. Lower"):
         trained(examples, tmp_path / "run", wild)
 
 
-def test_tensorboard_gets_loss_and_learning_rate(examples: Examples, tmp_path: Path) -> None:
+def test_tensorboard_gets_loss_and_learning_rate(examples: ExampleSet, tmp_path: Path) -> None:
     trained(examples, tmp_path / "run")
     log = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
     log.Reload()
@@ -158,13 +158,13 @@ def test_tensorboard_gets_loss_and_learning_rate(examples: Examples, tmp_path: P
     assert [event.step for event in log.Scalars("loss/train")] == [7, 14, 21, 28]
 
 
-def test_validation_is_watched_and_changes_nothing(examples: Examples, tmp_path: Path) -> None:
+def test_validation_is_watched_and_changes_nothing(examples: ExampleSet, tmp_path: Path) -> None:
     weights = []
     for name, watched in (("without", None), ("with", examples)):
         (tmp_path / name).mkdir()
-        network = new_network(SETTINGS, examples)
-        training = Training(network, examples, SETTINGS, tmp_path / name, validation=watched)
-        assert sum(1 for _ in training.steps()) == 28
+        network = build_initial_network(SETTINGS, examples)
+        training = Trainer(network, examples, SETTINGS, tmp_path / name, validation=watched)
+        assert sum(1 for _ in training.train_steps()) == 28
         assert all(("validation_loss" in epoch) == bool(watched) for epoch in training.history)
         save_model(Model(network, "locanet"), tmp_path / name)
         weights.append((tmp_path / name / "model.safetensors").read_bytes())
@@ -194,28 +194,28 @@ def test_validation_is_watched_and_changes_nothing(examples: Examples, tmp_path:
 )
 def test_settings_out_of_range_are_named(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=r"learning_rate: must|" + name):
-        replace(FitSettings(), **{name: value})  # type: ignore[arg-type]
+        replace(TrainConfig(), **{name: value})  # type: ignore[arg-type]
 
 
-def test_images_that_do_not_fit_the_network_are_refused(examples: Examples) -> None:
-    odd = Examples([p[:, :30] for p in examples.pixels], examples.robots)
+def test_images_that_do_not_fit_the_network_are_refused(examples: ExampleSet) -> None:
+    odd = ExampleSet([p[:, :30] for p in examples.pixels], examples.robots)
     with pytest.raises(SettingError, match=r"images of 48 x 30 px do not fit locanet"):
-        new_network(SETTINGS, odd)
-    none = Examples([p[:0] for p in examples.pixels], examples.robots[:0])
+        build_initial_network(SETTINGS, odd)
+    none = ExampleSet([p[:0] for p in examples.pixels], examples.robots[:0])
     with pytest.raises(SettingError, match="no images to train on"):
-        new_network(SETTINGS, none)
+        build_initial_network(SETTINGS, none)
 
 
 def test_a_missing_cuda_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    assert device_of("auto").type == "cpu"
+    assert select_device("auto").type == "cpu"
     with pytest.raises(SettingError, match="no CUDA device here"):
-        device_of("cuda")
+        select_device("cuda")
 
 
 def test_a_mean_of_weights_follows_the_first_steps_and_forgets_slowly_later() -> None:
-    network = build("dmrl-nano")
-    mean = Average(network, 100)
+    network = build_network("dmrl-nano")
+    mean = WeightEma(network, 100)
     expected = 0.0
     for step in range(1, 300):
         with torch.no_grad():
@@ -230,14 +230,14 @@ def test_a_mean_of_weights_follows_the_first_steps_and_forgets_slowly_later() ->
     assert float(next(mean.network.parameters()).flatten()[0]) < 299 - 20
 
 
-def test_a_teacher_s_share_of_the_loss_is_the_one_that_is_asked_for(examples: Examples) -> None:
+def test_a_teacher_s_share_of_the_loss_is_the_one_that_is_asked_for(examples: ExampleSet) -> None:
     settings = replace(SETTINGS, architecture="dmrl-nano")
-    pupil, teacher = (build("dmrl-nano", seed=seed).eval() for seed in (1, 2))
-    batch = gathered(examples, [0, 1])
+    pupil, teacher = (build_network("dmrl-nano", seed=seed).eval() for seed in (1, 2))
+    batch = collate(examples, [0, 1])
     with torch.no_grad():
-        alone = losses(pupil, batch, settings)
+        alone = compute_losses(pupil, batch, settings)
         none, half, all_ = (
-            losses(pupil, batch, replace(settings, distill_share=share), teacher)
+            compute_losses(pupil, batch, replace(settings, distill_share=share), teacher)
             for share in (0.0, 0.25, 1.0)
         )
     torch.testing.assert_close(none, alone)
@@ -247,15 +247,15 @@ def test_a_teacher_s_share_of_the_loss_is_the_one_that_is_asked_for(examples: Ex
 
 @pytest.mark.parametrize(("width", "height", "fits"), [(48, 32, 1), (44, 32, 0), (48, 28, 0)])
 def test_both_sides_of_images_fit_a_network(width: int, height: int, fits: int) -> None:
-    robots = np.full((1, 1, len(FIELDS)), np.nan, np.float32)
-    images = Examples([np.zeros((1, height, width, 3), np.uint8)], robots)
+    robots = np.full((1, 1, len(ROBOT_FIELDS)), np.nan, np.float32)
+    images = ExampleSet([np.zeros((1, height, width, 3), np.uint8)], robots)
     if fits:
-        assert new_network(SETTINGS, images).stride_px == 8
+        assert build_initial_network(SETTINGS, images).stride_px == 8
     else:
         with pytest.raises(SettingError, match=f"images of {width} x {height} px do not fit"):
-            new_network(SETTINGS, images)
+            build_initial_network(SETTINGS, images)
 
 
 def test_terms_of_the_loss_stand_in_this_order() -> None:
     names = ("confidence", "depth", "offset", "spread", "class")
-    assert tuple(f"{name}_loss" for name in names) == LOSSES
+    assert tuple(f"{name}_loss" for name in names) == LOSS_NAMES

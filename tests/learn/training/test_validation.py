@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
-from dmrl.learn.data.batches import FIELDS, Examples
-from dmrl.learn.inference.detection_metrics import score
+from dmrl.learn.data.batches import ROBOT_FIELDS, ExampleSet
+from dmrl.learn.inference.detection_metrics import score_detections
 from dmrl.learn.inference.matching import Points
-from dmrl.learn.inference.threshold import alarms, best_threshold
-from dmrl.learn.networks.architectures import build
-from dmrl.learn.training.config import FitSettings
-from dmrl.learn.training.validation import WATCHED, labels, validation_figures
+from dmrl.learn.inference.threshold import count_false_alarms, select_threshold
+from dmrl.learn.networks.architectures import build_network
+from dmrl.learn.training.config import TrainConfig
+from dmrl.learn.training.validation import VALIDATION_METRICS, select_visible_labels, validate
 
 
 def points(image: list[int], u_px: list[float], confidence: list[float]) -> Points:
@@ -20,7 +20,7 @@ def test_the_threshold_lies_below_the_last_detection_that_pays() -> None:
     # Ten right ones, then a wrong one, then a right one, then wrong ones.
     confidence = [0.9] * 10 + [0.6, 0.5, 0.3, 0.2]
     found = points([*range(12), 11, 11], [50.0] * 10 + [200.0, 50.0, 200.0, 250.0], confidence)
-    assert best_threshold(score(12, truth, found)) == pytest.approx(0.4)
+    assert select_threshold(score_detections(12, truth, found)) == pytest.approx(0.4)
 
 
 def test_the_threshold_keeps_to_the_rate_of_false_alarms() -> None:
@@ -28,56 +28,63 @@ def test_the_threshold_keeps_to_the_rate_of_false_alarms() -> None:
     # In 40 images without a robot three are believed to hold one: at 0.7, 0.55 and 0.45.
     confidence = [0.9] * 8 + [0.6, 0.5, 0.4, 0.3] + [0.7, 0.55, 0.45]
     found = points([*range(12), 20, 30, 40], [50.0] * 12 + [80.0] * 3, confidence)
-    scored = score(52, truth, found)
-    assert best_threshold(scored) == pytest.approx(0.15)
-    assert best_threshold(scored, false_alarms=0.05) == pytest.approx(0.475)  # two of 40
-    assert best_threshold(scored, false_alarms=0.0) == pytest.approx(0.8)
+    scored = score_detections(52, truth, found)
+    assert select_threshold(scored) == pytest.approx(0.15)
+    assert select_threshold(scored, false_alarms=0.05) == pytest.approx(0.475)  # two of 40
+    assert select_threshold(scored, false_alarms=0.0) == pytest.approx(0.8)
     # Nineteen empty images cannot tell a rate of one in twenty.
-    few = score(31, truth, points([*range(12), 20], [50.0] * 12 + [80.0], confidence[:13]))
-    assert best_threshold(few, false_alarms=0.0) == pytest.approx(0.15)
+    few = score_detections(
+        31, truth, points([*range(12), 20], [50.0] * 12 + [80.0], confidence[:13])
+    )
+    assert select_threshold(few, false_alarms=0.0) == pytest.approx(0.15)
 
 
 def test_a_false_alarm_that_is_the_surest_of_all_is_not_let_through() -> None:
     truth = points(list(range(12)), [50.0] * 12, [1.0] * 12)
     found = points([*range(12), 20], [50.0] * 12 + [80.0], [0.9] * 12 + [0.96])
-    assert best_threshold(score(40, truth, found), false_alarms=0.01) == pytest.approx(0.98)
+    assert select_threshold(score_detections(40, truth, found), false_alarms=0.01) == pytest.approx(
+        0.98
+    )
 
 
 def test_alarms_are_counted_where_nobody_is() -> None:
     truth = points([0], [50.0], [1.0])
     found = points([0, 0, 1, 1, 2], [50.0, 150.0, 60.0, 90.0, 60.0], [0.9, 0.8, 0.7, 0.6, 0.2])
-    scored = score(5, truth, found)
-    at_half = alarms(scored, 0.5)
+    scored = score_detections(5, truth, found)
+    at_half = count_false_alarms(scored, 0.5)
     assert (at_half.empty_images, at_half.alarmed_images, at_half.false_alarms) == (4, 1, 0.5)
-    assert alarms(scored, 0.1).alarmed_images == 2
-    assert np.isnan(alarms(score(1, truth, truth), 0.5).false_alarms)
+    assert count_false_alarms(scored, 0.1).alarmed_images == 2
+    assert np.isnan(count_false_alarms(score_detections(1, truth, truth), 0.5).false_alarms)
 
 
 def test_few_labels_or_nothing_right_give_no_threshold() -> None:
     few = points([0, 1], [50.0, 50.0], [1.0, 1.0])
-    assert best_threshold(score(2, few, few)) is None
+    assert select_threshold(score_detections(2, few, few)) is None
     many = points(list(range(12)), [50.0] * 12, [1.0] * 12)
     far = points(list(range(12)), [250.0] * 12, [0.9] * 12)
-    assert best_threshold(score(12, many, far)) is None
+    assert select_threshold(score_detections(12, many, far)) is None
 
 
 def test_figures_are_of_robots_inside_the_images() -> None:
-    robots = np.full((3, 2, len(FIELDS)), np.nan, np.float32)
+    robots = np.full((3, 2, len(ROBOT_FIELDS)), np.nan, np.float32)
     robots[0, 0, :6] = (20, 10, 1, 0, 0, 0)
     robots[0, 1, :6] = (-5, 10, 1, 0, 0, 0)
     robots[2, 1, :6] = (30, 31.5, 1, 0, 0, 0)
-    examples = Examples([np.zeros((3, 32, 48, 3), np.uint8)], robots)
-    assert labels(examples).image.tolist() == [0, 2]
-    assert labels(examples).u_px.tolist() == [20.0, 30.0]
-    found = validation_figures(build("dmrl-nano").eval(), examples, FitSettings())
-    assert found.keys() == {"validation_loss", *(f"validation_{name}" for name in WATCHED)}
+    examples = ExampleSet([np.zeros((3, 32, 48, 3), np.uint8)], robots)
+    assert select_visible_labels(examples).image.tolist() == [0, 2]
+    assert select_visible_labels(examples).u_px.tolist() == [20.0, 30.0]
+    found = validate(build_network("dmrl-nano").eval(), examples, TrainConfig())
+    assert found.keys() == {
+        "validation_loss",
+        *(f"validation_{name}" for name in VALIDATION_METRICS),
+    }
     assert np.isfinite(list(found.values())).all()
 
 
 def test_ten_labels_are_enough_for_a_threshold() -> None:
     for count, known in ((9, False), (10, True)):
         truth = points(list(range(count)), [50.0] * count, [1.0] * count)
-        found = best_threshold(score(count, truth, truth))
+        found = select_threshold(score_detections(count, truth, truth))
         assert (found is not None) == known
         assert found is None or found == 0.5  # between the last, of 1, and nothing
 
@@ -86,21 +93,25 @@ def test_twenty_empty_images_tell_a_rate() -> None:
     truth = points(list(range(12)), [50.0] * 12, [1.0] * 12)
     found = points([*range(12), 12], [50.0] * 12 + [80.0], [0.9] * 12 + [0.8])
     for images, threshold in ((12 + 19, 0.85), (12 + 20, 0.85)):
-        assert best_threshold(score(images, truth, found), 0.0) == pytest.approx(threshold)
+        assert select_threshold(score_detections(images, truth, found), 0.0) == pytest.approx(
+            threshold
+        )
     # One that is surer than all: with 19 it is no matter, with 20 none may be let through.
     sure = points([*range(12), 12], [50.0] * 12 + [80.0], [0.9] * 12 + [0.94])
     for images, threshold in ((12 + 19, 0.45), (12 + 20, 0.97)):
-        assert best_threshold(score(images, truth, sure), 0.0) == pytest.approx(threshold)
+        assert select_threshold(score_detections(images, truth, sure), 0.0) == pytest.approx(
+            threshold
+        )
     # A rate of one in twenty is kept by one in twenty.
-    assert best_threshold(score(32, truth, sure), 0.05) == pytest.approx(0.45)
+    assert select_threshold(score_detections(32, truth, sure), 0.05) == pytest.approx(0.45)
 
 
 def test_a_robot_on_the_upper_and_left_rim_is_inside_and_on_the_others_not() -> None:
-    robots = np.full((8, 1, len(FIELDS)), np.nan, np.float32)
+    robots = np.full((8, 1, len(ROBOT_FIELDS)), np.nan, np.float32)
     at = [(0, 10), (20, 0), (48, 10), (20, 32), (47.9, 31.9), (-0.1, 10), (20, -0.1)]
     for row, (u, v) in zip(robots, at, strict=False):
         row[0, :3] = u, v, 2.0
-    found = labels(Examples([np.zeros((8, 32, 48, 3), np.uint8)], robots))
+    found = select_visible_labels(ExampleSet([np.zeros((8, 32, 48, 3), np.uint8)], robots))
     assert found.image.tolist() == [0, 1, 4]
     assert found.depth_m.tolist() == [2, 2, 2] and found.confidence.tolist() == [1, 1, 1]
     assert found.v_px.tolist() == pytest.approx([10, 0, 31.9])
@@ -108,4 +119,4 @@ def test_a_robot_on_the_upper_and_left_rim_is_inside_and_on_the_others_not() -> 
 
 def test_alarms_count_from_the_threshold_itself() -> None:
     truth, found = points([0], [50.0], [1.0]), points([1, 2], [60.0, 60.0], [0.5, 0.49])
-    assert alarms(score(3, truth, found), 0.5).alarmed_images == 1
+    assert count_false_alarms(score_detections(3, truth, found), 0.5).alarmed_images == 1

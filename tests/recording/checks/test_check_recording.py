@@ -7,9 +7,9 @@ import pytest
 from mcap.writer import Writer
 
 from dmrl.images.codec import encode_png
-from dmrl.messages import message, schema_bytes
+from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import Provenance, RecordingWriter, check
-from dmrl.recording.checks.check_recording import say_findings
+from dmrl.recording.checks.check_recording import print_findings
 
 PNG = encode_png(np.zeros((224, 320, 3), np.uint8))
 Write = Callable[[int, str, Any], None]
@@ -24,15 +24,15 @@ def record(path: Path, fill: Callable[[Write], None]) -> list[str]:
 
 def calibrated(width: int = 320, height: int = 224, **other: Any) -> Any:
     numbers = {"K": [180, 0, width / 2, 0, 180, height / 2, 0, 0, 1]} | other
-    return message("CameraCalibration")(width=width, height=height, **numbers)
+    return message_class("CameraCalibration")(width=width, height=height, **numbers)
 
 
 def image(data: bytes = PNG) -> Any:
-    return message("CompressedImage")(data=data, format="png")
+    return message_class("CompressedImage")(data=data, format="png")
 
 
 def label(u_px: float, v_px: float, *, source: str = "truth", box: bool = True) -> Any:
-    return message("PeerLabel")(
+    return message_class("PeerLabel")(
         peer="cf2",
         u_px=u_px,
         v_px=v_px,
@@ -52,7 +52,7 @@ def labelled(write: Write, shift_v_px: float = 0.0) -> None:
         other.u_px += rng.normal(0, 1)
         other.v_px += shift_v_px + rng.normal(0, 1)
         write(k * 10**9, "/cf1/camera/image", image())
-        write(k * 10**9, "/cf1/labels", message("PeerLabels")(peers=[true, other]))
+        write(k * 10**9, "/cf1/labels", message_class("PeerLabels")(peers=[true, other]))
 
 
 def test_a_sound_recording_has_no_findings(tmp_path: Path) -> None:
@@ -71,7 +71,7 @@ def test_times_that_go_back_repeat_or_leave_gaps_are_found(tmp_path: Path) -> No
 
     def fill(write: Write) -> None:
         for time_s in times_s:
-            write(time_s * 10**9, "/cf1/height", message("Height")())
+            write(time_s * 10**9, "/cf1/height", message_class("Height")())
 
     findings = record(tmp_path / "a.mcap", fill)
     assert "warning /cf1/height 1 messages go back in time, by up to 4.000 s" in findings
@@ -82,10 +82,10 @@ def test_times_that_go_back_repeat_or_leave_gaps_are_found(tmp_path: Path) -> No
 def test_clocks_that_share_no_time_are_found(tmp_path: Path) -> None:
     def fill(write: Write) -> None:
         for k in range(20):
-            write(k * 10**9, "/cf1/height", message("Height")())
-            write(k * 10**9, "/cf1/velocity", message("Velocity")())
-            write((k + 56) * 10**9, "/cf2/height", message("Height")())
-            write((k + 119) * 10**9, "/cf1/range/cf2", message("UwbRange")())
+            write(k * 10**9, "/cf1/height", message_class("Height")())
+            write(k * 10**9, "/cf1/velocity", message_class("Velocity")())
+            write((k + 56) * 10**9, "/cf2/height", message_class("Height")())
+            write((k + 119) * 10**9, "/cf1/range/cf2", message_class("UwbRange")())
 
     assert record(tmp_path / "a.mcap", fill) == [
         "warning /cf1/range/cf2 shares no time with the robot's other topics: 100 s between",
@@ -93,8 +93,8 @@ def test_clocks_that_share_no_time_are_found(tmp_path: Path) -> None:
 
     def two(write: Write) -> None:
         for k in range(20):
-            write(k * 10**9, "/cf1/height", message("Height")())
-            write((k + 56) * 10**9, "/cf2/height", message("Height")())
+            write(k * 10**9, "/cf1/height", message_class("Height")())
+            write((k + 56) * 10**9, "/cf2/height", message_class("Height")())
 
     assert record(tmp_path / "b.mcap", two) == [
         "warning /cf1 shares no time with /cf2: 37 s between. Separate clocks? Try: dmrl align"
@@ -103,13 +103,13 @@ def test_clocks_that_share_no_time_are_found(tmp_path: Path) -> None:
 
 def test_times_and_stamps_of_zero_are_found(tmp_path: Path) -> None:
     def fill(write: Write) -> None:
-        pose = message("PoseInFrame")
+        pose = message_class("PoseInFrame")
         now_s = 1_800_000_000
         for k in range(3):
             moment = {"seconds": now_s + k}
             write((now_s + k) * 10**9, "/cf1/pose", pose(timestamp=moment))
             write((now_s + k) * 10**9, "/cf1/pose/truth", pose(timestamp={}))
-        write(0, "/cf1/height", message("Height")())
+        write(0, "/cf1/height", message_class("Height")())
 
     findings = record(tmp_path / "a.mcap", fill)
     assert findings == [
@@ -123,7 +123,7 @@ def test_times_and_stamps_of_zero_are_found(tmp_path: Path) -> None:
     [
         (label(400.0, 50.0), "warning /cf1/labels 1 of 1 labels of source 'truth' lie outside"),
         (
-            message("PeerLabel")(u_px=5, v_px=5, source="hand"),
+            message_class("PeerLabel")(u_px=5, v_px=5, source="hand"),
             "error /cf1/labels 1 labels of source",
         ),
         (label(float("nan"), 5.0), "error /cf1/labels 1 labels of source 'truth' have no pixel"),
@@ -134,7 +134,7 @@ def test_impossible_labels_are_found(tmp_path: Path, bad: Any, complaint: str) -
     def fill(write: Write) -> None:
         write(0, "/cf1/camera/calibration", calibrated())
         write(0, "/cf1/camera/image", image())
-        write(0, "/cf1/labels", message("PeerLabels")(peers=[bad]))
+        write(0, "/cf1/labels", message_class("PeerLabels")(peers=[bad]))
 
     assert any(f.startswith(complaint) for f in record(tmp_path / "a.mcap", fill))
 
@@ -143,7 +143,7 @@ def test_labels_without_their_image_are_found(tmp_path: Path) -> None:
     def fill(write: Write) -> None:
         write(0, "/cf1/camera/calibration", calibrated())
         write(0, "/cf1/camera/image", image())
-        write(5, "/cf1/labels", message("PeerLabels")())
+        write(5, "/cf1/labels", message_class("PeerLabels")())
 
     (finding,) = record(tmp_path / "a.mcap", fill)
     assert finding == "error /cf1/labels 1 of 1 messages have no image at their time"
@@ -164,10 +164,10 @@ def test_a_topic_without_messages_is_no_trouble(tmp_path: Path) -> None:
             ("/cf1/camera/calibration", "CameraCalibration"),
             ("/cf1/labels", "PeerLabels"),
         ):
-            full = message(name).DESCRIPTOR.full_name
-            schema = writer.register_schema(full, "protobuf", schema_bytes(name))
+            full = message_class(name).DESCRIPTOR.full_name
+            schema = writer.register_schema(full, "protobuf", serialize_schema(name))
             channel = writer.register_channel(topic, "protobuf", schema)
-        empty = message("PeerLabels")(peers=[label(5.0, 5.0)]).SerializeToString()
+        empty = message_class("PeerLabels")(peers=[label(5.0, 5.0)]).SerializeToString()
         writer.add_message(channel, 0, empty, 0)
         writer.finish()
     assert [f.text for f in check(path)] == ["1 of 1 messages have no image at their time"]
@@ -183,7 +183,7 @@ def test_a_gap_is_ten_periods_long_and_half_a_second(
     def fill(write: Write) -> None:
         for k in range(40):
             time_s = k * period_s + (hole_s - period_s) * (k >= 20)
-            write(round(time_s * 1e9), "/cf1/height", message("Height")())
+            write(round(time_s * 1e9), "/cf1/height", message_class("Height")())
 
     findings = record(tmp_path / "a.mcap", fill)
     assert len(findings) == found
@@ -199,7 +199,7 @@ def test_ten_steps_make_a_rhythm(tmp_path: Path) -> None:
 
         def fill(write: Write, moments: list[int] = moments) -> None:
             for moment in moments:
-                write(moment * 10**9, "/cf1/height", message("Height")())
+                write(moment * 10**9, "/cf1/height", message_class("Height")())
 
         assert len(record(tmp_path / f"{steps}.mcap", fill)) == found
 
@@ -212,7 +212,7 @@ def off_by(write: Write, off_px: list[tuple[float, float]]) -> None:
         peer.u_px += u_px
         peer.v_px += v_px
         write(k * 10**9, "/cf1/camera/image", image())
-        write(k * 10**9, "/cf1/labels", message("PeerLabels")(peers=[peer]))
+        write(k * 10**9, "/cf1/labels", message_class("PeerLabels")(peers=[peer]))
 
 
 def test_a_bias_is_told_by_its_standard_error(tmp_path: Path) -> None:
@@ -239,10 +239,10 @@ def test_what_was_just_written_is_looked_at_without_its_images(
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.write(0, "/cf1/camera/image", image(b"no image"))
         for topic in ("/cf1/height", "/cf1/velocity", "/cf1/attitude"):
-            kind = message(topic.rpartition("/")[2].title())
+            kind = message_class(topic.rpartition("/")[2].title())
             for second in (*range(12), 99):
                 sink.write(second * 10**9, topic, kind())
-    say_findings(path)
+    print_findings(path)
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 3
     assert all("1 gaps, the longest 88.000 s" in line for line in said[:2])
@@ -258,11 +258,13 @@ def test_what_cannot_be_judged_in_what_was_just_written_is_no_error(
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
-        schema = writer.register_schema("dmrl.v1.Velocity", "protobuf", schema_bytes("Velocity"))
+        schema = writer.register_schema(
+            "dmrl.v1.Velocity", "protobuf", serialize_schema("Velocity")
+        )
         channel = writer.register_channel(f"/cf2/{topic}", "protobuf", schema)
         writer.add_message(channel, 0, b"", 0)
         writer.finish()
-    say_findings(path)
+    print_findings(path)
     assert f"/cf2/{topic}" in capsys.readouterr().err
 
 
@@ -271,9 +273,11 @@ def test_boxes_that_the_border_cuts_say_nothing_of_a_bias(tmp_path: Path) -> Non
         write(0, "/cf1/camera/calibration", calibrated())
         for k in range(40):
             box = [left_px, 50, right_px, 70]
-            peer = message("PeerLabel")(u_px=100, v_px=60, depth_m=1, source="hand", box_px=box)
+            peer = message_class("PeerLabel")(
+                u_px=100, v_px=60, depth_m=1, source="hand", box_px=box
+            )
             write(k * 10**9, "/cf1/camera/image", image())
-            write(k * 10**9, "/cf1/labels", message("PeerLabels")(peers=[peer]))
+            write(k * 10**9, "/cf1/labels", message_class("PeerLabels")(peers=[peer]))
 
     for k, (left_px, right_px, found) in enumerate(
         [(1.5, 100, 1), (1, 100, 0), (100, 318.5, 1), (100, 319, 0)]
@@ -287,7 +291,7 @@ def test_boxes_that_the_border_cuts_say_nothing_of_a_bias(tmp_path: Path) -> Non
 def test_topics_that_are_not_dmrl_s_are_left_alone(tmp_path: Path) -> None:
     def fill(write: Write) -> None:
         for k in range(3):
-            write(k, "/cf1/own", message("Height")())
+            write(k, "/cf1/own", message_class("Height")())
 
     assert record(tmp_path / "a.mcap", fill) == []
 
@@ -296,7 +300,7 @@ def test_a_stamp_of_zero_counts_only_where_one_is_given_and_the_time_is_another(
     tmp_path: Path,
 ) -> None:
     def fill(write: Write) -> None:
-        pose = message("PoseInFrame")
+        pose = message_class("PoseInFrame")
         write(0, "/cf1/pose", pose(timestamp={}))
         write(5, "/cf1/pose", pose())
         write(6, "/cf1/pose", pose(timestamp={"nanos": 6}))

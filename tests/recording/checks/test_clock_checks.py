@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dmrl.recording.checks.clock_checks import EPOCH_NS, clocks
+from dmrl.recording.checks.clock_checks import UNIX_TIME_MIN_NS, check_clocks
 
 S = 1_000_000_000
 
@@ -14,8 +14,8 @@ S = 1_000_000_000
 def said(times: dict[str, list[float]], **unset: int) -> list[tuple[str, str]]:
     """What is said of topics with messages at these seconds."""
     held = {topic: np.round(np.array(t) * S).astype(np.int64) for topic, t in times.items()}
-    seen = SimpleNamespace(times=held, unset=Counter(unset))
-    return list(clocks(seen))  # type: ignore[arg-type]
+    seen = SimpleNamespace(times=held, unset_stamps=Counter(unset))
+    return list(check_clocks(seen))  # type: ignore[arg-type]
 
 
 def test_robots_that_touch_or_overlap_share_a_time() -> None:
@@ -53,7 +53,7 @@ def test_what_has_no_clock_of_a_robot_is_not_compared(topic: str) -> None:
 
 
 def test_times_of_0_are_said_where_others_count_from_1970() -> None:
-    late = EPOCH_NS / S
+    late = UNIX_TIME_MIN_NS / S
     for last, count in ((late, 1), (late - 1, 0)):
         found = said({"/cf1/height": [0, last - 5, last], "/cf1/velocity": [last - 5, last]})
         assert len(found) == count

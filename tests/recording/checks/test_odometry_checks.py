@@ -8,18 +8,18 @@ import pytest
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.geometry.rotations import quaternion_zyx
-from dmrl.messages import message
+from dmrl.geometry.rotations import euler_to_quaternion
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter, check
 from dmrl.recording.checks import odometry_checks as check_motion
 from dmrl.recording.checks.odometry_checks import (
-    Moved,
-    _alike,
-    _attitude,
-    _motion,
+    MotionSamples,
+    _build_signal,
+    _check_attitude,
+    _check_velocity,
+    _correlate,
+    _derive_motion,
     _rms,
-    _signal,
-    _velocity,
 )
 
 Columns = dict[str, NDArray[np.float64]]
@@ -42,7 +42,7 @@ def flown() -> tuple[Columns, Columns]:
         "pitch_rad": pitch + noise[3],
         "yaw_rate_radps": np.gradient(yaw, TIME_S) + noise[4],
     }
-    turns = quaternion_zyx(np.column_stack([roll, pitch, yaw]))
+    turns = euler_to_quaternion(np.column_stack([roll, pitch, yaw]))
     return measured, {"x": x, "y": y, **dict(zip(("qx", "qy", "qz", "qw"), turns.T, strict=True))}
 
 
@@ -54,12 +54,12 @@ def recorded(path: Path, said: Columns, poses: Columns, late_s: float = 0.0) -> 
             now = round((time_s + 1) * 1e9)
             velocity = {name: row[name] for name in ("vx_mps", "vy_mps")}
             turning = {name: row[name] for name in row if name not in velocity}
-            sink.write(now, topics.velocity("cf1"), message("Velocity")(**velocity))
-            sink.write(now, topics.attitude("cf1"), message("Attitude")(**turning))
+            sink.write(now, topics.VELOCITY("cf1"), message_class("Velocity")(**velocity))
+            sink.write(now, topics.ATTITUDE("cf1"), message_class("Attitude")(**turning))
             place = {"position": {axis: float(poses[axis][k]) for axis in "xy"}}
             turn = {"orientation": {axis: float(poses[f"q{axis}"][k]) for axis in "xyzw"}}
-            pose = message("PoseInFrame")(frame_id="world", pose={**place, **turn})
-            sink.write(now + round(late_s * 1e9), topics.true_pose("cf1"), pose)
+            pose = message_class("PoseInFrame")(frame_id="world", pose={**place, **turn})
+            sink.write(now + round(late_s * 1e9), topics.TRUE_POSE("cf1"), pose)
     return [f"{finding.topic}: {finding.text}" for finding in check(path)]
 
 
@@ -95,7 +95,7 @@ def test_velocities_of_another_frame(tmp_path: Path) -> None:
 
 def test_a_signal_is_in_order_and_finite_and_has_each_time_once() -> None:
     parts = [np.array([[3.0, 30], [1, 10]]), np.array([[1.0, 11], [2, np.nan], [4, 40]])]
-    time_s, values = _signal(parts)
+    time_s, values = _build_signal(parts)
     assert time_s.tolist() == [1, 3, 4]
     assert values.tolist() == [[10], [30], [40]]
 
@@ -103,12 +103,12 @@ def test_a_signal_is_in_order_and_finite_and_has_each_time_once() -> None:
 def poses(time_s: NDArray[np.float64], **angles: float) -> NDArray[np.float64]:
     """x 2 t, y -t, and angles that grow by so much a second."""
     turn = np.column_stack([angles.get(n, 0.0) * time_s for n in ("roll", "pitch", "yaw")])
-    return np.column_stack([2 * time_s, -time_s, quaternion_zyx(turn)])
+    return np.column_stack([2 * time_s, -time_s, euler_to_quaternion(turn)])
 
 
 def test_motion_is_the_slope_of_poses() -> None:
     time_s = np.arange(0, 4.01, 0.02)
-    found = _motion(time_s, poses(time_s, roll=0.1, pitch=-0.2, yaw=1.5))
+    found = _derive_motion(time_s, poses(time_s, roll=0.1, pitch=-0.2, yaw=1.5))
     for name, wanted in (("velocity", [2.0, -1.0]), ("yaw rate", [1.5])):
         at, values = found[name]
         assert at == pytest.approx(np.arange(0.3, 3.7, 0.05))
@@ -120,25 +120,25 @@ def test_motion_is_the_slope_of_poses() -> None:
 
 def test_motion_is_not_known_where_poses_are_rare_or_no_turns() -> None:
     time_s = np.concatenate([np.arange(0, 3, 0.02), np.arange(5, 8, 0.02)])
-    at = _motion(time_s, poses(time_s))["velocity"][0]
+    at = _derive_motion(time_s, poses(time_s))["velocity"][0]
     assert not ((at > 3.25) & (at < 4.75)).any()
     assert (at < 3.2).any() and (at > 4.8).any()
     shrunk = poses(time_s)
     shrunk[:, 2:] *= 0.89
-    assert _motion(time_s, shrunk) == {}
+    assert _derive_motion(time_s, shrunk) == {}
     shrunk[:, 2:] *= 0.92 / 0.89
-    assert _motion(time_s, shrunk)
-    assert _motion(time_s[:99], poses(time_s[:99])) == {}
-    assert _motion(time_s[:100], poses(time_s[:100])) != {}
+    assert _derive_motion(time_s, shrunk)
+    assert _derive_motion(time_s[:99], poses(time_s[:99])) == {}
+    assert _derive_motion(time_s[:100], poses(time_s[:100])) != {}
 
 
 def test_alike_is_one_for_the_same_shape_and_rms_is_of_whole_vectors() -> None:
     one, other = np.array([1.0, 2.0]), np.array([2.0, -1.0])
-    assert _alike(one, 3 * one) == pytest.approx(1)
-    assert _alike(one, -one) == pytest.approx(-1)
-    assert _alike(one, other) == 0
-    assert _alike(one, np.array([1.0, 0.0])) == pytest.approx(1 / 5**0.5)
-    assert _alike(0 * one, one) == 0
+    assert _correlate(one, 3 * one) == pytest.approx(1)
+    assert _correlate(one, -one) == pytest.approx(-1)
+    assert _correlate(one, other) == 0
+    assert _correlate(one, np.array([1.0, 0.0])) == pytest.approx(1 / 5**0.5)
+    assert _correlate(0 * one, one) == 0
     assert _rms(np.array([[3.0, 4.0], [0.0, 0.0]])) == pytest.approx((25 / 2) ** 0.5)
     assert _rms(np.zeros(0)) == 0
 
@@ -160,10 +160,10 @@ def moving(speed_mps: float, rate: float = 0.0) -> tuple[NDArray[np.float64], di
 def test_who_hardly_moves_is_not_doubted(speed_mps: float, count: int) -> None:
     time_s, motion = moving(speed_mps)
     said = -motion["velocity"][1]  # type: ignore[index]
-    assert len(list(_velocity((time_s, said), motion))) == count  # type: ignore[arg-type]
-    assert len(list(_velocity((time_s, 10 * said), motion))) == count  # type: ignore[arg-type]
-    assert not list(_velocity((time_s[:99], said[:99]), motion))  # type: ignore[arg-type]
-    assert not list(_velocity((time_s, said), {}))
+    assert len(list(_check_velocity((time_s, said), motion))) == count  # type: ignore[arg-type]
+    assert len(list(_check_velocity((time_s, 10 * said), motion))) == count  # type: ignore[arg-type]
+    assert not list(_check_velocity((time_s[:99], said[:99]), motion))  # type: ignore[arg-type]
+    assert not list(_check_velocity((time_s, said), {}))
 
 
 @pytest.mark.parametrize(("share", "count"), [(0.55, 0), (0.45, 0)])
@@ -173,7 +173,7 @@ def test_a_velocity_half_like_or_like_no_other_is_not_doubted(share: float, coun
     other = 2**0.5 * np.cos(4 * np.pi * time_s)
     said = share * forward - (1 - share**2) ** 0.5 * other
     rows = np.column_stack([said, 0 * said])
-    assert len(list(_velocity((time_s, rows), motion))) == count  # type: ignore[arg-type]
+    assert len(list(_check_velocity((time_s, rows), motion))) == count  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("share", "count"), [(-0.85, 1), (-0.75, 0)])
@@ -182,16 +182,16 @@ def test_a_velocity_is_doubted_that_is_like_another(share: float, count: int) ->
     forward = motion["velocity"][1][:, 0]  # type: ignore[index]
     said = share * forward + (1 - share**2) ** 0.5 * 2**0.5 * np.cos(4 * np.pi * time_s)
     rows = np.column_stack([said, 0 * said])
-    assert len(list(_velocity((time_s, rows), motion))) == count  # type: ignore[arg-type]
+    assert len(list(_check_velocity((time_s, rows), motion))) == count  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("tilt", "count"), [(0.019, 0), (0.021, 1)])
 def test_tilts_under_a_fiftieth_are_not_doubted(tilt: float, count: int) -> None:
     time_s, motion = moving(1.0, tilt)
     said = -np.column_stack([motion["angles"][1][:, :2], 0 * time_s]) + 5.0  # type: ignore[index]
-    found = list(_attitude((time_s, said), motion))  # type: ignore[arg-type]
+    found = list(_check_attitude((time_s, said), motion))  # type: ignore[arg-type]
     assert ["roll_rad" in text for text in found] == [True] * count
-    assert not list(_attitude((time_s[:99], said[:99]), motion))  # type: ignore[arg-type]
+    assert not list(_check_attitude((time_s[:99], said[:99]), motion))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("rate", "count"), [(0.09, 0), (0.11, 1)])
@@ -200,29 +200,29 @@ def test_slow_turns_are_not_doubted(rate: float, count: int) -> None:
     true = rate * 2**0.5 * np.sin(2 * np.pi * time_s)
     motion["yaw rate"] = (time_s, true[:, None])
     said = np.column_stack([0 * true, 0 * true, -true])
-    found = list(_attitude((time_s, said), motion))  # type: ignore[arg-type]
+    found = list(_check_attitude((time_s, said), motion))  # type: ignore[arg-type]
     assert ["yaw_rate_radps" in text for text in found] == [True] * count
     weak = np.column_stack([0 * true, 0 * true, -0.4 * true + 0.5 * np.cos(2 * np.pi * time_s)])
-    assert not list(_attitude((time_s, weak), motion))  # type: ignore[arg-type]
+    assert not list(_check_attitude((time_s, weak), motion))  # type: ignore[arg-type]
 
 
 def test_only_the_first_of_many_are_kept_and_only_of_what_moves(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(check_motion, "MOST", 7)
-    moved = Moved()
+    monkeypatch.setattr(check_motion, "SAMPLES_MAX", 7)
+    moved = MotionSamples()
     times = np.arange(5) * 10**9
     batch = pa.RecordBatch.from_pydict({"log_time": times, "vx_mps": times / 1e9, "vy_mps": -times})
     for _ in range(3):
-        moved.add("/cf1/velocity", batch)
-    moved.add("/cf1/height", batch)
+        moved.add_batch("/cf1/velocity", batch)
+    moved.add_batch("/cf1/height", batch)
     assert moved.parts.keys() == {"/cf1/velocity"}
     rows = np.concatenate(moved.parts["/cf1/velocity"])
     assert rows[:, 0].tolist() == rows[:, 1].tolist() == [0, 1, 2, 3, 4, 0, 1]
 
 
 def test_true_poses_come_before_the_robot_s_own() -> None:
-    moved, times = Moved(), np.arange(400) * 20_000_000
+    moved, times = MotionSamples(), np.arange(400) * 20_000_000
     ahead = 2e-9 * times
 
     def pose(x: NDArray[np.float64]) -> pa.RecordBatch:
@@ -236,9 +236,9 @@ def test_true_poses_come_before_the_robot_s_own() -> None:
         return pa.RecordBatch.from_pydict({"log_time": times, "pose": both})
 
     speed = {"log_time": times, "vx_mps": 0 * ahead + 2, "vy_mps": 0 * ahead}
-    moved.add(topics.velocity("cf1"), pa.RecordBatch.from_pydict(speed))
-    assert list(moved.doubted()) == []
-    moved.add(topics.pose("cf1"), pose(-ahead))
-    assert ["Forward seems" in text for _, text in moved.doubted()] == [True]
-    moved.add(topics.true_pose("cf1"), pose(ahead))
-    assert list(moved.doubted()) == []
+    moved.add_batch(topics.VELOCITY("cf1"), pa.RecordBatch.from_pydict(speed))
+    assert list(moved.find_contradictions()) == []
+    moved.add_batch(topics.POSE("cf1"), pose(-ahead))
+    assert ["Forward seems" in text for _, text in moved.find_contradictions()] == [True]
+    moved.add_batch(topics.TRUE_POSE("cf1"), pose(ahead))
+    assert list(moved.find_contradictions()) == []

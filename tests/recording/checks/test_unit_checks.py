@@ -4,14 +4,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from dmrl.recording.checks.unit_checks import Sizes, periods
+from dmrl.recording.checks.unit_checks import MagnitudeHistograms, check_periods
 
 
 def _doubted(topic: str, name: str, values: np.ndarray) -> list[tuple[str, str]]:
-    sizes = Sizes()
+    sizes = MagnitudeHistograms()
     for part in np.array_split(values, 3):
-        sizes.add(topic, pa.RecordBatch.from_pydict({name: pa.array(part)}))
-    return list(sizes.doubted())
+        sizes.add_batch(topic, pa.RecordBatch.from_pydict({name: pa.array(part)}))
+    return list(sizes.find_implausible_fields())
 
 
 @pytest.mark.parametrize(
@@ -48,12 +48,14 @@ def test_nothing_zero_or_infinite_counts_and_few_values_tell_nothing() -> None:
 
 def test_periods_of_sensors() -> None:
     times = np.arange(100) * 10_000_000
-    assert list(periods({"/cf1/height": times})) == []
-    ((_, rare),) = periods({"/cf1/height": times * 1000})
+    assert list(check_periods({"/cf1/height": times})) == []
+    ((_, rare),) = check_periods({"/cf1/height": times * 1000})
     assert rare == "one message in 10 s. Were its times in ms, us or ns?"
-    ((_, often),) = periods({"/cf1/height": times // 1_000_000})
+    ((_, often),) = check_periods({"/cf1/height": times // 1_000_000})
     assert "in s, ms or us" in often
-    assert list(periods({"/cf1/labels": times * 1000, "/cf1/height": times[:19] * 1000})) == []
+    assert (
+        list(check_periods({"/cf1/labels": times * 1000, "/cf1/height": times[:19] * 1000})) == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -61,8 +63,8 @@ def test_periods_of_sensors() -> None:
 )
 def test_periods_beyond_a_sensor_s(period_ns: int, said: int) -> None:
     times = np.arange(20) * period_ns
-    assert len(list(periods({"/cf1/height": times}))) == said
-    assert list(periods({"/cf1/height": times[:19]})) == []
+    assert len(list(check_periods({"/cf1/height": times}))) == said
+    assert list(check_periods({"/cf1/height": times[:19]})) == []
 
 
 def test_sizes_are_told_apart_to_a_fifth_of_their_limit() -> None:

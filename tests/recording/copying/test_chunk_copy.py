@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from dmrl.errors import RecordingError
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
-    Timed,
+    TimedMessage,
     merge,
     read_raw,
+    read_summary,
     recover,
     rewrite,
-    summary,
     trim,
 )
 from dmrl.recording.mcap import chunk_reader
@@ -32,14 +32,14 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("copying") / "flight.mcap"
     rng = np.random.default_rng(0)
     with RecordingWriter(path, MADE) as sink:
-        sink.write(0, "/cf1/camera/calibration", message("CameraCalibration")(width=320))
+        sink.write(0, "/cf1/camera/calibration", message_class("CameraCalibration")(width=320))
         for k in range(MOMENTS):
             for robot in ("cf1", "cf2"):
-                turn = message("Attitude")(roll_rad=rng.normal(), pitch_rad=rng.normal())
+                turn = message_class("Attitude")(roll_rad=rng.normal(), pitch_rad=rng.normal())
                 sink.write(k, f"/{robot}/attitude", turn, publish_ns=k + 3)
-                sink.write(k, f"/{robot}/height", message("Height")(height_m=rng.normal()))
+                sink.write(k, f"/{robot}/height", message_class("Height")(height_m=rng.normal()))
             if k % 10 == 0:
-                picture = message("CompressedImage")(data=rng.bytes(3000), format="jpeg")
+                picture = message_class("CompressedImage")(data=rng.bytes(3000), format="jpeg")
                 sink.write(k, "/cf1/camera/image", picture)
         sink.add_metadata("dmrl.split", {"train": "[[0, 10]]"})
     return path
@@ -50,16 +50,16 @@ def test_a_copy_is_made_of_the_same_chunks_and_goes_over_once(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[int] = []
-    unpacked = chunk_reader.unpacked
+    unpacked = chunk_reader.decompress
     monkeypatch.setattr(
-        chunk_reader, "unpacked", lambda p, c, at: opened.append(at) or unpacked(p, c, at)
+        chunk_reader, "decompress", lambda p, c, at: opened.append(at) or unpacked(p, c, at)
     )
-    fresh = [Timed(k * 100, "/cf1/labels", message("PeerLabels")()) for k in range(20)]
+    fresh = [TimedMessage(k * 100, "/cf1/labels", message_class("PeerLabels")()) for k in range(20)]
     out = tmp_path / "out.mcap"
     rewrite(flight, out, MADE, without=(), fresh=[fresh])
     assert len(opened) == len(set(opened)) == len(chunks(flight)) > 8
     assert len(set(packed(flight)) & set(packed(out))) >= len(chunks(flight)) - 2
-    unchanged(flight, out, list(summary(flight).topics))
+    unchanged(flight, out, list(read_summary(flight).topics))
     assert [r for r in read_raw(out) if r.topic != "/cf1/labels"] == list(read_raw(flight))
     assert [raw.time_ns for raw in read_raw(out, "/cf1/labels")] == [m.time_ns for m in fresh]
 
@@ -68,8 +68,8 @@ def test_a_copy_is_made_of_the_same_chunks_and_goes_over_once(
 def test_what_is_left_out_leaves_the_rest_bit_for_bit(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     rewrite(flight, out, MADE, without=["/cf2/attitude"], fresh=())
-    kept = [topic for topic in summary(flight).topics if topic != "/cf2/attitude"]
-    assert list(summary(out).topics) == kept
+    kept = [topic for topic in read_summary(flight).topics if topic != "/cf2/attitude"]
+    assert list(read_summary(out).topics) == kept
     unchanged(flight, out, kept)
 
 
@@ -92,7 +92,7 @@ def test_a_stretch_that_begins_with_a_chunk_defines_what_it_holds(
         cut = out.with_suffix(".cut.mcap")
         cut.write_bytes(out.read_bytes()[:-100])  # without its summary
         recover(cut, tmp_path / f"{k}.whole.mcap")
-        assert summary(tmp_path / f"{k}.whole.mcap").count == len(ours)
+        assert read_summary(tmp_path / f"{k}.whole.mcap").count == len(ours)
 
 
 @pytest.mark.heavy
@@ -101,8 +101,8 @@ def test_parts_are_merged_to_what_they_were(flight: Path, tmp_path: Path) -> Non
     trim(flight, parts[0], topics=["/cf1/*", "/cf1/camera/*"])
     trim(flight, parts[1], topics=["/cf2/*"])
     out = tmp_path / "out.mcap"
-    assert merge(parts, out) == summary(flight).count
-    unchanged(flight, out, list(summary(flight).topics))
+    assert merge(parts, out) == read_summary(flight).count
+    unchanged(flight, out, list(read_summary(flight).topics))
     again = tmp_path / "again.mcap"
     merge(parts, again)
     assert again.read_bytes() == out.read_bytes()
@@ -142,7 +142,7 @@ def test_recordings_whose_channels_have_the_same_numbers_are_merged(tmp_path: Pa
     for path, robot in zip(paths, ("cf1", "cf2"), strict=True):
         with RecordingWriter(path, MADE) as sink:
             for k in range(12_000):
-                sink.write(k, f"/{robot}/height", message("Height")(height_m=rng.normal()))
+                sink.write(k, f"/{robot}/height", message_class("Height")(height_m=rng.normal()))
     assert {*channels(paths[0])} == {*channels(paths[1])}
     out = tmp_path / "out.mcap"
     assert merge(paths, out) == 24_000
@@ -169,7 +169,7 @@ def test_recovering_keeps_whole_chunks_as_they_are(flight: Path, tmp_path: Path)
     last = max(c.chunk_start_offset for c in chunks(flight))
     cut.write_bytes(flight.read_bytes()[:last])
     result = recover(cut, out)
-    assert result.messages == summary(out).count > MOMENTS
+    assert result.messages == read_summary(out).count > MOMENTS
     assert len(set(packed(flight)) & set(packed(out))) >= len(chunks(flight)) - 3
 
 
@@ -190,7 +190,7 @@ def test_small_chunks_of_a_live_recording_are_put_together(tmp_path: Path) -> No
     path, out = tmp_path / "live.mcap", tmp_path / "out.mcap"
     with RecordingWriter(path, MADE) as sink:
         for k in range(500):
-            sink.write(k, "/cf1/height", message("Height")(height_m=k))
+            sink.write(k, "/cf1/height", message_class("Height")(height_m=k))
             if k % 10 == 9:
                 sink.flush()
     assert len(chunks(path)) == 50

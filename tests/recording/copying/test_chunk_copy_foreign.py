@@ -10,7 +10,7 @@ from mcap.records import MessageIndex
 from mcap.writer import ChunkBuilder, CompressionType, Writer
 
 from dmrl.errors import RecordingError
-from dmrl.messages import message, schema_bytes
+from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import Provenance, read_raw, rewrite, trim
 
 from ..records import channels, chunks, packed, unchanged
@@ -22,7 +22,7 @@ def foreign(path: Path, fill: Callable[[Writer, int], None], **options: Any) -> 
     with path.open("wb") as stream:
         writer = Writer(stream, **options)
         writer.start()
-        schema = writer.register_schema("dmrl.v1.Height", "protobuf", schema_bytes("Height"))
+        schema = writer.register_schema("dmrl.v1.Height", "protobuf", serialize_schema("Height"))
         fill(writer, schema)
         writer.finish()
     return path
@@ -36,7 +36,7 @@ def test_chunks_of_other_writers_are_copied_in_their_compression(
     rng = np.random.default_rng(0)
 
     def fill(writer: Writer, schema: int) -> None:
-        image = schema_bytes("CompressedImage")
+        image = serialize_schema("CompressedImage")
         pictures = writer.register_channel(
             "/cam",
             "protobuf",
@@ -44,9 +44,11 @@ def test_chunks_of_other_writers_are_copied_in_their_compression(
         )
         heights = writer.register_channel("/cf1/height", "protobuf", schema)
         for k in range(16_000):
-            writer.add_message(heights, k, message("Height")(height_m=k).SerializeToString(), k)
+            writer.add_message(
+                heights, k, message_class("Height")(height_m=k).SerializeToString(), k
+            )
         for k in range(40):  # a chunk of both, then of pictures alone
-            data = message("CompressedImage")(data=rng.bytes(20_000)).SerializeToString()
+            data = message_class("CompressedImage")(data=rng.bytes(20_000)).SerializeToString()
             writer.add_message(pictures, k, data, k)
 
     path = foreign(tmp_path / "a.mcap", fill, compression=compression, chunk_size=200_000)
@@ -62,7 +64,9 @@ def test_a_chunk_that_defines_a_channel_otherwise_is_not_copied(tmp_path: Path) 
     def fill(writer: Writer, schema: int) -> None:
         channel = writer.register_channel("/cf1/height", "protobuf", schema)
         for k in range(5_000):
-            writer.add_message(channel, k, message("Height")(height_m=k).SerializeToString(), k)
+            writer.add_message(
+                channel, k, message_class("Height")(height_m=k).SerializeToString(), k
+            )
 
     path = foreign(tmp_path / "a.mcap", fill, compression=CompressionType.NONE)
     data = bytearray(path.read_bytes())
@@ -95,7 +99,7 @@ def test_an_empty_index_of_another_writer_does_not_go_along(
         for topic in ("/cf1/height", "/cf2/height"):
             writer.register_channel(topic, "protobuf", schema)
         for k in range(20_000):
-            data = message("Height")(height_m=k).SerializeToString()
+            data = message_class("Height")(height_m=k).SerializeToString()
             writer.add_message(1 + (k < 10_000), k, data, k)
 
     path = foreign(tmp_path / "a.mcap", fill, chunk_size=100_000)
@@ -111,7 +115,9 @@ def test_a_recording_without_index_is_copied(tmp_path: Path) -> None:
     def fill(writer: Writer, schema: int) -> None:
         channel = writer.register_channel("/cf1/height", "protobuf", schema)
         for k in range(300):
-            writer.add_message(channel, k, message("Height")(height_m=k).SerializeToString(), k)
+            writer.add_message(
+                channel, k, message_class("Height")(height_m=k).SerializeToString(), k
+            )
 
     path = foreign(tmp_path / "a.mcap", fill, use_chunking=False)
     out = tmp_path / "out.mcap"
@@ -121,18 +127,20 @@ def test_a_recording_without_index_is_copied(tmp_path: Path) -> None:
 
 def test_a_calibration_at_time_0_in_a_chunk_of_its_own_goes_along(tmp_path: Path) -> None:
     def fill(writer: Writer, schema: int) -> None:
-        told = message("CameraCalibration")(width=320, distortion_model="x" * 500)
+        told = message_class("CameraCalibration")(width=320, distortion_model="x" * 500)
         camera = writer.register_channel(
             "/cf1/camera/calibration",
             "protobuf",
             writer.register_schema(
-                "foxglove.CameraCalibration", "protobuf", schema_bytes("CameraCalibration")
+                "foxglove.CameraCalibration", "protobuf", serialize_schema("CameraCalibration")
             ),
         )
         writer.add_message(camera, 0, told.SerializeToString(), 0)
         height = writer.register_channel("/cf1/height", "protobuf", schema)
         for k in range(60):
-            writer.add_message(height, k, message("Height")(height_m=k).SerializeToString(), k)
+            writer.add_message(
+                height, k, message_class("Height")(height_m=k).SerializeToString(), k
+            )
 
     path = foreign(tmp_path / "a.mcap", fill, chunk_size=400)
     assert chunks(path)[0].message_end_time == 0

@@ -5,16 +5,16 @@ import pytest
 from mcap.reader import make_reader
 
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
     merge,
     read,
     read_raw,
+    read_splits,
+    read_summary,
     recover,
-    splits,
-    summary,
     trim,
 )
 from dmrl.stages import trim as stage
@@ -24,7 +24,7 @@ def heights(path: Path, times_ns: list[int], split: str) -> Path:
     with RecordingWriter(path, Provenance("test")) as sink:
         for time_ns in times_ns:
             # A sine, so that chunks do not compress to nothing.
-            sink.write(time_ns, "/cf1/height", message("Height")(height_m=sin(time_ns)))
+            sink.write(time_ns, "/cf1/height", message_class("Height")(height_m=sin(time_ns)))
         sink.add_metadata("dmrl.split", {split: f"[[{times_ns[0]}, {times_ns[-1]}]]"})
     return path
 
@@ -35,7 +35,7 @@ def test_merging_interleaves_by_time_and_keeps_every_bit(tmp_path: Path, flight:
     merged = list(read_raw(tmp_path / "out.mcap"))
     assert [r.time_ns for r in merged] == sorted(r.time_ns for r in merged)
     assert [r for r in merged if r.topic == "/cf1/height"] == list(read_raw(other))
-    assert splits(tmp_path, summary(tmp_path / "out.mcap")) == {
+    assert read_splits(tmp_path, read_summary(tmp_path / "out.mcap")) == {
         "train": [(0, 10)],
         "test": [(15_000_000, 25_000_000)],
     }
@@ -44,9 +44,9 @@ def test_merging_interleaves_by_time_and_keeps_every_bit(tmp_path: Path, flight:
 def test_a_merge_tells_its_whole_ancestry(tmp_path: Path, flight: Path) -> None:
     trim(flight, tmp_path / "b.mcap", topics=["/cf1/attitude"])
     merge([flight, tmp_path / "b.mcap"], tmp_path / "out.mcap")
-    made = summary(tmp_path / "out.mcap").provenance
+    made = read_summary(tmp_path / "out.mcap").provenance
     assert made is not None
-    told = [(depth, s.provenance and s.provenance.stage) for depth, s in made.ancestry()]
+    told = [(depth, s.provenance and s.provenance.stage) for depth, s in made.iter_ancestors()]
     assert told == [(0, "test"), (0, "trim"), (1, None)]
     last = made.inputs[1].provenance
     assert last is not None
@@ -79,10 +79,10 @@ def test_of_many_calibrations_the_one_of_then_goes_along(tmp_path: Path) -> None
     every, out = tmp_path / "every.mcap", tmp_path / "out.mcap"
     with RecordingWriter(every, Provenance("test")) as sink:
         for k in range(1, 10):  # as ROS has them, again and again; others come late
-            told = message("CameraCalibration")(width=8 * k)
+            told = message_class("CameraCalibration")(width=8 * k)
             sink.write(10 * k, "/cf1/camera/calibration", told)
-            sink.write(10 * k + 5, "/cf1/height", message("Height")(height_m=k))
-        sink.write(95, "/cf2/camera/calibration", message("CameraCalibration")(width=8))
+            sink.write(10 * k + 5, "/cf1/height", message_class("Height")(height_m=k))
+        sink.write(95, "/cf2/camera/calibration", message_class("CameraCalibration")(width=8))
 
     def calibrations(**stretch: int) -> list[tuple[str, int, int]]:
         out.unlink(missing_ok=True)
@@ -122,7 +122,7 @@ def test_recover_returns_every_message_before_the_cut(tmp_path: Path, flight: Pa
         assert got == whole[: len(got)]
         assert result.messages == len(got)
         counts.append(len(got))
-        made = summary(tmp_path / f"{k}.mcap").provenance
+        made = read_summary(tmp_path / f"{k}.mcap").provenance
         assert made is not None
         assert made.inputs[0].provenance == Provenance("test", {"level": 1}, seed=3)
     assert counts == sorted(counts, reverse=True)
@@ -140,7 +140,7 @@ def test_recover_steps_over_a_damaged_chunk(tmp_path: Path) -> None:
     times_ns = [r.time_ns for r in read_raw(tmp_path / "b.mcap")]
     assert 15_000 < len(times_ns) < 30_000
     assert times_ns[-1] == 29_999
-    assert splits(tmp_path, summary(tmp_path / "b.mcap")) == {"train": [(0, 29_999)]}
+    assert read_splits(tmp_path, read_summary(tmp_path / "b.mcap")) == {"train": [(0, 29_999)]}
 
 
 def test_a_topic_whose_definition_is_damaged_is_not_lost(tmp_path: Path) -> None:
@@ -165,11 +165,13 @@ def test_messages_without_a_definition_are_counted(tmp_path: Path) -> None:
         for time_ns in range(900):
             if time_ns in (300, 600):
                 sink.flush()  # the end of a chunk
-            sink.write(time_ns, "/cf1/height", message("Height")(height_m=sin(time_ns)))
+            sink.write(time_ns, "/cf1/height", message_class("Height")(height_m=sin(time_ns)))
             if time_ns >= 300:
                 # The second shares its schema with what is lost.
-                sink.write(time_ns, "/cf1/attitude", message("Attitude")(roll_rad=sin(time_ns)))
-                sink.write(time_ns, "/cf2/height", message("Height")(height_m=sin(time_ns)))
+                sink.write(
+                    time_ns, "/cf1/attitude", message_class("Attitude")(roll_rad=sin(time_ns))
+                )
+                sink.write(time_ns, "/cf2/height", message_class("Height")(height_m=sin(time_ns)))
     data = bytearray(path.read_bytes())
     with path.open("rb") as stream:
         found = make_reader(stream).get_summary()
@@ -203,7 +205,7 @@ def test_a_merge_of_two_flights_by_the_same_robots_is_said(
 def test_parts_of_one_recording_are_merged_again_without_a_word(
     tmp_path: Path, flight: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    middle = summary(flight).start_ns + 5
+    middle = read_summary(flight).start_ns + 5
     trim(flight, tmp_path / "a.mcap", end_ns=middle)
     trim(flight, tmp_path / "b.mcap", start_ns=middle)
     merge([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "out.mcap")

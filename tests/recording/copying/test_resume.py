@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import OutputError, RecordingError
-from dmrl.messages import message
-from dmrl.recording import Provenance, RecordingWriter, interrupted
+from dmrl.messages import message_class
+from dmrl.recording import Provenance, RecordingWriter, recover_interrupted
 
 MADE = Provenance("test", settings={"range_m": (1.0, 2.0)})
 MOMENTS = 3000
@@ -19,7 +19,7 @@ def write(sink: RecordingWriter, first: int, last: int) -> None:
     """Two messages at every moment."""
     for k in range(first, last):
         for topic in ("/a", "/b"):
-            text = message("Log")(message=f"{k * 7919}{topic}{PADDING[k % 300 :]}")
+            text = message_class("Log")(message=f"{k * 7919}{topic}{PADDING[k % 300 :]}")
             sink.write(k, topic, text)
 
 
@@ -43,50 +43,50 @@ def stopped(tmp_path: Path) -> Path:
 
 
 def test_a_stopped_recording_goes_on_to_the_same_bytes(whole: Path, stopped: Path) -> None:
-    before = interrupted(stopped, resume=True)
-    before.check(MADE)
+    before = recover_interrupted(stopped, resume=True)
+    before.check_provenance(MADE)
     with RecordingWriter(stopped, MADE, keep_on_error=True) as sink:
-        done = before.copy(sink)
+        done = before.copy_into(sink)
         assert 0 < done < MOMENTS - 50
         write(sink, done, MOMENTS)
-    before.forget()
+    before.delete_file()
     assert stopped.read_bytes() == whole.read_bytes()
     assert sorted(p.name for p in stopped.parent.iterdir()) == ["out.mcap", "whole.mcap"]
 
 
 def test_stopped_twice_it_keeps_the_longer_part(stopped: Path) -> None:
-    kept = interrupted(stopped, resume=True)
-    count = sum(1 for _ in kept.moments())
+    kept = recover_interrupted(stopped, resume=True)
+    count = sum(1 for _ in kept.iter_moments())
     with (
         pytest.raises(KeyboardInterrupt),
         RecordingWriter(stopped, MADE, keep_on_error=True) as sink,
     ):
         write(sink, 0, 10)
         raise KeyboardInterrupt
-    assert sum(1 for _ in interrupted(stopped, resume=True).moments()) == count
+    assert sum(1 for _ in recover_interrupted(stopped, resume=True).iter_moments()) == count
 
 
 def test_other_settings_are_refused(stopped: Path) -> None:
-    before = interrupted(stopped, resume=True)
+    before = recover_interrupted(stopped, resume=True)
     with pytest.raises(RecordingError, match="other settings"):
-        before.check(Provenance("test", settings={"range_m": (1.0, 3.0)}))
+        before.check_provenance(Provenance("test", settings={"range_m": (1.0, 3.0)}))
 
 
 def test_what_is_left_is_not_silently_overwritten(stopped: Path) -> None:
     with pytest.raises(OutputError, match=r"Go on with --resume, or remove it"):
-        interrupted(stopped, resume=False)
+        recover_interrupted(stopped, resume=False)
 
 
 def test_nothing_to_resume_is_said(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"to resume\. Run without --resume"):
-        interrupted(tmp_path / "none.mcap", resume=True)
+        recover_interrupted(tmp_path / "none.mcap", resume=True)
 
 
 def write_pictures(sink: RecordingWriter, first: int, last: int) -> None:
     """At every moment what tells of a picture, then the picture, which does not compress."""
     for k in range(first, last):
-        sink.write(k, "/cf1/labels", message("PeerLabels")(sources=["truth"]))
-        picture = message("CompressedImage")(data=random.Random(k).randbytes(20_000))
+        sink.write(k, "/cf1/labels", message_class("PeerLabels")(sources=["truth"]))
+        picture = message_class("CompressedImage")(data=random.Random(k).randbytes(20_000))
         sink.write(k, "/cf1/camera/image", picture)
 
 
@@ -101,9 +101,9 @@ def test_pictures_without_what_was_said_of_them_are_not_whole(tmp_path: Path) ->
         ):
             write_pictures(sink, 0, stop)
             raise KeyboardInterrupt
-        before = interrupted(out, resume=True)
+        before = recover_interrupted(out, resume=True)
         with RecordingWriter(tmp_path / f"{stop}.mcap", MADE) as sink:
-            done = before.copy(sink)
+            done = before.copy_into(sink)
             assert least <= done <= most
             write_pictures(sink, done, 600)
         assert (tmp_path / f"{stop}.mcap").read_bytes() == whole.read_bytes()
@@ -115,5 +115,5 @@ def test_numbers_whose_pictures_were_lost_are_not_whole(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), RecordingWriter(out, MADE, keep_on_error=True) as sink:
         write(sink, 0, MOMENTS)
         raise KeyboardInterrupt
-    assert sum(1 for _ in interrupted(out, resume=True).moments()) > 0
-    assert list(interrupted(out, resume=True, pictured=True).moments()) == []
+    assert sum(1 for _ in recover_interrupted(out, resume=True).iter_moments()) > 0
+    assert list(recover_interrupted(out, resume=True, has_images=True).iter_moments()) == []

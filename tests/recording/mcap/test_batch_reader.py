@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from dmrl.errors import RecordingError
-from dmrl.recording.mcap.batch_reader import compare
+from dmrl.recording.mcap.batch_reader import check_counts
 
 
 def summary(counts: dict[int, int] | None) -> Any:
@@ -37,7 +37,7 @@ def test_a_recording_has_the_messages_that_its_statistics_say(
     said: dict[int, int] | None, found: dict[int, int], fault: str
 ) -> None:
     if not fault:
-        compare(Path("a.mcap"), summary(said), CHANNELS, Counter(found))
+        check_counts(Path("a.mcap"), summary(said), CHANNELS, Counter(found))
         return
     with pytest.raises(RecordingError, match=fault):
-        compare(Path("a.mcap"), summary(said), CHANNELS, Counter(found))
+        check_counts(Path("a.mcap"), summary(said), CHANNELS, Counter(found))

@@ -14,8 +14,14 @@ from mcap.records import Chunk, Message
 
 from dmrl.errors import RecordingError
 from dmrl.guards import limits
-from dmrl.recording.mcap.chunk import loose, messages_at, of_channels, scanned, unpacked
-from dmrl.recording.mcap.message_batch import Block
+from dmrl.recording.mcap.chunk import (
+    batch_from_messages,
+    build_batch_at,
+    decompress,
+    parse_records,
+    select_channels,
+)
+from dmrl.recording.mcap.message_batch import MessageBatch
 
 PATH = Path("a.mcap")
 ROWS = [(7, 30, 31, b"ab"), (300, 2**40, 2**50, b""), (7, 5, 6, b"xyz")]
@@ -33,43 +39,43 @@ def bytes_of(data: bytes) -> np.ndarray:
     return np.frombuffer(data, np.uint8)
 
 
-def block(rows: list[tuple[int, int, int, bytes]] = ROWS) -> Block:
-    return scanned(bytes_of(b"".join(message_record(*row) for row in rows))).block
+def block(rows: list[tuple[int, int, int, bytes]] = ROWS) -> MessageBatch:
+    return parse_records(bytes_of(b"".join(message_record(*row) for row in rows))).batch
 
 
 def test_messages_among_other_records_are_found_at_any_byte() -> None:
     for junk in range(4):
         parts = [record(Opcode.SCHEMA, bytes(junk)) + message_record(*row) for row in ROWS]
-        assert list(scanned(bytes_of(b"".join(parts))).block.rows()) == ROWS
-    assert len(scanned(bytes_of(b"")).block) == 0
-    assert len(messages_at(bytes_of(b"abc"), np.zeros(0, np.int64))) == 0
+        assert list(parse_records(bytes_of(b"".join(parts))).batch.iter_rows()) == ROWS
+    assert len(parse_records(bytes_of(b"")).batch) == 0
+    assert len(build_batch_at(bytes_of(b"abc"), np.zeros(0, np.int64))) == 0
 
 
 def test_loose_messages_are_a_block() -> None:
-    found = loose([Message(n, t, d, p, 0) for n, t, p, d in ROWS])
-    assert list(found.rows()) == ROWS
+    found = batch_from_messages([Message(n, t, d, p, 0) for n, t, p, d in ROWS])
+    assert list(found.iter_rows()) == ROWS
 
 
 def test_records_fill_a_chunk_to_its_last_byte() -> None:
     whole, other = message_record(1, 2, 3, b"data"), record(Opcode.SCHEMA, b"abc")
-    scan = scanned(bytes_of(whole + other + whole))
+    scan = parse_records(bytes_of(whole + other + whole))
     assert scan.messages == [0, len(whole + other)]
     assert scan.others == [(Opcode.SCHEMA, len(whole), len(whole + other))]
     for lost in range(1, len(whole)):
         with pytest.raises(McapError):
-            scanned(bytes_of(whole + whole[:-lost]))
+            parse_records(bytes_of(whole + whole[:-lost]))
     short = record(Opcode.MESSAGE, bytes(21))  # a message's own header takes 22
     with pytest.raises(McapError, match="wrong length"):
-        scanned(bytes_of(short))
-    assert scanned(bytes_of(record(Opcode.MESSAGE, bytes(22)))).messages == [0]
+        parse_records(bytes_of(short))
+    assert parse_records(bytes_of(record(Opcode.MESSAGE, bytes(22)))).messages == [0]
 
 
 def test_only_the_channels_that_are_asked_for() -> None:
-    assert list(of_channels(block(), {7}, {7, 300}).rows()) == [ROWS[0], ROWS[2]]
-    assert list(of_channels(block(), {300}, {7, 300}).rows()) == [ROWS[1]]
-    assert list(of_channels(block(), {7, 300, 9}, {7, 300, 9}).rows()) == ROWS
+    assert list(select_channels(block(), {7}, {7, 300}).iter_rows()) == [ROWS[0], ROWS[2]]
+    assert list(select_channels(block(), {300}, {7, 300}).iter_rows()) == [ROWS[1]]
+    assert list(select_channels(block(), {7, 300, 9}, {7, 300, 9}).iter_rows()) == ROWS
     with pytest.raises(McapError, match="channel 300, which is not defined"):
-        of_channels(block(), {7}, {7})
+        select_channels(block(), {7}, {7})
 
 
 LATE = [(1, 2**63, 0, b""), (1, 0, 2**63, b""), (1, 2**63 - 1, 0, b"")]
@@ -79,9 +85,9 @@ LATE = [(1, 2**63, 0, b""), (1, 0, 2**63, b""), (1, 2**63 - 1, 0, b"")]
 def test_times_that_64_bits_with_a_sign_cannot_hold(late: tuple[int, int, int, bytes]) -> None:
     """Of the log not the last of them either: no span could end after it."""
     last = (1, 2**63 - 2, 2**63 - 1, b"")
-    assert len(of_channels(block([last]), {1}, {1})) == 1
+    assert len(select_channels(block([last]), {1}, {1})) == 1
     with pytest.raises(McapError, match="beyond the year 2262"):
-        of_channels(block([last, late]), {1}, {1})
+        select_channels(block([last, late]), {1}, {1})
 
 
 def chunk(data: bytes, packed: bytes, how: str, crc: int | None = None) -> Chunk:
@@ -101,22 +107,22 @@ def test_a_chunk_is_unpacked_and_held_against_what_it_says(
     how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     packed = PACKED[how]
-    assert unpacked(PATH, chunk(DATA, packed, how), 9).tobytes() == DATA
-    assert unpacked(PATH, chunk(DATA, packed, how, crc=0), 9).tobytes() == DATA  # says none
+    assert decompress(PATH, chunk(DATA, packed, how), 9).tobytes() == DATA
+    assert decompress(PATH, chunk(DATA, packed, how, crc=0), 9).tobytes() == DATA  # says none
     with pytest.raises(RecordingError, match="chunk at byte 9 fails its CRC"):
-        unpacked(PATH, chunk(DATA, packed, how, crc=1), 9)
+        decompress(PATH, chunk(DATA, packed, how, crc=1), 9)
     for said in (DATA + b"\0", DATA[:-1]):
         with pytest.raises(
             RecordingError, match=r"a\.mcap.*(another size than|more than the size that) it states"
         ):
-            unpacked(PATH, chunk(said, packed, how, crc=0), 9)
+            decompress(PATH, chunk(said, packed, how, crc=0), 9)
     monkeypatch.setattr(limits, "UNPACKED_BYTES", len(DATA))
-    assert len(unpacked(PATH, chunk(DATA, packed, how), 9)) == len(DATA)
+    assert len(decompress(PATH, chunk(DATA, packed, how), 9)) == len(DATA)
     monkeypatch.setattr(limits, "UNPACKED_BYTES", len(DATA) - 1)
     with pytest.raises(RecordingError, match="unpacks to 0 MB"):
-        unpacked(PATH, chunk(DATA, packed, how), 9)
+        decompress(PATH, chunk(DATA, packed, how), 9)
 
 
 def test_a_compression_that_nobody_knows_is_named() -> None:
     with pytest.raises(RecordingError, match="unknown compression 'rar'"):
-        unpacked(PATH, chunk(DATA, DATA, "rar"), 0)
+        decompress(PATH, chunk(DATA, DATA, "rar"), 0)

@@ -12,17 +12,17 @@ from mcap.records import Channel as McapChannel
 from mcap.records import Schema
 
 from dmrl.errors import RecordingError
-from dmrl.messages import message, schema_bytes
+from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import Provenance, RawMessage, RecordingWriter, read_raw
 from dmrl.recording.mcap import chunk_builder as room
-from dmrl.recording.mcap.batch_reader import blocks
+from dmrl.recording.mcap.batch_reader import iter_batches
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.channel_registry import Defined, _free
-from dmrl.recording.mcap.chunk import scanned
-from dmrl.recording.mcap.chunk_builder import OpenChunk
-from dmrl.recording.mcap.file_writer import laid_out
-from dmrl.recording.mcap.message_batch import HEAD_BYTES, Block
-from dmrl.recording.mcap.message_index import index_entries
+from dmrl.recording.mcap.channel_registry import ChannelRegistry, _find_free_id
+from dmrl.recording.mcap.chunk import parse_records
+from dmrl.recording.mcap.chunk_builder import ChunkBuilder
+from dmrl.recording.mcap.file_writer import serialize
+from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, MessageBatch
+from dmrl.recording.mcap.message_index import parse_index_entries
 
 Row = tuple[int, int, int, bytes]
 ROWS: list[Row] = [(k % 3, 100 + k, 200 + k, bytes([k]) * (k % 5)) for k in range(12)]
@@ -30,60 +30,64 @@ ROWS: list[Row] = [(k % 3, 100 + k, 200 + k, bytes([k]) * (k % 5)) for k in rang
 
 def records_of(rows: list[Row]) -> tuple[np.ndarray, np.ndarray]:
     """Records one after another, and where each starts and the last ends."""
-    chunk = OpenChunk()
+    chunk = ChunkBuilder()
     for row in rows:
-        chunk.add(*row)
+        chunk.add_message(*row)
     return np.frombuffer(bytes(chunk.data), np.uint8), np.array([*chunk.starts, len(chunk.data)])
 
 
 @given(st.integers(0, 12), st.integers(0, 12), st.integers(0, 40))
 def test_many_at_once_are_the_same_as_one_by_one(alone: int, skipped: int, defined: int) -> None:
     records, at = records_of(ROWS)
-    one, many = OpenChunk(), OpenChunk()
+    one, many = ChunkBuilder(), ChunkBuilder()
     for chunk in (one, many):
-        chunk.define(b"\x03" + defined.to_bytes(8, "little") + bytes(defined))
+        chunk.add_definition(b"\x03" + defined.to_bytes(8, "little") + bytes(defined))
         for row in ROWS[:alone]:
-            chunk.add(*row)
+            chunk.add_message(*row)
     for row in ROWS[skipped:]:
-        one.add(*row)
+        one.add_message(*row)
     assert many.fill(records, at[skipped:]) == len(ROWS) - skipped
     assert (one.data, one.starts) == (many.data, many.starts)
-    assert list(scanned(np.frombuffer(bytes(one.data), np.uint8)).block.rows()) == (
+    assert list(parse_records(np.frombuffer(bytes(one.data), np.uint8)).batch.iter_rows()) == (
         ROWS[:alone] + ROWS[skipped:]
     )
 
 
 def test_a_chunk_takes_what_fits_and_is_full_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
     records, at = records_of([(1, k, k, b"x") for k in range(5)])
-    each = HEAD_BYTES + 1
+    each = MESSAGE_PREFIX_BYTES + 1
     for room_bytes, count in ((3 * each - 1, 2), (3 * each, 3), (5 * each, 5), (99 * each, 5)):
         monkeypatch.setattr(room, "CHUNK_BYTES", room_bytes)
-        chunk = OpenChunk()
+        chunk = ChunkBuilder()
         first = chunk.fill(records, at)
         # The one that no longer fits still goes in, and fills it.
         assert (first, chunk.full) in ((count, False), (count + 1, True))
         assert len(chunk.data) == first * each
     monkeypatch.setattr(room, "CHUNK_BYTES", each)
-    chunk = OpenChunk()
-    chunk.add(1, 2, 3, b"x")
+    chunk = ChunkBuilder()
+    chunk.add_message(1, 2, 3, b"x")
     assert not chunk.full
-    chunk.define(b"y")
+    chunk.add_definition(b"y")
     assert chunk.full
 
 
 def test_a_packed_chunk_says_where_its_messages_are_and_is_empty_then() -> None:
-    chunk = OpenChunk()
-    chunk.define(b"\x03" + (2).to_bytes(8, "little") + b"ab")
+    chunk = ChunkBuilder()
+    chunk.add_definition(b"\x03" + (2).to_bytes(8, "little") + b"ab")
     for row in ROWS:
-        chunk.add(*row)
+        chunk.add_message(*row)
     data, starts = bytes(chunk.data), chunk.starts.tolist()
     chunk.age = 3
-    packed = chunk.packed()
+    packed = chunk.compress()
     assert zstandard.ZstdDecompressor().decompress(packed.data) == data
     times = [row[1] for row in ROWS]
-    assert (packed.size, packed.first_ns, packed.last_ns) == (len(data), min(times), max(times))
-    found = index_entries(Path("a"), packed.index.records, packed.index.places)
-    told = zip(found.at.tolist(), found.channel.tolist(), found.time_ns.tolist(), strict=True)
+    assert (packed.uncompressed_size, packed.first_ns, packed.last_ns) == (
+        len(data),
+        min(times),
+        max(times),
+    )
+    found = parse_index_entries(Path("a"), packed.index.records, packed.index.offsets)
+    told = zip(found.offset.tolist(), found.channel.tolist(), found.time_ns.tolist(), strict=True)
     assert sorted(told) == [(k, row[0], row[1]) for k, row in zip(starts, ROWS, strict=True)]
     assert packed.index.counts == Counter(row[0] for row in ROWS)
     assert (len(chunk.data), len(chunk.starts), chunk.age) == (0, 0, 0)
@@ -98,14 +102,14 @@ def test_blocks_are_appended_as_messages_are(
     paths = [tmp_path / name for name in ("a.mcap", "b.mcap")]
     with RecordingWriter(paths[0], Provenance("test")) as sink:
         for k in range(100):
-            sink.write(k, "/cf1/height", message("Height")(height_m=k), publish_ns=k + 7)
+            sink.write(k, "/cf1/height", message_class("Height")(height_m=k), publish_ns=k + 7)
             if k % 9 == 0:
-                image = message("CompressedImage")(data=bytes([k]) * 90, format="png")
+                image = message_class("CompressedImage")(data=bytes([k]) * 90, format="png")
                 sink.write(k, "/cf1/camera/image", image)
-                sink.write(k, "/cf2/height", message("Height")(height_m=-k))
+                sink.write(k, "/cf2/height", message_class("Height")(height_m=-k))
     with RecordingWriter(paths[1], Provenance("test")) as sink:
-        for block, channels in blocks(paths[0]):
-            sink.chunks.append(block, channels)
+        for block, channels in iter_batches(paths[0]):
+            sink.chunk_writer.append_batch(block, channels)
     one, other = (
         sorted(read_raw(path), key=lambda raw: (raw.time_ns, raw.topic)) for path in paths
     )
@@ -117,37 +121,39 @@ def test_blocks_are_appended_as_messages_are(
 def test_a_block_with_a_negative_time_is_refused_by_topic(
     tmp_path: Path, wrong: tuple[int, int]
 ) -> None:
-    channels = {k: Channel(f"/{k}", "dmrl.v1.Height", schema_bytes("Height")) for k in (1, 2)}
+    channels = {k: Channel(f"/{k}", "dmrl.v1.Height", serialize_schema("Height")) for k in (1, 2)}
     records, at = records_of([(1, 3, 3, b""), (2, 3, 3, b"")])
     one, two = np.array([1, 2]), np.array([[3, 3], wrong])
-    block = Block(records, one, two[:, 0], two[:, 1], at[:-1] + HEAD_BYTES, at[1:])
+    block = MessageBatch(records, one, two[:, 0], two[:, 1], at[:-1] + MESSAGE_PREFIX_BYTES, at[1:])
     with (
         pytest.raises(RecordingError, match=r"on /2 is negative"),
         RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink,
     ):
-        sink.chunks.append(block, channels)
+        sink.chunk_writer.append_batch(block, channels)
 
 
 def channel(topic: str, schema: str = "a", **more: str) -> Channel:
     return Channel(topic, schema, schema.encode(), **more)
 
 
-def definitions(defined: Defined, one: Channel) -> list[McapChannel | Schema]:
+def definitions(defined: ChannelRegistry, one: Channel) -> list[McapChannel | Schema]:
     """What stands before the first message of a channel."""
-    begun = defined.begin(defined.number(one))
-    return list(scanned(np.frombuffer(begun, np.uint8)).definitions())
+    begun = defined.definition_records(defined.get_channel_id(one))
+    return list(parse_records(np.frombuffer(begun, np.uint8)).iter_definitions())
 
 
-def summarised(defined: Defined) -> tuple[list[int], list[int]]:
+def summarised(defined: ChannelRegistry) -> tuple[list[int], list[int]]:
     """Numbers of the schemas and channels that the summary repeats."""
-    records = [np.frombuffer(b"".join(kind), np.uint8) for kind in defined.all_begun()]
-    schemas, channels = ([one.id for one in scanned(r).definitions()] for r in records)
+    records = [
+        np.frombuffer(b"".join(kind), np.uint8) for kind in defined.list_written_definitions()
+    ]
+    schemas, channels = ([one.id for one in parse_records(r).iter_definitions()] for r in records)
     return schemas, channels
 
 
 def test_channels_are_numbered_once_and_defined_once() -> None:
-    defined = Defined()
-    assert [defined.number(channel(t)) for t in ("/a", "/b", "/a")] == [1, 2, 1]
+    defined = ChannelRegistry()
+    assert [defined.get_channel_id(channel(t)) for t in ("/a", "/b", "/a")] == [1, 2, 1]
     schema, own = definitions(defined, channel("/a"))
     assert isinstance(schema, Schema)
     assert isinstance(own, McapChannel)
@@ -170,25 +176,25 @@ def test_a_chunk_stands_as_it_is_where_its_words_are_those_that_are_known() -> N
     records = {n: McapChannel(n, c.topic, "protobuf", {}, 9) for n, c in mine.items()}
     schema = Schema(9, b"a", "protobuf", "a")
 
-    def chunk(*parts: McapChannel | Schema | int) -> Block:
-        held = OpenChunk()
+    def chunk(*parts: McapChannel | Schema | int) -> MessageBatch:
+        held = ChunkBuilder()
         for part in parts:
             if isinstance(part, int):
-                held.add(part, 1, 2, b"x")
+                held.add_message(part, 1, 2, b"x")
             else:
-                held.define(laid_out(part))
-        return scanned(np.frombuffer(bytes(held.data), np.uint8)).block
+                held.add_definition(serialize(part))
+        return parse_records(np.frombuffer(bytes(held.data), np.uint8)).batch
 
-    def begun(*parts: McapChannel | Schema | int) -> tuple[Defined, bool]:
-        defined = Defined()
-        defined.adopt(mine, records)
-        return defined, defined.begin_in(chunk(*parts), mine)
+    def begun(*parts: McapChannel | Schema | int) -> tuple[ChannelRegistry, bool]:
+        defined = ChannelRegistry()
+        defined.adopt_channels(mine, records)
+        return defined, defined.can_copy_chunk(chunk(*parts), mine)
 
     defined, stands = begun(schema, records[4], 4, records[6], 6, 4)
-    assert stands and defined.begun == {4, 6}
+    assert stands and defined.written == {4, 6}
     assert summarised(defined) == ([9], [4, 6])
-    assert defined.begin(4) == defined.begin(6) == b""
-    assert defined.begin_in(chunk(6, 4), mine)  # known by now
+    assert defined.definition_records(4) == defined.definition_records(6) == b""
+    assert defined.can_copy_chunk(chunk(6, 4), mine)  # known by now
     for parts in (
         (records[4], 4),  # without its schema
         (schema, 4),  # not defined
@@ -198,23 +204,23 @@ def test_a_chunk_stands_as_it_is_where_its_words_are_those_that_are_known() -> N
         (schema, records[4], McapChannel(7, "/c", "protobuf", {}, 9), 4),
     ):
         defined, stands = begun(*parts)
-        assert not stands and not defined.begun
-    defined = Defined()
-    defined.number(mine[6])
-    assert not defined.begin_in(chunk(schema, records[6], 6), mine)  # has another number here
+        assert not stands and not defined.written
+    defined = ChannelRegistry()
+    defined.get_channel_id(mine[6])
+    assert not defined.can_copy_chunk(chunk(schema, records[6], 6), mine)  # has another number here
 
 
 def test_copies_keep_their_numbers_where_these_are_free() -> None:
-    defined = Defined()
-    defined.number(channel("/a"))
+    defined = ChannelRegistry()
+    defined.get_channel_id(channel("/a"))
     kept, taken, other = channel("/c", "b"), channel("/d", "c"), channel("/f", "d")
 
     def theirs(number: int, one: Channel, schema_id: int) -> dict[int, McapChannel]:
         return {number: McapChannel(number, one.topic, "protobuf", {}, schema_id)}
 
     for number, one, schema_id in ((9, kept, 40), (1, taken, 50), (12, other, 40)):
-        defined.adopt({number: one}, theirs(number, one, schema_id))
-    assert [defined.number(one) for one in (kept, other, taken)] == [9, 12, 13]
+        defined.adopt_channels({number: one}, theirs(number, one, schema_id))
+    assert [defined.get_channel_id(one) for one in (kept, other, taken)] == [9, 12, 13]
     ids = []
     for one, name in ((kept, "b"), (other, "d"), (taken, "c")):
         schema, own = definitions(defined, one)
@@ -227,8 +233,13 @@ def test_copies_keep_their_numbers_where_these_are_free() -> None:
 
 
 def test_numbers_that_run_out_are_filled_up() -> None:
-    assert [_free(taken) for taken in ({}, {1: 0}, {7: 0}, {65_534: 0})] == [1, 2, 8, 65_535]
-    assert _free({65_535: 0, 1: 0, 3: 0}) == 2
+    assert [_find_free_id(taken) for taken in ({}, {1: 0}, {7: 0}, {65_534: 0})] == [
+        1,
+        2,
+        8,
+        65_535,
+    ]
+    assert _find_free_id({65_535: 0, 1: 0, 3: 0}) == 2
 
 
 def test_a_message_of_no_number_is_none() -> None:

@@ -6,34 +6,34 @@ from pathlib import Path
 import pytest
 
 from dmrl.errors import RecordingError
-from dmrl.messages import message
-from dmrl.recording import Provenance, RecordingWriter, summary
-from dmrl.recording.mcap.file import MAGIC, expect_unchanged, opened
+from dmrl.messages import message_class
+from dmrl.recording import Provenance, RecordingWriter, read_summary
+from dmrl.recording.mcap.file import MAGIC, expect_unchanged, open_mcap
 
 
 def write(path: Path, height_m: float) -> Path:
     path.unlink(missing_ok=True)
     with RecordingWriter(path, Provenance("test")) as sink:
-        sink.write(0, "/cf1/height", message("Height")(height_m=height_m))
+        sink.write(0, "/cf1/height", message_class("Height")(height_m=height_m))
     return path
 
 
 def test_what_was_hashed_is_read_as_it_was_until_an_output_is_done(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", 1.0)
     expect_unchanged(path)
-    assert summary(path).count == 1
+    assert read_summary(path).count == 1
     os.utime(path, (5, 5))
     with pytest.raises(RecordingError, match=r"a\.mcap was changed while it was read"):
-        summary(path)
+        read_summary(path)
     write(tmp_path / "b.mcap", 2.0)  # an output is done: what comes now belongs to the next
-    assert summary(path).count == 1
+    assert read_summary(path).count == 1
     expect_unchanged(path)
     other = path.with_name("c.mcap")
     other.write_bytes(path.read_bytes())
     os.utime(other, (5, 5))
     other.replace(path)  # alike in size and time, another file
     with pytest.raises(RecordingError, match="was changed"):
-        summary(path)
+        read_summary(path)
 
 
 @pytest.mark.parametrize(
@@ -49,21 +49,21 @@ def test_what_was_hashed_is_read_as_it_was_until_an_output_is_done(tmp_path: Pat
 )
 def test_a_file_begins_and_ends_as_a_recording(tmp_path: Path, content: bytes, words: str) -> None:
     (tmp_path / "a.mcap").write_bytes(content)
-    with pytest.raises(RecordingError, match=words), opened(tmp_path / "a.mcap"):
+    with pytest.raises(RecordingError, match=words), open_mcap(tmp_path / "a.mcap"):
         pass
 
 
 def test_no_read_goes_beyond_the_end(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(MAGIC + b"12" + MAGIC)
-    with opened(tmp_path / "a.mcap") as stream:
+    with open_mcap(tmp_path / "a.mcap") as stream:
         assert (stream.tell(), stream.size) == (0, 18)
         assert stream.read(18) == MAGIC + b"12" + MAGIC
         stream.seek(8)
         assert stream.read(None) == b"12" + MAGIC  # all, as of any file
     beyond = pytest.raises(RecordingError, match="a record at byte 1 runs beyond the end")
-    with beyond, opened(tmp_path / "a.mcap") as stream:
+    with beyond, open_mcap(tmp_path / "a.mcap") as stream:
         stream.seek(1)
         stream.read(18)
     for wrong, words in ((tmp_path, "is a folder"), (tmp_path / "none", "no recording")):
-        with pytest.raises(RecordingError, match=words), opened(wrong):
+        with pytest.raises(RecordingError, match=words), open_mcap(wrong):
             pass

@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 
-from dmrl.messages import message
-from dmrl.recording import Provenance, RecordingWriter, summary
+from dmrl.messages import message_class
+from dmrl.recording import Provenance, RecordingWriter, read_summary
 from dmrl.recording.mcap import summary_index
 
 
 def write(path: Path, heights: int) -> None:
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(heights):
-            sink.write(k, "/cf1/height", message("Height")(height_m=k))
+            sink.write(k, "/cf1/height", message_class("Height")(height_m=k))
 
 
 def settled(path: Path, second: int) -> None:
@@ -26,36 +26,36 @@ def test_a_summary_is_not_made_again_while_the_file_is_the_same(tmp_path: Path) 
     path = tmp_path / "a.mcap"
     write(path, 3)
     settled(path, 1_000_000_000)
-    assert summary(path) is summary(path)
+    assert read_summary(path) is read_summary(path)
 
 
 def test_a_file_written_anew_under_its_name_is_read_anew(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, 3)
     settled(path, 1_000_000_000)
-    assert summary(path).count == 3
+    assert read_summary(path).count == 3
     path.unlink()
     write(path, 5)
     settled(path, 1_000_000_001)
-    assert summary(path).count == 5
+    assert read_summary(path).count == 5
 
 
 def test_a_file_of_this_second_is_always_read_again(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, 3)
     settled(path, int(time.time()) + 60)  # a slow machine must not let the second pass
-    assert summary(path) is not summary(path)
+    assert read_summary(path) is not read_summary(path)
 
 
 def test_what_is_remembered_is_of_the_same_file_and_of_few(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(summary_index, "_MADE", {})
-    monkeypatch.setattr(summary_index, "MOST_REMEMBERED", 2)
+    monkeypatch.setattr(summary_index, "_CACHE", {})
+    monkeypatch.setattr(summary_index, "CACHE_ENTRIES_MAX", 2)
     now, made = time.time_ns(), list[str]()
 
     def asked(name: str, age_s: float = 60.0, ranged: object = None, size: int = 7) -> str:
         status = SimpleNamespace(st_ino=1, st_size=size, st_mtime_ns=now - round(age_s * 1e9))
-        stream: Any = SimpleNamespace(status=status, ranged=ranged)
-        found = summary_index.remembered("x", Path(name), stream, lambda: made.append(name) or name)
+        stream: Any = SimpleNamespace(status=status, remote_stream=ranged)
+        found = summary_index.get_cached("x", Path(name), stream, lambda: made.append(name) or name)
         return str(found)
 
     for name in ("a", "a", "b", "a"):

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from dmrl.errors import RecordingError
-from dmrl.recording.mcap.summary_section import _counted
+from dmrl.recording.mcap.summary_section import _check_statistics
 
 
 def summary(**more: Any) -> Any:
@@ -53,7 +53,7 @@ def summary(**more: Any) -> Any:
 )
 def test_a_summary_agrees_with_itself(more: dict[str, Any], fault: str) -> None:
     if not fault:
-        _counted(Path("a.mcap"), summary(**more))
+        _check_statistics(Path("a.mcap"), summary(**more))
         return
     with pytest.raises(RecordingError, match=fault):
-        _counted(Path("a.mcap"), summary(**more))
+        _check_statistics(Path("a.mcap"), summary(**more))

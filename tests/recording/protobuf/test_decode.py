@@ -15,9 +15,9 @@ from google.protobuf.message_factory import GetMessageClass
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording.protobuf.decode import decode
-from dmrl.recording.protobuf.wire_values import WireError, varint
+from dmrl.recording.protobuf.wire_values import WireError, decode_varints
 
 F = FieldDescriptorProto
 TYPES = {
@@ -118,29 +118,29 @@ def test_random_bytes_raise_wire_error_or_decode(data: bytes) -> None:
 
 
 def test_labels_with_and_without_peers() -> None:
-    label = message("PeerLabel")
+    label = message_class("PeerLabel")
     values = [
-        message("PeerLabels")(peers=[label(peer="cf2", box_px=[1, 2, 3, 4], source="truth")]),
-        message("PeerLabels")(),
-        message("PeerLabels")(peers=[label(peer="cf2"), label(peer="cf3", u_px=3.5)]),
+        message_class("PeerLabels")(peers=[label(peer="cf2", box_px=[1, 2, 3, 4], source="truth")]),
+        message_class("PeerLabels")(),
+        message_class("PeerLabels")(peers=[label(peer="cf2"), label(peer="cf3", u_px=3.5)]),
     ]
     assert rows(values) == [plain(v) for v in values]
 
 
 def test_a_value_beyond_its_message_is_an_error() -> None:
-    data = np.frombuffer(message("Height")(height_m=1.0).SerializeToString(), np.uint8)
+    data = np.frombuffer(message_class("Height")(height_m=1.0).SerializeToString(), np.uint8)
     with pytest.raises(WireError, match="beyond its message"):
-        decode(data, np.array([0]), np.array([len(data) - 1]), message("Height").DESCRIPTOR)
+        decode(data, np.array([0]), np.array([len(data) - 1]), message_class("Height").DESCRIPTOR)
 
 
 def test_a_field_of_another_wire_type_is_named() -> None:
     data = np.frombuffer(b"\x08\x05", np.uint8)  # field 1 as a varint; Height has a double
     with pytest.raises(WireError, match=r"dmrl.v1.Height.height_m has wire type 0"):
-        decode(data, np.array([0]), np.array([2]), message("Height").DESCRIPTOR)
+        decode(data, np.array([0]), np.array([2]), message_class("Height").DESCRIPTOR)
 
 
 def test_of_a_scalar_that_stands_twice_the_last_counts() -> None:
-    height = message("Height")
+    height = message_class("Height")
     data = height(height_m=1.0).SerializeToString() + height(height_m=2.5).SerializeToString()
     array = np.frombuffer(data + data, np.uint8)
     ends = np.array([len(data), 2 * len(data)])
@@ -153,8 +153,8 @@ def test_a_varint_has_ten_bytes_at_most(size: int) -> None:
     data = np.frombuffer(b"\x81" * (size - 1) + b"\x01" + bytes(3), np.uint8)
     if size > 10:
         with pytest.raises(WireError, match="longer than ten bytes"):
-            varint(data, np.array([0]))
+            decode_varints(data, np.array([0]))
         return
-    value, at = varint(data, np.array([0]))
+    value, at = decode_varints(data, np.array([0]))
     assert value.tolist() == [sum(1 << 7 * k for k in range(size)) % (1 << 64)]
     assert at.tolist() == [size]

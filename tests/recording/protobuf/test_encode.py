@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dmrl.errors import RecordingError
-from dmrl.messages import message
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter, read_raw
 from dmrl.recording.protobuf.encode import encode
 
@@ -56,7 +56,7 @@ def one(value: Any, k: int) -> Any:
     ],
 )
 def test_the_bytes_are_protobufs_own(kind: str, fields: dict[str, Any]) -> None:
-    made = message(kind)
+    made = message_class(kind)
     data, at = encode(made.DESCRIPTOR, fields, COUNT)
     for k in range(COUNT):
         theirs = made(**one(fields, k)).SerializeToString()
@@ -75,13 +75,13 @@ def test_the_bytes_are_protobufs_own(kind: str, fields: dict[str, Any]) -> None:
 )
 def test_columns_that_do_not_fit_are_refused(fields: dict[str, Any], error: type) -> None:
     with pytest.raises(error):
-        encode(message("Height").DESCRIPTOR, fields, 3)
+        encode(message_class("Height").DESCRIPTOR, fields, 3)
 
 
 @pytest.mark.parametrize("rows", [[1.5, 2.0], [2**40, 1], [np.nan, 1.0]])
 def test_numbers_that_are_not_whole_or_too_large_are_refused(rows: list[float]) -> None:
     with pytest.raises(ValueError, match="integers within its range"):
-        encode(message("GridMap").DESCRIPTOR, {"rows": rows}, 2)
+        encode(message_class("GridMap").DESCRIPTOR, {"rows": rows}, 2)
 
 
 def test_columns_become_the_recording_that_messages_become(tmp_path: Path) -> None:
@@ -89,11 +89,11 @@ def test_columns_become_the_recording_that_messages_become(tmp_path: Path) -> No
     roll = RNG.normal(size=9000)
     with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
         for time_ns, value in zip(times.tolist(), roll.tolist(), strict=True):
-            sink.write(time_ns, "/cf1/attitude", message("Attitude")(roll_rad=value))
+            sink.write(time_ns, "/cf1/attitude", message_class("Attitude")(roll_rad=value))
     with RecordingWriter(tmp_path / "b.mcap", Provenance("test")) as sink:
         for part in np.array_split(np.arange(9000), 7):
             columns = {"roll_rad": roll[part]}
-            sink.write_columns("/cf1/attitude", message("Attitude"), times[part], columns)
+            sink.write_columns("/cf1/attitude", message_class("Attitude"), times[part], columns)
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
     assert sum(1 for _ in read_raw(tmp_path / "b.mcap")) == 9000
 
@@ -101,14 +101,16 @@ def test_columns_become_the_recording_that_messages_become(tmp_path: Path) -> No
 def test_columns_keep_the_rules_of_messages(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
         times = np.array([5, 7])
-        sink.write_columns("/a", message("Height"), times, {"height_m": 1.0}, publish_ns=times + 1)
+        sink.write_columns(
+            "/a", message_class("Height"), times, {"height_m": 1.0}, publish_ns=times + 1
+        )
         with pytest.raises(RecordingError, match="negative"):
-            sink.write_columns("/a", message("Height"), times - 6, {"height_m": 1.0})
+            sink.write_columns("/a", message_class("Height"), times - 6, {"height_m": 1.0})
         with pytest.raises(RecordingError, match="negative"):
-            sink.write_columns("/a", message("Height"), times - 6, {}, publish_ns=times)
+            sink.write_columns("/a", message_class("Height"), times - 6, {}, publish_ns=times)
         with pytest.raises(RecordingError, match="negative"):
             late = times - np.array([0, 8])
-            sink.write_columns("/a", message("Height"), times, {}, publish_ns=late)
+            sink.write_columns("/a", message_class("Height"), times, {}, publish_ns=late)
         with pytest.raises(RecordingError, match="carries dmrl"):
-            sink.write_columns("/cf1/labels", message("Height"), times, {})
+            sink.write_columns("/cf1/labels", message_class("Height"), times, {})
     assert [(r.time_ns, r.publish_ns) for r in read_raw(tmp_path / "a.mcap")] == [(5, 6), (7, 8)]

@@ -9,7 +9,12 @@ import pytest
 from dmrl.errors import SettingError
 from dmrl.geometry.frames import AIDECK
 from dmrl.images.codec import encode_jpeg, encode_png
-from dmrl.rendering.backgrounds.photos import LIGHT_OF, panorama_view, photos_in, smeared
+from dmrl.rendering.backgrounds.photos import (
+    SRGB_TO_LINEAR,
+    apply_motion_blur,
+    open_photos,
+    render_panorama,
+)
 
 CAMERA = replace(AIDECK, distortion=())
 
@@ -27,9 +32,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_broken_photos_are_skipped_and_counted(folder: Path) -> None:
-    photos = photos_in(folder)
+    photos = open_photos(folder)
     for seed in range(6):
-        backdrop = photos.backdrop(np.random.default_rng(seed), CAMERA, zoom=1.5)
+        backdrop = photos.random_backdrop(np.random.default_rng(seed), CAMERA, zoom=1.5)
         assert backdrop.shape == (224, 320, 3)
     assert photos.broken == 2
 
@@ -38,11 +43,13 @@ def test_a_photo_is_averaged_or_sampled_in_the_middles_of_pixels(tmp_path: Path)
     stripes = np.zeros((448, 640, 3), np.uint8)
     stripes[:, 1::4] = 252
     (tmp_path / "stripes.png").write_bytes(encode_png(stripes))
-    photos, levels = photos_in(tmp_path), []
+    photos, levels = open_photos(tmp_path), []
     for averaged in (True, False):
         rng = np.random.default_rng(0)
-        light = photos.backdrop(rng, CAMERA, zoom=1.0, averaged=averaged)
-        levels.append(np.unique(np.round(np.interp(light[:, 8:-8], LIGHT_OF, np.arange(256)))))
+        light = photos.random_backdrop(rng, CAMERA, zoom=1.0, averaged=averaged)
+        levels.append(
+            np.unique(np.round(np.interp(light[:, 8:-8], SRGB_TO_LINEAR, np.arange(256))))
+        )
     # A pixel is two columns wide: every other one holds a stripe.
     assert levels[1].tolist() == [0, 252]
     assert levels[0].min() > 0
@@ -52,14 +59,14 @@ def test_a_folder_without_a_photo_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         SettingError, match=r"contains no readable photo .*Use another --backgrounds"
     ):
-        photos_in(tmp_path)
+        open_photos(tmp_path)
     with pytest.raises(SettingError, match="no folder"):
-        photos_in(tmp_path / "none")
+        open_photos(tmp_path / "none")
 
 
 def test_the_light_of_a_photo_follows_the_curve_of_screens() -> None:
-    assert LIGHT_OF[[0, 255]].tolist() == [0, 1]
-    assert LIGHT_OF[188] == pytest.approx(0.5, abs=0.01)
+    assert SRGB_TO_LINEAR[[0, 255]].tolist() == [0, 1]
+    assert SRGB_TO_LINEAR[188] == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +82,7 @@ def test_the_camera_sees_the_right_part_of_a_panorama(
 ) -> None:
     v, u = (np.mgrid[:64, :128] + 0.5) / np.array([64, 128])[:, None, None]
     panorama = np.stack([u, v, u], axis=-1).astype(np.float32)
-    view = panorama_view(panorama, CAMERA, turn_rad)
+    view = render_panorama(panorama, CAMERA, turn_rad)
     middle = view[int(CAMERA.cy_px), int(CAMERA.cx_px)]
     assert middle[:2] == pytest.approx([column, row], abs=0.01)
 
@@ -83,7 +90,7 @@ def test_the_camera_sees_the_right_part_of_a_panorama(
 def test_a_smear_keeps_the_light_and_the_middle() -> None:
     picture = np.zeros((11, 21, 3), np.float32)
     picture[5, 10] = 1
-    out = smeared(picture, (6.0, 0.0))
+    out = apply_motion_blur(picture, (6.0, 0.0))
     assert out.sum() == pytest.approx(3, abs=1e-4)
     assert np.flatnonzero(out[5, :, 0]).tolist() == list(range(7, 14))
-    assert smeared(picture, (0.0, 0.0)) is picture
+    assert apply_motion_blur(picture, (0.0, 0.0)) is picture

@@ -8,11 +8,11 @@ import pytest
 from dmrl.errors import SettingError
 from dmrl.geometry.frames import AIDECK
 from dmrl.rendering.camera.distortion import (
-    between,
-    canvas_of,
     image_from_pinhole,
+    interpolate_bilinear,
+    pinhole_canvas,
     pinhole_from_image,
-    sample,
+    sample_bilinear,
 )
 
 
@@ -34,16 +34,16 @@ def test_a_picture_sampled_at_its_pixels_centres_is_itself() -> None:
     picture = np.random.default_rng(0).random((5, 7, 4), np.float32)
     v, u = np.mgrid[:5, :7] + 0.5
     places = np.stack([u, v], axis=-1).astype(np.float32)
-    assert np.allclose(sample(picture, places), picture)
-    assert np.allclose(sample(picture, places - 100), 0)
+    assert np.allclose(sample_bilinear(picture, places), picture)
+    assert np.allclose(sample_bilinear(picture, places - 100), 0)
 
 
 def test_the_canvas_holds_all_that_the_image_shows() -> None:
-    canvas = canvas_of(AIDECK)
+    canvas = pinhole_canvas(AIDECK)
     assert canvas.places_px is not None
     assert canvas.places_px.min() > 0
     assert (canvas.places_px.max(axis=(0, 1)) < canvas.inside.shape[::-1]).all()
-    straight = canvas_of(replace(AIDECK, distortion=()))
+    straight = pinhole_canvas(replace(AIDECK, distortion=()))
     assert straight.places_px is None
     assert straight.inside.all()
 
@@ -51,10 +51,10 @@ def test_the_canvas_holds_all_that_the_image_shows() -> None:
 def test_the_first_column_follows_the_last_around_a_panorama() -> None:
     picture = np.arange(12, dtype=np.float32).reshape(2, 6, 1)
     places = np.array([[[5.5, 0.0], [-0.5, 0.0], [5.5, 0.5]]], np.float32)
-    found = between(picture, places, around=True)[0, :, 0]
+    found = interpolate_bilinear(picture, places, around=True)[0, :, 0]
     assert found.tolist() == [2.5, 2.5, 5.5]
 
 
 def test_a_slip_of_the_pen_is_no_image_size() -> None:
     with pytest.raises(SettingError, match="100000x224 px are too large to render"):
-        canvas_of(replace(AIDECK, width_px=100_000, height_px=224))
+        pinhole_canvas(replace(AIDECK, width_px=100_000, height_px=224))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dmrl.rendering.camera.sensor import Sensor, blur, demosaic, expose, mosaic
+from dmrl.rendering.camera.sensor import Sensor, apply_mosaic, demosaic, expose, gaussian_blur
 
 
 def rng() -> np.random.Generator:
@@ -12,12 +12,12 @@ def rng() -> np.random.Generator:
 
 def test_a_mosaic_of_one_colour_comes_back_whole() -> None:
     picture = np.broadcast_to(np.array([0.2, 0.5, 0.8], np.float32), (8, 10, 3))
-    assert np.allclose(demosaic(mosaic(picture)), picture)
+    assert np.allclose(demosaic(apply_mosaic(picture)), picture)
 
 
 def test_a_mosaic_keeps_what_each_pixel_measured() -> None:
     picture = rng().random((8, 10, 3), np.float32)
-    back = demosaic(mosaic(picture))
+    back = demosaic(apply_mosaic(picture))
     assert np.array_equal(back[::2, ::2, 0], picture[::2, ::2, 0])
     assert np.array_equal(back[1::2, 1::2, 2], picture[1::2, 1::2, 2])
     assert np.array_equal(back[::2, 1::2, 1], picture[::2, 1::2, 1])
@@ -26,7 +26,7 @@ def test_a_mosaic_keeps_what_each_pixel_measured() -> None:
 def test_a_blur_keeps_the_light_and_the_middle() -> None:
     picture = np.zeros((31, 31, 1), np.float32)
     picture[15, 15] = 1
-    out = blur(picture, 1.5)
+    out = gaussian_blur(picture, 1.5)
     v, u = np.mgrid[:31, :31]
     assert out.sum() == pytest.approx(1, abs=1e-5)
     assert (out[..., 0] * u).sum() == pytest.approx(15, abs=1e-4)

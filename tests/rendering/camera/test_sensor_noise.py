@@ -4,47 +4,55 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dmrl.rendering.camera.distortion import Picture
-from dmrl.rendering.camera.sensor import blur
-from dmrl.rendering.camera.sensor_noise import BLOCK_PX, Grain, blocks_of, grain_of, of_white
+from dmrl.rendering.camera.distortion import FloatImage
+from dmrl.rendering.camera.sensor import gaussian_blur
+from dmrl.rendering.camera.sensor_noise import (
+    BLOCK_PX,
+    NoiseEstimate,
+    estimate_noise,
+    measure_blocks,
+    white_noise_correlation,
+)
 
 SHAPE = (240, 320)
 
 
-def pictures(level: float, rng: np.random.Generator, textured: float = 0.0) -> Picture:
+def pictures(level: float, rng: np.random.Generator, textured: float = 0.0) -> FloatImage:
     """A wall in light of a level; a share of it is a street, whose texture the lens has blurred."""
     ramp = np.linspace(0.85, 1.15, SHAPE[1]) * level
-    street = blur(rng.standard_normal((*SHAPE, 1), np.float32), 1.0)[..., 0] * 0.2 * level
+    street = gaussian_blur(rng.standard_normal((*SHAPE, 1), np.float32), 1.0)[..., 0] * 0.2 * level
     street[int(textured * SHAPE[0]) :] = 0
     return np.asarray(ramp + street, np.float32)
 
 
-def taken(light: Picture, rng: np.random.Generator) -> NDArray[np.float32]:
+def taken(light: FloatImage, rng: np.random.Generator) -> NDArray[np.float32]:
     """Blocks of it under a sensor whose noise grows with light: 0.0225 levels^2 a level."""
     noise = rng.standard_normal(SHAPE, np.float32) * np.sqrt(0.0225 * np.maximum(light, 0))
-    return blocks_of(np.asarray(np.clip(np.round(light + noise), 0, 255), np.float32))
+    return measure_blocks(np.asarray(np.clip(np.round(light + noise), 0, 255), np.float32))
 
 
-def measured(levels: tuple[float, ...], textured: float) -> Grain:
+def measured(levels: tuple[float, ...], textured: float) -> NoiseEstimate:
     rng = np.random.default_rng(0)
     shots = [taken(pictures(level, rng, textured), rng) for level in levels * 8]
-    return grain_of(np.concatenate(shots))
+    return estimate_noise(np.concatenate(shots))
 
 
 def test_white_noise_has_no_correlation_and_its_own_spread() -> None:
     rng = np.random.default_rng(0)
     noise = np.asarray(128 + 2 * rng.standard_normal((800, 800), np.float32))
-    grain = grain_of(blocks_of(noise))
+    grain = estimate_noise(measure_blocks(noise))
     assert grain.grain == pytest.approx(2, rel=0.03)
     assert grain.grain_correlation == pytest.approx(0, abs=0.01)
-    assert of_white() < -0.04  # what taking the plane out of a block would make of it
+    assert (
+        white_noise_correlation() < -0.04
+    )  # what taking the plane out of a block would make of it
 
 
 def test_noise_of_a_mosaic_is_as_coarse_as_it_is() -> None:
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((800, 800), np.float32)
     both = 128 + noise + 0.5 * (np.roll(noise, 1, 0) + np.roll(noise, 1, 1))
-    found = grain_of(blocks_of(both)).grain_correlation
+    found = estimate_noise(measure_blocks(both)).grain_correlation
     assert 0.28 < found < 0.5 / 1.5  # a plane takes more out of coarse noise than out of white
 
 
@@ -61,12 +69,12 @@ def test_a_camera_has_one_grain_in_the_dark_and_in_the_light() -> None:
 
 def test_black_and_white_show_no_grain() -> None:
     for level in (0.0, 255.0):
-        grain = grain_of(blocks_of(np.full(SHAPE, level, np.float32)))
+        grain = estimate_noise(measure_blocks(np.full(SHAPE, level, np.float32)))
         assert np.isnan(grain.grain) and np.isnan(grain.grain_correlation)
 
 
 def test_a_block_is_not_chosen_by_its_own_noise() -> None:
-    blocks = blocks_of(np.random.default_rng(0).random((64, 8 * 5), np.float32) * 9 + 100)
+    blocks = measure_blocks(np.random.default_rng(0).random((64, 8 * 5), np.float32) * 9 + 100)
     assert blocks.shape == (64 // BLOCK_PX * 4, 4)  # the fifth has none beside it
     assert np.array_equal(blocks[0::2, 3], blocks[1::2, 1])
     assert np.array_equal(blocks[1::2, 3], blocks[0::2, 1])

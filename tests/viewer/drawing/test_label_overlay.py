@@ -4,13 +4,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from dmrl.viewer.drawing.archetypes import detections
-from dmrl.viewer.drawing.label_overlay import _text_places
-from dmrl.viewer.drawing.legend import _fitting
+from dmrl.viewer.drawing.archetypes import draw_detections
+from dmrl.viewer.drawing.label_overlay import _place_texts
+from dmrl.viewer.drawing.legend import _fit_names
 
 
 def test_a_text_stands_above_its_peer() -> None:
-    places = _text_places(np.array([[100.0, 80.0], [100.0, 80.0]]), np.array([0, 1]), 320)
+    places = _place_texts(np.array([[100.0, 80.0], [100.0, 80.0]]), np.array([0, 1]), 320)
     assert places == pytest.approx(np.array([[100.0, 80 - 320 / 12]] * 2))
 
 
@@ -18,7 +18,7 @@ def test_no_text_stands_on_another() -> None:
     rng = np.random.default_rng(0)
     for count in range(2, 7):
         tops = rng.uniform([100, 0], [180, 120], (count, 2))
-        places = _text_places(tops, np.zeros(count, int), 320)
+        places = _place_texts(tops, np.zeros(count, int), 320)
         assert (places[:, 1] >= 0).all()
         apart = abs(places[:, None] - places)[np.triu_indices(count, 1)]
         assert ((apart[:, 0] >= 80) | (apart[:, 1] >= 26)).all(), (tops, places)
@@ -27,7 +27,7 @@ def test_no_text_stands_on_another() -> None:
 def test_texts_of_two_estimates_at_other_heights_do_not_meet() -> None:
     # The upper one's text has its own place, the lower one's would stand on it.
     tops = np.array([[100.0, 80.0], [110.0, 90.0]])
-    places = _text_places(tops, np.zeros(2, int), 320)
+    places = _place_texts(tops, np.zeros(2, int), 320)
     assert abs(places[0, 1] - places[1, 1]) >= 320 / 12 - 0.5
 
 
@@ -36,7 +36,7 @@ def test_of_detections_whose_texts_would_meet_the_surer_has_one() -> None:
     near = [(100.0, 80.0, 0.5), (130.0, 90.0, 0.9), (130.0, 180.0, 0.6), (260.0, 90.0, 0.7)]
     found = [dict(zip(("u_px", "v_px", "confidence"), d, strict=True)) for d in near]
     rows = [{"threshold": 0.4, "detections": [{**d, "depth_m": 1.0} for d in found]}] * 2
-    points, entity, weak = detections("/a", "a", pa.RecordBatch.from_pylist(rows), 320)
+    points, entity, weak = draw_detections("/a", "a", pa.RecordBatch.from_pylist(rows), 320)
     assert (points.path, entity.path, weak.path) == ("/a", "/a/texts", "/a/weak")
     (texts,) = (c for c in entity.columns if "labels" in str(c.component_descriptor()))
     told = ["conf 0.90, 1.00 m", "conf 0.60, 1.00 m", "conf 0.70, 1.00 m"]
@@ -44,7 +44,7 @@ def test_of_detections_whose_texts_would_meet_the_surer_has_one() -> None:
 
 
 def test_names_of_a_legend_fit_or_are_shortened() -> None:
-    assert _fitting(["truth", "estimate", "old", "new"]) == ["truth", "estimate", "old", "new"]
-    long = _fitting(["truth", "estimate", "found-refined-101", "found-network-101"])
+    assert _fit_names(["truth", "estimate", "old", "new"]) == ["truth", "estimate", "old", "new"]
+    long = _fit_names(["truth", "estimate", "found-refined-101", "found-network-101"])
     assert long == ["truth", "estimate", "…refined…", "…network…"]
-    assert _fitting(["truth", "a" * 60]) == ["truth", "a" * 36 + "…"]
+    assert _fit_names(["truth", "a" * 60]) == ["truth", "a" * 36 + "…"]

@@ -16,7 +16,7 @@ import pytest
 from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import decode
 from dmrl.stages import view as stage
-from dmrl.viewer import Page, Settings, Web, screenshot, view
+from dmrl.viewer import Page, Settings, Web, show_in_window, write_screenshot
 from dmrl.viewer.layouts import BACKGROUND, IMAGE_OPACITY
 from dmrl.viewer.window import desktop, viewer_process
 
@@ -46,7 +46,7 @@ def test_a_picture_shows_the_image_nearest_to_the_time(
     make: Make, tmp_path: Path, vulkan: None
 ) -> None:
     picture = tmp_path / "picture.png"
-    assert screenshot([make()], picture, Settings(), time_s=0.43) == "at 0.400 s"
+    assert write_screenshot([make()], picture, Settings(), time_s=0.43) == "at 0.400 s"
     rgb = decode(picture.read_bytes())
     assert rgb.shape == (1000, 1600, 3)
     # No empty bar above the panels: their names stand in the first rows.
@@ -64,7 +64,7 @@ def test_without_a_vulkan_driver_a_picture_says_how_to_get_one(
     for name in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):
         monkeypatch.setenv(name, "/nonexistent")
     with pytest.raises(OutputError, match="apt-get install mesa-vulkan-drivers"):
-        screenshot([make()], tmp_path / "picture.png", Settings())
+        write_screenshot([make()], tmp_path / "picture.png", Settings())
     assert list(tmp_path.glob("picture*")) == []
 
 
@@ -74,25 +74,28 @@ def test_a_viewer_that_stops_is_reported_with_its_last_words(
     code = "import sys; sys.exit('out of luck')"
     monkeypatch.setattr(desktop, "command", lambda *_: [sys.executable, "-c", code])
     with pytest.raises(OutputError, match=r"viewer stopped: out of luck\. Try: dmrl view --save"):
-        screenshot([make()], tmp_path / "picture.png", Settings())
+        write_screenshot([make()], tmp_path / "picture.png", Settings())
     with pytest.raises(SettingError, match=r"viewer stopped: out of luck\. Use --save"):
-        view([make("second.mcap")], Settings())
+        show_in_window([make("second.mcap")], Settings())
 
 
 def test_a_picture_is_never_overwritten(make: Make, tmp_path: Path) -> None:
     (tmp_path / "picture.png").write_bytes(b"mine")
     with pytest.raises(OutputError, match="never overwritten"):
-        screenshot([make()], tmp_path / "picture.png", Settings())
+        write_screenshot([make()], tmp_path / "picture.png", Settings())
     assert (tmp_path / "picture.png").read_bytes() == b"mine"
 
 
 def test_without_a_screen_the_window_says_what_else_there_is(make: Make) -> None:
     with pytest.raises(SettingError, match=r"no screen.*--save, --screenshot or --serve"):
-        view([make()], Settings())
+        show_in_window([make()], Settings())
 
 
 def test_the_viewer_is_told_to_listen_on_loopback_and_to_call_nobody() -> None:
-    command, environment = viewer_process.command("127.0.0.1"), viewer_process.environment()
+    command, environment = (
+        viewer_process.build_command("127.0.0.1"),
+        viewer_process.build_environment(),
+    )
     assert command[command.index("--bind") + 1] == "127.0.0.1"
     assert environment["CI"] == "1"
     assert {environment[name] for name in ("https_proxy", "HTTPS_PROXY")} == {"http://127.0.0.1:9"}

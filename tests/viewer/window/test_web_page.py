@@ -102,7 +102,7 @@ def test_a_browser_shows_the_flight(fly: Make, browser: Browser) -> None:
     page = Page([fly()], Settings())
     try:
         browser.call("/url", {"url": page.url})
-        page.fill()
+        page.send_data()
         deadline = time.monotonic() + PATIENCE_S
         shown: dict[str, float] = {"nothing": 0.0}
         names = ("truth", "estimate", "detection", "range")

@@ -4,17 +4,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dmrl.deploy.c import c_name
-from dmrl.deploy.c.harness import harness
-from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, missing, run
+from dmrl.deploy.c.harness import generate_harness
+from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, find_missing, run_program
 from dmrl.deploy.int8.network import IntegerNetwork
 
 RISCV_FLAGS = ("-march=rv32imc", "-mabi=ilp32", "-nostdlib", "-nostartfiles", "-ffreestanding",
                "-Wl,--no-relax")  # fmt: skip
 """Flags for rv32imc without libraries. Without start-up code, no code sets the register for
 relaxation."""
-SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all",
+SANITIZER_FLAGS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all",
               "-DHARNESS_GUARD")  # fmt: skip
-LEVELS = ("-O0", "-O1", "-O2", "-O3")
+OPTIMIZATION_LEVELS = ("-O0", "-O1", "-O2", "-O3")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Build:
     bayer: bool = False
     emulated: bool = False
 
-    def program(
+    def compile_program(
         self, network: IntegerNetwork, folder: Path, build: Path, *, refine: bool = False
     ) -> list[str | Path]:
         """Compile the C of an export folder; return the command that runs the program.
@@ -63,7 +63,7 @@ class Build:
             If compilation fails.
         """
         harness_c, program = build / "harness.c", build / "program"
-        harness_c.write_text(harness(network), encoding="utf-8")
+        harness_c.write_text(generate_harness(network), encoding="utf-8")
         name = c_name(network)
         mode = f"-D{name.upper()}_BAYER={int(self.bayer)}"
         flags: tuple[str | Path, ...] = (*self.flags, mode, "-iquote", folder)
@@ -75,7 +75,7 @@ class Build:
             sources.append(folder / f"{name}_refine.c")
         last: tuple[str, ...] = ("-lgcc",) if self.emulated else ()
         what = f"{self.compiler} {self.label}"
-        run((self.compiler, "-std=gnu99", *flags, *sources, *last, "-o", program), what)
+        run_program((self.compiler, "-std=gnu99", *flags, *sources, *last, "-o", program), what)
         return [EMULATOR, program] if self.emulated else [program]
 
 
@@ -90,31 +90,31 @@ class Target:
     def skipped(self) -> str:
         """Reason why it cannot run on this machine; empty if it can."""
         needed = [self.builds[0].compiler]
-        return missing(*needed, *([EMULATOR] if self.builds[0].emulated else []))
+        return find_missing(*needed, *([EMULATOR] if self.builds[0].emulated else []))
 
 
-def targets() -> tuple[Target, ...]:
+def list_targets() -> tuple[Target, ...]:
     """Return every target."""
     hosts = tuple(
         Target(
             name,
             (
-                *(Build(level, name, (level,)) for level in LEVELS),
+                *(Build(level, name, (level,)) for level in OPTIMIZATION_LEVELS),
                 Build("-O3 Bayer", name, ("-O3",), bayer=True),
             ),
         )
         for name in ("gcc", "clang")
     )
     # gcc includes its sanitizers; those of clang are a separate package.
-    checker = "clang" if missing("gcc") and not missing("clang") else "gcc"
+    checker = "clang" if find_missing("gcc") and not find_missing("clang") else "gcc"
     label = f"{checker} address, undefined"
     return (
         *hosts,
         Target(
             "sanitizers",
             (
-                Build(label, checker, SANITIZERS),
-                Build(f"{label}, Bayer", checker, SANITIZERS, bayer=True),
+                Build(label, checker, SANITIZER_FLAGS),
+                Build(f"{label}, Bayer", checker, SANITIZER_FLAGS, bayer=True),
             ),
         ),
         Target(

@@ -11,17 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.c import c_name, write_c
-from dmrl.deploy.c.harness import DETECTION, MOST, Answer, detections_of, harness
-from dmrl.deploy.c.run.toolchain import host_compiler, run
+from dmrl.deploy.c.harness import (
+    DETECTION_DTYPE,
+    MAX_DETECTIONS,
+    HarnessResult,
+    generate_harness,
+    to_detections,
+)
+from dmrl.deploy.c.run.toolchain import find_host_compiler, run_program
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import ModelError
 
-FLAGS = ("-O3", "-std=gnu99", "-shared", "-fPIC", "-DHARNESS_SHARED")
+LIBRARY_FLAGS = ("-O3", "-std=gnu99", "-shared", "-fPIC", "-DHARNESS_SHARED")
 # Rows are short: 512-bit vectors would spend their time on remainders.
-PC_FLAGS = ("-march=native", "-mprefer-vector-width=256")
+X86_FLAGS = ("-march=native", "-mprefer-vector-width=256")
 
 
-class Compiled:
+class CompiledNetwork:
     """A network, compiled for this machine. Not thread-safe: the C has one state.
 
     Parameters
@@ -50,37 +56,37 @@ class Compiled:
         if folder is None:
             write_c(network, build, [])
             folder = build
-        require_c(network, folder)
+        require_c_files(network, folder)
         name = c_name(network)
-        (build / "harness.c").write_text(harness(network), encoding="utf-8")
+        (build / "harness.c").write_text(generate_harness(network), encoding="utf-8")
         library = build / "network.so"
         sources = (build / "harness.c", folder / f"{name}.c")
-        own = PC_FLAGS if platform.machine() in ("x86_64", "AMD64") else ()
-        flags = (*FLAGS, *own, f"-D{name.upper()}_BAYER=0", "-iquote", folder)
-        run(
-            (compiler or host_compiler(), *flags, *sources, "-o", library),
+        own = X86_FLAGS if platform.machine() in ("x86_64", "AMD64") else ()
+        flags = (*LIBRARY_FLAGS, *own, f"-D{name.upper()}_BAYER=0", "-iquote", folder)
+        run_program(
+            (compiler or find_host_compiler(), *flags, *sources, "-o", library),
             f"compiling {folder / name}.c",
         )
         self._run = ctypes.CDLL(str(library)).harness_run
 
-    def answer(self, image: NDArray[np.uint8], most: int = MOST) -> Answer:
+    def run_detections(self, image: NDArray[np.uint8], most: int = MAX_DETECTIONS) -> HarnessResult:
         """Return grids and detections of a (height, width, channels) image."""
         network = self.network
         assert image.shape == (network.height_px, network.width_px, network.channels)
         pixels = np.ascontiguousarray(image, np.uint8)
         grids = np.empty((len(network.heads), *network.grid_shape), np.int8)
-        found = np.zeros(most, DETECTION)
+        found = np.zeros(most, DETECTION_DTYPE)
         pointers = (ctypes.c_void_p(a.ctypes.data) for a in (pixels, grids, found))
         count = self._run(*pointers, most)
         named = dict(zip(network.heads, grids, strict=True))
-        return Answer(named, detections_of(found[:count]), 0)
+        return HarnessResult(named, to_detections(found[:count]), 0)
 
     def run(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
         """Return every head's grid, as `run_network` of ``reference`` does."""
-        return self.answer(image).grids
+        return self.run_detections(image).grids
 
 
-def require_c(network: IntegerNetwork, folder: Path) -> None:
+def require_c_files(network: IntegerNetwork, folder: Path) -> None:
     """Raise ModelError unless a folder contains the C of a network.
 
     Raises

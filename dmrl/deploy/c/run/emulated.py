@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.c import c_name, write_c
-from dmrl.deploy.c.harness import answers
-from dmrl.deploy.c.run.compile_targets import Build, Target, targets
-from dmrl.deploy.c.run.compiled import require_c
-from dmrl.deploy.c.run.toolchain import run
+from dmrl.deploy.c.harness import parse_results
+from dmrl.deploy.c.run.compile_targets import Build, Target, list_targets
+from dmrl.deploy.c.run.compiled import require_c_files
+from dmrl.deploy.c.run.toolchain import run_program
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import ToolError
 
 RISCV32 = "riscv32"
 
 
-class Emulated:
+class EmulatedNetwork:
     """A network, compiled for rv32imc and emulated. An image takes seconds.
 
     Output is that of the chip; speed is not.
@@ -40,7 +40,7 @@ class Emulated:
     """
 
     def __init__(self, network: IntegerNetwork, folder: Path | None = None) -> None:
-        target: Target = next(t for t in targets() if t.name == RISCV32)
+        target: Target = next(t for t in list_targets() if t.name == RISCV32)
         if target.skipped:
             raise ToolError(f"--backend {RISCV32}: {target.skipped}")
         self.network = network
@@ -49,15 +49,15 @@ class Emulated:
         if folder is None:
             write_c(network, build, [])
             folder = build
-        require_c(network, folder)
+        require_c_files(network, folder)
         first: Build = target.builds[0]
         self._what = f"{c_name(network)}.c on {RISCV32}"
-        self._program = first.program(network, folder, build)
+        self._program = first.compile_program(network, folder, build)
 
     def run(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
         """Return every head's grid, as `run_network` of ``reference`` does."""
-        said = run(self._program, self._what, data=np.ascontiguousarray(image).tobytes())
-        found = answers(self.network, said)
+        said = run_program(self._program, self._what, data=np.ascontiguousarray(image).tobytes())
+        found = parse_results(self.network, said)
         if len(found) != 1:
             raise ToolError(f"{self._what}: {len(found)} results for one image. Export it again")
         return found[0].grids

@@ -8,30 +8,30 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.c import L1_FOR_STATE, c_name
+from dmrl.deploy.c import MAX_L1_STATE_BYTES, c_name
 from dmrl.deploy.c.run.compile_targets import RISCV_FLAGS, Build
 from dmrl.deploy.c.run.toolchain import (
     EMULATOR,
     RISCV,
-    emulator_version,
-    host_compiler,
-    missing,
-    run,
-    run_both,
+    find_host_compiler,
+    find_missing,
+    get_emulator_version,
+    run_program,
+    run_with_stderr,
 )
-from dmrl.deploy.c.templating import fill
+from dmrl.deploy.c.templating import fill_template
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import ModelError, ToolError
 
 CLUSTER_HZ = 175e6
 """Clock of the GAP8's cluster of eight cores, Hz."""
-KERNEL_MACS = 4.1
+KERNEL_MACS_PER_CYCLE = 4.1
 """Multiply-accumulates per cycle of hand-written 8-bit kernels on eight cores, over a whole network
 of this size. PULP-NN reaches 15.5 in one large layer."""
 
 
 @dataclass(frozen=True, slots=True)
-class Cost:
+class ExecutionCost:
     """Cost on rv32imc at -O3.
 
     Parameters
@@ -47,7 +47,9 @@ class Cost:
     instructions: int | None
 
 
-def cost(network: IntegerNetwork, folder: Path, image: NDArray[np.uint8]) -> Cost | None:
+def measure_cost(
+    network: IntegerNetwork, folder: Path, image: NDArray[np.uint8]
+) -> ExecutionCost | None:
     """Measure the cost of the C of an export folder; None without the cross compiler.
 
     Raises
@@ -55,18 +57,18 @@ def cost(network: IntegerNetwork, folder: Path, image: NDArray[np.uint8]) -> Cos
     ToolError
         If compilation or the emulator fails.
     """
-    if missing(RISCV):
+    if find_missing(RISCV):
         return None
     with tempfile.TemporaryDirectory(prefix="dmrl-verify-") as place:
-        code, constants = _sizes(network, folder, Path(place))
+        code, constants = _measure_object(network, folder, Path(place))
         counted = None
-        if not missing(EMULATOR):
-            counted = _instructions(network, folder, Path(place), image)
-    return Cost(code, constants, counted)
+        if not find_missing(EMULATOR):
+            counted = _count_instructions(network, folder, Path(place), image)
+    return ExecutionCost(code, constants, counted)
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class StateMemory:
     """Memory that the C of an export keeps between rows.
 
     Parameters
@@ -86,10 +88,10 @@ class Memory:
     @property
     def fits_l1(self) -> bool:
         """Whether the state fits a GAP8's L1 beside the stacks of the cores."""
-        return self.state_bytes <= L1_FOR_STATE
+        return self.state_bytes <= MAX_L1_STATE_BYTES
 
 
-def memory_of(network: IntegerNetwork, folder: Path) -> Memory:
+def parse_state_memory(network: IntegerNetwork, folder: Path) -> StateMemory:
     """Read the sizes from the header of an export folder; the C checks them at compile time.
 
     Raises
@@ -103,39 +105,41 @@ def memory_of(network: IntegerNetwork, folder: Path) -> Memory:
     found = [re.search(rf"_{name}_BYTES \((\d+)", text) for name in names]
     if not found[0]:
         raise ModelError(f"{header} is damaged. Export the model again: dmrl export")
-    return Memory(*(int(one[1]) if one else 0 for one in found))
+    return StateMemory(*(int(one[1]) if one else 0 for one in found))
 
 
-def _sizes(network: IntegerNetwork, folder: Path, build: Path) -> tuple[int, int]:
+def _measure_object(network: IntegerNetwork, folder: Path, build: Path) -> tuple[int, int]:
     """Compile the object; return its bytes of code and of constants."""
     name = c_name(network)
     target = build / f"{name}.o"
     flags = ("-std=c99", "-O3", *RISCV_FLAGS, f"-D{name.upper()}_BAYER=0")
-    run((RISCV, *flags, "-c", folder / f"{name}.c", "-o", target), "measuring the C")
-    said = run((RISCV.replace("gcc", "size"), "-A", target), "measuring the C").decode()
+    run_program((RISCV, *flags, "-c", folder / f"{name}.c", "-o", target), "measuring the C")
+    said = run_program((RISCV.replace("gcc", "size"), "-A", target), "measuring the C").decode()
     sections = re.findall(r"^(\.\S+)\s+(\d+)", said, flags=re.MULTILINE)
     code = sum(int(size) for name, size in sections if name.startswith(".text"))
     constants = sum(int(size) for name, size in sections if "rodata" in name)
     return code, constants
 
 
-def _instructions(
+def _count_instructions(
     network: IntegerNetwork, folder: Path, build: Path, image: NDArray[np.uint8]
 ) -> int | None:
     """Count the instructions per image: the difference between two images and one."""
     plugin, source = build / "count.so", build / "count.c"
-    source.write_text(fill("count.c"), encoding="utf-8")
+    source.write_text(fill_template("count.c"), encoding="utf-8")
     # QEMU 9 no longer accepts version 1 of the plugin interface.
-    version = 1 if emulator_version() < 9 else 2
+    version = 1 if get_emulator_version() < 9 else 2
     flags = ("-O2", "-shared", "-fPIC", f"-DPLUGIN_VERSION={version}")
     harness = ("-O3", *RISCV_FLAGS, "-DHARNESS_COUNT")
-    program = Build("-O3", RISCV, harness, emulated=True).program(network, folder, build)
+    program = Build("-O3", RISCV, harness, emulated=True).compile_program(network, folder, build)
     counts = []
     try:
-        run((host_compiler(), *flags, source, "-o", plugin), "counting instructions")
+        run_program((find_host_compiler(), *flags, source, "-o", plugin), "counting instructions")
         for times in (1, 2):
             command = (EMULATOR, "-plugin", plugin, *program[1:])
-            _, said = run_both(command, "counting instructions", data=image.tobytes() * times)
+            _, said = run_with_stderr(
+                command, "counting instructions", data=image.tobytes() * times
+            )
             found = re.search(r"executed (\d+)", said)
             if not found:
                 return None
@@ -145,7 +149,9 @@ def _instructions(
     return counts[1] - counts[0]
 
 
-def rates(network: IntegerNetwork, found: Cost | None, kept: Memory) -> list[tuple[float, str]]:
+def estimate_rates(
+    network: IntegerNetwork, found: ExecutionCost | None, kept: StateMemory
+) -> list[tuple[float, str]]:
     """Estimate images per second on a GAP8; each estimate comes with its assumptions.
 
     Parameters
@@ -176,9 +182,9 @@ def rates(network: IntegerNetwork, found: Cost | None, kept: Memory) -> list[tup
         )
     out.append(
         (
-            CLUSTER_HZ * KERNEL_MACS / network.macs,
+            CLUSTER_HZ * KERNEL_MACS_PER_CYCLE / network.macs,
             f"hand-written 8-bit SIMD kernels (not exported) on all 8 cores at "
-            f"{CLUSTER_HZ / 1e6:.0f} MHz, {KERNEL_MACS} multiply-accumulates a cycle, {memory}",
+            f"{CLUSTER_HZ / 1e6:.0f} MHz, {KERNEL_MACS_PER_CYCLE} multiply-accumulates a cycle, {memory}",
         )
     )
     return out

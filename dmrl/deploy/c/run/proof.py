@@ -8,14 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.backends import seen_by
-from dmrl.deploy.c import L1_FOR_STATE
-from dmrl.deploy.c.run.compile_targets import targets
-from dmrl.deploy.c.run.compiled import require_c
-from dmrl.deploy.c.run.measure import Cost, Memory, cost, memory_of, rates
-from dmrl.deploy.c.run.verification import TargetResult, expected, prove
+from dmrl.deploy.backends import to_network_input
+from dmrl.deploy.c import MAX_L1_STATE_BYTES
+from dmrl.deploy.c.run.compile_targets import list_targets
+from dmrl.deploy.c.run.compiled import require_c_files
+from dmrl.deploy.c.run.measure import (
+    ExecutionCost,
+    StateMemory,
+    estimate_rates,
+    measure_cost,
+    parse_state_memory,
+)
+from dmrl.deploy.c.run.verification import TargetResult, compute_expected, verify_target
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.deploy.int8.store import load
+from dmrl.deploy.int8.store import load_network
 from dmrl.errors import SettingError, ToolError
 from dmrl.terminal.progress import track
 from dmrl.terminal.tables import print_line, print_table
@@ -45,8 +51,8 @@ class Proof:
     pictures: int
     noise: int
     targets: list[TargetResult]
-    cost: Cost | None
-    memory: Memory
+    cost: ExecutionCost | None
+    memory: StateMemory
 
     @property
     def wrong(self) -> bool:
@@ -93,7 +99,7 @@ class Proof:
             "instructions_per_mac": executed / network.macs if executed else None,
             "gap8_estimates": [
                 {"images_per_s": rate, "assuming": assumption}
-                for rate, assumption in rates(network, found, self.memory)
+                for rate, assumption in estimate_rates(network, found, self.memory)
             ],
         }
 
@@ -110,7 +116,7 @@ class Proof:
         tried = f"{self.pictures} images and {self.noise} of noise"
         print_table(f"{folder}: the C against the integer reference, {tried}", columns, rows)
         print_table("Cost of the C", ("what", "", "how"), self._cost_rows())
-        for rate, assumption in rates(self.network, self.cost, self.memory):
+        for rate, assumption in estimate_rates(self.network, self.cost, self.memory):
             print_line(f"estimated {rate:.2f} images/s on a GAP8: {assumption}")
 
     def _cost_rows(self) -> list[tuple[object, ...]]:
@@ -120,7 +126,7 @@ class Proof:
             (
                 "fits a GAP8's L1",
                 "yes" if kept.fits_l1 else "no",
-                f"{L1_FOR_STATE:,} bytes, beside stacks",
+                f"{MAX_L1_STATE_BYTES:,} bytes, beside stacks",
             ),
         ]
         if kept.far_bytes:
@@ -146,8 +152,8 @@ def open_export(folder: Path) -> IntegerNetwork:
     ModelError
         If the folder is not an export, or is damaged.
     """
-    network = load(folder)
-    require_c(network, folder)
+    network = load_network(folder)
+    require_c_files(network, folder)
     return network
 
 
@@ -193,20 +199,20 @@ def prove_export(
         )
     shape = (noise_images, network.height_px, network.width_px, network.channels)
     noise = np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
-    images = [*(seen_by(network, image) for image in pictures), *noise]
+    images = [*(to_network_input(network, image) for image in pictures), *noise]
     if not images:
         raise SettingError("no images to try the C on. Give --images or --noise above 0")
-    wanted = expected(network, list(track(images, "Computing the reference")))
-    chosen = [target for target in targets() if target.name in names]
-    tried = [prove(network, folder, t, wanted) for t in track(chosen, "Proving the C")]
+    wanted = compute_expected(network, list(track(images, "Computing the reference")))
+    chosen = [target for target in list_targets() if target.name in names]
+    tried = [verify_target(network, folder, t, wanted) for t in track(chosen, "Proving the C")]
     return Proof(
         network,
         len(pictures),
         noise_images,
         tried,
         # C that a target could not compile or run is not worth measuring.
-        None if any(t.error for t in tried) else cost(network, folder, images[0]),
-        memory_of(network, folder),
+        None if any(t.error for t in tried) else measure_cost(network, folder, images[0]),
+        parse_state_memory(network, folder),
     )
 
 

@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.bayer_input import demosaic, mosaic
-from dmrl.deploy.c.harness import MOST, Answer, answers
+from dmrl.deploy.bayer_input import demosaic, to_mosaic
+from dmrl.deploy.c.harness import MAX_DETECTIONS, HarnessResult, parse_results
 from dmrl.deploy.c.run.compile_targets import Build, Target
-from dmrl.deploy.c.run.toolchain import run
-from dmrl.deploy.c.source_file import STACK_BYTES
+from dmrl.deploy.c.run.toolchain import run_program
+from dmrl.deploy.c.source_file import MAX_STACK_BYTES
 from dmrl.deploy.c.templating import c_name
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.deploy.int8.reference import decode, tensors_of
-from dmrl.deploy.int8.reference import run as reference_run
-from dmrl.deploy.int8.refinement import Seen, learn, start
+from dmrl.deploy.int8.reference import decode_detections, iter_tensors
+from dmrl.deploy.int8.reference import run_network as reference_run
+from dmrl.deploy.int8.refinement import RefinementLabel, initial_weights, take_gradient_step
 from dmrl.errors import ToolError
 
 Image = NDArray[np.uint8]
-LEARNT_IMAGES, LEARNING_RATE = 5, 3277
+REFINE_IMAGES, REFINE_RATE = 5, 3277
 """Images and learning rate (0.05 in fixed point) of the refinement check."""
 BAYER_IMAGES = 4
 """Images for builds with raw mosaics: only the input stage of their code differs."""
@@ -82,34 +82,37 @@ class TargetResult:
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
+class ExpectedResults:
     """Images in the network's format, raw mosaics of some, and the expected results of both."""
 
     images: Sequence[Image]
     raws: Sequence[Image]
-    of_images: list[Answer]
-    of_raws: list[Answer]
+    of_images: list[HarnessResult]
+    of_raws: list[HarnessResult]
 
 
-def expected(network: IntegerNetwork, images: Sequence[Image]) -> Expected:
+def compute_expected(network: IntegerNetwork, images: Sequence[Image]) -> ExpectedResults:
     """Compute the reference results of (height, width, channels) images."""
-    raws = [mosaic(image) for image in images[:BAYER_IMAGES]]
+    raws = [to_mosaic(image) for image in images[:BAYER_IMAGES]]
     seen = [demosaic(raw, channels=network.channels) for raw in raws]
-    return Expected(
-        images, raws, [_answer(network, i) for i in images], [_answer(network, i) for i in seen]
+    return ExpectedResults(
+        images,
+        raws,
+        [_reference_result(network, i) for i in images],
+        [_reference_result(network, i) for i in seen],
     )
 
 
-def _answer(network: IntegerNetwork, image: Image) -> Answer:
+def _reference_result(network: IntegerNetwork, image: Image) -> HarnessResult:
     grids = reference_run(network, image)
-    return Answer(grids, decode(network, grids, MOST), 0)
+    return HarnessResult(grids, decode_detections(network, grids, MAX_DETECTIONS), 0)
 
 
-def prove(
+def verify_target(
     network: IntegerNetwork,
     folder: Path,
     target: Target,
-    wanted: Expected,
+    wanted: ExpectedResults,
     *,
     on_build: Callable[[str], None] = lambda _: None,
 ) -> TargetResult:
@@ -134,71 +137,75 @@ def prove(
     for build in target.builds:
         on_build(f"{target.name} {build.label}")
         try:
-            result.builds.append(_try(network, folder, build, wanted))
-            if learns(network, folder) and not build.bayer:
-                result.builds.append(_try_learning(network, folder, build, wanted.images))
+            result.builds.append(_verify_build(network, folder, build, wanted))
+            if has_refinement(network, folder) and not build.bayer:
+                result.builds.append(_verify_refinement(network, folder, build, wanted.images))
         except ToolError as e:
             return TargetResult(target.name, result.builds, error=str(e))
     return result
 
 
-def _try(network: IntegerNetwork, folder: Path, build: Build, wanted: Expected) -> BuildResult:
+def _verify_build(
+    network: IntegerNetwork, folder: Path, build: Build, wanted: ExpectedResults
+) -> BuildResult:
     images = wanted.raws if build.bayer else wanted.images
     right = wanted.of_raws if build.bayer else wanted.of_images
     with tempfile.TemporaryDirectory(prefix="dmrl-verify-") as place:
-        command = build.program(network, folder, Path(place))
+        command = build.compile_program(network, folder, Path(place))
         data = b"".join(image.tobytes() for image in images)
-        found = answers(network, run(command, f"{build.compiler} {build.label}", data=data))
+        found = parse_results(
+            network, run_program(command, f"{build.compiler} {build.label}", data=data)
+        )
     if len(found) != len(images):
         raise ToolError(
             f"{build.compiler} {build.label}: answered {len(found)} of {len(images)} images. "
             "Export the model again"
         )
     stack_bytes = max(a.stack_bytes for a in found)
-    if stack_bytes > STACK_BYTES:
+    if stack_bytes > MAX_STACK_BYTES:
         raise ToolError(
             f"{build.compiler} {build.label}: uses {stack_bytes} bytes of stack, the header states "
-            f"{STACK_BYTES}. Give its task more, and report it"
+            f"{MAX_STACK_BYTES}. Give its task more, and report it"
         )
-    wrong = sum(not same(a, b) for a, b in zip(found, right, strict=True))
+    wrong = sum(not is_same_result(a, b) for a, b in zip(found, right, strict=True))
     return BuildResult(build.label, len(images), wrong, stack_bytes)
 
 
-def learns(network: IntegerNetwork, folder: Path) -> bool:
+def has_refinement(network: IntegerNetwork, folder: Path) -> bool:
     """Return whether an export folder has the C for refinement."""
     return (folder / f"{c_name(network)}_refine.c").is_file()
 
 
-def _try_learning(
+def _verify_refinement(
     network: IntegerNetwork, folder: Path, build: Build, images: Sequence[Image]
 ) -> BuildResult:
     """Refine on image after image; compare every weight after every step."""
-    few = images[:LEARNT_IMAGES]
-    steps = [(*_made_up(network, k), LEARNING_RATE) for k in range(len(few))]
+    few = images[:REFINE_IMAGES]
+    steps = [(*_synthetic_label(network, k), REFINE_RATE) for k in range(len(few))]
     pairs = zip(few, steps, strict=True)
     data = b"".join(i.tobytes() + np.array(step, "<i4").tobytes() for i, step in pairs)
     with tempfile.TemporaryDirectory(prefix="dmrl-verify-") as place:
-        command = build.program(network, folder, Path(place), refine=True)
-        said = run(command, f"{build.compiler} {build.label}, learning", data=data)
-    learned, wanted = start(network), []
+        command = build.compile_program(network, folder, Path(place), refine=True)
+        said = run_program(command, f"{build.compiler} {build.label}, learning", data=data)
+    learned, wanted = initial_weights(network), []
     for image, (*seen, rate) in zip(few, steps, strict=True):
-        *_, features, _ = tensors_of(network, image)
-        learned = learn(network, learned, features, Seen(*seen), rate)
+        *_, features, _ = iter_tensors(network, image)
+        learned = take_gradient_step(network, learned, features, RefinementLabel(*seen), rate)
         wanted.append(np.concatenate([learned.weight.ravel(), learned.bias]))
     got = np.frombuffer(said[: len(said) // 4 * 4], "<i4").reshape(len(few), -1)
     wrong = sum(not np.array_equal(a, b) for a, b in zip(got, wanted, strict=True))
     return BuildResult(f"{build.label}, learning", len(few), wrong, 0)
 
 
-def _made_up(network: IntegerNetwork, number: int) -> Seen:
+def _synthetic_label(network: IntegerNetwork, number: int) -> RefinementLabel:
     """Return a synthetic label: a robot at some position, or none in every third image."""
     if number % 3 == 2:
-        return Seen(0, 0, 0)
+        return RefinementLabel(0, 0, 0)
     u_px, v_px = (37 + 61 * number) % network.width_px, (23 + 41 * number) % network.height_px
-    return Seen(16 * u_px + 5, 16 * v_px + 3, 400 + 300 * number)
+    return RefinementLabel(16 * u_px + 5, 16 * v_px + 3, 400 + 300 * number)
 
 
-def same(a: Answer, b: Answer) -> bool:
+def is_same_result(a: HarnessResult, b: HarnessResult) -> bool:
     """Return whether two results agree in every grid and every detection."""
     return a.detections == b.detections and all(
         np.array_equal(a.grids[head], b.grids[head]) for head in b.grids

@@ -6,29 +6,46 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.deploy.c.harness import Answer
+from dmrl.deploy.c.harness import HarnessResult
 from dmrl.deploy.c.run import measure, verification
 from dmrl.deploy.c.run.compile_targets import Build, Target
-from dmrl.deploy.c.run.measure import CLUSTER_HZ, KERNEL_MACS, Cost, Memory, memory_of, rates
-from dmrl.deploy.c.run.verification import BuildResult, TargetResult, expected, prove, same
-from dmrl.deploy.c.source_file import STACK_BYTES
-from dmrl.deploy.int8.reference import Detection
+from dmrl.deploy.c.run.measure import (
+    CLUSTER_HZ,
+    KERNEL_MACS_PER_CYCLE,
+    ExecutionCost,
+    StateMemory,
+    estimate_rates,
+    parse_state_memory,
+)
+from dmrl.deploy.c.run.verification import (
+    BuildResult,
+    TargetResult,
+    compute_expected,
+    is_same_result,
+    verify_target,
+)
+from dmrl.deploy.c.source_file import MAX_STACK_BYTES
+from dmrl.deploy.int8.reference import IntegerDetection
 from dmrl.errors import ModelError
 
 from ...networks import random_network
 
-FOUND = [Detection(16, 32, 1500, 40_000)]
-ANSWER = Answer(
+FOUND = [IntegerDetection(16, 32, 1500, 40_000)]
+ANSWER = HarnessResult(
     {"confidence": np.eye(3, dtype=np.int8), "depth": np.eye(3, dtype=np.int8)}, FOUND, 0
 )
 
 
 def test_answers_are_the_same_in_every_grid_and_every_detection() -> None:
-    assert same(ANSWER, replace(ANSWER, stack_bytes=9))
+    assert is_same_result(ANSWER, replace(ANSWER, stack_bytes=9))
     for name in ("confidence", "depth"):
-        assert not same(ANSWER, replace(ANSWER, grids=ANSWER.grids | {name: 2 * np.eye(3)}))
-    assert not same(ANSWER, replace(ANSWER, detections=[]))
-    assert not same(ANSWER, replace(ANSWER, detections=[replace(FOUND[0], depth_mm=1501)]))
+        assert not is_same_result(
+            ANSWER, replace(ANSWER, grids=ANSWER.grids | {name: 2 * np.eye(3)})
+        )
+    assert not is_same_result(ANSWER, replace(ANSWER, detections=[]))
+    assert not is_same_result(
+        ANSWER, replace(ANSWER, detections=[replace(FOUND[0], depth_mm=1501)])
+    )
 
 
 def test_proved_is_what_was_tried_without_an_error_or_a_difference() -> None:
@@ -46,8 +63,8 @@ def test_proved_is_what_was_tried_without_an_error_or_a_difference() -> None:
 @pytest.mark.parametrize(
     ("stack", "drop", "words"),
     [
-        (STACK_BYTES, 0, ""),
-        (STACK_BYTES + 1, 0, f"uses {STACK_BYTES + 1} bytes of stack"),
+        (MAX_STACK_BYTES, 0, ""),
+        (MAX_STACK_BYTES + 1, 0, f"uses {MAX_STACK_BYTES + 1} bytes of stack"),
         (0, 1, "answered 1 of 2 images"),
     ],
 )
@@ -60,19 +77,19 @@ def test_a_build_answers_every_image_within_its_stack(
             0, 256, (2, network.height_px, network.width_px, network.channels), np.uint8
         )
     )
-    wanted = expected(network, images)
+    wanted = compute_expected(network, images)
     given = {
         False: [replace(a, stack_bytes=stack) for a in wanted.of_images],
         True: list(wanted.of_raws),
     }
     given[True][1] = replace(given[True][1], detections=FOUND)
     monkeypatch.setattr(Build, "program", lambda build, *_: [build])
-    monkeypatch.setattr(verification, "run", lambda command, *_, **__: command[0].bayer)
+    monkeypatch.setattr(verification, "run_program", lambda command, *_, **__: command[0].bayer)
     kept = slice(drop, None)
-    monkeypatch.setattr(verification, "answers", lambda _, bayer: given[bayer][kept])
+    monkeypatch.setattr(verification, "parse_results", lambda _, bayer: given[bayer][kept])
     builds = Build("-O1", "cc", ()), Build("Bayer", "cc", (), bayer=True)
     monkeypatch.setattr(Target, "skipped", "")
-    result = prove(network, tmp_path, Target("cc", builds), wanted)
+    result = verify_target(network, tmp_path, Target("cc", builds), wanted)
     assert words in result.error
     assert bool(result.error) == bool(words)
     if not words:
@@ -82,17 +99,17 @@ def test_a_build_answers_every_image_within_its_stack(
 
 def test_rates_are_images_a_second() -> None:
     network = random_network(1)
-    both = rates(network, Cost(1, 2, round(CLUSTER_HZ / 25)), Memory(49_152))
+    both = estimate_rates(network, ExecutionCost(1, 2, round(CLUSTER_HZ / 25)), StateMemory(49_152))
     assert [rate for rate, _ in both] == pytest.approx(
-        [25, CLUSTER_HZ * KERNEL_MACS / network.macs]
+        [25, CLUSTER_HZ * KERNEL_MACS_PER_CYCLE / network.macs]
     )
     assert (
-        len(rates(network, Cost(1, 2, None), Memory(1)))
-        == len(rates(network, None, Memory(1)))
+        len(estimate_rates(network, ExecutionCost(1, 2, None), StateMemory(1)))
+        == len(estimate_rates(network, None, StateMemory(1)))
         == 1
     )
     assert not any("L1" in assumed for _, assumed in both)
-    over = rates(network, Cost(1, 2, 3), Memory(102_138))
+    over = estimate_rates(network, ExecutionCost(1, 2, 3), StateMemory(102_138))
     assert all(
         "L2, where 102,138 bytes of state lie that do not fit L1" in said for _, said in over
     )
@@ -101,10 +118,10 @@ def test_rates_are_images_a_second() -> None:
 def test_the_header_states_the_bytes_of_the_state(tmp_path: Path) -> None:
     header = tmp_path / "random.h"
     header.write_text("#define RANDOM_STATE_BYTES (1234 + 8)\n")
-    assert memory_of(random_network(1), tmp_path) == Memory(1234)
+    assert parse_state_memory(random_network(1), tmp_path) == StateMemory(1234)
     header.write_text("nothing")
     with pytest.raises(ModelError, match=r"random\.h is damaged"):
-        memory_of(random_network(1), tmp_path)
+        parse_state_memory(random_network(1), tmp_path)
 
 
 def test_the_cost_of_an_image_is_what_a_second_one_adds(
@@ -117,12 +134,12 @@ def test_the_cost_of_an_image_is_what_a_second_one_adds(
         return b"", counted["words"].format(1000 + 7 * len(data))
 
     monkeypatch.setattr(Build, "program", lambda *_: ["qemu", "program"])
-    monkeypatch.setattr(measure, "host_compiler", lambda: "cc")
-    monkeypatch.setattr(measure, "run", lambda command, _: flags.append(command))
-    monkeypatch.setattr(measure, "run_both", run_both)
+    monkeypatch.setattr(measure, "find_host_compiler", lambda: "cc")
+    monkeypatch.setattr(measure, "run_program", lambda command, _: flags.append(command))
+    monkeypatch.setattr(measure, "run_with_stderr", run_both)
     for version, plugin in ((8, 1), (9, 2)):
-        monkeypatch.setattr(measure, "emulator_version", lambda version=version: version)
-        assert measure._instructions(random_network(1), tmp_path, tmp_path, image) == 7 * 60
+        monkeypatch.setattr(measure, "get_emulator_version", lambda version=version: version)
+        assert measure._count_instructions(random_network(1), tmp_path, tmp_path, image) == 7 * 60
         assert f"-DPLUGIN_VERSION={plugin}" in flags[-1]
     counted["words"] = "no plugins here"
-    assert measure._instructions(random_network(1), tmp_path, tmp_path, image) is None
+    assert measure._count_instructions(random_network(1), tmp_path, tmp_path, image) is None
