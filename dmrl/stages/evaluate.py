@@ -65,7 +65,7 @@ class Settings:
 def run(
     recordings: Sequence[Path], out: Path | None, settings: Settings, *, workers: int = 1
 ) -> "Evaluation | dict[str, Any]":
-    """Judge detections together, or one recording's positions or tracks: then as JSON values.
+    """Evaluate detections together, or one recording's positions or tracks: then as JSON values.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def command(
     on: On = None,
     as_json: AsJson = False,
 ) -> None:
-    """Judge detections against labels; tracks and positions against the truth.
+    """Evaluate detections against labels; tracks and positions against the truth.
 
     Parameters
     ----------
@@ -133,8 +133,6 @@ def command(
     workers
         Processes that draw the intervals, at most. Without it, as many as there are cores.
         Changes no byte.
-    as_json
-        Print one JSON document in place of the table.
     """
     recordings = find_all_recordings(recordings)
     if on is not None:

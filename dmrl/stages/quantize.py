@@ -1,15 +1,15 @@
-"""``dmrl quantize``: a trained network to int8, and what that costs."""
+"""``dmrl quantize``: a trained network to int8, and the loss of accuracy."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter, validators
 
 from dmrl.atomic_output import refuse_existing
 from dmrl.errors import optional_imports
-from dmrl.terminal.arguments import AsJson, Flat
-from dmrl.terminal.tables import print_json
+from dmrl.pipeline.stage_command import stage_command
+from dmrl.terminal.closing import Closing, Given
 
 if TYPE_CHECKING:
     from dmrl.evaluation.quantization_report import QuantizationReport
@@ -41,19 +41,19 @@ class Settings:
 
 
 def run(model: Path, dataset: Path, out: Path, settings: Settings) -> "QuantizationReport":
-    """Quantise ``model`` by images of ``dataset`` and write the folder ``out``.
+    """Quantise a network to int8, and measure the loss of accuracy.
 
-    ``out`` is a run folder as well: it holds the float model beside the int8 one, a report, and
-    a picture of both networks' maps.
+    The output is a run folder as well: the float model lies beside the int8 one.
 
     Parameters
     ----------
     model
-        Run folder, .safetensors or Keras .h5.
+        A run folder of dmrl train, a .safetensors or a Keras .h5.
     dataset
-        Folder that ``dmrl dataset`` wrote, with images of the model's size.
+        Dataset with images of the model's size: its train split calibrates, another judges.
     out
-        Folder to write. Must not exist.
+        Folder to write: the int8 network, the float one, quantisation.json, a picture of the
+        maps. Must not exist.
     settings
         See `Settings`.
 
@@ -82,36 +82,16 @@ def run(model: Path, dataset: Path, out: Path, settings: Settings) -> "Quantizat
     return write_quantized(out, origin, inputs, made, settings.most)
 
 
-DEFAULTS = Settings()
+def _show(report: "QuantizationReport", given: Given) -> None:
+    from dmrl.evaluation.quantization_report import print_quantization
+
+    print_quantization(given.out, report)
 
 
-def command(
-    model: Path,
-    dataset: Path,
-    out: Path,
-    /,
-    *,
-    settings: Flat[Settings] = DEFAULTS,
-    as_json: AsJson = False,
-) -> None:
-    """Quantise a network to int8, and say what that costs.
+def _document(report: "QuantizationReport", _: Given) -> dict[str, Any]:
+    from dmrl.evaluation.quantization_report import describe_quantization
 
-    Parameters
-    ----------
-    model
-        A run folder of dmrl train, a .safetensors or a Keras .h5.
-    dataset
-        Dataset with images of the model's size: its train split calibrates, another judges.
-    out
-        Folder to write: the int8 network, the float one, quantisation.json, a picture of the
-        maps. Must not exist.
-    as_json
-        Print one JSON document in place of the tables.
-    """
-    from dmrl.evaluation.quantization_report import describe_quantization, print_quantization
+    return describe_quantization(report)
 
-    result = run(model, dataset, out, settings)
-    if as_json:
-        print_json(describe_quantization(result))
-    else:
-        print_quantization(out, result)
+
+command = stage_command(run, Closing(show=_show, document=_document))

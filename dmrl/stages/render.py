@@ -107,8 +107,6 @@ def command(
     preview
         Look at the robot first: OUT is a picture, NAME.png, of it from four sides, with its axes,
         its box and its size.
-    as_json
-        Print one JSON document in place of the table.
     """
     if setup:
         from dmrl.rendering.blender_environment import ensure_environment

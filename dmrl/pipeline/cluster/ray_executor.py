@@ -1,8 +1,7 @@
 """Executor that runs tasks on the nodes of a Ray cluster.
 
-Ray chooses the node of a task, and restarts it if its node dies. The node runs it in a process
-like those of `process_pool`, with the same environment, so the bytes are the same. Nodes need
-access to the files by the same names, and the same version of dmrl.
+Ray chooses a node, which runs the task in a process like those of `process_pool`, so the bytes are
+the same. Nodes need access to the files by the same names, and the same version of dmrl.
 """
 
 import os
@@ -179,11 +178,8 @@ class RayExecutor:
 
     def _refuse_other_versions(self) -> None:
         here = [node["NodeID"] for node in ray.nodes() if node["Alive"]]
-        looks = [
-            _build_task(node, exclusive=False, cores=0).remote("", __version__, "", False)
-            for node in here
-        ]
-        for answer in ray.get(looks):
+        tasks = (_build_task(node, exclusive=False, cores=0) for node in here)
+        for answer in ray.get([task.remote("", __version__, "", False) for task in tasks]):
             if has_failed(answer):
                 ray.shutdown()
                 raise ClusterError(answer["error"])
