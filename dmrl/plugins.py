@@ -53,10 +53,10 @@ PLACES = {
     "Network": "dmrl.learn.networks.architectures",
     "Options": "dmrl.formats.base",
     "Sample": "dmrl.samples.sample",
-    "image": "dmrl.samples.sample",
-    "in_order": "dmrl.samples.flight",
-    "nanoseconds": "dmrl.samples.flight",
-    "ranges": "dmrl.samples.flight",
+    "build_image": "dmrl.samples.sample",
+    "merge_by_time": "dmrl.samples.flight",
+    "to_nanoseconds": "dmrl.samples.flight",
+    "iter_ranges": "dmrl.samples.flight",
     "stage_command": "dmrl.pipeline.stage_command",
 }
 """Names that plug-ins import from here, and their modules, which may move."""

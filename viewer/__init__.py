@@ -14,31 +14,23 @@ from dmrl.guards.lazy_names import import_lazily
 from dmrl.viewer.settings import Settings, Web
 
 if TYPE_CHECKING:
-    from dmrl.viewer.flag_page import write_flag_page
+    from dmrl.viewer.flag_page import write_flag_page as flag
     from dmrl.viewer.session import save
-    from dmrl.viewer.window.desktop import show_in_window, write_screenshot
-    from dmrl.viewer.window.web_page import Page, open_page, serve
+    from dmrl.viewer.window.desktop import show_in_window as view
+    from dmrl.viewer.window.desktop import write_screenshot as screenshot
+    from dmrl.viewer.window.web_page import Page, serve
+    from dmrl.viewer.window.web_page import open_page as page
 
-__all__ = [
-    "Page",
-    "Settings",
-    "Web",
-    "open_page",
-    "save",
-    "serve",
-    "show_in_window",
-    "write_flag_page",
-    "write_screenshot",
-]
+__all__ = ["Page", "Settings", "Web", "flag", "page", "save", "screenshot", "serve", "view"]
 
 _PLACES = {
-    "flag": "dmrl.viewer.flag_page",
+    "flag": "dmrl.viewer.flag_page:write_flag_page",
     "Page": "dmrl.viewer.window.web_page",
-    "page": "dmrl.viewer.window.web_page",
+    "page": "dmrl.viewer.window.web_page:open_page",
     "save": "dmrl.viewer.session",
-    "screenshot": "dmrl.viewer.window.desktop",
+    "screenshot": "dmrl.viewer.window.desktop:write_screenshot",
     "serve": "dmrl.viewer.window.web_page",
-    "view": "dmrl.viewer.window.desktop",
+    "view": "dmrl.viewer.window.desktop:show_in_window",
 }
 _import = import_lazily(__name__, _PLACES)
 
