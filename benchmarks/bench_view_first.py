@@ -30,7 +30,7 @@ LOOK_EVERY_S, PATIENCE_S = 0.1, 120.0
 COMMAND = """
 import sys
 from dmrl.cli import main
-from dmrl.viewer import process, window
+from dmrl.viewer.window import desktop as window
 port, command, stream_to = int(sys.argv.pop(1)), window.command, window.stream_to
 size = ("--headless", "--window-size", window.PICTURE_SIZE)
 def streamed(*arguments):

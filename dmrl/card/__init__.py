@@ -132,9 +132,9 @@ def _draw_figures(
             raise DatasetError(f"{old} is a link to another file. Remove it")
     height_px, width_px = next(iter(splits.values())).image_shape
     every = np.concatenate([c.uv_px for c in counts.values()])
-    plots.depth_histogram({n: c.depth_m for n, c in counts.items()}, folder / "depth")
-    plots.position_heat(every, width_px, height_px, 2 * STRIDE_PX, folder / "position")
-    plots.peers_per_image({n: c.peers for n, c in counts.items()}, folder / "peers")
+    plots.plot_depth_histogram({n: c.depth_m for n, c in counts.items()}, folder / "depth")
+    plots.plot_position_heat(every, width_px, height_px, 2 * STRIDE_PX, folder / "position")
+    plots.plot_peers_per_image({n: c.peers for n, c in counts.items()}, folder / "peers")
     names = {"depth": "Depth", "position": "Position in the image", "peers": "Peers per image"}
     lines = [f"![{text}](figures/{name}.png)" for name, text in names.items()]
     return ["## Distributions", "", "Peers inside the images. Also as SVG.", "", *lines, ""]

@@ -204,7 +204,7 @@ def _draw_maps(split: Split, rows: list[int], outputs: dict[str, Outputs], folde
         )
         for k, image in zip(shown, split.images([rows[k] for k in shown]), strict=True)
     ]
-    plots.map_pairs(pictures, folder / "maps")
+    plots.plot_map_pairs(pictures, folder / "maps")
 
 
 def describe_quantization(result: QuantizationReport) -> dict[str, Any]:

@@ -28,10 +28,10 @@ def run(recordings: Sequence[Path], out: Path, settings: Settings) -> None:
     SettingError
         If ``out`` has another suffix, or no image lies in the time asked for.
     """
-    from dmrl.viewer import save, write_screenshot
+    from dmrl.viewer import save, screenshot
 
     if out.suffix == ".png":
-        write_screenshot(recordings, out, settings)
+        screenshot(recordings, out, settings)
     elif out.suffix == ".rrd":
         save(recordings, out, settings)
     else:
@@ -75,7 +75,7 @@ def command(
     rank
         Take the picture of this row of a dataset; 1 is the worst.
     """
-    from dmrl.viewer import save, serve, show_in_window, write_flag_page, write_screenshot
+    from dmrl.viewer import flag, save, screenshot, serve, view
 
     for path, suffix in ((save_to, ".rrd"), (screenshot_to, ".png"), (flag_to, ".html")):
         if path is not None and path.suffix != suffix:
@@ -86,15 +86,13 @@ def command(
         count = save(recording, save_to, settings)
         print_line(f"{save_to}: {count} images")
     elif screenshot_to is not None:
-        shown = write_screenshot(recording, screenshot_to, settings, time_s=time_s, rank=rank)
+        shown = screenshot(recording, screenshot_to, settings, time_s=time_s, rank=rank)
         print_line(f"{screenshot_to}: {shown}")
     elif flag_to is not None:
         if not any(path.is_dir() for path in recording):
             raise SettingError(f"{recording[0]} is no dataset. --flag needs one: dmrl dataset")
-        print_line(
-            f"{flag_to}: {write_flag_page(recording, flag_to, settings)} rows. Open it in a browser"
-        )
+        print_line(f"{flag_to}: {flag(recording, flag_to, settings)} rows. Open it in a browser")
     elif serve_web:
         serve(recording, settings, web)
     else:
-        show_in_window(recording, settings)
+        view(recording, settings)

@@ -251,7 +251,7 @@ def test_the_page_tells_of_a_catalogue_and_opens_no_thousand_recordings(
     assert "<h2>Catalogue</h2>" in shown and "4 recordings, 0.0 h" in shown
     assert "estimate" in shown and "cut short" in shown and "<h2>Recordings</h2>" in shown
     module = import_module("dmrl.html_report.collect")
-    monkeypatch.setattr(module, "MANY", 3)
+    monkeypatch.setattr(module, "MAX_OPENED_RECORDINGS", 3)
     monkeypatch.setattr(module, "read_summary", None)
     assert "<h2>Recordings</h2>" not in build_report(collect_outputs(flights))
 

@@ -155,7 +155,7 @@ def test_a_mosaic_shows_other_images_in_its_other_parts(monkeypatch: pytest.Monk
     maker = Augmenter(squares(5), Augmentation(mosaic_share=0.5), seed=0)
     rng, shown = np.random.default_rng(3), []
     monkeypatch.setattr(
-        maker, "_layer", lambda _, rect, source, *rest: shown.append((rect, source))
+        maker, "_draw_layer", lambda _, rect, source, *rest: shown.append((rect, source))
     )
     monkeypatch.setattr(maker, "_degrade_image", lambda *_: None)
     counts = []

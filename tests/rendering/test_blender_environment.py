@@ -20,7 +20,7 @@ def test_without_python_311_and_uv_it_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "which", lambda _: None)
-    monkeypatch.setattr(blender_environment, "_python_311", lambda: None)
+    monkeypatch.setattr(blender_environment, "_find_python_311", lambda: None)
     with pytest.raises(BlenderError, match=r"needs Python 3.11.*nor uv.*pip install uv"):
         blender_environment.ensure_environment(lambda _: None)
     assert list((tmp_path / "dmrl").iterdir()) == []

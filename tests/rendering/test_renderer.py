@@ -43,7 +43,7 @@ def test_pixels_come_through_files_where_memory_is_shut(
     with Renderer(blender, RobotModel(), workers=1, samples=2) as renderer:
         asked = [scene(renderer.lights[0], depth_m) for depth_m in (0.5, 1.0)]
         expected = list(renderer.render_shots(asked))
-    monkeypatch.setattr(worker_pool, "WORKER", tmp_path / "worker.py")
+    monkeypatch.setattr(worker_pool, "WORKER_SCRIPT", tmp_path / "worker.py")
     worker_pool.WORKER_SCRIPT.write_text(SHUT)
     with Renderer(blender, RobotModel(), workers=1, samples=2) as renderer:
         found = list(renderer.render_shots(asked))

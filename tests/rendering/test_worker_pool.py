@@ -42,7 +42,7 @@ while True:
 def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> WorkerStart:
     script = tmp_path / "worker.py"
     script.write_text(FAKE)
-    monkeypatch.setattr(worker_pool, "WORKER", script)
+    monkeypatch.setattr(worker_pool, "WORKER_SCRIPT", script)
     return WorkerStart(Path(sys.executable), {"died": str(tmp_path / "died"), "model": None})
 
 

@@ -100,7 +100,7 @@ def test_an_input_that_is_changed_meanwhile_is_one_line(
     def replace_it(*_: object) -> None:
         other.replace(path)
 
-    monkeypatch.setattr("dmrl.datasets.writing.parts.refuse_twins", replace_it)
+    monkeypatch.setattr("dmrl.datasets.writing.parts.reject_duplicates", replace_it)
     assert boundary.run_to_status(lambda: app(["dataset", str(path), str(box.out / "set")])) == 1
     said = capsys.readouterr().err
     assert "flight.mcap was changed while it was read. Run it again" in said

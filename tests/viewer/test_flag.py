@@ -13,7 +13,8 @@ import pytest
 from dmrl.errors import SettingError
 from dmrl.stages import dataset
 from dmrl.stages.view import command
-from dmrl.viewer import Settings, write_flag_page
+from dmrl.viewer import Settings
+from dmrl.viewer.flag_page import write_flag_page
 
 from .conftest import Make
 

@@ -179,7 +179,7 @@ def test_yaw_goes_on_where_it_turns_over(
     fly: Make, rrd: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # From 3.1 rad on, 0.01 rad a message, over many stretches.
-    monkeypatch.setattr(scene, "ROWS_AT_ONCE", 1)
+    monkeypatch.setattr(scene, "MIN_BATCH_ROWS", 1)
     save([fly()], rrd, Settings())
     yaw = np.array(column(rrd, "/cf1/attitude/yaw", "Scalars:scalars"))[:, 0]
     assert yaw == pytest.approx(np.degrees(3.1 + 0.01 * np.arange(20)))
@@ -256,7 +256,7 @@ def test_trails_errors_and_ranges_do_not_depend_on_where_a_stretch_of_the_file_e
     whole = saved("whole")
     monkeypatch.setattr(chunk_builder, "CHUNK_BYTES", 1)
     monkeypatch.setattr(reader, "BATCH_BYTES", 1)
-    monkeypatch.setattr(scene, "ROWS_AT_ONCE", 1)
+    monkeypatch.setattr(scene, "MIN_BATCH_ROWS", 1)
     pieces = saved("pieces")
     assert len(whole[f"{TRUTH}/trail", "LineStrips3D:strips"]) == 20
     assert whole.keys() == pieces.keys()

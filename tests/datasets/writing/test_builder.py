@@ -225,16 +225,16 @@ def test_of_large_images_few_are_in_memory(
     batch = dataset_writer._build_record_batch
     monkeypatch.setattr(
         dataset_writer,
-        "_record_batch",
+        "_build_record_batch",
         lambda rows, *more: made.append(len(rows)) or batch(rows, *more),
     )
     flight = record(peers=[[peer()]] * 5)
     for name, pixels, wanted in (("a", 10**9, [5]), ("b", 2 * WIDTH_PX * HEIGHT_PX, [2, 2, 1])):
-        monkeypatch.setattr(dataset_writer, "BATCH_PIXELS", pixels)
+        monkeypatch.setattr(dataset_writer, "MAX_BATCH_PIXELS", pixels)
         made.clear()
         run([flight], tmp_path / name, Settings())
         assert made == wanted
-    monkeypatch.setattr(dataset_writer, "BATCH_PIXELS", 1)
+    monkeypatch.setattr(dataset_writer, "MAX_BATCH_PIXELS", 1)
     made.clear()
     run([flight], tmp_path / "c", Settings())
     assert made == [1] * 5
@@ -289,7 +289,7 @@ def test_a_run_that_dies_in_the_middle_leaves_no_dataset(
         raise KeyboardInterrupt
 
     flight = record(peers=[[peer()]] * 100)
-    monkeypatch.setattr("dmrl.datasets.writing.builder.one_size", die)
+    monkeypatch.setattr("dmrl.datasets.writing.builder.require_same_size", die)
     with pytest.raises(KeyboardInterrupt):
         run([flight], tmp_path / "out", PLAIN)
     assert [p.name for p in tmp_path.iterdir()] == ["flight.mcap"]

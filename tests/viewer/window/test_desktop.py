@@ -16,9 +16,10 @@ import pytest
 from dmrl.errors import OutputError, SettingError
 from dmrl.images.codec import decode
 from dmrl.stages import view as stage
-from dmrl.viewer import Page, Settings, Web, show_in_window, write_screenshot
+from dmrl.viewer import Page, Settings, Web
 from dmrl.viewer.layouts import BACKGROUND, IMAGE_OPACITY
 from dmrl.viewer.window import desktop, viewer_process
+from dmrl.viewer.window.desktop import show_in_window, write_screenshot
 
 Make = Callable[..., Path]
 
@@ -72,7 +73,7 @@ def test_a_viewer_that_stops_is_reported_with_its_last_words(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     code = "import sys; sys.exit('out of luck')"
-    monkeypatch.setattr(desktop, "command", lambda *_: [sys.executable, "-c", code])
+    monkeypatch.setattr(desktop, "build_command", lambda *_: [sys.executable, "-c", code])
     with pytest.raises(OutputError, match=r"viewer stopped: out of luck\. Try: dmrl view --save"):
         write_screenshot([make()], tmp_path / "picture.png", Settings())
     with pytest.raises(SettingError, match=r"viewer stopped: out of luck\. Use --save"):
@@ -172,7 +173,7 @@ def test_a_pipeline_writes_by_suffix(
 
     recording = make()
     monkeypatch.setattr(
-        "dmrl.viewer.window.desktop.screenshot", drawn
+        "dmrl.viewer.window.desktop.write_screenshot", drawn
     )  # what it draws is looked at above
     for name in ("seen.rrd", "seen.png"):
         stage.run([recording], tmp_path / name, Settings())

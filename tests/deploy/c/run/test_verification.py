@@ -83,7 +83,7 @@ def test_a_build_answers_every_image_within_its_stack(
         True: list(wanted.of_raws),
     }
     given[True][1] = replace(given[True][1], detections=FOUND)
-    monkeypatch.setattr(Build, "program", lambda build, *_: [build])
+    monkeypatch.setattr(Build, "compile_program", lambda build, *_: [build])
     monkeypatch.setattr(verification, "run_program", lambda command, *_, **__: command[0].bayer)
     kept = slice(drop, None)
     monkeypatch.setattr(verification, "parse_results", lambda _, bayer: given[bayer][kept])
@@ -133,7 +133,7 @@ def test_the_cost_of_an_image_is_what_a_second_one_adds(
     def run_both(_command: object, _what: str, *, data: bytes) -> tuple[bytes, str]:
         return b"", counted["words"].format(1000 + 7 * len(data))
 
-    monkeypatch.setattr(Build, "program", lambda *_: ["qemu", "program"])
+    monkeypatch.setattr(Build, "compile_program", lambda *_: ["qemu", "program"])
     monkeypatch.setattr(measure, "find_host_compiler", lambda: "cc")
     monkeypatch.setattr(measure, "run_program", lambda command, _: flags.append(command))
     monkeypatch.setattr(measure, "run_with_stderr", run_both)
