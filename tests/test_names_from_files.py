@@ -1,4 +1,5 @@
-"""Held by the source itself: what comes from a file becomes a path in `dmrl.guards.safe_names` alone.
+"""Held by the source itself: what comes from a file becomes a path in `dmrl.guards.safe_names`
+alone.
 
 A path may be joined with a text that stands in the source. What else it is joined with goes
 through a function of `dmrl.guards.safe_names`, or stands below with the reason why it needs none.
@@ -51,7 +52,7 @@ REASONS = {
     "formats/aideck/chip_outputs.py: f'{name}{number}.ppm'": READ,
     "formats/files/flight_csv.py: log.robot": LISTED,
     "formats/published/locanet.py: name": READ,
-    "formats/aideck/nanocockpit.py: FOLDERS[0]": OURS,
+    "formats/aideck/nanocockpit.py: IMAGE_FOLDERS[0]": OURS,
     "formats/aideck/nanocockpit.py: f'{stem}{suffix}'": READ,
     "formats/aideck/nanocockpit.py: folder": OURS,
     "learn/training/checkpoint.py: name": OURS,

@@ -259,7 +259,8 @@ COMMAND = '''
 
     command = stage_command(
         run,
-        Closing(lines=lambda greetings, _: list(greetings), document=lambda greetings, _: greetings),
+        Closing(lines=lambda greetings, _: list(greetings), document=lambda greetings, _:
+        greetings),
     )
 '''
 

@@ -1,4 +1,4 @@
-"""Settings of the viewer and its web page. Imports nothing heavy: they are flags of ``dmrl view``."""
+"""Settings of the viewer and its web page, the flags of ``dmrl view``; nothing heavy."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal

@@ -174,8 +174,10 @@ def provenance_lines(facts: Facts) -> Iterator[str]:
     yield f"- Left out: {'; '.join(reasons) or 'no image'}."
     yield (
         f"- Leaks: {facts.twins or 'no'} images of a test split have the pixels of one in train, "
-        f"{facts.near or 'none'}{_comparison_words(facts)} are near duplicates of one in train: their "
-        f"64-bit perceptual hashes differ by at most {NEAR_DUPLICATE_BITS} bits. Images with the same "
+        f"{facts.near or 'none'}{_comparison_words(facts)} are near duplicates of one in train: "
+        "their "
+        f"64-bit perceptual hashes differ by at most {NEAR_DUPLICATE_BITS} bits. Images with the "
+        "same "
         "background often do."
     )
     licences = sorted(facts.licences.items())
@@ -188,7 +190,10 @@ def provenance_lines(facts: Facts) -> Iterator[str]:
 
 def _other_sources_line(used: str, name: str, others: Sequence[str]) -> str:
     more = ", ".join(map(markdown_code, others))
-    return f"- {markdown_code(name)}: labels from {markdown_code(used)} are used. It also has labels from {more}."
+    return (
+        f"- {markdown_code(name)}: labels from {markdown_code(used)} are used. It also has "
+        f"labels from {more}."
+    )
 
 
 def _join_names(names: Sequence[str]) -> str:

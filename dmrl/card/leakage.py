@@ -26,16 +26,19 @@ def leakage_lines(splits: Mapping[str, Split]) -> Iterator[str]:
         shared = sorted(set(_unique_texts(split, "source")) & set(_unique_texts(train, "source")))
         place = ", ".join(map(markdown_code, shared)) or "no recording"
         yield (
-            f"- {escape_markdown(name)} and train share {place}: images of one recording have similar "
+            f"- {escape_markdown(name)} and train share {place}: images of one recording have "
+            "similar "
             "places, light and backgrounds."
         )
         yield (
-            f"- {count_near_in_time(split, train)} of {len(split)} images of {escape_markdown(name)} were taken "
+            f"- {count_near_in_time(split, train)} of {len(split)} images of "
+            f"{escape_markdown(name)} were taken "
             f"within {SIMILAR_WITHIN_S:g} s of one in train, by the same camera."
         )
         shared_poses, poses = count_same_poses(split, train)
         yield (
-            f"- {shared_poses} of {poses} labels of {escape_markdown(name)} are within 1 px and 1 cm of "
+            f"- {shared_poses} of {poses} labels of {escape_markdown(name)} are within 1 px and 1 "
+            "cm of "
             "one in train."
         )
 

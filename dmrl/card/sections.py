@@ -118,7 +118,8 @@ def count_lines(counts: dict[str, SplitCounts]) -> list[str]:
             f"{escape_markdown(source)} ({n})" for source, n in sorted(c.label_sources.items())
         )
         lines.append(
-            f"| {escape_markdown(name)} | {c.images} | {int((c.peers > 0).sum())} | {int(c.peers.sum())} "
+            f"| {escape_markdown(name)} | {c.images} | {int((c.peers > 0).sum())} | "
+            f"{int(c.peers.sum())} "
             f"| {low:.2f} to {high:.2f} | {sources} |"
         )
     lines += ["", "Peers and depths count peers inside the image, labels all of them.", ""]

@@ -14,12 +14,12 @@ from dmrl.evaluation.figure_tables import (
     finite_or_none,
 )
 from dmrl.learn.inference.detection_metrics import (
-    METRIC_DEFINITIONS,
     BandMetrics,
     ScoredDetections,
     compute_band_metrics,
     score_detections,
 )
+from dmrl.learn.inference.metric_definitions import METRIC_DEFINITIONS
 from dmrl.learn.inference.threshold import (
     MIN_EMPTY_IMAGES,
     MIN_LABELS,

@@ -82,7 +82,7 @@ def evaluate_recordings(
             with _write_folder(out, "evaluation", made) as folder:
                 assert figures is not None
                 scored, threshold = evaluation.scored, evaluation.threshold
-                figures.draw(folder, evaluation.pairs, scored, criteria.against, threshold)
+                figures.draw_figures(folder, evaluation.pairs, scored, criteria.against, threshold)
         return evaluation
     if len(recordings) > 1:
         raise SettingError(
@@ -116,7 +116,7 @@ def _evaluate_against_truth(
     if out is not None:
         with _write_folder(out, what, made) as folder:
             assert figures is not None
-            figures.draw_errors(folder, judged)
+            figures.draw_error_plots(folder, judged)
     return made
 
 

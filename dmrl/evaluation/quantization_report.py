@@ -20,8 +20,8 @@ from dmrl.deploy.int8.store import INTEGER_NAME, save_network
 from dmrl.deploy.samples import SAMPLE_COUNT, save_samples
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation.detections import read_split_labels
-from dmrl.learn.inference.detection_metrics import METRIC_DEFINITIONS
 from dmrl.learn.inference.loaded_model import Model, load_model, save_model
+from dmrl.learn.inference.metric_definitions import METRIC_DEFINITIONS
 from dmrl.recording import Provenance
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_table

@@ -107,7 +107,10 @@ class ImageEmbedder:
             return f"<p>{to_html_text(path.name)}: {to_html_text(e)}</p>"
         words = b64encode(data).decode()
         if len(words) > self.room:
-            return f"<p>{to_html_text(path.name)}: no room left in this page. Open the file instead</p>"
+            return (
+                f"<p>{to_html_text(path.name)}: no room left in this page. Open the file "
+                "instead</p>"
+            )
         self.room -= len(words)
         where = f"data:image/{kind};base64,{words}"
         image = f'<img src="{where}" alt="{to_html_text(caption)}" loading="lazy">'
@@ -153,6 +156,7 @@ def build_page(title: str, lead: str, sections: Sequence[tuple[str, str]]) -> st
         f'<meta http-equiv="Content-Security-Policy" content="{CONTENT_SECURITY_POLICY}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{to_html_text(title)}</title><style>{STYLE}</style></head><body>"
-        f'<h1>{to_html_text(title)}</h1><p class="big">{to_html_text(lead)}</p><nav>{links}</nav>{parts}'
+        f'<h1>{to_html_text(title)}</h1><p class="big">{to_html_text(lead)}</p>'
+        f"<nav>{links}</nav>{parts}"
         "</body></html>\n"
     )

@@ -6,7 +6,6 @@ are shown.
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from dmrl.html_report import html
 from dmrl.html_report.catalogue_tables import build_catalogue_section
 from dmrl.html_report.collect import ReportInputs
 from dmrl.html_report.html import (
-    INVALID_DATA_ERRORS,
     ImageEmbedder,
     build_chart,
     build_row,
@@ -27,6 +25,13 @@ from dmrl.html_report.html import (
 )
 from dmrl.html_report.lineage import build_lineage
 from dmrl.html_report.recipe_figures import build_recipe_figures
+from dmrl.html_report.section_helpers import (
+    draw_or_explain,
+    extract_valid,
+    figure_if_present,
+    shorten,
+    show_documents,
+)
 from dmrl.plots import charts
 from dmrl.topics import list_robots
 
@@ -46,7 +51,6 @@ METRICS = {
 }
 OMITTED_VALUES: tuple[Any, ...] = (None, False, "", [], {})
 """Values of settings that are omitted from a command line."""
-Documents = Mapping[str, Mapping[str, Any]]
 
 
 def build_report(found: ReportInputs) -> str:
@@ -91,36 +95,12 @@ def _summarize(found: ReportInputs) -> str:
     return f"{', '.join(words)}. Written by dmrl {__version__}."
 
 
-def _show_documents(documents: Documents, show: Callable[[str, Any], str]) -> str:
-    """Show every document; name one that does not have dmrl's form."""
-    parts = []
-    for name, said in documents.items():
-        try:
-            parts.append(show(name, said))
-        except INVALID_DATA_ERRORS as e:
-            parts.append(
-                f"<p>{to_html_text(name)} does not have dmrl's form ({to_html_text(repr(e))}).</p>"
-            )
-    return "".join(parts)
-
-
-def _extract_valid(documents: Documents, take: Callable[[Any], Any]) -> dict[str, Any]:
-    """Apply ``take`` to every document that has the values it needs."""
-    out = {}
-    for name, said in documents.items():
-        try:
-            out[name] = take(said)
-        except INVALID_DATA_ERRORS:
-            continue
-    return out
-
-
 def _detections_section(found: ReportInputs, pictures: ImageEmbedder) -> str:
     judged = found.documents_of_kind("evaluations")
     if not judged:
         return ""
     heads = ["evaluation", "against", "images", *(words for words, _ in METRICS.values())]
-    rows = _extract_valid(
+    rows = extract_valid(
         judged, lambda said: [said["against"], said["images"], *_metric_cells(said["overall"])]
     )
     parts = [
@@ -131,33 +111,25 @@ def _detections_section(found: ReportInputs, pictures: ImageEmbedder) -> str:
     drawn = []
     for key, words in (("median_px", "median error, px"), ("depth_mae_m", "depth MAE, m")):
         bands = {
-            name: rows for name, rows in _extract_valid(few, _distance_bands(key)).items() if rows
+            name: rows for name, rows in extract_valid(few, _distance_bands(key)).items() if rows
         }
         if bands:
             drawn.append(
-                _draw_or_explain(
+                draw_or_explain(
                     charts.plot_by_distance, bands, words, caption=f"{words} by distance"
                 )
             )
-    if curves := _extract_valid(few, _precision_recall):
+    if curves := extract_valid(few, _precision_recall):
         words = "precision over recall, matches within 16 px"
-        drawn.append(_draw_or_explain(charts.plot_precision_recall, curves, caption=words))
-    if bins := _extract_valid(few, _reliability_bins):
+        drawn.append(draw_or_explain(charts.plot_precision_recall, curves, caption=words))
+    if bins := extract_valid(few, _reliability_bins):
         words = "share of correct detections over their confidence; calibrated is the diagonal"
-        drawn.append(_draw_or_explain(charts.plot_reliability, bins, caption=words))
+        drawn.append(draw_or_explain(charts.plot_reliability, bins, caption=words))
     parts.append(build_row(drawn))
     parts.append(
-        _show_documents(few, lambda name, said: _evaluation_details(found, name, said, pictures))
+        show_documents(few, lambda name, said: _evaluation_details(found, name, said, pictures))
     )
     return "".join(parts)
-
-
-def _draw_or_explain(draw: Callable[..., str], *given: Any, caption: str) -> str:
-    """Draw a chart; a line of text if its data are invalid."""
-    try:
-        return build_chart(draw(*given), caption)
-    except INVALID_DATA_ERRORS as e:
-        return f"<p>{to_html_text(caption)}: cannot be drawn ({to_html_text(repr(e))}).</p>"
 
 
 def _metric_cells(overall: Mapping[str, Any]) -> list[str]:
@@ -208,20 +180,18 @@ def _evaluation_details(
     partial = " Images without Detections were left out (--partial)." if said.get("partial") else ""
     words = f"{said['labels']} labels, threshold {float(said['threshold']):.2f}.{partial}"
     figures = [
-        _figure_if_present(
+        figure_if_present(
             found.folder / name / "examples.png", "images, confidence and depth", pictures
         ),
-        _figure_if_present(found.folder / name / "error-violins.png", "errors", pictures),
-        _figure_if_present(
+        figure_if_present(found.folder / name / "error-violins.png", "errors", pictures),
+        figure_if_present(
             found.folder / name / "error-by-distance.png", "errors by distance", pictures
         ),
     ]
-    return f"<h3>{to_html_text(name)}</h3><p>{to_html_text(words)} <code>{to_html_text(ran)}</code></p>{build_row(figures)}"
-
-
-def _figure_if_present(path: Path, caption: str, pictures: ImageEmbedder) -> str:
-    there = path.is_file() and not path.is_symlink()
-    return pictures.build_figure(path, caption, full="images" in caption) if there else ""
+    return (
+        f"<h3>{to_html_text(name)}</h3><p>{to_html_text(words)} "
+        f"<code>{to_html_text(ran)}</code></p>{build_row(figures)}"
+    )
 
 
 def _positions_section(found: ReportInputs, pictures: ImageEmbedder) -> str:
@@ -230,7 +200,7 @@ def _positions_section(found: ReportInputs, pictures: ImageEmbedder) -> str:
         ran = f"dmrl evaluate {said['recording']['name']} --what positions --plots {name}"
         drawn = sorted((found.folder / name).glob("position-error-*.png"))[:2]
         figures = build_row(
-            _figure_if_present(path, f"{path.stem}, 3-sigma bands", pictures) for path in drawn
+            figure_if_present(path, f"{path.stem}, 3-sigma bands", pictures) for path in drawn
         )
         judged = (
             build_table(heads, positions.rows(dict(said)))
@@ -240,7 +210,7 @@ def _positions_section(found: ReportInputs, pictures: ImageEmbedder) -> str:
             f"<h3>{to_html_text(name)}</h3><p><code>{to_html_text(ran)}</code></p>{judged}{figures}"
         )
 
-    return build_row(_draw_position_maps(found)) + _show_documents(
+    return build_row(_draw_position_maps(found)) + show_documents(
         found.documents_of_kind("positions"), show
     )
 
@@ -260,7 +230,7 @@ def _draw_position_maps(found: ReportInputs) -> list[str]:
             if path.kept.any():
                 words = f"{name}: {peer} relative to {robot}, from above; 95 % ellipses"
                 places = path.true_m, path.estimate_m, path.covariance, path.kept
-                out.append(_draw_or_explain(charts.plot_positions, *places, caption=words))
+                out.append(draw_or_explain(charts.plot_positions, *places, caption=words))
     return out
 
 
@@ -268,14 +238,14 @@ def _tracks_section(found: ReportInputs, pictures: ImageEmbedder) -> str:
     def show(name: str, said: Mapping[str, Any]) -> str:
         heads = ["robot", *(words for _, words, _ in tracks.COLUMNS)]
         drawn = sorted((found.folder / name).glob("*.png"))[:2]
-        figures = build_row(_figure_if_present(path, path.stem, pictures) for path in drawn)
+        figures = build_row(figure_if_present(path, path.stem, pictures) for path in drawn)
         judged = (
             build_table(heads, tracks.rows(dict(said)))
             + f"<p>{to_html_text(tracks.note(said))}.</p>"
         )
         return f"<h3>{to_html_text(name)}</h3>{judged}{figures}"
 
-    return _show_documents(found.documents_of_kind("tracks"), show)
+    return show_documents(found.documents_of_kind("tracks"), show)
 
 
 def _training_section(found: ReportInputs) -> str:
@@ -283,16 +253,16 @@ def _training_section(found: ReportInputs) -> str:
     if not models:
         return ""
     heads = ("model", "architecture", "parameters", "training images", "labels", "threshold")
-    rows = _extract_valid(models, _model_cells)
+    rows = extract_valid(models, _model_cells)
     histories = {
         name: losses
-        for name, losses in _extract_valid(
+        for name, losses in extract_valid(
             dict(list(models.items())[:MAX_SHOWN]), _loss_history
         ).items()
         if len(losses) > 1
     }
     words = "loss over the epochs"
-    drawn = [_draw_or_explain(charts.plot_losses, histories, caption=words)] if histories else []
+    drawn = [draw_or_explain(charts.plot_losses, histories, caption=words)] if histories else []
     return build_table(heads, [[name, *cells] for name, cells in rows.items()]) + build_row(drawn)
 
 
@@ -315,13 +285,14 @@ def _int8_section(found: ReportInputs, pictures: ImageEmbedder) -> str:
             [kind, *(format(float(figures[key]), form) for key, (_, form) in METRICS.items())]
             for kind, figures in said["accuracy"].items()
         ]
-        maps = _figure_if_present(
+        maps = figure_if_present(
             found.folder / name / "maps.png", "images and maps, float, int8", pictures
         )
         words = f"{said['images']} images of split {said['split']}"
-        return f"<h3>{to_html_text(name)}</h3><p>{to_html_text(words)}</p>{build_table(heads, rows)}{build_row([maps])}"
+        head = f"<h3>{to_html_text(name)}</h3><p>{to_html_text(words)}</p>"
+        return f"{head}{build_table(heads, rows)}{build_row([maps])}"
 
-    return _show_documents(found.documents_of_kind("int8"), show)
+    return show_documents(found.documents_of_kind("int8"), show)
 
 
 def _datasets_section(found: ReportInputs, pictures: ImageEmbedder) -> str:
@@ -332,7 +303,7 @@ def _datasets_section(found: ReportInputs, pictures: ImageEmbedder) -> str:
         rows.append((name, len(made.inputs) if made else None, sources))
         for stem in CARD_FIGURES:
             path = folder / "figures" / f"{stem}.png"
-            drawn.append(_figure_if_present(path, f"{name}: {stem}", pictures))
+            drawn.append(figure_if_present(path, f"{name}: {stem}", pictures))
     shown = build_row([figure for figure in drawn if figure][:MAX_SHOWN])
     return build_table(("dataset", "inputs", "recordings"), rows) + shown if rows else ""
 
@@ -372,11 +343,6 @@ def _provenance_section(found: ReportInputs) -> str:
 
 def _format_command(stage: str, settings: Mapping[str, Any]) -> str:
     words: Iterable[str] = (
-        f"{key}={_shorten(value)}" for key, value in settings.items() if value not in OMITTED_VALUES
+        f"{key}={shorten(value)}" for key, value in settings.items() if value not in OMITTED_VALUES
     )
     return f"dmrl {stage} {' '.join(words)}"
-
-
-def _shorten(value: object, most: int = 60) -> str:
-    words = str(value)
-    return words if len(words) <= most else words[: most - 3] + "..."

@@ -195,7 +195,8 @@ class WorkerPool:
         finally:
             self._idle.put(worker)
         raise BlenderError(
-            f"Blender died {MAX_TRIES} times on one image: {why}. Free memory, use fewer --workers, "
+            f"Blender died {MAX_TRIES} times on one image: {why}. Free memory, use fewer "
+            "--workers, "
             "or set up Blender again"
         )
 

@@ -111,7 +111,8 @@ def _lines(written: "list[Written]", given: Given) -> Iterator[str]:
     fit = "fits" if memory.fits_l1 else "does not fit"
     other = "" if memory.fits_l1 else "; --l1-kb 64 makes two memories of it"
     yield (
-        f"{memory.state_bytes:,} bytes of RAM, which {fit} a GAP8's L1: {MAX_L1_STATE_BYTES:,} beside "
+        f"{memory.state_bytes:,} bytes of RAM, which {fit} a GAP8's L1: {MAX_L1_STATE_BYTES:,} "
+        "beside "
         f"stacks{other}"
     )
     if memory.far_bytes:

@@ -12,7 +12,7 @@ from dmrl.terminal.closing import Closing, Given
 
 TRAINING = "dmrl.datasets.training"
 __getattr__ = import_lazily(
-    __name__, {"run": f"{TRAINING}:train_network", "Settings": f"{TRAINING}:FitSettings"}
+    __name__, {"run": f"{TRAINING}:train_network", "Settings": f"{TRAINING}:TrainConfig"}
 )
 
 

@@ -35,7 +35,9 @@ def recording(tmp_path: Path) -> Path:
             peers=[{"peer": "cf2", "box_px": [1, 2, 3, 4], "status": 2, "source": "truth"}]
         ),
         "/cf1/detections/grid": message_class("GridMap")(rows=1, channels=["a", "b"], data=b"\1\2"),
-        "/cf1/peer/cf2/truth": message_class("PeerPosition")(frame_id="x", x=1.0, covariance=[0.0] * 9),
+        "/cf1/peer/cf2/truth": message_class("PeerPosition")(
+            frame_id="x", x=1.0, covariance=[0.0] * 9
+        ),
         "/cf1/pose": message_class("PoseInFrame")(
             timestamp=STAMP, frame_id="world",
             pose={"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"w": 1}},

@@ -79,7 +79,8 @@ def blank(*_: object) -> None:
 
 
 class Forked:
-    """In place of a new Python: a child that has everything loaded, and works as `ProcessPool`'s do."""
+    """In place of a new Python: a child that has everything loaded, and works as `ProcessPool`'s
+    do."""
 
     def __init__(self, _: list[str], **given: Any) -> None:
         jobs, our_jobs = os.pipe()

@@ -49,7 +49,7 @@ def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
             )
             for name, value in values.items()
         }
-        monkeypatch.setattr(registry.plugins, "found", lambda group: rows)
+        monkeypatch.setattr(registry.plugins, "find_plugins", lambda group: rows)
 
     return added
 
@@ -133,7 +133,7 @@ def test_a_plug_in_is_asked_after_our_own_and_by_its_name(
     assert find_format(tmp_path / "log", "theirs").name == "theirs"
     assert capsys.readouterr().err == ""
     with pytest.raises(
-        PluginError, match=r"none, of the package their-logs, is not a dmrl.formats"
+        PluginError, match=r"none, of the package their-logs, is not a dmrl.plugins"
     ):
         find_format(tmp_path / "log", "none")
 

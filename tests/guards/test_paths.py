@@ -106,7 +106,7 @@ def test_every_path_of_a_command_line_is_refused_so() -> None:
     assert {name for name, hint in of_paths if hint != Path} >= {"label", "render", "train", "view"}
     for _, hint in of_paths:
         with pytest.raises(UnsafeName, match=r"^/dev/zero is a pipe or a device, not a file"):
-            cli.exact(hint, ["/dev/zero"])
+            cli.convert_strictly(hint, ["/dev/zero"])
 
 
 def test_what_may_be_named_is_a_file_a_folder_or_nothing(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_curves_stand_at_the_steps_of_what_they_show(
         rows.append(("first", 0.0, first_step))
         yield lambda *row: rows.append(row)
 
-    monkeypatch.setattr(trainer.boards, "opened", opened)
+    monkeypatch.setattr(trainer.boards, "open_log", opened)
     settings, images = replace(SETTINGS, epochs=2), dots(7)  # three steps, the last of one image
     network = build_initial_network(settings, images)
     training = Trainer(network, images, settings, tmp_path, validation=dots(3))
@@ -121,7 +121,7 @@ def test_every_step_is_asked_for_as_the_recipe_says(
     updated, hard = [], []
     monkeypatch.setattr(trainer, "train_step", step)
     monkeypatch.setattr(trainer, "save_checkpoint", lambda *_: None)
-    monkeypatch.setattr(trainer.boards, "opened", lambda *_: nullcontext(lambda *_: None))
+    monkeypatch.setattr(trainer.boards, "open_log", lambda *_: nullcontext(lambda *_: None))
     monkeypatch.setattr(trainer, "mine_hard_negatives", lambda *given: hard.append(given))
     monkeypatch.setattr(trainer.WeightEma, "update", lambda _, at: updated.append(at))
     shares = np.ones(8)

@@ -175,7 +175,11 @@ def test_a_packet_that_cannot_be_read_costs_a_connection_not_the_recording(
 def test_a_drone_that_starts_anew_is_connected_again(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, seconds in {"SILENT_S": 1.0, "FIRST_ANSWER_S": 0.5, "RETRY_S": 0.1}.items():
+    for name, seconds in {
+        "RECEIVE_TIMEOUT_S": 1.0,
+        "FIRST_ANSWER_TIMEOUT_S": 0.5,
+        "RETRY_DELAY_S": 0.1,
+    }.items():
         monkeypatch.setattr(crazyflie_link, name, seconds)
     settings = fake_drone.Settings(dies=("cf1=0.5:0.8",), speed=0.3)
     with drone_fleet.fleet(flight, ANY[:1], (), settings) as fleet:

@@ -56,7 +56,8 @@ class ExistingDataset:
         found = [read_hashes(part_folder(self.folder, k)) for k in range(self.manifest.parts)]
         if sum(map(len, found)) != sum(map(self.manifest.count_rows, self.manifest.splits)):
             raise DatasetError(
-                f"{self.folder / PARTS_FOLDER} has hashes of {sum(map(len, found))} images, which is not "
+                f"{self.folder / PARTS_FOLDER} has hashes of {sum(map(len, found))} images, which "
+                "is not "
                 "the number in the shards. Make the dataset again"
             )
         return found

@@ -53,7 +53,8 @@ def _check_columns(path: Path, columns: Sequence[str]) -> None:
     if missing or unknown or len(set(columns)) < len(columns):
         wrong = f"no column {missing[0]}" if missing else f"column {(unknown or columns)[0]!r}"
         raise SettingError(
-            f"{path}:1: {wrong}. Name each column once in the first line: {', '.join(REQUIRED_COLUMNS)}, "
+            f"{path}:1: {wrong}. Name each column once in the first line: "
+            f"{', '.join(REQUIRED_COLUMNS)}, "
             f"and optionally {', '.join(OPTIONAL_COLUMNS)}"
         )
 

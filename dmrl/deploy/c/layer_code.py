@@ -116,7 +116,8 @@ def _generate_pool(desk: StepAddresses, index: int) -> str:
     return indent_lines(
         [
             f"const uint8_t *const in[2] = {{{rows[0]}, {rows[1]}}};",
-            f"pool_{C_TYPES[source.signed][0]}(in, {desk.output_address(out)}, /* cols */ {out.cols}, "
+            f"pool_{C_TYPES[source.signed][0]}(in, {desk.output_address(out)}, /* cols */ "
+            f"{out.cols}, "
             f"/* channels */ {out.channels});",
             *desk.copy_out(out),
         ]

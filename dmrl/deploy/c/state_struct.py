@@ -6,7 +6,8 @@ from dmrl.deploy.c.buffer_plan import Buffer, BufferPlan
 def generate_members(planned: BufferPlan, prefix: str) -> str:
     """Generate the members of the (near) state; ``prefix`` is that of macros."""
     stage = [
-        f"    int32_t stage[{planned.l1_scratch_bytes // 4}]; /* tables and far rows of the current layer */"
+        f"    int32_t stage[{planned.l1_scratch_bytes // 4}]; /* tables and far rows of the "
+        "current layer */"
     ]
     lines = stage if planned.l1_scratch_bytes else []
     lines += [

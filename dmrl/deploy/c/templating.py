@@ -79,7 +79,8 @@ def template_values(network: IntegerNetwork) -> dict[str, str]:
         "PREFIX": name.upper(),
         "version": __version__,
         "description": (
-            f"{comment_safe(network.name)}: int8 network {comment_safe(network.architecture)} for images of "
+            f"{comment_safe(network.name)}: int8 network {comment_safe(network.architecture)} for "
+            "images of "
             f"{network.width_px} x {network.height_px} pixels, as portable C."
         ),
     }

@@ -64,7 +64,8 @@ def calibrate_by_flights(
     found = calibrate_mount(flights, camera, noise)
     if found is None:
         raise RecordingError(
-            f"{sources[0]}: fewer than {MIN_MATCHES} detections of {robots[0]} lie near where its peers "
+            f"{sources[0]}: fewer than {MIN_MATCHES} detections of {robots[0]} lie near where its "
+            "peers "
             "are. Was it the right model? Try: dmrl evaluate"
         )
     return found.camera, _figures(robots[0], found)

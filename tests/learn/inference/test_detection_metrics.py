@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from dmrl.learn.inference.detection_metrics import (
     DEPTH_BANDS_M,
-    METRIC_DEFINITIONS,
     BandMetrics,
     average_precision,
     compute_band_metrics,
@@ -19,6 +18,7 @@ from dmrl.learn.inference.detection_metrics import (
     weighted_quantile,
 )
 from dmrl.learn.inference.matching import Points
+from dmrl.learn.inference.metric_definitions import METRIC_DEFINITIONS
 
 
 def scene(images: int, offset_px: float = 0.0, depth_m: float = 1.0) -> tuple[Points, Points]:

@@ -184,7 +184,8 @@ def estimate_rates(
         (
             CLUSTER_HZ * KERNEL_MACS_PER_CYCLE / network.macs,
             f"hand-written 8-bit SIMD kernels (not exported) on all 8 cores at "
-            f"{CLUSTER_HZ / 1e6:.0f} MHz, {KERNEL_MACS_PER_CYCLE} multiply-accumulates a cycle, {memory}",
+            f"{CLUSTER_HZ / 1e6:.0f} MHz, {KERNEL_MACS_PER_CYCLE} multiply-accumulates a cycle, "
+            f"{memory}",
         )
     )
     return out
