@@ -236,7 +236,7 @@ def test_images_in_which_nobody_is_are_not_enough(tmp_path: Path) -> None:
 def test_the_shipped_recipe_is_the_default_and_the_published_one_is_the_papers() -> None:
     assert recipe.load("dmrl_nano", "train", Settings) == Settings()
     published = recipe.load("locanet", "train", Settings)
-    assert published.augmentation(0).is_nothing
+    assert published.augmentation(0).is_identity
     assert (published.architecture, published.epochs, published.batch_size) == ("locanet", 15, 5)
     for name in recipe.list_names() + recipe.pretrained_names():
         if recipe.read(name)["kind"] == "train":
