@@ -106,7 +106,7 @@ def _check_group(name: str, extra: str, serves: str, way: str, *, needed: bool =
             continue  # an extra that takes in another one, or what the others have
         if wanted.marker is not None and not wanted.marker.evaluate({"extra": extra}):
             continue
-        found = _installed_version(wanted.name)
+        found = _find_installed_version(wanted.name)
         present.append(f"{wanted.name} {found}")
         if not found:
             lacking.append(f"no {wanted.name}")
@@ -116,7 +116,7 @@ def _check_group(name: str, extra: str, serves: str, way: str, *, needed: bool =
     return Part(name, not lacking, shown, serves, way if lacking else "", needed)
 
 
-def _installed_version(package: str) -> str:
+def _find_installed_version(package: str) -> str:
     """Return the version of an installed package; empty: there is none."""
     try:
         return version(package)

@@ -12,7 +12,7 @@ In the package's pyproject.toml::
 A plug-in is imported when it is used by its name (a format: when no format of dmrl recognises a
 source). A name of dmrl's own stays dmrl's. An error in a plug-in becomes a `PluginError` that
 names its package, and affects no other command. The names of `PLACES` are imported from here, and
-each loads what it needs when it is used.
+each loads its packages on first use.
 """
 
 import re
@@ -167,11 +167,11 @@ def load_command(plugin: Plugin) -> Callable[..., Any]:
     plugin.require(callable(command), "a module with a function command()")
 
     @wraps(command)
-    def called(*arguments: Any, **named: Any) -> Any:
+    def call_plugin(*arguments: Any, **named: Any) -> Any:
         with plugin.naming_the_package("failed"):
             return command(*arguments, **named)
 
-    return called
+    return call_plugin
 
 
 _import = import_lazily(__name__, PLACES)

@@ -34,7 +34,7 @@ def list_names() -> list[str]:
     return _names_in(_recipe_files())
 
 
-def pretrained_names() -> list[str]:
+def list_pretrained_names() -> list[str]:
     """Return the names of the shipped recipes that trained the shipped networks."""
     return _names_in(_recipe_files() / PRETRAINED)
 
@@ -68,7 +68,7 @@ def read_text(name: str | Path) -> str:
             raise RecipeError(f"{name} has more than {MAX_BYTES} bytes. Use a smaller recipe")
         return content.decode("utf-8")
     except (FileNotFoundError, IsADirectoryError):
-        near = get_close_matches(path.stem, list_names() + pretrained_names(), n=1)
+        near = get_close_matches(path.stem, list_names() + list_pretrained_names(), n=1)
         hint = f"Did you mean {near[0]}?" if near else _list_shipped()
         raise RecipeError(f"no recipe {name}. {hint}") from None
     except (UnicodeDecodeError, OSError) as e:
@@ -131,13 +131,13 @@ def _names_in(folder: Traversable) -> list[str]:
 
 def _find_shipped(name: str) -> Traversable:
     """Return the file of a shipped recipe, whether it exists or not."""
-    folder = _recipe_files() / PRETRAINED if name in pretrained_names() else _recipe_files()
+    folder = _recipe_files() / PRETRAINED if name in list_pretrained_names() else _recipe_files()
     return folder / f"{name}.toml"
 
 
 def _list_shipped() -> str:
     """Return the names of all shipped recipes as one line for errors."""
-    others = ", ".join(pretrained_names())
+    others = ", ".join(list_pretrained_names())
     return f"Shipped ones: {', '.join(list_names())}; those of the shipped networks: {others}"
 
 

@@ -123,11 +123,11 @@ def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Sh
 
 def rank_dataset(paths: Sequence[Path], settings: Settings) -> tuple[Path, RankedRows]:
     """Return the folder of a dataset, and its rows in display order; see `browse`."""
-    folder, recordings = _split_paths(paths, settings)
+    folder, recordings = _separate_paths(paths, settings)
     return folder, _rank_rows(folder, recordings, settings)
 
 
-def _split_paths(paths: Sequence[Path], settings: Settings) -> tuple[Path, list[Path]]:
+def _separate_paths(paths: Sequence[Path], settings: Settings) -> tuple[Path, list[Path]]:
     folders = [path for path in dict.fromkeys(paths) if path.is_dir()]
     if settings.layout not in ("auto", "dataset"):
         raise SettingError(f"{folders[0]} is a dataset: leave --layout {settings.layout} out")

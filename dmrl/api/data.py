@@ -186,7 +186,7 @@ class Rows:
         return f"<split {self.name}: {len(self)} images of {width} x {height} px>"
 
     def _repr_html_(self) -> str:
-        shown = notebook_display.spread_indices(len(self))
+        shown = notebook_display.pick_even_indices(len(self))
         return notebook_display.html_images(repr(self)[1:-1], self._split.images(shown))
 
 

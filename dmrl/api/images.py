@@ -120,5 +120,5 @@ class Images(Sequence[Rgb]):
 
     def _repr_html_(self) -> str:
         return notebook_display.html_images(
-            repr(self)[1:-1], (self[k] for k in notebook_display.spread_indices(len(self)))
+            repr(self)[1:-1], (self[k] for k in notebook_display.pick_even_indices(len(self)))
         )

@@ -27,7 +27,7 @@ def html_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]
     return f"<p><b>{_cell_text(title)}</b></p><table><tr>{head}</tr>{body}</table>{more}"
 
 
-def spread_indices(count: int) -> list[int]:
+def pick_even_indices(count: int) -> list[int]:
     """Return the indices of the images to show: the first and others, evenly spaced."""
     shown = min(count, MAX_IMAGES)
     return [k * count // shown for k in range(shown)]

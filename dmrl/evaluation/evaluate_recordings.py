@@ -122,7 +122,7 @@ def _evaluate_against_truth(
 
 @contextmanager
 def _write_folder(out: Path, stem: str, made: Document) -> Iterator[Path]:
-    """Write a folder: first the document, then what the block writes."""
+    """Write a folder: first the document, then the files of the block."""
     with atomic_folder(out) as folder:
         text = json.dumps(made, indent=1, allow_nan=False)
         (folder / f"{stem}.json").write_text(text + "\n", encoding="utf-8")

@@ -15,7 +15,7 @@ from dmrl.deploy.accuracy import compare_peaks, compute_accuracy, decode_points
 from dmrl.deploy.backends import Backend, FloatBackend, Outputs, build_reference_backend, to_grids
 from dmrl.deploy.int8.layer_errors import LayerErrorStats, compute_layer_errors
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.deploy.int8.quantise_model import Quantised, spread_evenly
+from dmrl.deploy.int8.quantise_model import Quantised, pick_evenly
 from dmrl.deploy.int8.store import INTEGER_NAME, save_network
 from dmrl.deploy.samples import SAMPLE_COUNT, save_samples
 from dmrl.errors import MissingExtra, SettingError
@@ -137,7 +137,7 @@ def write_quantized(
         save_model(inputs.model, folder)
         save_network(quantised.network, folder / INTEGER_NAME)
         seen = inputs.calibration
-        rows = spread_evenly(len(seen), SAMPLE_COUNT)
+        rows = pick_evenly(len(seen), SAMPLE_COUNT)
         save_samples(np.stack(list(seen.images(rows))), folder)
         text = json.dumps(describe_quantization(report), indent=1, allow_nan=False)
         (folder / REPORT_NAME).write_text(text + "\n", encoding="utf-8")
@@ -150,14 +150,14 @@ def _compare(
 ) -> QuantizationReport:
     """Compare float and int8 on the same images; draw a few of them into the folder."""
     model, split, network = inputs.model, inputs.compared, quantised.network
-    rows = spread_evenly(len(split), most)
+    rows = pick_evenly(len(split), most)
     backends: dict[str, Backend] = {
         "float": FloatBackend(quantised.graph, model.network.channels),
         "int8": build_reference_backend(network),
     }
     outputs = _compute_outputs(backends, split, rows)
     labels = read_split_labels(split, rows)
-    few = [rows[k] for k in spread_evenly(len(rows), MAX_LAYER_IMAGES)]
+    few = [rows[k] for k in pick_evenly(len(rows), MAX_LAYER_IMAGES)]
     if plots is None:
         say("no picture of the maps: that needs matplotlib. pip install 'dmrl[plot]'")
     else:
@@ -194,7 +194,7 @@ def _compute_outputs(
 
 def _draw_maps(split: Split, rows: list[int], outputs: dict[str, Outputs], folder: Path) -> None:
     assert plots is not None
-    shown = spread_evenly(len(rows), MAX_DRAWN_IMAGES + 2)[1:-1] or [0]
+    shown = pick_evenly(len(rows), MAX_DRAWN_IMAGES + 2)[1:-1] or [0]
     grids = {name: to_grids(each) for name, each in outputs.items()}
     pictures = [
         plots.MapPair(

@@ -29,7 +29,7 @@ from dmrl.geometry.frames import (
 from dmrl.labelling.flight_log import OBSERVER_TOPICS, TRUTH_TOPICS, FlightLog, read_flight
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
 from dmrl.labelling.observer_log import ObserverLog, read_observer_log
-from dmrl.labelling.recorded_camera import recorded_camera
+from dmrl.labelling.recorded_camera import find_recorded_camera
 from dmrl.recording import build_input, read_summary
 
 TITLE, EACH = "tracks against truth", "observer"
@@ -81,7 +81,7 @@ def judge(recording: Path) -> list[EvaluatedTracks]:
 def _read_camera(held: FlightLog, robot: str) -> Camera:
     """The camera that the tracks were made with: its mount, delay and lens may be other ones."""
     used = held.metadata.get(CAMERAS_METADATA, [{}])[-1].get(robot)
-    camera = parse_camera(used, held.path) if used else recorded_camera(held, robot)
+    camera = parse_camera(used, held.path) if used else find_recorded_camera(held, robot)
     if camera is None:
         raise MissingTopic(topics.CALIBRATION(robot), held.topics, held.path)
     return camera

@@ -29,7 +29,7 @@ from dmrl.labelling.observer_log import read_observer_log
 from dmrl.labelling.pair_estimation import PairSolver, Spread, estimate_all, orient_pair
 from dmrl.labelling.pair_report import PairReport, explain_refusals, report_pair
 from dmrl.labelling.peer_positions import PeerPositions, sample_positions
-from dmrl.labelling.recorded_camera import recorded_camera
+from dmrl.labelling.recorded_camera import find_recorded_camera
 from dmrl.labelling.sensor_file import SensorConstants, read_sensors
 from dmrl.labelling.sensor_logs import SensorLogs, build_sensor_logs
 from dmrl.recording import Provenance, TimedMessage, rewrite
@@ -147,7 +147,7 @@ def read_bearings(
         raise MissingTopic(topics.DETECTIONS("*"), flight.topics, flight.path)
     out = {}
     for robot in (robot for robot in sorted(flight.detections) if robot in logs.robots):
-        camera = options.cameras.get(robot) or recorded_camera(flight, robot)
+        camera = options.cameras.get(robot) or find_recorded_camera(flight, robot)
         if camera is None:
             raise MissingTopic(topics.CALIBRATION(robot), flight.topics, flight.path)
         if not options.distorted:

@@ -18,7 +18,7 @@ from dmrl.labelling.image_labels import (
     label_images,
 )
 from dmrl.labelling.peer_positions import PeerPositions
-from dmrl.labelling.recorded_camera import recorded_camera
+from dmrl.labelling.recorded_camera import find_recorded_camera
 from dmrl.labelling.sensor_logs import SensorLogs
 from dmrl.messages import message_class
 from dmrl.recording import Series, Stamped, TimedMessage
@@ -66,7 +66,7 @@ def build_label_messages(
         Options of the projection.
     """
     kept, sources = _select_other_sources(flight.labels.get(robot, []))
-    camera = options.cameras.get(robot) or recorded_camera(flight, robot)
+    camera = options.cameras.get(robot) or find_recorded_camera(flight, robot)
     images_ns = flight.images_ns[robot]
     fresh = _label_peers(logs, robot, positions, options, camera, images_ns) if camera else {}
     for time_ns in sorted({*kept, *fresh}):

@@ -14,7 +14,7 @@ from dmrl.estimation.tracking.tuning import Tuning
 from dmrl.geometry.frames import Camera
 from dmrl.labelling.flight_log import FlightLog
 from dmrl.labelling.observer_log import ObserverLog, read_observer_log
-from dmrl.labelling.recorded_camera import read_robot_camera, recorded_camera
+from dmrl.labelling.recorded_camera import find_recorded_camera, read_robot_camera
 from dmrl.messages import message_class
 from dmrl.recording import TimedMessage
 from dmrl.terminal.progress import say, track
@@ -41,7 +41,9 @@ def choose_camera(
     MissingTopic
         If there is neither.
     """
-    camera = read_robot_camera(flight, robot, given) if given else recorded_camera(flight, robot)
+    camera = (
+        read_robot_camera(flight, robot, given) if given else find_recorded_camera(flight, robot)
+    )
     if camera is None:
         raise MissingTopic(topics.CALIBRATION(robot), flight.topics, flight.path)
     return replace(camera, distortion=()) if undistorted else camera

@@ -15,7 +15,7 @@ PLUMB_BOB_MODELS = ("", "plumb_bob", "rational_polynomial")
 """Names of lens models equal to plumb bob, the last if its further coefficients are 0."""
 
 
-def recorded_camera(flight: FlightLog, robot: str) -> Camera | None:
+def find_recorded_camera(flight: FlightLog, robot: str) -> Camera | None:
     """Return a robot's camera; None if the recording has no calibration.
 
     Raises

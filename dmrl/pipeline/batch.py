@@ -70,7 +70,7 @@ def find_recordings(source: Path, *, but: Path | None = None) -> dict[Path, Path
     if source.is_dir():
         base, found = source, _list_below(source, but)
     elif is_collection(source):
-        base, found = _fixed_parent(source), []
+        base, found = _find_fixed_parent(source), []
         for path in sorted(base.glob(str(source.relative_to(base)))):
             if any(part.startswith(".") for part in path.relative_to(base).parts):
                 continue
@@ -132,7 +132,7 @@ def _is_same(path: Path, other: Path | None) -> bool:
     return other is not None and other.exists() and path.samefile(other)
 
 
-def _fixed_parent(pattern: Path) -> Path:
+def _find_fixed_parent(pattern: Path) -> Path:
     """Return the folder above all files of a pattern."""
     return next(parent for parent in pattern.parents if not has_magic(str(parent)))
 
@@ -162,7 +162,7 @@ def build_tasks(
     inputs
         Further inputs, the same for all.
     """
-    own = changed_settings(settings)
+    own = find_changed_settings(settings)
     made = []
     for name, source in found.items():
         place = None if out is None else out / name
@@ -171,7 +171,7 @@ def build_tasks(
     return made
 
 
-def changed_settings(settings: Any) -> dict[str, Any]:
+def find_changed_settings(settings: Any) -> dict[str, Any]:
     """Return the settings that differ from the defaults, by name."""
     if settings is None:
         return {}

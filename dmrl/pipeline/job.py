@@ -43,7 +43,7 @@ def build_job(
     settings
         Settings, and other arguments, by name.
     resume
-        Whether to resume what a killed run left.
+        Whether to resume the output of a killed run.
     keep
         Whether an output that was made of the same inputs by the same settings stays. The result
         then has the return value of ``run``, and no hash of the output.

@@ -6,7 +6,7 @@ from typing import Any
 
 from dmrl.atomic_output import register_output
 from dmrl.errors import DmrlError, SettingError
-from dmrl.pipeline.batch import Task, changed_settings, error_text
+from dmrl.pipeline.batch import Task, error_text, find_changed_settings
 from dmrl.pipeline.executor import SLURM, open_executor
 from dmrl.pipeline.job import build_job, has_failed
 from dmrl.pipeline.stage_signature import signature_of
@@ -42,7 +42,7 @@ def run_on_cluster(
         raise SettingError(
             f"dmrl {stage} --on needs an output. Name a folder for its figures: --plots DIR"
         )
-    line = build_job(stage, out, dict(inputs), changed_settings(settings), keep=True)
+    line = build_job(stage, out, dict(inputs), find_changed_settings(settings), keep=True)
     task = Task(out, out, line)
     if on == SLURM:
         raise SettingError("--on slurm is for a folder of recordings. Name one, or --on ray")

@@ -227,13 +227,13 @@ def _keys(found: looks.Settings, start: looks.Settings) -> dict[str, object]:
     names = [*(knob.key for knob in KNOBS), "bayer", "jpeg_quality", "image_format"]
     changed = {name: getattr(found, name) for name in names}
     return {
-        name: [_rounded(end) for end in value] if isinstance(value, tuple) else value
+        name: [_round_values(end) for end in value] if isinstance(value, tuple) else value
         for name, value in changed.items()
         if value != getattr(start, name)
     }
 
 
-def _rounded(value: float) -> float:
+def _round_values(value: float) -> float:
     """Round to three significant digits."""
     return value if not value else round(value, 2 - math.floor(math.log10(abs(value))))
 

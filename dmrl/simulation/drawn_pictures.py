@@ -18,7 +18,7 @@ def draw_files(indices: range, settings: SketchSettings) -> list[tuple[str, byte
     made = []
     for index in indices:
         name, picture = f"{index:06d}.png", draw_picture(settings, index)
-        labels = list(_label_rows(name, picture, _split_name(settings, index)))
+        labels = list(_label_rows(name, picture, _choose_split(settings, index)))
         made.append((name, encode_png(picture.rgb), labels))
     return made
 
@@ -45,7 +45,7 @@ def _robot_count(rng: Generator, settings: SketchSettings) -> int:
     return 0 if empty else int(rng.integers(1, settings.robots_max + 1))
 
 
-def _split_name(settings: SketchSettings, index: int) -> str:
+def _choose_split(settings: SketchSettings, index: int) -> str:
     first_test = settings.images - round(settings.images * settings.test_share)
     return "test" if index >= first_test else "train"
 

@@ -36,11 +36,11 @@ class Fleet:
     cameras: tuple[SimulatedCamera, ...]
     clock: FlightClock
 
-    def listened(self) -> bool:
+    def has_listeners(self) -> bool:
         """Return whether a client still reads the log of a drone."""
         return any(drone.is_logging for drone in self.drones)
 
-    def sent(self) -> list[tuple[str, int, int]]:
+    def count_packets(self) -> list[tuple[str, int, int]]:
         """Return a row per drone and camera: name, packets sent, packets dropped."""
         rows = [(drone.robot, drone.sent, drone.dropped) for drone in self.drones]
         return rows + [(f"{c.robot} camera", c.sent, c.dropped) for c in self.cameras]

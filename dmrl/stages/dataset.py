@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from dmrl.datasets.settings import Settings
 from dmrl.errors import SettingError
-from dmrl.pipeline.batch import changed_settings, find_all_recordings
+from dmrl.pipeline.batch import find_all_recordings, find_changed_settings
 from dmrl.pipeline.process_pool import count_cores
 from dmrl.pipeline.single_run import run_on_cluster
 from dmrl.terminal.arguments import AsJson, Flat, On, Workers
@@ -89,7 +89,7 @@ def add(
     """
     from dmrl.card.dataset_build import extend_dataset
 
-    given = changed_settings(settings).keys()
+    given = find_changed_settings(settings).keys()
     return Result(*extend_dataset(recordings, out, settings, given, workers or count_cores()))
 
 

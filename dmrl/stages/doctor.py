@@ -31,7 +31,7 @@ def command(*, as_json: AsJson = False) -> None:
 
 
 def _conclude(found: "list[Part]") -> str:
-    """Return the last line: whether the base works, and what is missing."""
+    """Return the last line: whether the base works, and the missing parts."""
     missing = [part.name for part in found if not part.there]
     rest = f"Not there: {', '.join(missing)}" if missing else "Nothing is missing"
     return f"The base works. {rest}."

@@ -47,7 +47,7 @@ class Settings:
     seed
         Of the bootstrap.
     settle_s
-        positions, tracks: errors in the first seconds do not count, but for what is kept.
+        positions, tracks: errors in the first seconds do not count, except for kept positions.
         Without it, 20 s, or half of a flight under 30 s.
     """
 

@@ -44,7 +44,7 @@ def run(flight: Path, uris: Sequence[str], cameras: Sequence[int], settings: Set
                 pass
             # A link whose other end vanishes loses what it has not yet taken.
             linger_s = time.monotonic() + LINGER_S
-            while flying.listened() and time.monotonic() < linger_s and not ended.wait(0.1):
+            while flying.has_listeners() and time.monotonic() < linger_s and not ended.wait(0.1):
                 pass
         finally:
             signal.signal(signal.SIGINT, previous)
@@ -73,4 +73,4 @@ def command(
         TCP port of the first robot's camera; repeat for the next.
     """
     flying = run(flight, uri, camera or [], settings)
-    print_table("", COLUMNS, flying.sent())
+    print_table("", COLUMNS, flying.count_packets())

@@ -76,8 +76,8 @@ def run(model: Path, recording: In, out: Path, settings: Settings) -> Result:
     recording
         Recording with images; or a folder of recordings.
     out
-        Recording to write: all of IN, and what was detected. Must not exist. For a folder: the
-        folder of what is made, under the same names.
+        Recording to write: all of IN, and the detections. Must not exist. For a folder: the
+        folder of the outputs, under the same names.
     settings
         See `Settings`.
 

@@ -52,7 +52,7 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
     BlenderError
         If Blender cannot be set up, or does not start.
     RecordingError
-        If what is to be resumed is of other settings.
+        If the unfinished output was made with other settings.
     """
     from dmrl.render_recording import render_recording
 

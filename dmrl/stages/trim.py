@@ -73,7 +73,7 @@ def run(recording: Path, out: Path, settings: Settings) -> int:
     first, last = settings.from_s, settings.to_s
     if first is not None and last is not None and first >= last:
         raise SettingError(f"--from {first:g} is not before --to {last:g}. Swap them")
-    low_ns, high_ns = _kept_ns(recording, settings)
+    low_ns, high_ns = _compute_kept_ns(recording, settings)
     return trim(recording, out, start_ns=low_ns, end_ns=high_ns, topics=settings.topic)
 
 
@@ -81,12 +81,12 @@ def origin(recording: Path, settings: Settings) -> "Provenance":
     """Return the provenance of what `run` would write."""
     from dmrl.recording import build_provenance
 
-    low_ns, high_ns = _kept_ns(recording, settings)
+    low_ns, high_ns = _compute_kept_ns(recording, settings)
     kept = {"start_ns": low_ns, "end_ns": high_ns, "topics": list(settings.topic)}
     return build_provenance("trim", kept, [recording])
 
 
-def _kept_ns(recording: Path, settings: Settings) -> tuple[int | None, int | None]:
+def _compute_kept_ns(recording: Path, settings: Settings) -> tuple[int | None, int | None]:
     """Return the first log time that is kept, and the first after it that is not."""
     from dmrl.recording import read_summary
 

@@ -13,7 +13,7 @@ from dmrl.geometry.camera_file import format_camera
 from dmrl.geometry.frames import AIDECK, Camera
 from dmrl.images.codec import encode_png
 from dmrl.labelling.flight_log import read_flight
-from dmrl.labelling.recorded_camera import read_robot_camera, recorded_camera
+from dmrl.labelling.recorded_camera import find_recorded_camera, read_robot_camera
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 
@@ -33,8 +33,10 @@ def flight(path: Path, **lens: Any) -> Path:
 def test_a_calibration_is_read_as_it_was_written(tmp_path: Path, model: str) -> None:
     path = flight(tmp_path / "a.mcap", D=[0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0], distortion_model=model)
     lens = (0.1, 0.2, 0.3, 0.4, 0.5)
-    assert recorded_camera(read_flight(path), "cf1") == Camera(320, 224, 181, 182, 150, 100, lens)
-    assert recorded_camera(read_flight(path), "cf2") is None
+    assert find_recorded_camera(read_flight(path), "cf1") == Camera(
+        320, 224, 181, 182, 150, 100, lens
+    )
+    assert find_recorded_camera(read_flight(path), "cf2") is None
 
 
 @pytest.mark.parametrize(
@@ -43,7 +45,7 @@ def test_a_calibration_is_read_as_it_was_written(tmp_path: Path, model: str) -> 
 def test_a_lens_that_dmrl_does_not_know_is_refused(tmp_path: Path, lens: dict[str, Any]) -> None:
     path = flight(tmp_path / "a.mcap", **lens)
     with pytest.raises(RecordingError, match=r"coefficients, dmrl knows plumb_bob with 5"):
-        recorded_camera(read_flight(path), "cf1")
+        find_recorded_camera(read_flight(path), "cf1")
 
 
 @pytest.mark.parametrize("lens", [{"K": []}, {"K": [1, 2]}, {"D": [float("inf")]}, {"width": 0}])
@@ -52,7 +54,7 @@ def test_numbers_of_no_camera_are_refused(tmp_path: Path, lens: dict[str, Any]) 
     with pytest.raises(
         RecordingError, match=r"a.mcap: /cf1/camera/calibration (has|is) .*dmrl cali"
     ):
-        recorded_camera(read_flight(path), "cf1")
+        find_recorded_camera(read_flight(path), "cf1")
 
 
 def test_images_have_their_log_times(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from dmrl import topics
 from dmrl.errors import DmrlError, MissingTopic, OutputError, RecordingError, SettingError
 from dmrl.geometry.camera_file import format_camera
 from dmrl.labelling.flight_log import read_flight
-from dmrl.labelling.recorded_camera import recorded_camera
+from dmrl.labelling.recorded_camera import find_recorded_camera
 from dmrl.recording import Provenance, RecordingWriter, read, read_raw, read_summary, trim
 from dmrl.recording.provenance_inputs import hash_file
 from dmrl.stages import evaluate, fly, track
@@ -71,7 +71,7 @@ def test_tracks_are_judged_with_the_camera_that_made_them(
         for one in read(detected):
             seen = one.topic in (topics.DETECTIONS("cf1"), topics.CAMERA_IMAGE("cf1"))
             sink.write(one.time_ns + seen * 200_000_000, one.topic, one.message)
-    camera = recorded_camera(read_flight(detected), "cf1")
+    camera = find_recorded_camera(read_flight(detected), "cf1")
     assert camera is not None
     path.write_text(format_camera(replace(camera, delay_s=0.2)))
     track.run(late, out, Settings(camera={"cf1": path}))

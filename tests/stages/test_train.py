@@ -238,7 +238,7 @@ def test_the_shipped_recipe_is_the_default_and_the_published_one_is_the_papers()
     published = recipe.load("locanet", "train", Settings)
     assert published.augmentation(0).is_identity
     assert (published.architecture, published.epochs, published.batch_size) == ("locanet", 15, 5)
-    for name in recipe.list_names() + recipe.pretrained_names():
+    for name in recipe.list_names() + recipe.list_pretrained_names():
         if recipe.read(name)["kind"] == "train":
             recipe.load(name, "train", Settings)
 

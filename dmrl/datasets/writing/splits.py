@@ -49,11 +49,11 @@ def choose_test_independently(
     The hash of each recording decides alone, so the choice does not depend on other recordings.
     """
 
-    def drawn(path: Path) -> float:
+    def draw_share(path: Path) -> float:
         digest = hashlib.sha256(f"{seed} {sha256[path]}".encode()).digest()
         return int.from_bytes(digest[:8], "big") / 2**64
 
-    return {path for path in sha256 if drawn(path) < test_share}
+    return {path for path in sha256 if draw_share(path) < test_share}
 
 
 def build_split_lookup(path: Path, own: Mapping[str, Sequence[tuple[int, int]]]) -> SplitLookup:

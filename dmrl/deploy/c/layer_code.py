@@ -2,7 +2,7 @@
 
 from dmrl.deploy.c.buffer_plan import BufferPlan
 from dmrl.deploy.c.convolutions import generate_convolution_row, kernel_templates
-from dmrl.deploy.c.memory_levels import staged_buffers
+from dmrl.deploy.c.memory_levels import list_staged_buffers
 from dmrl.deploy.c.row_addresses import (
     C_RANGES,
     C_TYPES,
@@ -57,7 +57,7 @@ def _step_templates(step: Step) -> list[str]:
 
 def generate_row_function(plan: BufferPlan, index: int, prefix: str) -> str:
     """Generate the C function that computes one output row of a step."""
-    step, desk = plan.steps[index], StepAddresses(plan, staged_buffers(plan, index))
+    step, desk = plan.steps[index], StepAddresses(plan, list_staged_buffers(plan, index))
     if isinstance(step.layer, Conv):
         text = generate_convolution_row(desk, index)
     else:

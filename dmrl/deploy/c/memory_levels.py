@@ -39,7 +39,7 @@ class StagedBuffer:
         return round_up(self.at + self.size_bytes * self.count, 4)
 
 
-def staged_buffers(plan: BufferPlan, index: int) -> dict[str, StagedBuffer]:
+def list_staged_buffers(plan: BufferPlan, index: int) -> dict[str, StagedBuffer]:
     """Return the content of the scratch buffer of a step: its tables, and rows of far rings.
 
     Returns
@@ -80,7 +80,7 @@ def count_copied_bytes(plan: BufferPlan) -> int:
     return sum(
         load.size_bytes * load.count * out.rows
         for index, out in enumerate(plan.buffers[1:])
-        for load in staged_buffers(plan, index).values()
+        for load in list_staged_buffers(plan, index).values()
     )
 
 
@@ -130,5 +130,7 @@ def _list_choices(plan: BufferPlan) -> list[tuple[str, ...]]:
 def _place_in_l2(plan: BufferPlan, far: tuple[str, ...]) -> BufferPlan:
     buffers = tuple(replace(b, in_l2=b.home in far) for b in plan.buffers)
     draft = replace(plan, buffers=buffers, l1_scratch_bytes=1)
-    ends = [load.end for k in range(len(plan.steps)) for load in staged_buffers(draft, k).values()]
+    ends = [
+        load.end for k in range(len(plan.steps)) for load in list_staged_buffers(draft, k).values()
+    ]
     return replace(draft, l1_scratch_bytes=max(ends))

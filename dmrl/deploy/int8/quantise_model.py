@@ -61,18 +61,18 @@ def quantise_model(model: Model, source: ImageSource, most: int, *, grey: bool) 
     """
     graph = build_graph(trace_operations(model.network))
     graph = graph.to_grey() if grey else graph
-    rows = spread_evenly(len(source), most)
+    rows = pick_evenly(len(source), most)
     calibration = track(source.images(rows), "Calibrating", len(rows))
     ranges = calibrate_ranges(graph, (image[None] for image in calibration))
     graph, ranges = equalise_channels(graph, ranges)
-    rows = spread_evenly(len(source), min(most, MAX_ROUNDING_IMAGES))
+    rows = pick_evenly(len(source), min(most, MAX_ROUNDING_IMAGES))
     moments = measure_moments(graph, track(source.images(rows), "Rounding", len(rows)))
     return Quantised(
         graph, quantise_network(graph, ranges, _describe(model), moments), ranges.images
     )
 
 
-def spread_evenly(count: int, most: int) -> list[int]:
+def pick_evenly(count: int, most: int) -> list[int]:
     """Return at most ``most`` numbers below ``count``, ascending, evenly spread."""
     numbers: list[int] = np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()
     return numbers

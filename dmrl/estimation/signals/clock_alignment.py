@@ -90,7 +90,7 @@ class Clock:
             ", ".join(dict.fromkeys(by for by in (first.by, self.by) if by)),
         )
 
-    def inverted(self) -> "Clock":
+    def invert(self) -> "Clock":
         """Return the inverse correction."""
         drift = 1 / (1 + self.drift) - 1
         return Clock(
@@ -274,7 +274,7 @@ def connect_clocks(pairs: dict[tuple[str, str], Clock], reference: str) -> dict[
     dict
         Correction by robot, the reference included. Robots without a connection are missing.
     """
-    links = pairs | {(b, a): clock.inverted() for (a, b), clock in pairs.items()}
+    links = pairs | {(b, a): clock.invert() for (a, b), clock in pairs.items()}
     found = {reference: Clock(0.0)}
     while True:
         ready = [

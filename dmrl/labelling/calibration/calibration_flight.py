@@ -51,7 +51,7 @@ def read_calibration_flight(
     paths = {
         peer: _to_path(flight, found[robot, peer])
         if (robot, peer) in found
-        else _captured_path(flight, robot, peer)
+        else _build_mocap_path(flight, robot, peer)
         for peer in peers
     }
     return CalibrationFlight(
@@ -72,7 +72,7 @@ def _to_path(flight: FlightLog, found: PeerPositions) -> PeerPath:
     return PeerPath(flight.to_seconds(found.time_ns[good]), found.xyz_m[good], covariance)
 
 
-def _captured_path(flight: FlightLog, robot: str, peer: str) -> PeerPath:
+def _build_mocap_path(flight: FlightLog, robot: str, peer: str) -> PeerPath:
     """Return the positions by motion capture of both robots."""
     time_ns, xyz_m = find_true_path(flight, robot, peer)
     covariance = np.tile(MOCAP_COVARIANCE, (len(time_ns), 1, 1))

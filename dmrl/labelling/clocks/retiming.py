@@ -73,7 +73,7 @@ class Corrected:
         return bool(moved) and _is_stamped(self.held.topics[topic].schema)
 
     def _shift_ns(self, topic: str, time_ns: Times) -> Times:
-        """What is added to the times of a topic whose robot stands in its name."""
+        """Offset added to the times of a topic, by the robot in its name."""
         return self._lacking_ns(self._clock_of(topic, _robot(topic)), time_ns)
 
     def _lacking_ns(self, clock: Clock | None, time_ns: Times) -> Times:

@@ -254,20 +254,20 @@ def _error_metrics(
 
         depth_m = error.depth_m[inside][found]
         return {
-            "median_px": weighted_quantile(norm_px, weights, 0.5),
+            "median_px": compute_weighted_quantile(norm_px, weights, 0.5),
             "mean_px": mean(norm_px[found]),
             "rmse_px": np.sqrt(mean(norm_px[found] ** 2)),
-            "p95_px": weighted_quantile(norm_px, weights, 0.95),
+            "p95_px": compute_weighted_quantile(norm_px, weights, 0.95),
             "within_8_px": mean((norm_px <= 8).astype(np.float64), weights),
             "within_20_px": mean((norm_px <= 20).astype(np.float64), weights),
-            "bias_u_px": weighted_quantile(error.u_px[inside][found], matched, 0.5),
-            "bias_v_px": weighted_quantile(error.v_px[inside][found], matched, 0.5),
+            "bias_u_px": compute_weighted_quantile(error.u_px[inside][found], matched, 0.5),
+            "bias_v_px": compute_weighted_quantile(error.v_px[inside][found], matched, 0.5),
             "depth_mae_m": mean(np.abs(depth_m)),
             "depth_rmse_m": np.sqrt(mean(depth_m**2)),
         }
 
 
-def weighted_quantile(values: Array, weights: Array, share: float) -> Array:
+def compute_weighted_quantile(values: Array, weights: Array, share: float) -> Array:
     """Return (b,) quantiles of (n,) values under (b, n) weights, as if repeated that often.
 
     If the quantile falls between two values, it is their mean, so the median of an even number of

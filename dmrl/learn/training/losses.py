@@ -120,7 +120,9 @@ def offset_loss(predicted: Tensor, offset: Tensor, weight: Tensor) -> Tensor:
     return (weight[:, None] * (predicted - offset).abs()).sum(dim=(1, 2, 3)).mean()
 
 
-def spread_loss(log_spread: Tensor, log_depth: Tensor, depth_m: Tensor, weight: Tensor) -> Tensor:
+def compute_spread_loss(
+    log_spread: Tensor, log_depth: Tensor, depth_m: Tensor, weight: Tensor
+) -> Tensor:
     """Compute the negative log likelihood of the log depth error under a Laplace density.
 
     The constant log 2 is left out. The depth gets no gradient from it: detection is then as good as
@@ -196,8 +198,8 @@ def _offset_term(out: OutputChannels, wanted: Targets, settings: LossSettings) -
     return offset_loss(both, wanted.offset, wanted.offset_weight)
 
 
-def _spread_term(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Tensor:
-    return spread_loss(out[SPREAD_CHANNEL], out["log_depth"], wanted.depth_m, wanted.weight)
+def _compute_spread_term(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Tensor:
+    return compute_spread_loss(out[SPREAD_CHANNEL], out["log_depth"], wanted.depth_m, wanted.weight)
 
 
 def _class_term(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Tensor:
@@ -209,7 +211,7 @@ TERMS = (
     LossTerm("confidence_loss", "confidence_weight", ("confidence",), _confidence_term),
     LossTerm("depth_loss", "depth_weight", ("log_depth",), _depth_term),
     LossTerm("offset_loss", "offset_weight", ("offset_u", "offset_v"), _offset_term),
-    LossTerm("spread_loss", "spread_weight", (SPREAD_CHANNEL, "log_depth"), _spread_term),
+    LossTerm("spread_loss", "spread_weight", (SPREAD_CHANNEL, "log_depth"), _compute_spread_term),
     LossTerm("class_loss", "class_weight", (f"{CLASS_PREFIX}0",), _class_term),
 )
 """All terms of the loss; training minimises their weighted sum."""

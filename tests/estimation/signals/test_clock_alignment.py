@@ -117,9 +117,7 @@ def test_clocks_chain_and_undo() -> None:
     np.testing.assert_allclose(
         chained.correct_times(time), two.correct_times(one.correct_times(time))
     )
-    np.testing.assert_allclose(
-        one.inverted().correct_times(one.correct_times(time)), time, atol=1e-9
-    )
+    np.testing.assert_allclose(one.invert().correct_times(one.correct_times(time)), time, atol=1e-9)
     assert chained.sigma_s == pytest.approx(0.005)
 
 
@@ -144,7 +142,7 @@ def test_any_clocks_chain_and_undo(one: Clock, two: Clock) -> None:
     both = two.compose_after(one).correct_times(TIMES_S)
     np.testing.assert_allclose(both, two.correct_times(one.correct_times(TIMES_S)), atol=1e-8)
     np.testing.assert_allclose(
-        one.inverted().correct_times(one.correct_times(TIMES_S)), TIMES_S, atol=1e-8
+        one.invert().correct_times(one.correct_times(TIMES_S)), TIMES_S, atol=1e-8
     )
 
 
@@ -190,7 +188,7 @@ def test_a_chain_is_as_sure_as_its_parts_together() -> None:
     assert (both.sigma_s, both.sigma_drift) == pytest.approx((0.005, 5e-6))
     assert (both.correlation, both.by, both.at_s) == (0.8, "ranges, turns", 5.0)
     assert both.compose_after(both).by == "ranges, turns"
-    back = one.inverted()
+    back = one.invert()
     assert (back.sigma_s, back.sigma_drift, back.correlation, back.by) == (
         0.003,
         4e-6,

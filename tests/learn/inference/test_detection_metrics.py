@@ -13,9 +13,9 @@ from dmrl.learn.inference.detection_metrics import (
     compute_band_metrics,
     compute_curves,
     compute_metrics,
+    compute_weighted_quantile,
     iter_bootstrap_weights,
     score_detections,
-    weighted_quantile,
 )
 from dmrl.learn.inference.matching import Points
 from dmrl.learn.inference.metric_definitions import METRIC_DEFINITIONS
@@ -179,7 +179,7 @@ def test_the_median_is_numpys_also_with_repeats(numbers: list[float], random: ob
     array = np.array(numbers)
     times = np.array([random.randint(1, 3) for _ in numbers])  # type: ignore[attr-defined]
     repeated = np.repeat(array, times)
-    got = weighted_quantile(array, times[None].astype(float), 0.5)
+    got = compute_weighted_quantile(array, times[None].astype(float), 0.5)
     assert got[0] == pytest.approx(np.median(repeated))
 
 
@@ -272,7 +272,7 @@ def test_a_weighted_quantile_is_that_of_repeated_values(pairs: list[tuple[int, i
     values_, counts = (np.array(x, float) for x in zip(*pairs, strict=True))
     repeated = np.repeat(values_, counts.astype(int))
     for share in (0.25, 0.5, 0.95):
-        (got,) = weighted_quantile(values_, counts[None], share)
+        (got,) = compute_weighted_quantile(values_, counts[None], share)
         if len(repeated):
             wanted = np.quantile(repeated, share, method="averaged_inverted_cdf")
             assert got == pytest.approx(wanted)

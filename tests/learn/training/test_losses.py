@@ -14,10 +14,10 @@ from dmrl.learn.training.losses import (
     LossSettings,
     class_loss,
     compute_loss_terms,
+    compute_spread_loss,
     confidence_loss,
     depth_loss,
     offset_loss,
-    spread_loss,
 )
 
 
@@ -82,12 +82,16 @@ def test_the_best_spread_is_the_mean_error_and_depth_learns_nothing_from_it() ->
     log_depth = errors.reshape(1, 1, 4).requires_grad_()
     log_b = torch.linspace(-4, 0, 401)
     loss = [
-        float(spread_loss(b.expand(1, 1, 4), log_depth, torch.ones(1, 1, 4), torch.ones(1, 1, 4)))
+        float(
+            compute_spread_loss(
+                b.expand(1, 1, 4), log_depth, torch.ones(1, 1, 4), torch.ones(1, 1, 4)
+            )
+        )
         for b in log_b
     ]
     assert float(log_b[int(np.argmin(loss))].exp()) == pytest.approx(0.25, rel=0.01)
     spread = torch.zeros(1, 1, 4, requires_grad=True)
-    spread_loss(spread, log_depth, torch.ones(1, 1, 4), torch.ones(1, 1, 4)).backward()  # type: ignore[no-untyped-call]
+    compute_spread_loss(spread, log_depth, torch.ones(1, 1, 4), torch.ones(1, 1, 4)).backward()  # type: ignore[no-untyped-call]
     assert log_depth.grad is None
     assert spread.grad is not None
     assert (spread.grad > 0).all()
@@ -144,7 +148,7 @@ def test_a_term_is_nothing_to_a_network_that_lacks_its_channels() -> None:
 
 def test_a_spread_below_a_hundredth_is_one() -> None:
     one = torch.ones(1, 1, 1)
-    low, least = (spread_loss(x * one, 0 * one, one, one) for x in (-20.0, math.log(0.01)))
+    low, least = (compute_spread_loss(x * one, 0 * one, one, one) for x in (-20.0, math.log(0.01)))
     assert float(low) == float(least) == pytest.approx(math.log(0.01))
 
 

@@ -36,7 +36,7 @@ class Proof:
     Parameters
     ----------
     network
-        What the C should compute.
+        Network that the C should compute.
     pictures, noise
         Images it was tried on.
     targets
@@ -44,7 +44,7 @@ class Proof:
     cost
         On rv32imc; None without its compiler.
     memory
-        What the C keeps.
+        State that the C keeps.
     """
 
     network: IntegerNetwork
