@@ -1,4 +1,4 @@
-"""Convert messages about an image to rerun archetypes, one function per message type.
+"""Convert images, detections and grid maps to rerun archetypes; `label_overlay` draws labels.
 
 All are in the ``<robot>/image`` frame, so maps, labels and detections match the image's pixels.
 """

@@ -19,7 +19,8 @@ MAX_EXPECTED_BAD_SHARE = 0.045
 Most flights with calibrated sensors are good throughout and use little of it: over all of them the
 share is below 1 %. Raised on simulated flights, where fewer positions were bad than expected."""
 MAX_BAD_PROBABILITY = 0.12
-"""Largest probability of being bad of an OK position. Raised together with ``EXPECTED_SHARE``."""
+"""Largest probability of being bad of an OK position. Raised together with
+``MAX_EXPECTED_BAD_SHARE``."""
 MAX_BEARING_SIGMA_RAD, MAX_MEDIAN_BEARING_SIGMA_RAD = 0.35, 0.25
 """Largest sigma over distance of an observable bearing; and largest median of it over a flight.
 Above the median, the motion of the whole flight leaves the bearing open. No record of how the

@@ -151,7 +151,7 @@ def build_equations(
 
 
 def add_damping(equations: NormalEquations, damping: float) -> NormalEquations:
-    """Return the equations with Levenberg-Marquardt damping: a shorter, steeper step."""
+    """Return the equations with Marquardt damping of the keyframe states, not of the constants."""
     if damping == 0.0:
         return equations
     diagonal = equations.diagonal + damping * np.eye(len(WEAK_INFORMATION)) * equations.diagonal

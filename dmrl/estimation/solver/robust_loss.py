@@ -1,7 +1,8 @@
 """Robust losses for residuals with outliers and for the constants of a flight.
 
 Every residual r has the Cauchy loss L log(1 + r^2 / L) with its own scale L: quadratic where r^2 is
-small against L, logarithmic beyond. It is the log likelihood of Student's t, up to factors.
+small against L, logarithmic beyond. Up to factors, it is the negative log
+likelihood of Student's t.
 """
 
 from dataclasses import dataclass

@@ -174,7 +174,7 @@ class LossTerm:
         Field of `LossSettings` with its weight.
     channels
         Channels that it requires; the term is 0 for a network that lacks any of them.
-    of
+    compute
         Function of outputs, targets and settings that returns the unweighted loss, a scalar.
     """
 

@@ -19,7 +19,7 @@ LOSS_NAMES = tuple(term.name for term in TERMS)
 def compute_losses(
     network: Network, batch: Batch, settings: TrainConfig, teacher: Network | None = None
 ) -> Tensor:
-    """Compute the weighted losses of a batch, in the order of ``LOSSES``.
+    """Compute the weighted losses of a batch, in the order of ``LOSS_NAMES``.
 
     With a teacher, a fraction ``distill_share`` of each loss is against the teacher's output.
     """
@@ -86,7 +86,7 @@ def train_step(
     Returns
     -------
     Tensor
-        Losses of the whole batch before the update, in the order of ``LOSSES``.
+        Losses of the whole batch before the update, in the order of ``LOSS_NAMES``.
     """
     for parameters in optimizer.param_groups:
         parameters["lr"] = learning_rate

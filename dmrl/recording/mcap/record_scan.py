@@ -1,4 +1,4 @@
-"""Read a whole MCAP file record by record, for files without an index."""
+"""Read a whole MCAP file record by record, where its Summary section is absent or incomplete."""
 
 from collections import Counter
 from dataclasses import dataclass, field

@@ -45,7 +45,7 @@ def read_summary_section(path: Path, stream: BoundedReader) -> SummarySection | 
     RecordingError
         If the section contradicts itself or the file.
     """
-    return get_cached("raw", path, stream, lambda: read_verified_section(path, stream))
+    return get_cached("verified section", path, stream, lambda: read_verified_section(path, stream))
 
 
 def get_cached(kind: str, path: Path, stream: BoundedReader, make: Callable[[], Made]) -> Made:

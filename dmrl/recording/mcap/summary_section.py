@@ -83,7 +83,7 @@ class SummarySection(McapSummary):
 
 
 def read_verified_section(path: Path, stream: BoundedReader) -> SummarySection | None:
-    """Read and verify the Summary section; return None if it does not index the messages.
+    """Read and verify the Summary section; None if it is absent or does not list all messages.
 
     Parameters
     ----------
