@@ -23,7 +23,7 @@ from cyclopts import (
 from rich.console import Console
 from rich.text import Text
 
-from dmrl import __version__, boundary, plugins
+from dmrl import __version__, boundary, entry_points
 from dmrl.guards.safe_names import truncate_middle
 from dmrl.storage import to_path
 
@@ -74,7 +74,9 @@ def format_usage_error(error: CycloptsError) -> Text:
         return Text(f"dmrl: {truncate_middle(str(error))}")
     # The error's own text would load every command, and fail where an extra is missing.
     word = error.unused_tokens[0]
-    near = get_close_matches(word, [*COMMANDS, *plugins.find_plugins(plugins.STAGES)], n=1)
+    near = get_close_matches(
+        word, [*COMMANDS, *entry_points.find_plugins(entry_points.STAGES)], n=1
+    )
     hint = f"Did you mean {near[0]}?" if near else "Try: dmrl --help"
     return Text(f"dmrl: no command {word}. {hint}")
 
@@ -123,10 +125,10 @@ def add_plugin_commands() -> App:
 
     `main` does so only if dmrl has no such command: it takes 50 ms, a third of the start.
     """
-    for name, plugin in plugins.find_plugins(plugins.STAGES).items():
+    for name, plugin in entry_points.find_plugins(entry_points.STAGES).items():
         if name not in COMMANDS and name not in app:
             words = f"{plugin.summary} (of the package {plugin.package})".strip()
-            app.command(f"dmrl.plugins:{name}", name=name, help=words, sort_key=len(COMMANDS))
+            app.command(f"dmrl.entry_points:{name}", name=name, help=words, sort_key=len(COMMANDS))
     return app
 
 

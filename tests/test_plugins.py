@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl import plugins
+from dmrl import entry_points, plugins
 from dmrl.errors import PluginError, SettingError, SourceError
 from dmrl.formats.registry import find_format
 from dmrl.learn.inference.loaded_model import Model, load_model, save_model
@@ -94,10 +94,10 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         about.joinpath("entry_points.txt").write_text(
             "".join(f"[dmrl.{group}]\n{line}\n" for group, line in entries.items())
         )
-        plugins.find_plugins.cache_clear()
+        entry_points.find_plugins.cache_clear()
 
     yield installed
-    plugins.find_plugins.cache_clear()
+    entry_points.find_plugins.cache_clear()
     for path in site.glob("*.py"):
         sys.modules.pop(path.stem, None)
 

@@ -17,7 +17,7 @@ from dmrl.datasets.writing.rows import (
 )
 from dmrl.recording import LoadedRecording, list_label_findings, read_splits
 from dmrl.recording.licences import licences_in
-from dmrl.recording.mcap.shared_file import share_file
+from dmrl.storage.shared_file import share_file
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,10 +12,10 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import walk_packages
 
-from dmrl import formats, plugins
+from dmrl import entry_points, formats
+from dmrl.entry_points import Plugin
 from dmrl.errors import PluginError, SourceError
 from dmrl.formats.base import Content, Format, Options
-from dmrl.plugins import Plugin
 from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say
 
@@ -63,7 +63,7 @@ def find_format(source: Path, name: str | None = None) -> Format:
     """
     added = {
         n: p
-        for n, p in plugins.find_plugins(plugins.FORMATS).items()
+        for n, p in entry_points.find_plugins(entry_points.FORMATS).items()
         if n not in load_builtin_formats()
     }
     known = ", ".join([*load_builtin_formats(), *added])

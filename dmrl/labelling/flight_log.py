@@ -18,7 +18,7 @@ from dmrl.estimation.model.pair import Array
 from dmrl.images.codec import read_size
 from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.recording import LoadedRecording, Stamped, TopicInfo
-from dmrl.recording.mcap.shared_file import share_file
+from dmrl.storage.shared_file import share_file
 
 SENSOR_FIELDS = {
     topics.ATTITUDE: ("roll_rad", "pitch_rad", "yaw_rate_radps"),

@@ -26,7 +26,7 @@ from pkgutil import iter_modules
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
-from dmrl import plugins
+from dmrl import entry_points
 from dmrl.errors import RecipeError
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def _load_stage(stage: str) -> Any:
     # By name, because stages are above this room.
     package = "dmrl.stages"
     known = [m.name.replace("_", "-") for m in iter_modules(import_module(package).__path__)]
-    added = plugins.find_plugins(plugins.STAGES)
+    added = entry_points.find_plugins(entry_points.STAGES)
     if stage not in known and stage in added:
         return added[stage].load()
     known += list(added)

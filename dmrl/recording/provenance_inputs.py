@@ -12,10 +12,10 @@ from dmrl.errors import RecordingError
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_pipe
 from dmrl.recording.mcap.file import expect_unchanged
-from dmrl.recording.mcap.shared_file import open_raw, share_file
 from dmrl.recording.provenance import FILE_NAME, Input, Provenance
 from dmrl.recording.summary import read_summary
 from dmrl.storage import RemotePath
+from dmrl.storage.shared_file import open_raw, share_file
 
 UNHASHED_NAMES = ("README.md", "figures", "tensorboard")
 """Files and folders that the hash of an output folder leaves out."""

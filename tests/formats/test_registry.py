@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from dmrl import plugins
+from dmrl import entry_points
+from dmrl.entry_points import Plugin
 from dmrl.errors import PluginError, SourceError
 from dmrl.formats import registry
 from dmrl.formats.base import Content, Format, Options
 from dmrl.formats.registry import GUESS_ORDER, find_format, load_builtin_formats
-from dmrl.plugins import Plugin
 from dmrl.samples.sample import Sample
 
 from . import foreign
@@ -45,11 +45,14 @@ def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     def added(**values: str) -> None:
         rows = {
             name: Plugin(
-                name, "their-logs", "", EntryPoint(name, f"{__name__}:{value}", plugins.FORMATS)
+                name,
+                "their-logs",
+                "",
+                EntryPoint(name, f"{__name__}:{value}", entry_points.FORMATS),
             )
             for name, value in values.items()
         }
-        monkeypatch.setattr(registry.plugins, "find_plugins", lambda group: rows)
+        monkeypatch.setattr(registry.entry_points, "find_plugins", lambda group: rows)
 
     return added
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from dmrl import plugins, recipe
+from dmrl import entry_points, recipe
 from dmrl.errors import RecipeError, SettingError
 from dmrl.pipeline import recipe_run as pipeline
 from dmrl.pipeline.plan import Step
@@ -183,7 +183,9 @@ def test_a_stage_that_a_package_adds_is_a_step(
     def run(recording: Path, out: Path) -> None: ...
 
     smooth = SimpleNamespace(load=lambda: SimpleNamespace(run=run))
-    monkeypatch.setattr(plugins, "find_plugins", lambda group: {"smooth": smooth} if group else {})
+    monkeypatch.setattr(
+        entry_points, "find_plugins", lambda group: {"smooth": smooth} if group else {}
+    )
     text = 'step = [{ stage = "smooth", recording = "{data}/f.mcap", out = "s.mcap" }]'
     assert load(tmp_path, HEAD + text).steps[0].inputs == {"recording": "{data}/f.mcap"}
     with pytest.raises(RecipeError, match=r"no stage 'smoth'\. Did you mean smooth\?"):

@@ -32,7 +32,7 @@ from dmrl.images.codec import decode
 from dmrl.messages import STATUS_OK, to_status_name
 from dmrl.recording import LoadedRecording, Stamped, read
 from dmrl.recording.label_sources import SOURCE_FIELDS, collect_sources, get_message_sources
-from dmrl.recording.mcap.shared_file import share_file
+from dmrl.storage.shared_file import share_file
 
 LABEL_SOURCES = ("truth", "estimate", "hand", "published")
 """Sources of labels, best first."""

@@ -15,7 +15,7 @@ from typing import ClassVar, cast
 import torch
 from torch import Tensor, nn
 
-from dmrl import plugins
+from dmrl import entry_points
 from dmrl.errors import SettingError
 from dmrl.learn.networks.depthwise import DepthwiseConv
 
@@ -211,7 +211,7 @@ ARCHITECTURES: dict[str, type[Network]] = {
 
 def list_architectures() -> list[str]:
     """Return the names of all architectures, built in and from plug-ins, sorted."""
-    return sorted({*ARCHITECTURES, *plugins.find_plugins(plugins.NETWORKS)})
+    return sorted({*ARCHITECTURES, *entry_points.find_plugins(entry_points.NETWORKS)})
 
 
 def find_architecture(name: str) -> type[Network]:
@@ -226,7 +226,7 @@ def find_architecture(name: str) -> type[Network]:
     """
     if name in ARCHITECTURES:
         return ARCHITECTURES[name]
-    plugin = plugins.find_plugins(plugins.NETWORKS).get(name)
+    plugin = entry_points.find_plugins(entry_points.NETWORKS).get(name)
     if plugin is None:
         raise SettingError(
             f"no architecture {name}. Choose one of: {', '.join(list_architectures())}"
@@ -256,7 +256,10 @@ def build_network(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Net
     PluginError
         If it belongs to a plug-in that cannot be loaded.
     """
-    form, plugin = find_architecture(name), plugins.find_plugins(plugins.NETWORKS).get(name)
+    form, plugin = (
+        find_architecture(name),
+        entry_points.find_plugins(entry_points.NETWORKS).get(name),
+    )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         with plugin.naming_the_package("cannot be built") if plugin else nullcontext():

@@ -19,11 +19,11 @@ from dmrl.recording.copying.chunk_copy import (
 )
 from dmrl.recording.mcap.channel import RawMessage
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS, ROWS_AT_A_TIME, Ints
-from dmrl.recording.mcap.shared_file import share_file
 from dmrl.recording.protobuf.encode import ColumnValue
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.summary import read_summary
 from dmrl.recording.writer import RecordingWriter
+from dmrl.storage.shared_file import share_file
 
 
 class TimedMessage(NamedTuple):

@@ -14,9 +14,9 @@ from mcap.stream_reader import CRCValidationError
 
 from dmrl.atomic_output import count_ended_outputs
 from dmrl.errors import RecordingError
-from dmrl.recording.mcap.shared_file import open_raw
 from dmrl.storage import RemotePath
 from dmrl.storage.remote_stream import BUFFER_BYTES
+from dmrl.storage.shared_file import open_raw
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_STRUCT = struct.Struct("<BQ")  # opcode, length

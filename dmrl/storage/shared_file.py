@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from dmrl.storage import RemotePath
+from dmrl.storage.remote import RemotePath
 
 _SHARED: dict[Path, int] = {}
 """Descriptors of the recordings that `share_file` holds open in this process."""

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.recording.mcap.shared_file import open_raw, share_file
+from dmrl.storage.shared_file import open_raw, share_file
 
 
 def test_readers_of_one_file_have_their_own_positions(tmp_path: Path) -> None:
