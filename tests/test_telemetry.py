@@ -39,9 +39,9 @@ def test_onnxruntime_leaves_no_identifier(tmp_path: Path) -> None:
         "import numpy as np\n"
         "import dmrl\n"
         "from dmrl.deploy.detector import open_detector\n"
-        "from dmrl.learn.pretrained import resolved\n"
+        "from dmrl.learn.pretrained import resolve_model_path\n"
         "from pathlib import Path\n"
-        "detector = open_detector(resolved(Path('dmrl-nano')), 'onnx')\n"
+        "detector = open_detector(resolve_model_path(Path('dmrl-nano')), 'onnx')\n"
         "detector.grids([np.zeros((224, 320, 3), np.uint8)])\n"
     )
     subprocess.run([sys.executable, "-c", code], env=users_environment(home), check=True)

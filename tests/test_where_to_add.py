@@ -46,7 +46,7 @@ SENSORS = """    Topic(
         "50 Hz",
         "convert",
         sensor=True,
-        curve=Curve("pressure, Pa", ("pressure_pa",)),
+        curve=PlotSpec("pressure, Pa", ("pressure_pa",)),
         csv=("pressure_pa",),
     ),
     Topic(
@@ -57,7 +57,7 @@ SENSORS = """    Topic(
         "50 Hz",
         "convert",
         sensor=True,
-        curve=Curve("height, m", ("range_up_m",), name="up"),
+        curve=PlotSpec("height, m", ("range_up_m",), name="up"),
         csv=("range_up_m",),
     ),
     Topic(
@@ -68,7 +68,7 @@ SENSORS = """    Topic(
         "10 Hz",
         "convert",
         sensor=True,
-        curve=Curve("distance, m", ("sonar_m",)),
+        curve=PlotSpec("distance, m", ("sonar_m",)),
         csv=("sonar_m",),
     ),
 """
@@ -288,23 +288,24 @@ VIEW = '''
     from functools import partial
 
     from dmrl import topics
-    from dmrl.viewer import layouts, plots
-    from dmrl.viewer.scene import Draw, Scene
+    from dmrl.viewer import layouts
+    from dmrl.viewer.drawing import time_plots
+    from dmrl.viewer.scene import DrawRule, Scene
     from dmrl.viewer.selection import Selection
-from dmrl.viewer.settings import Settings
+    from dmrl.viewer.settings import Settings
 
 
     def scene(selection: Selection, settings: Settings) -> Scene:
         """One panel."""
         row = topics.find_topic("/any/height")
-        robots = [found["robot"] for found in selection.found(topics.HEIGHT)]
+        robots = [found["robot"] for found in selection.find_names(topics.HEIGHT)]
         draws = [
-            Draw(path, partial(plots.sensor, path, row=row, robot=robot, own=True))
+            DrawRule(path, partial(time_plots.draw_sensor, path, row=row, robot=robot, own=True))
             for robot in robots
             for path in [topics.HEIGHT(robot)]
         ]
-        panel = layouts.Plot("heights alone, m", tuple(draw.topic for draw in draws))
-        return Scene(layouts.window(layouts.plot_view(panel)), draws, [], [])
+        panel = layouts.PlotPanel("heights alone, m", tuple(draw.topic for draw in draws))
+        return Scene(layouts.build_window(layouts.build_plot_view(panel)), draws, [], [])
 '''
 
 

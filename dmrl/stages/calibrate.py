@@ -139,7 +139,11 @@ def run(
 
 def _calibrate_sensors(sources: list[Path], workers: int) -> Result:
     """Solve flights side by side, and pool their sensor constants."""
-    from dmrl.labelling.calibration.sensor_calibration import pool_sensor_constants, solve_flight
+    with optional_imports("calibrate", "dmrl calibrate --sensors"):
+        from dmrl.labelling.calibration.sensor_calibration import (
+            pool_sensor_constants,
+            solve_flight,
+        )
     from dmrl.pipeline.parallel_map import parallel_map
     from dmrl.recording.provenance_inputs import refuse_duplicates
     from dmrl.terminal.progress import track

@@ -212,7 +212,7 @@ class RemotePath(PosixPath):
         files = [self] if self.is_file() else self.list_files()
         if not files:
             raise FileNotFoundError(2, "No such file", str(self))
-        target.remove_all()
+        target.remove_tree()
         marks = [] if files == [self] else [target / UNFINISHED_MARK]
         with translate_errors(str(self)):
             for mark in marks:

@@ -192,7 +192,7 @@ def test_a_file_that_is_no_catalogue_is_left_alone(flights: Path) -> None:
     with pytest.raises(RecordingError, match="is damaged"):
         index.update(flights, workers=1)
     pq.write_table(pq.read_table(_indexed(flights)).select(["recording"]), flights / FILE_NAME)
-    with pytest.raises(RecordingError, match="is no catalogue"):
+    with pytest.raises(RecordingError, match="is not a catalogue"):
         index.update(flights, workers=1)
 
 

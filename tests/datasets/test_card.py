@@ -207,7 +207,7 @@ def test_a_licence_that_nobody_knows_is_refused(
 def test_the_backend_of_a_notebook_stops_no_figure(tmp_path: Path) -> None:
     code = (
         "import os, sys\nfrom pathlib import Path\nimport numpy as np\nfrom dmrl import plots\n"
-        "plots.depth_histogram({'train': np.ones(3)}, Path(sys.argv[1]))\n"
+        "plots.plot_depth_histogram({'train': np.ones(3)}, Path(sys.argv[1]))\n"
         "print(os.environ['MPLBACKEND'])"
     )
     inline = "module://matplotlib_inline.backend_inline"

@@ -23,9 +23,9 @@ from ..stages.detector import with_detections
 STEP_NS = 100_000_000
 STAND_INS = {
     "render": (
-        ("dmrl.rendering.renderer:", "Pool", "Painters"),
-        ("dmrl.rendering.renderer:", "shipped_lights", "sky"),
-        ("dmrl.render_recording:", "ensure", "no_python"),
+        ("dmrl.rendering.renderer:", "WorkerPool", "Painters"),
+        ("dmrl.rendering.renderer:", "list_shipped_panoramas", "sky"),
+        ("dmrl.render_recording:", "ensure_environment", "no_python"),
     ),
     "run": (("dmrl.pipeline.process_pool:", "subprocess", "Processes"),),
     "trim": (("dmrl.pipeline.process_pool:", "subprocess", "Processes"),),

@@ -42,7 +42,7 @@ class Painter:
 
 
 class Painters:
-    """In place of `dmrl.rendering.worker_pool.Pool`."""
+    """In place of `dmrl.rendering.worker_pool.WorkerPool`."""
 
     def __init__(self, start: WorkerStart, count: int) -> None:
         self.version = "0"

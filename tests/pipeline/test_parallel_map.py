@@ -19,10 +19,10 @@ WAITS = """
 import sys, time
 from pathlib import Path
 from test_parallel_map import wait_there
-from dmrl.pipeline.parallel_map import spread
+from dmrl.pipeline.parallel_map import parallel_map
 
 if __name__ == "__main__":
-    list(spread(wait_there, [Path(sys.argv[1])] * 2, 2))
+    list(parallel_map(wait_there, [Path(sys.argv[1])] * 2, 2))
 """
 
 

@@ -118,7 +118,7 @@ def test_many_small_bombs_are_refused(tmp_path: Path) -> None:
     one = Chunk("zstd", zstandard.compress(data), 0, 0, zlib.crc32(data), len(data))
     path = recording(tmp_path / "bomb.mcap", *[one] * 50)
     (said,) = read_bounded(path)
-    assert all("it unpacks to more than" in line for line in said)
+    assert all("it unpacks to" in line for line in said), said
 
 
 @pytest.mark.slow

@@ -92,8 +92,8 @@ def test_too_little_is_one_line(flights: list[Path], known: Path, tmp_path: Path
 def test_flights_that_agree_on_nothing_leave_no_file(
     flights: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sensor_calibration, "WORTH", 0.0)
-    monkeypatch.setattr(sensor_calibration, "OFF", float("inf"))
+    monkeypatch.setattr(sensor_calibration, "MAX_STD_SHARE", 0.0)
+    monkeypatch.setattr(sensor_calibration, "MIN_SIGMAS", float("inf"))
     with pytest.raises(RecordingError, match="agree on nothing of their sensors"):
         calibrate.run(flights[:2], tmp_path / "sensors.toml", SENSORS)
     assert list(tmp_path.iterdir()) == []

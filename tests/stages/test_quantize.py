@@ -15,7 +15,7 @@ from dmrl.images.codec import decode, encode_png
 from dmrl.learn.inference.loaded_model import load_model
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
-from dmrl.stages import convert, dataset, quantize
+from dmrl.stages import convert, dataset
 from dmrl.stages.quantize import Settings, run
 
 
@@ -47,7 +47,7 @@ def test_same_inputs_same_bytes(
 ) -> None:
     again = tmp_path / settled.name
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quantize, "plots", None)
+        patch.setattr(quantization_report, "plots", None)
         run(settled, dots_dataset, again, Settings())
     for path in quantised.iterdir():
         assert path.read_bytes() == (again / path.name).read_bytes(), path.name

@@ -38,7 +38,7 @@ def test_every_element_does_its_part_and_the_bytes_are_those_of_here(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(slurm, "MOST", 2)
+    monkeypatch.setattr(slurm, "MAX_ELEMENTS", 2)
     out = tmp_path / "out"
     run_over_folder("trim", flights, out, KEPT, workers=None, on="slurm")
     said = capsys.readouterr().out
@@ -73,7 +73,7 @@ def test_names_that_a_shell_would_run_are_names(
     for k, name in enumerate(sorted(names)):
         record(here / "flights" / name, roll_rad=k)
     monkeypatch.chdir(here)
-    monkeypatch.setattr(slurm, "MOST", 1)
+    monkeypatch.setattr(slurm, "MAX_ELEMENTS", 1)
     out = tmp_path / "out"
     run_over_folder("trim", Path("flights"), out, KEPT, workers=None, on="slurm")
     script = out / ".dmrl-job.sh"
