@@ -27,7 +27,7 @@ FEW = (2, 3)
 class Painter:
     """In place of a Blender process: a grey spot for every robot that is asked for."""
 
-    def ask(self, head: dict[str, Any], arrays: Arrays | None = None) -> tuple[Any, Arrays]:
+    def request(self, head: dict[str, Any], arrays: Arrays | None = None) -> tuple[Any, Arrays]:
         """As `dmrl.rendering.worker_pool.Worker.ask`."""
         if "panorama" in head:
             return {}, {"panorama": np.full((8, 16, 3), 0.5, np.float32)}
@@ -65,12 +65,12 @@ nothing = None
 
 
 def sky(_: Path) -> list[Path]:
-    """In place of `dmrl.rendering.renderer.shipped_lights`."""
+    """In place of `dmrl.rendering.renderer.list_shipped_panoramas`."""
     return [Path("sky.exr")]
 
 
 def no_python(_: object) -> Path:
-    """In place of `dmrl.rendering.blender_environment.ensure`."""
+    """In place of `dmrl.rendering.blender_environment.ensure_environment`."""
     return Path("python")
 
 
