@@ -41,7 +41,7 @@ def test_what_is_missing_or_too_old_is_said_with_the_line_to_type(
     known = {"filterpy": "", "rosbags": "0.1"}
     real = importlib.metadata.version
     monkeypatch.setattr(
-        installation, "_installed_version", lambda name: known.get(name, real(name))
+        installation, "_find_installed_version", lambda name: known.get(name, real(name))
     )
     monkeypatch.setattr(shutil, "which", lambda _: None)
     said = _said(capsys)
@@ -57,7 +57,7 @@ def test_a_base_that_does_not_work_is_an_error(
 ) -> None:
     real = importlib.metadata.version
     monkeypatch.setattr(
-        installation, "_installed_version", lambda name: "" if name == "mcap" else real(name)
+        installation, "_find_installed_version", lambda name: "" if name == "mcap" else real(name)
     )
     assert boundary.run_to_status(lambda: app(["doctor"], result_action="return_value")) == 1
     assert capsys.readouterr().err == "dmrl: base packages: no mcap. Try: pip install dmrl\n"
