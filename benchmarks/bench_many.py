@@ -30,7 +30,7 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 def write_recordings(folder: Path, count: int) -> None:
     """Write recordings, a thousand to a folder."""
     atomic_output.sync = lambda path: None  # ten thousand are not worth a disk's time each
-    atomic_output._sync_one = lambda path: None
+    atomic_output.sync_entry = lambda path: None
     rng = np.random.default_rng(0)
     for number in range(count):
         place = folder / f"{number // 1000:03d}" / f"{number:06d}.mcap"

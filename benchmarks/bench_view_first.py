@@ -31,13 +31,13 @@ COMMAND = """
 import sys
 from dmrl.cli import main
 from dmrl.viewer.window import desktop as window
-port, command, stream_to = int(sys.argv.pop(1)), window.command, window.stream_to
-size = ("--headless", "--window-size", window.PICTURE_SIZE)
+port, command, stream_to = int(sys.argv.pop(1)), window.build_command, window.stream_to
+size = ("--headless", "--window-size", window.SCREENSHOT_SIZE)
 def streamed(*arguments):
     stream_to(*arguments)
     print("sent", flush=True)
-window.free_port = lambda bind: port
-window.command = lambda bind, *rest: command(bind, *size, *rest)
+window.find_free_port = lambda bind: port
+window.build_command = lambda bind, *rest: command(bind, *size, *rest)
 window.stream_to = streamed
 main()
 """
