@@ -1,14 +1,13 @@
 """Log a selection into a rerun stream or file."""
 
 import os
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
 from threading import Thread
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import rerun as rr
 
@@ -21,6 +20,20 @@ from dmrl.viewer.show import EntityLogger, Show, build_cursor, open_stream
 
 COPY_BYTES = 1 << 20
 """Size of the pieces in which an .rrd file is written."""
+
+
+class Writable(Protocol):
+    """Protocol of a binary file that is written from start to end."""
+
+    @property
+    def name(self) -> Any:
+        """Name for errors."""
+
+    def write(self, block: bytes, /) -> int:
+        """Append bytes."""
+
+    def flush(self) -> None:
+        """Pass appended bytes to the system."""
 
 
 def save(paths: Sequence[Path], out: Path, settings: Settings) -> int:
@@ -43,8 +56,8 @@ def save(paths: Sequence[Path], out: Path, settings: Settings) -> int:
         If the recordings are empty at the requested time, or the layout does not fit.
     """
     show = prepare_show(paths, settings)
-    with atomic_file(out) as unfinished:
-        write_rrd(show, unfinished)
+    with atomic_file(out) as unfinished, unfinished.open("wb") as file:
+        write_rrd(show, file)
     return show.images
 
 
@@ -80,26 +93,26 @@ def prepare_show(
     )
 
 
-def write_rrd(show: Show, path: Path) -> None:
-    """Write an .rrd file, and replace any file at ``path``.
+def write_rrd(show: Show, file: Writable, wanted: Callable[[], bool] = lambda: True) -> None:
+    """Write the data of an .rrd file, as long as it is wanted.
 
     Raises
     ------
     OSError
         If writing fails.
     """
-    with _relay_to_file(path) as (pipe, still_written):
+    with _relay_to_file(file) as (pipe, still_written):
         stream = open_stream()
         stream.save(pipe, default_blueprint=show.blueprint)
         try:
-            log_show(show, stream, still_written)
+            log_show(show, stream, lambda: still_written() and wanted())
             stream.flush()
         finally:
             stream.disconnect()
 
 
 @contextmanager
-def _relay_to_file(path: Path) -> Iterator[tuple[str, Callable[[], bool]]]:
+def _relay_to_file(file: Writable) -> Iterator[tuple[str, Callable[[], bool]]]:
     """Yield a pipe that is copied to a file, and a function that is False after an error.
 
     rerun reports a failed write only on standard error, and may then wait for its writer for ever
@@ -110,13 +123,13 @@ def _relay_to_file(path: Path) -> Iterator[tuple[str, Callable[[], bool]]]:
 
     def drain() -> None:
         with os.fdopen(ear, "rb", buffering=0) as stream:
-            try:
-                with path.open("wb") as file:
-                    shutil.copyfileobj(stream, file, COPY_BYTES)
-            except OSError as e:
-                refused.append(e)
-                while stream.read(COPY_BYTES):
-                    pass
+            for block in iter(partial(stream.read, COPY_BYTES), b""):
+                if not refused:
+                    try:
+                        file.write(block)
+                        file.flush()
+                    except OSError as e:
+                        refused.append(e)
 
     drained = Thread(target=drain, daemon=True)
     drained.start()
@@ -127,7 +140,7 @@ def _relay_to_file(path: Path) -> Iterator[tuple[str, Callable[[], bool]]]:
         drained.join()
     if refused:
         error = refused[0]
-        raise OSError(error.errno, error.strerror, str(path)) from error
+        raise OSError(error.errno, error.strerror, str(file.name)) from error
 
 
 def log_show(

@@ -222,8 +222,11 @@ def test_a_full_disk_ends_it_with_the_reason_and_never_hangs(make: Make) -> None
     """rerun itself would say no reason, and now and then wait for ever."""
     show = prepare_show([make()], Settings())
     for _ in range(20):
-        with pytest.raises(OSError, match="/dev/full") as e:
-            write_rrd(show, Path("/dev/full"))
+        with (
+            Path("/dev/full").open("wb", buffering=0) as disk,
+            pytest.raises(OSError, match="/dev/full") as e,
+        ):
+            write_rrd(show, disk)
         assert e.value.errno == errno.ENOSPC
 
 

@@ -142,7 +142,8 @@ def _take_screenshot(show: Show) -> bytes:
     # From a file: a viewer that waits for a stream draws a message over the panels.
     with TemporaryDirectory(prefix="dmrl-view-") as folder:
         path = Path(folder) / "view.rrd"
-        write_rrd(show, path)
+        with path.open("wb") as file:
+            write_rrd(show, file)
         where = ("--headless", "--window-size", SCREENSHOT_SIZE, "--port", str(port), str(path))
         with run_viewer(build_command(LOOPBACK, *where)) as viewer:
             if picture := _wait_for_screenshot(show, viewer, port):

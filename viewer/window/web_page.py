@@ -3,31 +3,18 @@
 The server listens on 127.0.0.1 only, unless another address is given.
 """
 
-import socket
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from urllib.parse import quote
 
-from dmrl.errors import SettingError
 from dmrl.terminal.progress import say
 from dmrl.terminal.signals import set_on_signal
-from dmrl.viewer.session import prepare_show
-from dmrl.viewer.settings import LOOPBACK, Settings, Web
-from dmrl.viewer.window.viewer_process import (
-    ViewerProcess,
-    build_command,
-    find_free_port,
-    last_line,
-    require_free_port,
-    stream_to,
-    wait_until_listening,
-)
+from dmrl.viewer.session import prepare_show, write_rrd
+from dmrl.viewer.settings import Settings, Web
+from dmrl.viewer.window.page_server import PageServer
 
-ANY_ADDRESS = ("0.0.0.0", "::")
 NOTEBOOK_HEIGHT_PX = 700
-
-
 DEFAULT_ADDRESS = Web()
 
 
@@ -41,8 +28,8 @@ def serve(paths: Sequence[Path], settings: Settings, web: Web = DEFAULT_ADDRESS)
     SettingError
         If the recordings are empty at the requested time, or the port is in use.
     """
-    with suppress(KeyboardInterrupt), open_page(paths, settings, web) as shown:
-        shown.serve()
+    with suppress(KeyboardInterrupt), open_page(paths, settings, web) as page:
+        page.serve()
 
 
 @contextmanager
@@ -55,11 +42,11 @@ def open_page(
     ------
     As `serve`.
     """
-    opened = Page(paths, settings, web)
+    page = Page(paths, settings, web)
     try:
-        yield opened
+        yield page
     finally:
-        opened.close()
+        page.close()
 
 
 class Page:
@@ -83,42 +70,29 @@ class Page:
         self, paths: Sequence[Path], settings: Settings, web: Web = DEFAULT_ADDRESS
     ) -> None:
         self._show = prepare_show(paths, settings)
-        self._data_port = find_free_port(web.bind)
-        port = web.port or find_free_port(web.bind)
-        require_free_port(web.bind, port)
-        host = socket.gethostname() if web.bind in ANY_ADDRESS else web.bind
-        source = quote(f"rerun+http://{host}:{self._data_port}/proxy", safe="")
-        self.url = f"http://{host}:{port}?url={source}"
-        ports = ("--port", str(self._data_port), "--web-viewer-port", str(port))
-        allowed = ("--cors-allow-origin", f"http://{host}:{port}", "--server-memory-limit", "75%")
-        words = build_command(web.bind, "--serve-web", *ports, *allowed)
-        self._host = LOOPBACK if web.bind in ANY_ADDRESS else web.bind
-        self._viewer = ViewerProcess(words)
-        try:
-            if not wait_until_listening(self._viewer, self._host, self._data_port):
-                said = last_line(self._viewer.read_errors())
-                raise SettingError(
-                    f"rerun's server stopped: {said}. Choose another --port or --bind"
-                )
-        except BaseException:
-            self.close()
-            raise
+        self._server = PageServer(web)
+        self._ended = threading.Event()
+        self.url = self._server.url
 
     def send_data(self) -> None:
-        """Send all data; the page shows the first meanwhile."""
-        stream_to(self._show, self._viewer, self._data_port, self._host)
+        """Write all data, once; the page shows the first meanwhile."""
+        data = self._server.data
+        if not data.complete.is_set():
+            write_rrd(self._show, data, lambda: not self._ended.is_set())
+            data.complete.set()
 
     def serve(self) -> None:
-        """Print the address, send the data and wait for Ctrl-C or a kill."""
-        # An exception would be lost in a destructor of rerun's, which talks to the server.
-        with set_on_signal(self._viewer.ended):
+        """Print the address, write the data and wait for Ctrl-C or a kill."""
+        # An exception would be lost in a destructor of rerun's.
+        with set_on_signal(self._ended):
             say(f"{self.url} (Ctrl-C ends it)")
             self.send_data()
-            self._viewer.wait()
+            self._ended.wait()
 
     def close(self) -> None:
         """Stop the server."""
-        self._viewer.close()
+        self._ended.set()
+        self._server.close()
 
     def _repr_html_(self) -> str:
         self.send_data()
