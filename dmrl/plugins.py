@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from dmrl.samples.sample import Sample as Sample
     from dmrl.samples.sample import build_image as build_image
     from dmrl.terminal.closing import Closing as Closing
+    from dmrl.terminal.left_out import leave_out as leave_out
 
 PLACES = {
     "Closing": "dmrl.terminal.closing",
@@ -35,6 +36,7 @@ PLACES = {
     "merge_by_time": "dmrl.samples.flight",
     "to_nanoseconds": "dmrl.samples.flight",
     "iter_ranges": "dmrl.samples.flight",
+    "leave_out": "dmrl.terminal.left_out",
     "stage_command": "dmrl.pipeline.stage_command",
 }
 """Names that plug-ins import from here, and their modules, which may move."""

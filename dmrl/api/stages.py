@@ -18,6 +18,7 @@ from dmrl.api.recordings import PathLike, Recording
 from dmrl.api.results import Result, evaluate_recordings
 from dmrl.errors import SettingError
 from dmrl.pipeline.stage_signature import signature_of
+from dmrl.terminal.left_out import count_left_out
 
 OneOrMore: TypeAlias = PathLike | Sequence[PathLike]
 
@@ -238,7 +239,9 @@ def _run_to_recording(
 
 def _run_to_path(stage: str, out: Path, settings: dict[str, Any], **given: Any) -> Path:
     """Run a stage, and return the path that it wrote."""
-    signature_of(stage).run(out=out, **given, **_check_settings(stage, settings))
+    checked = _check_settings(stage, settings)
+    with count_left_out(strict=getattr(checked.get("settings"), "strict", False)):
+        signature_of(stage).run(out=out, **given, **checked)
     return out
 
 

@@ -6,9 +6,10 @@ finds it.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
+from dmrl.errors import SettingError
 from dmrl.geometry.frames import Camera
 from dmrl.samples.flight import merge_by_time
 from dmrl.samples.sample import Columns, Intervals, Sample
@@ -82,6 +83,28 @@ class Options:
     raw: bool = False
     columns: Path | None = None
 
+    def refuse(self, name: str, why: str) -> None:
+        """Raise SettingError if the user gave an option that has no effect on the source.
+
+        Parameters
+        ----------
+        name
+            Field of this class.
+        why
+            Reason, as the rest of a sentence: "has no effect on a recorded stream".
+        """
+        default = next(one for one in fields(self) if one.name == name)
+        usual = default.default_factory() if callable(default.default_factory) else default.default
+        if getattr(self, name) != usual:
+            flags = FLAGS.get(name) or f"--{name.replace('_', '-')}"
+            raise SettingError(f"{flags} {why}. Leave it out")
+
+
+FLAGS = {"size_px": "--width-px and --height-px"}
+"""Flags of the options that are not called like them."""
+SOURCE_OPTIONS = frozenset({"robot", "names"})
+"""Options that a log of robots uses."""
+
 
 @dataclass(frozen=True, slots=True)
 class Format:
@@ -97,9 +120,18 @@ class Format:
         Return whether a file or folder appears to have this format. Reads a few bytes only.
     content
         Return the samples of a source.
+    uses
+        Options that have an effect, by field of `Options`; others are refused. None: all.
     """
 
     name: str
     what: str
     recognises: Callable[[Path], bool]
     content: Callable[[Path, Options], Content]
+    uses: frozenset[str] | None = None
+
+    def refuse_unused(self, options: Options) -> None:
+        """Raise SettingError if the user gave an option that this format does not use."""
+        for one in fields(options):
+            if self.uses is not None and one.name not in self.uses:
+                options.refuse(one.name, f"has no effect on {self.what}")

@@ -135,4 +135,4 @@ def _load_plugin_format(plugin: Plugin) -> Format:
         with plugin.naming_the_package(f"fails to read {source}"):
             yield from given
 
-    return Format(plugin.name, form.what, recognises, content)
+    return Format(plugin.name, form.what, recognises, content, form.uses)

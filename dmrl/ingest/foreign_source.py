@@ -21,7 +21,8 @@ from dmrl.recording import (
     iter_time_slices,
     print_findings,
 )
-from dmrl.terminal.progress import say, track
+from dmrl.terminal.left_out import leave_out
+from dmrl.terminal.progress import track
 
 
 def record_source(
@@ -54,8 +55,12 @@ def record_source(
     ------
     SourceError
         If the source is not what its format says: names the file, and the line.
+    SettingError
+        If an option has no effect on the source.
     """
-    content = find_format(source, kind).content(source, options)
+    form = find_format(source, kind)
+    form.refuse_unused(options)
+    content = form.content(source, options)
     read = [path for path in files if path and path.is_file()]
     licence = find_licence_file(source)
     if licence is not None and source.is_file():
@@ -109,8 +114,8 @@ def find_sources(source: Path, kind: str | None) -> dict[Path, Path]:
         try:
             if path.name.startswith(".") or not find_format(path, kind):
                 continue
-        except SourceError as e:
-            say(f"left out: {e}")
+        except SourceError:
+            leave_out("files and folders of no known kind", path)
             continue
         name = Path(path.name if path.is_dir() else path.stem).with_suffix(".mcap")
         if (twin := found.setdefault(name, path)) is not path:

@@ -20,6 +20,7 @@ from dmrl.pipeline.cluster.slurm import write_array_job
 from dmrl.pipeline.executor import SLURM, Executor, open_executor
 from dmrl.pipeline.job import JobResult, build_job, has_failed
 from dmrl.storage import RemotePath
+from dmrl.terminal.left_out import count_so_far
 from dmrl.terminal.progress import say, track
 from dmrl.terminal.tables import print_json, print_line, print_table
 
@@ -262,7 +263,9 @@ def run_over_folder(
         for warning in _get_texts(answer.get("result"), "warnings"):
             say(f"{task.source}: {warning}")
     if as_json:
-        print_json({"folder": str(out), "recordings": [_to_document(*one) for one in done]})
+        held = {"left_out": count_so_far()} if count_so_far() else {}
+        documents = [_to_document(*one) for one in done]
+        print_json({"folder": str(out), **held, "recordings": documents})
     else:
         rows = [
             (task.out, status_word(answer), _summarize(answer.get("result")))
@@ -325,7 +328,7 @@ def _to_document(task: Task, answer: JobResult) -> dict[str, Any]:
     told = {"recording": str(task.source), "out": str(task.out), "state": status_word(answer)}
     if has_failed(answer):
         return {**told, "error": error_text(task, answer)}
-    return told if "up_to_date" in answer else {**told, "result": answer["result"]}
+    return told | {key: answer[key] for key in ("result", "left_out") if key in answer}
 
 
 def _get_texts(result: Any, name: str) -> list[str]:

@@ -12,6 +12,7 @@ key             content
 ==============  =============================================================
 ``sha256``      hash of the output
 ``result``      in place of it, if the job asked for it: the result of ``run``
+``left_out``    beside it: counts of what was left out, by reason
 ``up_to_date``  in place of both: the output existed, made of the same inputs
 ``error``       a failure that the user can fix
 ``retry``       beside it, "elsewhere": another machine may do it, as where a disk

@@ -24,6 +24,7 @@ from dmrl.pipeline.stage_signature import StageSignature, signature_of
 from dmrl.recording import Provenance, build_provenance
 from dmrl.recording.provenance_inputs import build_input, hash_file, hash_folder
 from dmrl.storage import to_path
+from dmrl.terminal.left_out import count_left_out
 
 
 def run_job(line: str) -> JobResult:
@@ -38,9 +39,11 @@ def run_job(line: str) -> JobResult:
         if told["keep"] and out.exists():
             _require_same_origin(out, told["stage"], takes, given)
             return {"up_to_date": True}
-        result = takes.run(**given, out=out)
+        with count_left_out(strict=getattr(given.get("settings"), "strict", False)) as left_out:
+            result = takes.run(**given, out=out)
         if told["keep"]:
-            return {"result": _to_json(result)}
+            more = {"left_out": dict(left_out.counts)} if left_out.counts else {}
+            return {"result": _to_json(result), **more}
         return {"sha256": hash_folder(out) if out.is_dir() else hash_file(out)}
     except BusyOutput as e:
         return {"error": str(e), "retry": "later"}

@@ -17,6 +17,7 @@ from dmrl.pipeline.process_pool import count_cores
 from dmrl.pipeline.stage_signature import resolve_hints
 from dmrl.terminal.arguments import AsJson, Flat, FolderWorkers, On, Workers
 from dmrl.terminal.closing import Closing, Given
+from dmrl.terminal.left_out import count_left_out
 from dmrl.terminal.progress import say
 
 POSITIONAL: Any = inspect.Parameter.POSITIONAL_ONLY
@@ -65,15 +66,17 @@ def stage_command(
         bound = signature.bind(*arguments, **named)
         bound.apply_defaults()
         given = Given(**{"as_json": False, "on": None, **bound.arguments})
-        if folder and _run_as_folder(name, folder, given, find):
-            return None
         values = {key: getattr(given, key) for key in taken}
         if "workers" in values:
             values["workers"] = values["workers"] or count_cores()
-        result = run(**values)
+        strict = getattr(getattr(given, "settings", None), "strict", False)
+        with count_left_out(strict=strict) as left_out:
+            if folder and _run_as_folder(name, folder, given, find):
+                return None
+            result = run(**values)
         for line in warnings(result, given) if warnings else ():
             say(line)
-        closing.print(result, given, as_json=given.as_json)
+        closing.print(result, given, as_json=given.as_json, left_out=left_out.counts)
         return int(status(result, given)) if status else None
 
     command.__doc__, command.__module__ = run.__doc__, run.__module__

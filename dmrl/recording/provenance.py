@@ -60,6 +60,8 @@ class Provenance:
         Versions of the packages that can change the result.
     dmrl_version
         Version of dmrl that wrote it.
+    left_out
+        Number of things in the inputs that could not be used, by reason.
     """
 
     stage: str
@@ -68,10 +70,11 @@ class Provenance:
     inputs: tuple[Input, ...] = ()
     libraries: Mapping[str, str] = field(default_factory=dict)
     dmrl_version: str = __version__
+    left_out: Mapping[str, int] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries, lists and values, with each input's provenance nested once."""
-        return asdict(self._remove_repeats())
+        return asdict(self._remove_repeats(), dict_factory=_drop_empty_count)
 
     def _remove_repeats(self) -> "Provenance":
         """Return a copy with the provenance of each input only at its first occurrence, by hash.
@@ -116,8 +119,9 @@ class Provenance:
                 known[sha256] = cls._parse(own, known)
             inputs.append(Input(str(name), str(sha256), known.get(sha256)))
         made = cls(**{**document, "inputs": tuple(inputs)})
-        if not (isinstance(made.settings, dict) and isinstance(made.libraries, dict)):
-            raise TypeError("settings and libraries are not tables")
+        tables = (made.settings, made.libraries, made.left_out)
+        if not all(isinstance(table, dict) for table in tables):
+            raise TypeError("settings, libraries and left_out are not tables")
         texts = (made.stage, made.dmrl_version)
         if not all(isinstance(text, str) for text in texts) or not isinstance(
             made.seed, int | None
@@ -150,6 +154,11 @@ class Provenance:
         """Write ``provenance.json`` into a dataset or run folder."""
         text = json.dumps(self.to_json(), indent=1, sort_keys=True)
         (folder / FILE_NAME).write_text(text + "\n", encoding="utf-8")
+
+
+def _drop_empty_count(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Build a dictionary without an empty ``left_out``, which earlier versions do not write."""
+    return {key: value for key, value in pairs if key != "left_out" or value}
 
 
 def _iter_nested(made: Provenance, depth: int) -> Iterator[tuple[int, Input]]:

@@ -5,6 +5,7 @@ Images are in chunks of their own, so that readers of numbers need not decompres
 
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -23,6 +24,7 @@ from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, Ints
 from dmrl.recording.protobuf.encode import ColumnValue, encode
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 from dmrl.samples.sample import Sample
+from dmrl.terminal.left_out import count_so_far
 from dmrl.topics import find_topic
 
 SUFFIX = ".mcap"
@@ -41,7 +43,8 @@ class RecordingWriter:
     path
         File to write. It must not exist.
     provenance
-        Stage, settings and inputs. Written before the first message.
+        Stage, settings and inputs. Written before the first message, and again at the end with the
+        counts of `dmrl.terminal.left_out`, if something was left out.
     recipe
         Text of the recipe of the run. None: the settings as TOML.
     keep_on_error
@@ -64,7 +67,7 @@ class RecordingWriter:
     ) -> None:
         if SUFFIX not in path.suffixes:  # a resumed recording is out.mcap.kept for a while
             raise OutputError(f"{path} is not named like a recording. Use {path.name}{SUFFIX}")
-        self._path = path
+        self._path, self._provenance = path, provenance
         self._topics: dict[str, tuple[type, int, ChunkBuilder]] = {}
         self._resources = ExitStack()
         partial = self._resources.enter_context(atomic_file(path, keep_on_error=keep_on_error))
@@ -191,7 +194,13 @@ class RecordingWriter:
             self._resources.__exit__(kind, error, traceback)
             return
         try:
+            if left_out := count_so_far():  # readers take the last record of this name
+                made = replace(self._provenance, left_out=left_out)
+                self._file.add_metadata(METADATA_NAME, made.to_metadata())
             self.chunk_writer.finish()
+        except OSError as e:
+            self._abandon(e)
+            raise as_output_error(self._path, e) from e
         except OutputError as e:
             self._abandon(e)
             raise

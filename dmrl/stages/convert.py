@@ -5,7 +5,7 @@ A new format is one file in ``dmrl/formats`` with a ``FORMAT``.
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,6 +16,7 @@ from dmrl.errors import SettingError
 from dmrl.guards.paths import refuse_pipes
 from dmrl.pipeline.batch import find_recordings
 from dmrl.pipeline.stage_command import stage_command
+from dmrl.terminal.arguments import Strict
 from dmrl.terminal.closing import Closing, Given
 from dmrl.terminal.tables import print_table
 
@@ -58,6 +59,9 @@ class Settings:
         nanobench.
     raw
         images: grey pictures are as the AI-deck's colour sensor gave them; make them RGB.
+    strict
+        End with an error if anything of the source cannot be used. Without it, such things are left
+        out and counted.
     to
         The other way: SOURCE is a recording, OUT a folder of tables (csv, parquet) or a ROS 2
         bag (ros2).
@@ -73,6 +77,7 @@ class Settings:
     height_px: Positive | None = None
     columns: Path | None = None
     raw: Annotated[bool, Parameter(negative=())] = False
+    strict: Strict = False
     to: Literal["csv", "parquet", "ros2"] | None = None
 
 
@@ -106,6 +111,8 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
     """
     refuse_existing(out)
     refuse_pipes(source)
+    if settings.to is not None:
+        _refuse_source_settings(settings)
     if settings.to == "ros2":
         from dmrl.export.ros2 import write_bag
 
@@ -120,6 +127,15 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
     files = (settings.labels, settings.camera, settings.columns)
     options = _to_options(settings)
     return record_source(source, out, kind, options, settings=settings, files=files)
+
+
+def _refuse_source_settings(settings: Settings) -> None:
+    """Raise SettingError if a setting describes a foreign source, but SOURCE is a recording."""
+    default = Settings()
+    for name in (one.name for one in fields(Settings) if one.name != "to"):
+        if getattr(settings, name) != getattr(default, name):
+            flag = "--from" if name == "source_kind" else f"--{name.replace('_', '-')}"
+            raise SettingError(f"{flag} has no effect with --to {settings.to}. Leave it out")
 
 
 def _to_options(settings: Settings) -> "Options":

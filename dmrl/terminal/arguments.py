@@ -15,6 +15,8 @@ AsJson = Annotated[
     Parameter(name="--json", negative=(), help="Print one JSON document in place of the table."),
 ]
 """Whether the result is printed as JSON."""
+Strict = Annotated[bool, Parameter(negative=())]
+"""Whether anything that is left out is an error; see `dmrl.terminal.left_out`."""
 Seed = Annotated[int, Parameter(validator=validators.Number(gte=0))]
 """Seed of all random numbers."""
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))]

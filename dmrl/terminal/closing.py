@@ -52,10 +52,21 @@ class Closing:
         """Whether a JSON document is described."""
         return bool(self.path_key or self.document)
 
-    def print(self, result: Any, given: Given, *, as_json: bool = False) -> None:
-        """Print a result, as JSON or for people."""
+    def print(
+        self,
+        result: Any,
+        given: Given,
+        *,
+        as_json: bool = False,
+        left_out: Mapping[str, int] | None = None,
+    ) -> None:
+        """Print a result, as JSON or for people. ``left_out``: counts for the JSON, by reason."""
         if as_json:
-            print_json((self.document or self._document)(result, given))
+            document = (self.document or self._document)(result, given)
+            can_leave_out = hasattr(getattr(given, "settings", None), "strict")
+            if isinstance(document, dict) and (left_out or can_leave_out):
+                document = {"left_out": dict(left_out or {})} | document
+            print_json(document)
             return
         if self.show is not None:
             self.show(result, given)

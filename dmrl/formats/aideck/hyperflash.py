@@ -13,12 +13,12 @@ import numpy as np
 
 from dmrl.errors import SourceError
 from dmrl.formats.aideck import published_firmware
-from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
 from dmrl.geometry.frames import AIDECK
 from dmrl.images import codec
 from dmrl.images.bayer import demosaic
 from dmrl.samples.sample import Sample, build_calibration, build_image
-from dmrl.terminal.progress import say
+from dmrl.terminal.left_out import leave_out
 
 HEIGHT_PX, WIDTH_PX = 224, 320
 PIXEL_COUNT = HEIGHT_PX * WIDTH_PX
@@ -56,7 +56,7 @@ def iter_records(stream: BinaryIO, what: object = None) -> Iterator[np.void]:
             return
         yield np.frombuffer(data, RECORD)[0]
     if what is not None and data.strip(b"\xff"):
-        say(f"{what}: its last {len(data)} bytes are no whole record; left out")
+        leave_out("records that are cut short", f"{what}: its last {len(data)} bytes")
 
 
 def load_content(source: Path, options: Options) -> Content:
@@ -96,7 +96,6 @@ def load_content(source: Path, options: Options) -> Content:
 
 def _iter_samples(source: Path, options: Options) -> Iterator[Sample]:
     camera, peer = options.camera or AIDECK, options.names.get("0", "cf2")
-    odd = 0
     yield build_calibration(0, options.robot, camera)
     with source.open("rb") as stream:
         for k, record in enumerate(iter_records(stream, source)):
@@ -104,10 +103,15 @@ def _iter_samples(source: Path, options: Options) -> Iterator[Sample]:
             png = codec.encode_png(demosaic(record["raw"]))
             yield build_image(time_ns, options.robot, png, "png")
             values = record["values"].tolist()
-            odd += not published_firmware.is_plausible(values)
+            if not published_firmware.is_plausible(values):
+                leave_out("labels of records with impossible numbers", f"{source}: record {k}")
             yield from published_firmware.iter_samples(time_ns, options.robot, peer, values, camera)
-    if odd:
-        say(f"{source}: {odd} images have impossible numbers; their labels are left out")
 
 
-FORMAT = Format("hyperflash", "a dump of the AI-deck's flash", can_read, load_content)
+FORMAT = Format(
+    "hyperflash",
+    "a dump of the AI-deck's flash",
+    can_read,
+    load_content,
+    SOURCE_OPTIONS | {"rate_hz", "camera"},
+)

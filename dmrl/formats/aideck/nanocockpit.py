@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.errors import SourceError
-from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
 from dmrl.formats.timestamps import unwrap
@@ -21,6 +21,7 @@ from dmrl.images import codec
 from dmrl.images.bayer import demosaic
 from dmrl.samples.flight import Times, merge_by_time
 from dmrl.samples.sample import Sample, build_calibration, build_image
+from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 
 METADATA_FILE = "metadata.csv"
@@ -86,7 +87,7 @@ def _load_metadata(path: Path) -> tuple[list[str], dict[str, Times]]:
     if missing := [name for name in REQUIRED_COLUMNS if name not in head]:
         raise SourceError(f"{path}:1: no column {', '.join(missing)}. Restore the file")
     if rows and len(rows[-1]) != len(head):
-        say(f"{path}: its last line is cut short; left out")
+        leave_out("lines that are cut short", f"{path}:{len(rows) + 1}")
         rows.pop()
     if not rows:
         raise SourceError(f"{path} has no rows. Pass another folder")
@@ -158,4 +159,10 @@ def _build_state_streams(
     return log_variables.build_streams(options.robot, [block], options.names, source)
 
 
-FORMAT = Format("nanocockpit", "a folder of the nanocockpit client", can_read, load_content)
+FORMAT = Format(
+    "nanocockpit",
+    "a folder of the nanocockpit client",
+    can_read,
+    load_content,
+    SOURCE_OPTIONS | {"camera"},
+)

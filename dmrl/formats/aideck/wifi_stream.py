@@ -13,14 +13,14 @@ import numpy as np
 from dmrl.errors import SourceError
 from dmrl.formats.aideck.cpx import Image, ImageReader
 from dmrl.formats.aideck.cpx_state import RobotState
-from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
 from dmrl.images import codec
 from dmrl.images.bayer import demosaic
 from dmrl.samples.flight import merge_by_time
 from dmrl.samples.sample import Sample, build_calibration, build_image
-from dmrl.terminal.progress import say
+from dmrl.terminal.left_out import leave_out
 
 READ_BYTES = 1 << 16
 SNIFF_BYTES = 1 << 18
@@ -61,11 +61,8 @@ def load_content(source: Path, options: Options) -> Content:
         states.append(found.state)
     if not times:
         raise SourceError(f"{source} has no whole image of a CPX stream. Pass another file")
-    if reader.broken or reader.skipped_bytes:
-        say(
-            f"{source}: {reader.broken} images are broken or cut short and "
-            f"{reader.skipped_bytes} bytes belong to no packet; left out"
-        )
+    leave_out("images that are broken or cut short", source, reader.broken)
+    leave_out("bytes that belong to no packet", source, reader.skipped_bytes)
     time_ns = _to_times_ns(times, options.rate_hz)
     pictures = _iter_image_samples(source, time_ns, options)
     told = [state for state in states if state is not None]
@@ -122,4 +119,10 @@ def _build_state_streams(
     return log_variables.build_streams(options.robot, [block], options.names, source)
 
 
-FORMAT = Format("aideck-stream", "a recorded CPX stream", can_read, load_content)
+FORMAT = Format(
+    "aideck-stream",
+    "a recorded CPX stream",
+    can_read,
+    load_content,
+    SOURCE_OPTIONS | {"rate_hz", "camera"},
+)

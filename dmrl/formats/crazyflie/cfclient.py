@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.errors import SourceError
-from dmrl.formats.base import Content, Format, Options, build_content
+from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
 from dmrl.formats.timestamps import unwrap
 from dmrl.geometry.frames import Array
 from dmrl.guards import limits
-from dmrl.terminal.progress import say
+from dmrl.terminal.left_out import leave_out
 
 TIME_COLUMN = "Timestamp"
 NS_PER_MS = 1_000_000
@@ -103,7 +103,7 @@ def read_block(path: Path) -> LogBlock:
         raise SourceError(f"{path}:1: not {TIME_COLUMN} and names of variables. Pass another file")
     rows = [_parse_row(line, len(names)) for line in lines[1:]]
     if rows and rows[-1] is None and not text.endswith("\n"):
-        say(f"{path}: its last line is cut short; left out")
+        leave_out("lines that are cut short", f"{path}:{len(lines)}")
         rows.pop()
     if None in rows:
         raise SourceError(f"{path}:{rows.index(None) + 2}: not {len(names)} numbers. Fix the line")
@@ -147,4 +147,6 @@ def _parse_row(line: str, width: int) -> list[float] | None:
     return row if len(row) == width and np.isfinite(row[0]) else None
 
 
-FORMAT = Format("cfclient", "log blocks of the Crazyflie client", can_read, load_content)
+FORMAT = Format(
+    "cfclient", "log blocks of the Crazyflie client", can_read, load_content, SOURCE_OPTIONS
+)

@@ -40,6 +40,7 @@ from dmrl.messages import LogType
 from dmrl.samples import flight
 from dmrl.samples.flight import RobotPose, Times
 from dmrl.samples.sample import Columns, Sample
+from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 
 MAX_RANGE_M = 60.0
@@ -172,8 +173,8 @@ def iter_range_streams(
     for number, time_ns, range_m in _iter_distances(blocks, where):
         peer = names.get(str(number), f"cf{number}")
         usable = np.isfinite(range_m) & (range_m > 0) & (range_m < MAX_RANGE_M)
-        if refused := int((np.isfinite(range_m) & (range_m != 0) & ~usable).sum()):
-            say(f"{where}: {refused} ranges to {peer} left out: not over 0 and under 60 m")
+        refused = int((np.isfinite(range_m) & (range_m != 0) & ~usable).sum())
+        leave_out(f"ranges to {peer} that are not over 0 and under 60 m", where, refused)
         if peer == robot or not usable.any():
             continue
         topic = topics.RANGE(robot, peer)

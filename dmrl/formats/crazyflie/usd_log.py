@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.errors import SourceError
-from dmrl.formats.base import Content, Format, Options, build_content
+from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
 from dmrl.formats.crazyflie.usd_records import EventType, Rows, gather_records
 from dmrl.formats.timestamps import unwrap
+from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 
 MAGIC = 0xBC
@@ -29,8 +30,6 @@ VERSIONS = {1: ("<u4", 1_000_000), 2: ("<u8", 1_000)}
 TYPE_CODES = "bBhHiIef"
 MAX_EVENT_TYPES = 250
 CRC_BYTES = 4
-MAX_LISTED_FILES = 3
-"""Largest number of skipped files that are listed by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +87,7 @@ def decode_log(data: bytes, what: object = "the log") -> UsdLog:
     stop = len(data) - CRC_BYTES * sealed
     rows, end = gather_records(data, body, stop, events)
     warnings = [] if sealed else [f"{what}: no valid CRC at its end; cut short, or damaged"]
-    if left := stop - end:
-        warnings.append(f"{what}: {left} bytes from byte {end} on are no whole record; left out")
+    leave_out("bytes that are no whole record", f"{what}: byte {end}", stop - end)
     scale = VERSIONS[version][1]
     blocks = [_build_block(e, rows[e.name], scale) for e in events if len(rows[e.name])]
     return UsdLog(version, tuple(blocks), tuple(warnings))
@@ -182,14 +180,11 @@ def _iter_logs(source: Path, options: Options) -> Iterator[tuple[str, Path]]:
         raise SourceError(f"no micro-SD log in {source}. Pass a folder with one file per robot")
     for path in paths:
         if path.stat().st_size == 0:
-            say(f"{path} is empty; left out")
+            leave_out("empty files", path)
         elif path in logs:
             yield options.names.get(path.stem, path.stem), path
-    if others := [path.name for path in paths if path.stat().st_size and path not in logs]:
-        more = (
-            f" and {len(others) - MAX_LISTED_FILES} more" if len(others) > MAX_LISTED_FILES else ""
-        )
-        say(f"{source}: left out, as no micro-SD log: {', '.join(others[:MAX_LISTED_FILES])}{more}")
+    others = [path for path in paths if path.stat().st_size and path not in logs]
+    leave_out("files that are no micro-SD log", next(iter(others), source), len(others))
 
 
 def _load_streams(robot: str, path: Path, options: Options) -> list[log_variables.SampleStream]:
@@ -202,5 +197,9 @@ def _load_streams(robot: str, path: Path, options: Options) -> list[log_variable
 
 
 FORMAT = Format(
-    "cfusdlog", "a micro-SD log of a Crazyflie, or a folder of them", can_read, load_content
+    "cfusdlog",
+    "a micro-SD log of a Crazyflie, or a folder of them",
+    can_read,
+    load_content,
+    SOURCE_OPTIONS,
 )

@@ -278,4 +278,10 @@ def _iter_image_streams(folder: Path, options: Options) -> Iterator[Iterator[Sam
     yield image_folder.load_content(folder, own).samples
 
 
-FORMAT = Format("csv", "a folder of flight logs", can_read, load_content)
+FORMAT = Format(
+    "csv",
+    "a folder of flight logs",
+    can_read,
+    load_content,
+    frozenset({"names", "camera", "size_px"}),
+)

@@ -29,7 +29,7 @@ from pathlib import Path
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats.aideck import published_firmware
 from dmrl.formats.aideck.chip_outputs import load_chip_maps
-from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
 from dmrl.formats.files.crop import Crop
 from dmrl.formats.files.label_csv import LabelRow, read_labels
 from dmrl.geometry.camera_file import read_camera
@@ -235,4 +235,5 @@ def _crop_camera(crop: Crop, camera: Camera) -> Camera:
     return crop.crop_camera(stored)
 
 
-FORMAT = Format("images", "a folder of pictures", can_read, load_content)
+IMAGE_OPTIONS = SOURCE_OPTIONS | {"rate_hz", "labels", "camera", "size_px", "raw"}
+FORMAT = Format("images", "a folder of pictures", can_read, load_content, IMAGE_OPTIONS)

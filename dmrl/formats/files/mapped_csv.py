@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.errors import SourceError
-from dmrl.formats.base import Content, Format, Options, build_content
+from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock, TimeSeries
 from dmrl.formats.crazyflie.log_variables import SampleStream
@@ -226,4 +226,10 @@ def _warn_about_units(
         say(f"{path}: turning rates are 1/{seen / told:.0f} of the slope of yaw. Are they rad/s?")
 
 
-FORMAT = Format("columns", "a CSV file and a table of its columns", can_read, load_content)
+FORMAT = Format(
+    "columns",
+    "a CSV file and a table of its columns",
+    can_read,
+    load_content,
+    SOURCE_OPTIONS | {"columns"},
+)

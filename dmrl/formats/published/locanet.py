@@ -309,4 +309,6 @@ def _build_labels(item: LocanetImage, names: list[str]) -> list[dict[str, Any]]:
     return found
 
 
-FORMAT = Format("locanet", "a folder of the published synthetic set", can_read, load_content)
+FORMAT = Format(
+    "locanet", "a folder of the published synthetic set", can_read, load_content, frozenset()
+)

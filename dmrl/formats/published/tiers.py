@@ -132,4 +132,4 @@ def _iter_ranges(one: str, other: str, range_m: Array) -> Iterator[Sample]:
     )
 
 
-FORMAT = Format("uwb-tiers", "ranges with motion capture", can_read, load_content)
+FORMAT = Format("uwb-tiers", "ranges with motion capture", can_read, load_content, frozenset())

@@ -26,7 +26,7 @@ from urllib.parse import quote
 
 from dmrl import topics
 from dmrl.errors import DmrlError, MissingExtra, SourceError
-from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
 from dmrl.formats.ros.ros_messages import (
     CONVERTERS,
     DMRL_PREFIX,
@@ -281,4 +281,4 @@ def _convert_message(
         yield sample
 
 
-FORMAT = Format("rosbag2", "a ROS bag", can_read, load_content)
+FORMAT = Format("rosbag2", "a ROS bag", can_read, load_content, SOURCE_OPTIONS)

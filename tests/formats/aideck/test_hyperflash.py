@@ -94,7 +94,8 @@ def test_a_record_that_was_cut_is_left_out_and_said(
 ) -> None:
     dump.write_bytes(dump.read_bytes()[: 2 * 71_704 + length])
     assert len(samples(dump, "CompressedImage")) == 2
-    assert f"its last {length} bytes are no whole record" in capsys.readouterr().err
+    said = f"left out: 1 records that are cut short (at {dump}: its last {length} bytes)"
+    assert said in capsys.readouterr().err
 
 
 def test_a_dump_without_end_marker_ends_with_the_file(
@@ -109,7 +110,7 @@ def test_impossible_numbers_make_no_label(dump: Path, capsys: pytest.CaptureFixt
     values = ((float("nan"), 0, 1, 0, 0, 1), *VALUES[1:])
     dump.write_bytes(foreign.flash_dump([to_bayer(p) for p in known_pictures()], values))
     assert len(samples(dump, "CompressedImage")) == 3
-    assert "1 images have impossible numbers" in capsys.readouterr().err
+    assert "left out: 1 labels of records with impossible numbers" in capsys.readouterr().err
     assert len(samples(dump, "PeerLabels")) == 2
 
 

@@ -167,7 +167,7 @@ def test_a_table_s_last_line_may_be_cut(
         return
     cut = "a,1" in text
     assert len(samples(folder)["/cf1/camera/image"]) == 2 - cut
-    assert ("its last line is cut short" in capsys.readouterr().err) == cut
+    assert ("1 lines that are cut short" in capsys.readouterr().err) == cut
 
 
 def test_every_number_of_a_state_is_in_its_place(folder: Path) -> None:

@@ -75,7 +75,7 @@ def test_a_stream_that_was_cut_gives_what_is_whole_and_says_so(
     one = pack_image(Image(32, 24, "raw", foreign.pictures(1)[0].tobytes()))
     found = samples(tmp_path / "a.cpx", one * 2 + one[:12] + one * 2)
     assert len(found["/cf1/camera/image"]) >= 3
-    assert "images are broken" in capsys.readouterr().err
+    assert "images that are broken" in capsys.readouterr().err
 
 
 def test_a_file_without_a_picture_is_one_line(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_a_stream_that_was_cut_says_so(
     path.write_bytes(whole[: int(len(whole) * share)])
     found = wifi_stream.load_content(path, Options()).samples
     assert len([s for s in found if s.message == "CompressedImage"]) == int(3 * share)
-    assert "1 images are broken or cut short" in capsys.readouterr().err
+    assert "left out: 1 images that are broken or cut short" in capsys.readouterr().err
     path.write_bytes(whole)
     list(wifi_stream.load_content(path, Options()).samples)
     assert not capsys.readouterr().err

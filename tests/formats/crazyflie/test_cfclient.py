@@ -113,7 +113,7 @@ def test_a_last_line_that_was_cut_is_left_out_and_said(
     path = swarm / "cf1" / "state-20221011T10-33-31.csv"
     path.write_text(path.read_text()[:-8])
     assert len(samples(path)["/cf1/attitude"]) == 9
-    assert "its last line is cut short" in capsys.readouterr().err
+    assert "1 lines that are cut short" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

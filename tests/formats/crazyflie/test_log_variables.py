@@ -225,7 +225,10 @@ def test_ranges_end_at_60_m_and_nothing_heard_is_not_refused(
     times = np.arange(7) * MS
     found = samples(LogBlock("r", times, {"ranging.distance2": np.array(metres)}))["/cf1/range/cf2"]
     assert [(s.time_ns, s.fields["range_m"]) for s in found] == [(0, 59.99), (6 * MS, 0.01)]
-    assert "the log: 3 ranges to cf2 left out: not over 0 and under 60 m" in capsys.readouterr().err
+    assert (
+        "left out: 3 ranges to cf2 that are not over 0 and under 60 m (first at the log)"
+        in capsys.readouterr().err
+    )
 
 
 def test_events_tell_whose_distance_they_are_and_a_robot_ranges_to_no_self() -> None:
@@ -245,7 +248,7 @@ def test_events_tell_whose_distance_they_are_and_a_robot_ranges_to_no_self() -> 
     [
         (np.array([61.0, 1500.0]), [0.061, 1.5], "61 or more: read as millimetres"),
         (np.array([59.0, 2.0]), [59.0, 2.0], ""),
-        (np.array([61.5, 2.0]), [2.0], "1 ranges to cf2 left out"),
+        (np.array([61.5, 2.0]), [2.0], "left out: 1 ranges to cf2 that"),
         (np.array([61, 1500]), [0.061, 1.5], ""),
         (np.array([2, 59]), [0.002, 0.059], "but is 59 at most. Are they metres?"),
     ],

@@ -124,11 +124,13 @@ def test_a_damaged_header_is_one_line(damage: object, text: str) -> None:
         usd_log.decode_log(damage(foreign.usd_log()), "log07")  # type: ignore[operator]
 
 
-def test_an_id_that_is_unknown_ends_the_log_with_a_warning() -> None:
+def test_an_id_that_is_unknown_ends_the_log_with_a_warning(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     raw = foreign.usd_log()
     log = usd_log.decode_log(raw[:-4] + b"\x55\x55" + b"\0" * 30)
     assert [len(b.time_ns) for b in log.blocks] == [100, 20, 20]
-    assert "32 bytes from byte" in log.warnings[1]
+    assert "left out: 32 bytes that are no whole record" in capsys.readouterr().err
 
 
 def test_bytes_that_look_like_ids_are_no_records() -> None:

@@ -118,7 +118,7 @@ def test_a_folder_is_a_robot_per_file(tmp_path: Path, capsys: pytest.CaptureFixt
     found = samples(tmp_path)
     assert {"/cf1/attitude", "/cf2/attitude"} <= found.keys()
     err = capsys.readouterr().err
-    assert "cf3 is empty; left out" in err and "left out, as no micro-SD log: notes.txt" in err
+    assert "left out: 1 empty files" in err and "1 files that are no micro-SD log" in err
 
 
 def test_attitude_before_the_estimator_starts_is_left_out(tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_impossible_ranges_are_left_out_and_said(
     path.write_bytes(plain_usd.encode(events, rows))
     got = [(s.time_ns, s.fields["range_m"]) for s in samples(path)["/cf1/range/cf2"]]
     assert got == [(1_000_000, 1.5), (4_000_000, 2.0)]  # what did not change is not new
-    assert "1 ranges to cf2 left out" in capsys.readouterr().err
+    assert "left out: 1 ranges to cf2 that" in capsys.readouterr().err
 
 
 def _log_of(path: Path, variables: tuple[str, ...], *rows: tuple[float, ...]) -> Path:
@@ -194,13 +194,13 @@ def test_real_logs_without_pitch_keep_their_velocity(
     assert "no attitude: no usable stateEstimate pitch." in capsys.readouterr().err
 
 
-def test_of_what_is_left_out_three_are_named(
+def test_files_that_are_no_log_are_counted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "cf1").write_bytes(foreign.usd_log())
-    for count, words in ((3, "a1, a2, a3\n"), (5, "a1, a2, a3 and 2 more\n")):
-        for k in range(1, count + 1):
-            (tmp_path / f"a{k}").write_text("x")
-        (tmp_path / ".hidden").write_text("x")
-        assert "/cf1/attitude" in samples(tmp_path)
-        assert f"left out, as no micro-SD log: {words}" in capsys.readouterr().err
+    for name in ("a1", "a2", ".hidden"):
+        (tmp_path / name).write_text("x")
+    assert "/cf1/attitude" in samples(tmp_path)
+    assert f"2 files that are no micro-SD log (first at {tmp_path / 'a1'})" in (
+        capsys.readouterr().err
+    )
