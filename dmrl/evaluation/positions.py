@@ -1,7 +1,7 @@
 """Evaluate the estimated positions of a recording against the ground truth, pair by pair."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +21,7 @@ from dmrl.estimation.model.position_metrics import (
     compute_figures,
     is_covered_by_truth,
 )
+from dmrl.evaluation.limit import FlightLimit, describe_limit, find_limit
 from dmrl.geometry.frames import Array
 from dmrl.labelling.flight_log import TRUTH_TOPICS, FlightLog, read_flight
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
@@ -35,6 +36,11 @@ COVERED_DEFINITION = (
     "use the existing estimates only"
 )
 """Definition of the metric ``covered``."""
+LIMIT_DEFINITION = (
+    "posterior Cramer-Rao bound: the least error of a smoother that knows the simulator's noise; "
+    "rmse_m from the start, settled_rmse_m after the settling time, kept_share by bad share"
+)
+"""Definition of ``limit``; null unless `dmrl fly` simulated the flight, with noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +59,8 @@ class EvaluatedPair:
         Number of samples of the truth.
     covered
         Number of them between two estimates that are close in time. Dropouts lower it.
+    bound
+        (N, 2, 2) least covariances of the estimates with ground truth; None if unknown.
     """
 
     robot: str
@@ -61,6 +69,7 @@ class EvaluatedPair:
     without_truth: int
     true: int
     covered: int
+    bound: Array | None = None
 
     @property
     def name(self) -> str:
@@ -111,7 +120,8 @@ def judge(recording: Path) -> list[EvaluatedPair]:
     estimated, known = _find_estimated_pairs(held.topics), list_true_pairs(held.topics)
     if not estimated:
         raise RecordingError(f"{recording} has no positions. Try: dmrl label {recording} OUT.mcap")
-    pairs = [_evaluate_pair(held, *names) for names in estimated if names in known]
+    limit = find_limit(held)
+    pairs = [_evaluate_pair(held, limit, *names) for names in estimated if names in known]
     pairs = [pair for pair in pairs if len(pair.judged.time_s)]
     if not pairs:
         raise RecordingError(
@@ -168,7 +178,9 @@ def _match_truth(estimate: PeerPositions, true_ns: Times, true_m: Array) -> Pair
     )
 
 
-def _evaluate_pair(held: FlightLog, robot: str, peer: str) -> EvaluatedPair:
+def _evaluate_pair(
+    held: FlightLog, limit: FlightLimit | None, robot: str, peer: str
+) -> EvaluatedPair:
     estimate = held.positions[robot, peer]
     true_ns, true_m = find_true_path(held, robot, peer)
     found = _match_truth(estimate, true_ns, true_m)
@@ -182,7 +194,13 @@ def _evaluate_pair(held: FlightLog, robot: str, peer: str) -> EvaluatedPair:
     time_ns = estimate.time_ns
     covered = is_covered_by_truth(true_ns, time_ns)
     return EvaluatedPair(
-        robot, peer, judged, len(time_ns) - len(found.kept), len(covered), int(covered.sum())
+        robot,
+        peer,
+        judged,
+        len(time_ns) - len(found.kept),
+        len(covered),
+        int(covered.sum()),
+        None if limit is None else limit.interpolate_at((robot, peer), found.time_ns),
     )
 
 
@@ -199,6 +217,7 @@ def document(recording: Path, pairs: list[EvaluatedPair], settle_s: float) -> di
         "recording": {"name": source.name, "sha256": source.sha256},
         "settle_s": settle_s,
         "overall": {"covered": _compute_coverage(pairs), **_to_json_values(combine_figures(each))},
+        "limit": _describe_limit(pairs, settle_s),
         "pairs": [
             {
                 "robot": pair.robot,
@@ -206,11 +225,19 @@ def document(recording: Path, pairs: list[EvaluatedPair], settle_s: float) -> di
                 "without_truth": pair.without_truth,
                 "covered": _compute_coverage([pair]),
                 **_to_json_values(measured),
+                "limit": _describe_limit([pair], settle_s),
             }
             for pair, measured in zip(pairs, each, strict=True)
         ],
-        "definitions": {**DEFINITIONS, "covered": COVERED_DEFINITION},
+        "definitions": {**DEFINITIONS, "covered": COVERED_DEFINITION, "limit": LIMIT_DEFINITION},
     }
+
+
+def _describe_limit(pairs: Sequence[EvaluatedPair], settle_s: float) -> dict[str, Any] | None:
+    whole = [pair.bound for pair in pairs if pair.bound is not None]
+    late = [pair.judged.time_s >= settle_s for pair in pairs]
+    settled = [bound[at] for bound, at in zip(whole, late, strict=False)]
+    return describe_limit(whole, settled) if whole else None
 
 
 def _compute_coverage(pairs: list[EvaluatedPair]) -> float:
@@ -227,6 +254,7 @@ COLUMNS = (
     ("samples", "samples", "d"),
     ("covered", "covered", ".0%"),
     ("rmse_m", "RMSE, m", ".2f"),
+    ("limit", "bound, m", ".2f"),
     ("p95_m", "95 %, m", ".2f"),
     ("wrong_basin", "wrong", ".0%"),
     ("nees", "NEES", ".1f"),
@@ -240,12 +268,16 @@ COLUMNS = (
 
 def note(made: Mapping[str, Any]) -> str:
     """Describe the columns of the table of a ``document``."""
+    shares = (made.get("limit") or {"kept_share": {}})["kept_share"].items()
+    kept = ", ".join(f"{share:.0%} at {float(bad):.0%} bad" for bad, share in shares)
+    bound = f"; bound: the least RMSE with this noise, which allows to keep {kept}" if kept else ""
     return (
         "errors are horizontal; covered: share of the truth that has an estimate; kept: status "
         f"OK; good: error of {MAX_GOOD_ERROR_M:g} m at most; these cover the whole flight. From "
         f"{made['settle_s']:g} s on: RMSE; 95 %: 95th percentile of the error; wrong: share of "
         "pairs with an error of half their distance; NEES: squared error over covariance, 2 if "
         "the covariance is right; in 95 %: share of the truth inside the 95 % ellipse"
+        f"{bound}"
     )
 
 
@@ -253,11 +285,18 @@ def rows(made: Mapping[str, Any]) -> list[list[str]]:
     """Return one row per pair of a ``document``, and one for all if there are several."""
     named = [(f"{pair['robot']} sees {pair['peer']}", pair) for pair in made["pairs"]]
     if len(named) > 1:
-        named.append(("all", made["overall"]))
+        named.append(("all", {**made["overall"], "limit": made.get("limit")}))
     return [
-        [name, *(_format_cell(values[key], form) for key, _, form in COLUMNS)]
+        [name, *(_format_cell(_get_figure(values, key), form) for key, _, form in COLUMNS)]
         for name, values in named
     ]
+
+
+def _get_figure(values: Mapping[str, Any], key: str) -> float | None:
+    """Return a figure of a row. Documents of earlier versions have no limit."""
+    limit = values.get("limit") or {"settled_rmse_m": None}
+    found: float | None = limit["settled_rmse_m"] if key == "limit" else values[key]
+    return found
 
 
 def _format_cell(value: float | None, form: str) -> str:

@@ -19,6 +19,7 @@ Plane = NDArray[np.complex128]
 Trajectory = Literal[
     "in_view",
     "random",
+    "room",
     "lawn_mower",
     "hover",
     "parallel",
@@ -36,6 +37,7 @@ VIEW_DISTANCE_M = (0.5, 2.0)
 VIEW_BEARING_RAD = 0.6
 VIEW_REDRAW_S = 2.5
 FOLLOW_GAIN_PER_S = 2.0
+ROOM_M, ROOM_REDRAW_S = 3.6, 3.0
 HOVER_SPEED_MPS = 0.03
 ROW_M, ROW_GAP_M, ROWS = 2.0, 0.4, 5
 
@@ -153,15 +155,38 @@ def follow_in_view(yaw_rate_radps: float) -> Mover:
         count = _count_draws(VIEW_REDRAW_S, start.samples)
         points, turns = draw_view_points(rng, count), rng.uniform(-1.0, 1.0, count)
         ahead = _repeat_draws(points, VIEW_REDRAW_S, start.samples) * np.exp(1j * leader.yaw)
-        turning = _repeat_draws(turns, VIEW_REDRAW_S, start.samples) * yaw_rate_radps
-        yaw_rate = apply_lag(turning, YAW_RATE_LAG_S)
         carried = leader.velocity + 1j * leader.yaw_rate * ahead
-        velocity = _follow_target(leader.position + ahead, carried)
-        yaw = np.real(_integrate_rate(yaw_rate, start.yaw_rad))
-        first = complex(leader.position[0] + ahead[0])
-        return Motion(_integrate_rate(velocity, first), velocity, yaw, yaw_rate)
+        turning = _repeat_draws(turns, VIEW_REDRAW_S, start.samples) * yaw_rate_radps
+        return _fly_to(start, leader.position + ahead, carried, turning)
 
     return move
+
+
+def fly_in_room(yaw_rate_radps: float) -> Mover:
+    """Return a mover that flies to random points of a room whose centre is the origin.
+
+    Parameters
+    ----------
+    yaw_rate_radps
+        Its yaw rate is uniform within plus and minus this, drawn anew with each point.
+    """
+
+    def move(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
+        x, y, turns = rng.uniform(-1.0, 1.0, (3, _count_draws(ROOM_REDRAW_S, start.samples)))
+        points = np.asarray(ROOM_M / 2 * (x + 1j * y), complex)
+        target = _repeat_draws(points, ROOM_REDRAW_S, start.samples)
+        turning = _repeat_draws(turns, ROOM_REDRAW_S, start.samples) * yaw_rate_radps
+        return _fly_to(start, target, np.zeros_like(target), turning)
+
+    return move
+
+
+def _fly_to(start: Start, target: Plane, carried: Plane, turning: Array) -> Motion:
+    """Return the motion of a robot that starts on a moving target, follows it and turns."""
+    yaw_rate = apply_lag(turning, YAW_RATE_LAG_S)
+    velocity = _follow_target(target, carried)
+    yaw = np.real(_integrate_rate(yaw_rate, start.yaw_rad))
+    return Motion(_integrate_rate(velocity, complex(target[0])), velocity, yaw, yaw_rate)
 
 
 def draw_view_points(rng: Generator, count: int) -> Plane:
@@ -231,6 +256,7 @@ def fly_rows(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
 TRAJECTORIES: dict[Trajectory, tuple[Mover, Mover]] = {
     "in_view": (back_and_forth(0.5, 0.4, 1.5), follow_in_view(0.8)),
     "random": (back_and_forth(1.0, 0.5, 1.0), back_and_forth(1.0, 0.5, 1.0)),
+    "room": (fly_in_room(0.8), fly_in_room(0.8)),
     "lawn_mower": (fly_rows, fly_rows),
     "hover": (hover_in_place, hover_in_place),
     "parallel": (back_and_forth(0.5, 0.4, 1.5), fly_parallel),

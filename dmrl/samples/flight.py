@@ -28,6 +28,8 @@ LOG_COLUMNS = (
 )
 """Columns of a robot's log, as ``iter_robot_log`` needs them."""
 
+START_NS = 1_000_000_000
+"""Log time of a simulated start: clocks that run late must not show a time before zero."""
 ZERO_COVARIANCE = [0.0] * 9
 ROWS_PER_SLICE = 256
 """Rows converted to Python numbers at a time, which take ten times the memory of an array."""

@@ -24,14 +24,12 @@ from dmrl.rendering.onboard_camera import ViewRenderer, WorldPose, build_view, r
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch_renderer import Sketch
 from dmrl.samples import flight as samples
-from dmrl.samples.flight import Times, merge_by_time, to_nanoseconds
+from dmrl.samples.flight import START_NS, Times, merge_by_time, to_nanoseconds
 from dmrl.samples.sample import Sample, build_calibration, build_image, build_labels
 from dmrl.simulation.settings import CameraRenderer, Preset
 from dmrl.terminal.arguments import Seed
 from dmrl.terminal.progress import say, track
 
-START_NS = 1_000_000_000
-"""Log time of the start: clocks that run late must not show a time before zero."""
 TRUTH_RATE_HZ = 20.0
 JPEG_QUALITY = 92
 

@@ -13,6 +13,7 @@ Preset = Literal["ideal", "calibrated", "realistic", "harsh", "published"]
 Trajectory = Literal[
     "in_view",
     "random",
+    "room",
     "lawn_mower",
     "hover",
     "parallel",
