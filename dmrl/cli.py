@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.text import Text
 
 from dmrl import __version__, boundary, entry_points
+from dmrl.guards.numeric_threads import set_one_blas_thread
 from dmrl.guards.safe_names import truncate_middle
 from dmrl.storage import to_path
 
@@ -136,6 +137,7 @@ def main() -> NoReturn:
     """Run the command; turn errors into one line and an exit status."""
     boundary.open_standard_streams()
     boundary.install_signal_handlers()
+    set_one_blas_thread()
     name, *words = sys.argv[1:] or [""]
     if name not in COMMANDS:
         add_plugin_commands()

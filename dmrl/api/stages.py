@@ -17,6 +17,7 @@ from dmrl.api.models import Model, load
 from dmrl.api.recordings import PathLike, Recording
 from dmrl.api.results import Result, evaluate_recordings
 from dmrl.errors import SettingError
+from dmrl.guards.numeric_threads import one_blas_thread
 from dmrl.pipeline.stage_signature import signature_of
 from dmrl.terminal.left_out import count_left_out
 
@@ -240,7 +241,8 @@ def _run_to_recording(
 def _run_to_path(stage: str, out: Path, settings: dict[str, Any], **given: Any) -> Path:
     """Run a stage, and return the path that it wrote."""
     checked = _check_settings(stage, settings)
-    with count_left_out(strict=getattr(checked.get("settings"), "strict", False)):
+    strict = getattr(checked.get("settings"), "strict", False)
+    with one_blas_thread(), count_left_out(strict=strict):
         signature_of(stage).run(out=out, **given, **checked)
     return out
 
