@@ -23,8 +23,8 @@ def to_log_time(time_s: float | None, start_ns: int) -> int | None:
     return None if time_s is None else start_ns + round(time_s * 1e9)
 
 
-def to_data_frame(table: pa.Table, start_ns: int) -> "pd.DataFrame":
-    """Return a table as a data frame over ``time_s``; a status becomes its name.
+def to_data_frame(table: pa.Table, start_ns: int, *, foreign: bool = False) -> "pd.DataFrame":
+    """Return a table as a data frame over ``time_s``; a status of dmrl becomes its name.
 
     Parameters
     ----------
@@ -32,6 +32,8 @@ def to_data_frame(table: pa.Table, start_ns: int) -> "pd.DataFrame":
         Table with ``log_time``, without nested messages.
     start_ns
         Log time from which seconds count, nanoseconds.
+    foreign
+        The messages are not of dmrl. A column ``time_s`` of theirs is renamed ``time_s_``.
 
     Raises
     ------
@@ -40,8 +42,9 @@ def to_data_frame(table: pa.Table, start_ns: int) -> "pd.DataFrame":
     """
     if find_spec("pandas") is None:
         raise MissingExtra("pandas", "table", "a data frame")
-    frame: pd.DataFrame = table.to_pandas()
-    if "status" in frame.columns:
+    names = {"time_s": "time_s_"} if "time_s_" not in table.column_names else {}
+    frame: pd.DataFrame = table.to_pandas().rename(columns=names)
+    if "status" in frame.columns and not foreign:
         known = frame["status"].notna()  # of an image without peers it is not
         names = [to_status_name(int(number)) for number in frame["status"][known]]
         frame["status"] = frame["status"].astype(object)
@@ -103,7 +106,8 @@ class Topic:
         -------
         pa.Table
             ``log_time`` and ``publish_time`` (int64, nanoseconds), then the fields: a message
-            within is a struct, a repeated field a list, an enum an int32.
+            within is a struct, a repeated field a list, an enum an int32. A field that is named
+            as a time has an underscore behind its name.
 
         Raises
         ------
@@ -133,7 +137,7 @@ class Topic:
             If the recording is damaged.
         """
         table = flatten_table(self.to_arrow(fields=fields, start_s=start_s, end_s=end_s))
-        return to_data_frame(table, self._start_ns)
+        return to_data_frame(table, self._start_ns, foreign=not self.schema.startswith("dmrl.v1."))
 
     def to_numpy(
         self,

@@ -130,7 +130,7 @@ def _is_struct_list(kind: pa.DataType) -> bool:
 def _explode_list(table: pa.Table, name: str) -> pa.Table:
     """Return one row per item of a list, and one empty row per list without items."""
     column = table[name].combine_chunks()
-    empty = pc.equal(pc.list_value_length(column), 0)
+    empty = pc.fill_null(pc.equal(pc.list_value_length(column), 0), True)
     filled = pc.if_else(empty, pa.scalar([None], column.type), column)
     at = table.schema.get_field_index(name)
     taken = table.remove_column(at).take(pc.list_parent_indices(filled))

@@ -16,7 +16,7 @@ from dmrl.recording.mcap.channel import Channel, RawMessage
 from dmrl.recording.mcap.file import corrupt_error
 from dmrl.recording.mcap.message_batch import EMPTY_BATCH, MessageBatch, concatenate_all
 from dmrl.recording.mcap.summary_index import TopicInfo, read_channel
-from dmrl.recording.protobuf.columns import decode_by_topic, decode_topic, to_record_batch
+from dmrl.recording.protobuf.columns import decode_by_topic, decode_topic
 from dmrl.recording.protobuf.message_types import find_channel_descriptor, require_types
 from dmrl.recording.summary import read_summary
 
@@ -231,9 +231,6 @@ def read_table(
     """Read one topic into an Arrow table, possibly without rows; see ``iter_columns``."""
     batches = list(iter_columns(path, topic, fields=fields, start_ns=start_ns, end_ns=end_ns))
     if not batches:
-        batches = [
-            to_record_batch(
-                EMPTY_BATCH, find_channel_descriptor(path, read_channel(path, topic)), fields
-            )
-        ]
+        channels = {0: read_channel(path, topic)}
+        batches = [decode_topic(path, topic, EMPTY_BATCH, channels, fields)]
     return pa.Table.from_batches(batches)

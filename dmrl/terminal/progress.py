@@ -1,6 +1,7 @@
 """Progress on standard error or in a notebook, silent when that is neither."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from functools import lru_cache
 from typing import TypeVar
 
 from rich.console import Console, RenderableType
@@ -96,3 +97,9 @@ def track(
 def say(line: str) -> None:
     """Print one line of news on standard error, terminal or not."""
     Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(to_one_line(line))
+
+
+@lru_cache(maxsize=4096)
+def say_once(line: str) -> None:
+    """Print one line of news, unless this process printed the same line before."""
+    say(line)

@@ -152,7 +152,8 @@ def _collect_from_messages(
         if fields is None:
             collected.broken[topic] = str(e)
         return
-    if stamped and "timestamp" in batch.schema.names:
+    names = batch.schema.names
+    if stamped and "timestamp" in names and pa.types.is_struct(batch["timestamp"].type):
         collected.unset_stamps[topic] += _count_unset_stamps(batch)
     collected.magnitudes.add_batch(topic, batch)
     collected.motion.add_batch(topic, batch)

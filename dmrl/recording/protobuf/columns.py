@@ -11,8 +11,12 @@ from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.file import corrupt_error
 from dmrl.recording.mcap.message_batch import MessageBatch
 from dmrl.recording.protobuf.decode import decode
-from dmrl.recording.protobuf.message_types import find_channel_descriptor, require_one_type
+from dmrl.recording.protobuf.message_types import find_channel_descriptor
 from dmrl.recording.protobuf.wire_values import WireError
+from dmrl.terminal.progress import say_once
+
+TIMES = {"log_time": "time_ns", "publish_time": "publish_ns"}
+"""Columns in front of the fields, and the times of a batch that they hold."""
 
 
 def decode_by_topic(
@@ -49,32 +53,78 @@ def decode_topic(
     channels: Mapping[int, Channel],
     fields: Sequence[str] | None,
 ) -> pa.RecordBatch:
-    """Decode the messages of one topic to columns.
+    """Decode the messages of one topic to columns, log time and publish time first.
+
+    If the topic's channels have several message types, the columns are those of all types, null
+    where a message's type lacks the field. A field that no common column can hold, or that has the
+    name of a time, gets underscores behind its name.
 
     Raises
     ------
     RecordingError
-        If the topic has several message types, or a message is not of its type.
+        If a message is not of its type.
     """
-    numbers = batch.list_channel_ids()
-    own = [n for n, channel in channels.items() if channel.topic == topic]
-    kinds = {find_channel_descriptor(path, channels[number]) for number in numbers or own}
-    return _decode_batch(path, topic, batch, require_one_type(path, topic, kinds), fields)
+    own = {n: c for n, c in channels.items() if c.topic == topic}
+    kinds = {n: find_channel_descriptor(path, c) for n, c in own.items()}
+    chosen = list(dict.fromkeys(kinds.values()))
+    if len(chosen) == 1:
+        return _decode_batch(path, topic, batch, chosen[0], fields)
+    parts, rows = [], []
+    for kind in chosen:
+        these = np.flatnonzero(np.isin(batch.channel, [n for n, k in kinds.items() if k is kind]))
+        parts.append(_decode_batch(path, topic, batch.take(these), kind, fields))
+        rows.append(these)
+    order = pa.array(np.argsort(np.concatenate(rows)))
+    joined = pa.concat_tables(_align_names(topic, parts), promote_options="permissive")
+    return joined.take(order).combine_chunks().to_batches(max_chunksize=None)[0]
+
+
+def _align_names(topic: str, parts: Sequence[pa.RecordBatch]) -> list[pa.Table]:
+    """Rename columns whose types cannot be joined with the column of that name before them."""
+    taken: dict[str, pa.DataType] = {}
+    tables = []
+    for part in parts:
+        names = []
+        for field in part.schema:
+            name = field.name
+            while name in taken and not _can_join(taken[name], field.type):
+                name += "_"
+            if name != field.name:
+                say_once(f"{topic}: {field.name} has several types: one of them is {name}")
+            taken.setdefault(name, field.type)
+            names.append(name)
+        tables.append(pa.Table.from_batches([part]).rename_columns(names))
+    return tables
+
+
+def _can_join(one: pa.DataType, other: pa.DataType) -> bool:
+    """Return whether a column can hold the values of both types, each of them exactly."""
+    if one == other:
+        return True
+    if pa.types.is_floating(one) != pa.types.is_floating(other):
+        return False
+    try:
+        parts = [pa.schema([("", kind)]) for kind in (one, other)]
+        pa.unify_schemas(parts, promote_options="permissive")
+    except (pa.ArrowTypeError, pa.ArrowInvalid):
+        return False
+    return True
 
 
 def _decode_batch(
     path: Path, topic: str, batch: MessageBatch, kind: Descriptor, fields: Sequence[str] | None
 ) -> pa.RecordBatch:
+    """Decode messages of one type to columns, log time and publish time first."""
     try:
-        return to_record_batch(batch, kind, fields)
+        body = decode(batch.data, batch.start, batch.end, kind, fields)
     except WireError as e:
         raise corrupt_error(path, f"{topic}: {e}") from e
-
-
-def to_record_batch(
-    batch: MessageBatch, kind: Descriptor, fields: Sequence[str] | None
-) -> pa.RecordBatch:
-    """Decode messages of one type to columns, log time and publish time first."""
-    body = decode(batch.data, batch.start, batch.end, kind, fields)
-    times = {"log_time": pa.array(batch.time_ns), "publish_time": pa.array(batch.publish_ns)}
-    return pa.RecordBatch.from_pydict(times | body)
+    columns = {name: pa.array(getattr(batch, of)) for name, of in TIMES.items()}
+    for name, values in body.items():
+        free = name
+        while free in columns or (free != name and free in body):
+            free += "_"
+        if free != name:
+            say_once(f"{topic}: the field {name} is column {free}, as {name} is the message's time")
+        columns[free] = values
+    return pa.RecordBatch.from_pydict(columns)

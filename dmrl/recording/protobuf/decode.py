@@ -1,20 +1,39 @@
 """Decode protobuf messages to Arrow columns, thousands at a time.
 
-The wire format is decoded field by field over all messages of a batch at once. Every round
-reads the next tag of every message, groups the messages by tag, and skips the values. A batch
-of messages of one layout (nearly every sensor topic) takes a few NumPy calls per field.
+The wire format is decoded field by field over all messages of a batch at once (`wire_scan`). A
+batch of messages of one layout (nearly every sensor topic) takes a few NumPy calls per field.
 Source: Protocol Buffers encoding specification.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+from google.protobuf import json_format, text_format
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.message import DecodeError
+from google.protobuf.message_factory import GetMessageClass
 from numpy.typing import NDArray
 
+from dmrl.guards import limits
 from dmrl.recording.mcap.message_batch import Bytes, Ints
+from dmrl.recording.protobuf.wire_scan import (
+    DELIMITED,
+    FIXED32,
+    FIXED64,
+    MAX_DEPTH,
+    START_GROUP,
+    VARINT,
+    FieldSpans,
+    concatenate_spans,
+    find_fields,
+    keep_last_of_oneof,
+    merge_occurrences,
+)
 from dmrl.recording.protobuf.wire_values import (
     FIXED_DTYPES,
     VARINT_DTYPES,
@@ -23,24 +42,21 @@ from dmrl.recording.protobuf.wire_values import (
     decode_integers,
     decode_present,
     decode_strings,
-    decode_varints,
 )
+from dmrl.terminal.progress import say_once
 
-VARINT, FIXED64, DELIMITED, FIXED32 = 0, 1, 2, 5
 F = FieldDescriptor
+WITHOUT_UTF8_CHECK = 3
+"""Value of the feature ``utf8_validation`` for texts that need not be UTF-8."""
 
 
-@dataclass(frozen=True, slots=True)
-class FieldSpans:
-    """Occurrences of one field: row and byte range of each value.
-
-    For varints ``start`` is the first byte of the value, for delimited values that of the payload.
-    """
-
-    row: Ints
-    wire: int
-    start: Ints
-    end: Ints
+def list_columns(kind: Descriptor) -> dict[str, FieldDescriptor]:
+    """Return the fields of a message by column; an extension is ``[its.full.name]``, as in JSON."""
+    columns = {f.name: f for f in kind.fields}
+    if kind.is_extendable:
+        extensions = sorted(kind.file.pool.FindAllExtensions(kind), key=lambda f: f.number)
+        columns |= {f"[{f.full_name}]": f for f in extensions}
+    return columns
 
 
 def decode(
@@ -62,126 +78,150 @@ def decode(
     Returns
     -------
     dict[str, pa.Array]
-        (N,) each, in schema order. An absent field has its protobuf default; an absent
-        sub-message is null. Repeated fields are lists, enums int32.
+        (N,) each, in schema order, then extensions. An absent field has its protobuf default; an
+        absent sub-message is null. Repeated fields are lists, maps lists of keys and values, enums
+        int32. A message that contains itself, or has too many fields, is JSON text.
 
     Raises
     ------
     WireError
         If the bytes do not conform to the wire format or the type.
     """
-    wanted = [f for f in descriptor.fields if fields is None or f.name in fields]
-    return _decode_fields(data, start, end, wanted, (descriptor.full_name,)) if wanted else {}
+    wanted = {
+        name: f for name, f in list_columns(descriptor).items() if fields is None or name in fields
+    }
+    return _decode_fields(data, start, end, wanted) if wanted else {}
 
 
 def _decode_fields(
-    data: Bytes,
-    start: Ints,
-    end: Ints,
-    fields: Sequence[FieldDescriptor],
-    within: tuple[str, ...],
+    data: Bytes, start: Ints, end: Ints, fields: dict[str, FieldDescriptor]
 ) -> dict[str, pa.Array]:
-    found = _find_fields(data, start, end, {f.number for f in fields})
+    oneofs = {o for f in fields.values() if (o := f.containing_oneof) and len(o.fields) > 1}
+    members = {f.number: f for o in oneofs for f in o.fields}
+    numbers = members | {f.number: f for f in fields.values()}
+    found = find_fields(data, start, end, numbers.keys())
+    for number in found:
+        found[number] = _select_valid(data, numbers[number], found[number])
+    for oneof in oneofs:
+        keep_last_of_oneof(found, oneof, len(start))
     return {
-        f.name: _decode_field(data, len(start), found.get(f.number, []), f, within) for f in fields
+        name: _decode_field(data, len(start), found.get(f.number, []), f)
+        for name, f in fields.items()
     }
 
 
+def _select_valid(data: Bytes, field: FieldDescriptor, found: list[FieldSpans]) -> list[FieldSpans]:
+    """Check the wire types, split packed runs, and drop numbers that a closed enum lacks."""
+    if field.is_repeated:
+        found = _expand_packed(data, field, found)
+    else:
+        for span in found:
+            _check_wire_type(field, span.wire, packed=False)
+    if field.enum_type is None or not field.enum_type.is_closed:
+        return found
+    known = list(field.enum_type.values_by_number)
+    dtype = np.dtype(VARINT_DTYPES[field.type])
+    return [s.select(np.isin(decode_integers(data, s.start, dtype, False), known)) for s in found]
+
+
 def _decode_struct(
-    data: Bytes,
-    start: Ints,
-    end: Ints,
-    kind: Descriptor,
-    within: tuple[str, ...],
-    absent: NDArray[np.bool_] | None,
-) -> pa.StructArray:
-    if kind.full_name in within:
-        raise WireError(f"{kind.full_name} contains itself")
-    if not kind.fields:
-        return pa.nulls(len(start), pa.struct([]))
-    columns = _decode_fields(data, start, end, kind.fields, (*within, kind.full_name))
+    data: Bytes, start: Ints, end: Ints, kind: Descriptor, absent: NDArray[np.bool_] | None
+) -> pa.Array:
+    if _count_columns(kind) > limits.VARIABLES and not kind.GetOptions().map_entry:
+        return _decode_to_json(data, start, end, kind, absent)
+    columns = _decode_fields(data, start, end, list_columns(kind))
+    if not columns:
+        mask = None if absent is None else pa.array(~absent).buffers()[1]
+        return pa.Array.from_buffers(pa.struct([]), len(start), [mask])
     mask = None if absent is None else pa.array(absent)
     return pa.StructArray.from_arrays(list(columns.values()), list(columns), mask=mask)
 
 
-def _find_fields(
-    data: Bytes, start: Ints, end: Ints, wanted: set[int]
-) -> dict[int, list[FieldSpans]]:
-    """Find the wanted fields of every message, in wire order within a message."""
-    found: dict[int, list[FieldSpans]] = {}
-    row, at, end = np.arange(len(start)), start.copy(), np.asarray(end)
-    while True:
-        going = at < end
-        if not going.all():
-            if (at > end).any():
-                raise WireError("a value runs beyond its message")
-            row, at, end = row[going], at[going], end[going]
-        if not len(row):
-            return found
-        tag, at = decode_varints(data, at)
-        if (tag == tag[0]).all():
-            at = _record_field(data, int(tag[0]), row, at, wanted, found)
+@lru_cache(maxsize=1024)
+def _count_columns(kind: Descriptor) -> float:
+    """Return the number of values of a message type; infinity if it contains itself."""
+    counts: dict[Descriptor, float] = {}
+
+    def count(inner: Descriptor, depth: int) -> float:
+        if inner not in counts:
+            counts[inner] = float("inf")  # until its fields are counted: it would contain itself
+            if depth < MAX_DEPTH:
+                fields = [f.message_type for f in list_columns(inner).values()]
+                counts[inner] = sum(1 if f is None else count(f, depth + 1) for f in fields)
+        return counts[inner]
+
+    return count(kind, 0)
+
+
+def _decode_to_json(
+    data: Bytes, start: Ints, end: Ints, kind: Descriptor, absent: NDArray[np.bool_] | None
+) -> pa.Array:
+    """Decode messages to JSON text, one by one."""
+    name, most = kind.full_name, limits.VARIABLES
+    say_once(f"{name} contains itself, or has over {most} fields: its column is JSON text")
+    build = GetMessageClass(kind)
+    rows: list[str | None] = []
+    for k, (first, last) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
+        if absent is not None and absent[k]:
+            rows.append(None)
             continue
-        for one in np.unique(tag):
-            these = np.flatnonzero(tag == one)
-            at[these] = _record_field(data, int(one), row[these], at[these], wanted, found)
+        try:
+            message = build.FromString(data[first:last].tobytes())
+        except DecodeError as e:
+            raise WireError(f"{name}: {e}") from None
+        rows.append(_to_json(message, kind))
+    return pa.array(rows, pa.string())
 
 
-def _record_field(
-    data: Bytes, tag: int, row: Ints, at: Ints, wanted: set[int], found: dict[int, list[FieldSpans]]
-) -> Ints:
-    """Record one field of some messages; return the offset of each message's next field."""
-    number, wire = tag >> 3, tag & 7
-    first = at
-    if wire == VARINT:
-        _, at = decode_varints(data, at)
-    elif wire == FIXED64:
-        at = at + 8
-    elif wire == FIXED32:
-        at = at + 4
-    elif wire == DELIMITED:
-        size, first = decode_varints(data, at)
-        at = first + size.astype(np.int64)
-        if (at < first).any():
-            raise WireError("a length is negative")
-    else:
-        raise WireError(f"field {number} has wire type {wire}, which protobuf 3 does not write")
-    if number in wanted:
-        found.setdefault(number, []).append(FieldSpans(row, wire, first, at))
-    return at
+def _to_json(message: Any, kind: Descriptor) -> str:
+    """Return a message as JSON; as a text in protobuf's format where JSON cannot express it."""
+    try:
+        return json_format.MessageToJson(
+            message, preserving_proto_field_name=True, indent=None, descriptor_pool=kind.file.pool
+        )
+    except (ValueError, TypeError, KeyError, json_format.Error):
+        return json.dumps(text_format.MessageToString(message, as_one_line=True))
 
 
 def _decode_field(
-    data: Bytes,
-    count: int,
-    found: list[FieldSpans],
-    field: FieldDescriptor,
-    within: tuple[str, ...],
+    data: Bytes, count: int, found: list[FieldSpans], field: FieldDescriptor
 ) -> pa.Array:
     """Decode one field of all messages, in row order."""
     if field.is_repeated:
-        spans = _expand_packed(data, field, found)
-        row = _concatenate(s.row for s in spans)
+        row = concatenate_spans(s.row for s in found)
         order = np.argsort(row, kind="stable")
         offsets = np.zeros(count + 1, np.int32)
         np.cumsum(np.bincount(row, minlength=count), out=offsets[1:])
-        start, end = (
-            _concatenate(s.start for s in spans)[order],
-            _concatenate(s.end for s in spans)[order],
-        )
-        values = _decode_values(data, start, end, None, field, within)
-        return pa.ListArray.from_arrays(pa.array(offsets), values)
+        start = concatenate_spans(s.start for s in found)[order]
+        end = concatenate_spans(s.end for s in found)[order]
+        values = _decode_values(data, start, end, None, field)
+        lists = pa.ListArray.from_arrays(pa.array(offsets), values)
+        is_map = field.message_type is not None and field.message_type.GetOptions().map_entry
+        return _keep_last_of_keys(lists) if is_map and len(values) > 1 else lists
     # The last scalar wins, as the specification requires. Absent: an empty span.
     start, end = np.zeros(count, np.int64), np.zeros(count, np.int64)
     present = np.zeros(count, np.bool_)
     for span in found:
-        _check_wire_type(field, span.wire, packed=False)
         start[span.row], end[span.row], present[span.row] = span.start, span.end, True
-    return _decode_values(data, start, end, present, field, within)
+    if field.message_type is not None:
+        if sum(len(span.row) for span in found) > np.count_nonzero(present):
+            data, start, end = merge_occurrences(data, count, found)
+        if field.containing_type.GetOptions().map_entry:  # an absent value of a map is empty
+            present[:] = True
+    return _decode_values(data, start, end, present, field)
 
 
-def _concatenate(parts: Iterable[Ints]) -> Ints:
-    return np.concatenate([np.empty(0, np.int64), *parts])
+def _keep_last_of_keys(lists: pa.ListArray) -> pa.ListArray:
+    """Keep the last value of each key of maps, as the specification requires."""
+    entries = lists.values
+    keys = pa.table({"row": pc.list_parent_indices(lists), "key": entries.field(0)})
+    keys = keys.append_column("at", pa.array(np.arange(len(entries))))
+    last = keys.group_by(["row", "key"], use_threads=False).aggregate([("at", "max")])
+    if len(last) == len(entries):
+        return lists
+    kept = np.sort(last["at_max"].to_numpy())
+    offsets = np.searchsorted(kept, lists.offsets.to_numpy()).astype(np.int32)
+    return pa.ListArray.from_arrays(pa.array(offsets), entries.take(pa.array(kept)))
 
 
 def _check_wire_type(field: FieldDescriptor, wire: int, *, packed: bool) -> None:
@@ -190,7 +230,7 @@ def _check_wire_type(field: FieldDescriptor, wire: int, *, packed: bool) -> None
     elif field.type in FIXED_DTYPES:
         expected = FIXED64 if np.dtype(FIXED_DTYPES[field.type]).itemsize == 8 else FIXED32
     else:
-        expected = DELIMITED
+        expected = START_GROUP if field.type == F.TYPE_GROUP else DELIMITED
     if wire != expected and not (packed and wire == DELIMITED):
         raise WireError(f"{field.full_name} has wire type {wire}, not {expected}")
 
@@ -232,28 +272,43 @@ def _decode_values(
     end: Ints,
     present: NDArray[np.bool_] | None,
     field: FieldDescriptor,
-    within: tuple[str, ...],
 ) -> pa.Array:
     """Decode the values in some spans; use the field's default where ``present`` is false."""
+    if field.message_type is not None:
+        absent = None if present is None or present.all() else ~present
+        return _decode_struct(data, start, end, field.message_type, absent)
+    default = None if field.is_repeated else field.default_value
     if field.type in FIXED_DTYPES:
         dtype = np.dtype(FIXED_DTYPES[field.type])
         return pa.array(
-            decode_present(present, start, lambda at: decode_fixed(data, at, dtype), dtype)
+            decode_present(present, start, lambda at: decode_fixed(data, at, dtype), dtype, default)
         )
     if field.type in VARINT_DTYPES:
-        dtype, zigzag = (
-            np.dtype(VARINT_DTYPES[field.type]),
-            field.type in (F.TYPE_SINT32, F.TYPE_SINT64),
-        )
+        dtype = np.dtype(VARINT_DTYPES[field.type])
+        zigzag = field.type in (F.TYPE_SINT32, F.TYPE_SINT64)
         values = decode_present(
-            present, start, lambda at: decode_integers(data, at, dtype, zigzag), dtype
+            present, start, lambda at: decode_integers(data, at, dtype, zigzag), dtype, default
         )
         return pa.array(values)
-    if field.type in (F.TYPE_STRING, F.TYPE_BYTES):
-        return decode_strings(
-            data, start, end, pa.string() if field.type == F.TYPE_STRING else pa.binary()
-        )
-    if field.message_type is None:
-        raise WireError(f"{field.full_name} has a type that protobuf 3 does not write")
-    absent = None if present is None or present.all() else ~present
-    return _decode_struct(data, start, end, field.message_type, within, absent)
+    return _decode_texts(data, start, end, present, field)
+
+
+def _decode_texts(
+    data: Bytes,
+    start: Ints,
+    end: Ints,
+    present: NDArray[np.bool_] | None,
+    field: FieldDescriptor,
+) -> pa.Array:
+    kind = pa.string() if field.type == F.TYPE_STRING else pa.binary()
+    try:
+        texts = decode_strings(data, start, end, kind)
+    except UnicodeDecodeError:
+        features = getattr(field, "_GetFeatures", lambda: None)()
+        if getattr(features, "utf8_validation", 0) != WITHOUT_UTF8_CHECK:
+            raise WireError("a text is not UTF-8") from None
+        held = decode_strings(data, start, end, pa.binary()).to_pylist()
+        texts = pa.array([value.decode(errors="backslashreplace") for value in held], kind)
+    if present is None or not field.default_value or present.all():
+        return texts
+    return pc.if_else(pa.array(present), texts, pa.scalar(field.default_value, kind))

@@ -14,7 +14,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from numpy.typing import ArrayLike, NDArray
 
 from dmrl.recording.mcap.message_batch import Bytes, Ints
-from dmrl.recording.protobuf.decode import DELIMITED, FIXED32, FIXED64, VARINT
+from dmrl.recording.protobuf.wire_scan import DELIMITED, FIXED32, FIXED64, VARINT
 from dmrl.recording.protobuf.wire_values import FIXED_DTYPES, VARINT_DTYPES
 
 ColumnValue = ArrayLike | Mapping[str, "ColumnValue"]

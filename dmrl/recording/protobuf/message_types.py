@@ -1,19 +1,22 @@
 """Find the message type of a channel, and check that topics carry their type.
 
-A recording contains its own schemas. For the types of dmrl, the built-in schemas are used.
+A recording contains its own schemas. For the types of dmrl, the built-in schemas are used if they
+have all fields of the recording's.
 """
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.message import DecodeError
 
 from dmrl.errors import RecordingError
-from dmrl.messages import build_pool, find_descriptor
+from dmrl.messages import PACKAGES, find_descriptor, serialize_schema
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.file import corrupt_error
 from dmrl.recording.mcap.summary_index import TopicInfo
+from dmrl.recording.protobuf.definitions import build_type
 from dmrl.topics import find_topic
 
 
@@ -35,36 +38,67 @@ def require_types(path: Path, topics: Mapping[str, TopicInfo], chosen: Iterable[
 
 
 def find_channel_descriptor(path: Path, channel: Channel) -> Descriptor:
-    """Return the message type of a channel: dmrl's own if it has that name, else the recording's.
+    """Return the message type of a channel.
 
     Raises
     ------
     RecordingError
-        If the channel is not protobuf, or its schema cannot be read.
+        If the channel is not protobuf, its schema defines no such message, or a topic of dmrl
+        carries a message with the name of dmrl's and other fields.
     """
     if channel.encoding != "protobuf" or channel.schema_encoding != "protobuf":
         raise RecordingError(
             f"{path}: {channel.topic} is {channel.encoding or 'without encoding'}, not protobuf. "
             "Leave it out, or convert it: dmrl convert --help"
         )
+    name = channel.schema_name
     try:
-        return find_descriptor(channel.schema_name)
-    except KeyError:
-        pass
-    try:
-        return build_pool(channel.schema_data).FindMessageTypeByName(channel.schema_name)
+        kind = _find_type(name, channel.schema_data)
     except (DecodeError, TypeError, KeyError) as e:
-        raise corrupt_error(path, f"schema {channel.schema_name}: {e}") from e
+        why = " ".join(str(e).split())
+        raise RecordingError(
+            f"{path}: the schema {name} of {channel.topic} cannot be used: {why}. Leave the topic "
+            "out: dmrl trim"
+        ) from e
+    row = find_topic(channel.topic)
+    if row is not None and name == row.message and not _has_fields(kind, find_descriptor(name)):
+        raise RecordingError(
+            f"{path}: {channel.topic} carries another {name}, without all fields of dmrl's. Leave "
+            "it out, or convert it: dmrl convert --help"
+        )
+    return kind
 
 
-def require_one_type(path: Path, topic: str, kinds: set[Descriptor]) -> Descriptor:
-    """Return the common message type of a topic's channels. After a merge there can be several.
+@lru_cache(maxsize=256)
+def _find_type(name: str, schema_data: bytes) -> Descriptor:
+    """Return dmrl's own type if it has that name and the recording's fields, else the latter's.
 
     Raises
     ------
-    RecordingError
-        If the types differ.
+    DecodeError, KeyError, TypeError
+        If the schema defines no such message.
     """
-    if len(kinds) != 1:
-        raise RecordingError(f"{path}: {topic} mixes message types. Split it: dmrl trim --help")
-    return kinds.pop()
+    own = None
+    if name.startswith(tuple(f"{package}." for package in PACKAGES)):
+        with suppress(KeyError):
+            own = find_descriptor(name)
+    if own is not None and (not schema_data or schema_data == serialize_schema(name)):
+        return own
+    recorded = build_type(name, schema_data)
+    return own if own is not None and _has_fields(own, recorded) else recorded
+
+
+def _has_fields(kind: Descriptor, other: Descriptor, within: tuple[str, ...] = ()) -> bool:
+    """Return whether a type has all fields of another, with their names, numbers and types."""
+    for theirs in other.fields:
+        mine = kind.fields_by_number.get(theirs.number)
+        if mine is None or (mine.name, mine.type, mine.is_repeated) != (
+            *(theirs.name, theirs.type, theirs.is_repeated),
+        ):
+            return False
+        inner, wanted = mine.message_type, theirs.message_type
+        if inner is None or wanted is None or wanted.full_name in within:
+            continue
+        if not _has_fields(inner, wanted, (*within, wanted.full_name)):
+            return False
+    return True

@@ -66,11 +66,12 @@ def decode_present(
     start: Ints,
     read: Callable[[Ints], NDArray[np.generic]],
     dtype: np.dtype[np.generic],
+    default: float | None = None,
 ) -> NDArray[np.generic]:
-    """Read the values at ``start``; return zero for those that are absent."""
+    """Read the values at ``start``; return the default, or zero, for those that are absent."""
     if present is None or present.all():
         return read(start)
-    out = np.zeros(len(start), dtype.newbyteorder("="))
+    out = np.full(len(start), default or 0, dtype.newbyteorder("="))
     out[present] = read(start[present])
     return out
 
@@ -97,6 +98,8 @@ def decode_integers(
     """Read (N,) integers, enums or booleans, stored as varints."""
     value, _ = decode_varints(data, at)
     if zigzag:
+        if dtype.itemsize == 4:  # a longer varint is cut first, then decoded
+            value &= np.uint64(0xFFFFFFFF)
         value = (value >> np.uint64(1)) ^ (np.uint64(0) - (value & np.uint64(1)))
     return value.astype(np.bool_) if dtype == np.bool_ else value.view(np.int64).astype(dtype)
 
@@ -107,7 +110,9 @@ def decode_strings(data: Bytes, start: Ints, end: Ints, kind: pa.DataType) -> pa
     Raises
     ------
     WireError
-        If a batch has more than 2 GiB of text, or a string is not UTF-8.
+        If a batch has more than 2 GiB of text.
+    UnicodeDecodeError
+        If a string is not UTF-8.
     """
     size = end - start
     offsets = np.zeros(len(size) + 1, np.int64)
@@ -125,5 +130,5 @@ def decode_strings(data: Bytes, start: Ints, end: Ints, kind: pa.DataType) -> pa
     try:
         made.validate(full=True)
     except pa.ArrowInvalid:
-        raise WireError("a text is not UTF-8") from None
+        raise UnicodeDecodeError("utf-8", b"", 0, 0, "in a batch of texts") from None
     return made

@@ -1,0 +1,154 @@
+"""Find the fields of protobuf messages in their bytes, thousands of messages at a time.
+
+Every round reads the next tag of every message, groups the messages by tag, and skips the values.
+Source: Protocol Buffers encoding specification.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from google.protobuf.descriptor import OneofDescriptor
+from numpy.typing import NDArray
+
+from dmrl.recording.mcap.message_batch import Bytes, Ints
+from dmrl.recording.protobuf.wire_values import WireError, decode_varints
+
+VARINT, FIXED64, DELIMITED, START_GROUP, END_GROUP, FIXED32 = range(6)
+MAX_DEPTH = 100
+"""Nesting of messages, the limit of Google's own decoders."""
+
+
+@dataclass(frozen=True, slots=True)
+class FieldSpans:
+    """Occurrences of one field: row and byte range of each value.
+
+    For varints ``start`` is the first byte of the value, for delimited values and groups that of
+    the payload.
+    """
+
+    row: Ints
+    wire: int
+    start: Ints
+    end: Ints
+
+    def select(self, keep: NDArray[np.bool_]) -> "FieldSpans":
+        """Return some of the occurrences."""
+        return FieldSpans(self.row[keep], self.wire, self.start[keep], self.end[keep])
+
+
+def find_fields(
+    data: Bytes, start: Ints, end: Ints, wanted: set[int]
+) -> dict[int, list[FieldSpans]]:
+    """Find the wanted fields of every message, in wire order within a message.
+
+    Raises
+    ------
+    WireError
+        If the bytes do not conform to the wire format.
+    """
+    found: dict[int, list[FieldSpans]] = {}
+    row, at, end = np.arange(len(start)), start.copy(), np.asarray(end)
+    while True:
+        going = at < end
+        if not going.all():
+            if (at > end).any():
+                raise WireError("a value runs beyond its message")
+            row, at, end = row[going], at[going], end[going]
+        if not len(row):
+            return found
+        tag, at = decode_varints(data, at)
+        if (tag == tag[0]).all():
+            at = _record_field(data, int(tag[0]), row, at, wanted, found)
+            continue
+        for one in np.unique(tag):
+            these = np.flatnonzero(tag == one)
+            at[these] = _record_field(data, int(one), row[these], at[these], wanted, found)
+
+
+def _record_field(
+    data: Bytes, tag: int, row: Ints, at: Ints, wanted: set[int], found: dict[int, list[FieldSpans]]
+) -> Ints:
+    """Record one field of some messages; return the offset of each message's next field."""
+    first, last, after = _locate_value(data, tag, at, 0)
+    if tag >> 3 in wanted:
+        found.setdefault(tag >> 3, []).append(FieldSpans(row, tag & 7, first, last))
+    return after
+
+
+def _locate_value(data: Bytes, tag: int, at: Ints, depth: int) -> tuple[Ints, Ints, Ints]:
+    """Return the first byte of each value of a tag, its end, and the offset of the next field."""
+    number, wire = tag >> 3, tag & 7
+    if not number:
+        raise WireError("a field has number 0")
+    if wire == VARINT:
+        _, after = decode_varints(data, at)
+    elif wire == FIXED64:
+        after = at + 8
+    elif wire == FIXED32:
+        after = at + 4
+    elif wire == DELIMITED:
+        size, first = decode_varints(data, at)
+        after = first + size.astype(np.int64)
+        if (after < first).any():
+            raise WireError("a length is negative")
+        return first, after, after
+    elif wire == START_GROUP:
+        return at, *_skip_groups(data, number, at, depth + 1)
+    else:
+        raise WireError(f"field {number} has wire type {wire}, which cannot begin a value")
+    return at, after, after
+
+
+def _skip_groups(data: Bytes, number: int, start: Ints, depth: int) -> tuple[Ints, Ints]:
+    """Return the offset of the end tag of each group, and the offset after that tag."""
+    if depth > MAX_DEPTH:
+        raise WireError("groups are nested too deep")
+    at, end, going = start.copy(), start.copy(), np.arange(len(start))
+    while len(going):
+        end[going] = at[going]
+        tag, at[going] = decode_varints(data, at[going])
+        going, tag = going[tag != (number << 3 | END_GROUP)], tag[tag != (number << 3 | END_GROUP)]
+        for one in np.unique(tag):
+            these = going[tag == one]
+            at[these] = _locate_value(data, int(one), at[these], depth)[2]
+        if (at > len(data)).any():
+            raise WireError("a value runs beyond its message")
+    return end, at
+
+
+def concatenate_spans(parts: Iterable[Ints]) -> Ints:
+    """Concatenate rows or offsets of several spans."""
+    return np.concatenate([np.empty(0, np.int64), *parts])
+
+
+def keep_last_of_oneof(
+    found: dict[int, list[FieldSpans]], oneof: OneofDescriptor, count: int
+) -> None:
+    """Drop the members of a oneof that a later member of the same message replaces."""
+    last = {f.number: np.full(count, -1, np.int64) for f in oneof.fields if f.number in found}
+    for number, offsets in last.items():
+        for span in found[number]:
+            offsets[span.row] = span.start
+    for number in last if len(last) > 1 else ():
+        others = np.max([offsets for n, offsets in last.items() if n != number], axis=0)
+        found[number] = [span.select(span.start > others[span.row]) for span in found[number]]
+
+
+def merge_occurrences(
+    data: Bytes, count: int, found: Sequence[FieldSpans]
+) -> tuple[Bytes, Ints, Ints]:
+    """Concatenate the payloads of sub-messages that occur several times in one message.
+
+    The specification defines that as their merge. Returns bytes, and (N,) start and end in them.
+    """
+    row = concatenate_spans(span.row for span in found)
+    order = np.argsort(row, kind="stable")
+    start = concatenate_spans(span.start for span in found)[order]
+    size = concatenate_spans(span.end for span in found)[order] - start
+    before = np.cumsum(size) - size
+    merged = data[np.arange(int(size.sum())) + np.repeat(start - before, size)]
+    sizes = np.zeros(count, np.int64)
+    np.add.at(sizes, row[order], size)
+    end = np.cumsum(sizes)
+    return merged, end - sizes, end

@@ -1,0 +1,257 @@
+"""Definitions of every shape, against Google's own decoder."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor import Descriptor
+from google.protobuf.descriptor_pb2 import (
+    FieldDescriptorProto,
+    FileDescriptorProto,
+    FileDescriptorSet,
+)
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from mcap.writer import Writer
+
+import dmrl
+from dmrl.errors import RecordingError
+from dmrl.recording.protobuf.decode import decode
+from dmrl.recording.protobuf.definitions import build_type
+from dmrl.stages.convert import Settings, run
+
+from .definitions_of_any_shape import from_table, iter_definitions, plain
+
+F = FieldDescriptorProto
+
+
+def rows(parts: list[bytes], kind: Descriptor) -> list[dict[str, Any]]:
+    end = np.cumsum([len(p) for p in parts], dtype=np.int64)
+    start = end - np.array([len(p) for p in parts], np.int64)
+    got = decode(np.frombuffer(b"".join(parts), np.uint8), start, end, kind)
+    for column in got.values():
+        column.validate(full=True)
+    lists = {name: column.to_pylist() for name, column in got.items()}
+    return [{name: lists[name][k] for name in lists} for k in range(len(parts))]
+
+
+def compare(seeds: range) -> int:
+    """Decode messages of random definitions; return how many were compared."""
+    count = 0
+    for made, pool in iter_definitions(seeds):
+        schema = made.schema()
+        for name in made.messages:
+            theirs, ours = pool.FindMessageTypeByName(name[1:]), build_type(name[1:], schema)
+            parts = made.payloads(theirs, 6)
+            wanted = [plain(GetMessageClass(theirs).FromString(part)) for part in parts]
+            got = [from_table(row, ours) for row in rows(parts, ours)]
+            assert repr(got) == repr(wanted), (made.rng, name)
+            count += len(parts)
+    return count
+
+
+@pytest.mark.heavy
+def test_definitions_of_every_shape_decode_as_google_decodes_them() -> None:
+    assert compare(range(25)) > 250
+
+
+@pytest.mark.slow
+def test_two_thousand_definitions_decode_as_google_decodes_them() -> None:
+    assert compare(range(1000, 3000)) > 20_000
+
+
+def message(file: FileDescriptorProto, name: str, **fields: Any) -> None:
+    """Add a message whose fields are types, by name."""
+    added = file.message_type.add(name=name)
+    for number, (field, kind) in enumerate(fields.items(), 1):
+        held = added.field.add(name=field, number=number, label=F.LABEL_OPTIONAL)
+        held.json_name = f"json{number}"
+        held.type = kind if isinstance(kind, int) else F.TYPE_MESSAGE
+        if isinstance(kind, str):
+            held.type_name = kind
+
+
+def proto(name: str, package: str = "my", **more: Any) -> FileDescriptorProto:
+    return FileDescriptorProto(name=name, package=package, syntax="proto3", **more)
+
+
+def build(name: str, *files: FileDescriptorProto) -> Any:
+    """Google's class of a message, of files in the order in which they can be added."""
+    pool = DescriptorPool()
+    for file in files:
+        pool.AddSerializedFile(file.SerializeToString())
+    return GetMessageClass(pool.FindMessageTypeByName(name))
+
+
+Sent = tuple[str, str, bytes, list[bytes]]
+
+
+def write(path: Path, *sent: Sent) -> Path:
+    """A file of mcap's own writer: of each topic, its schema's name and data, and messages."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for first, (topic, name, schema, parts) in enumerate(sent):
+            number = writer.register_schema(name, "protobuf", schema)
+            channel = writer.register_channel(topic, "protobuf", number)
+            for k, data in enumerate(parts):
+                time_ns = 10**18 + k * 10**8 + first
+                writer.add_message(channel, time_ns, data, time_ns, sequence=k)
+        writer.finish()
+    return path
+
+
+def packed(*files: FileDescriptorProto) -> bytes:
+    return FileDescriptorSet(file=files).SerializeToString()
+
+
+def test_imports_that_no_file_needs_or_has_are_no_damage(tmp_path: Path) -> None:
+    """Options of nanopb or of a validator are imported, and their files seldom come along."""
+    file = proto("m.proto", dependency=["nanopb.proto", "other.proto"])
+    message(file, "M", x=F.TYPE_DOUBLE, far=".other.Far")
+    whole = proto("m.proto", dependency=["other.proto"])
+    message(whole, "M", x=F.TYPE_DOUBLE, far=".other.Far")
+    other = proto("other.proto", "other")
+    message(other, "Far", y=F.TYPE_INT32)
+    made = build("my.M", other, whole)
+    data = made(x=1.5, far={"y": 7}).SerializeToString()
+    found = dmrl.open(write(tmp_path / "a.mcap", ("/x", "my.M", packed(file), [data] * 3)))
+    table = found["/x"].to_arrow()
+    assert table["x"].to_pylist() == [1.5] * 3
+    assert table["far"].to_pylist() == [b"\x08\x07"] * 3  # nobody says what it is
+
+
+def test_two_files_may_define_one_type(tmp_path: Path) -> None:
+    one, two = proto("a.proto"), proto("dir/a.proto", dependency=["a.proto"])
+    for file in (one, two):
+        message(file, "P", x=F.TYPE_DOUBLE)
+    message(two, "Q", p=".my.P")
+    only = proto("dir/a.proto", dependency=["a.proto"])
+    message(only, "Q", p=".my.P")
+    data = build("my.Q", one, only)(p={"x": 2.5}).SerializeToString()
+    path = write(tmp_path / "a.mcap", ("/x", "my.Q", packed(two, one), [data]))
+    assert dmrl.open(path)["/x"].to_arrow()["p"].to_pylist() == [{"x": 2.5}]
+
+
+def test_a_topic_whose_type_grows_has_the_columns_of_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sent: list[Sent] = []
+    inner = proto("in.proto")
+    message(inner, "In", a=F.TYPE_INT32)
+    for fields in (
+        {"x": F.TYPE_DOUBLE, "inner": ".my.In"},
+        {"x": F.TYPE_DOUBLE, "inner": ".my.In", "n": F.TYPE_INT32},
+        {"x": F.TYPE_STRING, "inner": ".my.In", "n": F.TYPE_INT64},
+    ):
+        file = proto("m.proto", dependency=["in.proto"])
+        message(file, "M", **fields)
+        made = build("my.M", inner, file)
+        text = "one" if fields["x"] == F.TYPE_STRING else 1.0
+        values = {"x": text, "inner": {"a": 4}} | ({"n": 9} if "n" in fields else {})
+        data = [made(**values).SerializeToString()] * 4
+        sent.append(("/x", "my.M", packed(file, inner), data))
+    table = dmrl.open(write(tmp_path / "a.mcap", *sent))["/x"].to_arrow()
+    assert (np.diff(table["log_time"].to_numpy()) > 0).all()
+    assert table["x"].to_pylist() == [1.0, 1.0, None] * 4
+    assert table["x_"].to_pylist() == [None, None, "one"] * 4
+    assert table["n"].to_pylist() == [None, 9, 9] * 4
+    assert table["inner"].to_pylist() == [{"a": 4}] * 12
+    assert "/x: x has several types: one of them is x_" in capsys.readouterr().err
+    assert dmrl.open(tmp_path / "a.mcap")["/x"].to_arrow(fields=["n"])["n"].null_count == 4
+
+
+def test_a_message_of_another_with_the_name_of_ours_is_its_own(tmp_path: Path) -> None:
+    short = proto("h.proto", "")
+    message(short, "Height", height_m=F.TYPE_STRING)
+    newer = proto("n.proto", "dmrl.v1")
+    message(newer, "Height", height_m=F.TYPE_DOUBLE, floor=F.TYPE_INT32)
+    odd = proto("o.proto", "dmrl.v1")
+    message(odd, "Height", metres=F.TYPE_DOUBLE)
+    older = proto("e.proto", "dmrl.v1")
+    message(older, "Height")
+    sent: list[Sent] = [
+        (
+            "/a",
+            "Height",
+            packed(short),
+            [build("Height", short)(height_m="2 m").SerializeToString()],
+        ),
+        (
+            "/cf1/height",
+            "dmrl.v1.Height",
+            packed(newer),
+            [build("dmrl.v1.Height", newer)(height_m=2, floor=3).SerializeToString()],
+        ),
+        ("/cf2/height", "dmrl.v1.Height", packed(odd), [b""]),
+        ("/b", "dmrl.v1.Height", packed(odd), [b""]),
+        ("/cf3/height", "dmrl.v1.Height", packed(older), [b""]),
+    ]
+    found = dmrl.open(write(tmp_path / "a.mcap", *sent))
+    assert found["/a"].to_arrow()["height_m"].to_pylist() == ["2 m"]
+    assert found["/cf1/height"].to_arrow()["floor"].to_pylist() == [3]
+    assert found["/b"].to_arrow().column_names[2:] == ["metres"]
+    assert found["/cf3/height"].to_arrow()["height_m"].to_pylist() == [0.0]  # as our own default
+    with pytest.raises(RecordingError, match=r"/cf2/height carries another dmrl.v1.Height"):
+        found["/cf2/height"].to_arrow()
+
+
+def test_fields_named_as_a_time_are_columns_of_their_own(tmp_path: Path) -> None:
+    file = FileDescriptorProto(name="m.proto", package="my", syntax="proto2")
+    names = ("log_time", "log_time_", "publish_time", "time_s", "status")
+    message(file, "M", **dict.fromkeys(names, F.TYPE_STRING))
+    data = build("my.M", file)(**{name: name for name in names}).SerializeToString()
+    path = write(tmp_path / "a.mcap", ("/x", "my.M", packed(file), [data] * 2))
+    topic = dmrl.open(path)["/x"]
+    table, frame, array = topic.to_arrow(), topic.to_pandas(), topic.to_numpy()
+    for held in (table, frame, array):
+        assert list(held["log_time"]) == [10**18, 10**18 + 10**8] or table is held
+        assert [str(v) for v in held["log_time__"]] == ["log_time"] * 2
+        assert [str(v) for v in held["log_time_"]] == ["log_time_"] * 2
+        assert [str(v) for v in held["publish_time_"]] == ["publish_time"] * 2
+    assert table["log_time"].to_pylist() == [10**18, 10**18 + 10**8]
+    assert frame.index.tolist() == [0.0, 0.1] and list(frame["time_s_"]) == ["time_s"] * 2
+    assert list(frame["status"]) == ["status"] * 2
+    run(path, tmp_path / "csv", Settings(to="csv"))
+    lines = (tmp_path / "csv" / "x.csv").read_text().splitlines()
+    assert lines[0] == "log_time,publish_time,log_time__,log_time_,publish_time_,time_s,status"
+    assert lines[1].startswith("1000000000000000000,1000000000000000000,log_time,log_time_,")
+
+
+def test_what_is_no_definition_is_one_true_line(tmp_path: Path) -> None:
+    file = proto("m.proto")
+    message(file, "M", x=F.TYPE_DOUBLE)
+    sent: list[Sent] = [("/x", "my.Other", packed(file), [b""]), ("/y", "my.M", b"\xff", [b""])]
+    found = dmrl.open(write(tmp_path / "a.mcap", *sent))
+    for topic in ("/x", "/y"):
+        with pytest.raises(RecordingError, match=f"of {topic} cannot be used") as e:
+            found[topic].to_arrow()
+        assert "damaged" not in str(e.value)
+
+
+def test_an_absent_message_with_a_list_in_it_keeps_its_row(tmp_path: Path) -> None:
+    file = proto("m.proto")
+    message(file, "P", a=F.TYPE_INT32)
+    message(file, "L")
+    file.message_type[1].field.add(
+        name="p", number=1, label=F.LABEL_REPEATED, type=F.TYPE_MESSAGE, type_name=".my.P"
+    )
+    message(file, "M", held=".my.L")
+    data = build("my.M", file)(held={"p": [{"a": 1}, {"a": 2}]}).SerializeToString()
+    path = write(tmp_path / "a.mcap", ("/x", "my.M", packed(file), [b"", data]))
+    assert len(dmrl.open(path)["/x"].to_pandas()) == 3
+
+
+def test_a_type_wider_than_a_table_is_text(tmp_path: Path) -> None:
+    """Ten types of ten fields each of the type before: a table of 10**10 columns."""
+    file = proto("m.proto")
+    message(file, "T0", a=F.TYPE_INT32)
+    for k in range(1, 11):
+        message(file, f"T{k}", **{f"f{n}": f".my.T{k - 1}" for n in range(10)})
+    made = build("my.T10", file)
+    value = made()
+    value.f3.f3.f3.SetInParent()
+    path = write(tmp_path / "a.mcap", ("/x", "my.T10", packed(file), [value.SerializeToString()]))
+    table = dmrl.open(path)["/x"].to_arrow()
+    assert table["f3"].to_pylist() == ['{"f3": {"f3": {}}}'] and table["f4"].to_pylist() == [None]
