@@ -72,6 +72,14 @@ class Options:
         Grey images are raw images of a colour sensor (RGGB).
     columns
         TOML file that maps the columns of a CSV file; None: not given.
+    bits
+        Significant bits of 16-bit pixels: 2^bits - 1 becomes 255.
+    as_stored
+        Do not turn images upright by their EXIF orientation.
+    robot_width_m
+        Width of the robots, metres, from which boxes give depths; None: they give none.
+    unlabelled
+        Pictures without a label file are not labelled; else they show nobody.
     """
 
     robot: str = "cf1"
@@ -82,6 +90,10 @@ class Options:
     size_px: tuple[int, int] | None = None
     raw: bool = False
     columns: Path | None = None
+    bits: int = 16
+    as_stored: bool = False
+    robot_width_m: float | None = None
+    unlabelled: bool = False
 
     def refuse(self, name: str, why: str) -> None:
         """Raise SettingError if the user gave an option that has no effect on the source.

@@ -21,7 +21,7 @@ from dmrl.terminal.progress import say
 
 GUESS_ORDER = (
     *("locanet", "csv", "uwb-tiers", "rosbag2", "nanocockpit", "cfclient"),
-    *("cfusdlog", "aideck-stream", "hyperflash"),
+    *("cfusdlog", "aideck-stream", "hyperflash", "coco", "voc", "yolo"),
 )
 """Formats to try first. The order matters: sources of some contain files that match later ones."""
 

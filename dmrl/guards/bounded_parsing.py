@@ -1,4 +1,4 @@
-"""Parse JSON, TOML and NumPy archives from untrusted files within limits."""
+"""Parse JSON, TOML, YAML and NumPy archives from untrusted files within limits."""
 
 import json
 import lzma
@@ -45,6 +45,31 @@ def parse_toml(text: str) -> dict[str, Any]:
         return table
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
+
+
+def parse_yaml(text: str) -> dict[str, Any]:
+    """Return the table of a YAML document without aliases, which can multiply its size.
+
+    Raises
+    ------
+    ValueError
+        If it is not a YAML table, has aliases, or exceeds the limit of characters or depth.
+    ModuleNotFoundError
+        If PyYAML is not installed.
+    """
+    import yaml  # noqa: PLC0415 - an extra
+
+    if len(text) > limits.TOML_CHARACTERS:
+        raise ValueError(f"it has {len(text)} characters, more than {limits.TOML_CHARACTERS}")
+    try:
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise ValueError("it has aliases")
+        table = _check_limits(yaml.safe_load(text))
+    except (yaml.YAMLError, RecursionError) as e:
+        raise ValueError(str(e)) from None
+    if not isinstance(table, dict):
+        raise ValueError("it is not a table of keys")
+    return table
 
 
 ARCHIVE_ERRORS = (

@@ -28,8 +28,8 @@ def load_opencv(extra: str = "bayer", what: str = "a raw picture") -> ModuleType
     return cv2
 
 
-def demosaic(raw: Grey) -> Rgb:
-    """Convert a raw RGGB image to RGB, bilinearly, as OpenCV does.
+def demosaic(raw: Grey, pattern: str = "RGGB") -> Rgb:
+    """Convert a raw Bayer image to RGB, bilinearly, as OpenCV does.
 
     The AI-deck's sensor is RGGB: red at the first pixel, blue one down and one to the right. The
     firmware's own conversion of published frames is identical to within 1 of 255.
@@ -38,6 +38,8 @@ def demosaic(raw: Grey) -> Rgb:
     ----------
     raw
         (H, W), uint8, at least 2 x 2.
+    pattern
+        Colours of the first two pixels of the first two rows: RGGB, BGGR, GBRG or GRBG.
 
     Returns
     -------
@@ -50,7 +52,7 @@ def demosaic(raw: Grey) -> Rgb:
         If OpenCV is not installed.
     """
     cv2 = load_opencv()
-    return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2RGB), np.uint8)
+    return np.asarray(cv2.cvtColor(raw, getattr(cv2, f"COLOR_Bayer{pattern}2RGB")), np.uint8)
 
 
 def to_bayer(rgb: Rgb) -> Grey:

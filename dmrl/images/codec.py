@@ -1,7 +1,7 @@
 """Image codec: encoded bytes to arrays and back. The only user of Pillow's decoders.
 
-Arrays are (height, width, 3), uint8, RGB. EXIF orientation is not applied: a camera's
-calibration refers to the pixels as stored.
+Arrays are (height, width, 3), uint8, RGB. EXIF orientation is not applied unless asked for: the
+calibration of a recorded camera refers to the pixels as stored.
 """
 
 import re
@@ -12,7 +12,7 @@ from io import BytesIO
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageOps
 
 from dmrl.errors import SourceError
 from dmrl.guards import limits
@@ -20,9 +20,23 @@ from dmrl.guards import limits
 Rgb = NDArray[np.uint8]
 Grey = NDArray[np.uint8]
 
-FORMATS = ("PNG", "JPEG", "PPM", "BMP")
+FORMATS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP", "GIF")
 # Exceptions that Pillow's decoders raise on broken images.
-DECODE_ERRORS = (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError)
+DECODE_ERRORS = (
+    *(OSError, SyntaxError, ValueError, LookupError, TypeError, AttributeError, EOFError),
+    *(RuntimeError, ArithmeticError, struct.error, Image.DecompressionBombError),
+)
+BITS = 16
+"""Significant bits of a 16-bit channel, unless a source states fewer."""
+ORIENTATION_TAG = 0x0112
+"""EXIF tag of the orientation; 1 is upright."""
+
+
+def scale_to_8_bits(values: NDArray[np.uint16], bits: int = BITS) -> NDArray[np.uint8]:
+    """Scale [0, 2^bits - 1] to [0, 255], the same for every image; larger values become 255."""
+    most = (1 << bits) - 1
+    scaled = np.minimum(values, most).astype(np.uint32) * 255
+    return ((scaled + most // 2) // most).astype(np.uint8)
 
 
 _spent = 0
@@ -76,14 +90,14 @@ def _check_decodable(image: Image.Image, data: bytes, what: object, most: int) -
 
 @dataclass(frozen=True, slots=True)
 class ImageHeader:
-    """A PNG, JPEG, PPM or BMP whose header was read, but no pixel.
+    """An image whose header was read, but no pixel.
 
     Parameters
     ----------
     width_px, height_px
-        Size of the image.
+        Size of the image as stored.
     kind
-        png, jpeg, ppm or bmp.
+        Its format in lower case: one of ``FORMATS``.
     """
 
     width_px: int
@@ -93,8 +107,29 @@ class ImageHeader:
     _data: bytes
     _what: object
 
-    def decode(self, most: int) -> Rgb:
-        """Decode the pixels, once. The image may have at most ``most``: see `decode`."""
+    @property
+    def has_16_bits(self) -> bool:
+        """Whether its grey values have more than 8 bits."""
+        return self._image.mode.startswith("I")
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether EXIF states another orientation than upright."""
+        try:
+            return self._image.getexif().get(ORIENTATION_TAG, 1) in range(2, 9)
+        except DECODE_ERRORS:
+            return False
+
+    @property
+    def is_animated(self) -> bool:
+        """Whether the file holds further images, which are never decoded."""
+        try:
+            return bool(getattr(self._image, "is_animated", False))
+        except DECODE_ERRORS:
+            return False
+
+    def decode(self, most: int, *, bits: int = BITS, upright: bool = False) -> Rgb:
+        """Decode the pixels of the first image, once: see `decode`."""
         with self._image as image:
             _check_decodable(image, self._data, self._what, most)
             try:
@@ -102,13 +137,27 @@ class ImageHeader:
                     warnings.simplefilter("ignore")
                     if image.mode == "P" and image.palette is None:  # Pillow only asserts it
                         raise ValueError("its palette is missing")
-                    # Converting an RGB image would copy it.
-                    return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
+                    return _to_rgb(image, bits, upright=upright)
             except DECODE_ERRORS as e:
                 why = " ".join(str(e).split())
                 raise SourceError(
                     f"{self._what} cannot be decoded: {why}. Remove it or save it again"
                 ) from None
+
+
+def _to_rgb(image: Image.Image, bits: int, *, upright: bool) -> Rgb:
+    image.seek(0)
+    if image.mode == "F" or (image.mode == "I" and image.format != "PPM"):
+        raise ValueError("pixels of 32 bits have no stated range")
+    if upright:
+        image = ImageOps.exif_transpose(image)
+    if image.mode.startswith("I"):
+        # Pillow scales the grey values of a PPM to 16 bits already.
+        grey = np.asarray(image).clip(0, 65535).astype(np.uint16)
+        grey = scale_to_8_bits(grey, BITS if image.format == "PPM" else bits)
+        return np.ascontiguousarray(np.broadcast_to(grey[..., None], (*grey.shape, 3)))
+    # Converting an RGB image would copy it.
+    return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
 
 
 def read_header(data: bytes, what: object = "the image") -> ImageHeader:
@@ -131,7 +180,7 @@ def read_header(data: bytes, what: object = "the image") -> ImageHeader:
 
 
 def decode(data: bytes, what: object = "the image", most: int = limits.FRAME_PIXELS) -> Rgb:
-    """Decode a PNG, JPEG, PPM or BMP.
+    """Decode the first image of a file of one of ``FORMATS``.
 
     Parameters
     ----------
@@ -145,7 +194,8 @@ def decode(data: bytes, what: object = "the image", most: int = limits.FRAME_PIX
     Returns
     -------
     Rgb
-        (H, W, 3), uint8, RGB. Grey becomes RGB, transparency is dropped.
+        (H, W, 3), uint8, RGB. Grey becomes RGB, transparency is dropped, 16 bits become 8: see
+        `scale_to_8_bits`.
 
     Raises
     ------
@@ -156,7 +206,7 @@ def decode(data: bytes, what: object = "the image", most: int = limits.FRAME_PIX
 
 
 def read_size(data: bytes, what: object = "the image") -> tuple[int, int, str]:
-    """Return width and height in pixels and format (png, jpeg, ppm, bmp), without decoding.
+    """Return width and height in pixels and format, one of ``FORMATS``, without decoding.
 
     Raises
     ------

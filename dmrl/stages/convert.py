@@ -59,6 +59,17 @@ class Settings:
         nanobench.
     raw
         images: grey pictures are as the AI-deck's colour sensor gave them; make them RGB.
+    bits
+        Significant bits of pixels of 16 bits: 2^bits - 1 becomes 255. 12 for the values of a 12-bit
+        sensor.
+    as_stored
+        images: keep pictures as they are stored. Without it, they are turned upright as their EXIF
+        orientation says.
+    robot_width_m
+        Width of the robots, metres: labels without depth get one from the width of their box.
+        Needs the camera.
+    unlabelled
+        yolo: pictures without a label file are not labelled. Without it, they show nobody.
     strict
         End with an error if anything of the source cannot be used. Without it, such things are left
         out and counted.
@@ -77,6 +88,10 @@ class Settings:
     height_px: Positive | None = None
     columns: Path | None = None
     raw: Annotated[bool, Parameter(negative=())] = False
+    bits: Annotated[int, Parameter(validator=validators.Number(gte=9, lte=16))] = 16
+    as_stored: Annotated[bool, Parameter(negative=())] = False
+    robot_width_m: Annotated[float | None, Parameter(validator=validators.Number(gt=0))] = None
+    unlabelled: Annotated[bool, Parameter(negative=())] = False
     strict: Strict = False
     to: Literal["csv", "parquet", "ros2"] | None = None
 
@@ -167,6 +182,10 @@ def _to_options(settings: Settings) -> "Options":
         size_px=None if width_px is None or height_px is None else (width_px, height_px),
         raw=settings.raw,
         columns=settings.columns,
+        bits=settings.bits,
+        as_stored=settings.as_stored,
+        robot_width_m=settings.robot_width_m,
+        unlabelled=settings.unlabelled,
     )
 
 

@@ -6,6 +6,7 @@ A record has 71,704 bytes: 224 x 320 raw pixels of the sensor (rows 10 to 233 an
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -14,10 +15,10 @@ import numpy as np
 from dmrl.errors import SourceError
 from dmrl.formats.aideck import published_firmware
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
+from dmrl.formats.files.pictures import PictureConverter, crop_camera
 from dmrl.geometry.frames import AIDECK
-from dmrl.images import codec
 from dmrl.images.bayer import demosaic
-from dmrl.samples.sample import Sample, build_calibration, build_image
+from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import leave_out
 
 HEIGHT_PX, WIDTH_PX = 224, 320
@@ -95,13 +96,15 @@ def load_content(source: Path, options: Options) -> Content:
 
 
 def _iter_samples(source: Path, options: Options) -> Iterator[Sample]:
-    camera, peer = options.camera or AIDECK, options.names.get("0", "cf2")
-    yield build_calibration(0, options.robot, camera)
+    stored, peer = options.camera or AIDECK, options.names.get("0", "cf2")
+    converter = PictureConverter(replace(options, camera=stored), source)
     with source.open("rb") as stream:
         for k, record in enumerate(iter_records(stream, source)):
             time_ns = round(k * 1e9 / options.rate_hz)
-            png = codec.encode_png(demosaic(record["raw"]))
-            yield build_image(time_ns, options.robot, png, "png")
+            rgb = demosaic(record["raw"])
+            crop, samples = converter.convert_pixels(time_ns, rgb, None, source)
+            yield from samples
+            camera = crop_camera(crop, stored)
             values = record["values"].tolist()
             if not published_firmware.is_plausible(values):
                 leave_out("labels of records with impossible numbers", f"{source}: record {k}")
@@ -113,5 +116,5 @@ FORMAT = Format(
     "a dump of the AI-deck's flash",
     can_read,
     load_content,
-    SOURCE_OPTIONS | {"rate_hz", "camera"},
+    SOURCE_OPTIONS | {"rate_hz", "camera", "size_px"},
 )

@@ -8,6 +8,7 @@ they are missing, the colour ones are used.
 
 import csv
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,10 @@ from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
+from dmrl.formats.files.pictures import PictureConverter
 from dmrl.formats.timestamps import unwrap
-from dmrl.images import codec
-from dmrl.images.bayer import demosaic
 from dmrl.samples.flight import Times, merge_by_time
-from dmrl.samples.sample import Sample, build_calibration, build_image
+from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 
@@ -56,12 +56,12 @@ def load_content(source: Path, options: Options) -> Content:
     source
         The folder.
     options
-        ``robot`` and ``camera``, which must have the size of the images.
+        ``robot``, and those of `PictureConverter`.
 
     Raises
     ------
     SourceError
-        If the table lacks a column, or an image is missing or cannot be decoded.
+        If the table lacks a column, or no image can be decoded.
     MissingExtra
         If images are raw and OpenCV is not installed.
     """
@@ -72,7 +72,7 @@ def load_content(source: Path, options: Options) -> Content:
     if lost:
         say(f"{source}: {lost} images were lost in transmission, by their numbers")
     state_ns = time_ns + _wrap_to_int32(table[STATE_TIME_COLUMN] - table[TIME_COLUMN]) * 1000
-    streams = [_iter_images(paths, np.maximum.accumulate(time_ns), options)]
+    streams = [_iter_images(source, paths, np.maximum.accumulate(time_ns), options)]
     return Content(merge_by_time(streams + _build_state_streams(table, state_ns, options, source)))
 
 
@@ -119,28 +119,27 @@ def _parse_integers(row: list[str], places: list[int], where: str) -> list[int]:
         raise SourceError(f"{where}: not a file and whole numbers. Fix the line") from None
 
 
-def _find_image(source: Path, name: str) -> Path:
+def _find_image(source: Path, name: str) -> Path | None:
     stem = Path(name).stem
     for folder, suffix in zip(IMAGE_FOLDERS, (".png", ".jpg"), strict=True):
         if (path := source / folder / f"{stem}{suffix}").is_file():
             return path
-    raise SourceError(f"no image {stem} in {source / IMAGE_FOLDERS[0]}. Restore it")
+    leave_out("rows without their picture", f"{source / METADATA_FILE}: {name}")
+    return None
 
 
-def _iter_images(paths: Sequence[Path], time_ns: Times, options: Options) -> Iterator[Sample]:
-    if options.camera is not None:
-        yield build_calibration(int(time_ns[0]), options.robot, options.camera)
+def _iter_images(
+    source: Path, paths: Sequence[Path | None], time_ns: Times, options: Options
+) -> Iterator[Sample]:
+    converter = PictureConverter(options, source)
     for path, moment in zip(paths, time_ns.tolist(), strict=True):
-        data = path.read_bytes()
-        rgb = codec.decode(data, path)
-        if path.parent.name == IMAGE_FOLDERS[0]:
-            if min(rgb.shape[:2]) < 4:
-                raise SourceError(f"{path} is smaller than 4 x 4 pixels. Restore it")
-            yield build_image(
-                moment, options.robot, codec.encode_png(demosaic(rgb[..., 0].copy())), "png"
-            )
-        else:
-            yield build_image(moment, options.robot, data, "jpeg")
+        if path is None:
+            continue
+        # The client's raw pictures are grey files of a colour sensor.
+        converter.options = replace(options, raw=path.parent.name == IMAGE_FOLDERS[0])
+        converted = converter.convert(moment, path.read_bytes(), path)
+        yield from converted[1] if converted else ()
+    yield from converter.finish()
 
 
 def _build_state_streams(
@@ -164,5 +163,5 @@ FORMAT = Format(
     "a folder of the nanocockpit client",
     can_read,
     load_content,
-    SOURCE_OPTIONS | {"camera"},
+    SOURCE_OPTIONS | {"camera", "size_px"},
 )

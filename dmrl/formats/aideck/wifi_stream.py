@@ -16,10 +16,10 @@ from dmrl.formats.aideck.cpx_state import RobotState
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
-from dmrl.images import codec
+from dmrl.formats.files.pictures import PictureConverter
 from dmrl.images.bayer import demosaic
 from dmrl.samples.flight import merge_by_time
-from dmrl.samples.sample import Sample, build_calibration, build_image
+from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import leave_out
 
 READ_BYTES = 1 << 16
@@ -44,7 +44,7 @@ def load_content(source: Path, options: Options) -> Content:
     source
         The file.
     options
-        ``robot``, ``rate_hz`` and ``camera``, which must have the size of the images.
+        ``robot``, ``rate_hz``, and those of `PictureConverter`.
 
     Raises
     ------
@@ -84,16 +84,17 @@ def _to_times_ns(times_us: Sequence[int | None], rate_hz: float) -> list[int]:
 
 
 def _iter_image_samples(source: Path, time_ns: Sequence[int], options: Options) -> Iterator[Sample]:
-    for k, (moment, found) in enumerate(
-        zip(time_ns, _iter_images(source, ImageReader()), strict=True)
-    ):
-        if k == 0 and options.camera is not None:
-            yield build_calibration(moment, options.robot, options.camera)
+    converter = PictureConverter(options, source)
+    images = _iter_images(source, ImageReader())
+    for k, (moment, found) in enumerate(zip(time_ns, images, strict=True)):
+        where = f"{source}: picture {k}"
         if found.encoding == "jpeg":
-            yield build_image(moment, options.robot, found.data, "jpeg")
-            continue
-        raw = np.frombuffer(found.data, np.uint8).reshape(found.height_px, found.width_px)
-        yield build_image(moment, options.robot, codec.encode_png(demosaic(raw)), "png")
+            converted = converter.convert(moment, found.data, where)
+        else:
+            raw = np.frombuffer(found.data, np.uint8).reshape(found.height_px, found.width_px)
+            converted = converter.convert_pixels(moment, demosaic(raw), None, where)
+        yield from converted[1] if converted else ()
+    yield from converter.finish()
 
 
 def _build_state_streams(
@@ -124,5 +125,5 @@ FORMAT = Format(
     "a recorded CPX stream",
     can_read,
     load_content,
-    SOURCE_OPTIONS | {"rate_hz", "camera"},
+    SOURCE_OPTIONS | {"rate_hz", "camera", "size_px", "raw"},
 )

@@ -1,15 +1,16 @@
 """A folder of images, with labels in a CSV file if there is one.
 
-Images: ``.png .jpg .jpeg .ppm .pgm .bmp``, in the order of their names. If every name is a
-number of 12 digits or more, the numbers are times in nanoseconds; otherwise the images
-get nominal times, evenly spaced from 0.
+Images: files of ``IMAGE_SUFFIXES``, in the natural order of their names: img2 before img10. If
+every name is a number of 12 digits or more, the numbers are times in nanoseconds; if every name
+has a decimal point, such as ``1403636579.763``, in seconds; otherwise the images get nominal
+times, evenly spaced from 0.
 
 Labels: ``labels.csv`` in the folder, or another file. It has one row per peer and image; a row
 with an empty peer means that no peer is in view. An image without a row is not labelled.
 
-* ``file, peer, u_px, v_px, depth_m`` are required;
-* ``left_px, top_px, right_px, bottom_px, visible_share, source, split, sigma_u_px,
-  sigma_v_px, sigma_depth_m`` are optional. An empty ``source`` is "hand".
+* ``file, peer`` are required, and ``u_px, v_px`` or ``left_px, top_px, right_px, bottom_px``;
+* ``depth_m, visible_share, source, split, sigma_u_px, sigma_v_px, sigma_depth_m`` are optional. An
+  empty ``source`` is "hand".
 
 Or ``label.txt`` as the published firmware's tools write it, ``imgNNNNN.ppm roll pitch x y z d``
 per line: see ``published_firmware``. Its labels need a camera. Maps of a chip: see
@@ -23,25 +24,31 @@ unless 324x244 is requested.
 
 from collections.abc import Collection, Iterator
 from dataclasses import replace
+from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
 
-from dmrl.errors import SettingError, SourceError
+from dmrl.errors import SourceError
 from dmrl.formats.aideck import published_firmware
 from dmrl.formats.aideck.chip_outputs import load_chip_maps
-from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
+from dmrl.formats.base import Content, Format, Options
 from dmrl.formats.files.crop import Crop
-from dmrl.formats.files.label_csv import LabelRow, read_labels
+from dmrl.formats.files.label_csv import read_labels
+from dmrl.formats.files.labelled_pictures import (
+    IMAGE_SUFFIXES,
+    LABELLED_OPTIONS,
+    LabelledPicture,
+    build_picture_content,
+    is_picture,
+    iter_picture_samples,
+    natural_key,
+)
+from dmrl.formats.files.pictures import crop_camera
 from dmrl.geometry.camera_file import read_camera
-from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX, Camera
-from dmrl.guards import limits
 from dmrl.guards.paths import refuse_pipes
-from dmrl.images import codec
-from dmrl.images.bayer import demosaic
-from dmrl.samples.sample import Sample, build_calibration, build_image, build_labels, find_intervals
+from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp")
 LABELS_FILE = "labels.csv"
 AIDECK_LABELS_FILE = "label.txt"
 CALIBRATION_FILE = "calibration.toml"
@@ -52,11 +59,7 @@ MAX_TIME_NS = 2**63 - 1
 
 def can_read(source: Path) -> bool:
     """Return whether a folder has an image."""
-    return source.is_dir() and any(_is_image(path) for path in source.iterdir())
-
-
-def _is_image(path: Path) -> bool:
-    return path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
+    return source.is_dir() and any(is_picture(path) for path in source.iterdir())
 
 
 def load_content(source: Path, options: Options) -> Content:
@@ -84,17 +87,22 @@ def load_content(source: Path, options: Options) -> Content:
     path = options.labels or source / LABELS_FILE
     known = {picture.name for _, picture in pictures}
     rows = read_labels(path, known) if options.labels or path.is_file() else {}
-    splits = {name: found[0].split for name, found in rows.items()}
+    labelled = [
+        (
+            time_ns,
+            LabelledPicture(p, rows[p.name][0].split, rows[p.name])
+            if p.name in rows
+            else LabelledPicture(p),
+        )
+        for time_ns, p in pictures
+    ]
     states = _load_aideck_labels(source / AIDECK_LABELS_FILE, known)
     if states.keys() - rows.keys() and options.camera is None:
         say(
             f"{source / AIDECK_LABELS_FILE} gives no labels without a camera. Pass: --camera aideck"
         )
-    return Content(
-        samples=_iter_samples(pictures, rows, states, options),
-        total=len(pictures) + len(rows) + (options.camera is not None),
-        split=find_intervals((time_ns, splits.get(p.name)) for time_ns, p in pictures),
-    )
+    content = build_picture_content(path, labelled, options)
+    return replace(content, samples=_iter_samples(source, labelled, states, options))
 
 
 def list_images(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
@@ -108,7 +116,7 @@ def list_images(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
     if not source.is_dir():
         raise SourceError(f"no folder {source}. Pass a folder of images")
     refuse_pipes(source)
-    paths = sorted(path for path in source.iterdir() if _is_image(path))
+    paths = sorted(filter(is_picture, source.iterdir()), key=natural_key)
     if not paths:
         raise SourceError(
             f"no image ({', '.join(IMAGE_SUFFIXES)}) in {source}. Pass another folder"
@@ -129,11 +137,13 @@ def list_images(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
 
 
 def _parse_time_ns(path: Path) -> int | None:
-    if not (path.stem.isdecimal() and len(path.stem) >= MIN_TIME_DIGITS):
+    name, digits = path.stem, path.stem.replace(".", "", 1)
+    if not (digits.isdecimal() and len(digits) >= MIN_TIME_DIGITS):
         return None
-    if int(path.stem) > MAX_TIME_NS:
+    time_ns = int(Decimal(name) * NS_PER_S) if "." in name else int(name)
+    if time_ns > MAX_TIME_NS:
         raise SourceError(f"{path}: time after the year 2262. Name it by nanoseconds since 1970")
-    return int(path.stem)
+    return time_ns
 
 
 def _load_aideck_labels(path: Path, files: Collection[str]) -> dict[str, list[float]]:
@@ -161,79 +171,27 @@ def _load_aideck_labels(path: Path, files: Collection[str]) -> dict[str, list[fl
 
 
 def _iter_samples(
-    pictures: list[tuple[int, Path]],
-    rows: dict[str, list[LabelRow]],
+    source: Path,
+    pictures: list[tuple[int, LabelledPicture]],
     states: dict[str, list[float]],
     options: Options,
 ) -> Iterator[Sample]:
-    """Yield the calibration, then each image, its labels, and the firmware's numbers."""
-    for k, (time_ns, path) in enumerate(pictures):
-        crop, data, kind = _load_image(path, options)
-        if options.camera is not None and k == 0:
-            yield build_calibration(time_ns, options.robot, _crop_camera(crop, options.camera))
-        yield build_image(time_ns, options.robot, data, kind)
+    """Yield the calibration, then each image, its labels, maps, and the firmware's numbers."""
+    labelled = {picture.path.name for _, picture in pictures if picture.rows is not None}
+
+    def more(path: Path, time_ns: int, crop: Crop) -> Iterator[Sample]:
         if (maps := load_chip_maps(path, time_ns, options.robot)) is not None and not crop.changes:
             yield maps
-        if path.name in rows:
-            peers = [crop.crop_label(row) for row in rows[path.name] if row.peer]
-            sources = {row.source for row in rows[path.name]}
-            yield build_labels(time_ns, options.robot, [row.to_fields() for row in peers], sources)
         if path.name in states:
-            known = options.camera if path.name not in rows else None
-            camera = _crop_camera(crop, known) if known else None
+            known = options.camera if path.name not in labelled else None
+            camera = crop_camera(crop, known) if known else None
             peer = options.names.get("0", "cf2")
             yield from published_firmware.iter_samples(
                 time_ns, options.robot, peer, states[path.name], camera
             )
 
-
-def _load_image(path: Path, options: Options) -> tuple[Crop, bytes, str]:
-    """Return the crop, bytes and format of an image; the bytes are unchanged if possible."""
-    data = path.read_bytes()
-    rgb = _decode_raw(data, path) if options.raw else codec.decode(data, path, limits.PIXELS)
-    crop = _build_crop(rgb.shape[1], rgb.shape[0], path, options)
-    if crop.changes:
-        return crop, codec.encode_png(crop.crop_image(rgb)), "png"
-    kind = "raw" if options.raw else codec.read_size(data)[2]
-    if kind in ("png", "jpeg"):
-        return crop, data, kind
-    return crop, codec.encode_png(rgb), "png"
+    yield from iter_picture_samples(source, pictures, options, more)
 
 
-def _decode_raw(data: bytes, path: Path) -> codec.Rgb:
-    rgb = codec.decode(data, path, limits.PIXELS)
-    if (rgb != rgb[..., :1]).any() or min(rgb.shape[:2]) < 4:
-        raise SourceError(f"{path} has colours already, so it is not raw. Remove --raw")
-    return demosaic(rgb[..., 0].copy())
-
-
-def _build_crop(width_px: int, height_px: int, path: Path, options: Options) -> Crop:
-    camera, size = options.camera, (width_px, height_px)
-    if camera is None or size == _camera_size(camera):
-        return Crop(*size, *(options.size_px or size))
-    if size == AIDECK_SENSOR_PX and _camera_size(camera) == _camera_size(AIDECK):
-        wanted = options.size_px or _camera_size(AIDECK)
-        return Crop(*size, *wanted, (0, 0) if wanted == size else AIDECK_CORNER_PX)
-    raise SettingError(
-        f"{path} is {width_px}x{height_px} px, its camera {camera.width_px}x"
-        f"{camera.height_px}. Pass the calibration of the images as they are stored"
-    )
-
-
-def _camera_size(camera: Camera) -> tuple[int, int]:
-    return camera.width_px, camera.height_px
-
-
-def _crop_camera(crop: Crop, camera: Camera) -> Camera:
-    """Return the camera of the cropped images, from that of the stored ones.
-
-    A camera smaller than the stored images is centred in them.
-    """
-    left = (crop.from_width_px - camera.width_px) / 2
-    top = (crop.from_height_px - camera.height_px) / 2
-    stored = replace(camera, cx_px=camera.cx_px + left, cy_px=camera.cy_px + top)
-    return crop.crop_camera(stored)
-
-
-IMAGE_OPTIONS = SOURCE_OPTIONS | {"rate_hz", "labels", "camera", "size_px", "raw"}
+IMAGE_OPTIONS = LABELLED_OPTIONS | {"labels"}
 FORMAT = Format("images", "a folder of pictures", can_read, load_content, IMAGE_OPTIONS)

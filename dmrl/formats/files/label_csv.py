@@ -3,7 +3,7 @@
 import csv
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TextIO
@@ -15,8 +15,16 @@ from dmrl.guards.safe_names import check_split_name
 POINT_COLUMNS = ("u_px", "v_px", "depth_m")
 BOX_COLUMNS = ("left_px", "top_px", "right_px", "bottom_px")
 SIGMA_COLUMNS = ("sigma_u_px", "sigma_v_px", "sigma_depth_m")
-REQUIRED_COLUMNS = ("file", "peer", *POINT_COLUMNS)
-COLUMNS = (*REQUIRED_COLUMNS, *BOX_COLUMNS, "visible_share", "source", "split", *SIGMA_COLUMNS)
+REQUIRED_COLUMNS = ("file", "peer")
+COLUMNS = (
+    *REQUIRED_COLUMNS,
+    *POINT_COLUMNS,
+    *BOX_COLUMNS,
+    "visible_share",
+    "source",
+    "split",
+    *SIGMA_COLUMNS,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +40,7 @@ class LabelRow:
     u_px, v_px
         Projection of its centre, pixel-edge coordinates.
     depth_m
-        Distance along the optical axis, metres.
+        Distance along the optical axis, metres; 0: unknown, its sigma is infinite then.
     box_px
         Left, top, right, bottom of the visible part; empty if unknown.
     visible_share
@@ -43,6 +51,8 @@ class LabelRow:
         train, test or another; None: no split.
     sigmas
         One standard deviation of u, v (px) and depth (m); 0: exact or unknown.
+    depth_from_box
+        The depth is from the width of the box and the stated width of the robot.
     """
 
     file: str
@@ -55,6 +65,17 @@ class LabelRow:
     source: str = "hand"
     split: str | None = None
     sigmas: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    depth_from_box: bool = False
+
+    def is_centre_in_box(self) -> bool:
+        """Return whether the centre lies in the box."""
+        left, top, right, bottom = self.box_px
+        return left <= self.u_px <= right and top <= self.v_px <= bottom
+
+    def scale(self, width: float, height: float) -> "LabelRow":
+        """Return the label with its pixels multiplied by a width and a height."""
+        box = tuple(edge * (width, height)[k % 2] for k, edge in enumerate(self.box_px))
+        return replace(self, u_px=self.u_px * width, v_px=self.v_px * height, box_px=box)
 
     def to_fields(self) -> dict[str, Any]:
         """Return the fields of a PeerLabel."""
@@ -65,17 +86,18 @@ class LabelRow:
         return (
             point
             | dict(zip(SIGMA_COLUMNS, self.sigmas, strict=True))
-            | {"box_px": list(self.box_px)}
+            | {"box_px": list(self.box_px), "depth_from_box": self.depth_from_box}
         )
 
     def to_cells(self) -> list[str]:
         """Return the cells of the row in the order of ``COLUMNS``; unknown values are empty."""
         if not self.peer:
             return [self.file, *[""] * 9, self.source, self.split or "", "", "", ""]
-        point = [f"{self.u_px:.4f}", f"{self.v_px:.4f}", f"{self.depth_m:.5f}"]
+        depth = f"{self.depth_m:.5f}" if self.depth_m else ""
+        point = [f"{self.u_px:.4f}", f"{self.v_px:.4f}", depth]
         box = [f"{edge:g}" for edge in self.box_px] or [""] * 4
         share = f"{self.visible_share:.4f}" if self.visible_share else ""
-        sigmas = [f"{sigma:g}" if sigma else "" for sigma in self.sigmas]
+        sigmas = [f"{sigma:g}" if 0 < sigma < math.inf else "" for sigma in self.sigmas]
         head = [self.file, self.peer, *point, *box, share]
         return [*head, self.source, self.split or "", *sigmas]
 
@@ -162,10 +184,23 @@ def _parse_row(where: str, cells: Mapping[str | None, Any], files: Collection[st
     if not row["peer"]:
         return _parse_empty_row(where, row, split)
     box = tuple(_parse_number(where, row, name) for name in BOX_COLUMNS if row.get(name))
-    u_px, v_px, depth_m = (_parse_number(where, row, name) for name in POINT_COLUMNS)
-    sigma_u, sigma_v, sigma_depth = (_parse_number(where, row, name, 0.0) for name in SIGMA_COLUMNS)
+    middle = [sum(box[k::2]) / 2 if len(box) == 4 else None for k in (0, 1)]
+    u_px, v_px = (
+        _parse_number(where, row, name, default)
+        for name, default in zip(POINT_COLUMNS, middle, strict=False)
+    )
+    known = bool(row.get("depth_m"))
+    depth_m = _parse_number(where, row, "depth_m") if known else 0.0
+    unknown = (0.0, 0.0, 0.0 if known else math.inf)
+    sigma_u, sigma_v, sigma_depth = (
+        _parse_number(where, row, *pair) for pair in zip(SIGMA_COLUMNS, unknown, strict=True)
+    )
     share = _parse_number(where, row, "visible_share", 0.0)
-    _check_values(where, depth_m, box, share, (sigma_u, sigma_v, sigma_depth))
+    if known and depth_m <= 0:
+        raise SourceError(
+            f"{where}: depth_m is {depth_m:g}; it must be over 0, or empty. Fix the cell"
+        )
+    _check_values(where, box, share, (sigma_u, sigma_v, sigma_depth))
     return LabelRow(
         file=row["file"],
         peer=row["peer"],
@@ -204,10 +239,8 @@ def _parse_number(
 
 
 def _check_values(
-    where: str, depth_m: float, box: tuple[float, ...], share: float, sigmas: tuple[float, ...]
+    where: str, box: tuple[float, ...], share: float, sigmas: tuple[float, ...]
 ) -> None:
-    if depth_m <= 0:
-        raise SourceError(f"{where}: depth_m is {depth_m:g}; it must be over 0. Fix the cell")
     if box and not (len(box) == 4 and box[0] < box[2] and box[1] < box[3]):
         raise SourceError(
             f"{where}: not a box. {', '.join(BOX_COLUMNS)}: all or none, left < right, top < bottom"

@@ -2,7 +2,7 @@
 
 These message types are converted. All others are left out, with a line that names them:
 
-* ``sensor_msgs/Image`` (8 bits), ``CompressedImage`` (PNG, JPEG) and ``CameraInfo``;
+* ``sensor_msgs/Image``, ``CompressedImage`` and ``CameraInfo``;
 * ``nav_msgs/Odometry``: attitude, velocity (in the body's frame), height, pose;
 * ``sensor_msgs/Imu`` and ``geometry_msgs/TwistStamped``, for a robot without odometry;
 * ``geometry_msgs/PoseStamped``: a true pose if the topic names motion capture, else a pose;
@@ -27,6 +27,7 @@ from urllib.parse import quote
 from dmrl import topics
 from dmrl.errors import DmrlError, MissingExtra, SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
+from dmrl.formats.files.pictures import scaling_words
 from dmrl.formats.ros.ros_messages import (
     CONVERTERS,
     DMRL_PREFIX,
@@ -102,7 +103,9 @@ def load_content(source: Path, options: Options) -> Content:
         raise SourceError(f"{source} has no topic of a known type: {known}. Pass another bag")
     if unknown:
         say(f"{source}: left out: {', '.join(sorted(unknown))}")
-    return Content(_iter_samples(source, lines), sum(line.count for line in lines.values()))
+    return Content(
+        _iter_samples(source, lines, options), sum(line.count for line in lines.values())
+    )
 
 
 def plan_topics(
@@ -225,10 +228,13 @@ def _iter_guarded(source: Path, of: Any) -> Iterator[Any]:
         raise SourceError(f"{source} cannot be read as a ROS bag: {why}. Restore it") from e
 
 
-def _iter_samples(source: Path, lines: Mapping[tuple[str, str], TopicPlan]) -> Iterator[Sample]:
+def _iter_samples(
+    source: Path, lines: Mapping[tuple[str, str], TopicPlan], options: Options
+) -> Iterator[Sample]:
     calibrated: set[str] = set()
     unstamped: Counter[str] = Counter()
     fixed: set[str] = set()
+    scaled: set[str] = set()
     moving = {line.robot for line in lines.values() if line.kind == "nav_msgs/msg/Odometry"}
 
     def messages(reader: Any) -> Iterator[Any]:
@@ -239,7 +245,9 @@ def _iter_samples(source: Path, lines: Mapping[tuple[str, str], TopicPlan]) -> I
 
     for line, bag_ns, decoded in _iter_guarded(source, messages):
         captured, odometry = bool(MOTION_CAPTURE.search(line.topic)), line.robot in moving
-        where = MessageContext(source, line.robot, line.peer, captured, odometry, fixed)
+        where = MessageContext(
+            source, line.robot, line.peer, captured, odometry, fixed, options.bits
+        )
         # Without a time in the header, the bag's own time is the best estimate.
         time_ns = _header_time_ns(decoded)
         unstamped[line.topic] += time_ns == 0 < bag_ns
@@ -250,6 +258,8 @@ def _iter_samples(source: Path, lines: Mapping[tuple[str, str], TopicPlan]) -> I
                 yield replace(sample, publish_ns=max(bag_ns, 0))
             if is_calibration:
                 calibrated.add(sample.topic)
+    if scaled:
+        say(f"{source}: images of {', '.join(sorted(scaled))}: {scaling_words(options.bits)}")
     _report_problems(source, fixed, unstamped)
 
 
@@ -281,4 +291,4 @@ def _convert_message(
         yield sample
 
 
-FORMAT = Format("rosbag2", "a ROS bag", can_read, load_content, SOURCE_OPTIONS)
+FORMAT = Format("rosbag2", "a ROS bag", can_read, load_content, SOURCE_OPTIONS | {"bits"})

@@ -10,12 +10,15 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import SourceError
+from dmrl.formats.files.pictures import UNDECODABLE
 from dmrl.geometry.frames import Array
 from dmrl.geometry.rotations import quaternion_to_euler
+from dmrl.guards import limits
 from dmrl.images import codec
-from dmrl.images.bayer import demosaic
+from dmrl.images.pixel_encodings import LAYOUTS, convert_to_rgb
 from dmrl.messages import LogType, find_descriptor
 from dmrl.samples.sample import Sample, build_image
+from dmrl.terminal.left_out import leave_out
 
 HALF_PX = 0.5  # the origin is the first pixel's centre in ROS, its edge in dmrl
 MAX_RANGE_M = 60.0
@@ -43,6 +46,10 @@ class MessageContext:
     fixed
         Robots whose velocities are in a fixed frame and cannot be rotated into their own. The
         converters add to it.
+    bits
+        Significant bits of 16-bit pixels.
+    scaled
+        Robots whose images have 16 bits. The converters add to it.
     """
 
     source: Path
@@ -51,39 +58,48 @@ class MessageContext:
     captured: bool = False
     odometry: bool = False
     fixed: set[str] = field(default_factory=set)
+    bits: int = codec.BITS
+    scaled: set[str] = field(default_factory=set)
 
 
 def _convert_image(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
-    rgb = _decode_image(message, where.source)
+    shape = message.height, message.width
+    if max(shape) > MAX_SIDE_PX:
+        raise SourceError(f"{where.source}: an image is over {MAX_SIDE_PX} px long. Scale it down")
+    try:
+        rgb = convert_to_rgb(
+            message.data,
+            message.encoding,
+            shape,
+            message.step,
+            big_endian=bool(message.is_bigendian),
+            bits=where.bits,
+        )
+    except SourceError as e:
+        leave_out(str(e), where.source)
+        return
+    if LAYOUTS[message.encoding][1] == 2:
+        where.scaled.add(where.robot)
     yield build_image(time_ns, where.robot, codec.encode_png(rgb), "png")
-
-
-def _decode_image(message: Any, source: Path) -> codec.Rgb:
-    channels = {"mono8": 1, "8UC1": 1, "bayer_rggb8": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3}
-    channels |= {"rgba8": 4, "bgra8": 4}
-    height, width, step = message.height, message.width, message.step
-    count = channels.get(message.encoding)
-    if count is None:
-        known = ", ".join(channels)
-        raise SourceError(f"{source}: images of encoding {message.encoding!r}. Use {known}")
-    if not (4 <= height <= MAX_SIDE_PX and width * count <= step <= len(message.data) // height):
-        raise SourceError(f"{source}: an image is not {width} x {height} pixels. Restore the bag")
-    rows = message.data[: height * step].reshape(height, step)[:, : width * count]
-    pixels = rows.reshape(height, width, count)
-    if message.encoding == "bayer_rggb8":
-        return demosaic(np.ascontiguousarray(pixels[..., 0]))
-    if message.encoding.startswith("bgr"):
-        pixels = pixels[..., [2, 1, 0]]
-    return np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (height, width, 3)))
 
 
 def _convert_compressed_image(
     message: Any, time_ns: int, where: MessageContext
 ) -> Iterator[Sample]:
     data = message.data.tobytes()
-    kind = codec.read_size(data, f"an image in {where.source}")[2]
-    if kind not in ("png", "jpeg"):
-        raise SourceError(f"{where.source}: images are {kind}. Save them as PNG or JPEG")
+    what = f"{where.source}: an image of {where.robot} at {time_ns} ns"
+    try:
+        header = codec.read_header(data, what)
+        rgb = header.decode(limits.FRAME_PIXELS, bits=where.bits)
+    except SourceError as e:
+        leave_out(f"{UNDECODABLE}, of format {message.format[:40]!r}", e)
+        return
+    if header.has_16_bits:
+        where.scaled.add(where.robot)
+    if header.kind not in ("png", "jpeg") or header.has_16_bits:
+        data, kind = codec.encode_png(rgb), "png"
+    else:
+        kind = header.kind
     yield build_image(time_ns, where.robot, data, kind)
 
 

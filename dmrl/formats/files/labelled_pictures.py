@@ -1,0 +1,238 @@
+"""Pictures with labels, as YOLO, COCO, Pascal VOC and folders of pictures have them in common.
+
+A box gives the pixel: the label is its centre. Its class, through ``--names``, is the peer; the
+second one of a class in a picture is ``<class>-2``. A label without depth has ``depth_m`` 0 and an
+infinite ``sigma_depth_m``.
+"""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+from dmrl.errors import SettingError, SourceError
+from dmrl.formats.base import Content, Options
+from dmrl.formats.files.crop import Crop
+from dmrl.formats.files.label_csv import LabelRow
+from dmrl.formats.files.pictures import PICTURE_OPTIONS, PictureConverter
+from dmrl.geometry.frames import Camera
+from dmrl.guards.paths import refuse_pipes
+from dmrl.samples.sample import Sample, build_labels, find_intervals
+from dmrl.terminal.left_out import leave_out
+from dmrl.terminal.progress import say
+
+IMAGE_SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp"),
+    *(".tif", ".tiff", ".webp", ".gif"),
+)
+SPLIT_NAMES = {"train": "train", "test": "test", "dev": "val"}
+SPLIT_NAMES |= dict.fromkeys(("val", "valid", "validation"), "val")
+"""Splits by the names of folders."""
+WIDTH_STD_RATIO = 0.098
+"""Standard deviation of the seen width of a square over its mean, at a random yaw.
+
+A square of side 1 is |cos| + |sin| wide: 4/pi on average, with a variance of 1 + 2/pi - 16/pi^2.
+"""
+EDGE_STD_PX = 1.0
+"""Standard deviation of an edge of a box that was drawn by hand, pixels."""
+BORDER_PX = 1.0
+"""A box this near to the border of its picture may be cut off there."""
+MAX_DEPTH_M = 100.0
+"""Larger depths are doubted: a robot of 0.1 m is less than a pixel wide, at 100 px focal length."""
+
+LABELLED_OPTIONS = PICTURE_OPTIONS | {"rate_hz", "robot_width_m"}
+
+MoreSamples = Callable[[Path, int, Crop], Iterator[Sample]]
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledPicture:
+    """One picture with its labels.
+
+    Parameters
+    ----------
+    path
+        The picture.
+    split
+        Its split; None: in no split.
+    rows
+        Its labels; empty: nobody is in view; None: not labelled. A row without a peer counts as no
+        label, but names its source.
+    size_px
+        Width and height to which the labels refer; (1, 1): shares of the size of the picture; None:
+        its pixels.
+    """
+
+    path: Path
+    split: str | None = None
+    rows: Sequence[LabelRow] | None = None
+    size_px: tuple[float, float] | None = None
+
+
+def is_picture(path: Path) -> bool:
+    """Return whether a path is a picture by its name; hidden files are not."""
+    return (
+        path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
+    )
+
+
+def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
+    """Return a sort key that puts img2 before img10."""
+    parts = re.split(r"(\d+)", str(path))
+    return tuple((0, int(p), p) if k % 2 else (1, 0, p) for k, p in enumerate(parts))
+
+
+def list_pictures(source: Path) -> list[Path]:
+    """Return all pictures below a folder, in natural order, without hidden folders and files."""
+    refuse_pipes(source)
+    found = (path for path in source.rglob("*") if is_picture(path))
+    visible = (p for p in found if not any(n[0] in "._" for n in p.relative_to(source).parts))
+    return sorted(visible, key=natural_key)
+
+
+def find_split(relative: PurePosixPath | Path, stated: Mapping[str, str]) -> str | None:
+    """Return the split of a path: the one stated for it or for a folder of it, else by its name."""
+    for path in (relative, *relative.parents):
+        if path.as_posix() in stated:
+            return stated[path.as_posix()]
+    named = (SPLIT_NAMES.get(part.lower()) for part in relative.parts[:-1])
+    return next(filter(None, named), None)
+
+
+def locate(source: Path, text: str) -> Path | None:
+    """Return the longest end of a path, as another machine wrote it, that exists in a folder."""
+    parts = [p for p in PurePosixPath(text.replace("\\", "/")).parts if p not in ("/", ".", "..")]
+    ends = (Path(*parts[k:]) for k in range(len(parts)))
+    return next((end for end in ends if (source / end).exists()), None)
+
+
+def name_peers(classes: Sequence[str], names: Mapping[str, str]) -> list[str]:
+    """Return the peer of each box of a picture from its class."""
+    seen: Counter[str] = Counter()
+    peers = []
+    for name in classes:
+        peer = re.sub(r"[^A-Za-z0-9_-]", "_", names.get(name, name)) or "_"
+        seen[peer] += 1
+        peers.append(peer if seen[peer] == 1 else f"{peer}-{seen[peer]}")
+    return peers
+
+
+def label_from_box(file: str, peer: str, box_px: Sequence[float]) -> LabelRow:
+    """Return a label at the centre of a box (left, top, right, bottom), without depth.
+
+    Raises
+    ------
+    ValueError
+        If it is no box.
+    """
+    left, top, right, bottom = (float(edge) for edge in box_px)
+    if not (left < right and top < bottom and math.isfinite(right + bottom - left - top)):
+        raise ValueError("a box has no area")
+    sigmas = (0.0, 0.0, math.inf)
+    centre = (left + right) / 2, (top + bottom) / 2
+    return LabelRow(file, peer, *centre, 0.0, (left, top, right, bottom), sigmas=sigmas)
+
+
+def build_picture_content(
+    source: Path, pictures: Sequence[tuple[int, LabelledPicture]], options: Options
+) -> Content:
+    """Build the content of labelled pictures with their times, in time order."""
+    if options.robot_width_m is not None and options.camera is None:
+        raise SettingError("--robot-width-m needs the focal length. Pass --camera")
+    report_doubts(source, [row for _, p in pictures for row in p.rows or ()], options.robot)
+    return Content(
+        samples=iter_picture_samples(source, pictures, options),
+        total=sum(2 if p.rows is not None else 1 for _, p in pictures),
+        split=find_intervals((time_ns, picture.split) for time_ns, picture in pictures),
+    )
+
+
+def iter_picture_samples(
+    source: Path,
+    pictures: Iterable[tuple[int, LabelledPicture]],
+    options: Options,
+    more: MoreSamples | None = None,
+) -> Iterator[Sample]:
+    """Yield the calibration, then each image, its labels, and ``more`` of the picture.
+
+    Pictures that cannot be decoded are left out with their labels.
+    """
+    converter = PictureConverter(options, source)
+    for time_ns, picture in pictures:
+        found = converter.convert(time_ns, picture.path.read_bytes(), picture.path)
+        if found is None:
+            continue
+        crop, samples = found
+        yield from samples
+        if (rows := _to_pixels(picture, crop)) is not None:
+            rows = [estimate_depth(row, crop, options) for row in rows]
+            peers = [crop.crop_label(row).to_fields() for row in rows if row.peer]
+            sources = {row.source for row in rows} or {"hand"}
+            yield build_labels(time_ns, options.robot, peers, sources)
+        if more is not None:
+            yield from more(picture.path, time_ns, crop)
+    yield from converter.finish()
+
+
+def _to_pixels(picture: LabelledPicture, crop: Crop) -> list[LabelRow] | None:
+    """Return the labels in pixels of the picture; None if it has none of its size."""
+    if picture.rows is None or picture.size_px is None:
+        return None if picture.rows is None else list(picture.rows)
+    size = crop.from_width_px, crop.from_height_px
+    if picture.size_px == (1, 1):
+        return [row.scale(*size) for row in picture.rows]
+    if picture.size_px != size:
+        leave_out("pictures with labels for another size", picture.path)
+        return None
+    return list(picture.rows)
+
+
+def estimate_depth(row: LabelRow, crop: Crop, options: Options) -> LabelRow:
+    """Return a label with the depth at which the robot is as wide as its box, if it has none.
+
+    A box at the border of the picture may be cut off and gives no depth.
+    """
+    camera: Camera | None = options.camera
+    if row.depth_m or not row.box_px or options.robot_width_m is None or camera is None:
+        return row
+    left, _, right, _ = row.box_px
+    if left < BORDER_PX or right > crop.from_width_px - BORDER_PX:
+        return row
+    width_px = right - left
+    depth_m = camera.fx_px * options.robot_width_m / width_px
+    ratio = math.hypot(WIDTH_STD_RATIO, math.sqrt(2) * EDGE_STD_PX / width_px)
+    sigmas = (*row.sigmas[:2], depth_m * ratio)
+    return replace(row, depth_m=depth_m, sigmas=sigmas, depth_from_box=True)
+
+
+def report_doubts(source: Path, rows: Sequence[LabelRow], robot: str) -> None:
+    """Print a line for each kind of label that is probably wrong."""
+    seen = [row for row in rows if row.peer]
+    boxed = [row for row in seen if row.box_px]
+    normalised = len(seen) > 1 and all(0 <= row.u_px <= 1 and 0 <= row.v_px <= 1 for row in seen)
+    doubts = {
+        "have u_px and v_px in [0, 1]: shares of the image size? They are pixels here": (
+            len(seen) * normalised
+        ),
+        f"have a depth over {MAX_DEPTH_M:g} m: millimetres? They are metres here": sum(
+            row.depth_m > MAX_DEPTH_M for row in seen
+        ),
+        "have their centre outside their box": sum(not row.is_centre_in_box() for row in boxed),
+        f"are of {robot}, which carries the camera (--robot)": sum(r.peer == robot for r in seen),
+    }
+    for doubt, count in doubts.items():
+        if count:
+            say(f"{source}: doubt: {count} of {len(seen)} labels {doubt}")
+
+
+def spread_over_time(
+    pictures: Iterable[LabelledPicture], rate_hz: float
+) -> list[tuple[int, LabelledPicture]]:
+    """Return pictures with nominal times, split by split, so that a split is one interval."""
+    order = {"train": 0, "val": 1, "test": 2, None: 4}
+    ordered = sorted(pictures, key=lambda p: (order.get(p.split, 3), p.split or ""))
+    if not ordered:
+        raise SourceError("no picture of the set is there. Pass the folder with its pictures")
+    return [(round(k * 1e9 / rate_hz), picture) for k, picture in enumerate(ordered)]

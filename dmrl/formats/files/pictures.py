@@ -1,0 +1,155 @@
+"""Conversion of the pictures of a source to images of a recording: 8 bits, upright, one size.
+
+PNG and JPEG keep their bytes where nothing changes. Every kind of change is reported once, with the
+number of pictures and the flag that decides it.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+from dmrl.errors import SettingError, SourceError
+from dmrl.formats.base import SOURCE_OPTIONS, Options
+from dmrl.formats.files.crop import Crop
+from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX, Camera
+from dmrl.guards import limits
+from dmrl.images import codec
+from dmrl.images.bayer import demosaic
+from dmrl.samples.sample import Sample, build_calibration, build_image
+from dmrl.terminal.left_out import leave_out
+from dmrl.terminal.progress import say
+
+PICTURE_OPTIONS = SOURCE_OPTIONS | {"camera", "size_px", "raw", "bits", "as_stored"}
+"""Options that have an effect on encoded pictures."""
+UNDECODABLE = "pictures that cannot be decoded"
+
+
+def scaling_words(bits: int) -> str:
+    """Return the words that state how pixels of 16 bits become 8."""
+    return f"16 bits scaled to 8, {2**bits - 1} to 255 (--bits)"
+
+
+@dataclass(slots=True)
+class PictureConverter:
+    """Converter of the pictures of one camera.
+
+    Parameters
+    ----------
+    options
+        ``robot``, ``camera``, ``size_px``, ``raw``, ``bits`` and ``as_stored``.
+    source
+        Source of the pictures, for reports.
+    """
+
+    options: Options
+    source: object
+    _converted: int = 0
+    _changes: Counter[str] = field(default_factory=Counter)
+
+    def convert(self, time_ns: int, data: bytes, where: object) -> tuple[Crop, list[Sample]] | None:
+        """Convert an encoded picture; leave it out and return None if it cannot be decoded."""
+        try:
+            return self.convert_pixels(time_ns, *self._decode(data, where), where)
+        except SourceError as e:
+            leave_out(UNDECODABLE, e)
+            return None
+
+    def convert_pixels(
+        self, time_ns: int, rgb: codec.Rgb, kept: tuple[bytes, str] | None, where: object
+    ) -> tuple[Crop, list[Sample]]:
+        """Convert the pixels of a picture.
+
+        Parameters
+        ----------
+        time_ns
+            Time of exposure.
+        rgb
+            (H, W, 3), uint8.
+        kept
+            Its encoded bytes and format, which are written if the size stays; None: PNG.
+        where
+            Name of the picture in errors.
+
+        Returns
+        -------
+        tuple
+            The crop, for labels; the image, after the calibration if it is the first image.
+
+        Raises
+        ------
+        SettingError
+            If the camera does not have the size of the picture, or the picture is not raw.
+        """
+        crop = _build_crop(rgb.shape[1], rgb.shape[0], where, self.options)
+        if crop.changes:
+            rgb, kept = crop.crop_image(rgb), None
+        image = build_image(time_ns, self.options.robot, *(kept or (codec.encode_png(rgb), "png")))
+        self._converted += 1
+        if self._converted > 1 or self.options.camera is None:
+            return crop, [image]
+        camera = crop_camera(crop, self.options.camera)
+        return crop, [build_calibration(time_ns, self.options.robot, camera), image]
+
+    def _decode(self, data: bytes, where: object) -> tuple[codec.Rgb, tuple[bytes, str] | None]:
+        """Return the pixels of an encoded picture, and its bytes if they may be kept."""
+        header = codec.read_header(data, where)
+        upright = not self.options.as_stored
+        changes = {
+            scaling_words(self.options.bits): header.has_16_bits,
+            "turned upright by EXIF (--as-stored keeps them)": upright and header.is_turned,
+            "one image of several used, the first": header.is_animated,
+        }
+        rgb = header.decode(limits.PIXELS, bits=self.options.bits, upright=upright)
+        if self.options.raw:
+            rgb = _demosaic(rgb, where)
+        self._changes.update(what for what, changed in changes.items() if changed)
+        keeps = not any(changes.values()) and header.kind in ("png", "jpeg")
+        return rgb, (data, header.kind) if keeps and not self.options.raw else None
+
+    def finish(self) -> Iterator[Sample]:
+        """Report the changes; yield nothing.
+
+        Raises
+        ------
+        SourceError
+            If no picture could be decoded.
+        """
+        if not self._converted:
+            raise SourceError(f"{self.source} has no picture that can be decoded. Pass another")
+        for change, count in self._changes.items():
+            say(f"{self.source}: {count} pictures: {change}")
+        yield from ()
+
+
+def _demosaic(rgb: codec.Rgb, where: object) -> codec.Rgb:
+    if (rgb != rgb[..., :1]).any() or min(rgb.shape[:2]) < 4:
+        raise SettingError(f"{where} has colours already, so it is not raw. Remove --raw")
+    return demosaic(rgb[..., 0].copy())
+
+
+def _build_crop(width_px: int, height_px: int, where: object, options: Options) -> Crop:
+    camera, size = options.camera, (width_px, height_px)
+    if camera is None or size == _camera_size(camera):
+        return Crop(*size, *(options.size_px or size))
+    if size == AIDECK_SENSOR_PX and _camera_size(camera) == _camera_size(AIDECK):
+        wanted = options.size_px or _camera_size(AIDECK)
+        return Crop(*size, *wanted, (0, 0) if wanted == size else AIDECK_CORNER_PX)
+    raise SettingError(
+        f"{where} is {width_px}x{height_px} px, its camera {camera.width_px}x"
+        f"{camera.height_px}. Pass the calibration of the images as they are stored"
+    )
+
+
+def _camera_size(camera: Camera) -> tuple[int, int]:
+    return camera.width_px, camera.height_px
+
+
+def crop_camera(crop: Crop, camera: Camera) -> Camera:
+    """Return the camera of the cropped images, from that of the stored ones.
+
+    A camera smaller than the stored images is centred in them.
+    """
+    left = (crop.from_width_px - camera.width_px) / 2
+    top = (crop.from_height_px - camera.height_px) / 2
+    stored = replace(camera, cx_px=camera.cx_px + left, cy_px=camera.cy_px + top)
+    return crop.crop_camera(stored)

@@ -1,0 +1,122 @@
+"""Pascal VOC sets: an XML file for each picture, in ``Annotations/`` or beside it.
+
+``bndbox`` counts whole pixels from 1, and its last ones are part of the box: ``xmin`` 1 and
+``xmax`` 500 are the edges 0 and 500. The split of a picture is that of
+``ImageSets/Main/train.txt``, ``val.txt`` or ``test.txt``, else that of its folder.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+from dmrl.errors import SourceError
+from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.files.label_csv import LabelRow
+from dmrl.formats.files.labelled_pictures import (
+    LABELLED_OPTIONS,
+    LabelledPicture,
+    build_picture_content,
+    find_split,
+    label_from_box,
+    list_pictures,
+    name_peers,
+    natural_key,
+    spread_over_time,
+)
+from dmrl.guards import limits
+from dmrl.terminal.left_out import leave_out
+
+HEAD_BYTES = 4096
+XML_BYTES = 10 * limits.MB
+UNREADABLE = "XML files that are not VOC's; their pictures have no labels"
+
+
+def can_read(source: Path) -> bool:
+    """Return whether a folder has an XML file with an annotation."""
+    return source.is_dir() and next(_iter_annotation_files(source), None) is not None
+
+
+def _iter_annotation_files(source: Path) -> Iterator[Path]:
+    for path in source.rglob("*.xml"):
+        if not path.name.startswith(".") and path.is_file():
+            with path.open("rb") as stream:
+                if b"<annotation" in stream.read(HEAD_BYTES):
+                    yield path
+
+
+def load_content(source: Path, options: Options) -> Content:
+    """Load the samples of a set: images split by split, with their labels.
+
+    Parameters
+    ----------
+    source
+        The folder of the set.
+    options
+        ``names`` of peers by class, ``rate_hz``, ``robot_width_m``, and those of
+        `PictureConverter`.
+
+    Raises
+    ------
+    SourceError
+        If no XML file can be read, or there is no picture.
+    """
+    labels = {path.stem: path for path in sorted(_iter_annotation_files(source), key=natural_key)}
+    splits = _read_image_sets(source)
+    pictures = []
+    for path in list_pictures(source):
+        label = labels.get(path.stem)
+        split = splits.get(path.stem) or find_split(path.relative_to(source), {})
+        rows, size = (None, None) if label is None else _read_rows(label, path, options)
+        pictures.append(LabelledPicture(path, split, rows, size))
+    if not any(picture.rows is not None for picture in pictures):
+        raise SourceError(f"{source}: no picture has an XML file that can be read. Pass another")
+    for lost in sorted(labels.keys() - {picture.path.stem for picture in pictures}):
+        leave_out("XML files without a picture", labels[lost])
+    return build_picture_content(source, spread_over_time(pictures, options.rate_hz), options)
+
+
+def _read_image_sets(source: Path) -> dict[str, str]:
+    """Return the splits of pictures, by their names without suffix."""
+    splits = {}
+    for split in ("train", "val", "test"):
+        for path in source.glob(f"**/ImageSets/Main/{split}.txt"):
+            text = path.read_text(encoding="utf-8", errors="replace")
+            splits.update({line.split()[0]: split for line in text.splitlines() if line.split()})
+    return splits
+
+
+def _read_rows(
+    label: Path, picture: Path, options: Options
+) -> tuple[list[LabelRow] | None, tuple[float, float] | None]:
+    """Return the labels of a picture and the size that they refer to; None, None: unreadable."""
+    try:
+        root = _parse_xml(label.read_bytes())
+        objects = root.findall("object")
+        if len(objects) > limits.PEERS:
+            raise ValueError(f"more than {limits.PEERS} boxes")
+        names = [(one.findtext("name") or "").strip() or "class" for one in objects]
+        boxes = [_parse_box(one) for one in objects]
+        width, height = (float(root.findtext(f"size/{side}") or 0) for side in ("width", "height"))
+        peers = name_peers(names, options.names)
+        rows = [label_from_box(picture.name, *both) for both in zip(peers, boxes, strict=True)]
+    except (OSError, ValueError, ElementTree.ParseError) as e:
+        leave_out(UNREADABLE, f"{label}: {e}")
+        return None, None
+    return rows, (width, height) if width and height else None
+
+
+def _parse_xml(data: bytes) -> ElementTree.Element:
+    if len(data) > XML_BYTES or b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise ValueError(f"it is over {XML_BYTES} bytes, or defines entities")
+    return ElementTree.fromstring(data)
+
+
+def _parse_box(one: ElementTree.Element) -> tuple[float, float, float, float]:
+    """Return left, top, right and bottom edge of an object."""
+    xmin, ymin, xmax, ymax = (
+        float(one.findtext(f"bndbox/{name}") or "nan") for name in ("xmin", "ymin", "xmax", "ymax")
+    )
+    return xmin - 1, ymin - 1, xmax, ymax
+
+
+FORMAT = Format("voc", "a Pascal VOC set", can_read, load_content, LABELLED_OPTIONS)
