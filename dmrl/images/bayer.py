@@ -7,6 +7,9 @@ import numpy as np
 from dmrl.errors import MissingExtra
 from dmrl.images.codec import Grey, Rgb
 
+BAYER_MIN_PX = 4
+"""Smallest width and height of a raw image whose colours can be interpolated."""
+
 
 def load_opencv(extra: str = "bayer", what: str = "a raw picture") -> ModuleType:
     """Import OpenCV.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.errors import SourceError
-from dmrl.images.bayer import demosaic
+from dmrl.images.bayer import BAYER_MIN_PX, demosaic
 from dmrl.images.codec import BITS, Rgb, scale_to_8_bits
 
 CHANNELS: dict[str, tuple[int, ...]] = {
@@ -100,7 +100,8 @@ def convert_to_rgb(
     rows = height + {"nv21": height // 2, "nv24": 2 * height}.get(encoding, 0)
     odd = (encoding in (*YUV, "nv21") and width % 2) or (encoding == "nv21" and height % 2)
     whole = height > 0 and 0 < width * channels * size <= step and rows * step <= len(data)
-    if odd or not whole:
+    small = encoding.startswith("bayer_") and min(shape) < BAYER_MIN_PX
+    if odd or small or not whole:
         raise SourceError("images with another number of bytes than their size states")
     lines = np.ascontiguousarray(data[: rows * step].reshape(rows, step))
     if encoding in PLANAR_YUV:

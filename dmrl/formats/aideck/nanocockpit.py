@@ -61,7 +61,7 @@ def load_content(source: Path, options: Options) -> Content:
     Raises
     ------
     SourceError
-        If the table lacks a column, or no image can be decoded.
+        If the table lacks a column.
     MissingExtra
         If images are raw and OpenCV is not installed.
     """
@@ -139,7 +139,7 @@ def _iter_images(
         converter.options = replace(options, raw=path.parent.name == IMAGE_FOLDERS[0])
         converted = converter.convert(moment, path.read_bytes(), path)
         yield from converted[1] if converted else ()
-    yield from converter.finish()
+    converter.report()
 
 
 def _build_state_streams(

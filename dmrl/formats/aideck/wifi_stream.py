@@ -94,7 +94,7 @@ def _iter_image_samples(source: Path, time_ns: Sequence[int], options: Options) 
             raw = np.frombuffer(found.data, np.uint8).reshape(found.height_px, found.width_px)
             converted = converter.convert_pixels(moment, demosaic(raw), None, where)
         yield from converted[1] if converted else ()
-    yield from converter.finish()
+    converter.report()
 
 
 def _build_state_streams(

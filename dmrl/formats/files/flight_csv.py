@@ -17,7 +17,7 @@ Images of a robot are in a folder ``<robot>/``, named by their time in nanosecon
 import csv
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -27,6 +27,8 @@ from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats.base import Content, Format, Options
 from dmrl.formats.files import image_folder
+from dmrl.formats.files.labelled_pictures import is_picture
+from dmrl.formats.files.pictures import PICTURE_OPTIONS
 from dmrl.geometry.frames import Array
 from dmrl.samples import flight
 from dmrl.samples.flight import LOG_COLUMNS, merge_by_time, to_nanoseconds
@@ -268,13 +270,13 @@ def _iter_image_streams(folder: Path, options: Options) -> Iterator[Iterator[Sam
         return
     for path in sorted(folder.iterdir()):
         named = path.stem.isdecimal() and len(path.stem) >= image_folder.MIN_TIME_DIGITS
-        if path.suffix.lower() in image_folder.IMAGE_SUFFIXES and not named:
+        if is_picture(path) and not named:
             raise SourceError(
                 f"{path} is not named by its time in nanoseconds, {image_folder.MIN_TIME_DIGITS} "
                 "digits or more. Rename it"
             )
     robot = options.names.get(folder.name, folder.name)
-    own = Options(robot=robot, camera=options.camera, size_px=options.size_px)
+    own = replace(options, robot=robot, names={})
     yield image_folder.load_content(folder, own).samples
 
 
@@ -283,5 +285,5 @@ FORMAT = Format(
     "a folder of flight logs",
     can_read,
     load_content,
-    frozenset({"names", "camera", "size_px"}),
+    PICTURE_OPTIONS - {"robot"},
 )

@@ -86,7 +86,8 @@ class LabelRow:
         return (
             point
             | dict(zip(SIGMA_COLUMNS, self.sigmas, strict=True))
-            | {"box_px": list(self.box_px), "depth_from_box": self.depth_from_box}
+            | {"box_px": list(self.box_px)}
+            | ({"depth_from_box": True} if self.depth_from_box else {})
         )
 
     def to_cells(self) -> list[str]:

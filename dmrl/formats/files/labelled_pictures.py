@@ -144,7 +144,7 @@ def build_picture_content(
     report_doubts(source, [row for _, p in pictures for row in p.rows or ()], options.robot)
     return Content(
         samples=iter_picture_samples(source, pictures, options),
-        total=sum(2 if p.rows is not None else 1 for _, p in pictures),
+        total=sum(1 + (p.rows is not None) for _, p in pictures) + (options.camera is not None),
         split=find_intervals((time_ns, picture.split) for time_ns, picture in pictures),
     )
 
@@ -173,7 +173,7 @@ def iter_picture_samples(
             yield build_labels(time_ns, options.robot, peers, sources)
         if more is not None:
             yield from more(picture.path, time_ns, crop)
-    yield from converter.finish()
+    converter.report()
 
 
 def _to_pixels(picture: LabelledPicture, crop: Crop) -> list[LabelRow] | None:

@@ -5,7 +5,6 @@ number of pictures and the flag that decides it.
 """
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from dmrl.errors import SettingError, SourceError
@@ -14,7 +13,7 @@ from dmrl.formats.files.crop import Crop
 from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX, Camera
 from dmrl.guards import limits
 from dmrl.images import codec
-from dmrl.images.bayer import demosaic
+from dmrl.images.bayer import BAYER_MIN_PX, demosaic
 from dmrl.samples.sample import Sample, build_calibration, build_image
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
@@ -106,24 +105,17 @@ class PictureConverter:
         keeps = not any(changes.values()) and header.kind in ("png", "jpeg")
         return rgb, (data, header.kind) if keeps and not self.options.raw else None
 
-    def finish(self) -> Iterator[Sample]:
-        """Report the changes; yield nothing.
-
-        Raises
-        ------
-        SourceError
-            If no picture could be decoded.
-        """
-        if not self._converted:
-            raise SourceError(f"{self.source} has no picture that can be decoded. Pass another")
+    def report(self) -> None:
+        """Print a line for each kind of change."""
         for change, count in self._changes.items():
             say(f"{self.source}: {count} pictures: {change}")
-        yield from ()
 
 
 def _demosaic(rgb: codec.Rgb, where: object) -> codec.Rgb:
-    if (rgb != rgb[..., :1]).any() or min(rgb.shape[:2]) < 4:
+    if (rgb != rgb[..., :1]).any():
         raise SettingError(f"{where} has colours already, so it is not raw. Remove --raw")
+    if min(rgb.shape[:2]) < BAYER_MIN_PX:
+        raise SourceError(f"{where} is smaller than {BAYER_MIN_PX} x {BAYER_MIN_PX} pixels")
     return demosaic(rgb[..., 0].copy())
 
 

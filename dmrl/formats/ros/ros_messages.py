@@ -64,9 +64,9 @@ class MessageContext:
 
 def _convert_image(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
     shape = message.height, message.width
-    if max(shape) > MAX_SIDE_PX:
-        raise SourceError(f"{where.source}: an image is over {MAX_SIDE_PX} px long. Scale it down")
     try:
+        if max(shape) > MAX_SIDE_PX:
+            raise SourceError(f"images over {MAX_SIDE_PX} px long")
         rgb = convert_to_rgb(
             message.data,
             message.encoding,

@@ -12,6 +12,7 @@ from dmrl.geometry.frames import AIDECK
 from dmrl.images.bayer import demosaic
 from dmrl.images.codec import decode, encode_jpeg, encode_png
 from dmrl.samples.sample import Sample
+from dmrl.terminal.left_out import count_left_out
 
 from .. import foreign
 
@@ -67,7 +68,6 @@ def test_lost_pictures_are_counted_by_their_numbers(
     ("old", "new", "text"),
     [
         ("frame_id", "frame", r"metadata.csv:1: no column frame_id"),
-        ("00003.jpg", "00009.jpg", r"no image 00009 in .*camera_raw"),
         (",10,255,", ",10,x,", r"metadata.csv:4: not a file and whole numbers"),
     ],
 )
@@ -77,6 +77,14 @@ def test_a_table_that_does_not_fit_is_one_line(folder: Path, old: str, new: str,
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(SourceError, match=text):
         samples(folder)
+
+
+def test_a_row_without_its_picture_is_left_out(folder: Path) -> None:
+    path = folder / "metadata.csv"
+    path.write_text(path.read_text().replace("00003.jpg", "00009.jpg"))
+    with count_left_out() as counted:
+        assert len(samples(folder)["/cf1/camera/image"]) == 5
+    assert counted.counts == {"rows without their picture": 1}
 
 
 def test_it_is_known_by_its_table(folder: Path) -> None:
@@ -138,8 +146,9 @@ def test_raw_pictures_are_of_four_by_four_pixels_at_least(
     if fits:
         assert len(samples(folder)["/cf1/camera/image"]) == 6
     else:
-        with pytest.raises(SourceError, match="is smaller than 4 x 4 pixels"):
-            samples(folder)
+        with count_left_out() as counted:
+            assert "/cf1/camera/image" not in samples(folder)
+        assert counted.counts == {"pictures that cannot be decoded": 6}
 
 
 @pytest.mark.parametrize(

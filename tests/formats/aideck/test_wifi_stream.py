@@ -1,19 +1,21 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dmrl.errors import SourceError
+from dmrl.errors import SettingError, SourceError
 from dmrl.formats.aideck import wifi_stream
-from dmrl.formats.aideck.cpx import Image, Layout
+from dmrl.formats.aideck.cpx import Encoding, Image, Layout
 from dmrl.formats.aideck.cpx_encode import pack_image
 from dmrl.formats.aideck.cpx_state import RobotState
 from dmrl.formats.base import Options
 from dmrl.formats.registry import find_format
-from dmrl.geometry.frames import AIDECK
+from dmrl.geometry.frames import AIDECK, Camera
 from dmrl.images.bayer import demosaic
 from dmrl.images.codec import decode, encode_jpeg
 from dmrl.samples.sample import Sample
+from dmrl.terminal.left_out import count_left_out
 
 from .. import foreign
 
@@ -40,10 +42,43 @@ def test_raw_pictures_get_their_colours_and_nominal_times(tmp_path: Path) -> Non
 def test_a_camera_that_is_given_comes_once_before_the_pictures(tmp_path: Path) -> None:
     raw = foreign.pictures(3)
     data = b"".join(pack_image(Image(32, 24, "raw", p.tobytes())) for p in raw)
-    found = samples(tmp_path / "a.cpx", data, Options(rate_hz=20, camera=AIDECK))
+    camera = replace(AIDECK, width_px=32, height_px=24)
+    found = samples(tmp_path / "a.cpx", data, Options(rate_hz=20, camera=camera))
     (calibration,) = found["/cf1/camera/calibration"]
     assert calibration.time_ns == 0
     assert len(found["/cf1/camera/image"]) == 3
+
+
+def test_a_camera_of_another_size_is_refused(tmp_path: Path) -> None:
+    data = pack_image(Image(32, 24, "raw", foreign.pictures(1)[0].tobytes()))
+    with pytest.raises(SettingError, match="is 32x24 px, its camera 320x224"):
+        samples(tmp_path / "a.cpx", data, Options(camera=AIDECK))
+
+
+@pytest.mark.parametrize("encoding", ["raw", "jpeg"])
+@pytest.mark.parametrize("camera", [None, AIDECK])
+def test_the_whole_sensor_is_cut_to_the_size_of_the_network(
+    encoding: Encoding, camera: Camera | None, tmp_path: Path
+) -> None:
+    raw = np.random.default_rng(0).integers(0, 256, (244, 324), np.uint8)
+    payload = raw.tobytes() if encoding == "raw" else encode_jpeg(demosaic(raw))
+    options = Options(camera=camera, size_px=(320, 224))
+    found = samples(tmp_path / "a.cpx", pack_image(Image(324, 244, encoding, payload)), options)
+    (image,) = found["/cf1/camera/image"]
+    rgb = decode(image.fields["data"])
+    assert rgb.shape == (224, 320, 3)
+    if camera is not None and encoding == "raw":
+        np.testing.assert_array_equal(rgb, demosaic(raw)[10:234, 2:322])
+
+
+def test_a_cut_jpeg_is_left_out_and_the_others_stay(tmp_path: Path) -> None:
+    jpeg = encode_jpeg(np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8))
+    parts = [jpeg, jpeg[: len(jpeg) // 2], jpeg]
+    data = b"".join(pack_image(Image(32, 24, "jpeg", part)) for part in parts)
+    with count_left_out() as counted:
+        found = samples(tmp_path / "a.cpx", data)
+    assert [s.time_ns for s in found["/cf1/camera/image"]] == [0, 200_000_000]
+    assert counted.counts == {"pictures that cannot be decoded": 1}
 
 
 def test_jpegs_keep_their_bytes(tmp_path: Path) -> None:

@@ -76,7 +76,9 @@ def test_a_point_is_kept_to_a_ten_thousandth_of_a_pixel(u: float, v: float, dept
         ("1,2,3,4,2,3,5,", "not a box"),
         ("1,2,3,1,6,3,5,", "not a box"),
         ("1,2,3,1,2,3,,", "not a box"),
-        ("1,2,,,,,,", "depth_m is '', not a number"),
+        ("1,2,,,,,,", ""),
+        (",,,1,2,3,4,", ""),
+        (",2,1,,,,,", "u_px is '', not a number"),
         ("1,2,inf,,,,,", "depth_m is 'inf', not a number"),
     ],
 )

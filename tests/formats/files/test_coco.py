@@ -1,0 +1,105 @@
+"""COCO sets become labels within 0.01 px."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats.base import Options
+from dmrl.formats.registry import find_format
+from dmrl.terminal.left_out import count_left_out
+
+from .boxes import HEIGHT, WIDTH, boxes_of, check, read, write_picture
+
+
+def coco(folder: str, ks: range, name: str) -> dict[str, Any]:
+    """A COCO document of pictures k in a folder."""
+    return {
+        "categories": [{"id": 7, "name": "drone"}, {"id": 9, "name": "quad copter"}],
+        "images": [
+            {"id": 100 + k, "file_name": f"{folder}{name}{k}.png", "width": WIDTH, "height": HEIGHT}
+            for k in ks
+        ],
+        "annotations": [
+            {
+                "id": 10 * k + n,
+                "image_id": 100 + k,
+                "category_id": {"drone": 7, "quad copter": 9}[kind],
+                "bbox": [a, b, c - a, d - b],
+                "area": (c - a) * (d - b),
+                "iscrowd": 0,
+            }
+            for k in ks
+            for n, (kind, (a, b, c, d)) in enumerate(boxes_of(k))
+        ],
+    }
+
+
+@pytest.mark.parametrize(
+    ("pictures", "file", "prefix"),
+    [
+        ("{split}2017/", "annotations/instances_{split}2017.json", ""),
+        ("images/{split}2017/", "annotations/instances_{split}2017.json", ""),
+        ("{split}/", "{split}/_annotations.coco.json", ""),
+        ("data/{split}/", "{split}.json", "{split}/"),
+    ],
+)
+def test_coco_with_splits(pictures: str, file: str, prefix: str, tmp_path: Path) -> None:
+    # Both splits have pictures of the same names.
+    for split, ks in (("train", range(6)), ("val", range(6, 9))):
+        for k in ks:
+            write_picture(tmp_path / pictures.format(split=split) / f"p{k % 6}.png", k)
+        told = coco(prefix.format(split=split), ks, "p")
+        for k, image in zip(ks, told["images"], strict=True):
+            image["file_name"] = f"{prefix.format(split=split)}p{k % 6}.png"
+        path = tmp_path / file.format(split=split)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(told))
+    if "annotations" in file and "_anno" not in file:
+        (tmp_path / "annotations/captions_train2017.json").write_text(
+            '{"images": [], "annotations": []}'
+        )
+    check(read(tmp_path, "coco"), list(range(9)))
+    content = find_format(tmp_path).content(tmp_path, Options())
+    assert content.split == {"train": [(0, 500_000_000)], "val": [(600_000_000, 800_000_000)]}
+
+
+def test_coco_leaves_out_what_cannot_be_used(tmp_path: Path) -> None:
+    for k in range(1, 6):
+        write_picture(tmp_path / f"p{k}.png", k)
+    told = coco("", range(1, 5), "p")
+    told["images"].append({"id": 1, "file_name": "gone.png"})
+    told["images"][0]["width"] = 640
+    told["annotations"].append({"id": 500, "image_id": 104, "category_id": 7, "iscrowd": 1})
+    next(a for a in told["annotations"] if a["image_id"] == 102)["bbox"] = [1, 2, 0, 3]
+    (tmp_path / "set.json").write_text(json.dumps(told))
+    with count_left_out() as counted:
+        samples = read(tmp_path, "coco")
+    assert sum(s.message == "CompressedImage" for s in samples) == 4
+    check(samples, [3, 4])
+    assert counted.counts == {
+        "pictures of a JSON file that are not there": 1,
+        "pictures with labels for another size": 1,
+        "boxes around crowds (iscrowd)": 1,
+        "pictures with a box that cannot be read": 1,
+        "pictures that no JSON file names": 1,
+    }
+    with count_left_out():
+        check(
+            list(
+                find_format(tmp_path / "set.json").content(tmp_path / "set.json", Options()).samples
+            ),
+            [3, 4],
+        )
+
+
+@pytest.mark.parametrize(
+    "text", ['{"images": [{}], ', '{"images": [{"id": 1}]}', '[{"images": []}]', '{"images": [3]}']
+)
+def test_a_file_that_is_not_coco_s_is_one_line(text: str, tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.png", 1)
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(SourceError, match=r"a\.json is not a COCO file: .*Restore"):
+        read(tmp_path, "coco")

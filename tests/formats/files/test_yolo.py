@@ -1,0 +1,185 @@
+"""YOLO sets, written by other programs, become labels within 0.01 px."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats.base import Options
+from dmrl.formats.registry import find_format
+from dmrl.terminal.left_out import count_left_out
+
+from .boxes import HEIGHT, WIDTH, boxes_of, check, labels_of, read, write_picture, yolo_lines
+
+DATA_YAML = "path: /content/elsewhere/set\ntrain: {}\nval: {}\nnc: 2\nnames: {}\n"
+
+
+@pytest.mark.parametrize(
+    ("places", "stated", "names"),
+    [
+        (("images/train", "images/val"), ("images/train", "images/val"), "[drone, 'quad copter']"),
+        (
+            ("train/images", "valid/images"),
+            ("../train/images", "../valid/images"),
+            "{0: drone, 1: quad copter}",
+        ),
+        (("images/a", "images/b"), ("images/a", "./images/b"), "[drone, quad copter]"),
+        (
+            ("images/a/deep", "images/b"),
+            ("[images/a, images/c]", "images/b"),
+            "['drone', quad copter]",
+        ),
+        (("images/a", "images/b"), ("train.txt", "lists/val.txt"), "[drone, quad copter]"),
+    ],
+)
+def test_yolo_with_splits(
+    places: tuple[str, str], stated: tuple[str, str], names: str, tmp_path: Path
+) -> None:
+    source = tmp_path / "set"
+    pictures: dict[str, list[Path]] = {"train": [], "val": []}
+    for k in range(11):
+        split = "val" if k in (3, 4, 8) else "train"
+        folder = source / places[split == "val"]
+        write_picture(folder / f"img{k}.png", k)
+        pictures[split].append(folder / f"img{k}.png")
+        label = Path(str(folder).replace("/images", "/labels")) / f"img{k}.txt"
+        label.parent.mkdir(parents=True, exist_ok=True)
+        label.write_text(yolo_lines(boxes_of(k)))
+    for split, text in zip(pictures, stated, strict=True):
+        if text.endswith(".txt"):
+            (source / text).parent.mkdir(exist_ok=True)
+            lines = [f"./{path.relative_to(source)}\n" for path in pictures[split]]
+            (source / text).write_text("".join(lines))
+    (source / "data.yaml").write_text(DATA_YAML.format(*stated, names))
+    train, val = [k for k in range(11) if k not in (3, 4, 8)], [3, 4, 8]
+    check(read(source, "yolo"), train + val)
+    content = find_format(source).content(source, Options())
+    assert content.split == {"train": [(0, 700_000_000)], "val": [(800_000_000, 1_000_000_000)]}
+
+
+@pytest.mark.parametrize("classes", ["classes.txt", "obj.names", "labels/classes.txt"])
+@pytest.mark.parametrize("beside", [False, True])
+def test_yolo_without_splits(classes: str, beside: bool, tmp_path: Path) -> None:
+    (tmp_path / "labels").mkdir()
+    for k in range(11):
+        write_picture(tmp_path / "images" / f"{k}.png", k)
+        folder = tmp_path / ("images" if beside else "labels")
+        (folder / f"{k}.txt").write_text(yolo_lines(boxes_of(k)))
+    (tmp_path / classes).write_text("drone\nquad copter\n")
+    samples = read(tmp_path, "yolo")
+    check(samples, list(range(11)))
+    assert not find_format(tmp_path).content(tmp_path, Options()).split
+
+
+def test_yolo_as_supervision_writes_it(tmp_path: Path) -> None:
+    sv = pytest.importorskip("supervision")
+    paths = []
+    annotations = {}
+    for k in range(6):
+        write_picture(tmp_path / "from" / f"{k}.png", k)
+        paths.append(str(tmp_path / "from" / f"{k}.png"))
+        boxes = np.array([box for _, box in boxes_of(k)], np.float32).reshape(-1, 4)
+        numbers = np.arange(len(boxes))
+        annotations[paths[-1]] = sv.Detections(xyxy=boxes, class_id=numbers)
+    made = sv.DetectionDataset(["drone", "quad copter"], paths, annotations)
+    out = tmp_path / "set"
+    made.as_yolo(str(out / "images"), str(out / "labels"), str(out / "data.yaml"))
+    check(read(out, "yolo"), list(range(6)))
+    made.as_coco(str(out / "c/images"), str(out / "c/annotations/all.json"))
+    check(read(out / "c", "coco"), list(range(6)))
+
+
+@pytest.mark.parametrize(
+    ("line", "box"),
+    [
+        ("0 0.5 0.5 0.25 0.5 0.93", (0.375, 0.25, 0.625, 0.75)),
+        ("0 0.1 0.2 0.5 0.2 0.3 0.7", (0.1, 0.2, 0.5, 0.7)),
+        ("0 0.1 0.2 0.5 0.2 0.5 0.7 0.1 0.7", (0.1, 0.2, 0.5, 0.7)),
+    ],
+)
+def test_confidences_and_polygons_give_boxes(
+    line: str, box: tuple[float, ...], small: Path
+) -> None:
+    (small / "labels/1.txt").write_text(line + "\n\n")
+    (peer,) = labels_of(read(small, "yolo"))[0]
+    want = np.array(box) * (WIDTH, HEIGHT, WIDTH, HEIGHT)
+    np.testing.assert_allclose(peer["box_px"], want)
+
+
+def test_keypoints_are_ignored_where_they_are_stated(small: Path) -> None:
+    (small / "labels/1.txt").write_text("0 0.5 0.5 0.25 0.5 0.4 0.4 2 0.6 0.6 2\n")
+    (small / "data.yaml").write_text("names: [drone]\nkpt_shape: [2, 3]\n")
+    (peer,) = labels_of(read(small, "yolo"))[0]
+    assert peer["box_px"] == [120, 56, 200, 168]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "0 0.5 0.5 0.25",
+        "0 160 112 40 30",
+        "drone 0.5 0.5 0.1 0.1",
+        "0 0.5 0.5 0 0.1",
+        "0 nan 0.5 0.1 0.1",
+        "0 0.1 0.2 0.5 0.2 0.3 0.7 0.4",
+        "\xff",
+    ],
+)
+def test_a_label_file_that_is_broken_leaves_its_picture(line: str, small: Path) -> None:
+    (small / "labels/1.txt").write_bytes(f"0 0.5 0.5 0.1 0.1\n{line}\n".encode("latin-1"))
+    with count_left_out() as counted:
+        samples = read(small, "yolo")
+    assert sum(s.message == "CompressedImage" for s in samples) == 2
+    check(samples, [2])
+    (count,) = counted.counts.values()
+    assert count == 1
+    assert "1.txt" in next(iter(counted.first.values()))
+
+
+def test_a_set_in_pixels_is_refused(small: Path) -> None:
+    for k in (1, 2):
+        (small / f"labels/{k}.txt").write_text("0 160 112 40 30\n")
+    with pytest.raises(SourceError, match=r"no label file is YOLO's"), count_left_out():
+        read(small, "yolo")
+
+
+@pytest.mark.parametrize("unlabelled", [False, True])
+def test_a_picture_without_label_file_shows_nobody_unless_said(
+    unlabelled: bool, small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_picture(small / "images/0.png", 0)
+    write_picture(small / "images/._0.png", 0)
+    (small / "labels/7.txt").write_text(yolo_lines(boxes_of(1)))
+    with count_left_out() as counted:
+        check(
+            read(small, "yolo", Options(unlabelled=unlabelled)), [1, 2] if unlabelled else [0, 1, 2]
+        )
+    assert counted.counts == {"label files without a picture": 1}
+    assert ("1 pictures have no label file" in capsys.readouterr().err) != unlabelled
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "names: [",
+        "- a\n",
+        "names: {a: b}",
+        "names: 7",
+        "names: &a [x]\ntrain: *a\n",
+        "!!python/object/apply:os.system [ls]",
+    ],
+)
+def test_a_description_that_is_none_is_one_line(text: str, small: Path) -> None:
+    (small / "data.yaml").write_text(text)
+    with pytest.raises(SourceError, match=r"data\.yaml does not describe a YOLO set: .*Fix") as e:
+        read(small, "yolo")
+    assert "\n" not in str(e.value)
+
+
+def test_a_picture_of_another_size_follows_the_crop(small: Path) -> None:
+    for peers, k in zip(
+        labels_of(read(small, "yolo", Options(size_px=(160, 112)))), (1, 2), strict=True
+    ):
+        for peer, (_, box) in zip(peers, boxes_of(k), strict=True):
+            np.testing.assert_allclose(peer["box_px"], np.array(box) / 2, atol=0.01)
