@@ -1,7 +1,7 @@
-"""Unwrapping of counters, and removal of jitter from times of arrival.
+"""Removal of jitter from times of arrival.
 
-Each comes in two forms. ``unwrap`` and ``dejitter`` process a whole file at once.
-``CounterUnwrapper`` and ``SteadyRateFilter`` process one value after the other, as they arrive.
+``dejitter`` processes a whole file at once. ``SteadyRateFilter`` processes one arrival after the
+other. Counters and clocks of files: `dmrl.formats.clocks`.
 """
 
 from collections import deque
@@ -15,71 +15,6 @@ EARLY_TOLERANCE = 0.3
 """Largest earliness of an arrival, as a share of the period."""
 EARLY_GAIN, LATE_GAIN = 0.3, 0.01
 """Shares of an early and of a late arrival's deviation by which the next due time is corrected."""
-
-
-def unwrap(values: ArrayLike, bits: int) -> Ints:
-    """Return (N,) counts that continue where the counter wrapped to 0.
-
-    Each step is the smallest one, forward or back, that gives the next value. So values slightly
-    out of order stay so, and a gap of half the counter's range or more is not detected.
-
-    Parameters
-    ----------
-    values
-        (N,) integers, as counted.
-    bits
-        Width of the counter: 8 for a frame number, 32 for microseconds.
-
-    Returns
-    -------
-    Ints
-        (N,) int64; the first value is unchanged.
-
-    Examples
-    --------
-    >>> unwrap([254, 255, 0, 2, 1], 8).tolist()
-    [254, 255, 256, 258, 257]
-    """
-    counts = np.asarray(values, np.int64)
-    half = 1 << (bits - 1)
-    steps = (np.diff(counts) + half) % (1 << bits) - half
-    return np.concatenate([counts[:1], counts[:1] + np.cumsum(steps)])
-
-
-class CounterUnwrapper:
-    """Unwrapper of a counter with few bits, one value at a time.
-
-    Parameters
-    ----------
-    bits
-        Width of the counter.
-    forward
-        True: the counter never steps back, so up to 2**bits - 1 values may be missing. False: take
-        the nearest value, before or after.
-    """
-
-    def __init__(self, bits: int, *, forward: bool = False) -> None:
-        self._period = 1 << bits
-        self._back = 0 if forward else self._period // 2
-        self._last: int | None = None
-
-    def __call__(self, value: int) -> int:
-        """Return the unwrapped value of the counter.
-
-        Examples
-        --------
-        >>> unwrapped = CounterUnwrapper(8)
-        >>> [unwrapped(value) for value in (254, 255, 1, 0)]
-        [254, 255, 257, 256]
-        """
-        self._last = self.find_nearest(value)
-        return self._last
-
-    def find_nearest(self, value: int) -> int:
-        """Return the unwrapped value without storing it. It may have more bits than the counter."""
-        if self._last is None:
-            return value
-        return self._last + (value - self._last + self._back) % self._period - self._back
 
 
 def dejitter(arrival_ns: ArrayLike, count: ArrayLike | None = None) -> Ints:

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from dmrl.errors import SettingError
-from dmrl.formats.timestamps import CounterUnwrapper
+from dmrl.formats.clocks import CounterUnwrapper
 from dmrl.live.cflib_session import CflibSession
 from dmrl.live.log_blocks import LogDecoder, LogPlan, plan_blocks
 from dmrl.live.queue import LinkStatus, ReceivedSample, SampleQueue

@@ -7,14 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dmrl.formats.timestamps import (
-    CounterUnwrapper,
-    SteadyRateFilter,
-    _lower_hull,
-    _number_arrivals,
-    dejitter,
-    unwrap,
-)
+from dmrl.formats.clocks import CounterUnwrapper, unwrap
+from dmrl.formats.timestamps import SteadyRateFilter, _lower_hull, _number_arrivals, dejitter
 
 MS = 1_000_000
 

@@ -18,7 +18,7 @@ from typing import Literal
 
 from dmrl.formats.aideck.cpx_log import APP, STREAMER, Packet, PacketReader
 from dmrl.formats.aideck.cpx_state import STATE_FORMAT, RobotState, unpack_state
-from dmrl.formats.timestamps import CounterUnwrapper
+from dmrl.formats.clocks import CounterUnwrapper
 
 Layout = Literal["plain", "stamped", "streamer"]
 Encoding = Literal["raw", "jpeg"]

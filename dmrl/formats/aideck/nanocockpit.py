@@ -15,10 +15,10 @@ import numpy as np
 
 from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
+from dmrl.formats.clocks import settle_times, unwrap
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
 from dmrl.formats.files.pictures import PictureConverter
-from dmrl.formats.timestamps import unwrap
 from dmrl.samples.flight import Times, merge_by_time
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import leave_out
@@ -67,12 +67,17 @@ def load_content(source: Path, options: Options) -> Content:
     """
     names, table = _load_metadata(source / METADATA_FILE)
     paths = [_find_image(source, name) for name in names]
-    time_ns = unwrap(table[TIME_COLUMN], 32) * 1000
+    found = settle_times(
+        unwrap(table[TIME_COLUMN], 32) * 1000,
+        lambda row: f"{source / METADATA_FILE}:{row + 2}",
+    )
+    paths, time_ns = [paths[row] for row in found.rows], found.time_ns
+    table = {name: column[found.rows] for name, column in table.items()}
     lost = int((np.diff(unwrap(table[NUMBER_COLUMN], 8)) - 1).clip(0).sum())
     if lost:
         say(f"{source}: {lost} images were lost in transmission, by their numbers")
     state_ns = time_ns + _wrap_to_int32(table[STATE_TIME_COLUMN] - table[TIME_COLUMN]) * 1000
-    streams = [_iter_images(source, paths, np.maximum.accumulate(time_ns), options)]
+    streams = [_iter_images(source, paths, time_ns, options)]
     return Content(merge_by_time(streams + _build_state_streams(table, state_ns, options, source)))
 
 

@@ -14,6 +14,7 @@ from dmrl.errors import SourceError
 from dmrl.formats.aideck.cpx import Image, ImageReader
 from dmrl.formats.aideck.cpx_state import RobotState
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
+from dmrl.formats.clocks import settle_times
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
 from dmrl.formats.files.pictures import PictureConverter
@@ -63,7 +64,7 @@ def load_content(source: Path, options: Options) -> Content:
         raise SourceError(f"{source} has no whole image of a CPX stream. Pass another file")
     leave_out("images that are broken or cut short", source, reader.broken)
     leave_out("bytes that belong to no packet", source, reader.skipped_bytes)
-    time_ns = _to_times_ns(times, options.rate_hz)
+    time_ns = _to_times_ns(times, source, options)
     pictures = _iter_image_samples(source, time_ns, options)
     told = [state for state in states if state is not None]
     return Content(merge_by_time([pictures, *_build_state_streams(told, options, source)]))
@@ -76,18 +77,32 @@ def _iter_images(source: Path, reader: ImageReader) -> Iterator[Image]:
     reader.finish()
 
 
-def _to_times_ns(times_us: Sequence[int | None], rate_hz: float) -> list[int]:
-    """Return the camera's times, or nominal ones unless every image has one."""
+def _to_times_ns(
+    times_us: Sequence[int | None], source: Path, options: Options
+) -> list[int | None]:
+    """Return the camera's times, or nominal ones unless every image has one.
+
+    None stands for an image whose time is wrong, which is left out.
+    """
     if any(time is None for time in times_us):
-        return [round(k * 1e9 / rate_hz) for k in range(len(times_us))]
-    return list(accumulate((1000 * (time or 0) for time in times_us), max))
+        return [round(k * 1e9 / options.rate_hz) for k in range(len(times_us))]
+    options.refuse("rate_hz", f"has no effect: {source} has the times of its camera")
+    told_ns = [1000 * (time or 0) for time in times_us]
+    found = settle_times(told_ns, lambda row: f"{source}: image {row + 1}")
+    settled = dict(zip(found.rows.tolist(), found.time_ns.tolist(), strict=True))
+    latest = accumulate((settled.get(row, 0) for row in range(len(told_ns))), max)
+    return [moment if row in settled else None for row, moment in enumerate(latest)]
 
 
-def _iter_image_samples(source: Path, time_ns: Sequence[int], options: Options) -> Iterator[Sample]:
+def _iter_image_samples(
+    source: Path, time_ns: Sequence[int | None], options: Options
+) -> Iterator[Sample]:
     converter = PictureConverter(options, source)
     images = _iter_images(source, ImageReader())
     for k, (moment, found) in enumerate(zip(time_ns, images, strict=True)):
         where = f"{source}: picture {k}"
+        if moment is None:
+            continue
         if found.encoding == "jpeg":
             converted = converter.convert(moment, found.data, where)
         else:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
+from dmrl.formats.clocks import unwrap
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
-from dmrl.formats.timestamps import unwrap
 from dmrl.geometry.frames import Array
 from dmrl.guards import limits
 from dmrl.terminal.left_out import leave_out

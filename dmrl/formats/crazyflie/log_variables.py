@@ -18,12 +18,14 @@ If attitude or velocity cannot be derived, one line reports the missing variable
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
+from dmrl.formats.clocks import find_new_values, settle_times
 from dmrl.formats.crazyflie.log_block import LogBlock, TimeSeries, find_series
 from dmrl.formats.crazyflie.state import (
     ANGLES,
@@ -66,8 +68,13 @@ def build_streams(
         Names of the robots that it ranges to, by their number; others are ``cf<number>``.
     where
         The source, for warnings.
+
+    Raises
+    ------
+    SourceError
+        If the clock of the log starts again.
     """
-    blocks = [_sort_by_time(block) for block in blocks]
+    blocks = [_settle_block(block, where) for block in blocks]
     logged = [build_raw_stream(robot, block) for block in blocks]
     return logged + derive_streams(robot, blocks, names, where)
 
@@ -86,13 +93,15 @@ def derive_streams(
     return found
 
 
-def _sort_by_time(block: LogBlock) -> LogBlock:
-    if (np.diff(block.time_ns) >= 0).all():
-        return block
-    order = np.argsort(block.time_ns, kind="stable")
-    return LogBlock(
-        block.name, block.time_ns[order], {name: v[order] for name, v in block.columns.items()}
-    )
+def _settle_block(block: LogBlock, where: object) -> LogBlock:
+    def name_row(row: int) -> str:
+        return f"{where}: {block.name}, record {row + 1}"
+
+    found = settle_times(block.time_ns, name_row)
+    if len(found.rows) == len(block.time_ns) and (np.diff(found.rows) == 1).all():
+        return replace(block, time_ns=found.time_ns)
+    columns = {name: values[found.rows] for name, values in block.columns.items()}
+    return replace(block, time_ns=found.time_ns, columns=columns)
 
 
 def build_raw_stream(robot: str, block: LogBlock) -> SampleStream:
@@ -189,7 +198,7 @@ def _iter_distances(
         for name, values in block.columns.items():
             match = DISTANCE_VARIABLE.fullmatch(name)
             if match:
-                fresh = np.concatenate([[True], values[1:] != values[:-1]])
+                fresh = find_new_values(values, polled=True)
                 metres = values[fresh] * _detect_unit(values, f"{where}: {name}")
                 yield int(match[1]), block.time_ns[fresh], metres
         if block.name == "estDistance" and {"id", "distance"} <= block.columns.keys():

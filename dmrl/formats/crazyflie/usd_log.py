@@ -17,10 +17,10 @@ import numpy as np
 
 from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
+from dmrl.formats.clocks import unwrap
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
 from dmrl.formats.crazyflie.usd_records import EventType, Rows, gather_records
-from dmrl.formats.timestamps import unwrap
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 

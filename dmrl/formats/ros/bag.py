@@ -27,6 +27,7 @@ from urllib.parse import quote
 from dmrl import topics
 from dmrl.errors import DmrlError, MissingExtra, SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
+from dmrl.formats.clocks import MessageClock
 from dmrl.formats.files.pictures import scaling_words
 from dmrl.formats.ros.ros_messages import (
     CONVERTERS,
@@ -243,15 +244,20 @@ def _iter_samples(
             line = lines[connection.topic, connection.msgtype]
             yield line, bag_ns, reader.deserialize(data, connection.msgtype)
 
+    with closing(_iter_guarded(source, messages)) as first:
+        stamps = ((line.topic, _header_time_ns(decoded), at) for line, at, decoded in first)
+        clock = MessageClock.from_stamps(source, stamps)
     for line, bag_ns, decoded in _iter_guarded(source, messages):
         captured, odometry = bool(MOTION_CAPTURE.search(line.topic)), line.robot in moving
         where = MessageContext(
             source, line.robot, line.peer, captured, odometry, fixed, options.bits
         )
         # Without a time in the header, the bag's own time is the best estimate.
-        time_ns = _header_time_ns(decoded)
-        unstamped[line.topic] += time_ns == 0 < bag_ns
-        for sample in _convert_message(line, decoded, time_ns or max(bag_ns, 0), where):
+        stamp_ns = _header_time_ns(decoded)
+        unstamped[line.topic] += clock.is_unset(line.topic, stamp_ns) and bag_ns > 0
+        if (time_ns := clock.find_time_ns(line.topic, stamp_ns, bag_ns)) is None:
+            continue
+        for sample in _convert_message(line, decoded, time_ns, where):
             is_calibration = sample.message == "CameraCalibration"
             # A calibration is sent with every image and never changes: keep the first.
             if not (is_calibration and sample.topic in calibrated):

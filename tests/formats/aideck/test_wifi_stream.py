@@ -140,10 +140,20 @@ def test_a_stream_that_was_cut_says_so(
 
 
 def test_times_of_a_camera_that_does_not_always_tell_are_nominal_and_none_goes_back() -> None:
-    of = wifi_stream._to_times_ns
-    assert of([5, 3, 9], 10.0) == [5000, 5000, 9000]
+    def of(times_us: list[int | None], rate_hz: float = 10.0) -> list[int | None]:
+        return wifi_stream._to_times_ns(times_us, Path("a.cpx"), Options(rate_hz=rate_hz))
+
+    assert of([5, 3, 9]) == [5000, 5000, 9000]
     assert of([5, None, 9], 4.0) == [0, 250_000_000, 500_000_000]
-    assert of([0, 1], 4.0) == [0, 1000]
+    assert of([0, 1]) == [0, 1000]
+    with pytest.raises(SettingError, match=r"--rate-hz has no effect: a\.cpx has the times"):
+        of([0, 1], 4.0)
+
+
+def test_a_camera_that_started_again_is_refused_with_its_image() -> None:
+    times: list[int | None] = [*range(60_000_000, 61_000_000, 50_000), *range(0, 500_000, 50_000)]
+    with pytest.raises(SourceError, match=r"a\.cpx: image 21: time goes back from 60\.95 s to 0 s"):
+        wifi_stream._to_times_ns(times, Path("a.cpx"), Options())
 
 
 @pytest.mark.parametrize(("garbage", "known"), [(1000, True), (65_000, True), (66_000, False)])
