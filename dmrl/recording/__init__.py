@@ -25,7 +25,6 @@ from dmrl.recording.licences import (
 from dmrl.recording.loaded import LoadedRecording
 from dmrl.recording.log_times import read_log_times
 from dmrl.recording.mcap.channel import Channel, RawMessage
-from dmrl.recording.mcap.summary_index import TopicInfo
 from dmrl.recording.preview import sample_topics
 from dmrl.recording.provenance import Input, Provenance
 from dmrl.recording.provenance_inputs import build_input, build_provenance
@@ -40,8 +39,8 @@ from dmrl.recording.reader import (
     read_table,
 )
 from dmrl.recording.recover import recover
-from dmrl.recording.recovery import Recovery
-from dmrl.recording.summary import SPLIT_METADATA, Summary, read_summary
+from dmrl.recording.recovery_report import Recovery
+from dmrl.recording.summary import SPLIT_METADATA, Summary, TopicInfo, read_summary
 from dmrl.recording.writer import RecordingWriter
 
 __all__ = [

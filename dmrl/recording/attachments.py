@@ -20,9 +20,9 @@ def copy_metadata_and_attachments(summary: Summary, out: RecordingWriter) -> Non
         if name not in (METADATA_NAME, checksums.METADATA_NAME):
             for values in records:
                 out.add_metadata(name, values)
-    for name, data in summary.attachments.items():
-        if name != RECIPE_NAME:
-            out.add_attachment(name, "application/octet-stream", data)
+    for attachment in summary.attachments:
+        if attachment.name != RECIPE_NAME:
+            out.copy_attachment(attachment)
 
 
 def read_splits(path: Path, summary: Summary) -> dict[str, list[tuple[int, int]]]:

@@ -13,11 +13,10 @@ from dmrl.recording.log_times import read_log_times
 from dmrl.recording.mcap.batch_reader import iter_batches
 from dmrl.recording.mcap.channel import Channel, RawMessage
 from dmrl.recording.mcap.message_batch import EMPTY_BATCH, Ints, MessageBatch, concatenate_all
-from dmrl.recording.mcap.summary_index import TopicInfo, read_channel
 from dmrl.recording.protobuf.columns import decode_topic, group_by_topic
 from dmrl.recording.protobuf.message_types import find_channel_descriptor, require_types
 from dmrl.recording.reader import Stamped, parse_message, read, select_topics
-from dmrl.recording.summary import read_summary
+from dmrl.recording.summary import TopicInfo, read_channel, read_summary
 
 PLACEHOLDER = re.compile(r"\\{\w+\\}")
 """A placeholder of a topic pattern, escaped."""

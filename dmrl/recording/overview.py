@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.recording.log_times import read_log_times
+from dmrl.recording.mcap.file import corrupt_error
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.summary import Summary
 from dmrl.terminal.tables import print_line, print_table
@@ -32,7 +33,7 @@ class Overview:
             "end_ns": found.end_ns,
             "topics": topics,
             "metadata": found.metadata,
-            "attachments": sorted(found.attachments),
+            "attachments": sorted(one.name for one in found.attachments),
             "provenance": found.provenance.to_json() if found.provenance else None,
         }
 
@@ -51,6 +52,9 @@ class Overview:
 def topic_rows(path: Path, found: Summary) -> list[tuple[str, str, int, float | None]]:
     """Return topic, message, count and mean rate of each topic, between its own messages."""
     times = read_log_times(path, found.topics)
+    for topic, info in found.topics.items():
+        if (listed := len(times[topic])) != info.count:
+            raise corrupt_error(path, f"{topic} has {listed} of {info.count} messages")
     return [
         (topic, info.schema, info.count, _rate_hz(times.get(topic)))
         for topic, info in found.topics.items()

@@ -13,8 +13,7 @@ from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunk_reader import read_chunk
 from dmrl.recording.mcap.file import open_mcap
 from dmrl.recording.mcap.message_batch import MessageBatch, concatenate_all
-from dmrl.recording.mcap.record_scan import build_channel
-from dmrl.recording.mcap.summary_index import read_summary_section
+from dmrl.recording.mcap.summary_section import read_summary_section
 from dmrl.recording.protobuf.columns import decode_by_topic
 from dmrl.recording.protobuf.message_types import require_types
 from dmrl.recording.summary import read_summary
@@ -77,11 +76,7 @@ def _sample_chunks(
         index = read_summary_section(path, stream)
         if index is None:
             return [], {}
-        channels = {
-            number: build_channel(number, index.channels, index.schemas)
-            for number, channel in index.channels.items()
-            if channel.topic in names
-        }
+        channels = {n: c for n, c in index.channels_by_id.items() if c.topic in names}
         batches = []
         for chunk in _choose_chunks(index, channels, start_ns, end_ns):
             batch = read_chunk(path, stream, chunk, channels, index)

@@ -15,10 +15,9 @@ from dmrl.recording.mcap.batch_reader import iter_batches
 from dmrl.recording.mcap.channel import Channel, RawMessage
 from dmrl.recording.mcap.file import corrupt_error
 from dmrl.recording.mcap.message_batch import EMPTY_BATCH, MessageBatch, concatenate_all
-from dmrl.recording.mcap.summary_index import TopicInfo, read_channel
 from dmrl.recording.protobuf.columns import decode_by_topic, decode_topic
 from dmrl.recording.protobuf.message_types import find_channel_descriptor, require_types
-from dmrl.recording.summary import read_summary
+from dmrl.recording.summary import TopicInfo, read_channel, read_summary
 
 BATCH_BYTES = 4 << 20
 """Bytes of messages that `iter_topic_batches` decodes at once: few calls, little memory."""

@@ -1,7 +1,6 @@
 """Recover the messages of a truncated or corrupt recording."""
 
 import struct
-import zlib
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
@@ -29,11 +28,12 @@ from mcap.summary import Summary as McapSummary
 from dmrl.errors import RecordingError
 from dmrl.guards import limits
 from dmrl.recording.attachments import copy_metadata_and_attachments
-from dmrl.recording.copying.chunk_copy import CopyUnit, write_unit
+from dmrl.recording.copying.chunk_copy import CopyUnit, adopt_definitions, write_unit
 from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.batch_reader import count_messages
-from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk import batch_from_messages, decompress, parse_records
+from dmrl.recording.mcap.channel import ChannelTable
+from dmrl.recording.mcap.chunk import ParsedChunk, batch_from_messages, decompress, parse_records
+from dmrl.recording.mcap.extra_records import has_valid_crc
 from dmrl.recording.mcap.file import (
     CORRUPTION_ERRORS,
     MAGIC,
@@ -43,13 +43,12 @@ from dmrl.recording.mcap.file import (
 )
 from dmrl.recording.mcap.message_batch import MessageBatch
 from dmrl.recording.mcap.message_index import ENTRY_BYTES
-from dmrl.recording.mcap.record_scan import build_channel
 from dmrl.recording.mcap.summary_section import iter_extents, read_raw_section
 from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
 from dmrl.recording.provenance_inputs import hash_file
-from dmrl.recording.recovery import Recovery
-from dmrl.recording.summary import Summary
-from dmrl.recording.writer import RecordingWriter
+from dmrl.recording.recovery_report import Recovery
+from dmrl.recording.summary import Definitions, Summary
+from dmrl.recording.writer import RECIPE_NAME, RecordingWriter
 
 MESSAGE_INDEX_HEADER = struct.Struct(
     "<HI"
@@ -71,10 +70,10 @@ class _RecoveryState:
     recovery: Recovery
     summary_section: McapSummary  # Summary section, as far as it can be read
     schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
+    channels: ChannelTable = field(default_factory=ChannelTable)
     channel_records: dict[int, McapChannel] = field(default_factory=dict)  # Channel records
     metadata: dict[str, list[dict[str, str]]] = field(default_factory=dict)
-    attachments: dict[str, bytes] = field(default_factory=dict)
+    attachments: list[Attachment] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)  # messages by channel id
     skipped: Counter[int] = field(default_factory=Counter)  # in corrupt chunks, by their indexes
     running_checksums: checksums.Checksums = field(default_factory=checksums.Checksums)
@@ -123,17 +122,27 @@ def recover(path: Path, out: Path) -> Recovery:
         pieces = _iter_units(stream, state)
         # dmrl writes the provenance before the first message, so read up to that first.
         first = next(pieces, None)
-        if first is None:
+        if first is None and _is_worthless(state):
             raise RecordingError(f"{path} holds no whole chunk: nothing to recover. Make it again")
         with RecordingWriter(out, _build_provenance(state)) as sink:
-            for piece in chain([first], pieces):
+            for piece in chain([first] if first else [], pieces):
                 sink.chunk_writer.adopt_channels(state.channels, state.channel_records)
                 state.recovery.messages += write_unit(piece, None, sink)
+            unused = state.channels.keys() - (+state.counts).keys()
+            definitions = Definitions(state.schemas, state.channel_records, state.channels, unused)
+            adopt_definitions(definitions, None, sink)
             copy_metadata_and_attachments(
                 Summary({}, 0, 0, state.metadata, state.attachments), sink
             )
     _complete_report(state)
     return state.recovery
+
+
+def _is_worthless(state: _RecoveryState) -> bool:
+    """Return whether a damaged file without messages has nothing that dmrl does not make itself."""
+    damaged = state.recovery.damaged_chunks or state.recovery.lost_bytes or not state.footer
+    extras = {*state.metadata, *(one.name for one in state.attachments)}
+    return bool(damaged) and extras <= {METADATA_NAME, RECIPE_NAME}
 
 
 def _build_provenance(state: _RecoveryState) -> Provenance:
@@ -163,15 +172,15 @@ def _iter_units(stream: BoundedReader, state: _RecoveryState) -> Iterator[CopyUn
     for at, record in _iter_records(stream, state):
         if isinstance(record, Chunk):
             state.chunks += 1
-            batch = _load_chunk(stream, state, record, at)
-            damaged = batch is None
-            if batch is not None:
-                yield from _iter_valid_units(state, batch, record)
+            scan = _load_chunk(stream, state, record, at)
+            damaged = scan is None
+            if scan is not None:
+                yield from _iter_valid_units(state, scan.batch, record, scan)
         elif isinstance(record, _IndexedCount):
             if damaged:
                 state.skipped[record.channel] += record.messages
         elif isinstance(record, Message):
-            yield from _iter_valid_units(state, batch_from_messages([record]), None)
+            yield from _iter_valid_units(state, batch_from_messages([record]))
         elif not _is_foreign_checksum(record, at):
             _register_record(state, record)
         else:
@@ -189,8 +198,8 @@ def _is_foreign_checksum(record: McapRecord, at: int) -> bool:
 
 def _load_chunk(
     stream: BoundedReader, state: _RecoveryState, chunk: Chunk, at: int
-) -> MessageBatch | None:
-    """Return the messages of a chunk and register its definitions; None if it is corrupt."""
+) -> ParsedChunk | None:
+    """Return the records of a chunk and register its definitions; None if it is corrupt."""
     try:
         scan = parse_records(decompress(state.path, chunk, at))
         found = list(scan.iter_definitions())
@@ -202,11 +211,14 @@ def _load_chunk(
         raise over_budget_error(state.path, "it unpacks to much more than its size")
     for record in found:
         _register_record(state, record)
-    return scan.batch
+    return scan
 
 
 def _iter_valid_units(
-    state: _RecoveryState, batch: MessageBatch, chunk: Chunk | None
+    state: _RecoveryState,
+    batch: MessageBatch,
+    chunk: Chunk | None = None,
+    others: ParsedChunk | None = None,
 ) -> Iterator[CopyUnit]:
     """Yield the messages of a batch that have a known topic and a valid time."""
     named = np.isin(batch.channel, list(state.channels))
@@ -218,7 +230,7 @@ def _iter_valid_units(
         batch, chunk = batch.take(good), None
     if len(batch):
         count_messages(state.counts, batch)
-        yield CopyUnit(batch, state.channels, chunk)
+        yield CopyUnit(batch, state.channels, chunk, others)
 
 
 def _iter_records(
@@ -286,9 +298,7 @@ def _parse_record(
     if opcode not in _RECORD_TYPES:
         return None
     record: McapRecord = _RECORD_TYPES[opcode].read(ReadDataStream(BytesIO(body)))
-    if isinstance(record, Attachment) and zlib.crc32(body[:-4]) != (
-        int.from_bytes(body[-4:], "little") or zlib.crc32(body[:-4])
-    ):
+    if isinstance(record, Attachment) and not has_valid_crc(record, body):
         state.recovery.doubtful = True
     if isinstance(record, Metadata) and record.name != checksums.METADATA_NAME:
         state.running_checksums.add_metadata(RECORD_STRUCT.pack(opcode, len(body)) + body)
@@ -301,14 +311,14 @@ def _register_record(state: _RecoveryState, record: McapRecord) -> None:
         case Schema():
             state.schemas[record.id] = record
         case McapChannel() if not record.schema_id or record.schema_id in state.schemas:
-            state.channels[record.id] = build_channel(record.id, {record.id: record}, state.schemas)
+            state.channels.define(record, state.schemas)
             state.channel_records[record.id] = record
         case Metadata():
             state.extras += 1
             state.metadata.setdefault(record.name, []).append(dict(record.metadata))
         case Attachment():
             state.extras += 1
-            state.attachments[record.name] = record.data
+            state.attachments.append(record)
 
 
 def _complete_report(state: _RecoveryState) -> None:

@@ -1,23 +1,51 @@
 """Read the summary of a recording: topics, times, metadata, attachments and provenance."""
 
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+
+from mcap.records import Attachment, Schema
+from mcap.records import Channel as McapChannel
 
 from dmrl.errors import RecordingError
 from dmrl.recording.mcap import checksums
+from dmrl.recording.mcap.channel import Channel
+from dmrl.recording.mcap.extra_records import read_attachment, read_metadata
 from dmrl.recording.mcap.file import BoundedReader, open_mcap
-from dmrl.recording.mcap.record_scan import build_channel, scan_file
-from dmrl.recording.mcap.summary_index import (
-    TopicInfo,
-    get_cached,
-    read_attachment,
-    read_metadata,
-    read_summary_section,
-)
+from dmrl.recording.mcap.file_cache import get_cached
+from dmrl.recording.mcap.message_count import count_messages, count_scanned
+from dmrl.recording.mcap.record_scan import scan_file
+from dmrl.recording.mcap.summary_section import read_summary_section
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 
 SPLIT_METADATA = "dmrl.split"
 """Metadata record with the split that the source defines."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    """Message type and number of messages of one topic."""
+
+    schema: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Definitions:
+    """Schemas and channels of a recording.
+
+    Parameters
+    ----------
+    schemas, channel_records, channels
+        By id.
+    unused
+        Ids of the channels without messages.
+    """
+
+    schemas: Mapping[int, Schema] = field(default_factory=dict)
+    channel_records: Mapping[int, McapChannel] = field(default_factory=dict)
+    channels: Mapping[int, Channel] = field(default_factory=dict)
+    unused: Collection[int] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,17 +61,23 @@ class Summary:
     metadata
         Strings by name. A name may occur several times.
     attachments
-        Files by name.
+        Files in the order of the recording. A name may occur several times.
     provenance
         Origin of the recording, or None if dmrl did not write it.
+    definitions
+        Schemas and channels.
+    contradiction
+        What the recording's statistics state about times that its messages do not; empty if none.
     """
 
     topics: dict[str, TopicInfo]
     start_ns: int
     end_ns: int
     metadata: dict[str, list[dict[str, str]]] = field(default_factory=dict)
-    attachments: dict[str, bytes] = field(default_factory=dict)
+    attachments: Sequence[Attachment] = ()
     provenance: Provenance | None = None
+    definitions: Definitions = field(default_factory=Definitions)
+    contradiction: str = ""
 
     @property
     def count(self) -> int:
@@ -51,59 +85,64 @@ class Summary:
         return sum(topic.count for topic in self.topics.values())
 
 
-def read_summary(path: Path) -> Summary:
+def read_summary(path: Path, *, verify: bool = False) -> Summary:
     """Read the summary of a recording, its metadata and its attachments.
+
+    Parameters
+    ----------
+    path
+        A complete recording.
+    verify
+        Count every message in the chunks of another program's file; see `count_messages`.
 
     Raises
     ------
     RecordingError
-        If the file is absent, not MCAP, truncated or corrupt.
+        If the file is absent, not MCAP, truncated or corrupt, or its statistics state another
+        number of messages.
     """
+    kind = "verified summary" if verify else "summary"
     with open_mcap(path) as stream:
-        return get_cached("summary", path, stream, lambda: _build_summary(path, stream))
+        return get_cached(kind, path, stream, lambda: _build_summary(path, stream, verify=verify))
 
 
-def _build_summary(path: Path, stream: BoundedReader) -> Summary:
+def _build_summary(path: Path, stream: BoundedReader, *, verify: bool) -> Summary:
     section = read_summary_section(path, stream)
-    if section is None or section.statistics is None:
-        return _build_summary_by_scan(path, stream)
-    metadata = read_metadata(path, stream, section)
+    if section is None:
+        scanned = scan_file(path, stream)
+        count, metadata, attachments = (
+            count_scanned(path, scanned),
+            scanned.metadata,
+            scanned.attachments,
+        )
+        definitions = Definitions(scanned.schemas, scanned.channel_records, scanned.channels)
+    else:
+        count = count_messages(path, stream, section, verify=verify)
+        metadata = read_metadata(path, stream, section)
+        places = sorted(section.attachment_indexes, key=lambda place: place.offset)
+        attachments = [read_attachment(path, stream, at) for at in places]
+        definitions = Definitions(section.schemas, section.channels, section.channels_by_id)
     metadata.pop(checksums.METADATA_NAME, None)
-    statistics = section.statistics
     topics: dict[str, TopicInfo] = {}
-    for number in sorted(section.channels):
-        channel = build_channel(number, section.channels, section.schemas)
+    for number, channel in sorted(definitions.channels.items()):
         before = topics[channel.topic].count if channel.topic in topics else 0
-        count = statistics.channel_message_counts.get(number, 0)
-        topics[channel.topic] = TopicInfo(channel.schema_name, before + count)
-    return Summary(
-        topics=dict(sorted(topics.items())),
-        start_ns=statistics.message_start_time,
-        end_ns=statistics.message_end_time,
-        metadata=metadata,
-        attachments=dict(read_attachment(path, stream, at) for at in section.attachment_indexes),
-        provenance=_parse_provenance(path, metadata),
-    )
-
-
-def _build_summary_by_scan(path: Path, stream: BoundedReader) -> Summary:
-    """Build the summary of a complete file that has no Summary section."""
-    scanned = scan_file(path, stream)
-    scanned.metadata.pop(checksums.METADATA_NAME, None)
-    counts = scanned.count_messages()
-    topics: dict[str, TopicInfo] = {}
-    for number, channel in scanned.channels.items():
-        before = topics[channel.topic].count if channel.topic in topics else 0
-        topics[channel.topic] = TopicInfo(channel.schema_name, before + counts[number])
-    held = [batch.time_ns for batch in scanned.batches if len(batch)]
+        topics[channel.topic] = TopicInfo(channel.schema_name, before + count.by_channel[number])
     return Summary(
         dict(sorted(topics.items())),
-        min((int(times.min()) for times in held), default=0),
-        max((int(times.max()) for times in held), default=0),
-        scanned.metadata,
-        scanned.attachments,
-        _parse_provenance(path, scanned.metadata),
+        count.start_ns,
+        count.end_ns,
+        metadata,
+        attachments,
+        _parse_provenance(path, metadata),
+        replace(definitions, unused=definitions.channels.keys() - (+count.by_channel).keys()),
+        count.contradiction,
     )
+
+
+def read_channel(path: Path, topic: str) -> Channel:
+    """Return the first channel of a topic."""
+    channels = read_summary(path).definitions.channels
+    return channels[min(n for n, channel in channels.items() if channel.topic == topic)]
 
 
 def _parse_provenance(path: Path, metadata: dict[str, list[dict[str, str]]]) -> Provenance | None:

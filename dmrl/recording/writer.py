@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from google.protobuf.descriptor import Descriptor
+from mcap.records import Attachment
 
 from dmrl.atomic_output import as_output_error, atomic_file
 from dmrl.errors import OutputError, RecordingError
@@ -175,7 +176,11 @@ class RecordingWriter:
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Append an attachment."""
-        self._file.add_attachment(name, media_type, data)
+        self.copy_attachment(Attachment(0, 0, name, media_type, data))
+
+    def copy_attachment(self, attachment: Attachment) -> None:
+        """Append an attachment of another recording, with its times and media type."""
+        self._file.add_attachment(attachment)
 
     def flush(self) -> None:
         """Write the open chunks, so that they survive a kill of the process."""

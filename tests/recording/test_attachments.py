@@ -27,7 +27,7 @@ from dmrl.recording.mcap.batch_reader import (
     iter_batches_in_file_order,
 )
 from dmrl.recording.mcap.message_index import MESSAGE_INDEX_STRUCT, parse_index_entries
-from dmrl.recording.mcap.summary_index import read_channel
+from dmrl.recording.summary import read_channel
 
 from .records import records
 
@@ -73,8 +73,12 @@ def test_metadata_and_attachments_go_along_but_no_provenance_or_recipe(tmp_path:
     assert found.metadata["own"] == [{"k": "v"}, {"k": "w"}]
     assert found.provenance is not None and found.provenance.stage == "other"
     assert len(found.metadata["dmrl.provenance"]) == 1
-    assert found.attachments.keys() - read_summary(one).attachments.keys() == set()
-    assert found.attachments["notes"] == b"hello"
+    assert [a.name for a in found.attachments] == ["recipe.toml", "notes"]
+    assert found.attachments[-1] == read_summary(one).attachments[-1]
+    assert (found.attachments[-1].media_type, found.attachments[-1].data) == (
+        "text/plain",
+        b"hello",
+    )
 
 
 def test_the_licence_beside_a_source_is_told_by_its_first_words(tmp_path: Path) -> None:

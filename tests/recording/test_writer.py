@@ -82,7 +82,7 @@ def test_a_negative_time_is_refused(tmp_path: Path) -> None:
 def test_provenance_and_recipe_stand_before_the_first_message(flight: Path) -> None:
     found = read_summary(flight)
     assert found.provenance == Provenance("test", {"level": 1}, seed=3)
-    assert found.attachments["recipe.toml"] == b'kind = "test"\nlevel = 1\n'
+    assert found.attachments[0].data == b'kind = "test"\nlevel = 1\n'
     data = flight.read_bytes()
     assert data.index(b"dmrl.provenance") < 64
 

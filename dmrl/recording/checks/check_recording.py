@@ -70,6 +70,8 @@ def check(path: Path, *, quick: bool = False) -> list[Finding]:
             check_labels,
         )
     findings = [finding for rule in rules for finding in rule(data)]
+    if data.contents.summary.contradiction:
+        findings.append(Finding("warning", "", data.contents.summary.contradiction))
     if not data.contents.summary.count:
         findings.append(Finding("error", "", "has no messages"))
     return sorted(findings, key=lambda f: f.level)

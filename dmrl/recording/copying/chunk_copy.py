@@ -17,12 +17,14 @@ from numpy.typing import NDArray
 
 from dmrl.recording.mcap.batch_reader import check_counts, count_messages, select_chunks
 from dmrl.recording.mcap.channel import Channel
+from dmrl.recording.mcap.chunk import ParsedChunk
 from dmrl.recording.mcap.chunk_reader import locate_chunk, read_chunk_for_copy
 from dmrl.recording.mcap.file import open_mcap
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS, MessageBatch
 from dmrl.recording.mcap.message_index import MessageIndex
-from dmrl.recording.mcap.record_scan import build_channel, scan_file
-from dmrl.recording.mcap.summary_index import read_summary_section
+from dmrl.recording.mcap.record_scan import scan_file
+from dmrl.recording.mcap.summary_section import read_summary_section
+from dmrl.recording.summary import Definitions, read_summary
 from dmrl.recording.writer import RecordingWriter
 
 
@@ -38,6 +40,8 @@ class CopyUnit:
         By channel id; may contain further channels of the recording.
     chunk
         The compressed chunk with exactly these messages. None: they must be copied as slices.
+    others
+        Other records of the chunk.
     index
         Verified message indexes of the chunk, or None.
     """
@@ -45,6 +49,7 @@ class CopyUnit:
     batch: MessageBatch
     channels: Mapping[int, Channel]
     chunk: Chunk | None = None
+    others: ParsedChunk | None = None
     index: MessageIndex | None = None
 
     @property
@@ -95,13 +100,23 @@ def copy_messages(path: Path, selection: TopicSelection, sink: RecordingWriter) 
 
 
 def adopt_channels(path: Path, topics: Collection[str], sink: RecordingWriter) -> None:
-    """Assign the channel ids of a recording to its topics in the output, where they are free."""
-    with open_mcap(path) as stream:
-        summary = read_summary_section(path, stream)
-        if summary is not None:
-            channels = _build_channels(summary)
-            kept = {n: channel for n, channel in channels.items() if channel.topic in topics}
-            sink.chunk_writer.adopt_channels(kept, summary.channels)
+    """Keep the ids of a recording's channels of some topics in the output, where they are free.
+
+    Its channels without messages are kept as well, and its schemas without channels.
+    """
+    adopt_definitions(read_summary(path).definitions, topics, sink)
+
+
+def adopt_definitions(
+    found: Definitions, topics: Collection[str] | None, sink: RecordingWriter
+) -> None:
+    """Do what `adopt_channels` does for definitions that were read (topics None: for all)."""
+    kept = {n: c for n, c in found.channels.items() if topics is None or c.topic in topics}
+    sink.chunk_writer.adopt_channels(kept, found.channel_records)
+    unused = [channel for n, channel in kept.items() if n in found.unused]
+    needed = {record.schema_id for record in found.channel_records.values()}
+    schemas = [schema for number, schema in found.schemas.items() if number not in needed]
+    sink.chunk_writer.keep_definitions(unused, schemas)
 
 
 def write_unit(unit: CopyUnit, selection: TopicSelection | None, sink: RecordingWriter) -> int:
@@ -113,10 +128,12 @@ def write_unit(unit: CopyUnit, selection: TopicSelection | None, sink: Recording
         count = int(rows.sum())
         if not rows.all():
             batch, unit = batch.take(rows), replace(unit, chunk=None)
-    whole, channels = unit.chunk, unit.channels
-    if whole is not None and sink.chunk_writer.append_chunk(whole, batch, channels, unit.index):
-        return count
-    if len(batch):
+    whole, others = unit.chunk, unit.others
+    if len(batch) and not (
+        whole is not None
+        and others is not None
+        and sink.chunk_writer.append_chunk(whole, batch, others, unit.channels, unit.index)
+    ):
         sink.chunk_writer.append_batch(batch, unit.channels)
     return count
 
@@ -135,23 +152,19 @@ def iter_units(path: Path, selection: TopicSelection) -> Iterator[CopyUnit]:
             walk = scan_file(path, stream)
             yield from (CopyUnit(block, walk.channels) for block in walk.batches)
             return
-        channels = _build_channels(summary)
+        channels = summary.channels_by_id
         counts: Counter[int] = Counter()
         chunks = _select_chunks(summary, channels, selection)
         stream.expect_reads([locate_chunk(index) for index in chunks])
         for index in chunks:
-            chunk, batch, messages = read_chunk_for_copy(path, stream, index, channels, summary)
+            chunk, batch, others, messages = read_chunk_for_copy(path, stream, index, summary)
             count_messages(counts, batch)
-            yield CopyUnit(batch, channels, chunk, messages)
+            yield CopyUnit(batch, channels, chunk, others, messages)
         if (selection.low_ns, selection.high_ns) == (0, MAX_TIME_NS):
             kept = {
                 n: channel for n, channel in channels.items() if channel.topic in selection.topics
             }
-            check_counts(path, summary, kept, counts)
-
-
-def _build_channels(summary: McapSummary) -> dict[int, Channel]:
-    return {n: build_channel(n, summary.channels, summary.schemas) for n in summary.channels}
+            check_counts(path, summary.statistics, kept, counts)
 
 
 def _select_chunks(

@@ -17,6 +17,7 @@ from dmrl.recording.copying.chunk_copy import (
 )
 from dmrl.recording.log_times import read_log_times
 from dmrl.recording.mcap.channel import RawMessage
+from dmrl.recording.mcap.message_batch import MAX_TIME_NS
 from dmrl.recording.provenance_inputs import build_provenance, refuse_duplicates
 from dmrl.recording.reader import match_topics, read_raw
 from dmrl.recording.summary import Summary, read_summary
@@ -131,19 +132,19 @@ def trim(
     OutputError
         If ``out`` exists or cannot be written.
     """
-    source = read_summary(path)
+    source = read_summary(path, verify=True)
     topics_to_keep = match_topics(path, topics) if topics else frozenset(source.topics)
     settings = {"start_ns": start_ns, "end_ns": end_ns, "topics": list(topics)}
     low = source.start_ns if start_ns is None else max(start_ns, source.start_ns)
-    high = source.end_ns + 1 if end_ns is None else end_ns
+    high = MAX_TIME_NS if end_ns is None else end_ns
     with RecordingWriter(out, build_provenance("trim", settings, [path])) as sink:
         copy_metadata_and_attachments(source, sink)
         adopt_channels(path, topics_to_keep, sink)
         for raw in _iter_calibrations(path, topics_to_keep, low, high):
             sink.write_raw(raw)
-        selection = TopicSelection(topics_to_keep, low, high)
+        selection = TopicSelection(topics_to_keep, start_ns or 0, high)
         count = sum(write_unit(piece, selection, sink) for piece in iter_units(path, selection))
-        if not count:
+        if not count and source.count:
             raise RecordingError(
                 f"{path} has no message in that time range; it lasts "
                 f"{(source.end_ns - source.start_ns) / 1e9:.3f} s. Choose times within it"

@@ -6,11 +6,11 @@ All readers of messages use this module. Decoders work on whole batches.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Set
+from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
 
 import numpy as np
-from mcap.records import ChunkIndex
+from mcap.records import ChunkIndex, Statistics
 from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.mcap.channel import Channel
@@ -24,9 +24,8 @@ from dmrl.recording.mcap.message_batch import (
     concatenate,
     concatenate_all,
 )
-from dmrl.recording.mcap.record_scan import build_channel, scan_file
-from dmrl.recording.mcap.summary_index import read_summary_section
-from dmrl.recording.mcap.summary_section import SummarySection
+from dmrl.recording.mcap.record_scan import scan_file
+from dmrl.recording.mcap.summary_section import SummarySection, read_summary_section
 
 
 def iter_batches(
@@ -65,16 +64,16 @@ def iter_batches(
             yield _scan_unindexed(path, stream, topics, low, high)
             return
         channels = {
-            number: build_channel(number, summary.channels, summary.schemas)
-            for number in summary.channels
-            if topics is None or summary.channels[number].topic in topics
+            number: channel
+            for number, channel in summary.channels_by_id.items()
+            if topics is None or channel.topic in topics
         }
         counts: Counter[int] = Counter()
         for batch in _iter_in_time_order(path, stream, summary, channels, low, high):
             count_messages(counts, batch)
             yield batch, channels
-        if start_ns is None and end_ns is None:
-            check_counts(path, summary, channels, counts)
+        if (low, high) == (0, MAX_TIME_NS):
+            check_counts(path, summary.statistics, channels, counts)
 
 
 def count_messages(counts: Counter[int], batch: MessageBatch) -> None:
@@ -85,10 +84,25 @@ def count_messages(counts: Counter[int], batch: MessageBatch) -> None:
 
 
 def check_counts(
-    path: Path, summary: McapSummary, channels: dict[int, Channel], counts: Counter[int]
+    path: Path,
+    statistics: Statistics | None,
+    channels: Mapping[int, Channel],
+    counts: Counter[int],
 ) -> None:
-    """Raise RecordingError unless the counts of messages equal those of the Statistics record."""
-    expected = summary.statistics.channel_message_counts if summary.statistics else {}
+    """Raise RecordingError unless the counts of messages equal those of the Statistics record.
+
+    Parameters
+    ----------
+    path
+        The recording, for errors.
+    statistics
+        The record, if there is one. It may lack the counts by channel.
+    channels
+        Channels that were read, by channel id.
+    counts
+        Messages found, by channel id.
+    """
+    expected = statistics.channel_message_counts if statistics else {}
     for number, channel in channels.items() if expected else ():
         if counts[number] != expected.get(number, 0):
             raise corrupt_error(
@@ -111,9 +125,7 @@ def iter_batches_in_file_order(path: Path) -> Iterator[tuple[MessageBatch, dict[
             for batch in walk.batches:
                 yield batch, walk.channels
             return
-        channels = {
-            n: build_channel(n, summary.channels, summary.schemas) for n in summary.channels
-        }
+        channels = summary.channels_by_id
         counts: Counter[int] = Counter()
         chunks = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
         stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
@@ -121,7 +133,7 @@ def iter_batches_in_file_order(path: Path) -> Iterator[tuple[MessageBatch, dict[
             batch = read_chunk(path, stream, chunk, channels, summary)
             count_messages(counts, batch)
             yield batch, channels
-        check_counts(path, summary, channels, counts)
+        check_counts(path, summary.statistics, channels, counts)
 
 
 def _iter_in_time_order(
@@ -137,8 +149,9 @@ def _iter_in_time_order(
     last = _find_image_channels(channels)
     pending: MessageBatch | None = None
     stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
+    ranged = (low, high) != (0, MAX_TIME_NS)
     for k, chunk in enumerate(chunks):
-        batch = read_chunk(path, stream, chunk, channels, summary)
+        batch = read_chunk(path, stream, chunk, channels, summary, whole=ranged)
         batch = batch.take((batch.time_ns >= low) & (batch.time_ns < high))
         pending = concatenate(pending, batch).sort_by_time(last)
         if k + 1 == len(chunks):

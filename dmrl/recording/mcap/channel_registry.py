@@ -1,13 +1,13 @@
 """Assign channel and schema ids in a new MCAP file, and serialize their records."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from mcap.opcode import Opcode
 from mcap.records import Channel as McapChannel
 from mcap.records import Schema
 
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk import RECORD_HEADER_BYTES, other_records
+from dmrl.recording.mcap.chunk import RECORD_HEADER_BYTES, ParsedChunk
 from dmrl.recording.mcap.file_writer import serialize
 from dmrl.recording.mcap.message_batch import MessageBatch
 
@@ -28,6 +28,9 @@ class ChannelRegistry:
         self._channels: dict[int, McapChannel] = {}
         self._records: dict[tuple[int, int], bytes] = {}  # by opcode and id
         self._written_schemas: set[int] = {0}
+        # Channels and schemas that are defined even if no message needs them.
+        self._kept: set[int] = set()
+        self._kept_schemas: set[int] = set()
         self._channel_ids: dict[Channel, int] = {}
         # By identity: to hash a channel takes longer than to copy its messages. The reference to
         # each channel keeps its id() valid.
@@ -52,6 +55,21 @@ class ChannelRegistry:
         for number, channel in channels.items():
             if channel not in self._channel_ids and number not in self._channels:
                 self._define_channel(channel, number, records[number].schema_id)
+
+    def keep_definitions(self, channels: Iterable[Channel], schemas: Iterable[Schema]) -> None:
+        """Define channels and schemas, even if no message needs them."""
+        self._kept.update(self.get_channel_id(channel) for channel in channels)
+        for one in schemas:
+            number = self._define_schema((one.name, one.encoding, one.data), one.id)
+            self._kept_schemas.add(number)
+
+    def take_unwritten_definitions(self) -> bytes:
+        """Return the records of kept definitions that are in no chunk; they count as written."""
+        records = [self.definition_records(number) for number in sorted(self._kept)]
+        unwritten = self._kept_schemas - self._written_schemas
+        self._written_schemas |= unwritten
+        records += [self._records[Opcode.SCHEMA, number] for number in sorted(unwritten)]
+        return b"".join(records)
 
     def get_channel_id(self, channel: Channel) -> int:
         """Return the id of a channel; assign one if it has none."""
@@ -87,7 +105,9 @@ class ChannelRegistry:
         self._written_schemas.add(schema_id)
         return self._records[Opcode.SCHEMA, schema_id] + record
 
-    def can_copy_chunk(self, batch: MessageBatch, channels: Mapping[int, Channel]) -> bool:
+    def can_copy_chunk(
+        self, batch: MessageBatch, others: ParsedChunk, channels: Mapping[int, Channel]
+    ) -> bool:
         """Return whether a compressed chunk can be copied as it is; if so, mark its channels.
 
         This requires that every channel has the same id here, that the chunk or an earlier one
@@ -98,6 +118,8 @@ class ChannelRegistry:
         ----------
         batch
             All messages of the chunk.
+        others
+            All other records of the chunk.
         channels
             By channel id in the chunk.
         """
@@ -106,8 +128,6 @@ class ChannelRegistry:
         if not all(self._has_same_id(number, channels[number]) for number in unverified):
             return False
         written_here = set[int](), set[int]()
-        if (others := other_records(batch)) is None:
-            return False
         for opcode, at, end in others.others:
             record = others.data[at:end].tobytes()
             number = int.from_bytes(record[RECORD_HEADER_BYTES : RECORD_HEADER_BYTES + 2], "little")
@@ -136,22 +156,20 @@ class ChannelRegistry:
         return schemas, [self._records[Opcode.CHANNEL, n] for n in sorted(self.written)]
 
     def _define_channel(self, channel: Channel, number: int, schema_number: int | None) -> int:
-        schema_id = self._define_schema(channel, schema_number)
+        kind = channel.schema_name, channel.schema_encoding, channel.schema_data
+        schema_id = self._define_schema(kind, schema_number) if any(kind) else 0
         metadata = dict(channel.metadata)
         made = McapChannel(number, channel.topic, channel.encoding, metadata, schema_id)
         self._channels[number], self._records[Opcode.CHANNEL, number] = made, serialize(made)
         self._channel_ids[channel] = number
         return number
 
-    def _define_schema(self, channel: Channel, number: int | None) -> int:
-        key = (channel.schema_name, channel.schema_encoding, channel.schema_data)
-        if not any(key):
-            return 0
+    def _define_schema(self, key: tuple[str, str, bytes], number: int | None) -> int:
         if key not in self._schema_ids:
             taken = set(self._schema_ids.values())
             if not number or number in taken:
                 number = _find_free_id(taken)
-            made = Schema(number, channel.schema_data, key[1], key[0])
+            made = Schema(number, key[2], key[1], key[0])
             self._schema_ids[key], self._records[Opcode.SCHEMA, number] = number, serialize(made)
         return self._schema_ids[key]
 

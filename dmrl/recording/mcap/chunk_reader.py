@@ -1,5 +1,6 @@
 """Read one chunk and verify it against its Chunk Index and Message Index records."""
 
+from collections.abc import Container, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunk import (
     MESSAGE_PREFIX_DTYPE,
     RECORD_HEADER_BYTES,
+    ParsedChunk,
     build_batch_at,
     decompress,
     other_records,
@@ -37,8 +39,10 @@ def read_chunk(
     path: Path,
     stream: BoundedReader,
     chunk_index: ChunkIndex,
-    channels: dict[int, Channel],
+    channels: Mapping[int, Channel],
     summary: SummarySection,
+    *,
+    whole: bool = False,
 ) -> MessageBatch:
     """Read a chunk and return its messages of some channels, in chunk order.
 
@@ -52,6 +56,9 @@ def read_chunk(
         Channels to read, by channel id.
     summary
         Summary section of the recording.
+    whole
+        Verify that the message indexes list every message of the chunk, even if only some channels
+        are read. Needed if no statistics are compared with the messages later.
 
     Raises
     ------
@@ -59,18 +66,20 @@ def read_chunk(
         If the chunk contradicts its Chunk Index, its Message Index or the Summary section.
     """
     raw, _, data = _load_chunk(path, stream, chunk_index)
+    indexed = chunk_index.message_index_offsets.keys()
+    if indexed and indexed <= channels.keys():
+        return _read_whole_chunk(path, raw, data, chunk_index, summary)[0]
+    if whole or not indexed or not summary.counts:
+        batch = _read_whole_chunk(path, raw, data, chunk_index, summary)[0]
+        return batch.select_channels(channels)
     if summary.needs_definition_check(chunk_index):
         summary.check_definitions(path, parse_records(data).iter_definitions())
-    return _select_by_index(path, raw, data, chunk_index, channels, summary)[0]
+    return _select_by_index(path, raw, data, chunk_index, channels)[0]
 
 
 def read_chunk_for_copy(
-    path: Path,
-    stream: BoundedReader,
-    chunk_index: ChunkIndex,
-    channels: dict[int, Channel],
-    summary: SummarySection,
-) -> tuple[Chunk, MessageBatch, MessageIndex | None]:
+    path: Path, stream: BoundedReader, chunk_index: ChunkIndex, summary: SummarySection
+) -> tuple[Chunk, MessageBatch, ParsedChunk, MessageIndex | None]:
     """Read a chunk for a copy: still compressed, with all its messages and message indexes.
 
     Parameters
@@ -79,16 +88,14 @@ def read_chunk_for_copy(
         The recording.
     chunk_index
         Chunk Index record of the chunk.
-    channels
-        All channels of the recording, by channel id.
     summary
         Summary section of the recording.
 
     Returns
     -------
     tuple
-        Chunk record, all messages, and message indexes. The indexes are None where there are none
-        or their layout differs from that of a copy.
+        Chunk record, all messages, all other records, and message indexes. The indexes are None
+        where there are none or their layout differs from that of a copy.
 
     Raises
     ------
@@ -96,17 +103,14 @@ def read_chunk_for_copy(
         If the chunk contradicts its Chunk Index, its Message Index or the Summary section.
     """
     raw, chunk, data = _load_chunk(path, stream, chunk_index)
-    batch, counts = _select_by_index(path, raw, data, chunk_index, channels, summary)
-    if summary.needs_definition_check(chunk_index):
-        summary.check_definitions(
-            path, (other_records(batch) or parse_records(data)).iter_definitions()
-        )
+    batch, others, counts = _read_whole_chunk(path, raw, data, chunk_index, summary)
     records = raw[chunk_index.chunk_length :]
-    if not all(counts.values()) or len(records) != compute_indexes_size(counts):
-        return chunk, batch, None
     after = chunk_index.chunk_start_offset + chunk_index.chunk_length
     places = {n: at - after for n, at in chunk_index.message_index_offsets.items()}
-    return chunk, batch, MessageIndex(records, places, counts)
+    own_layout = all(counts.values()) and len(records) == compute_indexes_size(counts)
+    if not own_layout or min(places.values(), default=-1) < 0:
+        return chunk, batch, others, None
+    return chunk, batch, others, MessageIndex(records, places, counts)
 
 
 def _load_chunk(
@@ -120,19 +124,38 @@ def _load_chunk(
     return raw, chunk, decompress(path, chunk, at)
 
 
+def _read_whole_chunk(
+    path: Path, raw: bytes, data: Bytes, chunk_index: ChunkIndex, summary: SummarySection
+) -> tuple[MessageBatch, ParsedChunk, dict[int, int]]:
+    """Return all messages, all other records, and the number that each message index lists."""
+    others: ParsedChunk | None
+    if chunk_index.message_index_offsets:
+        batch, counts = _select_by_index(path, raw, data, chunk_index, summary.channels)
+        others = other_records(batch)
+        if others is None:
+            at, found = chunk_index.chunk_start_offset, len(parse_records(data).messages)
+            raise corrupt_error(
+                path,
+                f"the message indexes of the chunk at byte {at} do not list each of its "
+                f"{found} messages once",
+            )
+    else:
+        others, counts = parse_records(data), {}
+        batch = select_channels(others.batch, summary.channels, summary.channels)
+        _check_time_range(path, chunk_index, batch)
+    summary.check_definitions(path, others.iter_definitions())
+    return batch, others, counts
+
+
 def _select_by_index(
     path: Path,
     raw: bytes,
     data: Bytes,
     chunk_index: ChunkIndex,
-    channels: dict[int, Channel],
-    summary: SummarySection,
+    channels: Container[int],
 ) -> tuple[MessageBatch, dict[int, int]]:
     """Return the messages of some channels, and the number that each message index lists."""
     at = chunk_index.chunk_start_offset
-    if not chunk_index.message_index_offsets:
-        batch = select_channels(parse_records(data).batch, channels, summary.channels)
-        return _check_time_range(path, chunk_index, batch), {}
     places = {
         n: place - at for n, place in chunk_index.message_index_offsets.items() if n in channels
     }

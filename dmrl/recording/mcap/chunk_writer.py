@@ -1,18 +1,18 @@
 """Collect messages into chunks, images and numbers apart, and write each chunk when it is full."""
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 from mcap.records import Channel as McapChannel
-from mcap.records import Chunk
+from mcap.records import Chunk, Schema
 
 from dmrl.atomic_output import as_output_error
 from dmrl.errors import RecordingError
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.channel_registry import ChannelRegistry
-from dmrl.recording.mcap.chunk import write_message_prefixes
+from dmrl.recording.mcap.chunk import ParsedChunk, write_message_prefixes
 from dmrl.recording.mcap.chunk_builder import CHUNK_BYTES, ChunkBuilder
 from dmrl.recording.mcap.file_writer import CompressedChunk, McapFileWriter
 from dmrl.recording.mcap.message_batch import Bytes, Ints, MessageBatch
@@ -65,6 +65,10 @@ class ChunkWriter:
         """Assign the channel ids of a recording that is copied; see `ChannelRegistry`."""
         self._registry.adopt_channels(channels, records)
 
+    def keep_definitions(self, channels: Iterable[Channel], schemas: Iterable[Schema]) -> None:
+        """Define channels and schemas of a copied recording, even if no message needs them."""
+        self._registry.keep_definitions(channels, schemas)
+
     def append_batch(self, batch: MessageBatch, channels: Mapping[int, Channel]) -> None:
         """Append a batch of messages, their payloads bit for bit.
 
@@ -114,6 +118,7 @@ class ChunkWriter:
         self,
         chunk: Chunk,
         batch: MessageBatch,
+        others: ParsedChunk,
         channels: Mapping[int, Channel],
         index: MessageIndex | None = None,
     ) -> bool:
@@ -124,7 +129,9 @@ class ChunkWriter:
         chunk
             A chunk that passed its CRC.
         batch
-            All messages of the chunk, in chunk order.
+            All messages of the chunk, in chunk order; at least one.
+        others
+            All other records of the chunk.
         channels
             By channel id in the chunk.
         index
@@ -145,7 +152,7 @@ class ChunkWriter:
             return False
         index = build_message_index(batch) if index is None else index
         pictured = {channels[number].carries_images for number in index.counts}
-        if len(pictured) != 1 or not self._registry.can_copy_chunk(batch, channels):
+        if len(pictured) != 1 or not self._registry.can_copy_chunk(batch, others, channels):
             return False
         self._require_nonnegative_times(batch, channels)
         before = self._images if pictured.pop() else self._numbers
@@ -210,7 +217,8 @@ class ChunkWriter:
         """
         self.flush()
         try:
-            self._file.finish(*self._registry.list_written_definitions())
+            unused = self._registry.take_unwritten_definitions()
+            self._file.finish(*self._registry.list_written_definitions(), unused)
         except OSError as e:
             raise as_output_error(self._path, e) from e
 

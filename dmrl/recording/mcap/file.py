@@ -20,6 +20,7 @@ from dmrl.storage.shared_file import open_raw
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_STRUCT = struct.Struct("<BQ")  # opcode, length
+FOOTER_STRUCT = struct.Struct("<BQQQI")  # opcode, length, summary start, summary offset start, CRC
 DEFINITIONS: dict[int, type[Schema] | type[Channel]] = {
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,

@@ -19,7 +19,6 @@ from mcap.records import (
     AttachmentIndex,
     ChunkIndex,
     DataEnd,
-    Footer,
     Header,
     McapRecord,
     Metadata,
@@ -29,11 +28,10 @@ from mcap.records import (
 )
 
 from dmrl.recording.mcap import checksums
-from dmrl.recording.mcap.file import MAGIC, RECORD_STRUCT
+from dmrl.recording.mcap.file import FOOTER_STRUCT, MAGIC, RECORD_STRUCT
 from dmrl.recording.mcap.message_index import MessageIndex
 
 CHUNK_STRUCT = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of a name
-FOOTER_STRUCT = struct.Struct("<BQQQ")  # opcode, length, summary start, summary offset start
 
 
 def serialize(*records: McapRecord) -> bytes:
@@ -113,12 +111,14 @@ class McapFileWriter:
         self._checksums.add_metadata(record)
         self._metadata.append(MetadataIndex(self._append(record), len(record), name))
 
-    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
+    def add_attachment(self, attachment: Attachment) -> None:
         """Append an Attachment record."""
-        record = serialize(Attachment(0, 0, name, media_type, data))
-        at = self._append(record)
+        record, one = serialize(attachment), attachment
+        at, size = self._append(record), len(one.data)
         self._attachments.append(
-            AttachmentIndex(at, len(record), 0, 0, len(data), name, media_type)
+            AttachmentIndex(
+                at, len(record), one.log_time, one.create_time, size, one.name, one.media_type
+            )
         )
 
     def add_chunk(self, chunk: CompressedChunk) -> None:
@@ -154,8 +154,17 @@ class McapFileWriter:
         statistics.message_count += sum(index.counts.values())
         self._counts.update(index.counts)
 
-    def finish(self, schemas: Sequence[bytes], channels: Sequence[bytes]) -> None:
-        """Write the checksums and the Summary section, which repeats these definitions."""
+    def finish(self, schemas: Sequence[bytes], channels: Sequence[bytes], unused: bytes) -> None:
+        """Write the checksums and the Summary section.
+
+        Parameters
+        ----------
+        schemas, channels
+            Definitions that the Summary section repeats.
+        unused
+            Those of them that are in no chunk, to be written before the end of the data section.
+        """
+        self._append(unused)
         self.add_metadata(checksums.METADATA_NAME, self._checksums.to_metadata(self._at))
         self._append(serialize(DataEnd(self._crc)))
         statistics = self._statistics
@@ -175,12 +184,10 @@ class McapFileWriter:
 
     def _write_summary(self, start: int, body: bytes, offsets: bytes) -> None:
         """Write the Summary section, the Footer and the magic bytes."""
-        places = start, start + len(body)
-        footer = FOOTER_STRUCT.pack(
-            Opcode.FOOTER, FOOTER_STRUCT.size - RECORD_STRUCT.size + 4, *places
-        )
+        length = FOOTER_STRUCT.size - RECORD_STRUCT.size
+        footer = FOOTER_STRUCT.pack(Opcode.FOOTER, length, start, start + len(body), 0)[:-4]
         crc = zlib.crc32(body + offsets + footer)
-        self._append(body + offsets + serialize(Footer(*places, crc)) + MAGIC)
+        self._append(b"".join((body, offsets, footer, struct.pack("<I", crc), MAGIC)))
 
     def close(self) -> None:
         """Close the file, complete or not."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from mcap.opcode import Opcode
 
-from dmrl.recording.mcap.file import corrupt_error
+from dmrl.recording.mcap.file import RECORD_STRUCT, corrupt_error
 from dmrl.recording.mcap.message_batch import (
     MESSAGE_PREFIX_BYTES,
     Bytes,
@@ -84,6 +84,26 @@ def _compute_entry_offsets(starts: Ints, counts: Ints) -> Ints:
     return found
 
 
+def check_all_listed(path: Path, records: bytes, offsets: Mapping[int, int]) -> None:
+    """Raise RecordingError if there is a message index that a Chunk Index does not list.
+
+    Parameters
+    ----------
+    path
+        The recording, for errors.
+    records
+        Records after a chunk.
+    offsets
+        Offset in ``records`` of each message index that is listed, by channel id.
+    """
+    at, listed = 0, set(offsets.values())
+    while at < len(records):
+        opcode, length, *head = MESSAGE_INDEX_STRUCT.unpack_from(records, at)
+        if opcode == Opcode.MESSAGE_INDEX and head[1] and at not in listed:
+            raise corrupt_error(path, f"its summary lacks a message index of channel {head[0]}")
+        at += RECORD_STRUCT.size + length
+
+
 class IndexEntries(NamedTuple):
     """Entries of the message indexes of a chunk, channel by channel.
 
@@ -125,10 +145,10 @@ def parse_index_entries(path: Path, raw: bytes, offsets: Mapping[int, int]) -> I
     heads = gather(raw, _HEADER_DTYPE, at)
     size = heads["size"].astype(np.int64)
     right = (heads["opcode"] == Opcode.MESSAGE_INDEX) & (heads["channel"] == numbers)
-    right &= (heads["length"] == size + 6) & (size % ENTRY_BYTES == 0)
+    right &= (heads["length"] >= size + 6) & (size % ENTRY_BYTES == 0)  # bytes may follow
     if not right.all():
         raise corrupt_error(path, f"message index of channel {numbers[~right][0]} is wrong")
-    if (at + MESSAGE_INDEX_STRUCT.size + size > len(raw)).any():
+    if (at + RECORD_STRUCT.size + heads["length"].astype(np.int64) > len(raw)).any():
         raise corrupt_error(path, "a message index is cut")
     counts = size // ENTRY_BYTES
     entries = gather(raw, _ENTRY_DTYPE, _compute_entry_offsets(at, counts))

@@ -5,9 +5,9 @@ section fits the file. Statistics, chunk indexes and the bytes between the liste
 therefore compared as well.
 """
 
-import struct
 import zlib
 from collections.abc import Iterable, Iterator
+from functools import cached_property
 from io import BytesIO
 from itertools import chain
 from pathlib import Path
@@ -16,9 +16,11 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
+    Attachment,
     AttachmentIndex,
     Channel,
     ChunkIndex,
+    Metadata,
     MetadataIndex,
     Schema,
     Statistics,
@@ -27,17 +29,29 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary as McapSummary
 
 from dmrl.guards import limits
+from dmrl.recording.mcap.channel import ChannelTable, build_channels
 from dmrl.recording.mcap.file import (
     DEFINITIONS,
+    FOOTER_STRUCT,
     MAGIC,
     RECORD_STRUCT,
     BoundedReader,
     corrupt_error,
     over_budget_error,
 )
+from dmrl.recording.mcap.file_cache import get_cached
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS
 
-FOOTER_STRUCT = struct.Struct("<BQQQI")  # opcode, length, summary start, summary offset start, CRC
+DATA_OPCODES = {
+    Opcode.HEADER,
+    Opcode.MESSAGE,
+    Opcode.CHUNK,
+    Opcode.MESSAGE_INDEX,
+    Opcode.ATTACHMENT,
+    Opcode.METADATA,
+    Opcode.DATA_END,
+}
+"""Records that the Summary section cannot contain."""
 
 
 class SummarySection(McapSummary):
@@ -52,6 +66,16 @@ class SummarySection(McapSummary):
 
     has_crc: bool = False
     _first_chunks: frozenset[int] | None = None
+
+    @cached_property
+    def channels_by_id(self) -> ChannelTable:
+        """Channels of the section, by channel id."""
+        return build_channels(self.channels, self.schemas)
+
+    @property
+    def counts(self) -> dict[int, int]:
+        """Number of messages by channel id that the Statistics record states; empty if none."""
+        return self.statistics.channel_message_counts if self.statistics else {}
 
     def needs_definition_check(self, chunk: ChunkIndex) -> bool:
         """Return whether the definitions in a chunk must be compared with this section.
@@ -82,8 +106,23 @@ class SummarySection(McapSummary):
                 raise corrupt_error(path, f"the definition of {name} contradicts the summary")
 
 
+def read_summary_section(path: Path, stream: BoundedReader) -> SummarySection | None:
+    """Return the verified Summary section from the cache, or read it; see `get_cached`.
+
+    None: it is absent or does not list all messages.
+
+    Raises
+    ------
+    RecordingError
+        If the section contradicts itself or the file.
+    """
+    return get_cached("verified section", path, stream, lambda: read_verified_section(path, stream))
+
+
 def read_verified_section(path: Path, stream: BoundedReader) -> SummarySection | None:
     """Read and verify the Summary section; None if it is absent or does not list all messages.
+
+    Metadata and attachments that it does not list are added to its indexes.
 
     Parameters
     ----------
@@ -105,6 +144,7 @@ def read_verified_section(path: Path, stream: BoundedReader) -> SummarySection |
     _check_times(path, summary_section)
     if not _lists_all_messages(path, stream, summary_section, start):
         return None
+    _check_extra_counts(path, summary_section)
     return summary_section
 
 
@@ -150,6 +190,11 @@ def read_raw_section(
 
 def _parse_section(body: bytes) -> SummarySection:
     summary_section = SummarySection()
+    at = 0
+    while body[at] != Opcode.FOOTER:
+        if body[at] in DATA_OPCODES:
+            raise McapError("its footer points into its data")
+        at += RECORD_STRUCT.size + RECORD_STRUCT.unpack_from(body, at)[1]
     for record in StreamReader(BytesIO(body), skip_magic=True, record_size_limit=len(body)).records:
         match record:
             case Statistics():
@@ -171,10 +216,15 @@ def _parse_section(body: bytes) -> SummarySection:
 
 def _indexes_messages(summary_section: McapSummary) -> bool:
     """Return whether the section repeats definitions and indexes chunks. Writers may omit both."""
-    some = summary_section.statistics is None or summary_section.statistics.message_count
-    defined = bool(summary_section.channels) and (
-        bool(summary_section.schemas)
-        or not any(c.schema_id for c in summary_section.channels.values())
+    statistics, channels = summary_section.statistics, summary_section.channels
+    if statistics is not None and (
+        statistics.channel_count > len(channels)
+        or statistics.schema_count > len(summary_section.schemas)
+    ):
+        return False
+    some = statistics is None or statistics.message_count
+    defined = bool(channels) and (
+        bool(summary_section.schemas) or not any(c.schema_id for c in channels.values())
     )
     return (defined and bool(summary_section.chunk_indexes)) or not some
 
@@ -213,23 +263,29 @@ def _check_statistics(path: Path, summary_section: McapSummary) -> None:
         return
     if counts and sum(counts.values()) != statistics.message_count:
         raise corrupt_error(path, "its statistics contradict themselves")
+    found, number = len(summary_section.chunk_indexes), statistics.chunk_count
+    if found and found != number:
+        raise corrupt_error(path, f"its summary lists {found} of {number} chunks")
+
+
+def _check_extra_counts(path: Path, summary_section: McapSummary) -> None:
+    """Raise unless there are as many metadata and attachments as Statistics states."""
+    statistics = summary_section.statistics
     for what, number, indexes in (
-        ("chunks", statistics.chunk_count, summary_section.chunk_indexes),
-        ("metadata records", statistics.metadata_count, summary_section.metadata_indexes),
-        ("attachments", statistics.attachment_count, summary_section.attachment_indexes),
+        (
+            ("metadata records", statistics.metadata_count, summary_section.metadata_indexes),
+            ("attachments", statistics.attachment_count, summary_section.attachment_indexes),
+        )
+        if statistics
+        else ()
     ):
-        if indexes and len(indexes) != number:
-            raise corrupt_error(path, f"its summary lists {len(indexes)} of {number} {what}")
+        if len(indexes) != number:
+            raise corrupt_error(path, f"it has {len(indexes)} of {number} {what}")
 
 
 def _check_times(path: Path, summary_section: McapSummary) -> None:
-    latest = [chunk.message_end_time for chunk in summary_section.chunk_indexes]
-    if summary_section.statistics is not None:
-        latest += [
-            summary_section.statistics.message_start_time,
-            summary_section.statistics.message_end_time,
-        ]
-    if max(latest, default=0) >= MAX_TIME_NS:
+    latest = max((chunk.message_end_time for chunk in summary_section.chunk_indexes), default=0)
+    if latest >= MAX_TIME_NS:
         raise corrupt_error(path, "a message has a time beyond the year 2262")
 
 
@@ -268,7 +324,10 @@ def iter_extents(summary_section: McapSummary) -> Iterator[tuple[int, int]]:
 def _has_no_messages(
     path: Path, stream: BoundedReader, summary_section: SummarySection, at: int, end: int
 ) -> bool:
-    """Return whether the records from ``at`` to ``end`` contain no message."""
+    """Return whether the records from ``at`` to ``end`` contain no message.
+
+    Metadata and attachments among them are added to the indexes of the section.
+    """
     while at < end:
         stream.seek(at)
         opcode, length = RECORD_STRUCT.unpack(stream.read(RECORD_STRUCT.size))
@@ -279,7 +338,24 @@ def _has_no_messages(
         if opcode in DEFINITIONS and not summary_section.has_crc:
             body = ReadDataStream(BytesIO(stream.read(length)))
             summary_section.check_definitions(path, [DEFINITIONS[opcode].read(body)])
+        elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+            _add_index(summary_section, opcode, at, stream.read(length))
         at += RECORD_STRUCT.size + length
     if at > end:
         raise corrupt_error(path, f"a record that ends at byte {at} overlaps the next one")
     return True
+
+
+def _add_index(summary_section: McapSummary, opcode: int, at: int, body: bytes) -> None:
+    """Add the index of a Metadata or Attachment record that the section does not list."""
+    data, length = ReadDataStream(BytesIO(body)), RECORD_STRUCT.size + len(body)
+    if opcode == Opcode.METADATA:
+        name = Metadata.read(data).name
+        summary_section.metadata_indexes.append(MetadataIndex(at, length, name))
+        return
+    one = Attachment.read(data)
+    summary_section.attachment_indexes.append(
+        AttachmentIndex(
+            at, length, one.log_time, one.create_time, len(one.data), one.name, one.media_type
+        )
+    )

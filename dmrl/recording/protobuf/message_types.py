@@ -15,8 +15,8 @@ from google.protobuf.message import DecodeError
 from dmrl.errors import RecordingError
 from dmrl.messages import PACKAGES, find_descriptor, serialize_schema
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.summary_index import TopicInfo
 from dmrl.recording.protobuf.definitions import build_type
+from dmrl.recording.summary import TopicInfo
 from dmrl.topics import find_topic
 
 

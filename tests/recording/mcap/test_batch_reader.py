@@ -11,10 +11,9 @@ from dmrl.errors import RecordingError
 from dmrl.recording.mcap.batch_reader import check_counts
 
 
-def summary(counts: dict[int, int] | None) -> Any:
+def statistics(counts: dict[int, int] | None) -> Any:
     """Of a recording of these messages by channel; None: it has no statistics."""
-    said = None if counts is None else SimpleNamespace(channel_message_counts=counts)
-    return SimpleNamespace(statistics=said)
+    return None if counts is None else SimpleNamespace(channel_message_counts=counts)
 
 
 CHANNELS: Any = {1: SimpleNamespace(topic="/a"), 2: SimpleNamespace(topic="/b")}
@@ -37,7 +36,7 @@ def test_a_recording_has_the_messages_that_its_statistics_say(
     said: dict[int, int] | None, found: dict[int, int], fault: str
 ) -> None:
     if not fault:
-        check_counts(Path("a.mcap"), summary(said), CHANNELS, Counter(found))
+        check_counts(Path("a.mcap"), statistics(said), CHANNELS, Counter(found))
         return
     with pytest.raises(RecordingError, match=fault):
-        check_counts(Path("a.mcap"), summary(said), CHANNELS, Counter(found))
+        check_counts(Path("a.mcap"), statistics(said), CHANNELS, Counter(found))

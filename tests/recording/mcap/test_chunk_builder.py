@@ -18,7 +18,7 @@ from dmrl.recording.mcap import chunk_builder as room
 from dmrl.recording.mcap.batch_reader import iter_batches
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.channel_registry import ChannelRegistry, _find_free_id
-from dmrl.recording.mcap.chunk import parse_records
+from dmrl.recording.mcap.chunk import ParsedChunk, parse_records
 from dmrl.recording.mcap.chunk_builder import ChunkBuilder
 from dmrl.recording.mcap.file_writer import serialize
 from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, MessageBatch
@@ -176,25 +176,28 @@ def test_a_chunk_stands_as_it_is_where_its_words_are_those_that_are_known() -> N
     records = {n: McapChannel(n, c.topic, "protobuf", {}, 9) for n, c in mine.items()}
     schema = Schema(9, b"a", "protobuf", "a")
 
-    def chunk(*parts: McapChannel | Schema | int) -> MessageBatch:
+    def chunk(*parts: McapChannel | Schema | int) -> ParsedChunk:
         held = ChunkBuilder()
         for part in parts:
             if isinstance(part, int):
                 held.add_message(part, 1, 2, b"x")
             else:
                 held.add_definition(serialize(part))
-        return parse_records(np.frombuffer(bytes(held.data), np.uint8)).batch
+        return parse_records(np.frombuffer(bytes(held.data), np.uint8))
+
+    def stands_in(defined: ChannelRegistry, one: ParsedChunk) -> bool:
+        return defined.can_copy_chunk(one.batch, one, mine)
 
     def begun(*parts: McapChannel | Schema | int) -> tuple[ChannelRegistry, bool]:
         defined = ChannelRegistry()
         defined.adopt_channels(mine, records)
-        return defined, defined.can_copy_chunk(chunk(*parts), mine)
+        return defined, stands_in(defined, chunk(*parts))
 
     defined, stands = begun(schema, records[4], 4, records[6], 6, 4)
     assert stands and defined.written == {4, 6}
     assert summarised(defined) == ([9], [4, 6])
     assert defined.definition_records(4) == defined.definition_records(6) == b""
-    assert defined.can_copy_chunk(chunk(6, 4), mine)  # known by now
+    assert stands_in(defined, chunk(6, 4))  # known by now
     for parts in (
         (records[4], 4),  # without its schema
         (schema, 4),  # not defined
@@ -207,7 +210,7 @@ def test_a_chunk_stands_as_it_is_where_its_words_are_those_that_are_known() -> N
         assert not stands and not defined.written
     defined = ChannelRegistry()
     defined.get_channel_id(mine[6])
-    assert not defined.can_copy_chunk(chunk(schema, records[6], 6), mine)  # has another number here
+    assert not stands_in(defined, chunk(schema, records[6], 6))  # has another number here
 
 
 def test_copies_keep_their_numbers_where_these_are_free() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter, read_summary
-from dmrl.recording.mcap import summary_index
+from dmrl.recording.mcap import file_cache
 
 
 def write(path: Path, heights: int) -> None:
@@ -48,14 +48,14 @@ def test_a_file_of_this_second_is_always_read_again(tmp_path: Path) -> None:
 
 
 def test_what_is_remembered_is_of_the_same_file_and_of_few(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(summary_index, "_CACHE", {})
-    monkeypatch.setattr(summary_index, "CACHE_ENTRIES_MAX", 2)
+    monkeypatch.setattr(file_cache, "_CACHE", {})
+    monkeypatch.setattr(file_cache, "CACHE_ENTRIES_MAX", 2)
     now, made = time.time_ns(), list[str]()
 
     def asked(name: str, age_s: float = 60.0, ranged: object = None, size: int = 7) -> str:
         status = SimpleNamespace(st_ino=1, st_size=size, st_mtime_ns=now - round(age_s * 1e9))
         stream: Any = SimpleNamespace(status=status, remote_stream=ranged)
-        found = summary_index.get_cached("x", Path(name), stream, lambda: made.append(name) or name)
+        found = file_cache.get_cached("x", Path(name), stream, lambda: made.append(name) or name)
         return str(found)
 
     for name in ("a", "a", "b", "a"):

@@ -1,0 +1,202 @@
+"""Count the messages of a recording, and compare them with its Statistics record."""
+
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Statistics
+
+from dmrl.recording.mcap import checksums
+from dmrl.recording.mcap.batch_reader import check_counts
+from dmrl.recording.mcap.channel import ChannelTable
+from dmrl.recording.mcap.chunk_reader import locate_chunk, read_chunk
+from dmrl.recording.mcap.extra_records import read_metadata
+from dmrl.recording.mcap.file import BoundedReader, corrupt_error
+from dmrl.recording.mcap.message_batch import Ints
+from dmrl.recording.mcap.message_index import (
+    ENTRY_BYTES,
+    MESSAGE_INDEX_STRUCT,
+    check_all_listed,
+    parse_index_entries,
+)
+from dmrl.recording.mcap.record_scan import ScannedFile
+from dmrl.recording.mcap.summary_section import SummarySection
+
+COUNTED_BYTES = 256_000_000
+"""Uncompressed size up to which every message of another program's file is counted.
+
+That takes about 0.3 s. For larger files the Statistics record is compared with the indexes.
+"""
+Times = Iterable[tuple[int, Ints]]
+
+
+@dataclass(frozen=True, slots=True)
+class MessageCount:
+    """Number and times of the messages of a recording.
+
+    Parameters
+    ----------
+    by_channel
+        Number of messages by channel id. Channels without messages may be missing.
+    start_ns, end_ns
+        First and last log time, nanoseconds; both 0 without messages.
+    contradiction
+        What the Statistics record states otherwise; empty if it agrees.
+    """
+
+    by_channel: Counter[int]
+    start_ns: int
+    end_ns: int
+    contradiction: str = ""
+
+
+def count_scanned(path: Path, scanned: ScannedFile) -> MessageCount:
+    """Count the messages of a file that was read record by record.
+
+    Raises
+    ------
+    RecordingError
+        If the Statistics record states another number.
+    """
+    times = (
+        (number, batch.time_ns[batch.channel == number])
+        for batch in scanned.batches
+        for number in batch.list_channel_ids()
+    )
+    return _compare(path, scanned.statistics, scanned.channels, times)
+
+
+def count_messages(
+    path: Path, stream: BoundedReader, section: SummarySection, *, verify: bool = False
+) -> MessageCount:
+    """Return number and times of the messages.
+
+    They are from the Statistics record where that is complete and agrees with the chunk indexes.
+    Otherwise they are counted in the message indexes, or in the chunks of a file without.
+
+    Parameters
+    ----------
+    path, stream, section
+        The recording and its Summary section.
+    verify
+        Read and verify every chunk, unless dmrl wrote the file, or it is larger than
+        `COUNTED_BYTES`, or in a bucket.
+
+    Raises
+    ------
+    RecordingError
+        If the file states another number, or is corrupt.
+    """
+    stated, size = _get_stated(section), sum(c.uncompressed_size for c in section.chunk_indexes)
+    own = checksums.METADATA_NAME in read_metadata(path, stream, section)
+    verify = verify and not own and size <= COUNTED_BYTES and stream.remote_stream is None
+    if stated is not None and not verify:
+        return stated
+    indexed = all(chunk.message_index_offsets for chunk in section.chunk_indexes)
+    times = (
+        iter_index_times(path, stream, section)
+        if indexed and not verify
+        else _iter_chunk_times(path, stream, section)
+    )
+    return _compare(path, section.statistics, section.channels_by_id, times)
+
+
+def _get_stated(section: SummarySection) -> MessageCount | None:
+    """Return what the Statistics record states, if it is complete and fits the chunk indexes."""
+    statistics, chunks = section.statistics, section.chunk_indexes
+    if statistics is None or (statistics.message_count and not section.counts):
+        return None
+    times = statistics.message_start_time, statistics.message_end_time
+    filled = [chunk for chunk in chunks if chunk.message_end_time or chunk.message_index_offsets]
+    if filled and times != (
+        min(chunk.message_start_time for chunk in filled),
+        max(chunk.message_end_time for chunk in filled),
+    ):
+        return None
+    # Each message index has a head, and an entry for every message.
+    size = sum(chunk.message_index_length for chunk in chunks)
+    heads = MESSAGE_INDEX_STRUCT.size * sum(len(chunk.message_index_offsets) for chunk in chunks)
+    if size and size != heads + ENTRY_BYTES * statistics.message_count:
+        return None
+    return MessageCount(Counter(section.counts), *times)
+
+
+def _iter_chunk_times(
+    path: Path, stream: BoundedReader, section: SummarySection
+) -> Iterator[tuple[int, Ints]]:
+    """Yield channel id and log times of the messages of every chunk."""
+    chunks = sorted(section.chunk_indexes, key=lambda c: c.chunk_start_offset)
+    stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
+    for chunk in chunks:
+        batch = read_chunk(path, stream, chunk, section.channels_by_id, section, whole=True)
+        for number in batch.list_channel_ids():
+            yield number, batch.time_ns[batch.channel == number]
+
+
+def iter_index_times(
+    path: Path, stream: BoundedReader, section: SummarySection, topics: frozenset[str] | None = None
+) -> Iterator[tuple[int, Ints]]:
+    """Yield channel id and log times of every message index by chunk, then verify the CRC of all.
+
+    For a file in a bucket, only indexes of chunks with the topics are read, without that CRC.
+
+    Raises
+    ------
+    RecordingError
+        If an index contradicts its chunk, is not listed, or fails the CRC.
+    """
+    stored_checksums = read_metadata(path, stream, section).get(checksums.METADATA_NAME)
+    crc = 0
+    chunks = sorted(section.chunk_indexes, key=lambda c: c.chunk_start_offset)
+    if stream.remote_stream is not None:
+        stored_checksums = None
+        wanted = {n for n, c in section.channels.items() if topics is None or c.topic in topics}
+        chunks = [chunk for chunk in chunks if wanted & chunk.message_index_offsets.keys()]
+    firsts = [chunk.chunk_start_offset + chunk.chunk_length for chunk in chunks]
+    stream.expect_reads([(k, c.message_index_length) for k, c in zip(firsts, chunks, strict=True)])
+    for first, chunk in zip(firsts, chunks, strict=True):
+        stream.seek(first)
+        raw = stream.read(chunk.message_index_length)
+        crc = zlib.crc32(raw, crc)
+        places = {n: at - first for n, at in chunk.message_index_offsets.items()}
+        _, times, _, counts = parse_index_entries(path, raw, places)
+        check_all_listed(path, raw, places)
+        low, high = chunk.message_start_time, chunk.message_end_time
+        if len(times) and not low <= int(times.min()) <= int(times.max()) <= high:
+            raise corrupt_error(path, f"a message index at byte {first} has times of another chunk")
+        bounds = pairwise([0, *np.cumsum(counts).tolist()])
+        for number, (begin, end) in zip(places, bounds, strict=True):
+            yield number, times[begin:end]
+    if stored_checksums and stored_checksums[-1].get("indexes") != checksums.format_crc(crc):
+        raise corrupt_error(path, "its message indexes fail their CRC")
+
+
+def _compare(
+    path: Path, statistics: Statistics | None, channels: ChannelTable, times: Times
+) -> MessageCount:
+    """Count messages by their times and compare them with the Statistics record."""
+    counts: Counter[int] = Counter()
+    lows, highs = [], []
+    for number, time_ns in times:
+        if len(time_ns):
+            counts[number] += len(time_ns)
+            lows.append(int(time_ns.min()))
+            highs.append(int(time_ns.max()))
+    start_ns, end_ns = min(lows, default=0), max(highs, default=0)
+    check_counts(path, statistics, channels, counts)
+    if statistics is None:
+        return MessageCount(counts, start_ns, end_ns)
+    if statistics.message_count != counts.total():
+        raise McapError(f"{counts.total()} of {statistics.message_count} messages are there")
+    stated = statistics.message_start_time, statistics.message_end_time
+    contradiction = (
+        f"its statistics state times from {stated[0]} to {stated[1]} ns, but its messages have "
+        f"{start_ns} to {end_ns} ns"
+    )
+    agrees = stated == (start_ns, end_ns) or not counts
+    return MessageCount(counts, start_ns, end_ns, "" if agrees else contradiction)

@@ -1,0 +1,73 @@
+"""Recordings of other writers that were lost in part, or refused, without need."""
+
+from pathlib import Path
+
+import pytest
+
+import dmrl
+from dmrl.errors import RecordingError
+from dmrl.recording import check, merge, recover, trim
+from dmrl.stages import info
+
+from .walk import walk
+
+
+def stranger(data: Path, name: str) -> Path:
+    for folder in ("strangers", "faults"):
+        if found := sorted((data / folder / name).glob("*.mcap")):
+            return found[0]
+    pytest.skip(f"{name} is not there")
+
+
+def test_attachments_of_one_name_keep_their_types_and_times(data: Path, tmp_path: Path) -> None:
+    path = stranger(data, "mcap-attachments")
+    want = walk(path).comparable()
+    assert [name for name, *_ in want["attachments"]] == ["cal.yaml", "pic.png", "pic.png"]
+    trim(path, tmp_path / "a.mcap")
+    recover(path, tmp_path / "b.mcap")
+    empty = tmp_path / "empty.mcap"
+    with dmrl.writer(empty):
+        pass
+    merge([path, empty], tmp_path / "c.mcap")
+    for name in "abc":
+        assert walk(tmp_path / f"{name}.mcap").comparable() == want | {
+            "schemas": sorted(set(want["schemas"]))
+        }
+
+
+def test_bytes_behind_the_known_fields_are_no_damage(data: Path, tmp_path: Path) -> None:
+    path = stranger(data, "mcap-padded-TenMessages")
+    assert not [f for f in check(path) if f.level == "error"]
+    trim(path, tmp_path / "out.mcap")
+    assert walk(tmp_path / "out.mcap").comparable() == walk(path).comparable()
+
+
+def test_statistics_with_a_wrong_time_lose_nothing_and_are_reported(
+    data: Path, tmp_path: Path
+) -> None:
+    path = stranger(data, "mcap-stat_start_late")
+    assert trim(path, tmp_path / "out.mcap") == 20
+    assert walk(tmp_path / "out.mcap").comparable() == walk(path).comparable()
+    (finding,) = (f for f in check(path) if "statistics" in f.text)
+    assert "state times from 1000000000100000000" in finding.text
+    assert info.run(path).summary.start_ns == 1_000_000_000_000_000_000
+
+
+def test_a_chunk_index_that_omits_a_channel_is_an_error(data: Path, tmp_path: Path) -> None:
+    path, out = stranger(data, "trim-chunk-index-short"), tmp_path / "out.mcap"
+    for read in (lambda: trim(path, out), lambda: check(path), lambda: info.run(path)):
+        with pytest.raises(RecordingError, match=r"is damaged .*Try: dmrl recover"):
+            read()
+    assert not out.exists()
+    assert recover(path, out).messages == len(walk(path).raw_messages) == 4600
+
+
+def test_statistics_without_counts_are_counted(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = stranger(data, "statistics-without-counts")
+    assert info.run(path).to_document()["messages"] == dmrl.open(path)._summary.count == 87
+    assert len(dmrl.open(path)) == 9
+    assert not [f for f in check(path) if "no messages" in f.text]
+    info.run(path).print()
+    assert "87 messages" in capsys.readouterr().out

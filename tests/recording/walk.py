@@ -1,0 +1,116 @@
+"""The content of an MCAP file by a walk over its bytes: no index, no mcap package, no dmrl.
+
+It follows the specification (https://mcap.dev/spec) and is the oracle of the tests of copies.
+"""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import lz4.frame
+import zstandard
+
+SCHEMA, CHANNEL, MESSAGE, CHUNK, ATTACHMENT, METADATA = 3, 4, 5, 6, 9, 12
+MAGIC = b"\x89MCAP0\r\n"
+
+
+@dataclass
+class Content:
+    """What a file has, whatever its summary says."""
+
+    schemas: dict[int, tuple] = field(default_factory=dict)
+    channels: dict[int, tuple] = field(default_factory=dict)
+    raw_messages: list[tuple] = field(default_factory=list)
+    attachments: list[tuple] = field(default_factory=list)
+    metadata: list[tuple] = field(default_factory=list)
+
+    def channel(self, number: int) -> tuple:
+        """Topic, encoding, metadata and schema of a channel."""
+        topic, encoding, pairs, schema = self.channels[number]
+        return topic, encoding, pairs, self.schemas[schema] if schema else None
+
+    @property
+    def messages(self) -> list[tuple]:
+        """Channel, log time, publish time, sequence and data of each, sorted."""
+        return sorted((self.channel(n), *rest) for n, *rest in self.raw_messages)
+
+    def comparable(self) -> dict[str, list]:
+        """All of it but what dmrl adds to its own copies."""
+        return {
+            "messages": self.messages,
+            "channels": sorted((self.channel(n) for n in self.channels), key=repr),
+            "schemas": sorted(set(self.schemas.values())),
+            "attachments": sorted(a for a in self.attachments if a[0] != "recipe.toml"),
+            "metadata": sorted(m for m in self.metadata if not m[0].startswith("dmrl.")),
+        }
+
+
+def text(data: bytes, at: int) -> tuple[str, int]:
+    size = int.from_bytes(data[at : at + 4], "little")
+    return data[at + 4 : at + 4 + size].decode(), at + 4 + size
+
+
+def pairs(data: bytes, at: int) -> tuple[tuple[tuple[str, str], ...], int]:
+    end = at + 4 + int.from_bytes(data[at : at + 4], "little")
+    at, found = at + 4, {}
+    while at < end:
+        key, at = text(data, at)
+        found[key], at = text(data, at)
+    return tuple(sorted(found.items())), at
+
+
+def unpacked(kind: str, data: bytes, size: int) -> bytes:
+    if kind == "zstd":
+        return zstandard.ZstdDecompressor().decompress(data, size) if size else b""
+    return lz4.frame.decompress(data) if kind == "lz4" else data
+
+
+def records(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Opcode and body of each record."""
+    at = 0
+    while at < len(data):
+        opcode, size = struct.unpack_from("<BQ", data, at)
+        yield opcode, data[at + 9 : at + 9 + size]
+        at += 9 + size
+
+
+def walk(path: Path) -> Content:
+    """Everything in a complete file, record by record."""
+    found = Content()
+    for opcode, body in records(path.read_bytes()[len(MAGIC) : -len(MAGIC)]):
+        take(found, opcode, body)
+    return found
+
+
+def take(found: Content, opcode: int, body: bytes) -> None:
+    if opcode == SCHEMA:
+        name, at = text(body, 2)
+        encoding, at = text(body, at)
+        size = int.from_bytes(body[at : at + 4], "little")
+        made = name, encoding, body[at + 4 : at + 4 + size]
+        found.schemas[int.from_bytes(body[:2], "little")] = made
+    elif opcode == CHANNEL:
+        number, schema = struct.unpack_from("<HH", body)
+        topic, at = text(body, 4)
+        encoding, at = text(body, at)
+        found.channels[number] = topic, encoding, pairs(body, at)[0], schema
+    elif opcode == MESSAGE:
+        number, sequence, log_ns, publish_ns = struct.unpack_from("<HIQQ", body)
+        found.raw_messages.append((number, log_ns, publish_ns, sequence, body[22:]))
+    elif opcode == CHUNK:
+        size, at = int.from_bytes(body[16:24], "little"), 28
+        kind, at = text(body, at)
+        length = int.from_bytes(body[at : at + 8], "little")
+        inner = unpacked(kind, body[at + 8 : at + 8 + length], size)
+        for each, part in records(inner):
+            take(found, each, part)
+    elif opcode == ATTACHMENT:
+        log_ns, create_ns = struct.unpack_from("<QQ", body)
+        name, at = text(body, 16)
+        media, at = text(body, at)
+        size = int.from_bytes(body[at : at + 8], "little")
+        found.attachments.append((name, media, log_ns, create_ns, body[at + 8 : at + 8 + size]))
+    elif opcode == METADATA:
+        name, at = text(body, 0)
+        found.metadata.append((name, pairs(body, at)[0]))
