@@ -4,6 +4,7 @@ There is one row per recording, camera and label source. A recording matches if 
 does. A query can read only these columns: no files and no other tables.
 """
 
+import json
 import re
 from pathlib import Path
 
@@ -12,12 +13,8 @@ import pyarrow as pa
 from dmrl.catalogue.table import FILE_NAME, Catalogue, file_stamp, open_catalogue
 from dmrl.errors import MissingExtra, RecordingError, SettingError
 from dmrl.guards import limits
+from dmrl.guards.cage import run_caged
 from dmrl.guards.safe_names import safe_join
-
-try:
-    import duckdb
-except ModuleNotFoundError as e:
-    raise MissingExtra("duckdb", "index", "dmrl find") from e
 
 FLAT_QUERY = """
 WITH seen AS (SELECT recording, unnest(cameras) AS c FROM held),
@@ -38,6 +35,8 @@ SELECT held.* REPLACE (
 FROM held LEFT JOIN seen ON seen.recording = held.recording
 LEFT JOIN labelled ON labelled.recording = held.recording AND labelled.camera = seen.c.camera
 """
+QUERY_KEY = b"query"
+"""Key of the query in the metadata of the table that a caged process reads."""
 QUOTED_TEXT = re.compile(r"""'(?:[^']|'')*'|"((?:[^"]|"")*)\"""")
 
 
@@ -57,6 +56,33 @@ def find_rows(catalogue: Catalogue, query: str) -> pa.Table:
     SettingError
         If DuckDB rejects the query. Contains DuckDB's message.
     """
+    buffer = pa.BufferOutputStream()
+    schema = catalogue.table.schema.with_metadata({QUERY_KEY: query.encode()})
+    with pa.ipc.new_stream(buffer, schema) as stream:
+        stream.write_table(catalogue.table.replace_schema_metadata(schema.metadata))
+    chosen = run_caged(
+        f"{__name__}:select_names", buffer.getvalue().to_pybytes(), f"the query {query!r}"
+    )
+    names = set(json.loads(chosen))
+    mask = pa.array([name in names for name in catalogue.table["recording"].to_pylist()])
+    return catalogue.table.filter(mask.cast(pa.bool_()))
+
+
+def select_names(request: bytes) -> bytes:
+    """Return the names of matching recordings as JSON, from a table with its query as Arrow IPC.
+
+    Raises
+    ------
+    SettingError
+        As `find_rows`.
+    """
+    try:
+        import duckdb  # noqa: PLC0415 - only the caged process needs it
+    except ModuleNotFoundError as e:
+        raise MissingExtra("duckdb", "index", "dmrl find") from e
+
+    table = pa.ipc.open_stream(request).read_all()
+    query = table.schema.metadata[QUERY_KEY].decode()
     own: dict[str, bool | str] = {
         "enable_external_access": False,
         "autoinstall_known_extensions": False,
@@ -68,16 +94,13 @@ def find_rows(catalogue: Catalogue, query: str) -> pa.Table:
         "lock_configuration": True,
     }
     with duckdb.connect(config=own) as asked:
-        flat = asked.from_arrow(catalogue.table).query("held", FLAT_QUERY)
+        flat = asked.from_arrow(table).query("held", FLAT_QUERY)
         try:
-            chosen = (
-                flat.filter(_convert_quotes(query, flat.columns)).project("recording").distinct()
-            )
-            names = {name for (name,) in chosen.fetchall()}
+            chosen = flat.filter(_convert_quotes(query, flat.columns)).project("recording")
+            names = [name for (name,) in chosen.distinct().fetchall()]
         except duckdb.Error as e:
             raise SettingError(_query_error(query, str(e), flat.columns)) from None
-    mask = pa.array([name in names for name in catalogue.table["recording"].to_pylist()])
-    return catalogue.table.filter(mask.cast(pa.bool_()))
+    return json.dumps(names).encode()
 
 
 def find_recordings(folder: Path, query: str) -> list[Path]:
