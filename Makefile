@@ -16,7 +16,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help bench demo test test-heavy test-all test-faults mutants golden check format lint types imports spell schemas docs site examples wheels layout clean
+.PHONY: help bench bench-labels demo test test-heavy test-all test-faults mutants golden check format lint types imports spell schemas docs site examples wheels layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -36,6 +36,9 @@ test-all: $(VENV)/.dev ## Run every test, those too that take minutes.
 bench: $(VENV)/.dev ## Time dmrl beside others, on flights it makes: build/bench/. ARGS="--only predict".
 	$(BIN)/pip install --quiet --group bench
 	$(BIN)/python benchmarks/bench_all.py build/bench $(ARGS)
+
+bench-labels: $(VENV)/.dev ## Judge labels, sound and with faults: build/judge/. ARGS="--sets sound --flights 2".
+	$(BIN)/python benchmarks/bench_label_judge.py build/judge $(ARGS)
 
 mutants: $(VENV)/.dev ## Change the code a little, often; see if tests notice. ARGS="geometry --seed 1".
 	$(BIN)/python tests/mutants.py $(ARGS)

@@ -173,7 +173,7 @@ def fly_in_room(yaw_rate_radps: float) -> Mover:
 
     def move(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
         x, y, turns = rng.uniform(-1.0, 1.0, (3, _count_draws(ROOM_REDRAW_S, start.samples)))
-        points = np.asarray(ROOM_M / 2 * (x + 1j * y), complex)
+        points: Plane = np.asarray(ROOM_M / 2 * (x + 1j * y), complex)
         target = _repeat_draws(points, ROOM_REDRAW_S, start.samples)
         turning = _repeat_draws(turns, ROOM_REDRAW_S, start.samples) * yaw_rate_radps
         return _fly_to(start, target, np.zeros_like(target), turning)

@@ -1,0 +1,203 @@
+"""Figures of labelled flights, and of a row of the judge's table over its flights."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmrl.evaluation.limit import describe_limit
+from dmrl.evaluation.positions import PairPaths, read_paths
+from dmrl.samples.flight import START_NS
+from label_judge.flights import Array
+
+BAD_M, CHI2_95 = 0.3, 5.991
+REFUSED_SHARE = 0.01
+"""A flight of which less is kept counts as refused."""
+
+
+@dataclass(frozen=True)
+class FlightFigures:
+    """Sums over all positions of one flight, kept or not, from the first second.
+
+    Parameters
+    ----------
+    positions, expected
+        Number of positions with truth; and of true positions, where nothing was written.
+    squared_error, squared_sigma, squared_bound
+        Sums, m^2; the bound's is NaN where it is not known.
+    inside, kept, bad
+        Number in the 95 % ellipse; with status OK; of these, over 0.3 m off.
+    keepable
+        By bad share: number that a smoother with the bound's covariances could keep.
+    named, said
+        Causes that the labels name, with a probability of 0.5 or more; else the lines printed.
+    error
+        The line with which the command failed, or "".
+    cpu_s
+        CPU seconds, start-up shared by the recordings of the folder.
+    """
+
+    positions: int = 0
+    expected: int = 0
+    squared_error: float = 0.0
+    squared_sigma: float = 0.0
+    squared_bound: float = 0.0
+    inside: int = 0
+    kept: int = 0
+    bad: int = 0
+    keepable: Mapping[str, float] | None = None
+    named: str = ""
+    said: str = ""
+    error: str = ""
+    cpu_s: float = 0.0
+
+
+def judge_flight(
+    labelled: Path, beside: Path | None, result: Mapping[str, Any], moving: Sequence[str] = ()
+) -> FlightFigures:
+    """Judge one flight.
+
+    Parameters
+    ----------
+    labelled
+        Recording with estimates and truth; it may not exist.
+    beside
+        File with the bound's covariances.
+    result
+        What `dmrl label --json` said of it.
+    moving
+        Only pairs of these robots count. Empty: all.
+    """
+    said = _find_words(result)
+    bounds = np.load(beside) if beside is not None else {}
+    expected = sum(len(bounds[key]) for key in bounds if key.endswith("-s"))
+    if not labelled.exists():
+        return FlightFigures(expected=expected, **said)
+    paths = read_paths(labelled)
+    if moving:
+        paths = {pair: path for pair, path in paths.items() if {*pair} <= {*moving}}
+    error = np.concatenate([path.estimate_m - path.true_m for path in paths.values()])
+    covariance = np.concatenate([path.covariance for path in paths.values()])
+    kept = np.concatenate([path.kept for path in paths.values()])
+    size = np.hypot(*error.T)
+    least = [_interpolate(bounds, pair, path) for pair, path in paths.items()] if bounds else []
+    limit = describe_limit(least, least)["kept_share"] if least else {}
+    return FlightFigures(
+        positions=len(size),
+        expected=expected or len(size),
+        squared_error=float((size**2).sum()),
+        squared_sigma=float(np.nan_to_num(np.trace(covariance, axis1=1, axis2=2)).sum()),
+        squared_bound=float(np.trace(np.concatenate(least), axis1=1, axis2=2).sum())
+        if least
+        else float("nan"),
+        inside=int((_mahalanobis_squared(error, covariance) <= CHI2_95).sum()),
+        kept=int(kept.sum()),
+        bad=int((size[kept] > BAD_M).sum()),
+        keepable={share: part * len(size) for share, part in limit.items()},
+        **said,
+    )
+
+
+def _interpolate(bounds: Mapping[str, Array], pair: tuple[str, str], path: PairPaths) -> Array:
+    name = "-".join(pair)
+    time_s = (path.time_ns - START_NS) * 1e-9
+    entries = bounds[name].reshape(-1, 4).T
+    return np.stack([np.interp(time_s, bounds[f"{name}-s"], e) for e in entries], 1).reshape(
+        -1, 2, 2
+    )
+
+
+def _mahalanobis_squared(error: Array, covariance: Array) -> Array:
+    (a, b), (_, d) = covariance.transpose(1, 2, 0)
+    x, y = error.T
+    determinant = a * d - b * b
+    with np.errstate(divide="ignore", invalid="ignore"):
+        squared = (d * x * x - 2 * b * x * y + a * y * y) / determinant
+    return np.where(determinant > 0, squared, np.inf)
+
+
+def _find_words(result: Mapping[str, Any]) -> dict[str, str]:
+    """What was said: causes as the labels give them, or the lines of earlier states."""
+    inner = result.get("result") or {}
+    causes = [cause for pair in inner.get("pairs", ()) for cause in pair.get("causes") or ()]
+    sure = [c for c in causes if c.get("probability", 1.0) >= 0.5]
+    named = {f"{c.get('robot') or ''} {c['name']}".strip() for c in sure}
+    lines = {re.sub(r"^\w+ sees \w+: ", "", line) for line in inner.get("warnings", ())}
+    return {
+        "named": "; ".join(sorted(named)),
+        "said": "; ".join(sorted(lines)),
+        "error": str(result.get("error") or ""),
+    }
+
+
+@dataclass(frozen=True)
+class RowFigures:
+    """Figures of a row: roots of means of squares over flights, shares of all positions."""
+
+    flights: int
+    rmse_m: float
+    sigma_m: float
+    bound_m: float
+    ellipse: float
+    kept: float
+    kept_of_limit: float
+    kept_of_sound: float
+    bad: float
+    worst: float
+    said: float
+    near: float
+    failed: int
+    cpu_s: float
+
+
+def combine(
+    flights: Sequence[FlightFigures], cause: str, sound: Sequence[FlightFigures] = ()
+) -> RowFigures:
+    """Combine the flights of a row.
+
+    Parameters
+    ----------
+    flights
+        Figures of each.
+    cause
+        Pattern of words that name what is wrong.
+    sound
+        The same flights without the fault.
+    """
+    made = [f for f in flights if f.positions]
+    positions, expected = sum(f.positions for f in made), sum(f.expected for f in flights)
+    kept = sum(f.kept for f in flights)
+
+    def root(name: str) -> float:
+        each = [getattr(f, name) / f.positions for f in made]
+        return float(np.sqrt(np.mean(each))) if each else float("nan")
+
+    keepable = sum((f.keepable or {}).get("0.02", 0.0) for f in flights)
+    sound_kept = sum(f.kept for f in sound)
+    # Until labels have causes, their lines count, and the line of a refusal.
+    words = [f.named or f.said or f.error for f in flights]
+    near = [bool(cause) and re.search(cause, w, re.IGNORECASE) is not None for w in words]
+    shares = [f.bad / f.kept for f in flights if f.kept]
+    return RowFigures(
+        flights=len(flights),
+        rmse_m=root("squared_error"),
+        sigma_m=root("squared_sigma"),
+        bound_m=root("squared_bound"),
+        ellipse=_divide(sum(f.inside for f in made), positions),
+        kept=_divide(kept, expected),
+        kept_of_limit=_divide(kept, keepable),
+        kept_of_sound=_divide(kept, sound_kept),
+        bad=_divide(sum(f.bad for f in flights), kept),
+        worst=max(shares, default=float("nan")),
+        said=float(np.mean([bool(w) for w in words])),
+        near=float(np.mean(near)),
+        failed=sum(1 for f in flights if f.error),
+        cpu_s=float(np.mean([f.cpu_s for f in flights])),
+    )
+
+
+def _divide(part: float, whole: float) -> float:
+    return part / whole if whole else float("nan")

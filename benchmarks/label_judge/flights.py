@@ -1,0 +1,243 @@
+"""Flights of two robots as arrays that a fault may change, and their recordings."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl import topics
+from dmrl.flight import NOISE, Fault, Flight, Scenario, simulate
+from dmrl.flight.bound import compute_bound
+from dmrl.geometry.frames import AIDECK_PINHOLE, pixels_from_horizontal
+from dmrl.messages import message_class
+from dmrl.recording import Provenance, RecordingWriter
+from dmrl.samples.flight import LOG_COLUMNS, START_NS, ZERO_COVARIANCE
+from dmrl.samples.sample import build_calibration
+from dmrl.simulation.flight_recording import FlySettings
+
+Array = NDArray[np.float64]
+Pair = tuple[str, str]
+BOTH: tuple[Pair, Pair] = (("cf1", "cf2"), ("cf2", "cf1"))
+MOTIONS = ("in_view", "room", "random")
+TRUTH_HZ = 20.0
+
+
+@dataclass
+class Logs:
+    """What a recording of a flight will hold, on the clocks of its robots, seconds.
+
+    Parameters
+    ----------
+    robots
+        By robot: ``time_s`` and the columns of its log, (N,) each; NaN where it is silent.
+    ranges
+        By (robot that ranges, robot that answers): (2, M) times and ranges.
+    truth
+        By (observer, peer): (N, 4) times and x, y, z in the observer's horizontal frame.
+    bound
+        By (observer, peer): (N, 2, 2) least covariances at the times of the truth.
+    flight
+        The flight, for faults that depend on the true motion.
+    detections
+        By robot: times of images, and of each the rows u, v, depth, confidence.
+    """
+
+    robots: dict[str, dict[str, Array]]
+    ranges: dict[Pair, Array]
+    truth: dict[Pair, Array]
+    bound: dict[Pair, Array]
+    flight: Flight
+    detections: dict[str, tuple[Array, list[Array]]] = field(default_factory=dict)
+
+    @property
+    def end_s(self) -> float:
+        """Length of the flight, seconds."""
+        return float(self.flight.truth["cf1"].time_s[-1])
+
+
+@dataclass(frozen=True)
+class Base:
+    """A flight without an injected fault.
+
+    Parameters
+    ----------
+    motion, noise, duration_s, seed
+        As in `dmrl fly`.
+    faults
+        Faults of motion, which the simulator makes: landings and crashes.
+    """
+
+    motion: str
+    noise: str
+    duration_s: float
+    seed: int
+    faults: tuple[Fault, ...] = ()
+
+    @property
+    def settings(self) -> FlySettings:
+        """The recipe of `dmrl fly`."""
+        return FlySettings(
+            duration_s=self.duration_s,
+            trajectory=self.motion,  # type: ignore[arg-type]
+            noise=self.noise,  # type: ignore[arg-type]
+            seed=self.seed,
+            faults=self.faults,
+        )
+
+
+@cache
+def _fly(base: Base) -> tuple[Flight, dict[Pair, Array], dict[Pair, Array]]:
+    settings, noise = base.settings, NOISE[base.noise]
+    scenario = Scenario(2, base.duration_s, settings.trajectory, settings.yaw_spread_rad)
+    flight = simulate(scenario, noise, base.seed, base.faults)
+    bound = compute_bound(flight, noise, scenario.yaw_spread_rad)
+    time_s = np.arange(0.0, flight.truth["cf1"].time_s[-1], 1 / TRUTH_HZ)
+    truth = {
+        pair: np.column_stack(
+            [
+                flight.clocks[pair[0]].to_clock_time(time_s),
+                flight.peer_in_horizontal(*pair, time_s),
+            ]
+        )
+        for pair in BOTH
+    }
+    return flight, truth, {pair: bound.interpolate_at(pair, time_s) for pair in BOTH}
+
+
+def fly(base: Base) -> Logs:
+    """Fly once; return fresh arrays, free to change."""
+    flight, truth, bound = _fly(base)
+    robots = {
+        name: {key: getattr(log, key).copy() for key in ("time_s", *LOG_COLUMNS)}
+        for name, log in flight.robots.items()
+    }
+    ranges = {link: np.stack([r.time_s, r.range_m]) for link, r in flight.ranges.items()}
+    copied = {pair: rows.copy() for pair, rows in truth.items()}
+    return Logs(robots, ranges, copied, bound, flight)
+
+
+def write(logs: Logs, base: Base, what: Mapping[str, Any], path: Path) -> None:
+    """Write a recording as `dmrl fly` would, and the bound beside it (.npz)."""
+    settings = {**asdict(base.settings), "injected": dict(what)}
+    with RecordingWriter(path, Provenance("fly", settings, base.seed), recipe="") as sink:
+        for robot, columns in logs.robots.items():
+            _write_log(sink, robot, columns)
+        for (robot, peer), (time_s, range_m) in logs.ranges.items():
+            _write_columns(sink, topics.RANGE(robot, peer), "UwbRange", time_s, range_m=range_m)
+        for (robot, peer), rows in logs.truth.items():
+            time_s, x, y, z = rows.T
+            exact = np.tile(np.array(ZERO_COVARIANCE), (len(rows), 1))
+            values = {"x": x, "y": y, "z": z, "covariance": exact}
+            _write_columns(sink, topics.TRUTH(robot, peer), "PeerPosition", time_s, **values)
+        for robot, (time_s, found) in logs.detections.items():
+            sink.write_sample(build_calibration(START_NS, robot, AIDECK_PINHOLE))
+            for at, rows in zip(time_s.tolist(), found, strict=True):
+                _write_detections(sink, robot, at, rows)
+    bounds = {f"{a}-{b}": rows for (a, b), rows in logs.bound.items()}
+    times = {f"{a}-{b}-s": rows[:, 0] for (a, b), rows in logs.truth.items()}
+    np.savez_compressed(path.with_suffix(".npz"), **bounds, **times)
+
+
+def _write_log(sink: RecordingWriter, robot: str, columns: Mapping[str, Array]) -> None:
+    time_s, rate = columns["time_s"], columns["yaw_rate_radps"]
+    known = np.isfinite(rate)
+    rate = np.interp(time_s, time_s[known], rate[known]) if known.any() else np.zeros(len(rate))
+    yaw = np.concatenate([[0.0], np.cumsum(np.diff(time_s) * (rate[1:] + rate[:-1]) / 2)])
+    attitude = {key: columns[key] for key in LOG_COLUMNS[:3]}
+    _write_columns(
+        sink, topics.ATTITUDE(robot), "Attitude", time_s, yaw_rad=columns.get("yaw_rad", yaw),
+        **attitude,
+    )  # fmt: skip
+    velocity = {key: columns[key] for key in LOG_COLUMNS[3:5]}
+    _write_columns(sink, topics.VELOCITY(robot), "Velocity", time_s, **velocity)
+    height_m = columns[LOG_COLUMNS[5]]
+    _write_columns(sink, topics.HEIGHT(robot), "Height", time_s, height_m=height_m)
+
+
+def _write_columns(
+    sink: RecordingWriter, topic: str, message: str, time_s: Array, **fields: Array
+) -> None:
+    """Write the rows in which everything is known, in the order of time."""
+    good = np.all([np.isfinite(v).reshape(len(time_s), -1).all(axis=1) for v in fields.values()], 0)
+    order = np.argsort(time_s[good], kind="stable")
+    log_ns = START_NS + np.rint(time_s[good][order] * 1e9).astype(np.int64)
+    columns = {name: np.asarray(values)[good][order] for name, values in fields.items()}
+    sink.write_columns(topic, message_class(message), log_ns, columns)
+
+
+def _write_detections(sink: RecordingWriter, robot: str, at_s: float, rows: Array) -> None:
+    names = ("u_px", "v_px", "depth_m", "confidence")
+    found = [dict(zip(names, row, strict=True)) for row in rows.tolist()]
+    message = message_class("Detections")(threshold=0.3, detections=found)
+    sink.write(START_NS + round(at_s * 1e9), topics.DETECTIONS(robot), message)
+
+
+@dataclass(frozen=True)
+class Eye:
+    """A detector on every robot: 10 images a second.
+
+    Parameters
+    ----------
+    pixel_px, depth_share, missed
+        Noise of u and v, of the depth, and the share of peers in view that are not found.
+    wrong
+        Share of images with a detection of nothing.
+    lasting_share, lasting_s
+        Standard deviation and time constant of a depth error that lasts.
+    unseen_share
+        Share of the time in which the peer is not found for seconds.
+    """
+
+    pixel_px: float = 2.0
+    depth_share: float = 0.1
+    missed: float = 0.15
+    wrong: float = 0.0
+    lasting_share: float = 0.0
+    lasting_s: float = 3.0
+    unseen_share: float = 0.0
+
+
+def look(logs: Logs, eye: Eye, rng: np.random.Generator) -> Logs:
+    """Give every robot the detections that its camera would bring."""
+    flight = logs.flight
+    for robot, peer in BOTH:
+        true_s = np.arange(0.05, logs.end_s, 0.1)
+        truth = flight.truth[robot]
+        roll, pitch = (np.interp(true_s, truth.time_s, a) for a in (truth.roll, truth.pitch))
+        place = flight.peer_in_horizontal(robot, peer, true_s)
+        uv, depth, _ = pixels_from_horizontal(place, roll, pitch, AIDECK_PINHOLE)
+        size = np.array([AIDECK_PINHOLE.width_px, AIDECK_PINHOLE.height_px])
+        shown = (depth > 0.1) & (depth < 5.0) & ((uv > 0) & (uv < size)).all(axis=1)
+        shown &= rng.random(len(uv)) >= eye.missed
+        shown &= draw_spans(rng, true_s, eye.lasting_s) >= eye.unseen_share
+        lasting = eye.lasting_share * draw_walk(rng, true_s, eye.lasting_s)
+        noisy = uv + rng.normal(0.0, eye.pixel_px, uv.shape)
+        away = depth * np.exp(rng.normal(0.0, eye.depth_share, len(depth)) + lasting)
+        found = []
+        for k in range(len(true_s)):
+            rows = [[*noisy[k], away[k], 0.8]] if shown[k] else []
+            if rng.random() < eye.wrong:
+                far = float(np.exp(rng.uniform(np.log(0.5), np.log(4.0))))
+                rows.append([*(rng.random(2) * size), far, 0.7])
+            found.append(np.reshape(np.array(rows, float), (-1, 4)))
+        logs.detections[robot] = (flight.clocks[robot].to_clock_time(true_s), found)
+    return logs
+
+
+def draw_walk(rng: np.random.Generator, time_s: Array, tau_s: float) -> Array:
+    """Draw (N,) stationary noise of unit size that fades over a time constant."""
+    keep = np.exp(-(time_s[1] - time_s[0]) / tau_s)
+    out = rng.normal(0.0, 1.0, len(time_s))
+    for k in range(1, len(out)):
+        out[k] = keep * out[k - 1] + np.sqrt(1 - keep**2) * out[k]
+    return np.asarray(out)
+
+
+def draw_spans(rng: np.random.Generator, time_s: Array, length_s: float) -> Array:
+    """Draw (N,) numbers in (0, 1) that are constant over spans of time."""
+    index = ((time_s - time_s[0]) / length_s).astype(int)
+    return np.asarray(rng.random(index[-1] + 1)[index])

@@ -1,0 +1,153 @@
+"""Flights that the judge asks for: what is flown, what is injected, and how it is labelled."""
+
+import re
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from label_judge import real
+from label_judge.faults import ROWS
+from label_judge.flights import MOTIONS, Base, Eye, fly, look, write
+from label_judge.injection import Row
+
+SETS = ("sound", "faults", "thirds", "eyes", "real")
+NOISES = ("calibrated", "realistic")
+FIRST_SEED = {"sound": 7100, "faults": 8100, "thirds": 8100, "eyes": 9100}
+
+
+@dataclass(frozen=True)
+class Job:
+    """One flight to be labelled.
+
+    Parameters
+    ----------
+    kind, row, noise, number
+        Set, words of the row, noise, and number of the flight in the row.
+    base
+        The flight; None where it is a real one.
+    fault
+        Injected fault.
+    eye, ranges
+        Detector, and whether ranges are in the recording.
+    options
+        Further flags of `dmrl label`.
+    cause
+        Pattern of words that name what is wrong.
+    """
+
+    kind: str
+    row: str
+    noise: str
+    number: int
+    base: Base | None = None
+    fault: Row | None = None
+    eye: Eye | None = None
+    ranges: bool = True
+    options: tuple[str, ...] = ()
+    cause: str = ""
+
+    @property
+    def key(self) -> str:
+        """Name of the flight's file."""
+        row = re.sub(r"\W+", "-", self.row).strip("-")
+        return f"{self.kind}-{row}-{self.noise}-{self.number}"
+
+    def make(self, path: Path, data: Path | None) -> None:
+        """Write the flight."""
+        if self.base is None:
+            assert data is not None
+            real.write_real(self.row, self.number, data, path)
+            return
+        logs, rng = fly(self.base), np.random.default_rng(zlib.crc32(self.key.encode()))
+        if self.fault is not None:
+            self.fault.inject(logs, self.fault.size, rng)
+        if self.eye is not None:
+            look(logs, self.eye, rng)
+        if not self.ranges:
+            logs.ranges.clear()
+        write(logs, self.base, {"row": self.row}, path)
+
+
+def list_sound(flights: int, noises: Sequence[str]) -> Iterator[Job]:
+    """Yield flights without a fault."""
+    seed = FIRST_SEED["sound"]
+    for noise in noises:
+        for motion in MOTIONS:
+            for k in range(flights):
+                base = Base(motion, noise, 100.0, seed + k)
+                yield Job("sound", f"{motion} 100 s", noise, k, base)
+        for k in range(flights):
+            base = Base(MOTIONS[k % 3], noise, 20.0, seed + 100 + k)
+            yield Job("sound", "all motions 20 s", noise, k, base)
+    for k in range(flights):
+        base = Base(MOTIONS[k % 3], "harsh", 100.0, seed + 200 + k)
+        yield Job("sound", "all motions 100 s", "harsh", k, base)
+
+
+def list_faults(kind: str, flights: int, noises: Sequence[str]) -> Iterator[Job]:
+    """Yield flights with one injected fault each, and the same without."""
+    none = Row("none", lambda logs, size, rng: None, 0.0, "")
+    rows = ROWS if kind == "faults" else [row.shrunk for row in ROWS if row.size]
+    for noise in noises:
+        for row in (none, *rows):
+            for k in range(flights):
+                motion = MOTIONS[k % 3]
+                base = Base(motion, noise, 100.0, FIRST_SEED[kind] + k, row.motion)
+                yield Job(kind, row.name, noise, k, base, row, cause=row.cause)
+
+
+EYES = {
+    "ideal camera": (Eye(), False),
+    "lasting errors": (Eye(lasting_share=0.2, unseen_share=0.3), False),
+    "half of the images wrong": (Eye(wrong=0.5), False),
+    "ideal camera and ranges": (Eye(), True),
+}
+
+
+def list_eyes(flights: int, noises: Sequence[str]) -> Iterator[Job]:
+    """Yield flights in view with cameras."""
+    for noise in noises:
+        for name, (eye, ranges) in EYES.items():
+            for k in range(flights):
+                base = Base("in_view", noise, 100.0, FIRST_SEED["eyes"] + k)
+                options = ("--detections",)
+                yield Job("eyes", name, noise, k, base, None, eye, ranges, options)
+
+
+def list_jobs(
+    sets: Sequence[str], flights: int, noises: Sequence[str], only: str, data: Path | None
+) -> list[Job]:
+    """List all flights that are asked for.
+
+    Parameters
+    ----------
+    sets
+        Some of `SETS`.
+    flights
+        Number of each row.
+    noises
+        Some of `NOISES`.
+    only
+        Pattern of rows.
+    data
+        Folder of real flights; without it, there are none.
+    """
+    jobs: list[Job] = []
+    for kind in sets:
+        if kind == "sound":
+            jobs += list_sound(flights, noises)
+        elif kind in ("faults", "thirds"):
+            jobs += list_faults(kind, flights, noises)
+        elif kind == "eyes":
+            jobs += list_eyes(flights, noises)
+        elif data is not None:
+            pairs = range(real.count_pairs(data))
+            jobs += [Job("real", "nanobench pair", "real", k) for k in pairs]
+            jobs.append(
+                Job("real", "TIERS", "real", 0, options=("--range-offset-m", str(real.OFFSET_M)))
+            )
+    wanted = re.compile(only, re.IGNORECASE)
+    return [job for job in jobs if wanted.search(job.row) or job.row == "none"]
