@@ -21,6 +21,7 @@ from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.mapped_files import MappedFile, require_whole
 from dmrl.guards.paths import refuse_pipes, require_text_path
 from dmrl.guards.safe_names import check_split_name, safe_join
 from dmrl.images.codec import decode
@@ -38,10 +39,17 @@ class Split:
         ``train`` or ``test``.
     table
         All columns, with the types of ``layout.build_schema``. Memory-mapped for Arrow shards.
+    files
+        The mapped shards.
     """
 
     name: str
     table: pa.Table
+    files: tuple[MappedFile, ...] = ()
+
+    def require_whole(self) -> None:
+        """Raise DatasetError if a shard was cut short after it was mapped."""
+        require_whole(self.files)
 
     def __len__(self) -> int:
         return int(self.table.num_rows)
@@ -71,6 +79,7 @@ class Split:
 
     def images(self, rows: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
         """Yield the images of these rows, (H, W, 3) each; PNGs of other rows are not decoded."""
+        self.require_whole()
         packed = layout.IMAGE in self.table.schema.names and "pixels" not in self.__dict__
         for chunk, place in map(self._locate_row, rows):
             if packed:
@@ -80,6 +89,7 @@ class Split:
 
     def grids(self, name: str, rows: Sequence[int]) -> NDArray[np.float32]:
         """Return the grid labels of these rows alone, (n, rows, cols)."""
+        self.require_whole()
         out = np.empty((len(rows), *self.grid_shape), np.float32)
         for grid, (chunk, place) in zip(out, map(self._locate_row, rows), strict=True):
             grid[:] = self._grids[name][chunk][place]
@@ -192,7 +202,8 @@ class Dataset:
                 raise DatasetError(f"{path} has other columns than {shards[0][0]}. Make it again")
         if not sum(table.num_rows for table in tables):
             raise DatasetError(f"split {name} of {self.path} has no images. Make it again")
-        return Split(name, pa.concat_tables(tables))
+        files = () if self.parquet else tuple(MappedFile(path) for path, _ in shards)
+        return Split(name, pa.concat_tables(tables), files)
 
     def list_shards(self, name: str) -> list[Path]:
         """Return the shards of a split, in the order of its rows."""

@@ -131,7 +131,7 @@ def build_examples(split: Split, classes: Sequence[str] = ()) -> ExampleSet:
     image = np.repeat(np.arange(len(counts)), counts)
     place = np.arange(len(flat)) - np.repeat(np.cumsum(counts) - counts, counts)
     robots[image, place] = flat
-    return ExampleSet(split.pixels, robots.astype(np.float32), split.masks)
+    return ExampleSet(split.pixels, robots.astype(np.float32), split.masks, split.require_whole)
 
 
 def _assign_class_ids(names: pa.Array, classes: Sequence[str]) -> NDArray[np.float32]:

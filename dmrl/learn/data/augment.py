@@ -150,6 +150,7 @@ class Augmenter:
         epoch, index
             Epoch, and index of the batch in it.
         """
+        self._examples.require_whole()
         rng = np.random.default_rng([self._seed, epoch, index])
         canvas = np.empty((len(chosen), self._height, self._width, 3), np.uint8)
         robots = np.full((len(chosen), MAX_ROBOTS_PER_IMAGE, len(ROBOT_FIELDS)), np.nan, np.float32)

@@ -5,7 +5,7 @@ image once, as uint8. `prefetch` prepares the next batch in a thread during the 
 """
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -59,11 +59,14 @@ class ExampleSet:
     masks
         Arrays of (n_i, H, W) uint8, segmentation masks: 0, or the index of a robot in ``robots``,
         from 1. Empty: no masks.
+    require_whole
+        Function that raises an error if the images can no longer be read.
     """
 
     pixels: Sequence[NDArray[np.uint8]]
     robots: Robots
     masks: Sequence[NDArray[np.uint8]] = ()
+    require_whole: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
         count = sum(len(chunk) for chunk in self.pixels)
@@ -93,7 +96,7 @@ class ExampleSet:
         places = [self._locate_image(index) for index in numbers.tolist()]
         chunks = [self.pixels[chunk][place][None] for chunk, place in places]
         masks = [self.masks[chunk][place][None] for chunk, place in places if self.masks]
-        return ExampleSet(chunks, self.robots[numbers], masks)
+        return ExampleSet(chunks, self.robots[numbers], masks, self.require_whole)
 
     def get_image(self, index: int) -> NDArray[np.uint8]:
         """Return the (H, W, 3) image at an index."""
@@ -176,6 +179,7 @@ def count_batches(count: int, batch_size: int) -> int:
 
 def collate(examples: ExampleSet, chosen: Sequence[int] | NDArray[np.int64]) -> Batch:
     """Collate the chosen examples into a batch, without augmentation."""
+    examples.require_whole()
     images = np.stack([examples.get_image(int(index)) for index in chosen])
     robots = torch.from_numpy(examples.robots[np.asarray(chosen)])
     return Batch(torch.from_numpy(images).permute(0, 3, 1, 2), robots)
