@@ -23,6 +23,8 @@ from dmrl.terminal.left_out import leave_out
 HALF_PX = 0.5  # the origin is the first pixel's centre in ROS, its edge in dmrl
 MAX_RANGE_M = 60.0
 DMRL_PREFIX = "dmrl_msgs/msg/"
+DEPTH_ENCODINGS = ("16UC1", "32FC1")
+"""Encodings of depth images by REP 118."""
 MAX_SIDE_PX = 10_000
 FIXED_FRAMES = ("odom", "map", "world", "earth")
 """Last parts of the names of frames that do not turn with a robot (REP 105)."""
@@ -43,9 +45,6 @@ class MessageContext:
         The message comes from motion capture.
     odometry
         The robot has odometry, which replaces other messages.
-    fixed
-        Robots whose velocities are in a fixed frame and cannot be rotated into their own. The
-        converters add to it.
     bits
         Significant bits of 16-bit pixels.
     scaled
@@ -57,7 +56,6 @@ class MessageContext:
     peer: str = ""
     captured: bool = False
     odometry: bool = False
-    fixed: set[str] = field(default_factory=set)
     bits: int = codec.BITS
     scaled: set[str] = field(default_factory=set)
 
@@ -81,6 +79,17 @@ def _convert_image(message: Any, time_ns: int, where: MessageContext) -> Iterato
     if LAYOUTS[message.encoding][1] == 2:
         where.scaled.add(where.robot)
     yield build_image(time_ns, where.robot, codec.encode_png(rgb), "png")
+
+
+def is_camera_image(message: Any) -> bool:
+    """Return whether an image can be decoded, and is no map of depths (REP 118) or of a mask."""
+    if hasattr(message, "encoding"):
+        return message.encoding in LAYOUTS and message.encoding not in DEPTH_ENCODINGS
+    try:
+        codec.read_header(message.data.tobytes())
+    except SourceError:
+        return False
+    return not message.format.startswith(tuple(DEPTH_ENCODINGS))
 
 
 def _convert_compressed_image(
@@ -107,6 +116,10 @@ def _convert_camera_info(message: Any, time_ns: int, where: MessageContext) -> I
     k = np.array(message.k if hasattr(message, "k") else message.K, float)
     p = np.array(message.p if hasattr(message, "p") else message.P, float)
     d = message.d if hasattr(message, "d") else message.D
+    if not (k[0] > 0 and k[4] > 0):
+        reason = f"calibrations of {where.robot} without a focal length"
+        leave_out(reason, f"{where.source} at {time_ns} ns")
+        return
     k[[2, 5]] += HALF_PX
     p[[2, 6]] += HALF_PX
     seconds, nanos = divmod(time_ns, 1_000_000_000)
@@ -133,6 +146,15 @@ def _to_euler(q: Any) -> Array | None:
     values = np.array([q.x, q.y, q.z, q.w])
     norm = float(np.linalg.norm(values))
     return quaternion_to_euler(values[None] / norm)[0] if abs(norm - 1) < 0.1 else None
+
+
+def _find_angles(q: Any, where: MessageContext, time_ns: int) -> Array | None:
+    """Return roll, pitch, yaw; None, counted as left out, if the quaternion is not a unit one."""
+    angles = _to_euler(q)
+    if angles is None:
+        reason = f"orientations of {where.robot} that are no unit quaternion"
+        leave_out(reason, f"{where.source} at {time_ns} ns")
+    return angles
 
 
 def _is_fixed_frame(frame: str, parent: str = "") -> bool:
@@ -184,10 +206,11 @@ def build_pose(topic: str, time_ns: int, position: Any, orientation: Any) -> Sam
 
 def _convert_odometry(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
     held, twist = message.pose.pose, message.twist.twist
-    yield build_pose(topics.POSE(where.robot), time_ns, held.position, held.orientation)
+    angles = _find_angles(held.orientation, where, time_ns)
+    if angles is not None:
+        yield build_pose(topics.POSE(where.robot), time_ns, held.position, held.orientation)
     height = {"height_m": float(held.position.z)}
     yield Sample(time_ns, topics.HEIGHT(where.robot), "Height", height)
-    angles = _to_euler(held.orientation)
     if angles is None:
         return
     # The twist is in the child's frame by definition; some drivers name a fixed one there.
@@ -200,8 +223,10 @@ def _convert_odometry(message: Any, time_ns: int, where: MessageContext) -> Iter
 
 
 def _convert_imu(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
-    angles = _to_euler(message.orientation)
-    if angles is not None and not where.odometry:
+    if where.odometry:
+        return
+    angles = _find_angles(message.orientation, where, time_ns)
+    if angles is not None:
         yaw_rate = _compute_yaw_rate(_to_array(message.angular_velocity), angles)
         yield _build_attitude(where.robot, time_ns, angles, yaw_rate)
 
@@ -210,21 +235,27 @@ def _convert_twist(message: Any, time_ns: int, where: MessageContext) -> Iterato
     if where.odometry:
         return
     if _is_fixed_frame(message.header.frame_id):
-        where.fixed.add(where.robot)
+        reason = f"velocities of {where.robot} in a frame that does not turn with the robot"
+        leave_out(reason, f"{where.source} at {time_ns} ns")
     else:
         yield _build_velocity(where.robot, time_ns, _to_array(message.twist.linear))
 
 
 def _convert_pose(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
     topic = topics.TRUE_POSE(where.robot) if where.captured else topics.POSE(where.robot)
+    if _find_angles(message.pose.orientation, where, time_ns) is None:
+        return
     yield build_pose(topic, time_ns, message.pose.position, message.pose.orientation)
 
 
 def _convert_range(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
     value = float(message.range)
+    topic = topics.RANGE(where.robot, where.peer)
     if 0 < value < MAX_RANGE_M:
-        topic = topics.RANGE(where.robot, where.peer)
         yield Sample(time_ns, topic, "UwbRange", {"range_m": value})
+    else:
+        reason = f"ranges of {topic} that are not over 0 and under {MAX_RANGE_M:.0f} m"
+        leave_out(reason, f"{where.source} at {time_ns} ns")
 
 
 def _convert_transforms(message: Any, time_ns: int, _where: MessageContext) -> Iterator[Sample]:

@@ -1,0 +1,177 @@
+"""Messages of ROS bags, through rosbags.
+
+A definition or a message that rosbags cannot read does not affect the others.
+"""
+
+import errno
+import re
+import sqlite3
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from dmrl.errors import DmrlError, MissingExtra, SourceError
+from dmrl.guards.memory import MemoryLimit, measure_size
+from dmrl.terminal.left_out import leave_out
+
+ROS1_MAGIC = b"#ROSBAG V2.0\n"
+COMPUTED_TABLE = re.compile(r"\bVIRTUAL\b|\bGENERATED\b|\bAS\s*\(", re.IGNORECASE)
+TYPE_NAME = re.compile(r"\w+/msg/\w+")
+"""Types that are read. rosbags builds Python code of definitions: their names are checked first."""
+IDL_SEPARATOR = "=" * 80 + "\n"
+
+
+@dataclass(frozen=True, slots=True)
+class BagMessage:
+    """One message: topic, type, time at which the bag received it, and the decoded message."""
+
+    topic: str
+    kind: str
+    bag_ns: int
+    decoded: Any
+
+
+def list_topics(source: Path) -> list[tuple[str, str, int]]:
+    """List topic, type and number of messages of all connections of a bag.
+
+    Raises
+    ------
+    SourceError
+        If the bag cannot be read.
+    MissingExtra
+        If rosbags is not installed.
+    """
+    found: Counter[tuple[str, str]] = Counter()
+    for connection in _iter_guarded(source, lambda reader: iter(reader.connections)):
+        found[connection.topic, connection.msgtype] += connection.msgcount
+    return [(topic, kind, count) for (topic, kind), count in found.items()]
+
+
+def iter_messages(
+    source: Path, wanted: Collection[tuple[str, str]], *, ahead: bool = False
+) -> Iterator[BagMessage]:
+    """Yield the messages of some topics and types, in the bag's order; raise as `list_topics`.
+
+    Messages that cannot be decoded are left out, and counted unless ``ahead``: they are read again.
+    """
+
+    def messages(reader: Any) -> Iterator[Any]:
+        chosen = [c for c in reader.connections if (c.topic, c.msgtype) in wanted]
+        decode = _build_decoder(chosen, is_ros1=source.suffix == ".bag")
+        for connection, bag_ns, data in reader.messages(connections=chosen) if chosen else ():
+            decoded = decode(data, connection.msgtype)
+            if decoded is None and not ahead:
+                reason = f"messages on {connection.topic} that cannot be decoded as"
+                leave_out(f"{reason} {connection.msgtype}", source)
+            elif decoded is not None:
+                yield BagMessage(connection.topic, connection.msgtype, bag_ns, decoded)
+
+    return _iter_guarded(source, messages)
+
+
+def _build_decoder(connections: Collection[Any], *, is_ros1: bool) -> Callable[[bytes, str], Any]:
+    """Return a function of data and type that decodes a message; None if that fails."""
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    store = get_typestore(Stores.EMPTY)
+    decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+    types: dict[str, Any] = {}
+    for connection in connections:
+        with suppress(Exception):  # a standard type has a definition of rosbags' own
+            held = connection.msgdef
+            types |= _parse_definition(connection.msgtype, held.format, held.data)
+    if not is_ros1 and not types.keys() >= {connection.msgtype for connection in connections}:
+        types = get_typestore(Stores.ROS2_HUMBLE).fielddefs | types
+    store.register(types)
+
+    def try_to_decode(data: bytes, kind: str) -> Any:
+        try:
+            return decode(data, kind)
+        except MemoryError:
+            raise
+        except Exception:  # rosbags passes on whatever a wrong message causes
+            return None
+
+    return try_to_decode
+
+
+@lru_cache(maxsize=256)
+def _parse_definition(msgtype: str, kind: Any, text: str) -> dict[str, Any]:
+    """Return the types that the definition of a message type contains."""
+    from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg  # noqa: PLC0415
+
+    known = kind != MessageDefinitionFormat.NONE and text.strip()
+    if not (known and TYPE_NAME.fullmatch(msgtype)):
+        return {}
+    if kind == MessageDefinitionFormat.MSG:
+        return dict(get_types_from_msg(text, msgtype))
+    if not text.startswith(f"{IDL_SEPARATOR}IDL: "):
+        return dict(get_types_from_idl(text))
+    found: dict[str, Any] = {}
+    for part in text.split(IDL_SEPARATOR)[1:]:
+        found |= get_types_from_idl(part.partition("\n")[2])
+    return found
+
+
+def _open_reader(source: Path) -> Any:
+    try:
+        from rosbags import rosbag1, rosbag2  # noqa: PLC0415
+    except ModuleNotFoundError as e:
+        raise MissingExtra("rosbags", "ros", "a ROS bag") from e
+    return rosbag1.Reader(source) if source.suffix == ".bag" else rosbag2.Reader(source)
+
+
+def _check_storage(source: Path) -> None:
+    """Raise SourceError unless a bag's SQLite files have tables alone; a view can run any query.
+
+    A ROS 1 bag must begin with its magic: rosbags reads its first line, however long it is.
+    """
+    for path in sorted(source.glob("*.db3")) if source.is_dir() else [source]:
+        with path.open("rb") as stream:
+            head = stream.read(16)
+        if path.suffix == ".bag" and not head.startswith(ROS1_MAGIC):
+            raise SourceError(f"{path} does not begin as a ROS 1 bag 2.0. Pass another file")
+        if not head.startswith(b"SQLite format 3"):
+            continue
+        where = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(where, uri=True)) as database:
+            for kind, text in database.execute("SELECT type, sql FROM sqlite_master"):
+                if kind not in ("table", "index") or COMPUTED_TABLE.search(text or ""):
+                    raise SourceError(f"{path} has more than tables. Record the bag again")
+
+
+def _iter_guarded(source: Path, of: Callable[[Any], Iterator[Any]]) -> Iterator[Any]:
+    """Yield the items of ``of(reader)``, with any error of rosbags as one line.
+
+    rosbags passes on the errors of sqlite, YAML, struct and its decompressors on damaged bags, so
+    all exceptions are caught.
+    """
+    try:
+        bound = MemoryLimit(measure_size(source))
+        reader = _open_reader(source)
+        _check_storage(source)
+        with bound:
+            reader.open()
+        with closing(reader):
+            found = of(reader)
+            while True:
+                with bound:
+                    one = next(found, None)
+                if one is None:
+                    return
+                yield one
+    except DmrlError:
+        raise
+    except Exception as e:
+        if isinstance(e, MemoryError) or getattr(e, "errno", None) == errno.EFBIG:
+            raise SourceError(
+                f"{source} unpacks to much more than its size explains. Record the bag again"
+            ) from e
+        why = " ".join(str(e).split())[:200] or type(e).__name__
+        raise SourceError(f"{source} cannot be read as a ROS bag: {why}. Restore it") from e

@@ -1,0 +1,256 @@
+"""Bags of other people: what can be read is kept, what cannot is counted and named."""
+
+import math
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+import dmrl
+from dmrl.errors import SettingError, SourceError
+from dmrl.formats.base import Options
+from dmrl.formats.ros.bag import load_content
+from dmrl.images.codec import encode_jpeg
+from dmrl.samples.sample import Sample
+from dmrl.stages.convert import Settings, run
+from dmrl.terminal.left_out import count_left_out
+
+from . import ros_writer as ros
+from .ros_writer import Sent, times
+
+
+def read(path: Path, **options: object) -> tuple[dict[str, list[Sample]], dict[str, int]]:
+    """Samples by topic, and what was left out."""
+    found: dict[str, list[Sample]] = {}
+    with count_left_out() as left:
+        for sample in load_content(path, Options(**options)).samples:  # type: ignore[arg-type]
+            found.setdefault(sample.topic, []).append(sample)
+    return found, dict(left.counts)
+
+
+def odometry(topic: str, count: int = 5) -> list[Sent]:
+    return [Sent(topic, t, ros.odometry(t)) for t in times(count)]
+
+
+def images(topic: str, encoding: str = "rgb8", count: int = 5) -> list[Sent]:
+    return [Sent(topic, t, ros.image(t, encoding)) for t in times(count)]
+
+
+@pytest.mark.parametrize(
+    ("topic", "others", "pair"),
+    [
+        ("/cf1/range/down", (), None),
+        ("/cf1/tof/range", (), None),
+        ("/cf1/range_front", (), None),
+        ("/cf1/zrange", (), None),
+        ("/cf1/vl53l1x_1/range", (), None),
+        ("/cf1/sonar2", (), None),
+        ("/cf1/mystery/range", (), None),
+        ("/drone/teraranger_evo/distance", (), None),
+        ("/mavros/distance_sensor/hrlv_ez4_pub", (), None),
+        ("/cf1/range/cf2", (), ("cf1", "cf2")),
+        ("/cf1/uwb/cf2", (), ("cf1", "cf2")),
+        ("/uwb/alice/bob/distance", (), ("alice", "bob")),
+        ("/alice/range/bob", ("/bob/odom",), ("alice", "bob")),
+        ("/alice/range/bob", ("/alice/odom",), None),
+        ("/swarm/cf1/uwb/swarm/cf2", (), ("cf1", "cf2")),
+    ],
+)
+@pytest.mark.heavy
+def test_a_range_to_the_floor_is_no_range_to_a_peer(
+    topic: str, others: tuple[str, ...], pair: tuple[str, str] | None, tmp_path: Path
+) -> None:
+    sent = [Sent(topic, t, ros.ranged(t)) for t in times()] + odometry("/x7/odom")
+    for other in others:
+        sent += odometry(other)
+    found, left = read(ros.write(tmp_path / "bag", sent))
+    wanted = [f"/{pair[0]}/range/{pair[1]}"] if pair else []
+    assert [t for t in found if "/range/" in t] == wanted
+    reason = f"messages on {topic}: it names no two robots, so it is no range to a peer"
+    assert left == ({} if pair else {reason: 5})
+
+
+@pytest.mark.parametrize(
+    ("odom", "camera", "robot"),
+    [
+        ("/swarm/ns/cf7/mavros/local_position/odom", "/swarm/ns/cf7/camera/color/image_raw", "cf7"),
+        ("/cf7/vins_estimator/odometry", "/cf7/cam0/image_raw", "cf7"),
+        ("/drone_3/state_estimator/ekf2/odom", "/drone_3/front_cam/image", "drone_3"),
+        ("/alpha/planner/odom", "/alpha/camera/image", "alpha"),
+        ("/mavros/local_position/odom", "/camera/image_raw", "cf1"),
+        ("/fleet/uav2/odom", "/fleet/uav2/realsense/infra1/image_rect_raw", "uav2"),
+        ("/robot/odom", "/robot/camera/image_raw", "robot"),
+    ],
+)
+def test_namespaces_are_no_robots(odom: str, camera: str, robot: str, tmp_path: Path) -> None:
+    found, left = read(ros.write(tmp_path / "bag", odometry(odom) + images(camera)))
+    assert {topic.split("/")[1] for topic in found} == {robot} and not left
+    assert len(found[f"/{robot}/camera/image"]) == len(found[f"/{robot}/pose"]) == 5
+
+
+def test_a_guessed_robot_is_said_and_can_be_stated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = ros.write(tmp_path / "bag", odometry("/lab/alpha/odom") + odometry("/cf2/odom"))
+    found, _ = read(path)
+    assert "/lab/height" in found
+    assert "/lab/alpha/odom is taken as lab's. --names /lab/alpha/odom=NAME decides" in (
+        capsys.readouterr().err
+    )
+    for names in ({"/lab/alpha/odom": "cf9"}, {"alpha": "cf9"}):
+        found, _ = read(path, names=names)
+        assert {"/cf9/height", "/cf2/height"} <= found.keys()
+    assert "is taken as" not in capsys.readouterr().err
+    run(path, tmp_path / "a.mcap", Settings(names="/lab/alpha/odom=cf9,cf2=cf3"))
+    assert dmrl.open(tmp_path / "a.mcap").robots == ["cf3", "cf9"]
+    with pytest.raises(SettingError, match="is not OLD=NEW"):
+        run(path, tmp_path / "b.mcap", Settings(names="/lab/alpha/odom=c f"))
+
+
+def test_numbers_that_are_none_are_left_out_and_counted(tmp_path: Path) -> None:
+    nan, sent = math.nan, []
+    turns = [(0.0, 0.0, 0.0, 1.0), (nan, 0.0, 0.0, 1.0), (0.0,) * 4, (0.0, 0.0, 0.0, 1.0)]
+    for t, z, turn in zip(times(4), (1.0, 1.0, 1.0, math.inf), turns, strict=True):
+        sent.append(Sent("/cf1/odom", t, ros.odometry(t, z, turn)))
+    for t, value in zip(times(6), (nan, math.inf, 0.0, -1.0, 99.0, 2.0), strict=True):
+        sent.append(Sent("/cf1/uwb/cf2", t, ros.ranged(t, value)))
+        sent.append(Sent("/vicon/cf1/pose", t, ros.pose(t, value)))
+        sent.append(Sent("/cf1/camera_info", t, ros.camera_info(t, 0.0)))
+    found, left = read(ros.write(tmp_path / "bag", sent))
+    assert {topic: len(held) for topic, held in found.items()} == {
+        "/cf1/pose": 1,
+        "/cf1/height": 3,
+        "/cf1/attitude": 2,
+        "/cf1/velocity": 2,
+        "/cf1/range/cf2": 1,
+        "/cf1/pose/truth": 4,
+    }
+    assert left == {
+        "samples of /cf1/pose with values that are not finite": 1,
+        "samples of /cf1/height with values that are not finite": 1,
+        "orientations of cf1 that are no unit quaternion": 2,
+        "ranges of /cf1/range/cf2 that are not over 0 and under 60 m": 5,
+        "samples of /cf1/pose/truth with values that are not finite": 2,
+        "calibrations of cf1 without a focal length": 6,
+    }
+
+
+@pytest.mark.parametrize(
+    ("other", "encoding"),
+    [
+        ("/cf1/camera/depth/image_rect_raw", "16UC1"),
+        ("/cf1/aaa/image", "32FC1"),
+        ("/cf1/aaa/image", "nonsense9"),
+    ],
+)
+def test_images_that_are_no_picture_spare_the_camera(
+    other: str, encoding: str, tmp_path: Path
+) -> None:
+    sent = images(other, encoding, 9) + images("/cf1/camera/image_raw") + odometry("/cf1/odom")
+    found, left = read(ros.write(tmp_path / "bag", sent))
+    assert len(found["/cf1/camera/image"]) == len(found["/cf1/height"]) == 5
+    assert left == {f"messages on {other}: another topic has this of cf1": 9}
+
+
+def test_video_and_torn_pictures_spare_the_others(tmp_path: Path) -> None:
+    whole = encode_jpeg(np.full((24, 32, 3), 90, np.uint8))
+    sent = odometry("/cf1/odom")
+    for k, t in enumerate(times(8)):
+        data = whole[: len(whole) // 2] if k == 3 else b"" if k == 5 else whole
+        sent.append(Sent("/cf1/cam/compressed", t, ros.compressed(t, "jpeg", data)))
+        video = b"\0\0\0\1\x67" + bytes(40)
+        sent.append(Sent("/cf1/cam/h264", t, ros.compressed(t, "h264", video)))
+        sent.append(Sent("/cf2/cam/h264", t, ros.compressed(t, "h264", video)))
+    found, left = read(ros.write(tmp_path / "bag", sent, "sqlite3"))
+    assert len(found["/cf1/camera/image"]) == 6 and "/cf2/camera/image" not in found
+    assert left == {
+        "messages on /cf1/cam/h264: another topic has this of cf1": 8,
+        "pictures that cannot be decoded, of format 'jpeg'": 2,
+        "pictures that cannot be decoded, of format 'h264'": 8,
+    }
+
+
+def test_a_calibration_is_that_of_the_camera_whose_pictures_are_kept(tmp_path: Path) -> None:
+    sent = images("/cf1/color/image_raw") + images("/cf1/depth/image_raw", "16UC1", 9)
+    for t in times(9):
+        sent.append(Sent("/cf1/depth/camera_info", t, ros.camera_info(t, 100.0)))
+    sent.append(Sent("/cf1/color/camera_info", times()[0], ros.camera_info(times()[0], 55.0)))
+    found, _ = read(ros.write(tmp_path / "bag", sent))
+    (calibration,) = found["/cf1/camera/calibration"]
+    assert calibration.fields["K"][0] == 55.0
+
+
+def test_messages_that_cannot_be_decoded_spare_the_others(tmp_path: Path) -> None:
+    sent = odometry("/cf1/odom")
+    kind = "nav_msgs/msg/Odometry"
+    for t, torn in zip(times(2), (b"", b"\0\1\0\0ab"), strict=True):
+        sent.append(Sent("/cf1/odom", t + 1, torn, kind))
+    found, left = read(ros.write(tmp_path / "bag", sent))
+    assert len(found["/cf1/height"]) == 5
+    assert left == {f"messages on /cf1/odom that cannot be decoded as {kind}": 2}
+    all_torn = [Sent("/cf1/odom", t, b"\0\1\0\0", kind) for t in times()]
+    with pytest.raises(SourceError, match="no message of it can be used"):
+        run(ros.write(tmp_path / "torn", all_torn), tmp_path / "a.mcap", Settings())
+    assert not (tmp_path / "a.mcap").exists()
+
+
+@pytest.mark.parametrize("text", ["MSG: a/srv/B_Event\nuint8 k\n---\nint64 s\n", "", "\0\1", "}{"])
+def test_definitions_that_cannot_be_parsed_spare_the_others(tmp_path: Path, text: str) -> None:
+    """Such as those of services' events, which hold several types of one name."""
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        sent = {"/add/_service_event": "a/srv/B_Event", "/x": "custom_msgs/msg/X"}
+        sent["/cf1/odom"] = "nav_msgs/msg/Odometry"
+        for topic, kind in sent.items():
+            data = text.encode()
+            schema = writer.register_schema(kind, "ros2msg", data)
+            channel = writer.register_channel(topic, "cdr", schema)
+            for t in times():
+                body = bytes(ros.STORE.serialize_cdr(ros.odometry(t), "nav_msgs/msg/Odometry"))
+                writer.add_message(channel, t, body, t)
+        writer.finish()
+    found, left = read(tmp_path / "a.mcap")
+    assert len(found["/cf1/height"]) == 5
+    assert left == {
+        "messages on /add/_service_event: a/srv/B_Event is not converted": 5,
+        "messages on /x: custom_msgs/msg/X is not converted": 5,
+    }
+
+
+def test_a_pose_beside_odometry_is_no_second_pose(tmp_path: Path) -> None:
+    sent = odometry("/cf1/odom") + [Sent("/cf1/pose", t, ros.pose(t)) for t in times(9)]
+    found, left = read(ros.write(tmp_path / "bag", sent))
+    assert len(found["/cf1/pose"]) == 5
+    assert left == {"messages on /cf1/pose: another topic has this of cf1": 9}
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted", "line"),
+    [
+        ("range_down_sensor", {"height": 20}, "/cf1/range/down"),
+        ("namespaced_deep", {"height": 20, "camera/image": 20}, ""),
+        ("odom_nan", {"height": 16, "pose": 16, "camera/image": 20}, "not finite"),
+        ("rgb_and_depth", {"height": 20, "camera/image": 20}, "/cf1/camera/depth/image_rect_raw"),
+        ("comp_h264_beside", {"height": 20, "camera/image": 20}, "/cf1/cam2/image_raw/compressed"),
+        ("comp_one_truncated", {"height": 20, "camera/image": 19}, "1 pictures"),
+        ("svc_event.mcap", {"height": 20}, "/add/_service_event"),
+    ],
+)
+def test_the_bags_that_were_handed_over(
+    name: str,
+    wanted: dict[str, int],
+    line: str,
+    data: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    source = data / "strangers" / f"ros-{name.removesuffix('.mcap')}" / name
+    with count_left_out():
+        counts = Counter(run(source, tmp_path / "a.mcap", Settings()))
+    assert len(dmrl.open(tmp_path / "a.mcap").robots) == 1
+    kept = {topic.split("/", 2)[2]: count for topic, count in counts.items()}
+    assert kept | wanted == kept and not any("range" in topic for topic in kept)
+    assert line in capsys.readouterr().err
