@@ -1,9 +1,10 @@
-"""TOML file of a camera's calibration."""
+"""File of a camera's calibration: TOML, or that of another tool."""
 
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 
 from dmrl.errors import SourceError
+from dmrl.geometry import foreign_calibration
 from dmrl.geometry.frames import AIDECK, PUBLISHED_RENDER, Camera
 from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.guards.paths import refuse_pipe
@@ -31,7 +32,7 @@ def format_camera(camera: Camera) -> str:
 
 
 def find_camera(name: Path) -> Camera:
-    """Return the built-in camera with this name, or read a TOML file.
+    """Return the built-in camera with this name, or read a file.
 
     Parameters
     ----------
@@ -47,12 +48,12 @@ def find_camera(name: Path) -> Camera:
 
 
 def read_camera(path: Path) -> Camera:
-    """Read a camera from a TOML file.
+    """Read a camera from a TOML file, or a YAML, JSON or XML file of ROS, Kalibr or OpenCV.
 
     Raises
     ------
     SourceError
-        If the file is not TOML, or a key is unknown, missing or of the wrong type.
+        If the file is neither, or a key is unknown, missing or of the wrong type.
     """
     refuse_pipe(path)
     try:
@@ -61,6 +62,8 @@ def read_camera(path: Path) -> Camera:
         raise SourceError(f"no calibration {path}. Use a TOML file, aideck or published") from None
     except (OSError, UnicodeDecodeError) as e:
         raise SourceError(f"{path} is not a TOML file: {e}. Keys: {', '.join(KEYS)}") from None
+    if path.suffix.lower() in foreign_calibration.SUFFIXES:
+        return foreign_calibration.parse_foreign_camera(text, path)
     return parse_camera(text, path)
 
 

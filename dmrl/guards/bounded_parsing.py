@@ -1,4 +1,4 @@
-"""Parse JSON, TOML, YAML and NumPy archives from untrusted files within limits."""
+"""Parse JSON, TOML, YAML, XML and NumPy archives from untrusted files within limits."""
 
 import json
 import lzma
@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +71,23 @@ def parse_yaml(text: str) -> dict[str, Any]:
     if not isinstance(table, dict):
         raise ValueError("it is not a table of keys")
     return table
+
+
+def parse_xml(data: bytes) -> ElementTree.Element:
+    """Return the root of an XML document without entities, which can multiply its size.
+
+    Raises
+    ------
+    ValueError
+        If it is not XML, defines entities, or exceeds the limit of characters.
+    """
+    most = limits.XML_BYTES
+    if len(data) > most or b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise ValueError(f"it is over {most} bytes, or defines entities")
+    try:
+        return ElementTree.fromstring(data)
+    except ElementTree.ParseError as e:
+        raise ValueError(str(e)) from None
 
 
 ARCHIVE_ERRORS = (

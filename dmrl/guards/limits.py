@@ -68,6 +68,9 @@ DEPTH = 200
 TOML_CHARACTERS = 100_000
 """Length of a recipe or a camera file. The time for long dotted keys grows with their square."""
 
+XML_BYTES = 10 * MB
+"""Size of an XML file of labels, or of a camera."""
+
 STEPS = 10_000
 """Steps of a pipeline after ``[each]`` is expanded. The longest that ships has 1,805."""
 

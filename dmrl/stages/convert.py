@@ -48,7 +48,8 @@ class Settings:
     labels
         images: CSV file with labels. Without it, labels.csv in the folder, if there.
     camera
-        Camera that took the pictures as they are stored: aideck, published, or a TOML file.
+        Camera that took the pictures as they are stored: aideck, published, a TOML file, or a
+        YAML, JSON or XML file of ROS, Kalibr or OpenCV.
         Without it, calibration.toml in the folder, if there.
     width_px
         images: crop to the middle and scale to this width. Needs the height too.

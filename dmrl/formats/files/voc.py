@@ -24,10 +24,10 @@ from dmrl.formats.files.labelled_pictures import (
     spread_over_time,
 )
 from dmrl.guards import limits
+from dmrl.guards.bounded_parsing import parse_xml
 from dmrl.terminal.left_out import leave_out
 
 HEAD_BYTES = 4096
-XML_BYTES = 10 * limits.MB
 UNREADABLE = "XML files that are not VOC's; their pictures have no labels"
 
 
@@ -90,7 +90,7 @@ def _read_rows(
 ) -> tuple[list[LabelRow] | None, tuple[float, float] | None]:
     """Return the labels of a picture and the size that they refer to; None, None: unreadable."""
     try:
-        root = _parse_xml(label.read_bytes())
+        root = parse_xml(label.read_bytes())
         objects = root.findall("object")
         if len(objects) > limits.PEERS:
             raise ValueError(f"more than {limits.PEERS} boxes")
@@ -99,16 +99,10 @@ def _read_rows(
         width, height = (float(root.findtext(f"size/{side}") or 0) for side in ("width", "height"))
         peers = name_peers(names, options.names)
         rows = [label_from_box(picture.name, *both) for both in zip(peers, boxes, strict=True)]
-    except (OSError, ValueError, ElementTree.ParseError) as e:
+    except (OSError, ValueError) as e:
         leave_out(UNREADABLE, f"{label}: {e}")
         return None, None
     return rows, (width, height) if width and height else None
-
-
-def _parse_xml(data: bytes) -> ElementTree.Element:
-    if len(data) > XML_BYTES or b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise ValueError(f"it is over {XML_BYTES} bytes, or defines entities")
-    return ElementTree.fromstring(data)
 
 
 def _parse_box(one: ElementTree.Element) -> tuple[float, float, float, float]:

@@ -1,0 +1,126 @@
+"""Calibration files of ROS, Kalibr and OpenCV, as these write them."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.geometry.camera_file import read_camera
+from dmrl.geometry.frames import Camera
+from dmrl.geometry.lens import distort
+
+K = np.array([[210.0, 0, 160], [0, 211, 119], [0, 0, 1]])
+D = (-0.1, 0.02, 0.001, -0.002, 0.0)
+WANTED = Camera(320, 240, 210.0, 211.0, 160.5, 119.5, D)
+
+ROS = """image_width: 320
+image_height: 240
+camera_name: cam
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [210, 0.0, 160.0, 0.0, 211.0, 119.0, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.1, 0.02, 0.001, -0.002, 0.0]
+rectification_matrix: {rows: 3, cols: 3, data: [1,0,0,0,1,0,0,0,1]}
+projection_matrix: {rows: 3, cols: 4, data: [210,0,160,0,0,211,119,0,0,0,1,0]}
+"""
+KALIBR = """cam0:
+  cam_overlaps: []
+  camera_model: pinhole
+  distortion_coeffs: [-0.1, 0.02, 0.001, -0.002]
+  distortion_model: radtan
+  intrinsics: [210.0, 211.0, 160.0, 119.0]
+  resolution: [320, 240]
+  rostopic: /cam0/image_raw
+"""
+MESSAGE = """header: {stamp: {sec: 1, nanosec: 0}, frame_id: c}
+height: 240
+width: 320
+distortion_model: plumb_bob
+d: [-0.1, 0.02, 0.001, -0.002, 0.0]
+k: [210.0, 0.0, 160.0, 0.0, 211.0, 119.0, 0.0, 0.0, 1.0]
+r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+p: [210.0, 0.0, 160.0, 0.0, 0.0, 211.0, 119.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+"""
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("text", [ROS, MESSAGE])
+def test_files_of_ros(text: str, tmp_path: Path) -> None:
+    assert read_camera(write(tmp_path / "camera.yaml", text)) == WANTED
+
+
+def test_a_file_of_kalibr_has_four_coefficients(tmp_path: Path) -> None:
+    found = read_camera(write(tmp_path / "camchain.yaml", KALIBR))
+    assert found == Camera(320, 240, 210.0, 211.0, 160.5, 119.5, D[:4])
+    two = KALIBR + KALIBR.replace("cam0", "cam1")
+    with pytest.raises(SourceError, match="it has cam0, cam1; keep one"):
+        read_camera(write(tmp_path / "two.yaml", two))
+
+
+@pytest.mark.parametrize("suffix", ["yml", "json", "xml"])
+@pytest.mark.parametrize("coefficients", [4, 5, 8, 14])
+def test_files_that_opencv_writes(suffix: str, coefficients: int, tmp_path: Path) -> None:
+    path = tmp_path / f"camera.{suffix}"
+    d = np.zeros(coefficients)
+    d[:4] = D[:4]
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 320)
+    storage.write("image_height", 240)
+    storage.write("camera_matrix", K)
+    storage.write("distortion_coefficients", d)
+    storage.release()
+    assert read_camera(path) == Camera(320, 240, 210.0, 211.0, 160.5, 119.5, tuple(d[:5]))
+
+
+def test_a_pixel_of_opencv_s_projection_is_half_a_pixel_from_ours(tmp_path: Path) -> None:
+    found = read_camera(write(tmp_path / "camera.yaml", ROS))
+    point = np.array([[0.3, -0.2, 1.0]])
+    (pixel,), _ = cv2.projectPoints(point, np.zeros(3), np.zeros(3), K, np.array(D))
+    bent, _ = distort(point[:, :2], found.distortion)
+    ours = bent * [found.fx_px, found.fy_px] + [found.cx_px, found.cy_px]
+    assert ours[0] == pytest.approx(pixel[0] + 0.5, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (KALIBR.replace("radtan", "equidistant"), "its lens model is equidistant, not plumb_bob"),
+        (KALIBR.replace("pinhole", "omni"), "its camera_model is omni"),
+        (KALIBR.replace("[320, 240]", "[320]"), "its size has no 2 numbers"),
+        (ROS.replace("image_width: 320", ""), "it has no key imagewidth"),
+        (ROS.replace("-0.002, 0.0]", "-0.002, 0.0, 0.1, 0.2, 0.3]"), "has 8 coefficients, not 5"),
+        (ROS.replace("[210, 0.0", "[.nan, 0.0"), "its matrix has no 9 numbers"),
+        (ROS.replace("[210, 0.0", "[210, 3.0"), "has a skew"),
+        (ROS.replace("[210, 0.0", "[210, a"), "'a' is no number"),
+        (ROS.replace("[210,", "[-210,"), "must be over 0"),
+        ("- 1\n- 2\n", "it is not a table"),
+        ("a: *b\n", "no calibration of ROS"),
+    ],
+)
+def test_what_is_no_pinhole_with_plumb_bob_is_one_line(text: str, why: str, tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=why) as e:
+        read_camera(write(tmp_path / "camera.yaml", text))
+    assert "\n" not in str(e.value) and "as TOML" in str(e.value)
+
+
+def test_json_of_anything_else_is_one_line(tmp_path: Path) -> None:
+    for document in ({"a": 1}, [1, 2], {"K": 3}):
+        with pytest.raises(SourceError, match="is no calibration of ROS, Kalibr or OpenCV"):
+            read_camera(write(tmp_path / "camera.json", json.dumps(document)))
+
+
+def test_the_file_that_was_handed_over(data: Path) -> None:
+    found = read_camera(data / "strangers" / "camera-ros" / "ros.yaml")
+    assert (found.width_px, found.height_px, found.fx_px, found.cx_px) == (320, 240, 210.0, 160.5)
