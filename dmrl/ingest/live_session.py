@@ -3,8 +3,8 @@
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from dmrl.live.receive_clocks import HostClock
 from dmrl.live.robot_options import RobotOptions
 from dmrl.live.status_table import StatusTable
 from dmrl.recording import RecordingWriter, build_provenance
+from dmrl.terminal.progress import say
 from dmrl.terminal.signals import set_on_signal
 
 FLUSH_S = 1.0
@@ -89,7 +90,7 @@ def record_session(
     )
     began_s, used_s = time.monotonic(), time.process_time()
     # What was received stays even if this process fails: flights are not repeated.
-    with RecordingWriter(out, made, keep_on_error=True) as sink:
+    with _name_unfinished(out), RecordingWriter(out, made, keep_on_error=True) as sink:
         ended = threading.Event() if ended is None else ended
         counts = _write_samples(sink, feed, table, threads, (settings.duration_s, ended), show)
     if not counts:
@@ -98,6 +99,21 @@ def record_session(
     passed_s = max(time.monotonic() - began_s, 1e-9)
     healths = [thread.health for thread in threads]
     return Result(counts, healths, (time.process_time() - used_s) / passed_s)
+
+
+@contextmanager
+def _name_unfinished(out: Path) -> Iterator[None]:
+    """Print the name of the file that holds the flight if the block fails."""
+    try:
+        yield
+    except BaseException:
+        unfinished = to_partial_path(out)
+        if unfinished.exists():
+            say(
+                f"{unfinished} holds the flight until then. Bring it back with: dmrl recover "
+                f"{unfinished} OTHER.mcap"
+            )
+        raise
 
 
 def _refuse_unfinished(out: Path) -> None:

@@ -24,6 +24,10 @@ READ_BYTES = 1 << 16
 MAX_GARBAGE_BYTES = 1 << 20
 """Bytes without an image after which a connection is no image stream."""
 
+FRAME_IDS = 256
+PERIOD_WEIGHT = 0.1
+"""Weight of a new interval in the mean of the last ones."""
+
 RobotTime = Callable[[float], int | None]
 
 
@@ -64,6 +68,35 @@ class _ExposureTimes:
             return self.steady(arrival_ns)
         self.clock.add_sample(image.time_us * NS_PER_US, arrival_ns)
         return min(self.clock.to_host_ns(image.time_us * NS_PER_US), arrival_ns)
+
+
+class FrameCount:
+    """Count of lost images by the camera's own counter of 8 bits, over pauses and reconnections.
+
+    A pause of more than 255 images is resolved by its length. A camera that restarted begins at an
+    earlier time; nothing is known of its images before that.
+    """
+
+    def __init__(self) -> None:
+        self._last: Image | None = None
+        self._seen_ns = 0
+        self._period_ns = 0.0
+
+    def add_image(self, image: Image, arrival_ns: int) -> int:
+        """Count an image; return the number lost since the one before."""
+        last, waited_ns = self._last, arrival_ns - self._seen_ns
+        self._last, self._seen_ns = image, arrival_ns
+        if last is None or last.frame_id is None or image.frame_id is None:
+            return 0
+        if image.time_us is not None and last.time_us is not None and image.time_us < last.time_us:
+            return 0
+        step = (image.frame_id - last.frame_id) % FRAME_IDS
+        if self._period_ns:
+            step += max(round((waited_ns / self._period_ns - step) / FRAME_IDS), 0) * FRAME_IDS
+        if step == 1:  # of images that follow each other; arrivals vary
+            change = waited_ns - self._period_ns
+            self._period_ns += change * (PERIOD_WEIGHT if self._period_ns else 1.0)
+        return max(step - 1, 0)
 
 
 class CameraClient(threading.Thread):
@@ -111,6 +144,7 @@ class CameraClient(threading.Thread):
         self._stop_wanted = threading.Event()
         self._size_px: tuple[int, int] | None = None
         self._warned: set[str] = set()
+        self._frames = FrameCount()
 
     def stop(self) -> None:
         """Request the thread to end; `join` waits for it."""
@@ -148,7 +182,6 @@ class CameraClient(threading.Thread):
         reader, times = ImageReader(), _ExposureTimes(self._robot_time)
         self.health.connections += 1
         broken, last_s, useless_bytes = 0, time.monotonic(), 0
-        frame_id: int | None = None
         while not self._stop_wanted.is_set():
             try:
                 data = connection.recv(READ_BYTES)
@@ -162,18 +195,13 @@ class CameraClient(threading.Thread):
             useless_bytes += len(data)
             for image in reader.feed(data):
                 self.health.state, useless_bytes = "connected", 0
-                frame_id = self._count_lost(image, frame_id)
+                self.health.lost += self._frames.add_image(image, arrival_ns)
                 self._post_image(image, times(image, arrival_ns), arrival_ns)
             self.health.broken += reader.broken - broken
             broken = reader.broken
             if useless_bytes > MAX_GARBAGE_BYTES:
                 return "sends no CPX images"
         return "stopped"
-
-    def _count_lost(self, image: Image, before: int | None) -> int | None:
-        if image.frame_id is not None and before is not None:
-            self.health.lost += image.frame_id - before - 1
-        return image.frame_id
 
     def _post_image(self, image: Image, time_ns: int, arrival_ns: int) -> None:
         try:

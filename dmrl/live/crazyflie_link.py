@@ -21,19 +21,45 @@ RECEIVE_TIMEOUT_S = 5.0
 FIRST_ANSWER_TIMEOUT_S, NEXT_ANSWER_TIMEOUT_S = 2.0, 5.0
 """Seconds without an answer after which the setup is aborted. The whole setup may take longer."""
 RETRY_DELAY_S = 1.0
+MAX_DELAY_MS = 2_000
+"""Largest difference between two packets' delays. A larger one is a restart of the drone."""
 
 
-@dataclass(slots=True)
-class _BlockStream:
-    """Packets of one block, to count losses."""
+class PacketCount:
+    """Count of lost packets by the drone's own clock, over pauses and reconnections.
 
-    period_ms: int
-    last_ms: int | None = None
+    A drone that restarted begins at another time; nothing is known of its packets before that.
+    """
 
-    def count_lost(self, time_ms: int) -> int:
-        """Return the number of packets lost between the last one and this one."""
-        last, self.last_ms = self.last_ms, time_ms
-        return 0 if last is None else max(round((time_ms - last) / self.period_ms) - 1, 0)
+    def __init__(self) -> None:
+        self._last_ms: dict[str, int] = {}
+        self._seen_ms: dict[str, int] = {}
+
+    def add_packet(self, block: str, period_ms: int, timestamp: int, arrival_ns: int) -> int:
+        """Count a packet; return the number lost since the one before of its block.
+
+        Parameters
+        ----------
+        block
+            Name of the block.
+        period_ms
+            Its period.
+        timestamp
+            Time of the packet on the drone's clock, milliseconds, 24 bits.
+        arrival_ns
+            Time of arrival on this computer's clock.
+        """
+        arrival_ms = arrival_ns // NS_PER_MS
+        last_ms, seen_ms = self._last_ms.get(block), self._seen_ms.get(block, 0)
+        self._last_ms[block], self._seen_ms[block] = timestamp, arrival_ms
+        if last_ms is None:
+            return 0
+        step_ms = (timestamp - last_ms) % (1 << TIMESTAMP_BITS)
+        waited_ms = arrival_ms - seen_ms
+        whole = round((waited_ms - step_ms) / (1 << TIMESTAMP_BITS)) << TIMESTAMP_BITS
+        if abs(step_ms + whole - waited_ms) > MAX_DELAY_MS:
+            return 0
+        return max(round((step_ms + whole) / period_ms) - 1, 0)
 
 
 @dataclass(slots=True)
@@ -45,7 +71,6 @@ class _LinkConnection:
 
     reading: LogDecoder
     clock: SenderClock = field(default_factory=SenderClock)
-    streams: dict[str, _BlockStream] = field(default_factory=dict)
     unwrapped: CounterUnwrapper = field(default_factory=lambda: CounterUnwrapper(TIMESTAMP_BITS))
     held: list[tuple[int, Mapping[str, float], int]] = field(default_factory=list)
 
@@ -106,6 +131,7 @@ class CrazyflieLink(threading.Thread):
         self._peers, self._period_ms, self._feed, self._now = peers, period_ms, feed, now
         self._stop_wanted = threading.Event()
         self._flight: _LinkConnection | None = None
+        self._packets = PacketCount()
         self._lock = threading.Lock()
         self._fault: Exception | None = None
 
@@ -217,8 +243,9 @@ class CrazyflieLink(threading.Thread):
             self.health.last_arrival_ns = arrival_ns
             for received in flight.add_packet(block.name, timestamp, values, arrival_ns):
                 self._feed.post_sample(received)
-            stream = flight.streams.setdefault(block.name, _BlockStream(block.period_in_ms))
-            self.health.lost += stream.count_lost(flight.unwrapped(timestamp))
+            self.health.lost += self._packets.add_packet(
+                block.name, block.period_in_ms, timestamp, arrival_ns
+            )
 
     def _flush_connection(self) -> None:
         with self._lock:

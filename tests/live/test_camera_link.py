@@ -128,15 +128,6 @@ def test_without_a_port_the_decks_own_is_taken() -> None:
     assert parse_address("192.168.4.1") == ("192.168.4.1", 5000)
 
 
-def test_images_that_did_not_come_are_counted_by_their_numbers() -> None:
-    camera = CameraClient("cf1", "127.0.0.1", 5000, SampleQueue(), HostClock())
-    before = None
-    for number in (None, 254, 255, 259, 260, None, 300):
-        before = camera._count_lost(replace(RAW, frame_id=number), before)
-    assert camera.health.lost == 3  # 256, 257 and 258
-    assert before == 300
-
-
 def test_the_best_clock_that_a_camera_tells_counts_and_nothing_is_of_the_future() -> None:
     known: dict[float, int] = {}
     times = _ExposureTimes(known.get)
