@@ -1,11 +1,11 @@
-"""Limit of a simulated flight: what a smoother that knows the simulator's noise could reach.
+"""Limit of a simulated flight: the least error of a smoother that knows the simulator's noise.
 
 The flight is simulated again from the provenance of the recording.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +13,11 @@ from dmrl.errors import SettingError
 from dmrl.estimation.model.position_metrics import MAX_GOOD_ERROR_M
 from dmrl.estimation.model.status import probability_beyond
 from dmrl.flight import NOISE, Fault, Flight, Noise, Ranges, Scenario, simulate
-from dmrl.flight.bound import PositionBound, compute_bound, count_bound_bytes
+from dmrl.flight.bound import compute_bound
 from dmrl.geometry.frames import Array
 from dmrl.labelling.flight_log import FlightLog, RobotPair, Times
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
-from dmrl.recording import Provenance, read_summary
+from dmrl.recording import read_summary
 from dmrl.samples.flight import START_NS
 from dmrl.terminal.progress import say
 
@@ -27,32 +27,16 @@ TOLERANCE_M = 1e-3
 """Largest difference of the true positions from those of the flight simulated again."""
 TRUTH_STEP_S = 0.05
 """Time between recorded true positions, seconds."""
-MAX_BYTES = 1e9
-"""Largest memory of a bound, bytes: ten robots for half an hour."""
+MIN_RECORDED = 0.1
+"""Least share of a flight's true positions that a recording holds, so that it explains the work."""
+MAX_WORK = 3e6
+"""Largest fourth power of the robots times seconds: 1 GB for ten robots and five minutes."""
+
+Bound = Callable[[RobotPair, Times], Array]
+"""Least covariances (N, 2, 2) of a pair's positions at (N,) log times, square metres."""
 
 
-class _Simulation(NamedTuple):
-    """Arguments of `simulate`."""
-
-    scenario: Scenario
-    noise: Noise
-    seed: int
-    faults: tuple[Fault, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class FlightLimit:
-    """Bound of a flight, at log times of its observers."""
-
-    flight: Flight
-    bound: PositionBound
-
-    def interpolate_at(self, pair: RobotPair, time_ns: Times) -> Array:
-        """Return the bound's (N, 2, 2) covariances at (N,) log times, square metres."""
-        return self.bound.interpolate_at(pair, _true_time_s(self.flight, pair[0], time_ns))
-
-
-def find_limit(held: FlightLog) -> FlightLimit | None:
+def find_limit(held: FlightLog) -> Bound | None:
     """Find the limit of a recording; None if `dmrl fly` did not simulate it, or without noise.
 
     Parameters
@@ -60,67 +44,47 @@ def find_limit(held: FlightLog) -> FlightLimit | None:
     held
         With the topics `flight_log.TRUTH_TOPICS`.
     """
+    made = read_summary(held.path).provenance
+    sources = [] if made is None else [made, *(s.provenance for _, s in made.iter_ancestors())]
+    flown = [one.settings for one in sources if one is not None and one.stage == "fly"]
+    paths = {pair: find_true_path(held, *pair) for pair in list_true_pairs(held.topics)}
     try:
-        made = _find_simulation(read_summary(held.path).provenance)
-        if made.noise == Noise() or not _is_affordable(held, made.scenario):
+        (settings,) = flown
+        noise = NOISE[settings["noise"]]
+        scenario = Scenario(*(settings[field.name] for field in fields(Scenario)))
+        robots, duration_s = scenario.robots, scenario.duration_s
+        true = robots * (robots - 1) * duration_s / TRUTH_STEP_S
+        recorded = sum(len(time_ns) for time_ns, _ in paths.values())
+        if noise == Noise() or recorded < MIN_RECORDED * true or robots**4 * duration_s > MAX_WORK:
             return None
-        flight = simulate(made.scenario, made.noise, made.seed, made.faults)
+        faults = [Fault(**fault) for fault in settings["faults"]]
+        flight = simulate(scenario, noise, settings["seed"], faults)
     except (SettingError, KeyError, TypeError, ValueError):
         return None  # nothing that this version could fly
-    if not _is_same_motion(held, flight):
+    if not all(_is_same_path(flight, pair, *path) for pair, path in paths.items()):
         say(f"{held.path}: this version of dmrl simulates the flight otherwise: no limit")
         return None
-    flight = replace(flight, ranges=_select_recorded_ranges(held, flight))
-    return FlightLimit(flight, compute_bound(flight, made.noise, made.scenario.yaw_spread_rad))
+    recorded_ns = np.concatenate([time_ns for time_ns, _ in paths.values()])
+    flight = replace(flight, ranges=_cut_ranges(flight, recorded_ns))
+    bound = compute_bound(flight, noise, scenario.yaw_spread_rad)
+    return lambda pair, time_ns: bound.interpolate_at(pair, _true_time_s(flight, pair[0], time_ns))
 
 
-def _find_simulation(made: Provenance | None) -> _Simulation:
-    """Return the one simulated flight that a recording comes from.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If there is none, or its settings are not complete.
-    """
-    sources = [] if made is None else [made, *(s.provenance for _, s in made.iter_ancestors())]
-    (settings,) = (one.settings for one in sources if one is not None and one.stage == "fly")
-    scenario = Scenario(*(settings[field.name] for field in fields(Scenario)))
-    faults = tuple(Fault(**fault) for fault in settings["faults"])
-    return _Simulation(scenario, NOISE[settings["noise"]], settings["seed"], faults)
+def _is_same_path(flight: Flight, pair: RobotPair, time_ns: Times, true_m: Array) -> bool:
+    if not flight.robots.keys() >= {*pair}:
+        return False
+    again_m = flight.peer_in_horizontal(*pair, _true_time_s(flight, pair[0], time_ns))
+    return np.allclose(true_m, again_m, rtol=0.0, atol=TOLERANCE_M)
 
 
-def _is_affordable(held: FlightLog, scenario: Scenario) -> bool:
-    """Return whether a recording explains the work: of what it claims to be, it holds a tenth."""
-    robots, duration_s = scenario.robots, scenario.duration_s
-    recorded = sum(len(find_true_path(held, *pair)[0]) for pair in list_true_pairs(held.topics))
-    claimed = robots * (robots - 1) * duration_s / TRUTH_STEP_S
-    return recorded > 0.1 * claimed and count_bound_bytes(robots, duration_s) < MAX_BYTES
-
-
-def _is_same_motion(held: FlightLog, flight: Flight) -> bool:
-    """Return whether the recorded true positions are those of the flight."""
-    for pair in list_true_pairs(held.topics):
-        if not flight.robots.keys() >= {*pair}:
-            return False
-        time_ns, true_m = find_true_path(held, *pair)
-        again_m = flight.peer_in_horizontal(*pair, _true_time_s(flight, pair[0], time_ns))
-        if not np.allclose(true_m, again_m, rtol=0.0, atol=TOLERANCE_M):
-            return False
-    return True
-
-
-def _select_recorded_ranges(held: FlightLog, flight: Flight) -> dict[RobotPair, Ranges]:
+def _cut_ranges(flight: Flight, recorded_ns: Times) -> dict[RobotPair, Ranges]:
     """Return the ranges while the recording lasts: of a trimmed flight others tell nothing."""
-    paths = [find_true_path(held, *pair)[0] for pair in list_true_pairs(held.topics)]
-    first_s, last_s = (
-        (int(log_ns) - START_NS) * 1e-9
-        for log_ns in (min(p[0] for p in paths), max(p[-1] for p in paths))
-    )
-    made = {}
-    for link, (time_s, range_m) in ((k, (r.time_s, r.range_m)) for k, r in flight.ranges.items()):
-        inside = (time_s >= first_s - TRUTH_STEP_S) & (time_s <= last_s + TRUTH_STEP_S)
-        made[link] = Ranges(time_s[inside], range_m[inside])
-    return made
+    first_ns, last_ns = int(recorded_ns.min()) - START_NS, int(recorded_ns.max()) - START_NS
+    cut = {}
+    for link, ranges in flight.ranges.items():
+        inside = (ranges.time_s > first_ns * 1e-9) & (ranges.time_s < last_ns * 1e-9 + TRUTH_STEP_S)
+        cut[link] = Ranges(ranges.time_s[inside], ranges.range_m[inside])
+    return cut
 
 
 def _true_time_s(flight: Flight, robot: str, time_ns: Times) -> Array:

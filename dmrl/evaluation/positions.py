@@ -21,7 +21,7 @@ from dmrl.estimation.model.position_metrics import (
     compute_figures,
     is_covered_by_truth,
 )
-from dmrl.evaluation.limit import FlightLimit, describe_limit, find_limit
+from dmrl.evaluation.limit import Bound, describe_limit, find_limit
 from dmrl.geometry.frames import Array
 from dmrl.labelling.flight_log import TRUTH_TOPICS, FlightLog, read_flight
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
@@ -178,9 +178,7 @@ def _match_truth(estimate: PeerPositions, true_ns: Times, true_m: Array) -> Pair
     )
 
 
-def _evaluate_pair(
-    held: FlightLog, limit: FlightLimit | None, robot: str, peer: str
-) -> EvaluatedPair:
+def _evaluate_pair(held: FlightLog, limit: Bound | None, robot: str, peer: str) -> EvaluatedPair:
     estimate = held.positions[robot, peer]
     true_ns, true_m = find_true_path(held, robot, peer)
     found = _match_truth(estimate, true_ns, true_m)
@@ -193,15 +191,9 @@ def _evaluate_pair(
     )
     time_ns = estimate.time_ns
     covered = is_covered_by_truth(true_ns, time_ns)
-    return EvaluatedPair(
-        robot,
-        peer,
-        judged,
-        len(time_ns) - len(found.kept),
-        len(covered),
-        int(covered.sum()),
-        None if limit is None else limit.interpolate_at((robot, peer), found.time_ns),
-    )
+    without_truth, seen = len(time_ns) - len(found.kept), int(covered.sum())
+    least = limit and limit((robot, peer), found.time_ns)
+    return EvaluatedPair(robot, peer, judged, without_truth, len(covered), seen, least)
 
 
 def lasts_s(pairs: list[EvaluatedPair]) -> float:
@@ -287,17 +279,12 @@ def rows(made: Mapping[str, Any]) -> list[list[str]]:
     if len(named) > 1:
         named.append(("all", {**made["overall"], "limit": made.get("limit")}))
     return [
-        [name, *(_format_cell(_get_figure(values, key), form) for key, _, form in COLUMNS)]
+        [name, *(_format_cell(values.get(key), form) for key, _, form in COLUMNS)]
         for name, values in named
     ]
 
 
-def _get_figure(values: Mapping[str, Any], key: str) -> float | None:
-    """Return a figure of a row. Documents of earlier versions have no limit."""
-    limit = values.get("limit") or {"settled_rmse_m": None}
-    found: float | None = limit["settled_rmse_m"] if key == "limit" else values[key]
-    return found
-
-
-def _format_cell(value: float | None, form: str) -> str:
+def _format_cell(value: Any, form: str) -> str:
+    """Format a figure; of the limit, the one that stands beside the RMSE."""
+    value = value["settled_rmse_m"] if isinstance(value, dict) else value
     return "-" if value is None else format(value, form)

@@ -15,7 +15,7 @@ from itertools import combinations, permutations
 
 import numpy as np
 
-from dmrl.flight.flight_arrays import RATE_HZ, Flight, Truth
+from dmrl.flight.flight_arrays import RATE_HZ, Flight
 from dmrl.flight.noise import Noise
 from dmrl.geometry.frames import Array
 
@@ -29,6 +29,8 @@ MIN_WHITE = 1e-3
 STATES, CONSTANTS = 5, 7
 """Number of states of a robot, and of its constants: scale of the velocity, bias of each of its
 axes, of the yaw rate and of the height, offset and drift of the clock."""
+LEFT = np.array([[0.0, -1.0], [1.0, 0.0]])
+"""Rotation by a quarter turn: the effect of a yaw on a vector."""
 DENSITY_POINTS = 4001
 """Points of the integral over the density of a range's error. Twice as many change it by 1e-5."""
 
@@ -57,19 +59,6 @@ class PositionBound:
         return np.stack(columns, axis=1).reshape(-1, 2, 2)
 
 
-@dataclass(slots=True)
-class _Information:
-    """Blocks of the information matrix, or of what elimination makes of them.
-
-    ``steps`` (K, d, d), ``next_step`` (K - 1, d, d), ``border`` (K, d, m), ``constants`` (m, m).
-    """
-
-    steps: Array
-    next_step: Array
-    border: Array
-    constants: Array
-
-
 def compute_bound(
     flight: Flight, noise: Noise, yaw_spread_rad: float = np.pi, step_s: float = STEP_S
 ) -> PositionBound:
@@ -86,28 +75,21 @@ def compute_bound(
     step_s
         Time between states, seconds.
     """
-    robots = list(flight.robots)
-    end_s = flight.truth[robots[0]].time_s[-1]
-    time_s = np.arange(0.0, end_s + step_s / 2, step_s)
-    information = _build_odometry(flight, time_s, noise, yaw_spread_rad)
-    for pair, (i, j) in enumerate(combinations(range(len(robots)), 2)):
-        for one, other in ((i, j), (j, i)):
-            _add_ranges(information, flight, (one, other), pair, time_s, noise)
-    covariance = _invert(information)
-    links = permutations(range(len(robots)), 2)
-    return PositionBound(
-        time_s,
-        {
-            (robots[i], robots[j]): _position_covariance(covariance, flight, (i, j), time_s, noise)
-            for i, j in links
-        },
-    )
-
-
-def count_bound_bytes(robots: int, duration_s: float) -> float:
-    """Return the memory that the bound of a flight takes, bytes."""
-    d, m = STATES * robots, CONSTANTS * robots + robots * (robots - 1)
-    return 8 * duration_s / STEP_S * d * (2 * d + m)
+    names = list(flight.robots)
+    time_s = np.arange(0.0, flight.truth[names[0]].time_s[-1] + step_s / 2, step_s)
+    rows, onward, constants = _add_odometry(flight, time_s, noise, yaw_spread_rad)
+    d = rows.shape[1]
+    for pair, (i, j) in enumerate(combinations(range(len(names)), 2)):
+        for link in ((i, j), (j, i)):
+            effect = _linearise_ranges(flight, link, pair, time_s, noise)
+            rows += effect[:, :d, None] * effect[:, None, :]
+            constants += effect[:, d:].T @ effect[:, d:]
+    covariance = _invert(rows, onward, constants)
+    found = {}
+    for i, j in permutations(range(len(names)), 2):
+        effect = _linearise_position(flight, (i, j), time_s, noise)
+        found[names[i], names[j]] = effect @ covariance @ effect.swapaxes(1, 2)
+    return PositionBound(time_s, found)
 
 
 @lru_cache
@@ -121,170 +103,159 @@ def compute_range_information(noise: Noise) -> float:
     error = np.linspace(-8 * white, 8 * white + 12 * mean * (share > 0), DENSITY_POINTS)
     density = np.exp(-((error / white) ** 2) / 2) / (white * np.sqrt(2 * np.pi))
     if share * mean > 0:
-        step = error[1] - error[0]
-        tail = np.exp((error[0] - error) / mean) * step / mean
+        tail = np.exp((error[0] - error) / mean) * (error[1] - error[0]) / mean
         tail[0] /= 2  # trapezoid rule
         density = (1 - share) * density + share * np.convolve(density, tail)[: len(error)]
     slope = np.gradient(density, error)
     return float(np.trapezoid(slope**2 / np.maximum(density, 1e-300), error))
 
 
-def _build_odometry(
+def _add_odometry(
     flight: Flight, time_s: Array, noise: Noise, yaw_spread_rad: float
-) -> _Information:
-    """Build the information of odometry, of the first poses and of the priors of constants."""
-    count, robots = len(time_s), len(flight.robots)
-    d, m = STATES * robots, CONSTANTS * robots + robots * (robots - 1)
-    built = _Information(
-        np.zeros((count, d, d)), np.zeros((count - 1, d, d)), np.zeros((count, d, m)), np.eye(m)
-    )
-    yaw_std = max(yaw_spread_rad / np.sqrt(3.0), MIN_WHITE)
-    for k, truth in enumerate(flight.truth.values()):
-        own, mine = slice(STATES * k, STATES * (k + 1)), slice(CONSTANTS * k, CONSTANTS * (k + 1))
-        first = [START_STD_M, START_STD_M, yaw_std] if k else [MIN_WHITE] * 3
-        built.steps[0, own, own] += np.diag(np.array([*first, 1.0, 1.0]) ** -2)
-        change, effect, spread = _linearise_odometry(truth, time_s, noise)
-        weight = np.linalg.inv(spread)
-        back = np.swapaxes(change, 1, 2) @ weight
-        built.steps[1:, own, own] += weight
-        built.steps[:-1, own, own] += back @ change
-        built.next_step[:, own, own] -= back
-        built.border[1:, own, mine] -= weight @ effect
-        built.border[:-1, own, mine] += back @ effect
-        built.constants[mine, mine] += (np.swapaxes(effect, 1, 2) @ weight @ effect).sum(axis=0)
-    return built
-
-
-def _linearise_odometry(truth: Truth, time_s: Array, noise: Noise) -> tuple[Array, Array, Array]:
-    """Linearise one robot's motion from step to step.
+) -> tuple[Array, Array, Array]:
+    """Return the information of odometry, of the first poses and of the priors of constants.
 
     Returns
     -------
     tuple
-        (K - 1, 5, 5) effect of the last state, (K - 1, 5, 7) effect of the constants, and
-        (K - 1, 5, 5) covariance of what is new. The integral of the coloured error is exact.
+        (K, d, d + m) rows of the states, with themselves and the constants, (K, d, d) with the
+        next states, and (m, m) of the constants.
     """
-    x, y = np.diff(truth.position_at(time_s)[:, :2], axis=0).T
-    yaw, step_s = truth.yaw_at((time_s[1:] + time_s[:-1]) / 2), time_s[1] - time_s[0]
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[cos, -sin], [sin, cos]]).transpose(2, 0, 1)
-    tau, coloured = noise.velocity_tau_s, noise.velocity_coloured_mps
+    change, weight = _linearise_odometry(flight, time_s, noise)
+    _, d, size = change.shape
+    back, forth = change[:, :, :d].swapaxes(1, 2) @ weight, weight @ change[:, :, d:]
+    rows, onward = np.zeros((len(time_s), d, size)), np.zeros((len(time_s), d, d))
+    rows[:-1] += back @ change
+    rows[1:, :, :d] += weight
+    rows[1:, :, d:] -= forth
+    onward[:-1] = -back
+    constants = np.eye(size - d) + (change[:, :, d:].swapaxes(1, 2) @ forth).sum(axis=0)
+    first = np.ones((d // STATES, STATES))
+    first[1:, :3] = START_STD_M, START_STD_M, max(yaw_spread_rad / np.sqrt(3.0), MIN_WHITE)
+    first[0, :3] = MIN_WHITE  # all poses are told relative to it
+    rows[0, :, :d] += np.diag(first.ravel() ** -2)
+    return rows, onward, constants
+
+
+def _linearise_odometry(flight: Flight, time_s: Array, noise: Noise) -> tuple[Array, Array]:
+    """Linearise the motion from step to step. The integral of the coloured error is exact.
+
+    Returns
+    -------
+    tuple
+        (K - 1, d, d + m) effect of the last states and of the constants on the next states, and
+        (K - 1, d, d) inverse covariance of the new noise.
+    """
+    step_s, tau, coloured = time_s[1] - time_s[0], noise.velocity_tau_s, noise.velocity_coloured_mps
     keep = np.exp(-step_s / tau)
-    change = np.tile(np.diag([1.0, 1.0, 1.0, keep, keep]), (len(x), 1, 1))
-    change[:, :2, 2] = np.stack([-y, x], axis=1)
-    change[:, :2, 3:] = -coloured * tau * (1 - keep) * turn
-    effect = np.zeros((len(x), STATES, CONSTANTS))
-    effect[:, :2, 0] = -noise.velocity_scale * np.stack([x, y], axis=1)
-    effect[:, :2, 1:3] = -noise.velocity_bias_mps * step_s * turn
-    effect[:, 2, 3] = -noise.yaw_rate_bias_radps * step_s
     white = [max(w, MIN_WHITE) for w in (noise.velocity_white_mps, noise.yaw_rate_white_radps)]
     place, yawing = np.square(white) * step_s / RATE_HZ
     place += 2 * coloured**2 * tau * (step_s - 2 * tau * (1 - keep) + tau * (1 - keep**2) / 2)
-    spread = np.tile(np.diag([place, place, yawing, 1 - keep**2, 1 - keep**2]), (len(x), 1, 1))
-    spread[:, :2, 3:] = -coloured * tau * (1 - keep) ** 2 * turn
-    spread[:, 3:, :2] = np.swapaxes(spread[:, :2, 3:], 1, 2)
-    return change, effect, spread
+    d, size = _count_unknowns(flight)
+    change = np.zeros((len(time_s) - 1, d, size))
+    weight = np.zeros((len(time_s) - 1, d, d))
+    for k, truth in enumerate(flight.truth.values()):
+        own, fixed = slice(STATES * k, STATES * (k + 1)), d + CONSTANTS * k
+        moved = np.diff(truth.position_at(time_s)[:, :2], axis=0)
+        turn = _rotate(truth.yaw_at((time_s[1:] + time_s[:-1]) / 2))
+        effect = change[:, own]
+        effect[:, :, own] = np.diag([1.0, 1.0, 1.0, keep, keep])
+        effect[:, :2, own.start + 2] = moved @ LEFT.T
+        effect[:, :2, own.start + 3 : own.stop] = -coloured * tau * (1 - keep) * turn
+        effect[:, :2, fixed] = -noise.velocity_scale * moved
+        effect[:, :2, fixed + 1 : fixed + 3] = -noise.velocity_bias_mps * step_s * turn
+        effect[:, 2, fixed + 3] = -noise.yaw_rate_bias_radps * step_s
+        spread = np.tile(
+            np.diag([place, place, yawing, 1 - keep**2, 1 - keep**2]), (len(turn), 1, 1)
+        )
+        spread[:, :2, 3:] = -coloured * tau * (1 - keep) ** 2 * turn
+        spread[:, 3:, :2] = spread[:, :2, 3:].swapaxes(1, 2)
+        weight[:, own, own] = np.linalg.inv(spread)
+    return change, weight
 
 
-def _relative_rows(flight: Flight, link: tuple[int, int], time_s: Array, noise: Noise) -> Array:
-    """Return (K, 2, d + m) effects on where a peer is in the world, from the observer.
+def _count_unknowns(flight: Flight) -> tuple[int, int]:
+    """Return the number of states of a step, and that with the constants of robots and pairs."""
+    robots = len(flight.robots)
+    return STATES * robots, (STATES + CONSTANTS + robots - 1) * robots
+
+
+def _rotate(angle: Array) -> Array:
+    """Return (K, 2, 2) rotations of the plane."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin], [sin, cos]]).transpose(2, 0, 1)
+
+
+def _linearise_away(flight: Flight, link: tuple[int, int], time_s: Array, noise: Noise) -> Array:
+    """Return (K, 2, d + m) effects on the place of a peer from the observer, world frame.
 
     The time of the observer's clock counts, so offset and drift of the peer's clock move it.
     """
-    robots = len(flight.robots)
-    d, m = STATES * robots, CONSTANTS * robots + robots * (robots - 1)
-    rows = np.zeros((len(time_s), 2, d + m))
+    d, size = _count_unknowns(flight)
+    effect = np.zeros((len(time_s), 2, size))
     truth = list(flight.truth.values())[link[1]]
     velocity = np.stack([np.interp(time_s, truth.time_s, v) for v in truth.velocity.T[:2]], axis=1)
     for robot, sign in zip(link, (-1.0, 1.0), strict=True):
-        rows[:, :, STATES * robot : STATES * robot + 2] = sign * np.eye(2)
+        effect[:, :, STATES * robot : STATES * robot + 2] = sign * np.eye(2)
         if robot:  # the first robot's clock is true
-            at = d + CONSTANTS * robot
-            rows[:, :, at + 5] = sign * noise.clock_offset_s / np.sqrt(3.0) * velocity
-            rows[:, :, at + 6] = sign * noise.clock_drift_ppm * 1e-6 * time_s[:, None] * velocity
-    return rows
+            clock = d + CONSTANTS * robot + 5
+            effect[:, :, clock] = sign * noise.clock_offset_s / np.sqrt(3.0) * velocity
+            effect[:, :, clock + 1] = (
+                sign * noise.clock_drift_ppm * 1e-6 * time_s[:, None] * velocity
+            )
+    return effect
 
 
-def _add_ranges(
-    information: _Information,
-    flight: Flight,
-    link: tuple[int, int],
-    pair: int,
-    time_s: Array,
-    noise: Noise,
-) -> None:
-    """Add the ranges of one robot to another, each at its nearest step."""
-    names, truths = list(flight.robots), list(flight.truth.values())
-    (i, j), robots = link, len(names)
-    away = truths[j].position_at(time_s) - truths[i].position_at(time_s)
-    distance = np.maximum(np.linalg.norm(away, axis=1), 0.01)
-    rows = np.einsum(
-        "ka,kas->ks", away[:, :2] / distance[:, None], _relative_rows(flight, link, time_s, noise)
-    )
-    d = STATES * robots
-    lift = noise.height_bias_m * away[:, 2] / distance
-    rows[:, d + CONSTANTS * j + 4] += lift
-    rows[:, d + CONSTANTS * i + 4] -= lift
-    own = d + CONSTANTS * robots + 2 * pair
-    rows[:, own], rows[:, own + 1] = noise.uwb_bias_m, noise.uwb_scale * distance
-    ranges = flight.ranges[names[i], names[j]]
-    true_s = flight.clocks[names[i]].to_true_time(ranges.time_s)
-    nearest = np.clip(np.rint(true_s / (time_s[1] - time_s[0])).astype(int), 0, len(time_s) - 1)
-    number = np.bincount(nearest, minlength=len(time_s))
-    rows *= np.sqrt(number * compute_range_information(noise))[:, None]
-    state, constant = rows[:, :d], rows[:, d:]
-    information.steps += state[:, :, None] * state[:, None, :]
-    information.border += state[:, :, None] * constant[:, None, :]
-    information.constants += constant.T @ constant
-
-
-def _invert(information: _Information) -> _Information:
-    """Return the blocks of the inverse in the same form, in the same memory.
-
-    Steps are eliminated forwards, then the covariances found backwards. ``next_step`` and
-    ``border`` hold the gains of each step on the next and on the constants in between.
-    """
-    steps, onward, border = information.steps, information.next_step, information.border
-    constants, last = information.constants, len(steps) - 1
-    for k in range(last + 1):
-        inverse = np.linalg.inv(steps[k])
-        on_constants = inverse @ border[k]
-        constants = constants - border[k].T @ on_constants
-        if k < last:
-            on_next = inverse @ onward[k]
-            steps[k + 1] -= onward[k].T @ on_next
-            border[k + 1] -= onward[k].T @ on_constants
-            onward[k] = on_next
-        steps[k], border[k] = inverse, on_constants
-    constants = np.asarray(np.linalg.inv(constants), float)
-    for k in range(last, -1, -1):
-        gain, shared = border[k], -border[k] @ constants
-        if k < last:
-            on_next, after = onward[k], border[k + 1]
-            shared -= on_next @ after
-            steps[k] += (on_next @ steps[k + 1] + gain @ after.T) @ on_next.T
-        steps[k] -= shared @ gain.T
-        border[k] = shared
-    return _Information(steps, onward, border, constants)
-
-
-def _position_covariance(
-    covariance: _Information, flight: Flight, link: tuple[int, int], time_s: Array, noise: Noise
+def _linearise_ranges(
+    flight: Flight, link: tuple[int, int], pair: int, time_s: Array, noise: Noise
 ) -> Array:
-    """Return (K, 2, 2) covariances of a peer in the observer's horizontal frame."""
-    names, (i, j) = list(flight.robots), link
-    yaw, rows = flight.truth[names[i]].yaw_at(time_s), _relative_rows(flight, link, time_s, noise)
-    x, y, _ = flight.peer_in_horizontal(names[i], names[j], time_s).T
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    rows = np.array([[cos, sin], [-sin, cos]]).transpose(2, 0, 1) @ rows
-    rows[:, :, STATES * i + 2] += np.stack([y, -x], axis=1)
-    d = covariance.steps.shape[1]
-    state, constant = rows[:, :, :d], rows[:, :, d:]
-    mixed = state @ covariance.border @ constant.swapaxes(1, 2)
-    own = state @ covariance.steps @ state.swapaxes(1, 2)
-    return (
-        own
-        + mixed
-        + mixed.swapaxes(1, 2)
-        + constant @ covariance.constants @ constant.swapaxes(1, 2)
-    )
+    """Return (K, d + m) effects on the ranges of one robot to another near each step, whitened."""
+    names, truths = list(flight.robots), list(flight.truth.values())
+    away = truths[link[1]].position_at(time_s) - truths[link[0]].position_at(time_s)
+    distance = np.maximum(np.linalg.norm(away, axis=1), 0.01)
+    toward = away[:, None, :2] / distance[:, None, None]
+    effect = (toward @ _linearise_away(flight, link, time_s, noise))[:, 0]
+    heights = [STATES * len(names) + CONSTANTS * robot + 4 for robot in link]
+    effect[:, heights] = np.outer(noise.height_bias_m * away[:, 2] / distance, [-1.0, 1.0])
+    own = (STATES + CONSTANTS) * len(names) + 2 * pair
+    effect[:, own], effect[:, own + 1] = noise.uwb_bias_m, noise.uwb_scale * distance
+    name = names[link[0]]
+    true_s = flight.clocks[name].to_true_time(flight.ranges[name, names[link[1]]].time_s)
+    nearest = np.clip(np.rint(true_s / time_s[1]).astype(int), 0, len(time_s) - 1)
+    number = np.bincount(nearest, minlength=len(time_s))
+    return np.asarray(effect * np.sqrt(number * compute_range_information(noise))[:, None])
+
+
+def _linearise_position(
+    flight: Flight, link: tuple[int, int], time_s: Array, noise: Noise
+) -> Array:
+    """Return (K, 2, d + m) effects on a peer's position in the observer's horizontal frame."""
+    names = list(flight.robots)
+    yaw = flight.truth[names[link[0]]].yaw_at(time_s)
+    effect = _rotate(-yaw) @ _linearise_away(flight, link, time_s, noise)
+    place = flight.peer_in_horizontal(names[link[0]], names[link[1]], time_s)[:, :2]
+    effect[:, :, STATES * link[0] + 2] -= place @ LEFT.T
+    return np.asarray(effect)
+
+
+def _invert(rows: Array, onward: Array, constants: Array) -> Array:
+    """Return (K, d + m, d + m) covariances of the states of each step and the constants.
+
+    States are eliminated forwards; their covariances follow backwards from those of the constants.
+    """
+    count, d, size = rows.shape
+    gain = np.zeros_like(rows)
+    for k in range(count):
+        rows[k, :, :d] = np.linalg.inv(rows[k, :, :d])
+        gain[k] = rows[k, :, :d] @ np.hstack([onward[k], rows[k, :, d:]])
+        constants = constants - rows[k, :, d:].T @ gain[k, :, d:]
+        if k + 1 < count:
+            rows[k + 1] -= onward[k].T @ gain[k]
+    joint = np.zeros((count + 1, size, size))
+    joint[-1, d:, d:] = np.linalg.inv(constants)
+    for k in reversed(range(count)):
+        carry = np.eye(size)
+        carry[:d] = -gain[k]
+        joint[k] = carry @ joint[k + 1] @ carry.T
+        joint[k, :d, :d] += rows[k, :, :d]
+    return joint[:-1]
