@@ -20,10 +20,10 @@ COLUMN_MEANINGS = {
     "peers.peer": "name of the peer",
     "peers.u_px": "px, right from the left edge; pixel-edge coordinates: [0, {width}]",
     "peers.v_px": "px, down from the top edge: [0, {height}]",
-    "peers.depth_m": "m, along the optical axis (camera x), not the range",
+    "peers.depth_m": "m, along the optical axis (camera x), not the range; 0: unknown",
     "peers.sigma_u_px": "px, one standard deviation; 0: exact or unknown",
     "peers.sigma_v_px": "px, one standard deviation; 0: exact or unknown",
-    "peers.sigma_depth_m": "m, one standard deviation; 0: exact or unknown",
+    "peers.sigma_depth_m": "m, one standard deviation; 0: exact or unknown; infinite: no depth",
     "peers.box_px": "px: left, top, right, bottom of the visible part; empty: none",
     "peers.visible_share": "visible share of the peer, 0 to 1; 0: unknown",
     "peers.status": "OK, UNCONVERGED or AMBIGUOUS",
@@ -158,6 +158,11 @@ def limit_lines(counts: dict[str, SplitCounts], made: Provenance) -> list[str]:
         lines.append(
             f"- 90 % of the peers are {low:.2f} to {high:.2f} m away, the median {middle:.2f} m. "
             "Depths outside that range cannot be learned."
+        )
+    if without := sum(len(c.uv_px) - len(c.depth_m) for c in counts.values()):
+        lines.append(
+            f"- {without} peers have no depth: `depth_m` is 0 and `sigma_depth_m` infinite. "
+            "Training masks their depth, and evaluation leaves it out."
         )
     lines.append(
         f"- {empty} of {images} images show no peer. They train a network to avoid false alarms. "

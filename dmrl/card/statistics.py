@@ -26,7 +26,7 @@ class SplitCounts:
     uv_px
         (M, 2) pixels of the peers inside the images.
     depth_m
-        (M,) their depths, metres.
+        (K,) their depths, metres, of those with a known depth.
     label_sources
         Labels per source, outside the images as well.
     recordings
@@ -60,6 +60,7 @@ def summarize_sigmas(
     )
     names = ("sigma_u_px", "sigma_v_px", "sigma_depth_m")
     values = np.column_stack([pc.struct_field(flat, name) for name in names])
+    values[np.isinf(values)] = 0.0  # the depth is unknown, not uncertain
     source = np.array(pc.struct_field(flat, "source").to_pylist(), object)
     found = {}
     for name in sorted(set(source.tolist())):
@@ -78,11 +79,12 @@ def count_split(split: Split) -> SplitCounts:
     height_px, width_px = split.image_shape
     seen = is_inside(uv_px, width_px, height_px)
     image = pc.list_parent_indices(peers).to_numpy()[seen]
+    known = np.isfinite(pc.struct_field(flat, "sigma_depth_m").to_numpy())
     return SplitCounts(
         images=len(split),
         peers=np.bincount(image, minlength=len(split)),
         uv_px=uv_px[seen],
-        depth_m=pc.struct_field(flat, "depth_m").to_numpy()[seen],
+        depth_m=pc.struct_field(flat, "depth_m").to_numpy()[seen & known],
         label_sources=Counter(pc.struct_field(flat, "source").to_pylist()),
         recordings=Counter(split.table["source"].to_pylist()),
         statuses=Counter(pc.struct_field(flat, "status").to_pylist()),

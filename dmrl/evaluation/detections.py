@@ -142,7 +142,7 @@ def read_split_labels(split: Split, rows: Sequence[int]) -> Points:
 
 def _is_in_view(labels: Points, width_px: int, height_px: int) -> Mask:
     uv = np.column_stack([labels.u_px, labels.v_px])
-    return is_inside(uv, width_px, height_px) & (labels.depth_m > 0)
+    return is_inside(uv, width_px, height_px) & ~(labels.depth_m <= 0)
 
 
 def _find_spans(
@@ -253,9 +253,11 @@ def _build_points(entries: pa.Array, mine: Mask | None, rows: Times, numbers: Ti
     names = {flat.type.field(i).name for i in range(flat.type.num_fields)}
     values = {
         name: flat.field(name).to_numpy(zero_copy_only=False)[keep]
-        for name in ("u_px", "v_px", "depth_m", "confidence")
+        for name in ("u_px", "v_px", "depth_m", "confidence", "sigma_depth_m")
         if name in names
     }
+    unknown = np.isinf(values.pop("sigma_depth_m", 0.0))
+    values["depth_m"] = np.where(unknown, np.nan, values["depth_m"])
     image = image[keep]
     values.setdefault("confidence", np.ones(len(keep)))
     # By image, and best first: a detector of another program may not sort them.

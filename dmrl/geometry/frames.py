@@ -168,7 +168,7 @@ def build_grid_label(
     uv
         (N, 2) pixels of the robot centres.
     depth_m
-        (N,) depths, metres.
+        (N,) depths, metres; 0: unknown.
     shape
         Rows and columns of the grid.
     stride_px
@@ -178,14 +178,15 @@ def build_grid_label(
     -------
     Array
         (2, rows, cols). Channel 0 is confidence, 0 or 1. Channel 1 is depth in metres, 0 where the
-        confidence is 0. Robots outside the image are ignored. Of two robots in one cell, the nearer
-        one is used because it hides the other.
+        confidence is 0 or the depth is unknown. Robots outside the image are ignored. Of two robots
+        in one cell, the nearer one is used because it hides the other.
     """
     rows, cols = shape
     grid = np.zeros((2, rows, cols), np.float32)
     seen = is_inside(uv, cols * stride_px, rows * stride_px)
     uv, depth_m = uv[seen], depth_m[seen]
-    order = np.argsort(-depth_m, kind="stable")  # far first, so that near overwrites
+    distance_m = np.where(depth_m > 0, depth_m, np.inf)
+    order = np.argsort(-distance_m, kind="stable")  # far first, so that near overwrites
     col, row = (uv[order] // stride_px).astype(int).T
     grid[0, row, col] = 1.0
     grid[1, row, col] = depth_m[order]

@@ -113,7 +113,7 @@ def plot_error_by_distance(
     Parameters
     ----------
     distance_m
-        (N,) depth of the label, metres.
+        (N,) depth of the label, metres; NaN: unknown, not drawn.
     error_px
         (N,) length of the pixel error, not finite where there was no detection.
     depth_error_m
@@ -123,7 +123,7 @@ def plot_error_by_distance(
     step_m
         Width of the distance bins of the medians, metres.
     """
-    found = np.isfinite(error_px)
+    found = np.isfinite(error_px) & np.isfinite(distance_m)
     with mpl.rc_context(STYLE):
         figure = Figure((SIZE_INCHES[0], 5.0), layout="constrained")
         pixels, metres = figure.subplots(2, 1, sharex=True)

@@ -157,16 +157,17 @@ def compute_row_errors(
     peers = rows["peers"].combine_chunks()
     labels = _build_points(peers, np.arange(len(peers)))
     uv = np.stack([labels.u_px, labels.v_px], axis=1)
-    labels = labels.select(is_inside(uv, *size_px) & (labels.depth_m > 0))
+    labels = labels.select(is_inside(uv, *size_px) & ~(labels.depth_m <= 0))
     messages = found.messages["detections"].combine_chunks()
     (known,) = np.nonzero(found.place >= 0)
     detections = _build_points(messages.take(pa.array(found.place[known])), known)
     judged = np.isin(labels.image, known)
-    off = compute_errors(labels.select(judged), detections)
-    image = labels.image[judged]
+    labels = labels.select(judged)
+    off = compute_errors(labels, detections)
+    depth_error_m = np.where(np.isnan(labels.depth_m), -1.0, abs(off.depth_m))
     return (
-        _largest_per_image(len(peers), image, off.norm_px),
-        _largest_per_image(len(peers), image, abs(off.depth_m)),
+        _largest_per_image(len(peers), labels.image, off.norm_px),
+        _largest_per_image(len(peers), labels.image, depth_error_m),
     )
 
 
@@ -182,6 +183,8 @@ def _build_points(column: pa.ListArray, numbers: NDArray[np.int64]) -> Points:
     image = np.repeat(numbers, column.value_lengths().to_numpy())
     u_px, v_px, depth_m = (flat.field(name).to_numpy() for name in ("u_px", "v_px", "depth_m"))
     names = {flat.type.field(k).name for k in range(flat.type.num_fields)}
+    if "sigma_depth_m" in names:
+        depth_m = np.where(np.isinf(flat.field("sigma_depth_m").to_numpy()), np.nan, depth_m)
     known = "confidence" in names
     confidence = flat.field("confidence").to_numpy() if known else np.ones(len(flat))
     order = np.lexsort((-confidence, image))

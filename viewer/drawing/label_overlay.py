@@ -92,7 +92,10 @@ class _SourceLabels:
 
     def _build_texts(self) -> rr.ComponentColumnList:
         names, depths_m = (self.peers.field(key).to_pylist() for key in ("peer", "depth_m"))
-        texts = [f"{name} {depth_m:.2f} m" for name, depth_m in zip(names, depths_m, strict=True)]
+        texts = [
+            f"{name} {depth_m:.2f} m" if depth_m else name
+            for name, depth_m in zip(names, depths_m, strict=True)
+        ]
         return rr.Points2D.columns(positions=self.texts_px, labels=texts)
 
     def _partition_rows(

@@ -307,7 +307,8 @@ def _build_row(
     # A label with a sigma as large as the image gives no position.
     peers = [peer for peer in map(_peer_to_dict, labels) if peer["sigma_u_px"] < width_px]
     uv_depth = np.array([[p["u_px"], p["v_px"], p["depth_m"]] for p in peers]).reshape(-1, 3)
-    ahead = uv_depth[np.isfinite(uv_depth).all(axis=1) & (uv_depth[:, 2] > 0)]
+    unknown = np.isinf([peer["sigma_depth_m"] for peer in peers])
+    ahead = uv_depth[np.isfinite(uv_depth).all(axis=1) & ((uv_depth[:, 2] > 0) | unknown)]
     shape = (height_px // STRIDE_PX, width_px // STRIDE_PX)
     grid = build_grid_label(ahead[:, :2], ahead[:, 2], shape=shape)
     row = Row(rgb, peers, grid, _parse_robot(image), path.name, image.time_ns)

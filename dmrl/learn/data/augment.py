@@ -128,7 +128,7 @@ class Augmenter:
         self._height, self._width, _ = examples.image_shape
         robots = examples.robots
         there = np.isfinite(robots[..., U])
-        depths = robots[..., DEPTH][there]
+        depths = robots[..., DEPTH][there & (robots[..., DEPTH] > 0)]
         self._depths = (
             (float(depths.min()) / DEPTH_RANGE_FACTOR, float(depths.max()) * DEPTH_RANGE_FACTOR)
             if len(depths)
@@ -235,7 +235,7 @@ class Augmenter:
     def _sample_zoom(self, robot: RobotRow | None, rng: Rng) -> float:
         """Sample a log-uniform magnification; the depth stays in the range of the labels."""
         low, high = self._settings.zoom
-        if robot is not None:
+        if robot is not None and robot[DEPTH] > 0:
             depth_m = robot[DEPTH]
             low = max(low, min(depth_m / self._depths[1], 1.0))
             high = max(min(high, max(depth_m / self._depths[0], 1.0)), low)

@@ -34,7 +34,7 @@ class Targets(NamedTuple):
         (N, rows, cols) weight of a cell in the confidence loss; 1 where labels are exact.
     weight, offset_weight
         (N, rows, cols) weight of a cell in the loss of the depth and of the offset; 0 away from
-        robots.
+        robots. That of the depth is 0 too where the depth is unknown.
     depth_m
         (N, rows, cols) metres; 1 where the weight is 0.
     offset
@@ -79,17 +79,19 @@ def build_targets(
         height of g is reduced, which gives the mean of g over the robot's possible positions.
     """
     robots = robots.to(torch.float32)
-    ahead = torch.isfinite(robots[..., :3]).all(dim=-1) & (robots[..., DEPTH] > 0)
+    unknown = torch.isinf(robots[..., SIGMA_DEPTH])  # no depth is known
+    ahead = torch.isfinite(robots[..., :3]).all(dim=-1) & ((robots[..., DEPTH] > 0) | unknown)
     # ``ahead`` removes robots by a product with 0, which NaN would survive.
-    clean = torch.nan_to_num(robots, nan=0.0)
+    clean = torch.nan_to_num(robots, nan=0.0, posinf=0.0)
     sigma_px = (clean[..., SIGMA_U].square() + clean[..., SIGMA_V].square()).div(2).sqrt()
     du, dv = _offsets_from_cells(clean[..., (U, V)] / stride_px, shape)
     present = _compute_presence(
         du, dv, sigma_cells, sigma_px / stride_px, soften=label_noise == "soften"
     )
     present = present * ahead[..., None, None]
-    # Slightly raise the presence of nearer robots, to break ties.
-    rank = present * (1 + 1e-3 / (1 + clean[..., DEPTH, None, None]))
+    # Slightly raise the presence of nearer robots, to break ties; unknown depths count as far.
+    bonus = 1e-3 / (1 + clean[..., DEPTH]) * ~unknown
+    rank = present * (1 + bonus[..., None, None])
     best = rank.argmax(dim=1, keepdim=True)
     confidence = present.amax(dim=1)
     near = confidence * (confidence >= MIN_PRESENCE)
@@ -98,6 +100,8 @@ def build_targets(
         relative = clean[..., SIGMA_DEPTH] / clean[..., DEPTH].clamp(min=1e-3)
         trust_px = _gather_best(best, _label_weight(sigma_px / SIGMA_TOLERANCE_PX))
         trust_depth = _gather_best(best, _label_weight(relative / SIGMA_TOLERANCE_DEPTH))
+    trust_depth = trust_depth * _gather_best(best, ~unknown[..., None, None])
+    depth_m = torch.where(unknown, 1.0, clean[..., DEPTH])
     found = near > 0
     class_id = torch.nan_to_num(robots[..., CLASS_ID, None, None], nan=-1.0)
     return Targets(
@@ -106,8 +110,8 @@ def build_targets(
         torch.where(confidence > 0.01, trust_px, 1.0),
         near * trust_depth,
         near * trust_px,
-        # 1 m where there is no robot, so that the logarithm is finite; the weight there is 0.
-        torch.where(found, _gather_best(best, clean[..., DEPTH, None, None]), 1.0),
+        # 1 m without a robot or its depth, so that the logarithm is finite; the weight there is 0.
+        torch.where(found, _gather_best(best, depth_m[..., None, None]), 1.0),
         torch.stack((_gather_best(best, du), _gather_best(best, dv)), dim=1) * found[:, None],
         torch.where(found, _gather_best(best, class_id), -1.0).to(torch.int64),
     )

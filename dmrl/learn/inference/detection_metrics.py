@@ -252,7 +252,9 @@ def _error_metrics(
             result: Array = (by @ values) / by.sum(axis=1)
             return result
 
-        depth_m = error.depth_m[inside][found]
+        depth_m = error.depth_m[inside]
+        known = np.isfinite(depth_m)
+        depth_m, by_depth = depth_m[known], weights[:, known]
         return {
             "median_px": compute_weighted_quantile(norm_px, weights, 0.5),
             "mean_px": mean(norm_px[found]),
@@ -262,8 +264,8 @@ def _error_metrics(
             "within_20_px": mean((norm_px <= 20).astype(np.float64), weights),
             "bias_u_px": compute_weighted_quantile(error.u_px[inside][found], matched, 0.5),
             "bias_v_px": compute_weighted_quantile(error.v_px[inside][found], matched, 0.5),
-            "depth_mae_m": mean(np.abs(depth_m)),
-            "depth_rmse_m": np.sqrt(mean(depth_m**2)),
+            "depth_mae_m": mean(np.abs(depth_m), by_depth),
+            "depth_rmse_m": np.sqrt(mean(depth_m**2, by_depth)),
         }
 
 
@@ -332,4 +334,6 @@ def _classify_detections(
 
 
 def _in_band(depth_m: Array, band: Band) -> NDArray[np.bool_]:
-    return (band[0] <= depth_m) & (depth_m < band[1])
+    """Return whether depths are in a band; unknown ones, NaN, are in that of all depths."""
+    inside: NDArray[np.bool_] = (band[0] <= depth_m) & (depth_m < band[1])
+    return inside | np.isnan(depth_m) if band == DEPTH_BANDS_M[0] else inside

@@ -26,7 +26,7 @@ class Points:
     image
         (M,) index of the image, ascending. Detections of one image: most confident first.
     u_px, v_px, depth_m
-        (M,) pixel and depth.
+        (M,) pixel and depth; NaN where a label has no depth.
     confidence
         (M,) 0 to 1; ones for labels.
     """

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from dmrl.learn.data.batches import DEPTH, ExampleSet, U, V, iter_batches
+from dmrl.learn.data.batches import DEPTH, SIGMA_DEPTH, ExampleSet, U, V, iter_batches
 from dmrl.learn.inference.decode_grids import decode
 from dmrl.learn.inference.detection_metrics import (
     ScoredDetections,
@@ -68,5 +68,5 @@ def select_visible_labels(examples: ExampleSet) -> Points:
     with np.errstate(invalid="ignore"):
         inside = (u >= 0) & (u < width_px) & (v >= 0) & (v < height_px)
     image, _ = np.nonzero(inside)
-    depth_m = robots[..., DEPTH][inside]
+    depth_m = np.where(np.isinf(robots[..., SIGMA_DEPTH]), np.nan, robots[..., DEPTH])[inside]
     return Points(image, u[inside], v[inside], depth_m, np.ones(len(image)))

@@ -80,7 +80,9 @@ def _check_values(
 ) -> Iterator[Finding]:
     uv = np.column_stack([peers["u_px"].to_numpy(), peers["v_px"].to_numpy()])
     depth_m = peers["depth_m"].to_numpy()
-    wrong = int((~np.isfinite(uv).all(axis=1) | ~np.isfinite(depth_m) | (depth_m <= 0)).sum())
+    known = ~np.isinf(peers["sigma_depth_m"].to_numpy())
+    bad_depth = known & (~np.isfinite(depth_m) | (depth_m <= 0))
+    wrong = int((~np.isfinite(uv).all(axis=1) | bad_depth).sum())
     if wrong:
         yield Finding(
             "error",
