@@ -12,9 +12,9 @@ from dmrl import topics
 from dmrl.deploy.backend_names import BackendName
 from dmrl.deploy.detector import BACKEND_PACKAGES, Detector, open_detector, select_fastest_backend
 from dmrl.deploy.image_detection import DetectionOptions, detect_images
-from dmrl.errors import MissingTopic
+from dmrl.errors import MissingTopic, RecordingError, SourceError
 from dmrl.guards import limits
-from dmrl.images.codec import ImageHeader, Rgb, read_header, read_size
+from dmrl.images.codec import UNDECODABLE, ImageHeader, Rgb, read_header
 from dmrl.images.prefetch import map_ahead
 from dmrl.learn.inference.decode_grids import DETECTION_COLUMNS, Detections, Grids
 from dmrl.learn.pretrained import resolve_model_path
@@ -23,7 +23,6 @@ from dmrl.recording import (
     LoadedRecording,
     Provenance,
     RawMessage,
-    Stamped,
     TimedMessage,
     build_provenance,
     parse_message,
@@ -31,6 +30,7 @@ from dmrl.recording import (
     rewrite,
 )
 from dmrl.recording.provenance_inputs import hash_file
+from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say, track
 
 OUTPUT_TOPICS = (topics.DETECTIONS, topics.GRID)
@@ -49,12 +49,10 @@ def choose_backend(model: Path, recording: Path, given: BackendName | None) -> B
     robots = topics.list_robots(list(held.topics))
     if not robots:
         raise MissingTopic(topics.CAMERA_IMAGE("*"), held.topics, recording)
-    images = (held.first(topics.CAMERA_IMAGE(robot)) for robot in robots if given is None)
-    first = min(filter(None, images), key=lambda image: image.time_ns, default=None)
-    if first is None:
+    sizes = (held.read_image_size(topics.CAMERA_IMAGE(robot)) for robot in robots if given is None)
+    if (size_px := next(filter(None, sizes), None)) is None:
         return given or "torch"
-    width_px, height_px, _ = read_size(first.message.data, _name_image(recording, first))
-    backend = select_fastest_backend(resolve_model_path(model), (width_px, height_px))
+    backend = select_fastest_backend(resolve_model_path(model), size_px)
     say(f"{recording}: --backend {backend}")
     return backend
 
@@ -138,7 +136,8 @@ def _iter_messages(
     total = sum(held.topics[t].count for t in images)
     raws = track(read_raw(held.path, *images), "Predicting", total)
     batches = _iter_batches(raws, batch_size, detector, held.path)
-    for batch in map_ahead(_decode_batch, batches, threads=1, max_waiting=1):
+    for decoded in map_ahead(_decode_batch, batches, threads=1, max_waiting=1):
+        batch = list(_iter_usable(decoded))
         tally["images"] += len(batch)
         raw_messages = iter(batch)
         for found, grids in detect_images([rgb for _, rgb in batch], detector, options):
@@ -152,6 +151,8 @@ def _iter_messages(
                 yield TimedMessage(raw.time_ns, topics.DETECTIONS(robot), made, raw.publish_ns)
                 grid = _to_grid_map(grids, k, detector.stride_px)
                 yield TimedMessage(raw.time_ns, topics.GRID(robot), grid, raw.publish_ns)
+    if total and not tally["images"]:
+        raise RecordingError(f"{held.path}: no image can be decoded. Restore the recording")
 
 
 def _iter_batches(
@@ -162,9 +163,12 @@ def _iter_batches(
     pixels = 0
     for raw in raws:
         name = _name_image(recording, raw)
-        image = read_header(
-            parse_message(raw, message_class("CompressedImage"), recording).data, name
-        )
+        data = parse_message(raw, message_class("CompressedImage"), recording).data
+        try:
+            image = read_header(data, name)
+        except SourceError as e:
+            leave_out(UNDECODABLE, e)
+            continue
         detector.require_size(image.width_px, image.height_px, name)
         pixels += image.width_px * image.height_px
         if len(batch) == most or (batch and pixels > limits.FRAME_PIXELS):
@@ -175,11 +179,30 @@ def _iter_batches(
         yield batch
 
 
-def _decode_batch(batch: list[tuple[RawMessage, ImageHeader]]) -> list[tuple[RawMessage, Rgb]]:
-    return [(raw, image.decode(limits.FRAME_PIXELS)) for raw, image in batch]
+def _decode_batch(
+    batch: list[tuple[RawMessage, ImageHeader]],
+) -> list[tuple[RawMessage, Rgb | SourceError]]:
+    return [(raw, _decode_or_fail(image)) for raw, image in batch]
 
 
-def _name_image(recording: Path, image: RawMessage | Stamped) -> str:
+def _decode_or_fail(image: ImageHeader) -> Rgb | SourceError:
+    try:
+        return image.decode(limits.FRAME_PIXELS)
+    except SourceError as e:
+        return e
+
+
+def _iter_usable(
+    decoded: list[tuple[RawMessage, Rgb | SourceError]],
+) -> Iterator[tuple[RawMessage, Rgb]]:
+    for raw, rgb in decoded:
+        if isinstance(rgb, SourceError):
+            leave_out(UNDECODABLE, rgb)
+        else:
+            yield raw, rgb
+
+
+def _name_image(recording: Path, image: RawMessage) -> str:
     return f"{recording}: the image of {image.topic} at {image.time_ns} ns"
 
 

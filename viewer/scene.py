@@ -12,8 +12,10 @@ import rerun.blueprint as rrb
 
 from dmrl import topics
 from dmrl.colours import RGB
+from dmrl.errors import SourceError
 from dmrl.images import codec
-from dmrl.recording import iter_topic_batches
+from dmrl.recording import LoadedRecording, iter_topic_batches
+from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import track
 from dmrl.viewer.content.flight_streamer import FlightStreamer
 from dmrl.viewer.content.robot_motion import Times
@@ -166,10 +168,20 @@ def _draw_batch(
     if draw.robot is not None and not selection.all_images:
         own = np.isin(batch["log_time"].to_numpy(), selection.image_ns[draw.robot])
         batch = batch.filter(pa.array(own))
+    if topics.parse_topic(topics.CAMERA_IMAGE, draw.topic):
+        batch = _select_decodable(batch, draw.topic)
     if batch.num_rows:
         times = _time_column(selection, batch["log_time"].to_numpy())
         for entity in draw.entities(batch):
             yield times, entity
+
+
+def _select_decodable(batch: pa.RecordBatch, topic: str) -> pa.RecordBatch:
+    """Return the images that can be decoded; leave out the others."""
+    found = [codec.is_decodable(data.as_py()) for data in batch["data"]]
+    for time_ns, good in zip(batch["log_time"].to_pylist(), found, strict=True):
+        leave_out(codec.UNDECODABLE, f"{topic} at {time_ns} ns", not good)
+    return batch if all(found) else batch.filter(pa.array(found))
 
 
 def _time_column(selection: Selection, time_ns: Times) -> Any:
@@ -214,17 +226,14 @@ def build_camera_panels(
     Raises
     ------
     SourceError
-        If a first image cannot be decoded.
+        If no image of a robot can be decoded.
     """
-    first = read_first_messages(selection, map(topics.CAMERA_IMAGE, robots))
     grids = read_first_messages(selection, map(topics.GRID, robots), model) if scales else {}
     prefix = "" if model is None else f"/{model.stem}"
     eyes = []
     for robot in robots:
         picture, grid = topics.CAMERA_IMAGE(robot), topics.GRID(robot)
-        width_px, height_px, _ = codec.read_size(
-            first[picture]["data"], f"the first image of {picture}"
-        )
+        width_px, height_px = _read_image_size(selection, picture)
         channels = grids[grid]["channels"] if grid in grids else ()
         eyes.append(
             CameraPanel(
@@ -240,6 +249,18 @@ def build_camera_panels(
             )
         )
     return eyes
+
+
+def _read_image_size(selection: Selection, picture: str) -> tuple[int, int]:
+    held = (
+        LoadedRecording(path)
+        for path, kept in selection.recordings.items()
+        if picture in kept.topics
+    )
+    found = (one.read_image_size(picture) for one in held)
+    if (size_px := next(filter(None, found), None)) is None:
+        raise SourceError(f"no image of {picture} can be decoded. Restore the recording")
+    return size_px
 
 
 def build_image_rules(eye: CameraPanel, sources: set[str]) -> list[DrawRule]:

@@ -19,10 +19,9 @@ from dmrl import topics
 from dmrl.datasets import Split
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.frames import is_inside
-from dmrl.images.codec import read_size
 from dmrl.learn.inference.matching import Points
 from dmrl.messages import STATUS_OK
-from dmrl.recording import LoadedRecording, read, read_splits
+from dmrl.recording import LoadedRecording, read_splits
 from dmrl.recording.label_sources import SOURCE_FIELDS, collect_sources
 from dmrl.recording.provenance_inputs import refuse_duplicates
 from dmrl.terminal.progress import track
@@ -191,8 +190,10 @@ def _join_robot(
     judged = times[usable]
     _, in_judged, in_detections = np.intersect1d(judged, seen_at, return_indices=True)
     labels = _build_points(peers, mine, np.flatnonzero(usable), np.arange(len(judged)))
-    width_px, height_px = _read_image_size(held.path, robot)
-    shown = _is_in_view(labels, width_px, height_px)
+    size_px = held.read_image_size(topics.CAMERA_IMAGE(robot))
+    if size_px is None:
+        raise RecordingError(f"{held.path} has no image of {robot}. Give the whole recording")
+    shown = _is_in_view(labels, *size_px)
     left_out["labels outside their image"] += int((~shown).sum())
     every = _combine_column(detected, "detections")
     detections = _build_points(every, None, in_detections, in_judged)
@@ -298,13 +299,3 @@ def _image_indices(entries: pa.Array) -> Times:
 def _combine_column(table: pa.Table, name: str) -> pa.Array:
     joined = table.column(name).combine_chunks()
     return pa.concat_arrays(joined.chunks) if isinstance(joined, pa.ChunkedArray) else joined
-
-
-def _read_image_size(recording: Path, robot: str) -> tuple[int, int]:
-    first = next(read(recording, topics.CAMERA_IMAGE(robot)), None)
-    if first is None:
-        raise RecordingError(f"{recording} has no image of {robot}. Give the whole recording")
-    width_px, height_px, _ = read_size(
-        first.message.data, f"{recording}: the first image of {robot}"
-    )
-    return width_px, height_px

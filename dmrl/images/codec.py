@@ -26,6 +26,8 @@ DECODE_ERRORS = (
     *(OSError, SyntaxError, ValueError, LookupError, TypeError, AttributeError, EOFError),
     *(RuntimeError, ArithmeticError, struct.error, Image.DecompressionBombError),
 )
+UNDECODABLE = "images that cannot be decoded"
+"""Reason of `dmrl.terminal.left_out`."""
 BITS = 16
 """Significant bits of a 16-bit channel, unless a source states fewer."""
 ORIENTATION_TAG = 0x0112
@@ -215,6 +217,18 @@ def read_size(data: bytes, what: object = "the image") -> tuple[int, int, str]:
     """
     picture = read_header(data, what)
     return picture.width_px, picture.height_px, picture.kind
+
+
+def is_decodable(data: bytes) -> bool:
+    """Return whether an image can be decoded. One that begins and ends as a whole one is not."""
+    ends = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND\xaeB`\x82"}
+    try:
+        header = read_header(data)
+        if not data.endswith(ends.get(data[:2], b"no end")):
+            header.decode(limits.FRAME_PIXELS)
+    except SourceError:
+        return False
+    return True
 
 
 def encode_png(rgb: Rgb | NDArray[np.uint16]) -> bytes:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.estimation.model.pair import Array
-from dmrl.images.codec import read_size
 from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.recording import LoadedRecording, Stamped, TopicInfo
 from dmrl.storage.shared_file import share_file
@@ -151,9 +150,8 @@ def read_flight(path: Path, *wanted: str, sizes_of: Collection[str] = ()) -> Fli
         if topics.CAMERA_IMAGE in wanted:
             log.images_ns.update({robot: held.get_times(topic) for robot, topic in images.items()})
         for robot in images.keys() & sizes_of:
-            if (first := held.first(images[robot])) is not None:
-                name = f"{path}: the first image of {robot}"
-                log.image_size_px[robot] = read_size(first.message.data, name)[:2]
+            if (size_px := held.read_image_size(images[robot])) is not None:
+                log.image_size_px[robot] = size_px
     return log
 
 

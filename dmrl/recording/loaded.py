@@ -9,6 +9,7 @@ import pyarrow as pa
 from google.protobuf.message_factory import GetMessageClass
 
 from dmrl.errors import MissingTopic
+from dmrl.images.codec import is_decodable, read_size
 from dmrl.recording.log_times import read_log_times
 from dmrl.recording.mcap.batch_reader import iter_batches
 from dmrl.recording.mcap.channel import Channel, RawMessage
@@ -114,6 +115,12 @@ class LoadedRecording:
     def first(self, topic: str) -> Stamped | None:
         """Return the first message of a topic, and load no other; None if it has none."""
         return next(read(self.path, topic), None)
+
+    def read_image_size(self, topic: str) -> tuple[int, int] | None:
+        """Return width and height of the first decodable image of a topic; None without one."""
+        every = (image.message.data for image in read(self.path, topic))
+        first = next(filter(is_decodable, every), None)
+        return None if first is None else read_size(first)[:2]
 
     def _get_messages(self, topic: str) -> tuple[MessageBatch, dict[int, Channel]]:
         """Return the messages of a topic, and its channels by channel id."""

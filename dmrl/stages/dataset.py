@@ -12,7 +12,8 @@ from dmrl.errors import SettingError
 from dmrl.pipeline.batch import find_all_recordings, find_changed_settings
 from dmrl.pipeline.process_pool import count_cores
 from dmrl.pipeline.single_run import run_on_cluster
-from dmrl.terminal.arguments import AsJson, Flat, On, Workers
+from dmrl.terminal.arguments import AsJson, Flat, On, Strict, Workers
+from dmrl.terminal.left_out import count_left_out
 from dmrl.terminal.tables import print_json, print_line, print_table
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ def command(
     settings: Flat[Settings] = DEFAULTS,
     from_index: str | None = None,
     into: Annotated[bool, Parameter(name="--add", negative=())] = False,
+    strict: Strict = False,
     workers: Workers = None,
     on: On = None,
     as_json: AsJson = False,
@@ -122,6 +124,9 @@ def command(
     into
         Add the recordings to OUT, a dataset, with the settings that it was made with. Shards that
         are there stay as they are; recordings and images that are there already are left out.
+    strict
+        End with an error if an image cannot be decoded. Without it, such images are left out and
+        counted.
     workers
         Threads that decode images. Without it, as many as there are cores. Changes no byte.
     """
@@ -130,7 +135,8 @@ def command(
     named = find_all_recordings(recordings, from_index)
     result: Result | None = None
     if on is None:
-        result = (add if into else run)(named, out, settings, workers=workers)
+        with count_left_out(strict=strict):
+            result = (add if into else run)(named, out, settings, workers=workers)
     elif said := run_on_cluster(on, "dataset", out, {"recordings": named}, settings):
         from dmrl.datasets.writing.rows import ExclusionCounts
 

@@ -9,7 +9,7 @@ from cyclopts import Parameter, validators
 from dmrl.deploy.backend_names import BackendName
 from dmrl.learn.inference.tta_views import TTA_VIEWS
 from dmrl.pipeline.stage_command import stage_command
-from dmrl.terminal.arguments import In
+from dmrl.terminal.arguments import In, Strict
 from dmrl.terminal.closing import Closing
 
 if TYPE_CHECKING:
@@ -44,6 +44,9 @@ class Settings:
         the work. Maps are of the first.
     batch_size
         Images that go through the network together.
+    strict
+        End with an error if an image cannot be decoded. Without it, such images are left out and
+        counted.
     """
 
     backend: BackendName | None = None
@@ -52,6 +55,7 @@ class Settings:
     most: Positive = 20
     views: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=len(TTA_VIEWS)))] = 1
     batch_size: Positive = 16
+    strict: Strict = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,11 +29,15 @@ class Settings:
         First time left out, seconds from the recording's start.
     topic
         Topic to keep, or a pattern such as /*/labels. Repeat for more. Without it, all.
+    only_decodable
+        Leave out images that cannot be decoded; each is decoded to see. Without it, images are
+        copied as they are.
     """
 
     from_s: Annotated[float | None, Parameter(name=["--from-s", "--from"])] = None
     to_s: Annotated[float | None, Parameter(name=["--to-s", "--to"])] = None
     topic: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = ()
+    only_decodable: Annotated[bool, Parameter(negative=())] = False
 
 
 def run(recording: Path, out: Path, settings: Settings) -> int:
@@ -74,7 +78,14 @@ def run(recording: Path, out: Path, settings: Settings) -> int:
     if first is not None and last is not None and first >= last:
         raise SettingError(f"--from {first:g} is not before --to {last:g}. Swap them")
     low_ns, high_ns = _compute_kept_ns(recording, settings)
-    return trim(recording, out, start_ns=low_ns, end_ns=high_ns, topics=settings.topic)
+    return trim(
+        recording,
+        out,
+        start_ns=low_ns,
+        end_ns=high_ns,
+        topics=settings.topic,
+        only_decodable=settings.only_decodable,
+    )
 
 
 def origin(recording: Path, settings: Settings) -> "Provenance":

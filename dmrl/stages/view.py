@@ -7,7 +7,8 @@ from typing import Annotated
 from cyclopts import Group, Parameter, validators
 
 from dmrl.errors import SettingError
-from dmrl.terminal.arguments import Flat
+from dmrl.terminal.arguments import Flat, Strict
+from dmrl.terminal.left_out import count_left_out
 from dmrl.terminal.tables import print_line
 from dmrl.viewer.settings import Settings, Web
 
@@ -48,6 +49,7 @@ def command(
     serve_web: Annotated[bool, Parameter(name="--serve", negative="", group=OUTPUT)] = False,
     time_s: Annotated[float | None, Parameter(name=["--time-s", "--time"])] = None,
     rank: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1,
+    strict: Strict = False,
     web: Flat[Web] = WEB,
     settings: Flat[Settings] = DEFAULTS,
 ) -> None:
@@ -74,6 +76,9 @@ def command(
         Take the picture of the image nearest to this time, seconds from the start.
     rank
         Take the picture of this row of a dataset; 1 is the worst.
+    strict
+        End with an error if an image cannot be decoded. Without it, such images are left out and
+        counted.
     """
     from dmrl.viewer import flag, save, screenshot, serve, view
 
@@ -82,17 +87,20 @@ def command(
             raise SettingError(
                 f"{path}: --save writes .rrd, --screenshot .png, --flag .html. Name it so"
             )
-    if save_to is not None:
-        count = save(recording, save_to, settings)
-        print_line(f"{save_to}: {count} images")
-    elif screenshot_to is not None:
-        shown = screenshot(recording, screenshot_to, settings, time_s=time_s, rank=rank)
-        print_line(f"{screenshot_to}: {shown}")
-    elif flag_to is not None:
-        if not any(path.is_dir() for path in recording):
-            raise SettingError(f"{recording[0]} is no dataset. --flag needs one: dmrl dataset")
-        print_line(f"{flag_to}: {flag(recording, flag_to, settings)} rows. Open it in a browser")
-    elif serve_web:
-        serve(recording, settings, web)
-    else:
-        view(recording, settings)
+    with count_left_out(strict=strict):
+        if save_to is not None:
+            count = save(recording, save_to, settings)
+            print_line(f"{save_to}: {count} images")
+        elif screenshot_to is not None:
+            shown = screenshot(recording, screenshot_to, settings, time_s=time_s, rank=rank)
+            print_line(f"{screenshot_to}: {shown}")
+        elif flag_to is not None:
+            if not any(path.is_dir() for path in recording):
+                raise SettingError(f"{recording[0]} is no dataset. --flag needs one: dmrl dataset")
+            print_line(
+                f"{flag_to}: {flag(recording, flag_to, settings)} rows. Open it in a browser"
+            )
+        elif serve_web:
+            serve(recording, settings, web)
+        else:
+            view(recording, settings)

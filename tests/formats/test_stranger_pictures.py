@@ -86,7 +86,7 @@ def test_a_stream_of_jpegs_gets_the_size_of_the_network(
 
 def test_a_cut_jpeg_of_a_stream_is_left_out(data: Path, convert: Convert, tmp_path: Path) -> None:
     told = convert(data / "strangers/cpx-jpeg_half/jpeg_half.cpx")
-    assert told["left_out"] == {"pictures that cannot be decoded": 1}
+    assert told["left_out"] == {"images that cannot be decoded": 1}
     assert len(images(tmp_path)) == 5
 
 
@@ -199,7 +199,7 @@ def test_a_picture_that_is_broken_is_left_out_with_its_labels(
     rows = "".join(f"{n},cf2,10,12,1.5\n" for n in ("a.png", name, "c.png"))
     (tmp_path / "in/labels.csv").write_text("file,peer,u_px,v_px,depth_m\n" + rows)
     told = convert(tmp_path / "in")
-    assert told["left_out"] == {"pictures that cannot be decoded": 1}
+    assert told["left_out"] == {"images that cannot be decoded": 1}
     assert name in told["stderr"]
     recording = dmrl.open(tmp_path / "out.mcap")
     assert recording["/cf1/labels"].to_pandas()["log_time"].astype(int).tolist() == [0, 200_000_000]
@@ -210,7 +210,7 @@ def test_floats_have_no_range(convert: Convert, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     save(tmp_path / "in/a.tif", PIL.Image.fromarray(RAMP.astype(np.float32)))
     (tmp_path / "in/b.png").write_bytes(encode_png(COLOURS))
-    assert convert(tmp_path / "in")["left_out"] == {"pictures that cannot be decoded": 1}
+    assert convert(tmp_path / "in")["left_out"] == {"images that cannot be decoded": 1}
 
 
 def test_names_with_a_point_are_seconds(convert: Convert, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from dmrl.datasets.writing.dataset_writer import Row
 from dmrl.datasets.writing.exclusions import FlaggedImage, read_flags
 from dmrl.datasets.writing.rows import ExclusionCounts, iter_row_builders
 from dmrl.datasets.writing.splits import SplitLookup
-from dmrl.errors import RecordingError
+from dmrl.errors import RecordingError, SourceError
 from dmrl.images.prefetch import map_ahead
 from dmrl.recording import LoadedRecording, read_summary
 from dmrl.terminal.progress import say, track
@@ -75,7 +75,9 @@ def iter_rows(
         )
     )
     for path, kept in track(map_ahead(_decode_row, planned, workers), "Writing images", total):
-        if kept is not None:
+        if isinstance(kept, SourceError):
+            tally.count_undecodable(kept)
+        elif kept is not None:
             size_px = size_px or kept[1].size_px
             require_same_size(path, kept[1], size_px)
             yield kept
@@ -83,9 +85,12 @@ def iter_rows(
 
 def _decode_row(
     planned: tuple[Path, tuple[str, Callable[[], Row]] | None],
-) -> tuple[Path, tuple[str, Row] | None]:
+) -> tuple[Path, tuple[str, Row] | SourceError | None]:
     path, kept = planned
-    return path, None if kept is None else (kept[0], kept[1]())
+    try:
+        return path, None if kept is None else (kept[0], kept[1]())
+    except SourceError as e:
+        return path, e
 
 
 def has_masks(recording: Path) -> bool:
@@ -139,7 +144,7 @@ def report_left_out(
             f"no image of {names} can be used: {'; '.join(reasons) or 'there is none'}. "
             "Try: dmrl info, dmrl label"
         )
-    for reason in reasons:
+    for reason in reasons[: -1 if tally.undecodable else None]:  # that one has its line
         say(f"left out: {reason}")
     if list(manifest.splits) == ["train"] and settings.split != "none" and settings.test_share > 0:
         say(

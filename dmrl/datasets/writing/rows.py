@@ -26,13 +26,14 @@ from dmrl.datasets.layout import PEER_TYPE
 from dmrl.datasets.writing.dataset_writer import Row
 from dmrl.datasets.writing.exclusions import FlaggedImage
 from dmrl.datasets.writing.splits import SplitLookup
-from dmrl.errors import RecordingError, SettingError
+from dmrl.errors import RecordingError, SettingError, SourceError
 from dmrl.geometry.frames import STRIDE_PX, build_grid_label
-from dmrl.images.codec import decode
+from dmrl.images.codec import UNDECODABLE, decode
 from dmrl.messages import STATUS_OK, to_status_name
 from dmrl.recording import LoadedRecording, Stamped, read
 from dmrl.recording.label_sources import SOURCE_FIELDS, collect_sources, get_message_sources
 from dmrl.storage.shared_file import share_file
+from dmrl.terminal.left_out import leave_out
 
 LABEL_SOURCES = ("truth", "estimate", "hand", "published")
 """Sources of labels, best first."""
@@ -61,6 +62,12 @@ class ExclusionCounts:
     in_no_split: int = 0
     flagged: int = 0
     twice: int = 0
+    undecodable: int = 0
+
+    def count_undecodable(self, error: SourceError) -> None:
+        """Count an image that was counted as kept before, but cannot be decoded."""
+        leave_out(UNDECODABLE, error)
+        self.kept, self.undecodable = self.kept - 1, self.undecodable + 1
 
     def count_duplicate(self) -> None:
         """Count an image as a duplicate that was counted as kept before."""
@@ -76,6 +83,7 @@ class ExclusionCounts:
             "belong to no split of their source (--split)": self.in_no_split,
             "were flagged (--without)": self.flagged,
             "are in the dataset already: same camera, time and pixels": self.twice,
+            "cannot be decoded": self.undecodable,
         }
 
 

@@ -20,7 +20,6 @@ from dmrl.terminal.progress import say
 
 PICTURE_OPTIONS = SOURCE_OPTIONS | {"camera", "size_px", "raw", "bits", "as_stored"}
 """Options that have an effect on encoded pictures."""
-UNDECODABLE = "pictures that cannot be decoded"
 
 
 def scaling_words(bits: int) -> str:
@@ -50,7 +49,7 @@ class PictureConverter:
         try:
             return self.convert_pixels(time_ns, *self._decode(data, where), where)
         except SourceError as e:
-            leave_out(UNDECODABLE, e)
+            leave_out(codec.UNDECODABLE, e)
             return None
 
     def convert_pixels(

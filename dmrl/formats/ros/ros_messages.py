@@ -10,7 +10,6 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import SourceError
-from dmrl.formats.files.pictures import UNDECODABLE
 from dmrl.geometry.frames import Array
 from dmrl.geometry.rotations import quaternion_to_euler
 from dmrl.guards import limits
@@ -101,7 +100,7 @@ def _convert_compressed_image(
         header = codec.read_header(data, what)
         rgb = header.decode(limits.FRAME_PIXELS, bits=where.bits)
     except SourceError as e:
-        leave_out(f"{UNDECODABLE}, of format {message.format[:40]!r}", e)
+        leave_out(f"{codec.UNDECODABLE}, of format {message.format[:40]!r}", e)
         return
     if header.has_16_bits:
         where.scaled.add(where.robot)

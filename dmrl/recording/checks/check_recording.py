@@ -183,7 +183,10 @@ def _check_sizes(
     data: CheckData, topic: str, calibration_topic: str, sizes: Counter[ImageSize]
 ) -> Iterator[Finding]:
     if unreadable := sizes.pop(None, 0):
-        yield Finding("error", topic, f"{unreadable} messages contain no readable image")
+        first_ns = ", ".join(f"{ns} ns" for ns in sorted(data.undecodable_ns[topic])[:3])
+        yield Finding(
+            "error", topic, f"{unreadable} messages contain no readable image: {first_ns}"
+        )
     listed = ", ".join(f"{w}x{h}" for w, h in sorted(k for k in sizes if k))
     if len(sizes) > 1:
         yield Finding("warning", topic, f"images of {len(sizes)} sizes: {listed}")

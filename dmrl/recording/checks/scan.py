@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from dmrl.errors import DmrlError, RecordingError
-from dmrl.images.codec import read_size
+from dmrl.images.codec import is_decodable, read_size
 from dmrl.recording.checks.odometry_checks import MotionSamples
 from dmrl.recording.checks.unit_checks import MagnitudeHistograms
 from dmrl.recording.loaded import LoadedRecording
@@ -45,6 +45,8 @@ class CheckData:
         Error text by topic, for messages that are not of their type.
     sizes
         Number of images of each size, by topic; the size of the first image comes first.
+    undecodable_ns
+        Log times of the images that cannot be decoded, by topic.
     unset_stamps
         Messages with time stamp 0 and another log time, by topic.
     magnitudes
@@ -57,6 +59,7 @@ class CheckData:
     times: dict[str, Ints]
     broken: dict[str, str] = field(default_factory=dict)
     sizes: dict[str, Counter[ImageSize]] = field(default_factory=lambda: defaultdict(Counter))
+    undecodable_ns: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
     unset_stamps: Counter[str] = field(default_factory=Counter)
     magnitudes: MagnitudeHistograms = field(default_factory=MagnitudeHistograms)
     motion: MotionSamples = field(default_factory=MotionSamples)
@@ -158,7 +161,11 @@ def _collect_from_messages(
     collected.magnitudes.add_batch(topic, batch)
     collected.motion.add_batch(topic, batch)
     if parse_topic(CAMERA_IMAGE, topic):
-        collected.sizes[topic].update(_decode_size(data.as_buffer()) for data in batch["data"])
+        for time_ns, data in zip(batch["log_time"].to_pylist(), batch["data"], strict=True):
+            size = _decode_size(data.as_buffer())
+            collected.sizes[topic][size] += 1
+            if size is None:
+                collected.undecodable_ns[topic].append(time_ns)
 
 
 def _count_unset_stamps(batch: pa.RecordBatch) -> int:
@@ -173,6 +180,8 @@ def _count_unset_stamps(batch: pa.RecordBatch) -> int:
 def _decode_size(data: pa.Buffer) -> ImageSize:
     try:
         width_px, height_px, _ = read_size(data.to_pybytes())
+        if not is_decodable(data.to_pybytes()):
+            return None
     except (DmrlError, ValueError):
         return None
     return width_px, height_px

@@ -110,6 +110,7 @@ def trim(
     start_ns: int | None = None,
     end_ns: int | None = None,
     topics: Sequence[str] = (),
+    only_decodable: bool = False,
 ) -> int:
     """Write the messages of a time range, or of some topics, and return how many.
 
@@ -124,6 +125,8 @@ def trim(
         Log times to keep, in [start_ns, end_ns), nanoseconds.
     topics
         Topics or patterns to keep. Empty: all.
+    only_decodable
+        Leave out images that cannot be decoded.
 
     Raises
     ------
@@ -142,7 +145,7 @@ def trim(
         adopt_channels(path, topics_to_keep, sink)
         for raw in _iter_calibrations(path, topics_to_keep, low, high):
             sink.write_raw(raw)
-        selection = TopicSelection(topics_to_keep, start_ns or 0, high)
+        selection = TopicSelection(topics_to_keep, start_ns or 0, high, only_decodable)
         count = sum(write_unit(piece, selection, sink) for piece in iter_units(path, selection))
         if not count and source.count:
             raise RecordingError(

@@ -148,7 +148,7 @@ def test_raw_pictures_are_of_four_by_four_pixels_at_least(
     else:
         with count_left_out() as counted:
             assert "/cf1/camera/image" not in samples(folder)
-        assert counted.counts == {"pictures that cannot be decoded": 6}
+        assert counted.counts == {"images that cannot be decoded": 6}
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def test_a_cut_jpeg_is_left_out_and_the_others_stay(tmp_path: Path) -> None:
     with count_left_out() as counted:
         found = samples(tmp_path / "a.cpx", data)
     assert [s.time_ns for s in found["/cf1/camera/image"]] == [0, 200_000_000]
-    assert counted.counts == {"pictures that cannot be decoded": 1}
+    assert counted.counts == {"images that cannot be decoded": 1}
 
 
 def test_jpegs_keep_their_bytes(tmp_path: Path) -> None:

@@ -344,4 +344,4 @@ def test_raw_pictures_are_of_four_by_four_pixels_at_least(
         return
     with count_left_out() as counted:
         assert not samples(tmp_path, "CompressedImage", Options(raw=True))
-    assert counted.counts == {"pictures that cannot be decoded": 1}
+    assert counted.counts == {"images that cannot be decoded": 1}

@@ -296,7 +296,7 @@ def test_a_video_and_a_cut_picture_are_left_out(data: bytes) -> None:
     message = SimpleNamespace(data=np.frombuffer(data, np.uint8), format="h264")
     with count_left_out() as counted:
         assert not given("sensor_msgs/msg/CompressedImage", message)
-    assert counted.counts == {"pictures that cannot be decoded, of format 'h264'": 1}
+    assert counted.counts == {"images that cannot be decoded, of format 'h264'": 1}
 
 
 def test_a_picture_is_the_robot_s_own() -> None:

@@ -1,0 +1,178 @@
+"""Images that cannot be decoded are left out, counted and named; if all are, it is an error."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl import boundary, card
+from dmrl.cli import app
+from dmrl.datasets import open_dataset
+from dmrl.errors import RecordingError
+from dmrl.images.codec import encode_jpeg, encode_png
+from dmrl.messages import message_class
+from dmrl.recording import Provenance, RecordingWriter, read, read_raw, read_summary
+from dmrl.topics import CAMERA_IMAGE, LABELS
+
+STEP_NS = 100_000_000
+COUNT = 6
+UNDECODABLE = {"images that cannot be decoded": 1}
+PIXELS = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+JPEG, PNG = encode_jpeg(PIXELS), encode_png(PIXELS)
+
+BROKEN = {
+    "a cut JPEG": JPEG[: len(JPEG) // 2],
+    "a cut PNG": PNG[: len(PNG) // 2],
+    "no byte": b"",
+    "other bytes": b"<html></html>",
+    "a JPEG without pixels": JPEG[:300],
+}
+
+
+def write(path: Path, broken: bytes, places: tuple[int, ...]) -> Path:
+    """Write six labelled images, of which some are broken."""
+    with RecordingWriter(path, Provenance("test")) as sink:
+        for k in range(COUNT):
+            kind = "png" if k % 2 else "jpeg"
+            data = broken if k in places else (PNG if k % 2 else JPEG)
+            image = message_class("CompressedImage")(data=data, format=kind)
+            peer = {"peer": "cf2", "u_px": 20, "v_px": 20, "depth_m": 1, "source": "hand"}
+            sink.write(k * STEP_NS, CAMERA_IMAGE("cf1"), image)
+            sink.write(k * STEP_NS, LABELS("cf1"), message_class("PeerLabels")(peers=[peer]))
+    return path
+
+
+@pytest.fixture(params=list(BROKEN))
+def broken(request: pytest.FixtureRequest) -> bytes:
+    return BROKEN[request.param]
+
+
+@pytest.fixture(params=[0, 3, COUNT - 1])
+def recording(request: pytest.FixtureRequest, broken: bytes, tmp_path: Path) -> Path:
+    """A recording with one broken image: the first, one in the middle, the last."""
+    return write(tmp_path / "in.mcap", broken, (request.param,))
+
+
+Run = Callable[..., tuple[int, dict[str, Any], str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command with --json; return its status, its document and its lines on stderr."""
+
+    def command(*words: object) -> tuple[int, dict[str, Any], str]:
+        status = boundary.run_to_status(lambda: app([str(word) for word in words]))
+        printed = capsys.readouterr()
+        told = json.loads(printed.out) if "--json" in words and printed.out else {}
+        return status, told, printed.err
+
+    return command
+
+
+def time_of(recording: Path, data: bytes) -> int:
+    """Time of the image with these bytes."""
+    (found,) = [s.time_ns for s in read(recording, CAMERA_IMAGE("cf1")) if s.message.data == data]
+    return found
+
+
+def test_predict_does_the_others(
+    run: Run, recording: Path, broken: bytes, model: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.mcap"
+    rc, told, said = run("predict", model, recording, out, "--json", "--backend", "torch")
+    assert (rc, told["images"], told["left_out"]) == (0, COUNT - 1, UNDECODABLE)
+    assert f"at {time_of(recording, broken)} ns" in said
+    times = [raw.time_ns for raw in read_raw(out, "/cf1/detections")]
+    assert sorted({*times, time_of(recording, broken)}) == [k * STEP_NS for k in range(COUNT)]
+    assert len(times) == COUNT - 1
+    made = read_summary(out).provenance
+    assert made is not None and made.left_out == UNDECODABLE
+    rc, _, said = run("predict", model, recording, tmp_path / "no.mcap", "--json", "--strict")
+    assert rc == 1 and "--strict" in said and not list(tmp_path.glob("no*"))
+
+
+def test_a_dataset_has_the_others(
+    run: Run, recording: Path, broken: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(card, "plots", None)
+    rc, told, said = run("dataset", recording, tmp_path / "set", "--json", "--test-share", 0)
+    assert (rc, told["left_out"]) == (0, {"cannot be decoded": 1})
+    assert f"at {time_of(recording, broken)} ns" in said
+    times = open_dataset(tmp_path / "set").split("train").table["log_time"].to_pylist()
+    assert sorted({*times, time_of(recording, broken)}) == [k * STEP_NS for k in range(COUNT)]
+    assert len(times) == COUNT - 1
+    rc, _, said = run("dataset", recording, tmp_path / "no", "--json", "--strict")
+    assert rc == 1 and "--strict" in said and not list(tmp_path.glob("no*"))
+
+
+def test_trim_takes_it_out_where_asked(
+    run: Run, recording: Path, broken: bytes, tmp_path: Path
+) -> None:
+    at_ns = time_of(recording, broken)
+    rc, _, said = run("trim", recording, tmp_path / "out.mcap", "--only-decodable")
+    assert rc == 0 and f"at {at_ns} ns" in said
+    kept = [(raw.topic, raw.time_ns, raw.data) for raw in read_raw(tmp_path / "out.mcap")]
+    want = [(raw.topic, raw.time_ns, raw.data) for raw in read_raw(recording)]
+    lost = [one for one in want if one[:2] == (CAMERA_IMAGE("cf1"), at_ns)]
+    assert len(lost) == 1
+    assert sorted(kept) == sorted(set(want) - set(lost))
+    rc, _, said = run("trim", recording, tmp_path / "all.mcap")
+    assert rc == 0 and not said
+    assert sum(1 for _ in read_raw(tmp_path / "all.mcap")) == len(want)
+
+
+def test_check_names_it(run: Run, recording: Path, broken: bytes) -> None:
+    rc, told, _ = run("check", recording, "--json")
+    texts = [finding["text"] for finding in told["findings"]]
+    wanted = f"1 messages contain no readable image: {time_of(recording, broken)} ns"
+    assert rc == 1 and wanted in texts
+
+
+def test_view_shows_the_others(run: Run, recording: Path, broken: bytes, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    rc, _, said = run("view", recording, "--save", tmp_path / "out.rrd")
+    assert rc == 0
+    where = f"{CAMERA_IMAGE('cf1')} at {time_of(recording, broken)} ns"
+    assert f"left out: 1 images that cannot be decoded (at {where})" in said
+
+
+def test_evaluate_measures_the_others(
+    run: Run, recording: Path, model: Path, tmp_path: Path
+) -> None:
+    run("predict", model, recording, tmp_path / "out.mcap", "--json", "--backend", "torch")
+    rc, told, _ = run("evaluate", tmp_path / "out.mcap", "--json", "--against", "hand", "--partial")
+    assert (rc, told["images"]) == (0, COUNT - 1)
+
+
+def test_nothing_is_left_of_nothing_but_broken_images(
+    run: Run, broken: bytes, model: Path, tmp_path: Path
+) -> None:
+    recording = write(tmp_path / "in.mcap", broken, tuple(range(COUNT)))
+    for words in (("predict", model), ("dataset",), ("view",)):
+        out = tmp_path / "out.mcap" if words[0] == "predict" else tmp_path / "out"
+        flags = ("--save", tmp_path / "out.rrd") if words[0] == "view" else (out,)
+        rc, _, said = run(*words, recording, *flags)
+        assert rc == 1, words
+        assert "decoded" in said
+        assert not list(tmp_path.glob("out*"))
+
+
+def test_the_stranger_s_recording(run: Run, data: Path, tmp_path: Path) -> None:
+    recording = data / "strangers/frame-jpeg_cut/bo_jpeg_cut_half.mcap"
+    out = tmp_path / "out.mcap"
+    rc, told, said = run("predict", "dmrl-nano", recording, out, "--json", "--backend", "torch")
+    assert (rc, told["images"], told["left_out"]) == (0, 19, UNDECODABLE)
+    assert "at 700000000 ns" in said
+    _, told, _ = run("check", recording, "--json")
+    assert any("700000000 ns" in finding["text"] for finding in told["findings"])
+
+
+def test_python_gets_one_error_for_all(broken: bytes, model: Path, tmp_path: Path) -> None:
+    from dmrl.stages import predict  # noqa: PLC0415 - the command imports it late too
+
+    recording = write(tmp_path / "in.mcap", broken, tuple(range(COUNT)))
+    with pytest.raises(RecordingError, match="no image can be decoded"):
+        predict.run(model, recording, tmp_path / "out.mcap", predict.Settings(backend="torch"))
