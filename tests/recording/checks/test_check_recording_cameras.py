@@ -25,7 +25,7 @@ def test_images_without_calibration_or_of_another_size_are_found(tmp_path: Path)
     assert (
         "error /cf1/camera/image images of 320x224, but the calibration is for 324x244" in findings
     )
-    assert "error /cf1/camera/image 1 messages contain no readable image" in findings
+    assert "error /cf1/camera/image 1 messages contain no readable image: 1 ns" in findings
 
 
 @pytest.mark.parametrize(
