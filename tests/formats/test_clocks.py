@@ -8,7 +8,8 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from dmrl.errors import SourceError
-from dmrl.formats.clocks import MessageClock, find_new_values, settle_times
+from dmrl.formats.clocks import find_new_values, settle_times
+from dmrl.formats.ros.message_clock import MessageClock
 from dmrl.terminal.left_out import count_left_out
 
 S = 1_000_000_000

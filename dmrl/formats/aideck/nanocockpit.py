@@ -6,7 +6,6 @@ second, a compressed quaternion, milliradians per second. Raw images are convert
 they are missing, the colour ones are used.
 """
 
-import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from dmrl.formats.clocks import settle_times, unwrap
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
 from dmrl.formats.files.pictures import PictureConverter
+from dmrl.formats.files.text_table import Dialect, TextTable, read_table
 from dmrl.samples.flight import Times, merge_by_time
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import leave_out
@@ -65,12 +65,9 @@ def load_content(source: Path, options: Options) -> Content:
     MissingExtra
         If images are raw and OpenCV is not installed.
     """
-    names, table = _load_metadata(source / METADATA_FILE)
+    names, table, text = _load_metadata(source / METADATA_FILE)
     paths = [_find_image(source, name) for name in names]
-    found = settle_times(
-        unwrap(table[TIME_COLUMN], 32) * 1000,
-        lambda row: f"{source / METADATA_FILE}:{row + 2}",
-    )
+    found = settle_times(unwrap(table[TIME_COLUMN], 32) * 1000, text.name_row)
     paths, time_ns = [paths[row] for row in found.rows], found.time_ns
     table = {name: column[found.rows] for name, column in table.items()}
     lost = int((np.diff(unwrap(table[NUMBER_COLUMN], 8)) - 1).clip(0).sum())
@@ -86,42 +83,35 @@ def _wrap_to_int32(ticks: Times) -> Times:
     return np.asarray((ticks + (1 << 31)) % (1 << 32) - (1 << 31))
 
 
-def _load_metadata(path: Path) -> tuple[list[str], dict[str, Times]]:
-    """Load the names of the images, and the other columns as integers."""
-    head, rows = _parse_csv(path)
-    if missing := [name for name in REQUIRED_COLUMNS if name not in head]:
+def _load_metadata(path: Path) -> tuple[list[str], dict[str, Times], TextTable]:
+    """Load the names of the images, the other columns as integers, and the rows they are of.
+
+    Lines that cannot be used are left out and counted.
+    """
+    text = read_table(path, REQUIRED_COLUMNS, Dialect(","))
+    if missing := [name for name in REQUIRED_COLUMNS if name not in text.columns]:
         raise SourceError(f"{path}:1: no column {', '.join(missing)}. Restore the file")
-    if rows and len(rows[-1]) != len(head):
-        leave_out("lines that are cut short", f"{path}:{len(rows) + 1}")
-        rows.pop()
-    if not rows:
-        raise SourceError(f"{path} has no rows. Pass another folder")
-    places = [head.index(name) for name in REQUIRED_COLUMNS[1:]]
-    values = [_parse_integers(row, places, f"{path}:{line}") for line, row in enumerate(rows, 2)]
+    cells = zip(*(text.columns[name] for name in REQUIRED_COLUMNS[1:]), strict=True)
+    values = [_parse_integers(row) for row in cells]
+    good = [k for k, row in enumerate(values) if row is not None]
+    if len(good) < len(values):
+        first = next(k for k, row in enumerate(values) if row is None)
+        reason = "lines with numbers that are not whole"
+        leave_out(reason, text.name_row(first), len(values) - len(good))
+    if not good:
+        raise SourceError(f"{path} has no row of whole numbers. Restore the file")
+    columns = np.array([values[k] for k in good], np.int64).T
+    text = text.select(good)
+    return text.columns[FILE_COLUMN], dict(zip(REQUIRED_COLUMNS[1:], columns, strict=True)), text
+
+
+def _parse_integers(row: Sequence[str]) -> list[int] | None:
+    """Parse whole numbers of 63 bits; None if a cell is none."""
     try:
-        columns = np.array(values, np.int64).T
-    except OverflowError:
-        raise SourceError(f"{path}: a number beyond 64 bits. Restore the file") from None
-    return [row[head.index(FILE_COLUMN)] for row in rows], dict(
-        zip(REQUIRED_COLUMNS[1:], columns, strict=True)
-    )
-
-
-def _parse_csv(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Parse a CSV file into the names of its columns and its rows."""
-    try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            head, *rows = list(csv.reader(stream)) or [[]]
-    except (OSError, UnicodeDecodeError, csv.Error) as e:
-        raise SourceError(f"{path} cannot be read as CSV: {e}. Restore the file") from None
-    return head, rows
-
-
-def _parse_integers(row: list[str], places: list[int], where: str) -> list[int]:
-    try:
-        return [int(row[place]) for place in places]
-    except (ValueError, IndexError):
-        raise SourceError(f"{where}: not a file and whole numbers. Fix the line") from None
+        found = [int(cell) for cell in row]
+    except ValueError:
+        return None
+    return found if max(map(abs, found)) < 1 << 63 else None
 
 
 def _find_image(source: Path, name: str) -> Path | None:

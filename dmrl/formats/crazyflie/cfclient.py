@@ -6,7 +6,6 @@ such files, is the log of one robot. In a folder of folders, each folder is a ro
 it.
 """
 
-import csv
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -20,14 +19,15 @@ from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_co
 from dmrl.formats.clocks import unwrap
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
+from dmrl.formats.files.text_table import Dialect, read_table
 from dmrl.geometry.frames import Array
-from dmrl.guards import limits
 from dmrl.terminal.left_out import leave_out
 
 TIME_COLUMN = "Timestamp"
 NS_PER_MS = 1_000_000
 TIMESTAMP_BITS = 24  # milliseconds in a log packet
 INTEGER_CELL = re.compile(r"\s*[+-]?\d+\s*")
+EMPTY_NAME = re.compile(r"column_\d+")  # given by read_table
 DATE_SUFFIX = re.compile(r"-\d{8}T\d{2}-\d{2}-\d{2}$")
 
 
@@ -83,43 +83,31 @@ def load_content(source: Path, options: Options) -> Content:
 
 
 def read_block(path: Path) -> LogBlock:
-    """Read one file. A last line that is cut short is left out and reported.
+    """Read one file. Lines that cannot be used are left out and counted.
 
     Raises
     ------
     SourceError
-        If the file is not a log of the client, or has no row.
+        If the file is not a log of the client, or has no row that can be used.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as e:
-        raise SourceError(f"{path} cannot be read as text: {e}. Pass another file") from None
-    lines = text.splitlines()
-    try:
-        names = next(csv.reader(lines[:1]), [])
-    except csv.Error as e:
-        raise SourceError(f"{path}:1: {e}. Pass another file") from None
-    if names[:1] != [TIME_COLUMN] or len(set(names)) < len(names) or not all(names):
+    text = read_table(path, [TIME_COLUMN], Dialect(","))
+    if next(iter(text.columns)) != TIME_COLUMN or any(map(EMPTY_NAME.fullmatch, text.columns)):
         raise SourceError(f"{path}:1: not {TIME_COLUMN} and names of variables. Pass another file")
-    rows = [_parse_row(line, len(names)) for line in lines[1:]]
-    if rows and rows[-1] is None and not text.endswith("\n"):
-        leave_out("lines that are cut short", f"{path}:{len(lines)}")
-        rows.pop()
-    if None in rows:
-        raise SourceError(f"{path}:{rows.index(None) + 2}: not {len(names)} numbers. Fix the line")
-    if not rows:
-        raise SourceError(f"{path} has no rows. Pass another file")
-    values = np.array(rows, float).T
-    time_ns = unwrap(values[0], TIMESTAMP_BITS) * NS_PER_MS
-    cells = zip(*(line.split(",")[1:] for line in lines[1 : len(rows) + 1]), strict=True)
+    values = {name: text.parse_numbers(name) for name in text.columns}
+    time_ms = values.pop(TIME_COLUMN)
+    if time_ms is None or not (known := np.isfinite(time_ms)).any():
+        raise SourceError(f"{path}: no number in {TIME_COLUMN}. Pass another file")
+    leave_out("rows without a time", path, int((~known).sum()))
     columns = {
-        name: _restore_type(text, column)
-        for name, text, column in zip(names[1:], cells, values[1:], strict=True)
+        name: _restore_type([text.columns[name][k] for k in np.flatnonzero(known)], column[known])
+        for name, column in values.items()
+        if column is not None
     }
+    time_ns = unwrap(time_ms[known], TIMESTAMP_BITS) * NS_PER_MS
     return LogBlock(DATE_SUFFIX.sub("", path.stem), time_ns, columns)
 
 
-def _restore_type(cells: tuple[str, ...], values: Array) -> NDArray[Any]:
+def _restore_type(cells: list[str], values: Array) -> NDArray[Any]:
     """Restore the type of a column: the client writes integers without a decimal point."""
     whole = all(INTEGER_CELL.fullmatch(cell) for cell in cells)
     if whole and np.abs(values).max() < 2**31:
@@ -135,16 +123,6 @@ def _unwrap_between_blocks(blocks: list[LogBlock]) -> list[LogBlock]:
         replace(block, time_ns=block.time_ns + (count - min(wraps)) * period_ns)
         for block, count in zip(blocks, wraps, strict=True)
     ]
-
-
-def _parse_row(line: str, width: int) -> list[float] | None:
-    if len(line) > limits.LINE_CHARACTERS:
-        return None  # Python's own error would quote the whole line
-    try:
-        row = [float(cell) for cell in line.split(",")]
-    except ValueError:
-        return None
-    return row if len(row) == width and np.isfinite(row[0]) else None
 
 
 FORMAT = Format(

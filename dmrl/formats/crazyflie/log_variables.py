@@ -75,6 +75,7 @@ def build_streams(
         If the clock of the log starts again.
     """
     blocks = [_settle_block(block, where) for block in blocks]
+    _report_missing(robot, blocks, where)
     logged = [build_raw_stream(robot, block) for block in blocks]
     return logged + derive_streams(robot, blocks, names, where)
 
@@ -87,7 +88,7 @@ def derive_streams(
     attitude = find_attitude(blocks)
     if attitude is not None:
         found.append(_build_attitude(robot, attitude, compute_yaw_rate(blocks, attitude)))
-    found += _iter_motion_streams(robot, blocks, attitude, where)
+    found += _iter_motion_streams(robot, blocks, attitude)
     found += iter_range_streams(robot, blocks, names, where)
     found += _iter_pose_streams(robot, blocks)
     return found
@@ -126,11 +127,10 @@ def _build_columns(
 
 
 def _iter_motion_streams(
-    robot: str, blocks: Sequence[LogBlock], attitude: TimeSeries | None, where: object
+    robot: str, blocks: Sequence[LogBlock], attitude: TimeSeries | None
 ) -> Iterator[SampleStream]:
-    velocity = find_in_metres(blocks, "vx vy vz") or find_in_metres(blocks, "vx vy")
+    velocity = _find_velocity(blocks)
     yaw = find_angle(blocks, "yaw") if attitude is None else attitude.select_column(2)
-    _report_missing(robot, blocks, attitude, velocity, where)
     if velocity is not None and yaw is not None:
         turned = yaw.interpolate(velocity.time_ns)[:, 0]
         x, y, *z = velocity.values.T
@@ -144,13 +144,12 @@ def _iter_motion_streams(
         yield _build_columns(topics.HEIGHT(robot), "Height", height.time_ns, names, height.values)
 
 
-def _report_missing(
-    robot: str,
-    blocks: Sequence[LogBlock],
-    attitude: TimeSeries | None,
-    velocity: TimeSeries | None,
-    where: object,
-) -> None:
+def _find_velocity(blocks: Sequence[LogBlock]) -> TimeSeries | None:
+    return find_in_metres(blocks, "vx vy vz") or find_in_metres(blocks, "vx vy")
+
+
+def _report_missing(robot: str, blocks: Sequence[LogBlock], where: object) -> None:
+    attitude, velocity = find_attitude(blocks), _find_velocity(blocks)
     lacking = [name for name in ANGLES if attitude is None and find_angle(blocks, name) is None]
     reasons = []
     if lacking:

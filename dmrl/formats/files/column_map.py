@@ -13,27 +13,34 @@
     name = "est_stateEstimate_vx"
     unit = "m/s"
     frame = "world"                 # or horizontal, which turns with the robot, or body
+    [height]
+    value = 0.2                     # a constant, in place of a column
+    unit = "m"
     [range.cf2]
     name = "uwb_2"
     unit = "mm"
 
+One table serves several robots: ``{robot}`` in a name stands for the robot, and ``{peer}`` in the
+name of ``[range."*"]`` for every peer. ``[robot] name`` is the column with the robot of each row.
+``[file]`` states the form of the file; see `dmrl.formats.files.text_table.Dialect`.
 ``QUANTITIES`` lists the supported quantities.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from dmrl.errors import SourceError
+from dmrl.formats.files.text_table import Dialect
 from dmrl.guards.bounded_parsing import parse_toml
 
 ANGLE_UNITS = {"rad": 1.0, "deg": 0.017453292519943295}
 RATE_UNITS = {"rad/s": 1.0, "deg/s": 0.017453292519943295}
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 SPEED_UNITS = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3}
-TIME_UNITS = {"s": 1_000_000_000.0, "ms": 1_000_000.0, "us": 1000.0, "ns": 1.0}
+TIME_UNITS = {"s": 1_000_000_000.0, "ms": 1_000_000.0, "us": 1000.0, "ns": 1.0, "iso": 1e9}
 NO_UNIT = {"1": 1.0}
 FRAMES = ("world", "horizontal", "body")
 
@@ -58,7 +65,9 @@ REQUIRED_TOGETHER = (
     ("true_qx", "true_qy", "true_qz", "true_qw"),
 )
 """Groups of quantities that are only meaningful together."""
-COLUMN_KEYS = ("name", "unit", "sign", "frame")
+COLUMN_KEYS = ("name", "unit", "sign", "frame", "value", "held")
+ANY_PEER = "*"
+"""Key of the ranges to all peers that the names of columns tell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,29 +77,41 @@ class Column:
     Parameters
     ----------
     name
-        Its name in the file's first line.
+        Its name in the header; empty: the value is constant.
     scale
         Factor from its unit and sign to dmrl's.
     frame
         Frame of a velocity.
+    unit
+        Its unit.
+    value
+        Constant value, in its unit.
+    held
+        Whether the log holds the last value of a range; None: not stated.
     """
 
     name: str
     scale: float
     frame: str = ""
+    unit: str = ""
+    value: float | None = None
+    held: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class ColumnMap:
-    """Columns by quantity, and columns of ranges by peer."""
+    """Columns by quantity, columns of ranges by peer, column of the robot, form of the file."""
 
     columns: Mapping[str, Column]
     ranges: Mapping[str, Column]
+    robot_column: str = ""
+    dialect: Dialect = field(default_factory=Dialect)
 
     @property
     def names(self) -> set[str]:
         """Names of all columns of the file that the map uses."""
-        return {column.name for column in (*self.columns.values(), *self.ranges.values())}
+        used = {column.name for column in (*self.columns.values(), *self.ranges.values())}
+        return (used | {self.robot_column}) - {""}
 
 
 def read_column_map(path: Path) -> ColumnMap:
@@ -105,17 +126,34 @@ def read_column_map(path: Path) -> ColumnMap:
         values = parse_toml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as e:
         raise SourceError(f"{path} is no table of columns in TOML: {e}. Fix it") from None
+    robot, form = (values.pop(key, {}) for key in ("robot", "file"))
     ranges = values.pop("range", {})
     ranges = ranges if isinstance(ranges, dict) else {"": ranges}
     faults = [fault for key, table in values.items() for fault in _iter_errors(key, table)]
     faults += [f for peer, table in ranges.items() for f in _iter_errors(f"range.{peer}", table)]
-    faults += _iter_missing(values)
+    faults += [*_iter_missing(values), *_iter_form_errors(robot, form)]
     if faults:
         raise SourceError(f"{path}: {'; '.join(faults)}. See docs/sources.md")
     columns = {key: _build_column(QUANTITIES[key], table) for key, table in values.items()}
-    return ColumnMap(
-        columns, {peer: _build_column(LENGTH_UNITS, table) for peer, table in ranges.items()}
-    )
+    held = {peer: _build_column(LENGTH_UNITS, table) for peer, table in ranges.items()}
+    return ColumnMap(columns, held, robot.get("name", ""), Dialect(**form))
+
+
+def _iter_form_errors(robot: Any, form: Any) -> Iterator[str]:
+    """Yield the errors of ``[robot]`` and ``[file]``."""
+    for key, table, known in (
+        ("robot", robot, ["name"]),
+        ("file", form, [one.name for one in fields(Dialect)]),
+    ):
+        wrong = not isinstance(table, dict) or any(
+            name not in known or not isinstance(value, str) for name, value in table.items()
+        )
+        if wrong:
+            yield f"[{key}]: not texts for {', '.join(known)}"
+    if isinstance(form, dict) and form.get("decimal", ".") not in (".", ","):
+        yield '[file] decimal: not "." or ","'
+    if isinstance(form, dict) and len(str(form.get("separator", ","))) != 1:
+        yield "[file] separator: not one character"
 
 
 def _iter_missing(values: Mapping[str, Any]) -> Iterator[str]:
@@ -150,9 +188,13 @@ def _iter_errors(key: str, table: Any) -> Iterator[str]:
 def _find_wrong_values(units: Mapping[str, float], table: Mapping[str, Any]) -> dict[str, str]:
     """Return the errors of the values of a quantity's table, by key."""
     wrong = {}
-    name, unit, sign, frame = (table.get(key) for key in COLUMN_KEYS)
-    if not (isinstance(name, str) and name):
+    name, unit, sign, frame, value, held = (table.get(key) for key in COLUMN_KEYS)
+    if value is not None and (name is not None or units is TIME_UNITS or not _is_number(value)):
+        wrong["value"] = "not a number in place of a name"
+    elif value is None and not (isinstance(name, str) and name):
         wrong["name"] = "not the name of a column"
+    if not isinstance(held, bool | None):
+        wrong["held"] = "not true or false"
     has_unit = unit is not None or units is not NO_UNIT  # a plain number needs none
     if has_unit and unit not in tuple(units):
         wrong["unit"] = f"not one of {', '.join(units)}"
@@ -165,6 +207,11 @@ def _find_wrong_values(units: Mapping[str, float], table: Mapping[str, Any]) -> 
     return wrong
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def _build_column(units: Mapping[str, float], table: Mapping[str, Any]) -> Column:
     scale = units[table.get("unit", "1")] * table.get("sign", 1)
-    return Column(table["name"], scale, table.get("frame", ""))
+    rest = {key: table[key] for key in ("frame", "unit", "value", "held") if key in table}
+    return Column(table.get("name", ""), scale, **rest)

@@ -14,7 +14,6 @@ Images of a robot are in a folder ``<robot>/``, named by their time in nanosecon
 12 digits (zeros in front); ``calibration.toml`` there is its camera.
 """
 
-import csv
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -26,20 +25,22 @@ import numpy as np
 from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.clocks import Ints, settle_times
 from dmrl.formats.files import image_folder
 from dmrl.formats.files.labelled_pictures import is_picture
 from dmrl.formats.files.pictures import PICTURE_OPTIONS
+from dmrl.formats.files.text_table import read_names, read_table
 from dmrl.geometry.frames import Array
 from dmrl.samples import flight
-from dmrl.samples.flight import LOG_COLUMNS, merge_by_time, to_nanoseconds
+from dmrl.samples.flight import LOG_COLUMNS, merge_by_time
 from dmrl.samples.sample import Sample
+from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 from dmrl.topics import Topic
 
 TIME_COLUMN = "time_s"
 REQUIRED_COLUMNS = (TIME_COLUMN, *LOG_COLUMNS)
 MIN_GAP_S = 1.0
-MAX_TIME_S = 9e9  # its nanoseconds fit 64 bits; the year 2255 if counted from 1970
 MAX_RANGE_M = 60.0  # beyond the reach of UWB; radios report 65535 mm without an answer
 OWN_SENSOR_COLUMNS = {field for row in topics.OWN_SENSORS for field in row.csv}
 OTHER_SENSORS = tuple(
@@ -52,21 +53,21 @@ OTHER_SENSORS = tuple(
 
 @dataclass(frozen=True, slots=True)
 class CsvLog:
-    """One CSV file: path, (N,) columns with NaN for empty cells, and the line of each row."""
+    """One CSV file: path, (N,) times, and (N,) columns with NaN for empty cells."""
 
     path: Path
+    time_ns: Ints
     columns: dict[str, Array]
-    lines: list[int]
+
+    @property
+    def time_s(self) -> Array:
+        """(N,) times, seconds."""
+        return np.asarray(self.time_ns * 1e-9)
 
     @property
     def robot(self) -> str:
         """Robot of the file."""
         return self.path.stem
-
-    @property
-    def time_s(self) -> Array:
-        """(N,) times."""
-        return self.columns[TIME_COLUMN]
 
     @property
     def range_peers(self) -> list[str]:
@@ -91,16 +92,8 @@ class CsvLog:
 def can_read(source: Path) -> bool:
     """Return whether a folder has a CSV file whose first column is ``time_s``."""
     return source.is_dir() and any(
-        _parse_header(path)[:1] == [TIME_COLUMN] for path in source.glob("*.csv")
+        read_names(path, REQUIRED_COLUMNS)[:1] == [TIME_COLUMN] for path in source.glob("*.csv")
     )
-
-
-def _parse_header(path: Path) -> list[str]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            return [name.strip() for name in next(csv.reader(stream), [])]
-    except (OSError, UnicodeDecodeError, csv.Error):
-        return []
 
 
 def load_content(source: Path, options: Options | None = None) -> Content:
@@ -116,8 +109,8 @@ def load_content(source: Path, options: Options | None = None) -> Content:
     Raises
     ------
     SourceError
-        If a column is missing, a cell is no number, time does not increase, or two robots
-        share no time: names the file, and the line.
+        If a column is missing, no row can be used, time goes back, or two robots share no time:
+        names the file, and the line.
     """
     paths = sorted(source.glob("*.csv")) if source.is_dir() else []
     if not paths:
@@ -133,60 +126,36 @@ def load_content(source: Path, options: Options | None = None) -> Content:
 
 
 def read_log(path: Path) -> CsvLog:
-    """Read and check the file of one robot.
+    """Read the file of one robot. Rows that cannot be used are left out and counted.
 
     Raises
     ------
     SourceError
-        If a column is missing, a cell is no number, or time does not increase.
+        If a column is missing, no row can be used, or time goes back.
     """
-    names = _parse_header(path)
-    if missing := [name for name in REQUIRED_COLUMNS if name not in names]:
+    text = read_table(path, REQUIRED_COLUMNS)
+    if missing := [name for name in REQUIRED_COLUMNS if name not in text.columns]:
         raise SourceError(f"{path} has no column {', '.join(missing)}. Add it, in SI units")
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.reader(stream)
-            next(reader)
-            rows = [(reader.line_num, row) for row in reader if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as e:
-        raise SourceError(f"{path} cannot be read as CSV: {e}. Save it as CSV in UTF-8") from None
-    lines = [line for line, _ in rows]
-    values = [_parse_numbers(path, line, row, len(names)) for line, row in rows]
-    if len(rows) < 2:
+    told_ns, rows = text.parse_times(TIME_COLUMN, 1e9)
+    if len(rows) < len(text.lines):
+        text = text.select(rows)
+    columns = {name: text.parse_numbers(name, used=name != TIME_COLUMN) for name in text.columns}
+    found = settle_times(told_ns, text.name_row)
+    held = {name: x[found.rows] for name, x in columns.items() if x is not None}
+    known = np.isfinite([held[n] if n in held else told_ns * np.nan for n in LOG_COLUMNS])
+    good = known.all(axis=0)
+    if lost := int((~good).sum()):
+        row, name = int(found.rows[~good][0]), LOG_COLUMNS[int(np.argmin(known[:, ~good][:, 0]))]
+        leave_out(f"rows without a number for {name} or another", text.name_row(row), lost)
+    if good.sum() < 2:
         raise SourceError(f"{path} has fewer than two rows. Add rows, or remove it")
-    log = CsvLog(path, dict(zip(names, np.array(values).T, strict=True)), lines)
+    log = CsvLog(path, found.time_ns[good], {name: x[good] for name, x in held.items()})
     _check_log(log)
     return log
 
 
-def _parse_numbers(path: Path, line: int, row: list[str], width: int) -> list[float]:
-    if len(row) != width:
-        raise SourceError(f"{path}:{line} has {len(row)} cells, not {width}. Fix the line")
-    try:
-        return [float(cell) if cell.strip() else np.nan for cell in row]
-    except ValueError as e:
-        raise SourceError(f"{path}:{line}: {e}. Fix the line, or leave the cell empty") from None
-
-
 def _check_log(log: CsvLog) -> None:
-    for name in REQUIRED_COLUMNS:
-        if (bad := np.flatnonzero(~np.isfinite(log.columns[name]))).size:
-            raise SourceError(
-                f"{log.path}:{log.lines[bad[0]]}: {name} is no number. Fill it, or remove the line"
-            )
     steps = np.diff(log.time_s)
-    if (back := np.flatnonzero(steps <= 0)).size:
-        raise SourceError(
-            f"{log.path}:{log.lines[back[0] + 1]}: time goes back or stands still "
-            f"({log.time_s[back[0] + 1]:.6f} s after {log.time_s[back[0]]:.6f} s). Sort the lines"
-        )
-    if log.time_s[-1] > MAX_TIME_S:
-        raise SourceError(
-            f"{log.path}: time_s reaches {log.time_s[-1]:.3g}, which is no time in seconds. Are "
-            "these ms, us or ns? Divide them"
-        )
-    if log.time_s[0] < 0:
-        raise SourceError(f"{log.path} begins before time 0. Add a constant to time_s everywhere")
     if (gaps := np.flatnonzero(steps > MIN_GAP_S)).size:
         at = log.time_s[gaps[0]]
         say(f"{log.path}: {gaps.size} gaps, the first of {steps[gaps[0]]:.1f} s after {at:.3f} s")
@@ -225,14 +194,14 @@ def _iter_streams(log: CsvLog, names: Mapping[str, str]) -> Iterator[Iterator[Sa
     def name(robot: str) -> str:
         return names.get(robot, robot)
 
-    own, time_ns = name(log.robot), to_nanoseconds(log.time_s)
+    own, time_ns = name(log.robot), log.time_ns
     yield flight.iter_robot_log(own, time_ns, log.columns)
     for peer in log.range_peers:
         range_m = log.columns[f"range_{peer}_m"]
         given = ~np.isnan(range_m)
         usable = given & (range_m > 0) & (range_m < MAX_RANGE_M)
-        if refused := int((given & ~usable).sum()):
-            say(f"{log.path}: {refused} ranges to {peer} left out: not over 0 and under 60 m")
+        refused = int((given & ~usable).sum())
+        leave_out(f"ranges to {peer} that are not over 0 and under 60 m", log.path, refused)
         yield flight.iter_ranges(own, name(peer), time_ns[usable], range_m[usable])
     for peer in log.truth_peers:
         xyz = np.stack([log.columns[f"{peer}_{axis}_m"] for axis in "xyz"], axis=1)

@@ -1,30 +1,45 @@
 """Foreign CSV files, read by a table that defines their columns (`column_map`).
 
-A file is the log of one robot; a folder has one per robot, named after its file. Every column is
-kept unchanged, on ``/<robot>/log/columns``. Flights of NanoBench are recognised by their columns.
+A file is the log of one robot, or of several, if the table says how columns or rows name them; a
+folder has one file per robot, named after it. Every column is kept unchanged, on
+``/<robot>/log/columns``. Flights of NanoBench are recognised by their columns.
 """
 
-import csv
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
+from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
+from dmrl.formats.clocks import find_new_values, settle_times
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock, TimeSeries
 from dmrl.formats.crazyflie.log_variables import SampleStream
 from dmrl.formats.crazyflie.state import find_attitude
-from dmrl.formats.files.column_map import ANGLE_UNITS, RATE_UNITS, ColumnMap, read_column_map
+from dmrl.formats.files.column_map import (
+    ANGLE_UNITS,
+    LENGTH_UNITS,
+    QUANTITIES,
+    RATE_UNITS,
+    Column,
+    read_column_map,
+)
+from dmrl.formats.files.robot_columns import RobotLog, read_robot_logs
+from dmrl.formats.files.text_table import (
+    TABLE_SUFFIXES,
+    TextTable,
+    read_names,
+)
 from dmrl.geometry.frames import Array
-from dmrl.samples import flight
 from dmrl.samples.flight import Times
+from dmrl.samples.sample import Columns
+from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 
 NANOBENCH_TABLE = Path(__file__).parent / "nanobench.toml"
-SEPARATORS = ",;\t"
 BUILTIN_TABLES = {"nanobench": NANOBENCH_TABLE}
 """Column tables of this package, by name."""
 
@@ -43,55 +58,129 @@ CRAZYFLIE_VARIABLES = {
 MAX_TILT_RAD = np.pi
 MAX_TURN_RATE_RATIO = 10.0
 """Largest ratio between a gyroscope and the slope of the yaw before their units are doubted."""
+UNIT_NORM_ERROR = 0.1
+"""Largest difference from 1 of the length of a quaternion."""
+UNIT_IN_NAME = re.compile(r".*[\s_\[(/]([A-Za-zµ°]+(?:/s)?)[\])]?")
+UNIT_WORDS = {"°": "deg", "degrees": "deg", "radians": "rad", "µs": "us", "°/s": "deg/s"}
+"""Units as headers write them, and as tables do."""
 
 
 def can_read(source: Path) -> bool:
     """Return whether a source is a CSV file with all columns of a table of this package."""
-    if not source.is_file() or source.suffix.lower() != ".csv":
+    if not source.is_file() or source.suffix.lower() not in TABLE_SUFFIXES:
         return False
-    return read_column_map(NANOBENCH_TABLE).names <= set(_parse_header(source)[0])
-
-
-def _parse_header(path: Path) -> tuple[list[str], str]:
-    """Parse the names of the columns, and their separator."""
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as stream:
-        first = stream.readline(1 << 16)
-    separator = max(SEPARATORS, key=first.count)
-    names = next(csv.reader([first], delimiter=separator), [])
-    return [name.strip() for name in names], separator
+    wanted = read_column_map(NANOBENCH_TABLE).names
+    return wanted <= set(read_names(source, wanted))
 
 
 def load_content(source: Path, options: Options) -> Content:
-    """Load the samples of the log of a robot, or of one per file of a folder.
+    """Load the samples of the log of a robot, or of several in a file or folder.
 
     Parameters
     ----------
     source
         The file or folder.
     options
-        ``columns``, the table (default: NanoBench's); ``robot`` of a single file; ``names`` of
-        those of a folder.
+        ``columns``, the table (default: NanoBench's); ``robot`` of a file that names none;
+        ``names`` of robots and peers.
 
     Raises
     ------
     SourceError
-        If the table is wrong, a column is missing, or a cell is no number: names file and line.
+        If the table is wrong, a column is missing, or nothing can be used: names file and line.
     """
     path = options.columns or NANOBENCH_TABLE
     table = read_column_map(BUILTIN_TABLES.get(str(path), path))
     files = {options.robot: source}
     if source.is_dir():
-        paths = sorted(p for p in source.iterdir() if p.suffix.lower() == ".csv")
-        files = {options.names.get(p.stem, p.stem): p for p in paths}
+        held = [p for p in sorted(source.iterdir()) if p.is_file() and p.name[0] != "."]
+        kinds = [[p for p in held if p.suffix.lower() == suffix] for suffix in TABLE_SUFFIXES]
+        files = {p.stem: p for p in next(filter(None, kinds), [])}
     if not files:
         raise SourceError(f"no CSV file in {source}. Pass a folder with one per robot")
-    return build_content(s for n, p in files.items() for s in _iter_streams(n, p, table))
+    logs = read_robot_logs(files, table)
+    if source.is_dir() or [log.robot for log in logs] != [options.robot]:
+        options.refuse("robot", f"has no effect: {source} names its robots. Use --names")
+    return build_content(s for log in logs for s in _iter_streams(log, options))
 
 
-def _iter_streams(robot: str, path: Path, table: ColumnMap) -> Iterator[SampleStream]:
-    time_ns, cells = _load_columns(path, table)
+def _iter_streams(log: RobotLog, options: Options) -> Iterator[SampleStream]:
+    robot, path = options.names.get(log.robot, log.robot), log.text.path
+    time = log.columns["time"]
+    told_ns, rows = log.text.parse_times(time.name, time.scale)
+    text = log.text.select(rows) if len(rows) < len(log.text.lines) else log.text
+    found = settle_times(told_ns, text.name_row)
+    time_ns = found.time_ns
+    used = {column.name for column in (*log.columns.values(), *log.ranges.values())}
+    cells = {
+        name: column[found.rows]
+        for name in text.columns
+        if (column := text.parse_numbers(name, used=name in used - {time.name})) is not None
+    }
     yield log_variables.build_raw_stream(robot, LogBlock("columns", time_ns, cells))
-    values = {key: cells[c.name] * c.scale for key, c in table.columns.items() if key != "time"}
+    values = {
+        key: _to_values(key, one, cells, text, len(time_ns))
+        for key, one in log.columns.items()
+        if key != "time"
+    }
+    for key, one in (*log.columns.items(), *log.ranges.items()):
+        _doubt_header_unit(key, one, text)
+    yield from _iter_sensor_streams(robot, path, time_ns, values, log)
+    for peer, one in log.ranges.items():
+        range_m = _to_values(f"range.{peer}", one, cells, text, len(time_ns))
+        yield _build_ranges(robot, options.names.get(peer, peer), time_ns, range_m, one, path)
+
+
+def _to_values(
+    key: str, column: Column, cells: Mapping[str, Array], text: TextTable, count: int
+) -> Array:
+    """Return a quantity in dmrl's unit, NaN where it is not known."""
+    if column.value is not None:
+        return np.full(count, column.value * column.scale)
+    if column.name not in cells:
+        raise SourceError(f"{text.name_row(0)}: {column.name} has no number. Fix the table")
+    values = cells[column.name] * column.scale
+    infinite = np.flatnonzero(np.isinf(values))
+    if len(infinite):
+        leave_out(f"infinite values of {key}", text.path, len(infinite))
+        values[infinite] = np.nan
+    return values
+
+
+def _doubt_header_unit(key: str, column: Column, text: TextTable) -> None:
+    """Report a unit in the header that is not the one in the table."""
+    in_name = UNIT_IN_NAME.fullmatch(column.name)
+    told = text.units.get(column.name) or (in_name[1] if in_name else "")
+    told = UNIT_WORDS.get(told, told)
+    if told in QUANTITIES.get(key, LENGTH_UNITS) and column.unit and told != column.unit:
+        say(f"{text.path}: the header has {column.name} in {told}, the table in {column.unit}")
+
+
+def _build_ranges(
+    robot: str, peer: str, time_ns: Times, range_m: Array, column: Column, path: Path
+) -> SampleStream:
+    """Build the stream of the ranges to a peer: possible ones, each measurement once."""
+    known = np.isfinite(range_m)
+    usable = known & (range_m > 0) & (range_m < log_variables.MAX_RANGE_M)
+    reason = f"ranges to {peer} that are not over 0 and under 60 m"
+    leave_out(reason, path, int((known & ~usable).sum()))
+    if column.held is not False:
+        new = find_new_values(np.where(usable, range_m, np.nan), polled=column.held is True)
+        if column.held is None:
+            reason = f"ranges to {peer} that repeat the last one, which the log holds"
+            leave_out(f"{reason} (held in the table decides it)", path, int((usable & ~new).sum()))
+        usable &= new
+    topic = topics.RANGE(robot, peer)
+    return Columns(topic, "UwbRange", time_ns[usable], {"range_m": range_m[usable]})
+
+
+def _iter_sensor_streams(
+    robot: str, path: Path, time_ns: Times, values: dict[str, Array], log: RobotLog
+) -> Iterator[SampleStream]:
+    """Yield attitude, velocity, height and poses."""
+    has_yaw = "yaw" in values or "qw" in values
+    _complete_attitude(path, time_ns, values)
+    _drop_bad_quaternions(path, values)
     logged = {
         CRAZYFLIE_VARIABLES[k][0]: v * CRAZYFLIE_VARIABLES[k][1]
         for k, v in values.items()
@@ -99,104 +188,80 @@ def _iter_streams(robot: str, path: Path, table: ColumnMap) -> Iterator[SampleSt
     }
     block = LogBlock("columns", time_ns, logged)
     attitude = find_attitude([block])
-    _warn_about_units(path, time_ns, values, attitude)
+    if has_yaw:
+        _warn_about_units(path, time_ns, values, attitude)
     if "vx" in values:
-        frame = table.columns["vx"].frame
-        logged |= _rotate_to_world(path, time_ns, values, frame, attitude)
+        frame = log.columns["vx"].frame
+        if frame == "world":
+            if not has_yaw:
+                raise SourceError(
+                    f"{path}: velocity in frame world needs [yaw] or [qw] in the table, measured "
+                    'in that frame. If it turns with the robot: frame = "horizontal"'
+                )
+            names = [name for name in ("vx", "vy", "vz") if name in values]
+            logged |= {f"stateEstimate.{name}": values[name] for name in names}
+        else:
+            yield _build_velocity(robot, path, time_ns, values, frame, attitude)
     yield from log_variables.derive_streams(robot, [block], {}, path)
-    for peer, column in table.ranges.items():
-        range_m = cells[column.name] * column.scale
-        usable = (range_m > 0) & (range_m < log_variables.MAX_RANGE_M)
-        if refused := int((np.isfinite(range_m) & ~usable).sum()):
-            say(f"{path}: {refused} ranges to {peer} left out: not over 0 and under 60 m")
-        yield flight.iter_ranges(robot, peer, time_ns[usable], range_m[usable])
-
-
-def _load_columns(path: Path, table: ColumnMap) -> tuple[Times, dict[str, Array]]:
-    """Load the times, and every numeric column, NaN where a cell is empty."""
-    names, separator = _parse_header(path)
-    if missing := sorted(table.names - set(names)):
-        raise SourceError(f"{path}:1: no column {', '.join(missing)}. Fix the table of columns")
-    if len(set(names)) < len(names):
-        raise SourceError(f"{path}:1: a column appears twice. Rename one")
-    rows = _parse_rows(path, separator, len(names))
-    time = table.columns["time"]
-    at = names.index(time.name)
-    moments = np.array(
-        [_parse_time_ns(path, line, row[at], time.scale) for line, row in rows], np.int64
-    )
-    order = np.argsort(moments, kind="stable")
-    if (np.diff(moments) < 0).any():
-        say(f"{path}: its lines are not in time order; sorted")
-    return moments[order], {
-        name: values[order]
-        for k, name in enumerate(names)
-        if (values := _parse_numbers(path, [(n, row[k]) for n, row in rows], name, table))
-        is not None
+    lacking = {
+        "attitude": attitude is None,
+        "velocity": "vx" not in values,
+        "height": not {"height", "z"} & values.keys(),
     }
+    if any(lacking.values()) and not all(lacking.values()):
+        absent = " and no ".join(name for name, lacks in lacking.items() if lacks)
+        say(f"{path}: no {absent} in the table, which dmrl label needs")
 
 
-def _parse_rows(path: Path, separator: str, cells: int) -> list[tuple[int, list[str]]]:
-    """Parse the line number and cells of every row below the header, with equally many cells."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.reader(stream, delimiter=separator)
-            next(reader)
-            rows = [(reader.line_num, row) for row in reader if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as e:
-        raise SourceError(f"{path} cannot be read as CSV: {e}. Pass another file") from None
-    if rows and len(rows[-1][1]) < cells:
-        say(f"{path}: its last line is cut short; left out")
-        rows.pop()
-    if not rows:
-        raise SourceError(f"{path} has no rows. Pass another file")
-    for line, row in rows:
-        if len(row) != cells:
-            raise SourceError(f"{path}:{line}: {len(row)} cells, not {cells}. Fix the line")
-    return rows
+def _complete_attitude(path: Path, time_ns: Times, values: dict[str, Array]) -> None:
+    """Add a yaw that is the integral of the yaw rate, and level roll and pitch, if they lack."""
+    rate = values.get("yaw_rate", values.get("gyro_z"))
+    if "qw" in values or rate is None:
+        return
+    if "roll" not in values:
+        say(f"{path}: no roll and pitch in the table: the robot is taken as level")
+        values |= {"roll": np.zeros(len(time_ns)), "pitch": np.zeros(len(time_ns))}
+    known = np.isfinite(rate)
+    if "yaw" not in values and known.any():
+        rate = np.interp(time_ns, time_ns[known], rate[known])
+        turned = np.diff(time_ns) * 1e-9 * (rate[1:] + rate[:-1]) / 2
+        values["yaw"] = np.concatenate([[0.0], np.cumsum(turned)])
 
 
-def _parse_time_ns(path: Path, line: int, cell: str, scale: float) -> int:
-    """Parse whole nanoseconds exactly: a float has too few digits for those since 1970."""
-    try:
-        time_ns = int((Decimal(cell.strip()) * Decimal(scale)).to_integral_value())
-    except (InvalidOperation, ValueError, OverflowError):
-        raise SourceError(f"{path}:{line}: {cell!r} is no time. Fix the line") from None
-    if not 0 <= time_ns < 1 << 63:
-        raise SourceError(f"{path}:{line}: time {cell} is before 1970 or after 2262. Fix its unit")
-    return time_ns
+def _drop_bad_quaternions(path: Path, values: dict[str, Array]) -> None:
+    """Leave out quaternions that are not of length 1."""
+    for before in ("", "true_"):
+        names = [f"{before}{name}" for name in ("qx", "qy", "qz", "qw")]
+        if names[0] not in values:
+            continue
+        norm = np.linalg.norm([values[name] for name in names], axis=0)
+        bad = np.isfinite(norm) & (np.abs(norm - 1) >= UNIT_NORM_ERROR)
+        leave_out(f"quaternions of {names[0]} that are not of length 1", path, int(bad.sum()))
+        for name in names:
+            values[name] = np.where(bad, np.nan, values[name])
 
 
-def _parse_numbers(
-    path: Path, cells: Sequence[tuple[int, str]], name: str, table: ColumnMap
-) -> Array | None:
-    """Parse a column; None for a text column that the table does not use."""
-    values = np.full(len(cells), np.nan)
-    for k, (line, cell) in enumerate(cells):
-        try:
-            values[k] = float(cell) if cell.strip() else np.nan
-        except ValueError:
-            if name not in table.names:
-                return None
-            raise SourceError(f"{path}:{line}: {name} is {cell!r}, no number. Fix it") from None
-    return values
-
-
-def _rotate_to_world(
-    path: Path, time_ns: Times, values: Mapping[str, Array], frame: str, attitude: TimeSeries | None
-) -> dict[str, Array]:
-    """Rotate velocity to the frame in which yaw is measured, as the Crazyflie logs it."""
+def _build_velocity(
+    robot: str,
+    path: Path,
+    time_ns: Times,
+    values: Mapping[str, Array],
+    frame: str,
+    attitude: TimeSeries | None,
+) -> SampleStream:
+    """Build the stream of velocities in the robot's horizontal frame, from that or the body's."""
     v = [values[name] for name in ("vx", "vy", "vz") if name in values]
-    if frame != "world":
-        if attitude is None or (frame == "body" and len(v) < 3):
-            wanted = "[vz], [roll], [pitch] and [yaw]" if frame == "body" else "an attitude"
-            raise SourceError(f"{path}: velocity in frame {frame} needs {wanted} in the table")
-        roll, pitch, yaw = attitude.interpolate(time_ns).T
-        if frame == "body":
-            v = _rotate_to_horizontal(v, roll, pitch)
-        c, s = np.cos(yaw), np.sin(yaw)
-        v = [c * v[0] - s * v[1], s * v[0] + c * v[1], *v[2:]]
-    return dict(zip(("stateEstimate.vx", "stateEstimate.vy", "stateEstimate.vz"), v, strict=False))
+    if frame == "body":
+        if attitude is None or len(v) < 3:
+            raise SourceError(
+                f"{path}: velocity in frame body needs [vz], [roll] and [pitch] in the table"
+            )
+        roll, pitch, _ = attitude.interpolate(time_ns).T
+        v = _rotate_to_horizontal(v, roll, pitch)
+    known = np.isfinite(v).all(axis=0)
+    names = ("vx_mps", "vy_mps", "vz_mps")
+    fields = {name: part[known] for name, part in zip(names, v, strict=False)}
+    return Columns(topics.VELOCITY(robot), "Velocity", time_ns[known], fields)
 
 
 def _rotate_to_horizontal(v: Sequence[Array], roll: Array, pitch: Array) -> list[Array]:

@@ -23,8 +23,8 @@ from typing import Any
 
 from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
-from dmrl.formats.clocks import MessageClock
 from dmrl.formats.files.pictures import scaling_words
+from dmrl.formats.ros.message_clock import MessageClock
 from dmrl.formats.ros.reader import BagMessage, iter_messages, list_topics
 from dmrl.formats.ros.ros_messages import (
     CONVERTERS,

@@ -72,7 +72,7 @@ def test_units_are_what_they_are_called() -> None:
         "gyro_z": {"rad/s": 1, "deg/s": degree},
         "height": {"m": 1, "cm": 0.01, "mm": 0.001},
         "vx": {"m/s": 1, "cm/s": 0.01, "mm/s": 0.001},
-        "time": {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1},
+        "time": {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1, "iso": 1e9},
         "qw": {"1": 1},
     }.items():
         assert QUANTITIES[quantity] == pytest.approx(units)

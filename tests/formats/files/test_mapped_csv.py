@@ -12,6 +12,7 @@ from dmrl.formats.files.column_map import QUANTITIES
 from dmrl.formats.registry import find_format
 from dmrl.geometry.rotations import euler_to_quaternion, quaternion_to_euler
 from dmrl.samples.sample import Sample
+from dmrl.terminal.left_out import count_left_out
 
 TABLE = """
 [time]
@@ -96,24 +97,40 @@ def test_velocities_of_other_frames_are_turned(frame: str, table: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "text"),
+    ("line", "reason", "heights"),
     [
-        ("soon;1;2;3;4;5;6;7;8;x", r"log\.csv:4: 'soon' is no time"),
-        ("1020;much;2;3;4;5;6;7;8;x", r"log\.csv:4: phi is 'much', no number"),
-        ("1020;1;2;3\n1030;1;2;3;4;5;6;7;8;x", r"log\.csv:4: 4 cells, not 10"),
-        ("-5;1;2;3;4;5;6;7;8;x", r"log\.csv:4: time -5 is before 1970"),
+        ("soon;1;2;3;4;5;6;7;8;x", "rows without a time", 3),
+        ("-5;1;2;3;4;5;6;7;8;x", "rows without a time, or with one before 1970", 3),
+        ("1020;much;2;3;4;5;6;7;8;x", "cells of 'phi' that are no number", 4),
+        ("1020;1;2;3", "lines with fewer or more cells than the header", 3),
+        ("1020;inf;2;3;4;5;6;7;8;x", "infinite values of roll", 4),
     ],
 )
-def test_a_wrong_line_is_named(line: str, text: str, table: Path) -> None:
+def test_a_line_that_cannot_be_used_is_left_out_and_named(
+    line: str, reason: str, heights: int, table: Path
+) -> None:
     log = table.with_name("log.csv")
-    log.write_text(log.read_text() + line + "\n")
-    with pytest.raises(SourceError, match=text):
+    log.write_text(log.read_text() + line + "\n1030;1;2;3;4;5;6;7;8;x\n")
+    with count_left_out() as left_out:
+        found = samples(log, Options(columns=table))
+    ((told, count),) = left_out.counts.items()
+    assert told.startswith(reason) and count == 1
+    assert str(log) in left_out.first[told]
+    assert left_out.first[told].endswith(":4") != (reason == "infinite values of roll")
+    assert len(found["/cf1/height"]) == heights
+    assert len(found["/cf1/attitude"]) == 3
+
+
+def test_a_file_without_any_time_is_refused(table: Path) -> None:
+    log = table.with_name("log.csv")
+    log.write_text(log.read_text().replace("1000;", "a;").replace("1010.5;", "b;"))
+    with pytest.raises(SourceError, match=r"log\.csv:2: 'a' in t \(ms\) is no time"):
         samples(log, Options(columns=table))
 
 
 def test_a_column_that_is_not_there_is_named(table: Path) -> None:
     table.write_text(TABLE.replace('"phi"', '"roll"'))
-    with pytest.raises(SourceError, match=r"log\.csv:1: no column roll\. Fix the table"):
+    with pytest.raises(SourceError, match=r"log\.csv: no column roll\. Fix the table"):
         samples(table.with_name("log.csv"), Options(columns=table))
 
 
@@ -127,7 +144,7 @@ def test_ranges_that_cannot_be_are_counted_and_empty_cells_are_none(
     log.write_text(log.read_text() + "\n".join([*rows, "1050;0;0;0;0;0;0;500;70000;x"]) + "\n")
     found = samples(log, Options(columns=table))["/cf1/range/cf2"]
     assert [s.fields["range_m"] for s in found] == pytest.approx([1.5, 0.009])
-    assert "2 ranges to cf2 left out: not over 0 and under 60 m" in capsys.readouterr().err
+    assert "left out: 2 ranges to cf2 that are not over 0 and under 60 m" in capsys.readouterr().err
 
 
 def test_units_that_cannot_be_are_doubted(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -231,8 +248,8 @@ def test_lines_out_of_order_are_sorted_and_the_last_may_be_cut(
     assert [s.time_ns for s in found] == [1_000_000_000, 1_010_500_000]
     assert [s.fields["height_m"] for s in found] == [0.5, 0.51]
     err = capsys.readouterr().err
-    assert "its lines are not in time order; sorted" in err
-    assert "its last line is cut short; left out" in err
+    assert "log.csv:3: rows are not in time order from here on; sorted" in err
+    assert "left out: 1 lines with fewer or more cells than the header" in err
 
 
 @pytest.mark.parametrize(
@@ -245,7 +262,7 @@ def test_times_are_whole_nanoseconds_of_63_bits(
     log = table.with_name("log.csv")
     log.write_text(f"{HEADER}\n{ROWS[0].replace('1000', cell, 1)}\n")
     if time_ns is None:
-        with pytest.raises(SourceError, match="before 1970 or after 2262"):
+        with pytest.raises(SourceError, match="is no time from 1970 to 2262"):
             samples(log, Options(columns=table))
     else:
         assert samples(log, Options(columns=table))["/cf1/height"][0].time_ns == time_ns
@@ -257,6 +274,7 @@ def test_a_folder_is_a_robot_per_file_by_its_name(table: Path) -> None:
     for name in ("a.csv", "b.CSV"):
         (folder / name).write_text(table.with_name("log.csv").read_text())
     (folder / "notes.txt").write_text("x")
+    (folder / "notes.csv").write_text("by,whom\nme,1\n")
     found = samples(folder, Options(columns=table, names={"a": "left"}))
     assert {topic.split("/")[1] for topic in found} - {"tf"} == {"left", "b"}
 
@@ -274,7 +292,6 @@ def test_columns_are_parted_by_what_stands_there_most(separator: str, table: Pat
     other = "," if separator != "," else ";"
     text = log.read_text().replace(";", separator).replace("note", f'"a{other}b"')
     log.write_text("\ufeff" + text, encoding="utf-8")
-    assert mapped_csv._parse_header(log)[1] == separator
     assert len(samples(log, Options(columns=table))["/cf1/height"]) == 2
 
 

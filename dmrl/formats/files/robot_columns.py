@@ -1,0 +1,132 @@
+"""Robots of text tables and their columns: a file, some columns or some rows for each robot."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dmrl.errors import SourceError
+from dmrl.formats.files.column_map import ANY_PEER, Column, ColumnMap
+from dmrl.formats.files.text_table import TextTable, name_missing, read_table
+from dmrl.terminal.left_out import leave_out
+from dmrl.terminal.progress import say
+
+
+@dataclass(frozen=True, slots=True)
+class RobotLog:
+    """Rows of one robot, and the column of each quantity and of the range to each peer.
+
+    ``missing`` holds the columns of the table that the file lacks.
+    """
+
+    robot: str
+    text: TextTable
+    columns: Mapping[str, Column]
+    ranges: Mapping[str, Column]
+    missing: frozenset[str]
+
+
+def read_robot_logs(files: Mapping[str, Path], table: ColumnMap) -> list[RobotLog]:
+    """Read the logs of all robots. Of several files, those without the columns are left out.
+
+    Parameters
+    ----------
+    files
+        Files by the robot of each, for files that name no robot.
+    table
+        Columns of the files.
+
+    Raises
+    ------
+    SourceError
+        If no file can be used, or a column is in none of them.
+    """
+    logs: list[RobotLog] = []
+    errors = []
+    for name, path in files.items():
+        try:
+            logs += _iter_robots(name, path, table)
+        except SourceError as e:
+            errors.append(e)
+    usable = [log for log in logs if "time" in log.columns]
+    if errors and not usable:
+        raise errors[0]
+    odd = [log.text.path for log in logs if log not in usable] if usable else []
+    reason = "files without the columns of the table"
+    leave_out(reason, next(iter([*errors, *odd]), ""), len(errors) + len(odd))
+    _check_missing(usable or logs)
+    return usable or logs
+
+
+def _iter_robots(name: str, path: Path, table: ColumnMap) -> Iterator[RobotLog]:
+    """Yield the log of each robot of a file; its names are in columns, in rows, or in none."""
+    plain = [column for column in table.names if "{" not in column]
+    text = read_table(path, plain, table.dialect)
+    if table.robot_column:
+        if table.robot_column not in text.columns:
+            raise SourceError(
+                f"{name_missing(path, [table.robot_column], text.columns)}. Fix [robot]"
+            )
+        cells = [cell.strip() for cell in text.columns[table.robot_column]]
+        for robot in sorted(set(cells)):
+            yield _resolve(robot, text.select(np.flatnonzero(np.array(cells) == robot)), table)
+        return
+    for robot in _find_robots(text, table) or [name]:
+        yield _resolve(robot, text, table)
+
+
+def _find_robots(text: TextTable, table: ColumnMap) -> list[str]:
+    """Return the robots that the names of columns tell: those that most columns are of."""
+    counts: dict[str, int] = {}
+    for column in table.columns.values():
+        for found in _match(column.name, text, "{robot}") if "{robot}" in column.name else ():
+            counts[found] = counts.get(found, 0) + 1
+    return sorted(robot for robot, n in counts.items() if 2 * n >= max(counts.values()))
+
+
+def _match(name: str, text: TextTable, placeholder: str) -> dict[str, str]:
+    """Return the columns whose name has this form, by what stands for the placeholder."""
+    form = re.escape(name).replace(re.escape(placeholder), "(.+)", 1)
+    form = form.replace(re.escape(placeholder), r"\1")
+    return {m[1]: column for column in text.columns if (m := re.fullmatch(form, column))}
+
+
+def _resolve(robot: str, text: TextTable, table: ColumnMap) -> RobotLog:
+    """Return the columns of a robot, by the names that the file has for them."""
+
+    def named(column: Column) -> Column:
+        return replace(column, name=column.name.replace("{robot}", robot))
+
+    columns = {key: named(column) for key, column in table.columns.items()}
+    ranges = {peer: named(column) for peer, column in table.ranges.items() if peer != robot}
+    if (any_peer := ranges.pop(ANY_PEER, None)) is not None:
+        taken = {column.name for column in columns.values()}
+        for peer, name in _match(any_peer.name, text, "{peer}").items():
+            if peer != robot and name not in taken:
+                ranges.setdefault(peer, replace(any_peer, name=name))
+    every = [*columns.values(), *ranges.values()]
+    missing = {c.name for c in every if c.name and c.name not in text.columns}
+    return RobotLog(
+        robot,
+        text,
+        {key: column for key, column in columns.items() if column.name not in missing},
+        {peer: column for peer, column in ranges.items() if column.name not in missing},
+        frozenset(missing),
+    )
+
+
+def _check_missing(logs: Sequence[RobotLog]) -> None:
+    """Raise SourceError if no robot has a column of the table.
+
+    A robot that has fewer columns than the others is reported.
+    """
+    nowhere = frozenset.intersection(*(log.missing for log in logs))
+    for log in logs:
+        if nowhere:
+            words = name_missing(log.text.path, nowhere, log.text.columns)
+            raise SourceError(f"{words}. Fix the table of columns")
+        if log.missing:
+            absent = ", ".join(sorted(log.missing))
+            say(f"{log.text.path}: no column {absent}, which other robots have")

@@ -1,0 +1,328 @@
+"""Tables in text files, as loggers, spreadsheets and pandas write them.
+
+Encoding, separator, decimal mark, comments and the line of the header are found; a `Dialect` can
+state them. Every row keeps the number of its line. What cannot be used is left out and counted.
+"""
+
+import csv
+import re
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+
+from dmrl.errors import SourceError
+from dmrl.formats.clocks import Ints
+from dmrl.formats.files.text_cells import DATE, is_number, parse_cells, parse_time_ns
+from dmrl.geometry.frames import Array
+from dmrl.terminal.left_out import leave_out
+from dmrl.terminal.progress import say
+
+TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
+SEPARATORS = (",", ";", "\t", "|", " ")
+"""Separators by preference. A space stands for any white space."""
+COMMENT_MARKS = ("#", "%", "//")
+HEADER_LINES_MAX = 200
+"""Lines in which the header is searched."""
+BYTE_ORDER_MARKS = (
+    (b"\xff\xfe\0\0", "utf-32"),
+    (b"\0\0\xfe\xff", "utf-32"),
+    (b"\xef\xbb\xbf", "utf-8-sig"),
+    (b"\xff\xfe", "utf-16"),
+    (b"\xfe\xff", "utf-16"),
+)
+DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*")
+UNIT_SUFFIX = re.compile(r"\s*[\[(<{/]\s*([^\])>}]+?)\s*[\])>}]?\s*")
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """Form of a text file. An empty field is found in the file.
+
+    Parameters
+    ----------
+    separator
+        Character between cells; a space: any white space.
+    decimal
+        Decimal mark, a point or a comma.
+    encoding
+        Encoding, by its name in Python.
+    comment
+        Mark at the beginning of a comment.
+    """
+
+    separator: str = ""
+    decimal: str = ""
+    encoding: str = ""
+    comment: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class TextTable:
+    """Rows of a text file: column names, line number of each row, and cells by column.
+
+    ``units`` holds what the header says about the unit of a column.
+    """
+
+    path: Path
+    columns: dict[str, list[str]]
+    lines: list[int]
+    units: dict[str, str] = field(default_factory=dict)
+    has_decimal_commas: bool = False
+
+    def name_row(self, row: int) -> str:
+        """Return the file and line of a row."""
+        return f"{self.path}:{self.lines[row]}"
+
+    def select(self, rows: Collection[int]) -> "TextTable":
+        """Return a table of some rows."""
+        columns = {name: [cells[k] for k in rows] for name, cells in self.columns.items()}
+        return replace(self, columns=columns, lines=[self.lines[k] for k in rows])
+
+    def parse_numbers(self, name: str, *, used: bool = True) -> Array | None:
+        """Parse a column to (N,) numbers, NaN where a cell has none; None: it is a text column.
+
+        Cells of a used column that are neither numbers nor empty are counted as left out.
+        """
+        cells = self.columns[name]
+        if self.has_decimal_commas:
+            cells = [cell.replace(",", ".") for cell in cells]
+        try:
+            return np.array([float(cell) for cell in cells])
+        except ValueError:
+            values, bad = parse_cells(cells)
+        if bad and not (used and np.isfinite(values).any()):
+            return None
+        if bad:
+            leave_out(f"cells of {name!r} that are no number", self.name_row(bad[0]), len(bad))
+        return values
+
+    def parse_times(self, name: str, scale: float) -> tuple[Ints, list[int]]:
+        """Parse (N,) times, in whole nanoseconds, and the rows that have one.
+
+        Numbers are times in a unit of ``scale`` nanoseconds; dates and times of the day are ISO
+        8601. A float has too few digits for nanoseconds since 1970, so digits are kept exactly.
+        """
+        cells = self.columns[name]
+        if any(found and not found[8] for found in map(DATE.fullmatch, map(str.strip, cells[:1]))):
+            say(f"{self.path}: times without a zone are read as UTC. Write them with one, as in Z")
+        found = [parse_time_ns(cell, scale, self.has_decimal_commas) for cell in cells]
+        rows = [k for k, time_ns in enumerate(found) if time_ns is not None]
+        lost = sorted(set(range(len(cells))) - set(rows))
+        if not rows:
+            raise SourceError(
+                f"{self.name_row(0)}: {cells[0]!r} in {name} is no time from 1970 to 2262, nor are "
+                "all others. Check the column and its unit"
+            )
+        if lost:
+            reason = "rows without a time, or with one before 1970 or after 2262"
+            leave_out(reason, self.name_row(lost[0]), len(lost))
+        return np.array([found[k] for k in rows], np.int64), rows
+
+
+def read_table(
+    path: Path, wanted: Collection[str] = (), dialect: Dialect | None = None
+) -> TextTable:
+    """Read the table in a text file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    wanted
+        Names of columns, by which the header is found. They may lack the unit that follows the name
+        in the header, as ``roll`` of ``roll [deg]``.
+    dialect
+        Form of the file, as far as it is known.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read, or has no header or no row.
+    """
+    dialect = dialect or Dialect()
+    lines = _read_lines(path, dialect.encoding)
+    head, separator, names = _find_header(path, lines, wanted, dialect)
+    units = {}
+    for k, name in enumerate(names):
+        known = next((w for w in wanted if w != name and _strip_unit(name, w) is not None), None)
+        if known and known not in names:
+            units[known], names[k] = _strip_unit(name, known) or "", known
+    marks = (dialect.comment,) if dialect.comment else COMMENT_MARKS
+    body = [(n, _cut_comment(line, marks)) for n, line in lines[head + 1 :]]
+    body = [(n, line) for n, line in body if line.strip()]
+    numbers, rows = _split_rows(path, body, separator, names)
+    if rows and not any(is_number(cell) for cell in rows[0]):
+        units |= {name: cell.strip() for name, cell in zip(names, rows[0], strict=True)}
+        numbers, rows = numbers[1:], rows[1:]  # a line of units
+    if not rows:
+        raise SourceError(f"{path} has no rows below its header. Pass another file")
+    columns = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
+    has_commas = dialect.decimal == "," or (not dialect.decimal and _find_commas(rows))
+    if has_commas and not dialect.decimal:
+        say(f"{path}: numbers are read with decimal commas. [file] decimal in the table decides it")
+    return TextTable(path, columns, numbers, units, has_commas)
+
+
+def read_names(path: Path, wanted: Collection[str]) -> list[str]:
+    """Return the names of the columns, from the first 64 KiB of a file; none if it is no table."""
+    with path.open("rb") as stream:
+        data = stream.read(1 << 16)
+    try:
+        lines = _number_lines(_decode(path, data, "", whole=False))
+        return _find_header(path, lines, wanted, Dialect())[2]
+    except SourceError:
+        return []
+
+
+def _read_lines(path: Path, encoding: str) -> list[tuple[int, str]]:
+    try:
+        return _number_lines(_decode(path, path.read_bytes(), encoding))
+    except (OSError, LookupError, UnicodeError) as e:
+        raise SourceError(f"{path} cannot be read as text: {e}. Save it as UTF-8") from None
+
+
+def _number_lines(text: str) -> list[tuple[int, str]]:
+    """Return the lines that are not blank, with their numbers."""
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    return [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
+
+
+def _decode(path: Path, data: bytes, encoding: str, *, whole: bool = True) -> str:
+    """Decode a file by its byte-order mark, else as UTF-8, else as Latin-1."""
+    if not encoding:
+        encoding = next((name for mark, name in BYTE_ORDER_MARKS if data.startswith(mark)), "")
+    if not encoding and data[1:400:2].count(0) > 100:
+        encoding = "utf-16-le"
+    if encoding:
+        return data.decode(encoding, "strict" if whole else "ignore")
+    try:
+        return data.decode("utf-8", "strict" if whole else "ignore")
+    except UnicodeDecodeError:
+        say(f"{path}: is not UTF-8; read as Latin-1. [file] encoding in the table decides it")
+        return data.decode("latin-1")
+
+
+def _find_header(
+    path: Path, lines: list[tuple[int, str]], wanted: Collection[str], dialect: Dialect
+) -> tuple[int, str, list[str]]:
+    """Return the place of the header among the lines, the separator, and the names.
+
+    It is the line with most of the wanted names; without any, the first that is no comment, or the
+    comment above it if that line is of numbers. A header may be a comment itself.
+    """
+    separators = (dialect.separator,) if dialect.separator else SEPARATORS
+    marks = (dialect.comment,) if dialect.comment else COMMENT_MARKS
+    best: tuple[int, int, str, list[str]] = (0, 0, "", [])
+    for place, (_, line) in enumerate(lines[:HEADER_LINES_MAX]):
+        for separator in separators if wanted else ():
+            for text in dict.fromkeys((line, _uncomment(line, marks))):
+                names = _split(text, separator)
+                score = sum(any(_is_named(name, w) for name in names) for w in set(wanted))
+                if score > best[0]:
+                    best = score, place, separator, names
+        if best[0] == len(set(wanted)) > 0:
+            break
+    if best[0]:
+        return best[1], best[2], _tidy(path, best[3], wanted)
+    plain = [k for k, (_, line) in enumerate(lines) if not line.lstrip().startswith(marks)]
+    if not plain:
+        raise SourceError(f"{path} has no line of names. Pass another file")
+    place = plain[0]
+    separator = max(separators, key=lambda s: len(_split(lines[place][1], s)))
+    if place and all(map(is_number, _split(lines[place][1], separator))):
+        place -= 1
+    names = _split(_uncomment(lines[place][1], marks), separator)
+    return place, separator, _tidy(path, names, wanted)
+
+
+def _uncomment(line: str, marks: tuple[str, ...]) -> str:
+    return line.lstrip().lstrip("".join(marks)) if line.lstrip().startswith(marks) else line
+
+
+def _cut_comment(line: str, marks: tuple[str, ...]) -> str:
+    """Cut a comment: from a mark at the beginning, or behind a space in a line without quotes."""
+    if line.lstrip().startswith(marks):
+        return ""
+    for mark in marks if '"' not in line else ():
+        line = line.partition(f" {mark}")[0]
+    return line
+
+
+def _split(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        line = " ".join(line.split())
+    try:
+        names = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    except csv.Error:
+        return []
+    return [name.strip().strip("\ufeff'\"") for name in names]
+
+
+def _is_named(name: str, wanted: str) -> bool:
+    return name == wanted or _strip_unit(name, wanted) is not None
+
+
+def _strip_unit(name: str, wanted: str) -> str | None:
+    """Return the unit that follows a wanted name in a header, as in ``roll [deg]``; or None."""
+    if not name.startswith(wanted) or name == wanted:
+        return None
+    found = UNIT_SUFFIX.fullmatch(name[len(wanted) :])
+    return found[1] if found else None
+
+
+def _tidy(path: Path, names: list[str], wanted: Collection[str]) -> list[str]:
+    """Return names that differ: a repeated one gets a number, an empty one its place."""
+    found: list[str] = []
+    for k, name in enumerate(names):
+        if name in found and name in wanted:
+            raise SourceError(f"{path}: a column appears twice, {name!r}. Rename one")
+        name = name or f"column_{k + 1}"
+        while name in found:
+            name += "_"
+        found.append(name)
+    return found
+
+
+def _split_rows(
+    path: Path, body: list[tuple[int, str]], separator: str, names: list[str]
+) -> tuple[list[int], list[list[str]]]:
+    """Split lines into rows with as many cells as there are names; return their lines and cells."""
+    texts = [line for _, line in body]
+    if separator == " ":
+        texts = [" ".join(line.split()) for line in texts]
+    reader = csv.reader(texts, delimiter=separator, skipinitialspace=True)
+    try:
+        rows = [(body[reader.line_num - 1][0], row) for row in reader]
+    except csv.Error as e:
+        line = body[min(reader.line_num, len(body)) - 1][0]
+        raise SourceError(f"{path}:{line} cannot be read as CSV: {e}. Fix the line") from None
+    width = len(names)
+    if rows and all(len(row) == width + 1 for _, row in rows):
+        ends_empty = all(not row[-1].strip() for _, row in rows)
+        # A separator at the end of each row, or R's names of rows, which have no name.
+        rows = [(number, row[:-1] if ends_empty else row[1:]) for number, row in rows]
+    kept = [(number, row) for number, row in rows if len(row) == width]
+    repeated = [number for number, row in kept if [cell.strip() for cell in row] == names]
+    kept = [(number, row) for number, row in kept if number not in set(repeated)]
+    odd = [number for number, row in rows if len(row) != width]
+    if odd:
+        reason = "lines with fewer or more cells than the header"
+        leave_out(reason, f"{path}:{odd[0]}", len(odd))
+    return [number for number, _ in kept], [row for _, row in kept]
+
+
+def _find_commas(rows: list[list[str]]) -> bool:
+    """Return whether numbers have a decimal comma: some cells do, and no number has a point."""
+    cells = [cell for row in rows[:HEADER_LINES_MAX] for cell in row]
+    commas = sum(bool(DECIMAL_COMMA.fullmatch(cell)) for cell in cells)
+    return commas > 0 and not any("." in cell and is_number(cell) for cell in cells)
+
+
+def name_missing(path: Path, missing: Collection[str], names: Collection[str]) -> str:
+    """Return the words for columns that a file does not have, with similar ones."""
+    near = {m: get_close_matches(m, names, n=1) for m in sorted(missing)}
+    hints = [f"did you mean {found[0]} for {m}?" for m, found in near.items() if found]
+    return f"{path}: no column {', '.join(sorted(missing))}" + "".join(f"; {h}" for h in hints)

@@ -1,0 +1,240 @@
+"""Tables in text files, as pandas, R, spreadsheets and loggers write them."""
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats.base import Options
+from dmrl.formats.files import mapped_csv
+from dmrl.formats.files.text_table import Dialect, read_table
+from dmrl.samples.sample import Sample
+from dmrl.terminal.left_out import count_left_out
+
+WANTED = ("t", "roll", "pitch", "d2")
+TIME_S = np.arange(200) / 50
+VALUES = np.column_stack(
+    [TIME_S, 0.1 * np.sin(TIME_S), 0.1 * np.cos(TIME_S), 2 + np.sin(TIME_S * 3)]
+).round(6)
+
+
+def plain(separator: str = ",", decimal: str = ".", header: str = "", before: str = "") -> str:
+    """The table, written cell by cell."""
+    rows = [separator.join(f"{x:.6f}".replace(".", decimal) for x in row) for row in VALUES]
+    return before + "\n".join([header or separator.join(WANTED), *rows]) + "\n"
+
+
+def by_pandas(**how: object) -> str:
+    """The table, as pandas writes it."""
+    pandas = pytest.importorskip("pandas")
+    text = io.StringIO()
+    pandas.DataFrame(VALUES, columns=list(WANTED)).to_csv(text, **how)
+    return text.getvalue()
+
+
+def with_note(text: str) -> str:
+    """Each row ends with a quoted text of two lines that has separators in it."""
+    first, *rows = text.splitlines()
+    return "\n".join([first + ",note", *(f'{row},"a, #b\n{k}"' for k, row in enumerate(rows))])
+
+
+TEXTS: dict[str, Callable[[], str]] = {
+    "plain": plain,
+    "semicolon": lambda: plain(";"),
+    "tab": lambda: plain("\t"),
+    "pipe": lambda: plain("|"),
+    "space": lambda: plain(" "),
+    "columns of spaces": lambda: plain("   "),
+    "decimal comma": lambda: plain(";", ","),
+    "decimal comma, tab": lambda: plain("\t", ","),
+    "comments above": lambda: plain(before="# a log\n#of two, robots\n\n"),
+    "comments of percent": lambda: plain(before="% a log\n"),
+    "comments of C": lambda: plain(before="// a log\n"),
+    "header is a comment": lambda: plain(header="# t,roll,pitch,d2"),
+    "header as rostopic's": lambda: plain(header="%t,roll,pitch,d2"),
+    "comments between": lambda: plain().replace("\n1.0", "\n# a pause\n1.0"),
+    "comments behind": lambda: plain().replace("\n1.0", " # a pause\n1.0"),
+    "title above": lambda: plain(before="Flight of Monday\n\n"),
+    "quoted header": lambda: plain(header='"t","roll","pitch","d2"'),
+    "spaces in header": lambda: plain(header="t, roll ,  pitch, d2"),
+    "units in header": lambda: plain(header="t [s],roll [rad],pitch (rad),d2 / m"),
+    "a line of units": lambda: plain(header="t,roll,pitch,d2\ns,rad,rad,m"),
+    "separator at the end": lambda: plain().replace("\n", ",\n"),
+    "separator at the end of rows": lambda: plain().replace("\n", ",\n").replace(",\n", "\n", 1),
+    "names of rows, as R": lambda: by_pandas(index_label=False),
+    "index of pandas": by_pandas,
+    "all quoted": lambda: by_pandas(index=False, quoting=1),
+    "blank lines": lambda: plain().replace("\n", "\n\n"),
+    "lines of Windows": lambda: plain().replace("\n", "\r\n"),
+    "lines of old Macs": lambda: plain().replace("\n", "\r"),
+    "text of two lines": lambda: with_note(plain()),
+    "no end of line": lambda: plain().rstrip("\n"),
+}
+
+
+@pytest.mark.parametrize("form", TEXTS)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_every_form_gives_the_same_rows(form: str, encoding: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes(TEXTS[form]().encode(encoding))
+    with count_left_out() as left_out:
+        table = read_table(path, WANTED)
+        time_ns, rows = table.parse_times("t", 1e9)
+        found = np.column_stack([table.parse_numbers(name) for name in WANTED])
+    assert left_out.counts == {}
+    np.testing.assert_array_equal(found, VALUES)
+    assert time_ns.tolist() == np.rint(TIME_S * 1e9).astype(int).tolist()
+    assert rows == list(range(200))
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (plain(before="# Flug über\n").encode("latin-1"), "is not UTF-8; read as Latin-1"),
+        (plain().encode("utf-16-le"), ""),
+        (plain().encode("utf-32"), ""),
+        (plain(";", ",").encode(), "read with decimal commas"),
+    ],
+)
+def test_what_is_guessed_is_said_with_what_decides_it(
+    data: bytes, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.csv").write_bytes(data)
+    found = read_table(tmp_path / "a.csv", WANTED).parse_numbers("d2")
+    np.testing.assert_array_equal(found, VALUES[:, 3])
+    err = capsys.readouterr().err
+    assert said in err and bool(said) == ("[file]" in err)
+
+
+def test_a_dialect_decides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.csv").write_bytes(plain(";", ",", before="! über\n").encode("cp1252"))
+    dialect = Dialect(";", ",", "cp1252", "!")
+    found = read_table(tmp_path / "a.csv", WANTED, dialect).parse_numbers("d2")
+    np.testing.assert_array_equal(found, VALUES[:, 3])
+    assert capsys.readouterr().err == ""
+    with pytest.raises(SourceError, match=r"a\.csv cannot be read as text.*Save it as UTF-8"):
+        read_table(tmp_path / "a.csv", WANTED, Dialect(encoding="none-such"))
+
+
+@pytest.mark.parametrize("missing", ["", "NA", "n/a", "NaN", "nan", "null", "None", "-", "?", " "])
+def test_missing_values_are_no_numbers_and_not_counted(missing: str, tmp_path: Path) -> None:
+    lines = plain().splitlines()
+    for k in range(3, 200, 7):
+        lines[k] = ",".join([*lines[k].split(",")[:3], missing])
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    with count_left_out() as left_out:
+        found = read_table(tmp_path / "a.csv", WANTED).parse_numbers("d2")
+    assert found is not None and np.flatnonzero(np.isnan(found)).tolist() == list(range(2, 199, 7))
+    assert left_out.counts == {}
+
+
+def test_what_cannot_be_used_is_counted_with_its_line(tmp_path: Path) -> None:
+    lines = plain(before="# a log\n").splitlines()
+    lines[10] = "0.18,0.1"
+    lines[12] = lines[12].rsplit(",", 1)[0] + ",far"
+    lines[14] = "later,0,0,2"
+    (tmp_path / "a.csv").write_text("\n".join([*lines, lines[1], *lines[-1:]]) + "\n")
+    with count_left_out() as left_out:
+        table = read_table(tmp_path / "a.csv", WANTED)
+        table.parse_numbers("d2")
+        table.parse_times("t", 1e9)
+    assert dict(left_out.counts) == {
+        "lines with fewer or more cells than the header": 1,
+        "cells of 'd2' that are no number": 1,
+        "rows without a time, or with one before 1970 or after 2262": 1,
+    }
+    assert list(left_out.first.values()) == [f"{tmp_path / 'a.csv'}:{n}" for n in (11, 13, 15)]
+
+
+@pytest.mark.parametrize(
+    ("cells", "times_s"),
+    [
+        (["2024-05-01T12:00:00Z", "2024-05-01T12:00:00.020Z"], (1714564800, 0.02)),
+        (["2024-05-01 12:00:00.5", "2024-05-01 12:00:01"], (1714564800.5, 0.5)),
+        (["2024-05-01T14:00:00,25+02:00", "2024-05-01T14:00:01+0200"], (1714564800.25, 0.75)),
+        (["2024/05/01 12:00:00.123456789", "2024/05/01 12:00:01.123456789"], (1714564800, 1)),
+        (["12:00:00.5", "12:00:01"], (43200.5, 0.5)),
+        (["1714564800123456789e-9", "1714564801.123456789"], (1714564800, 1)),
+    ],
+)
+def test_dates_are_times(cells: list[str], times_s: tuple[float, float], tmp_path: Path) -> None:
+    quoted = "\n".join(f'"{cell}",1' for cell in cells)
+    (tmp_path / "a.csv").write_text(f"t,d2\n{quoted}\n")
+    time_ns, _ = read_table(tmp_path / "a.csv", ["t", "d2"]).parse_times("t", 1e9)
+    assert time_ns[0] * 1e-9 == pytest.approx(times_s[0], abs=0.2)
+    assert (time_ns[1] - time_ns[0]) * 1e-9 == pytest.approx(times_s[1], abs=1e-9)
+
+
+def test_binary_files_are_no_tables(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for k in range(50):
+        (tmp_path / "a.csv").write_bytes(rng.bytes(int(rng.integers(0, 3000))))
+        try:
+            read_table(tmp_path / "a.csv", WANTED)
+        except SourceError as e:
+            assert "a.csv" in str(e) and "\n" not in str(e), k
+
+
+TABLE = """
+[time]
+name = "t"
+unit = "s"
+[roll]
+name = "roll"
+unit = "rad"
+[pitch]
+name = "pitch"
+unit = "rad"
+[yaw_rate]
+name = "r"
+unit = "rad/s"
+[range.cf2]
+name = "d2"
+unit = "m"
+"""
+
+
+def samples(folder: Path, **options: object) -> dict[str, list[Sample]]:
+    """Samples of a log by topic."""
+    found: dict[str, list[Sample]] = {}
+    given = Options(columns=folder / "map.toml", **options)  # type: ignore[arg-type]
+    for sample in mapped_csv.load_content(folder / "log.csv", given).samples:
+        found.setdefault(sample.topic, []).append(sample)
+    return found
+
+
+def test_a_unit_in_the_header_that_is_not_the_table_s_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "map.toml").write_text(TABLE)
+    (tmp_path / "log.csv").write_text("t [ms],roll (rad),pitch [°],r,d2\n1,0,0,0,2\n2,0,0,0,2.5\n")
+    samples(tmp_path)
+    err = capsys.readouterr().err
+    assert "the header has t in ms, the table in s" in err
+    assert "the header has pitch in deg, the table in rad" in err
+    assert "roll" not in err
+
+
+def test_two_flights_in_one_file_are_refused_with_the_line(tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text(TABLE)
+    flight = [f"{0.02 * k:.2f},0,0,0,2.{k:03d}" for k in range(300)]
+    (tmp_path / "log.csv").write_text("\n".join(["# a", "t,roll,pitch,r,d2", *flight, *flight]))
+    with pytest.raises(SourceError, match=r"log\.csv:303: time goes back from 5\.98 s to 0 s"):
+        samples(tmp_path)
+
+
+@pytest.mark.parametrize(("held", "count", "counted"), [("", 20, 180), ("true", 20, 0)])
+def test_held_ranges_count_once(held: str, count: int, counted: int, tmp_path: Path) -> None:
+    key = f"held = {held}\n" if held else ""
+    (tmp_path / "map.toml").write_text(TABLE + key)
+    rows = [f"{0.02 * k:.2f},0,0,0,{2 + 0.37 * np.sin(k // 10):.3f}" for k in range(200)]
+    (tmp_path / "log.csv").write_text("\n".join(["t,roll,pitch,r,d2", *rows]))
+    with count_left_out() as left_out:
+        found = samples(tmp_path)["/cf1/range/cf2"]
+    assert [s.time_ns for s in found] == [k * 200_000_000 for k in range(count)]
+    assert sum(left_out.counts.values()) == counted
+    (tmp_path / "map.toml").write_text(TABLE + "held = false\n")
+    assert len(samples(tmp_path)["/cf1/range/cf2"]) == 200
