@@ -1,4 +1,4 @@
-"""Plug-ins of other packages: formats, networks and commands, found by their entry points.
+"""Plug-ins of other packages: formats, networks, commands and pilots, found by their entry points.
 
 In the package's pyproject.toml::
 
@@ -8,6 +8,8 @@ In the package's pyproject.toml::
     their-nano = "their_package.network:TheirNano" # a subclass of dmrl.plugins.Network
     [project.entry-points."dmrl.stages"]
     smooth = "their_package.smooth"                # a module with command(), as in dmrl/stages
+    [project.entry-points."dmrl.pilots"]
+    patrol = "their_package.patrol:Patrol"         # a subclass of dmrl.plugins.Pilot
 
 A plug-in is imported when it is used by its name (a format: when no format of dmrl recognises a
 source). A name of dmrl's own stays dmrl's. An error in a plug-in becomes a `PluginError` that
@@ -29,13 +31,14 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 FORMATS, NETWORKS, STAGES = "dmrl.formats", "dmrl.networks", "dmrl.stages"
+PILOTS = "dmrl.pilots"
 """The groups of entry points."""
 PLUGIN_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
 
 @dataclass(frozen=True, slots=True)
 class Plugin:
-    """A format, network or command of another package, which is not imported yet.
+    """A format, network, command or pilot of another package, which is not imported yet.
 
     Parameters
     ----------

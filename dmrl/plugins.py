@@ -8,6 +8,11 @@ from typing import TYPE_CHECKING
 from dmrl.guards.lazy_names import import_lazily
 
 if TYPE_CHECKING:
+    from dmrl.flight.pilot import Command as Command
+    from dmrl.flight.pilot import Observation as Observation
+    from dmrl.flight.pilot import PeerTrack as PeerTrack
+    from dmrl.flight.pilot import Pilot as Pilot
+    from dmrl.flight.pilot import Task as Task
     from dmrl.formats.base import Content as Content
     from dmrl.formats.base import Format as Format
     from dmrl.formats.base import Options as Options
@@ -26,12 +31,17 @@ if TYPE_CHECKING:
 PLACES = {
     "Closing": "dmrl.terminal.closing",
     "Columns": "dmrl.samples.sample",
+    "Command": "dmrl.flight.pilot",
     "Content": "dmrl.formats.base",
     "ConvNorm": "dmrl.learn.networks.architectures",
     "Format": "dmrl.formats.base",
     "Network": "dmrl.learn.networks.architectures",
+    "Observation": "dmrl.flight.pilot",
     "Options": "dmrl.formats.base",
+    "PeerTrack": "dmrl.flight.pilot",
+    "Pilot": "dmrl.flight.pilot",
     "Sample": "dmrl.samples.sample",
+    "Task": "dmrl.flight.pilot",
     "build_image": "dmrl.samples.sample",
     "merge_by_time": "dmrl.samples.flight",
     "to_nanoseconds": "dmrl.samples.flight",

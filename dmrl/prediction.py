@@ -81,6 +81,11 @@ def describe_prediction(
     made = build_provenance(
         "predict", settings, (model, recording), libraries=BACKEND_PACKAGES[backend]
     )
+    return describe_weights(made, model, detector)
+
+
+def describe_weights(made: Provenance, model: Path, detector: Detector) -> Provenance:
+    """Return a provenance, whose first input is a model, with its threshold and weights alone."""
     # It stands beside the weights, and in every message.
     made = replace(made, settings={**made.settings, "model_threshold": detector.threshold})
     if model.is_dir() and detector.file is not None:
@@ -143,13 +148,14 @@ def _iter_messages(
         for found, grids in detect_images([rgb for _, rgb in batch], detector, options):
             for k in range(len(found.count)):
                 raw, _ = next(raw_messages)
-                made = _to_detections(found, k, detector.threshold)
+                fields = detection_fields(found, k, detector.threshold)
                 tally["believed"] += sum(
-                    d.confidence >= detector.threshold for d in made.detections
+                    d["confidence"] >= detector.threshold for d in fields["detections"]
                 )
+                made = message_class("Detections")(**fields)
                 robot = (topics.parse_topic(topics.CAMERA_IMAGE, raw.topic) or {})["robot"]
                 yield TimedMessage(raw.time_ns, topics.DETECTIONS(robot), made, raw.publish_ns)
-                grid = _to_grid_map(grids, k, detector.stride_px)
+                grid = message_class("GridMap")(**grid_fields(grids, k, detector.stride_px))
                 yield TimedMessage(raw.time_ns, topics.GRID(robot), grid, raw.publish_ns)
     if total and not tally["images"]:
         raise RecordingError(f"{held.path}: no image can be decoded. Restore the recording")
@@ -206,19 +212,21 @@ def _name_image(recording: Path, image: RawMessage) -> str:
     return f"{recording}: the image of {image.topic} at {image.time_ns} ns"
 
 
-def _to_detections(found: Detections, image: int, threshold: float) -> Any:
+def detection_fields(found: Detections, image: int, threshold: float) -> dict[str, Any]:
+    """Return the fields of the Detections of the image with this number."""
     columns = [getattr(found, name)[image, : found.count[image]] for name in DETECTION_COLUMNS]
     rows = zip(*(column.tolist() for column in columns), strict=True)
     detections = [dict(zip(DETECTION_COLUMNS, row, strict=True)) for row in rows]
-    return message_class("Detections")(detections=detections, threshold=threshold)
+    return {"detections": detections, "threshold": threshold}
 
 
-def _to_grid_map(grids: Grids, image: int, stride_px: int) -> Any:
+def grid_fields(grids: Grids, image: int, stride_px: int) -> dict[str, Any]:
+    """Return the fields of the GridMap of the image with this number."""
     maps = np.stack((grids.confidence[image], grids.depth_m[image]))
-    return message_class("GridMap")(
-        rows=maps.shape[1],
-        cols=maps.shape[2],
-        channels=("confidence", "depth_m"),
-        data=maps.astype("<f4").tobytes(),
-        stride_px=stride_px,
-    )
+    return {
+        "rows": maps.shape[1],
+        "cols": maps.shape[2],
+        "channels": ("confidence", "depth_m"),
+        "data": maps.astype("<f4").tobytes(),
+        "stride_px": stride_px,
+    }

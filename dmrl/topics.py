@@ -150,6 +150,7 @@ LABELS = RobotTopic("/{robot}/labels")
 DETECTIONS = RobotTopic("/{robot}/detections")
 GRID = RobotTopic("/{robot}/detections/grid")
 TRACKS = RobotTopic("/{robot}/tracks")
+COMMAND = RobotTopic("/{robot}/command")
 MASKS = RobotTopic("/{robot}/camera/masks")
 DEPTHS = RobotTopic("/{robot}/camera/depth")
 POSE = RobotTopic("/{robot}/pose")
@@ -180,9 +181,18 @@ TOPICS = (
     ),
     Topic(MASKS, "foxglove.CompressedImage", "image", "number of the peer", "per image", "render"),
     Topic(DEPTHS, "foxglove.CompressedImage", "image", "png, mm", "per image", "render"),
-    Topic(DETECTIONS, "dmrl.v1.Detections", "image", "px, m", "per image", "predict"),
-    Topic(GRID, "dmrl.v1.GridMap", "image grid", "0..1, m", "per image", "predict, convert"),
-    Topic(TRACKS, "dmrl.v1.Tracks", "<robot>/horizontal", "m, m/s", "per image", "track"),
+    Topic(DETECTIONS, "dmrl.v1.Detections", "image", "px, m", "per image", "predict, fly"),
+    Topic(GRID, "dmrl.v1.GridMap", "image grid", "0..1, m", "per image", "predict, fly, convert"),
+    Topic(TRACKS, "dmrl.v1.Tracks", "<robot>/horizontal", "m, m/s", "per image", "track, fly"),
+    Topic(
+        COMMAND,
+        "dmrl.v1.Command",
+        "<robot>/horizontal",
+        "m/s, rad/s",
+        "20 Hz",
+        "fly",
+        curve=PlotSpec("commands, m/s", ("vx_mps", "vy_mps", "vz_mps")),
+    ),
     Topic(
         ATTITUDE,
         "dmrl.v1.Attitude",
@@ -287,6 +297,12 @@ def parse_topic(pattern: str, topic: str) -> dict[str, str] | None:
 def find_topic(topic: str) -> Topic | None:
     """Return the table's row for a topic, or None for a topic that is not dmrl's."""
     return next((row for row in TOPICS if parse_topic(row.pattern, topic) is not None), None)
+
+
+def find_pattern(topic: str) -> str:
+    """Return the pattern of a topic; the topic itself if it is not dmrl's."""
+    row = find_topic(topic)
+    return topic if row is None else row.pattern
 
 
 def list_robots(topics: list[str] | tuple[str, ...], pattern: str = CAMERA_IMAGE) -> list[str]:

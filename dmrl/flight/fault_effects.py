@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 
 from dmrl.flight.faults import FaultEvent
-from dmrl.flight.flight_arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth
+from dmrl.flight.flight_arrays import RATE_HZ, Clock, Ranges, RobotLog
 from dmrl.flight.trajectories import Motion
 from dmrl.geometry.frames import Array
 
@@ -69,9 +69,9 @@ def apply_clock_faults(clock: Clock, faults: Sequence[FaultEvent]) -> Clock:
     return clock
 
 
-def apply_sensor_fault(rng: Generator, log: RobotLog, truth: Truth, event: FaultEvent) -> RobotLog:
-    """Apply a sensor fault to a robot's log. Missing measurements are NaN."""
-    at, amount = event.is_active(truth.time_s), event.fault.amount
+def apply_sensor_fault(rng: Generator, log: RobotLog, time_s: Array, event: FaultEvent) -> RobotLog:
+    """Apply a sensor fault to a robot's log with true times (N,). Missing measurements are NaN."""
+    at, amount = event.is_active(time_s), event.fault.amount
     match event.fault.kind:
         case "yaw_rate_bias":
             return replace(log, yaw_rate_radps=log.yaw_rate_radps + amount * at)
@@ -93,7 +93,7 @@ def apply_sensor_fault(rng: Generator, log: RobotLog, truth: Truth, event: Fault
             }
             return replace(log, **silent)
         case "crash":
-            since = np.maximum(truth.time_s - event.windows_s[0, 0], 0.0)
+            since = np.maximum(time_s - event.windows_s[0, 0], 0.0)
             speed, way = (
                 amount * (1 - np.exp(-since / DIVERGENCE_TIME_CONSTANT_S)),
                 rng.uniform(-np.pi, np.pi),

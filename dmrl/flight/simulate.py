@@ -1,6 +1,6 @@
 """Simulation of a whole flight from a scenario, a noise preset and a seed."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 
@@ -10,7 +10,7 @@ from numpy.random import Generator
 from dmrl.errors import SettingError
 from dmrl.flight import fault_effects, sensors, trajectories
 from dmrl.flight.faults import END_KINDS, Fault, FaultEvent, check_faults, schedule_fault
-from dmrl.flight.flight_arrays import RATE_HZ, Clock, Flight
+from dmrl.flight.flight_arrays import RATE_HZ, Clock, Flight, Ranges, RobotLog, Truth
 from dmrl.flight.noise import Noise
 from dmrl.flight.trajectories import TRAJECTORIES, Motion, Start, Trajectory
 from dmrl.geometry.frames import Array
@@ -18,6 +18,10 @@ from dmrl.geometry.frames import Array
 ROBOTS_MAX = 20
 MEAN_HEIGHT_M = 1.0
 HEIGHT_SPREAD_M = 0.25
+HEIGHT_SWING_M, HEIGHT_SWING_S = 0.05, (15.0, 30.0)
+"""Amplitude and range of the period of a robot's height."""
+EIGHT_SWING_M, EIGHT_SWING_S = 0.15, 11.0
+"""Amplitude and period of the height of a robot that flies a figure of eight."""
 START_SPACING_M = 1.5
 
 
@@ -35,17 +39,38 @@ class Scenario:
         One of ``TRAJECTORIES``.
     yaw_spread_rad
         Initial yaws are uniform within plus and minus this. That of the first robot is 0.
+    flown
+        The first robots, so many, fly commands; see `SteppedFlight`.
+    distance_m
+        Distance that they keep from the first robot that flies its trajectory, their leader.
     """
 
     robots: int = 2
     duration_s: float = 100.0
     trajectory: Trajectory = "in_view"
     yaw_spread_rad: float = float(np.pi)
+    flown: int = 0
+    distance_m: float = 0.7
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the robots."""
         return tuple(f"cf{k + 1}" for k in range(self.robots))
+
+    @property
+    def leader(self) -> str:
+        """First robot that flies its trajectory; empty if all fly commands."""
+        return "".join(self.names[self.flown : self.flown + 1])
+
+    @property
+    def samples(self) -> int:
+        """Samples of the flight at 100 Hz."""
+        return round(self.duration_s * RATE_HZ) + 1
+
+    @property
+    def last_s(self) -> float:
+        """Time of the last sample, seconds."""
+        return (self.samples - 1) / RATE_HZ
 
 
 def simulate(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault] = ()) -> Flight:
@@ -67,46 +92,99 @@ def simulate(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault
     SettingError
         If the scenario is impossible, or a fault does not fit into it.
     """
-    _check_scenario(scenario)
-    flight_s, names = scenario.duration_s, scenario.names
-    check_faults(faults, names, flight_s)
-    events = [
-        schedule_fault(_create_rng(seed, "fault", k), fault, flight_s)
-        for k, fault in enumerate(faults)
-    ]
-    moves = _simulate_motions(scenario, seed)
-    truth, clocks, robots = {}, {}, {}
+    plan = plan_flight(scenario, noise, seed, faults)
+    names, truth, clocks = scenario.names, plan.truth, plan.clocks
+    robots = {}
     for k, name in enumerate(names):
-        mine = [event for event in events if event.fault.robot == name]
-        way, height = _apply_endings(
-            moves[k], _draw_height(_create_rng(seed, "height", k), scenario), mine
-        )
-        truth[name] = trajectories.build_truth(way, height)
-        clocks[name] = fault_effects.apply_clock_faults(
-            _draw_clock(_create_rng(seed, "clock", k), k, noise), mine
-        )
-        robots[name] = sensors.simulate_log(
-            _create_rng(seed, "log", k), truth[name], way.yaw_rate, clocks[name], noise
-        )
+        errors = sensors.draw_log_errors(create_rng(seed, "log", k), scenario.samples, noise)
+        robots[name] = sensors.measure_log(truth[name], plan.yaw_rate[name], clocks[name], errors)
     ranges = {
-        (names[i], names[j]): sensors.simulate_ranges(
-            _create_rng(seed, "range", i, j),
+        (names[i], names[j]): sensors.measure_ranges(
             truth[names[i]],
             truth[names[j]],
             clocks[names[i]],
-            noise,
-            sensors.draw_pair_errors(_create_rng(seed, "pair", min(i, j), max(i, j)), noise),
+            draw_link(i, j, scenario, noise, seed),
         )
         for i, j in permutations(range(len(names)), 2)
     }
-    for k, event in enumerate(events):
-        robot, rng = event.fault.robot, _create_rng(seed, "fault", k, 1)
-        robots[robot] = fault_effects.apply_sensor_fault(rng, robots[robot], truth[robot], event)
+    apply_faults(plan, robots, ranges, lambda k: create_rng(seed, "fault", k, 1))
+    return Flight(robots, truth, ranges, clocks, plan.events)
+
+
+@dataclass(frozen=True, slots=True)
+class FlightPlan:
+    """Scripted motion, clocks and faults of a flight, by name of the robot.
+
+    Parameters
+    ----------
+    truth, yaw_rate
+        Ground truth, and (N,) yaw rates in radians per second.
+    clocks
+        Clocks, with their faults.
+    events
+        Faults with their times.
+    """
+
+    truth: dict[str, Truth]
+    yaw_rate: dict[str, Array]
+    clocks: dict[str, Clock]
+    events: tuple[FaultEvent, ...]
+
+
+def plan_flight(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault]) -> FlightPlan:
+    """Plan the motion of every robot, its clock and its faults; see `simulate`."""
+    _check_scenario(scenario)
+    check_faults(faults, scenario.names, scenario.duration_s)
+    events = tuple(
+        schedule_fault(create_rng(seed, "fault", k), fault, scenario.duration_s)
+        for k, fault in enumerate(faults)
+    )
+    plan = FlightPlan({}, {}, {}, events)
+    moves = _simulate_motions(scenario, seed)
+    for k, name in enumerate(scenario.names):
+        mine = [event for event in events if event.fault.robot == name]
+        height = _draw_height(create_rng(seed, "height", k), scenario)
+        way, height = _apply_endings(moves[k], height, mine)
+        plan.truth[name] = trajectories.build_truth(way, height)
+        plan.yaw_rate[name] = way.yaw_rate
+        clock = _draw_clock(create_rng(seed, "clock", k), k, noise)
+        plan.clocks[name] = fault_effects.apply_clock_faults(clock, mine)
+    return plan
+
+
+def apply_faults(
+    plan: FlightPlan,
+    robots: dict[str, RobotLog],
+    ranges: dict[tuple[str, str], Ranges],
+    rng_of: Callable[[int], Generator],
+    part: slice = slice(None),
+) -> None:
+    """Apply the faults of sensors to logs and ranges, in place.
+
+    Parameters
+    ----------
+    plan
+        Faults and truth of the flight.
+    robots, ranges
+        Logs, and ranges by (robot that ranges, robot that answers), of the flight or a part of it.
+    rng_of
+        Returns the random generator of the fault with this number.
+    part
+        Samples of the logs.
+    """
+    for k, event in enumerate(plan.events):
+        robot, rng = event.fault.robot, rng_of(k)
+        time_s = plan.truth[robot].time_s[part]
+        robots[robot] = fault_effects.apply_sensor_fault(rng, robots[robot], time_s, event)
         for link in (link for link in ranges if event.affects_link(link)):
-            ranges[link] = fault_effects.apply_range_fault(
-                rng, ranges[link], clocks[link[0]], event
-            )
-    return Flight(robots, truth, ranges, clocks, tuple(events))
+            clock = plan.clocks[link[0]]
+            ranges[link] = fault_effects.apply_range_fault(rng, ranges[link], clock, event)
+
+
+def draw_link(i: int, j: int, scenario: Scenario, noise: Noise, seed: int) -> sensors.RangeErrors:
+    """Draw times and errors of the ranges from robot number ``i`` to robot number ``j``."""
+    pair = sensors.draw_pair_errors(create_rng(seed, "pair", min(i, j), max(i, j)), noise)
+    return sensors.draw_range_errors(create_rng(seed, "range", i, j), scenario.last_s, noise, pair)
 
 
 def _apply_endings(
@@ -121,7 +199,8 @@ def _apply_endings(
 RNG_STREAMS = ("motion", "height", "clock", "log", "range", "pair", "start", "fault")
 
 
-def _create_rng(seed: int, purpose: str, *numbers: int) -> Generator:
+def create_rng(seed: int, purpose: str, *numbers: int) -> Generator:
+    """Return the random generator of one purpose, and of the robots with these numbers."""
     return np.random.default_rng((seed, RNG_STREAMS.index(purpose), *numbers))
 
 
@@ -130,14 +209,14 @@ def _simulate_motions(scenario: Scenario, seed: int) -> list[Motion]:
     made: list[Motion] = []
     for k in range(scenario.robots):
         move = others if k else first
-        start = _draw_start(_create_rng(seed, "start", k), k, scenario)
-        made.append(move(_create_rng(seed, "motion", k), start, made[0] if k else None))
+        start = _draw_start(create_rng(seed, "start", k), k, scenario)
+        made.append(move(create_rng(seed, "motion", k), start, made[0] if k else None))
     return made
 
 
 def _draw_start(rng: Generator, k: int, scenario: Scenario) -> Start:
     """Draw a start: the origin for the first robot; others in front of it, or on a spiral."""
-    samples = round(scenario.duration_s * RATE_HZ) + 1
+    samples = scenario.samples
     if k == 0:
         return Start(samples, 0j, 0.0)
     yaw = float(rng.uniform(-1.0, 1.0) * scenario.yaw_spread_rad)
@@ -150,10 +229,13 @@ def _draw_start(rng: Generator, k: int, scenario: Scenario) -> Start:
 
 def _draw_height(rng: Generator, scenario: Scenario) -> Array:
     """Draw the (N,) slowly varying height of one robot, metres."""
-    time_s = np.arange(round(scenario.duration_s * RATE_HZ) + 1) / RATE_HZ
+    time_s = np.arange(scenario.samples) / RATE_HZ
     base = MEAN_HEIGHT_M + rng.uniform(-HEIGHT_SPREAD_M, HEIGHT_SPREAD_M)
-    swing = 2 * np.pi * time_s / rng.uniform(15.0, 30.0) + rng.uniform(0, 2 * np.pi)
-    return np.asarray(base + 0.05 * np.sin(swing))
+    swing_s, swing_m = rng.uniform(*HEIGHT_SWING_S), HEIGHT_SWING_M
+    if scenario.trajectory == "figure_of_eight":
+        base, swing_s, swing_m = MEAN_HEIGHT_M, EIGHT_SWING_S, EIGHT_SWING_M
+    swing = 2 * np.pi * time_s / swing_s + rng.uniform(0, 2 * np.pi)
+    return np.asarray(base + swing_m * np.sin(swing))
 
 
 def _draw_clock(rng: Generator, k: int, noise: Noise) -> Clock:
@@ -170,6 +252,10 @@ def _check_scenario(scenario: Scenario) -> None:
         )
     if not 1.0 <= scenario.duration_s <= 3600.0:
         raise SettingError(f"a flight of {scenario.duration_s} s. Choose 1 to 3600: --duration-s")
+    if not 0 <= scenario.flown <= scenario.robots:
+        raise SettingError(f"flown = {scenario.flown}: choose 0 to {scenario.robots}, the robots")
+    if not 0.2 < scenario.distance_m <= 3.0:
+        raise SettingError(f"--distance-m {scenario.distance_m}: choose over 0.2, to 3")
     if scenario.trajectory not in TRAJECTORIES:
         kinds = ", ".join(TRAJECTORIES)
         raise SettingError(f"no trajectory {scenario.trajectory!r}. There are: {kinds}")

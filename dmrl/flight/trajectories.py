@@ -27,6 +27,7 @@ Trajectory = Literal[
     "peer_static",
     "no_yaw",
     "both_static",
+    "figure_of_eight",
 ]
 
 VELOCITY_LAG_S = 0.25
@@ -40,6 +41,11 @@ FOLLOW_GAIN_PER_S = 2.0
 ROOM_M, ROOM_REDRAW_S = 3.6, 3.0
 HOVER_SPEED_MPS = 0.03
 ROW_M, ROW_GAP_M, ROWS = 2.0, 0.4, 5
+EIGHT_HALF_AXES_M = 1.6, 1.2
+EIGHT_ROUND_S = 18.0, 30.0
+EIGHT_SPEED_MAX_MPS = 0.6
+EIGHT_YAW_RAD, EIGHT_YAW_S = 0.6, 9.0
+"""Amplitude and period of the yaw of a robot that flies a figure of eight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,6 +259,39 @@ def fly_rows(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
     )
 
 
+def fly_eight(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
+    """Return the motion of a robot that flies figures of eight around the world's origin.
+
+    Place, direction and duration of a round are random. Where the round would be faster than
+    ``EIGHT_SPEED_MAX_MPS``, the robot flies at that speed, and the round lasts longer.
+    """
+    round_s, first, heading = rng.uniform(
+        (EIGHT_ROUND_S[0], 0.0, 0.0), (EIGHT_ROUND_S[1], 2 * np.pi, 2 * np.pi)
+    )
+    way = rng.choice((-1.0, 1.0))
+    long_m, short_m = EIGHT_HALF_AXES_M
+
+    def seconds_per_rad(phase: Array) -> tuple[Plane, Array]:
+        """Return the slope of the curve, metres per radian, and the duration of a radian."""
+        slope = long_m * np.cos(phase) + 2j * short_m * np.cos(2 * phase)
+        return slope, np.maximum(round_s / (2 * np.pi), np.abs(slope) / EIGHT_SPEED_MAX_MPS)
+
+    time_s = np.arange(start.samples) / RATE_HZ
+    rounds = time_s[-1] / round_s + 1.0
+    phases = first + np.arange(0.0, 2 * np.pi * rounds, 1e-3)
+    lasts_s = np.cumsum(seconds_per_rad(phases[:-1] + 5e-4)[1] * 1e-3)
+    phase = np.interp(time_s, np.concatenate([[0.0], lasts_s]), phases)
+    slope, pace = seconds_per_rad(phase)
+    swing = 2 * np.pi / EIGHT_YAW_S
+    angle = swing * time_s + heading
+    return Motion(
+        long_m * np.sin(way * phase) + 1j * short_m * np.sin(2 * phase) * way,
+        way * slope / pace,
+        EIGHT_YAW_RAD * np.sin(angle),
+        EIGHT_YAW_RAD * swing * np.cos(angle),
+    )
+
+
 TRAJECTORIES: dict[Trajectory, tuple[Mover, Mover]] = {
     "in_view": (back_and_forth(0.5, 0.4, 1.5), follow_in_view(0.8)),
     "random": (back_and_forth(1.0, 0.5, 1.0), back_and_forth(1.0, 0.5, 1.0)),
@@ -264,6 +303,7 @@ TRAJECTORIES: dict[Trajectory, tuple[Mover, Mover]] = {
     "peer_static": (back_and_forth(0.5, 0.4, 1.5), stand_still),
     "no_yaw": (back_and_forth(0.5, 0.0, 1.5), follow_in_view(0.0)),
     "both_static": (stand_still, stand_still),
+    "figure_of_eight": (back_and_forth(0.5, 0.4, 1.5), fly_eight),
 }
 """Mover of the first robot, and mover of all others."""
 

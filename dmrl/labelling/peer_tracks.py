@@ -17,6 +17,7 @@ from dmrl.labelling.observer_log import ObserverLog, read_observer_log
 from dmrl.labelling.recorded_camera import find_recorded_camera, read_robot_camera
 from dmrl.messages import message_class
 from dmrl.recording import TimedMessage
+from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say, track
 
 
@@ -85,9 +86,10 @@ def track_peers(
     return made, RobotReport(robot, images, len(seen), named, round(entries / max(images, 1), 3))
 
 
-def _message(
-    sight: ObserverLog, k: int, tracks: list[Track], names: dict[int, str]
-) -> TimedMessage:
+def build_tracks(
+    robot: str, time_ns: int, tracks: list[Track], names: dict[int, str], publish_ns: int | None
+) -> Sample:
+    """Build the Tracks of one image; ``names`` are those of the peers, by number of the track."""
     entries: list[dict[str, Any]] = []
     for one in tracks:
         numbers = [*one.position_m.tolist(), *one.velocity_mps.tolist()]
@@ -100,5 +102,12 @@ def _message(
                 "covariance": np.ravel(one.covariance).tolist(),
             }
         )
-    made = message_class("Tracks")(frame_id=f"{sight.robot}/horizontal", tracks=entries)
-    return TimedMessage(int(sight.log_time_ns[k]), topics.TRACKS(sight.robot), made)
+    fields = {"frame_id": f"{robot}/horizontal", "tracks": entries}
+    return Sample(time_ns, topics.TRACKS(robot), "Tracks", fields, publish_ns)
+
+
+def _message(
+    sight: ObserverLog, k: int, tracks: list[Track], names: dict[int, str]
+) -> TimedMessage:
+    made = build_tracks(sight.robot, int(sight.log_time_ns[k]), tracks, names, None)
+    return TimedMessage(made.time_ns, made.topic, message_class("Tracks")(**made.fields))

@@ -19,6 +19,7 @@ from dmrl.guards.safe_names import check_file_name
 from dmrl.learn import pretrained
 from dmrl.pipeline.recipe_language import expand_steps
 from dmrl.pipeline.stage_signature import StageSignature, signature_of
+from dmrl.simulation.settings import NAMED_EYES
 
 RECIPE_KEYS = ("kind", "each", "defaults", "step", figure_specs.TITLE_KEY, figure_specs.FIGURE_KEY)
 STEP_KEYS = ("stage", "out", "optional", "recipe")
@@ -272,6 +273,7 @@ def _check_source_name(name: str, outs: set[str]) -> str:
         head in outs
         or head == DATA
         or name in NAMED_CAMERAS
+        or name in NAMED_EYES
         or name in pretrained.list_pretrained()
     ):
         return ""

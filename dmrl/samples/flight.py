@@ -46,11 +46,19 @@ def iter_rows(*columns: NDArray[Any]) -> Iterator[tuple[Any, ...]]:
         yield from zip(*(column[part].tolist() for column in columns), strict=True)
 
 
+def integrate_yaw(time_ns: Times, rate: Array) -> Array:
+    """Integrate (N,) yaw rates from 0 at the first time, interpolated over gaps."""
+    turning = np.isfinite(rate)
+    if turning.any():
+        rate = np.interp(time_ns, time_ns[turning], rate[turning])
+    turned = np.diff(time_ns) * 1e-9 * (rate[1:] + rate[:-1]) / 2
+    return np.concatenate([[0.0], np.cumsum(turned)])
+
+
 def iter_robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Iterator[Sample]:
     """Yield attitude, velocity and height of one robot, three samples per time.
 
-    A sensor whose values are not all finite has no sample at that time. The yaw of the attitude is
-    the integral of the yaw rate, from 0 at the first time, interpolated over gaps.
+    A sensor whose values are not all finite has no sample at that time.
 
     Parameters
     ----------
@@ -59,14 +67,11 @@ def iter_robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> 
     time_ns
         (N,) in order.
     columns
-        (N,) for each of ``LOG_COLUMNS``.
+        (N,) for each of ``LOG_COLUMNS``; and ``yaw_rad``, else see `integrate_yaw`.
     """
-    rate = columns["yaw_rate_radps"]
-    turning = np.isfinite(rate)
-    if turning.any():
-        rate = np.interp(time_ns, time_ns[turning], rate[turning])
-    turned = np.diff(time_ns) * 1e-9 * (rate[1:] + rate[:-1]) / 2
-    yaw = np.concatenate([[0.0], np.cumsum(turned)])
+    yaw = columns.get("yaw_rad")
+    if yaw is None:
+        yaw = integrate_yaw(time_ns, columns["yaw_rate_radps"])
     names = topics.ATTITUDE(robot), topics.VELOCITY(robot), topics.HEIGHT(robot)
     series = [*(columns[name] for name in LOG_COLUMNS), yaw]
     for moment, *row in iter_rows(time_ns, *series):

@@ -1,37 +1,45 @@
 """Simulated flights as recordings: sensors, truth, and images with exact labels."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import permutations, tee
+from itertools import tee
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from cyclopts import Parameter, validators
 
 from dmrl import topics
 from dmrl.atomic_output import refuse_existing
-from dmrl.errors import SettingError
-from dmrl.flight import NOISE, Clock, Fault, Flight, Scenario, Trajectory, Truth, simulate
-from dmrl.geometry.frames import AIDECK_PINHOLE, Array
+from dmrl.deploy.backend_names import BackendName
+from dmrl.errors import SettingError, optional_imports
+from dmrl.flight import NOISE, Fault, Flight, Scenario, Trajectory, simulate
+from dmrl.flight.flight_arrays import RATE_HZ
+from dmrl.geometry.frames import AIDECK_PINHOLE
 from dmrl.images.codec import encode_jpeg
 from dmrl.recording import Provenance, RecordingWriter, build_provenance
 from dmrl.rendering import flight_images, renderer
 from dmrl.rendering.blender_environment import ensure_environment
 from dmrl.rendering.onboard_camera import ViewRenderer, WorldPose, build_view, render_sketches
-from dmrl.rendering.shot import Shot
-from dmrl.rendering.sketch_renderer import Sketch
-from dmrl.samples import flight as samples
-from dmrl.samples.flight import START_NS, Times, merge_by_time, to_nanoseconds
+from dmrl.samples.flight import START_NS, merge_by_time
 from dmrl.samples.sample import Sample, build_calibration, build_image, build_labels
-from dmrl.simulation.settings import CameraRenderer, Preset
+from dmrl.simulation.flight_samples import (
+    JPEG_QUALITY,
+    TRUTH_RATE_HZ,
+    body_at,
+    iter_label_fields,
+    iter_sensor_streams,
+    iter_truth_streams,
+    log_times,
+)
+from dmrl.simulation.settings import CameraRenderer, Eye, Preset, Vision
+from dmrl.simulation.simulator import STEPS_PER_COMMAND, Simulation
 from dmrl.terminal.arguments import Seed
 from dmrl.terminal.progress import say, track
 
-TRUTH_RATE_HZ = 20.0
-JPEG_QUALITY = 92
+DEFAULT_VISION = Vision()
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +71,19 @@ class FlySettings:
         Pictures per second and robot.
     faults
         Further faults: tables with kind, robot and more; docs/flights.md has them all.
+    pilot
+        Who flies the first robots: follow, keep_apart, formation or a plug-in's. Empty: nobody,
+        they fly their trajectory.
+    flown
+        The pilot flies so many robots; the next one is their leader.
+    distance_m
+        Distance that the pilot keeps.
+    eye
+        What the pilot sees: truth, the true positions; ideal, a camera without alarms; or a model.
+    backend
+        What computes the model. Without it, the fastest float one.
+    vision
+        Delay and losses of images, and the errors of an ideal eye.
     """
 
     robots: Annotated[int, Parameter(validator=validators.Number(gte=2, lte=20))] = 2
@@ -76,6 +97,12 @@ class FlySettings:
     cameras_max: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 20
     camera_rate_hz: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=100))] = 5.0
     faults: tuple[Fault, ...] = ()
+    pilot: str = ""
+    flown: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=20))] = 1
+    distance_m: Annotated[float, Parameter(validator=validators.Number(gt=0.2, lte=3))] = 0.7
+    eye: Eye = "truth"
+    backend: BackendName | None = None
+    vision: Vision = DEFAULT_VISION
 
 
 def record_flight(out: Path, settings: FlySettings) -> dict[str, int]:
@@ -99,13 +126,16 @@ def record_flight(out: Path, settings: FlySettings) -> dict[str, int]:
     """
     refuse_existing(out)
     _check(settings)
+    if settings.pilot:
+        return _record_piloted(out, settings)
     scenario = Scenario(
         settings.robots, settings.duration_s, settings.trajectory, settings.yaw_spread_rad
     )
     flight = simulate(scenario, NOISE[settings.noise], settings.seed, settings.faults)
     _print_faults(flight)
     made = build_provenance("fly", settings, seed=settings.seed, libraries=("numpy", "pillow"))
-    streams = [*_sensor_streams(flight), *_truth_streams(flight)]
+    time_s = np.arange(0.0, scenario.last_s, 1.0 / TRUTH_RATE_HZ)
+    streams = [*iter_sensor_streams(flight), *iter_truth_streams(flight, time_s)]
     counts: Counter[str] = Counter()
     with ExitStack() as stack:
         if settings.camera:
@@ -114,8 +144,39 @@ def record_flight(out: Path, settings: FlySettings) -> dict[str, int]:
         sink = stack.enter_context(RecordingWriter(out, made))
         for sample in track(merge_by_time(streams), "Flying", _estimate_total(flight, settings)):
             sink.write_sample(sample)
-            counts[_topic_pattern(sample.topic)] += 1
+            counts[topics.find_pattern(sample.topic)] += 1
     return dict(sorted(counts.items()))
+
+
+def _record_piloted(out: Path, settings: FlySettings) -> dict[str, int]:
+    """Record a flight of pilots."""
+    with optional_imports("label", "a pilot"):
+        from dmrl.simulation import piloted_flight as piloted  # noqa: PLC0415 - has filterpy
+
+    eyes, settings, made = piloted.open_eyes(settings)
+    with Simulation(
+        settings.robots,
+        flown=settings.flown,
+        trajectory=settings.trajectory,
+        distance_m=settings.distance_m,
+        duration_s=settings.duration_s,
+        noise=settings.noise,
+        camera_renderer=settings.camera_renderer,
+        faults=settings.faults,
+    ) as simulation:
+        simulation.reset(settings.seed)
+        _print_faults(simulation.motion.flight)
+        if settings.camera and settings.camera_renderer == "blender" and eyes[0] is not None:
+            simulation.start_blender()
+            blender = {"blender": simulation.blender_version}
+            made = replace(made, libraries={**made.libraries, **blender})
+        with RecordingWriter(out, made) as sink:
+            writer = piloted.FlightWriter(sink, simulation)
+            flight = piloted.PilotedFlight(settings, simulation, eyes, writer)
+            steps = int(settings.duration_s * RATE_HZ / STEPS_PER_COMMAND)
+            for _ in track(flight.fly(), "Flying", steps):
+                pass
+    return dict(sorted(writer.counts.items()))
 
 
 def _print_faults(flight: Flight) -> None:
@@ -144,11 +205,6 @@ def _check(settings: FlySettings) -> None:
         raise SettingError(f"--camera-rate-hz {settings.camera_rate_hz}: choose over 0, to 100")
 
 
-def _topic_pattern(topic: str) -> str:
-    row = topics.find_topic(topic)
-    return topic if row is None else row.pattern
-
-
 def _estimate_total(flight: Flight, settings: FlySettings) -> int:
     """Estimate the number of samples, to within a few."""
     robots = len(flight.robots)
@@ -159,56 +215,6 @@ def _estimate_total(flight: Flight, settings: FlySettings) -> int:
         2 * min(robots, settings.cameras_max) * int(settings.duration_s * settings.camera_rate_hz)
     )
     return logs + ranged + truth + settings.camera * pictures
-
-
-def _log_times(clock: Clock, true_time_s: Array) -> Times:
-    """Return the log times of true times: those of the robot's own clock."""
-    return START_NS + to_nanoseconds(clock.to_clock_time(true_time_s))
-
-
-def _sensor_streams(flight: Flight) -> Iterator[Iterator[Sample]]:
-    for robot, log in flight.robots.items():
-        columns = {name: getattr(log, name) for name in samples.LOG_COLUMNS}
-        yield samples.iter_robot_log(robot, START_NS + to_nanoseconds(log.time_s), columns)
-    for (robot, peer), ranges in flight.ranges.items():
-        time_ns = START_NS + to_nanoseconds(ranges.time_s)
-        yield samples.iter_ranges(robot, peer, time_ns, ranges.range_m)
-
-
-def _truth_streams(flight: Flight) -> Iterator[Iterator[Sample]]:
-    end_s = next(iter(flight.truth.values())).time_s[-1]
-    time_s = np.arange(0.0, end_s, 1.0 / TRUTH_RATE_HZ)
-    for robot, peer in permutations(flight.truth, 2):
-        yield _peer_truth(flight, robot, peer, time_s)
-    yield (_transforms(flight, float(moment)) for moment in time_s)
-
-
-def _peer_truth(flight: Flight, robot: str, peer: str, true_time_s: Array) -> Iterator[Sample]:
-    for part in samples.iter_slices(len(true_time_s)):
-        time_s = true_time_s[part]
-        xyz = flight.peer_in_horizontal(robot, peer, time_s)
-        yield from samples.iter_truth(robot, peer, _log_times(flight.clocks[robot], time_s), xyz)
-
-
-def _transforms(flight: Flight, true_time_s: float) -> Sample:
-    """Return every robot's frames, on true time."""
-    bodies = {robot: _body_at(truth, true_time_s) for robot, truth in flight.truth.items()}
-    attitudes = {
-        robot: samples.RobotPose(b.xyz_world, b.yaw_rad, b.roll_rad, b.pitch_rad)
-        for robot, b in bodies.items()
-    }
-    time_ns = int(_log_times(Clock(), np.array([true_time_s]))[0])
-    return samples.build_transforms(time_ns, attitudes)
-
-
-def _body_at(truth: Truth, true_time_s: float) -> WorldPose:
-    at = np.array([true_time_s])
-    return WorldPose(
-        truth.position_at(at)[0],
-        float(truth.yaw_at(at)[0]),
-        float(np.interp(true_time_s, truth.time_s, truth.roll)),
-        float(np.interp(true_time_s, truth.time_s, truth.pitch)),
-    )
 
 
 def _camera_streams(
@@ -227,30 +233,16 @@ def _camera_stream(
     yield build_calibration(START_NS, robot, AIDECK_PINHOLE)
 
     def bodies(moment_s: float) -> dict[str, WorldPose]:
-        return {name: _body_at(truth, moment_s) for name, truth in flight.truth.items()}
+        return {name: body_at(truth, moment_s) for name, truth in flight.truth.items()}
 
     views = (
         build_view(bodies, robot, moment_s, (settings.seed, number, k))
         for k, moment_s in enumerate(time_s.tolist())
     )
     seen_in, drawn = tee(views)  # which holds what is drawn ahead of what is written
-    stamps = _log_times(flight.clocks[robot], time_s).tolist()
+    stamps = log_times(flight.clocks[robot], time_s).tolist()
     for time_ns, seen, picture in zip(stamps, seen_in, draw(AIDECK_PINHOLE, drawn), strict=True):
         yield build_image(time_ns, robot, encode_jpeg(picture.rgb, JPEG_QUALITY), "jpeg")
         yield build_labels(
-            time_ns, robot, list(_label_fields(list(seen.poses), picture)), ["truth"]
+            time_ns, robot, list(iter_label_fields(list(seen.poses), picture)), ["truth"]
         )
-
-
-def _label_fields(peers: Sequence[str], picture: Sketch | Shot) -> Iterator[dict[str, Any]]:
-    for k, peer in enumerate(peers):
-        box = picture.box_px[k]
-        yield {
-            "peer": peer,
-            "u_px": picture.uv_px[k, 0],
-            "v_px": picture.uv_px[k, 1],
-            "depth_m": picture.depth_m[k],
-            "box_px": [] if np.isnan(box).any() else box.tolist(),
-            "visible_share": float(picture.visible_share[k]),
-            "source": "truth",
-        }

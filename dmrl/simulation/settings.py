@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter, validators
 
+from dmrl.deploy.backend_names import BackendName
 from dmrl.terminal.arguments import Seed, Share
 
 CameraRenderer = Literal["sketch", "blender"]
@@ -21,7 +22,11 @@ Trajectory = Literal[
     "peer_static",
     "no_yaw",
     "both_static",
+    "figure_of_eight",
 ]
+NAMED_EYES = ("truth", "ideal")
+Eye = Literal["truth", "ideal"] | Path
+"""One of `NAMED_EYES`, or a model."""
 Count = Annotated[int, Parameter(validator=validators.Number(gte=2))]
 
 
@@ -106,6 +111,35 @@ class LikenessSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class Vision:
+    """Delay and losses between a camera and its pilot, and the errors of an ideal eye.
+
+    Parameters
+    ----------
+    delay_images
+        Detections reach the pilot so many images late.
+    lost_share
+        Share of the images that are lost, at random, 0 to 1.
+    lost_images
+        Numbers of images that are lost, from 0.
+    pixel_std_px, depth_std_ratio
+        Errors of an ideal eye: of u and v, and of the depth over the depth.
+    miss_share
+        Share of the images in which an ideal eye misses a peer, 0 to 1.
+    miss_burst_s
+        Mean duration of the misses. 0: each image for itself.
+    """
+
+    delay_images: Annotated[int, Parameter(validator=validators.Number(gte=0, lte=10))] = 1
+    lost_share: Share = 0.0
+    lost_images: tuple[int, ...] = ()
+    pixel_std_px: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 1.0
+    depth_std_ratio: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 0.1
+    miss_share: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=1))] = 0.0
+    miss_burst_s: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class FlyFlags:
     """Settings of a flight's recipe that a flag overrules.
 
@@ -128,6 +162,16 @@ class FlyFlags:
         it is not. Without it, the recipe's.
     camera_rate_hz
         Pictures per second and robot. Without it, the recipe's.
+    pilot
+        Who flies the first robots: follow, keep_apart, formation or a plug-in's. Without it, the
+        recipe's.
+    eye
+        What the pilot sees: truth; ideal; or a model, by its path or name. Without it, the
+        recipe's.
+    backend
+        What computes the model, as in dmrl predict.
+    distance_m
+        Distance that the pilot keeps. Without it, the recipe's.
     """
 
     robots: int | None = None
@@ -138,3 +182,7 @@ class FlyFlags:
     camera: bool | None = None
     camera_renderer: CameraRenderer | None = None
     camera_rate_hz: float | None = None
+    pilot: str | None = None
+    eye: Eye | None = None
+    backend: BackendName | None = None
+    distance_m: float | None = None

@@ -12,7 +12,7 @@ from dmrl.geometry.frames import AIDECK, Camera
 from dmrl.images.codec import encode_png
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter, read
-from dmrl.simulation.flight_recording import START_NS
+from dmrl.samples.flight import START_NS
 from dmrl.stages import calibrate, fly, label
 from dmrl.stages.calibrate import Settings
 

@@ -1,0 +1,67 @@
+"""Dead reckoning of one robot from its own log, sample by sample."""
+
+import numpy as np
+
+from dmrl.flight.flight_arrays import RobotLog
+from dmrl.geometry.frames import Array
+
+
+class DeadReckoning:
+    """Path and heading of a robot, integrated by the trapezoid rule as its log grows.
+
+    A sensor that is silent keeps its last value.
+
+    Parameters
+    ----------
+    log
+        The robot's log, filled up to the present.
+    """
+
+    def __init__(self, log: RobotLog) -> None:
+        count = len(log.time_s)
+        self._log = log
+        self.yaw_rad = np.zeros(count)
+        """(N,) heading relative to the start."""
+        self.path_m = np.zeros((count, 3))
+        """(N, 3) position over the start, along the heading at the start; z is the height."""
+        self.sensors = np.zeros((6, count))
+        """(6, N) roll, pitch, yaw rate, vx, vy and height."""
+
+    def extend(self, part: slice) -> None:
+        """Integrate the samples of a part that follows the last one."""
+        log = self._log
+        fresh = np.stack(
+            [
+                log.roll_rad[part],
+                log.pitch_rad[part],
+                log.yaw_rate_radps[part],
+                log.vx_mps[part],
+                log.vy_mps[part],
+                log.height_m[part],
+            ]
+        )
+        first = max(part.start - 1, 0)
+        for row, held in zip(fresh, self.sensors[:, first], strict=True):
+            if np.isnan(row).any():
+                known = np.maximum.accumulate(np.where(np.isnan(row), -1, np.arange(len(row))))
+                row[:] = np.where(known < 0, held, row[known])
+        self.sensors[:, part] = fresh
+        grown = slice(first, part.stop)
+        dt_s = np.diff(log.time_s[grown])
+        _, _, rate, vx, vy, height = self.sensors[:, grown]
+        yaw = self.yaw_rad[first] + np.cumsum(dt_s * (rate[1:] + rate[:-1]) / 2)
+        self.yaw_rad[first + 1 : part.stop] = yaw
+        over_ground = np.exp(1j * self.yaw_rad[grown]) * (vx + 1j * vy)
+        steps = dt_s * (over_ground[1:] + over_ground[:-1]) / 2
+        way = complex(*self.path_m[first, :2]) + np.cumsum(steps)
+        self.path_m[first + 1 : part.stop, 0] = way.real
+        self.path_m[first + 1 : part.stop, 1] = way.imag
+        self.path_m[grown, 2] = height
+
+    def motion(self, first: int, last: int) -> tuple[float, Array, float]:
+        """Return seconds, the (3,) way in the frame of the first of two samples, and the turn."""
+        c, s = np.cos(self.yaw_rad[first]), np.sin(self.yaw_rad[first])
+        x, y, z = self.path_m[last] - self.path_m[first]
+        dt_s = float(self._log.time_s[last] - self._log.time_s[first])
+        turn_rad = float(self.yaw_rad[last] - self.yaw_rad[first])
+        return dt_s, np.array([c * x + s * y, c * y - s * x, z]), turn_rad
