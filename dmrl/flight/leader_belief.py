@@ -64,7 +64,7 @@ class LeaderBelief:
     @property
     def bearing_rad(self) -> Array:
         """(N,) angles to the left of the robot's axis."""
-        return np.arctan2(self.place_m[:, 1], self.place_m[:, 0])
+        return np.asarray(np.arctan2(self.place_m[:, 1], self.place_m[:, 0]))
 
     def mean(self) -> tuple[Array, Array, float]:
         """Return (2,) position and velocity, and the standard deviation of the position."""

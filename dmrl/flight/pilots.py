@@ -16,11 +16,14 @@ from dmrl.flight.leader_belief import LeaderBelief
 from dmrl.flight.pilot import Command, Observation, PeerTrack, Pilot, Task
 from dmrl.geometry.frames import Array
 
-GAIN_PER_S, CLIMB_GAIN_PER_S, TURN_GAIN_PER_S = 1.2, 0.8, 2.0
+GAIN_PER_S, CLIMB_GAIN_PER_S, TURN_GAIN_PER_S = 1.2, 0.8, 3.0
 """Speed by metre of a wrong distance, of a wrong height; turn rate by radian of bearing."""
 TRUST_STD_M = 0.35
 """Standard deviation of the leader's position at which a pilot flies at half its speed: half the
 default distance."""
+RETREAT_MPS = 0.2
+"""Speed at which a pilot backs away from a leader that it does not see: from afar, the image shows
+more of the floor."""
 MISSED_S = 0.15
 """A leader that was not detected for so long before the last image is not seen."""
 START_STD_M = 0.2
@@ -70,8 +73,11 @@ class Follow(Pilot):
         towards = np.array([x, y]) / max(float(np.hypot(x, y)), 1e-6)
         # Flying at the leader needs to know where it is; flying away from it does not.
         wanted = wanted - (1.0 - trust) * max(float(wanted @ towards), 0.0) * towards
+        wanted -= (1.0 - trust) * RETREAT_MPS * towards
         climb = trust * CLIMB_GAIN_PER_S * float(to_go[2])
-        turn = TURN_GAIN_PER_S * leader.bearing_rad
+        passing = leader.velocity_mps[:2] - seen.velocity_mps
+        rate = (x * passing[1] - y * passing[0]) / max(x * x + y * y, NEAR_M**2)
+        turn = TURN_GAIN_PER_S * leader.bearing_rad + trust * float(rate)
         return keep_apart(Command(float(wanted[0]), float(wanted[1]), climb, turn), seen.tracks)
 
     def aim(self, leader: Leader) -> Array:
@@ -167,7 +173,8 @@ def keep_apart(command: Command, tracks: tuple[PeerTrack, ...]) -> Command:
         if distance < NEAR_M:
             towards = track.position_m / distance
             wanted -= (max(float(wanted @ towards), 0.0) + (NEAR_M - distance) * 2) * towards
-    return Command(*map(float, wanted), command.yaw_rate_radps)
+    vx_mps, vy_mps, vz_mps = wanted.tolist()
+    return Command(vx_mps, vy_mps, vz_mps, command.yaw_rate_radps)
 
 
 PILOTS: Mapping[str, type[Pilot]] = {

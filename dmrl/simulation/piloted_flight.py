@@ -289,7 +289,7 @@ def open_eyes(settings: "FlySettings") -> tuple[list[Eye | None], "FlySettings",
     made : Provenance
         Of the flight.
     """
-    libraries = ("numpy", "pillow", "scipy", "filterpy")
+    libraries = ["numpy", "pillow", "scipy", "filterpy"]
     numbers = range(settings.flown)
     if str(settings.eye) in NAMED_EYES:
         made = build_provenance("fly", settings, seed=settings.seed, libraries=libraries)
@@ -307,7 +307,7 @@ def open_eyes(settings: "FlySettings") -> tuple[list[Eye | None], "FlySettings",
     settings = replace(settings, backend=backend)
     detector = open_detector(model, backend)
     detector.require_size(*size_px, "the flight's camera")
-    libraries += tuple(name for name in BACKEND_PACKAGES[backend] if name not in libraries)
+    libraries += [name for name in BACKEND_PACKAGES[backend] if name not in libraries]
     made = build_provenance("fly", settings, [model], seed=settings.seed, libraries=libraries)
     look = NetworkEye(detector, DetectionOptions(MIN_CONFIDENCE, MOST, 1))
     return [look for _ in numbers], settings, describe_weights(made, model, detector)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from dmrl.rendering.sketch_renderer import Sketch
 from dmrl.simulation.flight_samples import body_at
 from dmrl.simulation.settings import CameraRenderer, Preset
 from dmrl.terminal.progress import say
+
+if TYPE_CHECKING:
+    from dmrl.rendering.renderer import Renderer
 
 STEPS_PER_COMMAND = 5
 """Steps of 10 ms for which a command holds."""
@@ -88,7 +91,7 @@ class Simulation:
         )
         self._noise, self._faults, self._kind = NOISE[noise], tuple(faults), camera_renderer
         self._resources = ExitStack()
-        self._renderer = None
+        self._renderer: Renderer | None = None
         self._draw: ViewRenderer = render_sketches
         self._seed = 0
         self._motion: SteppedFlight | None = None
@@ -162,7 +165,8 @@ class Simulation:
 
     def peer_position(self, robot: str, peer: str) -> Array:
         """Return the (3,) true position of a peer in a robot's horizontal frame, metres."""
-        return self.motion.flight.peer_in_horizontal(robot, peer, np.array([self.time_s]))[0]
+        found = self.motion.flight.peer_in_horizontal(robot, peer, np.array([self.time_s]))
+        return np.asarray(found[0])
 
     def view(self, robot: str) -> CameraView:
         """Return the true poses of all peers in front of a robot's camera."""
