@@ -104,6 +104,9 @@ class MissingTopic(RecordingError):
     def __init__(self, topic: str, present: Iterable[str], where: object) -> None:
         near = get_close_matches(topic, sorted(present), n=1)
         hint = f"Did you mean {near[0]}?" if near else f"Try: dmrl info {where}"
+        if near and topic.startswith("/*/"):  # a stage asks for it, and not the user
+            name = f"{near[0]}={topic.replace('*', 'cf1', 1)}"
+            hint += f" Rename it: dmrl convert {where} OUT.mcap --names {name}"
         super().__init__(f"no topic {topic} in {where}. {hint}")
 
 

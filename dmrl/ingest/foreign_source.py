@@ -7,9 +7,10 @@ from itertools import chain
 from pathlib import Path
 
 from dmrl.errors import SettingError, SourceError
-from dmrl.formats.base import Content, Options
+from dmrl.formats.base import Content, Format, Options
 from dmrl.formats.registry import find_format
 from dmrl.guards.paths import refuse_pipes
+from dmrl.ingest import foreign_recording
 from dmrl.messages import message_class
 from dmrl.recording import (
     LICENCES_METADATA,
@@ -58,7 +59,7 @@ def record_source(
     SettingError
         If an option has no effect on the source.
     """
-    form = find_format(source, kind)
+    form = _find_format(source, kind)
     form.refuse_unused(options)
     content = form.content(source, options)
     read = [path for path in files if path and path.is_file()]
@@ -76,6 +77,14 @@ def record_source(
             raise SourceError(f"{source}: nothing in it can be used. Pass another")
     print_findings(out)
     return counts
+
+
+def _find_format(source: Path, kind: str | None) -> Format:
+    """Return the format of a source; raise as `find_format`."""
+    adopted = foreign_recording.FORMAT
+    if kind == adopted.name or (kind is None and adopted.recognises(source)):
+        return adopted
+    return find_format(source, kind)
 
 
 def write_content(content: Content, sink: RecordingWriter) -> dict[str, int]:
@@ -116,7 +125,7 @@ def find_sources(source: Path, kind: str | None) -> dict[Path, Path]:
     found: dict[Path, Path] = {}
     for path in sorted(source.iterdir()) if source.is_dir() else [source]:
         try:
-            if path.name.startswith(".") or not find_format(path, kind):
+            if path.name.startswith(".") or not _find_format(path, kind):
                 continue
         except SourceError:
             leave_out("files and folders of no known kind", path)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from dmrl.formats.base import Options
 
 ROBOT = re.compile(r"[A-Za-z0-9_-]+")
+NEW_NAME = re.compile(r"[A-Za-z0-9_-]+|(/[A-Za-z0-9_-]+)+")
 
 RATE_MAX_HZ = 1e6
 SIDE_MAX_PX = 8192
@@ -42,7 +43,8 @@ class Settings:
         Robot that carries the camera, or whose log it is.
     names
         Names of robots by those that the source has for them: 0=cf2,turtle_cap=turtle1. The
-        numbers in logs are else cf0, cf1, ...
+        numbers in logs are else cf0, cf1, ... ROS bags and MCAP: also robots or topics of dmrl by
+        topics: /lab/odom=cf2,/image=/cf1/camera/image.
     rate_hz
         Pictures per second, where the source has no times.
     labels
@@ -191,11 +193,11 @@ def _to_options(settings: Settings) -> "Options":
 
 
 def _parse_names(text: str | None) -> dict[str, str]:
-    """Return the robot of every name in ``OLD=NEW,...``."""
+    """Return the robot, or topic, of every name or topic in ``OLD=NEW,...``."""
     found = {}
     for part in text.split(",") if text else []:
         old, _, new = part.strip().partition("=")
-        if not (old and ROBOT.fullmatch(new)):
+        if not (old and NEW_NAME.fullmatch(new)) or ("/" in new and "/" not in old):
             raise SettingError(f"--names {part.strip()!r} is not OLD=NEW. Try: 0=cf2,1=cf3")
         found[old] = new
     return found

@@ -33,11 +33,13 @@ from dmrl.formats.ros.ros_messages import (
     convert_dmrl_message,
     is_camera_image,
 )
-from dmrl.formats.ros.topic_plan import MOTION_CAPTURE, ODOMETRY, TopicPlan, plan_topics
+from dmrl.formats.ros.topic_plan import ODOMETRY, TopicPlan, plan_topics
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 
+FOREIGN_OUTPUTS = ("Attitude", "Velocity", "Height", "UwbRange", "PoseInFrame", "CameraCalibration")
+"""Messages of sensors, whose numbers must be finite."""
 SUFFIXES = (".db3", ".bag", ".mcap")
 
 
@@ -102,22 +104,18 @@ def _iter_samples(
         clock = MessageClock.from_stamps(source, stamps)
     for message in iter_messages(source, lines):
         line, bag_ns = lines[message.topic, message.kind], message.bag_ns
-        captured, odometry = bool(MOTION_CAPTURE.search(line.topic)), line.robot in moving
+        odometry = line.robot in moving
         where = MessageContext(
-            source, line.robot, line.peer, captured, odometry, options.bits, scaled
+            source, line.robot, line.peer, line.captured, odometry, options.bits, scaled
         )
         # Without a time in the header, the bag's own time is the best estimate.
         stamp_ns = _header_time_ns(message.decoded)
         unstamped[line.topic] += clock.is_unset(line.topic, stamp_ns) and bag_ns > 0
         if (time_ns := clock.find_time_ns(line.topic, stamp_ns, bag_ns)) is None:
             continue
-        for sample in _convert_message(line, message, time_ns, where):
-            is_calibration = sample.message == "CameraCalibration"
-            # A calibration is sent with every image and never changes: keep the first.
-            if not (is_calibration and sample.topic in calibrated):
-                yield replace(sample, publish_ns=max(bag_ns, 0))
-            if is_calibration:
-                calibrated.add(sample.topic)
+        samples = _convert_message(line, message, time_ns, where)
+        for sample in select_usable(samples, f"{source}: {line.topic}", calibrated):
+            yield replace(sample, publish_ns=max(bag_ns, 0))
     if scaled:
         say(f"{source}: images of {', '.join(sorted(scaled))}: {scaling_words(options.bits)}")
     _report_unstamped(source, unstamped)
@@ -140,18 +138,30 @@ def _header_time_ns(message: Any) -> int | None:
 def _convert_message(
     line: TopicPlan, message: BagMessage, time_ns: int, where: MessageContext
 ) -> Iterator[Sample]:
-    """Yield the samples of a message; leave out those with a number that is not finite."""
     if not line.kind.startswith(DMRL_PREFIX):
-        for sample in CONVERTERS[line.kind](message.decoded, time_ns, where):
-            if _is_finite(sample.fields):
-                yield sample
-            else:
-                reason = f"samples of {sample.topic} with values that are not finite"
-                leave_out(reason, f"{where.source}: {line.topic} at {time_ns} ns")
+        yield from CONVERTERS[line.kind](message.decoded, time_ns, where)
     elif (sample := convert_dmrl_message(message.decoded, line.topic, time_ns)) is not None:
         yield sample
     else:
         leave_out(f"messages on {line.topic} of another version of dmrl", where.source)
+
+
+def select_usable(
+    samples: Iterator[Sample], where: object, calibrated: set[str]
+) -> Iterator[Sample]:
+    """Yield the samples whose numbers are finite, and of calibrations the first of each topic.
+
+    A calibration is sent with every image and does not change. ``calibrated`` holds the topics that
+    have one. dmrl's own messages may hold infinite numbers, such as unknown sigmas.
+    """
+    for sample in samples:
+        is_calibration = sample.message == "CameraCalibration"
+        if sample.message in FOREIGN_OUTPUTS and not _is_finite(sample.fields):
+            reason = f"samples of {sample.topic} with values that are not finite"
+            leave_out(reason, f"{where} at {sample.time_ns} ns")
+        elif not (is_calibration and sample.topic in calibrated):
+            calibrated.update([sample.topic] if is_calibration else [])
+            yield sample
 
 
 def _is_finite(value: Any) -> bool:

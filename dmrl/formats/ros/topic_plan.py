@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from dmrl import topics
+from dmrl.errors import SettingError
 from dmrl.formats.base import Options
 from dmrl.formats.ros.ros_messages import CONVERTERS, DMRL_PREFIX
 from dmrl.terminal.progress import say
@@ -18,6 +19,16 @@ from dmrl.terminal.progress import say
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO, RANGE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Range"
 POSE, ODOMETRY = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
+TARGETS = {
+    **dict.fromkeys(IMAGE_TYPES, (topics.CAMERA_IMAGE,)),
+    CAMERA_INFO: (topics.CALIBRATION,),
+    RANGE: (topics.RANGE,),
+    POSE: (topics.POSE, topics.TRUE_POSE),
+    ODOMETRY: (topics.POSE, topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT),
+    "sensor_msgs/msg/Imu": (topics.ATTITUDE,),
+    "geometry_msgs/msg/TwistStamped": (topics.VELOCITY,),
+}
+"""Topics that messages become, by type."""
 NON_CAMERA_TOPICS = (topics.MASKS, topics.DEPTHS)
 """Image topics of an exported render that are not images of a camera."""
 MOTION_CAPTURE = re.compile(
@@ -50,13 +61,14 @@ UWB_PART = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class TopicPlan:
-    """Conversion of one topic of a bag: its type, message count, robot and peer."""
+    """Conversion of one topic: its type, message count, robot, peer; ``captured``: a true pose."""
 
     topic: str
     kind: str
     count: int
     robot: str
     peer: str = ""
+    captured: bool = False
 
 
 Held = Sequence[tuple[str, str, int]]
@@ -78,7 +90,16 @@ def plan_topics(
     is_camera
         Return whether a topic of images, by name and type, has images of a camera that can be
         decoded. It is called only for robots with several such topics.
+
+    Raises
+    ------
+    SettingError
+        If ``names`` gives a topic of dmrl's for one of another content.
     """
+    for topic, kind, _ in held:
+        wanted = options.names.get(topic, "")
+        if "/" in wanted and not any(topics.parse_topic(t, wanted) for t in TARGETS.get(kind, ())):
+            raise SettingError(f"--names {topic}={wanted}: {kind} is not converted to {wanted}")
     names = _TopicNames([topic for topic, kind, _ in held if kind in CONVERTERS], options)
     lines: dict[tuple[str, str], TopicPlan] = {}
     why: dict[tuple[str, str], str] = {}
@@ -96,7 +117,9 @@ def plan_topics(
             else:
                 lines[topic, kind] = TopicPlan(topic, kind, count, *pair)
         else:
-            lines[topic, kind] = TopicPlan(topic, kind, count, names.find_robot(topic))
+            captured = bool(MOTION_CAPTURE.search(options.names.get(topic, topic)))
+            robot = names.find_robot(topic)
+            lines[topic, kind] = TopicPlan(topic, kind, count, robot, captured=captured)
     for line in _find_doubles(lines, is_camera):
         del lines[line.topic, line.kind]
         why[line.topic, line.kind] = f"another topic has this of {line.robot}"
@@ -110,22 +133,20 @@ def _find_doubles(
     groups: dict[tuple[object, ...], list[TopicPlan]] = {}
     for line in lines.values():
         kind = "image" if line.kind in IMAGE_TYPES else line.kind
-        captured = bool(MOTION_CAPTURE.search(line.topic))
-        kind = ODOMETRY if kind == POSE and not captured else kind
+        kind = ODOMETRY if kind == POSE and not line.captured else kind
         if not kind.startswith(DMRL_PREFIX):
-            groups.setdefault((kind, line.robot, line.peer, captured), []).append(line)
+            groups.setdefault((kind, line.robot, line.peer, line.captured), []).append(line)
     best: dict[tuple[object, ...], TopicPlan] = {}
     cameras: dict[str, str] = {}
 
     def rank(line: TopicPlan) -> tuple[object, ...]:
-        pose_only = line.kind == POSE
         if line.kind in IMAGE_TYPES:
             return not is_camera(line.topic, line.kind), -line.count, line.kind != IMAGE_TYPES[0]
         if line.kind == CAMERA_INFO:
             camera = cameras.get(line.robot, "").split("/")
             shared = sum(map(str.__eq__, camera, line.topic.split("/")))
             return -shared, -line.count
-        return pose_only and not MOTION_CAPTURE.search(line.topic), -line.count
+        return line.kind == POSE, -line.count
 
     for key in sorted(groups, key=lambda one: one[0] == CAMERA_INFO):  # after the images
         found = groups[key]

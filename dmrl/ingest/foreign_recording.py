@@ -1,0 +1,229 @@
+"""Recordings of other programs in MCAP, and of dmrl under other names.
+
+Foxglove's images, calibrations and poses, in protobuf or JSON, are converted like the ROS messages
+that they were made from. Topics of dmrl with its own messages are copied, with new names of robots.
+All others are left out, with a line that names them.
+"""
+
+import base64
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto as F
+from google.protobuf.message import DecodeError
+from google.protobuf.message_factory import GetMessageClass
+
+from dmrl import topics
+from dmrl.errors import SourceError
+from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
+from dmrl.formats.clocks import MessageClock
+from dmrl.formats.files.pictures import scaling_words
+from dmrl.formats.ros import bag
+from dmrl.formats.ros.bag import select_usable
+from dmrl.formats.ros.ros_messages import CONVERTERS, MessageContext, is_camera_image
+from dmrl.formats.ros.topic_plan import TopicPlan, plan_topics
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.messages import LOG_PACKAGE, LogType
+from dmrl.recording import RawMessage, Summary, read_raw, read_splits, read_summary
+from dmrl.recording.protobuf.message_types import find_channel_descriptor
+from dmrl.recording.writer import RECIPE_NAME
+from dmrl.samples.sample import Sample
+from dmrl.terminal.left_out import leave_out
+from dmrl.terminal.progress import say
+
+ROS_TYPES = {
+    "foxglove.CompressedImage": "sensor_msgs/msg/CompressedImage",
+    "foxglove.RawImage": "sensor_msgs/msg/Image",
+    "foxglove.CameraCalibration": "sensor_msgs/msg/CameraInfo",
+    "foxglove.PoseInFrame": "geometry_msgs/msg/PoseStamped",
+}
+"""ROS messages with the fields of Foxglove's."""
+OWN_PACKAGES = ("dmrl.v1.", "dmrl.log.")
+FIELDS_WITH_ROBOTS = ("peer", "frame_id", "parent_frame_id", "child_frame_id")
+LOG_CODES = {F.TYPE_UINT32: "I", F.TYPE_SINT32: "i", F.TYPE_SINT64: "q"}
+LOG_CODES |= {F.TYPE_FLOAT: "f", F.TYPE_DOUBLE: "d"}
+"""Letters of `LogType` by type of field."""
+
+
+def can_read(source: Path) -> bool:
+    """Return whether a source is an MCAP file, and no ROS bag."""
+    return source.is_file() and source.suffix == ".mcap" and not bag.can_read(source)
+
+
+def load_content(source: Path, options: Options) -> Content:
+    """Load the samples of a recording.
+
+    Parameters
+    ----------
+    source
+        The recording.
+    options
+        ``names`` renames robots, names the robot of a topic, or gives a topic of dmrl's for one;
+        ``robot`` is that of topics that name none.
+
+    Raises
+    ------
+    SourceError
+        If no topic can be converted, or the recording is dmrl's own and nothing is renamed.
+    SettingError
+        If a name fits no topic.
+    """
+    summary = read_summary(source)
+    channels = {channel.topic: channel for channel in summary.definitions.channels.values()}
+    if any(channel.encoding in ("cdr", "ros1") for channel in channels.values()):
+        return bag.load_content(source, options)
+    if summary.provenance is not None and not options.names:
+        raise SourceError(f"{source} is a recording already. Pass --to: csv, parquet, ros2")
+    own = dict(_iter_own(summary, options))
+    held = []
+    for topic, info in summary.topics.items():
+        kind = ROS_TYPES.get(info.schema, f"{info.schema or 'data'} in {channels[topic].encoding}")
+        held += [(topic, kind, info.count)] if topic not in own else []
+
+    def is_camera(topic: str, _kind: str) -> bool:
+        found = [_decode(raw, source) for raw in islice(read_raw(source, topic), 1)]
+        return found[0] is not None and is_camera_image(found[0])
+
+    plan, why = plan_topics(held, options, is_camera)
+    for topic, kind, count in held:
+        if (topic, kind) in why:
+            leave_out(f"messages on {topic}: {why[topic, kind]}", source, count)
+    lines = {line.topic: line for line in plan.values()}
+    if not (lines or own):
+        raise SourceError(f"{source} has no topic of a known type. See docs/sources.md")
+    foreign = [one for one in summary.attachments if one.name != RECIPE_NAME]
+    leave_out("attachments", source, len(foreign))
+    count = sum(summary.topics[topic].count for topic in (*own, *lines))
+    splits = read_splits(source, summary)
+    return Content(_iter_samples(source, own, lines, options), count, splits)
+
+
+def _iter_own(summary: Summary, options: Options) -> Iterator[tuple[str, str]]:
+    """Yield the topics that hold dmrl's own messages, and their new names.
+
+    In a recording of dmrl's, Foxglove's messages count as its own: their calibrations count pixels
+    from the edge of the first one.
+    """
+    for topic, info in summary.topics.items():
+        parts = topic.split("/")
+        wanted = options.names.get(topic, "/".join(options.names.get(p, p) for p in parts))
+        row = topics.find_topic(wanted)
+        is_own = summary.provenance is not None or info.schema.startswith(OWN_PACKAGES)
+        if is_own and row is not None and row.accepts_message(info.schema):
+            yield topic, wanted
+
+
+def _iter_samples(
+    source: Path, own: Mapping[str, str], lines: Mapping[str, TopicPlan], options: Options
+) -> Iterator[Sample]:
+    calibrated: set[str] = set()
+    scaled: set[str] = set()
+    stamps = ((r.topic, _stamp_ns(_decode(r, source)), r.time_ns) for r in _read(source, lines))
+    clock = MessageClock.from_stamps(source, stamps)
+    for raw in _read(source, [*own, *lines]):
+        if raw.topic in own:
+            message = _parse(raw, source)
+            fields = _to_fields(message, options.names)
+            yield Sample(raw.time_ns, own[raw.topic], _to_type(message), fields, raw.publish_ns)
+            continue
+        line, held = lines[raw.topic], _decode(raw, source)
+        where = MessageContext(
+            source, line.robot, line.peer, line.captured, bits=options.bits, scaled=scaled
+        )
+        try:
+            time_ns = clock.find_time_ns(line.topic, _stamp_ns(held), raw.time_ns)
+            converted = CONVERTERS[line.kind](held, time_ns or 0, where)
+            samples = [] if time_ns is None else list(converted)
+        except (AttributeError, TypeError, ValueError):  # a field is missing, or is no number
+            leave_out(f"messages on {line.topic} that cannot be decoded", source)
+            continue
+        for sample in select_usable(iter(samples), f"{source}: {line.topic}", calibrated):
+            yield replace(sample, publish_ns=raw.publish_ns)
+    if scaled:
+        say(f"{source}: images of {', '.join(sorted(scaled))}: {scaling_words(options.bits)}")
+
+
+def _read(source: Path, wanted: Iterable[str]) -> Iterator[RawMessage]:
+    names = list(wanted)
+    return read_raw(source, *names) if names else iter(())
+
+
+def _parse(raw: RawMessage, source: Path) -> Any:
+    """Return a protobuf message, the value of a JSON one, or None for what is neither."""
+    try:
+        if raw.channel.encoding == "json":
+            return parse_json(raw.data)
+        return GetMessageClass(find_channel_descriptor(source, raw.channel)).FromString(raw.data)
+    except (ValueError, DecodeError):
+        return None
+
+
+def _decode(raw: RawMessage, source: Path) -> Any:
+    """Return a message of Foxglove's as an object with the fields of ROS's; None: it is none."""
+    message = _parse(raw, source)
+    if isinstance(message, dict) and isinstance(message.get("data"), str):
+        try:
+            message["data"] = base64.b64decode(message["data"], validate=True)
+        except ValueError:
+            return None
+    return None if message is None else _to_object(message)
+
+
+def _to_object(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return np.frombuffer(value, np.uint8)
+    if hasattr(value, "DESCRIPTOR"):
+        value = {field.name: getattr(value, field.name) for field in value.DESCRIPTOR.fields}
+    if isinstance(value, dict):
+        held = {str(name): _to_object(part) for name, part in value.items()}
+        return SimpleNamespace(**{"is_bigendian": False} | held)
+    return value
+
+
+def _stamp_ns(message: Any) -> int | None:
+    """Return the time in a message, protobuf's or JSON's; None if it has none."""
+    stamp = getattr(message, "timestamp", None)
+    seconds, nanos = (
+        getattr(stamp, names[0], getattr(stamp, names[1], None))
+        for names in (("seconds", "sec"), ("nanos", "nsec"))
+    )
+    whole = isinstance(seconds, int) and isinstance(nanos, int)
+    return max(seconds * 1_000_000_000 + nanos, 0) if whole else None
+
+
+def _to_type(message: Any) -> str | LogType:
+    """Return the type of a message of dmrl's for `Sample`."""
+    kind = message.DESCRIPTOR
+    if not kind.full_name.startswith(f"{LOG_PACKAGE}."):
+        return str(kind.full_name)
+    return LogType(kind.name, tuple((f.json_name, LOG_CODES[f.type]) for f in kind.fields))
+
+
+def _to_fields(value: Any, names: Mapping[str, str]) -> Any:
+    """Return a protobuf message as fields of a sample, with new names of robots."""
+    found = {}
+    for field, held in value.ListFields():
+        if field.message_type is not None:
+            held = (
+                [_to_fields(one, names) for one in held]
+                if field.is_repeated
+                else (_to_fields(held, names))
+            )
+        elif field.name in FIELDS_WITH_ROBOTS:
+            held = "/".join(names.get(part, part) for part in held.split("/"))
+        found[field.name] = list(held) if field.is_repeated else held
+    return found
+
+
+FORMAT = Format(
+    "mcap",
+    "an MCAP file of another program",
+    can_read,
+    load_content,
+    SOURCE_OPTIONS | {"bits"},
+)
