@@ -21,10 +21,10 @@ from google.protobuf.message_factory import GetMessageClass
 from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
-from dmrl.formats.clocks import MessageClock
 from dmrl.formats.files.pictures import scaling_words
 from dmrl.formats.ros import bag
 from dmrl.formats.ros.bag import select_usable
+from dmrl.formats.ros.message_clock import MessageClock
 from dmrl.formats.ros.ros_messages import CONVERTERS, MessageContext, is_camera_image
 from dmrl.formats.ros.topic_plan import TopicPlan, plan_topics
 from dmrl.guards.bounded_parsing import parse_json

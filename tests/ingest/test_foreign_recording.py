@@ -17,7 +17,7 @@ from mcap_protobuf.writer import Writer
 
 import dmrl
 from dmrl.errors import MissingTopic, SettingError, SourceError
-from dmrl.images.codec import decode, encode_png
+from dmrl.images.codec import UNDECODABLE, decode, encode_png
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter, match_topics, read_summary
 from dmrl.stages.convert import Settings, run
@@ -102,7 +102,7 @@ def test_what_cannot_be_used_is_named(tmp_path: Path) -> None:
     assert list(found.topics) == ["/a/camera/image"]
     assert left == {
         "messages on /a/video: another topic has this of a": 3,
-        "pictures that cannot be decoded, of format 'h264'": 3,
+        f"{UNDECODABLE}, of format 'h264'": 3,
         "samples of /b/pose with values that are not finite": 3,
         "orientations of c that are no unit quaternion": 3,
     }
