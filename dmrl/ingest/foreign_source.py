@@ -72,8 +72,6 @@ def record_source(
             sink.add_metadata(LICENCES_METADATA, {source.name: extract_licence_title(licence)})
         counts = write_content(content, sink)
         if not counts:
-            raise SourceError(f"{source}: no message of it can be used. Pass another source")
-        if not counts:
             raise SourceError(f"{source}: nothing in it can be used. Pass another")
     print_findings(out)
     return counts
