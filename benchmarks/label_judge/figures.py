@@ -135,13 +135,23 @@ def _find_words(result: Mapping[str, Any]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class RowFigures:
-    """Figures of a row: roots of means of squares over flights, shares of all positions."""
+    """Figures of a row: roots of means of squares over flights, shares of all positions.
+
+    ``median_m``, ``ratio`` and ``least_ellipse`` are the median RMSE of a flight, its median over
+    the bound, and the least share in the ellipse; ``worst_kept_m`` is the largest RMSE of a flight
+    of which anything is kept. ``near`` is the share of flights in which the words name the cause;
+    where there is none, that in which a cause is named all the same.
+    """
 
     flights: int
     rmse_m: float
+    median_m: float
+    worst_kept_m: float
+    ratio: float
     sigma_m: float
     bound_m: float
     ellipse: float
+    least_ellipse: float
     kept: float
     kept_of_limit: float
     kept_of_sound: float
@@ -179,14 +189,22 @@ def combine(
     sound_kept = sum(f.kept for f in sound)
     # Until labels have causes, their lines count, and the line of a refusal.
     words = [f.named or f.said or f.error for f in flights]
-    near = [bool(cause) and re.search(cause, w, re.IGNORECASE) is not None for w in words]
+    near = [re.search(cause, w, re.IGNORECASE) is not None for w in words]
+    if not cause:
+        near = [bool(f.named) for f in flights]
+    sizes = [np.sqrt(f.squared_error / f.positions) for f in made]
+    ratios = [np.sqrt(f.squared_error / f.squared_bound) for f in made]
     shares = [f.bad / f.kept for f in flights if f.kept]
     return RowFigures(
         flights=len(flights),
         rmse_m=root("squared_error"),
+        median_m=float(np.median(sizes)) if sizes else float("nan"),
+        worst_kept_m=max((s for s, f in zip(sizes, made, strict=True) if f.kept), default=0.0),
+        ratio=float(np.median(ratios)) if ratios else float("nan"),
         sigma_m=root("squared_sigma"),
         bound_m=root("squared_bound"),
         ellipse=_divide(sum(f.inside for f in made), positions),
+        least_ellipse=min((f.inside / f.positions for f in made), default=float("nan")),
         kept=_divide(kept, expected),
         kept_of_limit=_divide(kept, keepable),
         kept_of_sound=_divide(kept, sound_kept),

@@ -162,6 +162,8 @@ def _write_columns(
     sink: RecordingWriter, topic: str, message: str, time_s: Array, **fields: Array
 ) -> None:
     """Write the rows in which everything is known, in the order of time."""
+    if not len(time_s):
+        return
     good = np.all([np.isfinite(v).reshape(len(time_s), -1).all(axis=1) for v in fields.values()], 0)
     order = np.argsort(time_s[good], kind="stable")
     log_ns = START_NS + np.rint(time_s[good][order] * 1e9).astype(np.int64)
