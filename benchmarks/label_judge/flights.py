@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.flight import NOISE, Fault, Flight, Scenario, simulate
+from dmrl.flight import NOISE, TRAJECTORIES, Fault, Flight, Scenario, simulate
 from dmrl.flight.bound import compute_bound
+from dmrl.flight.trajectories import Motion, Start
 from dmrl.geometry.frames import AIDECK_PINHOLE, pixels_from_horizontal
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
@@ -23,7 +24,32 @@ Array = NDArray[np.float64]
 Pair = tuple[str, str]
 BOTH: tuple[Pair, Pair] = (("cf1", "cf2"), ("cf2", "cf1"))
 MOTIONS = ("in_view", "room", "random")
+HOPS = "hops"
+"""Motion of the judge's own: rests in a room of 4 x 4 m, and hops between them, up to 4 m/s."""
 TRUTH_HZ = 20.0
+
+
+def hop(rng: np.random.Generator, start: Start, _leader: Motion | None) -> Motion:
+    """Return the motion of a robot that rests and hops, with the least jerk, and turns."""
+    time_s = np.arange(start.samples) / 100
+    position, velocity = np.zeros((2, start.samples), complex)
+    yaw_rate = np.zeros(start.samples)
+    place, begins_s = complex(*rng.uniform(-1.8, 1.8, 2)), 0.0
+    while begins_s < time_s[-1]:
+        goal, rest_s = complex(*rng.uniform(-1.8, 1.8, 2)), rng.uniform(0.0, 2.0)
+        lasts_s = max(abs(goal - place) / rng.uniform(0.8, 2.2), 0.8)
+        at = np.clip((time_s - begins_s - rest_s) / lasts_s, 0.0, 1.0)
+        here = (time_s >= begins_s) & (time_s < begins_s + rest_s + lasts_s)
+        way = goal - place
+        position[here] = (place + way * (10 * at**3 - 15 * at**4 + 6 * at**5))[here]
+        velocity[here] = (way * 30 * at**2 * (1 - at) ** 2 / lasts_s)[here]
+        yaw_rate[here] = (rng.uniform(-1, 1) * 30 * at**2 * (1 - at) ** 2 / lasts_s)[here]
+        place, begins_s = goal, begins_s + rest_s + lasts_s
+    yaw = start.yaw_rad + np.concatenate([[0.0], np.cumsum(yaw_rate[1:] + yaw_rate[:-1]) / 200])
+    return Motion(position, velocity, yaw, yaw_rate)
+
+
+TRAJECTORIES[HOPS] = (hop, hop)  # type: ignore[index]
 
 
 @dataclass

@@ -10,7 +10,7 @@ import numpy as np
 
 from label_judge import real
 from label_judge.faults import ROWS
-from label_judge.flights import MOTIONS, Base, Eye, fly, look, write
+from label_judge.flights import HOPS, MOTIONS, Base, Eye, fly, look, write
 from label_judge.injection import Row
 
 SETS = ("sound", "faults", "thirds", "eyes", "real")
@@ -75,7 +75,7 @@ def list_sound(flights: int, noises: Sequence[str]) -> Iterator[Job]:
     """Yield flights without a fault."""
     seed = FIRST_SEED["sound"]
     for noise in noises:
-        for motion in MOTIONS:
+        for motion in (*MOTIONS, HOPS):
             for k in range(flights):
                 base = Base(motion, noise, 100.0, seed + k)
                 yield Job("sound", f"{motion} 100 s", noise, k, base)
