@@ -6,13 +6,14 @@ A new format is one file in ``dmrl/formats`` with a ``FORMAT``.
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter, validators
 
 from dmrl.atomic_output import refuse_existing
-from dmrl.errors import SettingError
+from dmrl.errors import SettingError, SourceError
 from dmrl.guards.paths import refuse_pipes
 from dmrl.pipeline.batch import find_recordings
 from dmrl.pipeline.stage_command import stage_command
@@ -23,6 +24,14 @@ from dmrl.terminal.tables import print_table
 if TYPE_CHECKING:
     from dmrl.formats.base import Options
 
+DATASET_WRITERS = {
+    "yolo": ("dmrl.export.detection_sets", "write_yolo"),
+    "coco": ("dmrl.export.detection_sets", "write_coco"),
+    "webdataset": ("dmrl.export.detection_sets", "write_webdataset"),
+    "lerobot": ("dmrl.export.lerobot", "write_lerobot"),
+}
+"""Writers of datasets for other trainers, by ``--to``."""
+BOX_SETTINGS = {"camera", "robot_width_m"}
 ROBOT = re.compile(r"[A-Za-z0-9_-]+")
 NEW_NAME = re.compile(r"[A-Za-z0-9_-]+|(/[A-Za-z0-9_-]+)+")
 
@@ -78,7 +87,8 @@ class Settings:
         out and counted.
     to
         The other way: SOURCE is a recording, OUT a folder of tables (csv, parquet) or a ROS 2
-        bag (ros2).
+        bag (ros2); or SOURCE is a dataset, OUT a folder for another trainer (yolo, coco, lerobot,
+        webdataset).
     """
 
     source_kind: Annotated[str | None, Parameter(name="--from")] = None
@@ -96,7 +106,7 @@ class Settings:
     robot_width_m: Annotated[float | None, Parameter(validator=validators.Number(gt=0))] = None
     unlabelled: Annotated[bool, Parameter(negative=())] = False
     strict: Strict = False
-    to: Literal["csv", "parquet", "ros2"] | None = None
+    to: Literal["csv", "parquet", "ros2", "yolo", "coco", "lerobot", "webdataset"] | None = None
 
 
 def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
@@ -131,6 +141,8 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
     refuse_pipes(source)
     if settings.to is not None:
         _refuse_source_settings(settings)
+    if settings.to in DATASET_WRITERS:
+        return _export_dataset(source, out, settings)
     if settings.to == "ros2":
         from dmrl.export.ros2 import write_bag
 
@@ -138,7 +150,7 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
     if settings.to is not None:
         from dmrl.export.csv_parquet import write_tables
 
-        return write_tables(source, out, settings.to)
+        return write_tables(source, out, str(settings.to))
     from dmrl.ingest.foreign_source import record_source
 
     kind = settings.source_kind or ("columns" if settings.columns else None)
@@ -147,10 +159,34 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
     return record_source(source, out, kind, options, settings=settings, files=files)
 
 
+def _export_dataset(source: Path, out: Path, settings: Settings) -> dict[str, int]:
+    """Write a dataset for other trainers; return images by split."""
+    from dmrl.atomic_output import atomic_folder
+    from dmrl.datasets import open_dataset
+    from dmrl.export.dataset_rows import BoxOptions, ExportRows
+    from dmrl.geometry.camera_file import find_camera
+    from dmrl.recording import build_provenance
+
+    camera = None if settings.camera is None else find_camera(settings.camera)
+    options = BoxOptions(_parse_names(settings.names), settings.robot_width_m, camera)
+    rows = ExportRows(open_dataset(source), options)
+    made = build_provenance("convert", settings, (source,), libraries=("pyarrow", "pillow"))
+    module, name = DATASET_WRITERS[str(settings.to)]
+    write = getattr(import_module(module), name)
+    with atomic_folder(out) as folder:
+        counts: dict[str, int] = write(rows, folder)
+        if not counts:
+            raise SourceError(f"{source} has no image that --to {settings.to} can hold")
+        made.write(folder)
+    return counts
+
+
 def _refuse_source_settings(settings: Settings) -> None:
-    """Raise SettingError if a setting describes a foreign source, but SOURCE is a recording."""
+    """Raise SettingError if a setting describes a foreign source, but SOURCE is none."""
     default = Settings()
-    for name in (one.name for one in fields(Settings) if one.name != "to"):
+    used = {"to", "strict"} | (BOX_SETTINGS if settings.to in ("yolo", "coco") else set())
+    used |= {"names"} if settings.to in DATASET_WRITERS else set()
+    for name in (one.name for one in fields(Settings) if one.name not in used):
         if getattr(settings, name) != getattr(default, name):
             flag = "--from" if name == "source_kind" else f"--{name.replace('_', '-')}"
             raise SettingError(f"{flag} has no effect with --to {settings.to}. Leave it out")
@@ -206,6 +242,8 @@ def _parse_names(text: str | None) -> dict[str, str]:
 def _find_many(given: Given) -> Mapping[Path, Path] | None:
     """Return the sources in a folder, by the names of the outputs; None: it is one source."""
     source, settings = given.source, given.settings
+    if settings.to in DATASET_WRITERS:
+        return None
     if not (source.is_dir() and (settings.to is not None or given.out.suffix != ".mcap")):
         return None
     if settings.to is not None:
@@ -216,7 +254,9 @@ def _find_many(given: Given) -> Mapping[Path, Path] | None:
 
 
 def _show(counts: dict[str, int], given: Given) -> None:
-    columns = ("topic", "rows" if given.settings.to else "messages")
+    to = given.settings.to
+    split = to in DATASET_WRITERS
+    columns = ("split", "images") if split else ("topic", "rows" if to else "messages")
     print_table(str(given.out), columns, list(counts.items()))
 
 

@@ -44,6 +44,9 @@ MAX_DEPTH_M = 100.0
 
 LABELLED_OPTIONS = PICTURE_OPTIONS | {"rate_hz", "robot_width_m"}
 
+SHARES = (1.0, 1.0)
+"""Size to which normalised coordinates refer."""
+
 MoreSamples = Callable[[Path, int, Crop], Iterator[Sample]]
 
 
@@ -61,8 +64,8 @@ class LabelledPicture:
         Its labels; empty: nobody is in view; None: not labelled. A row without a peer counts as no
         label, but names its source.
     size_px
-        Width and height to which the labels refer; (1, 1): shares of the size of the picture; None:
-        its pixels.
+        Width and height to which the labels refer; ``SHARES``: they are shares of the size of the
+        picture; None: its pixels.
     """
 
     path: Path
@@ -141,7 +144,8 @@ def build_picture_content(
     """Build the content of labelled pictures with their times, in time order."""
     if options.robot_width_m is not None and options.camera is None:
         raise SettingError("--robot-width-m needs the focal length. Pass --camera")
-    report_doubts(source, [row for _, p in pictures for row in p.rows or ()], options.robot)
+    in_pixels = [p for _, p in pictures if p.size_px != SHARES]
+    report_doubts(source, [row for p in in_pixels for row in p.rows or ()], options.robot)
     return Content(
         samples=iter_picture_samples(source, pictures, options),
         total=sum(1 + (p.rows is not None) for _, p in pictures) + (options.camera is not None),
@@ -181,7 +185,7 @@ def _to_pixels(picture: LabelledPicture, crop: Crop) -> list[LabelRow] | None:
     if picture.rows is None or picture.size_px is None:
         return None if picture.rows is None else list(picture.rows)
     size = crop.from_width_px, crop.from_height_px
-    if picture.size_px == (1, 1):
+    if picture.size_px == SHARES:
         return [row.scale(*size) for row in picture.rows]
     if picture.size_px != size:
         leave_out("pictures with labels for another size", picture.path)

@@ -22,6 +22,7 @@ from dmrl.formats.base import Content, Format, Options
 from dmrl.formats.files.label_csv import LabelRow
 from dmrl.formats.files.labelled_pictures import (
     LABELLED_OPTIONS,
+    SHARES,
     LabelledPicture,
     build_picture_content,
     find_split,
@@ -92,7 +93,7 @@ def load_content(source: Path, options: Options) -> Content:
             path,
             find_split(path.relative_to(source), about.splits),
             _read_rows(label, path, about, options),
-            (1, 1),
+            SHARES,
         )
         for path, label in labels.items()
     ]

@@ -1,0 +1,178 @@
+"""Rows of a dataset as other trainers take them: a PNG, a name, and boxes with classes."""
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from dmrl.datasets import Dataset, layout
+from dmrl.geometry.frames import Camera
+from dmrl.images.codec import encode_png
+from dmrl.terminal.left_out import leave_out
+from dmrl.terminal.progress import track
+
+COLUMNS = ("peers", "robot", "source", "log_time")
+WITHOUT_BOX = "images with a label without a box (--robot-width-m and --camera give one)"
+
+
+@dataclass(frozen=True)
+class ExportRow:
+    """One image of a split.
+
+    Parameters
+    ----------
+    split
+        Its split.
+    name
+        Name for files: its number in the split, recording, robot and log time.
+    size_px
+        Width and height.
+    png
+        The image.
+    peers
+        Its labels, dictionaries with the fields of ``layout.PEER_TYPE``. ``class`` is their class,
+        and ``box_px`` is empty where it is unknown.
+    robot, source, log_time
+        Robot whose camera took it, recording, and log time there, nanoseconds.
+    """
+
+    split: str
+    name: str
+    size_px: tuple[int, int]
+    png: bytes
+    peers: list[dict[str, Any]]
+    robot: str
+    source: str
+    log_time: int
+
+
+@dataclass(frozen=True)
+class BoxOptions:
+    """Options of the boxes and their classes.
+
+    Parameters
+    ----------
+    names
+        Classes by peer, or by peer without the number of its repetition.
+    robot_width_m, camera
+        Width of the robots, metres, and camera, from which labels without a box get one.
+    """
+
+    names: Mapping[str, str] = field(default_factory=dict)
+    robot_width_m: float | None = None
+    camera: Camera | None = None
+
+    def to_class(self, peer: str) -> str:
+        """Return the class of a peer: drone for drone-2."""
+        base = re.sub(r"-\d+$", "", peer)
+        return self.names.get(peer) or self.names.get(base) or base
+
+    def to_box(self, peer: Mapping[str, Any]) -> list[float]:
+        """Return the box of a label: its own, or one as wide as the robot at its depth."""
+        if peer["box_px"] or self.camera is None or not self.robot_width_m or not peer["depth_m"]:
+            return list(peer["box_px"])
+        half = self.camera.fx_px * self.robot_width_m / peer["depth_m"] / 2
+        u, v = peer["u_px"], peer["v_px"]
+        return [u - half, v - half, u + half, v + half]
+
+
+@dataclass(frozen=True)
+class ExportRows:
+    """All rows of a dataset.
+
+    Parameters
+    ----------
+    data
+        The dataset.
+    options
+        Options of its boxes.
+    """
+
+    data: Dataset
+    options: BoxOptions
+
+    @cached_property
+    def classes(self) -> list[str]:
+        """Every class, sorted."""
+        peers = (peer for s in self.data.splits for p in self._read(s, "peers") for peer in p)
+        return sorted({self.options.to_class(peer["peer"]) for peer in peers})
+
+    @cached_property
+    def most_peers(self) -> int:
+        """Largest number of labels of an image, 1 at least."""
+        return max(1, *(len(p) for s in self.data.splits for p in self._read(s, "peers")))
+
+    def list_times(self) -> list[list[int]]:
+        """Return the log times of the images of each robot, by split and recording."""
+        found: dict[tuple[str, ...], list[int]] = defaultdict(list)
+        for split in self.data.splits:
+            columns = (self._read(split, name) for name in ("robot", "source", "log_time"))
+            for robot, source, log_time in zip(*columns, strict=True):
+                found[split, robot, source].append(log_time)
+        return list(found.values())
+
+    def _read(self, split: str, column: str) -> Iterator[Any]:
+        for chunk in self.data.split(split).table[column].chunks:
+            yield from chunk.to_pylist()
+
+    def __iter__(self) -> Iterator[ExportRow]:
+        """Yield the rows, split by split."""
+        total = sum(len(self.data.split(split)) for split in self.data.splits)
+        return track(self._iter_rows(), "Writing images", total)
+
+    def iter_boxed(self) -> Iterator[ExportRow]:
+        """Yield the rows whose visible peers all have boxes, which are clipped to the image.
+
+        Others are left out: a detector would take their peers for background.
+        """
+        for row in self:
+            boxes = [(peer, self.options.to_box(peer)) for peer in row.peers]
+            if any(not box for _, box in boxes):
+                leave_out(WITHOUT_BOX, f"{self.data.path}: {row.name}")
+                continue
+            clipped = [peer | {"box_px": _clip(box, row.size_px)} for peer, box in boxes]
+            yield replace(row, peers=[peer for peer in clipped if peer["box_px"]])
+
+    def _iter_rows(self) -> Iterator[ExportRow]:
+        for name in self.data.splits:
+            split = self.data.split(name)
+            height_px, width_px = split.image_shape
+            columns = (self._read(name, column) for column in COLUMNS)
+            images = split.images(range(len(split)))
+            for k, (rgb, peers, robot, source, log_time) in enumerate(
+                zip(images, *columns, strict=True)
+            ):
+                stem = re.sub(r"[^A-Za-z0-9_-]", "_", Path(source).stem)[:80]
+                yield ExportRow(
+                    name,
+                    f"{k:06d}-{stem}-{robot}-{log_time}",
+                    (width_px, height_px),
+                    encode_png(rgb),
+                    [peer | {"class": self.options.to_class(peer["peer"])} for peer in peers],
+                    robot,
+                    source,
+                    log_time,
+                )
+
+
+def _clip(box_px: list[float], size_px: tuple[int, int]) -> list[float]:
+    left, top, right, bottom = (
+        min(max(edge, 0.0), float(size_px[k % 2])) for k, edge in enumerate(box_px)
+    )
+    return [left, top, right, bottom] if left < right and top < bottom else []
+
+
+def to_attributes(peer: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a label that JSON can hold; a depth that is unknown is left out."""
+    known = {name: peer[name] for name in (*(f.name for f in layout.PEER_TYPE), "class")}
+    if math.isinf(known["sigma_depth_m"]):
+        del known["depth_m"], known["sigma_depth_m"]
+    return {
+        name: value
+        for name, value in known.items()
+        if not isinstance(value, float) or math.isfinite(value)
+    }
