@@ -43,16 +43,17 @@ class PlotSpec:
 
 
 class UnitCheck(NamedTuple):
-    """Check for values in a wrong unit: a tenth of them is too large for a small robot.
+    """Check for values in a wrong unit: a tenth is too large for a small robot, or all too small.
 
     ``field`` of the message, in ``unit``; ``over`` is the largest plausible magnitude, and
-    ``perhaps`` the likely unit of larger ones.
+    ``perhaps`` the likely unit of larger ones. ``under`` is the smallest plausible one; 0: none.
     """
 
     field: str
     over: float
     unit: str
     perhaps: str
+    under: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +234,7 @@ TOPICS = (
         sensor=True,
         curve=PlotSpec("height, m", ("height_m",)),
         csv=("height_m",),
-        doubts=(UnitCheck("height_m", 30.0, "m", "mm or cm"),),
+        doubts=(UnitCheck("height_m", 30.0, "m", "mm or cm", 0.005),),
     ),
     Topic(
         RANGE,
@@ -245,7 +246,7 @@ TOPICS = (
         sensor=True,
         curve=PlotSpec("distance, m", ("range_m",), name="UWB"),
         csv=("range_m",),
-        doubts=(UnitCheck("range_m", 100.0, "m", "mm or cm"),),
+        doubts=(UnitCheck("range_m", 100.0, "m", "mm or cm", 0.1),),
     ),
     Topic(POSITION, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "20 Hz", "label"),
     Topic(

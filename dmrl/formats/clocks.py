@@ -178,7 +178,7 @@ def _find_unset(times: Ints, name_row: Callable[[int], str]) -> Mask:
 
     A time of 0 among times near 0 is a time.
     """
-    unset = times == 0
+    unset: Mask = np.asarray(times == 0)
     known = times[~unset]
     if not len(known) or known.min() <= max(int(np.ptp(known)), UNSET_MIN_NS):
         unset[:] = False

@@ -73,7 +73,7 @@ def record_source(
         counts = write_content(content, sink)
         if not counts:
             raise SourceError(f"{source}: nothing in it can be used. Pass another")
-    print_findings(out)
+    print_findings(out, values=True)
     return counts
 
 

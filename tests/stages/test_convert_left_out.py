@@ -3,11 +3,16 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dmrl import boundary
 from dmrl.cli import app
-from dmrl.recording import read_summary
+from dmrl.formats.aideck.cpx import Image
+from dmrl.formats.aideck.cpx_encode import pack_image
+from dmrl.images.bayer import demosaic
+from dmrl.images.codec import decode
+from dmrl.recording import read, read_summary
 
 from ..formats import plain_usd
 
@@ -73,3 +78,36 @@ def test_flags_without_effect_are_errors(
     capsys.readouterr()
     assert main(["convert", str(out), str(tmp_path / "t"), "--to", "parquet", "--raw"]) == 1
     assert "--raw has no effect with --to parquet" in capsys.readouterr().err
+
+
+def test_a_stream_of_the_whole_sensor_is_cut_for_the_shipped_network(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Raw images of 324x244 become those of the published calibration, 320x224."""
+    pytest.importorskip("cv2")
+    rng = np.random.default_rng(0)
+    pixels = [rng.integers(0, 256, (244, 324), np.uint8) for _ in range(3)]
+    packets = [
+        pack_image(Image(324, 244, "raw", raw.tobytes(), 50_000 * k, k), "streamer")
+        for k, raw in enumerate(pixels)
+    ]
+    (tmp_path / "flight.cpx").write_bytes(b"".join(packets))
+    source, out = str(tmp_path / "flight.cpx"), tmp_path / "out.mcap"
+    assert main(["convert", source, str(out), "--camera", "aideck"]) == 0
+    images = [decode(s.message.data) for s in read(out, "/cf1/camera/image")]
+    # The camera of 320x224 is in the middle of the sensor: 2 columns and 10 rows off its corner.
+    for rgb, raw in zip(images, pixels, strict=True):
+        np.testing.assert_array_equal(rgb, demosaic(raw)[10:234, 2:322])
+    (calibration,) = read(out, "/cf1/camera/calibration")
+    assert (calibration.message.width, calibration.message.height) == (320, 224)
+    half = str(tmp_path / "half.mcap")
+    assert main(["convert", source, half, "--width-px", "162", "--height-px", "122"]) == 0
+    assert decode(next(read(Path(half), "/cf1/camera/image")).message.data).shape == (122, 162, 3)
+    capsys.readouterr()
+    for flags, words in (
+        (["--raw"], "--raw has no effect: the images of"),
+        (["--rate-hz", "5"], "--rate-hz has no effect:"),
+        (["--labels", source], "--labels has no effect on a recorded CPX stream"),
+    ):
+        assert main(["convert", source, str(tmp_path / "x.mcap"), *flags]) == 1
+        assert words in capsys.readouterr().err

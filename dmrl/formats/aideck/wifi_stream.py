@@ -56,12 +56,15 @@ def load_content(source: Path, options: Options) -> Content:
     """
     if not source.is_file():
         raise SourceError(f"{source} is not a file. Pass a recorded stream")
-    times, states, reader = [], [], ImageReader()
+    times, states, encodings, reader = [], [], set(), ImageReader()
     for found in _iter_images(source, reader):
         times.append(found.time_us)
         states.append(found.state)
+        encodings.add(found.encoding)
     if not times:
         raise SourceError(f"{source} has no whole image of a CPX stream. Pass another file")
+    if encodings == {"raw"}:
+        options.refuse("raw", f"has no effect: the images of {source} say that they are raw")
     leave_out("images that are broken or cut short", source, reader.broken)
     leave_out("bytes that belong to no packet", source, reader.skipped_bytes)
     time_ns = _to_times_ns(times, source, options)

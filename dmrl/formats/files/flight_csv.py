@@ -159,20 +159,6 @@ def _check_log(log: CsvLog) -> None:
     if (gaps := np.flatnonzero(steps > MIN_GAP_S)).size:
         at = log.time_s[gaps[0]]
         say(f"{log.path}: {gaps.size} gaps, the first of {steps[gaps[0]]:.1f} s after {at:.3f} s")
-    _warn_about_units(log)
-
-
-def _warn_about_units(log: CsvLog) -> None:
-    """Warn about columns of which a tenth is too large for any small robot."""
-    for doubt in (doubt for row in topics.OWN_SENSORS for doubt in row.doubts):
-        if doubt.field not in log.columns:
-            continue
-        often = float(np.nanquantile(np.abs(log.columns[doubt.field]), 0.9))
-        if often > doubt.over:
-            say(
-                f"{log.path}: {doubt.field}: a tenth is over {often:.3g}. "
-                f"Are these {doubt.perhaps}? {doubt.unit} is expected"
-            )
 
 
 def _check_overlap(logs: list[CsvLog]) -> None:

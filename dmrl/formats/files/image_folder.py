@@ -84,6 +84,8 @@ def load_content(source: Path, options: Options) -> Content:
     if options.camera is None and own.is_file():
         options = replace(options, camera=read_camera(own))
     pictures = list_images(source, options.rate_hz)
+    if all(len(picture.stem) >= MIN_TIME_DIGITS for _, picture in pictures):
+        options.refuse("rate_hz", f"has no effect: the pictures of {source} are named by times")
     path = options.labels or source / LABELS_FILE
     known = {picture.name for _, picture in pictures}
     rows = read_labels(path, known) if options.labels or path.is_file() else {}

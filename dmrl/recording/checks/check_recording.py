@@ -22,6 +22,7 @@ from dmrl.recording.checks.scan import (
     carries_own_type,
     collect,
     collect_from_index,
+    collect_values,
 )
 from dmrl.recording.checks.unit_checks import check_periods
 from dmrl.recording.loaded import LoadedRecording
@@ -33,11 +34,11 @@ GAP_PERIODS = 10
 """Length of a gap, in median periods of the topic."""
 GAP_MIN_S = 0.5
 """Shortest gap that is reported, seconds."""
-FINDINGS_PRINTED_MAX = 2
+FINDINGS_PRINTED_MAX = 5
 """Findings that a stage prints about its output. ``dmrl check`` prints all."""
 
 
-def check(path: Path, *, quick: bool = False) -> list[Finding]:
+def check(path: Path, *, quick: bool = False, values: bool = False) -> list[Finding]:
     """Return the findings about a recording, errors first.
 
     Parameters
@@ -46,6 +47,8 @@ def check(path: Path, *, quick: bool = False) -> list[Finding]:
         A recording.
     quick
         Check times and labels only, without decoding images.
+    values
+        Check the values of sensors and samples of the images as well, if ``quick``.
 
     Raises
     ------
@@ -59,6 +62,8 @@ def check(path: Path, *, quick: bool = False) -> list[Finding]:
         check_labels,
     )
     data = collect_from_index(LoadedRecording(path, *KEPT_TOPICS)) if quick else collect(path)
+    if quick and values:
+        collect_values(data)
     if not quick:
         rules = (
             _check_types,
@@ -95,13 +100,13 @@ def list_label_findings(contents: LoadedRecording) -> list[str]:
     ]
 
 
-def print_findings(path: Path) -> None:
+def print_findings(path: Path, *, values: bool = False) -> None:
     """Print the first findings about a recording that was just written, on stderr.
 
     A failed check is printed as a warning: the recording itself is complete.
     """
     try:
-        findings = check(path, quick=True)
+        findings = check(path, quick=True, values=values)
     except RecordingError as e:
         say(f"warning: {e}")
         return
@@ -149,6 +154,7 @@ def _check_units(data: CheckData) -> Iterator[Finding]:
         *data.magnitudes.find_implausible_fields(),
         *check_periods(data.times),
         *data.motion.find_contradictions(),
+        *data.images.find_blind_cameras(),
     ):
         yield Finding("warning", topic, text)
 

@@ -22,6 +22,12 @@ true projection, the offset is 0.6 px.
 """
 BIAS_MIN_SIGMAS = 5.0
 """Smallest bias that is reported, in standard errors."""
+DOUBT_LABELS_MIN = 5
+"""Labels needed to doubt their units."""
+DEPTH_MAX_M = 50.0
+"""Largest plausible median depth, metres: a robot of 0.1 m is half a pixel there."""
+OUTSIDE_BOX_SHARE = 0.1
+"""Share of the centres outside their boxes from which to report."""
 BORDER_MARGIN_PX = 1.0
 """Distance from the image border below which a box counts as cropped, pixels."""
 
@@ -44,7 +50,9 @@ def check_labels(data: CheckData) -> Iterator[Finding]:
         for source in sorted(set(peers["source"].to_pylist())):
             source_labels = peers.filter(pc.equal(peers["source"], source))
             yield from _check_values(topic, source, source_labels, bounds)
-            yield from _check_bias(topic, source, source_labels, bounds)
+            yield from _check_plausibility(topic, source, source_labels, bounds)
+            biased = [*_check_bias(topic, source, source_labels, bounds)]
+            yield from _check_boxes(topic, source, source_labels, biased)
 
 
 def _check_images(data: CheckData, topic: str, image: str, table: pa.Table) -> Iterator[Finding]:
@@ -98,6 +106,41 @@ def _check_values(
             f"{outside} of {len(uv)} labels of source {source!r} lie outside the "
             f"{image_size[0]}x{image_size[1]} image",
         )
+
+
+def _check_plausibility(
+    topic: str, source: str, peers: pa.Table, image_size: tuple[int, int] | None
+) -> Iterator[Finding]:
+    """Report labels in the wrong unit."""
+    uv = np.column_stack([peers["u_px"].to_numpy(), peers["v_px"].to_numpy()])
+    if len(uv) < DOUBT_LABELS_MIN:
+        return
+    of = f"labels of source {source!r}"
+    if image_size is not None and ((uv >= 0) & (uv <= 1)).all():
+        yield Finding("warning", topic, f"{of} all lie in the first pixel. Are they normalised?")
+    if (depth_m := float(np.median(peers["depth_m"].to_numpy()))) > DEPTH_MAX_M:
+        text = f"{of} have a median depth of {depth_m:.0f} m. Is it in mm?"
+        yield Finding("warning", topic, text)
+
+
+def _check_boxes(
+    topic: str, source: str, peers: pa.Table, biased: list[Finding]
+) -> Iterator[Finding]:
+    """Report boxes without area; else a bias; else centres that are not in their boxes."""
+    uv = np.column_stack([peers["u_px"].to_numpy(), peers["v_px"].to_numpy()])
+    has_box = pc.equal(pc.list_value_length(peers["box_px"]), 4).to_numpy()
+    box = pc.list_flatten(peers.filter(pa.array(has_box))["box_px"]).to_numpy().reshape(-1, 4)
+    outside = (uv[has_box] < box[:, :2]).any(axis=1) | (uv[has_box] > box[:, 2:]).any(axis=1)
+    empty = (box[:, 2:] <= box[:, :2]).any(axis=1)
+    of = f"{len(box)} labels of source {source!r}"
+    if len(box) >= BIAS_LABELS_MIN and empty.mean() > OUTSIDE_BOX_SHARE:
+        text = f"{int(empty.sum())} of {of} have boxes without area"
+        yield Finding("warning", topic, f"{text}. Are they left, top, right, bottom?")
+    elif biased:
+        yield from biased
+    elif len(box) >= BIAS_LABELS_MIN and outside.mean() > OUTSIDE_BOX_SHARE:
+        text = f"{int(outside.sum())} of {of} have their centre outside their box"
+        yield Finding("warning", topic, text)
 
 
 def _check_bias(

@@ -31,7 +31,11 @@ MOTION_FIELDS = {
     topics.ATTITUDE: ("roll_rad", "pitch_rad", "yaw_rate_radps"),
     topics.POSE: (),
     topics.TRUE_POSE: (),
+    topics.HEIGHT: ("height_m",),
+    topics.RANGE: ("range_m",),
 }
+FLOOR_NEAR_M, FLOOR_SHARE = 0.05, 0.9
+"""Distance from the robot's height within which this share of the ranges are to the floor."""
 ALIGN_HINT = "or align its clock with the poses': dmrl align --mocap"
 Signal = tuple[Array, Array]
 """Increasing times (N,), seconds, and values (N, K)."""
@@ -56,6 +60,7 @@ class MotionSamples:
     def find_contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield topic and text for each signal that contradicts its robot's poses."""
         of = {topic: _build_signal(parts) for topic, parts in self.parts.items()}
+        yield from _find_floor_ranges(of)
         for kind in (topics.VELOCITY, topics.ATTITUDE):
             for topic in sorted(topic for topic in of if topics.parse_topic(kind, topic)):
                 robot = topics.list_robots([topic], kind)[0]
@@ -67,6 +72,19 @@ class MotionSamples:
                 ):
                     doubts = _check_velocity if kind == topics.VELOCITY else _check_attitude
                     yield from ((topic, text) for text in doubts(of[topic], _derive_motion(*pose)))
+
+
+def _find_floor_ranges(of: Mapping[str, Signal]) -> Iterator[tuple[str, str]]:
+    """Yield ranges to a peer that are the height of the robot that measured them."""
+    for topic, ranges in sorted(of.items()):
+        names = topics.parse_topic(topics.RANGE, topic)
+        height = of.get(topics.HEIGHT(names["robot"])) if names else None
+        if height is None or len(ranges[0]) < SAMPLES_MIN or len(height[0]) < SAMPLES_MIN:
+            continue
+        near = np.abs(ranges[1] - _interpolate(height, ranges[0])) < FLOOR_NEAR_M
+        if near.mean() > FLOOR_SHARE:
+            text = f"{near.mean():.0%} of the ranges are the robot's own height"
+            yield topic, f"{text}. Is it a range to the floor, and not to {names['peer']}?"
 
 
 def _extract_rows(batch: pa.RecordBatch, fields: tuple[str, ...]) -> NDArray[np.float64]:

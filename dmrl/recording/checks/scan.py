@@ -11,8 +11,9 @@ import pyarrow.compute as pc
 
 from dmrl.errors import DmrlError, RecordingError
 from dmrl.images.codec import is_decodable, read_size
+from dmrl.recording.checks.image_checks import ImageSamples
 from dmrl.recording.checks.odometry_checks import MotionSamples
-from dmrl.recording.checks.unit_checks import MagnitudeHistograms
+from dmrl.recording.checks.unit_checks import FINITE_TOPICS, MagnitudeHistograms
 from dmrl.recording.loaded import LoadedRecording
 from dmrl.recording.log_times import read_log_times
 from dmrl.recording.mcap.batch_reader import iter_batches_in_file_order
@@ -26,6 +27,9 @@ STAMPED_TYPES = ("CompressedImage", "PoseInFrame")
 """Message types that contain a time stamp."""
 KEPT_TOPICS = (LABELS, CALIBRATION)
 """Topics whose messages are kept in memory."""
+
+FIRST_VALUES, FIRST_IMAGES = 20_000, 500
+"""Messages of a topic that are enough to doubt what was just written."""
 
 ImageSize = tuple[int, int] | None
 """Width and height of an image; None for data that are not an image."""
@@ -53,6 +57,8 @@ class CheckData:
         Histograms of the sensor values.
     motion
         Samples of odometry and poses.
+    images
+        Samples of the images.
     """
 
     contents: LoadedRecording
@@ -63,6 +69,7 @@ class CheckData:
     unset_stamps: Counter[str] = field(default_factory=Counter)
     magnitudes: MagnitudeHistograms = field(default_factory=MagnitudeHistograms)
     motion: MotionSamples = field(default_factory=MotionSamples)
+    images: ImageSamples = field(default_factory=ImageSamples)
 
 
 def carries_own_type(topic: str, schema: str) -> bool:
@@ -110,6 +117,26 @@ def collect_from_index(contents: LoadedRecording) -> CheckData:
         If the file is not a complete recording.
     """
     return CheckData(contents, read_log_times(contents.path, contents.topics))
+
+
+def collect_values(data: CheckData) -> None:
+    """Add the first values of sensors and poses, and samples of the first images, of each topic."""
+    for topic, info in data.contents.topics.items():
+        own, total = carries_own_type(topic, info.schema), 0
+        is_image = parse_topic(CAMERA_IMAGE, topic) is not None
+        if not own or not (is_image or any(parse_topic(p, topic) for p in FINITE_TOPICS)):
+            continue
+        limit = FIRST_IMAGES if is_image else FIRST_VALUES
+        fields = ["data"] if is_image else None
+        for batch in iter_columns(data.contents.path, topic, fields=fields):
+            total += len(batch)
+            if is_image:
+                data.images.add_batch(topic, batch, min(info.count, limit))
+            else:
+                data.magnitudes.add_batch(topic, batch)
+                data.motion.add_batch(topic, batch)
+            if total >= limit:
+                break
 
 
 def find_first_size(data: CheckData, topic: str) -> ImageSize:
@@ -161,6 +188,7 @@ def _collect_from_messages(
     collected.magnitudes.add_batch(topic, batch)
     collected.motion.add_batch(topic, batch)
     if parse_topic(CAMERA_IMAGE, topic):
+        collected.images.add_batch(topic, batch, collected.contents.topics[topic].count)
         for time_ns, data in zip(batch["log_time"].to_pylist(), batch["data"], strict=True):
             size = _decode_size(data.as_buffer())
             collected.sizes[topic][size] += 1

@@ -4,15 +4,16 @@ Magnitudes are counted in logarithmic bins as messages pass, so that memory is c
 Findings are topic and text.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from dmrl.topics import SENSORS, UnitCheck, parse_topic
+from dmrl.topics import CAMERA_IMAGE, POSE, SENSORS, TRUE_POSE, UnitCheck, parse_topic
 
 PERIOD_MAX_S, PERIOD_MIN_S = 5.0, 1e-5
 """Longest and shortest plausible median period of a sensor, seconds."""
@@ -22,6 +23,8 @@ BINS_PER_OCTAVE = 4
 """Bins per power of two."""
 BIN_COUNT, BIN_OF_ONE = 2048, 1024
 """Number of bins, and the bin of magnitude 1."""
+FINITE_TOPICS = ({row.pattern for row in SENSORS} - {CAMERA_IMAGE}) | {POSE, TRUE_POSE}
+"""Topics whose values must be finite."""
 Times = NDArray[np.int64]
 
 
@@ -32,9 +35,11 @@ class MagnitudeHistograms:
     counts: dict[tuple[str, str], NDArray[np.int64]] = field(
         default_factory=lambda: defaultdict(lambda: np.zeros(BIN_COUNT, np.int64))
     )
+    not_finite: Counter[tuple[str, str]] = field(default_factory=Counter)
 
     def add_batch(self, topic: str, batch: pa.RecordBatch) -> None:
         """Add the values of a topic."""
+        self._count_not_finite(topic, batch)
         for doubt in _find_limits(topic):
             if doubt.field in batch.schema.names:
                 size = np.abs(batch[doubt.field].to_numpy(zero_copy_only=False).astype(float))
@@ -43,22 +48,49 @@ class MagnitudeHistograms:
                 counted = np.bincount(np.clip(place, 0, BIN_COUNT - 1), minlength=BIN_COUNT)
                 self.counts[topic, doubt.field] += counted
 
+    def _count_not_finite(self, topic: str, batch: pa.RecordBatch) -> None:
+        """Count NaN and infinite values of a sensor's or a pose's fields."""
+        if any(parse_topic(pattern, topic) for pattern in FINITE_TOPICS):
+            for name, column in _iter_floats(batch):
+                bad = ~np.isfinite(column.to_numpy(zero_copy_only=False))
+                self.not_finite[topic, name] += int(bad.sum())
+
     def find_implausible_fields(self) -> Iterator[tuple[str, str]]:
-        """Yield fields of which over a tenth of the values exceed the limit for their unit."""
+        """Yield fields with values that are not finite, or too large or small for their unit."""
+        for (topic, name), count in (+self.not_finite).items():
+            yield topic, f"{name}: {count} values are not finite"
         for (topic, name), counts in self.counts.items():
             total = int(counts.sum())
             doubt = next(doubt for doubt in _find_limits(topic) if doubt.field == name)
-            beyond = int(
-                counts[
-                    int(np.floor(np.log2(doubt.over) * BINS_PER_OCTAVE)) + BIN_OF_ONE + 1 :
-                ].sum()
-            )
+            beyond = int(counts[_find_bin(doubt.over) + 1 :].sum())
+            small = int(counts[: _find_bin(doubt.under)].sum()) if doubt.under else 0
+            if total >= MESSAGES_MIN and small * 10 > total * 9:
+                yield (
+                    topic,
+                    f"{name}: {small / total:.0%} of the values are under {doubt.under:g} "
+                    f"{doubt.unit}. Was their unit larger than the one that was told?",
+                )
             if total >= MESSAGES_MIN and beyond * 10 > total:
                 yield (
                     topic,
                     f"{name}: {beyond / total:.0%} of the values are over {doubt.over:g} "
                     f"{doubt.unit}. Are they {doubt.perhaps}?",
                 )
+
+
+def _find_bin(magnitude: float) -> int:
+    return int(np.floor(np.log2(magnitude) * BINS_PER_OCTAVE)) + BIN_OF_ONE
+
+
+def _iter_floats(columns: Any, before: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the name and values of each float field, also those of nested messages."""
+    kind = columns.schema if isinstance(columns, pa.RecordBatch) else columns.type
+    for k, one in enumerate(kind):
+        column = columns.column(k) if isinstance(columns, pa.RecordBatch) else columns.field(k)
+        if pa.types.is_struct(one.type):
+            yield from _iter_floats(column, f"{before}{one.name}.")
+        elif pa.types.is_floating(one.type):
+            yield f"{before}{one.name}", column
 
 
 def check_units(topic: str, table: pa.Table) -> list[str]:

@@ -9,9 +9,12 @@ from mcap.writer import Writer
 from dmrl.images.codec import encode_png
 from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import Provenance, RecordingWriter, check
+from dmrl.recording.checks import check_recording
 from dmrl.recording.checks.check_recording import print_findings
 
-PNG = encode_png(np.zeros((224, 320, 3), np.uint8))
+STRIPES = np.tile(np.arange(320, dtype=np.uint8) % 200, (224, 1))
+PNGS = [encode_png(np.repeat((STRIPES + k)[..., None], 3, 2)) for k in range(2)]
+PNG = PNGS[0]
 Write = Callable[[int, str, Any], None]
 
 
@@ -51,7 +54,7 @@ def labelled(write: Write, shift_v_px: float = 0.0) -> None:
         true, other = label(u_px, v_px), label(u_px, v_px, source="published")
         other.u_px += rng.normal(0, 1)
         other.v_px += shift_v_px + rng.normal(0, 1)
-        write(k * 10**9, "/cf1/camera/image", image())
+        write(k * 10**9, "/cf1/camera/image", image(PNGS[k % 2]))
         write(k * 10**9, "/cf1/labels", message_class("PeerLabels")(peers=[true, other]))
 
 
@@ -211,7 +214,7 @@ def off_by(write: Write, off_px: list[tuple[float, float]]) -> None:
         peer = label(100.0, 100.0)
         peer.u_px += u_px
         peer.v_px += v_px
-        write(k * 10**9, "/cf1/camera/image", image())
+        write(k * 10**9, "/cf1/camera/image", image(PNGS[k % 2]))
         write(k * 10**9, "/cf1/labels", message_class("PeerLabels")(peers=[peer]))
 
 
@@ -233,7 +236,7 @@ def test_a_bias_is_told_by_its_standard_error(tmp_path: Path) -> None:
 
 
 def test_what_was_just_written_is_looked_at_without_its_images(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
@@ -242,6 +245,7 @@ def test_what_was_just_written_is_looked_at_without_its_images(
             kind = message_class(topic.rpartition("/")[2].title())
             for second in (*range(12), 99):
                 sink.write(second * 10**9, topic, kind())
+    monkeypatch.setattr(check_recording, "FINDINGS_PRINTED_MAX", 2)
     print_findings(path)
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 3
@@ -276,7 +280,7 @@ def test_boxes_that_the_border_cuts_say_nothing_of_a_bias(tmp_path: Path) -> Non
             peer = message_class("PeerLabel")(
                 u_px=100, v_px=60, depth_m=1, source="hand", box_px=box
             )
-            write(k * 10**9, "/cf1/camera/image", image())
+            write(k * 10**9, "/cf1/camera/image", image(PNGS[k % 2]))
             write(k * 10**9, "/cf1/labels", message_class("PeerLabels")(peers=[peer]))
 
     for k, (left_px, right_px, found) in enumerate(

@@ -215,7 +215,7 @@ def test_only_the_first_of_many_are_kept_and_only_of_what_moves(
     batch = pa.RecordBatch.from_pydict({"log_time": times, "vx_mps": times / 1e9, "vy_mps": -times})
     for _ in range(3):
         moved.add_batch("/cf1/velocity", batch)
-    moved.add_batch("/cf1/height", batch)
+    moved.add_batch("/cf1/tracks", batch)
     assert moved.parts.keys() == {"/cf1/velocity"}
     rows = np.concatenate(moved.parts["/cf1/velocity"])
     assert rows[:, 0].tolist() == rows[:, 1].tolist() == [0, 1, 2, 3, 4, 0, 1]

@@ -41,7 +41,8 @@ def test_a_tenth_is_borne_and_more_is_not() -> None:
 
 def test_nothing_zero_or_infinite_counts_and_few_values_tell_nothing() -> None:
     odd = np.array([np.nan, np.inf, -np.inf, 0.0] * 30)
-    assert _doubted("/cf1/height", "height_m", odd) == []
+    ((_, text),) = _doubted("/cf1/height", "height_m", odd)
+    assert text == "height_m: 90 values are not finite"
     assert _doubted("/cf1/height", "height_m", np.full(19, 500.0)) == []
     assert _doubted("/own/topic", "height_m", np.full(99, 500.0)) == []
 
@@ -71,5 +72,6 @@ def test_sizes_are_told_apart_to_a_fifth_of_their_limit() -> None:
     assert _doubted("/cf1/height", "height_m", np.full(20, 30.0)) == []
     assert len(_doubted("/cf1/height", "height_m", np.full(20, 36.0))) == 1
     for tiny, huge in ((1e-80, 1e80), (-1e-300, -1e300)):
-        assert _doubted("/cf1/height", "height_m", np.full(20, tiny)) == []
+        ((_, text),) = _doubted("/cf1/height", "height_m", np.full(20, tiny))
+        assert "are under 0.005 m" in text
         assert len(_doubted("/cf1/height", "height_m", np.full(20, huge))) == 1
