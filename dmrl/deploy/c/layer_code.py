@@ -142,15 +142,3 @@ def generate_constants(plan: BufferPlan) -> tuple[str, int]:
             if conv.gain.size:
                 texts.append(format_array("int32_t", f"{step.name}_gains", conv.gain))
     return "\n".join(texts), size
-
-
-def generate_declarations(plan: BufferPlan) -> str:
-    """Generate declarations of weights and scales, which are defined at the end of the file."""
-    lines = []
-    for step in plan.steps:
-        if isinstance(step.layer, Conv):
-            lines.append(f"static const int8_t {step.name}_weights[{step.layer.weight.size}];\n")
-            lines.append(f"static const scale_t {step.name}_scales[{step.layer.bias.size}];\n")
-            if step.layer.gain.size:
-                lines.append(f"static const int32_t {step.name}_gains[{step.layer.gain.size}];\n")
-    return "".join(lines)

@@ -7,6 +7,7 @@ from dmrl.deploy.c.buffer_plan import Buffer, BufferPlan
 from dmrl.deploy.c.memory_levels import StagedBuffer
 
 C_TYPES = {False: ("u8", "uint8_t"), True: ("s8", "int8_t")}
+TABLE_TYPES = {"weights": "int8_t", "scales": "scale_t", "gains": "int32_t"}
 C_RANGES = {False: "0, 255", True: "-128, 127"}
 
 
@@ -74,7 +75,9 @@ class StepAddresses:
 
     def table_address(self, kind: str, name: str) -> str:
         """Return the address of a table of the step."""
-        return copy_in(self.staged[kind], name) if kind in self.staged else name
+        if kind not in self.staged:
+            return name
+        return f"(const {TABLE_TYPES[kind]} *){copy_in(self.staged[kind], name)}"
 
     def input_address(self, number: int, buffer: Buffer, row: str, pointer: str = "0") -> str:
         """Return the address of row ``row`` of an input, or of its padding.

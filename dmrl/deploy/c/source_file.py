@@ -6,7 +6,6 @@ from dmrl.deploy.c.buffer_plan import Buffer, BufferPlan, plan_buffers
 from dmrl.deploy.c.convolutions import generate_shared_kernels
 from dmrl.deploy.c.layer_code import (
     generate_constants,
-    generate_declarations,
     generate_kernels,
     generate_row_function,
     require_supported,
@@ -107,13 +106,16 @@ def _generate_code(
     planned: BufferPlan, names: dict[str, str], weights: str, tables: dict[str, Head]
 ) -> str:
     image, steps, prefix = planned.buffers[0], planned.steps, names["prefix"]
-    parts = [
-        fill_template("prelude.c", **names, gain_shift=GAIN_SHIFT),
-        generate_kernels(planned),
-        generate_shared_kernels(planned),
+    parts = [fill_template("prelude.c", **names, gain_shift=GAIN_SHIFT)]
+    # Before the code that uses them: C++ has no declaration of a constant without its value.
+    parts.append(
+        "/* Weights: of each output channel the kernel's rows, of each row the pixels, of "
+        "each pixel\n * the channels; depthwise: pixels, then channels. */\n" + weights
+    )
+    parts += [
+        "\n" + format_array(_table_type(name), name, head.table) for name, head in tables.items()
     ]
-    parts.append("/* Defined at the end of the file. */\n" + generate_declarations(planned))
-    parts += [f"static const {_table_type(n)} {n}[256];\n" for n in tables]
+    parts += ["\n", generate_kernels(planned), generate_shared_kernels(planned)]
     if planned.zero_bytes and not planned.l1_scratch_bytes:
         parts.append(
             f"\nstatic const uint8_t zeros[{planned.zero_bytes}] = {{0}}; "
@@ -131,12 +133,6 @@ def _generate_code(
     )
     parts.append(fill_template("rows.c", **names, place=place, bayer=mosaic))
     parts.append(_generate_decode(planned, names))
-    parts.append(
-        "/* Weights: of each output channel the kernel's rows, of each row the pixels, of "
-        "each pixel\n * the channels; depthwise: pixels, then channels. */\n" + weights
-    )
-    for name, head in tables.items():
-        parts.append("\n" + format_array(_table_type(name), name, head.table))
     return "".join(parts)
 
 

@@ -16,6 +16,10 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 #define ${PREFIX}_WIDTH $width
 #define ${PREFIX}_HEIGHT $height
 #define ${PREFIX}_CHANNELS $channels /* 3: red, green, blue; 1: grey */
@@ -80,5 +84,9 @@ int32_t ${prefix}_meaning(int head, int8_t value);
 
 /* Runs init, all rows and detect on an image of ${PREFIX}_IMAGE_BYTES bytes, from the top left. */
 int ${prefix}_run($params, const uint8_t *image, ${prefix}_detection_t *found, int most);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

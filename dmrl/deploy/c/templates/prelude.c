@@ -7,7 +7,7 @@
  * output row, until no layer can. A row consists of pixels, a pixel of adjacent channels. Every
  * value of an output row is rounded once (see `scaled`).
  *
- * C99 on a machine with 8-bit bytes where >> of a negative number rounds down, as on every
+ * C99 or C++11 on a machine with 8-bit bytes where >> of a negative number rounds down, as on every
  * compiler known to us. No library, no floating point, no heap, no recursion.
  */
 #include "$prefix.h"
@@ -113,8 +113,14 @@ APART void copy(uint8_t *out, const uint8_t *values, int count)
 {
     volatile uint8_t *to = out;
     for (const uint8_t *end = values + count / 8 * 8; values != end; to += 8, values += 8) {
-        to[0] = values[0], to[1] = values[1], to[2] = values[2], to[3] = values[3];
-        to[4] = values[4], to[5] = values[5], to[6] = values[6], to[7] = values[7];
+        to[0] = values[0];
+        to[1] = values[1];
+        to[2] = values[2];
+        to[3] = values[3];
+        to[4] = values[4];
+        to[5] = values[5];
+        to[6] = values[6];
+        to[7] = values[7];
     }
     count %= 8;
     for (int i = 0; i < count; i++)

@@ -13,6 +13,10 @@
 
 #include "$prefix.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 #define ${PREFIX}_FEATURES $features
 /* Bytes of ${prefix}_head_t. */
 #define ${PREFIX}_HEAD_BYTES (4 * ${PREFIX}_HEADS * (${PREFIX}_FEATURES + 1))
@@ -33,5 +37,9 @@ void ${prefix}_head_apply(const ${prefix}_head_t *head, ${prefix}_t *net);
  * rate times 65536, 0 to 65536. */
 void ${prefix}_head_learn(${prefix}_head_t *head, const ${prefix}_t *net, int32_t u_q4, int32_t v_q4,
                      int32_t depth_mm, int32_t rate);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif
