@@ -10,7 +10,13 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.deploy.backend_names import BackendName
-from dmrl.deploy.detector import BACKEND_PACKAGES, Detector, open_detector, select_fastest_backend
+from dmrl.deploy.detector import (
+    BACKEND_PACKAGES,
+    Detector,
+    open_detector,
+    read_rates,
+    select_fastest_backend,
+)
 from dmrl.deploy.image_detection import DetectionOptions, detect_images
 from dmrl.errors import MissingTopic, RecordingError, SourceError
 from dmrl.guards import limits
@@ -63,6 +69,11 @@ def open_with_threshold(model: Path, backend: BackendName, threshold: float | No
     return detector if threshold is None else replace(detector, threshold=threshold)
 
 
+def read_model_rates(model: Path) -> dict[str, Any] | None:
+    """Return the rates of a model, see `read_rates`; None without them."""
+    return read_rates(resolve_model_path(model))
+
+
 def describe_prediction(
     model: Path, recording: Path, settings: Any, backend: BackendName, detector: Detector
 ) -> Provenance:
@@ -102,6 +113,7 @@ def write_detections(
     detector: Detector,
     options: DetectionOptions,
     batch_size: int,
+    rates: dict[str, Any] | None,
 ) -> tuple[int, int]:
     """Copy a recording with the detections in every image.
 
@@ -115,6 +127,8 @@ def write_detections(
         The opened model, and the options of the detection.
     batch_size
         Most images that go through the network together.
+    rates
+        The model's rates, as of `read_rates`.
 
     Returns
     -------
@@ -124,7 +138,7 @@ def write_detections(
     held = LoadedRecording(recording)
     replaced = [t for t in held.topics if any(topics.parse_topic(own, t) for own in OUTPUT_TOPICS)]
     tally = Counter[str]()
-    found = _iter_messages(held, detector, options, batch_size, tally)
+    found = _iter_messages(held, detector, options, batch_size, tally, rates)
     rewrite(recording, out, origin, without=replaced, fresh=[found])
     return tally["images"], tally["believed"]
 
@@ -135,6 +149,7 @@ def _iter_messages(
     options: DetectionOptions,
     batch_size: int,
     tally: Counter[str],
+    rates: dict[str, Any] | None,
 ) -> Iterator[TimedMessage]:
     """Yield Detections and GridMap of every image, and count them on the way."""
     images = [t for t in held.topics if topics.parse_topic(topics.CAMERA_IMAGE, t)]
@@ -148,7 +163,7 @@ def _iter_messages(
         for found, grids in detect_images([rgb for _, rgb in batch], detector, options):
             for k in range(len(found.count)):
                 raw, _ = next(raw_messages)
-                fields = detection_fields(found, k, detector.threshold)
+                fields = detection_fields(found, k, detector.threshold, rates)
                 tally["believed"] += sum(
                     d["confidence"] >= detector.threshold for d in fields["detections"]
                 )
@@ -212,12 +227,14 @@ def _name_image(recording: Path, image: RawMessage) -> str:
     return f"{recording}: the image of {image.topic} at {image.time_ns} ns"
 
 
-def detection_fields(found: Detections, image: int, threshold: float) -> dict[str, Any]:
+def detection_fields(
+    found: Detections, image: int, threshold: float, rates: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """Return the fields of the Detections of the image with this number."""
     columns = [getattr(found, name)[image, : found.count[image]] for name in DETECTION_COLUMNS]
     rows = zip(*(column.tolist() for column in columns), strict=True)
     detections = [dict(zip(DETECTION_COLUMNS, row, strict=True)) for row in rows]
-    return {"detections": detections, "threshold": threshold}
+    return {"detections": detections, "threshold": threshold, "rates": rates}
 
 
 def grid_fields(grids: Grids, image: int, stride_px: int) -> dict[str, Any]:

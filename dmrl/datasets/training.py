@@ -5,7 +5,7 @@ from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pyarrow.compute as pc
 
@@ -24,6 +24,7 @@ with optional_imports("train", "dmrl train"):
         apply_calibration,
         fit_calibration,
     )
+    from dmrl.learn.inference.detector_rates import measure_rates
     from dmrl.learn.inference.loaded_model import (
         PUBLISHED_THRESHOLD,
         Model,
@@ -185,25 +186,27 @@ def _refuse_unfinished(partial: Path, *, resume: bool) -> None:
 
 
 class Calibrated(NamedTuple):
-    """Threshold and calibration of a network, from the images held out."""
+    """Threshold, calibration and rates of a network, from the images held out."""
 
     threshold: float
     calibration: PlattScaling | None
+    rates: dict[str, Any] | None
 
 
 def _calibrate(network: Network, held_out: ExampleSet | None, settings: TrainConfig) -> Calibrated:
     """Calibrate the network on the images held out, and choose its threshold there."""
     if held_out is None:
-        return Calibrated(_or_published(settings.threshold), None)
+        return Calibrated(_or_published(settings.threshold), None, None)
     scored = score_examples(network, held_out)
     found = fit_calibration(scored)
     if found is not None and apply_calibration(network, found):
         scored = score_examples(network, held_out)
     else:
         found = None
-    if settings.threshold is not None:
-        return Calibrated(settings.threshold, found)
-    return Calibrated(_or_published(select_threshold(scored, settings.false_alarms)), found)
+    threshold = settings.threshold
+    if threshold is None:
+        threshold = _or_published(select_threshold(scored, settings.false_alarms))
+    return Calibrated(threshold, found, measure_rates(scored))
 
 
 def _or_published(threshold: float | None) -> float:
@@ -261,6 +264,7 @@ def _to_model(
         height_px=height_px,
         threshold=judged.threshold,
         label_source=", ".join(sorted(sources)),
+        rates=judged.rates,
         training={
             "images": images,
             "calibration": judged.calibration and judged.calibration._asdict(),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +31,8 @@ INT8_ONNX_NAME = "model.int8.onnx"
 DESCRIPTION_NAME = "model.json"
 WEIGHTS_NAME = "model.safetensors"
 QUANTIZE_HINT = "Make one with: dmrl quantize MODEL DATASET OUT"
+RATE_FIELDS = ("min_confidence", "distance_m", "detected", "false_per_image", "slope", "offset")
+"""Fields of the rates in the description of a model."""
 BACKEND_PACKAGES: dict[BackendName, tuple[str, ...]] = {
     "torch": ("torch", "numpy"),
     "onnx": ("onnxruntime", "numpy"),
@@ -244,6 +247,34 @@ def _parse_description(file: Path) -> tuple[int, float]:
         return stride_px, threshold
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise ModelError(f"{file} is damaged: {e}. Export the model again") from None
+
+
+def read_rates(model: Path) -> dict[str, Any] | None:
+    """Read the rates of a model from the description beside its weights; None without them.
+
+    They are the fields of a DetectorRates message: detected peers by distance, false alarms, and
+    the likelihood ratio of a confidence. Quantisation is taken to keep them.
+
+    Raises
+    ------
+    ModelError
+        If they are damaged.
+    """
+    file = model / DESCRIPTION_NAME if model.is_dir() else model.with_suffix(".json")
+    if not file.is_file() or (model.is_file() and model.suffix != ".safetensors"):
+        return None
+    try:
+        said = parse_json(file.read_text(encoding="utf-8"))
+        found = said.get("rates")
+        if found is None:
+            return None
+        rates = {name: np.array(found[name], float) for name in RATE_FIELDS}
+        lengths = {rates[name].shape for name in ("distance_m", "detected")}
+        if not all(np.isfinite(v).all() for v in rates.values()) or len(lengths) > 1:
+            raise ValueError(f"rates {str(found)[:60]}")
+        return {name: value.tolist() for name, value in rates.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
+        raise ModelError(f"{file} is damaged: {e}. Train or export the model again") from None
 
 
 def _import_optional(name: str, extra: str, what: str) -> ModuleType:

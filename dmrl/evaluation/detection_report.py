@@ -19,6 +19,7 @@ from dmrl.learn.inference.detection_metrics import (
     compute_band_metrics,
     score_detections,
 )
+from dmrl.learn.inference.detector_rates import measure_rates
 from dmrl.learn.inference.metric_definitions import METRIC_DEFINITIONS
 from dmrl.learn.inference.threshold import (
     MIN_EMPTY_IMAGES,
@@ -156,6 +157,7 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
                 count_false_alarms(evaluation.scored, evaluation.threshold)
             ).items()
         },
+        "rates": measure_rates(evaluation.scored),
         "bootstrap": {"draws": criteria.draws, "seed": criteria.seed},
         "overall": overall,
         "bands": bands,

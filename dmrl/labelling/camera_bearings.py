@@ -40,7 +40,7 @@ def detections_to_bearings(
         Standard deviation of roll and pitch.
     """
     image = np.repeat(np.arange(len(observer.time_ns)), np.diff(observer.first_row))
-    depth_m, sigma_m = observer.detections[:, 2:].T
+    depth_m, sigma_m = observer.detections[:, 2:4].T
     roll_rad, pitch_rad = observer.attitude_rad[image].T
     points_m = horizontal_from_pixels(
         observer.detections[:, :2], depth_m, roll_rad, pitch_rad, observer.camera

@@ -3,7 +3,7 @@
 Times are log times in nanoseconds. Values have the units and frames of their topics.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -51,13 +51,15 @@ class DetectionTable(NamedTuple):
 
     ``time_ns`` (K,) log times of the images, ``threshold`` (K,) the detector's least confidence,
     ``first`` (K + 1,) row of each image's first detection and the end, ``rows`` (M, 5) u, v in
-    pixels, depth, its standard deviation in metres (0: unknown) and confidence.
+    pixels, depth, its standard deviation in metres (0: unknown) and confidence. ``rates`` holds the
+    fields of the first message's DetectorRates, None without one.
     """
 
     time_ns: Times
     threshold: Array
     first: Times
     rows: Array
+    rates: dict[str, Any] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +242,21 @@ def _read_detections(held: LoadedRecording, topic: str) -> DetectionTable:
     ]
     threshold = np.array(table["threshold"].to_numpy())
     first = lists.offsets.to_numpy() - lists.offsets[0].as_py()
-    return DetectionTable(table["log_time"].to_numpy(), threshold, first, np.column_stack(rows))
+    columns = table["log_time"].to_numpy(), threshold, first, np.column_stack(rows)
+    return DetectionTable(*columns, _read_rates(_read_first(held, topic)))
+
+
+def _read_rates(message: Any) -> dict[str, Any] | None:
+    """Return the detector's rates in a Detections message; recordings of before have none."""
+    rates = getattr(message, "rates", None)
+    if rates is None or not message.HasField("rates"):
+        return None
+    return {
+        field.name: tuple(value)
+        if isinstance(value := getattr(rates, field.name), Sequence)
+        else value
+        for field in rates.DESCRIPTOR.fields
+    }
 
 
 def _read_first(held: LoadedRecording, topic: str) -> Any:

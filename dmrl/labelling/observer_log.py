@@ -13,6 +13,10 @@ from dmrl.labelling.flight_log import FlightLog, Samples, Times
 LONGEST_GAP_S = 0.1
 """Longest time between an image and a range that counts for it, seconds."""
 
+HEIGHT_WINDOW_S = 0.1
+"""Time before an image over which the observer's height is averaged, seconds: that between images
+at 10 Hz."""
+
 
 @dataclass(frozen=True, slots=True)
 class ObserverLog:
@@ -27,8 +31,8 @@ class ObserverLog:
     log_time_ns, time_ns
         (K,) log times of the images, and when they were taken.
     detections
-        (M, 4) u and v in pixels, depth and its standard deviation in metres (0: unknown), of
-        all images.
+        (M, 5) u and v in pixels, depth and its standard deviation in metres (0: unknown), and
+        confidence, of all images.
     first_row
         (K + 1,) row of each image's first detection, and the end.
     attitude_rad
@@ -70,7 +74,7 @@ class ObserverLog:
         rows = self.detections[self.first_row[k] : self.first_row[k + 1]]
         roll_rad, pitch_rad = self.attitude_rad[k]
         return ImageDetections(
-            rows[:, :2], rows[:, 2], float(roll_rad), float(pitch_rad), rows[:, 3]
+            rows[:, :2], rows[:, 2], float(roll_rad), float(pitch_rad), rows[:, 4], rows[:, 3]
         )
 
     def ranges(self, k: int) -> dict[str, float]:
@@ -137,7 +141,7 @@ def select_detections(
     least = found.threshold if threshold is None else np.full(len(found.time_ns), threshold)
     keep = (found.rows[:, 4] >= least[image]) & (found.rows[:, 2] > 0)
     first = np.searchsorted(image[keep], np.arange(len(found.time_ns) + 1))
-    return found.time_ns, found.rows[keep, :4].astype(float), first
+    return found.time_ns, found.rows[keep].astype(float), first
 
 
 def finite_attitude(flight: FlightLog, robot: str) -> tuple[Times, Array]:
@@ -190,8 +194,20 @@ def _dead_reckon(
     if high is None:
         warnings.append(f"{topics.HEIGHT(robot)}: not there; {robot} is taken to keep its height")
     else:
-        path_m[:, 2] = np.interp(time_ns, high[0], high[1][:, 0])
+        # The noise of single heights would look like motion between two images.
+        path_m[:, 2] = _average_before(*high, time_ns)
     return path_m
+
+
+def _average_before(at_ns: Times, values: Array, time_ns: Times) -> Array:
+    """Return (K,) means of a sampled value over ``HEIGHT_WINDOW_S`` before each time."""
+    summed = _integrate(at_ns, values)[:, 0]
+    ends_ns = np.clip(time_ns, at_ns[0], at_ns[-1])
+    starts_ns = np.clip(time_ns - round(HEIGHT_WINDOW_S * 1e9), at_ns[0], at_ns[-1])
+    span_s = (ends_ns - starts_ns) * 1e-9
+    total = np.interp(ends_ns, at_ns, summed) - np.interp(starts_ns, at_ns, summed)
+    here = np.interp(time_ns, at_ns, values[:, 0])
+    return np.where(span_s > 0, total / np.where(span_s > 0, span_s, 1.0), here)
 
 
 def _integrate(time_ns: Times, rate: Array) -> Array:

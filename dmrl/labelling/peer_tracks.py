@@ -8,6 +8,7 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import MissingTopic
+from dmrl.estimation.tracking.detector_rates import DetectorRates
 from dmrl.estimation.tracking.identity import TrackIdentity
 from dmrl.estimation.tracking.tracker import Track, Tracker
 from dmrl.estimation.tracking.tuning import Tuning
@@ -64,14 +65,15 @@ def track_peers(
     camera
         Its camera.
     threshold
-        Least confidence of a detection. None: the recording's.
+        Least confidence of a detection. None: that of the detector's rates.
     tuning
         Errors that the tracker assumes.
     """
-    sight = read_observer_log(flight, robot, camera, threshold)
+    sight = read_observer_log(flight, robot, camera, threshold or 0.0)
+    rates = DetectorRates(**(flight.detections[robot].rates or {}))
     for warning in sight.warnings:
         say(f"{flight.path}: {warning}")
-    tracker, identity = Tracker(sight.camera, tuning), TrackIdentity()
+    tracker, identity = Tracker(sight.camera, tuning, rates), TrackIdentity()
     made: list[TimedMessage] = []
     seen: dict[int, str] = {}
     entries = 0
@@ -100,6 +102,9 @@ def build_tracks(
                 "peer": names.get(one.number, ""),
                 **dict(zip(keys, numbers, strict=True)),
                 "covariance": np.ravel(one.covariance).tolist(),
+                "existence": one.existence,
+                "age_s": one.age_s,
+                "unseen_s": one.unseen_s,
             }
         )
     fields = {"frame_id": f"{robot}/horizontal", "tracks": entries}

@@ -97,11 +97,14 @@ def run(model: Path, recording: In, out: Path, settings: Settings) -> Result:
         If ``out`` exists.
     """
     from dmrl.deploy.image_detection import DetectionOptions
-    from dmrl.prediction import write_detections
+    from dmrl.prediction import read_model_rates, write_detections
 
     settings, detector, made = _open(model, recording, settings)
     options = DetectionOptions(settings.min_confidence, settings.most, settings.views)
-    return Result(*write_detections(recording, out, made, detector, options, settings.batch_size))
+    rates = read_model_rates(model)
+    return Result(
+        *write_detections(recording, out, made, detector, options, settings.batch_size, rates)
+    )
 
 
 def origin(model: Path, recording: Path, settings: Settings) -> "Provenance":

@@ -19,29 +19,27 @@ if TYPE_CHECKING:
 
 TUNING = Tuning()
 Positive = Annotated[float, Parameter(validator=validators.Number(gt=0, lt=1e6))]
-Share = Annotated[float, Parameter(validator=validators.Number(gt=0, lt=1))]
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Assumptions about the detector.
+    """Assumptions about detector and peers. Rates of the detector come with the detections.
 
     Parameters
     ----------
     threshold
-        Confidence from which detections are taken, 0 to 1. Without it, the recording's.
+        Confidence below which detections are left out, 0 to 1. Without it, the floor of the
+        detector's rates: a low confidence is weak evidence, not none.
     pixel_std_px
         Error of a detection in u and in v, pixels.
     depth_std_ratio
         New error of a detection's depth in every image, over the depth.
     depth_bias_ratio
         Error of the depth that stays for seconds, over the depth.
-    acceleration_std_mps2
-        How much a peer changes its velocity in a second, m/s.
-    detection_share
-        Share of the images with a peer in view that it is detected in.
-    false_per_image
-        False alarms per image.
+    speed_std_mps
+        Speed of a peer in each horizontal direction, m/s.
+    tilt_bias_rad
+        Error of roll and pitch that stays for a flight, radians.
     undistorted
         The images have no lens distortion any more, whatever the calibration says.
     camera
@@ -52,9 +50,8 @@ class Settings:
     pixel_std_px: Positive = TUNING.pixel_std_px
     depth_std_ratio: Positive = TUNING.depth_std_ratio
     depth_bias_ratio: Positive = TUNING.depth_bias_ratio
-    acceleration_std_mps2: Positive = TUNING.acceleration_std_mps2
-    detection_share: Share = TUNING.detection_share
-    false_per_image: Positive = TUNING.false_per_image
+    speed_std_mps: Positive = TUNING.speed_std_mps
+    tilt_bias_rad: Positive = TUNING.tilt_bias_rad
     undistorted: bool = False
     camera: dict[str, Path] = field(default_factory=dict)
 
@@ -115,7 +112,7 @@ def run(recording: In, out: Path, settings: Settings) -> "list[RobotReport]":
     ]
     replaced = [topic for topic in flight.topics if topics.parse_topic(topics.TRACKS, topic)]
     inputs = [recording, *settings.camera.values()]
-    made = build_provenance("track", settings, inputs, libraries=("numpy", "scipy", "filterpy"))
+    made = build_provenance("track", settings, inputs, libraries=("numpy", "scipy"))
     metadata = {CAMERAS_METADATA: {robot: format_camera(c) for robot, c in cameras.items()}}
     fresh = [messages for messages, _ in tracked]
     rewrite(recording, out, made, without=replaced, fresh=fresh, metadata=metadata)

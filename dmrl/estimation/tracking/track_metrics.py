@@ -82,6 +82,9 @@ def match_positions(
 ) -> NDArray[np.int64]:
     """Match true and estimated positions; return (J,) indices of the estimates, -1 for none.
 
+    Pairs within ``MAX_MATCH_M`` come first: a distance beyond it adds next to nothing, so that one
+    false position does not take a good one from its peer.
+
     Parameters
     ----------
     truth_m, found_m
@@ -91,9 +94,10 @@ def match_positions(
     """
     out = np.full(len(truth_m), -1, np.int64)
     distance_m = np.linalg.norm(truth_m[:, None] - found_m, axis=-1)
-    distance_m = np.where(distance_m <= radius_m, distance_m, 1e6)
-    rows, columns = linear_sum_assignment(distance_m)
-    near = distance_m[rows, columns] < 1e6
+    near = distance_m <= radius_m
+    cost = np.where(distance_m <= MAX_MATCH_M, distance_m, MAX_MATCH_M + 1e-3 * distance_m)
+    rows, columns = linear_sum_assignment(np.where(near, cost, 1e6))
+    near = near[rows, columns]
     out[rows[near]] = columns[near]
     return out
 

@@ -1,94 +1,82 @@
-"""Track peers over time from detections, with covariance. Arrays only.
+"""Track peers over time from detections, with covariance and existence. Arrays only.
 
-One extended Kalman filter (filterpy's) runs per track. Its state is the position of the peer and
-its velocity over ground, both along the axes of the observer's horizontal frame, and the relative
-depth error of the network for this peer. The depth error lasts for seconds, since the image hardly
-changes. As white noise it would make every covariance too small.
-
-Birth, confirmation and death follow the score of a track: the log likelihood ratio of its
-detections between a peer and false alarms (Blackman and Popoli 1999, 6.2).
+Every detection above a low floor counts, by its place and by its confidence; see ``association``.
+The update is that of a probabilistic data association filter (Bar-Shalom, Daum and Huang 2009).
+All tracks are rows of arrays of fixed layout, and a step has no loop over them.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
-from scipy.optimize import linear_sum_assignment
+from scipy.special import ndtr
 from scipy.stats import chi2
 
+from dmrl.estimation.tracking.association import Association, associate
+from dmrl.estimation.tracking.detector_rates import DetectorRates
+from dmrl.estimation.tracking.track_states import (
+    BIAS,
+    FALSE_OBJECT,
+    NOBODY,
+    SEEN,
+    P,
+    TrackStates,
+    cartesian_from_polar,
+    start_states,
+)
 from dmrl.estimation.tracking.tracker_input import EgoMotion, ImageDetections
 from dmrl.estimation.tracking.tuning import Tuning
 from dmrl.geometry.frames import (
     Array,
     Camera,
     horizontal_from_pixels,
-    is_inside,
     pixels_from_horizontal,
 )
 
-P, V, BIAS = slice(0, 3), slice(3, 6), 6
-"""Index of position, velocity and depth error in the state."""
 LOG_DEPTH_SPAN = np.log(20.0)
 """Range of the log depth of false alarms, uniform from near to twenty times that. No record of how
 the value was chosen."""
+MAX_TRACKS = 24
+"""Largest number of tracks, those not reported included; the least probable ones are dropped."""
+MIN_OBJECT = 0.05
+"""Probability of any object, peer or false, below which a track is deleted."""
+MIN_UNEXPLAINED = 0.2
+"""Least probability that a detection belongs to no track, for it to start one."""
 
 
-class _Filter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
-    """Extended Kalman filter of filterpy with a linear prediction.
-
-    The input is the observer's shift.
-    """
-
-    def __init__(self, state: Array, covariance: Array) -> None:
-        super().__init__(dim_x=7, dim_z=3)
-        self.x, self.P = state, covariance
-
-    def predict_x(self, u: Array) -> None:
-        """Move the state; filterpy's ``predict`` then moves the covariance by F and Q."""
-        self.x = self.F @ self.x + u
-
-
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Track:
-    """Track of one peer.
+    """Track of one peer after an image.
 
     Parameters
     ----------
     number
         Unique number of the track.
-    filter
-        State and covariance.
-    score, best
-        Log odds that it is a peer, now and at their highest.
-    confirmed
-        Whether the odds were ever high enough.
+    position_m, velocity_mps
+        (3,) in the observer's horizontal frame; and over ground, along the axes of that frame.
+    state_covariance
+        (6, 6) of position and velocity.
+    existence
+        Probability that it is a peer.
+    age_s, unseen_s
+        Time since its first and since its last probable detection.
     """
 
     number: int
-    filter: _Filter
-    score: float = 0.0
-    best: float = field(default=-np.inf)
-    confirmed: bool = False
-
-    @property
-    def position_m(self) -> Array:
-        """(3,) in the observer's horizontal frame."""
-        return np.asarray(self.filter.x[P])
-
-    @property
-    def velocity_mps(self) -> Array:
-        """(3,) over ground, along the axes of that frame."""
-        return np.asarray(self.filter.x[V])
+    position_m: Array
+    velocity_mps: Array
+    state_covariance: Array
+    existence: float
+    age_s: float
+    unseen_s: float
 
     @property
     def covariance(self) -> Array:
         """(3, 3) of the position, m^2."""
-        return np.asarray(self.filter.P[P, P])
+        return np.asarray(self.state_covariance[P, P])
 
 
 class Tracker:
-    """Tracker of one observer.
+    """Tracker of one observer, stepped image by image.
 
     Parameters
     ----------
@@ -96,74 +84,76 @@ class Tracker:
         Camera of the observer; ``distortion`` is empty for undistorted images.
     tuning
         Expected errors, see `Tuning`.
+    rates
+        Rates of the detector. None: those of dmrl-nano.
     """
 
-    def __init__(self, camera: Camera, tuning: Tuning) -> None:
-        self.camera, self.tuning = camera, tuning
-        self.tracks: list[Track] = []
-        self._born = 0
-        area = camera.width_px * camera.height_px * LOG_DEPTH_SPAN
-        self._false_density = tuning.false_per_image / area
+    def __init__(self, camera: Camera, tuning: Tuning, rates: DetectorRates | None = None) -> None:
+        self.camera, self.tuning, self.rates = camera, tuning, rates or DetectorRates()
+        self.states = TrackStates()
+        self._next_number = 0
+        volume = camera.width_px * camera.height_px * LOG_DEPTH_SPAN
+        self._false_density = self.rates.false_per_image / volume
         self._gate = float(chi2.ppf(tuning.gate, 3))
 
     def step(self, motion: EgoMotion, view: ImageDetections) -> list[Track]:
-        """Return the confirmed tracks after the observer has moved and taken another image.
+        """Return the reported tracks after the observer has moved and taken another image.
 
         Parameters
         ----------
         motion
             Motion since the last image.
         view
-            Detections of this image, and the attitude.
+            All detections of this image, and the attitude.
         """
-        for track in self.tracks:
-            self._predict(track, motion)
-        free = self._associate(view)
-        self._delete_lost()
-        self._start_tracks(view, free)
-        return [track for track in self.tracks if track.confirmed]
+        view = view.select(view.confidence >= self.rates.min_confidence)
+        evidence = self.rates.log_ratio(view.confidence)
+        free = np.ones(len(evidence))
+        if len(self.states):
+            self.states.predict(motion, self.tuning)
+            self._predict_beliefs(motion.dt_s)
+            free = self._update(motion.dt_s, view, evidence)
+        if (free > MIN_UNEXPLAINED).any():
+            self._start_tracks(motion.dt_s, view, evidence, free)
+        self._report_and_delete()
+        return self._build_tracks()
 
-    def _predict(self, track: Track, motion: EgoMotion) -> None:
-        """Predict with constant velocity over ground, in a frame that moves and turns."""
-        t, dt = self.tuning, motion.dt_s
-        c, s = np.cos(motion.turn_rad), np.sin(motion.turn_rad)
-        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # new from old axes
-        # The depth error is a first-order Gauss-Markov process: it decays with ``depth_bias_s``,
-        # and the noise below compensates for that, so that its variance stays constant.
-        keep = np.exp(-dt / t.depth_bias_s)
-        ekf = track.filter
-        ekf.F = np.zeros((7, 7))
-        ekf.F[P, P], ekf.F[P, V], ekf.F[V, V], ekf.F[BIAS, BIAS] = turn, dt * turn, turn, keep
-        x, y, _ = ekf.x[P]
-        # A wrong yaw rate moves the peer sideways, in proportion to its distance.
-        across = np.array([y, -x, 0.0]) * t.yaw_rate_std_radps * dt
-        own = (t.own_velocity_std_mps * dt) ** 2 * np.diag([1.0, 1.0, 0.0])
-        power = t.acceleration_std_mps2**2 * np.eye(3)
-        # White noise of acceleration, integrated over dt (Bar-Shalom et al. 2001, 6.2).
-        ekf.Q = np.zeros((7, 7))
-        ekf.Q[P, P] = power * dt**3 / 3 + own + np.outer(across, across)
-        ekf.Q[P, V] = ekf.Q[V, P] = power * dt**2 / 2
-        ekf.Q[V, V] = power * dt
-        ekf.Q[BIAS, BIAS] = t.depth_bias_ratio**2 * (1 - keep**2)
-        shift = np.zeros(7)
-        shift[P] = -turn @ motion.shift_m
-        ekf.predict(shift)
+    def _predict_beliefs(self, dt_s: float) -> None:
+        """Move the beliefs by the Markov chain of appearance, silence and end."""
+        t, belief = self.tuning, self.states.belief
+        stays, lasts = np.exp(-dt_s / t.leaving_s), np.exp(-dt_s / t.lasting_false_s)
+        peer = self.states.existence * stays
+        # The share of time seen follows from the share of images with a detection.
+        detected = self.rates.detected_share(np.exp(self.states.mean[:, 2]))
+        share = (detected - t.silent_share) / (t.seen_share - t.silent_share)
+        mixed = 1 - np.exp(-dt_s / t.visibility_s)
+        seen = belief[:, SEEN] * stays
+        seen = seen + mixed * (np.clip(share, 0.02, 0.98) * peer - seen)
+        false = belief[:, FALSE_OBJECT] * lasts
+        self.states.belief = np.stack([1 - peer - false, false, seen, peer - seen], axis=1)
 
-    def _predict_measurement(
-        self, track: Track, view: ImageDetections
-    ) -> tuple[Array, Array, Array]:
-        """Predict u, v, log depth (3,), their Jacobian (3, 7) and the noise except the depth's."""
-        t = self.tuning
-        attitude = np.array([view.roll_rad]), np.array([view.pitch_rad])
-        uv, depth_m, by = pixels_from_horizontal(track.position_m[None], *attitude, self.camera)
-        # The logarithm, because the error of a depth grows with it. Its derivative is 1 / depth.
-        by = by[0] / np.array([[1.0], [1.0], [depth_m[0]]])
-        row = np.zeros((3, 7))
-        row[:, P], row[2, BIAS] = by[:, :3], 1.0
-        white = np.diag([t.pixel_std_px**2, t.pixel_std_px**2, 0.0])
-        noise = white + t.attitude_std_rad**2 * by[:, 3:] @ by[:, 3:].T
+    def _predict_measurement(self, view: ImageDetections) -> tuple[Array, Array, Array]:
+        """Predict u, v, log depth (T, 3), their Jacobian (T, 3, 7) and the noise but the depth's.
+
+        A track at or behind the optical centre gets NaN.
+        """
+        place_m, by_polar = cartesian_from_polar(self.states.mean[:, P])
+        roll, pitch = (np.full(len(place_m), a) for a in (view.roll_rad, view.pitch_rad))
+        uv, depth_m, by = pixels_from_horizontal(place_m, roll, pitch, self.camera)
+        by[:, 2] /= depth_m[:, None]
+        row = np.zeros((len(place_m), 3, 7))
+        row[:, :, P], row[:, 2, BIAS] = by[:, :, :3] @ by_polar, 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.array([*uv[0], np.log(depth_m[0]) + track.filter.x[BIAS]]), row, noise
+            log_depth = np.log(depth_m) + self.states.mean[:, BIAS]
+        return np.hstack([uv, log_depth[:, None]]), row, self._pixel_noise(by)
+
+    def _pixel_noise(self, by: Array) -> Array:
+        """Return (T, 3, 3) noise of pixel and attitude; ``by`` (T, 3, 5) as of the projection."""
+        t = self.tuning
+        white = np.diag([t.pixel_std_px**2, t.pixel_std_px**2, 0.0])
+        return np.asarray(
+            white + t.tilt_std_rad**2 * by[:, :, 3:] @ by[:, :, 3:].transpose(0, 2, 1)
+        )
 
     def _depth_noise(self, view: ImageDetections) -> Array:
         """Return (N, 3, 3) noise of each detection's log depth."""
@@ -175,80 +165,128 @@ class Tracker:
         noise[:, 2, 2] = ratio**2
         return noise
 
-    def _associate(self, view: ImageDetections) -> list[int]:
-        """Update every track with its best detection; return the detections without a track."""
-        seen = np.column_stack([view.uv, np.log(view.depth_m)])
-        of_depth = self._depth_noise(view)
-        expected = [self._predict_measurement(track, view) for track in self.tracks]
-        gain = np.full((len(self.tracks), len(seen)), -np.inf)
-        for k, (track, (mean, row, noise)) in enumerate(zip(self.tracks, expected, strict=True)):
-            if np.isfinite(mean).all():
-                spread = row @ track.filter.P @ row.T + noise + of_depth
-                gain[k] = self._log_likelihood_ratios(seen - mean, spread)
-        free = set(range(len(seen)))
-        # The solver rejects rows without any finite entry, so "never" is a large loss here.
-        rows, columns = linear_sum_assignment(np.maximum(gain, -1e6), maximize=True)
-        taken = {k: j for k, j in zip(rows, columns, strict=True) if np.isfinite(gain[k, j])}
-        for k, track in enumerate(self.tracks):
-            mean, row, noise = expected[k]
-            if k in taken:
-                free.discard(taken[k])
-                self._update(track, seen[taken[k]], mean, row, noise + of_depth[taken[k]])
-                track.score += gain[k, taken[k]]
-            # A missed detection counts only if the peer is in view.
-            elif np.isfinite(mean).all() and self._in_view(mean):
-                track.score += np.log1p(-self.tuning.detection_share)
-        return sorted(free)
+    def _in_view(self, mean: Array, spread: Array) -> Array:
+        """Return (T,) probabilities that the network can see the tracks: in view, off the edge."""
+        size = np.array([self.camera.width_px, self.camera.height_px])
+        std = np.sqrt(np.diagonal(spread[:, :2, :2], axis1=1, axis2=2) + self.tuning.edge_px**2)
+        inside = ndtr((size - mean[:, :2]) / std) - ndtr(-mean[:, :2] / std)
+        return np.nan_to_num(inside.prod(axis=1))
 
-    def _log_likelihood_ratios(self, difference: Array, spread: Array) -> Array:
-        """Return (N,) log likelihood ratios of detections and a track; -inf outside its gate."""
-        squared = np.einsum("ni,nij,nj->n", difference, np.linalg.inv(spread), difference)
-        density = -0.5 * (squared + np.linalg.slogdet(2 * np.pi * spread)[1])
-        ratio = np.log(self.tuning.detection_share / self._false_density) + density
-        return np.where(squared <= self._gate, ratio, -np.inf)
+    def _update(self, dt_s: float, view: ImageDetections, evidence: Array) -> Array:
+        """Update all tracks; return (N,) probabilities that a detection belongs to none."""
+        states, t = self.states, self.tuning
+        mean, row, noise = self._predict_measurement(view)
+        ahead = np.isfinite(mean).all(axis=1)
+        row[~ahead], noise[~ahead] = 0.0, np.eye(3)
+        base = row @ states.covariance @ row.transpose(0, 2, 1) + noise
+        spread = base[:, None] + self._depth_noise(view)
+        off = np.column_stack([view.uv, np.log(view.depth_m)]) - mean[:, None]
+        inverse = np.linalg.inv(spread)
+        squared = (off[:, :, None] @ inverse @ off[..., None])[..., 0, 0]
+        likelihood = np.exp(-0.5 * squared) / np.sqrt(np.linalg.det(2 * np.pi * spread))
+        near = np.where(squared <= self._gate, likelihood / self._false_density, 0.0)
+        shares = np.array([0.0, t.seen_share, t.seen_share, t.silent_share])
+        found = self._in_view(mean, base)[:, None] * shares
+        # Confidences of consecutive images repeat each other. As a first-order Gauss-Markov process
+        # only their change is new.
+        alike = np.exp(-dt_s / t.confidence_s)
+        bright = np.exp((evidence - alike * states.evidence[:, None]) / (1 + alike))
+        weights = associate(states.belief, found, near, bright)
+        states.belief = weights.belief
+        states.evidence = weights.miss * alike * states.evidence + weights.detection @ evidence
+        states.unseen_s[weights.detection.sum(axis=1) > 0.5] = 0.0
+        gain = states.covariance[:, None] @ row.transpose(0, 2, 1)[:, None] @ inverse
+        self._merge_updates(weights, gain, np.where(ahead[:, None, None], off, 0.0), spread)
+        mine = weights.detection * (1 - weights.belief[:, NOBODY, None])
+        return 1 - np.minimum(mine.sum(axis=0), 1.0)
 
-    def _in_view(self, mean: Array) -> bool:
-        return bool(is_inside(mean[None, :2], self.camera.width_px, self.camera.height_px)[0])
+    def _merge_updates(self, weights: Association, gain: Array, off: Array, spread: Array) -> None:
+        """Replace each state by the mean and covariance of its updates by every detection."""
+        states, each = self.states, weights.detection[..., None]
+        moved = (gain @ off[..., None])[..., 0]
+        step = (each * moved).sum(axis=1)
+        apart = moved - step[:, None]
+        after = states.covariance[:, None] - gain @ spread @ gain.transpose(0, 1, 3, 2)
+        after = after + apart[..., None] * apart[:, :, None]
+        missed = states.covariance + step[:, :, None] * step[:, None]
+        states.mean = states.mean + step
+        states.covariance = weights.miss[:, None, None] * missed + (each[..., None] * after).sum(1)
 
-    def _update(self, track: Track, seen: Array, mean: Array, row: Array, noise: Array) -> None:
-        track.filter.update(seen, lambda _: row, lambda _: mean, R=noise)
-        assert track.filter.x.shape == (7,), "filterpy changed the state's shape"
+    def _start_tracks(
+        self, dt_s: float, view: ImageDetections, evidence: Array, free: Array
+    ) -> None:
+        """Start a track at every detection that no track explains."""
+        t, alarms = self.tuning, self.rates.false_per_image
+        roll, pitch = (np.full(len(free), angle) for angle in (view.roll_rad, view.pitch_rad))
+        place_m = horizontal_from_pixels(view.uv, view.depth_m, roll, pitch, self.camera)
+        use = np.isfinite(place_m).all(axis=1) & (free > MIN_UNEXPLAINED)
+        place_m, free = place_m[use], free[use]
+        by = pixels_from_horizontal(place_m, roll[use], pitch[use], self.camera)[2]
+        by[:, 2] /= view.depth_m[use, None]
+        noise = self._pixel_noise(by) + self._depth_noise(view)[use]
+        states = start_states(place_m, noise, by[:, :, :3], t)
+        # Without a step before, as in the first image, peers have had a second to appear.
+        states.belief[:, SEEN] = t.appearing_per_s * (dt_s or 1.0) * np.exp(evidence[use]) * free
+        states.belief[:, FALSE_OBJECT] = alarms * t.lasting_false_share * free
+        states.belief[:, NOBODY] = alarms - states.belief[:, FALSE_OBJECT]
+        states.belief /= states.belief.sum(axis=1, keepdims=True)
+        states.evidence = evidence[use]
+        self.states = self.states.concatenate(states)
 
-    def _delete_lost(self) -> None:
-        """Confirm tracks, and delete those whose peers are gone."""
-        allowed = np.log(self.tuning.lost_odds)
-        kept = []
-        for track in self.tracks:
-            track.best = max(track.best, track.score)
-            track.confirmed |= track.score >= np.log(self.tuning.confirm_odds)
-            spread_m = np.sqrt(np.linalg.eigvalsh(track.covariance)[-1])
-            # A new track may lose no more than its first score.
-            lost = track.best - track.score > (allowed if track.confirmed else track.best)
-            if not lost and spread_m < self.tuning.lost_std_m:
-                kept.append(track)
-        self.tracks = kept
+    def _report_and_delete(self) -> None:
+        """Decide which tracks are reported, and delete those without an object."""
+        t, states = self.tuning, self.states
+        if not len(states):
+            return
+        existence = states.existence
+        # One detection, however sure, is no track: a second one costs an image and tells a lot.
+        again = (states.age_s > 0) & (states.unseen_s == 0)
+        new = (existence >= t.confirm) & again & (states.number < 0)
+        for k in np.flatnonzero(new):
+            states.number[k] = self._continue_track(int(k))
+        states.reported &= existence >= t.keep
+        states.reported |= (existence >= t.confirm) & (states.number >= 0)
+        existence = states.existence
+        spread = states.cartesian()[1][:, P, P]
+        std_m = np.sqrt(np.linalg.eigvalsh(spread)[:, -1])
+        kept = (1 - states.belief[:, NOBODY] >= MIN_OBJECT) & (std_m < t.lost_std_m)
+        rows = np.flatnonzero(kept)
+        best = rows[np.argsort(-existence[rows], kind="stable")][:MAX_TRACKS]
+        self.states = states.select(np.sort(best))
 
-    def _start_tracks(self, view: ImageDetections, free: Sequence[int]) -> None:
-        """Start a track at every detection without one."""
-        t = self.tuning
-        attitude = np.array([view.roll_rad]), np.array([view.pitch_rad])
-        of_depth = self._depth_noise(view)
-        for k in free:
-            at = view.uv[k : k + 1], view.depth_m[k : k + 1]
-            xyz = horizontal_from_pixels(*at, *attitude, self.camera)[0]
-            if not np.isfinite(xyz).all():
-                continue
-            ekf = _Filter(np.array([*xyz, 0.0, 0.0, 0.0, 0.0]), np.zeros((7, 7)))
-            ekf.P[V, V] = t.speed_std_mps**2 * np.eye(3)
-            ekf.P[BIAS, BIAS] = t.depth_bias_ratio**2
-            track = Track(self._born, ekf)
-            _, row, noise = self._predict_measurement(track, view)
-            noise += of_depth[k]
-            noise[2, 2] += t.depth_bias_ratio**2
-            # The first position inverts the measurement model: position = inverse of (seen - bias).
-            # So it contains the noise of the pixels, and the bias with the opposite sign.
-            by_pixel = np.linalg.inv(row[:, P])
-            ekf.P[P, P] = by_pixel @ noise @ by_pixel.T
-            ekf.P[P, BIAS] = ekf.P[BIAS, P] = -by_pixel[:, 2] * t.depth_bias_ratio**2
-            self._born += 1
-            self.tracks.append(track)
+    def _continue_track(self, k: int) -> int:
+        """Return the number of a new track: a fresh one, or that of the track that it continues.
+
+        A silent track ends where a new one starts inside its gate: both are of the same peer.
+        """
+        states = self.states
+        silent = np.flatnonzero(states.reported & (states.unseen_s >= states.age_s[k]))
+        mean, covariance = (part[:, ..., :3] for part in states.cartesian())
+        off = mean[silent] - mean[k]
+        spread = covariance[silent, :3] + covariance[k, :3]
+        squared = (off[:, None] @ np.linalg.inv(spread) @ off[..., None])[:, 0, 0]
+        if len(silent) and squared.min() < self._gate:
+            old = silent[squared.argmin()]
+            states.belief[old], states.reported[old] = np.eye(4)[NOBODY], False
+            return int(states.number[old])
+        self._next_number += 1
+        return self._next_number - 1
+
+    def _build_tracks(self) -> list[Track]:
+        """Return the reported tracks.
+
+        A lasting tilt turns all positions alike, so images never reduce it. It is added here.
+        """
+        states = self.states.select(np.flatnonzero(self.states.reported))
+        mean, covariance = states.cartesian()
+        x, y, z = mean[:, P].T
+        zero = np.zeros(len(x))
+        tilt = self.tuning.tilt_bias_rad * np.stack([zero, z, -z, zero, y, -x], 1).reshape(-1, 3, 2)
+        covariance[:, P, P] += tilt @ tilt.transpose(0, 2, 1)
+        columns = (states.number, states.existence, states.age_s, states.unseen_s)
+        return [
+            Track(number, row[:3], row[3:], square, *rest)
+            for row, square, (number, *rest) in zip(
+                mean, covariance, zip(*(c.tolist() for c in columns), strict=True), strict=True
+            )
+        ]

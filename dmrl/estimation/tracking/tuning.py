@@ -1,4 +1,4 @@
-"""Errors and rates that the tracker assumes. Imports nothing heavy: help shows its defaults."""
+"""Errors and times that the tracker assumes. Imports nothing heavy: help shows its defaults."""
 
 from dataclasses import dataclass
 
@@ -7,6 +7,10 @@ from dataclasses import dataclass
 class Tuning:
     """Expected errors of detector, robots and sensors.
 
+    Errors and correlation times were measured on eight rendered flights with dmrl-nano; see
+    docs/tracking.md. The other values were chosen there by the share of followed peers, at one
+    false track a minute.
+
     Parameters
     ----------
     pixel_std_px
@@ -14,34 +18,60 @@ class Tuning:
     depth_std_ratio, depth_bias_ratio, depth_bias_s
         Error of a detection's depth over the depth: the part that is new in every image, unless the
         detection has its own; the part that lasts; its correlation time.
-    speed_std_mps, acceleration_std_mps2
-        Initial speed of a peer, and change of its velocity (in a second).
-    own_velocity_std_mps, yaw_rate_std_radps, attitude_std_rad
-        Errors of the observer's own sensors. Those of roll and pitch are new in every image.
-    detection_share
-        Share of the images with a peer in view in which it is detected, 0 to 1.
-    false_per_image
-        Mean number of false alarms per image.
+    speed_std_mps, climb_std_mps, velocity_s
+        Speed of a peer in each horizontal direction and vertically, and its correlation time.
+    own_drift_m, own_height_std_m, yaw_drift_rad
+        Errors of the observer's own motion: horizontally, in the root of a second; in height
+        between two images; and of its heading, in the root of a second.
+    tilt_std_rad, tilt_bias_rad
+        Errors of roll and pitch: the part that is new in every image, and the part that stays for
+        a flight.
+    seen_share, silent_share
+        Share of the images with a peer in view in which it is detected, while the network sees it
+        and while it is silent.
+    visibility_s
+        Correlation time of these two states.
+    edge_px
+        Width of the margin of the image in which the detection probability falls.
+    confidence_s
+        Correlation time of a detection's confidence.
+    appearing_per_s
+        Mean number of peers that come into view in a second.
+    leaving_s
+        Mean time after which a peer is gone for good.
+    lasting_false_share, lasting_false_s
+        Share of the false alarms that stay at their place, and their mean duration.
     gate
         Probability that a peer's own detection passes the gate, 0 to 1.
-    confirm_odds, lost_odds
-        Odds at which a track is confirmed, and drop of the odds at which it is deleted.
+    confirm, keep
+        Probability of existence at which a track is reported, and below which it is not reported
+        any more.
     lost_std_m
         Standard deviation of the position at which a track is deleted.
     """
 
-    pixel_std_px: float = 4.0
-    depth_std_ratio: float = 0.12
-    depth_bias_ratio: float = 0.08
-    depth_bias_s: float = 2.0
-    speed_std_mps: float = 0.7
-    acceleration_std_mps2: float = 0.8
-    own_velocity_std_mps: float = 0.1
-    yaw_rate_std_radps: float = 0.05
-    attitude_std_rad: float = 0.015
-    detection_share: float = 0.7
-    false_per_image: float = 0.3
+    pixel_std_px: float = 1.8
+    depth_std_ratio: float = 0.10
+    depth_bias_ratio: float = 0.15
+    depth_bias_s: float = 1.5
+    speed_std_mps: float = 0.4
+    climb_std_mps: float = 0.1
+    velocity_s: float = 0.7
+    own_drift_m: float = 0.06
+    own_height_std_m: float = 0.01
+    yaw_drift_rad: float = 0.01
+    tilt_std_rad: float = 0.005
+    tilt_bias_rad: float = 0.01
+    seen_share: float = 0.95
+    silent_share: float = 0.03
+    visibility_s: float = 4.0
+    edge_px: float = 8.0
+    confidence_s: float = 0.5
+    appearing_per_s: float = 0.3
+    leaving_s: float = 200.0
+    lasting_false_share: float = 0.3
+    lasting_false_s: float = 5.0
     gate: float = 0.997
-    confirm_odds: float = 1e6
-    lost_odds: float = 1e4
-    lost_std_m: float = 1.0
+    confirm: float = 0.6
+    keep: float = 0.05
+    lost_std_m: float = 1.5

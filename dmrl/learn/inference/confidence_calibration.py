@@ -13,15 +13,13 @@ import torch
 from torch import nn
 
 from dmrl.learn.inference.detection_metrics import ScoredDetections
-from dmrl.learn.inference.matching import Array
+from dmrl.learn.inference.detector_rates import fit_logistic
 from dmrl.learn.networks.architectures import Network
 
 MIN_DETECTIONS = 30
 """Minimum number of correct detections, and of wrong ones, for a fit."""
 MIN_CONFIDENCE = 0.02
 """Lower bound of the confidence of detections in the fit; fainter ones are irrelevant in use."""
-NEWTON_STEPS, NEWTON_TOLERANCE, NEWTON_RIDGE = 50, 1e-9, 1e-6
-"""Newton's method: most steps, tolerance of loss and step, and diagonal added to the Hessian."""
 SLOPE_RANGE = (0.2, 10.0)
 """Accepted slopes. Others come from too few detections or an uninformative confidence."""
 
@@ -55,31 +53,8 @@ def fit_calibration(scored: ScoredDetections) -> PlattScaling | None:
         return None
     p = np.clip(confidence[seen], 1e-7, 1 - 1e-7)
     rows = np.column_stack([np.log(p / (1 - p)), np.ones(len(p))])
-    slope, offset = _fit_logistic(rows, right).tolist()
+    slope, offset = fit_logistic(rows, right).tolist()
     return PlattScaling(slope, offset) if SLOPE_RANGE[0] <= slope <= SLOPE_RANGE[1] else None
-
-
-def _fit_logistic(rows: Array, right: Array) -> Array:
-    """Fit a logistic regression of (N,) labels on (N, K) rows; return (K,) weights.
-
-    Newton's method with step halving, so that the loss never increases.
-    """
-
-    def loss(weights: Array) -> float:
-        odds = rows @ weights
-        return float((np.logaddexp(0, odds) - right * odds).sum())
-
-    found, before = np.zeros(rows.shape[1]), np.inf
-    for _ in range(NEWTON_STEPS):
-        said = 1 / (1 + np.exp(-np.clip(rows @ found, -50, 50)))
-        bend = (rows.T * (said * (1 - said))) @ rows + NEWTON_RIDGE * np.eye(len(found))
-        step = np.linalg.solve(bend, rows.T @ (said - right))
-        while loss(found - step) > loss(found) and np.abs(step).max() > NEWTON_TOLERANCE:
-            step = step / 2
-        found = found - step
-        if before - (before := loss(found)) < NEWTON_TOLERANCE:
-            break
-    return found
 
 
 def apply_calibration(network: Network, found: PlattScaling) -> bool:

@@ -79,6 +79,8 @@ class Model:
         Source of the labels it was trained on ("truth", "published", ...); empty: unknown.
     training
         Summary of the training: settings, losses, images.
+    rates
+        How often it detects and errs, as of `measure_rates`. None: not measured.
     """
 
     network: Network
@@ -89,6 +91,7 @@ class Model:
     threshold: float = PUBLISHED_THRESHOLD
     label_source: str = ""
     training: dict[str, Any] = field(default_factory=dict)
+    rates: dict[str, Any] | None = None
 
     def require_size(self, width_px: int, height_px: int, what: object) -> None:
         """Raise SettingError unless the network accepts images of this size.
@@ -211,6 +214,7 @@ def describe(model: Model) -> dict[str, Any]:
         "outputs": list(model.network.channels),
         "threshold": model.threshold,
         "label_source": model.label_source,
+        "rates": model.rates,
         "training": model.training,
     }
 
@@ -270,7 +274,8 @@ def _load_safetensors(weights: Path, description: Path, name: str) -> Model:
         raise ModelError(f"{weights} is damaged: {e}. Copy it again or train again") from None
     set_weights(network, tensors, weights)
     known = ("width_px", "height_px", "threshold", "label_source", "training")
-    return Model(network.eval(), said["architecture"], name, **{k: said[k] for k in known})
+    fields = {k: said[k] for k in known} | {"rates": said.get("rates")}
+    return Model(network.eval(), said["architecture"], name, **fields)
 
 
 def _extra_channels(said: dict[str, Any], path: Path) -> list[str]:

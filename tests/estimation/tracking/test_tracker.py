@@ -6,7 +6,10 @@ import pytest
 from numpy.random import default_rng
 from scipy.stats import chi2
 
+from dmrl.estimation.tracking.association import associate
+from dmrl.estimation.tracking.detector_rates import DetectorRates
 from dmrl.estimation.tracking.identity import TrackIdentity
+from dmrl.estimation.tracking.track_states import TrackStates
 from dmrl.estimation.tracking.tracker import Tracker
 from dmrl.estimation.tracking.tracker_input import EgoMotion, ImageDetections
 from dmrl.estimation.tracking.tuning import Tuning
@@ -20,16 +23,19 @@ from dmrl.geometry.frames import (
 
 TUNING = Tuning()
 DT_S = 0.1
-LEVEL = np.zeros(1)
 
 
 @dataclass(frozen=True)
 class Detector:
-    """What a network makes of peers in view: noise as the tuning says, misses, false alarms."""
+    """What a network makes of peers in view: noise as the tuning says, misses, false alarms.
+
+    Confidences are calibrated: of both kinds, the log odds are normal with unit variance, their
+    means two apart. So the log likelihood ratio of a logit is 2 logit, `CALIBRATED`.
+    """
 
     rng: np.random.Generator
-    share: float = TUNING.detection_share
-    false_per_image: float = TUNING.false_per_image
+    share: float = 0.7
+    false_per_image: float = 0.3
 
     def view(self, peers: Array, bias: Array) -> ImageDetections:
         uv, depth_m, _ = pixels_from_horizontal(
@@ -37,26 +43,36 @@ class Detector:
         )
         seen = is_inside(uv, 320, 224) & (depth_m > 0) & (self.rng.random(len(peers)) < self.share)
         noise = self.rng.normal(size=(len(peers), 3))
-        tilt_px = TUNING.attitude_std_rad * AIDECK.fx_px * self.rng.normal(size=2)
+        tilt_px = TUNING.tilt_std_rad * AIDECK.fx_px * self.rng.normal(size=2)
         uv = uv + TUNING.pixel_std_px * noise[:, :2] + tilt_px
         depth_m = depth_m * np.exp(TUNING.depth_std_ratio * noise[:, 2] + bias)
         alarms = self.rng.poisson(self.false_per_image)
         false_uv = self.rng.uniform((0, 0), (320, 224), (alarms, 2))
         false_m = 0.3 * np.exp(self.rng.uniform(0, np.log(20), alarms))
+        logit = self.rng.normal(size=seen.sum() + alarms)
+        logit += np.repeat([1.0, -1.0], [seen.sum(), alarms])
         return ImageDetections(
             np.concatenate([uv[seen], false_uv]),
             np.concatenate([depth_m[seen], false_m]),
             0.0,
             0.0,
+            1 / (1 + np.exp(-logit)),
         )
 
 
+CALIBRATED = DetectorRates(0.0, (1.0,), (0.7,), 0.3, 2.0, 0.0)
+
+
 def wandering(rng: np.random.Generator, steps: int, start: Array) -> Iterator[Array]:
-    """Positions of a peer that flies about its start, metres."""
-    place, speed = start.copy(), np.zeros(3)
+    """Positions of a peer whose velocity is as the tuning says, metres."""
+    place, std = start.copy(), np.array([TUNING.speed_std_mps] * 2 + [TUNING.climb_std_mps])
+    speed, fine = std * rng.normal(size=3), DT_S / 10
+    calm = np.exp(-fine / TUNING.velocity_s)
     for _ in range(steps):
-        speed += 0.8 * np.sqrt(DT_S) * rng.normal(size=3) - DT_S * (0.8 * speed + (place - start))
-        place = place + DT_S * speed
+        for _ in range(10):
+            place = place + fine * speed
+            speed = calm * speed + np.sqrt(1 - calm**2) * std * rng.normal(size=3)
+        place = place + 1.0 * DT_S * (start - place)  # it stays in view
         yield place
 
 
@@ -81,7 +97,7 @@ class Outcome:
 
 def followed(seed: int, starts: Array, steps: int = 600) -> Outcome:
     rng = np.random.default_rng(seed)
-    tracker, detector = Tracker(AIDECK, TUNING), Detector(rng)
+    tracker, detector = Tracker(AIDECK, TUNING, CALIBRATED), Detector(rng)
     paths = [wandering(rng, steps, start) for start in starts]
     out = Outcome([], [], [], [], 0)
     false: set[int] = set()
@@ -120,7 +136,7 @@ def test_the_filter_knows_its_error_while_its_model_holds() -> None:
     squared: list[float] = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        tracker, detector = Tracker(AIDECK, TUNING), Detector(rng, 1.0, 0.0)
+        tracker, detector = Tracker(AIDECK, TUNING, CALIBRATED), Detector(rng, 1.0, 0.0)
         path = wandering(rng, 60, np.array([1.5, 0.0, 0.0]))
         for truth, bias in zip(path, depth_biases(rng, 60, 1), strict=True):
             for track in tracker.step(STILL, detector.view(truth[None], bias)):
@@ -152,13 +168,15 @@ def test_depths_count_by_what_the_detections_say_of_them() -> None:
     assert np.mean(np.array(squared) <= chi2.ppf(0.95, 3)) >= 0.88
 
 
-def view_of(xyz: Array, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> ImageDetections:
+def view_of(
+    xyz: Array, roll_rad: float = 0.0, pitch_rad: float = 0.0, confidence: float = 0.9
+) -> ImageDetections:
     angles = np.full(len(xyz), roll_rad), np.full(len(xyz), pitch_rad)
     uv, depth_m, _ = pixels_from_horizontal(xyz, *angles, AIDECK)
-    return ImageDetections(uv, depth_m, roll_rad, pitch_rad)
+    return ImageDetections(uv, depth_m, roll_rad, pitch_rad, np.full(len(xyz), confidence))
 
 
-NOTHING = ImageDetections(np.zeros((0, 2)), np.zeros(0), 0.0, 0.0)
+NOTHING = ImageDetections(np.zeros((0, 2)), np.zeros(0), 0.0, 0.0, np.zeros(0))
 STILL = EgoMotion(DT_S, np.zeros(3), 0.0)
 
 
@@ -187,7 +205,7 @@ def test_a_peer_that_is_gone_is_given_up_and_one_out_of_view_is_not_at_once() ->
     turned = EgoMotion(DT_S, np.zeros(3), 1.5)  # the peer is now beside the image
     assert len(tracker.step(turned, NOTHING)) == 1
     assert all(len(tracker.step(STILL, NOTHING)) == 1 for _ in range(3))
-    for _ in range(100):
+    for _ in range(300):
         left = tracker.step(STILL, NOTHING)
     assert not left
 
@@ -197,8 +215,51 @@ def test_single_false_alarms_never_become_tracks() -> None:
     for _ in range(100):
         xyz = np.array([[rng.uniform(0.5, 3.0), 0.0, 0.0]]) * [1.0, 1.0, 1.0]
         xyz[0, 1:] = xyz[0, 0] * rng.uniform(-0.4, 0.4, 2)
-        view = view_of(xyz) if rng.random() < 0.3 else NOTHING
+        view = view_of(xyz, confidence=0.5) if rng.random() < 0.3 else NOTHING
         assert not tracker.step(STILL, view)
+
+
+@pytest.mark.parametrize(("confidence", "images"), [(0.95, 1), (0.6, 5), (0.1, None)])
+def test_confidence_decides_when_a_lasting_detection_is_a_peer(
+    confidence: float, images: int | None
+) -> None:
+    tracker, view = Tracker(AIDECK, TUNING), view_of(np.array([[1.2, 0.1, 0.0]]))
+    view = replace(view, confidence=np.array([confidence]))
+    seen = [bool(tracker.step(STILL, view)) for _ in range(60)]
+    if images is None:
+        assert not any(seen)
+    else:
+        assert True in seen[1 : images + 3]
+        assert not seen[0]
+
+
+def test_a_low_confidence_where_a_peer_is_expected_keeps_its_track_exact() -> None:
+    """Of two tracks, one gets weak detections and the other none."""
+    weak, blind = Tracker(AIDECK, TUNING), Tracker(AIDECK, TUNING)
+    peer = np.array([[1.2, 0.1, 0.0]])
+    for _ in range(20):
+        weak.step(STILL, view_of(peer))
+        blind.step(STILL, view_of(peer))
+    for _ in range(15):
+        (held,) = weak.step(STILL, view_of(peer, confidence=0.1))
+        (coasts,) = blind.step(STILL, NOTHING)
+    assert held.unseen_s == 0.0
+    assert coasts.unseen_s == pytest.approx(1.5)
+    assert np.trace(held.covariance) < 0.25 * np.trace(coasts.covariance)
+    assert held.existence > 0.9
+
+
+def test_silence_lowers_existence_slowly_and_near_more_than_far() -> None:
+    fallen = []
+    for distance_m in (0.75, 1.75):
+        tracker = Tracker(AIDECK, TUNING)
+        for _ in range(20):
+            tracker.step(STILL, view_of(np.array([[distance_m, 0.0, 0.0]])))
+        before = float(tracker.states.existence[0])
+        for _ in range(10):
+            (track,) = tracker.step(STILL, NOTHING)
+        fallen.append(before - track.existence)
+    assert 0 < fallen[1] < fallen[0] < 0.4
 
 
 def test_two_peers_keep_their_numbers_and_get_their_names_by_range() -> None:
@@ -228,52 +289,57 @@ def test_a_track_that_no_range_fits_has_no_name() -> None:
 def test_an_image_without_detections_and_one_behind_the_lens_s_fold_are_taken() -> None:
     tracker = Tracker(AIDECK, TUNING)
     assert tracker.step(STILL, NOTHING) == []
-    far_out = ImageDetections(np.array([[5000.0, 5000.0]]), np.ones(1), 0.0, 0.0)
+    far_out = ImageDetections(np.array([[5000.0, 5000.0]]), np.ones(1), 0.0, 0.0, np.ones(1))
     assert tracker.step(STILL, far_out) == []
 
 
-def test_what_is_not_seen_grows_as_unsure_as_the_tuning_says() -> None:
+def started(xyz: Array) -> TrackStates:
+    """The states after a first image of one peer."""
     tracker = Tracker(AIDECK, TUNING)
-    xyz = np.array([[1.5, 0.2, -0.1]])
-    uv, depth_m, _ = pixels_from_horizontal(xyz, LEVEL, LEVEL, AIDECK)
-    tracker.step(EgoMotion(0.0, np.zeros(3), 0.0), ImageDetections(uv, depth_m, 0.0, 0.0))
-    (track,) = tracker.tracks
-    assert track.position_m == pytest.approx(xyz[0], abs=1e-6)
-    before, dt_s = track.filter.P.copy(), 0.2
-    tracker._predict(track, EgoMotion(dt_s, np.zeros(3), 0.0))
-    after = track.filter.P
-    power = TUNING.acceleration_std_mps2**2
-    moved = before[:3, :3] + dt_s**2 * before[3:6, 3:6]
-    grown = np.diag(after)[:3] - np.diag(moved)
-    own = (TUNING.own_velocity_std_mps * dt_s) ** 2
-    turn = (TUNING.yaw_rate_std_radps * dt_s) ** 2
-    x, y, _ = track.position_m
-    still = power * dt_s**3 / 3
-    assert grown == pytest.approx([still + own + turn * y**2, still + own + turn * x**2, still])
-    assert after[0, 1] - moved[0, 1] == pytest.approx(-turn * x * y)
-    assert np.diag(after)[3:6] - np.diag(before)[3:6] == pytest.approx([power * dt_s] * 3)
-    gained = np.diag(after[:3, 3:6] - before[:3, 3:6]) - dt_s * np.diag(before)[3:6]
-    assert gained == pytest.approx([power * dt_s**2 / 2] * 3)
-    keep = np.exp(-dt_s / TUNING.depth_bias_s)
-    assert after[6, 6] == pytest.approx(TUNING.depth_bias_ratio**2)  # as much lost as gained
-    assert after[0, 6] == pytest.approx(keep * before[0, 6])
+    tracker.step(EgoMotion(0.0, np.zeros(3), 0.0), view_of(xyz))
+    return tracker.states
+
+
+def test_a_peer_out_of_sight_grows_as_uncertain_as_the_tuning_says() -> None:
+    """Against a simulation of the tuning's words: Gauss-Markov velocity, drift, heading."""
+    rng, count, dt_s, steps = default_rng(2), 20_000, 0.1, 12
+    states = started(np.array([[1.5, 0.2, -0.1]]))
+    (mean,), (covariance,) = states.cartesian()
+    drawn = rng.multivariate_normal(mean, covariance, count)
+    t = TUNING
+    std, calm = np.array([t.speed_std_mps] * 2 + [t.climb_std_mps]), np.exp(-0.01 / t.velocity_s)
+    for _ in range(steps):
+        states.predict(EgoMotion(dt_s, np.zeros(3), 0.0), t)
+        for _ in range(10):
+            drawn[:, :3] += 0.01 * drawn[:, 3:]
+            drawn[:, 3:] *= calm
+            drawn[:, 3:] += np.sqrt(1 - calm**2) * std * rng.normal(size=(count, 3))
+        drawn[:, :2] += t.own_drift_m * np.sqrt(dt_s) * rng.normal(size=(count, 2))
+        drawn[:, 2] += t.own_height_std_m * rng.normal(size=count)
+        turn = t.yaw_drift_rad * np.sqrt(dt_s) * rng.normal(size=count)
+        drawn[:, :2] += turn[:, None] * drawn[:, [1, 0]] * [1.0, -1.0]
+    (mean,), (covariance,) = states.cartesian()
+    assert mean == pytest.approx(drawn.mean(axis=0), abs=0.03)
+    assert np.sqrt(np.diag(covariance)) == pytest.approx(drawn.std(axis=0), rel=0.08)
 
 
 def test_a_track_moves_against_the_observer() -> None:
-    tracker = Tracker(AIDECK, TUNING)
-    uv, depth_m, _ = pixels_from_horizontal(np.array([[2.0, 0.3, 0.1]]), LEVEL, LEVEL, AIDECK)
-    tracker.step(EgoMotion(0.0, np.zeros(3), 0.0), ImageDetections(uv, depth_m, 0.0, 0.0))
-    (track,) = tracker.tracks
-    track.filter.x[3:6] = 0.5, 0.0, -0.2  # over ground, along the axes before the turn
-    tracker._predict(track, EgoMotion(0.5, np.array([0.4, 0.1, 0.05]), np.pi / 2))
-    # Ahead by 2 + 0.25 - 0.4 and left by 0.3 - 0.1; after a quarter turn left that is right.
-    assert track.position_m == pytest.approx([0.2, -1.85, -0.05])
-    assert track.velocity_mps == pytest.approx([0.0, -0.5, -0.2])
+    states = started(np.array([[2.0, 0.3, 0.1]]))
+    states.mean[0, 3:6] = 0.5, 0.0, -0.2  # over ground, along the axes before the turn
+    states.predict(EgoMotion(0.5, np.array([0.4, 0.1, 0.05]), np.pi / 2), TUNING)
+    calm = np.exp(-0.5 / TUNING.velocity_s)
+    reach_s = TUNING.velocity_s * (1 - calm)
+    # Ahead by 2 + 0.5 reach - 0.4 and left by 0.3 - 0.1; after a quarter turn left that is right.
+    place = [0.2, -1.6 - 0.5 * reach_s, 0.05 - 0.2 * reach_s]
+    (mean,), _ = states.cartesian()
+    assert mean == pytest.approx([*place, 0.0, -0.5 * calm, -0.2 * calm])
 
 
 def test_a_depth_s_own_deviation_counts_by_its_share_of_the_depth() -> None:
-    view = ImageDetections(
-        np.zeros((3, 2)), np.array([2.0, 4.0, 1.0]), 0.0, 0.0, np.array([0.3, 0.3, 0.0])
+    view = replace(
+        view_of(np.ones((3, 3))),
+        depth_m=np.array([2.0, 4.0, 1.0]),
+        sigma_depth_m=np.array([0.3, 0.3, 0.0]),
     )
     noise = Tracker(AIDECK, TUNING)._depth_noise(view)
     assert np.sqrt(noise[:, 2, 2]) == pytest.approx([0.15, 0.075, TUNING.depth_std_ratio])
@@ -284,29 +350,52 @@ def test_a_new_track_is_as_unsure_as_detections_that_are_drawn() -> None:
     tracker, rng, count = Tracker(AIDECK, replace(TUNING, pixel_std_px=2.0)), default_rng(0), 4_000
     true, tilt = np.array([[1.6, 0.3, -0.2]]), np.array([0.1, -0.05])
     uv, depth_m, _ = pixels_from_horizontal(true, tilt[:1], tilt[1:], AIDECK)
-    tracker.step(STILL, ImageDetections(uv, depth_m, *tilt.tolist()))
-    (track,) = tracker.tracks
+    tracker.step(STILL, ImageDetections(uv, depth_m, *tilt.tolist(), np.array([0.9])))
     bias = rng.normal(0, TUNING.depth_bias_ratio, count)
     white = rng.normal(0, TUNING.depth_std_ratio, count)
     pixels = uv + rng.normal(0, 2.0, (count, 2))
-    roll, pitch = (tilt[:, None] + rng.normal(0, TUNING.attitude_std_rad, (2, count))).tolist()
+    roll, pitch = (tilt[:, None] + rng.normal(0, TUNING.tilt_std_rad, (2, count))).tolist()
     drawn = horizontal_from_pixels(
-        pixels, depth_m * (1 - bias - white), np.array(roll), np.array(pitch), AIDECK
+        pixels, depth_m * np.exp(-bias - white), np.array(roll), np.array(pitch), AIDECK
     )
-    seen = np.cov(np.column_stack([drawn, bias]).T)
-    told = track.filter.P[np.ix_([0, 1, 2, 6], [0, 1, 2, 6])]
-    assert told == pytest.approx(seen, rel=0.15, abs=1e-3)
-    assert np.diag(track.filter.P)[3:6] == pytest.approx(TUNING.speed_std_mps**2)
+    range_m = np.linalg.norm(drawn, axis=1)
+    polar = np.arctan2(drawn[:, 1], drawn[:, 0]), np.arcsin(drawn[:, 2] / range_m), np.log(range_m)
+    seen = np.cov(np.column_stack([*polar, bias]).T)
+    told = tracker.states.covariance[0][np.ix_([0, 1, 2, 6], [0, 1, 2, 6])]
+    assert told == pytest.approx(seen, rel=0.15, abs=1e-4)
+    std = [TUNING.speed_std_mps] * 2 + [TUNING.climb_std_mps]
+    assert np.sqrt(np.diag(tracker.states.covariance[0])[3:6]) == pytest.approx(std)
 
 
-def test_the_gate_lets_its_share_of_a_peer_s_own_detections_through() -> None:
-    tracker, rng = Tracker(AIDECK, replace(TUNING, gate=0.9)), default_rng(1)
-    spread = np.array([[16.0, 3.0, 0.1], [3.0, 9.0, 0.0], [0.1, 0.0, 0.02]])
-    off = rng.multivariate_normal(np.zeros(3), spread, 5000)
-    gain = tracker._log_likelihood_ratios(off, np.tile(spread, (5000, 1, 1)))
-    assert np.isfinite(gain).mean() == pytest.approx(0.9, abs=0.015)
-    # At its middle: how much likelier a detection is from a track than a false alarm.
-    best = tracker._log_likelihood_ratios(np.zeros((1, 3)), spread[None])
-    alarms = TUNING.false_per_image / (AIDECK.width_px * AIDECK.height_px * np.log(20))
-    wanted = TUNING.detection_share / alarms / np.sqrt(np.linalg.det(2 * np.pi * spread))
-    assert best == pytest.approx(np.log(wanted))
+def test_a_lasting_tilt_stays_in_the_covariance_however_many_images_come() -> None:
+    tracker, xyz = Tracker(AIDECK, TUNING), np.array([[1.5, 0.0, 0.0]])
+    tracker.step(STILL, view_of(xyz))
+    for _ in range(200):
+        (track,) = tracker.step(STILL, view_of(xyz))
+    plain = np.sqrt(tracker.states.cartesian()[1][0, 2, 2])
+    both = np.hypot(plain, TUNING.tilt_bias_rad * 1.5)
+    assert np.sqrt(track.covariance[2, 2]) == pytest.approx(both, rel=1e-3)
+
+
+def test_one_detection_is_shared_by_two_tracks_and_its_owner_gets_most() -> None:
+    """By hand: two tracks that exist surely, one detection, likelihood ratios 50 and 10."""
+    belief = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    found = np.tile([0.0, 0.9, 0.9, 0.03], (2, 1))
+    near = np.array([[50.0], [10.0]])
+    weights = associate(belief, found, near, np.ones((2, 1)))
+    share = [0.9 * 50 / (0.1 + 0.9 * 50), 0.9 * 10 / (0.1 + 0.9 * 10)]
+    rival = 50 * share[0] / (1 - share[0]), 10 * share[1] / (1 - share[1])
+    claim = [0.9 * 50 / (1 + rival[1]), 0.9 * 10 / (1 + rival[0])]
+    wanted = [c / (0.1 + c) for c in claim]
+    assert weights.detection[:, 0] == pytest.approx(wanted, rel=1e-6)
+    assert weights.detection[:, 0] + weights.miss == pytest.approx([1.0, 1.0])
+    alone = associate(belief[:1], found[:1], near[:1], np.ones((1, 1)))
+    assert alone.detection[0, 0] == pytest.approx(share[0])
+
+
+def test_bright_detections_raise_the_belief_in_a_peer_as_bayes_says() -> None:
+    belief = np.array([[0.5, 0.2, 0.2, 0.1]])
+    found = np.array([[0.0, 0.9, 0.9, 0.0]])
+    weights = associate(belief, found, np.array([[20.0]]), np.array([[4.0]]))
+    after = np.array([0.5, 0.2 * (0.1 + 0.9 * 20), 0.2 * (0.1 + 0.9 * 20 * 4), 0.1])
+    assert weights.belief[0] == pytest.approx(after / after.sum())

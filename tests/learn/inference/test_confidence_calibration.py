@@ -8,7 +8,6 @@ from dmrl.learn.inference.confidence_calibration import (
     MIN_CONFIDENCE,
     MIN_DETECTIONS,
     PlattScaling,
-    _fit_logistic,
     apply_calibration,
     fit_calibration,
 )
@@ -18,6 +17,7 @@ from dmrl.learn.inference.detection_metrics import (
     compute_curves,
     score_detections,
 )
+from dmrl.learn.inference.detector_rates import fit_logistic
 from dmrl.learn.inference.matching import Points
 from dmrl.learn.networks.architectures import build_network
 
@@ -136,5 +136,5 @@ def test_a_fit_is_where_the_likelihood_is_flat() -> None:
     rng = np.random.default_rng(0)
     rows = np.column_stack([rng.normal(size=500), np.ones(500)])
     right = (rng.random(500) < 1 / (1 + np.exp(-3 * rows[:, 0] + 1))).astype(float)
-    said = 1 / (1 + np.exp(-rows @ _fit_logistic(rows, right)))
+    said = 1 / (1 + np.exp(-rows @ fit_logistic(rows, right)))
     assert rows.T @ (said - right) == pytest.approx(np.zeros(2), abs=1e-4)
