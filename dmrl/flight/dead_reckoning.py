@@ -5,6 +5,9 @@ import numpy as np
 from dmrl.flight.flight_arrays import RobotLog
 from dmrl.geometry.frames import Array
 
+HEIGHT_SAMPLES = 10
+"""Number of samples before the present over which the height is averaged: 0.1 s."""
+
 
 class DeadReckoning:
     """Path and heading of a robot, integrated by the trapezoid rule as its log grows.
@@ -58,10 +61,15 @@ class DeadReckoning:
         self.path_m[first + 1 : part.stop, 1] = way.imag
         self.path_m[grown, 2] = height
 
+    def _mean_height(self, sample: int) -> float:
+        """Return the mean height over the samples before; the noise of one looks like motion."""
+        return float(self.path_m[max(sample - HEIGHT_SAMPLES, 0) : sample + 1, 2].mean())
+
     def motion(self, first: int, last: int) -> tuple[float, Array, float]:
         """Return seconds, the (3,) way in the frame of the first of two samples, and the turn."""
         c, s = np.cos(self.yaw_rad[first]), np.sin(self.yaw_rad[first])
-        x, y, z = self.path_m[last] - self.path_m[first]
+        x, y, _ = self.path_m[last] - self.path_m[first]
+        z = self._mean_height(last) - self._mean_height(first)
         dt_s = float(self._log.time_s[last] - self._log.time_s[first])
         turn_rad = float(self.yaw_rad[last] - self.yaw_rad[first])
         return dt_s, np.array([c * x + s * y, c * y - s * x, z]), turn_rad

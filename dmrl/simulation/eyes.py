@@ -97,16 +97,20 @@ class NetworkEye:
         The opened model.
     options
         Limits on the detections.
+    rates
+        Rates of the model; None: unknown.
     """
 
-    def __init__(self, detector: Detector, options: DetectionOptions) -> None:
-        self._detector, self._options = detector, options
+    def __init__(
+        self, detector: Detector, options: DetectionOptions, rates: dict[str, Any] | None
+    ) -> None:
+        self._detector, self._options, self._rates = detector, options, rates
 
     def __call__(self, view: CameraView, time_s: float, rgb: Rgb | None) -> Look:
         """Return the detections in an image, and the grids."""
         assert rgb is not None, "a network needs images"
         found, grids = next(detect_images([rgb], self._detector, self._options))
         return Look(
-            detection_fields(found, 0, self._detector.threshold),
+            detection_fields(found, 0, self._detector.threshold, self._rates),
             grid_fields(grids, 0, self._detector.stride_px),
         )

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from dmrl.estimation.tracking.detector_rates import DetectorRates
 from dmrl.estimation.tracking.identity import TrackIdentity
 from dmrl.estimation.tracking.tracker import Track, Tracker
 from dmrl.estimation.tracking.tracker_input import EgoMotion, ImageDetections
@@ -16,7 +17,7 @@ from dmrl.geometry.frames import AIDECK_PINHOLE
 from dmrl.labelling.peer_tracks import build_tracks
 from dmrl.samples.sample import Sample
 
-COLUMNS = ("u_px", "v_px", "depth_m", "sigma_depth_m")
+COLUMNS = ("u_px", "v_px", "depth_m", "sigma_depth_m", "confidence")
 
 
 class OnboardTracker:
@@ -32,17 +33,16 @@ class OnboardTracker:
 
     def __init__(self, robot: str, reckoning: DeadReckoning) -> None:
         self._robot, self._reckoning = robot, reckoning
-        self._tracker, self._identity = Tracker(AIDECK_PINHOLE, Tuning()), TrackIdentity()
+        self._tracker: Tracker | None = None
+        self._identity = TrackIdentity()
         self._sample: int | None = None
         self._tracks: list[Track] = []
         self._names: dict[int, str] = {}
-        self._seen: dict[int, tuple[float, int]] = {}
-        """By track: its score, and the sample of the last image that raised it."""
 
     def see(
         self, sample: int, detections: Mapping[str, Any], range_m: dict[str, float]
     ) -> list[Track]:
-        """Use the detections of an image, and return the confirmed tracks.
+        """Use the detections of an image, and return the reported tracks.
 
         Parameters
         ----------
@@ -57,20 +57,15 @@ class OnboardTracker:
         motion = EgoMotion(*self._reckoning.motion(before, sample))
         self._sample = sample
         roll, pitch = self._reckoning.sensors[:2, sample].tolist()
-        least, every = detections["threshold"], detections["detections"]
-        kept = [[d[name] for name in COLUMNS] for d in every if d["confidence"] >= least]
-        rows = np.array(kept)
-        u, v, depth_m, sigma_m = rows.reshape(-1, 4).T
-        view = ImageDetections(np.column_stack([u, v]), depth_m, roll, pitch, sigma_m)
+        rows = np.array([[d[name] for name in COLUMNS] for d in detections["detections"]])
+        u, v, depth_m, sigma_m, confidence = rows.reshape(-1, len(COLUMNS)).T
+        uv = np.column_stack([u, v])
+        view = ImageDetections(uv, depth_m, roll, pitch, confidence, sigma_m)
+        if self._tracker is None:
+            rates = DetectorRates(**(detections.get("rates") or {}))
+            self._tracker = Tracker(AIDECK_PINHOLE, Tuning(), rates)
         self._tracks = self._tracker.step(motion, view)
         self._names = self._identity.assign(self._tracks, range_m, motion.dt_s)
-        last = self._seen
-        self._seen = {
-            t.number: (t.score, sample)
-            if t.number not in last or t.score > last[t.number][0]
-            else (t.score, last[t.number][1])
-            for t in self._tracker.tracks
-        }
         return self._tracks
 
     def build_sample(self, time_ns: int, publish_ns: int) -> Sample:
@@ -91,7 +86,7 @@ class OnboardTracker:
         found = []
         for track in self._tracks:
             moved = np.hstack([np.eye(3), dt_s * np.eye(3)])
-            covariance = moved @ track.filter.P[:6, :6] @ moved.T
+            covariance = moved @ track.state_covariance @ moved.T
             place_m = track.position_m + dt_s * track.velocity_mps - shift_m
             found.append(
                 PeerTrack(
@@ -100,7 +95,7 @@ class OnboardTracker:
                     turn @ place_m,
                     turn @ track.velocity_mps,
                     turn @ covariance @ turn.T,
-                    dt_s + (self._sample - self._seen[track.number][1]) / RATE_HZ,
+                    dt_s + track.unseen_s,
                 )
             )
         return tuple(found)

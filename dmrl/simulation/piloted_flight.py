@@ -9,7 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dmrl import topics
-from dmrl.deploy.detector import BACKEND_PACKAGES, open_detector, select_fastest_backend
+from dmrl.deploy.detector import (
+    BACKEND_PACKAGES,
+    open_detector,
+    read_rates,
+    select_fastest_backend,
+)
 from dmrl.deploy.image_detection import DetectionOptions
 from dmrl.errors import SettingError
 from dmrl.flight.flight_arrays import RATE_HZ, Flight, Ranges, RobotLog
@@ -289,7 +294,7 @@ def open_eyes(settings: "FlySettings") -> tuple[list[Eye | None], "FlySettings",
     made : Provenance
         Of the flight.
     """
-    libraries = ["numpy", "pillow", "scipy", "filterpy"]
+    libraries = ["numpy", "pillow", "scipy"]
     numbers = range(settings.flown)
     if str(settings.eye) in NAMED_EYES:
         made = build_provenance("fly", settings, seed=settings.seed, libraries=libraries)
@@ -309,7 +314,7 @@ def open_eyes(settings: "FlySettings") -> tuple[list[Eye | None], "FlySettings",
     detector.require_size(*size_px, "the flight's camera")
     libraries += [name for name in BACKEND_PACKAGES[backend] if name not in libraries]
     made = build_provenance("fly", settings, [model], seed=settings.seed, libraries=libraries)
-    look = NetworkEye(detector, DetectionOptions(MIN_CONFIDENCE, MOST, 1))
+    look = NetworkEye(detector, DetectionOptions(MIN_CONFIDENCE, MOST, 1), read_rates(model))
     return [look for _ in numbers], settings, describe_weights(made, model, detector)
 
 

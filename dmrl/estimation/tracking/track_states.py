@@ -94,7 +94,7 @@ class TrackStates:
         reach_s = tuning.velocity_s * (1 - calm)
         before_m, by_polar = cartesian_from_polar(self.mean[:, P])
         velocity = self.mean[:, V] @ turn.T
-        place_m = (before_m - motion.shift_m) @ turn.T + reach_s * velocity
+        place_m: Array = (before_m - motion.shift_m) @ turn.T + reach_s * velocity
         polar = _polar_from_cartesian(place_m)
         back = np.linalg.inv(cartesian_from_polar(polar)[1])
         move = np.zeros((len(self), 7, 7))

@@ -8,6 +8,7 @@ All tracks are rows of arrays of fixed layout, and a step has no loop over them.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import chi2
 
@@ -170,13 +171,13 @@ class Tracker:
         size = np.array([self.camera.width_px, self.camera.height_px])
         std = np.sqrt(np.diagonal(spread[:, :2, :2], axis1=1, axis2=2) + self.tuning.edge_px**2)
         inside = ndtr((size - mean[:, :2]) / std) - ndtr(-mean[:, :2] / std)
-        return np.nan_to_num(inside.prod(axis=1))
+        return np.asarray(np.nan_to_num(inside.prod(axis=1)))
 
     def _update(self, dt_s: float, view: ImageDetections, evidence: Array) -> Array:
         """Update all tracks; return (N,) probabilities that a detection belongs to none."""
         states, t = self.states, self.tuning
         mean, row, noise = self._predict_measurement(view)
-        ahead = np.isfinite(mean).all(axis=1)
+        ahead: NDArray[np.bool_] = np.isfinite(mean).all(axis=1)
         row[~ahead], noise[~ahead] = 0.0, np.eye(3)
         base = row @ states.covariance @ row.transpose(0, 2, 1) + noise
         spread = base[:, None] + self._depth_noise(view)
@@ -198,7 +199,7 @@ class Tracker:
         gain = states.covariance[:, None] @ row.transpose(0, 2, 1)[:, None] @ inverse
         self._merge_updates(weights, gain, np.where(ahead[:, None, None], off, 0.0), spread)
         mine = weights.detection * (1 - weights.belief[:, NOBODY, None])
-        return 1 - np.minimum(mine.sum(axis=0), 1.0)
+        return np.asarray(1 - np.minimum(mine.sum(axis=0), 1.0))
 
     def _merge_updates(self, weights: Association, gain: Array, off: Array, spread: Array) -> None:
         """Replace each state by the mean and covariance of its updates by every detection."""

@@ -219,7 +219,7 @@ def test_single_false_alarms_never_become_tracks() -> None:
         assert not tracker.step(STILL, view)
 
 
-@pytest.mark.parametrize(("confidence", "images"), [(0.95, 1), (0.6, 5), (0.1, None)])
+@pytest.mark.parametrize(("confidence", "images"), [(0.95, 1), (0.8, 5), (0.1, None)])
 def test_confidence_decides_when_a_lasting_detection_is_a_peer(
     confidence: float, images: int | None
 ) -> None:
