@@ -58,7 +58,7 @@ class Recording:
 
     def __init__(self, path: PathLike, temporary: Path | None = None) -> None:
         self.path = Path(path)
-        self._summary = read_summary(self.path, verify=True)
+        self._summary = read_summary(self.path)
         self._kept = None if temporary is None else _TemporaryFolder(temporary)
 
     def __fspath__(self) -> str:

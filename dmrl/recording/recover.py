@@ -43,7 +43,7 @@ from dmrl.recording.mcap.file import (
 )
 from dmrl.recording.mcap.message_batch import MessageBatch
 from dmrl.recording.mcap.message_index import ENTRY_BYTES
-from dmrl.recording.mcap.summary_section import iter_extents, read_raw_section
+from dmrl.recording.mcap.summary_section import read_raw_section
 from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
 from dmrl.recording.provenance_inputs import hash_file
 from dmrl.recording.recovery_report import Recovery
@@ -72,6 +72,7 @@ class _RecoveryState:
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: ChannelTable = field(default_factory=ChannelTable)
     channel_records: dict[int, McapChannel] = field(default_factory=dict)  # Channel records
+    incomplete: dict[int, str] = field(default_factory=dict)  # topics without their schema
     metadata: dict[str, list[dict[str, str]]] = field(default_factory=dict)
     attachments: list[Attachment] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)  # messages by channel id
@@ -237,7 +238,7 @@ def _iter_records(
     stream: BoundedReader, state: _RecoveryState
 ) -> Iterator[tuple[int, McapRecord | _IndexedCount]]:
     """Yield offset and record up to the footer, skipping corrupt ranges."""
-    listed_offsets = sorted(start for start, _ in iter_extents(state.summary_section))
+    listed_offsets = sorted(_iter_listed_offsets(stream, state.summary_section))
     at = len(MAGIC)
     while at < stream.size and not state.footer:
         later = bisect_right(listed_offsets, at)
@@ -251,6 +252,24 @@ def _iter_records(
         if record is not None:
             yield at, record
         at = end
+
+
+def _iter_listed_offsets(stream: BoundedReader, section: McapSummary) -> Iterator[int]:
+    """Yield the offsets that the Summary section lists, where there is such a record."""
+    listed = [
+        *(
+            (Opcode.CHUNK, one.chunk_start_offset, one.chunk_length)
+            for one in section.chunk_indexes
+        ),
+        *((Opcode.METADATA, one.offset, one.length) for one in section.metadata_indexes),
+        *((Opcode.ATTACHMENT, one.offset, one.length) for one in section.attachment_indexes),
+    ]
+    for opcode, at, length in listed:
+        if at + length <= stream.size and length >= RECORD_STRUCT.size:
+            stream.seek(at)
+            head = stream.read(RECORD_STRUCT.size)
+            if head == RECORD_STRUCT.pack(opcode, length - RECORD_STRUCT.size):
+                yield at
 
 
 def _parse_record_at(
@@ -307,12 +326,18 @@ def _parse_record(
 
 def _register_record(state: _RecoveryState, record: McapRecord) -> None:
     """Register a definition, metadata record or attachment."""
+    known = {Schema: state.schemas, McapChannel: state.channel_records}.get(type(record), {})
+    if known.get(getattr(record, "id", 0), record) != record:
+        state.recovery.contradictions.append(f"{_name(record)} is defined in two ways")
     match record:
         case Schema():
             state.schemas[record.id] = record
         case McapChannel() if not record.schema_id or record.schema_id in state.schemas:
             state.channels.define(record, state.schemas)
+            state.incomplete.pop(record.id, None)
             state.channel_records[record.id] = record
+        case McapChannel():
+            state.incomplete[record.id] = record.topic
         case Metadata():
             state.extras += 1
             state.metadata.setdefault(record.name, []).append(dict(record.metadata))
@@ -321,33 +346,43 @@ def _register_record(state: _RecoveryState, record: McapRecord) -> None:
             state.attachments.append(record)
 
 
+def _name(definition: McapRecord) -> str:
+    return definition.name if isinstance(definition, Schema) else definition.topic
+
+
 def _complete_report(state: _RecoveryState) -> None:
     """Complete the report: compare the recovered messages with the file's statistics."""
-    recovery, statistics = state.recovery, state.summary_section.statistics
-    had = (
-        Counter(statistics.channel_message_counts)
-        if statistics is not None
-        else state.counts + state.skipped
-    )
+    recovery, section = state.recovery, state.summary_section
+    statistics, found = section.statistics, state.counts.total()
+    stated = Counter(statistics.channel_message_counts) if statistics is not None else None
+    had = stated or state.counts + state.skipped
     for number, count in sorted((had - state.counts).items()):
         channel = state.channels.get(number)
         topic = channel.topic if channel else f"channel {number}"
         recovery.missing[topic] = recovery.missing.get(topic, 0) + count
+    lost = sorted(set(state.incomplete.values()))
+    recovery.contradictions += [f"the schema of {topic} is missing" for topic in lost]
     recovery.counted = statistics is not None
-    if (
-        statistics is not None
-        and statistics.metadata_count + statistics.attachment_count != state.extras
-    ):
-        recovery.doubtful = True
+    if statistics is not None:
+        unknown = statistics.message_count - found - sum(recovery.missing.values())
+        if unknown > 0:
+            recovery.missing["unknown"] = unknown
+        if state.counts - had or unknown < 0:  # duplicates, or messages of another recording
+            recovery.contradictions.append(
+                f"its statistics state {statistics.message_count} messages, otherwise distributed"
+            )
+        if statistics.metadata_count + statistics.attachment_count != state.extras:
+            recovery.doubtful = True
+    if section.chunk_indexes and len(section.chunk_indexes) != state.chunks:
+        recovery.contradictions.append(
+            f"its summary lists {len(section.chunk_indexes)} chunks, but it has {state.chunks}"
+        )
     crc = state.metadata.get(checksums.METADATA_NAME)
     if crc and crc[-1].get("metadata") != checksums.format_crc(state.running_checksums.metadata):
         recovery.doubtful = True
     recovery.whole = (
         state.footer
-        and state.chunks == (len(state.summary_section.chunk_indexes) or state.chunks)
-        and not recovery.doubtful
+        and not (recovery.doubtful or recovery.contradictions)
         and not (recovery.damaged_chunks or recovery.lost_bytes)
-        and not (recovery.nameless or recovery.timeless)
-        and not recovery.missing
-        and not state.counts - had  # duplicates, or messages of another recording
+        and not (recovery.nameless or recovery.timeless or recovery.missing)
     )

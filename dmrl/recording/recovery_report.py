@@ -20,9 +20,12 @@ class Recovery:
     lost_bytes
         Bytes outside of complete records: after the last one, or before the next listed one.
     missing
-        Messages that were not recovered, by topic, as far as the file lists them.
+        Messages that were not recovered, by topic, as far as the file lists them. Their topic is
+        "unknown" where the file states only how many there were.
     counted
         Whether ``missing`` covers the whole file: its Statistics record was readable.
+    contradictions
+        What the file states about itself that is not so, a phrase each.
     doubtful
         Whether metadata or attachments are missing or fail their checksum. They are kept as they
         are.
@@ -37,5 +40,6 @@ class Recovery:
     lost_bytes: int = 0
     missing: dict[str, int] = field(default_factory=dict)
     counted: bool = False
+    contradictions: list[str] = field(default_factory=list)
     doubtful: bool = False
     whole: bool = False

@@ -13,7 +13,7 @@ from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.extra_records import read_attachment, read_metadata
 from dmrl.recording.mcap.file import BoundedReader, open_mcap
 from dmrl.recording.mcap.file_cache import get_cached
-from dmrl.recording.mcap.message_count import count_messages, count_scanned
+from dmrl.recording.mcap.message_count import count_recording, count_scanned
 from dmrl.recording.mcap.record_scan import scan_file
 from dmrl.recording.mcap.summary_section import read_summary_section
 from dmrl.recording.provenance import METADATA_NAME, Provenance
@@ -85,28 +85,20 @@ class Summary:
         return sum(topic.count for topic in self.topics.values())
 
 
-def read_summary(path: Path, *, verify: bool = False) -> Summary:
+def read_summary(path: Path) -> Summary:
     """Read the summary of a recording, its metadata and its attachments.
-
-    Parameters
-    ----------
-    path
-        A complete recording.
-    verify
-        Count every message in the chunks of another program's file; see `count_messages`.
 
     Raises
     ------
     RecordingError
-        If the file is absent, not MCAP, truncated or corrupt, or its statistics state another
-        number of messages.
+        If the file is absent, not MCAP, truncated or corrupt, or it states another number of
+        messages than it has; see `count_recording`.
     """
-    kind = "verified summary" if verify else "summary"
     with open_mcap(path) as stream:
-        return get_cached(kind, path, stream, lambda: _build_summary(path, stream, verify=verify))
+        return get_cached("summary", path, stream, lambda: _build_summary(path, stream))
 
 
-def _build_summary(path: Path, stream: BoundedReader, *, verify: bool) -> Summary:
+def _build_summary(path: Path, stream: BoundedReader) -> Summary:
     section = read_summary_section(path, stream)
     if section is None:
         scanned = scan_file(path, stream)
@@ -117,7 +109,7 @@ def _build_summary(path: Path, stream: BoundedReader, *, verify: bool) -> Summar
         )
         definitions = Definitions(scanned.schemas, scanned.channel_records, scanned.channels)
     else:
-        count = count_messages(path, stream, section, verify=verify)
+        count = count_recording(path, stream, section)
         metadata = read_metadata(path, stream, section)
         places = sorted(section.attachment_indexes, key=lambda place: place.offset)
         attachments = [read_attachment(path, stream, at) for at in places]

@@ -21,7 +21,7 @@ def run(recording: Path) -> "Overview":
     from dmrl.recording import read_summary
     from dmrl.recording.overview import Overview
 
-    return Overview(recording, read_summary(recording, verify=True))
+    return Overview(recording, read_summary(recording))
 
 
 command = stage_command(

@@ -30,7 +30,7 @@ def run(recording: Path, out: Path) -> "Recovery":
     return recover(recording, out)
 
 
-def _losses(result: "Recovery") -> str:
+def describe_losses(result: "Recovery") -> str:
     """Describe everything that could not be brought back."""
     if result.whole:
         sure = "" if result.counted else " as far as can be told: it does not say what it had"
@@ -44,6 +44,7 @@ def _losses(result: "Recovery") -> str:
         f"{result.timeless} messages left out whose time is impossible" * bool(result.timeless),
         f"{result.lost_bytes} bytes that are no whole record lost" * bool(result.lost_bytes),
         "metadata or attachments missing, or damaged and kept as they stand" * result.doubtful,
+        *result.contradictions,
         unknown * (not result.counted),
     )
     return ", ".join(part for part in parts if part)
@@ -53,7 +54,7 @@ command = stage_command(
     run,
     Closing(
         lines=lambda result, given: [
-            f"{given.out}: {result.messages} messages brought back; {_losses(result)}"
+            f"{given.out}: {result.messages} messages brought back; {describe_losses(result)}"
         ],
         document=lambda result, _: asdict(result),
     ),

@@ -24,6 +24,7 @@ class Content:
     raw_messages: list[tuple] = field(default_factory=list)
     attachments: list[tuple] = field(default_factory=list)
     metadata: list[tuple] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)  # chunks, and definitions that contradict
 
     def channel(self, number: int) -> tuple:
         """Topic, encoding, metadata and schema of a channel."""
@@ -33,7 +34,19 @@ class Content:
     @property
     def messages(self) -> list[tuple]:
         """Channel, log time, publish time, sequence and data of each, sorted."""
-        return sorted((self.channel(n), *rest) for n, *rest in self.raw_messages)
+        return sorted(((self.channel(n), *rest) for n, *rest in self.raw_messages), key=repr)
+
+    def set_aside_nameless(self) -> None:
+        """Leave out channels without their schema, and messages without their channel."""
+        known = {
+            n: channel
+            for n, channel in self.channels.items()
+            if not channel[3] or channel[3] in self.schemas
+        }
+        kept = [message for message in self.raw_messages if message[0] in known]
+        if lost := len(self.raw_messages) - len(kept):
+            self.unreadable.append(f"{lost} messages without a channel")
+        self.channels, self.raw_messages = known, kept
 
     def comparable(self) -> dict[str, list]:
         """All of it but what dmrl adds to its own copies."""
@@ -63,7 +76,7 @@ def pairs(data: bytes, at: int) -> tuple[tuple[tuple[str, str], ...], int]:
 def unpacked(kind: str, data: bytes, size: int) -> bytes:
     if kind == "zstd":
         return zstandard.ZstdDecompressor().decompress(data, size) if size else b""
-    return lz4.frame.decompress(data) if kind == "lz4" else data
+    return lz4.frame.decompress(data) if kind == "lz4" else {"": data}[kind]
 
 
 def records(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -89,12 +102,15 @@ def take(found: Content, opcode: int, body: bytes) -> None:
         encoding, at = text(body, at)
         size = int.from_bytes(body[at : at + 4], "little")
         made = name, encoding, body[at + 4 : at + 4 + size]
-        found.schemas[int.from_bytes(body[:2], "little")] = made
+        if found.schemas.setdefault(int.from_bytes(body[:2], "little"), made) != made:
+            found.unreadable.append("a schema is defined otherwise")
     elif opcode == CHANNEL:
         number, schema = struct.unpack_from("<HH", body)
         topic, at = text(body, 4)
         encoding, at = text(body, at)
-        found.channels[number] = topic, encoding, pairs(body, at)[0], schema
+        made = topic, encoding, pairs(body, at)[0], schema
+        if found.channels.setdefault(number, made) != made:
+            found.unreadable.append("a channel is defined otherwise")
     elif opcode == MESSAGE:
         number, sequence, log_ns, publish_ns = struct.unpack_from("<HIQQ", body)
         found.raw_messages.append((number, log_ns, publish_ns, sequence, body[22:]))
@@ -102,7 +118,12 @@ def take(found: Content, opcode: int, body: bytes) -> None:
         size, at = int.from_bytes(body[16:24], "little"), 28
         kind, at = text(body, at)
         length = int.from_bytes(body[at : at + 8], "little")
-        inner = unpacked(kind, body[at + 8 : at + 8 + length], size)
+        try:
+            inner = unpacked(kind, body[at + 8 : at + 8 + length], size)
+            assert len(inner) == size
+        except (RuntimeError, zstandard.ZstdError, KeyError, AssertionError) as e:
+            found.unreadable.append(str(e))
+            return
         for each, part in records(inner):
             take(found, each, part)
     elif opcode == ATTACHMENT:

@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from dmrl.errors import SourceError
 from dmrl.images.codec import UNDECODABLE, decode
 from dmrl.messages import message_class
-from dmrl.recording.mcap.batch_reader import check_counts, count_messages, select_chunks
+from dmrl.recording.mcap.batch_reader import count_messages, select_chunks
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunk import ParsedChunk
 from dmrl.recording.mcap.chunk_reader import locate_chunk, read_chunk_for_copy
 from dmrl.recording.mcap.file import open_mcap
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS, MessageBatch
+from dmrl.recording.mcap.message_count import check_counts
 from dmrl.recording.mcap.message_index import MessageIndex
 from dmrl.recording.mcap.record_scan import scan_file
 from dmrl.recording.mcap.summary_section import read_summary_section

@@ -135,7 +135,7 @@ def trim(
     OutputError
         If ``out`` exists or cannot be written.
     """
-    source = read_summary(path, verify=True)
+    source = read_summary(path)
     topics_to_keep = match_topics(path, topics) if topics else frozenset(source.topics)
     settings = {"start_ns": start_ns, "end_ns": end_ns, "topics": list(topics)}
     low = source.start_ns if start_ns is None else max(start_ns, source.start_ns)

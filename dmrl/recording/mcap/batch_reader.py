@@ -6,17 +6,17 @@ All readers of messages use this module. Decoders work on whole batches.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterator, Set
 from pathlib import Path
 
 import numpy as np
-from mcap.records import ChunkIndex, Statistics
+from mcap.records import ChunkIndex
 from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunk import select_channels
 from dmrl.recording.mcap.chunk_reader import locate_chunk, read_chunk
-from dmrl.recording.mcap.file import BoundedReader, corrupt_error, open_mcap
+from dmrl.recording.mcap.file import BoundedReader, open_mcap
 from dmrl.recording.mcap.message_batch import (
     EMPTY_BATCH,
     MAX_TIME_NS,
@@ -24,6 +24,7 @@ from dmrl.recording.mcap.message_batch import (
     concatenate,
     concatenate_all,
 )
+from dmrl.recording.mcap.message_count import check_counts, verify_indexes
 from dmrl.recording.mcap.record_scan import scan_file
 from dmrl.recording.mcap.summary_section import SummarySection, read_summary_section
 
@@ -83,33 +84,6 @@ def count_messages(counts: Counter[int], batch: MessageBatch) -> None:
             counts[number] += count
 
 
-def check_counts(
-    path: Path,
-    statistics: Statistics | None,
-    channels: Mapping[int, Channel],
-    counts: Counter[int],
-) -> None:
-    """Raise RecordingError unless the counts of messages equal those of the Statistics record.
-
-    Parameters
-    ----------
-    path
-        The recording, for errors.
-    statistics
-        The record, if there is one. It may lack the counts by channel.
-    channels
-        Channels that were read, by channel id.
-    counts
-        Messages found, by channel id.
-    """
-    expected = statistics.channel_message_counts if statistics else {}
-    for number, channel in channels.items() if expected else ():
-        if counts[number] != expected.get(number, 0):
-            raise corrupt_error(
-                path, f"{channel.topic} has {counts[number]} of {expected.get(number, 0)} messages"
-            )
-
-
 def iter_batches_in_file_order(path: Path) -> Iterator[tuple[MessageBatch, dict[int, Channel]]]:
     """Yield every message in file order, chunk by chunk, unsorted.
 
@@ -149,9 +123,13 @@ def _iter_in_time_order(
     last = _find_image_channels(channels)
     pending: MessageBatch | None = None
     stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
+    # Statistics are compared with the messages where all are read, else with the message indexes.
     ranged = (low, high) != (0, MAX_TIME_NS)
+    if ranged:
+        verify_indexes(path, stream, summary)
+    whole = ranged and not summary.has_own_checksums
     for k, chunk in enumerate(chunks):
-        batch = read_chunk(path, stream, chunk, channels, summary, whole=ranged)
+        batch = read_chunk(path, stream, chunk, channels, summary, whole=whole)
         batch = batch.take((batch.time_ns >= low) & (batch.time_ns < high))
         pending = concatenate(pending, batch).sort_by_time(last)
         if k + 1 == len(chunks):

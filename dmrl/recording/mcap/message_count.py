@@ -2,7 +2,7 @@
 
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -12,11 +12,11 @@ from mcap.exceptions import McapError
 from mcap.records import Statistics
 
 from dmrl.recording.mcap import checksums
-from dmrl.recording.mcap.batch_reader import check_counts
-from dmrl.recording.mcap.channel import ChannelTable
+from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunk_reader import locate_chunk, read_chunk
 from dmrl.recording.mcap.extra_records import read_metadata
 from dmrl.recording.mcap.file import BoundedReader, corrupt_error
+from dmrl.recording.mcap.file_cache import get_cached
 from dmrl.recording.mcap.message_batch import Ints
 from dmrl.recording.mcap.message_index import (
     ENTRY_BYTES,
@@ -27,10 +27,11 @@ from dmrl.recording.mcap.message_index import (
 from dmrl.recording.mcap.record_scan import ScannedFile
 from dmrl.recording.mcap.summary_section import SummarySection
 
-COUNTED_BYTES = 256_000_000
-"""Uncompressed size up to which every message of another program's file is counted.
+COUNTED_BYTES = 128_000_000
+"""Uncompressed size up to which every chunk of another program's file is read to count.
 
-That takes about 0.3 s. For larger files the Statistics record is compared with the indexes.
+It costs a few tenths of a second, once a process. The chunks of larger files are verified when
+they are read.
 """
 Times = Iterable[tuple[int, Ints]]
 
@@ -71,39 +72,76 @@ def count_scanned(path: Path, scanned: ScannedFile) -> MessageCount:
     return _compare(path, scanned.statistics, scanned.channels, times)
 
 
-def count_messages(
-    path: Path, stream: BoundedReader, section: SummarySection, *, verify: bool = False
-) -> MessageCount:
+def count_recording(path: Path, stream: BoundedReader, section: SummarySection) -> MessageCount:
     """Return number and times of the messages.
 
-    They are from the Statistics record where that is complete and agrees with the chunk indexes.
-    Otherwise they are counted in the message indexes, or in the chunks of a file without.
-
-    Parameters
-    ----------
-    path, stream, section
-        The recording and its Summary section.
-    verify
-        Read and verify every chunk, unless dmrl wrote the file, or it is larger than
-        `COUNTED_BYTES`, or in a bucket.
+    Every chunk of another program's file is read and verified. Of a file that dmrl wrote, is larger
+    than `COUNTED_BYTES`, or is in a bucket, they are from the Statistics record if that is complete
+    and agrees with the chunk indexes; else they are counted in the message indexes.
 
     Raises
     ------
     RecordingError
         If the file states another number, or is corrupt.
     """
-    stated, size = _get_stated(section), sum(c.uncompressed_size for c in section.chunk_indexes)
-    own = checksums.METADATA_NAME in read_metadata(path, stream, section)
-    verify = verify and not own and size <= COUNTED_BYTES and stream.remote_stream is None
-    if stated is not None and not verify:
-        return stated
-    indexed = all(chunk.message_index_offsets for chunk in section.chunk_indexes)
-    times = (
-        iter_index_times(path, stream, section)
-        if indexed and not verify
-        else _iter_chunk_times(path, stream, section)
-    )
+    size = sum(chunk.uncompressed_size for chunk in section.chunk_indexes)
+    costly = size > COUNTED_BYTES or stream.remote_stream is not None
+    trusted = costly or checksums.METADATA_NAME in read_metadata(path, stream, section)
+    if trusted:
+        count = _get_stated(section) or verify_indexes(path, stream, section)
+        if count is not None:
+            return count
+    times = _iter_chunk_times(path, stream, section)
     return _compare(path, section.statistics, section.channels_by_id, times)
+
+
+def verify_indexes(
+    path: Path, stream: BoundedReader, section: SummarySection
+) -> MessageCount | None:
+    """Compare the message indexes of all chunks with the Statistics record, and count by them.
+
+    The result is cached. None: the file has chunks without indexes.
+
+    Raises
+    ------
+    RecordingError
+        If they state another number or other times, one is not listed, or they fail dmrl's CRC.
+    """
+    if not all(chunk.message_index_offsets for chunk in section.chunk_indexes):
+        return None
+
+    def count() -> MessageCount:
+        times = iter_index_times(path, stream, section)
+        return _compare(path, section.statistics, section.channels_by_id, times)
+
+    return get_cached("message indexes", path, stream, count)
+
+
+def check_counts(
+    path: Path,
+    statistics: Statistics | None,
+    channels: Mapping[int, Channel],
+    counts: Counter[int],
+) -> None:
+    """Raise RecordingError unless the counts of messages equal those of the Statistics record.
+
+    Parameters
+    ----------
+    path
+        The recording, for errors.
+    statistics
+        The record, if there is one. It may lack the counts by channel.
+    channels
+        Channels that were read, by channel id.
+    counts
+        Messages found, by channel id.
+    """
+    expected = statistics.channel_message_counts if statistics else {}
+    for number, channel in channels.items() if expected else ():
+        if counts[number] != expected.get(number, 0):
+            raise corrupt_error(
+                path, f"{channel.topic} has {counts[number]} of {expected.get(number, 0)} messages"
+            )
 
 
 def _get_stated(section: SummarySection) -> MessageCount | None:
@@ -177,7 +215,7 @@ def iter_index_times(
 
 
 def _compare(
-    path: Path, statistics: Statistics | None, channels: ChannelTable, times: Times
+    path: Path, statistics: Statistics | None, channels: Mapping[int, Channel], times: Times
 ) -> MessageCount:
     """Count messages by their times and compare them with the Statistics record."""
     counts: Counter[int] = Counter()

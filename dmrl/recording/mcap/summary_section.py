@@ -29,6 +29,7 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary as McapSummary
 
 from dmrl.guards import limits
+from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.channel import ChannelTable, build_channels
 from dmrl.recording.mcap.file import (
     DEFINITIONS,
@@ -71,6 +72,11 @@ class SummarySection(McapSummary):
     def channels_by_id(self) -> ChannelTable:
         """Channels of the section, by channel id."""
         return build_channels(self.channels, self.schemas)
+
+    @property
+    def has_own_checksums(self) -> bool:
+        """Whether dmrl wrote the file. It then has checksums of its message indexes."""
+        return any(one.name == checksums.METADATA_NAME for one in self.metadata_indexes)
 
     @property
     def counts(self) -> dict[int, int]:
@@ -335,7 +341,7 @@ def _has_no_messages(
             raise corrupt_error(path, f"its summary lacks the chunk at byte {at}")
         if opcode == Opcode.MESSAGE:
             return False
-        if opcode in DEFINITIONS and not summary_section.has_crc:
+        if opcode in DEFINITIONS:
             body = ReadDataStream(BytesIO(stream.read(length)))
             summary_section.check_definitions(path, [DEFINITIONS[opcode].read(body)])
         elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):

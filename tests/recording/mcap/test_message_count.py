@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from dmrl.errors import RecordingError
-from dmrl.recording.mcap.batch_reader import check_counts
+from dmrl.recording.mcap.message_count import check_counts
 
 
 def statistics(counts: dict[int, int] | None) -> Any:

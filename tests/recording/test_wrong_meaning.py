@@ -1,0 +1,189 @@
+"""Files with right checksums and wrong meaning: all messages arrive, or an error says otherwise.
+
+`walk`, an independent walk over the bytes, is the oracle. Outputs are read by it and by mcap's own
+readers, with their indexes and without.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from dmrl import open as open_recording
+from dmrl import writer
+from dmrl.errors import DmrlError
+from dmrl.recording import read_raw, recover
+from dmrl.recording import trim as trim_range
+from dmrl.stages import check, info, merge, trim
+from dmrl.stages.recover import describe_losses
+
+from .test_conformance import official
+from .walk import Content, walk
+from .wrong_meaning import FAULTS, draw
+
+MAX_NS = 2**63 - 1
+SAMPLE, MANY = 100, 10_000
+
+
+def readable(path: Path) -> Content:
+    """What the bytes of a file have, without messages that lack a channel."""
+    found = walk(path)
+    found.set_aside_nameless()
+    return found
+
+
+def same_everywhere(out: Path, want: dict[str, list]) -> None:
+    """A copy has what it must have, whoever reads it."""
+    assert walk(out).comparable() == official(out).comparable() == want
+    with out.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        got = [(c.topic, m.log_time, m.sequence, m.data) for _, c, m in reader.iter_messages()]
+    assert sorted(got) == sorted((m[0][0], m[1], m[3], m[4]) for m in want["messages"])
+
+
+def told(read: Callable[[], Any]) -> Any:
+    """What a command returns; None if it says that it cannot."""
+    try:
+        return read()
+    except DmrlError as e:
+        assert "\n" not in str(e)
+        return None
+
+
+def between(content: Content, low: int, high: int) -> dict[str, list]:
+    """Everything, but of the messages those of a time range."""
+    want = content.comparable()
+    return want | {"messages": [m for m in want["messages"] if low <= m[1] < high]}
+
+
+def copies(path: Path, empty: Path, out: Path, content: Content) -> None:
+    """Each copy is complete, or an error."""
+    want = content.comparable()
+    times = sorted({m[1] for m in want["messages"] if m[1] < MAX_NS})
+    ranges = [(times[len(times) // 3], times[-1] + 1), (times[0], times[-1])] if times else []
+    tried: list[tuple[Callable[[], Any], dict[str, list]]] = [
+        (lambda: trim.run(path, out, trim.Settings()), want),
+        (lambda: merge.run([path, empty], out), want),
+    ]
+    for low, high in ranges:
+        tried.append(
+            (
+                lambda low=low, high=high: trim_range(path, out, start_ns=low, end_ns=high),
+                between(content, low, high),
+            )
+        )
+    for copy, expected in tried:
+        if told(copy) is None:
+            assert not out.exists()
+            continue
+        assert not content.unreadable
+        found = walk(out).comparable()
+        if expected is not want:  # channels without messages in the range are left out
+            expected = expected | {k: found[k] for k in ("channels", "schemas")}
+        same_everywhere(out, expected)
+        out.unlink()
+
+
+def reads(path: Path, content: Content) -> None:
+    """What is counted and read is complete, or an error."""
+    want = content.comparable()["messages"]
+    counts = Counter(channel[0] for channel, *_ in want)
+    if (overview := told(lambda: info.run(path).to_document())) is not None:
+        topics = {topic: one["count"] for topic, one in overview["topics"].items()}
+        assert topics == {c[0]: counts[c[0]] for c in content.comparable()["channels"]}
+        assert overview["start_ns"] == min((m[1] for m in want), default=0)
+        assert not content.unreadable
+    if (checked := told(lambda: check.run(path))) is not None and not any(
+        finding.level == "error" for finding in checked.findings
+    ):
+        assert checked.messages == len(want)
+        assert not content.unreadable
+    held = told(lambda: open_recording(path))
+    assert held is None or held._summary.count == len(want)
+    for topic in counts:
+        rows = sorted((m[1], m[2], m[4]) for m in want if m[0][0] == topic)
+        for low, high in ((None, None), (rows[0][0], rows[-1][0])):
+            found = told(
+                lambda topic=topic, low=low, high=high: [
+                    (raw.time_ns, raw.publish_ns, raw.data)
+                    for raw in read_raw(path, topic, start_ns=low, end_ns=high)
+                ]
+            )
+            if found is not None:
+                inside = [r for r in rows if low is None or low <= r[0] < high]
+                assert sorted(found) == inside
+
+
+def recovers(path: Path, out: Path, content: Content) -> None:
+    """Every readable message is brought back, and what was lost is told."""
+    want = content.comparable()
+    report = told(lambda: recover(path, out))
+    if report is None:
+        assert not want["messages"]
+        return
+    timed = [m for m in want["messages"] if m[1] < MAX_NS and m[2] <= MAX_NS]
+    found = walk(out).comparable()
+    if "a channel is defined otherwise" not in content.unreadable:
+        lost = Counter(map(repr, timed)) - Counter(map(repr, found["messages"]))
+        assert lost.total() <= report.nameless  # defined behind them, in the summary alone
+        assert len(found["messages"]) == len(timed) - lost.total()
+    assert len(found["messages"]) == report.messages
+    if report.whole:
+        assert not content.unreadable and len(timed) == len(want["messages"])
+        same_everywhere(out, want)
+    else:
+        assert describe_losses(report)
+    out.unlink()
+
+
+def judge(seed: int, path: Path, out: Path, empty: Path) -> tuple[str, ...]:
+    """Make a file and send it through every command; return its faults."""
+    data, faults = draw(Random(seed))
+    path.unlink(missing_ok=True)
+    out.unlink(missing_ok=True)
+    path.write_bytes(data)
+    content = readable(path)
+    if not faults:
+        assert official(path).comparable() == content.comparable()
+    reads(path, content)
+    copies(path, empty, out, content)
+    recovers(path, out, content)
+    return faults
+
+
+@pytest.fixture
+def places(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """A file, an output, and an empty recording to merge with."""
+    empty = tmp_path / "empty.mcap"
+    with writer(empty):
+        pass
+    return tmp_path / "in.mcap", tmp_path / "out.mcap", empty
+
+
+@pytest.mark.parametrize("part", range(5))
+def test_a_hundred_wrong_files_lose_nothing_in_silence(
+    places: tuple[Path, Path, Path], part: int
+) -> None:
+    for seed in range(part, SAMPLE, 5):
+        judge(seed, *places)
+
+
+@pytest.mark.slow
+def test_ten_thousand_wrong_files_lose_nothing_in_silence(
+    places: tuple[Path, Path, Path],
+) -> None:
+    seen: Counter[str] = Counter()
+
+    @settings(max_examples=MANY, derandomize=True, database=None)
+    @given(st.integers(SAMPLE, 2**31))
+    def every(seed: int) -> None:
+        seen.update(judge(seed, *places) or ("none",))
+
+    every()
+    assert seen.keys() == {*FAULTS, "padded", "none"}
