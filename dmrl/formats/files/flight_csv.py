@@ -25,7 +25,7 @@ import numpy as np
 from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats.base import Content, Format, Options
-from dmrl.formats.clocks import Ints, settle_times
+from dmrl.formats.clocks import Ints
 from dmrl.formats.files import image_folder
 from dmrl.formats.files.labelled_pictures import is_picture
 from dmrl.formats.files.pictures import PICTURE_OPTIONS
@@ -136,20 +136,18 @@ def read_log(path: Path) -> CsvLog:
     text = read_table(path, REQUIRED_COLUMNS)
     if missing := [name for name in REQUIRED_COLUMNS if name not in text.columns]:
         raise SourceError(f"{path} has no column {', '.join(missing)}. Add it, in SI units")
-    told_ns, rows = text.parse_times(TIME_COLUMN, 1e9)
-    if len(rows) < len(text.lines):
-        text = text.select(rows)
+    text, time_ns = text.order_by_time(TIME_COLUMN, 1e9)
     columns = {name: text.parse_numbers(name, used=name != TIME_COLUMN) for name in text.columns}
-    found = settle_times(told_ns, text.name_row)
-    held = {name: x[found.rows] for name, x in columns.items() if x is not None}
-    known = np.isfinite([held[n] if n in held else told_ns * np.nan for n in LOG_COLUMNS])
+    held = {name: x for name, x in columns.items() if x is not None}
+    known = np.isfinite([held[n] if n in held else time_ns * np.nan for n in LOG_COLUMNS])
     good = known.all(axis=0)
     if lost := int((~good).sum()):
-        row, name = int(found.rows[~good][0]), LOG_COLUMNS[int(np.argmin(known[:, ~good][:, 0]))]
+        row = int(np.argmin(good))
+        name = LOG_COLUMNS[int(np.argmin(known[:, row]))]
         leave_out(f"rows without a number for {name} or another", text.name_row(row), lost)
     if good.sum() < 2:
         raise SourceError(f"{path} has fewer than two rows. Add rows, or remove it")
-    log = CsvLog(path, found.time_ns[good], {name: x[good] for name, x in held.items()})
+    log = CsvLog(path, time_ns[good], {name: x[good] for name, x in held.items()})
     _check_log(log)
     return log
 

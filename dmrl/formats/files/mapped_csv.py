@@ -14,7 +14,7 @@ import numpy as np
 from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
-from dmrl.formats.clocks import find_new_values, settle_times
+from dmrl.formats.clocks import find_new_values
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock, TimeSeries
 from dmrl.formats.crazyflie.log_variables import SampleStream
@@ -55,7 +55,6 @@ CRAZYFLIE_VARIABLES = {
     **{name: (f"stateEstimate.{name}", 1.0) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")},
     **{f"true_{n}": (f"locSrv.{n}", 1.0) for n in ("x", "y", "z", "qx", "qy", "qz", "qw")},
 }
-MAX_TILT_RAD = np.pi
 MAX_TURN_RATE_RATIO = 10.0
 """Largest ratio between a gyroscope and the slope of the yaw before their units are doubted."""
 UNIT_NORM_ERROR = 0.1
@@ -107,13 +106,10 @@ def load_content(source: Path, options: Options) -> Content:
 def _iter_streams(log: RobotLog, options: Options) -> Iterator[SampleStream]:
     robot, path = options.names.get(log.robot, log.robot), log.text.path
     time = log.columns["time"]
-    told_ns, rows = log.text.parse_times(time.name, time.scale)
-    text = log.text.select(rows) if len(rows) < len(log.text.lines) else log.text
-    found = settle_times(told_ns, text.name_row)
-    time_ns = found.time_ns
+    text, time_ns = log.text.order_by_time(time.name, time.scale)
     used = {column.name for column in (*log.columns.values(), *log.ranges.values())}
     cells = {
-        name: column[found.rows]
+        name: column
         for name in text.columns
         if (column := text.parse_numbers(name, used=name in used - {time.name})) is not None
     }
@@ -138,7 +134,10 @@ def _to_values(
     if column.value is not None:
         return np.full(count, column.value * column.scale)
     if column.name not in cells:
-        raise SourceError(f"{text.name_row(0)}: {column.name} has no number. Fix the table")
+        cell = text.columns[column.name][0]
+        raise SourceError(
+            f"{text.name_row(0)}: {column.name} is {cell!r}, and no cell of it is a number. Fix it"
+        )
     values = cells[column.name] * column.scale
     infinite = np.flatnonzero(np.isinf(values))
     if len(infinite):
@@ -189,7 +188,7 @@ def _iter_sensor_streams(
     block = LogBlock("columns", time_ns, logged)
     attitude = find_attitude([block])
     if has_yaw:
-        _warn_about_units(path, time_ns, values, attitude)
+        _warn_about_turning_rates(path, time_ns, values, attitude)
     if "vx" in values:
         frame = log.columns["vx"].frame
         if frame == "world":
@@ -271,14 +270,10 @@ def _rotate_to_horizontal(v: Sequence[Array], roll: Array, pitch: Array) -> list
     return [cp * v[0] + sp * up, left, -sp * v[0] + cp * up]
 
 
-def _warn_about_units(
+def _warn_about_turning_rates(
     path: Path, time_ns: Times, values: Mapping[str, Array], attitude: TimeSeries | None
 ) -> None:
-    """Warn about units that cannot be right."""
-    for name in ("roll", "pitch"):
-        most = float(np.nanmax(np.abs(values.get(name, np.zeros(1)))))
-        if most > MAX_TILT_RAD:
-            say(f"{path}: {name} reaches {most:.0f} rad. Is its unit deg?")
+    """Warn about turning rates whose unit cannot be right."""
     gyro = values.get("gyro_z", values.get("yaw_rate"))
     if gyro is None or attitude is None or len(time_ns) < 3:
         return

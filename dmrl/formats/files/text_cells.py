@@ -49,7 +49,7 @@ def parse_time_ns(cell: str, scale: float, has_decimal_commas: bool) -> int | No
         time_ns: int | None = int((number * Decimal(scale)).to_integral_value())
     except (InvalidOperation, ValueError, OverflowError):
         time_ns = _parse_date_ns(text)
-    return time_ns if time_ns is not None and 0 <= time_ns < 1 << 63 else None
+    return time_ns if time_ns is not None and abs(time_ns) < 1 << 63 else None
 
 
 def _parse_date_ns(text: str) -> int | None:

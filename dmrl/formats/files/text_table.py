@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from dmrl.errors import SourceError
-from dmrl.formats.clocks import Ints
+from dmrl.formats.clocks import Ints, settle_times
 from dmrl.formats.files.text_cells import DATE, is_number, parse_cells, parse_time_ns
 from dmrl.geometry.frames import Array
 from dmrl.terminal.left_out import leave_out
@@ -99,27 +99,36 @@ class TextTable:
             leave_out(f"cells of {name!r} that are no number", self.name_row(bad[0]), len(bad))
         return values
 
-    def parse_times(self, name: str, scale: float) -> tuple[Ints, list[int]]:
-        """Parse (N,) times, in whole nanoseconds, and the rows that have one.
+    def order_by_time(self, name: str, scale: float) -> tuple["TextTable", Ints]:
+        """Return the rows that have a time, in its order, and the (N,) times, nanoseconds.
 
         Numbers are times in a unit of ``scale`` nanoseconds; dates and times of the day are ISO
         8601. A float has too few digits for nanoseconds since 1970, so digits are kept exactly.
+
+        Raises
+        ------
+        SourceError
+            If no row has a time from 1970 to 2262, or the clock starts again.
         """
         cells = self.columns[name]
         if any(found and not found[8] for found in map(DATE.fullmatch, map(str.strip, cells[:1]))):
             say(f"{self.path}: times without a zone are read as UTC. Write them with one, as in Z")
-        found = [parse_time_ns(cell, scale, self.has_decimal_commas) for cell in cells]
-        rows = [k for k, time_ns in enumerate(found) if time_ns is not None]
-        lost = sorted(set(range(len(cells))) - set(rows))
-        if not rows:
+        told = [parse_time_ns(cell, scale, self.has_decimal_commas) for cell in cells]
+        rows = [k for k, time_ns in enumerate(told) if time_ns is not None]
+        if len(rows) < len(cells):
+            first = next(k for k, time_ns in enumerate(told) if time_ns is None)
+            leave_out("rows without a time", self.name_row(first), len(cells) - len(rows))
+        found = settle_times([told[k] for k in rows], lambda k: self.name_row(rows[k]))
+        kept = [rows[k] for k in found.rows[found.time_ns >= 0]]
+        if not kept:
             raise SourceError(
                 f"{self.name_row(0)}: {cells[0]!r} in {name} is no time from 1970 to 2262, nor are "
                 "all others. Check the column and its unit"
             )
-        if lost:
-            reason = "rows without a time, or with one before 1970 or after 2262"
-            leave_out(reason, self.name_row(lost[0]), len(lost))
-        return np.array([found[k] for k in rows], np.int64), rows
+        before = len(found.rows) - len(kept)
+        leave_out("rows with times before 0", self.name_row(rows[int(found.rows[0])]), before)
+        same = kept == list(range(len(cells)))
+        return self if same else self.select(kept), found.time_ns[before:]
 
 
 def read_table(

@@ -61,6 +61,13 @@ class MotionSamples:
         """Yield topic and text for each signal that contradicts its robot's poses."""
         of = {topic: _build_signal(parts) for topic, parts in self.parts.items()}
         yield from _find_floor_ranges(of)
+        for topic, (_, values) in of.items():
+            if (
+                topics.parse_topic(topics.RANGE, topic)
+                and len(values) >= SAMPLES_MIN
+                and not np.ptp(values)
+            ):
+                yield topic, f"all ranges are {values[0, 0]:.3g} m. Does the sensor measure?"
         for kind in (topics.VELOCITY, topics.ATTITUDE):
             for topic in sorted(topic for topic in of if topics.parse_topic(kind, topic)):
                 robot = topics.list_robots([topic], kind)[0]

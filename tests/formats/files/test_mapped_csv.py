@@ -100,7 +100,7 @@ def test_velocities_of_other_frames_are_turned(frame: str, table: Path) -> None:
     ("line", "reason", "heights"),
     [
         ("soon;1;2;3;4;5;6;7;8;x", "rows without a time", 3),
-        ("-5;1;2;3;4;5;6;7;8;x", "rows without a time, or with one before 1970", 3),
+        ("-5;1;2;3;4;5;6;7;8;x", "rows with times before 0", 3),
         ("1020;much;2;3;4;5;6;7;8;x", "cells of 'phi' that are no number", 4),
         ("1020;1;2;3", "lines with fewer or more cells than the header", 3),
         ("1020;inf;2;3;4;5;6;7;8;x", "infinite values of roll", 4),
@@ -148,10 +148,6 @@ def test_ranges_that_cannot_be_are_counted_and_empty_cells_are_none(
 
 
 def test_units_that_cannot_be_are_doubted(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    table.write_text(TABLE.replace('unit = "deg"', 'unit = "rad"'))
-    samples(table.with_name("log.csv"), Options(columns=table))
-    err = capsys.readouterr().err
-    assert "roll reaches 10 rad. Is its unit deg?" in err
     log = table.with_name("log.csv")
     rows = [f"{1000 + 10 * k};0;0;{0.02 * k};114.6;0;0;0;0;x" for k in range(50)]  # 2 rad/s
     log.write_text("\n".join([HEADER, *rows]) + "\n")
@@ -228,15 +224,6 @@ def test_turning_rates_ten_times_off_are_doubted(
     assert said in err and bool(said) == ("turning rates" in err)
     turning(table, np.degrees(told), slope, 2)
     assert "turning rates" not in capsys.readouterr().err
-
-
-def test_a_tilt_of_half_a_turn_may_be(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    table.write_text(TABLE.replace('name = "theta"\nunit = "deg"', 'name = "theta"\nunit = "rad"'))
-    for tilt, said in ((3.14, False), (3.15, True)):
-        rows = [f"{1000 + 10 * k};0;{-tilt};0;0;0;0;0;0;x" for k in range(3)]
-        table.with_name("log.csv").write_text("\n".join([HEADER, *rows]) + "\n")
-        samples(table.with_name("log.csv"), Options(columns=table))
-        assert ("pitch reaches 3 rad" in capsys.readouterr().err) == said
 
 
 def test_lines_out_of_order_are_sorted_and_the_last_may_be_cut(

@@ -82,12 +82,12 @@ def test_every_form_gives_the_same_rows(form: str, encoding: str, tmp_path: Path
     path.write_bytes(TEXTS[form]().encode(encoding))
     with count_left_out() as left_out:
         table = read_table(path, WANTED)
-        time_ns, rows = table.parse_times("t", 1e9)
+        ordered, time_ns = table.order_by_time("t", 1e9)
         found = np.column_stack([table.parse_numbers(name) for name in WANTED])
     assert left_out.counts == {}
     np.testing.assert_array_equal(found, VALUES)
     assert time_ns.tolist() == np.rint(TIME_S * 1e9).astype(int).tolist()
-    assert rows == list(range(200))
+    assert ordered is table
 
 
 @pytest.mark.parametrize(
@@ -140,11 +140,11 @@ def test_what_cannot_be_used_is_counted_with_its_line(tmp_path: Path) -> None:
     with count_left_out() as left_out:
         table = read_table(tmp_path / "a.csv", WANTED)
         table.parse_numbers("d2")
-        table.parse_times("t", 1e9)
+        table.order_by_time("t", 1e9)
     assert dict(left_out.counts) == {
         "lines with fewer or more cells than the header": 1,
         "cells of 'd2' that are no number": 1,
-        "rows without a time, or with one before 1970 or after 2262": 1,
+        "rows without a time": 1,
     }
     assert list(left_out.first.values()) == [f"{tmp_path / 'a.csv'}:{n}" for n in (11, 13, 15)]
 
@@ -163,7 +163,7 @@ def test_what_cannot_be_used_is_counted_with_its_line(tmp_path: Path) -> None:
 def test_dates_are_times(cells: list[str], times_s: tuple[float, float], tmp_path: Path) -> None:
     quoted = "\n".join(f'"{cell}",1' for cell in cells)
     (tmp_path / "a.csv").write_text(f"t,d2\n{quoted}\n")
-    time_ns, _ = read_table(tmp_path / "a.csv", ["t", "d2"]).parse_times("t", 1e9)
+    _, time_ns = read_table(tmp_path / "a.csv", ["t", "d2"]).order_by_time("t", 1e9)
     assert time_ns[0] * 1e-9 == pytest.approx(times_s[0], abs=0.2)
     assert (time_ns[1] - time_ns[0]) * 1e-9 == pytest.approx(times_s[1], abs=1e-9)
 
@@ -224,6 +224,29 @@ def test_two_flights_in_one_file_are_refused_with_the_line(tmp_path: Path) -> No
     (tmp_path / "log.csv").write_text("\n".join(["# a", "t,roll,pitch,r,d2", *flight, *flight]))
     with pytest.raises(SourceError, match=r"log\.csv:303: time goes back from 5\.98 s to 0 s"):
         samples(tmp_path)
+
+
+@pytest.mark.parametrize("bits", [16, 32])
+def test_signed_counters_wrap_to_negative_numbers(bits: int, tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text(TABLE.replace('unit = "s"', 'unit = "ms"', 1))
+    half = 1 << (bits - 1)
+    times_ms = half - 1000 + np.arange(200) * 20
+    wrapped = (times_ms + half) % (2 * half) - half
+    rows = [f"{t},0,0,0,{2 + 0.01 * k:.2f}" for k, t in enumerate(wrapped)]
+    (tmp_path / "log.csv").write_text("\n".join(["t,roll,pitch,r,d2", *rows]))
+    found = samples(tmp_path)["/cf1/range/cf2"]
+    assert [s.time_ns for s in found] == (times_ms * 1_000_000).tolist()
+
+
+def test_rows_before_time_0_are_left_out(tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text(TABLE)
+    rows = [f"{0.02 * k - 1:.2f},0,0,0,{2 + 0.01 * k:.2f}" for k in range(200)]
+    (tmp_path / "log.csv").write_text("\n".join(["t,roll,pitch,r,d2", *rows]))
+    with count_left_out() as left_out:
+        found = samples(tmp_path)["/cf1/range/cf2"]
+    assert [s.time_ns for s in found] == [20_000_000 * k for k in range(150)]
+    assert left_out.counts == {"rows with times before 0": 50}
+    assert left_out.first["rows with times before 0"].endswith("log.csv:2")
 
 
 @pytest.mark.parametrize(("held", "count", "counted"), [("", 20, 180), ("true", 20, 0)])

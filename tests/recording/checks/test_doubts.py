@@ -46,6 +46,11 @@ def test_a_range_that_is_the_height_is_doubted(beside_m: float, tmp_path: Path) 
     assert "/cf1/range/cf2 100% of the ranges are the robot's own height" in found
 
 
+def test_a_range_that_never_changes_is_doubted(tmp_path: Path) -> None:
+    (found,) = texts(sensors(tmp_path, apart=np.full(400, 2.0)))
+    assert found == "/cf1/range/cf2 all ranges are 2 m. Does the sensor measure?"
+
+
 def test_ranges_near_the_height_for_a_while_are_ranges(tmp_path: Path) -> None:
     apart = np.where(TIME_S < 6, MOVING_M, MOVING_M + TIME_S)
     assert texts(sensors(tmp_path, apart=apart)) == []
