@@ -6,7 +6,7 @@ All others are left out, with a line that names them.
 """
 
 import base64
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -29,7 +29,7 @@ from dmrl.formats.ros.ros_messages import CONVERTERS, MessageContext, is_camera_
 from dmrl.formats.ros.topic_plan import TopicPlan, plan_topics
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.messages import LOG_PACKAGE, LogType
-from dmrl.recording import RawMessage, Summary, read_raw, read_splits, read_summary
+from dmrl.recording import Channel, RawMessage, Summary, read_raw, read_splits, read_summary
 from dmrl.recording.protobuf.message_types import find_channel_descriptor
 from dmrl.recording.writer import RECIPE_NAME
 from dmrl.samples.sample import Sample
@@ -55,7 +55,19 @@ def can_read(source: Path) -> bool:
     return source.is_file() and source.suffix == ".mcap" and not bag.can_read(source)
 
 
-def load_content(source: Path, options: Options) -> Content:
+def is_bag(source: Path) -> bool:
+    """Return whether a source holds messages of ROS."""
+    return bag.can_read(source) or any(
+        channel.encoding in ("cdr", "ros1")
+        for channel in (_list_channels(source) if can_read(source) else ())
+    )
+
+
+def _list_channels(source: Path) -> list[Channel]:
+    return list(read_summary(source).definitions.channels.values())
+
+
+def load_content(source: Path, options: Options, *, skip: Collection[str] = ()) -> Content:
     """Load the samples of a recording.
 
     Parameters
@@ -65,6 +77,8 @@ def load_content(source: Path, options: Options) -> Content:
     options
         ``names`` renames robots, names the robot of a topic, or gives a topic of dmrl's for one;
         ``robot`` is that of topics that name none.
+    skip
+        Topics that are read otherwise.
 
     Raises
     ------
@@ -73,17 +87,17 @@ def load_content(source: Path, options: Options) -> Content:
     SettingError
         If a name fits no topic.
     """
-    summary = read_summary(source)
-    channels = {channel.topic: channel for channel in summary.definitions.channels.values()}
-    if any(channel.encoding in ("cdr", "ros1") for channel in channels.values()):
+    if is_bag(source):
         return bag.load_content(source, options)
-    if summary.provenance is not None and not options.names:
+    summary = read_summary(source)
+    encodings = {channel.topic: channel.encoding for channel in _list_channels(source)}
+    if summary.provenance is not None and not (options.names or skip):
         raise SourceError(f"{source} is a recording already. Pass --to: csv, parquet, ros2")
-    own = dict(_iter_own(summary, options))
+    own = {old: new for old, new in _iter_own(summary, options) if old not in skip}
     held = []
     for topic, info in summary.topics.items():
-        kind = ROS_TYPES.get(info.schema, f"{info.schema or 'data'} in {channels[topic].encoding}")
-        held += [(topic, kind, info.count)] if topic not in own else []
+        kind = ROS_TYPES.get(info.schema, f"{info.schema or 'data'} in {encodings[topic]}")
+        held += [(topic, kind, info.count)] if topic not in {*own, *skip} else []
 
     def is_camera(topic: str, _kind: str) -> bool:
         found = [_decode(raw, source) for raw in islice(read_raw(source, topic), 1)]
@@ -94,7 +108,7 @@ def load_content(source: Path, options: Options) -> Content:
         if (topic, kind) in why:
             leave_out(f"messages on {topic}: {why[topic, kind]}", source, count)
     lines = {line.topic: line for line in plan.values()}
-    if not (lines or own):
+    if not (lines or own or skip):
         raise SourceError(f"{source} has no topic of a known type. See docs/sources.md")
     foreign = [one for one in summary.attachments if one.name != RECIPE_NAME]
     leave_out("attachments", source, len(foreign))
@@ -127,7 +141,7 @@ def _iter_samples(
     clock = MessageClock.from_stamps(source, stamps)
     for raw in _read(source, [*own, *lines]):
         if raw.topic in own:
-            message = _parse(raw, source)
+            message = parse(raw, source)
             fields = _to_fields(message, options.names)
             yield Sample(raw.time_ns, own[raw.topic], _to_type(message), fields, raw.publish_ns)
             continue
@@ -153,7 +167,7 @@ def _read(source: Path, wanted: Iterable[str]) -> Iterator[RawMessage]:
     return read_raw(source, *names) if names else iter(())
 
 
-def _parse(raw: RawMessage, source: Path) -> Any:
+def parse(raw: RawMessage, source: Path) -> Any:
     """Return a protobuf message, the value of a JSON one, or None for what is neither."""
     try:
         if raw.channel.encoding == "json":
@@ -165,7 +179,7 @@ def _parse(raw: RawMessage, source: Path) -> Any:
 
 def _decode(raw: RawMessage, source: Path) -> Any:
     """Return a message of Foxglove's as an object with the fields of ROS's; None: it is none."""
-    message = _parse(raw, source)
+    message = parse(raw, source)
     if isinstance(message, dict) and isinstance(message.get("data"), str):
         try:
             message["data"] = base64.b64decode(message["data"], validate=True)

@@ -10,7 +10,7 @@ from dmrl.errors import SettingError, SourceError
 from dmrl.formats.base import Content, Format, Options
 from dmrl.formats.registry import find_format
 from dmrl.guards.paths import refuse_pipes
-from dmrl.ingest import foreign_recording
+from dmrl.ingest import foreign_recording, mapped_topics
 from dmrl.messages import message_class
 from dmrl.recording import (
     LICENCES_METADATA,
@@ -79,7 +79,9 @@ def record_source(
 
 def _find_format(source: Path, kind: str | None) -> Format:
     """Return the format of a source; raise as `find_format`."""
-    adopted = foreign_recording.FORMAT
+    mapped, adopted = mapped_topics.FORMAT, foreign_recording.FORMAT
+    if kind == "columns" and source.exists() and mapped.recognises(source):
+        return mapped
     if kind == adopted.name or (kind is None and adopted.recognises(source)):
         return adopted
     return find_format(source, kind)

@@ -67,8 +67,8 @@ class Settings:
     height_px
         images: crop to the middle and scale to this height. Needs the width too.
     columns
-        TOML file that describes the columns of a CSV file, with their units, frames and signs, or
-        nanobench.
+        TOML file that describes the columns of a CSV file, or fields of topics of a bag or an MCAP
+        file, with their units, frames and signs, or nanobench.
     raw
         images: grey pictures are as the AI-deck's colour sensor gave them; make them RGB.
     bits

@@ -22,7 +22,8 @@
 
 One table serves several robots: ``{robot}`` in a name stands for the robot, and ``{peer}`` in the
 name of ``[range."*"]`` for every peer. ``[robot] name`` is the column with the robot of each row.
-``[file]`` states the form of the file; see `dmrl.formats.files.text_table.Dialect`.
+``[file]`` states the form of the file; see `dmrl.formats.files.text_table.Dialect`. ``[names]``
+renames robots, as ``--names`` does.
 ``QUANTITIES`` lists the supported quantities.
 """
 
@@ -100,12 +101,13 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class ColumnMap:
-    """Columns by quantity, columns of ranges by peer, column of the robot, form of the file."""
+    """Columns by quantity and of ranges by peer, column of the robot, form of the file, renames."""
 
     columns: Mapping[str, Column]
     ranges: Mapping[str, Column]
     robot_column: str = ""
     dialect: Dialect = field(default_factory=Dialect)
+    renames: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def names(self) -> set[str]:
@@ -114,8 +116,15 @@ class ColumnMap:
         return (used | {self.robot_column}) - {""}
 
 
-def read_column_map(path: Path) -> ColumnMap:
+def read_column_map(path: Path, *, time_column: str = "") -> ColumnMap:
     """Read the column map from a TOML file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    time_column
+        Column of nanoseconds that is the time if the file states none; empty: it must.
 
     Raises
     ------
@@ -126,17 +135,21 @@ def read_column_map(path: Path) -> ColumnMap:
         values = parse_toml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as e:
         raise SourceError(f"{path} is no table of columns in TOML: {e}. Fix it") from None
-    robot, form = (values.pop(key, {}) for key in ("robot", "file"))
+    robot, form, renames = (values.pop(key, {}) for key in ("robot", "file", "names"))
+    if time_column:
+        values.setdefault("time", {"name": time_column, "unit": "ns"})
     ranges = values.pop("range", {})
     ranges = ranges if isinstance(ranges, dict) else {"": ranges}
     faults = [fault for key, table in values.items() for fault in _iter_errors(key, table)]
     faults += [f for peer, table in ranges.items() for f in _iter_errors(f"range.{peer}", table)]
     faults += [*_iter_missing(values), *_iter_form_errors(robot, form)]
+    if not isinstance(renames, dict) or not all(isinstance(new, str) for new in renames.values()):
+        faults.append("[names]: not new names by old ones")
     if faults:
         raise SourceError(f"{path}: {'; '.join(faults)}. See docs/sources.md")
     columns = {key: _build_column(QUANTITIES[key], table) for key, table in values.items()}
     held = {peer: _build_column(LENGTH_UNITS, table) for peer, table in ranges.items()}
-    return ColumnMap(columns, held, robot.get("name", ""), Dialect(**form))
+    return ColumnMap(columns, held, robot.get("name", ""), Dialect(**form), renames)
 
 
 def _iter_form_errors(robot: Any, form: Any) -> Iterator[str]:

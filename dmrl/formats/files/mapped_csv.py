@@ -7,6 +7,7 @@ folder has one file per robot, named after it. Every column is kept unchanged, o
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -100,10 +101,14 @@ def load_content(source: Path, options: Options) -> Content:
     logs = read_robot_logs(files, table)
     if source.is_dir() or [log.robot for log in logs] != [options.robot]:
         options.refuse("robot", f"has no effect: {source} names its robots. Use --names")
-    return build_content(s for log in logs for s in _iter_streams(log, options))
+    options = replace(options, names={**table.renames, **options.names})
+    return build_content(s for log in logs for s in iter_robot_streams(log, options))
 
 
-def _iter_streams(log: RobotLog, options: Options) -> Iterator[SampleStream]:
+def iter_robot_streams(
+    log: RobotLog, options: Options, *, raw: bool = True
+) -> Iterator[SampleStream]:
+    """Yield the streams of a robot; ``raw``: also every column of numbers as it is."""
     robot, path = options.names.get(log.robot, log.robot), log.text.path
     time = log.columns["time"]
     text, time_ns = log.text.order_by_time(time.name, time.scale)
@@ -113,7 +118,8 @@ def _iter_streams(log: RobotLog, options: Options) -> Iterator[SampleStream]:
         for name in text.columns
         if (column := text.parse_numbers(name, used=name in used - {time.name})) is not None
     }
-    yield log_variables.build_raw_stream(robot, LogBlock("columns", time_ns, cells))
+    if raw:
+        yield log_variables.build_raw_stream(robot, LogBlock("columns", time_ns, cells))
     values = {
         key: _to_values(key, one, cells, text, len(time_ns))
         for key, one in log.columns.items()

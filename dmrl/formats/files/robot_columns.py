@@ -77,6 +77,19 @@ def _iter_robots(name: str, path: Path, table: ColumnMap) -> Iterator[RobotLog]:
         yield _resolve(robot, text, table)
 
 
+def resolve_robots(name: str, text: TextTable, table: ColumnMap) -> list[RobotLog]:
+    """Return the columns of each robot; ``name`` is the robot if the columns tell none.
+
+    Raises
+    ------
+    SourceError
+        If no robot has a column of the table.
+    """
+    logs = [_resolve(robot, text, table) for robot in _find_robots(text, table) or [name]]
+    _check_missing(logs)
+    return logs
+
+
 def _find_robots(text: TextTable, table: ColumnMap) -> list[str]:
     """Return the robots that the names of columns tell: those that most columns are of."""
     counts: dict[str, int] = {}

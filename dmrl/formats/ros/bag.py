@@ -14,7 +14,7 @@ replaces it, and a line reports this. That time is the publish time of every mes
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
 from math import isfinite
@@ -56,7 +56,7 @@ def can_read(source: Path) -> bool:
     return head.startswith((b"SQLite format 3", b"#ROSBAG V2"))
 
 
-def load_content(source: Path, options: Options) -> Content:
+def load_content(source: Path, options: Options, *, skip: Collection[str] = ()) -> Content:
     """Load the samples of a bag, in the bag's order.
 
     Parameters
@@ -66,6 +66,8 @@ def load_content(source: Path, options: Options) -> Content:
     options
         ``names`` renames robots; others keep the names in their topics. ``robot`` is the robot of
         topics that name none.
+    skip
+        Topics that are read otherwise.
 
     Raises
     ------
@@ -74,14 +76,14 @@ def load_content(source: Path, options: Options) -> Content:
     MissingExtra
         If rosbags is not installed.
     """
-    held = list_topics(source)
+    held = [one for one in list_topics(source) if one[0] not in skip]
 
     def is_camera(topic: str, kind: str) -> bool:
         first = next(iter_messages(source, [(topic, kind)], ahead=True), None)
         return first is not None and is_camera_image(first.decoded)
 
     lines, why = plan_topics(held, options, is_camera)
-    if not lines:
+    if not (lines or skip):
         known = ", ".join(sorted({*CONVERTERS}))
         raise SourceError(f"{source} has no topic of a known type: {known}. Pass another bag")
     for topic, kind, count in held:
@@ -100,7 +102,7 @@ def _iter_samples(
     scaled: set[str] = set()
     moving = {line.robot for line in lines.values() if line.kind == ODOMETRY}
     with closing(iter_messages(source, lines, ahead=True)) as first:
-        stamps = ((m.topic, _header_time_ns(m.decoded), m.bag_ns) for m in first)
+        stamps = ((m.topic, header_time_ns(m.decoded), m.bag_ns) for m in first)
         clock = MessageClock.from_stamps(source, stamps)
     for message in iter_messages(source, lines):
         line, bag_ns = lines[message.topic, message.kind], message.bag_ns
@@ -109,7 +111,7 @@ def _iter_samples(
             source, line.robot, line.peer, line.captured, odometry, options.bits, scaled
         )
         # Without a time in the header, the bag's own time is the best estimate.
-        stamp_ns = _header_time_ns(message.decoded)
+        stamp_ns = header_time_ns(message.decoded)
         unstamped[line.topic] += clock.is_unset(line.topic, stamp_ns) and bag_ns > 0
         if (time_ns := clock.find_time_ns(line.topic, stamp_ns, bag_ns)) is None:
             continue
@@ -127,7 +129,7 @@ def _report_unstamped(source: Path, unstamped: Mapping[str, int]) -> None:
         say(f"{source}: messages with a stamp of 0 get the bag's times: {', '.join(zeros)}")
 
 
-def _header_time_ns(message: Any) -> int | None:
+def header_time_ns(message: Any) -> int | None:
     """Return the time in the header; 0: it is empty, None: there is no header."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     if stamp is None:

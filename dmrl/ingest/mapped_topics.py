@@ -1,0 +1,166 @@
+"""Topics of any messages, by a table that says what their fields mean (`column_map`).
+
+The name of a column is ``TOPIC:FIELD``, such as ``/{robot}/state:pose.position.z`` or
+``/uwb:distances.0``. The time may be ``:FIELD``, a field of every topic's messages; without
+``[time]``, times are the log times, or those in ROS headers. Topics that the table does not name
+are converted as without it. Messages are protobuf, JSON or ROS's.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmrl.errors import SourceError
+from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
+from dmrl.formats.files.column_map import Column, read_column_map
+from dmrl.formats.files.mapped_csv import iter_robot_streams
+from dmrl.formats.files.robot_columns import RobotLog, resolve_robots
+from dmrl.formats.files.text_table import TextTable
+from dmrl.formats.ros import bag
+from dmrl.formats.ros.reader import iter_messages, list_topics
+from dmrl.ingest import foreign_recording
+from dmrl.recording import read_raw, read_summary
+from dmrl.terminal.left_out import leave_out
+
+LOG_TIME = ":log_time"
+Cells = dict[str, dict[str, list[str]]]
+"""Cells by topic and column, as in a text file."""
+
+
+def can_read(source: Path) -> bool:
+    """Return whether a source has topics: an MCAP file or a ROS bag."""
+    return bag.can_read(source) or foreign_recording.can_read(source)
+
+
+def load_content(source: Path, options: Options) -> Content:
+    """Load the samples of the topics of a table, and of all topics that it does not name.
+
+    Parameters
+    ----------
+    source
+        A recording or a bag.
+    options
+        ``columns``, the table; ``robot`` of topics that name none; ``names`` of robots.
+
+    Raises
+    ------
+    SourceError
+        If the table is wrong, or names a topic or a field that the source lacks.
+    """
+    table = read_column_map(Path(options.columns or ""), time_column=LOG_TIME)
+    options = replace(options, names={**table.renames, **options.names}, columns=None)
+    is_bag = foreign_recording.is_bag(source)
+    kinds = {topic: kind for topic, kind, count in _list_topics(source, is_bag=is_bag) if count}
+    fields = {name.rpartition(":")[2] for name in table.names}
+    names: dict[str, list[str]] = {f"{t}:{f}": [] for t in ("", *kinds) for f in fields}
+    logs = resolve_robots(options.robot, TextTable(source, names, []), table)
+    used = {name.rpartition(":")[0] for log in logs for name in _list_names(log)} - {""}
+    wanted = {
+        topic: {n for log in logs for n in _list_names(log) if n.rpartition(":")[0] in ("", topic)}
+        for topic in used
+    }
+    cells = _read_cells(source, wanted, kinds, is_bag=is_bag)
+    streams: list[Iterable[Any]] = []
+    for log in logs:
+        for topic, columns in cells.items():
+            if (part := _select_topic(log, topic, columns)) is not None:
+                streams += iter_robot_streams(part, options, raw=False)
+    if kinds.keys() - used:
+        load = bag.load_content if is_bag else foreign_recording.load_content
+        streams.append(load(source, options, skip=used).samples)
+    return build_content(streams)
+
+
+def _list_topics(source: Path, *, is_bag: bool) -> list[tuple[str, str, int]]:
+    if is_bag:
+        return list_topics(source)
+    return [(t, info.schema, info.count) for t, info in read_summary(source).topics.items()]
+
+
+def _list_names(log: RobotLog) -> Iterator[str]:
+    yield from (column.name for column in (*log.columns.values(), *log.ranges.values()))
+
+
+def _read_cells(
+    source: Path, columns: Mapping[str, set[str]], kinds: Mapping[str, str], *, is_bag: bool
+) -> Cells:
+    """Read the fields of messages, by topic and column.
+
+    Raises
+    ------
+    SourceError
+        If no message of a topic has a number in a field.
+    """
+    cells: Cells = {topic: {name: [] for name in names} for topic, names in columns.items()}
+    for topic, time_ns, message in _iter_objects(source, columns, kinds, is_bag=is_bag):
+        for name, column in cells[topic].items():
+            path = name.rpartition(":")[2].split(".")
+            column.append(str(time_ns) if name == LOG_TIME else _find_number(message, path))
+    for topic, held in cells.items():
+        for name, column in held.items():
+            if not any(column):
+                raise SourceError(f"{source}: no message on {topic} has a number in {name}")
+    return cells
+
+
+def _iter_objects(
+    source: Path, topics: Iterable[str], kinds: Mapping[str, str], *, is_bag: bool
+) -> Iterator[tuple[str, int, Any]]:
+    """Yield topic, time and decoded message; messages that cannot be decoded are left out."""
+    if is_bag:
+        for message in iter_messages(source, {(topic, kinds[topic]) for topic in topics}):
+            stamp_ns = bag.header_time_ns(message.decoded)
+            yield message.topic, message.bag_ns if stamp_ns is None else stamp_ns, message.decoded
+        return
+    for raw in read_raw(source, *topics):
+        if (found := foreign_recording.parse(raw, source)) is None:
+            leave_out(f"messages on {raw.topic} that cannot be decoded", source)
+        else:
+            yield raw.topic, raw.time_ns, found
+
+
+def _find_number(value: Any, path: Sequence[str]) -> str:
+    """Return the number in a field, in an item of a list, or in a part of it; empty: there is none.
+
+    A time of ROS or protobuf is a number of nanoseconds.
+    """
+    for part in path:
+        if isinstance(value, Mapping):
+            value = value.get(part)
+        elif part.isdigit() and hasattr(value, "__getitem__"):
+            value = value[int(part)] if int(part) < len(value) else None
+        else:
+            value = getattr(value, part, None)
+    seconds, nanos = (
+        next((getattr(value, name) for name in names if hasattr(value, name)), None)
+        for names in (("seconds", "sec"), ("nanos", "nanosec"))
+    )
+    if seconds is not None and nanos is not None:
+        value = seconds * 1_000_000_000 + nanos
+    return str(value) if isinstance(value, int | float | np.number) else ""
+
+
+def _select_topic(log: RobotLog, topic: str, cells: Mapping[str, list[str]]) -> RobotLog | None:
+    """Return the part of a robot's log that one topic has; None if it has nothing of it."""
+
+    def select(columns: Mapping[str, Column]) -> dict[str, Column]:
+        return {key: c for key, c in columns.items() if c.name.rpartition(":")[0] == topic}
+
+    columns, ranges = select(log.columns), select(log.ranges)
+    if not (columns or ranges):
+        return None
+    lines = list(range(len(next(iter(cells.values())))))
+    text = replace(log.text, path=f"{log.text.path}: {topic}", columns=dict(cells), lines=lines)
+    return RobotLog(log.robot, text, {"time": log.columns["time"]} | columns, ranges, frozenset())
+
+
+FORMAT = Format(
+    "topics",
+    "topics and a table of their fields",
+    can_read,
+    load_content,
+    SOURCE_OPTIONS | {"bits", "columns"},
+)
