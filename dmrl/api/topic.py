@@ -42,8 +42,9 @@ def to_data_frame(table: pa.Table, start_ns: int, *, foreign: bool = False) -> "
     """
     if find_spec("pandas") is None:
         raise MissingExtra("pandas", "table", "a data frame")
-    names = {"time_s": "time_s_"} if "time_s_" not in table.column_names else {}
-    frame: pd.DataFrame = table.to_pandas().rename(columns=names)
+    frame: pd.DataFrame = table.to_pandas()
+    if "time_s_" not in frame.columns:
+        frame = frame.rename(columns={"time_s": "time_s_"})
     if "status" in frame.columns and not foreign:
         known = frame["status"].notna()  # of an image without peers it is not
         names = [to_status_name(int(number)) for number in frame["status"][known]]

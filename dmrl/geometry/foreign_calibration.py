@@ -55,7 +55,7 @@ def parse_foreign_camera(text: str, path: Path) -> Camera:
             raise ValueError("it is not a table of keys")
         return _build_camera(document)
     except ModuleNotFoundError as e:
-        raise MissingExtra("pyyaml", "yolo", path) from e
+        raise MissingExtra("pyyaml", "yolo", str(path)) from e
     except (ValueError, TypeError, OverflowError) as e:
         why = " ".join(str(e).split())[:200]
         raise SourceError(

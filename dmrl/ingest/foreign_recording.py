@@ -206,8 +206,9 @@ def _stamp_ns(message: Any) -> int | None:
         getattr(stamp, names[0], getattr(stamp, names[1], None))
         for names in (("seconds", "sec"), ("nanos", "nsec"))
     )
-    whole = isinstance(seconds, int) and isinstance(nanos, int)
-    return max(seconds * 1_000_000_000 + nanos, 0) if whole else None
+    if not (isinstance(seconds, int) and isinstance(nanos, int)):
+        return None
+    return max(seconds * 1_000_000_000 + nanos, 0)
 
 
 def _to_type(message: Any) -> str | LogType:

@@ -7,7 +7,7 @@ import errno
 import re
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Generator, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -54,7 +54,7 @@ def list_topics(source: Path) -> list[tuple[str, str, int]]:
 
 def iter_messages(
     source: Path, wanted: Collection[tuple[str, str]], *, ahead: bool = False
-) -> Iterator[BagMessage]:
+) -> Generator[BagMessage]:
     """Yield the messages of some topics and types, in the bag's order; raise as `list_topics`.
 
     Messages that cannot be decoded are left out, and counted unless ``ahead``: they are read again.
@@ -146,7 +146,7 @@ def _check_storage(source: Path) -> None:
                     raise SourceError(f"{path} has more than tables. Record the bag again")
 
 
-def _iter_guarded(source: Path, of: Callable[[Any], Iterator[Any]]) -> Iterator[Any]:
+def _iter_guarded(source: Path, of: Callable[[Any], Iterator[Any]]) -> Generator[Any]:
     """Yield the items of ``of(reader)``, with any error of rosbags as one line.
 
     rosbags passes on the errors of sqlite, YAML, struct and its decompressors on damaged bags, so

@@ -99,7 +99,7 @@ def _decode_fields(
     oneofs = {o for f in fields.values() if (o := f.containing_oneof) and len(o.fields) > 1}
     members = {f.number: f for o in oneofs for f in o.fields}
     numbers = members | {f.number: f for f in fields.values()}
-    found = find_fields(data, start, end, numbers.keys())
+    found = find_fields(data, start, end, set(numbers))
     for number in found:
         found[number] = _select_valid(data, numbers[number], found[number])
     for oneof in oneofs:
@@ -196,7 +196,8 @@ def _decode_field(
         end = concatenate_spans(s.end for s in found)[order]
         values = _decode_values(data, start, end, None, field)
         lists = pa.ListArray.from_arrays(pa.array(offsets), values)
-        is_map = field.message_type is not None and field.message_type.GetOptions().map_entry
+        inner = field.message_type
+        is_map = inner is not None and inner.GetOptions().map_entry
         return _keep_last_of_keys(lists) if is_map and len(values) > 1 else lists
     # The last scalar wins, as the specification requires. Absent: an empty span.
     start, end = np.zeros(count, np.int64), np.zeros(count, np.int64)

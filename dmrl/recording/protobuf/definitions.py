@@ -136,9 +136,10 @@ def _iter_type_names(file: FileDescriptorProto) -> Iterator[str]:
 def _remove_twins(file: FileDescriptorProto, defined: set[str]) -> None:
     """Remove the types of a file that other files define already, under other file names."""
     prefix = f"{file.package}." if file.package else ""
-    for held in (file.message_type, file.enum_type):
-        for twin in [one for one in held if prefix + one.name in defined]:
-            held.remove(twin)
+    for message in [one for one in file.message_type if prefix + one.name in defined]:
+        file.message_type.remove(message)
+    for enum in [one for one in file.enum_type if prefix + one.name in defined]:
+        file.enum_type.remove(enum)
 
 
 def _iter_fields(file: FileDescriptorProto) -> Iterator[FieldDescriptorProto]:
@@ -173,7 +174,9 @@ def _make_opaque(file: FileDescriptorProto, defined: set[str]) -> None:
         return name.startswith(".") and name[1:] not in defined
 
     del file.service[:]
-    for holder in (file, *(message for _, message in _iter_messages(file))):
+    holders: list[FileDescriptorProto | DescriptorProto] = [file]
+    holders += [message for _, message in _iter_messages(file)]
+    for holder in holders:
         for field in [e for e in holder.extension if is_undefined(e.extendee)]:
             holder.extension.remove(field)
     for field in _iter_fields(file):
