@@ -198,7 +198,7 @@ def test_a_header_s_stamp_is_whole_nanoseconds(
 ) -> None:
     held = stamp and SimpleNamespace(sec=stamp[0], nanosec=stamp[1])
     message = SimpleNamespace(header=SimpleNamespace(stamp=held)) if held else SimpleNamespace()
-    assert ros._header_time_ns(message) == time_ns
+    assert ros.header_time_ns(message) == time_ns
 
 
 @pytest.mark.parametrize(
