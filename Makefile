@@ -10,13 +10,15 @@ LAYOUT := build/layout
 # One process for each core, each with one thread: more would take the cores from each other.
 # Tests of a file stay together, with what they share.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --dist loadfile
-INSTALL := $(BIN)/pip install --constraint constraints.txt --editable
+# pip refuses an editable install where a hash is asked for.
+VERSIONS := build/constraints.txt
+INSTALL := $(BIN)/pip install --constraint $(VERSIONS) --editable
 # Tests start many processes. Without bytecode on disk each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help bench bench-labels demo test test-heavy test-all test-faults mutants golden check format lint types imports spell schemas docs site examples wheels layout clean
+.PHONY: help bench bench-labels demo test test-heavy test-all test-faults mutants golden check format lint types imports spell schemas constraints docs site examples wheels layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -69,6 +71,13 @@ spell: $(VENV)/.dev ## Check spelling.
 schemas: $(VENV)/.dev ## Build the message classes again from schemas/dmrl/v1/*.proto.
 	$(BIN)/python schemas/build.py
 
+constraints: $(VENV)/.dev ## Renew the versions and hashes of constraints.txt. ARGS="--upgrade-package numpy".
+	$(BIN)/pip install --quiet uv
+	@sed -n '/^#/!q;p' constraints.txt > build/pins
+	$(BIN)/uv pip compile pyproject.toml --all-extras --group dev --universal --python-version 3.11.7 \
+	  --generate-hashes --no-annotate --no-header --quiet $(or $(ARGS),--upgrade) --output-file constraints.txt
+	@{ cat build/pins; echo; cat constraints.txt; } > build/pins.all && mv build/pins.all constraints.txt
+
 docs: $(VENV)/.dev ## Write the generated parts of README.md and docs/ again.
 	$(BIN)/python docs/build.py
 
@@ -98,10 +107,14 @@ $(VENV)/.pip:
 	$(BIN)/pip install --upgrade 'pip>=25.1'
 	@touch $@
 
-$(VENV)/.demo: $(VENV)/.pip pyproject.toml constraints.txt
+$(VERSIONS): constraints.txt
+	@mkdir -p $(@D)
+	@sed -e '/--hash/d' -e 's/ *\\$$//' $< > $@
+
+$(VENV)/.demo: $(VENV)/.pip pyproject.toml $(VERSIONS)
 	$(INSTALL) '.[train,label,view,plot]'
 	@touch $@
 
-$(VENV)/.dev: $(VENV)/.pip pyproject.toml constraints.txt
+$(VENV)/.dev: $(VENV)/.pip pyproject.toml $(VERSIONS)
 	$(INSTALL) '.[all]' --group dev
 	@touch $(VENV)/.demo $@

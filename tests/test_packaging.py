@@ -52,7 +52,7 @@ def test_every_extra_is_in_the_extra_that_brings_all() -> None:
 def test_constraints_pin_every_direct_dependency_within_its_bounds() -> None:
     packaging = pytest.importorskip("packaging.requirements")
     pinned = {
-        _name(line.split("==")[0]): line.split("==")[1]
+        _name(line.split("==")[0]): line.split("==")[1].split()[0]
         for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
         if "==" in line
     }
@@ -65,6 +65,15 @@ def test_constraints_pin_every_direct_dependency_within_its_bounds() -> None:
         wanted = packaging.Requirement(text)
         if wanted.name != "dmrl":
             assert wanted.specifier.contains(pinned[_name(wanted.name)]), text
+
+
+def test_every_pin_has_the_hashes_of_its_files() -> None:
+    """So `pip install --require-hashes -r constraints.txt` works."""
+    text = (ROOT / "constraints.txt").read_text(encoding="utf-8").replace("\\\n", " ")
+    pins = [line for line in text.splitlines() if line and not line.startswith("#")]
+    assert len(pins) > 200
+    assert [pin for pin in pins if not re.search(r"--hash=sha256:[0-9a-f]{64}\b", pin)] == []
+    assert [pin for pin in pins if "==" not in pin] == []
 
 
 def _name(package: str) -> str:
