@@ -206,7 +206,7 @@ def main() -> None:
     parser.add_argument("--no-run", action="store_true", help="print the figures that are there")
     parser.add_argument("--json", type=Path, help="write the table there too")
     given = parser.parse_args()
-    here = f"{shlex.quote(sys.executable)} -m dmrl"
+    here = f"{shlex.quote(sys.executable)} -m dmrl.cli"
     commands = dict(text.split("=", 1) for text in given.state) or {"here": here}
     given.folder.mkdir(parents=True, exist_ok=True)
     jobs = list_jobs(given.sets, given.flights, given.noise, given.only or "", given.data)

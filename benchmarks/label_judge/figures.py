@@ -83,7 +83,7 @@ def judge_flight(
     covariance = np.concatenate([path.covariance for path in paths.values()])
     kept = np.concatenate([path.kept for path in paths.values()])
     size = np.hypot(*error.T)
-    least = [_interpolate(bounds, pair, path) for pair, path in paths.items()] if bounds else []
+    least = [_interpolate(bounds, *one) for one in paths.items() if "-".join(one[0]) in bounds]
     limit = describe_limit(least, least)["kept_share"] if least else {}
     return FlightFigures(
         positions=len(size),

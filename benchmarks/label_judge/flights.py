@@ -65,7 +65,8 @@ class Logs:
     truth
         By (observer, peer): (N, 4) times and x, y, z in the observer's horizontal frame.
     bound
-        By (observer, peer): (N, 2, 2) least covariances at the times of the truth.
+        By (observer, peer): (N, 2, 2) least covariances at the times of the truth; empty with
+        cameras.
     flight
         The flight, for faults that depend on the true motion.
     detections

@@ -66,6 +66,7 @@ class Job:
             self.fault.inject(logs, self.fault.size, rng)
         if self.eye is not None:
             look(logs, self.eye, rng)
+            logs.bound = {}  # it knows of no cameras
         if not self.ranges:
             logs.ranges.clear()
         write(logs, self.base, {"row": self.row}, path)
