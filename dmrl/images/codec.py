@@ -155,8 +155,8 @@ def _to_rgb(image: Image.Image, bits: int, *, upright: bool) -> Rgb:
         image = ImageOps.exif_transpose(image)
     if image.mode.startswith("I"):
         # Pillow scales the grey values of a PPM to 16 bits already.
-        grey = np.asarray(image).clip(0, 65535).astype(np.uint16)
-        grey = scale_to_8_bits(grey, BITS if image.format == "PPM" else bits)
+        values = np.asarray(image).clip(0, 65535).astype(np.uint16)
+        grey = scale_to_8_bits(values, BITS if image.format == "PPM" else bits)
         return np.ascontiguousarray(np.broadcast_to(grey[..., None], (*grey.shape, 3)))
     # Converting an RGB image would copy it.
     return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))

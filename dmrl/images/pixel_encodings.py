@@ -139,4 +139,4 @@ def _convert_planar_yuv(lines: NDArray[np.uint8], encoding: str, shape: tuple[in
 
 def _yuv_to_rgb(y: NDArray[np.uint8], u: NDArray[np.uint8], v: NDArray[np.uint8]) -> Rgb:
     yuv = np.stack([y, u, v], axis=-1) - np.array([16.0, 128.0, 128.0])
-    return np.rint(yuv @ RGB_FROM_YUV.T).clip(0, 255).astype(np.uint8)
+    return np.asarray(np.rint(yuv @ RGB_FROM_YUV.T).clip(0, 255), np.uint8)

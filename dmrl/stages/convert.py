@@ -150,7 +150,7 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
     if settings.to is not None:
         from dmrl.export.csv_parquet import write_tables
 
-        return write_tables(source, out, str(settings.to))
+        return write_tables(source, out, "csv" if settings.to == "csv" else "parquet")
     from dmrl.ingest.foreign_source import record_source
 
     kind = settings.source_kind or ("columns" if settings.columns else None)

@@ -162,16 +162,27 @@ def _build_row(file: str, peer: str, annotation: Record) -> LabelRow:
     left, top, width, height = map(float, annotation["bbox"])
     row = label_from_box(file, peer, (left, top, left + width, top + height))
     told = annotation.get("attributes") or {}
-    names = ("u_px", "v_px", "depth_m", "visible_share")
-    values = {name: float(told[name]) for name in names if name in told}
-    if not all(math.isfinite(value) for value in values.values()):
-        raise ValueError("an attribute is not finite")
-    row = replace(row, **values)
-    known = 0.0 if row.depth_m else math.inf
-    sigma_names = {"sigma_u_px": 0.0, "sigma_v_px": 0.0, "sigma_depth_m": known}
-    u, v, depth = (float(told.get(name, value)) for name, value in sigma_names.items())
-    texts = {k: str(told[k]) for k in ("peer", "source") if k in told}
-    return replace(row, sigmas=(u, v, depth), **texts)
+
+    def number(name: str, default: float) -> float:
+        if name in told and not math.isfinite(float(told[name])):
+            raise ValueError(f"{name} is not finite")
+        return float(told.get(name, default))
+
+    depth_m = number("depth_m", 0.0)
+    return replace(
+        row,
+        peer=str(told.get("peer", peer)),
+        source=str(told.get("source", row.source)),
+        u_px=number("u_px", row.u_px),
+        v_px=number("v_px", row.v_px),
+        depth_m=depth_m,
+        visible_share=number("visible_share", 0.0),
+        sigmas=(
+            number("sigma_u_px", 0.0),
+            number("sigma_v_px", 0.0),
+            number("sigma_depth_m", 0.0 if depth_m else math.inf),
+        ),
+    )
 
 
 FORMAT = Format("coco", "a COCO set", can_read, load_content, LABELLED_OPTIONS)

@@ -11,9 +11,11 @@ of a picture is that of ``data.yaml``, else that of its folder: ``train``, ``val
 """
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from dmrl.formats.files.labelled_pictures import (
     LabelledPicture,
     build_picture_content,
     find_split,
+    is_picture,
     label_from_box,
     list_pictures,
     locate,
@@ -39,7 +42,9 @@ from dmrl.terminal.progress import say
 
 DESCRIPTIONS = ("data.yaml", "data.yml", "dataset.yaml", "dataset.yml")
 NAME_FILES = ("classes.txt", "obj.names", "labels/classes.txt")
-SPLIT_KEYS = ("train", "val", "test")
+BOX_LINE = re.compile(rb"\d+( +[01]?\.\d+){4}")
+SNIFFED_PICTURES = 20
+SPLIT_KEYS = ("train", "test", "val")
 MAX_SHARE = 1.001
 """Largest coordinate; above 1 by the rounding of other programs only."""
 UNREADABLE = "label files that are not YOLO's; their pictures have no labels"
@@ -47,14 +52,17 @@ NO_LABEL_FILE = "pictures have no label file and are taken to show nobody (--unl
 
 
 def can_read(source: Path) -> bool:
-    """Return whether a folder has YOLO's description, class names, or its pair of folders."""
-    if not source.is_dir():
+    """Return whether a folder has YOLO's description, class names, or label files."""
+    if not source.is_dir() or (source / "labels.csv").is_file():
         return False
-    stated = any((source / name).is_file() for name in (*DESCRIPTIONS, *NAME_FILES))
+    if any((source / name).is_file() for name in (*DESCRIPTIONS, *NAME_FILES)):
+        return True
     folders = [source, *(path for path in source.iterdir() if path.is_dir())]
-    return stated or any(
-        (folder / "images").is_dir() and (folder / "labels").is_dir() for folder in folders
-    )
+    if any((folder / "images").is_dir() and (folder / "labels").is_dir() for folder in folders):
+        return True
+    pictures = (path for folder in folders for path in folder.iterdir() if is_picture(path))
+    beside = (path.with_suffix(".txt") for path in islice(pictures, SNIFFED_PICTURES))
+    return any(path.is_file() and BOX_LINE.match(path.read_bytes()[:200]) for path in beside)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,12 +127,13 @@ def _read_description(source: Path) -> _Description:
         names = told.get("names", {})
         pairs = names.items() if isinstance(names, dict) else enumerate(names)
         listed_names = {int(number): str(name) for number, name in pairs}
+        splits = _read_splits(source, told)
     except ModuleNotFoundError as e:
-        raise MissingExtra("pyyaml", "yolo", found) from e
+        raise MissingExtra("pyyaml", "yolo", str(found)) from e
     except (ValueError, TypeError, AttributeError) as e:
         why = " ".join(str(e).split())[:200]
         raise SourceError(f"{found} does not describe a YOLO set: {why}. Fix the file") from None
-    return _Description(listed_names, _read_splits(source, told), bool(told.get("kpt_shape")))
+    return _Description(listed_names, splits, bool(told.get("kpt_shape")))
 
 
 def _read_splits(source: Path, told: Mapping[str, Any]) -> dict[str, str]:
@@ -139,7 +148,8 @@ def _read_splits(source: Path, told: Mapping[str, Any]) -> dict[str, str]:
                 places = [locate(source, line.strip()) for line in lines if line.strip()]
             else:
                 places = [place]
-            splits.update({p.as_posix(): split for p in places if p is not None})
+            for path in filter(None, places):
+                splits.setdefault(path.as_posix(), split)
     return splits
 
 

@@ -166,6 +166,7 @@ def test_a_picture_without_label_file_shows_nobody_unless_said(
         "- a\n",
         "names: {a: b}",
         "names: 7",
+        "names: [x]\ntrain: 5",
         "names: &a [x]\ntrain: *a\n",
         "!!python/object/apply:os.system [ls]",
     ],
@@ -183,3 +184,21 @@ def test_a_picture_of_another_size_follows_the_crop(small: Path) -> None:
     ):
         for peer, (_, box) in zip(peers, boxes_of(k), strict=True):
             np.testing.assert_allclose(peer["box_px"], np.array(box) / 2, atol=0.01)
+
+
+@pytest.mark.parametrize("folder", ["", "train/"])
+def test_label_files_beside_the_pictures_are_enough(folder: str, tmp_path: Path) -> None:
+    for k in range(5):
+        write_picture(tmp_path / f"{folder}{k}.png", k)
+        (tmp_path / f"{folder}{k}.txt").write_text(yolo_lines(boxes_of(k)))
+    found = labels_of(read(tmp_path, "yolo"))
+    assert [[peer["peer"] for peer in peers] for peers in found] == [
+        [f"class{n}" for n in range(k % 3)] for k in range(5)
+    ]
+
+
+def test_texts_beside_pictures_are_not_always_labels(tmp_path: Path) -> None:
+    write_picture(tmp_path / "0.png", 0)
+    for text in ("1.5 2 3 4 5\n", "0 a b c d\n", "taken on Monday", "0 1 2 3 4"):
+        (tmp_path / "0.txt").write_text(text)
+        assert find_format(tmp_path).name == "images"
