@@ -28,6 +28,7 @@ CHECKED_BEFORE = "checked just before"
 OURS = "made of our own words and numbers"
 LISTED = "the name of a file that was found there"
 GIVEN = "a path of the user's, with an ending of ours"
+BY_ROWS = "checked, or made of letters and digits, by ExportRows"
 READ = "only read: names of files beside each other"
 REASONS = {
     "api/stages.py: f'{stage}.mcap'": OURS,
@@ -49,10 +50,23 @@ REASONS = {
     "evaluation/pipeline_summary.py: name": OURS,
     "export/ros2.py: path.name": LISTED,
     "export/csv_parquet.py: name": "a number, and one of two endings",
+    "export/detection_sets.py: f'instances_{split}.json'": BY_ROWS,
+    "export/detection_sets.py: f'{row.name}.png'": BY_ROWS,
+    "export/detection_sets.py: f'{row.name}.txt'": BY_ROWS,
+    "export/detection_sets.py: name": BY_ROWS,
+    "export/detection_sets.py: row.split": BY_ROWS,
+    "export/detection_sets.py: shard": BY_ROWS,
+    "export/lerobot.py: FILE.format(**place)": OURS,
+    "export/lerobot.py: FILE.format(chunk_index=0, file_index=0)": OURS,
+    "formats/files/labelled_pictures.py: end": "only read, and without '..'",
+    "formats/files/yolo.py: *parts[:k]": LISTED,
+    "formats/files/yolo.py: *parts[k + 1:]": LISTED,
+    "formats/files/yolo.py: n": OURS,
+    "formats/files/yolo.py: name": OURS,
+    "formats/files/yolo.py: place": "only read, and without '..'",
     "formats/aideck/chip_outputs.py: f'{name}{number}.ppm'": READ,
     "formats/files/flight_csv.py: log.robot": LISTED,
     "formats/published/locanet.py: name": READ,
-    "formats/aideck/nanocockpit.py: IMAGE_FOLDERS[0]": OURS,
     "formats/aideck/nanocockpit.py: f'{stem}{suffix}'": READ,
     "formats/aideck/nanocockpit.py: folder": OURS,
     "learn/training/checkpoint.py: name": OURS,

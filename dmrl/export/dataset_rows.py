@@ -11,6 +11,7 @@ from typing import Any
 
 from dmrl.datasets import Dataset, layout
 from dmrl.geometry.frames import Camera
+from dmrl.guards.safe_names import check_split_name
 from dmrl.images.codec import encode_png
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import track
@@ -146,10 +147,10 @@ class ExportRows:
             for k, (rgb, peers, robot, source, log_time) in enumerate(
                 zip(images, *columns, strict=True)
             ):
-                stem = re.sub(r"[^A-Za-z0-9_-]", "_", Path(source).stem)[:80]
+                place = f"{Path(source).stem[:80]}-{robot[:80]}-{log_time}"
                 yield ExportRow(
-                    name,
-                    f"{k:06d}-{stem}-{robot}-{log_time}",
+                    check_split_name(name, f"{self.data.path}: a split"),
+                    f"{k:06d}-" + re.sub(r"[^A-Za-z0-9_-]", "_", place),
                     (width_px, height_px),
                     encode_png(rgb),
                     [peer | {"class": self.options.to_class(peer["peer"])} for peer in peers],
