@@ -266,6 +266,8 @@ TOPICS = (
 SENSORS = tuple(row for row in TOPICS if row.sensor)
 OWN_SENSORS = tuple(row for row in SENSORS if not row.is_pairwise and row.pattern != CAMERA_IMAGE)
 """Sensors with which a robot measures itself."""
+OWN_CURVES = tuple(row for row in TOPICS if row.curve is not None and not row.is_pairwise)
+"""Rows with a plot of one robot."""
 PAIR_SENSORS = tuple(row for row in SENSORS if row.is_pairwise)
 """Sensors with which a robot measures a peer."""
 

@@ -148,6 +148,7 @@ def build_flight_layout(
     spaces: Sequence[SpacePanel],
     eyes: Sequence[CameraPanel],
     plots: Mapping[str, Sequence[PlotPanel]],
+    scales: Mapping[str, ColourScale],
 ) -> rrb.Blueprint:
     """Build a layout with 3D views and images above, and plots below.
 
@@ -159,8 +160,10 @@ def build_flight_layout(
         Cameras whose images are shown.
     plots
         Panels by tab.
+    scales
+        Colours of the maps that are shown beside the images.
     """
-    views = [build_camera_views(eye, {})[0] for eye in eyes]
+    views = [view for eye in eyes for view in build_camera_views(eye, scales)]
     spatial = rrb.Tabs(*(_build_space_view(space) for space in spaces))
     above: rrb.Container = spatial
     if len(views) == 1:

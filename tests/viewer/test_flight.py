@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dmrl import recipe as recipes
 from dmrl.colours import RGB, STATUS_RGB
 from dmrl.errors import SettingError
 from dmrl.recording import reader, sample_topics
 from dmrl.recording.mcap import chunk_builder, chunk_reader
+from dmrl.stages import fly as fly_stage
 from dmrl.viewer import Settings, save, scene
 from dmrl.viewer.session import prepare_show
 
@@ -261,3 +263,22 @@ def test_trails_errors_and_ranges_do_not_depend_on_where_a_stretch_of_the_file_e
     assert len(whole[f"{TRUTH}/trail", "LineStrips3D:strips"]) == 20
     assert whole.keys() == pieces.keys()
     assert [key for key, values in whole.items() if values != pieces[key]] == []
+
+
+def test_a_piloted_flight_shows_commands_maps_and_when_the_leader_was_not_seen(
+    tmp_path: Path, rrd: Path
+) -> None:
+    flags = fly_stage.Flags(eye=Path("dmrl-nano"), camera_renderer="sketch", duration_s=1.0)
+    settings = recipes.load("fly_follow", "fly", fly_stage.Settings, flags)
+    fly_stage.run(tmp_path / "flight.mcap", settings)
+    save([tmp_path / "flight.mcap"], rrd, Settings())
+    rows = logged(rrd)
+    for field in ("vx_mps", "vy_mps", "vz_mps"):
+        assert rows[f"/cf1/command/{field}", "Scalars"] >= 20
+    assert rows["/cf1/detections/sight", "StateChange"] == 10
+    assert rows["/cf1/peer/cf2/truth/trail", "LineStrips3D"] >= 20
+    assert rows["/cf2/peer/cf1/truth/trail", "LineStrips3D"] >= 20
+    shown = panels(rrd)
+    assert {"commands, m/s", "detections, per image", "cf1 confidence", "cf1 depth, m"} <= shown
+    states = column(rrd, "/cf1/detections/sight", "StateChange:state")
+    assert {state for (state,) in states} <= {"detected", "not detected"}

@@ -3,7 +3,7 @@
 Styles are logged once but requested for every batch, so they are cached.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -16,7 +16,7 @@ from dmrl.geometry.frames import Array
 from dmrl.messages import find_descriptor
 from dmrl.topics import RANGE, Topic
 from dmrl.viewer.content.robot_motion import Positions
-from dmrl.viewer.drawing.archetypes import Colour
+from dmrl.viewer.drawing.archetypes import Colour, row_indices
 from dmrl.viewer.drawing.entity import Entity
 
 BOUND_SIGMAS = 3.0
@@ -139,6 +139,21 @@ def _compute_nees(error: Array, covariance: Array) -> Array:
     return out
 
 
+def draw_sight(path: str, batch: pa.RecordBatch) -> Iterator[Entity]:
+    """Draw as a band in which images a peer was detected."""
+    column = batch["detections"]
+    least = batch["threshold"].to_numpy()[row_indices(column)]
+    believed = column.flatten().field("confidence").to_numpy() >= least
+    number = np.bincount(row_indices(column)[believed], minlength=batch.num_rows)
+    states = np.where(number > 0, "detected", "not detected").tolist()
+    yield Entity(f"{path}/sight", rr.StateChange.columns(state=states), (_sight_style(),))
+
+
+@cache
+def _sight_style() -> rr.StateConfiguration:
+    return _state_style({"detected": STATUS_RGB["OK"], "not detected": STATUS_RGB["AMBIGUOUS"]})
+
+
 def draw_status(path: str, positions: Positions) -> Iterator[Entity]:
     """Draw the status of the estimates as a band."""
     kind = find_descriptor("PeerPosition").fields_by_name["status"].enum_type
@@ -149,11 +164,12 @@ def draw_status(path: str, positions: Positions) -> Iterator[Entity]:
 
 @cache
 def _status_style() -> rr.StateConfiguration:
-    return rr.StateConfiguration(
-        values=list(STATUS_RGB),
-        labels=list(STATUS_RGB),
-        colors=np.array([_pack_rgba(colour) for colour in STATUS_RGB.values()], np.uint32),
-    )
+    return _state_style(STATUS_RGB)
+
+
+def _state_style(colours: Mapping[str, Colour]) -> rr.StateConfiguration:
+    packed = np.array([_pack_rgba(colour) for colour in colours.values()], np.uint32)
+    return rr.StateConfiguration(values=list(colours), labels=list(colours), colors=packed)
 
 
 def _pack_rgba(colour: Sequence[int]) -> int:

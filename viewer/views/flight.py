@@ -12,7 +12,7 @@ from dmrl.topics import Topic
 from dmrl.viewer import layouts
 from dmrl.viewer.content.flight_streamer import FlightStreamer
 from dmrl.viewer.content.robot_motion import FlightMotion, Names, sample_motion
-from dmrl.viewer.drawing import space, time_plots
+from dmrl.viewer.drawing import archetypes, space, time_plots
 from dmrl.viewer.drawing.entity import (
     WORLD_FRAME,
     Entity,
@@ -25,6 +25,7 @@ from dmrl.viewer.scene import (
     DrawRule,
     Scene,
     build_camera_panels,
+    build_colour_bars,
     build_image_rules,
     build_model_rules,
     read_first_messages,
@@ -42,17 +43,21 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     pairs = _choose_pairs(selection, settings.robot)
     seen = sample_motion(selection.recordings, pairs, *selection.shown_ns)
     robots = _choose_robots(selection, pairs, settings.robot)
-    eyes = build_camera_panels(selection, sorted(selection.image_ns)[:MAX_CAMERAS], {})
+    piloted = {n["robot"] for n in selection.find_names(topics.COMMAND)}
+    scales = archetypes.build_scales(settings.depth_max_m) if piloted else {}
+    eyes = build_camera_panels(selection, sorted(selection.image_ns)[:MAX_CAMERAS], scales)
     sources: dict[str, set[str]] = {eye.robot: set() for eye in eyes}
     named = {}
     draws: list[DrawRule] = []
     for eye in eyes:
         draws += build_image_rules(eye, sources[eye.robot])
         if topics.DETECTIONS(eye.robot) in _list_topics(selection):
-            draws += build_model_rules(eye, {}, smooth=False)
+            draws += build_model_rules(eye, scales, smooth=False)
             named["detection"] = RGB["detection"]
     for robot in robots:
         draws += _build_robot_rules(selection, seen, robot, own=robot == robots[0])
+    for topic in map(topics.DETECTIONS, sorted(piloted)):
+        draws.append(DrawRule(topic, partial(time_plots.draw_sight, topic)))
     for pair in pairs:
         draws += [_build_sensor_rule(row, *pair, own=False) for row in topics.PAIR_SENSORS]
     spaces = _build_spaces(selection, seen, pairs, robots, eyes)
@@ -60,9 +65,12 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     if not pairs:
         panels = {robots[0]: _build_sensor_plots(selection, robots)} if robots else {}
     return Scene(
-        layouts.build_flight_layout(spaces, eyes, panels),
+        layouts.build_flight_layout(spaces, eyes, panels, scales),
         draws,
-        [(None, entity) for entity in _iter_static_entities(selection, seen, robots)],
+        [
+            *((None, entity) for entity in _iter_static_entities(selection, seen, robots)),
+            *(bar for eye in eyes if scales for bar in build_colour_bars(eye, scales)),
+        ],
         eyes,
         sources,
         named,
@@ -103,7 +111,7 @@ def _build_robot_rules(
     attitude = topics.ATTITUDE(robot)
     draws = [
         DrawRule(attitude, time_plots.AttitudePlot(attitude, robot, own).draw_rows),
-        *(_build_sensor_rule(row, robot, own=own) for row in topics.OWN_SENSORS),
+        *(_build_sensor_rule(row, robot, own=own) for row in topics.OWN_CURVES),
         DrawRule(topics.TRACKS(robot), partial(space.draw_tracks, topics.TRACKS(robot), robot)),
     ]
     if camera_frame(robot) not in motion.poses:
@@ -258,8 +266,13 @@ def _collect_curves(
 def _build_sensor_plots(selection: Selection, robots: Sequence[str]) -> list[PlotPanel]:
     present = _list_topics(selection)
     tilted = [t for r in robots if (t := topics.ATTITUDE(r)) in present]
-    curves = _collect_curves(selection, topics.OWN_SENSORS, [(robot, "") for robot in robots])
+    curves = _collect_curves(selection, topics.OWN_CURVES, [(robot, "") for robot in robots])
     panels = [PlotPanel(title, tuple(lines)) for title, lines in curves.items()]
+    piloted = [robot for robot in robots if topics.COMMAND(robot) in present]
+    sights = [t for robot in piloted if (t := topics.DETECTIONS(robot)) in present]
+    if sights:
+        bands = tuple(f"{topic}/sight" for topic in sights)
+        panels.insert(0, PlotPanel("detections, per image", bands, band=True))
     if tilted:
         own = tilted[0]
         name = f"attitude of {(topics.parse_topic(topics.ATTITUDE, own) or {})['robot']}, degrees"
