@@ -10,7 +10,7 @@ from typing import Any
 from dmrl import topics
 from dmrl.atomic_output import atomic_folder, refuse_existing
 from dmrl.errors import MissingExtra, SettingError
-from dmrl.evaluation import positions, tracks
+from dmrl.evaluation import flights, positions, tracks
 from dmrl.evaluation.detection_report import (
     DetectionCriteria,
     Evaluation,
@@ -29,7 +29,7 @@ except MissingExtra:
     figures = None
 
 Document = dict[str, Any]
-KINDS = {"positions": positions, "tracks": tracks}
+KINDS = {"flight": flights, "positions": positions, "tracks": tracks}
 """Modules that evaluate against true positions; both offer the same functions."""
 SETTLE_S, SHORT_FLIGHT_S = 20.0, 30.0
 """Time to settle, seconds; for a flight shorter than the second, half of it."""
@@ -53,7 +53,7 @@ def evaluate_recordings(
     out
         Folder to write plots and the figures to. None: nothing is written.
     what
-        "auto", "detections", "positions" or "tracks".
+        "auto", "detections", "flight", "positions" or "tracks".
     criteria
         Of detections.
     settle_s
@@ -93,6 +93,8 @@ def evaluate_recordings(
 
 def _choose_kind(recording: Path) -> str:
     """Return the kind of results that the last stage has written."""
+    if flights.has_flown(recording):
+        return "flight"
     if tracks.has_tracks_and_truth(recording):
         return "tracks"
     detected = topics.list_robots(list(read_summary(recording).topics), topics.DETECTIONS)
@@ -116,7 +118,8 @@ def _evaluate_against_truth(
     if out is not None:
         with _write_folder(out, what, made) as folder:
             assert figures is not None
-            figures.draw_error_plots(folder, judged)
+            if what != "flight":
+                figures.draw_error_plots(folder, judged)
     return made
 
 
@@ -130,8 +133,8 @@ def _write_folder(out: Path, stem: str, made: Document) -> Iterator[Path]:
 
 
 def print_document(recording: Path, made: Document) -> None:
-    """Print the figures of positions, one row per pair, or of tracks, one per observer."""
-    kind = tracks if "robots" in made else positions
+    """Print the figures of flights and positions by pair, and of tracks by observer."""
+    kind = flights if "flights" in made else tracks if "robots" in made else positions
     headers = [words for _, words, _ in kind.COLUMNS]
     print_table(f"{recording}: {kind.TITLE}", [kind.EACH, *headers], kind.rows(made))
     print_line(kind.note(made))

@@ -78,7 +78,7 @@ def judge(recording: Path) -> list[EvaluatedTracks]:
     return judged
 
 
-def _read_camera(held: FlightLog, robot: str) -> Camera:
+def read_track_camera(held: FlightLog, robot: str) -> Camera:
     """The camera that the tracks were made with: its mount, delay and lens may be other ones."""
     used = held.metadata.get(CAMERAS_METADATA, [{}])[-1].get(robot)
     camera = parse_camera(used, held.path) if used else find_recorded_camera(held, robot)
@@ -103,8 +103,8 @@ def _evaluate_observer(held: FlightLog, robot: str, peers: list[str]) -> Evaluat
 
     The life of a track is counted in images. In an image, a track is astray if it is near no peer.
     """
-    sight = read_observer_log(held, robot, _read_camera(held, robot), 0.0)
-    truth, shown = _interpolate_truth(held, sight, peers)
+    sight = read_observer_log(held, robot, read_track_camera(held, robot), 0.0)
+    truth, shown = interpolate_truth(held, sight, peers)
     rows: list[_PeerRow] = []
     lived: Counter[int] = Counter()
     astray: Counter[int] = Counter()
@@ -180,7 +180,7 @@ def _track_positions(tracks: list[Any]) -> Array:
     return np.array([[t.x, t.y, t.z] for t in tracks]).reshape(-1, 3)
 
 
-def _interpolate_truth(
+def interpolate_truth(
     held: FlightLog, sight: ObserverLog, peers: list[str]
 ) -> tuple[Array, NDArray[np.bool_]]:
     """(J, K, 3) true positions at the images, NaN where unknown; (J, K) whether in the image."""

@@ -27,8 +27,9 @@ class Settings:
     Parameters
     ----------
     what
-        "auto": tracks where there are any with true positions, else detections, else estimated
-        positions.
+        "auto": flight where a pilot flew a robot, tracks where there are any with true positions,
+        else detections, else estimated positions. flight: seconds held, contacts, silent stretches
+        and alarms over time.
     against
         Whose labels.
     split
@@ -51,7 +52,7 @@ class Settings:
         Without it, 20 s, or half of a flight under 30 s.
     """
 
-    what: Literal["auto", "detections", "positions", "tracks"] = "auto"
+    what: Literal["auto", "detections", "flight", "positions", "tracks"] = "auto"
     against: Literal["truth", "estimate", "hand", "published"] = "truth"
     split: str | None = None
     partial: Annotated[bool, Parameter(negative=())] = False

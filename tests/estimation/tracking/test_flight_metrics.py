@@ -1,0 +1,137 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.tracking.flight_metrics import (
+    LOST_RAD,
+    PairFlight,
+    compute_bands,
+    compute_flight_figures,
+    find_stretches,
+)
+
+TRUE_S = np.arange(0, 20.001, 0.05)
+IMAGES = 200
+IMAGE_S = 0.1 * np.arange(IMAGES)
+
+
+def flight(**changes: np.ndarray) -> PairFlight:
+    """Twenty seconds at 0.8 m ahead, seen in every image."""
+    yes, no = np.ones(IMAGES, bool), np.zeros(IMAGES)
+    ahead = np.tile([0.8, 0.0, 0.0], (len(TRUE_S), 1))
+    plain = PairFlight(
+        "cf1", "cf2", TRUE_S, ahead, IMAGE_S, np.full(IMAGES, 0.8), no, yes, yes, yes, no
+    )
+    return replace(plain, **changes)
+
+
+def places(start_s: float, end_s: float, xyz: list[float]) -> np.ndarray:
+    out = flight().true_m.copy()
+    out[(start_s <= TRUE_S) & (end_s > TRUE_S)] = xyz
+    return out
+
+
+def mask(*spans: tuple[int, int]) -> np.ndarray:
+    """All images but some."""
+    out = np.ones(IMAGES, bool)
+    for first, end in spans:
+        out[first:end] = False
+    return out
+
+
+def test_stretches_are_found_at_both_ends() -> None:
+    found = find_stretches(np.array([True, False, True, True, False, True]))
+    assert found.tolist() == [[0, 1], [2, 4], [5, 6]]
+    assert not len(find_stretches(np.zeros(3, bool)))
+
+
+@pytest.mark.parametrize(
+    ("end_s", "xyz", "held_s"),
+    [
+        (7.9, [3.1, 0.0, 0.0], 20.0),  # less than three seconds
+        (8.2, [3.1, 0.0, 0.0], 5.0),
+        (8.2, [2.9, 0.0, 0.0], 20.0),
+        (8.2, [0.8, 0.8 * math.tan(LOST_RAD + 0.01), 0.0], 5.0),
+        (8.2, [0.8, 0.0, -0.8 * math.tan(LOST_RAD - 0.01)], 20.0),
+        (8.2, [-0.8, 0.0, 0.0], 5.0),
+    ],
+)
+def test_a_peer_is_lost_far_away_or_off_the_axis_for_three_seconds(
+    end_s: float, xyz: list[float], held_s: float
+) -> None:
+    figures = compute_flight_figures(flight(true_m=places(5.0, end_s, xyz)))
+    assert figures["held_s"] == pytest.approx(held_s)
+    assert figures["held_to_end"] == (held_s == 20.0)
+
+
+def test_contacts_are_counted_once_each() -> None:
+    path = places(3.0, 3.5, [0.19, 0.0, 0.0])
+    path[TRUE_S > 19.5] = 0.0, 0.1, 0.1
+    figures = compute_flight_figures(flight(true_m=path))
+    assert figures["contacts"] == 2
+    assert figures["least_m"] == pytest.approx(math.hypot(0.1, 0.1))
+
+
+def test_silences_are_stretches_in_view_without_a_detection() -> None:
+    figures = compute_flight_figures(
+        flight(in_view=mask((50, 60)), detected=mask((10, 12), (48, 66), (190, 200)))
+    )
+    # Two images, two and six beside the ten out of view, ten at the end.
+    assert figures["silences"] == 4
+    assert figures["silence_s"] == pytest.approx(0.5)
+    assert figures["longest_silence_s"] == pytest.approx(1.0)
+    assert figures["recall"] == pytest.approx(1 - 20 / 190)
+    assert figures["find_again_s"] == pytest.approx(0.6)  # it is back at 60, detected at 66
+
+
+def test_alarms_have_a_duration() -> None:
+    false = np.zeros(IMAGES)
+    false[20:24], false[100:102] = 1, 3
+    figures = compute_flight_figures(flight(false=false))
+    assert figures["false_per_image"] == pytest.approx(10 / IMAGES)
+    assert figures["alarm_s"] == pytest.approx(0.3)
+    assert figures["longest_alarm_s"] == pytest.approx(0.4)
+
+
+def test_long_silences_end_loops_and_weak_detections_do_not() -> None:
+    short, long = mask(*((k, k + 5) for k in range(0, 150, 15))), mask((30, 45), (90, 110))
+    times = {
+        name: compute_flight_figures(flight(found=found))["loop_s"]
+        for name, found in (("all", mask()), ("short", short), ("long", long))
+    }
+    assert times == pytest.approx({"all": 40.0, "short": 40.0, "long": 20 / 2.5})
+
+
+def test_silences_count_by_how_often_loops_are_at_their_distance() -> None:
+    """Half the images are at 0.8 m, where loops are most of the time, and half at 2.5 m."""
+    distance_m = np.where(np.arange(IMAGES) < 100, 0.8, 2.5)
+    near, far = (
+        compute_flight_figures(flight(distance_m=distance_m, found=mask(span)))["loop_s"]
+        for span in ((20, 40), (120, 140))
+    )
+    assert near is not None
+    assert far is not None
+    assert near < 0.5 * far
+
+
+def test_bands_hold_the_images_of_their_distance_and_turn_rate() -> None:
+    turn = np.where(np.arange(IMAGES) < 50, 1.0, 0.1)
+    bands = compute_bands(flight(turn_radps=turn, detected=mask((0, 25))))
+    shown = {(b["by"], b["from"]): (b["in_view"], b["recall"]) for b in bands if b["in_view"]}
+    assert shown == {
+        ("distance_m", 0.5): (200, 0.875),
+        ("turn_radps", 0.0): (150, 1.0),
+        ("turn_radps", 0.75): (50, 0.5),
+    }
+
+
+def test_a_flight_without_images_has_no_figures_of_them() -> None:
+    none, no = np.zeros(0), np.zeros(0, bool)
+    figures = compute_flight_figures(
+        PairFlight("a", "b", TRUE_S, flight().true_m, none, none, none, no, no, no, none)
+    )
+    assert figures["held_s"] == pytest.approx(20.0)
+    assert figures["recall"] is None
+    assert figures["loop_s"] is None

@@ -1,0 +1,52 @@
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dmrl import recipe as recipes
+from dmrl import topics
+from dmrl.errors import RecordingError
+from dmrl.recording import read_summary, trim
+from dmrl.stages import evaluate, fly
+from dmrl.stages.fly import Flags, Settings
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten seconds behind a leader that an ideal eye misses in a third of the images."""
+    out = tmp_path_factory.mktemp("flight") / "flight.mcap"
+    flags = Flags(duration_s=10.0, eye="ideal", camera=False, seed=2)
+    settings = recipes.load("fly_follow", "fly", Settings, flags)
+    fly.run(out, replace(settings, vision=replace(settings.vision, miss_share=1 / 3)))
+    return out
+
+
+def evaluated(path: Path, what: Any = "auto") -> dict[str, Any]:
+    made = evaluate.run([path], None, evaluate.Settings(what=what))
+    assert isinstance(made, dict)
+    return made
+
+
+def test_a_piloted_flight_is_evaluated_over_time(flown: Path) -> None:
+    (one,) = evaluated(flown)["flights"]
+    assert (one["robot"], one["peer"]) == ("cf1", "cf2")
+    assert one["held_s"] == pytest.approx(10.0, abs=0.1)
+    assert one["contacts"] == 0
+    assert one["recall"] == pytest.approx(2 / 3, abs=0.15)
+    assert one["false_per_image"] == 0.0
+    assert one["silences"] > 5
+    assert 0.1 <= one["silence_s"] < 0.4
+    assert sum(b["in_view"] for b in one["bands"] if b["by"] == "distance_m") == one["in_view"]
+
+
+def test_tracks_of_such_a_flight_are_evaluated_on_request(flown: Path) -> None:
+    assert evaluated(flown, "tracks")["robots"][0]["robot"] == "cf1"
+
+
+def test_without_truth_there_is_nothing_to_hold(flown: Path, tmp_path: Path) -> None:
+    short = tmp_path / "short.mcap"
+    kept = [t for t in read_summary(flown).topics if not topics.parse_topic(topics.TRUTH, t)]
+    trim(flown, short, topics=[t for t in kept if t != "/tf"])
+    with pytest.raises(RecordingError, match="no true position"):
+        evaluated(short, "flight")
