@@ -1,14 +1,18 @@
 """Recordings of other writers that were lost in part, or refused, without need."""
 
+import struct
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 
 import dmrl
 from dmrl.errors import RecordingError
-from dmrl.recording import check, merge, recover, trim
+from dmrl.recording import check, merge, read_summary, recover, trim
 from dmrl.stages import info
 
+from .records import records, small
+from .test_renames import rejoined
 from .walk import walk
 
 
@@ -60,6 +64,26 @@ def test_a_chunk_index_that_omits_a_channel_is_an_error(data: Path, tmp_path: Pa
             read()
     assert not out.exists()
     assert recover(path, out).messages == len(walk(path).raw_messages) == 4600
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_doctored_chunk_index_of_our_own_is_an_error(stated: bool, tmp_path: Path) -> None:
+    """Without a checksum that tells: the lengths of the message indexes do, or a record there."""
+    path = small(tmp_path / "a.mcap")
+    data = path.read_bytes()
+    parts = [(opcode, data[start:end]) for opcode, start, end in records(data)]
+    places = [k for k, (opcode, _) in enumerate(parts) if opcode == Opcode.CHUNK_INDEX]
+    index = next(parts[k][1] for k in places if parts[k][1][41] == 20)  # of two channels
+    cut = index[:41] + struct.pack("<I", 10) + index[45:55] + index[65:]
+    short = bytes([Opcode.CHUNK_INDEX]) + struct.pack("<Q", len(cut) - 9) + cut[9:]
+    kept = [
+        (opcode, short if part == index else part)
+        for opcode, part in parts
+        if opcode != Opcode.STATISTICS or stated
+    ]
+    rejoined(path, kept)
+    with pytest.raises(RecordingError, match=r"lacks a message index of channel \d"):
+        read_summary(path)
 
 
 def test_statistics_without_counts_are_counted(
