@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from mcap.records import Chunk, ChunkIndex
-from mcap.summary import Summary as McapSummary
+from mcap.records import Chunk
 from numpy.typing import NDArray
 
 from dmrl.errors import SourceError
@@ -183,23 +182,12 @@ def iter_units(path: Path, selection: TopicSelection) -> Iterator[CopyUnit]:
             return
         channels = summary.channels_by_id
         counts: Counter[int] = Counter()
-        chunks = _select_chunks(summary, channels, selection)
+        kept = {n: channel for n, channel in channels.items() if channel.topic in selection.topics}
+        chunks = select_chunks(summary, kept.keys(), selection.low_ns, selection.high_ns)
         stream.expect_reads([locate_chunk(index) for index in chunks])
         for index in chunks:
             chunk, batch, others, messages = read_chunk_for_copy(path, stream, index, summary)
             count_messages(counts, batch)
             yield CopyUnit(batch, channels, chunk, others, messages)
         if (selection.low_ns, selection.high_ns) == (0, MAX_TIME_NS):
-            kept = {
-                n: channel for n, channel in channels.items() if channel.topic in selection.topics
-            }
             check_counts(path, summary.statistics, kept, counts)
-
-
-def _select_chunks(
-    summary: McapSummary, channels: Mapping[int, Channel], selection: TopicSelection
-) -> list[ChunkIndex]:
-    """Return the chunks that may contain selected messages, by time."""
-    mine = {n for n, channel in channels.items() if channel.topic in selection.topics}
-    found = select_chunks(summary, mine, selection.low_ns, selection.high_ns)
-    return sorted(found, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))

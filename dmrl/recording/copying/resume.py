@@ -120,13 +120,9 @@ def _recover_partial(partial: Path, kept: Path) -> None:
         recover(partial, recovered)
     except RecordingError:
         return  # it ends before its first complete chunk
-    if not kept.exists() or _count_messages(recovered) > _count_messages(kept):
+    if not kept.exists() or read_summary(recovered).count > read_summary(kept).count:
         recovered.replace(kept)
     recovered.unlink(missing_ok=True)
-
-
-def _count_messages(path: Path) -> int:
-    return sum(info.count for info in read_summary(path).topics.values())
 
 
 def _find_complete_until_ns(path: Path, *, has_images: bool) -> int:

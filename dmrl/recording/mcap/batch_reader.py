@@ -123,13 +123,11 @@ def _iter_in_time_order(
     last = _find_image_channels(channels)
     pending: MessageBatch | None = None
     stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
-    # Statistics are compared with the messages where all are read, else with the message indexes.
-    ranged = (low, high) != (0, MAX_TIME_NS)
-    if ranged:
+    if (low, high) != (0, MAX_TIME_NS) and stream.remote_stream is None:
+        # The messages cannot be compared with the statistics, but all message indexes can.
         verify_indexes(path, stream, summary)
-    whole = ranged and not summary.has_own_checksums
     for k, chunk in enumerate(chunks):
-        batch = read_chunk(path, stream, chunk, channels, summary, whole=whole)
+        batch = read_chunk(path, stream, chunk, channels, summary)
         batch = batch.take((batch.time_ns >= low) & (batch.time_ns < high))
         pending = concatenate(pending, batch).sort_by_time(last)
         if k + 1 == len(chunks):

@@ -41,8 +41,6 @@ def read_chunk(
     chunk_index: ChunkIndex,
     channels: Mapping[int, Channel],
     summary: SummarySection,
-    *,
-    whole: bool = False,
 ) -> MessageBatch:
     """Read a chunk and return its messages of some channels, in chunk order.
 
@@ -56,9 +54,6 @@ def read_chunk(
         Channels to read, by channel id.
     summary
         Summary section of the recording.
-    whole
-        Verify that the message indexes list every message of the chunk, even if only some channels
-        are read. Needed if no statistics are compared with the messages later.
 
     Raises
     ------
@@ -69,7 +64,7 @@ def read_chunk(
     indexed = chunk_index.message_index_offsets.keys()
     if indexed and indexed <= channels.keys():
         return _read_whole_chunk(path, raw, data, chunk_index, summary)[0]
-    if whole or not indexed or not summary.counts:
+    if not indexed or not summary.counts:  # no statistics will be compared with the messages
         batch = _read_whole_chunk(path, raw, data, chunk_index, summary)[0]
         return batch.select_channels(channels)
     if summary.needs_definition_check(chunk_index):

@@ -171,7 +171,7 @@ def _iter_chunk_times(
     chunks = sorted(section.chunk_indexes, key=lambda c: c.chunk_start_offset)
     stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
     for chunk in chunks:
-        batch = read_chunk(path, stream, chunk, section.channels_by_id, section, whole=True)
+        batch = read_chunk(path, stream, chunk, section.channels_by_id, section)
         for number in batch.list_channel_ids():
             yield number, batch.time_ns[batch.channel == number]
 

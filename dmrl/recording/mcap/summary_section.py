@@ -29,7 +29,6 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary as McapSummary
 
 from dmrl.guards import limits
-from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.channel import ChannelTable, build_channels
 from dmrl.recording.mcap.file import (
     DEFINITIONS,
@@ -72,11 +71,6 @@ class SummarySection(McapSummary):
     def channels_by_id(self) -> ChannelTable:
         """Channels of the section, by channel id."""
         return build_channels(self.channels, self.schemas)
-
-    @property
-    def has_own_checksums(self) -> bool:
-        """Whether dmrl wrote the file. It then has checksums of its message indexes."""
-        return any(one.name == checksums.METADATA_NAME for one in self.metadata_indexes)
 
     @property
     def counts(self) -> dict[int, int]:
