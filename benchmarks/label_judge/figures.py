@@ -28,6 +28,8 @@ class FlightFigures:
         Number of positions with truth; and of true positions, where nothing was written.
     squared_error, squared_sigma, squared_bound
         Sums, m^2; the bound's is NaN where it is not known.
+    worst_pair_m
+        Largest RMSE of an observer and its peer.
     inside, kept, bad
         Number in the 95 % ellipse; with status OK; of these, over 0.3 m off.
     keepable
@@ -45,6 +47,7 @@ class FlightFigures:
     squared_error: float = 0.0
     squared_sigma: float = 0.0
     squared_bound: float = 0.0
+    worst_pair_m: float = 0.0
     inside: int = 0
     kept: int = 0
     bad: int = 0
@@ -93,6 +96,10 @@ def judge_flight(
         squared_bound=float(np.trace(np.concatenate(least), axis1=1, axis2=2).sum())
         if least
         else float("nan"),
+        worst_pair_m=max(
+            float(np.sqrt(((path.estimate_m - path.true_m) ** 2).sum(axis=1).mean()))
+            for path in paths.values()
+        ),
         inside=int((_mahalanobis_squared(error, covariance) <= CHI2_95).sum()),
         kept=int(kept.sum()),
         bad=int((size[kept] > BAD_M).sum()),
@@ -147,6 +154,7 @@ class RowFigures:
     rmse_m: float
     median_m: float
     worst_kept_m: float
+    worst_pair_m: float
     ratio: float
     sigma_m: float
     bound_m: float
@@ -200,6 +208,7 @@ def combine(
         rmse_m=root("squared_error"),
         median_m=float(np.median(sizes)) if sizes else float("nan"),
         worst_kept_m=max((s for s, f in zip(sizes, made, strict=True) if f.kept), default=0.0),
+        worst_pair_m=max((f.worst_pair_m for f in made), default=0.0),
         ratio=float(np.median(ratios)) if ratios else float("nan"),
         sigma_m=root("squared_sigma"),
         bound_m=root("squared_bound"),

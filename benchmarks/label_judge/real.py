@@ -12,7 +12,7 @@ from dmrl.samples.flight import START_NS, ZERO_COVARIANCE
 
 OFFSET_M = 0.35
 """Antenna delay of the TIERS group's ranges, metres."""
-MOVING = ("robot1", "robot3", "robot4")
+MOVING = ("turtle1", "turtle3", "turtle4")
 TRUTH_HZ, SEED = 20.0, 40
 
 
