@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
-from dmrl.formats.clocks import unwrap
+from dmrl.formats.clocks import settle_times, unwrap
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock
 from dmrl.formats.files.text_table import Dialect, read_table
@@ -95,16 +95,19 @@ def read_block(path: Path) -> LogBlock:
         raise SourceError(f"{path}:1: not {TIME_COLUMN} and names of variables. Pass another file")
     values = {name: text.parse_numbers(name) for name in text.columns}
     time_ms = values.pop(TIME_COLUMN)
-    if time_ms is None or not (known := np.isfinite(time_ms)).any():
+    known = np.flatnonzero(np.isfinite([] if time_ms is None else time_ms))
+    if time_ms is None or not len(known):
         raise SourceError(f"{path}: no number in {TIME_COLUMN}. Pass another file")
-    leave_out("rows without a time", path, int((~known).sum()))
+    leave_out("rows without a time", path, len(time_ms) - len(known))
+    time_ns = unwrap(time_ms[known], TIMESTAMP_BITS) * NS_PER_MS
+    found = settle_times(time_ns, lambda row: text.name_row(int(known[row])))
+    rows = known[found.rows]
     columns = {
-        name: _restore_type([text.columns[name][k] for k in np.flatnonzero(known)], column[known])
+        name: _restore_type([text.columns[name][k] for k in rows], column[rows])
         for name, column in values.items()
         if column is not None
     }
-    time_ns = unwrap(time_ms[known], TIMESTAMP_BITS) * NS_PER_MS
-    return LogBlock(DATE_SUFFIX.sub("", path.stem), time_ns, columns)
+    return LogBlock(DATE_SUFFIX.sub("", path.stem), found.time_ns, columns)
 
 
 def _restore_type(cells: list[str], values: Array) -> NDArray[Any]:

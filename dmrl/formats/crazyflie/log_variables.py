@@ -50,6 +50,9 @@ MAX_ZRANGE_MM = 8000.0  # the sensor reports values such as 32766 where it detec
 TF_PERIOD_NS = 50_000_000
 DISTANCE_VARIABLE = re.compile(r"ranging\.distance(\d+)")
 
+KNOWN_GROUPS = ("stateEstimate", "stabilizer.", "gyro.", "range.", "ranging.", "locSrv.")
+"""Beginnings of the names of variables that dmrl's own topics are derived from."""
+
 SampleStream = Iterable[Sample]
 
 
@@ -75,6 +78,7 @@ def build_streams(
         If the clock of the log starts again.
     """
     blocks = [_settle_block(block, where) for block in blocks]
+    _count_not_finite(blocks, where)
     _report_missing(robot, blocks, where)
     logged = [build_raw_stream(robot, block) for block in blocks]
     return logged + derive_streams(robot, blocks, names, where)
@@ -92,6 +96,15 @@ def derive_streams(
     found += iter_range_streams(robot, blocks, names, where)
     found += _iter_pose_streams(robot, blocks)
     return found
+
+
+def _count_not_finite(blocks: Sequence[LogBlock], where: object) -> None:
+    """Count the values of known variables that are not finite, which only the raw log keeps."""
+    for block in blocks:
+        for name, values in block.columns.items():
+            if name.startswith(KNOWN_GROUPS) and values.dtype.kind == "f":
+                count = int((~np.isfinite(values)).sum())
+                leave_out(f"values of {name} that are not finite", where, count)
 
 
 def _settle_block(block: LogBlock, where: object) -> LogBlock:

@@ -115,10 +115,11 @@ class TextTable:
             say(f"{self.path}: times without a zone are read as UTC. Write them with one, as in Z")
         told = [parse_time_ns(cell, scale, self.has_decimal_commas) for cell in cells]
         rows = [k for k, time_ns in enumerate(told) if time_ns is not None]
+        told_ns = np.array([time_ns for time_ns in told if time_ns is not None], np.int64)
         if len(rows) < len(cells):
             first = next(k for k, time_ns in enumerate(told) if time_ns is None)
             leave_out("rows without a time", self.name_row(first), len(cells) - len(rows))
-        found = settle_times([told[k] for k in rows], lambda k: self.name_row(rows[k]))
+        found = settle_times(told_ns, lambda k: self.name_row(rows[k]))
         kept = [rows[k] for k in found.rows[found.time_ns >= 0]]
         if not kept:
             raise SourceError(

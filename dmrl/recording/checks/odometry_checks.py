@@ -86,7 +86,12 @@ def _find_floor_ranges(of: Mapping[str, Signal]) -> Iterator[tuple[str, str]]:
     for topic, ranges in sorted(of.items()):
         names = topics.parse_topic(topics.RANGE, topic)
         height = of.get(topics.HEIGHT(names["robot"])) if names else None
-        if height is None or len(ranges[0]) < SAMPLES_MIN or len(height[0]) < SAMPLES_MIN:
+        if (
+            names is None
+            or height is None
+            or len(ranges[0]) < SAMPLES_MIN
+            or len(height[0]) < SAMPLES_MIN
+        ):
             continue
         near = np.abs(ranges[1] - _interpolate(height, ranges[0])) < FLOOR_NEAR_M
         if near.mean() > FLOOR_SHARE:

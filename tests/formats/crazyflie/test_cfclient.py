@@ -222,3 +222,11 @@ def test_a_block_of_one_row_is_one(tmp_path: Path) -> None:
     found = samples(tmp_path)
     assert [s.time_ns for s in found["/cf1/log/a"]] == [5_000_000]
     assert [s.time_ns for s in found["/cf1/log/b"]] == [5_000_000, 7_000_000]
+
+
+def test_a_client_that_logged_two_flights_is_refused_with_the_line(tmp_path: Path) -> None:
+    flight = [f"{10 * k},1.5" for k in range(300)]
+    text = "\n".join(["Timestamp,x", *(f"{5000 + 10 * k},1.5" for k in range(300)), *flight])
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(SourceError, match=r"a\.csv:302: time goes back from 7\.99 s to 0 s"):
+        cfclient.read_block(tmp_path / "a.csv")

@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dmrl.errors import SourceError
 from dmrl.formats.base import Options
 from dmrl.formats.crazyflie import usd_log
 from dmrl.samples.sample import Sample
+from dmrl.terminal.left_out import count_left_out
 
 from .. import foreign, plain_usd
 
@@ -204,3 +206,42 @@ def test_files_that_are_no_log_are_counted(
     assert f"2 files that are no micro-SD log (first at {tmp_path / 'a1'})" in (
         capsys.readouterr().err
     )
+
+
+STATE = [(f"stateEstimate.{n}", "f") for n in ("x", "y", "z", "roll", "pitch", "yaw")]
+
+
+def write_states(path: Path, times_us: np.ndarray, x: np.ndarray) -> None:
+    """A log of one event at these times."""
+    rows = [(1, int(t), (float(v), 0, 1, 0, 0, 0)) for t, v in zip(times_us, x, strict=True)]
+    path.write_bytes(plain_usd.encode({1: ("state", STATE)}, rows))
+
+
+def test_a_robot_that_started_again_is_refused_with_its_record(tmp_path: Path) -> None:
+    flight = np.arange(300) * 10_000
+    write_states(tmp_path / "log", np.concatenate([flight + 5_000_000, flight]), np.zeros(600))
+    with pytest.raises(
+        SourceError, match=r"log: state, record 301: time goes back from 7\.99 s to"
+    ):
+        samples(tmp_path / "log")
+
+
+def test_records_whose_time_jumps_or_was_not_set_are_left_out(tmp_path: Path) -> None:
+    times_us = np.arange(300) * 10_000 + 5_000_000
+    for wrong in (0, 9_000_000_000_000):
+        told = times_us.copy()
+        told[100] = wrong
+        write_states(tmp_path / "log", told, np.zeros(300))
+        with count_left_out() as left_out:
+            found = samples(tmp_path / "log")["/cf1/height"]
+        assert [s.time_ns for s in found] == (np.delete(times_us, 100) * 1000).tolist()
+        assert left_out.counts == {"rows whose time jumps and returns": 1}
+
+
+def test_values_that_are_not_finite_are_counted_and_stay_in_the_log(tmp_path: Path) -> None:
+    x = np.where(np.arange(300) % 3 == 0, np.nan, 1.0)
+    write_states(tmp_path / "log", np.arange(300) * 10_000, x)
+    with count_left_out() as left_out:
+        found = samples(tmp_path / "log")
+    assert left_out.counts == {"values of stateEstimate.x that are not finite": 100}
+    assert len(found["/cf1/pose"]) == 200 and len(found["/cf1/log/state"]) == 300
