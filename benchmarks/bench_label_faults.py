@@ -58,7 +58,7 @@ def pair_of(flight: Flight, one: str, other: str) -> Pair:
     order = np.argsort(time_s, kind="stable")
     time_s, range_m = time_s[order], range_m[order]
     good = usable_ranges(time_s, range_m) & (time_s >= grid_s[0]) & (time_s <= grid_s[-1])
-    own, peer = (log.track(grid_s) for log in logs)
+    own, peer = (log.to_track(grid_s) for log in logs)
     return Pair(grid_s, own, peer, time_s[good], range_m[good])
 
 

@@ -143,7 +143,9 @@ def pair_of(one: Flown, other: Flown, rng: np.random.Generator) -> Pair:
     grid_s = start_s + np.arange(int((end_s - start_s) * GRID_RATE_HZ) + 1) / GRID_RATE_HZ
     time_s, range_m = measured(one, other, rng)
     good = usable_ranges(time_s, range_m) & (time_s >= grid_s[0]) & (time_s <= grid_s[-1])
-    return Pair(grid_s, one.log.track(grid_s), other.log.track(grid_s), time_s[good], range_m[good])
+    return Pair(
+        grid_s, one.log.to_track(grid_s), other.log.track(grid_s), time_s[good], range_m[good]
+    )
 
 
 def truth(one: Flown, other: Flown, time_s: Array) -> Array:

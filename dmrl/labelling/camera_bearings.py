@@ -1,24 +1,19 @@
-"""Convert a camera's detections to bearings, and correct heights by their elevations."""
+"""Convert a camera's detections to bearings."""
 
 from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from dmrl.estimation.filters.ou_smoother import smooth_ornstein_uhlenbeck
-from dmrl.estimation.model.bearings import associate, to_bearing
+from dmrl.estimation.model.bearings import to_bearing
 from dmrl.estimation.model.pair import BearingMeasurements, Pair
 from dmrl.geometry.frames import horizontal_from_pixels
 from dmrl.labelling.observer_log import ObserverLog
-from dmrl.labelling.peer_positions import PeerPositions
-from dmrl.messages import STATUS_OK
 
 DISTANCE_RATIO = 0.25
 """Error of a detection's distance over the distance, for networks that estimate none."""
 MIN_DISTANCE_RATIO = 0.05
 """Smallest such error. Networks are overconfident about distances."""
-HEIGHT_ERROR_DECAY_S = 4.0
-"""Time in which the error of a height decays to 1/e, seconds."""
 
 Names = tuple[str, str]
 
@@ -83,44 +78,3 @@ def add_bearings(
         )
         for (one, other), pair in pairs.items()
     }
-
-
-def correct_heights(
-    found: PeerPositions, start_ns: int, seen: BearingMeasurements
-) -> tuple[PeerPositions, int]:
-    """Correct the heights of OK positions by elevations; also return the number of used images.
-
-    The solve assumes exact heights. The elevation of a detection at the solved position measures
-    the error, which decays in seconds.
-
-    Parameters
-    ----------
-    found
-        Positions of a peer, at the images among other times.
-    start_ns
-        Log time of second zero.
-    seen
-        Bearings of the observer's detections.
-    """
-    good = np.flatnonzero(found.status == STATUS_OK)
-    time_s = np.asarray((found.time_ns[good] - start_ns) * 1e-9)
-    place = np.minimum(np.searchsorted(time_s, seen.time_s - 1e-6), max(len(good) - 1, 0))
-    matched = np.abs(time_s[place] - seen.time_s) < 1e-6 if len(good) else np.zeros(0, bool)
-    place = place[matched]
-    if not len(place):
-        return found, 0
-    shown = BearingMeasurements(seen.time_s[matched], seen.bearing[matched], seen.std[matched])
-    here_m = found.xyz_m[good[place]]
-    best = associate(shown, here_m, found.covariance[good[place]])
-    images = np.flatnonzero(best.is_consistent)
-    at = images, best.nearest[images], 1
-    level_m = np.hypot(*here_m[images, :2].T)
-    off_m = (shown.bearing[at] - to_bearing(here_m[images])[:, 1]) * level_m
-    height_std_m = np.sqrt(found.covariance[good, 2, 2])
-    error_m, variance = smooth_ornstein_uhlenbeck(
-        time_s, height_std_m, HEIGHT_ERROR_DECAY_S, place[images], off_m, shown.std[at] * level_m
-    )
-    xyz, covariance = found.xyz_m.copy(), found.covariance.copy()
-    xyz[good, 2] += error_m
-    covariance[good, 2, 2] = variance
-    return replace(found, xyz_m=xyz, covariance=covariance), len(images)

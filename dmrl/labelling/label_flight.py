@@ -9,7 +9,7 @@ import numpy as np
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError, SettingError
 from dmrl.estimation.model.pair import BearingMeasurements
-from dmrl.labelling.camera_bearings import add_bearings, correct_heights, detections_to_bearings
+from dmrl.labelling.camera_bearings import add_bearings, detections_to_bearings
 from dmrl.labelling.flight_log import (
     OBSERVER_TOPICS,
     SENSOR_TOPICS,
@@ -33,7 +33,6 @@ from dmrl.labelling.recorded_camera import find_recorded_camera
 from dmrl.labelling.sensor_file import SensorConstants, read_sensors
 from dmrl.labelling.sensor_logs import SensorLogs, build_sensor_logs
 from dmrl.recording import Provenance, TimedMessage, rewrite
-from dmrl.terminal.progress import say
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +129,7 @@ def read_bearings(
     options
         The cameras, and the error of their attitude.
     method
-        Must be "batch".
+        Must be "batch" or "swarm".
     pixel_std_px
         Error of a detection in u and in v.
 
@@ -141,8 +140,8 @@ def read_bearings(
     MissingTopic
         If there are no detections, or a camera is unknown.
     """
-    if method != "batch":
-        raise SettingError(f"--detections goes with --method batch, not {method}")
+    if method not in ("batch", "swarm"):
+        raise SettingError(f"--detections goes with --method batch or swarm, not {method}")
     if not flight.detections:
         raise MissingTopic(topics.DETECTIONS("*"), flight.topics, flight.path)
     out = {}
@@ -187,12 +186,7 @@ def label_flight(
     positions = {}
     for (robot, peer), estimate in estimates.items():
         pair = orient_pair(logs.pairs, (robot, peer))
-        found = sample_positions(logs.start_ns, pair, estimate, exposures[robot])
-        if robot in bearings:
-            found, used = correct_heights(found, logs.start_ns, bearings[robot])
-            images_seen = len(bearings[robot].time_s)
-            say(f"{robot} -> {peer}: {used} detections in {images_seen} images counted")
-        positions[robot, peer] = found
+        positions[robot, peer] = sample_positions(logs.start_ns, pair, estimate, exposures[robot])
     filming = [robot for robot, times in images.items() if len(times)]
     labels = {}
     for robot in filming:

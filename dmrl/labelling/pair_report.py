@@ -9,14 +9,6 @@ import numpy as np
 from dmrl.estimation.model.position_metrics import is_covered_by_truth
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.estimate import Estimate, RejectionReason
-from dmrl.estimation.solver.residuals import (
-    CLOCK,
-    OWN_GYRO,
-    OWN_SCALE,
-    PEER_GYRO,
-    PEER_SCALE,
-    RANGE_BIAS,
-)
 from dmrl.labelling.flight_log import FlightLog
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
 from dmrl.labelling.peer_positions import PeerPositions
@@ -108,8 +100,8 @@ def report_pair(
         positions=len(ok),
         ok_share=float(ok.mean()),
         ambiguous_share=float((positions.status == STATUS_AMBIGUOUS).mean()),
-        range_bias_m=float(estimate.constants[RANGE_BIAS]),
-        gyro_difference_radps=float(estimate.constants[PEER_GYRO] - estimate.constants[OWN_GYRO]),
+        range_bias_m=estimate.value("range_offset", 0, 1),
+        gyro_difference_radps=estimate.value("gyro_bias", 1) - estimate.value("gyro_bias", 0),
         sigma_m=float(np.median(sigma)),
         rmse_ok_m=_rms(error, ok),
         rmse_m=_rms(error, np.ones_like(ok)),
@@ -174,10 +166,9 @@ def find_suspect_sensors(pair: tuple[str, str], estimate: Estimate) -> list[str]
     estimate
         Of the peer by the observer.
     """
-    found, said = estimate.constants, []
-    for robot, turn, scale in zip(
-        pair, found[[OWN_GYRO, PEER_GYRO]], found[[OWN_SCALE, PEER_SCALE]], strict=True
-    ):
+    said = []
+    for side, robot in enumerate(pair):
+        turn, scale = (estimate.value(name, side) for name in ("gyro_bias", "velocity_scale"))
         if abs(turn) > MAX_GYRO_BIAS_RADPS:
             said.append(
                 f"{robot}'s yaw rate seems biased by {turn:.2g} rad/s; it was solved for. "
@@ -189,13 +180,14 @@ def find_suspect_sensors(pair: tuple[str, str], estimate: Estimate) -> list[str]
                 f"{'large' if scale > 0 else 'small'}; it was solved for. Is its height right? "
                 "Where it is so in every flight: dmrl calibrate --sensors"
             )
-    if abs(found[RANGE_BIAS]) > MAX_RANGE_OFFSET_M:
+    offset_m, clock_s = estimate.value("range_offset", 0, 1), estimate.value("clock", 1)
+    if abs(offset_m) > MAX_RANGE_OFFSET_M:
         said.append(
-            f"ranges seem {found[RANGE_BIAS]:+.2f} m off; it was solved for. Measure it once, "
+            f"ranges seem {offset_m:+.2f} m off; it was solved for. Measure it once, "
             "and give it with --range-offset-m, or let flights tell: dmrl calibrate --sensors"
         )
-    if abs(found[CLOCK]) > MAX_CLOCK_OFFSET_S:
-        said.append(f"{pair[1]}'s log seems {found[CLOCK]:+.2f} s off. Try: dmrl align")
+    if abs(clock_s) > MAX_CLOCK_OFFSET_S:
+        said.append(f"{pair[1]}'s log seems {clock_s:+.2f} s off. Try: dmrl align")
     return said
 
 

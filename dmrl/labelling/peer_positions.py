@@ -57,7 +57,10 @@ def sample_positions(
     time_s = (time_ns - start_ns) * 1e-9
     xy, spread, status = estimate.interpolate_at(np.asarray(time_s, float))
     z = np.interp(time_s, pair.time_s, pair.peer.height_m - pair.own.height_m)
+    if estimate.height_m is not None:
+        z = z - np.interp(time_s, estimate.time_s, estimate.height_m)
     covariance = np.zeros((len(time_ns), 3, 3))
     covariance[:, :2, :2] = spread
-    covariance[:, 2, 2] = estimate.noise.height_std_m**2
+    std = estimate.noise.height_std_m if estimate.height_std_m is None else estimate.height_std_m
+    covariance[:, 2, 2] = np.interp(time_s, estimate.time_s, std + 0 * estimate.time_s) ** 2
     return PeerPositions(time_ns, np.column_stack([xy, z]), covariance, status)

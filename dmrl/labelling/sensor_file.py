@@ -13,9 +13,8 @@ import numpy as np
 import tomli_w
 
 from dmrl.errors import SourceError
-from dmrl.estimation.model.pair import GLOBALS_FROM_PEER, Array
-from dmrl.estimation.solver.keyframes import GLOBALS
-from dmrl.estimation.solver.residuals import OBSERVER_CONSTANTS, RANGE_BIAS, RANGE_SCALE
+from dmrl.estimation.model.pair import Array
+from dmrl.estimation.solver.unknowns import TABLE, Subject
 from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.guards.paths import refuse_pipe
 
@@ -24,15 +23,12 @@ Value = tuple[float, float]
 """A mean over flights, and the standard deviation of the next flight about it."""
 Values = Mapping[str, Value]
 
-_KEYS = ("yaw_rate_bias_radps", "velocity_scale", "vx_bias_mps", "vy_bias_mps")
-OF_ROBOT = {
-    key: (place, GLOBALS_FROM_PEER[place])
-    for key, place in zip(_KEYS, OBSERVER_CONSTANTS, strict=True)
-}
-"""Index into ``GLOBALS`` of a robot's constant as observer, and as peer."""
-OF_PAIR = {"range_offset_m": RANGE_BIAS, "range_scale": RANGE_SCALE}
-"""Index into ``GLOBALS`` of a pair's constant. Clock offsets differ in every flight."""
-SCALES = ("velocity_scale", "range_scale")
+OF_ROBOT, OF_PAIR = (
+    {row.key: row.name for row in TABLE if row.key and row.owner == owner}
+    for owner in ("robot", "pair")
+)
+"""Names of the unknowns of a robot and of a pair, by their keys in the file."""
+SCALES = tuple(row.key for row in TABLE if row.key and row.unit == "1")
 MAX_MEAN, MAX_SCALE_MEAN = 60.0, 0.9
 """Largest mean of a constant, and of a scale."""
 HEAD = """\
@@ -77,15 +73,15 @@ class SensorConstants:
         longer_m = _get_mean(known, "range_offset_m")
         return np.asarray((measured - longer_m) / (1 + _get_mean(known, "range_scale")))
 
-    def to_prior_std(self, pair: Names) -> Array | None:
-        """Return (G,) prior standard deviations, infinite where unknown; None: all unknown."""
-        out = np.full(len(GLOBALS), np.inf)
+    def to_prior_std(self, pair: Names) -> dict[Subject, float]:
+        """Return the prior standard deviations of a pair's known constants."""
+        out: dict[Subject, float] = {}
         for side, robot in enumerate(pair):
             for key, value in self.robots.get(robot, {}).items():
-                out[OF_ROBOT[key][side]] = value[1]
+                out[OF_ROBOT[key], (side,)] = value[1]
         for key, value in self.pairs.get(pair, {}).items():
-            out[OF_PAIR[key]] = value[1]
-        return out if np.isfinite(out).any() else None
+            out[OF_PAIR[key], (0, 1)] = value[1]
+        return out
 
 
 def _get_mean(known: Values, key: str) -> float:

@@ -213,7 +213,7 @@ def _build_pair(
     time_s, range_m = measured
     on_grid = time_s <= grid_s[-1]  # which ends up to a step before the logs do
     ranged = time_s[on_grid], range_m[on_grid]
-    return Pair(grid_s, tracks[0], tracks[1], *ranged, calibrated_std=known.to_prior_std(names))
+    return Pair(grid_s, tracks[0], tracks[1], *ranged, known_std=known.to_prior_std(names))
 
 
 def _select_ranges(

@@ -40,7 +40,7 @@ class Settings:
         Standard deviation of roll and pitch, radians.
     detections
         Solve with the detections that are in the recording as well, whosever they may be, wrong
-        ones among them. For the method "batch".
+        ones among them. For the methods "batch" and "swarm".
     pixel_std_px
         Error of such a detection in u and in v, pixels.
     range_offset_m

@@ -1,4 +1,4 @@
-"""Detections as bearings and distances, and heights that they correct."""
+"""Detections as bearings and distances."""
 
 from dataclasses import replace
 
@@ -6,18 +6,14 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.model.bearings import to_bearing
-from dmrl.estimation.model.pair import Array
 from dmrl.geometry.frames import Camera, pixels_from_horizontal
 from dmrl.labelling.camera_bearings import (
     DISTANCE_RATIO,
     MIN_DISTANCE_RATIO,
     add_bearings,
-    correct_heights,
     detections_to_bearings,
 )
 from dmrl.labelling.observer_log import ObserverLog
-from dmrl.labelling.peer_positions import PeerPositions
-from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
 
 from ..estimation.sighted_flights import still_pair
 
@@ -27,11 +23,6 @@ TIME_NS = START_NS + np.arange(COUNT) * STEP_NS
 SWAY = np.sin(np.arange(COUNT) / 10)
 TRUE_M = np.column_stack([2 + 0 * SWAY, 0.3 * SWAY, 0.1 + 0 * SWAY])
 TILT = np.column_stack([0.25 * np.cos(SWAY), -0.15 + 0.05 * SWAY])
-
-
-def known(off_m: Array, status: int = STATUS_OK) -> PeerPositions:
-    covariance = np.tile(np.diag([0.01, 0.01, 0.04]), (COUNT, 1, 1))
-    return PeerPositions(TIME_NS, TRUE_M + off_m, covariance, np.full(COUNT, status, np.int8))
 
 
 def seen(sigma_m: float = 0.0, every: int = 1) -> ObserverLog:
@@ -84,31 +75,3 @@ def test_both_robots_of_a_pair_get_what_their_cameras_showed() -> None:
     assert pairs["a", "b"].peer_bearings is sees and pairs["a", "b"].own_bearings is None
     assert pairs["b", "c"].own_bearings is sees and pairs["b", "c"].peer_bearings is None
     assert pairs["a", "b"].swap_robots().own_bearings is sees
-
-
-def test_heights_go_to_where_the_peer_was_seen() -> None:
-    sees = detections_to_bearings(seen(every=2), START_NS, 3.0, 0.005)
-    before = known(np.array([0.0, 0.02, 0.15]))
-    after, used = correct_heights(before, START_NS, sees)
-    assert used == COUNT // 2
-    assert (after.xyz_m[:, :2] == before.xyz_m[:, :2]).all()
-    assert np.abs(after.xyz_m - TRUE_M)[:, 2].max() < 0.03
-    assert (after.covariance[:, 2, 2] < 0.2 * before.covariance[:, 2, 2]).all()
-    assert (after.status == before.status).all()
-
-
-def test_what_is_not_ok_or_was_not_seen_stays() -> None:
-    sees = detections_to_bearings(seen(), START_NS, 3.0, 0.005)
-    open_ones = known(np.array([0.0, 0.0, 0.15]), STATUS_AMBIGUOUS)
-    assert correct_heights(open_ones, START_NS, sees) == (open_ones, 0)
-    elsewhere = known(np.array([0.0, 1.5, 0.15]))
-    after, used = correct_heights(elsewhere, START_NS, sees)
-    assert used == 0
-    assert after.xyz_m == pytest.approx(elsewhere.xyz_m)
-    assert after.covariance == pytest.approx(elsewhere.covariance)
-    half = np.where(np.arange(COUNT) < 20, STATUS_AMBIGUOUS, STATUS_OK).astype(np.int8)
-    mixed = replace(known(np.array([0.0, 0.0, 0.15])), status=half)
-    after, used = correct_heights(mixed, START_NS, sees)
-    assert used == 20
-    assert (after.xyz_m[:20] == mixed.xyz_m[:20]).all()
-    assert np.abs(after.xyz_m[20:] - TRUE_M[20:])[:, 2].max() < 0.03

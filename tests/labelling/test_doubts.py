@@ -3,14 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.model.pair import GLOBALS_FROM_PEER
-from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.keyframes import GLOBALS, NoiseModel
+from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
+from dmrl.estimation.solver.keyframes import NoiseModel
+from dmrl.estimation.solver.unknowns import Subject, from_peer
 from dmrl.labelling.pair_report import explain_refusal, explain_refusals, find_suspect_sensors
 
 
-def estimate(status: int = 0, **constants: float) -> Estimate:
-    found = np.array([constants.get(name, 0.0) for name in GLOBALS])
+def estimate(status: int = 0, constants: dict[Subject, float] | None = None) -> Estimate:
+    found = np.array([(constants or {}).get(s, 0.0) for s, _ in PAIR_LAYOUT.constants])
     state, covariance = np.zeros((2, 3)), np.stack([np.eye(3)] * 2)
     return Estimate(
         np.arange(2.0), state, covariance, np.full(2, status, np.int8), found, NoiseModel()
@@ -18,26 +18,24 @@ def estimate(status: int = 0, **constants: float) -> Estimate:
 
 
 def test_sensors_in_order_are_not_worth_a_line() -> None:
-    assert (
-        find_suspect_sensors(("cf1", "cf2"), estimate(range_bias_m=0.1, own_velocity_scale=0.05))
-        == []
-    )
+    small: dict[Subject, float] = {("range_offset", (0, 1)): 0.1, ("velocity_scale", (0,)): 0.05}
+    assert find_suspect_sensors(("cf1", "cf2"), estimate(constants=small)) == []
 
 
 @pytest.mark.parametrize(
     ("constant", "value", "words"),
     [
-        ("peer_gyro_bias_radps", 0.05, "cf2's yaw rate seems biased by 0.05 rad/s"),
-        ("own_gyro_bias_radps", -0.05, "cf1's yaw rate seems biased by -0.05 rad/s"),
-        ("own_velocity_scale", 0.2, "cf1's velocity seems 20% too large"),
-        ("range_bias_m", 0.35, "ranges seem +0.35 m off"),
-        ("peer_clock_s", 0.08, "cf2's log seems +0.08 s off"),
+        (("gyro_bias", (1,)), 0.05, "cf2's yaw rate seems biased by 0.05 rad/s"),
+        (("gyro_bias", (0,)), -0.05, "cf1's yaw rate seems biased by -0.05 rad/s"),
+        (("velocity_scale", (0,)), 0.2, "cf1's velocity seems 20% too large"),
+        (("range_offset", (0, 1)), 0.35, "ranges seem +0.35 m off"),
+        (("clock", (1,)), 0.08, "cf2's log seems +0.08 s off"),
     ],
 )
 def test_a_sensor_that_is_off_is_named_with_what_to_do(
-    constant: str, value: float, words: str
+    constant: Subject, value: float, words: str
 ) -> None:
-    (line,) = find_suspect_sensors(("cf1", "cf2"), estimate(**{constant: value}))
+    (line,) = find_suspect_sensors(("cf1", "cf2"), estimate(constants={constant: value}))
     assert line.startswith(words)
 
 
@@ -50,8 +48,8 @@ def test_a_flight_of_which_nothing_is_kept_says_why_and_what_to_do() -> None:
 
 
 def test_what_is_off_is_the_reason_where_nothing_is_kept_and_a_line_of_its_own_elsewhere() -> None:
-    lost = estimate(status=1, peer_gyro_bias_radps=0.05)
-    there = replace(lost, constants=lost.constants[GLOBALS_FROM_PEER])
+    lost = estimate(status=1, constants={("gyro_bias", (1,)): 0.05})
+    there = replace(lost, constants=from_peer(PAIR_LAYOUT, lost.constants))
     here, back = explain_refusals([("cf1", "cf2")], {("cf1", "cf2"): lost, ("cf2", "cf1"): there})
     assert here.startswith("cf1 sees cf2: nothing is kept: cf2's yaw rate seems biased by 0.05")
     assert "exact to 1.00 m" in here

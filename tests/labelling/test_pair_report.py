@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.residuals import OWN_GYRO, PEER_GYRO, RANGE_BIAS
+from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
 from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.pair_report import PairReport, report_pair
 from dmrl.labelling.peer_positions import PeerPositions
@@ -30,10 +29,13 @@ def found() -> PeerPositions:
 
 
 def estimate() -> Estimate:
-    constants = np.zeros(max(RANGE_BIAS, OWN_GYRO, PEER_GYRO) + 1)
-    constants[[RANGE_BIAS, OWN_GYRO, PEER_GYRO]] = 0.35, 0.02, 0.05
+    constants = np.zeros(len(PAIR_LAYOUT.constants))
+    for value, name, *own in ((0.35, "range_offset", 0, 1), (0.02, "gyro_bias", 0)):
+        constants[PAIR_LAYOUT.find(name, *own)] = value
+    constants[PAIR_LAYOUT.find("gyro_bias", 1)] = 0.05
     made = object.__new__(Estimate)
     object.__setattr__(made, "constants", constants)
+    object.__setattr__(made, "layout", PAIR_LAYOUT)
     object.__setattr__(made, "rejection_reason", None)
     return made
 

@@ -22,7 +22,7 @@ def test_a_peer_above_is_above_at_each_time_by_the_sensors_of_heights() -> None:
     spread = np.tile(np.diag([0.04, 0.09, 0.01]), (100, 1, 1))
     status = np.zeros(100, np.int8)
     noise = NoiseModel(height_std_m=0.3)
-    found = Estimate(time_s[::10], state, spread, status, np.zeros(11), noise)
+    found = Estimate(time_s[::10], state, spread, status, np.zeros(13), noise)
     start_ns, images_ns = 7 * SECOND_NS + 20_000_000, np.array([5, 8, 99]) * SECOND_NS + 33
     made = sample_positions(start_ns, pair, found, images_ns)
     later_s = (made.time_ns - start_ns) * 1e-9
@@ -35,3 +35,21 @@ def test_a_peer_above_is_above_at_each_time_by_the_sensors_of_heights() -> None:
         int(np.searchsorted(made.time_ns, 8 * SECOND_NS + 33))
     ]
     assert (made.time_ns[0], made.time_ns[-1]) == (7_050_000_000, 16_900_000_000)
+
+
+def test_an_estimated_height_error_is_removed() -> None:
+    time_s = np.arange(0, 10, 0.01)
+    none, gap = np.zeros(len(time_s)), np.zeros(len(time_s), bool)
+    own, peer = (SensorTrack(none, none, none, high + none, gap) for high in (1.0, 1.5))
+    pair = Pair(time_s, own, peer, np.array([1.0]), np.array([2.0]))
+    key_s, count = time_s[::10], len(time_s[::10])
+    spread, status = np.tile(np.eye(3), (count, 1, 1)), np.zeros(count, np.int8)
+    error_m, std_m = np.linspace(0.1, 0.3, count), np.full(count, 0.02)
+    found = Estimate(
+        key_s, np.ones((count, 3)), spread, status, np.zeros(13), NoiseModel(),
+        height_m=error_m, height_std_m=std_m,
+    )  # fmt: skip
+    made = sample_positions(0, pair, found, np.zeros(0, np.int64))
+    wanted = 0.5 - np.interp(made.time_ns * 1e-9, key_s, error_m)
+    assert made.xyz_m[:, 2] == pytest.approx(wanted)
+    assert made.covariance[:, 2, 2] == pytest.approx(0.02**2)

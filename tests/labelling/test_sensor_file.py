@@ -6,7 +6,7 @@ import pytest
 
 from dmrl.errors import SourceError
 from dmrl.estimation.flight.pairs import estimate_pairs
-from dmrl.estimation.solver.residuals import CLOCK, OWN_GYRO, PEER_GYRO, PEER_SCALE, RANGE_BIAS
+from dmrl.estimation.solver.unknowns import Subject
 from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.sensor_file import SensorConstants, read_sensors, write_sensors
 from dmrl.labelling.sensor_logs import build_sensor_logs
@@ -53,16 +53,16 @@ def test_logs_come_out_as_the_sensors_should_have_said() -> None:
 
 
 def test_sigmas_stand_where_the_solve_looks_for_them() -> None:
-    std = KNOWN.to_prior_std(("cf1", "cf2"))
-    assert std is not None
-    told = std[[RANGE_BIAS, OWN_GYRO, PEER_GYRO, PEER_SCALE]]
-    assert told == pytest.approx([0.04, 0.001, 0.002, 0.01])
-    assert np.isinf(std[CLOCK])
-    back = KNOWN.to_prior_std(("cf2", "cf3"))
-    assert back is not None
-    assert back[OWN_GYRO] == 0.002
-    assert np.isinf(back[[PEER_GYRO, RANGE_BIAS]]).all()
-    assert KNOWN.to_prior_std(("cf3", "cf4")) is None
+    assert KNOWN.to_prior_std(("cf1", "cf2")) == {
+        ("range_offset", (0, 1)): 0.04,
+        ("range_scale", (0, 1)): 0.01,
+        ("gyro_bias", (0,)): 0.001,
+        ("gyro_bias", (1,)): 0.002,
+        ("velocity_scale", (1,)): 0.01,
+        ("vx_bias", (1,)): 0.01,
+        ("vy_bias", (1,)): 0.01,
+    }
+    assert KNOWN.to_prior_std(("cf1", "cf3")) == {("gyro_bias", (0,)): 0.001}
 
 
 @pytest.mark.parametrize(
@@ -98,20 +98,19 @@ def test_a_recording_is_read_without_what_is_known_to_be_off(tmp_path: Path) -> 
     assert known.own.vx_mps == pytest.approx(found.own.vx_mps)
     assert known.peer.vx_mps == pytest.approx((found.peer.vx_mps - 0.02) / 1.15)
     assert known.own.yaw_rate_radps == pytest.approx(found.own.yaw_rate_radps - 0.01)
-    assert known.calibrated_std == pytest.approx(KNOWN.to_prior_std(("cf1", "cf2")))
-    assert found.calibrated_std is None
-    swapped = known.swap_robots().calibrated_std
-    assert swapped is not None
-    assert swapped[[OWN_GYRO, PEER_GYRO]] == pytest.approx([0.002, 0.001])
+    assert known.known_std == KNOWN.to_prior_std(("cf1", "cf2"))
+    assert not found.known_std
+    swapped = known.swap_robots().known_std
+    assert [swapped["gyro_bias", (side,)] for side in (0, 1)] == [0.002, 0.001]
+    assert swapped["range_offset", (0, 1)] == 0.04
 
 
 @pytest.mark.heavy
 def test_what_is_known_exactly_is_not_solved_for() -> None:
     pair = pair_of(flown("in_view", "realistic", 31))
     free = estimate_pairs([pair])[0][0]
-    std = np.full(len(free.constants), np.inf)
-    std[[RANGE_BIAS, PEER_SCALE]] = 1e-4
-    held = estimate_pairs([replace(pair, calibrated_std=std)])[0][0]
-    assert np.abs(held.constants[[RANGE_BIAS, PEER_SCALE]]).max() < 1e-3
-    assert np.abs(free.constants[[RANGE_BIAS, PEER_SCALE]]).min() > 3e-3
-    assert np.abs(held.constants[OWN_GYRO] - free.constants[OWN_GYRO]) < 0.01
+    known: dict[Subject, float] = {("range_offset", (0, 1)): 1e-4, ("velocity_scale", (1,)): 1e-4}
+    held = estimate_pairs([replace(pair, known_std=known)])[0][0]
+    for name, own in known:
+        assert abs(held.value(name, *own)) < 1e-3 < 3e-3 < abs(free.value(name, *own))
+    assert abs(held.value("gyro_bias", 0) - free.value("gyro_bias", 0)) < 0.01

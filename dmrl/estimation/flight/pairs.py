@@ -1,22 +1,24 @@
 """Estimate relative positions of many pairs with covariance and status: the entry point."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Literal
+from itertools import pairwise
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
 
 from dmrl.estimation.filters import ekf
-from dmrl.estimation.flight.hypotheses import between_solution_covariance
-from dmrl.estimation.flight.initial_guesses import InitialGuesses, find_initial_guesses
-from dmrl.estimation.flight.multi_start import find_solutions, select_distinct
-from dmrl.estimation.flight.segments import (
-    join_segments,
-    prefer_confident_segments,
-    split_at_dropouts,
+from dmrl.estimation.flight.pair_solver import (
+    PairSolution,
+    relative_modes,
+    solve_pair,
+    squared_distances,
 )
+from dmrl.estimation.flight.windows import carry_information, split_windows
+from dmrl.estimation.model.bearings import ASSOCIATION_GATE
 from dmrl.estimation.model.gate import GATE_M
+from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Mask, Pair
 from dmrl.estimation.model.status import (
     AMBIGUOUS,
@@ -25,57 +27,55 @@ from dmrl.estimation.model.status import (
     Statuses,
     classify_positions,
 )
-from dmrl.estimation.solver.camera_residuals import (
-    keep_consistent_cameras,
-    keyframes_with_agreement,
+from dmrl.estimation.search.hypotheses import follow_hypotheses
+from dmrl.estimation.search.modes import coarsen, place_peer
+from dmrl.estimation.signals.contradictions import drop_contradictions
+from dmrl.estimation.solver.covariance import (
+    calm_motion,
+    compute_covariance,
+    odometry_energy,
+    relative_covariance,
 )
-from dmrl.estimation.solver.covariance import compute_covariance, motion_energy
-from dmrl.estimation.solver.estimate import Estimate, RejectionReason, seen_from_peer
+from dmrl.estimation.solver.estimate import (
+    PAIR_LAYOUT,
+    Estimate,
+    RejectionReason,
+    seen_from_peer,
+)
 from dmrl.estimation.solver.keyframes import (
-    GLOBALS,
-    KEYFRAME_HZ,
-    KeyframeProblem,
     NoiseModel,
-    build_keyframes,
+    Problem,
+    build_problem,
+    odometry_dropout,
+    range_dropout,
 )
-from dmrl.estimation.solver.levenberg_marquardt import ROUGH_TOLERANCE, MapEstimate, solve
-from dmrl.estimation.solver.noise_selection import fit_range_noise, select_noise_model
-from dmrl.estimation.solver.residuals import RANGE_BIAS, RANGE_ERROR
+from dmrl.estimation.solver.levenberg_marquardt import Carried, Solver, relative_path
+from dmrl.estimation.solver.residuals import Values, odometry_factor
 
-SIGMA_INFLATION = 1.03
-"""Factor on the sigmas of the batch solve. Chosen on simulated flights in view: 93 to 99 % of the
-true positions are inside the 95 % ellipse."""
+OUTPUT_HZ = 10.0
+"""Rate of the estimates, Hz: positions between keyframes follow the odometry."""
+SIGMA_INFLATION = 1.2
+"""Factor on the sigmas of a solution: no sensor has exactly the noise of its model. Chosen on 42
+simulated flights of 100 s: 95 % of the true positions are inside the 95 % ellipse at 1.1."""
 GATE_SIGMA_FACTOR = 0.75
-"""Factor on the sigmas that the gate uses. The written sigmas leave room for constant errors and so
-predict more bad positions than there are. No figure of the choice is recorded."""
-NOISE_RATIO_BOUNDS, MAX_CORRELATED_RANGE_M = (1.1, 1.5), 0.1
-"""Velocity noise relative to the default model, and standard deviation of correlated range errors,
-metres.
-
-At the first ratio the gate uses the smaller sigmas, at the second the written ones, and in between
-it interpolates. Beyond the range error it uses the written ones. The lasting errors of unusually
-bad sensors are unknown, and the best-looking part of their flights is mostly chance. The range
-error was raised because one of six realistic flights without a fault had been lost."""
-SMOOTHER_SIGMA_INFLATION = 1.5
-"""Factor on the sigmas of the smoother. No record of how the value was chosen."""
-MIN_OWN_ENERGY, MIN_RELATIVE_ENERGY = 0.022, 0.04
-"""Smallest mean square, (m/s)^2, of the observer's velocity and of the relative velocity that make
-the bearing observable. Bad logs of robots at rest reach 0.018 and 0.03."""
+"""Factor on the written sigmas that the gate uses."""
+CONTRADICTED_SIGMAS = 15.0
+"""Odometry that differs from the solution by more has dropped out for the status, in sigmas."""
+RANGE_MEDIAN, RANGE_MARGIN_M = 21, 0.5
+"""Number of ranges in the median that bounds a position; and margin of that bound, metres."""
+MIN_MOTION_ENERGY = 1.0
+"""Smallest energy of a motion that makes the bearing observable, relative to that of the odometry
+noise over a second: 0.06 m/s with the default noise, 0.04 m/s with calibrated sensors."""
 MIN_CAMERA_S = 3.0
-"""Shortest time with consistent images that makes the bearing of a motionless flight observable,
-seconds. No record of how the value was chosen."""
-RANGE_MEDIAN_REACH, RANGE_MARGIN_M = 10, 0.5
-"""Number of ranges before and after in the median that bounds a position; and margin of that bound,
-metres. No record of how the values were chosen."""
-RIVAL_COST_MARGIN, MAX_RIVALS = 8.0, 3
-"""Largest cost above the best, and largest number, of other solutions that are solved under the
-selected noise. No record of how the values were chosen."""
+"""Shortest time with consistent images that replaces motion, seconds."""
+SMOOTHER_SIGMA_INFLATION = 1.5
+"""Factor on the sigmas of the smoother, whose track is no minimum of the cost."""
 MAJORITY_SHARE = 0.5
 """Share of a flight that determines the reason for its rejection."""
 
 
 def estimate_pairs(
-    pairs: list[Pair],
+    pairs: Sequence[Pair],
     method: Literal["batch", "smoother"] = "batch",
     *,
     noise: NoiseModel | None = None,
@@ -86,97 +86,228 @@ def estimate_pairs(
     Parameters
     ----------
     pairs
-        Any number of pairs. Pairs of equal length share work.
+        Any number of pairs.
     method
-        The batch solve, or the smoother that provides its initial guesses.
+        The batch solve, or the filter and smoother that provide its first guesses.
     noise
         Noise model of the sensors. None: selected for each flight.
     gate_m
         Largest error of a good position, metres.
     """
-    problems = [build_keyframes(pair, KEYFRAME_HZ) for pair in pairs]
-    made = []
-    begun = find_initial_guesses(problems, noise or NoiseModel())
-    for pair, flight, starts in zip(pairs, problems, begun, strict=True):
+    out = []
+    for logged in pairs:
+        pair = drop_contradictions(logged)
         if method == "smoother":
-            made.append(
-                _both_directions(
-                    flight, _estimate_by_smoother(flight, noise or NoiseModel(), starts), gate_m
-                )
-            )
-            continue
-        # The segments between long dropouts are solved first, as flights of their own. Joined,
-        # they are one more initial guess of the whole flight.
-        cut = split_at_dropouts(pair)
-        parts = estimate_pairs(cut, noise=noise, gate_m=gate_m) if cut else []
-        pieced = [join_segments(flight, [here for here, _ in parts])] if parts else []
-        whole = _estimate_by_batch(flight, noise, starts, pieced)
-        made.append(prefer_confident_segments(_both_directions(flight, whole, gate_m), parts))
-    return made
+            pieces = [_smooth_piece(pair, noise)]
+        else:
+            pieces = list(_solve_pieces(pair, noise))
+        out.append(_both_directions(pair, pieces, gate_m))
+    return out
+
+
+class Piece(NamedTuple):
+    """Estimate of a window, without statuses.
+
+    ``silent`` (K,) dropouts of odometry or contradictory odometry, ``sighted`` (2, K) consistent
+    images of either robot nearby, ``energy`` (3,) mean squares of the own, peer and relative
+    velocity without noise, relative to that noise.
+    """
+
+    estimate: Estimate
+    silent: Mask
+    sighted: Mask
+    energy: Array
+
+
+def _solve_pieces(pair: Pair, noise: NoiseModel | None) -> Iterator[Piece]:
+    """Yield the estimates of the windows of a flight."""
+    carried: Carried | None = None
+    for window in split_windows(float(pair.time_s[0]), float(pair.time_s[-1])):
+        part = pair.crop(window.start_s, window.end_s)
+        solution = solve_pair(build_problem({(0, 1): part}), noise, carried)
+        times = output_times(pair.time_s[0], window.from_s, window.until_s)
+        yield _to_piece(solution, part, times)
+        if not window.is_last:
+            solver = Solver(solution.problem, solution.carried)
+            carried = carry_information(solver, solution.values, window.next_s)
+
+
+def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
+    """Return the estimate of a solved window at some times."""
+    problem, values, key_s = solution.problem, solution.values, solution.problem.keyframe_s
+    spread = relative_covariance(values.state, solution.keyframes) * SIGMA_INFLATION**2
+    spread = spread + solution.between_modes(relative_modes(solution))
+    state = interpolate_states(problem, values.state, time_s)
+    error = problem.layout.state_column("range_error", 0, 1)
+    covariances = solution.keyframes, solution.constants
+    heights, height_std = height_errors(problem, values, covariances, (0, 1))
+    estimate = Estimate(
+        time_s,
+        relative_path(state),
+        interpolate_at(time_s, key_s, spread),
+        np.zeros(len(time_s), np.int8),
+        values.constants,
+        problem.noise,
+        problem.layout,
+        interpolate_at(time_s, key_s, heights),
+        interpolate_at(time_s, key_s, height_std),
+        None if error is None else np.interp(time_s, key_s, values.state[:, error]),
+        constants_covariance=solution.constants,
+        modes=len(solution.modes),
+    )
+    contradicted = np.zeros(len(key_s) - 1, bool)
+    for robot in range(2):
+        rows = odometry_factor(problem, problem.layout, robot, values)
+        contradicted |= (rows.square > CONTRADICTED_SIGMAS**2).any(axis=1)
+    step = np.clip(np.searchsorted(key_s, time_s, "right") - 1, 0, len(contradicted) - 1)
+    silent = odometry_dropout(pair, time_s) | contradicted[step]
+    return Piece(estimate, silent, _sighted(solution, time_s), motion_energy(problem, values))
+
+
+def _smooth_piece(pair: Pair, noise: NoiseModel | None) -> Piece:
+    """Return the estimate of the likeliest track of the filter and smoother."""
+    problem = build_problem({(0, 1): pair})
+    problem = replace(problem, noise=noise or problem.noise)
+    coarse = coarsen(problem)
+    best = follow_hypotheses(problem)[0]
+    values = place_peer(coarse, best.pose, best.gyro_bias_radps)
+    keyframes, _ = compute_covariance(Solver(coarse), values)
+    spread = relative_covariance(values.state, keyframes) * SMOOTHER_SIGMA_INFLATION**2
+    time_s = output_times(pair.time_s[0], pair.time_s[0], pair.time_s[-1])
+    states = relative_path(interpolate_states(coarse, values.state, time_s))
+    none, zeros = np.zeros(len(time_s), np.int8), np.zeros(len(PAIR_LAYOUT.constants))
+    covariance = interpolate_at(time_s, problem.keyframe_s, spread)
+    estimate = Estimate(time_s, states, covariance, none, zeros, problem.noise)
+    unseen = np.zeros((2, len(time_s)), bool)
+    energy = motion_energy(problem, values)
+    return Piece(estimate, odometry_dropout(pair, time_s), unseen, energy)
+
+
+def output_times(zero_s: float, from_s: float, until_s: float) -> Array:
+    """Return the times of estimates in an interval, on a grid that begins at ``zero_s``."""
+    first = int(np.ceil((from_s - zero_s) * OUTPUT_HZ - 1e-6))
+    last = int(np.floor((until_s - zero_s) * OUTPUT_HZ + 1e-6))
+    return np.asarray(zero_s + np.arange(first, last + 1) / OUTPUT_HZ)
+
+
+def interpolate_states(problem: Problem, state: Array, time_s: Array) -> Array:
+    """Return (T, 3 N) poses of all robots at any times, by odometry from both keyframes around."""
+    key_s = problem.keyframe_s
+    low = np.clip(np.searchsorted(key_s, time_s, "right") - 1, 0, len(key_s) - 2)
+    share = ((time_s - key_s[low]) / np.diff(key_s)[low])[:, None]
+    out = np.zeros((len(time_s), 3 * len(problem.robots)))
+    for robot, steps in enumerate(problem.robots):
+        mine = slice(3 * robot, 3 * robot + 3)
+        for key, part in ((low, 1 - share), (low + 1, share)):
+            pose, moved = state[key, mine], steps.path.relative_motion(key_s[key], time_s)
+            xy = pose[:, :2] + rotate(rotation_matrix(pose[:, 2]), moved.shift_m)
+            out[:, mine] += part * np.column_stack([xy, pose[:, 2] + moved.turn_rad])
+    return out
+
+
+def interpolate_at(time_s: Array, key_s: Array, values: Array) -> Array:
+    """Interpolate (K, ...) values at times."""
+    flat = values.reshape(len(key_s), -1)
+    columns = [np.interp(time_s, key_s, column) for column in flat.T]
+    return np.column_stack(columns).reshape(-1, *values.shape[1:])
+
+
+def height_errors(
+    problem: Problem, values: Values, covariances: tuple[Array, Array], both: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Return (K,) errors of the height difference of two robots, and their standard deviations.
+
+    Parameters
+    ----------
+    problem, values
+        Flight and its solution.
+    covariances
+        (K, n, n) and (G, G) of keyframes and constants.
+    both
+        Observer and peer.
+    """
+    error, variance = np.zeros(len(values.state)), np.zeros(len(values.state))
+    for row, c, constant, side in problem.layout.measured(both, "height"):
+        value = values.constants[c] if constant else values.state[:, c]
+        error = error - side * row.height * value
+        variance = variance + row.height**2 * covariances[constant][..., c, c]
+    return error, np.sqrt(variance)
+
+
+def _sighted(solution: PairSolution, time_s: Array) -> Mask:
+    """Return (2, T) whether an image of either robot near a time is consistent."""
+    out = np.zeros((2, len(time_s)), bool)
+    for view in solution.problem.views:
+        squared = squared_distances(solution.problem, view, solution.values)
+        at_s = np.concatenate([[-np.inf], view.time_s[squared < ASSOCIATION_GATE], [np.inf]])
+        after = np.searchsorted(at_s, time_s)
+        near = np.minimum(at_s[after] - time_s, time_s - at_s[after - 1])
+        out[view.robots[0]] |= near <= MAX_DROPOUT_S
+    return out
+
+
+def motion_energy(problem: Problem, values: Values, one: int = 0, other: int = 1) -> Array:
+    """Return (3,) energies of the own, peer and relative motion, relative to the odometry noise."""
+    state = calm_motion(problem, values.state)
+    here, there = (state[:, 3 * k : 3 * k + 2] for k in (one, other))
+    relative = np.diff(there - here, axis=0) / np.diff(problem.keyframe_s)[:, None]
+    energy = (relative**2).sum(axis=1).mean() / problem.velocity_psd
+    return np.array([odometry_energy(problem, one), odometry_energy(problem, other), energy])
 
 
 def _both_directions(
-    flight: KeyframeProblem, estimate: Estimate, gate_m: float
+    pair: Pair, pieces: Sequence[Piece], gate_m: float
 ) -> tuple[Estimate, Estimate]:
     """Return the estimates of both robots, with their statuses."""
-    estimate, far = clip_to_ranges(flight, estimate)
-    own, peer, relative = motion_energy(flight, estimate.state)
-    looks = keep_consistent_cameras(flight.camera, estimate.state)
-    looked = [
-        keyframes_with_agreement(looks, estimate.state, side, flight.keyframe_s, MAX_DROPOUT_S)
-        for side in (1, -1)
-    ]
+    joined = join_pieces(pieces)
+    estimate, far = clip_to_ranges(pair, joined.estimate)
     # Consistent images replace missing ranges.
-    silent = flight.dropout | (flight.range_dropout & ~(looked[0] | looked[1]))
-    # Without motion the bearing is unobservable, unless the camera detects the peer.
-    enough = [at.sum() >= MIN_CAMERA_S * KEYFRAME_HZ for at in looked]
-    why = [
-        None if seen else insufficient_excitation(moved, relative)
-        for seen, moved in zip(enough, (own, peer), strict=True)
-    ]
-    sigma = gate_sigma_factor(estimate.noise)
+    quiet = range_dropout(pair, estimate.time_s) & ~joined.sighted.any(axis=0)
+    floor = joined.silent | quiet | far
+    own, peer, relative = joined.energy
+    enough = [bool(at.sum() >= MIN_CAMERA_S * OUTPUT_HZ) for at in joined.sighted]
     return (
-        with_status(estimate, silent, why[0], gate_m, far=far, sigma=sigma),
-        with_status(seen_from_peer(estimate), silent, why[1], gate_m, far=far, sigma=sigma),
+        with_status(estimate, floor, (own, relative), gate_m, sighted=enough[0]),
+        with_status(seen_from_peer(estimate), floor, (peer, relative), gate_m, sighted=enough[1]),
     )
 
 
-def gate_sigma_factor(noise: NoiseModel) -> float:
-    """Return the factor on the written sigmas that the gate uses.
-
-    Parameters
-    ----------
-    noise
-        Selected noise model of the sensors.
-    """
-    usual = NoiseModel()
-    if noise.range_error_std_m > MAX_CORRELATED_RANGE_M:
-        return 1.0
-    worse = noise.velocity_std_mps / usual.velocity_std_mps
-    return float(np.interp(worse, NOISE_RATIO_BOUNDS, (GATE_SIGMA_FACTOR, 1.0)))
+def join_pieces(pieces: Sequence[Piece]) -> Piece:
+    """Join the windows of a flight."""
+    made = join_estimates([piece.estimate for piece in pieces])
+    first = _first_samples([piece.estimate for piece in pieces])
+    silent = np.concatenate([p.silent[k:] for p, k in zip(pieces, first, strict=True)])
+    sighted = np.concatenate([p.sighted[:, k:] for p, k in zip(pieces, first, strict=True)], axis=1)
+    return Piece(made, silent, sighted, np.mean([p.energy for p in pieces], axis=0))
 
 
-def insufficient_excitation(moved: float, relative: float) -> RejectionReason | None:
-    """Return the reason why a motion leaves the bearing unobservable; None if it does not.
+def _first_samples(estimates: Sequence[Estimate]) -> list[int]:
+    """Return the first sample of each window that is not in the window before."""
+    return [0, *[int(a.time_s[-1] >= b.time_s[0] - 1e-6) for a, b in pairwise(estimates)]]
 
-    Parameters
-    ----------
-    moved, relative
-        Mean squares of the observer's velocity and of the relative velocity, (m/s)^2.
-    """
-    if moved < MIN_OWN_ENERGY:
-        return "still"
-    return "alike" if relative < MIN_RELATIVE_ENERGY else None
+
+def join_estimates(estimates: Sequence[Estimate]) -> Estimate:
+    """Join the estimates of the windows of a flight. The constants are those of the last one."""
+    first = _first_samples(estimates)
+
+    def join(name: str) -> Array | None:
+        values = [getattr(one, name) for one in estimates]
+        if any(value is None for value in values):
+            return None
+        return np.concatenate([v[k:] for v, k in zip(values, first, strict=True)])
+
+    names = ("time_s", "state", "covariance", "status", "height_m", "height_std_m", "range_error_m")
+    modes = max(one.modes for one in estimates)
+    return replace(estimates[-1], **{name: join(name) for name in names}, modes=modes)
 
 
 def with_status(
     estimate: Estimate,
     silent: Mask,
-    why: RejectionReason | None,
+    energy: tuple[float, float],
     gate_m: float,
     *,
-    far: Mask | None = None,
-    sigma: float = 1.0,
+    sighted: bool = False,
 ) -> Estimate:
     """Return an estimate with its statuses and, if no position is OK, the reason.
 
@@ -186,54 +317,45 @@ def with_status(
         Estimate of a pair.
     silent
         (K,) whether a sensor of either robot, or their ranges, dropped out.
-    why
-        Reason why the motion leaves the bearing unobservable; None if it does not.
+    energy
+        Energies of the observer's and of the relative motion, relative to the odometry noise.
     gate_m
         Largest error of a good position, metres.
-    far
-        (K,) where the estimate was farther than the ranges allow. None: nowhere.
-    sigma
-        Factor on the sigmas that the gate uses.
+    sighted
+        Whether the observer's camera shows the bearing, whatever the motion.
     """
-    status = classify_positions(estimate.state, estimate.covariance * sigma**2, gate_m)
-    floor = silent if far is None else silent | far
-    status = np.maximum(status, floor * np.int8(UNCONVERGED))
-    if why:
+    status = classify_positions(estimate.state, estimate.covariance * GATE_SIGMA_FACTOR**2, gate_m)
+    status = np.maximum(status, silent * np.int8(UNCONVERGED))
+    if min(energy) < MIN_MOTION_ENERGY and not sighted:
         status[:] = AMBIGUOUS
-    refused = _find_rejection_reason(status, why, bool(silent.mean() > MAJORITY_SHARE))
+    refused = _find_rejection_reason(status, energy, bool(silent.mean() > MAJORITY_SHARE))
     return replace(estimate, status=status, rejection_reason=refused)
 
 
 def _find_rejection_reason(
-    status: Statuses, why: RejectionReason | None, silent: bool
+    status: Statuses, energy: tuple[float, float], silent: bool
 ) -> RejectionReason | None:
     """Return the reason why no position is OK; None if any is."""
     if (status == OK).any():
         return None
-    if why:
-        return why
     if silent:
         return "silent"
-    return "open" if (status == AMBIGUOUS).mean() > MAJORITY_SHARE else "imprecise"
+    if (status == AMBIGUOUS).mean() <= MAJORITY_SHARE:
+        return "imprecise"
+    own, relative = energy
+    if own < MIN_MOTION_ENERGY:
+        return "still"
+    return "alike" if relative < MIN_MOTION_ENERGY else "open"
 
 
-def clip_to_ranges(flight: KeyframeProblem, estimate: Estimate) -> tuple[Estimate, Mask]:
-    """Clip an estimate to the distance that the ranges allow, and return where it exceeded it.
-
-    Parameters
-    ----------
-    flight
-        Keyframes of the flight.
-    estimate
-        Estimate of the flight.
-    """
-    if not len(flight.range_m):
-        return estimate, np.zeros(len(flight.keyframe_s), bool)
-    smooth_m = median_filter(flight.range_m, 2 * RANGE_MEDIAN_REACH + 1, mode="nearest")
-    near = np.searchsorted(flight.keyframe_s[flight.range_keyframe], flight.keyframe_s)
-    around = np.clip(
-        near[:, None] + [-RANGE_MEDIAN_REACH, 0, RANGE_MEDIAN_REACH], 0, len(smooth_m) - 1
-    )
+def clip_to_ranges(pair: Pair, estimate: Estimate) -> tuple[Estimate, Mask]:
+    """Clip an estimate to the distance that the ranges allow, and return where it exceeded it."""
+    if not len(pair.range_m):
+        return estimate, np.zeros(len(estimate.time_s), bool)
+    smooth_m = median_filter(pair.range_m, RANGE_MEDIAN, mode="nearest")
+    near = np.searchsorted(pair.range_time_s, estimate.time_s)
+    reach = RANGE_MEDIAN // 2
+    around = np.clip(near[:, None] + [-reach, 0, reach], 0, len(smooth_m) - 1)
     reach_m = smooth_m[around].max(axis=1) + RANGE_MARGIN_M
     distance = np.hypot(*estimate.state[:, :2].T)
     far = distance > reach_m
@@ -254,78 +376,12 @@ def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = GATE_M) -> l
     gate_m
         As in `estimate_pairs`.
     """
-    steps = [ekf.build_steps(pair, ekf.PRESETS[preset]) for pair in pairs]
-    out: dict[int, Estimate] = {}
-    lengths = np.array([len(pair.time_s) for pair in pairs], int)
-    for length in np.unique(lengths):
-        numbers = np.flatnonzero(lengths == length).tolist()
-        side_by_side = ekf.stack_pairs([steps[n] for n in numbers])
-        state, spread = ekf.filter_many(side_by_side, ekf.PRESETS[preset])
-        for k, n in enumerate(numbers):
-            none, constants = np.zeros(length, np.int8), np.zeros(len(GLOBALS))
-            made = Estimate(
-                pairs[n].time_s, state[:, k], spread[:, k], none, constants, NoiseModel()
-            )
-            out[n] = replace(made, status=classify_positions(made.state, made.covariance, gate_m))
-    return [out[n] for n in range(len(pairs))]
-
-
-def _estimate_by_smoother(
-    flight: KeyframeProblem, noise: NoiseModel, starts: InitialGuesses
-) -> Estimate:
-    """Return the estimate of the smoother, with the spread between its guesses."""
-    order = np.argsort(-starts.score)
-    best = int(order[0])
-    ends = starts.tracks[..., :3].swapaxes(0, 1)[order]
-    apart = between_solution_covariance(-starts.score[order], ends)
-    constants = np.zeros(len(GLOBALS))
-    constants[RANGE_BIAS] = starts.range_offset_m
-    return Estimate(
-        flight.keyframe_s,
-        starts.tracks[:, best, :3],
-        starts.covariances[:, best, :3, :3] * SMOOTHER_SIGMA_INFLATION**2 + apart,
-        np.zeros(len(flight.keyframe_s), np.int8),
-        constants,
-        noise,
-    )
-
-
-def _estimate_by_batch(
-    flight: KeyframeProblem,
-    noise: NoiseModel | None,
-    starts: InitialGuesses,
-    pieced: Sequence[Array],
-) -> Estimate:
-    """Return the estimate of the batch solve, with the selected noise model."""
-    known = () if flight.calibrated_std is None else tuple(flight.calibrated_std.tolist())
-    first = noise or NoiseModel(calibrated_std=known)
-    ends = find_solutions(flight, first, starts, pieced)
-    if flight.camera is not None:
-        flight = replace(flight, camera=keep_consistent_cameras(flight.camera, ends[0].state))
-    found, best = (noise, ends[0]) if noise else select_noise_model(flight, first, ends[0])
-    ends = _rank_solutions(flight, found, best, ends)
-    apart = between_solution_covariance(
-        np.array([s.cost for s in ends]), np.stack([s.state[:, :3] for s in ends])
-    )
-    best = ends[0]
-    if not noise:
-        found, best = fit_range_noise(flight, found, best)
-    keyframes, constants = compute_covariance(flight, found, best)
-    spread = keyframes[:, :3, :3] * SIGMA_INFLATION**2 + apart
-    none = np.zeros(len(flight.keyframe_s), np.int8)
-    state, error_m = best.state[:, :3], best.state[:, RANGE_ERROR]
-    made = Estimate(flight.keyframe_s, state, spread, none, best.constants, found, error_m)
-    return replace(made, constants_covariance=constants)
-
-
-def _rank_solutions(
-    flight: KeyframeProblem, noise: NoiseModel, best: MapEstimate, ends: Sequence[MapEstimate]
-) -> list[MapEstimate]:
-    """Solve again under the selected noise model; return the solutions, best first.
-
-    The cost difference between solutions depends on the noise model.
-    """
-    found = [solve(flight, noise, best.state, best.constants)]
-    for end in select_distinct(ends, RIVAL_COST_MARGIN)[1 : 1 + MAX_RIVALS]:
-        found.append(solve(flight, noise, end.state, end.constants, found, ROUGH_TOLERANCE))
-    return sorted(found, key=lambda s: s.cost)
+    out = []
+    for pair in pairs:
+        steps = ekf.build_steps(pair, ekf.PRESETS[preset])
+        state, spread = ekf.filter_many(steps, ekf.PRESETS[preset])
+        none, constants = np.zeros(len(state), np.int8), np.zeros(len(PAIR_LAYOUT.constants))
+        made = Estimate(pair.time_s, state[:, 0], spread[:, 0], none, constants, NoiseModel())
+        status = classify_positions(made.state, made.covariance, gate_m)
+        out.append(replace(made, status=status))
+    return out

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.keyframes import GLOBALS, NoiseModel
-from dmrl.estimation.solver.robust_loss import PRIOR_LOSS_SCALES, loss_curvature, prior_curvature
+from dmrl.estimation.solver.residuals import ConstantPrior
+from dmrl.estimation.solver.unknowns import Subject, Unknown
 
 PRIOR_STD_SHARE, PRIOR_FLIGHTS = 1 / 3, 2.0
 """Prior of the change from flight to flight: share of the prior's standard deviation, and its
@@ -24,9 +24,6 @@ of how the values were chosen."""
 MAX_ROUNDS, TOLERANCE = 200, 1e-3
 """Largest number of EM iterations, and the relative change that ends them. No record of how the
 values were chosen."""
-VARIATION_GROUPS = np.array([0, 1, 2, 2, 3, 3, 4, 4, 4, 4, 5])
-"""Group of each constant, in the order of ``GLOBALS``. The constants of a group share one relative
-change."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +33,7 @@ class FlightInformation:
     Parameters
     ----------
     information
-        (G, G) in the order of ``GLOBALS``; positive semi-definite.
+        (G, G); positive semi-definite.
     information_vector
         (G,) the information times the likeliest values.
     column
@@ -68,52 +65,58 @@ class PooledConstants:
     flights: NDArray[np.intp]
 
 
-def flight_information(estimate: Estimate, column: NDArray[np.intp]) -> FlightInformation:
-    """Return the information of a batch solve about its constants, without their prior.
+def flight_information(
+    estimate: Estimate, subjects: Sequence[Subject], column: NDArray[np.intp]
+) -> FlightInformation:
+    """Return the information of a batch solve about some constants, without their prior.
 
     Parameters
     ----------
     estimate
         Estimate of the batch solve, which has a covariance of the constants.
+    subjects
+        The G constants.
     column
         (G,) index of the mean of each constant.
     """
     assert estimate.constants_covariance is not None
-    found, noise = estimate.constants, estimate.noise
-    bent = np.linalg.inv(estimate.constants_covariance) - np.diag(prior_curvature(noise, found))
+    layout, found = estimate.layout, estimate.constants
+    std = estimate.noise.prior_std(layout)
+    prior = ConstantPrior(found, std, tuple(row.loss for _, row in layout.constants))
+    kept = np.array([layout.find(name, *robots) for name, robots in subjects])
+    # The other constants keep their priors and are marginalized.
+    spread = estimate.constants_covariance[np.ix_(kept, kept)]
+    bent = np.linalg.inv(spread) - np.diag(prior.curvature()[kept])
     values, vectors = np.linalg.eigh((bent + bent.T) / 2)
     information = (vectors * np.maximum(values, 0.0)) @ vectors.T
     # At the solution the gradients of likelihood and prior cancel.
-    out = found / noise.prior_std()
-    prior = out / noise.prior_std() / (1 + out**2 / PRIOR_LOSS_SCALES)
-    return FlightInformation(information, information @ found + prior, column)
+    pull = (prior.information() * found)[kept]
+    return FlightInformation(information, information @ found[kept] + pull, column)
 
 
-def pool_flights(flights: Sequence[FlightInformation], kind: NDArray[np.intp]) -> PooledConstants:
+def pool_flights(flights: Sequence[FlightInformation], rows: Sequence[Unknown]) -> PooledConstants:
     """Pool M constants over flights, with the standard deviation of the next flight.
 
     Parameters
     ----------
     flights
         Information of each flight.
-    kind
-        (M,) index of each constant among ``GLOBALS``; any of those in its group.
+    rows
+        (M,) row of each constant. Constants with equal unit and owner share one relative change.
     """
-    usual, limit, group = (
-        NoiseModel().prior_std()[kind],
-        PRIOR_LOSS_SCALES[kind],
-        VARIATION_GROUPS[kind],
-    )
-    mean: Array = np.zeros(len(kind))
+    usual, losses = np.array([row.std for row in rows]), tuple(row.loss for row in rows)
+    kinds = [(row.unit, row.owner) for row in rows]
+    group = np.array([sorted(set(kinds)).index(kind) for kind in kinds])
+    mean: Array = np.zeros(len(rows))
     change = usual.copy()
-    counts = np.bincount(np.concatenate([flight.column for flight in flights]), minlength=len(kind))
+    counts = np.bincount(np.concatenate([flight.column for flight in flights]), minlength=len(rows))
     for _ in range(MAX_ROUNDS):
         information, pull = _total_information(flights, change)
         # The heavy-tailed prior of a single flight. If flights determine only the difference of
         # two robots, it attributes the whole error to one of them.
-        weight = 1 / (1 + (mean / usual) ** 2 / limit) / usual**2
+        weight = ConstantPrior(mean, usual, losses).information()
         mean = np.asarray(np.linalg.solve(information + np.diag(weight), pull), float)
-        bent = np.diag(loss_curvature((mean / usual) ** 2 / limit) / usual**2)
+        bent = np.diag(ConstantPrior(mean, usual, losses).curvature())
         covariance = np.asarray(np.linalg.pinv(information + bent, hermitian=True), float)
         squares = _sum_expected_squares(flights, mean, covariance, change)
         # A group has one standard deviation, relative to that of the prior.
@@ -134,7 +137,7 @@ def _total_information(flights: Sequence[FlightInformation], change: Array) -> t
     information, pull = np.zeros((len(change),) * 2), np.zeros(len(change))
     for flight in flights:
         spread = np.diag(change[flight.column] ** 2)
-        kept = np.linalg.inv(np.eye(len(GLOBALS)) + flight.information @ spread)
+        kept = np.linalg.inv(np.eye(len(spread)) + flight.information @ spread)
         information[np.ix_(flight.column, flight.column)] += kept @ flight.information
         pull[flight.column] += kept @ flight.information_vector
     return information, pull

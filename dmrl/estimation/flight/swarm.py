@@ -1,48 +1,59 @@
-"""Estimate all robots of a flight in one frame, from all their ranges at once.
+"""Estimate all robots of a flight in one frame, from all their measurements at once.
 
-The solutions of the pairs are the initial guess. A third robot often resolves a bearing that a pair
+The solutions of the pairs are the first guess. A third robot often resolves a bearing that a pair
 leaves open: its ranges cross theirs, and each robot's odometry enters once instead of in each pair.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
+from scipy.stats import chi2
 
-from dmrl.estimation.flight.pairs import insufficient_excitation, with_status
-from dmrl.estimation.flight.segments import is_inconsistent
+from dmrl.estimation.flight.pair_solver import consistent_views
+from dmrl.estimation.flight.pairs import (
+    SIGMA_INFLATION,
+    height_errors,
+    interpolate_at,
+    interpolate_states,
+    join_estimates,
+    motion_energy,
+    output_times,
+    with_status,
+)
+from dmrl.estimation.flight.windows import carry_information, split_windows
 from dmrl.estimation.model.gate import GATE_M
-from dmrl.estimation.model.odometry import QUARTER_TURN, preintegrate, rotate, rotation_matrix
-from dmrl.estimation.model.pair import GLOBALS_FROM_PEER, Array, Pair, SensorTrack
-from dmrl.estimation.solver.covariance import (
-    MOTION_WINDOW_S,
-    shrink_to_signal,
-    velocity_noise_power,
+from dmrl.estimation.model.odometry import rotate, rotation_matrix
+from dmrl.estimation.model.pair import Array, Mask, Pair
+from dmrl.estimation.model.status import OK
+from dmrl.estimation.signals.contradictions import drop_contradictions
+from dmrl.estimation.solver.covariance import compute_covariance, relative_covariance
+from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
+from dmrl.estimation.solver.keyframes import (
+    Problem,
+    build_problem,
+    list_robots,
+    odometry_dropout,
+    range_dropout,
 )
-from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.keyframes import GLOBALS, KEYFRAME_HZ, odometry_dropout, range_dropout
-from dmrl.estimation.solver.multi_robot import (
-    CONSTANTS_PER_LINK,
-    CONSTANTS_PER_ROBOT,
-    STATES_PER_ROBOT,
-    RangeLink,
-    SwarmEstimate,
-    SwarmProblem,
-    marginals,
-    solve,
+from dmrl.estimation.solver.levenberg_marquardt import (
+    ROUGH_TOLERANCE,
+    Carried,
+    Solver,
+    relative_path,
 )
-from dmrl.estimation.solver.residuals import (
-    OBSERVER_CONSTANTS,
-    OWN_GYRO,
-    PEER_GYRO,
-    RANGE_BIAS,
-    RANGE_SCALE,
-)
+from dmrl.estimation.solver.residuals import Values
+from dmrl.estimation.solver.unknowns import Layout
 
 Names = tuple[str, str]
 MIN_SHARED_S = 5.0
-"""Shortest time with data of all robots that is solved, seconds. No record of how the value was
-chosen."""
+"""Shortest time with data of all robots that is solved, seconds: that of a pair."""
+MIN_RANGE_ERROR_M = 0.05
+"""Temporary excess of a pair's ranges from which the joint solve estimates it too, metres: half the
+noise of a range."""
+CONSISTENCY_PROBABILITY, MAX_OUTSIDE_SHARE = 0.99, 0.2
+"""A solution is rejected if more than the second share of another one's OK positions have it
+outside their ellipse of the first probability."""
 
 
 def estimate_swarm(
@@ -61,17 +72,37 @@ def estimate_swarm(
     """
     out = dict(estimates)
     for group in _find_groups(pairs):
-        mine = {names: pair for names, pair in pairs.items() if names[0] in group}
-        shared_s = min(p.time_s[-1] for p in mine.values()) - max(
-            p.time_s[0] for p in mine.values()
-        )
-        if len(group) > 2 and shared_s >= MIN_SHARED_S:
+        mine = {names: drop_contradictions(p) for names, p in pairs.items() if names[0] in group}
+        start_s = max(p.time_s[0] for p in mine.values())
+        end_s = min(p.time_s[-1] for p in mine.values())
+        if len(group) > 2 and end_s - start_s >= MIN_SHARED_S:
             theirs = {names: e for names, e in estimates.items() if names[0] in group}
-            together = _estimate_group(mine, theirs, gate_m)
+            together = _estimate_group(mine, theirs, (start_s, end_s), gate_m)
             # An error without a model bends the joint solve, which then contradicts a pair.
             bent = any(is_inconsistent(together[names], found) for names, found in theirs.items())
             out |= {} if bent else together
     return out
+
+
+def is_inconsistent(whole: Estimate, sure: Estimate) -> bool:
+    """Return whether a solution fails a chi-square test against another one's confident positions.
+
+    Parameters
+    ----------
+    whole
+        Solution to test.
+    sure
+        Another solution of the same ordered pair, of the same time or a part of it.
+    """
+    xy, _, _ = whole.interpolate_at(sure.time_s)
+    known = sure.status == OK
+    if not known.any():
+        return False
+    apart = (xy - sure.state[:, :2])[known]
+    information = np.linalg.inv(sure.covariance[known, :2, :2])
+    # Squared Mahalanobis distances are chi-square with two degrees of freedom if both are right.
+    squared = np.einsum("ki,kij,kj->k", apart, information, apart)
+    return bool((squared > chi2.ppf(CONSISTENCY_PROBABILITY, 2)).mean() > MAX_OUTSIDE_SHARE)
 
 
 def _find_groups(pairs: Mapping[Names, Pair]) -> list[set[str]]:
@@ -85,166 +116,130 @@ def _find_groups(pairs: Mapping[Names, Pair]) -> list[set[str]]:
 
 
 def _estimate_group(
-    pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate], gate_m: float
+    pairs: Mapping[Names, Pair],
+    estimates: Mapping[Names, Estimate],
+    shared_s: tuple[float, float],
+    gate_m: float,
 ) -> dict[Names, Estimate]:
     """Return the estimates of one group, from the solve over all its robots."""
-    flight = build_swarm_problem(pairs, estimates)
-    # The noise model is that of the pair with the median velocity noise.
-    ordered = sorted(estimates.values(), key=lambda estimate: estimate.noise.velocity_std_mps)
-    noise = ordered[len(ordered) // 2].noise
-    found = solve(flight, noise, _initial_state(flight, estimates))
-    spread = marginals(
-        flight, noise, found, _denoise_paths(flight, found.state, velocity_noise_power(noise))
-    )
-    place = {name: number for number, name in enumerate(flight.names)}
+    names, parts = list_robots(pairs), list(_solve_windows(pairs, estimates, shared_s))
     out = {}
     for one, other in estimates:
-        state, covariance = _relative_pose(found.state, spread, place[one], place[other])
-        constants = _pair_constants(flight, found, place[one], place[other])
-        none = np.zeros(len(state), np.int8)
-        seen = Estimate(flight.keyframe_s, state, covariance, none, constants, noise)
         pair = pairs[one, other] if (one, other) in pairs else pairs[other, one]
-        # A third robot resolves two that move alike, so only the own motion is tested.
-        why = insufficient_excitation(_motion_energy(flight, place[one]), np.inf)
-        silent = odometry_dropout(pair, flight.keyframe_s) | range_dropout(pair, flight.keyframe_s)
-        out[one, other] = with_status(seen, silent, why, gate_m)
+        both = names.index(one), names.index(other)
+        seen = join_estimates([_select_pair(part, both) for part in parts])
+        energy = np.mean(
+            [motion_energy(solver.problem, v, *both) for solver, v, *_ in parts], axis=0
+        )
+        silent: Mask = odometry_dropout(pair, seen.time_s) | range_dropout(pair, seen.time_s)
+        out[one, other] = with_status(seen, silent, (energy[0], energy[2]), gate_m)
     return out
 
 
-def build_swarm_problem(
-    pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate]
-) -> SwarmProblem:
-    """Build the keyframes of the time that all robots share.
-
-    Parameters
-    ----------
-    pairs, estimates
-        As in `estimate_swarm`.
-    """
-    start_s = max(pair.time_s[0] for pair in pairs.values())
-    end_s = min(pair.time_s[-1] for pair in pairs.values())
-    key_s = start_s + np.arange(int((end_s - start_s) * KEYFRAME_HZ + 1e-6) + 1) / KEYFRAME_HZ
-    logs: dict[str, tuple[Array, SensorTrack]] = {}
-    for (one, other), pair in pairs.items():
-        logs |= {one: (pair.time_s, pair.own), other: (pair.time_s, pair.peer)}
-    names = sorted(logs)
-    ways = {name: preintegrate(track, time_s) for name, (time_s, track) in logs.items()}
-    gaps = [
-        np.diff(np.interp(key_s, time_s, np.cumsum(track.dropout) * (time_s[1] - time_s[0])))
-        for time_s, track in (logs[name] for name in names)
-    ]
-    links = []
-    for (one, other), pair in pairs.items():
-        inside = (pair.range_time_s >= key_s[0]) & (pair.range_time_s <= key_s[-1])
-        at_s = pair.range_time_s[inside]
-        key = np.clip(np.searchsorted(key_s, at_s, "right") - 1, 0, len(key_s) - 1)
-        shifts = [ways[name].relative_motion(key_s[key], at_s).shift_m for name in (one, other)]
-        height_m = np.interp(at_s, pair.time_s, pair.peer.height_m - pair.own.height_m)
-        both = names.index(one), names.index(other)
-        # An obstacle lengthens ranges for seconds. The pair's solve has estimated the excess.
-        range_m = pair.range_m[inside] - _range_error(estimates.get((one, other)), at_s)
-        links.append(RangeLink(both, key, range_m, shifts[0], shifts[1], height_m))
-    moves = [ways[name].relative_motion(key_s[:-1], key_s[1:]) for name in names]
-    paths = [ways[name].interpolate_at(key_s)[:2] for name in names]
-    return SwarmProblem(
-        names, key_s, moves, paths, np.array(gaps), links, _collect_calibrated_std(names, pairs)
-    )
+Part = tuple[Solver, Values, tuple[Array, Array], Array]
+"""A window: its solver, values, covariances of keyframes and constants, and output times."""
 
 
-def _collect_calibrated_std(names: list[str], pairs: Mapping[Names, Pair]) -> Array:
-    """Return (4 N + 2 L,) standard deviations of the constants from the pairs, in swarm order."""
-    robots = np.full((len(names), CONSTANTS_PER_ROBOT), np.inf)
-    shared = np.full((len(pairs), CONSTANTS_PER_LINK), np.inf)
-    for number, (both, pair) in enumerate(pairs.items()):
-        if pair.calibrated_std is None:
-            continue
-        for name, known in zip(
-            both, (pair.calibrated_std, pair.calibrated_std[GLOBALS_FROM_PEER]), strict=True
-        ):
-            mine = robots[names.index(name)]
-            mine[:] = np.minimum(mine, known[OBSERVER_CONSTANTS])
-        shared[number] = pair.calibrated_std[[RANGE_BIAS, RANGE_SCALE]]
-    return np.concatenate([robots.ravel(), shared.ravel()])
+def _solve_windows(
+    pairs: Mapping[Names, Pair],
+    estimates: Mapping[Names, Estimate],
+    shared_s: tuple[float, float],
+) -> Iterator[Part]:
+    """Solve all robots window by window."""
+    carried: Carried | None = None
+    names = list_robots(pairs)
+    for window in split_windows(*shared_s):
+        cut = {both: pair.crop(window.start_s, window.end_s) for both, pair in pairs.items()}
+        numbered = {(names.index(a), names.index(b)): pair for (a, b), pair in cut.items()}
+        problem = _with_pair_models(build_problem(numbered), names, estimates)
+        start = Values(
+            _initial_state(problem, names, estimates), np.zeros(len(problem.layout.constants))
+        )
+        views = consistent_views(problem, start)
+        kept = replace(problem, views=views)
+        start = Values(start.state, np.zeros(len(kept.layout.constants)))
+        if kept.layout.width != problem.layout.width:
+            start = Values(_initial_state(kept, names, estimates), start.constants)
+        solver = Solver(kept, carried if carried and carried.fits(kept.layout) else None)
+        values = solver.solve(start, tolerance=ROUGH_TOLERANCE).values
+        first = next(iter(pairs.values()))
+        times = output_times(first.time_s[0], window.from_s, window.until_s)
+        yield solver, values, compute_covariance(solver, values), times
+        carried = None if window.is_last else carry_information(solver, values, window.next_s)
 
 
-def _range_error(estimate: Estimate | None, at_s: Array) -> Array:
-    """Return (R,) range errors of the pair's own solve, metres."""
-    if estimate is None or estimate.range_error_m is None:
-        return np.zeros(len(at_s))
-    return np.interp(at_s, estimate.time_s, estimate.range_error_m)
+def _with_pair_models(
+    problem: Problem, names: list[str], estimates: Mapping[Names, Estimate]
+) -> Problem:
+    """Return a flight with the noise of the median pair, and range errors where pairs have them."""
+    ordered = sorted(estimates.values(), key=lambda estimate: estimate.noise.grade)
+    noise = replace(ordered[len(ordered) // 2].noise, known_std=problem.noise.known_std)
+    unused = set()
+    for link in problem.links:
+        error = estimates[names[link.robots[0]], names[link.robots[1]]].range_error_m
+        if error is None or np.abs(error).max() < MIN_RANGE_ERROR_M:
+            unused.add(("range_error", link.robots))
+    return replace(problem, noise=noise, unused=frozenset(unused))
 
 
-def _initial_state(flight: SwarmProblem, estimates: Mapping[Names, Estimate]) -> Array:
-    """Return (K, N, 5) states from the pairs' solutions, along the tree of smallest sigmas."""
+def _initial_state(flight: Problem, names: list[str], estimates: Mapping[Names, Estimate]) -> Array:
+    """Return (K, n) states from the pairs' solutions, along the tree of smallest sigmas."""
     sigma_m = {
-        names: float(np.median(np.linalg.eigvalsh(e.covariance[:, :2, :2])[:, -1]))
-        for names, e in estimates.items()
+        both: float(np.median(np.linalg.eigvalsh(e.covariance[:, :2, :2])[:, -1]))
+        for both, e in estimates.items()
     }
-    state = np.zeros((len(flight.keyframe_s), len(flight.names), STATES_PER_ROBOT))
-    heading, position = flight.paths[0]
-    state[:, 0, :2], state[:, 0, 2] = position, heading
-    done = {flight.names[0]}
-    while len(done) < len(flight.names):
-        open_ends = [names for names in estimates if names[0] in done and names[1] not in done]
-        one, other = min(open_ends, key=lambda names: sigma_m[names])
-        here = state[:, flight.names.index(one)]
+    key_s, layout = flight.keyframe_s, flight.layout
+    state = np.zeros((len(key_s), layout.width))
+    heading, position, _ = flight.robots[0].path.interpolate_at(key_s)
+    state[:, :2], state[:, 2] = position, heading
+    done = {names[0]}
+    while len(done) < len(names):
+        open_ends = [both for both in estimates if both[0] in done and both[1] not in done]
+        one, other = min(open_ends, key=lambda both: sigma_m[both])
+        here = state[:, layout.pose(names.index(one))]
         found = estimates[one, other]
         columns = np.column_stack([found.state[:, :2], np.unwrap(found.state[:, 2])])
-        x, y, psi = (np.interp(flight.keyframe_s, found.time_s, column) for column in columns.T)
+        x, y, psi = (np.interp(key_s, found.time_s, column) for column in columns.T)
+        there = layout.pose(names.index(other))
         away = rotate(rotation_matrix(here[:, 2]), np.column_stack([x, y]))
-        there = flight.names.index(other)
-        state[:, there, :2], state[:, there, 2] = here[:, :2] + away, here[:, 2] + psi
+        state[:, there] = np.column_stack([here[:, :2] + away, here[:, 2] + psi])
         done.add(other)
+    for link in flight.links:
+        column = layout.state_column("range_error", *link.robots)
+        error = estimates[names[link.robots[0]], names[link.robots[1]]]
+        if column is not None and error.range_error_m is not None:
+            state[:, column] = np.interp(key_s, error.time_s, error.range_error_m)
     return state
 
 
-def _denoise_paths(flight: SwarmProblem, state: Array, energy: float) -> Array:
-    """Return the states on paths without probable noise, own and relative."""
-    step_s = float(np.median(np.diff(flight.keyframe_s)))
-    velocity = np.diff(state[:, :, :2], axis=0) / step_s
-    robots = range(len(flight.names))
-    own = np.stack([shrink_to_signal(velocity[:, k], energy, step_s) for k in robots], axis=1)
-    mean = own.mean(axis=1, keepdims=True)
-    apart = np.stack([shrink_to_signal((own - mean)[:, k], energy, step_s) for k in robots], axis=1)
-    path = np.concatenate([np.zeros((1, *own.shape[1:])), np.cumsum(mean + apart, axis=0)])
-    path *= step_s
-    calm = state.copy()
-    calm[:, :, :2] = path + state[:, :, :2].mean(axis=0) - path.mean(axis=0)
-    return calm
-
-
-def _relative_pose(state: Array, spread: Array, one: int, other: int) -> tuple[Array, Array]:
-    """Return the pose (K, 3) of a robot in another's horizontal frame, and its covariance."""
-    here, there = state[:, one], state[:, other]
-    back = rotation_matrix(-here[:, 2])
-    xy = rotate(back, there[:, :2] - here[:, :2])
-    by_both = np.zeros((len(state), 3, 6))
-    by_both[:, :2, :2], by_both[:, :2, 3:5], by_both[:, :2, 2] = -back, back, -xy @ QUARTER_TURN.T
-    by_both[:, 2, 2], by_both[:, 2, 5] = -1.0, 1.0
-    at = np.concatenate(
-        [one * STATES_PER_ROBOT + np.arange(3), other * STATES_PER_ROBOT + np.arange(3)]
+def _select_pair(part: Part, both: tuple[int, int]) -> Estimate:
+    """Return the estimate of one ordered pair in a window, without statuses."""
+    solver, values, (keyframes, constants), time_s = part
+    problem, key_s = solver.problem, solver.problem.keyframe_s
+    spread = relative_covariance(values.state, keyframes, *both) * SIGMA_INFLATION**2
+    heights, height_std = height_errors(problem, values, (keyframes, constants), both)
+    return Estimate(
+        time_s,
+        relative_path(interpolate_states(problem, values.state, time_s), *both),
+        interpolate_at(time_s, key_s, spread),
+        np.zeros(len(time_s), np.int8),
+        _pair_constants(problem.layout, values.constants, both),
+        problem.noise,
+        height_m=interpolate_at(time_s, key_s, heights),
+        height_std_m=interpolate_at(time_s, key_s, height_std),
     )
-    covariance = by_both @ spread[:, at[:, None], at] @ by_both.swapaxes(1, 2)
-    return np.column_stack([xy, there[:, 2] - here[:, 2]]), covariance
 
 
-def _motion_energy(flight: SwarmProblem, robot: int) -> float:
-    """Return the mean square of a robot's averaged velocity, (m/s)^2."""
-    step_s = float(np.median(np.diff(flight.keyframe_s)))
-    velocity = np.diff(flight.paths[robot][1], axis=0) / step_s
-    slow = uniform_filter1d(velocity, round(MOTION_WINDOW_S / step_s), axis=0, mode="nearest")
-    return float((slow**2).sum(axis=1).mean())
-
-
-def _pair_constants(flight: SwarmProblem, found: SwarmEstimate, one: int, other: int) -> Array:
-    """Return (G,) constants of a pair in the order of ``GLOBALS``; zeros where not estimated."""
-    out = np.zeros(len(GLOBALS))
-    out[OWN_GYRO], out[PEER_GYRO] = found.constants[
-        [one * CONSTANTS_PER_ROBOT, other * CONSTANTS_PER_ROBOT]
-    ]
-    for number, link in enumerate(flight.links):
-        if set(link.robots) == {one, other}:
-            out[RANGE_BIAS] = found.constants[
-                len(flight.names) * CONSTANTS_PER_ROBOT + number * CONSTANTS_PER_LINK
-            ]
+def _pair_constants(layout: Layout, constants: Array, both: tuple[int, int]) -> Array:
+    """Return (G,) constants of a pair in the order of ``PAIR_LAYOUT``; 0 without an estimate."""
+    known = {subject: constants[k] for k, (subject, _) in enumerate(layout.constants)}
+    out = np.zeros(len(PAIR_LAYOUT.constants))
+    for k, ((name, own), row) in enumerate(PAIR_LAYOUT.constants):
+        if row.owner == "clock":
+            # The first robot's clock counts, and has no column.
+            here, there = (known.get((name, (robot,)), 0.0) for robot in both)
+            out[k] = there - here
+        else:
+            owners = tuple(sorted(both[side] for side in own))
+            out[k] = known.get((name, owners), 0.0)
     return out

@@ -81,26 +81,6 @@ def associate(bearings: BearingMeasurements, xyz_m: Array, covariance: Array) ->
     return Association(nearest, least, -(least + np.log(variance[images, nearest]).sum(axis=1)) / 2)
 
 
-def crop_to_time(
-    bearings: BearingMeasurements | None, start_s: float, end_s: float
-) -> BearingMeasurements | None:
-    """Crop bearing measurements to an interval; None stays None.
-
-    Parameters
-    ----------
-    sightings
-        Measurements of the flight.
-    start_s, end_s
-        First and last time of the interval, seconds.
-    """
-    if bearings is None:
-        return None
-    inside = (bearings.time_s >= start_s) & (bearings.time_s <= end_s)
-    return BearingMeasurements(
-        bearings.time_s[inside], bearings.bearing[inside], bearings.std[inside]
-    )
-
-
 def drop_candidates(
     bearings: BearingMeasurements, images: Mask, candidates: NDArray[np.intp]
 ) -> BearingMeasurements:

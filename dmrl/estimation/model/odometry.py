@@ -91,6 +91,12 @@ class RelativeMotion:
     shift_m: Array
     bias_jacobian_s: Array
 
+    def first(self, count: int) -> "RelativeMotion":
+        """Return the first motions."""
+        return RelativeMotion(
+            self.turn_rad[:count], self.shift_m[:count], self.bias_jacobian_s[:count]
+        )
+
 
 def preintegrate(track: SensorTrack, time_s: Array) -> Odometry:
     """Integrate a robot's velocity and yaw rate by the trapezoidal rule.

@@ -1,6 +1,7 @@
 """Sensor data of two robots on one clock, the input of every estimator."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,6 @@ MAX_DROPOUT_S = 0.5
 chosen."""
 MAX_RANGE_M = 60.0
 """Longest plausible UWB range, metres. It rejects 65535 and other fill values."""
-GLOBALS_FROM_PEER = [0, 1, 3, 2, 5, 4, 8, 9, 6, 7, 10]
-"""Permutation of ``GLOBALS`` that exchanges observer and peer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +43,12 @@ class SensorTrack:
     dropout: Mask
     height_dropout: Mask | None = None
 
+    def select(self, samples: Mask) -> "SensorTrack":
+        """Return some of the samples."""
+        gap = None if self.height_dropout is None else self.height_dropout[samples]
+        signals = (signal[samples] for signal in self.signals())
+        return SensorTrack(*signals, self.dropout[samples], gap)
+
     def signals(self) -> tuple[Array, Array, Array, Array]:
         """Return vx, vy, yaw rate and height, (K,) each."""
         return self.vx_mps, self.vy_mps, self.yaw_rate_radps, self.height_m
@@ -68,6 +73,11 @@ class BearingMeasurements:
     bearing: Array
     std: Array
 
+    def crop(self, start_s: float, end_s: float) -> "BearingMeasurements":
+        """Return the images in an interval of time, seconds."""
+        inside = (self.time_s >= start_s) & (self.time_s <= end_s)
+        return BearingMeasurements(self.time_s[inside], self.bearing[inside], self.std[inside])
+
 
 @dataclass(frozen=True, slots=True)
 class Pair:
@@ -86,9 +96,9 @@ class Pair:
     own_bearings, peer_bearings
         Candidates of either camera. None: no camera, or no candidate. Images outside the grid are
         ignored.
-    calibrated_std
-        (G,) standard deviations of the constants of the flight, in the order of ``GLOBALS``, where
-        a calibration makes them smaller than the default. None: no calibration.
+    known_std
+        Standard deviations of unknowns that a calibration determined, by name and robots (0:
+        observer, 1: peer).
 
     Raises
     ------
@@ -104,7 +114,7 @@ class Pair:
     range_m: Array
     own_bearings: BearingMeasurements | None = None
     peer_bearings: BearingMeasurements | None = None
-    calibrated_std: Array | None = None
+    known_std: Mapping[tuple[str, tuple[int, ...]], float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         count = len(self.time_s)
@@ -140,8 +150,24 @@ class Pair:
         """Return the pair with observer and peer exchanged."""
         ranges = self.range_time_s, self.range_m
         sees = self.peer_bearings, self.own_bearings
-        known_std = None if self.calibrated_std is None else self.calibrated_std[GLOBALS_FROM_PEER]
-        return Pair(self.time_s, self.peer, self.own, *ranges, *sees, known_std)
+        known = {
+            (name, own if len(own) == 2 else (1 - own[0],)): std
+            for (name, own), std in self.known_std.items()
+        }
+        return Pair(self.time_s, self.peer, self.own, *ranges, *sees, known)
+
+    def crop(self, start_s: float, end_s: float) -> "Pair":
+        """Return the pair in an interval of time, seconds."""
+        at = (self.time_s >= start_s) & (self.time_s <= end_s)
+        time_s = self.time_s[at]
+        heard = (self.range_time_s >= time_s[0]) & (self.range_time_s <= time_s[-1])
+        ranges = self.range_time_s[heard], self.range_m[heard]
+        sees = (
+            s and s.crop(time_s[0], time_s[-1]) for s in (self.own_bearings, self.peer_bearings)
+        )
+        return Pair(
+            time_s, self.own.select(at), self.peer.select(at), *ranges, *sees, self.known_std
+        )
 
 
 def usable_ranges(time_s: Array, range_m: Array) -> Mask:

@@ -28,7 +28,9 @@ MIN_STEP_SIGMAS = 5.0
 chosen."""
 
 
-def step_offsets(values: Array, step_s: float, least: float, reach: int) -> Array:
+def step_offsets(
+    values: Array, step_s: float, least: float, reach: int, moved: Array | float = 0.0
+) -> Array:
     """Return (N,) the excess of a signal: piecewise constant, mostly 0.
 
     Parameters
@@ -41,6 +43,8 @@ def step_offsets(values: Array, step_s: float, least: float, reach: int) -> Arra
         Smallest jump. Jumps must also exceed the signal's noise.
     reach
         Number of samples in the medians before and after.
+    moved
+        (N,) largest change of the signal by motion, from the samples before to those after.
     """
     if len(values) < 4 * reach:
         return np.zeros(len(values))
@@ -52,7 +56,8 @@ def step_offsets(values: Array, step_s: float, least: float, reach: int) -> Arra
     change = middle[1 + reach : reach + len(values)] - middle[1 : len(values)] - reach * trend
     change[:reach], change[-reach:] = 0.0, 0.0
     jumps = []
-    for first, last in _find_runs(np.abs(change) > may):
+    plain = np.abs(change + reach * trend) - np.broadcast_to(moved, values.shape)[1:]
+    for first, last in _find_runs((np.abs(change) > may) & (plain > 0)):
         jump = float(change[first + int(np.argmax(np.abs(change[first:last])))])
         jumps.append((first + int(np.argmax(np.sign(jump) * single[first:last])) + 1, jump))
     return _offsets_between_jumps(jumps, len(values), round(MAX_OFFSET_S / step_s))

@@ -1,7 +1,6 @@
-"""Resample a robot's logs on a time grid, without physically impossible readings."""
+"""Resample a robot's logs on a time grid, and mark dropouts."""
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d
 
 from dmrl.estimation.model.pair import (
     GRID_RATE_HZ,
@@ -16,15 +15,6 @@ from dmrl.estimation.signals.jump_detection import remove_height_steps
 HEIGHT_SMOOTHING_S = 0.5
 """Window of the parabolic smoothing of heights, seconds. The noise of a range finder is 2 cm in
 every sample, 4 px of a label at 1 m, and a drone climbs slowly."""
-RUNAWAY_MPS, RUNAWAY_RADPS, RUNAWAY_RATIO, RUNAWAY_S = 3.0, 5.0, 4.0, 0.2
-"""Limits of a runaway state estimate: speed, yaw rate, ratio to the flight's median, and duration.
-
-An estimate runs away after a crash. The robot then lies still, so its rates are set to zero and
-marked as dropout. In logs of real crashes the estimate reached 9 m/s. No record of how the values
-were chosen."""
-RUNAWAY_WINDOW = 2 * round(GRID_RATE_HZ) + 1
-"""Window around a runaway estimate, samples: one second before and after, which may belong to the
-fall."""
 MAX_REPEATED_SHARE = 0.5
 """A log that repeats more than this share of its samples is written that way. No record of how the
 value was chosen."""
@@ -55,40 +45,8 @@ def build_track(
     level = remove_height_steps(height[0], height[1][:, 0])
     above, height_gap = resample(height[0], level[:, None], grid_s)
     smooth_m = _smooth_parabola(above[:, 0], int(HEIGHT_SMOOTHING_S * GRID_RATE_HZ / 2))
-    lost = find_runaway(np.hypot(*speed.T), RUNAWAY_MPS) | find_runaway(
-        np.abs(turn[:, 0]), RUNAWAY_RADPS
-    )
-    known = ~lost
-    gap |= turn_gap | lost
-    rates = (speed[:, 0] * known, speed[:, 1] * known, turn[:, 0] * known)
-    return SensorTrack(*rates, np.where(find_crash(lost), 0.0, smooth_m), gap, height_gap)
-
-
-def find_runaway(size: Array, fast: float) -> Mask:
-    """Return (K,) where a rate at 100 Hz ran away, with one second around.
-
-    Parameters
-    ----------
-    size
-        (K,) absolute value of the rate.
-    fast
-        Rate below which no estimate has run away.
-    """
-    limit = max(fast, RUNAWAY_RATIO * float(np.median(size)))
-    lasting = median_filter(size, round(RUNAWAY_S * GRID_RATE_HZ), mode="mirror") > limit
-    return np.asarray(maximum_filter1d(lasting, RUNAWAY_WINDOW))
-
-
-def find_crash(lost: Mask) -> Mask:
-    """Return (K,) where a crashed robot lies on the floor, at a height of zero.
-
-    Parameters
-    ----------
-    lost
-        (K,) where its estimate ran away, and a second around, at 100 Hz.
-    """
-    ran = minimum_filter1d(lost, RUNAWAY_WINDOW)
-    return np.asarray(np.logical_and.accumulate(ran[::-1])[::-1])
+    gap |= turn_gap
+    return SensorTrack(speed[:, 0], speed[:, 1], turn[:, 0], smooth_m, gap, height_gap)
 
 
 def find_frozen(time_s: Array, values: Array, grid_s: Array) -> Mask:

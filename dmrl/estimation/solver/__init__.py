@@ -1,1 +1,1 @@
-"""Factor solver of a flight: residuals, robust losses, marginals and noise selection."""
+"""Factors of the solver: robust losses, the table of unknowns, and measurement residuals."""

@@ -1,20 +1,16 @@
-"""Bordered block-tridiagonal normal equations: assembly, solution and marginal covariances."""
+"""Bordered block-tridiagonal normal equations: assembly, solution, marginals and elimination."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.camera_residuals import CameraMeasurements, CameraResiduals
-from dmrl.estimation.solver.residuals import RANGE_STATES, Linearization
-from dmrl.estimation.solver.robust_loss import IrlsWeights
 
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """Normal equations of a flight: J^T J and J^T e.
+    """Normal equations of a flight: J^T W J and J^T W e.
 
     Parameters
     ----------
@@ -37,81 +33,55 @@ class NormalEquations:
     gradient: Array
     globals_gradient: Array
 
+    @classmethod
+    def zeros(cls, keyframes: int, width: int, constants: int) -> "NormalEquations":
+        """Return empty equations."""
+        return cls(
+            np.zeros((keyframes, width, width)),
+            np.zeros((keyframes - 1, width, width)),
+            np.zeros((keyframes, width, constants)),
+            np.zeros((constants, constants)),
+            np.zeros((keyframes, width)),
+            np.zeros(constants),
+        )
 
-def assemble(
-    linear: Linearization, range_key: NDArray[np.intp], weights: IrlsWeights, prior: Array
-) -> NormalEquations:
-    """Assemble the normal equations without the prior of the constants.
+    def add_rows(self, products: Array, columns: list[int], border: list[int], steps: bool) -> None:
+        """Add products of Jacobian rows, in place.
 
-    Parameters
-    ----------
-    linear
-        Residuals and Jacobians.
-    range_key
-        (R,) keyframe of each range.
-    weights
-        Weights of the squared residuals.
-    prior
-        (n,) information added to every keyframe. A tiny value keeps the system positive definite.
-    """
-    steps, ranges, width = linear.steps, linear.ranges, len(prior)
-    size = steps.shape[2] - 2 * width - 1
-    diagonal = np.zeros((len(steps) + 1, width, width)) + np.diag(prior)
-    border, gradient = np.zeros((*diagonal.shape[:2], size)), np.zeros(diagonal.shape[:2])
-    rooted = steps * np.sqrt(weights.step)[..., None]
-    products = rooted[..., : 2 * width].swapaxes(1, 2) @ rooted
-    for keyframes, rows in ((slice(-1), slice(width)), (slice(1, None), slice(width, 2 * width))):
-        diagonal[keyframes] += products[:, rows, rows]
-        border[keyframes] += products[:, rows, 2 * width : -1]
-        gradient[keyframes] += products[:, rows, -1]
+        Parameters
+        ----------
+        products
+            (B, w, w) of the rows of each keyframe or step: columns of the keyframe, of the next
+            one if these are steps, of the constants, and the residual.
+        columns, border
+            Columns of a keyframe, and of the constants.
+        steps
+            Whether the rows depend on the next keyframe too.
+        """
+        size, corner = len(columns), len(columns) * (1 + steps)
+        at, edge = np.array(columns, int), np.array(border, int)
+        blocks = ((slice(-1), 0), (slice(1, None), size)) if steps else ((slice(None), 0),)
+        for keys, start in blocks:
+            mine = slice(start, start + size)
+            _add_block(self.diagonal[keys], at, at, products[:, mine, mine])
+            _add_block(self.coupling[keys], at, edge, products[:, mine, corner:-1])
+            self.gradient[keys][:, at] += products[:, mine, -1]
+        if steps:
+            _add_block(self.off_diagonal, at, at, products[:, :size, size:corner])
+        rest = products[:, corner:, corner:].sum(axis=0)
+        self.globals_block[np.ix_(edge, edge)] += rest[:-1, :-1]
+        self.globals_gradient[edge] += rest[:-1, -1]
 
-    weighted = ranges * weights.range[:, None]
-    keys, sums = _sum_by_keyframe(range_key, weighted[:, :4, None] * ranges[:, None, :])
-    states = np.array(RANGE_STATES)
-    diagonal[np.ix_(keys, states, states)] += sums[..., :4]
-    border[np.ix_(keys, states, np.arange(2))] += sums[..., 4:6]
-    gradient[np.ix_(keys, states)] += sums[..., 6]
-    flat = rooted.reshape(-1, steps.shape[2])[:, 2 * width :]
-    rest = flat.T @ flat
-    shared = [0, 1, -1]  # bias and scale of the ranges, and the residual
-    rest[np.ix_(shared, shared)] += weighted[:, 4:].T @ ranges[:, 4:]
-    above = products[:, :width, width : 2 * width]
-    return NormalEquations(diagonal, above, border, rest[:-1, :-1], gradient, rest[:-1, -1])
-
-
-def add_camera(
-    equations: NormalEquations,
-    camera: CameraMeasurements,
-    residuals: CameraResiduals,
-    weight: Array,
-) -> None:
-    """Add the camera residuals to normal equations, in place.
-
-    Parameters
-    ----------
-    equations
-        Normal equations of a flight's ranges and motions.
-    camera
-        Measurements of I images, each between two keyframes.
-    residuals
-        Rows of the images.
-    weight
-        (I,) weights of their squares.
-    """
-    products = residuals.rows[..., :3].swapaxes(1, 2) @ (residuals.rows * weight[:, None, None])
-    after = camera.fraction[:, None, None]
-    for key, part in ((camera.keyframe, 1 - after), (camera.keyframe + 1, after)):
-        np.add.at(equations.diagonal[:, :3, :3], key, part**2 * products[..., :3])
-        np.add.at(equations.gradient[:, :3], key, part[..., 0] * products[..., 3])
-    np.add.at(
-        equations.off_diagonal[:, :3, :3], camera.keyframe, (1 - after) * after * products[..., :3]
-    )
+    def damped(self, damping: float) -> "NormalEquations":
+        """Return the equations with Marquardt damping of the keyframes, not of the constants."""
+        eye = np.eye(self.diagonal.shape[1])
+        return replace(self, diagonal=self.diagonal * (1 + damping * eye)) if damping else self
 
 
-def _sum_by_keyframe(key: NDArray[np.intp], parts: Array) -> tuple[NDArray[np.intp], Array]:
-    """Return the distinct keyframes and the sum of the parts of each. Keyframes must be sorted."""
-    first = np.flatnonzero(np.diff(key, prepend=-1))
-    return key[first], np.add.reduceat(parts, first, axis=0) if len(key) else parts
+def _add_block(target: Array, rows: Array, columns: Array, values: Array) -> None:
+    """Add (B, r, c) values to some rows and columns of (B, n, m) blocks."""
+    if len(rows) and len(columns):
+        target[:, rows[:, None], columns] += values
 
 
 def to_upper_bands(diagonal: Array, above: Array) -> Array:
@@ -120,42 +90,38 @@ def to_upper_bands(diagonal: Array, above: Array) -> Array:
     width = 2 * size - 1
     out = np.zeros((width + 1, len(diagonal), size))
     for row in range(size):
-        for column in range(row, size):
-            out[width + row - column, :, column] = diagonal[:, row, column]
-        for column in range(size):
-            out[width + row - column - size, 1:, column] = above[:, row, column]
+        at = width + row - np.arange(row, size)
+        out[at, :, np.arange(row, size)] = diagonal[:, row, row:].T
+        at = width + row - np.arange(size) - size
+        out[at, 1:, np.arange(size)] = above[:, row].T
     return out.reshape(width + 1, -1)
 
 
-def log_det(equations: NormalEquations) -> float:
-    """Return the log determinant of the whole matrix, coupling and constants included.
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """Solution of the normal equations.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the matrix is not positive definite.
-    """
-    size = len(equations.globals_block)
-    factor = cholesky_banded(to_upper_bands(equations.diagonal, equations.off_diagonal))
-    border = equations.coupling.reshape(-1, size)
-    solved = cho_solve_banded((factor, False), border)
-    rest = np.linalg.slogdet(equations.globals_block - border.T @ solved)[1]
-    return float(2 * np.log(factor[-1]).sum() + rest)
-
-
-def solve_step(equations: NormalEquations) -> tuple[Array, Array, Array, Array]:
-    """Solve for the Gauss-Newton step and the terms of the covariance.
-
-    Returns
-    -------
-    state : Array
-        (K, n) change of the keyframes.
-    constants : Array
-        (G,) change of the constants.
-    response : Array
+    Parameters
+    ----------
+    state, constants
+        (K, n) and (G,) Gauss-Newton steps.
+    response
         (K, n, G) negated derivative of the keyframes by the constants.
-    covariance : Array
+    covariance
         (G, G) of the constants.
+    log_det
+        Log determinant of the whole matrix.
+    """
+
+    state: Array
+    constants: Array
+    response: Array
+    covariance: Array
+    log_det: float
+
+
+def solve_step(equations: NormalEquations) -> Solved:
+    """Solve for the Gauss-Newton step and the terms of the covariance.
 
     Raises
     ------
@@ -163,18 +129,24 @@ def solve_step(equations: NormalEquations) -> tuple[Array, Array, Array, Array]:
         If the matrix is not positive definite.
     """
     size, width = len(equations.globals_block), equations.diagonal.shape[1]
-    factor = cholesky_banded(to_upper_bands(equations.diagonal, equations.off_diagonal))
+    factor = cholesky_banded(
+        to_upper_bands(equations.diagonal, equations.off_diagonal), check_finite=False
+    )
     right = np.concatenate([equations.gradient[..., None], equations.coupling], axis=2)
-    solved = cho_solve_banded((factor, False), right.reshape(-1, size + 1))
+    solved = cho_solve_banded(
+        (factor, False), right.reshape(-1, size + 1), overwrite_b=True, check_finite=False
+    )
     border = equations.coupling.reshape(-1, size)
-    covariance = np.linalg.inv(equations.globals_block - border.T @ solved[:, 1:])
+    rest = equations.globals_block - border.T @ solved[:, 1:]
+    covariance = np.linalg.inv(rest)
     constants = -covariance @ (equations.globals_gradient - border.T @ solved[:, 0])
     state = -solved[:, 0] - solved[:, 1:] @ constants
-    return (
+    return Solved(
         state.reshape(-1, width),
         constants,
         solved[:, 1:].reshape(-1, width, size),
         covariance,
+        float(2 * np.log(factor[-1]).sum() + np.linalg.slogdet(rest)[1]),
     )
 
 
@@ -195,5 +167,42 @@ def marginal_covariances(diagonal: Array, above: Array) -> Array:
     right = np.stack([above, above[::-1].swapaxes(-1, -2)], axis=1)
     under = right.swapaxes(-1, -2)
     for k in range(len(above)):
-        left[k + 1] -= under[k] @ np.linalg.inv(left[k]) @ right[k]
+        left[k + 1] -= under[k] @ np.linalg.solve(left[k], right[k])
     return np.asarray(np.linalg.inv(left[:, 0] + left[::-1, 1] - diagonal))
+
+
+def eliminate_before(equations: NormalEquations, keyframe: int) -> tuple[Array, Array]:
+    """Eliminate the keyframes before one; return the information that they leave.
+
+    Parameters
+    ----------
+    equations
+        Normal equations of the keyframes before it and their steps alone: they are not in the
+        information of the keyframe itself.
+    keyframe
+        Number of keyframes to eliminate.
+
+    Returns
+    -------
+    information, vector : Array
+        (n + G, n + G) and (n + G,) of the keyframe's states and the constants.
+    """
+    width, size = equations.diagonal.shape[1], len(equations.globals_block)
+    factor = cholesky_banded(
+        to_upper_bands(equations.diagonal[:keyframe], equations.off_diagonal[: keyframe - 1])
+    )
+    edge = np.zeros((keyframe, width, width + size))
+    edge[-1, :, :width] = equations.off_diagonal[keyframe - 1]
+    edge[..., width:] = equations.coupling[:keyframe]
+    edge = edge.reshape(-1, width + size)
+    solved = cho_solve_banded((factor, False), edge)
+    information = np.zeros((width + size, width + size))
+    information[:width, :width] = equations.diagonal[keyframe]
+    information[:width, width:] = equations.coupling[keyframe]
+    information[width:, :width] = equations.coupling[keyframe].T
+    information[width:, width:] = equations.globals_block
+    vector = np.concatenate([equations.gradient[keyframe], equations.globals_gradient])
+    return (
+        information - edge.T @ solved,
+        vector - solved.T @ equations.gradient[:keyframe].ravel(),
+    )

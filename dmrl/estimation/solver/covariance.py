@@ -1,225 +1,160 @@
 """Covariance of a solution, taken where measurement noise does not count as motion.
 
 The motion of a robot makes the bearing to its peer observable: if the whole solution is turned, the
-ranges no longer fit the motion. Gauss-Newton treats the measured motion as exact. So the noise in
-the log of a robot at rest seems to fix the bearing, as a flight would.
+ranges no longer fit the motion. Gauss-Newton treats the solved motion as exact. So the noise in the
+log of a robot at rest seems to fix the bearing, as a flight would.
 
-Therefore the covariance is computed at a smoothed copy of the solution. Its motion is averaged over
-most of a second. The observer's motion, and the peer's motion relative to it, are shrunk where they
-do not exceed their noise. A static observer or a parallel flight then leaves the bearing open.
+Therefore the equations are linearized at a calm copy of the solution. A short-time Fourier
+transform separates each robot's velocity into frequencies. Those without more energy than the noise
+of the odometry vanish. Slow motion that lasts has its energy at low frequencies and stays.
 """
 
-from dataclasses import replace
-
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
-from dmrl.estimation.model.odometry import RelativeMotion, rotate, rotation_matrix
+from dmrl.estimation.model.odometry import QUARTER_TURN, rotation_matrix
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.block_tridiagonal import (
-    NormalEquations,
-    marginal_covariances,
-    solve_step,
-)
-from dmrl.estimation.solver.camera_residuals import (
-    CameraMeasurements,
-    CameraResiduals,
-    select_associated,
-)
-from dmrl.estimation.solver.keyframes import KeyframeProblem, NoiseModel
-from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, build_equations
-from dmrl.estimation.solver.residuals import RANGE_BIAS, RANGE_SCALE, linearize
-from dmrl.estimation.solver.robust_loss import irls_weights, prior_curvature
+from dmrl.estimation.solver.block_tridiagonal import marginal_covariances, solve_step
+from dmrl.estimation.solver.keyframes import Problem
+from dmrl.estimation.solver.levenberg_marquardt import Solver, relative_path
+from dmrl.estimation.solver.residuals import ConstantPrior, Rows, Values, build_equations
 
-SMOOTHING_S = 0.8
-"""Window of the moving average of velocities, seconds. Robots do not change their velocity faster
-than this. No record of how the value was chosen."""
-MOTION_WINDOW_S = 1.5
-"""Window of the same average when the motion of a robot is measured, seconds. No record of how the
-value was chosen."""
-NOISE_WINDOW_S = 10.0
-"""Window over which motion is compared with its noise, seconds. No record of how the value was
-chosen."""
-MIN_ENERGY_RATIO = 1.8
-"""Motion must exceed the energy of its noise by this factor. 10 s of pure noise reach it in a few
-per cent of all cases."""
-NOISE_INFLATION, RANGE_CONSTANT_INFLATION, CONSTANT_INFLATION = 1.25, 1.15, 1.4
-"""Factors of the sigmas: of errors from noise, of offset and scale of the ranges, of all other
-constants.
-
-The noise of a real sensor differs from its model. An average over a flight does not reduce a
-constant error, so a flight whose constant is outside its ellipse is outside throughout. Real
-velocities have larger scales and biases than their priors, and scales that differ by axis. Chosen
-for fewer bad labels among the kept ones on every simulated set."""
+CALM_WINDOW_S = 20.0
+"""Window of the transform, seconds: a slow robot keeps its velocity for a part of it."""
+MAX_MOTION_HZ = 1.0
+"""Highest frequency of motion, Hz. Robots do not change their velocity faster."""
+MIN_ENERGY_RATIO = 2.5
+"""Motion must exceed the energy of its noise by this factor. The mean of three bins of pure noise,
+chi-square with six degrees of freedom, exceeds it in 2 % of all cases."""
 
 
-def compute_covariance(
-    problem: KeyframeProblem, noise: NoiseModel, solution: MapEstimate
-) -> tuple[Array, Array]:
-    """Compute the covariances of a solution's keyframes and constants.
+def compute_covariance(solver: Solver, values: Values) -> tuple[Array, Array]:
+    """Compute the covariances of a solution's keyframes (K, n, n) and constants (G, G)."""
+    layout = solver.layout
+    calm = Values(calm_motion(solver.problem, values.state), values.constants)
+    factors = []
+    pairs = zip(solver.linearize(calm, layout), solver.linearize(values, layout), strict=True)
+    for at_calm, at_solution in pairs:
+        if isinstance(at_calm, Rows) and isinstance(at_solution, Rows):
+            # The calm copy does not fit the measurements: weights come from the solution.
+            at_calm = at_calm.with_residuals_of(at_solution)
+        factors.append(at_calm)
+    equations = build_equations(layout, factors, len(calm.state))
+    for factor in factors:
+        if isinstance(factor, ConstantPrior):
+            held = factor.curvature() - factor.information()
+            equations.globals_block[...] += np.diag(held)
+    solved = solve_step(equations)
+    spread = marginal_covariances(equations.diagonal, equations.off_diagonal)
+    by_constants = solved.response @ solved.covariance @ solved.response.swapaxes(1, 2)
+    return spread + by_constants, solved.covariance
+
+
+def relative_covariance(state: Array, spread: Array, one: int = 0, other: int = 1) -> Array:
+    """Return (K, 3, 3) covariances of one robot's pose in another's horizontal frame.
 
     Parameters
     ----------
-    problem, noise
-        Keyframes of the flight, and the noise model.
-    solution
-        Solution of the flight.
-
-    Returns
-    -------
-    keyframes : Array
-        (K, 6, 6) of x, y (m), psi (rad), wx, wy (m/s), b (m).
-    constants : Array
-        (G, G), in the order of ``GLOBALS``.
+    state, spread
+        (K, n) and (K, n, n) keyframes and their covariances.
+    one, other
+        Observer and peer.
     """
-    if problem.camera is not None:
-        problem = replace(problem, camera=select_associated(problem.camera, solution.state))
-    at_solution = linearize(problem, noise, solution.state, solution.constants)
-    calm, state = denoise_for_covariance(problem, noise, solution.state)
-    linear = linearize(calm, noise, state, solution.constants)
-    # The denoised copy does not fit the ranges, so their weights come from the solution.
-    linear.ranges[:, -1] = at_solution.range
-    if linear.camera is not None and at_solution.camera is not None:
-        linear.camera.rows[..., -1] = at_solution.camera.rows[..., -1]
-        linear.camera.excess[:] = at_solution.camera.excess
-    equations = build_equations(calm, noise, linear, solution.constants)
-    weights = irls_weights(linear, noise, solution.constants)
-    held = prior_curvature(noise, solution.constants) - weights.prior * noise.prior_std() ** -2
-    equations.globals_block[...] += np.diag(held)
-    keyframes, constants = _inflate_marginals(equations)
-    if problem.camera is not None and linear.camera is not None and weights.camera is not None:
-        keyframes += _camera_covariance(equations, problem.camera, linear.camera, weights.camera)
-    return keyframes, constants
+    xy = relative_path(state, one, other)[:, :2]
+    back = rotation_matrix(-state[:, 3 * one + 2])
+    by_both = np.zeros((len(state), 3, 6))
+    by_both[:, :2, :2], by_both[:, :2, 3:5], by_both[:, :2, 2] = -back, back, -xy @ QUARTER_TURN.T
+    by_both[:, 2, 2], by_both[:, 2, 5] = -1.0, 1.0
+    at = np.concatenate([3 * one + np.arange(3), 3 * other + np.arange(3)])
+    return np.asarray(by_both @ spread[:, at[:, None], at] @ by_both.swapaxes(1, 2))
 
 
-def _camera_covariance(
-    equations: NormalEquations, looks: CameraMeasurements, found: CameraResiduals, weight: Array
-) -> Array:
-    """Return (K, 6, 6) the covariance from an error that all images of a camera share.
-
-    Such errors come from a mount or a network. They are considered, not solved for (Schmidt 1966):
-    one for either camera, as large as the azimuth error of a single image.
-    """
-    out = np.zeros_like(equations.diagonal)
-    for side in (1, -1):
-        mine = weight * (looks.observer_sign == side)
-        gradient = np.zeros_like(equations.gradient)
-        pulled, part = found.rows[:, 0, :3] * mine[:, None], looks.fraction[:, None]
-        np.add.at(gradient[:, :3], looks.keyframe, (1 - part) * pulled)
-        np.add.at(gradient[:, :3], looks.keyframe + 1, part * pulled)
-        nothing = np.zeros_like(equations.globals_gradient)
-        moved = solve_step(replace(equations, gradient=gradient, globals_gradient=nothing))[0]
-        out += moved[:, :, None] * moved[:, None, :]
-    return out
-
-
-def _inflate_marginals(equations: NormalEquations) -> tuple[Array, Array]:
-    """Return inflated covariances of keyframes (K, n, n) and plain ones of the constants (G, G)."""
-    *_, response, constants = solve_step(equations)
-    keyframes = NOISE_INFLATION**2 * marginal_covariances(
-        equations.diagonal, equations.off_diagonal
-    )
-    wider = np.full(len(constants), CONSTANT_INFLATION)
-    wider[[RANGE_BIAS, RANGE_SCALE]] = RANGE_CONSTANT_INFLATION
-    response = response * wider
-    return keyframes + response @ constants @ response.swapaxes(1, 2), constants
-
-
-def denoise_for_covariance(
-    problem: KeyframeProblem, noise: NoiseModel, state: Array
-) -> tuple[KeyframeProblem, Array]:
-    """Return a flight and its solution without probable noise, for the linearization.
-
-    Parameters
-    ----------
-    problem, noise
-        Keyframes of the flight, and the noise model.
-    state
-        (K, 6) states of the solution.
-    """
-    step_s = float(np.median(problem.steps_s))
-    own_heading, own = integrate_path(problem.own)
-    relative = rotate(rotation_matrix(own_heading), state[:, :2])
-    single = velocity_noise_power(noise)
-    own_steps = shrink_to_signal(np.diff(own, axis=0) / step_s, single, step_s) * step_s
-    relative_steps = (
-        shrink_to_signal(np.diff(relative, axis=0) / step_s, 2 * single, step_s) * step_s
-    )
-    path = np.concatenate([np.zeros((1, 2)), np.cumsum(relative_steps, axis=0)])
-    path += relative.mean(axis=0) - path.mean(axis=0)
-
-    out = np.zeros_like(state)
-    out[:, :2] = rotate(rotation_matrix(-own_heading), path)
-    out[:, 2] = state[:, 2]
-    own_shift = rotate(rotation_matrix(-own_heading[:-1]), own_steps)
-    # The peer's own path is the observer's plus the relative one, rotated into the peer's frame.
-    peer_heading = own_heading[:-1] + state[:-1, 2]
-    peer_shift = rotate(rotation_matrix(-peer_heading), own_steps + relative_steps)
-    return replace(
-        problem,
-        own=replace(problem.own, shift_m=own_shift),
-        peer=replace(problem.peer, shift_m=peer_shift),
-    ), out
-
-
-def velocity_noise_power(noise: NoiseModel) -> float:
-    """Return the mean square of one velocity's noise after the average, both axes, (m/s)^2.
-
-    It is at least that of the default model: motion that reveals good logs is sufficient motion.
-    """
-    return 2 * max(noise.velocity_psd, NoiseModel().velocity_psd) / SMOOTHING_S
-
-
-def shrink_to_signal(velocity: Array, energy: float, step_s: float) -> Array:
-    """Return (K - 1, 2) averaged velocities, shrunk towards zero by their share of noise.
-
-    Parameters
-    ----------
-    velocity
-        (K - 1, 2) m/s.
-    energy
-        Mean square of their noise after the average, (m/s)^2.
-    step_s
-        Seconds between samples.
-    """
-    slow = uniform_filter1d(velocity, max(1, round(SMOOTHING_S / step_s)), axis=0, mode="nearest")
-    window = max(1, round(NOISE_WINDOW_S / step_s))
-    seen = uniform_filter1d((slow**2).sum(axis=1), window, mode="nearest")
-    # The energies of motion and noise add up to the measured one, so motion's share is the rest.
-    share = np.sqrt(np.maximum(1 - MIN_ENERGY_RATIO * energy / np.maximum(seen, 1e-12), 0.0))
-    return np.asarray(slow * share[:, None])
-
-
-def motion_energy(problem: KeyframeProblem, state: Array) -> tuple[float, float, float]:
-    """Return mean squares of the averaged own, peer and relative velocity.
+def calm_motion(problem: Problem, state: Array) -> Array:
+    """Return the states on paths without probable noise, own and relative.
 
     Parameters
     ----------
     problem
-        Keyframes of the flight.
+        Flight and its noise model.
     state
-        (K, 3) or (K, 6) states of the solution.
-
-    Returns
-    -------
-    own, peer, relative : float
-        (m/s)^2, noise included.
+        (K, n) states of the solution.
     """
-    step_s = float(np.median(problem.steps_s))
-    heading, own = integrate_path(problem.own)
-    relative = rotate(rotation_matrix(heading), state[:, :2])
-    energies = []
-    for path in (own, integrate_path(problem.peer)[1], relative):
-        velocity = np.diff(path, axis=0) / step_s
-        slow = uniform_filter1d(
-            velocity, max(1, round(MOTION_WINDOW_S / step_s)), axis=0, mode="nearest"
-        )
-        energies.append(float((slow**2).sum(axis=1).mean()))
-    return energies[0], energies[1], energies[2]
+    robots, step_s = len(problem.robots), float(np.median(np.diff(problem.keyframe_s)))
+    xy = np.stack([state[:, 3 * k] + 1j * state[:, 3 * k + 1] for k in range(robots)], axis=1)
+    velocity = np.diff(xy, axis=0) / step_s
+    own = np.stack([_drop_noise(v, v, problem, step_s) for v in velocity.T], axis=1)
+    mean = own.mean(axis=1, keepdims=True)
+    # Two robots that move alike do not move relative to each other.
+    pairs = zip((own - mean).T, velocity.T, strict=True)
+    apart = np.stack([_drop_noise(v, raw, problem, step_s) for v, raw in pairs], axis=1)
+    path = np.concatenate([np.zeros((1, robots)), np.cumsum(mean + apart, axis=0)]) * step_s
+    path += xy.mean(axis=0) - path.mean(axis=0)
+    out = state.copy()
+    for k in range(robots):
+        out[:, 3 * k], out[:, 3 * k + 1] = path[:, k].real, path[:, k].imag
+    return out
 
 
-def integrate_path(moves: RelativeMotion) -> tuple[Array, Array]:
-    """Return heading (K,) and position (K, 2) of a robot in the frame of its first keyframe."""
-    heading = np.concatenate([[0.0], np.cumsum(moves.turn_rad)])
-    steps = rotate(rotation_matrix(heading[:-1]), moves.shift_m)
-    return heading, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+def odometry_energy(problem: Problem, robot: int) -> float:
+    """Return the energy of a robot's own motion without noise, relative to the noise in a second.
+
+    It is that of the measured motion: ranges to a peer would bend a solved one.
+    """
+    motion, step_s = problem.robots[robot].motion, problem.robots[robot].steps_s
+    heading = np.concatenate([[0.0], np.cumsum(motion.turn_rad)])[:-1]
+    shift = (motion.shift_m[:, 0] + 1j * motion.shift_m[:, 1]) * np.exp(1j * heading)
+    calm = _drop_noise(shift / step_s, shift / step_s, problem, float(np.median(step_s)))
+    return float((np.abs(calm) ** 2).mean() / problem.velocity_psd)
+
+
+def _drop_noise(velocity: Array, raw: Array, problem: Problem, step_s: float) -> Array:
+    """Return a complex velocity (S,) with the frequencies that exceed their noise.
+
+    Parameters
+    ----------
+    velocity, raw
+        (S,) x + i y to clean; and as solved, which shows the noise above all motion, m/s.
+    problem
+        Flight with its noise model.
+    step_s
+        Seconds between samples.
+    """
+    length = min(2 * round(CALM_WINDOW_S / step_s / 2), 2 * (len(velocity) // 2))
+    if length < 4:
+        return velocity * 0
+    hop = length // 2
+    window = np.sin((np.arange(length) + 0.5) * np.pi / length)
+    hz = np.fft.fftfreq(length, step_s)
+    found = _transform(velocity, window, hop)
+    energy = np.abs(found) ** 2
+    energy = (energy + np.roll(energy, 1, axis=1) + np.roll(energy, -1, axis=1)) / 3
+    noise = 2 * (window**2).sum() / step_s * _noise_density(problem, hz, step_s)
+    above = np.abs(hz) > MAX_MOTION_HZ
+    # A flight without motion shows no grade of its noise, but robots do not move that fast.
+    shown = np.median((np.abs(_transform(raw, window, hop)[:, above]) ** 2).mean(axis=1))
+    noise = noise * max(1.0, float(shown / noise[above].mean()))
+    bias_mps = next((row.std for row in problem.table if row.name == "vx_bias"), 0.0)
+    noise[[-1, 0, 1]] += 2 * (window.sum() * bias_mps) ** 2 / 3
+    # The energies of motion and noise add up to the measured one, so motion's share is the rest.
+    share = np.sqrt(np.maximum(1 - noise / np.maximum(energy, 1e-12), 0.0))
+    share[(energy < MIN_ENERGY_RATIO * noise) | above] = 0.0
+    calm = np.fft.ifft(found * share, axis=1) * window
+    out = np.zeros(hop * (len(calm) + 1), complex)
+    for number, piece in enumerate(calm):
+        out[number * hop : number * hop + length] += piece
+    return out[hop : hop + len(velocity)]
+
+
+def _transform(velocity: Array, window: Array, hop: int) -> Array:
+    """Return (W, length) Fourier transforms of overlapping windows of a velocity."""
+    mode = "reflect" if len(velocity) > len(window) + hop else "wrap"
+    padded = np.pad(velocity, (hop, len(window) + hop), mode=mode)
+    starts = np.arange(0, len(padded) - len(window) + 1, hop)
+    return np.fft.fft(padded[starts[:, None] + np.arange(len(window))] * window, axis=1)
+
+
+def _noise_density(problem: Problem, hz: Array, step_s: float) -> Array:
+    """Return (length,) noise of one axis of a velocity at each frequency, m^2/s."""
+    white = problem.noise.velocity_psd * problem.noise.grade**2
+    tau_s = max((r.time_s for r in problem.table if r.name == "velocity_error_x"), default=0.0)
+    fading = problem.fading_psd / (1 + (2 * np.pi * hz * tau_s) ** 2)
+    return np.asarray((white + fading) * np.sinc(hz * step_s) ** 2)

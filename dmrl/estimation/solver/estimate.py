@@ -6,10 +6,10 @@ from typing import Literal
 import numpy as np
 
 from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation_matrix
-from dmrl.estimation.model.pair import GLOBALS_FROM_PEER, Array
+from dmrl.estimation.model.pair import Array
 from dmrl.estimation.model.status import UNCONVERGED, Statuses
 from dmrl.estimation.solver.keyframes import NoiseModel
-from dmrl.estimation.solver.residuals import CLOCK
+from dmrl.estimation.solver.unknowns import TABLE, Layout, build_layout, from_peer
 
 RejectionReason = Literal["still", "alike", "silent", "open", "imprecise"]
 """Reason why no position is OK.
@@ -17,11 +17,13 @@ RejectionReason = Literal["still", "alike", "silent", "open", "imprecise"]
 still: the observer hardly moves. alike: both robots move alike. silent: sensors dropped out for
 most of the flight. open: the motion leaves the bearing open, or other solutions fit. imprecise: no
 position is precise enough."""
+PAIR_LAYOUT: Layout = build_layout(TABLE, 2, [(0, 1)])
+"""Columns of a pair without detections."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Trajectory of a peer over a flight, K keyframes or steps.
+    """Trajectory of a peer over a flight, K keyframes or steps. The observer is robot 0.
 
     Parameters
     ----------
@@ -34,16 +36,23 @@ class Estimate:
     status
         (K,) OK, UNCONVERGED (not precise enough to label) or AMBIGUOUS (more than one solution).
     constants
-        (G,) constants of the flight, in the order of ``GLOBALS``; zeros if the method estimates
+        (G,) constants of the flight, in the order of ``layout``; zeros if the method estimates
         none.
     noise
         Selected noise model of the sensors.
+    layout
+        Columns of the constants.
+    height_m, height_std_m
+        (K,) error of the measured height difference, metres, and its standard deviation. None: not
+        estimated.
     range_error_m
         (K,) temporary excess of the ranges, as behind an obstacle, metres. None: not estimated.
     rejection_reason
         Reason why no position is OK; None if any is.
     constants_covariance
         (G, G) of the constants. None: not estimated.
+    modes
+        Number of distinct solutions of nearly equal cost that the covariance contains.
     """
 
     time_s: Array
@@ -52,9 +61,17 @@ class Estimate:
     status: Statuses
     constants: Array
     noise: NoiseModel
+    layout: Layout = PAIR_LAYOUT
+    height_m: Array | None = None
+    height_std_m: Array | None = None
     range_error_m: Array | None = None
     rejection_reason: RejectionReason | None = None
     constants_covariance: Array | None = None
+    modes: int = 1
+
+    def value(self, name: str, *robots: int) -> float:
+        """Return a constant of the flight by name and robots (0: observer, 1: peer)."""
+        return float(self.constants[self.layout.find(name, *robots)])
 
     def interpolate_at(self, time_s: Array) -> tuple[Array, Array, Statuses]:
         """Interpolate positions (N, 2), covariances (N, 2, 2) and statuses (N,) at times.
@@ -88,12 +105,11 @@ def seen_from_peer(estimate: Estimate) -> Estimate:
     by_state[:, :2, :2], by_state[:, 2, 2] = -rotation_matrix(-estimate.state[:, 2]), -1.0
     by_state[:, :2, 2] = -state[:, :2] @ QUARTER_TURN.T
     covariance = by_state @ estimate.covariance @ by_state.swapaxes(1, 2)
-    constants = estimate.constants[GLOBALS_FROM_PEER]
-    constants[CLOCK] *= -1  # the offset of the other clock has the opposite sign
     return replace(
         estimate,
         state=state,
         covariance=covariance,
-        constants=constants,
+        constants=from_peer(estimate.layout, estimate.constants),
         constants_covariance=None,
+        height_m=None if estimate.height_m is None else -estimate.height_m,
     )

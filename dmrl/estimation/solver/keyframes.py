@@ -1,256 +1,402 @@
-"""Cut a pair into keyframes for the filter, the smoother and the batch solve."""
+"""Cut a flight of N robots into keyframes: the measured data of every factor."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.estimation.model.odometry import RelativeMotion, preintegrate
-from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Mask, Pair
+from dmrl.estimation.model.odometry import Odometry, RelativeMotion, preintegrate
+from dmrl.estimation.model.pair import (
+    MAX_DROPOUT_S,
+    Array,
+    BearingMeasurements,
+    Mask,
+    Pair,
+    SensorTrack,
+)
 from dmrl.estimation.signals.jump_detection import step_offsets
-from dmrl.estimation.solver.camera_residuals import CameraMeasurements, camera_measurements
+from dmrl.estimation.solver.robust_loss import Cauchy, Loss
+from dmrl.estimation.solver.unknowns import TABLE, Layout, Subject, Unknown, build_layout
 
-KEYFRAME_HZ = 10.0
-"""Keyframes per second, Hz. No record of how the value was chosen."""
-RANGE_BLOCK_S, RANGE_MEDIAN_BLOCKS = 0.1, 3
-"""Length of the blocks of ranges, seconds, and the number of block medians on either side of a
-step. No record of how the values were chosen."""
-MIN_RANGE_STEP_M = 0.45
-"""Smallest detected step of the ranges, metres. Smaller steps are left to the solve. Added for
-bursts of long ranges; no record of how the value was chosen."""
-CLOCK_HALF_STEP_S = 0.02
-"""Half the time difference of the numeric derivative by the peer's clock, seconds. No record of how
-the value was chosen."""
+Measured = TypeVar("Measured", "RangeLink", "CameraView")
+
+KEYFRAME_HZ = 5.0
+"""Keyframes per second, Hz. Twice the rate costs twice the time and gave the same error on ten
+simulated flights; ranges and outputs keep their own times."""
+RANGE_BLOCK_S, RANGE_MEDIAN_BLOCKS, MIN_RANGE_STEP_M = 0.1, 3, 0.45
+"""Detection of range steps for the search: length of a block, seconds; number of block medians on
+either side; smallest step, metres. Smaller steps are left to the solve."""
+CORRELATION_S = 0.3
+"""Time over which a network repeats its errors, seconds: images within it count as one."""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Noise model of the sensors; one standard deviation each unless a unit shows otherwise.
+    """Noise of the measurements; the unknowns have their own in the table.
 
     Parameters
     ----------
-    velocity_std_mps, velocity_tau_s
-        Coloured noise of either robot's velocity, per axis, and its correlation time.
-    velocity_white_psd
-        White noise of either velocity: variance per second of integration, m^2/s.
+    grade
+        Factor of the velocity noise, relative to the defaults.
+    constants_grade
+        Factor of the priors of graded constants.
+    velocity_psd
+        White noise of a velocity: variance per second of integration, m^2/s.
     yaw_rate_psd
-        White noise of either yaw rate, rad^2/s.
+        White noise of a yaw rate, rad^2/s.
     range_std_m
         White noise of a range.
-    range_loss_scale_m
-        Residual at which a range has half its weight.
-    range_error_std_m, range_tau_s
-        Coloured noise of the ranges, and its correlation time.
-    range_step_sigmas
-        Change of that noise at which a step has half its weight, in standard deviations. The loss
-        lets the error jump.
-    range_error_loss_scale_m, range_error_weight
-        Weak prior that pulls the coloured range error back to zero at every keyframe: the error at
-        which it has half its weight, and the weight.
-    bias_std_m, scale_std
-        Offset and scale of a pair's ranges.
-    gyro_std_radps
-        Bias of either yaw rate.
-    velocity_scale_std, velocity_bias_std_mps
-        Scale and bias of either velocity.
-    clock_std_s
-        Offset of the peer's clock.
     height_std_m
         Height difference.
     dropout_speed_mps, dropout_turn_radps
-        Motion of a robot during a dropout of its sensors, per square root of a second.
-    calibrated_std
-        Constants of the flight, in the order of ``GLOBALS``, as known from other flights. Empty: no
-        calibration.
+        Motion of a robot without odometry, per square root of a second.
+    range_loss, motion_loss, bearing_loss
+        Losses. A radio's detour or a slipping flow is no Gaussian tail.
+    known_std
+        Standard deviations of constants that other flights determined, by subject.
     """
 
-    velocity_std_mps: float = 0.08
-    velocity_tau_s: float = 0.3
-    velocity_white_psd: float = 2e-4
+    grade: float = 1.0
+    constants_grade: float = 1.0
+    velocity_psd: float = 2e-4
     yaw_rate_psd: float = 1e-5
     range_std_m: float = 0.12
-    range_loss_scale_m: float = 0.15
-    range_error_std_m: float = 0.02
-    range_tau_s: float = 200.0
-    range_step_sigmas: float = 1.0
-    range_error_loss_scale_m: float = 0.05
-    range_error_weight: float = 0.02
-    bias_std_m: float = 0.15
-    scale_std: float = 0.02
-    gyro_std_radps: float = 0.003
-    velocity_scale_std: float = 0.05
-    velocity_bias_std_mps: float = 0.02
-    clock_std_s: float = 0.02
     height_std_m: float = 0.04
     dropout_speed_mps: float = 0.5
     dropout_turn_radps: float = 0.5
-    calibrated_std: tuple[float, ...] = ()
+    range_loss: Loss = field(default_factory=lambda: Cauchy(1.25))
+    motion_loss: Loss = field(default_factory=lambda: Cauchy(5.0))
+    bearing_loss: Loss = field(default_factory=lambda: Cauchy(2.0))
+    known_std: Mapping[tuple[str, tuple[int, ...]], float] = field(default_factory=dict)
 
-    @property
-    def velocity_psd(self) -> float:
-        """Low-frequency noise of either velocity: variance per second, m^2/s."""
-        return 2 * self.velocity_tau_s * self.velocity_std_mps**2 + self.velocity_white_psd
-
-    def scaled_by(self, grade: float, constants: float | None = None) -> "NoiseModel":
-        """Return the model with scaled velocity noise and scaled priors of the constants.
-
-        Parameters
-        ----------
-        grade
-            Factor of the velocity noise.
-        constants
-            Factor of the priors of the scales. None: the same factor.
-        """
-        worse = grade if constants is None else constants
-        return replace(
-            self,
-            velocity_std_mps=self.velocity_std_mps * grade,
-            velocity_white_psd=self.velocity_white_psd * grade**2,
-            scale_std=self.scale_std * worse,
-            velocity_scale_std=self.velocity_scale_std * worse,
+    def prior_std(self, layout: Layout) -> Array:
+        """Return (G,) prior standard deviations of the constants."""
+        return np.array(
+            [
+                min(
+                    row.std * (self.constants_grade if row.graded else 1.0),
+                    self.known_std.get(subject, np.inf),
+                )
+                for subject, row in layout.constants
+            ]
         )
-
-    def with_range_noise(self, times: float) -> "NoiseModel":
-        """Return the model with the white range noise multiplied by a factor."""
-        return replace(
-            self,
-            range_std_m=self.range_std_m * times,
-            range_loss_scale_m=self.range_loss_scale_m * times,
-        )
-
-    def prior_std(self) -> Array:
-        """Return (11,) prior standard deviations of the constants, in the order of ``GLOBALS``."""
-        pairwise = [self.gyro_std_radps] * 2 + [self.velocity_scale_std] * 2
-        velocity = [self.velocity_bias_std_mps] * 4
-        usual = [self.bias_std_m, self.scale_std, *pairwise, *velocity, self.clock_std_s]
-        return np.minimum(usual, self.calibrated_std or np.inf)
-
-
-GLOBALS = (
-    "range_bias_m",
-    "range_scale",
-    "own_gyro_bias_radps",
-    "peer_gyro_bias_radps",
-    "own_velocity_scale",
-    "peer_velocity_scale",
-    "own_vx_bias_mps",
-    "own_vy_bias_mps",
-    "peer_vx_bias_mps",
-    "peer_vy_bias_mps",
-    "peer_clock_s",
-)
-"""Constants of a flight, in the order of every vector of globals."""
 
 
 @dataclass(frozen=True, slots=True)
-class KeyframeProblem:
-    """A pair cut into K keyframes, with R ranges.
+class Steps:
+    """Measured motion of one robot between K keyframes, S = K - 1.
+
+    Parameters
+    ----------
+    steps_s
+        (S,) seconds.
+    motion
+        S motions from each keyframe to the next.
+    clock_derivative
+        (S, 3) derivative of shift and turn by the robot's clock offset, per second.
+    dropout_s
+        (S,) seconds of each step without odometry.
+    path
+        Dead reckoning of the robot, for any time.
+    height_m
+        (K,) measured heights.
+    """
+
+    steps_s: Array
+    motion: RelativeMotion
+    clock_derivative: Array
+    dropout_s: Array
+    path: Odometry
+    height_m: Array
+
+
+@dataclass(frozen=True, slots=True)
+class RangeLink:
+    """R ranges between two robots.
+
+    Parameters
+    ----------
+    robots
+        Indices of the two robots.
+    keyframe
+        (R,) keyframe nearest to each range, ascending.
+    time_s, range_m
+        (R,) times, seconds, and measured ranges, metres.
+    std_share
+        (R,) standard deviations relative to the noise model's.
+    own_shift_m, peer_shift_m
+        (R, 2) motion of either robot from the keyframe to the range, in its own frame.
+    height_m
+        (R,) height of the second robot minus that of the first.
+    offset_guess_m
+        (R,) detected excess of the ranges: a first guess.
+    """
+
+    robots: tuple[int, int]
+    keyframe: NDArray[np.intp]
+    time_s: Array
+    range_m: Array
+    std_share: Array
+    own_shift_m: Array
+    peer_shift_m: Array
+    height_m: Array
+    offset_guess_m: Array
+
+
+@dataclass(frozen=True, slots=True)
+class CameraView:
+    """Candidate detections of one robot in another's I images.
+
+    Parameters
+    ----------
+    robots
+        Indices of the robot with the camera and of its peer.
+    keyframe
+        (I,) keyframe nearest to each image, ascending.
+    own_shift_m, peer_shift_m, own_turn_rad
+        (I, 2), (I, 2), (I,) motions from the keyframe to the image.
+    height_m
+        (I,) height of the peer minus that of the observer.
+    bearing, std
+        (I, C, 3) azimuth, elevation (rad) and log distance of the candidates, NaN where there are
+        fewer; and their standard deviations.
+    weight
+        (I,) weight of an image among those with the same errors.
+    time_s
+        (I,) capture times, seconds.
+    """
+
+    robots: tuple[int, int]
+    keyframe: NDArray[np.intp]
+    own_shift_m: Array
+    peer_shift_m: Array
+    own_turn_rad: Array
+    height_m: Array
+    bearing: Array
+    std: Array
+    weight: Array
+    time_s: Array
+
+
+def select_measurements(measured: Measured, chosen: Mask) -> Measured:
+    """Return some of the ranges of a link, or of the images of a view."""
+    names = [name for name in measured.__dataclass_fields__ if name != "robots"]
+    return replace(measured, **{name: getattr(measured, name)[chosen] for name in names})
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A flight of N robots at K keyframes, with the table of its unknowns.
 
     Parameters
     ----------
     keyframe_s
-        (K,) times of the keyframes, seconds.
-    own, peer
-        K - 1 motions from each keyframe to the next.
-    peer_clock_derivative
-        (K - 1, 2) derivative of the peer's shift by its clock offset, m/s.
-    dropout_s
-        (K - 1,) part of the interval, in seconds, with a dropout of velocity or yaw rate.
-    dropout
-        (K,) whether any sensor of a robot, heights included, dropped out for over half a second.
-    range_dropout
-        (K,) whether the ranges dropped out.
-    range_keyframe
-        (R,) keyframe at or before each range.
-    range_m
-        (R,) measured ranges, metres.
-    own_to_range, peer_to_range
-        R motions from that keyframe to the range.
-    range_offset_guess_m
-        (R,) detected step offset of the ranges, metres: a first guess.
-    height_m
-        (R,) peer's height minus the observer's, metres.
-    camera
-        Camera measurements. None: no images.
-    calibrated_std
-        As in `Pair`.
+        (K,) times, seconds.
+    robots, links, views
+        Measured motions, ranges and detections.
+    table
+        Rows of the unknowns.
+    noise
+        Noise of the measurements.
+    unused
+        Unknowns of the table that this flight does not need.
     """
 
     keyframe_s: Array
-    own: RelativeMotion
-    peer: RelativeMotion
-    peer_clock_derivative: Array
-    dropout_s: Array
-    dropout: Mask
-    range_dropout: Mask
-    range_keyframe: NDArray[np.intp]
-    range_m: Array
-    own_to_range: RelativeMotion
-    peer_to_range: RelativeMotion
-    range_offset_guess_m: Array
-    height_m: Array
-    camera: CameraMeasurements | None = None
-    calibrated_std: Array | None = None
+    robots: tuple[Steps, ...]
+    links: tuple[RangeLink, ...]
+    views: tuple[CameraView, ...] = ()
+    table: tuple[Unknown, ...] = TABLE
+    noise: NoiseModel = field(default_factory=NoiseModel)
+    unused: frozenset[Subject] = frozenset()
 
     @property
-    def steps_s(self) -> Array:
-        """(K - 1,) seconds between keyframes."""
-        return np.diff(self.keyframe_s)
+    def layout(self) -> Layout:
+        """Columns of the unknowns."""
+        sighted = {robot for view in self.views for robot in view.robots}
+        links = [link.robots for link in self.links]
+        return build_layout(self.table, len(self.robots), links, sighted, self.unused)
+
+    @property
+    def fading_psd(self) -> float:
+        """Low-frequency noise of a fading velocity error: variance per second, m^2/s."""
+        rows = [row for row in self.table if row.name == "velocity_error_x"]
+        return sum(2 * row.time_s * (row.std * self.noise.grade) ** 2 for row in rows)
+
+    @property
+    def velocity_psd(self) -> float:
+        """Low-frequency noise of a velocity: variance per second, m^2/s."""
+        return self.noise.velocity_psd * self.noise.grade**2 + self.fading_psd
 
 
-def build_keyframes(pair: Pair, rate_hz: float = KEYFRAME_HZ) -> KeyframeProblem:
-    """Build the keyframes of a pair.
+def build_problem(pairs: Mapping[tuple[int, int], Pair], rate_hz: float = KEYFRAME_HZ) -> Problem:
+    """Cut a flight into keyframes over the time that all robots share.
 
     Parameters
     ----------
-    pair
-        Sensor data of both robots.
+    pairs
+        Sensor data by the indices of both robots, each pair once.
     rate_hz
         Keyframes per second.
     """
-    grid = pair.time_s
-    count = max(2, int((grid[-1] - grid[0]) * rate_hz) + 1)
-    key_s = grid[0] + np.arange(count) / rate_hz
-    key_s = np.minimum(key_s, grid[-1])
-    own, peer = preintegrate(pair.own, grid), preintegrate(pair.peer, grid)
-    start, end = key_s[:-1], key_s[1:]
-    range_key = np.clip(np.searchsorted(key_s, pair.range_time_s, "right") - 1, 0, count - 1)
-    early, late = (np.clip(edge - CLOCK_HALF_STEP_S, grid[0], grid[-1]) for edge in (start, end))
-    early_2, late_2 = (
-        np.clip(edge + CLOCK_HALF_STEP_S, grid[0], grid[-1]) for edge in (start, end)
+    start_s = max(pair.time_s[0] for pair in pairs.values())
+    end_s = min(pair.time_s[-1] for pair in pairs.values())
+    count = max(2, int((end_s - start_s) * rate_hz + 1e-6) + 1)
+    key_s = np.minimum(start_s + np.arange(count) / rate_hz, end_s)
+    logs: dict[int, tuple[Array, SensorTrack]] = {}
+    for both, pair in pairs.items():
+        for number, track in zip(both, (pair.own, pair.peer), strict=True):
+            # A contradiction with one peer's ranges counts for all of them.
+            if number not in logs or track.dropout.mean() > logs[number][1].dropout.mean():
+                logs[number] = pair.time_s, track
+    robots = [_cut_steps(*logs[number], key_s) for number in range(len(logs))]
+    links, views = [], []
+    for (one, other), pair in pairs.items():
+        links.append(_cut_link((one, other), pair, robots, key_s))
+        for side, sees in (((one, other), pair.own_bearings), ((other, one), pair.peer_bearings)):
+            cropped = sees and sees.crop(key_s[0], key_s[-1])
+            if cropped is not None and len(cropped.time_s):
+                views.append(_cut_view(side, cropped, pair, robots, key_s))
+    known = _collect_known(pairs)
+    for view in views:
+        # Errors that last are as large as those of one detection.
+        for axis, name in enumerate(("camera_azimuth", "camera_elevation", "camera_distance")):
+            known[name, view.robots[:1]] = float(np.nanmedian(view.std[..., axis]))
+    noise = NoiseModel(known_std=known)
+    return Problem(key_s, tuple(robots), tuple(links), tuple(views), noise=noise)
+
+
+def _collect_known(
+    pairs: Mapping[tuple[int, int], Pair],
+) -> dict[tuple[str, tuple[int, ...]], float]:
+    """Return the known standard deviations of all pairs by the robots of the flight."""
+    out: dict[tuple[str, tuple[int, ...]], float] = {}
+    for both, pair in pairs.items():
+        for (name, own), std in pair.known_std.items():
+            subject = name, tuple(both[side] for side in own)
+            out[subject] = min(std, out.get(subject, np.inf))
+    return out
+
+
+def nearest_keyframe(key_s: Array, time_s: Array) -> NDArray[np.intp]:
+    """Return (N,) the keyframe nearest to each time."""
+    place = np.rint(np.interp(time_s, key_s, np.arange(len(key_s))))
+    return np.asarray(place, np.intp)
+
+
+def _cut_steps(time_s: Array, track: SensorTrack, key_s: Array) -> Steps:
+    """Cut the log of one robot."""
+    path = preintegrate(track, time_s)
+    motion = path.relative_motion(key_s[:-1], key_s[1:])
+    half_s = 2 * float(time_s[1] - time_s[0])
+    late, early = (
+        path.relative_motion(key_s[:-1] + lag, key_s[1:] + lag) for lag in (half_s, -half_s)
     )
-    before, after = peer.relative_motion(early, late), peer.relative_motion(early_2, late_2)
-    gap = np.interp(end, grid, np.cumsum((pair.own.dropout | pair.peer.dropout) * pair.dt_s))
-    height = pair.peer.height_m - pair.own.height_m
-    return KeyframeProblem(
-        keyframe_s=key_s,
-        own=own.relative_motion(start, end),
-        peer=peer.relative_motion(start, end),
-        peer_clock_derivative=(after.shift_m - before.shift_m) / (2 * CLOCK_HALF_STEP_S),
-        dropout_s=np.diff(gap, prepend=0.0),
-        dropout=odometry_dropout(pair, key_s),
-        range_dropout=range_dropout(pair, key_s),
-        range_keyframe=range_key,
-        range_m=pair.range_m,
-        own_to_range=own.relative_motion(key_s[range_key], pair.range_time_s),
-        peer_to_range=peer.relative_motion(key_s[range_key], pair.range_time_s),
-        range_offset_guess_m=range_step_offsets(pair),
-        height_m=np.interp(pair.range_time_s, grid, height),
-        camera=camera_measurements(pair, key_s, NoiseModel().height_std_m),
-        calibrated_std=pair.calibrated_std,
+    by_clock = np.column_stack([late.shift_m - early.shift_m, late.turn_rad - early.turn_rad])
+    gap_s = np.cumsum(track.dropout) * (time_s[1] - time_s[0])
+    return Steps(
+        np.diff(key_s),
+        motion,
+        by_clock / (2 * half_s),
+        np.diff(np.interp(key_s, time_s, gap_s)),
+        path,
+        np.interp(key_s, time_s, track.height_m),
     )
 
 
-def odometry_dropout(pair: Pair, time_s: Array) -> Mask:
-    """Return (K,) whether a sensor of either robot dropped out for over half a second.
+def _cut_link(
+    both: tuple[int, int], pair: Pair, robots: Sequence[Steps], key_s: Array
+) -> RangeLink:
+    """Cut the ranges of a pair."""
+    inside = (pair.range_time_s >= key_s[0]) & (pair.range_time_s <= key_s[-1])
+    at_s = pair.range_time_s[inside]
+    key = nearest_keyframe(key_s, at_s)
+    shifts = [robots[k].path.relative_motion(key_s[key], at_s).shift_m for k in both]
+    height_m = np.interp(at_s, pair.time_s, pair.peer.height_m - pair.own.height_m)
+    guess = range_step_offsets(pair)[inside]
+    ones = np.ones(len(key))
+    return RangeLink(both, key, at_s, pair.range_m[inside], ones, *shifts, height_m, guess)
+
+
+def _cut_view(
+    both: tuple[int, int],
+    sees: BearingMeasurements,
+    pair: Pair,
+    robots: Sequence[Steps],
+    key_s: Array,
+) -> CameraView:
+    """Cut the detections of one camera of a pair."""
+    key = nearest_keyframe(key_s, sees.time_s)
+    own, peer = (robots[k].path.relative_motion(key_s[key], sees.time_s) for k in both)
+    up = pair.peer.height_m - pair.own.height_m
+    height_m = np.interp(sees.time_s, pair.time_s, up if both[0] < both[1] else -up)
+    around = [np.searchsorted(sees.time_s, sees.time_s + s * CORRELATION_S / 2) for s in (-1, 1)]
+    weight = 1 / np.maximum(around[1] - around[0], 1)
+    return CameraView(
+        both, key, own.shift_m, peer.shift_m, own.turn_rad, height_m,
+        sees.bearing, sees.std, weight, sees.time_s,
+    )  # fmt: skip
+
+
+def range_step_offsets(pair: Pair) -> Array:
+    """Return (R,) the detected step offset of every range of a pair, metres."""
+    if not len(pair.range_m):
+        return pair.range_m
+    block = ((pair.range_time_s - pair.time_s[0]) / RANGE_BLOCK_S).astype(int)
+    blocks, inverse = np.unique(block, return_inverse=True)
+    ends = np.cumsum(np.bincount(inverse, minlength=len(blocks)))
+    middle = np.array([np.median(part) for part in np.split(pair.range_m, ends[:-1])])
+    # The distance changes at most as fast as both robots fly.
+    speed = sum(np.hypot(track.vx_mps, track.vy_mps) for track in (pair.own, pair.peer))
+    way_m = np.cumsum(speed) * pair.dt_s
+    half_s, at_s = RANGE_MEDIAN_BLOCKS * RANGE_BLOCK_S / 2, pair.time_s[0] + blocks * RANGE_BLOCK_S
+    late, early = (np.interp(at_s + way * half_s, pair.time_s, way_m) for way in (1, -1))
+    moved_m = late - early
+    found = step_offsets(middle, RANGE_BLOCK_S, MIN_RANGE_STEP_M, RANGE_MEDIAN_BLOCKS, moved_m)
+    return np.asarray(found[inverse])
+
+
+def average_ranges(link: RangeLink, key_s: Array) -> RangeLink:
+    """Return one range per keyframe: the median, without step offset and trend.
 
     Parameters
     ----------
-    pair
-        Sensor data of both robots.
-    time_s
-        (K,) times to test, seconds.
+    link
+        Ranges of a pair.
+    key_s
+        (K,) times of the keyframes, seconds.
     """
+    if not len(link.range_m):
+        return link
+    level = link.range_m - link.offset_guess_m
+    rough = _medians(link.keyframe, level)
+    keys = np.unique(link.keyframe)
+    rate = np.gradient(rough, key_s[keys]) if len(keys) > 1 else np.zeros(1)
+    late_s = link.time_s - key_s[link.keyframe]
+    trend = np.interp(key_s[link.keyframe], key_s[keys], rate) * late_s
+    count = np.bincount(link.keyframe)[keys]
+    first = np.cumsum(count) - count
+    height, guess = (
+        np.add.reduceat(v, first) / count for v in (link.height_m, link.offset_guess_m)
+    )
+    none = np.zeros((len(keys), 2))
+    # A median of n values has pi/2 / n of the variance of one.
+    std = np.sqrt(np.pi / 2 / count)
+    middle = _medians(link.keyframe, level - trend)
+    return RangeLink(link.robots, keys, key_s[keys], middle, std, none, none, height, guess)
+
+
+def _medians(key: NDArray[np.intp], values: Array) -> Array:
+    """Return the median of the values of each distinct key; the keys are sorted."""
+    ordered, count = values[np.lexsort((values, key))], np.unique(key, return_counts=True)[1]
+    first = np.cumsum(count) - count
+    return np.asarray((ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2)
+
+
+def odometry_dropout(pair: Pair, time_s: Array) -> Mask:
+    """Return (K,) whether a sensor of either robot dropped out for over half a second."""
     gap = pair.own.dropout | pair.peer.dropout
     for track in (pair.own, pair.peer):
         if track.height_dropout is not None:
@@ -260,32 +406,12 @@ def odometry_dropout(pair: Pair, time_s: Array) -> Mask:
 
 
 def range_dropout(pair: Pair, time_s: Array) -> Mask:
-    """Return (K,) whether the ranges dropped out for over half a second.
-
-    Parameters
-    ----------
-    pair
-        Sensor data of both robots.
-    time_s
-        (K,) times to test, seconds.
-    """
+    """Return (K,) whether the ranges dropped out for over half a second."""
     edges = np.concatenate([[-np.inf], pair.range_time_s, [np.inf]])
     after = np.clip(np.searchsorted(edges, time_s), 1, len(edges) - 1)
     return np.asarray(edges[after] - edges[after - 1] > MAX_DROPOUT_S)
 
 
-def range_step_offsets(pair: Pair) -> Array:
-    """Return (R,) the detected step offset of every range, metres.
-
-    Parameters
-    ----------
-    pair
-        Sensor data of both robots.
-    """
-    if not len(pair.range_m):
-        return pair.range_m
-    block = ((pair.range_time_s - pair.time_s[0]) / RANGE_BLOCK_S).astype(int)
-    blocks, inverse = np.unique(block, return_inverse=True)
-    ends = np.cumsum(np.bincount(inverse, minlength=len(blocks)))
-    middle = np.array([np.median(part) for part in np.split(pair.range_m, ends[:-1])])
-    return step_offsets(middle, RANGE_BLOCK_S, MIN_RANGE_STEP_M, RANGE_MEDIAN_BLOCKS)[inverse]
+def list_robots(pairs: Collection[tuple[str, str]]) -> list[str]:
+    """Return the names of all robots of pairs, in order."""
+    return sorted({name for both in pairs for name in both})

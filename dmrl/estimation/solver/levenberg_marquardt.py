@@ -1,42 +1,54 @@
 """Levenberg-Marquardt over a whole flight, for keyframe states and constants together."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.block_tridiagonal import (
-    NormalEquations,
-    add_camera,
-    assemble,
-    log_det,
-    solve_step,
-)
-from dmrl.estimation.solver.keyframes import GLOBALS, KeyframeProblem, NoiseModel
+from dmrl.estimation.solver.block_tridiagonal import NormalEquations, Solved, solve_step
+from dmrl.estimation.solver.keyframes import Problem
 from dmrl.estimation.solver.residuals import (
-    OWN_SCALE,
-    PEER_SCALE,
-    RANGE_ERROR,
-    SCALED_RESIDUALS,
-    STATE_SIZE,
-    Linearization,
+    CarriedPrior,
+    Chain,
+    ConstantPrior,
+    Factor,
+    Values,
+    build_equations,
     linearize,
-    step_variance,
+    odometry_variance,
+    total_cost,
 )
-from dmrl.estimation.solver.robust_loss import irls_weights, total_cost
+from dmrl.estimation.solver.unknowns import Layout
 
-MAX_ITERATIONS = 25
-"""Largest number of iterations. No record of how the value was chosen."""
+MAX_ITERATIONS, MAX_DAMPING = 25, 1e4
+"""Largest number of iterations; and the damping beyond which no smaller step is tried."""
 TOLERANCE, ROUGH_TOLERANCE = 1e-5, 1e-4
 """Relative change of the cost that ends the iteration; the second where solutions are only
-compared. No record of how the values were chosen."""
+compared."""
 SAME_SOLUTION_M = 0.05
-"""Largest distance between two paths that count as the same solution, metres. No record of how the
-value was chosen."""
-WEAK_INFORMATION: Array = np.array([1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 1.0])
-"""Information added to every keyframe, in inverse squares of its units. It is practically none and
-keeps the equations positive definite."""
+"""Largest distance between two relative paths that are the same solution, metres: half the standard
+deviation of a range."""
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """Information about the first keyframe and the constants from before the flight begins.
+
+    Parameters
+    ----------
+    mean, information, vector
+        As in `CarriedPrior`.
+    """
+
+    mean: Array
+    information: Array
+    vector: Array
+
+    def fits(self, layout: Layout) -> bool:
+        """Return whether the information has the columns of a layout."""
+        return len(self.mean) == layout.width + len(layout.constants)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,121 +57,135 @@ class MapEstimate:
 
     Parameters
     ----------
-    state
-        (K, 6) x, y (m), psi (rad), wx, wy (m/s), b (m) at the keyframes.
-    constants
-        (G,) in the order of ``GLOBALS``.
+    values
+        Values of all unknowns.
     cost
         Half the sum of the losses.
     """
 
-    state: Array
-    constants: Array
+    values: Values
     cost: float
 
 
-def solve(
-    problem: KeyframeProblem,
-    noise: NoiseModel,
-    state: Array,
-    constants: Array | None = None,
-    previous: Sequence[MapEstimate] = (),
-    tolerance: float = TOLERANCE,
-) -> MapEstimate:
-    """Find the most likely flight near a first guess.
+@dataclass(frozen=True, slots=True)
+class Solver:
+    """Problem with its layout and the information from before it.
 
     Parameters
     ----------
-    problem, noise
-        Keyframes of the flight, and the noise model.
-    state
-        (K, 3) or (K, 6) first guess.
-    constants
-        (G,) first guess. None: zeros.
-    previous
-        Solutions found before. The iteration ends when it reaches one of them.
-    tolerance
-        Relative change of the cost that ends the iteration.
+    problem
+        Flight to solve.
+    carried
+        Information from an earlier window. None: the flight begins here.
     """
-    constants = np.zeros(len(GLOBALS)) if constants is None else constants
-    if state.shape[1] == 3:
-        state = np.column_stack([state, np.zeros((len(state), STATE_SIZE - 3))])
-    linear = linearize(problem, noise, state, constants)
-    best = total_cost(linear, noise, constants)
-    equations = build_equations(problem, noise, linear, constants)
-    damping = 0.0
-    for _ in range(MAX_ITERATIONS):
-        change, change_constants, *_ = solve_step(add_damping(equations, damping))
-        tried = linearize(problem, noise, state + change, constants + change_constants)
-        cost = total_cost(tried, noise, constants + change_constants)
-        if not cost < best:
-            if damping > 1e4:
+
+    problem: Problem
+    carried: Carried | None = None
+
+    @property
+    def layout(self) -> Layout:
+        """Columns of the unknowns."""
+        return self.problem.layout
+
+    def linearize(self, values: Values, layout: Layout | None = None) -> list[Factor]:
+        """Linearize all factors at the values of the unknowns."""
+        carried = self.carried is not None
+        out = linearize(self.problem, layout or self.layout, values, begins=not carried)
+        if self.carried is not None:
+            here = np.concatenate([values.state[0], values.constants])
+            known = self.carried
+            loss = self.problem.noise.motion_loss
+            out.append(CarriedPrior(known.mean, known.information, known.vector, here, loss))
+        return out
+
+    def equations(self, values: Values) -> tuple[NormalEquations, list[Factor]]:
+        """Build the normal equations at the values of the unknowns."""
+        layout, factors = self.layout, self.linearize(values)
+        return build_equations(layout, factors, len(values.state)), factors
+
+    def solve(
+        self,
+        start: Values,
+        previous: Sequence[MapEstimate] = (),
+        tolerance: float = TOLERANCE,
+        same_m: float = SAME_SOLUTION_M,
+    ) -> MapEstimate:
+        """Find the most likely flight near a first guess.
+
+        Parameters
+        ----------
+        start
+            First guess.
+        previous
+            Solutions found before. The iteration ends when it reaches one of them.
+        tolerance
+            Relative change of the cost that ends the iteration.
+        same_m
+            Largest distance between two paths that are the same solution, metres.
+        """
+        layout, values = self.layout, start
+        factors = self.linearize(values, layout)
+        best, damping = total_cost(factors), 0.0
+        equations = build_equations(layout, factors, len(values.state))
+        for _ in range(MAX_ITERATIONS):
+            try:
+                step = solve_step(equations.damped(damping))
+                tried = Values(values.state + step.state, values.constants + step.constants)
+                factors = self.linearize(tried, layout)
+                cost = total_cost(factors)
+            except np.linalg.LinAlgError:
+                cost = np.inf
+            if not cost < best:
+                if damping > MAX_DAMPING:
+                    break
+                damping = max(10 * damping, 1e-2)
+                continue
+            gained, best, values, damping = best - cost, cost, tried, damping / 10
+            if gained < tolerance * best or any(
+                is_same_solution(values, other.values, same_m) for other in previous
+            ):
                 break
-            damping = max(10 * damping, 1e-2)
-            continue
-        state, constants, linear = state + change, constants + change_constants, tried
-        damping, gained, best = damping / 10, best - cost, cost
-        if gained < tolerance * best or any(
-            is_same_solution(state, other.state) for other in previous
-        ):
-            break
-        equations = build_equations(problem, noise, linear, constants)
-    return MapEstimate(state, constants, best)
+            equations = build_equations(layout, factors, len(values.state))
+        return MapEstimate(values, best)
+
+    def log_evidence(self, found: MapEstimate, solved: Solved | None = None) -> float:
+        """Return the Laplace approximation of the log evidence at a solution.
+
+        It lacks a constant that depends on the measurements alone, so models (rows of the table
+        and grades of noise) with the same measurements can be compared.
+        """
+        equations, factors = self.equations(found.values)
+        solved = solved or solve_step(equations)
+        noise, normalizer = self.problem.noise, 0.0
+        for robot in range(len(self.problem.robots)):
+            normalizer += float(np.log(odometry_variance(self.problem, robot)).sum()) / 2
+        normalizer += sum(len(link.range_m) for link in self.problem.links) * float(
+            np.log(noise.range_std_m)
+        )
+        pull = 0.0
+        for factor in factors:
+            if isinstance(factor, Chain):
+                normalizer += float(np.log(factor.std).sum() + np.log(factor.start_std))
+                # The pull to zero is not a normalized density, so it is no evidence.
+                square = (factor.value / factor.row.pull_std) ** 2
+                pull += factor.row.pull_weight * float(np.log1p(square).sum()) / 2
+            elif isinstance(factor, ConstantPrior):
+                normalizer += float(np.log(factor.std).sum())
+        return pull - found.cost - normalizer - solved.log_det / 2
 
 
-def is_same_solution(state: Array, other: Array) -> bool:
-    """Return whether two paths are everywhere so close that they are the same solution."""
-    return bool(np.hypot(*(state - other)[:, :2].T).max() <= SAME_SOLUTION_M)
+def relative_path(state: Array, one: int = 0, other: int = 1) -> Array:
+    """Return (K, 3) x, y (m) and heading of one robot in another's horizontal frame."""
+    here, there = state[:, 3 * one : 3 * one + 3], state[:, 3 * other : 3 * other + 3]
+    xy = rotate(rotation_matrix(-here[:, 2]), there[:, :2] - here[:, :2])
+    return np.column_stack([xy, there[:, 2] - here[:, 2]])
 
 
-def laplace_log_evidence(
-    problem: KeyframeProblem, noise: NoiseModel, solution: MapEstimate
-) -> float:
-    """Return the Laplace approximation of the log evidence of a noise model.
-
-    It lacks a constant that depends on the flight alone, so noise models can be compared.
-    """
-    linear = linearize(problem, noise, solution.state, solution.constants)
-    # The pull of range errors to zero is not a normalized density, so it is no evidence.
-    noise = replace(noise, range_error_weight=0.0)
-    cost = total_cost(linear, noise, solution.constants)
-    equations = build_equations(problem, noise, linear, solution.constants)
-    spread = np.log(step_variance(problem, noise)).sum() / 2
-    gains = 1 / (1 + solution.constants[[OWN_SCALE, PEER_SCALE]])
-    spread += len(SCALED_RESIDUALS) * len(problem.steps_s) * np.log((gains**2).mean()) / 2
-    spread += len(problem.range_m) * np.log(noise.range_std_m)
-    spread += np.log(noise.prior_std()).sum()
-    return -cost - float(spread) - log_det(equations) / 2
-
-
-def build_equations(
-    problem: KeyframeProblem, noise: NoiseModel, linear: Linearization, constants: Array
-) -> NormalEquations:
-    """Build normal equations with the weights of the losses and the prior of the constants."""
-    weights = irls_weights(linear, noise, constants)
-    equations = assemble(linear, problem.range_keyframe, weights, WEAK_INFORMATION)
-    if problem.camera is not None and linear.camera is not None and weights.camera is not None:
-        add_camera(equations, problem.camera, linear.camera, weights.camera)
-    held = weights.free.copy()
-    held[0] += weights.first
-    equations.diagonal[:, RANGE_ERROR, RANGE_ERROR] += held
-    equations.gradient[:, RANGE_ERROR] += held * linear.error_m
-    information = weights.prior * noise.prior_std() ** -2
-    equations.globals_block[...] += np.diag(information)
-    equations.globals_gradient[...] += information * constants
-    return equations
-
-
-def add_damping(equations: NormalEquations, damping: float) -> NormalEquations:
-    """Return the equations with Marquardt damping of the keyframe states, not of the constants."""
-    if damping == 0.0:
-        return equations
-    diagonal = equations.diagonal + damping * np.eye(len(WEAK_INFORMATION)) * equations.diagonal
-    return NormalEquations(
-        diagonal,
-        equations.off_diagonal,
-        equations.coupling,
-        equations.globals_block,
-        equations.gradient,
-        equations.globals_gradient,
-    )
+def is_same_solution(values: Values, other: Values, within_m: float = SAME_SOLUTION_M) -> bool:
+    """Return whether the positions of the second robot are everywhere nearly the same."""
+    # Most solutions differ at one in ten keyframes already.
+    for every in (10, 1):
+        apart = relative_path(values.state[::every]) - relative_path(other.state[::every])
+        if np.hypot(*apart[:, :2].T).max() > within_m:
+            return False
+    return True

@@ -1,246 +1,469 @@
-"""Residuals of a flight and their analytic Jacobians, by keyframe state and by constant.
+"""Factors of a flight: residuals with Jacobians of odometry, ranges, bearings, and priors.
 
-A keyframe state is (x, y, psi, wx, wy, b). w is the error of the measured relative velocity in the
-observer's frame, which decays with its correlation time. White noise in its place would discard
-half of the information of the ranges. b is the temporary excess of the ranges: an obstacle
-lengthens ranges for seconds.
-
-With s the velocity scales, the process residual is divided by 1 / (1 + s). Without that division a
-scale that shrinks the path would also shrink its noise and always reduce the cost.
+Every factor is linearized to rows. A row group contains the Jacobians by a keyframe (and by the
+next one), by the constants, and the residual, whitened. `Rows` and `Chain` add themselves to the
+normal equations and return their loss, so a new factor is one function that returns one of them.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from dmrl.estimation.model.odometry import QUARTER_TURN, rotation_matrix
+from dmrl.estimation.model.bearings import subtract_bearings
+from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.camera_residuals import CameraResiduals, linearize_camera
-from dmrl.estimation.solver.keyframes import GLOBALS, KeyframeProblem, NoiseModel
+from dmrl.estimation.solver.block_tridiagonal import NormalEquations
+from dmrl.estimation.solver.keyframes import CameraView, Problem, RangeLink
+from dmrl.estimation.solver.robust_loss import Loss
+from dmrl.estimation.solver.unknowns import Layout, Unknown
 
-RANGE_BIAS, RANGE_SCALE, OWN_GYRO, PEER_GYRO, OWN_SCALE, PEER_SCALE = range(6)
-"""Index among ``GLOBALS`` of offset and scale of the ranges, biases of the yaw rates, scales of the
-velocities."""
-STATE_SIZE = 6
-"""Number of states of a keyframe."""
-RANGE_STATES = [0, 1, 2, 5]
-"""Index of the states on which a range depends."""
-RANGE_ERROR = 5
-"""Index of the range error b among the states, and among the residuals of a step."""
-SCALED_RESIDUALS = [0, 1, 3, 4]
-"""Index of the residuals of a step that the velocity scales divide."""
-OWN_VELOCITY, PEER_VELOCITY, CLOCK = slice(6, 8), slice(8, 10), 10
-"""Index among ``GLOBALS`` of the velocity biases and of the peer's clock offset."""
-OBSERVER_CONSTANTS = [OWN_GYRO, OWN_SCALE, 6, 7]
-"""Index among ``GLOBALS`` of the observer's own constants; `GLOBALS_FROM_PEER` maps them to the
-peer's."""
+WEAK_INFORMATION = 1e-3
+"""Information added to every state, in inverse squares of its unit. It is practically none and
+keeps the equations positive definite."""
+ANCHOR_INFORMATION = 1e6
+"""Information on the first robot's first pose, which defines the frame of the flight."""
+MAX_OUTLIER_SIGMAS, AZIMUTH_MARGIN_RAD = 5.0, 0.05
+"""Distance beyond which an image has no weight, in sigmas; and the azimuth error of an unfinished
+solve that is added, radians. Wrong detections bent flights that a camera rarely covers."""
+
+
+class Values(NamedTuple):
+    """Values of all unknowns: (K, n) of the keyframes, and (G,) constants."""
+
+    state: Array
+    constants: Array
+
+
+class Factor(Protocol):
+    """Linearized factor."""
+
+    def cost(self) -> float:
+        """Return half the sum of the losses."""
+
+    def add_to(self, equations: NormalEquations) -> None:
+        """Add the weighted rows to the normal equations."""
 
 
 @dataclass(frozen=True, slots=True)
-class Linearization:
-    """Whitened residuals and Jacobians at one solution. K keyframes, R ranges, G constants.
-
-    Each Jacobian is stored beside its residuals in one array, so that one multiplication computes
-    all products of a row.
+class Rows:
+    """Whitened rows of one kind of measurement.
 
     Parameters
     ----------
+    rows
+        (B, m, q, w) of every keyframe, or of every step: m measurements of q values each. The last
+        column is the residual.
+    columns, border
+        Columns of the keyframe and of the constants, in the order of the rows.
+    loss
+        Loss of the squared length of the q values.
+    weight
+        (B, m) factor of the loss; 0 pads keyframes with fewer measurements.
     steps
-        (K - 1, 6, 6 + 6 + G + 1) rows of x, y, psi, wx, wy, b between neighbouring keyframes:
-        Jacobians by the first keyframe, by the second, by the constants; residual.
-    ranges
-        (R, 4 + 2 + 1) Jacobians by x, y, psi, b and by offset and scale of the ranges; residual.
-    error_m
-        (K,) b, metres.
-    camera
-        Residuals of the cameras. None: no images.
+        Whether the rows depend on the next keyframe too.
     """
 
-    steps: Array
-    ranges: Array
-    error_m: Array
-    camera: CameraResiduals | None = None
+    rows: Array
+    columns: list[int]
+    border: list[int]
+    loss: Loss
+    weight: Array
+    steps: bool = False
 
     @property
-    def step(self) -> Array:
-        """(K - 1, 6) residuals of the steps."""
-        return self.steps[..., -1]
+    def square(self) -> Array:
+        """(B, m) squared whitened residuals."""
+        return np.asarray((self.rows[..., -1] ** 2).sum(axis=-1))
+
+    def cost(self) -> float:
+        """Return half the sum of the losses."""
+        return float((self.weight * self.loss.cost(self.square)).sum()) / 2
+
+    def add_to(self, equations: NormalEquations) -> None:
+        """Add the weighted rows to the normal equations."""
+        root = np.sqrt(self.weight * self.loss.weight(self.square))
+        flat = (self.rows * root[..., None, None]).reshape(len(self.rows), -1, self.rows.shape[-1])
+        equations.add_rows(flat.swapaxes(1, 2) @ flat, self.columns, self.border, self.steps)
+
+    def with_residuals_of(self, other: "Rows") -> "Rows":
+        """Return the rows with the residuals, and so the weights, of another linearization."""
+        rows = self.rows.copy()
+        rows[..., -1] = other.rows[..., -1]
+        return Rows(rows, self.columns, self.border, self.loss, other.weight, self.steps)
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """Evolution of one state over the flight, and the pull of each value to zero.
+
+    Parameters
+    ----------
+    row, column
+        The unknown, and its column.
+    value
+        (K,) values.
+    kept, std
+        (S,) share of a value that a step keeps, and standard deviation of the step.
+    start_std
+        Standard deviation of the first value.
+    """
+
+    row: Unknown
+    column: int
+    value: Array
+    kept: Array
+    std: Array
+    start_std: float
 
     @property
-    def range(self) -> Array:
-        """(R,) residuals of the ranges."""
-        return self.ranges[:, -1]
+    def residual(self) -> Array:
+        """(K,) whitened first value and steps."""
+        steps = (self.value[1:] - self.kept * self.value[:-1]) / self.std
+        return np.concatenate([self.value[:1] / self.start_std, steps])
+
+    def cost(self) -> float:
+        """Return half the sum of the losses."""
+        pull = self.row.pull_weight * np.log1p((self.value / self.row.pull_std) ** 2).sum()
+        return float(self.row.loss.cost(self.residual**2).sum() + pull) / 2
+
+    def add_to(self, equations: NormalEquations) -> None:
+        """Add the weighted rows to the normal equations."""
+        at, residual = self.column, self.residual
+        weight = self.row.loss.weight(residual**2)
+        pull = self.row.pull_weight / (self.row.pull_std**2 + self.value**2)
+        weight_start, weight = weight[0] / self.start_std**2, weight[1:] / self.std**2
+        diagonal, gradient = equations.diagonal[:, at, at], equations.gradient[:, at]
+        diagonal += pull
+        gradient += pull * self.value
+        diagonal[0] += weight_start
+        gradient[0] += weight_start * self.value[0]
+        diagonal[1:] += weight
+        diagonal[:-1] += weight * self.kept**2
+        equations.off_diagonal[:, at, at] -= weight * self.kept
+        step = weight * self.std * residual[1:]
+        gradient[1:] += step
+        gradient[:-1] -= self.kept * step
+
+
+@dataclass(frozen=True, slots=True)
+class ConstantPrior:
+    """Priors of the constants: (G,) values, standard deviations and losses."""
+
+    value: Array
+    std: Array
+    losses: tuple[Loss, ...]
+
+    def _each(self, method: str) -> Array:
+        square = (self.value / self.std) ** 2
+        return np.array(
+            [getattr(one, method)(s) for one, s in zip(self.losses, square, strict=True)], float
+        )
+
+    def cost(self) -> float:
+        """Return half the sum of the losses."""
+        return float(self._each("cost").sum()) / 2
+
+    def add_to(self, equations: NormalEquations) -> None:
+        """Add the weighted priors to the normal equations."""
+        information = self.information()
+        equations.globals_block[...] += np.diag(information)
+        equations.globals_gradient[...] += information * self.value
+
+    def information(self) -> Array:
+        """Return (G,) information from the IRLS weights."""
+        return np.asarray(self._each("weight") / self.std**2)
+
+    def curvature(self) -> Array:
+        """Return (G,) information from the curvature of the losses.
+
+        The IRLS weight matches the slope of a loss. The curvature is smaller: the prior hardly
+        constrains a constant that is as far out as the prior is wide.
+        """
+        return np.asarray(self._each("curvature") / self.std**2)
+
+
+@dataclass(frozen=True, slots=True)
+class CarriedPrior:
+    """Information of the flight before the first keyframe, about its states and the constants.
+
+    Parameters
+    ----------
+    mean
+        (n + G,) values at which the information was linearized.
+    information, vector
+        (n + G, n + G) and (n + G,) its normal equations there.
+    value
+        (n + G,) present values.
+    loss
+        Loss of the squared Mahalanobis distance from the carried optimum.
+    """
+
+    mean: Array
+    information: Array
+    vector: Array
+    value: Array
+    loss: Loss
+
+    def _squares(self) -> tuple[Array, float]:
+        off = self.value - self.mean
+        slope = self.information @ off + self.vector
+        best = np.linalg.lstsq(self.information, -self.vector, rcond=None)[0]
+        apart = off - best
+        return slope, float(max(apart @ self.information @ apart, 0.0))
+
+    def cost(self) -> float:
+        """Return half the loss."""
+        return float(self.loss.cost(np.array(self._squares()[1]))) / 2
+
+    def add_to(self, equations: NormalEquations) -> None:
+        """Add the information to the normal equations."""
+        slope, square = self._squares()
+        weight, width = float(self.loss.weight(np.array(square))), equations.diagonal.shape[1]
+        equations.diagonal[0] += weight * self.information[:width, :width]
+        equations.coupling[0] += weight * self.information[:width, width:]
+        equations.globals_block[...] += weight * self.information[width:, width:]
+        equations.gradient[0] += weight * slope[:width]
+        equations.globals_gradient[...] += weight * slope[width:]
 
 
 def linearize(
-    problem: KeyframeProblem, noise: NoiseModel, state: Array, constants: Array
-) -> Linearization:
-    """Compute residuals and Jacobians at a solution.
+    problem: Problem, layout: Layout, values: Values, *, begins: bool = True
+) -> list[Factor]:
+    """Linearize all factors of a flight at the values of its unknowns.
 
     Parameters
     ----------
-    problem, noise
-        Keyframes of the flight, and the noise model.
-    state
-        (K, 6) x, y (m), psi (rad), wx, wy (m/s), b (m).
-    constants
-        (G,) in the order of ``GLOBALS``.
+    problem, layout
+        The flight, and the columns of its unknowns.
+    values
+        Values of all unknowns.
+    begins
+        Whether walks and jumps begin here. Else carried information knows their first values.
     """
-    steps = _step_rows(problem, noise, state, constants)
-    ranges = _range_rows(problem, noise, state, constants)
-    looked = None if problem.camera is None else linearize_camera(problem.camera, state)
-    return Linearization(steps, ranges, state[:, RANGE_ERROR], looked)
-
-
-@dataclass(frozen=True, slots=True)
-class _Propagation:
-    """Propagation of a solution from each keyframe to the next. S = K - 1 steps.
-
-    ``own_gain`` and ``peer_gain`` are 1 / (1 + scale) of either velocity. ``own`` and ``peer`` (S,
-    2) are the corrected shifts, ``own_turn`` and ``peer_turn`` (S,) the corrected turns.
-    ``heading`` and ``turned`` (S, 2, 2) rotate by the peer's heading and by the observer's turn.
-    ``ahead`` and ``error_ahead`` (S, 2) are position and velocity error of the next keyframe in the
-    frame of this one. ``half_s`` (S, 1) is half the step. ``kept`` and ``range_kept`` (S, 1) are
-    the factors by which a velocity error and a range error decay over the step.
-    """
-
-    own_gain: float
-    peer_gain: float
-    own: Array
-    peer: Array
-    own_turn: Array
-    peer_turn: Array
-    heading: Array
-    turned: Array
-    ahead: Array
-    error_ahead: Array
-    half_s: Array
-    kept: Array
-    range_kept: Array
-
-
-def _propagate(
-    problem: KeyframeProblem, noise: NoiseModel, state: Array, constants: Array
-) -> _Propagation:
-    """Propagate the states by the measured motion, corrected by the constants."""
-    steps_s = problem.steps_s
-    own_gain, peer_gain = 1 / (1 + constants[[OWN_SCALE, PEER_SCALE]])
-    clock = problem.peer_clock_derivative * constants[CLOCK]
-    biased = problem.peer.bias_jacobian_s @ constants[PEER_VELOCITY]
-    heading = rotation_matrix(state[:-1, 2])
-    own_turn = problem.own.turn_rad - constants[OWN_GYRO] * steps_s
-    turned = rotation_matrix(own_turn)
-    return _Propagation(
-        own_gain,
-        peer_gain,
-        own=own_gain
-        * (problem.own.shift_m - problem.own.bias_jacobian_s @ constants[OWN_VELOCITY]),
-        peer=_multiply_pairwise(heading, peer_gain * (problem.peer.shift_m + clock - biased)),
-        own_turn=own_turn,
-        peer_turn=problem.peer.turn_rad - constants[PEER_GYRO] * steps_s,
-        heading=heading,
-        turned=turned,
-        ahead=_multiply_pairwise(turned, state[1:, :2]),
-        error_ahead=_multiply_pairwise(turned, state[1:, 3:5]),
-        half_s=steps_s[:, None] / 2,
-        kept=np.exp(-steps_s / noise.velocity_tau_s)[:, None],
-        range_kept=np.exp(-steps_s / noise.range_tau_s)[:, None],
-    )
-
-
-def _step_rows(
-    problem: KeyframeProblem, noise: NoiseModel, state: Array, constants: Array
-) -> Array:
-    """Return (S, 6, 6 + 6 + G + 1) whitened rows of the steps."""
-    moves = _propagate(problem, noise, state, constants)
-    share = np.sqrt((moves.own_gain**2 + moves.peer_gain**2) / 2)
-    weight = 1 / np.sqrt(step_variance(problem, noise))
-    weight[:, SCALED_RESIDUALS] /= share
-    out = np.zeros((len(moves.own), STATE_SIZE, 2 * STATE_SIZE + len(GLOBALS) + 1))
-    by_start, by_end, by_globals = np.split(out[..., :-1], [STATE_SIZE, 2 * STATE_SIZE], axis=2)
-    out[..., -1] = _step_residuals(moves, state)
-    _fill_state_jacobians(moves, by_start, by_end)
-    _fill_global_jacobians(moves, problem, by_globals)
-    out *= weight[:, :, None]
-    # The whitening itself depends on the scales.
-    for column, gain in ((OWN_SCALE, moves.own_gain), (PEER_SCALE, moves.peer_gain)):
-        by_globals[:, SCALED_RESIDUALS, column] += (
-            out[:, SCALED_RESIDUALS, -1] * gain**3 / (2 * share**2)
-        )
+    out: list[Factor] = [
+        odometry_factor(problem, layout, robot, values) for robot in range(layout.robots)
+    ]
+    out += [range_factor(problem, layout, link, values) for link in problem.links]
+    out += [bearing_factor(problem, layout, view, values) for view in problem.views]
+    steps_s = problem.robots[0].steps_s
+    for k, (_, row) in enumerate(layout.states):
+        kept, std = row.step_model(steps_s)
+        grade = problem.noise.grade if row.graded else 1.0
+        start = (row.std if row.evolution == "fading" else row.start_std) * grade
+        start = start if begins or row.evolution == "fading" else np.inf
+        column = 3 * layout.robots + k
+        value = values.state[:, column]
+        out.append(Chain(row, column, value, kept, std * grade, start))
+    losses = tuple(row.loss for _, row in layout.constants)
+    out.append(ConstantPrior(values.constants, problem.noise.prior_std(layout), losses))
     return out
 
 
-def _step_residuals(moves: _Propagation, state: Array) -> Array:
-    """Return (S, 6) residuals of the steps before whitening."""
-    error = state[:-1, 3:5]
-    # Relative motion in the observer's frame: p' = p + peer's shift - own shift + half_s (w + w'),
-    # with the velocity error by the trapezoidal rule. psi: the peer's heading minus the observer's.
-    shift = moves.ahead - state[:-1, :2] - moves.peer + moves.own
-    shift = shift - moves.half_s * (error + moves.error_ahead)
-    turn = state[1:, 2] - state[:-1, 2] - moves.peer_turn + moves.own_turn
-    # Gauss-Markov process: an error decays over a step; the residual is the new noise.
-    longer = state[1:, RANGE_ERROR:] - moves.range_kept * state[:-1, RANGE_ERROR:]
-    return np.column_stack([shift, turn, moves.error_ahead - moves.kept * error, longer])
+def build_equations(
+    layout: Layout, factors: list[Factor], keyframes: int, *, anchored: bool = True
+) -> NormalEquations:
+    """Build the normal equations of linearized factors.
+
+    Parameters
+    ----------
+    layout
+        Columns of the unknowns.
+    factors
+        Linearized factors.
+    keyframes
+        Number of keyframes.
+    anchored
+        Whether the first robot's first pose defines the frame of the flight.
+    """
+    equations = NormalEquations.zeros(keyframes, layout.width, len(layout.constants))
+    for factor in factors:
+        factor.add_to(equations)
+    at = np.arange(layout.width)
+    equations.diagonal[:, at, at] += WEAK_INFORMATION
+    equations.diagonal[0, :3, :3] += anchored * ANCHOR_INFORMATION * np.eye(3)
+    return equations
 
 
-def _fill_state_jacobians(moves: _Propagation, by_start: Array, by_end: Array) -> None:
-    """Fill (S, 6, 6) zeros each with the Jacobians by both keyframes."""
-    by_start[:] = np.diag([-1.0, -1.0, -1.0, 0.0, 0.0, 0.0])
-    by_start[:, :2, 2] = -moves.peer @ QUARTER_TURN.T
-    by_start[:, [0, 1], [3, 4]], by_start[:, [3, 4], [3, 4]] = -moves.half_s, -moves.kept
-    by_start[:, RANGE_ERROR, RANGE_ERROR] = -moves.range_kept[:, 0]
-    by_end[:, :2, :2] = by_end[:, 3:5, 3:5] = moves.turned
-    by_end[:, :2, 3:5] = -moves.half_s[:, None] * moves.turned
-    by_end[:, 2, 2] = by_end[:, RANGE_ERROR, RANGE_ERROR] = 1.0
+def total_cost(factors: list[Factor]) -> float:
+    """Return half the sum of all losses."""
+    return sum(factor.cost() for factor in factors)
 
 
-def _fill_global_jacobians(moves: _Propagation, problem: KeyframeProblem, out: Array) -> None:
-    """Fill (S, 6, G) zeros with the Jacobian by the constants."""
-    steps_s, heading = problem.steps_s, moves.heading
-    moved = moves.ahead - moves.half_s * moves.error_ahead
-    out[:, :2, OWN_GYRO] = -steps_s[:, None] * (moved @ QUARTER_TURN.T)
-    out[:, 3:5, OWN_GYRO] = -steps_s[:, None] * (moves.error_ahead @ QUARTER_TURN.T)
-    out[:, 2, OWN_GYRO], out[:, 2, PEER_GYRO] = -steps_s, steps_s
-    out[:, :2, OWN_SCALE] = -moves.own_gain * moves.own
-    out[:, :2, PEER_SCALE] = moves.peer_gain * moves.peer
-    out[:, :2, OWN_VELOCITY] = -moves.own_gain * problem.own.bias_jacobian_s
-    out[:, :2, PEER_VELOCITY] = moves.peer_gain * (heading @ problem.peer.bias_jacobian_s)
-    out[:, :2, CLOCK] = -moves.peer_gain * _multiply_pairwise(
-        heading, problem.peer_clock_derivative
+def odometry_variance(problem: Problem, robot: int) -> Array:
+    """Return (S, 3) variances of the measured motions between keyframes."""
+    steps, noise = problem.robots[robot], problem.noise
+    shift = noise.velocity_psd * noise.grade**2 * steps.steps_s
+    shift = shift + noise.dropout_speed_mps**2 * steps.dropout_s
+    turn = noise.yaw_rate_psd * steps.steps_s + noise.dropout_turn_radps**2 * steps.dropout_s
+    return np.column_stack([shift, shift, turn])
+
+
+def odometry_factor(problem: Problem, layout: Layout, robot: int, values: Values) -> Rows:
+    """Linearize the measured motions of one robot: predicted minus measured shift and turn."""
+    steps, pose = problem.robots[robot], values.state[:, layout.pose(robot)]
+    back = rotation_matrix(-pose[:-1, 2])
+    way = rotate(back, np.diff(pose[:, :2], axis=0))
+    mine = list(layout.of(robot))
+    columns = layout.pose(robot) + [c for row, c, constant in mine if row.motion and not constant]
+    border = [c for row, c, constant in mine if constant and (row.motion or row.motion_scale)]
+    size = len(columns)
+    out = np.zeros((len(way), 3, 2 * size + len(border) + 1))
+    gain = np.ones(2)
+    for row, c, constant in mine:
+        if row.motion_scale and constant:
+            factors = np.array(row.motion_scale)
+            gain = gain + factors * values.constants[c]
+            out[:, :2, 2 * size + border.index(c)] += way * factors
+        if row.motion and constant:
+            effect = row.motion(steps)
+            out[:, :, 2 * size + border.index(c)] += effect
+            out[..., -1] += effect * values.constants[c]
+        elif row.motion:
+            # A state acts by the mean of its values at both ends.
+            effect, at = row.motion(steps) / 2, columns.index(c)
+            out[:, :, at] = out[:, :, size + at] = effect
+            out[..., -1] += effect * (values.state[:-1, c] + values.state[1:, c])[:, None]
+    out[:, :2, -1] += gain * way - steps.motion.shift_m
+    out[:, 2, -1] += np.diff(pose[:, 2]) - steps.motion.turn_rad
+    ahead = gain[:, None] * back
+    out[:, :2, :2], out[:, :2, size : size + 2] = -ahead, ahead
+    out[:, :2, 2] = -gain * (way @ QUARTER_TURN.T)
+    out[:, 2, 2], out[:, 2, size + 2] = -1.0, 1.0
+    out /= np.sqrt(odometry_variance(problem, robot))[..., None]
+    rows, ones = out[:, :, None], np.ones((len(way), 3))
+    return Rows(rows, columns, border, problem.noise.motion_loss, ones, steps=True)
+
+
+class _Geometry(NamedTuple):
+    """Relative position of two robots at N measurements, and its derivatives.
+
+    ``offset`` (N, 2) in the frame of the flight, ``up`` (N,) height difference, ``by_turn`` (N, 2)
+    and (N, 2) derivatives of the offset by either heading.
+    """
+
+    offset: Array
+    up: Array
+    by_own_turn: Array
+    by_peer_turn: Array
+
+
+def _geometry(measured: RangeLink | CameraView, layout: Layout, values: Values) -> _Geometry:
+    """Return the relative position at each measurement."""
+    one, other = measured.robots
+    here, there = (values.state[measured.keyframe][:, layout.pose(k)] for k in (one, other))
+    own = rotate(rotation_matrix(here[:, 2]), measured.own_shift_m)
+    peer = rotate(rotation_matrix(there[:, 2]), measured.peer_shift_m)
+    up = measured.height_m.copy()
+    for row, c, constant, side in layout.measured(measured.robots, "height"):
+        error = values.constants[c] if constant else values.state[measured.keyframe, c]
+        up = up + side * row.height * error
+    offset = there[:, :2] + peer - here[:, :2] - own
+    return _Geometry(offset, up, -own @ QUARTER_TURN.T, peer @ QUARTER_TURN.T)
+
+
+def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Values) -> Rows:
+    """Linearize the ranges of one pair: predicted minus measured."""
+    at = _geometry(link, layout, values)
+    distance = np.sqrt((at.offset**2).sum(axis=1) + at.up**2) + 1e-6
+    towards = at.offset / distance[:, None]
+    used = layout.measured(link.robots, "range")
+    states = [c for _, c, constant, _ in used if not constant]
+    border = [c for _, c, constant, _ in used if constant]
+    columns = layout.pose(link.robots[0]) + layout.pose(link.robots[1]) + states
+    out = np.zeros((len(distance), len(columns) + len(border) + 1))
+    gain, error, heights = 1.0, np.zeros(len(distance)), []
+    for row, c, constant, side in used:
+        column = len(columns) + border.index(c) if constant else columns.index(c)
+        value = values.constants[c] if constant else values.state[link.keyframe, c]
+        if row.height:
+            out[:, column] = side * row.height * at.up / distance
+            heights.append(column)
+        elif row.range_scale:
+            gain = gain + row.range_scale * value
+            out[:, column] = row.range_scale * distance
+        elif row.range:
+            effect = row.range(link, distance)
+            out[:, column] = effect
+            error = error + effect * value
+    gain = np.broadcast_to(gain, distance.shape)[:, None]
+    out[:, heights] *= gain
+    out[:, 0:2], out[:, 3:5] = -gain * towards, gain * towards
+    for column, by_turn in ((2, at.by_own_turn), (5, at.by_peer_turn)):
+        out[:, column] = gain[:, 0] * (towards * by_turn).sum(axis=1)
+    out[:, -1] = gain[:, 0] * distance + error - link.range_m
+    out /= (problem.noise.range_std_m * link.std_share)[:, None]
+    return _pad_rows(
+        out[:, None], link.keyframe, np.ones(len(out)), len(values.state),
+        (columns, border, problem.noise.range_loss),
+    )  # fmt: skip
+
+
+def bearing_factor(problem: Problem, layout: Layout, view: CameraView, values: Values) -> Rows:
+    """Linearize the candidate of each image that is nearest to the present solution."""
+    at, one = _geometry(view, layout, values), layout.pose(view.robots[0])
+    used = layout.measured(view.robots, "bearing")
+    states = [c for _, c, constant, _ in used if not constant]
+    border = [c for _, c, constant, _ in used if constant]
+    columns = one + layout.pose(view.robots[1]) + states
+    x, y = at.offset.T
+    level2 = np.maximum(x * x + y * y, 1e-6)
+    square, level = level2 + at.up**2, np.sqrt(level2)
+    heading = values.state[view.keyframe, one[2]] + view.own_turn_rad
+    polar = np.column_stack(
+        [np.arctan2(y, x) - heading, np.arctan2(at.up, level), np.log(square) / 2]
     )
+    by_offset = np.zeros((len(x), 3, 3))
+    by_offset[:, 0, 0], by_offset[:, 0, 1] = -y / level2, x / level2
+    by_offset[:, 1, :2] = -at.offset * (at.up / (level * square))[:, None]
+    by_offset[:, 1, 2] = level / square
+    by_offset[:, 2, :2], by_offset[:, 2, 2] = at.offset / square[:, None], at.up / square
+    out = np.zeros((len(x), 3, len(columns) + len(border) + 1))
+    out[..., 0:2], out[..., 3:5] = -by_offset[..., :2], by_offset[..., :2]
+    out[..., 2] = rotate_rows(by_offset, at.by_own_turn)
+    out[..., 5] = rotate_rows(by_offset, at.by_peer_turn)
+    out[:, 0, 2] -= 1.0
+    for row, c, constant, side in used:
+        column = len(columns) + border.index(c) if constant else columns.index(c)
+        if row.height:
+            out[..., column] = side * row.height * by_offset[..., 2]
+        elif row.bearing:
+            effect = row.bearing(view)
+            out[..., column] = effect
+            value = values.constants[c] if constant else values.state[view.keyframe, c][:, None]
+            polar = polar + effect * value
+    off = -subtract_bearings(view.bearing, polar[:, None]) / view.std
+    squared = np.where(np.isnan(off).any(axis=-1), np.inf, (off**2).sum(axis=-1))
+    nearest, images = squared.argmin(axis=1), np.arange(len(x))
+    std = view.std[images, nearest]
+    out[..., -1] = off[images, nearest]
+    out[..., :-1] /= std[..., None]
+    lost = squared.min(axis=1) > MAX_OUTLIER_SIGMAS**2 * (1 + (AZIMUTH_MARGIN_RAD / std[:, 0]) ** 2)
+    most = MAX_OUTLIER_SIGMAS * np.sqrt(1 + (AZIMUTH_MARGIN_RAD / std[:, 0]) ** 2)
+    # A lost image costs the same wherever it is.
+    out[lost], out[lost, 0, -1] = 0.0, most[lost]
+    return _pad_rows(
+        out, view.keyframe, view.weight, len(values.state),
+        (columns, border, problem.noise.bearing_loss),
+    )  # fmt: skip
 
 
-def step_variance(problem: KeyframeProblem, noise: NoiseModel) -> Array:
-    """Return (K - 1, 6) variances of the residuals of each step, before whitening."""
-    steps_s = problem.steps_s
-    shift = 2 * noise.velocity_white_psd * steps_s + noise.dropout_speed_mps**2 * problem.dropout_s
-    turn = 2 * noise.yaw_rate_psd * steps_s + noise.dropout_turn_radps**2 * problem.dropout_s
-    faded = 1 - np.exp(-2 * steps_s / noise.velocity_tau_s)
-    error = 2 * noise.velocity_std_mps**2 * faded
-    longer = noise.range_error_std_m**2 * (1 - np.exp(-2 * steps_s / noise.range_tau_s))
-    return np.column_stack([shift, shift, turn, error, error, longer])
+def rotate_rows(by_offset: Array, by_turn: Array) -> Array:
+    """Return (N, 3) derivatives of a bearing by a heading that moves the offset."""
+    return np.asarray((by_offset[..., :2] @ by_turn[..., None])[..., 0])
 
 
-def _range_rows(
-    problem: KeyframeProblem, noise: NoiseModel, state: Array, constants: Array
-) -> Array:
-    """Return (R, 4 + 2 + 1) whitened rows of the ranges."""
-    at = state[problem.range_keyframe]
-    peer = _multiply_pairwise(
-        rotation_matrix(state[:, 2])[problem.range_keyframe], problem.peer_to_range.shift_m
-    )
-    offset = at[:, :2] + peer - problem.own_to_range.shift_m
-    distance = np.sqrt((offset**2).sum(axis=1) + problem.height_m**2) + 1e-6
-    towards = offset / distance[:, None]
-    gain = 1 + constants[RANGE_SCALE]
-    out = np.empty((len(at), 7))
-    out[:, :2] = -gain * towards
-    out[:, 2] = gain * (towards[:, 0] * peer[:, 1] - towards[:, 1] * peer[:, 0])
-    out[:, 3] = -1.0
-    out[:, 4 + RANGE_BIAS], out[:, 4 + RANGE_SCALE] = -1.0, -distance
-    out[:, -1] = problem.range_m - gain * distance - constants[RANGE_BIAS] - at[:, RANGE_ERROR]
-    return out / noise.range_std_m
-
-
-def _multiply_pairwise(matrices: Array, vectors: Array) -> Array:
-    return matrices[..., 0] * vectors[:, :1] + matrices[..., 1] * vectors[:, 1:]
+def _pad_rows(
+    rows: Array,
+    keyframe: Array,
+    weight: Array,
+    keyframes: int,
+    rest: tuple[list[int], list[int], Loss],
+) -> Rows:
+    """Return rows (N, q, w) of sorted keyframes as (K, m, q, w), padded with weight 0."""
+    count = np.bincount(keyframe, minlength=keyframes)
+    slot = np.arange(len(rows)) - (np.cumsum(count) - count)[keyframe]
+    out = np.zeros((keyframes, max(int(count.max(initial=0)), 1), *rows.shape[1:]))
+    factor = np.zeros(out.shape[:2])
+    out[keyframe, slot], factor[keyframe, slot] = rows, weight
+    return Rows(out, *rest, factor)

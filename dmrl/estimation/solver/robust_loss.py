@@ -1,125 +1,94 @@
-"""Robust losses for residuals with outliers and for the constants of a flight.
+"""Robust losses as objects. A residual's loss is a function of its whitened square.
 
-Every residual r has the Cauchy loss L log(1 + r^2 / L) with its own scale L: quadratic where r^2 is
-small against L, logarithmic beyond. Up to factors, it is the negative log
-likelihood of Student's t.
+Each loss equals the square for small residuals. The solver needs the loss, its slope (the IRLS
+weight) and its curvature, so a new loss is one class with three methods.
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.camera_residuals import BEARING_LOSS_SCALE
-from dmrl.estimation.solver.keyframes import NoiseModel
-from dmrl.estimation.solver.residuals import RANGE_ERROR, STATE_SIZE, Linearization
 
-MOTION_LOSS_SCALE = 25.0
-"""Loss scale of the motion residuals. Five standard deviations are no noise."""
 
-QUADRATIC_LOSS_SCALE = 1e9
-"""Loss scale of a quadratic loss: practically infinite."""
-PRIOR_LOSS_SCALES: Array = np.array(
-    [2.0, QUADRATIC_LOSS_SCALE, 4.0, 4.0, *[QUADRATIC_LOSS_SCALE] * 6, 4.0]
-)
-"""Loss scales of the constants, in the order of ``GLOBALS``.
+class Loss(Protocol):
+    """Loss of whitened squared residuals, any shape."""
 
-Offsets of ranges, biases of yaw rates and clock offsets are mostly small and sometimes large. The
-scales keep a quadratic loss: a scale without a firm prior would shrink the path to nothing. No
-record of how the values were chosen."""
+    def cost(self, square: Array) -> Array:
+        """Return the losses; equal to the squares where those are small."""
+
+    def weight(self, square: Array) -> Array:
+        """Return the derivatives of the losses by the squares: the IRLS weights."""
+
+    def curvature(self, square: Array) -> Array:
+        """Return half the second derivatives by the residuals, at least 0."""
 
 
 @dataclass(frozen=True, slots=True)
-class IrlsWeights:
-    """IRLS weights of the squared residuals.
+class Gaussian:
+    """The square itself."""
+
+    def cost(self, square: Array) -> Array:
+        """Return the squares."""
+        return square
+
+    def weight(self, square: Array) -> Array:
+        """Return ones."""
+        return np.ones_like(square)
+
+    def curvature(self, square: Array) -> Array:
+        """Return ones."""
+        return np.ones_like(square)
+
+
+@dataclass(frozen=True, slots=True)
+class Cauchy:
+    """s^2 log(1 + r^2 / s^2): the negative log likelihood of Student's t, up to factors.
 
     Parameters
     ----------
-    step
-        (K - 1, 6) of the steps.
-    range
-        (R,) of the ranges.
-    first
-        Of the first range error, per square metre.
-    free
-        (K,) of the pull of every range error to zero, per square metre.
-    prior
-        (G,) of the constants.
-    camera
-        (I,) of the images. None: no images.
+    sigmas
+        Residual s with half its weight, in standard deviations.
     """
 
-    step: Array
-    range: Array
-    first: float
-    free: Array
-    prior: Array
-    camera: Array | None = None
+    sigmas: float
+
+    def cost(self, square: Array) -> Array:
+        """Return the losses."""
+        return np.asarray(self.sigmas**2 * np.log1p(square / self.sigmas**2))
+
+    def weight(self, square: Array) -> Array:
+        """Return the IRLS weights."""
+        return np.asarray(1 / (1 + square / self.sigmas**2))
+
+    def curvature(self, square: Array) -> Array:
+        """Return half the second derivatives, at least 0."""
+        out = square / self.sigmas**2
+        return np.asarray(np.maximum(1 - out, 0.0) / (1 + out) ** 2)
 
 
-def loss_scales(noise: NoiseModel) -> tuple[Array, float]:
-    """Return the loss scales of a step's residuals (6,) and of a range's."""
-    step = np.full(STATE_SIZE, MOTION_LOSS_SCALE)
-    step[RANGE_ERROR] = noise.range_step_sigmas**2
-    return step, (noise.range_loss_scale_m / noise.range_std_m) ** 2
+@dataclass(frozen=True, slots=True)
+class Huber:
+    """The square up to a residual s, its tangent beyond.
 
-
-def total_cost(linear: Linearization, noise: NoiseModel, constants: Array) -> float:
-    """Return half the sum of the losses."""
-    step, ranges = loss_scales(noise)
-    total = (step * np.log1p(linear.step**2 / step)).sum()
-    total += ranges * np.log1p(linear.range**2 / ranges).sum()
-    total += noise.range_step_sigmas**2 * np.log1p(_first_range_error_square(linear, noise))
-    total += (
-        noise.range_error_weight
-        * np.log1p((linear.error_m / noise.range_error_loss_scale_m) ** 2).sum()
-    )
-    total += (
-        PRIOR_LOSS_SCALES * np.log1p((constants / noise.prior_std()) ** 2 / PRIOR_LOSS_SCALES)
-    ).sum()
-    if linear.camera is not None:
-        total += (
-            linear.camera.weight
-            * BEARING_LOSS_SCALE
-            * np.log1p(linear.camera.squared_distance / BEARING_LOSS_SCALE)
-        ).sum()
-    return float(total) / 2
-
-
-def irls_weights(linear: Linearization, noise: NoiseModel, constants: Array) -> IrlsWeights:
-    """Return the IRLS weight of every residual: weighted squares have the slope of the losses."""
-    step, ranges = loss_scales(noise)
-    looked = linear.camera
-    return IrlsWeights(
-        1 / (1 + linear.step**2 / step),
-        1 / (1 + linear.range**2 / ranges),
-        1 / (1 + _first_range_error_square(linear, noise)) / noise.range_error_std_m**2,
-        noise.range_error_weight / (noise.range_error_loss_scale_m**2 + linear.error_m**2),
-        1 / (1 + (constants / noise.prior_std()) ** 2 / PRIOR_LOSS_SCALES),
-        None
-        if looked is None
-        else looked.weight / (1 + looked.squared_distance / BEARING_LOSS_SCALE),
-    )
-
-
-def prior_curvature(noise: NoiseModel, constants: Array) -> Array:
-    """Return (G,) information of the prior about the constants, from the curvature of its loss.
-
-    The IRLS weight matches the slope of the loss. The curvature is smaller: the prior hardly
-    constrains a constant that is as far out as the prior is wide.
+    Parameters
+    ----------
+    sigmas
+        The residual s, in standard deviations.
     """
-    return (
-        loss_curvature((constants / noise.prior_std()) ** 2 / PRIOR_LOSS_SCALES)
-        * noise.prior_std() ** -2
-    )
 
+    sigmas: float
 
-def loss_curvature(out: Array) -> Array:
-    """Return the curvature of the loss at r^2 / L, relative to a square."""
-    # Half of the second derivative of L log(1 + r^2 / L) is (1 - r^2 / L) / (1 + r^2 / L)^2.
-    return np.asarray(np.maximum(1 - out, 0.0) / (1 + out) ** 2)
+    def cost(self, square: Array) -> Array:
+        """Return the losses."""
+        size = np.sqrt(square)
+        return np.where(size > self.sigmas, self.sigmas * (2 * size - self.sigmas), square)
 
+    def weight(self, square: Array) -> Array:
+        """Return the IRLS weights."""
+        return np.asarray(np.minimum(1.0, self.sigmas / np.sqrt(np.maximum(square, 1e-12))))
 
-def _first_range_error_square(linear: Linearization, noise: NoiseModel) -> float:
-    """Return the square of the first range error, relative to the scale of a step."""
-    return float(linear.error_m[0] / (noise.range_step_sigmas * noise.range_error_std_m)) ** 2
+    def curvature(self, square: Array) -> Array:
+        """Return half the second derivatives, at least 0."""
+        return np.asarray(square <= self.sigmas**2, float)

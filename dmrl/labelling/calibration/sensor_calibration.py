@@ -1,6 +1,6 @@
 """Estimate constant sensor errors from many flights: solve each, then pool all."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,23 +10,23 @@ from numpy.typing import NDArray
 from dmrl.errors import RecordingError
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.flight.random_effects import PooledConstants, flight_information, pool_flights
-from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.keyframes import GLOBALS, NoiseModel
-from dmrl.estimation.solver.residuals import CLOCK
+from dmrl.estimation.solver.unknowns import TABLE, Subject, Unknown
 from dmrl.labelling.flight_log import SENSOR_TOPICS, read_flight
 from dmrl.labelling.sensor_file import OF_PAIR, OF_ROBOT, Names, SensorConstants, Value
 from dmrl.labelling.sensor_logs import build_sensor_logs
 
 Ints = NDArray[np.intp]
-Subject = tuple[str | Names, str]
-"""A robot or both of a pair, and the name of a constant."""
+Owned = tuple[str | Names, str]
+"""A robot or both of a pair, and the key of a constant."""
 
 MIN_FLIGHTS = 2
 """Fewest flights of a pair. One flight cannot separate lasting errors from those of a day."""
 MAX_STD_SHARE, MIN_SIGMAS = 0.8, 2.0
 """A constant is kept if its std is below this share of the usual one, or its mean is more than so
 many of its own standard deviations from zero."""
+ROWS = {row.name: row for row in TABLE}
+"""Rows of the unknowns by name."""
 CLOCK_OFF = "clock_s"
 """Reported with the others, but not kept: clock offsets differ in every flight."""
 UNUSABLE = ("still", "alike", "silent", "open")
@@ -95,13 +95,15 @@ def pool_sensor_constants(
             f"{MIN_FLIGHTS} flights that tell where both were. Give more flights of the same "
             "robots; dmrl label says what is wrong with each"
         )
-    place = {key: at for names, _ in twice for key, at in _index_constants(names).items()}
-    number = {subject: k for k, subject in enumerate(place)}
-    flights = [flight_information(one, _number_constants(names, number)) for names, one in twice]
-    kinds = np.array(list(place.values()))
-    out = _select_constants(
-        list(place), pool_flights(flights, kinds), NoiseModel().prior_std()[kinds]
-    )
+    place = {owned: name for names, _ in twice for owned, (name, _) in _subjects(names).items()}
+    number = {owned: k for k, owned in enumerate(place)}
+    flights = []
+    for names, one in twice:
+        mine = _subjects(names)
+        column = np.array([number[owned] for owned in mine], np.intp)
+        flights.append(flight_information(one, list(mine.values()), column))
+    rows = [ROWS[name] for name in place.values()]
+    out = _select_constants(list(place), pool_flights(flights, rows), rows)
     if not out.sensors.names:
         raise RecordingError(
             f"{sources[0]}: {len(sources)} recordings agree on nothing of their sensors that is "
@@ -122,25 +124,18 @@ def solve_flight(source: Path) -> dict[Names, Estimate]:
     return dict(zip(pairs, (here for here, _ in estimate_pairs(list(pairs.values()))), strict=True))
 
 
-def _index_constants(names: Names) -> dict[Subject, int]:
-    """Return every constant of a pair with its index into ``GLOBALS``."""
-    shared: dict[Subject, int] = {(names, key): place for key, place in OF_PAIR.items()}
+def _subjects(names: Names) -> dict[Owned, Subject]:
+    """Return the unknowns of a pair by the owner and key of each."""
+    out: dict[Owned, Subject] = {(names, key): (name, (0, 1)) for key, name in OF_PAIR.items()}
     for side, robot in enumerate(names):
-        shared |= {(robot, key): places[side] for key, places in OF_ROBOT.items()}
-    return {(names, CLOCK_OFF): CLOCK, **shared}
-
-
-def _number_constants(names: Names, number: Mapping[Subject, int]) -> Ints:
-    """Return (G,) numbers of a pair's constants, in the order of ``GLOBALS``."""
-    out = np.zeros(len(GLOBALS), np.intp)
-    for subject, place in _index_constants(names).items():
-        out[place] = number[subject]
-    return out
+        out |= {(robot, key): (name, (side,)) for key, name in OF_ROBOT.items()}
+    return {(names, CLOCK_OFF): ("clock", (1,)), **out}
 
 
 def _select_constants(
-    subjects: Sequence[Subject], found: PooledConstants, usual: Array
+    subjects: Sequence[Owned], found: PooledConstants, rows: Sequence[Unknown]
 ) -> SensorCalibration:
+    usual = np.array([row.std for row in rows])
     better = (found.std < MAX_STD_SHARE * usual) | (np.abs(found.mean) > MIN_SIGMAS * found.std)
     columns = (found.mean, found.std, found.flights, better)
     constants = [

@@ -9,14 +9,13 @@ from dmrl.estimation.flight.data_association import resolve_conflicts
 from dmrl.estimation.model.bearings import (
     associate,
     bearing_variance,
-    crop_to_time,
     drop_candidates,
     to_bearing,
 )
 from dmrl.estimation.model.pair import Array, BearingMeasurements, Pair
 from dmrl.estimation.model.status import OK
-from dmrl.estimation.solver.estimate import Estimate, seen_from_peer
-from dmrl.estimation.solver.keyframes import GLOBALS, NoiseModel
+from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate, seen_from_peer
+from dmrl.estimation.solver.keyframes import NoiseModel
 
 from ..sighted_flights import STD, still_pair
 
@@ -41,7 +40,8 @@ def at(bearing_rad: float, sigma_m: float = 0.1) -> Estimate:
     covariance = np.tile(sigma_m**2 * np.eye(3), (101, 1, 1))
     status = np.full(101, OK, np.int8)
     time_s = np.linspace(pair.time_s[0], pair.time_s[-1], 101)
-    return Estimate(time_s, state, covariance, status, np.zeros(len(GLOBALS)), NoiseModel())
+    constants = np.zeros(len(PAIR_LAYOUT.constants))
+    return Estimate(time_s, state, covariance, status, constants, NoiseModel())
 
 
 def both_ways(found: dict[Names, Estimate]) -> dict[Names, Estimate]:
@@ -102,8 +102,7 @@ def test_images_without_a_candidate_left_are_no_images() -> None:
     gone = np.arange(len(TIMES_S)) < 3
     left = drop_candidates(sees, gone, np.zeros(len(TIMES_S), np.intp))
     assert left.time_s.tolist() == TIMES_S[3:].tolist()
-    assert crop_to_time(sees, 1.0, 2.0).time_s.tolist() == [1.0, 1.5, 2.0]  # type: ignore[union-attr]
-    assert crop_to_time(None, 1.0, 2.0) is None
+    assert sees.crop(1.0, 2.0).time_s.tolist() == [1.0, 1.5, 2.0]
 
 
 def test_directions_are_as_uncertain_as_the_place_is() -> None:

@@ -9,14 +9,21 @@ from dmrl.estimation.flight.random_effects import (
     pool_flights,
 )
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.keyframes import GLOBALS, NoiseModel
-from dmrl.estimation.solver.residuals import OWN_GYRO, PEER_GYRO, RANGE_BIAS
-from dmrl.estimation.solver.robust_loss import PRIOR_LOSS_SCALES, prior_curvature
+from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
+from dmrl.estimation.solver.keyframes import NoiseModel
+from dmrl.estimation.solver.residuals import ConstantPrior
 
-SIZE = len(GLOBALS)
+SUBJECTS = [subject for subject, _ in PAIR_LAYOUT.constants]
+ROWS = [row for _, row in PAIR_LAYOUT.constants]
+SIZE = len(ROWS)
 ALL = np.arange(SIZE)
-USUAL = NoiseModel().prior_std()
+USUAL = NoiseModel().prior_std(PAIR_LAYOUT)
+OWN_GYRO, PEER_GYRO = (PAIR_LAYOUT.find("gyro_bias", side) for side in (0, 1))
+RANGE_BIAS = PAIR_LAYOUT.find("range_offset", 0, 1)
+
+
+def prior(found: Array) -> ConstantPrior:
+    return ConstantPrior(found, USUAL, tuple(row.loss for row in ROWS))
 
 
 def information(rng: np.random.Generator, rank: int = SIZE) -> Array:
@@ -29,9 +36,8 @@ def solved(seen: Array, likeliest: Array) -> Estimate:
     """What a solve says of a flight, whose prior holds the constants back."""
     noise, found = NoiseModel(), np.zeros(SIZE)
     for _ in range(200):
-        weight = 1 / (1 + (found / USUAL) ** 2 / PRIOR_LOSS_SCALES) / USUAL**2
-        found = np.linalg.solve(seen + np.diag(weight), seen @ likeliest)
-    covariance = np.linalg.inv(seen + np.diag(prior_curvature(noise, found)))
+        found = np.linalg.solve(seen + np.diag(prior(found).information()), seen @ likeliest)
+    covariance = np.linalg.inv(seen + np.diag(prior(found).curvature()))
     state, spread, status = np.zeros((2, 3)), np.stack([np.eye(3)] * 2), np.zeros(2, np.int8)
     made = Estimate(np.arange(2.0), state, spread, status, found, noise)
     return replace(made, constants_covariance=covariance)
@@ -40,7 +46,7 @@ def solved(seen: Array, likeliest: Array) -> Estimate:
 def test_a_flight_tells_what_it_does_without_its_prior() -> None:
     rng = np.random.default_rng(0)
     seen, likeliest = information(rng), rng.normal(0, 0.5 * USUAL)
-    out = flight_information(solved(seen, likeliest), ALL)
+    out = flight_information(solved(seen, likeliest), SUBJECTS, ALL)
     scale = np.outer(USUAL, USUAL)
     assert out.information * scale == pytest.approx(seen * scale, rel=1e-6, abs=1e-6)
     assert out.information_vector * USUAL == pytest.approx(seen @ likeliest * USUAL, rel=1e-4)
@@ -58,7 +64,7 @@ def test_the_next_flight_is_as_far_off_as_is_said() -> None:
             FlightInformation(one, one @ flight, ALL)
             for one, flight in zip(seen, flights, strict=True)
         ]
-        found = pool_flights(parts, ALL)
+        found = pool_flights(parts, ROWS)
         assert (found.flights == 5).sum() == 0
         off.append((own + rng.normal(0, 0.3 * USUAL) - found.mean) / found.std)
     assert 0.75 < np.sqrt(np.mean(np.square(off))) < 1.25
@@ -72,8 +78,8 @@ def test_where_a_difference_alone_is_told_one_robot_is_off() -> None:
     true[PEER_GYRO] = 0.05
     # Of a third robot too: who is in both pairs is the one.
     columns = [ALL, np.where(ALL == OWN_GYRO, SIZE, ALL)]
-    kind = np.append(ALL, OWN_GYRO)
-    found = pool_flights([FlightInformation(seen, seen @ true, column) for column in columns], kind)
+    rows = [*ROWS, ROWS[OWN_GYRO]]
+    found = pool_flights([FlightInformation(seen, seen @ true, column) for column in columns], rows)
     assert found.mean[PEER_GYRO] == pytest.approx(0.05, abs=0.003)
     assert found.mean[[OWN_GYRO, SIZE]] == pytest.approx(0.0, abs=0.003)
 
@@ -83,11 +89,26 @@ def test_what_is_another_every_time_is_not_known() -> None:
     seen[RANGE_BIAS, RANGE_BIAS] = 1e6
     offsets = [-0.4, 0.5, 0.1, -0.3, 0.45, -0.35]
     found = pool_flights(
-        [FlightInformation(seen, seen[RANGE_BIAS] * offset, ALL) for offset in offsets], ALL
+        [FlightInformation(seen, seen[RANGE_BIAS] * offset, ALL) for offset in offsets], ROWS
     )
     assert found.std[RANGE_BIAS] > USUAL[RANGE_BIAS]
     same = pool_flights(
-        [FlightInformation(seen, seen[RANGE_BIAS] * 0.35, ALL) for _ in offsets], ALL
+        [FlightInformation(seen, seen[RANGE_BIAS] * 0.35, ALL) for _ in offsets], ROWS
     )
     assert same.mean[RANGE_BIAS] == pytest.approx(0.35, abs=0.01)
     assert same.std[RANGE_BIAS] < 0.3 * USUAL[RANGE_BIAS]
+
+
+def test_constants_beside_those_asked_for_are_marginalized() -> None:
+    rng = np.random.default_rng(2)
+    seen, likeliest = information(rng), rng.normal(0, 0.5 * USUAL)
+    made = solved(seen, likeliest)
+    kept = [k for k, (name, _) in enumerate(SUBJECTS) if name != "height_offset"]
+    out = flight_information(made, [SUBJECTS[k] for k in kept], np.arange(len(kept)))
+    rest = [k for k in ALL if k not in kept]
+    held = seen + np.diag(prior(made.constants).curvature())
+    wanted = seen[np.ix_(kept, kept)] - seen[np.ix_(kept, rest)] @ np.linalg.solve(
+        held[np.ix_(rest, rest)], seen[np.ix_(rest, kept)]
+    )
+    scale = np.outer(USUAL[kept], USUAL[kept])
+    assert out.information * scale == pytest.approx(wanted * scale, rel=1e-6, abs=1e-6)

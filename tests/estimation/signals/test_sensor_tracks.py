@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.signals.sensor_tracks import build_track, find_frozen, find_runaway
+from dmrl.estimation.signals.sensor_tracks import build_track, find_frozen
 
 GRID_S = np.arange(0, 20, 0.01)
 
@@ -25,24 +25,6 @@ def test_a_log_that_repeats_its_samples_or_stands_still_is_not_frozen() -> None:
     assert not find_frozen(GRID_S, np.zeros((len(GRID_S), 2)), GRID_S).any()
 
 
-def test_an_estimate_that_runs_away_at_the_end_is_cut_off() -> None:
-    velocity, turn, height = noisy(), np.zeros((len(GRID_S), 1)), np.ones((len(GRID_S), 1))
-    crash = GRID_S > 16
-    velocity[crash] += np.minimum(9, 6 * (GRID_S[crash] - 16))[:, None]
-    found = build_track((GRID_S, turn), (GRID_S, velocity), (GRID_S, height), GRID_S)
-    assert found.dropout[GRID_S > 16].all() and not found.dropout[GRID_S < 14].any()
-    assert not found.vx_mps[crash].any()
-    # Its height says 1 m still, but it lies on the floor.
-    assert not found.height_m[GRID_S > 17].any()
-    assert found.height_m[GRID_S < 16] == pytest.approx(1.0)
-
-
-def test_fast_flight_and_single_outliers_do_not_run_away() -> None:
-    speed = 2.5 + noisy()[:, 0]
-    speed[::50] = 20.0
-    assert not find_runaway(speed, 3.0).any()
-
-
 def test_each_sensor_stands_in_its_place_and_any_ones_silence_is_a_gap() -> None:
     forward = noisy() * 0.01 + [1.0, -0.5]
     turn = np.full((len(GRID_S), 1), 0.3)
@@ -59,38 +41,6 @@ def test_each_sensor_stands_in_its_place_and_any_ones_silence_is_a_gap() -> None
         found = build_track(*logs, GRID_S)
         assert (getattr(found, names) == ~heard).mean() > 0.99
         assert not (found.dropout.any() and silent == 2)
-
-
-def test_a_robot_that_spins_is_lost_for_a_second_around() -> None:
-    turn, high = np.full((len(GRID_S), 1), 0.2), np.ones((len(GRID_S), 1))
-    turn[(GRID_S > 10) & (GRID_S < 11)] = 9.0
-    found = build_track((GRID_S, turn), (GRID_S, noisy()), (GRID_S, high), GRID_S)
-    assert GRID_S[found.dropout].min() == pytest.approx(9.0, abs=0.12)
-    assert GRID_S[found.dropout].max() == pytest.approx(12.0, abs=0.12)
-    assert not found.yaw_rate_radps[found.dropout].any()
-    assert found.height_m == pytest.approx(1.0)  # it flies on
-
-
-@pytest.mark.parametrize(
-    ("speed", "lasts_s", "usual", "lost"),
-    [
-        (2.9, 1.0, 0.1, False),
-        (3.1, 1.0, 0.1, True),
-        (3.1, 0.09, 0.1, False),
-        (3.1, 0.12, 0.1, True),
-        (3.9, 1.0, 1.0, False),
-        (4.1, 1.0, 1.0, True),
-    ],
-)
-def test_what_runs_away_is_fast_and_four_times_the_usual_and_lasts(
-    speed: float, lasts_s: float, usual: float, lost: bool
-) -> None:
-    size = np.full(len(GRID_S), usual)
-    size[1000 : 1000 + round(100 * lasts_s)] = speed
-    found = find_runaway(size, 3.0)
-    assert found.any() == lost
-    if lost and lasts_s == 1.0:  # and a second around
-        assert GRID_S[found][[0, -1]] == pytest.approx([9.0, 11.99], abs=0.02)
 
 
 @pytest.mark.parametrize(("lasts_s", "stuck"), [(0.49, False), (0.52, True)])

@@ -8,9 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmrl.estimation.model.status import AMBIGUOUS, OK, UNCONVERGED
-from dmrl.estimation.solver.estimate import Estimate, seen_from_peer, transform_to_peer
-from dmrl.estimation.solver.keyframes import GLOBALS, NoiseModel
-from dmrl.estimation.solver.residuals import CLOCK
+from dmrl.estimation.solver.estimate import (
+    PAIR_LAYOUT,
+    Estimate,
+    seen_from_peer,
+    transform_to_peer,
+)
+from dmrl.estimation.solver.keyframes import NoiseModel
 
 COUNT = 4
 
@@ -24,7 +28,7 @@ def estimate(seed: int = 0) -> Estimate:
         rng.normal(size=(COUNT, 3)),
         root @ root.swapaxes(1, 2),
         np.full(COUNT, OK, np.int8),
-        rng.normal(size=len(GLOBALS)),
+        rng.normal(size=len(PAIR_LAYOUT.constants)),
         NoiseModel(),
     )
 
@@ -80,14 +84,13 @@ def test_a_covariance_seen_from_the_peer_is_that_of_states_seen_from_there() -> 
 
 def test_seen_from_the_peer_own_constants_are_the_peer_s() -> None:
     found = estimate(3)
-    values = dict(zip(GLOBALS, found.constants.tolist(), strict=True))
-    other = dict(zip(GLOBALS, seen_from_peer(found).constants.tolist(), strict=True))
-    turned = {"own": "peer", "peer": "own"}
-    for name, value in other.items():
-        first, _, rest = name.partition("_")
-        of = "_".join([turned.get(first, first), rest]) if rest else name
-        sign = -1 if GLOBALS.index(name) == CLOCK else 1
-        assert value == sign * values[of if of in values else name]
+    other = seen_from_peer(found)
+    for name in ("gyro_bias", "velocity_scale", "vx_bias", "vy_bias", "height_offset"):
+        for side in (0, 1):
+            assert other.value(name, side) == found.value(name, 1 - side)
+    for name in ("range_offset", "range_scale"):
+        assert other.value(name, 0, 1) == found.value(name, 0, 1)
+    assert other.value("clock", 1) == -found.value("clock", 1)
     again = seen_from_peer(seen_from_peer(found))
     for field in fields(Estimate):
         if field.name in ("state", "covariance", "constants"):

@@ -1,0 +1,296 @@
+"""Robust EKF of a pair over keyframes, for many hypotheses, forwards and backwards in time.
+
+The state is x, y, psi of the peer in the observer's horizontal frame and the biases of both yaw
+rates. A lane is one run through the flight from a start in either direction; hypotheses of all
+lanes run side by side.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.estimation.model.bearings import subtract_bearings
+from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation_matrix
+from dmrl.estimation.model.pair import Array
+from dmrl.estimation.solver.keyframes import CameraView, Problem, average_ranges
+from dmrl.estimation.solver.residuals import odometry_variance
+
+SIZE = 5
+"""Number of states."""
+HYPOTHESIS_STD: Array = np.array([0.35, 0.35, 0.45, 0.01, 0.01])
+"""Initial standard deviations of x, y (m), psi (rad): half the distance to the next hypothesis.
+Then those of both yaw rate biases, rad/s."""
+SHADOWED_RANGE_STD_M, RANGE_BIAS_STD_M = 0.3, 0.05
+"""Standard deviations of a range after its step offset is removed, and of the unknown bias of an
+averaged range, metres."""
+SOFT_SIGMAS = 2.0
+"""Innovation beyond which an update is down-weighted, in standard deviations."""
+IMAGE_INTERVAL_S, IMAGE_STD, IMAGE_GATE = 0.4, 0.05, 16.0
+"""Interval between used images of a camera, seconds; standard deviation added because an image is
+beside its keyframe, radians; gate on the squared distance of a candidate, four sigmas."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """One run through a flight: T keyframes from a start.
+
+    Parameters
+    ----------
+    keyframe
+        (T,) keyframes in the order of the run.
+    forwards
+        Whether the run follows time.
+    """
+
+    keyframe: NDArray[np.intp]
+    forwards: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FilterInputs:
+    """Measurements of a pair at K keyframes, and its motions.
+
+    ``step_s`` (K - 1,), ``turns`` (K - 1, 2), ``shifts`` (K - 1, 2, 2) of observer and peer,
+    ``step_var`` (K - 1, 5), ``range_m`` (K,) and ``range_var`` (K,), NaN without a range,
+    ``height_m`` (K,), ``images`` by keyframe: (sign of the observer, bearing, std).
+    """
+
+    step_s: Array
+    turns: Array
+    shifts: Array
+    step_var: Array
+    range_m: Array
+    range_var: Array
+    height_m: Array
+    images: dict[int, list[tuple[float, Array, Array]]]
+
+
+@dataclass(frozen=True, slots=True)
+class FilterRun:
+    """Run of B filters over T keyframes.
+
+    ``state``, ``covariance`` (T, B, ...) after the update, ``prior``, ``prior_covariance`` before,
+    ``step`` (T, B, 5, 5) Jacobian to the next keyframe, ``log_likelihood`` (T, B) of each
+    keyframe's measurements.
+    """
+
+    state: Array
+    covariance: Array
+    prior: Array
+    prior_covariance: Array
+    step: Array
+    log_likelihood: Array
+
+
+def build_inputs(problem: Problem, range_excess_m: float = 0.0) -> FilterInputs:
+    """Build the filter inputs of a pair.
+
+    Parameters
+    ----------
+    problem
+        Flight of two robots.
+    range_excess_m
+        Assumed excess of all ranges, metres.
+    """
+    count = len(problem.keyframe_s)
+    link = average_ranges(problem.links[0], problem.keyframe_s)
+    range_m, variance = np.full(count, np.nan), np.full(count, np.nan)
+    range_m[link.keyframe] = link.range_m - range_excess_m
+    shadow = (link.offset_guess_m != 0) * SHADOWED_RANGE_STD_M**2
+    noise = problem.noise
+    variance[link.keyframe] = (
+        (noise.range_std_m * link.std_share) ** 2 + RANGE_BIAS_STD_M**2 + shadow
+    )
+    one, other = problem.robots
+    step_var = np.zeros((count - 1, SIZE))
+    extra = problem.fading_psd * one.steps_s
+    for robot in range(2):
+        step_var[:, :3] += odometry_variance(problem, robot)
+        step_var[:, :2] += extra[:, None]
+    return FilterInputs(
+        one.steps_s,
+        np.column_stack([one.motion.turn_rad, other.motion.turn_rad]),
+        np.stack([one.motion.shift_m, other.motion.shift_m], axis=1),
+        step_var,
+        range_m,
+        variance,
+        other.height_m - one.height_m,
+        _select_images(problem.views),
+    )
+
+
+def _select_images(views: Sequence[CameraView]) -> dict[int, list[tuple[float, Array, Array]]]:
+    """Return some images of both cameras, by keyframe."""
+    out: dict[int, list[tuple[float, Array, Array]]] = {}
+    for view in views:
+        last_s, sign = -np.inf, 1.0 if view.robots[0] < view.robots[1] else -1.0
+        for k in range(len(view.time_s)):
+            if view.time_s[k] >= last_s + IMAGE_INTERVAL_S:
+                last_s = view.time_s[k]
+                there = np.isfinite(view.bearing[k, :, 0])
+                bearing, std = view.bearing[k, there].copy(), view.std[k, there]
+                bearing[:, 0] += view.own_turn_rad[k]
+                seen = (sign, bearing, np.hypot(std, IMAGE_STD))
+                out.setdefault(int(view.keyframe[k]), []).append(seen)
+    return out
+
+
+def run_lanes(
+    inputs: FilterInputs, lanes: Sequence[Lane], start: Array, lane_of: NDArray[np.intp], steps: int
+) -> FilterRun:
+    """Run B filters side by side, each along its lane, for a number of keyframes at most.
+
+    Parameters
+    ----------
+    inputs
+        Measurements of the pair.
+    lanes
+        Runs through the flight.
+    start
+        (B, 3) first x, y, psi.
+    lane_of
+        (B,) index of each filter's lane.
+    steps
+        Largest number of keyframes. A lane that ends before waits.
+    """
+    count, filters = min(steps, max(len(lane.keyframe) for lane in lanes)), len(start)
+    state = np.zeros((filters, SIZE))
+    state[:, :3] = start
+    covariance = np.broadcast_to(np.diag(HYPOTHESIS_STD**2), (filters, SIZE, SIZE)).copy()
+    out = FilterRun(*(np.zeros((count, *shape)) for shape in (
+        (filters, SIZE), (filters, SIZE, SIZE), (filters, SIZE), (filters, SIZE, SIZE),
+        (filters, SIZE, SIZE), (filters,),
+    )))  # fmt: skip
+    keys = np.stack([_padded(lane.keyframe, count) for lane in lanes])
+    columns = [np.flatnonzero(lane_of == number) for number in range(len(lanes))]
+    for t in range(count):
+        out.prior[t], out.prior_covariance[t] = state, covariance
+        key = keys[lane_of, t]
+        alive = key >= 0
+        _update_ranges(state, covariance, inputs, np.where(alive, key, 0), alive, out, t)
+        for number, mine in enumerate(columns):
+            for image in inputs.images.get(int(keys[number, t]), ()):
+                _update_image(state, covariance, inputs, int(keys[number, t]), mine, image, out, t)
+        out.state[t], out.covariance[t] = state, covariance
+        if t < count - 1:
+            state, step, variance = _propagate(state, inputs, key, keys[lane_of, t + 1])
+            out.step[t] = step
+            covariance = step @ covariance @ step.swapaxes(1, 2)
+            covariance[:, range(SIZE), range(SIZE)] += variance
+    return out
+
+
+def _padded(keyframe: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    return np.concatenate([keyframe[:count], np.full(max(count - len(keyframe), 0), -1)])
+
+
+def _propagate(
+    state: Array, inputs: FilterInputs, key: NDArray[np.intp], after: NDArray[np.intp]
+) -> tuple[Array, Array, Array]:
+    """Return (B, 5) states at the next keyframe, (B, 5, 5) Jacobians and (B, 5) variances."""
+    moving, forwards = after >= 0, after > key
+    step = np.where(moving, np.minimum(key, after), 0)
+    seconds = np.where(moving, np.where(forwards, 1.0, -1.0), 0.0) * inputs.step_s[step]
+    turns, shifts = inputs.turns[step], inputs.shifts[step]
+    # Backwards a step is its inverse: the turn negated, the shift seen from its end.
+    sign = np.where(forwards, 1.0, -1.0)
+    turned = rotation_matrix(np.where(forwards[:, None], 0.0, -turns))
+    shifts = sign[:, None, None] * np.einsum("brij,brj->bri", turned, shifts)
+    shifts *= moving[:, None, None]
+    turns = turns * (sign * moving)[:, None] - seconds[:, None] * state[:, 3:5]
+    peer = rotate(rotation_matrix(state[:, 2]), shifts[:, 1])
+    back = rotation_matrix(-turns[:, 0])
+    out = state.copy()
+    out[:, :2] = rotate(back, state[:, :2] + peer - shifts[:, 0])
+    out[:, 2] += turns[:, 1] - turns[:, 0]
+    jacobian = np.zeros((len(state), SIZE, SIZE))
+    jacobian[:, :2, :2] = back
+    jacobian[:, :2, 2] = rotate(back, peer @ QUARTER_TURN.T)
+    jacobian[:, :2, 3] = seconds[:, None] * (out[:, :2] @ QUARTER_TURN.T)
+    jacobian[:, [2, 3, 4], [2, 3, 4]] = 1.0
+    jacobian[:, 2, 3], jacobian[:, 2, 4] = seconds, -seconds
+    return out, jacobian, inputs.step_var[step] * moving[:, None]
+
+
+def _update_ranges(
+    state: Array,
+    covariance: Array,
+    inputs: FilterInputs,
+    key: NDArray[np.intp],
+    alive: NDArray[np.bool_],
+    out: FilterRun,
+    t: int,
+) -> None:
+    """Update the filters with the ranges of their keyframes, in place."""
+    measured, variance = inputs.range_m[key], inputs.range_var[key]
+    seen = alive & np.isfinite(measured)
+    variance = np.where(seen, variance, 1.0)
+    expected = np.sqrt((state[:, :2] ** 2).sum(axis=1) + inputs.height_m[key] ** 2) + 1e-6
+    towards = state[:, :2] / expected[:, None]
+    cross = np.einsum("bij,bj->bi", covariance[:, :, :2], towards)
+    spread = np.einsum("bi,bi->b", towards, cross[:, :2]) + variance
+    innovation = np.where(seen, measured - expected, 0.0)
+    size = np.abs(innovation) / np.sqrt(spread)
+    out.log_likelihood[t] -= seen * (0.5 * np.log(spread) + np.log1p(0.5 * size**2))
+    # A large innovation counts as a noisy range.
+    spread += variance * (np.maximum(1.0, size / SOFT_SIGMAS) ** 2 - 1)
+    gain = np.where(seen, 1 / spread, 0.0)[:, None] * cross
+    state += gain * innovation[:, None]
+    covariance -= gain[:, :, None] * cross[:, None, :]
+
+
+def _update_image(
+    state: Array,
+    covariance: Array,
+    inputs: FilterInputs,
+    key: int,
+    mine: NDArray[np.intp],
+    image: tuple[float, Array, Array],
+    out: FilterRun,
+    t: int,
+) -> None:
+    """Update some filters with the candidate nearest to each, in place. The azimuth alone counts.
+
+    A filter far from every candidate stays as it is.
+    """
+    sign, bearing, std = image
+    x, y = sign * state[mine, :2].T
+    up = sign * inputs.height_m[key]
+    level2 = np.maximum(x * x + y * y, 1e-4)
+    turned = sign < 0
+    polar = np.column_stack(
+        [
+            np.arctan2(y, x) - turned * state[mine, 2],
+            np.arctan2(up, np.sqrt(level2)),
+            np.log(level2 + up * up) / 2,
+        ]
+    )
+    row = np.column_stack([-y, x, np.zeros(len(x))]) * (sign / level2)[:, None]
+    row[:, 2] = -1.0 * turned
+    farther = np.column_stack([x, y]) * (sign / (level2 + up * up))[:, None]
+    cross = np.einsum("bij,bj->bi", covariance[mine][..., :3], row)
+    spread = np.zeros((len(mine), 1, 3))
+    spread[:, 0, 0] = np.einsum("bi,bi->b", row, cross[:, :3])
+    spread[:, 0, 2] = np.einsum("bi,bij,bj->b", farther, covariance[mine][:, :2, :2], farther)
+    spread = spread + std**2
+    off = subtract_bearings(bearing, polar[:, None])
+    squared = (off**2 / spread).sum(axis=2)
+    nearest, filters = squared.argmin(axis=1), np.arange(len(mine))
+    least, variance = squared[filters, nearest], spread[filters, nearest, 0]
+    out.log_likelihood[t, mine] -= 0.5 * np.log(variance) + np.log1p(0.5 * least)
+    gain = np.where(least < IMAGE_GATE, 1 / variance, 0.0)[:, None] * cross
+    state[mine] += gain * off[filters, nearest, :1]
+    covariance[mine] -= gain[:, :, None] * cross[:, None, :]
+
+
+def smooth_rts(run: FilterRun) -> Array:
+    """Return (T, B, 5) states smoothed from the end of each lane to its start."""
+    state = run.state.copy()
+    for t in range(len(state) - 2, -1, -1):
+        back = np.linalg.solve(
+            run.prior_covariance[t + 1], (state[t + 1] - run.prior[t + 1])[..., None]
+        )
+        state[t] += (run.covariance[t] @ run.step[t].swapaxes(1, 2) @ back)[..., 0]
+    return state

@@ -1,0 +1,102 @@
+"""Long flights in windows: joined without a seam, and with a carried prior."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.flight import windows
+from dmrl.estimation.flight.pairs import estimate_pairs
+from dmrl.estimation.flight.windows import carry_information, split_windows
+from dmrl.estimation.model.status import OK
+from dmrl.estimation.solver.block_tridiagonal import solve_step
+from dmrl.estimation.solver.levenberg_marquardt import Solver
+from dmrl.estimation.solver.residuals import ConstantPrior, Values, build_equations
+
+from ..flights import flown, pair_of, truth_at
+from ..solver.test_residuals import flight
+
+
+def test_windows_cover_a_flight_and_overlap() -> None:
+    found = list(split_windows(10.0, 1010.0))
+    assert [w.is_last for w in found] == [False] * (len(found) - 1) + [True]
+    assert (found[0].from_s, found[-1].until_s, found[-1].end_s) == (10.0, 1010.0, 1010.0)
+    for one, other in pairwise(found):
+        assert one.until_s == other.from_s
+        assert one.next_s == other.start_s
+        assert one.end_s - other.start_s == windows.OVERLAP_S
+        assert one.until_s == pytest.approx((one.end_s + other.start_s) / 2)
+    assert max(w.end_s - w.start_s for w in found) <= 2 * windows.WINDOW_S - windows.OVERLAP_S
+    (whole,) = split_windows(0.0, 2 * windows.WINDOW_S - windows.OVERLAP_S)
+    assert whole.is_last
+
+
+def test_carried_information_is_that_of_the_earlier_keyframes() -> None:
+    """With the later measurements it gives the covariance of all of them together."""
+    problem, values = flight()
+    values = Values(values.state, values.constants)
+    solver = Solver(replace(problem, views=()))
+    layout = solver.layout
+    values = Values(values.state[:, : layout.width], values.constants[: len(layout.constants)] * 0)
+    at = 9
+    carried = carry_information(solver, values, float(problem.keyframe_s[at]))
+    # By hand: all equations without priors, less those from the keyframe on.
+    factors = [f for f in solver.linearize(values) if not isinstance(f, ConstantPrior)]
+    whole = build_equations(layout, factors, len(values.state), anchored=False)
+    late = replace(solver, problem=windows._until(solver.problem, at))
+    assert len(late.problem.links[0].range_m) == (solver.problem.links[0].keyframe <= at).sum()
+    size = layout.width + len(layout.constants)
+    assert carried.information.shape == (size, size)
+    assert carried.fits(layout)
+    assert np.linalg.eigvalsh(carried.information).min() > -1e-6
+    # Information about the relative position is there, about the absolute one is not.
+    absolute = np.zeros(size)
+    absolute[[0, 3]] = 1.0
+    relative = np.zeros(size)
+    relative[0], relative[3] = -1.0, 1.0
+    known, unknown = (v @ carried.information @ v for v in (relative, absolute))
+    assert known > 1e3 * unknown
+    assert carried.mean[:3] == pytest.approx(0.0)
+    step = solve_step(whole.damped(1e-6))
+    assert np.isfinite(step.log_det)
+
+
+@pytest.mark.heavy
+def test_in_windows_a_flight_is_as_good_as_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = flown("random", "calibrated", 1002, 80.0)
+    pair = pair_of(world)
+    (whole,) = estimate_pairs([pair])
+    monkeypatch.setattr(windows, "WINDOW_S", 30.0)
+    monkeypatch.setattr(windows, "OVERLAP_S", 14.0)
+    assert len(list(split_windows(0.0, 80.0))) == 4
+    (parts,) = estimate_pairs([pair])
+    assert parts[0].time_s == pytest.approx(whole[0].time_s)
+    errors = [
+        np.hypot(*(found[0].state[:, :2] - truth_at(world, found[0].time_s)).T)
+        for found in (whole, parts)
+    ]
+    rms = [float(np.sqrt((error**2).mean())) for error in errors]
+    assert rms[1] < 1.5 * rms[0] + 0.02
+    assert np.abs(np.diff(parts[0].state[:, :2], axis=0)).max() < 0.3
+    assert (parts[0].status == OK).mean() > 0.6
+
+
+@pytest.mark.heavy
+def test_a_carried_prior_keeps_a_bearing_that_the_window_leaves_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The observer rests after a minute: its bearing is known from before, for a while."""
+    world = flown("random", "calibrated", 1002, 60.0)
+    pair = pair_of(world)
+    monkeypatch.setattr(windows, "WINDOW_S", 30.0)
+    monkeypatch.setattr(windows, "OVERLAP_S", 10.0)
+    kept = estimate_pairs([pair])[0][0]
+    monkeypatch.setattr(windows, "CARRIED_SHARE", 1e-9)
+    dropped = estimate_pairs([pair])[0][0]
+    late = kept.time_s > 45
+    widths = [
+        float(np.sqrt(np.linalg.eigvalsh(e.covariance[late, :2, :2])[:, -1].mean()))
+        for e in (kept, dropped)
+    ]
+    assert widths[0] < widths[1]

@@ -1,0 +1,82 @@
+"""Odometry and heights that contradict the ranges, and those that only are fast."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.model.pair import Array, Pair, SensorTrack
+from dmrl.estimation.signals.contradictions import drop_contradictions
+
+GRID_S = np.arange(0, 20.001, 0.01)
+RANGES_S = np.arange(0.1, 20, 0.05)
+
+
+def track(speed: Array | float = 0.0, height: Array | float = 1.0) -> SensorTrack:
+    zero = np.zeros(len(GRID_S))
+    return SensorTrack(zero + speed, zero, zero + 0.1, zero + height, np.zeros(len(zero), bool))
+
+
+def pair(own: SensorTrack, peer: SensorTrack, distance: Array | float = 2.0) -> Pair:
+    return Pair(GRID_S, own, peer, RANGES_S, np.zeros(len(RANGES_S)) + distance)
+
+
+def runaway(start_s: float = 16.0, end_s: float = np.inf) -> Array:
+    inside = (start_s < GRID_S) & (end_s > GRID_S)
+    return np.minimum(9.0, 6 * (GRID_S - start_s)) * inside
+
+
+@pytest.mark.parametrize("robot", ["own", "peer"])
+def test_a_crashed_robot_lies_still_on_the_floor(robot: str) -> None:
+    flight = pair(track(), track())
+    found = drop_contradictions(replace(flight, **{robot: track(runaway())}))
+    gone, other = (getattr(found, k) for k in (robot, "peer" if robot == "own" else "own"))
+    assert gone.dropout[GRID_S > 17].all() and not gone.dropout[GRID_S < 15].any()
+    for signal in (gone.vx_mps, gone.vy_mps, gone.yaw_rate_radps):
+        assert not signal[GRID_S > 17].any()
+    assert not gone.height_m[GRID_S > 18.5].any()
+    assert gone.height_m[GRID_S < 15] == pytest.approx(1.0)
+    assert not other.dropout.any() and (other.height_m == 1.0).all()
+
+
+def test_an_estimate_that_comes_back_is_no_crash() -> None:
+    found = drop_contradictions(pair(track(runaway(8.0, 11.0)), track()))
+    assert found.own.dropout[(GRID_S > 9) & (GRID_S < 11)].all()
+    assert not found.own.dropout[(GRID_S < 7) | (GRID_S > 13)].any()
+    assert (found.own.height_m == 1.0).all()
+
+
+def test_fast_robots_whose_ranges_follow_are_not_touched() -> None:
+    """One flies past the other at 8 m/s; then both fly side by side."""
+    away = np.abs(8.0 * (RANGES_S - 10)) + 1.0
+    past = pair(track(8.0), track(), np.minimum(away, 59.0))
+    assert drop_contradictions(past).own.dropout.sum() == 0
+    together = pair(track(8.0), track(8.0))
+    assert drop_contradictions(together).own.dropout.sum() == 0
+
+
+def test_single_outliers_and_wrong_scales_are_no_contradiction() -> None:
+    speed = np.full(len(GRID_S), 0.2)
+    speed[::50] = 20.0
+    assert not drop_contradictions(pair(track(speed), track())).own.dropout.any()
+    swing = 1.5 * np.sin(GRID_S)
+    far = 2.0 + 1.5 * (1 - np.cos(RANGES_S))
+    assert not drop_contradictions(pair(track(1.2 * swing), track(), far)).own.dropout.any()
+
+
+def test_where_ranges_are_silent_nothing_is_contradicted() -> None:
+    flight = pair(track(runaway(8.0, 11.0)), track())
+    heard = (flight.range_time_s < 7) | (flight.range_time_s > 12)
+    quiet = replace(flight, range_time_s=RANGES_S[heard], range_m=flight.range_m[heard])
+    assert not drop_contradictions(quiet).own.dropout.any()
+    few = replace(flight, range_time_s=RANGES_S[:10], range_m=flight.range_m[:10])
+    assert drop_contradictions(few) is few
+
+
+def test_a_height_farther_than_the_peer_is_impossible() -> None:
+    high = np.where((GRID_S > 5) & (GRID_S < 6), 9.0, 1.0)
+    found = drop_contradictions(pair(track(), track(height=high)))
+    assert found.peer.height_dropout is not None
+    assert GRID_S[found.peer.height_dropout][[0, -1]] == pytest.approx([5.01, 5.99])
+    assert found.peer.height_m == pytest.approx(1.0)
+    assert found.own.height_dropout is None

@@ -1,0 +1,147 @@
+"""Covariances count motion, and no noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.model.odometry import rotation_matrix
+from dmrl.estimation.model.pair import Pair
+from dmrl.estimation.solver.covariance import (
+    calm_motion,
+    compute_covariance,
+    relative_covariance,
+)
+from dmrl.estimation.solver.keyframes import NoiseModel, Problem, build_problem
+from dmrl.estimation.solver.levenberg_marquardt import Solver, relative_path
+from dmrl.estimation.solver.residuals import build_equations
+
+from ..sighted_flights import still_pair
+from .test_residuals import flight
+
+KEYS, STEP_S = 501, 0.2
+KEY_S = np.arange(KEYS) * STEP_S
+
+
+def problem(noise: NoiseModel | None = None) -> Problem:
+    """A flight of two robots of 100 s; its measurements do not matter."""
+    time_s = np.arange(0, 100.001, 0.01)
+    short, _ = still_pair()
+    zero, never = np.zeros(len(time_s)), np.zeros(len(time_s), bool)
+    still = replace(
+        short.own, vx_mps=zero, vy_mps=zero, yaw_rate_radps=zero, height_m=zero, dropout=never
+    )
+    ranges_s = np.arange(0.05, 100, 1.0)
+    pair = Pair(time_s, still, still, ranges_s, np.full(len(ranges_s), 2.0))
+    return replace(build_problem({(0, 1): pair}), noise=noise or NoiseModel())
+
+
+def moving(task: Problem, *velocities: np.ndarray | complex) -> np.ndarray:
+    """States of robots at complex velocities, (S,) or constant."""
+    state = np.zeros((KEYS, task.layout.width))
+    for robot, velocity in enumerate(velocities):
+        steps = np.broadcast_to(velocity, KEYS - 1) * STEP_S
+        path = robot + np.concatenate([[0], np.cumsum(steps)])
+        state[:, 3 * robot], state[:, 3 * robot + 1] = path.real, path.imag
+    return state
+
+
+def speeds(task: Problem, state: np.ndarray) -> list[float]:
+    """Root mean square of the calm own and relative velocity."""
+    calm = calm_motion(task, state)
+    own, peer = (calm[:, 3 * k] + 1j * calm[:, 3 * k + 1] for k in (0, 1))
+    inner = slice(50, -50)
+    return [
+        float(np.sqrt((np.abs(np.diff(path) / STEP_S)[inner] ** 2).mean()))
+        for path in (own, peer - own)
+    ]
+
+
+def noise_of(task: Problem, rng: np.random.Generator) -> np.ndarray:
+    """Odometry noise of the model: a part that fades in 0.3 s, and a white one."""
+    fading = 0.08 * task.noise.grade
+    out, value = np.zeros(KEYS - 1, complex), 0j
+    for k in range(10 * (KEYS - 1)):
+        kept = np.exp(-0.02 / 0.3)
+        draw = complex(*rng.normal(0, fading * np.sqrt(1 - kept**2), 2))
+        value = kept * value + draw
+        out[k // 10] += value / 10
+    white = task.noise.grade * np.sqrt(task.noise.velocity_psd / STEP_S)
+    return out + rng.normal(0, white, KEYS - 1) + 1j * rng.normal(0, white, KEYS - 1)
+
+
+def test_of_noise_alone_nothing_is_left() -> None:
+    task, rng = problem(), np.random.default_rng(0)
+    for _ in range(3):
+        own, relative = speeds(task, moving(task, noise_of(task, rng), noise_of(task, rng)))
+        raw = np.sqrt(2 * task.velocity_psd / STEP_S)
+        assert own < 0.15 * raw and relative < 0.15 * raw
+
+
+def test_motion_stays_and_a_slow_one_that_lasts_does_too() -> None:
+    task = problem(NoiseModel(grade=0.63))
+    rng = np.random.default_rng(1)
+    for speed, period_s in ((0.5, 6.0), (0.12, 25.0)):
+        way = speed * np.exp(2j * np.pi * KEY_S[1:] / period_s)
+        own, relative = speeds(task, moving(task, way + noise_of(task, rng), noise_of(task, rng)))
+        assert 0.5 * speed < own < 1.2 * speed
+        assert 0.5 * speed < relative < 1.2 * speed
+
+
+def test_robots_that_move_alike_do_not_move_relative_to_each_other() -> None:
+    task, rng = problem(), np.random.default_rng(2)
+    way = 0.5 * np.exp(2j * np.pi * KEY_S[1:] / 6.0)
+    own, relative = speeds(task, moving(task, way + noise_of(task, rng), way + noise_of(task, rng)))
+    assert own == pytest.approx(0.5, rel=0.2)
+    assert relative < 0.1
+
+
+def test_a_constant_velocity_within_the_bias_is_no_motion() -> None:
+    task = problem(NoiseModel(grade=0.3))
+    own, _ = speeds(task, moving(task, 0.02 + 0j, 0j))
+    assert own < 0.005
+    own, _ = speeds(task, moving(task, 0.2 + 0j, 0j))
+    assert own == pytest.approx(0.2, rel=0.2)
+
+
+def test_a_relative_covariance_is_that_of_draws() -> None:
+    rng = np.random.default_rng(0)
+    state = np.array([[0.4, -0.3, 0.7, 1.5, 0.8, -0.2]])
+    root = 0.01 * rng.normal(size=(6, 6))
+    spread = root @ root.T
+    drawn = state + rng.multivariate_normal(np.zeros(6), spread, 100_000)
+    for both in ((0, 1), (1, 0)):
+        found = relative_covariance(state, spread[None], *both)[0]
+        assert found == pytest.approx(np.cov(relative_path(drawn, *both).T), rel=0.05, abs=2e-6)
+
+
+def test_of_a_flight_with_much_motion_it_is_the_inverse_of_the_equations() -> None:
+    task, values = flight()
+    quiet = replace(task, noise=replace(task.noise, grade=1e-3), views=())
+    width = quiet.layout.width
+    values = type(values)(values.state[:, :width], np.zeros(len(quiet.layout.constants)))
+    solver = Solver(quiet)
+    keyframes, constants = compute_covariance(solver, values)
+    equations = build_equations(solver.layout, solver.linearize(values), len(values.state))
+    size = len(values.state) * width
+    dense = np.zeros((size + len(constants),) * 2)
+    for k, block in enumerate(equations.diagonal):
+        at = slice(k * width, (k + 1) * width)
+        dense[at, at] = block
+        dense[at, size:] = equations.coupling[k]
+        dense[size:, at] = equations.coupling[k].T
+        if k:
+            before = slice(at.start - width, at.start)
+            dense[before, at] = equations.off_diagonal[k - 1]
+            dense[at, before] = equations.off_diagonal[k - 1].T
+    dense[size:, size:] = equations.globals_block
+    wanted = np.linalg.inv(dense)
+    assert np.sqrt(constants.diagonal()) == pytest.approx(
+        np.sqrt(wanted[size:, size:].diagonal()), rel=0.3
+    )
+    middle = len(values.state) // 2
+    at = slice(middle * width + 3, middle * width + 5)
+    assert np.sqrt(keyframes[middle].diagonal()[3:5]) == pytest.approx(
+        np.sqrt(wanted[at, at].diagonal()), rel=0.6
+    )
+    assert rotation_matrix(np.array(0.0)) == pytest.approx(np.eye(2))

@@ -1,0 +1,166 @@
+"""A flight cut into keyframes, of motions that are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.flight.pairs import clip_to_ranges
+from dmrl.estimation.model.pair import Array, Pair, SensorTrack
+from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
+from dmrl.estimation.solver.keyframes import (
+    MIN_RANGE_STEP_M,
+    NoiseModel,
+    average_ranges,
+    build_problem,
+    odometry_dropout,
+    range_dropout,
+    range_step_offsets,
+    select_measurements,
+)
+
+from ..model.test_odometry import TIME_S, along_arc, arc
+
+
+def pair(ranges_s: Array, range_m: Array | None = None) -> Pair:
+    range_m = 2.0 + 0 * ranges_s if range_m is None else range_m
+    peer = replace(arc(-0.3), height_m=2 + 0.3 * (TIME_S - 3))
+    return Pair(TIME_S, arc(), peer, ranges_s, range_m)
+
+
+def test_keyframes_hold_what_happened_between_them_and_around_each_range() -> None:
+    ranges_s = np.array([3.0, 3.05, 7.77, 23.0])
+    task = build_problem({(0, 1): pair(ranges_s)}, 10.0)
+    own, peer = task.robots
+    (link,) = task.links
+    assert task.keyframe_s == pytest.approx(3 + np.arange(201) / 10)
+    assert own.steps_s == pytest.approx(0.1)
+    assert own.motion.shift_m == pytest.approx(along_arc(np.full(200, 0.1)), abs=1e-5)
+    assert peer.motion.turn_rad == pytest.approx(-0.03)
+    assert link.keyframe.tolist() == [0, 0, 48, 200]
+    since = ranges_s - task.keyframe_s[link.keyframe]
+    assert link.own_shift_m == pytest.approx(along_arc(since), abs=1e-5)
+    assert link.height_m == pytest.approx(1 + 0.2 * (ranges_s - 3))
+    assert own.height_m == pytest.approx(1 + 0.1 * (task.keyframe_s - 3))
+    # A peer whose clock is late did a moment ago what it seems to do now: no more, no less.
+    assert peer.clock_derivative[1:-1] == pytest.approx(0.0, abs=1e-6)
+    speeding = replace(arc(0.0), vx_mps=0.5 * (TIME_S - 3))
+    later = build_problem({(0, 1): Pair(TIME_S, arc(), speeding, ranges_s, 2 + 0 * ranges_s)}, 10.0)
+    assert later.robots[1].clock_derivative[1:-1, :2] == pytest.approx(
+        np.tile([0.05, 0.0], (198, 1)), abs=1e-6
+    )
+
+
+def test_a_robot_without_odometry_has_dropped_out_of_its_own_steps() -> None:
+    dense, quiet = np.arange(3.0, 23.0, 0.1), (TIME_S > 10) & (TIME_S < 11)
+    flight = pair(dense)
+    flight = replace(flight, peer=replace(flight.peer, dropout=quiet))
+    own, peer = build_problem({(0, 1): flight}).robots
+    assert not own.dropout_s.any()
+    assert peer.dropout_s.sum() == pytest.approx(1.0, abs=0.02)
+
+
+def test_of_logs_of_one_robot_that_with_most_dropouts_counts() -> None:
+    dense, quiet = np.arange(3.0, 23.0, 0.1), (TIME_S > 10) & (TIME_S < 11)
+    flight = pair(dense)
+    gone = replace(flight, own=replace(flight.own, dropout=quiet))
+    for flights in ((gone, flight), (flight, gone)):
+        first, *_ = build_problem({(0, 1): flights[0], (0, 2): flights[1]}).robots
+        assert first.dropout_s.sum() == pytest.approx(1.0, abs=0.02)
+
+
+def test_silence_of_ranges_lasts_over_half_a_second() -> None:
+    dense = np.arange(3.0, 23.0, 0.1)
+    times = np.arange(4.0, 22.0, 0.1)
+    assert not range_dropout(pair(dense), times).any()
+    gap = range_dropout(pair(dense[(dense < 10) | (dense > 10.65)]), times)
+    assert times[gap][[0, -1]] == pytest.approx([10.0, 10.7], abs=0.06)
+
+
+def test_a_time_beside_a_silent_sample_is_silent() -> None:
+    flight = pair(np.arange(3.0, 23.0, 0.1))
+    alone = np.arange(len(TIME_S)) == 1000
+    flight = replace(flight, peer=replace(flight.peer, dropout=alone))
+    beside = TIME_S[1000] + np.array([-0.015, -0.005, 0.005, 0.015])
+    assert odometry_dropout(flight, beside).tolist() == [False, True, True, False]
+
+
+def test_a_shadow_is_guessed_by_its_jumps_and_small_ones_are_left_alone() -> None:
+    dense = np.arange(3.0, 23.0, 0.02)
+    shadow = (dense > 9) & (dense < 11)
+    for height_m, found_m in (
+        (MIN_RANGE_STEP_M + 0.3, MIN_RANGE_STEP_M + 0.3),
+        (MIN_RANGE_STEP_M - 0.2, 0.0),
+    ):
+        levels = range_step_offsets(pair(dense, 2 + height_m * shadow))
+        assert np.median(levels[shadow]) == pytest.approx(found_m, abs=0.02)
+        assert not levels[(dense < 8.5) | (dense > 11.5)].any()
+
+
+def test_a_fast_change_of_the_distance_is_no_shadow() -> None:
+    """Robots that fly apart at 3 m/s in a second, by their own odometry."""
+    speed = 1.5 * ((TIME_S > 9) & (TIME_S < 9.4))
+    own = replace(arc(0.0, 0.0, 0.0), vx_mps=-speed)
+    peer = replace(arc(0.0, 0.0, 0.0), vx_mps=speed)
+    ranges_s = np.arange(3.0, 23.0, 0.02)
+    range_m = 2 + np.interp(ranges_s, [9.0, 9.4], [0.0, 1.2])
+    assert not range_step_offsets(Pair(TIME_S, own, peer, ranges_s, range_m)).any()
+    still = replace(own, vx_mps=0 * speed)
+    assert range_step_offsets(Pair(TIME_S, still, still, ranges_s, range_m)).any()
+
+
+def test_an_averaged_range_is_the_median_at_its_keyframe() -> None:
+    ranges_s = np.arange(3.0, 22.99, 0.02)
+    range_m = 2 + 0.5 * (ranges_s - 3)
+    range_m[::11] += 3.0
+    task = build_problem({(0, 1): pair(ranges_s, range_m)})
+    found = average_ranges(task.links[0], task.keyframe_s)
+    inner = slice(2, -2)
+    wanted = 2 + 0.5 * (task.keyframe_s[found.keyframe] - 3)
+    assert found.range_m[inner] == pytest.approx(wanted[inner], abs=0.02)
+    # Ten ranges a keyframe; a median has pi/2 of the variance of a mean.
+    assert found.std_share[inner] == pytest.approx(np.sqrt(np.pi / 2 / 10), rel=0.06)
+    assert not found.own_shift_m.any() and not found.peer_shift_m.any()
+    some = select_measurements(task.links[0], task.links[0].keyframe < 3)
+    assert len(some.range_m) == len(some.own_shift_m) == (task.links[0].keyframe < 3).sum()
+    assert some.robots == (0, 1)
+
+
+def test_nobody_is_farther_than_the_ranges_around_allow() -> None:
+    ranges_s = np.arange(3.0, 23.0, 0.05)
+    range_m = np.where(ranges_s < 13, 2.0, 4.0)
+    range_m[40:-40:9] = 30.0  # single outliers allow nothing
+    flight, key_s = pair(ranges_s, range_m), np.arange(3.0, 23.0, 0.1)
+    count = len(key_s)
+    away = np.array([0.6, -0.8])
+    for distance_m, allowed_m in ((1.9, 1.9), (2.49, 2.49), (3.5, 2.5), (9.0, 2.5)):
+        state = np.column_stack([np.tile(distance_m * away, (count, 1)), np.full(count, 0.3)])
+        made = Estimate(
+            key_s,
+            state,
+            np.tile(np.eye(3), (count, 1, 1)),
+            np.zeros(count, np.int8),
+            np.zeros(len(PAIR_LAYOUT.constants)),
+            NoiseModel(),
+        )
+        found, far = clip_to_ranges(flight, made)
+        early = key_s < 11
+        assert found.state[early, :2] == pytest.approx(np.tile(allowed_m * away, (early.sum(), 1)))
+        assert (far[early] == (allowed_m < distance_m)).all()
+        late = key_s > 15
+        reach_m = min(distance_m, 4.5)
+        assert found.state[late, :2] == pytest.approx(np.tile(reach_m * away, (late.sum(), 1)))
+        assert (found.state[:, 2] == 0.3).all() and (made.state == state).all()
+
+
+def test_ranges_are_levelled_in_blocks_from_the_start_of_a_flight() -> None:
+    time_s = 5.03 + np.arange(2001) / 100
+    still = SensorTrack(*np.zeros((4, 2001)), np.zeros(2001, bool))
+    ranges_s = time_s[:-1]
+    shadow = (ranges_s >= 5.03 + 4 - 1e-6) & (ranges_s < 5.03 + 8 - 1e-6)
+    flight = Pair(time_s, still, still, ranges_s + 1e-4, 2.0 + 1.0 * shadow)
+    assert range_step_offsets(flight) == pytest.approx(1.0 * shadow)
+    assert (
+        range_step_offsets(replace(flight, range_time_s=ranges_s[:0], range_m=ranges_s[:0])).size
+        == 0
+    )

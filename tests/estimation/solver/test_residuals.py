@@ -1,0 +1,323 @@
+"""Every factor: its Jacobian is that of finite differences, and its rows are zero at the truth."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.model.odometry import rotate, rotation_matrix
+from dmrl.estimation.model.pair import Array, BearingMeasurements, Pair, SensorTrack
+from dmrl.estimation.solver.keyframes import NoiseModel, Problem, build_problem
+from dmrl.estimation.solver.levenberg_marquardt import Carried, Solver
+from dmrl.estimation.solver.residuals import (
+    CarriedPrior,
+    Chain,
+    ConstantPrior,
+    Rows,
+    Values,
+    bearing_factor,
+    linearize,
+    odometry_factor,
+    range_factor,
+    total_cost,
+)
+from dmrl.estimation.solver.robust_loss import Cauchy, Gaussian
+from dmrl.estimation.solver.unknowns import Unknown
+
+TIME_S = np.arange(0, 4.001, 0.01)
+
+
+def track(turn: float, vx: float, vy: float, height: float) -> SensorTrack:
+    ones = np.ones(len(TIME_S))
+    swing = np.sin(TIME_S)
+    return SensorTrack(
+        vx * ones + 0.2 * swing, vy * ones, turn + 0.3 * swing, height + 0.1 * swing,
+        np.zeros(len(ones), bool),
+    )  # fmt: skip
+
+
+def paths(pair: Pair) -> tuple[Problem, Values]:
+    """A problem, and values at which both robots are on their dead reckoning."""
+    problem = build_problem({(0, 1): pair})
+    layout, key_s = problem.layout, problem.keyframe_s
+    state = np.zeros((len(key_s), layout.width))
+    for robot, (x, y, theta) in enumerate(((0.0, 0.0, 0.0), (1.5, 0.7, 0.4))):
+        heading, place, _ = problem.robots[robot].path.interpolate_at(key_s)
+        mine = layout.pose(robot)
+        state[:, mine[:2]] = np.array([x, y]) + place @ rotation_matrix(np.array(theta)).T
+        state[:, mine[2]] = theta + heading
+    return problem, Values(state, np.zeros(len(layout.constants)))
+
+
+def position(values: Values, problem: Problem, robot: int, time_s: Array) -> tuple[Array, Array]:
+    """Where a robot is and looks at any time."""
+    path, first = problem.robots[robot].path, values.state[0, 3 * robot : 3 * robot + 3]
+    heading, place, _ = path.interpolate_at(time_s)
+    return first[:2] + place @ rotation_matrix(first[2]).T, first[2] + heading
+
+
+@cache
+def flight() -> tuple[Problem, Values]:
+    """Two robots, exact ranges and exact detections of both cameras."""
+    own, peer = track(0.4, 0.5, -0.2, 1.0), track(-0.3, 0.1, 0.4, 1.4)
+    ranges_s = np.arange(0.03, 3.99, 0.05)
+    bare = Pair(TIME_S, own, peer, ranges_s, np.full(len(ranges_s), 2.0))
+    problem, values = paths(bare)
+    images_s = np.arange(0.13, 3.9, 0.3)
+
+    def relative(time_s: Array, one: int) -> tuple[Array, Array]:
+        (here, heading), (there, _) = (position(values, problem, k, time_s) for k in (one, 1 - one))
+        up = np.interp(time_s, TIME_S, peer.height_m - own.height_m) * (1 - 2 * one)
+        return np.column_stack([rotate(rotation_matrix(-heading), there - here), up]), heading
+
+    def seen(one: int) -> BearingMeasurements:
+        xyz, _ = relative(images_s, one)
+        level = np.hypot(xyz[:, 0], xyz[:, 1])
+        polar = np.column_stack(
+            [np.arctan2(xyz[:, 1], xyz[:, 0]), np.arctan2(xyz[:, 2], level),
+             np.log(np.linalg.norm(xyz, axis=1))]
+        )  # fmt: skip
+        other = polar + np.array([0.4, 0.3, 0.5])
+        bearing = np.stack([other, polar], axis=1)
+        return BearingMeasurements(images_s, bearing, np.full(bearing.shape, 0.03))
+
+    exact = np.linalg.norm(relative(ranges_s, 0)[0], axis=1)
+    pair = replace(bare, range_m=exact, own_bearings=seen(0), peer_bearings=seen(1))
+    return paths(pair)
+
+
+def moved(values: Values, seed: int = 0) -> Values:
+    """Values a little off."""
+    rng = np.random.default_rng(seed)
+    return Values(
+        values.state + 0.01 * rng.standard_normal(values.state.shape),
+        values.constants + 0.01 * rng.standard_normal(values.constants.shape),
+    )
+
+
+def check_jacobian(make: Callable[[Values], Rows], values: Values) -> None:
+    """Compare every column of the rows with finite differences."""
+    at, step = make(values), 1e-6
+    size = len(at.columns)
+    for key in (0, 7, len(values.state) - 2):
+        for part in range(1 + at.steps):
+            for place, column in enumerate(at.columns):
+                high, low = values.state.copy(), values.state.copy()
+                high[key + part, column] += step
+                low[key + part, column] -= step
+                ends = [make(Values(s, values.constants)).rows[key, ..., -1] for s in (high, low)]
+                found = at.rows[key, ..., part * size + place]
+                assert found == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-4, rel=1e-5)
+    for place, column in enumerate(at.border):
+        high, low = values.constants.copy(), values.constants.copy()
+        high[column] += step
+        low[column] -= step
+        ends = [make(Values(values.state, c)).rows[..., -1] for c in (high, low)]
+        found = at.rows[..., size * (1 + at.steps) + place]
+        assert found == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-4, rel=1e-5)
+
+
+@pytest.mark.parametrize("robot", [0, 1])
+def test_odometry(robot: int) -> None:
+    problem, values = flight()
+    layout = problem.layout
+    rows = odometry_factor(problem, layout, robot, values)
+    assert rows.rows[..., -1] == pytest.approx(0.0, abs=1e-3)
+    names = {layout.constants[c][0][0] for c in rows.border}
+    assert names == {"gyro_bias", "velocity_scale", "vx_bias", "vy_bias"} | (
+        {"clock"} if robot else set()
+    )
+    check_jacobian(lambda v: odometry_factor(problem, layout, robot, v), moved(values))
+
+
+def test_measured_motion_has_the_errors_of_its_sensors() -> None:
+    """A scale multiplies the true shift, a bias adds to it, and so on: signs and sizes."""
+    problem, values = flight()
+    layout, noise = problem.layout, problem.noise
+    for name, value, column, wanted in (
+        ("velocity_scale", 0.1, 0, 0.1 * problem.robots[0].motion.shift_m[:, 0]),
+        ("vx_bias", 0.3, 0, 0.3 * 0.2), ("vy_bias", 0.3, 1, 0.3 * 0.2),
+        ("gyro_bias", 0.2, 2, 0.2 * 0.2),
+    ):  # fmt: skip
+        constants = values.constants.copy()
+        constants[layout.find(name, 0)] = value
+        found = odometry_factor(problem, layout, 0, Values(values.state, constants))
+        std = np.sqrt((noise.yaw_rate_psd if column == 2 else noise.velocity_psd) * 0.2)
+        assert found.rows[:, column, 0, -1] * std == pytest.approx(
+            np.broadcast_to(wanted, len(found.rows)), abs=2e-3
+        )
+    state = values.state.copy()
+    state[:, layout.state_column("velocity_error_y", 1)] = 0.5
+    found = odometry_factor(problem, layout, 1, Values(state, values.constants))
+    std = np.sqrt(noise.velocity_psd * 0.2)
+    assert found.rows[:, 1, 0, -1] * std == pytest.approx(0.1, abs=5e-3)
+
+
+def test_a_late_clock_shows_what_was_a_moment_ago() -> None:
+    problem, _ = flight()
+    by_clock = problem.robots[1].clock_derivative
+    # The turn rate is -0.3 + 0.3 sin t, so a step's turn changes by 0.3 cos t per second.
+    middle = problem.keyframe_s[:-1] + 0.1
+    assert by_clock[2:-2, 2] == pytest.approx(0.2 * 0.3 * np.cos(middle)[2:-2], abs=2e-3)
+
+
+def test_ranges() -> None:
+    problem, values = flight()
+    layout, (link,) = problem.layout, problem.links
+    rows = range_factor(problem, layout, link, values)
+    assert rows.rows[..., -1] == pytest.approx(0.0, abs=2e-2)
+    assert rows.weight.sum() == len(link.range_m)
+    check_jacobian(lambda v: range_factor(problem, layout, link, v), moved(values))
+    std = problem.noise.range_std_m
+    true_m = link.range_m.mean()
+    for name, own, value, wanted in (
+        ("range_offset", (0, 1), 0.3, 0.3), ("range_scale", (0, 1), 0.1, 0.1 * true_m),
+    ):  # fmt: skip
+        constants = values.constants.copy()
+        constants[layout.find(name, *own)] = value
+        found = range_factor(problem, layout, link, Values(values.state, constants))
+        mean = found.rows[..., 0, -1][found.weight > 0].mean() * std
+        assert mean == pytest.approx(wanted, abs=5e-3)
+    state = values.state.copy()
+    state[:, layout.state_column("range_error", 0, 1)] = 0.4
+    found = range_factor(problem, layout, link, Values(state, values.constants))
+    assert found.rows[..., 0, -1][found.weight > 0].mean() * std == pytest.approx(0.4, abs=5e-3)
+
+
+def test_a_measured_height_is_the_true_one_and_its_error() -> None:
+    """The peer is 0.4 m higher: a peer whose height reads high is nearer in height."""
+    problem, values = flight()
+    layout, (link,) = problem.layout, problem.links
+    means = []
+    for robot in (0, 1):
+        constants = values.constants.copy()
+        constants[layout.find("height_offset", robot)] = 0.1
+        found = range_factor(problem, layout, link, Values(values.state, constants))
+        means.append(found.rows[..., 0, -1][found.weight > 0].mean())
+    assert means[1] < 0 < means[0]
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_bearings(side: int) -> None:
+    problem, values = flight()
+    layout, view = problem.layout, problem.views[side]
+    rows = bearing_factor(problem, layout, view, values)
+    # The second candidate of every image is the peer.
+    assert np.abs(rows.rows[..., -1]).max() < 0.2
+    assert rows.weight.sum() == pytest.approx(len(view.time_s))
+    check_jacobian(lambda v: bearing_factor(problem, layout, view, v), moved(values))
+    names = {layout.constants[c][0] for c in rows.border}
+    assert {("camera_azimuth", (side,)), ("height_offset", (1 - side,))} < names
+    assert ("camera_azimuth", (1 - side,)) not in names
+    for axis, name in enumerate(("camera_azimuth", "camera_elevation", "camera_distance")):
+        constants = values.constants.copy()
+        constants[layout.find(name, side)] = 0.02
+        found = bearing_factor(problem, layout, view, Values(values.state, constants))
+        change = (found.rows - rows.rows)[..., axis, -1][rows.weight > 0]
+        assert change == pytest.approx(0.02 / 0.03)
+
+
+def test_an_image_far_off_has_no_weight_and_a_constant_cost() -> None:
+    problem, values = flight()
+    layout, view = problem.layout, problem.views[0]
+    costs = []
+    for off in (1.0, 1.2):
+        lost = replace(view, bearing=view.bearing + np.array([off, 0.0, 0.0]))
+        rows = bearing_factor(problem, layout, lost, values)
+        assert not rows.rows[..., :-1].any()
+        costs.append(rows.cost())
+    assert costs[0] == pytest.approx(costs[1])
+
+
+def test_images_at_once_count_as_one() -> None:
+    problem, _ = flight()
+    view = problem.views[0]
+    assert view.weight == pytest.approx(1.0)
+    own, peer = track(0.4, 0.5, -0.2, 1.0), track(-0.3, 0.1, 0.4, 1.4)
+    dense_s = np.arange(0.5, 3.5, 0.06)
+    sees = BearingMeasurements(
+        dense_s, np.zeros((len(dense_s), 1, 3)), np.ones((len(dense_s), 1, 3))
+    )
+    pair = Pair(TIME_S, own, peer, np.array([1.0]), np.array([2.0]), own_bearings=sees)
+    (many,) = build_problem({(0, 1): pair}).views
+    assert many.weight[10:-10] == pytest.approx(1 / 5)
+
+
+def test_equations_are_the_gradient_of_the_cost() -> None:
+    problem, values = flight()
+    solver = Solver(problem)
+    at = moved(values, 1)
+    equations, factors = solver.equations(at)
+    assert {type(factor) for factor in factors} == {Rows, Chain, ConstantPrior}
+    step = 1e-6
+    for column in range(problem.layout.width):
+        ends = []
+        for way in (1, -1):
+            state = at.state.copy()
+            state[9, column] += way * step
+            ends.append(total_cost(solver.linearize(Values(state, at.constants))))
+        slope = (ends[0] - ends[1]) / (2 * step)
+        assert equations.gradient[9, column] == pytest.approx(slope, rel=1e-4, abs=1e-2)
+    for column in range(len(at.constants)):
+        ends = []
+        for way in (1, -1):
+            constants = at.constants.copy()
+            constants[column] += way * step
+            ends.append(total_cost(solver.linearize(Values(at.state, constants))))
+        slope = (ends[0] - ends[1]) / (2 * step)
+        assert equations.globals_gradient[column] == pytest.approx(slope, rel=1e-4, abs=1e-2)
+
+
+def test_a_chain_is_a_walk_that_begins_near_zero() -> None:
+    row = Unknown("a", "m", 0.1, "pair", Cauchy(1.0), "jump", pull_std=0.05, pull_weight=0.04)
+    value, kept, std = np.array([0.3, 0.2, 0.6]), np.array([0.5, 0.9]), np.array([0.1, 0.2])
+    chain = Chain(row, 0, value, kept, std, 0.4)
+    assert chain.residual == pytest.approx([0.75, (0.2 - 0.15) / 0.1, (0.6 - 0.18) / 0.2])
+    loss = np.log1p(chain.residual**2).sum() + 0.04 * np.log1p((value / 0.05) ** 2).sum()
+    assert chain.cost() == pytest.approx(loss / 2)
+    problem, values = flight()
+    begun, carried = (
+        [f for f in linearize(problem, problem.layout, values, begins=b) if isinstance(f, Chain)]
+        for b in (True, False)
+    )
+    for one, other in zip(begun, carried, strict=True):
+        if one.row.evolution == "jump":
+            assert (one.start_std, other.start_std) == (one.row.start_std, np.inf)
+        else:
+            assert one.start_std == other.start_std == one.row.std
+
+
+def test_priors_hold_constants_with_their_losses() -> None:
+    prior = ConstantPrior(np.array([0.2, 0.3]), np.array([0.1, 0.1]), (Cauchy(2.0), Gaussian()))
+    assert prior.cost() == pytest.approx((4 * np.log(2.0) + 9) / 2)
+    assert prior.information() == pytest.approx([50.0, 100.0])
+    assert prior.curvature() == pytest.approx([0.0, 100.0])
+
+
+def test_carried_information_is_least_at_its_optimum() -> None:
+    information, best = np.diag([4.0, 1.0, 2.0]), np.array([0.5, -1.0, 2.0])
+    mean = np.array([1.0, 0.0, 0.0])
+    carried = Carried(mean, information, information @ (mean - best))
+    values = [np.array([0.5, -1.0, 2.0]), np.array([0.7, -1.0, 2.0])]
+    costs = [
+        CarriedPrior(carried.mean, carried.information, carried.vector, v, Gaussian()).cost()
+        for v in values
+    ]
+    assert costs == pytest.approx([0.0, 4 * 0.04 / 2])
+
+
+def test_noise_of_odometry_is_that_of_the_model_and_of_dropouts() -> None:
+    problem, values = flight()
+    noise = NoiseModel(velocity_psd=0.01, yaw_rate_psd=0.02, grade=2.0)
+    own = replace(problem.robots[0], dropout_s=np.full(len(problem.robots[0].steps_s), 0.1))
+    loud = replace(problem, noise=noise, robots=(own, problem.robots[1]))
+    rows = odometry_factor(loud, problem.layout, 0, values).rows
+    plain = odometry_factor(problem, problem.layout, 0, values).rows
+    ratio = [plain[0, k, 0, k] / rows[0, k, 0, k] for k in (0, 2)]
+    usual = problem.noise
+    assert ratio[0] ** 2 == pytest.approx(
+        (0.01 * 4 * 0.2 + 0.25 * 0.1) / (usual.velocity_psd * 0.2)
+    )
+    assert ratio[1] ** 2 == pytest.approx((0.02 * 0.2 + 0.25 * 0.1) / (usual.yaw_rate_psd * 0.2))
