@@ -130,13 +130,13 @@ def _drop_noise(velocity: Array, raw: Array, problem: Problem, step_s: float) ->
     noise = 2 * (window**2).sum() / step_s * _noise_density(problem, hz, step_s)
     above = np.abs(hz) > MAX_MOTION_HZ
     # A flight without motion shows no grade of its noise, but robots do not move that fast.
-    shown = np.median((np.abs(_transform(raw, window, hop)[:, above]) ** 2).mean(axis=1))
-    noise = noise * max(1.0, float(shown / noise[above].mean()))
+    shown = (np.abs(_transform(raw, window, hop)[:, above]) ** 2).mean(axis=1).min()
+    louder = max(1.0, float(shown / noise[above].mean()))
     bias_mps = next((row.std for row in problem.table if row.name == "vx_bias"), 0.0)
     noise[[-1, 0, 1]] += 2 * (window.sum() * bias_mps) ** 2 / 3
     # The energies of motion and noise add up to the measured one, so motion's share is the rest.
     share = np.sqrt(np.maximum(1 - noise / np.maximum(energy, 1e-12), 0.0))
-    share[(energy < MIN_ENERGY_RATIO * noise) | above] = 0.0
+    share[(energy < MIN_ENERGY_RATIO * louder * noise) | above] = 0.0
     calm = np.fft.ifft(found * share, axis=1) * window
     out = np.zeros(hop * (len(calm) + 1), complex)
     for number, piece in enumerate(calm):
