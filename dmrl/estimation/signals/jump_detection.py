@@ -57,7 +57,7 @@ def step_offsets(
     change[:reach], change[-reach:] = 0.0, 0.0
     jumps = []
     plain = np.abs(change + reach * trend) - np.broadcast_to(moved, values.shape)[1:]
-    for first, last in _find_runs((np.abs(change) > may) & (plain > 0)):
+    for first, last in _find_runs((np.abs(change) > may) & (plain > least / 4)):
         jump = float(change[first + int(np.argmax(np.abs(change[first:last])))])
         jumps.append((first + int(np.argmax(np.sign(jump) * single[first:last])) + 1, jump))
     return _offsets_between_jumps(jumps, len(values), round(MAX_OFFSET_S / step_s))
