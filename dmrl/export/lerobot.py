@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dmrl.datasets.layout import PNG_TYPE, format_json
-from dmrl.export.dataset_rows import ExportRow, ExportRows
+from dmrl.export.dataset_rows import ExportRow, ExportRows, to_attributes
 
 VERSION = "v3.0"
 CHUNK_FILES = 1000
@@ -92,22 +92,18 @@ def _build_schema(most: int) -> pa.Schema:
 
 def _to_frame(row: ExportRow, rows: ExportRows) -> dict[str, Any]:
     """Return the image and the labels of a row."""
-    nan = float("nan")
     frame: dict[str, Any] = {IMAGE: {"bytes": row.png, "path": None}, "log_time": row.log_time}
+    told = [
+        dict(zip(EDGES, peer["box_px"], strict=False))
+        | to_attributes(peer)
+        | {"class_id": rows.classes.index(peer["class"])}
+        for peer in row.peers
+    ]
     for name in LABELS:
-        values = [_get_label(peer, name, rows.classes) for peer in row.peers]
-        values += [nan] * (rows.most_peers - len(values))
+        values = [float(peer.get(name, math.nan)) for peer in told]
+        values += [math.nan] * (rows.most_peers - len(values))
         frame[f"labels.{name}"] = values[0] if rows.most_peers == 1 else values
     return frame
-
-
-def _get_label(peer: dict[str, Any], name: str, classes: list[str]) -> float:
-    if name == "class_id":
-        return float(classes.index(peer["class"]))
-    if name in EDGES:
-        return float(peer["box_px"][EDGES.index(name)]) if peer["box_px"] else float("nan")
-    unknown = name == "depth_m" and math.isinf(peer["sigma_depth_m"])
-    return float("nan") if unknown else float(peer[name])
 
 
 def _describe(
@@ -149,14 +145,9 @@ def _write_meta(folder: Path, episodes: list[dict[str, Any]], info: dict[str, An
     pq.write_table(pa.Table.from_pylist(episodes), place)
     (meta / "info.json").write_text(format_json(info), encoding="utf-8")
     # LeRobot reads the tasks with pandas, by their index.
-    text = {"name": None, "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
-    number = {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
     key = "__index_level_0__"
-    columns = [
-        {"name": "task_index", "field_name": "task_index", **number},
-        {**text, "field_name": key},
-    ]
-    about = {"index_columns": [key], "column_indexes": [{**text, "field_name": None}]}
     table = pa.table({"task_index": [0], key: [TASK]})
-    described = json.dumps({**about, "columns": columns, "pandas_version": "2.2"})
+    index = {"name": None, "field_name": key, "pandas_type": "unicode", "numpy_type": "object"}
+    about = {"index_columns": [key], "columns": [index | {"metadata": None}], "column_indexes": []}
+    described = json.dumps(about)
     pq.write_table(table.replace_schema_metadata({"pandas": described}), meta / "tasks.parquet")

@@ -22,14 +22,11 @@ from dmrl.formats.files.labelled_pictures import (
     LABELLED_OPTIONS,
     SPLIT_NAMES,
     LabelledPicture,
-    build_picture_content,
+    build_rows,
+    build_set_content,
     find_split,
-    label_from_box,
     list_pictures,
-    name_peers,
-    spread_over_time,
 )
-from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.terminal.left_out import leave_out
 
@@ -82,7 +79,7 @@ def load_content(source: Path, options: Options) -> Content:
     used = {picture.path for picture in pictures}
     if unnamed := [path for path in found.paths if path not in used]:
         leave_out("pictures that no JSON file names", unnamed[0], len(unnamed))
-    return build_picture_content(source, spread_over_time(pictures, options.rate_hz), options)
+    return build_set_content(source, pictures, options)
 
 
 class _PictureIndex:
@@ -147,20 +144,24 @@ def _build_rows(
     single = [a for a in annotations if not a.get("iscrowd")]
     leave_out("boxes around crowds (iscrowd)", where, len(annotations) - len(single))
     try:
-        names = [classes.get(a["category_id"], f"class{a['category_id']}") for a in single]
-        peers = name_peers(names, options.names)
-        if len(peers) > limits.PEERS:
-            raise ValueError(f"more than {limits.PEERS} boxes")
-        return [_build_row(file, *each) for each in zip(peers, single, strict=True)]
+        boxes = [_parse_box(annotation, classes) for annotation in single]
+        return list(map(_add_attributes, build_rows(file, boxes, options.names), single))
     except (ValueError, TypeError, KeyError, AttributeError) as e:
         why = " ".join(f"{type(e).__name__}: {e}".split())[:200]
         leave_out("pictures with a box that cannot be read", f"{where}: {why}")
         return None
 
 
-def _build_row(file: str, peer: str, annotation: Record) -> LabelRow:
+def _parse_box(
+    annotation: Record, classes: Mapping[Any, str]
+) -> tuple[str, tuple[float, float, float, float]]:
     left, top, width, height = map(float, annotation["bbox"])
-    row = label_from_box(file, peer, (left, top, left + width, top + height))
+    kind = annotation["category_id"]
+    return classes.get(kind, f"class{kind}"), (left, top, left + width, top + height)
+
+
+def _add_attributes(row: LabelRow, annotation: Record) -> LabelRow:
+    """Return a label with what the attributes of its annotation add to the box."""
     told = annotation.get("attributes") or {}
 
     def number(name: str, default: float) -> float:
@@ -171,7 +172,7 @@ def _build_row(file: str, peer: str, annotation: Record) -> LabelRow:
     depth_m = number("depth_m", 0.0)
     return replace(
         row,
-        peer=str(told.get("peer", peer)),
+        peer=str(told.get("peer", row.peer)),
         source=str(told.get("source", row.source)),
         u_px=number("u_px", row.u_px),
         v_px=number("v_px", row.v_px),

@@ -18,6 +18,7 @@ from dmrl.formats.files.crop import Crop
 from dmrl.formats.files.label_csv import LabelRow
 from dmrl.formats.files.pictures import PICTURE_OPTIONS, PictureConverter
 from dmrl.geometry.frames import Camera
+from dmrl.guards import limits
 from dmrl.guards.paths import refuse_pipes
 from dmrl.samples.sample import Sample, build_labels, find_intervals
 from dmrl.terminal.left_out import leave_out
@@ -122,14 +123,32 @@ def name_peers(classes: Sequence[str], names: Mapping[str, str]) -> list[str]:
     return peers
 
 
-def label_from_box(file: str, peer: str, box_px: Sequence[float]) -> LabelRow:
-    """Return a label at the centre of a box (left, top, right, bottom), without depth.
+def build_rows(
+    file: str, boxes: Sequence[tuple[str, Sequence[float]]], names: Mapping[str, str]
+) -> list[LabelRow]:
+    """Return a label without depth at the centre of each box of a picture.
+
+    Parameters
+    ----------
+    file
+        Name of the picture.
+    boxes
+        Class, and left, top, right, bottom.
+    names
+        Peers by class.
 
     Raises
     ------
     ValueError
-        If it is no box.
+        If one is no box, or there are too many.
     """
+    if len(boxes) > limits.PEERS:
+        raise ValueError(f"more than {limits.PEERS} boxes")
+    peers = name_peers([name for name, _ in boxes], names)
+    return [_build_row(file, peer, box) for peer, (_, box) in zip(peers, boxes, strict=True)]
+
+
+def _build_row(file: str, peer: str, box_px: Sequence[float]) -> LabelRow:
     left, top, right, bottom = (float(edge) for edge in box_px)
     if not (left < right and top < bottom and math.isfinite(right + bottom - left - top)):
         raise ValueError("a box has no area")
@@ -231,12 +250,13 @@ def report_doubts(source: Path, rows: Sequence[LabelRow], robot: str) -> None:
             say(f"{source}: doubt: {count} of {len(seen)} labels {doubt}")
 
 
-def spread_over_time(
-    pictures: Iterable[LabelledPicture], rate_hz: float
-) -> list[tuple[int, LabelledPicture]]:
-    """Return pictures with nominal times, split by split, so that a split is one interval."""
+def build_set_content(
+    source: Path, pictures: Iterable[LabelledPicture], options: Options
+) -> Content:
+    """Build the content of pictures at nominal times, split by split: a split is one interval."""
     order = {"train": 0, "val": 1, "test": 2, None: 4}
     ordered = sorted(pictures, key=lambda p: (order.get(p.split, 3), p.split or ""))
     if not ordered:
-        raise SourceError("no picture of the set is there. Pass the folder with its pictures")
-    return [(round(k * 1e9 / rate_hz), picture) for k, picture in enumerate(ordered)]
+        raise SourceError(f"{source}: no picture of the set is there. Pass the folder with them")
+    timed = [(round(k * 1e9 / options.rate_hz), picture) for k, picture in enumerate(ordered)]
+    return build_picture_content(source, timed, options)

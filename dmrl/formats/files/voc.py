@@ -15,15 +15,12 @@ from dmrl.formats.files.label_csv import LabelRow
 from dmrl.formats.files.labelled_pictures import (
     LABELLED_OPTIONS,
     LabelledPicture,
-    build_picture_content,
+    build_rows,
+    build_set_content,
     find_split,
-    label_from_box,
     list_pictures,
-    name_peers,
     natural_key,
-    spread_over_time,
 )
-from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_xml
 from dmrl.terminal.left_out import leave_out
 
@@ -72,7 +69,7 @@ def load_content(source: Path, options: Options) -> Content:
         raise SourceError(f"{source}: no picture has an XML file that can be read. Pass another")
     for lost in sorted(labels.keys() - {picture.path.stem for picture in pictures}):
         leave_out("XML files without a picture", labels[lost])
-    return build_picture_content(source, spread_over_time(pictures, options.rate_hz), options)
+    return build_set_content(source, pictures, options)
 
 
 def _read_image_sets(source: Path) -> dict[str, str]:
@@ -91,26 +88,22 @@ def _read_rows(
     """Return the labels of a picture and the size that they refer to; None, None: unreadable."""
     try:
         root = parse_xml(label.read_bytes())
-        objects = root.findall("object")
-        if len(objects) > limits.PEERS:
-            raise ValueError(f"more than {limits.PEERS} boxes")
-        names = [(one.findtext("name") or "").strip() or "class" for one in objects]
-        boxes = [_parse_box(one) for one in objects]
         width, height = (float(root.findtext(f"size/{side}") or 0) for side in ("width", "height"))
-        peers = name_peers(names, options.names)
-        rows = [label_from_box(picture.name, *both) for both in zip(peers, boxes, strict=True)]
+        boxes = [_parse_box(one) for one in root.findall("object")]
+        rows = build_rows(picture.name, boxes, options.names)
     except (OSError, ValueError) as e:
         leave_out(UNREADABLE, f"{label}: {e}")
         return None, None
     return rows, (width, height) if width and height else None
 
 
-def _parse_box(one: ElementTree.Element) -> tuple[float, float, float, float]:
-    """Return left, top, right and bottom edge of an object."""
+def _parse_box(one: ElementTree.Element) -> tuple[str, tuple[float, float, float, float]]:
+    """Return the class of an object, and its left, top, right and bottom edge."""
     xmin, ymin, xmax, ymax = (
         float(one.findtext(f"bndbox/{name}") or "nan") for name in ("xmin", "ymin", "xmax", "ymax")
     )
-    return xmin - 1, ymin - 1, xmax, ymax
+    name = (one.findtext("name") or "").strip() or "class"
+    return name, (xmin - 1, ymin - 1, xmax, ymax)
 
 
 FORMAT = Format("voc", "a Pascal VOC set", can_read, load_content, LABELLED_OPTIONS)

@@ -14,7 +14,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -26,16 +25,13 @@ from dmrl.formats.files.labelled_pictures import (
     LABELLED_OPTIONS,
     SHARES,
     LabelledPicture,
-    build_picture_content,
+    build_rows,
+    build_set_content,
     find_split,
     is_picture,
-    label_from_box,
     list_pictures,
     locate,
-    name_peers,
-    spread_over_time,
 )
-from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_yaml
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
@@ -111,7 +107,7 @@ def load_content(source: Path, options: Options) -> Content:
         say(f"{source}: {bare} {NO_LABEL_FILE}")
     for lost in _list_label_files(source) - found:
         leave_out("label files without a picture", lost)
-    return build_picture_content(source, spread_over_time(pictures, options.rate_hz), options)
+    return build_set_content(source, pictures, options)
 
 
 def _read_description(source: Path) -> _Description:
@@ -180,11 +176,7 @@ def _read_rows(
             line += 1
             if words := text.split():
                 boxes.append(_parse_line(words, about))
-        if len(boxes) > limits.PEERS:
-            raise ValueError(f"more than {limits.PEERS} boxes")
-        classes = [name for name, _ in boxes]
-        build = partial(label_from_box, picture.name)
-        return list(map(build, name_peers(classes, options.names), [box for _, box in boxes]))
+        return build_rows(picture.name, boxes, options.names)
     except (ValueError, SourceError) as e:
         leave_out(UNREADABLE, f"{label}:{line}: {e}")
         return None
