@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from dmrl.errors import DmrlError
@@ -89,6 +90,36 @@ def _ranges(folder: Path) -> tuple[Path, Path]:
     return path, path
 
 
+def _saved(suffix: str) -> Callable[[Path], tuple[Path, Path]]:
+    def make(folder: Path) -> tuple[Path, Path]:
+        path = folder / f"a.{suffix}"
+        rgb = np.random.default_rng(0).integers(0, 256, (12, 16, 3), np.uint8)
+        PIL.Image.fromarray(rgb).save(path)
+        return folder, path
+
+    return make
+
+
+def _labelled(name: str, text: str) -> Callable[[Path], tuple[Path, Path]]:
+    def make(folder: Path) -> tuple[Path, Path]:
+        (folder / "a.png").write_bytes(foreign.coloured()["a.png"])
+        (folder / "classes.txt").write_text("drone\n")
+        (folder / name).write_text(text)
+        return folder, folder / name
+
+    return make
+
+
+BOXES = "0 0.5 0.5 0.25 0.5\n0 0.2 0.2 0.1 0.1 0.9\n0 0.1 0.2 0.5 0.2 0.3 0.7\n"
+DESCRIPTION = "path: .\ntrain: images/train\nval: [a, b]\nnames:\n  0: drone\n  1: 'x y'\n"
+COCO = """{"images": [{"id": 1, "file_name": "a.png", "width": 5, "height": 4}],
+"categories": [{"id": 1, "name": "drone"}], "annotations": [
+{"id": 1, "image_id": 1, "category_id": 1, "bbox": [1, 2, 3, 4], "attributes": {"depth_m": 2}}]}
+"""
+VOC = """<annotation><size><width>5</width><height>4</height></size><object><name>drone</name>
+<bndbox><xmin>1</xmin><ymin>2</ymin><xmax>3</xmax><ymax>4</ymax></bndbox></object></annotation>
+"""
+
 # Format, and a maker of a source with the one file of it that is damaged.
 SOURCES = {
     "cfusdlog 1": ("cfusdlog", _usd(1)),
@@ -101,6 +132,13 @@ SOURCES = {
     "PNG": ("images", _picture("a.png")),
     "JPEG": ("images", _picture("b.jpg")),
     "PPM": ("images", _picture("c.ppm")),
+    "TIFF": ("images", _saved("tif")),
+    "WebP": ("images", _saved("webp")),
+    "GIF": ("images", _saved("gif")),
+    "YOLO": ("yolo", _labelled("a.txt", BOXES)),
+    "YOLO's description": ("yolo", _labelled("data.yaml", DESCRIPTION)),
+    "COCO": ("coco", _labelled("set.json", COCO)),
+    "VOC": ("voc", _labelled("a.xml", VOC)),
     "nanocockpit": ("nanocockpit", _nanocockpit),
     "npz": ("uwb-tiers", _ranges),
 }
