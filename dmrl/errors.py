@@ -7,6 +7,7 @@
   - UnsafeName        a name from a file cannot become a path
   - RecordingError    the file cannot be read, or lacks requested data
     + MissingTopic
+    + UnreadableTopic
   - SourceError       a foreign file or folder does not conform to its format
   - DatasetError      a folder is not a dataset, or lacks requested data
   - ModelError        weights or a run folder cannot be used
@@ -108,6 +109,26 @@ class MissingTopic(RecordingError):
             name = f"{near[0]}={topic.replace('*', 'cf1', 1)}"
             hint += f" Rename it: dmrl convert {where} OUT.mcap --names {name}"
         super().__init__(f"no topic {topic} in {where}. {hint}")
+
+
+class UnreadableTopic(RecordingError):
+    """Messages of a topic cannot be decoded, in a sound recording.
+
+    Parameters
+    ----------
+    where
+        The recording.
+    topic
+        The topic.
+    why
+        Reason, as the rest of a sentence about the topic.
+    """
+
+    def __init__(self, where: object, topic: str, why: str) -> None:
+        self.reason = f"messages on {topic}, which {why}"
+        super().__init__(
+            f"{where}: {topic} {why}. Leave it out (dmrl trim), or convert it: dmrl convert --help"
+        )
 
 
 class SourceError(DmrlError):

@@ -23,9 +23,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from dmrl.atomic_output import atomic_folder
-from dmrl.errors import MissingExtra, UnsafeName
+from dmrl.errors import MissingExtra, RecordingError, UnreadableTopic, UnsafeName
 from dmrl.guards.safe_names import safe_join, to_topic_file_name
 from dmrl.recording import iter_columns, read_summary, read_table
+from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import track
 
 TableFormat = Literal["csv", "parquet"]
@@ -66,14 +67,22 @@ def write_tables(recording: Path, out: Path, kind: TableFormat) -> dict[str, int
             path = safe_join(
                 folder, to_topic_file_name(topic), f"{recording}: a topic", suffix=f".{kind}"
             )
-            if info.schema == "foxglove.CompressedImage":
-                table = _write_images(recording, topic, path.with_suffix(""))
-            else:
-                table = read_table(recording, topic)
+            try:
+                if info.schema == "foxglove.CompressedImage":
+                    table = _write_images(recording, topic, path.with_suffix(""))
+                else:
+                    table = read_table(recording, topic)
+            except UnreadableTopic as e:
+                leave_out(e.reason, recording, info.count)
+                continue
             table = flatten_table(table)
             _check_free(path, topic)
             _write_table(table, path, kind)
             counts[topic] = table.num_rows
+        if found.topics and not counts:
+            raise RecordingError(
+                f"{recording} has no topic in protobuf. Try: dmrl info {recording}"
+            )
     return counts
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.message import DecodeError
 
-from dmrl.errors import RecordingError
+from dmrl.errors import RecordingError, UnreadableTopic
 from dmrl.messages import PACKAGES, find_descriptor, serialize_schema
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.protobuf.definitions import build_type
@@ -42,30 +42,28 @@ def find_channel_descriptor(path: Path, channel: Channel) -> Descriptor:
 
     Raises
     ------
-    RecordingError
+    UnreadableTopic
         If the channel is not protobuf, its schema defines no such message, or a topic of dmrl
         carries a message with the name of dmrl's and other fields.
     """
     if channel.encoding != "protobuf" or channel.schema_encoding != "protobuf":
-        raise RecordingError(
-            f"{path}: {channel.topic} is {channel.encoding or 'without encoding'}, not protobuf. "
-            "Leave it out, or convert it: dmrl convert --help"
+        raise UnreadableTopic(
+            path, channel.topic, f"is {channel.encoding or 'without encoding'}, not protobuf"
         )
     name = channel.schema_name
     try:
         kind = _find_type(name, channel.schema_data)
     except (DecodeError, TypeError, KeyError) as e:
         why = " ".join(str(e).split())
-        raise RecordingError(
-            f"{path}: the schema {name} of {channel.topic} cannot be used: {why}. Leave the topic "
-            "out: dmrl trim"
-        ) from e
+        reason = f"has a schema {name} that cannot be used: {why}"
+        raise UnreadableTopic(path, channel.topic, reason) from e
     row = find_topic(channel.topic)
-    if row is not None and name == row.message and not _has_fields(kind, find_descriptor(name)):
-        raise RecordingError(
-            f"{path}: {channel.topic} carries another {name}, without all fields of dmrl's. Leave "
-            "it out, or convert it: dmrl convert --help"
-        )
+    if row is not None and name == row.message:
+        own = find_descriptor(name)
+        if kind is not own and not _has_fields(kind, own):
+            raise UnreadableTopic(
+                path, channel.topic, f"carries another {name}, without all fields of dmrl's"
+            )
     return kind
 
 

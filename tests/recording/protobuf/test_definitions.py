@@ -20,8 +20,10 @@ from dmrl.errors import RecordingError
 from dmrl.recording.protobuf.decode import decode
 from dmrl.recording.protobuf.definitions import build_type
 from dmrl.stages.convert import Settings, run
+from dmrl.terminal.left_out import count_left_out
 
-from .definitions_of_any_shape import from_table, iter_definitions, plain
+from .definitions_of_any_shape import iter_definitions
+from .plain_rows import from_table, plain
 
 F = FieldDescriptorProto
 
@@ -225,9 +227,37 @@ def test_what_is_no_definition_is_one_true_line(tmp_path: Path) -> None:
     sent: list[Sent] = [("/x", "my.Other", packed(file), [b""]), ("/y", "my.M", b"\xff", [b""])]
     found = dmrl.open(write(tmp_path / "a.mcap", *sent))
     for topic in ("/x", "/y"):
-        with pytest.raises(RecordingError, match=f"of {topic} cannot be used") as e:
+        with pytest.raises(
+            RecordingError, match=f"{topic} has a schema .* that cannot be used"
+        ) as e:
             found[topic].to_arrow()
         assert "damaged" not in str(e.value)
+
+
+def test_a_topic_that_is_no_protobuf_spares_the_tables_of_others(tmp_path: Path) -> None:
+    file = proto("m.proto")
+    message(file, "M", x=F.TYPE_DOUBLE)
+    data = build("my.M", file)(x=1.5).SerializeToString()
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, encoding, schema in (
+            ("/x", "protobuf", writer.register_schema("my.M", "protobuf", packed(file))),
+            ("/note", "json", writer.register_schema("N", "jsonschema", b"{}")),
+            ("/odd", "protobuf", writer.register_schema("my.Odd", "protobuf", packed(file))),
+        ):
+            channel = writer.register_channel(topic, encoding, schema)
+            writer.add_message(channel, 5, data, 5)
+        writer.finish()
+    with count_left_out() as left:
+        assert run(path, tmp_path / "csv", Settings(to="csv")) == {"/x": 1}
+    assert sorted(name.name for name in (tmp_path / "csv").iterdir()) == ["x.csv"]
+    why = 'cannot be used: "Couldn\'t find message my.Odd"'
+    assert dict(left.counts) == {
+        "messages on /note, which is json, not protobuf": 1,
+        f"messages on /odd, which has a schema my.Odd that {why}": 1,
+    }
 
 
 def test_an_absent_message_with_a_list_in_it_keeps_its_row(tmp_path: Path) -> None:

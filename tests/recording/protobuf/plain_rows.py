@@ -1,0 +1,76 @@
+"""Messages as rows of a table: as Google's library reads them, and as tables of dmrl have them."""
+
+import json
+from typing import Any
+
+from google.protobuf import json_format
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+
+
+def contains_itself(kind: Descriptor, within: tuple[str, ...] = ()) -> bool:
+    """Whether a type holds, however deep, the type itself or one that does."""
+    if kind.full_name in within:
+        return True
+    inner = (f.message_type for f in kind.fields if f.message_type is not None)
+    return any(contains_itself(one, (*within, kind.full_name)) for one in inner)
+
+
+def plain(message: Any, *, top: bool = True) -> Any:
+    """A message as its table has it, read by Google's own library."""
+    kind = message.DESCRIPTOR
+    if not top and contains_itself(kind):
+        return json.loads(
+            json_format.MessageToJson(
+                message, preserving_proto_field_name=True, descriptor_pool=kind.file.pool
+            )
+        )
+    out = {field.name: _value(message, field) for field in kind.fields}
+    for extension in sorted(kind.file.pool.FindAllExtensions(kind), key=lambda f: f.number):
+        held = message.Extensions[extension]
+        out[f"[{extension.full_name}]"] = list(held) if extension.is_repeated else held
+    return out
+
+
+def _value(message: Any, field: FieldDescriptor) -> Any:
+    held, inner = getattr(message, field.name), field.message_type
+    if inner is not None and inner.GetOptions().map_entry:
+        entries = [
+            (key, held[key] if inner.fields_by_name["value"].message_type is None else
+             plain(held[key], top=False))
+            for key in held
+        ]  # fmt: skip
+        return sorted(entries, key=repr)
+    if field.is_repeated:
+        return [plain(one, top=False) if inner is not None else one for one in held]
+    if inner is not None:
+        return plain(held, top=False) if message.HasField(field.name) else None
+    return held
+
+
+def from_table(value: Any, kind: Descriptor, *, top: bool = True) -> Any:
+    """A row of a table in the form of `plain`: maps sorted, JSON parsed."""
+    if value is None:
+        return None
+    if not top and contains_itself(kind):
+        return json.loads(value)
+    out = dict(value)
+    for field in kind.fields:
+        inner = field.message_type
+        if inner is None:
+            continue
+        if inner.GetOptions().map_entry:
+            deep = inner.fields_by_name["value"].message_type
+            out[field.name] = sorted(
+                (
+                    (one["key"], from_table(one["value"], deep, top=False))
+                    if deep is not None
+                    else (one["key"], one["value"])
+                    for one in value[field.name]
+                ),
+                key=repr,
+            )
+        elif field.is_repeated:
+            out[field.name] = [from_table(one, inner, top=False) for one in value[field.name]]
+        else:
+            out[field.name] = from_table(value[field.name], inner, top=False)
+    return out
