@@ -326,13 +326,14 @@ def _parse_record(
 
 def _register_record(state: _RecoveryState, record: McapRecord) -> None:
     """Register a definition, metadata record or attachment."""
-    known = {Schema: state.schemas, McapChannel: state.channel_records}.get(type(record), {})
-    if known.get(getattr(record, "id", 0), record) != record:
-        state.recovery.contradictions.append(f"{_name(record)} is defined in two ways")
     match record:
         case Schema():
+            if state.schemas.get(record.id, record) != record:
+                state.recovery.contradictions.append(f"{record.name} is defined in two ways")
             state.schemas[record.id] = record
         case McapChannel() if not record.schema_id or record.schema_id in state.schemas:
+            if state.channel_records.get(record.id, record) != record:
+                state.recovery.contradictions.append(f"{record.topic} is defined in two ways")
             state.channels.define(record, state.schemas)
             state.incomplete.pop(record.id, None)
             state.channel_records[record.id] = record
@@ -344,10 +345,6 @@ def _register_record(state: _RecoveryState, record: McapRecord) -> None:
         case Attachment():
             state.extras += 1
             state.attachments.append(record)
-
-
-def _name(definition: McapRecord) -> str:
-    return definition.name if isinstance(definition, Schema) else definition.topic
 
 
 def _complete_report(state: _RecoveryState) -> None:
@@ -369,7 +366,7 @@ def _complete_report(state: _RecoveryState) -> None:
             recovery.missing["unknown"] = unknown
         if state.counts - had or unknown < 0:  # duplicates, or messages of another recording
             recovery.contradictions.append(
-                f"its statistics state {statistics.message_count} messages, otherwise distributed"
+                f"its statistics disagree: {statistics.message_count} messages"
             )
         if statistics.metadata_count + statistics.attachment_count != state.extras:
             recovery.doubtful = True
