@@ -80,7 +80,7 @@ def write_bag(recording: Path, out: Path) -> dict[str, int]:
                     connections[topic] = opened
                 if connections[topic].msgtype != kind:
                     mixed = f"{recording}: {topic} mixes message types"
-                    raise RecordingError(f"{mixed}. Split it: dmrl trim --help")
+                    raise RecordingError(f"{mixed}, which a bag cannot hold. Pass --to csv")
                 data = types.store.serialize_cdr(message, kind)
                 writer.write(connections[topic], sample.time_ns, data)
                 counts[topic] += 1

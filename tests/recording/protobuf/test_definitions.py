@@ -285,3 +285,24 @@ def test_a_type_wider_than_a_table_is_text(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", ("/x", "my.T10", packed(file), [value.SerializeToString()]))
     table = dmrl.open(path)["/x"].to_arrow()
     assert table["f3"].to_pylist() == ['{"f3": {"f3": {}}}'] and table["f4"].to_pylist() == [None]
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "columns"),
+    [
+        ("timestamp_root_first", 5, {"stamp", "x"}),
+        ("deps_reverse_order", 5, {"v"}),
+        ("google_struct", 5, {"x", "extra"}),
+        ("schema_evolved_one_topic", 6, {"x", "y"}),
+        ("field_named_log_time", 5, {"log_time_", "publish_time_", "time_s"}),
+    ],
+)
+def test_the_files_that_were_handed_over(
+    name: str, rows: int, columns: set[str], data: Path
+) -> None:
+    found = dmrl.open(data / "strangers" / f"pb-{name}" / f"{name}.mcap")
+    (topic,) = found.topics
+    table = found[topic].to_arrow()
+    assert len(table) == rows and set(table.column_names[2:]) == columns
+    assert (np.diff(table["log_time"].to_numpy()) > 0).all()
+    assert table["log_time"][0].as_py() == 10**18
