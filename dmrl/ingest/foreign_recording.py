@@ -1,13 +1,14 @@
 """Recordings of other programs in MCAP, and of dmrl under other names.
 
 Foxglove's images, calibrations and poses, in protobuf or JSON, are converted like the ROS messages
-that they were made from. Topics of dmrl with its own messages are copied, with new names of robots.
-All others are left out, with a line that names them.
+that they were made from, and so are ROS messages beside them. Topics of dmrl with its own messages
+are copied, with new names of robots. All others are left out, with a line that names them.
 """
 
 import base64
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,14 +20,15 @@ from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
 from dmrl import topics
-from dmrl.errors import SourceError
+from dmrl.errors import RecordingError, SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
 from dmrl.formats.files.pictures import scaling_words
 from dmrl.formats.ros import bag
 from dmrl.formats.ros.bag import select_usable
 from dmrl.formats.ros.message_clock import MessageClock
-from dmrl.formats.ros.ros_messages import CONVERTERS, MessageContext, is_camera_image
-from dmrl.formats.ros.topic_plan import TopicPlan, plan_topics
+from dmrl.formats.ros.reader import build_decoder
+from dmrl.formats.ros.ros_messages import MessageContext, is_camera_image
+from dmrl.formats.ros.topic_plan import ODOMETRY, TopicPlan, plan_topics
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.messages import LOG_PACKAGE, LogType
 from dmrl.recording import Channel, RawMessage, Summary, read_raw, read_splits, read_summary
@@ -43,6 +45,7 @@ ROS_TYPES = {
     "foxglove.PoseInFrame": "geometry_msgs/msg/PoseStamped",
 }
 """ROS messages with the fields of Foxglove's."""
+ROS_ENCODINGS = ("cdr", "ros1")
 OWN_PACKAGES = ("dmrl.v1.", "dmrl.log.")
 FIELDS_WITH_ROBOTS = ("peer", "frame_id", "parent_frame_id", "child_frame_id")
 LOG_CODES = {F.TYPE_UINT32: "I", F.TYPE_SINT32: "i", F.TYPE_SINT64: "q"}
@@ -51,16 +54,15 @@ LOG_CODES |= {F.TYPE_FLOAT: "f", F.TYPE_DOUBLE: "d"}
 
 
 def can_read(source: Path) -> bool:
-    """Return whether a source is an MCAP file, and no ROS bag."""
-    return source.is_file() and source.suffix == ".mcap" and not bag.can_read(source)
-
-
-def is_bag(source: Path) -> bool:
-    """Return whether a source holds messages of ROS."""
-    return bag.can_read(source) or any(
-        channel.encoding in ("cdr", "ros1")
-        for channel in (_list_channels(source) if can_read(source) else ())
-    )
+    """Return whether a source is an MCAP file, and not a bag of ROS messages alone."""
+    if not (source.is_file() and source.suffix == ".mcap"):
+        return False
+    if not bag.can_read(source):
+        return True
+    try:
+        return any(channel.encoding != "cdr" for channel in _list_channels(source))
+    except RecordingError:
+        return False  # the reader of bags says what is wrong
 
 
 def _list_channels(source: Path) -> list[Channel]:
@@ -87,20 +89,17 @@ def load_content(source: Path, options: Options, *, skip: Collection[str] = ()) 
     SettingError
         If a name fits no topic.
     """
-    if is_bag(source):
-        return bag.load_content(source, options)
     summary = read_summary(source)
-    encodings = {channel.topic: channel.encoding for channel in _list_channels(source)}
+    kinds = {channel.topic: _to_kind(channel) for channel in _list_channels(source)}
     if summary.provenance is not None and not (options.names or skip):
         raise SourceError(f"{source} is a recording already. Pass --to: csv, parquet, ros2")
     own = {old: new for old, new in _iter_own(summary, options) if old not in skip}
     held = []
     for topic, info in summary.topics.items():
-        kind = ROS_TYPES.get(info.schema, f"{info.schema or 'data'} in {encodings[topic]}")
-        held += [(topic, kind, info.count)] if topic not in {*own, *skip} else []
+        held += [(topic, kinds[topic], info.count)] if topic not in {*own, *skip} else []
 
     def is_camera(topic: str, _kind: str) -> bool:
-        found = [_decode(raw, source) for raw in islice(read_raw(source, topic), 1)]
+        found = [_decode(raw, source) for raw in islice(read_topics(source, [topic]), 1)]
         return found[0] is not None and is_camera_image(found[0])
 
     plan, why = plan_topics(held, options, is_camera)
@@ -137,21 +136,25 @@ def _iter_samples(
 ) -> Iterator[Sample]:
     calibrated: set[str] = set()
     scaled: set[str] = set()
-    stamps = ((r.topic, _stamp_ns(_decode(r, source)), r.time_ns) for r in _read(source, lines))
+    stamps = (
+        (r.topic, _stamp_ns(_decode(r, source)), r.time_ns) for r in read_topics(source, lines)
+    )
     clock = MessageClock.from_stamps(source, stamps)
-    for raw in _read(source, [*own, *lines]):
+    moving = {line.robot for line in lines.values() if line.kind == ODOMETRY}
+    for raw in read_topics(source, [*own, *lines]):
         if raw.topic in own:
             message = parse(raw, source)
             fields = _to_fields(message, options.names)
             yield Sample(raw.time_ns, own[raw.topic], _to_type(message), fields, raw.publish_ns)
             continue
         line, held = lines[raw.topic], _decode(raw, source)
+        odometry = line.robot in moving
         where = MessageContext(
-            source, line.robot, line.peer, line.captured, bits=options.bits, scaled=scaled
+            source, line.robot, line.peer, line.captured, odometry, options.bits, scaled
         )
         try:
             time_ns = clock.find_time_ns(line.topic, _stamp_ns(held), raw.time_ns)
-            converted = CONVERTERS[line.kind](held, time_ns or 0, where)
+            converted = bag.convert_message(line, held, time_ns or 0, where)
             samples = [] if time_ns is None else list(converted)
         except (AttributeError, TypeError, ValueError):  # a field is missing, or is no number
             leave_out(f"messages on {line.topic} that cannot be decoded", source)
@@ -162,9 +165,10 @@ def _iter_samples(
         say(f"{source}: images of {', '.join(sorted(scaled))}: {scaling_words(options.bits)}")
 
 
-def _read(source: Path, wanted: Iterable[str]) -> Iterator[RawMessage]:
-    names = list(wanted)
-    return read_raw(source, *names) if names else iter(())
+def read_topics(source: Path, wanted: Iterable[str]) -> Iterator[RawMessage]:
+    """Yield the messages of some topics in log-time order, whatever types they carry."""
+    names = set(wanted)  # not by name: topics of dmrl's may carry other messages here
+    return (raw for raw in (read_raw(source) if names else ()) if raw.topic in names)
 
 
 def parse(raw: RawMessage, source: Path) -> Any:
@@ -172,9 +176,26 @@ def parse(raw: RawMessage, source: Path) -> Any:
     try:
         if raw.channel.encoding == "json":
             return parse_json(raw.data)
+        if raw.channel.encoding in ROS_ENCODINGS:
+            return _build_decoder(raw.channel)(raw.data, _to_kind(raw.channel))
         return GetMessageClass(find_channel_descriptor(source, raw.channel)).FromString(raw.data)
     except (ValueError, DecodeError):
         return None
+
+
+@cache
+def _build_decoder(channel: Channel) -> Callable[[bytes, str], Any]:
+    form = {"ros2msg": "MSG", "ros1msg": "MSG", "ros2idl": "IDL"}.get(channel.schema_encoding, "")
+    text = channel.schema_data.decode(errors="replace")
+    return build_decoder([(_to_kind(channel), form, text)], is_ros1=channel.encoding == "ros1")
+
+
+def _to_kind(channel: Channel) -> str:
+    """Return the ROS type with the content of a channel's messages, or its type and encoding."""
+    name = channel.schema_name
+    if channel.encoding in ROS_ENCODINGS:
+        return name if name.count("/") != 1 else name.replace("/", "/msg/")
+    return ROS_TYPES.get(name, f"{name or 'data'} in {channel.encoding}")
 
 
 def _decode(raw: RawMessage, source: Path) -> Any:
@@ -185,7 +206,8 @@ def _decode(raw: RawMessage, source: Path) -> Any:
             message["data"] = base64.b64decode(message["data"], validate=True)
         except ValueError:
             return None
-    return None if message is None else _to_object(message)
+    is_ros = raw.channel.encoding in ROS_ENCODINGS
+    return message if is_ros or message is None else _to_object(message)
 
 
 def _to_object(value: Any) -> Any:
@@ -200,7 +222,9 @@ def _to_object(value: Any) -> Any:
 
 
 def _stamp_ns(message: Any) -> int | None:
-    """Return the time in a message, protobuf's or JSON's; None if it has none."""
+    """Return the time in a message, protobuf's, JSON's or ROS's; None if it has none."""
+    if hasattr(message, "header"):
+        return bag.header_time_ns(message)
     stamp = getattr(message, "timestamp", None)
     seconds, nanos = (
         getattr(stamp, names[0], getattr(stamp, names[1], None))

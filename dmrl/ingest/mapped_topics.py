@@ -22,7 +22,7 @@ from dmrl.formats.files.text_table import TextTable
 from dmrl.formats.ros import bag
 from dmrl.formats.ros.reader import iter_messages, list_topics
 from dmrl.ingest import foreign_recording
-from dmrl.recording import read_raw, read_summary
+from dmrl.recording import read_summary
 from dmrl.terminal.left_out import leave_out
 
 LOG_TIME = ":log_time"
@@ -52,7 +52,7 @@ def load_content(source: Path, options: Options) -> Content:
     """
     table = read_column_map(Path(options.columns or ""), time_column=LOG_TIME)
     options = replace(options, names={**table.renames, **options.names}, columns=None)
-    is_bag = foreign_recording.is_bag(source)
+    is_bag = not foreign_recording.can_read(source)
     kinds = {topic: kind for topic, kind, count in _list_topics(source, is_bag=is_bag) if count}
     fields = {name.rpartition(":")[2] for name in table.names}
     names: dict[str, list[str]] = {f"{t}:{f}": [] for t in ("", *kinds) for f in fields}
@@ -115,11 +115,12 @@ def _iter_objects(
             stamp_ns = bag.header_time_ns(message.decoded)
             yield message.topic, message.bag_ns if stamp_ns is None else stamp_ns, message.decoded
         return
-    for raw in read_raw(source, *topics):
+    for raw in foreign_recording.read_topics(source, topics):
         if (found := foreign_recording.parse(raw, source)) is None:
             leave_out(f"messages on {raw.topic} that cannot be decoded", source)
         else:
-            yield raw.topic, raw.time_ns, found
+            stamp_ns = bag.header_time_ns(found)
+            yield raw.topic, raw.time_ns if stamp_ns is None else stamp_ns, found
 
 
 def _find_number(value: Any, path: Sequence[str]) -> str:

@@ -14,6 +14,7 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer as PlainWriter
 from mcap_protobuf.writer import Writer
+from rosbags.typesys import Stores, get_typestore
 
 import dmrl
 from dmrl.errors import MissingTopic, SettingError, SourceError
@@ -189,6 +190,39 @@ def test_robots_of_a_recording_of_dmrl_are_renamed(tmp_path: Path) -> None:
     assert not left and set(found.topics) == {"/cf1/labels", "/cf1/range/red", "/blue/height"}
     assert found.labels()["peer"].tolist() == ["red"]
     assert read_summary(tmp_path / "b.mcap").metadata["dmrl.split"] == [{"train": "[[5, 5]]"}]
+
+
+@pytest.mark.parametrize("profile", ["", "ros2"])
+@pytest.mark.parametrize("other", ["json", "protobuf", ""])
+def test_messages_of_ros_beside_others(profile: str, other: str, tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind = "geometry_msgs/msg/PoseStamped"
+    held, types = a_pose().pose, store.types
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        writer = PlainWriter(stream)
+        writer.start(profile=profile)
+        text = store.generate_msgdef(kind)[0].encode()
+        schema = writer.register_schema(kind, "ros2msg", text)
+        channels = [writer.register_channel("/cf1/pose", "cdr", schema)]
+        if other:
+            number = writer.register_schema("my.M", other, b"")
+            channels.append(writer.register_channel("/other", other, number))
+        for k in range(4):
+            pose = types["geometry_msgs/msg/Pose"](
+                types["geometry_msgs/msg/Point"](held.position.x, 0.0, 0.0),
+                types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+            )
+            stamp = types["builtin_interfaces/msg/Time"](7, k)
+            header = types["std_msgs/msg/Header"](stamp, "map")
+            data = bytes(store.serialize_cdr(types[kind](header, pose), kind))
+            for channel in channels:
+                writer.add_message(channel, START_NS + k, data, START_NS + k)
+        writer.finish()
+    found, left = convert(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    table = found["/cf1/pose"].to_arrow()
+    assert table["log_time"].to_pylist() == [7_000_000_000 + k for k in range(4)]
+    reason = f"messages on /other: my.M in {other} is not converted"
+    assert left == ({reason: 4} if other else {})
 
 
 def test_the_file_that_was_handed_over(data: Path, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
 from dmrl.formats.files.pictures import scaling_words
 from dmrl.formats.ros.message_clock import MessageClock
-from dmrl.formats.ros.reader import BagMessage, iter_messages, list_topics
+from dmrl.formats.ros.reader import iter_messages, list_topics
 from dmrl.formats.ros.ros_messages import (
     CONVERTERS,
     DMRL_PREFIX,
@@ -115,7 +115,7 @@ def _iter_samples(
         unstamped[line.topic] += clock.is_unset(line.topic, stamp_ns) and bag_ns > 0
         if (time_ns := clock.find_time_ns(line.topic, stamp_ns, bag_ns)) is None:
             continue
-        samples = _convert_message(line, message, time_ns, where)
+        samples = convert_message(line, message.decoded, time_ns, where)
         for sample in select_usable(samples, f"{source}: {line.topic}", calibrated):
             yield replace(sample, publish_ns=max(bag_ns, 0))
     if scaled:
@@ -137,12 +137,13 @@ def header_time_ns(message: Any) -> int | None:
     return max(int(stamp.sec * 1_000_000_000 + stamp.nanosec), 0)
 
 
-def _convert_message(
-    line: TopicPlan, message: BagMessage, time_ns: int, where: MessageContext
+def convert_message(
+    line: TopicPlan, decoded: Any, time_ns: int, where: MessageContext
 ) -> Iterator[Sample]:
+    """Yield the samples of a decoded message."""
     if not line.kind.startswith(DMRL_PREFIX):
-        yield from CONVERTERS[line.kind](message.decoded, time_ns, where)
-    elif (sample := convert_dmrl_message(message.decoded, line.topic, time_ns)) is not None:
+        yield from CONVERTERS[line.kind](decoded, time_ns, where)
+    elif (sample := convert_dmrl_message(decoded, line.topic, time_ns)) is not None:
         yield sample
     else:
         leave_out(f"messages on {line.topic} of another version of dmrl", where.source)

@@ -62,7 +62,8 @@ def iter_messages(
 
     def messages(reader: Any) -> Iterator[Any]:
         chosen = [c for c in reader.connections if (c.topic, c.msgtype) in wanted]
-        decode = _build_decoder(chosen, is_ros1=source.suffix == ".bag")
+        definitions = [(c.msgtype, c.msgdef.format.name, c.msgdef.data) for c in chosen]
+        decode = build_decoder(definitions, is_ros1=source.suffix == ".bag")
         for connection, bag_ns, data in reader.messages(connections=chosen) if chosen else ():
             decoded = decode(data, connection.msgtype)
             if decoded is None and not ahead:
@@ -74,18 +75,29 @@ def iter_messages(
     return _iter_guarded(source, messages)
 
 
-def _build_decoder(connections: Collection[Any], *, is_ros1: bool) -> Callable[[bytes, str], Any]:
-    """Return a function of data and type that decodes a message; None if that fails."""
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+def build_decoder(
+    definitions: Collection[tuple[str, str, str]], *, is_ros1: bool
+) -> Callable[[bytes, str], Any]:
+    """Return a function of data and type that decodes a message; None if that fails.
 
+    Parameters
+    ----------
+    definitions
+        Type, form (MSG or IDL; others: none) and text of each definition.
+    is_ros1
+        Messages are serialized as by ROS 1, and not in CDR.
+    """
+    try:
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    except ModuleNotFoundError as e:
+        raise MissingExtra("rosbags", "ros", "messages of ROS") from e
     store = get_typestore(Stores.EMPTY)
     decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
     types: dict[str, Any] = {}
-    for connection in connections:
+    for msgtype, form, text in definitions:
         with suppress(Exception):  # a standard type has a definition of rosbags' own
-            held = connection.msgdef
-            types |= _parse_definition(connection.msgtype, held.format, held.data)
-    if not is_ros1 and not types.keys() >= {connection.msgtype for connection in connections}:
+            types |= _parse_definition(msgtype, form, text)
+    if not is_ros1 and not types.keys() >= {msgtype for msgtype, _, _ in definitions}:
         types = get_typestore(Stores.ROS2_HUMBLE).fielddefs | types
     store.register(types)
 
@@ -101,15 +113,13 @@ def _build_decoder(connections: Collection[Any], *, is_ros1: bool) -> Callable[[
 
 
 @lru_cache(maxsize=256)
-def _parse_definition(msgtype: str, kind: Any, text: str) -> dict[str, Any]:
+def _parse_definition(msgtype: str, form: str, text: str) -> dict[str, Any]:
     """Return the types that the definition of a message type contains."""
-    from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415
     from rosbags.typesys import get_types_from_idl, get_types_from_msg  # noqa: PLC0415
 
-    known = kind != MessageDefinitionFormat.NONE and text.strip()
-    if not (known and TYPE_NAME.fullmatch(msgtype)):
+    if form not in ("MSG", "IDL") or not (text.strip() and TYPE_NAME.fullmatch(msgtype)):
         return {}
-    if kind == MessageDefinitionFormat.MSG:
+    if form == "MSG":
         return dict(get_types_from_msg(text, msgtype))
     if not text.startswith(f"{IDL_SEPARATOR}IDL: "):
         return dict(get_types_from_idl(text))
