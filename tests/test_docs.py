@@ -153,10 +153,10 @@ STOP = re.compile(
 
 
 def blocks(page: Path, until: str | None) -> list[tuple[str, str]]:
-    """Shell and Python blocks of a page, in order; until a heading."""
+    """Shell, Python and TOML blocks of a page, in order; until a heading."""
     text = page.read_text(encoding="utf-8")
     text = text if until is None else text[: text.index(until)]
-    return re.findall(r"```(sh|python)\n(.*?)```", text, re.DOTALL)
+    return re.findall(r"```(sh|python|toml)\n(.*?)```", text, re.DOTALL)
 
 
 def walk(page: Path, until: str | None = None, stop: re.Pattern[str] = STOP) -> None:
@@ -165,6 +165,9 @@ def walk(page: Path, until: str | None = None, stop: re.Pattern[str] = STOP) -> 
     for kind, block in blocks(page, until):
         if kind == "python":
             exec(block, names)
+            continue
+        if kind == "toml":
+            Path("map.toml").write_text(block, encoding="utf-8")
             continue
         for line in re.findall(r"^(dmrl .*)", block.replace("\\\n", " "), re.MULTILINE):
             if not stop.match(line):
