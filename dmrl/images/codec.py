@@ -108,16 +108,21 @@ class ImageHeader:
     _image: Image.Image
     _data: bytes
     _what: object
+    _has_deep_colours: bool
 
     @property
     def has_16_bits(self) -> bool:
-        """Whether its grey values have more than 8 bits."""
-        return self._image.mode.startswith("I")
+        """Whether its values have more than 8 bits."""
+        return self._image.mode.startswith("I") or self._has_deep_colours
 
     @property
     def is_turned(self) -> bool:
         """Whether EXIF states another orientation than upright."""
+        if self.kind == "png" and b"eXIf" not in self._data:
+            return False
         try:
+            # Pillow decodes a PNG to find it.
+            _check_decodable(self._image, self._data, self._what, limits.PIXELS)
             return self._image.getexif().get(ORIENTATION_TAG, 1) in range(2, 9)
         except DECODE_ERRORS:
             return False
@@ -139,12 +144,25 @@ class ImageHeader:
                     warnings.simplefilter("ignore")
                     if image.mode == "P" and image.palette is None:  # Pillow only asserts it
                         raise ValueError("its palette is missing")
+                    if self._has_deep_colours and bits < BITS:
+                        return _decode_deep_colours(self._data, bits)
                     return _to_rgb(image, bits, upright=upright)
             except DECODE_ERRORS as e:
                 why = " ".join(str(e).split())
                 raise SourceError(
                     f"{self._what} cannot be decoded: {why}. Remove it or save it again"
                 ) from None
+
+
+def _decode_deep_colours(data: bytes, bits: int) -> Rgb:
+    """Decode colours of 16 bits with fewer significant ones, which Pillow would drop."""
+    from dmrl.images.bayer import load_opencv  # noqa: PLC0415 - it imports this module
+
+    cv2 = load_opencv(what="colours of 16 bits with --bits")
+    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if bgr is None or bgr.ndim < 3:
+        raise ValueError("OpenCV cannot decode it")
+    return scale_to_8_bits(np.ascontiguousarray(bgr[..., 2::-1]), bits)
 
 
 def _to_rgb(image: Image.Image, bits: int, *, upright: bool) -> Rgb:
@@ -178,7 +196,10 @@ def read_header(data: bytes, what: object = "the image") -> ImageHeader:
         If the bytes do not start like such an image.
     """
     image = _open_image(data, what)
-    return ImageHeader(image.width, image.height, str(image.format).lower(), image, data, what)
+    # Pillow keeps the upper 8 bits of colours of 16.
+    deep = image.mode.startswith("RGB") and ";16" in str(getattr(image, "tile", ""))
+    kind = str(image.format).lower()
+    return ImageHeader(image.width, image.height, kind, image, data, what, deep)
 
 
 def decode(data: bytes, what: object = "the image", most: int = limits.FRAME_PIXELS) -> Rgb:

@@ -114,6 +114,22 @@ def test_every_depth_of_grey_becomes_the_same_ramp(
     assert np.abs(dark[..., 0] - RAMP * 255 / 4).max() <= 0.8
 
 
+@pytest.mark.parametrize("bits", [12, 16])
+@pytest.mark.parametrize("suffix", ["png", "tiff"])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_colours_of_every_depth_are_scaled(
+    bits: int, suffix: str, channels: int, convert: Convert, tmp_path: Path
+) -> None:
+    (tmp_path / "in").mkdir()
+    shares = np.random.default_rng(0).random((48, 64, channels))
+    bgr = np.rint(shares * (2**bits - 1)).astype(np.uint16)
+    assert cv2.imwrite(str(tmp_path / f"in/a.{suffix}"), bgr)
+    told = convert(tmp_path / "in", "--bits", bits)
+    (image,) = images(tmp_path)
+    assert np.abs(image - shares[..., 2::-1] * 255).max() <= 1
+    assert f"16 bits scaled to 8, {2**bits - 1} to 255" in told["stderr"]
+
+
 COLOURS = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
 
 
