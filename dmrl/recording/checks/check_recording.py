@@ -151,6 +151,7 @@ def _check_clocks(data: CheckData) -> Iterator[Finding]:
 def _check_units(data: CheckData) -> Iterator[Finding]:
     """Report values and times that contradict the unit, frame or sign of their topic."""
     for topic, text in (
+        *data.magnitudes.find_not_finite_fields(),
         *data.magnitudes.find_implausible_fields(),
         *check_periods(data.times),
         *data.motion.find_contradictions(),

@@ -55,10 +55,13 @@ class MagnitudeHistograms:
                 bad = ~np.isfinite(column.to_numpy(zero_copy_only=False))
                 self.not_finite[topic, name] += int(bad.sum())
 
-    def find_implausible_fields(self) -> Iterator[tuple[str, str]]:
-        """Yield fields with values that are not finite, or too large or small for their unit."""
+    def find_not_finite_fields(self) -> Iterator[tuple[str, str]]:
+        """Yield fields with NaN or infinite values."""
         for (topic, name), count in (+self.not_finite).items():
             yield topic, f"{name}: {count} values are not finite"
+
+    def find_implausible_fields(self) -> Iterator[tuple[str, str]]:
+        """Yield fields with values too large or too small for their unit."""
         for (topic, name), counts in self.counts.items():
             total = int(counts.sum())
             doubt = next(doubt for doubt in _find_limits(topic) if doubt.field == name)

@@ -11,7 +11,7 @@ def _doubted(topic: str, name: str, values: np.ndarray) -> list[tuple[str, str]]
     sizes = MagnitudeHistograms()
     for part in np.array_split(values, 3):
         sizes.add_batch(topic, pa.RecordBatch.from_pydict({name: pa.array(part)}))
-    return list(sizes.find_implausible_fields())
+    return [*sizes.find_not_finite_fields(), *sizes.find_implausible_fields()]
 
 
 @pytest.mark.parametrize(
