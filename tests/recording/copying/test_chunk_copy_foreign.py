@@ -14,6 +14,9 @@ from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import Provenance, read_raw, rewrite, trim
 
 from ..records import channels, chunks, packed, unchanged
+from ..walk import walk
+from ..wrong_meaning import Chunk, Layout, Message
+from ..wrong_meaning import Writer as FileWriter
 
 MADE = Provenance("test")
 
@@ -109,6 +112,20 @@ def test_an_empty_index_of_another_writer_does_not_go_along(
     assert {*chunks(path)[0].message_index_offsets} == {1, 2}
     assert {*chunks(out)[0].message_index_offsets} == {2}
     assert packed(out)[0] == packed(path)[0]
+
+
+def test_a_large_chunk_of_definitions_alone_is_no_bug(tmp_path: Path) -> None:
+    """Some programs start with a chunk of all schemas, too large to be joined with the next."""
+    layout = Layout(crcs=False)
+    layout.schemas[1] = "Kind", "jsonschema", b" " * 100_000
+    layout.channels = {1: ("/a", 1, {}), 2: ("/b", 1, {"k": "v"})}
+    layout.parts = [Chunk([], definitions=[1, 2]), Chunk([Message(1, 5, 5, b"x")])]
+    path, out = tmp_path / "a.mcap", tmp_path / "out.mcap"
+    path.write_bytes(FileWriter(layout).write())
+    rewrite(path, out, MADE, without=(), fresh=())
+    want = walk(path).comparable()
+    assert walk(out).comparable() == want
+    assert [topic for topic, *_ in want["channels"]] == ["/a", "/b"]
 
 
 def test_a_recording_without_index_is_copied(tmp_path: Path) -> None:
