@@ -105,7 +105,7 @@ class ExportRows:
     @cached_property
     def most_peers(self) -> int:
         """Largest number of labels of an image, 1 at least."""
-        return max(1, *(len(p) for s in self.data.splits for p in self._read(s, "peers")))
+        return max([1, *(len(p) for s in self.data.splits for p in self._read(s, "peers"))])
 
     def list_times(self) -> list[list[int]]:
         """Return the log times of the images of each robot, by split and recording."""

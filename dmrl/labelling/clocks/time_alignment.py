@@ -10,6 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from dmrl import topics
+from dmrl.errors import SourceError
 from dmrl.estimation.signals.clock_alignment import Clock, estimate_clock
 from dmrl.estimation.signals.image_motion import estimate_shift, shift_rates, shrink_image
 from dmrl.estimation.signals.ranging_clocks import estimate_from_exchanges
@@ -18,6 +19,7 @@ from dmrl.geometry.rotations import quaternion_to_euler
 from dmrl.images import codec
 from dmrl.labelling.flight_log import FlightLog, Samples
 from dmrl.recording import read
+from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import track
 
 Signals = dict[str, tuple[Array, Array]]
@@ -71,7 +73,7 @@ def estimate_camera_clock(
     Raises
     ------
     SourceError
-        If an image cannot be decoded.
+        If an image cannot be decoded and the command is strict.
     """
     topic = topics.CAMERA_IMAGE(robot)
     if robot not in flight.attitude:
@@ -80,7 +82,11 @@ def estimate_camera_clock(
     count = flight.topics[topic].count
     for stamped in track(read(flight.path, topic), f"Turns of {robot}'s camera", count):
         at = f"{topic} at {stamped.time_ns} ns in {flight.path}"
-        after = shrink_image(codec.decode(stamped.message.data, at))
+        try:
+            after = shrink_image(codec.decode(stamped.message.data, at))
+        except SourceError as e:
+            leave_out(codec.UNDECODABLE, e)
+            continue
         if before is not None:
             moved.append(estimate_shift(before, after) or (np.nan, np.nan))
         times.append(even_ns.get(stamped.time_ns, stamped.time_ns))
