@@ -111,3 +111,20 @@ def test_a_stream_of_the_whole_sensor_is_cut_for_the_shipped_network(
     ):
         assert main(["convert", source, str(tmp_path / "x.mcap"), *flags]) == 1
         assert words in capsys.readouterr().err
+
+
+def test_flags_without_effect_on_a_folder_are_errors(
+    cut_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "swarm").mkdir()
+    cut_log.rename(tmp_path / "swarm" / "cf7")
+    out = str(tmp_path / "out.mcap")
+    assert main(["convert", str(tmp_path / "swarm"), out, "--robot", "a"]) == 1
+    assert "--robot has no effect: the files of" in capsys.readouterr().err
+    (tmp_path / "flight").mkdir()
+    head = "time_s,roll_rad,pitch_rad,yaw_rate_radps,vx_mps,vy_mps,height_m"
+    rows = [f"{0.1 * k:.1f},0,0,0,{k},0,1" for k in range(5)]
+    (tmp_path / "flight" / "cf1.csv").write_text("\n".join([head, *rows]))
+    assert main(["convert", str(tmp_path / "flight"), out, "--camera", "aideck"]) == 1
+    assert "--camera has no effect: " in capsys.readouterr().err
+    assert main(["convert", str(tmp_path / "flight"), out]) == 0

@@ -74,6 +74,8 @@ def load_content(source: Path, options: Options) -> Content:
         raise SourceError(
             f"no CSV file that begins with {TIME_COLUMN} in {source}. Pass another source"
         )
+    if options.robot not in robots:
+        options.refuse("robot", f"has no effect: the folders of {source} are named after robots")
     streams: list[log_variables.SampleStream] = []
     for name, paths in robots.items():
         robot = options.names.get(name, name)

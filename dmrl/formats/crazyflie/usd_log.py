@@ -174,6 +174,7 @@ def _iter_logs(source: Path, options: Options) -> Iterator[tuple[str, Path]]:
     if not source.is_dir():
         yield options.robot, source
         return
+    options.refuse("robot", f"has no effect: the files of {source} are named after robots")
     paths = sorted(p for p in source.iterdir() if p.is_file() and p.name[0] != ".")
     logs = [path for path in paths if path.stat().st_size and can_read(path)]
     if not logs:

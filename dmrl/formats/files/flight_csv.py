@@ -118,6 +118,9 @@ def load_content(source: Path, options: Options | None = None) -> Content:
     logs = [read_log(path) for path in paths]
     _check_overlap(logs)
     options = options or Options()
+    if not any((source / log.robot).is_dir() for log in logs):
+        for name in ("camera", "size_px"):
+            options.refuse(name, f"has no effect: {source} has no folder of pictures of a robot")
     streams = [stream for log in logs for stream in _iter_streams(log, options.names)]
     streams += [
         stream for log in logs for stream in _iter_image_streams(source / log.robot, options)
