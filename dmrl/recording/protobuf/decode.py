@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from google.protobuf import json_format, text_format
-from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.descriptor import Descriptor, FieldDescriptor, OneofDescriptor
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 from numpy.typing import NDArray
@@ -50,6 +50,7 @@ WITHOUT_UTF8_CHECK = 3
 """Value of the feature ``utf8_validation`` for texts that need not be UTF-8."""
 
 
+@lru_cache(maxsize=1024)
 def list_columns(kind: Descriptor) -> dict[str, FieldDescriptor]:
     """Return the fields of a message by column; an extension is ``[its.full.name]``, as in JSON."""
     columns = {f.name: f for f in kind.fields}
@@ -57,6 +58,12 @@ def list_columns(kind: Descriptor) -> dict[str, FieldDescriptor]:
         extensions = sorted(kind.file.pool.FindAllExtensions(kind), key=lambda f: f.number)
         columns |= {f"[{f.full_name}]": f for f in extensions}
     return columns
+
+
+@lru_cache(maxsize=1024)
+def _list_oneofs(kind: Descriptor) -> tuple[OneofDescriptor, ...]:
+    """Return the oneofs of a message with several members; an optional field has one of its own."""
+    return tuple(oneof for oneof in kind.oneofs if len(oneof.fields) > 1)
 
 
 def decode(
@@ -90,15 +97,15 @@ def decode(
     wanted = {
         name: f for name, f in list_columns(descriptor).items() if fields is None or name in fields
     }
-    return _decode_fields(data, start, end, wanted) if wanted else {}
+    return _decode_fields(data, start, end, descriptor, wanted) if wanted else {}
 
 
 def _decode_fields(
-    data: Bytes, start: Ints, end: Ints, fields: dict[str, FieldDescriptor]
+    data: Bytes, start: Ints, end: Ints, kind: Descriptor, fields: dict[str, FieldDescriptor]
 ) -> dict[str, pa.Array]:
-    oneofs = {o for f in fields.values() if (o := f.containing_oneof) and len(o.fields) > 1}
-    members = {f.number: f for o in oneofs for f in o.fields}
-    numbers = members | {f.number: f for f in fields.values()}
+    oneofs = _list_oneofs(kind)
+    numbers = {f.number: f for f in fields.values()}
+    numbers |= {f.number: f for oneof in oneofs for f in oneof.fields}
     found = find_fields(data, start, end, set(numbers))
     for number in found:
         found[number] = _select_valid(data, numbers[number], found[number])
@@ -129,7 +136,7 @@ def _decode_struct(
 ) -> pa.Array:
     if _count_columns(kind) > limits.VARIABLES and not kind.GetOptions().map_entry:
         return _decode_to_json(data, start, end, kind, absent)
-    columns = _decode_fields(data, start, end, list_columns(kind))
+    columns = _decode_fields(data, start, end, kind, list_columns(kind))
     if not columns:
         mask = None if absent is None else pa.array(~absent).buffers()[1]
         return pa.Array.from_buffers(pa.struct([]), len(start), [mask])
