@@ -241,6 +241,27 @@ def test_names_with_a_point_are_seconds(convert: Convert, tmp_path: Path) -> Non
     ]
 
 
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        (("0.5", "0.25"), (250_000_000, 500_000_000)),
+        (("1700000001", "1700000000"), (1_700_000_000_000_000_000, 1_700_000_001_000_000_000)),
+        (("0.5", "a"), (0, 100_000_000)),
+        (("0000000001", "0000000002"), (0, 100_000_000)),
+    ],
+)
+def test_names_are_seconds_if_all_are(
+    names: tuple[str, ...], times: tuple[int, ...], convert: Convert, tmp_path: Path
+) -> None:
+    (tmp_path / "in").mkdir()
+    for name in names:
+        (tmp_path / "in" / f"{name}.png").write_bytes(encode_png(COLOURS))
+    said = convert(tmp_path / "in")["stderr"]
+    table = dmrl.open(tmp_path / "out.mcap")["/cf1/camera/image"].to_pandas()
+    assert tuple(table["log_time"].astype("int64")) == times
+    assert ("taken for times in seconds" in said) == (times[0] != 0)
+
+
 def test_depths_in_millimetres_and_boxes_elsewhere_are_doubted(
     convert: Convert, tmp_path: Path
 ) -> None:

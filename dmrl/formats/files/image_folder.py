@@ -2,8 +2,8 @@
 
 Images: files of ``IMAGE_SUFFIXES``, in the natural order of their names: img2 before img10. If
 every name is a number of 12 digits or more, the numbers are times in nanoseconds; if every name
-has a decimal point, such as ``1403636579.763``, in seconds; otherwise the images get nominal
-times, evenly spaced from 0.
+is a number like ``SECONDS``, in seconds; otherwise the images get nominal times, evenly spaced
+from 0.
 
 Labels: ``labels.csv`` in the folder, or another file. It has one row per peer and image; a row
 with an empty peer means that no peer is in view. An image without a row is not labelled.
@@ -22,6 +22,7 @@ AI-deck's whole sensor, 324x244, with a camera of 320x224 are cropped to the are
 unless 324x244 is requested.
 """
 
+import re
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from decimal import Decimal
@@ -53,6 +54,8 @@ LABELS_FILE = "labels.csv"
 AIDECK_LABELS_FILE = "label.txt"
 CALIBRATION_FILE = "calibration.toml"
 MIN_TIME_DIGITS = 12  # fewer would be under 17 minutes after 1970: a counter, not a time
+SECONDS = re.compile(r"[0-9]+\.[0-9]+|1[0-9]{9}")
+"""Names that are seconds: with a decimal point, or whole ones of the years 2001 to 2033."""
 NS_PER_S = 1_000_000_000
 MAX_TIME_NS = 2**63 - 1
 
@@ -123,7 +126,9 @@ def list_images(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
         raise SourceError(
             f"no image ({', '.join(IMAGE_SUFFIXES)}) in {source}. Pass another folder"
         )
-    timed = [path for path in paths if _parse_time_ns(path) is not None]
+    if seconds := all(SECONDS.fullmatch(path.stem) for path in paths):
+        say(f"{source}: the names of the pictures are taken for times in seconds")
+    timed = [path for path in paths if _parse_time_ns(path, seconds=seconds) is not None]
     if not timed:
         return [(round(k * NS_PER_S / rate_hz), path) for k, path in enumerate(paths)]
     if odd := sorted(set(paths) - set(timed)):
@@ -131,18 +136,21 @@ def list_images(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
             f"{odd[0]} is not named by its time in nanoseconds as {timed[0].name} is. "
             "Rename it, or move it out of the folder"
         )
-    moments = sorted((_parse_time_ns(path) or 0, path) for path in paths)
+    moments = sorted((_parse_time_ns(path, seconds=seconds) or 0, path) for path in paths)
     for (time_ns, path), (next_ns, following) in pairwise(moments):
         if time_ns == next_ns:
             raise SourceError(f"{path} and {following.name} have the same time. Remove one")
     return moments
 
 
-def _parse_time_ns(path: Path) -> int | None:
-    name, digits = path.stem, path.stem.replace(".", "", 1)
-    if not (digits.isdecimal() and len(digits) >= MIN_TIME_DIGITS):
+def _parse_time_ns(path: Path, *, seconds: bool = False) -> int | None:
+    """Return the time that a name states: nanoseconds of 12 digits or more, or seconds."""
+    if seconds:
+        time_ns = int(Decimal(path.stem) * NS_PER_S)
+    elif path.stem.isdecimal() and len(path.stem) >= MIN_TIME_DIGITS:
+        time_ns = int(path.stem)
+    else:
         return None
-    time_ns = int(Decimal(name) * NS_PER_S) if "." in name else int(name)
     if time_ns > MAX_TIME_NS:
         raise SourceError(f"{path}: time after the year 2262. Name it by nanoseconds since 1970")
     return time_ns
