@@ -18,7 +18,7 @@ from dmrl.flight.pilot import Command, Observation, Pilot
 from dmrl.flight.pilots import PILOTS
 from dmrl.recording import check, read, read_raw, read_summary, read_table, recover
 from dmrl.simulation.settings import Vision
-from dmrl.stages import fly, predict, track
+from dmrl.stages import convert, dataset, fly, predict, quantize, sketch, track
 from dmrl.stages.fly import Flags, Settings
 
 SHORT = recipes.load(
@@ -276,3 +276,19 @@ def test_the_command_line_takes_pilot_eye_and_distance(tmp_path: Path) -> None:
         "ideal",
         0.9,
     )
+
+
+@pytest.mark.slow
+def test_integers_and_c_fly_the_same_flight(tmp_path: Path) -> None:
+    sketch.run(tmp_path / "pictures", sketch.Settings(images=24))
+    convert.run(tmp_path / "pictures", tmp_path / "pictures.mcap", convert.Settings())
+    dataset.run([tmp_path / "pictures.mcap"], tmp_path / "drawn", dataset.Settings())
+    int8 = tmp_path / "int8"
+    quantize.run(Path("dmrl-nano"), tmp_path / "drawn", int8, quantize.Settings())
+    flown = []
+    for backend in ("integer", "c"):
+        out = tmp_path / f"{backend}.mcap"
+        fly.run(out, replace(DRAWN, eye=int8, backend=backend, duration_s=2.0))
+        flown.append(commands(out))
+    assert np.abs(flown[0]).max() > 0.1
+    np.testing.assert_array_equal(flown[0], flown[1])
