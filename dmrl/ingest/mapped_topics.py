@@ -51,6 +51,8 @@ def load_content(source: Path, options: Options) -> Content:
         If the table is wrong, or names a topic or a field that the source lacks.
     """
     table = read_column_map(Path(options.columns or ""), time_column=LOG_TIME)
+    if fixed := [key for key, column in table.columns.items() if column.value is not None]:
+        raise SourceError(f"[{fixed[0]}] value: constants are for text files. Name a field")
     options = replace(options, names={**table.renames, **options.names}, columns=None)
     is_bag = not foreign_recording.can_read(source)
     kinds = {topic: kind for topic, kind, count in _list_topics(source, is_bag=is_bag) if count}

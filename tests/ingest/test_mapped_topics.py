@@ -196,6 +196,10 @@ def test_topics_that_the_table_does_not_name_are_left_out_by_name(tmp_path: Path
 @pytest.mark.parametrize(
     ("text", "why"),
     [
+        (
+            '[height]\nvalue = 1\nunit = "m"\n',
+            r"\[height\] value: constants are for text files",
+        ),
         (TABLE.replace(":rate", ":turn"), r"no message on /red/att has a number in /red/att:turn"),
         (TABLE.replace("uwb:d", "radio:d"), r"no column /red/radio:d"),
         (TABLE.replace("uwb:d", "uwb:label"), r"has a number in /red/uwb:label"),
