@@ -303,12 +303,12 @@ def _lists_all_messages(
     for start, length in sorted(iter_extents(summary_section)):
         if start < at:
             raise corrupt_error(path, f"its summary lists two records that overlap at byte {start}")
-        if not _has_no_messages(path, stream, summary_section, at, start):
+        if not _has_nothing_new(path, stream, summary_section, at, start):
             return False
         at = start + length
     if at > end:
         raise corrupt_error(path, "its summary lists a record beyond the data section")
-    return _has_no_messages(path, stream, summary_section, at, end)
+    return _has_nothing_new(path, stream, summary_section, at, end)
 
 
 def iter_extents(summary_section: McapSummary) -> Iterator[tuple[int, int]]:
@@ -321,10 +321,10 @@ def iter_extents(summary_section: McapSummary) -> Iterator[tuple[int, int]]:
         yield attachment.offset, attachment.length
 
 
-def _has_no_messages(
+def _has_nothing_new(
     path: Path, stream: BoundedReader, summary_section: SummarySection, at: int, end: int
 ) -> bool:
-    """Return whether the records from ``at`` to ``end`` contain no message.
+    """Return whether the records from ``at`` to ``end`` contain no message, and no new definition.
 
     Metadata and attachments among them are added to the indexes of the section.
     """
@@ -336,8 +336,11 @@ def _has_no_messages(
         if opcode == Opcode.MESSAGE:
             return False
         if opcode in DEFINITIONS:
-            body = ReadDataStream(BytesIO(stream.read(length)))
-            summary_section.check_definitions(path, [DEFINITIONS[opcode].read(body)])
+            one = DEFINITIONS[opcode].read(ReadDataStream(BytesIO(stream.read(length))))
+            known = summary_section.schemas if opcode == Opcode.SCHEMA else summary_section.channels
+            if one.id not in known:
+                return False
+            summary_section.check_definitions(path, [one])
         elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             _add_index(summary_section, opcode, at, stream.read(length))
         at += RECORD_STRUCT.size + length
