@@ -214,7 +214,8 @@ def _decode_field(
     if field.message_type is not None:
         if sum(len(span.row) for span in found) > np.count_nonzero(present):
             data, start, end = merge_occurrences(data, count, found)
-        if field.containing_type.GetOptions().map_entry:  # an absent value of a map is empty
+        within = field.containing_type
+        if within is not None and within.GetOptions().map_entry:  # an absent value is empty
             present[:] = True
     return _decode_values(data, start, end, present, field)
 
