@@ -19,6 +19,7 @@ from dmrl.estimation.tracking.track_states import (
     FALSE_OBJECT,
     NOBODY,
     SEEN,
+    SILENT,
     P,
     TrackStates,
     cartesian_from_polar,
@@ -276,7 +277,8 @@ class Tracker:
     def _build_tracks(self) -> list[Track]:
         """Return the reported tracks.
 
-        A lasting tilt turns all positions alike, so images never reduce it. It is added here.
+        A lasting tilt turns all positions alike, so images never reduce it. It is added here, and so
+        is the error of a silent track that follows a false object.
         """
         states = self.states.select(np.flatnonzero(self.states.reported))
         mean, covariance = states.cartesian()
@@ -284,6 +286,8 @@ class Tracker:
         zero = np.zeros(len(x))
         tilt = self.tuning.tilt_bias_rad * np.stack([zero, z, -z, zero, y, -x], 1).reshape(-1, 3, 2)
         covariance[:, P, P] += tilt @ tilt.transpose(0, 2, 1)
+        silent = states.belief[:, SILENT] / states.existence
+        covariance[:, P, P] += self.tuning.capture_std_m**2 * silent[:, None, None] * np.eye(3)
         columns = (states.number, states.existence, states.age_s, states.unseen_s)
         return [
             Track(number, row[:3], row[3:], square, *rest)

@@ -33,6 +33,8 @@ class Tuning:
         Correlation time of these two states.
     edge_px
         Width of the margin of the image in which the detection probability falls.
+    capture_std_m
+        Error of a silent track, if what it follows may be a false object.
     confidence_s
         Correlation time of a detection's confidence.
     appearing_per_s
@@ -66,6 +68,7 @@ class Tuning:
     silent_share: float = 0.03
     visibility_s: float = 4.0
     edge_px: float = 8.0
+    capture_std_m: float = 0.25
     confidence_s: float = 0.5
     appearing_per_s: float = 0.3
     leaving_s: float = 200.0

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from dmrl.estimation.tracking.association import associate
 from dmrl.estimation.tracking.detector_rates import DetectorRates
 from dmrl.estimation.tracking.identity import TrackIdentity
-from dmrl.estimation.tracking.track_states import TrackStates
+from dmrl.estimation.tracking.track_states import SILENT, TrackStates
 from dmrl.estimation.tracking.tracker import Tracker
 from dmrl.estimation.tracking.tracker_input import EgoMotion, ImageDetections
 from dmrl.estimation.tracking.tuning import Tuning
@@ -373,8 +373,11 @@ def test_a_lasting_tilt_stays_in_the_covariance_however_many_images_come() -> No
     for _ in range(200):
         (track,) = tracker.step(STILL, view_of(xyz))
     plain = np.sqrt(tracker.states.cartesian()[1][0, 2, 2])
-    both = np.hypot(plain, TUNING.tilt_bias_rad * 1.5)
-    assert np.sqrt(track.covariance[2, 2]) == pytest.approx(both, rel=1e-3)
+    silent = tracker.states.belief[0, SILENT] / track.existence
+    captured = TUNING.capture_std_m * np.sqrt(silent)
+    wanted = np.linalg.norm([plain, TUNING.tilt_bias_rad * 1.5, captured])
+    assert np.sqrt(track.covariance[2, 2]) == pytest.approx(wanted, rel=1e-3)
+    assert silent < 0.01
 
 
 def test_one_detection_is_shared_by_two_tracks_and_its_owner_gets_most() -> None:
