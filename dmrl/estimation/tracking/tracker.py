@@ -277,8 +277,8 @@ class Tracker:
     def _build_tracks(self) -> list[Track]:
         """Return the reported tracks.
 
-        A lasting tilt turns all positions alike, so images never reduce it. It is added here, and so
-        is the error of a silent track that follows a false object.
+        A lasting tilt turns all positions alike, so images never reduce it. It is added here. So is
+        the error of a silent track that follows a false object.
         """
         states = self.states.select(np.flatnonzero(self.states.reported))
         mean, covariance = states.cartesian()
