@@ -102,6 +102,9 @@ def test_long_silences_end_loops_and_weak_detections_do_not() -> None:
         for name, found in (("all", mask()), ("short", short), ("long", long))
     }
     assert times == pytest.approx({"all": 40.0, "short": 40.0, "long": 20 / 2.5})
+    false = np.zeros(IMAGES)
+    false[[3, 4, 90]] = 1
+    assert compute_flight_figures(flight(false=false))["loop_s"] == pytest.approx(20 / 2.5)
 
 
 def test_silences_count_by_how_often_loops_are_at_their_distance() -> None:
