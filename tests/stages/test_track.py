@@ -10,6 +10,7 @@ from dmrl.errors import DmrlError, MissingTopic, OutputError, RecordingError, Se
 from dmrl.geometry.camera_file import format_camera
 from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.recorded_camera import find_recorded_camera
+from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter, read, read_raw, read_summary, trim
 from dmrl.recording.provenance_inputs import hash_file
 from dmrl.stages import evaluate, fly, track
@@ -93,6 +94,28 @@ def test_other_messages_stay_and_old_tracks_go(
     assert read_summary(again).topics[topics.TRACKS("cf1")].count == len(
         list(read(detected, topics.DETECTIONS("cf1")))
     )
+
+
+def test_the_rates_in_a_recording_are_those_of_the_tracker(detected: Path, tmp_path: Path) -> None:
+    """With rates of a detector whose detections are nearly all false, nobody is followed."""
+    told, out = tmp_path / "told.mcap", tmp_path / "out.mcap"
+    rates = {
+        "min_confidence": 0.2,
+        "distance_m": [0.5, 1.5],
+        "detected": [0.9, 0.5],
+        "false_per_image": 40.0,
+        "slope": 1.0,
+        "offset": -6.0,
+    }
+    with RecordingWriter(told, Provenance("test")) as sink:
+        for one in read(detected):
+            if one.topic == topics.DETECTIONS("cf1"):
+                one.message.rates.MergeFrom(message_class("DetectorRates")(**rates))
+            sink.write(one.time_ns, one.topic, one.message)
+    found = read_flight(told, topics.DETECTIONS).detections["cf1"].rates
+    assert found == {k: tuple(v) if isinstance(v, list) else v for k, v in rates.items()}
+    assert read_flight(detected, topics.DETECTIONS).detections["cf1"].rates is None
+    assert track.run(told, out, Settings())[0].tracks == 0
 
 
 def test_the_same_input_gives_the_same_bytes(detected: Path, tracked: Path, tmp_path: Path) -> None:
