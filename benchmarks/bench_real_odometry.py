@@ -144,7 +144,7 @@ def pair_of(one: Flown, other: Flown, rng: np.random.Generator) -> Pair:
     time_s, range_m = measured(one, other, rng)
     good = usable_ranges(time_s, range_m) & (time_s >= grid_s[0]) & (time_s <= grid_s[-1])
     return Pair(
-        grid_s, one.log.to_track(grid_s), other.log.track(grid_s), time_s[good], range_m[good]
+        grid_s, one.log.to_track(grid_s), other.log.to_track(grid_s), time_s[good], range_m[good]
     )
 
 
@@ -203,7 +203,7 @@ def _row(one: Flown, other: Flown, rng: np.random.Generator) -> tuple[float, ...
         seen.append(
             EvaluatedPositions(time_s - time_s[0], xy - true, spread, distance, status == OK)
         )
-    size = np.concatenate([one.size_m for one in seen])
+    size = np.concatenate([one.error_norm_m for one in seen])
     inside = np.concatenate([mahalanobis_squared(one) <= CHI2_95_OF_2 for one in seen])
     kept = np.concatenate([one.kept for one in seen])
     bad = float((size[kept] > GATE_M).mean()) if kept.any() else 0.0

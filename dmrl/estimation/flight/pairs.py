@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 
 from dmrl.estimation.filters import ekf
 from dmrl.estimation.flight.pair_solver import (
@@ -50,7 +50,7 @@ from dmrl.estimation.solver.keyframes import (
     range_dropout,
 )
 from dmrl.estimation.solver.levenberg_marquardt import Carried, Solver, relative_path
-from dmrl.estimation.solver.residuals import Values, odometry_factor
+from dmrl.estimation.solver.residuals import Values, odometry_factor, range_factor
 
 OUTPUT_HZ = 10.0
 """Rate of the estimates, Hz: positions between keyframes follow the odometry."""
@@ -59,8 +59,9 @@ SIGMA_INFLATION = 1.2
 simulated flights of 100 s: 95 % of the true positions are inside the 95 % ellipse at 1.1."""
 GATE_SIGMA_FACTOR = 0.75
 """Factor on the written sigmas that the gate uses."""
-CONTRADICTED_SIGMAS = 15.0
-"""Odometry that differs from the solution by more has dropped out for the status, in sigmas."""
+CONTRADICTED_SIGMAS, CONTRADICTED_RANGE_SIGMAS = 15.0, 3.0
+"""Odometry that differs from the solution by more has dropped out for the status, in sigmas; and so
+has a second in which most ranges differ by more."""
 RANGE_MEDIAN, RANGE_MARGIN_M = 21, 0.5
 """Number of ranges in the median that bounds a position; and margin of that bound, metres."""
 MIN_MOTION_ENERGY = 1.0
@@ -155,13 +156,37 @@ def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
         constants_covariance=solution.constants,
         modes=len(solution.modes),
     )
-    contradicted = np.zeros(len(key_s) - 1, bool)
-    for robot in range(2):
-        rows = odometry_factor(problem, problem.layout, robot, values)
-        contradicted |= (rows.square > CONTRADICTED_SIGMAS**2).any(axis=1)
-    step = np.clip(np.searchsorted(key_s, time_s, "right") - 1, 0, len(contradicted) - 1)
-    silent = odometry_dropout(pair, time_s) | contradicted[step]
+    step = np.clip(np.searchsorted(key_s, time_s, "right") - 1, 0, len(key_s) - 2)
+    silent = odometry_dropout(pair, time_s) | find_contradicted_steps(problem, values)[step]
     return Piece(estimate, silent, _sighted(solution, time_s), motion_energy(problem, values))
+
+
+def find_contradicted_steps(problem: Problem, values: Values) -> Mask:
+    """Return (S,) the steps at which odometry or most ranges contradict the solution.
+
+    The half second around them counts too.
+
+    Parameters
+    ----------
+    problem, values
+        Flight and its solution.
+    """
+    layout, wrong = problem.layout, np.zeros(len(problem.keyframe_s) - 1, bool)
+    for robot in range(len(problem.robots)):
+        rows = odometry_factor(problem, layout, robot, values)
+        wrong |= (rows.square > CONTRADICTED_SIGMAS**2).any(axis=1)
+    for k, (_, row) in enumerate(layout.states):
+        if row.motion and row.evolution == "fading":
+            error = np.abs(values.state[:, 3 * layout.robots + k]) / (row.std * problem.noise.grade)
+            wrong |= np.maximum(error[1:], error[:-1]) > CONTRADICTED_SIGMAS
+    around = round(MAX_DROPOUT_S / float(np.median(np.diff(problem.keyframe_s))))
+    for link in problem.links:
+        found = range_factor(problem, layout, link, values)
+        far = (found.weight * (found.square > CONTRADICTED_RANGE_SIGMAS**2)).sum(axis=1)
+        near = found.weight.sum(axis=1) - far
+        excess = uniform_filter1d(far - near, 2 * around + 1, mode="constant")
+        wrong |= np.maximum(excess[1:], excess[:-1]) > 0
+    return np.asarray(maximum_filter1d(wrong, 2 * around + 1))
 
 
 def _smooth_piece(pair: Pair, noise: NoiseModel | None) -> Piece:

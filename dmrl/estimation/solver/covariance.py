@@ -129,9 +129,13 @@ def _drop_noise(velocity: Array, raw: Array, problem: Problem, step_s: float) ->
     energy = (energy + np.roll(energy, 1, axis=1) + np.roll(energy, -1, axis=1)) / 3
     noise = 2 * (window**2).sum() / step_s * _noise_density(problem, hz, step_s)
     above = np.abs(hz) > MAX_MOTION_HZ
-    # A flight without motion shows no grade of its noise, but robots do not move that fast.
-    shown = (np.abs(_transform(raw, window, hop)[:, above]) ** 2).mean(axis=1).min()
-    louder = max(1.0, float(shown / noise[above].mean()))
+    # A flight without motion shows no grade of its noise, but no robot moves at twice this limit.
+    beyond = np.abs(hz) > 2 * MAX_MOTION_HZ
+    if beyond.any():
+        shown = (np.abs(_transform(raw, window, hop)[:, beyond]) ** 2).mean(axis=1).min()
+        louder = max(1.0, float(shown / noise[beyond].mean()))
+    else:
+        louder = 1.0
     bias_mps = next((row.std for row in problem.table if row.name == "vx_bias"), 0.0)
     noise[[-1, 0, 1]] += 2 * (window.sum() * bias_mps) ** 2 / 3
     # The energies of motion and noise add up to the measured one, so motion's share is the rest.

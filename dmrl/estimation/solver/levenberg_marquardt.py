@@ -17,6 +17,7 @@ from dmrl.estimation.solver.residuals import (
     Values,
     build_equations,
     linearize,
+    motion_gain,
     odometry_variance,
     total_cost,
 )
@@ -159,6 +160,9 @@ class Solver:
         noise, normalizer = self.problem.noise, 0.0
         for robot in range(len(self.problem.robots)):
             normalizer += float(np.log(odometry_variance(self.problem, robot)).sum()) / 2
+            # The noise is that of the true motion: a scale is no evidence by itself.
+            gains = motion_gain(self.layout, robot, found.values.constants)
+            normalizer -= len(self.problem.keyframe_s) * float(np.log(gains).sum())
         normalizer += sum(len(link.range_m) for link in self.problem.links) * float(
             np.log(noise.range_std_m)
         )

@@ -42,11 +42,14 @@ def select_model(problem: Problem, start: Values) -> tuple[Problem, MapEstimate]
     links = tuple(average_ranges(link, problem.keyframe_s) for link in problem.links)
     short = replace(problem, links=links)
     plain, likelihood, solution = _search_grade(short, start)
-    fading = replace(plain, table=with_rows(problem.table, RANGE_MODELS["fading"]))
-    solver = Solver(fading)
-    solved = solver.solve(solution.values, tolerance=ROUGH_TOLERANCE)
-    if solver.log_evidence(solved) > likelihood + FADING_MARGIN:
-        plain, _, solution = _search_grade(replace(short, table=fading.table), solved.values)
+    fading = replace(short, table=with_rows(problem.table, RANGE_MODELS["fading"]))
+    # Errors of ranges that fade look like noisy velocities, so both grades are tried.
+    for grade in {1.0, plain.noise.grade}:
+        solver = Solver(replace(fading, noise=_graded(short, grade)))
+        solved = solver.solve(solution.values, tolerance=ROUGH_TOLERANCE)
+        if solver.log_evidence(solved) > likelihood + FADING_MARGIN:
+            plain, _, solution = _search_grade(fading, solved.values)
+            break
     return replace(problem, table=plain.table, noise=plain.noise), solution
 
 

@@ -299,6 +299,15 @@ def odometry_variance(problem: Problem, robot: int) -> Array:
     return np.column_stack([shift, shift, turn])
 
 
+def motion_gain(layout: Layout, robot: int, constants: Array) -> Array:
+    """Return (2,) measured shift of a robot over its true shift, along x and y."""
+    gain = np.ones(2)
+    for row, c, constant in layout.of(robot):
+        if row.motion_scale and constant:
+            gain = gain + np.array(row.motion_scale) * constants[c]
+    return np.asarray(np.maximum(gain, 0.1))
+
+
 def odometry_factor(problem: Problem, layout: Layout, robot: int, values: Values) -> Rows:
     """Linearize the measured motions of one robot: predicted minus measured shift and turn."""
     steps, pose = problem.robots[robot], values.state[:, layout.pose(robot)]
@@ -309,12 +318,10 @@ def odometry_factor(problem: Problem, layout: Layout, robot: int, values: Values
     border = [c for row, c, constant in mine if constant and (row.motion or row.motion_scale)]
     size = len(columns)
     out = np.zeros((len(way), 3, 2 * size + len(border) + 1))
-    gain = np.ones(2)
+    gain = motion_gain(layout, robot, values.constants)
     for row, c, constant in mine:
         if row.motion_scale and constant:
-            factors = np.array(row.motion_scale)
-            gain = gain + factors * values.constants[c]
-            out[:, :2, 2 * size + border.index(c)] += way * factors
+            out[:, :2, 2 * size + border.index(c)] += way * np.array(row.motion_scale)
         if row.motion and constant:
             effect = row.motion(steps)
             out[:, :, 2 * size + border.index(c)] += effect

@@ -161,6 +161,12 @@ def test_a_late_clock_shows_what_was_a_moment_ago() -> None:
     # The turn rate is -0.3 + 0.3 sin t, so a step's turn changes by 0.3 cos t per second.
     middle = problem.keyframe_s[:-1] + 0.1
     assert by_clock[2:-2, 2] == pytest.approx(0.2 * 0.3 * np.cos(middle)[2:-2], abs=2e-3)
+    problem, values = flight()
+    layout, constants = problem.layout, values.constants.copy()
+    constants[layout.find("clock", 1)] = 0.1
+    late = odometry_factor(problem, layout, 1, Values(values.state, constants))
+    std = np.sqrt(problem.noise.yaw_rate_psd * 0.2)
+    assert late.rows[2:-2, 2, 0, -1] * std == pytest.approx(-0.1 * by_clock[2:-2, 2], abs=1e-4)
 
 
 def test_ranges() -> None:
