@@ -56,7 +56,8 @@ OUTPUT_HZ = 10.0
 """Rate of the estimates, Hz: positions between keyframes follow the odometry."""
 SIGMA_INFLATION = 1.1
 """Factor on the sigmas of a solution: no sensor has exactly the noise of its model. Chosen on 42
-simulated flights of 100 s: 95 % of the true positions and more are inside the 95 % ellipse in every group."""
+simulated flights of 100 s: in every group at least 95 % of the positions are in the 95 % ellipse.
+"""
 GATE_SIGMA_FACTOR = 0.75
 """Factor on the written sigmas that the gate uses."""
 CONTRADICTED_SIGMAS, CONTRADICTED_RANGE_SIGMAS = 15.0, 3.0
