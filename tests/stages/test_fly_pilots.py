@@ -131,7 +131,8 @@ def test_predict_and_track_find_in_the_recording_what_the_drone_found(
     )
     assert len(flown) == 29 and len(again) == 30
     for one, other in zip(flown, again, strict=False):
-        assert np.array(one) == pytest.approx(np.array(other), abs=1e-6)
+        # In flight the height is a mean over the past; dmrl track may use the future as well.
+        assert np.array(one) == pytest.approx(np.array(other), abs=0.02)
 
 
 def test_detections_are_used_one_image_late_and_tracks_say_so(ideal: Path) -> None:
