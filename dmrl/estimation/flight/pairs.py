@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
@@ -316,7 +316,7 @@ def join_estimates(estimates: Sequence[Estimate]) -> Estimate:
     """Join the estimates of the windows of a flight. The constants are those of the last one."""
     first = _first_samples(estimates)
 
-    def join(name: str) -> Array | None:
+    def join(name: str) -> Any:
         values = [getattr(one, name) for one in estimates]
         if any(value is None for value in values):
             return None

@@ -46,8 +46,8 @@ class SensorTrack:
     def select(self, samples: Mask) -> "SensorTrack":
         """Return some of the samples."""
         gap = None if self.height_dropout is None else self.height_dropout[samples]
-        signals = (signal[samples] for signal in self.signals())
-        return SensorTrack(*signals, self.dropout[samples], gap)
+        vx, vy, turn, height = (signal[samples] for signal in self.signals())
+        return SensorTrack(vx, vy, turn, height, self.dropout[samples], gap)
 
     def signals(self) -> tuple[Array, Array, Array, Array]:
         """Return vx, vy, yaw rate and height, (K,) each."""
@@ -150,7 +150,7 @@ class Pair:
         """Return the pair with observer and peer exchanged."""
         ranges = self.range_time_s, self.range_m
         sees = self.peer_bearings, self.own_bearings
-        known = {
+        known: dict[tuple[str, tuple[int, ...]], float] = {
             (name, own if len(own) == 2 else (1 - own[0],)): std
             for (name, own), std in self.known_std.items()
         }
@@ -162,11 +162,11 @@ class Pair:
         time_s = self.time_s[at]
         heard = (self.range_time_s >= time_s[0]) & (self.range_time_s <= time_s[-1])
         ranges = self.range_time_s[heard], self.range_m[heard]
-        sees = (
+        own, peer = (
             s and s.crop(time_s[0], time_s[-1]) for s in (self.own_bearings, self.peer_bearings)
         )
         return Pair(
-            time_s, self.own.select(at), self.peer.select(at), *ranges, *sees, self.known_std
+            time_s, self.own.select(at), self.peer.select(at), *ranges, own, peer, self.known_std
         )
 
 

@@ -10,6 +10,7 @@ of the odometry vanish. Slow motion that lasts has its energy at low frequencies
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dmrl.estimation.model.odometry import QUARTER_TURN, rotation_matrix
 from dmrl.estimation.model.pair import Array
@@ -18,6 +19,7 @@ from dmrl.estimation.solver.keyframes import Problem
 from dmrl.estimation.solver.levenberg_marquardt import Solver, relative_path
 from dmrl.estimation.solver.residuals import ConstantPrior, Rows, Values, build_equations
 
+Complex = NDArray[np.complex128]
 CALM_WINDOW_S = 20.0
 """Window of the transform, seconds: a slow robot keeps its velocity for a part of it."""
 MAX_MOTION_HZ = 1.0
@@ -102,11 +104,12 @@ def odometry_energy(problem: Problem, robot: int) -> float:
     motion, step_s = problem.robots[robot].motion, problem.robots[robot].steps_s
     heading = np.concatenate([[0.0], np.cumsum(motion.turn_rad)])[:-1]
     shift = (motion.shift_m[:, 0] + 1j * motion.shift_m[:, 1]) * np.exp(1j * heading)
-    calm = _drop_noise(shift / step_s, shift / step_s, problem, float(np.median(step_s)))
+    velocity: Complex = np.asarray(shift / step_s, complex)
+    calm = _drop_noise(velocity, velocity, problem, float(np.median(step_s)))
     return float((np.abs(calm) ** 2).mean() / problem.velocity_psd)
 
 
-def _drop_noise(velocity: Array, raw: Array, problem: Problem, step_s: float) -> Array:
+def _drop_noise(velocity: Complex, raw: Complex, problem: Problem, step_s: float) -> Complex:
     """Return a complex velocity (S,) with the frequencies that exceed their noise.
 
     Parameters
@@ -123,7 +126,7 @@ def _drop_noise(velocity: Array, raw: Array, problem: Problem, step_s: float) ->
         return velocity * 0
     hop = length // 2
     window = np.sin((np.arange(length) + 0.5) * np.pi / length)
-    hz = np.fft.fftfreq(length, step_s)
+    hz: Array = np.asarray(np.fft.fftfreq(length, step_s), float)
     found = _transform(velocity, window, hop)
     energy = np.abs(found) ** 2
     energy = (energy + np.roll(energy, 1, axis=1) + np.roll(energy, -1, axis=1)) / 3
@@ -148,12 +151,13 @@ def _drop_noise(velocity: Array, raw: Array, problem: Problem, step_s: float) ->
     return out[hop : hop + len(velocity)]
 
 
-def _transform(velocity: Array, window: Array, hop: int) -> Array:
+def _transform(velocity: Complex, window: Array, hop: int) -> Complex:
     """Return (W, length) Fourier transforms of overlapping windows of a velocity."""
-    mode = "reflect" if len(velocity) > len(window) + hop else "wrap"
-    padded = np.pad(velocity, (hop, len(window) + hop), mode=mode)
+    ends = (hop, len(window) + hop)
+    long = len(velocity) > len(window) + hop
+    padded = np.pad(velocity, ends, mode="reflect") if long else np.pad(velocity, ends, "wrap")
     starts = np.arange(0, len(padded) - len(window) + 1, hop)
-    return np.fft.fft(padded[starts[:, None] + np.arange(len(window))] * window, axis=1)
+    return np.asarray(np.fft.fft(padded[starts[:, None] + np.arange(len(window))] * window, axis=1))
 
 
 def _noise_density(problem: Problem, hz: Array, step_s: float) -> Array:

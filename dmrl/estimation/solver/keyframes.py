@@ -313,11 +313,11 @@ def _cut_link(
     inside = (pair.range_time_s >= key_s[0]) & (pair.range_time_s <= key_s[-1])
     at_s = pair.range_time_s[inside]
     key = nearest_keyframe(key_s, at_s)
-    shifts = [robots[k].path.relative_motion(key_s[key], at_s).shift_m for k in both]
+    own, peer = (robots[k].path.relative_motion(key_s[key], at_s).shift_m for k in both)
     height_m = np.interp(at_s, pair.time_s, pair.peer.height_m - pair.own.height_m)
     guess = range_step_offsets(pair)[inside]
     ones = np.ones(len(key))
-    return RangeLink(both, key, at_s, pair.range_m[inside], ones, *shifts, height_m, guess)
+    return RangeLink(both, key, at_s, pair.range_m[inside], ones, own, peer, height_m, guess)
 
 
 def _cut_view(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dmrl.estimation.model.bearings import subtract_bearings
 from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation_matrix
@@ -210,7 +211,7 @@ class CarriedPrior:
         slope = self.information @ off + self.vector
         best = np.linalg.lstsq(self.information, -self.vector, rcond=None)[0]
         apart = off - best
-        return slope, float(max(apart @ self.information @ apart, 0.0))
+        return slope, max(float(apart @ self.information @ apart), 0.0)
 
     def cost(self) -> float:
         """Return half the loss."""
@@ -379,7 +380,7 @@ def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Valu
     border = [c for _, c, constant, _ in used if constant]
     columns = layout.pose(link.robots[0]) + layout.pose(link.robots[1]) + states
     out = np.zeros((len(distance), len(columns) + len(border) + 1))
-    gain, error, heights = 1.0, np.zeros(len(distance)), []
+    gain, error, heights = np.ones(len(distance)), np.zeros(len(distance)), []
     for row, c, constant, side in used:
         column = len(columns) + border.index(c) if constant else columns.index(c)
         value = values.constants[c] if constant else values.state[link.keyframe, c]
@@ -393,12 +394,11 @@ def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Valu
             effect = row.range(link, distance)
             out[:, column] = effect
             error = error + effect * value
-    gain = np.broadcast_to(gain, distance.shape)[:, None]
-    out[:, heights] *= gain
-    out[:, 0:2], out[:, 3:5] = -gain * towards, gain * towards
+    out[:, heights] *= gain[:, None]
+    out[:, 0:2], out[:, 3:5] = -gain[:, None] * towards, gain[:, None] * towards
     for column, by_turn in ((2, at.by_own_turn), (5, at.by_peer_turn)):
-        out[:, column] = gain[:, 0] * (towards * by_turn).sum(axis=1)
-    out[:, -1] = gain[:, 0] * distance + error - link.range_m
+        out[:, column] = gain * (towards * by_turn).sum(axis=1)
+    out[:, -1] = gain * distance + error - link.range_m
     out /= (problem.noise.range_std_m * link.std_share)[:, None]
     return _pad_rows(
         out[:, None], link.keyframe, np.ones(len(out)), len(values.state),
@@ -462,7 +462,7 @@ def rotate_rows(by_offset: Array, by_turn: Array) -> Array:
 
 def _pad_rows(
     rows: Array,
-    keyframe: Array,
+    keyframe: NDArray[np.intp],
     weight: Array,
     keyframes: int,
     rest: tuple[list[int], list[int], Loss],
