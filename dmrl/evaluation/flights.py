@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import RecordingError
@@ -95,8 +96,8 @@ def _follow_peers(flight: FlightLog, robot: str, peers: list[str]) -> list[PairF
 
 
 def _match_detections(
-    sight: ObserverLog, truth: Array, shown: Array, threshold: Array
-) -> tuple[Array, Array]:
+    sight: ObserverLog, truth: Array, shown: NDArray[np.bool_], threshold: Array
+) -> tuple[NDArray[np.bool_], Array]:
     """Return (J, K) whether peers are detected, and (K,) detections of nobody, at a threshold."""
     count = np.diff(sight.first_row)
     image = np.repeat(np.arange(len(count)), count)

@@ -96,7 +96,7 @@ class TrackStates:
         velocity = self.mean[:, V] @ turn.T
         place_m: Array = (before_m - motion.shift_m) @ turn.T + reach_s * velocity
         polar = _polar_from_cartesian(place_m)
-        back = np.linalg.inv(cartesian_from_polar(polar)[1])
+        back = np.asarray(np.linalg.inv(cartesian_from_polar(polar)[1]), float)
         move = np.zeros((len(self), 7, 7))
         move[:, P, P], move[:, P, V] = back @ turn @ by_polar, back @ (reach_s * turn)
         move[:, V, V], move[:, BIAS, BIAS] = calm * turn, keep

@@ -8,7 +8,6 @@ All tracks are rows of arrays of fixed layout, and a step has no loop over them.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import chi2
 
@@ -178,7 +177,7 @@ class Tracker:
         """Update all tracks; return (N,) probabilities that a detection belongs to none."""
         states, t = self.states, self.tuning
         mean, row, noise = self._predict_measurement(view)
-        ahead: NDArray[np.bool_] = np.isfinite(mean).all(axis=1)
+        ahead = np.asarray(np.isfinite(mean).all(axis=1))
         row[~ahead], noise[~ahead] = 0.0, np.eye(3)
         base = row @ states.covariance @ row.transpose(0, 2, 1) + noise
         spread = base[:, None] + self._depth_noise(view)

@@ -134,7 +134,7 @@ def _read_description(source: Path) -> _Description:
 
 def _read_splits(source: Path, told: Mapping[str, Any]) -> dict[str, str]:
     """Return the splits of folders and pictures, which other machines may have named."""
-    splits = {}
+    splits: dict[str, str] = {}
     for split in SPLIT_KEYS:
         stated = told.get(split) or []
         for text in [stated] if isinstance(stated, str) else stated:
