@@ -13,10 +13,10 @@ from dmrl.errors import RecordingError
 from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import Provenance, read_raw, rewrite, trim
 
+from ..mcap_layout import Chunk, Layout, Message
+from ..mcap_layout import Writer as FileWriter
 from ..records import channels, chunks, packed, unchanged
 from ..walk import walk
-from ..wrong_meaning import Chunk, Layout, Message
-from ..wrong_meaning import Writer as FileWriter
 
 MADE = Provenance("test")
 
