@@ -28,6 +28,7 @@ EXTRAS = {
     "plot": "figures of cards and evaluations",
     "bayer": "raw pictures of the AI-deck",
     "ros": "ROS bags, in and out",
+    "yolo": "data.yaml of YOLO sets",
     "table": "dmrl convert --to csv",
     "record": "dmrl record; cflib: GPL-3.0",
     "deploy": "ONNX: dmrl export, predict",

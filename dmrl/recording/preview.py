@@ -10,7 +10,7 @@ from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.mcap.batch_reader import iter_batches, select_chunks
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk_reader import read_chunk
+from dmrl.recording.mcap.chunks.chunk_reader import read_chunk
 from dmrl.recording.mcap.file import open_mcap
 from dmrl.recording.mcap.message_batch import MessageBatch, concatenate_all
 from dmrl.recording.mcap.summary_section import read_summary_section

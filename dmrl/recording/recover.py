@@ -1,19 +1,11 @@
 """Recover the messages of a truncated or corrupt recording."""
 
-import struct
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from io import BytesIO
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     Chunk,
@@ -23,7 +15,6 @@ from mcap.records import (
     Schema,
 )
 from mcap.records import Channel as McapChannel
-from mcap.summary import Summary as McapSummary
 
 from dmrl.errors import RecordingError
 from dmrl.guards import limits
@@ -31,58 +22,30 @@ from dmrl.recording.attachments import copy_metadata_and_attachments
 from dmrl.recording.copying.chunk_copy import CopyUnit, adopt_definitions, write_unit
 from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.batch_reader import count_messages
-from dmrl.recording.mcap.channel import ChannelTable
-from dmrl.recording.mcap.chunk import ParsedChunk, batch_from_messages, decompress, parse_records
-from dmrl.recording.mcap.extra_records import has_valid_crc
+from dmrl.recording.mcap.chunks.chunk import (
+    ParsedChunk,
+    batch_from_messages,
+    decompress,
+    parse_records,
+)
 from dmrl.recording.mcap.file import (
     CORRUPTION_ERRORS,
     MAGIC,
-    RECORD_STRUCT,
     BoundedReader,
     over_budget_error,
 )
 from dmrl.recording.mcap.message_batch import MessageBatch
-from dmrl.recording.mcap.message_index import ENTRY_BYTES
-from dmrl.recording.mcap.summary_section import read_raw_section
 from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
 from dmrl.recording.provenance_inputs import hash_file
 from dmrl.recording.recovery_report import Recovery
+from dmrl.recording.recovery_scan import (
+    IndexedCount,
+    RecoveryState,
+    iter_records,
+    read_listed_section,
+)
 from dmrl.recording.summary import Definitions, Summary
 from dmrl.recording.writer import RECIPE_NAME, RecordingWriter
-
-MESSAGE_INDEX_HEADER = struct.Struct(
-    "<HI"
-)  # of a Message Index record: channel id, bytes of entries
-
-
-class _IndexedCount(NamedTuple):
-    """Number of messages that a message index lists for a channel."""
-
-    channel: int
-    messages: int
-
-
-@dataclass(slots=True)
-class _RecoveryState:
-    """State while the records of a file are read one after the other."""
-
-    path: Path
-    recovery: Recovery
-    summary_section: McapSummary  # Summary section, as far as it can be read
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: ChannelTable = field(default_factory=ChannelTable)
-    channel_records: dict[int, McapChannel] = field(default_factory=dict)  # Channel records
-    incomplete: dict[int, str] = field(default_factory=dict)  # topics without their schema
-    metadata: dict[str, list[dict[str, str]]] = field(default_factory=dict)
-    attachments: list[Attachment] = field(default_factory=list)
-    counts: Counter[int] = field(default_factory=Counter)  # messages by channel id
-    skipped: Counter[int] = field(default_factory=Counter)  # in corrupt chunks, by their indexes
-    running_checksums: checksums.Checksums = field(default_factory=checksums.Checksums)
-    extras: int = 0  # number of metadata and attachments
-    chunks: int = 0
-    unpacked: int = 0
-    footer: bool = False
-    data_ended: bool = False
 
 
 def recover(path: Path, out: Path) -> Recovery:
@@ -112,7 +75,7 @@ def recover(path: Path, out: Path) -> Recovery:
             raise RecordingError(
                 f"{path} does not begin like a recording: nothing to recover. Make it again"
             )
-        state = _RecoveryState(path, Recovery(), _read_summary_section(path, stream))
+        state = RecoveryState(path, Recovery(), read_listed_section(path, stream))
         for record in (
             *state.summary_section.schemas.values(),
             *state.summary_section.channels.values(),
@@ -139,14 +102,14 @@ def recover(path: Path, out: Path) -> Recovery:
     return state.recovery
 
 
-def _is_worthless(state: _RecoveryState) -> bool:
+def _is_worthless(state: RecoveryState) -> bool:
     """Return whether a damaged file without messages has nothing that dmrl does not make itself."""
     damaged = state.recovery.damaged_chunks or state.recovery.lost_bytes or not state.footer
     extras = {*state.metadata, *(one.name for one in state.attachments)}
     return bool(damaged) and extras <= {METADATA_NAME, RECIPE_NAME}
 
 
-def _build_provenance(state: _RecoveryState) -> Provenance:
+def _build_provenance(state: RecoveryState) -> Provenance:
     own = None
     if METADATA_NAME in state.metadata:
         try:
@@ -157,27 +120,17 @@ def _build_provenance(state: _RecoveryState) -> Provenance:
     return Provenance("recover", inputs=(source,))
 
 
-def _read_summary_section(
-    path: Path, stream: BoundedReader, start: int | None = None
-) -> McapSummary:
-    """Read the Summary section at ``start`` or where the Footer points; empty if corrupt."""
-    try:
-        return read_raw_section(path, stream, start)[0] or McapSummary()
-    except (RecordingError, *CORRUPTION_ERRORS):
-        return McapSummary()
-
-
-def _iter_units(stream: BoundedReader, state: _RecoveryState) -> Iterator[CopyUnit]:
+def _iter_units(stream: BoundedReader, state: RecoveryState) -> Iterator[CopyUnit]:
     """Yield everything that is readable and has a known topic, in file order."""
     damaged = False  # whether the chunk before the next message indexes is corrupt
-    for at, record in _iter_records(stream, state):
+    for at, record in iter_records(stream, state):
         if isinstance(record, Chunk):
             state.chunks += 1
             scan = _load_chunk(stream, state, record, at)
             damaged = scan is None
             if scan is not None:
                 yield from _iter_valid_units(state, scan.batch, record, scan)
-        elif isinstance(record, _IndexedCount):
+        elif isinstance(record, IndexedCount):
             if damaged:
                 state.skipped[record.channel] += record.messages
         elif isinstance(record, Message):
@@ -198,7 +151,7 @@ def _is_foreign_checksum(record: McapRecord, at: int) -> bool:
 
 
 def _load_chunk(
-    stream: BoundedReader, state: _RecoveryState, chunk: Chunk, at: int
+    stream: BoundedReader, state: RecoveryState, chunk: Chunk, at: int
 ) -> ParsedChunk | None:
     """Return the records of a chunk and register its definitions; None if it is corrupt."""
     try:
@@ -216,7 +169,7 @@ def _load_chunk(
 
 
 def _iter_valid_units(
-    state: _RecoveryState,
+    state: RecoveryState,
     batch: MessageBatch,
     chunk: Chunk | None = None,
     others: ParsedChunk | None = None,
@@ -234,97 +187,7 @@ def _iter_valid_units(
         yield CopyUnit(batch, state.channels, chunk, others)
 
 
-def _iter_records(
-    stream: BoundedReader, state: _RecoveryState
-) -> Iterator[tuple[int, McapRecord | _IndexedCount]]:
-    """Yield offset and record up to the footer, skipping corrupt ranges."""
-    listed_offsets = sorted(_iter_listed_offsets(stream, state.summary_section))
-    at = len(MAGIC)
-    while at < stream.size and not state.footer:
-        later = bisect_right(listed_offsets, at)
-        edge = listed_offsets[later] if later < len(listed_offsets) else stream.size
-        try:
-            record, end = _parse_record_at(stream, state, at, edge)
-        except CORRUPTION_ERRORS:  # continue at the next record that the Summary section lists
-            state.recovery.lost_bytes += edge - at
-            at = edge
-            continue
-        if record is not None:
-            yield at, record
-        at = end
-
-
-def _iter_listed_offsets(stream: BoundedReader, section: McapSummary) -> Iterator[int]:
-    """Yield the offsets that the Summary section lists, where there is such a record."""
-    listed = [
-        *(
-            (Opcode.CHUNK, one.chunk_start_offset, one.chunk_length)
-            for one in section.chunk_indexes
-        ),
-        *((Opcode.METADATA, one.offset, one.length) for one in section.metadata_indexes),
-        *((Opcode.ATTACHMENT, one.offset, one.length) for one in section.attachment_indexes),
-    ]
-    for opcode, at, length in listed:
-        if at + length <= stream.size and length >= RECORD_STRUCT.size:
-            stream.seek(at)
-            head = stream.read(RECORD_STRUCT.size)
-            if head == RECORD_STRUCT.pack(opcode, length - RECORD_STRUCT.size):
-                yield at
-
-
-def _parse_record_at(
-    stream: BoundedReader, state: _RecoveryState, at: int, edge: int
-) -> tuple[McapRecord | _IndexedCount | None, int]:
-    """Read the record at an offset; return it, or None if it is unused, and its end.
-
-    A record that would end after ``edge``, where a listed record starts, is corrupt.
-    """
-    stream.seek(at)
-    opcode, length = RECORD_STRUCT.unpack(stream.read(RECORD_STRUCT.size))
-    end = at + RECORD_STRUCT.size + length
-    if end > edge:
-        raise McapError("a record overlaps the next listed record")
-    record = _parse_record(opcode, stream.read(length), state)
-    if opcode == Opcode.DATA_END:
-        state.data_ended = True
-        if state.summary_section.statistics is None:
-            state.summary_section = _read_summary_section(state.path, stream, end)
-    elif state.data_ended and opcode in (Opcode.CHUNK, Opcode.MESSAGE):
-        state.recovery.doubtful = True  # not allowed after the data section
-    state.footer |= opcode == Opcode.FOOTER
-    return record, end
-
-
-_RECORD_TYPES: dict[int, type[Any]] = {
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: McapChannel,
-    Opcode.CHUNK: Chunk,
-    Opcode.ATTACHMENT: Attachment,
-    Opcode.METADATA: Metadata,
-}
-
-
-def _parse_record(
-    opcode: int, body: bytes, state: _RecoveryState
-) -> McapRecord | _IndexedCount | None:
-    """Parse a record from its body; return None for an unused type."""
-    if opcode == Opcode.MESSAGE:
-        message: Message = Message.read(ReadDataStream(BytesIO(body)), len(body))
-        return message
-    if opcode == Opcode.MESSAGE_INDEX:
-        number, size = MESSAGE_INDEX_HEADER.unpack_from(body)
-        return _IndexedCount(number, size // ENTRY_BYTES)
-    if opcode not in _RECORD_TYPES:
-        return None
-    record: McapRecord = _RECORD_TYPES[opcode].read(ReadDataStream(BytesIO(body)))
-    if isinstance(record, Attachment) and not has_valid_crc(record, body):
-        state.recovery.doubtful = True
-    if isinstance(record, Metadata) and record.name != checksums.METADATA_NAME:
-        state.running_checksums.add_metadata(RECORD_STRUCT.pack(opcode, len(body)) + body)
-    return record
-
-
-def _register_record(state: _RecoveryState, record: McapRecord) -> None:
+def _register_record(state: RecoveryState, record: McapRecord) -> None:
     """Register a definition, metadata record or attachment."""
     match record:
         case Schema():
@@ -347,7 +210,7 @@ def _register_record(state: _RecoveryState, record: McapRecord) -> None:
             state.attachments.append(record)
 
 
-def _complete_report(state: _RecoveryState) -> None:
+def _complete_report(state: RecoveryState) -> None:
     """Complete the report: compare the recovered messages with the file's statistics."""
     recovery, section = state.recovery, state.summary_section
     statistics, found = section.statistics, state.counts.total()

@@ -18,8 +18,8 @@ from dmrl.errors import OutputError, RecordingError
 from dmrl.messages import message_class as message_class
 from dmrl.messages import serialize_schema
 from dmrl.recording.mcap.channel import Channel, RawMessage
-from dmrl.recording.mcap.chunk_builder import ChunkBuilder
-from dmrl.recording.mcap.chunk_writer import OPEN_CHUNK_AGE_MAX, ChunkWriter
+from dmrl.recording.mcap.chunks.chunk_builder import ChunkBuilder
+from dmrl.recording.mcap.chunks.chunk_writer import OPEN_CHUNK_AGE_MAX, ChunkWriter
 from dmrl.recording.mcap.file_writer import McapFileWriter
 from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, Ints
 from dmrl.recording.protobuf.encode import ColumnValue, encode

@@ -17,7 +17,7 @@ from mcap.writer import Writer
 from dmrl.errors import RecordingError
 from dmrl.guards import limits
 from dmrl.messages import serialize_schema
-from dmrl.recording.mcap.chunk import decompress
+from dmrl.recording.mcap.chunks.chunk import decompress
 
 MAGIC = b"\x89MCAP0\r\n"
 HEIGHT = serialize_schema("Height")

@@ -22,7 +22,7 @@ from dmrl.recording import (
     reader,
     sample_topics,
 )
-from dmrl.recording.mcap import chunk_builder, chunk_reader
+from dmrl.recording.mcap.chunks import chunk_builder, chunk_reader
 
 HEIGHT = message_class("Height")
 

@@ -22,7 +22,7 @@ from dmrl.recording import (
     read_table,
     recover,
 )
-from dmrl.recording.mcap import chunk_reader
+from dmrl.recording.mcap.chunks import chunk_reader
 
 HEIGHT = message_class("Height")
 

@@ -12,7 +12,7 @@ from dmrl import card, topics
 from dmrl.messages import message_class
 from dmrl.recording import RecordingWriter, build_provenance, check, merge, read_summary, trim
 from dmrl.recording.copying.chunk_copy import TopicSelection, copy_messages
-from dmrl.recording.mcap import chunk_builder, chunk_reader
+from dmrl.recording.mcap.chunks import chunk_builder, chunk_reader
 from dmrl.stages import dataset, evaluate, fly, label, track
 
 Passes = Callable[[Path], float]

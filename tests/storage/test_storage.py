@@ -17,7 +17,7 @@ from dmrl.images.codec import encode_png
 from dmrl.messages import message_class
 from dmrl.pipeline.batch import build_tasks, find_recordings
 from dmrl.recording import LoadedRecording, Provenance, RecordingWriter, iter_columns, read_summary
-from dmrl.recording.mcap.chunk_reader import locate_chunk
+from dmrl.recording.mcap.chunks.chunk_reader import locate_chunk
 from dmrl.recording.mcap.file import open_mcap
 from dmrl.recording.mcap.summary_section import read_verified_section
 from dmrl.recording.provenance_inputs import build_input, hash_file

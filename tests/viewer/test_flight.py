@@ -12,7 +12,7 @@ from dmrl import recipe as recipes
 from dmrl.colours import RGB, STATUS_RGB
 from dmrl.errors import SettingError
 from dmrl.recording import reader, sample_topics
-from dmrl.recording.mcap import chunk_builder, chunk_reader
+from dmrl.recording.mcap.chunks import chunk_builder, chunk_reader
 from dmrl.stages import fly as fly_stage
 from dmrl.viewer import Settings, save, scene
 from dmrl.viewer.session import prepare_show

@@ -20,8 +20,8 @@ from dmrl.images.codec import UNDECODABLE, decode
 from dmrl.messages import message_class
 from dmrl.recording.mcap.batch_reader import count_messages, select_chunks
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk import ParsedChunk
-from dmrl.recording.mcap.chunk_reader import locate_chunk, read_chunk_for_copy
+from dmrl.recording.mcap.chunks.chunk import ParsedChunk
+from dmrl.recording.mcap.chunks.chunk_reader import locate_chunk, read_chunk_for_copy
 from dmrl.recording.mcap.file import open_mcap
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS, MessageBatch
 from dmrl.recording.mcap.message_count import check_counts

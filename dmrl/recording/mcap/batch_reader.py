@@ -14,8 +14,8 @@ from mcap.records import ChunkIndex
 from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk import select_channels
-from dmrl.recording.mcap.chunk_reader import locate_chunk, read_chunk
+from dmrl.recording.mcap.chunks.chunk import select_channels
+from dmrl.recording.mcap.chunks.chunk_reader import locate_chunk, read_chunk
 from dmrl.recording.mcap.file import BoundedReader, open_mcap
 from dmrl.recording.mcap.message_batch import (
     EMPTY_BATCH,

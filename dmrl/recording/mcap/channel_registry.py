@@ -7,7 +7,7 @@ from mcap.records import Channel as McapChannel
 from mcap.records import Schema
 
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk import RECORD_HEADER_BYTES, ParsedChunk
+from dmrl.recording.mcap.chunks.chunk import RECORD_HEADER_BYTES, ParsedChunk
 from dmrl.recording.mcap.file_writer import serialize
 from dmrl.recording.mcap.message_batch import MessageBatch
 

@@ -13,7 +13,7 @@ from mcap.records import Statistics
 
 from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk_reader import locate_chunk, read_chunk
+from dmrl.recording.mcap.chunks.chunk_reader import locate_chunk, read_chunk
 from dmrl.recording.mcap.extra_records import read_metadata
 from dmrl.recording.mcap.file import BoundedReader, corrupt_error
 from dmrl.recording.mcap.file_cache import get_cached

@@ -10,7 +10,7 @@ from mcap.stream_reader import StreamReader
 
 from dmrl.guards import limits
 from dmrl.recording.mcap.channel import ChannelTable
-from dmrl.recording.mcap.chunk import (
+from dmrl.recording.mcap.chunks.chunk import (
     batch_from_messages,
     decompress,
     parse_records,

@@ -9,7 +9,6 @@ import zlib
 from collections.abc import Iterable, Iterator
 from functools import cached_property
 from io import BytesIO
-from itertools import chain
 from pathlib import Path
 
 from mcap.data_stream import ReadDataStream
@@ -28,7 +27,6 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader
 from mcap.summary import Summary as McapSummary
 
-from dmrl.guards import limits
 from dmrl.recording.mcap.channel import ChannelTable, build_channels
 from dmrl.recording.mcap.file import (
     DEFINITIONS,
@@ -37,10 +35,14 @@ from dmrl.recording.mcap.file import (
     RECORD_STRUCT,
     BoundedReader,
     corrupt_error,
-    over_budget_error,
 )
 from dmrl.recording.mcap.file_cache import get_cached
-from dmrl.recording.mcap.message_batch import MAX_TIME_NS
+from dmrl.recording.mcap.summary_checks import (
+    check_budget,
+    check_extra_counts,
+    check_statistics,
+    check_times,
+)
 
 DATA_OPCODES = {
     Opcode.HEADER,
@@ -139,12 +141,12 @@ def read_verified_section(path: Path, stream: BoundedReader) -> SummarySection |
     summary_section, start = read_raw_section(path, stream)
     if summary_section is None or not _indexes_messages(summary_section):
         return None
-    _check_budget(path, stream, summary_section)
-    _check_statistics(path, summary_section)
-    _check_times(path, summary_section)
+    check_budget(path, stream, summary_section)
+    check_statistics(path, summary_section)
+    check_times(path, summary_section)
     if not _lists_all_messages(path, stream, summary_section, start):
         return None
-    _check_extra_counts(path, summary_section)
+    check_extra_counts(path, summary_section)
     return summary_section
 
 
@@ -227,66 +229,6 @@ def _indexes_messages(summary_section: McapSummary) -> bool:
         bool(summary_section.schemas) or not any(c.schema_id for c in channels.values())
     )
     return (defined and bool(summary_section.chunk_indexes)) or not some
-
-
-def _check_budget(path: Path, stream: BoundedReader, summary_section: McapSummary) -> None:
-    if max(len(summary_section.channels), len(summary_section.schemas)) > limits.TOPICS:
-        raise over_budget_error(path, f"it has more than {limits.TOPICS} topics or message types")
-    names = chain(
-        (c.topic for c in summary_section.channels.values()),
-        (s.name for s in summary_section.schemas.values()),
-    )
-    if longest := [name for name in names if len(name) > limits.NAME_CHARACTERS]:
-        raise over_budget_error(
-            path, f"the name {longest[0][:20]}... has {len(longest[0])} characters"
-        )
-    size = sum(chunk.uncompressed_size for chunk in summary_section.chunk_indexes)
-    if size > limits.max_unpacked_bytes(stream.size):
-        raise over_budget_error(
-            path, f"{stream.size / 1e6:.1f} MB of recording unpack to {size / 1e6:.0f} MB"
-        )
-
-
-def _check_statistics(path: Path, summary_section: McapSummary) -> None:
-    """Raise unless Statistics, chunk indexes and channels agree with each other."""
-    counts = summary_section.statistics.channel_message_counts if summary_section.statistics else {}
-    mentioned = {number for number, count in counts.items() if count}
-    for chunk in summary_section.chunk_indexes:
-        mentioned.update(chunk.message_index_offsets)
-    if unknown := mentioned - summary_section.channels.keys():
-        raise corrupt_error(path, f"its summary lacks channel {min(unknown)}")
-    for channel in summary_section.channels.values():
-        if channel.schema_id and channel.schema_id not in summary_section.schemas:
-            raise corrupt_error(path, f"its summary lacks the message type of {channel.topic}")
-    statistics = summary_section.statistics
-    if statistics is None:
-        return
-    if counts and sum(counts.values()) != statistics.message_count:
-        raise corrupt_error(path, "its statistics contradict themselves")
-    found, number = len(summary_section.chunk_indexes), statistics.chunk_count
-    if found and found != number:
-        raise corrupt_error(path, f"its summary lists {found} of {number} chunks")
-
-
-def _check_extra_counts(path: Path, summary_section: McapSummary) -> None:
-    """Raise unless there are as many metadata and attachments as Statistics states."""
-    statistics = summary_section.statistics
-    for what, number, indexes in (
-        (
-            ("metadata records", statistics.metadata_count, summary_section.metadata_indexes),
-            ("attachments", statistics.attachment_count, summary_section.attachment_indexes),
-        )
-        if statistics
-        else ()
-    ):
-        if len(indexes) != number:
-            raise corrupt_error(path, f"it has {len(indexes)} of {number} {what}")
-
-
-def _check_times(path: Path, summary_section: McapSummary) -> None:
-    latest = max((chunk.message_end_time for chunk in summary_section.chunk_indexes), default=0)
-    if latest >= MAX_TIME_NS:
-        raise corrupt_error(path, "a message has a time beyond the year 2262")
 
 
 def _lists_all_messages(

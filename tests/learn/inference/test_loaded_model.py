@@ -269,6 +269,7 @@ def test_a_model_is_described_by_what_it_is() -> None:
         "outputs": ["log_depth", "confidence", "offset_u", "offset_v", "log_spread"],
         "threshold": 0.25,
         "label_source": "truth",
+        "rates": None,
         "training": {"epochs": 3},
     }
 

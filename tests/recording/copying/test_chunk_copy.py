@@ -18,7 +18,7 @@ from dmrl.recording import (
     rewrite,
     trim,
 )
-from dmrl.recording.mcap import chunk_reader
+from dmrl.recording.mcap.chunks import chunk_reader
 
 from ..records import channels, chunks, packed, unchanged
 

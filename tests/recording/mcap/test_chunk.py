@@ -14,7 +14,7 @@ from mcap.records import Chunk, Message
 
 from dmrl.errors import RecordingError
 from dmrl.guards import limits
-from dmrl.recording.mcap.chunk import (
+from dmrl.recording.mcap.chunks.chunk import (
     batch_from_messages,
     build_batch_at,
     decompress,

@@ -14,12 +14,12 @@ from mcap.records import Schema
 from dmrl.errors import RecordingError
 from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import Provenance, RawMessage, RecordingWriter, read_raw
-from dmrl.recording.mcap import chunk_builder as room
 from dmrl.recording.mcap.batch_reader import iter_batches
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.channel_registry import ChannelRegistry, _find_free_id
-from dmrl.recording.mcap.chunk import ParsedChunk, parse_records
-from dmrl.recording.mcap.chunk_builder import ChunkBuilder
+from dmrl.recording.mcap.chunks import chunk_builder as room
+from dmrl.recording.mcap.chunks.chunk import ParsedChunk, parse_records
+from dmrl.recording.mcap.chunks.chunk_builder import ChunkBuilder
 from dmrl.recording.mcap.file_writer import serialize
 from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, MessageBatch
 from dmrl.recording.mcap.message_index import parse_index_entries

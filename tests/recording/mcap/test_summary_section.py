@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from dmrl.errors import RecordingError
-from dmrl.recording.mcap.summary_section import _check_extra_counts, _check_statistics
+from dmrl.recording.mcap.summary_checks import check_extra_counts, check_statistics
 
 
 def summary(**more: Any) -> Any:
@@ -55,5 +55,5 @@ def summary(**more: Any) -> Any:
 def test_a_summary_agrees_with_itself(more: dict[str, Any], fault: str) -> None:
     expected = pytest.raises(RecordingError, match=fault) if fault else nullcontext()
     with expected:
-        _check_statistics(Path("a.mcap"), summary(**more))
-        _check_extra_counts(Path("a.mcap"), summary(**more))
+        check_statistics(Path("a.mcap"), summary(**more))
+        check_extra_counts(Path("a.mcap"), summary(**more))

@@ -8,7 +8,7 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk, ChunkIndex
 
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunk import (
+from dmrl.recording.mcap.chunks.chunk import (
     MESSAGE_PREFIX_DTYPE,
     RECORD_HEADER_BYTES,
     ParsedChunk,

@@ -12,8 +12,8 @@ from dmrl.atomic_output import as_output_error
 from dmrl.errors import RecordingError
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.channel_registry import ChannelRegistry
-from dmrl.recording.mcap.chunk import ParsedChunk, write_message_prefixes
-from dmrl.recording.mcap.chunk_builder import CHUNK_BYTES, ChunkBuilder
+from dmrl.recording.mcap.chunks.chunk import ParsedChunk, write_message_prefixes
+from dmrl.recording.mcap.chunks.chunk_builder import CHUNK_BYTES, ChunkBuilder
 from dmrl.recording.mcap.file_writer import CompressedChunk, McapFileWriter
 from dmrl.recording.mcap.message_batch import Bytes, Ints, MessageBatch
 from dmrl.recording.mcap.message_index import MessageIndex, build_message_index

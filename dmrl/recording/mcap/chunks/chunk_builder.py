@@ -7,7 +7,7 @@ from array import array
 import numpy as np
 import zstandard
 
-from dmrl.recording.mcap.chunk import MESSAGE_OPCODE, RECORD_HEADER_BYTES, build_batch_at
+from dmrl.recording.mcap.chunks.chunk import MESSAGE_OPCODE, RECORD_HEADER_BYTES, build_batch_at
 from dmrl.recording.mcap.file_writer import CompressedChunk
 from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, Bytes, Ints
 from dmrl.recording.mcap.message_index import build_message_index

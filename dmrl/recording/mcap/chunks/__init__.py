@@ -1,0 +1,1 @@
+"""Chunks of MCAP files: parsed, read, built and written."""
