@@ -13,6 +13,7 @@ import pyarrow as pa
 from dmrl.catalogue.table import FILE_NAME, Catalogue, file_stamp, open_catalogue
 from dmrl.errors import MissingExtra, RecordingError, SettingError
 from dmrl.guards import limits
+from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.cage import run_caged
 from dmrl.guards.safe_names import safe_join
 
@@ -63,7 +64,7 @@ def find_rows(catalogue: Catalogue, query: str) -> pa.Table:
     chosen = run_caged(
         f"{__name__}:select_names", buffer.getvalue().to_pybytes(), f"the query {query!r}"
     )
-    names = set(json.loads(chosen))
+    names = set(parse_json(chosen))
     mask = pa.array([name in names for name in catalogue.table["recording"].to_pylist()])
     return catalogue.table.filter(mask.cast(pa.bool_()))
 

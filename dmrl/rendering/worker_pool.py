@@ -1,5 +1,6 @@
 """Pool of Blender worker processes, which are replaced when they exit."""
 
+import os
 import subprocess
 import threading
 from collections import deque
@@ -60,6 +61,8 @@ class Worker:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
+            # It is another Python: variables for this one would hide its modules.
+            env={k: v for k, v in os.environ.items() if not k.startswith("PYTHON")},
         )
         self._last_words: deque[bytes] = deque(maxlen=20)
         self._listener = threading.Thread(target=self._collect_errors, daemon=True)
