@@ -14,7 +14,8 @@ import tomli_w
 
 from dmrl.errors import SourceError
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.unknowns import TABLE, Subject
+from dmrl.estimation.solver.layout import Subject
+from dmrl.estimation.solver.unknowns import TABLE
 from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.guards.paths import refuse_pipe
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
-from dmrl.estimation.solver.keyframes import NoiseModel
-from dmrl.estimation.solver.unknowns import Subject, from_peer
+from dmrl.estimation.solver.layout import Subject, from_peer
+from dmrl.estimation.solver.problem import NoiseModel
 from dmrl.labelling.pair_report import explain_refusal, explain_refusals, find_suspect_sensors
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from dmrl.estimation.model.pair import Pair, SensorTrack
 from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.keyframes import NoiseModel
+from dmrl.estimation.solver.problem import NoiseModel
 from dmrl.labelling.peer_positions import sample_positions
 
 SECOND_NS = 1_000_000_000

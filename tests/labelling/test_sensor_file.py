@@ -6,7 +6,7 @@ import pytest
 
 from dmrl.errors import SourceError
 from dmrl.estimation.flight.pairs import estimate_pairs
-from dmrl.estimation.solver.unknowns import Subject
+from dmrl.estimation.solver.layout import Subject
 from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.sensor_file import SensorConstants, read_sensors, write_sensors
 from dmrl.labelling.sensor_logs import build_sensor_logs

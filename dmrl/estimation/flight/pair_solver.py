@@ -16,7 +16,6 @@ from dmrl.estimation.search.modes import (
     select_modes,
 )
 from dmrl.estimation.solver.covariance import compute_covariance
-from dmrl.estimation.solver.keyframes import CameraView, NoiseModel, Problem
 from dmrl.estimation.solver.levenberg_marquardt import (
     ROUGH_TOLERANCE,
     Carried,
@@ -25,6 +24,7 @@ from dmrl.estimation.solver.levenberg_marquardt import (
     relative_path,
 )
 from dmrl.estimation.solver.noise_selection import range_noise_ratio, select_model
+from dmrl.estimation.solver.problem import CameraView, NoiseModel, Problem
 from dmrl.estimation.solver.residuals import Values, bearing_factor
 
 MIN_RANGE_NOISE_RATIO = 1.1

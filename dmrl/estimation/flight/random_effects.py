@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.residuals import ConstantPrior
-from dmrl.estimation.solver.unknowns import Subject, Unknown
+from dmrl.estimation.solver.layout import Subject
+from dmrl.estimation.solver.priors import ConstantPrior
+from dmrl.estimation.solver.unknowns import Unknown
 
 PRIOR_STD_SHARE, PRIOR_FLIGHTS = 1 / 3, 2.0
 """Prior of the change from flight to flight: share of the prior's standard deviation, and its

@@ -10,9 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from dmrl.estimation.flight.pair_solver import consistent_views
-from dmrl.estimation.flight.pairs import (
-    SIGMA_INFLATION,
+from dmrl.estimation.flight.pair_output import (
     height_errors,
     interpolate_at,
     interpolate_states,
@@ -21,6 +19,8 @@ from dmrl.estimation.flight.pairs import (
     output_times,
     with_status,
 )
+from dmrl.estimation.flight.pair_solver import consistent_views
+from dmrl.estimation.flight.pairs import SIGMA_INFLATION
 from dmrl.estimation.flight.windows import carry_information, split_windows
 from dmrl.estimation.model.gate import GATE_M
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
@@ -30,20 +30,20 @@ from dmrl.estimation.signals.contradictions import drop_contradictions
 from dmrl.estimation.solver.covariance import compute_covariance, relative_covariance
 from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
 from dmrl.estimation.solver.keyframes import (
-    Problem,
     build_problem,
     list_robots,
     odometry_dropout,
     range_dropout,
 )
+from dmrl.estimation.solver.layout import Layout
 from dmrl.estimation.solver.levenberg_marquardt import (
     ROUGH_TOLERANCE,
     Carried,
     Solver,
     relative_path,
 )
+from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import Values
-from dmrl.estimation.solver.unknowns import Layout
 
 Names = tuple[str, str]
 MIN_SHARED_S = 5.0

@@ -13,9 +13,12 @@ from scipy.linalg import block_diag
 
 from dmrl.estimation.model.odometry import rotation_matrix
 from dmrl.estimation.solver.block_tridiagonal import eliminate_before
-from dmrl.estimation.solver.keyframes import Problem, select_measurements
+from dmrl.estimation.solver.equations import build_equations
+from dmrl.estimation.solver.keyframes import select_measurements
 from dmrl.estimation.solver.levenberg_marquardt import Carried, Solver
-from dmrl.estimation.solver.residuals import ConstantPrior, Rows, Values, build_equations
+from dmrl.estimation.solver.priors import ConstantPrior
+from dmrl.estimation.solver.problem import Problem
+from dmrl.estimation.solver.residuals import Rows, Values
 
 WINDOW_S, OVERLAP_S = 200.0, 50.0
 """Length of a window and of its overlap, seconds. Half of the overlap is the time in which a

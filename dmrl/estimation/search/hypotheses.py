@@ -13,7 +13,7 @@ from dmrl.estimation.search.pair_filter import (
     run_lanes,
     smooth_rts,
 )
-from dmrl.estimation.solver.keyframes import Problem
+from dmrl.estimation.solver.problem import Problem
 
 BEARING_COUNT, HEADING_COUNT = 12, 8
 """Number of bearings of the peer, and of headings for each bearing: 96 hypotheses. Their distance

@@ -15,7 +15,8 @@ from scipy.ndimage import minimum_filter1d
 from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.search.hypotheses import Track, choose_starts, follow_hypotheses
-from dmrl.estimation.solver.keyframes import Problem, average_ranges
+from dmrl.estimation.solver.keyframes import average_ranges
+from dmrl.estimation.solver.layout import Layout
 from dmrl.estimation.solver.levenberg_marquardt import (
     ROUGH_TOLERANCE,
     MapEstimate,
@@ -23,8 +24,9 @@ from dmrl.estimation.solver.levenberg_marquardt import (
     is_same_solution,
     relative_path,
 )
+from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import Values
-from dmrl.estimation.solver.unknowns import Layout, without_rows
+from dmrl.estimation.solver.unknowns import without_rows
 
 MAX_SOLVED, MAX_DEFICIT = 6, 100.0
 """Largest number of tracks that are solved, and largest log likelihood below the best of one."""

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from dmrl.estimation.model.bearings import subtract_bearings
 from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.keyframes import CameraView, Problem, average_ranges
+from dmrl.estimation.solver.keyframes import average_ranges
+from dmrl.estimation.solver.problem import CameraView, Problem
 from dmrl.estimation.solver.residuals import odometry_variance
 
 SIZE = 5

@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from dmrl.estimation.model.odometry import QUARTER_TURN, rotation_matrix
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.block_tridiagonal import marginal_covariances, solve_step
-from dmrl.estimation.solver.keyframes import Problem
+from dmrl.estimation.solver.equations import build_equations
 from dmrl.estimation.solver.levenberg_marquardt import Solver, relative_path
-from dmrl.estimation.solver.residuals import ConstantPrior, Rows, Values, build_equations
+from dmrl.estimation.solver.priors import ConstantPrior
+from dmrl.estimation.solver.problem import Problem
+from dmrl.estimation.solver.residuals import Rows, Values
 
 Complex = NDArray[np.complex128]
 CALM_WINDOW_S = 20.0

@@ -8,8 +8,9 @@ import numpy as np
 from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.model.status import UNCONVERGED, Statuses
-from dmrl.estimation.solver.keyframes import NoiseModel
-from dmrl.estimation.solver.unknowns import TABLE, Layout, build_layout, from_peer
+from dmrl.estimation.solver.layout import Layout, build_layout, from_peer
+from dmrl.estimation.solver.problem import NoiseModel
+from dmrl.estimation.solver.unknowns import TABLE
 
 RejectionReason = Literal["still", "alike", "silent", "open", "imprecise"]
 """Reason why no position is OK.

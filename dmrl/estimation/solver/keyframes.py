@@ -1,13 +1,12 @@
 """Cut a flight of N robots into keyframes: the measured data of every factor."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.estimation.model.odometry import Odometry, RelativeMotion, preintegrate
+from dmrl.estimation.model.odometry import preintegrate
 from dmrl.estimation.model.pair import (
     MAX_DROPOUT_S,
     Array,
@@ -17,10 +16,15 @@ from dmrl.estimation.model.pair import (
     SensorTrack,
 )
 from dmrl.estimation.signals.jump_detection import step_offsets
-from dmrl.estimation.solver.robust_loss import Cauchy, Loss
-from dmrl.estimation.solver.unknowns import TABLE, Layout, Subject, Unknown, build_layout
-
-Measured = TypeVar("Measured", "RangeLink", "CameraView")
+from dmrl.estimation.solver.problem import (
+    CORRELATION_S,
+    CameraView,
+    Measured,
+    NoiseModel,
+    Problem,
+    RangeLink,
+    Steps,
+)
 
 KEYFRAME_HZ = 5.0
 """Keyframes per second, Hz. Twice the rate costs twice the time and gave the same error on ten
@@ -28,207 +32,12 @@ simulated flights; ranges and outputs keep their own times."""
 RANGE_BLOCK_S, RANGE_MEDIAN_BLOCKS, MIN_RANGE_STEP_M = 0.1, 3, 0.45
 """Detection of range steps for the search: length of a block, seconds; number of block medians on
 either side; smallest step, metres. Smaller steps are left to the solve."""
-CORRELATION_S = 0.3
-"""Time over which a network repeats its errors, seconds: images within it count as one."""
-
-
-@dataclass(frozen=True, slots=True)
-class NoiseModel:
-    """Noise of the measurements; the unknowns have their own in the table.
-
-    Parameters
-    ----------
-    grade
-        Factor of the velocity noise, relative to the defaults.
-    constants_grade
-        Factor of the priors of graded constants.
-    velocity_psd
-        White noise of a velocity: variance per second of integration, m^2/s.
-    yaw_rate_psd
-        White noise of a yaw rate, rad^2/s.
-    range_std_m
-        White noise of a range.
-    height_std_m
-        Height difference.
-    dropout_speed_mps, dropout_turn_radps
-        Motion of a robot without odometry, per square root of a second.
-    range_loss, motion_loss, bearing_loss
-        Losses. A radio's detour or a slipping flow is no Gaussian tail.
-    known_std
-        Standard deviations of constants that other flights determined, by subject.
-    """
-
-    grade: float = 1.0
-    constants_grade: float = 1.0
-    velocity_psd: float = 2e-4
-    yaw_rate_psd: float = 1e-5
-    range_std_m: float = 0.12
-    height_std_m: float = 0.04
-    dropout_speed_mps: float = 0.5
-    dropout_turn_radps: float = 0.5
-    range_loss: Loss = field(default_factory=lambda: Cauchy(1.25))
-    motion_loss: Loss = field(default_factory=lambda: Cauchy(5.0))
-    bearing_loss: Loss = field(default_factory=lambda: Cauchy(2.0))
-    known_std: Mapping[tuple[str, tuple[int, ...]], float] = field(default_factory=dict)
-
-    def prior_std(self, layout: Layout) -> Array:
-        """Return (G,) prior standard deviations of the constants."""
-        return np.array(
-            [
-                min(
-                    row.std * (self.constants_grade if row.graded else 1.0),
-                    self.known_std.get(subject, np.inf),
-                )
-                for subject, row in layout.constants
-            ]
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """Measured motion of one robot between K keyframes, S = K - 1.
-
-    Parameters
-    ----------
-    steps_s
-        (S,) seconds.
-    motion
-        S motions from each keyframe to the next.
-    clock_derivative
-        (S, 3) derivative of shift and turn by the robot's clock offset, per second.
-    dropout_s
-        (S,) seconds of each step without odometry.
-    path
-        Dead reckoning of the robot, for any time.
-    height_m
-        (K,) measured heights.
-    """
-
-    steps_s: Array
-    motion: RelativeMotion
-    clock_derivative: Array
-    dropout_s: Array
-    path: Odometry
-    height_m: Array
-
-
-@dataclass(frozen=True, slots=True)
-class RangeLink:
-    """R ranges between two robots.
-
-    Parameters
-    ----------
-    robots
-        Indices of the two robots.
-    keyframe
-        (R,) keyframe nearest to each range, ascending.
-    time_s, range_m
-        (R,) times, seconds, and measured ranges, metres.
-    std_share
-        (R,) standard deviations relative to the noise model's.
-    own_shift_m, peer_shift_m
-        (R, 2) motion of either robot from the keyframe to the range, in its own frame.
-    height_m
-        (R,) height of the second robot minus that of the first.
-    offset_guess_m
-        (R,) detected excess of the ranges: a first guess.
-    """
-
-    robots: tuple[int, int]
-    keyframe: NDArray[np.intp]
-    time_s: Array
-    range_m: Array
-    std_share: Array
-    own_shift_m: Array
-    peer_shift_m: Array
-    height_m: Array
-    offset_guess_m: Array
-
-
-@dataclass(frozen=True, slots=True)
-class CameraView:
-    """Candidate detections of one robot in another's I images.
-
-    Parameters
-    ----------
-    robots
-        Indices of the robot with the camera and of its peer.
-    keyframe
-        (I,) keyframe nearest to each image, ascending.
-    own_shift_m, peer_shift_m, own_turn_rad
-        (I, 2), (I, 2), (I,) motions from the keyframe to the image.
-    height_m
-        (I,) height of the peer minus that of the observer.
-    bearing, std
-        (I, C, 3) azimuth, elevation (rad) and log distance of the candidates, NaN where there are
-        fewer; and their standard deviations.
-    weight
-        (I,) weight of an image among those with the same errors.
-    time_s
-        (I,) capture times, seconds.
-    """
-
-    robots: tuple[int, int]
-    keyframe: NDArray[np.intp]
-    own_shift_m: Array
-    peer_shift_m: Array
-    own_turn_rad: Array
-    height_m: Array
-    bearing: Array
-    std: Array
-    weight: Array
-    time_s: Array
 
 
 def select_measurements(measured: Measured, chosen: Mask) -> Measured:
     """Return some of the ranges of a link, or of the images of a view."""
     names = [name for name in measured.__dataclass_fields__ if name != "robots"]
     return replace(measured, **{name: getattr(measured, name)[chosen] for name in names})
-
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """A flight of N robots at K keyframes, with the table of its unknowns.
-
-    Parameters
-    ----------
-    keyframe_s
-        (K,) times, seconds.
-    robots, links, views
-        Measured motions, ranges and detections.
-    table
-        Rows of the unknowns.
-    noise
-        Noise of the measurements.
-    unused
-        Unknowns of the table that this flight does not need.
-    """
-
-    keyframe_s: Array
-    robots: tuple[Steps, ...]
-    links: tuple[RangeLink, ...]
-    views: tuple[CameraView, ...] = ()
-    table: tuple[Unknown, ...] = TABLE
-    noise: NoiseModel = field(default_factory=NoiseModel)
-    unused: frozenset[Subject] = frozenset()
-
-    @property
-    def layout(self) -> Layout:
-        """Columns of the unknowns."""
-        sighted = {robot for view in self.views for robot in view.robots}
-        links = [link.robots for link in self.links]
-        return build_layout(self.table, len(self.robots), links, sighted, self.unused)
-
-    @property
-    def fading_psd(self) -> float:
-        """Low-frequency noise of a fading velocity error: variance per second, m^2/s."""
-        rows = [row for row in self.table if row.name == "velocity_error_x"]
-        return sum(2 * row.time_s * (row.std * self.noise.grade) ** 2 for row in rows)
-
-    @property
-    def velocity_psd(self) -> float:
-        """Low-frequency noise of a velocity: variance per second, m^2/s."""
-        return self.noise.velocity_psd * self.noise.grade**2 + self.fading_psd
 
 
 def build_problem(pairs: Mapping[tuple[int, int], Pair], rate_hz: float = KEYFRAME_HZ) -> Problem:

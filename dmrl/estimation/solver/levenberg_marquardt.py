@@ -8,20 +8,11 @@ import numpy as np
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.block_tridiagonal import NormalEquations, Solved, solve_step
-from dmrl.estimation.solver.keyframes import Problem
-from dmrl.estimation.solver.residuals import (
-    CarriedPrior,
-    Chain,
-    ConstantPrior,
-    Factor,
-    Values,
-    build_equations,
-    linearize,
-    motion_gain,
-    odometry_variance,
-    total_cost,
-)
-from dmrl.estimation.solver.unknowns import Layout
+from dmrl.estimation.solver.equations import build_equations, linearize, total_cost
+from dmrl.estimation.solver.layout import Layout
+from dmrl.estimation.solver.priors import CarriedPrior, Chain, ConstantPrior
+from dmrl.estimation.solver.problem import Problem
+from dmrl.estimation.solver.residuals import Factor, Values, motion_gain, odometry_variance
 
 MAX_ITERATIONS, MAX_DAMPING = 25, 1e4
 """Largest number of iterations; and the damping beyond which no smaller step is tried."""

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.keyframes import NoiseModel, Problem, average_ranges
+from dmrl.estimation.solver.keyframes import average_ranges
 from dmrl.estimation.solver.levenberg_marquardt import ROUGH_TOLERANCE, MapEstimate, Solver
+from dmrl.estimation.solver.problem import NoiseModel, Problem
 from dmrl.estimation.solver.residuals import Values, range_factor
 from dmrl.estimation.solver.unknowns import RANGE_MODELS, with_rows
 

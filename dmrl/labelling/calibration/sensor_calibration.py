@@ -11,7 +11,8 @@ from dmrl.errors import RecordingError
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.flight.random_effects import PooledConstants, flight_information, pool_flights
 from dmrl.estimation.solver.estimate import Estimate
-from dmrl.estimation.solver.unknowns import TABLE, Subject, Unknown
+from dmrl.estimation.solver.layout import Subject
+from dmrl.estimation.solver.unknowns import TABLE, Unknown
 from dmrl.labelling.flight_log import SENSOR_TOPICS, read_flight
 from dmrl.labelling.sensor_file import OF_PAIR, OF_ROBOT, Names, SensorConstants, Value
 from dmrl.labelling.sensor_logs import build_sensor_logs

@@ -15,7 +15,7 @@ from dmrl.estimation.model.bearings import (
 from dmrl.estimation.model.pair import Array, BearingMeasurements, Pair
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate, seen_from_peer
-from dmrl.estimation.solver.keyframes import NoiseModel
+from dmrl.estimation.solver.problem import NoiseModel
 
 from ..sighted_flights import STD, still_pair
 

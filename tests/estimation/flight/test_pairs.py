@@ -17,8 +17,8 @@ from dmrl.estimation.solver.estimate import (
     seen_from_peer,
     transform_to_peer,
 )
-from dmrl.estimation.solver.keyframes import NoiseModel
 from dmrl.estimation.solver.levenberg_marquardt import MapEstimate
+from dmrl.estimation.solver.problem import NoiseModel
 from dmrl.estimation.solver.residuals import Values
 from dmrl.flight import Trajectory
 

@@ -10,8 +10,8 @@ from dmrl.estimation.flight.random_effects import (
 )
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
-from dmrl.estimation.solver.keyframes import NoiseModel
-from dmrl.estimation.solver.residuals import ConstantPrior
+from dmrl.estimation.solver.priors import ConstantPrior
+from dmrl.estimation.solver.problem import NoiseModel
 
 SUBJECTS = [subject for subject, _ in PAIR_LAYOUT.constants]
 ROWS = [row for _, row in PAIR_LAYOUT.constants]

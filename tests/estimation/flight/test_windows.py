@@ -11,8 +11,10 @@ from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.flight.windows import carry_information, split_windows
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.block_tridiagonal import solve_step
+from dmrl.estimation.solver.equations import build_equations
 from dmrl.estimation.solver.levenberg_marquardt import Solver
-from dmrl.estimation.solver.residuals import ConstantPrior, Values, build_equations
+from dmrl.estimation.solver.priors import ConstantPrior
+from dmrl.estimation.solver.residuals import Values
 
 from ..flights import flown, pair_of, truth_at
 from ..solver.test_residuals import flight

@@ -13,9 +13,10 @@ from dmrl.estimation.solver.covariance import (
     compute_covariance,
     relative_covariance,
 )
-from dmrl.estimation.solver.keyframes import NoiseModel, Problem, build_problem
+from dmrl.estimation.solver.equations import build_equations
+from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.levenberg_marquardt import Solver, relative_path
-from dmrl.estimation.solver.residuals import build_equations
+from dmrl.estimation.solver.problem import NoiseModel, Problem
 
 from ..sighted_flights import still_pair
 from .test_residuals import flight

@@ -14,7 +14,7 @@ from dmrl.estimation.solver.estimate import (
     seen_from_peer,
     transform_to_peer,
 )
-from dmrl.estimation.solver.keyframes import NoiseModel
+from dmrl.estimation.solver.problem import NoiseModel
 
 COUNT = 4
 

@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.flight.pairs import clip_to_ranges
+from dmrl.estimation.flight.pair_output import clip_to_ranges
 from dmrl.estimation.model.pair import Array, Pair, SensorTrack
 from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
 from dmrl.estimation.solver.keyframes import (
     MIN_RANGE_STEP_M,
-    NoiseModel,
     average_ranges,
     build_problem,
     odometry_dropout,
@@ -18,6 +17,7 @@ from dmrl.estimation.solver.keyframes import (
     range_step_offsets,
     select_measurements,
 )
+from dmrl.estimation.solver.problem import NoiseModel
 
 from ..model.test_odometry import TIME_S, along_arc, arc
 

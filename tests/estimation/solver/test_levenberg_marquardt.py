@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.solver.keyframes import NoiseModel, average_ranges, build_problem
+from dmrl.estimation.solver.keyframes import average_ranges, build_problem
 from dmrl.estimation.solver.levenberg_marquardt import (
     MapEstimate,
     Solver,
     is_same_solution,
     relative_path,
 )
+from dmrl.estimation.solver.problem import NoiseModel
 from dmrl.estimation.solver.residuals import Values
 from dmrl.estimation.solver.unknowns import TABLE, without_rows
 

@@ -9,19 +9,17 @@ import pytest
 
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array, BearingMeasurements, Pair, SensorTrack
-from dmrl.estimation.solver.keyframes import NoiseModel, Problem, build_problem
+from dmrl.estimation.solver.equations import linearize, total_cost
+from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.levenberg_marquardt import Carried, Solver
+from dmrl.estimation.solver.priors import CarriedPrior, Chain, ConstantPrior
+from dmrl.estimation.solver.problem import NoiseModel, Problem
 from dmrl.estimation.solver.residuals import (
-    CarriedPrior,
-    Chain,
-    ConstantPrior,
     Rows,
     Values,
     bearing_factor,
-    linearize,
     odometry_factor,
     range_factor,
-    total_cost,
 )
 from dmrl.estimation.solver.robust_loss import Cauchy, Gaussian
 from dmrl.estimation.solver.unknowns import Unknown

@@ -7,7 +7,7 @@ import pytest
 
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.model.status import OK
-from dmrl.estimation.solver.keyframes import NoiseModel
+from dmrl.estimation.solver.problem import NoiseModel
 from dmrl.estimation.solver.robust_loss import Cauchy, Gaussian, Huber, Loss
 
 from ..flights import flown, pair_of

@@ -7,17 +7,11 @@ import pytest
 
 from dmrl.estimation.flight.pair_solver import solve_pair
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.keyframes import NoiseModel, RangeLink, build_problem
+from dmrl.estimation.solver.keyframes import build_problem
+from dmrl.estimation.solver.layout import build_layout, from_peer
 from dmrl.estimation.solver.levenberg_marquardt import relative_path
-from dmrl.estimation.solver.unknowns import (
-    SIGHTED,
-    TABLE,
-    Unknown,
-    build_layout,
-    from_peer,
-    with_rows,
-    without_rows,
-)
+from dmrl.estimation.solver.problem import NoiseModel, RangeLink
+from dmrl.estimation.solver.unknowns import SIGHTED, TABLE, Unknown, with_rows, without_rows
 from dmrl.labelling.sensor_file import OF_PAIR, OF_ROBOT, SCALES
 
 from ..flights import flown, pair_of
