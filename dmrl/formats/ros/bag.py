@@ -132,9 +132,10 @@ def _report_unstamped(source: Path, unstamped: Mapping[str, int]) -> None:
 def header_time_ns(message: Any) -> int | None:
     """Return the time in the header; 0: it is empty, None: there is no header."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None:
-        return None
-    return max(int(stamp.sec * 1_000_000_000 + stamp.nanosec), 0)
+    try:
+        return max(int(stamp.sec * 1_000_000_000 + stamp.nanosec), 0)  # type: ignore[union-attr]
+    except (AttributeError, TypeError, ValueError, OverflowError):
+        return None  # no header, or one of another definition
 
 
 def convert_message(
@@ -142,7 +143,11 @@ def convert_message(
 ) -> Iterator[Sample]:
     """Yield the samples of a decoded message."""
     if not line.kind.startswith(DMRL_PREFIX):
-        yield from CONVERTERS[line.kind](decoded, time_ns, where)
+        try:
+            yield from list(CONVERTERS[line.kind](decoded, time_ns, where))
+        except (AttributeError, TypeError, ValueError, LookupError, ArithmeticError):
+            # The file's definition of a standard type may be another.
+            leave_out(f"messages on {line.topic} that are no {line.kind}", where.source)
     elif (sample := convert_dmrl_message(decoded, line.topic, time_ns)) is not None:
         yield sample
     else:
