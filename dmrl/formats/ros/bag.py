@@ -147,7 +147,7 @@ def convert_message(
             yield from list(CONVERTERS[line.kind](decoded, time_ns, where))
         except (AttributeError, TypeError, ValueError, LookupError, ArithmeticError):
             # The file's definition of a standard type may be another.
-            leave_out(f"messages on {line.topic} that are no {line.kind}", where.source)
+            leave_out(f"messages on {line.topic} that cannot be decoded", where.source)
     elif (sample := convert_dmrl_message(decoded, line.topic, time_ns)) is not None:
         yield sample
     else:
