@@ -130,7 +130,9 @@ def test_what_a_network_saw_makes_labels_better(
             sink.write(stamped.time_ns, topics.DETECTIONS("cf1"), made)
     label.run(seen, tmp_path / "refined.mcap", replace(LENIENT, detections=True))
     assert off_px(tmp_path / "refined.mcap") < 0.6 * off_px(labelled)
-    with pytest.raises(SettingError, match="--detections goes with --method batch, not ekf"):
+    with pytest.raises(
+        SettingError, match="--detections goes with --method batch or swarm, not ekf"
+    ):
         label.run(seen, tmp_path / "none.mcap", Settings(method="ekf", detections=True))
     with pytest.raises(MissingTopic, match="no topic /\\*/detections"):
         label.run(flight, tmp_path / "none.mcap", replace(LENIENT, detections=True))
