@@ -1,15 +1,18 @@
 """Conversion of poses in the world to views of a robot's camera."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
+from dmrl.images.canvas import Levels
+from dmrl.rendering.backgrounds.procedural import make_background
 from dmrl.rendering.robots.quadrotor import RADIUS_M
 from dmrl.rendering.shot import Shot
-from dmrl.rendering.sketch_renderer import Pose, Sketch, render_sketch
-from dmrl.rendering.sketch_scene import random_look
+from dmrl.rendering.sketch_renderer import Look, Pose, Sketch, render_sketch
+from dmrl.rendering.sketch_scene import random_look, random_noise
 
 MIN_DEPTH_M = 2 * RADIUS_M
 """Minimum depth of a drawn robot, metres: nearer ones would touch the image plane."""
@@ -133,3 +136,53 @@ def render_sketches(camera: Camera, views: Iterable[CameraView]) -> Iterator[Ske
     for one in views:
         rng = np.random.default_rng(one.key)
         yield render_sketch(camera, list(one.poses.values()), random_look(rng, camera))
+
+
+WALLS, MARGIN_SHARE = 4, 0.3
+"""Backgrounds around a sketched place; and its height above and below an image, over an image's."""
+
+
+class SketchedPlace:
+    """Draw the images of one flight: one place, light and sensor for all of them.
+
+    Parameters
+    ----------
+    seed
+        Seed of the flight.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._draw = cache(self._draw_place)
+
+    def __call__(self, camera: Camera, views: Iterable[CameraView]) -> Iterator[Sketch]:
+        """Yield a sketch of every view of one robot, in their order."""
+        walls, look = self._draw(camera)
+        for one in views:
+            rng = np.random.default_rng(one.key)
+            seen = replace(
+                look,
+                background=_cut_window(walls, camera, one.here),
+                light_camera=one.here.body_from_world @ look.light_camera,
+                blade_rad=rng.uniform(0, np.pi),
+                noise=random_noise(rng, camera),
+            )
+            yield render_sketch(camera, list(one.poses.values()), seen)
+
+    def _draw_place(self, camera: Camera) -> tuple[Levels, Look]:
+        """Return the walls all around, and the light and the sensor of the place."""
+        rng = np.random.default_rng((self._seed, 3))
+        around_px = round(2 * np.pi * camera.fx_px / WALLS)
+        high_px = camera.height_px + 2 * round(MARGIN_SHARE * camera.height_px)
+        walls = [make_background(rng, around_px, high_px) for _ in range(WALLS)]
+        again = -(-camera.width_px // around_px)
+        return np.concatenate(walls + walls[:again], axis=1), random_look(rng, camera)
+
+
+def _cut_window(walls: Levels, camera: Camera, here: WorldPose) -> Levels:
+    """Return the part of the walls that a robot sees: its columns by yaw, its rows by pitch."""
+    around_px = WALLS * round(2 * np.pi * camera.fx_px / WALLS)
+    left = round(-here.yaw_rad * camera.fx_px) % around_px
+    spare = len(walls) - camera.height_px
+    top = min(max(round(spare / 2 + here.pitch_rad * camera.fy_px), 0), spare)
+    return walls[top : top + camera.height_px, left : left + camera.width_px]

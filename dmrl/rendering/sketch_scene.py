@@ -77,7 +77,7 @@ def random_look(rng: Generator, camera: Camera) -> Look:
     """
     size = camera.width_px, camera.height_px
     towards = rng.normal((0.0, 0.0, 1.5), 1.0)
-    noise = random_window(rng, _noise_table(*size), *size)
+    noise = random_noise(rng, camera)
     return Look(
         background=make_background(rng, *size),
         light_camera=towards / np.linalg.norm(towards),
@@ -90,8 +90,15 @@ def random_look(rng: Generator, camera: Camera) -> Look:
         gain=np.exp(rng.normal(0.1, 0.2)) * rng.normal(1, 0.05, 3),
         gamma=float(np.exp(rng.normal(0, 0.2))),
         noise_deviation=rng.uniform(0.003, 0.04),
-        noise=noise.reshape(camera.height_px, camera.width_px, 3),
+        noise=noise,
     )
+
+
+def random_noise(rng: Generator, camera: Camera) -> FloatImage:
+    """Return (H, W, 3) grey white noise for an image of a camera."""
+    size = camera.width_px, camera.height_px
+    window = random_window(rng, _noise_table(*size), *size)
+    return window.reshape(camera.height_px, camera.width_px, 3)
 
 
 @cache

@@ -14,10 +14,10 @@ from dmrl.flight.stepped import SteppedFlight
 from dmrl.geometry.frames import AIDECK_PINHOLE, Array
 from dmrl.rendering.onboard_camera import (
     CameraView,
+    SketchedPlace,
     ViewRenderer,
     WorldPose,
     build_view,
-    render_sketches,
 )
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch_renderer import Sketch
@@ -92,7 +92,7 @@ class Simulation:
         self._noise, self._faults, self._kind = NOISE[noise], tuple(faults), camera_renderer
         self._resources = ExitStack()
         self._renderer: Renderer | None = None
-        self._draw: ViewRenderer = render_sketches
+        self._draw: ViewRenderer = SketchedPlace(0)
         self._seed = 0
         self._motion: SteppedFlight | None = None
         self.reckoning: dict[str, DeadReckoning] = {}
@@ -106,7 +106,7 @@ class Simulation:
         seed
             Another seed gives another flight: path, noise, and appearance.
         """
-        self._seed = seed
+        self._seed, self._draw = seed, SketchedPlace(seed)
         self._motion = SteppedFlight(self._scenario, self._noise, seed, self._faults)
         logs = self._motion.flight.robots
         self.reckoning = {robot: DeadReckoning(log) for robot, log in logs.items()}
