@@ -7,18 +7,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pyarrow.compute as pc
 
 from dmrl.atomic_output import atomic_folder, refuse_existing, to_partial_path
 from dmrl.datasets import Split, open_dataset
+from dmrl.datasets.backgrounds import open_backgrounds
 from dmrl.errors import ModelError, OutputError, SettingError, optional_imports
+from dmrl.geometry.frames import AIDECK_PINHOLE
 from dmrl.learn.pretrained import resolve_model_path
 from dmrl.recording import build_provenance
 from dmrl.terminal.progress import track
 
 with optional_imports("train", "dmrl train"):
     from dmrl.datasets.training_examples import load_training_data
-    from dmrl.learn.data.batches import ExampleSet
+    from dmrl.learn.data.batches import ROBOT_FIELDS, ExampleSet
     from dmrl.learn.inference.confidence_calibration import (
         PlattScaling,
         apply_calibration,
@@ -35,7 +38,12 @@ with optional_imports("train", "dmrl train"):
         set_weights,
         transfer_weights,
     )
-    from dmrl.learn.inference.threshold import select_threshold
+    from dmrl.learn.inference.threshold import (
+        MIN_EMPTY_IMAGES,
+        count_false_alarms,
+        find_unlabelled_images,
+        select_threshold,
+    )
     from dmrl.learn.networks.architectures import Network
     from dmrl.learn.training.checkpoint import has_checkpoint, remove_checkpoint
     from dmrl.learn.training.config import AUTO, DEFAULT_ARCHITECTURE, TrainConfig
@@ -185,12 +193,17 @@ def _refuse_unfinished(partial: Path, *, resume: bool) -> None:
         )
 
 
+EMPTY_IMAGES = 100
+"""Rooms without a robot that dmrl draws where the images held out have too few."""
+
+
 class Calibrated(NamedTuple):
-    """Threshold, calibration and rates of a network, from the images held out."""
+    """Threshold, calibration and rates of a network, and how the threshold was chosen."""
 
     threshold: float
     calibration: PlattScaling | None
     rates: dict[str, Any] | None
+    promise: dict[str, Any] | None = None
 
 
 def _calibrate(network: Network, held_out: ExampleSet | None, settings: TrainConfig) -> Calibrated:
@@ -203,10 +216,32 @@ def _calibrate(network: Network, held_out: ExampleSet | None, settings: TrainCon
         scored = score_examples(network, held_out)
     else:
         found = None
+    rates, source = measure_rates(scored), "the images held out"
     threshold = settings.threshold
     if threshold is None:
+        if find_unlabelled_images(scored).sum() < MIN_EMPTY_IMAGES:
+            source += " and rooms that dmrl draws"
+            scored = score_examples(network, _add_empty_rooms(held_out, settings.seed))
         threshold = _or_published(select_threshold(scored, settings.false_alarms))
-    return Calibrated(threshold, found, measure_rates(scored))
+    counted = count_false_alarms(scored, threshold)
+    promise = {
+        "a hit is within": "16 px and twice the sigma of its label",
+        "false alarms allowed": settings.false_alarms,
+        "false alarms an empty image": counted.false_alarms,
+        "empty images": counted.empty_images,
+        "they are of": source,
+    }
+    return Calibrated(threshold, found, rates, promise)
+
+
+def _add_empty_rooms(held_out: ExampleSet, seed: int) -> ExampleSet:
+    """Return the images, and rooms without a robot of the same size after them."""
+    height_px, width_px, _ = held_out.image_shape
+    camera = replace(AIDECK_PINHOLE, width_px=width_px, height_px=height_px)
+    rooms, rng = open_backgrounds(Path("rooms")), np.random.default_rng((seed, 7))
+    drawn = np.stack([rooms.random_crop(rng, camera, 1.0) for _ in range(EMPTY_IMAGES)])
+    nobody = np.full((EMPTY_IMAGES, held_out.robots.shape[1], len(ROBOT_FIELDS)), np.nan, "f4")
+    return ExampleSet([*held_out.pixels, drawn], np.concatenate([held_out.robots, nobody]))
 
 
 def _or_published(threshold: float | None) -> float:
@@ -268,6 +303,7 @@ def _to_model(
         training={
             "images": images,
             "calibration": judged.calibration and judged.calibration._asdict(),
+            "threshold": judged.promise,
             "settings": asdict(settings),
             "history": training.history,
         },

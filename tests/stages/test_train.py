@@ -249,6 +249,9 @@ def test_the_threshold_is_chosen_on_images_held_out(dots_dataset: Path, tmp_path
     run(dots_dataset, tmp_path / "run", settings)
     model = load_model(tmp_path / "run")
     assert model.training["images"] == 16
+    promise = model.training["threshold"]
+    assert promise["empty images"] == 100 and "rooms" in promise["they are of"]
+    assert promise["false alarms an empty image"] <= promise["false alarms allowed"] == 0.02
     assert "validation_ap_16_px" in model.training["history"][0]
     run(dots_dataset, tmp_path / "given", replace(settings, threshold=0.45))
     assert load_model(tmp_path / "given").threshold == 0.45

@@ -84,15 +84,17 @@ class ScoredDetections:
     right_16_px: Index
 
 
-def score_detections(images: int, labels: Points, detections: Points) -> ScoredDetections:
-    """Match labels and detections."""
+def score_detections(
+    images: int, labels: Points, detections: Points, blur_px: float | Array = 0.0
+) -> ScoredDetections:
+    """Match labels and detections; ``blur_px`` (L,) is added to the radius around each label."""
     return ScoredDetections(
         images,
         labels,
         detections,
         compute_errors(labels, detections),
-        match_within_radius(labels, detections, 8.0),
-        match_within_radius(labels, detections, SCORE_RADIUS_PX),
+        match_within_radius(labels, detections, 8.0 + blur_px),
+        match_within_radius(labels, detections, SCORE_RADIUS_PX + blur_px),
     )
 
 

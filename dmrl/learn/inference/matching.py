@@ -126,11 +126,15 @@ def assign_detections(labels: Points, detections: Points) -> Index:
     return out
 
 
-def match_within_radius(labels: Points, detections: Points, radius_px: float) -> Index:
-    """Match each detection with a label within a radius; return (D,) label rows, -1 for none."""
+def match_within_radius(labels: Points, detections: Points, radius_px: float | Array) -> Index:
+    """Match each detection with a label within a radius; return (D,) label rows, -1 for none.
+
+    ``radius_px`` is one radius, or (L,) one of each label.
+    """
     out = np.full(len(detections), -1, np.int64)
     if not len(labels):
         return out
+    radius_px = np.broadcast_to(radius_px, len(labels))
     places = labels.ranks_in_image()
     images = int(max(labels.image[-1], detections.image[-1] if len(detections) else 0)) + 1
     row_at = np.full((images, int(places.max()) + 1), -1, np.int64)
@@ -146,7 +150,8 @@ def match_within_radius(labels: Points, detections: Points, radius_px: float) ->
         )
         distance_px[rows < 0] = np.inf
         nearest = np.argmin(distance_px, axis=1)
-        right = distance_px[np.arange(len(chosen)), nearest] <= radius_px
+        every = np.arange(len(chosen))
+        right = distance_px[every, nearest] <= radius_px[rows[every, nearest]]
         out[chosen[right]] = rows[right, nearest[right]]
         row_at[image[right], nearest[right]] = -1
     return out

@@ -61,7 +61,7 @@ class TrainConfig(LossSettings):
         than 10 robots.
     false_alarms
         Largest mean number of detections at or above the threshold in a held-out image without a
-        robot. Applied if there are at least 20 such images.
+        robot. With fewer than 20 such images, rooms that dmrl draws are added.
     init_share
         Weight of the initial model in the saved weights, 0 to 1, against forgetting (Wortsman et
         al. 2022). 0: the trained weights only.
@@ -127,7 +127,7 @@ class TrainConfig(LossSettings):
     shares: dict[str, float] = field(default_factory=dict)
     validation_share: float = 0.1
     threshold: float | None = None
-    false_alarms: float = 0.05
+    false_alarms: float = 0.02
     init_share: float = 0.0
     hard_share: float = 0.0
     flip_share: float = 0.5

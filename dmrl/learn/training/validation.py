@@ -2,8 +2,9 @@
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from dmrl.learn.data.batches import DEPTH, SIGMA_DEPTH, ExampleSet, U, V, iter_batches
+from dmrl.learn.data.batches import DEPTH, SIGMA_DEPTH, SIGMA_U, ExampleSet, U, V, iter_batches
 from dmrl.learn.inference.decode_grids import decode
 from dmrl.learn.inference.detection_metrics import (
     ScoredDetections,
@@ -20,6 +21,8 @@ VALIDATION_METRICS = ("within_20_px", "median_px", "depth_mae_m", "ap_16_px")
 """Metrics of `detection_metrics` that are logged during a training."""
 ALL_DEPTHS_M = (0.0, np.inf)
 """Depth band of all labels, metres."""
+SIGMAS_OF_HIT = 2.0
+"""Standard deviations of a label by which a hit may be off, beside the radius."""
 
 
 def validate(network: Network, examples: ExampleSet, settings: TrainConfig) -> dict[str, float]:
@@ -47,7 +50,10 @@ def validate(network: Network, examples: ExampleSet, settings: TrainConfig) -> d
 def score_examples(
     network: Network, examples: ExampleSet, batch_size: int = 16
 ) -> ScoredDetections:
-    """Detect robots in images and match the detections with the labels."""
+    """Detect robots in images and match the detections with the labels.
+
+    A hit may be off by twice the label's standard deviation, beside the radius of the metric.
+    """
     parts = []
     for batch in iter_batches(examples, batch_size):
         found = decode(*predict_grids(network, batch.images), stride_px=network.stride_px)
@@ -55,18 +61,27 @@ def score_examples(
         columns = (found.u_px, found.v_px, found.depth_m, found.confidence)
         parts.append(Points(image, *(column[image, place] for column in columns)))
     first = np.arange(0, len(examples), batch_size)
+    sigma_px = examples.robots[..., SIGMA_U : SIGMA_U + 2].max(axis=-1)[_find_visible(examples)]
     return score_detections(
-        len(examples), select_visible_labels(examples), Points.concatenate(parts, first)
+        len(examples),
+        select_visible_labels(examples),
+        Points.concatenate(parts, first),
+        SIGMAS_OF_HIT * np.nan_to_num(sigma_px).astype(float),
     )
 
 
 def select_visible_labels(examples: ExampleSet) -> Points:
     """Return the labels of robots whose centres are inside the images."""
-    height_px, width_px, _ = examples.image_shape
+    inside = _find_visible(examples)
     robots = examples.robots.astype(np.float64)
-    u, v = robots[..., U], robots[..., V]
-    with np.errstate(invalid="ignore"):
-        inside = (u >= 0) & (u < width_px) & (v >= 0) & (v < height_px)
     image, _ = np.nonzero(inside)
     depth_m = np.where(np.isinf(robots[..., SIGMA_DEPTH]), np.nan, robots[..., DEPTH])[inside]
-    return Points(image, u[inside], v[inside], depth_m, np.ones(len(image)))
+    return Points(image, robots[inside, U], robots[inside, V], depth_m, np.ones(len(image)))
+
+
+def _find_visible(examples: ExampleSet) -> NDArray[np.bool_]:
+    """Return (N, K) whether the centre of each robot is inside its image."""
+    height_px, width_px, _ = examples.image_shape
+    u, v = examples.robots[..., U], examples.robots[..., V]
+    with np.errstate(invalid="ignore"):
+        return np.asarray((u >= 0) & (u < width_px) & (v >= 0) & (v < height_px))

@@ -105,5 +105,5 @@ def test_what_nobody_asks_for_is_off() -> None:
 def test_defaults_are_those_that_docs_training_md_tells() -> None:
     plain = TrainConfig()
     assert (plain.architecture, plain.epochs) == ("dmrl-nano", 60)
-    assert (plain.validation_share, plain.false_alarms) == (0.1, 0.05)
+    assert (plain.validation_share, plain.false_alarms) == (0.1, 0.02)
     assert (plain.optimizer, plain.label_noise, plain.precision) == ("muon", "ignore", "float32")

@@ -120,3 +120,9 @@ def test_a_robot_on_the_upper_and_left_rim_is_inside_and_on_the_others_not() -> 
 def test_alarms_count_from_the_threshold_itself() -> None:
     truth, found = points([0], [50.0], [1.0]), points([1, 2], [60.0, 60.0], [0.5, 0.49])
     assert count_false_alarms(score_detections(3, truth, found), 0.5).alarmed_images == 1
+
+
+def test_a_hit_may_be_off_by_twice_the_sigma_of_its_label() -> None:
+    truth, found = points([0, 1], [50.0] * 2, [1.0] * 2), points([0, 1], [75.0] * 2, [0.9] * 2)
+    scored = score_detections(2, truth, found, np.array([0.0, 10.0]))
+    assert scored.right_16_px.tolist() == [-1, 1]
