@@ -118,6 +118,7 @@ def test_a_wheel_brings_one_top_level_name(wheel: zipfile.ZipFile) -> None:
     assert {top for top in tops if not top.endswith(".dist-info")} == {"dmrl"}
 
 
+@pytest.mark.heavy
 def test_a_wheel_holds_every_module_and_data_file(wheel: zipfile.ZipFile) -> None:
     names = set(wheel.namelist())
     wanted = {"dmrl/py.typed", "dmrl/schemas/dmrl.binpb"}

@@ -12,6 +12,7 @@ from dmrl.datasets import open_dataset
 from dmrl.errors import DatasetError
 
 
+@pytest.mark.heavy
 def test_splits_rows_and_arrays(data: Path) -> None:
     found = dmrl.dataset(data)
     split = open_dataset(data).split("train")

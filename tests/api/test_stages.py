@@ -47,6 +47,7 @@ def test_wrong_settings_are_said(flight: Path) -> None:
         dmrl.label(flight, gate=0.4)
 
 
+@pytest.mark.heavy
 def test_no_recording_at_all_is_said_and_one_is_a_list_of_one(flight: Path, tmp_path: Path) -> None:
     for stage in (dmrl.evaluate, dmrl.merge):
         with pytest.raises(SettingError, match="empty list"):

@@ -95,32 +95,38 @@ def test_queries_are_of_a_recording_its_cameras_and_their_labels(flights: Path) 
     assert names(flights, "false") == []
 
 
+HOSTILE_QUERIES = [
+    "colour = 1",
+    "messages >",
+    "1); select 2 --",
+    "recording in (select * from read_text('/etc/passwd'))",
+    "recording in (select recording from table)",
+    "recording in (select recording from held)",
+    "recording in (select * from 'FOLDER/a.csv')",
+    "(select count(*) from read_csv('FOLDER/a.csv')) > 0",
+    "(select count(*) from glob('FOLDER/*')) > 0",
+    "(select count(*) from sqlite_scan('FOLDER/a.db', 't')) > 0",
+    "(select count(*) from duckdb_secrets()) > 0",
+    "getenv('HOME') = ''",
+    "true; COPY (select 1) TO 'FOLDER/b.csv'",
+    "true; ATTACH 'FOLDER/b.db'",
+    "true; INSTALL httpfs; LOAD httpfs",
+    "true; SET enable_external_access = true",
+    "true; drop table held",
+    "true union all select '../../a'",
+    "true limit 0",
+    "not " * 20_000 + "true",
+    "'",
+    "/*",
+    "",
+]
+
+
 @pytest.mark.parametrize(
     "query",
     [
-        "colour = 1",
-        "messages >",
-        "1); select 2 --",
-        "recording in (select * from read_text('/etc/passwd'))",
-        "recording in (select recording from table)",
-        "recording in (select recording from held)",
-        "recording in (select * from 'FOLDER/a.csv')",
-        "(select count(*) from read_csv('FOLDER/a.csv')) > 0",
-        "(select count(*) from glob('FOLDER/*')) > 0",
-        "(select count(*) from sqlite_scan('FOLDER/a.db', 't')) > 0",
-        "(select count(*) from duckdb_secrets()) > 0",
-        "getenv('HOME') = ''",
-        "true; COPY (select 1) TO 'FOLDER/b.csv'",
-        "true; ATTACH 'FOLDER/b.db'",
-        "true; INSTALL httpfs; LOAD httpfs",
-        "true; SET enable_external_access = true",
-        "true; drop table held",
-        "true union all select '../../a'",
-        "true limit 0",
-        "not " * 20_000 + "true",
-        "'",
-        "/*",
-        "",
+        *HOSTILE_QUERIES[:3],
+        *(pytest.param(q, marks=pytest.mark.heavy) for q in HOSTILE_QUERIES[3:]),
     ],
 )
 def test_a_query_that_cannot_be_answered_is_one_line_and_reads_nothing_else(

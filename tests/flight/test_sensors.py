@@ -139,6 +139,7 @@ def test_ranges_have_the_noise_of_the_table(preset: Preset) -> None:
     assert np.mean([e.mean() for e in every]) == pytest.approx(mean, abs=spread)
 
 
+@pytest.mark.heavy
 def test_the_share_of_lost_ranges_is_that_of_the_table(preset: Preset) -> None:
     noise, pairs = preset
     got = np.mean([[len(r.time_s) for r in noisy.ranges.values()] for noisy, _ in pairs])

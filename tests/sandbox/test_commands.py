@@ -147,6 +147,7 @@ def test_links_in_out_are_not_written_through(
             path.unlink()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["../../victim/x", "{victim}/x", "recipe.toml", "..", "a/../../x"])
 def test_a_recipe_s_step_writes_in_the_pipeline_s_folder(
     name: str, box: Box, capsys: pytest.CaptureFixture[str]

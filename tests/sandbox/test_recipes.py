@@ -55,7 +55,10 @@ def given(box: Box) -> Box:
     return box
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    "command",
+    ["run", "render", *(pytest.param(c, marks=pytest.mark.heavy) for c in list(COMMANDS)[2:])],
+)
 def test_hostile_toml_is_one_line_that_names_it(
     command: str, given: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -50,6 +50,7 @@ def boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.heavy
 def test_mount_and_delay_come_from_a_flight(calibrated: tuple[Path, calibrate.Result]) -> None:
     out, found = calibrated
     assert read_camera(out) == found.camera

@@ -102,6 +102,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_another_flight(
     assert not np.allclose(commands(tmp_path / "3.mcap"), commands(ideal))
 
 
+@pytest.mark.heavy
 def test_a_flight_is_made_again_from_its_own_recipe(seen: Path, tmp_path: Path) -> None:
     recipe = tmp_path / "again.toml"
     made = read_summary(seen).provenance
@@ -263,6 +264,7 @@ def test_errors_are_one_line_and_leave_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.heavy
 def test_the_command_line_takes_pilot_eye_and_distance(tmp_path: Path) -> None:
     out = tmp_path / "flight.mcap"
     words = ["fly", "fly_in_view", str(out), "--pilot", "keep_apart", "--eye", "ideal"]

@@ -33,6 +33,7 @@ def labelled(flight: Path) -> Path:
     return out
 
 
+@pytest.mark.heavy
 def test_everything_else_is_copied_bit_for_bit(flight: Path, labelled: Path) -> None:
     topics = [t for t in read_summary(flight).topics if t != "/cf1/labels"]
     assert list(read_raw(labelled, *topics)) == list(read_raw(flight, *topics))

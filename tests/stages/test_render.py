@@ -57,6 +57,7 @@ def test_a_recording_holds_images_labels_and_truth(recording: Path) -> None:
     assert check(recording) == []
 
 
+@pytest.mark.heavy
 def test_masks_depths_and_labels_agree(recording: Path) -> None:
     topics = ("/cf1/labels", "/cf1/camera/masks")
     samples = list(read(recording, *topics))

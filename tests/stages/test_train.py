@@ -220,6 +220,7 @@ def test_what_cannot_be_trained_is_said_in_one_line(dots_dataset: Path, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
+@pytest.mark.heavy
 def test_images_in_which_nobody_is_are_not_enough(tmp_path: Path) -> None:
     shots = tmp_path / "shots"
     shots.mkdir()

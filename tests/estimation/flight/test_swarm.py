@@ -72,6 +72,7 @@ def test_the_ellipses_hold_the_truth_and_what_is_kept_is_good() -> None:
     assert kept > 500 and bad <= 0.02 * kept
 
 
+@pytest.mark.heavy
 def test_the_frame_is_one_positions_agree_around_a_triangle() -> None:
     *_, swarm = solved("random", "realistic")
     one, two, three = (swarm[n].state for n in (("cf1", "cf2"), ("cf2", "cf3"), ("cf1", "cf3")))
