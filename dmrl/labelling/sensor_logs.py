@@ -15,6 +15,7 @@ from dmrl.estimation.signals.sensor_tracks import Signals, build_track
 from dmrl.labelling.flight_log import SENSOR_FIELDS, FlightLog, RobotPair, Samples
 from dmrl.labelling.sensor_file import SensorConstants
 from dmrl.recording.checks.unit_checks import check_units
+from dmrl.terminal.left_out import leave_out
 
 MIN_DURATION_S = 5.0
 """Shortest common stretch of two logs that is estimated, seconds."""
@@ -121,6 +122,8 @@ def build_sensor_logs(
         pair = _build_pair(robots, (one, other), ranges, known, warnings)
         if pair is not None:
             pairs[one, other] = pair
+        elif found:
+            leave_out("pairs of robots without the logs that they need", f"{one}-{other}")
     flying = _find_flying(flight)
     paired = {name for pair in pairs for name in pair}
     warnings += [
@@ -169,10 +172,8 @@ def _to_signals(
     warnings += [f"{topic}: {doubt}" for doubt in check_units(topic, table)]
     good = np.asarray((abs(values) < MAX_VALUE).all(axis=1))
     if bad := int((~good).sum()):
-        warnings.append(
-            f"{topic}: {bad} of {len(good)} samples are not finite, or {MAX_VALUE:g} and more; "
-            "left out"
-        )
+        reason = f"samples of {topic} that are not finite, or {MAX_VALUE:g} and more"
+        leave_out(reason, flight.path, bad)
     # Messages are in log-time order; their order of arrival shows a clock that was set back.
     if back := int((np.diff(samples.publish_ns) < -1_000_000_000).sum()):
         warnings.append(f"{topic}: its clock goes back {back} times; samples overlap there")
@@ -227,7 +228,7 @@ def _select_ranges(
     time_s, range_m = time_s[order], range_m[order]
     good = usable_ranges(time_s, range_m)
     if bad := int((~good).sum()):
-        warnings.append(f"{name}: {bad} of {len(good)} ranges are not in (0, 60] m; left out")
+        leave_out(f"ranges of {name} that are not in (0, 60] m", name, bad)
     good &= (time_s >= start_s) & (time_s <= end_s)
     if good.sum() < MIN_RANGES:
         warnings.append(f"{name}: {good.sum()} usable ranges, under {MIN_RANGES}; left out")

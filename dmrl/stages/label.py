@@ -11,7 +11,7 @@ from dmrl.errors import optional_imports
 from dmrl.estimation.model.gate import GATE_M
 from dmrl.pipeline.parallel_map import parallel_map
 from dmrl.pipeline.stage_command import stage_command
-from dmrl.terminal.arguments import In
+from dmrl.terminal.arguments import In, Strict
 from dmrl.terminal.closing import Closing, Given
 from dmrl.terminal.tables import print_table
 
@@ -54,6 +54,9 @@ class Settings:
         read; dmrl merge puts them to the others.
     camera
         A robot's camera, with mount and delay, as dmrl calibrate wrote it: --camera.cf1 FILE.
+    strict
+        End with an error if samples, ranges or pairs of robots cannot be used. Without it, they are
+        left out and counted.
     """
 
     method: Literal["batch", "swarm", "smoother", "ekf"] = "batch"
@@ -67,6 +70,7 @@ class Settings:
     undistorted: bool = False
     copy: bool = True
     camera: dict[str, Path] = field(default_factory=dict)
+    strict: Strict = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from dmrl import topics
+from dmrl.errors import SourceError
 from dmrl.estimation.model.pair import GRID_RATE_HZ
 from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.sensor_logs import MIN_RANGES, RobotLog, SensorLogs, build_sensor_logs
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
+from dmrl.terminal.left_out import count_left_out
 
 START_NS = 7_000_000_000
 Write = Callable[[float, str, Any], None]
@@ -203,11 +205,15 @@ def test_samples_that_are_no_numbers_and_clocks_that_go_back_are_said(tmp_path: 
         write(8.0, topics.RANGE("cf1", "cf2"), message_class("UwbRange")(range_m=70.0))
 
     path = tmp_path / "a.mcap"
-    found = logs(path, flight, ranges, bad)
-    assert found.warnings == [
-        "/cf1/height: 2 of 162 samples are not finite, or 1e+06 and more; left out",
-        "cf1-cf2: 1 of 41 ranges are not in (0, 60] m; left out",
-    ]
+    with count_left_out() as left_out:
+        found = logs(path, flight, ranges, bad)
+    assert found.warnings == []
+    assert left_out.counts == {
+        "samples of /cf1/height that are not finite, or 1e+06 and more": 2,
+        "ranges of cf1-cf2 that are not in (0, 60] m": 1,
+    }
+    with pytest.raises(SourceError, match="drop --strict"), count_left_out(strict=True):
+        build_sensor_logs(read_flight(path))
     with RecordingWriter(tmp_path / "b.mcap", Provenance("test")) as sink:
         late = lambda t, topic, m: sink.write(  # noqa: E731
             START_NS + round(t * 1e9),
