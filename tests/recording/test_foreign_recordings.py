@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from mcap.opcode import Opcode
+from mcap.writer import CompressionType, Writer
 
 import dmrl
 from dmrl.errors import RecordingError
@@ -95,3 +96,24 @@ def test_statistics_without_counts_are_counted(
     assert not [f for f in check(path) if "no messages" in f.text]
     info.run(path).print()
     assert "87 messages" in capsys.readouterr().out
+
+
+def test_a_large_file_of_others_says_that_nobody_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "foreign.mcap"
+    with path.open("wb") as stream:
+        sink = Writer(stream, compression=CompressionType.ZSTD)
+        sink.start()
+        schema = sink.register_schema("x", "protobuf", b"")
+        channel = sink.register_channel("/a", "protobuf", schema)
+        for k in range(50):
+            sink.add_message(channel, k, b"1234", k)
+        sink.finish()
+    assert read_summary(path).count == 50
+    assert "count" not in capsys.readouterr().err
+    monkeypatch.setattr("dmrl.recording.mcap.message_count.COUNTED_BYTES", 100)
+    copied = tmp_path / "large.mcap"
+    copied.write_bytes(path.read_bytes())
+    assert read_summary(copied).count == 50
+    assert f"{copied} is large or in a bucket" in capsys.readouterr().err

@@ -26,6 +26,7 @@ from dmrl.recording.mcap.message_index import (
 )
 from dmrl.recording.mcap.record_scan import ScannedFile
 from dmrl.recording.mcap.summary_section import SummarySection
+from dmrl.terminal.progress import say_once
 
 COUNTED_BYTES = 128_000_000
 """Uncompressed size up to which every chunk of another program's file is read to count.
@@ -86,10 +87,13 @@ def count_recording(path: Path, stream: BoundedReader, section: SummarySection) 
     """
     size = sum(chunk.uncompressed_size for chunk in section.chunk_indexes)
     costly = size > COUNTED_BYTES or stream.remote_stream is not None
-    trusted = costly or checksums.METADATA_NAME in read_metadata(path, stream, section)
-    if trusted:
+    own = checksums.METADATA_NAME in read_metadata(path, stream, section)
+    if costly or own:
         count = _get_stated(section) or verify_indexes(path, stream, section)
         if count is not None:
+            if not own:
+                words = "is large or in a bucket: its statistics count its messages"
+                say_once(f"{path} {words}. To count them all: dmrl check")
             return count
     times = _iter_chunk_times(path, stream, section)
     return _compare(path, section.statistics, section.channels_by_id, times)
