@@ -4,87 +4,48 @@ Times are log times in nanoseconds. `reader` reads messages, `writer` writes a r
 `summary` reads its topics and metadata. No other package imports mcap.
 """
 
-from dmrl.recording.attachments import copy_metadata_and_attachments, read_splits
-from dmrl.recording.checks.check_recording import check, list_label_findings, print_findings
-from dmrl.recording.checks.finding import Finding
-from dmrl.recording.copying.edit import merge, trim
-from dmrl.recording.copying.resume import InterruptedRecording, recover_interrupted
-from dmrl.recording.copying.rewrite import (
-    Series,
-    TimedMessage,
-    iter_time_slices,
-    rewrite,
-    shift_times,
+from dmrl.recording.attachments import (
+    copy_metadata_and_attachments as copy_metadata_and_attachments,
 )
-from dmrl.recording.licences import (
-    LICENCES_METADATA,
-    extract_licence_title,
-    find_licence_file,
-    read_licences,
-)
-from dmrl.recording.loaded import LoadedRecording
-from dmrl.recording.log_times import read_log_times
-from dmrl.recording.mcap.channel import Channel, RawMessage
-from dmrl.recording.preview import sample_topics
-from dmrl.recording.provenance import Input, Provenance
-from dmrl.recording.provenance_inputs import build_input, build_provenance
-from dmrl.recording.reader import (
-    Stamped,
-    iter_columns,
-    iter_topic_batches,
-    match_topics,
-    parse_message,
-    read,
-    read_raw,
-    read_table,
-)
-from dmrl.recording.recover import recover
-from dmrl.recording.recovery_report import Recovery
-from dmrl.recording.summary import SPLIT_METADATA, Summary, TopicInfo, read_summary
-from dmrl.recording.writer import RecordingWriter
-
-__all__ = [
-    "LICENCES_METADATA",
-    "SPLIT_METADATA",
-    "Channel",
-    "Finding",
-    "Input",
-    "InterruptedRecording",
-    "LoadedRecording",
-    "Provenance",
-    "RawMessage",
-    "RecordingWriter",
-    "Recovery",
-    "Series",
-    "Stamped",
-    "Summary",
-    "TimedMessage",
-    "TopicInfo",
-    "build_input",
-    "build_provenance",
-    "check",
-    "copy_metadata_and_attachments",
-    "extract_licence_title",
-    "find_licence_file",
-    "iter_columns",
-    "iter_time_slices",
-    "iter_topic_batches",
-    "list_label_findings",
-    "match_topics",
-    "merge",
-    "parse_message",
-    "print_findings",
-    "read",
-    "read_licences",
-    "read_log_times",
-    "read_raw",
-    "read_splits",
-    "read_summary",
-    "read_table",
-    "recover",
-    "recover_interrupted",
-    "rewrite",
-    "sample_topics",
-    "shift_times",
-    "trim",
-]
+from dmrl.recording.attachments import read_splits as read_splits
+from dmrl.recording.checks.check_recording import check as check
+from dmrl.recording.checks.check_recording import list_label_findings as list_label_findings
+from dmrl.recording.checks.check_recording import print_findings as print_findings
+from dmrl.recording.checks.finding import Finding as Finding
+from dmrl.recording.copying.edit import merge as merge
+from dmrl.recording.copying.edit import trim as trim
+from dmrl.recording.copying.resume import InterruptedRecording as InterruptedRecording
+from dmrl.recording.copying.resume import recover_interrupted as recover_interrupted
+from dmrl.recording.copying.rewrite import Series as Series
+from dmrl.recording.copying.rewrite import TimedMessage as TimedMessage
+from dmrl.recording.copying.rewrite import iter_time_slices as iter_time_slices
+from dmrl.recording.copying.rewrite import rewrite as rewrite
+from dmrl.recording.copying.rewrite import shift_times as shift_times
+from dmrl.recording.licences import LICENCES_METADATA as LICENCES_METADATA
+from dmrl.recording.licences import extract_licence_title as extract_licence_title
+from dmrl.recording.licences import find_licence_file as find_licence_file
+from dmrl.recording.licences import read_licences as read_licences
+from dmrl.recording.loaded import LoadedRecording as LoadedRecording
+from dmrl.recording.log_times import read_log_times as read_log_times
+from dmrl.recording.mcap.channel import Channel as Channel
+from dmrl.recording.mcap.channel import RawMessage as RawMessage
+from dmrl.recording.preview import sample_topics as sample_topics
+from dmrl.recording.provenance import Input as Input
+from dmrl.recording.provenance import Provenance as Provenance
+from dmrl.recording.provenance_inputs import build_input as build_input
+from dmrl.recording.provenance_inputs import build_provenance as build_provenance
+from dmrl.recording.reader import Stamped as Stamped
+from dmrl.recording.reader import iter_columns as iter_columns
+from dmrl.recording.reader import iter_topic_batches as iter_topic_batches
+from dmrl.recording.reader import match_topics as match_topics
+from dmrl.recording.reader import parse_message as parse_message
+from dmrl.recording.reader import read as read
+from dmrl.recording.reader import read_raw as read_raw
+from dmrl.recording.reader import read_table as read_table
+from dmrl.recording.recover import recover as recover
+from dmrl.recording.recovery_report import Recovery as Recovery
+from dmrl.recording.summary import SPLIT_METADATA as SPLIT_METADATA
+from dmrl.recording.summary import Summary as Summary
+from dmrl.recording.summary import TopicInfo as TopicInfo
+from dmrl.recording.summary import read_summary as read_summary
+from dmrl.recording.writer import RecordingWriter as RecordingWriter
