@@ -5,45 +5,41 @@ others become ``dmrl_msgs/msg/<Name>`` with the fields of dmrl's own; these type
 from protobuf. ``dmrl convert`` reads all of them back. Bag times are log times.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from keyword import iskeyword
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.message_factory import GetMessageClass
 
 from dmrl.atomic_output import atomic_folder
-from dmrl.errors import MissingExtra, RecordingError
+from dmrl.errors import MissingExtra, RecordingError, UnreadableTopic
 from dmrl.formats.ros.ros_messages import DMRL_PREFIX, HALF_PX
-from dmrl.recording import Stamped, read, read_summary
+from dmrl.recording import RawMessage, parse_message, read_raw, read_summary
+from dmrl.recording.protobuf.message_types import find_channel_descriptor
+from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import track
 
 F = FieldDescriptor
 ROS_SCALARS = {
     F.TYPE_DOUBLE: "float64",
     F.TYPE_FLOAT: "float32",
-    F.TYPE_UINT32: "uint32",
-    F.TYPE_SINT32: "int32",
-    F.TYPE_INT32: "int32",
-    F.TYPE_SINT64: "int64",
-    F.TYPE_INT64: "int64",
-    F.TYPE_UINT64: "uint64",
-    F.TYPE_FIXED32: "uint32",
-    F.TYPE_FIXED64: "uint64",
-    F.TYPE_SFIXED32: "int32",
-    F.TYPE_SFIXED64: "int64",
-    F.TYPE_ENUM: "int32",
     F.TYPE_BOOL: "bool",
     F.TYPE_STRING: "string",
     F.TYPE_BYTES: "uint8[]",
+    **dict.fromkeys((F.TYPE_UINT32, F.TYPE_FIXED32), "uint32"),
+    **dict.fromkeys((F.TYPE_UINT64, F.TYPE_FIXED64), "uint64"),
+    **dict.fromkeys((F.TYPE_INT32, F.TYPE_SINT32, F.TYPE_SFIXED32, F.TYPE_ENUM), "int32"),
+    **dict.fromkeys((F.TYPE_INT64, F.TYPE_SINT64, F.TYPE_SFIXED64), "int64"),
 }
-NUMPY_CODES = {"float64": "f8", "float32": "f4", "uint32": "u4", "int32": "i4", "int64": "i8"}
-NUMPY_CODES |= {"uint64": "u8", "bool": "?"}
 
 
 def write_bag(recording: Path, out: Path) -> dict[str, int]:
     """Write the bag to the folder ``out``; return messages per topic.
+
+    Topics and messages that a bag cannot hold are left out.
 
     Parameters
     ----------
@@ -57,7 +53,7 @@ def write_bag(recording: Path, out: Path) -> dict[str, int]:
     MissingExtra
         If rosbags is not installed.
     RecordingError
-        If the recording cannot be read, or a type has no equivalent in ROS 2.
+        If the recording cannot be read, or nothing of it fits ROS 2.
     OutputError
         If ``out`` exists or cannot be written.
     """
@@ -72,26 +68,31 @@ def write_bag(recording: Path, out: Path) -> dict[str, int]:
     with atomic_folder(out) as folder:
         writer = Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
         with writer:
-            for sample in track(read(recording), "Writing a bag", found.count):
-                kind, message = types.convert_sample(sample)
-                topic = sample.topic
-                if topic not in connections:
-                    opened = writer.add_connection(topic, kind, typestore=types.store)
-                    connections[topic] = opened
-                if connections[topic].msgtype != kind:
-                    mixed = f"{recording}: {topic} mixes message types"
-                    raise RecordingError(f"{mixed}, which a bag cannot hold. Pass --to csv")
+            for raw in track(read_raw(recording), "Writing a bag", found.count):
+                topic = raw.topic
+                try:
+                    kind, message = types.convert(raw)
+                    if topic not in connections:
+                        opened = writer.add_connection(topic, kind, typestore=types.store)
+                        connections[topic] = opened
+                    if connections[topic].msgtype != kind:
+                        raise _UnfitError("its type is another than that of the first message")
+                except _UnfitError as e:
+                    leave_out(f"messages on {topic} that ROS 2 cannot hold: {e}", recording)
+                    continue
                 data = types.store.serialize_cdr(message, kind)
-                writer.write(connections[topic], sample.time_ns, data)
+                writer.write(connections[topic], raw.time_ns, data)
                 counts[topic] += 1
+        if found.count and not connections:
+            raise RecordingError(f"{recording} has nothing that ROS 2 can hold. Pass --to csv")
         for path in (folder / "bag").iterdir():
             path.rename(folder / path.name)
         (folder / "bag").rmdir()
-    return counts
+    return {t: n for t, n in counts.items() if n or not found.topics[t].count}
 
 
-class _UnsupportedType(ValueError):
-    """A type without an equivalent in ROS 2."""
+class _UnfitError(ValueError):
+    """A message, or a type, without an equivalent in ROS 2."""
 
 
 class _RosTypes:
@@ -103,22 +104,29 @@ class _RosTypes:
         self._recording = recording
         self.store = get_typestore(Stores.ROS2_HUMBLE)
         self._names: dict[Descriptor, str] = {}
-        self._fields: dict[Descriptor, dict[str, FieldDescriptor]] = {}
+        self._unfit: dict[Descriptor, _UnfitError] = {}
+        self._renamed: dict[str, dict[str, str]] = {}
+        """Fields of the protobuf messages by those of their ROS types, by type."""
 
-    def convert_sample(self, sample: Stamped) -> tuple[str, Any]:
-        """Return the type name and message of a sample."""
-        kind = sample.message.DESCRIPTOR
-        standard = STANDARD_TYPES.get(kind.full_name)
-        if standard is not None:
-            name, make = standard
-            return name, make(self.store.types, sample.message, sample.time_ns)
+    def convert(self, raw: RawMessage) -> tuple[str, Any]:
+        """Return the type name and the message of a message; raise _UnfitError if it has none."""
         try:
-            return self._register_type(kind), self._convert_message(sample.message)
-        except _UnsupportedType as e:
-            raise RecordingError(
-                f"{self._recording}: {sample.topic}: {e}, which ROS 2 does not support. Remove it: "
-                "dmrl trim"
-            ) from None
+            kind = find_channel_descriptor(self._recording, raw.channel)
+        except UnreadableTopic as e:
+            raise _UnfitError(e.reason) from None
+        message = parse_message(raw, GetMessageClass(kind), self._recording)
+        if kind.full_name in STANDARD_TYPES:
+            name, describe = STANDARD_TYPES[kind.full_name]
+            return name, self._build(name, describe(message, raw.time_ns))
+        if kind in self._unfit:
+            raise self._unfit[kind]
+        try:
+            name = self._register_type(kind)
+        except _UnfitError as e:
+            self._names = {known: name for known, name in self._names.items() if name}
+            self._unfit[kind] = e
+            raise
+        return name, self._build(name, message)
 
     def _register_type(self, kind: Descriptor) -> str:
         """Register a type and its nested types; return its name."""
@@ -135,40 +143,48 @@ class _RosTypes:
             name = f"{base}{len(self._names)}"
         self.store.register(get_types_from_msg("\n".join(lines) + "\n", name))
         self._names[kind] = name
-        self._fields[kind] = {names[field.name]: field for field in kind.fields}
+        self._renamed[name] = {ros: own for own, ros in names.items()}
         return name
 
     def _to_field_type(self, field: FieldDescriptor) -> str:
-        if field.message_type is not None:
-            inner = field.message_type
+        inner = field.message_type
+        if inner is not None:
             if inner.GetOptions().map_entry or self._names.get(inner) == "":
-                raise _UnsupportedType(f"{field.full_name} is a map, or its type contains itself")
-            own = self._register_type(field.message_type).replace("/msg/", "/")
+                raise _UnfitError(f"{field.full_name} is a map, or its type contains itself")
+            own = self._register_type(inner).replace("/msg/", "/")
         else:
             own = ROS_SCALARS[field.type]
         if field.is_repeated and field.type == F.TYPE_BYTES:
-            raise _UnsupportedType(f"{field.full_name} is a list of bytes")
+            raise _UnfitError(f"{field.full_name} is a list of bytes")
         return f"{own}[]" if field.is_repeated else own
 
-    def _convert_message(self, message: Any) -> Any:
-        kind = message.DESCRIPTOR
-        make = self.store.types[self._register_type(kind)]
-        values = {
-            name: self._convert_value(field, getattr(message, field.name))
-            for name, field in self._fields[kind].items()
+    def _build(self, name: str, value: Any) -> Any:
+        """Build a message from a protobuf message, or from a mapping; other fields are 0."""
+        _, fields = self.store.fielddefs[name]
+        sources = {field: self._renamed.get(name, {}).get(field, field) for field, _ in fields}
+        given = {
+            field: value.get(own) if isinstance(value, Mapping) else getattr(value, own, None)
+            for field, own in sources.items()
         }
-        # ROS 2 requires a hidden field in a message without fields.
-        return make(**values) if values else make(structure_needs_at_least_one_member=0)
+        parts = {field: self._build_field(*form, given[field]) for field, form in fields}
+        return self.store.types[name](**parts)
 
-    def _convert_value(self, field: FieldDescriptor, value: Any) -> Any:
-        if field.is_repeated:
-            if field.type == F.TYPE_MESSAGE:
-                return [self._convert_message(item) for item in value]
-            code = NUMPY_CODES.get(ROS_SCALARS[field.type])
-            return np.array(list(value), code) if code else list(value)
-        if field.type == F.TYPE_MESSAGE:
-            return self._convert_message(value)
-        return np.frombuffer(value, np.uint8) if field.type == F.TYPE_BYTES else value
+    def _build_field(self, node: int, form: Any, value: Any) -> Any:
+        """Build a field of a form that rosbags gives: a name, a base type, or a list of either."""
+        if node == NAME_NODE:
+            return self._build(form, {} if value is None else value)
+        if node not in LIST_NODES:
+            return 0 if value is None else value
+        item, kind = form[0]
+        if item == NAME_NODE:
+            return [self._build(kind, one) for one in value]
+        if isinstance(value, bytes):
+            return np.frombuffer(value, np.uint8)
+        return list(value) if kind[0] == "string" else np.array(list(value), kind[0])
+
+
+NAME_NODE, LIST_NODES = 2, (3, 4)
+"""Kinds of fields in rosbags: a message; an array and a sequence."""
 
 
 def _to_field_name(name: str) -> str:
@@ -189,87 +205,43 @@ def _to_type_name(kind: Descriptor) -> str:
     return f"Log{name}" if kind.full_name.startswith("dmrl.log.") else name
 
 
-def _build_header(types: Any, time_ns: int, frame: str) -> Any:
+def _header(time_ns: int, frame: str) -> dict[str, Any]:
     seconds, nanos = divmod(time_ns, 1_000_000_000)
-    stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanos)
-    return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
+    return {"header": {"stamp": {"sec": seconds, "nanosec": nanos}, "frame_id": frame}}
 
 
-def _frame_time_ns(message: Any) -> int:
-    return int(message.timestamp.seconds * 1_000_000_000 + message.timestamp.nanos)
+def _describe_image(message: Any, time_ns: int) -> dict[str, Any]:
+    own = {"format": message.format, "data": message.data}
+    return _header(time_ns, message.frame_id) | own
 
 
-def _build_vector(types: Any, name: str, value: Any) -> Any:
-    return types[f"geometry_msgs/msg/{name}"](x=value.x, y=value.y, z=value.z)
-
-
-def _build_quaternion(types: Any, q: Any) -> Any:
-    return types["geometry_msgs/msg/Quaternion"](x=q.x, y=q.y, z=q.z, w=q.w)
-
-
-def _convert_compressed_image(types: Any, message: Any, time_ns: int) -> Any:
-    return types["sensor_msgs/msg/CompressedImage"](
-        header=_build_header(types, time_ns, message.frame_id),
-        format=message.format,
-        data=np.frombuffer(message.data, np.uint8),
-    )
-
-
-def _convert_camera_info(types: Any, message: Any, time_ns: int) -> Any:
-    sizes = (len(message.K), len(message.R), len(message.P))
-    if sizes != (9, 9, 12):
-        raise RecordingError(
-            f"a camera calibration at {time_ns} ns has {sizes} numbers in K, R and P, not 9, 9 and "
-            "12. Remove its topic: dmrl trim"
-        )
+def _describe_camera(message: Any, time_ns: int) -> dict[str, Any]:
+    if (sizes := (len(message.K), len(message.R), len(message.P))) != (9, 9, 12):
+        raise _UnfitError(f"a calibration with {sizes} numbers in K, R and P, not 9, 9 and 12")
     k, p = np.array(message.K), np.array(message.P)
     k[[2, 5]] -= HALF_PX
     p[[2, 6]] -= HALF_PX
-    roi = types["sensor_msgs/msg/RegionOfInterest"](
-        x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-    )
-    return types["sensor_msgs/msg/CameraInfo"](
-        header=_build_header(types, time_ns, message.frame_id),
-        height=message.height,
-        width=message.width,
-        distortion_model=message.distortion_model,
-        d=np.array(message.D, float),
-        k=k,
-        r=np.array(message.R, float),
-        p=p,
-        binning_x=0,
-        binning_y=0,
-        roi=roi,
-    )
+    own = {name: getattr(message, name) for name in ("height", "width", "distortion_model")}
+    own |= {"d": message.D, "k": k, "r": message.R, "p": p}
+    return _header(time_ns, message.frame_id) | own
 
 
-def _convert_pose(types: Any, message: Any, time_ns: int) -> Any:
-    pose = types["geometry_msgs/msg/Pose"](
-        position=_build_vector(types, "Point", message.pose.position),
-        orientation=_build_quaternion(types, message.pose.orientation),
-    )
-    header = _build_header(types, time_ns, message.frame_id)
-    return types["geometry_msgs/msg/PoseStamped"](header=header, pose=pose)
+def _describe_pose(message: Any, time_ns: int) -> dict[str, Any]:
+    return _header(time_ns, message.frame_id) | {"pose": message.pose}
 
 
-def _convert_transforms(types: Any, message: Any, time_ns: int) -> Any:
-    frames = [
-        types["geometry_msgs/msg/TransformStamped"](
-            header=_build_header(types, _frame_time_ns(frame) or time_ns, frame.parent_frame_id),
-            child_frame_id=frame.child_frame_id,
-            transform=types["geometry_msgs/msg/Transform"](
-                translation=_build_vector(types, "Vector3", frame.translation),
-                rotation=_build_quaternion(types, frame.rotation),
-            ),
-        )
-        for frame in message.transforms
-    ]
-    return types["tf2_msgs/msg/TFMessage"](transforms=frames)
+def _describe_transforms(message: Any, time_ns: int) -> dict[str, Any]:
+    frames = []
+    for frame in message.transforms:
+        stamp_ns = frame.timestamp.seconds * 1_000_000_000 + frame.timestamp.nanos
+        own = {"child_frame_id": frame.child_frame_id, "transform": frame}
+        frames.append(_header(stamp_ns or time_ns, frame.parent_frame_id) | own)
+    return {"transforms": frames}
 
 
-STANDARD_TYPES: dict[str, tuple[str, Callable[[Any, Any, int], Any]]] = {
-    "foxglove.CompressedImage": ("sensor_msgs/msg/CompressedImage", _convert_compressed_image),
-    "foxglove.CameraCalibration": ("sensor_msgs/msg/CameraInfo", _convert_camera_info),
-    "foxglove.PoseInFrame": ("geometry_msgs/msg/PoseStamped", _convert_pose),
-    "foxglove.FrameTransforms": ("tf2_msgs/msg/TFMessage", _convert_transforms),
+STANDARD_TYPES: dict[str, tuple[str, Callable[[Any, int], dict[str, Any]]]] = {
+    "foxglove.CompressedImage": ("sensor_msgs/msg/CompressedImage", _describe_image),
+    "foxglove.CameraCalibration": ("sensor_msgs/msg/CameraInfo", _describe_camera),
+    "foxglove.PoseInFrame": ("geometry_msgs/msg/PoseStamped", _describe_pose),
+    "foxglove.FrameTransforms": ("tf2_msgs/msg/TFMessage", _describe_transforms),
 }

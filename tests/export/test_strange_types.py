@@ -1,5 +1,6 @@
 """Recordings of types that dmrl does not know, as bags and tables: all of it, or one line."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ from rosbags.highlevel import AnyReader
 from dmrl.errors import RecordingError
 from dmrl.export.csv_parquet import write_tables
 from dmrl.export.ros2 import write_bag
-from dmrl.recording import Channel, RawMessage, RecordingWriter, build_provenance
+from dmrl.messages import message_class
+from dmrl.recording import Channel, RawMessage, RecordingWriter, build_provenance, read_raw
+from dmrl.terminal.left_out import count_left_out
 
 OWN = {"type": F.TYPE_MESSAGE, "type_name": ".x.M"}
 MANY = {"label": F.LABEL_REPEATED}
@@ -83,11 +86,22 @@ def test_every_whole_number_is_one_in_a_bag(kind: int, tmp_path: Path) -> None:
     ],
     ids=["itself", "a list of itself", "a map", "a list of bytes"],
 )
-def test_what_ros_cannot_say_is_one_line(field: dict[str, Any], words: str, tmp_path: Path) -> None:
+def test_what_ros_cannot_say_is_left_out(field: dict[str, Any], words: str, tmp_path: Path) -> None:
     path = recorded(tmp_path, field)
-    with pytest.raises(RecordingError, match=rf"in.mcap: /cf1/m: x.M.a .*{words}.*dmrl trim"):
+    with (
+        pytest.raises(RecordingError, match=r"in.mcap has nothing that ROS 2 can hold"),
+        count_left_out() as left_out,
+    ):
         write_bag(path, tmp_path / "bag")
     assert list(tmp_path.iterdir()) == [path]
+    (reason,) = left_out.counts
+    assert re.match(rf"messages on /cf1/m that ROS 2 cannot hold: x.M.a .*{words}", reason)
+    both = tmp_path / "both.mcap"
+    with RecordingWriter(both, build_provenance("test")) as sink:
+        for raw in read_raw(path):
+            sink.write_raw(raw)
+        sink.write(5, "/cf1/height", message_class("Height")(height_m=0.5))
+    assert write_bag(both, tmp_path / "bag") == {"/cf1/height": 1}
 
 
 def test_a_list_of_bytes_is_base64_in_a_table(tmp_path: Path) -> None:
