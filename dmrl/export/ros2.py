@@ -166,16 +166,17 @@ class _RosTypes:
             field: value.get(own) if isinstance(value, Mapping) else getattr(value, own, None)
             for field, own in sources.items()
         }
-        parts = {field: self._build_field(*form, given[field]) for field, form in fields}
+        parts = {field: self._build_field(form, given[field]) for field, form in fields}
         return self.store.types[name](**parts)
 
-    def _build_field(self, node: int, form: Any, value: Any) -> Any:
+    def _build_field(self, form: Any, value: Any) -> Any:
         """Build a field of a form that rosbags gives: a name, a base type, or a list of either."""
+        node, detail = form
         if node == NAME_NODE:
-            return self._build(form, {} if value is None else value)
+            return self._build(detail, {} if value is None else value)
         if node not in LIST_NODES:
             return 0 if value is None else value
-        item, kind = form[0]
+        item, kind = detail[0]
         if item == NAME_NODE:
             return [self._build(kind, one) for one in value]
         if isinstance(value, bytes):

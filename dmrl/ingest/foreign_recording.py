@@ -6,8 +6,7 @@ are copied, with new names of robots. All others are left out, with a line that 
 """
 
 import base64
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -22,13 +21,10 @@ from google.protobuf.message_factory import GetMessageClass
 from dmrl import topics
 from dmrl.errors import RecordingError, SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
-from dmrl.formats.files.pictures import scaling_words
 from dmrl.formats.ros import bag
-from dmrl.formats.ros.bag import select_usable
-from dmrl.formats.ros.message_clock import MessageClock
-from dmrl.formats.ros.reader import build_decoder
-from dmrl.formats.ros.ros_messages import MessageContext, is_camera_image
-from dmrl.formats.ros.topic_plan import ODOMETRY, TopicPlan, plan_topics
+from dmrl.formats.ros.reader import BagMessage, build_decoder
+from dmrl.formats.ros.ros_messages import is_camera_image
+from dmrl.formats.ros.topic_plan import TopicPlan, plan_topics
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.messages import LOG_PACKAGE, LogType
 from dmrl.recording import Channel, RawMessage, Summary, read_raw, read_splits, read_summary
@@ -36,7 +32,6 @@ from dmrl.recording.protobuf.message_types import find_channel_descriptor
 from dmrl.recording.writer import RECIPE_NAME
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import leave_out
-from dmrl.terminal.progress import say
 
 ROS_TYPES = {
     "foxglove.CompressedImage": "sensor_msgs/msg/CompressedImage",
@@ -48,6 +43,8 @@ ROS_TYPES = {
 ROS_ENCODINGS = ("cdr", "ros1")
 OWN_PACKAGES = ("dmrl.v1.", "dmrl.log.")
 FIELDS_WITH_ROBOTS = ("peer", "frame_id", "parent_frame_id", "child_frame_id")
+STAMP_FIELDS = {"seconds": "sec", "sec": "sec", "nanos": "nanosec", "nsec": "nanosec"}
+"""Fields of a time by those of a time in protobuf or JSON."""
 LOG_CODES = {F.TYPE_UINT32: "I", F.TYPE_SINT32: "i", F.TYPE_SINT64: "q"}
 LOG_CODES |= {F.TYPE_FLOAT: "f", F.TYPE_DOUBLE: "d"}
 """Letters of `LogType` by type of field."""
@@ -134,35 +131,21 @@ def _iter_own(summary: Summary, options: Options) -> Iterator[tuple[str, str]]:
 def _iter_samples(
     source: Path, own: Mapping[str, str], lines: Mapping[str, TopicPlan], options: Options
 ) -> Iterator[Sample]:
-    calibrated: set[str] = set()
-    scaled: set[str] = set()
-    stamps = (
-        (r.topic, _stamp_ns(_decode(r, source)), r.time_ns) for r in read_topics(source, lines)
-    )
-    clock = MessageClock.from_stamps(source, stamps)
-    moving = {line.robot for line in lines.values() if line.kind == ODOMETRY}
-    for raw in read_topics(source, [*own, *lines]):
-        if raw.topic in own:
-            message = parse(raw, source)
-            fields = _to_fields(message, options.names)
-            yield Sample(raw.time_ns, own[raw.topic], _to_type(message), fields, raw.publish_ns)
-            continue
-        line, held = lines[raw.topic], _decode(raw, source)
-        odometry = line.robot in moving
-        where = MessageContext(
-            source, line.robot, line.peer, line.captured, odometry, options.bits, scaled
-        )
-        try:
-            time_ns = clock.find_time_ns(line.topic, _stamp_ns(held), raw.time_ns)
-            converted = bag.convert_message(line, held, time_ns or 0, where)
-            samples = [] if time_ns is None else list(converted)
-        except (AttributeError, TypeError, ValueError):  # a field is missing, or is no number
-            leave_out(f"messages on {line.topic} that cannot be decoded", source)
-            continue
-        for sample in select_usable(iter(samples), f"{source}: {line.topic}", calibrated):
-            yield replace(sample, publish_ns=raw.publish_ns)
-    if scaled:
-        say(f"{source}: images of {', '.join(sorted(scaled))}: {scaling_words(options.bits)}")
+    by_kind = {(line.topic, line.kind): line for line in lines.values()}
+
+    def messages(topics: Collection[str]) -> Generator[BagMessage | Sample]:
+        for raw in read_topics(source, topics):
+            if raw.topic in own:
+                message = parse(raw, source)
+                fields = _to_fields(message, options.names)
+                yield Sample(raw.time_ns, own[raw.topic], _to_type(message), fields, raw.publish_ns)
+            elif (held := _decode(raw, source)) is not None:
+                kind = lines[raw.topic].kind
+                yield BagMessage(raw.topic, kind, raw.time_ns, held, raw.publish_ns)
+            elif topics is not lines:  # those are read again
+                leave_out(f"messages on {raw.topic} that cannot be decoded", source)
+
+    return bag.iter_samples(source, messages([*own, *lines]), messages(lines), by_kind, options)
 
 
 def read_topics(source: Path, wanted: Iterable[str]) -> Iterator[RawMessage]:
@@ -217,22 +200,17 @@ def _to_object(value: Any) -> Any:
         value = {field.name: getattr(value, field.name) for field in value.DESCRIPTOR.fields}
     if isinstance(value, dict):
         held = {str(name): _to_object(part) for name, part in value.items()}
+        if isinstance(held.get("timestamp"), SimpleNamespace):
+            held = {"header": _to_header(held["timestamp"])} | held
         return SimpleNamespace(**{"is_bigendian": False} | held)
     return value
 
 
-def _stamp_ns(message: Any) -> int | None:
-    """Return the time in a message, protobuf's, JSON's or ROS's; None if it has none."""
-    if hasattr(message, "header"):
-        return bag.header_time_ns(message)
-    stamp = getattr(message, "timestamp", None)
-    seconds, nanos = (
-        getattr(stamp, names[0], getattr(stamp, names[1], None))
-        for names in (("seconds", "sec"), ("nanos", "nsec"))
-    )
-    if not (isinstance(seconds, int) and isinstance(nanos, int)):
-        return None
-    return max(seconds * 1_000_000_000 + nanos, 0)
+def _to_header(stamp: Any) -> Any:
+    """Return a ROS header with the time of a message, protobuf's or JSON's."""
+    told = {STAMP_FIELDS[n]: v for n, v in vars(stamp).items() if n in STAMP_FIELDS}
+    whole = all(isinstance(value, int) for value in told.values())
+    return SimpleNamespace(stamp=SimpleNamespace(**told) if whole else None)
 
 
 def _to_type(message: Any) -> str | LogType:

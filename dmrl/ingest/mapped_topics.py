@@ -112,17 +112,19 @@ def _iter_objects(
     source: Path, topics: Iterable[str], kinds: Mapping[str, str], *, is_bag: bool
 ) -> Iterator[tuple[str, int, Any]]:
     """Yield topic, time and decoded message; messages that cannot be decoded are left out."""
+    found: Iterable[tuple[str, int, Any]]
     if is_bag:
-        for message in iter_messages(source, {(topic, kinds[topic]) for topic in topics}):
-            stamp_ns = bag.header_time_ns(message.decoded)
-            yield message.topic, message.bag_ns if stamp_ns is None else stamp_ns, message.decoded
-        return
-    for raw in foreign_recording.read_topics(source, topics):
-        if (found := foreign_recording.parse(raw, source)) is None:
-            leave_out(f"messages on {raw.topic} that cannot be decoded", source)
+        wanted = {(topic, kinds[topic]) for topic in topics}
+        found = ((m.topic, m.bag_ns, m.decoded) for m in iter_messages(source, wanted))
+    else:
+        raws = foreign_recording.read_topics(source, topics)
+        found = ((raw.topic, raw.time_ns, foreign_recording.parse(raw, source)) for raw in raws)
+    for topic, time_ns, message in found:
+        if message is None:
+            leave_out(f"messages on {topic} that cannot be decoded", source)
         else:
-            stamp_ns = bag.header_time_ns(found)
-            yield raw.topic, raw.time_ns if stamp_ns is None else stamp_ns, found
+            stamp_ns = bag.header_time_ns(message)
+            yield topic, time_ns if stamp_ns is None else stamp_ns, message
 
 
 def _find_number(value: Any, path: Sequence[str]) -> str:

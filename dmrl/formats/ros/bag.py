@@ -14,7 +14,7 @@ replaces it, and a line reports this. That time is the publish time of every mes
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
 from math import isfinite
@@ -25,7 +25,7 @@ from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
 from dmrl.formats.files.pictures import scaling_words
 from dmrl.formats.ros.message_clock import MessageClock
-from dmrl.formats.ros.reader import iter_messages, list_topics
+from dmrl.formats.ros.reader import BagMessage, iter_messages, list_topics
 from dmrl.formats.ros.ros_messages import (
     CONVERTERS,
     DMRL_PREFIX,
@@ -89,22 +89,50 @@ def load_content(source: Path, options: Options, *, skip: Collection[str] = ()) 
     for topic, kind, count in held:
         if (topic, kind) in why:
             leave_out(f"messages on {topic}: {why[topic, kind]}", source, count)
-    return Content(
-        _iter_samples(source, lines, options), sum(line.count for line in lines.values())
+    samples = iter_samples(
+        source,
+        iter_messages(source, lines),
+        iter_messages(source, lines, ahead=True),
+        lines,
+        options,
     )
+    return Content(samples, sum(line.count for line in lines.values()))
 
 
-def _iter_samples(
-    source: Path, lines: Mapping[tuple[str, str], TopicPlan], options: Options
+def iter_samples(
+    source: Path,
+    messages: Iterable[BagMessage | Sample],
+    ahead: Generator[BagMessage | Sample],
+    lines: Mapping[tuple[str, str], TopicPlan],
+    options: Options,
 ) -> Iterator[Sample]:
+    """Yield the samples of messages of ROS, or of messages with the fields of ROS's.
+
+    Parameters
+    ----------
+    source
+        The file, for reports.
+    messages
+        The messages, in the file's order. Samples among them are yielded unchanged.
+    ahead
+        The messages once more, of which the first tell the clock.
+    lines
+        Conversion by topic and type.
+    options
+        ``bits``.
+    """
     calibrated: set[str] = set()
     unstamped: Counter[str] = Counter()
     scaled: set[str] = set()
     moving = {line.robot for line in lines.values() if line.kind == ODOMETRY}
-    with closing(iter_messages(source, lines, ahead=True)) as first:
+    with closing(ahead):
+        first = (m for m in ahead if isinstance(m, BagMessage))
         stamps = ((m.topic, header_time_ns(m.decoded), m.bag_ns) for m in first)
         clock = MessageClock.from_stamps(source, stamps)
-    for message in iter_messages(source, lines):
+    for message in messages:
+        if isinstance(message, Sample):
+            yield message
+            continue
         line, bag_ns = lines[message.topic, message.kind], message.bag_ns
         odometry = line.robot in moving
         where = MessageContext(
@@ -116,8 +144,9 @@ def _iter_samples(
         if (time_ns := clock.find_time_ns(line.topic, stamp_ns, bag_ns)) is None:
             continue
         samples = convert_message(line, message.decoded, time_ns, where)
+        received_ns = bag_ns if message.publish_ns is None else message.publish_ns
         for sample in select_usable(samples, f"{source}: {line.topic}", calibrated):
-            yield replace(sample, publish_ns=max(bag_ns, 0))
+            yield replace(sample, publish_ns=max(received_ns, 0))
     if scaled:
         say(f"{source}: images of {', '.join(sorted(scaled))}: {scaling_words(options.bits)}")
     _report_unstamped(source, unstamped)

@@ -28,12 +28,16 @@ IDL_SEPARATOR = "=" * 80 + "\n"
 
 @dataclass(frozen=True, slots=True)
 class BagMessage:
-    """One message: topic, type, time at which the bag received it, and the decoded message."""
+    """One message: topic, type, time at which the bag received it, and the decoded message.
+
+    ``publish_ns`` is its publish time, if that is another.
+    """
 
     topic: str
     kind: str
     bag_ns: int
     decoded: Any
+    publish_ns: int | None = None
 
 
 def list_topics(source: Path) -> list[tuple[str, str, int]]:
