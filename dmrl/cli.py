@@ -31,7 +31,7 @@ from dmrl.storage import to_path
 # In the order of the work. The help line is the first line of the function's docstring;
 # it stands here too so that `dmrl --help` loads nothing (a test holds the two together).
 COMMANDS = {
-    "demo": "Run the whole pipeline, small, on pictures that dmrl draws itself.",
+    "demo": "Run the whole pipeline, small, on a flight that ships and on pictures it draws.",
     "run": "Run the steps of a pipeline recipe whose outputs are not up to date, side by side.",
     "render": "Render images of robots with exact labels, as a recipe says, into a recording.",
     "likeness": "Fit a render recipe to one's own frames, and show both beside each other.",

@@ -39,6 +39,12 @@ def list_pretrained_names() -> list[str]:
     return _names_in(_recipe_files() / PRETRAINED)
 
 
+def locate_recording(name: str) -> Path | None:
+    """Return the path of a recording that ships beside the recipes; None, if none has this name."""
+    path = Path(str(_recipe_files() / Path(name).name))
+    return path if path.name == name and path.suffix == ".mcap" and path.is_file() else None
+
+
 def read(name: str | Path) -> dict[str, Any]:
     """Read the keys of a recipe, by path or by the name of a shipped one.
 

@@ -121,7 +121,7 @@ def test_a_wheel_brings_one_top_level_name(wheel: zipfile.ZipFile) -> None:
 @pytest.mark.heavy
 def test_a_wheel_holds_every_module_and_data_file(wheel: zipfile.ZipFile) -> None:
     names = set(wheel.namelist())
-    wanted = {"dmrl/py.typed", "dmrl/schemas/dmrl.binpb"}
+    wanted = {"dmrl/py.typed", "dmrl/schemas/dmrl.binpb", "dmrl/recipes/demo_flight.mcap"}
     wanted |= {f"dmrl/{p.relative_to(ROOT)}" for p in ROOT.glob("schemas/dmrl/v1/*.proto")}
     wanted |= {f"dmrl/{p.relative_to(ROOT)}" for p in ROOT.glob("recipes/**/*.toml")}
     for package in SETUPTOOLS["packages"]:
@@ -142,5 +142,6 @@ def test_an_sdist_can_be_built_from(built: Path) -> None:
     wanted = {"pyproject.toml", "README.md", "LICENSE", "dmrl/py.typed", "schemas/dmrl.binpb"}
     wanted |= {str(p.relative_to(ROOT)) for p in ROOT.glob("schemas/dmrl/v1/*.proto")}
     wanted |= {str(p.relative_to(ROOT)) for p in ROOT.glob("recipes/**/*.toml")}
+    wanted |= {"recipes/demo_flight.mcap"}
     wanted |= {f"{FOLDER_OF[package]}/__init__.py" for package in MAPPED}
     assert wanted <= names

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from dmrl.evaluation import positions
+from dmrl.evaluation import positions, tracks
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.terminal.tables import print_json, print_line, print_table
 
@@ -21,7 +21,9 @@ class StepOutcome:
     left_out: bool = False
 
 
-EVALUATION_FILE, POSITIONS_FILE = "evaluation.json", "positions.json"
+EVALUATION_FILE = "evaluation.json"
+ERRORS_3D = {"positions": positions, "tracks": tracks}
+"""Evaluations of 3D positions, in files of their name, with the module that formats each."""
 FIGURE_COLUMNS = {
     "median_px": ("median, px", ".1f"),
     "within_8_px": ("within 8 px", ".1%"),
@@ -42,25 +44,25 @@ def print_report(done: Sequence[StepOutcome], *, as_json: bool = False) -> None:
     as_json
         Print one JSON document instead: seconds per step, evaluations, images.
     """
-    evaluations, judged = (
-        _read_documents(done, EVALUATION_FILE),
-        _read_documents(done, POSITIONS_FILE),
-    )
+    evaluations = _read_documents(done, EVALUATION_FILE)
+    judged = {kind: _read_documents(done, f"{kind}.json") for kind in ERRORS_3D}
     pictures = [picture for d in done if _is_result(d) for picture in _list_images(d.out)]
     if as_json:
         print_json(
             {
                 "steps": [asdict(d) for d in done],
                 "evaluations": evaluations,
-                "positions": judged,
+                **judged,
                 "pictures": pictures,
             }
         )
         return
-    for name, document in judged.items():
-        headers = [words for _, words, _ in positions.COLUMNS]
-        print_table(name, ["pair", *headers], positions.rows(document))
-        print_line(positions.note(document))
+    for kind, documents in judged.items():
+        module = ERRORS_3D[kind]
+        for name, document in documents.items():
+            headers = [words for _, words, _ in module.COLUMNS]
+            print_table(name, ["", *headers], module.rows(document))
+            print_line(module.note(document))
     rows = [(name, *_format_row(document)) for name, document in evaluations.items()]
     headers = [words for words, _ in FIGURE_COLUMNS.values()]
     if rows:

@@ -123,7 +123,9 @@ def locate_input(name: str, outs: set[str], folder: Path, data: Path | None) -> 
         return data / name.removeprefix(DATA).lstrip("/")
     if name.split("/")[0] in outs:
         return folder / name
-    return pretrained.PRETRAINED_DIR / name if name in pretrained.list_pretrained() else Path(name)
+    if name in pretrained.list_pretrained():
+        return pretrained.PRETRAINED_DIR / name
+    return recipes.locate_recording(name) or Path(name)
 
 
 def load_plan(name: str | Path) -> Plan:
@@ -275,6 +277,7 @@ def _check_source_name(name: str, outs: set[str]) -> str:
         or name in NAMED_CAMERAS
         or name in NAMED_EYES
         or name in pretrained.list_pretrained()
+        or recipes.locate_recording(name)
     ):
         return ""
     if name.startswith("/"):

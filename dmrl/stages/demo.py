@@ -10,12 +10,12 @@ def command(
     out: Path = Path("demo"),
     as_json: AsJson = False,
 ) -> None:
-    """Run the whole pipeline, small, on pictures that dmrl draws itself.
+    """Run the whole pipeline, small, on a flight that ships and on pictures it draws.
 
-    Draws pictures of small drones, converts them to a recording, builds a dataset, trains
-    the published network on it, lets it look at pictures it has not seen, judges it against
-    the truth and shows it; report.html shows it all on one page. The steps are those of the
-    recipe demo: dmrl run demo.
+    First, the network that ships finds and tracks a drone in a rendered flight. Then dmrl draws
+    pictures of small drones, builds a dataset, trains the published network on it and evaluates
+    it on other pictures. report.html shows all results on one page. The recipe demo has the same
+    steps: dmrl run demo.
 
     Parameters
     ----------
@@ -29,13 +29,7 @@ def command(
     print_report(pipeline.run("demo", out), as_json=as_json)
     page = write_html_report(out)
     if not as_json:
-        print(f"""{page}: open it in a browser; {_find_picture(out)} is a picture of it. Now try:
-  dmrl view {out}/predictions.mcap       # the same in rerun, image by image
+        print(f"""{page}: open it in a browser. Now try:
+  dmrl view {out}/flight_tracks.mcap     # the flight in rerun: images, detections, tracks
   dmrl fly fly_in_view flight.mcap && dmrl label flight.mcap labelled.mcap
   dmrl predict dmrl-nano YOUR.mcap found.mcap   # the network that ships, on your own images""")
-
-
-def _find_picture(out: Path) -> Path:
-    """Return the picture that rerun drew, or else the one that matplotlib drew."""
-    drawn = out / "picture.png"
-    return drawn if drawn.is_file() else out / "evaluation" / "examples.png"

@@ -34,12 +34,14 @@ def test_the_demo_s_pipeline_with_all_it_makes_in_a_bucket_is_that_of_here(
     text = recipes.read_text("demo").replace("images = 600", "images = 20")
     text = text.replace("epochs = 12", "epochs = 1")
     recipe = tmp_path / "small.toml"
-    recipe.write_text(text[: text.index("[[step]]   # needs a Vulkan driver")])
+    steps = text.split("[[step]]")
+    recipe.write_text("[[step]]".join(s for s in steps if "needs a Vulkan driver" not in s))
     there = to_path("s3://lab/demo")
     pipeline.run(recipe, tmp_path / "here", workers=1)
     made = pipeline.run(recipe, there, workers=1)
     assert [one.stage for one in made] == [
-        *("sketch", "convert", "dataset", "train", "predict", "evaluate")
+        *("predict", "evaluate", "track", "evaluate"),
+        *("sketch", "convert", "dataset", "train", "predict", "evaluate"),
     ]
     here, compared = tmp_path / "here", 0
     for path in sorted(p for p in here.rglob("*") if p.is_file()):
