@@ -146,7 +146,7 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return (N, width, rows, cols) for an input of the same shape."""
-        return torch.relu(x + self.pointwise(self.depthwise(x)))
+        return torch.relu_(x + self.pointwise(self.depthwise(x)))
 
 
 class DmrlNano(Network):
