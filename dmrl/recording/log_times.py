@@ -59,9 +59,9 @@ def read_indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
     """
     parts: dict[str, list[Ints]] = {topic: [_NO_TIMES] for topic in topics}
     with open_mcap(path) as stream:
-        summary = read_summary_section(path, stream)
+        summary = read_summary_section(stream)
         if summary is not None and all(c.message_index_offsets for c in summary.chunk_indexes):
-            for number, times in iter_index_times(path, stream, summary, topics):
+            for number, times in iter_index_times(stream, summary, topics):
                 if (topic := summary.channels[number].topic) in parts:
                     parts[topic].append(times)
             return {topic: np.concatenate(times) for topic, times in parts.items()}

@@ -73,13 +73,13 @@ def _sample_chunks(
 ) -> tuple[list[MessageBatch], dict[int, Channel]]:
     """Read the chosen chunks; return their batches, and channels by channel id."""
     with open_mcap(path) as stream:
-        index = read_summary_section(path, stream)
+        index = read_summary_section(stream)
         if index is None:
             return [], {}
         channels = {n: c for n, c in index.channels_by_id.items() if c.topic in names}
         batches = []
         for chunk in _choose_chunks(index, channels, start_ns, end_ns):
-            batch = read_chunk(path, stream, chunk, channels, index)
+            batch = read_chunk(stream, chunk, channels, index)
             batch = batch.take((batch.time_ns >= start_ns) & (batch.time_ns < end_ns))
             batches.append(batch.compact())
     return [block for block in batches if len(block)], channels

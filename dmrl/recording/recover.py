@@ -155,7 +155,7 @@ def _load_chunk(
 ) -> ParsedChunk | None:
     """Return the records of a chunk and register its definitions; None if it is corrupt."""
     try:
-        scan = parse_records(decompress(state.path, chunk, at))
+        scan = parse_records(decompress(chunk, at))
         found = list(scan.iter_definitions())
     except (RecordingError, *CORRUPTION_ERRORS):
         state.recovery.damaged_chunks += 1

@@ -75,7 +75,7 @@ class RecoveryState:
 def read_listed_section(path: Path, stream: BoundedReader, start: int | None = None) -> McapSummary:
     """Read the Summary section at ``start`` or where the Footer points; empty if corrupt."""
     try:
-        return read_raw_section(path, stream, start)[0] or McapSummary()
+        return read_raw_section(stream, start)[0] or McapSummary()
     except (RecordingError, *CORRUPTION_ERRORS):
         return McapSummary()
 

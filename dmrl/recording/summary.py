@@ -95,24 +95,24 @@ def read_summary(path: Path) -> Summary:
         messages than it has; see `count_recording`.
     """
     with open_mcap(path) as stream:
-        return get_cached("summary", path, stream, lambda: _build_summary(path, stream))
+        return get_cached("summary", stream, lambda: _build_summary(path, stream))
 
 
 def _build_summary(path: Path, stream: BoundedReader) -> Summary:
-    section = read_summary_section(path, stream)
+    section = read_summary_section(stream)
     if section is None:
-        scanned = scan_file(path, stream)
+        scanned = scan_file(stream)
         count, metadata, attachments = (
-            count_scanned(path, scanned),
+            count_scanned(scanned),
             scanned.metadata,
             scanned.attachments,
         )
         definitions = Definitions(scanned.schemas, scanned.channel_records, scanned.channels)
     else:
-        count = count_recording(path, stream, section)
-        metadata = read_metadata(path, stream, section)
+        count = count_recording(stream, section)
+        metadata = read_metadata(stream, section)
         places = sorted(section.attachment_indexes, key=lambda place: place.offset)
-        attachments = [read_attachment(path, stream, at) for at in places]
+        attachments = [read_attachment(stream, at) for at in places]
         definitions = Definitions(section.schemas, section.channels, section.channels_by_id)
     metadata.pop(checksums.METADATA_NAME, None)
     topics: dict[str, TopicInfo] = {}

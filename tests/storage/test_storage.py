@@ -274,7 +274,7 @@ def _sizes(path: Path) -> tuple[int, int]:
     """Bytes of the chunks of numbers and of those of pictures, as they lie in the file."""
     sizes = [0, 0]
     with open_mcap(path) as stream:
-        found = read_verified_section(path, stream)
+        found = read_verified_section(stream)
         assert found is not None
         pictured = {n for n, c in found.channels.items() if "camera/image" in c.topic}
         for chunk in found.chunk_indexes:

@@ -175,9 +175,9 @@ def iter_units(path: Path, selection: TopicSelection) -> Iterator[CopyUnit]:
         If the file is not a complete recording, or a chunk is corrupt.
     """
     with open_mcap(path) as stream:
-        summary = read_summary_section(path, stream)
+        summary = read_summary_section(stream)
         if summary is None:
-            walk = scan_file(path, stream)
+            walk = scan_file(stream)
             yield from (CopyUnit(block, walk.channels) for block in walk.batches)
             return
         channels = summary.channels_by_id
@@ -186,8 +186,8 @@ def iter_units(path: Path, selection: TopicSelection) -> Iterator[CopyUnit]:
         chunks = select_chunks(summary, kept.keys(), selection.low_ns, selection.high_ns)
         stream.expect_reads([locate_chunk(index) for index in chunks])
         for index in chunks:
-            chunk, batch, others, messages = read_chunk_for_copy(path, stream, index, summary)
+            chunk, batch, others, messages = read_chunk_for_copy(stream, index, summary)
             count_messages(counts, batch)
             yield CopyUnit(batch, channels, chunk, others, messages)
         if (selection.low_ns, selection.high_ns) == (0, MAX_TIME_NS):
-            check_counts(path, summary.statistics, kept, counts)
+            check_counts(summary.statistics, kept, counts)

@@ -60,9 +60,9 @@ def iter_batches(
     low = 0 if start_ns is None else start_ns
     high = MAX_TIME_NS if end_ns is None else end_ns
     with open_mcap(path) as stream:
-        summary = read_summary_section(path, stream)
+        summary = read_summary_section(stream)
         if summary is None:
-            yield _scan_unindexed(path, stream, topics, low, high)
+            yield _scan_unindexed(stream, topics, low, high)
             return
         channels = {
             number: channel
@@ -70,11 +70,11 @@ def iter_batches(
             if topics is None or channel.topic in topics
         }
         counts: Counter[int] = Counter()
-        for batch in _iter_in_time_order(path, stream, summary, channels, low, high):
+        for batch in _iter_in_time_order(stream, summary, channels, low, high):
             count_messages(counts, batch)
             yield batch, channels
         if (low, high) == (0, MAX_TIME_NS):
-            check_counts(path, summary.statistics, channels, counts)
+            check_counts(summary.statistics, channels, counts)
 
 
 def count_messages(counts: Counter[int], batch: MessageBatch) -> None:
@@ -93,9 +93,9 @@ def iter_batches_in_file_order(path: Path) -> Iterator[tuple[MessageBatch, dict[
         As ``iter_batches``.
     """
     with open_mcap(path) as stream:
-        summary = read_summary_section(path, stream)
+        summary = read_summary_section(stream)
         if summary is None:
-            walk = scan_file(path, stream)
+            walk = scan_file(stream)
             for batch in walk.batches:
                 yield batch, walk.channels
             return
@@ -104,14 +104,13 @@ def iter_batches_in_file_order(path: Path) -> Iterator[tuple[MessageBatch, dict[
         chunks = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
         stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
         for chunk in chunks:
-            batch = read_chunk(path, stream, chunk, channels, summary)
+            batch = read_chunk(stream, chunk, channels, summary)
             count_messages(counts, batch)
             yield batch, channels
-        check_counts(path, summary.statistics, channels, counts)
+        check_counts(summary.statistics, channels, counts)
 
 
 def _iter_in_time_order(
-    path: Path,
     stream: BoundedReader,
     summary: SummarySection,
     channels: dict[int, Channel],
@@ -125,9 +124,9 @@ def _iter_in_time_order(
     stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
     if (low, high) != (0, MAX_TIME_NS) and stream.remote_stream is None:
         # The messages cannot be compared with the statistics, but all message indexes can.
-        verify_indexes(path, stream, summary)
+        verify_indexes(stream, summary)
     for k, chunk in enumerate(chunks):
-        batch = read_chunk(path, stream, chunk, channels, summary)
+        batch = read_chunk(stream, chunk, channels, summary)
         batch = batch.take((batch.time_ns >= low) & (batch.time_ns < high))
         pending = concatenate(pending, batch).sort_by_time(last)
         if k + 1 == len(chunks):
@@ -167,10 +166,10 @@ def select_chunks(
 
 
 def _scan_unindexed(
-    path: Path, stream: BoundedReader, topics: frozenset[str] | None, low: int, high: int
+    stream: BoundedReader, topics: frozenset[str] | None, low: int, high: int
 ) -> tuple[MessageBatch, dict[int, Channel]]:
     """Read every message of a file without chunk indexes into one batch."""
-    walk = scan_file(path, stream)
+    walk = scan_file(stream)
     channels = {n: c for n, c in walk.channels.items() if topics is None or c.topic in topics}
     kept = []
     for whole in walk.batches:

@@ -2,35 +2,33 @@
 
 import zlib
 from io import BytesIO
-from pathlib import Path
 
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, MetadataIndex
 from mcap.records import Metadata as McapMetadata
 from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.mcap import checksums
-from dmrl.recording.mcap.file import RECORD_STRUCT, BoundedReader, corrupt_error
+from dmrl.recording.mcap.file import RECORD_STRUCT, BoundedReader
 
 
-def read_metadata(
-    path: Path, stream: BoundedReader, section: McapSummary
-) -> dict[str, list[dict[str, str]]]:
+def read_metadata(stream: BoundedReader, section: McapSummary) -> dict[str, list[dict[str, str]]]:
     """Read the metadata by name, and verify them against the CRC of dmrl's recordings.
 
     Raises
     ------
-    RecordingError
+    McapError
         If the CRC does not match, or a record is not where the Summary section lists it.
     """
     metadata: dict[str, list[dict[str, str]]] = {}
     crc = before = 0
     for place in sorted(section.metadata_indexes, key=lambda place: place.offset):
-        body = _read_record(path, stream, place, Opcode.METADATA)
+        body = _read_record(stream, place, Opcode.METADATA)
         record = McapMetadata.read(ReadDataStream(BytesIO(body[RECORD_STRUCT.size :])))
         if record.name != place.name:
-            raise corrupt_error(path, f"metadata {place.name} has another name")
+            raise McapError(f"metadata {place.name} has another name")
         if record.name != checksums.METADATA_NAME or checksums.belongs_to_file(
             record.metadata, place.offset
         ):
@@ -38,16 +36,16 @@ def read_metadata(
         before, crc = crc, zlib.crc32(body, crc)
     stored = metadata.get(checksums.METADATA_NAME)
     if stored and stored[-1].get("metadata") != checksums.format_crc(before):
-        raise corrupt_error(path, "its metadata fail their CRC")
+        raise McapError("its metadata fail their CRC")
     return metadata
 
 
-def read_attachment(path: Path, stream: BoundedReader, place: AttachmentIndex) -> Attachment:
+def read_attachment(stream: BoundedReader, place: AttachmentIndex) -> Attachment:
     """Read an attachment with its times and media type, and verify its CRC."""
-    body = _read_record(path, stream, place, Opcode.ATTACHMENT)[RECORD_STRUCT.size :]
+    body = _read_record(stream, place, Opcode.ATTACHMENT)[RECORD_STRUCT.size :]
     record: Attachment = Attachment.read(ReadDataStream(BytesIO(body)))
     if record.name != place.name or not has_valid_crc(record, body):
-        raise corrupt_error(path, f"attachment {place.name} fails its CRC")
+        raise McapError(f"attachment {place.name} fails its CRC")
     return record
 
 
@@ -67,7 +65,7 @@ def has_valid_crc(attachment: Attachment, body: bytes) -> bool:
 
 
 def _read_record(
-    path: Path, stream: BoundedReader, place: MetadataIndex | AttachmentIndex, kind: Opcode
+    stream: BoundedReader, place: MetadataIndex | AttachmentIndex, kind: Opcode
 ) -> bytes:
     """Read the record that an index points at. mcap's reader would read the whole summary again."""
     stream.seek(place.offset)
@@ -76,5 +74,5 @@ def _read_record(
         kind,
         len(body) - RECORD_STRUCT.size,
     ):
-        raise corrupt_error(path, f"no {kind.name.lower()} at byte {place.offset}")
+        raise McapError(f"no {kind.name.lower()} at byte {place.offset}")
     return body

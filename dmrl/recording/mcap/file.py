@@ -38,11 +38,17 @@ CORRUPTION_ERRORS = (
 """Errors that the mcap package raises on corrupt lengths and strings."""
 
 
+class BudgetError(McapError):
+    """A file exceeds a limit of `dmrl.guards.limits`. The text says how."""
+
+
 class BoundedReader(io.BufferedReader):
     """A file that raises on reads beyond its end, so that a corrupt length reserves no memory.
 
     Attributes
     ----------
+    path
+        The file.
     remote_stream
         Stream of a file in a bucket; None for a local file.
     size
@@ -50,6 +56,7 @@ class BoundedReader(io.BufferedReader):
     """
 
     def __init__(self, path: Path) -> None:
+        self.path = path
         self.remote_stream = path.open_ranges() if isinstance(path, RemotePath) else None
         if self.remote_stream is None:
             super().__init__(open_raw(path))
@@ -106,13 +113,15 @@ def open_mcap(path: Path) -> Iterator[BoundedReader]:
         raise RecordingError(f"{path} is not a regular file. Save it to one first")
     try:
         with BoundedReader(path) as stream:
-            _refuse_changed(path, stream)
-            _check_magic(path, stream)
+            _refuse_changed(stream)
+            _check_magic(stream)
             yield stream
     except FileNotFoundError:
         raise RecordingError(f"no recording {path}. Check the name") from None
     except PermissionError:
         raise RecordingError(f"{path} cannot be read. Check its permissions") from None
+    except BudgetError as e:
+        raise over_budget_error(path, e) from e
     except CORRUPTION_ERRORS as e:
         raise corrupt_error(path, e) from e
 
@@ -136,10 +145,10 @@ def expect_unchanged(path: Path) -> None:
         _HASHED_INPUTS[path] = count_ended_outputs(), _identify_file(stream)
 
 
-def _refuse_changed(path: Path, stream: BoundedReader) -> None:
-    when, stamp = _HASHED_INPUTS.get(path, (-1, None))
+def _refuse_changed(stream: BoundedReader) -> None:
+    when, stamp = _HASHED_INPUTS.get(stream.path, (-1, None))
     if when == count_ended_outputs() and stamp != _identify_file(stream):
-        raise RecordingError(f"{path} was changed while it was read. Run it again")
+        raise RecordingError(f"{stream.path} was changed while it was read. Run it again")
 
 
 def corrupt_error(path: Path, cause: object) -> RecordingError:
@@ -150,14 +159,15 @@ def corrupt_error(path: Path, cause: object) -> RecordingError:
     )
 
 
-def over_budget_error(path: Path, what: str) -> RecordingError:
+def over_budget_error(path: Path, what: object) -> RecordingError:
     """Build the error for a file that exceeds a limit of `dmrl.guards.limits`."""
     return RecordingError(
         f"{path}: {what}, over the limit. If you trust the file, rewrite it with smaller chunks"
     )
 
 
-def _check_magic(path: Path, stream: BoundedReader) -> None:
+def _check_magic(stream: BoundedReader) -> None:
+    path = stream.path
     start = stream.read(min(len(MAGIC), stream.size))
     if not start:
         raise RecordingError(f"{path} is empty. Make it again")

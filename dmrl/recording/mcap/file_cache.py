@@ -13,7 +13,7 @@ _CACHE: dict[tuple[Path, str], tuple[tuple[int, int, int], Any]] = {}
 Made = TypeVar("Made")
 
 
-def get_cached(kind: str, path: Path, stream: BoundedReader, make: Callable[[], Made]) -> Made:
+def get_cached(kind: str, stream: BoundedReader, make: Callable[[], Made]) -> Made:
     """Return the result for a file from the cache, or make it with ``make``.
 
     A result is valid while inode, size and modification time are the same. Local files that are
@@ -21,7 +21,7 @@ def get_cached(kind: str, path: Path, stream: BoundedReader, make: Callable[[], 
     """
     status = stream.status
     stamp = status.st_ino, status.st_size, status.st_mtime_ns
-    key = path, kind
+    key = stream.path, kind
     if key in _CACHE and _CACHE[key][0] == stamp:
         cached: Made = _CACHE[key][1]
         return cached

@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -15,7 +14,7 @@ from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunks.chunk_reader import locate_chunk, read_chunk
 from dmrl.recording.mcap.extra_records import read_metadata
-from dmrl.recording.mcap.file import BoundedReader, corrupt_error
+from dmrl.recording.mcap.file import BoundedReader
 from dmrl.recording.mcap.file_cache import get_cached
 from dmrl.recording.mcap.message_batch import Ints
 from dmrl.recording.mcap.message_index import (
@@ -57,12 +56,12 @@ class MessageCount:
     contradiction: str = ""
 
 
-def count_scanned(path: Path, scanned: ScannedFile) -> MessageCount:
+def count_scanned(scanned: ScannedFile) -> MessageCount:
     """Count the messages of a file that was read record by record.
 
     Raises
     ------
-    RecordingError
+    McapError
         If the Statistics record states another number.
     """
     times = (
@@ -70,10 +69,10 @@ def count_scanned(path: Path, scanned: ScannedFile) -> MessageCount:
         for batch in scanned.batches
         for number in batch.list_channel_ids()
     )
-    return _compare(path, scanned.statistics, scanned.channels, times)
+    return _compare(scanned.statistics, scanned.channels, times)
 
 
-def count_recording(path: Path, stream: BoundedReader, section: SummarySection) -> MessageCount:
+def count_recording(stream: BoundedReader, section: SummarySection) -> MessageCount:
     """Return number and times of the messages.
 
     Every chunk of another program's file is read and verified. Of a file that dmrl wrote, is larger
@@ -82,57 +81,52 @@ def count_recording(path: Path, stream: BoundedReader, section: SummarySection) 
 
     Raises
     ------
-    RecordingError
+    McapError
         If the file states another number, or is corrupt.
     """
     size = sum(chunk.uncompressed_size for chunk in section.chunk_indexes)
     costly = size > COUNTED_BYTES or stream.remote_stream is not None
-    own = checksums.METADATA_NAME in read_metadata(path, stream, section)
+    own = checksums.METADATA_NAME in read_metadata(stream, section)
     if costly or own:
-        count = _get_stated(section) or verify_indexes(path, stream, section)
+        count = _get_stated(section) or verify_indexes(stream, section)
         if count is not None:
             if not own:
                 words = "is large or in a bucket: its statistics count its messages"
-                say_once(f"{path} {words}. To count them all: dmrl check")
+                say_once(f"{stream.path} {words}. To count them all: dmrl check")
             return count
-    times = _iter_chunk_times(path, stream, section)
-    return _compare(path, section.statistics, section.channels_by_id, times)
+    times = _iter_chunk_times(stream, section)
+    return _compare(section.statistics, section.channels_by_id, times)
 
 
-def verify_indexes(
-    path: Path, stream: BoundedReader, section: SummarySection
-) -> MessageCount | None:
+def verify_indexes(stream: BoundedReader, section: SummarySection) -> MessageCount | None:
     """Compare the message indexes of all chunks with the Statistics record, and count by them.
 
     The result is cached. None: the file has chunks without indexes.
 
     Raises
     ------
-    RecordingError
+    McapError
         If they state another number or other times, one is not listed, or they fail dmrl's CRC.
     """
     if not all(chunk.message_index_offsets for chunk in section.chunk_indexes):
         return None
 
     def count() -> MessageCount:
-        times = iter_index_times(path, stream, section)
-        return _compare(path, section.statistics, section.channels_by_id, times)
+        times = iter_index_times(stream, section)
+        return _compare(section.statistics, section.channels_by_id, times)
 
-    return get_cached("message indexes", path, stream, count)
+    return get_cached("message indexes", stream, count)
 
 
 def check_counts(
-    path: Path,
     statistics: Statistics | None,
     channels: Mapping[int, Channel],
     counts: Counter[int],
 ) -> None:
-    """Raise RecordingError unless the counts of messages equal those of the Statistics record.
+    """Raise McapError unless the counts of messages equal those of the Statistics record.
 
     Parameters
     ----------
-    path
-        The recording, for errors.
     statistics
         The record, if there is one. It may lack the counts by channel.
     channels
@@ -143,8 +137,8 @@ def check_counts(
     expected = statistics.channel_message_counts if statistics else {}
     for number, channel in channels.items() if expected else ():
         if counts[number] != expected.get(number, 0):
-            raise corrupt_error(
-                path, f"{channel.topic} has {counts[number]} of {expected.get(number, 0)} messages"
+            raise McapError(
+                f"{channel.topic} has {counts[number]} of {expected.get(number, 0)} messages"
             )
 
 
@@ -168,20 +162,18 @@ def _get_stated(section: SummarySection) -> MessageCount | None:
     return MessageCount(Counter(section.counts), *times)
 
 
-def _iter_chunk_times(
-    path: Path, stream: BoundedReader, section: SummarySection
-) -> Iterator[tuple[int, Ints]]:
+def _iter_chunk_times(stream: BoundedReader, section: SummarySection) -> Iterator[tuple[int, Ints]]:
     """Yield channel id and log times of the messages of every chunk."""
     chunks = sorted(section.chunk_indexes, key=lambda c: c.chunk_start_offset)
     stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
     for chunk in chunks:
-        batch = read_chunk(path, stream, chunk, section.channels_by_id, section)
+        batch = read_chunk(stream, chunk, section.channels_by_id, section)
         for number in batch.list_channel_ids():
             yield number, batch.time_ns[batch.channel == number]
 
 
 def iter_index_times(
-    path: Path, stream: BoundedReader, section: SummarySection, topics: frozenset[str] | None = None
+    stream: BoundedReader, section: SummarySection, topics: frozenset[str] | None = None
 ) -> Iterator[tuple[int, Ints]]:
     """Yield channel id and log times of every message index by chunk, then verify the CRC of all.
 
@@ -189,10 +181,10 @@ def iter_index_times(
 
     Raises
     ------
-    RecordingError
+    McapError
         If an index contradicts its chunk, is not listed, or fails the CRC.
     """
-    stored_checksums = read_metadata(path, stream, section).get(checksums.METADATA_NAME)
+    stored_checksums = read_metadata(stream, section).get(checksums.METADATA_NAME)
     crc = 0
     chunks = sorted(section.chunk_indexes, key=lambda c: c.chunk_start_offset)
     if stream.remote_stream is not None:
@@ -206,20 +198,20 @@ def iter_index_times(
         raw = stream.read(chunk.message_index_length)
         crc = zlib.crc32(raw, crc)
         places = {n: at - first for n, at in chunk.message_index_offsets.items()}
-        _, times, _, counts = parse_index_entries(path, raw, places)
-        check_all_listed(path, raw, places)
+        _, times, _, counts = parse_index_entries(raw, places)
+        check_all_listed(raw, places)
         low, high = chunk.message_start_time, chunk.message_end_time
         if len(times) and not low <= int(times.min()) <= int(times.max()) <= high:
-            raise corrupt_error(path, f"a message index at byte {first} has times of another chunk")
+            raise McapError(f"a message index at byte {first} has times of another chunk")
         bounds = pairwise([0, *np.cumsum(counts).tolist()])
         for number, (begin, end) in zip(places, bounds, strict=True):
             yield number, times[begin:end]
     if stored_checksums and stored_checksums[-1].get("indexes") != checksums.format_crc(crc):
-        raise corrupt_error(path, "its message indexes fail their CRC")
+        raise McapError("its message indexes fail their CRC")
 
 
 def _compare(
-    path: Path, statistics: Statistics | None, channels: Mapping[int, Channel], times: Times
+    statistics: Statistics | None, channels: Mapping[int, Channel], times: Times
 ) -> MessageCount:
     """Count messages by their times and compare them with the Statistics record."""
     counts: Counter[int] = Counter()
@@ -230,7 +222,7 @@ def _compare(
             lows.append(int(time_ns.min()))
             highs.append(int(time_ns.max()))
     start_ns, end_ns = min(lows, default=0), max(highs, default=0)
-    check_counts(path, statistics, channels, counts)
+    check_counts(statistics, channels, counts)
     if statistics is None:
         return MessageCount(counts, start_ns, end_ns)
     if statistics.message_count != counts.total():

@@ -3,13 +3,13 @@
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from dmrl.recording.mcap.file import RECORD_STRUCT, corrupt_error
+from dmrl.recording.mcap.file import RECORD_STRUCT
 from dmrl.recording.mcap.message_batch import (
     MESSAGE_PREFIX_BYTES,
     Bytes,
@@ -84,13 +84,11 @@ def _compute_entry_offsets(starts: Ints, counts: Ints) -> Ints:
     return found
 
 
-def check_all_listed(path: Path, records: bytes, offsets: Mapping[int, int]) -> None:
-    """Raise RecordingError if there is a message index that a Chunk Index does not list.
+def check_all_listed(records: bytes, offsets: Mapping[int, int]) -> None:
+    """Raise McapError if there is a message index that a Chunk Index does not list.
 
     Parameters
     ----------
-    path
-        The recording, for errors.
     records
         Records after a chunk.
     offsets
@@ -100,7 +98,7 @@ def check_all_listed(path: Path, records: bytes, offsets: Mapping[int, int]) -> 
     while at < len(records):
         opcode, length, *head = MESSAGE_INDEX_STRUCT.unpack_from(records, at)
         if opcode == Opcode.MESSAGE_INDEX and head[1] and at not in listed:
-            raise corrupt_error(path, f"its summary lacks a message index of channel {head[0]}")
+            raise McapError(f"its summary lacks a message index of channel {head[0]}")
         at += RECORD_STRUCT.size + length
 
 
@@ -121,13 +119,11 @@ class IndexEntries(NamedTuple):
     counts: Ints
 
 
-def parse_index_entries(path: Path, raw: bytes, offsets: Mapping[int, int]) -> IndexEntries:
+def parse_index_entries(raw: bytes, offsets: Mapping[int, int]) -> IndexEntries:
     """Parse the message indexes of some channels.
 
     Parameters
     ----------
-    path
-        The recording, for errors.
     raw
         Bytes that contain the records.
     offsets
@@ -135,21 +131,21 @@ def parse_index_entries(path: Path, raw: bytes, offsets: Mapping[int, int]) -> I
 
     Raises
     ------
-    RecordingError
+    McapError
         If a record is truncated, or is not the Message Index of its channel.
     """
     numbers = np.fromiter(offsets.keys(), np.int64, len(offsets))
     at = np.fromiter(offsets.values(), np.int64, len(offsets))
     if len(at) and not 0 <= at.min() <= at.max() <= len(raw) - MESSAGE_INDEX_STRUCT.size:
-        raise corrupt_error(path, "a message index is cut")
+        raise McapError("a message index is cut")
     heads = gather(raw, _HEADER_DTYPE, at)
     size = heads["size"].astype(np.int64)
     right = (heads["opcode"] == Opcode.MESSAGE_INDEX) & (heads["channel"] == numbers)
     right &= (heads["length"] >= size + 6) & (size % ENTRY_BYTES == 0)  # bytes may follow
     if not right.all():
-        raise corrupt_error(path, f"message index of channel {numbers[~right][0]} is wrong")
+        raise McapError(f"message index of channel {numbers[~right][0]} is wrong")
     if (at + RECORD_STRUCT.size + heads["length"].astype(np.int64) > len(raw)).any():
-        raise corrupt_error(path, "a message index is cut")
+        raise McapError("a message index is cut")
     counts = size // ENTRY_BYTES
     entries = gather(raw, _ENTRY_DTYPE, _compute_entry_offsets(at, counts))
     return IndexEntries(np.repeat(numbers, counts), entries["time"], entries["at"], counts)

@@ -1,7 +1,6 @@
 """Read a whole MCAP file record by record, where its Summary section is absent or incomplete."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from mcap.exceptions import McapError
 from mcap.records import Attachment, Chunk, McapRecord, Message, Metadata, Schema, Statistics
@@ -16,7 +15,7 @@ from dmrl.recording.mcap.chunks.chunk import (
     parse_records,
     select_channels,
 )
-from dmrl.recording.mcap.file import BoundedReader, over_budget_error
+from dmrl.recording.mcap.file import BoundedReader, BudgetError
 from dmrl.recording.mcap.message_batch import MessageBatch
 
 
@@ -49,12 +48,12 @@ class ScannedFile:
     statistics: Statistics | None = None
 
 
-def scan_file(path: Path, stream: BoundedReader) -> ScannedFile:
+def scan_file(stream: BoundedReader) -> ScannedFile:
     """Read everything in a complete recording, with or without an index.
 
     Raises
     ------
-    RecordingError, McapError, CRCValidationError
+    McapError, CRCValidationError
         If it is corrupt, or decompresses to more than the limit for its size.
     """
     stream.seek(0)
@@ -66,8 +65,8 @@ def scan_file(path: Path, stream: BoundedReader) -> ScannedFile:
         if isinstance(record, Chunk):
             size += record.uncompressed_size
             if size > limits.max_unpacked_bytes(stream.size):
-                raise over_budget_error(path, f"it unpacks to more than {size / 1e6:.0f} MB")
-            scan = parse_records(decompress(path, record, stream.tell()))
+                raise BudgetError(f"it unpacks to more than {size / 1e6:.0f} MB")
+            scan = parse_records(decompress(record, stream.tell()))
             for definition in scan.iter_definitions():
                 _register_record(content, definition)
             content.batches.append(select_channels(scan.batch, content.channels, content.channels))

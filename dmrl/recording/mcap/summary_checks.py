@@ -1,60 +1,55 @@
 """Check that the parts of a Summary section agree with each other and with the limits."""
 
 from itertools import chain
-from pathlib import Path
 
+from mcap.exceptions import McapError
 from mcap.summary import Summary as McapSummary
 
 from dmrl.guards import limits
 from dmrl.recording.mcap.file import (
     BoundedReader,
-    corrupt_error,
-    over_budget_error,
+    BudgetError,
 )
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS
 
 
-def check_budget(path: Path, stream: BoundedReader, summary_section: McapSummary) -> None:
+def check_budget(stream: BoundedReader, summary_section: McapSummary) -> None:
     """Raise unless names, topics and the size of all chunks are within the limits."""
     if max(len(summary_section.channels), len(summary_section.schemas)) > limits.TOPICS:
-        raise over_budget_error(path, f"it has more than {limits.TOPICS} topics or message types")
+        raise BudgetError(f"it has more than {limits.TOPICS} topics or message types")
     names = chain(
         (c.topic for c in summary_section.channels.values()),
         (s.name for s in summary_section.schemas.values()),
     )
     if longest := [name for name in names if len(name) > limits.NAME_CHARACTERS]:
-        raise over_budget_error(
-            path, f"the name {longest[0][:20]}... has {len(longest[0])} characters"
-        )
+        raise BudgetError(f"the name {longest[0][:20]}... has {len(longest[0])} characters")
     size = sum(chunk.uncompressed_size for chunk in summary_section.chunk_indexes)
     if size > limits.max_unpacked_bytes(stream.size):
-        raise over_budget_error(
-            path, f"{stream.size / 1e6:.1f} MB of recording unpack to {size / 1e6:.0f} MB"
-        )
+        raise BudgetError(f"{stream.size / 1e6:.1f} MB of recording unpack to {size / 1e6:.0f} MB")
 
 
-def check_statistics(path: Path, summary_section: McapSummary) -> None:
+def check_statistics(summary_section: McapSummary) -> None:
     """Raise unless Statistics, chunk indexes and channels agree with each other."""
     counts = summary_section.statistics.channel_message_counts if summary_section.statistics else {}
     mentioned = {number for number, count in counts.items() if count}
     for chunk in summary_section.chunk_indexes:
         mentioned.update(chunk.message_index_offsets)
     if unknown := mentioned - summary_section.channels.keys():
-        raise corrupt_error(path, f"its summary lacks channel {min(unknown)}")
+        raise McapError(f"its summary lacks channel {min(unknown)}")
     for channel in summary_section.channels.values():
         if channel.schema_id and channel.schema_id not in summary_section.schemas:
-            raise corrupt_error(path, f"its summary lacks the message type of {channel.topic}")
+            raise McapError(f"its summary lacks the message type of {channel.topic}")
     statistics = summary_section.statistics
     if statistics is None:
         return
     if counts and sum(counts.values()) != statistics.message_count:
-        raise corrupt_error(path, "its statistics contradict themselves")
+        raise McapError("its statistics contradict themselves")
     found, number = len(summary_section.chunk_indexes), statistics.chunk_count
     if found and found != number:
-        raise corrupt_error(path, f"its summary lists {found} of {number} chunks")
+        raise McapError(f"its summary lists {found} of {number} chunks")
 
 
-def check_extra_counts(path: Path, summary_section: McapSummary) -> None:
+def check_extra_counts(summary_section: McapSummary) -> None:
     """Raise unless there are as many metadata and attachments as Statistics states."""
     statistics = summary_section.statistics
     for what, number, indexes in (
@@ -66,11 +61,11 @@ def check_extra_counts(path: Path, summary_section: McapSummary) -> None:
         else ()
     ):
         if len(indexes) != number:
-            raise corrupt_error(path, f"it has {len(indexes)} of {number} {what}")
+            raise McapError(f"it has {len(indexes)} of {number} {what}")
 
 
-def check_times(path: Path, summary_section: McapSummary) -> None:
+def check_times(summary_section: McapSummary) -> None:
     """Raise if a chunk ends beyond the largest time."""
     latest = max((chunk.message_end_time for chunk in summary_section.chunk_indexes), default=0)
     if latest >= MAX_TIME_NS:
-        raise corrupt_error(path, "a message has a time beyond the year 2262")
+        raise McapError("a message has a time beyond the year 2262")

@@ -9,7 +9,6 @@ import zlib
 from collections.abc import Iterable, Iterator
 from functools import cached_property
 from io import BytesIO
-from pathlib import Path
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -34,7 +33,6 @@ from dmrl.recording.mcap.file import (
     MAGIC,
     RECORD_STRUCT,
     BoundedReader,
-    corrupt_error,
 )
 from dmrl.recording.mcap.file_cache import get_cached
 from dmrl.recording.mcap.summary_checks import (
@@ -93,98 +91,96 @@ class SummarySection(McapSummary):
             self._first_chunks = frozenset(firsts.values())
         return not self.has_crc or chunk.chunk_start_offset in self._first_chunks
 
-    def check_definitions(self, path: Path, definitions: Iterable[Schema | Channel]) -> None:
-        """Raise RecordingError unless schemas and channels equal those of this section.
+    def check_definitions(self, definitions: Iterable[Schema | Channel]) -> None:
+        """Raise McapError unless schemas and channels equal those of this section.
 
         Raises
         ------
-        RecordingError
+        McapError
             If a definition differs.
         """
         for one in definitions:
             expected = self.schemas if isinstance(one, Schema) else self.channels
             if expected.get(one.id, one) != one:
                 name = one.name if isinstance(one, Schema) else one.topic
-                raise corrupt_error(path, f"the definition of {name} contradicts the summary")
+                raise McapError(f"the definition of {name} contradicts the summary")
 
 
-def read_summary_section(path: Path, stream: BoundedReader) -> SummarySection | None:
+def read_summary_section(stream: BoundedReader) -> SummarySection | None:
     """Return the verified Summary section from the cache, or read it; see `get_cached`.
 
     None: it is absent or does not list all messages.
 
     Raises
     ------
-    RecordingError
+    McapError
         If the section contradicts itself or the file.
     """
-    return get_cached("verified section", path, stream, lambda: read_verified_section(path, stream))
+    return get_cached("verified section", stream, lambda: read_verified_section(stream))
 
 
-def read_verified_section(path: Path, stream: BoundedReader) -> SummarySection | None:
+def read_verified_section(stream: BoundedReader) -> SummarySection | None:
     """Read and verify the Summary section; None if it is absent or does not list all messages.
 
     Metadata and attachments that it does not list are added to its indexes.
 
     Parameters
     ----------
-    path
-        The recording, for errors.
     stream
         The complete file.
 
     Raises
     ------
-    RecordingError
+    McapError
         If the section fails its CRC, contradicts itself or the file, or exceeds a limit.
     """
-    summary_section, start = read_raw_section(path, stream)
+    summary_section, start = read_raw_section(stream)
     if summary_section is None or not _indexes_messages(summary_section):
         return None
-    check_budget(path, stream, summary_section)
-    check_statistics(path, summary_section)
-    check_times(path, summary_section)
-    if not _lists_all_messages(path, stream, summary_section, start):
+    check_budget(stream, summary_section)
+    check_statistics(summary_section)
+    check_times(summary_section)
+    if not _lists_all_messages(stream, summary_section, start):
         return None
-    check_extra_counts(path, summary_section)
+    check_extra_counts(summary_section)
     return summary_section
 
 
 def read_raw_section(
-    path: Path, stream: BoundedReader, start: int | None = None
+    stream: BoundedReader, start: int | None = None
 ) -> tuple[SummarySection | None, int]:
     """Read the Summary section and check only its CRC; return it and its offset.
 
     Parameters
     ----------
-    path, stream
+    stream
         The recording.
     start
         Offset of the section, for a file that lost bytes before it. None: the Footer contains it.
 
     Raises
     ------
-    RecordingError
+    McapError
         If there is no Footer, or the section fails its CRC.
     """
     end = stream.size - len(MAGIC) - FOOTER_STRUCT.size
     if end < len(MAGIC):
-        raise corrupt_error(path, "it has no footer")
+        raise McapError("it has no footer")
     stream.seek(end)
     footer = stream.read(FOOTER_STRUCT.size)
     opcode, length, summary_start, _, crc = FOOTER_STRUCT.unpack(footer)
     if (opcode, length) != (Opcode.FOOTER, FOOTER_STRUCT.size - RECORD_STRUCT.size):
-        raise corrupt_error(path, "it has no footer")
+        raise McapError("it has no footer")
     if not summary_start:
         return None, end
     start = summary_start if start is None else start
     if not len(MAGIC) <= start <= end:
-        raise corrupt_error(path, "its footer points beyond it")
+        raise McapError("its footer points beyond it")
     stream.seek(start)
     body = stream.read(end - start)
     # The CRC covers everything before its own four bytes.
     if crc and zlib.crc32(footer[:-4], zlib.crc32(body)) != crc:
-        raise corrupt_error(path, "its summary fails its CRC")
+        raise McapError("its summary fails its CRC")
     summary_section = _parse_section(body + footer + MAGIC)
     summary_section.has_crc = crc != 0
     return summary_section, start
@@ -231,26 +227,24 @@ def _indexes_messages(summary_section: McapSummary) -> bool:
     return (defined and bool(summary_section.chunk_indexes)) or not some
 
 
-def _lists_all_messages(
-    path: Path, stream: BoundedReader, summary_section: SummarySection, end: int
-) -> bool:
+def _lists_all_messages(stream: BoundedReader, summary_section: SummarySection, end: int) -> bool:
     """Return whether all messages are in listed chunks.
 
     Raises
     ------
-    RecordingError
+    McapError
         If a chunk is not listed, two records overlap, or one runs beyond the data section.
     """
     at = len(MAGIC)
     for start, length in sorted(iter_extents(summary_section)):
         if start < at:
-            raise corrupt_error(path, f"its summary lists two records that overlap at byte {start}")
-        if not _has_nothing_new(path, stream, summary_section, at, start):
+            raise McapError(f"its summary lists two records that overlap at byte {start}")
+        if not _has_nothing_new(stream, summary_section, at, start):
             return False
         at = start + length
     if at > end:
-        raise corrupt_error(path, "its summary lists a record beyond the data section")
-    return _has_nothing_new(path, stream, summary_section, at, end)
+        raise McapError("its summary lists a record beyond the data section")
+    return _has_nothing_new(stream, summary_section, at, end)
 
 
 def iter_extents(summary_section: McapSummary) -> Iterator[tuple[int, int]]:
@@ -264,7 +258,7 @@ def iter_extents(summary_section: McapSummary) -> Iterator[tuple[int, int]]:
 
 
 def _has_nothing_new(
-    path: Path, stream: BoundedReader, summary_section: SummarySection, at: int, end: int
+    stream: BoundedReader, summary_section: SummarySection, at: int, end: int
 ) -> bool:
     """Return whether the records from ``at`` to ``end`` contain no message, and no new definition.
 
@@ -274,7 +268,7 @@ def _has_nothing_new(
         stream.seek(at)
         opcode, length = RECORD_STRUCT.unpack(stream.read(RECORD_STRUCT.size))
         if opcode == Opcode.CHUNK:
-            raise corrupt_error(path, f"its summary lacks the chunk at byte {at}")
+            raise McapError(f"its summary lacks the chunk at byte {at}")
         if opcode == Opcode.MESSAGE:
             return False
         if opcode in DEFINITIONS:
@@ -282,12 +276,12 @@ def _has_nothing_new(
             known = summary_section.schemas if opcode == Opcode.SCHEMA else summary_section.channels
             if one.id not in known:
                 return False
-            summary_section.check_definitions(path, [one])
+            summary_section.check_definitions([one])
         elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             _add_index(summary_section, opcode, at, stream.read(length))
         at += RECORD_STRUCT.size + length
     if at > end:
-        raise corrupt_error(path, f"a record that ends at byte {at} overlaps the next one")
+        raise McapError(f"a record that ends at byte {at} overlaps the next one")
     return True
 
 

@@ -86,7 +86,7 @@ def test_a_packed_chunk_says_where_its_messages_are_and_is_empty_then() -> None:
         min(times),
         max(times),
     )
-    found = parse_index_entries(Path("a"), packed.index.records, packed.index.offsets)
+    found = parse_index_entries(packed.index.records, packed.index.offsets)
     told = zip(found.offset.tolist(), found.channel.tolist(), found.time_ns.tolist(), strict=True)
     assert sorted(told) == [(k, row[0], row[1]) for k, row in zip(starts, ROWS, strict=True)]
     assert packed.index.counts == Counter(row[0] for row in ROWS)

@@ -54,8 +54,8 @@ def test_what_is_remembered_is_of_the_same_file_and_of_few(monkeypatch: pytest.M
 
     def asked(name: str, age_s: float = 60.0, ranged: object = None, size: int = 7) -> str:
         status = SimpleNamespace(st_ino=1, st_size=size, st_mtime_ns=now - round(age_s * 1e9))
-        stream: Any = SimpleNamespace(status=status, remote_stream=ranged)
-        found = file_cache.get_cached("x", Path(name), stream, lambda: made.append(name) or name)
+        stream: Any = SimpleNamespace(path=Path(name), status=status, remote_stream=ranged)
+        found = file_cache.get_cached("x", stream, lambda: made.append(name) or name)
         return str(found)
 
     for name in ("a", "a", "b", "a"):

@@ -4,7 +4,6 @@ import zlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from io import BytesIO
-from pathlib import Path
 
 import lz4.frame
 import numpy as np
@@ -15,7 +14,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema
 
 from dmrl.guards import limits
-from dmrl.recording.mcap.file import DEFINITIONS, RECORD_STRUCT, corrupt_error, over_budget_error
+from dmrl.recording.mcap.file import DEFINITIONS, RECORD_STRUCT, BudgetError
 from dmrl.recording.mcap.file_writer import serialize
 from dmrl.recording.mcap.message_batch import (
     MESSAGE_PREFIX_BYTES,
@@ -44,26 +43,26 @@ MESSAGE_PREFIX_DTYPE = np.dtype(
 """Layout of a Message record up to its payload."""
 
 
-def decompress(path: Path, chunk: Chunk, offset: int) -> Bytes:
+def decompress(chunk: Chunk, offset: int) -> Bytes:
     """Decompress the records of a chunk and check their size and CRC.
 
     Raises
     ------
-    RecordingError
+    McapError
         If the size exceeds the budget or differs from the chunk's uncompressed size, the data
         cannot be decompressed, or the CRC does not match.
     """
     size = chunk.uncompressed_size
     if size > limits.UNPACKED_BYTES:
-        raise over_budget_error(path, f"the chunk at byte {offset} unpacks to {size / 1e6:.0f} MB")
+        raise BudgetError(f"the chunk at byte {offset} unpacks to {size / 1e6:.0f} MB")
     try:
         data = _decompress_bytes(chunk.compression, chunk.data, size)
     except (zstandard.ZstdError, RuntimeError, MemoryError, ValueError) as e:
-        raise corrupt_error(path, f"chunk at byte {offset}: {e}") from e
+        raise McapError(f"chunk at byte {offset}: {e}") from e
     if len(data) != size:
-        raise corrupt_error(path, f"chunk at byte {offset} unpacks to another size than it states")
+        raise McapError(f"chunk at byte {offset} unpacks to another size than it states")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise corrupt_error(path, f"chunk at byte {offset} fails its CRC")
+        raise McapError(f"chunk at byte {offset} fails its CRC")
     return np.frombuffer(data, np.uint8)
 
 

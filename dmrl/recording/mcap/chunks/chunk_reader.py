@@ -1,9 +1,9 @@
 """Read one chunk and verify it against its Chunk Index and Message Index records."""
 
 from collections.abc import Container, Mapping
-from pathlib import Path
 
 import numpy as np
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Chunk, ChunkIndex
 
@@ -19,7 +19,7 @@ from dmrl.recording.mcap.chunks.chunk import (
     require_valid_times,
     select_channels,
 )
-from dmrl.recording.mcap.file import BoundedReader, corrupt_error
+from dmrl.recording.mcap.file import BoundedReader
 from dmrl.recording.mcap.file_writer import CHUNK_STRUCT
 from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, Bytes, MessageBatch, gather
 from dmrl.recording.mcap.message_index import (
@@ -36,7 +36,6 @@ def locate_chunk(chunk: ChunkIndex) -> tuple[int, int]:
 
 
 def read_chunk(
-    path: Path,
     stream: BoundedReader,
     chunk_index: ChunkIndex,
     channels: Mapping[int, Channel],
@@ -46,7 +45,7 @@ def read_chunk(
 
     Parameters
     ----------
-    path, stream
+    stream
         The recording.
     chunk_index
         Chunk Index record of the chunk.
@@ -57,29 +56,29 @@ def read_chunk(
 
     Raises
     ------
-    RecordingError
+    McapError
         If the chunk contradicts its Chunk Index, its Message Index or the Summary section.
     """
-    raw, _, data = _load_chunk(path, stream, chunk_index)
+    raw, _, data = _load_chunk(stream, chunk_index)
     indexed = chunk_index.message_index_offsets.keys()
     if indexed and indexed <= channels.keys():
-        return _read_whole_chunk(path, raw, data, chunk_index, summary)[0]
+        return _read_whole_chunk(raw, data, chunk_index, summary)[0]
     if not indexed or not summary.counts:  # no statistics will be compared with the messages
-        batch = _read_whole_chunk(path, raw, data, chunk_index, summary)[0]
+        batch = _read_whole_chunk(raw, data, chunk_index, summary)[0]
         return batch.select_channels(channels)
     if summary.needs_definition_check(chunk_index):
-        summary.check_definitions(path, parse_records(data).iter_definitions())
-    return _select_by_index(path, raw, data, chunk_index, channels)[0]
+        summary.check_definitions(parse_records(data).iter_definitions())
+    return _select_by_index(raw, data, chunk_index, channels)[0]
 
 
 def read_chunk_for_copy(
-    path: Path, stream: BoundedReader, chunk_index: ChunkIndex, summary: SummarySection
+    stream: BoundedReader, chunk_index: ChunkIndex, summary: SummarySection
 ) -> tuple[Chunk, MessageBatch, ParsedChunk, MessageIndex | None]:
     """Read a chunk for a copy: still compressed, with all its messages and message indexes.
 
     Parameters
     ----------
-    path, stream
+    stream
         The recording.
     chunk_index
         Chunk Index record of the chunk.
@@ -94,11 +93,11 @@ def read_chunk_for_copy(
 
     Raises
     ------
-    RecordingError
+    McapError
         If the chunk contradicts its Chunk Index, its Message Index or the Summary section.
     """
-    raw, chunk, data = _load_chunk(path, stream, chunk_index)
-    batch, others, counts = _read_whole_chunk(path, raw, data, chunk_index, summary)
+    raw, chunk, data = _load_chunk(stream, chunk_index)
+    batch, others, counts = _read_whole_chunk(raw, data, chunk_index, summary)
     records = raw[chunk_index.chunk_length :]
     after = chunk_index.chunk_start_offset + chunk_index.chunk_length
     places = {n: at - after for n, at in chunk_index.message_index_offsets.items()}
@@ -108,42 +107,38 @@ def read_chunk_for_copy(
     return chunk, batch, others, MessageIndex(records, places, counts)
 
 
-def _load_chunk(
-    path: Path, stream: BoundedReader, chunk_index: ChunkIndex
-) -> tuple[bytes, Chunk, Bytes]:
+def _load_chunk(stream: BoundedReader, chunk_index: ChunkIndex) -> tuple[bytes, Chunk, Bytes]:
     """Return a chunk's bytes with its message indexes, its record, and its decompressed data."""
     at, size = locate_chunk(chunk_index)
     stream.seek(at)
     raw = stream.read(size)
-    chunk = _parse_chunk_record(path, raw, chunk_index)
-    return raw, chunk, decompress(path, chunk, at)
+    chunk = _parse_chunk_record(raw, chunk_index)
+    return raw, chunk, decompress(chunk, at)
 
 
 def _read_whole_chunk(
-    path: Path, raw: bytes, data: Bytes, chunk_index: ChunkIndex, summary: SummarySection
+    raw: bytes, data: Bytes, chunk_index: ChunkIndex, summary: SummarySection
 ) -> tuple[MessageBatch, ParsedChunk, dict[int, int]]:
     """Return all messages, all other records, and the number that each message index lists."""
     others: ParsedChunk | None
     if chunk_index.message_index_offsets:
-        batch, counts = _select_by_index(path, raw, data, chunk_index, summary.channels)
+        batch, counts = _select_by_index(raw, data, chunk_index, summary.channels)
         others = other_records(batch)
         if others is None:
             at, found = chunk_index.chunk_start_offset, len(parse_records(data).messages)
-            raise corrupt_error(
-                path,
+            raise McapError(
                 f"the message indexes of the chunk at byte {at} do not list each of its "
                 f"{found} messages once",
             )
     else:
         others, counts = parse_records(data), {}
         batch = select_channels(others.batch, summary.channels, summary.channels)
-        _check_time_range(path, chunk_index, batch)
-    summary.check_definitions(path, others.iter_definitions())
+        _check_time_range(chunk_index, batch)
+    summary.check_definitions(others.iter_definitions())
     return batch, others, counts
 
 
 def _select_by_index(
-    path: Path,
     raw: bytes,
     data: Bytes,
     chunk_index: ChunkIndex,
@@ -154,7 +149,7 @@ def _select_by_index(
     places = {
         n: place - at for n, place in chunk_index.message_index_offsets.items() if n in channels
     }
-    entries = parse_index_entries(path, raw, places)
+    entries = parse_index_entries(raw, places)
     if (
         len(entries.offset)
         and not 0
@@ -162,36 +157,35 @@ def _select_by_index(
         <= entries.offset.max()
         <= len(data) - MESSAGE_PREFIX_BYTES
     ):
-        raise corrupt_error(path, f"index beyond the chunk at byte {at}")
+        raise McapError(f"index beyond the chunk at byte {at}")
     # Message indexes have no CRC, so they are compared with the records they point at.
     heads = gather(data, MESSAGE_PREFIX_DTYPE, entries.offset)
     batch = build_batch_at(data, np.sort(entries.offset.astype(np.uint32)).astype(np.int64))
     right = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == entries.channel)
     right &= heads["time"].view(np.int64) == entries.time_ns
     if not (right & (batch.end <= len(data))).all():
-        raise corrupt_error(path, f"index of the chunk at byte {at} is wrong")
-    return _check_time_range(path, chunk_index, require_valid_times(batch)), dict(
+        raise McapError(f"index of the chunk at byte {at} is wrong")
+    return _check_time_range(chunk_index, require_valid_times(batch)), dict(
         zip(places, entries.counts.tolist(), strict=True)
     )
 
 
-def _check_time_range(path: Path, chunk_index: ChunkIndex, batch: MessageBatch) -> MessageBatch:
-    """Return the batch; raise RecordingError if its times exceed the range of its Chunk Index."""
+def _check_time_range(chunk_index: ChunkIndex, batch: MessageBatch) -> MessageBatch:
+    """Return the batch; raise McapError if its times exceed the range of its Chunk Index."""
     low, high = chunk_index.message_start_time, chunk_index.message_end_time
     if len(batch) and not low <= batch.time_span_ns[0] <= batch.time_span_ns[1] <= high:
-        raise corrupt_error(
-            path,
+        raise McapError(
             f"messages in the chunk at byte {chunk_index.chunk_start_offset} are "
             "outside the time range that it states",
         )
     return batch
 
 
-def _parse_chunk_record(path: Path, raw: bytes, chunk_index: ChunkIndex) -> Chunk:
+def _parse_chunk_record(raw: bytes, chunk_index: ChunkIndex) -> Chunk:
     """Parse the Chunk record at the start of some bytes and compare it with its Chunk Index."""
     at = chunk_index.chunk_start_offset
     if len(raw) < CHUNK_STRUCT.size or raw[0] != Opcode.CHUNK:
-        raise corrupt_error(path, f"no chunk at byte {at}")
+        raise McapError(f"no chunk at byte {at}")
     _, length, first, last, size, crc, name_bytes = CHUNK_STRUCT.unpack_from(raw)
     begin = CHUNK_STRUCT.size + name_bytes + 8
     compression = raw[CHUNK_STRUCT.size : begin - 8].decode()
@@ -202,5 +196,5 @@ def _parse_chunk_record(path: Path, raw: bytes, chunk_index: ChunkIndex) -> Chun
         found != (*listed, chunk_index.uncompressed_size, chunk_index.compression)
         or end > chunk_index.chunk_length
     ):
-        raise corrupt_error(path, f"the chunk at byte {at} differs from its index in the summary")
+        raise McapError(f"the chunk at byte {at} differs from its index in the summary")
     return Chunk(compression, raw[begin:end], last, first, crc, size)
