@@ -1,5 +1,6 @@
 """Chunks that are filled: one message at a time, or many, they hold the same."""
 
+import zlib
 from collections import Counter
 from pathlib import Path
 
@@ -247,3 +248,20 @@ def test_numbers_that_run_out_are_filled_up() -> None:
 
 def test_a_message_of_no_number_is_none() -> None:
     assert RawMessage(1, 2, channel("/a"), b"x").topic == "/a"
+
+
+def test_pictures_that_do_not_get_smaller_are_stored_as_they_are() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, 60_000, np.uint8).tobytes()
+    for payload, images, wanted in (
+        (noise, True, ""),
+        (noise, False, "zstd"),
+        (bytes(60_000), True, "zstd"),
+    ):
+        chunk = ChunkBuilder(images=images)
+        for k in range(3):
+            chunk.add_message(1, k, k, payload)
+        packed = chunk.compress()
+        assert packed.compression == wanted
+        data = zstandard.ZstdDecompressor().decompress(packed.data) if wanted else packed.data
+        assert len(data) == packed.uncompressed_size > 180_000
+        assert zlib.crc32(data) == packed.crc

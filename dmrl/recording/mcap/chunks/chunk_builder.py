@@ -22,6 +22,11 @@ ZSTD_LEVEL = 1
 
 Takes half the time of the default 3, and sensor values do not get larger.
 """
+SAMPLE_SHARE, PACKED_SHARE_MAX = 8, 0.95
+"""Part of a chunk of images, its first eighth, that is compressed to find out whether that helps.
+
+JPEG and PNG do not get smaller. Chunks of them are stored as they are.
+"""
 MESSAGE_PREFIX_STRUCT = struct.Struct(
     "<BQHIQQ"
 )  # opcode, length, channel, sequence, log and publish time
@@ -33,14 +38,20 @@ PREFIX_BODY_BYTES = (
 class ChunkBuilder:
     """One chunk that is being filled, with messages of one kind: images or numbers.
 
+    Parameters
+    ----------
+    images
+        It is stored uncompressed if compression does not help.
+
     Attributes
     ----------
     age
         Chunks of the other kind that were written since this one was started.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, images: bool = False) -> None:
         self.data, self.starts, self.age = bytearray(), array("q"), 0
+        self.images = images
 
     @property
     def full(self) -> bool:
@@ -80,11 +91,20 @@ class ChunkBuilder:
 
     def compress(self) -> CompressedChunk:
         """Compress the chunk, build its message indexes, and start an empty chunk."""
-        data = np.frombuffer(bytes(self.data), np.uint8)
-        batch = build_batch_at(data, np.array(self.starts, np.int64))
-        compressed = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(data.data)
-        crc = zlib.crc32(data.data)
+        data = bytes(self.data)
+        batch = build_batch_at(np.frombuffer(data, np.uint8), np.array(self.starts, np.int64))
+        compression, packed = _compress(data, may_store=self.images)
+        crc = zlib.crc32(data)
         self.data, self.starts, self.age = bytearray(), array("q"), 0
         return CompressedChunk(
-            "zstd", compressed, len(data), crc, *batch.time_span_ns, build_message_index(batch)
+            compression, packed, len(data), crc, *batch.time_span_ns, build_message_index(batch)
         )
+
+
+def _compress(data: bytes, *, may_store: bool) -> tuple[str, bytes]:
+    """Return the name of the compression and the compressed data; "" and the data: not smaller."""
+    zstd = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
+    sample = data[: len(data) // SAMPLE_SHARE]
+    if may_store and len(zstd.compress(sample)) > PACKED_SHARE_MAX * len(sample):
+        return "", data
+    return "zstd", zstd.compress(data)

@@ -41,7 +41,7 @@ class ChunkWriter:
     def __init__(self, path: Path, file: McapFileWriter, age_max: int = OPEN_CHUNK_AGE_MAX) -> None:
         self._path, self._file, self._age_max = path, file, age_max
         self._registry = ChannelRegistry()
-        self._numbers, self._images = ChunkBuilder(), ChunkBuilder()
+        self._numbers, self._images = ChunkBuilder(), ChunkBuilder(images=True)
 
     def add_message(
         self, channel_id: int, chunk: ChunkBuilder, time_ns: int, publish_ns: int, payload: bytes
