@@ -6,14 +6,13 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 from mcap.records import ChunkIndex
-from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.mcap.batch_reader import iter_batches, select_chunks
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunks.chunk_reader import read_chunk
 from dmrl.recording.mcap.file import open_mcap
 from dmrl.recording.mcap.message_batch import MessageBatch, concatenate_all
-from dmrl.recording.mcap.summary_section import read_summary_section
+from dmrl.recording.mcap.summary_section import SummarySection, read_summary_section
 from dmrl.recording.protobuf.columns import decode_by_topic
 from dmrl.recording.protobuf.message_types import require_types
 from dmrl.recording.summary import read_summary
@@ -86,7 +85,7 @@ def _sample_chunks(
 
 
 def _choose_chunks(
-    index: McapSummary, channels: Mapping[int, Channel], start_ns: int, end_ns: int
+    index: SummarySection, channels: Mapping[int, Channel], start_ns: int, end_ns: int
 ) -> list[ChunkIndex]:
     """Choose the first chunk of each channel, its last, and some between."""
     chosen: dict[int, ChunkIndex] = {}

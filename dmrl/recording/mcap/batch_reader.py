@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 from mcap.records import ChunkIndex
-from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunks.chunk import select_channels
@@ -147,22 +146,13 @@ def _find_image_channels(channels: dict[int, Channel]) -> list[int]:
 
 
 def select_chunks(
-    summary: McapSummary, channel_ids: Set[int], low: int, high: int
+    summary: SummarySection, channel_ids: Set[int], low: int, high: int
 ) -> list[ChunkIndex]:
     """Return the chunks that may contain messages of these channels in [low, high), by time."""
-
-    def may_contain(chunk: ChunkIndex) -> bool:
-        seen = chunk.message_index_offsets
-        return (
-            chunk.message_end_time >= low
-            and chunk.message_start_time < high
-            and (not seen or not channel_ids.isdisjoint(seen))
-        )
-
-    return sorted(
-        filter(may_contain, summary.chunk_indexes),
-        key=lambda c: (c.message_start_time, c.chunk_start_offset),
-    )
+    chunks, starts, ends = summary.chunks_by_time
+    inside = [chunks[k] for k in np.flatnonzero((ends >= low) & (starts < high)).tolist()]
+    seen = [chunk.message_index_offsets for chunk in inside]
+    return [c for c, n in zip(inside, seen, strict=True) if not (n and channel_ids.isdisjoint(n))]
 
 
 def _scan_unindexed(

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from functools import cached_property
 from io import BytesIO
 
+import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -35,6 +36,7 @@ from dmrl.recording.mcap.file import (
     BoundedReader,
 )
 from dmrl.recording.mcap.file_cache import get_cached
+from dmrl.recording.mcap.message_batch import Ints
 from dmrl.recording.mcap.summary_checks import (
     check_budget,
     check_extra_counts,
@@ -71,6 +73,16 @@ class SummarySection(McapSummary):
     def channels_by_id(self) -> ChannelTable:
         """Channels of the section, by channel id."""
         return build_channels(self.channels, self.schemas)
+
+    @cached_property
+    def chunks_by_time(self) -> tuple[list[ChunkIndex], Ints, Ints]:
+        """Chunk indexes by their first log time, and (N,) first and last log times."""
+        found = sorted(
+            self.chunk_indexes, key=lambda c: (c.message_start_time, c.chunk_start_offset)
+        )
+        times = [(chunk.message_start_time, chunk.message_end_time) for chunk in found]
+        starts, ends = np.array(times, np.int64).reshape(-1, 2).T
+        return found, starts, ends
 
     @property
     def counts(self) -> dict[int, int]:
