@@ -1,13 +1,15 @@
 """Check the labels of a recording."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from dmrl.errors import RecordingError
-from dmrl.geometry.frames import is_inside
+from dmrl.geometry.frames import Array, is_inside
 from dmrl.recording.checks.finding import Finding
 from dmrl.recording.checks.scan import CheckData, find_first_size
 from dmrl.topics import CALIBRATION, CAMERA_IMAGE, DETECTIONS, LABELS, parse_topic
@@ -46,13 +48,50 @@ def check_labels(data: CheckData) -> Iterator[Finding]:
             continue
         yield from _check_images(data, topic, CAMERA_IMAGE(parts["robot"]), table)
         peers = _flatten_peers(table["peers"])
-        bounds = _find_image_size(data, parts["robot"])
+        size_px = _find_image_size(data, parts["robot"])
         for source in sorted(set(peers["source"].to_pylist())):
-            source_labels = peers.filter(pc.equal(peers["source"], source))
-            yield from _check_values(topic, source, source_labels, bounds)
-            yield from _check_plausibility(topic, source, source_labels, bounds)
-            biased = [*_check_bias(topic, source, source_labels, bounds)]
-            yield from _check_boxes(topic, source, source_labels, biased)
+            labels = _build_labels(source, peers.filter(pc.equal(peers["source"], source)), size_px)
+            yield from (Finding("error", topic, text) for text in _check_pixels(labels))
+            for rule in (_check_size, _check_plausibility, _check_boxes):
+                yield from (Finding("warning", topic, text) for text in rule(labels))
+
+
+@dataclass(frozen=True, slots=True)
+class _Labels:
+    """Labels of one source.
+
+    Parameters
+    ----------
+    name
+        Words for them.
+    uv, depth_m, has_depth
+        (N, 2) pixels, (N,) depths, and whether each is known.
+    has_box, box
+        (N,) whether a label has a box, and (K, 4) the boxes.
+    size_px
+        Width and height of the images; None: unknown.
+    """
+
+    name: str
+    uv: Array
+    depth_m: Array
+    has_depth: NDArray[np.bool_]
+    has_box: NDArray[np.bool_]
+    box: Array
+    size_px: tuple[int, int] | None
+
+
+def _build_labels(source: str, peers: pa.Table, size_px: tuple[int, int] | None) -> _Labels:
+    has_box = pc.equal(pc.list_value_length(peers["box_px"]), 4).to_numpy()
+    return _Labels(
+        f"labels of source {source!r}",
+        np.column_stack([peers["u_px"].to_numpy(), peers["v_px"].to_numpy()]),
+        peers["depth_m"].to_numpy(),
+        ~np.isinf(peers["sigma_depth_m"].to_numpy()),
+        has_box,
+        pc.list_flatten(peers.filter(pa.array(has_box))["box_px"]).to_numpy().reshape(-1, 4),
+        size_px,
+    )
 
 
 def _check_images(data: CheckData, topic: str, image: str, table: pa.Table) -> Iterator[Finding]:
@@ -85,89 +124,66 @@ def _flatten_peers(peers: pa.ChunkedArray) -> pa.Table:
     return pa.table({f.name: pc.struct_field(flat, f.name) for f in flat.type})
 
 
-def _check_values(
-    topic: str, source: str, peers: pa.Table, image_size: tuple[int, int] | None
-) -> Iterator[Finding]:
-    uv = np.column_stack([peers["u_px"].to_numpy(), peers["v_px"].to_numpy()])
-    depth_m = peers["depth_m"].to_numpy()
-    known = ~np.isinf(peers["sigma_depth_m"].to_numpy())
-    bad_depth = known & (~np.isfinite(depth_m) | (depth_m <= 0))
-    wrong = int((~np.isfinite(uv).all(axis=1) | bad_depth).sum())
-    if wrong:
-        yield Finding(
-            "error",
-            topic,
-            f"{wrong} labels of source {source!r} have no pixel, or a depth that is not positive",
-        )
-    if image_size is not None and (outside := int((~is_inside(uv, *image_size)).sum())):
-        yield Finding(
-            "warning",
-            topic,
-            f"{outside} of {len(uv)} labels of source {source!r} lie outside the "
-            f"{image_size[0]}x{image_size[1]} image",
-        )
+def _check_pixels(labels: _Labels) -> Iterator[str]:
+    """Report labels without a pixel, or with an impossible depth."""
+    bad_depth = labels.has_depth & (~np.isfinite(labels.depth_m) | (labels.depth_m <= 0))
+    if wrong := int((~np.isfinite(labels.uv).all(axis=1) | bad_depth).sum()):
+        yield f"{wrong} {labels.name} have no pixel, or a depth that is not positive"
 
 
-def _check_plausibility(
-    topic: str, source: str, peers: pa.Table, image_size: tuple[int, int] | None
-) -> Iterator[Finding]:
+def _check_size(labels: _Labels) -> Iterator[str]:
+    if labels.size_px is not None and (
+        outside := int((~is_inside(labels.uv, *labels.size_px)).sum())
+    ):
+        count, (width, height) = len(labels.uv), labels.size_px
+        yield f"{outside} of {count} {labels.name} lie outside the {width}x{height} image"
+
+
+def _check_plausibility(labels: _Labels) -> Iterator[str]:
     """Report labels in the wrong unit."""
-    uv = np.column_stack([peers["u_px"].to_numpy(), peers["v_px"].to_numpy()])
+    uv = labels.uv
     if len(uv) < DOUBT_LABELS_MIN:
         return
-    of = f"labels of source {source!r}"
-    if image_size is not None and ((uv >= 0) & (uv <= 1)).all():
-        yield Finding("warning", topic, f"{of} all lie in the first pixel. Are they normalised?")
-    if (depth_m := float(np.median(peers["depth_m"].to_numpy()))) > DEPTH_MAX_M:
-        text = f"{of} have a median depth of {depth_m:.0f} m. Is it in mm?"
-        yield Finding("warning", topic, text)
+    if labels.size_px is not None and ((uv >= 0) & (uv <= 1)).all():
+        yield f"{labels.name} all lie in the first pixel. Are they normalised?"
+    if (depth_m := float(np.median(labels.depth_m))) > DEPTH_MAX_M:
+        yield f"{labels.name} have a median depth of {depth_m:.0f} m. Is it in mm?"
 
 
-def _check_boxes(
-    topic: str, source: str, peers: pa.Table, biased: list[Finding]
-) -> Iterator[Finding]:
+def _check_boxes(labels: _Labels) -> Iterator[str]:
     """Report boxes without area; else a bias; else centres that are not in their boxes."""
-    uv = np.column_stack([peers["u_px"].to_numpy(), peers["v_px"].to_numpy()])
-    has_box = pc.equal(pc.list_value_length(peers["box_px"]), 4).to_numpy()
-    box = pc.list_flatten(peers.filter(pa.array(has_box))["box_px"]).to_numpy().reshape(-1, 4)
-    outside = (uv[has_box] < box[:, :2]).any(axis=1) | (uv[has_box] > box[:, 2:]).any(axis=1)
+    box, uv = labels.box, labels.uv[labels.has_box]
+    outside = (uv < box[:, :2]).any(axis=1) | (uv > box[:, 2:]).any(axis=1)
     empty = (box[:, 2:] <= box[:, :2]).any(axis=1)
-    of = f"{len(box)} labels of source {source!r}"
+    of = f"{len(box)} {labels.name}"
     if len(box) >= BIAS_LABELS_MIN and empty.mean() > OUTSIDE_BOX_SHARE:
         text = f"{int(empty.sum())} of {of} have boxes without area"
-        yield Finding("warning", topic, f"{text}. Are they left, top, right, bottom?")
-    elif biased:
-        yield from biased
+        yield f"{text}. Are they left, top, right, bottom?"
+    elif biased := _describe_bias(labels):
+        yield biased
     elif len(box) >= BIAS_LABELS_MIN and outside.mean() > OUTSIDE_BOX_SHARE:
-        text = f"{int(outside.sum())} of {of} have their centre outside their box"
-        yield Finding("warning", topic, text)
+        yield f"{int(outside.sum())} of {of} have their centre outside their box"
 
 
-def _check_bias(
-    topic: str, source: str, peers: pa.Table, image_size: tuple[int, int] | None
-) -> Iterator[Finding]:
-    """Report labels with a common offset from the middle of their boxes."""
-    labels_with_box = peers.filter(pc.equal(pc.list_value_length(peers["box_px"]), 4))
-    if image_size is None or labels_with_box.num_rows < BIAS_LABELS_MIN:
-        return
-    box = pc.list_flatten(labels_with_box["box_px"]).to_numpy().reshape(-1, 4)
-    low, high = box[:, :2], box[:, 2:]
+def _describe_bias(labels: _Labels) -> str:
+    """Return the words for a common offset from the middle of the boxes; empty if none."""
+    if labels.size_px is None or len(labels.box) < BIAS_LABELS_MIN:
+        return ""
+    low, high = labels.box[:, :2], labels.box[:, 2:]
     whole = (low > BORDER_MARGIN_PX).all(axis=1) & (
-        high < np.array(image_size) - BORDER_MARGIN_PX
+        high < np.array(labels.size_px) - BORDER_MARGIN_PX
     ).all(axis=1)
     if whole.sum() < BIAS_LABELS_MIN:
-        return
-    uv = np.column_stack([labels_with_box["u_px"].to_numpy(), labels_with_box["v_px"].to_numpy()])
-    offset = (uv - (low + high) / 2)[whole]
+        return ""
+    offset = (labels.uv[labels.has_box] - (low + high) / 2)[whole]
     middle = np.median(offset, axis=0)
     # Standard error of a median; the spread is estimated robustly from the MAD.
     sigma = 1.4826 * np.median(np.abs(offset - middle), axis=0)
     error = 1.2533 * sigma / np.sqrt(len(offset))
-    if ((np.abs(middle) > BIAS_MIN_PX) & (np.abs(middle) > BIAS_MIN_SIGMAS * error)).any():
-        yield Finding(
-            "warning",
-            topic,
-            f"labels of source {source!r} are biased: {middle[0]:+.1f} px in u and "
-            f"{middle[1]:+.1f} px in v from the middle of their boxes "
-            f"(median of {len(offset)}, standard error {error[0]:.2f} and {error[1]:.2f} px)",
-        )
+    if not ((np.abs(middle) > BIAS_MIN_PX) & (np.abs(middle) > BIAS_MIN_SIGMAS * error)).any():
+        return ""
+    return (
+        f"{labels.name} are biased: {middle[0]:+.1f} px in u and {middle[1]:+.1f} px in v from the "
+        f"middle of their boxes (median of {len(offset)}, standard error {error[0]:.2f} and "
+        f"{error[1]:.2f} px)"
+    )
