@@ -5,8 +5,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from dmrl.atomic_output import refuse_existing, to_partial_path
 from dmrl.errors import OutputError, RecordingError
@@ -85,9 +86,7 @@ def record_session(
     clients = build_cameras(robots, links, (settings.pixels, settings.images), feed, now)
     threads: list[CrazyflieLink | CameraClient] = [*links.values(), *clients]
     table = StatusTable(list(links.values()), [client.health for client in clients])
-    made = build_provenance(
-        "record", _to_provenance(robots, settings), libraries=("cflib", "numpy")
-    )
+    made = build_provenance("record", _describe(robots, settings), libraries=("cflib", "numpy"))
     began_s, used_s = time.monotonic(), time.process_time()
     # What was received stays even if this process fails: flights are not repeated.
     with _name_unfinished(out), RecordingWriter(out, made, keep_on_error=True) as sink:
@@ -125,29 +124,12 @@ def _refuse_unfinished(out: Path) -> None:
         )
 
 
-def _to_provenance(robots: Sequence[RobotOptions], settings: RecordSettings) -> "_Recorded":
-    return _Recorded(
-        tuple(r.name for r in robots),
-        tuple(r.uri for r in robots),
-        tuple("" if r.camera is None else f"{r.camera[0]}:{r.camera[1]}" for r in robots),
-        settings.rate_hz,
-        settings.pixels,
-        settings.images,
-        settings.peer,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class _Recorded:
-    """Settings and addresses that the provenance lists."""
-
-    robots: tuple[str, ...]
-    uris: tuple[str, ...]
-    cameras: tuple[str, ...]
-    rate_hz: float
-    pixels: str
-    images: str
-    peer: tuple[str, ...]
+def _describe(robots: Sequence[RobotOptions], settings: RecordSettings) -> dict[str, Any]:
+    """Return the settings and addresses that the provenance lists."""
+    cameras = ["" if r.camera is None else f"{r.camera[0]}:{r.camera[1]}" for r in robots]
+    addresses = {"robots": [r.name for r in robots], "uris": [r.uri for r in robots]}
+    told = {key: value for key, value in asdict(settings).items() if key != "duration_s"}
+    return addresses | {"cameras": cameras} | told
 
 
 def _write_samples(

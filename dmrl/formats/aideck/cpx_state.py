@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dmrl.formats.crazyflie.log_block import unpack_quaternions
+
 STATE_FORMAT = "I9hi3h"
 """``struct`` format: robot's time (ms), position (mm), velocity (mm/s), acceleration (mm/s^2),
 compressed quaternion, turning rates (mrad/s)."""
@@ -85,16 +87,8 @@ def decompress_quaternion(packed: int) -> Quaternion:
     Each of the others has a sign and 9 bits. Follows the Crazyflie's ``quatcompress.h``. The
     largest part is positive and is computed from the others.
     """
-    packed &= 0xFFFFFFFF
-    largest = packed >> 30
-    parts = [0.0] * 4
-    for k in (3, 2, 1, 0):
-        if k != largest:
-            magnitude = (packed & MAGNITUDE_MAX) / MAGNITUDE_MAX * np.sqrt(0.5)
-            parts[k] = float(-magnitude if packed & (MAGNITUDE_MAX + 1) else magnitude)
-            packed >>= 10
-    parts[largest] = float(np.sqrt(max(1 - sum(part * part for part in parts), 0.0)))
-    return parts[0], parts[1], parts[2], parts[3]
+    x, y, z, w = unpack_quaternions(np.array([packed], np.int64))[0].tolist()
+    return x, y, z, w
 
 
 def compress_quaternion(xyzw: Quaternion) -> int:

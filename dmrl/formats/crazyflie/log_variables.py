@@ -193,13 +193,27 @@ def iter_range_streams(
     """Yield streams of UWB distances. A repeated value is not a new measurement."""
     for number, time_ns, range_m in _iter_distances(blocks, where):
         peer = names.get(str(number), f"cf{number}")
-        usable = np.isfinite(range_m) & (range_m > 0) & (range_m < MAX_RANGE_M)
-        refused = int((np.isfinite(range_m) & (range_m != 0) & ~usable).sum())
-        leave_out(f"ranges to {peer} that are not over 0 and under 60 m", where, refused)
-        if peer == robot or not usable.any():
-            continue
-        topic = topics.RANGE(robot, peer)
-        yield Columns(topic, "UwbRange", time_ns[usable], {"range_m": range_m[usable]})
+        found = build_ranges(
+            robot,
+            peer,
+            time_ns,
+            np.where((range_m == 0) | np.isinf(range_m), np.nan, range_m),
+            where,
+        )
+        if peer != robot and len(found.time_ns):
+            yield found
+
+
+def build_ranges(robot: str, peer: str, time_ns: Times, range_m: Array, where: object) -> Columns:
+    """Build the stream of the (N,) ranges to a peer, NaN where there is none.
+
+    Those that radios do not reach are left out and counted.
+    """
+    usable = (range_m > 0) & (range_m < MAX_RANGE_M)
+    refused = int((~np.isnan(range_m) & ~usable).sum())
+    leave_out(f"ranges to {peer} that are not over 0 and under 60 m", where, refused)
+    fields = {"range_m": range_m[usable]}
+    return Columns(topics.RANGE(robot, peer), "UwbRange", time_ns[usable], fields)
 
 
 def _iter_distances(

@@ -15,7 +15,7 @@ Images of a robot are in a folder ``<robot>/``, named by their time in nanosecon
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -26,6 +26,7 @@ from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats.base import Content, Format, Options
 from dmrl.formats.clocks import Ints
+from dmrl.formats.crazyflie.log_variables import build_ranges
 from dmrl.formats.files import image_folder
 from dmrl.formats.files.labelled_pictures import is_picture
 from dmrl.formats.files.pictures import PICTURE_OPTIONS
@@ -41,7 +42,6 @@ from dmrl.topics import Topic
 TIME_COLUMN = "time_s"
 REQUIRED_COLUMNS = (TIME_COLUMN, *LOG_COLUMNS)
 MIN_GAP_S = 1.0
-MAX_RANGE_M = 60.0  # beyond the reach of UWB; radios report 65535 mm without an answer
 OWN_SENSOR_COLUMNS = {field for row in topics.OWN_SENSORS for field in row.csv}
 OTHER_SENSORS = tuple(
     row
@@ -177,7 +177,7 @@ def _check_overlap(logs: list[CsvLog]) -> None:
                 say(f"{log.path} has ranges to {peer}, but there is no {peer}.csv beside it")
 
 
-def _iter_streams(log: CsvLog, names: Mapping[str, str]) -> Iterator[Iterator[Sample]]:
+def _iter_streams(log: CsvLog, names: Mapping[str, str]) -> Iterator[Iterable[Sample]]:
     def name(robot: str) -> str:
         return names.get(robot, robot)
 
@@ -185,11 +185,7 @@ def _iter_streams(log: CsvLog, names: Mapping[str, str]) -> Iterator[Iterator[Sa
     yield flight.iter_robot_log(own, time_ns, log.columns)
     for peer in log.range_peers:
         range_m = log.columns[f"range_{peer}_m"]
-        given = ~np.isnan(range_m)
-        usable = given & (range_m > 0) & (range_m < MAX_RANGE_M)
-        refused = int((given & ~usable).sum())
-        leave_out(f"ranges to {peer} that are not over 0 and under 60 m", log.path, refused)
-        yield flight.iter_ranges(own, name(peer), time_ns[usable], range_m[usable])
+        yield build_ranges(own, name(peer), time_ns, range_m, log.path)
     for peer in log.truth_peers:
         xyz = np.stack([log.columns[f"{peer}_{axis}_m"] for axis in "xyz"], axis=1)
         known = np.flatnonzero(np.isfinite(xyz).all(axis=1))

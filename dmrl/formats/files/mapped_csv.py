@@ -165,18 +165,15 @@ def _build_ranges(
     robot: str, peer: str, time_ns: Times, range_m: Array, column: Column, path: Path
 ) -> SampleStream:
     """Build the stream of the ranges to a peer: possible ones, each measurement once."""
-    known = np.isfinite(range_m)
-    usable = known & (range_m > 0) & (range_m < log_variables.MAX_RANGE_M)
-    reason = f"ranges to {peer} that are not over 0 and under 60 m"
-    leave_out(reason, path, int((known & ~usable).sum()))
     if column.held is not False:
-        new = find_new_values(np.where(usable, range_m, np.nan), polled=column.held is True)
-        if column.held is None:
+        usable = (range_m > 0) & (range_m < log_variables.MAX_RANGE_M)
+        polled = column.held is True
+        held = usable & ~find_new_values(np.where(usable, range_m, np.nan), polled=polled)
+        if not polled:
             reason = f"ranges to {peer} that repeat the last one, which the log holds"
-            leave_out(f"{reason} (held in the table decides it)", path, int((usable & ~new).sum()))
-        usable &= new
-    topic = topics.RANGE(robot, peer)
-    return Columns(topic, "UwbRange", time_ns[usable], {"range_m": range_m[usable]})
+            leave_out(f"{reason} (held in the table decides it)", path, int(held.sum()))
+        range_m = np.where(held, np.nan, range_m)
+    return log_variables.build_ranges(robot, peer, time_ns, range_m, path)
 
 
 def _iter_sensor_streams(

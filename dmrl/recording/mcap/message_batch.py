@@ -164,22 +164,16 @@ class MessageBatch:
 
 def concatenate(first: MessageBatch | None, second: MessageBatch) -> MessageBatch:
     """Join two batches over one byte array, keeping all bytes."""
-    if first is None or not len(first):
-        return second
-    shift = len(first.data)
-    return MessageBatch(
-        np.concatenate([first.data, second.data]),
-        np.concatenate([first.channel, second.channel]),
-        np.concatenate([first.time_ns, second.time_ns]),
-        np.concatenate([first.publish_ns, second.publish_ns]),
-        np.concatenate([first.start, second.start + shift]),
-        np.concatenate([first.end, second.end + shift]),
-    )
+    return second if first is None or not len(first) else _join([first, second])
 
 
 def concatenate_all(batches: Sequence[MessageBatch]) -> MessageBatch:
     """Join batches over one byte array; leave out unused bytes where they are the larger part."""
-    parts = [b.compact() if 2 * int((b.end - b.start).sum()) < len(b.data) else b for b in batches]
+    used = [2 * int((b.end - b.start).sum()) >= len(b.data) for b in batches]
+    return _join([b if most else b.compact() for b, most in zip(batches, used, strict=True)])
+
+
+def _join(parts: Sequence[MessageBatch]) -> MessageBatch:
     shift = np.cumsum([0, *(len(part.data) for part in parts)])
     return MessageBatch(
         np.concatenate([part.data for part in parts]),

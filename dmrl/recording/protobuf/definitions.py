@@ -8,20 +8,8 @@ nowhere keeps its wire format: a sub-message becomes bytes, an enum an integer.
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import lru_cache
+from importlib import import_module
 
-from google.protobuf import (
-    any_pb2,
-    api_pb2,
-    descriptor_pb2,
-    duration_pb2,
-    empty_pb2,
-    field_mask_pb2,
-    source_context_pb2,
-    struct_pb2,
-    timestamp_pb2,
-    type_pb2,
-    wrappers_pb2,
-)
 from google.protobuf.descriptor import Descriptor, FileDescriptor
 from google.protobuf.descriptor_pb2 import (
     DescriptorProto,
@@ -34,12 +22,12 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from dmrl.messages import PACKAGES, find_descriptor
 
 F = FieldDescriptorProto
+WELL_KNOWN_FILES = (
+    "any api descriptor duration empty field_mask source_context struct timestamp type wrappers"
+)
 WELL_KNOWN = {
     f"google.protobuf.{name}": module.DESCRIPTOR
-    for module in (
-        *(any_pb2, api_pb2, descriptor_pb2, duration_pb2, empty_pb2, field_mask_pb2),
-        *(source_context_pb2, struct_pb2, timestamp_pb2, type_pb2, wrappers_pb2),
-    )
+    for module in (import_module(f"google.protobuf.{f}_pb2") for f in WELL_KNOWN_FILES.split())
     for name in (*module.DESCRIPTOR.message_types_by_name, *module.DESCRIPTOR.enum_types_by_name)
 }
 """Google's own files by the full names of their types."""
