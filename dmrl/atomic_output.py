@@ -39,6 +39,11 @@ def register_output(path: Path) -> None:
     _started_outputs.append(path)
 
 
+def has_begun() -> bool:
+    """Return whether this process has begun an output."""
+    return bool(_started_outputs)
+
+
 def list_finished_outputs() -> list[Path]:
     """Return the outputs of this process that are complete and have their final name."""
     return [path for path in _started_outputs if path.exists()]

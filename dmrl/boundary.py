@@ -15,11 +15,13 @@ SIGHUP                     129     the same, if anybody still listens
 With ``DMRL_DEBUG`` set, errors that are not the user's keep their traceback.
 """
 
+import _thread
 import io
 import os
 import signal
 import sys
 import tempfile
+import threading
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
@@ -29,8 +31,15 @@ from types import FrameType
 from dmrl import atomic_output
 from dmrl.errors import DmrlError, SettingError, describe_error, to_one_line
 from dmrl.guards.safe_names import truncate_middle
+from dmrl.terminal.signals import (
+    NOTHING_WRITTEN,
+    TERMINATION_SIGNALS,
+    handle_signals,
+    is_importing,
+)
 
-TERMINATION_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+RETRY_S = 0.02
+"""Time between two looks whether an import has ended, seconds."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -58,16 +67,26 @@ def open_standard_streams() -> None:
 
 
 def install_signal_handlers() -> None:
-    """Install handlers of SIGINT, SIGTERM and SIGHUP: one ends in order, a second one at once."""
+    """Install handlers of the termination signals: one ends in order, a second one at once.
 
-    def stop(number: int, _: FrameType | None) -> None:
+    An exception inside an import would be turned into another error. A signal there ends the
+    process at once if nothing was written so far; else it waits until the import has ended.
+    """
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if is_importing(frame):
+            if not atomic_output.has_begun():
+                _print_error(NOTHING_WRITTEN)
+                os._exit(128 + number)
+            again = threading.Timer(RETRY_S, _thread.interrupt_main, [number])
+            again.daemon = True
+            again.start()
+            return
         for ending in TERMINATION_SIGNALS:
             signal.signal(ending, signal.SIG_DFL)
         raise Interrupted(number)
 
-    for number in TERMINATION_SIGNALS:
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, stop)
+    handle_signals(stop)
 
 
 def run_to_status(work: Callable[[], object]) -> int:
@@ -93,7 +112,7 @@ def _run_guarded(work: Callable[[], object]) -> int:
     except DmrlError as e:
         return _print_error(str(e))
     except KeyboardInterrupt as e:
-        return _print_error(_interrupt_text(), 128 + getattr(e, "number", signal.SIGINT))
+        return _print_error(describe_interrupt(), 128 + getattr(e, "number", signal.SIGINT))
     except BrokenPipeError:
         return 1  # the reader of our output, such as `head`, has gone: nobody is left to tell
     except Exception as e:
@@ -117,14 +136,15 @@ def _print_error(text: str, status: int = 1) -> int:
     return status
 
 
-def _interrupt_text() -> str:
+def describe_interrupt() -> str:
+    """Return the line about an interrupt: which outputs are complete."""
     try:
         whole = atomic_output.list_finished_outputs()
     except (DmrlError, OSError) as e:  # outputs may lie where nobody answers any more
         return f"stopped. What has its final name is not known: {e}"
     if whole:
         return f"stopped. Whole: {', '.join(map(str, whole))}; nothing else has its final name"
-    return "stopped. Nothing stands under its final name"
+    return NOTHING_WRITTEN
 
 
 def _report_bug(error: Exception) -> str:

@@ -27,6 +27,7 @@ from dmrl import __version__, boundary, entry_points
 from dmrl.guards.numeric_threads import set_one_blas_thread
 from dmrl.guards.safe_names import truncate_middle
 from dmrl.storage import to_path
+from dmrl.terminal.signals import end_on_signal
 
 # In the order of the work. The help line is the first line of the function's docstring;
 # it stands here too so that `dmrl --help` loads nothing (a test holds the two together).
@@ -142,7 +143,9 @@ def main() -> NoReturn:
     if name not in COMMANDS:
         add_plugin_commands()
     wants_help = name in COMMANDS and not set(app.help_flags).isdisjoint(words)
-    raise SystemExit(boundary.run_to_status((lambda: print_help(name)) if wants_help else app))
+    status = boundary.run_to_status((lambda: print_help(name)) if wants_help else app)
+    end_on_signal(boundary.describe_interrupt)  # what libraries do at exit loses an exception
+    raise SystemExit(status)
 
 
 def print_help(name: str) -> None:

@@ -10,6 +10,7 @@
     + UnreadableTopic
   - SourceError       a foreign file or folder does not conform to its format
   - DatasetError      a folder is not a dataset, or lacks requested data
+    + MissingSplit
   - ModelError        weights or a run folder cannot be used
   - RecipeError       the TOML does not describe a run
   - SettingError      a setting does not fit the input
@@ -25,6 +26,12 @@ import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+
+
+def suggest(wrong: str, known: Iterable[str], otherwise: str) -> str:
+    """Return "Did you mean ...?" with the known name nearest to a wrong one, or other words."""
+    near = get_close_matches(wrong, sorted(known), n=1)
+    return f"Did you mean {near[0]}?" if near else otherwise
 
 
 def to_one_line(text: str) -> str:
@@ -104,7 +111,7 @@ class MissingTopic(RecordingError):
 
     def __init__(self, topic: str, present: Iterable[str], where: object) -> None:
         near = get_close_matches(topic, sorted(present), n=1)
-        hint = f"Did you mean {near[0]}?" if near else f"Try: dmrl info {where}"
+        hint = suggest(topic, present, f"Try: dmrl info {where}")
         if near and topic.startswith("/*/"):  # a stage asks for it, and not the user
             name = f"{near[0]}={topic.replace('*', 'cf1', 1)}"
             hint += f" Rename it: dmrl convert {where} OUT.mcap --names {name}"
@@ -137,6 +144,27 @@ class SourceError(DmrlError):
 
 class DatasetError(DmrlError):
     """A folder is not a dataset, or lacks requested data."""
+
+
+class MissingSplit(DatasetError, KeyError):
+    """A dataset has no split of this name. Also a KeyError, as of any mapping.
+
+    Parameters
+    ----------
+    split
+        The requested name.
+    present
+        Splits of the dataset.
+    where
+        The dataset.
+    """
+
+    def __init__(self, split: str, present: Iterable[str], where: object) -> None:
+        super().__init__(f"no split {split} in {where}. It has: {', '.join(present)}")
+
+    def __str__(self) -> str:
+        """Return the message; a KeyError would quote it."""
+        return to_one_line(str(self.args[0]))
 
 
 class ModelError(DmrlError):

@@ -8,7 +8,6 @@ import json
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, asdict, fields, replace
-from difflib import get_close_matches
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -17,10 +16,11 @@ from typing import Any, TypeVar, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
 
-from dmrl.errors import RecipeError, SettingError
+from dmrl.errors import RecipeError, SettingError, suggest
 from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.guards.paths import refuse_pipe
+from dmrl.storage import to_path
 
 Settings = TypeVar("Settings")
 MAX_BYTES = 4 * limits.TOML_CHARACTERS
@@ -74,8 +74,7 @@ def read_text(name: str | Path) -> str:
             raise RecipeError(f"{name} has more than {MAX_BYTES} bytes. Use a smaller recipe")
         return content.decode("utf-8")
     except (FileNotFoundError, IsADirectoryError):
-        near = get_close_matches(path.stem, list_names() + list_pretrained_names(), n=1)
-        hint = f"Did you mean {near[0]}?" if near else _list_shipped()
+        hint = suggest(path.stem, list_names() + list_pretrained_names(), _list_shipped())
         raise RecipeError(f"no recipe {name}. {hint}") from None
     except (UnicodeDecodeError, OSError) as e:
         raise RecipeError(f"{name} cannot be read: {e}. Give a TOML text file") from e
@@ -216,7 +215,14 @@ def _validate_keys(keys: Mapping[str, Any], schema: type[Any]) -> dict[str, Any]
     # JSON, because pydantic's strict mode accepts lists as tuples and text as paths only there.
     model = _build_model(schema)  # type: ignore[arg-type] # a class has a hash
     made = model.model_validate_json(json.dumps(keys, default=str))
-    return {name: getattr(made, name) for name in keys}
+    return {name: _keep_remote(getattr(made, name), keys[name]) for name in keys}
+
+
+def _keep_remote(value: Any, given: Any) -> Any:
+    """Return a path in a bucket as such: pydantic's ``Path`` has lost a slash of its scheme."""
+    if isinstance(value, dict) and isinstance(given, Mapping):
+        return {key: _keep_remote(one, given[key]) for key, one in value.items() if key in given}
+    return to_path(str(given)) if isinstance(value, Path) else value
 
 
 def find_faults(keys: Any, schema: type[Any]) -> list[str]:
@@ -225,7 +231,7 @@ def find_faults(keys: Any, schema: type[Any]) -> list[str]:
         values = _validate_keys(keys, schema)
         schema(**values)
     except ValidationError as e:
-        return [f"{'.'.join(map(str, d['loc']))}: {_plain_message(d['msg'])}" for d in e.errors()]
+        return [_describe_fault(fault, schema) for fault in e.errors()]
     except ValueError as e:
         return [str(e)]
     return list(_iter_range_faults(values, schema))
@@ -243,9 +249,19 @@ def _iter_range_faults(values: Mapping[str, Any], schema: type[Any]) -> Iterator
                     yield f"{name}: {str(e)[:1].lower()}{str(e)[1:].rstrip('.')}"
 
 
-def _plain_message(message: str) -> str:
-    """Convert a pydantic message to plain words."""
-    return message.removeprefix("Value error, ") if "Value error" in message else message.lower()
+def _describe_fault(fault: Any, schema: type[Any]) -> str:
+    """Describe a fault that pydantic found, in plain words; of an unknown key, the nearest one."""
+    where, words = ".".join(map(str, fault["loc"])), fault["msg"]
+    if fault["type"] == "extra_forbidden":
+        return describe_unknown_key(where, [f.name for f in fields(schema)])
+    plain = words.removeprefix("Value error, ") if "Value error" in words else words.lower()
+    return f"{where}: {plain}"
+
+
+def describe_unknown_key(key: str, known: Iterable[str]) -> str:
+    """Return the fault of a key that does not exist, with the nearest one that does."""
+    near = suggest(key, known, "").replace("Did", "did")
+    return f"{key}: extra inputs are not permitted" + (f" ({near})" if near else "")
 
 
 def _create_instance(keys: Mapping[str, Any], schema: type[Settings]) -> Settings:

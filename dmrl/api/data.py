@@ -15,6 +15,7 @@ from dmrl.api import notebook_display
 from dmrl.datasets import Dataset, Split, layout, open_dataset
 from dmrl.errors import DatasetError, MissingExtra
 from dmrl.export.csv_parquet import flatten_table
+from dmrl.storage import to_path
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -212,13 +213,11 @@ class Data(Mapping[str, Rows]):
 
         Raises
         ------
-        KeyError
-            If there is none of that name.
+        MissingSplit
+            If there is none of that name. It is a KeyError as well.
         DatasetError
             If a shard is missing or cut short.
         """
-        if split not in self._found.splits:
-            raise KeyError(f"no split {split} in {self.path}; it has {', '.join(self)}")
         return Rows(self._found.split(split))
 
     def __iter__(self) -> Iterator[str]:
@@ -277,7 +276,7 @@ def dataset(path: str | os.PathLike[str]) -> Data:
     >>> for batch in dmrl.dataset("set")["train"].loader(shuffle=True):  # doctest: +SKIP
     ...     train(batch["image"], batch["confidence"], batch["depth"])
     """
-    return Data(open_dataset(Path(path)))
+    return Data(open_dataset(to_path(path)))
 
 
 def _import_torch_dataset() -> Any:

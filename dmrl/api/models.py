@@ -4,7 +4,6 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from dmrl.deploy.detector import Detector, open_detector
 from dmrl.errors import SettingError
 from dmrl.learn.inference.decode_grids import DETECTION_COLUMNS, Grids, decode
 from dmrl.learn.pretrained import resolve_model_path
+from dmrl.storage import to_path
 
 Rgb = NDArray[np.uint8]
 BATCH_IMAGES = 16
@@ -163,7 +163,7 @@ def load(model: str | os.PathLike[str], *, backend: BackendName = "torch") -> Mo
     >>> model = dmrl.load("dmrl-nano")  # doctest: +SKIP
     >>> model.detect(dmrl.open("flight.mcap").images("cf1"))  # doctest: +SKIP
     """
-    return Model(open_detector(resolve_model_path(Path(model)), backend))
+    return Model(open_detector(resolve_model_path(to_path(model)), backend))
 
 
 def _require_rgb(images: Rgb) -> None:

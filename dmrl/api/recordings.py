@@ -26,6 +26,7 @@ from dmrl.recording import (
     read,
     read_summary,
 )
+from dmrl.storage import to_path
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,7 +58,7 @@ class Recording:
     """
 
     def __init__(self, path: PathLike, temporary: Path | None = None) -> None:
-        self.path = Path(path)
+        self.path = to_path(path)
         self._summary = read_summary(self.path)
         self._kept = None if temporary is None else _TemporaryFolder(temporary)
 

@@ -19,6 +19,7 @@ from dmrl.api.results import Result, evaluate_recordings
 from dmrl.errors import SettingError
 from dmrl.guards.numeric_threads import one_blas_thread
 from dmrl.pipeline.stage_signature import signature_of
+from dmrl.storage import to_path
 from dmrl.terminal.left_out import count_left_out
 
 OneOrMore: TypeAlias = PathLike | Sequence[PathLike]
@@ -41,7 +42,7 @@ def label(recording: PathLike, out: PathLike | None = None, **settings: Any) -> 
     DmrlError
         As the command.
     """
-    return _run_to_recording("label", out, settings, recording=Path(recording))
+    return _run_to_recording("label", out, settings, recording=to_path(recording))
 
 
 def predict(
@@ -51,23 +52,23 @@ def predict(
 
     Parameters, errors as `label`; ``model`` as `dmrl.load` takes it.
     """
-    given = {"model": Path(model), "recording": Path(recording)}
+    given = {"model": to_path(model), "recording": to_path(recording)}
     return _run_to_recording("predict", out, settings, **given)
 
 
 def track(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
     """Track detected peers over time: ``dmrl track``. Parameters, errors as `label`."""
-    return _run_to_recording("track", out, settings, recording=Path(recording))
+    return _run_to_recording("track", out, settings, recording=to_path(recording))
 
 
 def align(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
     """Align the clocks of robots and cameras: ``dmrl align``. Parameters, errors as `label`."""
-    return _run_to_recording("align", out, settings, recording=Path(recording))
+    return _run_to_recording("align", out, settings, recording=to_path(recording))
 
 
 def trim(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
     """Copy a part of a recording, or some topics: ``dmrl trim``. Parameters, errors as `label`."""
-    return _run_to_recording("trim", out, settings, recording=Path(recording))
+    return _run_to_recording("trim", out, settings, recording=to_path(recording))
 
 
 def merge(recordings: Sequence[PathLike], out: PathLike | None = None) -> Recording:
@@ -80,7 +81,7 @@ def merge(recordings: Sequence[PathLike], out: PathLike | None = None) -> Record
 
 def convert(source: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
     """Convert a foreign file or folder: ``dmrl convert``. Parameters, errors as `label`."""
-    return _run_to_recording("convert", out, settings, source=Path(source))
+    return _run_to_recording("convert", out, settings, source=to_path(source))
 
 
 def fly(
@@ -129,13 +130,13 @@ def render(
 
 def sketch(out: PathLike, **settings: Any) -> Path:
     """Draw a folder of images with exact labels: ``dmrl sketch``. Errors as `label`."""
-    return _run_to_path("sketch", Path(out), settings)
+    return _run_to_path("sketch", to_path(out), settings)
 
 
 def make_dataset(recordings: OneOrMore, out: PathLike, **settings: Any) -> Data:
     """Build a dataset with its card: ``dmrl dataset``. Errors as `label`."""
     given = _to_paths("make_dataset", recordings)
-    return dataset(_run_to_path("dataset", Path(out), settings, recordings=given))
+    return dataset(_run_to_path("dataset", to_path(out), settings, recordings=given))
 
 
 def train(
@@ -166,21 +167,27 @@ def train(
     DmrlError
         As the command.
     """
-    given = {"dataset": data.path if isinstance(data, Data) else Path(data)}
+    given = {"dataset": data.path if isinstance(data, Data) else to_path(data)}
     if init is not None:
-        given["init"] = Path(init)
-    return load(_run_to_path("train", Path(out), _recipe_keys("train", recipe) | settings, **given))
+        given["init"] = to_path(init)
+    return load(
+        _run_to_path("train", to_path(out), _recipe_keys("train", recipe) | settings, **given)
+    )
 
 
 def quantize(model: PathLike, data: PathLike | Data, out: PathLike, **settings: Any) -> Model:
     """Quantize a network to int8: ``dmrl quantize``. Errors as `label`."""
-    images = data.path if isinstance(data, Data) else Path(data)
-    return load(_run_to_path("quantize", Path(out), settings, model=Path(model), dataset=images))
+    images = data.path if isinstance(data, Data) else to_path(data)
+    return load(
+        _run_to_path("quantize", to_path(out), settings, model=to_path(model), dataset=images)
+    )
 
 
 def calibrate(sources: OneOrMore, out: PathLike, **settings: Any) -> Path:
     """Calibrate a camera by chessboards or flights: ``dmrl calibrate``. Errors as `label`."""
-    return _run_to_path("calibrate", Path(out), settings, sources=_to_paths("calibrate", sources))
+    return _run_to_path(
+        "calibrate", to_path(out), settings, sources=_to_paths("calibrate", sources)
+    )
 
 
 def evaluate(recordings: OneOrMore, **settings: Any) -> Result:
@@ -211,7 +218,7 @@ def _recipe_keys(kind: str, name: PathLike | None) -> dict[str, Any]:
     """Return the keys of a recipe of this kind, without the kind."""
     if name is None:
         return {}
-    keys = recipes.read(Path(name))
+    keys = recipes.read(to_path(name))
     recipes.check_kind(str(name), keys, kind)
     return {key: value for key, value in keys.items() if key != "kind"}
 
@@ -221,7 +228,7 @@ def _to_paths(what: str, given: OneOrMore) -> list[Path]:
     several = [given] if isinstance(given, str | os.PathLike) else list(given)
     if not several:
         raise SettingError(f"dmrl.{what} was given an empty list. Name one file at least")
-    return [Path(path) for path in several]
+    return [to_path(path) for path in several]
 
 
 def _run_to_recording(
@@ -229,7 +236,7 @@ def _run_to_recording(
 ) -> Recording:
     """Run a stage that writes a recording, and return it."""
     if out is not None:
-        return Recording(_run_to_path(stage, Path(out), settings, **given))
+        return Recording(_run_to_path(stage, to_path(out), settings, **given))
     folder = Path(mkdtemp(prefix="dmrl-"))
     try:
         return Recording(_run_to_path(stage, folder / f"{stage}.mcap", settings, **given), folder)

@@ -1,7 +1,6 @@
 """Writer of recordings: messages by topic and fields, images as arrays."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -19,6 +18,7 @@ from dmrl.images.codec import encode_jpeg, encode_png
 from dmrl.messages import message_class
 from dmrl.recording import RecordingWriter, build_provenance
 from dmrl.samples import sample
+from dmrl.storage import to_path
 
 LATEST_TIME_S = 9.2e9
 """Beyond it whole nanoseconds do not fit into 64 bits; seconds, the year 2261."""
@@ -59,7 +59,7 @@ class Writer:
     """
 
     def __init__(self, path: PathLike, settings: Mapping[str, Any]) -> None:
-        self.path = Path(path)
+        self.path = to_path(path)
         self._done = False
         self._sink = RecordingWriter(self.path, build_provenance("python", dict(settings)))
 
@@ -176,7 +176,7 @@ class Writer:
         SourceError
             If the file cannot be read.
         """
-        known = camera if isinstance(camera, Camera) else read_camera(Path(camera))
+        known = camera if isinstance(camera, Camera) else read_camera(to_path(camera))
         (time_ns,) = self._log_times(topics.CALIBRATION(robot), [time_s])
         self._send_sample(sample.build_calibration(int(time_ns), robot, known))
 

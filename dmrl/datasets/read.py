@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dmrl.datasets import layout
 from dmrl.datasets.manifest import Manifest, read_manifest
 from dmrl.datasets.shards import open_shard
-from dmrl.errors import DatasetError
+from dmrl.errors import DatasetError, MissingSplit
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_json
@@ -193,8 +193,7 @@ class Dataset:
             If the split does not exist, or a shard is missing or truncated.
         """
         if name not in self.splits:
-            present = ", ".join(self.splits)
-            raise DatasetError(f"no split {name} in {self.path}. It has: {present}")
+            raise MissingSplit(name, self.splits, self.path)
         shards = self._locate_shards(name)
         tables = [open_shard(path, rows) for path, rows in shards]
         for (path, _), table in zip(shards, tables, strict=True):

@@ -34,6 +34,8 @@ MAX_OPENED_RECORDINGS = 100
 """Largest number of recordings in a catalogue that are opened one by one."""
 RECIPE_FILE = "recipe.toml"
 """The recipe that `dmrl.pipeline` leaves beside its outputs."""
+SKIPPED_FOLDERS = ("unfinished", "previous")
+"""Folders of `dmrl.pipeline` with outputs that are incomplete or replaced."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -132,7 +134,9 @@ def _iter_files(folder: Path) -> Iterator[Path]:
         inside = Path(place)
         if len(inside.relative_to(folder).parts) >= MAX_FOLDER_DEPTH:
             below.clear()
-        below[:] = sorted(n for n in below if not n.endswith(".partial") and n != "unfinished")
+        below[:] = sorted(
+            n for n in below if not n.endswith(".partial") and n not in SKIPPED_FOLDERS
+        )
         for name in sorted(names):
             seen += 1
             path = inside / name

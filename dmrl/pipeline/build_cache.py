@@ -33,12 +33,15 @@ class BuildCache:
         Key and SHA-256 of the last build that ended, by output.
     hashes
         Size and times of a file, and its SHA-256, by path; of a folder's files together.
+    made_of
+        Stage, settings and inputs of the last build that ended, by output.
     """
 
     file: Path
     begun: dict[str, str] = field(default_factory=dict)
     done: dict[str, list[str]] = field(default_factory=dict)
     hashes: dict[str, list[str]] = field(default_factory=dict)
+    made_of: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     @classmethod
     def load(cls, file: Path) -> "BuildCache":
@@ -51,7 +54,8 @@ class BuildCache:
         """
         try:
             kept = parse_json(file.read_text(encoding="utf-8"))
-            return cls(file, dict(kept["begun"]), dict(kept["done"]), dict(kept["hashes"]))
+            made_of = dict(kept.get("made_of", {}))
+            return cls(file, dict(kept["begun"]), dict(kept["done"]), dict(kept["hashes"]), made_of)
         except FileNotFoundError:
             return cls(file)
         except (ValueError, KeyError, TypeError, OSError) as e:
@@ -96,8 +100,10 @@ class BuildCache:
         self.hashes = {path: known for path, known in self.hashes.items() if Path(path).exists()}
 
 
-def build_key(stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]) -> str:
-    """Return one hash of everything that determines the bytes of an output.
+def describe_build(
+    stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Describe everything that determines the bytes of an output.
 
     Parameters
     ----------
@@ -108,7 +114,11 @@ def build_key(stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]
     inputs
         Name and SHA-256 of every input, by role.
     """
-    made_of = {"dmrl": __version__, "stage": stage, "settings": settings, "inputs": inputs}
+    return {"dmrl": __version__, "stage": stage, "settings": settings, "inputs": inputs}
+
+
+def build_key(made_of: Mapping[str, Any]) -> str:
+    """Return one hash of the description of a build."""
     return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()
 
 

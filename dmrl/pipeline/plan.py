@@ -25,7 +25,9 @@ RECIPE_KEYS = ("kind", "each", "defaults", "step", figure_specs.TITLE_KEY, figur
 STEP_KEYS = ("stage", "out", "optional", "recipe")
 DATA = "{data}"
 RECIPE_FILE, STATE_FILE, UNFINISHED = "recipe.toml", "pipeline.json", "unfinished"
-RESERVED_NAMES = (RECIPE_FILE, STATE_FILE, UNFINISHED, "report.html")
+PREVIOUS = "previous"
+"""Folder of the outputs that a later run replaced."""
+RESERVED_NAMES = (RECIPE_FILE, STATE_FILE, UNFINISHED, PREVIOUS, "report.html")
 
 Table = dict[str, Any]
 
@@ -149,7 +151,7 @@ def load_plan(name: str | Path) -> Plan:
 
 def _build_steps(name: str | Path, recipe: Table) -> list[Step]:
     recipes.check_kind(name, recipe, "pipeline")
-    faults = [f"{k}: extra inputs are not permitted" for k in recipe if k not in RECIPE_KEYS]
+    faults = [recipes.describe_unknown_key(k, RECIPE_KEYS) for k in recipe if k not in RECIPE_KEYS]
     found = []
     for number, table in expand_steps(recipe, faults):
         wrong: list[str] = []

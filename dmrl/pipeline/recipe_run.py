@@ -17,8 +17,10 @@ from dmrl.evaluation.pipeline_summary import StepOutcome
 from dmrl.guards.paths import require_text_path
 from dmrl.pipeline.build_cache import BuildCache
 from dmrl.pipeline.executor import open_executor
+from dmrl.pipeline.forecast import Forecast, forecast_steps
 from dmrl.pipeline.plan import (
     DATA,
+    PREVIOUS,
     RECIPE_FILE,
     STATE_FILE,
     UNFINISHED,
@@ -27,12 +29,21 @@ from dmrl.pipeline.plan import (
     load_plan,
     locate_input,
 )
-from dmrl.pipeline.runner import Runner
+from dmrl.pipeline.runner import Runner, keep_previous
 from dmrl.storage import RemotePath
 from dmrl.storage.upload import require_bucket
 from dmrl.terminal.progress import say
 
-__all__ = ["Plan", "Step", "StepOutcome", "load_plan", "read_recipe_text", "run"]
+__all__ = [
+    "Forecast",
+    "Plan",
+    "Step",
+    "StepOutcome",
+    "forecast",
+    "load_plan",
+    "read_recipe_text",
+    "run",
+]
 
 LEFTOVER_NAMES = (UNFINISHED, to_partial_path(Path(STATE_FILE)).name)
 """Files that remain if a disk failed before a pipeline began."""
@@ -83,9 +94,10 @@ def run(
     with _lock_folder(out) as folder:
         memory = BuildCache.load(folder / STATE_FILE)
         memory.save()
+        _announce_replacements(Runner(plan, folder, data, memory))
         _write_recipe(folder, plan)
         with open_executor(on, workers, bars=True) as crew:
-            done = Runner(plan, folder, data, memory, crew).run()
+            done = Runner(plan, folder, data, memory).run(crew)
         memory.drop_missing_files()
         memory.save()
         with suppress(OSError):
@@ -93,6 +105,26 @@ def run(
     if skipped := sum(one.skipped for one in done):
         say(f"{skipped} of {len(done)} steps were up to date")
     return done
+
+
+def forecast(name: str | Path, out: Path, data: Path | None = None) -> list[Forecast]:
+    """Return what `run` would do, step by step. Nothing is written.
+
+    Parameters, errors as `run`.
+    """
+    plan = load_plan(name)
+    _check_data(name, plan, data)
+    _refuse_foreign_folder(out)
+    return forecast_steps(Runner(plan, out, data, BuildCache.load(out / STATE_FILE)))
+
+
+def _announce_replacements(runner: Runner) -> None:
+    """Print a line for each output that the run replaces."""
+    with suppress(OSError, OutputError):  # the runner reports them, with their step
+        for one in forecast_steps(runner):
+            if one.action == "replace":
+                place = one.out.parent / PREVIOUS
+                say(f"{one.out.name} is replaced: {one.reason}. The one before moves to {place}")
 
 
 def _check_data(name: str | Path, plan: Plan, data: Path | None) -> None:
@@ -172,5 +204,7 @@ def read_recipe_text(folder: Path) -> str | None:
 def _write_recipe(folder: Path, plan: Plan) -> None:
     """Write the recipe into the folder of its outputs."""
     kept = folder / RECIPE_FILE
+    if read_recipe_text(folder) not in (None, plan.text):
+        keep_previous(kept)
     with replace_file(kept) as partial:
         partial.write_text(plan.text, encoding="utf-8")

@@ -4,6 +4,7 @@ import shutil
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict, dataclass
+from itertools import count
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -12,10 +13,18 @@ from dmrl import recipe as recipes
 from dmrl.atomic_output import register_output, to_partial_path
 from dmrl.errors import DmrlError, OutputError
 from dmrl.evaluation.pipeline_summary import StepOutcome
-from dmrl.pipeline.build_cache import BuildCache, build_key
+from dmrl.pipeline.build_cache import BuildCache, build_key, describe_build
 from dmrl.pipeline.executor import Executor
 from dmrl.pipeline.job import JobResult, build_job
-from dmrl.pipeline.plan import UNFINISHED, Plan, Step, find_producers, locate_input, map_strings
+from dmrl.pipeline.plan import (
+    PREVIOUS,
+    UNFINISHED,
+    Plan,
+    Step,
+    find_producers,
+    locate_input,
+    map_strings,
+)
 from dmrl.pipeline.stage_signature import SETTINGS_WITHOUT_EFFECT
 from dmrl.storage import RemotePath
 from dmrl.terminal.progress import say
@@ -43,30 +52,30 @@ class Runner:
         Folder that replaces ``{data}``.
     memory
         Cache of the folder.
-    crew
-        Executor of the steps.
     """
 
-    def __init__(
-        self, plan: Plan, folder: Path, data: Path | None, memory: BuildCache, crew: Executor
-    ) -> None:
-        self.folder, self.data, self.memory, self.crew = folder, data, memory, crew
+    crew: Executor
+
+    def __init__(self, plan: Plan, folder: Path, data: Path | None, memory: BuildCache) -> None:
+        self.folder, self.data, self.memory = folder, data, memory
         self.steps = {step.out: step for step in plan.steps}
         self.outs = set(self.steps)
         self.order = plan.order
         self.running: dict[Future[JobResult], RunningStep] = {}
         self.done: dict[str, StepOutcome] = {}
         self.failed: list[DmrlError] = []
+        self._made_of: dict[str, dict[str, Any]] = {}
         self._places = {out: k for k, out in enumerate(self.steps)}
 
-    def run(self) -> list[StepOutcome]:
-        """Run all steps; return their outcomes in the order of the recipe.
+    def run(self, crew: Executor) -> list[StepOutcome]:
+        """Run all steps by an executor; return their outcomes in the order of the recipe.
 
         Raises
         ------
         DmrlError
             The error of the first step that failed. Steps beside it were finished.
         """
+        self.crew = crew
         self.order.prepare()
         ready: deque[tuple[Step, str]] = deque()
         while self.order.is_active():
@@ -96,7 +105,8 @@ class Runner:
             self._fail_step(step, f"reads {missing[0]}, which was left out. Fix that first")
             return None
         try:
-            key = self._build_key(step)
+            self._made_of[step.out] = self.describe_step(step)
+            key = build_key(self._made_of[step.out])
             made = self.memory.is_up_to_date(out, key)
         except OSError as e:
             self._fail_step(step, f"cannot read {e.filename}: {e.strerror}. Check it")
@@ -104,12 +114,17 @@ class Runner:
         if made:
             self._mark_done(step, StepOutcome(step.stage, out, 0.0, skipped=True))
             return None
-        if out.exists() and not {step.out} & (self.memory.done.keys() | self.memory.begun.keys()):
-            raise OutputError(f"{out} exists but this pipeline did not write it. Move or rename it")
+        self.refuse_foreign_output(step)
         return step, key
 
-    def _build_key(self, step: Step) -> str:
-        """Return the key of a step: it determines the bytes of the output."""
+    def refuse_foreign_output(self, step: Step) -> None:
+        """Raise OutputError if the output exists, and this pipeline did not write it."""
+        out = self.folder / step.out
+        if out.exists() and not {step.out} & (self.memory.done.keys() | self.memory.begun.keys()):
+            raise OutputError(f"{out} exists but this pipeline did not write it. Move or rename it")
+
+    def describe_step(self, step: Step) -> dict[str, Any]:
+        """Describe what determines the bytes of an output: stage, settings, inputs."""
         takes = step.signature
         own = {k: v for k, v in step.settings.items() if k not in takes.others}
         filled: dict[str, Any] = {k: step.settings[k] for k in takes.others}
@@ -121,7 +136,7 @@ class Runner:
             for k, v in recipes.to_json_values(filled).items()
             if k not in SETTINGS_WITHOUT_EFFECT
         }
-        return build_key(step.stage, matter, map_strings(dict(step.inputs), self._hash_input))
+        return describe_build(step.stage, matter, map_strings(dict(step.inputs), self._hash_input))
 
     def _hash_input(self, name: str) -> list[str]:
         """Return name and SHA-256 of an input; for a built-in name, the name alone."""
@@ -177,20 +192,14 @@ class Runner:
                 self._fail_step(one.step, answer["error"])
 
     def _install_output(self, one: RunningStep, sha256: str) -> None:
-        """Rename a complete output to its name, in place of the one before."""
+        """Rename a complete output to its name; the one before moves to ``previous/``."""
         out, new = self.folder / one.step.out, self.folder / UNFINISHED / one.step.out
-        if isinstance(out, RemotePath):
-            new.replace(out)
-        elif out.is_dir() or (out.exists() and new.is_dir()):
-            old = new.with_name(f"{new.name}.old")
-            _remove_path(old)
-            out.rename(old)
-            new.rename(out)
-            _remove_path(old)
-        else:
-            new.replace(out)
+        if out.exists() or out.is_symlink():
+            keep_previous(out)
+        new.replace(out)
         register_output(out)
         self.memory.done[one.step.out] = [one.key, sha256]
+        self.memory.made_of[one.step.out] = self._made_of[one.step.out]
         self.memory.set_sha256(out, sha256)
         self.memory.save()
         seconds = perf_counter() - one.begun_s
@@ -208,6 +217,16 @@ class Runner:
         say(f"{step.out} ({step.stage}) is left out. {words}")
         out = self.folder / step.out
         self._mark_done(step, StepOutcome(step.stage, out, 0.0, skipped=False, left_out=True))
+
+
+def keep_previous(path: Path) -> Path:
+    """Move a file or folder into ``previous/`` beside it, under a free name; return that name."""
+    folder = path.parent / PREVIOUS
+    folder.mkdir(exist_ok=True)
+    names = (path.name if k == 1 else f"{path.stem}.{k}{path.suffix}" for k in count(1))
+    kept = next(place for name in names if not (place := folder / name).exists())
+    path.replace(kept)
+    return kept
 
 
 def _remove_path(path: Path) -> None:

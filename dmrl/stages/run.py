@@ -1,11 +1,18 @@
 """``dmrl run``: the steps of a pipeline recipe."""
 
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from dmrl.errors import MissingExtra
 from dmrl.terminal.arguments import AsJson, On, Workers
 from dmrl.terminal.progress import say
-from dmrl.terminal.tables import print_line
+from dmrl.terminal.tables import print_json, print_line, print_table
+
+if TYPE_CHECKING:
+    from dmrl.pipeline.recipe_run import Forecast
 
 
 def command(
@@ -14,12 +21,14 @@ def command(
     *,
     out: Path | None = None,
     data: Path | None = None,
+    dry_run: Annotated[bool, Parameter(negative=())] = False,
     workers: Workers = None,
     on: On = None,
     as_json: AsJson = False,
 ) -> None:
     """Run the steps of a pipeline recipe whose outputs are not up to date, side by side.
 
+    An output that is made again replaces the one before, which moves to previous/ in the folder.
     A recipe with figures, such as paper, ends with report.html in its folder.
 
     Parameters
@@ -30,6 +39,8 @@ def command(
         Folder for every output. Without it, the recipe's name.
     data
         Folder with the data that the recipe reads and that does not ship with dmrl.
+    dry_run
+        Print what the run would make and replace, and why. Write nothing.
     workers
         Steps that run at a time, at most. Without it, as many as there are cores. Changes no byte.
     """
@@ -37,6 +48,9 @@ def command(
     from dmrl.pipeline import recipe_run as pipeline
 
     folder = Path(Path(recipe).stem) if out is None else out
+    if dry_run:
+        _print_forecast(pipeline.forecast(recipe, folder, data), as_json=as_json)
+        return
     plan, before = pipeline.load_plan(recipe), pipeline.read_recipe_text(folder)
     done = pipeline.run(recipe, folder, data, workers=workers, on=on)
     print_report(done, as_json=as_json)
@@ -46,6 +60,15 @@ def command(
         print_line(
             f"{page}: open it in a browser" if page else f"On one page: dmrl report {folder}"
         )
+
+
+def _print_forecast(found: "list[Forecast]", *, as_json: bool) -> None:
+    """Print what a run would do, a row for each step."""
+    if as_json:
+        print_json({"steps": [asdict(one) for one in found]})
+        return
+    rows = [(one.stage, one.out, one.action, one.reason) for one in found]
+    print_table("", ("step", "output", "would", "because"), rows)
 
 
 def _write_page(folder: Path, *, changed: bool) -> Path | None:

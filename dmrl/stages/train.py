@@ -9,6 +9,7 @@ from cyclopts import Parameter
 from dmrl.guards.lazy_names import import_lazily
 from dmrl.terminal.arguments import AsJson, Flat
 from dmrl.terminal.closing import Closing, Given
+from dmrl.terminal.progress import announce_import
 
 TRAINING = "dmrl.datasets.training"
 __getattr__ = import_lazily(
@@ -81,6 +82,7 @@ def command(
     resume
         Go on with the interrupted training in OUT_DIR.partial.
     """
+    announce_import("torch")
     from dmrl import recipe as recipes
     from dmrl.datasets.training import train_network
     from dmrl.learn.training.config import TrainConfig

@@ -228,14 +228,19 @@ class RemotePath(PosixPath):
     rename = replace
 
 
-def to_path(name: str) -> Path:
+def to_path(name: str | os.PathLike[str]) -> Path:
     """Return a `RemotePath` for a name such as ``s3://bucket/key``, else a plain path.
+
+    A path is returned unchanged.
 
     Raises
     ------
     UnsafeName
         If it names a pipe or a device, where a read could block or never end.
     """
+    if isinstance(name, Path):
+        return name
+    name = os.fspath(name)
     scheme, mark, _ = name.partition("://")
     if mark and scheme in SCHEMES:
         return RemotePath(name)

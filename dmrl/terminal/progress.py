@@ -1,7 +1,10 @@
 """Progress on standard error or in a notebook, silent when that is neither."""
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from functools import lru_cache
+from importlib import import_module
+from time import monotonic
 from typing import TypeVar
 
 from rich.console import Console, RenderableType
@@ -20,6 +23,8 @@ from dmrl.errors import to_one_line
 
 Item = TypeVar("Item")
 Lines = Sequence[Sequence[object]]
+NOTEBOOK_PERIOD_S = 0.3
+"""Time between two updates of the line in a notebook, seconds."""
 
 
 class _Progress(Progress):
@@ -74,7 +79,10 @@ def track(
     if total is None and isinstance(items, Sized):
         total = len(items)
     console = Console(stderr=True)
-    if not (console.is_terminal or console.is_jupyter):
+    if console.is_jupyter:
+        yield from _track_in_notebook(items, what, total, describe)
+        return
+    if not console.is_terminal:
         yield from items
         return
     columns = (
@@ -94,9 +102,34 @@ def track(
             bar.advance(task)
 
 
+def _track_in_notebook(
+    items: Iterable[Item], what: str, total: int | None, describe: Callable[[Item], str] | None
+) -> Iterator[Item]:
+    """Yield items, with a line in the notebook's cell; rich's bars would need ipywidgets."""
+
+    def text(words: str) -> dict[str, str]:
+        return {"text/plain": to_one_line(words)}
+
+    shown = import_module("IPython.display").display(text(what), raw=True, display_id=True)
+    due_s = 0.0
+    for done, item in enumerate(items):
+        if (now_s := monotonic()) >= due_s:
+            due_s = now_s + NOTEBOOK_PERIOD_S
+            words = what if describe is None else describe(item)
+            shown.update(text(f"{words}: {done}" + (f" of {total}" if total else "")), raw=True)
+        yield item
+    shown.update(text(""), raw=True)
+
+
 def say(line: str) -> None:
     """Print one line of news on standard error, terminal or not."""
     Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(to_one_line(line))
+
+
+def announce_import(package: str) -> None:
+    """Say that a package is being loaded, unless it is: torch takes seconds."""
+    if package not in sys.modules:
+        say(f"loading {package}")
 
 
 @lru_cache(maxsize=4096)

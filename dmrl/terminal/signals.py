@@ -1,14 +1,56 @@
-"""Ctrl-C, SIGTERM and SIGHUP as an event that a loop checks.
+"""Ctrl-C, SIGTERM and SIGHUP: end at once, or set an event that a loop checks.
 
 An exception could come at any line, do harm there, or be lost.
 """
 
+import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
-TERMINATION_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+TERMINATION_SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+"""Signals that end a command. Windows has no SIGHUP."""
+NOTHING_WRITTEN = "stopped. Nothing stands under its final name"
+
+Handler = Callable[[int, FrameType | None], None]
+
+
+def handle_signals(handler: Handler) -> None:
+    """Install a handler of all termination signals, but those that the parent ignores (nohup)."""
+    for number in TERMINATION_SIGNALS:
+        if not _is_ignored(number):
+            signal.signal(number, handler)
+
+
+def _is_ignored(number: signal.Signals) -> bool:
+    return signal.getsignal(number) is signal.SIG_IGN
+
+
+def end_on_signal(describe: Callable[[], str] = lambda: NOTHING_WRITTEN) -> None:
+    """End the process at once when a signal comes, with one line and its exit status.
+
+    For times when an exception would be lost or turned into another: while modules are imported,
+    and after the work.
+    """
+
+    def end(number: int, _: FrameType | None) -> None:
+        os.write(2, f"dmrl: {describe()}\n".encode(errors="backslashreplace"))
+        os._exit(128 + number)
+
+    handle_signals(end)
+
+
+def is_importing(frame: FrameType | None) -> bool:
+    """Return whether a frame runs inside an import."""
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
 
 
 @contextmanager
@@ -25,12 +67,8 @@ def set_on_signal(ended: threading.Event) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    ignores_hangup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # nohup
-    before = {
-        number: signal.signal(number, lambda *_: ended.set())
-        for number in TERMINATION_SIGNALS
-        if not (ignores_hangup and number is signal.SIGHUP)
-    }
+    heard = [n for n in TERMINATION_SIGNALS if n is signal.SIGINT or not _is_ignored(n)]
+    before = {number: signal.signal(number, lambda *_: ended.set()) for number in heard}
     try:
         yield
     finally:

@@ -74,7 +74,7 @@ def run(tmp_path: Path) -> Run:
     ) -> tuple[list[StepOutcome], Pretender]:
         with Pretender(**how) as crew:
             memory = BuildCache.load(tmp_path / "pipeline.json")
-            return Runner(Plan(steps, ""), tmp_path, data, memory, crew).run(), crew
+            return Runner(Plan(steps, ""), tmp_path, data, memory).run(crew), crew
 
     return runs
 
@@ -196,7 +196,7 @@ def test_a_killed_step_goes_on_where_it_was_unless_it_is_another(run: Run, tmp_p
         step = Step("render", "r.mcap", settings={"seed": seed, "workers": seed})
         with pytest.raises(DmrlError), Pretender(fails=("r.mcap",)) as crew:
             memory = BuildCache.load(tmp_path / "pipeline.json")
-            Runner(Plan((step,), ""), tmp_path, None, memory, crew).run()
+            Runner(Plan((step,), ""), tmp_path, None, memory).run(crew)
         return crew.jobs[0]["resume"], partial.exists()
 
     assert render(1) == (False, False)
