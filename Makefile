@@ -13,6 +13,8 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --dist loadfile
 # pip refuses an editable install where a hash is asked for.
 VERSIONS := build/constraints.txt
 INSTALL := $(BIN)/pip install --constraint $(VERSIONS) --editable
+# pip's own line installs a hook of import, which editors and type checkers do not run.
+POINT_TO_LAYOUT = $(MAKE) --no-print-directory layout && for site in $(VENV)/lib/python*/site-packages; do echo "$(CURDIR)/$(LAYOUT)" > "$$site/dmrl_layout.pth"; done
 # Tests start many processes. Without bytecode on disk each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -94,11 +96,12 @@ clean: ## Remove what was built, .venv and demo/ as well.
 	rm -rf $(VENV) build demo *.egg-info
 
 # viewer/, schemas/ and recipes/ are imported as dmrl.viewer and so on. Tools that read the
-# source without importing it see them there only in a tree laid out as it is installed.
+# source without importing it see them there only in a tree laid out as it is installed. The
+# installation points to it, so that editors and type checkers resolve `import dmrl`.
 layout:
-	@rm -rf $(LAYOUT)
 	@mkdir -p $(LAYOUT)/dmrl
-	@for place in dmrl/* viewer schemas recipes; do ln -s "$(CURDIR)/$$place" $(LAYOUT)/dmrl/; done
+	@for place in $(LAYOUT)/dmrl/*; do test -e "$$place" || rm -f "$$place"; done
+	@for place in dmrl/* viewer schemas recipes; do ln -sfn "$(CURDIR)/$$place" "$(LAYOUT)/dmrl/$$(basename "$$place")"; done
 
 $(VENV)/.pip:
 	@test -n "$(PYTHON)" || { echo "dmrl needs Python 3.11 or newer; none was found" >&2; exit 1; }
@@ -113,8 +116,10 @@ $(VERSIONS): constraints.txt
 
 $(VENV)/.demo: $(VENV)/.pip pyproject.toml $(VERSIONS)
 	$(INSTALL) '.[train,label,view,plot]'
+	@$(POINT_TO_LAYOUT)
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.pip pyproject.toml $(VERSIONS)
 	$(INSTALL) '.[all]' --group dev
+	@$(POINT_TO_LAYOUT)
 	@touch $(VENV)/.demo $@

@@ -3,8 +3,6 @@
 `dmrl.api` is loaded when one of its names is used, and with each name only what that needs.
 """
 
-from importlib import import_module
-
 from dmrl.guards.telemetry import disable_telemetry
 
 __version__ = "0.1.0"
@@ -47,6 +45,8 @@ __all__ = ["__version__", *_PLACES]
 
 
 def __getattr__(name: str) -> object:
+    from importlib import import_module  # noqa: PLC0415 - Ctrl-C at the start of a command
+
     if name in _PLACES:
         return getattr(import_module(f"dmrl.api.{_PLACES[name]}"), name)
     raise AttributeError(f"dmrl has no {name}. It has: {', '.join(sorted(_PLACES))}")

@@ -1,15 +1,21 @@
 """Start the command line, ``dmrl`` or ``python -m dmrl``, with signals handled from the start."""
 
-from typing import NoReturn
-
-from dmrl.terminal.signals import end_on_signal
+import os
 
 
-def main() -> NoReturn:
-    """Run a command; a signal while its packages are imported ends it with one line."""
-    end_on_signal()
-    from dmrl import cli  # noqa: PLC0415 - it takes 0.1 s, in which a signal may come
+def main() -> None:
+    """Run a command; Ctrl-C while its packages are imported ends it with one line.
 
+    Nothing is imported before that.
+    """
+    try:
+        from dmrl.terminal.signals import end_on_signal  # noqa: PLC0415
+
+        end_on_signal()
+        from dmrl import cli  # noqa: PLC0415 - it takes 0.1 s
+    except KeyboardInterrupt:
+        os.write(2, b"dmrl: stopped. Nothing stands under its final name\n")
+        os._exit(130)
     cli.main()
 
 

@@ -15,6 +15,7 @@ from cyclopts import (
     App,
     CoercionError,
     CycloptsError,
+    Group,
     Parameter,
     Token,
     UnknownCommandError,
@@ -27,6 +28,7 @@ from dmrl import __version__, boundary, entry_points
 from dmrl.guards.numeric_threads import set_one_blas_thread
 from dmrl.guards.safe_names import truncate_middle
 from dmrl.storage import to_path
+from dmrl.terminal import help_pages
 from dmrl.terminal.signals import end_on_signal
 
 # In the order of the work. The help line is the first line of the function's docstring;
@@ -34,18 +36,18 @@ from dmrl.terminal.signals import end_on_signal
 COMMANDS = {
     "demo": "Run the whole pipeline, small, on a flight that ships and on pictures it draws.",
     "run": "Run the steps of a pipeline recipe whose outputs are not up to date, side by side.",
-    "render": "Render images of robots with exact labels, as a recipe says, into a recording.",
-    "likeness": "Fit a render recipe to one's own frames, and show both beside each other.",
-    "sketch": "Draw a folder of pictures of small drones, with exact labels.",
-    "fly": "Simulate a flight of robots that measure themselves and each other.",
-    "convert": "Convert a foreign file or folder into a recording, or a recording into files.",
+    "doctor": "List packages, programs and devices that dmrl uses, and how to get missing ones.",
     "record": "Record the logs and cameras of Crazyflies in flight, until Ctrl-C.",
+    "convert": "Convert a foreign file or folder into a recording, or a recording into files.",
+    "fly": "Simulate a flight of robots that measure themselves and each other.",
+    "render": "Render images of robots with exact labels, as a recipe says, into a recording.",
+    "sketch": "Draw a folder of pictures of small drones, with exact labels.",
+    "likeness": "Fit a render recipe to one's own frames, and show both beside each other.",
     "fake-drone": "Send a simulated flight as Crazyflies and AI-decks do, to try record with.",
     "calibrate": "Calibrate cameras by boards or flights, and other sensors by several flights.",
     "align": "Set clocks by each other: from ranges of pairs, images, or motion capture.",
     "label": "Find every robot's peers from ranges and odometry, and label the images with them.",
     "dataset": "Build an Arrow dataset and its card from recordings.",
-    "card": "Write a dataset's card and figures again; your own words below its last line stay.",
     "train": "Train a network on a dataset.",
     "predict": "Run a network on every image of a recording.",
     "track": "Follow detected peers over time: 3D tracks with covariance.",
@@ -54,7 +56,6 @@ COMMANDS = {
     "export": "Write a network as ONNX and as C.",
     "verify": "Prove that the C of an export computes the int8 network, bit for bit.",
     "view": "Show recordings in rerun, or save them as an .rrd file or a picture.",
-    "doctor": "List packages, programs and devices that dmrl uses, and how to get missing ones.",
     "report": "Show the results in a folder as one HTML page that needs nothing else.",
     "info": "Show the contents and the origin of a recording.",
     "check": "Check a recording: schemas, times, gaps, calibration, labels.",
@@ -63,7 +64,19 @@ COMMANDS = {
     "recover": "Bring back the messages of a recording that was cut short.",
     "merge": "Merge recordings into one, by time.",
     "trim": "Keep a stretch of a recording, or some of its topics.",
+    "card": "Write a dataset's card and figures again; your own words below its last line stay.",
 }
+GROUPS = {
+    "Start": ("demo", "run", "doctor"),
+    "Make recordings": ("record", "convert", "fly", "render", "sketch", "likeness", "fake-drone"),
+    "Label": ("calibrate", "align", "label"),
+    "Learn": ("dataset", "train", "predict", "track", "evaluate"),
+    "Deploy": ("quantize", "export", "verify"),
+    "Look": ("view", "report", "info", "check", "index", "find"),
+    "Files": ("recover", "merge", "trim"),
+    "Share": ("card",),
+}
+"""Commands by what they are for. One that is in no group is listed last."""
 COMPLETION = "--install-completion"
 
 
@@ -110,6 +123,8 @@ app = App(
     help="Teach tiny camera drones to see each other: recordings in, recordings out.",
     version=__version__,
     help_format="plaintext",
+    help_formatter=help_pages.Formatter(),
+    group_commands=Group("Others", sort_key=len(GROUPS)),
     error_formatter=format_usage_error,
     error_console=Console(stderr=True, soft_wrap=True),  # one line, however narrow a pipe is
     suppress_keyboard_interrupt=False,  # main says what stands
@@ -117,9 +132,12 @@ app = App(
 app.register_install_completion_command(
     name=COMPLETION, help="Have the shell (bash, zsh, fish) complete commands, flags and choices."
 )
+_groups: dict[str, Group] = {}
+for _place, (_title, _names) in enumerate(GROUPS.items()):
+    _groups |= dict.fromkeys(_names, Group(_title, sort_key=_place))
 for _order, (_name, _help) in enumerate(COMMANDS.items()):
-    _module = _name.replace("-", "_")
-    app.command(f"dmrl.stages.{_module}:command", name=_name, help=_help, sort_key=_order)
+    _run = f"dmrl.stages.{_name.replace('-', '_')}:command"
+    app.command(_run, name=_name, help=_help, group=_groups.get(_name), sort_key=_order)
 
 
 def add_plugin_commands() -> App:
@@ -148,10 +166,11 @@ def main() -> NoReturn:
     raise SystemExit(status)
 
 
-def print_help(name: str) -> None:
-    """Print a command's help; load nothing that only its work needs."""
+def print_help(name: str, console: Console | None = None) -> None:
+    """Print a command's help and its examples; load nothing that only its work needs."""
     gc.disable()  # it prints a page and ends: a collection would only cost time
-    app.help_print([name])
+    app.help_print([name], console=console)
+    help_pages.print_examples(name, console or Console())
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from dmrl.cli import COMMANDS, app
+from dmrl.cli import COMMANDS, print_help
 from dmrl.topics import TOPICS
 
 ROOT = Path(__file__).parents[1]
@@ -78,7 +78,7 @@ def commands() -> str:
     for name in COMMANDS:
         page = io.StringIO()
         console = Console(file=page, width=HELP_COLUMNS, color_system=None, force_terminal=False)
-        app.help_print([name], console=console)
+        print_help(name, console)
         lines = "\n".join(line.rstrip() for line in page.getvalue().strip().splitlines())
         parts.append(f"## dmrl {name}\n\n```text\n{lines}\n```\n")
     return "\n".join(parts)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl import boundary
+from dmrl import __version__, boundary
 from dmrl.cli import COMMANDS, app
 from dmrl.errors import OutputError
 
@@ -172,3 +172,50 @@ def test_a_working_folder_that_was_removed_is_said_before_a_library_aborts(
     gone.rmdir()
     assert boundary.run_to_status(lambda: app([name])) == 1
     assert capsys.readouterr().err == "dmrl: the folder you are in was removed. Go to another: cd\n"
+
+
+EARLY = """
+import sys
+sys.argv = ["dmrl", *sys.argv[1:]]
+print("begun", flush=True)
+from dmrl.__main__ import main
+main()
+"""
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize(
+    ("words", "longest_s"), [(["train", "dataset", "m"], 3.0), (["info", "a.mcap"], 0.3)]
+)
+def test_ctrl_c_at_any_moment_is_one_line_and_status_130(
+    words: list[str], longest_s: float, tmp_path: Path
+) -> None:
+    """At 15 moments of each: while modules are imported, and after."""
+    app(["sketch", str(tmp_path / "p"), "--images", "20"], result_action="return_value")
+    for source, out in (("p", "a.mcap"), ("a.mcap", "dataset")):
+        name = "dataset" if out == "dataset" else "convert"
+        app([name, str(tmp_path / source), str(tmp_path / out)], result_action="return_value")
+    ended = []
+    for k in range(15):
+        with subprocess.Popen(
+            [sys.executable, "-c", EARLY, *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=tmp_path,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        ) as process:
+            assert process.stdout is not None and process.stdout.readline() == "begun\n"
+            time.sleep(0.02 + longest_s * k / 15)
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=PATIENCE_S)
+        if process.returncode or words[0] == "train":  # info may have ended before
+            ended.append((process.returncode, said.replace("dmrl: loading torch\n", "")))
+            ended[-1] = (ended[-1][0], ended[-1][1].replace("loading torch\n", ""))
+    assert ended and {status for status, _ in ended} == {130}
+    assert all(re.fullmatch(r"dmrl: stopped\. .*\n", said) for _, said in ended), ended
+
+
+def test_python_dash_m_dmrl_is_the_command() -> None:
+    line = [sys.executable, "-m", "dmrl", "--version"]
+    assert subprocess.run(line, capture_output=True, text=True).stdout == f"{__version__}\n"

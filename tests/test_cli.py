@@ -4,6 +4,7 @@ import ast
 import importlib
 import inspect
 import io
+import itertools
 import json
 import os
 import re
@@ -63,6 +64,21 @@ def test_help_lists_every_command_in_the_order_of_the_work(
     lines = capsys.readouterr().out.splitlines()
     words = [line.split()[1] for line in lines if line.startswith("│ ") and line[2] != " "]
     assert words[: len(COMMANDS)] == list(COMMANDS)
+    titles = [line.split()[1] for line in lines if line.startswith("╭─ ")]
+    assert titles == [*(title.split()[0] for title in cli.GROUPS), "Others"]
+    assert sum(cli.GROUPS.values(), ()) == tuple(COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_line_of_a_help_page_breaks_where_the_next_word_would_fit(name: str) -> None:
+    page = io.StringIO()
+    cli.print_help(name, Console(file=page, width=88))
+    rows = [line[2:-2] for line in page.getvalue().splitlines() if line.startswith("│ ")]
+    for row, after in itertools.pairwise(rows):
+        went_on = after[:4].strip() == "" and len(after) - len(after.lstrip()) >= 4
+        same = len(row) - len(after) == 0 and went_on
+        room = len(row) - len(row.rstrip())
+        assert not same or room <= len(after.split()[0]), (row, after)
 
 
 def test_every_stage_is_in_the_table() -> None:

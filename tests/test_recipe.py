@@ -2,8 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import pytest
 from cyclopts import Parameter
@@ -200,3 +201,17 @@ def test_a_setting_may_be_called_as_a_method_of_pydantic(write: Write) -> None:
 
     path = write('kind = "draw"\ncopy = false\n')
     assert recipe.load(path, "draw", Copied) == Copied(copy=False)
+
+
+def test_an_unknown_key_is_told_with_the_nearest_one() -> None:
+    (fault,) = recipe.find_faults({"gat_m": 0.3}, _label_settings())
+    assert fault == "gat_m: extra inputs are not permitted (did you mean gate_m?)"
+
+
+def test_a_path_in_a_bucket_stays_one() -> None:
+    made = recipe.check("x", {"sensors": "s3://lab/sensors.toml"}, _label_settings())
+    assert str(made.sensors) == "s3://lab/sensors.toml"
+
+
+def _label_settings() -> Any:
+    return import_module("dmrl.stages.label").Settings

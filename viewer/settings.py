@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter, validators
 
+from dmrl.terminal.arguments import Robot
 from dmrl.viewer.views import LAYOUT_NAMES
 
 LOOPBACK = "127.0.0.1"
@@ -47,7 +48,7 @@ class Settings:
     """
 
     layout: Layout = "auto"
-    robot: str | None = None
+    robot: Robot | None = None
     from_s: Annotated[float | None, Parameter(name=["--from-s", "--from"])] = None
     to_s: Annotated[float | None, Parameter(name=["--to-s", "--to"])] = None
     every: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1

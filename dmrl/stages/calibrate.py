@@ -10,6 +10,7 @@ from dmrl.atomic_output import atomic_file, refuse_existing
 from dmrl.errors import SettingError, optional_imports
 from dmrl.estimation.calibration.noise import Noise
 from dmrl.pipeline.stage_command import stage_command
+from dmrl.terminal.arguments import Robot
 from dmrl.terminal.closing import Closing, Given
 from dmrl.terminal.tables import print_table
 
@@ -49,7 +50,7 @@ class Settings:
 
     board: str | None = None
     sensors: bool = False
-    robot: str | None = None
+    robot: Robot | None = None
     against: Literal["estimate", "truth"] = "estimate"
     camera: Path | None = None
     threshold: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1))] = None

@@ -11,6 +11,7 @@ from dmrl.atomic_output import atomic_folder, refuse_existing
 from dmrl.errors import SettingError
 from dmrl.learn.pretrained import resolve_model_path
 from dmrl.pipeline.stage_command import stage_command
+from dmrl.terminal.arguments import Model
 from dmrl.terminal.closing import Closing, Given
 from dmrl.terminal.progress import say
 
@@ -41,7 +42,7 @@ class Settings:
     l1_kb: Annotated[int | None, Parameter(validator=validators.Number(gte=9))] = None
 
 
-def run(model: Path, out: Path, settings: Settings) -> "list[Written]":
+def run(model: Model, out: Path, settings: Settings) -> "list[Written]":
     """Write a network as ONNX and as C.
 
     Parameters

@@ -5,7 +5,7 @@ from pathlib import Path
 from dmrl.guards.lazy_names import import_lazily
 from dmrl.pipeline.single_run import run_on_cluster
 from dmrl.simulation.settings import FlyFlags as Flags
-from dmrl.terminal.arguments import AsJson, Flat, On
+from dmrl.terminal.arguments import AsJson, Flat, On, Recipe
 from dmrl.terminal.closing import Closing, Given
 
 FLIGHT = "dmrl.simulation.flight_recording"
@@ -17,7 +17,7 @@ CLOSING = Closing(columns=("topics", "messages"), path_key="recording", result_k
 
 
 def command(
-    recipe: str,
+    recipe: Recipe,
     out: Path,
     /,
     *,

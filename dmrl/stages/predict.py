@@ -9,7 +9,7 @@ from cyclopts import Parameter, validators
 from dmrl.deploy.backend_names import BackendName
 from dmrl.learn.inference.tta_views import TTA_VIEWS
 from dmrl.pipeline.stage_command import stage_command
-from dmrl.terminal.arguments import In, Strict
+from dmrl.terminal.arguments import In, Model, Strict
 from dmrl.terminal.closing import Closing
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class Result:
     believed: int
 
 
-def run(model: Path, recording: In, out: Path, settings: Settings) -> Result:
+def run(model: Model, recording: In, out: Path, settings: Settings) -> Result:
     """Run a network on every image of a recording.
 
     Messages of other topics are copied bit for bit; detections that were there are replaced.

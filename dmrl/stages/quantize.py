@@ -9,6 +9,7 @@ from cyclopts import Parameter, validators
 from dmrl.atomic_output import refuse_existing
 from dmrl.errors import optional_imports
 from dmrl.pipeline.stage_command import stage_command
+from dmrl.terminal.arguments import Model
 from dmrl.terminal.closing import Closing, Given
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class Settings:
     most: Count = 1000
 
 
-def run(model: Path, dataset: Path, out: Path, settings: Settings) -> "QuantizationReport":
+def run(model: Model, dataset: Path, out: Path, settings: Settings) -> "QuantizationReport":
     """Quantise a network to int8, and measure the loss of accuracy.
 
     The output is a run folder as well: the float model lies beside the int8 one.

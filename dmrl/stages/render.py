@@ -11,7 +11,7 @@ from dmrl.errors import SettingError
 from dmrl.pipeline.single_run import run_on_cluster
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.settings import filled as filled
-from dmrl.terminal.arguments import AsJson, On
+from dmrl.terminal.arguments import AsJson, On, Recipe
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_table
 
@@ -60,7 +60,7 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
 
 
 def command(
-    recipe: str | None = None,
+    recipe: Recipe | None = None,
     out: Path | None = None,
     /,
     *,

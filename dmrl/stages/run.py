@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dmrl.errors import MissingExtra
-from dmrl.terminal.arguments import AsJson, On, Workers
+from dmrl.terminal.arguments import AsJson, On, Recipe, Workers
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def command(
-    recipe: str,
+    recipe: Recipe,
     /,
     *,
     out: Path | None = None,

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from dmrl.guards.lazy_names import import_lazily
-from dmrl.terminal.arguments import AsJson, Flat
+from dmrl.terminal.arguments import AsJson, Flat, Model, Recipe
 from dmrl.terminal.closing import Closing, Given
 from dmrl.terminal.progress import announce_import
 
@@ -57,9 +57,9 @@ def command(
     out: Annotated[Path, Parameter(name="OUT_DIR")],
     /,
     *,
-    recipe: str = "dmrl_nano",
-    init: Path | None = None,
-    teacher: Path | None = None,
+    recipe: Recipe = "dmrl_nano",
+    init: Model | None = None,
+    teacher: Model | None = None,
     resume: bool = False,
     flags: Flat[Flags] = NO_FLAGS,
     as_json: AsJson = False,

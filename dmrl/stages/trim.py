@@ -8,6 +8,7 @@ from cyclopts import Parameter
 
 from dmrl.errors import SettingError
 from dmrl.pipeline.stage_command import stage_command
+from dmrl.terminal.arguments import complete_topic
 from dmrl.terminal.closing import Closing
 
 if TYPE_CHECKING:
@@ -36,7 +37,9 @@ class Settings:
 
     from_s: Annotated[float | None, Parameter(name=["--from-s", "--from"])] = None
     to_s: Annotated[float | None, Parameter(name=["--to-s", "--to"])] = None
-    topic: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = ()
+    topic: Annotated[
+        tuple[str, ...], Parameter(negative=(), show_default=False, completer=complete_topic)
+    ] = ()
     only_decodable: Annotated[bool, Parameter(negative=())] = False
 
 

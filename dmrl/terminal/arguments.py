@@ -1,11 +1,57 @@
 """Types of arguments that several commands share."""
 
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from cyclopts import Parameter, validators
 
 T = TypeVar("T")
+
+
+def _complete_files(start: str) -> list[str]:
+    """Return the files that a word may stand for; a folder ends in a slash."""
+    found = sorted(Path(start).parent.glob("*") if "/" in start else Path().glob("*"))
+    return [f"{path}/" if path.is_dir() else str(path) for path in found]
+
+
+def complete_recipe(context: Any) -> list[str]:
+    """Return the names of the shipped recipes, and files."""
+    from dmrl import recipe  # noqa: PLC0415 - for the shell alone
+
+    return [*recipe.list_names(), *_complete_files(context.incomplete)]
+
+
+def complete_model(context: Any) -> list[str]:
+    """Return the names of the shipped networks, and files."""
+    from dmrl.learn import pretrained  # noqa: PLC0415
+
+    return [*pretrained.list_pretrained(), *_complete_files(context.incomplete)]
+
+
+def _read_topics(context: Any) -> list[str]:
+    """Return the topics of the recordings that stand in the line so far."""
+    from dmrl.recording import read_summary  # noqa: PLC0415
+
+    words = (token.value for argument in context.arguments for token in argument.tokens)
+    paths = [Path(word) for word in words if word.endswith(".mcap")]
+    return sorted({topic for path in paths if path.exists() for topic in read_summary(path).topics})
+
+
+def complete_topic(context: Any) -> list[str]:
+    """Return the topics of the recordings that stand in the line so far."""
+    return _read_topics(context)
+
+
+def complete_robot(context: Any) -> list[str]:
+    """Return the robots of the recordings that stand in the line so far."""
+    return sorted({topic.split("/")[1] for topic in _read_topics(context) if topic.count("/") > 1})
+
+
+Recipe = Annotated[str, Parameter(completer=complete_recipe)]
+"""A recipe: a TOML file, or the name of a shipped one."""
+Model = Annotated[Path, Parameter(completer=complete_model)]
+"""A model: a path, or the name of a shipped network."""
+Robot = Annotated[str, Parameter(completer=complete_robot)]
 In = Annotated[Path, Parameter(name="IN")]
 """Input, called IN in the help."""
 Flat = Annotated[T, Parameter(name="*")]

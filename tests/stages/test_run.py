@@ -1,5 +1,6 @@
 """A run whose recipe has figures ends with a page; nothing is drawn again for nothing."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -46,3 +47,58 @@ def test_a_page_is_drawn_again_when_a_step_or_a_figure_has_changed(
     recipe.write_text(RECIPE.replace("WORDS", "last words"))
     run.command(str(recipe), out=tmp_path / "out", workers=1)
     assert "last words" in page.read_text() and "2 of 2 steps" in capsys.readouterr().err
+
+
+def test_what_a_run_replaces_is_kept_and_told_with_its_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe, out = tmp_path / "few.toml", tmp_path / "out"
+    steps = RECIPE[: RECIPE.index("[[figure]]")].replace('title = "Few"\n', "")
+    recipe.write_text(steps)
+    run.command(str(recipe), out=out, dry_run=True)
+    assert not out.exists() and capsys.readouterr().out.count("make") == 2
+    run.command(str(recipe), out=out, workers=1)
+    first = {path: path.read_bytes() for path in sorted(out.glob("**/*.*")) if path.is_file()}
+    for images in (3, 4):
+        recipe.write_text(steps.replace("images = 2", f"images = {images}"))
+        capsys.readouterr()
+        run.command(str(recipe), out=out, dry_run=True, as_json=True)
+        said = json.loads(capsys.readouterr().out)["steps"]
+        assert [one["action"] for one in said] == ["replace", "replace"]
+        assert said[0]["reason"] == f"images {images - 1} -> {images}"
+        assert said[1]["reason"] == "pictures is made again"
+        run.command(str(recipe), out=out, workers=1)
+        assert f"pictures is replaced: images {images - 1}" in capsys.readouterr().err
+    kept = out / "previous"
+    assert sorted(path.name for path in kept.iterdir()) == sorted(
+        [
+            "pictures",
+            "pictures.2",
+            "pictures.mcap",
+            "pictures.2.mcap",
+            "recipe.toml",
+            "recipe.2.toml",
+        ]
+    )
+    again = {
+        path: (kept / path.relative_to(out)).read_bytes()
+        for path in first
+        if path.name != "pipeline.json"
+    }
+    assert again == {
+        path: content for path, content in first.items() if path.name != "pipeline.json"
+    }
+
+
+def test_an_output_that_was_changed_by_hand_is_told_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe, out = tmp_path / "few.toml", tmp_path / "out"
+    recipe.write_text(RECIPE[: RECIPE.index("[[figure]]")].replace('title = "Few"\n', ""))
+    run.command(str(recipe), out=out, workers=1)
+    (out / "pictures/labels.csv").write_text("mine")
+    capsys.readouterr()
+    run.command(str(recipe), out=out, dry_run=True)
+    assert "it was changed after the run" in capsys.readouterr().out
+    run.command(str(recipe), out=out, workers=1)
+    assert (out / "previous/pictures/labels.csv").read_text() == "mine"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import dmrl
 from dmrl import boundary, topics
 from dmrl.atomic_output import atomic_file, atomic_folder, replace_file
 from dmrl.cli import app
@@ -320,3 +321,20 @@ def test_outputs_for_keys_with_signs_of_a_shell_or_a_terminal_stay_in_their_fold
     assert {str(name) for name in found} == set(names)
     tasks = build_tasks("trim", "recording", found, tmp_path / "out")
     assert {task.out for task in tasks} == {tmp_path / "out" / name for name in names}
+
+
+def test_python_opens_and_writes_what_lies_in_a_bucket(lab: Any, tmp_path: Path) -> None:
+    source = pictured(tmp_path / "py.mcap")
+    lab.put(str(source), "lab/py/a.mcap")
+    found = dmrl.open("s3://lab/py/a.mcap")
+    here = dmrl.open(source)
+    assert str(found.path) == "s3://lab/py/a.mcap" and found.robots == here.robots
+    assert len(found["/cf1/attitude"].to_arrow()) == 3000
+    np.testing.assert_array_equal(found.images()[0], here.images()[0])
+    cut = dmrl.trim(found, "s3://lab/py/b.mcap", to_s=1.0)
+    assert cut["/cf1/attitude"].to_arrow() == dmrl.trim(here, to_s=1.0)["/cf1/attitude"].to_arrow()
+    data = dmrl.make_dataset("s3://lab/py/a.mcap", "s3://lab/py/set")
+    assert len(dmrl.dataset("s3://lab/py/set")["train"]) == len(data["train"])
+    with dmrl.writer("s3://lab/py/own.mcap") as out:
+        out.write("/cf1/height", 0.0, {"height_m": 0.4})
+    assert len(dmrl.open("s3://lab/py/own.mcap")) == 1
