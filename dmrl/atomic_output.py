@@ -50,10 +50,7 @@ def list_finished_outputs() -> list[Path]:
 
 
 def count_ended_outputs() -> int:
-    """Return how many outputs of this process have ended, complete or not.
-
-    Inputs may change afterwards.
-    """
+    """Return how many outputs of this process have ended; inputs may change afterwards."""
     return len(_ended_outputs)
 
 
