@@ -77,6 +77,8 @@ class Observation:
         Peers that the camera tracks.
     image_age_s
         Seconds since the exposure of the last image that the tracks contain; infinite before it.
+    detections
+        u and v (pixels), depth (metres) and confidence of each detection in that image, best first.
     """
 
     time_s: float
@@ -88,6 +90,7 @@ class Observation:
     range_m: Mapping[str, float] = field(default_factory=dict)
     tracks: tuple[PeerTrack, ...] = ()
     image_age_s: float = float("inf")
+    detections: tuple[tuple[float, float, float, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ import numpy as np
 from dmrl import entry_points
 from dmrl.errors import SettingError
 from dmrl.flight.leader_belief import LeaderBelief
+from dmrl.flight.onboard_pilot import Onboard
 from dmrl.flight.pilot import Command, Observation, PeerTrack, Pilot, Task
 from dmrl.geometry.frames import Array
 
@@ -181,6 +182,7 @@ PILOTS: Mapping[str, type[Pilot]] = {
     "follow": Follow,
     "keep_apart": KeepApart,
     "formation": Formation,
+    "onboard": Onboard,
 }
 """Pilots of dmrl by name."""
 

@@ -36,6 +36,8 @@ class OnboardTracker:
         self._tracker: Tracker | None = None
         self._identity = TrackIdentity()
         self._sample: int | None = None
+        self.detections: tuple[tuple[float, float, float, float], ...] = ()
+        """u, v, depth and confidence of the detections of the last image."""
         self._tracks: list[Track] = []
         self._names: dict[int, str] = {}
 
@@ -60,6 +62,9 @@ class OnboardTracker:
         rows = np.array([[d[name] for name in COLUMNS] for d in detections["detections"]])
         u, v, depth_m, sigma_m, confidence = rows.reshape(-1, len(COLUMNS)).T
         uv = np.column_stack([u, v])
+        self.detections = tuple(
+            zip(*(c.tolist() for c in (u, v, depth_m, confidence)), strict=True)
+        )
         view = ImageDetections(uv, depth_m, roll, pitch, confidence, sigma_m)
         if self._tracker is None:
             rates = DetectorRates(**(detections.get("rates") or {}))

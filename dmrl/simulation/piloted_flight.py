@@ -226,11 +226,16 @@ class PilotedFlight:
 
     def _command(self, drone: Drone, now: int) -> None:
         """Ask a pilot for its command."""
-        tracks, image_age_s = self._true_tracks(drone.robot), 0.0
-        if drone.eye is not None:
-            tracks, image_age_s = drone.tracker.predict(now), drone.tracker.image_age_s(now)
         seen = self._simulation.observe(drone.robot)
-        seen = replace(seen, tracks=tracks, image_age_s=image_age_s)
+        if drone.eye is None:
+            seen = replace(seen, tracks=self._true_tracks(drone.robot), image_age_s=0.0)
+        else:
+            seen = replace(
+                seen,
+                tracks=drone.tracker.predict(now),
+                image_age_s=drone.tracker.image_age_s(now),
+                detections=drone.tracker.detections,
+            )
         command = check_command(drone.robot, drone.pilot.command(seen))
         self._commands[drone.robot] = command
         time_ns = self._log_time(drone.robot, now)

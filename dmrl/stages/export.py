@@ -66,7 +66,10 @@ def run(model: Model, out: Path, settings: Settings) -> "list[Written]":
     SettingError
         If two memories are wanted with ``refine``, or the near one is too small.
     """
+    from dmrl.deploy.c.pilot_code import write_pilot
     from dmrl.deploy.export_folder import list_files, refuse_export, write_export
+    from dmrl.flight.onboard_pilot import CONSTANTS, DETECTIONS_MAX
+    from dmrl.geometry.frames import AIDECK_PINHOLE
     from dmrl.recording import build_provenance
 
     if settings.refine and settings.l1_kb is not None:
@@ -79,6 +82,8 @@ def run(model: Model, out: Path, settings: Settings) -> "list[Written]":
     made = build_provenance("export", settings, (model,), libraries=("torch", "onnx", "numpy"))
     with atomic_folder(out) as folder:
         quantized = write_export(model, folder, **asdict(settings))
+        if quantized:
+            write_pilot(folder, AIDECK_PINHOLE, CONSTANTS, DETECTIONS_MAX)
         made.write(folder)
     if not quantized:
         say(f"no int8 and no C: {model} is float. For those: dmrl quantize {model} DATASET OUT")
@@ -105,6 +110,7 @@ def _document(written: "list[Written]", given: Given) -> dict[str, Any]:
 
 def _lines(written: "list[Written]", given: Given) -> Iterator[str]:
     from dmrl.deploy.c import MAX_L1_STATE_BYTES
+    from dmrl.deploy.c.pilot_code import PILOT_BYTES
 
     memory = _measure_memory(written, given.out)
     if memory is None:
@@ -116,6 +122,7 @@ def _lines(written: "list[Written]", given: Given) -> Iterator[str]:
         "beside "
         f"stacks{other}"
     )
+    yield f"{PILOT_BYTES:,} bytes more for the state of pilot.c, which flies by its detections"
     if memory.far_bytes:
         yield (
             f"{memory.far_bytes:,} bytes more in a far memory; {memory.traffic_bytes:,} bytes are "

@@ -1,0 +1,347 @@
+"""Pilot of few bytes: raw detections and state in, commands out. The reference of ``pilot.c``.
+
+One Kalman filter for one leader, in the frame of the robot's own dead reckoning, with the
+probability that the filter follows it. All numbers are IEEE doubles, and all operations are +, -, *
+and /, in the order of the C: both give the same commands, bit for bit.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from dmrl.flight.pilot import Command, Observation, Pilot, Task
+from dmrl.geometry.frames import AIDECK_PINHOLE, Camera
+
+CONSTANTS = {
+    "PAST": 16,  # steps of the robot's own path that are kept
+    "MAX_AGE_S": 0.6,  # an older image is not used
+    "STALE_S": 1.0,  # without a younger image the robot hovers
+    "BLIND_S": 1.2,  # so long after the last detection it searches
+    "FOUND": 45875,  # confidence, of 65536, at which a lost leader is found again: 0.7
+    "LOST_ODDS": 0.2,
+    "MAX_ODDS": 50.0,
+    "START_ODDS": 9.0,
+    "START_VAR": 0.04,  # m^2
+    "SPEED_VAR": 0.09,  # (m/s)^2 along each axis
+    "SPEED_S": 1.5,
+    "DRIFT_VAR": 0.004,  # m^2/s, of the robot's own path
+    "DEPTH_RATIO": 0.15,
+    "SIDE_RATIO": 0.015,
+    "IN_VIEW": 0.8,  # tangent of the angle off the axis within which a leader is in the image
+    "SEEN_SHARE": 0.7,
+    "UNSEEN_SHARE": 0.05,
+    "EVIDENCE": 2.0,  # odds of a detection of confidence 0.5
+    "FALSE_PER_M2": 0.12,
+    "TRUST_VAR": 0.1225,  # m^2, at which it flies at half its speed
+    "GAIN": 1.2,
+    "CLIMB_GAIN": 0.8,
+    "TURN_GAIN": 3.0,
+    "RETREAT": 0.2,  # m/s
+    "SEARCH_RATE": 0.8,  # rad/s
+    "NEAR": 0.45,  # m
+}
+"""Constants of the pilot, here and in the C; lengths in metres, times in seconds."""
+_K = CONSTANTS
+DETECTIONS_MAX = 20
+
+
+class RawDetection(NamedTuple):
+    """A detection as the network's C gives it: 1/16 px, millimetres, confidence of 65536."""
+
+    u_q4: int
+    v_q4: int
+    depth_mm: int
+    confidence: int
+
+
+class RobotState(NamedTuple):
+    """What the robot measures: seconds, radians, metres per second along its axes, and metres."""
+
+    time_s: float
+    roll_rad: float
+    pitch_rad: float
+    yaw_rate_radps: float
+    vx_mps: float
+    vy_mps: float
+    height_m: float
+
+
+class _Pose(NamedTuple):
+    """Own pose: time, place and heading by dead reckoning, and attitude and height."""
+
+    time_s: float
+    x: float
+    y: float
+    c: float
+    s: float
+    roll: float
+    pitch: float
+    height: float
+
+
+@dataclass(slots=True)
+class OnboardFilter:
+    """State of the pilot; see `step`.
+
+    Parameters
+    ----------
+    distance_m
+        Distance to keep.
+    camera
+        Pinhole camera of the detections.
+    """
+
+    distance_m: float
+    camera: Camera = AIDECK_PINHOLE
+    pose: _Pose = _Pose(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+    past: list[_Pose] = field(default_factory=list)
+    mean: list[float] = field(default_factory=list)
+    covariance: list[list[float]] = field(default_factory=list)
+    height_m: float = 0.0
+    odds: float = _K["START_ODDS"]
+    side: float = 1.0
+    seen_s: float = 0.0
+    image_s: float = -1.0
+
+    def step(
+        self, state: RobotState, image_s: float, detections: list[RawDetection]
+    ) -> tuple[float, float, float, float]:
+        """Return vx, vy, vz and the yaw rate to fly.
+
+        Parameters
+        ----------
+        state
+            Measurements now.
+        image_s
+            Exposure of the newest image that has arrived; negative: none yet. An image that was
+            used before, or is too old, is not used.
+        detections
+            Detections in it.
+        """
+        if not self.past:
+            self._start(state)
+        self._move(state)
+        age_s = state.time_s - image_s
+        if image_s > self.image_s and image_s >= 0.0:
+            self.image_s = image_s
+            if age_s <= _K["MAX_AGE_S"]:
+                self._look(age_s, detections)
+        return self._command(state)
+
+    def _start(self, state: RobotState) -> None:
+        """Begin with the leader ahead, at the distance and the own height."""
+        self.pose = _Pose(state.time_s, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+        self._restart(self.distance_m, 0.0, state.height_m, _K["START_VAR"], state.time_s)
+        self.odds = _K["START_ODDS"]
+
+    def _restart(self, x: float, y: float, z: float, variance: float, time_s: float) -> None:
+        self.mean = [x, y, 0.0, 0.0]
+        diagonal = (variance, variance, _K["SPEED_VAR"], _K["SPEED_VAR"])
+        self.covariance = [[diagonal[i] if i == j else 0.0 for j in range(4)] for i in range(4)]
+        self.height_m, self.odds, self.seen_s = z, 1.0, time_s
+
+    def _move(self, state: RobotState) -> None:
+        """Reckon the own pose, and predict the leader."""
+        dt = state.time_s - self.pose.time_s
+        turned_c, turned_s = turn_of(state.yaw_rate_radps * dt)
+        c = self.pose.c * turned_c - self.pose.s * turned_s
+        s = self.pose.s * turned_c + self.pose.c * turned_s
+        x = self.pose.x + dt * (c * state.vx_mps - s * state.vy_mps)
+        y = self.pose.y + dt * (s * state.vx_mps + c * state.vy_mps)
+        attitude = state.roll_rad, state.pitch_rad, state.height_m
+        self.pose = _Pose(state.time_s, x, y, c, s, *attitude)
+        self.past = [self.pose, *self.past[: int(_K["PAST"]) - 1]]
+        keep = 1.0 / (1.0 + dt / _K["SPEED_S"])
+        m, p = self.mean, self.covariance
+        self.mean = [m[0] + dt * m[2], m[1] + dt * m[3], keep * m[2], keep * m[3]]
+        rows = [[p[i][j] + dt * p[i + 2][j] for j in range(4)] for i in range(2)]
+        rows += [[keep * p[i][j] for j in range(4)] for i in range(2, 4)]
+        columns = [[r[0] + dt * r[2], r[1] + dt * r[3], keep * r[2], keep * r[3]] for r in rows]
+        for i in range(2):
+            columns[i][i] += _K["DRIFT_VAR"] * dt
+            columns[i + 2][i + 2] += (1.0 - keep * keep) * _K["SPEED_VAR"]
+        self.covariance = columns
+
+    def _look(self, age_s: float, detections: list[RawDetection]) -> None:
+        """Use an image: choose the likeliest detection, or count a miss."""
+        then = self.past[0]
+        for pose in self.past:
+            if pose.time_s >= self.image_s:
+                then = pose
+        m = self.mean
+        dx, dy = m[0] - age_s * m[2] - then.x, m[1] - age_s * m[3] - then.y
+        ahead, aside = then.c * dx + then.s * dy, then.c * dy - then.s * dx
+        in_view = ahead > 0.1 and abs(aside) < _K["IN_VIEW"] * ahead
+        share = _K["SEEN_SHARE"] if in_view else _K["UNSEEN_SHARE"]
+        best, total, sure = None, 0.0, None
+        for found in detections[:DETECTIONS_MAX]:
+            place = self._locate(then, found)
+            candidate = self._compare(place, age_s)
+            p = (found.confidence + 0.5) / 65536.0
+            ratio = share * _K["EVIDENCE"] * p / (1.0 - p) * candidate[0] / _K["FALSE_PER_M2"]
+            total += ratio
+            if best is None or ratio > best[0]:
+                best = (ratio, candidate, place)
+            if found.confidence >= _K["FOUND"] and (sure is None or found.confidence > sure[0]):
+                sure = (found.confidence, place)
+        miss = 1.0 - share
+        self.odds = min(self.odds * (miss + total), _K["MAX_ODDS"])
+        self.odds = max(self.odds, 0.001)
+        if best is not None and best[0] > miss:
+            self._update(best[1], best[2], age_s)
+        elif self.odds < _K["LOST_ODDS"] and sure is not None:
+            x, y, z, along, _, _, _ = sure[1]
+            self._restart(x, y, z, along, self.image_s)
+
+    def _locate(
+        self, then: _Pose, found: RawDetection
+    ) -> tuple[float, float, float, float, float, float, float]:
+        """Return x, y, height, variances along and across, and direction of a detection."""
+        depth = found.depth_mm / 1000.0
+        left = (self.camera.cx_px - found.u_q4 / 16.0) / self.camera.fx_px * depth
+        up = (self.camera.cy_px - found.v_q4 / 16.0) / self.camera.fy_px * depth
+        cr, sr = turn_of(then.roll)
+        cp, sp = turn_of(then.pitch)
+        level = sr * left + cr * up
+        ahead, aside = cp * depth + sp * level, cr * left - sr * up
+        x = then.x + (then.c * ahead - then.s * aside)
+        y = then.y + (then.s * ahead + then.c * aside)
+        z = then.height + (cp * level - sp * depth)
+        away = root(ahead * ahead + aside * aside) + 0.001
+        along, across = _K["DEPTH_RATIO"] * away, _K["SIDE_RATIO"] * away
+        to_x, to_y = (x - then.x) / away, (y - then.y) / away
+        return x, y, z, along * along, across * across, to_x, to_y
+
+    def _compare(
+        self, place: tuple[float, ...], age_s: float
+    ) -> tuple[float, float, float, float, float, float]:
+        """Return the density of a detection's place, its residual, and the inverse covariance."""
+        x, y, _, along, across, to_x, to_y = place
+        m, p = self.mean, self.covariance
+        rx, ry = x - (m[0] - age_s * m[2]), y - (m[1] - age_s * m[3])
+        aa = age_s * age_s
+        sxx = p[0][0] - age_s * (p[0][2] + p[2][0]) + aa * p[2][2]
+        sxy = p[0][1] - age_s * (p[0][3] + p[2][1]) + aa * p[2][3]
+        syy = p[1][1] - age_s * (p[1][3] + p[3][1]) + aa * p[3][3]
+        sxx += along * to_x * to_x + across * to_y * to_y
+        sxy += (along - across) * to_x * to_y
+        syy += along * to_y * to_y + across * to_x * to_x
+        det = sxx * syy - sxy * sxy
+        ixx, ixy, iyy = syy / det, -sxy / det, sxx / det
+        squared = rx * (ixx * rx + ixy * ry) + ry * (ixy * rx + iyy * ry)
+        near = 1.0 + squared / 6.0  # a density with heavier tails than the Gaussian, without exp
+        return 1.0 / (6.283185307179586 * root(det) * near * near * near), rx, ry, ixx, ixy, iyy
+
+    def _update(
+        self,
+        candidate: tuple[float, float, float, float, float, float],
+        place: tuple[float, ...],
+        age_s: float,
+    ) -> None:
+        _, rx, ry, ixx, ixy, iyy = candidate
+        p = self.covariance
+        # Columns of the covariance of state and measurement, then the gain.
+        hx = [p[i][0] - age_s * p[i][2] for i in range(4)]
+        hy = [p[i][1] - age_s * p[i][3] for i in range(4)]
+        kx = [hx[i] * ixx + hy[i] * ixy for i in range(4)]
+        ky = [hx[i] * ixy + hy[i] * iyy for i in range(4)]
+        self.mean = [self.mean[i] + (kx[i] * rx + ky[i] * ry) for i in range(4)]
+        self.covariance = [
+            [p[i][j] - (kx[i] * hx[j] + ky[i] * hy[j]) for j in range(4)] for i in range(4)
+        ]
+        self.height_m += 0.5 * (place[2] - self.height_m)
+        self.seen_s = self.image_s
+
+    def _command(self, state: RobotState) -> tuple[float, float, float, float]:
+        pose, m, p = self.pose, self.mean, self.covariance
+        dx, dy = m[0] - pose.x, m[1] - pose.y
+        x, y = pose.c * dx + pose.s * dy, pose.c * dy - pose.s * dx
+        vx, vy = pose.c * m[2] + pose.s * m[3], pose.c * m[3] - pose.s * m[2]
+        drift_x, drift_y = vx - state.vx_mps, vy - state.vy_mps
+        if state.time_s - self.seen_s > _K["BLIND_S"]:
+            turn = self.side * _K["SEARCH_RATE"]
+            return (0.0, 0.0, 0.0, 0.0 if self._is_stale(state) else turn)
+        self.side = 1.0 if y + 0.7 * drift_y > 0.0 else -1.0
+        if self._is_stale(state):
+            return (0.0, 0.0, 0.0, 0.0)
+        away = root(x * x + y * y) + 0.001
+        to_x, to_y = x / away, y / away
+        variance = 0.5 * (p[0][0] + p[1][1])
+        trust = self.odds / (1.0 + self.odds) / (1.0 + variance / _K["TRUST_VAR"])
+        short = _K["GAIN"] * (away - self.distance_m)
+        wx, wy = trust * vx + short * to_x, trust * vy + short * to_y
+        towards = wx * to_x + wy * to_y
+        less = (1.0 - trust) * (max(towards, 0.0) + _K["RETREAT"])
+        if away < _K["NEAR"]:
+            less += max(towards - less, 0.0) + 2.0 * (_K["NEAR"] - away)
+        wx, wy = wx - less * to_x, wy - less * to_y
+        near = max(away * away, _K["NEAR"] * _K["NEAR"])
+        passing = trust * (x * drift_y - y * drift_x) / near
+        turn = _K["TURN_GAIN"] * angle_of(x, y) + passing
+        climb = trust * _K["CLIMB_GAIN"] * (self.height_m - state.height_m)
+        return (wx, wy, climb, turn)
+
+    def _is_stale(self, state: RobotState) -> bool:
+        return state.time_s - self.image_s > _K["STALE_S"]
+
+
+def turn_of(angle_rad: float) -> tuple[float, float]:
+    """Return cosine and sine of a small angle, from the tangent of its half."""
+    half = angle_rad / 2.0
+    scale = 1.0 / (1.0 + half * half)
+    return (1.0 - half * half) * scale, 2.0 * half * scale
+
+
+def root(value: float) -> float:
+    """Return the square root, by Newton's method."""
+    if value <= 0.0:
+        return 0.0
+    guess = max(value, 1.0)
+    for _ in range(40):
+        guess = 0.5 * (guess + value / guess)
+    return guess
+
+
+def angle_of(x: float, y: float) -> float:
+    """Return the direction of a point, radians to the left of x (Abramowitz and Stegun 4.4.49)."""
+    wide, high = abs(x), abs(y)
+    if wide + high == 0.0:
+        return 0.0
+    t = min(wide, high) / max(wide, high)
+    q = t * t
+    a = 0.9998660 + q * (-0.3302995 + q * (0.1801410 + q * (-0.0851330 + q * 0.0208351)))
+    a *= t
+    if high > wide:
+        a = 1.5707963267948966 - a
+    if x < 0.0:
+        a = 3.141592653589793 - a
+    return a if y >= 0.0 else -a
+
+
+class Onboard(Pilot):
+    """Follow the leader as ``pilot.c`` does, from the newest image's raw detections."""
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        self._filter = OnboardFilter(task.distance_m)
+
+    def command(self, seen: Observation) -> Command:
+        """Return the command of the filter."""
+        return Command(*self._filter.step(*to_raw(seen)))
+
+
+def to_raw(seen: Observation) -> tuple[RobotState, float, list[RawDetection]]:
+    """Return the arguments of `OnboardFilter.step`: what the C gets."""
+    attitude = seen.roll_rad, seen.pitch_rad, seen.yaw_rate_radps
+    vx, vy = seen.velocity_mps.tolist()
+    state = RobotState(seen.time_s, *attitude, vx, vy, seen.height_m)
+    found = [
+        RawDetection(
+            round(16 * u_px),
+            round(16 * v_px),
+            min(round(1000 * depth_m), 65535),
+            min(int(65536 * confidence), 65535),
+        )
+        for u_px, v_px, depth_m, confidence in seen.detections[:DETECTIONS_MAX]
+    ]
+    image_s = seen.time_s - seen.image_age_s if seen.image_age_s < 1e9 else -1.0
+    return state, image_s, found
