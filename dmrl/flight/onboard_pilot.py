@@ -78,6 +78,9 @@ class _Pose(NamedTuple):
     height: float
 
 
+_START = _Pose(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+
+
 @dataclass(slots=True)
 class OnboardFilter:
     """State of the pilot; see `step`.
@@ -92,7 +95,7 @@ class OnboardFilter:
 
     distance_m: float
     camera: Camera = AIDECK_PINHOLE
-    pose: _Pose = _Pose(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+    pose: _Pose = _START
     past: list[_Pose] = field(default_factory=list)
     mean: list[float] = field(default_factory=list)
     covariance: list[list[float]] = field(default_factory=list)
@@ -129,7 +132,7 @@ class OnboardFilter:
 
     def _start(self, state: RobotState) -> None:
         """Begin with the leader ahead, at the distance and the own height."""
-        self.pose = _Pose(state.time_s, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+        self.pose = _START._replace(time_s=state.time_s)
         self._restart(self.distance_m, 0.0, state.height_m, _K["START_VAR"], state.time_s)
         self.odds = _K["START_ODDS"]
 
