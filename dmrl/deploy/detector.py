@@ -21,6 +21,7 @@ from dmrl.deploy.c.run.emulated import RISCV32, EmulatedNetwork
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.store import INTEGER_NAME, load_network
 from dmrl.errors import MissingExtra, ModelError, SettingError
+from dmrl.geometry.frames import STRIDE_PX
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_pipes, require_text_path
 from dmrl.learn import pretrained
@@ -119,6 +120,8 @@ def open_detector(model: Path, backend: BackendName) -> Detector:
         )
     require_text_path(model)
     refuse_pipes(model)
+    if model.suffix == ".onnx":
+        return _open_submitted(model, backend)
     if backend not in OPENERS:
         raise SettingError(f"no backend {backend}. There are: {', '.join(OPENERS)}")
     return OPENERS[backend](model, backend)
@@ -134,6 +137,8 @@ def select_fastest_backend(model: Path, size_px: tuple[int, int]) -> BackendName
     size_px
         Width and height of the images.
     """
+    if model.suffix == ".onnx":
+        return "onnx"
     try:
         import_module("dmrl.deploy.onnx.runtime")
         if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():
@@ -184,6 +189,17 @@ def _open_onnx(model: Path, _backend: BackendName) -> Detector:
     size_px = (runs.width_px, runs.height_px)
     decides = file if file.is_file() else None
     return Detector(model.name, _grids_function(runs), stride_px, threshold, size_px, decides)
+
+
+def _open_submitted(model: Path, backend: BackendName) -> Detector:
+    """Open an ONNX file of another program; only onnxruntime can run it."""
+    if backend != "onnx":
+        raise ModelError(
+            f"{model} is an ONNX file, which {backend} cannot run. Give --backend onnx"
+        )
+    room = _import_optional("dmrl.deploy.onnx.submitted", "deploy", "an ONNX file")
+    network = room.SubmittedNetwork(model)
+    return Detector(model.stem, network, STRIDE_PX, network.threshold, network.size_px, model)
 
 
 def _open_onnx_int8(model: Path, backend: BackendName) -> Detector:

@@ -121,7 +121,11 @@ def judge(recording: Path) -> list[EvaluatedPair]:
     if not estimated:
         raise RecordingError(f"{recording} has no positions. Try: dmrl label {recording} OUT.mcap")
     limit = find_limit(held)
-    pairs = [_evaluate_pair(held, limit, *names) for names in estimated if names in known]
+    pairs = [
+        evaluate_pair(held, limit, *names, held.positions[names])
+        for names in estimated
+        if names in known
+    ]
     pairs = [pair for pair in pairs if len(pair.judged.time_s)]
     if not pairs:
         raise RecordingError(
@@ -178,8 +182,10 @@ def _match_truth(estimate: PeerPositions, true_ns: Times, true_m: Array) -> Pair
     )
 
 
-def _evaluate_pair(held: FlightLog, limit: Bound | None, robot: str, peer: str) -> EvaluatedPair:
-    estimate = held.positions[robot, peer]
+def evaluate_pair(
+    held: FlightLog, limit: Bound | None, robot: str, peer: str, estimate: PeerPositions
+) -> EvaluatedPair:
+    """Evaluate estimates of one robot about one peer against the truth of a flight."""
     true_ns, true_m = find_true_path(held, robot, peer)
     found = _match_truth(estimate, true_ns, true_m)
     judged = EvaluatedPositions(

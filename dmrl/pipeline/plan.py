@@ -9,6 +9,7 @@ from difflib import get_close_matches
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 from typing import Any
 
 from dmrl import recipe as recipes
@@ -24,12 +25,16 @@ from dmrl.simulation.settings import NAMED_EYES
 RECIPE_KEYS = ("kind", "each", "defaults", "step", figure_specs.TITLE_KEY, figure_specs.FIGURE_KEY)
 STEP_KEYS = ("stage", "out", "optional", "recipe")
 DATA = "{data}"
+SUBMITTED = ("network", "labels")
+"""Names of ``[each]`` that flags of ``dmrl run`` add a row to."""
 RECIPE_FILE, STATE_FILE, UNFINISHED = "recipe.toml", "pipeline.json", "unfinished"
 PREVIOUS = "previous"
 """Folder of the outputs that a later run replaced."""
 RESERVED_NAMES = (RECIPE_FILE, STATE_FILE, UNFINISHED, PREVIOUS, "report.html")
 
 Table = dict[str, Any]
+NOTHING: Mapping[str, Table] = MappingProxyType({})
+"""No submission."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,13 +135,15 @@ def locate_input(name: str, outs: set[str], folder: Path, data: Path | None) -> 
     return recipes.locate_recording(name) or Path(name)
 
 
-def load_plan(name: str | Path) -> Plan:
+def load_plan(name: str | Path, rows: Mapping[str, Table] = NOTHING) -> Plan:
     """Load a pipeline recipe, and find all its faults.
 
     Parameters
     ----------
     name
         Path, or the name of a shipped recipe.
+    rows
+        Further rows of its ``[each]``, by name: what the command line submits.
 
     Raises
     ------
@@ -146,7 +153,19 @@ def load_plan(name: str | Path) -> Plan:
         If a package that a stage needs is not installed.
     """
     text, keys = recipes.read_text(name), recipes.read(name)
+    keys = _add_submitted(keys, rows)
     return Plan(tuple(_build_steps(name, keys)), text, figure_specs.FIGURE_KEY in keys)
+
+
+def _add_submitted(keys: Table, rows: Mapping[str, Table]) -> Table:
+    """Add rows to ``[each]``, and leave out the steps of a submission that is not there."""
+    each, steps = keys.get("each", {}), keys.get("step")
+    if not isinstance(each, dict) or not isinstance(steps, list):
+        return keys
+    each = each | {name: [*each.get(name, []), row] for name, row in rows.items()}
+    absent = [f"{{{name}." for name in SUBMITTED if name not in each]
+    kept = [step for step in steps if not any(name in str(step) for name in absent)]
+    return {**keys, "each": each, "step": kept} if len(kept) < len(steps) or rows else keys
 
 
 def _build_steps(name: str | Path, recipe: Table) -> list[Step]:

@@ -7,7 +7,7 @@ The old one stays until the new one is complete. See docs/pipelines.md.
 import errno
 import fcntl
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -20,12 +20,14 @@ from dmrl.pipeline.executor import open_executor
 from dmrl.pipeline.forecast import Forecast, forecast_steps
 from dmrl.pipeline.plan import (
     DATA,
+    NOTHING,
     PREVIOUS,
     RECIPE_FILE,
     STATE_FILE,
     UNFINISHED,
     Plan,
     Step,
+    Table,
     load_plan,
     locate_input,
 )
@@ -56,6 +58,7 @@ def run(
     *,
     workers: int | None = None,
     on: str | None = None,
+    submitted: Mapping[str, Table] = NOTHING,
 ) -> list[StepOutcome]:
     """Run the steps of a pipeline recipe whose outputs are not there, or not up to date.
 
@@ -72,6 +75,8 @@ def run(
         same with any number.
     on
         Cluster that runs the steps in place of processes here; see `open_executor`.
+    submitted
+        Rows that the recipe's ``[each]`` gets in addition; see `load_plan`.
 
     Returns
     -------
@@ -89,7 +94,7 @@ def run(
     DmrlError
         If a step fails.
     """
-    plan = load_plan(name)
+    plan = load_plan(name, submitted)
     _check_data(name, plan, data)
     with _lock_folder(out) as folder:
         memory = BuildCache.load(folder / STATE_FILE)
@@ -107,12 +112,17 @@ def run(
     return done
 
 
-def forecast(name: str | Path, out: Path, data: Path | None = None) -> list[Forecast]:
+def forecast(
+    name: str | Path,
+    out: Path,
+    data: Path | None = None,
+    submitted: Mapping[str, Table] = NOTHING,
+) -> list[Forecast]:
     """Return what `run` would do, step by step. Nothing is written.
 
     Parameters, errors as `run`.
     """
-    plan = load_plan(name)
+    plan = load_plan(name, submitted)
     _check_data(name, plan, data)
     _refuse_foreign_folder(out)
     return forecast_steps(Runner(plan, out, data, BuildCache.load(out / STATE_FILE)))

@@ -1,12 +1,13 @@
 """``dmrl run``: the steps of a pipeline recipe."""
 
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dmrl.errors import MissingExtra
+from dmrl.errors import MissingExtra, SettingError
 from dmrl.terminal.arguments import AsJson, On, Recipe, Workers
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
@@ -21,6 +22,8 @@ def command(
     *,
     out: Path | None = None,
     data: Path | None = None,
+    network: Path | None = None,
+    labels: Path | None = None,
     dry_run: Annotated[bool, Parameter(negative=())] = False,
     workers: Workers = None,
     on: On = None,
@@ -39,6 +42,10 @@ def command(
         Folder for every output. Without it, the recipe's name.
     data
         Folder with the data that the recipe reads and that does not ship with dmrl.
+    network
+        Network that the recipe benchmark scores, such as an ONNX file.
+    labels
+        CSV of positions that the recipe benchmark scores.
     dry_run
         Print what the run would make and replace, and why. Write nothing.
     workers
@@ -48,12 +55,19 @@ def command(
     from dmrl.pipeline import recipe_run as pipeline
 
     folder = Path(Path(recipe).stem) if out is None else out
+    given = _submitted("network", "name", network) | _submitted("labels", "csv", labels)
     if dry_run:
-        _print_forecast(pipeline.forecast(recipe, folder, data), as_json=as_json)
+        _print_forecast(pipeline.forecast(recipe, folder, data, given), as_json=as_json)
         return
-    plan, before = pipeline.load_plan(recipe), pipeline.read_recipe_text(folder)
-    done = pipeline.run(recipe, folder, data, workers=workers, on=on)
+    plan, before = pipeline.load_plan(recipe, given), pipeline.read_recipe_text(folder)
+    done = pipeline.run(recipe, folder, data, workers=workers, on=on, submitted=given)
     print_report(done, as_json=as_json)
+    if any(one.stage == "score" for one in done):
+        from dmrl.html_report.benchmark_page import write_benchmark_page
+
+        scored = write_benchmark_page(folder)
+        if not as_json:
+            print_line(f"{scored}: all submissions")
     changed = plan.text != before or not all(one.skipped for one in done)
     page = _write_page(folder, changed=changed) if plan.pictured else None
     if not as_json:
@@ -69,6 +83,16 @@ def _print_forecast(found: "list[Forecast]", *, as_json: bool) -> None:
         return
     rows = [(one.stage, one.out, one.action, one.reason) for one in found]
     print_table("", ("step", "output", "would", "because"), rows)
+
+
+def _submitted(each: str, key: str, path: Path | None) -> dict[str, dict[str, str]]:
+    """Return the row of a submitted file, named by its stem; empty: there is none."""
+    if path is None:
+        return {}
+    if not path.exists():
+        raise SettingError(f"no {path}. Check --{each}")
+    stem = re.sub(r"[^\w.-]+", "-", path.stem).strip("-.") or "submission"
+    return {each: {key: stem, "file": str(path.absolute())}}
 
 
 def _write_page(folder: Path, *, changed: bool) -> Path | None:

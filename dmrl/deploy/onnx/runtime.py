@@ -37,23 +37,7 @@ class OnnxRun:
     """
 
     def __init__(self, model: Path | bytes, where: object = "the model", threads: int = 0) -> None:
-        options = onnxruntime.SessionOptions()
-        # Other numeric libraries read OMP_NUM_THREADS; onnxruntime does not.
-        given = os.environ.get("OMP_NUM_THREADS", "")
-        options.intra_op_num_threads = threads or (int(given) if given.isdecimal() else 0)
-        options.log_severity_level = 3
-        if not _has_vnni():
-            # Without VNNI, pairs of products are added in 16 bits, which overflow. This option
-            # selects the slower exact kernels.
-            options.add_session_config_entry("session.x64quantprecision", "1")
-        source = model if isinstance(model, bytes) else str(model)
-        try:
-            self._session = onnxruntime.InferenceSession(
-                source, options, providers=["CPUExecutionProvider"]
-            )
-        except Exception as e:  # its exceptions have no common base
-            why = " ".join(str(e).split())
-            raise ModelError(f"{where} cannot be run: {why}. Export the model again") from None
+        self._session = open_session(model, where, threads)
         inputs = self._session.get_inputs()
         self.names = [output.name for output in self._session.get_outputs()]
         if [i.name for i in inputs] != ["image"] or "confidence_logit" not in self.names:
@@ -71,6 +55,33 @@ class OnnxRun:
             CHANNEL_OF_OUTPUT.get(name, name): np.concatenate(values)
             for name, values in zip(self.names, zip(*each, strict=True), strict=True)
         }
+
+
+def open_session(
+    model: Path | bytes, where: object, threads: int = 0
+) -> "onnxruntime.InferenceSession":
+    """Open an ONNX file, or its bytes; see `OnnxRun`.
+
+    Raises
+    ------
+    ModelError
+        If it cannot be run.
+    """
+    options = onnxruntime.SessionOptions()
+    # Other numeric libraries read OMP_NUM_THREADS; onnxruntime does not.
+    given = os.environ.get("OMP_NUM_THREADS", "")
+    options.intra_op_num_threads = threads or (int(given) if given.isdecimal() else 0)
+    options.log_severity_level = 3
+    if not _has_vnni():
+        # Without VNNI, pairs of products are added in 16 bits, which overflow. This option
+        # selects the slower exact kernels.
+        options.add_session_config_entry("session.x64quantprecision", "1")
+    source = model if isinstance(model, bytes) else str(model)
+    try:
+        return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+    except Exception as e:  # its exceptions have no common base
+        why = " ".join(str(e).split())
+        raise ModelError(f"{where} cannot be run: {why}. Export the model again") from None
 
 
 def _has_vnni() -> bool:
