@@ -64,7 +64,7 @@ class SubmittedNetwork:
         seen = rgb_to_grey(image[None]) if self._grey else image[None]
         data = np.ascontiguousarray(seen.transpose(0, 3, 1, 2) if self._first else seen)
         if self._input.type != "tensor(uint8)":
-            data = data.astype(np.float16 if "float16" in self._input.type else np.float32) / 255
+            data = (data / 255.0).astype("f2" if "float16" in self._input.type else "f4")
         try:
             values = self._session.run(self.names, {self._input.name: data})
         except Exception as e:  # onnxruntime's exceptions have no common base
