@@ -22,6 +22,15 @@ MEMORY_BYTES = 500 * MB
 MEMORY_TIMES = 10
 """A library may use `MEMORY_BYTES` and this many times the size of the file."""
 
+ANSWER_BYTES = 4 * MB
+"""Answer of a server of buckets that is no object. A page of 1,000 long keys has 3.5 MB."""
+
+LISTED_FILES = 200_000
+"""Objects of a listing."""
+
+LISTING_S, LISTED_PER_S = 30.0, 100
+"""Timeout of a listing: a fixed part, seconds, and a minimum rate, objects per second."""
+
 TOPICS = 2_000
 """Channels of a recording, and schemas."""
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from dmrl.errors import StorageError
 from dmrl.guards.paths import refuse_pipe
-from dmrl.guards.safe_names import safe_join
+from dmrl.guards.safe_names import safe_join, truncate
 from dmrl.storage.remote_stream import WHOLE_FILE_STEP_BYTES, RangeReader
 from dmrl.storage.system import get_filesystem, translate_errors
 
@@ -119,7 +119,8 @@ class RemotePath(PosixPath):
         Raises
         ------
         StorageError
-            If no path can express a key. The path of ``a//b`` is that of ``a/b``, another object.
+            If no path can express a key, or it has control characters. The path of ``a//b`` is
+            that of ``a/b``, another object.
         """
         with translate_errors(str(self)):
             found = get_filesystem(self.scheme).find(self.key)
@@ -129,10 +130,11 @@ class RemotePath(PosixPath):
             if key.endswith("/"):
                 continue  # web consoles create such an object for an empty folder
             path = type(self)(head + key)
-            if path.key != key or VERSION_MARK in key:
+            is_below = path == self or self in path.parents
+            if path.key != key or VERSION_MARK in key or not key.isprintable() or not is_below:
                 raise StorageError(
-                    f"{self}: an object is called {key!r}, which cannot be a path. Rename it, or "
-                    "name the files"
+                    f"{self}: an object is called {truncate(key)!r}, which cannot be a path. "
+                    "Rename it, or name the files"
                 )
             paths.append(path)
         return paths
@@ -165,10 +167,7 @@ class RemotePath(PosixPath):
 
     def open_ranges(self) -> RangeReader:
         """Return a reader of byte ranges of the file."""
-        info = self._info()
-        return RangeReader(
-            get_filesystem(self.scheme), self.key, str(self), int(info.get("size") or 0)
-        )
+        return RangeReader(get_filesystem(self.scheme), self.key, str(self), self._info())
 
     def sha256(self) -> str:
         """Return the hash from the object's metadata, or compute it from all its bytes."""
@@ -220,6 +219,8 @@ class RemotePath(PosixPath):
             for one in files:
                 to = target.joinpath(*one.parts[len(self.parts) :])
                 get_filesystem(self.scheme).cp_file(one.key, to.key)
+                if to.stat().st_size != one.stat().st_size:
+                    raise StorageError(f"{to}: the server did not copy {one}. Run it again")
         for mark in marks:
             mark.unlink()
         self.remove_tree()

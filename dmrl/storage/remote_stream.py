@@ -13,9 +13,16 @@ BUFFER_BYTES = 512
 """Buffer size of small reads. Larger ranges are fetched unbuffered."""
 WHOLE_FILE_STEP_BYTES = 8 << 20
 """Bytes per request when a whole file is read."""
+VERSION_HEADERS = ("ETag", "Last-Modified")
+"""Properties that identify the version of a file."""
 
 ByteRange = tuple[int, int]
 """Start and size of a range, bytes."""
+
+
+def get_version(info: dict[str, Any]) -> dict[str, str]:
+    """Return the version of a file, from what its server reports about it."""
+    return {name: info[name] for name in VERSION_HEADERS if info.get(name)}
 
 
 class RangeReader(io.RawIOBase):
@@ -29,13 +36,16 @@ class RangeReader(io.RawIOBase):
         Name of the file in the file system.
     url
         Name of the file in errors.
-    size
-        Size of the file, bytes.
+    info
+        Properties of the file: its size, bytes, and its version, to which all reads belong.
     """
 
-    def __init__(self, system: Any, name: str, url: str, size: int) -> None:
+    def __init__(self, system: Any, name: str, url: str, info: dict[str, Any]) -> None:
         super().__init__()
-        self._system, self._name, self._url, self._size = system, name, url, size
+        self._system, self._name, self._url = system, name, url
+        self._size = int(info.get("size") or 0)
+        checks = getattr(system, "checks_version", False)
+        self._more = {"version": get_version(info)} if checks else {}
         self._at = 0
         self._expected: list[ByteRange] = []
         self._prefetched: dict[ByteRange, bytes] = {}
@@ -61,7 +71,7 @@ class RangeReader(io.RawIOBase):
         if place in self._prefetched:
             return self._prefetched.pop(place)
         with translate_errors(self._url):
-            data = self._system.cat_file(self._name, start=start, end=start + size)
+            data = self._system.cat_file(self._name, start=start, end=start + size, **self._more)
         return self._check_length(data, size)
 
     def _check_length(self, data: bytes, size: int) -> bytes:
@@ -92,7 +102,7 @@ class RangeReader(io.RawIOBase):
         starts, ends = [s for s, _ in group], [s + n for s, n in group]
         with translate_errors(self._url):
             found = self._system.cat_ranges(
-                [self._name] * len(group), starts, ends, on_error="raise"
+                [self._name] * len(group), starts, ends, on_error="raise", **self._more
             )
         self._prefetched = {
             place: self._check_length(data, place[1])

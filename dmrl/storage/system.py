@@ -24,10 +24,15 @@ def get_filesystem(scheme: str) -> Any:
     try:
         import fsspec  # noqa: PLC0415 - an extra
 
+        # Imported here, as they need packages of the same extra.
         if scheme in ("http", "https"):
-            from dmrl.storage.web import WebFileSystem  # noqa: PLC0415 - aiohttp, the same extra
+            from dmrl.storage.web import WebFileSystem  # noqa: PLC0415
 
             return WebFileSystem(use_listings_cache=False)
+        if scheme == "s3":
+            from dmrl.storage.bucket import BucketFileSystem  # noqa: PLC0415
+
+            return BucketFileSystem(use_listings_cache=False)
         return fsspec.filesystem(scheme, use_listings_cache=False)
     except ImportError as e:
         raise MissingExtra(SCHEME_PACKAGES[scheme], "storage", f"{scheme}://") from e

@@ -13,7 +13,8 @@ import pytest
 
 from dmrl.errors import StorageError
 from dmrl.recording import read_summary
-from dmrl.storage import to_path, web
+from dmrl.storage import server_answers, to_path, web
+from dmrl.storage.inner_addresses import is_inner
 from dmrl.storage.system import get_filesystem
 
 from ..faults.ending import ended
@@ -53,8 +54,19 @@ class Handler(BaseHTTPRequestHandler):
         self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65_536)
         super().setup()
 
+    def _lead(self) -> bool:
+        """Lead elsewhere, from every page or from the first alone."""
+        verb, _, words = self.site.wrong.partition(" ")
+        where, _, once = words.partition(" ")
+        leads = verb == "leads" and not (once and self.path == where)
+        if leads:
+            self._head(302, 0, {"Location": where})
+        return leads
+
     def do_HEAD(self) -> None:
         """Its size."""
+        if self._lead():
+            return
         self.site.paths.append(self.path)
         if self.site.wrong == "lists" and "a.mcap" not in self.path:
             self._head(200, 0, {"Content-Type": "text/html"})
@@ -66,8 +78,7 @@ class Handler(BaseHTTPRequestHandler):
         """A range, or the whole file."""
         site = self.site
         site.asked += 1
-        if site.wrong.startswith("leads "):
-            self._head(302, 0, {"Location": site.wrong.removeprefix("leads ")})
+        if self._lead():
             return
         site.paths.append(self.path)
         asked = self.headers.get("Range")
@@ -204,7 +215,7 @@ def test_a_server_that_sends_what_was_not_asked_is_one_line(
 
 
 def test_a_server_that_drips_is_not_waited_for(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(server_answers, "PATIENCE_S", 0.3)
     get_filesystem.cache_clear()
     web.WebFileSystem.clear_instance_cache()
     site.wrong = "drips"
@@ -223,6 +234,48 @@ def test_a_server_leads_to_no_file_of_this_machine(address: str, site: Site) -> 
         assert status == 1 and site.url in said, said
     with pytest.raises((StorageError, FileNotFoundError)):
         os.fspath(to_path(site.url))
+
+
+def test_a_server_leads_to_no_inner_address_that_nobody_named(site: Site, inputs: Inputs) -> None:
+    """Another server of this machine, by its number, by its name, and mapped to IPv6."""
+    secret = Site(b"secret")
+    handler = type("Inner", (Handler,), {"site": secret})
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        for host in ("127.0.0.1", "localhost", "[::ffff:127.0.0.1]", "0.0.0.0"):
+            site.wrong = f"leads http://{host}:{server.server_port}/a.mcap"
+            status, said = ended(lambda: cli("info", site.url))
+            assert status == 1 and f"{site.url}: the server redirects to" in said, said
+            with pytest.raises(StorageError, match="an inner address"):
+                os.fspath(to_path(site.url))
+        server.shutdown()
+    assert not secret.paths and not secret.asked
+
+
+def test_a_server_may_lead_to_another_page_of_its_own(site: Site) -> None:
+    site.wrong = "leads /b/a.mcap once"
+    assert to_path(site.url).stat().st_size == len(site.data)
+    assert Path(os.fspath(to_path(site.url))).read_bytes() == site.data
+
+
+@pytest.mark.parametrize(
+    ("address", "inner"),
+    [
+        ("127.0.0.1", True),
+        ("10.1.2.3", True),
+        ("192.168.0.1", True),
+        ("169.254.169.254", True),
+        ("0.0.0.0", True),
+        ("::1", True),
+        ("fe80::1%eth0", True),
+        ("fd00::1", True),
+        ("::ffff:10.0.0.1", True),
+        ("93.184.216.34", False),
+        ("2606:2800:220:1:248:1893:25c8:1946", False),
+    ],
+)
+def test_addresses_of_machines_and_private_networks_are_inner(address: str, inner: bool) -> None:
+    assert is_inner(address) is inner
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,194 @@
+"""Read and write S3 buckets, whose servers are not trusted.
+
+s3fs reads whole answers into memory, follows redirects, lists without end, and takes every upload
+for stored. Here an answer has a size and a time limit, belongs to one version of the object, and an
+upload is complete once the server reports its size and hash.
+"""
+
+import hashlib
+import shutil
+import time
+from collections.abc import AsyncIterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from aiobotocore.httpsession import AIOHTTPSession
+from botocore.exceptions import ConnectTimeoutError, HTTPClientError, ReadTimeoutError
+from s3fs import S3FileSystem
+
+from dmrl.errors import DmrlError, StorageError
+from dmrl.guards import limits
+from dmrl.storage.server_answers import (
+    build_timeout,
+    changed_error,
+    read_range,
+    read_up_to,
+    slow_server_error,
+    wrong_bytes_error,
+)
+
+READ_STEP_BYTES = 8 << 20
+"""Bytes per request when an object is copied."""
+PART_BYTES = 50 << 20
+"""Size of the parts of an upload; an object has at most `PARTS` of them."""
+PARTS = 10_000
+ENCRYPTED_KEYS = ("SSEKMSKeyId", "SSECustomerAlgorithm")
+"""Properties of objects whose ETag is not an MD5 hash."""
+
+
+class BucketFileSystem(S3FileSystem):  # type: ignore[misc]
+    """File system of S3 buckets, for `dmrl.storage.system`."""
+
+    protocol = ("s3",)
+    checks_version = True
+    cachable = False  # `get_filesystem` keeps one
+
+    def __init__(self, **given: Any) -> None:
+        config = {"http_session_cls": _CarefulSession}
+        super().__init__(config_kwargs=config, **given)
+
+    async def _cat_file(
+        self,
+        path: str,
+        start: int | None = None,
+        end: int | None = None,
+        version: dict[str, str] | None = None,
+        **_: Any,
+    ) -> bytes:
+        """Return the bytes from ``start`` to ``end`` of one version of an object."""
+        if start is None or end is None:
+            info = await self._info(path)
+            start, end, version = 0, int(info["size"]), {"ETag": info["ETag"]}
+        bucket, key, _version_id = self.split_path(path)
+        tag = (version or {}).get("ETag")
+        condition = {"IfMatch": tag} if tag else {}
+        asked = {"Range": f"bytes={start}-{end - 1}"} if end > start else {}
+        try:
+            answer = await self._call_s3("get_object", Bucket=bucket, Key=key, **condition, **asked)
+        except OSError as e:
+            if _has_code(e, "PreconditionFailed", "412", "InvalidRange", "416"):
+                raise changed_error(f"s3://{path}") from None
+            raise
+        try:
+            if tag and answer.get("ETag", tag) != tag:
+                raise changed_error(f"s3://{path}")
+            if end == start:
+                return b""
+            found = answer.get("ContentRange", "")
+            return await read_range(answer["Body"], found, start, end, f"s3://{path}")
+        finally:
+            answer["Body"].close()
+
+    async def _get_file(self, rpath: str, lpath: str, **_: Any) -> None:
+        """Copy one version of an object."""
+        info = await self._info(rpath)
+        size, version = int(info["size"]), {"ETag": info["ETag"]}
+        free = shutil.disk_usage(Path(lpath).parent).free
+        if size > free:
+            raise StorageError(
+                f"s3://{rpath} has {size} bytes, but only {free} are free. Free some"
+            )
+        with Path(lpath).open("wb") as out:
+            for start in range(0, size, READ_STEP_BYTES):
+                end = min(start + READ_STEP_BYTES, size)
+                out.write(await self._cat_file(rpath, start, end, version))
+
+    async def _list_pages(self, method: str, **given: Any) -> AsyncIterator[dict[str, Any]]:
+        """Yield the pages of a listing that makes progress, up to the limit of objects."""
+        url, count, begun = f"s3://{given['Bucket']}/{given['Prefix']}", 0, None
+        async for page in super()._list_pages(method, **given):
+            begun = begun or time.monotonic()
+            count += len(page.get("Contents", ())) + len(page.get("CommonPrefixes", ()))
+            if count > limits.LISTED_FILES:
+                raise StorageError(
+                    f"{url}: the server lists more than {limits.LISTED_FILES} objects. Name a "
+                    "folder with fewer"
+                )
+            yield page
+            patience_s = limits.LISTING_S + count / limits.LISTED_PER_S
+            if page.get("IsTruncated") and time.monotonic() - begun > patience_s:
+                raise slow_server_error(url)
+
+    async def _put_file(self, lpath: str, rpath: str, **given: Any) -> None:
+        """Upload a file, and compare the size and hash that the server reports."""
+        size = Path(lpath).stat().st_size
+        part_size = max(PART_BYTES, -(-size // PARTS))
+        await super()._put_file(lpath, rpath, chunksize=part_size, **given)
+        bucket, key, _ = self.split_path(rpath)
+        try:
+            stored = await self._call_s3("head_object", Bucket=bucket, Key=key)
+        except FileNotFoundError:
+            raise _not_stored_error(rpath) from None
+        tag = str(stored.get("ETag", "")).strip('"')
+        expected = compute_tag(Path(lpath), part_size, parted="-" in tag)
+        is_hash = len(tag) == len(expected) and not any(stored.get(k) for k in ENCRYPTED_KEYS)
+        if stored["ContentLength"] != size or (is_hash and tag != expected):
+            await self._rm_file(rpath)
+            raise _not_stored_error(rpath)
+
+
+def compute_tag(path: Path, part_size: int, *, parted: bool) -> str:
+    """Return the ETag of a stored file: its MD5, or that of the MD5s of its parts."""
+    md5 = partial(hashlib.md5, usedforsecurity=False)
+    whole, parts = md5(), []
+    with path.open("rb") as stream:
+        while data := stream.read(part_size):
+            whole.update(data)
+            parts.append(md5(data).digest())
+    return f"{md5(b''.join(parts)).hexdigest()}-{len(parts)}" if parted else whole.hexdigest()
+
+
+class _CarefulSession(AIOHTTPSession):  # type: ignore[misc]
+    """Connections that follow no redirect, and whose answers have a size and a time limit."""
+
+    async def _get_session(self, proxy_url: str | None) -> Any:
+        return _LimitedRequests(await super()._get_session(proxy_url))
+
+    async def send(self, request: Any) -> Any:
+        """Send a request; raise a StorageError as it is, so that it is not tried again."""
+        try:
+            return await super().send(request)
+        except (HTTPClientError, ReadTimeoutError) as e:
+            if isinstance(e, ReadTimeoutError) and not isinstance(e, ConnectTimeoutError):
+                raise slow_server_error(request.url) from None
+            cause = e.kwargs.get("error")
+            raise (cause if isinstance(cause, DmrlError) else e) from None
+
+
+class _LimitedRequests:
+    """The session of aiohttp as `AIOHTTPSession` uses it."""
+
+    def __init__(self, session: Any) -> None:
+        self._session = session
+
+    async def request(self, method: str, url: Any, **given: Any) -> Any:
+        sent = int(given["headers"].get("Content-Length", 0))
+        start, _, last = given["headers"].get("Range", "").removeprefix("bytes=").partition("-")
+        size = sent + (int(last) - int(start) if last else limits.ANSWER_BYTES)
+        given["timeout"] = build_timeout(size)
+        answer = await self._session.request(method, url=url, allow_redirects=False, **given)
+        answer.read = partial(_read_document, answer)
+        return answer
+
+
+async def _read_document(answer: Any) -> bytes:
+    """Read an answer that is no object: a listing, or an error."""
+    url = str(answer.url)
+    data = await read_up_to(answer.content, limits.ANSWER_BYTES + 1, url)
+    if len(data) > limits.ANSWER_BYTES:
+        answer.close()
+        raise wrong_bytes_error(url)
+    return data
+
+
+def _has_code(error: OSError, *codes: str) -> bool:
+    response = getattr(error.__cause__, "response", None) or {}
+    return response.get("Error", {}).get("Code") in codes
+
+
+def _not_stored_error(path: str) -> StorageError:
+    return StorageError(
+        f"s3://{path}: the server does not store what it was sent. Check the bucket, and run it "
+        "again"
+    )
