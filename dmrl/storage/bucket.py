@@ -42,7 +42,6 @@ class BucketFileSystem(S3FileSystem):  # type: ignore[misc]
 
     protocol = ("s3",)
     checks_version = True
-    cachable = False  # `get_filesystem` keeps one
 
     def __init__(self, **given: Any) -> None:
         config = {"http_session_cls": _CarefulSession}

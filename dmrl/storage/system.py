@@ -32,7 +32,7 @@ def get_filesystem(scheme: str) -> Any:
         if scheme == "s3":
             from dmrl.storage.bucket import BucketFileSystem  # noqa: PLC0415
 
-            return BucketFileSystem(use_listings_cache=False)
+            return BucketFileSystem(use_listings_cache=False, skip_instance_cache=True)
         return fsspec.filesystem(scheme, use_listings_cache=False)
     except ImportError as e:
         raise MissingExtra(SCHEME_PACKAGES[scheme], "storage", f"{scheme}://") from e
