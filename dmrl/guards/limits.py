@@ -31,6 +31,12 @@ LISTED_FILES = 200_000
 LISTING_S, LISTED_PER_S = 30.0, 100
 """Timeout of a listing: a fixed part, seconds, and a minimum rate, objects per second."""
 
+TENSOR_BYTES = 300 * MB
+"""Tensors that an ONNX file of a few kB holds at a time, for one image."""
+
+NETWORK_PRODUCTS = 100_000 * MB
+"""Multiplications of an ONNX file for one image: some seconds. `dmrl-nano` has 50 million."""
+
 TOPICS = 2_000
 """Channels of a recording, and schemas."""
 
@@ -101,6 +107,11 @@ def max_unpacked_bytes(size: int) -> int:
 def max_archive_bytes(size: int) -> int:
     """Return the limit for the decompressed size of an archive of ``size`` bytes, all in memory."""
     return UNPACKED_BYTES + MEMORY_TIMES * size
+
+
+def max_tensor_bytes(size: int) -> int:
+    """Return the limit for the tensors of a network whose file has ``size`` bytes."""
+    return TENSOR_BYTES + MEMORY_TIMES * size
 
 
 def max_memory_bytes(size: int) -> int:

@@ -1,13 +1,18 @@
 """Inference with onnxruntime, the fastest backend on a computer; no other module imports it."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from dmrl.deploy.backends import Images, Outputs
 from dmrl.deploy.int8.graph import rgb_to_grey
+from dmrl.deploy.onnx.static_check import require_modest
 from dmrl.errors import MissingExtra, ModelError
+from dmrl.guards import limits
+from dmrl.guards.memory import MemoryLimit
 
 try:
     import onnxruntime
@@ -37,7 +42,9 @@ class OnnxRun:
     """
 
     def __init__(self, model: Path | bytes, where: object = "the model", threads: int = 0) -> None:
-        self._session = open_session(model, where, threads)
+        data = model if isinstance(model, bytes) else model.read_bytes()
+        self._where, self._size = where, len(data)
+        self._session = open_session(data, where, threads)
         inputs = self._session.get_inputs()
         self.names = [output.name for output in self._session.get_outputs()]
         if [i.name for i in inputs] != ["image"] or "confidence_logit" not in self.names:
@@ -50,7 +57,8 @@ class OnnxRun:
         # long per image and gives the same bits.
         ones = [image[None] for image in images] or [np.asarray(images)]
         seen = map(rgb_to_grey, ones) if self.channels == 1 else map(np.ascontiguousarray, ones)
-        each = [self._session.run(self.names, {"image": image}) for image in seen]
+        with _limit_memory(self._size, self._where):
+            each = [self._session.run(self.names, {"image": image}) for image in seen]
         return {
             CHANNEL_OF_OUTPUT.get(name, name): np.concatenate(values)
             for name, values in zip(self.names, zip(*each, strict=True), strict=True)
@@ -76,9 +84,19 @@ def open_session(
         # Without VNNI, pairs of products are added in 16 bits, which overflow. This option
         # selects the slower exact kernels.
         options.add_session_config_entry("session.x64quantprecision", "1")
-    source = model if isinstance(model, bytes) else str(model)
+    data = model if isinstance(model, bytes) else model.read_bytes()
+    require_modest(data, where)
+    with _limit_memory(len(data), where):
+        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+
+
+@contextmanager
+def _limit_memory(size: int, where: object) -> Iterator[None]:
+    """Limit the memory of onnxruntime in the block, and turn its errors into one line."""
+    stacks = limits.MB * (os.cpu_count() or 1)  # each thread has a stack of 8 MB
     try:
-        return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+        with MemoryLimit(size + stacks):
+            yield
     except Exception as e:  # its exceptions have no common base
         why = " ".join(str(e).split())
         raise ModelError(f"{where} cannot be run: {why}. Export the model again") from None
