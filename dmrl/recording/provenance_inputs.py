@@ -1,7 +1,6 @@
 """Build the provenance of an output: hash its inputs and nest their provenance."""
 
 import hashlib
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -14,8 +13,7 @@ from dmrl.guards.paths import refuse_pipe
 from dmrl.recording.mcap.file import expect_unchanged
 from dmrl.recording.provenance import FILE_NAME, Input, Provenance
 from dmrl.recording.summary import read_summary
-from dmrl.storage import RemotePath
-from dmrl.storage.shared_file import open_raw, share_file
+from dmrl.storage import RemotePath, shared_file
 
 UNHASHED_NAMES = ("README.md", "figures", "tensorboard")
 """Files and folders that the hash of an output folder leaves out."""
@@ -92,7 +90,7 @@ def build_input(path: Path) -> Input:
     if not path.exists():
         raise RecordingError(f"no file or folder {path}. Check the name")
     refuse_pipe(path)  # a link in a folder may point to a device
-    with share_file(path):
+    with shared_file.share_file(path):
         if path.suffix == ".mcap" and path.is_file():
             expect_unchanged(path)
         digest = hash_folder(path) if path.is_dir() else hash_file(path)
@@ -103,8 +101,7 @@ def hash_file(path: Path) -> str:
     """Return the SHA-256 of a file, hexadecimal."""
     if isinstance(path, RemotePath):
         return path.sha256()
-    with io.BufferedReader(open_raw(path)) as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    return shared_file.hash_file(path)
 
 
 def hash_folder(folder: Path) -> str:
