@@ -31,6 +31,7 @@ from types import FrameType
 from dmrl import atomic_output
 from dmrl.errors import DmrlError, SettingError, describe_error, to_one_line
 from dmrl.guards.safe_names import truncate_middle
+from dmrl.guards.temporary_folder import find_system_folder
 from dmrl.terminal.signals import (
     NOTHING_WRITTEN,
     TERMINATION_SIGNALS,
@@ -152,7 +153,8 @@ def _report_bug(error: Exception) -> str:
     kind = f"{type(error).__name__}: {str(error)[:200]}".rstrip(": ")
     text = "".join(traceback.format_exception(error))
     try:
-        held, path = tempfile.mkstemp(prefix="dmrl-error-", suffix=".txt")
+        folder = find_system_folder()
+        held, path = tempfile.mkstemp(prefix="dmrl-error-", suffix=".txt", dir=folder)
         with os.fdopen(held, "w", encoding="utf-8", errors="backslashreplace") as stream:
             stream.write(f"dmrl {' '.join(sys.argv[1:])}\n\n{text}")
     except OSError:

@@ -27,6 +27,7 @@ from rich.text import Text
 from dmrl import __version__, boundary, entry_points
 from dmrl.guards.numeric_threads import set_one_blas_thread
 from dmrl.guards.safe_names import truncate_middle
+from dmrl.guards.temporary_folder import use_own_temporary_folder
 from dmrl.storage import to_path
 from dmrl.terminal import help_pages
 from dmrl.terminal.signals import end_on_signal
@@ -158,6 +159,7 @@ def main() -> NoReturn:
     boundary.open_standard_streams()
     boundary.install_signal_handlers()
     set_one_blas_thread()
+    use_own_temporary_folder()
     name, *words = sys.argv[1:] or [""]
     if name not in COMMANDS:
         add_plugin_commands()

@@ -20,6 +20,7 @@ from dmrl.deploy.detector import (
 from dmrl.deploy.image_detection import DetectionOptions, detect_images
 from dmrl.errors import MissingTopic, RecordingError, SourceError
 from dmrl.guards import limits
+from dmrl.guards.memory import return_large_blocks
 from dmrl.images.codec import UNDECODABLE, ImageHeader, Rgb, read_header
 from dmrl.images.prefetch import map_ahead
 from dmrl.learn.inference.decode_grids import DETECTION_COLUMNS, Detections, Grids
@@ -192,6 +193,8 @@ def _iter_batches(
             continue
         detector.require_size(image.width_px, image.height_px, name)
         pixels += image.width_px * image.height_px
+        if image.width_px * image.height_px > limits.LARGE_PIXELS:
+            return_large_blocks()
         if len(batch) == most or (batch and pixels > limits.FRAME_PIXELS):
             yield batch
             batch, pixels = [], image.width_px * image.height_px

@@ -13,6 +13,7 @@ from rerun.experimental import ViewerClient
 
 from dmrl.atomic_output import atomic_file
 from dmrl.errors import OutputError, SettingError
+from dmrl.guards.temporary_folder import find_system_folder
 from dmrl.images.codec import decode, encode_png
 from dmrl.terminal.signals import set_on_signal
 from dmrl.viewer.session import prepare_show, write_rrd
@@ -127,8 +128,9 @@ def open_window(*, headless: bool = False) -> tuple[subprocess.Popen[bytes], str
     extra = ("--headless", "--window-size", SCREENSHOT_SIZE) if headless else ()
     words = build_command(LOOPBACK, *extra, "--port", str(port))
     # Its own session: Ctrl-C ends the recording, not the window.
+    environment = build_environment() | {"TMPDIR": str(find_system_folder())}
     process = subprocess.Popen(
-        words, env=build_environment(), stderr=subprocess.DEVNULL, start_new_session=True
+        words, env=environment, stderr=subprocess.DEVNULL, start_new_session=True
     )
     return process, build_proxy_url(port)
 

@@ -19,6 +19,7 @@ from typing import Any, Self
 
 from dmrl import __version__
 from dmrl.errors import ClusterError, MissingExtra
+from dmrl.guards.temporary_folder import find_system_folder
 from dmrl.pipeline.job import JobResult, has_failed
 from dmrl.terminal.progress import Lines, say
 
@@ -322,9 +323,12 @@ def _connect(address: str) -> None:
 
 
 def _connect_here(quiet: dict[str, Any]) -> None:
+    # A running cluster is noted in the system's temporary folder; our own ends with the command.
+    os.environ["RAY_TMPDIR"] = str(find_system_folder())
     try:
         ray.init(os.environ.get("RAY_ADDRESS", "auto"), **quiet)
     except ConnectionError:
+        os.environ.pop("RAY_TMPDIR")
         if "RAY_ADDRESS" in os.environ:
             raise
         # Ray advertises the machine's own address unless clusters are disabled.

@@ -1,0 +1,89 @@
+"""A command's temporary folder: its own, and removed also after kill -9."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dmrl.guards.temporary_folder import PREFIX
+
+LITTER = """
+import os, sys, tempfile, time
+from pathlib import Path
+from dmrl.guards.temporary_folder import use_own_temporary_folder
+use_own_temporary_folder()
+tempfile.mkdtemp(prefix="torchinductor_")
+os.system("mktemp -d -t blender_XXXXXX > /dev/null")
+"""
+KILLED = LITTER + "os.kill(os.getpid(), 9)"
+WAITS = LITTER + "print(os.environ['TMPDIR'], flush=True); input()"
+
+
+def run(code: str, system: Path) -> int:
+    """Return the exit status of a Python program with a temporary folder."""
+    environment = os.environ | {"TMPDIR": str(system)}
+    environment.pop("DMRL_SYSTEM_TMPDIR", None)
+    done = subprocess.run([sys.executable, "-c", code], env=environment, check=False)
+    return done.returncode
+
+
+def test_what_libraries_leave_behind_goes_with_the_command(tmp_path: Path) -> None:
+    assert run(LITTER, tmp_path) == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_command_left_goes_at_the_next_start(tmp_path: Path) -> None:
+    assert run(KILLED, tmp_path) == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    assert len(list(left.iterdir())) == 2
+    command = "import sys; sys.argv = ['dmrl', '--version']; from dmrl.cli import main; main()"
+    assert run(command, tmp_path) == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_folder_of_a_living_command_stays(tmp_path: Path) -> None:
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    with subprocess.Popen(
+        [sys.executable, "-c", WAITS],
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as other:
+        assert other.stdout and other.stdin
+        folder = Path(other.stdout.readline().strip())
+        assert run(LITTER, tmp_path) == 0
+        assert list(tmp_path.iterdir()) == [folder] and len(list(folder.iterdir())) == 2
+        other.stdin.write("\n")
+    assert other.returncode == 0 and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("what", ["link", "file", "open to others"])
+def test_what_is_not_its_own_is_not_removed(what: str, tmp_path: Path) -> None:
+    system, victim = tmp_path / "system", tmp_path / "victim"
+    system.mkdir()
+    victim.mkdir()
+    (victim / "data").write_text("kept")
+    place = system / f"{PREFIX}abc"
+    if what == "link":
+        place.symlink_to(victim)
+    elif what == "file":
+        place.write_text("kept")
+    else:
+        place.mkdir(mode=0o777)
+        place.chmod(0o777)
+    assert run(LITTER, system) == 0
+    assert list(system.iterdir()) == [place] and (victim / "data").read_text() == "kept"
+
+
+def test_without_a_place_for_it_nothing_changes(tmp_path: Path) -> None:
+    code = LITTER.split("tempfile.mkdtemp")[0].replace(
+        "\nuse_own", "\ntempfile.tempdir = '/nowhere'\nuse_own"
+    )
+    check = "assert (tempfile.tempdir, os.environ['TMPDIR']) == ('/nowhere', sys.argv[-1])"
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    words = [sys.executable, "-c", code + check, str(tmp_path)]
+    subprocess.run(words, env=environment, check=True)
