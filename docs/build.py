@@ -6,6 +6,7 @@ help. A test compares them with what this file would write.
 
 import io
 import re
+import runpy
 import tomllib
 from pathlib import Path
 
@@ -100,7 +101,8 @@ def filled(page: Path) -> str:
 def pages() -> dict[Path, str]:
     """Every page that is generated, or in part, with its text."""
     made = {page: filled(page) for page in (ROOT / "README.md", ROOT / "docs/formats.md")}
-    return {**made, ROOT / "docs/commands.md": commands()}
+    typed = runpy.run_path(str(ROOT / "docs/settings_types.py"))["settings_types"]()
+    return {**made, ROOT / "docs/commands.md": commands(), ROOT / "dmrl/api/settings.pyi": typed}
 
 
 if __name__ == "__main__":

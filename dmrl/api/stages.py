@@ -5,11 +5,11 @@ recording without a name for the output lives in a temporary folder as long as i
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from shutil import rmtree
 from tempfile import mkdtemp
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dmrl import recipe as recipes
 from dmrl.api.data import Data, dataset
@@ -22,10 +22,32 @@ from dmrl.pipeline.stage_signature import signature_of
 from dmrl.storage import to_path
 from dmrl.terminal.left_out import count_left_out
 
+if TYPE_CHECKING:
+    from typing import Unpack
+
+    from dmrl.api.settings import (
+        AlignSettings,
+        CalibrateSettings,
+        ConvertSettings,
+        DatasetSettings,
+        EvaluateSettings,
+        FlySettings,
+        LabelSettings,
+        PredictSettings,
+        QuantizeSettings,
+        RenderSettings,
+        SketchSettings,
+        TrackSettings,
+        TrainSettings,
+        TrimSettings,
+    )
+
 OneOrMore: TypeAlias = PathLike | Sequence[PathLike]
 
 
-def label(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
+def label(
+    recording: PathLike, out: PathLike | None = None, **settings: "Unpack[LabelSettings]"
+) -> Recording:
     """Estimate positions of peers and label the images: ``dmrl label``.
 
     Parameters
@@ -46,7 +68,10 @@ def label(recording: PathLike, out: PathLike | None = None, **settings: Any) -> 
 
 
 def predict(
-    model: PathLike, recording: PathLike, out: PathLike | None = None, **settings: Any
+    model: PathLike,
+    recording: PathLike,
+    out: PathLike | None = None,
+    **settings: "Unpack[PredictSettings]",
 ) -> Recording:
     """Run a network on every image of a recording: ``dmrl predict``.
 
@@ -56,17 +81,23 @@ def predict(
     return _run_to_recording("predict", out, settings, **given)
 
 
-def track(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
+def track(
+    recording: PathLike, out: PathLike | None = None, **settings: "Unpack[TrackSettings]"
+) -> Recording:
     """Track detected peers over time: ``dmrl track``. Parameters, errors as `label`."""
     return _run_to_recording("track", out, settings, recording=to_path(recording))
 
 
-def align(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
+def align(
+    recording: PathLike, out: PathLike | None = None, **settings: "Unpack[AlignSettings]"
+) -> Recording:
     """Align the clocks of robots and cameras: ``dmrl align``. Parameters, errors as `label`."""
     return _run_to_recording("align", out, settings, recording=to_path(recording))
 
 
-def trim(recording: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
+def trim(
+    recording: PathLike, out: PathLike | None = None, **settings: "Unpack[TrimSettings]"
+) -> Recording:
     """Copy a part of a recording, or some topics: ``dmrl trim``. Parameters, errors as `label`."""
     return _run_to_recording("trim", out, settings, recording=to_path(recording))
 
@@ -79,13 +110,18 @@ def merge(recordings: Sequence[PathLike], out: PathLike | None = None) -> Record
     return _run_to_recording("merge", out, {}, recordings=named)
 
 
-def convert(source: PathLike, out: PathLike | None = None, **settings: Any) -> Recording:
+def convert(
+    source: PathLike, out: PathLike | None = None, **settings: "Unpack[ConvertSettings]"
+) -> Recording:
     """Convert a foreign file or folder: ``dmrl convert``. Parameters, errors as `label`."""
     return _run_to_recording("convert", out, settings, source=to_path(source))
 
 
 def fly(
-    out: PathLike | None = None, *, recipe: PathLike | None = None, **settings: Any
+    out: PathLike | None = None,
+    *,
+    recipe: PathLike | None = None,
+    **settings: "Unpack[FlySettings]",
 ) -> Recording:
     """Simulate a flight: ``dmrl fly``.
 
@@ -107,7 +143,9 @@ def fly(
 
 
 def render(
-    scene: PathLike = "synthetic_first_look", out: PathLike | None = None, **settings: Any
+    scene: PathLike = "synthetic_first_look",
+    out: PathLike | None = None,
+    **settings: "Unpack[RenderSettings]",
 ) -> Recording:
     """Render images of robots with exact labels, by Blender: ``dmrl render``.
 
@@ -128,12 +166,14 @@ def render(
     return _run_to_recording("render", out, _recipe_keys("render", scene) | settings)
 
 
-def sketch(out: PathLike, **settings: Any) -> Path:
+def sketch(out: PathLike, **settings: "Unpack[SketchSettings]") -> Path:
     """Draw a folder of images with exact labels: ``dmrl sketch``. Errors as `label`."""
     return _run_to_path("sketch", to_path(out), settings)
 
 
-def make_dataset(recordings: OneOrMore, out: PathLike, **settings: Any) -> Data:
+def make_dataset(
+    recordings: OneOrMore, out: PathLike, **settings: "Unpack[DatasetSettings]"
+) -> Data:
     """Build a dataset with its card: ``dmrl dataset``. Errors as `label`."""
     given = _to_paths("make_dataset", recordings)
     return dataset(_run_to_path("dataset", to_path(out), settings, recordings=given))
@@ -145,7 +185,7 @@ def train(
     *,
     recipe: PathLike | None = None,
     init: PathLike | None = None,
-    **settings: Any,
+    **settings: "Unpack[TrainSettings]",
 ) -> Model:
     """Train a network on a dataset: ``dmrl train``.
 
@@ -175,7 +215,9 @@ def train(
     )
 
 
-def quantize(model: PathLike, data: PathLike | Data, out: PathLike, **settings: Any) -> Model:
+def quantize(
+    model: PathLike, data: PathLike | Data, out: PathLike, **settings: "Unpack[QuantizeSettings]"
+) -> Model:
     """Quantize a network to int8: ``dmrl quantize``. Errors as `label`."""
     images = data.path if isinstance(data, Data) else to_path(data)
     return load(
@@ -183,14 +225,14 @@ def quantize(model: PathLike, data: PathLike | Data, out: PathLike, **settings: 
     )
 
 
-def calibrate(sources: OneOrMore, out: PathLike, **settings: Any) -> Path:
+def calibrate(sources: OneOrMore, out: PathLike, **settings: "Unpack[CalibrateSettings]") -> Path:
     """Calibrate a camera by chessboards or flights: ``dmrl calibrate``. Errors as `label`."""
     return _run_to_path(
         "calibrate", to_path(out), settings, sources=_to_paths("calibrate", sources)
     )
 
 
-def evaluate(recordings: OneOrMore, **settings: Any) -> Result:
+def evaluate(recordings: OneOrMore, **settings: "Unpack[EvaluateSettings]") -> Result:
     """Evaluate detections, tracks or positions: ``dmrl evaluate``.
 
     Parameters
@@ -232,7 +274,7 @@ def _to_paths(what: str, given: OneOrMore) -> list[Path]:
 
 
 def _run_to_recording(
-    stage: str, out: PathLike | None, settings: dict[str, Any], **given: Any
+    stage: str, out: PathLike | None, settings: Mapping[str, Any], **given: Any
 ) -> Recording:
     """Run a stage that writes a recording, and return it."""
     if out is not None:
@@ -245,7 +287,7 @@ def _run_to_recording(
         raise
 
 
-def _run_to_path(stage: str, out: Path, settings: dict[str, Any], **given: Any) -> Path:
+def _run_to_path(stage: str, out: Path, settings: Mapping[str, Any], **given: Any) -> Path:
     """Run a stage, and return the path that it wrote."""
     checked = _check_settings(stage, settings)
     strict = getattr(checked.get("settings"), "strict", False)
@@ -254,7 +296,7 @@ def _run_to_path(stage: str, out: Path, settings: dict[str, Any], **given: Any) 
     return out
 
 
-def _check_settings(stage: str, keys: dict[str, Any]) -> dict[str, Any]:
+def _check_settings(stage: str, keys: Mapping[str, Any]) -> dict[str, Any]:
     """Return the argument ``settings`` of a stage, checked, if it has one."""
     face = signature_of(stage)
     if face.settings is None:
