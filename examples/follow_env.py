@@ -45,7 +45,7 @@ class FollowEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Fly an action for 0.05 s; the reward is 1 at the distance, straight ahead."""
-        seen = self.simulation.step({"cf1": np.clip(action, -1, 1) * LIMITS})["cf1"]
+        seen = self.simulation.step({"cf1": (np.clip(action, -1, 1) * LIMITS).tolist()})["cf1"]
         x, y, z = self.simulation.peer_position("cf1", "cf2")
         distance = float(np.linalg.norm((x, y, z)))
         bearing = float(np.arctan2(y, x))

@@ -20,14 +20,14 @@ with dmrl.writer("drive.mcap", robots="two ground robots") as out:
     for own, peer in (("rover", "carrier"), ("carrier", "rover")):
         velocity = np.gradient(paths[own], time_s, axis=1)
         yaw = np.unwrap(np.arctan2(velocity[1], velocity[0]))
-        speed = np.hypot(*velocity) + rng.normal(0, 0.03, len(time_s))
+        speed = np.hypot(velocity[0], velocity[1]) + rng.normal(0, 0.03, len(time_s))
         level = np.zeros(len(time_s))
         turn = np.gradient(yaw, time_s) + rng.normal(0, 0.01, len(time_s))
         attitude = {"roll_rad": level, "pitch_rad": level, "yaw_rate_radps": turn}
         out.write_columns(f"/{own}/attitude", time_s, attitude)
         out.write_columns(f"/{own}/velocity", time_s, {"vx_mps": speed, "vy_mps": level})
         out.write_columns(f"/{own}/height", time_s, {"height_m": level + 0.15})
-        apart = np.hypot(*(paths[own] - paths[peer])) + rng.normal(0, 0.05, len(time_s))
+        apart = np.linalg.norm(paths[own] - paths[peer], axis=0) + rng.normal(0, 0.05, len(time_s))
         out.write_columns(f"/{own}/range/{peer}", time_s, {"range_m": apart})
     out.camera("rover", Camera(320, 240, 200.0, 200.0, 160.0, 120.0))
     for moment in np.arange(5.0, 55.0, 1.0):

@@ -66,7 +66,9 @@ def generated() -> dict[Path, str]:
     return dict(runpy.run_path(str(ROOT / "docs/build.py"))["pages"]())
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/commands.md", "docs/formats.md", "dmrl/api/settings.pyi"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/commands.md", "docs/formats.md", "dmrl/api/settings.pyi"]
+)
 def test_generated_parts_are_fresh(page: str, generated: dict[Path, str]) -> None:
     assert (ROOT / page).read_text(encoding="utf-8") == generated[ROOT / page], "run: make docs"
 

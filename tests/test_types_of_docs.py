@@ -1,0 +1,67 @@
+"""Examples and programs on pages have no fault that pyright finds, strictly, after the set-up."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FRAGMENTS = {"rendering.md", "tracking.md"}
+"""Pages whose code names a camera or an image that it does not make."""
+INCOMPLETE = {
+    "formats.md": "datasets",
+    "own_camera.md": "cv2",
+    "own_network.md": "torch",
+    "own_network.py": "torch",
+}
+"""Files that use a package whose own types are incomplete."""
+PYRIGHT = shutil.which("pyright", path=str(Path(sys.executable).parent)) or shutil.which("pyright")
+
+
+def programs() -> dict[str, str]:
+    """The code of each page and example, by name."""
+    found = {path.name: path.read_text(encoding="utf-8") for path in ROOT.glob("examples/*.py")}
+    for page in (ROOT / "README.md", *ROOT.glob("docs/*.md")):
+        blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+        if blocks and page.name not in FRAGMENTS:
+            found[page.name] = "\n".join(blocks)
+    return found
+
+
+def run_pyright(folder: Path) -> list[tuple[str, str]]:
+    """File and message of each error."""
+    setup = {"typeCheckingMode": "strict", "reportMissingTypeStubs": False}
+    (folder / "pyrightconfig.json").write_text(json.dumps(setup), encoding="utf-8")
+    line = [str(PYRIGHT), "--pythonpath", sys.executable, "--outputjson", "."]
+    done = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
+    try:
+        said = json.loads(done.stdout[done.stdout.index("{") :])
+    except ValueError:
+        pytest.skip(f"pyright does not start here: {(done.stderr or done.stdout)[-300:]}")
+    return [
+        (Path(one["file"]).name, f"{one['range']['start']['line'] + 1}: {one['message']}")
+        for one in said["generalDiagnostics"]
+        if one["severity"] == "error"
+    ]
+
+
+@pytest.mark.heavy
+@pytest.mark.skipif(PYRIGHT is None, reason="pyright is not installed: pip install pyright")
+def test_pages_and_examples_have_no_fault_that_pyright_finds(tmp_path: Path) -> None:
+    for name, code in programs().items():
+        head = ""
+        if name in INCOMPLETE:
+            rules = ("MemberType", "VariableType", "ArgumentType")
+            head = f"# pyright: {', '.join(f'reportUnknown{rule}=false' for rule in rules)}\n"
+        stem = Path(name).stem + ("_page.py" if name.endswith(".md") else ".py")
+        (tmp_path / stem).write_text(head + code, encoding="utf-8")
+    wrong = "import dmrl\ndmrl.label('a.mcap', gate=0.3)\ndmrl.label('a.mcap', gate_m='x')\n"
+    (tmp_path / "wrong.py").write_text(wrong, encoding="utf-8")
+    found = run_pyright(tmp_path)
+    told = [message for name, message in found if name == "wrong.py"]
+    assert len(told) == 2 and '"gate"' in told[0] and '"gate_m"' in told[1]
+    assert [one for one in found if one[0] != "wrong.py"] == []
