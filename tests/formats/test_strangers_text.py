@@ -56,7 +56,7 @@ def test_simulated_time_from_zero(
 ) -> None:
     pytest.importorskip("rosbags")
     convert(data, "ros-sim_time_from_zero", tmp_path / "a.mcap", capsys)
-    for topic, time_ns in read_log_times(
-        tmp_path / "a.mcap", read_summary(tmp_path / "a.mcap").topics
-    ).items():
+    summary = read_summary(tmp_path / "a.mcap")
+    assert {info.count for info in summary.topics.values()} == {20}  # of 20 images and 20 odometry
+    for topic, time_ns in read_log_times(tmp_path / "a.mcap", summary.topics).items():
         assert (time_ns.min(), time_ns.max()) == (0, 1_900_000_000), topic

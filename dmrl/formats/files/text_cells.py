@@ -8,8 +8,11 @@ import numpy as np
 
 from dmrl.geometry.frames import Array
 
-MISSING = {"", "na", "n/a", "nan", "-nan", "null", "none", "nil", "-", "--", "?", "<na>", "#n/a"}
-"""Cells without a value, in lower case."""
+MISSING = {
+    *("", "na", "n/a", "nan", "-nan", "null", "none", "nil", "-", "--", "?", "<na>"),
+    *("#n/a", "#na", "#n/a n/a", "1.#ind", "-1.#ind", "1.#qnan", "-1.#qnan"),
+}
+"""Cells without a value, in lower case: those of pandas and of other loggers."""
 DATE = re.compile(
     r"(\d{4})[-/](\d\d?)[-/](\d\d?)[T ]+(\d\d?):(\d\d)(?::(\d\d)(?:[.,](\d+))?)?"
     r"\s*(Z|UTC|[+-]\d\d(?::?\d\d)?)?",

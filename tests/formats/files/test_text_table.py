@@ -3,13 +3,19 @@
 import io
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
+import pandas
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dmrl.errors import SourceError
 from dmrl.formats.base import Options
 from dmrl.formats.files import mapped_csv
+from dmrl.formats.files.text_cells import parse_time_ns
 from dmrl.formats.files.text_table import Dialect, read_table
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import count_left_out
@@ -29,7 +35,6 @@ def plain(separator: str = ",", decimal: str = ".", header: str = "", before: st
 
 def by_pandas(**how: object) -> str:
     """The table, as pandas writes it."""
-    pandas = pytest.importorskip("pandas")
     text = io.StringIO()
     pandas.DataFrame(VALUES, columns=list(WANTED)).to_csv(text, **how)
     return text.getvalue()
@@ -261,3 +266,45 @@ def test_held_ranges_count_once(held: str, count: int, counted: int, tmp_path: P
     assert sum(left_out.counts.values()) == counted
     (tmp_path / "map.toml").write_text(TABLE + "held = false\n")
     assert len(samples(tmp_path)["/cf1/range/cf2"]) == 200
+
+
+CELLS = st.one_of(
+    st.floats(-1e9, 1e9).map(repr),
+    st.integers(-(10**12), 10**12).map(str),
+    st.sampled_from(["1e-3", "+2.5", "-0", ".5", "7.", "inf", "-inf"]),
+    st.sampled_from(sorted(pandas.io.parsers.readers.STR_NA_VALUES)),
+)
+
+
+@given(st.lists(st.tuples(CELLS, CELLS, CELLS), min_size=3, max_size=20), st.sampled_from(",;\t|"))
+def test_numbers_and_missing_values_are_those_of_pandas(
+    rows: list[tuple[str, ...]], separator: str
+) -> None:
+    names = ["t", "roll", "pitch", "d2"]
+    lines = [[str(k), *cells] for k, cells in enumerate(rows)]
+    text = "\n".join(separator.join(row) for row in [names, *lines]) + "\n"
+    wanted = pandas.read_csv(io.StringIO(text), sep=separator)
+    with TemporaryDirectory() as folder, count_left_out() as left_out:
+        path = Path(folder) / "a.csv"
+        path.write_text(text, encoding="utf-8")
+        table = read_table(path, names, Dialect(separator, "."))
+        for name in names:
+            column = wanted[name].astype(float).to_numpy()
+            np.testing.assert_allclose(table.parse_numbers(name), column, rtol=1e-15)
+    assert left_out.counts == {}
+
+
+MOMENTS = st.datetimes(pandas.Timestamp("1970-01-02"), pandas.Timestamp("2200-01-01"))
+
+
+@given(
+    st.lists(MOMENTS, min_size=2, max_size=9, unique=True),
+    st.sampled_from(["T", " "]),
+    st.sampled_from(["", "Z", "+00:00", "+05:30", "-0800"]),
+)
+def test_iso_times_are_those_of_pandas(moments: list[Any], between: str, zone: str) -> None:
+    moments = sorted(moments, key=lambda moment: moment.timestamp())
+    cells = [moment.isoformat(between) + zone for moment in moments]
+    wanted = pandas.to_datetime(pandas.Series(cells), format="ISO8601", utc=True)
+    wanted_ns = wanted.dt.as_unit("ns").astype("int64").tolist()
+    assert [parse_time_ns(cell, 1e9, has_decimal_commas=False) for cell in cells] == wanted_ns

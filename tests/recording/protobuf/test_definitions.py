@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 import pytest
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.descriptor_pb2 import (
@@ -306,3 +307,18 @@ def test_the_files_that_were_handed_over(
     assert len(table) == rows and set(table.column_names[2:]) == columns
     assert (np.diff(table["log_time"].to_numpy()) > 0).all()
     assert table["log_time"][0].as_py() == 10**18
+
+
+def test_a_field_with_the_name_of_a_time_stands_beside_it_in_csv(
+    data: Path, tmp_path: Path
+) -> None:
+    name = "field_named_log_time"
+    source = data / "strangers" / f"pb-{name}" / f"{name}.mcap"
+    run(source, tmp_path / "out", Settings(to="csv"))
+    (table,) = (tmp_path / "out").glob("*.csv")
+    found = pandas.read_csv(table)
+    assert found["log_time"].tolist() == [10**18 + k * 10**8 for k in range(len(found))]
+    own = dmrl.open(source)
+    (topic,) = own.topics
+    assert found["log_time_"].tolist() == own[topic].to_arrow()["log_time_"].to_pylist()
+    assert found["log_time_"].tolist() != found["log_time"].tolist()
