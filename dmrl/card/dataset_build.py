@@ -18,7 +18,6 @@ from dmrl.datasets.manifest import Manifest, part_folder, read_manifest
 from dmrl.datasets.settings import Settings
 from dmrl.datasets.writing.append import ExistingDataset, open_existing, read_combined_provenance
 from dmrl.datasets.writing.builder import (
-    RowFilter,
     has_masks,
     iter_rows,
     report_left_out,
@@ -30,7 +29,7 @@ from dmrl.datasets.writing.exclusions import read_flags
 from dmrl.datasets.writing.inputs import warn_about_lenses
 from dmrl.datasets.writing.near_duplicates import ImageHashes
 from dmrl.datasets.writing.parts import assign_splits
-from dmrl.datasets.writing.rows import ExclusionCounts
+from dmrl.datasets.writing.rows import ExclusionCounts, RowFilter
 from dmrl.datasets.writing.splits import SplitLookup
 from dmrl.errors import SettingError
 from dmrl.recording import LoadedRecording, Provenance, build_provenance

@@ -11,16 +11,13 @@ from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
 from dmrl.errors import MissingTopic
-from dmrl.recording.mcap.batch_reader import iter_batches
+from dmrl.recording.mcap.batch_reader import iter_batches, join_batches
 from dmrl.recording.mcap.channel import Channel, RawMessage
 from dmrl.recording.mcap.file import corrupt_error
-from dmrl.recording.mcap.message_batch import EMPTY_BATCH, MessageBatch, concatenate_all
+from dmrl.recording.mcap.message_batch import EMPTY_BATCH
 from dmrl.recording.protobuf.columns import decode_by_topic, decode_topic
 from dmrl.recording.protobuf.message_types import find_channel_descriptor, require_types
 from dmrl.recording.summary import TopicInfo, read_channel, read_summary
-
-BATCH_BYTES = 4 << 20
-"""Bytes of messages that `iter_topic_batches` decodes at once: few calls, little memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,17 +203,9 @@ def iter_topic_batches(
     present = read_summary(path).topics
     names = frozenset(topic for topic in fields if topic in present)
     require_types(path, present, names)
-    pending: list[MessageBatch] = []
-    size = 0
-    channels: dict[int, Channel] = {}
-    for batch, channels in iter_batches(path, names, start_ns=start_ns, end_ns=end_ns):
-        pending.append(batch)
-        size += len(batch.data)
-        if size >= BATCH_BYTES:
-            yield decode_by_topic(path, concatenate_all(pending), channels, fields)
-            pending, size = [], 0
-    if pending:
-        yield decode_by_topic(path, concatenate_all(pending), channels, fields)
+    batches = iter_batches(path, names, start_ns=start_ns, end_ns=end_ns)
+    for batch, channels in join_batches(batches):
+        yield decode_by_topic(path, batch, channels, fields)
 
 
 def read_table(

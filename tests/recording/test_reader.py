@@ -19,9 +19,9 @@ from dmrl.recording import (
     read_raw,
     read_summary,
     read_table,
-    reader,
     sample_topics,
 )
+from dmrl.recording.mcap import batch_reader
 from dmrl.recording.mcap.chunks import chunk_builder, chunk_reader
 
 HEIGHT = message_class("Height")
@@ -260,7 +260,7 @@ def test_a_stretch_without_messages_is_a_table_without_rows(flight: Path) -> Non
 def test_topics_are_read_in_one_pass_as_one_by_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reader, "BATCH_BYTES", 10_000)
+    monkeypatch.setattr(batch_reader, "JOINED_BYTES", 10_000)
     path = tmp_path / "two.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(20_000):

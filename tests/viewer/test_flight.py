@@ -11,7 +11,8 @@ import pytest
 from dmrl import recipe as recipes
 from dmrl.colours import RGB, STATUS_RGB
 from dmrl.errors import SettingError
-from dmrl.recording import reader, sample_topics
+from dmrl.recording import sample_topics
+from dmrl.recording.mcap import batch_reader
 from dmrl.recording.mcap.chunks import chunk_builder, chunk_reader
 from dmrl.stages import fly as fly_stage
 from dmrl.viewer import Settings, save, scene
@@ -222,14 +223,14 @@ def test_images_come_first_and_wait_for_no_more_of_the_flight(
     fly: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(chunk_builder, "CHUNK_BYTES", 1)
-    monkeypatch.setattr(reader, "BATCH_BYTES", 1)
+    monkeypatch.setattr(batch_reader, "JOINED_BYTES", 1)
     monkeypatch.setattr(sys.modules[sample_topics.__module__], "CHUNKS_PER_CHANNEL_MAX", 2)
     opened: list[int] = []
     unpacked = chunk_reader.decompress
     monkeypatch.setattr(
         chunk_reader,
         "decompress",
-        lambda path, chunk, at: opened.append(at) or unpacked(path, chunk, at),
+        lambda chunk, at: opened.append(at) or unpacked(chunk, at),
     )
     show = prepare_show([fly()], Settings())
     paths, before = [], None
@@ -257,7 +258,7 @@ def test_trails_errors_and_ranges_do_not_depend_on_where_a_stretch_of_the_file_e
 
     whole = saved("whole")
     monkeypatch.setattr(chunk_builder, "CHUNK_BYTES", 1)
-    monkeypatch.setattr(reader, "BATCH_BYTES", 1)
+    monkeypatch.setattr(batch_reader, "JOINED_BYTES", 1)
     monkeypatch.setattr(scene, "MIN_BATCH_ROWS", 1)
     pieces = saved("pieces")
     assert len(whole[f"{TRUTH}/trail", "LineStrips3D:strips"]) == 20

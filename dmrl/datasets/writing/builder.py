@@ -1,29 +1,19 @@
 """Build the rows of many recordings, decode images ahead, and report the images left out."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from dmrl import topics
 from dmrl.datasets.manifest import Manifest
 from dmrl.datasets.settings import Settings
 from dmrl.datasets.writing.dataset_writer import Row
-from dmrl.datasets.writing.exclusions import FlaggedImage, read_flags
-from dmrl.datasets.writing.rows import ExclusionCounts, iter_row_builders
+from dmrl.datasets.writing.exclusions import read_flags
+from dmrl.datasets.writing.rows import ExclusionCounts, RowFilter, iter_row_builders
 from dmrl.datasets.writing.splits import SplitLookup
 from dmrl.errors import RecordingError, SourceError
 from dmrl.images.prefetch import map_ahead
 from dmrl.recording import LoadedRecording, read_summary
 from dmrl.terminal.progress import say, track
-
-
-@dataclass(frozen=True, slots=True)
-class RowFilter:
-    """Filter and contents of the rows; see `iter_row_builders`."""
-
-    keep_all: bool
-    masks: bool
-    flagged: Set[FlaggedImage]
 
 
 def iter_rows(
@@ -61,7 +51,6 @@ def iter_rows(
     RecordingError
         If an image has another size.
     """
-    how = {"keep_all": wanted.keep_all, "masks": wanted.masks}
     planned = (
         (path, row)
         for path, source in sources.items()
@@ -70,8 +59,7 @@ def iter_rows(
             source,
             split_of[path],
             tally,
-            flagged=wanted.flagged,
-            **how,
+            wanted,
         )
     )
     for path, kept in track(map_ahead(_decode_row, planned, workers), "Writing images", total):

@@ -50,6 +50,26 @@ Mask = NDArray[np.uint8]
 """(H, W) index of the peer that each pixel shows, from 1 among the labels; 0 for the background."""
 
 
+@dataclass(frozen=True, slots=True)
+class RowFilter:
+    """Filter and contents of the rows.
+
+    Parameters
+    ----------
+    keep_all
+        Also use labels that are not OK.
+    masks
+        Rows have masks. Images that show a peer and have no mask are left out: an empty mask would
+        mark the peer as background.
+    flagged
+        Images that are left out.
+    """
+
+    keep_all: bool = False
+    masks: bool = False
+    flagged: Set[FlaggedImage] = frozenset()
+
+
 @dataclass(slots=True)
 class ExclusionCounts:
     """Number of images kept, and of images left out by reason."""
@@ -147,10 +167,7 @@ def iter_row_builders(
     source: str,
     split_of: SplitLookup,
     tally: ExclusionCounts,
-    *,
-    keep_all: bool,
-    masks: bool,
-    flagged: Set[FlaggedImage] = frozenset(),
+    wanted: RowFilter,
 ) -> Iterator[tuple[str, Callable[[], Row]] | None]:
     """Yield the split and a row builder for each image, in time order; None for one left out.
 
@@ -167,14 +184,10 @@ def iter_row_builders(
         Split of a log time.
     tally
         Counts of kept and excluded images; updated in place.
-    keep_all
-        Also use labels that are not OK.
-    masks
-        Rows have masks. Images that show a peer and have no mask are left out: an empty mask would
-        mark the peer as background.
-    flagged
-        Images that are left out.
+    wanted
+        Filter and contents of the rows.
     """
+    masks, flagged = wanted.masks, wanted.flagged
     for image, labels, covered in iter_labelled_images(held, masks=masks):
         split = split_of(image.time_ns)
         mine = [] if labels is None else [one for one in labels.peers if one.source == source]
@@ -188,7 +201,7 @@ def iter_row_builders(
             tally.of_other_sources += 1
         elif masks and covered is None and mine:
             tally.without_mask += 1
-        elif not keep_all and any(label.status != STATUS_OK for label in mine):
+        elif not wanted.keep_all and any(label.status != STATUS_OK for label in mine):
             tally.not_ok += 1
         else:
             tally.kept += 1

@@ -1,7 +1,6 @@
 """Collect the data that the checks evaluate, in one pass over a recording."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,11 +15,11 @@ from dmrl.recording.checks.odometry_checks import MotionSamples
 from dmrl.recording.checks.unit_checks import FINITE_TOPICS, MagnitudeHistograms
 from dmrl.recording.loaded import LoadedRecording
 from dmrl.recording.log_times import read_log_times
-from dmrl.recording.mcap.batch_reader import iter_batches_in_file_order
+from dmrl.recording.mcap.batch_reader import iter_batches_in_file_order, join_batches
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.message_batch import Ints, MessageBatch, concatenate_all
+from dmrl.recording.mcap.message_batch import Ints, MessageBatch
 from dmrl.recording.protobuf.columns import decode_topic, group_by_topic
-from dmrl.recording.reader import BATCH_BYTES, iter_columns
+from dmrl.recording.reader import iter_columns
 from dmrl.topics import CALIBRATION, CAMERA_IMAGE, LABELS, find_topic, parse_topic
 
 STAMPED_TYPES = ("CompressedImage", "PoseInFrame")
@@ -91,7 +90,7 @@ def collect(path: Path) -> CheckData:
     times: dict[str, list[Ints]] = {topic: [np.empty(0, np.int64)] for topic in contents.topics}
     kept: dict[str, list[MessageBatch]] = {t: [] for t in contents.topics if _is_kept(contents, t)}
     channels: dict[int, Channel] = {}
-    for batch, channels in _iter_large_batches(path):
+    for batch, channels in join_batches(iter_batches_in_file_order(path)):
         for topic, mine in group_by_topic(batch, channels).items():
             times[topic].append(mine.time_ns)
             if topic in kept:
@@ -150,21 +149,6 @@ def find_first_size(data: CheckData, topic: str) -> ImageSize:
 def _is_kept(contents: LoadedRecording, topic: str) -> bool:
     of_kind = any(parse_topic(pattern, topic) for pattern in KEPT_TOPICS)
     return of_kind and carries_own_type(topic, contents.topics[topic].schema)
-
-
-def _iter_large_batches(path: Path) -> Iterator[tuple[MessageBatch, dict[int, Channel]]]:
-    """Yield every message in file order, joining chunks so that few calls decode them."""
-    pending: list[MessageBatch] = []
-    size = 0
-    channels: dict[int, Channel] = {}
-    for batch, channels in iter_batches_in_file_order(path):
-        pending.append(batch)
-        size += len(batch.data)
-        if size >= BATCH_BYTES:
-            yield concatenate_all(pending), channels
-            pending, size = [], 0
-    if pending:
-        yield concatenate_all(pending), channels
 
 
 def _collect_from_messages(

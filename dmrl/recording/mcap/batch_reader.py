@@ -6,7 +6,7 @@ All readers of messages use this module. Decoders work on whole batches.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Set
+from collections.abc import Iterable, Iterator, Set
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,9 @@ from dmrl.recording.mcap.message_batch import (
 from dmrl.recording.mcap.message_count import check_counts, verify_indexes
 from dmrl.recording.mcap.record_scan import scan_file
 from dmrl.recording.mcap.summary_section import SummarySection, read_summary_section
+
+JOINED_BYTES = 4 << 20
+"""Bytes of messages that are decoded at once: few calls, little memory."""
 
 
 def iter_batches(
@@ -107,6 +110,23 @@ def iter_batches_in_file_order(path: Path) -> Iterator[tuple[MessageBatch, dict[
             count_messages(counts, batch)
             yield batch, channels
         check_counts(summary.statistics, channels, counts)
+
+
+def join_batches(
+    batches: Iterable[tuple[MessageBatch, dict[int, Channel]]],
+) -> Iterator[tuple[MessageBatch, dict[int, Channel]]]:
+    """Join batches to some of `JOINED_BYTES`, which few calls decode."""
+    pending: list[MessageBatch] = []
+    channels: dict[int, Channel] = {}
+    size = 0
+    for batch, channels in batches:
+        pending.append(batch)
+        size += len(batch.data)
+        if size >= JOINED_BYTES:
+            yield concatenate_all(pending), channels
+            pending, size = [], 0
+    if pending:
+        yield concatenate_all(pending), channels
 
 
 def _iter_in_time_order(

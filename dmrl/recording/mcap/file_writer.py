@@ -42,6 +42,14 @@ def serialize(*records: McapRecord) -> bytes:
     return bytes(builder.end())
 
 
+def index_attachment(one: Attachment, at: int, length: int) -> AttachmentIndex:
+    """Build the index of an attachment, from the offset and the length of its record."""
+    size = len(one.data)
+    return AttachmentIndex(
+        at, length, one.log_time, one.create_time, size, one.name, one.media_type
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class CompressedChunk:
     """A compressed chunk and its message indexes.
@@ -113,13 +121,9 @@ class McapFileWriter:
 
     def add_attachment(self, attachment: Attachment) -> None:
         """Append an Attachment record."""
-        record, one = serialize(attachment), attachment
-        at, size = self._append(record), len(one.data)
-        self._attachments.append(
-            AttachmentIndex(
-                at, len(record), one.log_time, one.create_time, size, one.name, one.media_type
-            )
-        )
+        record = serialize(attachment)
+        at = self._append(record)
+        self._attachments.append(index_attachment(attachment, at, len(record)))
 
     def add_chunk(self, chunk: CompressedChunk) -> None:
         """Append a chunk and its message indexes."""

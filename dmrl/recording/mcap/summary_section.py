@@ -36,6 +36,7 @@ from dmrl.recording.mcap.file import (
     BoundedReader,
 )
 from dmrl.recording.mcap.file_cache import get_cached
+from dmrl.recording.mcap.file_writer import index_attachment
 from dmrl.recording.mcap.message_batch import Ints
 from dmrl.recording.mcap.summary_checks import (
     check_budget,
@@ -304,9 +305,5 @@ def _add_index(summary_section: McapSummary, opcode: int, at: int, body: bytes) 
         name = Metadata.read(data).name
         summary_section.metadata_indexes.append(MetadataIndex(at, length, name))
         return
-    one = Attachment.read(data)
-    summary_section.attachment_indexes.append(
-        AttachmentIndex(
-            at, length, one.log_time, one.create_time, len(one.data), one.name, one.media_type
-        )
-    )
+    index = index_attachment(Attachment.read(data), at, length)
+    summary_section.attachment_indexes.append(index)

@@ -86,16 +86,10 @@ class ChunkWriter:
         """
         present = batch.list_channel_ids()
         for images in (False, True):
-            channel_ids = [
-                number for number in present if channels[number].carries_images == images
-            ]
-            if channel_ids:
-                part = (
-                    batch
-                    if len(channel_ids) == len(present)
-                    else batch.select_channels(channel_ids)
-                )
-                self._append_one_kind(part, {number: channels[number] for number in channel_ids})
+            own = {n: channels[n] for n in present if channels[n].carries_images == images}
+            if own:
+                whole = len(own) == len(present)
+                self._append_one_kind(batch if whole else batch.select_channels(own), own)
 
     def _append_one_kind(self, batch: MessageBatch, channels: Mapping[int, Channel]) -> None:
         """Append messages that are all images, or all numbers."""
