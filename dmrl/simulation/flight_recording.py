@@ -58,6 +58,9 @@ class FlySettings:
         How wrong the sensors are; docs/flights.md has the numbers.
     seed
         Another seed gives another flight.
+    place
+        Number of the room and its light, and of the camera, for images in one place. Without it,
+        the seed's.
     yaw_spread_rad
         Robots start with a yaw within plus and minus this; cf1 with 0.
     camera
@@ -91,6 +94,7 @@ class FlySettings:
     trajectory: Trajectory = "in_view"
     noise: Preset = "realistic"
     seed: Seed = 0
+    place: Seed | None = None
     yaw_spread_rad: float = 3.141592653589793
     camera: bool = False
     camera_renderer: CameraRenderer = "sketch"
@@ -164,7 +168,7 @@ def _record_piloted(out: Path, settings: FlySettings) -> dict[str, int]:
         camera_renderer=settings.camera_renderer,
         faults=settings.faults,
     ) as simulation:
-        simulation.reset(settings.seed)
+        simulation.reset(settings.seed, settings.place)
         _print_faults(simulation.motion.flight)
         if settings.camera and settings.camera_renderer == "blender" and eyes[0] is not None:
             simulation.start_blender()
@@ -195,7 +199,11 @@ def _open_renderer(
         return render_sketches, made
     blender = stack.enter_context(renderer.Renderer(ensure_environment(say), renderer.RobotModel()))
     made = replace(made, libraries={**made.libraries, "blender": blender.version})
-    return flight_images.FlightRenderer(blender, settings.seed), made
+    return flight_images.FlightRenderer(blender, _choose_place(settings)), made
+
+
+def _choose_place(settings: FlySettings) -> int:
+    return settings.seed if settings.place is None else settings.place
 
 
 def _check(settings: FlySettings) -> None:
@@ -236,7 +244,7 @@ def _camera_stream(
         return {name: body_at(truth, moment_s) for name, truth in flight.truth.items()}
 
     views = (
-        build_view(bodies, robot, moment_s, (settings.seed, number, k))
+        build_view(bodies, robot, moment_s, (_choose_place(settings), number, k))
         for k, moment_s in enumerate(time_s.tolist())
     )
     seen_in, drawn = tee(views)  # which holds what is drawn ahead of what is written

@@ -155,6 +155,8 @@ class FlyFlags:
         How wrong the sensors are. Without it, the recipe's.
     seed
         Another seed gives another flight. Without it, the recipe's.
+    place
+        Number of the room, for images by one camera in it. Without it, the recipe's.
     camera
         Render the images of every camera. Without it, as the recipe says.
     camera_renderer
@@ -179,6 +181,7 @@ class FlyFlags:
     trajectory: Trajectory | None = None
     noise: Preset | None = None
     seed: int | None = None
+    place: int | None = None
     camera: bool | None = None
     camera_renderer: CameraRenderer | None = None
     camera_rate_hz: float | None = None

@@ -93,20 +93,23 @@ class Simulation:
         self._resources = ExitStack()
         self._renderer: Renderer | None = None
         self._draw: ViewRenderer = SketchedPlace(0)
-        self._seed = 0
+        self._place = 0
         self._motion: SteppedFlight | None = None
         self.reckoning: dict[str, DeadReckoning] = {}
         """Dead reckoning of every robot, from its own sensors."""
 
-    def reset(self, seed: int = 0) -> dict[str, Observation]:
+    def reset(self, seed: int = 0, place: int | None = None) -> dict[str, Observation]:
         """Start a flight; return what every flown robot measures.
 
         Parameters
         ----------
         seed
             Another seed gives another flight: path, noise, and appearance.
+        place
+            Number of the room and of the cameras. None: the seed.
         """
-        self._seed, self._draw = seed, SketchedPlace(seed)
+        self._place = seed if place is None else place
+        self._draw = SketchedPlace(self._place)
         self._motion = SteppedFlight(self._scenario, self._noise, seed, self._faults)
         logs = self._motion.flight.robots
         self.reckoning = {robot: DeadReckoning(log) for robot, log in logs.items()}
@@ -176,7 +179,7 @@ class Simulation:
             return {name: body_at(one, moment_s) for name, one in truth.items()}
 
         number = self.motion.names.index(robot)
-        return build_view(bodies, robot, self.time_s, (self._seed, number, self.motion.sample))
+        return build_view(bodies, robot, self.time_s, (self._place, number, self.motion.sample))
 
     def render(self, robot: str) -> Sketch | Shot:
         """Render what a robot's camera sees now: the image, with the true labels.
@@ -211,7 +214,7 @@ class Simulation:
             self._renderer = self._resources.enter_context(
                 Renderer(ensure_environment(say), RobotModel(), workers=1)
             )
-        self._draw = FlightRenderer(self._renderer, self._seed)
+        self._draw = FlightRenderer(self._renderer, self._place)
 
     @property
     def blender_version(self) -> str:
