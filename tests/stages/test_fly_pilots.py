@@ -16,6 +16,7 @@ from dmrl import topics
 from dmrl.errors import ModelError, SettingError
 from dmrl.flight.pilot import Command, Observation, Pilot
 from dmrl.flight.pilots import PILOTS
+from dmrl.images.codec import decode
 from dmrl.recording import check, read, read_raw, read_summary, read_table, recover
 from dmrl.simulation.settings import Vision
 from dmrl.stages import convert, dataset, fly, predict, quantize, sketch, track
@@ -281,17 +282,37 @@ def test_the_command_line_takes_pilot_eye_and_distance(tmp_path: Path) -> None:
     )
 
 
+@pytest.fixture(scope="module")
+def int8(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped network, quantised by sketches."""
+    folder = tmp_path_factory.mktemp("int8")
+    sketch.run(folder / "pictures", sketch.Settings(images=24))
+    convert.run(folder / "pictures", folder / "pictures.mcap", convert.Settings())
+    dataset.run([folder / "pictures.mcap"], folder / "drawn", dataset.Settings())
+    quantize.run(Path("dmrl-nano"), folder / "drawn", folder / "int8", quantize.Settings())
+    return folder / "int8"
+
+
 @pytest.mark.slow
-def test_integers_and_c_fly_the_same_flight(tmp_path: Path) -> None:
-    sketch.run(tmp_path / "pictures", sketch.Settings(images=24))
-    convert.run(tmp_path / "pictures", tmp_path / "pictures.mcap", convert.Settings())
-    dataset.run([tmp_path / "pictures.mcap"], tmp_path / "drawn", dataset.Settings())
-    int8 = tmp_path / "int8"
-    quantize.run(Path("dmrl-nano"), tmp_path / "drawn", int8, quantize.Settings())
+@pytest.mark.parametrize("seed", range(16))
+def test_integers_and_c_fly_the_same_flight(seed: int, int8: Path, tmp_path: Path) -> None:
     flown = []
     for backend in ("integer", "c"):
         out = tmp_path / f"{backend}.mcap"
-        fly.run(out, replace(DRAWN, eye=int8, backend=backend, duration_s=2.0))
+        settings = replace(DRAWN, eye=int8, backend=backend, duration_s=30.0, seed=seed)
+        fly.run(out, settings)
         flown.append(commands(out))
-    assert np.abs(flown[0]).max() > 0.1
+    assert len(flown[0]) == 601 and np.abs(flown[0]).max() > 0.1
     np.testing.assert_array_equal(flown[0], flown[1])
+
+
+def test_flights_in_one_place_share_the_room_and_not_the_path(tmp_path: Path) -> None:
+    first = []
+    for name, seed, place in (("a", 1, None), ("b", 2, 1), ("c", 2, None)):
+        out = tmp_path / f"{name}.mcap"
+        fly.run(out, replace(DRAWN, seed=seed, place=place, duration_s=1.0))
+        rgb = decode(next(iter(read(out, "/cf1/camera/image"))).message.data).astype(float)
+        first.append((rgb.mean(axis=(0, 1)), commands(out)))
+    assert not np.allclose(first[0][1], first[1][1])
+    np.testing.assert_array_equal(first[1][1], first[2][1])  # an ideal eye sees no room
+    assert np.abs(first[1][0] - first[2][0]).max() > 2.0
