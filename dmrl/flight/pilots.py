@@ -22,9 +22,9 @@ GAIN_PER_S, CLIMB_GAIN_PER_S, TURN_GAIN_PER_S = 1.2, 0.8, 3.0
 TRUST_STD_M = 0.35
 """Standard deviation of the leader's position at which a pilot flies at half its speed: half the
 default distance."""
-RETREAT_MPS = 0.2
+RETREAT_MPS, SIGHT_M = 0.2, 0.8
 """Speed at which a pilot backs away from a leader that it does not see: from afar, the image shows
-more of the floor."""
+more of the floor. Beyond the second, where a small network seldom sees a drone, it comes closer."""
 MISSED_S = 0.15
 """A leader that was not detected for so long before the last image is not seen."""
 START_STD_M = 0.2
@@ -74,7 +74,8 @@ class Follow(Pilot):
         towards = np.array([x, y]) / max(float(np.hypot(x, y)), 1e-6)
         # Flying at the leader needs to know where it is; flying away from it does not.
         wanted = wanted - (1.0 - trust) * max(float(wanted @ towards), 0.0) * towards
-        wanted -= (1.0 - trust) * RETREAT_MPS * towards
+        back = RETREAT_MPS if float(np.hypot(x, y)) < SIGHT_M else -RETREAT_MPS
+        wanted -= (1.0 - trust) * back * towards
         climb = trust * CLIMB_GAIN_PER_S * float(to_go[2])
         passing = leader.velocity_mps[:2] - seen.velocity_mps
         rate = (x * passing[1] - y * passing[0]) / max(x * x + y * y, NEAR_M**2)
