@@ -20,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help bench bench-labels demo test test-heavy test-all test-faults mutants golden check format lint types imports spell schemas constraints docs site examples wheels layout clean
+.PHONY: help bench bench-labels demo test test-heavy test-all test-faults mutants golden check format lint types imports spell schemas constraints docs pictures site examples wheels layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -82,6 +82,9 @@ constraints: $(VENV)/.dev ## Renew the versions and hashes of constraints.txt. A
 
 docs: $(VENV)/.dev ## Write the generated parts of README.md and docs/ again.
 	$(BIN)/python docs/build.py
+
+pictures: $(VENV)/.dev ## Draw the pictures of README.md and docs/ again. ARGS="--data DIR".
+	$(BIN)/python docs/pictures.py $(ARGS)
 
 site: $(VENV)/.dev ## Build the pages of docs/ as a site: build/site/index.html.
 	$(BIN)/mkdocs build --quiet

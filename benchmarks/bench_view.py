@@ -23,7 +23,7 @@ from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter, read, read_summary, trim
 from dmrl.stages import fly
 from dmrl.viewer import Settings, save
-from dmrl.viewer.window.desktop import viewer_process
+from dmrl.viewer.window import viewer_process
 
 RATE_HZ = 20
 ROWS, COLS = 28, 40
@@ -98,7 +98,7 @@ def with_dmrl(path: Path, out: Path, layout: str) -> dict[str, float]:
 
 def with_rerun(path: Path, out: Path) -> dict[str, float]:
     """The same of rerun's own importer of MCAP."""
-    program = viewer_process.command(viewer_process.LOOPBACK)[0]
+    program = viewer_process.build_command(viewer_process.LOOPBACK)[0]
     subprocess.run([program, "mcap", "convert", str(path), "-o", str(out)], check=True)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {

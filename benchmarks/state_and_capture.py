@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from dmrl.formats.crazyflie.log_block import euler_zyx
+from dmrl.geometry.rotations import quaternion_to_euler
 from dmrl.recording import read_table
 
 COLOURS = ("#c0392b", "#1e8449", "#2471a3")
@@ -23,7 +23,7 @@ def poses(recording: Path, topic: str) -> tuple[np.ndarray, np.ndarray, np.ndarr
     rows = table["pose"].to_pylist()
     place = np.array([[row["position"][n] for n in "xyz"] for row in rows])
     turn = np.array([[row["orientation"][n] for n in "xyzw"] for row in rows])
-    angles = np.unwrap(euler_zyx(turn), axis=0)
+    angles = np.unwrap(quaternion_to_euler(turn), axis=0)
     return table["log_time"].to_numpy() * 1e-9, place, np.degrees(angles)
 
 

@@ -1,4 +1,4 @@
-"""Write the generated parts of README.md and docs/: ``make docs`` does.
+"""Write the generated parts of docs/: ``make docs`` does.
 
 Tables come from the code that they describe, and docs/commands.md from the commands' own
 help. A test compares them with what this file would write.
@@ -100,7 +100,7 @@ def filled(page: Path) -> str:
 
 def pages() -> dict[Path, str]:
     """Every page that is generated, or in part, with its text."""
-    made = {page: filled(page) for page in (ROOT / "README.md", ROOT / "docs/formats.md")}
+    made = {page: filled(page) for page in (ROOT / "docs/index.md", ROOT / "docs/formats.md")}
     typed = runpy.run_path(str(ROOT / "docs/settings_types.py"))["settings_types"]()
     return {**made, ROOT / "docs/commands.md": commands(), ROOT / "dmrl/api/settings.pyi": typed}
 
