@@ -211,6 +211,17 @@ def test_renders_of_ones_own_camera_can_be_refined_word_for_word(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_readme_can_be_walked_word_for_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    walk(ROOT / "README.md", stop=re.compile("dmrl view"))
+    assert {"tracks.mcap", "out"} <= {path.name for path in tmp_path.iterdir()}
+    assert "mismatches" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_how_a_camera_is_mounted_is_found_word_for_word(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
