@@ -74,7 +74,8 @@ class Follow(Pilot):
         towards = np.array([x, y]) / max(float(np.hypot(x, y)), 1e-6)
         # Flying at the leader needs to know where it is; flying away from it does not.
         wanted = wanted - (1.0 - trust) * max(float(wanted @ towards), 0.0) * towards
-        back = RETREAT_MPS if float(np.hypot(x, y)) < SIGHT_M else -RETREAT_MPS
+        too_far = self._seen is None and float(np.hypot(x, y)) > SIGHT_M
+        back = -RETREAT_MPS if too_far else RETREAT_MPS
         wanted -= (1.0 - trust) * back * towards
         climb = trust * CLIMB_GAIN_PER_S * float(to_go[2])
         passing = leader.velocity_mps[:2] - seen.velocity_mps

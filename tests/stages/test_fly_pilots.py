@@ -294,6 +294,7 @@ def int8(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("seed", range(16))
 def test_integers_and_c_fly_the_same_flight(seed: int, int8: Path, tmp_path: Path) -> None:
     flown = []
