@@ -75,8 +75,8 @@ class Follow(Pilot):
         # Flying at the leader needs to know where it is; flying away from it does not.
         wanted = wanted - (1.0 - trust) * max(float(wanted @ towards), 0.0) * towards
         too_far = self._seen is None and float(np.hypot(x, y)) > SIGHT_M
-        back = -RETREAT_MPS if too_far else RETREAT_MPS
-        wanted -= (1.0 - trust) * back * towards
+        back = -trust if too_far else 1.0 - trust
+        wanted -= back * RETREAT_MPS * towards
         climb = trust * CLIMB_GAIN_PER_S * float(to_go[2])
         passing = leader.velocity_mps[:2] - seen.velocity_mps
         rate = (x * passing[1] - y * passing[0]) / max(x * x + y * y, NEAR_M**2)
