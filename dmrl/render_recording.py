@@ -31,6 +31,7 @@ from dmrl.recording import (
 from dmrl.rendering.backgrounds.rooms import ROOMS
 from dmrl.rendering.blender_environment import ensure_environment
 from dmrl.rendering.camera.distortion import pinhole_canvas
+from dmrl.rendering.cutouts import CutoutRenderer, open_cutouts
 from dmrl.rendering.image_messages import OBSERVER, build_samples
 from dmrl.rendering.randomise import RandomScene, SceneSource, draw_scene
 from dmrl.rendering.renderer import Renderer, RobotModel, Scene, list_panoramas
@@ -99,7 +100,9 @@ def render_recording(out: Path, settings: Settings, *, resume: bool = False) -> 
     camera = read_render_camera(settings)
     photos = None if settings.backgrounds is None else open_backgrounds(settings.backgrounds)
     with ExitStack() as stack:
-        renderer = stack.enter_context(_open_renderer(settings))
+        renderer = _open_renderer(settings)
+        if isinstance(renderer, Renderer):
+            stack.enter_context(renderer)
         made = _describe(settings, renderer.version)
         before.check_provenance(made)
         sink = stack.enter_context(RecordingWriter(out, made, keep_on_error=True))
@@ -122,7 +125,16 @@ def render_recording(out: Path, settings: Settings, *, resume: bool = False) -> 
     return Rendered(settings.images, *_count_labels(out), broken, done)
 
 
-def _open_renderer(settings: Settings) -> Renderer:
+def _open_renderer(settings: Settings) -> Renderer | CutoutRenderer:
+    """Read the settings' cut-outs, or start Blender with their robot and panoramas."""
+    if settings.cutouts is not None:
+        found = open_cutouts(settings.cutouts)
+        tilt = settings.robot_tilt_max_deg
+        return CutoutRenderer(found, settings.cutout_width_m, tilt, matched=settings.pasted)
+    return _open_blender(settings)
+
+
+def _open_blender(settings: Settings) -> Renderer:
     """Start Blender with the settings' robot and panoramas."""
     lights = None if settings.lights is None else list_panoramas(settings.lights)
     design = DESIGNS[settings.design]
@@ -169,7 +181,7 @@ def preview_robot(out: Path, settings: Settings) -> dict[str, float]:
         raise OutputError(f"{out} is not named .png. With --preview OUT is a picture: NAME.png")
     from dmrl.rendering.robot_preview import render_preview  # noqa: PLC0415 - an extra
 
-    with _open_renderer(replace(settings, workers=1, samples=PREVIEW_SAMPLES)) as renderer:
+    with _open_blender(replace(settings, workers=1, samples=PREVIEW_SAMPLES)) as renderer:
         seen = render_preview(renderer, settings, read_render_camera(settings))
     with atomic_file(out) as partial:
         partial.write_bytes(seen.png)
@@ -201,7 +213,7 @@ def _describe(settings: Settings, blender: str) -> Provenance:
 
 def _list_sources(settings: Settings) -> list[Path]:
     """Return the files and folders that the images are made from."""
-    named = (settings.model, settings.backgrounds, settings.lights)
+    named = (settings.model, settings.cutouts, settings.backgrounds, settings.lights)
     return [path for path in named if path is not None and str(path) != ROOMS]
 
 
@@ -222,7 +234,9 @@ def _time_ns(settings: Settings, index: int) -> int:
     return round(index * 1e9 / settings.rate_hz)
 
 
-def _write_images(world: SceneSource, renderer: Renderer, sink: RecordingWriter, done: int) -> None:
+def _write_images(
+    world: SceneSource, renderer: Renderer | CutoutRenderer, sink: RecordingWriter, done: int
+) -> None:
     """Write every image from number ``done`` on, in order, as it arrives."""
     settings, camera = world.settings, world.camera
     if not done:

@@ -17,6 +17,7 @@ LIMITS: dict[str, Range] = {
     "workers": (0, 256),
     "samples": (1, 4096),
     "scale": (1e-9, 1e9),
+    "cutout_width_m": (0.01, 3.0),
     "rate_hz": (1e-3, 1e4),
     "test_share": (0, 1),
     "empty_share": (0, 1),
@@ -84,6 +85,10 @@ class Settings:
         Reference point of the labels: the middle of the model's box, or the file's origin.
     scale
         Metres per unit of the model. Without a model, times life size.
+    cutouts
+        Folder of photographs of the robot, PNG with alpha, in place of a model. Wants backgrounds.
+    cutout_width_m
+        True width of the robot in them.
     backgrounds
         Folder of photos, a dataset, or rooms for generated rooms. Default: the panoramas.
     lights
@@ -141,7 +146,8 @@ class Settings:
         of a renderer that composites over a photo.
     pasted
         Whether robots are composited over photos as the authors did: the photo keeps its values,
-        and a lamp at the camera lights the robots independently of it. Ignored without photos.
+        and a lamp at the camera lights the robots independently of it. Cut-outs take its light.
+        Ignored without photos.
     background_zoom
         Range of zoom factors of the photos.
     recoloured_share
@@ -188,6 +194,8 @@ class Settings:
     model_up: Literal["auto", "y", "z"] = "auto"
     model_centre: Literal["box", "origin"] = "box"
     scale: float = 1.0
+    cutouts: Path | None = None
+    cutout_width_m: float = 0.13
     backgrounds: Path | None = None
     lights: Path | None = None
     masks: bool = False
@@ -234,7 +242,10 @@ class Settings:
     jpeg_subsampled: bool = False
 
     def __post_init__(self) -> None:
-        if faults := list(_find_faults(self)):
+        faults = list(_find_faults(self))
+        if self.cutouts is not None and self.backgrounds is None:
+            faults.append("cutouts: they want backgrounds, a folder of photos, a dataset or rooms")
+        if faults:
             raise ValueError("; ".join(faults))
 
 
@@ -300,6 +311,14 @@ PRESETS: dict[str, dict[str, Any]] = {
         "robot_blur_px": [0.35, 0.5],
         "jpeg_subsampled": True,
         "jpeg_quality": [90, 90],
+    },
+    # Cut-outs over frames of the camera itself, which keep their values.
+    "cutouts": {
+        "pasted": True,
+        "background_blur_px": [0.0, 0.0],
+        "background_zoom": [1.0, 1.2],
+        "robot_gain": [0.3, 1.3],
+        "depth_m": [0.15, 2.2],
     },
     "plain": {},
 }

@@ -13,6 +13,9 @@ METRIC_DEFINITIONS = {
     "bias_v_px": "median error in v, label minus detection",
     "depth_mae_m": "mean absolute depth error, over labels with a detection",
     "depth_rmse_m": "root mean square depth error, over labels with a detection",
+    "r2_u": "share of the variance of u that is explained, R2, over labels with a detection",
+    "r2_v": "the same of v",
+    "r2_depth": "the same of the depth",
     "precision": "share of detections at or above the threshold that are right: in order of "
     "confidence each takes the nearest free label within 16 px",
     "recall": "share of labels taken by a detection at or above the threshold",

@@ -1,0 +1,315 @@
+"""The release gate of a shipped network: every figure, with a floor that it must not fall below.
+
+    python benchmarks/release_gate.py MODEL DATA [--part choose|judge] [--held HELD.mcap]
+        [--floors NAME] [--json] [--curve OUT.png]
+
+DATA is a folder with the published renders, real frames and cut-outs (`locanet-synthetic`,
+`locanet-multi`, `aideck-frames`, `aideck-empty`, `himax-frames`, `cutouts`); what is missing is
+left out. `--part choose` reads what settings may be chosen on: the published training images,
+which no shipped network learned from, and every second empty frame. `--part judge` reads the
+published test images and the other frames, for a release. `--held` adds renders, with recall by
+distance.
+
+A composite is a cut-out of a Crazyflie, 18 to 110 px wide, on an empty frame; two of them on
+every frame. Right: the most confident detection is within 16 px. Believed: it is above the
+threshold, too. Limits are in recipes/pretrained/release_gate.toml; the exit status is 1 if a figure
+is beyond its own.
+"""
+
+import argparse
+import json
+import sys
+import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dmrl.formats.published.locanet import load_images
+from dmrl.geometry.camera_file import find_camera
+from dmrl.geometry.frames import PUBLISHED_RENDER, project
+from dmrl.images.codec import Rgb, crop_and_scale, decode
+from dmrl.learn.inference.decode_grids import decode as decode_grids
+from dmrl.learn.inference.detection_metrics import (
+    ScoredDetections,
+    compute_curves,
+    compute_metrics,
+    score_detections,
+)
+from dmrl.learn.inference.loaded_model import Model, load_model
+from dmrl.learn.inference.matching import Points
+from dmrl.learn.inference.threshold import find_unlabelled_images
+from dmrl.learn.pretrained import resolve_model_path
+from dmrl.recording import iter_columns, read
+from dmrl.rendering.backgrounds.photos import SRGB_TO_LINEAR
+from dmrl.rendering.camera.sensor import Sensor
+from dmrl.rendering.cutouts import CutoutRenderer, open_cutouts
+from dmrl.rendering.shot import Light, Look, Robot
+from dmrl.rendering.sketch_renderer import Pose
+from dmrl.terminal.tables import print_table
+
+FLOORS = Path(__file__).parents[1] / "recipes/pretrained/release_gate.toml"
+SIZE_PX = (320, 224)
+CUTOUT_WIDTH_M = 0.13
+CUTOUT_WIDTHS_PX = (18.0, 110.0)
+FRAMES_PX = {
+    "img00185": (174, 65),
+    "img00216": (152, 135),
+    "img00375": (298, 138),
+    "img00495": (98, 130),
+}
+"""Centres of the drones in the real frames, read by eye."""
+NO_LIGHT = Light("", (0.0, 0.0, 0.0), 0.0, np.array([-1.0, 0, 0]), 0.0, (1.0, 1.0, 1.0), 0.1)
+Set = tuple[list[Rgb], list[NDArray[np.float64]]]
+"""Images, and (K, 3) labels of each: u, v, depth."""
+
+
+def fitted(path: Path) -> Rgb:
+    """An image of the size that the networks take, cut in the middle and scaled."""
+    rgb = decode(path.read_bytes(), path)
+    height, width, _ = rgb.shape
+    scale = min(width / SIZE_PX[0], height / SIZE_PX[1])
+    half_u, half_v = SIZE_PX[0] * scale / 2, SIZE_PX[1] * scale / 2
+    box = (width / 2 - half_u, height / 2 - half_v, width / 2 + half_u, height / 2 + half_v)
+    return crop_and_scale(rgb, box, *SIZE_PX)
+
+
+def published(folder: Path, *, split: str | None) -> Set:
+    """The published renders of a split, with their true projection."""
+    found = [item for item in load_images(folder) if split is None or item.split == split]
+    labels = []
+    for item in found:
+        uv, depth_m = project(item.xyz_camera, PUBLISHED_RENDER.image_from_optical)
+        labels.append(np.column_stack([uv, depth_m]))
+    return [decode(item.path.read_bytes(), item.path) for item in found], labels
+
+
+def frames(folder: Path) -> Set:
+    """The real frames with a drone; depths are unknown."""
+    paths = sorted(path for path in folder.glob("img*.ppm") if path.stem in FRAMES_PX)
+    labels = [np.array([[*FRAMES_PX[path.stem], np.nan]]) for path in paths]
+    return [decode(path.read_bytes(), path) for path in paths], labels
+
+
+def empty(folder: Path, part: str) -> Set:
+    """Every second real frame without a drone."""
+    paths = sorted(path for path in folder.rglob("*") if path.suffix in (".pgm", ".png"))
+    mine = paths[0 if part == "choose" else 1 :: 2]
+    return [fitted(path) for path in mine], [np.zeros((0, 3))] * len(mine)
+
+
+def composites(cutouts: Path, behind: Sequence[Rgb], seed: int) -> Set:
+    """Two composites on every frame, with exact labels."""
+    camera = replace(find_camera(Path("aideck")), mount_rad=(0.0, 0.0, 0.0), delay_s=0.0)
+    renderer = CutoutRenderer(open_cutouts(cutouts), CUTOUT_WIDTH_M, 15.0, matched=True)
+    rng = np.random.default_rng(seed)
+    scenes = []
+    for frame in [*behind, *behind]:
+        width_px = float(np.exp(rng.uniform(*np.log(CUTOUT_WIDTHS_PX))))
+        depth_m = camera.fx_px * CUTOUT_WIDTH_M / width_px
+        u, v = rng.uniform((20, 20), (300, 204))
+        at = [depth_m, depth_m * (camera.cx_px - u) / camera.fx_px]
+        at.append(depth_m * (camera.cy_px - v) / camera.fy_px)
+        sensor, gain = Sensor(brightness=None), float(np.exp(rng.uniform(*np.log((0.4, 1.3)))))
+        seed = int(rng.integers(2**31))
+        look = Look(np.take(SRGB_TO_LINEAR, frame), NO_LIGHT, sensor, gain, seed=seed)
+        scenes.append((camera, [Robot(Pose(np.array(at), np.eye(3)))], look))
+    shots = list(renderer.render_shots(scenes))
+    labels = [np.column_stack([shot.uv_px, shot.depth_m]) for shot in shots]
+    return [np.asarray(shot.rgb) for shot in shots], labels
+
+
+def renders(recording: Path) -> Set:
+    """The images of a rendered recording, and their labels."""
+    images = [decode(one.message.data, recording) for one in read(recording, "/cf1/camera/image")]
+    peers = [
+        row
+        for batch in iter_columns(recording, "/cf1/labels", fields=["peers"])
+        for row in batch["peers"].to_pylist()
+    ]
+    rows = [[[p["u_px"], p["v_px"], p["depth_m"]] for p in row] for row in peers]
+    return images, [np.array(row, float).reshape(-1, 3) for row in rows]
+
+
+def score(model: Model, data: Set) -> ScoredDetections:
+    """Detect, and match with the labels."""
+    images, labels = data
+    parts = []
+    for start in range(0, len(images), 16):
+        grids = model.grids(np.stack(images[start : start + 16]))
+        found = decode_grids(*grids, stride_px=model.network.stride_px)
+        image, at = np.nonzero(np.arange(found.u_px.shape[1]) < found.count[:, None])
+        columns = (found.u_px, found.v_px, found.depth_m, found.confidence)
+        parts.append(Points(image, *(column[image, at] for column in columns)))
+    inside = []
+    for row in labels:
+        seen = (row[:, :2] >= 0).all(axis=1) & (row[:, :2] < SIZE_PX).all(axis=1)
+        inside.append(row[seen])
+    flat = np.concatenate([np.zeros((0, 3)), *inside])
+    image = np.repeat(np.arange(len(inside)), [len(row) for row in inside])
+    points = Points(image, *flat.T, np.ones(len(flat)))
+    first = np.arange(0, len(images), 16)
+    return score_detections(len(images), points, Points.concatenate(parts, first))
+
+
+def located(name: str, scored: ScoredDetections, threshold: float) -> dict[str, float]:
+    """Errors, average precision and explained variance of a set with labels."""
+    one = np.ones((1, scored.images))
+    got = {k: float(v[0]) for k, v in compute_metrics(scored, (0, np.inf), threshold, one).items()}
+    kept = ("within_20_px", "median_px", "ap_16_px", "depth_mae_m", "r2_u", "r2_v", "r2_depth")
+    return {f"{name}.{key}": got[key] for key in kept}
+
+
+def first_detections(name: str, scored: ScoredDetections, threshold: float) -> dict[str, float]:
+    """Shares of images with one label whose best detection is right, and believed, too."""
+    best = scored.detections.ranks_in_image() == 0
+    right = scored.right_16_px[best] >= 0
+    believed = right & (scored.detections.confidence[best] >= threshold)
+    sure = scored.detections.confidence >= threshold
+    false = float((sure & (scored.right_16_px < 0)).sum())
+    return {
+        f"{name}.right_first": float(right.mean()),
+        f"{name}.believed": float(believed.mean()),
+        f"{name}.false_an_image": false / scored.images,
+    }
+
+
+def alarms(name: str, scored: ScoredDetections, threshold: float) -> dict[str, float]:
+    """Shares of empty images with a detection at the threshold, and detections at 0.9."""
+    image, confidence = scored.detections.image, scored.detections.confidence
+    share = len(np.unique(image[confidence >= threshold])) / scored.images
+    return {f"{name}.alarms": share, f"{name}.at_0.9": float((confidence >= 0.9).sum())}
+
+
+def by_distance(name: str, scored: ScoredDetections) -> dict[str, float]:
+    """Recall by distance at 0.02 false detections in an image without a drone."""
+    image, confidence = scored.detections.image, scored.detections.confidence
+    bare = find_unlabelled_images(scored)
+    ghosts = np.sort(confidence[bare[image]])[::-1]
+    allowed = int(0.02 * bare.sum())
+    threshold = float(ghosts[allowed]) if allowed < len(ghosts) else 0.0
+    found = np.zeros(len(scored.labels), bool)
+    sure = (confidence > threshold) & (scored.right_16_px >= 0)
+    found[scored.right_16_px[sure]] = True
+    depth = scored.labels.depth_m
+    out = {f"{name}.threshold_at_0.02": threshold}
+    for low, high in ((0, 0.5), (0.5, 1), (1, 1.5), (1.5, 2.3)):
+        mine = (depth >= low) & (depth < high)
+        if mine.any():
+            out[f"{name}.recall_{low:g}_{high:g}_m"] = float(found[mine].mean())
+    return out
+
+
+def reliability(name: str, scored: ScoredDetections) -> dict[str, float]:
+    """Share right of the detections of 0.8 and more, and the mean gap to their confidence."""
+    sure = scored.detections.confidence >= 0.8
+    right = (scored.right_16_px >= 0)[sure]
+    said = scored.detections.confidence[sure]
+    if not len(said):
+        return {}
+    curves = compute_curves(scored)
+    gap = np.abs(curves.bin_confidence - curves.bin_right)
+    weight = np.where(np.arange(10) >= 1, curves.bin_count, 0)  # what nobody believes is no matter
+    return {
+        f"{name}.said_at_0.8": float(said.mean()),
+        f"{name}.right_at_0.8": float(right.mean()),
+        f"{name}.calibration_gap": float(np.nansum(gap * weight) / max(weight.sum(), 1)),
+    }
+
+
+def far(name: str, scored: ScoredDetections) -> dict[str, float]:
+    """Share within 20 px of the labels from 1.8 m on."""
+    mine = scored.labels.depth_m >= 1.8
+    error = scored.label_error.norm_px[mine]
+    return {
+        f"{name}.within_20_px_from_1.8_m": float((error <= 20).mean()),
+        f"{name}.far": mine.sum(),
+    }
+
+
+def gate(
+    model: Model, data: Path, part: str, held: Path | None
+) -> tuple[dict[str, float], dict[str, ScoredDetections]]:
+    """Every figure of a network, and what it is made from."""
+    split = "train" if part == "choose" else "test"
+    threshold, figures = model.threshold, {"threshold": model.threshold}
+    scored: dict[str, ScoredDetections] = {}
+    bare: list[Rgb] = []
+    if (folder := data / "locanet-synthetic").is_dir():
+        scored["single"] = score(model, published(folder, split=split))
+        figures |= located("single", scored["single"], threshold) | far("single", scored["single"])
+    if part == "judge" and (folder := data / "locanet-multi").is_dir():
+        scored["multi"] = score(model, published(folder, split=None))
+        figures |= located("multi", scored["multi"], threshold)
+    if (folder := data / "aideck-frames").is_dir():
+        figures |= first_detections("frames", score(model, frames(folder)), threshold)
+    for name in ("himax-frames", "aideck-empty"):
+        if (folder := data / name).is_dir():
+            images = empty(folder, part)
+            bare += images[0]
+            scored[name] = score(model, images)
+            figures |= alarms(name, scored[name], threshold)
+    if bare and (folder := data / "cutouts").is_dir():
+        drawn = composites(folder, bare, 0 if part == "choose" else 1)
+        scored["composites"] = score(model, drawn)
+        figures |= first_detections("composites", scored["composites"], threshold)
+        both = (drawn[0] + bare, drawn[1] + [np.zeros((0, 3))] * len(bare))
+        figures |= reliability("composites_and_empty", score(model, both))
+    if held is not None:
+        scored["held"] = score(model, renders(held))
+        figures |= located("held", scored["held"], threshold)
+        figures |= by_distance("held", scored["held"]) | reliability("held", scored["held"])
+    return figures, scored
+
+
+def draw_curves(scored: dict[str, ScoredDetections], out: Path) -> None:
+    """Draw the reliability of every set with labels."""
+    import matplotlib.pyplot as plt  # noqa: PLC0415 - only for the picture
+
+    figure, axes = plt.subplots(figsize=(4.5, 4), layout="constrained")
+    axes.plot([0, 1], [0, 1], color="0.7")
+    for name, one in scored.items():
+        if len(one.labels):
+            curves = compute_curves(one)
+            seen = curves.bin_count >= 5
+            axes.plot(curves.bin_confidence[seen], curves.bin_right[seen], "o-", label=name)
+    axes.set(xlabel="confidence", ylabel="share right within 16 px")
+    axes.legend()
+    figure.savefig(out, dpi=110)
+
+
+def main() -> int:
+    """Print every figure beside its floor."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("model", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--part", choices=("choose", "judge"), default="choose")
+    parser.add_argument("--held", type=Path)
+    parser.add_argument("--floors", help="network of release_gate.toml; default: the model's name")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--curve", type=Path)
+    given = parser.parse_args()
+    model = load_model(resolve_model_path(given.model))
+    figures, scored = gate(model, given.data, given.part, given.held)
+    name = given.floors or given.model.name
+    floors = tomllib.loads(FLOORS.read_text()).get(name, {}) if FLOORS.is_file() else {}
+    if given.curve:
+        draw_curves(scored, given.curve)
+    failed, rows = [], []
+    for key, value in figures.items():
+        low, high = floors.get(key, [-np.inf, np.inf])
+        bad = given.part == "judge" and not low <= value <= high
+        failed += [key] * bad
+        limits = f"{low:g} to {high:g}" if key in floors else ""
+        rows.append((key, f"{value:.3f}", limits, "below its floor" if bad else ""))
+    if given.json:
+        json.dump({k: float(v) for k, v in figures.items()}, sys.stdout, indent=1)
+    else:
+        print_table(f"{name}, {given.part}", ("figure", "value", "floor", ""), rows)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
