@@ -8,7 +8,7 @@ import numpy as np
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
 from dmrl.images.canvas import Levels
-from dmrl.rendering.backgrounds.procedural import make_background
+from dmrl.rendering.backgrounds.rooms import draw_room
 from dmrl.rendering.robots.quadrotor import RADIUS_M
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch_renderer import Look, Pose, Sketch, render_sketch
@@ -174,7 +174,7 @@ class SketchedPlace:
         rng = np.random.default_rng((self._seed, 3))
         around_px = round(2 * np.pi * camera.fx_px / WALLS)
         high_px = camera.height_px + 2 * round(MARGIN_SHARE * camera.height_px)
-        walls = [make_background(rng, around_px, high_px) for _ in range(WALLS)]
+        walls = [draw_room(rng, around_px, high_px) for _ in range(WALLS)]
         again = -(-camera.width_px // around_px)
         return np.concatenate(walls + walls[:again], axis=1), random_look(rng, camera)
 

@@ -1,7 +1,9 @@
 """Settings of rendered images: the ranges of all random draws."""
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,49 +12,11 @@ from dmrl.errors import RecipeError
 Range = tuple[float, float]
 
 ANY = (-float("inf"), float("inf"))
-# Minimum and maximum of every key that is a number or a range of numbers.
-LIMITS: dict[str, Range] = {
-    "images": (1, 9_999_999),
-    "seed": (0, 2**31 - 1),
-    "workers": (0, 256),
-    "samples": (1, 4096),
-    "scale": (1e-9, 1e9),
-    "cutout_width_m": (0.01, 3.0),
-    "rate_hz": (1e-3, 1e4),
-    "test_share": (0, 1),
-    "empty_share": (0, 1),
-    "robots_max": (1, 20),
-    "place_u": (0, 1),
-    "place_v": (0, 1),
-    "depth_m": (0.08, 50.0),
-    "robot_tilt_max_deg": (0, 90),
-    "camera_tilt_max_deg": (0, 60),
-    "speed_max_mps": (0, 20),
-    "shutter_s": (0, 0.1),
-    "shake_max_dps": (0, 500),
-    "rotor_speed_rps": (0, 1000),
-    "rotors_stopped_share": (0, 1),
-    "wear": (0, 1),
-    "colour_spread": (0, 1),
-    "painted_share": (0, 1),
-    "light_strength": (0, 20),
-    "sun_strength": (0, 50),
-    "robot_gain": (0.05, 20),
-    "robot_blur_px": (0, 5),
-    "background_zoom": (1, 8),
-    "recoloured_share": (0, 1),
-    "background_contrast": (0.2, 5),
-    "background_blur_px": (0, 20),
-    "brightness": (0.02, 0.98),
-    "contrast_gamma": (0.5, 3),
-    "warmth": (0.2, 5),
-    "saturation": (0, 1),
-    "vignetting": (0, 1),
-    "defocus_px": (0, 10),
-    "shot_noise": (0, 0.1),
-    "read_noise": (0, 0.3),
-    "jpeg_quality": (1, 100),
-}
+TABLE = tomllib.loads(files(__package__).joinpath("settings.toml").read_text("utf-8"))
+LIMITS: dict[str, list[float]] = TABLE["limits"]
+"""Minimum and maximum of every key that is a number or a range of numbers."""
+PRESETS: dict[str, dict[str, Any]] = TABLE["presets"]
+"""Defaults by the recipe's key `preset`. The recipe's other keys override them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,65 +227,6 @@ def _find_faults(settings: Settings) -> list[str]:
         elif list(numbers) != sorted(numbers):
             faults.append(f"{key.name}: {value} ends before it begins")
     return faults
-
-
-# Defaults by the recipe's key `preset`. The recipe's other keys override them.
-PRESETS: dict[str, dict[str, Any]] = {
-    # The HM01B0 of the AI-deck: raw response, no white balance, small lens.
-    "himax": {
-        "camera": "aideck",
-        "distorted": True,
-        "robots_max": 1,
-        "speed_max_mps": 0.6,
-        "shutter_s": [0.002, 0.012],
-        "shake_max_dps": 40.0,
-        "background_blur_px": [0.0, 1.0],
-        "robot_gain": [0.25, 1.4],
-        "brightness": [0.28, 0.58],
-        "contrast_gamma": [1.2, 1.9],
-        "warmth": [0.5, 4.0],
-        "saturation": [0.2, 0.7],
-        "vignetting": [0.55, 0.95],
-        "defocus_px": [0.2, 1.2],
-        "bayer": True,
-        "shot_noise": [0.0001, 0.001],
-        "read_noise": [0.001, 0.005],
-        "jpeg_quality": [98, 100],  # below, JPEG makes noise coarser than that of real images
-    },
-    # The authors' renders: f = 120 px, centred, robots at twice life size, a clean camera.
-    "published": {
-        "camera": "published",
-        "distorted": False,
-        "robots_max": 1,
-        "empty_share": 0.0,
-        "scale": 2.0,
-        "place_u": [0.0875, 0.9125],  # y/x to 1.1
-        "place_v": [0.045, 0.955],  # z/x to 0.85
-        "depth_m": [0.2, 2.0],
-        "robot_turns": "xzy",
-        "rotors_stopped_share": 1.0,
-        "background_zoom": [1.0, 1.0],
-        "background_blur_px": [0.0, 0.0],
-        "wear": [0.0, 0.0],
-        "pasted": True,
-        "depth_spacing": "linear",
-        "light_strength": [0.08, 0.16],
-        "sun_strength": [1.5, 1.9],
-        "robot_gain": [1.0, 1.0],
-        "robot_blur_px": [0.35, 0.5],
-        "jpeg_subsampled": True,
-        "jpeg_quality": [90, 90],
-    },
-    # Cut-outs over frames of the camera itself, which keep their values.
-    "cutouts": {
-        "pasted": True,
-        "background_blur_px": [0.0, 0.0],
-        "background_zoom": [1.0, 1.2],
-        "robot_gain": [0.3, 1.3],
-        "depth_m": [0.15, 2.2],
-    },
-    "plain": {},
-}
 
 
 def filled(keys: Mapping[str, Any]) -> dict[str, Any]:

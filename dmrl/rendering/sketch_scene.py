@@ -6,14 +6,18 @@ import numpy as np
 from numpy.random import Generator
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
-from dmrl.images.canvas import FloatImage
-from dmrl.rendering.backgrounds.procedural import make_background, random_window
+from dmrl.images.canvas import FloatImage, Levels
+from dmrl.rendering.backgrounds.photos import Photos
+from dmrl.rendering.backgrounds.rooms import draw_numbered_room
 from dmrl.rendering.robots.quadrotor import RADIUS_M
 from dmrl.rendering.sketch_renderer import Look, Pose
 
 DEPTH_M = (0.2, 2.0)
 TILT_MAX_RAD = float(np.radians(20))
 MAX_TRIES_PER_ROBOT = 30
+ROOM_COUNT = 60
+"""Rooms behind sketches. All of them stay in memory."""
+MAX_ZOOM = 2.5
 
 
 def random_poses(rng: Generator, camera: Camera, count: int) -> list[Pose]:
@@ -75,11 +79,10 @@ def random_look(rng: Generator, camera: Camera) -> Look:
     camera
         Camera with the size of the image.
     """
-    size = camera.width_px, camera.height_px
     towards = rng.normal((0.0, 0.0, 1.5), 1.0)
     noise = random_noise(rng, camera)
     return Look(
-        background=make_background(rng, *size),
+        background=_draw_background(rng, camera),
         light_camera=towards / np.linalg.norm(towards),
         ambient=rng.uniform(0.3, 0.7),
         shine=rng.uniform(0.6, 1.6) * rng.normal(1, 0.06, 3),
@@ -96,13 +99,25 @@ def random_look(rng: Generator, camera: Camera) -> Look:
 
 def random_noise(rng: Generator, camera: Camera) -> FloatImage:
     """Return (H, W, 3) grey white noise for an image of a camera."""
-    size = camera.width_px, camera.height_px
-    window = random_window(rng, _noise_table(*size), *size)
-    return window.reshape(camera.height_px, camera.width_px, 3)
+    width, height = camera.width_px, camera.height_px
+    top, left = int(rng.integers(height + 1)), int(rng.integers(width + 1))
+    return _noise_table(width, height)[top : top + height, left : left + width]
+
+
+def _draw_background(rng: Generator, camera: Camera) -> Levels:
+    """Draw a part of one of few rooms, in tones of their own: drawing a room takes long."""
+    crop = _open_rooms().random_crop(rng, camera, rng.uniform(1, MAX_ZOOM))
+    return crop[..., rng.permutation(3)]
+
+
+@cache
+def _open_rooms() -> Photos:
+    return Photos(draw_numbered_room, ROOM_COUNT)
 
 
 @cache
 def _noise_table(width_px: int, height_px: int) -> FloatImage:
-    """Return (2 H, 2 W * 3) grey white noise. Every image uses a random window of it."""
+    """Return (2 H, 2 W, 3) grey white noise. Every image uses a random window of it."""
     rng = np.random.default_rng(0)
-    return rng.standard_normal((2 * height_px, 2 * width_px), np.float32).repeat(3, axis=1)
+    noise = rng.standard_normal((2 * height_px, 2 * width_px, 1), np.float32)
+    return noise.repeat(3, axis=2)

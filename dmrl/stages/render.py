@@ -68,6 +68,7 @@ def command(
     seed: int | None = None,
     workers: int | None = None,
     backgrounds: Path | None = None,
+    cutouts: Path | None = None,
     camera: Path | None = None,
     model: Path | None = None,
     scale: float | None = None,
@@ -94,6 +95,8 @@ def command(
     backgrounds
         What to put behind the robots: a folder of photos; rooms, which are made by code; or a
         dataset whose train images are put there, their robots painted over.
+    cutouts
+        Folder of photographs of your own robot, cut out, PNG with alpha, in place of a model.
     camera
         Calibration of the camera, a TOML file as dmrl calibrate writes, or aideck or published.
     model
@@ -124,6 +127,7 @@ def command(
         seed=seed,
         workers=workers,
         backgrounds=backgrounds,
+        cutouts=cutouts,
         camera=camera,
         model=model,
         scale=scale,

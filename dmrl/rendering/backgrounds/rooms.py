@@ -8,17 +8,10 @@ import numpy as np
 from numpy.random import Generator
 
 from dmrl.geometry.frames import Array
-from dmrl.images.canvas import Colour, FloatImage
+from dmrl.images.canvas import LEVELS, Colour, FloatImage
 from dmrl.images.codec import Rgb
 from dmrl.rendering.backgrounds.photos import Photos
-from dmrl.rendering.backgrounds.room_items import (
-    FLAT_ITEMS,
-    STANDING_ITEMS,
-    WALL_ITEMS,
-    FloorItem,
-    dark_colour,
-    greyish_colour,
-)
+from dmrl.rendering.backgrounds.room_items import draw_item, greyish_colour
 from dmrl.rendering.backgrounds.room_view import RoomView, Surface, build_turn
 
 ROOMS = "rooms"
@@ -34,16 +27,16 @@ OUTDOOR_SHARE = 0.15
 
 def open_rooms() -> Photos:
     """Return generated rooms as photos. Room k is the same on every machine."""
-    return Photos(_draw_numbered_room, ROOM_COUNT)
+    return Photos(draw_numbered_room, ROOM_COUNT)
 
 
-def _draw_numbered_room(number: int) -> Rgb:
-    picture = draw_room(np.random.default_rng((number, 8)), *SIZE_PX)
-    return np.asarray(picture * 255 + 0.5, np.uint8)
+def draw_numbered_room(number: int) -> Rgb:
+    """Draw room number ``number``, (H, W, 3)."""
+    return draw_room(np.random.default_rng((number, 8)), *SIZE_PX)
 
 
-def draw_room(rng: Generator, width_px: int, height_px: int) -> FloatImage:
-    """Draw a random room, (height_px, width_px, 3), with the values of a photo, 0 to 1.
+def draw_room(rng: Generator, width_px: int, height_px: int) -> Rgb:
+    """Draw a random room, (height_px, width_px, 3), with the values of a photo.
 
     Parameters
     ----------
@@ -56,11 +49,14 @@ def draw_room(rng: Generator, width_px: int, height_px: int) -> FloatImage:
     low, high = _draw_box(rng, outdoors=outdoors)
     view = _draw_view(rng, (width_px, height_px), low, high)
     for _ in range(int(rng.integers(1, 9))):
-        WALL_ITEMS[rng.integers(len(WALL_ITEMS))](view, *_draw_wall_place(rng, low, high))
-    for item, at in _draw_floor_places(rng, low, high):
-        item(view, at, float(rng.uniform(0, 2 * np.pi)))
+        draw_item(view, "wall", *_draw_wall_place(rng, low, high))
+    for where in ("flat", "standing", "small"):
+        for _ in range(int(rng.integers(0, 6))):
+            at = _draw_floor_place(rng, low, high)
+            draw_item(view, where, at, float(rng.uniform(0, 2 * np.pi)))
     canvas = view.paint(low, high, _draw_surfaces(rng, outdoors=outdoors))
-    return np.clip(_add_bloom(view, canvas.to_rgb()), 0, 1)
+    lit = _add_bloom(view, canvas.to_rgb())
+    return np.asarray(np.clip(lit, 0, 1) * LEVELS + 0.5, np.uint8)
 
 
 def _draw_box(rng: Generator, *, outdoors: bool) -> tuple[Array, Array]:
@@ -108,39 +104,37 @@ def _draw_surfaces(rng: Generator, *, outdoors: bool) -> list[Surface]:
 def _draw_wall(rng: Generator, paint: Colour, *, outdoors: bool) -> Surface:
     """Draw paint, bricks, a curtain, or the windows of a street."""
     if outdoors:
-        glass = dark_colour(rng) if rng.random() < 0.7 else greyish_colour(rng, 0.6, 1)
+        glass = (
+            greyish_colour(rng, 0.02, 0.3) if rng.random() < 0.7 else greyish_colour(rng, 0.6, 1)
+        )
         cell_m = (float(rng.uniform(1.2, 3)), float(rng.uniform(2, 3.5)))
         return Surface(greyish_colour(rng, 0.2, 0.8), glass, "windows", cell_m, stain=0.3)
     kind = rng.random()
     if kind < 0.1:
-        return Surface(dark_colour(rng), paint, "curtain", (float(rng.uniform(0.08, 0.3)), 1.0))
+        return Surface(
+            greyish_colour(rng, 0.02, 0.3), paint, "curtain", (float(rng.uniform(0.08, 0.3)), 1.0)
+        )
     if kind < 0.2:
         size = float(rng.uniform(0.06, 0.3))
         return Surface(greyish_colour(rng, 0.2, 0.9), paint, "boards", (2 * size, size), joint=0.08)
     return Surface(paint * rng.uniform(0.8, 1), paint, grain=0.02)
 
 
-def _draw_wall_place(rng: Generator, low: Array, high: Array) -> tuple[Array, Array]:
+def _draw_wall_place(rng: Generator, low: Array, high: Array) -> tuple[Array, float]:
     """Draw a place at the bottom of the wall ahead or to a side, and the direction along it."""
     side = int(rng.integers(3))
     if side == 0:
-        return np.array([high[0], rng.uniform(low[1], high[1]), 0.0]), np.array([0.0, -1.0, 0.0])
-    y, along = (high[1], 1.0) if side == 1 else (low[1], -1.0)
-    return np.array([rng.uniform(0.3, high[0]), y, 0.0]), np.array([along, 0.0, 0.0])
+        return np.array([high[0], rng.uniform(low[1], high[1]), 0.0]), -np.pi / 2
+    y, yaw = (high[1], 0.0) if side == 1 else (low[1], np.pi)
+    return np.array([rng.uniform(0.3, high[0]), y, 0.0]), yaw
 
 
-def _draw_floor_places(rng: Generator, low: Array, high: Array) -> list[tuple[FloorItem, Array]]:
-    """Draw what lies and what stands on the floor, and where: most of it in view."""
-    flat, standing = int(rng.integers(0, 7)), int(rng.integers(0, 7))
-    items = [FLAT_ITEMS[k] for k in rng.integers(len(FLAT_ITEMS), size=flat)]
-    items += [STANDING_ITEMS[k] for k in rng.integers(len(STANDING_ITEMS), size=standing)]
-    places = []
-    for item in items:
-        far = float(np.exp(rng.uniform(np.log(0.8), np.log(7.0))))
-        bearing = float(rng.uniform(-1.1, 1.1))
-        at = np.array([far * np.cos(bearing), far * np.sin(bearing), 0.0])
-        places.append((item, np.clip(at, low + INSIDE_M, high - INSIDE_M)))
-    return places
+def _draw_floor_place(rng: Generator, low: Array, high: Array) -> Array:
+    """Draw a place on the floor, mostly in view."""
+    far = float(np.exp(rng.uniform(np.log(0.8), np.log(7.0))))
+    bearing = float(rng.uniform(-1.1, 1.1))
+    at = np.array([far * np.cos(bearing), far * np.sin(bearing), 0.0])
+    return np.clip(at, low + INSIDE_M, high - INSIDE_M)
 
 
 def _add_bloom(view: RoomView, picture: FloatImage) -> FloatImage:

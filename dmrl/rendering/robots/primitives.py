@@ -1,14 +1,17 @@
 """Solids from which robots are built: boxes, prisms and cylinders, each of one material."""
 
+import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from importlib.resources import files
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.geometry.frames import Array
 
+MOTOR_ANGLES_RAD = np.pi / 4 + np.pi / 2 * np.arange(4)
 CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
 
 Part = tuple[str, Array, NDArray[np.int64]]
@@ -161,3 +164,40 @@ def make_chamfered_box(
         ]
     )
     return name, *make_prism(outline + np.array([x, y]), z - size[2] / 2, z + size[2] / 2)
+
+
+MAKERS: Mapping[str, Callable[..., Part]] = {
+    "box": make_box,
+    "chamfered": make_chamfered_box,
+    "cylinder": make_cylinder,
+}
+
+
+def read_design(
+    name: str, more: Callable[[], Iterable[Part]], scale: float = 1.0, lift_m: float = 0.0
+) -> RobotDesign:
+    """Read a robot's table, a TOML file beside this one.
+
+    Parameters
+    ----------
+    name
+        Name of the file, without its suffix.
+    more
+        Builds the parts that no table describes: rotors or blades.
+    scale, lift_m
+        Applied to all parts: factor, then offset upwards, metres.
+    """
+    table = tomllib.loads(files(__package__).joinpath(f"{name}.toml").read_text("utf-8"))
+    parts = table["parts"]
+
+    def build() -> Iterable[Part]:
+        made = [MAKERS[kind](*rest) for kind, *rest in parts["body"]]
+        for k, angle in enumerate(MOTOR_ANGLES_RAD):
+            arm = parts["arm"] + parts.get(f"arm_{k}", [])
+            made += [rotate_part(MAKERS[kind](*rest), angle) for kind, *rest in arm]
+        lift = np.array([0.0, 0.0, lift_m])
+        return [(kind, points * scale + lift, faces) for kind, points, faces in (*made, *more())]
+
+    paint = {key: (tuple(colour), *finish) for key, (colour, *finish) in table["paint"].items()}
+    others = {key: tuple(map(tuple, colours)) for key, colours in table["others"].items()}
+    return RobotDesign(paint, others, build)
