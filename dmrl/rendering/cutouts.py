@@ -10,13 +10,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.random import Generator
-from PIL import Image
 
 from dmrl.errors import SettingError, SourceError
 from dmrl.geometry.frames import Camera, project
-from dmrl.guards import limits
 from dmrl.guards.paths import refuse_pipes
-from dmrl.images.codec import decode
+from dmrl.images.layers import decode_with_alpha, turn_and_scale
 from dmrl.rendering.backgrounds.photos import SRGB_TO_LINEAR
 from dmrl.rendering.camera.distortion import FloatImage, pinhole_canvas
 from dmrl.rendering.camera.image_statistics import measure_images
@@ -53,11 +51,7 @@ def read_cutout(path: Path) -> Cutout:
     SourceError
         If the file is not readable, has no alpha, or shows nothing.
     """
-    decode(path.read_bytes(), path, limits.PIXELS)  # refuses what is broken or too large
-    with Image.open(path) as image:
-        if "A" not in image.getbands() and "transparency" not in image.info:
-            raise SourceError(f"{path} has no alpha. Cut the robot out and save it as PNG")
-        levels = np.asarray(image.convert("RGBA"))
+    levels = decode_with_alpha(path.read_bytes(), path)
     alpha = levels[..., 3:].astype(np.float32) / np.float32(255)
     solid = alpha[..., 0] >= MIN_OPACITY
     if not solid.any():
@@ -146,24 +140,14 @@ class CutoutRenderer:
         if (low >= high).any():
             return None
         seen = cutout.light[:, ::-1] if mirrored else cutout.light
-        corners = (np.stack([low, high]) - (uv[0] - half)) * scale
-        light = _resample(seen, turn_deg, corners.ravel().tolist(), (high - low).tolist())
+        left, top, right, bottom = (
+            ((np.stack([low, high]) - (uv[0] - half)) * scale).ravel().tolist()
+        )
+        width, height = (high - low).tolist()
+        light = turn_and_scale(seen, turn_deg, (left, top, right, bottom), (width, height))
         light = match_backdrop(light, backdrop, rng, brightness=self._matched)
         flat = np.where(light[..., 3] > 0, np.float32(depth_m[0]), np.float32(0))
         return Layer(int(low[0]), int(low[1]), light, flat)
-
-
-def _resample(
-    light: FloatImage, turn_deg: float, box_px: list[float], size_px: list[int]
-) -> FloatImage:
-    """Return the (h, w, 4) average of a box of a turned image."""
-    channels = []
-    for channel in np.moveaxis(light, 2, 0):
-        image = Image.fromarray(np.ascontiguousarray(channel))
-        turned = image.rotate(turn_deg, Image.Resampling.BILINEAR)
-        box = (box_px[0], box_px[1], box_px[2], box_px[3])
-        channels.append(turned.resize((size_px[0], size_px[1]), Image.Resampling.BOX, box=box))
-    return np.stack([np.asarray(one, np.float32) for one in channels], axis=2)
 
 
 def match_backdrop(
