@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from dmrl.atomic_output import atomic_folder, refuse_existing, to_partial_path
 from dmrl.datasets import Split, open_dataset
@@ -152,7 +153,7 @@ def _train_in_process(
         _refuse_unfinished(to_partial_path(out), resume=resume)
     data = open_dataset(dataset)
     train = data.split("train")
-    examples, held_out, shares = load_training_data(data, settings)
+    examples, held_out, shares, sources = load_training_data(data, settings)
     network = _build_network(settings, examples, given.init)
     first = {name: value.clone() for name, value in get_weights(network).items()}
     teacher = _load_teacher(given.teacher, network) if given.teacher else None
@@ -178,7 +179,7 @@ def _train_in_process(
         result = _run_steps(training, settings, len(examples), group)
         if group.is_main:
             interpolate_weights(training.network, first, settings.init_share)
-            judged = _calibrate(training.network, held_out, settings)
+            judged = _calibrate(training.network, held_out, sources, settings)
             save_model(_to_model(training, settings, train, len(examples), judged), folder)
             remove_checkpoint(folder)
     return result
@@ -206,12 +207,17 @@ class Calibrated(NamedTuple):
     promise: dict[str, Any] | None = None
 
 
-def _calibrate(network: Network, held_out: ExampleSet | None, settings: TrainConfig) -> Calibrated:
+def _calibrate(
+    network: Network,
+    held_out: ExampleSet | None,
+    sources: NDArray[np.int64] | None,
+    settings: TrainConfig,
+) -> Calibrated:
     """Calibrate the network on the images held out, and choose its threshold there."""
     if held_out is None:
         return Calibrated(_or_published(settings.threshold), None, None)
     scored = score_examples(network, held_out)
-    found = fit_calibration(scored)
+    found = fit_calibration(scored, sources)
     if found is not None and apply_calibration(network, found):
         scored = score_examples(network, held_out)
     else:
@@ -283,7 +289,8 @@ def _run_steps(
         pass
     seconds = time.perf_counter() - begun
     seen = left * min(settings.batch_size, images)
-    return Result(images, training.history[-1]["loss"], seconds, seen / seconds)
+    loss = training.history[-1]["loss"] if training.history else 0.0
+    return Result(images, loss, seconds, seen / seconds)
 
 
 def _to_model(

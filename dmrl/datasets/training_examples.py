@@ -28,11 +28,14 @@ class TrainingData(NamedTuple):
     shares
         (N,) mean number of times that each of ``examples`` is drawn in an epoch, 1 on average.
         None: each once.
+    sources
+        (N,) number of the recording of each image of ``held_out``.
     """
 
     examples: ExampleSet
     held_out: ExampleSet | None
     shares: NDArray[np.float64] | None
+    sources: NDArray[np.int64] | None
 
 
 def load_training_data(data: Dataset, settings: TrainConfig) -> TrainingData:
@@ -56,12 +59,19 @@ def load_training_data(data: Dataset, settings: TrainConfig) -> TrainingData:
     _require_classes(train, every, settings.classes)
     sources = np.array(train.table.column("source").to_pylist())
     held = np.zeros(len(every), bool)
-    watched = build_examples(data.split("val"), settings.classes) if "val" in data.splits else None
-    if watched is None and settings.validation_share:
+    watched, watched_sources = None, sources[:0]
+    if "val" in data.splits:
+        val = data.split("val")
+        watched = build_examples(val, settings.classes)
+        watched_sources = np.array(val.table.column("source").to_pylist())
+    elif settings.validation_share:
         held = _select_last_share(sources, settings.validation_share)
         watched = every.select(held) if held.any() else None
+        watched_sources = sources[held]
     learnt = every.select(~held) if held.any() else every
-    return TrainingData(learnt, watched, _compute_sample_weights(sources[~held], settings.shares))
+    weights = _compute_sample_weights(sources[~held], settings.shares)
+    numbers = np.unique(watched_sources, return_inverse=True)[1] if watched is not None else None
+    return TrainingData(learnt, watched, weights, numbers)
 
 
 def _require_classes(train: Split, every: ExampleSet, classes: Sequence[str]) -> None:

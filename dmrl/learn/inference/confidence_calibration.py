@@ -14,6 +14,7 @@ from torch import nn
 
 from dmrl.learn.inference.detection_metrics import ScoredDetections
 from dmrl.learn.inference.detector_rates import fit_logistic
+from dmrl.learn.inference.matching import Index
 from dmrl.learn.networks.architectures import Network
 
 MIN_DETECTIONS = 30
@@ -31,7 +32,7 @@ class PlattScaling(NamedTuple):
     offset: float
 
 
-def fit_calibration(scored: ScoredDetections) -> PlattScaling | None:
+def fit_calibration(scored: ScoredDetections, group: Index | None = None) -> PlattScaling | None:
     """Fit the slope and offset that make each confidence the fraction of correct detections.
 
     A detection is correct within 16 px of a label.
@@ -40,6 +41,9 @@ def fit_calibration(scored: ScoredDetections) -> PlattScaling | None:
     ----------
     scored
         Matched detections of images that the network was not trained on.
+    group
+        (images,) number of the source of each image: renders, composites, real frames. Each source
+        counts the same, however many detections it has. None: one source.
 
     Returns
     -------
@@ -53,7 +57,9 @@ def fit_calibration(scored: ScoredDetections) -> PlattScaling | None:
         return None
     p = np.clip(confidence[seen], 1e-7, 1 - 1e-7)
     rows = np.column_stack([np.log(p / (1 - p)), np.ones(len(p))])
-    slope, offset = fit_logistic(rows, right).tolist()
+    sources = np.zeros(len(p), np.int64) if group is None else group[scored.detections.image[seen]]
+    weight = 1 / np.bincount(sources)[sources]
+    slope, offset = fit_logistic(rows, right, weight * len(p) / weight.sum()).tolist()
     return PlattScaling(slope, offset) if SLOPE_RANGE[0] <= slope <= SLOPE_RANGE[1] else None
 
 

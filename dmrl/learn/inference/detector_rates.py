@@ -76,21 +76,22 @@ def _share_by_distance(depth_m: Array, found: Array) -> tuple[list[float], list[
     return middles, shares
 
 
-def fit_logistic(rows: Array, right: Array) -> Array:
+def fit_logistic(rows: Array, right: Array, counts: Array | float = 1.0) -> Array:
     """Fit a logistic regression of (N,) labels on (N, K) rows; return (K,) weights.
 
-    Newton's method with step halving, so that the loss never increases.
+    Newton's method with step halving, so that the loss never increases. ``counts`` (N,) says how
+    often each row counts.
     """
 
     def loss(weights: Array) -> float:
         odds = rows @ weights
-        return float((np.logaddexp(0, odds) - right * odds).sum())
+        return float((counts * (np.logaddexp(0, odds) - right * odds)).sum())
 
     found, before = np.zeros(rows.shape[1]), np.inf
     for _ in range(NEWTON_STEPS):
         said = 1 / (1 + np.exp(-np.clip(rows @ found, -50, 50)))
-        bend = (rows.T * (said * (1 - said))) @ rows + NEWTON_RIDGE * np.eye(len(found))
-        step = np.linalg.solve(bend, rows.T @ (said - right))
+        bend = (rows.T * (counts * said * (1 - said))) @ rows + NEWTON_RIDGE * np.eye(len(found))
+        step = np.linalg.solve(bend, rows.T @ (counts * (said - right)))
         while loss(found - step) > loss(found) and np.abs(step).max() > NEWTON_TOLERANCE:
             step = step / 2
         found = found - step

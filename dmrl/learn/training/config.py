@@ -22,7 +22,7 @@ class TrainConfig(LossSettings):
     architecture
         Name of the network. auto: that of the model to start from, or dmrl-nano if there is none.
     epochs
-        Number of epochs of ``epoch_images`` images.
+        Number of epochs of ``epoch_images`` images. 0: calibrate the model to start from anew.
     epoch_images
         Images per epoch, drawn with repetition from a small dataset and as a sample from a large
         one. 0: the size of the dataset.
@@ -200,9 +200,9 @@ FRACTION_SETTINGS = (
     *("blur_share", "colour", "noise", "distill_share", "grey_share", "hard_share"),
     "init_share",
 )
-POSITIVE_SETTINGS = ("epochs", "batch_size", "processes")
+POSITIVE_SETTINGS = ("batch_size", "processes")
 NON_NEGATIVE_SETTINGS = (
-    "epoch_images",
+    *("epochs", "epoch_images"),
     *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus", "seed"),
     *(term.weight for term in TERMS),
     *("rotation_deg", "paste"),

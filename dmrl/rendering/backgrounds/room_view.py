@@ -319,7 +319,7 @@ def _paint_pattern(
     whole_a = np.floor(a)
     edges = [np.abs(part - whole - 0.5) for part, whole in ((a, whole_a), (b, whole_b))]
     if surface.pattern == "windows":
-        return (np.maximum(*edges) < np.float32(0.3)).astype(np.float32)
+        return np.asarray(np.maximum(*edges) < np.float32(0.3), np.float32)
     numbers = [whole.astype(np.int32) % NOISE_CELLS for whole in (whole_a, whole_b)]
     tone *= 1 + np.float32(0.04) * _noise_table()[0][numbers[0], numbers[1]]
     shares = np.zeros(len(a), np.float32)

@@ -134,7 +134,7 @@ def _draw_floor_place(rng: Generator, low: Array, high: Array) -> Array:
     far = float(np.exp(rng.uniform(np.log(0.8), np.log(7.0))))
     bearing = float(rng.uniform(-1.1, 1.1))
     at = np.array([far * np.cos(bearing), far * np.sin(bearing), 0.0])
-    return np.clip(at, low + INSIDE_M, high - INSIDE_M)
+    return np.asarray(np.clip(at, low + INSIDE_M, high - INSIDE_M))
 
 
 def _add_bloom(view: RoomView, picture: FloatImage) -> FloatImage:

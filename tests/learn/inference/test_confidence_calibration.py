@@ -60,6 +60,22 @@ def test_confidence_is_the_share_that_is_right_afterwards() -> None:
     assert gaps[1] < 0.03
 
 
+def test_every_source_counts_the_same_however_large_it_is() -> None:
+    large, small = scored(2.5, 1.0, count=8000), scored(2.5, -1.0, count=1000)
+    first = np.array([0, large.images])
+    labels, found = (
+        Points.concatenate([getattr(large, name), getattr(small, name)], first)
+        for name in ("labels", "detections")
+    )
+    both = score_detections(large.images + small.images, labels, found)
+    group = np.repeat([0, 1], [large.images, small.images])
+    alone, shared = fit_calibration(both), fit_calibration(both, group)
+    assert alone is not None
+    assert shared is not None
+    assert alone.offset > 0.6
+    assert shared.offset == pytest.approx(0, abs=0.2)
+
+
 def test_too_little_to_tell_or_no_sense_in_it_is_no_calibration() -> None:
     assert fit_calibration(scored(2.5, 1.0, count=40)) is None
     assert fit_calibration(scored(-1.0, 0.0)) is None
