@@ -174,7 +174,7 @@ def test_validation_is_watched_and_changes_nothing(examples: ExampleSet, tmp_pat
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("epochs", 0),
+        ("epochs", -1),
         ("batch_size", 0),
         ("learning_rate", 0.0),
         ("final_learning_rate", 1.0),
