@@ -114,6 +114,8 @@ def train_network(
     """
     if settings.init_share and init is None:
         raise SettingError("init_share: there is nothing to keep a share of. Give --init MODEL")
+    if not settings.epochs and init is None:
+        raise SettingError("epochs: 0 trains nothing. Give --init MODEL to calibrate, or epochs")
     given = Given(init and resolve_model_path(init), teacher and resolve_model_path(teacher))
     settings = _with_architecture(settings, given.init)
     processes = settings.processes if select_device(settings.device).type == "cpu" else 1

@@ -304,8 +304,20 @@ def test_flags_win_over_the_recipe(dots_dataset: Path, tmp_path: Path) -> None:
 
 
 def test_a_flag_out_of_range_is_one_line() -> None:
-    with pytest.raises(SettingError, match="epochs: must be at least 1"):
-        recipe.load("dmrl_nano", "train", Settings, Flags(epochs=0))
+    with pytest.raises(SettingError, match="epochs: must not be negative"):
+        recipe.load("dmrl_nano", "train", Settings, Flags(epochs=-1))
+
+
+def test_no_epochs_calibrate_a_model_and_train_nothing(dots_dataset: Path, tmp_path: Path) -> None:
+    none = Flags(epochs=0, device="cpu")
+    with pytest.raises(SettingError, match="epochs: 0 trains nothing"):
+        train.command(dots_dataset, tmp_path / "run", flags=none)
+    train.command(dots_dataset, tmp_path / "run", flags=Flags(epochs=1, device="cpu"))
+    train.command(dots_dataset, tmp_path / "again", init=tmp_path / "run", flags=none)
+    before, after = (load_model(tmp_path / name).network for name in ("run", "again"))
+    heads = {"head.weight", "head.bias"}
+    names = before.state_dict().keys() - heads
+    assert all(bool((before.state_dict()[k] == after.state_dict()[k]).all()) for k in names)
 
 
 def test_json_names_the_model(
