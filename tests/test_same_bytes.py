@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,8 @@ import pytest
 
 pytestmark = pytest.mark.heavy
 COMMANDS = {
-    "sketch": "sketch out --images 6",
+    "sketch": "sketch out --images 20",
+    "pilot": "fly fly_in_view out.mcap --pilot follow --eye truth --duration-s 6 --seed 2",
     "fly": "fly fly_in_view out.mcap --duration-s 8 --seed 2 --camera --camera-rate-hz 1",
     "label": "label {flight} out.mcap",
     "dataset": "dataset {flight} out --split none",
@@ -34,6 +36,12 @@ MACHINES = {
         "UMASK": "077",
     },
 }
+if platform.machine() == "x86_64":
+    MACHINES["an older processor"] = {
+        "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4",
+        "OPENBLAS_CORETYPE": "Nehalem",
+        "ONEDNN_MAX_CPU_ISA": "SSE41",
+    }
 
 
 def run(words: str, folder: Path, **settings: str) -> str:

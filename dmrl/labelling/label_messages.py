@@ -23,17 +23,18 @@ from dmrl.labelling.sensor_logs import SensorLogs
 from dmrl.messages import message_class
 from dmrl.recording import Series, Stamped, TimedMessage
 from dmrl.recording.label_sources import get_message_sources
+from dmrl.samples.sample import DECIMALS, round_values
 
 
 def build_position_series(observer: str, peer: str, found: PeerPositions) -> Series:
     """Return the PeerPosition messages of one pair."""
-    x, y, z = found.xyz_m.T
+    x, y, z = found.xyz_m.T.round(DECIMALS)
     fields = {
         "frame_id": f"{observer}/horizontal",
         "x": x,
         "y": y,
         "z": z,
-        "covariance": found.covariance.reshape(-1, 9),
+        "covariance": found.covariance.reshape(-1, 9).round(DECIMALS + 3),
         "status": found.status,
     }
     topic = topics.POSITION(observer, peer)
@@ -118,7 +119,8 @@ def _label_peers(
     for time_ns, peers in unknown.items():
         made[time_ns] += [label_anywhere(peer, camera, MIN_DEPTH_M) for peer in sorted(peers)]
     return {
-        t: [message_class("PeerLabel")(**label) for label in labels] for t, labels in made.items()
+        t: [message_class("PeerLabel")(**round_values(label)) for label in labels]
+        for t, labels in made.items()
     }
 
 

@@ -174,6 +174,8 @@ def _project_polygons(
     corners = corners_body @ pose.camera_from_body.T + pose.xyz_camera
     uv, _ = project(corners.reshape(-1, 3), camera.image_from_optical)
     distance = np.linalg.norm(corners.mean(axis=1), axis=1)
+    # The last bits depend on the processor, and would decide between faces at one distance.
+    uv, distance = uv.round(6), distance.round(9)
     return _Polygons(uv.reshape(*corners.shape[:2], 2), distance, colours, opacity)
 
 
@@ -227,7 +229,8 @@ def _apply_sensor(levels: Levels, look: Look) -> Levels:
     dim_v = ((1 - look.vignette / 2 * v) ** look.gamma).astype(np.float32)
     dim_u = (look.gain * (1 - look.vignette / 2 * u)) ** look.gamma
     gain = (255 * dim_u).astype(np.float32).ravel()
-    curve = np.linspace(0, 1, CURVE_STEPS, dtype=np.float32) ** np.float32(look.gamma)
+    # Powers of float32 depend on the processor; those of float64, rounded to float32, do not.
+    curve = (np.linspace(0, 1, CURVE_STEPS) ** look.gamma).astype(np.float32)
     noise = look.noise.reshape(height, -1)
     deviation = np.float32(255 * look.noise_deviation)
     flat = levels.reshape(height, -1)

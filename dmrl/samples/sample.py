@@ -11,6 +11,8 @@ from dmrl import topics
 from dmrl.geometry.frames import Camera
 from dmrl.messages import LogType
 
+DECIMALS = 6
+"""Decimals of computed values: micrometres, microradians and millionths of a pixel."""
 Intervals = dict[str, list[tuple[int, int]]]
 
 
@@ -37,6 +39,26 @@ class Sample:
     message: str | LogType
     fields: Mapping[str, Any]
     publish_ns: int | None = None
+
+
+def round_sample(sample: Sample) -> Sample:
+    """Round the values of a simulated sample; see `round_values`."""
+    return replace(sample, fields=round_values(sample.fields))
+
+
+def round_values(value: Any) -> Any:
+    """Round computed values, nested in any way, to `DECIMALS`.
+
+    Sines and exponentials differ in their last bits between processors; what is computed from
+    them has the same bytes after rounding, but for one value in some millions.
+    """
+    if isinstance(value, float):
+        return round(value, DECIMALS) + 0.0  # no negative zero
+    if isinstance(value, Mapping):
+        return {name: round_values(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [round_values(inner) for inner in value]
+    return value
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,13 @@ from dmrl.rendering import flight_images, renderer
 from dmrl.rendering.blender_environment import ensure_environment
 from dmrl.rendering.onboard_camera import ViewRenderer, WorldPose, build_view, render_sketches
 from dmrl.samples.flight import START_NS, merge_by_time
-from dmrl.samples.sample import Sample, build_calibration, build_image, build_labels
+from dmrl.samples.sample import (
+    Sample,
+    build_calibration,
+    build_image,
+    build_labels,
+    round_sample,
+)
 from dmrl.simulation.flight_samples import (
     JPEG_QUALITY,
     TRUTH_RATE_HZ,
@@ -147,7 +153,7 @@ def record_flight(out: Path, settings: FlySettings) -> dict[str, int]:
             streams += _camera_streams(flight, settings, draw)
         sink = stack.enter_context(RecordingWriter(out, made))
         for sample in track(merge_by_time(streams), "Flying", _estimate_total(flight, settings)):
-            sink.write_sample(sample)
+            sink.write_sample(round_sample(sample))
             counts[topics.find_pattern(sample.topic)] += 1
     return dict(sorted(counts.items()))
 

@@ -27,7 +27,13 @@ from dmrl.prediction import describe_weights
 from dmrl.recording import Provenance, RecordingWriter, build_provenance
 from dmrl.rendering.onboard_camera import CameraView
 from dmrl.samples.flight import START_NS, merge_by_time
-from dmrl.samples.sample import Sample, build_calibration, build_image, build_labels
+from dmrl.samples.sample import (
+    Sample,
+    build_calibration,
+    build_image,
+    build_labels,
+    round_sample,
+)
 from dmrl.simulation.eyes import Eye, IdealEye, NetworkEye
 from dmrl.simulation.flight_samples import (
     JPEG_QUALITY,
@@ -112,7 +118,7 @@ class FlightWriter:
         streams = [*iter_sensor_streams(block, yaw), *iter_truth_streams(block, moments)]
         events = sorted(self._events, key=lambda sample: sample.time_ns)
         for sample in merge_by_time([*streams, events]):
-            self._sink.write_sample(sample)
+            self._sink.write_sample(round_sample(sample))
             self.counts[topics.find_pattern(sample.topic)] += 1
         self._written, self._events, self._ranges = end, [], {}
 
