@@ -1,4 +1,4 @@
-"""The table of docs/reliability.md: what it names is there."""
+"""The tables of docs/reliability.md and SECURITY.md: what they name is there."""
 
 import re
 import tomllib
@@ -11,6 +11,22 @@ ROW = re.compile(
 )
 
 
+def require_test(file: str, name: str) -> None:
+    text = (TESTS / file).read_text(encoding="utf-8")
+    assert re.search(rf"^def {name}\(", text, re.MULTILINE), f"{file}::{name}"
+
+
+def test_every_claim_of_the_page_on_security_has_its_test() -> None:
+    page = (TESTS.parent / "SECURITY.md").read_text(encoding="utf-8")
+    table = page.partition("## Which test holds what")[2].partition("\n## ")[0]
+    rows = re.findall(
+        r"^\| [^|]+ \| `([a-z0-9_/]+\.py)::(test_[a-z0-9_]+)` \|$", table, re.MULTILINE
+    )
+    assert len(rows) == table.count("\n| ") - 1 > 30
+    for file, name in rows:
+        require_test(file, name)
+
+
 def test_every_test_and_every_change_that_the_table_names_is_there() -> None:
     _, _, table = PAGE.read_text(encoding="utf-8").partition("## Which test holds what")
     rows = ROW.findall(table)
@@ -18,6 +34,5 @@ def test_every_test_and_every_change_that_the_table_names_is_there() -> None:
     changes = tomllib.loads((TESTS / "mutants.toml").read_text(encoding="utf-8"))
     known = {name for of in changes.values() for name in of}
     for file, name, change in rows:
-        text = (TESTS / file).read_text(encoding="utf-8")
-        assert re.search(rf"^def {name}\(", text, re.MULTILINE), f"{file}::{name}"
+        require_test(file, name)
         assert not change or change in known, change

@@ -1,0 +1,74 @@
+"""ONNX files of strangers: what they ask for is known before onnxruntime sees them."""
+
+import pytest
+
+from dmrl.errors import ModelError
+
+onnx = pytest.importorskip("onnx")
+from onnx import TensorProto, helper  # noqa: E402
+
+from dmrl.deploy.onnx.static_check import require_modest  # noqa: E402
+
+
+def network(*nodes: object, sides: tuple[int, ...] = (4,), image: object = 224) -> bytes:
+    """A network whose output is its image, with nodes beside it."""
+    shape = ["N", image, 320, 3]
+    made = helper.make_graph(
+        [helper.make_node("Identity", ["image"], ["confidence_logit"]), *nodes],
+        "network",
+        [helper.make_tensor_value_info("image", TensorProto.UINT8, shape)],
+        [helper.make_tensor_value_info("confidence_logit", TensorProto.UINT8, shape)],
+        [helper.make_tensor("sides", TensorProto.INT64, [len(sides)], list(sides))],
+    )
+    opsets = [helper.make_opsetid("", 17)]
+    data: bytes = helper.make_model(made, opset_imports=opsets).SerializeToString()
+    return data
+
+
+def node(kind: str, inputs: tuple[str, ...], output: str, **more: object) -> object:
+    return helper.make_node(kind, list(inputs), [output], **more)
+
+
+MANY = node("ConstantOfShape", ("sides",), "many")
+BODY = helper.make_graph([], "body", [], [])
+
+
+def test_a_sound_network_passes() -> None:
+    require_modest(network(), "a.onnx")
+    require_modest(network(MANY, sides=(1_000, 1_000)), "a.onnx")
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (network(MANY, sides=(1 << 30,)), "ConstantOfShape makes 4295 MB"),
+        (
+            network(MANY, node("MatMul", ("many", "many"), "more"), sides=(6_000, 6_000)),
+            "MatMul makes .* 216 billion products",
+        ),
+        (
+            network(node("Tile", ("image", "times"), "more"), node("Shape", ("image",), "times")),
+            "a.onnx cannot be run",
+        ),
+        (network(node("Loop", ("sides",), "more", body=BODY)), "Loop runs another graph"),
+        (network(node("If", ("sides",), "more", then_branch=BODY)), "If runs another graph"),
+        (network(node("Scan", ("sides",), "more", body=BODY)), "Scan runs another graph"),
+        (network(node("Gelu", ("image",), "more", domain="com.x")), "Gelu is no standard operator"),
+        (network(image="H"), "the size of image is not known"),
+        (network(node("NonZero", ("image",), "more")), "the size of more is not known"),
+        (b"no network", "a.onnx cannot be run"),
+    ],
+)
+def test_what_asks_for_too_much_is_one_line(data: bytes, said: str) -> None:
+    with pytest.raises(ModelError, match=said) as e:
+        require_modest(data, "a.onnx")
+    assert str(e.value).startswith("a.onnx cannot be run: ") and "\n" not in str(e.value)
+
+
+def test_constants_in_other_files_are_not_read() -> None:
+    model = onnx.load_model_from_string(network())
+    constant = model.graph.initializer[0]
+    constant.data_location = TensorProto.EXTERNAL
+    constant.external_data.add(key="location", value="/etc/passwd")
+    with pytest.raises(ModelError, match="its constants are in other files"):
+        require_modest(model.SerializeToString(), "a.onnx")
