@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from dmrl.flight.faults import FaultEvent
 from dmrl.geometry.frames import Array
 
+DECIMALS = 8
+"""Decimals of simulated values: the last bits of sines differ between processors."""
 RATE_HZ = 100.0
 """Samples per second of logs and truth."""
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
-from dmrl.flight.flight_arrays import RATE_HZ, Clock, Ranges, RobotLog, Truth, scan_values
+from dmrl.flight.flight_arrays import DECIMALS, RATE_HZ, Clock, Ranges, RobotLog, Truth, scan_values
 from dmrl.flight.noise import Noise
 from dmrl.geometry.frames import Array
 
@@ -88,7 +88,7 @@ def measure_log(
     true = np.stack([*own, truth.roll[part], truth.pitch[part], yaw_rate[part], height_m])
     found = errors.scale * true + errors.bias + errors.white[:, part]
     found[:2] += errors.slow[:, part]
-    vx, vy, roll, pitch, turning, height = found
+    vx, vy, roll, pitch, turning, height = found.round(DECIMALS)
     return RobotLog(
         time_s=clock.to_clock_time(truth.time_s[part]),
         roll_rad=roll,
@@ -171,4 +171,4 @@ def measure_ranges(
     distance = np.linalg.norm(peer.position_at(time_s) - observer.position_at(time_s), axis=1)
     measured = errors.scale * distance + errors.bias_m + errors.detour_m[part]
     measured += errors.white_m[part]
-    return Ranges(clock.to_clock_time(time_s), np.maximum(measured, 0.01))
+    return Ranges(clock.to_clock_time(time_s), np.maximum(measured, 0.01).round(DECIMALS))

@@ -23,18 +23,18 @@ from dmrl.labelling.sensor_logs import SensorLogs
 from dmrl.messages import message_class
 from dmrl.recording import Series, Stamped, TimedMessage
 from dmrl.recording.label_sources import get_message_sources
-from dmrl.samples.sample import DECIMALS, round_values
+from dmrl.samples.sample import round_values
 
 
 def build_position_series(observer: str, peer: str, found: PeerPositions) -> Series:
     """Return the PeerPosition messages of one pair."""
-    x, y, z = found.xyz_m.T.round(DECIMALS)
+    x, y, z = found.xyz_m.T
     fields = {
         "frame_id": f"{observer}/horizontal",
         "x": x,
         "y": y,
         "z": z,
-        "covariance": found.covariance.reshape(-1, 9).round(DECIMALS + 3),
+        "covariance": found.covariance.reshape(-1, 9),
         "status": found.status,
     }
     topic = topics.POSITION(observer, peer)

@@ -10,6 +10,8 @@ from dmrl.estimation.solver.estimate import Estimate
 
 POSITION_HZ = 20.0
 """Rate of the written positions; images have positions of their own."""
+POSITION_DECIMALS, COVARIANCE_DECIMALS = 8, 9
+"""Hundredths of micrometres, and squares of 0.03 mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,4 +65,6 @@ def sample_positions(
     covariance[:, :2, :2] = spread
     std = estimate.noise.height_std_m if estimate.height_std_m is None else estimate.height_std_m
     covariance[:, 2, 2] = np.interp(time_s, estimate.time_s, std + 0 * estimate.time_s) ** 2
-    return PeerPositions(time_ns, np.column_stack([xy, z]), covariance, status)
+    # The last bits depend on the processor.
+    xyz_m = np.column_stack([xy, z]).round(POSITION_DECIMALS)
+    return PeerPositions(time_ns, xyz_m, covariance.round(COVARIANCE_DECIMALS), status)

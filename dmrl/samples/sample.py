@@ -11,8 +11,8 @@ from dmrl import topics
 from dmrl.geometry.frames import Camera
 from dmrl.messages import LogType
 
-DECIMALS = 6
-"""Decimals of computed values: micrometres, microradians and millionths of a pixel."""
+DECIMALS = 8
+"""Decimals of computed values: metres, radians and pixels."""
 Intervals = dict[str, list[tuple[int, int]]]
 
 
@@ -41,9 +41,9 @@ class Sample:
     publish_ns: int | None = None
 
 
-def round_sample(sample: Sample) -> Sample:
-    """Round the values of a simulated sample; see `round_values`."""
-    return replace(sample, fields=round_values(sample.fields))
+def round_samples(samples: Iterable[Sample]) -> Iterator[Sample]:
+    """Round the values of computed samples; see `round_values`."""
+    return (replace(one, fields=round_values(one.fields)) for one in samples)
 
 
 def round_values(value: Any) -> Any:

@@ -29,7 +29,7 @@ from dmrl.samples.sample import (
     build_calibration,
     build_image,
     build_labels,
-    round_sample,
+    round_samples,
 )
 from dmrl.simulation.flight_samples import (
     JPEG_QUALITY,
@@ -145,15 +145,18 @@ def record_flight(out: Path, settings: FlySettings) -> dict[str, int]:
     _print_faults(flight)
     made = build_provenance("fly", settings, seed=settings.seed, libraries=("numpy", "pillow"))
     time_s = np.arange(0.0, scenario.last_s, 1.0 / TRUTH_RATE_HZ)
-    streams = [*iter_sensor_streams(flight), *iter_truth_streams(flight, time_s)]
+    streams = [
+        *iter_sensor_streams(flight),
+        *map(round_samples, iter_truth_streams(flight, time_s)),
+    ]
     counts: Counter[str] = Counter()
     with ExitStack() as stack:
         if settings.camera:
             draw, made = _open_renderer(settings, made, stack)
-            streams += _camera_streams(flight, settings, draw)
+            streams += map(round_samples, _camera_streams(flight, settings, draw))
         sink = stack.enter_context(RecordingWriter(out, made))
         for sample in track(merge_by_time(streams), "Flying", _estimate_total(flight, settings)):
-            sink.write_sample(round_sample(sample))
+            sink.write_sample(sample)
             counts[topics.find_pattern(sample.topic)] += 1
     return dict(sorted(counts.items()))
 

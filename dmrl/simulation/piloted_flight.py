@@ -32,7 +32,7 @@ from dmrl.samples.sample import (
     build_calibration,
     build_image,
     build_labels,
-    round_sample,
+    round_samples,
 )
 from dmrl.simulation.eyes import Eye, IdealEye, NetworkEye
 from dmrl.simulation.flight_samples import (
@@ -115,10 +115,11 @@ class FlightWriter:
         block = Flight(logs, flight.truth, ranges, flight.clocks)
         every = round(RATE_HZ / TRUTH_RATE_HZ)
         moments = np.arange(-(-part.start // every) * every, end, every) / RATE_HZ
-        streams = [*iter_sensor_streams(block, yaw), *iter_truth_streams(block, moments)]
-        events = sorted(self._events, key=lambda sample: sample.time_ns)
+        truth = map(round_samples, iter_truth_streams(block, moments))
+        streams = [*iter_sensor_streams(block, yaw), *truth]
+        events = sorted(round_samples(self._events), key=lambda sample: sample.time_ns)
         for sample in merge_by_time([*streams, events]):
-            self._sink.write_sample(round_sample(sample))
+            self._sink.write_sample(sample)
             self.counts[topics.find_pattern(sample.topic)] += 1
         self._written, self._events, self._ranges = end, [], {}
 
