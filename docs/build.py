@@ -7,6 +7,8 @@ help. A test compares them with what this file would write.
 import io
 import re
 import runpy
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -102,7 +104,15 @@ def pages() -> dict[Path, str]:
     """Every page that is generated, or in part, with its text."""
     made = {page: filled(page) for page in (ROOT / "docs/index.md", ROOT / "docs/formats.md")}
     typed = runpy.run_path(str(ROOT / "docs/settings_types.py"))["settings_types"]()
-    return {**made, ROOT / "docs/commands.md": commands(), ROOT / "dmrl/api/settings.pyi": typed}
+    types = ROOT / "dmrl/api/settings.pyi"
+    return {**made, ROOT / "docs/commands.md": commands(), types: format_code(typed, types)}
+
+
+def format_code(text: str, path: Path) -> str:
+    """Format Python as ``make format`` wants it."""
+    ruff = [Path(sys.executable).parent / "ruff", "format", "--stdin-filename", path, "-"]
+    made = subprocess.run(ruff, input=text, text=True, capture_output=True, check=True, cwd=ROOT)
+    return made.stdout
 
 
 if __name__ == "__main__":

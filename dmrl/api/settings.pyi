@@ -112,6 +112,8 @@ class RenderSettings(TypedDict, total=False):
     model_up: Literal["auto", "y", "z"]
     model_centre: Literal["box", "origin"]
     scale: float
+    cutouts: str | PathLike[str] | None
+    cutout_width_m: float
     backgrounds: str | PathLike[str] | None
     lights: str | PathLike[str] | None
     masks: bool
