@@ -21,7 +21,6 @@ from fault_cases import BAD, CASES
 from matplotlib.figure import Figure
 
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
-from dmrl.estimation.model.gate import GATE_M
 from dmrl.estimation.model.pair import GRID_RATE_HZ, Mask, Pair, usable_ranges
 from dmrl.estimation.model.position_metrics import (
     CHI2_95_OF_2,
@@ -103,7 +102,7 @@ def graph(pairs: list[Pair]) -> list[tuple[Found, Found]]:
 
 
 def _of_graph(pair: Pair, key_s: Array, state: Array, covariance: Array) -> Found:
-    status, time_s = classify_positions(state, covariance, GATE_M), times(pair)
+    status, time_s = classify_positions(state, covariance), times(pair)
     at = np.clip(np.searchsorted(key_s, time_s), 0, len(key_s) - 1)
     xy = np.stack([np.interp(time_s, key_s, axis) for axis in state[:, :2].T], axis=1)
     return xy, covariance[at, :2, :2], status[at] == OK

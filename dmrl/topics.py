@@ -147,6 +147,7 @@ HEIGHT = RobotTopic("/{robot}/height")
 RANGE = PairTopic("/{robot}/range/{peer}")
 POSITION = PairTopic("/{robot}/peer/{peer}/position")
 TRUTH = PairTopic("/{robot}/peer/{peer}/truth")
+CAUSES = PairTopic("/{robot}/peer/{peer}/causes")
 LABELS = RobotTopic("/{robot}/labels")
 DETECTIONS = RobotTopic("/{robot}/detections")
 GRID = RobotTopic("/{robot}/detections/grid")
@@ -249,6 +250,7 @@ TOPICS = (
         doubts=(UnitCheck("range_m", 100.0, "m", "mm or cm", 0.1),),
     ),
     Topic(POSITION, "dmrl.v1.PeerPosition", "<robot>/horizontal", "m, m^2", "20 Hz", "label"),
+    Topic(CAUSES, "dmrl.v1.PeerCauses", "-", "s", "once", "label"),
     Topic(
         TRUTH,
         "dmrl.v1.PeerPosition",

@@ -6,9 +6,10 @@ from os import PathLike
 from typing import Any, Literal, TypedDict
 
 class LabelSettings(TypedDict, total=False):
-    method: Literal["batch", "swarm", "smoother", "ekf"]
+    method: Literal["batch", "swarm", "ekf"]
     preset: Literal["published-sim", "published-firmware"]
     gate_m: float
+    bad_share: float
     attitude_std_rad: float
     detections: bool
     pixel_std_px: float

@@ -20,6 +20,7 @@ from dmrl.labelling.flight_log import (
 )
 from dmrl.labelling.image_labels import CameraOptions
 from dmrl.labelling.label_messages import (
+    build_cause_messages,
     build_label_messages,
     build_position_series,
     count_estimated,
@@ -27,7 +28,7 @@ from dmrl.labelling.label_messages import (
 )
 from dmrl.labelling.observer_log import read_observer_log
 from dmrl.labelling.pair_estimation import PairSolver, Spread, estimate_all, orient_pair
-from dmrl.labelling.pair_report import PairReport, explain_refusals, report_pair
+from dmrl.labelling.pair_report import PairReport, explain_causes, report_pair
 from dmrl.labelling.peer_positions import PeerPositions, sample_positions
 from dmrl.labelling.recorded_camera import find_recorded_camera
 from dmrl.labelling.sensor_file import SensorConstants, read_sensors
@@ -80,7 +81,12 @@ def read_label_inputs(path: Path, cameras: Collection[str], *, detections: bool)
 
 
 def require_pairs(
-    flight: FlightLog, range_offset_m: float, sensors: Path | None, cameras: Collection[str]
+    flight: FlightLog,
+    range_offset_m: float,
+    sensors: Path | None,
+    cameras: Collection[str],
+    *,
+    detections: bool = False,
 ) -> SensorLogs:
     """Return the sensor logs; raise unless there is a pair, and a robot for every file.
 
@@ -94,6 +100,8 @@ def require_pairs(
         TOML file of sensor constants.
     cameras
         Robots whose camera is given by a file.
+    detections
+        Whether detections replace missing ranges.
 
     Raises
     ------
@@ -103,7 +111,7 @@ def require_pairs(
         If the constants, or a camera, are of other robots.
     """
     known = read_sensors(sensors) if sensors else SensorConstants()
-    logs = build_sensor_logs(flight, range_offset_m, known)
+    logs = build_sensor_logs(flight, range_offset_m, known, detections=detections)
     if sensors and not set(logs.robots) & set(known.names):
         raise SettingError(
             f"{sensors} is of {', '.join(known.names) or 'nobody'}, and {flight.path} has "
@@ -194,9 +202,7 @@ def label_flight(
         labels[robot] = list(build_label_messages(flight, logs, robot, mine, options))
     reports = [report_pair(flight, pair, positions[pair], estimates[pair]) for pair in positions]
     warnings = [*logs.warnings, *_warn_without_camera(flight, filming, options.cameras)]
-    return LabelledFlight(
-        positions, labels, reports, [*warnings, *explain_refusals(logs.pairs, estimates)]
-    )
+    return LabelledFlight(positions, labels, reports, [*warnings, *explain_causes(reports)])
 
 
 def _warn_without_camera(
@@ -230,11 +236,17 @@ def write_labelled(
         Keep all other messages; else labels of other sources are left out as well.
     """
     series = [build_position_series(*pair, found) for pair, found in labelled.positions.items()]
+    causes = build_cause_messages(flight.start_ns, labelled.reports)
     if copy:
         replaced = [topics.LABELS(robot) for robot in labelled.labels]
-        replaced += [topic for topic in flight.topics if topics.parse_topic(topics.POSITION, topic)]
+        replaced += [
+            topic
+            for topic in flight.topics
+            for pattern in (topics.POSITION, topics.CAUSES)
+            if topics.parse_topic(pattern, topic)
+        ]
         fresh = list(labelled.labels.values())
     else:
         replaced = list(flight.topics)
         fresh = [list(select_estimated(made)) for made in labelled.labels.values()]
-    rewrite(flight.path, out, origin, without=replaced, fresh=fresh, series=series)
+    rewrite(flight.path, out, origin, without=replaced, fresh=[*fresh, *causes], series=series)

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from dmrl.labelling.image_labels import (
     label_anywhere,
     label_images,
 )
+from dmrl.labelling.pair_report import PairReport
 from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.labelling.recorded_camera import find_recorded_camera
 from dmrl.labelling.sensor_logs import SensorLogs
@@ -39,6 +41,27 @@ def build_position_series(observer: str, peer: str, found: PeerPositions) -> Ser
     }
     topic = topics.POSITION(observer, peer)
     return Series(topic, message_class("PeerPosition"), found.time_ns, fields)
+
+
+def build_cause_messages(
+    start_ns: int, reports: Iterable[PairReport]
+) -> Iterator[list[TimedMessage]]:
+    """Yield the PeerCauses message of each ordered pair.
+
+    Parameters
+    ----------
+    start_ns
+        Log time from which the seconds of causes count.
+    reports
+        Reports of the pairs.
+    """
+    for report in reports:
+        causes = [
+            message_class("Cause")(**{**asdict(cause), "robot": cause.robot or ""})
+            for cause in report.causes
+        ]
+        made = message_class("PeerCauses")(causes=causes)
+        yield [TimedMessage(start_ns, topics.CAUSES(report.robot, report.peer), made)]
 
 
 def build_label_messages(

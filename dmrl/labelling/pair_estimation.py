@@ -7,6 +7,7 @@ from typing import Any, Literal
 from dmrl.estimation.flight.data_association import resolve_conflicts
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
 from dmrl.estimation.flight.swarm import estimate_swarm
+from dmrl.estimation.model.gate import Gate
 from dmrl.estimation.model.pair import Pair
 from dmrl.estimation.solver.estimate import Estimate
 from dmrl.labelling.flight_log import RobotPair
@@ -19,7 +20,7 @@ MIN_GROUP = 4
 MIN_PARALLEL_S = 300.0
 """Flight time of all pairs from which more processes pay off, seconds: each starts in a second."""
 
-Method = Literal["batch", "swarm", "smoother", "ekf"]
+Method = Literal["batch", "swarm", "ekf"]
 Spread = Callable[[Callable[..., Any], Sequence[Any], int], Iterator[Any]]
 """A function, its items and a number of processes to the results in their order."""
 
@@ -34,20 +35,19 @@ class PairSolver:
         As in ``dmrl.stages.label.Settings``.
     preset
         Noise of the method "ekf".
-    gate_m
-        Error at which a position is bad, metres.
+    gate
+        Gate of the positions.
     """
 
     method: Method
     preset: str
-    gate_m: float
+    gate: Gate
 
     def solve(self, pairs: list[Pair]) -> Sequence[tuple[Estimate, Estimate | None]]:
         """Return the estimates of the peer and, unless the method is "ekf", of the observer."""
         if self.method == "ekf":
-            return [(one, None) for one in estimate_ekf(pairs, self.preset, gate_m=self.gate_m)]
-        method: Literal["batch", "smoother"] = "smoother" if self.method == "smoother" else "batch"
-        return estimate_pairs(pairs, method, gate_m=self.gate_m)
+            return [(one, None) for one in estimate_ekf(pairs, self.preset, gate=self.gate)]
+        return estimate_pairs(pairs, gate=self.gate)
 
 
 def orient_pair(pairs: Mapping[RobotPair, Pair], name: RobotPair) -> Pair:
@@ -93,4 +93,4 @@ def _estimate(
             out[name] = of_peer
             if of_observer is not None:
                 out[name[::-1]] = of_observer
-    return estimate_swarm(pairs, out, gate_m=solver.gate_m) if solver.method == "swarm" else out
+    return estimate_swarm(pairs, out, gate=solver.gate) if solver.method == "swarm" else out

@@ -24,6 +24,8 @@ MIN_RANGES = 20
 MAX_VALUE = 1e6
 """Largest value of a sensor, metres, radians or metres per second; larger ones overflow squared."""
 NO_CONSTANTS = SensorConstants()
+SentRanges = tuple[Array, Array, bool]
+"""Times, ranges, and whether the second robot of the pair measured them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +89,11 @@ class SensorLogs:
 
 
 def build_sensor_logs(
-    flight: FlightLog, range_offset_m: float = 0.0, known: SensorConstants = NO_CONSTANTS
+    flight: FlightLog,
+    range_offset_m: float = 0.0,
+    known: SensorConstants = NO_CONSTANTS,
+    *,
+    detections: bool = False,
 ) -> SensorLogs:
     """Return the sensor logs of a flight.
 
@@ -99,9 +105,15 @@ def build_sensor_logs(
         Subtracted from every range.
     known
         Sensor errors that are removed from the samples.
+    detections
+        Whether robots with a detector count as a pair without ranges too.
     """
     warnings: list[str] = []
-    names = sorted({name for link in flight.ranges for name in link})
+    seeing = set(flight.detections) if detections else set()
+    names = sorted(
+        {name for link in flight.ranges for name in link}
+        | (set(flight.velocity) if seeing else set())
+    )
     robots = {}
     for name in names:
         log = _build_robot_log(flight, name, known, warnings)
@@ -109,17 +121,19 @@ def build_sensor_logs(
             robots[name] = log
     pairs = {}
     for one, other in combinations(names, 2):
+        links = [link for link in ((one, other), (other, one)) if link in flight.ranges]
         found = [
             _to_signals(flight, topics.RANGE, topics.RANGE(*link), samples, warnings)
-            for link in ((one, other), (other, one))
-            if (samples := flight.ranges.get(link)) is not None
+            for link in links
+            for samples in (flight.ranges[link],)
         ]
         ranges = [
-            (r[0], known.correct_ranges((one, other), r[1] - range_offset_m))
-            for r in found
+            (r[0], known.correct_ranges((one, other), r[1] - range_offset_m), links[k][0] == other)
+            for k, r in enumerate(found)
             if r is not None
         ]
-        pair = _build_pair(robots, (one, other), ranges, known, warnings)
+        sighted = bool(seeing & {one, other})
+        pair = _build_pair(robots, (one, other), ranges, known, warnings, sighted=sighted)
         if pair is not None:
             pairs[one, other] = pair
         elif found:
@@ -186,13 +200,15 @@ def _to_signals(
 def _build_pair(
     robots: dict[str, RobotLog],
     names: RobotPair,
-    ranges: list[Signals],
+    ranges: list[SentRanges],
     known: SensorConstants,
     warnings: list[str],
+    *,
+    sighted: bool,
 ) -> Pair | None:
     """Return a pair on its common time grid; None, with a warning, if it cannot be used."""
     name = "-".join(names)
-    if not ranges or not all(robot in robots for robot in names):
+    if not (ranges or sighted) or not all(robot in robots for robot in names):
         return None
     logs = [robots[robot] for robot in names]
     start_s, end_s = max(log.start_s for log in logs), min(log.end_s for log in logs)
@@ -202,30 +218,35 @@ def _build_pair(
             f"{MIN_DURATION_S:g} s; left out. Do their clocks agree?"
         )
         return None
-    measured = _select_ranges(name, ranges, start_s, end_s, warnings)
-    if measured is None:
+    none = np.zeros(0)
+    measured = _select_ranges(name, ranges, start_s, end_s, warnings) if ranges else None
+    if measured is None and not sighted:
         return None
+    measured = measured or (none, none, none)
     grid_s = start_s + np.arange(int((end_s - start_s) * GRID_RATE_HZ) + 1) / GRID_RATE_HZ
     tracks = [log.to_track(grid_s) for log in logs]
     for robot, one in zip(names, tracks, strict=True):
         if one.dropout.any():
             silent_s = one.dropout.sum() / GRID_RATE_HZ
             warnings.append(f"{name}: {robot} is silent for {silent_s:.1f} s; unconverged there")
-    time_s, range_m = measured
-    on_grid = time_s <= grid_s[-1]  # which ends up to a step before the logs do
-    ranged = time_s[on_grid], range_m[on_grid]
-    return Pair(grid_s, tracks[0], tracks[1], *ranged, known_std=known.to_prior_std(names))
+    on_grid = measured[0] <= grid_s[-1]  # which ends up to a step before the logs do
+    time_s, range_m, sender = (values[on_grid] for values in measured)
+    return Pair(
+        grid_s, tracks[0], tracks[1], time_s, range_m,
+        known_std=known.to_prior_std(names), range_sender=np.asarray(sender, np.int8),
+    )  # fmt: skip
 
 
 def _select_ranges(
-    name: str, ranges: list[Signals], start_s: float, end_s: float, warnings: list[str]
-) -> tuple[Array, Array] | None:
+    name: str, ranges: list[SentRanges], start_s: float, end_s: float, warnings: list[str]
+) -> tuple[Array, Array, Array] | None:
     """Return a pair's usable ranges with their times; None, with a warning, if they are too few."""
     # Both directions measure the same distance, so they form one series.
     time_s = np.concatenate([r[0] for r in ranges])
     range_m = np.concatenate([r[1][:, 0] for r in ranges])
+    sender = np.concatenate([np.full(len(r[0]), float(r[2])) for r in ranges])
     order = np.argsort(time_s, kind="stable")
-    time_s, range_m = time_s[order], range_m[order]
+    time_s, range_m, sender = time_s[order], range_m[order], sender[order]
     good = usable_ranges(time_s, range_m)
     if bad := int((~good).sum()):
         leave_out(f"ranges of {name} that are not in (0, 60] m", name, bad)
@@ -233,4 +254,4 @@ def _select_ranges(
     if good.sum() < MIN_RANGES:
         warnings.append(f"{name}: {good.sum()} usable ranges, under {MIN_RANGES}; left out")
         return None
-    return time_s[good], range_m[good]
+    return time_s[good], range_m[good], sender[good]

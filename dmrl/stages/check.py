@@ -92,9 +92,10 @@ def _check_side_by_side(named: Sequence[Path], crew: Executor, *, as_json: bool)
     with crew:
         for task, answer in iter_results(tasks, crew, "Checking"):
             done.append((task, answer))
-            if not (as_json or has_failed(answer)):
-                print_line(f"{task.source}: {_summary_line(answer['result'])}")
-    documents = [_document(task, answer) for task, answer in done]
+    documents = sorted((_document(task, answer) for task, answer in done), key=_badness)
+    for one in documents:
+        if not as_json and "error" not in one:
+            print_line(f"{one['recording']}: {_summary_line(one)}")
     errors, warnings = (
         sum(one["level"] == level for each in documents for one in each["findings"])
         for level in ("error", "warning")
@@ -110,6 +111,13 @@ def _check_side_by_side(named: Sequence[Path], crew: Executor, *, as_json: bool)
         )
     report_failures(done)
     return 0 if sound == len(documents) else 1
+
+
+def _badness(document: dict[str, Any]) -> tuple[int, int, str]:
+    """Return the order of a recording: worst first, then by name."""
+    levels = [one["level"] for one in document["findings"]]
+    unread = 10**6 if "error" in document else 0
+    return -unread - levels.count("error"), -levels.count("warning"), document["recording"]
 
 
 def _is_sound(document: dict[str, Any]) -> bool:

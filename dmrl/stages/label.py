@@ -8,7 +8,7 @@ from cyclopts import Parameter, validators
 
 from dmrl.atomic_output import refuse_existing
 from dmrl.errors import optional_imports
-from dmrl.estimation.model.gate import GATE_M
+from dmrl.estimation.model.gate import BAD_SHARE, GATE_M, Gate
 from dmrl.pipeline.parallel_map import parallel_map
 from dmrl.pipeline.stage_command import stage_command
 from dmrl.terminal.arguments import In, Strict
@@ -29,18 +29,18 @@ class Settings:
     ----------
     method
         "batch": the whole flight at once, pair by pair. "swarm": then all robots together, where
-        ranges connect three or more. "smoother": EKF and RTS from the best of 96 starts.
-        "ekf": the published filter, online, from (0, 0, 0).
+        ranges connect three or more. "ekf": the published filter, online, from (0, 0, 0).
     preset
         ekf: its noise, as published for simulation or in the firmware.
     gate_m
-        A position that is off by more than this is a bad one, metres. Of a flight's OK positions
-        at most 4.5 % are expected to be bad; docs/labelling.md says how many were.
+        A position that is off by more than this is a bad one, metres.
+    bad_share
+        Share of a flight's OK positions that may be bad, as the estimate expects.
     attitude_std_rad
         Standard deviation of roll and pitch, radians.
     detections
         Solve with the detections that are in the recording as well, whosever they may be, wrong
-        ones among them. For the methods "batch" and "swarm".
+        ones among them; with or without ranges. For the methods "batch" and "swarm".
     pixel_std_px
         Error of such a detection in u and in v, pixels.
     range_offset_m
@@ -59,9 +59,10 @@ class Settings:
         left out and counted.
     """
 
-    method: Literal["batch", "swarm", "smoother", "ekf"] = "batch"
+    method: Literal["batch", "swarm", "ekf"] = "batch"
     preset: Literal["published-sim", "published-firmware"] = "published-sim"
     gate_m: Positive = GATE_M
+    bad_share: Annotated[float, Parameter(validator=validators.Number(gt=0, lt=1))] = BAD_SHARE
     attitude_std_rad: Positive = 0.015
     detections: bool = False
     pixel_std_px: Positive = 6.0
@@ -118,12 +119,14 @@ def run(recording: In, out: Path, settings: Settings, *, workers: int = 1) -> Re
     refuse_existing(out)
     files, detections = settings.camera, settings.detections
     flight = labelling.read_label_inputs(recording, files, detections=detections)
-    logs = labelling.require_pairs(flight, settings.range_offset_m, settings.sensors, files)
+    logs = labelling.require_pairs(
+        flight, settings.range_offset_m, settings.sensors, files, detections=detections
+    )
     cameras = read_robot_cameras(flight, files)
     options = CameraOptions(settings.attitude_std_rad, not settings.undistorted, cameras)
     seen = (flight, logs, options, settings.method, settings.pixel_std_px)
     bearings = labelling.read_bearings(*seen) if detections else {}
-    solver = PairSolver(settings.method, settings.preset, settings.gate_m)
+    solver = PairSolver(settings.method, settings.preset, Gate(settings.gate_m, settings.bad_share))
     made = labelling.label_flight(flight, logs, bearings, options, solver, workers, parallel_map)
     inputs = [recording, *files.values(), *filter(None, [settings.sensors])]
     origin = build_provenance("label", settings, inputs, libraries=("numpy", "scipy"))

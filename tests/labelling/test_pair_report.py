@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
+from dmrl.estimation.evidence.error_models import MODELS
+from dmrl.estimation.solver.estimate import PAIR_LAYOUT, REASONS, Cause, Estimate
 from dmrl.labelling.flight_log import read_flight
-from dmrl.labelling.pair_report import PairReport, report_pair
+from dmrl.labelling.pair_report import REMEDIES, PairReport, explain_causes, report_pair
 from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message_class
 from dmrl.recording import Provenance, RecordingWriter
@@ -36,7 +37,8 @@ def estimate() -> Estimate:
     made = object.__new__(Estimate)
     object.__setattr__(made, "constants", constants)
     object.__setattr__(made, "layout", PAIR_LAYOUT)
-    object.__setattr__(made, "rejection_reason", None)
+    causes = (Cause("yaw rate bias", 0.9, 1.0, 2.0, 1), Cause("range offset", 0.3, 1.0, 2.0))
+    object.__setattr__(made, "causes", causes)
     return made
 
 
@@ -54,9 +56,9 @@ def report(path: Path) -> PairReport:
 
 def test_a_report_says_how_sure_and_how_right(tmp_path: Path) -> None:
     got = report(flight(tmp_path / "a.mcap", np.arange(0, 4.1, 0.5).tolist()))
-    assert (got.observer, got.peer, got.positions) == ("cf1", "cf2", 5)
-    assert (got.ok_share, got.ambiguous_share) == pytest.approx((0.6, 0.2))
-    assert (got.range_bias_m, got.gyro_difference_radps) == pytest.approx((0.35, 0.03))
+    assert (got.robot, got.peer, got.positions) == ("cf1", "cf2", 5)
+    assert (got.kept_share, got.ambiguous_share) == pytest.approx((0.6, 0.2))
+    assert got.range_bias_m == pytest.approx(0.35)
     assert got.sigma_m == pytest.approx(0.2)
     assert got.rmse_ok_m == pytest.approx(np.sqrt((0.25 + 0) / 2))
     assert got.rmse_m == pytest.approx(np.sqrt((0.25 + 0 + 25 + 1) / 4))
@@ -72,3 +74,18 @@ def test_a_row_stands_under_its_headers(tmp_path: Path) -> None:
     got = report(flight(tmp_path / "a.mcap", [0.0, 4.0]))
     assert PairReport.columns() == tuple(field.name for field in fields(PairReport))
     assert dict(zip(got.columns(), got.row(), strict=True))["range_bias_m"] == pytest.approx(0.35)
+
+
+def test_probable_causes_are_lines_with_the_robot_and_what_to_do(tmp_path: Path) -> None:
+    got = report(flight(tmp_path / "a.mcap", [0.0, 4.0]))
+    assert [(cause.name, cause.robot) for cause in got.causes] == [
+        ("yaw rate bias", "cf2"),
+        ("range offset", None),
+    ]
+    (line,) = explain_causes([got, got])
+    assert line.startswith("cf1-cf2: cf2's yaw rate bias (90%, 1 to 2 s). Let its gyroscope settle")
+
+
+def test_every_cause_has_a_remedy() -> None:
+    names = [model.name for model in MODELS] + list(REASONS.values())
+    assert {name.split()[0] for name in names} <= set(REMEDIES)

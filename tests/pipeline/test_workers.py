@@ -22,7 +22,7 @@ CALLS: Mapping[str, tuple[str, ...]] = {
     "dataset": ("flights/a.mcap", "flights/b.mcap", "out"),
     "evaluate": ("found/a.mcap", "--plots", "out"),
     "index": ("flights",),
-    "label": ("flights", "out", "--method", "smoother"),
+    "label": ("flights", "out", "--method", "ekf"),
     "predict": ("dmrl-nano", "flights", "out"),
     "recover": ("flights", "out"),
     "sketch": ("out", "--images", "250", "--seed", "4"),  # parts of a hundred

@@ -75,8 +75,8 @@ def test_labels_made_with_it_lie_where_the_peer_was_seen(
                 sink.write(one.time_ns, "/cf1/camera/image", blank)
     distance = {}
     for name, settings in {
-        "plain": label.Settings(gate_m=0.5, method="smoother"),
-        "calibrated": label.Settings(gate_m=0.5, method="smoother", camera={"cf1": camera}),
+        "plain": label.Settings(gate_m=0.5),
+        "calibrated": label.Settings(gate_m=0.5, camera={"cf1": camera}),
     }.items():
         out = tmp_path / f"{name}.mcap"
         label.run(with_images, out, settings)

@@ -54,7 +54,7 @@ def test_a_short_flight_starts_from_it_and_comes_out_right(known: Path, tmp_path
     out = tmp_path / "with.mcap"
     better = label.run(flight, out, label.Settings(sensors=known))
     for before, after in zip(without.pairs, better.pairs, strict=True):
-        assert after.ok_share >= before.ok_share
+        assert after.kept_share >= before.kept_share
         assert after.sigma_m < before.sigma_m
         assert after.rmse_ok_m is not None
         assert after.rmse_ok_m < 0.2

@@ -238,7 +238,7 @@ def test_flights_logged_on_micro_sd_can_be_labelled(tmp_path: Path) -> None:
         for field in fields:
             np.testing.assert_allclose(told[field], known[field], atol=2e-6)
     result = label.run(made, labelled, label.Settings())
-    assert {(pair.observer, pair.peer) for pair in result.pairs} == {("cf1", "cf2"), ("cf2", "cf1")}
+    assert {(pair.robot, pair.peer) for pair in result.pairs} == {("cf1", "cf2"), ("cf2", "cf1")}
     assert all(pair.positions > 500 for pair in result.pairs)
     assert result.warnings == []
     assert check(made) == []

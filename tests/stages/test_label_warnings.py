@@ -41,7 +41,7 @@ def changed(flight: Path, tmp_path: Path) -> Callable[[Change], Path]:
 
 def warnings_of(path: Path) -> str:
     out = path.with_name("out.mcap")
-    return "\n".join(label.run(path, out, Settings(method="smoother")).warnings)
+    return "\n".join(label.run(path, out, Settings(method="ekf")).warnings)
 
 
 def test_ranges_that_cannot_be_are_left_out_with_a_word(

@@ -1,17 +1,18 @@
 """Solve one window of a pair: modes, noise model, full solve and covariance."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
+from dmrl.estimation.evidence.posterior import Member, Mixture, weigh_models
 from dmrl.estimation.model.bearings import ASSOCIATION_GATE
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.search.modes import (
+    SAME_TRACK_M,
     coarsen,
     convert_values,
     dead_reckon,
+    find_flexible_modes,
     find_modes,
+    find_tracks,
     mode_weights,
     select_modes,
 )
@@ -19,9 +20,8 @@ from dmrl.estimation.solver.covariance import compute_covariance
 from dmrl.estimation.solver.levenberg_marquardt import (
     ROUGH_TOLERANCE,
     Carried,
-    MapEstimate,
     Solver,
-    relative_path,
+    is_same_solution,
 )
 from dmrl.estimation.solver.noise_selection import range_noise_ratio, select_model
 from dmrl.estimation.solver.problem import CameraView, NoiseModel, Problem
@@ -40,45 +40,37 @@ class PairSolution:
 
     Parameters
     ----------
-    problem
-        Flight with the selected model.
-    modes
-        Distinct solutions, best first.
-    weight
-        (M,) their weights.
-    keyframes, constants
-        (K, n, n) and (G, G) covariances of the best one.
-    carried
-        Information from earlier windows that it contains.
+    mixture
+        Solutions under likely models, best first, with their weights.
+    covariances
+        (K, n, n) of the keyframes and (G, G) of the constants of each.
     """
 
-    problem: Problem
-    modes: list[MapEstimate]
-    weight: Array
-    keyframes: Array
-    constants: Array
-    carried: Carried | None = None
+    mixture: Mixture
+    covariances: list[tuple[Array, Array]]
+
+    @property
+    def solver(self) -> Solver:
+        """Flight under the best model."""
+        return self.mixture.members[0].solver
+
+    @property
+    def problem(self) -> Problem:
+        """Flight under the best model."""
+        return self.solver.problem
 
     @property
     def values(self) -> Values:
-        """Values of the best mode."""
-        return self.modes[0].values
-
-    def between_modes(self, states: Sequence[Array]) -> Array:
-        """Return (K, 3, 3) the covariance that the choice between modes adds to the best one.
-
-        Parameters
-        ----------
-        states
-            (K, 3) x, y, psi of every mode.
-        """
-        apart = np.stack(states) - states[0]
-        apart[..., 2] = np.angle(np.exp(1j * apart[..., 2]))
-        return np.asarray(np.einsum("s,ski,skj->kij", self.weight, apart, apart))
+        """Values of the best solution."""
+        return self.mixture.members[0].values
 
 
 def solve_pair(
-    problem: Problem, noise: NoiseModel | None = None, carried: Carried | None = None
+    problem: Problem,
+    noise: NoiseModel | None = None,
+    carried: Carried | None = None,
+    *,
+    plain: bool = False,
 ) -> PairSolution:
     """Solve a flight of two robots.
 
@@ -90,8 +82,11 @@ def solve_pair(
         Noise model of the sensors. None: selected.
     carried
         Information from earlier windows.
+    plain
+        Without error models beyond the plain one.
     """
-    modes = find_modes(problem)
+    tracks = find_tracks(problem)
+    modes = find_modes(problem, tracks)
     full = [convert_values(m.values, coarsen(problem).layout, problem.layout) for m in modes]
     kept = replace(problem, views=consistent_views(problem, full[0]))
     full = [convert_values(values, problem.layout, kept.layout) for values in full]
@@ -117,8 +112,19 @@ def solve_pair(
         problem = replace(problem, noise=wider)
         solver = replace(solver, problem=problem)
         found = select_modes([solver.solve(mode.values) for mode in found])
-    keyframes, constants = compute_covariance(solver, found[0].values)
-    return PairSolution(problem, found, mode_weights(found), keyframes, constants, solver.carried)
+    if plain or noise is not None:
+        members = [Member(solver, mode, -mode.cost) for mode in found]
+        mixture = Mixture(members, mode_weights(found))
+    else:
+        others = find_flexible_modes(problem, tracks)
+        distinct = [
+            values
+            for values in others
+            if not any(is_same_solution(values, mode.values, SAME_TRACK_M) for mode in found)
+        ]
+        mixture = weigh_models(solver, found, distinct)
+    covariances = [compute_covariance(one.solver, one.values) for one in mixture.members]
+    return PairSolution(mixture, covariances)
 
 
 def _with_step_offsets(problem: Problem, values: Values) -> Values:
@@ -146,8 +152,3 @@ def consistent_views(problem: Problem, values: Values) -> tuple[CameraView, ...]
         if agree.sum() >= least:
             out.append(view)
     return tuple(out)
-
-
-def relative_modes(solution: PairSolution) -> list[Array]:
-    """Return (K, 3) relative paths of all modes, best first."""
-    return [relative_path(mode.values.state) for mode in solution.modes]

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
+from dmrl.estimation.evidence.causes import find_causes, find_dropouts
 from dmrl.estimation.filters import ekf
 from dmrl.estimation.flight.pair_output import (
     OUTPUT_HZ,
@@ -14,60 +15,50 @@ from dmrl.estimation.flight.pair_output import (
     clip_to_ranges,
     height_errors,
     interpolate_at,
-    interpolate_states,
     join_estimates,
     list_sighted,
+    mix_members,
     motion_energy,
     output_times,
     with_status,
 )
 from dmrl.estimation.flight.pair_solver import (
     PairSolution,
-    relative_modes,
     solve_pair,
 )
 from dmrl.estimation.flight.windows import carry_information, split_windows
-from dmrl.estimation.model.gate import GATE_M
+from dmrl.estimation.model.gate import DEFAULT_GATE, Gate
 from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Mask, Pair
 from dmrl.estimation.model.status import (
     classify_positions,
 )
-from dmrl.estimation.search.hypotheses import follow_hypotheses
-from dmrl.estimation.search.modes import coarsen, place_peer
-from dmrl.estimation.signals.contradictions import drop_contradictions
-from dmrl.estimation.solver.covariance import (
-    compute_covariance,
-    relative_covariance,
-)
+from dmrl.estimation.signals.contradictions import drop_contradictions, drop_held_ranges
 from dmrl.estimation.solver.estimate import (
     PAIR_LAYOUT,
     Estimate,
     seen_from_peer,
 )
 from dmrl.estimation.solver.keyframes import build_problem, odometry_dropout, range_dropout
-from dmrl.estimation.solver.levenberg_marquardt import Carried, Solver, relative_path
+from dmrl.estimation.solver.levenberg_marquardt import Carried
 from dmrl.estimation.solver.problem import NoiseModel, Problem
 from dmrl.estimation.solver.residuals import Values, odometry_factor, range_factor
+from dmrl.estimation.solver.unknowns import TABLE
 
-SIGMA_INFLATION = 1.1
-"""Factor on the sigmas of a solution: no sensor has exactly the noise of its model. Chosen on 42
-simulated flights of 100 s: in every group at least 95 % of the positions are in the 95 % ellipse.
-"""
 CONTRADICTED_SIGMAS, CONTRADICTED_RANGE_SIGMAS = 15.0, 3.0
 """Odometry that differs from the solution by more has dropped out for the status, in sigmas; and so
 has a second in which most ranges differ by more."""
+SHARED_NAMES = {row.name for row in TABLE}
+"""Names of the unknowns of the plain model, which both directions of a pair report."""
 MIN_CAMERA_S = 3.0
 """Shortest time with consistent images that replaces motion, seconds."""
-SMOOTHER_SIGMA_INFLATION = 1.5
-"""Factor on the sigmas of the smoother, whose track is no minimum of the cost."""
 
 
 def estimate_pairs(
     pairs: Sequence[Pair],
-    method: Literal["batch", "smoother"] = "batch",
     *,
     noise: NoiseModel | None = None,
-    gate_m: float = GATE_M,
+    gate: Gate = DEFAULT_GATE,
+    plain: bool = False,
 ) -> list[tuple[Estimate, Estimate]]:
     """Estimate both directions of several pairs: peer by observer, and observer by peer.
 
@@ -75,21 +66,25 @@ def estimate_pairs(
     ----------
     pairs
         Any number of pairs.
-    method
-        The batch solve, or the filter and smoother that provide its first guesses.
     noise
         Noise model of the sensors. None: selected for each flight.
-    gate_m
-        Largest error of a good position, metres.
+    gate
+        Gate of the positions.
+    plain
+        Without error models beyond the plain one, as `dmrl calibrate` pools flights.
     """
     out = []
     for logged in pairs:
-        pair = drop_contradictions(logged)
-        if method == "smoother":
-            pieces = [_smooth_piece(pair, noise)]
-        else:
-            pieces = list(_solve_pieces(pair, noise))
-        out.append(_both_directions(pair, pieces, gate_m))
+        pair = drop_contradictions(drop_held_ranges(logged))
+        pieces = list(_solve_pieces(pair, noise, plain=plain))
+        found = _both_directions(pair, pieces, gate)
+        gaps = find_dropouts(logged, pair)
+        out.append(
+            (
+                replace(found[0], causes=(*gaps, *found[0].causes)),
+                replace(found[1], causes=(*(c.seen_from_peer() for c in gaps), *found[1].causes)),
+            )
+        )
     return out
 
 
@@ -107,41 +102,44 @@ class Piece(NamedTuple):
     energy: Array
 
 
-def _solve_pieces(pair: Pair, noise: NoiseModel | None) -> Iterator[Piece]:
+def _solve_pieces(pair: Pair, noise: NoiseModel | None, *, plain: bool) -> Iterator[Piece]:
     """Yield the estimates of the windows of a flight."""
     carried: Carried | None = None
     for window in split_windows(float(pair.time_s[0]), float(pair.time_s[-1])):
         part = pair.crop(window.start_s, window.end_s)
-        solution = solve_pair(build_problem({(0, 1): part}), noise, carried)
+        solution = solve_pair(build_problem({(0, 1): part}), noise, carried, plain=plain)
         times = output_times(pair.time_s[0], window.from_s, window.until_s)
         yield _to_piece(solution, part, times)
         if not window.is_last:
-            solver = Solver(solution.problem, solution.carried)
-            carried = carry_information(solver, solution.values, window.next_s)
+            carried = carry_information(solution.solver, solution.values, window.next_s)
 
 
 def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
     """Return the estimate of a solved window at some times."""
     problem, values, key_s = solution.problem, solution.values, solution.problem.keyframe_s
-    spread = relative_covariance(values.state, solution.keyframes) * SIGMA_INFLATION**2
-    spread = spread + solution.between_modes(relative_modes(solution))
-    state = interpolate_states(problem, values.state, time_s)
+    state, spread = mix_members(solution, time_s)
     error = problem.layout.state_column("range_error", 0, 1)
-    covariances = solution.keyframes, solution.constants
+    covariances = solution.covariances[0]
     heights, height_std = height_errors(problem, values, covariances, (0, 1))
+    # Unknowns of error models may belong to one robot alone.
+    shared = [
+        k for k, ((name, _), _) in enumerate(problem.layout.constants) if name in SHARED_NAMES
+    ]
+    layout = replace(problem.layout, constants=tuple(problem.layout.constants[k] for k in shared))
     estimate = Estimate(
         time_s,
-        relative_path(state),
-        interpolate_at(time_s, key_s, spread),
+        state,
+        spread,
         np.zeros(len(time_s), np.int8),
-        values.constants,
+        values.constants[shared],
         problem.noise,
-        problem.layout,
+        layout,
         interpolate_at(time_s, key_s, heights),
         interpolate_at(time_s, key_s, height_std),
         None if error is None else np.interp(time_s, key_s, values.state[:, error]),
-        constants_covariance=solution.constants,
-        modes=len(solution.modes),
+        constants_covariance=covariances[1][np.ix_(shared, shared)],
+        modes=len(solution.mixture.members),
+        causes=find_causes(solution.mixture, (float(time_s[0]), float(time_s[-1]))),
     )
     step = np.clip(np.searchsorted(key_s, time_s, "right") - 1, 0, len(key_s) - 2)
     silent = odometry_dropout(pair, time_s) | find_contradicted_steps(problem, values)[step]
@@ -176,39 +174,19 @@ def find_contradicted_steps(problem: Problem, values: Values) -> Mask:
     return np.asarray(maximum_filter1d(wrong, 2 * around + 1))
 
 
-def _smooth_piece(pair: Pair, noise: NoiseModel | None) -> Piece:
-    """Return the estimate of the likeliest track of the filter and smoother."""
-    problem = build_problem({(0, 1): pair})
-    problem = replace(problem, noise=noise or problem.noise)
-    coarse = coarsen(problem)
-    best = follow_hypotheses(problem)[0]
-    values = place_peer(coarse, best.pose, best.gyro_bias_radps)
-    keyframes, _ = compute_covariance(Solver(coarse), values)
-    spread = relative_covariance(values.state, keyframes) * SMOOTHER_SIGMA_INFLATION**2
-    time_s = output_times(pair.time_s[0], pair.time_s[0], pair.time_s[-1])
-    states = relative_path(interpolate_states(coarse, values.state, time_s))
-    none, zeros = np.zeros(len(time_s), np.int8), np.zeros(len(PAIR_LAYOUT.constants))
-    covariance = interpolate_at(time_s, problem.keyframe_s, spread)
-    estimate = Estimate(time_s, states, covariance, none, zeros, problem.noise)
-    unseen = np.zeros((2, len(time_s)), bool)
-    energy = motion_energy(problem, values)
-    return Piece(estimate, odometry_dropout(pair, time_s), unseen, energy)
-
-
-def _both_directions(
-    pair: Pair, pieces: Sequence[Piece], gate_m: float
-) -> tuple[Estimate, Estimate]:
+def _both_directions(pair: Pair, pieces: Sequence[Piece], gate: Gate) -> tuple[Estimate, Estimate]:
     """Return the estimates of both robots, with their statuses."""
     joined = join_pieces(pieces)
     estimate, far = clip_to_ranges(pair, joined.estimate)
-    # Consistent images replace missing ranges.
+    # Consistent images replace missing ranges; without any range the covariance decides.
     quiet = range_dropout(pair, estimate.time_s) & ~joined.sighted.any(axis=0)
+    quiet &= len(pair.range_m) > 0
     floor = joined.silent | quiet | far
     own, peer, relative = joined.energy
     enough = [bool(at.sum() >= MIN_CAMERA_S * OUTPUT_HZ) for at in joined.sighted]
     return (
-        with_status(estimate, floor, (own, relative), gate_m, sighted=enough[0]),
-        with_status(seen_from_peer(estimate), floor, (peer, relative), gate_m, sighted=enough[1]),
+        with_status(estimate, floor, (own, relative), gate, sighted=enough[0]),
+        with_status(seen_from_peer(estimate), floor, (peer, relative), gate, sighted=enough[1]),
     )
 
 
@@ -221,7 +199,7 @@ def join_pieces(pieces: Sequence[Piece]) -> Piece:
     return Piece(made, silent, sighted, np.mean([p.energy for p in pieces], axis=0))
 
 
-def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = GATE_M) -> list[Estimate]:
+def estimate_ekf(pairs: list[Pair], preset: str, *, gate: Gate = DEFAULT_GATE) -> list[Estimate]:
     """Estimate pairs with the published filter, at every step of their time grids.
 
     Parameters
@@ -230,7 +208,7 @@ def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = GATE_M) -> l
         Any number of pairs.
     preset
         One of ``ekf.PRESETS``.
-    gate_m
+    gate
         As in `estimate_pairs`.
     """
     out = []
@@ -239,6 +217,6 @@ def estimate_ekf(pairs: list[Pair], preset: str, *, gate_m: float = GATE_M) -> l
         state, spread = ekf.filter_many(steps, ekf.PRESETS[preset])
         none, constants = np.zeros(len(state), np.int8), np.zeros(len(PAIR_LAYOUT.constants))
         made = Estimate(pair.time_s, state[:, 0], spread[:, 0], none, constants, NoiseModel())
-        status = classify_positions(made.state, made.covariance, gate_m)
+        status = classify_positions(made.state, made.covariance, gate)
         out.append(replace(made, status=status))
     return out

@@ -20,9 +20,8 @@ from dmrl.estimation.flight.pair_output import (
     with_status,
 )
 from dmrl.estimation.flight.pair_solver import consistent_views
-from dmrl.estimation.flight.pairs import SIGMA_INFLATION
 from dmrl.estimation.flight.windows import carry_information, split_windows
-from dmrl.estimation.model.gate import GATE_M
+from dmrl.estimation.model.gate import DEFAULT_GATE, Gate
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array, Mask, Pair
 from dmrl.estimation.model.status import OK
@@ -57,7 +56,7 @@ outside their ellipse of the first probability."""
 
 
 def estimate_swarm(
-    pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate], *, gate_m: float = GATE_M
+    pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate], *, gate: Gate = DEFAULT_GATE
 ) -> dict[Names, Estimate]:
     """Estimate every ordered pair; robots in no group of three keep their estimates.
 
@@ -67,8 +66,8 @@ def estimate_swarm(
         Sensor data, each pair once. A robot's log is the same in all of them.
     estimates
         Estimates of every ordered pair, by pairs.
-    gate_m
-        Largest error of a good position, metres.
+    gate
+        Gate of the positions.
     """
     out = dict(estimates)
     for group in _find_groups(pairs):
@@ -77,7 +76,7 @@ def estimate_swarm(
         end_s = min(p.time_s[-1] for p in mine.values())
         if len(group) > 2 and end_s - start_s >= MIN_SHARED_S:
             theirs = {names: e for names, e in estimates.items() if names[0] in group}
-            together = _estimate_group(mine, theirs, (start_s, end_s), gate_m)
+            together = _estimate_group(mine, theirs, (start_s, end_s), gate)
             # An error without a model bends the joint solve, which then contradicts a pair.
             bent = any(is_inconsistent(together[names], found) for names, found in theirs.items())
             out |= {} if bent else together
@@ -119,7 +118,7 @@ def _estimate_group(
     pairs: Mapping[Names, Pair],
     estimates: Mapping[Names, Estimate],
     shared_s: tuple[float, float],
-    gate_m: float,
+    gate: Gate,
 ) -> dict[Names, Estimate]:
     """Return the estimates of one group, from the solve over all its robots."""
     names, parts = list_robots(pairs), list(_solve_windows(pairs, estimates, shared_s))
@@ -132,7 +131,7 @@ def _estimate_group(
             [motion_energy(solver.problem, v, *both) for solver, v, *_ in parts], axis=0
         )
         silent: Mask = odometry_dropout(pair, seen.time_s) | range_dropout(pair, seen.time_s)
-        out[one, other] = with_status(seen, silent, (energy[0], energy[2]), gate_m)
+        out[one, other] = with_status(seen, silent, (energy[0], energy[2]), gate)
     return out
 
 
@@ -216,7 +215,7 @@ def _select_pair(part: Part, both: tuple[int, int]) -> Estimate:
     """Return the estimate of one ordered pair in a window, without statuses."""
     solver, values, (keyframes, constants), time_s = part
     problem, key_s = solver.problem, solver.problem.keyframe_s
-    spread = relative_covariance(values.state, keyframes, *both) * SIGMA_INFLATION**2
+    spread = relative_covariance(values.state, keyframes, *both)
     heights, height_std = height_errors(problem, values, (keyframes, constants), both)
     return Estimate(
         time_s,

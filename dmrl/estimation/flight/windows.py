@@ -104,6 +104,7 @@ def _until(problem: Problem, last: int) -> Problem:
             motion=steps.motion.first(last),
             clock_derivative=steps.clock_derivative[:last],
             dropout_s=steps.dropout_s[:last],
+            turn_dropout_s=steps.turn_dropout_s[:last],
             height_m=steps.height_m[: last + 1],
         )
         for steps in problem.robots

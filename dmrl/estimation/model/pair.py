@@ -34,6 +34,9 @@ class SensorTrack:
         (K,) whether velocity or yaw rate dropped out. The values there are interpolated.
     height_dropout
         (K,) whether the height dropped out. None: at no time.
+    turn_dropout
+        (K,) whether the yaw rate dropped out, which is part of ``dropout``. None: whenever
+        ``dropout`` says so.
     """
 
     vx_mps: Array
@@ -42,12 +45,16 @@ class SensorTrack:
     height_m: Array
     dropout: Mask
     height_dropout: Mask | None = None
+    turn_dropout: Mask | None = None
 
     def select(self, samples: Mask) -> "SensorTrack":
         """Return some of the samples."""
-        gap = None if self.height_dropout is None else self.height_dropout[samples]
+        height_gap, turn_gap = (
+            None if gap is None else gap[samples]
+            for gap in (self.height_dropout, self.turn_dropout)
+        )
         vx, vy, turn, height = (signal[samples] for signal in self.signals())
-        return SensorTrack(vx, vy, turn, height, self.dropout[samples], gap)
+        return SensorTrack(vx, vy, turn, height, self.dropout[samples], height_gap, turn_gap)
 
     def signals(self) -> tuple[Array, Array, Array, Array]:
         """Return vx, vy, yaw rate and height, (K,) each."""
@@ -99,6 +106,8 @@ class Pair:
     known_std
         Standard deviations of unknowns that a calibration determined, by name and robots (0:
         observer, 1: peer).
+    range_sender
+        (R,) robot that measured each range: 0 the observer, 1 the peer. None: not known.
 
     Raises
     ------
@@ -115,6 +124,7 @@ class Pair:
     own_bearings: BearingMeasurements | None = None
     peer_bearings: BearingMeasurements | None = None
     known_std: Mapping[tuple[str, tuple[int, ...]], float] = field(default_factory=dict)
+    range_sender: NDArray[np.int8] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.time_s)
@@ -154,7 +164,8 @@ class Pair:
             (name, own if len(own) == 2 else (1 - own[0],)): std
             for (name, own), std in self.known_std.items()
         }
-        return Pair(self.time_s, self.peer, self.own, *ranges, *sees, known)
+        sender = None if self.range_sender is None else np.asarray(1 - self.range_sender, np.int8)
+        return Pair(self.time_s, self.peer, self.own, *ranges, *sees, known, sender)
 
     def crop(self, start_s: float, end_s: float) -> "Pair":
         """Return the pair in an interval of time, seconds."""
@@ -165,9 +176,9 @@ class Pair:
         own, peer = (
             s and s.crop(time_s[0], time_s[-1]) for s in (self.own_bearings, self.peer_bearings)
         )
-        return Pair(
-            time_s, self.own.select(at), self.peer.select(at), *ranges, own, peer, self.known_std
-        )
+        sender = None if self.range_sender is None else self.range_sender[heard]
+        tracks = self.own.select(at), self.peer.select(at)
+        return Pair(time_s, *tracks, *ranges, own, peer, self.known_std, sender)
 
 
 def usable_ranges(time_s: Array, range_m: Array) -> Mask:

@@ -8,19 +8,12 @@ their probability of being bad, as long as the expected share of bad ones stays 
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.estimation.model.gate import DEFAULT_GATE, Gate
 from dmrl.estimation.model.pair import Array, Mask
 
 OK, UNCONVERGED, AMBIGUOUS = range(3)
 """Values of ``status``, equal to those of ``dmrl.v1.Status``."""
 
-MAX_EXPECTED_BAD_SHARE = 0.045
-"""Largest expected share of bad positions among the OK positions of a flight.
-
-Most flights with calibrated sensors are good throughout and use little of it: over all of them the
-share is below 1 %. Raised on simulated flights, where fewer positions were bad than expected."""
-MAX_BAD_PROBABILITY = 0.12
-"""Largest probability of being bad of an OK position. Raised together with
-``MAX_EXPECTED_BAD_SHARE``."""
 MAX_BEARING_SIGMA_RAD, MAX_MEDIAN_BEARING_SIGMA_RAD = 0.35, 0.25
 """Largest sigma over distance of an observable bearing; and largest median of it over a flight.
 Above the median, the motion of the whole flight leaves the bearing open. No record of how the
@@ -35,7 +28,7 @@ up to some twenty times the other."""
 Statuses = NDArray[np.int8]
 
 
-def classify_positions(state: Array, covariance: Array, gate_m: float) -> Statuses:
+def classify_positions(state: Array, covariance: Array, gate: Gate = DEFAULT_GATE) -> Statuses:
     """Return (K,) the status of every position, from its covariance.
 
     Parameters
@@ -44,11 +37,11 @@ def classify_positions(state: Array, covariance: Array, gate_m: float) -> Status
         (K, 3) x, y (m), psi (rad).
     covariance
         (K, 3, 3) of the state.
-    gate_m
-        Largest error of a good position, metres.
+    gate
+        Gate of the positions.
     """
     xy, spread = state[:, :2], covariance[:, :2, :2]
-    good = select_within_budget(probability_beyond(spread, gate_m), MAX_EXPECTED_BAD_SHARE)
+    good = select_within_budget(probability_beyond(spread, gate.error_m), gate.bad_share)
     status = np.where(good, OK, UNCONVERGED).astype(np.int8)
     sigma_m = np.sqrt(np.linalg.eigvalsh(spread)[:, -1])
     bearing_rad = sigma_m / np.maximum(np.hypot(*xy.T), MIN_DISTANCE_M)
@@ -92,5 +85,5 @@ def select_within_budget(probability: Array, share: float) -> Mask:
     ordered = np.sort(probability)
     mean = np.cumsum(ordered) / np.arange(1, len(ordered) + 1)
     count = int(np.searchsorted(mean, share, "right"))
-    limit = min(float(ordered[count - 1]), MAX_BAD_PROBABILITY) if count else -1.0
+    limit = float(ordered[count - 1]) if count else -1.0
     return np.asarray(probability <= limit)

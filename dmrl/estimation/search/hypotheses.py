@@ -113,7 +113,11 @@ def _circle_at(inputs: FilterInputs, start: int) -> Array:
     if not len(seen):
         seen = np.flatnonzero(np.isfinite(inputs.range_m))[-1:]
     if not len(seen):
-        return range_circle(1.0, 0.0)
+        # Without ranges a detection gives the distance.
+        later = [key for key in sorted(inputs.images) if key >= start] or sorted(inputs.images)[-1:]
+        distances = [np.exp(b[:, 2]) for key in later[:5] for _, b, _ in inputs.images[key]]
+        found = np.concatenate(distances) if distances else np.ones(1)
+        return range_circle(float(np.median(found)), 0.0)
     # A single range may be an outlier.
     range_m = float(np.median(inputs.range_m[seen[:5]]))
     return range_circle(range_m, float(inputs.height_m[seen[0]]))

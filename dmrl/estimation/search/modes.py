@@ -26,7 +26,7 @@ from dmrl.estimation.solver.levenberg_marquardt import (
 )
 from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import Values
-from dmrl.estimation.solver.unknowns import without_rows
+from dmrl.estimation.solver.unknowns import YAW_RATE_ERROR, with_rows, without_rows
 
 MAX_SOLVED, MAX_DEFICIT = 6, 100.0
 """Largest number of tracks that are solved, and largest log likelihood below the best of one."""
@@ -46,6 +46,8 @@ MIN_COST_GAIN = 0.5
 MODE_COST_MARGIN, MAX_MODES = 12.0, 4
 """Largest cost above the best, and largest number, of the modes of a flight that are kept. A
 mode 12 above the best has 5 % of its weight at the cost scale of 4."""
+MAX_FLEXIBLE = 2
+"""Largest number of solutions with changing yaw rate biases from which error models are solved."""
 COST_SCALE = 4.0
 """Cost difference at which a mode has 1 / e of the weight of the best one. Costs differ by this
 much without reason, because losses and noise model are approximations."""
@@ -97,13 +99,33 @@ def place_peer(problem: Problem, pose: Array, bias: Array) -> Values:
     return Values(state, constants)
 
 
-def find_modes(problem: Problem) -> list[MapEstimate]:
+def find_flexible_modes(problem: Problem, tracks: Sequence[Track]) -> list[Values]:
+    """Find solutions under yaw rate biases that change, in the layout of the problem.
+
+    A flight whose gyroscope drifts has no good solution with constant biases.
+
+    Parameters
+    ----------
+    problem
+        Flight of two robots with its noise.
+    tracks
+        Its tracks.
+    """
+    flexible = replace(problem, table=with_rows(problem.table, YAW_RATE_ERROR))
+    modes = find_modes(flexible, tracks)[:MAX_FLEXIBLE]
+    layout = coarsen(flexible).layout
+    return [convert_values(mode.values, layout, problem.layout) for mode in modes]
+
+
+def find_modes(problem: Problem, tracks: Sequence[Track] | None = None) -> list[MapEstimate]:
     """Find the modes of a flight of two robots, best first.
 
     Parameters
     ----------
     problem
         The flight.
+    tracks
+        Its tracks, best first. None: searched.
 
     Returns
     -------
@@ -112,7 +134,7 @@ def find_modes(problem: Problem) -> list[MapEstimate]:
     """
     coarse = coarsen(problem)
     solver = Solver(coarse)
-    tracks = _tracks(problem)
+    tracks = tracks or find_tracks(problem)
     starts = [_composite(tracks, choose_starts(problem.keyframe_s))]
     starts += [track for track in tracks if track.score > tracks[0].score - MAX_DEFICIT]
     found: list[MapEstimate] = []
@@ -155,7 +177,7 @@ def dead_reckon(problem: Problem, first: Array) -> Values:
     return Values(state, first[layout.width :])
 
 
-def _tracks(problem: Problem) -> list[Track]:
+def find_tracks(problem: Problem) -> list[Track]:
     """Return the tracks of a flight, best first; with longer ranges if these are far likelier."""
     tracks, ranges = follow_hypotheses(problem), problem.links[0].range_m
     if len(ranges) and np.quantile(ranges, CLOSE_SHARE) < CLOSE_M:

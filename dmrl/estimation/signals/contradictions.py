@@ -12,6 +12,7 @@ from scipy.ndimage import binary_dilation, median_filter
 
 from dmrl.estimation.model.odometry import preintegrate
 from dmrl.estimation.model.pair import GRID_RATE_HZ, MAX_DROPOUT_S, Array, Mask, Pair, SensorTrack
+from dmrl.estimation.signals.jump_detection import find_held
 
 WINDOWS_S = (0.5, 1.0, 2.0, 4.0)
 """Times over which ways are compared, seconds. An estimate that runs away for less is an outlier,
@@ -23,6 +24,20 @@ RANGE_MEDIAN = 21
 """Number of ranges in the median that a contradiction uses: twice the outliers in a row."""
 SURROUNDING_S = 1.0
 """Time around a contradiction that is dropped too, seconds: it may belong to the fall."""
+
+
+def drop_held_ranges(pair: Pair) -> Pair:
+    """Return the pair without ranges that repeat the one before, of each robot that ranges."""
+    held, sender = np.zeros(len(pair.range_m), bool), pair.range_sender
+    for robot in (0, 1):
+        mine = np.full(len(held), robot == 0) if sender is None else sender == robot
+        held[mine] = find_held(pair.range_m[mine])
+    if not held.any():
+        return pair
+    return replace(
+        pair, range_time_s=pair.range_time_s[~held], range_m=pair.range_m[~held],
+        range_sender=None if sender is None else sender[~held],
+    )  # fmt: skip
 
 
 def drop_contradictions(pair: Pair) -> Pair:
@@ -98,9 +113,10 @@ def _drop_odometry(track: SensorTrack, wrong: Mask, time_s: Array) -> SensorTrac
         fallen = crash + round(SURROUNDING_S * GRID_RATE_HZ)
         height_m[fallen:] = 0.0
     known = ~wrong
+    turning = None if track.turn_dropout is None else track.turn_dropout | wrong
     return SensorTrack(
         track.vx_mps * known, track.vy_mps * known, track.yaw_rate_radps * known,
-        height_m, track.dropout | wrong, track.height_dropout,
+        height_m, track.dropout | wrong, track.height_dropout, turning,
     )  # fmt: skip
 
 

@@ -23,6 +23,8 @@ value was chosen."""
 HEIGHT_MEDIAN_S, MIN_HEIGHT_STEP_M = 0.05, 0.12
 """Length of the medians of a height before and after a step, seconds; and smallest step, metres, as
 smaller ones may be noise. No record of how the values were chosen."""
+MIN_STEPS = 10.0
+"""Median change of a signal over its smallest, from which repeated values are no rounding."""
 MIN_STEP_SIGMAS = 5.0
 """Smallest jump, in standard deviations of a sample's change. No record of how the value was
 chosen."""
@@ -93,6 +95,24 @@ def _offset_after_jump(level: float, jump: float, on_top: bool) -> float:
     if jump > 0:
         return level + jump if on_top else jump
     return level + jump if level + jump > -MIN_OFFSET_SHARE * jump else 0.0
+
+
+def find_held(values: Array) -> Array:
+    """Return (N,) whether a sample repeats the one before it, in a signal that seldom does.
+
+    A log that is rounded repeats values by chance, and counts as not held.
+
+    Parameters
+    ----------
+    values
+        (N,) samples of one sensor, in the order of time.
+    """
+    same = np.diff(values, prepend=np.nan) == 0
+    steps = np.abs(np.diff(values[~same]))
+    coarse = len(steps) < 2 or np.median(steps) < MIN_STEPS * steps.min(
+        initial=np.inf, where=steps > 0
+    )
+    return np.zeros(len(values), bool) if coarse else same
 
 
 def _find_runs(marked: Array) -> list[tuple[int, int]]:

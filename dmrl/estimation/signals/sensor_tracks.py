@@ -1,6 +1,7 @@
 """Resample a robot's logs on a time grid, and mark dropouts."""
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from dmrl.estimation.model.pair import (
     GRID_RATE_HZ,
@@ -18,6 +19,10 @@ every sample, 4 px of a label at 1 m, and a drone climbs slowly."""
 MAX_REPEATED_SHARE = 0.5
 """A log that repeats more than this share of its samples is written that way. No record of how the
 value was chosen."""
+
+SPIKE_SAMPLES, MIN_SPIKE_RADPS = 41, 2.5
+"""Samples of the median of a yaw rate, and smallest difference of a spike from it, rad/s. A
+Crazyflie turns by 3.5 rad/s at most by default, and needs 0.2 s for it."""
 
 Signals = tuple[Array, Array]
 """Times (N,), seconds, and (N, C) values."""
@@ -39,14 +44,39 @@ def build_track(
     grid_s
         (K,) uniform grid at 100 Hz, seconds.
     """
-    turn, turn_gap = resample(*yaw_rate, grid_s)
+    spiky = find_spikes(yaw_rate[1][:, 0])
+    turn, turn_gap = resample(yaw_rate[0][~spiky], yaw_rate[1][~spiky], grid_s)
+    turn_gap |= find_frozen(*yaw_rate, grid_s) | _near(yaw_rate[0][spiky], grid_s)
     speed, gap = resample(*velocity, grid_s)
     gap |= find_frozen(*velocity, grid_s)
     level = remove_height_steps(height[0], height[1][:, 0])
     above, height_gap = resample(height[0], level[:, None], grid_s)
     smooth_m = _smooth_parabola(above[:, 0], int(HEIGHT_SMOOTHING_S * GRID_RATE_HZ / 2))
     gap |= turn_gap
-    return SensorTrack(speed[:, 0], speed[:, 1], turn[:, 0], smooth_m, gap, height_gap)
+    return SensorTrack(speed[:, 0], speed[:, 1], turn[:, 0], smooth_m, gap, height_gap, turn_gap)
+
+
+def find_spikes(yaw_rate_radps: Array) -> Mask:
+    """Return (N,) whether a yaw rate leaves the median of its surroundings for an instant.
+
+    No robot turns that fast and back. A reset of the heading, or a bad sample, looks so.
+
+    Parameters
+    ----------
+    yaw_rate_radps
+        (N,) samples, rad/s.
+    """
+    middle = median_filter(yaw_rate_radps, SPIKE_SAMPLES, mode="nearest")
+    return np.asarray(np.abs(yaw_rate_radps - middle) > MIN_SPIKE_RADPS)
+
+
+def _near(time_s: Array, grid_s: Array) -> Mask:
+    """Return (K,) whether one of some times is within a step of the grid."""
+    out, step_s = np.zeros(len(grid_s), bool), grid_s[1] - grid_s[0]
+    at = np.rint((time_s - grid_s[0]) / step_s).astype(int)
+    for shift in (-1, 0, 1):
+        out[np.clip(at + shift, 0, len(grid_s) - 1)] = True
+    return out if len(time_s) else np.zeros(len(grid_s), bool)
 
 
 def find_frozen(time_s: Array, values: Array, grid_s: Array) -> Mask:

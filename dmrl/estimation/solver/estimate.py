@@ -1,7 +1,6 @@
 """Estimated trajectory of a peer, and the same trajectory from the other robot."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -12,14 +11,45 @@ from dmrl.estimation.solver.layout import Layout, build_layout, from_peer
 from dmrl.estimation.solver.problem import NoiseModel
 from dmrl.estimation.solver.unknowns import TABLE
 
-RejectionReason = Literal["still", "alike", "silent", "open", "imprecise"]
-"""Reason why no position is OK.
-
-still: the observer hardly moves. alike: both robots move alike. silent: sensors dropped out for
-most of the flight. open: the motion leaves the bearing open, or other solutions fit. imprecise: no
-position is precise enough."""
 PAIR_LAYOUT: Layout = build_layout(TABLE, 2, [(0, 1)])
 """Columns of a pair without detections."""
+
+
+REASONS = {
+    "still": "robot hardly moves",
+    "alike": "robots move alike",
+    "silent": "sensors are silent",
+    "open": "bearing is open",
+    "imprecise": "positions are imprecise",
+}
+"""Names of the reasons why no position of a flight is OK."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Error of a sensor that a flight shows.
+
+    Parameters
+    ----------
+    name
+        Name of its model.
+    probability
+        Probability of the error, 0 to 1.
+    from_s, to_s
+        Times between which it is seen, seconds.
+    robot
+        0: the observer's sensor, 1: the peer's. None: the pair's.
+    """
+
+    name: str
+    probability: float
+    from_s: float
+    to_s: float
+    robot: int | None = None
+
+    def seen_from_peer(self) -> "Cause":
+        """Return the cause with observer and peer exchanged."""
+        return self if self.robot is None else replace(self, robot=1 - self.robot)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +78,12 @@ class Estimate:
         estimated.
     range_error_m
         (K,) temporary excess of the ranges, as behind an obstacle, metres. None: not estimated.
-    rejection_reason
-        Reason why no position is OK; None if any is.
     constants_covariance
         (G, G) of the constants. None: not estimated.
     modes
-        Number of distinct solutions of nearly equal cost that the covariance contains.
+        Number of solutions of nearly equal probability that the covariance contains.
+    causes
+        Errors of sensors that the flight shows, and a reason if no position is OK.
     """
 
     time_s: Array
@@ -66,9 +96,9 @@ class Estimate:
     height_m: Array | None = None
     height_std_m: Array | None = None
     range_error_m: Array | None = None
-    rejection_reason: RejectionReason | None = None
     constants_covariance: Array | None = None
     modes: int = 1
+    causes: tuple[Cause, ...] = ()
 
     def value(self, name: str, *robots: int) -> float:
         """Return a constant of the flight by name and robots (0: observer, 1: peer)."""
@@ -112,5 +142,6 @@ def seen_from_peer(estimate: Estimate) -> Estimate:
         covariance=covariance,
         constants=from_peer(estimate.layout, estimate.constants),
         constants_covariance=None,
+        causes=tuple(cause.seen_from_peer() for cause in estimate.causes),
         height_m=None if estimate.height_m is None else -estimate.height_m,
     )

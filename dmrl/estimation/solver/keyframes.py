@@ -104,12 +104,13 @@ def _cut_steps(time_s: Array, track: SensorTrack, key_s: Array) -> Steps:
         path.relative_motion(key_s[:-1] + lag, key_s[1:] + lag) for lag in (half_s, -half_s)
     )
     by_clock = np.column_stack([late.shift_m - early.shift_m, late.turn_rad - early.turn_rad])
-    gap_s = np.cumsum(track.dropout) * (time_s[1] - time_s[0])
+    masks = (track.dropout, track.dropout if track.turn_dropout is None else track.turn_dropout)
+    gaps_s = [np.cumsum(mask) * (time_s[1] - time_s[0]) for mask in masks]
     return Steps(
         np.diff(key_s),
         motion,
         by_clock / (2 * half_s),
-        np.diff(np.interp(key_s, time_s, gap_s)),
+        *(np.diff(np.interp(key_s, time_s, gap_s)) for gap_s in gaps_s),
         path,
         np.interp(key_s, time_s, track.height_m),
     )
@@ -126,7 +127,8 @@ def _cut_link(
     height_m = np.interp(at_s, pair.time_s, pair.peer.height_m - pair.own.height_m)
     guess = range_step_offsets(pair)[inside]
     ones = np.ones(len(key))
-    return RangeLink(both, key, at_s, pair.range_m[inside], ones, own, peer, height_m, guess)
+    sent = ones / 2 if pair.range_sender is None else 1.0 - pair.range_sender[inside]
+    return RangeLink(both, key, at_s, pair.range_m[inside], ones, own, peer, height_m, guess, sent)
 
 
 def _cut_view(
@@ -187,14 +189,14 @@ def average_ranges(link: RangeLink, key_s: Array) -> RangeLink:
     trend = np.interp(key_s[link.keyframe], key_s[keys], rate) * late_s
     count = np.bincount(link.keyframe)[keys]
     first = np.cumsum(count) - count
-    height, guess = (
-        np.add.reduceat(v, first) / count for v in (link.height_m, link.offset_guess_m)
+    height, guess, sent = (
+        np.add.reduceat(v, first) / count for v in (link.height_m, link.offset_guess_m, link.sent)
     )
     none = np.zeros((len(keys), 2))
     # A median of n values has pi/2 / n of the variance of one.
     std = np.sqrt(np.pi / 2 / count)
     middle = _medians(link.keyframe, level - trend)
-    return RangeLink(link.robots, keys, key_s[keys], middle, std, none, none, height, guess)
+    return RangeLink(link.robots, keys, key_s[keys], middle, std, none, none, height, guess, sent)
 
 
 def _medians(key: NDArray[np.intp], values: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,18 +88,24 @@ class Steps:
         (S, 3) derivative of shift and turn by the robot's clock offset, per second.
     dropout_s
         (S,) seconds of each step without odometry.
+    turn_dropout_s
+        (S,) of these, seconds without a yaw rate.
     path
         Dead reckoning of the robot, for any time.
     height_m
         (K,) measured heights.
+    noise_factor
+        Factor of the robot's velocity noise, beside the grade of the flight.
     """
 
     steps_s: Array
     motion: RelativeMotion
     clock_derivative: Array
     dropout_s: Array
+    turn_dropout_s: Array
     path: Odometry
     height_m: Array
+    noise_factor: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +128,9 @@ class RangeLink:
         (R,) height of the second robot minus that of the first.
     offset_guess_m
         (R,) detected excess of the ranges: a first guess.
+    sent
+        (R,) share of each range that the first robot measured: 1, 0, or one half where it is not
+        known.
     """
 
     robots: tuple[int, int]
@@ -133,6 +142,19 @@ class RangeLink:
     peer_shift_m: Array
     height_m: Array
     offset_guess_m: Array
+    sent: Array
+
+
+class Sight(NamedTuple):
+    """What the owner of an unknown sees at R ranges.
+
+    ``distance`` (R,) true distances, metres; ``bearing`` (R,) of the other robot in the owner's
+    frame, radians; ``sent`` (R,) share of each range that the owner measured.
+    """
+
+    distance: Array
+    bearing: Array
+    sent: Array
 
 
 @dataclass(frozen=True, slots=True)

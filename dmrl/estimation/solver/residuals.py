@@ -16,7 +16,7 @@ from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.block_tridiagonal import NormalEquations
 from dmrl.estimation.solver.layout import Layout
-from dmrl.estimation.solver.problem import CameraView, Problem, RangeLink
+from dmrl.estimation.solver.problem import CameraView, Problem, RangeLink, Sight
 from dmrl.estimation.solver.robust_loss import Loss
 
 MAX_OUTLIER_SIGMAS, AZIMUTH_MARGIN_RAD = 5.0, 0.05
@@ -92,9 +92,9 @@ class Rows:
 def odometry_variance(problem: Problem, robot: int) -> Array:
     """Return (S, 3) variances of the measured motions between keyframes."""
     steps, noise = problem.robots[robot], problem.noise
-    shift = noise.velocity_psd * noise.grade**2 * steps.steps_s
+    shift = noise.velocity_psd * (noise.grade * steps.noise_factor) ** 2 * steps.steps_s
     shift = shift + noise.dropout_speed_mps**2 * steps.dropout_s
-    turn = noise.yaw_rate_psd * steps.steps_s + noise.dropout_turn_radps**2 * steps.dropout_s
+    turn = noise.yaw_rate_psd * steps.steps_s + noise.dropout_turn_radps**2 * steps.turn_dropout_s
     return np.column_stack([shift, shift, turn])
 
 
@@ -168,6 +168,18 @@ def _geometry(measured: RangeLink | CameraView, layout: Layout, values: Values) 
     return _Geometry(offset, up, -own @ QUARTER_TURN.T, peer @ QUARTER_TURN.T)
 
 
+def _sights(
+    link: RangeLink, layout: Layout, values: Values, offset: Array, distance: Array
+) -> dict[float, Sight]:
+    """Return what either robot of a link sees at its ranges, by the side of the robot."""
+    away = np.arctan2(offset[:, 1], offset[:, 0])
+    here, there = (values.state[link.keyframe, layout.pose(k)[2]] for k in link.robots)
+    return {
+        1.0: Sight(distance, away - here, link.sent),
+        -1.0: Sight(distance, away + np.pi - there, 1 - link.sent),
+    }
+
+
 def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Values) -> Rows:
     """Linearize the ranges of one pair: predicted minus measured."""
     at = _geometry(link, layout, values)
@@ -179,6 +191,7 @@ def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Valu
     columns = layout.pose(link.robots[0]) + layout.pose(link.robots[1]) + states
     out = np.zeros((len(distance), len(columns) + len(border) + 1))
     gain, error, heights = np.ones(len(distance)), np.zeros(len(distance)), []
+    sights = _sights(link, layout, values, at.offset, distance)
     for row, c, constant, side in used:
         column = len(columns) + border.index(c) if constant else columns.index(c)
         value = values.constants[c] if constant else values.state[link.keyframe, c]
@@ -189,7 +202,7 @@ def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Valu
             gain = gain + row.range_scale * value
             out[:, column] = row.range_scale * distance
         elif row.range:
-            effect = row.range(link, distance)
+            effect = row.range(link, sights[side])
             out[:, column] = effect
             error = error + effect * value
     out[:, heights] *= gain[:, None]

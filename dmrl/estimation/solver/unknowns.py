@@ -19,7 +19,7 @@ from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.robust_loss import Cauchy, Gaussian, Loss
 
 if TYPE_CHECKING:
-    from dmrl.estimation.solver.problem import CameraView, RangeLink, Steps
+    from dmrl.estimation.solver.problem import CameraView, RangeLink, Sight, Steps
 
 Owner = Literal["robot", "clock", "antenna", "pair", "flight"]
 """Owner of an unknown. A clock: every robot but the first, whose clock counts. An antenna or a
@@ -80,7 +80,7 @@ class Unknown:
     negated: bool = False
     motion: "Callable[[Steps], Array] | None" = None
     motion_scale: tuple[float, float] | None = None
-    range: "Callable[[RangeLink, Array], Array] | None" = None
+    range: "Callable[[RangeLink, Sight], Array] | None" = None
     range_scale: float = 0.0
     height: float = 0.0
     bearing: "Callable[[CameraView], Array] | None" = None
@@ -107,30 +107,30 @@ def _shift_along(steps: "Steps", axis: int) -> Array:
     return np.column_stack([shift, np.zeros(len(shift))])
 
 
-def _along_x(steps: "Steps") -> Array:
+def along_x(steps: "Steps") -> Array:
     """Return the effect of a forward velocity error."""
     return _shift_along(steps, 0)
 
 
-def _along_y(steps: "Steps") -> Array:
+def along_y(steps: "Steps") -> Array:
     """Return the effect of a velocity error to the left."""
     return _shift_along(steps, 1)
 
 
-def _turn(steps: "Steps") -> Array:
+def turn(steps: "Steps") -> Array:
     """Return the effect of a yaw rate bias."""
     none = np.zeros(len(steps.steps_s))
     return np.column_stack([none, none, steps.steps_s])
 
 
-def _later(steps: "Steps") -> Array:
+def later(steps: "Steps") -> Array:
     """Return the effect of a clock that stamps late: the motion shown is that of before."""
     return -steps.clock_derivative
 
 
-def _longer(_link: "RangeLink", distance: Array) -> Array:
+def longer(_link: "RangeLink", sight: "Sight") -> Array:
     """Return the effect of an excess of the ranges."""
-    return np.ones_like(distance)
+    return np.ones_like(sight.distance)
 
 
 def _aside(_view: "CameraView") -> Array:
@@ -157,11 +157,11 @@ TABLE: tuple[Unknown, ...] = (
         Cauchy(1.5),
         graded=True,
         key="range_offset_m",
-        range=_longer,
+        range=longer,
     ),
     Unknown("range_scale", "1", 0.02, "pair", graded=True, key="range_scale", range_scale=1.0),
     Unknown(
-        "gyro_bias", "rad/s", 0.003, "robot", Cauchy(2.0), key="yaw_rate_bias_radps", motion=_turn
+        "gyro_bias", "rad/s", 0.003, "robot", Cauchy(2.0), key="yaw_rate_bias_radps", motion=turn
     ),
     Unknown(
         "velocity_scale",
@@ -172,8 +172,8 @@ TABLE: tuple[Unknown, ...] = (
         key="velocity_scale",
         motion_scale=(1.0, 1.0),
     ),
-    Unknown("vx_bias", "m/s", 0.02, "robot", key="vx_bias_mps", motion=_along_x),
-    Unknown("vy_bias", "m/s", 0.02, "robot", key="vy_bias_mps", motion=_along_y),
+    Unknown("vx_bias", "m/s", 0.02, "robot", key="vx_bias_mps", motion=along_x),
+    Unknown("vy_bias", "m/s", 0.02, "robot", key="vy_bias_mps", motion=along_y),
     Unknown(
         "clock",
         "s",
@@ -181,7 +181,7 @@ TABLE: tuple[Unknown, ...] = (
         "clock",
         Cauchy(2.0),
         negated=True,
-        motion=_later,
+        motion=later,
     ),
     Unknown("height_offset", "m", 0.03, "robot", height=1.0),
     Unknown(
@@ -193,7 +193,7 @@ TABLE: tuple[Unknown, ...] = (
         "fading",
         0.3,
         graded=True,
-        motion=_along_x,
+        motion=along_x,
     ),
     Unknown(
         "velocity_error_y",
@@ -204,7 +204,7 @@ TABLE: tuple[Unknown, ...] = (
         "fading",
         0.3,
         graded=True,
-        motion=_along_y,
+        motion=along_y,
     ),
     Unknown(
         "range_error",
@@ -213,7 +213,7 @@ TABLE: tuple[Unknown, ...] = (
         "pair",
         Cauchy(1.0),
         "jump",
-        range=_longer,
+        range=longer,
         start_std=0.02,
         pull_std=0.05,
         pull_weight=0.04,
@@ -240,11 +240,23 @@ RANGE_MODELS: dict[str, Unknown] = {
         Cauchy(5.0),
         "fading",
         1.0,
-        range=_longer,
+        range=longer,
     ),
 }
 """Models of the temporary excess of ranges: jumps behind an obstacle, or reflections that fade in a
 second. Each is one row; `noise.select_model` compares their evidence."""
+
+YAW_RATE_ERROR = Unknown(
+    "yaw_rate_error",
+    "rad/s",
+    0.003,
+    "robot",
+    Cauchy(2.0),
+    "jump",
+    motion=turn,
+    start_std=0.03,
+)
+"""Bias of a yaw rate that changes over time, by small steps or by jumps."""
 
 SIGHTED = ("height_error", "camera_azimuth", "camera_elevation", "camera_distance")
 """Unknowns that only detections determine."""

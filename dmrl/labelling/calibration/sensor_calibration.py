@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dmrl.errors import RecordingError
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.flight.random_effects import PooledConstants, flight_information, pool_flights
-from dmrl.estimation.solver.estimate import Estimate
+from dmrl.estimation.solver.estimate import REASONS, Estimate
 from dmrl.estimation.solver.layout import Subject
 from dmrl.estimation.solver.unknowns import TABLE, Unknown
 from dmrl.labelling.flight_log import SENSOR_TOPICS, read_flight
@@ -30,7 +30,7 @@ ROWS = {row.name: row for row in TABLE}
 """Rows of the unknowns by name."""
 CLOCK_OFF = "clock_s"
 """Reported with the others, but not kept: clock offsets differ in every flight."""
-UNUSABLE = ("still", "alike", "silent", "open")
+UNUSABLE = {REASONS[reason] for reason in ("still", "alike", "silent", "open")}
 """Reasons of refusal after which a flight has no bearing, or perhaps a mirrored one."""
 
 
@@ -87,7 +87,11 @@ def pool_sensor_constants(
         a constant would change no label.
     """
     found = [one for flight in solved for one in flight.items()]
-    usable = [(names, one) for names, one in found if one.rejection_reason not in UNUSABLE]
+    usable = [
+        (names, one)
+        for names, one in found
+        if not any(cause.name in UNUSABLE for cause in one.causes)
+    ]
     counts = {names: sum(n == names for n, _ in usable) for names, _ in usable}
     twice = [(names, one) for names, one in usable if counts[names] >= MIN_FLIGHTS]
     if not twice:
@@ -122,7 +126,8 @@ def solve_flight(source: Path) -> dict[Names, Estimate]:
         If the recording cannot be read.
     """
     pairs = build_sensor_logs(read_flight(source, *SENSOR_TOPICS)).pairs
-    return dict(zip(pairs, (here for here, _ in estimate_pairs(list(pairs.values()))), strict=True))
+    found = estimate_pairs(list(pairs.values()), plain=True)
+    return dict(zip(pairs, (here for here, _ in found), strict=True))
 
 
 def _subjects(names: Names) -> dict[Owned, Subject]:

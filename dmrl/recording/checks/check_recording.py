@@ -14,7 +14,7 @@ from dmrl.errors import RecordingError
 from dmrl.geometry.calibration import find_calibration_fault
 from dmrl.recording.checks.clock_checks import check_clocks
 from dmrl.recording.checks.finding import Finding
-from dmrl.recording.checks.label_checks import check_labels
+from dmrl.recording.checks.label_checks import check_causes, check_labels
 from dmrl.recording.checks.scan import (
     KEPT_TOPICS,
     CheckData,
@@ -73,6 +73,7 @@ def check(path: Path, *, quick: bool = False, values: bool = False) -> list[Find
             _check_images,
             _check_calibrations,
             check_labels,
+            check_causes,
         )
     findings = [finding for rule in rules for finding in rule(data)]
     if data.contents.summary.contradiction:

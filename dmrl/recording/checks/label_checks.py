@@ -12,7 +12,7 @@ from dmrl.errors import RecordingError
 from dmrl.geometry.frames import Array, is_inside
 from dmrl.recording.checks.finding import Finding
 from dmrl.recording.checks.scan import CheckData, find_first_size
-from dmrl.topics import CALIBRATION, CAMERA_IMAGE, DETECTIONS, LABELS, parse_topic
+from dmrl.topics import CALIBRATION, CAMERA_IMAGE, CAUSES, DETECTIONS, LABELS, parse_topic
 
 BIAS_LABELS_MIN = 20
 """Labels with boxes that are needed to measure a bias."""
@@ -92,6 +92,27 @@ def _build_labels(source: str, peers: pa.Table, size_px: tuple[int, int] | None)
         pc.list_flatten(peers.filter(pa.array(has_box))["box_px"]).to_numpy().reshape(-1, 4),
         size_px,
     )
+
+
+def check_causes(data: CheckData) -> Iterator[Finding]:
+    """Report the errors of sensors that `dmrl label` found, most probable first."""
+    found: dict[str, tuple[float, str]] = {}
+    for topic in data.contents.topics:
+        parts = parse_topic(CAUSES, topic)
+        if parts is None or topic in data.broken:
+            continue
+        for causes in data.contents.get_table(topic)["causes"].to_pylist():
+            for one in causes:
+                owner = f"{one['robot']}'s " if one["robot"] else ""
+                text = (
+                    f"{owner}{one['name']}, {one['probability']:.0%}, "
+                    f"{one['from_s']:.0f} to {one['to_s']:.0f} s"
+                )
+                both = "-".join(sorted(parts.values()))
+                # Both directions of a pair have the same causes.
+                found.setdefault(f"{both}: {text}", (one["probability"], topic))
+    for text, (_, topic) in sorted(found.items(), key=lambda item: -item[1][0]):
+        yield Finding("warning", topic, text)
 
 
 def _check_images(data: CheckData, topic: str, image: str, table: pa.Table) -> Iterator[Finding]:

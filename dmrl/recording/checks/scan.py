@@ -20,11 +20,11 @@ from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.message_batch import Ints, MessageBatch
 from dmrl.recording.protobuf.columns import decode_topic, group_by_topic
 from dmrl.recording.reader import iter_columns
-from dmrl.topics import CALIBRATION, CAMERA_IMAGE, LABELS, find_topic, parse_topic
+from dmrl.topics import CALIBRATION, CAMERA_IMAGE, CAUSES, LABELS, find_topic, parse_topic
 
 STAMPED_TYPES = ("CompressedImage", "PoseInFrame")
 """Message types that contain a time stamp."""
-KEPT_TOPICS = (LABELS, CALIBRATION)
+KEPT_TOPICS = (LABELS, CALIBRATION, CAUSES)
 """Topics whose messages are kept in memory."""
 
 FIRST_VALUES, FIRST_IMAGES = 20_000, 500

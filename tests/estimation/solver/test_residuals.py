@@ -315,7 +315,8 @@ def test_carried_information_is_least_at_its_optimum() -> None:
 def test_noise_of_odometry_is_that_of_the_model_and_of_dropouts() -> None:
     problem, values = flight()
     noise = NoiseModel(velocity_psd=0.01, yaw_rate_psd=0.02, grade=2.0)
-    own = replace(problem.robots[0], dropout_s=np.full(len(problem.robots[0].steps_s), 0.1))
+    gap_s = np.full(len(problem.robots[0].steps_s), 0.1)
+    own = replace(problem.robots[0], dropout_s=gap_s, turn_dropout_s=gap_s)
     loud = replace(problem, noise=noise, robots=(own, problem.robots[1]))
     rows = odometry_factor(loud, problem.layout, 0, values).rows
     plain = odometry_factor(problem, problem.layout, 0, values).rows

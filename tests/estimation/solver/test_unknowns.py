@@ -10,7 +10,7 @@ from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.layout import build_layout, from_peer
 from dmrl.estimation.solver.levenberg_marquardt import relative_path
-from dmrl.estimation.solver.problem import NoiseModel, RangeLink
+from dmrl.estimation.solver.problem import NoiseModel, RangeLink, Sight
 from dmrl.estimation.solver.unknowns import SIGHTED, TABLE, Unknown, with_rows, without_rows
 from dmrl.labelling.sensor_file import OF_PAIR, OF_ROBOT, SCALES
 
@@ -121,9 +121,9 @@ def test_rows_are_replaced_by_name_and_removed() -> None:
     assert "clock" not in [row.name for row in without_rows(TABLE, ("clock",))]
 
 
-def _pattern(link: RangeLink, distance: Array) -> Array:
+def _pattern(link: RangeLink, sight: Sight) -> Array:
     """Ranges that grow over the flight."""
-    return np.asarray((link.time_s - 20.0) / 20.0) + 0 * distance
+    return np.asarray((link.time_s - 20.0) / 20.0) + 0 * sight.distance
 
 
 @pytest.mark.heavy

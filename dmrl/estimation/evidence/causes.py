@@ -1,0 +1,87 @@
+"""Causes of a flight: the error models that are probable, with their times."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dmrl.estimation.evidence.posterior import Mixture
+from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Pair
+from dmrl.estimation.solver.estimate import Cause
+
+MIN_DROPOUT_SHARE = 0.01
+"""Share of a flight from which a silent sensor is reported."""
+MIN_PROBABILITY = 0.1
+"""Smallest probability of a cause that is reported."""
+
+
+def find_causes(mixture: Mixture, span_s: tuple[float, float]) -> tuple[Cause, ...]:
+    """Return the causes of a window, most probable first.
+
+    Parameters
+    ----------
+    mixture
+        Solutions of the window under likely models.
+    span_s
+        First and last second of the window.
+    """
+    found = [
+        Cause(candidate.model.name, probability, *span_s, candidate.robot)
+        for candidate, probability in mixture.probabilities().items()
+        if probability >= MIN_PROBABILITY
+    ]
+    return tuple(sorted(found, key=lambda cause: -cause.probability))
+
+
+def join_causes(causes: Sequence[Cause]) -> tuple[Cause, ...]:
+    """Return causes with those of the same name and robot as one."""
+    out: dict[tuple[str, int | None], Cause] = {}
+    for cause in causes:
+        before = out.get((cause.name, cause.robot), cause)
+        out[cause.name, cause.robot] = replace(
+            before,
+            probability=max(before.probability, cause.probability),
+            from_s=min(before.from_s, cause.from_s),
+            to_s=max(before.to_s, cause.to_s),
+        )
+    return tuple(sorted(out.values(), key=lambda cause: -cause.probability))
+
+
+def find_dropouts(logged: Pair, used: Pair) -> tuple[Cause, ...]:
+    """Return the sensors that were silent, repeated one value, or were dropped.
+
+    Parameters
+    ----------
+    logged, used
+        The pair as logged, and as it was estimated.
+    """
+    found: list[Cause] = []
+    for robot, (before, after) in enumerate(((logged.own, used.own), (logged.peer, used.peer))):
+        turning = before.dropout if before.turn_dropout is None else before.turn_dropout
+        height = np.zeros_like(turning) if after.height_dropout is None else after.height_dropout
+        masks = {
+            "yaw rate silent or in spikes": turning,
+            "flow silent or stuck": before.dropout & ~turning,
+            "height silent or impossible": height,
+            "flow runs away or robot lies still": after.dropout & ~before.dropout,
+        }
+        found += [
+            _cause(name, used.time_s[mask], robot)
+            for name, mask in masks.items()
+            if mask.mean() > MIN_DROPOUT_SHARE
+        ]
+    held = np.isin(logged.range_time_s, used.range_time_s, invert=True)
+    if held.sum() > MIN_DROPOUT_SHARE * len(held):
+        found.append(_cause("range frozen", logged.range_time_s[held], None))
+    edges = np.concatenate([used.time_s[:1], used.range_time_s, used.time_s[-1:]])
+    gaps_s = np.diff(edges)
+    silent_s = gaps_s[gaps_s > MAX_DROPOUT_S].sum()
+    if len(used.range_m) and silent_s > MIN_DROPOUT_SHARE * (edges[-1] - edges[0]):
+        silent = np.flatnonzero(gaps_s > MAX_DROPOUT_S)
+        found.append(_cause("range silent", edges[[silent[0], silent[-1] + 1]], None))
+    return tuple(found)
+
+
+def _cause(name: str, time_s: Array, robot: int | None) -> Cause:
+    """Return a cause that the measurements show by themselves."""
+    return Cause(name, 1.0, float(time_s.min()), float(time_s.max()), robot)
