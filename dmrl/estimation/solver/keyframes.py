@@ -106,11 +106,13 @@ def _cut_steps(time_s: Array, track: SensorTrack, key_s: Array) -> Steps:
     by_clock = np.column_stack([late.shift_m - early.shift_m, late.turn_rad - early.turn_rad])
     masks = (track.dropout, track.dropout if track.turn_dropout is None else track.turn_dropout)
     gaps_s = [np.cumsum(mask) * (time_s[1] - time_s[0]) for mask in masks]
+    dropout_s, turn_dropout_s = (np.diff(np.interp(key_s, time_s, gap_s)) for gap_s in gaps_s)
     return Steps(
         np.diff(key_s),
         motion,
         by_clock / (2 * half_s),
-        *(np.diff(np.interp(key_s, time_s, gap_s)) for gap_s in gaps_s),
+        dropout_s,
+        turn_dropout_s,
         path,
         np.interp(key_s, time_s, track.height_m),
     )
