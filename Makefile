@@ -20,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help bench bench-labels demo test test-heavy test-all test-faults mutants golden check format lint types imports spell schemas constraints docs pictures site examples wheels layout clean
+.PHONY: help int8 bench bench-labels demo test test-heavy test-all test-faults mutants golden check format lint types imports spell schemas constraints docs pictures site examples wheels layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -69,6 +69,9 @@ imports: $(VENV)/.dev layout ## Check that imports go down only.
 
 spell: $(VENV)/.dev ## Check spelling.
 	$(BIN)/codespell
+
+int8: $(VENV)/.dev ## Quantise the shipped networks again. ARGS="published.mcap" adds images that set ranges.
+	$(BIN)/python benchmarks/ship_int8.py $(ARGS)
 
 schemas: $(VENV)/.dev ## Build the message classes again from schemas/dmrl/v1/*.proto.
 	$(BIN)/python schemas/build.py

@@ -23,7 +23,12 @@ class Written:
     size_bytes: int
 
 
+DECODED_NAMES = {FLOAT_ONNX_NAME: "decoded.onnx", INT8_ONNX_NAME: "decoded.int8.onnx"}
+"""Files with the decoding inside, by the file that they are made of."""
 CONTENTS = {
+    "decoded.onnx": "float ONNX with the decoding: image in, detections out",
+    "decoded.int8.onnx": "int8 ONNX with the decoding",
+    "README.md": "how to use it: programs for onnxruntime, ROS 2, C and C++",
     FLOAT_ONNX_NAME: "float ONNX: image in, maps out",
     INT8_ONNX_NAME: "int8 ONNX (QDQ): the fast way on a computer, with onnxruntime",
     INTEGER_NAME: "the int8 network as arrays: what dmrl verify compares with",
@@ -74,6 +79,23 @@ def write_export(
     text = json.dumps(described, indent=1) + "\n"
     (folder / DESCRIPTION_NAME).write_text(text, encoding="utf-8")
     return network is not None
+
+
+def write_decoded(folder: Path) -> None:
+    """Write the ONNX files of an export once more, with the decoding inside.
+
+    Raises
+    ------
+    MissingExtra
+        If onnx is not installed.
+    """
+    from dmrl.deploy.onnx.decoded_output import add_decoding  # noqa: PLC0415 - an extra
+
+    described = json.loads((folder / DESCRIPTION_NAME).read_text(encoding="utf-8"))
+    for name, decoded in DECODED_NAMES.items():
+        if (folder / name).is_file():
+            model = add_decoding((folder / name).read_bytes(), described["stride_px"])
+            (folder / decoded).write_bytes(model)
 
 
 def refuse_export(model: Path) -> None:

@@ -32,6 +32,8 @@ class Settings:
     refine
         Write C that learns on in the last layer too, from images of which it is told who is in
         view. The state then holds all that the last layer reads.
+    decoded
+        Write ONNX files that decode as well: pixels, metres and confidences out, in place of maps.
     l1_kb
         The C works in a near memory of so many kilobytes, 8 of which are left for stacks, such as
         the 64 of a GAP8's L1: rings that do not fit lie in a far one, and rows are copied.
@@ -39,6 +41,7 @@ class Settings:
 
     bayer: bool = False
     refine: bool = False
+    decoded: bool = False
     l1_kb: Annotated[int | None, Parameter(validator=validators.Number(gte=9))] = None
 
 
@@ -67,7 +70,8 @@ def run(model: Model, out: Path, settings: Settings) -> "list[Written]":
         If two memories are wanted with ``refine``, or the near one is too small.
     """
     from dmrl.deploy.c.pilot_code import write_pilot
-    from dmrl.deploy.export_folder import list_files, refuse_export, write_export
+    from dmrl.deploy.export_folder import list_files, refuse_export, write_decoded, write_export
+    from dmrl.deploy.usage import write_usage
     from dmrl.flight.onboard_pilot import CONSTANTS, DETECTIONS_MAX
     from dmrl.geometry.frames import AIDECK_PINHOLE
     from dmrl.recording import build_provenance
@@ -81,7 +85,11 @@ def run(model: Model, out: Path, settings: Settings) -> "list[Written]":
     refuse_export(model)
     made = build_provenance("export", settings, (model,), libraries=("torch", "onnx", "numpy"))
     with atomic_folder(out) as folder:
-        quantized = write_export(model, folder, **asdict(settings))
+        form = {key: value for key, value in asdict(settings).items() if key != "decoded"}
+        quantized = write_export(model, folder, **form)
+        if settings.decoded:
+            write_decoded(folder)
+        write_usage(folder)
         if quantized:
             write_pilot(folder, AIDECK_PINHOLE, CONSTANTS, DETECTIONS_MAX)
         made.write(folder)

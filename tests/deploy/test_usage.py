@@ -1,0 +1,124 @@
+"""Every export says how to use it, in programs that compile, run, and find the same robots."""
+
+import py_compile
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dmrl
+from dmrl.cli import app
+from dmrl.images.codec import encode_png
+from dmrl.learn.inference.decode_grids import decode
+
+pytestmark = pytest.mark.heavy
+WARNINGS = ["-O1", "-Wall", "-Wextra", "-Wconversion", "-Werror"]
+COMPILERS = [pair for pair in (("gcc", "g++"), ("clang", "clang++")) if shutil.which(pair[0])]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording, and the exports of a shipped network: float, int8, and with two memories."""
+    place = tmp_path_factory.mktemp("usage")
+    for line in (
+        ["sketch", "pictures", "--images", "12"],
+        ["convert", "pictures", "pictures.mcap"],
+        ["dataset", "pictures.mcap", "dataset"],
+        ["quantize", "dmrl-nano", "dataset", "int8", "--images", "4"],
+        ["export", "dmrl-nano", "float", "--decoded"],
+        ["export", "int8", "network", "--decoded"],
+        ["export", "int8", "two", "--l1-kb", "64"],
+    ):
+        names = [
+            w if w.startswith("-") or w.isdigit() or w == "dmrl-nano" else str(place / w)
+            for w in line[1:]
+        ]
+        app([line[0], *names], result_action="return_value")
+    return place
+
+
+def programs(folder: Path, kind: str) -> list[str]:
+    """The programs of one language in a README that are to be saved."""
+    text = (folder / "README.md").read_text(encoding="utf-8")
+    text = text[text.index(": from an image to pixels") :]
+    return re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)
+
+
+def numbers(said: str) -> list[float]:
+    return [float(n) for n in re.findall(r"-?\d+\.\d+", said.splitlines()[0])]
+
+
+def best(model: Path, backend: str, image: np.ndarray) -> list[float]:
+    found = dmrl.load(model, backend=backend).detect(image[None])[0][0]
+    return [found.u_px, found.v_px, found.depth_m, found.confidence]
+
+
+@pytest.mark.parametrize("name", ["float", "network"])
+def test_the_program_for_onnxruntime_finds_what_dmrl_finds(folders: Path, name: str) -> None:
+    folder, image = folders / name, dmrl.open(folders / "pictures.mcap").images()[1]
+    first, node = programs(folder, "python")
+    (folder / "detect.py").write_text(first)
+    (folder / "node.py").write_text(node)
+    (folder / "image.png").write_bytes(encode_png(image))
+    py_compile.compile(str(folder / "node.py"), doraise=True)
+    line = [sys.executable, "detect.py", "image.png"]
+    done = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=True)
+    wanted = best(folder, "onnx" if name == "float" else "onnx-int8", image)
+    np.testing.assert_allclose(numbers(done.stdout), wanted, atol=0.06)
+
+
+@pytest.mark.parametrize("name", ["network", "two"])
+@pytest.mark.parametrize(("cc", "cxx"), COMPILERS)
+def test_the_programs_in_c_and_cpp_compile_cleanly_and_find_the_same(
+    folders: Path, name: str, cc: str, cxx: str, tmp_path: Path
+) -> None:
+    folder, image = folders / name, dmrl.open(folders / "pictures.mcap").images()[1]
+    (in_c,), (in_cpp,) = programs(folder, "c"), programs(folder, "cpp")
+    (tmp_path / "detect.c").write_text(in_c)
+    (tmp_path / "detect.cpp").write_text(in_cpp)
+    there = ["-I", str(folder)]
+    code = str(folder / "dmrl_nano.c")
+    for line in (
+        [cc, "-std=c99", *WARNINGS, *there, "detect.c", code, "-o", "as_c"],
+        [cc, "-std=c99", *WARNINGS, *there, "-c", code, "-o", "net.o"],
+        [cxx, "-std=c++11", *WARNINGS, *there, "detect.cpp", "net.o", "-o", "as_cpp"],
+    ):
+        subprocess.run(line, cwd=tmp_path, check=True)
+    wanted = best(folder, "integer", image)
+    for program in ("as_c", "as_cpp"):
+        done = subprocess.run(
+            [tmp_path / program], input=image.tobytes(), capture_output=True, check=True
+        )
+        np.testing.assert_allclose(numbers(done.stdout.decode()), wanted, atol=0.07)
+
+
+@pytest.mark.parametrize(
+    ("maps", "decoded"), [("model.onnx", "decoded.onnx"), ("model.int8.onnx", "decoded.int8.onnx")]
+)
+def test_detections_out_of_onnx_are_those_of_its_maps(
+    folders: Path, maps: str, decoded: str
+) -> None:
+    ort = pytest.importorskip("onnxruntime")
+    images = dmrl.open(folders / "pictures.mcap").images().to_numpy()
+    options = ort.SessionOptions()
+    options.add_session_config_entry("session.x64quantprecision", "1")
+    session = ort.InferenceSession(folders / "network" / maps, options)
+    names = [output.name for output in session.get_outputs()]
+    out = dict(zip(names, session.run(None, {"image": images}), strict=True))
+    offset = np.stack([out["offset_u"], out["offset_v"]], axis=1)
+    confidence = (1 / (1 + np.exp(-out["confidence_logit"].astype(float)))).astype(np.float32)
+    wanted = decode(confidence, np.exp(out["log_depth"]), offset, min_confidence=0.02)
+    (found,) = ort.InferenceSession(folders / "network" / decoded, options).run(
+        None, {"image": images}
+    )
+    assert found.shape == (len(images), 20, 4)
+    for k, rows in enumerate(found):
+        kept = rows[rows[:, 3] >= 0.02]
+        count = int((wanted.confidence[k, : wanted.count[k]] >= 0.02).sum())
+        columns = ("u_px", "v_px", "depth_m", "confidence")
+        held = np.stack([getattr(wanted, name)[k, :count] for name in columns], axis=1)
+        np.testing.assert_allclose(kept, held, atol=1e-3)
