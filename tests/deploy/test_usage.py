@@ -14,6 +14,7 @@ import dmrl
 from dmrl.cli import app
 from dmrl.images.codec import encode_png
 from dmrl.learn.inference.decode_grids import decode
+from dmrl.learn.pretrained import list_pretrained
 
 pytestmark = pytest.mark.heavy
 WARNINGS = ["-O1", "-Wall", "-Wextra", "-Wconversion", "-Werror"]
@@ -122,3 +123,16 @@ def test_detections_out_of_onnx_are_those_of_its_maps(
         columns = ("u_px", "v_px", "depth_m", "confidence")
         held = np.stack([getattr(wanted, name)[k, :count] for name in columns], axis=1)
         np.testing.assert_allclose(kept, held, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", list_pretrained())
+def test_a_shipped_network_has_its_int8_network_beside_it(name: str, tmp_path: Path) -> None:
+    """Of the weights that ship: else its outputs would be others. See benchmarks/ship_int8.py."""
+    app(["export", name, str(tmp_path / "out")], result_action="return_value")
+    assert (tmp_path / "out/model.int8.onnx").is_file() and list((tmp_path / "out").glob("*.c"))
+    dmrl.sketch(tmp_path / "drawn", images=12, seed=5)
+    images = dmrl.convert(tmp_path / "drawn", tmp_path / "drawn.mcap").images().to_numpy()
+    float_grids = dmrl.load(name, backend="torch").grids(images)
+    int8_grids = dmrl.load(name, backend="onnx-int8").grids(images)
+    both = [grids.confidence.ravel() for grids in (float_grids, int8_grids)]
+    assert np.corrcoef(*both)[0, 1] > 0.97

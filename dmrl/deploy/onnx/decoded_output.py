@@ -6,8 +6,10 @@ The nodes follow `dmrl.learn.inference.decode_grids`, in its order of ties.
 from typing import Any
 
 import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
 
-from dmrl.deploy.onnx.graph_writer import OUTPUT_OF, TensorProto, helper, numpy_helper, onnx
+from dmrl.deploy.onnx.graph_writer import OUTPUT_OF
 from dmrl.learn.inference.decode_grids import DUPLICATE_RADIUS_PX
 
 MOST = 20
