@@ -1,7 +1,8 @@
 """Quantise the shipped networks again, and put the int8 networks beside their weights.
 
 python benchmarks/ship_int8.py [RECORDING ...]: the images of the recordings and of 400 drawings by
-`dmrl sketch` set the ranges of the activations. Run it when a shipped network has changed: `make int8`.
+`dmrl sketch` set the ranges of the activations. Run it when a shipped network has changed
+(`make int8`).
 A test fails if an int8 network is not of the weights beside it.
 """
 

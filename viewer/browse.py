@@ -5,7 +5,7 @@ by source recording, robot and log time.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,8 @@ TIMELINE = "rank"
 ROBOT = "row"
 FACTS_PATH, ERROR_PX_PATH, ERROR_M_PATH = "/row/facts", "/row/error_px", "/row/error_m"
 BATCH_ROWS = 32
+MOST_ROWS = 200
+"""Rows that are shown by default."""
 
 CHANNEL_COLUMNS = {"confidence": layout.CONFIDENCE, "depth_m": layout.DEPTH}
 """Channels of maps, and the columns with their ground truth."""
@@ -88,7 +90,7 @@ def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Sh
     SettingError
         If no row is left, or another layout was requested.
     """
-    folder, ranked = rank_dataset(paths, settings)
+    folder, ranked = rank_dataset(paths, replace(settings, most=settings.most or MOST_ROWS))
     if rank is not None and not 1 <= rank <= len(ranked.rows):
         raise SettingError(
             f"{folder} shows {len(ranked.rows)} rows. Give --rank 1 to {len(ranked.rows)}"

@@ -1,68 +1,100 @@
-"""Write a page to mark bad rows of a dataset: images to click, and a CSV file to save.
+"""Write the label desk: one offline page to check, correct and flag labels of images.
 
-rerun reports no clicks to a program, so this is a separate page: one HTML file that opens offline,
-with the rows in the order of the layout ``dataset``.
+The page is ``desk/desk.html`` with the images and labels of a dataset or of recordings. It saves
+corrections as recordings of source ``hand`` and flags as a CSV file; ``dmrl dataset`` reads both.
 """
 
-import io
 import json
 from base64 import b64encode
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from html import escape
+from importlib.resources import files
 from pathlib import Path
+from string import Template
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl import topics
 from dmrl.atomic_output import atomic_file
-from dmrl.colours import RGB
 from dmrl.datasets import layout
 from dmrl.datasets.writing.exclusions import REQUIRED_COLUMNS
-from dmrl.errors import to_one_line
+from dmrl.errors import DmrlError, SettingError, to_one_line
 from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
+from dmrl.messages import (
+    STATUS_OK,
+    find_descriptor,
+    message_class,
+    serialize_schema,
+    to_status_name,
+)
+from dmrl.recording import Provenance, build_input, read, read_summary
+from dmrl.recording.provenance import METADATA_NAME, Input
+from dmrl.recording.provenance_inputs import read_provenance
+from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import track
 from dmrl.viewer.browse import RankedRows, image_size, rank_dataset
+from dmrl.viewer.label_suspicion import NEAR_PX, score_suspicion
 from dmrl.viewer.settings import Settings
 
-WIDE_PX = 240
-"""Width of an image on the page, pixels."""
-STYLE = """
-:root { color-scheme: light dark; font: 15px/1.4 system-ui, sans-serif }
-body { margin: 0 auto; max-width: 80rem; padding: 0 1rem 4rem }
-header { position: sticky; top: 0; background: Canvas; padding: .6rem 0; z-index: 1 }
-button { font: inherit; padding: .4rem .9rem }
-main { display: grid; grid-template-columns: repeat(auto-fill, minmax(11rem, 1fr)); gap: .6rem }
-label { display: block; cursor: pointer; border: 3px solid transparent; border-radius: 6px }
-label:has(:checked) { border-color: #d55e00 }
-label:has(:checked) svg { opacity: .45 }
-svg { width: 100%; height: auto; display: block }
-small { display: block; overflow-wrap: anywhere; padding: .1rem .2rem }
-"""
-SCRIPT = """
-const boxes = [...document.querySelectorAll('input')], count = document.querySelector('output');
-const cell = s => '"' + String(s).replaceAll('"', '""') + '"';
-const show = () => count.value = boxes.filter(b => b.checked).length;
-document.addEventListener('change', show);
-document.querySelector('button').addEventListener('click', () => {
-  const rows = boxes.filter(b => b.checked).map(b => JSON.parse(b.value).map(cell).join(','));
-  const text = [HEAD, ...rows].join('\\n') + '\\n';
-  const link = document.createElement('a');
-  link.href = URL.createObjectURL(new Blob([text], {type: 'text/csv'}));
-  link.download = 'flags.csv';
-  link.click();
-});
-show();
-""".replace("HEAD", json.dumps(",".join(REQUIRED_COLUMNS)))
+WIDE_PX, QUALITY = 320, 75
+"""Width of an image on the page, pixels, and quality of its JPEG."""
+DEFAULT_THRESHOLD = 0.5
+"""Threshold of detections that name none."""
+LABEL_FIELDS = [f.name for f in find_descriptor("PeerLabel").fields]
+STATUSES = {number: to_status_name(number) for number in range(3)}
+
+
+@dataclass(slots=True)
+class DeskRow:
+    """An image on the desk.
+
+    Parameters
+    ----------
+    source, robot, time_ns
+        Recording, robot and log time of the image.
+    image
+        JPEG as the address of an image.
+    labels, found
+        Fields of its PeerLabel and Detection messages.
+    error_px
+        Error of the worst label; None if unknown.
+    suspicion
+        Suspicion that a label is wrong or missing, 0 to 1.
+    """
+
+    source: str
+    robot: str
+    time_ns: int
+    image: str
+    labels: list[dict[str, Any]]
+    found: list[dict[str, Any]] = field(default_factory=list)
+    error_px: float | None = None
+    suspicion: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Desk:
+    """Rows of a desk, the size of its images, and what its recordings were made from."""
+
+    title: str
+    size_px: tuple[int, int]
+    rows: list[DeskRow]
+    inputs: Mapping[str, Input]
+    threshold: float = DEFAULT_THRESHOLD
 
 
 def write_flag_page(paths: Sequence[Path], out: Path, settings: Settings) -> int:
-    """Write the page of a dataset's rows, and return their number.
+    """Write the label desk of a dataset or of recordings, and return the number of images.
 
     Parameters
     ----------
     paths
-        The dataset, and optionally recordings with a model's detections: then worst rows first.
+        A dataset, and optionally recordings with a model's detections; or recordings with images
+        and labels, and detections if they have any.
     out
         Page to write. Must not exist.
     settings
@@ -73,81 +105,176 @@ def write_flag_page(paths: Sequence[Path], out: Path, settings: Settings) -> int
     DatasetError
         If the dataset or the rows do not exist.
     SettingError
-        If the paths contain no dataset.
+        If no recording has images.
     OutputError
         If ``out`` exists or cannot be written.
     """
-    folder, ranked = rank_dataset(paths, settings)
+    found = any(path.is_dir() for path in paths)
+    desk = _read_dataset(paths, settings) if found else _read_recordings(paths, settings)
+    for row in desk.rows:
+        row.suspicion = score_suspicion(row.labels, row.found)
     with atomic_file(out) as partial:
-        partial.write_text(page(folder.name, ranked), encoding="utf-8")
-    return len(ranked.rows)
+        partial.write_text(build_page(desk), encoding="utf-8")
+    return len(desk.rows)
 
 
-def page(name: str, ranked: RankedRows) -> str:
-    """Build the page, HTML; file names are escaped."""
-    policy = (
-        "default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
-        f"script-src 'sha256-{_hash_script(SCRIPT)}'"
+def build_page(desk: Desk) -> str:
+    """Build the page, HTML; names from files are escaped."""
+    parts = {name: _read_text(name) for name in ("desk.html", "desk.css", "desk.js")}
+    script = parts["desk.js"].strip()
+    provenance = {
+        name: Provenance("desk", {"page": desk.title}, inputs=(source,)).to_metadata()
+        for name, source in desk.inputs.items()
+    }
+    data = {
+        "size": desk.size_px,
+        "threshold": desk.threshold,
+        "near_px": NEAR_PX,
+        "ok": STATUS_OK,
+        "statuses": STATUSES,
+        "peers": sorted({label["peer"] for row in desk.rows for label in row.labels}),
+        "fields": [_describe_field(one) for one in find_descriptor("PeerLabel").fields],
+        "schema_name": find_descriptor("PeerLabels").full_name,
+        "schema": b64encode(serialize_schema("PeerLabels")).decode(),
+        "metadata_name": METADATA_NAME,
+        "provenance": provenance,
+        "flag_columns": REQUIRED_COLUMNS,
+        "rows": [asdict(row) | {"time_ns": str(row.time_ns)} for row in desk.rows],
+    }
+    # A closing tag inside a text would end the script that holds the data.
+    plain = json.dumps(_without_infinities(data)).replace("<", "\\u003c")
+    return Template(parts["desk.html"]).substitute(
+        title=escape(to_one_line(desk.title)),
+        style=parts["desk.css"],
+        data=plain,
+        script=script,
+        hash=b64encode(sha256(script.encode()).digest()).decode(),
     )
-    cells = "".join(track(_cells(ranked), "Drawing", len(ranked.rows)))
-    more = f" of {ranked.of}" if ranked.of > len(ranked.rows) else ""
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{_text(name)}</title><style>{STYLE}</style></head><body><header>"
-        f"<b>{_text(name)}</b>: {len(ranked.rows)}{more} rows. Click the bad ones. "
-        "<output></output> marked: <button>save flags.csv</button>, then run "
-        f"<code>dmrl dataset ... --without flags.csv</code></header><main>{cells}</main>"
-        f"<script>{SCRIPT}</script></body></html>\n"
-    )
 
 
-def _text(words: str) -> str:
-    return escape(to_one_line(words))
+def _read_text(name: str) -> str:
+    return files("dmrl.viewer").joinpath("desk", name).read_text(encoding="utf-8")
 
 
-def _hash_script(script: str) -> str:
-    return b64encode(sha256(script.encode()).digest()).decode()
+def _describe_field(one: Any) -> tuple[str, int, str]:
+    """Return name, number and kind of a field, as the page encodes it."""
+    kind = {one.TYPE_STRING: "string", one.TYPE_DOUBLE: "double"}.get(one.type, "number")
+    return one.name, one.number, "doubles" if one.is_repeated else kind
 
 
-def _cells(ranked: RankedRows) -> Iterator[str]:
-    wide, high = image_size(ranked.rows)
-    for k in range(len(ranked.rows)):
+def _without_infinities(value: Any) -> Any:
+    """Return JSON values; an infinite or unknown number becomes None."""
+    if isinstance(value, Mapping):
+        return {str(key): _without_infinities(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_infinities(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _read_dataset(paths: Sequence[Path], settings: Settings) -> Desk:
+    folder, ranked = rank_dataset(paths, settings)
+    size_px = image_size(ranked.rows)
+    made = read_provenance(folder)
+    inputs = {source.name: source for source in (made.inputs if made else ())}
+    threshold, found = _read_found(ranked)
+    rows = []
+    for k in track(range(len(ranked.rows)), "Drawing"):
         row = ranked.rows.slice(k, 1).to_pylist()[0]
-        value = escape(json.dumps([row[name] for name in REQUIRED_COLUMNS]))
-        error = ranked.error_px[k]
-        judged = f", error {error:.1f} px" if np.isfinite(error) else ""
-        words = f"{row['source']}, {row['robot']}, {row['log_time'] / 1e9:.2f} s{judged}"
-        yield (
-            f'<label><input type="checkbox" value="{value}">{_draw_thumbnail(row, wide, high)}'
-            f"<small>{_text(words)}</small></label>"
+        error = float(ranked.error_px[k])
+        rows.append(
+            DeskRow(
+                row["source"],
+                row["robot"],
+                row["log_time"],
+                _to_address(_pixels(row, *size_px), size_px),
+                [_fill_label(peer) for peer in row["peers"]],
+                found[k],
+                None if np.isnan(error) else min(error, 1e9),
+            )
         )
+    named = {name: inputs.get(name, Input(name, "")) for name in {row.source for row in rows}}
+    return Desk(folder.name, size_px, rows, named, threshold)
 
 
-def _draw_thumbnail(row: dict[str, object], wide: int, high: int) -> str:
-    """Draw a small image with a circle around every labelled peer."""
-    size = (WIDE_PX, max(1, round(high * WIDE_PX / wide)))
-    small = encode_jpeg(crop_and_scale(_pixels(row, wide, high), (0, 0, wide, high), *size), 80)
-    marks = io.StringIO()
-    peers = row["peers"]
-    assert isinstance(peers, list)
-    for peer in peers:
-        red, green, blue = RGB.get(peer["source"], RGB["other"])
-        line = f'fill="none" stroke="rgb({red},{green},{blue})" stroke-width="2"'
-        marks.write(f'<circle cx="{peer["u_px"]:.1f}" cy="{peer["v_px"]:.1f}" r="14" {line}/>')
-    data = b64encode(small).decode()
-    return (
-        f'<svg viewBox="0 0 {wide} {high}"><image width="{wide}" height="{high}" '
-        f'href="data:image/jpeg;base64,{data}"/>{marks.getvalue()}</svg>'
-    )
+def _read_found(ranked: RankedRows) -> tuple[float, list[list[dict[str, Any]]]]:
+    """Return the threshold of a model, and its detections of each row."""
+    if ranked.found is None:
+        return DEFAULT_THRESHOLD, [[] for _ in range(len(ranked.rows))]
+    batch = ranked.found.to_detections()
+    threshold = max(batch["threshold"].to_pylist(), default=0.0) or DEFAULT_THRESHOLD
+    return threshold, batch["detections"].to_pylist()
 
 
-def _pixels(row: dict[str, object], wide: int, high: int) -> NDArray[np.uint8]:
+def _fill_label(peer: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a PeerLabel from a dataset's peer."""
+    label = {name: peer[name] for name in LABEL_FIELDS if name in peer}
+    return label | {"status": next(n for n, name in STATUSES.items() if name == peer["status"])}
+
+
+def _read_recordings(paths: Sequence[Path], settings: Settings) -> Desk:
+    rows: list[DeskRow] = []
+    size_px, threshold = (0, 0), DEFAULT_THRESHOLD
+    for path in paths:
+        robots = topics.list_robots(list(read_summary(path).topics))
+        for robot in robots if settings.robot is None else [settings.robot]:
+            for row, told, size in track(_iter_rows(path, robot), f"Reading {path.name}"):
+                size_px, threshold = size, told or threshold
+                rows.append(row)
+    if not rows:
+        raise SettingError(f"{paths[0]} has no images. Name a dataset or a recording with images")
+    rows = rows[:: settings.every][: settings.most]
+    inputs = {path.name: build_input(path) for path in paths}
+    return Desk(" + ".join(path.stem for path in paths), size_px, rows, inputs, threshold)
+
+
+def _iter_rows(path: Path, robot: str) -> Iterator[tuple[DeskRow, float, tuple[int, int]]]:
+    """Yield the images of a robot, the threshold of their detections, and their size."""
+    wanted = (topics.CAMERA_IMAGE(robot), topics.LABELS(robot), topics.DETECTIONS(robot))
+    present = read_summary(path).topics
+    messages: dict[str, dict[int, Any]] = {topic: {} for topic in wanted}
+    for topic in wanted[1:]:
+        if topic in present:
+            messages[topic] = {one.time_ns: one.message for one in read(path, topic)}
+    nothing = message_class("PeerLabels")(), message_class("Detections")()
+    for stamped in read(path, wanted[0]):
+        labels, found = (
+            messages[topic].get(stamped.time_ns, none)
+            for topic, none in zip(wanted[1:], nothing, strict=True)
+        )
+        try:
+            pixels = decode(stamped.message.data, f"{path}: image at {stamped.time_ns} ns")
+        except DmrlError as e:
+            leave_out("images that cannot be decoded", e)
+            continue
+        high, wide = pixels.shape[:2]
+        row = DeskRow(
+            path.name,
+            robot,
+            stamped.time_ns,
+            _to_address(pixels, (wide, high)),
+            [_message_fields(one, LABEL_FIELDS) for one in labels.peers],
+            [
+                _message_fields(one, ("u_px", "v_px", "depth_m", "confidence"))
+                for one in found.detections
+            ],
+        )
+        yield row, float(found.threshold), (wide, high)
+
+
+def _message_fields(message: Any, names: Sequence[str]) -> dict[str, Any]:
+    values = {name: getattr(message, name) for name in names}
+    return {k: list(v) if k == "box_px" else v for k, v in values.items()}
+
+
+def _to_address(pixels: NDArray[np.uint8], size_px: tuple[int, int]) -> str:
+    """Return an image, scaled, as the address that a page can hold."""
+    wide, high = size_px
+    size = (min(WIDE_PX, wide), max(1, round(high * min(WIDE_PX, wide) / wide)))
+    small = encode_jpeg(crop_and_scale(pixels, (0, 0, wide, high), *size), QUALITY)
+    return f"data:image/jpeg;base64,{b64encode(small).decode()}"
+
+
+def _pixels(row: Mapping[str, Any], wide: int, high: int) -> NDArray[np.uint8]:
     if layout.PIXELS in row:
-        raw = row[layout.PIXELS]
-        assert isinstance(raw, bytes)
-        return np.frombuffer(raw, np.uint8).reshape(high, wide, 3)
-    image = row[layout.IMAGE]
-    assert isinstance(image, dict)
-    return decode(image["bytes"], "a row's image")
+        return np.frombuffer(row[layout.PIXELS], np.uint8).reshape(high, wide, 3)
+    return decode(row[layout.IMAGE]["bytes"], "a row's image")

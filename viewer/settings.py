@@ -38,7 +38,7 @@ class Settings:
     overlay
         Lay the maps over the image, scaled up smoothly.
     most
-        dataset: largest number of rows shown.
+        dataset: largest number of rows shown. Without it, 200; on the label desk, all.
     split
         dataset: only rows of this split.
     error_from_px
@@ -54,7 +54,7 @@ class Settings:
     every: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1
     depth_max_m: Annotated[float, Parameter(validator=validators.Number(gt=0))] = 3.0
     overlay: bool = False
-    most: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 200
+    most: Annotated[int | None, Parameter(validator=validators.Number(gte=1))] = None
     split: str | None = None
     error_from_px: Pixels = None
     error_to_px: Pixels = None

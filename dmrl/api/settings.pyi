@@ -167,6 +167,7 @@ class DatasetSettings(TypedDict, total=False):
     png: bool
     parquet: bool
     without: str | PathLike[str] | None
+    corrections: Sequence[str | PathLike[str]]
     shard_images: int
     title: str
     license: str

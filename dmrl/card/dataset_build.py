@@ -24,6 +24,7 @@ from dmrl.datasets.writing.builder import (
     warn_about_other_sources,
     warn_about_unused_flags,
 )
+from dmrl.datasets.writing.corrections import read_corrections
 from dmrl.datasets.writing.dataset_writer import write_shards
 from dmrl.datasets.writing.exclusions import read_flags
 from dmrl.datasets.writing.inputs import warn_about_lenses
@@ -100,7 +101,7 @@ def _settings_of(
     """Return the settings of a dataset, which those given must not contradict."""
     made = before.made
     assert made is not None
-    names = {f.name for f in fields(Settings)} - {"without"}
+    names = {f.name for f in fields(Settings)} - {"without", "corrections"}
     for name in sorted(names & set(given)):
         if getattr(settings, name) != made.settings.get(name):
             flag = f"--{name.replace('_', '-')}"
@@ -109,7 +110,8 @@ def _settings_of(
                 "another dataset"
             )
     own = {name: value for name, value in made.settings.items() if name in names}
-    return replace(recipes.check(f"{out}/provenance.json", own, Settings), without=settings.without)
+    made_with = recipes.check(f"{out}/provenance.json", own, Settings)
+    return replace(made_with, without=settings.without, corrections=settings.corrections)
 
 
 def _write_part(
@@ -179,7 +181,8 @@ def _assign_splits(
 
 def _select_images(settings: Settings) -> RowFilter:
     flagged = frozenset() if settings.without is None else read_flags(settings.without)
-    return RowFilter(settings.keep_all, settings.masks, flagged)
+    corrected = read_corrections(settings.corrections)
+    return RowFilter(settings.keep_all, settings.masks, flagged, corrected)
 
 
 def _describe(folder: Path) -> None:
@@ -206,7 +209,7 @@ def _describe(folder: Path) -> None:
 
 def _provenance(recordings: Sequence[Path], settings: Settings) -> Provenance:
     flags = [] if settings.without is None else [settings.without]
-    inputs, libraries = [*recordings, *flags], ("pyarrow", "pillow")
+    inputs, libraries = [*recordings, *flags, *settings.corrections], ("pyarrow", "pillow")
     return build_provenance("dataset", settings, inputs, seed=settings.seed, libraries=libraries)
 
 

@@ -40,6 +40,9 @@ class Settings:
     parquet
         Write Parquet files in place of Arrow shards, for publishing. Images are PNG then, which
         other tools display.
+    corrections
+        Recordings of corrected labels, as the page of dmrl view --flag saves them: of their images,
+        these labels are used. Repeat for more.
     without
         CSV file of images to leave out: source, robot, log_time. dmrl view DATASET --flag helps
         to write one.
@@ -62,6 +65,7 @@ class Settings:
     png: bool = False
     parquet: bool = False
     without: Path | None = None
+    corrections: Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)] = ()
     shard_images: Positive = 2048
     title: str = ""
     license: str = "unknown"

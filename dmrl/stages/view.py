@@ -68,8 +68,8 @@ def command(
     screenshot_to
         Write a PNG picture. Needs no screen.
     flag_to
-        Write an HTML page of a dataset's rows on which to click those that are bad; it saves
-        them as flags.csv, for dmrl dataset --without.
+        Write the label desk of a dataset or of recordings: an HTML page to check, correct and
+        flag labels. It saves recordings for dmrl dataset --corrections, and flags for --without.
     serve_web
         Show it in a browser.
     time_s
@@ -95,11 +95,8 @@ def command(
             shown = screenshot(recording, screenshot_to, settings, time_s=time_s, rank=rank)
             print_line(f"{screenshot_to}: {shown}")
         elif flag_to is not None:
-            if not any(path.is_dir() for path in recording):
-                raise SettingError(f"{recording[0]} is no dataset. --flag needs one: dmrl dataset")
-            print_line(
-                f"{flag_to}: {flag(recording, flag_to, settings)} rows. Open it in a browser"
-            )
+            count = flag(recording, flag_to, settings)
+            print_line(f"{flag_to}: {count} rows. Open it in a browser")
         elif serve_web:
             serve(recording, settings, web)
         else:

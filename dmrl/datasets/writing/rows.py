@@ -11,7 +11,7 @@ Each recording uses one source of labels. These images are kept or left out:
 
 import re
 from collections.abc import Callable, Iterator, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.datasets.layout import PEER_TYPE
+from dmrl.datasets.writing.corrections import Corrections
 from dmrl.datasets.writing.dataset_writer import Row
 from dmrl.datasets.writing.exclusions import FlaggedImage
 from dmrl.datasets.writing.splits import SplitLookup
@@ -63,11 +64,14 @@ class RowFilter:
         mark the peer as background.
     flagged
         Images that are left out.
+    corrected
+        Labels of images that replace those of the recording.
     """
 
     keep_all: bool = False
     masks: bool = False
     flagged: Set[FlaggedImage] = frozenset()
+    corrected: Corrections = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -83,6 +87,7 @@ class ExclusionCounts:
     flagged: int = 0
     twice: int = 0
     undecodable: int = 0
+    corrected: int = 0
 
     def count_undecodable(self, error: SourceError) -> None:
         """Count an image that was counted as kept before, but cannot be decoded."""
@@ -190,14 +195,19 @@ def iter_row_builders(
     masks, flagged = wanted.masks, wanted.flagged
     for image, labels, covered in iter_labelled_images(held, masks=masks):
         split = split_of(image.time_ns)
+        key = (held.path.name, _parse_robot(image), image.time_ns)
+        fixed = wanted.corrected.get(key)
         mine = [] if labels is None else [one for one in labels.peers if one.source == source]
-        if flagged and (held.path.name, _parse_robot(image), image.time_ns) in flagged:
+        if fixed is not None:
+            tally.corrected += 1
+            mine, labels = list(fixed), None
+        if key in flagged:
             tally.flagged += 1
-        elif labels is None:
+        elif labels is None and fixed is None:
             tally.without_labels += 1
         elif split is None:
             tally.in_no_split += 1
-        elif source not in (get_message_sources(labels) or {source}):
+        elif labels is not None and source not in (get_message_sources(labels) or {source}):
             tally.of_other_sources += 1
         elif masks and covered is None and mine:
             tally.without_mask += 1

@@ -82,7 +82,7 @@ def add_decoding(model: bytes, stride_px: int) -> bytes:
     parts = [node("Unsqueeze", column, last) for column in columns]
     graph.node.append(helper.make_node("Concat", parts, [OUTPUT], OUTPUT, axis=2))
     del graph.output[:]
-    shape = ["N", min(MOST, rows * cols), len(parts)]
+    shape: list[str | int | None] = ["N", min(MOST, rows * cols), len(parts)]
     graph.output.append(helper.make_tensor_value_info(OUTPUT, TensorProto.FLOAT, shape))
     onnx.checker.check_model(loaded, full_check=True)
     written: bytes = loaded.SerializeToString(deterministic=True)

@@ -1,0 +1,135 @@
+"""The label desk in a browser: labels are moved, drawn, accepted and flagged, and come back."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dmrl
+from dmrl.cli import app
+from dmrl.viewer.label_suspicion import score_suspicion
+
+from .webdriver import MISSING, Browser, open_browser, wait_for
+
+browser_only = pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}")
+pytestmark = [pytest.mark.heavy, pytest.mark.timeout(600)]
+
+
+def at(u_px: float, v_px: float, confidence: float = 0.0, sigma: float = 0.0) -> dict[str, float]:
+    return {
+        "u_px": u_px,
+        "v_px": v_px,
+        "confidence": confidence,
+        "sigma_u_px": sigma,
+        "sigma_v_px": sigma,
+    }
+
+
+def test_suspicion_is_high_where_a_label_and_a_sure_detection_miss_each_other() -> None:
+    right = score_suspicion([at(50, 50)], [at(52, 51, 0.9)])
+    moved = score_suspicion([at(50, 50)], [at(120, 51, 0.9)])
+    missing = score_suspicion([], [at(120, 51, 0.9)])
+    not_found = score_suspicion([at(50, 50)], [])
+    assert moved > missing > not_found > right
+    assert score_suspicion([at(50, 50, sigma=30)], [at(120, 51, 0.9)]) < moved
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording with truth and a network's detections."""
+    place = tmp_path_factory.mktemp("desk")
+    dmrl.sketch(place / "pictures", images=24, seed=4)
+    dmrl.convert(place / "pictures", place / "flight.mcap")
+    dmrl.predict("dmrl-nano", place / "flight.mcap", place / "seen.mcap")
+    dmrl.make_dataset(place / "flight.mcap", place / "set", split="none")
+    return place
+
+
+def screen_place(browser: Browser, u_px: float, v_px: float) -> tuple[float, float]:
+    script = f"""const at = new DOMPoint({u_px}, {v_px}).matrixTransform(
+        document.querySelector('#stage svg').getScreenCTM()); return [at.x, at.y];"""
+    return tuple(browser.run(script))
+
+
+def label(browser: Browser, row: int, k: int) -> dict[str, float]:
+    return dict(browser.run(f"return rows[{row}].labels[{k}];"))
+
+
+@browser_only
+@pytest.mark.parametrize("width_px", [1200, 390])
+@pytest.mark.parametrize("what", ["dataset", "recording"])
+def test_what_a_person_does_on_the_desk_comes_back_in_the_dataset(
+    seen: Path, tmp_path: Path, width_px: int, what: str
+) -> None:
+    given = ["set", "seen.mcap"] if what == "dataset" else ["seen.mcap"]
+    page = tmp_path / "desk.html"
+    words = ["view", *(str(seen / name) for name in given), "--flag", str(page)]
+    app(words, result_action="return_value")
+    source = "flight.mcap" if what == "dataset" else "seen.mcap"
+    truth = dmrl.open(seen / "flight.mcap")["/cf1/labels"].to_arrow().to_pylist()
+    with open_browser(tmp_path, width_px) as browser:
+        browser.open(page)
+        assert browser.run("return document.documentElement.scrollWidth <= innerWidth;")
+        assert browser.run("return shown.length;") == 24
+        # The page of a dataset is by error; rows are told by their time.
+        times = browser.run("return rows.map(row => row.time_ns);")
+        row = next(k for k, t in enumerate(times) if len(truth_of(truth, t)) >= 1)
+        # 1: drag a label.
+        browser.click(f"#row-{row}")
+        first = label(browser, row, 0)
+        browser.drag(
+            screen_place(browser, first["u_px"], first["v_px"]), screen_place(browser, 200, 100)
+        )
+        moved = label(browser, row, 0)
+        assert abs(moved["u_px"] - 200) < 1.5 and abs(moved["v_px"] - 100) < 1.5
+        browser.screenshot(tmp_path / f"desk-{width_px}.png")
+        # 2: draw one in the next image, by the keys; 3: flag the one after.
+        second, third = (
+            browser.run(f"return shown[(shown.indexOf(rows[{row}]) + {k}) % 24].index;")
+            for k in (1, 2)
+        )
+        for shown in (second, third):
+            browser.press("\ue00c")
+            browser.click(f"#row-{shown}")
+            if shown == second:
+                before = browser.run(f"return rows[{second}].labels.length;")
+                browser.press("n")
+                browser.drag(screen_place(browser, 40, 60), screen_place(browser, 40, 60))
+                assert browser.run(f"return rows[{second}].labels.length;") == before + 1
+            else:
+                browser.click('[data-key="f"]')
+        browser.press("\ue00c")
+        browser.run("byId('save').click(); byId('flags').click();")
+        corrections = tmp_path / f"corrections-{source.removesuffix('.mcap')}.mcap"
+        wait_for(corrections)
+        flags = wait_for(tmp_path / "flags.csv").decode().splitlines()
+    assert flags == ["source,robot,log_time", f'"{source}","cf1","{times[third]}"']
+    found = dmrl.open(corrections)
+    errors = [f.text for f in found.check() if f.level == "error"]
+    assert errors == ["labels without any image on /cf1/camera/image"]  # it holds no images
+    table = found["/cf1/labels"].to_arrow().to_pylist()
+    assert sorted(one["log_time"] for one in table) == sorted(int(times[k]) for k in (row, second))
+    assert {peer["source"] for one in table for peer in one["peers"]} == {"hand"}
+    assert found.provenance is not None and found.provenance.inputs[0].name == source
+    recording = seen / source
+    made = dmrl.make_dataset(
+        recording,
+        tmp_path / "fixed",
+        split="none",
+        corrections=[corrections],
+        without=tmp_path / "flags.csv",
+    )
+    frame = made["train"].to_pandas()
+    mine = frame[frame["log_time"] == int(times[row])]
+    assert set(mine["label_source"]) == {"hand"}
+    assert np.abs(mine[["u_px", "v_px"]].to_numpy() - [200, 100]).max(axis=1).min() < 1.5
+    drawn = frame[frame["log_time"] == int(times[second])]
+    assert len(drawn) == before + 1 and np.isinf(drawn["sigma_depth_m"]).sum() == 1
+    assert int(times[third]) not in set(frame["log_time"]) and len(made["train"]) == 23
+
+
+def truth_of(table: list[dict[str, object]], time_ns: str) -> list[object]:
+    (one,) = (row for row in table if row["log_time"] == int(time_ns))
+    peers = one["peers"]
+    assert isinstance(peers, list)
+    return [p for p in peers if 20 < p["u_px"] < 300 and 20 < p["v_px"] < 200]
