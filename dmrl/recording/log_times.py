@@ -8,7 +8,13 @@ import numpy as np
 from dmrl.recording.mcap.batch_reader import iter_batches
 from dmrl.recording.mcap.file import open_mcap
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS, Ints
-from dmrl.recording.mcap.message_count import iter_index_times
+from dmrl.recording.mcap.message_count import (
+    count_chunks,
+    count_scanned,
+    iter_index_times,
+    verify_indexes,
+)
+from dmrl.recording.mcap.record_scan import scan_file
 from dmrl.recording.mcap.summary_section import read_summary_section
 from dmrl.recording.protobuf.message_types import require_types
 from dmrl.recording.summary import read_summary
@@ -47,6 +53,31 @@ def read_log_times(
     high = MAX_TIME_NS if end_ns is None else end_ns
     found = {topic: np.sort(times) for topic, times in read_indexed_times(path, names).items()}
     return {topic: t[(t >= low) & (t < high)] for topic, t in found.items()}
+
+
+def read_time_spans(path: Path) -> dict[str, tuple[int, int]]:
+    """Read the first and last log time of each topic that has messages, in flat memory.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a complete recording, or its message indexes contradict its statistics.
+    """
+    present = read_summary(path).topics
+    require_types(path, present, present)
+    with open_mcap(path) as stream:
+        section = read_summary_section(stream)
+        if section is None:
+            scanned = scan_file(stream)
+            found, channels = count_scanned(scanned), scanned.channels
+        else:
+            found = verify_indexes(stream, section) or count_chunks(stream, section)
+            channels = section.channels_by_id
+    spans: dict[str, tuple[int, int]] = {}
+    for number, (low, high) in found.spans_ns.items():
+        before = spans.get(channels[number].topic, (low, high))
+        spans[channels[number].topic] = min(low, before[0]), max(high, before[1])
+    return spans
 
 
 def read_indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:

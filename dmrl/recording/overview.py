@@ -4,11 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from dmrl.recording.log_times import read_log_times
-from dmrl.recording.mcap.file import corrupt_error
+from dmrl.recording.log_times import read_time_spans
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.summary import Summary
 from dmrl.terminal.tables import print_line, print_table
@@ -51,20 +47,15 @@ class Overview:
 
 def topic_rows(path: Path, found: Summary) -> list[tuple[str, str, int, float | None]]:
     """Return topic, message, count and mean rate of each topic, between its own messages."""
-    times = read_log_times(path, found.topics)
-    for topic, info in found.topics.items():
-        if (listed := len(times[topic])) != info.count:
-            raise corrupt_error(path, f"{topic} has {listed} of {info.count} messages")
+    spans = read_time_spans(path)
     return [
-        (topic, info.schema, info.count, _rate_hz(times.get(topic)))
+        (topic, info.schema, info.count, _rate_hz(info.count, *spans.get(topic, (0, 0))))
         for topic, info in found.topics.items()
     ]
 
 
-def _rate_hz(time_ns: NDArray[np.int64] | None) -> float | None:
-    if time_ns is None or len(time_ns) < 2 or time_ns[0] == time_ns[-1]:
-        return None
-    return (len(time_ns) - 1) / float((time_ns[-1] - time_ns[0]) * 1e-9)
+def _rate_hz(count: int, first_ns: int, last_ns: int) -> float | None:
+    return (count - 1) / ((last_ns - first_ns) * 1e-9) if last_ns > first_ns else None
 
 
 def ancestry_lines(made: Provenance | None) -> list[str]:

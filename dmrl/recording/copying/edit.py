@@ -15,7 +15,7 @@ from dmrl.recording.copying.chunk_copy import (
     iter_units,
     write_unit,
 )
-from dmrl.recording.log_times import read_log_times
+from dmrl.recording.log_times import read_log_times, read_time_spans
 from dmrl.recording.mcap.channel import RawMessage
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS
 from dmrl.recording.provenance_inputs import build_provenance, refuse_duplicates
@@ -71,7 +71,9 @@ def _warn_about_shared_sensors(one: Path, other: Path) -> None:
         row = find_topic(topic)
         if row is None or not row.sensor:
             continue
-        (start, end), (from_, to) = (_find_time_span(path, topic) for path in (one, other))
+        (start, end), (from_, to) = (
+            read_time_spans(path).get(topic, (0, 0)) for path in (one, other)
+        )
         if start < to and from_ < end:
             say(
                 f"{one} and {other} both have {topic} at the same time: different flights, or one "
@@ -95,12 +97,6 @@ def _collect_source_hashes(summary: Summary) -> set[str]:
         if summary.provenance
         else set()
     )
-
-
-def _find_time_span(path: Path, topic: str) -> tuple[int, int]:
-    """Return the first and last log time of a topic, nanoseconds."""
-    times = read_log_times(path, [topic])[topic]
-    return (int(times[0]), int(times[-1])) if len(times) else (0, 0)
 
 
 def trim(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dmrl.atomic_output import to_partial_path
 from dmrl.errors import OutputError, RecordingError
-from dmrl.recording.log_times import read_log_times
+from dmrl.recording.log_times import read_time_spans
 from dmrl.recording.mcap.channel import RawMessage, is_image_type
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.reader import read_raw
@@ -129,8 +129,9 @@ def _find_complete_until_ns(path: Path, *, has_images: bool) -> int:
     """Return the log time before which no message, image or number, is missing."""
     last: dict[bool, int] = {}
     topics = read_summary(path).topics
-    for topic, times in read_log_times(path, topics).items():
-        picture = is_image_type(topics[topic].schema)
-        last[picture] = max(last.get(picture, 0), int(times.max(initial=0)))
+    spans = read_time_spans(path)
+    for topic, info in topics.items():
+        picture = is_image_type(info.schema)
+        last[picture] = max(last.get(picture, 0), spans.get(topic, (0, 0))[1])
     # Images come with numbers that describe them, so a file with images alone has lost numbers.
     return min(last.values()) if False in last and (True in last or not has_images) else 0

@@ -3,7 +3,7 @@
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -48,12 +48,15 @@ class MessageCount:
         First and last log time, nanoseconds; both 0 without messages.
     contradiction
         What the Statistics record states otherwise; empty if it agrees.
+    spans_ns
+        First and last log time by channel id; empty if only the Statistics record was read.
     """
 
     by_channel: Counter[int]
     start_ns: int
     end_ns: int
     contradiction: str = ""
+    spans_ns: Mapping[int, tuple[int, int]] = field(default_factory=dict)
 
 
 def count_scanned(scanned: ScannedFile) -> MessageCount:
@@ -94,6 +97,11 @@ def count_recording(stream: BoundedReader, section: SummarySection) -> MessageCo
                 words = "is large or in a bucket: its statistics count its messages"
                 say_once(f"{stream.path} {words}. To count them all: dmrl check")
             return count
+    return count_chunks(stream, section)
+
+
+def count_chunks(stream: BoundedReader, section: SummarySection) -> MessageCount:
+    """Count the messages of every chunk, each read and verified; raise as `count_recording`."""
     times = _iter_chunk_times(stream, section)
     return _compare(section.statistics, section.channels_by_id, times)
 
@@ -215,16 +223,18 @@ def _compare(
 ) -> MessageCount:
     """Count messages by their times and compare them with the Statistics record."""
     counts: Counter[int] = Counter()
-    lows, highs = [], []
+    spans: dict[int, tuple[int, int]] = {}
     for number, time_ns in times:
         if len(time_ns):
             counts[number] += len(time_ns)
-            lows.append(int(time_ns.min()))
-            highs.append(int(time_ns.max()))
-    start_ns, end_ns = min(lows, default=0), max(highs, default=0)
+            low, high = int(time_ns.min()), int(time_ns.max())
+            before = spans.get(number, (low, high))
+            spans[number] = min(low, before[0]), max(high, before[1])
+    start_ns = min((low for low, _ in spans.values()), default=0)
+    end_ns = max((high for _, high in spans.values()), default=0)
     check_counts(statistics, channels, counts)
     if statistics is None:
-        return MessageCount(counts, start_ns, end_ns)
+        return MessageCount(counts, start_ns, end_ns, "", spans)
     if statistics.message_count != counts.total():
         raise McapError(f"{counts.total()} of {statistics.message_count} messages are there")
     stated = statistics.message_start_time, statistics.message_end_time
@@ -233,4 +243,4 @@ def _compare(
         f"{start_ns} to {end_ns} ns"
     )
     agrees = stated == (start_ns, end_ns) or not counts
-    return MessageCount(counts, start_ns, end_ns, "" if agrees else contradiction)
+    return MessageCount(counts, start_ns, end_ns, "" if agrees else contradiction, spans)
