@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from google.protobuf import json_format, text_format
-from google.protobuf.descriptor import Descriptor, FieldDescriptor, OneofDescriptor
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 from numpy.typing import NDArray
@@ -31,8 +31,6 @@ from dmrl.recording.protobuf.wire_scan import (
     FieldSpans,
     concatenate_spans,
     find_fields,
-    keep_last_of_oneof,
-    merge_occurrences,
 )
 from dmrl.recording.protobuf.wire_values import (
     FIXED_DTYPES,
@@ -58,12 +56,6 @@ def list_columns(kind: Descriptor) -> dict[str, FieldDescriptor]:
         extensions = sorted(kind.file.pool.FindAllExtensions(kind), key=lambda f: f.number)
         columns |= {f"[{f.full_name}]": f for f in extensions}
     return columns
-
-
-@lru_cache(maxsize=1024)
-def _list_oneofs(kind: Descriptor) -> tuple[OneofDescriptor, ...]:
-    """Return the oneofs of a message with several members; an optional field has one of its own."""
-    return tuple(oneof for oneof in kind.oneofs if len(oneof.fields) > 1)
 
 
 def decode(
@@ -97,20 +89,69 @@ def decode(
     wanted = {
         name: f for name, f in list_columns(descriptor).items() if fields is None or name in fields
     }
-    return _decode_fields(data, start, end, descriptor, wanted) if wanted else {}
+    if not wanted:
+        return {}
+    if _has_rare_fields(descriptor):
+        data, start, end = _rewrite(data, start, end, descriptor)
+    try:
+        return _decode_fields(data, start, end, wanted)
+    except _RepeatedError:
+        return _decode_fields(*_rewrite(data, start, end, descriptor), wanted)
+
+
+class _RepeatedError(Exception):
+    """A sub-message occurs several times in a message. Google's decoder merges them."""
+
+
+@lru_cache(maxsize=1024)
+def _has_rare_fields(kind: Descriptor) -> bool:
+    """Return whether a type has a oneof, a map or a closed enum, or sub-messages that do."""
+    seen: set[Descriptor] = set()
+    held = [kind]
+    while held:
+        one = held.pop()
+        seen.add(one)
+        columns = list_columns(one).values()
+        if one.GetOptions().map_entry or any(len(oneof.fields) > 1 for oneof in one.oneofs):
+            return True
+        if any(f.enum_type is not None and f.enum_type.is_closed for f in columns):
+            return True
+        inner = (f.message_type for f in columns)
+        held += [message for message in inner if message is not None and message not in seen]
+    return False
+
+
+def _rewrite(data: Bytes, start: Ints, end: Ints, kind: Descriptor) -> tuple[Bytes, Ints, Ints]:
+    """Write messages again by Google's decoder: of what excludes or replaces another, the last.
+
+    Oneofs, keys of maps, numbers of closed enums and occurrences of sub-messages are then unique.
+    """
+    build = GetMessageClass(kind)
+    parts = []
+    for message in (
+        _parse(build, data, *at) for at in zip(start.tolist(), end.tolist(), strict=True)
+    ):
+        message.DiscardUnknownFields()
+        parts.append(message.SerializePartialToString(deterministic=True))
+    ends = np.cumsum([len(part) for part in parts], dtype=np.int64)
+    starts = np.concatenate([[0], ends[:-1]]).astype(np.int64)[: len(parts)]
+    return np.frombuffer(b"".join(parts), np.uint8), starts, ends
+
+
+def _parse(build: Any, data: Bytes, first: int, last: int) -> Any:
+    try:
+        return build.FromString(data[first:last].tobytes())
+    except DecodeError as e:
+        raise WireError(f"{build.DESCRIPTOR.full_name}: {e}") from None
 
 
 def _decode_fields(
-    data: Bytes, start: Ints, end: Ints, kind: Descriptor, fields: dict[str, FieldDescriptor]
+    data: Bytes, start: Ints, end: Ints, fields: dict[str, FieldDescriptor]
 ) -> dict[str, pa.Array]:
-    oneofs = _list_oneofs(kind)
     numbers = {f.number: f for f in fields.values()}
-    numbers |= {f.number: f for oneof in oneofs for f in oneof.fields}
     found = find_fields(data, start, end, set(numbers))
-    for number in found:
-        found[number] = _select_valid(data, numbers[number], found[number])
-    for oneof in oneofs:
-        keep_last_of_oneof(found, oneof, len(start))
+    for number, spans in found.items():
+        found[number] = _select_valid(data, numbers[number], spans)
     return {
         name: _decode_field(data, len(start), found.get(f.number, []), f)
         for name, f in fields.items()
@@ -118,17 +159,12 @@ def _decode_fields(
 
 
 def _select_valid(data: Bytes, field: FieldDescriptor, found: list[FieldSpans]) -> list[FieldSpans]:
-    """Check the wire types, split packed runs, and drop numbers that a closed enum lacks."""
+    """Check the wire types, and split packed runs."""
     if field.is_repeated:
-        found = _expand_packed(data, field, found)
-    else:
-        for span in found:
-            _check_wire_type(field, span.wire, packed=False)
-    if field.enum_type is None or not field.enum_type.is_closed:
-        return found
-    known = list(field.enum_type.values_by_number)
-    dtype = np.dtype(VARINT_DTYPES[field.type])
-    return [s.select(np.isin(decode_integers(data, s.start, dtype, False), known)) for s in found]
+        return _expand_packed(data, field, found)
+    for span in found:
+        _check_wire_type(field, span.wire, packed=False)
+    return found
 
 
 def _decode_struct(
@@ -136,7 +172,7 @@ def _decode_struct(
 ) -> pa.Array:
     if _count_columns(kind) > limits.VARIABLES and not kind.GetOptions().map_entry:
         return _decode_to_json(data, start, end, kind, absent)
-    columns = _decode_fields(data, start, end, kind, list_columns(kind))
+    columns = _decode_fields(data, start, end, list_columns(kind))
     if not columns:
         mask = None if absent is None else pa.array(~absent).buffers()[1]
         return pa.Array.from_buffers(pa.struct([]), len(start), [mask])
@@ -172,11 +208,7 @@ def _decode_to_json(
         if absent is not None and absent[k]:
             rows.append(None)
             continue
-        try:
-            message = build.FromString(data[first:last].tobytes())
-        except DecodeError as e:
-            raise WireError(f"{name}: {e}") from None
-        rows.append(_to_json(message, kind))
+        rows.append(_to_json(_parse(build, data, first, last), kind))
     return pa.array(rows, pa.string())
 
 
@@ -202,35 +234,16 @@ def _decode_field(
         start = concatenate_spans(s.start for s in found)[order]
         end = concatenate_spans(s.end for s in found)[order]
         values = _decode_values(data, start, end, None, field)
-        lists = pa.ListArray.from_arrays(pa.array(offsets), values)
-        inner = field.message_type
-        is_map = inner is not None and inner.GetOptions().map_entry
-        return _keep_last_of_keys(lists) if is_map and len(values) > 1 else lists
+        return pa.ListArray.from_arrays(pa.array(offsets), values)
     # The last scalar wins, as the specification requires. Absent: an empty span.
     start, end = np.zeros(count, np.int64), np.zeros(count, np.int64)
     present = np.zeros(count, np.bool_)
     for span in found:
         start[span.row], end[span.row], present[span.row] = span.start, span.end, True
-    if field.message_type is not None:
-        if sum(len(span.row) for span in found) > np.count_nonzero(present):
-            data, start, end = merge_occurrences(data, count, found)
-        within = field.containing_type
-        if within is not None and within.GetOptions().map_entry:  # an absent value is empty
-            present[:] = True
+    occurrences = sum(len(span.row) for span in found)
+    if field.message_type is not None and occurrences > np.count_nonzero(present):
+        raise _RepeatedError
     return _decode_values(data, start, end, present, field)
-
-
-def _keep_last_of_keys(lists: pa.ListArray) -> pa.ListArray:
-    """Keep the last value of each key of maps, as the specification requires."""
-    entries = lists.values
-    keys = pa.table({"row": pc.list_parent_indices(lists), "key": entries.field(0)})
-    keys = keys.append_column("at", pa.array(np.arange(len(entries))))
-    last = keys.group_by(["row", "key"], use_threads=False).aggregate([("at", "max")])
-    if len(last) == len(entries):
-        return lists
-    kept = np.sort(last["at_max"].to_numpy())
-    offsets = np.searchsorted(kept, lists.offsets.to_numpy()).astype(np.int32)
-    return pa.ListArray.from_arrays(pa.array(offsets), entries.take(pa.array(kept)))
 
 
 def _check_wire_type(field: FieldDescriptor, wire: int, *, packed: bool) -> None:

@@ -4,12 +4,10 @@ Every round reads the next tag of every message, groups the messages by tag, and
 Source: Protocol Buffers encoding specification.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from google.protobuf.descriptor import OneofDescriptor
-from numpy.typing import NDArray
 
 from dmrl.recording.mcap.message_batch import Bytes, Ints
 from dmrl.recording.protobuf.wire_values import WireError, decode_varints
@@ -31,10 +29,6 @@ class FieldSpans:
     wire: int
     start: Ints
     end: Ints
-
-    def select(self, keep: NDArray[np.bool_]) -> "FieldSpans":
-        """Return some of the occurrences."""
-        return FieldSpans(self.row[keep], self.wire, self.start[keep], self.end[keep])
 
 
 def find_fields(
@@ -120,35 +114,3 @@ def _skip_groups(data: Bytes, number: int, start: Ints, depth: int) -> tuple[Int
 def concatenate_spans(parts: Iterable[Ints]) -> Ints:
     """Concatenate rows or offsets of several spans."""
     return np.concatenate([np.empty(0, np.int64), *parts])
-
-
-def keep_last_of_oneof(
-    found: dict[int, list[FieldSpans]], oneof: OneofDescriptor, count: int
-) -> None:
-    """Drop the members of a oneof that a later member of the same message replaces."""
-    last = {f.number: np.full(count, -1, np.int64) for f in oneof.fields if f.number in found}
-    for number, offsets in last.items():
-        for span in found[number]:
-            offsets[span.row] = span.start
-    for number in last if len(last) > 1 else ():
-        others = np.max([offsets for n, offsets in last.items() if n != number], axis=0)
-        found[number] = [span.select(span.start > others[span.row]) for span in found[number]]
-
-
-def merge_occurrences(
-    data: Bytes, count: int, found: Sequence[FieldSpans]
-) -> tuple[Bytes, Ints, Ints]:
-    """Concatenate the payloads of sub-messages that occur several times in one message.
-
-    The specification defines that as their merge. Returns bytes, and (N,) start and end in them.
-    """
-    row = concatenate_spans(span.row for span in found)
-    order = np.argsort(row, kind="stable")
-    start = concatenate_spans(span.start for span in found)[order]
-    size = concatenate_spans(span.end for span in found)[order] - start
-    before = np.cumsum(size) - size
-    merged = data[np.arange(int(size.sum())) + np.repeat(start - before, size)]
-    sizes = np.zeros(count, np.int64)
-    np.add.at(sizes, row[order], size)
-    end = np.cumsum(sizes)
-    return merged, end - sizes, end

@@ -15,11 +15,16 @@ def contains_itself(kind: Descriptor, within: tuple[str, ...] = ()) -> bool:
     return any(contains_itself(one, (*within, kind.full_name)) for one in inner)
 
 
+def ordered(text: str) -> Any:
+    """The values of a JSON text, the keys of its objects sorted: those of a map have no order."""
+    return json.loads(text, object_pairs_hook=lambda pairs: dict(sorted(pairs)))
+
+
 def plain(message: Any, *, top: bool = True) -> Any:
     """A message as its table has it, read by Google's own library."""
     kind = message.DESCRIPTOR
     if not top and contains_itself(kind):
-        return json.loads(
+        return ordered(
             json_format.MessageToJson(
                 message, preserving_proto_field_name=True, descriptor_pool=kind.file.pool
             )
@@ -52,7 +57,7 @@ def from_table(value: Any, kind: Descriptor, *, top: bool = True) -> Any:
     if value is None:
         return None
     if not top and contains_itself(kind):
-        return json.loads(value)
+        return ordered(value)
     out = dict(value)
     for field in kind.fields:
         inner = field.message_type
