@@ -178,8 +178,9 @@ def test_a_hundred_wrong_files_lose_nothing_in_silence(
 
 @pytest.mark.slow
 def test_ten_thousand_wrong_files_lose_nothing_in_silence(
-    places: tuple[Path, Path, Path],
+    places: tuple[Path, Path, Path], record_property: Callable[[str, object], None]
 ) -> None:
+    """Files by fault are a property of ``--junitxml FILE -o junit_family=xunit1``."""
     seen: Counter[str] = Counter()
 
     @settings(max_examples=MANY, derandomize=True, database=None)
@@ -188,4 +189,5 @@ def test_ten_thousand_wrong_files_lose_nothing_in_silence(
         seen.update(judge(seed, *places) or ("none",))
 
     every()
+    record_property("files by fault", dict(sorted(seen.items())))
     assert seen.keys() == {*FAULTS, "padded", "none"}
