@@ -140,7 +140,8 @@ def find_intervals(moments: Iterable[tuple[int, str | None]]) -> Intervals:
     return found
 
 
-def _to_timestamp(time_ns: int) -> dict[str, int]:
+def to_timestamp(time_ns: int) -> dict[str, int]:
+    """Return a time as the fields of a protobuf Timestamp."""
     seconds, nanos = divmod(time_ns, 1_000_000_000)
     return {"seconds": seconds, "nanos": nanos}
 
@@ -160,7 +161,7 @@ def build_image(time_ns: int, robot: str, data: bytes, kind: str) -> Sample:
         "png" or "jpeg".
     """
     fields = {
-        "timestamp": _to_timestamp(time_ns),
+        "timestamp": to_timestamp(time_ns),
         "frame_id": f"{robot}/optical",
         "data": data,
         "format": kind,
@@ -176,7 +177,7 @@ def build_calibration(time_ns: int, robot: str, camera: Camera) -> Sample:
     """
     k = camera.image_from_optical
     fields = {
-        "timestamp": _to_timestamp(time_ns),
+        "timestamp": to_timestamp(time_ns),
         "frame_id": f"{robot}/optical",
         "width": camera.width_px,
         "height": camera.height_px,

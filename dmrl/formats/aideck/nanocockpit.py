@@ -6,6 +6,7 @@ second, a compressed quaternion, milliradians per second. Raw images are convert
 they are missing, the colour ones are used.
 """
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,7 @@ FILE_COLUMN, NUMBER_COLUMN = "filename", "frame_id"
 TIME_COLUMN, STATE_TIME_COLUMN = "frame_gap8_timestamp", "state_gap8_timestamp"
 STATE_COLUMNS = ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "quat")
 RATE_COLUMNS = ("rateRoll", "ratePitch", "rateYaw")
+WHOLE_NUMBER = re.compile(r"\s*[+-]?\d{1,18}\s*")
 REQUIRED_COLUMNS = (
     FILE_COLUMN,
     NUMBER_COLUMN,
@@ -92,26 +94,15 @@ def _load_metadata(path: Path) -> tuple[list[str], dict[str, Times], TextTable]:
     if missing := [name for name in REQUIRED_COLUMNS if name not in text.columns]:
         raise SourceError(f"{path}:1: no column {', '.join(missing)}. Restore the file")
     cells = zip(*(text.columns[name] for name in REQUIRED_COLUMNS[1:]), strict=True)
-    values = [_parse_integers(row) for row in cells]
-    good = [k for k, row in enumerate(values) if row is not None]
-    if len(good) < len(values):
-        first = next(k for k, row in enumerate(values) if row is None)
-        reason = "lines with numbers that are not whole"
-        leave_out(reason, text.name_row(first), len(values) - len(good))
+    good = [k for k, row in enumerate(cells) if all(map(WHOLE_NUMBER.fullmatch, row))]
+    odd = sorted({*range(len(text.lines))} - {*good})
+    reason = "lines with numbers that are not whole"
+    leave_out(reason, text.name_row(odd[0]) if odd else path, len(odd))
     if not good:
         raise SourceError(f"{path} has no row of whole numbers. Restore the file")
-    columns = np.array([values[k] for k in good], np.int64).T
     text = text.select(good)
-    return text.columns[FILE_COLUMN], dict(zip(REQUIRED_COLUMNS[1:], columns, strict=True)), text
-
-
-def _parse_integers(row: Sequence[str]) -> list[int] | None:
-    """Parse whole numbers of 63 bits; None if a cell is none."""
-    try:
-        found = [int(cell) for cell in row]
-    except ValueError:
-        return None
-    return found if max(map(abs, found)) < 1 << 63 else None
+    columns = {name: np.array(text.columns[name], np.int64) for name in REQUIRED_COLUMNS[1:]}
+    return text.columns[FILE_COLUMN], columns, text
 
 
 def _find_image(source: Path, name: str) -> Path | None:

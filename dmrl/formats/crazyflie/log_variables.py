@@ -287,8 +287,7 @@ def _build_pose_columns(topic: str, time_ns: Times, rows: Array) -> SampleStream
         "position": dict(zip("xyz", rows.T[:3], strict=True)),
         "orientation": dict(zip("xyzw", rows.T[3:], strict=True)),
     }
-    seconds, nanos = np.divmod(time_ns, 1_000_000_000)
-    stamp = {"seconds": seconds, "nanos": nanos}
+    stamp = dict(zip(("seconds", "nanos"), np.divmod(time_ns, 1_000_000_000), strict=True))
     fields = {"timestamp": stamp, "frame_id": "world", "pose": pose}
     return Columns(topic, "PoseInFrame", time_ns, fields)
 

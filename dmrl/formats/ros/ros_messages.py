@@ -16,7 +16,7 @@ from dmrl.guards import limits
 from dmrl.images import codec
 from dmrl.images.pixel_encodings import LAYOUTS, convert_to_rgb
 from dmrl.messages import LogType, find_descriptor
-from dmrl.samples.sample import Sample, build_image
+from dmrl.samples.sample import Sample, build_image, to_timestamp
 from dmrl.terminal.left_out import leave_out
 
 HALF_PX = 0.5  # the origin is the first pixel's centre in ROS, its edge in dmrl
@@ -112,26 +112,24 @@ def _convert_compressed_image(
 
 
 def _convert_camera_info(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
-    k = np.array(message.k if hasattr(message, "k") else message.K, float)
-    p = np.array(message.p if hasattr(message, "p") else message.P, float)
-    d = message.d if hasattr(message, "d") else message.D
+    # ROS 1 and Foxglove write these names in capitals.
+    k, p, d, r = (
+        np.array(getattr(message, name, getattr(message, name.upper(), None)), float)
+        for name in "kpdr"
+    )
     if not (k[0] > 0 and k[4] > 0):
         reason = f"calibrations of {where.robot} without a focal length"
         leave_out(reason, f"{where.source} at {time_ns} ns")
         return
     k[[2, 5]] += HALF_PX
     p[[2, 6]] += HALF_PX
-    seconds, nanos = divmod(time_ns, 1_000_000_000)
     fields = {
-        "timestamp": {"seconds": seconds, "nanos": nanos},
+        "timestamp": to_timestamp(time_ns),
         "frame_id": f"{where.robot}/optical",
         "width": message.width,
         "height": message.height,
         "distortion_model": message.distortion_model,
-        "D": np.asarray(d, float).tolist(),
-        "K": k.tolist(),
-        "R": np.asarray(message.r if hasattr(message, "r") else message.R, float).tolist(),
-        "P": p.tolist(),
+        **{name: value.tolist() for name, value in zip("DKRP", (d, k, r, p), strict=True)},
     }
     yield Sample(time_ns, topics.CALIBRATION(where.robot), "CameraCalibration", fields)
 
@@ -192,11 +190,10 @@ def _rotate_from_fixed(fixed: Array, angles: Array) -> Array:
 
 def build_pose(topic: str, time_ns: int, position: Any, orientation: Any) -> Sample:
     """Build a pose in the world frame from a geometry_msgs pose."""
-    seconds, nanos = divmod(time_ns, 1_000_000_000)
     turn = {name: float(getattr(orientation, name)) for name in "xyzw"}
     place = {name: float(getattr(position, name)) for name in "xyz"}
     fields = {
-        "timestamp": {"seconds": seconds, "nanos": nanos},
+        "timestamp": to_timestamp(time_ns),
         "frame_id": "world",
         "pose": {"position": place, "orientation": turn},
     }
