@@ -67,13 +67,11 @@ def _warn_about_shared_sensors(one: Path, other: Path) -> None:
     They may be different flights or robots. Consecutive parts of one recording do not warn.
     """
     first, second = read_summary(one), read_summary(other)
-    for topic in sorted(set(first.topics) & set(second.topics)):
-        row = find_topic(topic)
-        if row is None or not row.sensor:
-            continue
-        (start, end), (from_, to) = (
-            read_time_spans(path).get(topic, (0, 0)) for path in (one, other)
-        )
+    rows = {topic: find_topic(topic) for topic in sorted({*first.topics} & {*second.topics})}
+    shared = [topic for topic, row in rows.items() if row is not None and row.sensor]
+    spans = [read_time_spans(path) for path in (one, other)] if shared else []
+    for topic in shared:
+        (start, end), (from_, to) = (found.get(topic, (0, 0)) for found in spans)
         if start < to and from_ < end:
             say(
                 f"{one} and {other} both have {topic} at the same time: different flights, or one "
