@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.records import ChunkIndex
 
 from dmrl import card, topics
 from dmrl.messages import message_class
 from dmrl.recording import RecordingWriter, build_provenance, check, merge, read_summary, trim
 from dmrl.recording.copying.chunk_copy import TopicSelection, copy_messages
 from dmrl.recording.mcap.chunks import chunk_builder, chunk_reader
+from dmrl.recording.mcap.file import BoundedReader
 from dmrl.stages import dataset, evaluate, fly, label, track
 
 Passes = Callable[[Path], float]
@@ -56,13 +58,13 @@ def _chunks(path: Path) -> int:
 def passes(monkeypatch: pytest.MonkeyPatch) -> Passes:
     """How often a recording was gone over since the last call."""
     opened: Counter[str] = Counter()
-    unpacked = chunk_reader.decompress
+    load = chunk_reader._load_chunk
 
-    def counted(path: Path, *rest: object) -> object:
-        opened[path.name] += 1
-        return unpacked(path, *rest)  # type: ignore[arg-type]
+    def counted(stream: BoundedReader, index: ChunkIndex) -> object:
+        opened[stream.path.name] += 1
+        return load(stream, index)
 
-    monkeypatch.setattr(chunk_reader, "decompress", counted)
+    monkeypatch.setattr(chunk_reader, "_load_chunk", counted)
     monkeypatch.setattr(card, "plots", None)
 
     def count(path: Path) -> float:
