@@ -175,7 +175,7 @@ BOMBS: dict[str, tuple[str, str, str, Make]] = {
         "any",
         "predict {model} {bomb} {out}.mcap --backend torch",
         "predict {model} {dots} {out}.mcap --backend torch",
-        with_image(png(3840, 2160), 20),
+        with_image(png(3840, 2160), 4),
     ),
     "image of 13,000 px": (
         "one",
@@ -281,6 +281,7 @@ def test_a_bomb_ends_with_one_line_in_little_memory(
     size_kb = sum(file.stat().st_size for file in files) // 1000
     assert peak - usual < SPARE_KB + FILE_TIMES * size_kb, (peak, usual)
     if end == "one":
-        assert status == 1 and said.startswith("dmrl: ") and said.count("\n") == 1, said
+        told = [line for line in said.splitlines() if not line.startswith("left out: ")]
+        assert status == 1 and len(told) == 1 and told[0].startswith("dmrl: "), said
     else:
         assert status in (0, 1) and "Traceback" not in said, said
