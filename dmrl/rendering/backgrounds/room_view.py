@@ -272,7 +272,9 @@ class RoomView:
             a, b, c = (at - part for part, at in zip(hit, lamp, strict=True))
             cosine = np.maximum(a * x + b * y - c * z, 0)
             cosine = cosine * cosine / (length2 * (a * a + b * b + c * c))
-            total += cosine**16
+            for _ in range(4):  # the 16th power
+                cosine = cosine * cosine
+            total += cosine
         return total
 
 
@@ -311,7 +313,8 @@ def _paint_pattern(
         return 0.0
     a, b = (part / np.float32(cell) for part, cell in zip(along, surface.cell_m, strict=True))
     if surface.pattern == "curtain":
-        tone *= 1 + np.float32(0.5) * np.sin(np.float32(2 * np.pi) * a)
+        # Sines and powers of float32 depend on the processor; rounded float64 does not.
+        tone *= (1 + 0.5 * np.sin(2 * np.pi * a.astype(float))).astype(np.float32)
         return 0.0
     whole_b = np.floor(b)
     if surface.pattern == "boards":

@@ -152,7 +152,7 @@ def _add_bloom(view: RoomView, picture: FloatImage) -> FloatImage:
         core, halo = rng.uniform(0.005, 0.03), rng.uniform(0.05, 0.25)
         for spread, power in ((core, rng.uniform(0.2, 1)), (halo, rng.uniform(0.05, 0.3))):
             across, along = (
-                np.exp(-((part - middle) ** 2) / np.float32(2 * spread**2))
+                np.exp(-((part.astype(float) - middle) ** 2) / (2 * spread**2))
                 for part, middle in ((u, right), (v, down))
             )
             bloom += np.float32(power) * along * across
