@@ -40,7 +40,6 @@ with optional_imports("train", "dmrl train"):
         transfer_weights,
     )
     from dmrl.learn.inference.threshold import (
-        MIN_EMPTY_IMAGES,
         count_false_alarms,
         find_unlabelled_images,
         select_threshold,
@@ -197,7 +196,8 @@ def _refuse_unfinished(partial: Path, *, resume: bool) -> None:
 
 
 EMPTY_IMAGES = 100
-"""Rooms without a robot that dmrl draws where the images held out have too few."""
+"""Rooms without a robot that dmrl draws where the images held out have fewer: of 20, two in a
+hundred cannot be told from none."""
 
 
 class Calibrated(NamedTuple):
@@ -227,7 +227,7 @@ def _calibrate(
     rates, source = measure_rates(scored), "the images held out"
     threshold = settings.threshold
     if threshold is None:
-        if find_unlabelled_images(scored).sum() < MIN_EMPTY_IMAGES:
+        if find_unlabelled_images(scored).sum() < EMPTY_IMAGES:
             source += " and rooms that dmrl draws"
             scored = score_examples(network, _add_empty_rooms(held_out, settings.seed))
         threshold = _or_published(select_threshold(scored, settings.false_alarms))

@@ -61,7 +61,7 @@ class TrainConfig(LossSettings):
         than 10 robots.
     false_alarms
         Largest mean number of detections at or above the threshold in a held-out image without a
-        robot. With fewer than 20 such images, rooms that dmrl draws are added.
+        robot. With fewer than 100 such images, rooms that dmrl draws are added.
     init_share
         Weight of the initial model in the saved weights, 0 to 1, against forgetting (Wortsman et
         al. 2022). 0: the trained weights only.
