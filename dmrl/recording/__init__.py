@@ -24,7 +24,6 @@ from dmrl.recording.copying.rewrite import shift_times as shift_times
 from dmrl.recording.licences import LICENCES_METADATA as LICENCES_METADATA
 from dmrl.recording.licences import extract_licence_title as extract_licence_title
 from dmrl.recording.licences import find_licence_file as find_licence_file
-from dmrl.recording.licences import read_licences as read_licences
 from dmrl.recording.loaded import LoadedRecording as LoadedRecording
 from dmrl.recording.log_times import read_log_times as read_log_times
 from dmrl.recording.mcap.channel import Channel as Channel

@@ -1,9 +1,9 @@
 """Find the licence file of a source, and read the licences from recordings' metadata."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
-from dmrl.recording.summary import Summary, read_summary
+from dmrl.recording.summary import Summary
 
 LICENCES_METADATA = "dmrl.licences"
 LICENCE_STEMS = ("LICENSE", "LICENCE", "COPYING")
@@ -28,17 +28,6 @@ def extract_licence_title(path: Path) -> str:
     text = path.read_text(encoding="utf-8", errors="replace")
     lines = (line.strip(" #*") for line in text.splitlines())
     return next((line for line in lines if line), "empty")[:TITLE_CHARACTERS_MAX]
-
-
-def read_licences(recordings: Sequence[Path]) -> dict[str, str]:
-    """Return the licences of the sources of some recordings, by source name.
-
-    Raises
-    ------
-    RecordingError
-        If a recording cannot be read.
-    """
-    return dict(sorted(pair for path in recordings for pair in licences_in(read_summary(path))))
 
 
 def licences_in(found: Summary) -> Iterator[tuple[str, str]]:

@@ -15,7 +15,8 @@ from dmrl.errors import OutputError, RecordingError, SettingError
 from dmrl.geometry.camera_file import format_camera
 from dmrl.geometry.frames import Array, Camera, project
 from dmrl.images.codec import decode, encode_png
-from dmrl.recording import check, read, read_licences, read_summary
+from dmrl.recording import check, read, read_summary
+from dmrl.recording.licences import licences_in
 from dmrl.render_recording import read_render_camera
 from dmrl.rendering.camera.distortion import image_from_pinhole
 from dmrl.rendering.image_messages import to_quaternion
@@ -184,7 +185,7 @@ def test_what_stands_beside_the_photos_stands_in_the_recording(
     for k in range(2):
         (photos / f"{k}.png").write_bytes(encode_png(np.full((240, 320, 3), 90 + k, np.uint8)))
     run(out, Settings(images=1, backgrounds=photos, samples=1, workers=1))
-    assert read_licences([out]) == {"hall": "CC BY-SA 3.0"}
+    assert dict(licences_in(read_summary(out))) == {"hall": "CC BY-SA 3.0"}
 
 
 @pytest.mark.heavy
