@@ -31,7 +31,10 @@ FLIGHT = (
     "dmrl predict dmrl-nano labelled.mcap nano.mcap",
 )
 """A rendered flight of two drones, its labels and the detections of the network that ships."""
-VIEWER = ("viewer/*.py", "viewer/drawing/*.py", "viewer/content/*.py", "viewer/views/*.py")
+VIEWER = (
+    *("viewer/drawing/*.py", "viewer/content/*.py", "viewer/views/*.py"),
+    *("viewer/layouts.py", "viewer/scene.py", "viewer/show.py"),
+)
 RENDERER = ("dmrl/rendering/blender/*.py", "dmrl/rendering/camera/*.py")
 WIDTH_PX, GAP_PX = 1280, 8
 IMAGE_PANEL_PX = (113, 36, 688, 438)
@@ -121,7 +124,7 @@ PICTURES = {
             "dmrl dataset labelled.mcap set --labels truth",
             "dmrl view set nano.mcap --screenshot picture.png --rank 5",
         ),
-        VIEWER,
+        (*VIEWER, "viewer/browse.py"),
     ),
     "docs/rendering.png": Picture(
         (
