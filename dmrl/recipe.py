@@ -16,7 +16,7 @@ from typing import Any, TypeVar, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
 
-from dmrl.errors import RecipeError, SettingError, suggest
+from dmrl.errors import RecipeError, SettingError, UnsafeName, suggest
 from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.guards.paths import refuse_pipe
@@ -232,7 +232,7 @@ def find_faults(keys: Any, schema: type[Any]) -> list[str]:
         schema(**values)
     except ValidationError as e:
         return [_describe_fault(fault, schema) for fault in e.errors()]
-    except ValueError as e:
+    except (ValueError, UnsafeName) as e:
         return [str(e)]
     return list(_iter_range_faults(values, schema))
 

@@ -31,6 +31,10 @@ GIVEN = "a path of the user's, with an ending of ours"
 BY_ROWS = "checked, or made of letters and digits, by ExportRows"
 READ = "only read: names of files beside each other"
 REASONS = {
+    "pipeline/forecast.py: out": CHECKED_BEFORE,
+    "pipeline/runner.py: name": LISTED,
+    "deploy/c/pilot_code.py: name": OURS,
+    "rendering/robots/primitives.py: f'{name}.toml'": OURS,
     "api/stages.py: f'{stage}.mcap'": OURS,
     "guards/safe_names.py: check_file_name(name, what) + suffix": CHECKED_BEFORE,
     "datasets/layout.py: f'data-{number}.arrow'": OURS,
@@ -82,7 +86,6 @@ REASONS = {
     "pipeline/build_cache.py: name": LISTED,
     "pipeline/plan.py: name": "only read, and checked by _source_fault",
     "pipeline/plan.py: name.removeprefix(DATA).lstrip('/')": "only read, and checked likewise",
-    "pipeline/runner.py: f'{new.name}.old'": "checked by _out_fault of the plan",
     "pipeline/runner.py: one.step.out": "checked by _out_fault of the plan",
     "pipeline/runner.py: step.out": "checked by _out_fault of the plan",
     "plots/style.py: stem.name + suffix": GIVEN,
@@ -99,6 +102,10 @@ REASONS = {
 }
 PARSERS = ("json.load", "json.loads", "tomllib.load", "tomllib.loads", "np.load", "pickle.")
 MAY_PARSE = {
+    "terminal/help_pages.py": "a table of the package",
+    "rendering/robots/primitives.py": "a table of the package",
+    "rendering/backgrounds/room_items.py": "a table of the package",
+    "rendering/settings.py": "a table of the package",
     "guards/bounded_parsing.py": "the home",
     "rendering/blender/protocol.py": "what our own processes say to each other",
     "pipeline/process_pool.py": "what our own processes say to each other",

@@ -58,7 +58,7 @@ class BuildCache:
             return cls(file, dict(kept["begun"]), dict(kept["done"]), dict(kept["hashes"]), made_of)
         except FileNotFoundError:
             return cls(file)
-        except (ValueError, KeyError, TypeError, OSError) as e:
+        except (ValueError, KeyError, TypeError, AttributeError, OSError) as e:
             raise OutputError(
                 f"{file} is damaged ({e}). Remove {file.parent}, or name another: --out DIR"
             ) from None

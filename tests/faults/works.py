@@ -173,6 +173,7 @@ WORKS = (
     Work("card", _card, "set", before=_copied, pieces=True),
     Work("predict", lambda i, out: cli("predict", i.model, i.dots, out), "a.mcap"),
     Work("evaluate", lambda i, out: cli("evaluate", i.found, "--plots", out), "plots"),
+    Work("score", lambda i, out: cli("score", out, "--name", "mine"), "score.json"),
     Work("index", lambda i, out: cli("index", out), "set", before=flights, pieces=True),
     Work("report", lambda i, out: cli("report", i.flights, out), "a.html"),
     Work("train", _train, "model", keeps=True),

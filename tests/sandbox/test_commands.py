@@ -48,6 +48,10 @@ HOSTILE: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "track": (("IN/bad.mcap", "OUT/track.mcap"),),
     "evaluate": (("IN/bad.mcap",), ("IN/bad.mcap", "--plots", "OUT/judged")),
+    "score": (
+        ("OUT/score.json", "--detected", "IN/bad.mcap"),
+        ("OUT/score.json", "--labels", "IN/link", "--scenes", "IN/bad.mcap"),
+    ),
     "quantize": (("IN/model", "OUT/cards", "OUT/int8"), ("dmrl-nano", "OUT/cards", "OUT/int8")),
     "export": (("IN/model", "OUT/exported"), ("IN/link", "OUT/exported")),
     "verify": (("IN/model",), ("IN/link",)),
