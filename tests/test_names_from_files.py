@@ -13,7 +13,7 @@ from pathlib import Path
 
 import dmrl
 
-SOURCE = Path(dmrl.__file__).parent
+SOURCE = Path(dmrl.__file__).resolve().parent
 CHECKED = {
     "safe_join",
     "check_file_name",
