@@ -31,6 +31,10 @@ GIVEN = "a path of the user's, with an ending of ours"
 BY_ROWS = "checked, or made of letters and digits, by ExportRows"
 READ = "only read: names of files beside each other"
 REASONS = {
+    "deploy/export_folder.py: decoded": OURS,
+    "deploy/usage.py: f'{header}.h'": LISTED,
+    "deploy/usage.py: page": OURS,
+    "viewer/flag_page.py: name": OURS,
     "pipeline/forecast.py: out": CHECKED_BEFORE,
     "pipeline/runner.py: name": LISTED,
     "deploy/c/pilot_code.py: name": OURS,
@@ -102,6 +106,8 @@ REASONS = {
 }
 PARSERS = ("json.load", "json.loads", "tomllib.load", "tomllib.loads", "np.load", "pickle.")
 MAY_PARSE = {
+    "deploy/export_folder.py": "what json.dumps has just made",
+    "deploy/usage.py": "what json.dumps has just made",
     "terminal/help_pages.py": "a table of the package",
     "rendering/robots/primitives.py": "a table of the package",
     "rendering/backgrounds/room_items.py": "a table of the package",
