@@ -21,6 +21,7 @@ def build_catalogue_section(name: str, catalogue: pa.Table) -> str:
             build_table(("camera", "labels from", "OK", "all"), _count_labels(catalogue["labels"])),
             build_table(("made by", "recordings"), _count_values(catalogue["stage"])),
             _list_errors(catalogue),
+            _list_causes(catalogue),
         )
     )
 
@@ -59,6 +60,17 @@ def _flatten_rows(rows: pa.ChunkedArray) -> Iterable[dict[str, Any]]:
 
 def _count_values(column: pa.ChunkedArray) -> list[tuple[str, int]]:
     return Counter(value or "unknown" for value in column.to_pylist()).most_common()
+
+
+def _list_causes(catalogue: pa.Table) -> str:
+    """Return a table of the sensor errors that `dmrl label` found, worst recordings first."""
+    found = []
+    columns = (catalogue[name].to_pylist() for name in ("recording", "findings"))
+    for name, findings in zip(*columns, strict=True):
+        causes = [one["text"] for one in findings or () if one["topic"].endswith("/causes")]
+        found += [(len(causes), name, "; ".join(causes))] if causes else []
+    rows = [(name, text) for _, name, text in sorted(found, key=lambda one: -one[0])]
+    return build_table(("recording", "causes"), rows[:MAX_LISTED_ERRORS]) if rows else ""
 
 
 def _list_errors(catalogue: pa.Table) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from dmrl.estimation.evidence.causes import find_causes, find_dropouts
+from dmrl.estimation.evidence.mistakes import MISTAKES, Mistake
 from dmrl.estimation.filters import ekf
 from dmrl.estimation.flight.pair_output import (
     OUTPUT_HZ,
@@ -29,12 +30,11 @@ from dmrl.estimation.flight.pair_solver import (
 from dmrl.estimation.flight.windows import carry_information, split_windows
 from dmrl.estimation.model.gate import DEFAULT_GATE, Gate
 from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Mask, Pair
-from dmrl.estimation.model.status import (
-    classify_positions,
-)
+from dmrl.estimation.model.status import UNCONVERGED, classify_positions
 from dmrl.estimation.signals.contradictions import drop_contradictions, drop_held_ranges
 from dmrl.estimation.solver.estimate import (
     PAIR_LAYOUT,
+    Cause,
     Estimate,
     seen_from_peer,
 )
@@ -47,6 +47,9 @@ from dmrl.estimation.solver.unknowns import TABLE
 CONTRADICTED_SIGMAS, CONTRADICTED_RANGE_SIGMAS = 15.0, 3.0
 """Odometry that differs from the solution by more has dropped out for the status, in sigmas; and so
 has a second in which most ranges differ by more."""
+MISFIT_GRADE, MISTAKE_GAIN, MISTAKE_S = 1.8, 100.0, 50.0
+"""Grade of the noise from which a log may be written wrongly: harsh sensors have 1.4. Gain of the
+log evidence that shows a mistake, and the time in which it is sought, seconds."""
 SHARED_NAMES = {row.name for row in TABLE}
 """Names of the unknowns of the plain model, which both directions of a pair report."""
 MIN_CAMERA_S = 3.0
@@ -77,8 +80,19 @@ def estimate_pairs(
     for logged in pairs:
         pair = drop_contradictions(drop_held_ranges(logged))
         pieces = list(_solve_pieces(pair, noise, plain=plain))
-        found = _both_directions(pair, pieces, gate)
         gaps = find_dropouts(logged, pair)
+        mistake = None if plain or noise else find_mistake(pair, pieces)
+        if mistake is not None:
+            pair = mistake[0].apply(pair, mistake[1])
+            pieces = list(_solve_pieces(pair, noise, plain=plain))
+            span = float(pair.time_s[0]), float(pair.time_s[-1])
+            gaps = (*gaps, Cause(mistake[0].name, 1.0, *span, mistake[1]))
+        found = _both_directions(pair, pieces, gate)
+        if mistake is not None and mistake[0].heading_is_open:
+            side = mistake[1] or 0
+            blind = np.full(len(found[side].time_s), UNCONVERGED, np.int8)
+            left = replace(found[side], status=np.maximum(found[side].status, blind))
+            found = (left, found[1]) if side == 0 else (found[0], left)
         out.append(
             (
                 replace(found[0], causes=(*gaps, *found[0].causes)),
@@ -86,6 +100,36 @@ def estimate_pairs(
             )
         )
     return out
+
+
+def find_mistake(pair: Pair, pieces: Sequence["Piece"]) -> tuple[Mistake, int | None] | None:
+    """Find the discrete mistake without which a flight fits; None if it fits as it is.
+
+    Parameters
+    ----------
+    pair
+        Sensor data of both robots.
+    pieces
+        Its estimate.
+    """
+    if max(piece.estimate.noise.grade for piece in pieces) < MISFIT_GRADE:
+        return None
+    part = pair.crop(pair.time_s[0], pair.time_s[0] + MISTAKE_S)
+
+    def solve(mistake: Mistake | None, robot: int | None) -> tuple[float, float]:
+        tried = mistake.apply(part, robot) if mistake else part
+        solution = solve_pair(build_problem({(0, 1): drop_contradictions(tried)}), plain=True)
+        score = solution.solver.log_evidence(solution.mixture.members[0].found)
+        return score, solution.problem.noise.grade
+
+    as_logged, _ = solve(None, None)
+    tried = [
+        (*solve(mistake, robot), mistake, robot)
+        for mistake in MISTAKES
+        for robot in ((0, 1) if mistake.correct else (None,))
+    ]
+    score, grade, mistake, robot = max(tried, key=lambda one: one[0])
+    return (mistake, robot) if score > as_logged + MISTAKE_GAIN and grade < MISFIT_GRADE else None
 
 
 class Piece(NamedTuple):

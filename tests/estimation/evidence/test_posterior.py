@@ -1,0 +1,60 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.evidence.causes import find_dropouts, join_causes
+from dmrl.estimation.evidence.error_models import MODELS, Candidate, list_candidates
+from dmrl.estimation.flight.pairs import estimate_pairs
+from dmrl.estimation.solver.estimate import Cause
+from dmrl.estimation.solver.keyframes import build_problem
+from dmrl.estimation.solver.unknowns import TABLE
+
+from ..flights import flown, pair_of, truth_at
+
+
+def test_names_of_models_and_of_their_unknowns_are_distinct() -> None:
+    rows = [row.name for model in MODELS for row in model.rows]
+    assert len(set(rows)) == len(rows) and not set(rows) & {row.name for row in TABLE}
+    assert len({model.name for model in MODELS}) == len(MODELS)
+
+
+@pytest.mark.parametrize("candidate", list(list_candidates()), ids=str)
+def test_a_model_adds_its_unknowns_for_its_robot_alone(candidate: Candidate) -> None:
+    problem = build_problem({(0, 1): pair_of(flown("in_view", "calibrated", 1000, 20.0))})
+    before, after = problem.layout, candidate.apply(problem).layout
+    added = {s for s, _ in (*after.states, *after.constants)} - {
+        s for s, _ in (*before.states, *before.constants)
+    }
+    assert {name for name, _ in added} == {row.name for row in candidate.model.rows}
+    if candidate.robot is not None:
+        assert {own for _, own in added} <= {(candidate.robot,)}
+
+
+@pytest.mark.heavy
+def test_a_gyroscope_that_jumps_is_named_and_its_error_taken_out() -> None:
+    flight = flown("in_view", "calibrated", 1002, 60.0)
+    pair = pair_of(flight)
+    late = pair.time_s > 30.0
+    jumped = replace(pair.own, yaw_rate_radps=pair.own.yaw_rate_radps + 0.06 * late)
+    ((sound, _),) = estimate_pairs([pair])
+    ((plain, _),) = estimate_pairs([replace(pair, own=jumped)], plain=True)
+    ((found, _),) = estimate_pairs([replace(pair, own=jumped)])
+    error, worse = (
+        np.hypot(*(e.state[:, :2] - truth_at(flight, e.time_s)).T).mean() for e in (found, plain)
+    )
+    assert not any(cause.probability > 0.5 and "yaw" in cause.name for cause in sound.causes)
+    assert any(cause.probability > 0.5 and "yaw rate" in cause.name for cause in found.causes)
+    assert error < worse
+
+
+def test_silent_sensors_are_causes_and_windows_are_joined() -> None:
+    pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
+    assert find_dropouts(pair, pair) == ()
+    gap = (pair.time_s > 5) & (pair.time_s < 8)
+    quiet = replace(pair.peer, dropout=gap, turn_dropout=np.zeros_like(gap))
+    (cause,) = find_dropouts(replace(pair, peer=quiet), replace(pair, peer=quiet))
+    assert (cause.name, cause.robot) == ("flow silent or stuck", 1)
+    assert (cause.from_s, cause.to_s) == pytest.approx((5, 8), abs=0.05)
+    one, two = Cause("a", 0.4, 0.0, 5.0, 1), Cause("a", 0.9, 5.0, 9.0, 1)
+    assert join_causes([one, two]) == (Cause("a", 0.9, 0.0, 9.0, 1),)
