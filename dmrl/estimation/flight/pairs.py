@@ -31,6 +31,7 @@ from dmrl.estimation.flight.windows import carry_information, split_windows
 from dmrl.estimation.model.gate import DEFAULT_GATE, Gate
 from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Mask, Pair
 from dmrl.estimation.model.status import UNCONVERGED, classify_positions
+from dmrl.estimation.search.modes import find_modes
 from dmrl.estimation.signals.contradictions import drop_contradictions, drop_held_ranges
 from dmrl.estimation.solver.estimate import (
     PAIR_LAYOUT,
@@ -47,9 +48,12 @@ from dmrl.estimation.solver.unknowns import TABLE
 CONTRADICTED_SIGMAS, CONTRADICTED_RANGE_SIGMAS = 15.0, 3.0
 """Odometry that differs from the solution by more has dropped out for the status, in sigmas; and so
 has a second in which most ranges differ by more."""
-MISFIT_GRADE, MISTAKE_GAIN, MISTAKE_S = 1.8, 100.0, 50.0
-"""Grade of the noise from which a log may be written wrongly: harsh sensors have 1.4. Gain of the
-log evidence that shows a mistake, and the time in which it is sought, seconds."""
+MISFIT_GRADE, MISTAKE_S = 1.8, 50.0
+"""Grade of the noise from which a log may be written wrongly: harsh sensors have 1.4; and the time
+in which a mistake is sought, seconds."""
+MAX_COST, MISTAKE_GAIN = 0.8, 0.3
+"""Largest cost of a keyframe of a flight that fits, and reduction that shows a mistake. Sound
+flights have 0.3."""
 SHARED_NAMES = {row.name for row in TABLE}
 """Names of the unknowns of the plain model, which both directions of a pair report."""
 MIN_CAMERA_S = 3.0
@@ -89,7 +93,7 @@ def estimate_pairs(
             gaps = (*gaps, Cause(mistake[0].name, 1.0, *span, mistake[1]))
         found = _both_directions(pair, pieces, gate)
         if mistake is not None and mistake[0].heading_is_open:
-            side = mistake[1] or 0
+            side = mistake[1]
             blind = np.full(len(found[side].time_s), UNCONVERGED, np.int8)
             left = replace(found[side], status=np.maximum(found[side].status, blind))
             found = (left, found[1]) if side == 0 else (found[0], left)
@@ -102,7 +106,7 @@ def estimate_pairs(
     return out
 
 
-def find_mistake(pair: Pair, pieces: Sequence["Piece"]) -> tuple[Mistake, int | None] | None:
+def find_mistake(pair: Pair, pieces: Sequence["Piece"]) -> tuple[Mistake, int] | None:
     """Find the discrete mistake without which a flight fits; None if it fits as it is.
 
     Parameters
@@ -116,20 +120,15 @@ def find_mistake(pair: Pair, pieces: Sequence["Piece"]) -> tuple[Mistake, int | 
         return None
     part = pair.crop(pair.time_s[0], pair.time_s[0] + MISTAKE_S)
 
-    def solve(mistake: Mistake | None, robot: int | None) -> tuple[float, float]:
-        tried = mistake.apply(part, robot) if mistake else part
-        solution = solve_pair(build_problem({(0, 1): drop_contradictions(tried)}), plain=True)
-        score = solution.solver.log_evidence(solution.mixture.members[0].found)
-        return score, solution.problem.noise.grade
+    def search(tried: Pair) -> float:
+        problem = build_problem({(0, 1): drop_contradictions(tried)})
+        return find_modes(problem)[0].cost / len(problem.keyframe_s)
 
-    as_logged, _ = solve(None, None)
-    tried = [
-        (*solve(mistake, robot), mistake, robot)
-        for mistake in MISTAKES
-        for robot in ((0, 1) if mistake.correct else (None,))
-    ]
-    score, grade, mistake, robot = max(tried, key=lambda one: one[0])
-    return (mistake, robot) if score > as_logged + MISTAKE_GAIN and grade < MISFIT_GRADE else None
+    choices = [(mistake, robot) for mistake in MISTAKES for robot in (0, 1)]
+    costs = [search(mistake.apply(part, robot)) for mistake, robot in choices]
+    best = int(np.argmin(costs))
+    as_logged = search(part)
+    return choices[best] if costs[best] < min(MAX_COST, as_logged - MISTAKE_GAIN) else None
 
 
 class Piece(NamedTuple):
