@@ -40,14 +40,14 @@ def write_boxes(path: Path, rows: list[list[float]]) -> Path:
 
 def write_maps(path: Path, rows: int = 28) -> Path:
     """A network whose confidence is the mean red of a cell, and whose depth is constant."""
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, "h", "w"])
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 224, 320])
     kernel = np.zeros((1, 3, 8, 8), np.float32)
     kernel[0, 0] = 1 / 64
     weights = [numpy_helper.from_array(kernel, "kernel")]
     weights.append(numpy_helper.from_array(np.full((1, 1, rows, 40), 1.5, np.float32), "deep"))
     outs = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 1, None, None])
-        for name in ("confidence", "depth_m")
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", 1, side, 40])
+        for name, side in (("confidence", 28), ("depth_m", rows))
     ]
     nodes = [
         helper.make_node("Conv", ["image", "kernel"], ["confidence"], strides=[8, 8]),
