@@ -151,6 +151,7 @@ def test_what_was_made_from_a_sealed_flight_is_refused_by_its_provenance(
 
 
 @pytest.mark.heavy
+@pytest.mark.timeout(900)
 def test_one_command_scores_a_strangers_network(tmp_path: Path) -> None:
     text = recipes.read_text("benchmark").replace('"blender"', '"sketch"')
     for long, short in (
