@@ -52,7 +52,6 @@ REASONS = {
     "deploy/c/run/measure.py: f'{name}.c'": "named by c_name",
     "deploy/c/run/measure.py: f'{name}.o'": "named by c_name",
     "deploy/c/run/compile_targets.py: f'{name}.c'": "named by c_name",
-    "deploy/c/run/compile_targets.py: f'{name}_refine.c'": "named by c_name",
     "deploy/export_folder.py: name": OURS,
     "evaluation/evaluate_recordings.py: f'{stem}.json'": OURS,
     "evaluation/pipeline_summary.py: name": OURS,

@@ -38,9 +38,7 @@ CONTENTS = {
 """Content of each file, by its name."""
 
 
-def write_export(
-    model: Path, folder: Path, *, bayer: bool, refine: bool, l1_kb: int | None
-) -> bool:
+def write_export(model: Path, folder: Path, *, bayer: bool, l1_kb: int | None) -> bool:
     """Write a model into a folder; return whether it has an int8 network, and so C.
 
     Parameters
@@ -51,8 +49,6 @@ def write_export(
         Folder to write the files into.
     bayer
         Let the C take raw colour mosaics.
-    refine
-        Write C that goes on learning in the last layer.
     l1_kb
         Kilobytes of the near memory that the C works in. None: there is one memory.
 
@@ -74,7 +70,7 @@ def write_export(
         near_bytes = None if l1_kb is None else l1_kb * 1024 - CORE_STACKS_BYTES
         _write_int8(network, model, folder)
         images = [to_network_input(network, image) for image in load_samples(model)]
-        write_c(network, folder, images, bayer=bayer, refine=refine, near_bytes=near_bytes)
+        write_c(network, folder, images, bayer=bayer, near_bytes=near_bytes)
     described = loaded_model.describe(trained) | {"channels": 1 if grey else 3}
     text = json.dumps(described, indent=1) + "\n"
     (folder / DESCRIPTION_NAME).write_text(text, encoding="utf-8")

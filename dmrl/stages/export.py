@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter, validators
 
 from dmrl.atomic_output import atomic_folder, refuse_existing
-from dmrl.errors import SettingError
 from dmrl.learn.pretrained import resolve_model_path
 from dmrl.pipeline.stage_command import stage_command
 from dmrl.terminal.arguments import Model
@@ -29,9 +28,6 @@ class Settings:
     bayer
         The C takes raw colour mosaics, as the AI-deck's camera gives them, unless it is compiled
         otherwise.
-    refine
-        Write C that learns on in the last layer too, from images of which it is told who is in
-        view. The state then holds all that the last layer reads.
     decoded
         Write ONNX files that decode as well: pixels, metres and confidences out, in place of maps.
     l1_kb
@@ -40,7 +36,6 @@ class Settings:
     """
 
     bayer: bool = False
-    refine: bool = False
     decoded: bool = False
     l1_kb: Annotated[int | None, Parameter(validator=validators.Number(gte=9))] = None
 
@@ -67,7 +62,7 @@ def run(model: Model, out: Path, settings: Settings) -> "list[Written]":
     OutputError
         If ``out`` exists.
     SettingError
-        If two memories are wanted with ``refine``, or the near one is too small.
+        If the near memory is too small.
     """
     from dmrl.deploy.c.pilot_code import write_pilot
     from dmrl.deploy.export_folder import list_files, refuse_export, write_decoded, write_export
@@ -76,10 +71,6 @@ def run(model: Model, out: Path, settings: Settings) -> "list[Written]":
     from dmrl.geometry.frames import AIDECK_PINHOLE
     from dmrl.recording import build_provenance
 
-    if settings.refine and settings.l1_kb is not None:
-        raise SettingError(
-            "--refine holds all that the last layer reads, in one memory. Leave out --l1-kb"
-        )
     refuse_existing(out)
     model = resolve_model_path(model)
     refuse_export(model)

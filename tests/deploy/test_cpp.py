@@ -43,10 +43,10 @@ int main()
 
 
 def write(folder: Path, kind: str) -> IntegerNetwork:
-    """Write the C of a network: plain, with refinement, or with two memories."""
+    """Write the C of a network: plain, or with two memories."""
     network = splittable(1) if kind == "two memories" else quantised_network(1)
     near = smallest(network) if kind == "two memories" else None
-    write_c(network, folder, [], refine=kind == "refinement", near_bytes=near)
+    write_c(network, folder, [], near_bytes=near)
     return network
 
 
@@ -58,13 +58,13 @@ def compiler(name: str) -> tuple[str, ...]:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("kind", ["plain", "refinement", "two memories"])
+@pytest.mark.parametrize("kind", ["plain", "two memories"])
 @pytest.mark.parametrize("name", COMPILERS)
 def test_every_file_compiles_without_a_warning(name: str, kind: str, tmp_path: Path) -> None:
     words = compiler(name)
     write(tmp_path, kind)
     sources = sorted(path.name for path in tmp_path.glob("*.c"))
-    assert len(sources) == 2 + (kind == "refinement")
+    assert len(sources) == 2
     for source in sources:
         for bayer in ("0",) if source == "main.c" else ("0", "1"):  # its vectors are RGB
             command = [*words, *WARNINGS, "-O1", f"-DRANDOM_BAYER={bayer}", "-c", source]

@@ -82,8 +82,6 @@ def test_an_export_for_a_small_near_memory_says_what_lies_where(
         assert min(said[1]["far_bytes"], said[1]["traffic_bytes"]) > 0
     with pytest.raises(SettingError, match="Raise --l1-kb"):
         run(quantised, none, Settings(l1_kb=9))
-    with pytest.raises(SettingError, match="Leave out --l1-kb"):
-        run(quantised, none, Settings(l1_kb=64, refine=True))
     assert sorted(tmp_path.iterdir()) == [two, whole]
 
 

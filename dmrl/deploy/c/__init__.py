@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.c.refinement_code import generate_refinement
 from dmrl.deploy.c.self_test import MAX_DETECTIONS, generate_vectors
 from dmrl.deploy.c.source_file import CSource, generate_source
 from dmrl.deploy.c.templating import c_name, fill_template, template_values
@@ -26,7 +25,6 @@ def write_c(
     images: Sequence[NDArray[np.uint8]],
     *,
     bayer: bool = False,
-    refine: bool = False,
     near_bytes: int | None = None,
 ) -> list[str]:
     """Write the C of a network into a folder.
@@ -42,8 +40,6 @@ def write_c(
         self-test, in addition to one of noise.
     bayer
         Whether the C takes raw Bayer mosaics by default; a compiler flag overrides it.
-    refine
-        Also write the C for on-device refinement, see `refinement_code`.
     near_bytes
         Bytes of the near memory that the state must fit, see `memory_levels`. None: one memory.
 
@@ -60,9 +56,8 @@ def write_c(
         If the near memory is too small.
     """
     names, name = template_values(network), c_name(network)
-    made = generate_source(network, names, bayer=bayer, features=refine, near_bytes=near_bytes)
-    files = generate_refinement(network, names) if refine else {}
-    files |= {
+    made = generate_source(network, names, bayer=bayer, near_bytes=near_bytes)
+    files = {
         f"{name}.c": made.code,
         f"{name}.h": made.header,
         f"{name}_vectors.h": generate_vectors(network, images, names, bayer=bayer),

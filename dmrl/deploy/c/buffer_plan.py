@@ -123,15 +123,13 @@ class BufferPlan:
         return image.padded_bytes if image.above and image.pad_value else 0
 
 
-def plan_buffers(network: IntegerNetwork, *, features: bool = False) -> BufferPlan:
+def plan_buffers(network: IntegerNetwork) -> BufferPlan:
     """Plan the buffers of a network's C.
 
     Parameters
     ----------
     network
         The network.
-    features
-        Keep all rows that the last layer reads, as for the heads.
 
     Raises
     ------
@@ -146,8 +144,6 @@ def plan_buffers(network: IntegerNetwork, *, features: bool = False) -> BufferPl
     steps, tensors = _build_steps(network)
     shapes = [network.shapes[tensors.index(k)] for k in range(len(steps) + 1)]
     whole = frozenset(tensors[h.tensor] for h in network.heads.values())
-    if features:
-        whole |= set(steps[-1].sources)
     writes = schedule_rows(steps, [rows for _, rows, _ in shapes])
     rings = count_ring_rows(writes, len(shapes))
     drafts = [_build_buffer(k, shapes[k], rings[k], steps) for k in range(len(shapes))]

@@ -55,7 +55,6 @@ def generate_source(
     names: dict[str, str],
     *,
     bayer: bool,
-    features: bool = False,
     near_bytes: int | None = None,
 ) -> CSource:
     """Generate the C file and the header of a network.
@@ -68,8 +67,6 @@ def generate_source(
         Names from `template_values`.
     bayer
         Whether images are raw Bayer mosaics by default; a compiler flag overrides it.
-    features
-        Whether the state keeps all that the last layer reads, for `refinement_code`.
     near_bytes
         Bytes of the near memory; rings that do not fit are placed in a far one, see
         `memory_levels`. None: one memory.
@@ -81,7 +78,7 @@ def generate_source(
     SettingError
         If the near memory is too small.
     """
-    planned = plan_buffers(network, features=features)
+    planned = plan_buffers(network)
     require_supported(planned)
     if near_bytes is not None:
         planned = assign_memories(planned, near_bytes)

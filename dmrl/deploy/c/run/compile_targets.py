@@ -42,7 +42,7 @@ class Build:
     emulated: bool = False
 
     def compile_program(
-        self, network: IntegerNetwork, folder: Path, build: Path, *, refine: bool = False
+        self, network: IntegerNetwork, folder: Path, build: Path
     ) -> list[str | Path]:
         """Compile the C of an export folder; return the command that runs the program.
 
@@ -54,8 +54,6 @@ class Build:
             Export folder.
         build
             Folder for compiled files.
-        refine
-            Build the refinement program instead of the detection program.
 
         Raises
         ------
@@ -70,9 +68,6 @@ class Build:
         if "-DHARNESS_GUARD" in flags:
             flags = (*flags, f"-D{name.upper()}_COPY=harness_copy")
         sources = [harness_c, folder / f"{name}.c"]
-        if refine:
-            flags = (*flags, "-DHARNESS_REFINE")
-            sources.append(folder / f"{name}_refine.c")
         last: tuple[str, ...] = ("-lgcc",) if self.emulated else ()
         what = f"{self.compiler} {self.label}"
         run_program((self.compiler, "-std=gnu99", *flags, *sources, *last, "-o", program), what)

@@ -13,16 +13,11 @@ from dmrl.deploy.c.harness import MAX_DETECTIONS, HarnessResult, parse_results
 from dmrl.deploy.c.run.compile_targets import Build, Target
 from dmrl.deploy.c.run.toolchain import run_program
 from dmrl.deploy.c.source_file import MAX_STACK_BYTES
-from dmrl.deploy.c.templating import c_name
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.deploy.int8.reference import decode_detections, iter_tensors
-from dmrl.deploy.int8.reference import run_network as reference_run
-from dmrl.deploy.int8.refinement import RefinementLabel, initial_weights, take_gradient_step
+from dmrl.deploy.int8.reference import decode_detections, run_network
 from dmrl.errors import ToolError
 
 Image = NDArray[np.uint8]
-REFINE_IMAGES, REFINE_RATE = 5, 3277
-"""Images and learning rate (0.05 in fixed point) of the refinement check."""
 BAYER_IMAGES = 4
 """Images for builds with raw mosaics: only the input stage of their code differs."""
 
@@ -104,7 +99,7 @@ def compute_expected(network: IntegerNetwork, images: Sequence[Image]) -> Expect
 
 
 def _reference_result(network: IntegerNetwork, image: Image) -> HarnessResult:
-    grids = reference_run(network, image)
+    grids = run_network(network, image)
     return HarnessResult(grids, decode_detections(network, grids, MAX_DETECTIONS), 0)
 
 
@@ -138,8 +133,6 @@ def verify_target(
         on_build(f"{target.name} {build.label}")
         try:
             result.builds.append(_verify_build(network, folder, build, wanted))
-            if has_refinement(network, folder) and not build.bayer:
-                result.builds.append(_verify_refinement(network, folder, build, wanted.images))
         except ToolError as e:
             return TargetResult(target.name, result.builds, error=str(e))
     return result
@@ -169,40 +162,6 @@ def _verify_build(
         )
     wrong = sum(not is_same_result(a, b) for a, b in zip(found, right, strict=True))
     return BuildResult(build.label, len(images), wrong, stack_bytes)
-
-
-def has_refinement(network: IntegerNetwork, folder: Path) -> bool:
-    """Return whether an export folder has the C for refinement."""
-    return (folder / f"{c_name(network)}_refine.c").is_file()
-
-
-def _verify_refinement(
-    network: IntegerNetwork, folder: Path, build: Build, images: Sequence[Image]
-) -> BuildResult:
-    """Refine on image after image; compare every weight after every step."""
-    few = images[:REFINE_IMAGES]
-    steps = [(*_synthetic_label(network, k), REFINE_RATE) for k in range(len(few))]
-    pairs = zip(few, steps, strict=True)
-    data = b"".join(i.tobytes() + np.array(step, "<i4").tobytes() for i, step in pairs)
-    with tempfile.TemporaryDirectory(prefix="dmrl-verify-") as place:
-        command = build.compile_program(network, folder, Path(place), refine=True)
-        said = run_program(command, f"{build.compiler} {build.label}, learning", data=data)
-    learned, wanted = initial_weights(network), []
-    for image, (*seen, rate) in zip(few, steps, strict=True):
-        *_, features, _ = iter_tensors(network, image)
-        learned = take_gradient_step(network, learned, features, RefinementLabel(*seen), rate)
-        wanted.append(np.concatenate([learned.weight.ravel(), learned.bias]))
-    got = np.frombuffer(said[: len(said) // 4 * 4], "<i4").reshape(len(few), -1)
-    wrong = sum(not np.array_equal(a, b) for a, b in zip(got, wanted, strict=True))
-    return BuildResult(f"{build.label}, learning", len(few), wrong, 0)
-
-
-def _synthetic_label(network: IntegerNetwork, number: int) -> RefinementLabel:
-    """Return a synthetic label: a robot at some position, or none in every third image."""
-    if number % 3 == 2:
-        return RefinementLabel(0, 0, 0)
-    u_px, v_px = (37 + 61 * number) % network.width_px, (23 + 41 * number) % network.height_px
-    return RefinementLabel(16 * u_px + 5, 16 * v_px + 3, 400 + 300 * number)
 
 
 def is_same_result(a: HarnessResult, b: HarnessResult) -> bool:

@@ -145,24 +145,6 @@ int main(void)
         network(image, found, MOST);
     return 0;
 }
-#elif defined(HARNESS_REFINE)
-#include "${prefix}_refine.h"
-
-static ${prefix}_head_t head;
-static int32_t seen[4]; /* u, v, depth, rate */
-
-/* Reads pairs of image and label; writes the refined weights after each. */
-int main(void)
-{
-    ${prefix}_head_init(&head);
-    while (take(image, sizeof image) && take(seen, sizeof seen)) {
-        network(image, found, MOST);
-        ${prefix}_head_apply(&head, &net);
-        ${prefix}_head_learn(&head, &net, seen[0], seen[1], seen[2], seen[3]);
-        give(&head, sizeof head);
-    }
-    return 0;
-}
 #else
 int main(void)
 {
