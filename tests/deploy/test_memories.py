@@ -10,7 +10,7 @@ import pytest
 
 from dmrl.deploy.c import MAX_L1_STATE_BYTES, write_c
 from dmrl.deploy.c.buffer_plan import BufferPlan, plan_buffers
-from dmrl.deploy.c.memory_levels import assign_memories, count_copied_bytes
+from dmrl.deploy.c.placement import Placement, place_buffers
 from dmrl.deploy.c.run.compile_targets import SANITIZER_FLAGS, Build, Target
 from dmrl.deploy.c.run.measure import StateMemory, parse_state_memory
 from dmrl.deploy.c.run.verification import TargetResult, compute_expected, verify_target
@@ -28,9 +28,9 @@ def smallest(network: IntegerNetwork) -> int:
     """The least near memory that will do, as the error says; 0: all of it has to be near."""
     whole = plan_buffers(network)
     with pytest.raises(SettingError, match="at least") as error:
-        assign_memories(whole, 0)
+        place_buffers(whole, 0)
     least = int(re.findall(r"at least (\S+) bytes", str(error.value))[0].replace(",", ""))
-    return least if least < whole.state_bytes(bayer=True) else 0
+    return least if least < Placement(whole).near_bytes(bayer=True) else 0
 
 
 def splittable(seed: int) -> IntegerNetwork:
@@ -121,10 +121,10 @@ def test_the_self_test_passes_with_two_memories(tmp_path: Path) -> None:
 def test_what_ships_fits_a_gap8_with_the_rings_of_long_reach_far() -> None:
     nano, fine = plan_buffers(untrained("dmrl-nano")), plan_buffers(untrained("dmrl-nano-fine"))
     for whole, far in ((nano, {"body_5_0"}), (fine, {"body_1_0", "body_9_0"})):
-        two = assign_memories(whole, MAX_L1_STATE_BYTES)
-        assert set(two.member_bytes(in_l2=True)) == far
-        assert two.state_bytes(bayer=True) <= MAX_L1_STATE_BYTES
-    rows = count_copied_bytes(assign_memories(nano, MAX_L1_STATE_BYTES)) - tables(nano)
+        two = place_buffers(whole, MAX_L1_STATE_BYTES)
+        assert two.far == far
+        assert two.near_bytes(bayer=True) <= MAX_L1_STATE_BYTES
+    rows = place_buffers(nano, MAX_L1_STATE_BYTES).traffic_bytes - tables(nano)
     # A row of 40 x 48: five depthwise read three, five shortcuts one, five layers write one.
     assert rows == 28 * 40 * 48 * (5 * 3 + 5 + 5)
 
@@ -141,21 +141,20 @@ def tables(whole: BufferPlan) -> int:
 def test_of_all_that_fits_the_least_is_copied() -> None:
     network = splittable(5)
     whole = plan_buffers(network)
-    least, most = smallest(network), whole.state_bytes(bayer=True)
-    assert assign_memories(whole, most) is whole
+    least, most = smallest(network), Placement(whole).near_bytes(bayer=True)
+    assert not place_buffers(whole, most).far
     sizes = range(least, most, 64)
-    ways = [assign_memories(whole, size) for size in sizes]
-    copied = [count_copied_bytes(way) for way in ways]
-    assert all(w.state_bytes(bayer=True) <= size for w, size in zip(ways, sizes, strict=True))
+    ways = [place_buffers(whole, size) for size in sizes]
+    copied = [way.traffic_bytes for way in ways]
+    assert all(w.near_bytes(bayer=True) <= size for w, size in zip(ways, sizes, strict=True))
     assert copied == sorted(copied, reverse=True)
     with pytest.raises(SettingError, match=rf"at least {least:,} bytes .* {least - 4:,} are there"):
-        assign_memories(whole, least - 4)
+        place_buffers(whole, least - 4)
 
 
 def test_the_header_states_both_sizes(tmp_path: Path) -> None:
     network = splittable(1)
     write_c(network, tmp_path, [], near_bytes=smallest(network))
-    two = assign_memories(plan_buffers(network), smallest(network))
-    far = sum(two.member_bytes(in_l2=True).values())
-    wanted = StateMemory(two.state_bytes(bayer=False), far, count_copied_bytes(two))
+    two = place_buffers(plan_buffers(network), smallest(network))
+    wanted = StateMemory(two.near_bytes(bayer=False), two.far_bytes, two.traffic_bytes)
     assert parse_state_memory(network, tmp_path) == wanted

@@ -9,8 +9,8 @@ import pytest
 
 from dmrl.cli import app
 from dmrl.deploy.c import write_c
+from dmrl.deploy.c.network_source import MAX_STACK_BYTES
 from dmrl.deploy.c.run import compile_targets, proof
-from dmrl.deploy.c.source_file import MAX_STACK_BYTES
 from dmrl.deploy.int8.network import Conv, IntegerNetwork
 from dmrl.deploy.int8.store import INTEGER_NAME, save_network
 from dmrl.deploy.samples import save_samples

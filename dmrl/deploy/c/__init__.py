@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.deploy.c.network_source import generate_source
 from dmrl.deploy.c.self_test import MAX_DETECTIONS, generate_vectors
-from dmrl.deploy.c.source_file import CSource, generate_source
 from dmrl.deploy.c.templating import c_name, fill_template, template_values
 from dmrl.deploy.int8.network import IntegerNetwork
 
@@ -41,7 +41,7 @@ def write_c(
     bayer
         Whether the C takes raw Bayer mosaics by default; a compiler flag overrides it.
     near_bytes
-        Bytes of the near memory that the state must fit, see `memory_levels`. None: one memory.
+        Bytes of the near memory that the state must fit, see `placement`. None: one memory.
 
     Returns
     -------
@@ -55,39 +55,18 @@ def write_c(
     SettingError
         If the near memory is too small.
     """
-    names, name = template_values(network), c_name(network)
-    made = generate_source(network, names, bayer=bayer, near_bytes=near_bytes)
+    name = c_name(network)
+    made = generate_source(network, template_values(network), bayer=bayer, near_bytes=near_bytes)
+    values = made.values
+    memory = "L1" if values["state_bytes"] <= MAX_L1_STATE_BYTES else "L2"
     files = {
         f"{name}.c": made.code,
         f"{name}.h": made.header,
-        f"{name}_vectors.h": generate_vectors(network, images, names, bayer=bayer),
-        "main.c": fill_template("main.c", **names, most=MAX_DETECTIONS),
-        "Makefile": fill_template("Makefile", **names),
-        "README.md": _generate_readme(network, names, made, bayer=bayer),
+        f"{name}_vectors.h": generate_vectors(network, images, values, bayer=bayer),
+        "main.c": fill_template("main.c", **values, most=MAX_DETECTIONS),
+        "Makefile": fill_template("Makefile", **values),
+        "README.md": fill_template("README.md", **values, memory=memory),
     }
     for file, text in files.items():
         (folder / file).write_text(text, encoding="utf-8")
     return list(files)
-
-
-def _generate_readme(
-    network: IntegerNetwork, names: dict[str, str], made: CSource, *, bayer: bool
-) -> str:
-    far = f"static {names['prefix']}_far_t away;" if made.far_bytes else ""
-    return fill_template(
-        "README.md",
-        **names,
-        state_bytes=made.state_bytes,
-        bayer_bytes=made.bayer_bytes,
-        constant_bytes=made.constant_bytes,
-        stack_bytes=made.stack_bytes,
-        input="raw Bayer images" if bayer else "RGB" if network.channels == 3 else "grey",
-        macs=f"{network.macs / 1e6:.1f}",
-        memory="L1" if made.state_bytes <= MAX_L1_STATE_BYTES else "L2",
-        refs="&net, &away" if far else "&net",
-        away=f"{far} /* {made.far_bytes} bytes, in a larger one */\n" if far else "",
-        l2_away=f"PI_L2 {far}\n" if far else "",
-        far=fill_template("readme_far.md", **names, traffic_bytes=made.traffic_bytes)
-        if far
-        else "",
-    )

@@ -14,6 +14,7 @@ from dmrl.deploy.c.row_schedule import (
     find_overlaps,
     schedule_rows,
     share_ring,
+    slides_along_row,
 )
 from dmrl.deploy.int8.network import Conv, IntegerNetwork, MaxPool, Shape
 from dmrl.errors import ModelError
@@ -47,8 +48,6 @@ class Buffer:
         Whether values are int8.
     shift
         Position of row 0 in the ring; several buffers may share one ring.
-    far
-        Whether it is in the far memory (L2), see `memory_levels`.
     """
 
     name: str
@@ -62,7 +61,6 @@ class Buffer:
     ring: int
     signed: bool
     shift: int = 0
-    in_l2: bool = False
 
     @property
     def row_bytes(self) -> int:
@@ -91,16 +89,6 @@ class BufferPlan:
     """Buffer of every tensor of the network; -1 for a tensor inside a fused step."""
     whole: frozenset[int]
     """Buffers kept whole, since they are read after the last row."""
-    l1_scratch_bytes: int = 0
-    """Bytes of scratch memory in L1 if there are two memories, see `memory_levels`; 0: one
-    memory."""
-
-    def member_bytes(self, *, in_l2: bool) -> dict[str, int]:
-        """Return the members of the near or the far state that contain rings, and their bytes."""
-        return {
-            name: max(b.size for b in self.buffers if b.home == name)
-            for name in dict.fromkeys(b.home for b in self.buffers if b.in_l2 == in_l2)
-        }
 
     @property
     def zero_bytes(self) -> int:
@@ -108,19 +96,30 @@ class BufferPlan:
         rows = (b.padded_bytes for b in self.buffers if b.above and b.pad_value == 0)
         return max(rows, default=0)
 
-    def state_bytes(self, *, bayer: bool) -> int:
-        """Return the bytes of the (near) state, with or without raw Bayer images."""
-        used = 2 * len(self.buffers) + sum(self.member_bytes(in_l2=False).values()) + self.pad_bytes
-        used += 2 + 3 * self.network.width_px if bayer else 0
-        if not self.l1_scratch_bytes:
-            return round_up(used, 2)
-        return round_up(used + self.zero_bytes + self.l1_scratch_bytes, 4)
-
     @property
     def pad_bytes(self) -> int:
         """Bytes of the padding row of the image; 0: none."""
         image = self.buffers[0]
         return image.padded_bytes if image.above and image.pad_value else 0
+
+    @property
+    def read(self) -> set[int]:
+        """Buffers that a step reads."""
+        return {k for step in self.steps for k in step.sources}
+
+    @property
+    def pools(self) -> bool:
+        """Whether a step has a max-pool."""
+        return any(step.pooled or isinstance(step.layer, MaxPool) for step in self.steps)
+
+    def output_of(self, step: Step) -> Buffer:
+        """Return the buffer that a step writes."""
+        return self.buffers[self.steps.index(step) + 1]
+
+    def deepest_reader(self, index: int) -> int:
+        """Return the last step that reads the output of a step, or the step itself."""
+        readers = [k for k, step in enumerate(self.steps) if index + 1 in step.sources]
+        return max(readers, default=index)
 
 
 def plan_buffers(network: IntegerNetwork) -> BufferPlan:
@@ -255,22 +254,6 @@ SHARED_PREFIX = "passing_"
 """Prefix of members that several buffers share."""
 
 
-def slides_along_row(conv: Conv) -> bool:
-    """Return whether the C of a convolution slides along the row; it needs no padding columns."""
-    same = conv.stride == 1 and conv.padding == conv.dilation
-    return conv.depthwise and conv.kernel == 3 and same
-
-
-def count_pointers(conv: Conv) -> int:
-    """Return the number of row pointers of a convolution's kernel.
-
-    A pointer refers to one row of the kernel, whose columns are adjacent in memory. With dilation
-    they are not, and each weight of the kernel has its own pointer.
-    """
-    spread = conv.dilation > 1 and not conv.depthwise and conv.kernel > 1
-    return conv.kernel**2 if spread else conv.kernel
-
-
 def _build_buffer(index: int, shape: Shape, ring: int, steps: list[Step]) -> Buffer:
     channels, rows, cols = shape
     convs = [s.layer for s in steps if index == s.sources[0] and isinstance(s.layer, Conv)]
@@ -287,8 +270,3 @@ def _build_buffer(index: int, shape: Shape, ring: int, steps: list[Step]) -> Buf
         ring=ring,
         signed=bool(index) and steps[index - 1].layer.signed,
     )
-
-
-def round_up(size: int, step: int) -> int:
-    """Round up to the next multiple of ``step``."""
-    return -(-size // step) * step

@@ -10,6 +10,47 @@ from dataclasses import dataclass
 from dmrl.deploy.int8.network import AnyLayer, Conv, MaxPool
 
 
+def slides_along_row(conv: Conv) -> bool:
+    """Return whether the C of a convolution slides along the row; it needs no padding columns."""
+    same = conv.stride == 1 and conv.padding == conv.dilation
+    return conv.depthwise and conv.kernel == 3 and same
+
+
+@dataclass(frozen=True, slots=True)
+class RowReads:
+    """Pointers of a step to rows of its first input, in C: pointer k is one kernel row or weight.
+
+    A pointer refers to one row of the kernel, whose columns are adjacent in memory. With dilation
+    they are not, and each weight of the kernel has its own pointer. A pooled step computes two rows
+    at once and has twice as many pointers.
+
+    Parameters
+    ----------
+    taps
+        Pointers of the kernel for one row.
+    rows
+        Rows computed at once.
+    across
+        Pointers of a row of the kernel.
+    dilation, stride
+        Rows between two pointers, and between two rows computed at once.
+    margin
+        Columns of padding that the kernel reads on the left.
+    """
+
+    taps: int
+    rows: int = 1
+    across: int = 1
+    dilation: int = 1
+    stride: int = 1
+    margin: int = 0
+
+    @property
+    def count(self) -> int:
+        """Number of pointers."""
+        return self.taps * self.rows
+
+
 @dataclass(frozen=True, slots=True)
 class Step:
     """Computation of one output row of a layer, or of a convolution and its max-pool.
@@ -50,6 +91,17 @@ class Step:
             rows = self.layer.dilation * (self.layer.kernel - 1) - self.layer.padding
             return rows + (self.layer.stride if self.pooled else 0)
         return 1 if isinstance(self.layer, MaxPool) else 0
+
+    @property
+    def reads(self) -> RowReads:
+        """Rows of the first input that the C reads."""
+        conv = self.layer
+        if not isinstance(conv, Conv):
+            return RowReads(2 if isinstance(conv, MaxPool) else 1)
+        across = conv.kernel if conv.dilation > 1 and not conv.depthwise else 1
+        margin = 0 if slides_along_row(conv) else conv.padding
+        rows = 2 if self.pooled else 1
+        return RowReads(conv.kernel * across, rows, across, conv.dilation, conv.stride, margin)
 
 
 @dataclass(frozen=True, slots=True)

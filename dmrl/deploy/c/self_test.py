@@ -1,12 +1,13 @@
 """Test vectors of the self-test: images and the reference output for them."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.bayer_input import demosaic, to_mosaic
-from dmrl.deploy.c.templating import fill_template, format_array
+from dmrl.deploy.c.templating import fill_template
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.reference import decode_detections, run_network
 
@@ -16,7 +17,7 @@ MAX_DETECTIONS = 5
 
 
 def generate_vectors(
-    network: IntegerNetwork, images: Sequence[Image], names: dict[str, str], *, bayer: bool
+    network: IntegerNetwork, images: Sequence[Image], values: dict[str, Any], *, bayer: bool
 ) -> str:
     """Generate the header with the vectors: one of noise, and the first of ``images``."""
     if not bayer:
@@ -26,12 +27,13 @@ def generate_vectors(
     else:
         raws = [generate_noise((network.height_px, network.width_px)), *map(to_mosaic, images[:1])]
         seen = [demosaic(raw, channels=network.channels) for raw in raws]
-    rows = "".join(
-        _generate_vector(network, image, ("0", "picture")[k]) for k, image in enumerate(seen)
-    )
-    pictures = "".join(format_array("uint8_t", "picture", raw) for raw in raws[1:])
+    vectors = [_run_vector(network, image) for image in seen]
     return fill_template(
-        "vectors.h", **names, bayer=int(bayer), most=MAX_DETECTIONS, pictures=pictures, rows=rows
+        "vectors.h",
+        **values,
+        most=MAX_DETECTIONS,
+        picture=raws[1] if raws[1:] else None,
+        vectors=vectors,
     )
 
 
@@ -52,12 +54,8 @@ def hash_grids(grids: Sequence[NDArray[np.int8]]) -> int:
     return state
 
 
-def _generate_vector(network: IntegerNetwork, image: Image, name: str) -> str:
-    """Generate the C initialiser of one vector."""
+def _run_vector(network: IntegerNetwork, image: Image) -> dict[str, Any]:
+    """Return the checksum and the detections that the self-test expects for an image."""
     grids = run_network(network, image)
-    found = [
-        f"{{{d.u_q4}, {d.v_q4}, {d.depth_mm}, {d.confidence}, 0}}"
-        for d in decode_detections(network, grids, MAX_DETECTIONS)
-    ]
-    body = ", ".join(found) or "{0, 0, 0, 0, 0}"
-    return f"    {{{name}, {hash_grids(list(grids.values()))}u, {len(found)}, {{{body}}}}},\n"
+    found = decode_detections(network, grids, MAX_DETECTIONS)
+    return {"checksum": hash_grids(list(grids.values())), "found": found}

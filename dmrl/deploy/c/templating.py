@@ -1,9 +1,11 @@
 """C text from templates and arrays."""
 
 import re
-from importlib.resources import files
-from string import Template
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
 
+import jinja2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,22 +20,42 @@ LINE_WIDTH = 100
 
 
 def fill_template(template: str, **values: object) -> str:
-    """Fill in a template of ``templates/``: replace its ``$names``.
+    """Fill in a template of ``templates/``: Jinja with ``${...}`` and ``/*% ... %*/``.
 
     Untrusted values must be numbers or pass through `dmrl.guards.safe_names.comment_safe`: a value
     becomes code, or could end a comment.
 
     Raises
     ------
-    KeyError
+    jinja2.UndefinedError
         If a name has no value.
     """
-    text = files("dmrl.deploy.c").joinpath("templates", template).read_text(encoding="utf-8")
-    return Template(text).substitute(values)
+    return _environment().get_template(template).render(values)
 
 
-def format_array(kind: str, name: str, values: NDArray[np.integer]) -> str:
-    """Format the definition of a constant array.
+@cache
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+        block_start_string="/*%",
+        block_end_string="%*/",
+        variable_start_string="${",
+        variable_end_string="}",
+        comment_start_string="/*#",
+        comment_end_string="#*/",
+    )
+    environment.globals["zip"] = zip
+    environment.filters["wrapped"] = format_numbers
+    return environment
+
+
+def format_numbers(values: NDArray[np.integer]) -> str:
+    """Format the numbers of a constant array, in lines of at most ``LINE_WIDTH`` characters.
 
     Raises
     ------
@@ -41,19 +63,16 @@ def format_array(kind: str, name: str, values: NDArray[np.integer]) -> str:
         If the values are not integers, since anything else could inject code.
     """
     if values.dtype.kind not in "iu":
-        raise TypeError(f"{name} is of {values.dtype}, not of integers")
-    words = [f"{v}," for v in values.ravel().tolist()]
-    body = "\n".join(wrap_words(words, "    "))
-    return f"static const {kind} {name}[{values.size}] = {{\n{body}\n}};\n"
+        raise TypeError(f"an array is of {values.dtype}, not of integers")
+    return "\n".join(_wrap(f"{v}," for v in values.ravel().tolist()))
 
 
-def wrap_words(words: list[str], indent: str) -> list[str]:
-    """Wrap words into lines of at most ``LINE_WIDTH`` characters."""
-    lines, line = [], indent
+def _wrap(words: Iterable[str]) -> list[str]:
+    lines, line = [], "    "
     for word in words:
         if len(line) + len(word) > LINE_WIDTH:
             lines.append(line.rstrip())
-            line = indent
+            line = "    "
         line += word + " "
     return [*lines, line.rstrip()]
 
@@ -80,7 +99,6 @@ def template_values(network: IntegerNetwork) -> dict[str, str]:
         "version": __version__,
         "description": (
             f"{comment_safe(network.name)}: int8 network {comment_safe(network.architecture)} for "
-            "images of "
-            f"{network.width_px} x {network.height_px} pixels, as portable C."
+            f"images of {network.width_px} x {network.height_px} pixels, as portable C."
         ),
     }

@@ -1,6 +1,6 @@
 """Layers of an int8 network: parameters, output shapes, and invariants.
 
-``reference`` computes them, ``c.layer_code`` generates their C. A network checks its layers when it
+``reference`` computes them, the templates of ``c`` are their C. A network checks its layers when it
 is created, so neither has to handle overflow.
 """
 

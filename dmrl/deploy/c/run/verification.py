@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from dmrl.deploy.bayer_input import demosaic, to_mosaic
 from dmrl.deploy.c.harness import MAX_DETECTIONS, HarnessResult, parse_results
+from dmrl.deploy.c.network_source import MAX_STACK_BYTES
 from dmrl.deploy.c.run.compile_targets import Build, Target
 from dmrl.deploy.c.run.toolchain import run_program
-from dmrl.deploy.c.source_file import MAX_STACK_BYTES
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.reference import decode_detections, run_network
 from dmrl.errors import ToolError

@@ -4,7 +4,7 @@
  * Output for each image, little endian: the grid of every head, int8, row by row; int32 stack bytes
  * used (0 where not measured); int32 number of detections; the detections, as in the header. On a
  * bare RISC-V it makes its own system calls, so it needs no library. */
-#include "$prefix.h"
+#include "${prefix}.h"
 
 static ${prefix}_t net;
 #ifdef ${PREFIX}_FAR_BYTES
@@ -62,7 +62,7 @@ int harness_run(const uint8_t *image, int8_t *grids, ${prefix}_detection_t *foun
 }
 
 #ifndef HARNESS_SHARED
-#define MOST $most
+#define MOST ${most}
 
 #if defined(__riscv)
 static long system_call(long number, long a, long b, long c)

@@ -1,9 +1,9 @@
-/* Self-test of $prefix.c: runs the vectors and compares the output, bit for bit. main returns the
+/* Self-test of ${prefix}.c: runs the vectors and compares the output, bit for bit. main returns the
  * number of failed vectors.
  *
  * Prints the detections; with -DSILENT it prints nothing and needs no library, for use on a chip.
  *
- * Written by dmrl $version (`dmrl export`). */
+ * Written by dmrl ${version} (`dmrl export`). */
 #include "${prefix}_vectors.h"
 
 #ifdef SILENT
@@ -20,7 +20,7 @@ static ${prefix}_far_t away;
 #else
 #define STATE &net
 #endif
-static ${prefix}_detection_t found[$most];
+static ${prefix}_detection_t found[${most}];
 static uint8_t line[${PREFIX}_ROW_BYTES];
 
 static const uint8_t *next_row(const vector_t *vector, int row, uint32_t *state)
@@ -56,7 +56,7 @@ static int passes(const vector_t *vector)
     ${prefix}_init(STATE);
     for (int row = 0; row < ${PREFIX}_HEIGHT; row++)
         ${prefix}_row(STATE, next_row(vector, row, &state));
-    const int count = ${prefix}_detect(&net, found, $most);
+    const int count = ${prefix}_detect(&net, found, ${most});
     int right = count == vector->count && checksum() == vector->checksum;
     for (int k = 0; k < count; k++) {
         SAY("  u %.2f px, v %.2f px, depth %d mm, confidence %.3f\n", found[k].u_q4 / 16.0,

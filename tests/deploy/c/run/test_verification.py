@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dmrl.deploy.c.harness import HarnessResult
+from dmrl.deploy.c.network_source import MAX_STACK_BYTES
 from dmrl.deploy.c.run import measure, verification
 from dmrl.deploy.c.run.compile_targets import Build, Target
 from dmrl.deploy.c.run.measure import (
@@ -24,7 +25,6 @@ from dmrl.deploy.c.run.verification import (
     is_same_result,
     verify_target,
 )
-from dmrl.deploy.c.source_file import MAX_STACK_BYTES
 from dmrl.deploy.int8.reference import IntegerDetection
 from dmrl.errors import ModelError
 

@@ -15,7 +15,7 @@
 /* Computes one output row of a depthwise 3x3 convolution with stride 1 and padding equal to the
  * dilation, channel by channel. The nine weights and two of the three columns stay in registers, so
  * each column is loaded once. Positions left and right of the row read as `pad`. */
-INLINE void depthwise_along_$suffix(const uint8_t *const *in, uint8_t *out, const int8_t *weights,
+INLINE void depthwise_along_${suffix}(const uint8_t *const *in, uint8_t *out, const int8_t *weights,
                                const scale_t *scales, int cols, int channels, int dilation,
                                int pad, int low, int high, int shift)
 {
@@ -27,8 +27,8 @@ INLINE void depthwise_along_$suffix(const uint8_t *const *in, uint8_t *out, cons
         const int32_t bias = scales[c].bias, multiplier = scales[c].multiplier;
         for (int first = 0; first < dilation && first < cols; first++) {
             const int at = first * channels + c;
-            const $type *p = (const $type *)in[0] + at, *q = (const $type *)in[1] + at,
-                        *r = (const $type *)in[2] + at;
+            const ${type} *p = (const ${type} *)in[0] + at, *q = (const ${type} *)in[1] + at,
+                        *r = (const ${type} *)in[2] + at;
             uint8_t *to = out + at;
             int32_t a0 = pad, a1 = pad, a2 = pad, b0 = p[0], b1 = q[0], b2 = r[0], c0, c1, c2;
             int left = (cols - 1 - first) / dilation; /* columns to the right of b */
