@@ -15,22 +15,20 @@ import numpy as np
 
 from dmrl.deploy.backend_names import BackendName
 from dmrl.deploy.backends import Backend, Images, Int8Backend, build_reference_backend, to_grids
-from dmrl.deploy.c import c_name
-from dmrl.deploy.c.run.compiled import CompiledNetwork
-from dmrl.deploy.c.run.emulated import RISCV32, EmulatedNetwork
 from dmrl.deploy.int8.network import IntegerNetwork
+from dmrl.deploy.int8.quantise import HEAD_OF_CHANNEL
 from dmrl.deploy.int8.store import INTEGER_NAME, load_network
+from dmrl.deploy.onnx.float_cache import build_float_onnx_once
 from dmrl.errors import MissingExtra, ModelError, SettingError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_pipes, require_text_path
 from dmrl.learn import pretrained
 from dmrl.learn.inference.decode_grids import Grids
+from dmrl.learn.pretrained import DESCRIPTION_NAME, WEIGHTS_NAME
 
 FLOAT_ONNX_NAME = "model.onnx"
 INT8_ONNX_NAME = "model.int8.onnx"
-DESCRIPTION_NAME = "model.json"
-WEIGHTS_NAME = "model.safetensors"
 QUANTIZE_HINT = "Make one with: dmrl quantize MODEL DATASET OUT"
 RATE_FIELDS = ("min_confidence", "distance_m", "detected", "false_per_image", "slope", "offset")
 """Fields of the rates in the description of a model."""
@@ -143,12 +141,17 @@ def select_fastest_backend(model: Path, size_px: tuple[int, int]) -> BackendName
         import_module("dmrl.deploy.onnx.runtime")
         if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():
             return "onnx"
-        written = import_module("dmrl.deploy.onnx.graph_writer").OUTPUT_OF
-        learned = import_module("dmrl.learn.inference.loaded_model").load_model(model)
-    except (MissingExtra, ModuleNotFoundError, ModelError):
+        said = _build_float_onnx(model)[1]
+    except (MissingExtra, ModelError):
         return "torch"  # which then reports the error
-    told = set(learned.network.channels) <= set(written)
-    return "onnx" if told and size_px == (learned.width_px, learned.height_px) else "torch"
+    told = set(said["outputs"]) <= set(HEAD_OF_CHANNEL)
+    return "onnx" if told and size_px == (said["width_px"], said["height_px"]) else "torch"
+
+
+def _build_float_onnx(model: Path) -> tuple[bytes, dict[str, Any]]:
+    """Return the float ONNX of a model that is no export folder, and its description."""
+    grey = (model / INTEGER_NAME).is_file() and load_network(model).channels == 1
+    return build_float_onnx_once(model, grey=grey)
 
 
 def _open_torch(model: Path, _backend: BackendName) -> Detector:
@@ -178,13 +181,9 @@ def _open_onnx(model: Path, _backend: BackendName) -> Detector:
         runs = room.OnnxRun(file, file)
         stride_px, threshold = _parse_description(model / DESCRIPTION_NAME)
     else:
-        learned = _import_optional(
-            "dmrl.learn.inference.loaded_model", "train", "a model to ONNX"
-        ).load_model(model)
-        grey = (model / INTEGER_NAME).is_file() and load_network(model).channels == 1
-        export = _import_optional("dmrl.deploy.onnx.float_model", "deploy", "--backend onnx")
-        runs = room.OnnxRun(export.float_onnx_of(learned, grey=grey), model)
-        stride_px, threshold = learned.network.stride_px, learned.threshold
+        written, said = _build_float_onnx(model)
+        runs = room.OnnxRun(written, model)
+        stride_px, threshold = said["stride_px"], said["threshold"]
         file = model / WEIGHTS_NAME
     size_px = (runs.width_px, runs.height_px)
     decides = file if file.is_file() else None
@@ -221,6 +220,11 @@ def _open_integer(model: Path, backend: BackendName) -> Detector:
 
 def _open_c(model: Path, backend: BackendName) -> Detector:
     network = _load_int8_network(model, backend)
+    # With their template engine, these are not for the backends that start fast.
+    from dmrl.deploy.c import c_name  # noqa: PLC0415
+    from dmrl.deploy.c.run.compiled import CompiledNetwork  # noqa: PLC0415
+    from dmrl.deploy.c.run.emulated import RISCV32, EmulatedNetwork  # noqa: PLC0415
+
     source = model / f"{c_name(network)}.c"
     exported = source.is_file()
     kind = EmulatedNetwork if backend == RISCV32 else CompiledNetwork

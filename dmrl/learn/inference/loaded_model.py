@@ -34,9 +34,8 @@ from dmrl.learn.networks.architectures import (
     unbind_channels,
 )
 from dmrl.learn.networks.keras_weights import load_keras_weights
+from dmrl.learn.pretrained import DESCRIPTION_NAME, WEIGHTS_NAME
 
-WEIGHTS_NAME = "model.safetensors"
-DESCRIPTION_NAME = "model.json"
 PUBLISHED_THRESHOLD = 0.33
 """Confidence threshold of the published evaluation, 0 to 1."""
 

@@ -3,6 +3,9 @@
 from pathlib import Path
 
 PRETRAINED_DIR = Path(__file__).parent
+WEIGHTS_NAME = "model.safetensors"
+DESCRIPTION_NAME = "model.json"
+"""Files of a run folder."""
 
 
 def list_pretrained() -> list[str]:
