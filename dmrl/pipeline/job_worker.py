@@ -4,6 +4,7 @@ Started by `process_pool`. It ends with the process that started it, and with it
 that its stage has started.
 """
 
+import gc
 import json
 import os
 import queue
@@ -19,7 +20,7 @@ from typing import Any
 
 from dmrl import recipe as recipes
 from dmrl.errors import BusyOutput, FullDisk, MissingExtra, OutputError, describe_error
-from dmrl.pipeline.job import JobResult
+from dmrl.pipeline.job import JobResult, has_failed
 from dmrl.pipeline.stage_signature import StageSignature, signature_of
 from dmrl.recording import Provenance, build_provenance
 from dmrl.recording.provenance_inputs import build_input, hash_file, hash_folder
@@ -127,7 +128,10 @@ def main() -> None:
     print("ready", file=answers, flush=True)
     try:
         while True:
-            print(json.dumps(run_job(jobs.get())), file=answers, flush=True)
+            answer = run_job(jobs.get())
+            if has_failed(answer):
+                gc.collect()  # a cycle would hold the files and locks of the failed stage
+            print(json.dumps(answer), file=answers, flush=True)
     except KeyboardInterrupt:
         pass
     # Only after the exception has gone, with the frames that hold unfinished outputs.

@@ -11,7 +11,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
-from dmrl.pipeline.job import JobResult, has_failed
+from dmrl.pipeline.job import JobResult
 from dmrl.terminal.progress import Lines
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -85,8 +85,8 @@ class ProcessPool:
         with self._lock:
             if self._over:
                 return answer
-            if not (has_failed(answer) or exclusive):
-                self._idle.append(process)  # one that failed may hold resources
+            if not (exclusive or "bug" in answer or "retry" in answer):
+                self._idle.append(process)  # after a bug or for lack of memory it may be damaged
                 return answer
             self._all.remove(process)
         stop_processes([process], in_order=False)

@@ -277,7 +277,7 @@ def test_without_a_compiler_the_package_to_install_is_named(
 def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
     integers = untrained(name)
     made = generate_source(integers, template_values(integers), bayer=False)
-    assert made.values["state_bytes"] + made.values["bayer_bytes"] <= bytes_  # type: ignore[operator]
+    assert made.values["state_bytes"] + made.values["bayer_bytes"] <= bytes_
 
 
 @pytest.mark.heavy

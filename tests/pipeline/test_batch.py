@@ -14,6 +14,7 @@ import pytest
 from dmrl.errors import DmrlError, RecordingError
 from dmrl.images.codec import encode_png
 from dmrl.messages import message_class
+from dmrl.pipeline import process_pool
 from dmrl.pipeline.batch import find_recordings, is_collection, run_over_folder
 from dmrl.recording import Provenance, RecordingWriter, read_summary
 from dmrl.stages import check, convert, trim
@@ -99,6 +100,24 @@ def test_one_that_fails_stops_no_other_and_is_told_at_the_end(
 
 
 @pytest.mark.heavy
+def test_a_recording_that_fails_does_not_cost_its_process(
+    flights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = []
+    start = process_pool.WorkerProcess.__init__
+    monkeypatch.setattr(
+        process_pool.WorkerProcess,
+        "__init__",
+        lambda self, *rest: (started.append(1), start(self, *rest))[1],
+    )
+    for name in ("b", "x", "y", "z"):
+        (flights / f"{name}.mcap").write_bytes(b"no recording")
+    with pytest.raises(DmrlError, match="4 of 7 recordings failed"):
+        trimmed(flights, tmp_path / "out", workers=1)
+    assert len(started) == 1
+    assert len(list((tmp_path / "out").rglob("*.mcap"))) == 3
+
+
 def test_what_is_there_and_made_of_the_same_is_left_as_it_is(
     flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,10 +1,11 @@
 """C file and header of a network: the values of their templates."""
 
 from dataclasses import dataclass
+from typing import Any
 
-from dmrl.deploy.c.buffer_plan import BufferPlan, plan_buffers, slides_along_row
+from dmrl.deploy.c.buffer_plan import BufferPlan, plan_buffers
 from dmrl.deploy.c.placement import Placement, place_buffers
-from dmrl.deploy.c.row_schedule import Step
+from dmrl.deploy.c.row_schedule import Step, slides_along_row
 from dmrl.deploy.c.templating import fill_template
 from dmrl.deploy.int8.layers import GAIN_SHIFT
 from dmrl.deploy.int8.network import SUBPIXEL, Conv, IntegerNetwork
@@ -30,7 +31,7 @@ class CSource:
 
     code: str
     header: str
-    values: dict[str, object]
+    values: dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +117,7 @@ def generate_source(
     placement = place_buffers(plan, near_bytes)
     calls = [_build_call(plan, step) for step in plan.steps]
     unique = list(dict.fromkeys(call for call in calls if call))
-    values: dict[str, object] = {
+    values: dict[str, Any] = {
         **names,
         **_state_arguments(placement, names["prefix"]),
         **_count_bytes(placement),
