@@ -1,7 +1,7 @@
 /* See pilot.h. The reference, with the reasons, is dmrl/flight/onboard_pilot.py: the same operations
  * in the same order.
  *
- * Written by dmrl $version (`dmrl export`). */
+ * Written by dmrl ${version} (`dmrl export`). */
 #include "pilot.h"
 
 #if defined(__clang__)
@@ -84,7 +84,7 @@ static void restart(pilot_t *p, double x, double y, double z, double variance, d
     for (int i = 0; i < 4; i++) {
         p->mean[i] = 0.0;
         for (int j = 0; j < 4; j++)
-            p->covariance[i][j] = i != j ? 0.0 : i < 2 ? variance : $SPEED_VAR;
+            p->covariance[i][j] = i != j ? 0.0 : i < 2 ? variance : ${SPEED_VAR};
     }
     p->mean[0] = x;
     p->mean[1] = y;
@@ -104,7 +104,7 @@ void pilot_start(pilot_t *pilot, double distance)
 static void move(pilot_t *p, const pilot_state_t *state)
 {
     const pilot_pose_t before = p->past[p->newest];
-    const double dt = state->time_s - before.time_s, keep = 1.0 / (1.0 + dt / $SPEED_S);
+    const double dt = state->time_s - before.time_s, keep = 1.0 / (1.0 + dt / ${SPEED_S});
     double turned_c, turned_s, rows[4][4], *m = p->mean;
     pilot_pose_t *now;
     turn_of(state->yaw_rate * dt, &turned_c, &turned_s);
@@ -133,8 +133,8 @@ static void move(pilot_t *p, const pilot_state_t *state)
             p->covariance[i][j + 2] = keep * rows[i][j + 2];
         }
     for (int i = 0; i < 2; i++) {
-        p->covariance[i][i] += $DRIFT_VAR * dt;
-        p->covariance[i + 2][i + 2] += (1.0 - keep * keep) * $SPEED_VAR;
+        p->covariance[i][i] += ${DRIFT_VAR} * dt;
+        p->covariance[i + 2][i + 2] += (1.0 - keep * keep) * ${SPEED_VAR};
     }
 }
 
@@ -143,8 +143,8 @@ static place_t locate(const pilot_pose_t *then, const pilot_detection_t *found)
     place_t place;
     double cr, sr, cp, sp, away, along, across;
     const double depth = found->depth_mm / 1000.0;
-    const double left = ($CX - found->u_q4 / 16.0) / $FX * depth;
-    const double up = ($CY - found->v_q4 / 16.0) / $FY * depth;
+    const double left = (${CX} - found->u_q4 / 16.0) / ${FX} * depth;
+    const double up = (${CY} - found->v_q4 / 16.0) / ${FY} * depth;
     double level, ahead, aside;
     turn_of(then->roll, &cr, &sr);
     turn_of(then->pitch, &cp, &sp);
@@ -155,8 +155,8 @@ static place_t locate(const pilot_pose_t *then, const pilot_detection_t *found)
     place.y = then->y + (then->s * ahead + then->c * aside);
     place.z = then->height + (cp * level - sp * depth);
     away = root(ahead * ahead + aside * aside) + 0.001;
-    along = $DEPTH_RATIO * away;
-    across = $SIDE_RATIO * away;
+    along = ${DEPTH_RATIO} * away;
+    across = ${SIDE_RATIO} * away;
     place.to_x = (place.x - then->x) / away;
     place.to_y = (place.y - then->y) / away;
     place.along = along * along;
@@ -221,8 +221,8 @@ static void look(pilot_t *p, double age, const pilot_detection_t *found, int cou
     const double dx = p->mean[0] - age * p->mean[2] - then->x;
     const double dy = p->mean[1] - age * p->mean[3] - then->y;
     const double ahead = then->c * dx + then->s * dy, aside = then->c * dy - then->s * dx;
-    const int in_view = ahead > 0.1 && size_of(aside) < $IN_VIEW * ahead;
-    const double share = in_view ? $SEEN_SHARE : $UNSEEN_SHARE, miss = 1.0 - share;
+    const int in_view = ahead > 0.1 && size_of(aside) < ${IN_VIEW} * ahead;
+    const double share = in_view ? ${SEEN_SHARE} : ${UNSEEN_SHARE}, miss = 1.0 - share;
     double total = 0.0, most = 0.0;
     candidate_t best = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     place_t best_at = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0}, sure_at = best_at;
@@ -232,23 +232,23 @@ static void look(pilot_t *p, double age, const pilot_detection_t *found, int cou
         const candidate_t c = compare(p, &at, age);
         const double sureness = (found[k].confidence + 0.5) / 65536.0;
         const double ratio =
-            share * $EVIDENCE * sureness / (1.0 - sureness) * c.density / $FALSE_PER_M2;
+            share * ${EVIDENCE} * sureness / (1.0 - sureness) * c.density / ${FALSE_PER_M2};
         total += ratio;
         if (k == 0 || ratio > most) {
             most = ratio;
             best = c;
             best_at = at;
         }
-        if (found[k].confidence >= $FOUND && found[k].confidence > sure) {
+        if (found[k].confidence >= ${FOUND} && found[k].confidence > sure) {
             sure = found[k].confidence;
             sure_at = at;
         }
     }
-    p->odds = smaller(p->odds * (miss + total), $MAX_ODDS);
+    p->odds = smaller(p->odds * (miss + total), ${MAX_ODDS});
     p->odds = larger(p->odds, 0.001);
     if (count > 0 && most > miss)
         update(p, &best, &best_at, age);
-    else if (p->odds < $LOST_ODDS && sure >= 0)
+    else if (p->odds < ${LOST_ODDS} && sure >= 0)
         restart(p, sure_at.x, sure_at.y, sure_at.z, sure_at.along, p->image_s);
 }
 
@@ -269,8 +269,8 @@ static void steer(pilot_t *p, const pilot_state_t *state, pilot_command_t *comma
     const double drift_x = vx - state->vx, drift_y = vy - state->vy;
     const int stale = state->time_s - p->image_s > PILOT_STALE_S;
     double away, to_x, to_y, variance, trust, gap, wx, wy, towards, less, near, passing;
-    if (state->time_s - p->seen_s > $BLIND_S) {
-        give(command, 0.0, 0.0, 0.0, stale ? 0.0 : p->side * $SEARCH_RATE);
+    if (state->time_s - p->seen_s > ${BLIND_S}) {
+        give(command, 0.0, 0.0, 0.0, stale ? 0.0 : p->side * ${SEARCH_RATE});
         return;
     }
     p->side = y + 0.7 * drift_y > 0.0 ? 1.0 : -1.0;
@@ -282,18 +282,18 @@ static void steer(pilot_t *p, const pilot_state_t *state, pilot_command_t *comma
     to_x = x / away;
     to_y = y / away;
     variance = 0.5 * (p->covariance[0][0] + p->covariance[1][1]);
-    trust = p->odds / (1.0 + p->odds) / (1.0 + variance / $TRUST_VAR);
-    gap = $GAIN * (away - p->distance);
+    trust = p->odds / (1.0 + p->odds) / (1.0 + variance / ${TRUST_VAR});
+    gap = ${GAIN} * (away - p->distance);
     wx = trust * vx + gap * to_x;
     wy = trust * vy + gap * to_y;
     towards = wx * to_x + wy * to_y;
-    less = (1.0 - trust) * (larger(towards, 0.0) + $RETREAT);
-    if (away < $NEAR)
-        less += larger(towards - less, 0.0) + 2.0 * ($NEAR - away);
-    near = larger(away * away, $NEAR * $NEAR);
+    less = (1.0 - trust) * (larger(towards, 0.0) + ${RETREAT});
+    if (away < ${NEAR})
+        less += larger(towards - less, 0.0) + 2.0 * (${NEAR} - away);
+    near = larger(away * away, ${NEAR} * ${NEAR});
     passing = trust * (x * drift_y - y * drift_x) / near;
     give(command, wx - less * to_x, wy - less * to_y,
-         trust * $CLIMB_GAIN * (p->height - state->height), $TURN_GAIN * angle_of(x, y) + passing);
+         trust * ${CLIMB_GAIN} * (p->height - state->height), ${TURN_GAIN} * angle_of(x, y) + passing);
 }
 
 void pilot_step(pilot_t *p, const pilot_state_t *state, double image_s,
@@ -305,8 +305,8 @@ void pilot_step(pilot_t *p, const pilot_state_t *state, double image_s,
         first->time_s = state->time_s;
         first->x = first->y = first->s = first->roll = first->pitch = first->height = 0.0;
         first->c = 1.0;
-        restart(p, p->distance, 0.0, state->height, $START_VAR, state->time_s);
-        p->odds = $START_ODDS;
+        restart(p, p->distance, 0.0, state->height, ${START_VAR}, state->time_s);
+        p->odds = ${START_ODDS};
     }
     move(p, state);
     if (image_s > p->image_s && image_s >= 0.0) {

@@ -4,16 +4,16 @@
  * has used before or that is older than PILOT_MAX_AGE_S, and hovers without an image for PILOT_STALE_S.
  * Compile with -ffp-contract=off to get the commands of dmrl.flight.onboard_pilot, bit for bit.
  *
- * Written by dmrl $version (`dmrl export`). */
+ * Written by dmrl ${version} (`dmrl export`). */
 #ifndef PILOT_H
 #define PILOT_H
 
 #include <stdint.h>
 
-#define PILOT_PAST $PAST
-#define PILOT_DETECTIONS_MAX $DETECTIONS_MAX
-#define PILOT_MAX_AGE_S $MAX_AGE_S
-#define PILOT_STALE_S $STALE_S
+#define PILOT_PAST ${PAST}
+#define PILOT_DETECTIONS_MAX ${DETECTIONS_MAX}
+#define PILOT_MAX_AGE_S ${MAX_AGE_S}
+#define PILOT_STALE_S ${STALE_S}
 #define PILOT_PACKET_MAX (12 + 8 * PILOT_DETECTIONS_MAX) /* bytes */
 
 /* As the network's C detects: 1/16 px, millimetres, confidence of 65536. */
