@@ -11,7 +11,7 @@ from dmrl.errors import SettingError
 from dmrl.pipeline.single_run import run_on_cluster
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.settings import filled as filled
-from dmrl.terminal.arguments import AsJson, On, Recipe
+from dmrl.terminal.arguments import AsJson, Flat, On, Recipe
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_table
 
@@ -59,6 +59,7 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
     return Result(*render_recording(out, settings, resume=resume))
 
 
+<<<<<<< HEAD
 def command(
     recipe: Recipe | None = None,
     out: Path | None = None,
@@ -79,13 +80,14 @@ def command(
     as_json: AsJson = False,
 ) -> None:
     """Render images of robots with exact labels, as a recipe says, into a recording.
+=======
+@dataclass(frozen=True, slots=True)
+class Flags:
+    """Settings of the recipe that a flag overrules.
+>>>>>>> ffcb07ac (Import filterpy and scipy.stats only where they are used; test what commands load)
 
     Parameters
     ----------
-    recipe
-        A TOML file, or the name of a shipped recipe, such as synthetic_first_look.
-    out
-        Recording to write, or with --preview a picture. Must not exist.
     images
         Images to render. Without it, as the recipe says; so for all that follow.
     seed
@@ -103,6 +105,40 @@ def command(
         .blend, .glb, .obj or .stl of the robot.
     scale
         Metres per unit of the model; of the Crazyflie that dmrl draws, times life size.
+    """
+
+    images: Count | None = None
+    seed: int | None = None
+    workers: int | None = None
+    backgrounds: Path | None = None
+    camera: Path | None = None
+    model: Path | None = None
+    scale: float | None = None
+
+
+NO_FLAGS = Flags()
+
+
+def command(
+    recipe: Recipe | None = None,
+    out: Path | None = None,
+    /,
+    *,
+    flags: Flat[Flags] = NO_FLAGS,
+    resume: Annotated[bool, Parameter(negative=())] = False,
+    setup: Annotated[bool, Parameter(negative=())] = False,
+    preview: Annotated[bool, Parameter(negative=())] = False,
+    on: On = None,
+    as_json: AsJson = False,
+) -> None:
+    """Render images of robots with exact labels, as a recipe says, into a recording.
+
+    Parameters
+    ----------
+    recipe
+        A TOML file, or the name of a shipped recipe, such as synthetic_first_look.
+    out
+        Recording to write, or with --preview a picture. Must not exist.
     resume
         Go on with an interrupted OUT.
     setup
@@ -121,6 +157,7 @@ def command(
         raise SettingError("render wants a recipe and an output. Try: dmrl render --help")
     from dmrl.render_recording import preview_robot, read_render_settings
 
+<<<<<<< HEAD
     settings = read_render_settings(
         recipe,
         images=images,
@@ -132,19 +169,18 @@ def command(
         model=model,
         scale=scale,
     )
+=======
+    settings = read_render_settings(recipe, **asdict(flags))
+    if preview and (on is not None or resume):
+        raise SettingError("--preview is one picture, made here. Leave out --on and --resume")
+>>>>>>> ffcb07ac (Import filterpy and scipy.stats only where they are used; test what commands load)
     if preview:
-        if on is not None or resume:
-            raise SettingError("--preview is one picture, made here. Leave out --on and --resume")
-        return _print("picture", out, preview_robot(out, settings), as_json)
-    if on is not None:
-        return _print(
-            "recording", out, run_on_cluster(on, "render", out, {}, settings) or {}, as_json
-        )
-    return _print("recording", out, asdict(run(out, settings, resume=resume)), as_json)
-
-
-def _print(kind: str, out: Path, result: Mapping[str, object], as_json: bool) -> None:
+        result: Mapping[str, object] = preview_robot(out, settings)
+    elif on is not None:
+        result = run_on_cluster(on, "render", out, {}, settings) or {}
+    else:
+        result = asdict(run(out, settings, resume=resume))
     rows = {name.replace("_", " "): value for name, value in result.items()}
     if as_json:
-        return print_json({kind: str(out), **rows})
+        return print_json({"picture" if preview else "recording": str(out), **rows})
     return print_table(str(out), ("what", "value"), list(rows.items()))

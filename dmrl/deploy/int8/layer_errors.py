@@ -1,16 +1,16 @@
 """Quantization error of each layer: the int8 network against the float one, on the same images."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.int8 import graph as floats
 from dmrl.deploy.int8 import reference
-from dmrl.deploy.int8.graph import Float32, FloatGraph, rgb_to_grey
+from dmrl.deploy.int8.graph import FloatGraph, rgb_to_grey
 from dmrl.deploy.int8.network import Conv, IntegerNetwork
-from dmrl.deploy.int8.reference import QuantizedTensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,21 +44,35 @@ class LayerErrorStats:
     saturated: float
 
 
+class _Output(NamedTuple):
+    """Compared part of a tensor: the output of a layer, or a head, which is one channel of it."""
+
+    name: str
+    kind: str
+    tensor: int
+    channels: slice
+    shape: tuple[int, int, int]
+    products: int
+    scale: float
+    zero_point: int
+    signed: bool
+
+    @property
+    def levels(self) -> tuple[int, int]:
+        """First and last level."""
+        return (-128, 127) if self.signed else (0, 255)
+
+    def dequantize(self, levels: NDArray[np.integer] | int) -> NDArray[np.float64] | float:
+        """Return the real values of levels."""
+        return self.scale * (levels - self.zero_point)
+
+
 @dataclass
 class _ErrorSums:
     signal: float = 0.0
     error: float = 0.0
     saturated: int = 0
     count: int = 0
-
-    def accumulate(
-        self, wanted: Float32, got: NDArray[np.floating], levels: NDArray[np.integer], signed: bool
-    ) -> None:
-        self.signal += float((wanted.astype(np.float64) ** 2).sum())
-        self.error += float(((wanted - got) ** 2).sum())
-        last = (levels == 127) | (levels == -128) if signed else levels == 255
-        self.saturated += int(last.sum())
-        self.count += levels.size
 
     @property
     def sqnr_db(self) -> float | None:
@@ -79,68 +93,48 @@ def compute_layer_errors(
     images
         (height, width, 3) RGB images.
     """
-    layers = [_ErrorSums() for _ in network.layers]
-    heads = {name: _ErrorSums() for name in network.heads}
+    compared = [(output, _ErrorSums()) for output in _iter_outputs(network)]
     for image in images:
         seen = rgb_to_grey(image[None])[0] if network.channels == 1 else image
         wanted = floats.compute_tensors(graph, floats.normalize_images(seen[None]))
         got = list(reference.iter_tensors(network, seen))
-        _accumulate_image(network, [tensor[0] for tensor in wanted], got, layers, heads)
-    return [*_summarise_layers(network, layers), *_summarise_heads(network, heads)]
-
-
-def _accumulate_image(
-    network: IntegerNetwork,
-    wanted: list[Float32],
-    got: list[QuantizedTensor],
-    layers: list[_ErrorSums],
-    heads: dict[str, _ErrorSums],
-) -> None:
-    for sums, layer, real, levels in zip(layers, network.layers, wanted[1:], got[1:], strict=True):
-        sums.accumulate(real, levels * layer.scale, levels, layer.signed)
-    for name, head in network.heads.items():
-        levels = got[head.tensor][head.channel]
-        values = reference.dequantize(head, levels.astype(np.int8))
-        heads[name].accumulate(wanted[head.tensor][head.channel], values, levels, signed=True)
-
-
-def _summarise_layers(network: IntegerNetwork, sums: list[_ErrorSums]) -> list[LayerErrorStats]:
-    shapes = network.shapes
-    of_heads = {head.tensor for head in network.heads.values()}
+        for one, sums in compared:
+            real = wanted[one.tensor][0][one.channels]
+            levels = got[one.tensor][one.channels]
+            sums.signal += float((real.astype(np.float64) ** 2).sum())
+            sums.error += float(((real - one.dequantize(levels)) ** 2).sum())
+            last = one.levels if one.signed else one.levels[1:]
+            sums.saturated += int(np.isin(levels, last).sum())
+            sums.count += levels.size
     return [
         LayerErrorStats(
-            layer.name,
-            layer.kind,
-            shapes[k + 1],
-            layer.count_macs((shapes[layer.source],)) if isinstance(layer, Conv) else 0,
-            -128 * layer.scale if layer.signed else 0.0,
-            (127 if layer.signed else 255) * layer.scale,
-            sums[k].sqnr_db,
-            sums[k].saturated / max(sums[k].count, 1),
+            one.name,
+            one.kind,
+            one.shape,
+            one.products,
+            *(float(one.dequantize(level)) for level in one.levels),
+            sums.sqnr_db,
+            sums.saturated / max(sums.count, 1),
         )
-        for k, layer in enumerate(network.layers)
-        if k + 1 not in of_heads
+        for one, sums in compared
     ]
 
 
-def _summarise_heads(network: IntegerNetwork, sums: dict[str, _ErrorSums]) -> list[LayerErrorStats]:
-    out = []
+def _iter_outputs(network: IntegerNetwork) -> Iterator[_Output]:
+    shapes, whole = network.shapes, slice(None)
+    of_heads = {head.tensor for head in network.heads.values()}
+    products = [
+        layer.count_macs((shapes[layer.source],)) if isinstance(layer, Conv) else 0
+        for layer in network.layers
+    ]
+    for tensor, layer in enumerate(network.layers, start=1):
+        if tensor not in of_heads:
+            about = (shapes[tensor], products[tensor - 1], layer.scale, 0, layer.signed)
+            yield _Output(layer.name, layer.kind, tensor, whole, *about)
     for name, head in network.heads.items():
-        layer = network.layers[head.tensor - 1]
-        assert isinstance(layer, Conv)
-        channels, *grid = network.shapes[head.tensor]
-        source = network.shapes[layer.source]
-        low, high = reference.dequantize(head, np.array([-128, 127], np.int8))
-        out.append(
-            LayerErrorStats(
-                f"{layer.name}[{head.channel}] {name}",
-                "head",
-                (1, grid[0], grid[1]),
-                layer.count_macs((source,)) // channels,
-                float(low),
-                float(high),
-                sums[name].sqnr_db,
-                sums[name].saturated / max(sums[name].count, 1),
-            )
-        )
-    return out
+        channels, rows, cols = shapes[head.tensor]
+        label = f"{network.layers[head.tensor - 1].name}[{head.channel}] {name}"
+        own = slice(head.channel, head.channel + 1)
+        share = products[head.tensor - 1] // channels
+        about = ((1, rows, cols), share, head.scale, head.zero_point, True)
+        yield _Output(label, "head", head.tensor, own, *about)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from dmrl.estimation.flight.pair_output import (
     height_errors,
@@ -101,7 +101,9 @@ def is_inconsistent(whole: Estimate, sure: Estimate) -> bool:
     information = np.linalg.inv(sure.covariance[known, :2, :2])
     # Squared Mahalanobis distances are chi-square with two degrees of freedom if both are right.
     squared = np.einsum("ki,kij,kj->k", apart, information, apart)
-    return bool((squared > chi2.ppf(CONSISTENCY_PROBABILITY, 2)).mean() > MAX_OUTSIDE_SHARE)
+    return bool(
+        (squared > 2 * gammaincinv(1.0, CONSISTENCY_PROBABILITY)).mean() > MAX_OUTSIDE_SHARE
+    )
 
 
 def _find_groups(pairs: Mapping[Names, Pair]) -> list[set[str]]:

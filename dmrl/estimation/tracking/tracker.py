@@ -8,8 +8,7 @@ All tracks are rows of arrays of fixed layout, and a step has no loop over them.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
-from scipy.stats import chi2
+from scipy.special import gammaincinv, ndtr
 
 from dmrl.estimation.tracking.association import Association, associate
 from dmrl.estimation.tracking.detector_rates import DetectorRates
@@ -95,7 +94,9 @@ class Tracker:
         self._next_number = 0
         volume = camera.width_px * camera.height_px * LOG_DEPTH_SPAN
         self._false_density = self.rates.false_per_image / volume
-        self._gate = float(chi2.ppf(tuning.gate, 3))
+        self._gate = float(
+            2 * gammaincinv(1.5, tuning.gate)
+        )  # quantile of chi squared, 3 dimensions
 
     def step(self, motion: EgoMotion, view: ImageDetections) -> list[Track]:
         """Return the reported tracks after the observer has moved and taken another image.

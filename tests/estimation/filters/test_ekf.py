@@ -7,12 +7,12 @@ from dmrl.estimation.filters.ekf import (
     Steps,
     build_steps,
     filter_many,
-    filter_reference,
     input_variance,
     predict_range,
     propagate_state,
     stack_pairs,
 )
+from dmrl.estimation.filters.filterpy_ekf import filter_reference
 from dmrl.estimation.model.pair import Pair, SensorTrack
 
 from ..flights import flown, pair_of

@@ -1,0 +1,54 @@
+"""Commands load no heavy package that they do not need: a table of commands and packages."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+HEAVY = {
+    *("torch", "onnx", "onnxruntime", "safetensors", "tensorboard", "sympy", "h5py", "jinja2"),
+    *("filterpy", "scipy.stats", "scipy.optimize", "cv2", "matplotlib", "pandas", "duckdb"),
+    *("rerun", "rosbags", "cflib", "ray", "fsspec", "bpy", "datasets"),
+}
+TABLE = {
+    "info flight.mcap": set(),
+    "check flight.mcap": {"pandas"},
+    "trim flight.mcap trimmed.mcap --to-s 1": set(),
+    "convert flight.mcap tables --to csv": {"pandas"},
+    "label flight.mcap labelled.mcap --gate-m 9": {"scipy.optimize", "pandas"},
+    "predict dmrl-nano flight.mcap found.mcap --backend onnx": {"onnxruntime"},
+    "predict dmrl-nano flight.mcap torch.mcap --backend torch": {
+        "torch",
+        "safetensors",
+        "sympy",
+        "h5py",
+    },
+}
+"""Packages of `HEAVY` that a command may load. pyarrow loads pandas, where it is installed, as it\nmakes its first array of Python or NumPy values."""
+LISTED = f"print(*(m for m in {sorted(HEAVY)} if m in sys.modules), file=open('loaded', 'w'))"
+CODE = f"import sys\nfrom dmrl.cli import main\ntry:\n    main()\nfinally:\n    {LISTED}"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("start")
+    dmrl("fly fly_in_view flight.mcap --duration-s 12 --seed 5 --camera --camera-rate-hz 1", folder)
+    dmrl("predict dmrl-nano flight.mcap first.mcap --backend onnx", folder)  # makes the ONNX once
+    return folder
+
+
+def dmrl(line: str, folder: Path) -> set[str]:
+    """Run a command; return the heavy packages that it has loaded."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-P", "-c", CODE, *line.split()]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return set((folder / "loaded").read_text().split())
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("line", TABLE)
+def test_a_command_loads_only_the_packages_of_its_row(line: str, folder: Path) -> None:
+    assert dmrl(line, folder) <= TABLE[line]
