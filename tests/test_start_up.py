@@ -26,7 +26,8 @@ TABLE = {
         "h5py",
     },
 }
-"""Packages of `HEAVY` that a command may load. pyarrow loads pandas, where it is installed, as it\nmakes its first array of Python or NumPy values."""
+"""Packages of `HEAVY` that a command may load. pyarrow loads pandas, where it is installed, as it
+makes its first array of Python or NumPy values."""
 LISTED = f"print(*(m for m in {sorted(HEAVY)} if m in sys.modules), file=open('loaded', 'w'))"
 CODE = f"import sys\nfrom dmrl.cli import main\ntry:\n    main()\nfinally:\n    {LISTED}"
 

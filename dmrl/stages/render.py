@@ -59,32 +59,9 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
     return Result(*render_recording(out, settings, resume=resume))
 
 
-<<<<<<< HEAD
-def command(
-    recipe: Recipe | None = None,
-    out: Path | None = None,
-    /,
-    *,
-    images: Count | None = None,
-    seed: int | None = None,
-    workers: int | None = None,
-    backgrounds: Path | None = None,
-    cutouts: Path | None = None,
-    camera: Path | None = None,
-    model: Path | None = None,
-    scale: float | None = None,
-    resume: Annotated[bool, Parameter(negative=())] = False,
-    setup: Annotated[bool, Parameter(negative=())] = False,
-    preview: Annotated[bool, Parameter(negative=())] = False,
-    on: On = None,
-    as_json: AsJson = False,
-) -> None:
-    """Render images of robots with exact labels, as a recipe says, into a recording.
-=======
 @dataclass(frozen=True, slots=True)
 class Flags:
     """Settings of the recipe that a flag overrules.
->>>>>>> ffcb07ac (Import filterpy and scipy.stats only where they are used; test what commands load)
 
     Parameters
     ----------
@@ -111,6 +88,7 @@ class Flags:
     seed: int | None = None
     workers: int | None = None
     backgrounds: Path | None = None
+    cutouts: Path | None = None
     camera: Path | None = None
     model: Path | None = None
     scale: float | None = None
@@ -157,23 +135,9 @@ def command(
         raise SettingError("render wants a recipe and an output. Try: dmrl render --help")
     from dmrl.render_recording import preview_robot, read_render_settings
 
-<<<<<<< HEAD
-    settings = read_render_settings(
-        recipe,
-        images=images,
-        seed=seed,
-        workers=workers,
-        backgrounds=backgrounds,
-        cutouts=cutouts,
-        camera=camera,
-        model=model,
-        scale=scale,
-    )
-=======
     settings = read_render_settings(recipe, **asdict(flags))
     if preview and (on is not None or resume):
         raise SettingError("--preview is one picture, made here. Leave out --on and --resume")
->>>>>>> ffcb07ac (Import filterpy and scipy.stats only where they are used; test what commands load)
     if preview:
         result: Mapping[str, object] = preview_robot(out, settings)
     elif on is not None:
