@@ -10,8 +10,7 @@ from dmrl.deploy.int8 import reference
 from dmrl.deploy.int8.graph import (
     Float32,
     FloatGraph,
-    compute_tensors,
-    normalize_images,
+    compute_rgb_tensors,
     rgb_to_grey,
     select_outputs,
 )
@@ -62,9 +61,7 @@ class FloatBackend:
 
     def outputs(self, images: Images) -> Outputs:
         """Compute the output for (N, height, width, 3) RGB images."""
-        stacked = np.asarray(images)
-        seen = rgb_to_grey(stacked) if self.graph.channels == 1 else stacked
-        output = select_outputs(self.graph, compute_tensors(self.graph, normalize_images(seen)))
+        output = select_outputs(self.graph, compute_rgb_tensors(self.graph, np.asarray(images)))
         return dict(zip(self.channels, output.swapaxes(0, 1), strict=True))
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.graph import FloatGraph, compute_tensors, normalize_images, rgb_to_grey
+from dmrl.deploy.int8.graph import FloatGraph, compute_rgb_tensors
 from dmrl.errors import SettingError
 
 Array = NDArray[np.float64]
@@ -83,8 +83,7 @@ def calibrate_ranges(graph: FloatGraph, batches: Iterable[NDArray[np.uint8]]) ->
 
 
 def _measure_ranges(graph: FloatGraph, images: NDArray[np.uint8]) -> ActivationRanges:
-    seen = rgb_to_grey(images) if graph.channels == 1 else images
-    tensors = compute_tensors(graph, normalize_images(seen))
+    tensors = compute_rgb_tensors(graph, images)
     return ActivationRanges(
         tuple(tensor.min(axis=(0, 2, 3)).astype(np.float64) for tensor in tensors),
         tuple(tensor.max(axis=(0, 2, 3)).astype(np.float64) for tensor in tensors),

@@ -306,6 +306,12 @@ def rgb_to_grey(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return ((weighted + 128) >> 8).astype(np.uint8)[..., None]
 
 
+def compute_rgb_tensors(graph: FloatGraph, images: NDArray[np.uint8]) -> list[Float32]:
+    """Compute the tensors of (N, H, W, 3) RGB images, converted to grey if the network needs it."""
+    seen = rgb_to_grey(images) if graph.channels == 1 else images
+    return compute_tensors(graph, normalize_images(seen))
+
+
 def compute_tensors(graph: FloatGraph, images: Float32) -> list[Float32]:
     """Compute the input and the output of every layer, each (N, channels, rows, cols)."""
     tensors = [images]

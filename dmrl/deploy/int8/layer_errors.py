@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8 import graph as floats
 from dmrl.deploy.int8 import reference
-from dmrl.deploy.int8.graph import FloatGraph, rgb_to_grey
+from dmrl.deploy.int8.graph import FloatGraph, compute_rgb_tensors, rgb_to_grey
 from dmrl.deploy.int8.network import Conv, IntegerNetwork
 
 
@@ -62,10 +61,6 @@ class _Output(NamedTuple):
         """First and last level."""
         return (-128, 127) if self.signed else (0, 255)
 
-    def dequantize(self, levels: NDArray[np.integer] | int) -> NDArray[np.float64] | float:
-        """Return the real values of levels."""
-        return self.scale * (levels - self.zero_point)
-
 
 @dataclass
 class _ErrorSums:
@@ -96,13 +91,13 @@ def compute_layer_errors(
     compared = [(output, _ErrorSums()) for output in _iter_outputs(network)]
     for image in images:
         seen = rgb_to_grey(image[None])[0] if network.channels == 1 else image
-        wanted = floats.compute_tensors(graph, floats.normalize_images(seen[None]))
+        wanted = compute_rgb_tensors(graph, image[None])
         got = list(reference.iter_tensors(network, seen))
         for one, sums in compared:
             real = wanted[one.tensor][0][one.channels]
             levels = got[one.tensor][one.channels]
             sums.signal += float((real.astype(np.float64) ** 2).sum())
-            sums.error += float(((real - one.dequantize(levels)) ** 2).sum())
+            sums.error += float(((real - one.scale * (levels - one.zero_point)) ** 2).sum())
             last = one.levels if one.signed else one.levels[1:]
             sums.saturated += int(np.isin(levels, last).sum())
             sums.count += levels.size
@@ -112,7 +107,8 @@ def compute_layer_errors(
             one.kind,
             one.shape,
             one.products,
-            *(float(one.dequantize(level)) for level in one.levels),
+            one.scale * (one.levels[0] - one.zero_point),
+            one.scale * (one.levels[1] - one.zero_point),
             sums.sqnr_db,
             sums.saturated / max(sums.count, 1),
         )

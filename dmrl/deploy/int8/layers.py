@@ -1,11 +1,14 @@
 """Layers of an int8 network: parameters, output shapes, and invariants.
 
+Each has a ``name`` and a ``kind``, the tensors that it reads (``sources``), whether its output is
+int8 (``signed``, else uint8), and the real value of one step of the output (``scale``).
+
 ``reference`` computes them, the templates of ``c`` are their C. A network checks its layers when it
 is created, so neither has to handle overflow.
 """
 
 from dataclasses import dataclass, field
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,40 +29,6 @@ GAIN_SHIFT = 8
 SIGNED_OFFSET = 128
 """Offset of a signed convolution's sums over its output, in levels. It makes all representable sums
 positive: a multiplier that is rounded up would give one level too few for negative ones."""
-
-
-class Layer(Protocol):
-    """Protocol of a layer."""
-
-    kind: ClassVar[str]
-
-    @property
-    def name(self) -> str:
-        """Name of the layer in the network."""
-
-    @property
-    def sources(self) -> tuple[int, ...]:
-        """Tensors it reads."""
-
-    @property
-    def signed(self) -> bool:
-        """Whether its output is int8; otherwise uint8."""
-
-    @property
-    def scale(self) -> float:
-        """Real value of one step of its output. For heads, see `Head`."""
-
-    def output_shape(self, inputs: tuple[Shape, ...]) -> Shape:
-        """Return channels, rows and columns of its output."""
-
-    def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
-        """Raise ModelError unless its invariants hold for inputs of these shapes and types.
-
-        Raises
-        ------
-        ModelError
-            If an invariant is violated.
-        """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -261,6 +230,6 @@ class Add:
 AnyLayer = Conv | MaxPool | Add
 
 
-def invalid_layer_error(layer: Layer, what: str) -> ModelError:
+def invalid_layer_error(layer: "Conv | MaxPool | Add", what: str) -> ModelError:
     """Return the error for a layer that violates an invariant."""
     return ModelError(f"layer {layer.name} {what}. Quantise the model again")

@@ -10,13 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.graph import (
-    FloatConv,
-    FloatGraph,
-    compute_tensors,
-    normalize_images,
-    rgb_to_grey,
-)
+from dmrl.deploy.int8.graph import FloatConv, FloatGraph, compute_rgb_tensors
 from dmrl.deploy.int8.windows import extract_taps
 
 Array = NDArray[np.float64]
@@ -35,10 +29,7 @@ def measure_moments(graph: FloatGraph, images: Iterable[NDArray[np.uint8]]) -> I
     sums: InputMoments = {}
     count = 0
     for image in images:
-        seen = image[None]
-        tensors = compute_tensors(
-            graph, normalize_images(rgb_to_grey(seen) if graph.channels == 1 else seen)
-        )
+        tensors = compute_rgb_tensors(graph, image[None])
         for index, layer in enumerate(graph.layers):
             if isinstance(layer, FloatConv):
                 more = _layer_moments(layer, tensors[layer.sources[0]][0])

@@ -27,7 +27,33 @@ LIBRARY_FLAGS = ("-O3", "-std=gnu99", "-shared", "-fPIC", "-DHARNESS_SHARED")
 X86_FLAGS = ("-march=native", "-mprefer-vector-width=256")
 
 
-class CompiledNetwork:
+class BuiltNetwork:
+    """Folder of a compiled network, removed with this object.
+
+    Parameters
+    ----------
+    network
+        Network of the C.
+    folder
+        Export folder with the C. None: the C is generated.
+
+    Raises
+    ------
+    ModelError
+        If the folder has no C, or the C does not support the network.
+    """
+
+    def __init__(self, network: IntegerNetwork, folder: Path | None) -> None:
+        self.network = network
+        self.build = Path(tempfile.mkdtemp(prefix="dmrl-c-"))
+        self._remove = weakref.finalize(self, shutil.rmtree, self.build, ignore_errors=True)
+        self.folder = folder or self.build
+        if folder is None:
+            write_c(network, self.build, [])
+        require_c_files(network, self.folder)
+
+
+class CompiledNetwork(BuiltNetwork):
     """A network, compiled for this machine. Not thread-safe: the C has one state.
 
     Parameters
@@ -50,14 +76,8 @@ class CompiledNetwork:
     def __init__(
         self, network: IntegerNetwork, folder: Path | None = None, compiler: str | None = None
     ) -> None:
-        self.network = network
-        build = Path(tempfile.mkdtemp(prefix="dmrl-c-"))
-        self._remove = weakref.finalize(self, shutil.rmtree, build, ignore_errors=True)
-        if folder is None:
-            write_c(network, build, [])
-            folder = build
-        require_c_files(network, folder)
-        name = c_name(network)
+        super().__init__(network, folder)
+        name, build, folder = c_name(network), self.build, self.folder
         (build / "harness.c").write_text(generate_harness(network), encoding="utf-8")
         library = build / "network.so"
         sources = (build / "harness.c", folder / f"{name}.c")

@@ -1,17 +1,14 @@
 """C of a network on a 32-bit RISC-V in an emulator, for ``predict --backend riscv32``."""
 
-import shutil
-import tempfile
-import weakref
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.c import c_name, write_c
+from dmrl.deploy.c import c_name
 from dmrl.deploy.c.harness import parse_results
-from dmrl.deploy.c.run.compile_targets import Build, Target, list_targets
-from dmrl.deploy.c.run.compiled import require_c_files
+from dmrl.deploy.c.run.compile_targets import list_targets
+from dmrl.deploy.c.run.compiled import BuiltNetwork
 from dmrl.deploy.c.run.toolchain import run_program
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import ToolError
@@ -19,7 +16,7 @@ from dmrl.errors import ToolError
 RISCV32 = "riscv32"
 
 
-class EmulatedNetwork:
+class EmulatedNetwork(BuiltNetwork):
     """A network, compiled for rv32imc and emulated. An image takes seconds.
 
     Output is that of the chip; speed is not.
@@ -40,19 +37,12 @@ class EmulatedNetwork:
     """
 
     def __init__(self, network: IntegerNetwork, folder: Path | None = None) -> None:
-        target: Target = next(t for t in list_targets() if t.name == RISCV32)
+        target = next(t for t in list_targets() if t.name == RISCV32)
         if target.skipped:
             raise ToolError(f"--backend {RISCV32}: {target.skipped}")
-        self.network = network
-        build = Path(tempfile.mkdtemp(prefix="dmrl-riscv-"))
-        self._remove = weakref.finalize(self, shutil.rmtree, build, ignore_errors=True)
-        if folder is None:
-            write_c(network, build, [])
-            folder = build
-        require_c_files(network, folder)
-        first: Build = target.builds[0]
+        super().__init__(network, folder)
         self._what = f"{c_name(network)}.c on {RISCV32}"
-        self._program = first.compile_program(network, folder, build)
+        self._program = target.builds[0].compile_program(network, self.folder, self.build)
 
     def run(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
         """Return every head's grid, as `run_network` of ``reference`` does."""

@@ -1,7 +1,7 @@
 """Verification: compares the C of an export with the reference, bit for bit, on every target."""
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -108,8 +108,6 @@ def verify_target(
     folder: Path,
     target: Target,
     wanted: ExpectedResults,
-    *,
-    on_build: Callable[[str], None] = lambda _: None,
 ) -> TargetResult:
     """Verify every build of a target on every image.
 
@@ -123,14 +121,11 @@ def verify_target(
         The target.
     wanted
         Images and their expected results.
-    on_build
-        Called with the name of the next build.
     """
     result = TargetResult(target.name, skipped=target.skipped)
     if result.skipped:
         return result
     for build in target.builds:
-        on_build(f"{target.name} {build.label}")
         try:
             result.builds.append(_verify_build(network, folder, build, wanted))
         except ToolError as e:
