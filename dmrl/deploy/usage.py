@@ -5,7 +5,8 @@ from importlib.resources import files
 from pathlib import Path
 from string import Template
 
-from dmrl.deploy.detector import DESCRIPTION_NAME, FLOAT_ONNX_NAME, INT8_ONNX_NAME
+from dmrl.deploy.detector import FLOAT_ONNX_NAME, INT8_ONNX_NAME
+from dmrl.learn.pretrained import DESCRIPTION_NAME
 
 README_NAME = "README.md"
 OFFSETS = {"offset_u": "col", "offset_v": "row"}
