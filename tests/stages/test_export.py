@@ -89,7 +89,12 @@ def test_a_float_model_becomes_float_onnx_alone(
     settled: Path, dots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     written = run(settled, tmp_path / "export", Settings())
-    assert {each.name for each in written} == {"model.onnx", "model.json", "provenance.json"}
+    assert {each.name for each in written} == {
+        "model.onnx",
+        "model.json",
+        "provenance.json",
+        "README.md",
+    }
     assert f"dmrl quantize {settled} DATASET OUT" in capsys.readouterr().err
     assert len(grids(tmp_path / "export", dots, tmp_path, "onnx")) == 30
 
