@@ -72,7 +72,19 @@ class ConvertSettings(TypedDict, total=False):
 class FlySettings(TypedDict, total=False):
     robots: int
     duration_s: float
-    trajectory: Literal["in_view", "random", "room", "lawn_mower", "hover", "parallel", "observer_static", "peer_static", "no_yaw", "both_static", "figure_of_eight"]
+    trajectory: Literal[
+        "in_view",
+        "random",
+        "room",
+        "lawn_mower",
+        "hover",
+        "parallel",
+        "observer_static",
+        "peer_static",
+        "no_yaw",
+        "both_static",
+        "figure_of_eight",
+    ]
     noise: Literal["ideal", "calibrated", "realistic", "harsh", "published"]
     seed: int
     place: int | None
