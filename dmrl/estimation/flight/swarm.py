@@ -27,7 +27,7 @@ from dmrl.estimation.model.pair import Array, Mask, Pair
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.signals.contradictions import drop_contradictions
 from dmrl.estimation.solver.covariance import compute_covariance, relative_covariance
-from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
+from dmrl.estimation.solver.estimate import PAIR_LAYOUT, REASONS, Estimate
 from dmrl.estimation.solver.keyframes import (
     build_problem,
     list_robots,
@@ -133,6 +133,9 @@ def _estimate_group(
             [motion_energy(solver.problem, v, *both) for solver, v, *_ in parts], axis=0
         )
         silent: Mask = odometry_dropout(pair, seen.time_s) | range_dropout(pair, seen.time_s)
+        # The reason why a pair was refused alone need not hold for the swarm.
+        causes = tuple(c for c in estimates[one, other].causes if c.name not in REASONS.values())
+        seen = replace(seen, causes=causes)
         out[one, other] = with_status(seen, silent, (energy[0], energy[2]), gate)
     return out
 
