@@ -258,7 +258,6 @@ def test_errors_are_one_line_and_leave_no_file(
         ({"eye": Path("nothing"), "camera": True}, ModelError, "no model nothing"),
         ({"flown": 5}, SettingError, "flown = 5"),
         ({"robots": 1}, SettingError, "1 robots"),
-        ({"eye": Path("dmrl-nano"), "camera": True, "backend": "integer"}, ModelError, "int8"),
     ):
         with pytest.raises(error, match=text):
             fly.run(out, replace(SHORT, **wrong))
