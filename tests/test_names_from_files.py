@@ -51,7 +51,6 @@ REASONS = {
     "deploy/c/run/measure.py: f'{name}.c'": "named by c_name",
     "deploy/c/run/measure.py: f'{name}.o'": "named by c_name",
     "deploy/c/run/compile_targets.py: f'{name}.c'": "named by c_name",
-    "deploy/c/pilot_code.py: name": OURS,
     "deploy/export_folder.py: name": OURS,
     "deploy/onnx/float_cache.py: f'{key}.onnx'": "a hash",
     "deploy/onnx/float_cache.py: name": OURS,
