@@ -145,3 +145,13 @@ def test_an_sdist_can_be_built_from(built: Path) -> None:
     wanted |= {"recipes/demo_flight.mcap"}
     wanted |= {f"{FOLDER_OF[package]}/__init__.py" for package in MAPPED}
     assert wanted <= names
+
+
+@pytest.mark.slow
+def test_the_constraints_install_with_their_hashes_alone(tmp_path: Path) -> None:
+    """In an empty environment: every package is listed, and every file has its hash."""
+    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True)
+    words = ["install", "--dry-run", "--quiet", "--require-hashes", "-r", "constraints.txt"]
+    pip = [str(tmp_path / "venv" / "bin" / "python"), "-m", "pip"]
+    done = subprocess.run([*pip, *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
