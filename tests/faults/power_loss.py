@@ -67,6 +67,19 @@ def unescape(text: str) -> str:
     return os.fsdecode(bytes.fromhex(text.replace("\\x", ""))) if "\\x" in text else text
 
 
+def join_threads(lines: Sequence[str]) -> Iterator[str]:
+    """Yield whole calls: strace prints one in two parts where another thread comes between."""
+    begun: dict[str, str] = {}
+    for line in lines:
+        process, _, call = line.partition(" ")
+        if call.endswith("<unfinished ...>"):
+            begun[process] = line.removesuffix("<unfinished ...>").rstrip()
+        elif resumed := re.match(r" *<\.\.\. \w+ resumed>(.*)", call):
+            yield begun.pop(process, "") + resumed[1]
+        else:
+            yield line
+
+
 class Recorded:
     """The calls of a command below a folder.
 
@@ -106,7 +119,7 @@ class Recorded:
             **options,
         )  # type: ignore[call-overload]
         assert done.returncode == 0, done.stderr
-        for line in log.read_text(errors="replace").splitlines():
+        for line in join_threads(log.read_text(errors="replace").splitlines()):
             if (found := LINE.match(line)) and not found[4].startswith("-"):
                 self._follow(found[2], found[3], found[4])
 

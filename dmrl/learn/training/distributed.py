@@ -140,7 +140,9 @@ def _join_group(meeting: str, rank: int, size: int, work: GroupWork[ResultT]) ->
             f"the {size} processes did not find each other within {CONNECT_TIMEOUT_S:g} s. "
             "Try again on a less busy machine or with fewer --processes"
         ) from e
-    distributed.distributed_c10d._set_pg_timeout(timedelta(seconds=COLLECTIVE_TIMEOUT_S))
+    # torch 2.14 made it public.
+    set_timeout = getattr(distributed, "set_timeout", distributed.distributed_c10d._set_pg_timeout)
+    set_timeout(timedelta(seconds=COLLECTIVE_TIMEOUT_S))
     return _run_and_wait(work)
 
 
