@@ -1,18 +1,20 @@
 """The release gate of a shipped network: every figure, with a floor that it must not fall below.
 
-    python benchmarks/release_gate.py MODEL DATA [--part choose|judge] [--held HELD.mcap]
+    python benchmarks/release_gate.py MODEL DATA [--part choose|judge] [--held HELD.mcap ...]
         [--floors NAME] [--json] [--curve OUT.png]
+        [--calibrate OUT [--threshold-anew] [--renders-only]]
 
 DATA is a folder with the published renders, real frames and cut-outs (`locanet-synthetic`,
 `locanet-multi`, `aideck-frames`, `aideck-empty`, `himax-frames`, `cutouts`); what is missing is
 left out. `--part choose` reads what settings may be chosen on: the published training images,
 which no shipped network learned from, and every second empty frame. `--part judge` reads the
-published test images and the other frames, for a release. `--held` adds renders, with recall by
-distance.
+published test images and the other frames, for a release. `--held` adds renders, several times if
+need be, with recall by distance. `--calibrate OUT` writes the network with confidence calibrated on
+the part `choose` and these renders; `--renders-only` leaves real frames out of that.
 
 A composite is a cut-out of a Crazyflie, 18 to 110 px wide, on an empty frame; two of them on
 every frame. Right: the most confident detection is within 16 px. Believed: it is above the
-threshold, too. Limits are in recipes/pretrained/release_gate.toml; the exit status is 1 if a figure
+threshold, too. Limits are in release_gate.toml beside this file; the exit status is 1 if a figure
 is beyond its own.
 """
 
@@ -31,6 +33,7 @@ from dmrl.formats.published.locanet import load_images
 from dmrl.geometry.camera_file import find_camera
 from dmrl.geometry.frames import PUBLISHED_RENDER, project
 from dmrl.images.codec import Rgb, crop_and_scale, decode
+from dmrl.learn.inference.confidence_calibration import apply_calibration, fit_calibration
 from dmrl.learn.inference.decode_grids import decode as decode_grids
 from dmrl.learn.inference.detection_metrics import (
     ScoredDetections,
@@ -38,9 +41,9 @@ from dmrl.learn.inference.detection_metrics import (
     compute_metrics,
     score_detections,
 )
-from dmrl.learn.inference.loaded_model import Model, load_model
+from dmrl.learn.inference.loaded_model import Model, load_model, save_model
 from dmrl.learn.inference.matching import Points
-from dmrl.learn.inference.threshold import find_unlabelled_images
+from dmrl.learn.inference.threshold import count_false_alarms, find_unlabelled_images
 from dmrl.learn.pretrained import resolve_model_path
 from dmrl.recording import iter_columns, read
 from dmrl.rendering.backgrounds.photos import SRGB_TO_LINEAR
@@ -50,7 +53,7 @@ from dmrl.rendering.shot import Light, Look, Robot
 from dmrl.rendering.sketch_renderer import Pose
 from dmrl.terminal.tables import print_table
 
-FLOORS = Path(__file__).parents[1] / "recipes/pretrained/release_gate.toml"
+FLOORS = Path(__file__).with_suffix(".toml")
 SIZE_PX = (320, 224)
 CUTOUT_WIDTH_M = 0.13
 CUTOUT_WIDTHS_PX = (18.0, 110.0)
@@ -131,6 +134,45 @@ def renders(recording: Path) -> Set:
     ]
     rows = [[[p["u_px"], p["v_px"], p["depth_m"]] for p in row] for row in peers]
     return images, [np.array(row, float).reshape(-1, 3) for row in rows]
+
+
+def join(sets: Sequence[Set]) -> Set:
+    """All images and labels of some sets."""
+    return [one for images, _ in sets for one in images], [row for _, rows in sets for row in rows]
+
+
+def calibrate(model: Model, scored: dict[str, ScoredDetections], out: Path, *, anew: bool) -> None:
+    """Write the network with confidence calibrated, and the threshold chosen anew.
+
+    Renders, and composites with empty real frames, count the same. Threshold and rates are those of
+    before, of the same detections under their new confidence. With ``anew`` the threshold is the
+    lowest at which empty renders have at most 0.02 detections an image.
+    """
+    groups = [scored[name] for name in ("held", "composites_and_empty") if name in scored]
+    images = np.cumsum([0, *(one.images for one in groups)])[:-1]
+    labels, found = (
+        Points.concatenate([getattr(one, part) for one in groups], images)
+        for part in ("labels", "detections")
+    )
+    every = score_detections(sum(one.images for one in groups), labels, found)
+    source = np.repeat(np.arange(len(groups)), [one.images for one in groups])
+    scaling = fit_calibration(every, source)
+    if scaling is None or not apply_calibration(model.network, scaling):
+        raise SystemExit("too few detections to calibrate")
+    rates = None if model.rates is None else dict(model.rates)
+    if rates:
+        least = np.log(rates["min_confidence"] / (1 - rates["min_confidence"]))
+        rates["min_confidence"] = 1 / (1 + np.exp(-scaling.slope * least - scaling.offset))
+        rates["offset"] -= rates["slope"] * scaling.offset / scaling.slope
+        rates["slope"] /= scaling.slope
+        rates = {k: np.round(v, 4).tolist() for k, v in rates.items()}
+    before = by_distance("", scored["held"])[".threshold_at_0.02"] if anew else model.threshold
+    logit = scaling.slope * np.log(before / (1 - before)) + scaling.offset
+    known = {**model.training, "calibrated_again": scaling._asdict()}
+    threshold = round(float(1 / (1 + np.exp(-logit))), 4)
+    out.mkdir(parents=True)
+    save_model(replace(model, threshold=threshold, rates=rates, training=known), out)
+    print(f"{out}: slope {scaling.slope:.3f}, offset {scaling.offset:.3f}, threshold {threshold}")
 
 
 def score(model: Model, data: Set) -> ScoredDetections:
@@ -230,7 +272,7 @@ def far(name: str, scored: ScoredDetections) -> dict[str, float]:
 
 
 def gate(
-    model: Model, data: Path, part: str, held: Path | None
+    model: Model, data: Path, part: str, held: Sequence[Path]
 ) -> tuple[dict[str, float], dict[str, ScoredDetections]]:
     """Every figure of a network, and what it is made from."""
     split = "train" if part == "choose" else "test"
@@ -256,11 +298,14 @@ def gate(
         scored["composites"] = score(model, drawn)
         figures |= first_detections("composites", scored["composites"], threshold)
         both = (drawn[0] + bare, drawn[1] + [np.zeros((0, 3))] * len(bare))
-        figures |= reliability("composites_and_empty", score(model, both))
-    if held is not None:
-        scored["held"] = score(model, renders(held))
+        scored["composites_and_empty"] = score(model, both)
+        figures |= reliability("composites_and_empty", scored["composites_and_empty"])
+    if held:
+        scored["held"] = score(model, join([renders(recording) for recording in held]))
         figures |= located("held", scored["held"], threshold)
         figures |= by_distance("held", scored["held"]) | reliability("held", scored["held"])
+        alarmed = count_false_alarms(scored["held"], threshold)
+        figures |= {"held.false_an_empty_image": alarmed.false_alarms}
     return figures, scored
 
 
@@ -286,13 +331,20 @@ def main() -> int:
     parser.add_argument("model", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--part", choices=("choose", "judge"), default="choose")
-    parser.add_argument("--held", type=Path)
+    parser.add_argument("--held", type=Path, action="append", default=[])
     parser.add_argument("--floors", help="network of release_gate.toml; default: the model's name")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--curve", type=Path)
+    parser.add_argument("--calibrate", type=Path, metavar="OUT")
+    parser.add_argument("--threshold-anew", action="store_true")
+    parser.add_argument("--renders-only", action="store_true")
     given = parser.parse_args()
     model = load_model(resolve_model_path(given.model))
     figures, scored = gate(model, given.data, given.part, given.held)
+    if given.renders_only:  # a network for the published renders: real frames are no matter
+        scored.pop("composites_and_empty", None)
+    if given.calibrate:
+        calibrate(model, scored, given.calibrate, anew=given.threshold_anew)
     name = given.floors or given.model.name
     floors = tomllib.loads(FLOORS.read_text()).get(name, {}) if FLOORS.is_file() else {}
     if given.curve:
