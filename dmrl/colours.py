@@ -13,7 +13,7 @@ RGB = {
 }
 """Colours of the sources of positions, and of other measurements."""
 
-SECOND_DETECTION_RGB = (170, 230, 60)
+SECOND_DETECTION_RGB = (80, 140, 255)
 """Colour of a second model's detections, beside those of a first."""
 
 OWN_RGB, PEER_RGB = (240, 240, 240), (150, 150, 150)

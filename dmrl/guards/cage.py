@@ -7,7 +7,6 @@ says so in one line.
 
 import ctypes
 import os
-import resource
 import subprocess
 import sys
 from contextlib import suppress
@@ -16,6 +15,7 @@ from importlib import import_module
 from dmrl.errors import DmrlError, SettingError
 from dmrl.guards import limits
 from dmrl.guards.memory import MemoryLimit
+from dmrl.guards.posix import resource
 
 CPU_TIME_S = 300
 """CPU time of a child, seconds. A query of a thousand recordings takes 0.1 s."""

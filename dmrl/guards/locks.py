@@ -1,13 +1,13 @@
 """Lock files and folders for one process, with locks that end with the process."""
 
 import errno
-import fcntl
 import os
 import time
 from contextlib import suppress
 from pathlib import Path
 
 from dmrl.errors import BusyOutput, OutputError
+from dmrl.guards.posix import O_DIRECTORY, O_NOFOLLOW, O_NONBLOCK, fcntl
 
 LOCK_WAIT_S = 0.25
 """Time to wait for a lock. Another process may be testing it at this moment."""
@@ -18,7 +18,7 @@ UNSUPPORTED_ERRNOS = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, e
 def refuse_locked(path: Path) -> None:
     """Raise OutputError if a living process has locked ``path``."""
     with suppress(OSError):  # nothing exists, or it cannot be locked
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        descriptor = os.open(path, os.O_RDONLY | O_NOFOLLOW | O_NONBLOCK)
         try:
             _lock(descriptor, path)
         finally:
@@ -47,7 +47,7 @@ def take_folder(partial: Path) -> int:
         with suppress(FileExistsError):
             partial.mkdir()
         try:
-            descriptor = os.open(partial, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            descriptor = os.open(partial, os.O_RDONLY | O_DIRECTORY | O_NOFOLLOW)
         except FileNotFoundError:
             continue  # finished by another process just now
         except NotADirectoryError:
@@ -76,7 +76,7 @@ def _lock_if_same(descriptor: int, partial: Path) -> bool:
 def _remove_left_over(partial: Path) -> None:
     """Remove a file of a killed process. It is not emptied: it may have another name by now."""
     try:
-        descriptor = os.open(partial, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        descriptor = os.open(partial, os.O_RDONLY | O_NOFOLLOW | O_NONBLOCK)
     except FileNotFoundError:
         return
     except OSError as e:

@@ -6,11 +6,11 @@ itself, the operating system enforces the limit.
 
 import ctypes
 import re
-import resource
 from contextlib import suppress
 from pathlib import Path
 
 from dmrl.guards import limits
+from dmrl.guards.posix import resource
 
 M_MMAP_THRESHOLD = -3
 _VM_DATA = re.compile(r"VmData:\s*(\d+) kB")

@@ -6,7 +6,6 @@ removes those whose owner was killed.
 """
 
 import atexit
-import fcntl
 import os
 import shutil
 import stat
@@ -15,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dmrl.guards.locks import is_same_file
+from dmrl.guards.posix import HAS_LOCKS, O_CLOEXEC, O_DIRECTORY, O_NOFOLLOW, fcntl, getuid
 
 PREFIX = "dmrl-run-"
 SYSTEM_FOLDER = "DMRL_SYSTEM_TMPDIR"
@@ -26,6 +26,8 @@ def use_own_temporary_folder() -> None:
 
     Without a temporary folder that can be written and locked, nothing changes.
     """
+    if not HAS_LOCKS:
+        return
     system = Path(tempfile.gettempdir())
     with suppress(OSError):
         _remove_abandoned(system)
@@ -59,12 +61,12 @@ def _remove_abandoned(system: Path) -> None:
 def _take(folder: Path, how: int) -> int:
     """Lock a folder of this user; return its descriptor, or -1 if it is not there."""
     try:
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        descriptor = os.open(folder, os.O_RDONLY | O_DIRECTORY | O_NOFOLLOW | O_CLOEXEC)
     except OSError:
         return -1
     try:
         found = os.fstat(descriptor)
-        own = found.st_uid == os.getuid() and not stat.S_IMODE(found.st_mode) & 0o077
+        own = found.st_uid == getuid() and not stat.S_IMODE(found.st_mode) & 0o077
         fcntl.flock(descriptor, how)
         if own and is_same_file(folder, descriptor):
             return descriptor

@@ -160,7 +160,10 @@ def stop_processes(processes: list[WorkerProcess], *, in_order: bool) -> None:
             with suppress(subprocess.TimeoutExpired):
                 process.popen.wait(TERMINATE_TIMEOUT_S)
         with suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.popen.pid, signal.SIGKILL)
+            if hasattr(os, "killpg"):
+                os.killpg(process.popen.pid, signal.SIGKILL)
+            else:  # Windows: what the process has started goes on
+                process.popen.kill()
         process.popen.wait()
         for stream in (process.popen.stdin, process.popen.stdout):
             if stream is not None:

@@ -5,7 +5,6 @@ The old one stays until the new one is complete. See docs/pipelines.md.
 """
 
 import errno
-import fcntl
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -15,6 +14,7 @@ from dmrl.atomic_output import as_output_error, replace_file, to_partial_path
 from dmrl.errors import OutputError, SettingError
 from dmrl.evaluation.pipeline_summary import StepOutcome
 from dmrl.guards.paths import require_text_path
+from dmrl.guards.posix import fcntl
 from dmrl.pipeline.build_cache import BuildCache
 from dmrl.pipeline.executor import open_executor
 from dmrl.pipeline.forecast import Forecast, forecast_steps

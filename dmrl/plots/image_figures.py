@@ -72,7 +72,7 @@ def plot_examples(shown: Sequence[Example], stem: Path, *, depth_max_m: float = 
             row[0].set_title(example.title, fontsize=9, loc="left")
             maps = [
                 row[1].imshow(example.confidence, vmin=0, vmax=1, cmap="inferno", **at),
-                row[2].imshow(example.depth_m, vmin=0, vmax=depth_max_m, cmap="turbo", **at),
+                row[2].imshow(example.depth_m, vmin=0, vmax=depth_max_m, cmap="viridis", **at),
             ]
             for axes in row:
                 _draw_markers(axes, example)
@@ -253,7 +253,7 @@ def plot_map_pairs(shown: Sequence[MapPair], stem: Path) -> None:
             row[0].imshow(pair.rgb)
             row[0].set_title(pair.title, fontsize=9)
         # Column 0 has the images; then one block of columns for each channel.
-        for channel, (name, colours) in enumerate(zip(words, ("inferno", "turbo"), strict=True)):
+        for channel, (name, colours) in enumerate(zip(words, ("inferno", "viridis"), strict=True)):
             block = grid[:, 1 + channel * len(names) : 1 + (channel + 1) * len(names)]
             most = max(pair.maps[who][channel].max() for pair in shown for who in names)
             for row, pair in zip(block, shown, strict=True):

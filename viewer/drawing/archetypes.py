@@ -55,7 +55,7 @@ class ColourScale:
     """
 
     title: str
-    colormap: Literal["inferno", "turbo"]
+    colormap: Literal["inferno", "viridis"]
     last: float
     unit: str
 
@@ -64,7 +64,7 @@ def build_scales(depth_max_m: float) -> dict[str, ColourScale]:
     """Return the colours of the channels that are shown, by name of the channel."""
     return {
         "confidence": ColourScale("confidence", "inferno", 1.0, ""),
-        "depth_m": ColourScale("depth, m", "turbo", depth_max_m, " m"),
+        "depth_m": ColourScale("depth, m", "viridis", depth_max_m, " m"),
     }
 
 

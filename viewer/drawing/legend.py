@@ -13,7 +13,8 @@ LEGEND_HEIGHT_PX = 26
 """Height of the legend and the colour bars below an image, pixels."""
 
 MARK_PX, BAR_PX, BAR_STEPS = 6, 6, 64
-TEXT_COLOUR = (220, 220, 220)
+TEXT_COLOUR = (128, 128, 128)
+"""Grey that is readable on a dark theme and on a light one."""
 MAX_CHARACTERS, GAP_CHARACTERS = 50, 4
 """Characters that fit side by side in a panel of a quarter of the window, and gap between names."""
 

@@ -22,6 +22,7 @@ from dmrl.errors import ClusterError, MissingExtra
 from dmrl.guards.temporary_folder import find_system_folder
 from dmrl.pipeline.job import JobResult, has_failed
 from dmrl.terminal.progress import Lines, say
+from dmrl.terminal.signals import TERMINATION_SIGNALS as SIGNALS
 
 try:
     import ray
@@ -42,7 +43,6 @@ TASKS_AHEAD_PER_CORE = 4
 CONNECT_TIMEOUT_S, TERMINATE_TIMEOUT_S, NODE_POLL_S = 10.0, 30.0, 2.0
 HEAD = ("node", "", "done", "failed", "s of work")
 HERE, LOST = "there", "lost"
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def _run_on_node(line: str, version: str, folder: str, exclusive: bool) -> JobResult:
