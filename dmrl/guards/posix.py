@@ -40,6 +40,7 @@ try:
 except ImportError:
     resource = SimpleNamespace(
         RLIMIT_AS=0,
+        RLIMIT_CORE=5,
         RLIMIT_CPU=1,
         RLIMIT_DATA=2,
         RLIMIT_FSIZE=3,
