@@ -100,7 +100,8 @@ def _lock(descriptor: int, partial: Path) -> None:
     until = time.monotonic() + LOCK_WAIT_S
     while True:
         try:
-            return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
         except BlockingIOError:
             if time.monotonic() > until:
                 raise _busy_error(descriptor, partial) from None
@@ -108,7 +109,7 @@ def _lock(descriptor: int, partial: Path) -> None:
         except OSError as e:
             if e.errno not in UNSUPPORTED_ERRNOS:
                 raise
-            return None
+            return
 
 
 def _busy_error(descriptor: int, partial: Path) -> BusyOutput:
