@@ -9,7 +9,6 @@ import numpy as np
 
 from dmrl.deploy.backends import Images, Outputs
 from dmrl.deploy.int8.graph import rgb_to_grey
-from dmrl.deploy.onnx.static_check import require_modest
 from dmrl.errors import MissingExtra, ModelError
 from dmrl.guards import limits
 from dmrl.guards.memory import MemoryLimit
@@ -42,9 +41,9 @@ class OnnxRun:
     """
 
     def __init__(self, model: Path | bytes, where: object = "the model", threads: int = 0) -> None:
-        data = model if isinstance(model, bytes) else model.read_bytes()
-        self._where, self._size = where, len(data)
-        self._session = open_session(data, where, threads)
+        self._where = where
+        self._size = len(model) if isinstance(model, bytes) else model.stat().st_size
+        self._session = open_session(model, where, threads)
         inputs = self._session.get_inputs()
         self.names = [output.name for output in self._session.get_outputs()]
         if [i.name for i in inputs] != ["image"] or "confidence_logit" not in self.names:
@@ -68,7 +67,9 @@ class OnnxRun:
 def open_session(
     model: Path | bytes, where: object, threads: int = 0
 ) -> "onnxruntime.InferenceSession":
-    """Open an ONNX file, or its bytes; see `OnnxRun`.
+    """Open an ONNX file, or the bytes of one that dmrl has just made; see `OnnxRun`.
+
+    A file may be a stranger's and is checked first.
 
     Raises
     ------
@@ -84,8 +85,13 @@ def open_session(
         # Without VNNI, pairs of products are added in 16 bits, which overflow. This option
         # selects the slower exact kernels.
         options.add_session_config_entry("session.x64quantprecision", "1")
-    data = model if isinstance(model, bytes) else model.read_bytes()
-    require_modest(data, where)
+    if isinstance(model, bytes):
+        data = model
+    else:
+        from dmrl.deploy.onnx.static_check import require_modest  # noqa: PLC0415 - loads onnx
+
+        data = model.read_bytes()
+        require_modest(data, where)
     with _limit_memory(len(data), where):
         return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
 

@@ -299,11 +299,7 @@ def _connect(address: str) -> None:
         If the connection fails.
     """
     before = {number: signal.getsignal(number) for number in SIGNALS}
-    quiet: dict[str, Any] = {
-        "log_to_driver": False,
-        "logging_level": "ERROR",
-        "configure_logging": True,
-    }
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     try:
         if address:
             _require_answer(address)
