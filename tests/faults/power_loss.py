@@ -199,6 +199,11 @@ class Recorded:
             node.writes.append((self.moment, at, data[:result]))
             if call != "pwrite64":
                 self._open[number] = node, at + result
+        elif call == "sendfile":  # the file that is copied does not change
+            source, start = re.search(r", \d+<([^>]*)>, (?:\[(\d+)\]|NULL)", given).groups()  # type: ignore[union-attr]
+            data = Path(unescape(source)).read_bytes()[int(start or place) :][:result]
+            node.writes.append((self.moment, place, data))
+            self._open[number] = node, place + result
         elif call == "mmap":
             assert "PROT_WRITE" not in given or "MAP_PRIVATE" in given, given
         else:
