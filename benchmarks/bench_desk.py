@@ -4,8 +4,8 @@ python benchmarks/bench_desk.py OUT [--images 1000] [--planted 50] [--first 60] 
 
 1,000 drawings of `dmrl sketch`; in 50 of them the label of one robot is moved by 15 to 60 px. The
 detections of dmrl-nano order the desk, or with `--epochs 12` those of a network trained on the
-dataset with the bad labels. Prints how many planted rows are among the first 60, by suspicion and by
-error, and how many of these the accepted detections correct.
+dataset with the bad labels. Prints how many planted rows are among the first 60, by suspicion and
+by error, and how many of these the accepted detections correct.
 """
 
 import argparse
