@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.guards import limits
+from dmrl.guards.memory import MemoryLimit
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -42,9 +43,10 @@ def parse_toml(text: str) -> dict[str, Any]:
     if len(text) > limits.TOML_CHARACTERS:
         raise ValueError(f"it has {len(text)} characters, more than {limits.TOML_CHARACTERS}")
     try:
-        table: dict[str, Any] = _check_limits(tomllib.loads(text))
+        with MemoryLimit(len(text)):  # a key of many parts needs their number squared
+            table: dict[str, Any] = _check_limits(tomllib.loads(text))
         return table
-    except RecursionError:
+    except (RecursionError, MemoryError):
         raise ValueError(_TOO_DEEP) from None
 
 
