@@ -5,7 +5,7 @@
 
 from dmrl.guards.telemetry import disable_telemetry
 
-__version__ = "0.1.0"
+__version__ = "0.3.0"
 
 disable_telemetry()  # dependencies read their switches when they are imported
 
