@@ -53,11 +53,20 @@ COPY_M, COPIED_SHARE = 1e-4, 0.05
 
 
 def score_documents(task: str, outputs: Sequence[Path]) -> dict[str, Any]:
-    """Return the figures of a task over the outputs of ``dmrl evaluate``, one a seed."""
+    """Return the figures of a task over the outputs of ``dmrl evaluate``, one a seed.
+
+    Raises
+    ------
+    SourceError
+        If an output is no JSON document and no folder with one.
+    """
     found = []
-    for folder in outputs:
-        (file,) = sorted(folder.glob("*.json"))
-        found.append(parse_json(file.read_text(encoding="utf-8")))
+    for path in outputs:
+        file = next(iter(sorted(path.glob("*.json"))), path) if path.is_dir() else path
+        try:
+            found.append(parse_json(file.read_text(encoding="utf-8")))
+        except (OSError, ValueError) as e:
+            raise SourceError(f"{path} is no output of dmrl evaluate --plots ({e})") from None
     return spread_figures(task, found)
 
 

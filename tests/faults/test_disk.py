@@ -20,8 +20,8 @@ SIZES = 8
 AT_ONCE = 12
 """Operations that a process goes through, with every error, before a fresh one."""
 WRITES_NOTHING = {"check", "doctor", "fake-drone", "find", "info"}
-IS_A_RUN = {"demo", "score"}
-"""They are `dmrl run demo`, and the last step of `dmrl run benchmark`."""
+IS_A_RUN = {"demo"}
+"""It is `dmrl run demo`."""
 
 
 @pytest.fixture

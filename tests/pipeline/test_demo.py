@@ -32,7 +32,7 @@ def test_the_flight_that_ships_has_the_settings_of_its_recipe() -> None:
 
 
 def test_a_step_reads_the_flight_by_its_name(tmp_path: Path) -> None:
-    assert locate_input("demo_flight.mcap", set(), tmp_path, None) == FLIGHT
+    assert locate_input("demo_flight.mcap", set(), tmp_path, None).samefile(FLIGHT)
     assert locate_input("demo_flight.mcap", {"demo_flight.mcap"}, tmp_path, None).parent == tmp_path
     assert recipe.locate_recording("../demo_flight.mcap") is None
     assert recipe.locate_recording("demo.toml") is None

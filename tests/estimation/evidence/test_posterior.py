@@ -19,7 +19,9 @@ def test_names_of_models_and_of_their_unknowns_are_distinct() -> None:
     assert len({model.name for model in MODELS}) == len(MODELS)
 
 
-@pytest.mark.parametrize("candidate", list(list_candidates()), ids=lambda one: f"{one.model.name} {one.robot}")
+@pytest.mark.parametrize(
+    "candidate", list(list_candidates()), ids=lambda one: f"{one.model.name} {one.robot}"
+)
 def test_a_model_adds_its_unknowns_for_its_robot_alone(candidate: Candidate) -> None:
     problem = build_problem({(0, 1): pair_of(flown("in_view", "calibrated", 1000, 20.0))})
     before, after = problem.layout, candidate.apply(problem).layout
