@@ -94,8 +94,8 @@ PICTURES = {
             ' images = dmrl.open("follow.mcap").images("cf1");'
             ' Image.fromarray(images.nearest(14.0)).save("plain.png")\'',
             "dmrl view follow.mcap --layout image --screenshot near.png --time 14",
-            "dmrl view follow.mcap --screenshot space.png --time 7",
-            "dmrl view follow.mcap --layout image --screenshot there.png --time 7",
+            "dmrl view follow.mcap --screenshot space.png --time 11",
+            "dmrl view follow.mcap --layout image --screenshot there.png --time 3.3",
         ),
         VIEWER,
         join_front,
