@@ -17,6 +17,7 @@ from dmrl.errors import SourceError
 from dmrl.formats.clocks import Ints, settle_times
 from dmrl.formats.files.text_cells import DATE, is_number, parse_cells, parse_time_ns
 from dmrl.geometry.frames import Array
+from dmrl.guards import limits
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 
@@ -226,6 +227,9 @@ def _find_header(
     separators = (dialect.separator,) if dialect.separator else SEPARATORS
     marks = (dialect.comment,) if dialect.comment else COMMENT_MARKS
     best: tuple[int, int, str, list[str]] = (0, 0, "", [])
+    for number, line in lines[:HEADER_LINES_MAX]:
+        if len(line) > limits.LINE_CHARACTERS:
+            raise SourceError(f"{path}, line {number}: has {len(line)} characters. Pass a table")
     for place, (_, line) in enumerate(lines[:HEADER_LINES_MAX]):
         for separator in separators if wanted else ():
             for text in dict.fromkeys((line, _uncomment(line, marks))):
@@ -285,6 +289,8 @@ def _strip_unit(name: str, wanted: str) -> str | None:
 
 def _tidy(path: Path, names: list[str], wanted: Collection[str]) -> list[str]:
     """Return names that differ: a repeated one gets a number, an empty one its place."""
+    if len(names) > limits.VARIABLES:
+        raise SourceError(f"{path} has {len(names)} columns. Keep {limits.VARIABLES} at most")
     found: list[str] = []
     for k, name in enumerate(names):
         if name in found and name in wanted:
