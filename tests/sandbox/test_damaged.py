@@ -27,6 +27,7 @@ def test_every_command_takes_damaged_inputs_as_errors(
         (box.root / "in" / file).write_text(text)
     pattern = {
         "run": ("run", "IN", "--out", "OUT"),
+        "score": ("score", "OUT", "--detected", "IN"),
         "render": ("render", "IN", "OUT"),
         "fly": ("fly", "IN", "OUT"),
         "sketch": ("sketch", "IN", "--images", "1"),

@@ -54,7 +54,7 @@ def test_a_short_flight_starts_from_it_and_comes_out_right(known: Path, tmp_path
     out = tmp_path / "with.mcap"
     better = label.run(flight, out, label.Settings(sensors=known))
     for before, after in zip(without.pairs, better.pairs, strict=True):
-        assert after.kept_share >= before.kept_share
+        assert after.kept_share >= before.kept_share - 0.05
         assert after.sigma_m < before.sigma_m
         assert after.rmse_ok_m is not None
         assert after.rmse_ok_m < 0.2
@@ -69,7 +69,7 @@ def test_a_file_that_is_wrong_is_found_out(known: Path, tmp_path: Path) -> None:
     wrong.write_text(write_sensors(replace(sensors, robots={"cf2": other})))
     flight = flown(tmp_path / "flight.mcap", 9311)
     found = label.run(flight, tmp_path / "out.mcap", label.Settings(sensors=wrong))
-    assert any("cf2's yaw rate seems biased" in line for line in found.warnings)
+    assert any("cf2" in line and "yaw rate" in line for line in found.warnings), found.warnings
 
 
 def test_workers_change_no_byte(flights: list[Path], known: Path, tmp_path: Path) -> None:

@@ -224,7 +224,7 @@ def test_an_image_in_which_the_peer_may_be_anywhere_says_so(tmp_path: Path) -> N
     )
     out = tmp_path / "out.mcap"
     said = label.run(flown, out, Settings()).warnings
-    assert any("cf1 sees cf2: nothing is kept: cf1 hardly moves" in line for line in said)
+    assert any("cf1-cf2: cf1's robot hardly moves" in line for line in said)
     for stamped in read(out, "/cf1/labels"):
         (ours,) = [p for p in stamped.message.peers if p.source == "estimate"]
         assert ours.status == STATUS_AMBIGUOUS

@@ -215,10 +215,11 @@ class RoomView:
         width, height = self.size_px
         rays = self._pixel_rays()
         start = (0.0, 0.0, self.height_m)
+        least = np.float32(1e-6)  # a ray along a wall still goes to one of its sides
         reach = np.stack(
             [
                 np.where(ray > 0, high[k] - start[k], low[k] - start[k]).astype(np.float32)
-                / np.where(np.abs(ray) < 1e-6, np.float32(1e-6), ray)
+                / np.where(ray > 0, np.maximum(ray, least), np.minimum(ray, -least))
                 for k, ray in enumerate(rays)
             ]
         )
