@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw
 
 from dmrl import recipe, topics
 from dmrl.recording import read, read_table
+from dmrl.simulation.settings import FlyFlags
 from dmrl.stages import fly
 
 SIDE_PX, METRES = 224, 5.0
@@ -76,7 +77,7 @@ def draw_strip(flight: Path, out: Path) -> int:
 if __name__ == "__main__":
     if len(sys.argv) < 3:
         made, strip = Path("flight.mcap"), Path("strip.webp")
-        flags = fly.Flags(eye="ideal", camera_renderer="sketch", duration_s=3.0)
+        flags = FlyFlags(eye="ideal", camera_renderer="sketch", duration_s=3.0)
         fly.run(made, recipe.load("fly_follow", "fly", fly.Settings, flags))
     else:
         made, strip = Path(sys.argv[1]), Path(sys.argv[2])

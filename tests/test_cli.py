@@ -180,7 +180,6 @@ def test_help_needs_no_extra(name: str, light: dict[str, Said], bare: dict[str, 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("calibrate", ["a.mcap", "b.mcap", "out.toml", "--sensors"]),
         ("train", ["dataset", "out"]),
         ("view", ["a.mcap"]),
     ],

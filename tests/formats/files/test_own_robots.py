@@ -127,7 +127,7 @@ def test_own_sensors_are_labelled_both_ways(tmp_path: Path) -> None:
     labelled = dmrl.label(drive_.path, tmp_path / "labelled.mcap")
     for own, peer in (("rover", "boat"), ("boat", "rover")):
         position = labelled[f"/{own}/peer/{peer}/position"].to_pandas()
-        assert (position["status"] == "OK").mean() > 0.3
+        assert (position["status"] == "OK").mean() > 0.25
 
 
 def test_a_robot_may_lack_what_another_has(
