@@ -173,8 +173,8 @@ def test_attitude_is_put_together_from_several_blocks(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("Timestamp," + "a" * 200_000 + "\n1,2\n", "has no rows|characters|columns"),
-        ("Timestamp," + ",".join(f"a{k}" for k in range(1001)) + "\n", "has no rows|characters|columns"),
+        ("Timestamp," + "a" * 200_000 + "\n1,2\n", "characters"),
+        ("Timestamp," + ",".join(f"a{k}" for k in range(1001)) + "\n", "columns"),
     ],
 )
 def test_a_header_without_end_is_one_line(tmp_path: Path, text: str, complaint: str) -> None:
@@ -189,7 +189,7 @@ def test_a_log_of_very_many_variables_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     names = ",".join(f"a{k}" for k in range(1001))
     path.write_text(f"Timestamp,{names}\n" + f"{'1,' * 1001}1\n" * 2)
-    with pytest.raises(SourceError, match="more than 1000|1000 at most"):
+    with pytest.raises(SourceError, match="1000"):
         list(cfclient.load_content(path, Options()).samples)
 
 
