@@ -4,9 +4,8 @@ import functools
 import json
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from dmrl.learn.data import batches
 from dmrl.learn.data.torch_dataset import ProcessSampler
 from dmrl.stages.dataset import Settings, add, run
 
+from ..local_server import serve_locally
 from .conftest import Record
 
 
@@ -34,10 +34,8 @@ class Silent(SimpleHTTPRequestHandler):
 def served(tmp_path: Path) -> Iterator[str]:
     """Address of a server of the test's folder."""
     handler = functools.partial(Silent, directory=str(tmp_path))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
+    with serve_locally(handler) as port:
+        yield f"http://127.0.0.1:{port}"
 
 
 def grown(record: Record, out: Path, *, parquet: bool = False) -> Path:

@@ -4,11 +4,10 @@ import hashlib
 import os
 import re
 import shutil
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from urllib.parse import parse_qs, unquote, urlsplit
 
@@ -22,6 +21,7 @@ from dmrl.storage.system import get_filesystem
 
 from ..faults.ending import ended
 from ..faults.inputs import Inputs, cli
+from ..local_server import serve_locally
 
 pytest.importorskip("s3fs")
 pytestmark = [
@@ -204,15 +204,13 @@ def store(inputs: Inputs, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
     """A recording in a bucket."""
     store = Store({"a.mcap": inputs.dots.read_bytes()})
     handler = type("Mine", (Handler,), {"store": store})
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+    with serve_locally(handler) as port:
         for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
             monkeypatch.setenv(name, "test")
         monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{port}")
         get_filesystem.cache_clear()
         yield store
-        server.shutdown()
     get_filesystem.cache_clear()
 
 

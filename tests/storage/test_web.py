@@ -2,11 +2,10 @@
 
 import os
 import socket
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
@@ -19,6 +18,7 @@ from dmrl.storage.system import get_filesystem
 
 from ..faults.ending import ended
 from ..faults.inputs import Inputs, cli
+from ..local_server import serve_locally
 
 pytest.importorskip("aiohttp")
 pytestmark = pytest.mark.filterwarnings("ignore")  # of aiohttp and of broken connections
@@ -162,12 +162,9 @@ def site(inputs: Inputs) -> Iterator[Site]:
     """A recording on a server."""
     site = Site(inputs.dots.read_bytes())
     handler = type("Mine", (Handler,), {"site": site})
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
-        site.address = f"http://127.0.0.1:{server.server_port}"
+    with serve_locally(handler) as port:
+        site.address = f"http://127.0.0.1:{port}"
         yield site
-        server.shutdown()
     get_filesystem.cache_clear()
 
 
@@ -240,15 +237,13 @@ def test_a_server_leads_to_no_inner_address_that_nobody_named(site: Site, inputs
     """Another server of this machine, by its number, by its name, and mapped to IPv6."""
     secret = Site(b"secret")
     handler = type("Inner", (Handler,), {"site": secret})
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+    with serve_locally(handler) as port:
         for host in ("127.0.0.1", "localhost", "[::ffff:127.0.0.1]", "0.0.0.0"):
-            site.wrong = f"leads http://{host}:{server.server_port}/a.mcap"
+            site.wrong = f"leads http://{host}:{port}/a.mcap"
             status, said = ended(lambda: cli("info", site.url))
             assert status == 1 and f"{site.url}: the server redirects to" in said, said
             with pytest.raises(StorageError, match="an inner address"):
                 os.fspath(to_path(site.url))
-        server.shutdown()
     assert not secret.paths and not secret.asked
 
 
