@@ -20,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help int8 bench bench-labels demo test test-heavy test-all test-faults mutants golden check format lint types imports spell schemas constraints docs pictures site examples wheels layout clean
+.PHONY: help int8 bench bench-labels reliability demo test test-heavy test-all test-faults mutants golden check format lint types imports spell schemas constraints docs pictures site examples wheels layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -49,6 +49,9 @@ mutants: $(VENV)/.dev ## Change the code a little, often; see if tests notice. A
 
 test-faults: $(VENV)/.dev ## Break disks, processes and files in every way; prints what came of it.
 	$(PYTEST) -m "slow or not slow" --timeout 3600 tests/faults tests/recording/test_flips.py tests/recording/test_renames.py tests/recording/test_budgets.py tests/formats/test_fuzz.py $(ARGS)
+
+reliability: export DMRL_FAULTS_PAGE = docs/reliability.md
+reliability: test-faults ## Run test-faults, and write the table of docs/reliability.md.
 
 golden: $(VENV)/.dev ## Compare the decoded outputs of the main commands with tests/golden.json.
 	$(BIN)/python tests/golden.py $(ARGS)
