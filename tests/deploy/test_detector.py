@@ -1,6 +1,7 @@
 """One model, opened for every way to compute it, says the same."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, find_missing
 from dmrl.deploy.detector import Detector, open_detector
 from dmrl.deploy.int8.graph import rgb_to_grey
 from dmrl.deploy.int8.store import INTEGER_NAME, save_network
+from dmrl.deploy.onnx import float_cache
 from dmrl.deploy.onnx.float_model import float_onnx_of
 from dmrl.errors import ModelError, SettingError, ToolError
 from dmrl.learn.inference.loaded_model import Model, load_model, save_model
@@ -144,3 +146,19 @@ def test_without_risc_v_tools_the_line_to_type_is_said(
     monkeypatch.setenv("PATH", "")
     with pytest.raises(ToolError, match="apt-get install gcc-riscv64-unknown-elf"):
         open_detector(tmp_path, "riscv32")
+
+
+def test_the_cache_keeps_the_newest_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(float_cache, "KEPT", 2)
+    folder = tmp_path / "cache" / "dmrl" / "onnx"
+    folder.mkdir(parents=True)
+    for age_s, name in enumerate(("newer", "older", "oldest"), 1):
+        for suffix in (".onnx", ".json"):
+            (folder / name).with_suffix(suffix).touch()
+        os.utime(folder / f"{name}.onnx", (1e9 - age_s, 1e9 - age_s))
+    made, _ = float_cache.build_float_onnx_once(run_folder(tmp_path / "run"), grey=False)
+    kept = {path.stem for path in folder.glob("*.onnx")}
+    assert len(kept) == 2 and "newer" in kept
+    assert {path.stem for path in folder.glob("*.json")} == kept
+    assert float_cache.build_float_onnx_once(tmp_path / "run", grey=False)[0] == made

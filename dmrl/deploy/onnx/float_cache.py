@@ -25,6 +25,8 @@ CODE = (
     *("learn/networks/trace.py", "learn/inference/loaded_model.py"),
 )
 """Files whose change makes other ONNX of the same weights."""
+KEPT = 20
+"""Models that the cache keeps, some 100 kB each. The ones made first go first."""
 
 
 def build_float_onnx_once(model: Path, *, grey: bool) -> tuple[bytes, dict[str, Any]]:
@@ -60,11 +62,19 @@ def build_float_onnx_once(model: Path, *, grey: bool) -> tuple[bytes, dict[str, 
                 partial.write_text(json.dumps(said), encoding="utf-8")
             with replace_file(cached) as partial:
                 partial.write_bytes(made)
+            _remove_oldest(cached.parent)
     return made, said
 
 
 def _cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dmrl" / "onnx"
+
+
+def _remove_oldest(folder: Path) -> None:
+    """Remove all models but the newest of the cache."""
+    for old in sorted(folder.glob("*.onnx"), key=lambda path: path.stat().st_mtime)[:-KEPT]:
+        for path in (old, old.with_suffix(".json")):
+            path.unlink(missing_ok=True)
 
 
 def _hash_inputs(paths: list[Path], *, grey: bool) -> str:
