@@ -222,8 +222,7 @@ def _open_c(model: Path, backend: BackendName) -> Detector:
     network = _load_int8_network(model, backend)
     # With their template engine, these are not for the backends that start fast.
     from dmrl.deploy.c import c_name  # noqa: PLC0415
-    from dmrl.deploy.c.run.compiled import CompiledNetwork  # noqa: PLC0415
-    from dmrl.deploy.c.run.emulated import RISCV32, EmulatedNetwork  # noqa: PLC0415
+    from dmrl.deploy.c.run.compiled import RISCV32, CompiledNetwork, EmulatedNetwork  # noqa: PLC0415
 
     source = model / f"{c_name(network)}.c"
     exported = source.is_file()

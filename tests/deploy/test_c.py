@@ -59,14 +59,14 @@ def test_random_networks_come_through_quantiser_and_c_bit_for_bit(
     seed: int, tmp_path: Path
 ) -> None:
     result = proved(quantisable(seed), tmp_path, QUICK)
-    assert (result.error, result.mismatches) == ("", 0)
+    assert (result.error, result.mismatches) == (None, 0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(200))
 def test_two_hundred_random_networks_do_so_under_the_sanitizers(seed: int, tmp_path: Path) -> None:
     result = proved(quantisable(seed), tmp_path, CHECKED)
-    assert (result.error, result.mismatches) == ("", 0)
+    assert (result.error, result.mismatches) == (None, 0)
 
 
 @pytest.mark.heavy
@@ -77,7 +77,7 @@ def test_any_integers_will_do_shifts_below_33_and_missing_padding_too(
     seed: int, tmp_path: Path
 ) -> None:
     result = proved(random_network(seed), tmp_path, CHECKED)
-    assert (result.error, result.mismatches) == ("", 0)
+    assert (result.error, result.mismatches) == (None, 0)
 
 
 @pytest.mark.heavy
@@ -173,7 +173,7 @@ def test_layers_may_have_any_names(tmp_path: Path) -> None:
         replace(layer, name=names[k % len(names)]) for k, layer in enumerate(network.layers)
     )
     result = proved(replace(network, layers=layers), tmp_path, QUICK)
-    assert (result.error, result.mismatches) == ("", 0)
+    assert (result.error, result.mismatches) == (None, 0)
 
 
 @pytest.mark.heavy
@@ -196,7 +196,7 @@ def test_files_and_functions_are_named_after_the_architecture(
     network = replace(SMALLEST, architecture=architecture, name="some folder")
     assert c_name(network) == name
     result = proved(network, tmp_path, QUICK)
-    assert (result.error, result.mismatches) == ("", 0)
+    assert (result.error, result.mismatches) == (None, 0)
     assert {f"{name}.c", f"{name}.h", f"{name}_vectors.h"} <= {f.name for f in tmp_path.iterdir()}
     assert f"int {name}_run(" in (tmp_path / f"{name}.h").read_text()
     made = ["make", "self_test", "CFLAGS=-O0"]
@@ -284,7 +284,7 @@ def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
 @pytest.mark.parametrize("name", ["locanet", "dmrl-nano"])
 def test_the_architectures_come_through_bit_for_bit(name: str, tmp_path: Path) -> None:
     result = proved(untrained(name, 176, 96), tmp_path, QUICK)
-    assert (result.error, result.mismatches) == ("", 0)
+    assert (result.error, result.mismatches) == (None, 0)
 
 
 @pytest.mark.heavy
@@ -297,6 +297,5 @@ def test_a_product_takes_few_instructions_of_a_riscv(
     integers = untrained(name)
     write_c(integers, tmp_path, [])
     found = measure_cost(integers, tmp_path, noise(integers, 1)[0])
-    assert found is not None
     assert found.instructions is not None
     assert found.instructions / integers.macs < most

@@ -11,6 +11,7 @@ from dmrl.cli import app
 from dmrl.deploy.c import write_c
 from dmrl.deploy.c.network_source import MAX_STACK_BYTES
 from dmrl.deploy.c.run import compile_targets, proof
+from dmrl.deploy.c.run.measure import ExecutionCost
 from dmrl.deploy.int8.network import Conv, IntegerNetwork
 from dmrl.deploy.int8.store import INTEGER_NAME, save_network
 from dmrl.deploy.samples import save_samples
@@ -86,7 +87,7 @@ def test_counting_instructions_gives_the_same_number_again(
 def one_level(monkeypatch: pytest.MonkeyPatch) -> None:
     """The C is compiled once and its cost not counted: the slow tests do all of that."""
     monkeypatch.setattr(compile_targets, "OPTIMIZATION_LEVELS", ("-O0",))
-    monkeypatch.setattr(proof, "measure_cost", lambda *_: None)
+    monkeypatch.setattr(proof, "measure_cost", lambda *_: ExecutionCost())
 
 
 @pytest.mark.heavy

@@ -90,34 +90,22 @@ class Target:
 
 def list_targets() -> tuple[Target, ...]:
     """Return every target."""
-    hosts = tuple(
-        Target(
-            name,
-            (
-                *(Build(level, name, (level,)) for level in OPTIMIZATION_LEVELS),
-                Build("-O3 Bayer", name, ("-O3",), bayer=True),
-            ),
-        )
+    builds = {
+        name: [
+            *(Build(level, name, (level,)) for level in OPTIMIZATION_LEVELS),
+            Build("-O3 Bayer", name, ("-O3",), bayer=True),
+        ]
         for name in ("gcc", "clang")
-    )
+    }
     # gcc includes its sanitizers; those of clang are a separate package.
     checker = "clang" if find_missing("gcc") and not find_missing("clang") else "gcc"
     label = f"{checker} address, undefined"
-    return (
-        *hosts,
-        Target(
-            "sanitizers",
-            (
-                Build(label, checker, SANITIZER_FLAGS),
-                Build(f"{label}, Bayer", checker, SANITIZER_FLAGS, bayer=True),
-            ),
-        ),
-        Target(
-            "riscv32",
-            (
-                Build("-O3", RISCV, ("-O3", *RISCV_FLAGS), emulated=True),
-                Build("-Os", RISCV, ("-Os", *RISCV_FLAGS), emulated=True),
-                Build("-O3 Bayer", RISCV, ("-O3", *RISCV_FLAGS), bayer=True, emulated=True),
-            ),
-        ),
-    )
+    builds["sanitizers"] = [
+        Build(label, checker, SANITIZER_FLAGS),
+        Build(f"{label}, Bayer", checker, SANITIZER_FLAGS, bayer=True),
+    ]
+    builds["riscv32"] = [
+        Build(label, RISCV, (label[:3], *RISCV_FLAGS), bayer="Bayer" in label, emulated=True)
+        for label in ("-O3", "-Os", "-O3 Bayer")
+    ]
+    return tuple(Target(name, tuple(own)) for name, own in builds.items())

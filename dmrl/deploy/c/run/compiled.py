@@ -1,4 +1,4 @@
-"""C of a network as a shared library, for ``predict --backend c``."""
+"""C of a network, run as a shared library (``--backend c``) or emulated (``riscv32``)."""
 
 import ctypes
 import platform
@@ -15,14 +15,16 @@ from dmrl.deploy.c.harness import (
     DETECTION_DTYPE,
     MAX_DETECTIONS,
     HarnessResult,
-    generate_harness,
+    parse_results,
     to_detections,
 )
+from dmrl.deploy.c.run.compile_targets import Build, list_targets
 from dmrl.deploy.c.run.toolchain import find_host_compiler, run_program
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.errors import ModelError
+from dmrl.errors import ModelError, ToolError
 
-LIBRARY_FLAGS = ("-O3", "-std=gnu99", "-shared", "-fPIC", "-DHARNESS_SHARED")
+RISCV32 = "riscv32"
+LIBRARY_FLAGS = ("-O3", "-shared", "-fPIC", "-DHARNESS_SHARED")
 # Rows are short: 512-bit vectors would spend their time on remainders.
 X86_FLAGS = ("-march=native", "-mprefer-vector-width=256")
 
@@ -77,16 +79,9 @@ class CompiledNetwork(BuiltNetwork):
         self, network: IntegerNetwork, folder: Path | None = None, compiler: str | None = None
     ) -> None:
         super().__init__(network, folder)
-        name, build, folder = c_name(network), self.build, self.folder
-        (build / "harness.c").write_text(generate_harness(network), encoding="utf-8")
-        library = build / "network.so"
-        sources = (build / "harness.c", folder / f"{name}.c")
         own = X86_FLAGS if platform.machine() in ("x86_64", "AMD64") else ()
-        flags = (*LIBRARY_FLAGS, *own, f"-D{name.upper()}_BAYER=0", "-iquote", folder)
-        run_program(
-            (compiler or find_host_compiler(), *flags, *sources, "-o", library),
-            f"compiling {folder / name}.c",
-        )
+        build = Build("library", compiler or find_host_compiler(), (*LIBRARY_FLAGS, *own))
+        (library,) = build.compile_program(network, self.folder, self.build)
         self._run = ctypes.CDLL(str(library)).harness_run
 
     def run_detections(self, image: NDArray[np.uint8], most: int = MAX_DETECTIONS) -> HarnessResult:
@@ -104,6 +99,43 @@ class CompiledNetwork(BuiltNetwork):
     def run(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
         """Return every head's grid, as `run_network` of ``reference`` does."""
         return self.run_detections(image).grids
+
+
+class EmulatedNetwork(BuiltNetwork):
+    """A network, compiled for rv32imc and emulated. An image takes seconds.
+
+    Output is that of the chip; speed is not.
+
+    Parameters
+    ----------
+    network
+        Network of the C.
+    folder
+        Export folder with the C. None: the C is generated.
+
+    Raises
+    ------
+    ToolError
+        If the compiler or the emulator is missing, or compilation fails.
+    ModelError
+        If the folder has no C, or the C does not support the network.
+    """
+
+    def __init__(self, network: IntegerNetwork, folder: Path | None = None) -> None:
+        target = next(t for t in list_targets() if t.name == RISCV32)
+        if target.skipped:
+            raise ToolError(f"--backend {RISCV32}: {target.skipped}")
+        super().__init__(network, folder)
+        self._what = f"{c_name(network)}.c on {RISCV32}"
+        self._program = target.builds[0].compile_program(network, self.folder, self.build)
+
+    def run(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
+        """Return every head's grid, as `run_network` of ``reference`` does."""
+        said = run_program(self._program, self._what, data=np.ascontiguousarray(image).tobytes())
+        found = parse_results(self.network, said)
+        if len(found) != 1:
+            raise ToolError(f"{self._what}: {len(found)} results for one image. Export it again")
+        return found[0].grids
 
 
 def require_c_files(network: IntegerNetwork, folder: Path) -> None:

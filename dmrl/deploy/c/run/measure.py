@@ -32,25 +32,23 @@ of this size. PULP-NN reaches 15.5 in one large layer."""
 
 @dataclass(frozen=True, slots=True)
 class ExecutionCost:
-    """Cost on rv32imc at -O3.
+    """Cost on rv32imc at -O3. None: not measured.
 
     Parameters
     ----------
     code_bytes, constant_bytes
         Bytes of the object file.
     instructions
-        Instructions executed per image; None: not counted.
+        Instructions executed per image.
     """
 
-    code_bytes: int
-    constant_bytes: int
-    instructions: int | None
+    code_bytes: int | None = None
+    constant_bytes: int | None = None
+    instructions: int | None = None
 
 
-def measure_cost(
-    network: IntegerNetwork, folder: Path, image: NDArray[np.uint8]
-) -> ExecutionCost | None:
-    """Measure the cost of the C of an export folder; None without the cross compiler.
+def measure_cost(network: IntegerNetwork, folder: Path, image: NDArray[np.uint8]) -> ExecutionCost:
+    """Measure the cost of the C of an export folder; nothing without the cross compiler.
 
     Raises
     ------
@@ -58,7 +56,7 @@ def measure_cost(
         If compilation or the emulator fails.
     """
     if find_missing(RISCV):
-        return None
+        return ExecutionCost()
     with tempfile.TemporaryDirectory(prefix="dmrl-verify-") as place:
         code, constants = _measure_object(network, folder, Path(place))
         counted = None
@@ -150,7 +148,7 @@ def _count_instructions(
 
 
 def estimate_rates(
-    network: IntegerNetwork, found: ExecutionCost | None, kept: StateMemory
+    network: IntegerNetwork, found: ExecutionCost, kept: StateMemory
 ) -> list[tuple[float, str]]:
     """Estimate images per second on a GAP8; each estimate comes with its assumptions.
 
@@ -172,7 +170,7 @@ def estimate_rates(
         memory = (
             f"no waiting for the {kept.traffic_bytes:,} bytes that are copied from L2 and to it"
         )
-    if found and found.instructions:
+    if found.instructions:
         out.append(
             (
                 CLUSTER_HZ / found.instructions,

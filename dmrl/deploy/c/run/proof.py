@@ -42,7 +42,7 @@ class Proof:
     targets
         What each gave.
     cost
-        On rv32imc; None without its compiler.
+        On rv32imc, if its compiler is there.
     memory
         State that the C keeps.
     """
@@ -51,7 +51,7 @@ class Proof:
     pictures: int
     noise: int
     targets: list[TargetResult]
-    cost: ExecutionCost | None
+    cost: ExecutionCost
     memory: StateMemory
 
     @property
@@ -73,29 +73,21 @@ class Proof:
     def to_document(self) -> dict[str, Any]:
         """Return everything as JSON values."""
         network, found = self.network, self.cost
-        executed = found.instructions if found else None
+        executed = found.instructions
         return {
             "network": network.name,
             "architecture": network.architecture,
             "images": self.pictures,
             "noise_images": self.noise,
             "targets": [
-                {
-                    "target": t.target,
-                    "mismatches": t.mismatches if not t.skipped else None,
-                    "skipped": t.skipped or None,
-                    "error": t.error or None,
-                    "builds": [asdict(build) for build in t.builds],
-                }
+                asdict(t) | {"mismatches": None if t.skipped else t.mismatches}
                 for t in self.targets
             ],
             "macs": network.macs,
             **asdict(self.memory),
             "fits_gap8_l1": self.memory.fits_l1,
             "stack_bytes": self.stack_bytes,
-            "code_bytes": found.code_bytes if found else None,
-            "constant_bytes": found.constant_bytes if found else None,
-            "instructions": executed,
+            **asdict(found),
             "instructions_per_mac": executed / network.macs if executed else None,
             "gap8_estimates": [
                 {"images_per_s": rate, "assuming": assumption}
@@ -110,9 +102,8 @@ class Proof:
         for t in self.targets:
             rows += [(t.target, b.label, b.images, b.mismatches, "") for b in t.builds]
             if t.skipped or t.error:
-                rows.append(
-                    (t.target, "", None, None, f"skipped: {t.skipped}" if t.skipped else t.error)
-                )
+                why = f"skipped: {t.skipped}" if t.skipped else t.error
+                rows.append((t.target, "", None, None, why))
         tried = f"{self.pictures} images and {self.noise} of noise"
         print_table(f"{folder}: the C against the integer reference, {tried}", columns, rows)
         print_table("Cost of the C", ("what", "", "how"), self._cost_rows())
@@ -121,27 +112,23 @@ class Proof:
 
     def _cost_rows(self) -> list[tuple[object, ...]]:
         kept = self.memory
-        rows: list[tuple[object, ...]] = [
+        fits, near = "yes" if kept.fits_l1 else "no", f"{MAX_L1_STATE_BYTES:,} bytes, beside stacks"
+        found, how = self.cost, "rv32imc, gcc -O3"
+        per_mac = (found.instructions or 0) / self.network.macs
+        counted = f"{how}, counted by QEMU: {per_mac:.2f} a multiply-accumulate"
+        measured = (
+            ("far memory, bytes", kept.far_bytes, "no layer works on it"),
+            ("copied, bytes", kept.traffic_bytes, "an image, near and far"),
+            ("stack, bytes", self.stack_bytes, "the most of rv32imc's builds, measured"),
+            ("code, bytes", found.code_bytes, how),
+            ("constants, bytes", found.constant_bytes, how),
+            ("instructions an image", found.instructions, counted),
+        )
+        return [
             ("RAM, bytes", f"{kept.state_bytes:,}", "state, RGB or grey"),
-            (
-                "fits a GAP8's L1",
-                "yes" if kept.fits_l1 else "no",
-                f"{MAX_L1_STATE_BYTES:,} bytes, beside stacks",
-            ),
+            ("fits a GAP8's L1", fits, near),
+            *((what, f"{size:,}", how) for what, size, how in measured if size),
         ]
-        if kept.far_bytes:
-            rows.append(("far memory, bytes", f"{kept.far_bytes:,}", "no layer works on it"))
-            rows.append(("copied, bytes", f"{kept.traffic_bytes:,}", "an image, near and far"))
-        if (stack := self.stack_bytes) is not None:
-            rows.append(("stack, bytes", f"{stack:,}", "the most of rv32imc's builds, measured"))
-        if found := self.cost:
-            rows.append(("code, bytes", f"{found.code_bytes:,}", "rv32imc, gcc -O3"))
-            rows.append(("constants, bytes", f"{found.constant_bytes:,}", "rv32imc, gcc -O3"))
-            if found.instructions:
-                per_mac = found.instructions / self.network.macs
-                how = f"rv32imc, gcc -O3, counted by QEMU: {per_mac:.2f} a multiply-accumulate"
-                rows.append(("instructions an image", f"{found.instructions:,}", how))
-        return rows
 
 
 def open_export(folder: Path) -> IntegerNetwork:
@@ -211,7 +198,9 @@ def prove_export(
         noise_images,
         tried,
         # C that a target could not compile or run is not worth measuring.
-        None if any(t.error for t in tried) else measure_cost(network, folder, images[0]),
+        ExecutionCost()
+        if any(t.error for t in tried)
+        else measure_cost(network, folder, images[0]),
         parse_state_memory(network, folder),
     )
 

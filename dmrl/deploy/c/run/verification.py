@@ -55,15 +55,15 @@ class TargetResult:
     builds
         Results of its builds.
     skipped
-        Reason why it was not tried; empty: it was.
+        Reason why it was not tried; None: it was.
     error
-        Error; empty: none.
+        Error, if any.
     """
 
     target: str
     builds: list[BuildResult] = field(default_factory=list)
-    skipped: str = ""
-    error: str = ""
+    skipped: str | None = None
+    error: str | None = None
 
     @property
     def mismatches(self) -> int:
@@ -122,7 +122,7 @@ def verify_target(
     wanted
         Images and their expected results.
     """
-    result = TargetResult(target.name, skipped=target.skipped)
+    result = TargetResult(target.name, skipped=target.skipped or None)
     if result.skipped:
         return result
     for build in target.builds:
