@@ -4,18 +4,8 @@ from functools import cache
 
 import numpy as np
 
-from dmrl.deploy.int8.layers import SIGNED_OFFSET
-from dmrl.deploy.int8.network import (
-    CONFIDENCE_ONE,
-    PIXEL_ZERO,
-    Add,
-    AnyLayer,
-    Conv,
-    Head,
-    IntegerNetwork,
-    MaxPool,
-    Shape,
-)
+from dmrl.deploy.int8.layers import PIXEL_ZERO, SIGNED_OFFSET, Add, AnyLayer, Conv, MaxPool, Shape
+from dmrl.deploy.int8.network import CONFIDENCE_ONE, Head, IntegerNetwork
 from dmrl.deploy.int8.reference import accumulate, compute_layer
 
 Rng = np.random.Generator

@@ -17,7 +17,8 @@ from dmrl.deploy.c.run.measure import measure_cost
 from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, find_missing
 from dmrl.deploy.c.run.verification import TargetResult, compute_expected, verify_target
 from dmrl.deploy.c.templating import template_values
-from dmrl.deploy.int8.network import Conv, IntegerNetwork
+from dmrl.deploy.int8.layers import Conv
+from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.reference import decode_detections, run_network
 from dmrl.errors import ModelError, SettingError, ToolError
 

@@ -8,7 +8,8 @@ import pytest
 from dmrl.deploy.backends import FloatBackend, build_reference_backend
 from dmrl.deploy.int8.activation_ranges import calibrate_ranges
 from dmrl.deploy.int8.graph import FloatConv, FloatGraph
-from dmrl.deploy.int8.network import Add, Conv, IntegerNetwork
+from dmrl.deploy.int8.layers import Add, Conv
+from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.quantise import HEAD_OF_CHANNEL, NetworkInfo, quantise_network
 from dmrl.deploy.onnx.graph_writer import build_float_onnx, int8_onnx
 from dmrl.deploy.onnx.runtime import OnnxRun

@@ -4,7 +4,7 @@ import pytest
 
 from dmrl.deploy.c.buffer_plan import plan_buffers
 from dmrl.deploy.c.row_schedule import Step, count_ring_rows, schedule_rows, share_ring
-from dmrl.deploy.int8.network import Conv
+from dmrl.deploy.int8.layers import Conv
 
 from .graphs import quantised_network, untrained
 from .networks import random_network

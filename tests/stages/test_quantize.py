@@ -7,7 +7,7 @@ import pytest
 
 from dmrl import card
 from dmrl.cli import app
-from dmrl.deploy.int8.network import Conv
+from dmrl.deploy.int8.layers import Conv
 from dmrl.deploy.int8.store import load_network
 from dmrl.errors import OutputError, SettingError
 from dmrl.evaluation import quantization_report

@@ -12,7 +12,8 @@ from dmrl.deploy.c import write_c
 from dmrl.deploy.c.network_source import MAX_STACK_BYTES
 from dmrl.deploy.c.run import compile_targets, proof
 from dmrl.deploy.c.run.measure import ExecutionCost
-from dmrl.deploy.int8.network import Conv, IntegerNetwork
+from dmrl.deploy.int8.layers import Conv
+from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.store import INTEGER_NAME, save_network
 from dmrl.deploy.samples import save_samples
 from dmrl.errors import DatasetError, ModelError, SettingError, ToolError

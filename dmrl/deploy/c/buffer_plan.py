@@ -16,7 +16,8 @@ from dmrl.deploy.c.row_schedule import (
     share_ring,
     slides_along_row,
 )
-from dmrl.deploy.int8.network import Conv, IntegerNetwork, MaxPool, Shape
+from dmrl.deploy.int8.layers import Conv, MaxPool, Shape
+from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.errors import ModelError
 
 MAX_SIDE_PX = 4096

@@ -7,8 +7,8 @@ from dmrl.deploy.c.buffer_plan import BufferPlan, plan_buffers
 from dmrl.deploy.c.placement import Placement, place_buffers
 from dmrl.deploy.c.row_schedule import Step, slides_along_row
 from dmrl.deploy.c.templating import fill_template
-from dmrl.deploy.int8.layers import GAIN_SHIFT
-from dmrl.deploy.int8.network import SUBPIXEL, Conv, IntegerNetwork
+from dmrl.deploy.int8.layers import GAIN_SHIFT, Conv
+from dmrl.deploy.int8.network import SUBPIXEL, IntegerNetwork
 from dmrl.errors import ModelError
 from dmrl.learn.inference.decode_grids import DUPLICATE_RADIUS_PX
 

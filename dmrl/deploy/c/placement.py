@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from dmrl.deploy.c.buffer_plan import SHARED_PREFIX, Buffer, BufferPlan
 from dmrl.deploy.c.row_schedule import Step
-from dmrl.deploy.int8.network import Conv
+from dmrl.deploy.int8.layers import Conv
 from dmrl.errors import SettingError
 
 MAX_FAR_CANDIDATES = 12

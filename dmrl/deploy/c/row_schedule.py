@@ -7,7 +7,7 @@ step can. `schedule_rows` simulates this, so the derived buffer sizes are exact.
 import itertools
 from dataclasses import dataclass
 
-from dmrl.deploy.int8.network import AnyLayer, Conv, MaxPool
+from dmrl.deploy.int8.layers import AnyLayer, Conv, MaxPool
 
 
 def slides_along_row(conv: Conv) -> bool:

@@ -12,7 +12,7 @@ from typing import TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.network import PIXEL_ZERO
+from dmrl.deploy.int8.layers import PIXEL_ZERO
 from dmrl.deploy.int8.windows import extract_taps, max_pool_2x2
 from dmrl.errors import ModelError
 from dmrl.learn.networks.graph_ops import Op
@@ -119,6 +119,13 @@ class UnsupportedLayer(ModelError):
         super().__init__(f"layer {name} is {what}, which int8 does not support. Use {instead}")
 
 
+def _refuse_unsupported(op: Op, *faults: tuple[bool, str, str]) -> None:
+    """Raise UnsupportedLayer for the first fault: whether it is there, its name, a replacement."""
+    for wrong, what, instead in faults:
+        if wrong:
+            raise UnsupportedLayer(op.name, what, instead)
+
+
 def build_graph(operations: Sequence[Op]) -> FloatGraph:
     """Build the layer graph of a network's operations.
 
@@ -185,31 +192,25 @@ class _GraphBuilder:
 
     def _add_conv(self, op: Op) -> None:
         (source,) = self._source_tensors(op)
-        weight, asked = op.values["weight"], op.settings
+        weight, bias, asked = op.values["weight"], op.values["bias"], op.settings
         outs, ins, *kernel = weight.shape
         stride, dilation, padding, groups = (
             asked[name] for name in ("stride", "dilation", "padding", "groups")
         )
-        if kernel not in ([1, 1], [3, 3]):
-            size = " x ".join(map(str, kernel))
-            raise UnsupportedLayer(op.name, f"a {size} convolution", "1x1 or 3x3 convolutions")
-        if not all(isinstance(value, int) for value in (stride, dilation, padding)):
-            raise UnsupportedLayer(
-                op.name, "a convolution that differs by direction", "one stride both ways"
-            )
-        if padding not in (0, dilation * (kernel[0] // 2)) or "padding_mode" in asked:
-            raise UnsupportedLayer(
-                op.name, f"a convolution with padding {padding}", "'same' zero padding"
-            )
-        if groups > 1 and (ins > 1 or outs != groups):
-            raise UnsupportedLayer(
-                op.name,
-                f"a convolution in {groups} groups",
-                "groups=1, or depthwise: as many groups as channels in and out",
-            )
+        size, same = " x ".join(map(str, kernel)), (0, dilation * (kernel[0] // 2))
+        both_ways = all(isinstance(value, int) for value in (stride, dilation, padding))
+        padded = padding not in same or "padding_mode" in asked
+        grouped = groups > 1 and (ins > 1 or outs != groups)
+        depthwise = "groups=1, or depthwise: as many groups as channels in and out"
+        _refuse_unsupported(
+            op,
+            (kernel not in ([1, 1], [3, 3]), f"a {size} convolution", "1x1 or 3x3 convolutions"),
+            (not both_ways, "a convolution that differs by direction", "one stride both ways"),
+            (padded, f"a convolution with padding {padding}", "'same' zero padding"),
+            (grouped, f"a convolution in {groups} groups", depthwise),
+        )
         if source == 0:
             self.channels = ins * groups
-        bias = op.values["bias"]
         self._append_layer(
             op, FloatConv(op.name, (source,), weight, bias, stride, dilation, padding, groups)
         )
@@ -244,12 +245,12 @@ class _GraphBuilder:
     def _add_pool(self, op: Op) -> None:
         (source,) = self._source_tensors(op)
         plain = set(op.settings) == {"kernel", "stride"}
-        if source == 0:
-            raise UnsupportedLayer(op.name, "a max-pool of the image", "a convolution first")
-        if not plain or any(side != 2 for side in op.settings.values()):
-            raise UnsupportedLayer(
-                op.name, f"a max-pool with {op.settings}", "2x2 max-pools with stride 2"
-            )
+        odd = not plain or any(side != 2 for side in op.settings.values())
+        _refuse_unsupported(
+            op,
+            (source == 0, "a max-pool of the image", "a convolution first"),
+            (odd, f"a max-pool with {op.settings}", "2x2 max-pools with stride 2"),
+        )
         self._append_layer(op, FloatPool(op.name, (source,)))
 
     def _add_sum(self, op: Op) -> None:

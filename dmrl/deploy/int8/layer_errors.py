@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from dmrl.deploy.int8 import reference
 from dmrl.deploy.int8.graph import FloatGraph, compute_rgb_tensors, rgb_to_grey
-from dmrl.deploy.int8.network import Conv, IntegerNetwork
+from dmrl.deploy.int8.layers import Shape
+from dmrl.deploy.int8.network import IntegerNetwork
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +36,7 @@ class LayerErrorStats:
 
     name: str
     kind: str
-    shape: tuple[int, int, int]
+    shape: Shape
     products: int
     low: float
     high: float
@@ -46,12 +47,10 @@ class LayerErrorStats:
 class _Output(NamedTuple):
     """Compared part of a tensor: the output of a layer, or a head, which is one channel of it."""
 
-    name: str
-    kind: str
+    about: tuple[str, str, Shape, int]
+    """The first fields of `LayerErrorStats`."""
     tensor: int
     channels: slice
-    shape: tuple[int, int, int]
-    products: int
     scale: float
     zero_point: int
     signed: bool
@@ -60,18 +59,6 @@ class _Output(NamedTuple):
     def levels(self) -> tuple[int, int]:
         """First and last level."""
         return (-128, 127) if self.signed else (0, 255)
-
-
-@dataclass
-class _ErrorSums:
-    signal: float = 0.0
-    error: float = 0.0
-    saturated: int = 0
-    count: int = 0
-
-    @property
-    def sqnr_db(self) -> float | None:
-        return float(10 * np.log10(self.signal / self.error)) if self.signal * self.error else None
 
 
 def compute_layer_errors(
@@ -88,49 +75,40 @@ def compute_layer_errors(
     images
         (height, width, 3) RGB images.
     """
-    compared = [(output, _ErrorSums()) for output in _iter_outputs(network)]
+    outputs = list(_iter_outputs(network))
+    totals = np.zeros((len(outputs), 4))
     for image in images:
         seen = rgb_to_grey(image[None])[0] if network.channels == 1 else image
         wanted = compute_rgb_tensors(graph, image[None])
         got = list(reference.iter_tensors(network, seen))
-        for one, sums in compared:
-            real = wanted[one.tensor][0][one.channels]
+        for one, sums in zip(outputs, totals, strict=True):
+            real = wanted[one.tensor][0][one.channels].astype(np.float64)
             levels = got[one.tensor][one.channels]
-            sums.signal += float((real.astype(np.float64) ** 2).sum())
-            sums.error += float(((real - one.scale * (levels - one.zero_point)) ** 2).sum())
-            last = one.levels if one.signed else one.levels[1:]
-            sums.saturated += int(np.isin(levels, last).sum())
-            sums.count += levels.size
-    return [
-        LayerErrorStats(
-            one.name,
-            one.kind,
-            one.shape,
-            one.products,
-            one.scale * (one.levels[0] - one.zero_point),
-            one.scale * (one.levels[1] - one.zero_point),
-            sums.sqnr_db,
-            sums.saturated / max(sums.count, 1),
-        )
-        for one, sums in compared
-    ]
+            off = real - one.scale * (levels - one.zero_point)
+            last = np.isin(levels, one.levels if one.signed else one.levels[1:])
+            sums += (real**2).sum(), (off**2).sum(), last.sum(), levels.size
+    return [_summarize(one, *sums.tolist()) for one, sums in zip(outputs, totals, strict=True)]
+
+
+def _summarize(
+    one: _Output, signal: float, error: float, saturated: float, count: float
+) -> LayerErrorStats:
+    low, high = (one.scale * (level - one.zero_point) for level in one.levels)
+    sqnr_db = float(10 * np.log10(signal / error)) if signal * error else None
+    return LayerErrorStats(*one.about, low, high, sqnr_db, saturated / max(count, 1))
 
 
 def _iter_outputs(network: IntegerNetwork) -> Iterator[_Output]:
     shapes, whole = network.shapes, slice(None)
     of_heads = {head.tensor for head in network.heads.values()}
-    products = [
-        layer.count_macs((shapes[layer.source],)) if isinstance(layer, Conv) else 0
-        for layer in network.layers
-    ]
+    products = network.layer_macs
     for tensor, layer in enumerate(network.layers, start=1):
         if tensor not in of_heads:
-            about = (shapes[tensor], products[tensor - 1], layer.scale, 0, layer.signed)
-            yield _Output(layer.name, layer.kind, tensor, whole, *about)
+            about = (layer.name, layer.kind, shapes[tensor], products[tensor - 1])
+            yield _Output(about, tensor, whole, layer.scale, 0, layer.signed)
     for name, head in network.heads.items():
         channels, rows, cols = shapes[head.tensor]
         label = f"{network.layers[head.tensor - 1].name}[{head.channel}] {name}"
+        about = (label, "head", (1, rows, cols), products[head.tensor - 1] // channels)
         own = slice(head.channel, head.channel + 1)
-        share = products[head.tensor - 1] // channels
-        about = ((1, rows, cols), share, head.scale, head.zero_point, True)
-        yield _Output(label, "head", head.tensor, own, *about)
+        yield _Output(about, head.tensor, own, head.scale, head.zero_point, True)

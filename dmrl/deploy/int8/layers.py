@@ -7,13 +7,12 @@ int8 (``signed``, else uint8), and the real value of one step of the output (``s
 is created, so neither has to handle overflow.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-
-from dmrl.errors import ModelError
 
 Int8 = NDArray[np.int8]
 Int32 = NDArray[np.int32]
@@ -129,38 +128,31 @@ class Conv:
         channels, rows, cols = self.output_shape(inputs)
         return channels * rows * cols * int(np.prod(self.weight.shape[1:]))
 
-    def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
-        """Raise ModelError unless its shapes fit and no sum can overflow."""
+    def iter_faults(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> Iterator[str]:
+        """Yield shapes that do not fit and numbers that could overflow; the first one counts."""
         channels = inputs[0][0]
         outs, ins, *kernel = self.weight.shape
         if kernel not in ([1, 1], [3, 3]) or ins * self.groups != channels:
-            raise invalid_layer_error(
-                self, f"has weights {self.weight.shape} for {channels} channels"
-            )
+            yield f"has weights {self.weight.shape} for {channels} channels"
         if self.groups not in (1, channels) or (self.depthwise and outs != channels):
-            raise invalid_layer_error(self, f"has {self.groups} groups of {channels} channels")
+            yield f"has {self.groups} groups of {channels} channels"
         own = (self.bias, self.multiplier, *([self.gain] if len(inputs) > 1 else []))
         if any(one.shape != (outs,) for one in own):
-            raise invalid_layer_error(
-                self, f"lacks a bias, multiplier or gain for some of {outs} channels"
-            )
+            yield f"lacks a bias, multiplier or gain for some of {outs} channels"
         # Bound on the sum: the largest input value of the type times the sum of absolute weights.
         largest_input = 128 if signed[0] else 255
         largest = largest_input * np.abs(self.weight.astype(np.int64)).sum(axis=(1, 2, 3))
         if len(inputs) > 1:
-            if (
-                self.depthwise
-                or inputs[1] != self.output_shape(inputs)
-                or inputs[1][1:] != inputs[0][1:]
-            ):
-                raise invalid_layer_error(self, f"adds {inputs[1]} to {self.output_shape(inputs)}")
+            out = self.output_shape(inputs)
+            if self.depthwise or inputs[1] != out or out[1:] != inputs[0][1:]:
+                yield f"adds {inputs[1]} to {out}"
             if (self.gain < 0).any() or (self.gain >= 2**23).any():
-                raise invalid_layer_error(self, "has a gain out of range")
+                yield "has a gain out of range"
             largest += (128 if signed[1] else 255) * self.gain.astype(np.int64) >> GAIN_SHIFT
         if (largest + np.abs(self.bias.astype(np.int64))).max() >= 2**31:
-            raise invalid_layer_error(self, "can overflow int32")
+            yield "can overflow int32"
         if (self.multiplier < 1).any() or not 1 <= self.shift <= 32:
-            raise invalid_layer_error(self, "has a multiplier or shift out of range")
+            yield "has a multiplier or shift out of range"
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,10 +175,10 @@ class MaxPool:
         channels, rows, cols = inputs[0]
         return channels, rows // 2, cols // 2
 
-    def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
-        """Raise ModelError unless input and output have the same type."""
+    def iter_faults(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> Iterator[str]:
+        """Yield a difference between the types of input and output."""
         if self.signed != signed[0]:
-            raise invalid_layer_error(self, "changes the type of its input")
+            yield "changes the type of its input"
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,18 +210,13 @@ class Add:
         """Return channels, rows and columns of its output."""
         return inputs[0]
 
-    def require_sound(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> None:
-        """Raise ModelError unless its inputs have one shape and its numbers are in range."""
+    def iter_faults(self, inputs: tuple[Shape, ...], signed: tuple[bool, ...]) -> Iterator[str]:
+        """Yield shapes of the inputs that differ and numbers out of range."""
         if inputs[0] != inputs[1]:
-            raise invalid_layer_error(self, f"adds {inputs[0]} to {inputs[1]}")
+            yield f"adds {inputs[0]} to {inputs[1]}"
         low, high = sorted(self.multipliers)
         if not (low >= 0 and 2**20 <= high < 2**21 and 1 <= self.shift <= 30):
-            raise invalid_layer_error(self, "has a multiplier or shift out of range")
+            yield "has a multiplier or shift out of range"
 
 
 AnyLayer = Conv | MaxPool | Add
-
-
-def invalid_layer_error(layer: "Conv | MaxPool | Add", what: str) -> ModelError:
-    """Return the error for a layer that violates an invariant."""
-    return ModelError(f"layer {layer.name} {what}. Quantise the model again")

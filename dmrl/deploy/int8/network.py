@@ -10,42 +10,20 @@ type. The clamp of an unsigned tensor at 0 is the ReLU.
 """
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from dmrl.deploy.int8.layers import (
-    PIXEL_ZERO,
-    Add,
-    AnyLayer,
-    Conv,
-    Int32,
-    MaxPool,
-    Shape,
-    invalid_layer_error,
-)
+from dmrl.deploy.int8.layers import AnyLayer, Conv, Int32, Shape
 from dmrl.errors import ModelError
 from dmrl.guards.safe_names import truncate
-
-__all__ = [
-    "CONFIDENCE_ONE",
-    "PIXEL_ZERO",
-    "SUBPIXEL",
-    "Add",
-    "AnyLayer",
-    "Conv",
-    "Head",
-    "Int32",
-    "IntegerNetwork",
-    "MaxPool",
-    "Shape",
-    "require_sound",
-]
 
 SUBPIXEL = 16
 """Steps per pixel of integer positions."""
 CONFIDENCE_ONE = 65535
 """Integer confidence of 1.0."""
+HEAD_NAMES = ("confidence", "depth", "offset_u", "offset_v")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,12 +92,7 @@ class IntegerNetwork:
     @property
     def heads(self) -> dict[str, Head]:
         """Existing heads, by name."""
-        named = {
-            "confidence": self.confidence,
-            "depth": self.depth,
-            "offset_u": self.offset_u,
-            "offset_v": self.offset_v,
-        }
+        named = {name: getattr(self, name) for name in HEAD_NAMES}
         return {name: head for name, head in named.items() if head is not None}
 
     @property
@@ -136,14 +109,18 @@ class IntegerNetwork:
         return self.shapes[self.confidence.tensor][1:]
 
     @property
+    def layer_macs(self) -> list[int]:
+        """Multiply-accumulates of every layer per image."""
+        shapes = self.shapes
+        return [
+            layer.count_macs((shapes[layer.source],)) if isinstance(layer, Conv) else 0
+            for layer in self.layers
+        ]
+
+    @property
     def macs(self) -> int:
         """Multiply-accumulates per image."""
-        shapes = self.shapes
-        return sum(
-            layer.count_macs((shapes[layer.source],))
-            for layer in self.layers
-            if isinstance(layer, Conv)
-        )
+        return sum(self.layer_macs)
 
     @property
     def threshold_q(self) -> int:
@@ -160,25 +137,26 @@ def require_sound(network: IntegerNetwork) -> None:
     ModelError
         If one is violated; the message contains the layer's name.
     """
+    for fault in _iter_faults(network):
+        raise ModelError(f"{fault}. Quantise the model again")
+
+
+def _iter_faults(network: IntegerNetwork) -> Iterator[str]:
     for index, layer in enumerate(network.layers):
         if not all(0 <= k <= index for k in layer.sources):
-            raise invalid_layer_error(
-                layer, f"reads tensors {layer.sources}, which are not all computed before it"
-            )
+            yield f"layer {layer.name} reads tensors {layer.sources}, which are not all before it"
     shapes = network.shapes
     signed = [False, *(layer.signed for layer in network.layers)]
     for layer, shape in zip(network.layers, shapes[1:], strict=True):
         inputs = tuple(shapes[k] for k in layer.sources)
         if min(shape) < 1:
-            raise invalid_layer_error(
-                layer, f"has no output for {inputs[0][2]} x {inputs[0][1]} inputs"
-            )
-        layer.require_sound(inputs, tuple(signed[k] for k in layer.sources))
+            yield f"layer {layer.name} has no output for {inputs[0][2]} x {inputs[0][1]} inputs"
+        faults = layer.iter_faults(inputs, tuple(signed[k] for k in layer.sources))
+        yield from (f"layer {layer.name} {fault}" for fault in faults)
     read = {k for layer in network.layers for k in layer.sources}
     for name, head in network.heads.items():
         on_grid = shapes[head.tensor][1:] == network.grid_shape
         if not signed[head.tensor] or head.tensor in read or not on_grid:
-            raise ModelError(f"head {name} is not a signed tensor of the grid. Quantise again")
+            yield f"head {name} is not a signed tensor of the grid"
     named = Counter(layer.name for layer in network.layers)
-    if twice := [name for name, count in named.items() if count > 1]:
-        raise ModelError(f"two layers are named {truncate(twice[0])!r}. Quantise the model again")
+    yield from (f"two layers are named {truncate(name)!r}" for name in named if named[name] > 1)

@@ -18,19 +18,17 @@ from dmrl.deploy.int8.graph import (
     FloatGraph,
     FloatPool,
 )
-from dmrl.deploy.int8.layers import GAIN_SHIFT, SIGNED_OFFSET
-from dmrl.deploy.int8.network import (
-    CONFIDENCE_ONE,
+from dmrl.deploy.int8.layers import (
+    GAIN_SHIFT,
     PIXEL_ZERO,
-    SUBPIXEL,
+    SIGNED_OFFSET,
     Add,
     AnyLayer,
     Conv,
-    Head,
     Int32,
-    IntegerNetwork,
     MaxPool,
 )
+from dmrl.deploy.int8.network import CONFIDENCE_ONE, SUBPIXEL, Head, IntegerNetwork
 from dmrl.deploy.int8.rounding import InputMoments, round_weights
 from dmrl.errors import SettingError
 
@@ -301,18 +299,9 @@ def _quantise_add(
     # 21 bits for the larger one: two terms of 8 and 21 bits and their sum fit in int32.
     _, exponent = np.frexp(max(a, b) / scale)
     shift = 21 - int(exponent)
-    multipliers = [round(part / scale * 2**shift) for part in (a, b)]
-    if max(multipliers) == 2**21:  # rounded up to one bit more
-        shift -= 1
-        multipliers = [round(part / scale * 2**shift) for part in (a, b)]
-    return Add(
-        layer.name,
-        layer.sources,
-        (multipliers[0], multipliers[1]),
-        shift,
-        signed=signed,
-        scale=scale,
-    )
+    shift -= round(max(a, b) / scale * 2**shift) == 2**21  # rounded up to one bit more
+    first, second = (round(part / scale * 2**shift) for part in (a, b))
+    return Add(layer.name, layer.sources, (first, second), shift, signed=signed, scale=scale)
 
 
 def _quantise_pool(layer: FloatPool, scales: list[float], signed: list[bool]) -> MaxPool:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.layers import GAIN_SHIFT, SIGNED_OFFSET
-from dmrl.deploy.int8.network import SUBPIXEL, Add, AnyLayer, Conv, Head, IntegerNetwork
+from dmrl.deploy.int8.layers import GAIN_SHIFT, SIGNED_OFFSET, Add, AnyLayer, Conv
+from dmrl.deploy.int8.network import SUBPIXEL, Head, IntegerNetwork
 from dmrl.deploy.int8.windows import extract_taps, max_pool_2x2
 from dmrl.learn.inference.decode_grids import DUPLICATE_RADIUS_PX
 

@@ -11,7 +11,8 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.int8.network import Add, AnyLayer, Conv, Head, IntegerNetwork, MaxPool
+from dmrl.deploy.int8.layers import Add, AnyLayer, Conv, MaxPool
+from dmrl.deploy.int8.network import HEAD_NAMES, Head, IntegerNetwork
 from dmrl.errors import ModelError
 from dmrl.guards.bounded_parsing import load_npz, parse_json
 from dmrl.guards.paths import refuse_pipes
@@ -20,14 +21,8 @@ INTEGER_NAME = "integer.npz"
 """Name of the file in a quantised model and in an export folder."""
 FORMAT = 3
 LAYER_CLASSES: dict[str, type[AnyLayer]] = {kind.kind: kind for kind in (Conv, MaxPool, Add)}
-HEAD_NAMES = ("confidence", "depth", "offset_u", "offset_v")
 PLAIN_FIELDS = (
-    "name",
-    "architecture",
-    "channels",
-    "height_px",
-    "width_px",
-    "stride_px",
+    *("name", "architecture", "channels", "height_px", "width_px", "stride_px"),
     "threshold",
 )
 
@@ -132,10 +127,9 @@ def _check_types(part: Part) -> Part:
         If one does not.
     """
     for field, kind in get_type_hints(type(part)).items():
-        if field not in ("kind", "layers", *HEAD_NAMES) and not _has_type(
-            getattr(part, field), kind
-        ):
-            raise TypeError(f"{field} is {str(getattr(part, field))[:40]!r}")
+        value = getattr(part, field)
+        if field not in ("kind", "layers", *HEAD_NAMES) and not _has_type(value, kind):
+            raise TypeError(f"{field} is {str(value)[:40]!r}")
     return part
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.int8.graph import FloatAdd, FloatConv, FloatGraph
-from dmrl.deploy.int8.layers import GAIN_SHIFT, SIGNED_OFFSET
-from dmrl.deploy.int8.network import PIXEL_ZERO, Add, Conv, Head, IntegerNetwork
+from dmrl.deploy.int8.layers import GAIN_SHIFT, PIXEL_ZERO, SIGNED_OFFSET, Add, Conv
+from dmrl.deploy.int8.network import Head, IntegerNetwork
 from dmrl.deploy.int8.quantise import HEAD_OF_CHANNEL
 from dmrl.errors import MissingExtra
 

@@ -25,12 +25,7 @@ def conv(outs: int = 2, kernel: int = 3, ins: int = 3, **more: Any) -> Conv:
 
 
 def sound(layer: Any, *shapes: tuple[int, int, int], signed: tuple[bool, ...] = (False,)) -> bool:
-    try:
-        layer.require_sound(shapes or (SHAPE,), signed)
-    except ModelError as e:
-        assert f"layer {layer.name}" in str(e)
-        return False
-    return True
+    return next(layer.iter_faults(shapes or (SHAPE,), signed), None) is None
 
 
 @pytest.mark.parametrize("signed", [False, True])
@@ -158,3 +153,5 @@ def test_heads_are_signed_tensors_of_the_grid_that_nobody_reads() -> None:
     late = (replace(network().layers[0], source=1),)
     with pytest.raises(ModelError, match="layer conv reads tensors"):
         network(layers=late)
+    with pytest.raises(ModelError, match="layer conv has a multiplier or shift out of range"):
+        network(layers=(replace(network().layers[0], shift=0),))

@@ -20,7 +20,7 @@ from dmrl.deploy.int8.graph import (
     select_outputs,
 )
 from dmrl.deploy.int8.layer_errors import compute_layer_errors
-from dmrl.deploy.int8.network import Conv
+from dmrl.deploy.int8.layers import Conv
 from dmrl.deploy.int8.quantise import (
     HEAD_CONVERSIONS,
     NetworkInfo,

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from dmrl.deploy.backends import build_reference_backend, to_grids
-from dmrl.deploy.int8.network import Add, Conv, IntegerNetwork, MaxPool
+from dmrl.deploy.int8.layers import Add, Conv, MaxPool
+from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.reference import (
     IntegerDetection,
     compute_layer,
