@@ -283,7 +283,7 @@ def _to_fixed_point(divisor: Array) -> tuple[Int32, int]:
     Integers give the same rounding on every machine, including those without floating point. The
     shift is 32 unless a divisor is 4 or less. Multipliers are rounded up: with a shift of 32 and a
     whole divisor up to 4095, the product is the exact quotient, rounded down, of every
-    representable sum. For larger divisors, a sum of 24 bits has an error below a tenth of a step.
+    representable sum. Otherwise, a sum of 24 bits has an error of an eighth of a step at most.
     """
     shift = min(32, 30 - int(np.frexp(1 / divisor.min())[1]))
     return np.ceil(2.0**shift / divisor).astype(np.int32), shift
