@@ -10,15 +10,7 @@ from dmrl.learn.inference.matching import Points
 
 def decode_points(outputs: Outputs, stride_px: int) -> Points:
     """Decode the detections in N images."""
-    found = decode(*to_grids(outputs), stride_px=stride_px)
-    kept = np.arange(found.u_px.shape[1]) < found.count[:, None]
-    return Points(
-        np.nonzero(kept)[0],
-        found.u_px[kept],
-        found.v_px[kept],
-        found.depth_m[kept],
-        found.confidence[kept],
-    )
+    return Points.from_detections(decode(*to_grids(outputs), stride_px=stride_px))
 
 
 def compute_accuracy(

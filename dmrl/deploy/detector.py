@@ -24,7 +24,7 @@ from dmrl.geometry.frames import STRIDE_PX
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_pipes, require_text_path
 from dmrl.learn import pretrained
-from dmrl.learn.inference.decode_grids import Grids
+from dmrl.learn.inference.decode_grids import Grids, require_whole_cells
 from dmrl.learn.pretrained import DESCRIPTION_NAME, WEIGHTS_NAME
 
 FLOAT_ONNX_NAME = "model.onnx"
@@ -78,11 +78,8 @@ class Detector:
         SettingError
             If it requires another size or a whole number of cells.
         """
-        if self.size_px is None and (width_px % self.stride_px or height_px % self.stride_px):
-            raise SettingError(
-                f"{what}: images of {width_px} x {height_px} px do not divide into cells of "
-                f"{self.stride_px} px, as {self.name} needs. Crop or scale the images first"
-            )
+        if self.size_px is None:
+            require_whole_cells((width_px, height_px), self.stride_px, self.name, what)
         if self.size_px not in (None, (width_px, height_px)):
             taken = "{} x {}".format(*self.size_px or ())
             raise SettingError(

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.errors import SettingError
+
 Array = NDArray[np.float64]
 
 DETECTION_COLUMNS = ("u_px", "v_px", "depth_m", "confidence", "sigma_depth_m", "class_id")
@@ -68,6 +70,28 @@ class Detections:
     sigma_depth_m: Array
     class_id: NDArray[np.int64]
     count: NDArray[np.int64]
+
+
+def require_whole_cells(
+    size_px: tuple[int, int], stride_px: int, network: str, what: object
+) -> None:
+    """Raise SettingError unless images of this width and height divide into grid cells.
+
+    Parameters
+    ----------
+    size_px
+        Width and height of the images.
+    stride_px
+        Side of a grid cell.
+    network, what
+        Names of the network and of the images, for the error.
+    """
+    width_px, height_px = size_px
+    if width_px % stride_px or height_px % stride_px:
+        raise SettingError(
+            f"{what}: images of {width_px} x {height_px} px do not divide into cells of "
+            f"{stride_px} px, as {network} needs. Crop or scale the images first"
+        )
 
 
 def find_peaks(confidence: NDArray[np.floating]) -> NDArray[np.bool_]:

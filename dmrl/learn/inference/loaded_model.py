@@ -16,12 +16,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from dmrl.errors import ModelError, SettingError
+from dmrl.errors import ModelError
 from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_pipes, require_text_path
 from dmrl.learn import pretrained
-from dmrl.learn.inference.decode_grids import Grids
+from dmrl.learn.inference.decode_grids import Grids, require_whole_cells
 from dmrl.learn.networks.architectures import (
     CLASS_PREFIX,
     SPREAD_CHANNEL,
@@ -100,12 +100,8 @@ class Model:
         SettingError
             If a side is not a whole number of grid cells.
         """
-        cell = self.network.stride_px
-        if width_px % cell or height_px % cell:
-            raise SettingError(
-                f"{what}: images of {width_px} x {height_px} px do not divide into cells of "
-                f"{cell} px, as {self.architecture} needs. Crop or scale the images first"
-            )
+        cell_px = self.network.stride_px
+        require_whole_cells((width_px, height_px), cell_px, self.architecture, what)
 
     def grids(self, images: NDArray[np.uint8]) -> Grids:
         """Run the network on (N, H, W, 3) RGB images.

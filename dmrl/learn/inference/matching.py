@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from dmrl.learn.inference.decode_grids import Detections
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -47,23 +49,23 @@ class Points:
     @staticmethod
     def concatenate(parts: Sequence["Points"], first: Index) -> "Points":
         """Concatenate parts; image indices of part k are offset by ``first[k]``."""
-        return Points(
-            np.concatenate([part.image + first[k] for k, part in enumerate(parts)]),
-            np.concatenate([part.u_px for part in parts]),
-            np.concatenate([part.v_px for part in parts]),
-            np.concatenate([part.depth_m for part in parts]),
-            np.concatenate([part.confidence for part in parts]),
-        )
+        image = np.concatenate([part.image + first[k] for k, part in enumerate(parts)])
+        columns = zip(*(part._columns() for part in parts), strict=True)
+        return Points(image, *map(np.concatenate, columns))
 
     def select(self, keep: NDArray[np.bool_] | Index) -> "Points":
         """Return the chosen rows."""
-        return Points(
-            self.image[keep],
-            self.u_px[keep],
-            self.v_px[keep],
-            self.depth_m[keep],
-            self.confidence[keep],
-        )
+        return Points(self.image[keep], *(column[keep] for column in self._columns()))
+
+    @staticmethod
+    def from_detections(found: Detections) -> "Points":
+        """Return the decoded detections of N images."""
+        image, place = np.nonzero(np.arange(found.u_px.shape[1]) < found.count[:, None])
+        columns = (found.u_px, found.v_px, found.depth_m, found.confidence)
+        return Points(image, *(column[image, place] for column in columns))
+
+    def _columns(self) -> tuple[Array, Array, Array, Array]:
+        return self.u_px, self.v_px, self.depth_m, self.confidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,11 +99,8 @@ def compute_errors(labels: Points, detections: Points) -> LabelErrors:
             return np.full(len(label), np.nan)
         return np.where(missing, np.nan, label - detection[rows])
 
-    return LabelErrors(
-        difference(labels.u_px, detections.u_px),
-        difference(labels.v_px, detections.v_px),
-        difference(labels.depth_m, detections.depth_m),
-    )
+    names = ("u_px", "v_px", "depth_m")
+    return LabelErrors(*(difference(getattr(labels, k), getattr(detections, k)) for k in names))
 
 
 def assign_detections(labels: Points, detections: Points) -> Index:

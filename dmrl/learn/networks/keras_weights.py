@@ -49,8 +49,9 @@ def load_keras_weights(path: Path) -> dict[str, Tensor]:
         with MemoryLimit(path.stat().st_size), h5py.File(path, "r") as file:
             inner = file.get("model_weights", getlink=True)
             group = file["model_weights"] if isinstance(inner, h5py.HardLink) else file
+            shapes = {name: value.shape for name, value in LocaNet().state_dict().items()}
             return {
-                name: _load_variable(path, group, *where)
+                name: _load_variable(path, group, *where, shapes[name])
                 for name, where in _map_variables().items()
             }
     except (OSError, RuntimeError, ValueError, TypeError, LookupError, MemoryError) as e:
@@ -71,7 +72,9 @@ def _map_variables() -> dict[str, tuple[str, str]]:
     return places
 
 
-def _load_variable(path: Path, group: "h5py.Group", layer: str, variable: str) -> Tensor:
+def _load_variable(
+    path: Path, group: "h5py.Group", layer: str, variable: str, ours: tuple[int, ...]
+) -> Tensor:
     found: h5py.Group | h5py.Dataset | None = group
     for part in (layer, layer, f"{variable}:0"):
         # A soft or external link could lead to any other file of this machine.
@@ -81,7 +84,7 @@ def _load_variable(path: Path, group: "h5py.Group", layer: str, variable: str) -
         found = found[part] if found is not None and own else None
     if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
         raise ModelError(f"{path} has no {layer}/{variable}. Give weights of locanet")
-    wanted, shape = _keras_shape(layer, variable), found.shape
+    wanted, shape = (*ours[2:], *ours[1::-1]), found.shape  # Keras has the channels last
     if shape != wanted:
         raise ModelError(
             f"{path}: {layer}/{variable} has shape {shape}, locanet needs {wanted}. "
@@ -91,12 +94,3 @@ def _load_variable(path: Path, group: "h5py.Group", layer: str, variable: str) -
     if values.ndim == 4:
         values = values.transpose(3, 2, 0, 1)
     return torch.from_numpy(np.ascontiguousarray(values))
-
-
-def _keras_shape(layer: str, variable: str) -> tuple[int, ...]:
-    ins, outs = (3, *LocaNet.widths), (*LocaNet.widths, 2)
-    index = int(layer.rpartition("_")[2]) if layer[-1].isdigit() else 0
-    if variable != "kernel":
-        return (outs[index],)
-    side = 1 if index == len(LocaNet.widths) else 3
-    return (side, side, ins[index], outs[index])

@@ -92,18 +92,13 @@ def load_checkpoint(
         state = TrainingProgress(**said)
         if not isinstance(state.run, dict) or not isinstance(state.epochs_done, int):
             raise ValueError("run or epochs_done is missing")
-    except (ValueError, KeyError, TypeError, OSError, SafetensorError) as e:
-        raise ModelError(
-            f"{folder}/{CHECKPOINT_NAME} is damaged: {e}. Train without --resume"
-        ) from None
-    _require_same_run(state.run, run, folder)
-    for role, network in networks.items():
-        start = f"{role}."
-        mine = {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
-        set_weights(network, mine, folder)
-    try:
+        _require_same_run(state.run, run, folder)
+        for role, network in networks.items():
+            start = f"{role}."
+            mine = {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
+            set_weights(network, mine, folder)
         _load_optimizer_state(optimizer, tensors)
-    except (ValueError, LookupError, RuntimeError) as e:
+    except (ValueError, LookupError, TypeError, RuntimeError, OSError, SafetensorError) as e:
         raise ModelError(
             f"{folder}/{CHECKPOINT_NAME} is damaged: {e}. Train without --resume"
         ) from None

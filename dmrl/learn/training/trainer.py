@@ -24,6 +24,7 @@ from dmrl.learn.data.batches import (
     epoch_indices,
     prefetch,
 )
+from dmrl.learn.inference.decode_grids import require_whole_cells
 from dmrl.learn.networks.architectures import Network, build_network
 from dmrl.learn.training import tensorboard_log as boards
 from dmrl.learn.training.checkpoint import TrainingProgress, load_checkpoint, save_checkpoint
@@ -89,12 +90,8 @@ def build_initial_network(settings: TrainConfig, examples: ExampleSet) -> Networ
     if not len(examples):
         raise SettingError("no images to train on. Use a dataset with a train split")
     height_px, width_px, _ = examples.image_shape
-    cell = network.stride_px
-    if height_px % cell or width_px % cell:
-        raise SettingError(
-            f"images of {width_px} x {height_px} px do not fit {settings.architecture}, whose "
-            f"cells are {cell} px. Make the dataset from images of another size"
-        )
+    size_px = (width_px, height_px)
+    require_whole_cells(size_px, network.stride_px, settings.architecture, "the dataset")
     return network
 
 

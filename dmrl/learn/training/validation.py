@@ -57,9 +57,7 @@ def score_examples(
     parts = []
     for batch in iter_batches(examples, batch_size):
         found = decode(*predict_grids(network, batch.images), stride_px=network.stride_px)
-        image, place = np.nonzero(np.arange(found.u_px.shape[1]) < found.count[:, None])
-        columns = (found.u_px, found.v_px, found.depth_m, found.confidence)
-        parts.append(Points(image, *(column[image, place] for column in columns)))
+        parts.append(Points.from_detections(found))
     first = np.arange(0, len(examples), batch_size)
     sigma_px = examples.robots[..., SIGMA_U : SIGMA_U + 2].max(axis=-1)[_find_visible(examples)]
     return score_detections(

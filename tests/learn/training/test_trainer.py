@@ -199,7 +199,9 @@ def test_settings_out_of_range_are_named(name: str, value: object) -> None:
 
 def test_images_that_do_not_fit_the_network_are_refused(examples: ExampleSet) -> None:
     odd = ExampleSet([p[:, :30] for p in examples.pixels], examples.robots)
-    with pytest.raises(SettingError, match=r"images of 48 x 30 px do not fit locanet"):
+    with pytest.raises(
+        SettingError, match="48 x 30 px do not divide into cells of 8 px, as locanet"
+    ):
         build_initial_network(SETTINGS, odd)
     none = ExampleSet([p[:0] for p in examples.pixels], examples.robots[:0])
     with pytest.raises(SettingError, match="no images to train on"):
@@ -252,7 +254,7 @@ def test_both_sides_of_images_fit_a_network(width: int, height: int, fits: int) 
     if fits:
         assert build_initial_network(SETTINGS, images).stride_px == 8
     else:
-        with pytest.raises(SettingError, match=f"images of {width} x {height} px do not fit"):
+        with pytest.raises(SettingError, match=f"images of {width} x {height} px do not divide"):
             build_initial_network(SETTINGS, images)
 
 
