@@ -115,7 +115,7 @@ def _run_guarded(work: Callable[[], object]) -> int:
     except KeyboardInterrupt as e:
         return _print_error(describe_interrupt(), 128 + getattr(e, "number", signal.SIGINT))
     except BrokenPipeError:
-        return 1  # the reader of our output, such as `head`, has gone: nobody is left to tell
+        return 1  # the reader of our output, such as `head`, closed the pipe
     except Exception as e:
         if os.environ.get("DMRL_DEBUG"):
             raise

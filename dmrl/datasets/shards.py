@@ -34,8 +34,8 @@ def open_shard(path: Path, rows: int | None) -> pa.Table:
     Raises
     ------
     DatasetError
-        If the shard is missing, damaged, unpacks to far more memory than its size explains, or does
-        not follow the layout.
+        If the shard is missing, damaged, decompresses to far more memory than its size explains,
+        or does not follow the layout.
     """
     if path.exists() and not path.is_file():
         raise DatasetError(f"shard {path} is not a file. {REBUILD_HINT}")
@@ -47,7 +47,7 @@ def open_shard(path: Path, rows: int | None) -> pa.Table:
         raise DatasetError(f"shard {path} is missing. {REBUILD_HINT}") from None
     except MemoryError:
         raise DatasetError(
-            f"shard {path} unpacks to much more than its size explains. {REBUILD_HINT}"
+            f"shard {path} decompresses to much more than its size explains. {REBUILD_HINT}"
         ) from None
     except (pa.ArrowException, OSError, ValueError) as e:
         why = " ".join(str(e).split())

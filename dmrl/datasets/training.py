@@ -112,7 +112,7 @@ def train_network(
         longer a number.
     """
     if settings.init_share and init is None:
-        raise SettingError("init_share: there is nothing to keep a share of. Give --init MODEL")
+        raise SettingError("init_share requires an initial model. Pass --init MODEL")
     if not settings.epochs and init is None:
         raise SettingError("epochs: 0 trains nothing. Give --init MODEL to calibrate, or epochs")
     given = Given(init and resolve_model_path(init), teacher and resolve_model_path(teacher))

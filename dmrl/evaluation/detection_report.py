@@ -121,7 +121,7 @@ def _choose_threshold(
         own = pairs.threshold or DEFAULT_THRESHOLD
         return own if criteria.threshold is None else criteria.threshold
     if criteria.threshold is not None:
-        raise SettingError("--threshold and --false-alarms are two answers. Give one of them")
+        raise SettingError("--threshold and --false-alarms cannot be combined. Pass one of them")
     empty = count_false_alarms(scored, 0.0).empty_images
     chosen = select_threshold(scored, criteria.false_alarms)
     if chosen is None or empty < MIN_EMPTY_IMAGES:

@@ -112,7 +112,7 @@ def _guess_format(source: Path, added: Iterable[Plugin]) -> Format | None:
             if form.recognises(source):
                 return form
         except PluginError as e:
-            say(f"{e}. Not tried on {source}")
+            say(f"{e}. Skipped for {source}")
     return pictures if pictures.recognises(source) else None
 
 

@@ -134,7 +134,7 @@ def load_npz(path: Path) -> dict[str, NDArray[Any]]:
         with zipfile.ZipFile(stream) as archive:
             size = sum(member.file_size for member in archive.infolist())
         if size > limits.max_archive_bytes(path.stat().st_size):
-            raise ValueError(f"it unpacks to {size / 1e6:.0f} MB")
+            raise ValueError(f"it decompresses to {size / 1e6:.0f} MB")
         stream.seek(0)
         try:
             with np.load(stream, allow_pickle=False) as arrays:

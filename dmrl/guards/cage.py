@@ -1,8 +1,8 @@
-"""Run a library on a stranger's words in a child process with few rights.
+"""Run a library on untrusted input in a sandboxed child process.
 
 The child has limits of memory and CPU time, and no network where the system allows that. It takes
-bytes on standard input and gives bytes on standard output. Whatever ends it, the command lives and
-says so in one line.
+bytes on standard input and writes bytes on standard output. However it ends, the command survives
+and reports it in one line.
 """
 
 import ctypes

@@ -22,8 +22,8 @@ class RecordSettings:
         How images are stored that are not JPEG already: png, nothing lost, or jpeg, a fifth
         of that.
     peer
-        Whose distance ranging.distance<N> is, as N=NAME; repeat for more. Without it, robot
-        cf<N>'s.
+        Robot to which ranging.distance<N> is the distance, as N=NAME; repeat for more. Without
+        it, cf<N>.
     """
 
     duration_s: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=1e6))] = None

@@ -107,9 +107,7 @@ def plan_blocks(
     motion.append(RequestedVariable(YAW_RATE_VARIABLE, "float"))
     height = HEIGHT_VARIABLE if HEIGHT_VARIABLE in toc else GROUND_VARIABLE
     if missing := [name for name in (*(v.name for v in motion), height) if name not in toc]:
-        raise SettingError(
-            f"{robot} has no log variable {', '.join(missing)}. Use a Crazyflie's firmware"
-        )
+        raise SettingError(f"{robot} has no log variable {', '.join(missing)}. Update its firmware")
     if PITCH_RATE_VARIABLE in toc:
         # As FP16 it fits into the block. It only corrects the yaw rate for tilt.
         motion.append(RequestedVariable(PITCH_RATE_VARIABLE, "FP16"))

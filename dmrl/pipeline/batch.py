@@ -58,7 +58,7 @@ def find_recordings(source: Path, *, but: Path | None = None) -> dict[Path, Path
     Parameters
     ----------
     source
-        A folder, which is searched to its depths; a pattern such as ``2024-*/*.mcap``; or a
+        A folder, which is searched recursively; a pattern such as ``2024-*/*.mcap``; or a
         recording.
     but
         Folder to leave out, such as that of the outputs.

@@ -186,9 +186,11 @@ def _build_steps(name: str | Path, recipe: Table) -> list[Step]:
         Plan(tuple(steps), "").order.prepare()
     except CycleError as e:
         circle = " of ".join(e.args[1])
-        raise RecipeError(f"{name}: a circle: {circle}. Break it") from None
+        raise RecipeError(
+            f"{name}: steps depend on each other in a cycle: {circle}. Remove one"
+        ) from None
     if not steps:
-        raise RecipeError(f"{name} stands for no step at all. Give its rows what out names")
+        raise RecipeError(f"{name} expands to no step. Add the keys that `out` uses to its rows")
     return steps
 
 

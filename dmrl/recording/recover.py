@@ -162,7 +162,7 @@ def _load_chunk(
         return None
     state.unpacked += len(scan.data)
     if state.unpacked > limits.max_unpacked_bytes(stream.size):
-        raise over_budget_error(state.path, "it unpacks to much more than its size")
+        raise over_budget_error(state.path, "it decompresses to much more than its size")
     for record in found:
         _register_record(state, record)
     return scan

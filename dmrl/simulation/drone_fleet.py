@@ -111,7 +111,7 @@ def _robots(flight: Path, uris: Sequence[str], cameras: Sequence[int]) -> list[s
     if not 0 < len(uris) <= len(known) or len(cameras) > len(uris):
         raise SettingError(
             f"{len(uris)} --uri and {len(cameras)} --camera for {len(known)} robots "
-            f"({', '.join(known)}). Give a --uri for each that shall fly, then their cameras"
+            f"({', '.join(known)}). Pass one --uri per robot, and at most as many --camera"
         )
     if wrong := [port for port in cameras if not 0 <= port < 65536]:
         raise SettingError(f"--camera {wrong[0]}: ports go from 1 to 65535. Name another")

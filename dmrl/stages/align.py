@@ -44,7 +44,7 @@ class Settings:
 
 
 def run(recording: In, out: Path, settings: Settings) -> "dict[str, Clock]":
-    """Set clocks by each other: from ranges of pairs, images, or motion capture.
+    """Synchronise clocks by ranges of pairs, by images, or by motion capture.
 
     Parameters
     ----------

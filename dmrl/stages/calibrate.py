@@ -90,7 +90,7 @@ def run(
         See `Settings`.
     workers
         --sensors: flights that are solved at a time, at most. Without it, as many as there are
-        cores. Changes no byte.
+        cores. Does not affect the output.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def run(
     refuse_existing(out)
     if settings.sensors:
         if settings.board is not None:
-            raise SettingError("--sensors and --board are two calibrations. Do one after the other")
+            raise SettingError("--sensors and --board cannot be combined. Run one after the other")
         result = _calibrate_sensors(sources, workers)
     elif settings.board is None:
         if folder := next((source for source in sources if source.is_dir()), None):

@@ -25,7 +25,7 @@ class Settings:
 
 
 def run(dataset: Path, settings: Settings, out: Path | None = None) -> Path:
-    """Write a dataset's card and figures again; your own words below its last line stay.
+    """Write a dataset's card and figures again; text below its last line is kept.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ def run(
     settings
         See `Settings`.
     workers
-        Threads that decode images. None: as many as there are cores. Changes no byte.
+        Threads that decode images. None: as many as there are cores. Does not affect the output.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def command(
         End with an error if an image cannot be decoded. Without it, such images are left out and
         counted.
     workers
-        Threads that decode images. Without it, as many as there are cores. Changes no byte.
+        Threads that decode images. Without it, one per core. Does not affect the output.
     """
     if into and on is not None:
         raise SettingError("--add is done here. Leave out --on")

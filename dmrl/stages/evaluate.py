@@ -133,7 +133,7 @@ def command(
         exist.
     workers
         Processes that draw the intervals, at most. Without it, as many as there are cores.
-        Changes no byte.
+        Does not affect the output.
     """
     recordings = find_all_recordings(recordings)
     if on is not None:

@@ -103,14 +103,14 @@ def _describe_all(
 def command(
     folder: Path, /, *, workers: Workers = None, on: On = None, as_json: AsJson = False
 ) -> None:
-    """List a folder's recordings and their contents in catalogue.parquet, for dmrl find.
+    """List the recordings of a folder in catalogue.parquet, for dmrl find.
 
     Run it again when recordings came, went or changed: only those are looked at.
 
     Parameters
     ----------
     folder
-        Folder of recordings, searched to its depths. The table is written into it.
+        Folder of recordings, searched recursively. The table is written into it.
     workers
         Recordings at a time, at most. Without it, as many as there are cores.
     """

@@ -33,25 +33,25 @@ class Settings:
     preset
         ekf: its noise, as published for simulation or in the firmware.
     gate_m
-        A position that is off by more than this is a bad one, metres.
+        Horizontal error, in metres, beyond which a position is bad.
     bad_share
         Share of a flight's OK positions that may be bad, as the estimate expects.
     attitude_std_rad
         Standard deviation of roll and pitch, radians.
     detections
-        Solve with the detections that are in the recording as well, whosever they may be, wrong
-        ones among them; with or without ranges. For the methods "batch" and "swarm".
+        Use the recording's detections too, with or without ranges. They need no identity, and
+        some may be false. For the methods "batch" and "swarm".
     pixel_std_px
-        Error of such a detection in u and in v, pixels.
+        Standard deviation of a detection in u and in v, pixels.
     range_offset_m
         Known offset of every range, subtracted first: an antenna delay, 0.35 m for some.
     sensors
-        What flights of these robots agree on, as dmrl calibrate --sensors wrote it.
+        Sensor constants of these robots, a file that dmrl calibrate --sensors wrote.
     undistorted
         The images have no lens distortion any more, whatever the calibration says.
     copy
-        With all that IN holds. --no-copy: the labels and positions alone, for which no picture is
-        read; dmrl merge puts them to the others.
+        Copy all topics of the input. --no-copy writes labels and positions alone and reads no
+        image; dmrl merge joins them with the input.
     camera
         A robot's camera, with mount and delay, as dmrl calibrate wrote it: --camera.cf1 FILE.
     strict
@@ -100,7 +100,7 @@ def run(recording: In, out: Path, settings: Settings, *, workers: int = 1) -> Re
         See `Settings`.
     workers
         Recordings of a folder, or pairs of robots of one, at a time, at most. Without it, as many
-        as there are cores. Changes no byte.
+        as there are cores. Does not affect the output.
 
     Raises
     ------

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def run(
     real: Path, out: Annotated[Path, Parameter(name="OUT.toml")], settings: Settings
 ) -> "Result":
-    """Fit a render recipe to one's own frames, and show both beside each other.
+    """Fit a render recipe to your own frames, and show both side by side.
 
     Parameters
     ----------

@@ -27,13 +27,12 @@ class Settings:
     Parameters
     ----------
     backend
-        What computes. torch and onnx are float; onnx-int8, integer (NumPy), c and riscv32 (the C
+        Backend. torch and onnx are float; onnx-int8, integer (NumPy), c and riscv32 (the C
         in an emulator, seconds an image) are int8, and need a quantised model or an export
-        folder. Without it, onnx where it is installed and gives all that the network says, else
-        torch.
+        folder. Without it, onnx where it is installed and supports all outputs of the network,
+        else torch.
     threshold
-        Confidence from which detections are to be believed, written beside them, 0 to 1.
-        Without it, the model's.
+        Confidence threshold, 0 to 1, stored with the detections. Without it, the model's.
     min_confidence
         Leave out detections below this, 0 to 1; the best of each image stays.
     most

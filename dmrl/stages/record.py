@@ -25,7 +25,7 @@ def command(
     view: Annotated[bool, Parameter(negative=())] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Record the logs and cameras of Crazyflies in flight, until Ctrl-C.
+    """Record logs and images of flying Crazyflies, until Ctrl-C.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def run(recording: Path, out: Path) -> "Recovery":
-    """Bring back the messages of a recording that was cut short.
+    """Recover the messages of a damaged or unfinished recording.
 
     Every message that can be read is kept, bit for bit; a chunk that fails its CRC is left
     out, and what follows it is kept. The line says how many messages are missing, by topic.

@@ -66,11 +66,11 @@ class Flags:
     Parameters
     ----------
     images
-        Images to render. Without it, as the recipe says; so for all that follow.
+        Images to render. Without it, as the recipe says, as with the options below.
     seed
         Another seed renders other images.
     workers
-        Blender processes; 0: as many as there are cores. Changes no byte of the output.
+        Blender processes; 0: as many as there are cores. Does not affect the output.
     backgrounds
         What to put behind the robots: a folder of photos; rooms, which are made by code; or a
         dataset whose train images are put there, their robots painted over.

@@ -49,7 +49,7 @@ def command(
     dry_run
         Print what the run would make and replace, and why. Write nothing.
     workers
-        Steps that run at a time, at most. Without it, as many as there are cores. Changes no byte.
+        Steps that run at a time, at most. Without it, one per core. Does not affect the output.
     """
     from dmrl.evaluation.pipeline_summary import print_report
     from dmrl.pipeline import recipe_run as pipeline

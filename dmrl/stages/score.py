@@ -16,7 +16,7 @@ class Settings:
     Parameters
     ----------
     name
-        As it stands on the page.
+        Name shown on the page.
     """
 
     name: str = "submission"

@@ -30,7 +30,7 @@ def run(out: Path, settings: Settings, *, workers: int = 1) -> dict[str, int]:
     settings
         See `Settings`.
     workers
-        Processes that draw, at most. Without it, as many as there are cores. Changes no byte.
+        Processes that draw, at most. Without it, one per core. Does not affect the output.
 
     Returns
     -------

@@ -24,20 +24,20 @@ class Flags:
     Parameters
     ----------
     epochs
-        Times that every image is seen. Without it, the recipe's.
+        Passes over all images. Without it, the recipe's.
     batch_size
         Images per step. Without it, the recipe's.
     learning_rate
-        At the end of the warm-up. Without it, the recipe's.
+        Peak learning rate, at the end of the warm-up. Without it, the recipe's.
     false_alarms
-        Detections of an image without a robot, on average, that the threshold lets through at
-        most. Without it, the recipe's.
+        Largest expected number of detections above the threshold in an image without a robot.
+        Without it, the recipe's.
     seed
-        Of the first weights and the order of the images. Without it, the recipe's.
+        Seed of the initial weights and the order of the images. Without it, the recipe's.
     device
         Where to compute. Without it, the recipe's.
     processes
-        That share every batch, on a CPU. Without it, the recipe's.
+        Training processes that share every batch, on a CPU. Without it, the recipe's.
     """
 
     epochs: int | None = None

@@ -44,7 +44,7 @@ class Settings:
 
 
 def run(recording: Path, out: Path, settings: Settings) -> int:
-    """Keep a stretch of a recording, or some of its topics.
+    """Cut a time range out of a recording, or keep some of its topics.
 
     The calibration that a camera had then goes along.
 

@@ -71,7 +71,8 @@ On = Annotated[
     str | None,
     Parameter(
         help="Do it on a cluster: ray for the Ray cluster that this machine is part of (or this "
-        "machine alone), ray://HOST:PORT for another, slurm to write an array job. Changes no byte."
+        "machine alone), ray://HOST:PORT for another, slurm to write an array job. Does not affect "
+        "the output."
     ),
 ]
 """Cluster that runs the command; None: this machine."""
@@ -81,7 +82,7 @@ FolderWorkers = Annotated[
     Workers,
     Parameter(
         help="Of a folder: recordings at a time, at most. Without it, as many as there are "
-        "cores. Changes no byte."
+        "cores. Does not affect the output."
     ),
 ]
 """`Workers` of a command that takes a folder."""

@@ -76,7 +76,7 @@ def test_a_shard_that_unpacks_to_much_is_refused(shard: Path) -> None:
     many = pa.concat_tables([table_of(shard).slice(0, 1)] * 5_000).combine_chunks()
     rewritten(shard, many, "zstd", times=20)
     assert shard.stat().st_size < 5_000_000
-    with pytest.raises(DatasetError, match="unpacks to much more than its size explains"):
+    with pytest.raises(DatasetError, match="decompresses to much more than its size explains"):
         open_shard(shard, None)
 
 
@@ -90,7 +90,7 @@ def test_a_parquet_file_that_repeats_one_row_without_end_is_refused(
         for _ in range(10):
             sink.write_table(rows)
     assert path.stat().st_size < 5_000_000
-    with pytest.raises(DatasetError, match="unpacks to much more than its size explains"):
+    with pytest.raises(DatasetError, match="decompresses to much more than its size explains"):
         open_shard(path, None)
 
 

@@ -130,7 +130,7 @@ def test_a_plug_in_is_asked_after_our_own_and_by_its_name(
     assert (found.name, found.what) == ("theirs", "a log of theirs")
     assert found.recognises(tmp_path / "a.theirs") and not found.recognises(tmp_path / "a.txt")
     err = capsys.readouterr().err
-    assert "of the package their-logs, fails to check" in err and "Not tried on" in err
+    assert "of the package their-logs, fails to check" in err and "Skipped for" in err
     (tmp_path / "log").write_bytes(foreign.usd_log())
     assert find_format(tmp_path / "log").name == "cfusdlog"
     assert find_format(tmp_path / "log", "theirs").name == "theirs"

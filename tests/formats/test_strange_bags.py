@@ -98,7 +98,7 @@ def test_a_chunk_of_ros_1_that_unpacks_to_much_is_refused(tmp_path: Path) -> Non
     zeros = bz2.compress(bytes(1 << 20)) * 200  # bz2 takes one stream after the other
     path = ros1_bag(tmp_path / "a.bag", zeros, 200 << 20, "nav_msgs/Odometry", "bz2")
     assert path.stat().st_size < 100_000
-    with pytest.raises(SourceError, match="unpacks to much more than its size explains"):
+    with pytest.raises(SourceError, match="decompresses to much more than its size explains"):
         read(path)
 
 
@@ -107,7 +107,7 @@ def test_a_compressed_file_of_a_bag_does_not_fill_the_disk(tmp_path: Path) -> No
     frame = zstandard.compress(bytes(1 << 24))
     (tmp_path / "a.db3.zstd").write_bytes(frame * 10)
     (tmp_path / "metadata.yaml").write_text(FOLDER)
-    with pytest.raises(SourceError, match="unpacks to much more than its size explains"):
+    with pytest.raises(SourceError, match="decompresses to much more than its size explains"):
         read(tmp_path)
 
 

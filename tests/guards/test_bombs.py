@@ -75,7 +75,7 @@ def text(data: str | bytes) -> Make:
 
 
 def chunk_bomb(kind: str) -> Make:
-    """A recording of one chunk that unpacks to gigabytes."""
+    """A recording of one chunk that decompresses to gigabytes."""
     data = zeros(6 << 30) if kind == "zstd" else lz4.frame.compress(bytes(1 << 30))
     return lambda _, path: recording(path, chunk(data, 1000, kind)) and None
 
@@ -159,7 +159,7 @@ def keras(_: Inputs, path: Path) -> None:
 
 
 def parquet(_: Inputs, path: Path) -> None:
-    """A dataset whose one column unpacks to 2 GB."""
+    """A dataset whose one column decompresses to 2 GB."""
     pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     path.mkdir()
     values = pa.array([bytes(10_000_000)] * 200, pa.binary())

@@ -100,14 +100,14 @@ def test_bombs_are_refused(tmp_path: Path) -> None:
     assert all(path.stat().st_size < 2_000_000 for path in paths)
     for name, (*read, recovered) in zip(bombs, read_bounded(*paths), strict=True):
         # Where the frame tells its size, not by want of memory: that this process alone has.
-        words = "is damaged" if name == "a frame without size" else "unpacks to"
+        words = "is damaged" if name == "a frame without size" else "decompresses to"
         assert all(words in said for said in read), (name, read)
         assert "nothing to recover" in recovered, name
 
 
 def test_a_chunk_has_a_budget_of_its_own_in_a_file_of_any_size() -> None:
     """A file of 10 MB may unpack to a GB, but not at once."""
-    with pytest.raises(BudgetError, match="the chunk at byte 8 unpacks to 268 MB"):
+    with pytest.raises(BudgetError, match="the chunk at byte 8 decompresses to 268 MB"):
         decompress(chunk(zeros(1 << 28), 1 << 28), 8)
 
 
@@ -118,7 +118,7 @@ def test_many_small_bombs_are_refused(tmp_path: Path) -> None:
     one = Chunk("zstd", zstandard.compress(data), 0, 0, zlib.crc32(data), len(data))
     path = recording(tmp_path / "bomb.mcap", *[one] * 50)
     (said,) = read_bounded(path)
-    assert all("it unpacks to" in line for line in said), said
+    assert all("it decompresses to" in line for line in said), said
 
 
 @pytest.mark.slow

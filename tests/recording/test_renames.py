@@ -94,7 +94,7 @@ def rejoined(path: Path, parts: list[tuple[int, bytes]]) -> None:
     ("kind", "place", "complaint"),
     [
         (Opcode.CHANNEL, Opcode.FOOTER, "two channels"),
-        (Opcode.SCHEMA, Opcode.FOOTER, "two message types"),
+        (Opcode.SCHEMA, Opcode.FOOTER, "two different schemas"),
         (Opcode.CHUNK_INDEX, Opcode.FOOTER, r"lists 3 of 2 chunks"),
         (Opcode.CHUNK, Opcode.DATA_END, "lacks the chunk"),
     ],

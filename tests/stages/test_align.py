@@ -111,7 +111,7 @@ def test_what_cannot_be_aligned_is_one_line(recording: Path, tmp_path: Path) -> 
     with RecordingWriter(alone, build_provenance("test")) as sink:
         for k in range(30):
             sink.write(k * 10**9, "/cf1/range/cf2", message_class("UwbRange")(range_m=1.0))
-    with pytest.raises(RecordingError, match="no robot saw what cf1 saw"):
+    with pytest.raises(RecordingError, match="in common with cf1"):
         run(alone, tmp_path / "out.mcap", Settings())
     assert not (tmp_path / "out.mcap").exists()
 

@@ -259,7 +259,7 @@ def test_the_threshold_of_a_rate_of_false_alarms(write: Callable[..., Path]) -> 
     few = write({"cf1": [*seen, *quiet[:5]]}, looked=["truth"], name="few.mcap")
     with pytest.raises(SettingError, match=r"there are 12 and 5\. Give --threshold"):
         run([few], None, settings)
-    with pytest.raises(SettingError, match="two answers"):
+    with pytest.raises(SettingError, match="cannot be combined"):
         run([path], None, Settings(threshold=0.5, false_alarms=0.05))
 
 

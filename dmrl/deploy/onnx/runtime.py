@@ -47,7 +47,9 @@ class OnnxRun:
         inputs = self._session.get_inputs()
         self.names = [output.name for output in self._session.get_outputs()]
         if [i.name for i in inputs] != ["image"] or "confidence_logit" not in self.names:
-            raise ModelError(f"{where} is not a network that dmrl export wrote. Use one")
+            raise ModelError(
+                f"{where} is not a network of dmrl export. Use an ONNX file that it wrote"
+            )
         self.height_px, self.width_px, self.channels = (int(side) for side in inputs[0].shape[1:])
 
     def outputs(self, images: Images) -> Outputs:

@@ -1,1 +1,1 @@
-"""Kalman filters of a pair and an Ornstein-Uhlenbeck smoother."""
+"""Kalman filters of a pair."""

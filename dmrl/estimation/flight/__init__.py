@@ -1,1 +1,1 @@
-"""Estimate a whole flight: initial guesses, solutions, segments and the swarm."""
+"""Estimate a whole flight: initial guesses, solutions, windows and the swarm."""

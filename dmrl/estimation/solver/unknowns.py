@@ -6,7 +6,7 @@ new unknown is one row with one effect.
 
 A measurement is predicted as (1 + sum a u) z + sum b u, with z the value without errors and u the
 unknowns. An effect returns a or b. ``Steps``, ``RangeLink`` and ``CameraView`` are the measured
-data that an effect can use; see `keyframes`.
+data that an effect can use; see `problem`.
 """
 
 from collections.abc import Callable, Collection
@@ -244,7 +244,7 @@ RANGE_MODELS: dict[str, Unknown] = {
     ),
 }
 """Models of the temporary excess of ranges: jumps behind an obstacle, or reflections that fade in a
-second. Each is one row; `noise.select_model` compares their evidence."""
+second. Each is one row; `noise_selection` compares their evidence."""
 
 YAW_RATE_ERROR = Unknown(
     "yaw_rate_error",

@@ -185,7 +185,7 @@ def _iter_guarded(source: Path, of: Callable[[Any], Iterator[Any]]) -> Generator
     except Exception as e:
         if isinstance(e, MemoryError) or getattr(e, "errno", None) == errno.EFBIG:
             raise SourceError(
-                f"{source} unpacks to much more than its size explains. Record the bag again"
+                f"{source} decompresses to much more than its size explains. Record the bag again"
             ) from e
         why = " ".join(str(e).split())[:200] or type(e).__name__
         raise SourceError(f"{source} cannot be read as a ROS bag: {why}. Restore it") from e

@@ -111,8 +111,8 @@ def pool_sensor_constants(
     out = _select_constants(list(place), pool_flights(flights, rows), rows)
     if not out.sensors.names:
         raise RecordingError(
-            f"{sources[0]}: {len(sources)} recordings agree on nothing of their sensors that is "
-            "known better than of any others. Give more flights, or longer ones"
+            f"{sources[0]}: {len(sources)} recordings determine no sensor constant better than "
+            "its prior. Give more flights, or longer ones"
         )
     return out
 

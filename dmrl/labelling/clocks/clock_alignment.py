@@ -83,8 +83,8 @@ def _robot_clocks(held: FlightLog, wanted: Sources) -> dict[str, Clock]:
     clocks = connect_clocks(pairs, reference)
     if len(clocks) == 1 and not (wanted.cameras or wanted.steady_cameras):
         raise RecordingError(
-            f"{held.path}: no robot saw what {reference} saw, for 20 s at least. Ranges of both "
-            "to each other are wanted, or motion capture (--mocap)"
+            f"{held.path}: no robot has 20 s of ranges or motion capture in common with "
+            f"{reference}. Record ranges of both to each other, or pass --mocap"
         )
     for robot in sorted(robots - clocks.keys()):
         say(f"{held.path}: nothing ties the clock of {robot} to that of {reference}; it stays")

@@ -96,7 +96,7 @@ def build_initial_network(settings: TrainConfig, examples: ExampleSet) -> Networ
 
 
 class Trainer:
-    """Training loop: iterate ``steps()`` to the end, then use ``history`` and ``network``.
+    """Training loop: iterate ``train_steps()`` to the end, then use ``history`` and ``network``.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ class Trainer:
 
     @property
     def steps_left(self) -> int:
-        """Number of steps that ``steps()`` will take."""
+        """Number of steps that ``train_steps()`` will take."""
         return (self._settings.epochs - self._state.epochs_done) * self._steps_per_epoch
 
     def train_steps(self) -> Iterator[StepProgress]:

@@ -65,7 +65,7 @@ def scan_file(stream: BoundedReader) -> ScannedFile:
         if isinstance(record, Chunk):
             size += record.uncompressed_size
             if size > limits.max_unpacked_bytes(stream.size):
-                raise BudgetError(f"it unpacks to more than {size / 1e6:.0f} MB")
+                raise BudgetError(f"it decompresses to more than {size / 1e6:.0f} MB")
             scan = parse_records(decompress(record, stream.tell()))
             for definition in scan.iter_definitions():
                 _register_record(content, definition)

@@ -16,7 +16,7 @@ from dmrl.recording.mcap.message_batch import MAX_TIME_NS
 def check_budget(stream: BoundedReader, summary_section: McapSummary) -> None:
     """Raise unless names, topics and the size of all chunks are within the limits."""
     if max(len(summary_section.channels), len(summary_section.schemas)) > limits.TOPICS:
-        raise BudgetError(f"it has more than {limits.TOPICS} topics or message types")
+        raise BudgetError(f"it has more than {limits.TOPICS} channels or schemas")
     names = chain(
         (c.topic for c in summary_section.channels.values()),
         (s.name for s in summary_section.schemas.values()),
@@ -38,7 +38,7 @@ def check_statistics(summary_section: McapSummary) -> None:
         raise McapError(f"its summary lacks channel {min(unknown)}")
     for channel in summary_section.channels.values():
         if channel.schema_id and channel.schema_id not in summary_section.schemas:
-            raise McapError(f"its summary lacks the message type of {channel.topic}")
+            raise McapError(f"its summary lacks the schema of {channel.topic}")
     statistics = summary_section.statistics
     if statistics is None:
         return

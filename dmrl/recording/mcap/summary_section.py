@@ -212,7 +212,7 @@ def _parse_section(body: bytes) -> SummarySection:
                 summary_section.statistics = record
             case Schema():
                 if summary_section.schemas.setdefault(record.id, record) != record:
-                    raise McapError(f"its summary has two message types {record.id}")
+                    raise McapError(f"its summary has two different schemas of id {record.id}")
             case Channel():
                 if summary_section.channels.setdefault(record.id, record) != record:
                     raise McapError(f"its summary has two channels {record.id}")

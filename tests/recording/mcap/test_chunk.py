@@ -119,7 +119,7 @@ def test_a_chunk_is_unpacked_and_held_against_what_it_says(
     monkeypatch.setattr(limits, "UNPACKED_BYTES", len(DATA))
     assert len(decompress(chunk(DATA, packed, how), 9)) == len(DATA)
     monkeypatch.setattr(limits, "UNPACKED_BYTES", len(DATA) - 1)
-    with pytest.raises(BudgetError, match="unpacks to 0 MB"):
+    with pytest.raises(BudgetError, match="decompresses to 0 MB"):
         decompress(chunk(DATA, packed, how), 9)
 
 

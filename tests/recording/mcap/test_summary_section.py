@@ -48,7 +48,7 @@ def summary(**more: Any) -> Any:
         ({"channel_message_counts": {1: 3, 7: 2}}, "its summary lacks channel 7"),
         ({"channel_message_counts": {1: 5, 7: 0}}, ""),
         ({"channels": {1: SimpleNamespace(topic="/a", schema_id=3)}}, "lacks channel 2"),
-        ({"schemas": {}}, "its summary lacks the message type of /a"),
+        ({"schemas": {}}, "its summary lacks the schema of /a"),
     ],
 )
 def test_a_summary_agrees_with_itself(more: dict[str, Any], fault: str) -> None:

@@ -54,13 +54,13 @@ def decompress(chunk: Chunk, offset: int) -> Bytes:
     """
     size = chunk.uncompressed_size
     if size > limits.UNPACKED_BYTES:
-        raise BudgetError(f"the chunk at byte {offset} unpacks to {size / 1e6:.0f} MB")
+        raise BudgetError(f"the chunk at byte {offset} decompresses to {size / 1e6:.0f} MB")
     try:
         data = _decompress_bytes(chunk.compression, chunk.data, size)
     except (zstandard.ZstdError, RuntimeError, MemoryError, ValueError) as e:
         raise McapError(f"chunk at byte {offset}: {e}") from e
     if len(data) != size:
-        raise McapError(f"chunk at byte {offset} unpacks to another size than it states")
+        raise McapError(f"chunk at byte {offset} decompresses to another size than it states")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise McapError(f"chunk at byte {offset} fails its CRC")
     return np.frombuffer(data, np.uint8)
@@ -70,7 +70,7 @@ def _decompress_bytes(compression: str, data: bytes, size: int) -> bytes:
     """Decompress to at most ``size`` bytes. Neither decoder reserves more memory than that."""
     if compression == "zstd":
         if zstandard.frame_content_size(data) > size:
-            raise ValueError("unpacks to more than the size that it states")
+            raise ValueError("decompresses to more than the size that it states")
         if not size:
             return b""
         return zstandard.ZstdDecompressor().decompress(data, size)
