@@ -31,7 +31,7 @@ def off_m(found: Estimate, flight: Flight, own: str = "cf1", peer: str = "cf2") 
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("trajectory", ["observer_static", "both_static", "parallel"])
-def test_a_camera_tells_the_bearing_of_flights_without_motion(trajectory: Trajectory) -> None:
+def test_detections_resolve_bearing_without_motion(trajectory: Trajectory) -> None:
     flight = flown(trajectory, "calibrated", 3, 30.0)
     ((blind, _),) = estimate_pairs([pair_of(flight)])
     ((here, there),) = estimate_pairs([looking(flight)])
@@ -49,7 +49,7 @@ def test_a_camera_tells_the_bearing_of_flights_without_motion(trajectory: Trajec
 
 
 @pytest.mark.heavy
-def test_wrong_ones_take_nothing_from_a_flight_that_ranges_know() -> None:
+def test_false_detections_do_not_degrade_a_solved_flight() -> None:
     flight = flown("in_view", "calibrated", 3, 60.0)
     ((blind, _),) = estimate_pairs([pair_of(flight)])
     for wrong in (0.07, 0.5):
@@ -61,7 +61,7 @@ def test_wrong_ones_take_nothing_from_a_flight_that_ranges_know() -> None:
 
 
 @pytest.mark.heavy
-def test_a_robot_at_rest_whose_camera_shows_other_things_stays_ambiguous() -> None:
+def test_robot_at_rest_with_false_detections_stays_ambiguous() -> None:
     flight = flown("both_static", "calibrated", 3, 30.0)
     lost = sightings(flight, "cf1", (), wrong=0.5)
     ((here, there),) = estimate_pairs([replace(pair_of(flight), own_bearings=lost)])
@@ -70,7 +70,7 @@ def test_a_robot_at_rest_whose_camera_shows_other_things_stays_ambiguous() -> No
 
 
 @pytest.mark.heavy
-def test_of_two_peers_at_rest_each_gets_its_own() -> None:
+def test_two_peers_at_rest_get_their_own_detections() -> None:
     """One camera sees both, nobody says who is who; the ranges do."""
     flight = simulate(Scenario(3, 30.0, "both_static"), NOISE["calibrated"], 5)
     sees = sightings(flight, "cf1", ("cf2", "cf3"))

@@ -45,7 +45,7 @@ def test_detections_are_directions_in_the_horizontal_frame() -> None:
     assert found.std == pytest.approx(np.tile(wanted, (COUNT // 2, 1, 1)))
 
 
-def test_a_network_that_says_how_sure_it_is_of_a_distance_is_believed_to_a_limit() -> None:
+def test_depth_sigma_of_network_has_a_lower_limit() -> None:
     depth_m = seen().detections[:, 2]
     assert detections_to_bearings(seen(0.4), 0, 3.0, 0.01).std[:, 0, 2] == pytest.approx(
         0.4 / depth_m

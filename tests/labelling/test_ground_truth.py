@@ -37,7 +37,7 @@ def test_a_peer_is_where_the_robot_sees_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(back, [[-3.0, 0.0, -0.4]] * 100, atol=1e-9)
 
 
-def test_lost_markers_tell_nothing(tmp_path: Path) -> None:
+def test_true_path_omits_lost_markers(tmp_path: Path) -> None:
     held = captured(tmp_path / "a.mcap", lost=(20, 60))
     time_ns, _ = find_true_path(held, "cf1", "cf2")
     gone = (time_ns > 19 * 20_000_000) & (time_ns < 60 * 20_000_000)

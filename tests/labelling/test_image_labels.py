@@ -51,7 +51,7 @@ def test_a_peer_is_seen_in_its_quarter_of_the_image(left: float, up: float) -> N
     assert (label["peer"], label["source"], label["status"]) == ("cf2", "estimate", STATUS_OK)
 
 
-def test_right_side_down_lifts_what_is_left_and_nose_down_lifts_what_is_ahead() -> None:
+def test_roll_and_pitch_move_labels_in_the_documented_direction() -> None:
     (rolled,) = labels(positions((2.0, 0.4, 0.0)), roll=0.3)
     assert rolled["u_px"] == pytest.approx(150 - 180 * 0.4 * np.cos(0.3) / 2)
     assert rolled["v_px"] == pytest.approx(100 + 190 * 0.4 * np.sin(0.3) / 2)
@@ -107,7 +107,7 @@ def test_a_margin_is_no_wider_than_three_images() -> None:
     assert far is None
 
 
-def test_who_is_behind_or_too_near_is_not_in_view() -> None:
+def test_peer_behind_or_too_near_is_not_in_view() -> None:
     behind, near, ahead = labels(positions((-2.0, 0, 0), (MIN_DEPTH_M - 0.01, 0, 0), (0.06, 0, 0)))
     assert behind is None
     assert near is None
@@ -115,7 +115,7 @@ def test_who_is_behind_or_too_near_is_not_in_view() -> None:
 
 
 @pytest.mark.parametrize("status", [STATUS_AMBIGUOUS, STATUS_UNCONVERGED])
-def test_who_is_not_located_may_be_anywhere(status: int) -> None:
+def test_peer_without_position_may_be_anywhere_in_the_image(status: int) -> None:
     behind, ahead = labels(positions((-3.0, 4.0, 0.0), (2.0, 0.0, 0.0), status=status))
     assert behind == label_anywhere("cf2", CAMERA, 5.0, status)
     assert (behind["u_px"], behind["v_px"], behind["depth_m"]) == (160, 112, 5.0)

@@ -62,7 +62,7 @@ def written(
     return list(build_label_messages(read_flight(path), known, "cf1", found, look))
 
 
-def test_a_position_message_says_all_of_it(tmp_path: Path) -> None:
+def test_position_message_has_time_frame_covariance_and_status(tmp_path: Path) -> None:
     found = at([1.0, 2.0], STATUS_UNCONVERGED)
     series = build_position_series("cf1", "cf2", found)
     assert series.topic == "/cf1/peer/cf2/position"
@@ -107,7 +107,7 @@ def test_labels_of_others_stay_and_estimates_of_before_go(tmp_path: Path) -> Non
     assert list(second.message.sources) == ["truth"]
 
 
-def test_who_flies_without_a_position_may_be_in_any_image_that_has_one(tmp_path: Path) -> None:
+def test_robot_without_position_is_unconverged_in_every_labelled_image(tmp_path: Path) -> None:
     path = flight(tmp_path / "a.mcap", [2.0, 3.0])
     (only,) = written(path, {"cf2": at([2.0])}, AIDECK, logs(["cf1", "cf2", "cf3", "cf4"]))
     known, *unknown = only.message.peers

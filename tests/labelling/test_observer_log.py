@@ -102,7 +102,7 @@ def test_motion_between_images_is_along_the_axes_before(tmp_path: Path) -> None:
     assert sight.warnings == []
 
 
-def test_without_velocity_or_height_it_stands_with_a_word(tmp_path: Path) -> None:
+def test_missing_velocity_or_height_means_standing_still_and_warns(tmp_path: Path) -> None:
     sight = sight_of(tmp_path / "a.mcap", [seen(2.0), seen(3.0), *motion(False, False)])
     assert sight.motion(1).shift_m.tolist() == [0, 0, 0]
     assert sight.warnings == [
@@ -129,7 +129,7 @@ def test_an_observer_without_attitude_is_an_error(tmp_path: Path) -> None:
         sight_of(tmp_path / "b.mcap", [seen(1.0), lost])
 
 
-def test_what_a_camera_is_calibrated_with(tmp_path: Path) -> None:
+def test_calibration_flight_has_detections_and_peer_paths(tmp_path: Path) -> None:
     place = {"x": 1.0, "y": 2.0, "z": 3.0}
     spread = [0.04, 0, 0, 0, 0.05, 0, 0, 0, 0.06]
     topic = topics.POSITION("cf1", "cf2")

@@ -54,7 +54,7 @@ def report(path: Path) -> PairReport:
     return report_pair(read_flight(path), ("cf1", "cf2"), found(), estimate())
 
 
-def test_a_report_says_how_sure_and_how_right(tmp_path: Path) -> None:
+def test_pair_report_has_sigma_shares_and_rmse(tmp_path: Path) -> None:
     got = report(flight(tmp_path / "a.mcap", np.arange(0, 4.1, 0.5).tolist()))
     assert (got.robot, got.peer, got.positions) == ("cf1", "cf2", 5)
     assert (got.kept_share, got.ambiguous_share) == pytest.approx((0.6, 0.2))

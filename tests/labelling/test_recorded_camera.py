@@ -30,7 +30,7 @@ def flight(path: Path, **lens: Any) -> Path:
 
 
 @pytest.mark.parametrize("model", ["", "plumb_bob", "rational_polynomial"])
-def test_a_calibration_is_read_as_it_was_written(tmp_path: Path, model: str) -> None:
+def test_recorded_camera_equals_written_calibration(tmp_path: Path, model: str) -> None:
     path = flight(tmp_path / "a.mcap", D=[0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0], distortion_model=model)
     lens = (0.1, 0.2, 0.3, 0.4, 0.5)
     assert find_recorded_camera(read_flight(path), "cf1") == Camera(

@@ -33,14 +33,14 @@ KNOWN = SensorConstants(
 )
 
 
-def test_what_was_written_is_read(tmp_path: Path) -> None:
+def test_sensor_file_round_trips(tmp_path: Path) -> None:
     path = tmp_path / "sensors.toml"
     path.write_text(write_sensors(KNOWN))
     assert read_sensors(path) == KNOWN
     assert KNOWN.names == ["cf1", "cf2"]
 
 
-def test_logs_come_out_as_the_sensors_should_have_said() -> None:
+def test_logged_values_are_corrected_by_sensor_constants() -> None:
     true = np.array([[0.4, -0.2], [0.0, 1.0]])
     logged = true * 1.15 + [0.02, -0.03]
     assert KNOWN.correct_velocity("cf2", logged) == pytest.approx(true)
@@ -106,7 +106,7 @@ def test_a_recording_is_read_without_what_is_known_to_be_off(tmp_path: Path) -> 
 
 
 @pytest.mark.heavy
-def test_what_is_known_exactly_is_not_solved_for() -> None:
+def test_known_constants_stay_fixed_in_the_solve() -> None:
     pair = pair_of(flown("in_view", "realistic", 31))
     free = estimate_pairs([pair])[0][0]
     known: dict[Subject, float] = {("range_offset", (0, 1)): 1e-4, ("velocity_scale", (1,)): 1e-4}

@@ -138,7 +138,7 @@ def without(kind: str) -> Callable[[Write], None]:
     ],
     ids=["no velocity", "short", "late and short", "few ranges"],
 )
-def test_what_is_left_out_is_said(tmp_path: Path, parts: list[Any], said: list[str]) -> None:
+def test_omitted_pairs_are_reported(tmp_path: Path, parts: list[Any], said: list[str]) -> None:
     found = logs(tmp_path / "a.mcap", *parts)
     assert not found.pairs
     assert found.warnings == said
@@ -153,7 +153,7 @@ def test_a_grid_is_of_the_time_that_both_logs_share(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["attitude", "velocity", "height"])
-def test_a_sensor_that_only_says_nan_is_none(tmp_path: Path, kind: str) -> None:
+def test_sensor_with_only_nan_is_omitted(tmp_path: Path, kind: str) -> None:
     def spoilt(write: Write) -> None:
         def one(t: float, topic: str, m: Any) -> None:
             for field in m.DESCRIPTOR.fields if topic == f"/cf2/{kind}" else ():
@@ -189,7 +189,7 @@ def test_silence_is_a_gap_of_that_robot(tmp_path: Path) -> None:
     assert warning.endswith(" s; unconverged there")
 
 
-def test_who_has_a_log_and_no_pair_is_flying_and_said_so(tmp_path: Path) -> None:
+def test_robot_with_log_but_no_pair_is_reported(tmp_path: Path) -> None:
     three = lambda write: flight(write, ("cf1", "cf2", "cf3"))  # noqa: E731
     found = logs(tmp_path / "a.mcap", three, ranges)
     assert found.flying == {"cf1", "cf2", "cf3"}
@@ -198,7 +198,7 @@ def test_who_has_a_log_and_no_pair_is_flying_and_said_so(tmp_path: Path) -> None
     ]
 
 
-def test_samples_that_are_no_numbers_and_clocks_that_go_back_are_said(tmp_path: Path) -> None:
+def test_non_finite_samples_and_backward_clocks_are_reported(tmp_path: Path) -> None:
     def bad(write: Write) -> None:
         for time_s, height_m in ((8.0, float("nan")), (8.01, -1e300)):
             write(time_s, topics.HEIGHT("cf1"), message_class("Height")(height_m=height_m))

@@ -55,7 +55,7 @@ def shown_by(robots: NDArray[np.float32], window: CropWindow, rect: Rect) -> NDA
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_turned_camera_sees_points_where_and_as_deep_as_they_then_are(seed: int) -> None:
+def test_turned_camera_projects_points_and_depths_correctly(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = np.array([0.3, -0.2, 1.0]) * rng.uniform(0.7, 1.3, (20, 3))
     source = seen_at(points[:1])[0]
@@ -74,7 +74,7 @@ def test_a_turned_camera_sees_points_where_and_as_deep_as_they_then_are(seed: in
     np.testing.assert_allclose(got[:, 5] / got[:, 2], 0.1 / points[:, 2], rtol=1e-5)
 
 
-def test_what_is_straight_above_stays_straight_above() -> None:
+def test_turned_camera_keeps_vertical_lines_vertical() -> None:
     post = np.array([[0.5, y, 1.0] for y in (-0.4, 0.0, 0.3)])
     matrix = build_rotation_homography(
         CAMERA, UPRIGHT, pair(seen_at(post)[1]), (90.0, 100.0), (0.0, 0.0)
@@ -91,20 +91,20 @@ def test_a_zoom_brings_the_point_it_is_about_nearer_by_as_much() -> None:
     np.testing.assert_allclose(got[0, :3], [*at, 1.2 / 1.5], rtol=1e-5)
 
 
-def test_what_is_behind_a_turned_camera_is_nowhere() -> None:
+def test_points_behind_a_turned_camera_are_nan() -> None:
     away = np.array([[-3.0, 0.0, 1.0]])
     matrix = build_rotation_homography(CAMERA, UPRIGHT, (318.0, 100.0), (0.0, 100.0), (0.0, 0.0))
     got = shown_by(robots_at(away), CropWindow(matrix, 1.0, CAMERA), WHOLE)
     assert np.isnan(got[0, :2]).all()
 
 
-def test_what_is_beside_the_camera_is_nowhere() -> None:
+def test_homography_of_points_at_infinity_is_nan() -> None:
     sideways = np.eye(3)[[0, 1, 0]].tolist()
     assert np.isnan(apply_homography(sideways, 0.0, 1.0)).all()
     assert apply_homography(sideways, 2.0, 1.0) == (1.0, 0.5)
 
 
-def test_pixels_go_where_labels_go() -> None:
+def test_warped_pixels_and_labels_agree() -> None:
     point = np.array([[0.35, 0.15, 1.0]])
     u, v = seen_at(point)[0]
     down, across = np.indices((224, 320)) + 0.5
@@ -208,7 +208,7 @@ def centres(*uv: tuple[float, float]) -> NDArray[np.float32]:
     return out
 
 
-def test_a_rectangle_is_cut_in_two_or_four_near_its_middle() -> None:
+def test_mosaic_splits_a_rectangle_into_two_or_four_parts() -> None:
     rng, kinds = np.random.default_rng(0), set()
     for _ in range(60):
         cut = tile_mosaic((10, 20, 70, 110), rng)
@@ -240,13 +240,13 @@ def test_a_rectangle_holds_its_left_and_upper_border() -> None:
     assert [is_covered(robot, rect, None) for robot in robots] == held
 
 
-def test_distance_over_depth_is_the_length_of_a_ray_one_deep() -> None:
+def test_ray_length_is_distance_over_depth() -> None:
     points = np.array([[0.0, 0, 2], [1, 0, 2], [0, -1.5, 3], [1, 2, 2]])
     wanted = np.linalg.norm(points, axis=1) / points[:, 2]
     assert [ray_length(CAMERA, *pair(at)) for at in seen_at(points)] == pytest.approx(wanted)
 
 
-def test_a_flat_window_is_a_turn_about_a_point() -> None:
+def test_crop_homography_rotates_and_scales_about_a_point() -> None:
     matrix = build_crop_homography(((0.0, -0.5), (0.5, 0.0)), (30.0, 40.0), (7.0, 9.0))
     shown = [(7.0, 9.0), (9.0, 9.0), (7.0, 11.0)]
     assert [apply_homography(matrix.tolist(), *at) for at in shown] == [

@@ -38,7 +38,7 @@ def test_gradients_of_one_step_are_gone_before_the_next(examples: ExampleSet) ->
     assert sizes[1] == pytest.approx(sizes[0], rel=1e-3)
 
 
-def test_every_epoch_has_an_order_of_its_own(examples: ExampleSet, tmp_path: Path) -> None:
+def test_epochs_differ_in_order_and_are_reproducible(examples: ExampleSet, tmp_path: Path) -> None:
     training = Trainer(build_initial_network(SETTINGS, examples), examples, SETTINGS, tmp_path)
     seen = [
         torch.cat([b.images for b in training._iter_batches(epoch, None)]) for epoch in (0, 0, 1)
@@ -60,7 +60,7 @@ def test_an_epoch_of_so_many_images_takes_as_many_steps_of_few(
     assert all(np.isfinite(epoch["loss"]) for epoch in training.history)
 
 
-def test_the_loss_that_is_shown_is_the_mean_over_the_images_since_the_last(
+def test_reported_loss_is_the_mean_since_the_last_report(
     examples: ExampleSet, tmp_path: Path
 ) -> None:
     settings = replace(SETTINGS, epochs=2)
@@ -105,7 +105,7 @@ def test_curves_stand_at_the_steps_of_what_they_show(
     )
 
 
-def test_every_step_is_asked_for_as_the_recipe_says(
+def test_trainer_passes_recipe_settings_to_each_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is computed here: what each step of three epochs would be given."""

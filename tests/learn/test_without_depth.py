@@ -56,7 +56,7 @@ def test_the_loss_has_no_gradient_where_the_depth_is_unknown() -> None:
     assert not out["log_depth"].grad.any()
 
 
-def test_of_two_in_a_cell_the_one_with_a_depth_counts() -> None:
+def test_label_with_depth_wins_within_a_cell() -> None:
     for order in (1, -1):
         rows = ((20.0, 20.0, 0.0, np.inf), (21.0, 20.0, 3.0, 0.0))[::order]
         made = build_targets(robots(*rows), SHAPE, sigma_cells=0.0)

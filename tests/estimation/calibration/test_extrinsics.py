@@ -62,7 +62,7 @@ def test_mount_and_delay_are_found_again() -> None:
 
 
 @pytest.mark.heavy
-def test_a_camera_that_is_right_is_left_as_it_is() -> None:
+def test_exact_mount_and_delay_stay_unchanged() -> None:
     found = calibrate_mount([flight(1, AIDECK)], AIDECK, Noise(3.0, 0.005))
     assert found is not None
     assert np.abs(np.degrees(found.camera.mount_rad)).max() < 0.3
@@ -96,7 +96,7 @@ def test_gaps_in_the_positions_are_not_bridged() -> None:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("delay_s", [-0.3, 0.0, 0.2])
-def test_the_delay_does_not_hang_on_where_it_starts(delay_s: float) -> None:
+def test_delay_is_independent_of_its_initial_guess(delay_s: float) -> None:
     # Attitude as a log has it: its noise moves a peer by a pixel from sample to sample.
     rng = np.random.default_rng(7)
     clean = flight(5, images=400)
@@ -151,7 +151,7 @@ def test_a_path_that_is_far_off_for_seconds_does_not_turn_the_mount() -> None:
 
 
 @pytest.mark.heavy
-def test_how_far_single_detections_are_off_is_found() -> None:
+def test_detection_noise_is_estimated() -> None:
     sharp, blunt = (
         calibrate_mount([flight(9, images=600, outliers=0.0)], AIDECK, Noise(pixels, 0.005))
         for pixels in (3.0, 9.0)
@@ -167,7 +167,7 @@ def mount_of(values: np.ndarray, std_s: float, cost: float = 5.0) -> MountEstima
 
 
 @pytest.mark.parametrize(("true_s", "wanted_s"), [(0.003, 0.003), (0.0004, 0.001)])
-def test_a_delay_is_as_sure_as_others_are_worse(
+def test_delay_std_follows_curvature_of_the_cost(
     true_s: float, wanted_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The cost beside the best is a parabola here, wider or narrower than the solve says."""

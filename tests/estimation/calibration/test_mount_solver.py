@@ -66,7 +66,7 @@ def seen(images: int = 30) -> tuple[list[PeerView], Matches]:
 VIEWS, MATCHED = seen()
 
 
-def test_slopes_are_those_of_small_steps() -> None:
+def test_pixel_jacobian_equals_finite_differences() -> None:
     found = pixel_jacobian(VIEWS, AIDECK, MATCHED, VALUES)
     assert found.shape == (len(MATCHED.time_s), 2, 4)
     for k in range(4):
@@ -78,7 +78,7 @@ def test_slopes_are_those_of_small_steps() -> None:
         assert found[:, :, k] == pytest.approx(slope, rel=0.02, abs=0.02 * np.abs(slope).max())
 
 
-def test_axes_lie_along_the_line_of_sight_across_it_and_up() -> None:
+def test_error_axes_are_along_and_across_the_line_of_sight_and_up() -> None:
     xyz = np.array([[3.0, 4.0, 1.0], [-2.0, 0.0, -0.5], [0.03, 0.04, 1.0]])
     spread = np.array([np.diag([0.04, 0.09, 0.01]) + 0.01] * 3)
     axes, turn = _error_axes(xyz, spread)
@@ -96,13 +96,13 @@ def test_axes_lie_along_the_line_of_sight_across_it_and_up() -> None:
     assert turn * across == pytest.approx(ROTATION_SHARE**0.5 * np.median(across / level) * level)
 
 
-def test_knots_vary_as_a_process_that_fades() -> None:
+def test_knots_have_an_exponential_markov_prior() -> None:
     covariance = np.linalg.inv(_markov_information(6).toarray())
     away_s = KNOT_SPACING_S * np.abs(np.subtract.outer(np.arange(6), np.arange(6)))
     assert covariance == pytest.approx(np.exp(-away_s / DECAY_S))
 
 
-def test_errors_of_a_path_show_where_the_moved_path_would_be_seen() -> None:
+def test_path_error_jacobian_equals_finite_differences() -> None:
     paths = _linearize_paths(VIEWS, TRUE, MATCHED, VALUES)
     assert [path.flight for path in paths] == [0, 1]  # of those that were seen
     for path, number in zip(paths, (0, 2), strict=True):
@@ -130,7 +130,7 @@ def test_errors_of_a_path_show_where_the_moved_path_would_be_seen() -> None:
             assert path.level[:, k] == pytest.approx(shift, abs=0.06 * np.abs(shift).max())
 
 
-def test_between_knots_an_error_goes_along_a_line() -> None:
+def test_path_error_is_linear_between_knots() -> None:
     for path in _linearize_paths(VIEWS, TRUE, MATCHED, VALUES):
         since_s = MATCHED.time_s[path.rows] - MATCHED.time_s[path.rows[0]]
         fading = path.errors[:, 4:]
@@ -140,7 +140,7 @@ def test_between_knots_an_error_goes_along_a_line() -> None:
 
 
 @pytest.mark.parametrize("held", [False, True])
-def test_a_step_is_that_of_the_dense_equations(held: bool) -> None:
+def test_gauss_newton_step_equals_dense_solve(held: bool) -> None:
     rng = np.random.default_rng(4)
     paths = _linearize_paths(VIEWS, TRUE, MATCHED, VALUES)
     starts = [0.3 * rng.normal(size=path.prior.shape[0]) for path in paths]
@@ -182,14 +182,14 @@ def test_a_step_is_that_of_the_dense_equations(held: bool) -> None:
     assert (errors.levels - levels).ravel() == pytest.approx(wanted[-4:], abs=1e-8)
 
 
-def test_a_charge_is_half_a_square_that_is_small_and_hardly_grows_later() -> None:
+def test_cauchy_cost_is_quadratic_then_logarithmic() -> None:
     assert _cauchy_cost(np.array([1e-4, 3e-4])) == pytest.approx(2e-4, rel=1e-3)
     assert _cauchy_cost(np.array([CAUCHY_SIGMAS**2])) == pytest.approx(
         0.5 * CAUCHY_SIGMAS**2 * np.log(2)
     )
 
 
-def test_a_mount_is_found_its_delay_held_or_not_and_what_was_missed_costs() -> None:
+def test_mount_is_solved_with_free_or_fixed_delay_and_misses_add_cost() -> None:
     off = VALUES + np.array([0.01, -0.01, 0.01, 0.02])
     found = solve_mount(VIEWS, TRUE, MATCHED, off, NOISE, 3.0)
     sigma = np.sqrt(np.diag(found.covariance))
@@ -207,7 +207,7 @@ def test_a_mount_is_found_its_delay_held_or_not_and_what_was_missed_costs() -> N
     assert found.cost > 0
 
 
-def test_what_a_mount_costs_is_the_loss_of_what_is_left_in_sigmas(
+def test_mount_cost_is_robust_loss_of_residuals_in_sigmas(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(mount_solver, "MAX_ROUNDS", 0)
@@ -217,13 +217,13 @@ def test_what_a_mount_costs_is_the_loss_of_what_is_left_in_sigmas(
     assert found.cost == pytest.approx(_cauchy_cost(square))
 
 
-def test_a_mount_that_nobody_would_build_is_at_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mount_angles_are_clipped_to_their_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mount_solver, "MAX_VALUES", np.array([0.01, 0.35, 0.35, 0.5]))
     found: Array = solve_mount(VIEWS, TRUE, MATCHED, VALUES, NOISE, 3.0).values
     assert abs(found[0]) <= 0.01
 
 
-def test_a_rough_search_comes_near_from_some_degrees_off() -> None:
+def test_coarse_search_converges_from_a_few_degrees() -> None:
     off = np.array([0.03, -0.03, 0.03, 0.08])
     for sign in (1, -1):
         found = _fit_independent(VIEWS, TRUE, MATCHED, VALUES + sign * off)
@@ -231,7 +231,7 @@ def test_a_rough_search_comes_near_from_some_degrees_off() -> None:
         assert abs(found[3] - VALUES[3]) < 0.03
 
 
-def test_of_tries_that_are_about_as_good_one_of_each_delay_is_refined() -> None:
+def test_one_candidate_per_delay_is_refined() -> None:
     def one(delay_s: float, misfit: float) -> _Candidate:
         return _Candidate(np.array([0.0, 0, 0, delay_s]), misfit)
 

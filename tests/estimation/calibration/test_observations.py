@@ -81,7 +81,7 @@ def test_a_peer_is_expected_where_its_path_is_known_at_the_exposure() -> None:
     assert match_detections([(late, PATH)], CAMERA, 30.0, Noise()).expected == 2
 
 
-def test_whitened_errors_have_the_variance_of_one() -> None:
+def test_whitened_errors_have_unit_covariance() -> None:
     here = flight([0, 1, 2, 3], seen())
     noise = Noise(5.0, 0.02)
     found = match_detections([(here, PATH)], CAMERA, 30.0, noise)
@@ -94,7 +94,7 @@ def test_whitened_errors_have_the_variance_of_one() -> None:
     assert np.cov(found.whiten[1] @ error.T) == pytest.approx(np.eye(2), abs=0.05)
 
 
-def test_a_thinner_flight_keeps_detections_with_their_images() -> None:
+def test_thinned_flight_keeps_detections_of_kept_images() -> None:
     uv = np.arange(10.0).reshape(5, 2)
     thin = flight([0, 1, 2, 2, 3], uv).thin_images(2)
     assert thin.image_s.tolist() == [1.0, 3.05]
@@ -103,7 +103,7 @@ def test_a_thinner_flight_keeps_detections_with_their_images() -> None:
     assert flight([0, 1, 2, 2, 3], uv).thin_images(4).image.tolist() == [0, 1, 2, 2, 3]
 
 
-def test_attitude_loses_its_noise_and_keeps_its_motion() -> None:
+def test_smoothing_removes_attitude_noise_and_keeps_motion() -> None:
     at_s = np.arange(0, 5, 0.01)
     slow = np.column_stack([0.2 * np.sin(at_s), 0.1 * np.cos(2 * at_s)])
     noise = np.random.default_rng(0).normal(0, 0.02, slow.shape)
@@ -117,7 +117,7 @@ def test_attitude_loses_its_noise_and_keeps_its_motion() -> None:
         assert np.std(left, axis=1).max() < most_rad
 
 
-def test_attitude_that_jumps_loses_its_noise_and_keeps_its_jumps() -> None:
+def test_smoothing_keeps_attitude_steps() -> None:
     at_s, rng = np.arange(0, 60, 0.01), np.random.default_rng(1)
     since_s = at_s % 1.5
     true = np.column_stack([0.1 * np.exp(-since_s / 0.25), -0.05 * np.exp(-since_s / 0.25)])
@@ -133,7 +133,7 @@ def test_attitude_that_jumps_loses_its_noise_and_keeps_its_jumps() -> None:
         assert np.abs(left[beside].mean(axis=0)).max() < 0.005
 
 
-def test_of_white_noise_the_window_leaves_what_a_bell_of_two_samples_leaves() -> None:
+def test_attitude_smoother_attenuates_noise_as_a_two_sample_gaussian() -> None:
     """A mean under weights w of independent values has the variance sum w^2 / (sum w)^2."""
     noise = np.random.default_rng(2).normal(0, 0.01, (5000, 2))
     here = replace(flight([], np.zeros((0, 2))), attitude_s=np.arange(5e3), attitude_rad=noise)
@@ -141,14 +141,14 @@ def test_of_white_noise_the_window_leaves_what_a_bell_of_two_samples_leaves() ->
     assert here.smooth_attitude().attitude_rad.std() == pytest.approx(0.01 * bell, rel=0.06)
 
 
-def test_attitude_of_two_samples_stays_as_it_is() -> None:
+def test_attitude_of_two_samples_is_unchanged() -> None:
     two = np.array([[0.1, 0.2], [0.3, 0.4]])
     here = replace(flight([], np.zeros((0, 2))), attitude_s=np.arange(2.0), attitude_rad=two)
     assert here.smooth_attitude().attitude_rad.tolist() == two.tolist()
 
 
 @pytest.mark.parametrize("found", [1, 2, 4])
-def test_images_without_a_detection_near_are_the_worst_there_are(found: int) -> None:
+def test_image_without_near_detection_costs_the_maximum(found: int) -> None:
     views, values = [(flight(list(range(found)), seen()[:found]), PATH)], np.zeros(4)
     misfit = _mean_misfit(views, CAMERA, np.array([*CAMERA.mount_rad, CAMERA.delay_s]), Noise())
     assert misfit == pytest.approx(MAX_SQUARED_RESIDUAL * (4 - found) / 4, abs=1e-6)

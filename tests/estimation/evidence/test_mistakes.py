@@ -10,7 +10,7 @@ from ..flights import flown, pair_of
 BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
 
 
-def test_a_sign_is_corrected_for_one_robot_alone() -> None:
+def test_sign_correction_applies_to_one_robot() -> None:
     pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
     wrong = replace(pair, peer=replace(pair.peer, yaw_rate_radps=-pair.peer.yaw_rate_radps))
     again = BY_NAME["yaw rate fits if it is negated"].apply(wrong, 1)

@@ -23,7 +23,7 @@ def steps_of(seed: int, preset: str) -> Steps:
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_the_twin_agrees_with_filterpy(preset: str) -> None:
+def test_vectorized_ekf_equals_filterpy(preset: str) -> None:
     flights = [steps_of(seed, preset) for seed in (1000, 1001)]
     state, covariance = filter_many(stack_pairs(flights), PRESETS[preset])
     for k, steps in enumerate(flights):
@@ -33,7 +33,7 @@ def test_the_twin_agrees_with_filterpy(preset: str) -> None:
         assert np.abs(covariance[:, k] - reference_covariance).max() < 1e-9 * max(scale, 1.0)
 
 
-def test_filterpy_keeps_a_flat_state_flat_and_spoils_a_column() -> None:
+def test_filterpy_needs_a_one_dimensional_state() -> None:
     ekf = ExtendedKalmanFilter(dim_x=3, dim_z=1)
     assert ekf.x.shape == (3, 1)  # the default, with which a flat gain broadcasts to (3, 3)
     state, _ = filter_reference(steps_of(1000, "published-sim"), PRESETS["published-sim"])
@@ -77,7 +77,7 @@ def test_a_range_is_the_length_of_all_three_sides() -> None:
     assert by_state[0] == pytest.approx([3 / 13, 4 / 13, 0.0], abs=1e-3)
 
 
-def test_steps_are_what_either_robot_measured_and_ranges_go_to_the_nearest() -> None:
+def test_ekf_steps_hold_inputs_and_ranges_go_to_the_nearest_step() -> None:
     time_s = 7 + np.arange(50) / 100
     own, peer = (
         SensorTrack(*(k + 10 * n + 0.01 * np.arange(50) for k in range(4)), np.zeros(50, bool))
@@ -97,7 +97,7 @@ def test_steps_are_what_either_robot_measured_and_ranges_go_to_the_nearest() -> 
     assert twice.inputs.shape == (50, 2, 6) and twice.range_m.shape == (50, 2)
 
 
-def test_inputs_vary_as_velocities_and_as_yaw_rates() -> None:
+def test_input_covariance_has_velocity_and_yaw_rate_variances() -> None:
     preset = PRESETS["published-firmware"]
     v, r = preset.velocity_var, preset.yaw_rate_var
     assert v != r

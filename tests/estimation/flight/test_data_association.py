@@ -61,7 +61,7 @@ def bearings(sees: BearingMeasurements | None) -> Array:
     return np.unique(sees.bearing[np.isfinite(sees.bearing[..., 0]), 0])
 
 
-def test_who_took_another_s_candidates_is_solved_again_without_them() -> None:
+def test_conflicting_pair_is_resolved_without_shared_candidates() -> None:
     pairs = pairs_of(candidates(LEFT, RIGHT))
     found = both_ways({("a", "b"): at(LEFT), ("a", "c"): at(LEFT - 0.08)})
     (again,) = resolve_conflicts(pairs, found).items()
@@ -70,13 +70,13 @@ def test_who_took_another_s_candidates_is_solved_again_without_them() -> None:
     assert bearings(pairs["a", "c"].own_bearings) == pytest.approx([RIGHT, LEFT])
 
 
-def test_a_vague_solution_s_claim_is_the_weaker_one() -> None:
+def test_less_certain_pair_loses_the_conflict() -> None:
     pairs = pairs_of(candidates(LEFT, RIGHT))
     found = both_ways({("a", "b"): at(LEFT, 0.5), ("a", "c"): at(LEFT, 0.1)})
     assert list(resolve_conflicts(pairs, found)) == [("a", "b")]
 
 
-def test_robots_that_each_have_their_own_are_left_alone() -> None:
+def test_pairs_without_conflict_are_unchanged() -> None:
     pairs = pairs_of(candidates(LEFT, RIGHT))
     assert not resolve_conflicts(pairs, both_ways({("a", "b"): at(LEFT), ("a", "c"): at(RIGHT)}))
     blind = {names: replace(pair, own_bearings=None) for names, pair in pairs.items()}
@@ -97,7 +97,7 @@ def test_the_camera_of_a_robot_that_is_second_by_name_counts_as_well() -> None:
     assert again[1].own_bearings is None
 
 
-def test_images_without_a_candidate_left_are_no_images() -> None:
+def test_images_without_candidates_are_dropped() -> None:
     sees = candidates(LEFT)
     gone = np.arange(len(TIMES_S)) < 3
     left = drop_candidates(sees, gone, np.zeros(len(TIMES_S), np.intp))
@@ -105,14 +105,14 @@ def test_images_without_a_candidate_left_are_no_images() -> None:
     assert sees.crop(1.0, 2.0).time_s.tolist() == [1.0, 1.5, 2.0]
 
 
-def test_directions_are_as_uncertain_as_the_place_is() -> None:
+def test_bearing_variance_follows_position_covariance() -> None:
     rng, place = np.random.default_rng(0), np.array([[1.5, -0.8, 0.4]])
     spread = np.diag([0.02, 0.01, 0.015]) ** 2
     drawn = to_bearing(place + rng.multivariate_normal(np.zeros(3), spread, 50_000))
     assert bearing_variance(place, spread[None])[0] == pytest.approx(drawn.var(axis=0), rel=0.05)
 
 
-def test_a_claim_is_the_density_of_what_was_seen() -> None:
+def test_association_likelihood_is_the_gaussian_density() -> None:
     place, spread = np.array([[2.0, 0.0, 0.0]]), 0.1**2 * np.eye(3)[None]
     sees = candidates(0.1, 0.3)
     one = BearingMeasurements(sees.time_s[:1], sees.bearing[:1], sees.std[:1])

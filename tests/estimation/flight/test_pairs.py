@@ -54,7 +54,7 @@ def rmse(
     return float(np.sqrt((error[settled] ** 2).sum(axis=1).mean()))
 
 
-def test_spreads_grow_with_what_else_may_be() -> None:
+def test_covariance_includes_distance_between_modes() -> None:
     """Two solutions of one weight, 1 m apart."""
     problem = build_problem({(0, 1): pair_of(flown("in_view", "calibrated", 1000, 20.0))})
     count, width = len(problem.keyframe_s), problem.layout.width
@@ -111,7 +111,7 @@ def test_the_batch_solve_beats_the_published_filter() -> None:
 
 
 @pytest.mark.heavy
-def test_the_grade_tells_calibrated_sensors_from_realistic_and_harsh_ones() -> None:
+def test_noise_scale_orders_calibrated_realistic_and_harsh_sensors() -> None:
     grades = [solved("in_view", n, 1001)[0].noise for n in ("calibrated", "realistic", "harsh")]
     assert grades[0].grade < grades[1].grade < grades[2].grade
     assert grades[0].grade < 0.8 < grades[2].grade
@@ -119,7 +119,7 @@ def test_the_grade_tells_calibrated_sensors_from_realistic_and_harsh_ones() -> N
 
 
 @pytest.mark.heavy
-def test_both_directions_come_from_one_solve() -> None:
+def test_both_directions_are_transforms_of_one_solve() -> None:
     here, there = solved("in_view", "calibrated", 1001)
     assert rmse(there, 1001, own="cf2") < 0.35
     assert np.allclose(transform_to_peer(there.state), here.state)
@@ -151,13 +151,15 @@ def test_motion_that_leaves_the_bearing_open_is_never_ok(
 @pytest.mark.parametrize("seed", range(1000, 1005))
 @pytest.mark.parametrize("trajectory", ["observer_static", "parallel", "both_static", "hover"])
 @pytest.mark.parametrize("noise", ["realistic", "harsh"])
-def test_nor_is_it_in_other_flights(trajectory: Trajectory, noise: str, seed: int) -> None:
+def test_motion_that_leaves_the_bearing_open_is_ambiguous_in_other_flights(
+    trajectory: Trajectory, noise: str, seed: int
+) -> None:
     (estimate, _) = solved(trajectory, noise, seed)
     assert (estimate.status == room.AMBIGUOUS).mean() > 0.9
 
 
 @pytest.mark.heavy
-def test_where_a_sensor_is_silent_nothing_is_ok() -> None:
+def test_no_position_is_ok_during_sensor_dropout() -> None:
     pair = pair_of(flown("random", "calibrated", 1001, LONG_S))
     gap = (pair.time_s > 30) & (pair.time_s < 33)
     held = SensorTrack(*(np.where(gap, 0.0, signal) for signal in pair.own.signals()), gap)
@@ -170,7 +172,7 @@ def test_where_a_sensor_is_silent_nothing_is_ok() -> None:
 
 
 @pytest.mark.heavy
-def test_where_ranges_are_silent_nothing_is_ok_and_nothing_is_out_of_their_reach() -> None:
+def test_no_position_is_ok_during_range_dropout_and_distance_stays_bounded() -> None:
     pair = pair_of(flown("random", "calibrated", 1000, LONG_S))
     kept = (pair.range_time_s < 30) | (pair.range_time_s > 33)
     range_time_s, range_m = pair.range_time_s[kept], pair.range_m[kept]
@@ -183,7 +185,7 @@ def test_where_ranges_are_silent_nothing_is_ok_and_nothing_is_out_of_their_reach
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("fault", ["shadowed", "own bias", "peer bias", "offset"])
-def test_a_fault_does_not_move_the_flight(fault: str) -> None:
+def test_solve_is_robust_to_range_and_gyro_faults(fault: str) -> None:
     # A minute does not tell an offset of the ranges well enough to keep anything.
     duration_s = 100.0 if fault == "offset" else LONG_S
     pair = pair_of(flown("in_view", "calibrated", 1002, duration_s))
@@ -217,7 +219,7 @@ def test_pairs_of_different_length_are_estimated_together_as_alone() -> None:
         assert np.allclose(alone.state, estimate.state)
 
 
-def test_between_keyframes_positions_are_interpolated_and_outside_unconverged() -> None:
+def test_positions_are_interpolated_and_unconverged_outside_the_flight() -> None:
     none = np.zeros(2, np.int8)
     estimate = Estimate(
         np.array([0.0, 1.0]),
@@ -233,7 +235,7 @@ def test_between_keyframes_positions_are_interpolated_and_outside_unconverged() 
     assert status.tolist() == [room.OK, room.UNCONVERGED]
 
 
-def test_between_two_statuses_the_worse_counts_and_turned_covariances_are_those_of_draws() -> None:
+def test_interpolation_takes_worse_status_and_peer_covariance_is_sampled() -> None:
     spread = np.array([[0.02, 0.01, 0.003], [0.01, 0.03, -0.002], [0.003, -0.002, 0.01]])
     state = np.array([[1.0, 0.5, 0.4], [1.0, 0.5, 0.4]])
     status = np.array([room.OK, room.AMBIGUOUS], np.int8)

@@ -43,7 +43,7 @@ def solved(seen: Array, likeliest: Array) -> Estimate:
     return replace(made, constants_covariance=covariance)
 
 
-def test_a_flight_tells_what_it_does_without_its_prior() -> None:
+def test_flight_information_excludes_the_prior() -> None:
     rng = np.random.default_rng(0)
     seen, likeliest = information(rng), rng.normal(0, 0.5 * USUAL)
     out = flight_information(solved(seen, likeliest), SUBJECTS, ALL)
@@ -52,7 +52,7 @@ def test_a_flight_tells_what_it_does_without_its_prior() -> None:
     assert out.information_vector * USUAL == pytest.approx(seen @ likeliest * USUAL, rel=1e-4)
 
 
-def test_the_next_flight_is_as_far_off_as_is_said() -> None:
+def test_pooled_std_predicts_error_of_the_next_flight() -> None:
     """Of many labs, whose robots' constants stay but for a little, as in their priors' units."""
     rng = np.random.default_rng(1)
     off = []
@@ -70,7 +70,7 @@ def test_the_next_flight_is_as_far_off_as_is_said() -> None:
     assert 0.75 < np.sqrt(np.mean(np.square(off))) < 1.25
 
 
-def test_where_a_difference_alone_is_told_one_robot_is_off() -> None:
+def test_pooling_assigns_a_common_difference_to_the_shared_robot() -> None:
     row = np.zeros(SIZE)
     row[OWN_GYRO], row[PEER_GYRO] = -1e4, 1e4
     seen = np.outer(row, row)
@@ -84,7 +84,7 @@ def test_where_a_difference_alone_is_told_one_robot_is_off() -> None:
     assert found.mean[[OWN_GYRO, SIZE]] == pytest.approx(0.0, abs=0.003)
 
 
-def test_what_is_another_every_time_is_not_known() -> None:
+def test_constant_that_varies_between_flights_keeps_a_wide_std() -> None:
     seen = np.zeros((SIZE, SIZE))
     seen[RANGE_BIAS, RANGE_BIAS] = 1e6
     offsets = [-0.4, 0.5, 0.1, -0.3, 0.45, -0.35]

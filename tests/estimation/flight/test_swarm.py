@@ -59,7 +59,7 @@ def test_all_together_are_as_near_the_truth_as_pair_by_pair(noise: str, share: f
 
 
 @pytest.mark.heavy
-def test_the_ellipses_hold_the_truth_and_what_is_kept_is_good() -> None:
+def test_swarm_covariances_cover_truth_and_ok_positions_are_accurate() -> None:
     flight, _, _, swarm = solved("random", "realistic")
     inside, bad, kept = [], 0, 0
     for names, e in swarm.items():
@@ -83,7 +83,7 @@ def test_the_frame_is_one_positions_agree_around_a_triangle() -> None:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("trajectory", ["parallel", "hover"])
-def test_what_no_motion_tells_is_ambiguous_here_too(trajectory: Trajectory) -> None:
+def test_unobservable_swarm_motion_has_no_ok_positions(trajectory: Trajectory) -> None:
     *_, swarm = solved(trajectory, "calibrated", duration_s=20.0)
     for estimate in swarm.values():
         assert not (estimate.status == OK).any()
@@ -96,7 +96,7 @@ def test_an_observer_that_stands_still_has_no_bearings() -> None:
         assert (swarm["cf1", peer].status == AMBIGUOUS).mean() > 0.9
 
 
-def test_two_robots_stay_a_pair() -> None:
+def test_swarm_solve_leaves_a_single_pair_unchanged() -> None:
     _, pairs, both, _ = solved("random", "realistic")
     names = ("cf1", "cf2")
     alone = {n: both[n] for n in (names, names[::-1])}
@@ -119,7 +119,7 @@ def test_shadowed_ranges_of_one_pair_do_not_bend_the_others() -> None:
 
 
 @pytest.mark.heavy
-def test_one_solve_that_contradicts_a_sure_pair_is_not_believed() -> None:
+def test_swarm_estimate_inconsistent_with_pair_is_detected() -> None:
     *_, pairwise, swarm = solved("in_view", "calibrated")
     names = ("cf1", "cf2")
     assert not is_inconsistent(swarm[names], pairwise[names])
@@ -154,7 +154,7 @@ def test_a_peer_whose_clock_is_late_is_found_in_a_swarm_too() -> None:
 
 
 @pytest.mark.heavy
-def test_detections_count_in_a_swarm() -> None:
+def test_detections_improve_a_swarm_solve() -> None:
     flight, pairs, both, swarm = solved("in_view", "calibrated")
     sees = sightings(flight, "cf1", ("cf2",))
     looking = {

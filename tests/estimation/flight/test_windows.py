@@ -65,7 +65,7 @@ def test_carried_information_is_that_of_the_earlier_keyframes() -> None:
 
 
 @pytest.mark.heavy
-def test_in_windows_a_flight_is_as_good_as_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_windowed_solve_is_as_accurate_as_whole_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     world = flown("random", "calibrated", 1002, 80.0)
     pair = pair_of(world)
     (whole,) = estimate_pairs([pair])

@@ -24,7 +24,7 @@ def along_arc(lasts_s: Array, turn: float = TURN) -> Array:
     return np.column_stack([z.real, z.imag])
 
 
-def test_increments_are_arcs_seen_from_their_start() -> None:
+def test_preintegrated_motion_equals_arcs_in_start_frame() -> None:
     from_s, to_s = np.array([3.0, 4.003, 10.0, 12.0]), np.array([3.5, 6.011, 10.0, 11.0])
     found = preintegrate(arc(), TIME_S).relative_motion(from_s, to_s)
     lasts = to_s - from_s

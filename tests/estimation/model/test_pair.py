@@ -60,7 +60,7 @@ def test_resampling_leaves_out_what_is_not_finite_or_goes_back() -> None:
     assert not gap.any()
 
 
-def test_of_samples_of_one_time_the_first_counts() -> None:
+def test_resampling_keeps_the_first_of_equal_times() -> None:
     values = np.array([[0.0], [1.0], [99.0], [2.0]])
     signal, _ = resample(np.array([0.0, 0.1, 0.1, 0.2]), values, np.array([0.1, 0.15, 0.2]))
     assert signal[:, 0].tolist() == pytest.approx([1.0, 1.5, 2.0])

@@ -27,7 +27,7 @@ def judged(error_m: Array, std_m: float = 0.1, kept: bool | Array = True) -> Eva
     )
 
 
-def test_an_honest_estimator_has_a_nees_of_two_and_covers_95_percent() -> None:
+def test_consistent_estimator_has_nees_2_and_coverage_95_percent() -> None:
     rng = np.random.default_rng(0)
     covariance = np.array([[0.04, 0.015], [0.015, 0.01]])
     errors = rng.multivariate_normal(np.zeros(2), covariance, 20_000)
@@ -93,7 +93,7 @@ def test_every_figure_is_defined() -> None:
     assert set(DEFINITIONS) == set(PairFigures.__dataclass_fields__) - {"samples"}
 
 
-def test_truth_reaches_as_far_as_it_is_dense() -> None:
+def test_truth_covers_times_between_dense_samples() -> None:
     true_ns = np.array([0, 200, 450, 701, 1000]) * 1_000_000  # gaps of 0.2, 0.25, 0.251, 0.299 s
     at_ns = np.array([-1, 0, 100, 200, 300, 450, 500, 701, 900, 1000, 1001]) * 1_000_000
     near = [False, True, True, True, True, True, False, True, False, True, False]
@@ -151,7 +151,7 @@ def test_half_the_distance_is_a_wrong_basin(share: float, wrong: float) -> None:
     "covariance",
     [[[1, 1], [1, 1]], [[-1, 0], [0, -1]], [[-1, 0], [0, 1]], [[0, 0], [0, 1]], [[1, 2], [2, 1]]],
 )
-def test_what_is_no_covariance_gives_no_distance(covariance: list[list[float]]) -> None:
+def test_invalid_covariance_gives_nan_mahalanobis_distance(covariance: list[list[float]]) -> None:
     one = replace(judged(np.array([[1.0, 0.0]])), covariance=np.array([covariance], float))
     assert np.isnan(mahalanobis_squared(one)).all()
 

@@ -30,7 +30,7 @@ def test_the_probability_of_a_long_error_is_that_of_samples() -> None:
     assert probability_beyond(covariance[None], 0.3)[0] == pytest.approx(share, rel=0.02)
 
 
-def test_a_flight_keeps_its_best_until_the_budget_is_spent() -> None:
+def test_best_positions_are_kept_within_the_error_budget() -> None:
     probability = np.array([0.1, 0.0, 0.06, 0.05, 0.0])
     for share, count in ((0.01, 2), (0.02, 3)):
         kept = select_within_budget(probability, share)
@@ -40,14 +40,14 @@ def test_a_flight_keeps_its_best_until_the_budget_is_spent() -> None:
         assert np.append(probability[kept], worse).mean() > share
 
 
-def test_a_bearing_that_is_open_is_ambiguous_and_a_blurred_one_unconverged() -> None:
+def test_open_bearing_is_ambiguous_and_uncertain_position_unconverged() -> None:
     far = np.tile([4.0, 0.0, 0.0], (5, 1))
     assert (statuses_of(far, spread(*[0.08] * 5)) == OK).all()
     assert (statuses_of(far, spread(*[0.5] * 5)) == UNCONVERGED).all()
     assert (statuses_of(far / 4, spread(*[0.5] * 5)) == AMBIGUOUS).all()
 
 
-def test_where_most_of_a_flight_is_open_all_of_it_is() -> None:
+def test_flight_is_ambiguous_if_median_bearing_is_open() -> None:
     near = np.tile([1.0, 0.0, 0.0], (5, 1))
     vague = spread(0.3, 0.3, 0.3, 0.02, 0.02)  # 0.3 rad at the median: below what is open by itself
     assert (statuses_of(near, vague) == AMBIGUOUS).all()
@@ -56,7 +56,7 @@ def test_where_most_of_a_flight_is_open_all_of_it_is() -> None:
     assert (statuses_of(near, mostly)[2:] == OK).all()
 
 
-def test_the_positions_of_a_flight_are_worth_what_is_stated() -> None:
+def test_ok_positions_meet_the_stated_error_rate() -> None:
     """Of those that are OK 4.5 % are expected to be bad, and none by more than 12 %."""
     std_m = np.linspace(0.02, 0.2, 400)
     far = np.tile([4.0, 0.0, 0.0], (400, 1))

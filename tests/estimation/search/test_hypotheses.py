@@ -32,12 +32,12 @@ def test_hypotheses_fill_the_circle_of_the_range() -> None:
     ("length_s", "starts_s"),
     [(10, [0]), (24.8, [0]), (50, [0, 25]), (100, [0, 25, 50, 75]), (200, [0, 50, 100, 150])],
 )
-def test_starts_are_in_mid_flight_too(length_s: float, starts_s: list[float]) -> None:
+def test_starts_include_times_in_mid_flight(length_s: float, starts_s: list[float]) -> None:
     key_s = 7 + np.arange(0, length_s + 0.01, 0.2)
     assert key_s[choose_starts(key_s)] - 7 == pytest.approx(starts_s, abs=0.21)
 
 
-def test_states_are_the_same_at_both_ends_only() -> None:
+def test_states_are_compared_at_both_ends_modulo_full_turns() -> None:
     states = np.zeros((2, 4, 3))
     states[0, 1], states[1, 2] = [0.5, 0, 0], [0, 0, 0.6]
     order = np.array([0, 3, 1, 2])

@@ -42,7 +42,7 @@ def test_a_close_pass_is_flipped_and_the_rest_stays() -> None:
     assert not mirror_copies(straight(MAX_PASS_M + 0.05), 5.0)
 
 
-def test_between_two_passes_the_peer_is_put_on_the_other_side() -> None:
+def test_mirror_copies_swap_side_between_close_passes() -> None:
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     loop = np.column_stack([2 * np.sin(angle), 1.0 * np.sin(2 * angle) + 0.1, np.zeros(60)])
     copies = mirror_copies(loop, 5.0)

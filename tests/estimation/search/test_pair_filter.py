@@ -52,7 +52,7 @@ def test_without_measurements_a_step_back_undoes_a_step() -> None:
     assert ahead.state[1:, 0, :3] == pytest.approx(true[6:9], abs=2e-3)
 
 
-def test_a_bias_acts_against_the_sense_of_time() -> None:
+def test_bias_jacobian_changes_sign_backward_in_time() -> None:
     made, true = inputs()
     blind = replace(made, range_m=np.full(len(true), np.nan))
     step = 1e-6
@@ -116,7 +116,7 @@ def test_an_image_turns_the_peer_to_where_it_was_seen() -> None:
             assert away.state[0, 0, 2] == pytest.approx(start[0, 2] + 3.0)
 
 
-def test_lanes_side_by_side_are_those_alone_and_short_ones_wait() -> None:
+def test_parallel_lanes_equal_single_lanes_and_short_ones_stay_constant() -> None:
     made, true = inputs()
     both = [Lane(np.arange(len(true)), True), Lane(np.arange(3, -1, -1), False)]
     start = np.stack([true[0], true[3]])

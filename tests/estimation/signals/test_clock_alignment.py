@@ -73,7 +73,7 @@ def test_clocks_may_be_far_apart(apart_s: float) -> None:
     assert clock.offset_s == pytest.approx(-OFFSET_S - apart_s, abs=0.005)
 
 
-def test_ranges_of_exchanges_of_their_own_tell_as_much_as_their_sigma_says() -> None:
+def test_clock_sigma_is_consistent_for_independent_ranges() -> None:
     errors = []
     for seed in range(8):
         rng = np.random.default_rng(100 + seed)
@@ -99,18 +99,18 @@ def test_a_signal_of_another_scale_aligns_as_well() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 5, 100])
-def test_too_little_is_no_clock(count: int) -> None:
+def test_clock_needs_enough_exchanges(count: int) -> None:
     here, range_m, there, peer_m = exchanges(0)
     assert estimate_from_exchanges(here, range_m, there[:count], peer_m[:count]) is None
 
 
-def test_what_was_not_seen_twice_is_no_clock() -> None:
+def test_uncorrelated_ranges_give_no_clock() -> None:
     here, range_m, there, _ = exchanges(0)
     noise = np.random.default_rng(0).normal(size=len(there))
     assert estimate_from_exchanges(here, range_m, there, noise) is None
 
 
-def test_clocks_chain_and_undo() -> None:
+def test_clocks_compose_and_invert() -> None:
     one, two = Clock(0.5, 1e-5, 100.0, 0.003), Clock(-2.0, -3e-5, 40.0, 0.004)
     time = np.linspace(0, 300, 7)
     chained = two.compose_after(one)
@@ -138,7 +138,7 @@ TIMES_S = np.linspace(-500, 500, 5)
 
 
 @given(CLOCKS, CLOCKS)
-def test_any_clocks_chain_and_undo(one: Clock, two: Clock) -> None:
+def test_random_clocks_compose_and_invert(one: Clock, two: Clock) -> None:
     both = two.compose_after(one).correct_times(TIMES_S)
     np.testing.assert_allclose(both, two.correct_times(one.correct_times(TIMES_S)), atol=1e-8)
     np.testing.assert_allclose(
@@ -171,7 +171,7 @@ def test_clocks_need_not_begin_together(cut_s: float) -> None:
     assert also_s[0] - 1 < clock.at_s - 3.3 < also_s[-1] + 1
 
 
-def test_the_deviations_of_offset_and_drift_are_each_its_own() -> None:
+def test_offset_and_drift_have_separate_stds() -> None:
     for one in (exchanges(0), exchanges(1)):
         clock = estimate_from_exchanges(*one)
         assert clock is not None
@@ -181,7 +181,7 @@ def test_the_deviations_of_offset_and_drift_are_each_its_own() -> None:
         assert abs(clock.drift + DRIFT) < 5 * clock.sigma_drift
 
 
-def test_a_chain_is_as_sure_as_its_parts_together() -> None:
+def test_composed_clock_adds_variances() -> None:
     one = Clock(1.0, 1e-5, 5.0, 0.003, 4e-6, 0.9, "ranges")
     two = Clock(2.0, 2e-5, 7.0, 0.004, 3e-6, 0.8, "turns")
     both = two.compose_after(one)
@@ -198,7 +198,7 @@ def test_a_chain_is_as_sure_as_its_parts_together() -> None:
     assert back.at_s == 6.0
 
 
-def test_single_outliers_are_not_heard_and_holes_are_known() -> None:
+def test_resampled_series_rejects_outliers_and_marks_gaps() -> None:
     time_s = np.concatenate([np.arange(0, 30, 0.1), np.arange(32, 60, 0.1)])
     values = np.sin(time_s / 3)
     spoilt = values.copy()
@@ -222,7 +222,7 @@ def test_a_second_without_samples_is_not_known(gap_s: float, unknown: bool) -> N
     assert (~found.known).any() == unknown
 
 
-def test_clocks_that_are_told_are_exact() -> None:
+def test_given_clocks_have_zero_sigma() -> None:
     both = Clock(0.5).compose_after(Clock(0.25))
     assert (both.offset_s, both.sigma_s, both.sigma_drift) == (0.75, 0.0, 0.0)
 
@@ -236,7 +236,7 @@ def test_a_series_lasts_twenty_seconds_at_least(lasts_s: float, enough: bool) ->
 
 
 @given(st.lists(st.floats(-5, 5), min_size=1, max_size=30))
-def test_a_slow_part_is_a_running_mean_of_whole_windows(values: list[float]) -> None:
+def test_trend_is_a_running_mean_with_repeated_ends(values: list[float]) -> None:
     """Of series shorter than its window here: the mean of what lies around, ends repeated."""
     array = np.array(values)
     width = min(int(TREND_WINDOW_S / GRID_STEP_S), len(array)) | 1
@@ -245,7 +245,7 @@ def test_a_slow_part_is_a_running_mean_of_whole_windows(values: list[float]) -> 
     assert _running_mean(array) == pytest.approx(np.array(wanted), abs=1e-9)
 
 
-def test_smoothing_keeps_what_is_even_and_spreads_a_point_as_a_bell() -> None:
+def test_gaussian_smoothing_keeps_constants_and_spreads_an_impulse() -> None:
     assert _smooth_gaussian(np.full(50, 3.0), 0.3) == pytest.approx(np.full(50, 3.0))
     point = np.zeros(401)
     point[200] = 1.0

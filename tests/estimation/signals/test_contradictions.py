@@ -64,7 +64,7 @@ def test_single_outliers_and_wrong_scales_are_no_contradiction() -> None:
     assert not drop_contradictions(pair(track(1.2 * swing), track(), far)).own.dropout.any()
 
 
-def test_where_ranges_are_silent_nothing_is_contradicted() -> None:
+def test_no_contradiction_is_found_without_ranges() -> None:
     flight = pair(track(runaway(8.0, 11.0)), track())
     heard = (flight.range_time_s < 7) | (flight.range_time_s > 12)
     quiet = replace(flight, range_time_s=RANGES_S[heard], range_m=flight.range_m[heard])

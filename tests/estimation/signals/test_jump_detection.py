@@ -12,7 +12,7 @@ def climbing(noise_m: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 0.02, 0.03])
-def test_heights_over_a_box_are_heights_above_the_floor(noise_m: float) -> None:
+def test_height_steps_over_a_box_are_removed(noise_m: float) -> None:
     floor = climbing(noise_m)
     over = ((TIME_S > 10) & (TIME_S < 12)) | ((TIME_S > 30) & (TIME_S < 31.5))
     found = remove_height_steps(TIME_S, floor - 0.35 * over)
@@ -36,7 +36,7 @@ def test_a_signal_that_begins_and_one_that_ends_too_large() -> None:
     assert np.allclose(found[380:], 2.0)
 
 
-def test_what_never_comes_back_is_no_level() -> None:
+def test_step_that_never_returns_is_no_level() -> None:
     values = np.zeros(800)
     values[300:] = 1.0
     assert not step_offsets(values, 0.1, 0.45, 3).any()
@@ -54,7 +54,7 @@ def test_a_jump_is_larger_than_the_least(jump: float, seen: bool) -> None:
 
 
 @pytest.mark.parametrize(("lasts", "level"), [(299, True), (300, False), (301, False)])
-def test_a_level_lasts_30_s_at_most(lasts: int, level: bool) -> None:
+def test_level_lasts_at_most_30_s(lasts: int, level: bool) -> None:
     values = np.zeros(800)
     values[100 : 100 + lasts] = 1.0
     assert step_offsets(values, 0.1, 0.45, 3).any() == level
@@ -64,7 +64,7 @@ def test_a_level_lasts_30_s_at_most(lasts: int, level: bool) -> None:
 
 
 @pytest.mark.parametrize(("back", "left"), [(0.6, 0.4), (0.7, 0.0)])
-def test_less_than_half_of_a_jump_is_none_after_it(back: float, left: float) -> None:
+def test_step_back_below_half_of_the_jump_is_ignored(back: float, left: float) -> None:
     values = np.zeros(400)
     values[100:150] = 1.0
     values[150:250] = 1.0 - back
@@ -73,7 +73,7 @@ def test_less_than_half_of_a_jump_is_none_after_it(back: float, left: float) -> 
     assert found[200] == pytest.approx(left)
 
 
-def test_what_climbs_does_not_jump_and_a_jump_on_the_way_is_no_larger() -> None:
+def test_climb_is_no_step_and_does_not_enlarge_a_step() -> None:
     climb = 0.4 * np.arange(400) * 0.1
     assert not step_offsets(climb, 0.1, 0.45, 3).any()
     over = climb.copy()
@@ -81,7 +81,7 @@ def test_what_climbs_does_not_jump_and_a_jump_on_the_way_is_no_larger() -> None:
     assert step_offsets(over, 0.1, 0.45, 3)[120] == pytest.approx(0.8, abs=1e-6)
 
 
-def test_how_fast_a_signal_climbs_is_no_noise() -> None:
+def test_slope_of_a_signal_is_not_counted_as_noise() -> None:
     over = 1.5 * np.arange(400) * 0.1
     climb = over.copy()
     over[100:150] += 0.8
@@ -103,7 +103,7 @@ def steps(*changes: tuple[int, float]) -> np.ndarray:
     return values
 
 
-def test_a_box_on_a_table_and_two_that_overlap() -> None:
+def test_nested_and_overlapping_steps_are_found() -> None:
     for values in (
         steps((100, 0.7), (120, 0.5), (150, -0.5), (180, -0.7)),
         steps((100, 0.7), (120, 0.7), (150, -0.7), (180, -0.7)),
@@ -112,7 +112,7 @@ def test_a_box_on_a_table_and_two_that_overlap() -> None:
         assert step_offsets(values, 0.1, 0.45, 3) == pytest.approx(values)
 
 
-def test_where_a_way_back_was_missed_the_next_jump_begins_anew() -> None:
+def test_missed_return_does_not_spoil_the_next_step() -> None:
     values = steps((100, 1.0), (300, 0.8), (340, -0.8))
     ramp = np.interp(np.arange(600), [130, 160], [0.0, -1.0])  # too slow for a jump
     found = step_offsets(values + ramp, 0.1, 0.45, 3)

@@ -15,7 +15,7 @@ from dmrl.estimation.signals.ranging_clocks import (
 )
 
 
-def test_a_line_is_found_under_outliers_with_the_deviations_of_its_parts() -> None:
+def test_robust_line_fit_has_consistent_stds() -> None:
     x = np.linspace(-100, 100, 2001)
     off = []
     for seed in range(30):
@@ -31,7 +31,7 @@ def test_a_line_is_found_under_outliers_with_the_deviations_of_its_parts() -> No
     assert MIN_JITTER_S < 0.02
 
 
-def test_what_both_logged_is_told_by_value_and_time() -> None:
+def test_exchanges_are_matched_by_range_and_time() -> None:
     time_s = np.arange(0, 10, 0.1)
     value = 1 + 0.01 * np.arange(100)
     late = time_s + 0.05
@@ -58,7 +58,7 @@ def test_a_clock_s_deviations_are_of_its_offset_and_of_its_drift() -> None:
     assert middle + 0.04 + 2e-5 * middle - 0.005 == pytest.approx(clock.at_s, abs=1e-3)
 
 
-def test_what_a_rough_clock_is_off_by_single_exchanges_put_right(
+def test_matched_exchanges_refine_a_coarse_clock(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A guess that is 50 ms late and 100 ppm slow, of a clock that is right."""

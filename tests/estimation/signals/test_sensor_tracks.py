@@ -10,7 +10,7 @@ def noisy() -> np.ndarray:
     return np.random.default_rng(0).normal(0, 0.1, (len(GRID_S), 2))
 
 
-def test_flow_that_reads_zero_is_silence() -> None:
+def test_zero_optical_flow_is_a_dropout() -> None:
     velocity = noisy()
     stuck = (GRID_S > 5) & (GRID_S < 9)
     velocity[stuck] = 0.0
@@ -54,7 +54,7 @@ def test_silence_is_longer_than_half_a_second(lasts_s: float, stuck: bool) -> No
 
 
 @pytest.mark.parametrize(("share", "told"), [(0.48, True), (0.52, False)])
-def test_what_repeats_itself_more_often_than_not_is_written_so(share: float, told: bool) -> None:
+def test_signal_with_mostly_repeated_samples_is_not_frozen(share: float, told: bool) -> None:
     values = noisy()
     values[: round(share * len(values))] = 1.0
     assert find_frozen(GRID_S, values, GRID_S).any() == told

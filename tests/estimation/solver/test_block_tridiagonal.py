@@ -41,7 +41,7 @@ def random_equations(seed: int = 0) -> tuple[NormalEquations, Array, Array]:
     return out, dense, vector
 
 
-def test_equations_are_the_squares_of_their_rows() -> None:
+def test_normal_equations_equal_dense_jtj() -> None:
     found, dense, vector = random_equations()
     for key in range(KEYS):
         mine = slice(key * WIDTH, (key + 1) * WIDTH)
@@ -71,7 +71,7 @@ def test_a_step_is_that_of_the_dense_matrix() -> None:
         assert spread[key] == pytest.approx(inverse[mine, mine])
 
 
-def test_damping_holds_keyframes_alone() -> None:
+def test_damping_applies_to_keyframes_only() -> None:
     found, *_ = random_equations()
     damped = found.damped(3.0)
     assert damped.diagonal[2].diagonal() == pytest.approx(4 * found.diagonal[2].diagonal())

@@ -72,7 +72,7 @@ def noise_of(task: Problem, rng: np.random.Generator) -> np.ndarray:
     return out + rng.normal(0, white, KEYS - 1) + 1j * rng.normal(0, white, KEYS - 1)
 
 
-def test_of_noise_alone_nothing_is_left() -> None:
+def test_denoising_removes_motion_that_is_noise() -> None:
     task, rng = problem(), np.random.default_rng(0)
     for _ in range(3):
         own, relative = speeds(task, moving(task, noise_of(task, rng), noise_of(task, rng)))
@@ -80,7 +80,7 @@ def test_of_noise_alone_nothing_is_left() -> None:
         assert own < 0.15 * raw and relative < 0.15 * raw
 
 
-def test_motion_stays_and_a_slow_one_that_lasts_does_too() -> None:
+def test_denoising_keeps_fast_and_slow_motion() -> None:
     task = problem(NoiseModel(grade=0.63))
     rng = np.random.default_rng(1)
     for speed, period_s in ((0.5, 6.0), (0.12, 25.0)):
@@ -117,7 +117,7 @@ def test_a_relative_covariance_is_that_of_draws() -> None:
         assert found == pytest.approx(np.cov(relative_path(drawn, *both).T), rel=0.05, abs=2e-6)
 
 
-def test_without_noise_in_the_motion_it_is_the_inverse_of_the_equations(
+def test_covariance_without_motion_noise_is_the_inverse_normal_matrix(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(covariance, "calm_motion", lambda _problem, state: state)

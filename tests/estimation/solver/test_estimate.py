@@ -62,7 +62,7 @@ def test_the_observer_is_where_its_peer_sees_it() -> None:
     assert transform_to_peer(seen(0, 1)) == pytest.approx(seen(1, 0))
 
 
-def test_a_covariance_seen_from_the_peer_is_that_of_states_seen_from_there() -> None:
+def test_covariance_seen_from_peer_is_transformed_by_the_jacobian() -> None:
     found = estimate(2)
     other = seen_from_peer(found)
     assert other.state == pytest.approx(transform_to_peer(found.state))

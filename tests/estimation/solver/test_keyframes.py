@@ -28,7 +28,7 @@ def pair(ranges_s: Array, range_m: Array | None = None) -> Pair:
     return Pair(TIME_S, arc(), peer, ranges_s, range_m)
 
 
-def test_keyframes_hold_what_happened_between_them_and_around_each_range() -> None:
+def test_keyframes_hold_motion_between_them_and_around_each_range() -> None:
     ranges_s = np.array([3.0, 3.05, 7.77, 23.0])
     task = build_problem({(0, 1): pair(ranges_s)}, 10.0)
     own, peer = task.robots
@@ -60,7 +60,7 @@ def test_a_robot_without_odometry_has_dropped_out_of_its_own_steps() -> None:
     assert peer.dropout_s.sum() == pytest.approx(1.0, abs=0.02)
 
 
-def test_of_logs_of_one_robot_that_with_most_dropouts_counts() -> None:
+def test_log_with_most_dropouts_is_used_for_a_robot() -> None:
     dense, quiet = np.arange(3.0, 23.0, 0.1), (TIME_S > 10) & (TIME_S < 11)
     flight = pair(dense)
     gone = replace(flight, own=replace(flight.own, dropout=quiet))
@@ -85,7 +85,7 @@ def test_a_time_beside_a_silent_sample_is_silent() -> None:
     assert odometry_dropout(flight, beside).tolist() == [False, True, True, False]
 
 
-def test_a_shadow_is_guessed_by_its_jumps_and_small_ones_are_left_alone() -> None:
+def test_range_step_offset_is_detected_above_the_minimum() -> None:
     dense = np.arange(3.0, 23.0, 0.02)
     shadow = (dense > 9) & (dense < 11)
     for height_m, found_m in (
@@ -126,7 +126,7 @@ def test_an_averaged_range_is_the_median_at_its_keyframe() -> None:
     assert some.robots == (0, 1)
 
 
-def test_nobody_is_farther_than_the_ranges_around_allow() -> None:
+def test_positions_are_clipped_to_surrounding_ranges() -> None:
     ranges_s = np.arange(3.0, 23.0, 0.05)
     range_m = np.where(ranges_s < 13, 2.0, 4.0)
     range_m[40:-40:9] = 30.0  # single outliers allow nothing
@@ -153,7 +153,7 @@ def test_nobody_is_farther_than_the_ranges_around_allow() -> None:
         assert (found.state[:, 2] == 0.3).all() and (made.state == state).all()
 
 
-def test_ranges_are_levelled_in_blocks_from_the_start_of_a_flight() -> None:
+def test_range_steps_are_found_in_blocks_from_flight_start() -> None:
     time_s = 5.03 + np.arange(2001) / 100
     still = SensorTrack(*np.zeros((4, 2001)), np.zeros(2001, bool))
     ranges_s = time_s[:-1]

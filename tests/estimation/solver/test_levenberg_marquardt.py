@@ -20,7 +20,7 @@ from ..flights import flown, pair_of
 from .test_residuals import flight, moved
 
 
-def test_a_solve_comes_back_to_what_was_flown() -> None:
+def test_solve_converges_to_the_true_flight() -> None:
     problem, true = flight()
     start = moved(true, 3)
     found = Solver(problem).solve(start)
@@ -57,7 +57,7 @@ def test_a_relative_path_is_the_peer_in_the_observer_s_frame() -> None:
     assert relative_path(state, 1, 0)[0, :2] == pytest.approx([-2 * np.sin(0.3), -2 * np.cos(0.3)])
 
 
-def test_evidence_is_laplace_s() -> None:
+def test_log_evidence_equals_laplace_approximation_by_quadrature() -> None:
     """Of a model with fewer unknowns it is the integral over those, by quadrature."""
     problem, true = flight()
     rows = without_rows(TABLE, ("velocity_error_x", "velocity_error_y", "range_error"))

@@ -118,7 +118,7 @@ def check_jacobian(make: Callable[[Values], Rows], values: Values) -> None:
 
 
 @pytest.mark.parametrize("robot", [0, 1])
-def test_odometry(robot: int) -> None:
+def test_odometry_factor_is_zero_at_truth_with_exact_jacobian(robot: int) -> None:
     problem, values = flight()
     layout = problem.layout
     rows = odometry_factor(problem, layout, robot, values)
@@ -167,7 +167,7 @@ def test_a_late_clock_shows_what_was_a_moment_ago() -> None:
     assert late.rows[2:-2, 2, 0, -1] * std == pytest.approx(-0.1 * by_clock[2:-2, 2], abs=1e-4)
 
 
-def test_ranges() -> None:
+def test_range_factor_is_zero_at_truth_with_exact_jacobian() -> None:
     problem, values = flight()
     layout, (link,) = problem.layout, problem.links
     rows = range_factor(problem, layout, link, values)
@@ -204,7 +204,7 @@ def test_a_measured_height_is_the_true_one_and_its_error() -> None:
 
 
 @pytest.mark.parametrize("side", [0, 1])
-def test_bearings(side: int) -> None:
+def test_bearing_factor_is_zero_at_truth_with_exact_jacobian(side: int) -> None:
     problem, values = flight()
     layout, view = problem.layout, problem.views[side]
     rows = bearing_factor(problem, layout, view, values)
@@ -235,7 +235,7 @@ def test_an_image_far_off_has_no_weight_and_a_constant_cost() -> None:
     assert costs[0] == pytest.approx(costs[1])
 
 
-def test_images_at_once_count_as_one() -> None:
+def test_simultaneous_images_share_one_weight() -> None:
     problem, _ = flight()
     view = problem.views[0]
     assert view.weight == pytest.approx(1.0)
@@ -274,7 +274,7 @@ def test_equations_are_the_gradient_of_the_cost() -> None:
         assert equations.globals_gradient[column] == pytest.approx(slope, rel=1e-4, abs=1e-2)
 
 
-def test_a_chain_is_a_walk_that_begins_near_zero() -> None:
+def test_chain_factor_is_a_random_walk_with_start_prior() -> None:
     row = Unknown("a", "m", 0.1, "pair", Cauchy(1.0), "jump", pull_std=0.05, pull_weight=0.04)
     value, kept, std = np.array([0.3, 0.2, 0.6]), np.array([0.5, 0.9]), np.array([0.1, 0.2])
     chain = Chain(row, 0, value, kept, std, 0.4)

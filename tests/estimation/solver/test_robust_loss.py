@@ -43,7 +43,7 @@ def test_a_residual_at_the_scale_of_cauchy_counts_half() -> None:
 
 
 @pytest.mark.heavy
-def test_huber_for_cauchy_is_one_argument_and_keeps_the_flight() -> None:
+def test_huber_loss_replaces_cauchy_by_argument() -> None:
     flight = flown("random", "calibrated", 1001, 40.0)
     noise = replace(NoiseModel(grade=0.63), range_loss=Huber(1.25), motion_loss=Huber(3.0))
     ((here, there),) = estimate_pairs([pair_of(flight)], noise=noise)

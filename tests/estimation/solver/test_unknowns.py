@@ -102,7 +102,7 @@ def test_known_and_graded_priors_are_those_of_the_noise_model() -> None:
     assert std[layout.find("gyro_bias", 1)] == 1e-4
 
 
-def test_steps_vary_as_the_evolution_of_the_row() -> None:
+def test_step_model_follows_evolution_of_the_unknown() -> None:
     steps_s = np.array([0.01, 0.2, 100.0])
     fading = Unknown("a", "m", 0.08, "robot", evolution="fading", time_s=0.3)
     kept, std = fading.step_model(steps_s)

@@ -107,7 +107,7 @@ def test_long_silences_end_loops_and_weak_detections_do_not() -> None:
     assert compute_flight_figures(flight(false=false))["loop_s"] == pytest.approx(20 / 2.5)
 
 
-def test_silences_count_by_how_often_loops_are_at_their_distance() -> None:
+def test_detection_gaps_are_weighted_by_distance_distribution() -> None:
     """Half the images are at 0.8 m, where loops are most of the time, and half at 2.5 m."""
     distance_m = np.where(np.arange(IMAGES) < 100, 0.8, 2.5)
     near, far = (

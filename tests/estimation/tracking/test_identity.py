@@ -48,7 +48,7 @@ def test_two_tracks_share_the_names_as_they_fit_together() -> None:
     assert names([Track(1, 1.0), Track(2, 3.0)], cf2=3.0, cf3=1.0) == {1: "cf3", 2: "cf2"}
 
 
-def test_one_detour_is_forgotten_and_counts_no_more_than_the_worst() -> None:
+def test_single_range_outlier_is_bounded_and_forgotten() -> None:
     identity = TrackIdentity()
     track: list[Track] = [Track(1, 2.0)]
     steps = round(3 * AVERAGING_S / 0.1)

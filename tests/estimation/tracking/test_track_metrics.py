@@ -32,7 +32,7 @@ def judged() -> EvaluatedTracks:
     )
 
 
-def test_every_figure_is_what_it_says() -> None:
+def test_track_figures_equal_hand_computed_values() -> None:
     found = compute_figures(judged(), 0.0)
     assert found["in_view"] == 4
     assert found["rmse_m"] == pytest.approx(np.sqrt((0.09 + 0.16) / 2))  # of those with both
@@ -46,7 +46,7 @@ def test_every_figure_is_what_it_says() -> None:
     assert found["named_right"] == 0.5
 
 
-def test_before_it_settles_nothing_counts_but_false_tracks() -> None:
+def test_only_false_tracks_count_before_settling() -> None:
     found = compute_figures(judged(), 1.0)
     assert (found["in_view"], found["rmse_m"]) == (3, pytest.approx(0.4))
     assert (found["named_right"], found["false_tracks_per_min"]) == (0.0, pytest.approx(2.0))

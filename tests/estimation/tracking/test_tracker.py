@@ -42,7 +42,7 @@ def test_the_filter_knows_its_error_while_its_model_holds() -> None:
     assert 0.88 <= np.mean(np.array(squared) <= chi2.ppf(0.95, 3)) <= 0.99
 
 
-def test_depths_count_by_what_the_detections_say_of_them() -> None:
+def test_tracker_weights_depths_by_their_sigma() -> None:
     """Every other depth is off by 40 %, the rest by 3 %: one tracker is told which."""
     told, untold, squared = [], [], []
     for seed in range(4):
@@ -94,7 +94,7 @@ def test_a_standing_peer_has_no_velocity_whatever_the_observer_does() -> None:
     assert np.abs(track.velocity_mps).max() < 0.05
 
 
-def test_a_peer_that_is_gone_is_given_up_and_one_out_of_view_is_not_at_once() -> None:
+def test_track_of_peer_out_of_view_outlives_a_missing_one() -> None:
     tracker = Tracker(AIDECK, TUNING)
     for _ in range(10):
         tracker.step(STILL, view_of(np.array([[1.5, 0.0, 0.0]])))
@@ -130,7 +130,7 @@ def test_confidence_decides_when_a_lasting_detection_is_a_peer(
         assert not seen[0]
 
 
-def test_a_low_confidence_where_a_peer_is_expected_keeps_its_track_exact() -> None:
+def test_weak_detections_keep_an_expected_track_accurate() -> None:
     """Of two tracks, one gets weak detections and the other none."""
     weak, blind = Tracker(AIDECK, TUNING), Tracker(AIDECK, TUNING)
     peer = np.array([[1.2, 0.1, 0.0]])
@@ -159,7 +159,7 @@ def test_silence_lowers_existence_slowly_and_near_more_than_far() -> None:
     assert 0 < fallen[1] < fallen[0] < 0.4
 
 
-def test_two_peers_keep_their_numbers_and_get_their_names_by_range() -> None:
+def test_two_tracks_keep_numbers_and_are_named_by_range() -> None:
     tracker, identity = Tracker(AIDECK, TUNING), TrackIdentity()
     peers = np.array([[1.0, 0.3, 0.0], [2.2, -0.4, 0.1]])
     distances = dict(zip(("cf2", "cf3"), np.linalg.norm(peers, axis=1).tolist(), strict=True))
@@ -183,7 +183,7 @@ def test_a_track_that_no_range_fits_has_no_name() -> None:
     assert not names
 
 
-def test_an_image_without_detections_and_one_behind_the_lens_s_fold_are_taken() -> None:
+def test_tracker_accepts_empty_images_and_pixels_beyond_the_lens_model() -> None:
     tracker = Tracker(AIDECK, TUNING)
     assert tracker.step(STILL, NOTHING) == []
     far_out = ImageDetections(np.array([[5000.0, 5000.0]]), np.ones(1), 0.0, 0.0, np.ones(1))
@@ -197,7 +197,7 @@ def started(xyz: Array) -> TrackStates:
     return tracker.states
 
 
-def test_a_peer_out_of_sight_grows_as_uncertain_as_the_tuning_says() -> None:
+def test_predicted_covariance_matches_simulated_motion_model() -> None:
     """Against a simulation of the tuning's words: Gauss-Markov velocity, drift, heading."""
     rng, count, dt_s, steps = default_rng(2), 20_000, 0.1, 12
     states = started(np.array([[1.5, 0.2, -0.1]]))
@@ -264,7 +264,7 @@ def test_a_new_track_is_as_unsure_as_detections_that_are_drawn() -> None:
     assert np.sqrt(np.diag(tracker.states.covariance[0])[3:6]) == pytest.approx(std)
 
 
-def test_a_lasting_tilt_stays_in_the_covariance_however_many_images_come() -> None:
+def test_constant_tilt_bias_stays_in_the_covariance() -> None:
     tracker, xyz = Tracker(AIDECK, TUNING), np.array([[1.5, 0.0, 0.0]])
     tracker.step(STILL, view_of(xyz))
     for _ in range(200):
@@ -277,7 +277,7 @@ def test_a_lasting_tilt_stays_in_the_covariance_however_many_images_come() -> No
     assert silent < 0.01
 
 
-def test_one_detection_is_shared_by_two_tracks_and_its_owner_gets_most() -> None:
+def test_shared_detection_is_weighted_between_tracks() -> None:
     """By hand: two tracks that exist surely, one detection, likelihood ratios 50 and 10."""
     belief = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
     found = np.tile([0.0, 0.9, 0.9, 0.03], (2, 1))
@@ -293,7 +293,7 @@ def test_one_detection_is_shared_by_two_tracks_and_its_owner_gets_most() -> None
     assert alone.detection[0, 0] == pytest.approx(share[0])
 
 
-def test_bright_detections_raise_the_belief_in_a_peer_as_bayes_says() -> None:
+def test_confident_detections_update_belief_by_bayes_rule() -> None:
     belief = np.array([[0.5, 0.2, 0.2, 0.1]])
     found = np.array([[0.0, 0.9, 0.9, 0.0]])
     weights = associate(belief, found, np.array([[20.0]]), np.array([[4.0]]))

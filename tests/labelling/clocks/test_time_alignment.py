@@ -130,7 +130,7 @@ def test_times_that_repeat_or_go_back_and_no_numbers_are_left_out() -> None:
     assert kept.tolist() == [5.0, 6.0, 9.0]
 
 
-def test_poses_tell_what_a_robot_measures_of_itself() -> None:
+def test_pose_signals_equal_own_sensor_signals() -> None:
     time_s = np.arange(0, 4, 0.025)
     (roll, _), (pitch, _), (yaw, yaw_rate), (x, vx), (y, vy) = (smooth(k, time_s) for k in range(5))
     angles = np.column_stack([0.8 * roll, 0.9 * pitch, 8 * yaw])
@@ -154,7 +154,7 @@ def test_poses_that_are_too_near_to_each_other_are_left_out() -> None:
     assert _pose_signals(time_s[:2], rows[:2]) == {}
 
 
-def test_of_several_signals_the_one_with_least_doubt_counts() -> None:
+def test_most_certain_signal_sets_the_clock() -> None:
     rng = np.random.default_rng(0)
     one, two = (smooth(k, TIME_S)[0] for k in (7, 8))
     noisy = two + rng.normal(0, 0.2, len(two))

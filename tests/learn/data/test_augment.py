@@ -88,12 +88,12 @@ def test_images_without_robots_or_boxes_can_be_varied_too() -> None:
     assert batch.images.shape == (2, 3, 112, 160)
 
 
-def test_nothing_is_nothing() -> None:
+def test_default_augmentation_is_identity() -> None:
     assert Augmentation().is_identity
     assert not replace(Augmentation(), flip_share=0.1).is_identity
 
 
-def test_every_epoch_varies_images_anew_and_noise_is_no_louder_than_asked_for() -> None:
+def test_noise_differs_between_epochs_and_stays_below_its_std() -> None:
     grey = ExampleSet(
         [np.full((1, 112, 160, 3), 128, np.uint8)],
         np.full((1, 1, len(ROBOT_FIELDS)), np.nan, np.float32),
@@ -201,13 +201,13 @@ def test_defocus_spreads_a_point_over_its_neighbours_alike() -> None:
     assert (min(blurred), max(blurred)) == pytest.approx((0.2, 2 / 3), abs=0.02)
 
 
-def test_plain_is_whole_images_in_other_colours() -> None:
+def test_without_geometry_keeps_photometric_settings_only() -> None:
     every = replace(GEOMETRY, colour=0.1, noise=0.2, blur_share=0.3, grey_share=0.4)
     wanted = Augmentation(flip_share=0.5, colour=0.1, noise=0.2, blur_share=0.3, grey_share=0.4)
     assert every.without_geometry == wanted
 
 
-def test_a_camera_is_turned_no_further_than_a_quarter_of_the_depth_is_left() -> None:
+def test_camera_turn_keeps_a_quarter_of_the_depth() -> None:
     camera, rng = (60.0, 64.0, 80.0, 56.0), np.random.default_rng(5)
     maker, kept = augmenter(intrinsics=camera), []
     k = np.array([[60.0, 0, 80], [0, 64, 56], [0, 0, 1]])
@@ -318,7 +318,7 @@ def test_a_window_is_no_smaller_than_its_source_lets_it_be(
         assert {zoom for zoom, _, _ in found} == {least}
 
 
-def test_grain_of_noise_begins_anywhere() -> None:
+def test_noise_pattern_starts_at_a_random_offset() -> None:
     maker, rng = augmenter(noise=0.1), np.random.default_rng(4)
     assert len(maker._grain) == 2 * 112 * 160 * 3
     assert maker._grain.std() == pytest.approx(1, abs=0.01)

@@ -64,7 +64,7 @@ def test_the_order_depends_on_seed_and_epoch_alone() -> None:
     assert sorted(epoch_indices(50, seed=1, epoch=2)) == list(range(50))
 
 
-def test_images_come_as_often_as_their_shares_say() -> None:
+def test_images_are_drawn_in_proportion_to_their_weights() -> None:
     shares = np.array([4.0] * 10 + [0.25] * 40)
     seen = np.zeros(50)
     for epoch in range(40):
@@ -118,14 +118,14 @@ def test_a_mask_is_of_a_robot_whose_centre_it_shows() -> None:
         ExampleSet(examples.pixels, robots, [masks[:, :3]])
 
 
-def test_a_batch_is_no_longer_than_the_images_and_counts_are_rounded_up() -> None:
+def test_batch_count_is_rounded_up() -> None:
     assert [count_batches(count, 4) for count in (0, 1, 4, 5, 8)] == [0, 1, 1, 2, 2]
     assert numbered(5).image_shape == (8, 16, 3)
     assert len(numbered(5, 2)) == 7
 
 
 @pytest.mark.parametrize("count", [40, 41, 47, 16])
-def test_of_very_many_images_those_of_a_while_lie_together(
+def test_large_sets_are_shuffled_in_blocks_within_windows(
     count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(batches, "SHUFFLE_WINDOW_IMAGES", 16)
@@ -143,14 +143,14 @@ def test_of_very_many_images_those_of_a_while_lie_together(
     assert any((np.diff(one[:16]) != 1).sum() > 12 for one in found)
 
 
-def test_shares_come_to_whole_images_at_the_border() -> None:
+def test_fractional_weights_round_to_whole_images() -> None:
     shares = np.array([0.5, 0.5, 2.0, 1.0])
     for epoch in range(20):
         drawn = np.bincount(epoch_indices(4, seed=0, epoch=epoch, shares=shares), minlength=4)
         assert drawn.sum() == 4 and drawn[2] == 2 and drawn[3] == 1 and drawn[:2].sum() == 1
 
 
-def test_an_epoch_has_as_many_images_as_it_is_asked_for() -> None:
+def test_epoch_has_the_requested_number_of_images() -> None:
     """A few come often and alike, of many each comes once at most, and all come in time."""
     often = np.bincount(epoch_indices(3, seed=0, epoch=0, images=10), minlength=3)
     assert often.sum() == 10 and set(often.tolist()) == {3, 4}

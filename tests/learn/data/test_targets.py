@@ -31,7 +31,7 @@ def test_without_width_they_are_the_grid_labels_of_the_paper() -> None:
         np.testing.assert_allclose(got.depth_m[0].numpy() * confidence, depth_m, rtol=1e-6)
 
 
-def test_with_width_the_offset_leads_from_every_near_cell_to_the_centre() -> None:
+def test_offset_of_each_near_cell_points_to_the_centre() -> None:
     got = build_targets(robots((101.5, 50.25, 1.3)), SHAPE, sigma_cells=0.7)
     rows, cols = torch.nonzero(got.weight[0], as_tuple=True)
     assert len(rows) > 4
@@ -153,7 +153,7 @@ def test_a_sigma_in_pixels_is_the_root_mean_square_of_both_ways() -> None:
 
 @pytest.mark.parametrize("label_noise", ["ignore", "weight", "soften"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_targets_are_those_of_a_look_at_every_cell(label_noise: LabelNoise, seed: int) -> None:
+def test_targets_equal_a_loop_over_cells(label_noise: LabelNoise, seed: int) -> None:
     rng, shape, sigma_cells = np.random.default_rng(seed), (5, 7), 0.8
     rows = np.full((2, 4, len(ROBOT_FIELDS)), np.nan, np.float32)
     for image in rows:

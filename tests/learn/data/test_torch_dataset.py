@@ -84,7 +84,7 @@ def test_a_loader_gives_batches_of_its_part(shuffle: bool) -> None:
     assert read(part=None) == whole  # without torchrun
 
 
-def test_torchrun_tells_which_process_this_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rank_and_world_size_are_read_from_torchrun(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RANK", raising=False)
     monkeypatch.delenv("WORLD_SIZE", raising=False)
     assert get_torchrun_rank() == (0, 1)

@@ -76,7 +76,7 @@ def test_every_source_counts_the_same_however_large_it_is() -> None:
     assert shared.offset == pytest.approx(0, abs=0.2)
 
 
-def test_too_little_to_tell_or_no_sense_in_it_is_no_calibration() -> None:
+def test_calibration_needs_enough_data_and_positive_slope() -> None:
     assert fit_calibration(scored(2.5, 1.0, count=40)) is None
     assert fit_calibration(scored(-1.0, 0.0)) is None
 
@@ -94,7 +94,7 @@ def test_the_last_layer_carries_it_and_nothing_else_changes() -> None:
     torch.testing.assert_close(after[:, others], before[:, others])
 
 
-def test_a_network_with_another_last_layer_is_left_as_it_is() -> None:
+def test_network_with_another_last_layer_is_not_calibrated() -> None:
     network = build_network("locanet")
     network.head = torch.nn.Identity()  # type: ignore[assignment]
     assert not apply_calibration(network, PlattScaling(2.0, 0.0))
@@ -125,7 +125,7 @@ def test_thirty_of_each_are_needed_and_faint_ones_do_not_count() -> None:
         assert fit_calibration(faint) == fit_calibration(told(confidence, sure + weak))
 
 
-def test_two_confidences_become_the_shares_that_are_right() -> None:
+def test_two_confidence_levels_are_calibrated_to_their_precision() -> None:
     confidence = [0.8] * 100 + [0.3] * 100
     right = [True] * 90 + [False] * 10 + [True] * 40 + [False] * 60
     found = fit_calibration(told(confidence, right))
@@ -137,7 +137,7 @@ def test_two_confidences_become_the_shares_that_are_right() -> None:
 @pytest.mark.parametrize(
     ("slope", "known"), [(0.15, False), (0.25, True), (9.5, True), (11, False)]
 )
-def test_a_slope_of_nothing_or_of_a_cliff_is_none(slope: float, known: bool) -> None:
+def test_calibration_rejects_slopes_that_are_too_flat_or_steep(slope: float, known: bool) -> None:
     logit, share = 0.2, 1 / (1 + np.exp(-0.2 * slope))
     count = 20_000
     right = [True] * round(share * count) + [False] * round((1 - share) * count)
@@ -148,7 +148,7 @@ def test_a_slope_of_nothing_or_of_a_cliff_is_none(slope: float, known: bool) -> 
     assert found is None or found == pytest.approx((slope, 0.0), abs=0.05)
 
 
-def test_a_fit_is_where_the_likelihood_is_flat() -> None:
+def test_logistic_fit_has_zero_likelihood_gradient() -> None:
     rng = np.random.default_rng(0)
     rows = np.column_stack([rng.normal(size=500), np.ones(500)])
     right = (rng.random(500) < 1 / (1 + np.exp(-3 * rows[:, 0] + 1))).astype(float)

@@ -59,7 +59,7 @@ def test_no_more_than_asked_for() -> None:
 
 
 @given(arrays(np.float32, (1, 5, 6), elements=st.sampled_from([0.0, 0.25, 0.5])))
-def test_equal_neighbours_give_one_peak_and_the_first_maximum_is_always_one(
+def test_plateau_gives_one_peak_and_first_maximum_is_a_peak(
     confidence: np.ndarray,
 ) -> None:
     found = find_peaks(confidence)[0]
@@ -84,7 +84,7 @@ def test_depth_error_and_class_are_those_of_the_peak() -> None:
 
 
 @pytest.mark.parametrize(("away_px", "count"), [(7.99, 1), (8.0, 2)])
-def test_detections_nearer_than_a_cell_are_one(away_px: float, count: int) -> None:
+def test_detections_within_one_cell_are_merged(away_px: float, count: int) -> None:
     confidence, offset = np.zeros((1, 4, 9)), np.zeros((1, 2, 4, 9))
     confidence[0, 1, [1, 3]] = 0.9, 0.8
     offset[0, 0, 1, 3] = away_px / 8 - 2
@@ -146,7 +146,7 @@ GRID = st.sampled_from([0.0, 0.005, 0.01, 0.25, 0.5, 0.75])
     st.integers(1, 6),
     st.sampled_from([-1.0, 0.01, 0.3]),
 )
-def test_detections_are_those_of_a_look_at_every_cell(
+def test_decoded_detections_equal_a_loop_over_cells(
     confidence: np.ndarray, offset: np.ndarray, shifted: bool, most: int, least: float
 ) -> None:
     depth_m, spread = np.arange(1.0, 41).reshape(2, 4, 5), np.arange(40.0).reshape(2, 4, 5) / 40

@@ -109,7 +109,7 @@ def test_below_the_threshold_is_not_claimed() -> None:
     assert got["ap_16_px"] == 1
 
 
-def test_bands_hold_their_own_labels_and_empty_ones_say_nothing() -> None:
+def test_bands_hold_their_own_labels_and_empty_bands_are_nan() -> None:
     labels, found = scene(10, depth_m=0.7)
     bands = compute_band_metrics(score_detections(10, labels, found), threshold=0.33, draws=5)
     assert [(b.from_m, b.to_m) for b in bands] == list(DEPTH_BANDS_M)
@@ -280,7 +280,7 @@ def test_a_weighted_quantile_is_that_of_repeated_values(pairs: list[tuple[int, i
             assert math.isnan(got)
 
 
-def test_curves_are_thinned_evenly_and_full_confidence_is_in_the_last_bin() -> None:
+def test_curves_are_thinned_evenly_and_confidence_1_is_in_the_last_bin() -> None:
     labels, _ = scene(100)
     confidence = np.linspace(1.0, 0.01, 100)
     found = Points(labels.image, labels.u_px, labels.v_px, labels.depth_m, confidence)

@@ -52,7 +52,7 @@ def test_few_detections_give_no_rates() -> None:
     assert measure_rates(scored(40)) is None
 
 
-def test_the_shipped_model_has_rates_and_a_description_without_them_has_none(
+def test_rates_are_read_from_the_shipped_model_and_are_optional(
     tmp_path: Path,
 ) -> None:
     rates = read_rates(resolve_model_path(Path("dmrl-nano")))

@@ -54,7 +54,7 @@ def test_a_saved_model_sees_the_same_when_it_is_loaded(run: Path) -> None:
         assert got.offset is None
 
 
-def test_dmrl_nano_says_where_in_the_cell(tmp_path: Path) -> None:
+def test_dmrl_nano_predicts_an_offset_within_the_cell(tmp_path: Path) -> None:
     network = build_network("dmrl-nano", seed=1).eval()
     with torch.no_grad():
         network.head.bias[2:] = torch.tensor([0.25, -0.5])  # type: ignore[union-attr, index]
@@ -103,7 +103,7 @@ def test_a_known_network_lends_its_weights_to_one_with_more_channels() -> None:
     assert torch.equal(got["body.0.0.weight"], wanted["body.0.0.weight"])
 
 
-def test_run_folders_of_before_the_offset_still_load(run: Path) -> None:
+def test_run_folders_without_outputs_key_still_load(run: Path) -> None:
     said = json.loads((run / "model.json").read_text())
     del said["outputs"]
     (run / "model.json").write_text(json.dumps(said))
@@ -216,7 +216,7 @@ def test_weights_of_another_kind_than_numbers_with_a_point_are_refused(
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
-def test_weights_go_a_share_of_the_way_to_others(share: float) -> None:
+def test_weights_are_interpolated_by_a_fraction(share: float) -> None:
     network, first = build_network("locanet", seed=1), get_weights(build_network("locanet", seed=2))
     before = {name: value.clone() for name, value in get_weights(network).items()}
     assert not any(name.endswith("num_batches_tracked") for name in before)

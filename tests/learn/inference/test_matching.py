@@ -51,7 +51,7 @@ def test_one_label_takes_the_most_confident_detection_not_the_nearest() -> None:
     assert compute_errors(labels, found).depth_m.tolist() == [-1.0]
 
 
-def test_two_labels_share_the_two_best_detections_by_least_total_distance() -> None:
+def test_two_labels_are_assigned_at_least_total_distance() -> None:
     labels = points((3, 0, 0, 1, 1), (3, 10, 0, 1, 1))
     # Greedily the first label would take u = 4 and leave 30 to the second.
     found = points((3, 9, 0, 1, 0.9), (3, -20, 0, 1, 0.8), (3, 0, 0, 1, 0.7))
@@ -110,7 +110,7 @@ ROWS = st.lists(st.tuples(st.integers(0, 3), PIXELS, PIXELS), max_size=9).map(
 
 
 @given(ROWS, ROWS, st.sampled_from([0.0, 1.0, 3.0, 5.0]))
-def test_detections_take_the_nearest_label_that_is_free_one_after_the_other(
+def test_detections_match_greedily_to_the_nearest_free_label(
     label_rows: list[tuple[int, float, float]],
     found_rows: list[tuple[int, float, float]],
     radius_px: float,

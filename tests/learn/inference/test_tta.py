@@ -56,14 +56,14 @@ def test_one_view_agrees_with_itself() -> None:
         assert (getattr(again, name) == getattr(alone, name)).all()
 
 
-def test_what_one_view_alone_sees_is_believed_less() -> None:
+def test_detection_in_one_view_has_lower_confidence() -> None:
     ghost = (60.0, 40.0, 2.0, 0.9)
     both = merge_views([found([ghost, (10, 20, 1, 0.8)]), *[found([(10, 20, 1, 0.8)])] * 2])
     assert both.u_px[0].tolist() == [10, 60]
     assert both.confidence[0].tolist() == pytest.approx([0.8, 0.3])
 
 
-def test_two_robots_stay_two_and_images_keep_their_own() -> None:
+def test_merging_views_keeps_two_robots_and_separate_images() -> None:
     near = [(10.0, 20.0, 1.0, 0.8), (30.0, 20.0, 1.5, 0.7)]
     both = merge_views([found(near, near[:1]), found(near[::-1], near[1:])])
     assert both.count.tolist() == [2, 2]
@@ -93,7 +93,7 @@ def test_detections_16_px_apart_are_of_one_robot(apart: float, count: int) -> No
     assert both.confidence[0].tolist() == pytest.approx([0.7] if count == 1 else [0.4, 0.3])
 
 
-def test_of_two_near_ones_of_a_view_the_nearer_is_the_same_robot() -> None:
+def test_merging_views_pairs_the_nearer_of_two_detections() -> None:
     both = merge_views([found([(10, 20, 1, 0.8)]), found([(14, 20, 3, 0.7), (12, 20, 2, 0.6)])])
     assert both.u_px[0].tolist() == pytest.approx([11, 14])
     assert both.depth_m[0].tolist() == pytest.approx([1.5, 3])
@@ -116,7 +116,7 @@ def test_a_class_is_the_surest_s_and_a_sigma_the_median() -> None:
 
 
 @pytest.mark.parametrize("view", TTA_VIEWS)
-def test_what_a_view_puts_outside_is_at_the_rim(view: TtaView) -> None:
+def test_detections_outside_the_image_are_clipped_to_its_edge(view: TtaView) -> None:
     corners = found([(-50.0, -50.0, 1, 0.9), (150.0, 150.0, 1, 0.8)])
     back = undo_view(corners, view, STRIDE_PX, (48, 64))
     assert sorted(back.u_px[0].tolist()) == [0, 64]

@@ -29,7 +29,7 @@ def test_the_small_networks_keep_to_their_budget() -> None:
 
 
 @pytest.mark.parametrize(("name", "wide_px"), [("dmrl-nano", 287), ("dmrl-nano-fine", 311)])
-def test_how_far_a_network_sees(name: str, wide_px: int) -> None:
+def test_receptive_field_has_its_documented_width(name: str, wide_px: int) -> None:
     network = build_network(name).eval()
     for layer in network.modules():
         if isinstance(layer, torch.nn.Conv2d):
@@ -60,7 +60,7 @@ def test_every_network_gives_one_cell_per_stride(name: str) -> None:
     assert set(network.channels) <= CHANNEL_MEANINGS.keys()
 
 
-def test_the_seed_decides_the_weights_and_leaves_torch_as_it_was() -> None:
+def test_seed_sets_weights_without_changing_the_torch_generator() -> None:
     torch.manual_seed(7)
     wanted = torch.rand(1)
     torch.manual_seed(7)
@@ -74,7 +74,7 @@ def test_the_seed_decides_the_weights_and_leaves_torch_as_it_was() -> None:
     assert not torch.equal(first.convs[0].weight, other.convs[0].weight)  # type: ignore[union-attr, index, arg-type]
 
 
-def test_a_new_network_believes_in_nothing_yet() -> None:
+def test_initial_network_has_low_confidence() -> None:
     network = build_network("locanet").eval()
     with torch.no_grad():
         logit = network(normalize_images(torch.randint(0, 256, (1, 3, 64, 64), dtype=torch.uint8)))[
@@ -90,7 +90,7 @@ def test_input_is_scaled_to_about_one_and_stays_channels_last() -> None:
     assert normalize_images(many).is_contiguous(memory_format=torch.channels_last)
 
 
-def test_an_unknown_architecture_is_answered_with_the_known_ones() -> None:
+def test_unknown_architecture_error_lists_known_ones() -> None:
     with pytest.raises(
         SettingError, match=r"no architecture resnet\. Choose one of: dmrl-large, dmrl-nano, "
     ):

@@ -52,12 +52,12 @@ def between(step: Any) -> list[Op]:
         (nn.MaxPool2d((2, 3), 2), {"kernel": (2, 3), "stride": 2}),
     ],
 )
-def test_a_pool_is_the_same_said_in_any_way(step: Any, settings: dict[str, Any]) -> None:
+def test_max_pool_is_traced_from_module_and_function(step: Any, settings: dict[str, Any]) -> None:
     (pool,) = between(step)
     assert (pool.kind, pool.settings) == ("max_pool", settings)
 
 
-def test_functions_are_named_by_what_they_do_and_those_that_do_nothing_are_no_operation() -> None:
+def test_functions_are_traced_by_kind_and_no_ops_are_skipped() -> None:
     for step in (nn.ReLU(), torch.relu, relu, lambda x: x.relu()):
         assert [op.kind for op in between(step)] == ["relu"]
     for nothing in (nn.Identity(), nn.Dropout(0.5), lambda x: x.float().contiguous().clone()):
@@ -93,7 +93,7 @@ def test_convolutions_and_norms_bring_their_numbers() -> None:
     np.testing.assert_allclose(x.numpy() * factor + summand, wanted, atol=1e-6)
 
 
-def test_a_network_is_left_as_it_was() -> None:
+def test_tracing_leaves_the_network_unchanged() -> None:
     network = Small(nn.BatchNorm2d(4)).train()
     before = {name: value.clone() for name, value in network.state_dict().items()}
     trace_operations(network)

@@ -31,7 +31,7 @@ def test_counts_begin_at_one(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NON_NEGATIVE_SETTINGS)
-def test_what_may_be_nothing_may_be_no_less(name: str) -> None:
+def test_non_negative_settings_refuse_negative_values(name: str) -> None:
     assert [refused(**{name: value}) for value in (-1e-9, 0)] == [True, False]
     assert {term.weight for term in TERMS} <= set(NON_NEGATIVE_SETTINGS)
 
@@ -44,7 +44,7 @@ def test_shares_are_from_nothing_to_all(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MAX_SETTINGS)
-def test_what_no_training_reaches_is_refused(name: str) -> None:
+def test_settings_have_upper_limits(name: str) -> None:
     """A recipe of a stranger: 2^63 images an epoch, a rate of 1e308, a billion patches."""
     assert [refused(**{name: value}) for value in (MAX_SETTINGS[name], MAX_SETTINGS[name] + 1)] == [
         False,
@@ -90,7 +90,7 @@ def test_the_last_epochs_are_plain_where_that_is_asked_for() -> None:
     assert settings.augmentation(9).flip_share == settings.flip_share
 
 
-def test_what_nobody_asks_for_is_off() -> None:
+def test_optional_settings_are_off_by_default() -> None:
     plain = TrainConfig()
     for name in (
         *("init_share", "hard_share", "paste", "plain_epochs", "frozen_norm_epochs", "grey_share"),
@@ -102,7 +102,7 @@ def test_what_nobody_asks_for_is_off() -> None:
     assert (plain.offset_weight, plain.focus) == (0.5, 2.0)  # as the weights that ship were made
 
 
-def test_defaults_are_those_that_docs_training_md_tells() -> None:
+def test_defaults_equal_docs_training_md() -> None:
     plain = TrainConfig()
     assert (plain.architecture, plain.epochs) == ("dmrl-nano", 60)
     assert (plain.validation_share, plain.false_alarms) == (0.1, 0.02)

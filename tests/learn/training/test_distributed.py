@@ -28,7 +28,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("group_work")
 
 
-def test_all_work_and_the_first_returns(work: ModuleType) -> None:
+def test_all_processes_run_and_rank_0_returns(work: ModuleType) -> None:
     threads = torch.get_num_threads()
     assert run_distributed(2, partial(work.rank_sum, more=10)) == 11
     assert torch.get_num_threads() == threads
@@ -41,7 +41,7 @@ def test_one_that_was_killed_is_one_line(work: ModuleType) -> None:
     assert not distributed.is_initialized()
 
 
-def test_the_others_end_with_the_first(work: ModuleType) -> None:
+def test_failure_of_rank_0_ends_the_other_processes(work: ModuleType) -> None:
     with pytest.raises(RuntimeError, match="a bug"):
         run_distributed(2, work.first_fails)
     assert not distributed.is_initialized()
@@ -58,7 +58,7 @@ def test_a_start_that_failed_leaves_nothing_to_the_next(
     assert run_distributed(2, partial(work.rank_sum, more=0)) == 1
 
 
-def test_once_they_have_met_one_may_wait_longer(tmp_path: Path) -> None:
+def test_collective_timeout_is_longer_than_the_join_timeout(tmp_path: Path) -> None:
     def patience(_: ProcessGroup) -> float:
         found = distributed.distributed_c10d._get_default_group()
         backend = found._get_backend(torch.device("cpu"))

@@ -32,7 +32,7 @@ def examples() -> ExampleSet:
     return ExampleSet([pixels], robots)
 
 
-def test_what_the_network_believes_comes_more_often() -> None:
+def test_confident_negatives_are_sampled_more_often() -> None:
     network = Bright().train()
     assert network.channels == DETECTION_CHANNELS
     believed = compute_peak_confidences(network, examples(), np.arange(5))

@@ -40,7 +40,7 @@ def test_depth_loss_counts_cells_with_a_robot_only() -> None:
     assert float(depth_loss(log_depth, depth_m, confidence)) == pytest.approx(0.25 / 2)
 
 
-def test_a_far_off_log_depth_in_an_empty_cell_harms_nothing() -> None:
+def test_log_depth_in_an_empty_cell_has_no_gradient() -> None:
     log_depth = torch.full((1, 1, 1), 1000.0, requires_grad=True)
     loss = depth_loss(log_depth, torch.zeros(1, 1, 1), torch.zeros(1, 1, 1))
     loss.backward()  # type: ignore[no-untyped-call]
@@ -50,7 +50,7 @@ def test_a_far_off_log_depth_in_an_empty_cell_harms_nothing() -> None:
 
 
 @pytest.mark.parametrize("kind", ["squared", "log"])
-def test_depth_that_is_not_known_harms_nothing(kind: DepthLoss) -> None:
+def test_unknown_depth_has_no_gradient(kind: DepthLoss) -> None:
     log_depth = torch.zeros(1, 1, 2, requires_grad=True)
     depth_m = torch.tensor([[[math.e, 0.0]]])
     depth_loss(log_depth, depth_m, torch.tensor([[[1.0, 0.0]]]), kind).backward()  # type: ignore[no-untyped-call]
@@ -77,7 +77,7 @@ def test_offset_loss_is_the_sum_of_both_ways_where_there_is_a_robot() -> None:
     assert float(offset_loss(predicted, wanted, weight)) == pytest.approx(0.35)
 
 
-def test_the_best_spread_is_the_mean_error_and_depth_learns_nothing_from_it() -> None:
+def test_spread_loss_is_minimal_at_the_mean_error_without_depth_gradient() -> None:
     errors = torch.tensor([0.1, 0.3, 0.2, 0.4])
     log_depth = errors.reshape(1, 1, 4).requires_grad_()
     log_b = torch.linspace(-4, 0, 401)
@@ -108,7 +108,7 @@ def test_class_loss_is_the_papers_and_only_where_the_class_is_known() -> None:
 WEIGHTS = [field.name for field in fields(TrainConfig) if field.name.endswith("_weight")]
 
 
-def test_every_weight_weighs_one_term() -> None:
+def test_each_loss_weight_belongs_to_one_term() -> None:
     assert sorted(WEIGHTS) == sorted(term.weight for term in TERMS)
     assert len({term.name for term in TERMS}) == len(TERMS)
 
@@ -146,7 +146,7 @@ def test_a_term_is_nothing_to_a_network_that_lacks_its_channels() -> None:
     assert parts["confidence_loss"] > 0
 
 
-def test_a_spread_below_a_hundredth_is_one() -> None:
+def test_predicted_spread_is_clamped_at_one_hundredth() -> None:
     one = torch.ones(1, 1, 1)
     low, least = (compute_spread_loss(x * one, 0 * one, one, one) for x in (-20.0, math.log(0.01)))
     assert float(low) == float(least) == pytest.approx(math.log(0.01))
@@ -160,7 +160,7 @@ def test_the_focus_is_an_exponent(focus: float) -> None:
     assert float(confidence_loss(logit, label, focus=focus)) == pytest.approx(plain * wrong**focus)
 
 
-def test_what_is_learnt_where_a_recipe_says_nothing() -> None:
+def test_default_loss_settings_are_documented_values() -> None:
     assert asdict(LossSettings()) == {
         "confidence_weight": 1.0,
         "focus": 2.0,

@@ -76,7 +76,7 @@ def plain_orthogonal(matrix: np.ndarray) -> np.ndarray:
     return x
 
 
-def test_steps_of_muon_are_those_that_were_published_and_the_rest_is_adam() -> None:
+def test_muon_steps_equal_the_published_algorithm_and_others_use_adam() -> None:
     torch.manual_seed(2)
     rate, decay = 0.02, 0.1
     kernel = torch.nn.Parameter(torch.randn(4, 3, 3, 3))
@@ -105,7 +105,7 @@ def test_steps_of_muon_are_those_that_were_published_and_the_rest_is_adam() -> N
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(3, 5), (5, 3), (4, 4), (1, 7)])
-def test_a_matrix_is_brought_to_even_singular_values_lying_or_standing(
+def test_orthogonalize_wide_and_tall_matrices(
     rows: int, columns: int
 ) -> None:
     matrix = np.random.default_rng(rows).normal(size=(rows, columns)).astype(np.float32)

@@ -31,7 +31,7 @@ def test_same_seed_same_bytes_and_another_seed_others(examples: ExampleSet, tmp_
 
 
 @pytest.mark.heavy
-def test_training_finds_the_dot(tmp_path: Path) -> None:
+def test_locanet_learns_to_detect_a_dot(tmp_path: Path) -> None:
     examples = dots(150)
     settings = replace(SETTINGS, epochs=12, learning_rate=3e-3)
     training, network = trained(examples, tmp_path / "run", settings)
@@ -46,7 +46,7 @@ def test_training_finds_the_dot(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_dmrl_nano_finds_the_dot_within_its_cell(tmp_path: Path) -> None:
+def test_dmrl_nano_learns_to_locate_a_dot_within_its_cell(tmp_path: Path) -> None:
     examples = dots(64)
     settings = TrainConfig(
         epochs=20, batch_size=8, ema_steps=40, rotation_deg=0.0, blur_share=0.0, device="cpu"
@@ -102,7 +102,7 @@ def test_frozen_norms_are_learnt_but_not_measured(
     assert not any(torch.equal(first[name], second[name]) for name in scales)
 
 
-def test_a_teacher_that_says_the_same_leaves_nothing_to_learn(examples: ExampleSet) -> None:
+def test_distillation_loss_is_zero_for_an_identical_teacher(examples: ExampleSet) -> None:
     settings = TrainConfig(distill_share=1.0, device="cpu")
     batch = collate(examples, np.arange(8))
     student = build_network("dmrl-nano", seed=1).eval()
@@ -208,14 +208,14 @@ def test_images_that_do_not_fit_the_network_are_refused(examples: ExampleSet) ->
         build_initial_network(SETTINGS, none)
 
 
-def test_a_missing_cuda_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_cuda_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     assert select_device("auto").type == "cpu"
     with pytest.raises(SettingError, match="no CUDA device here"):
         select_device("cuda")
 
 
-def test_a_mean_of_weights_follows_the_first_steps_and_forgets_slowly_later() -> None:
+def test_weight_ema_follows_early_steps_and_averages_later_ones() -> None:
     network = build_network("dmrl-nano")
     mean = WeightEma(network, 100)
     expected = 0.0

@@ -15,7 +15,7 @@ def points(image: list[int], u_px: list[float], confidence: list[float]) -> Poin
     return Points(np.array(image), u, np.full(len(u), 50.0), np.ones(len(u)), np.array(confidence))
 
 
-def test_the_threshold_lies_below_the_last_detection_that_pays() -> None:
+def test_threshold_is_set_by_the_detection_that_maximizes_f_score() -> None:
     truth = points(list(range(12)), [50.0] * 12, [1.0] * 12)
     # Ten right ones, then a wrong one, then a right one, then wrong ones.
     confidence = [0.9] * 10 + [0.6, 0.5, 0.3, 0.2]
@@ -47,7 +47,7 @@ def test_a_false_alarm_that_is_the_surest_of_all_is_not_let_through() -> None:
     )
 
 
-def test_alarms_are_counted_where_nobody_is() -> None:
+def test_false_alarms_are_counted_in_empty_images() -> None:
     truth = points([0], [50.0], [1.0])
     found = points([0, 0, 1, 1, 2], [50.0, 150.0, 60.0, 90.0, 60.0], [0.9, 0.8, 0.7, 0.6, 0.2])
     scored = score_detections(5, truth, found)
@@ -89,7 +89,7 @@ def test_ten_labels_are_enough_for_a_threshold() -> None:
         assert found is None or found == 0.5  # between the last, of 1, and nothing
 
 
-def test_twenty_empty_images_tell_a_rate() -> None:
+def test_false_alarm_rate_needs_twenty_empty_images() -> None:
     truth = points(list(range(12)), [50.0] * 12, [1.0] * 12)
     found = points([*range(12), 12], [50.0] * 12 + [80.0], [0.9] * 12 + [0.8])
     for images, threshold in ((12 + 19, 0.85), (12 + 20, 0.85)):
@@ -106,7 +106,7 @@ def test_twenty_empty_images_tell_a_rate() -> None:
     assert select_threshold(score_detections(32, truth, sure), 0.05) == pytest.approx(0.45)
 
 
-def test_a_robot_on_the_upper_and_left_rim_is_inside_and_on_the_others_not() -> None:
+def test_upper_and_left_image_edges_are_inside() -> None:
     robots = np.full((8, 1, len(ROBOT_FIELDS)), np.nan, np.float32)
     at = [(0, 10), (20, 0), (48, 10), (20, 32), (47.9, 31.9), (-0.1, 10), (20, -0.1)]
     for row, (u, v) in zip(robots, at, strict=False):
