@@ -105,9 +105,7 @@ def test_muon_steps_equal_the_published_algorithm_and_others_use_adam() -> None:
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(3, 5), (5, 3), (4, 4), (1, 7)])
-def test_orthogonalize_wide_and_tall_matrices(
-    rows: int, columns: int
-) -> None:
+def test_orthogonalize_wide_and_tall_matrices(rows: int, columns: int) -> None:
     matrix = np.random.default_rng(rows).normal(size=(rows, columns)).astype(np.float32)
     lying = matrix.T if rows > columns else matrix
     wanted = plain_orthogonal(lying)
