@@ -60,7 +60,7 @@ def test_shuffling_depends_on_the_seed_alone_and_loses_nothing(data: Path) -> No
     assert sorted(order(1)) == sorted(order(2))
 
 
-def test_what_is_no_dataset_or_split_is_said(data: Path, tmp_path: Path) -> None:
+def test_missing_dataset_or_split_is_reported(data: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="dmrl dataset"):
         dmrl.dataset(tmp_path)
     with pytest.raises(MissingSplit, match=r"^no split val in .*\. It has: train"):

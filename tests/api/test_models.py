@@ -43,26 +43,26 @@ def test_one_image_is_a_sequence_of_one(flight: Path) -> None:
         [None],
     ],
 )
-def test_what_is_no_image_is_said(images: Any) -> None:
+def test_invalid_images_are_reported(images: Any) -> None:
     with pytest.raises(SettingError, match="RGB"):
         dmrl.load("dmrl-nano").detect(images)
 
 
-def test_sizes_that_do_not_divide_are_said() -> None:
+def test_sizes_not_divisible_by_the_stride_are_reported() -> None:
     with pytest.raises(SettingError, match="Crop or scale"):
         dmrl.load("dmrl-nano").detect(np.zeros((1, 225, 320, 3), np.uint8))
 
 
-def test_no_model_of_a_name_is_said() -> None:
+def test_unknown_model_name_is_reported() -> None:
     with pytest.raises(ModelError, match="dmrl-nano"):
         dmrl.load("dmrl-mini")
 
 
-def test_no_backend_of_a_name_is_said() -> None:
+def test_unknown_backend_name_is_reported() -> None:
     with pytest.raises(SettingError, match=r"no backend cuda\. There are: torch, onnx"):
         dmrl.load("dmrl-nano", backend="cuda")  # type: ignore[arg-type]
 
 
-def test_a_path_is_no_images() -> None:
+def test_a_path_is_refused_as_images() -> None:
     with pytest.raises(SettingError, match="RGB"):
         dmrl.load("dmrl-nano").detect("flight.mcap")  # type: ignore[arg-type]

@@ -41,7 +41,7 @@ def test_a_stretch_of_time_and_fewer_fields(flight: Path) -> None:
     assert 90 <= len(frame) <= 110
 
 
-def test_a_message_within_is_columns_of_its_own(flight: Path) -> None:
+def test_nested_messages_become_dotted_columns(flight: Path) -> None:
     frame = dmrl.open(flight)["/tf"].to_pandas()
     assert "transforms.translation.x" in frame.columns
 
@@ -74,14 +74,14 @@ def test_images_are_decoded_one_by_one_sliced_and_near_a_time(flight: Path) -> N
         images[12]
 
 
-def test_images_of_several_robots_want_a_name(flight: Path) -> None:
+def test_images_of_several_robots_need_a_robot_name(flight: Path) -> None:
     with pytest.raises(SettingError, match="Name one"):
         dmrl.open(flight).images()
     with pytest.raises(MissingTopic):
         dmrl.open(flight).images("cf9")
 
 
-def test_what_is_not_there_is_said(flight: Path, tmp_path: Path) -> None:
+def test_missing_topic_or_recording_is_reported(flight: Path, tmp_path: Path) -> None:
     with pytest.raises(MissingTopic, match="Did you mean /cf1/attitude"):
         dmrl.open(flight)["/cf1/atitude"]
     with pytest.raises(RecordingError, match="no recording"):

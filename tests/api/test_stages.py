@@ -42,13 +42,13 @@ def test_topics_and_images_keep_a_temporary_recording_there(flight: Path) -> Non
     assert not any(path.exists() for path in paths)
 
 
-def test_wrong_settings_are_said(flight: Path) -> None:
+def test_wrong_settings_name_the_setting(flight: Path) -> None:
     with pytest.raises(RecipeError, match="gate: "):
         dmrl.label(flight, gate=0.4)
 
 
 @pytest.mark.heavy
-def test_no_recording_at_all_is_said_and_one_is_a_list_of_one(flight: Path, tmp_path: Path) -> None:
+def test_empty_list_is_refused_and_one_recording_is_accepted(flight: Path, tmp_path: Path) -> None:
     for stage in (dmrl.evaluate, dmrl.merge):
         with pytest.raises(SettingError, match="empty list"):
             stage([])

@@ -38,7 +38,7 @@ def test_an_error_in_the_block_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_wrong_topics_fields_and_lengths_are_said(tmp_path: Path) -> None:
+def test_wrong_topics_fields_and_lengths_are_reported(tmp_path: Path) -> None:
     with dmrl.writer(tmp_path / "own.mcap") as out:
         with pytest.raises(RecordingError, match="no topic /a/smell"):
             out.write("/a/smell", 0.0, {})
@@ -59,7 +59,7 @@ def test_wrong_topics_fields_and_lengths_are_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("time_s", [math.nan, math.inf, -0.1, 1e10])
-def test_a_time_that_no_recording_holds_is_said(tmp_path: Path, time_s: float) -> None:
+def test_time_out_of_range_is_reported(tmp_path: Path, time_s: float) -> None:
     with dmrl.writer(tmp_path / "own.mcap") as out:
         out.write("/a/height", 0.0, {"height_m": 1.0})
         with pytest.raises(RecordingError, match=r"/a/height at .* s\. Give seconds from 0"):
@@ -71,14 +71,14 @@ def test_a_time_that_no_recording_holds_is_said(tmp_path: Path, time_s: float) -
     assert len(out.open()["/a/height"]) == 1
 
 
-def test_what_is_written_after_the_end_is_not_lost_in_silence(tmp_path: Path) -> None:
+def test_writing_after_close_is_refused(tmp_path: Path) -> None:
     with dmrl.writer(tmp_path / "own.mcap") as out:
         out.write("/a/height", 0.0, {"height_m": 1.0})
     with pytest.raises(SettingError, match=r"own\.mcap is written"):
         out.write("/a/height", 1.0, {"height_m": 1.0})
 
 
-def test_a_message_of_another_recording_is_written_as_it_is(tmp_path: Path) -> None:
+def test_message_of_another_recording_is_written_unchanged(tmp_path: Path) -> None:
     with dmrl.writer(tmp_path / "a.mcap") as out:
         peers = [{"peer": "cf2", "u_px": 3.5, "source": "truth"}]
         out.write("/cf1/labels", 0.5, {"peers": peers})
@@ -92,7 +92,7 @@ def test_a_message_of_another_recording_is_written_as_it_is(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", ["a\nb", "\0", "\udcff", "x" * 5000, "\u202ecf2"])
-def test_a_name_that_nobody_would_read_again_is_said(name: str, tmp_path: Path) -> None:
+def test_unreadable_name_is_refused_on_writing(name: str, tmp_path: Path) -> None:
     with dmrl.writer(tmp_path / "a.mcap") as out:
         for write in (
             lambda: out.write(f"/{name}/height", 1.0, {"height_m": 1.0}),
@@ -106,7 +106,7 @@ def test_a_name_that_nobody_would_read_again_is_said(name: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("shape", [(9_000, 9_000, 3), (1, 70_000, 3), (70_000, 70_000)])
-def test_a_picture_that_nobody_would_read_again_is_said(
+def test_image_over_the_size_limit_is_refused_on_writing(
     shape: tuple[int, ...], tmp_path: Path
 ) -> None:
     with (

@@ -65,7 +65,7 @@ def names(folder: Path, query: str) -> list[str]:
 
 
 @pytest.mark.heavy
-def test_a_row_says_what_its_recording_holds(flights: Path) -> None:
+def test_catalogue_row_describes_its_recording(flights: Path) -> None:
     made = index.update(flights, workers=1)
     assert made == index.Result(recordings=4, looked_at=4, known=0, gone=0, unread=1)
     table = pq.read_table(flights / FILE_NAME)
@@ -129,7 +129,7 @@ HOSTILE_QUERIES = [
         *(pytest.param(q, marks=pytest.mark.heavy) for q in HOSTILE_QUERIES[3:]),
     ],
 )
-def test_a_query_that_cannot_be_answered_is_one_line_and_reads_nothing_else(
+def test_invalid_query_gives_one_line_error_and_reads_no_other_file(
     query: str, tmp_path: Path
 ) -> None:
     (tmp_path / "a.csv").write_text("a\nprecious\n")
@@ -141,7 +141,7 @@ def test_a_query_that_cannot_be_answered_is_one_line_and_reads_nothing_else(
 
 
 @pytest.mark.heavy
-def test_only_what_changed_is_looked_at_again(flights: Path) -> None:
+def test_only_changed_recordings_are_indexed_again(flights: Path) -> None:
     index.update(flights, workers=1)
     before = (flights / FILE_NAME).stat().st_mtime_ns
     (flights / "torn.mcap").unlink()
@@ -158,7 +158,7 @@ def test_only_what_changed_is_looked_at_again(flights: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_what_was_seen_before_a_stop_is_kept(
+def test_interrupted_index_keeps_finished_rows(
     flights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = index.iter_results
@@ -177,7 +177,7 @@ def test_what_was_seen_before_a_stop_is_kept(
     assert (again.looked_at, again.known) == (3, 1)  # one of the two cannot be read
 
 
-def test_a_name_that_no_table_can_hold_is_said_before_the_work(
+def test_non_utf_8_name_is_refused_before_indexing(
     flights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     odd = flights / os.fsdecode(b"\xff.mcap")
@@ -249,7 +249,7 @@ def test_a_dataset_of_what_a_query_finds(
 
 
 @pytest.mark.heavy
-def test_the_page_tells_of_a_catalogue_and_opens_no_thousand_recordings(
+def test_report_shows_the_catalogue_without_opening_every_recording(
     flights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     index.update(flights, workers=1)
@@ -284,7 +284,7 @@ def _edited(folder: Path, **values: Any) -> None:
         ({"cameras": [{"camera": "x", "images": 1, "focal_px": float("inf")}]}, "focal_px"),
     ],
 )
-def test_a_stranger_s_catalogue_is_one_line(
+def test_invalid_catalogue_gives_one_line_error(
     tmp_path: Path, values: dict[str, Any], complaint: str
 ) -> None:
     table = to_table([{"recording": "a.mcap", "bytes": 1, "stamp": "1 2 3"}])

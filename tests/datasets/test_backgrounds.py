@@ -38,7 +38,7 @@ def test_a_dataset_whose_robots_have_no_box_is_refused(record: Record, tmp_path:
         open_backgrounds(tmp_path / "set")
 
 
-def test_what_is_hidden_is_painted_with_what_is_around_it() -> None:
+def test_hidden_pixels_are_inpainted_from_their_surroundings() -> None:
     rgb = np.full((64, 96, 3), (20, 120, 220), np.uint8)
     hidden = np.zeros((64, 96), bool)
     hidden[20:40, 30:60] = True

@@ -60,7 +60,7 @@ def front_of(folder: Path) -> Any:
 
 
 @pytest.mark.heavy
-def test_the_front_matter_says_what_the_hub_asks(built: Path) -> None:
+def test_front_matter_has_the_fields_of_the_hub(built: Path) -> None:
     front = front_of(built)
     assert front["pretty_name"] == "Two flights: a test"
     assert front["license"] == "cc-by-4.0"
@@ -88,7 +88,7 @@ def test_every_column_has_a_meaning_with_its_unit(built: Path) -> None:
     assert all(meaning.strip() for _, meaning in rows)
 
 
-def test_it_tells_the_whole_ancestry_with_hashes(built: Path) -> None:
+def test_card_lists_the_lineage_with_hashes(built: Path) -> None:
     text = (built / "README.md").read_text()
     made = json.loads((built / "provenance.json").read_text())
     for source in made["inputs"]:
@@ -130,7 +130,9 @@ def test_a_card_can_be_written_elsewhere_and_the_one_before_stays(
     assert (built / "README.md").read_bytes() == before
 
 
-def test_it_says_what_to_know_before_learning(record: Record, tmp_path: Path) -> None:
+def test_card_warns_of_label_bias_exclusions_leaks_and_licence(
+    record: Record, tmp_path: Path
+) -> None:
     def boxed(k: int) -> Any:
         u_px = 20.0 + k % 20
         box = [u_px - 8, 10, u_px + 8, 30]
@@ -167,7 +169,7 @@ def test_licences_beside_a_source_reach_the_card(tmp_path: Path) -> None:
     assert "- Licence of `pictures`: MIT License." in text
 
 
-def test_what_a_hand_wrote_below_the_line_stays(built: Path) -> None:
+def test_handwritten_text_below_the_marker_is_kept(built: Path) -> None:
     readme = built / "README.md"
     before = readme.read_text(encoding="utf-8")
     readme.write_text(before + "\nFlown in hall 3.\n", encoding="utf-8")
@@ -193,9 +195,7 @@ def test_licences_that_are_known_are_taken(built: Path, license_id: str) -> None
     assert front_of(built)["license"] == license_id
 
 
-def test_a_licence_that_nobody_knows_is_refused(
-    built: Path, record: Record, tmp_path: Path
-) -> None:
+def test_unknown_licence_is_refused(built: Path, record: Record, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"--license foo-1: neither SPDX nor .* Try: cc-by-4"):
         run_card(built, CardSettings(license="foo-1"))
     with pytest.raises(SettingError, match="--license foo-1"):
@@ -243,7 +243,7 @@ def test_the_hub_reads_the_front_matter(built: Path) -> None:
     assert infos["default"].features == datasets.load_from_disk(str(built))["train"].features
 
 
-def test_it_says_what_limits_it_and_what_it_was_taken_with(built: Path, tmp_path: Path) -> None:
+def test_card_lists_limitations_and_sensors(built: Path, tmp_path: Path) -> None:
     text = (built / "README.md").read_text()
     assert "- 2 of 5 images show no peer." in text and "peers in one image is 2." in text
     assert "- Labels by status: OK 5." in text
@@ -270,7 +270,7 @@ def test_many_recordings_are_a_few_lines_of_a_card() -> None:
     assert found[20] == "- 80 more lines of this kind are in `facts.json`."
 
 
-def test_without_matplotlib_the_card_has_no_figures_and_says_how_to_get_them(
+def test_card_without_matplotlib_omits_figures_and_names_the_extra(
     record: Record,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -313,7 +313,7 @@ def test_a_broken_provenance_is_one_line(built: Path) -> None:
         '{"other": 1}',
     ],
 )
-def test_facts_that_are_none_are_one_line(built: Path, text: str) -> None:
+def test_invalid_facts_give_one_line_error(built: Path, text: str) -> None:
     (built / "facts.json").write_text(text)
     with pytest.raises(DatasetError, match=r"facts.json cannot be read"):
         write_card(built)

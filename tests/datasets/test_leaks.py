@@ -35,9 +35,7 @@ def test_the_same_picture_brighter_noisier_or_smaller_looks_the_same() -> None:
         assert apart(picture, picture.resize((160, 112))) <= NEAR_DUPLICATE_BITS
 
 
-def test_a_small_drone_before_the_same_background_looks_the_same_and_another_place_does_not() -> (
-    None
-):
+def test_near_duplicate_hash_ignores_a_small_drone_but_not_the_scene() -> None:
     for seed in range(20):
         picture, moved = scene(seed), np.asarray(scene(seed)).copy()
         moved[100:112, 200:216] = 10

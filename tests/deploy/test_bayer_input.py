@@ -7,14 +7,14 @@ PHASES = [(row, col) for row in (0, 1) for col in (0, 1)]
 
 
 @pytest.mark.parametrize(("row", "col"), PHASES)
-def test_what_a_pixel_measured_stays(row: int, col: int) -> None:
+def test_demosaicing_keeps_measured_values(row: int, col: int) -> None:
     image = np.random.default_rng(0).integers(0, 256, (9, 12, 3), dtype=np.uint8)
     raw = to_mosaic(image, red_row=row, red_col=col)
     seen = demosaic(raw, red_row=row, red_col=col)
     assert np.array_equal(to_mosaic(seen, red_row=row, red_col=col), raw)
 
 
-def test_even_light_stays_even() -> None:
+def test_demosaicing_keeps_uniform_colour() -> None:
     image = np.broadcast_to(np.array([200, 90, 31], np.uint8), (8, 10, 3))
     assert np.array_equal(demosaic(to_mosaic(image)), image)
 
@@ -28,6 +28,6 @@ def test_halves_go_up_and_the_border_is_mirrored() -> None:
     assert red[1, 1] == (10 + 30 + 90 + 110 + 2) // 4
 
 
-def test_grey_weighs_the_colours() -> None:
+def test_grey_is_a_weighted_sum_of_colours() -> None:
     image = np.broadcast_to(np.array([255, 0, 0], np.uint8), (4, 4, 3))
     assert (demosaic(to_mosaic(image), channels=1) == (77 * 255 + 128) >> 8).all()

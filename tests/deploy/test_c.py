@@ -74,9 +74,7 @@ def test_two_hundred_random_networks_do_so_under_the_sanitizers(seed: int, tmp_p
 @pytest.mark.parametrize(
     "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 9))]
 )
-def test_any_integers_will_do_shifts_below_33_and_missing_padding_too(
-    seed: int, tmp_path: Path
-) -> None:
+def test_random_integer_networks_match_the_reference(seed: int, tmp_path: Path) -> None:
     result = proved(random_network(seed), tmp_path, CHECKED)
     assert (result.error, result.mismatches) == (None, 0)
 
@@ -224,7 +222,7 @@ def test_the_same_network_gives_the_same_text() -> None:
 
 
 @pytest.mark.heavy
-def test_of_many_peaks_the_first_stay() -> None:
+def test_first_peaks_are_kept_if_there_are_too_many() -> None:
     network = replace(quantised_network(1), threshold=0.0)
     compiled = CompiledNetwork(network)
     image = noise(network, 1)[0]

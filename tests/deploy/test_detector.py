@@ -29,7 +29,7 @@ needs_riscv = pytest.mark.skipif(bool(find_missing(RISCV, EMULATOR)), reason="no
 @pytest.mark.parametrize(
     "backend", ["integer", "onnx-int8", "c", pytest.param("riscv32", marks=needs_riscv)]
 )
-def test_an_int8_network_says_the_same_by_every_backend(backend: str, tmp_path: Path) -> None:
+def test_int8_backends_give_equal_outputs(backend: str, tmp_path: Path) -> None:
     network = replace(quantised_network(11), threshold=0.37)
     save_network(network, tmp_path / INTEGER_NAME)
     shape = (2, network.height_px, network.width_px, 3)
@@ -57,7 +57,7 @@ def run_folder(folder: Path) -> Path:
     return folder
 
 
-def test_a_float_model_says_the_same_by_torch_and_onnx_and_as_an_export(tmp_path: Path) -> None:
+def test_float_backends_and_export_give_equal_outputs(tmp_path: Path) -> None:
     run = run_folder(tmp_path / "run")
     images = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3), np.uint8)
     export = tmp_path / "export"
@@ -139,7 +139,7 @@ def test_logits_far_out_overflow_nothing() -> None:
     assert to_grids({"confidence": far, "log_depth": far, "offset_u": far}).offset is None
 
 
-def test_without_risc_v_tools_the_line_to_type_is_said(
+def test_missing_risc_v_tools_error_names_the_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_network(quantised_network(0), tmp_path / INTEGER_NAME)

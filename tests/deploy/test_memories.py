@@ -52,9 +52,7 @@ def images(network: IntegerNetwork) -> list[np.ndarray]:
 @no_gcc
 @pytest.mark.heavy
 @pytest.mark.parametrize("seed", [*range(4), 5, 12, 15, 19, 47])  # every way to read rows
-def test_layers_touch_the_near_memory_alone_and_copy_as_much_as_is_stated(
-    seed: int, tmp_path: Path
-) -> None:
+def test_layers_use_near_memory_only_and_copy_the_stated_bytes(seed: int, tmp_path: Path) -> None:
     network = splittable(seed)
     result = proved(network, tmp_path, smallest(network))
     assert (result.error, result.mismatches) == (None, 0)
@@ -72,7 +70,7 @@ def test_networks_that_ship_come_through_bit_for_bit(name: str, tmp_path: Path) 
 
 @no_gcc
 @pytest.mark.heavy
-def test_a_layer_that_works_in_the_far_memory_is_found_out(tmp_path: Path) -> None:
+def test_layer_that_uses_far_memory_is_detected(tmp_path: Path) -> None:
     network = splittable(3)
     write_c(network, tmp_path, [], near_bytes=smallest(network))
     code = tmp_path / "random.c"
@@ -85,7 +83,7 @@ def test_a_layer_that_works_in_the_far_memory_is_found_out(tmp_path: Path) -> No
 
 @no_gcc
 @pytest.mark.heavy
-def test_less_copied_than_stated_is_found_out(tmp_path: Path) -> None:
+def test_too_little_copied_traffic_is_detected(tmp_path: Path) -> None:
     network = splittable(3)
     write_c(network, tmp_path, [], near_bytes=smallest(network))
     header = tmp_path / "random.h"
@@ -118,7 +116,7 @@ def test_the_self_test_passes_with_two_memories(tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_what_ships_fits_a_gap8_with_the_rings_of_long_reach_far() -> None:
+def test_shipped_networks_fit_gap8_with_long_ring_buffers_in_far_memory() -> None:
     nano, fine = plan_buffers(untrained("dmrl-nano")), plan_buffers(untrained("dmrl-nano-fine"))
     for whole, far in ((nano, {"body_5_0"}), (fine, {"body_1_0", "body_9_0"})):
         two = place_buffers(whole, MAX_L1_STATE_BYTES)
@@ -138,7 +136,7 @@ def tables(whole: BufferPlan) -> int:
     return total
 
 
-def test_of_all_that_fits_the_least_is_copied() -> None:
+def test_placement_with_least_traffic_is_chosen() -> None:
     network = splittable(5)
     whole = plan_buffers(network)
     least, most = smallest(network), Placement(whole).near_bytes(bayer=True)

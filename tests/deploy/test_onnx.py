@@ -74,7 +74,7 @@ def test_the_same_network_gives_the_same_bytes() -> None:
     assert int8_onnx(quantised_network(4)) == int8_onnx(quantised_network(4))
 
 
-def test_what_is_not_a_network_of_ours_is_refused(tmp_path: Path) -> None:
+def test_invalid_onnx_file_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "model.onnx"
     file.write_bytes(b"no model")
     with pytest.raises(ModelError, match=r"model.onnx cannot be run: .* Export the model again"):

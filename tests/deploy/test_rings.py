@@ -13,7 +13,7 @@ NETWORKS = [*map(random_network, range(12)), *map(quantised_network, range(24))]
 
 
 @pytest.mark.heavy
-def test_what_is_still_needed_is_never_overwritten() -> None:
+def test_ring_buffers_never_overwrite_needed_rows() -> None:
     joined = 0
     for network in [*NETWORKS, untrained("dmrl-nano", 64, 96)]:
         planned = plan_buffers(network)
@@ -38,7 +38,7 @@ def conv(**more: int) -> Conv:
 
 
 @pytest.mark.parametrize("dilation", [1, 2, 5])
-def test_a_convolution_reads_what_it_would_overwrite_so_two_in_a_row_gain_nothing(
+def test_consecutive_convolutions_cannot_share_a_ring_buffer(
     dilation: int,
 ) -> None:
     spread = conv(dilation=dilation, padding=dilation)
@@ -48,7 +48,7 @@ def test_a_convolution_reads_what_it_would_overwrite_so_two_in_a_row_gain_nothin
     assert share_ring([1, 2], writes) == (4 * dilation + 2, [0, 3 * dilation + 1])
 
 
-def test_rows_are_made_as_soon_as_they_can_be() -> None:
+def test_rows_are_scheduled_as_early_as_possible() -> None:
     writes = schedule_rows([Step("s", conv(stride=2), pooled=False, sources=(0,))], [6, 3])
     assert [(w.buffer, w.row) for w in writes] == [
         (0, 0), (0, 1), (1, 0), (0, 2), (0, 3), (1, 1), (0, 4), (0, 5), (1, 2),

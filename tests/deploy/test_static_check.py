@@ -59,7 +59,7 @@ def test_a_sound_network_passes() -> None:
         (b"no network", "a.onnx cannot be run"),
     ],
 )
-def test_what_asks_for_too_much_is_one_line(data: bytes, said: str) -> None:
+def test_oversized_onnx_file_gives_one_line_error(data: bytes, said: str) -> None:
     with pytest.raises(ModelError, match=said) as e:
         require_modest(data, "a.onnx")
     assert str(e.value).startswith("a.onnx cannot be run: ") and "\n" not in str(e.value)

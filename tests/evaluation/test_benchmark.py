@@ -115,7 +115,7 @@ def write_labels(path: Path, source: Path, scene: Path, error_m: float) -> Path:
     return path
 
 
-def test_labels_of_strangers_are_scored_by_the_input_they_were_made_from(
+def test_submitted_labels_are_scored_by_their_input_and_truth_is_refused(
     scene: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:
     whole, public, blind = scene
@@ -136,7 +136,7 @@ def test_labels_of_strangers_are_scored_by_the_input_they_were_made_from(
         score_labels(tmp_path / "odd.csv", [whole], inputs)
 
 
-def test_what_was_made_from_a_sealed_flight_is_refused_by_its_provenance(
+def test_network_trained_on_sealed_flight_is_refused(
     scene: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:
     whole, _, _ = scene
@@ -152,7 +152,7 @@ def test_what_was_made_from_a_sealed_flight_is_refused_by_its_provenance(
 
 @pytest.mark.heavy
 @pytest.mark.timeout(900)
-def test_one_command_scores_a_strangers_network(tmp_path: Path) -> None:
+def test_one_command_scores_a_submitted_network(tmp_path: Path) -> None:
     text = recipes.read_text("benchmark").replace('"blender"', '"sketch"')
     for long, short in (
         ("91001, 91002, 91003, 91004", "91001, 91002"),

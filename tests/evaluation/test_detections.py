@@ -55,7 +55,7 @@ def test_detections_come_best_first_however_they_were_written(tmp_path: Path) ->
     assert pairs.threshold == pytest.approx(0.4)
 
 
-def test_an_image_counts_if_the_source_looked_and_all_it_said_is_ok(tmp_path: Path) -> None:
+def test_image_counts_if_the_source_labelled_it_and_all_labels_are_ok(tmp_path: Path) -> None:
     images: list[Image] = [
         ([label(1)], [], ()),
         ([label(2, source="hand")], [], ()),  # nobody knows whether truth looked

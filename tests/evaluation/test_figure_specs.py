@@ -45,12 +45,12 @@ def test_a_wrong_figure_is_a_fault_of_the_recipe(change: dict[str, Any], says: s
 @pytest.mark.parametrize(
     "form", ["{}", "999999999.1f", "1000000000", "*>900000000f", ".999999999f"]
 )
-def test_a_format_that_is_none_or_asks_for_a_gigabyte_is_a_fault(form: str) -> None:
+def test_invalid_or_oversized_number_format_is_a_fault(form: str) -> None:
     row = {"what": "px", "of": "judged", "at": "x", "form": form}
     assert "is not a number format" in wrong({"title": "N", "shows": "numbers", "rows": [row]})
 
 
-def test_tables_that_are_none_are_faults() -> None:
+def test_invalid_tables_are_faults() -> None:
     assert "must be [[figure]] tables" in "".join(iter_faults({"figure": 3}, OUTS))
     assert "must be a table" in wrong("losses")
     with pytest.raises(RecipeError, match="must be"):
@@ -72,6 +72,6 @@ def test_tables_that_are_none_are_faults() -> None:
         ("none", None),
     ],
 )
-def test_a_place_of_a_document_is_found_or_is_none(at: str, value: int | None) -> None:
+def test_value_is_found_by_its_path_in_a_document(at: str, value: int | None) -> None:
     document = {"a": {"b": 3}, "rows": [{"name": "gcc", "x": 5}, {"name": "riscv32", "x": 6}]}
     assert find_value(document, at) == value

@@ -53,7 +53,7 @@ def _limit(path: Path, settle_s: float = 10.0) -> Any:
     return document(path, judge(path), settle_s)["limit"]
 
 
-def test_evaluate_says_what_a_smoother_could_reach(
+def test_evaluate_reports_the_bound_of_a_smoother(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = _record(tmp_path / "a.mcap")
@@ -111,11 +111,13 @@ def test_a_part_of_a_flight_has_the_limit_of_its_ranges(tmp_path: Path) -> None:
         {**asdict(SETTINGS), "trajectory": "unheard of"},
     ],
 )
-def test_what_was_not_simulated_so_has_no_limit(tmp_path: Path, settings: dict[str, Any]) -> None:
+def test_flight_without_simulation_settings_has_no_bound(
+    tmp_path: Path, settings: dict[str, Any]
+) -> None:
     assert _limit(_record(tmp_path / "a.mcap", settings)) is None
 
 
-def test_another_motion_than_this_versions_is_told(
+def test_flight_simulated_by_another_version_has_no_bound_and_warns(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert _limit(_record(tmp_path / "moved.mcap", shift_m=0.01)) is None

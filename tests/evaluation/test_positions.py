@@ -13,7 +13,7 @@ from dmrl.recording import Provenance, RecordingWriter
 SPREAD = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, 0.003], [0.002, 0.003, 0.25]])
 
 
-def test_each_axis_stands_beside_its_own(tmp_path: Path) -> None:
+def test_each_axis_is_compared_with_the_same_axis_of_truth(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     made = message_class("PeerPosition")
     with RecordingWriter(path, Provenance("test")) as sink:

@@ -67,7 +67,7 @@ def test_tables_hold_what_the_recording_holds(recording: Path, tmp_path: Path, k
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_topics_that_look_alike_have_tables_of_their_own(tmp_path: Path, kind: str) -> None:
+def test_similar_topics_have_separate_tables(tmp_path: Path, kind: str) -> None:
     path, out = tmp_path / "in.mcap", tmp_path / "out"
     like = build_topic_channel("/cf1/height", message_class("Height").DESCRIPTOR)
     rows = {"/cf1/height": 2, "/cf1.height": 3, "cf1/height": 4}
@@ -83,7 +83,7 @@ def test_topics_that_look_alike_have_tables_of_their_own(tmp_path: Path, kind: s
     assert sorted(len(read(file)) for file in out.iterdir()) == [2, 3, 4]
 
 
-def test_topics_that_one_disk_would_put_into_one_table_are_refused(
+def test_topics_with_colliding_file_names_are_refused(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As where A and a are one name of a file."""

@@ -266,7 +266,7 @@ def test_a_label_without_a_box_needs_the_width_of_the_robot(to: str, tmp_path: P
     assert right - left == pytest.approx(40 * 0.1 / peers_of(1)[0]["depth_m"], abs=0.01)
 
 
-def test_what_cannot_be_exported_is_one_line(source: Path, tmp_path: Path) -> None:
+def test_invalid_export_gives_one_line_error(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(DatasetError, match="is not a dataset"):
         convert.run(tmp_path / "flight.mcap", out, convert.Settings(to="yolo"))

@@ -86,7 +86,9 @@ def test_every_whole_number_is_one_in_a_bag(kind: int, tmp_path: Path) -> None:
     ],
     ids=["itself", "a list of itself", "a map", "a list of bytes"],
 )
-def test_what_ros_cannot_say_is_left_out(field: dict[str, Any], words: str, tmp_path: Path) -> None:
+def test_types_without_ros_equivalent_are_omitted(
+    field: dict[str, Any], words: str, tmp_path: Path
+) -> None:
     path = recorded(tmp_path, field)
     with (
         pytest.raises(RecordingError, match=r"in.mcap has nothing that ROS 2 can hold"),

@@ -36,7 +36,7 @@ def test_every_command_that_writes_is_broken() -> None:
 
 
 @pytest.mark.slow
-def test_what_a_library_writes_in_c_comes_to_the_disk(disk: Disk, folder: Path) -> None:
+def test_writes_of_c_libraries_reach_the_faulty_disk(disk: Disk, folder: Path) -> None:
     """Arrow opens and writes the tables of a dataset without Python."""
     broken = Broken(work_named("dataset"), disk, folder, disk.inputs)
     failed = []
@@ -50,9 +50,7 @@ def test_what_a_library_writes_in_c_comes_to_the_disk(disk: Disk, folder: Path) 
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("work", [pytest.param(work, id=work.name) for work in WORKS])
-def test_every_work_comes_to_its_end_where_nothing_fails(
-    work: Work, disk: Disk, folder: Path
-) -> None:
+def test_every_command_succeeds_without_faults(work: Work, disk: Disk, folder: Path) -> None:
     """What the slow ones begin with: a work that its command has outgrown is seen early."""
     assert Broken(work, disk, folder, disk.inputs).whole
 
@@ -85,7 +83,7 @@ def test_every_operation_may_fail_in_every_way(
 
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("work", SLOW)
-def test_no_file_may_grow_beyond_what_the_kernel_lets_it(
+def test_file_size_limit_of_the_kernel_is_reported(
     work: Work, disk: Disk, folder: Path, count: Count
 ) -> None:
     broken = Broken(work, disk, folder, disk.inputs)
@@ -114,13 +112,15 @@ def killed(broken: Broken, count: Count, moments: int) -> None:
 
 
 @pytest.mark.parametrize("work", QUICK)
-def test_a_kill_leaves_nothing_half(work: Work, disk: Disk, folder: Path, count: Count) -> None:
+def test_killed_command_leaves_no_partial_output(
+    work: Work, disk: Disk, folder: Path, count: Count
+) -> None:
     killed(Broken(work, disk, folder, disk.inputs), count, 6)
 
 
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("work", SLOW)
-def test_a_kill_at_any_moment_leaves_nothing_half(
+def test_command_killed_at_any_operation_leaves_no_partial_output(
     work: Work, disk: Disk, folder: Path, count: Count
 ) -> None:
     killed(Broken(work, disk, folder, disk.inputs), count, cases_of(KILLS))

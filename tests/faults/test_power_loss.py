@@ -68,7 +68,9 @@ def read_output(path: Path) -> object:
 
 
 @pytest.mark.parametrize("work", OUTPUTS)
-def test_an_output_is_whole_or_absent(work: str, inputs: Inputs, tmp_path: Path) -> None:
+def test_output_is_complete_or_absent_after_power_loss(
+    work: str, inputs: Inputs, tmp_path: Path
+) -> None:
     words, name = OUTPUTS[work]
     disk = tmp_path / "disk"
     disk.mkdir()
@@ -84,9 +86,7 @@ def test_an_output_is_whole_or_absent(work: str, inputs: Inputs, tmp_path: Path)
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_a_dataset_that_grows_is_as_it_was_or_grown(
-    packed: bool, inputs: Inputs, tmp_path: Path
-) -> None:
+def test_append_is_atomic_at_power_loss(packed: bool, inputs: Inputs, tmp_path: Path) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()
     shutil.copytree(inputs.packed if packed else inputs.set, disk / "a")

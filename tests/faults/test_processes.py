@@ -51,14 +51,14 @@ def race(work: Work, disk: Disk, folder: Path, count: Count) -> None:
 
 
 @pytest.mark.heavy
-def test_of_six_writers_one_succeeds(disk: Disk, tmp_path: Path, count: Count) -> None:
+def test_one_of_six_concurrent_writers_succeeds(disk: Disk, tmp_path: Path, count: Count) -> None:
     race(work_named("trim"), disk, tmp_path / "disk", count)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("work", WORKS, ids=lambda work: work.name)
-def test_of_six_writers_of_every_output_one_succeeds(
+def test_one_of_six_concurrent_writers_of_each_command_succeeds(
     work: Work, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
     race(work, disk, tmp_path / "disk", count)

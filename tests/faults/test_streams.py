@@ -27,7 +27,7 @@ def read_mute(name: str, disk: Disk, folder: Path, count: Count) -> None:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", QUICK)
-def test_what_cannot_be_said_is_one_line(
+def test_full_or_closed_stdout_gives_one_line_error(
     name: str, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
     read_mute(name, disk, tmp_path / "disk", count)
@@ -35,7 +35,7 @@ def test_what_cannot_be_said_is_one_line(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", READS.keys() - set(QUICK))
-def test_what_no_reading_command_can_say_is_one_line(
+def test_full_or_closed_stdout_of_each_reading_command_gives_one_line_error(
     name: str, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
     read_mute(name, disk, tmp_path / "disk", count)

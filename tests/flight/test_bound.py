@@ -44,7 +44,7 @@ def test_a_random_walk_in_white_noise_has_its_closed_form() -> None:
     assert middle[1, 1] == pytest.approx(1.5**2 + 2 * 0.3**2 * 20.0 / 100, rel=0.01)
 
 
-def test_constants_of_ranges_limit_what_many_ranges_tell() -> None:
+def test_range_bias_and_scale_limit_the_bound_of_many_ranges() -> None:
     noise = Noise(uwb_white_m=0.1, uwb_bias_m=0.05, uwb_scale=0.02, velocity_white_mps=1e-3)
     place = compute_bound(_still_flight(40.0, 50.0), noise, 0.0).interpolate_at(LINK, np.zeros(1))
     constants = 0.05**2 + (2 * 0.02) ** 2 + 0.1**2 / 2000

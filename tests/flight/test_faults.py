@@ -71,12 +71,12 @@ def test_a_fault_changes_its_own_sensor_in_its_window_alone(
         (Fault("height_step", "cf2", size=-0.4, duration_s=15.0), "height_m", -0.4),
     ],
 )
-def test_what_is_added_has_the_size(fault: Fault, column: str, added: float) -> None:
+def test_additive_fault_has_its_size(fault: Fault, column: str, added: float) -> None:
     log, before = (f.robots["cf2"] for f in (flown(fault), PLAIN))
     assert np.allclose(getattr(log, column) - getattr(before, column), added)
 
 
-def test_silent_sensors_are_nan_and_stuck_ones_zero() -> None:
+def test_gap_faults_give_nan_and_stuck_faults_zero() -> None:
     stuck = flown(Fault("velocity_stuck", "cf1", start_s=5.0)).robots["cf1"].vx_mps[500:1500]
     silent = flown(Fault("velocity_gap", "cf1", start_s=5.0)).robots["cf1"].vx_mps[500:1000]
     assert not stuck.any() and np.isnan(silent).all()
@@ -105,7 +105,7 @@ def test_as_many_windows_as_asked_for_each_in_its_part_of_the_flight() -> None:
     assert (end <= 3.0 * np.arange(1, 6)).all()
 
 
-def test_a_clock_is_off_and_everything_else_is_as_it_was() -> None:
+def test_clock_fault_changes_times_only() -> None:
     wrong = Fault("clock_drift", "cf2", size=200.0), Fault("clock_offset", "cf2", size=0.1)
     flight = flown(*wrong)
     clock, before = flight.clocks["cf2"], PLAIN.clocks["cf2"]
@@ -178,7 +178,7 @@ def test_faults_that_do_not_fit_the_flight_are_refused(fault: Fault, why: str) -
 
 
 @pytest.mark.parametrize("kind", get_args(FaultKind))
-def test_every_kind_happens_as_named_alone_and_the_same_way_again(kind: FaultKind) -> None:
+def test_every_fault_kind_has_an_effect_and_is_reproducible(kind: FaultKind) -> None:
     one, same = (flown(Fault(kind, "cf2", duration_s=WINDOWS.get(kind))) for _ in range(2))
     assert one.clocks != PLAIN.clocks or changed(one)
     for name in COLUMNS:

@@ -172,7 +172,7 @@ def test_ideal_sensors_have_no_noise() -> None:
     assert np.abs(range_errors(flight)[0]).max() < 1e-3
 
 
-def test_presets_grow_worse_in_every_number() -> None:
+def test_presets_are_ordered_in_every_noise_parameter() -> None:
     names = [f.name for f in fields(Noise) if f.name not in ("ranging_rate_hz", "velocity_tau_s")]
     presets = [NOISE[name] for name in ("ideal", *PRESETS)]
     for better, worse in pairwise(presets):

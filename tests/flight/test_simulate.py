@@ -89,7 +89,7 @@ def test_parallel_robots_keep_their_relative_position() -> None:
     assert np.array_equal(flight.robots["cf1"].vx_mps, flight.robots["cf2"].vx_mps)
 
 
-def test_the_same_arguments_give_the_same_flight_and_another_seed_another() -> None:
+def test_flight_depends_only_on_arguments_and_seed() -> None:
     one, same, other = (simulate(SHORT, NOISE["harsh"], seed) for seed in (7, 7, 8))
     assert np.array_equal(one.robots["cf2"].vx_mps, same.robots["cf2"].vx_mps)
     assert np.array_equal(one.ranges["cf1", "cf2"].range_m, same.ranges["cf1", "cf2"].range_m)
@@ -112,7 +112,7 @@ def test_random_robots_start_apart() -> None:
     assert apart.min() > 0.7
 
 
-def test_clocks_go_there_and_back() -> None:
+def test_clock_time_and_true_time_round_trip() -> None:
     clock = Clock(0.03, 2e-5)
     time_s = np.linspace(0, 100, 7)
     assert np.allclose(clock.to_true_time(clock.to_clock_time(time_s)), time_s)

@@ -35,7 +35,7 @@ def test_the_leader_flies_the_eight_of_the_contract(seed: int) -> None:
 
 
 @pytest.mark.parametrize("distance_m", [0.7, 1.0])
-def test_it_starts_a_little_farther_than_the_distance_facing_the_leader(distance_m: float) -> None:
+def test_follower_starts_behind_the_leader_and_faces_it(distance_m: float) -> None:
     flight = SteppedFlight(replace(EIGHT, distance_m=distance_m), NOISE["ideal"], 5).flight
     x, y, z = flight.peer_in_horizontal("cf1", "cf2", np.zeros(1))[0]
     assert (x, y) == pytest.approx((distance_m + 0.1, 0.0))
@@ -54,7 +54,7 @@ def test_commands_are_followed_with_lag_and_within_limits() -> None:
     assert fast._flyers["cf1"].yaw_rate[500] == pytest.approx(1.5, abs=0.01)
 
 
-def test_velocity_is_along_the_robots_own_axes_and_it_tilts_as_it_accelerates() -> None:
+def test_velocity_is_in_body_axes_and_acceleration_tilts_the_robot() -> None:
     flight = fly(Command(0.0, 0.5, 0.0, 0.0), 1.0)
     log = flight.flight.robots["cf1"]
     assert log.vy_mps[100] == pytest.approx(0.5, abs=0.02)
@@ -109,7 +109,7 @@ def test_a_silent_sensor_keeps_its_last_value() -> None:
     assert reckoning.sensors[3, 150] == reckoning.sensors[3, 99] > 0.4
 
 
-def test_what_cannot_be_flown_is_named() -> None:
+def test_invalid_stepped_flight_is_refused() -> None:
     with pytest.raises(SettingError, match="a pilot flies it"):
         SteppedFlight(EIGHT, NOISE["ideal"], 1, (Fault("crash", "cf1"),))
     with pytest.raises(SettingError, match="flown = 3"):

@@ -28,7 +28,7 @@ def test_every_column_key_and_suffix_is_documented() -> None:
     assert " ".join(IMAGE_SUFFIXES) in TEXT
 
 
-def test_the_worked_example_of_a_format_reads_what_it_says(tmp_path: Path) -> None:
+def test_documented_format_example_works(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "add-a-format.md").read_text(encoding="utf-8")
     code = page.split("```python\n")[1].split("```")[0]
     example: dict[str, Any] = {}

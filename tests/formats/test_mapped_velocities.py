@@ -61,7 +61,7 @@ def test_a_velocity_in_the_horizontal_frame_needs_no_yaw(tmp_path: Path) -> None
     assert [a["yaw_rad"] for a in attitude] == pytest.approx([0.006 * k for k in range(5)])
 
 
-def test_a_velocity_that_cannot_be_turned_says_what_it_wants(tmp_path: Path) -> None:
+def test_velocity_frame_error_names_missing_columns(tmp_path: Path) -> None:
     rows = np.array([[0.02 * k, 0.0, 0.0, 1.0, 0.5, 0.3] for k in range(5)])
     names = ("time", "roll", "pitch", "vx", "vy", "yaw_rate")
     for frame, wanted in (

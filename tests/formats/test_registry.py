@@ -84,14 +84,14 @@ def test_the_sources_of_each_are_known(tmp_path: Path) -> None:
         ("a.mcap", b"x", "is a recording already. Pass --to: csv, parquet, ros2"),
     ],
 )
-def test_what_is_no_source_is_said(name: str, data: bytes, said: str, tmp_path: Path) -> None:
+def test_unknown_source_is_reported(name: str, data: bytes, said: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(data)
     with pytest.raises(SourceError) as e:
         find_format(tmp_path / name)
     assert said in str(e.value) and name in str(e.value)
 
 
-def test_folders_that_are_empty_and_things_that_are_not_there_are_said(tmp_path: Path) -> None:
+def test_empty_folder_missing_path_and_pipe_are_reported(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="is an empty folder"):
         find_format(tmp_path)
     with pytest.raises(SourceError, match=r"no file or folder .*nothing. Pass one"):
@@ -105,9 +105,7 @@ def test_folders_that_are_empty_and_things_that_are_not_there_are_said(tmp_path:
         find_format(tmp_path / "below" / "pipe")
 
 
-def test_a_kind_that_is_misspelled_is_told_the_near_one(
-    tmp_path: Path, plug: Callable[..., None]
-) -> None:
+def test_misspelled_format_suggests_the_nearest(tmp_path: Path, plug: Callable[..., None]) -> None:
     plug(theirs="FORMAT")
     (tmp_path / "a").write_bytes(b"x")
     for name, hint in (
@@ -141,9 +139,7 @@ def test_a_plug_in_is_asked_after_our_own_and_by_its_name(
         find_format(tmp_path / "log", "none")
 
 
-def test_what_fails_in_a_plug_in_names_its_package(
-    tmp_path: Path, plug: Callable[..., None]
-) -> None:
+def test_plugin_error_names_its_package(tmp_path: Path, plug: Callable[..., None]) -> None:
     plug(broken="BROKEN", late="LATE")
     (tmp_path / "a.late").write_bytes(b"x")
     with pytest.raises(

@@ -150,7 +150,7 @@ def _palette() -> PIL.Image.Image:
         ("a.png", _palette, 64),
     ],
 )
-def test_what_pillow_opens_becomes_rgb(
+def test_images_opened_by_pillow_become_rgb(
     name: str,
     make: Callable[[], PIL.Image.Image],
     apart: int,
@@ -177,7 +177,7 @@ def test_exif_turns_pictures_upright(as_stored: bool, convert: Convert, tmp_path
 
 
 @pytest.mark.parametrize("name", ["a.gif", "a.webp", "a.tif", "a.png"])
-def test_of_several_images_in_a_file_the_first_counts(
+def test_first_image_of_a_multi_image_file_is_used(
     name: str, convert: Convert, tmp_path: Path
 ) -> None:
     (tmp_path / "in").mkdir()

@@ -29,7 +29,7 @@ def convert(data: Path, name: str, out: Path, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize("name", ["comment_lines", "hash_header"])
-def test_comments_and_a_header_that_is_one(
+def test_comments_and_a_commented_header_are_parsed(
     name: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert convert(data, f"csv-{name}", tmp_path / "a.mcap", capsys) == {}

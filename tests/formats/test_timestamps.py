@@ -37,7 +37,7 @@ def test_jitter_of_arrival_is_taken_away(drop: float, counted: bool) -> None:
     assert np.abs(arrival - sent).max() > 5_000_000
 
 
-def test_where_holes_and_jitter_cannot_be_told_apart_arrivals_stand() -> None:
+def test_dejitter_keeps_arrivals_of_irregular_senders() -> None:
     arrival = np.cumsum(np.random.default_rng(2).exponential(5e7, 500)).astype(np.int64)
     assert (dejitter(arrival) == arrival).all()
     assert dejitter([5, 9]).tolist() == [5, 9]
@@ -54,7 +54,7 @@ def test_counters_unwrap_forward_or_to_the_nearest() -> None:
     ]
 
 
-def test_a_counter_is_asked_for_values_of_more_bits_without_being_changed() -> None:
+def test_counter_finds_nearest_wide_value_without_state_change() -> None:
     times = CounterUnwrapper(24)
     times(5)
     assert times.find_nearest((7 << 24) + 8) == 8
@@ -62,7 +62,7 @@ def test_a_counter_is_asked_for_values_of_more_bits_without_being_changed() -> N
     assert times(6) == 6
 
 
-def test_arrivals_of_a_steady_sender_are_evened_out_and_never_in_the_future() -> None:
+def test_steady_rate_filter_reduces_jitter_causally() -> None:
     rng = np.random.default_rng(3)
     sender, errors_ms, raw_ms, last = SteadyRateFilter(), [], [], 0
     for k in range(1000):
@@ -83,7 +83,7 @@ def test_after_a_pause_arrivals_stand_as_they_are() -> None:
     assert sender(5050 * MS) == 5050 * MS
 
 
-def test_half_of_a_counter_s_range_is_a_step_back_and_less_is_one_ahead() -> None:
+def test_counter_difference_of_half_range_is_backward() -> None:
     assert unwrap([3, 131, 3], 8).tolist() == [3, -125, -253]
     assert unwrap([3, 130], 8).tolist() == [3, 130]
     ahead = CounterUnwrapper(8)
@@ -91,20 +91,20 @@ def test_half_of_a_counter_s_range_is_a_step_back_and_less_is_one_ahead() -> Non
     assert ahead(1) == 1 and ahead(129) == -127
 
 
-def test_a_hole_is_seen_from_seven_tenths_of_a_period_beyond_what_is_due() -> None:
+def test_gap_is_detected_at_0_7_periods_after_the_due_time() -> None:
     steady = [100 * k for k in range(10)]
     for last, number in ((1069, 10), (1072, 11), (1169, 11), (1172, 12), (2500, 25)):
         assert _number_arrivals(np.array([*steady, last])).tolist() == [*range(10), number]
 
 
-def test_what_is_due_follows_early_arrivals_by_three_tenths() -> None:
+def test_due_time_follows_early_arrivals_with_gain_0_3() -> None:
     # Early by 20 of 100, then late by 6: due at 994, then 1094.06.
     steady = [*(100 * k for k in range(10)), 980, 1100]
     for last, number in ((1263, 12), (1265, 13)):
         assert _number_arrivals(np.array([*steady, last]))[-1] == number
 
 
-def test_the_lower_hull_bends_upwards_and_takes_the_lowest_of_one_place() -> None:
+def test_lower_hull_is_convex_and_takes_the_lowest_of_equal_x() -> None:
     x = np.array([0.0, 1, 1, 2, 3, 3, 4])
     assert _lower_hull(x, np.array([5.0, 2, 1, 3, 0, 4, 4])) == [0, 2, 4, 6]
     assert _lower_hull(x[:3], np.array([0.0, 1, 2])) == [0, 1]
@@ -118,7 +118,7 @@ def test_times_lie_on_the_line_under_all_arrivals(count: list[int] | None) -> No
     assert dejitter(10**18 + arrival, count).tolist() == (10**18 + sent).tolist()
 
 
-def test_seven_arrivals_stand_and_the_eighth_is_where_their_pace_has_it() -> None:
+def test_steady_rate_filter_starts_at_the_eighth_arrival() -> None:
     sender = SteadyRateFilter()
     arrivals = [0, 60, 90, 160, 195, 260, 300]
     assert [sender(a * MS) for a in arrivals] == [a * MS for a in arrivals]

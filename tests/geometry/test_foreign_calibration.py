@@ -109,18 +109,18 @@ def test_a_pixel_of_opencv_s_projection_is_half_a_pixel_from_ours(tmp_path: Path
         ("a: *b\n", "no calibration of ROS"),
     ],
 )
-def test_what_is_no_pinhole_with_plumb_bob_is_one_line(text: str, why: str, tmp_path: Path) -> None:
+def test_unsupported_calibration_gives_one_line_error(text: str, why: str, tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=why) as e:
         read_camera(write(tmp_path / "camera.yaml", text))
     assert "\n" not in str(e.value) and "as TOML" in str(e.value)
 
 
-def test_json_of_anything_else_is_one_line(tmp_path: Path) -> None:
+def test_other_json_gives_one_line_error(tmp_path: Path) -> None:
     for document in ({"a": 1}, [1, 2], {"K": 3}):
         with pytest.raises(SourceError, match="is no calibration of ROS, Kalibr or OpenCV"):
             read_camera(write(tmp_path / "camera.json", json.dumps(document)))
 
 
-def test_the_file_that_was_handed_over(data: Path) -> None:
+def test_third_party_calibration_file_is_read(data: Path) -> None:
     found = read_camera(data / "strangers" / "camera-ros" / "ros.yaml")
     assert (found.width_px, found.height_px, found.fx_px, found.cx_px) == (320, 240, 210.0, 160.5)

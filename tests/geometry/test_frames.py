@@ -76,7 +76,7 @@ def test_a_nose_down_pitch_lifts_the_horizon() -> None:
     assert v_px == pytest.approx(112 - 184 * np.tan(np.radians(10)))
 
 
-def test_the_axis_of_a_camera_that_looks_10_degrees_down_hits_the_floor_ahead() -> None:
+def test_axis_of_a_camera_pitched_10_degrees_hits_the_floor_ahead() -> None:
     height_m = 1.0
     ahead_m = height_m / np.tan(np.radians(10))
     np.testing.assert_allclose(pixel((ahead_m, 0.0, -height_m), 0, 10), [160, 112])
@@ -110,7 +110,7 @@ def test_the_paper_s_signs_taken_as_printed_cost_many_pixels(
 
 
 @given(ANGLE, ANGLE)
-def test_a_turn_keeps_lengths_and_hands(roll_rad: float, pitch_rad: float) -> None:
+def test_rotation_keeps_lengths_and_handedness(roll_rad: float, pitch_rad: float) -> None:
     turn = camera_from_horizontal(roll_rad, pitch_rad)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(turn) == pytest.approx(1)
@@ -126,7 +126,7 @@ def test_points_behind_the_camera_are_refused_by_row() -> None:
         project(np.array([[1.0, 0, 0], [-0.5, 0, 0]]), K)
 
 
-def test_the_cameras_are_those_of_the_paper_and_of_the_published_images() -> None:
+def test_cameras_equal_the_paper_and_the_published_images() -> None:
     np.testing.assert_allclose(
         AIDECK.image_from_optical, [[183.73, 0, 166.90], [0, 184.12, 77.51], [0, 0, 1]]
     )
@@ -135,7 +135,7 @@ def test_the_cameras_are_those_of_the_paper_and_of_the_published_images() -> Non
     np.testing.assert_allclose(uv[0], centre_px)
 
 
-def test_the_left_and_top_edge_belong_to_the_image_and_the_others_do_not() -> None:
+def test_left_and_top_edges_belong_to_the_image() -> None:
     uv = np.array([[0, 0], [319.999, 223.999], [320, 100], [100, 224], [-0.001, 5]])
     assert is_inside(uv, 320, 224).tolist() == [True, True, False, False, False]
 
@@ -150,7 +150,7 @@ def test_a_peer_marks_the_cell_at_row_v_and_column_u() -> None:
 
 
 @pytest.mark.parametrize("order", [[0, 1], [1, 0]])
-def test_of_two_peers_in_a_cell_the_nearer_wins(order: list[int]) -> None:
+def test_nearer_of_two_peers_wins_the_cell(order: list[int]) -> None:
     uv = np.array([[100.0, 50.0], [101.0, 51.0]])[order]
     grid = build_grid_label(uv, np.array([1.5, 0.7])[order])
     assert grid[1, 6, 12] == np.float32(0.7)
@@ -174,7 +174,7 @@ def test_other_grids_than_the_paper_s_work_too() -> None:
     assert np.argwhere(grid[0]).tolist() == [[1, 1]]
 
 
-def test_pixels_of_the_horizontal_frame_are_those_of_opencv_with_distortion() -> None:
+def test_projection_with_distortion_equals_opencv() -> None:
     rng = np.random.default_rng(0)
     camera = replace(AIDECK, distortion=(-0.0957, 0.0211, 0.003, -0.002, 0.01))
     roll, pitch = rng.uniform(-0.4, 0.4, (2, 200))
@@ -209,7 +209,7 @@ def test_without_distortion_the_pixels_are_those_of_project() -> None:
             assert depth_m[k] == pytest.approx(depth[0])
 
 
-def test_the_derivative_of_the_projection_is_that_of_finite_differences() -> None:
+def test_projection_jacobian_equals_finite_differences() -> None:
     rng = np.random.default_rng(2)
     given_at = np.column_stack(
         [rng.uniform([1.0, -0.8, -0.6], [4.0, 0.8, 0.6], (50, 3)), rng.uniform(-0.4, 0.4, (50, 2))]
@@ -273,7 +273,7 @@ def test_a_mount_is_yaw_then_pitch_then_roll_of_the_camera(mount: tuple[float, .
     st.tuples(*[st.floats(-0.3, 0.3)] * 2),
     st.tuples(st.floats(0.8, 4.0), st.floats(-0.5, 0.5), st.floats(-0.4, 0.4)),
 )
-def test_any_camera_gives_back_what_it_saw(
+def test_projection_and_back_projection_round_trip(
     mount: tuple[float, ...], tilt: tuple[float, ...], bearing: tuple[float, ...]
 ) -> None:
     camera = replace(AIDECK, fx_px=150.0, mount_rad=mount)
@@ -285,7 +285,7 @@ def test_any_camera_gives_back_what_it_saw(
         np.testing.assert_allclose(back, xyz, atol=1e-6)
 
 
-def test_what_is_beside_the_optical_centre_has_no_pixel() -> None:
+def test_point_beside_the_optical_centre_has_no_pixel() -> None:
     beside, level = np.array([[0.0, 1.0, 0.5], [-1.0, 0.0, 0.0]]), np.zeros(2)
     uv, depth_m, _ = pixels_from_horizontal(beside, level, level, AIDECK)
     assert depth_m.tolist() == [0, -1]

@@ -59,6 +59,6 @@ def test_every_mild_lens_can_be_undone(
     np.testing.assert_allclose(undistort(distort(plane, lens)[0], lens), plane, atol=1e-9)
 
 
-def test_where_the_model_folds_there_is_no_place_any_more() -> None:
+def test_distortion_is_nan_where_the_model_folds() -> None:
     at_fold, _ = distort(np.array([[1.0, 0.0], [0.999, 0.0]]), (0.0, -0.2))
     assert np.isnan(at_fold[0]).all() and np.isfinite(at_fold[1]).all()

@@ -22,7 +22,7 @@ def test_nesting_has_a_budget(depth: int) -> None:
             parse_json(text)
 
 
-def test_as_deep_as_may_be_is_read() -> None:
+def test_deepest_allowed_nesting_is_read() -> None:
     assert parse_json("[" * 199 + "]" * 199) is not None
 
 
@@ -56,7 +56,7 @@ def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path: Path) -> None:
         load_npz(path)
 
 
-def test_an_array_that_is_said_to_be_huge_is_refused(tmp_path: Path) -> None:
+def test_array_with_oversized_header_is_refused(tmp_path: Path) -> None:
     header = io.BytesIO()
     shape = {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**7)}
     np.lib.format.write_array_header_1_0(header, shape)
@@ -85,7 +85,7 @@ def test_a_damaged_archive_of_any_compression_is_refused(kind: int, tmp_path: Pa
                 load_npz(path)
 
 
-def test_a_member_that_hides_its_size_unpacks_to_what_it_says(tmp_path: Path) -> None:
+def test_archive_member_is_read_up_to_its_stated_size(tmp_path: Path) -> None:
     """The list of an archive may say less than its members hold: no more than that is read."""
     path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:

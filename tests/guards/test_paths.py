@@ -63,7 +63,7 @@ def test_pipes_and_links_to_devices_are_found_at_any_depth(folder: Path) -> None
         refuse_pipes(folder)
 
 
-def test_what_is_no_folder_here_is_left_to_who_opens_it(folder: Path) -> None:
+def test_pipe_check_ignores_files_missing_paths_and_buckets(folder: Path) -> None:
     refuse_pipes(folder / "a.txt")
     refuse_pipes(folder / "absent")
     refuse_pipes(to_path("s3://bucket/key"))
@@ -80,7 +80,7 @@ def test_what_is_no_folder_here_is_left_to_who_opens_it(folder: Path) -> None:
     ids=["a command line", "a recipe", "a camera", "a folder"],
 )
 @pytest.mark.parametrize("kind", ["pipe", "socket", "device"])
-def test_what_is_no_file_is_refused_under_its_own_name_too(
+def test_pipe_device_or_socket_is_refused(
     reads: Callable[[str], object], kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)  # the name of a socket is short
@@ -109,7 +109,7 @@ def test_every_path_of_a_command_line_is_refused_so() -> None:
             cli.convert_strictly(hint, ["/dev/zero"])
 
 
-def test_what_may_be_named_is_a_file_a_folder_or_nothing(tmp_path: Path) -> None:
+def test_path_may_be_file_folder_or_missing(tmp_path: Path) -> None:
     for name in (tmp_path, tmp_path / "absent", Path("x" * 5000)):
         refuse_pipe(name)
     with pytest.raises(UnsafeName, match=r"no file can be called 'a\\x00b'"):
@@ -117,14 +117,14 @@ def test_what_may_be_named_is_a_file_a_folder_or_nothing(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", [os.fsdecode(b"\xff"), os.fsdecode(b"\xff/b"), "a\0b"])
-def test_a_name_that_is_no_text_is_said(name: str) -> None:
+def test_non_utf_8_path_is_reported(name: str) -> None:
     require_text_path(Path("\N{LATIN SMALL LETTER E WITH ACUTE} \n\x1b"))
     with pytest.raises(UnsafeName, match=r"(Rename it|Check the name)$"):
         require_text_path(Path(name))
 
 
 @pytest.mark.parametrize("what", ["a dataset", "a model", "a model for a backend"])
-def test_what_libraries_open_by_its_name_has_one_that_is_text(what: str, tmp_path: Path) -> None:
+def test_paths_given_to_libraries_must_be_utf_8(what: str, tmp_path: Path) -> None:
     (given := tmp_path / os.fsdecode(b"\xff")).mkdir()
     with pytest.raises(UnsafeName, match="is not valid UTF-8"):
         OPENED[what](given)

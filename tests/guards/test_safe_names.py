@@ -31,12 +31,12 @@ def test_no_name_leads_out_of_its_folder(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["cf1", "Flug 3 (äöü)", "a.b", "x-1_2"])
-def test_honest_names_stay_what_they_are(name: str, tmp_path: Path) -> None:
+def test_safe_names_are_unchanged(name: str, tmp_path: Path) -> None:
     assert safe_join(tmp_path, name, "it", suffix=".csv") == tmp_path / f"{name}.csv"
 
 
 @pytest.mark.parametrize("name", [*HOSTILE, "data", "figures", "README.md", 'x"]; import os', "`"])
-def test_a_split_is_called_by_a_word(name: str) -> None:
+def test_split_name_must_be_a_word(name: str) -> None:
     with pytest.raises(UnsafeName):
         check_split_name(name, "it")
 
@@ -48,7 +48,7 @@ def test_a_split_has_a_folder_of_its_own_on_every_disk(name: str) -> None:
     assert check_split_name(f"x-{name}", "it") == f"x-{name}"
 
 
-def test_every_topic_has_a_file_of_its_own() -> None:
+def test_topics_have_distinct_file_names() -> None:
     known = [
         *("/cf1/height", "/cf1.height", "cf1/height", "cf1.height", "/cf1%2Eheight", "/=cf1"),
         *("/cf1/height/", "//cf1/height", "/cf1/../height", "/../../victim", "/", "/cf1 height"),

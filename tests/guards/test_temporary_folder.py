@@ -30,12 +30,12 @@ def run(code: str, system: Path) -> int:
     return done.returncode
 
 
-def test_what_libraries_leave_behind_goes_with_the_command(tmp_path: Path) -> None:
+def test_temporary_files_are_removed_when_the_command_ends(tmp_path: Path) -> None:
     assert run(LITTER, tmp_path) == 0
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_command_left_goes_at_the_next_start(tmp_path: Path) -> None:
+def test_temporary_folder_of_a_killed_command_is_removed_at_next_start(tmp_path: Path) -> None:
     assert run(KILLED, tmp_path) == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
     assert len(list(left.iterdir())) == 2
@@ -62,7 +62,7 @@ def test_the_folder_of_a_living_command_stays(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["link", "file", "open to others"])
-def test_what_is_not_its_own_is_not_removed(what: str, tmp_path: Path) -> None:
+def test_foreign_files_in_the_temporary_folder_are_kept(what: str, tmp_path: Path) -> None:
     system, victim = tmp_path / "system", tmp_path / "victim"
     system.mkdir()
     victim.mkdir()
@@ -79,7 +79,7 @@ def test_what_is_not_its_own_is_not_removed(what: str, tmp_path: Path) -> None:
     assert list(system.iterdir()) == [place] and (victim / "data").read_text() == "kept"
 
 
-def test_without_a_place_for_it_nothing_changes(tmp_path: Path) -> None:
+def test_unwritable_temporary_folder_leaves_tempdir_unchanged(tmp_path: Path) -> None:
     code = LITTER.split("tempfile.mkdtemp")[0].replace(
         "\nuse_own", "\ntempfile.tempdir = '/nowhere'\nuse_own"
     )

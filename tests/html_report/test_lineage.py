@@ -8,7 +8,7 @@ def _made(stage: str, *inputs: Input) -> Provenance:
     return Provenance(stage, inputs=inputs)
 
 
-def test_a_chain_in_columns_with_counts_and_rounds() -> None:
+def test_lineage_has_columns_with_counts_and_rounds() -> None:
     fly = [_made("fly"), _made("fly")]
     label = [_made("label", Input(f"f{k}", f"{k}", fly[k])) for k in range(2)]
     train = _made("train", Input("a", "10", label[0]), Input("b", "11", label[1]))
@@ -32,5 +32,5 @@ def test_files_of_others_are_sources() -> None:
     assert len(columns[0]) == 13 and columns[0][-1] == "more files"
 
 
-def test_nothing_made_is_an_empty_graph() -> None:
+def test_lineage_without_outputs_is_empty() -> None:
     assert build_lineage({}) == ([], [])

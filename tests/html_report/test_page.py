@@ -59,7 +59,7 @@ def test_the_page_shows_what_is_there_and_fetches_nothing(outputs: Path) -> None
 
 
 @pytest.mark.heavy
-def test_pictures_have_every_figure_of_the_card_and_no_heading_for_positions(
+def test_report_of_images_has_card_figures_and_no_positions(
     tmp_path: Path,
 ) -> None:
     dmrl.sketch(tmp_path / "pictures", images=8, seed=1)
@@ -114,7 +114,7 @@ def test_documents_that_are_not_as_they_should_be_leave_the_rest(
 
 
 @pytest.mark.heavy
-def test_damaged_recordings_and_pictures_are_named_and_the_rest_is_shown(outputs: Path) -> None:
+def test_unreadable_files_are_listed_and_the_rest_is_shown(outputs: Path) -> None:
     (outputs / "cut.mcap").write_bytes((outputs / "flight.mcap").read_bytes()[:-20])
     (outputs / "odd.png").write_bytes(b"\xff\xd8 no picture" * 30_000)
     html = build_report(collect_outputs(outputs))
@@ -150,14 +150,14 @@ def test_a_report_is_written_again_but_no_other_file(outputs: Path) -> None:
     assert other.read_text() == "<p>mine</p>"
 
 
-def test_a_folder_with_nothing_to_tell_of_is_an_error(tmp_path: Path) -> None:
+def test_report_of_an_empty_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="contains no recording"):
         write_html_report(tmp_path)
     with pytest.raises(SettingError, match="is not a folder"):
         write_html_report(tmp_path / "none")
 
 
-def test_numbers_of_logarithmic_axes_are_no_formulas_and_legends_cover_no_curve() -> None:
+def test_log_axis_labels_are_plain_text_and_legend_is_outside() -> None:
     svg = charts.plot_losses({"one": [2.0, 0.5, 0.05], "two": [1.0, 0.1, 0.02]})
     assert "mathdefault" not in svg and ">0.1<" in svg and ">1<" in svg
     legend = svg.index('id="legend_1"')

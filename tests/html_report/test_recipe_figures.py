@@ -83,7 +83,7 @@ def test_a_recipes_figures_come_first_in_its_order(pipeline: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_maps_say_how_far_they_are_from_the_first(pipeline: Path) -> None:
+def test_maps_show_their_difference_from_the_first(pipeline: Path) -> None:
     html = build_report(collect_outputs(pipeline))
     grid = np.linspace(0.1, 0.9, 12)
     assert "against float" in html and ">1.000<" in html
@@ -93,7 +93,7 @@ def test_maps_say_how_far_they_are_from_the_first(pipeline: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_a_figure_that_cannot_be_drawn_says_why_and_the_rest_is_shown(pipeline: Path) -> None:
+def test_figure_that_cannot_be_drawn_shows_its_reason(pipeline: Path) -> None:
     (pipeline / "model/model.json").write_text("{")
     (pipeline / "judged/circles.png").write_bytes(b"no picture")
     (pipeline / "chip.mcap").write_bytes(b"no recording")
@@ -104,7 +104,7 @@ def test_a_figure_that_cannot_be_drawn_says_why_and_the_rest_is_shown(pipeline: 
 
 
 @pytest.mark.heavy
-def test_what_leads_out_of_the_folder_is_not_shown(pipeline: Path, tmp_path: Path) -> None:
+def test_figure_sources_outside_the_folder_are_not_shown(pipeline: Path, tmp_path: Path) -> None:
     secret = tmp_path / "secret.json"
     secret.write_text('{"overall": "hidden words"}')
     recipe = RECIPE.replace("judged/evaluation.json", str(secret)).replace(".nothing", "")
@@ -121,7 +121,7 @@ def test_a_recipe_that_is_none_is_named_and_the_page_written(pipeline: Path) -> 
 
 
 @pytest.mark.heavy
-def test_what_a_stranger_wants_shown_is_shown_or_says_why(pipeline: Path) -> None:
+def test_unusable_figure_sources_show_a_reason(pipeline: Path) -> None:
     """No output is there, one has no picture, one is a folder: a sentence each."""
     (pipeline / "chip.mcap").unlink()
     with RecordingWriter(pipeline / "chip.mcap", Provenance("test", {})) as sink:

@@ -53,7 +53,7 @@ def test_a_cut_picture_is_named(rgb: codec.Rgb, share: float) -> None:
 
 
 @pytest.mark.parametrize("bad", [b"", b"GIF89a" + b"\0" * 40, b"\x89PNG\r\n\x1a\n" + b"\0" * 40])
-def test_what_is_no_picture_is_named(bad: bytes) -> None:
+def test_invalid_image_is_reported_by_name(bad: bytes) -> None:
     for function in (codec.decode, codec.read_size):
         with pytest.raises(SourceError, match=r"^a\.png is not an image \(PNG, JPEG"):
             function(bad, "a.png")

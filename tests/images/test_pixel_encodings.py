@@ -34,7 +34,7 @@ def test_the_table_is_that_of_ros() -> None:
 @pytest.mark.parametrize("spare", [0, 3])
 @pytest.mark.parametrize("big", [False, True])
 @pytest.mark.parametrize("encoding", [e for e in ROS if re.search(r"^(rgb|bgr|mono)|C\d", e)])
-def test_channels_go_where_their_names_say(encoding: str, big: bool, spare: int) -> None:
+def test_channel_order_follows_the_encoding_name(encoding: str, big: bool, spare: int) -> None:
     found = re.fullmatch(r"(\D+)(8|16)|(8|16)([US])C(\d)", encoding)
     assert found is not None
     name, size = found[1], int(found[2] or found[3]) // 8
@@ -97,7 +97,7 @@ def test_nv24_has_a_chroma_sample_for_each_pixel() -> None:
 
 
 @pytest.mark.parametrize("bits", [10, 12, 14, 16])
-def test_the_bits_say_what_is_white(bits: int) -> None:
+def test_bit_depth_sets_the_white_level(bits: int) -> None:
     values = np.array([[0, (1 << bits) // 2, (1 << bits) - 1, 65535]] * 4, "<u2")
     rgb = convert_to_rgb(values.view(np.uint8).ravel(), "mono16", (4, 4), 8, bits=bits)
     assert rgb[0, :, 0].tolist() == [0, 128, 255, 255]
@@ -119,7 +119,7 @@ def test_the_bits_say_what_is_white(bits: int) -> None:
         ("", (4, 4), 16, 64),
     ],
 )
-def test_what_is_no_image_is_an_error(
+def test_invalid_image_data_is_refused(
     encoding: str, shape: tuple[int, int], step: int, size: int
 ) -> None:
     with pytest.raises(SourceError, match=r"^images (of|with)"):

@@ -90,7 +90,7 @@ def test_foxglove_s_messages_become_topics_of_robots(tmp_path: Path) -> None:
     assert found["/cf1/camera/calibration"].to_arrow()["K"][0].as_py()[2] == 16.0
 
 
-def test_what_cannot_be_used_is_named(tmp_path: Path) -> None:
+def test_unusable_topics_are_reported(tmp_path: Path) -> None:
     image = CompressedImage(data=encode_png(PIXELS), format="png")
     sent = {
         "/a/image": image,
@@ -169,7 +169,7 @@ def test_topics_are_renamed_to_topics_of_dmrl(tmp_path: Path) -> None:
     assert not (tmp_path / "c.mcap").exists()
 
 
-def test_a_stage_that_lacks_a_topic_says_how_to_rename(tmp_path: Path) -> None:
+def test_missing_topic_error_suggests_renaming(tmp_path: Path) -> None:
     sent = {"/camera/image": CompressedImage(data=encode_png(PIXELS), format="png")}
     path = foxglove(tmp_path / "a.mcap", sent)
     with pytest.raises(MissingTopic, match="--names /camera/image=/cf1/camera/image"):
@@ -225,6 +225,6 @@ def test_messages_of_ros_beside_others(profile: str, other: str, tmp_path: Path)
     assert left == ({reason: 4} if other else {})
 
 
-def test_the_file_that_was_handed_over(data: Path, tmp_path: Path) -> None:
+def test_third_party_foxglove_file_is_converted(data: Path, tmp_path: Path) -> None:
     source = data / "strangers" / "fox-plain_topic" / "fx_plain.mcap"
     assert run(source, tmp_path / "a.mcap", Settings()) == {"/cf1/camera/image": 5}

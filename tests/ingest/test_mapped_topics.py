@@ -160,7 +160,7 @@ def ros(path: Path, sent: list[tuple[str, str, int, dict[str, Any]]]) -> Path:
 
 
 @pytest.mark.parametrize("write", [protobuf, in_json, ros])
-def test_a_table_takes_topics_of_any_encoding(
+def test_column_map_reads_topics_of_any_encoding(
     write: Callable[[Path, Any], Path], tmp_path: Path
 ) -> None:
     other = [one for one in messages("cf2") if one[1] != "Uwb"]

@@ -82,7 +82,7 @@ def test_images_come_after_their_calibration_over_two_connections(client: Start)
     assert "closed the connection" in said[0]
 
 
-def test_a_closed_port_is_said_once_and_tried_again(client: Start) -> None:
+def test_closed_port_is_reported_once_and_retried(client: Start) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken_port:
         port = taken_port.getsockname()[1]
     camera, feed = client(port)
@@ -99,7 +99,7 @@ def test_garbage_ends_the_connection_and_gives_no_image(client: Start) -> None:
     assert taken(feed)[0] == []
 
 
-def test_images_that_are_not_what_they_say_are_counted_and_left_out(client: Start) -> None:
+def test_invalid_images_are_counted_and_omitted(client: Start) -> None:
     header = cpx.HEADER.pack(cpx.MAGIC, 320, 224, 1, 0, 100)
     wrong = [Packet(GAP8, HOST, APP, data) for data in (header, bytes(100))]
     no_jpeg = Image(320, 224, "jpeg", b"\xff\xd8" + bytes(500))
@@ -119,7 +119,7 @@ def test_images_of_another_size_come_without_a_calibration(client: Start) -> Non
 
 
 @pytest.mark.parametrize("text", ["", ":5000", "host:", "host:0", "host:70000", "host:x"])
-def test_what_is_no_address_is_refused(text: str) -> None:
+def test_invalid_address_is_refused(text: str) -> None:
     with pytest.raises(SettingError, match="HOST:PORT"):
         parse_address(text)
 
@@ -128,7 +128,7 @@ def test_without_a_port_the_decks_own_is_taken() -> None:
     assert parse_address("192.168.4.1") == ("192.168.4.1", 5000)
 
 
-def test_the_best_clock_that_a_camera_tells_counts_and_nothing_is_of_the_future() -> None:
+def test_exposure_time_uses_the_best_clock_and_never_exceeds_arrival() -> None:
     known: dict[float, int] = {}
     times = _ExposureTimes(known.get)
     # Its robot's clock was at 4 ms when the camera's was at 0; the picture is of 1 ms later.

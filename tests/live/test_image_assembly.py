@@ -31,7 +31,7 @@ def test_a_jpeg_of_the_right_size_keeps_its_bytes() -> None:
     assert codec.read_size(data) == (320, 224, kind)
 
 
-def test_a_jpeg_of_another_size_than_was_said_is_refused() -> None:
+def test_jpeg_size_must_match_its_header() -> None:
     jpeg = codec.encode_jpeg(SMOOTH)
     with pytest.raises(SourceError, match="not 160 x 120 px as in its header"):
         encode_image(Image(160, 120, "jpeg", jpeg), "colour")

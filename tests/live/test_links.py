@@ -17,7 +17,7 @@ from dmrl.live.robot_options import RobotOptions
         (["left"], [], []),
     ],
 )
-def test_ranges_that_are_nobodys_are_said(
+def test_ranges_without_a_known_peer_are_reported(
     names: list[str], peer: list[str], said: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     robots = [

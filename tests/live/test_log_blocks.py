@@ -35,7 +35,7 @@ def test_blocks_fit_their_packet_and_hold_every_variable_once(peers: int) -> Non
     assert len(fast) == (2 if peers <= 5 else len(fast))
 
 
-def test_types_are_as_long_as_cflib_says() -> None:
+def test_variable_sizes_equal_cflib() -> None:
     elements = pytest.importorskip("cflib.crazyflie.log").LogTocElement.types
     assert {name: size for name, _, size in elements.values()} == VARIABLE_BYTES
     assert {name: kind for kind, (name, _, _) in elements.items()} == {

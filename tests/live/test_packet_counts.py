@@ -64,7 +64,7 @@ def test_late_packets_are_not_lost() -> None:
 
 
 @pytest.mark.parametrize("pause", [3, 100, 300, 900])
-def test_images_of_a_pause_are_counted(pause: int) -> None:
+def test_images_lost_in_a_pause_are_counted(pause: int) -> None:
     frames, rng, lost = FrameCount(), np.random.default_rng(0), 0
     for k in range(2000):
         if not 500 <= k < 500 + pause:

@@ -73,9 +73,7 @@ def test_signs_in_the_name_of_a_file_are_no_pattern(tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_the_bytes_are_those_of_one_at_a_time_with_any_number_of_workers(
-    flights: Path, tmp_path: Path
-) -> None:
+def test_batch_outputs_are_independent_of_worker_count(flights: Path, tmp_path: Path) -> None:
     trimmed(flights, tmp_path / "one", workers=1)
     trimmed(flights, tmp_path / "two", workers=2)
     made = bytes_in(tmp_path / "one")
@@ -86,7 +84,7 @@ def test_the_bytes_are_those_of_one_at_a_time_with_any_number_of_workers(
 
 
 @pytest.mark.heavy
-def test_one_that_fails_stops_no_other_and_is_told_at_the_end(
+def test_failing_recording_does_not_stop_the_batch_and_is_reported(
     flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (flights / "aa.mcap").write_bytes((flights / "a.mcap").read_bytes()[:200])
@@ -118,7 +116,7 @@ def test_a_recording_that_fails_does_not_cost_its_process(
     assert len(list((tmp_path / "out").rglob("*.mcap"))) == 3
 
 
-def test_what_is_there_and_made_of_the_same_is_left_as_it_is(
+def test_up_to_date_outputs_are_kept(
     flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -137,7 +135,7 @@ def test_what_is_there_and_made_of_the_same_is_left_as_it_is(
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("wrong", ["settings", "input", "torn"])
-def test_what_is_there_and_of_something_else_is_refused(
+def test_existing_output_with_other_inputs_is_refused(
     wrong: str, flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -179,7 +177,7 @@ def test_check_of_a_folder_is_a_line_each_and_one_for_all(
 
 
 @pytest.mark.heavy
-def test_check_of_many_with_a_bad_one_says_so_in_json_and_status(
+def test_check_of_a_folder_with_an_invalid_recording_fails_in_json_and_status(
     flights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (flights / "b.mcap").write_bytes(b"no recording")

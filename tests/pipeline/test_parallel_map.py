@@ -62,7 +62,7 @@ def test_results_come_in_order_from_other_processes_of_one_core_each() -> None:
     assert {one[2] for one in found} == {"1"}
 
 
-def test_one_worker_or_one_thing_is_done_here() -> None:
+def test_one_worker_or_one_item_runs_in_process() -> None:
     for items, workers in ((range(3), 1), (range(1), 4)):
         assert {one[1] for one in parallel_map(twice, items, workers)} == {os.getpid()}
 

@@ -103,7 +103,7 @@ ONE = 'kind = "pipeline"\n[[step]]\nstage = "sketch"\nout = "pictures"\nimages =
 
 
 @pytest.mark.heavy
-def test_what_a_broken_disk_kept_of_a_beginning_is_no_folder_of_another(tmp_path: Path) -> None:
+def test_partial_files_of_a_failed_start_do_not_block_the_folder(tmp_path: Path) -> None:
     """The first thing written could neither be finished nor removed; now the disk is well."""
     out = tmp_path / "out"
     (out / "unfinished").mkdir(parents=True)
@@ -113,7 +113,7 @@ def test_what_a_broken_disk_kept_of_a_beginning_is_no_folder_of_another(tmp_path
     assert {p.name for p in out.iterdir()} == {"pictures", "pipeline.json", "recipe.toml"}
 
 
-def test_what_the_system_refuses_a_step_is_its_error_and_no_bug(
+def test_os_error_in_a_step_is_no_internal_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def refused(*_: object, **__: object) -> None:
@@ -199,7 +199,7 @@ def test_a_killed_worker_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_what_a_user_can_mend_and_what_only_we_can_are_told_apart(tmp_path: Path) -> None:
+def test_user_errors_and_internal_errors_are_distinguished(tmp_path: Path) -> None:
     with ProcessPool(1) as crew:
         wrong = build_job("convert", tmp_path / "a", {"source": tmp_path / "no"}, {}, resume=False)
         assert crew.submit(wrong, exclusive=False).result().keys() == {"error"}

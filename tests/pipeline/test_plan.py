@@ -167,7 +167,7 @@ def of_interface(stage: str) -> tuple[Any, ...]:
     return roles, set(takes.paths), takes.resumes, takes.exclusive
 
 
-def test_what_a_stage_takes_is_read_from_its_run() -> None:
+def test_stage_interface_is_read_from_its_run_signature() -> None:
     one, maybe, many = (False, True), (False, False), (True, True)
     train = {"dataset": one, "init": maybe, "teacher": maybe}
     assert of_interface("train") == (train, set(), True, True)
@@ -215,7 +215,7 @@ def told(step: Step) -> dict[str, Any]:
     return {**asdict(step), "settings": settings}
 
 
-def test_self_supervised_is_still_what_it_was() -> None:
+def test_recipe_self_supervised_has_its_number_of_steps() -> None:
     steps = pipeline.load_plan("self_supervised").steps
     assert len(recipe.read_text("self_supervised").splitlines()) <= 100
     assert Counter(step.stage for step in steps) == {
@@ -269,7 +269,7 @@ def test_data_of_optional_steps_need_not_be_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_a_recipe_with_figures_ends_with_its_page_drawn_again_where_something_changed(
+def test_recipe_with_figures_redraws_its_report_on_change(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sketch = '[[step]]\nstage = "sketch"\nimages = 3\nout = "pictures"\n'

@@ -59,7 +59,7 @@ train = { epochs = 8, seed = 5 }
 """
 
 
-def test_rows_bring_values_and_what_a_row_lacks_is_left_out_or_is_no_step() -> None:
+def test_rows_set_values_and_missing_values_drop_keys_or_steps() -> None:
     train, predict = {"stage": "train", "seed": 5}, {"stage": "predict", "model": "model-1"}
     assert steps(ROUNDS) == [
         {**train, "epochs": 8, "dataset": "flown", "out": "model-1"},
@@ -69,7 +69,7 @@ def test_rows_bring_values_and_what_a_row_lacks_is_left_out_or_is_no_step() -> N
     ]
 
 
-def test_data_is_not_replaced_and_what_a_value_brings_is_not_looked_at_again() -> None:
+def test_data_placeholder_is_kept_and_values_are_not_expanded_again() -> None:
     (step,) = steps(
         'step = [{ stage = "convert", source = "{data}/{log}.csv", out = "a" }]\n'
         '[each]\nlog = ["{data}"]'
@@ -107,7 +107,7 @@ ONE = 'step = [{ stage = "fly", out = "f-{a}", seed = "{a}" }]\n[each]\n'
         ('step = [{ stage = "fly" }]', "step.1.out: a text is required"),
     ],
 )
-def test_what_cannot_be_meant_is_a_fault(text: str, fault: str) -> None:
+def test_invalid_recipe_is_a_fault(text: str, fault: str) -> None:
     assert any(found.startswith(fault) for found in faults(text)), faults(text)
 
 
@@ -125,7 +125,7 @@ HUGE = [
 
 
 @pytest.mark.parametrize("text", HUGE)
-def test_what_stands_for_too_much_is_never_written_out(text: str) -> None:
+def test_oversized_recipe_is_not_expanded(text: str) -> None:
     found: list[str] = []
     assert not expand_steps(tomllib.loads(text), found)
     assert found

@@ -79,7 +79,7 @@ def run(tmp_path: Path) -> Run:
     return runs
 
 
-def test_every_step_is_made_and_then_none(run: Run, tmp_path: Path) -> None:
+def test_second_run_skips_every_step(run: Run, tmp_path: Path) -> None:
     done, crew = run(A, B, BOTH, LAST)
     assert crew.made == ["a", "b", "both", "last"]
     assert [(d.stage, d.out, d.skipped) for d in done][2:] == [
@@ -90,7 +90,7 @@ def test_every_step_is_made_and_then_none(run: Run, tmp_path: Path) -> None:
     assert not crew.made and all(d.skipped for d in done)
 
 
-def test_what_hangs_on_a_changed_setting_is_made_again_and_nothing_else(run: Run) -> None:
+def test_changed_setting_reruns_only_dependent_steps(run: Run) -> None:
     run(A, B, BOTH, LAST)
     _, crew = run(A, B, BOTH, Step(LAST.stage, "last", LAST.inputs, {"to_s": 2.0}))
     assert crew.made == ["last"]
@@ -107,7 +107,7 @@ def test_steps_may_be_moved_renamed_and_added_in_the_same_folder(run: Run, tmp_p
     assert (tmp_path / "both").exists()
 
 
-def test_data_is_told_by_its_content(run: Run, tmp_path: Path) -> None:
+def test_changed_input_is_detected_by_content(run: Run, tmp_path: Path) -> None:
     data, moved = tmp_path / "data", tmp_path / "moved"
     data.mkdir()
     (data / "log").write_text("one")
@@ -122,7 +122,7 @@ def test_data_is_told_by_its_content(run: Run, tmp_path: Path) -> None:
     assert run(*steps, data=moved)[1].made == ["x", "y"]
 
 
-def test_data_of_the_same_content_under_another_name_is_another(run: Run, tmp_path: Path) -> None:
+def test_renamed_input_counts_as_changed(run: Run, tmp_path: Path) -> None:
     for name in ("one", "two"):
         (tmp_path / name).write_text("same")
     for name in ("one", "two"):  # names of inputs stand in provenance
@@ -130,7 +130,7 @@ def test_data_of_the_same_content_under_another_name_is_another(run: Run, tmp_pa
 
 
 @pytest.mark.parametrize("spoil", [Path.unlink, lambda path: path.write_text("{}")])
-def test_an_output_that_is_not_as_it_was_made_is_made_again(
+def test_modified_output_is_made_again(
     run: Run, tmp_path: Path, spoil: Callable[[Path], object]
 ) -> None:
     run(A, B, BOTH, LAST)
@@ -138,7 +138,7 @@ def test_an_output_that_is_not_as_it_was_made_is_made_again(
     assert run(A, B, BOTH, LAST)[1].made == ["b"]
 
 
-def test_what_was_there_stays_until_the_new_is_whole(run: Run, tmp_path: Path) -> None:
+def test_previous_output_stays_until_the_new_one_is_complete(run: Run, tmp_path: Path) -> None:
     run(A, B, BOTH)
     before = (tmp_path / "both").read_bytes()
     with pytest.raises(DmrlError, match=r"^both \(merge\): no both today\. Wait$"):
@@ -148,7 +148,7 @@ def test_what_was_there_stays_until_the_new_is_whole(run: Run, tmp_path: Path) -
     assert run(A, Step("sketch", "b", settings={"seed": 3}), BOTH, LAST)[1].made == ["both", "last"]
 
 
-def test_what_stands_beside_a_failure_is_finished_and_both_are_said(
+def test_parallel_steps_finish_after_a_failure_and_all_failures_are_reported(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(DmrlError, match=r"^a \(sketch\): no a today"):
@@ -159,7 +159,7 @@ def test_what_stands_beside_a_failure_is_finished_and_both_are_said(
     assert "also: c (sketch): no c today" in capsys.readouterr().err
 
 
-def test_an_optional_step_is_left_out_and_what_needs_it_is_not_made_of_the_old(
+def test_failed_optional_step_blocks_its_dependents(
     run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
     maybe = Step("sketch", "a", settings={"seed": 9}, optional=True)

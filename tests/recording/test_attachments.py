@@ -82,7 +82,7 @@ def test_metadata_and_attachments_go_along_but_no_provenance_or_recipe(tmp_path:
     )
 
 
-def test_the_licence_beside_a_source_is_told_by_its_first_words(tmp_path: Path) -> None:
+def test_licence_title_is_the_first_line_of_the_licence_file(tmp_path: Path) -> None:
     source = tmp_path / "photo.jpg"
     source.write_bytes(b"x")
     assert find_licence_file(source) is None
@@ -132,9 +132,7 @@ def test_a_topic_of_two_channels_is_one_topic(indexed: bool, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("publish_ns", [2**64 - 1, 2**63])
-def test_a_time_that_no_signed_number_holds_is_said(
-    publish_ns: int, indexed: bool, tmp_path: Path
-) -> None:
+def test_time_beyond_int64_is_reported(publish_ns: int, indexed: bool, tmp_path: Path) -> None:
     """By a message index too, where it became -1."""
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
@@ -149,7 +147,7 @@ def test_a_time_that_no_signed_number_holds_is_said(
 
 
 @pytest.mark.parametrize("log_ns", [2**64 - 1, 2**63, 2**63 - 1])
-def test_a_time_after_every_other_is_said_by_all_that_read(log_ns: int, tmp_path: Path) -> None:
+def test_time_beyond_2262_is_reported_by_every_reader(log_ns: int, tmp_path: Path) -> None:
     """check called it sound, convert damaged; view ended in an internal error."""
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
@@ -215,7 +213,7 @@ def test_an_index_is_of_its_channel_and_whole() -> None:
 
 
 @pytest.mark.parametrize("times", [[], [0], [5, 3, 9]])
-def test_statistics_say_what_is_there(times: list[int], tmp_path: Path) -> None:
+def test_statistics_count_the_written_records(times: list[int], tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, MADE) as sink:
         for time_ns in times:

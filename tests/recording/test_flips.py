@@ -107,7 +107,7 @@ def test_every_substituted_opcode_is_noticed_or_changes_nothing(tmp_path: Path) 
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)])
-def test_recover_says_that_nothing_was_lost_only_if_nothing_was(step: int, tmp_path: Path) -> None:
+def test_recover_reports_a_whole_file_only_if_nothing_was_lost(step: int, tmp_path: Path) -> None:
     path = small(tmp_path / "a.mcap")
     data = path.read_bytes()
     sound = [(raw.time_ns, raw.topic, raw.data) for raw in read_raw(path)]
@@ -168,7 +168,7 @@ def test_messages_of_a_damaged_chunk_are_counted_even_without_the_end(tmp_path: 
     assert result.missing == {"/cf1/height": 2, "/cf1/range/cf2": 2}
 
 
-def test_sums_that_another_program_copied_say_nothing_of_its_file(tmp_path: Path) -> None:
+def test_checksums_copied_by_other_programs_are_ignored(tmp_path: Path) -> None:
     """As `mcap filter --include-metadata` does."""
     path, copy = small(tmp_path / "a.mcap"), tmp_path / "b.mcap"
     with path.open("rb") as source, copy.open("wb") as stream:

@@ -98,7 +98,7 @@ def test_statistics_without_counts_are_counted(
     assert "87 messages" in capsys.readouterr().out
 
 
-def test_a_large_file_of_others_says_that_nobody_counted(
+def test_large_foreign_file_is_not_counted_and_warns(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "foreign.mcap"

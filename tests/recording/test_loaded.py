@@ -11,7 +11,7 @@ from dmrl.recording import read, read_table
 from dmrl.recording.loaded import LoadedRecording
 
 
-def test_what_is_held_is_what_is_read_whether_it_was_named_or_not(flight: Path) -> None:
+def test_loaded_topics_equal_read_topics(flight: Path) -> None:
     for wanted in (("/{robot}/attitude", "/{robot}/range/{peer}"), ()):
         held = LoadedRecording(flight, *wanted)
         for topic in ("/cf1/attitude", "/cf1/range/cf2", "/cf1/camera/calibration"):

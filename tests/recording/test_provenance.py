@@ -24,19 +24,19 @@ def rounds(count: int, flights: int) -> Provenance:
     return model
 
 
-def test_many_rounds_are_no_more_text_than_their_sum() -> None:
+def test_shared_ancestors_are_written_once() -> None:
     text = json.dumps(rounds(12, 20).to_json())
     assert len(text) < 14 * len(json.dumps(rounds(1, 20).to_json()))
 
 
-def test_what_is_told_once_is_known_of_all() -> None:
+def test_provenance_with_shared_ancestors_round_trips() -> None:
     made = rounds(2, 3)
     again = Provenance.from_json(json.loads(json.dumps(made.to_json())))
     assert again == made
     assert Provenance.from_metadata(made.to_metadata()) == made
 
 
-def test_an_ancestry_told_every_time_is_read_as_well() -> None:
+def test_provenance_with_repeated_ancestors_is_read() -> None:
     """As dmrl wrote it at first."""
     made = rounds(1, 2)
     document = made.to_json()
@@ -44,7 +44,7 @@ def test_an_ancestry_told_every_time_is_read_as_well() -> None:
     assert Provenance.from_json(document) == made
 
 
-def test_info_says_where_it_told_it_before() -> None:
+def test_info_abbreviates_repeated_ancestors() -> None:
     lines = ancestry_lines(rounds(1, 2))
     assert [line.rpartition(", ")[2] for line in lines if "model-0" in line] == [
         f"made by: dmrl {Provenance('x').dmrl_version} train round=0",
@@ -87,7 +87,7 @@ def test_a_provenance_that_nests_without_end_is_refused() -> None:
         {"inputs": [3]},
     ],
 )
-def test_what_is_no_provenance_is_refused(wrong: dict[str, object]) -> None:
+def test_invalid_provenance_is_refused(wrong: dict[str, object]) -> None:
     document = Provenance("trim", {"to_s": 1.0}).to_json()
     with pytest.raises((TypeError, ValueError, KeyError)):
         Provenance.from_json(document | wrong)

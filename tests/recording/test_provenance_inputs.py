@@ -31,7 +31,7 @@ def test_a_folder_is_its_names_and_contents(tmp_path: Path) -> None:
     assert len(known) == 5  # a stranger's folder: all of it counts
 
 
-def test_of_a_folder_that_dmrl_wrote_the_card_is_no_content(tmp_path: Path) -> None:
+def test_folder_hash_ignores_its_card_and_figures(tmp_path: Path) -> None:
     here = folder(tmp_path / "a", one="1", README_md="card", sub__README_md="text")
     (here / FILE_NAME).write_text("{}")
     before = hash_folder(here)
@@ -41,7 +41,7 @@ def test_of_a_folder_that_dmrl_wrote_the_card_is_no_content(tmp_path: Path) -> N
     assert hash_folder(here) != before
 
 
-def test_an_input_is_named_hashed_and_tells_where_it_came_from(tmp_path: Path) -> None:
+def test_input_has_name_hash_and_provenance(tmp_path: Path) -> None:
     made = Provenance("test", {"level": 1})
     with RecordingWriter(tmp_path / "a.mcap", made):
         pass
@@ -69,7 +69,7 @@ def test_settings_name_files_and_do_not_place_them() -> None:
     assert build_provenance("test").settings == {}
 
 
-def test_one_recording_under_two_names_is_given_twice(tmp_path: Path) -> None:
+def test_linked_recording_counts_as_a_duplicate(tmp_path: Path) -> None:
     one, link = tmp_path / "a.mcap", tmp_path / "b.mcap"
     one.touch()
     link.symlink_to(one)

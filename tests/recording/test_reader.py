@@ -112,7 +112,7 @@ def test_patterns_name_topics(flight: Path) -> None:
     assert {raw.topic for raw in read_raw(flight, "/*/range/*")} == {"/cf1/range/cf2"}
 
 
-def test_a_missing_topic_is_named_with_the_nearest_before_the_first_message(flight: Path) -> None:
+def test_missing_topic_suggests_the_nearest_before_reading(flight: Path) -> None:
     with pytest.raises(
         MissingTopic, match=r"no topic /cf1/range/cf3 .* Did you mean /cf1/range/cf2\?"
     ):
@@ -195,7 +195,7 @@ def test_a_truncated_file_names_the_way_out(flight: Path, tmp_path: Path, share:
     ],
     ids=["zero bytes", "7 bytes", "8 bytes", "a PNG"],
 )
-def test_what_is_no_recording_is_said_so(tmp_path: Path, content: bytes, complaint: str) -> None:
+def test_invalid_recording_is_reported(tmp_path: Path, content: bytes, complaint: str) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=complaint):
@@ -282,7 +282,7 @@ def test_topics_are_read_in_one_pass_as_one_by_one(
         assert ns.tolist() == [t for b in found[topic] for t in b["log_time"].to_pylist()]
 
 
-def test_a_glance_sees_every_topic_all_over_the_recording_in_a_few_chunks(
+def test_topic_samples_cover_the_recording_in_few_chunks(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "chunks.mcap"
@@ -308,7 +308,7 @@ def test_a_glance_sees_every_topic_all_over_the_recording_in_a_few_chunks(
     assert len(chunks) <= 33
 
 
-def test_a_glance_finds_what_the_chunks_it_takes_do_not_hold(tmp_path: Path) -> None:
+def test_topic_samples_include_topics_of_other_chunks(tmp_path: Path) -> None:
     # Chunks of a few messages each that all span the whole time.
     times = [time for k in range(1, 499) for time in (0, k, 499)]
     path = foreign(tmp_path / "a.mcap", times)

@@ -39,7 +39,7 @@ def broken(tmp_path: Path) -> tuple[Path, int]:
     return path, 900
 
 
-def test_what_a_damaged_chunk_had_is_said_by_topic(
+def test_messages_lost_in_a_damaged_chunk_are_counted_by_topic(
     broken: tuple[Path, int], tmp_path: Path
 ) -> None:
     path, lost = broken
@@ -49,7 +49,7 @@ def test_what_a_damaged_chunk_had_is_said_by_topic(
     assert (found.counted, found.doubtful, found.whole) == (True, False, False)
 
 
-def test_a_file_that_is_cut_says_only_what_its_indexes_say(
+def test_truncated_file_reports_indexed_losses_only(
     broken: tuple[Path, int], tmp_path: Path
 ) -> None:
     path, lost = broken

@@ -54,7 +54,7 @@ def foreign(path: Path, **options: Any) -> Path:
     ],
     ids=str,
 )
-def test_what_other_writers_leave_out_is_not_missed(
+def test_optional_records_of_other_writers_may_be_missing(
     tmp_path: Path, options: dict[str, Any]
 ) -> None:
     path = foreign(tmp_path / "a.mcap", **options)

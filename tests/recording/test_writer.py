@@ -34,7 +34,7 @@ def write_heights(path: Path, times_ns: list[int]) -> Path:
     return path
 
 
-def test_what_was_written_is_read(tmp_path: Path) -> None:
+def test_written_messages_are_read_back(tmp_path: Path) -> None:
     path = write_heights(tmp_path / "a.mcap", [0, 5, 10])
     got = [(s.time_ns, s.topic, s.message.height_m) for s in read(path)]
     assert got == [(0, "/cf1/height", 0.0), (5, "/cf1/height", 5e-9), (10, "/cf1/height", 1e-8)]
@@ -203,7 +203,7 @@ def test_mcaps_own_reader_sees_what_dmrl_sees(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("keep", "chunks"), [(False, 16), (True, 1)])
-def test_what_is_rare_is_not_left_open_while_the_other_kind_is_written(
+def test_rare_messages_are_flushed_beside_frequent_images(
     tmp_path: Path, keep: bool, chunks: int
 ) -> None:
     path, mended = tmp_path / "a.mcap", tmp_path / "b.mcap"

@@ -51,7 +51,7 @@ def sources(folder: Path, split: str = "train") -> list[str]:
 
 
 @pytest.mark.parametrize("parquet", [False, True])
-def test_what_is_there_is_not_written_again_and_what_is_added_comes_after_it(
+def test_appending_keeps_existing_shards_and_adds_new_ones(
     record: Record, tmp_path: Path, parquet: bool
 ) -> None:
     out, settings = tmp_path / "set", Settings(split="none", shard_images=4, parquet=parquet)
@@ -72,7 +72,7 @@ def test_what_is_there_is_not_written_again_and_what_is_added_comes_after_it(
     assert "`2.mcap`" in (out / "README.md").read_text()
 
 
-def test_others_open_what_has_grown(record: Record, tmp_path: Path) -> None:
+def test_other_libraries_open_an_extended_dataset(record: Record, tmp_path: Path) -> None:
     out = tmp_path / "set"
     run(flights(record, 0), out, PLAIN)
     mark = load_from_disk(str(out))["train"]._fingerprint
@@ -87,9 +87,7 @@ def test_others_open_what_has_grown(record: Record, tmp_path: Path) -> None:
     assert info["num_bytes"] == sum(sizes)
 
 
-def test_what_an_add_that_was_killed_leaves_belongs_to_nobody(
-    record: Record, tmp_path: Path
-) -> None:
+def test_shards_of_a_killed_append_are_ignored(record: Record, tmp_path: Path) -> None:
     """Parquet files are named one by one: a pattern would find those without a manifest too."""
     out, settings = tmp_path / "set", Settings(split="none", shard_images=4, parquet=True)
     run(flights(record, 0), out, settings)
@@ -105,9 +103,7 @@ def test_what_an_add_that_was_killed_leaves_belongs_to_nobody(
     assert files["includes"] == [f"data/train-0000{k}-of-0000{n}.parquet" for k, n in SHARDS]
 
 
-def test_the_same_steps_make_the_same_bytes_and_a_step_again_changes_nothing(
-    record: Record, tmp_path: Path
-) -> None:
+def test_appending_is_deterministic_and_idempotent(record: Record, tmp_path: Path) -> None:
     one, two, three = flights(record, 0, 1, 2)
     for name, workers in (("a", 1), ("b", 3)):
         run([one], tmp_path / name, Settings(test_share=0.5))
@@ -119,7 +115,7 @@ def test_the_same_steps_make_the_same_bytes_and_a_step_again_changes_nothing(
     assert again.images == {} and contents(tmp_path / "a") == made
 
 
-def test_a_recording_that_is_there_and_an_image_that_is_there_come_once(
+def test_existing_recordings_and_images_are_not_added_twice(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "set"
@@ -155,7 +151,7 @@ def test_a_name_twice_or_a_part_of_what_is_there_is_refused(record: Record, tmp_
     assert contents(out) == made
 
 
-def test_its_settings_hold(record: Record, tmp_path: Path) -> None:
+def test_append_requires_the_settings_of_the_dataset(record: Record, tmp_path: Path) -> None:
     out = tmp_path / "set"
     run(flights(record, 0), out, Settings(png=True, test_share=0.0))
     second = flights(record, 1)
@@ -177,7 +173,7 @@ def test_a_flight_has_its_split_whatever_comes_with_it(record: Record, tmp_path:
     assert "test" in (tmp_path / "b" / "dataset_dict.json").read_text()
 
 
-def test_what_cannot_grow_is_one_line(record: Record, tmp_path: Path) -> None:
+def test_append_to_invalid_dataset_gives_one_line_error(record: Record, tmp_path: Path) -> None:
     out = tmp_path / "set"
     first, new = flights(record, 0), flights(record, 1)
     with pytest.raises(DatasetError, match="cannot be extended"):

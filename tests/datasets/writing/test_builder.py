@@ -21,7 +21,7 @@ from ..conftest import HEIGHT_PX, STEP_NS, WIDTH_PX, Record, peer, pixels_of
 PLAIN = Settings()
 
 
-def test_every_labelled_image_becomes_a_row_that_names_recording_and_time(
+def test_labelled_images_become_rows_with_recording_and_time(
     record: Record, tmp_path: Path
 ) -> None:
     run([record()], tmp_path / "out", PLAIN)
@@ -71,7 +71,7 @@ def test_masks_are_kept_by_the_place_of_the_peer(record: Record, tmp_path: Path)
         }
 
 
-def test_images_with_peers_and_no_mask_are_left_out_and_said(
+def test_images_without_masks_are_omitted_and_reported(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SettingError, match=r"flight\.mcap has no masks; renders have\. Leave out"):
@@ -82,7 +82,7 @@ def test_images_with_peers_and_no_mask_are_left_out_and_said(
     assert "left out: 4 images show a peer, but have no mask" in capsys.readouterr().err
 
 
-def test_labels_that_were_estimated_go_before_the_truth_and_it_is_said(
+def test_estimated_labels_precede_truth_and_the_choice_is_reported(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flight = record(peers=[[peer(u_px=20.0), peer(source="estimate", u_px=30.0)]])
@@ -119,7 +119,7 @@ def test_a_peer_out_of_sight_is_listed_but_makes_no_cell(
     assert len(split.table["peers"][0].as_py()) == 1
 
 
-def test_an_image_where_nobody_is_seen_stays_and_one_nobody_labelled_goes(
+def test_images_without_peers_stay_and_unlabelled_ones_are_omitted(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     result = run([record(peers=[[peer()], [], None, None])], tmp_path / "out", PLAIN)
@@ -145,14 +145,14 @@ def test_an_image_whose_peers_another_source_labelled_is_no_negative(
     assert (result.images, result.tally.of_other_sources) == ({"train": 2}, 1)
 
 
-def test_a_peer_that_may_be_anywhere_is_nowhere(record: Record, tmp_path: Path) -> None:
+def test_peer_without_position_makes_no_cell(record: Record, tmp_path: Path) -> None:
     anywhere = peer(status=STATUS_UNCONVERGED, sigma_u_px=WIDTH_PX, peer="cf3")
     run([record(peers=[[peer(), anywhere]])], tmp_path / "out", Settings(keep_all=True))
     (row,) = open_dataset(tmp_path / "out").split("train").table["peers"].to_pylist()
     assert [one["peer"] for one in row] == ["cf2"]
 
 
-def test_cameras_of_other_focal_lengths_are_said(
+def test_different_focal_lengths_are_reported(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flights = []
@@ -168,14 +168,12 @@ def test_cameras_of_other_focal_lengths_are_said(
     assert "focal lengths from 180 to 400 px" in capsys.readouterr().err
 
 
-def test_a_source_nobody_used_is_refused_with_those_that_are_there(
-    record: Record, tmp_path: Path
-) -> None:
+def test_unknown_label_source_error_lists_available_ones(record: Record, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"no labels from hand\. Try one of --labels truth"):
         run([record()], tmp_path / "out", Settings(labels="hand"))
 
 
-def test_an_image_with_a_doubtful_label_is_left_out_unless_all_are_kept(
+def test_images_with_ambiguous_labels_are_omitted_without_keep_all(
     record: Record, tmp_path: Path
 ) -> None:
     doubtful = [peer(), peer(peer="cf3", status=STATUS_AMBIGUOUS)]
@@ -218,7 +216,7 @@ def test_shards_hold_no_more_images_than_asked(record: Record, tmp_path: Path) -
     assert np.array_equal(got, np.stack([pixels_of(k) for k in range(150)]))
 
 
-def test_of_large_images_few_are_in_memory(
+def test_batch_of_large_images_is_limited_by_pixels(
     record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[int] = []
@@ -268,7 +266,7 @@ def test_a_topic_with_another_message_is_refused(tmp_path: Path) -> None:
         run([path], tmp_path / "out", PLAIN)
 
 
-def test_recordings_with_nothing_to_keep_say_why(record: Record, tmp_path: Path) -> None:
+def test_recording_without_usable_images_reports_the_reason(record: Record, tmp_path: Path) -> None:
     flight = record(peers=[[peer(status=STATUS_AMBIGUOUS)]] * 3)
     with pytest.raises(RecordingError, match=r"3 images had a label that is not OK"):
         run([flight], tmp_path / "out", PLAIN)

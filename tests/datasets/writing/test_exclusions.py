@@ -37,7 +37,7 @@ def test_flags_are_read_with_reasons_or_without(tmp_path: Path) -> None:
         ("", "flags.csv:1: no column source"),
     ],
 )
-def test_what_is_no_flag_is_named_by_its_line(tmp_path: Path, text: str, says: str) -> None:
+def test_invalid_flag_error_names_its_line(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(SettingError, match=says):
         read_flags(flags(tmp_path, text))
 
@@ -48,7 +48,7 @@ def test_a_file_that_is_not_there_is_one_line(record: Record, tmp_path: Path) ->
     assert not (tmp_path / "out").exists()
 
 
-def test_flags_that_name_no_image_are_said(
+def test_flags_without_an_image_are_reported(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = flags(tmp_path, HEAD + "flight.mcap,cf1,0\nflight.mcap,cf9,0\n")

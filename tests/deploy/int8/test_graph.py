@@ -97,14 +97,14 @@ class Odd(Network):
         (lambda x: x if x.sum() > 0 else -x, r"layer sum is a sum, .* Use convolutions"),
     ],
 )
-def test_what_cannot_be_carried_is_named_with_what_to_use_instead(
+def test_unsupported_layer_error_names_a_replacement(
     part: nn.Module | Callable[[Tensor], Tensor], words: str
 ) -> None:
     with pytest.raises(ModelError, match=words):
         build_graph(trace_operations(Odd(part)))
 
 
-def test_heads_may_be_convolutions_of_their_own() -> None:
+def test_heads_may_be_separate_convolutions() -> None:
     class TwoHeads(Network):
         def __init__(self) -> None:
             super().__init__()

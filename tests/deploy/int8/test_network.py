@@ -52,7 +52,7 @@ def test_factors_are_of_31_bits_and_a_shift(field: str, value: Any, good: bool) 
     assert sound(conv(**{field: value})) == good
 
 
-def test_a_shortcut_is_of_the_outputs_shape_and_beside_a_convolution_that_keeps_the_size() -> None:
+def test_shortcut_needs_the_output_shape_and_a_size_preserving_convolution() -> None:
     both, gain = (False, True), np.full(2, 7 << 8, np.int32)
 
     def beside(shape: tuple[int, int, int], **more: Any) -> bool:
@@ -141,7 +141,7 @@ def test_the_threshold_is_the_first_level_that_reaches_it() -> None:
     assert network(confidence=low).threshold_q == 128
 
 
-def test_heads_are_signed_tensors_of_the_grid_that_nobody_reads() -> None:
+def test_heads_are_signed_grid_tensors_without_consumers() -> None:
     network()
     unsigned = (conv(padding=1, pad_value=128),)
     read = (*network().layers, conv(ins=2, kernel=1, signed=True, source=1))

@@ -122,7 +122,7 @@ def test_the_grid_of_levels_holds_the_range_and_zero() -> None:
         assert ends[0] <= 0 <= ends[1]
 
 
-def test_tables_say_what_the_levels_mean() -> None:
+def test_lookup_tables_convert_levels_to_confidence_and_depth() -> None:
     network = quantise_network(small(), calibrate_ranges(small(), [NOISE]), ABOUT)
     logit = network.confidence.scale * (np.arange(-128, 128) - network.confidence.zero_point)
     np.testing.assert_allclose(
@@ -157,7 +157,7 @@ def test_a_network_without_confidence_is_refused() -> None:
         quantise_network(small(), ranges, replace(ABOUT, channels=("log_depth", "class")))
 
 
-def test_a_network_that_breaks_its_promises_is_refused() -> None:
+def test_network_that_violates_its_invariants_is_refused() -> None:
     network = quantise_network(small(), calibrate_ranges(small(), [NOISE]), ABOUT)
     first = network.layers[0]
     assert isinstance(first, Conv)
@@ -170,7 +170,7 @@ def test_a_network_that_breaks_its_promises_is_refused() -> None:
 
 
 @given(st.lists(st.floats(0.25, 2.0**32), min_size=1, max_size=5))
-def test_multipliers_are_31_bits_and_one_shift_that_rounds_no_sum_by_an_eighth_of_a_step(
+def test_fixed_point_multipliers_round_by_less_than_an_eighth_of_a_step(
     divisors: list[float],
 ) -> None:
     multipliers, shift = _to_fixed_point(np.array(divisors))
@@ -185,9 +185,7 @@ def test_multipliers_are_31_bits_and_one_shift_that_rounds_no_sum_by_an_eighth_o
     ("divisor", "wanted"),
     [(8.0, (2**29, 32)), (4.0, (2**29, 31)), (1.0, (2**29, 29)), (2.0**40, (1, 32))],
 )
-def test_the_shift_is_32_where_the_high_word_will_do(
-    divisor: float, wanted: tuple[int, int]
-) -> None:
+def test_shift_is_32_if_the_high_word_suffices(divisor: float, wanted: tuple[int, int]) -> None:
     (multiplier,), shift = _to_fixed_point(np.array([divisor]))
     assert (multiplier, shift) == wanted
 
@@ -258,7 +256,7 @@ def test_ranges_are_those_of_all_images_and_grey_networks_see_grey() -> None:
     assert grey.high[0].tolist() == [float(normalize_images(rgb_to_grey(NOISE)).max())]
 
 
-def test_meanings_are_those_of_their_names() -> None:
+def test_lookup_tables_convert_units_by_output_name() -> None:
     """Of an offset from the middle of a cell: where from its edge, in sixteenths of a pixel."""
     for name in ("offset_u", "offset_v"):
         assert HEAD_CONVERSIONS[name](np.array([0.0, -0.5, 0.5, 1.0]), 8).tolist() == [

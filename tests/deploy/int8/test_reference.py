@@ -54,7 +54,7 @@ def test_every_convolution_is_what_it_is_by_hand(seed: int) -> None:
             np.testing.assert_array_equal(compute_layer(layer, *inputs), by_hand(layer, *inputs))
 
 
-def test_half_goes_up_on_either_side_of_zero() -> None:
+def test_halves_round_up_for_both_signs() -> None:
     layer = Add("add", (0, 1), (2**20, 2**20), 21, signed=True)  # (a + b) / 2
     a, b = (np.array(v, np.int16).reshape(1, 1, -1) for v in ([3, -3, 1, -1], [0, 0, 0, 0]))
     assert compute_layer(layer, a, b).ravel().tolist() == [2, -1, 1, 0]

@@ -29,7 +29,7 @@ def output(one: FloatConv) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("groups", "gain"), [(1, 4), (3, 2)])
-def test_errors_cancel_where_nearest_weights_add_them_up(groups: int, gain: float) -> None:
+def test_correlated_rounding_beats_nearest_rounding(groups: int, gain: float) -> None:
     one = layer(groups)
     scale = np.abs(one.weight).max(axis=(1, 2, 3)) / 7  # four bits, so that it shows
     moments = measure_moments(FloatGraph((one,), ()), SMOOTH)[0]

@@ -15,7 +15,7 @@ from ..networks import random_network
 
 
 @pytest.mark.parametrize("seed", [0, 3, 8])
-def test_a_network_comes_back_as_it_was(seed: int, tmp_path: Path) -> None:
+def test_integer_network_round_trips(seed: int, tmp_path: Path) -> None:
     network = random_network(seed)
     save_network(network, tmp_path / INTEGER_NAME)
     again = load_network(tmp_path)
@@ -28,13 +28,13 @@ def test_a_network_comes_back_as_it_was(seed: int, tmp_path: Path) -> None:
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / INTEGER_NAME).read_bytes()
 
 
-def test_no_network_is_said(tmp_path: Path) -> None:
+def test_missing_network_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"no integer.npz in .*Make one with: dmrl quantize"):
         load_network(tmp_path)
 
 
 @pytest.mark.parametrize("kept", [0, 1, 100, 3000])
-def test_a_file_that_is_cut_short_is_said(kept: int, tmp_path: Path) -> None:
+def test_truncated_network_file_is_reported(kept: int, tmp_path: Path) -> None:
     file = tmp_path / INTEGER_NAME
     save_network(quantised_network(0), file)
     file.write_bytes(file.read_bytes()[:kept])

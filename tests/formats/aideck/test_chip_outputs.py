@@ -30,9 +30,7 @@ def frames(tmp_path: Path) -> Path:
     return folder
 
 
-def test_maps_stand_at_the_time_of_their_picture_in_probabilities_and_metres(
-    frames: Path, tmp_path: Path
-) -> None:
+def test_chip_maps_are_probabilities_and_metres_at_image_time(frames: Path, tmp_path: Path) -> None:
     rec = dmrl.convert(frames, tmp_path / "out.mcap")
     (grid,) = rec.messages("/cf1/detections/grid")
     assert grid.time_ns == 100_000_000 and tuple(grid.message.channels) == ("confidence", "depth_m")
@@ -52,7 +50,7 @@ def test_half_a_pair_and_pairs_of_two_sizes_are_refused(frames: Path, tmp_path: 
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_maps_of_one_picture_are_its_own(frames: Path) -> None:
+def test_chip_maps_belong_to_the_image_of_their_name(frames: Path) -> None:
     assert load_chip_maps(frames / "img00007.png", 5, "cf7") is None
     found = load_chip_maps(frames / "img00009.png", 5, "cf7")
     assert found is not None

@@ -42,7 +42,7 @@ def test_raw_and_jpeg_images_come_back_however_the_bytes_are_cut(step: int) -> N
     assert (reader.broken, reader.skipped_bytes) == (0, 0)
 
 
-def test_the_first_bytes_of_an_image_are_those_that_the_published_viewer_reads() -> None:
+def test_image_header_matches_the_published_viewer() -> None:
     data = pack_image(raw(320, 224))
     length, route, function = struct.unpack_from("<HBB", data)
     assert (length, route & 7, route >> 3 & 7, function) == (13, 3, 4, 5)
@@ -77,7 +77,7 @@ def test_streamer_images_keep_number_times_and_state_over_their_wraps() -> None:
     assert reader.broken == 0
 
 
-def test_streamer_metadata_is_148_bytes_and_its_length_leaves_the_routing_out() -> None:
+def test_streamer_length_includes_metadata_without_routing() -> None:
     assert cpx.METADATA.size == 148
     data = pack_image(raw(10, 10, time_us=5, frame_id=1), "streamer")
     assert struct.unpack_from("<HBB", data) == (12 + 148 + 100, 0x63, 6)
@@ -140,7 +140,7 @@ def test_quaternions_come_back_to_a_quarter_of_a_degree() -> None:
         assert angle_rad < np.deg2rad(0.25)
 
 
-def test_what_a_camera_does_not_tell_is_sent_as_nothing() -> None:
+def test_missing_camera_fields_are_packed_as_zero() -> None:
     bare = raw(8, 8)
     (streamed,), _ = read(pack_image(bare, "streamer"))
     assert (streamed.frame_id, streamed.time_us, streamed.state) == (0, 0, None)
@@ -150,7 +150,7 @@ def test_what_a_camera_does_not_tell_is_sent_as_nothing() -> None:
     assert raw(8, 8, time_us=9).robot_time_us is None
 
 
-def test_a_stamp_tells_milliseconds_and_where_the_robot_is() -> None:
+def test_stamp_has_milliseconds_and_robot_state() -> None:
     state = RobotState(5, 6, (0.1, -0.2, 0.3), quaternion_xyzw=(1.0, 0.0, 0.0, 0.0))
     data = pack_image(raw(8, 8, time_us=(2**32 + 5) * 1000 + 999, state=state), "stamped")
     assert cpx.STAMP.unpack_from(data, 4 + cpx.HEADER.size) == (5, 100, -200, 300, 0)
@@ -168,7 +168,7 @@ def test_streamer_metadata_stands_where_the_firmware_has_it() -> None:
     assert data[148 : 148 + 120] == image.data
 
 
-def test_a_robot_s_time_is_the_camera_s_by_when_it_last_told_it() -> None:
+def test_robot_time_is_extrapolated_from_its_last_state() -> None:
     image = raw(8, 8, time_us=10_000, state=RobotState(7, 4_000))
     assert image.robot_time_us == 7_000 + 6_000
 
@@ -207,7 +207,7 @@ def test_a_jpeg_that_does_not_begin_as_one_is_broken() -> None:
 
 
 @pytest.mark.parametrize("cut", range(1, 40))
-def test_where_bytes_are_cut_changes_nothing_that_is_found_after_garbage(cut: int) -> None:
+def test_packet_reader_is_independent_of_chunk_boundaries_after_garbage(cut: int) -> None:
     packet = pack_packet(Packet(GAP8, HOST, APP, b"abcdef"))
     data = b"\0" * 25 + packet * 2
     reader = PacketReader()
@@ -242,7 +242,7 @@ def test_streamer_images_of_many_packets_come_back(width: int) -> None:
 
 
 @pytest.mark.parametrize("layout", ["plain", "stamped", "streamer"])
-def test_what_others_send_amid_an_image_does_not_break_it(layout: cpx.Layout) -> None:
+def test_interleaved_packets_do_not_break_an_image(layout: cpx.Layout) -> None:
     image = raw(90, 100, time_us=9000, frame_id=1)
     packets = [pack_packet(p) for p in PacketReader().feed(pack_image(image, layout))]
     words = b"Starting camera task"
@@ -286,7 +286,7 @@ def test_streamer_metadata_is_of_version_10_and_of_as_many_pixels(
     ("kind", "size", "broken"),
     [(1, 149, 0), (1, 148, 1), (1, 1 << 22, 0), (1, (1 << 22) + 1, 1), (2, 200, 0)],
 )
-def test_where_a_streamer_header_ends_to_be_one(kind: int, size: int, broken: int) -> None:
+def test_streamer_header_limits_are_checked(kind: int, size: int, broken: int) -> None:
     reader = ImageReader()
     begin = cpx.BEGIN_HEADER.pack(cpx.STREAMER_BEGIN, kind, size, 0)
     list(reader.feed(pack_packet(Packet(GAP8, HOST, STREAMER, begin))))
@@ -296,7 +296,7 @@ def test_where_a_streamer_header_ends_to_be_one(kind: int, size: int, broken: in
 
 
 @pytest.mark.parametrize("data", [b"\x10\1", b"\x11\0", b"\x12\0\0\0"])
-def test_a_streamer_packet_that_is_none_breaks_the_image_that_was_begun(data: bytes) -> None:
+def test_invalid_streamer_packet_breaks_the_current_image(data: bytes) -> None:
     first, *_ = PacketReader().feed(pack_image(raw(90, 100), "streamer"))
     reader = ImageReader()
     list(reader.feed(pack_packet(first)))

@@ -21,7 +21,7 @@ from dmrl.formats.aideck.cpx_log import (
 
 
 @pytest.mark.parametrize(("function", "counted"), [(APP, 2), (STREAMER, 0)])
-def test_a_packet_has_a_longest_length(function: int, counted: int) -> None:
+def test_packet_length_is_limited(function: int, counted: int) -> None:
     most = PACKET_MAX_BYTES - counted
     packet = Packet(GAP8, HOST, function, bytes(most), last=False)
     data = pack_packet(packet)
@@ -58,7 +58,7 @@ def app_packet(data: bytes) -> bytes:
         ((10, 10, 1, 1, (1 << 22) + 1), 1),
     ],
 )
-def test_where_a_header_ends_to_be_one(header: tuple[int, ...], broken: int) -> None:
+def test_header_limits_are_checked(header: tuple[int, ...], broken: int) -> None:
     reader = ImageReader()
     list(reader.feed(app_packet(cpx.HEADER.pack(cpx.MAGIC, *header))))
     assert reader.broken == broken
@@ -100,7 +100,7 @@ NOISE = st.sampled_from([b"", bytes(3), b"\0\0\x63\5", b"\2\0\x63", b"\6\0\x63\5
 
 
 @given(st.lists(st.tuples(NOISE, st.integers(0, 5)), max_size=9), st.integers(1, 9))
-def test_packets_amid_noise_are_those_of_a_search_byte_by_byte(
+def test_packets_in_noise_equal_a_bytewise_search(
     parts: list[tuple[bytes, int]], step: int
 ) -> None:
     data = b"".join(noise + app_packet(bytes(range(size))) for noise, size in parts)

@@ -89,7 +89,7 @@ def test_nothing_after_the_end_marker_is_read(dump: Path) -> None:
 
 
 @pytest.mark.parametrize("length", [1, 71_679, 71_680, 71_703])
-def test_a_record_that_was_cut_is_left_out_and_said(
+def test_truncated_record_is_omitted_and_reported(
     dump: Path, length: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     dump.write_bytes(dump.read_bytes()[: 2 * 71_704 + length])
@@ -154,7 +154,7 @@ def test_most_records_of_a_dump_are_plausible(odd: int, of: int, taken: bool, du
             hyperflash.load_content(dump, Options())
 
 
-def test_a_dump_is_whole_records_and_erased_flash_of_numbers_not_all_zero(dump: Path) -> None:
+def test_dump_is_recognized_by_whole_records_and_erased_flash(dump: Path) -> None:
     whole = dump.read_bytes()[:71_704]
     for data, known in (
         (whole, True),

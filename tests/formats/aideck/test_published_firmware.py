@@ -34,13 +34,13 @@ def test_degrees_nose_up_become_radians_nose_down() -> None:
     assert {s.time_ns for s in (logged, attitude, position, heard, labels)} == {7}
 
 
-def test_what_is_not_plausible_is_only_logged_and_no_range_is_no_range() -> None:
+def test_implausible_values_are_only_logged_and_zero_range_is_omitted() -> None:
     assert len(list(iter_samples(7, "cf1", "cf2", (*VALUES[:5], 1e9), AIDECK))) == 1
     kinds = [s.message for s in iter_samples(7, "cf1", "cf2", (*VALUES[:5], 0.0), None)]
     assert kinds[1:] == ["Attitude", "PeerPosition"]
 
 
-def test_who_is_out_of_view_has_no_label() -> None:
+def test_peer_out_of_view_has_no_label() -> None:
     for xyz in ((-2.0, 0.0, 0.0), (1.0, 5.0, 0.0), (1.0, 0.0, -5.0)):
         *_, labels = iter_samples(7, "cf1", "cf2", (0.0, 0.0, *xyz, 0.0), AIDECK)
         assert labels.fields["peers"] == []

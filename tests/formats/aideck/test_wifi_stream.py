@@ -104,7 +104,7 @@ def test_the_camera_s_clock_and_the_robot_s_state_are_used(tmp_path: Path) -> No
     assert found["/cf1/log/cpx_state"][2].fields["stateEstimate_x"] == pytest.approx(0.2)
 
 
-def test_a_stream_that_was_cut_gives_what_is_whole_and_says_so(
+def test_damaged_stream_keeps_whole_images_and_reports_the_rest(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     one = pack_image(Image(32, 24, "raw", foreign.pictures(1)[0].tobytes()))
@@ -121,7 +121,7 @@ def test_a_file_without_a_picture_is_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.99])
 @pytest.mark.parametrize("layout", ["plain", "streamer"])
-def test_a_stream_that_was_cut_says_so(
+def test_truncated_stream_reports_the_broken_image(
     layout: Layout, share: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     images = [
@@ -139,7 +139,7 @@ def test_a_stream_that_was_cut_says_so(
     assert not capsys.readouterr().err
 
 
-def test_times_of_a_camera_that_does_not_always_tell_are_nominal_and_none_goes_back() -> None:
+def test_missing_camera_times_become_nominal_and_times_never_decrease() -> None:
     def of(times_us: list[int | None], rate_hz: float = 10.0) -> list[int | None]:
         return wifi_stream._to_times_ns(times_us, Path("a.cpx"), Options(rate_hz=rate_hz))
 
@@ -168,7 +168,7 @@ def test_a_stream_is_known_by_a_whole_picture_near_its_start(
     assert not wifi_stream.can_read(tmp_path / "flight.txt")
 
 
-def test_the_robot_s_turning_is_told_in_radians(tmp_path: Path) -> None:
+def test_yaw_rate_is_in_radians(tmp_path: Path) -> None:
     state = RobotState(1000, 5_000_000, (0.0, 0.0, 0.7), turning_radps=(0.1, 0.2, 0.5))
     raw = foreign.pictures(1)[0].tobytes()
     data = pack_image(Image(32, 24, "raw", raw, 5_004_000, 1, state), "streamer")

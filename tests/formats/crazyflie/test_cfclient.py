@@ -108,7 +108,7 @@ def test_a_block_is_named_without_its_date(tmp_path: Path) -> None:
         assert cfclient.read_block(tmp_path / f"{stem}.csv").name == name
 
 
-def test_a_last_line_that_was_cut_is_left_out_and_said(
+def test_truncated_last_line_is_omitted_and_reported(
     swarm: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = swarm / "cf1" / "state-20221011T10-33-31.csv"
@@ -124,7 +124,7 @@ def test_a_last_line_that_was_cut_is_left_out_and_said(
         ("Timestamp,a\nnan,2\nx,3\n", "no number in Timestamp"),
     ],
 )
-def test_what_is_no_log_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_log_gives_one_line_error(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(SourceError, match=message):
         samples(tmp_path / "a.csv")
@@ -196,7 +196,9 @@ def test_a_log_of_very_many_variables_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "whole"), [("nan,1", False), ("inf,1", False), ("5,nan", True), ("5,1,1", False)]
 )
-def test_a_time_is_a_number_and_a_value_may_be_none(line: str, whole: bool, tmp_path: Path) -> None:
+def test_lines_need_a_numeric_time_and_values_may_be_missing(
+    line: str, whole: bool, tmp_path: Path
+) -> None:
     (tmp_path / "a.csv").write_text(f"Timestamp,x\n{line}\n6,1\n")
     if whole:
         assert cfclient.read_block(tmp_path / "a.csv").time_ns.tolist() == [
@@ -216,7 +218,7 @@ def test_a_header_is_the_time_and_names(head: str, tmp_path: Path) -> None:
         cfclient.read_block(tmp_path / "a.csv")
 
 
-def test_a_block_of_one_row_is_one(tmp_path: Path) -> None:
+def test_log_block_may_have_one_row(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("Timestamp,x\n5,1\n")
     (tmp_path / "b.csv").write_text("Timestamp,y\n5,1\n7,2\n")
     found = samples(tmp_path)

@@ -72,7 +72,7 @@ def test_a_steady_turn_is_found_in_the_body_rates(roll: float, pitch: float, rat
     np.testing.assert_allclose(compute_yaw_rate([gyro], attitude), rate, atol=1e-5)
 
 
-def test_without_a_gyroscope_the_yaw_tells_its_rate() -> None:
+def test_yaw_rate_is_derived_from_yaw_without_gyroscope() -> None:
     yaw = TimeSeries(TIMES, np.column_stack([0 * TIMES, 0 * TIMES, 2e-9 * TIMES]))
     assert compute_yaw_rate([], yaw) == pytest.approx(2.0)
     late = TimeSeries(17 * 10**17 + TIMES, yaw.values)  # as exactly on a clock of today
@@ -184,7 +184,7 @@ def test_rows_out_of_order_are_put_in_order_with_all_their_columns() -> None:
 
 
 @pytest.mark.parametrize(("norm", "kept"), [(0.91, 1), (0.89, 0), (1.09, 1), (1.11, 0)])
-def test_quaternions_a_tenth_from_unit_length_are_none(norm: float, kept: int) -> None:
+def test_quaternions_far_from_unit_norm_are_dropped(norm: float, kept: int) -> None:
     rows = [[0.0, norm], [0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
     names = ("stateEstimate__qx", "stateEstimate__qy", "stateEstimate__qz", "stateEstimate__qw")
     found = find_quaternions([block("a", **dict(zip(names, rows, strict=True)))])
@@ -217,7 +217,7 @@ def test_angles_of_the_estimate_come_before_the_stabilizer_s() -> None:
     assert found.values == pytest.approx(euler_to_quaternion(np.radians([[20.0, 0, 0]])), abs=1e-6)
 
 
-def test_ranges_end_at_60_m_and_nothing_heard_is_not_refused(
+def test_ranges_are_limited_to_60_m_and_zeros_are_not_reported(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     # Alone, so that nothing else is logged.
@@ -231,7 +231,7 @@ def test_ranges_end_at_60_m_and_nothing_heard_is_not_refused(
     )
 
 
-def test_events_tell_whose_distance_they_are_and_a_robot_ranges_to_no_self() -> None:
+def test_event_ranges_are_assigned_by_id_and_own_id_is_dropped() -> None:
     event = LogBlock(
         "estDistance",
         TIMES,
@@ -253,7 +253,7 @@ def test_events_tell_whose_distance_they_are_and_a_robot_ranges_to_no_self() -> 
         (np.array([2, 59]), [0.002, 0.059], "but is 59 at most. Are they metres?"),
     ],
 )
-def test_the_unit_of_a_distance_is_told_by_its_type_and_size(
+def test_range_unit_is_inferred_from_type_and_magnitude(
     values: np.ndarray, range_m: list[float], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = samples(LogBlock("r", TIMES[:2], {"ranging.distance2": values}))["/cf1/range/cf2"]
@@ -265,7 +265,7 @@ def test_the_unit_of_a_distance_is_told_by_its_type_and_size(
     )
 
 
-def test_poses_take_the_nearest_turn_and_true_ones_that_stand_come_once() -> None:
+def test_poses_take_the_nearest_orientation_and_repeated_truth_is_dropped() -> None:
     place = block("p", **{f"locSrv__{n}": [1.0, 1.0, 2.0] for n in "xyz"})
     still = {"locSrv__qx": [0.0] * 3, "locSrv__qy": [0.0] * 3}
     turn = block("q", **still, locSrv__qz=[0.0, 0.0, 1.0], locSrv__qw=[1.0, 1.0, 0.0])
@@ -282,14 +282,14 @@ def test_poses_take_the_nearest_turn_and_true_ones_that_stand_come_once() -> Non
     assert len(samples(event, turn)["/cf1/pose/truth"]) == 3
 
 
-def test_frames_of_a_robot_are_told_every_50_ms() -> None:
+def test_transforms_are_written_every_50_ms() -> None:
     times = np.arange(0, 200, 20) * MS
     columns = {f"stateEstimate.{n}": np.arange(10.0) + k for k, n in enumerate("xyz")}
     found = samples(LogBlock("s", times, columns))["/tf"]
     assert [s.time_ns // MS for s in found] == [0, 60, 100, 160]
 
 
-def test_a_beam_of_8_m_and_more_saw_no_floor() -> None:
+def test_beam_range_of_8_m_or_more_gives_no_height() -> None:
     found = samples(block("b", range__zrange=[7999.0, 8001.0, 1.0]))["/cf1/height"]
     assert [s.time_ns for s in found] == [0, 20 * MS]
     assert [s.fields["height_m"] for s in found] == pytest.approx([7.999, 0.001])
@@ -316,7 +316,7 @@ def test_frames_and_poses_turn_as_what_was_logged() -> None:
     np.testing.assert_allclose(heading[2], [0, 0, 1], atol=1e-12)
 
 
-def test_a_peer_of_which_nothing_was_heard_has_no_ranges(
+def test_peer_with_zero_ranges_has_no_range_topic(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     for kind in (np.uint16, np.float32):

@@ -154,7 +154,7 @@ def test_bytes_that_look_like_ids_are_no_records() -> None:
         60 * "ab" + 60 * "ba",
     ],
 )
-def test_events_in_any_order_are_told_apart(pattern: str, code: str) -> None:
+def test_interleaved_events_are_decoded(pattern: str, code: str) -> None:
     events = {ord(c) - 90: (c, [("x", "H"), ("y", code)]) for c in "abc"}
     rows = [(ord(c) - 90, 1000 * k, (k, 7)) for k, c in enumerate(pattern)]
     raw = plain_usd.encode(events, rows)
@@ -212,7 +212,7 @@ def test_variables_have_names_of_their_own_and_known_types(
 
 
 @pytest.mark.parametrize("numbers", [(1, 257), (0x0102, 0xFF02), (0xFFFF, 0x00FF)])
-def test_events_whose_numbers_end_alike_are_told_apart(numbers: tuple[int, int]) -> None:
+def test_events_with_equal_low_id_bytes_are_decoded(numbers: tuple[int, int]) -> None:
     events = {numbers[0]: ("a", [("x", "H")]), numbers[1]: ("b", [("y", "I"), ("z", "H")])}
     rows = [
         (numbers[k % 3 == 0], 1000 * k, (k,) if k % 3 else (70_000 + k, 257)) for k in range(200)

@@ -133,7 +133,7 @@ def test_attitude_before_the_estimator_starts_is_left_out(tmp_path: Path) -> Non
     assert (len(found["/cf1/attitude"]), len(found["/cf1/log/state"])) == (1, 2)
 
 
-def test_impossible_ranges_are_left_out_and_said(
+def test_impossible_ranges_are_omitted_and_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     events = {1: ("range", [("ranging.distance2", "H")])}
@@ -169,7 +169,7 @@ def test_velocity_needs_yaw_alone(tmp_path: Path, capsys: pytest.CaptureFixture[
         (("stateEstimate.yaw",), ("stateEstimate roll, pitch;", "no usable stateEstimate vx")),
     ],
 )
-def test_why_a_log_has_no_attitude_or_velocity_is_said(
+def test_missing_attitude_or_velocity_reports_the_reason(
     variables: tuple[str, ...],
     reasons: tuple[str, ...],
     tmp_path: Path,

@@ -59,13 +59,13 @@ def test_every_fault_of_a_table_is_named_in_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["time = ", "range = 5\n", "time = 5\n", "vx = 5\n"])
-def test_what_is_no_table_is_one_line(text: str, tmp_path: Path) -> None:
+def test_invalid_column_map_gives_one_line_error(text: str, tmp_path: Path) -> None:
     (tmp_path / "map.toml").write_text(text)
     with pytest.raises(SourceError, match=r"map\.toml"):
         read_column_map(tmp_path / "map.toml")
 
 
-def test_units_are_what_they_are_called() -> None:
+def test_units_have_their_conversion_factor() -> None:
     degree = np.pi / 180
     for quantity, units in {
         "yaw": {"rad": 1, "deg": degree},
@@ -95,7 +95,7 @@ def test_units_are_what_they_are_called() -> None:
         ("[range.cf2]", "[range.cf2]\nsign = 2", "[range.cf2] sign: not 1 or -1"),
     ],
 )
-def test_one_fault_of_a_table_is_said_and_no_other(
+def test_single_fault_of_a_column_map_is_reported_alone(
     was: str, now: str, fault: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "map.toml"

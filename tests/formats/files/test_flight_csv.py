@@ -228,7 +228,7 @@ def test_steps_of_a_second_are_no_gap_and_longer_ones_are(
     assert line.endswith("cf2.csv: 2 gaps, the first of 1.0 s after 1.190 s")
 
 
-def test_clocks_that_touch_share_a_time_and_the_order_of_files_does_not_matter(
+def test_clocks_must_overlap_in_any_file_order(
     flight: Path,
 ) -> None:
     for robot in ("cf0", "cf2"):  # before and after cf1 by name
@@ -238,14 +238,14 @@ def test_clocks_that_touch_share_a_time_and_the_order_of_files_does_not_matter(
         assert list(flight_csv.load_content(flight).samples)
 
 
-def test_a_range_under_60_m_is_one(flight: Path) -> None:
+def test_ranges_of_60_m_or_more_are_dropped(flight: Path) -> None:
     data: Rows = [[*row, 59.99 if k % 2 else 60.0] for k, row in enumerate(rows())]
     write(flight, "cf1", data, [*HEADER, "range_cf2_m"])
     samples = [s for s in flight_csv.load_content(flight).samples if s.topic == "/cf1/range/cf2"]
     assert [s.fields["range_m"] for s in samples] == [59.99] * 10
 
 
-def test_where_a_peer_truly_is_needs_three_numbers(flight: Path) -> None:
+def test_true_peer_position_needs_three_coordinates(flight: Path) -> None:
     cells = [["1", "2", ""], ["", "2", "3"], ["1", "2", "3"]]
     data: Rows = [[*row, *cells[k % 3]] for k, row in enumerate(rows())]
     write(flight, "cf1", data, [*HEADER, "cf2_x_m", "cf2_y_m", "cf2_z_m"])
@@ -277,7 +277,7 @@ def test_a_flight_may_begin_at_0(flight: Path) -> None:
     assert next(flight_csv.load_content(flight).samples).time_ns == 0
 
 
-def test_columns_that_only_look_like_ranges_are_none(flight: Path) -> None:
+def test_similar_column_names_are_not_ranges(flight: Path) -> None:
     data: Rows = [[*row, 1.5, 1.5, 1.5] for row in rows()]
     write(flight, "cf1", data, [*HEADER, "range_cf2_s", "range_cf2", "my_range_cf2_m"])
     assert not [s for s in flight_csv.load_content(flight).samples if "range" in s.topic]

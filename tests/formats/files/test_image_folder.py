@@ -60,7 +60,7 @@ def test_names_of_twelve_digits_are_times(folder: Path) -> None:
     assert [s.time_ns for s in samples(folder, "CompressedImage")] == sorted(times)
 
 
-def test_unlabelled_empty_and_seen_are_three_things(folder: Path) -> None:
+def test_unlabelled_empty_and_labelled_images_differ(folder: Path) -> None:
     (folder / "labels.csv").write_text(
         "file,peer,u_px,v_px,depth_m,left_px,top_px,right_px,bottom_px,visible_share,source,split\n"
         "a.png,cf2,10.5,20,0.8,5,15,16,25,0.5,truth,train\n"
@@ -115,7 +115,7 @@ def test_labels_boxes_and_camera_follow_the_crop(folder: Path) -> None:
     assert calibration.fields["D"] == list(AIDECK.distortion)
 
 
-def test_the_crop_shows_what_its_labels_say(tmp_path: Path) -> None:
+def test_crop_and_labels_agree(tmp_path: Path) -> None:
     rgb = np.zeros((300, 500, 3), np.uint8)
     rgb[100:120, 350:380] = 255
     (tmp_path / "a.png").write_bytes(encode_png(rgb))
@@ -197,7 +197,7 @@ def test_real_frames_convert(data: Path) -> None:
         np.testing.assert_array_equal(decode(sample.fields["data"]), decode(path.read_bytes()))
 
 
-def test_the_firmware_s_text_beside_pictures_becomes_messages_and_labels(folder: Path) -> None:
+def test_firmware_text_file_becomes_messages_and_labels(folder: Path) -> None:
     lines = ["deck/a.png 1.5 -2.0 1.0 0.2 -0.1 1.03", "c.ppm,0,0,2,0,0,2", ""]
     (folder / "label.txt").write_text("\n".join(lines))
     camera = replace(AIDECK, width_px=64, height_px=48, cx_px=32, cy_px=24, fx_px=40, fy_px=40)
@@ -224,7 +224,7 @@ def test_a_wrong_line_of_the_firmware_s_text_is_named(folder: Path, line: str, t
         samples(folder, "PeerPosition")
 
 
-def test_the_firmware_s_text_without_a_camera_is_said(
+def test_firmware_text_file_without_camera_is_reported(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "label.txt").write_text("a.png 1 2 1.0 0.1 0.0 1.0\n")
@@ -267,7 +267,7 @@ def test_pictures_of_the_whole_sensor_are_cut_to_what_the_camera_is_of(tmp_path:
         ((324, 244), (AIDECK.fx_px, AIDECK.cx_px + 2, AIDECK.cy_px + 10), (102, 110)),
     ],
 )
-def test_pictures_of_the_whole_sensor_in_other_sizes_keep_a_true_camera(
+def test_full_sensor_images_scale_the_camera_matrix(
     tmp_path: Path,
     size_px: tuple[int, int],
     wanted: tuple[float, float, float],
@@ -286,7 +286,7 @@ def test_pictures_of_the_whole_sensor_in_other_sizes_keep_a_true_camera(
     assert (label.fields["peers"][0]["u_px"], label.fields["peers"][0]["v_px"]) == label_px
 
 
-def test_how_much_there_will_be_is_told_before(folder: Path) -> None:
+def test_expected_message_count_is_exact(folder: Path) -> None:
     (folder / "labels.csv").write_text(HEADER + "a.png,cf2,10,20,0.8\na.png,cf3,10,20,0.8\n")
     camera = replace(AIDECK, width_px=64, height_px=48)
     for options, more in ((Options(), 0), (Options(camera=camera), 1)):
@@ -294,7 +294,7 @@ def test_how_much_there_will_be_is_told_before(folder: Path) -> None:
         assert content.total == len(list(content.samples)) == 3 + 1 + more
 
 
-def test_a_camera_that_is_given_counts_before_the_one_beside_the_pictures(folder: Path) -> None:
+def test_given_camera_precedes_calibration_file(folder: Path) -> None:
     near = replace(AIDECK, width_px=64, height_px=48, cx_px=30.0)
     (folder / "calibration.toml").write_text(format_camera(near))
     for camera, cx_px in ((None, 30.0), (replace(near, cx_px=31.0), 31.0)):
@@ -304,7 +304,7 @@ def test_a_camera_that_is_given_counts_before_the_one_beside_the_pictures(folder
 
 
 @pytest.mark.parametrize(("labelled", "camera", "said"), [(0, 0, 1), (1, 0, 0), (0, 1, 0)])
-def test_labels_that_want_a_camera_are_said_where_there_are_no_others(
+def test_missing_camera_is_reported_only_if_labels_depend_on_it(
     labelled: int, camera: int, said: int, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "label.txt").write_text("a.png 1 2 1.0 0.1 0.0 1.0\n")
@@ -315,7 +315,7 @@ def test_labels_that_want_a_camera_are_said_where_there_are_no_others(
     assert ("gives no labels without a camera" in capsys.readouterr().err) == bool(said)
 
 
-def test_names_end_to_be_times_with_64_bits(tmp_path: Path) -> None:
+def test_names_beyond_64_bits_are_not_times(tmp_path: Path) -> None:
     (tmp_path / f"{2**63 - 1}.png").write_bytes(b"")
     (tmp_path / "000000000007.png").write_bytes(b"")
     found = image_folder.list_images(tmp_path, 10.0)

@@ -82,7 +82,7 @@ def test_a_point_is_kept_to_a_ten_thousandth_of_a_pixel(u: float, v: float, dept
         ("1,2,inf,,,,,", "depth_m is 'inf', not a number"),
     ],
 )
-def test_where_values_end(tmp_path: Path, cells: str, complaint: str) -> None:
+def test_label_values_have_limits(tmp_path: Path, cells: str, complaint: str) -> None:
     text = f"{HEADER}a.png,cf2,{cells}\n"
     if not complaint:
         assert len(read(tmp_path, text)["a.png"]) == 1
@@ -92,7 +92,7 @@ def test_where_values_end(tmp_path: Path, cells: str, complaint: str) -> None:
 
 
 @pytest.mark.parametrize("cell", range(7))
-def test_who_sees_nobody_says_nothing_of_where(tmp_path: Path, cell: int) -> None:
+def test_row_without_peer_must_have_empty_cells(tmp_path: Path, cell: int) -> None:
     cells = ["5" if k == cell else "" for k in range(8)]
     with pytest.raises(SourceError, match="without a peer"):
         read(tmp_path, f"{HEADER}a.png,,{','.join(cells)}\n")
@@ -118,14 +118,14 @@ def test_a_picture_has_so_many_rows_at_most(
         read(tmp_path, written(*rows))
 
 
-def test_a_column_that_is_misspelled_is_told_the_near_one(tmp_path: Path) -> None:
+def test_misspelled_column_suggests_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"unknown column 'sigma_u'\. Did you mean sigma_u_px\?"):
         read(tmp_path, "file,peer,u_px,v_px,depth_m,sigma_u\n")
     with pytest.raises(SourceError, match=r"unknown column 'zz'\. Known are file, peer"):
         read(tmp_path, "file,peer,u_px,v_px,depth_m,zz\n")
 
 
-def test_who_looked_and_saw_nobody_is_told(tmp_path: Path) -> None:
+def test_row_without_peer_keeps_its_source(tmp_path: Path) -> None:
     head = "file,peer,u_px,v_px,depth_m,source\n"
     found = read(tmp_path, f"{head}a.png,,,,,\nb.png,,,,,truth\n")
     assert (found["a.png"][0].source, found["b.png"][0].source) == ("hand", "truth")
@@ -138,7 +138,7 @@ def test_who_looked_and_saw_nobody_is_told(tmp_path: Path) -> None:
     st.lists(st.integers(0, 8), min_size=3, max_size=3),
     st.integers(0, 100),
 )
-def test_whatever_a_row_holds_is_read_back(
+def test_label_rows_round_trip(
     tmp_path_factory: pytest.TempPathFactory, edges: list[float], sigmas: list[int], share: int
 ) -> None:
     (left, right), (top, bottom) = sorted(edges[:2]), sorted(edges[2:])

@@ -36,7 +36,7 @@ def test_the_width_of_a_robot_gives_the_depth_of_its_box(small: Path) -> None:
         read(small, "yolo", Options(robot_width_m=0.12))
 
 
-def test_a_square_seen_from_a_random_side_is_as_wide_as_the_sigma_says() -> None:
+def test_width_sigma_matches_a_square_at_random_yaw() -> None:
     yaw = np.random.default_rng(0).uniform(0, 2 * np.pi, 1_000_000)
     width = np.abs(np.cos(yaw)) + np.abs(np.sin(yaw))
     assert width.std() / width.mean() == pytest.approx(0.098, abs=1e-3)

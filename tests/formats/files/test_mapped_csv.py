@@ -66,7 +66,7 @@ def table(tmp_path: Path) -> Path:
     return tmp_path / "map.toml"
 
 
-def test_units_frames_and_signs_are_as_the_table_says(table: Path) -> None:
+def test_units_frames_and_signs_follow_the_column_map(table: Path) -> None:
     found = samples(table.with_name("log.csv"), Options(columns=table))
     attitude = found["/cf1/attitude"][0].fields
     assert (attitude["roll_rad"], attitude["pitch_rad"]) == pytest.approx(np.radians((10, -20)))
@@ -134,7 +134,7 @@ def test_a_column_that_is_not_there_is_named(table: Path) -> None:
         samples(table.with_name("log.csv"), Options(columns=table))
 
 
-def test_ranges_that_cannot_be_are_counted_and_empty_cells_are_none(
+def test_impossible_ranges_are_counted_and_empty_cells_are_not(
     table: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = table.with_name("log.csv")
@@ -274,7 +274,7 @@ def test_a_column_that_stands_twice_is_refused(table: Path) -> None:
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_columns_are_parted_by_what_stands_there_most(separator: str, table: Path) -> None:
+def test_most_frequent_delimiter_is_used(separator: str, table: Path) -> None:
     log = table.with_name("log.csv")
     other = "," if separator != "," else ";"
     text = log.read_text().replace(";", separator).replace("note", f'"a{other}b"')

@@ -165,7 +165,7 @@ def test_robots_and_peers_are_renamed(tmp_path: Path) -> None:
         mapped_csv.load_content(source, Options(columns=tmp_path / "map.toml", robot="c"))
 
 
-def test_a_rover_with_wheels_and_a_gyroscope_alone_is_level(
+def test_robot_without_roll_and_pitch_is_level(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "map.toml").write_text(

@@ -104,7 +104,7 @@ def test_every_form_gives_the_same_rows(form: str, encoding: str, tmp_path: Path
         (plain(";", ",").encode(), "read with decimal commas"),
     ],
 )
-def test_what_is_guessed_is_said_with_what_decides_it(
+def test_guessed_dialect_is_reported_with_the_deciding_key(
     data: bytes, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "a.csv").write_bytes(data)
@@ -136,7 +136,7 @@ def test_missing_values_are_no_numbers_and_not_counted(missing: str, tmp_path: P
     assert left_out.counts == {}
 
 
-def test_what_cannot_be_used_is_counted_with_its_line(tmp_path: Path) -> None:
+def test_unusable_cells_and_rows_are_counted_by_line(tmp_path: Path) -> None:
     lines = plain(before="# a log\n").splitlines()
     lines[10] = "0.18,0.1"
     lines[12] = lines[12].rsplit(",", 1)[0] + ",far"
@@ -211,7 +211,7 @@ def samples(folder: Path, **options: object) -> dict[str, list[Sample]]:
     return found
 
 
-def test_a_unit_in_the_header_that_is_not_the_table_s_is_said(
+def test_unit_in_the_header_that_differs_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "map.toml").write_text(TABLE)

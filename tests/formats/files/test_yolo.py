@@ -145,7 +145,7 @@ def test_a_set_in_pixels_is_refused(small: Path) -> None:
 
 
 @pytest.mark.parametrize("unlabelled", [False, True])
-def test_a_picture_without_label_file_shows_nobody_unless_said(
+def test_image_without_label_file_is_empty_unless_unlabelled_is_set(
     unlabelled: bool, small: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_picture(small / "images/0.png", 0)

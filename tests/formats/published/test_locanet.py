@@ -268,7 +268,7 @@ def test_the_whole_of_a_published_attitude_is_known_by_two_angles() -> None:
         assert camera_from_horizontal(*found) @ [0, 0, 1] == pytest.approx(up)
 
 
-def test_a_picture_s_number_is_its_time_and_its_rows_are_its_own(folder: Path) -> None:
+def test_image_number_sets_its_time_and_rows(folder: Path) -> None:
     inner = folder / "synImgs"
     jpeg = (inner / "0000.jpg").read_bytes()
     for path in inner.iterdir():
@@ -320,7 +320,7 @@ def test_a_robot_at_the_camera_s_own_place_is_not_before_it(folder: Path) -> Non
                 locanet.load_images(folder)
 
 
-def test_an_empty_list_and_a_name_without_a_number_are_said(folder: Path) -> None:
+def test_empty_list_and_unnumbered_name_are_reported(folder: Path) -> None:
     inner = folder / "synImgs"
     (inner / "a7.jpg").write_bytes((inner / "0000.jpg").read_bytes())
     _spoil("posLabel.txt", 1, POSITION.format(0).replace("0000", "a7").strip())(inner)

@@ -60,7 +60,7 @@ def test_bags_of_every_kind_give_the_same(
     assert "left out: 5 messages on /chatter: std_msgs/msg/String" in capsys.readouterr().err
 
 
-def test_when_a_bag_received_its_messages_is_kept(tmp_path: Path) -> None:
+def test_receive_time_becomes_publish_time(tmp_path: Path) -> None:
     found = samples(foreign.ros2_bag(tmp_path / "flight", late_ns=7_000_000))
     for topic in ("/cf1/height", "/cf1/range/cf2", "/cf1/camera/image"):
         assert [s.time_ns for s in found[topic]] == [10**12 + k * 10**8 for k in range(5)]
@@ -68,7 +68,7 @@ def test_when_a_bag_received_its_messages_is_kept(tmp_path: Path) -> None:
         assert received == [10**12 + k * 10**8 + 7_000_000 for k in range(5)]
 
 
-def test_stamps_of_zero_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_zero_stamps_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     late_ns = 48 * 86_400 * 10**9
     source = foreign.ros2_bag(tmp_path / "flight", late_ns=late_ns, ranges_stamped=False)
     found = samples(source)
@@ -91,7 +91,7 @@ def test_a_bag_without_anything_known_is_one_line(tmp_path: Path) -> None:
     assert "\n" not in str(e.value)
 
 
-def test_of_two_odometries_of_a_robot_the_longer_counts() -> None:
+def test_longer_of_two_odometry_topics_is_used() -> None:
     kind = "nav_msgs/msg/Odometry"
     lines, why = ros.plan_topics([("/cf1/odom", kind, 5), ("/vio/cf1/odom", kind, 50)], Options())
     assert [line.topic for line in lines.values()] == ["/vio/cf1/odom"]
@@ -126,7 +126,7 @@ def planned(
     return found, [topic for topic, _ in why]
 
 
-def test_topics_tell_whose_they_are() -> None:
+def test_topics_are_assigned_to_robots() -> None:
     found, unknown = planned(
         ("/cf1/uwb/cf2/range", RANGE, 5),
         ("/imu/data", IMU, 5),
@@ -157,7 +157,7 @@ def test_a_pose_of_motion_capture_is_kept_beside_another_of_the_robot() -> None:
     assert unknown == ["/vio/cf1/pose"]  # as long as the first, and after it
 
 
-def test_how_many_messages_there_will_be_is_told_before(tmp_path: Path) -> None:
+def test_expected_message_count_is_an_estimate_per_topic(tmp_path: Path) -> None:
     content = ros.load_content(bag("sqlite3", tmp_path), Options())
     with_odometry = 4  # of one message come attitude, velocity, height and pose
     assert content.total == len(list(content.samples)) - 5 * (with_odometry - 1)

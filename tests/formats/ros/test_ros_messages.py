@@ -112,7 +112,7 @@ def test_odometry_in_a_fixed_frame_is_turned_by_the_yaw(child: str) -> None:
 
 
 @pytest.mark.parametrize(("norm", "there"), [(0.91, True), (0.89, False), (1.11, False)])
-def test_a_quaternion_a_tenth_from_unit_length_tells_no_angles(norm: float, there: bool) -> None:
+def test_quaternion_far_from_unit_norm_gives_no_angles(norm: float, there: bool) -> None:
     found = _to_euler(xyzw(*(norm * value for value in vars(TURN).values())))
     assert (found is not None) == there
     assert found is None or found == pytest.approx(np.array(TILT))
@@ -261,7 +261,7 @@ def test_frames_that_do_not_turn_are_known_by_their_names(
     assert _is_fixed_frame(frame, parent) == fixed
 
 
-def test_an_imu_that_knows_no_attitude_says_nothing() -> None:
+def test_imu_without_orientation_gives_no_attitude() -> None:
     lost = SimpleNamespace(orientation=xyzw(0, 0, 0, 0), angular_velocity=xyzw(0.1, 0.2, 0.4))
     assert given("sensor_msgs/msg/Imu", lost) == []
     held = odometry("base", (1.0, 2.0, 3.0))
@@ -299,7 +299,7 @@ def test_a_video_and_a_cut_picture_are_left_out(data: bytes) -> None:
     assert counted.counts == {"images that cannot be decoded, of format 'h264'": 1}
 
 
-def test_a_picture_is_the_robot_s_own() -> None:
+def test_image_goes_to_the_robot_of_its_topic() -> None:
     (found,) = given("sensor_msgs/msg/Image", picture("rgb8", 3))
     assert (found.topic, found.time_ns) == ("/cf1/camera/image", 1_500_000_000)
     v, u, k = np.meshgrid(np.arange(4), np.arange(5), np.arange(3), indexing="ij")

@@ -90,7 +90,7 @@ def test_namespaces_are_no_robots(odom: str, camera: str, robot: str, tmp_path: 
     assert len(found[f"/{robot}/camera/image"]) == len(found[f"/{robot}/pose"]) == 5
 
 
-def test_a_guessed_robot_is_said_and_can_be_stated(
+def test_guessed_robot_name_is_reported_and_can_be_given(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = ros.write(tmp_path / "bag", odometry("/lab/alpha/odom") + odometry("/cf2/odom"))
@@ -243,7 +243,7 @@ def test_a_pose_beside_odometry_is_no_second_pose(tmp_path: Path) -> None:
         ("svc_event.mcap", {"height": 20}, "/add/_service_event"),
     ],
 )
-def test_the_bags_that_were_handed_over(
+def test_third_party_bags_are_converted(
     name: str,
     wanted: dict[str, int],
     line: str,

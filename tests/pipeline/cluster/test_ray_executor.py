@@ -88,7 +88,7 @@ def alone(flights: Path) -> dict[str, bytes]:
     return bytes_in(out)
 
 
-def test_the_bytes_are_those_of_this_machine_and_each_node_is_told_of(
+def test_ray_outputs_equal_local_outputs_and_nodes_are_listed(
     nodes: Nodes, flights: Path, alone: dict[str, bytes], tmp_path: Path, capfd: Any
 ) -> None:
     run_over_folder("trim", flights, tmp_path / "out", KEPT, workers=None, on="ray")
@@ -187,9 +187,7 @@ def _kill_after(nodes: Nodes, out: Path, seed: int) -> None:
     nodes.die()
 
 
-def test_a_dataset_of_the_cluster_is_the_one_of_here(
-    nodes: Nodes, labelled: Path, tmp_path: Path
-) -> None:
+def test_ray_dataset_equals_local_dataset(nodes: Nodes, labelled: Path, tmp_path: Path) -> None:
     nodes.whole()
     given, how = sorted(labelled.glob("*.mcap")), dataset.Settings(keep_all=True)
     dataset.run(given, tmp_path / "here", how, workers=1)
@@ -199,7 +197,7 @@ def test_a_dataset_of_the_cluster_is_the_one_of_here(
     assert run_on_cluster("ray", "dataset", tmp_path / "there", {"recordings": given}, how) is None
 
 
-def test_the_table_of_nodes_counts_and_tells_of_one_that_is_lost(
+def test_node_table_counts_jobs_and_marks_lost_nodes(
     nodes: Nodes, flights: Path, tmp_path: Path, capfd: Any
 ) -> None:
     nodes.whole()
@@ -223,7 +221,7 @@ def test_the_table_of_nodes_counts_and_tells_of_one_that_is_lost(
     assert len(told) == 2 and sum(line.endswith(", lost") for line in told) == 1
 
 
-def test_what_fails_on_one_node_is_tried_on_the_other(nodes: Nodes, tmp_path: Path) -> None:
+def test_job_that_fails_on_one_node_is_retried_elsewhere(nodes: Nodes, tmp_path: Path) -> None:
     """A full disk is one node's: the answer says that another may do it."""
     nodes.whole()
     with open_executor("ray", None) as crew:
@@ -248,7 +246,9 @@ def test_what_fails_on_one_node_is_tried_on_the_other(nodes: Nodes, tmp_path: Pa
     assert len(seen) == 2 and seen[0] != seen[1]
 
 
-def test_one_that_fails_stops_no_other(nodes: Nodes, flights: Path, tmp_path: Path) -> None:
+def test_failing_recording_does_not_stop_the_others(
+    nodes: Nodes, flights: Path, tmp_path: Path
+) -> None:
     few = tmp_path / "few"
     shutil.copytree(flights / "0", few)
     (few / "torn.mcap").write_bytes(b"no recording")
@@ -290,7 +290,7 @@ def test_ctrl_c_ends_the_tasks(nodes: Nodes, flights: Path, tmp_path: Path) -> N
     assert not [name for name in made if name.endswith(".partial")]
 
 
-def test_what_on_does_not_take_is_one_line() -> None:
+def test_invalid_executor_gives_one_line_error() -> None:
     for on in ("spark", "ray://", "raytrace://host:1"):
         with pytest.raises(SettingError, match="this takes ray"):
             open_executor(on, None)

@@ -32,7 +32,7 @@ def run(script: Path, element: int) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.heavy
-def test_every_element_does_its_part_and_the_bytes_are_those_of_here(
+def test_slurm_array_outputs_equal_local_outputs(
     flights: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -86,7 +86,7 @@ def test_names_that_a_shell_would_run_are_names(
     assert not list(tmp_path.rglob("victim"))
 
 
-def test_one_output_is_no_array(tmp_path: Path) -> None:
+def test_single_output_is_refused_as_slurm_array(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="--on slurm is for a folder"):
         run_on_cluster("slurm", "fly", tmp_path / "a.mcap", {}, None)
 

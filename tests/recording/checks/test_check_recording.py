@@ -62,7 +62,7 @@ def test_a_sound_recording_has_no_findings(tmp_path: Path) -> None:
     assert record(tmp_path / "a.mcap", labelled) == []
 
 
-def test_a_label_bias_is_found_and_said_in_one_line(tmp_path: Path) -> None:
+def test_label_bias_is_reported_in_one_line(tmp_path: Path) -> None:
     (finding,) = record(tmp_path / "a.mcap", lambda write: labelled(write, shift_v_px=10.0))
     assert finding.startswith("warning /cf1/labels labels of source 'published' are biased:")
     assert "+10." in finding or "+9." in finding
@@ -218,7 +218,7 @@ def off_by(write: Write, off_px: list[tuple[float, float]]) -> None:
         write(k * 10**9, "/cf1/labels", message_class("PeerLabels")(peers=[peer]))
 
 
-def test_a_bias_is_told_by_its_standard_error(tmp_path: Path) -> None:
+def test_bias_is_judged_by_its_standard_error(tmp_path: Path) -> None:
     def spread(middle_px: float, by_px: float) -> list[float]:
         return [middle_px + by_px * (-1) ** k for k in range(40)] + [middle_px]
 
@@ -235,7 +235,7 @@ def test_a_bias_is_told_by_its_standard_error(tmp_path: Path) -> None:
     assert len(record(tmp_path / "e.mcap", lambda w: off_by(w, [(9.0, 9.0)] * 20))) == 1
 
 
-def test_what_was_just_written_is_looked_at_without_its_images(
+def test_check_after_writing_skips_images(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.mcap"
@@ -254,7 +254,7 @@ def test_what_was_just_written_is_looked_at_without_its_images(
 
 
 @pytest.mark.parametrize("topic", ["height", "camera/calibration", "labels", "camera/image"])
-def test_what_cannot_be_judged_in_what_was_just_written_is_no_error(
+def test_check_after_writing_never_fails(
     topic: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The work is done, and stands."""
@@ -272,7 +272,7 @@ def test_what_cannot_be_judged_in_what_was_just_written_is_no_error(
     assert f"/cf2/{topic}" in capsys.readouterr().err
 
 
-def test_boxes_that_the_border_cuts_say_nothing_of_a_bias(tmp_path: Path) -> None:
+def test_boxes_cut_by_the_image_edge_are_ignored_for_bias(tmp_path: Path) -> None:
     def fill(write: Write, left_px: float, right_px: float) -> None:
         write(0, "/cf1/camera/calibration", calibrated())
         for k in range(40):
@@ -300,7 +300,7 @@ def test_topics_that_are_not_dmrl_s_are_left_alone(tmp_path: Path) -> None:
     assert record(tmp_path / "a.mcap", fill) == []
 
 
-def test_a_stamp_of_zero_counts_only_where_one_is_given_and_the_time_is_another(
+def test_zero_stamp_counts_only_if_present_and_different_from_log_time(
     tmp_path: Path,
 ) -> None:
     def fill(write: Write) -> None:

@@ -45,14 +45,14 @@ def test_a_topic_apart_from_all_others_of_its_robot_is_named() -> None:
 
 
 @pytest.mark.parametrize("topic", ["/cf1/camera/calibration", "/tf", "height", "/cf1/velocity"])
-def test_what_has_no_clock_of_a_robot_is_not_compared(topic: str) -> None:
+def test_topics_without_a_robot_clock_are_not_compared(topic: str) -> None:
     """Calibrations, transforms, topics of strangers; and one message, which tells nothing."""
     moments = [90.0] if topic == "/cf1/velocity" else [90, 95]
     assert said({"/cf1/height": [1, 5], topic: moments}) == []
     assert said({"/cf1/height": [1, 5], topic: []}) == []
 
 
-def test_times_of_0_are_said_where_others_count_from_1970() -> None:
+def test_zero_times_are_reported_beside_unix_times() -> None:
     late = UNIX_TIME_MIN_NS / S
     for last, count in ((late, 1), (late - 1, 0)):
         found = said({"/cf1/height": [0, last - 5, last], "/cf1/velocity": [last - 5, last]})

@@ -63,7 +63,7 @@ def recorded(path: Path, said: Columns, poses: Columns, late_s: float = 0.0) -> 
     return [f"{finding.topic}: {finding.text}" for finding in check(path)]
 
 
-def test_what_fits_is_not_doubted(tmp_path: Path) -> None:
+def test_consistent_odometry_gives_no_finding(tmp_path: Path) -> None:
     assert recorded(tmp_path / "a.mcap", *flown()) == []
 
 
@@ -72,13 +72,13 @@ def test_a_clock_that_is_a_little_off_is_no_wrong_sign(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["roll_rad", "pitch_rad", "yaw_rate_radps"])
-def test_another_sign(tmp_path: Path, name: str) -> None:
+def test_opposite_sign_is_found(tmp_path: Path, name: str) -> None:
     measured, poses = flown()
     found = recorded(tmp_path / "a.mcap", measured | {name: -measured[name]}, poses)
     assert len(found) == 1 and f"/cf1/attitude: {name} has the opposite sign" in found[0]
 
 
-def test_velocities_of_another_frame(tmp_path: Path) -> None:
+def test_velocity_in_another_frame_is_found(tmp_path: Path) -> None:
     measured, poses = flown()
     vx, vy = measured["vx_mps"], measured["vy_mps"]
     wrong = {
@@ -132,7 +132,7 @@ def test_motion_is_not_known_where_poses_are_rare_or_no_turns() -> None:
     assert _derive_motion(time_s[:100], poses(time_s[:100])) != {}
 
 
-def test_alike_is_one_for_the_same_shape_and_rms_is_of_whole_vectors() -> None:
+def test_correlation_and_rms_equal_hand_computed_values() -> None:
     one, other = np.array([1.0, 2.0]), np.array([2.0, -1.0])
     assert _correlate(one, 3 * one) == pytest.approx(1)
     assert _correlate(one, -one) == pytest.approx(-1)
@@ -157,7 +157,7 @@ def moving(speed_mps: float, rate: float = 0.0) -> tuple[NDArray[np.float64], di
 
 
 @pytest.mark.parametrize(("speed_mps", "count"), [(0.09, 0), (0.11, 1)])
-def test_who_hardly_moves_is_not_doubted(speed_mps: float, count: int) -> None:
+def test_slow_robot_gives_no_finding(speed_mps: float, count: int) -> None:
     time_s, motion = moving(speed_mps)
     said = -motion["velocity"][1]  # type: ignore[index]
     assert len(list(_check_velocity((time_s, said), motion))) == count  # type: ignore[arg-type]
@@ -221,7 +221,7 @@ def test_only_the_first_of_many_are_kept_and_only_of_what_moves(
     assert rows[:, 0].tolist() == rows[:, 1].tolist() == [0, 1, 2, 3, 4, 0, 1]
 
 
-def test_true_poses_come_before_the_robot_s_own() -> None:
+def test_true_poses_precede_estimated_poses() -> None:
     moved, times = MotionSamples(), np.arange(400) * 20_000_000
     ahead = 2e-9 * times
 

@@ -30,7 +30,7 @@ def test_thousandths_are_doubted_and_the_unit_is_not(topic: str, name: str, usua
     assert where == topic and text.startswith(f"{name}: ")
 
 
-def test_a_tenth_is_borne_and_more_is_not() -> None:
+def test_unit_finding_needs_more_than_a_tenth_of_the_values() -> None:
     values = np.full(100, 0.5)
     values[:10] = 500.0
     assert _doubted("/cf1/height", "height_m", values) == []
@@ -39,7 +39,7 @@ def test_a_tenth_is_borne_and_more_is_not() -> None:
     assert text == "height_m: 11% of the values are over 30 m. Are they mm or cm?"
 
 
-def test_nothing_zero_or_infinite_counts_and_few_values_tell_nothing() -> None:
+def test_unit_check_ignores_zeros_non_finite_values_and_short_series() -> None:
     odd = np.array([np.nan, np.inf, -np.inf, 0.0] * 30)
     ((_, text),) = _doubted("/cf1/height", "height_m", odd)
     assert text == "height_m: 90 values are not finite"
@@ -47,7 +47,7 @@ def test_nothing_zero_or_infinite_counts_and_few_values_tell_nothing() -> None:
     assert _doubted("/own/topic", "height_m", np.full(99, 500.0)) == []
 
 
-def test_periods_of_sensors() -> None:
+def test_sensor_periods_out_of_range_are_found() -> None:
     times = np.arange(100) * 10_000_000
     assert list(check_periods({"/cf1/height": times})) == []
     ((_, rare),) = check_periods({"/cf1/height": times * 1000})
@@ -62,13 +62,13 @@ def test_periods_of_sensors() -> None:
 @pytest.mark.parametrize(
     ("period_ns", "said"), [(4_900_000_000, 0), (5_100_000_000, 1), (9_000, 1), (11_000, 0), (0, 0)]
 )
-def test_periods_beyond_a_sensor_s(period_ns: int, said: int) -> None:
+def test_sensor_period_limits_are_exact(period_ns: int, said: int) -> None:
     times = np.arange(20) * period_ns
     assert len(list(check_periods({"/cf1/height": times}))) == said
     assert list(check_periods({"/cf1/height": times[:19]})) == []
 
 
-def test_sizes_are_told_apart_to_a_fifth_of_their_limit() -> None:
+def test_magnitudes_are_binned_to_a_fifth_of_the_limit() -> None:
     assert _doubted("/cf1/height", "height_m", np.full(20, 30.0)) == []
     assert len(_doubted("/cf1/height", "height_m", np.full(20, 36.0))) == 1
     for tiny, huge in ((1e-80, 1e80), (-1e-300, -1e300)):

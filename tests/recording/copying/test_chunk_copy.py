@@ -46,7 +46,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.heavy
-def test_a_copy_is_made_of_the_same_chunks_and_goes_over_once(
+def test_rewrite_copies_whole_chunks_in_one_pass(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[int] = []
@@ -65,7 +65,7 @@ def test_a_copy_is_made_of_the_same_chunks_and_goes_over_once(
 
 
 @pytest.mark.heavy
-def test_what_is_left_out_leaves_the_rest_bit_for_bit(flight: Path, tmp_path: Path) -> None:
+def test_omitting_a_topic_keeps_the_rest_bit_for_bit(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     rewrite(flight, out, MADE, without=["/cf2/attitude"], fresh=())
     kept = [topic for topic in read_summary(flight).topics if topic != "/cf2/attitude"]
@@ -73,7 +73,7 @@ def test_what_is_left_out_leaves_the_rest_bit_for_bit(flight: Path, tmp_path: Pa
     unchanged(flight, out, kept)
 
 
-def test_a_stretch_is_trimmed_out_of_its_chunks(flight: Path, tmp_path: Path) -> None:
+def test_trim_copies_whole_chunks_within_the_span(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     assert trim(flight, out, start_ns=1000, end_ns=3000) == 2000 * 4 + 200
     ours = [r for r in read_raw(flight) if 1000 <= r.time_ns < 3000]
@@ -96,7 +96,7 @@ def test_a_stretch_that_begins_with_a_chunk_defines_what_it_holds(
 
 
 @pytest.mark.heavy
-def test_parts_are_merged_to_what_they_were(flight: Path, tmp_path: Path) -> None:
+def test_merging_trimmed_parts_restores_the_recording(flight: Path, tmp_path: Path) -> None:
     parts = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     trim(flight, parts[0], topics=["/cf1/*", "/cf1/camera/*"])
     trim(flight, parts[1], topics=["/cf2/*"])
@@ -173,7 +173,7 @@ def test_recovering_keeps_whole_chunks_as_they_are(flight: Path, tmp_path: Path)
     assert len(set(packed(flight)) & set(packed(out))) >= len(chunks(flight)) - 3
 
 
-def test_what_is_copied_is_checked(flight: Path, tmp_path: Path) -> None:
+def test_damaged_chunk_is_detected_while_copying(flight: Path, tmp_path: Path) -> None:
     damaged = tmp_path / "a.mcap"
     for chunk in chunks(flight)[2], chunks(flight)[-1]:
         data = bytearray(flight.read_bytes())

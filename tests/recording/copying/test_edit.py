@@ -41,7 +41,7 @@ def test_merging_interleaves_by_time_and_keeps_every_bit(tmp_path: Path, flight:
     }
 
 
-def test_a_merge_tells_its_whole_ancestry(tmp_path: Path, flight: Path) -> None:
+def test_merged_recording_has_the_provenance_of_all_inputs(tmp_path: Path, flight: Path) -> None:
     trim(flight, tmp_path / "b.mcap", topics=["/cf1/attitude"])
     merge([flight, tmp_path / "b.mcap"], tmp_path / "out.mcap")
     made = read_summary(tmp_path / "out.mcap").provenance
@@ -75,7 +75,7 @@ def test_seconds_of_a_stretch_count_from_where_it_begins(tmp_path: Path, flight:
     assert {r.time_ns // 10**9 for r in heights} == {30, 31, 32}
 
 
-def test_of_many_calibrations_the_one_of_then_goes_along(tmp_path: Path) -> None:
+def test_trim_keeps_the_calibration_valid_at_its_start(tmp_path: Path) -> None:
     every, out = tmp_path / "every.mcap", tmp_path / "out.mcap"
     with RecordingWriter(every, Provenance("test")) as sink:
         for k in range(1, 10):  # as ROS has them, again and again; others come late
@@ -190,7 +190,7 @@ def test_a_time_that_is_none_trims_nothing(tmp_path: Path, flight: Path, seconds
         stage.run(flight, tmp_path / "b.mcap", stage.Settings(to_s=seconds))
 
 
-def test_a_merge_of_two_flights_by_the_same_robots_is_said(
+def test_merging_flights_of_the_same_robots_warns(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     one = heights(tmp_path / "a.mcap", [0, 10], "train")
@@ -202,7 +202,7 @@ def test_a_merge_of_two_flights_by_the_same_robots_is_said(
     assert "both have /cf1/height, one after the other" in capsys.readouterr().err
 
 
-def test_parts_of_one_recording_are_merged_again_without_a_word(
+def test_merging_parts_of_one_recording_does_not_warn(
     tmp_path: Path, flight: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     middle = read_summary(flight).start_ns + 5

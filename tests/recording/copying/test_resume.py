@@ -72,12 +72,12 @@ def test_other_settings_are_refused(stopped: Path) -> None:
         before.check_provenance(Provenance("test", settings={"range_m": (1.0, 3.0)}))
 
 
-def test_what_is_left_is_not_silently_overwritten(stopped: Path) -> None:
+def test_partial_recording_is_not_overwritten(stopped: Path) -> None:
     with pytest.raises(OutputError, match=r"Go on with --resume, or remove it"):
         recover_interrupted(stopped, resume=False)
 
 
-def test_nothing_to_resume_is_said(tmp_path: Path) -> None:
+def test_missing_partial_recording_is_reported(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"to resume\. Run without --resume"):
         recover_interrupted(tmp_path / "none.mcap", resume=True)
 
@@ -90,7 +90,7 @@ def write_pictures(sink: RecordingWriter, first: int, last: int) -> None:
         sink.write(k, "/cf1/camera/image", picture)
 
 
-def test_pictures_without_what_was_said_of_them_are_not_whole(tmp_path: Path) -> None:
+def test_resume_drops_images_without_their_labels(tmp_path: Path) -> None:
     whole, out = tmp_path / "whole.mcap", tmp_path / "out.mcap"
     with RecordingWriter(whole, MADE) as sink:
         write_pictures(sink, 0, 600)

@@ -51,7 +51,7 @@ def test_messages_among_other_records_are_found_at_any_byte() -> None:
     assert len(build_batch_at(bytes_of(b"abc"), np.zeros(0, np.int64))) == 0
 
 
-def test_loose_messages_are_a_block() -> None:
+def test_messages_outside_chunks_become_a_batch() -> None:
     found = batch_from_messages([Message(n, t, d, p, 0) for n, t, p, d in ROWS])
     assert list(found.iter_rows()) == ROWS
 
@@ -103,9 +103,7 @@ PACKED = {
 
 
 @pytest.mark.parametrize("how", PACKED)
-def test_a_chunk_is_unpacked_and_held_against_what_it_says(
-    how: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunk_size_and_crc_are_verified(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     packed = PACKED[how]
     assert decompress(chunk(DATA, packed, how), 9).tobytes() == DATA
     assert decompress(chunk(DATA, packed, how, crc=0), 9).tobytes() == DATA  # says none
@@ -123,6 +121,6 @@ def test_a_chunk_is_unpacked_and_held_against_what_it_says(
         decompress(chunk(DATA, packed, how), 9)
 
 
-def test_a_compression_that_nobody_knows_is_named() -> None:
+def test_unknown_compression_is_reported() -> None:
     with pytest.raises(McapError, match="unknown compression 'rar'"):
         decompress(chunk(DATA, DATA, "rar"), 0)

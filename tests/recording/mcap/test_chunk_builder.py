@@ -38,7 +38,7 @@ def records_of(rows: list[Row]) -> tuple[np.ndarray, np.ndarray]:
 
 
 @given(st.integers(0, 12), st.integers(0, 12), st.integers(0, 40))
-def test_many_at_once_are_the_same_as_one_by_one(alone: int, skipped: int, defined: int) -> None:
+def test_batch_fill_equals_single_messages(alone: int, skipped: int, defined: int) -> None:
     records, at = records_of(ROWS)
     one, many = ChunkBuilder(), ChunkBuilder()
     for chunk in (one, many):
@@ -72,7 +72,7 @@ def test_a_chunk_takes_what_fits_and_is_full_beyond(monkeypatch: pytest.MonkeyPa
     assert chunk.full
 
 
-def test_a_packed_chunk_says_where_its_messages_are_and_is_empty_then() -> None:
+def test_compressed_chunk_has_a_message_index_and_resets_the_builder() -> None:
     chunk = ChunkBuilder()
     chunk.add_definition(b"\x03" + (2).to_bytes(8, "little") + b"ab")
     for row in ROWS:
@@ -171,7 +171,7 @@ def test_channels_are_numbered_once_and_defined_once() -> None:
     assert summarised(defined) == ([1], [1, 2, 3])
 
 
-def test_a_chunk_stands_as_it_is_where_its_words_are_those_that_are_known() -> None:
+def test_chunk_is_copied_if_definitions_match() -> None:
     """Channels 4 and 6 of schema 9, defined in the chunk in front of their messages."""
     mine = {n: channel(topic) for n, topic in ((4, "/a"), (6, "/b"))}
     records = {n: McapChannel(n, c.topic, "protobuf", {}, 9) for n, c in mine.items()}
@@ -214,7 +214,7 @@ def test_a_chunk_stands_as_it_is_where_its_words_are_those_that_are_known() -> N
     assert not stands_in(defined, chunk(schema, records[6], 6))  # has another number here
 
 
-def test_copies_keep_their_numbers_where_these_are_free() -> None:
+def test_copied_channels_keep_their_ids_if_free() -> None:
     defined = ChannelRegistry()
     defined.get_channel_id(channel("/a"))
     kept, taken, other = channel("/c", "b"), channel("/d", "c"), channel("/f", "d")
@@ -236,7 +236,7 @@ def test_copies_keep_their_numbers_where_these_are_free() -> None:
     assert len({1, *ids}) == 4  # the schema of another with that number has one of its own
 
 
-def test_numbers_that_run_out_are_filled_up() -> None:
+def test_free_ids_are_reused_when_exhausted() -> None:
     assert [_find_free_id(taken) for taken in ({}, {1: 0}, {7: 0}, {65_534: 0})] == [
         1,
         2,
@@ -246,7 +246,7 @@ def test_numbers_that_run_out_are_filled_up() -> None:
     assert _find_free_id({65_535: 0, 1: 0, 3: 0}) == 2
 
 
-def test_a_message_of_no_number_is_none() -> None:
+def test_raw_message_has_its_topic_without_channel_id() -> None:
     assert RawMessage(1, 2, channel("/a"), b"x").topic == "/a"
 
 

@@ -18,7 +18,7 @@ def write(path: Path, height_m: float) -> Path:
     return path
 
 
-def test_what_was_hashed_is_read_as_it_was_until_an_output_is_done(tmp_path: Path) -> None:
+def test_hashed_input_must_stay_unchanged_until_an_output_is_done(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", 1.0)
     expect_unchanged(path)
     assert read_summary(path).count == 1

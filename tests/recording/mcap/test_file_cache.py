@@ -47,7 +47,7 @@ def test_a_file_of_this_second_is_always_read_again(tmp_path: Path) -> None:
     assert read_summary(path) is not read_summary(path)
 
 
-def test_what_is_remembered_is_of_the_same_file_and_of_few(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_is_keyed_by_file_identity_and_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(file_cache, "_CACHE", {})
     monkeypatch.setattr(file_cache, "CACHE_ENTRIES_MAX", 2)
     now, made = time.time_ns(), list[str]()

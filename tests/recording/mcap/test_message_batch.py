@@ -35,7 +35,7 @@ def block_of(rows: list[Row], gap: int = 3) -> MessageBatch:
 
 
 @given(ROWS, ROWS)
-def test_messages_stay_whole(one: list[Row], other: list[Row]) -> None:
+def test_batch_operations_keep_messages_intact(one: list[Row], other: list[Row]) -> None:
     first, second = block_of(one), block_of(other, 1)
     assert list(first.iter_rows()) == one
     assert list(first.compact().iter_rows()) == one
@@ -56,7 +56,7 @@ def test_messages_stay_whole(one: list[Row], other: list[Row]) -> None:
     )
 
 
-def test_joined_blocks_hold_little_but_their_own() -> None:
+def test_concatenated_batch_copies_only_its_messages() -> None:
     large = block_of([(1, k, k, bytes([k]) * 10) for k in range(100)], 0)
     few = concatenate_all([large.take(np.array([k])) for k in (3, 50)])
     assert [payload for *_, payload in few.iter_rows()] == [b"\x03" * 10, b"2" * 10]

@@ -31,7 +31,7 @@ CHANNELS: Any = {1: SimpleNamespace(topic="/a"), 2: SimpleNamespace(topic="/b")}
         ({}, {1: 3}, ""),
     ],
 )
-def test_a_recording_has_the_messages_that_its_statistics_say(
+def test_message_count_must_match_statistics(
     said: dict[int, int] | None, found: dict[int, int], fault: str
 ) -> None:
     if not fault:

@@ -104,7 +104,7 @@ def rows(messages: list[Any]) -> list[dict[str, Any]]:
 @pytest.mark.heavy
 @settings(max_examples=12)
 @given(st.lists(contents(), min_size=1, max_size=5))
-def test_bulk_decoding_equals_protobufs_own(values: list[dict[str, Any]]) -> None:
+def test_bulk_decoding_equals_google_protobuf(values: list[dict[str, Any]]) -> None:
     messages = [OUTER(**v) for v in values]
     assert rows(messages) == [plain(m) for m in messages]
 
@@ -139,7 +139,7 @@ def test_a_field_of_another_wire_type_is_named() -> None:
         decode(data, np.array([0]), np.array([2]), message_class("Height").DESCRIPTOR)
 
 
-def test_of_a_scalar_that_stands_twice_the_last_counts() -> None:
+def test_last_of_repeated_scalars_is_used() -> None:
     height = message_class("Height")
     data = height(height_m=1.0).SerializeToString() + height(height_m=2.5).SerializeToString()
     array = np.frombuffer(data + data, np.uint8)

@@ -165,7 +165,7 @@ def test_a_topic_whose_type_grows_has_the_columns_of_all(
     assert dmrl.open(tmp_path / "a.mcap")["/x"].to_arrow(fields=["n"])["n"].null_count == 4
 
 
-def test_a_message_of_another_with_the_name_of_ours_is_its_own(tmp_path: Path) -> None:
+def test_third_party_type_with_our_name_keeps_its_own_fields(tmp_path: Path) -> None:
     short = proto("h.proto", "")
     message(short, "Height", height_m=F.TYPE_STRING)
     newer = proto("n.proto", "dmrl.v1")
@@ -200,7 +200,7 @@ def test_a_message_of_another_with_the_name_of_ours_is_its_own(tmp_path: Path) -
         found["/cf2/height"].to_arrow()
 
 
-def test_fields_named_as_a_time_are_columns_of_their_own(tmp_path: Path) -> None:
+def test_fields_named_like_time_columns_are_renamed(tmp_path: Path) -> None:
     file = FileDescriptorProto(name="m.proto", package="my", syntax="proto2")
     names = ("log_time", "log_time_", "publish_time", "time_s", "status")
     message(file, "M", **dict.fromkeys(names, F.TYPE_STRING))
@@ -222,7 +222,7 @@ def test_fields_named_as_a_time_are_columns_of_their_own(tmp_path: Path) -> None
     assert lines[1].startswith("1000000000000000000,1000000000000000000,log_time,log_time_,")
 
 
-def test_what_is_no_definition_is_one_true_line(tmp_path: Path) -> None:
+def test_invalid_definition_gives_one_line_error(tmp_path: Path) -> None:
     file = proto("m.proto")
     message(file, "M", x=F.TYPE_DOUBLE)
     sent: list[Sent] = [("/x", "my.Other", packed(file), [b""]), ("/y", "my.M", b"\xff", [b""])]
@@ -298,7 +298,7 @@ def test_a_type_wider_than_a_table_is_text(tmp_path: Path) -> None:
         ("field_named_log_time", 5, {"log_time_", "publish_time_", "time_s"}),
     ],
 )
-def test_the_files_that_were_handed_over(
+def test_third_party_protobuf_files_are_read(
     name: str, rows: int, columns: set[str], data: Path
 ) -> None:
     found = dmrl.open(data / "strangers" / f"pb-{name}" / f"{name}.mcap")

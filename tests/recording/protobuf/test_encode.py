@@ -55,7 +55,7 @@ def one(value: Any, k: int) -> Any:
         ),
     ],
 )
-def test_the_bytes_are_protobufs_own(kind: str, fields: dict[str, Any]) -> None:
+def test_encoded_bytes_equal_google_protobuf(kind: str, fields: dict[str, Any]) -> None:
     made = message_class(kind)
     data, at = encode(made.DESCRIPTOR, fields, COUNT)
     for k in range(COUNT):
