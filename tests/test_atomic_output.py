@@ -80,7 +80,7 @@ def test_a_partial_folder_of_a_killed_run_is_cleared(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "dangling link"])
-def test_what_is_there_is_never_overwritten(tmp_path: Path, kind: str) -> None:
+def test_existing_output_is_never_overwritten(tmp_path: Path, kind: str) -> None:
     out = tmp_path / "taken"
     make = {
         "file": lambda: out.write_text("mine"),
@@ -198,7 +198,7 @@ def test_a_second_writer_gets_one_line_and_the_first_its_output(
 
 
 @KINDS
-def test_of_many_writers_one_wins_and_its_output_is_whole(kind: str, tmp_path: Path) -> None:
+def test_one_of_many_writers_succeeds_with_complete_output(kind: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-c", WRITER, kind, str(out)]
     words = [str(k) * 4000 for k in range(6)]
@@ -220,7 +220,7 @@ def test_of_many_writers_one_wins_and_its_output_is_whole(kind: str, tmp_path: P
 
 
 @KINDS
-def test_what_a_killed_writer_leaves_is_in_nobody_s_way(kind: str, tmp_path: Path) -> None:
+def test_partial_file_of_a_killed_writer_blocks_no_other(kind: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with _writing(kind, out, "half") as first:
         assert first.stdout is not None
@@ -234,7 +234,7 @@ def test_what_a_killed_writer_leaves_is_in_nobody_s_way(kind: str, tmp_path: Pat
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_what_is_left_over_is_not_emptied_under_another_name(tmp_path: Path) -> None:
+def test_hard_linked_partial_file_is_not_truncated(tmp_path: Path) -> None:
     to_partial_path(tmp_path / "a").write_text("whole, killed between its two names")
     (tmp_path / "b").hardlink_to(to_partial_path(tmp_path / "a"))
     with atomic_file(tmp_path / "a") as partial:
@@ -254,7 +254,7 @@ def test_a_link_in_place_of_the_partial_file_is_not_followed(
     assert victim.read_text() == "precious"
 
 
-def test_what_comes_between_is_not_replaced_and_the_work_is_kept(tmp_path: Path) -> None:
+def test_file_created_meanwhile_is_not_replaced_and_work_is_kept(tmp_path: Path) -> None:
     for writer in (atomic_file, atomic_folder):
         out = tmp_path / writer.__name__
         with pytest.raises(OutputError, match="created by another program"), writer(out) as partial:
@@ -336,14 +336,14 @@ def test_a_folder_that_cannot_be_opened_is_not_left_behind(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_name_too_long_is_said_before_any_work(tmp_path: Path) -> None:
+def test_overlong_name_is_refused_before_any_work(tmp_path: Path) -> None:
     for length in (248, 256, 5000):
         with pytest.raises(OutputError, match="Give one of 247 bytes"):
             refuse_existing(tmp_path / ("a" * length))
     refuse_existing(tmp_path / ("a" * 247))
 
 
-def test_a_folder_removed_while_it_is_written_is_said(tmp_path: Path) -> None:
+def test_folder_removed_during_writing_is_reported(tmp_path: Path) -> None:
     gone = pytest.raises(OutputError, match="was removed while it was written")
     with gone, atomic_folder(tmp_path / "set") as partial:
         partial.rmdir()

@@ -60,7 +60,7 @@ def test_a_bug_keeps_its_traceback_where_someone_looks_for_it(
         (OutputError("a\x1b[31m\nb exists"), r"a\x1b[31m b exists"),
     ],
 )
-def test_what_the_system_refuses_is_one_line(
+def test_os_error_gives_one_line_error(
     error: Exception,
     words: str,
     monkeypatch: pytest.MonkeyPatch,
@@ -82,9 +82,7 @@ def test_a_link_to_itself_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixt
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_says_that_nothing_has_its_final_name(
-    number: signal.Signals, tmp_path: Path
-) -> None:
+def test_signal_reports_that_no_output_is_complete(number: signal.Signals, tmp_path: Path) -> None:
     command = [*DMRL, "sketch", str(tmp_path / "out"), "--images", "99999"]
     with subprocess.Popen(
         command,
@@ -107,7 +105,7 @@ def test_a_signal_says_that_nothing_has_its_final_name(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_whole_when_a_signal_comes_is_said(tmp_path: Path) -> None:
+def test_signal_reports_complete_outputs(tmp_path: Path) -> None:
     code = (
         "import os, sys, signal; from pathlib import Path\n"
         "from dmrl import boundary; from dmrl.atomic_output import atomic_file\n"
@@ -130,7 +128,7 @@ def test_what_is_whole_when_a_signal_comes_is_said(tmp_path: Path) -> None:
     ("where", "words"),
     [(">&-", "Bad file descriptor"), (">/dev/full", "No space left on device")],
 )
-def test_an_output_that_takes_nothing_is_one_line(where: str, words: str) -> None:
+def test_unwritable_stdout_gives_one_line_error(where: str, words: str) -> None:
     shell = f'"$@" {where}'
     command = ["sh", "-c", shell, "sh", *DMRL, "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -153,7 +151,7 @@ def test_no_file_is_opened_as_a_closed_standard_stream(tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_nothing_of_the_process_is_needed(tmp_path: Path) -> None:
+def test_command_runs_without_home_temp_folder_or_locale(tmp_path: Path) -> None:
     """No home, no temporary folder, no language."""
     out = tmp_path / "out"
     environment = {"PATH": os.environ["PATH"], "TMPDIR": "/nonexistent"}
@@ -164,7 +162,7 @@ def test_nothing_of_the_process_is_needed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_working_folder_that_was_removed_is_said_before_a_library_aborts(
+def test_removed_working_folder_is_reported_before_libraries_abort(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (gone := tmp_path / "gone").mkdir()

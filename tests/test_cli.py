@@ -70,7 +70,7 @@ def test_help_lists_every_command_in_the_order_of_the_work(
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_no_line_of_a_help_page_breaks_where_the_next_word_would_fit(name: str) -> None:
+def test_help_lines_are_filled_before_wrapping(name: str) -> None:
     page = io.StringIO()
     cli.print_help(name, Console(file=page, width=88))
     rows = [line[2:-2] for line in page.getvalue().splitlines() if line.startswith("│ ")]
@@ -197,7 +197,7 @@ def test_without_the_extras_a_command_names_the_extra(
     assert done.stderr.count("\n") == 1, done.stderr
 
 
-def test_a_command_that_does_not_exist_is_a_bad_command_line_with_or_without_extras() -> None:
+def test_unknown_command_suggests_the_nearest_with_or_without_extras() -> None:
     hide = f"import sys\nsys.modules.update(dict.fromkeys({OPTIONAL}))\n"
     code = "sys.argv = ['dmrl', 'trian']\nfrom dmrl.cli import main\nmain()"
     for script in (f"import sys\n{code}", hide + code):
@@ -213,7 +213,7 @@ def test_a_command_that_does_not_exist_is_a_bad_command_line_with_or_without_ext
     "arguments",
     [["info"], ["info", "a.mcap", "--colour"], ["fly", "fly_in_view", "a.mcap", "--seed", "1.5"]],
 )
-def test_a_bad_command_line_is_told_on_stderr_with_status_2(arguments: list[str]) -> None:
+def test_usage_error_is_on_stderr_with_status_2(arguments: list[str]) -> None:
     done = dmrl(*arguments)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("dmrl: ")
@@ -229,7 +229,7 @@ def test_a_known_error_is_one_line_on_stderr_with_status_1(tmp_path: Path) -> No
 
 
 @pytest.mark.heavy
-def test_a_flag_that_wants_a_robot_says_so(tmp_path: Path) -> None:
+def test_flag_without_robot_name_shows_the_right_form(tmp_path: Path) -> None:
     done = dmrl("label", str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap"), "--camera", "my.toml")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (

@@ -115,7 +115,7 @@ def test_the_index_names_every_page() -> None:
     assert sorted(p.name for p in set(ROOT.glob("docs/*.md")) - named) == []
 
 
-def test_the_page_on_the_architecture_has_the_layers_and_homes_that_are_checked() -> None:
+def test_architecture_page_lists_the_checked_layers_and_packages() -> None:
     page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d+) \| `(\w+)` \| .* \|(.*)\|$", page, re.MULTILINE)
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
@@ -185,7 +185,7 @@ def walk(page: Path, until: str | None = None, stop: re.Pattern[str] = STOP) -> 
         ("own_camera.md", "## 4.", "focal_px"),
     ],
 )
-def test_a_page_can_be_walked_word_for_word(
+def test_commands_of_a_page_run_as_written(
     name: str,
     until: str | None,
     said: str,
@@ -201,7 +201,7 @@ def test_a_page_can_be_walked_word_for_word(
 
 
 @pytest.mark.slow
-def test_renders_of_ones_own_camera_can_be_refined_word_for_word(
+def test_own_camera_refinement_commands_run_as_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -212,7 +212,7 @@ def test_renders_of_ones_own_camera_can_be_refined_word_for_word(
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_the_readme_can_be_walked_word_for_word(
+def test_readme_commands_run_as_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -222,7 +222,7 @@ def test_the_readme_can_be_walked_word_for_word(
 
 
 @pytest.mark.slow
-def test_how_a_camera_is_mounted_is_found_word_for_word(
+def test_mount_calibration_commands_run_as_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -236,7 +236,7 @@ def test_how_a_camera_is_mounted_is_found_word_for_word(
     assert "median_after_px" in capsys.readouterr().out
 
 
-def test_the_page_on_errors_has_words_of_the_errors() -> None:
+def test_faq_quotes_existing_error_messages() -> None:
     page = (ROOT / "docs/faq.md").read_text(encoding="utf-8")
     quoted = [h for h in re.findall(r"^## (.*)", page, re.MULTILINE) if h[0].islower()]
     sources = "".join(p.read_text(encoding="utf-8") for p in ROOT.glob("dmrl/**/*.py"))
@@ -267,7 +267,7 @@ def test_make_demo_installs_what_the_first_evening_types() -> None:
     assert {"label", "view"} <= needed <= set(installed.split(","))
 
 
-def test_help_and_page_agree_with_the_gate_on_how_many_positions_are_bad() -> None:
+def test_documented_bad_share_equals_the_default() -> None:
     page = (ROOT / "docs/labelling.md").read_text(encoding="utf-8")
     share = f"{BAD_SHARE:.0%}".replace("%", " %")
     assert f"at most {share} are expected to be bad" in re.sub(r"\s+", " ", page)

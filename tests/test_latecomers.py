@@ -12,7 +12,7 @@ from dmrl.errors import OutputError
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
 @pytest.mark.parametrize("keep", [True, False])
-def test_who_comes_just_after_another_leaves_nothing(
+def test_late_writer_leaves_no_partial_file(
     kind: str, keep: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Six times `dmrl train` or `render` into one name left a NAME.partial beside it."""
@@ -30,9 +30,7 @@ def test_who_comes_just_after_another_leaves_nothing(
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_work_that_can_be_resumed_is_not_taken_away_by_who_comes_late(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_late_writer_keeps_resumable_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, take = tmp_path / "out", atomic_output.take_folder
     to_partial_path(out).mkdir()
     (to_partial_path(out) / "epochs").write_text("a night")

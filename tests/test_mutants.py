@@ -31,7 +31,7 @@ def found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Mutant]:
     return mutants_of(path)
 
 
-def test_every_kind_of_change_is_made_once_per_place(found: list[Mutant]) -> None:
+def test_every_mutation_is_applied_once_per_place(found: list[Mutant]) -> None:
     assert sorted((m.line, m.kind, m.before, m.after) for m in found) == [
         (4, "swap", "(wide, high)", "(high, wide)"),
         (6, "constant", "0.5", "1.0"),
@@ -51,7 +51,7 @@ def test_every_kind_of_change_is_made_once_per_place(found: list[Mutant]) -> Non
     ]
 
 
-def test_tests_near_a_change_are_the_module_s_own_then_those_that_name_it_or_all() -> None:
+def test_tests_of_a_mutant_are_its_module_s_then_those_naming_it() -> None:
     def of(path: str) -> list[str]:
         return near(Mutant(path, 1, "term", 0, 0, "", ""))
 
@@ -88,7 +88,7 @@ tests = ["tests/other/test_c.py", "tests/test_d.py"]
 """
 
 
-def test_changes_made_by_hand_are_found_and_those_that_are_gone_said(
+def test_named_mutants_are_found_and_missing_ones_reported(
     found: list[Mutant], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     assert found
@@ -110,7 +110,7 @@ def test_the_list_of_changes_can_be_read() -> None:
         assert all((mutations.REPOSITORY / test).exists() for test in tests)
 
 
-def test_every_change_made_by_hand_still_has_its_place() -> None:
+def test_every_named_mutant_applies() -> None:
     """Code that was rewritten takes its protection's proof along, and nobody would see."""
     found, gone = named()
     assert not gone

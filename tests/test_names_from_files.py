@@ -244,7 +244,7 @@ def test_a_path_is_joined_with_checked_names_alone() -> None:
     assert REASONS.keys() - found == set(), "these are no more"
 
 
-def test_documents_of_strangers_are_parsed_in_one_place() -> None:
+def test_untrusted_documents_are_parsed_in_one_module() -> None:
     found = {
         name
         for name, nodes in sources().items()

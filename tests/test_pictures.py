@@ -31,7 +31,7 @@ def test_every_picture_of_a_page_has_a_recipe_and_every_recipe_a_page() -> None:
     assert stored == shown
 
 
-def test_the_hash_changes_with_command_recipe_and_code_but_not_with_comments(
+def test_picture_hash_ignores_comments(
     tmp_path: Path,
 ) -> None:
     code = tmp_path / "code.py"

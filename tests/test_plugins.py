@@ -150,7 +150,7 @@ def test_dmrls_own_names_stay_dmrls(install: Install, tmp_path: Path) -> None:
         ("raise SystemExit(3)", "cannot be loaded: RuntimeError: it ends the program, with 3"),
     ],
 )
-def test_a_broken_format_is_said_and_passed_over(
+def test_broken_format_plugin_is_reported_and_skipped(
     text: str, said: str, install: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     install("alt-logs", text, formats="altitudes = alt_logs:FORMAT")

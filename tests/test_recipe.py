@@ -85,7 +85,7 @@ def test_every_wrong_key_is_named(write: Write) -> None:
         ("images = [", None),
     ],
 )
-def test_values_are_not_bent_to_fit(write: Write, line: str, key: str | None) -> None:
+def test_values_are_not_coerced(write: Write, line: str, key: str | None) -> None:
     with pytest.raises(RecipeError) as caught:
         recipe.load(write(f'kind = "draw"\n{line}\n'), "draw", Settings)
     if key is None:
@@ -99,7 +99,7 @@ def test_a_setting_without_a_default_must_be_given(write: Write) -> None:
         recipe.load(write('kind = "fly"\n'), "fly", Needy)
 
 
-def test_a_recipe_of_another_kind_says_what_is_wanted(write: Write) -> None:
+def test_recipe_of_another_kind_names_the_expected_kind(write: Write) -> None:
     with pytest.raises(RecipeError, match=r"is of kind 'fly'\. .* kind = \"draw\""):
         recipe.load(write('kind = "fly"\n'), "draw", Settings)
     with pytest.raises(RecipeError, match="has no kind"):
@@ -166,7 +166,7 @@ def test_shipped_recipes_are_those_of_the_folder() -> None:
     assert not set(trained) & set(recipe.list_names())
 
 
-def test_recipes_of_the_shipped_networks_are_found_by_name_and_listed_apart() -> None:
+def test_pretrained_recipes_are_found_by_name() -> None:
     path = RECIPES / "pretrained/nano_clean.toml"
     assert (
         recipe.read_text("nano_clean") == recipe.read_text(path) == path.read_text(encoding="utf-8")
@@ -203,7 +203,7 @@ def test_a_setting_may_be_called_as_a_method_of_pydantic(write: Write) -> None:
     assert recipe.load(path, "draw", Copied) == Copied(copy=False)
 
 
-def test_an_unknown_key_is_told_with_the_nearest_one() -> None:
+def test_unknown_key_suggests_the_nearest() -> None:
     (fault,) = recipe.find_faults({"gat_m": 0.3}, _label_settings())
     assert fault == "gat_m: extra inputs are not permitted (did you mean gate_m?)"
 

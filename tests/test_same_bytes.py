@@ -69,7 +69,9 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_seed_gives_the_same_bytes(command: str, flight: Path, tmp_path: Path) -> None:
+def test_same_seed_gives_same_bytes_on_any_machine(
+    command: str, flight: Path, tmp_path: Path
+) -> None:
     hashes = {}
     for number, (name, settings) in enumerate(MACHINES.items()):
         folder = tmp_path / str(number)

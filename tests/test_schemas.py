@@ -52,7 +52,7 @@ def test_status_values_are_those_of_the_schema() -> None:
 
 
 @pytest.mark.parametrize("path", PROTOS, ids=lambda p: p.stem)
-def test_every_message_says_what_it_is(path: Path) -> None:
+def test_every_message_has_a_comment(path: Path) -> None:
     lines = path.read_text(encoding="utf-8").splitlines()
     opened = [k for k, line in enumerate(lines) if re.match(r"(message|enum) ", line)]
     assert opened
@@ -60,7 +60,7 @@ def test_every_message_says_what_it_is(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", PROTOS, ids=lambda p: p.stem)
-def test_every_field_says_its_unit_in_its_name_or_a_comment(path: Path) -> None:
+def test_every_field_has_a_unit_suffix_or_comment(path: Path) -> None:
     """A comment holds for the block of fields below it, up to an empty line."""
     unexplained, explained = [], False
     for line in path.read_text(encoding="utf-8").splitlines():

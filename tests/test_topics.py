@@ -35,7 +35,7 @@ def test_every_pattern_of_the_module_is_in_the_table() -> None:
 
 
 @pytest.mark.parametrize("row", TOPICS, ids=lambda row: row.pattern)
-def test_what_is_plotted_and_read_are_fields_of_the_message(row: topics.Topic) -> None:
+def test_curves_and_csv_columns_are_fields_of_the_message(row: topics.Topic) -> None:
     if row.curve is None and not row.csv:
         return
     fields = find_descriptor(row.message).fields_by_name
@@ -47,7 +47,7 @@ def test_what_is_plotted_and_read_are_fields_of_the_message(row: topics.Topic) -
     assert row.curve is None or ", " in row.curve.title
 
 
-def test_a_robots_log_is_what_its_own_sensors_say() -> None:
+def test_log_columns_are_those_of_own_sensors() -> None:
     assert tuple(field for row in topics.OWN_SENSORS for field in row.csv)[:6] == LOG_COLUMNS
 
 

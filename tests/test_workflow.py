@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 STEPS = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]["run"]["steps"]
 
 
-def test_the_workflow_runs_the_words_of_a_developer() -> None:
+def test_workflow_runs_the_ci_script() -> None:
     assert [step["run"] for step in STEPS if "run" in step][-1] == ".ci/run"
     assert os.access(ROOT / ".ci/run", os.X_OK)
     targets = set(re.findall(r"^make ([a-z-]+)", (ROOT / ".ci/run").read_text(), re.MULTILINE))

@@ -16,7 +16,7 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 
-def test_without_python_311_and_uv_it_says_what_to_install(
+def test_missing_python_311_and_uv_error_names_packages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "which", lambda _: None)
@@ -26,7 +26,7 @@ def test_without_python_311_and_uv_it_says_what_to_install(
     assert list((tmp_path / "dmrl").iterdir()) == []
 
 
-def test_offline_it_says_so_and_leaves_nothing(
+def test_failed_download_is_reported_and_leaves_no_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:

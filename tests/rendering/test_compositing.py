@@ -48,7 +48,7 @@ def test_a_near_robot_hides_a_far_one_whatever_their_order() -> None:
     assert shot.surface_m[60, 115] == 1.0
 
 
-def test_a_blurred_robot_reaches_past_its_edge_and_is_labelled_the_same() -> None:
+def test_robot_blur_softens_the_edge_without_changing_labels() -> None:
     black = square(100, 50, 20, 1.0)
     black.light[..., :3] = 0
     layers = {0: black}

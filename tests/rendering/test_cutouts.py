@@ -97,7 +97,7 @@ def test_a_cutout_takes_over_colour_light_and_grain() -> None:
     assert tinted[..., 0].mean() / tinted[..., 2].mean() > 5
 
 
-def test_what_is_no_cutout_is_refused(tmp_path: Path, folders: tuple[Path, Path]) -> None:
+def test_invalid_cutouts_are_refused(tmp_path: Path, folders: tuple[Path, Path]) -> None:
     cutouts, photos = folders
     with pytest.raises(RecipeError, match="want backgrounds"):
         read_render_settings(str(write_recipe(tmp_path, cutouts, None)))

@@ -31,7 +31,7 @@ def test_a_peer_ahead_is_at_the_principal_point_whatever_the_yaw() -> None:
         assert pose.camera_from_body == pytest.approx(np.eye(3))
 
 
-def test_nose_down_moves_the_peer_up_and_right_side_down_turns_it_anticlockwise() -> None:
+def test_pitch_and_roll_move_the_peer_in_the_documented_direction() -> None:
     peer = body(2, 0, 0)
     _, v_level = project(
         relative_pose(peer, body(0, 0, 0)).xyz_camera[None], CAMERA.image_from_optical
@@ -66,7 +66,7 @@ def test_a_sketch_shows_the_peer_where_it_is() -> None:
     assert left < uv[0, 0] < right and top < uv[0, 1] < bottom
 
 
-def test_a_view_tells_how_peers_and_the_scene_move() -> None:
+def test_view_has_velocities_of_peers_and_camera() -> None:
     def bodies(time_s: float) -> dict[str, WorldPose]:
         here = body(0, 0, 0, yaw=0.5 * time_s, pitch=0.2 * time_s)
         return {"cf1": here, "cf2": body(2, time_s, 0), "cf3": body(-2, 0, 0)}

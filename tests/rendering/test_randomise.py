@@ -19,7 +19,7 @@ SMALL = Camera(40, 28, 15.0, 15.0, 20.0, 14.0)
 """PUBLISHED_RENDER, every length an eighth: many scenes are drawn in the time of one."""
 
 
-def test_strong_colours_are_two_hues_over_every_part_that_does_not_glow() -> None:
+def test_strong_colours_are_two_hues_on_all_non_emissive_parts() -> None:
     paint = random_two_colours(np.random.default_rng(3), CRAZYFLIE)
     dull = {
         f"colour_{k}" for k, name in enumerate(CRAZYFLIE.materials) if not CRAZYFLIE.paint[name][3]
@@ -47,7 +47,7 @@ def world(settings: Settings, folder: Path, camera: Camera = PUBLISHED_RENDER) -
     )
 
 
-def test_what_is_pasted_leaves_the_photo_as_it_is(tmp_path: Path) -> None:
+def test_pasted_robots_leave_the_photo_unchanged(tmp_path: Path) -> None:
     keys: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v for k, v in PRESETS["published"].items()
     }

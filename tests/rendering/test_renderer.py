@@ -55,7 +55,7 @@ def test_pixels_come_through_files_where_memory_is_shut(
 
 
 @pytest.mark.heavy
-def test_what_was_rendered_before_changes_no_pixel(blender: Path) -> None:
+def test_rendering_is_independent_of_earlier_shots(blender: Path) -> None:
     with Renderer(blender, RobotModel(), workers=1, samples=2) as renderer:
         first, second = renderer.lights[0], renderer.lights[1]
         asked = [scene(first, 0.5), scene(second, 0.3), scene(first, 0.5)]

@@ -118,7 +118,7 @@ def test_half_outside_the_image_the_box_ends_there(plain: Look) -> None:
     assert (outside.rgb == 255).all()
 
 
-def test_what_cannot_be_drawn_is_refused(plain: Look) -> None:
+def test_invalid_sketch_scene_is_refused(plain: Look) -> None:
     with pytest.raises(ValueError, match="behind the camera"):
         render_sketch(CAMERA, [at(0.02, 0.0, 0.0)], plain)
     with pytest.raises(ValueError, match="without distortion"):
@@ -161,7 +161,7 @@ def test_a_polygon_covers_its_area_in_its_place(opacity: float) -> None:
     assert np.abs(np.mean(off, axis=0)).max() < 0.02 and np.abs(off).max() < 0.2
 
 
-def test_what_is_drawn_on_a_ground_hides_it(plain: Look) -> None:
+def test_polygon_is_composited_over_the_background(plain: Look) -> None:
     ground = np.full((8, 8, 3), 64, np.uint8)
     canvas = Canvas(0, 0, 8, 8, ground=ground)
     canvas.fill_polygon(np.array([[0, 0], [4, 0], [4, 8], [0, 8]]), np.ones(3), 0.5)

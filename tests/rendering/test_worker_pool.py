@@ -85,13 +85,13 @@ def test_a_job_that_kills_every_worker_is_an_error(start: WorkerStart) -> None:
         list(workers.map(double, [1, 13]))
 
 
-def test_what_the_worker_says_of_a_model_is_the_error(start: WorkerStart) -> None:
+def test_worker_error_about_a_model_is_raised(start: WorkerStart) -> None:
     start.head["model"] = "bad"
     with pytest.raises(BlenderError, match="bad is no model"):
         WorkerPool(start, 1)
 
 
-def test_a_worker_that_does_not_start_says_why(start: WorkerStart) -> None:
+def test_worker_that_fails_to_start_reports_the_reason(start: WorkerStart) -> None:
     worker_pool.WORKER_SCRIPT.write_text("import nothing_of_that_name")
     with pytest.raises(BlenderError, match=r"nothing_of_that_name.*dmrl render --setup"):
         WorkerPool(start, 1)

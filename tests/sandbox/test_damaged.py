@@ -108,7 +108,7 @@ def test_an_input_that_is_changed_meanwhile_is_one_line(
     assert list(box.out.iterdir()) == []
 
 
-def test_a_name_that_is_no_text_is_one_line(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
+def test_non_utf_8_name_gives_one_line_error(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
     made = with_junk(box.root / "in" / "a.mcap", "", {})
     flight = made.rename(made.with_name(os.fsdecode(b"\xff.mcap")))
     for words in (

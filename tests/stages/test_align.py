@@ -88,7 +88,7 @@ def test_times_stay_where_no_robot_would_begin_before_zero(
     assert after.equals(before)
 
 
-def test_a_move_of_all_times_is_said_and_kept(
+def test_shift_of_all_times_is_reported_and_recorded(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with RecordingWriter(tmp_path / "early.mcap", build_provenance("test")) as sink:
@@ -104,7 +104,9 @@ def test_a_move_of_all_times_is_said_and_kept(
     assert read_summary(out).start_ns == 0
 
 
-def test_what_cannot_be_aligned_is_one_line(recording: Path, tmp_path: Path) -> None:
+def test_recording_that_cannot_be_aligned_gives_one_line_error(
+    recording: Path, tmp_path: Path
+) -> None:
     with pytest.raises(SettingError, match=r"--reference cf9: no such robot .* Known: cf1"):
         run(recording, tmp_path / "out.mcap", Settings(reference="cf9"))
     alone = tmp_path / "alone.mcap"

@@ -124,7 +124,7 @@ def test_robots_are_set_to_5_ms_over_5_minutes_by_motion_capture(tmp_path: Path)
     assert max(mocap_errors_s(tmp_path, 300.0, "realistic")) < 0.005
 
 
-def test_what_neither_camera_nor_motion_capture_can_tell_is_one_line(tmp_path: Path) -> None:
+def test_unalignable_cameras_and_poses_give_one_line_errors(tmp_path: Path) -> None:
     path, out = tmp_path / "in.mcap", tmp_path / "out.mcap"
     fly.run(path, fly.Settings(duration_s=2.0, camera=True, camera_rate_hz=2.0))
     with pytest.raises(SettingError, match=r"has labels already\. Align before that"):

@@ -78,7 +78,7 @@ def time_of(recording: Path, data: bytes) -> int:
     return found
 
 
-def test_predict_does_the_others(
+def test_predict_skips_broken_images(
     run: Run, recording: Path, broken: bytes, model: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out.mcap"
@@ -94,7 +94,7 @@ def test_predict_does_the_others(
     assert rc == 1 and "--strict" in said and not list(tmp_path.glob("no*"))
 
 
-def test_a_dataset_has_the_others(
+def test_dataset_skips_broken_images(
     run: Run, recording: Path, broken: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(card, "plots", None)
@@ -108,7 +108,7 @@ def test_a_dataset_has_the_others(
     assert rc == 1 and "--strict" in said and not list(tmp_path.glob("no*"))
 
 
-def test_trim_takes_it_out_where_asked(
+def test_trim_only_decodable_removes_broken_images(
     run: Run, recording: Path, broken: bytes, tmp_path: Path
 ) -> None:
     at_ns = time_of(recording, broken)
@@ -124,14 +124,14 @@ def test_trim_takes_it_out_where_asked(
     assert sum(1 for _ in read_raw(tmp_path / "all.mcap")) == len(want)
 
 
-def test_check_names_it(run: Run, recording: Path, broken: bytes) -> None:
+def test_check_reports_broken_images(run: Run, recording: Path, broken: bytes) -> None:
     rc, told, _ = run("check", recording, "--json")
     texts = [finding["text"] for finding in told["findings"]]
     wanted = f"1 messages contain no readable image: {time_of(recording, broken)} ns"
     assert rc == 1 and wanted in texts
 
 
-def test_view_shows_the_others(run: Run, recording: Path, broken: bytes, tmp_path: Path) -> None:
+def test_view_skips_broken_images(run: Run, recording: Path, broken: bytes, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     rc, _, said = run("view", recording, "--save", tmp_path / "out.rrd")
     assert rc == 0
@@ -139,7 +139,7 @@ def test_view_shows_the_others(run: Run, recording: Path, broken: bytes, tmp_pat
     assert f"left out: 1 images that cannot be decoded (at {where})" in said
 
 
-def test_evaluate_measures_the_others(
+def test_evaluate_skips_broken_images(
     run: Run, recording: Path, model: Path, tmp_path: Path
 ) -> None:
     run("predict", model, recording, tmp_path / "out.mcap", "--json", "--backend", "torch")
@@ -147,7 +147,7 @@ def test_evaluate_measures_the_others(
     assert (rc, told["images"]) == (0, COUNT - 1)
 
 
-def test_nothing_is_left_of_nothing_but_broken_images(
+def test_only_broken_images_are_an_error(
     run: Run, broken: bytes, model: Path, tmp_path: Path
 ) -> None:
     recording = write(tmp_path / "in.mcap", broken, tuple(range(COUNT)))
@@ -160,7 +160,9 @@ def test_nothing_is_left_of_nothing_but_broken_images(
         assert not list(tmp_path.glob("out*"))
 
 
-def test_the_stranger_s_recording(run: Run, data: Path, tmp_path: Path) -> None:
+def test_third_party_recording_with_broken_image_is_processed(
+    run: Run, data: Path, tmp_path: Path
+) -> None:
     recording = data / "strangers/frame-jpeg_cut/bo_jpeg_cut_half.mcap"
     out = tmp_path / "out.mcap"
     rc, told, said = run("predict", "dmrl-nano", recording, out, "--json", "--backend", "torch")
@@ -170,7 +172,9 @@ def test_the_stranger_s_recording(run: Run, data: Path, tmp_path: Path) -> None:
     assert any("700000000 ns" in finding["text"] for finding in told["findings"])
 
 
-def test_python_gets_one_error_for_all(broken: bytes, model: Path, tmp_path: Path) -> None:
+def test_python_api_raises_one_error_for_broken_images(
+    broken: bytes, model: Path, tmp_path: Path
+) -> None:
     from dmrl.stages import predict  # noqa: PLC0415 - the command imports it late too
 
     recording = write(tmp_path / "in.mcap", broken, tuple(range(COUNT)))

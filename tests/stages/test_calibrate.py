@@ -137,7 +137,7 @@ def test_pictures_of_two_sizes_are_refused(boards: Path, tmp_path: Path) -> None
         calibrate.run([folder], tmp_path / "camera.toml", Settings(board="7x5"))
 
 
-def test_a_flight_without_positions_says_what_is_missing(seen: Path, tmp_path: Path) -> None:
+def test_flight_without_positions_names_the_missing_topic(seen: Path, tmp_path: Path) -> None:
     with pytest.raises(MissingTopic, match="position"):
         calibrate.run([seen], tmp_path / "camera.toml", Settings())
 

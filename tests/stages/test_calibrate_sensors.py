@@ -40,7 +40,7 @@ def known(flights: list[Path]) -> Path:
     return out
 
 
-def test_what_is_off_in_every_flight_is_found(known: Path) -> None:
+def test_constant_sensor_errors_are_estimated(known: Path) -> None:
     found = read_sensors(known)
     offset_m, std_m = found.pairs["cf1", "cf2"]["range_offset_m"]
     assert offset_m == pytest.approx(0.35, abs=0.1)
@@ -62,7 +62,7 @@ def test_a_short_flight_starts_from_it_and_comes_out_right(known: Path, tmp_path
     assert known.name in [one.name for one in read_summary(out).provenance.inputs]
 
 
-def test_a_file_that_is_wrong_is_found_out(known: Path, tmp_path: Path) -> None:
+def test_wrong_sensor_file_is_detected(known: Path, tmp_path: Path) -> None:
     sensors = read_sensors(known)
     other = {**sensors.robots["cf2"], "yaw_rate_bias_radps": (-0.05, 0.004)}
     wrong = tmp_path / "wrong.toml"

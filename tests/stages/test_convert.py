@@ -102,7 +102,7 @@ def test_real_frames_take_the_camera_by_name(data: Path, tmp_path: Path) -> None
     assert calibration.message.distortion_model == "plumb_bob"
 
 
-def test_what_is_odd_in_a_new_recording_is_said_at_once(
+def test_findings_are_reported_after_conversion(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "logs").mkdir()
@@ -154,7 +154,7 @@ def test_an_empty_folder_is_called_empty(tmp_path: Path) -> None:
         (Settings(labels=Path("no.csv")), SourceError, "no label file no.csv"),
     ],
 )
-def test_what_cannot_be_met_is_one_line_and_leaves_nothing(
+def test_invalid_settings_give_one_line_error_and_no_output(
     pictures: Path, tmp_path: Path, settings: Settings, kind: type[DmrlError], message: str
 ) -> None:
     with pytest.raises(kind, match=message) as e:
@@ -171,7 +171,7 @@ def test_pictures_that_all_break_half_way_leave_nothing(pictures: Path, tmp_path
     assert list(tmp_path.glob("out*")) == []
 
 
-def test_a_source_of_no_kind_hears_what_kinds_there_are(tmp_path: Path) -> None:
+def test_unknown_source_error_lists_formats(tmp_path: Path) -> None:
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").write_text("hello")
     with pytest.raises(

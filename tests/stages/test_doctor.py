@@ -19,7 +19,7 @@ def _said(capsys: pytest.CaptureFixture[str]) -> dict[str, dict[str, object]]:
     return {part["name"]: part for part in json.loads(capsys.readouterr().out)}
 
 
-def test_the_base_is_there(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_finds_the_base_installation(capsys: pytest.CaptureFixture[str]) -> None:
     said = _said(capsys)
     assert said["base packages"]["there"] and said["Python"]["there"]
     assert "pyarrow" in str(said["base packages"]["found"])
@@ -35,7 +35,7 @@ def test_every_extra_is_named_with_what_it_is_for() -> None:
     assert said == installation.EXTRAS
 
 
-def test_what_is_missing_or_too_old_is_said_with_the_line_to_type(
+def test_doctor_reports_missing_packages_with_install_commands(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known = {"filterpy": "", "rosbags": "0.1"}
@@ -63,7 +63,9 @@ def test_a_base_that_does_not_work_is_an_error(
     assert capsys.readouterr().err == "dmrl: base packages: no mcap. Try: pip install dmrl\n"
 
 
-def test_no_vulkan_driver_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_doctor_reports_missing_vulkan_driver(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(installation, "DRIVERS", (str(tmp_path),))
     monkeypatch.setattr("platform.system", lambda: "Linux")
     monkeypatch.delenv("VK_ICD_FILENAMES", raising=False)

@@ -84,14 +84,14 @@ def test_robots_are_not_mixed(write: Callable[..., Path]) -> None:
     assert figures(path)["labels"] == 2
 
 
-def test_who_looked_and_saw_nobody_is_believed(write: Callable[..., Path]) -> None:
+def test_empty_image_of_a_labelling_source_counts_as_negative(write: Callable[..., Path]) -> None:
     other = ([peer(40, 10, source="estimate")], [found(40, 10)])
     images = {"cf1": [([peer(10, 10)], [found(10, 10)]), other]}
     assert figures(write(images))["precision"] == 1
     assert figures(write(images, looked=["truth"], name="b.mcap"))["precision"] == 0.5
 
 
-def test_a_recording_in_which_nobody_is_seen_can_be_judged(write: Callable[..., Path]) -> None:
+def test_recording_without_peers_can_be_evaluated(write: Callable[..., Path]) -> None:
     empty = write({"cf1": [([], [found(10, 10)])]}, name="empty.mcap")
     assert run([empty], None, FAST).pairs.images == 1
     good = write({"cf1": [([peer(10, 10)], [found(10, 10)])]})
@@ -208,9 +208,7 @@ def test_a_camera_that_never_detected_counts_too(write: Callable[..., Path]) -> 
     assert figures(path, Settings(draws=20, partial=True))["recall"] == 1
 
 
-def test_a_label_without_an_image_says_nothing_of_detections(
-    write: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_labels_without_images_are_omitted(write: Callable[..., Path], tmp_path: Path) -> None:
     path = write({"cf1": [([peer(10, 10)], [found(10, 10)])]})
     late = tmp_path / "late.mcap"
     with RecordingWriter(late, Provenance("test")) as sink:
@@ -237,7 +235,7 @@ def test_the_threshold_is_the_detectors_unless_one_is_given(write: Callable[...,
     assert figures(path, Settings(threshold=0.5, draws=5))["recall"] == 1
 
 
-def test_alarms_where_nobody_is_are_counted(
+def test_false_alarms_in_empty_images_are_counted(
     write: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     empty: list[Any] = [([], [found(10, 10, 0.5), found(40, 30, 0.4)])] * 2 + [([], [])] * 6
@@ -263,7 +261,7 @@ def test_the_threshold_of_a_rate_of_false_alarms(write: Callable[..., Path]) -> 
         run([path], None, Settings(threshold=0.5, false_alarms=0.05))
 
 
-def test_what_is_missing_is_named(write: Callable[..., Path], dots: Path) -> None:
+def test_missing_labels_or_detections_are_reported(write: Callable[..., Path], dots: Path) -> None:
     path = write({"cf1": [([peer(10, 10, source="hand")], [found(10, 10)])]})
     with pytest.raises(SettingError, match=r"no labels from truth\. Give --against one of: hand"):
         run([path], None, FAST)

@@ -80,7 +80,7 @@ def test_the_table_has_a_row_per_pair_and_one_for_all(
     assert json.loads(capsys.readouterr().out)["settle_s"] == 20.0
 
 
-def test_estimates_that_were_left_out_are_told(
+def test_coverage_counts_missing_estimates(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "picked.mcap"

@@ -52,7 +52,7 @@ def test_every_backend_runs_a_quantised_model_and_an_export(
 
 
 @pytest.mark.heavy
-def test_an_export_says_what_it_holds(
+def test_export_lists_its_files(
     quantised: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "export"
@@ -67,7 +67,7 @@ def test_an_export_says_what_it_holds(
 
 
 @pytest.mark.heavy
-def test_an_export_for_a_small_near_memory_says_what_lies_where(
+def test_export_for_small_l1_reports_memory_placement(
     quantised: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole, two, none = (tmp_path / name for name in ("whole", "two", "none"))
@@ -140,12 +140,12 @@ def test_a_missing_package_is_named_with_its_extra(
 
 
 @pytest.mark.parametrize("backend", detector.OPENERS)
-def test_no_model_is_said(tmp_path: Path, backend: str) -> None:
+def test_missing_model_is_reported(tmp_path: Path, backend: str) -> None:
     with pytest.raises(ModelError, match=r"no model .*nowhere"):
         detector.open_detector(tmp_path / "nowhere", backend)
 
 
-def test_a_damaged_description_is_said(exported: Path, tmp_path: Path) -> None:
+def test_damaged_description_is_reported(exported: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     copy.mkdir()
     for path in exported.iterdir():

@@ -38,7 +38,7 @@ def test_every_topic_is_there_at_its_rate(seen: Path) -> None:
     assert not [f for f in check(seen) if f.level == "error"]
 
 
-def test_what_was_measured_stands_on_the_clock_of_the_robot(seen: Path) -> None:
+def test_measurements_use_the_clock_of_the_robot(seen: Path) -> None:
     flight = simulate(Scenario(3, 4.0), NOISE["harsh"], 3)
     table = read_table(seen, "/cf2/velocity")
     assert np.allclose(table.column("vx_mps").to_numpy(), flight.robots["cf2"].vx_mps)
@@ -144,7 +144,7 @@ def test_every_wrong_key_of_a_recipe_is_named(tmp_path: Path) -> None:
     assert all(key in str(caught.value) for key in ("robots", "trajectory", "wind"))
 
 
-def test_a_recipe_with_faults_is_flown_and_told(
+def test_faults_of_a_recipe_are_simulated_and_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, out = tmp_path / "faulty.toml", tmp_path / "out.mcap"

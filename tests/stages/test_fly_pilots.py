@@ -76,7 +76,7 @@ def test_detections_of_an_ideal_eye_are_the_labels_with_its_errors(ideal: Path) 
     assert np.std(depths) == pytest.approx(0.1, abs=0.04)
 
 
-def test_the_follower_keeps_its_distance_by_its_eye_alone(tmp_path: Path) -> None:
+def test_follower_keeps_its_distance_by_detections_only(tmp_path: Path) -> None:
     out = tmp_path / "flight.mcap"
     fly.run(out, replace(SHORT, duration_s=12.0, distance_m=1.0))
     table = read_table(out, "/cf1/peer/cf2/truth")
@@ -86,7 +86,7 @@ def test_the_follower_keeps_its_distance_by_its_eye_alone(tmp_path: Path) -> Non
     assert np.abs(np.arctan2(y, x))[late].max() < 0.72
 
 
-def test_a_blind_follower_does_not_follow(tmp_path: Path) -> None:
+def test_follower_without_detections_loses_the_leader(tmp_path: Path) -> None:
     out = tmp_path / "flight.mcap"
     fly.run(out, replace(SHORT, duration_s=12.0, vision=Vision(lost_share=1.0)))
     table = read_table(out, "/cf1/peer/cf2/truth")
@@ -141,7 +141,7 @@ def test_predict_and_track_find_in_the_recording_what_the_drone_found(
         assert np.array(one) == pytest.approx(np.array(other), abs=0.02)
 
 
-def test_detections_are_used_one_image_late_and_tracks_say_so(ideal: Path) -> None:
+def test_tracks_are_published_one_image_late(ideal: Path) -> None:
     for stamped in read_raw(ideal, "/cf1/tracks"):
         assert stamped.publish_ns - stamped.time_ns == 100_000_000
 
@@ -157,7 +157,7 @@ class Witness(Pilot):
 
 
 @pytest.mark.parametrize("lost", range(8))
-def test_no_image_is_ever_younger_than_it_says(
+def test_image_age_is_exact_when_images_are_lost(
     lost: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The image of every number is lost in turn: its detections reach nobody."""
@@ -299,7 +299,7 @@ def int8(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("seed", range(16))
-def test_integers_and_c_fly_the_same_flight(seed: int, int8: Path, tmp_path: Path) -> None:
+def test_integer_and_c_backends_give_equal_commands(seed: int, int8: Path, tmp_path: Path) -> None:
     flown = []
     for backend in ("integer", "c"):
         out = tmp_path / f"{backend}.mcap"
@@ -310,7 +310,7 @@ def test_integers_and_c_fly_the_same_flight(seed: int, int8: Path, tmp_path: Pat
     np.testing.assert_array_equal(flown[0], flown[1])
 
 
-def test_flights_in_one_place_share_the_room_and_not_the_path(tmp_path: Path) -> None:
+def test_flights_with_one_place_share_the_room_only(tmp_path: Path) -> None:
     first = []
     for name, seed, place in (("a", 1, None), ("b", 2, 1), ("c", 2, None)):
         out = tmp_path / f"{name}.mcap"

@@ -109,9 +109,7 @@ def off_px(recording: Path) -> float:
 
 
 @pytest.mark.heavy
-def test_what_a_network_saw_makes_labels_better(
-    flight: Path, labelled: Path, tmp_path: Path
-) -> None:
+def test_detections_improve_labels(flight: Path, labelled: Path, tmp_path: Path) -> None:
     seen, rng = tmp_path / "seen.mcap", np.random.default_rng(0)
     with RecordingWriter(seen, Provenance("test")) as sink:
         for stamped in read(flight):
@@ -190,7 +188,7 @@ def test_a_robot_with_a_log_but_no_position_may_be_in_any_image(
         assert (entry.status, entry.sigma_u_px) == (STATUS_UNCONVERGED, 320)
 
 
-def test_who_looked_is_written_where_nobody_is_in_view(flight: Path, labelled: Path) -> None:
+def test_labels_of_empty_images_name_their_source(flight: Path, labelled: Path) -> None:
     assert {tuple(s.message.sources) for s in read(flight, "/cf1/labels")} == {("truth",)}
     looked = [set(s.message.sources) for s in read(labelled, "/cf1/labels")]
     assert all("truth" in sources for sources in looked)
@@ -207,7 +205,7 @@ def test_the_noise_of_heights_is_smoothed_away(labelled: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_an_image_in_which_the_peer_may_be_anywhere_says_so(tmp_path: Path) -> None:
+def test_label_of_a_peer_without_bearing_is_ambiguous(tmp_path: Path) -> None:
     flown = tmp_path / "still.mcap"
     fly.run(
         flown,
@@ -241,9 +239,7 @@ def test_a_known_offset_of_ranges_need_not_be_found(flight: Path, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_real_ranges_of_moving_robots_are_labelled_and_a_static_observer_is_not(
-    data: Path, tmp_path: Path
-) -> None:
+def test_real_ranges_label_moving_observers_only(data: Path, tmp_path: Path) -> None:
     source = data / "uwb-tiers" / "4robots_data_01.npz"
     convert.run(source, tmp_path / "ranges.mcap", convert.Settings())
     out = tmp_path / "out.mcap"

@@ -44,7 +44,7 @@ def warnings_of(path: Path) -> str:
     return "\n".join(label.run(path, out, Settings(method="ekf")).warnings)
 
 
-def test_ranges_that_cannot_be_are_left_out_with_a_word(
+def test_impossible_ranges_are_omitted_and_reported(
     changed: Callable[[Change], Path],
 ) -> None:
     count = iter(range(10**6))
@@ -62,7 +62,7 @@ def test_ranges_that_cannot_be_are_left_out_with_a_word(
     assert "that are not in (0, 60] m" in said
 
 
-def test_a_robot_without_logs_is_left_out_with_a_word(changed: Callable[[Change], Path]) -> None:
+def test_robot_without_logs_is_omitted_with_a_warning(changed: Callable[[Change], Path]) -> None:
     def third(stamped: Stamped) -> list[Stamped]:
         if stamped.topic != "/cf1/range/cf2":
             return [stamped]
@@ -90,7 +90,7 @@ def test_a_calibration_of_another_size_or_lens_is_refused(flight: Path, tmp_path
         label.run(fisheye, tmp_path / "out.mcap", LENIENT)
 
 
-def test_silence_is_bridged_with_a_word(changed: Callable[[Change], Path]) -> None:
+def test_sensor_gap_is_bridged_with_a_warning(changed: Callable[[Change], Path]) -> None:
     def silent(stamped: Stamped) -> list[Stamped]:
         quiet = 10 * SECOND_NS < stamped.time_ns < 13 * SECOND_NS
         return [] if quiet and stamped.topic == "/cf2/velocity" else [stamped]
@@ -108,7 +108,7 @@ def test_a_clock_that_went_back_is_named(flight: Path, tmp_path: Path) -> None:
     assert "/cf2/velocity: its clock goes back" in warnings_of(path)
 
 
-def test_degrees_are_suspected(changed: Callable[[Change], Path]) -> None:
+def test_angles_in_degrees_give_a_warning(changed: Callable[[Change], Path]) -> None:
     def degrees(stamped: Stamped) -> list[Stamped]:
         if stamped.topic == "/cf1/attitude":
             stamped.message.roll_rad *= 57.3
@@ -131,7 +131,7 @@ def test_clocks_an_hour_apart_are_an_error_of_one_line(
     assert not list(tmp_path.glob("out*"))
 
 
-def test_a_recording_without_ranges_says_so(changed: Callable[[Change], Path]) -> None:
+def test_recording_without_ranges_is_refused(changed: Callable[[Change], Path]) -> None:
     def none(stamped: Stamped) -> list[Stamped]:
         return [] if "range" in stamped.topic else [stamped]
 

@@ -78,7 +78,7 @@ def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_a_recording_will_do_and_json_says_it_all(
+def test_likeness_reads_recordings_and_prints_json(
     dots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "dots.toml"
@@ -90,7 +90,7 @@ def test_a_recording_will_do_and_json_says_it_all(
     assert tomllib.loads(out.read_text())["preset"] == "himax"
 
 
-def test_what_cannot_be_measured_is_one_line(tmp_path: Path, dots: Path) -> None:
+def test_frames_that_cannot_be_measured_give_one_line_errors(tmp_path: Path, dots: Path) -> None:
     (tmp_path / "none").mkdir()
     with pytest.raises(SourceError, match="no image"):
         run(tmp_path / "none", tmp_path / "a.toml", Settings())
@@ -143,7 +143,7 @@ def test_frames_that_show_no_camera_are_one_line(
     assert [path.name for path in tmp_path.iterdir()] == ["own"]
 
 
-def test_what_frames_do_not_show_is_said_and_left(
+def test_unmeasurable_figures_are_reported_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Black and white stripes have sharp edges, but no grain."""

@@ -55,9 +55,7 @@ def test_detections_have_the_time_of_their_image(dots: Path, model: Path, tmp_pa
         assert [(raw.time_ns, raw.publish_ns) for raw in read_raw(out, topic)] == images
 
 
-def test_what_a_network_says_beyond_is_written_with_its_detections(
-    dots: Path, tmp_path: Path
-) -> None:
+def test_extra_network_outputs_are_written_with_detections(dots: Path, tmp_path: Path) -> None:
     network = build_network("dmrl-nano", seed=1, extra=("log_spread", "class_0", "class_1")).eval()
     with torch.no_grad():
         network.head.bias[4:] = torch.tensor([-1.0, 0.0, 9.0])  # type: ignore[union-attr, index]
@@ -72,7 +70,7 @@ def test_what_a_network_says_beyond_is_written_with_its_detections(
         assert d.sigma_depth_m == pytest.approx(2**0.5 * np.exp(-1) * d.depth_m)
 
 
-def test_the_grid_is_what_the_network_says_and_detections_are_its_peaks(
+def test_grid_equals_network_output_and_detections_are_its_peaks(
     dots: Path, model: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out.mcap"
@@ -114,7 +112,7 @@ def test_two_views_see_the_same_in_an_image_and_its_mirror_image(tmp_path: Path)
     assert alone[0].u_px != here[0].u_px or alone[0].confidence != here[0].confidence
 
 
-def test_detections_of_before_are_replaced(dots: Path, model: Path, tmp_path: Path) -> None:
+def test_earlier_detections_are_replaced(dots: Path, model: Path, tmp_path: Path) -> None:
     run(model, dots, tmp_path / "once.mcap", Settings())
     run(model, tmp_path / "once.mcap", tmp_path / "twice.mcap", Settings(threshold=0.9))
     topics = read_summary(tmp_path / "twice.mcap").topics
@@ -140,7 +138,7 @@ def test_images_of_several_sizes_go_through(model: Path, tmp_path: Path) -> None
     assert [(g.rows, g.cols) for g in grids] == [(6, 8), (4, 4), (4, 4), (6, 8)]
 
 
-def test_of_large_images_few_are_in_memory(
+def test_batch_of_large_images_is_limited_by_pixels(
     dots: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sizes: list[int] = []
@@ -194,7 +192,7 @@ def test_json_counts_images_and_detections(
     assert said == {"recording": str(tmp_path / "out.mcap"), "images": 30, "believed": 0}
 
 
-def test_without_a_backend_the_fastest_is_taken_and_said(
+def test_fastest_backend_is_chosen_and_reported(
     dots: Path, settled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(settled, dots, tmp_path / "out.mcap", Settings())

@@ -78,7 +78,7 @@ def by_source(result: Result) -> dict[str, tuple[int, int, int]]:
 
 
 @pytest.mark.heavy
-def test_all_that_was_sent_is_recorded_as_it_was_flown(flight: Path, tmp_path: Path) -> None:
+def test_every_packet_sent_is_recorded(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     # The clock of the drones wraps one second after take-off.
     settings = fake_drone.Settings(sends="streamer", boot_ms=float((1 << 24) - 1000))
@@ -115,7 +115,7 @@ def assert_as_flown(flight: Path, out: Path, robot: str) -> float:
     return start_ns
 
 
-def test_drones_stay_until_they_are_heard_out(flight: Path, tmp_path: Path) -> None:
+def test_simulated_drones_wait_until_all_packets_are_received(flight: Path, tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_port:
         any_port.bind(("127.0.0.1", 0))
         uri = f"udp://127.0.0.1:{any_port.getsockname()[1]}"
@@ -135,7 +135,7 @@ def test_drones_stay_until_they_are_heard_out(flight: Path, tmp_path: Path) -> N
     assert results[0].healths[0].received == drone.sent > 500
 
 
-def test_dropped_packets_are_counted_and_a_dead_drone_stops_nobody(
+def test_dropped_packets_are_counted_and_a_dead_drone_does_not_stop_others(
     flight: Path, tmp_path: Path
 ) -> None:
     settings = fake_drone.Settings(drop=0.05, dies=("cf2=1",), sends="stamped")
@@ -150,7 +150,7 @@ def test_dropped_packets_are_counted_and_a_dead_drone_stops_nobody(
     assert result.messages["/cf1/attitude"] > 250 and result.messages["/cf2/attitude"] < 150
 
 
-def test_a_packet_that_cannot_be_read_costs_a_connection_not_the_recording(
+def test_undecodable_packet_restarts_the_connection_only(
     flight: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -238,7 +238,7 @@ def test_ctrl_c_leaves_a_whole_recording(flight: Path, tmp_path: Path) -> None:
     assert sum(1 for _ in read(out, "/cf1/attitude")) == result.messages["/cf1/attitude"] >= 70
 
 
-def test_nobody_there_leaves_no_recording(tmp_path: Path) -> None:
+def test_unreachable_robots_leave_no_recording(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     nobody = [RobotOptions("cf1", "udp://127.0.0.1:9")]
     with pytest.raises(RecordingError, match=r"no data for .* \(cf1 at udp://127.0.0.1:9"):
@@ -272,7 +272,7 @@ def test_two_robots_of_one_name_are_refused(tmp_path: Path) -> None:
         record.run(tmp_path / "out.mcap", twice, record.Settings())
 
 
-def test_without_cflib_the_line_says_what_to_install(
+def test_missing_cflib_error_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in [name for name in sys.modules if name.split(".")[0] == "cflib"]:

@@ -119,7 +119,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(blender: Path, tmp_path: Path) -
 
 
 @pytest.mark.heavy
-def test_what_is_resumed_must_be_of_the_same_settings(recording: Path, tmp_path: Path) -> None:
+def test_resume_requires_equal_settings(recording: Path, tmp_path: Path) -> None:
     (tmp_path / "out.mcap.partial").write_bytes(recording.read_bytes())
     with pytest.raises(RecordingError, match="other settings"):
         run(tmp_path / "out.mcap", Settings(images=6), resume=True)
@@ -176,9 +176,7 @@ OWN = Camera(160, 120, 100.0, 101.0, 81.0, 58.0, (-0.28, 0.09, 0.0, 0.0, 0.0))
 
 
 @pytest.mark.heavy
-def test_what_stands_beside_the_photos_stands_in_the_recording(
-    blender: Path, tmp_path: Path
-) -> None:
+def test_licence_of_backgrounds_is_recorded(blender: Path, tmp_path: Path) -> None:
     photos, out = tmp_path / "hall", tmp_path / "out.mcap"
     photos.mkdir()
     (photos / "LICENSE").write_text("# CC BY-SA 3.0\n\nthe photographers\n")

@@ -68,7 +68,7 @@ def test_the_box_of_a_preview_is_about_what_it_shows(
 
 
 @pytest.mark.heavy
-def test_a_preview_is_a_picture_that_says_the_size(
+def test_preview_shows_the_robot_and_prints_its_size(
     blender: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "robot.png"

@@ -49,7 +49,7 @@ def test_a_page_is_drawn_again_when_a_step_or_a_figure_has_changed(
     assert "last words" in page.read_text() and "2 of 2 steps" in capsys.readouterr().err
 
 
-def test_what_a_run_replaces_is_kept_and_told_with_its_reason(
+def test_replaced_outputs_are_kept_and_reported_with_the_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recipe, out = tmp_path / "few.toml", tmp_path / "out"
@@ -90,7 +90,7 @@ def test_what_a_run_replaces_is_kept_and_told_with_its_reason(
     }
 
 
-def test_an_output_that_was_changed_by_hand_is_told_so(
+def test_output_modified_by_hand_is_reported_and_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recipe, out = tmp_path / "few.toml", tmp_path / "out"

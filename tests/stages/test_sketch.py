@@ -24,7 +24,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_every_picture_is_labelled_and_those_without_a_robot_say_so(folder: Path) -> None:
+def test_every_image_is_labelled_including_empty_ones(folder: Path) -> None:
     names = [path.name for path in sorted(folder.glob("*.png"))]
     assert names == [f"{k:06d}.png" for k in range(12)]
     with (folder / "labels.csv").open(newline="") as stream:

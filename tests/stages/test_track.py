@@ -55,7 +55,7 @@ def test_every_image_gets_its_tracks_in_the_observers_frame(tracked: Path) -> No
     assert {entry.peer for entry in entries} <= {"", "cf2", "cf3"}
 
 
-def test_tracks_are_better_than_single_images_and_honest(judged: dict[str, Any]) -> None:
+def test_tracks_reduce_the_error_with_consistent_covariance(judged: dict[str, Any]) -> None:
     assert judged["robot"] == "cf1"
     assert judged["reduction"] > 0.3
     assert judged["coverage_95"] > 0.85
@@ -131,7 +131,7 @@ def test_the_same_input_gives_the_same_bytes(detected: Path, tracked: Path, tmp_
         ("/cf1/attitude", "/cf1/attitude"),
     ],
 )
-def test_what_is_missing_is_named(detected: Path, tmp_path: Path, topic: str, words: str) -> None:
+def test_missing_topic_is_reported(detected: Path, tmp_path: Path, topic: str, words: str) -> None:
     short = tmp_path / "short.mcap"
     others = [t for t in read_summary(detected).topics if t != topic]
     trim(detected, short, topics=others)

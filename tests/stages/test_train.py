@@ -28,7 +28,7 @@ from .trainings import SETTINGS
 
 
 @pytest.mark.heavy
-def test_a_run_folder_says_what_was_trained_on_what(dots_dataset: Path, tmp_path: Path) -> None:
+def test_run_folder_records_training_and_provenance(dots_dataset: Path, tmp_path: Path) -> None:
     result = run(dots_dataset, tmp_path / "run", SETTINGS)
     assert result.images == 20
     model = load_model(tmp_path / "run")
@@ -154,7 +154,7 @@ def check_that_it_goes_on(dataset: Path, out: Path, settings: Settings) -> None:
 
 
 @pytest.mark.heavy
-def test_an_interrupted_training_leaves_no_final_name_and_is_resumed_to_the_same_bytes(
+def test_interrupted_training_resumes_to_the_same_bytes(
     dots_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "run"
@@ -172,9 +172,7 @@ def test_an_interrupted_training_leaves_no_final_name_and_is_resumed_to_the_same
 
 
 @pytest.mark.slow
-def test_a_killed_training_leaves_no_final_name_and_is_resumed_to_the_same_bytes(
-    dots_dataset: Path, tmp_path: Path
-) -> None:
+def test_killed_training_resumes_to_the_same_bytes(dots_dataset: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, epochs=4)
     out, partial = tmp_path / "run", tmp_path / "run.partial"
     process = subprocess.Popen([sys.executable, "-c", KILLED, str(dots_dataset), str(out)])
@@ -198,7 +196,7 @@ def test_a_training_killed_in_its_first_epoch_starts_over(
     assert weights[0] == weights[1]
 
 
-def test_what_cannot_be_trained_is_said_in_one_line(dots_dataset: Path, tmp_path: Path) -> None:
+def test_invalid_training_gives_one_line_error(dots_dataset: Path, tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"to resume\. Train without --resume"):
         run(dots_dataset, tmp_path / "run", SETTINGS, resume=True)
     with pytest.raises(DatasetError, match="dmrl dataset"):
@@ -221,7 +219,7 @@ def test_what_cannot_be_trained_is_said_in_one_line(dots_dataset: Path, tmp_path
 
 
 @pytest.mark.heavy
-def test_images_in_which_nobody_is_are_not_enough(tmp_path: Path) -> None:
+def test_training_needs_images_with_robots(tmp_path: Path) -> None:
     shots = tmp_path / "shots"
     shots.mkdir()
     for name in ("a", "b"):
@@ -234,7 +232,7 @@ def test_images_in_which_nobody_is_are_not_enough(tmp_path: Path) -> None:
         run(tmp_path / "dataset", tmp_path / "run", SETTINGS)
 
 
-def test_the_shipped_recipe_is_the_default_and_the_published_one_is_the_papers() -> None:
+def test_shipped_recipe_is_the_default_and_locanet_follows_the_paper() -> None:
     assert recipe.load("dmrl_nano", "train", Settings) == Settings()
     published = recipe.load("locanet", "train", Settings)
     assert published.augmentation(0).is_identity

@@ -59,7 +59,7 @@ def test_torchrun_trains_what_two_processes_train(dots_dataset: Path, tmp_path: 
 
 
 @pytest.mark.heavy
-def test_an_error_of_two_processes_is_said_once(
+def test_error_of_two_processes_is_reported_once(
     dots_dataset: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SettingError, match=r"shares: all are 0"):

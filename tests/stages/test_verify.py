@@ -67,7 +67,7 @@ def test_every_target_computes_what_the_reference_does(everything: dict[str, Any
 
 
 @pytest.mark.slow
-def test_what_the_c_costs_is_measured(everything: dict[str, Any]) -> None:
+def test_code_size_stack_and_instructions_are_measured(everything: dict[str, Any]) -> None:
     assert 500 < everything["code_bytes"] < 50_000
     assert 0 < everything["stack_bytes"] <= MAX_STACK_BYTES
     # A multiplication and an addition at the least; small layers cost more around them.
@@ -138,7 +138,7 @@ def test_c_that_does_not_compile_is_an_error_of_its_target(folder: Path, tmp_pat
     assert "error" in result.targets[0].error
 
 
-def test_without_tools_every_target_is_skipped_and_said_so(
+def test_targets_without_tools_are_skipped_and_reported(
     folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

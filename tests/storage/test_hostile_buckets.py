@@ -264,7 +264,7 @@ def test_a_listing_ends(
         ("leads /secret", "s3://lab/a.mcap"),
     ],
 )
-def test_what_was_not_asked_is_not_read(
+def test_bucket_bytes_beyond_the_request_are_not_read(
     wrong: str, said: str | None, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server_answers, "PATIENCE_S", 0.5 if wrong == "drips" else 30)

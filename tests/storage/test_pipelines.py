@@ -27,9 +27,7 @@ def test_a_pipeline_keeps_its_folder_in_a_bucket(lab: Any, tmp_path: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_the_demo_s_pipeline_with_all_it_makes_in_a_bucket_is_that_of_here(
-    lab: Any, tmp_path: Path
-) -> None:
+def test_demo_pipeline_in_a_bucket_equals_the_local_one(lab: Any, tmp_path: Path) -> None:
     """Every step that ships but the picture of rerun, on fewer drawn pictures."""
     text = recipes.read_text("demo").replace("images = 600", "images = 20")
     text = text.replace("epochs = 12", "epochs = 1")

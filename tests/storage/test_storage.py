@@ -59,7 +59,7 @@ def pictured(path: Path, *, seed: int = 0) -> Path:
     return path
 
 
-def test_names_of_buckets_are_paths_and_others_are_as_ever() -> None:
+def test_bucket_urls_become_paths_and_other_names_stay_local() -> None:
     path = to_path("s3://lab/a/b.mcap")
     assert isinstance(path, RemotePath) and str(path) == "s3://lab/a/b.mcap"
     assert str(path.parent / "c.mcap") == "s3://lab/a/c.mcap" and path.suffix == ".mcap"
@@ -71,7 +71,7 @@ def test_names_of_buckets_are_paths_and_others_are_as_ever() -> None:
 
 
 @pytest.mark.heavy
-def test_a_command_from_bucket_to_bucket_makes_the_bytes_of_here(
+def test_command_between_buckets_equals_local_output(
     lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = record(tmp_path / "a.mcap")
@@ -127,7 +127,7 @@ def test_numbers_are_read_without_the_pictures(
 
 
 @pytest.mark.heavy
-def test_what_is_not_whole_is_not_there(lab: Any, tmp_path: Path) -> None:
+def test_incomplete_bucket_output_is_invisible(lab: Any, tmp_path: Path) -> None:
     file, folder = to_path("s3://lab/whole/a.bin"), to_path("s3://lab/whole/set")
     with pytest.raises(RuntimeError), atomic_file(file) as here:
         here.write_bytes(b"half")
@@ -212,7 +212,7 @@ def test_a_dataset_in_a_bucket_grows_and_nothing_else_is_written(
 
 
 @pytest.mark.heavy
-def test_what_is_wrong_with_a_bucket_is_one_line(
+def test_bucket_errors_are_one_line(
     lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lab.put_file(str(record(tmp_path / "good.mcap")), "lab/wrong/good.mcap")
@@ -310,9 +310,7 @@ def test_a_key_that_no_path_stands_for_is_not_taken_for_another(key: str, lab: A
             look(RemotePath(f"s3://{folder}"))
 
 
-def test_outputs_for_keys_with_signs_of_a_shell_or_a_terminal_stay_in_their_folder(
-    lab: Any, tmp_path: Path
-) -> None:
+def test_keys_with_special_characters_stay_in_the_output_folder(lab: Any, tmp_path: Path) -> None:
     names = ("$(touch x).mcap", "-rf.mcap", "a%2Fb.mcap", "C:\\x.mcap")
     hidden = ("../../up.mcap", "dir/../../../up.mcap", ".hidden.mcap")
     for name in (*names, *hidden):
@@ -323,7 +321,7 @@ def test_outputs_for_keys_with_signs_of_a_shell_or_a_terminal_stay_in_their_fold
     assert {task.out for task in tasks} == {tmp_path / "out" / name for name in names}
 
 
-def test_python_opens_and_writes_what_lies_in_a_bucket(lab: Any, tmp_path: Path) -> None:
+def test_python_api_reads_and_writes_buckets(lab: Any, tmp_path: Path) -> None:
     source = pictured(tmp_path / "py.mcap")
     lab.put(str(source), "lab/py/a.mcap")
     found = dmrl.open("s3://lab/py/a.mcap")

@@ -168,7 +168,7 @@ def site(inputs: Inputs) -> Iterator[Site]:
     get_filesystem.cache_clear()
 
 
-def test_a_recording_on_a_web_server_is_that_of_here(
+def test_recording_on_a_web_server_equals_the_local_file(
     site: Site, inputs: Inputs, tmp_path: Path
 ) -> None:
     for name, source in (("here", inputs.dots), ("there", site.url)):
@@ -181,7 +181,7 @@ def test_a_recording_on_a_web_server_is_that_of_here(
 
 
 @pytest.mark.parametrize("wrong", [pytest.param("endless", marks=pytest.mark.heavy), "more"])
-def test_what_a_server_sends_beyond_what_was_asked_is_not_read(wrong: str, site: Site) -> None:
+def test_server_bytes_beyond_the_request_are_not_read(wrong: str, site: Site) -> None:
     site.wrong = wrong
     for command in ("info", "check"):
         cli(command, site.url)
@@ -224,7 +224,7 @@ def test_a_server_that_drips_is_not_waited_for(site: Site, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("address", ["file:///etc/passwd", "s3://a/b", "http://127.0.0.1:1/a"])
-def test_a_server_leads_to_no_file_of_this_machine(address: str, site: Site) -> None:
+def test_redirects_to_local_files_are_refused(address: str, site: Site) -> None:
     site.wrong = f"leads {address}"
     for command in ("info", "check"):
         status, said = ended(lambda c=command: cli(c, site.url))
@@ -233,7 +233,7 @@ def test_a_server_leads_to_no_file_of_this_machine(address: str, site: Site) -> 
         os.fspath(to_path(site.url))
 
 
-def test_a_server_leads_to_no_inner_address_that_nobody_named(site: Site, inputs: Inputs) -> None:
+def test_redirects_to_internal_addresses_are_refused(site: Site, inputs: Inputs) -> None:
     """Another server of this machine, by its number, by its name, and mapped to IPv6."""
     secret = Site(b"secret")
     handler = type("Inner", (Handler,), {"site": secret})
@@ -283,9 +283,7 @@ def test_addresses_of_machines_and_private_networks_are_inner(address: str, inne
         ("changes", "changed while it was read"),
     ],
 )
-def test_a_copy_is_what_the_server_said_and_no_more(
-    wrong: str, said: str | None, site: Site
-) -> None:
+def test_local_copy_has_the_stated_size(wrong: str, said: str | None, site: Site) -> None:
     """As of a model, which a library opens by its name."""
     site.wrong = wrong
     if said is None:

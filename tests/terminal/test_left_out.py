@@ -4,7 +4,9 @@ from dmrl.errors import SourceError
 from dmrl.terminal.left_out import count_left_out, count_so_far, leave_out
 
 
-def test_things_are_counted_by_reason_and_said_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_omissions_are_counted_by_reason_and_reported_once(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with count_left_out() as held:
         for line in (3, 8, 9):
             leave_out("rows without a time", f"a.csv:{line}")

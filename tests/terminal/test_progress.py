@@ -20,7 +20,7 @@ def test_a_terminal_sees_a_bar(
     assert "Counting" in err
 
 
-def test_the_words_before_the_bar_may_follow_the_items(
+def test_progress_description_may_follow_the_items(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")
@@ -29,6 +29,6 @@ def test_the_words_before_the_bar_may_follow_the_items(
     assert "number 2" in capsys.readouterr().err
 
 
-def test_news_go_to_standard_error_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_messages_go_to_stderr_unchanged(capsys: pytest.CaptureFixture[str]) -> None:
     say("left out: [bold]3 " + "x" * 200)
     assert capsys.readouterr() == ("", "left out: [bold]3 " + "x" * 200 + "\n")

@@ -116,7 +116,7 @@ def test_rows_are_filtered_by_error_and_number(folder: Path, found: Path, rrd: P
     assert greys(rrd) == [40]
 
 
-def test_a_filter_that_leaves_nothing_says_what_there_is(
+def test_filter_without_matches_reports_the_error_range(
     folder: Path, found: Path, rrd: Path
 ) -> None:
     with pytest.raises(
@@ -135,7 +135,7 @@ def test_a_recording_of_other_images_is_refused(folder: Path, make: Make, rrd: P
         save([folder, make("blind.mcap", without=("detections",))], rrd, Settings())
 
 
-def test_what_is_no_dataset_is_named(tmp_path: Path, folder: Path, rrd: Path) -> None:
+def test_invalid_dataset_or_layout_is_reported(tmp_path: Path, folder: Path, rrd: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetError, match=r"empty is not a dataset"):
         save([tmp_path / "empty"], rrd, Settings())

@@ -25,7 +25,7 @@ def at(u_px: float, v_px: float, confidence: float = 0.0, sigma: float = 0.0) ->
     }
 
 
-def test_suspicion_is_high_where_a_label_and_a_sure_detection_miss_each_other() -> None:
+def test_suspicion_is_high_if_label_and_confident_detection_disagree() -> None:
     right = score_suspicion([at(50, 50)], [at(52, 51, 0.9)])
     moved = score_suspicion([at(50, 50)], [at(120, 51, 0.9)])
     missing = score_suspicion([], [at(120, 51, 0.9)])
@@ -58,7 +58,7 @@ def label(browser: Browser, row: int, k: int) -> dict[str, float]:
 @browser_only
 @pytest.mark.parametrize("width_px", [1200, 390])
 @pytest.mark.parametrize("what", ["dataset", "recording"])
-def test_what_a_person_does_on_the_desk_comes_back_in_the_dataset(
+def test_edits_on_the_label_desk_reach_the_dataset(
     seen: Path, tmp_path: Path, width_px: int, what: str
 ) -> None:
     given = ["set", "seen.mcap"] if what == "dataset" else ["seen.mcap"]

@@ -73,7 +73,7 @@ def test_a_recording_is_shown_with_its_own_detections(make: Make, tmp_path: Path
 
 
 @pytest.mark.heavy
-def test_what_the_page_names_is_left_out_and_provenance_says_so(
+def test_flagged_rows_are_omitted_and_recorded_in_provenance(
     built: Path, make: Make, tmp_path: Path
 ) -> None:
     write_flag_page([built], tmp_path / "flag.html", Settings())

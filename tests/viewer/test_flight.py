@@ -244,7 +244,7 @@ def test_images_come_first_and_wait_for_no_more_of_the_flight(
 
 
 @pytest.mark.heavy
-def test_trails_errors_and_ranges_do_not_depend_on_where_a_stretch_of_the_file_ends(
+def test_trails_errors_and_ranges_are_independent_of_batch_boundaries(
     fly: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def saved(name: str) -> dict[tuple[str, str], list[Any]]:
@@ -266,9 +266,7 @@ def test_trails_errors_and_ranges_do_not_depend_on_where_a_stretch_of_the_file_e
     assert [key for key, values in whole.items() if values != pieces[key]] == []
 
 
-def test_a_piloted_flight_shows_commands_maps_and_when_the_leader_was_not_seen(
-    tmp_path: Path, rrd: Path
-) -> None:
+def test_piloted_flight_shows_commands_maps_and_detection_gaps(tmp_path: Path, rrd: Path) -> None:
     flags = fly_stage.Flags(eye=Path("dmrl-nano"), camera_renderer="sketch", duration_s=1.0)
     settings = recipes.load("fly_follow", "fly", fly_stage.Settings, flags)
     fly_stage.run(tmp_path / "flight.mcap", settings)

@@ -65,7 +65,7 @@ def test_images_are_logged_as_they_are(make: Make, rrd: Path) -> None:
     assert kinds == ["image/jpeg", "image/png"] * 5
 
 
-def test_labels_say_peer_and_depth_and_disappear_with_the_peer(make: Make, rrd: Path) -> None:
+def test_labels_show_peer_and_depth_while_the_peer_is_visible(make: Make, rrd: Path) -> None:
     save([make()], rrd, Settings())
     texts = column(rrd, "/cf1/labels/truth/texts", "Points2D:labels")
     assert texts == [["cf2 1.25 m"]] * 9 + [[]]

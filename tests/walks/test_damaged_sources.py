@@ -27,7 +27,7 @@ def converted(source: Path, out: Path, kind: str | None = None) -> dict[str, int
 @pytest.mark.parametrize("damage", sources.DAMAGES, ids=lambda damage: damage.__name__)
 @pytest.mark.parametrize("kind", sources.KINDS)
 @pytest.mark.parametrize("said_kind", [False, True], ids=["guessed", "said"])
-def test_damage_is_refused_or_said(
+def test_damage_is_refused_or_reported(
     said_kind: bool,
     kind: str,
     damage: sources.Callable[[bytes], bytes],
@@ -55,7 +55,7 @@ def test_damage_is_refused_or_said(
 
 @pytest.mark.parametrize("damage", sources.DAMAGES, ids=lambda damage: damage.__name__)
 @pytest.mark.parametrize("name", ["posLabel.txt", "train.txt", "boxLabel.txt"])
-def test_damage_of_the_published_set_is_refused_or_said(
+def test_damage_of_the_published_set_is_refused_or_reported(
     name: str,
     damage: sources.Callable[[bytes], bytes],
     data: Path,

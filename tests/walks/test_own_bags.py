@@ -1,8 +1,7 @@
-"""A walk: bags of three robots of one's own, recorded with ROS, with motion capture beside them.
+"""Convert bags of three own robots, recorded with ROS, with motion capture beside them.
 
-Monday: the three kinds of bags there are. Tuesday: a driver that tells velocities in the frame of
-its odometry. Wednesday: robots that count from their own boot. Thursday: the log was set to zero
-at take-off, so that it begins before zero.
+Tested are the three formats of bags, velocities in the frame of odometry, robots whose clocks
+begin at their own boot, and a log that begins before time zero.
 """
 
 from pathlib import Path
@@ -35,7 +34,7 @@ def taken(source: Path, out: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap", "ros1"])
-def test_monday_every_kind_of_bag_says_the_same(flight: Flight, tmp_path: Path, kind: str) -> None:
+def test_all_bag_formats_give_equal_recordings(flight: Flight, tmp_path: Path, kind: str) -> None:
     if kind == "ros1":
         bag = Bag(flight, version=1).write(tmp_path / "flight.bag")
     else:
@@ -54,7 +53,7 @@ def test_monday_every_kind_of_bag_says_the_same(flight: Flight, tmp_path: Path, 
     assert links == sorted(f"/{a}/range/{b}" for a in ROBOTS for b in ROBOTS if a != b)
 
 
-def test_tuesday_velocities_in_the_frame_of_odometry(flight: Flight, tmp_path: Path) -> None:
+def test_odometry_velocities_are_rotated_to_the_robot(flight: Flight, tmp_path: Path) -> None:
     bag = Bag(flight, moving_frame="world").write(tmp_path / "flight")
     out = taken(bag, tmp_path / "flight.mcap")
     velocity = read_table(out, "/cf2/velocity")
@@ -67,7 +66,7 @@ def test_tuesday_velocities_in_the_frame_of_odometry(flight: Flight, tmp_path: P
 
 
 @pytest.mark.parametrize("reference", ["cf2", "mocap"])
-def test_wednesday_robots_count_from_their_own_boot(
+def test_robots_with_boot_clocks_are_aligned(
     flight: Flight, tmp_path: Path, reference: str
 ) -> None:
     born_s = {"cf1": 12.5, "cf2": 70.0, "cf3": 300.25}
@@ -90,7 +89,7 @@ def test_wednesday_robots_count_from_their_own_boot(
         assert np.median(kept) < 0.12
 
 
-def test_thursday_times_before_zero(flight: Flight, tmp_path: Path) -> None:
+def test_times_before_zero_are_refused(flight: Flight, tmp_path: Path) -> None:
     folder = tmp_path / "flight"
     folder.mkdir()
     for robot, peer in (("cf1", "cf2"), ("cf2", "cf1")):

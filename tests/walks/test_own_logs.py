@@ -1,7 +1,7 @@
-"""A walk: the logs of one's own drones, from the cards and the notebook's folder.
+"""Convert logs of own drones, from micro-SD cards and from a notebook's folder.
 
-Monday: micro-SD logs, whatever variables they were set to. Tuesday: flights that somebody else
-published as CSV. Wednesday: two robots whose clocks began at their own boots.
+Tested are micro-SD logs with any variables, flights that others published as CSV, and two robots
+whose clocks began at their own boots.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ from ..formats import plain_usd
 pytestmark = pytest.mark.slow
 
 
-def test_monday_every_card_gives_motion_or_a_reason(
+def test_every_sd_card_log_gives_motion_or_a_reason(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for card in sorted((data / "crazypad").glob("*_log*")):
@@ -32,7 +32,7 @@ def test_monday_every_card_gives_motion_or_a_reason(
         assert not [finding for finding in check(out) if finding.level == "error"]
 
 
-def test_tuesday_somebody_s_flights_are_known_by_their_columns(data: Path, tmp_path: Path) -> None:
+def test_third_party_csv_flights_are_read_by_column_map(data: Path, tmp_path: Path) -> None:
     for k, flight in enumerate(sorted((data / "nanobench").glob("*.csv")), 1):
         out = tmp_path / f"{flight.stem}.mcap"
         counts = convert.run(flight, out, convert.Settings(robot=f"cf{k}"))
@@ -46,9 +46,7 @@ def test_tuesday_somebody_s_flights_are_known_by_their_columns(data: Path, tmp_p
     assert [f.topic for f in check(tmp_path / "both.mcap") if "shares no time" in f.text]
 
 
-def test_wednesday_two_clocks_become_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_clocks_are_aligned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """cf2 was switched on 37 s after cf1, and both ranged to each other for a minute."""
     rng = np.random.default_rng(0)
     time_s = np.cumsum(rng.uniform(0.03, 0.05, 1500))

@@ -33,7 +33,7 @@ def pictures(tmp_path: Path) -> Path:
     return folder
 
 
-def test_the_week_ends_with_a_card_that_hides_nothing(
+def test_own_images_become_a_dataset_with_a_complete_card(
     pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = tmp_path / "hall.mcap"

@@ -77,12 +77,12 @@ def said(source: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
     return printed.err + "\n".join(line for line in warnings if "0 warnings" not in line)
 
 
-def test_right_units_are_not_doubted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_right_units_give_no_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert said(flight(tmp_path / "flight"), tmp_path / "out.mcap", capsys) == ""
 
 
 @pytest.mark.parametrize("name", UNITS)
-def test_another_unit_is_said_with_its_column(
+def test_wrong_unit_is_reported_with_its_column(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     column, factor = UNITS[name]

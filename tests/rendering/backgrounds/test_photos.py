@@ -39,7 +39,7 @@ def test_broken_photos_are_skipped_and_counted(folder: Path) -> None:
     assert photos.broken == 2
 
 
-def test_a_photo_is_averaged_or_sampled_in_the_middles_of_pixels(tmp_path: Path) -> None:
+def test_photo_is_area_averaged_or_point_sampled(tmp_path: Path) -> None:
     stripes = np.zeros((448, 640, 3), np.uint8)
     stripes[:, 1::4] = 252
     (tmp_path / "stripes.png").write_bytes(encode_png(stripes))
@@ -64,7 +64,7 @@ def test_a_folder_without_a_photo_is_refused(tmp_path: Path) -> None:
         open_photos(tmp_path / "none")
 
 
-def test_the_light_of_a_photo_follows_the_curve_of_screens() -> None:
+def test_photo_is_converted_from_srgb_to_linear_light() -> None:
     assert SRGB_TO_LINEAR[[0, 255]].tolist() == [0, 1]
     assert SRGB_TO_LINEAR[188] == pytest.approx(0.5, abs=0.01)
 
@@ -87,7 +87,7 @@ def test_the_camera_sees_the_right_part_of_a_panorama(
     assert middle[:2] == pytest.approx([column, row], abs=0.01)
 
 
-def test_a_smear_keeps_the_light_and_the_middle() -> None:
+def test_motion_blur_keeps_brightness_and_centroid() -> None:
     picture = np.zeros((11, 21, 3), np.float32)
     picture[5, 10] = 1
     out = apply_motion_blur(picture, (6.0, 0.0))

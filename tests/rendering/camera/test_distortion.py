@@ -55,6 +55,6 @@ def test_the_first_column_follows_the_last_around_a_panorama() -> None:
     assert found.tolist() == [2.5, 2.5, 5.5]
 
 
-def test_a_slip_of_the_pen_is_no_image_size() -> None:
+def test_oversized_image_is_refused() -> None:
     with pytest.raises(SettingError, match="100000x224 px are too large to render"):
         pinhole_canvas(replace(AIDECK, width_px=100_000, height_px=224))

@@ -23,7 +23,7 @@ def test_a_mosaic_keeps_what_each_pixel_measured() -> None:
     assert np.array_equal(back[::2, 1::2, 1], picture[::2, 1::2, 1])
 
 
-def test_a_blur_keeps_the_light_and_the_middle() -> None:
+def test_lens_blur_keeps_brightness_and_centroid() -> None:
     picture = np.zeros((31, 31, 1), np.float32)
     picture[15, 15] = 1
     out = gaussian_blur(picture, 1.5)

@@ -48,7 +48,7 @@ def test_white_noise_has_no_correlation_and_its_own_spread() -> None:
     )  # what taking the plane out of a block would make of it
 
 
-def test_noise_of_a_mosaic_is_as_coarse_as_it_is() -> None:
+def test_correlation_of_demosaiced_noise_is_measured() -> None:
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((800, 800), np.float32)
     both = 128 + noise + 0.5 * (np.roll(noise, 1, 0) + np.roll(noise, 1, 1))
@@ -62,7 +62,7 @@ def test_most_of_the_picture_may_have_texture() -> None:
     assert street.grain_correlation == pytest.approx(plain.grain_correlation, abs=0.03)
 
 
-def test_a_camera_has_one_grain_in_the_dark_and_in_the_light() -> None:
+def test_noise_estimate_is_independent_of_brightness() -> None:
     dim, bright = measured((40.0, 180.0), 0.0), measured((40.0, 180.0, 180.0, 180.0), 0.0)
     assert bright.grain == pytest.approx(dim.grain, rel=0.03)
 

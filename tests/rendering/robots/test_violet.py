@@ -9,7 +9,7 @@ from dmrl.rendering.robots.violet import FIT_OFFSET_Z_M, FIT_SCALE, VIOLET
 from dmrl.rendering.settings import Settings
 
 
-def test_it_has_four_motors_as_far_apart_as_fitted() -> None:
+def test_violet_has_four_motors_at_the_fitted_radius() -> None:
     mesh = VIOLET.build_mesh()
     motor = mesh.vertices[np.unique(mesh.faces[mesh.material == VIOLET.materials.index("motor")])]
     side = np.sign(motor[:, :2])

@@ -27,7 +27,7 @@ def transforms(xyz: list[list[float]], xyzw: list[list[float]]) -> pa.RecordBatc
 
 
 @pytest.mark.parametrize("bad", [*HOSTILE, 0.0])
-def test_poses_that_cannot_be_drawn_are_left_out_without_a_word(bad: float) -> None:
+def test_invalid_poses_are_omitted_without_warnings(bad: float) -> None:
     """A pose of numbers that are none, or a turn of length zero, between two sound ones."""
     still, turn = [1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0]
     with warnings.catch_warnings():

@@ -24,14 +24,14 @@ def test_no_text_stands_on_another() -> None:
         assert ((apart[:, 0] >= 80) | (apart[:, 1] >= 26)).all(), (tops, places)
 
 
-def test_texts_of_two_estimates_at_other_heights_do_not_meet() -> None:
+def test_texts_of_two_estimates_do_not_overlap() -> None:
     # The upper one's text has its own place, the lower one's would stand on it.
     tops = np.array([[100.0, 80.0], [110.0, 90.0]])
     places = _place_texts(tops, np.zeros(2, int), 320)
     assert abs(places[0, 1] - places[1, 1]) >= 320 / 12 - 0.5
 
 
-def test_of_detections_whose_texts_would_meet_the_surer_has_one() -> None:
+def test_more_confident_of_overlapping_detections_keeps_its_text() -> None:
     # Where, and how sure; the two images hold the same.
     near = [(100.0, 80.0, 0.5), (130.0, 90.0, 0.9), (130.0, 180.0, 0.6), (260.0, 90.0, 0.7)]
     found = [dict(zip(("u_px", "v_px", "confidence"), d, strict=True)) for d in near]

@@ -59,7 +59,7 @@ def test_a_picture_shows_the_image_nearest_to_the_time(
     assert list(tmp_path.glob("*.partial")) == []
 
 
-def test_without_a_vulkan_driver_a_picture_says_how_to_get_one(
+def test_missing_vulkan_driver_error_names_the_package(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):
@@ -69,7 +69,7 @@ def test_without_a_vulkan_driver_a_picture_says_how_to_get_one(
     assert list(tmp_path.glob("picture*")) == []
 
 
-def test_a_viewer_that_stops_is_reported_with_its_last_words(
+def test_viewer_that_stops_is_reported_with_its_output(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     code = "import sys; sys.exit('out of luck')"
@@ -87,12 +87,12 @@ def test_a_picture_is_never_overwritten(make: Make, tmp_path: Path) -> None:
     assert (tmp_path / "picture.png").read_bytes() == b"mine"
 
 
-def test_without_a_screen_the_window_says_what_else_there_is(make: Make) -> None:
+def test_missing_screen_error_names_alternatives(make: Make) -> None:
     with pytest.raises(SettingError, match=r"no screen.*--save, --screenshot or --serve"):
         show_in_window([make()], Settings())
 
 
-def test_the_viewer_is_told_to_listen_on_loopback_and_to_call_nobody() -> None:
+def test_viewer_listens_on_loopback_and_has_no_network() -> None:
     command, environment = (
         viewer_process.build_command("127.0.0.1"),
         viewer_process.build_environment(),
