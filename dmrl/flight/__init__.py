@@ -8,7 +8,8 @@ does not change the others.
 from dmrl.flight.faults import Fault
 from dmrl.flight.flight_arrays import Clock, Flight, Ranges, RobotLog, Truth
 from dmrl.flight.noise import NOISE, Noise
-from dmrl.flight.simulate import Scenario, simulate
+from dmrl.flight.plan import Scenario
+from dmrl.flight.stepped import simulate
 from dmrl.flight.trajectories import TRAJECTORIES, Trajectory
 
 __all__ = [

@@ -8,7 +8,7 @@ and /, in the order of the C: both give the same commands, bit for bit.
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from dmrl.flight.pilot import Command, Observation, Pilot, Task
+from dmrl.flight.pilot import Observation
 from dmrl.geometry.frames import AIDECK_PINHOLE, Camera
 
 CONSTANTS = {
@@ -31,6 +31,7 @@ CONSTANTS = {
     "UNSEEN_SHARE": 0.05,
     "EVIDENCE": 2.0,  # odds of a detection of confidence 0.5
     "FALSE_PER_M2": 0.12,
+    "GATE": 20.0,  # squared residual, in variances, beyond which a detection is another object's
     "TRUST_VAR": 0.1225,  # m^2, at which it flies at half its speed
     "GAIN": 1.2,
     "CLIMB_GAIN": 0.8,
@@ -91,10 +92,13 @@ class OnboardFilter:
         Distance to keep.
     camera
         Pinhole camera of the detections.
+    above_m
+        Height to keep above the leader.
     """
 
     distance_m: float
     camera: Camera = AIDECK_PINHOLE
+    above_m: float = 0.0
     pose: _Pose = _START
     past: list[_Pose] = field(default_factory=list)
     mean: list[float] = field(default_factory=list)
@@ -232,7 +236,8 @@ class OnboardFilter:
         ixx, ixy, iyy = syy / det, -sxy / det, sxx / det
         squared = rx * (ixx * rx + ixy * ry) + ry * (ixy * rx + iyy * ry)
         near = 1.0 + squared / 6.0  # a density with heavier tails than the Gaussian, without exp
-        return 1.0 / (6.283185307179586 * root(det) * near * near * near), rx, ry, ixx, ixy, iyy
+        density = 1.0 / (6.283185307179586 * root(det) * near * near * near)
+        return (0.0 if squared > _K["GATE"] else density), rx, ry, ixx, ixy, iyy
 
     def _update(
         self,
@@ -270,8 +275,8 @@ class OnboardFilter:
         to_x, to_y = x / away, y / away
         variance = 0.5 * (p[0][0] + p[1][1])
         trust = self.odds / (1.0 + self.odds) / (1.0 + variance / _K["TRUST_VAR"])
-        short = _K["GAIN"] * (away - self.distance_m)
-        wx, wy = trust * vx + short * to_x, trust * vy + short * to_y
+        go_x, go_y = self.aim(x, y, away)
+        wx, wy = trust * vx + go_x, trust * vy + go_y
         towards = wx * to_x + wy * to_y
         less = (1.0 - trust) * (max(towards, 0.0) + _K["RETREAT"])
         if away < _K["NEAR"]:
@@ -280,8 +285,19 @@ class OnboardFilter:
         near = max(away * away, _K["NEAR"] * _K["NEAR"])
         passing = trust * (x * drift_y - y * drift_x) / near
         turn = _K["TURN_GAIN"] * angle_of(x, y) + passing
-        climb = trust * _K["CLIMB_GAIN"] * (self.height_m - state.height_m)
+        climb = trust * _K["CLIMB_GAIN"] * (self.above_m + self.height_m - state.height_m)
         return (wx, wy, climb, turn)
+
+    def aim(self, x: float, y: float, away: float) -> tuple[float, float]:
+        """Return the velocity towards the wanted place, in the robot's horizontal frame.
+
+        Parameters
+        ----------
+        x, y, away
+            Place of the leader in that frame, and its distance.
+        """
+        short = _K["GAIN"] * (away - self.distance_m)
+        return short * (x / away), short * (y / away)
 
     def _is_stale(self, state: RobotState) -> bool:
         return state.time_s - self.image_s > _K["STALE_S"]
@@ -318,18 +334,6 @@ def angle_of(x: float, y: float) -> float:
     if x < 0.0:
         a = 3.141592653589793 - a
     return a if y >= 0.0 else -a
-
-
-class Onboard(Pilot):
-    """Follow the leader as ``pilot.c`` does, from the newest image's raw detections."""
-
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
-        self._filter = OnboardFilter(task.distance_m)
-
-    def command(self, seen: Observation) -> Command:
-        """Return the command of the filter."""
-        return Command(*self._filter.step(*to_raw(seen)))
 
 
 def to_raw(seen: Observation) -> tuple[RobotState, float, list[RawDetection]]:

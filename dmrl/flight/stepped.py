@@ -1,4 +1,4 @@
-"""Flights in steps: some robots fly commands, the others their trajectory.
+"""Simulated flights: some robots fly commands, step by step, the others their trajectory.
 
 The arrays have the length of the whole flight from the start, and are filled up to the present.
 """
@@ -9,12 +9,12 @@ from itertools import permutations
 import numpy as np
 
 from dmrl.errors import SettingError
-from dmrl.flight import sensors
+from dmrl.flight import fault_effects, sensors
 from dmrl.flight.faults import END_KINDS, Fault
 from dmrl.flight.flight_arrays import RATE_HZ, Flight, Ranges, RobotLog, Truth
 from dmrl.flight.noise import Noise
 from dmrl.flight.pilot import Command
-from dmrl.flight.simulate import Scenario, apply_faults, create_rng, draw_link, plan_flight
+from dmrl.flight.plan import Scenario, create_rng, draw_link, plan_flight
 from dmrl.flight.trajectories import GRAVITY_MPS2, VELOCITY_LAG_S, YAW_RATE_LAG_S
 from dmrl.geometry.frames import Array
 
@@ -30,8 +30,15 @@ _LAG = float(1 - np.exp(-1 / (RATE_HZ * VELOCITY_LAG_S)))
 _YAW_LAG = float(1 - np.exp(-1 / (RATE_HZ * YAW_RATE_LAG_S)))
 
 
+def simulate(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault] = ()) -> Flight:
+    """Simulate a whole flight at once; robots that fly commands hover. See `SteppedFlight`."""
+    return SteppedFlight(scenario, noise, seed, faults, scenario.samples).flight
+
+
 class SteppedFlight:
     """A flight that goes on by steps of 10 ms. The same commands give the same flight.
+
+    Faults change only the signals they name.
 
     Parameters
     ----------
@@ -43,6 +50,8 @@ class SteppedFlight:
         Seed of all random draws.
     faults
         Additional faults of sensors.
+    samples
+        Samples before the first command, in which all hover.
 
     Raises
     ------
@@ -51,7 +60,12 @@ class SteppedFlight:
     """
 
     def __init__(
-        self, scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault] = ()
+        self,
+        scenario: Scenario,
+        noise: Noise,
+        seed: int,
+        faults: Sequence[Fault] = (),
+        samples: int = 1,
     ) -> None:
         self.names, self.flown = scenario.names, scenario.names[: scenario.flown]
         for fault in faults:
@@ -59,7 +73,7 @@ class SteppedFlight:
                 raise SettingError(f"{fault}: a pilot flies it. Choose another robot for the fault")
         self._seed, self._plan = seed, plan_flight(scenario, noise, seed, faults)
         self.sample = -1
-        """Last sample that is there. -1: none yet."""
+        """Last sample that is there."""
         self.samples = scenario.samples
         count = range(scenario.robots)
         self._errors = [
@@ -79,7 +93,7 @@ class SteppedFlight:
         logs = {name: RobotLog(*np.full((7, self.samples), np.nan)) for name in self.names}
         self.flight = Flight(logs, self._plan.truth, {}, self._plan.clocks, self._plan.events)
         """Logs and truth up to the present; the ranges of the last step only."""
-        self.advance({})
+        self.advance({}, samples)
 
     @property
     def time_s(self) -> float:
@@ -94,7 +108,7 @@ class SteppedFlight:
         commands
             Command of each flown robot; without one it hovers.
         steps
-            Steps of 10 ms. The first one after the start gives the sample at time 0.
+            Steps of 10 ms.
         """
         first = self.sample + 1
         last = min(self.sample + steps, self.samples - 1)
@@ -119,18 +133,25 @@ class SteppedFlight:
             ranges[robot, peer] = sensors.measure_ranges(
                 truth[robot], truth[peer], clocks[robot], errors, slice(begin, end)
             )
-        apply_faults(
-            self._plan,
-            logs,
-            ranges,
-            lambda k: create_rng(self._seed, "fault", k, 1, part.start),
-            part,
-        )
+        self._apply_faults(logs, ranges, part)
         for name, log in logs.items():
             for column in RobotLog.__slots__:
                 getattr(self.flight.robots[name], column)[part] = getattr(log, column)
         self.flight.ranges.clear()
         self.flight.ranges.update(ranges)
+
+    def _apply_faults(
+        self, logs: dict[str, RobotLog], ranges: dict[tuple[str, str], Ranges], part: slice
+    ) -> None:
+        """Apply the faults of sensors to the logs and ranges of some samples, in place."""
+        for k, event in enumerate(self._plan.events):
+            robot = event.fault.robot
+            rng = create_rng(self._seed, "fault", k, 1, *([part.start] if part.start else []))
+            time_s = self._plan.truth[robot].time_s[part]
+            logs[robot] = fault_effects.apply_sensor_fault(rng, logs[robot], time_s, event)
+            for link in (link for link in ranges if event.affects_link(link)):
+                clock = self._plan.clocks[link[0]]
+                ranges[link] = fault_effects.apply_range_fault(rng, ranges[link], clock, event)
 
 
 def _place(

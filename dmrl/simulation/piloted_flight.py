@@ -20,7 +20,7 @@ from dmrl.errors import SettingError
 from dmrl.flight.flight_arrays import RATE_HZ, Flight, Ranges, RobotLog
 from dmrl.flight.pilot import Command, PeerTrack, Pilot, Task
 from dmrl.flight.pilots import find_pilot
-from dmrl.geometry.frames import AIDECK_PINHOLE, is_inside, project
+from dmrl.geometry.frames import AIDECK_PINHOLE, is_inside, pixels_from_horizontal, project
 from dmrl.images.codec import decode, encode_jpeg
 from dmrl.learn.pretrained import resolve_model_path
 from dmrl.prediction import describe_weights
@@ -34,7 +34,7 @@ from dmrl.samples.sample import (
     build_labels,
     round_samples,
 )
-from dmrl.simulation.eyes import Eye, IdealEye, NetworkEye
+from dmrl.simulation.eyes import IDEAL_CONFIDENCE, Eye, IdealEye, NetworkEye
 from dmrl.simulation.flight_samples import (
     JPEG_QUALITY,
     TRUTH_RATE_HZ,
@@ -235,7 +235,9 @@ class PilotedFlight:
         """Ask a pilot for its command."""
         seen = self._simulation.observe(drone.robot)
         if drone.eye is None:
-            seen = replace(seen, tracks=self._true_tracks(drone.robot), image_age_s=0.0)
+            tracks = self._true_tracks(drone.robot)
+            found = detect_tracks(tracks, seen.roll_rad, seen.pitch_rad)
+            seen = replace(seen, tracks=tracks, image_age_s=0.0, detections=found)
         else:
             seen = replace(
                 seen,
@@ -268,6 +270,17 @@ class PilotedFlight:
     def _log_time(self, robot: str, sample: int) -> int:
         clock = self._simulation.motion.flight.clocks[robot]
         return int(log_times(clock, np.array([sample / RATE_HZ]))[0])
+
+
+def detect_tracks(
+    tracks: Sequence[PeerTrack], roll_rad: float, pitch_rad: float
+) -> tuple[tuple[float, float, float, float], ...]:
+    """Return u, v, depth and a high confidence of every track ahead, in or out of the image."""
+    places = np.array([track.position_m for track in tracks])
+    roll, pitch = np.full(len(places), roll_rad), np.full(len(places), pitch_rad)
+    uv_px, depth_m, _ = pixels_from_horizontal(places, roll, pitch, AIDECK_PINHOLE)
+    rows = np.column_stack([uv_px, depth_m])[np.isfinite(depth_m) & (depth_m > 0)].tolist()
+    return tuple((u_px, v_px, depth, IDEAL_CONFIDENCE) for u_px, v_px, depth in rows)
 
 
 def check_command(robot: str, command: Command) -> Command:

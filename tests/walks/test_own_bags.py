@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from dmrl.errors import SourceError
+from dmrl.flight import Scenario, simulate
 from dmrl.flight.flight_arrays import Flight
 from dmrl.flight.noise import NOISE
-from dmrl.flight.simulate import Scenario, simulate
 from dmrl.recording import LoadedRecording, check, read_summary, read_table
 from dmrl.stages import align, convert, evaluate, label
 

@@ -184,6 +184,8 @@ static candidate_t compare(const pilot_t *pilot, const place_t *at, double age)
     squared = c.rx * (c.ixx * c.rx + c.ixy * c.ry) + c.ry * (c.ixy * c.rx + c.iyy * c.ry);
     near = 1.0 + squared / 6.0;
     c.density = 1.0 / (6.283185307179586 * root(det) * near * near * near);
+    if (squared > ${GATE})
+        c.density = 0.0;
     return c;
 }
 

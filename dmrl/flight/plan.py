@@ -1,8 +1,7 @@
-"""Simulation of a whole flight from a scenario, a noise preset and a seed."""
+"""Plan of a flight: motions, clocks and faults, from a scenario, a noise preset and a seed."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations
 
 import numpy as np
 from numpy.random import Generator
@@ -10,7 +9,7 @@ from numpy.random import Generator
 from dmrl.errors import SettingError
 from dmrl.flight import fault_effects, sensors, trajectories
 from dmrl.flight.faults import END_KINDS, Fault, FaultEvent, check_faults, schedule_fault
-from dmrl.flight.flight_arrays import RATE_HZ, Clock, Flight, Ranges, RobotLog, Truth
+from dmrl.flight.flight_arrays import RATE_HZ, Clock, Truth
 from dmrl.flight.noise import Noise
 from dmrl.flight.trajectories import TRAJECTORIES, Motion, Start, Trajectory
 from dmrl.geometry.frames import Array
@@ -73,44 +72,6 @@ class Scenario:
         return (self.samples - 1) / RATE_HZ
 
 
-def simulate(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault] = ()) -> Flight:
-    """Simulate a flight. The same arguments give the same flight.
-
-    Parameters
-    ----------
-    scenario
-        Robots, duration and trajectory.
-    noise
-        Errors of the sensors.
-    seed
-        Seed of all random draws.
-    faults
-        Additional faults. They change only the signals they name.
-
-    Raises
-    ------
-    SettingError
-        If the scenario is impossible, or a fault does not fit into it.
-    """
-    plan = plan_flight(scenario, noise, seed, faults)
-    names, truth, clocks = scenario.names, plan.truth, plan.clocks
-    robots = {}
-    for k, name in enumerate(names):
-        errors = sensors.draw_log_errors(create_rng(seed, "log", k), scenario.samples, noise)
-        robots[name] = sensors.measure_log(truth[name], plan.yaw_rate[name], clocks[name], errors)
-    ranges = {
-        (names[i], names[j]): sensors.measure_ranges(
-            truth[names[i]],
-            truth[names[j]],
-            clocks[names[i]],
-            draw_link(i, j, scenario, noise, seed),
-        )
-        for i, j in permutations(range(len(names)), 2)
-    }
-    apply_faults(plan, robots, ranges, lambda k: create_rng(seed, "fault", k, 1))
-    return Flight(robots, truth, ranges, clocks, plan.events)
-
-
 @dataclass(frozen=True, slots=True)
 class FlightPlan:
     """Scripted motion, clocks and faults of a flight, by name of the robot.
@@ -132,7 +93,7 @@ class FlightPlan:
 
 
 def plan_flight(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fault]) -> FlightPlan:
-    """Plan the motion of every robot, its clock and its faults; see `simulate`."""
+    """Plan the motion of every robot, its clock and its faults; see `SteppedFlight`."""
     _check_scenario(scenario)
     check_faults(faults, scenario.names, scenario.duration_s)
     events = tuple(
@@ -150,35 +111,6 @@ def plan_flight(scenario: Scenario, noise: Noise, seed: int, faults: Sequence[Fa
         clock = _draw_clock(create_rng(seed, "clock", k), k, noise)
         plan.clocks[name] = fault_effects.apply_clock_faults(clock, mine)
     return plan
-
-
-def apply_faults(
-    plan: FlightPlan,
-    robots: dict[str, RobotLog],
-    ranges: dict[tuple[str, str], Ranges],
-    rng_of: Callable[[int], Generator],
-    part: slice = slice(None),
-) -> None:
-    """Apply the faults of sensors to logs and ranges, in place.
-
-    Parameters
-    ----------
-    plan
-        Faults and truth of the flight.
-    robots, ranges
-        Logs, and ranges by (robot that ranges, robot that answers), of the flight or a part of it.
-    rng_of
-        Returns the random generator of the fault with this number.
-    part
-        Samples of the logs.
-    """
-    for k, event in enumerate(plan.events):
-        robot, rng = event.fault.robot, rng_of(k)
-        time_s = plan.truth[robot].time_s[part]
-        robots[robot] = fault_effects.apply_sensor_fault(rng, robots[robot], time_s, event)
-        for link in (link for link in ranges if event.affects_link(link)):
-            clock = plan.clocks[link[0]]
-            ranges[link] = fault_effects.apply_range_fault(rng, ranges[link], clock, event)
 
 
 def draw_link(i: int, j: int, scenario: Scenario, noise: Noise, seed: int) -> sensors.RangeErrors:
