@@ -25,7 +25,7 @@ EXTRAS = {
     "calibrate": "dmrl calibrate",
     "keras": "published .h5 weights",
     "view": "dmrl view; its API moves every release",
-    "plot": "figures of cards and evaluations",
+    "plot": "figures of evaluations, reports",
     "bayer": "raw pictures of the AI-deck",
     "ros": "ROS bags, in and out",
     "yolo": "data.yaml of YOLO sets",

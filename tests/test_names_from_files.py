@@ -82,6 +82,7 @@ REASONS = {
     "atomic_output.py: file": "what we wrote ourselves just now",
     "atomic_output.py: last": OURS,
     "atomic_output.py: path.name + PARTIAL_SUFFIX": GIVEN,
+    "card/figures.py: name": OURS,
     "html_report/collect.py: name": LISTED,
     "html_report/report_sections.py: name": LISTED,
     "html_report/recipe_figures.py: name": "only read, and nothing outside the folder",

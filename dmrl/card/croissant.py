@@ -4,101 +4,78 @@ Version 1.0 of MLCommons' vocabulary, https://docs.mlcommons.org/croissant/docs/
 """
 
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
-from dmrl.card.sections import COLUMN_MEANINGS
+from dmrl.card.describe import explain_column
+from dmrl.card.templating import fill_template
 from dmrl.datasets import Split, layout
-from dmrl.geometry.frames import STRIDE_PX
-from dmrl.recording import Provenance
+from dmrl.guards.bounded_parsing import parse_json
 
 CROISSANT_FILE = "croissant.json"
-CONTEXT = {
-    "@language": "en",
-    "@vocab": "https://schema.org/",
-    "cr": "http://mlcommons.org/croissant/",
-    "dct": "http://purl.org/dc/terms/",
-    "rai": "http://mlcommons.org/croissant/RAI/",
-    "sc": "https://schema.org/",
-    "conformsTo": "dct:conformsTo",
-    "data": {"@id": "cr:data", "@type": "@json"},
-    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "examples": {"@id": "cr:examples", "@type": "@json"},
-} | {
-    name: f"cr:{name}"
-    for name in (
-        *("citeAs", "column", "equivalentProperty", "extract", "field", "fileObject"),
-        *("fileProperty", "fileSet", "format", "includes", "isLiveDataset", "jsonPath", "key"),
-        *("md5", "parentField", "path", "recordSet", "references", "regex", "repeated"),
-        *("replace", "samplingRate", "separator", "source", "subField", "transform"),
-    )
-}
+CONTEXT_FILE = "croissant_context.json"
+"""The fixed beginning of the document: MLCommons' names of its keys."""
 ENCODING_FORMATS = {
-    "parquet": "application/x-parquet",
-    "arrow": "application/vnd.apache.arrow.stream",
+    True: "application/x-parquet",
+    False: "application/vnd.apache.arrow.stream",
 }
+"""Format of the shards, by whether they are Parquet, which Croissant's loaders read."""
 
 
-def build_croissant(
-    splits: Mapping[str, Split],
-    made: Provenance,
-    *,
-    title: str,
-    license_id: str,
-    licences: Mapping[str, str],
-    files: Mapping[str, Sequence[Path]],
-    parquet: bool,
-) -> str:
-    """Build the JSON document of a dataset.
-
-    Parameters
-    ----------
-    splits
-        By name.
-    made
-        Provenance of the dataset.
-    title, license_id
-        As on the card.
-    licences
-        Licences of the source files, by name of the file.
-    files
-        Shards of each split, relative to the document.
-    parquet
-        Shards are Parquet files, which Croissant's loaders read; else Arrow streams.
-    """
-    first = next(iter(splits.values()))
-    height_px, width_px = first.image_shape
+def build_croissant(about: Mapping[str, Any]) -> str:
+    """Build the JSON document of a dataset from the values of its card."""
+    splits, title = about["splits"], about["title"]
+    licences = about["facts"].licences if about["facts"] else {}
+    context = (Path(__file__).parent / CONTEXT_FILE).read_text(encoding="utf-8")
     document: dict[str, Any] = {
-        "@context": CONTEXT,
+        "@context": parse_json(context),
         "@type": "sc:Dataset",
         "name": title,
         "conformsTo": "http://mlcommons.org/croissant/1.0",
-        "description": f"{sum(map(len, splits.values()))} camera images of {width_px} x "
-        f"{height_px} px with the pixel position and depth of the peer robots in them. "
-        "Pixel-edge coordinates, metres along the optical axis, nanoseconds. See README.md.",
-        "license": license_id,
-        "creator": {"@type": "sc:Organization", "name": f"dmrl {made.dmrl_version}"},
+        "description": fill_template("croissant.txt", **about),
+        "license": about["license_id"],
+        "version": about["version"],
+        "citeAs": fill_template("citation.bib", **about, key=_name_citation(title)),
+        "creator": {"@type": "sc:Organization", "name": f"dmrl {about['made'].dmrl_version}"},
         "isBasedOn": [
             {"@type": "sc:CreativeWork", "name": name, "license": words}
             for name, words in sorted(licences.items())
         ],
-        "distribution": [_describe_files(name, files[name], parquet=parquet) for name in splits],
+        "distribution": [
+            _describe_files(name, about["files"][name], parquet=about["parquet"]) for name in splits
+        ],
         "recordSet": [_describe_rows(name, split) for name, split in splits.items()],
     }
+    if about["published"]:
+        document["datePublished"] = about["published"]
     return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
 
 
-def _describe_files(split: str, files: Sequence[Path], *, parquet: bool) -> dict[str, Any]:
+def _name_citation(title: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40] or "dataset"
+
+
+def read_publication_date(folder: Path) -> str | None:
+    """Return the date of publication in the document of a dataset; None without one."""
+    try:
+        found = parse_json((folder / CROISSANT_FILE).read_text(encoding="utf-8"))
+        return str(found["datePublished"])
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+
+
+def _describe_files(split: str, files: Sequence[str], *, parquet: bool) -> dict[str, Any]:
     return {
         "@type": "cr:FileSet",
         "@id": f"{split}-shards",
         "name": f"{split}-shards",
         "description": f"Shards of the split {split}.",
-        "encodingFormat": ENCODING_FORMATS["parquet" if parquet else "arrow"],
-        "includes": [file.as_posix() for file in files],
+        "encodingFormat": ENCODING_FORMATS[parquet],
+        "includes": list(files),
     }
 
 
@@ -113,50 +90,38 @@ def _describe_rows(name: str, split: Split) -> dict[str, Any]:
 
 
 def _iter_fields(name: str, split: Split) -> Iterator[dict[str, Any]]:
-    height_px, width_px = split.image_shape
-    sizes = {"height": height_px, "width": width_px, "stride": STRIDE_PX}
     for column in split.table.schema:
-        words = COLUMN_MEANINGS.get(column.name, "").format(**sizes)
-        field = _describe_field(f"{name}/{column.name}", column.name, words)
+        field = _describe_field(name, column.name, explain_column(column.name, split))
         if pa.types.is_list(column.type) and pa.types.is_struct(column.type.value_type):
-            yield field | {
-                "repeated": True,
-                "subField": list(_iter_peer_fields(name, column, sizes)),
-            }
+            inner = list(_iter_peer_fields(name, column, split))
+            yield field | {"repeated": True, "subField": inner}
             continue
         if pa.types.is_fixed_size_list(column.type):
             field["repeated"] = True
         path = "bytes" if column.name == layout.IMAGE else ""
-        yield field | {
-            "dataType": _name_data_type(column),
-            "source": _describe_source(name, column.name, path),
-        }
+        yield field | _describe_values(name, column.name, column, path)
 
 
 def _describe_field(place: str, name: str, words: str) -> dict[str, Any]:
-    return {"@type": "cr:Field", "@id": place, "name": name, "description": words}
+    return {"@type": "cr:Field", "@id": f"{place}/{name}", "name": name, "description": words}
 
 
-def _describe_source(split: str, column: str, path: str) -> dict[str, Any]:
+def _describe_values(split: str, column: str, values: pa.Field, path: str) -> dict[str, Any]:
+    """Describe the type of a column's values, and where they are."""
     source: dict[str, Any] = {
         "fileSet": {"@id": f"{split}-shards"},
         "extract": {"column": column},
     }
-    return source | ({"transform": {"jsonPath": path}} if path else {})
+    at = {"transform": {"jsonPath": path}} if path else {}
+    return {"dataType": _name_data_type(values), "source": source | at}
 
 
-def _iter_peer_fields(
-    split: str, column: pa.Field, sizes: Mapping[str, int]
-) -> Iterator[dict[str, Any]]:
+def _iter_peer_fields(name: str, column: pa.Field, split: Split) -> Iterator[dict[str, Any]]:
     """Yield the fields of a column with several peers per row, each as a list."""
     for inner in column.type.value_type:
-        where = f"{column.name}.{inner.name}"
-        field = _describe_field(f"{split}/{column.name}/{inner.name}", inner.name, "")
-        field["description"] = COLUMN_MEANINGS.get(where, "").format(**sizes)
-        yield field | {
-            "dataType": _name_data_type(inner),
-            "source": _describe_source(split, column.name, inner.name),
-        }
+        words = explain_column(f"{column.name}.{inner.name}", split)
+        field = _describe_field(f"{name}/{column.name}", inner.name, words)
+        yield field | _describe_values(name, column.name, inner, inner.name)
 
 
 def _name_data_type(column: pa.Field) -> str:

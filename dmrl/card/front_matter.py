@@ -1,14 +1,12 @@
 """The YAML front matter of a card, in the form that the Hugging Face Hub reads."""
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
 
-from dmrl.datasets import Split, layout
+from dmrl.datasets import layout
 from dmrl.errors import SettingError
 from dmrl.guards.bounded_parsing import parse_json
 
@@ -59,42 +57,13 @@ def check_license(text: str) -> None:
         ) from None
 
 
-def build_front_matter(
-    splits: dict[str, Split], title: str, license_id: str, files: Mapping[str, Sequence[Path]]
-) -> Iterator[str]:
-    """Yield the lines of the front matter, with the dashes around it.
-
-    Parameters
-    ----------
-    splits
-        By name.
-    title, license_id
-        For ``pretty_name`` and ``license``.
-    files
-        Parquet files of each split, relative to the card. ``datasets.load_dataset`` then ignores
-        other files, such as those of an interrupted ``--add``. Empty: Arrow dataset.
-    """
-    total = sum(map(len, splits.values()))
-    size = next((name for limit, name in SIZE_CATEGORIES.items() if total < limit), "n>1M")
-    schema = next(iter(splits.values())).table.schema
-    sizes = [
-        {"name": n, "num_bytes": s.table.nbytes, "num_examples": len(s)} for n, s in splits.items()
-    ]
-    front: dict[str, Any] = {
-        "pretty_name": title,
-        "license": license_id,
-        "task_categories": ["object-detection", "depth-estimation", "robotics"],
-        "size_categories": [size],
-        "tags": ["dmrl", "multi-robot", "relative-localization"],
-        "dataset_info": {"features": [_to_yaml_feature(f) for f in schema], "splits": sizes},
-    }
-    if files:
-        named = [{"split": name, "path": [p.as_posix() for p in files[name]]} for name in splits]
-        front["configs"] = [{"config_name": "default", "data_files": named}]
-    yield from ("---", *_format_yaml(front), "---", "")
+def name_size_category(images: int) -> str:
+    """Return the Hub's name of a number of images."""
+    return next((name for limit, name in SIZE_CATEGORIES.items() if images < limit), "n>1M")
 
 
-def _to_yaml_feature(column: pa.Field) -> dict[str, Any]:
+def to_yaml_feature(column: pa.Field) -> dict[str, Any]:
+    """Return a column as a feature of ``datasets``."""
     if column.name == layout.IMAGE:
         return {"name": column.name, "dtype": "image"}
     inner = _to_yaml_type(column.type)
@@ -103,27 +72,9 @@ def _to_yaml_feature(column: pa.Field) -> dict[str, Any]:
 
 def _to_yaml_type(kind: pa.DataType) -> Any:
     if pa.types.is_struct(kind):
-        return [_to_yaml_feature(f) for f in kind]
+        return [to_yaml_feature(f) for f in kind]
     if pa.types.is_fixed_size_list(kind):
         return {"list": _to_yaml_type(kind.value_type), "length": kind.list_size}
     if pa.types.is_list(kind):
         return {"list": _to_yaml_type(kind.value_type)}
     return layout.to_dtype_name(kind)
-
-
-def _format_yaml(value: Any, indent: int = 0) -> Iterator[str]:
-    # JSON scalars are YAML; only blocks are laid out here.
-    pad = " " * indent
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            block = isinstance(inner, dict | list)
-            yield (
-                f"{pad}{key}:" if block else f"{pad}{key}: {json.dumps(inner, ensure_ascii=False)}"
-            )
-            yield from _format_yaml(inner, indent + 2) if block else ()
-    else:
-        for item in value:
-            block = isinstance(item, dict | list)
-            first, *rest = _format_yaml(item, indent + 2) if block else (json.dumps(item),)
-            yield f"{pad}- {first.lstrip()}"
-            yield from rest

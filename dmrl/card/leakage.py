@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -9,7 +10,6 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from dmrl.datasets import Split
-from dmrl.guards.safe_names import escape_markdown, markdown_code
 
 SIMILAR_WITHIN_S = 1.0
 """Two images of one camera within this time count as similar, seconds."""
@@ -17,34 +17,25 @@ SAME_POSE_LIMITS = (1.0, 1.0, 0.01)
 """Largest difference of equal poses: u and v, pixels, and depth, metres."""
 
 
-def leakage_lines(splits: Mapping[str, Split]) -> Iterator[str]:
-    """Yield Markdown lines on the content that each other split shares with train."""
+def find_leaks(splits: Mapping[str, Split]) -> Iterator[dict[str, Any]]:
+    """Yield the content that each other split shares with train."""
     train = splits.get("train")
     for name, split in splits.items():
         if name == "train" or train is None or not len(split):
             continue
-        shared = sorted(set(_unique_texts(split, "source")) & set(_unique_texts(train, "source")))
-        place = ", ".join(map(markdown_code, shared)) or "no recording"
-        yield (
-            f"- {escape_markdown(name)} and train share {place}: images of one recording have "
-            "similar "
-            "places, light and backgrounds."
-        )
-        yield (
-            f"- {count_near_in_time(split, train)} of {len(split)} images of "
-            f"{escape_markdown(name)} were taken "
-            f"within {SIMILAR_WITHIN_S:g} s of one in train, by the same camera."
-        )
-        shared_poses, poses = count_same_poses(split, train)
-        yield (
-            f"- {shared_poses} of {poses} labels of {escape_markdown(name)} are within 1 px and 1 "
-            "cm of "
-            "one in train."
-        )
+        same_poses, poses = count_same_poses(split, train)
+        yield {
+            "split": name,
+            "images": len(split),
+            "shared": sorted(_unique_texts(split, "source") & _unique_texts(train, "source")),
+            "near": count_near_in_time(split, train),
+            "same_poses": same_poses,
+            "poses": poses,
+        }
 
 
-def _unique_texts(split: Split, column: str) -> list[str]:
-    return list(pc.unique(split.table[column]).to_pylist())
+def _unique_texts(split: Split, column: str) -> set[str]:
+    return set(pc.unique(split.table[column]).to_pylist())
 
 
 def count_near_in_time(split: Split, train: Split) -> int:

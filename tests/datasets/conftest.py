@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dmrl import card, topics
+from dmrl import topics
 from dmrl.images.codec import encode_png
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
@@ -30,12 +30,6 @@ def peer(**fields: Any) -> Any:
     """One peer of PeerLabels, inside the image unless told otherwise."""
     values = {"peer": "cf2", "u_px": 20.5, "v_px": 12.5, "depth_m": 1.5, "source": "truth"}
     return message_class("PeerLabel")(**{**values, **fields})
-
-
-@pytest.fixture(autouse=True)
-def figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cards without figures, which take longer than the rest; test_card.py draws them."""
-    monkeypatch.setattr(card, "plots", None)
 
 
 def recorder(folder: Path) -> Record:

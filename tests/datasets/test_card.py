@@ -13,9 +13,10 @@ import pytest
 from PIL import Image
 
 import dmrl
-from dmrl import card, plots
 from dmrl.card import write_card
-from dmrl.card.facts import Facts, provenance_lines, sensor_lines
+from dmrl.card.describe import describe_facts
+from dmrl.card.facts import Facts
+from dmrl.card.templating import fill_template
 from dmrl.errors import DatasetError, SettingError
 from dmrl.images.codec import encode_png
 from dmrl.stages import convert
@@ -49,12 +50,6 @@ def built(drawn: Path, tmp_path: Path) -> Path:
     return shutil.copytree(drawn, tmp_path / "out")
 
 
-@pytest.fixture
-def with_figures(figures: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cards of the test have figures."""
-    monkeypatch.setattr(card, "plots", plots)
-
-
 def front_of(folder: Path) -> Any:
     return yaml.safe_load((folder / "README.md").read_text().split("---\n")[1])
 
@@ -76,7 +71,7 @@ def test_it_counts_images_and_peers(built: Path) -> None:
     text = (built / "README.md").read_text()
     counts = re.findall(r"^\| (?:train|test) \| (\d+) \| (\d+) \| (\d+) \|", text, re.M)
     assert sorted(counts) == [("2", "1", "1"), ("3", "2", "3")]
-    assert re.search(r"^\| flight.mcap \| (train|test) \| 3 \|$", text, re.M)
+    assert re.search(r"^\| flight.mcap \| (train|test) \| 3 \| 60.0 % \|$", text, re.M)
 
 
 def test_every_column_has_a_meaning_with_its_unit(built: Path) -> None:
@@ -97,30 +92,23 @@ def test_card_lists_the_lineage_with_hashes(built: Path) -> None:
     assert "seed = 1" in text
 
 
-def test_figures_stand_beside_it_as_png_and_svg(built: Path) -> None:
+def test_figures_stand_beside_it(built: Path) -> None:
     text = (built / "README.md").read_text()
-    for name in ("depth", "position", "peers"):
-        assert f"](figures/{name}.png)" in text
-        with Image.open(built / "figures" / f"{name}.png") as image:
+    for name in ("depth.png", "position.png", "peers.png", "samples.jpg"):
+        assert f"](figures/{name})" in text
+        with Image.open(built / "figures" / name) as image:
             assert image.width >= 800
-        assert (built / "figures" / f"{name}.svg").read_text().startswith("<?xml")
-
-
-def test_figures_have_units_on_their_axes(built: Path) -> None:
-    # Text in SVG is drawn as paths; matplotlib keeps the words as comments.
-    assert "<!-- depth along the optical axis, m -->" in (built / "figures/depth.svg").read_text()
-    assert "<!-- u, px -->" in (built / "figures/position.svg").read_text()
 
 
 @pytest.mark.heavy
-def test_writing_it_again_gives_the_same_bytes(built: Path, with_figures: None) -> None:
+def test_writing_it_again_gives_the_same_bytes(built: Path) -> None:
     before = {p: p.read_bytes() for p in built.rglob("*") if p.is_file()}
     assert run_card(built, CardSettings()) == built / "README.md"
     assert {p: p.read_bytes() for p in built.rglob("*") if p.is_file()} == before
 
 
 def test_a_card_can_be_written_elsewhere_and_the_one_before_stays(
-    built: Path, with_figures: None, empty_figures: None, tmp_path: Path
+    built: Path, tmp_path: Path
 ) -> None:
     before = (built / "README.md").read_bytes()
     card = run_card(built, CardSettings(title="Elsewhere"), tmp_path / "card")
@@ -187,6 +175,16 @@ def test_title_and_license_can_be_given_and_stay(built: Path) -> None:
     run_card(built, CardSettings())
     front = front_of(built)
     assert (front["pretty_name"], front["license"]) == ('A "new" name', "mit")
+
+
+def test_the_day_of_publication_stays_and_must_be_a_date(built: Path) -> None:
+    run_card(built, CardSettings(published="2026-11-27"))
+    run_card(built, CardSettings(title="Named"))
+    about = json.loads((built / "croissant.json").read_text())
+    assert (about["datePublished"], about["version"]) == ("2026-11-27", "1.0.0")
+    assert "year = {2026}" in about["citeAs"] and "title = {Named}" in about["citeAs"]
+    with pytest.raises(SettingError, match="--published soon is not a date"):
+        run_card(built, CardSettings(published="soon"))
 
 
 @pytest.mark.parametrize("license_id", ["cc0-1.0", "Apache-2.0 OR MIT", "odc-by", "other"])
@@ -260,26 +258,16 @@ def test_many_recordings_are_a_few_lines_of_a_card() -> None:
     names = [f"{k:03d}.mcap" for k in range(100)]
     cameras = {f"{name}: cf1": "320 x 224 px" for name in names} | {"other.mcap: cf1": "64 x 48 px"}
     facts = Facts(used=dict.fromkeys(names, "truth"), findings={n: ["a bias"] for n in names})
-    lines = list(sensor_lines(replace(facts, cameras=cameras)))
+    values = describe_facts(replace(facts, cameras=cameras))
+    lines = fill_template("sensors.md", **values).splitlines()
     assert lines[1:] == [
         "- Camera of `000.mcap: cf1`, `001.mcap: cf1`, `002.mcap: cf1` and 97 more: 320 x 224 px.",
         "- Camera of `other.mcap: cf1`: 64 x 48 px.",
     ]
-    found = [line for line in provenance_lines(facts) if "a bias" in line or "more lines" in line]
+    every = fill_template("facts.md", **values).splitlines()
+    found = [line for line in every if "a bias" in line or "more lines" in line]
     assert len(found) == 21 and found[19] == "- `019.mcap`: a bias."
     assert found[20] == "- 80 more lines of this kind are in `facts.json`."
-
-
-def test_card_without_matplotlib_omits_figures_and_names_the_extra(
-    record: Record,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setattr(card, "plots", None)
-    run([record()], tmp_path / "out", Settings(split="none"))
-    assert "pip install 'dmrl[plot]', then dmrl card" in capsys.readouterr().err
-    assert "figures/" not in (tmp_path / "out" / "README.md").read_text()
 
 
 def test_a_dataset_without_any_peer_has_a_card(record: Record, tmp_path: Path) -> None:

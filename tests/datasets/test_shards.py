@@ -10,7 +10,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from dmrl import card
 from dmrl.datasets import open_dataset
 from dmrl.datasets.layout import MANIFEST_FILE, build_schema
 from dmrl.datasets.shards import open_shard
@@ -27,9 +26,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of four images. To be read only."""
     folder = tmp_path_factory.mktemp("shards")
     flight = recorder(folder)(peers=[[peer()] * k for k in (1, 2, 3, 1)])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(card, "plots", None)
-        run([flight], folder / "set", Settings())
+    run([flight], folder / "set", Settings())
     return folder / "set"
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dmrl import card
 from dmrl.datasets import open_dataset
 from dmrl.errors import DatasetError, SettingError, SourceError
 from dmrl.images.codec import encode_png
@@ -71,11 +70,6 @@ def write(path: Path, without_box: int | None = None) -> Path:
             sink.write(k * STEP_NS, CAMERA_IMAGE("cf1"), image)
             sink.write(k * STEP_NS, LABELS("cf1"), labels)
     return path
-
-
-@pytest.fixture(autouse=True)
-def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(card, "plots", None)
 
 
 @pytest.fixture

@@ -35,8 +35,6 @@ STAND_INS = {
     ),
     "index": (("dmrl.pipeline.process_pool:", "subprocess", "Processes"),),
     "report": (("matplotlib.figure:Figure", "draw", "blank"),),
-    "dataset": (("dmrl.card:", "plots", "nothing"),),
-    "card": (("dmrl.card:", "plots", "nothing"),),
     "quantize": (("dmrl.evaluation.quantization_report:", "plots", "nothing"),),
 }
 """By command: where, what, and the name in stand_ins.py of what takes its place."""

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from dmrl import card
 from dmrl.datasets import open_dataset
 from dmrl.evaluation import quantization_report
 from dmrl.images.codec import encode_png
@@ -54,9 +53,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def dots_dataset(dots: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset of the small flight."""
     out = tmp_path_factory.mktemp("dots-dataset") / "dots"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(card, "plots", None)  # figures take longer than the rest
-        dataset.run([dots], out, dataset.Settings())
+    dataset.run([dots], out, dataset.Settings())
     return out
 
 

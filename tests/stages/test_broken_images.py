@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dmrl import boundary, card
+from dmrl import boundary
 from dmrl.cli import app
 from dmrl.datasets import open_dataset
 from dmrl.errors import RecordingError
@@ -97,7 +97,6 @@ def test_predict_skips_broken_images(
 def test_dataset_skips_broken_images(
     run: Run, recording: Path, broken: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(card, "plots", None)
     rc, told, said = run("dataset", recording, tmp_path / "set", "--json", "--test-share", 0)
     assert (rc, told["left_out"]) == (0, {"cannot be decoded": 1})
     assert f"at {time_of(recording, broken)} ns" in said

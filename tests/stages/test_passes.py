@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 
-from dmrl import card, topics
+from dmrl import topics
 from dmrl.messages import message_class
 from dmrl.recording import RecordingWriter, build_provenance, check, merge, read_summary, trim
 from dmrl.recording.copying.chunk_copy import TopicSelection, copy_messages
@@ -65,7 +65,6 @@ def passes(monkeypatch: pytest.MonkeyPatch) -> Passes:
         return load(stream, index)
 
     monkeypatch.setattr(chunk_reader, "_load_chunk", counted)
-    monkeypatch.setattr(card, "plots", None)
 
     def count(path: Path) -> float:
         found = opened[path.name] / _chunks(path)

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl import card
 from dmrl.cli import app
 from dmrl.deploy.int8.layers import Conv
 from dmrl.deploy.int8.store import load_network
@@ -87,7 +86,6 @@ def test_images_of_another_size_are_refused(
 def test_constant_images_are_refused(
     settled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(card, "plots", None)
     recording = tmp_path / "plain.mcap"
     with RecordingWriter(recording, Provenance("test")) as sink:
         for k in range(4):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl import card, topics
+from dmrl import topics
 from dmrl.datasets import open_dataset
 from dmrl.errors import DatasetError, RecordingError, SettingError
 from dmrl.images.codec import encode_png
@@ -43,9 +43,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def folder(pictures: Path) -> Path:
     """The five images as a dataset."""
     out = pictures.with_name("set")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(card, "plots", None)
-        dataset_stage.run([pictures], out, dataset_stage.Settings(split="none"))
+    dataset_stage.run([pictures], out, dataset_stage.Settings(split="none"))
     return out
 
 
