@@ -10,7 +10,7 @@ __version__ = "0.3.0"
 disable_telemetry()  # dependencies read their switches when they are imported
 
 # Where each public name lives. `__init__.pyi` says the same to type checkers, a test holds them
-# together; imports here would be a circle, since every room asks for the version.
+# together; imports here would be a circle, since every package reads for the version.
 _PLACES = {
     "Data": "data",
     "Detection": "models",
