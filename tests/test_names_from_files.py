@@ -46,7 +46,6 @@ REASONS = {
     "datasets/layout.py: split": CHECKED_BEFORE,
     "datasets/manifest.py: f'{number:05d}'": OURS,
     "deploy/c/__init__.py: file": "named by c_name",
-    "deploy/c/run/compiled.py: f'{name}.c'": "named by c_name",
     "deploy/c/run/compiled.py: name": OURS,
     "deploy/c/run/measure.py: f'{name}.c'": "named by c_name",
     "deploy/c/run/measure.py: f'{name}.o'": "named by c_name",

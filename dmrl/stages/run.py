@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dmrl.errors import MissingExtra, SettingError
+from dmrl.storage import to_path
 from dmrl.terminal.arguments import AsJson, On, Recipe, Workers
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
@@ -31,17 +32,21 @@ def command(
 ) -> None:
     """Run the steps of a pipeline recipe whose outputs are not up to date, side by side.
 
+    RECIPE may be a recording that dmrl wrote: it is made again as OUT, from its provenance, and
+    both are compared.
+
     An output that is made again replaces the one before, which moves to previous/ in the folder.
     A recipe with figures, such as paper, ends with report.html in its folder.
 
     Parameters
     ----------
     recipe
-        A TOML file, or the name of a shipped recipe, such as published.
+        A TOML file, the name of a shipped recipe, such as published, or a recording.
     out
-        Folder for every output. Without it, the recipe's name.
+        Folder for every output. Without it, the recipe's name. For a recording, the new one.
     data
-        Folder with the data that the recipe reads and that does not ship with dmrl.
+        Folder with the data that the recipe reads and that does not ship with dmrl, or with
+        the inputs of a recording.
     network
         Network that the recipe benchmark scores, such as an ONNX file.
     labels
@@ -54,6 +59,9 @@ def command(
     from dmrl.evaluation.pipeline_summary import print_report
     from dmrl.pipeline import recipe_run as pipeline
 
+    if recipe.endswith(".mcap"):
+        _rebuild(to_path(recipe), out, data, as_json=as_json)
+        return
     folder = Path(Path(recipe).stem) if out is None else out
     given = _submitted("network", "name", network) | _submitted("labels", "csv", labels)
     if dry_run:
@@ -74,6 +82,22 @@ def command(
         print_line(
             f"{page}: open it in a browser" if page else f"On one page: dmrl report {folder}"
         )
+
+
+def _rebuild(source: Path, out: Path | None, data: Path | None, *, as_json: bool) -> None:
+    """Make a recording again, and print the differences."""
+    from dmrl.pipeline.rebuild import rebuild
+
+    if out is None:
+        raise SettingError(f"{source} is made again as another file. Name it: --out NEW.mcap")
+    found = rebuild(source, out, data)
+    if as_json:
+        print_json({"same": not found, "differences": [asdict(one) for one in found]})
+        return
+    if found:
+        rows = [(one.what, one.before, one.after) for one in found]
+        print_table("", ("came out otherwise", "before", "now"), rows)
+    print_line(f"{out}: {'differs from' if found else 'the same messages as'} {source}")
 
 
 def _print_forecast(found: "list[Forecast]", *, as_json: bool) -> None:

@@ -1,6 +1,6 @@
 """``dmrl trim``: a stretch of a recording, or some of its topics."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -88,6 +88,7 @@ def run(recording: Path, out: Path, settings: Settings) -> int:
         end_ns=high_ns,
         topics=settings.topic,
         only_decodable=settings.only_decodable,
+        origin=origin(recording, settings),
     )
 
 
@@ -96,7 +97,7 @@ def origin(recording: Path, settings: Settings) -> "Provenance":
     from dmrl.recording import build_provenance
 
     low_ns, high_ns = _compute_kept_ns(recording, settings)
-    kept = {"start_ns": low_ns, "end_ns": high_ns, "topics": list(settings.topic)}
+    kept = {**asdict(settings), "start_ns": low_ns, "end_ns": high_ns}
     return build_provenance("trim", kept, [recording])
 
 

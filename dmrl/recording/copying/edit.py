@@ -18,6 +18,7 @@ from dmrl.recording.copying.chunk_copy import (
 from dmrl.recording.log_times import read_log_times, read_time_spans
 from dmrl.recording.mcap.channel import RawMessage
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS
+from dmrl.recording.provenance import Provenance
 from dmrl.recording.provenance_inputs import build_provenance, refuse_duplicates
 from dmrl.recording.reader import match_topics, read_raw
 from dmrl.recording.summary import Summary, read_summary
@@ -105,6 +106,7 @@ def trim(
     end_ns: int | None = None,
     topics: Sequence[str] = (),
     only_decodable: bool = False,
+    origin: Provenance | None = None,
 ) -> int:
     """Write the messages of a time range, or of some topics, and return how many.
 
@@ -121,6 +123,8 @@ def trim(
         Topics or patterns to keep. Empty: all.
     only_decodable
         Leave out images that cannot be decoded.
+    origin
+        Provenance of ``out``. None: it has the settings above.
 
     Raises
     ------
@@ -131,10 +135,12 @@ def trim(
     """
     source = read_summary(path)
     topics_to_keep = match_topics(path, topics) if topics else frozenset(source.topics)
-    settings = {"start_ns": start_ns, "end_ns": end_ns, "topics": list(topics)}
+    if origin is None:
+        settings = {"start_ns": start_ns, "end_ns": end_ns, "topics": list(topics)}
+        origin = build_provenance("trim", settings, [path])
     low = source.start_ns if start_ns is None else max(start_ns, source.start_ns)
     high = MAX_TIME_NS if end_ns is None else end_ns
-    with RecordingWriter(out, build_provenance("trim", settings, [path])) as sink:
+    with RecordingWriter(out, origin) as sink:
         copy_metadata_and_attachments(source, sink)
         adopt_channels(path, topics_to_keep, sink)
         for raw in _iter_calibrations(path, topics_to_keep, low, high):
