@@ -139,7 +139,7 @@ class Disk:
         kill_s: float | None = None,
         most_bytes: int | None = None,
     ) -> Ending:
-        """Run a work of `works.WORKS` in a process of its own.
+        """Run a work of `works.WORKLOADS` in a process of its own.
 
         Parameters
         ----------

@@ -18,7 +18,7 @@ from dmrl.boundary import open_standard_streams
 
 from .disk import small_files
 from .ending import ended
-from .works import READS, WORKS, Inputs, work_named
+from .workloads import READS, WORKLOADS, Inputs, find_workload
 
 HANG_S = 300
 """A command that takes longer hangs, on a machine however busy."""
@@ -76,7 +76,7 @@ def _child(told: dict[str, Any], inputs: Inputs, told_in: Path) -> None:
 
 def run_work(inputs: Inputs, work: str, out: str, most_bytes: int | None) -> tuple[int, str]:
     """How a work ended."""
-    run = work_named(work).run
+    run = find_workload(work).run
     with small_files(most_bytes):
         return ended(lambda: run(inputs, Path(out)))
 
@@ -89,7 +89,7 @@ def run_mute(inputs: Inputs, work: str, out: str, stream: str) -> tuple[int, str
     sys.stdout = None  # type: ignore[assignment]
     open_standard_streams()
     kept = sys.stdout  # a child that forgets it would close 1, where it answers
-    run = (READS | {one.name: one.run for one in WORKS})[work]
+    run = (READS | {one.name: one.run for one in WORKLOADS})[work]
     try:
         return ended(lambda: run(inputs, Path(out)), mute=True)
     finally:
@@ -121,7 +121,7 @@ def run_together(inputs: Inputs, work: str, out: str, times: int) -> list[tuple[
 
 def prepare_work(inputs: Inputs, work: str, out: str) -> None:
     """Make what has to be there before it."""
-    before = work_named(work).before
+    before = find_workload(work).before
     if before is not None:
         before(inputs, Path(out))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from .ending import ended
 from .mutate import mutated
-from .works import Inputs, cli
+from .workloads import Inputs, cli
 
 Use = Callable[[Inputs, Path, Path], None]
 

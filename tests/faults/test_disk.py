@@ -8,13 +8,13 @@ import pytest
 
 from dmrl.cli import COMMANDS
 
-from .broken import Broken
 from .conftest import SHARE, Count, cases_of
 from .disk import KILL, Disk, Fault
-from .works import RECORD, WORKS, Work, work_named
+from .fault_trials import FaultTrials
+from .workloads import RECORD, WORKLOADS, Workload, find_workload
 
-SLOW = [pytest.param(work, id=work.name, marks=pytest.mark.slow) for work in WORKS]
-QUICK = [pytest.param(work, id=work.name) for work in WORKS if work.name == "trim"]
+SLOW = [pytest.param(work, id=work.name, marks=pytest.mark.slow) for work in WORKLOADS]
+QUICK = [pytest.param(work, id=work.name) for work in WORKLOADS if work.name == "trim"]
 KILLS = 50
 SIZES = 8
 AT_ONCE = 12
@@ -31,14 +31,14 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_every_command_that_writes_is_broken() -> None:
-    broken = {work.of for work in (*WORKS, RECORD)}
+    broken = {work.of for work in (*WORKLOADS, RECORD)}
     assert broken == COMMANDS.keys() - WRITES_NOTHING - IS_A_RUN
 
 
 @pytest.mark.slow
 def test_writes_of_c_libraries_reach_the_faulty_disk(disk: Disk, folder: Path) -> None:
     """Arrow opens and writes the tables of a dataset without Python."""
-    broken = Broken(work_named("dataset"), disk, folder, disk.inputs)
+    broken = FaultTrials(find_workload("dataset"), disk, folder, disk.inputs)
     failed = []
     for at in range(broken.sound.operations):
         broken.clear()
@@ -49,13 +49,13 @@ def test_writes_of_c_libraries_reach_the_faulty_disk(disk: Disk, folder: Path) -
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("work", [pytest.param(work, id=work.name) for work in WORKS])
-def test_every_command_succeeds_without_faults(work: Work, disk: Disk, folder: Path) -> None:
+@pytest.mark.parametrize("work", [pytest.param(work, id=work.name) for work in WORKLOADS])
+def test_every_command_succeeds_without_faults(work: Workload, disk: Disk, folder: Path) -> None:
     """What the slow ones begin with: a work that its command has outgrown is seen early."""
-    assert Broken(work, disk, folder, disk.inputs).whole
+    assert FaultTrials(work, disk, folder, disk.inputs).whole
 
 
-def broken_everywhere(broken: Broken, disk: Disk, count: Count, *, quick: bool) -> None:
+def broken_everywhere(broken: FaultTrials, disk: Disk, count: Count, *, quick: bool) -> None:
     """Every operation fails once with each error; ``quick``: with the next of them in turn.
 
     One process goes through many of them, as a program that uses dmrl would.
@@ -64,29 +64,29 @@ def broken_everywhere(broken: Broken, disk: Disk, count: Count, *, quick: bool) 
     for first in range(0, broken.sound.operations, AT_ONCE):
         last = min(first + AT_ONCE, broken.sound.operations)
         given = {"work": broken.work.name, "folder": str(broken.folder), "quick": quick}
-        broken.add(**disk.call("here:break_at", first=first, last=last, **given))
+        broken.add(**disk.call("in_process:break_at", first=first, last=last, **given))
     broken.report("the n-th operation fails", count)
 
 
 @pytest.mark.parametrize("work", QUICK)
-def test_every_operation_may_fail(work: Work, disk: Disk, folder: Path, count: Count) -> None:
-    broken_everywhere(Broken(work, disk, folder, disk.inputs), disk, count, quick=True)
+def test_every_operation_may_fail(work: Workload, disk: Disk, folder: Path, count: Count) -> None:
+    broken_everywhere(FaultTrials(work, disk, folder, disk.inputs), disk, count, quick=True)
 
 
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("work", SLOW)
 def test_every_operation_may_fail_in_every_way(
-    work: Work, disk: Disk, folder: Path, count: Count
+    work: Workload, disk: Disk, folder: Path, count: Count
 ) -> None:
-    broken_everywhere(Broken(work, disk, folder, disk.inputs), disk, count, quick=SHARE < 1)
+    broken_everywhere(FaultTrials(work, disk, folder, disk.inputs), disk, count, quick=SHARE < 1)
 
 
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("work", SLOW)
 def test_file_size_limit_of_the_kernel_is_reported(
-    work: Work, disk: Disk, folder: Path, count: Count
+    work: Workload, disk: Disk, folder: Path, count: Count
 ) -> None:
-    broken = Broken(work, disk, folder, disk.inputs)
+    broken = FaultTrials(work, disk, folder, disk.inputs)
     largest = max(map(len, broken.whole.values()))
     for size in np.unique(np.geomspace(1, largest, SIZES).astype(int) - 1).tolist():
         broken.clear()
@@ -96,7 +96,7 @@ def test_file_size_limit_of_the_kernel_is_reported(
     broken.report("no file may be larger (RLIMIT_FSIZE)", count)
 
 
-def killed(broken: Broken, count: Count, moments: int) -> None:
+def killed(broken: FaultTrials, count: Count, moments: int) -> None:
     """Kill it at a random operation, and at a random moment, in turn."""
     rng = np.random.default_rng(len(broken.work.name))
     for k in range(moments):
@@ -113,14 +113,14 @@ def killed(broken: Broken, count: Count, moments: int) -> None:
 
 @pytest.mark.parametrize("work", QUICK)
 def test_killed_command_leaves_no_partial_output(
-    work: Work, disk: Disk, folder: Path, count: Count
+    work: Workload, disk: Disk, folder: Path, count: Count
 ) -> None:
-    killed(Broken(work, disk, folder, disk.inputs), count, 6)
+    killed(FaultTrials(work, disk, folder, disk.inputs), count, 6)
 
 
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("work", SLOW)
 def test_command_killed_at_any_operation_leaves_no_partial_output(
-    work: Work, disk: Disk, folder: Path, count: Count
+    work: Workload, disk: Disk, folder: Path, count: Count
 ) -> None:
-    killed(Broken(work, disk, folder, disk.inputs), count, cases_of(KILLS))
+    killed(FaultTrials(work, disk, folder, disk.inputs), count, cases_of(KILLS))

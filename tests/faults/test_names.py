@@ -6,7 +6,7 @@ import pytest
 
 from .conftest import Count
 from .disk import Disk
-from .works import WORKS, Work, clear
+from .workloads import WORKLOADS, Workload, clear
 
 NAMES = ("\udcff", "\udcffof/x", "a\n$(touch b)", "-rf", "x" * 300, "a\0b", "of/none/x", "loop")
 """Of what is no text, a terminal's and a shell's orders, too long, and where nothing can be."""
@@ -25,9 +25,9 @@ def below(folder: Path) -> set[str]:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("work", WORKS, ids=lambda work: work.name)
+@pytest.mark.parametrize("work", WORKLOADS, ids=lambda work: work.name)
 def test_a_hostile_name_is_taken_or_refused_in_one_line(
-    work: Work, disk: Disk, tmp_path: Path, count: Count
+    work: Workload, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
     made = 0
     for name in NAMES:

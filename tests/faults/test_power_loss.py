@@ -15,7 +15,7 @@ from dmrl.datasets import open_dataset
 
 from .inputs import Inputs, cli, flights
 from .power_loss import Recorded
-from .works import contents
+from .workloads import contents
 
 pytestmark = [
     pytest.mark.slow,

@@ -18,11 +18,11 @@ from dmrl.simulation.drone_fleet import Fleet
 from dmrl.simulation.drone_fleet import fleet as fly_fleet
 from dmrl.stages import fake_drone, fly
 
-from .broken import Broken
 from .conftest import Count, cases_of
 from .disk import REFUSALS, Disk, Fault
 from .ending import ended
-from .works import RECORD, WORKS, Work, clear, work_named
+from .fault_trials import FaultTrials
+from .workloads import RECORD, WORKLOADS, Workload, clear, find_workload
 
 WRITERS = 6
 KILLS = 50
@@ -31,13 +31,13 @@ AWAY = ("cf1=30:45", "cf2=60:90", "cf3=120:121")
 """Robot, and between which seconds of the flight it is switched off."""
 
 
-def race(work: Work, disk: Disk, folder: Path, count: Count) -> None:
+def race(work: Workload, disk: Disk, folder: Path, count: Count) -> None:
     """Six processes write one output: one succeeds, the others say why not.
 
     What may be written again, as a card or a report, or is found to be done, as the steps of a
     pipeline, is no error for those who come later.
     """
-    broken = Broken(work, disk, folder, disk.inputs)
+    broken = FaultTrials(work, disk, folder, disk.inputs)
     broken.clear()
     given = {"work": work.name, "out": str(broken.out), "times": WRITERS}
     endings = disk.call("server:run_together", **given)
@@ -52,14 +52,14 @@ def race(work: Work, disk: Disk, folder: Path, count: Count) -> None:
 
 @pytest.mark.heavy
 def test_one_of_six_concurrent_writers_succeeds(disk: Disk, tmp_path: Path, count: Count) -> None:
-    race(work_named("trim"), disk, tmp_path / "disk", count)
+    race(find_workload("trim"), disk, tmp_path / "disk", count)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("work", WORKS, ids=lambda work: work.name)
+@pytest.mark.parametrize("work", WORKLOADS, ids=lambda work: work.name)
 def test_one_of_six_concurrent_writers_of_each_command_succeeds(
-    work: Work, disk: Disk, tmp_path: Path, count: Count
+    work: Workload, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
     race(work, disk, tmp_path / "disk", count)
 

@@ -16,7 +16,7 @@ from dmrl.formats.registry import load_builtin_formats
 from ..formats.test_fuzz import SOURCES
 from .conftest import Count
 from .ending import ended
-from .works import cli
+from .workloads import cli
 
 GB = 1 << 30
 HANG_S = 1200

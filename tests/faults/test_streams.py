@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from .broken import Broken
 from .conftest import Count
 from .disk import Disk
-from .works import READS, WORKS, Work, clear
+from .fault_trials import FaultTrials
+from .workloads import READS, WORKLOADS, Workload, clear
 
 STREAMS = ("full", "closed")
 QUICK = ("info", "find as JSON")
@@ -43,11 +43,11 @@ def test_full_or_closed_stdout_of_each_reading_command_gives_one_line_error(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("work", WORKS, ids=lambda work: work.name)
+@pytest.mark.parametrize("work", WORKLOADS, ids=lambda work: work.name)
 def test_a_command_that_cannot_speak_has_done_its_work_or_nothing(
-    work: Work, disk: Disk, tmp_path: Path, count: Count
+    work: Workload, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
-    broken = Broken(work, disk, tmp_path / "disk", disk.inputs)
+    broken = FaultTrials(work, disk, tmp_path / "disk", disk.inputs)
     for stream in STREAMS:
         broken.clear()
         given = {"work": work.name, "out": str(broken.out), "stream": stream}

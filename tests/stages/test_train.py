@@ -282,6 +282,7 @@ def test_the_last_images_of_a_recording_are_held_out(dots_dataset: Path) -> None
     )
 
 
+@pytest.mark.heavy
 def test_shares_are_of_recordings_by_name(dots_dataset: Path, tmp_path: Path) -> None:
     run(dots_dataset, tmp_path / "run", replace(SETTINGS, shares={"dots*": 0.7}))
     with pytest.raises(SettingError, match=r"no images left for flight-\*.*are dots\.mcap"):
@@ -290,6 +291,7 @@ def test_shares_are_of_recordings_by_name(dots_dataset: Path, tmp_path: Path) ->
         run(dots_dataset, tmp_path / "b", replace(SETTINGS, shares={"*": 0.0}))
 
 
+@pytest.mark.heavy
 def test_flags_win_over_the_recipe(dots_dataset: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine.toml"
     mine.write_text(
@@ -306,6 +308,7 @@ def test_a_flag_out_of_range_is_one_line() -> None:
         recipe.load("dmrl_nano", "train", Settings, Flags(epochs=-1))
 
 
+@pytest.mark.heavy
 def test_no_epochs_calibrate_a_model_and_train_nothing(dots_dataset: Path, tmp_path: Path) -> None:
     none = Flags(epochs=0, device="cpu")
     with pytest.raises(SettingError, match="epochs: 0 trains nothing"):

@@ -212,7 +212,7 @@ def test_a_flight_without_ranges_is_ambiguous() -> None:
 
 
 def test_pairs_of_different_length_are_estimated_together_as_alone() -> None:
-    pairs = [pair_of(flown("in_view", "calibrated", 1000 + k, 20.0 + k)) for k in range(2)]
+    pairs = [pair_of(flown("in_view", "calibrated", 1000 + k, 4.0 + k)) for k in range(2)]
     together = estimate_pairs(pairs)
     for pair, (estimate, _) in zip(pairs, together, strict=True):
         ((alone, _),) = estimate_pairs([pair])

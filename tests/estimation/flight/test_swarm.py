@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.flight import windows
-from dmrl.estimation.flight.pairs import estimate_pairs
+from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
 from dmrl.estimation.flight.swarm import estimate_swarm, is_inconsistent
 from dmrl.estimation.model.pair import Pair, SensorTrack
 from dmrl.estimation.model.status import AMBIGUOUS, OK
-from dmrl.estimation.solver.estimate import Estimate
+from dmrl.estimation.solver.estimate import Estimate, seen_from_peer
 from dmrl.flight import NOISE, Fault, Flight, Scenario, Trajectory, simulate
 
 from ..flights import pair_of, truth_at
@@ -97,10 +97,11 @@ def test_an_observer_that_stands_still_has_no_bearings() -> None:
 
 
 def test_swarm_solve_leaves_a_single_pair_unchanged() -> None:
-    _, pairs, both, _ = solved("random", "realistic")
     names = ("cf1", "cf2")
-    alone = {n: both[n] for n in (names, names[::-1])}
-    assert estimate_swarm({names: pairs[names]}, alone) == alone
+    pair = pair_of(simulate(Scenario(2, 10.0), NOISE["realistic"], 1))
+    (estimate,) = estimate_ekf([pair], "published-sim")
+    alone = {names: estimate, names[::-1]: seen_from_peer(estimate)}
+    assert estimate_swarm({names: pair}, alone) == alone
 
 
 @pytest.mark.heavy

@@ -1,4 +1,4 @@
-"""Works broken in one process, one after the other: a child of the process of server.py."""
+"""Inject faults into workloads in one process, one after the other: a child of server.py."""
 
 import mmap
 import os
@@ -7,22 +7,22 @@ import time
 from pathlib import Path
 from typing import Any
 
-from .broken import Broken
 from .disk import Ending, Fault, Orders, small_files
 from .ending import ended
+from .fault_trials import FaultTrials
 from .inputs import Inputs
-from .works import work_named
+from .workloads import find_workload
 
 HANG_S = 300
 
 
-class Here:
-    """The disk of disk.c, and works that are run in this very process.
+class InProcess:
+    """Run workloads in this process, on the disk of disk.c.
 
     Parameters
     ----------
     inputs
-        What the works are given.
+        Inputs of the workloads.
     """
 
     def __init__(self, inputs: Inputs) -> None:
@@ -41,11 +41,11 @@ class Here:
         kill_s: float | None = None,
         most_bytes: int | None = None,
     ) -> Ending:
-        """As `Disk.run`, but that nothing is killed here."""
+        """Run a workload as `Disk.run` does, without killing it."""
         assert kill_s is None
         begun_s = time.monotonic()
         signal.alarm(HANG_S)  # ends this process
-        run = work_named(work).run
+        run = find_workload(work).run
         self.orders.order(folder, fault)
         try:
             with small_files(most_bytes):
@@ -58,8 +58,8 @@ class Here:
         return Ending(status, said, self.orders.count, failed, time.monotonic() - begun_s)
 
     def prepare(self, work: str, folder: Path, out: str) -> None:
-        """Make what has to be there before a work."""
-        before = work_named(work).before
+        """Make what a workload needs before it starts."""
+        before = find_workload(work).before
         if before is not None:
             before(self.inputs, folder / out)
 
@@ -67,8 +67,10 @@ class Here:
 def break_at(
     inputs: Inputs, work: str, folder: str, first: int, last: int, quick: bool
 ) -> dict[str, Any]:
-    """Let each of these operations of a work fail: what came of it, for `Broken.add`."""
-    broken = Broken(work_named(work), Here(inputs), Path(folder), inputs.folder, times=1)
+    """Let each of these operations of a workload fail; return the counts for `FaultTrials.add`."""
+    broken = FaultTrials(
+        find_workload(work), InProcess(inputs), Path(folder), inputs.folder, times=1
+    )
     broken.break_at(range(first, last), quick=quick)
     return {
         "cases": broken.cases,

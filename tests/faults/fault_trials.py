@@ -1,4 +1,4 @@
-"""One work that is broken again and again, and what came of it."""
+"""Inject faults into one workload again and again, and count the results."""
 
 import errno
 import time
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from .disk import REFUSALS, Ending, Fault
-from .works import Work, clear, contents
+from .workloads import Workload, clear, contents
 
 STAYING = (errno.ENOSPC, errno.EIO, errno.EROFS)
 """Of these every second stays: the disk is full, broken or read-only from there on."""
@@ -15,7 +15,7 @@ PATIENCE_S = 30.0
 
 
 class Runner(Protocol):
-    """What runs works on a disk that fails: `Disk`, in processes of their own, or `Here`."""
+    """Runner of workloads on a disk that fails: `Disk` in child processes, or `InProcess`."""
 
     def run(
         self,
@@ -27,32 +27,32 @@ class Runner(Protocol):
         kill_s: float | None = None,
         most_bytes: int | None = None,
     ) -> Ending:
-        """How it ended."""
+        """Run a workload and return how it ended."""
 
     def prepare(self, work: str, folder: Path, out: str) -> None:
-        """Make what has to be there before it."""
+        """Make what a workload needs before it starts."""
 
 
-class Broken:
-    """A work, what it gives undisturbed, and what was counted.
+class FaultTrials:
+    """A workload, its outputs without faults, and the counts of its trials.
 
     Parameters
     ----------
     work
-        The work.
+        The workload.
     disk
-        What runs it.
+        Runner of the workload.
     folder
         The disk.
     inputs
-        A folder that no work may change.
+        A folder that no workload may change.
     times
-        How often it is run undisturbed: twice, where the first makes the inputs, and loads what
+        How often it is run without faults: twice, where the first makes the inputs, and loads what
         the command imports.
     """
 
     def __init__(
-        self, work: Work, disk: Runner, folder: Path, inputs: Path, times: int = 2
+        self, work: Workload, disk: Runner, folder: Path, inputs: Path, times: int = 2
     ) -> None:
         self.work, self.disk, self.folder = work, disk, folder
         self.out = folder / work.out
@@ -69,7 +69,7 @@ class Broken:
         self._inputs = (inputs, contents(inputs))
 
     def clear(self) -> None:
-        """The disk as it was before."""
+        """Restore the disk to its first state."""
         clear(self.folder)
         if self.work.before:
             self.disk.prepare(self.work.name, self.folder, self.work.out)

@@ -1,4 +1,4 @@
-"""Every command that writes, on inputs so small that it can be broken hundreds of times."""
+"""Every command that writes, on inputs so small that hundreds of fault trials are cheap."""
 
 import pickle
 import shutil
@@ -21,7 +21,7 @@ Run = Callable[[Inputs, Path], object]
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
+class Workload:
     """A command that writes.
 
     Parameters
@@ -125,44 +125,46 @@ def _record(i: Inputs, out: Path) -> None:
         cli("record", out, *named, "--duration-s", RECORD_S)
 
 
-WORKS = (
-    Work("sketch", lambda i, out: cli("sketch", out, "--images", 2), "pictures"),
-    Work("convert", lambda i, out: cli("convert", i.pictures, out), "a.mcap"),
-    Work("convert to csv", lambda i, out: cli("convert", i.moment, out, "--to", "csv"), "tables"),
-    Work("convert to ros2", lambda i, out: cli("convert", i.dots, out, "--to", "ros2"), "bag"),
-    Work("trim", lambda i, out: cli("trim", i.dots, out, "--to-s", 0.9), "a.mcap"),
-    Work(
+WORKLOADS = (
+    Workload("sketch", lambda i, out: cli("sketch", out, "--images", 2), "pictures"),
+    Workload("convert", lambda i, out: cli("convert", i.pictures, out), "a.mcap"),
+    Workload(
+        "convert to csv", lambda i, out: cli("convert", i.moment, out, "--to", "csv"), "tables"
+    ),
+    Workload("convert to ros2", lambda i, out: cli("convert", i.dots, out, "--to", "ros2"), "bag"),
+    Workload("trim", lambda i, out: cli("trim", i.dots, out, "--to-s", 0.9), "a.mcap"),
+    Workload(
         "trim a folder",
         lambda i, out: cli("trim", i.flights, out, "--to-s", 0.9, "--workers", 1),
         "flights",
         pieces=True,
     ),
-    Work("merge", lambda i, out: cli("merge", i.dots, i.seen, out), "a.mcap"),
-    Work("recover", lambda i, out: cli("recover", i.cut, out), "a.mcap"),
-    Work(
+    Workload("merge", lambda i, out: cli("merge", i.dots, i.seen, out), "a.mcap"),
+    Workload("recover", lambda i, out: cli("recover", i.cut, out), "a.mcap"),
+    Workload(
         "fly",
         lambda i, out: cli("fly", "fly_in_view", out, "--duration-s", 1, "--seed", 1),
         "a.mcap",
     ),
-    Work("label", lambda i, out: cli("label", i.flight, out), "a.mcap"),
-    Work("align", lambda i, out: cli("align", i.pair, out), "a.mcap"),
-    Work("track", lambda i, out: cli("track", i.seen, out), "a.mcap"),
-    Work(
+    Workload("label", lambda i, out: cli("label", i.flight, out), "a.mcap"),
+    Workload("align", lambda i, out: cli("align", i.pair, out), "a.mcap"),
+    Workload("track", lambda i, out: cli("track", i.seen, out), "a.mcap"),
+    Workload(
         "calibrate",
         lambda i, out: cli("calibrate", i.boards, out, "--board", "7x5"),
         "camera.toml",
     ),
-    Work(
+    Workload(
         "likeness",
         lambda i, out: cli("likeness", i.dots, out / "like.toml"),
         "like",
         before=lambda _, out: out.mkdir(),
         pieces=True,
     ),
-    Work("dataset", lambda i, out: cli("dataset", i.dots, out), "set"),
-    Work("dataset to parquet", lambda i, out: cli("dataset", i.dots, out, "--parquet"), "set"),
-    Work("dataset --add", _grow, "set", before=_copied, pieces=True, reads=_rows_read),
-    Work(
+    Workload("dataset", lambda i, out: cli("dataset", i.dots, out), "set"),
+    Workload("dataset to parquet", lambda i, out: cli("dataset", i.dots, out, "--parquet"), "set"),
+    Workload("dataset --add", _grow, "set", before=_copied, pieces=True, reads=_rows_read),
+    Workload(
         "dataset --add to parquet",
         _grow,
         "set",
@@ -170,21 +172,21 @@ WORKS = (
         pieces=True,
         reads=_rows_read,
     ),
-    Work("card", _card, "set", before=_copied, pieces=True),
-    Work("predict", lambda i, out: cli("predict", i.model, i.dots, out), "a.mcap"),
-    Work("evaluate", lambda i, out: cli("evaluate", i.found, "--plots", out), "plots"),
-    Work("score", lambda i, out: cli("score", out, "--name", "mine"), "score.json"),
-    Work("index", lambda i, out: cli("index", out), "set", before=flights, pieces=True),
-    Work("report", lambda i, out: cli("report", i.flights, out), "a.html"),
-    Work("train", _train, "model", keeps=True),
-    Work("quantize", lambda i, out: cli("quantize", i.model, i.set, out), "int8"),
-    Work("export", lambda i, out: cli("export", i.int8, out), "c"),
-    Work("verify", _verify, "proof.json"),
-    Work("render", _render, "a.mcap", keeps=True),
-    Work("view", lambda i, out: cli("view", i.dots, "--save", out), "a.rrd", same=False),
-    Work("run", lambda i, out: cli("run", i.chain, "--out", out), "chain", pieces=True),
+    Workload("card", _card, "set", before=_copied, pieces=True),
+    Workload("predict", lambda i, out: cli("predict", i.model, i.dots, out), "a.mcap"),
+    Workload("evaluate", lambda i, out: cli("evaluate", i.found, "--plots", out), "plots"),
+    Workload("score", lambda i, out: cli("score", out, "--name", "mine"), "score.json"),
+    Workload("index", lambda i, out: cli("index", out), "set", before=flights, pieces=True),
+    Workload("report", lambda i, out: cli("report", i.flights, out), "a.html"),
+    Workload("train", _train, "model", keeps=True),
+    Workload("quantize", lambda i, out: cli("quantize", i.model, i.set, out), "int8"),
+    Workload("export", lambda i, out: cli("export", i.int8, out), "c"),
+    Workload("verify", _verify, "proof.json"),
+    Workload("render", _render, "a.mcap", keeps=True),
+    Workload("view", lambda i, out: cli("view", i.dots, "--save", out), "a.rrd", same=False),
+    Workload("run", lambda i, out: cli("run", i.chain, "--out", out), "chain", pieces=True),
 )
-RECORD = Work("record", _record, "a.mcap", keeps=True, same=False)
+RECORD = Workload("record", _record, "a.mcap", keeps=True, same=False)
 """Apart from the others: it writes what comes in, and that is never the same."""
 READS: dict[str, Run] = {
     "info": lambda i, _: cli("info", i.dots),
@@ -202,9 +204,9 @@ READS: dict[str, Run] = {
 """Commands that only say something."""
 
 
-def work_named(name: str) -> Work:
+def find_workload(name: str) -> Workload:
     """The work of that name."""
-    return next(work for work in (*WORKS, RECORD) if work.name == name)
+    return next(work for work in (*WORKLOADS, RECORD) if work.name == name)
 
 
 def contents(path: Path) -> dict[str, bytes]:
