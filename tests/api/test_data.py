@@ -13,7 +13,7 @@ from dmrl.errors import DatasetError, MissingSplit
 
 
 @pytest.mark.heavy
-def test_splits_rows_and_arrays(data: Path) -> None:
+def test_dataset_rows_equal_arrays_of_the_split(data: Path) -> None:
     found = dmrl.dataset(data)
     split = open_dataset(data).split("train")
     rows = found["train"]
@@ -37,7 +37,7 @@ def test_a_frame_has_the_peers(data: Path) -> None:
     assert set(frame["label_source"].dropna()) == {"truth"}
 
 
-def test_the_loader_gives_what_single_rows_give(data: Path) -> None:
+def test_loader_batches_equal_single_rows(data: Path) -> None:
     rows = dmrl.dataset(data)["train"]
     batches = list(rows.loader(4))
     images = torch.cat([batch["image"] for batch in batches])

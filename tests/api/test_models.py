@@ -25,7 +25,7 @@ def test_detections_are_those_of_predict(flight: Path, tmp_path: Path) -> None:
     assert all(d.confidence >= model.threshold for image in model.detect(images) for d in image)
 
 
-def test_one_image_is_a_sequence_of_one(flight: Path) -> None:
+def test_one_image_is_treated_as_a_batch_of_one(flight: Path) -> None:
     model = dmrl.load("dmrl-nano")
     images = dmrl.open(flight).images("cf1")
     assert model.detect(images[0], threshold=0.01) == model.detect(images[:1], threshold=0.01)

@@ -33,7 +33,7 @@ def test_a_topic_as_arrow_pandas_and_numpy_is_the_same(flight: Path) -> None:
     )
 
 
-def test_a_stretch_of_time_and_fewer_fields(flight: Path) -> None:
+def test_topic_is_read_by_time_span_and_fields(flight: Path) -> None:
     rec = dmrl.open(flight)
     frame = rec["/cf1/height"].to_pandas(fields=["height_m"], start_s=1.0, end_s=2.0)
     assert list(frame.columns) == ["log_time", "publish_time", "height_m"]
@@ -95,7 +95,7 @@ def test_html_of_names_that_are_markup(tmp_path: Path) -> None:
     assert "<b>/height" not in html and "&lt;b&gt;" in html
 
 
-def test_images_show_themselves_and_none_is_no_error(flight: Path) -> None:
+def test_images_have_html_and_an_empty_span_is_allowed(flight: Path) -> None:
     images = dmrl.open(flight).images("cf1")
     assert images._repr_html_().count("<img") == 6 and images[:2]._repr_html_().count("<img") == 2
     none = images.between(90.0, 91.0)

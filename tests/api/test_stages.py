@@ -85,7 +85,7 @@ def test_nothing_heavy_is_loaded_before_it_is_used(flight: Path) -> None:
     assert said.stdout.split("\n")[0] == "[] False"
 
 
-def test_public_names_are_those_that_type_checkers_see() -> None:
+def test_public_names_equal_the_type_stub() -> None:
     stub = Path(dmrl.__file__).with_suffix(".pyi").read_text()
     told = {line.rpartition(" as ")[2] for line in stub.splitlines() if " as " in line}
     assert told == set(dmrl._PLACES)

@@ -11,7 +11,7 @@ from dmrl.errors import OutputError, RecordingError, SettingError, UnsafeName
 from dmrl.geometry.frames import Camera
 
 
-def test_fields_columns_images_and_a_camera_come_back(tmp_path: Path) -> None:
+def test_written_fields_columns_images_and_camera_round_trip(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     rgb = rng.integers(0, 255, (16, 24, 3), np.uint8)
     grey = rng.integers(0, 255, (16, 24), np.uint8)

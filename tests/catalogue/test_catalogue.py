@@ -84,7 +84,7 @@ def test_catalogue_row_describes_its_recording(flights: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_queries_are_of_a_recording_its_cameras_and_their_labels(flights: Path) -> None:
+def test_queries_filter_by_recording_camera_and_labels(flights: Path) -> None:
     index.update(flights, workers=1)
     assert names(flights, 'camera = "cf1" and ok_labels > 3') == ["a.mcap"]
     assert names(flights, "camera = 'cf1' and images < 4") == ["monday/b.mcap"]
@@ -308,7 +308,7 @@ def test_a_query_takes_no_disk_and_little_memory(
 
 
 @pytest.mark.heavy
-def test_a_focal_length_that_is_no_number_is_not_known(tmp_path: Path) -> None:
+def test_nan_focal_length_is_stored_as_null(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
         said = message_class("CameraCalibration")(width=64, height=48, K=[float("nan")] * 9)
         sink.write(0, topics.CALIBRATION("cf1"), said)

@@ -47,13 +47,13 @@ def test_hidden_pixels_are_inpainted_from_their_surroundings() -> None:
     assert off.max() <= 4  # it rounds as it goes inwards
 
 
-def test_a_folder_of_photos_is_what_it_was(tmp_path: Path) -> None:
+def test_background_photos_are_loaded_unchanged(tmp_path: Path) -> None:
     photo = np.random.default_rng(0).integers(0, 255, (30, 40, 3), np.uint8)
     (tmp_path / "a.png").write_bytes(encode_png(photo))
     assert (open_backgrounds(tmp_path).load_photo(0) == photo).all()
 
 
-def test_rooms_are_made_by_code_and_are_the_same_by_number() -> None:
+def test_rooms_are_generated_and_reproducible_by_index() -> None:
     photos = open_backgrounds(Path("rooms"))
     rooms = [photos.load_photo(k) for k in range(6)]
     assert {room.shape for room in rooms} == {(252, 360, 3)}

@@ -51,7 +51,7 @@ def test_batches_of_a_training(built: Path, augmented: bool) -> None:
         augmenter.augment_batch([0], epoch=0, index=0) if augmented else collate(examples, [0])
 
 
-def test_a_file_that_was_replaced_is_read_on(built: Path) -> None:
+def test_replaced_shard_is_read_from_the_old_mapping(built: Path) -> None:
     """The mapping keeps the old file: nothing is cut."""
     rows = dmrl.dataset(built)["train"]
     before = rows[5]["image"]
@@ -63,7 +63,7 @@ def test_a_file_that_was_replaced_is_read_on(built: Path) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks for SIGBUS")
 @pytest.mark.heavy
-def test_a_cut_during_a_read_is_one_line(built: Path) -> None:
+def test_shard_truncated_during_a_read_gives_one_line_error(built: Path) -> None:
     code = """
 import os, sys
 from pathlib import Path

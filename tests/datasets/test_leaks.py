@@ -25,7 +25,7 @@ def apart(a: Image.Image, b: Image.Image) -> int:
     ).bit_count()
 
 
-def test_the_same_picture_brighter_noisier_or_smaller_looks_the_same() -> None:
+def test_near_duplicate_hash_ignores_brightness_noise_and_scale() -> None:
     for seed in range(20):
         picture = scene(seed)
         noise = np.random.default_rng(seed).normal(0, 4, (224, 320, 3))
@@ -68,7 +68,7 @@ def test_moments_and_poses_that_train_has_too_are_counted(record: Record, tmp_pa
     assert "1 of 3 labels of test are within 1 px and 1 cm" in text
 
 
-def test_recordings_apart_share_nothing(record: Record, tmp_path: Path) -> None:
+def test_separate_recordings_have_no_leaks(record: Record, tmp_path: Path) -> None:
     one = record(split={"train": "[[0, 900000000]]"})
     other = record("other.mcap", [[peer(u_px=50.0)]], seed=1, split={"test": "[[0, 900000000]]"})
     run([one, other], tmp_path / "out", Settings())

@@ -66,13 +66,13 @@ def test_images_of_rows_come_from_every_shard_in_the_order_asked(built: Path) ->
 
 
 @LINUX
-def test_datasets_does_not_copy(built: Path) -> None:
+def test_datasets_library_maps_pixels_without_copying(built: Path) -> None:
     table = datasets.load_from_disk(str(built), keep_in_memory=False)["train"].data
     for chunk in table["pixels"].chunks:
         assert SHARD.search(mapped_file(chunk.buffers()[1].address))
 
 
-def test_a_plain_memory_map_holds_every_buffer(built: Path) -> None:
+def test_memory_mapped_shard_contains_every_buffer(built: Path) -> None:
     for shard in sorted(built.rglob("*.arrow")):
         whole = pa.memory_map(str(shard)).read_buffer()
         table = pa.ipc.open_stream(whole).read_all()
@@ -85,7 +85,7 @@ def test_a_plain_memory_map_holds_every_buffer(built: Path) -> None:
 
 
 @LINUX
-def test_our_pixels_are_views_of_the_mapped_file(built: Path) -> None:
+def test_pixels_are_read_only_views_of_the_mapped_file(built: Path) -> None:
     for block in open_dataset(built).split("train").pixels:
         assert SHARD.search(mapped_file(block.ctypes.data))
         assert not block.flags.writeable

@@ -139,7 +139,7 @@ def test_what_is_not_laid_out_as_a_dataset_is_refused(
         open_shard(shard, None)
 
 
-def test_columns_that_dmrl_does_not_know_are_left_alone(shard: Path) -> None:
+def test_unknown_columns_are_kept(shard: Path) -> None:
     table = table_of(shard)
     nested: Any = pa.array([[[["x"]]]] * 4)
     rewritten(shard, table.append_column("mine", nested))

@@ -15,13 +15,13 @@ def outputs(*best: tuple[int, int]) -> dict[str, np.ndarray]:
     return {"confidence": logit, "log_depth": np.ones_like(logit), "depth": np.ones_like(logit)}
 
 
-def test_the_share_of_images_whose_best_cell_stays() -> None:
+def test_peak_agreement_is_the_share_of_equal_best_cells() -> None:
     wanted, got = outputs((0, 1), (2, 3), (3, 4), (1, 1)), outputs((0, 1), (2, 4), (3, 4), (0, 1))
     assert compare_peaks(wanted, got) == 0.5
     assert compare_peaks(wanted, wanted) == 1.0
 
 
-def test_detections_are_judged_as_those_of_any_network() -> None:
+def test_int8_detections_are_scored_with_the_common_metrics() -> None:
     found = decode_points(outputs((0, 1), (2, 3)), 8)
     sure = found.confidence > 0.5
     assert found.image[sure].tolist() == [0, 1]

@@ -19,7 +19,7 @@ def test_demosaicing_keeps_uniform_colour() -> None:
     assert np.array_equal(demosaic(to_mosaic(image)), image)
 
 
-def test_halves_go_up_and_the_border_is_mirrored() -> None:
+def test_demosaicing_rounds_halves_up_and_mirrors_the_border() -> None:
     raw = np.array([[10, 20, 30, 40], [50, 60, 70, 81], [90, 100, 110, 120]], np.uint8)
     red, green, blue = demosaic(raw).transpose(2, 0, 1)
     assert red[0].tolist() == [10, 20, 30, 30]  # beyond the last column lies the one before it

@@ -56,16 +56,14 @@ def proved(network: IntegerNetwork, folder: Path, target: Target) -> TargetResul
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_random_networks_come_through_quantiser_and_c_bit_for_bit(
-    seed: int, tmp_path: Path
-) -> None:
+def test_quantized_random_networks_match_the_c_bit_for_bit(seed: int, tmp_path: Path) -> None:
     result = proved(quantisable(seed), tmp_path, QUICK)
     assert (result.error, result.mismatches) == (None, 0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(200))
-def test_two_hundred_random_networks_do_so_under_the_sanitizers(seed: int, tmp_path: Path) -> None:
+def test_two_hundred_random_networks_match_under_sanitizers(seed: int, tmp_path: Path) -> None:
     result = proved(quantisable(seed), tmp_path, CHECKED)
     assert (result.error, result.mismatches) == (None, 0)
 
@@ -83,7 +81,7 @@ def test_random_integer_networks_match_the_reference(seed: int, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("channels", "phase"), [(3, (0, 0)), (3, (0, 1)), (3, (1, 0)), (3, (1, 1)), (1, (0, 1))]
 )
-def test_raw_mosaics_of_any_phase_are_seen_as_the_reference_sees_them(
+def test_c_demosaicing_matches_the_reference_in_any_bayer_phase(
     channels: int, phase: tuple[int, int], tmp_path: Path
 ) -> None:
     network = next(n for n in map(quantised_network, range(20)) if n.channels == channels)
@@ -281,16 +279,14 @@ def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", ["locanet", "dmrl-nano"])
-def test_the_architectures_come_through_bit_for_bit(name: str, tmp_path: Path) -> None:
+def test_shipped_architectures_match_the_c_bit_for_bit(name: str, tmp_path: Path) -> None:
     result = proved(untrained(name, 176, 96), tmp_path, QUICK)
     assert (result.error, result.mismatches) == (None, 0)
 
 
 @pytest.mark.heavy
 @pytest.mark.parametrize(("name", "most"), [("locanet", 2.7), ("dmrl-nano", 2.78)])
-def test_a_product_takes_few_instructions_of_a_riscv(
-    name: str, most: float, tmp_path: Path
-) -> None:
+def test_instructions_per_mac_on_riscv_are_limited(name: str, most: float, tmp_path: Path) -> None:
     if find_missing(RISCV, EMULATOR):
         pytest.skip("no RISC-V tools")
     integers = untrained(name)

@@ -6,7 +6,7 @@ from pathlib import Path
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "bench_chip.py"
 
 
-def test_int8_agrees_with_the_chip_as_float_does(data: Path) -> None:
+def test_int8_maps_agree_with_the_chip_as_well_as_float(data: Path) -> None:
     found, pictures = runpy.run_path(str(BENCHMARK))["compare"](data)
     assert len(pictures) == 2
     for (name, channel, who), agreement in found.items():

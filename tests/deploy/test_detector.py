@@ -118,7 +118,7 @@ def test_images_are_of_its_size_or_of_whole_cells(
         detector.require_size(*image_px, "a.mcap")
 
 
-def test_grey_networks_are_shown_grey() -> None:
+def test_grey_networks_get_grey_input() -> None:
     image = np.random.default_rng(0).integers(0, 256, (4, 6, 3), np.uint8)
     networks = [quantised_network(seed) for seed in range(4)]
     assert {network.channels for network in networks} == {1, 3}
@@ -127,7 +127,7 @@ def test_grey_networks_are_shown_grey() -> None:
         assert (to_network_input(network, image) == wanted).all()
 
 
-def test_logits_far_out_overflow_nothing() -> None:
+def test_extreme_logits_do_not_overflow() -> None:
     far = np.array([[[-1e9, 0.0, 1e9]]])
     grids = to_grids({"confidence": far, "log_depth": far, "offset_u": far, "offset_v": 2 * far})
     assert grids.confidence[0, 0].tolist() == pytest.approx([0, 0.5, 1])

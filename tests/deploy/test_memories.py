@@ -62,7 +62,7 @@ def test_layers_use_near_memory_only_and_copy_the_stated_bytes(seed: int, tmp_pa
 @no_gcc
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", ["dmrl-nano", "dmrl-nano-fine"])
-def test_networks_that_ship_come_through_bit_for_bit(name: str, tmp_path: Path) -> None:
+def test_shipped_networks_match_with_two_memories(name: str, tmp_path: Path) -> None:
     network = untrained(name, 176, 96)
     result = proved(network, tmp_path, smallest(network))
     assert (result.error, result.mismatches) == (None, 0)

@@ -57,7 +57,7 @@ def test_shortcuts_and_sums_are_among_these_networks() -> None:
     assert sum(isinstance(layer, Add) for layer in layers) > 1
 
 
-def test_heads_may_be_behind_a_shortcut() -> None:
+def test_heads_may_follow_a_shortcut() -> None:
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (3, 16, 24, 3)).astype(np.uint8)
     first = FloatConv(

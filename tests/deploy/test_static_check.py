@@ -33,7 +33,7 @@ MANY = node("ConstantOfShape", ("sides",), "many")
 BODY = helper.make_graph([], "body", [], [])
 
 
-def test_a_sound_network_passes() -> None:
+def test_valid_onnx_network_passes_the_static_check() -> None:
     require_modest(network(), "a.onnx")
     require_modest(network(MANY, sides=(1_000, 1_000)), "a.onnx")
 

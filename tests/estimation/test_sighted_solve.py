@@ -86,7 +86,7 @@ def test_two_peers_at_rest_get_their_own_detections() -> None:
 
 
 @pytest.mark.heavy
-def test_the_same_pair_the_other_way_round_is_the_same_solution() -> None:
+def test_swapping_the_robots_gives_the_same_solution() -> None:
     pair = looking(flown("in_view", "calibrated", 4, 20.0))
     ((here, there),) = estimate_pairs([pair])
     ((back, forth),) = estimate_pairs([pair.swap_robots()])

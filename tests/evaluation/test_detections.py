@@ -77,9 +77,7 @@ def test_image_counts_if_the_source_labelled_it_and_all_labels_are_ok(tmp_path: 
 
 
 @pytest.mark.parametrize(("split", "times"), [("train", [0, 1]), ("test", [2, 4, 5])])
-def test_both_ends_of_a_split_s_spans_are_in_it(
-    tmp_path: Path, split: str, times: list[int]
-) -> None:
+def test_split_spans_include_both_ends(tmp_path: Path, split: str, times: list[int]) -> None:
     images: list[Image] = [([label(k + 1)], [], ()) for k in range(6)]
     pairs = joined(tmp_path / "a.mcap", images, split=split)
     assert [at.time_ns for at in pairs.at] == times

@@ -15,7 +15,7 @@ def wrong(table: Any) -> str:
     return "; ".join(iter_faults({"figure": [table]}, OUTS))
 
 
-def test_a_good_figure_has_no_fault_and_is_read() -> None:
+def test_valid_figure_specs_are_read() -> None:
     rows = [{"what": "px", "of": "judged/evaluation.json", "at": "overall.median_px.value"}]
     numbers = {"title": "Numbers", "shows": "numbers", "rows": rows}
     recipe = {"title": "Mine", "figure": [GOOD, numbers]}

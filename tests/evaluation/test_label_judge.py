@@ -16,7 +16,7 @@ def _judge(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.heavy
-def test_every_fault_changes_signals_and_no_true_position() -> None:
+def test_faults_change_signals_of_one_robot_and_no_truth() -> None:
     from label_judge.faults import ROWS  # noqa: PLC0415  # of benchmarks/
     from label_judge.flights import Base, fly  # noqa: PLC0415
 

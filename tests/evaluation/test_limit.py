@@ -78,7 +78,7 @@ def test_evaluate_reports_the_bound_of_a_smoother(
     assert f"{limit['kept_share']['0.02']:.0%} at 2% bad" in said
 
 
-def test_the_share_kept_is_what_gaussian_errors_allow() -> None:
+def test_bound_of_the_kept_share_assumes_gaussian_errors() -> None:
     rng = np.random.default_rng(1)
     sigma = rng.uniform(0.02, 0.4, (4000, 2))
     covariance = np.zeros((4000, 2, 2))

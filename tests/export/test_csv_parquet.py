@@ -141,7 +141,7 @@ def test_two_pictures_of_one_time_are_two_files(tmp_path: Path) -> None:
     assert [(tmp_path / "out" / name).read_bytes() for name in names] == pictures
 
 
-def test_numbers_come_back_to_the_bit(tmp_path: Path) -> None:
+def test_exported_numbers_round_trip_exactly(tmp_path: Path) -> None:
     path, values = tmp_path / "in.mcap", np.random.default_rng(0).normal(size=50)
     with RecordingWriter(path, build_provenance("test")) as sink:
         for k, value in enumerate(values.tolist()):

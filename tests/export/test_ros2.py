@@ -61,7 +61,7 @@ def recording(tmp_path: Path) -> Path:
     return path
 
 
-def test_any_reader_of_bags_finds_every_message(recording: Path, tmp_path: Path) -> None:
+def test_rosbags_reader_finds_every_exported_message(recording: Path, tmp_path: Path) -> None:
     counts = write_bag(recording, tmp_path / "bag")
     assert counts == {t: i.count for t, i in read_summary(recording).topics.items()}
     kinds = {}
@@ -81,7 +81,7 @@ def test_any_reader_of_bags_finds_every_message(recording: Path, tmp_path: Path)
     assert kinds["/cf1/log/state"] == "dmrl_msgs/msg/LogState"
 
 
-def test_a_bag_becomes_the_recording_that_it_was(recording: Path, tmp_path: Path) -> None:
+def test_exported_bag_converts_back_to_the_recording(recording: Path, tmp_path: Path) -> None:
     write_bag(recording, tmp_path / "bag")
     again = tmp_path / "again.mcap"
     convert.run(tmp_path / "bag", again, convert.Settings())

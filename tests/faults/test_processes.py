@@ -81,7 +81,7 @@ def recovered(folder: Path) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
-def test_a_disk_that_fails_loses_no_flight(disk: Disk, tmp_path: Path, count: Count) -> None:
+def test_recording_survives_disk_faults(disk: Disk, tmp_path: Path, count: Count) -> None:
     """The n-th operation of `record` fails: what was written before is brought back."""
     pytest.importorskip("cflib", reason="cflib (extra record) is not installed")
     clear(folder := tmp_path / "disk")

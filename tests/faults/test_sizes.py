@@ -83,9 +83,7 @@ def converted(source: Path, name: str, out: Path) -> tuple[int, int, float]:
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("which", ALL)
-def test_a_large_file_takes_no_more_than_its_size_explains(
-    which: str, tmp_path: Path, count: Count
-) -> None:
+def test_memory_and_cpu_are_bounded_by_file_size(which: str, tmp_path: Path, count: Count) -> None:
     name, make = ALL[which]
     source, file = make(tmp_path)
     for what in odd(file):

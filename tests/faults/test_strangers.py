@@ -36,7 +36,7 @@ def damaged(name: str, disk: Disk, folder: Path, cases: int, count: Count) -> No
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", QUICK)
-def test_damaged_files_are_refused_or_used(
+def test_damaged_files_are_refused_or_read(
     name: str, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
     damaged(name, disk, tmp_path, 10, count)

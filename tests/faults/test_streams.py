@@ -44,7 +44,7 @@ def test_full_or_closed_stdout_of_each_reading_command_gives_one_line_error(
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("work", WORKLOADS, ids=lambda work: work.name)
-def test_a_command_that_cannot_speak_has_done_its_work_or_nothing(
+def test_command_with_unwritable_stdout_completes_or_leaves_nothing(
     work: Workload, disk: Disk, tmp_path: Path, count: Count
 ) -> None:
     broken = FaultTrials(work, disk, tmp_path / "disk", disk.inputs)

@@ -79,7 +79,7 @@ def test_silent_ranges_and_a_third_robot_change_the_bound() -> None:
     assert at(replace(alone, ranges=silent)) > 1.5 * at(alone)
 
 
-def test_a_clock_that_is_off_costs_where_the_peer_moves() -> None:
+def test_clock_uncertainty_widens_the_bound_of_a_moving_peer() -> None:
     flight = simulate(Scenario(duration_s=30.0), NOISE["calibrated"], 3)
     exact, off = (
         compute_bound(flight, replace(NOISE["calibrated"], clock_offset_s=s)) for s in (0.0, 0.5)
@@ -91,7 +91,7 @@ def test_a_clock_that_is_off_costs_where_the_peer_moves() -> None:
 
 
 @pytest.mark.heavy
-def test_a_smoother_that_knows_the_noise_reaches_it() -> None:
+def test_optimal_smoother_reaches_the_bound() -> None:
     squared, bounds, distances = [], [], []
     for seed in range(FLIGHTS):
         flight = simulate(Scenario(duration_s=20.0), NOISE["calibrated"], 300 + seed)

@@ -93,11 +93,11 @@ def test_ranges_are_longer_by_the_size_and_outliers_are_a_share() -> None:
     assert (off - before).max() <= 3.0 and off.min() >= 0.01
 
 
-def test_without_a_peer_every_link_of_the_robot_is_meant() -> None:
+def test_range_fault_without_peer_affects_all_links_of_the_robot() -> None:
     assert set(changed(flown(Fault("nlos", "cf2")))) == {"cf1-cf2", "cf2-cf1", "cf2-cf3", "cf3-cf2"}
 
 
-def test_as_many_windows_as_asked_for_each_in_its_part_of_the_flight() -> None:
+def test_fault_windows_are_spread_evenly_over_the_flight() -> None:
     (event,) = flown(Fault("nlos", "cf1", duration_s=2.0, number=5)).faults
     start, end = event.windows_s.T
     assert np.allclose(end - start, 2.0)
@@ -117,7 +117,7 @@ def test_clock_fault_changes_times_only() -> None:
 
 
 @pytest.mark.parametrize("kind", ["landing", "crash"])
-def test_a_robot_comes_down_and_lies_still(kind: FaultKind) -> None:
+def test_crashed_robot_falls_and_stays_on_the_floor(kind: FaultKind) -> None:
     flight = flown(Fault(kind, "cf3", start_s=8.0))
     truth, before = flight.truth["cf3"], PLAIN.truth["cf3"]
     assert np.array_equal(truth.position[:800], before.position[:800])
@@ -133,7 +133,7 @@ def test_a_robot_comes_down_and_lies_still(kind: FaultKind) -> None:
     assert np.median(last.range_m[at]) == pytest.approx(np.linalg.norm(away), abs=0.8)
 
 
-def test_the_estimate_of_a_crashed_robot_runs_away() -> None:
+def test_velocity_estimate_of_a_crashed_robot_diverges() -> None:
     log = flown(Fault("crash", "cf1", start_s=5.0, size=9.0)).robots["cf1"]
     assert np.hypot(log.vx_mps[-50:], log.vy_mps[-50:]).mean() == pytest.approx(8.9, abs=0.4)
     assert np.array_equal(log.vx_mps[:500], PLAIN.robots["cf1"].vx_mps[:500])

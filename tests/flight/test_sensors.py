@@ -99,7 +99,7 @@ def test_velocity_scale_and_bias_are_those_of_the_table(name: str) -> None:
     assert bias.std() == pytest.approx(preset.velocity_bias_mps, rel=0.12)
 
 
-def test_coloured_noise_is_steady_and_fades() -> None:
+def test_coloured_noise_is_stationary_with_exponential_correlation() -> None:
     made = np.array(
         [draw_coloured_noise(np.random.default_rng(k), 300, 0.1, 0.3) for k in range(800)]
     )
@@ -155,7 +155,7 @@ def test_bias_and_scale_of_a_pair_are_those_of_the_table(name: str) -> None:
     assert drawn[:, 1].mean() == pytest.approx(1.0, abs=0.005)
 
 
-def test_both_ways_of_a_pair_share_their_bias() -> None:
+def test_range_bias_is_equal_in_both_directions() -> None:
     noise = Noise(uwb_bias_m=0.3)
     flight = simulate(Scenario(duration_s=5.0), noise, 3)
     offsets = []

@@ -13,7 +13,7 @@ IDEAL = NOISE["ideal"]
 
 
 @pytest.mark.parametrize("kind", TRAJECTORIES)
-def test_velocity_is_the_slope_of_the_position(kind: Trajectory) -> None:
+def test_velocity_is_the_derivative_of_position(kind: Trajectory) -> None:
     for truth in simulate(replace(SHORT, trajectory=kind), IDEAL, 1).truth.values():
         slope = np.diff(truth.position, axis=0) / np.diff(truth.time_s)[:, None]
         mean = (truth.velocity[1:] + truth.velocity[:-1]) / 2
@@ -119,7 +119,7 @@ def test_clock_time_and_true_time_round_trip() -> None:
     assert clock.to_clock_time(np.array([100.0]))[0] == pytest.approx(100.032)
 
 
-def test_the_first_robot_has_the_right_time_and_others_theirs() -> None:
+def test_first_robot_has_the_true_clock_and_others_offsets() -> None:
     flight = simulate(replace(SHORT, robots=4), NOISE["harsh"], 1)
     assert flight.clocks["cf1"] == Clock()
     for robot, log in flight.robots.items():

@@ -151,7 +151,9 @@ def test_equal_times_are_refused() -> None:
     noise_m=st.floats(0.05, 0.2),
     seed=st.integers(0, 99),
 )
-def test_held_values_are_no_new_ones(held: int, digits: int, noise_m: float, seed: int) -> None:
+def test_repeated_values_are_not_new_measurements(
+    held: int, digits: int, noise_m: float, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     measured = np.round(2 + np.sin(np.arange(60) / 5) + rng.normal(0, noise_m, 60), digits)
     measured = measured[np.concatenate([[True], np.diff(measured) != 0])]

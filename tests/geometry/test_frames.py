@@ -91,7 +91,7 @@ def test_pitch_turns_before_roll_when_both_are_there() -> None:
 
 
 @given(ANGLE, ANGLE)
-def test_the_paper_s_matrix_is_ours_with_both_angles_negated(phi: float, theta: float) -> None:
+def test_paper_rotation_equals_ours_with_negated_angles(phi: float, theta: float) -> None:
     """Eq. 2 of the paper is Rx(phi) Ry(theta), rotations of the right-hand rule."""
     c, s = np.cos(phi), np.sin(phi)
     rx = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
@@ -101,7 +101,7 @@ def test_the_paper_s_matrix_is_ours_with_both_angles_negated(phi: float, theta: 
 
 
 @pytest.mark.parametrize(("tilt_deg", "error_px"), [(3, 19), (6, 38), (10, 64)])
-def test_the_paper_s_signs_taken_as_printed_cost_many_pixels(
+def test_printed_signs_of_the_paper_cause_large_pixel_errors(
     tilt_deg: float, error_px: float
 ) -> None:
     point = (1.0, 0.0, 0.0)

@@ -163,7 +163,7 @@ def test_append_requires_the_settings_of_the_dataset(record: Record, tmp_path: P
 
 
 @pytest.mark.heavy
-def test_a_flight_has_its_split_whatever_comes_with_it(record: Record, tmp_path: Path) -> None:
+def test_split_of_a_flight_is_independent_of_other_flights(record: Record, tmp_path: Path) -> None:
     first, *others = flights(record, *range(8))
     for name, parts in (("a", [others]), ("b", [[one] for one in reversed(others)])):
         run([first], tmp_path / name, Settings(test_share=0.5))
@@ -228,7 +228,7 @@ def dying(at: int, work: Callable[[], Any]) -> bool:
 @pytest.mark.parametrize(
     "step", [pytest.param(6, marks=pytest.mark.heavy), pytest.param(1, marks=pytest.mark.slow)]
 )
-def test_a_process_that_dies_anywhere_leaves_one_dataset_or_the_other(
+def test_append_killed_at_any_file_change_leaves_old_or_new_dataset(
     record: Record, tmp_path: Path, step: int
 ) -> None:
     """Killed at each change of a file: it opens, and the command again makes the same bytes."""

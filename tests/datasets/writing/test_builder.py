@@ -38,7 +38,7 @@ def test_pixels_are_those_of_the_image(record: Record, tmp_path: Path) -> None:
     assert np.array_equal(got, np.stack([pixels_of(k) for k in range(6)]))
 
 
-def test_a_label_makes_its_cell_and_keeps_its_numbers(record: Record, tmp_path: Path) -> None:
+def test_label_sets_its_grid_cell_and_keeps_its_fields(record: Record, tmp_path: Path) -> None:
     run([record(peers=[[peer(sigma_u_px=2.0, box_px=[1, 2, 30, 40])]])], tmp_path / "out", PLAIN)
     split = open_dataset(tmp_path / "out").split("train")
     assert split.confidence.shape == split.depth.shape == (1, 6, 8)
@@ -49,7 +49,7 @@ def test_a_label_makes_its_cell_and_keeps_its_numbers(record: Record, tmp_path: 
     assert (got["sigma_u_px"], got["box_px"], got["status"]) == (2.0, [1, 2, 30, 40], "OK")
 
 
-def test_masks_are_kept_by_the_place_of_the_peer(record: Record, tmp_path: Path) -> None:
+def test_masks_are_numbered_by_peer_index(record: Record, tmp_path: Path) -> None:
     numbers = np.zeros((48, 64), np.uint8)
     numbers[3, 4], numbers[5, 6], numbers[7, 8] = 2, 3, 9
     peers = [peer(peer="cf3"), peer(peer="painted2", u_px=40.0)]
@@ -110,7 +110,7 @@ def test_a_mask_of_another_size_is_refused_by_topic(record: Record, tmp_path: Pa
 
 
 @pytest.mark.parametrize("fields", [{"u_px": 64.0}, {"v_px": -0.1}, {"depth_m": -1.0}])
-def test_a_peer_out_of_sight_is_listed_but_makes_no_cell(
+def test_peer_outside_the_image_is_listed_but_sets_no_cell(
     record: Record, tmp_path: Path, fields: dict[str, float]
 ) -> None:
     run([record(peers=[[peer(**fields)]])], tmp_path / "out", PLAIN)
@@ -137,7 +137,7 @@ def test_the_best_source_wins_and_the_others_are_dropped(record: Record, tmp_pat
         assert got["u_px"] == u_px
 
 
-def test_an_image_whose_peers_another_source_labelled_is_no_negative(
+def test_image_labelled_by_another_source_only_is_no_negative(
     record: Record, tmp_path: Path
 ) -> None:
     flight = record(peers=[[peer(source="hand")], [peer(source="estimate")], []])

@@ -125,7 +125,7 @@ def test_a_recording_beside_one_made_of_it_is_refused(record: Record, tmp_path: 
             run(both, tmp_path / "out", Settings())
 
 
-def test_a_recording_beside_one_that_knows_it_through_a_dataset(
+def test_recording_and_render_of_its_dataset_are_accepted_together(
     record: Record, tmp_path: Path
 ) -> None:
     # As a render over its images does, or labels of a model that learned from it.
@@ -137,7 +137,7 @@ def test_a_recording_beside_one_that_knows_it_through_a_dataset(
     assert sum(run([flight, other], tmp_path / "out", Settings()).images.values()) == 12
 
 
-def test_every_split_of_a_merged_recording_counts(record: Record, tmp_path: Path) -> None:
+def test_splits_of_a_merged_recording_are_combined(record: Record, tmp_path: Path) -> None:
     # Two flights one after the other, each with a split of its own.
     first = record(
         "a.mcap",

@@ -77,7 +77,7 @@ def fly_at_random(seed: int) -> list[tuple[RobotState, float, list[RawDetection]
 
 
 @pytest.mark.parametrize("emulated", [False, pytest.param(True, marks=pytest.mark.heavy)])
-def test_the_c_commands_what_the_reference_commands(folder: Path, emulated: bool) -> None:
+def test_c_pilot_commands_equal_the_reference(folder: Path, emulated: bool) -> None:
     if emulated and not (shutil.which("qemu-riscv32") and shutil.which("riscv64-unknown-elf-gcc")):
         pytest.skip("no emulator")
     commands = []
@@ -93,7 +93,7 @@ def test_the_c_commands_what_the_reference_commands(folder: Path, emulated: bool
     assert np.ptp(np.array(commands), axis=0).min() > 0.05  # it did something
 
 
-def test_no_image_is_used_twice_or_late() -> None:
+def test_pilot_ignores_repeated_and_late_images() -> None:
     found = [RawDetection(2560, 1200, 700, 60000)]
     hover = RobotState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     again, without = OnboardFilter(DISTANCE_M), OnboardFilter(DISTANCE_M)

@@ -60,7 +60,7 @@ def test_a_grey_network_gives_the_same_on_grey_images() -> None:
     np.testing.assert_allclose(outputs(graph.to_grey(), grey), wanted, rtol=1e-4, atol=1e-5)
 
 
-def test_grey_of_a_grey_picture_is_itself() -> None:
+def test_grey_conversion_keeps_grey_images() -> None:
     levels = np.arange(256, dtype=np.uint8).reshape(1, 16, 16, 1)
     np.testing.assert_array_equal(rgb_to_grey(np.repeat(levels, 3, axis=3)), levels)
 
@@ -149,7 +149,9 @@ class Summed(Network):
         (Summed(nn.Conv2d(4, 4, 1), twice=True), 2),
     ],
 )
-def test_a_sum_is_part_of_the_dense_convolution_before_it(network: Network, sums: int) -> None:
+def test_residual_sum_is_fused_into_the_preceding_dense_convolution(
+    network: Network, sums: int
+) -> None:
     network.eval()
     graph = build_graph(trace_operations(network))
     assert sum(isinstance(layer, FloatAdd) for layer in graph.layers) == sums

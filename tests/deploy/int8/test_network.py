@@ -90,7 +90,7 @@ def test_weights_fit_the_channels_they_read() -> None:
     ("kernel", "stride", "dilation", "padding"),
     [(3, 1, 1, 1), (3, 2, 1, 1), (3, 1, 4, 4), (3, 2, 2, 0), (1, 1, 1, 0), (1, 2, 1, 0)],
 )
-def test_shapes_and_products_are_those_of_the_places_that_fit(
+def test_convolution_shape_and_mac_count_follow_kernel_positions(
     kernel: int, stride: int, dilation: int, padding: int
 ) -> None:
     layer = conv(kernel=kernel, stride=stride, dilation=dilation, padding=padding)
@@ -105,7 +105,7 @@ def test_shapes_and_products_are_those_of_the_places_that_fit(
     assert MaxPool("pool", 0).output_shape(((4, 9, 6),)) == (4, 4, 3)
 
 
-def test_pools_keep_their_type_and_sums_are_of_one_shape() -> None:
+def test_pools_keep_signedness_and_sums_need_equal_shapes() -> None:
     assert sound(MaxPool("pool", 0, signed=True), signed=(True,))
     assert not sound(MaxPool("pool", 0, signed=True))
     both = (False, True)
@@ -131,7 +131,7 @@ def network(**more: Any) -> IntegerNetwork:
     return IntegerNetwork("a", "b", 3, 8, 10, 8, **fields)
 
 
-def test_the_threshold_is_the_first_level_that_reaches_it() -> None:
+def test_threshold_is_the_first_level_at_or_above_it() -> None:
     believed = 0.5 * 65535
     q = network().threshold_q
     assert network().confidence.table[q + 128] >= believed > network().confidence.table[q + 127]

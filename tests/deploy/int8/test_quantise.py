@@ -66,7 +66,7 @@ def test_int8_is_near_float_on_most_random_networks() -> None:
     assert np.quantile(sqnr_db, 0.05) > 15
 
 
-def test_equalising_changes_nothing_but_the_ranges() -> None:
+def test_channel_equalisation_keeps_outputs() -> None:
     moved = 0
     for seed in range(30):
         graph, _, images = random_graph(seed)
@@ -85,7 +85,7 @@ def test_equalising_changes_nothing_but_the_ranges() -> None:
     assert moved > 20
 
 
-def test_channels_along_a_residual_block_have_like_ranges() -> None:
+def test_channel_equalisation_balances_residual_blocks() -> None:
     rng = np.random.default_rng(0)
     size = np.array([1, 0.1, 0.01, 0.3])
     first = FloatConv("first", (0,), size[:, None, None, None] * rng.normal(0, 1, (4, 3, 3, 3)),
@@ -102,7 +102,7 @@ def test_channels_along_a_residual_block_have_like_ranges() -> None:
         assert after < before / 2
 
 
-def test_a_bias_that_outweighs_its_channel_still_fits() -> None:
+def test_large_bias_fits_int32() -> None:
     graph = small(weight=1e-7, bias=3.0)
     network = quantise_network(graph, calibrate_ranges(graph, [NOISE]), ABOUT)
     first, head = compute_layer_errors(graph, network, NOISE)[0], network.layers[0]
@@ -228,7 +228,7 @@ def test_sums_are_rounded_to_the_nearest_level(shortcut: bool) -> None:
     assert abs(beside.mean()) < 0.05
 
 
-def test_the_largest_value_that_was_seen_has_the_last_level() -> None:
+def test_largest_calibration_value_maps_to_the_last_level() -> None:
     """Unsigned tensors use all of 0 to 255, signed ones -127 to 127."""
     rng = np.random.default_rng(2)
     first = small().layers[0]
@@ -244,7 +244,7 @@ def test_the_largest_value_that_was_seen_has_the_last_level() -> None:
     assert signed.min() < 0
 
 
-def test_ranges_are_those_of_all_images_and_grey_networks_see_grey() -> None:
+def test_calibration_ranges_cover_all_images_in_network_colours() -> None:
     alone = calibrate_ranges(small(), [NOISE])
     for parts in ([NOISE[:1], NOISE[1:]], [NOISE[1:], NOISE[:1]], [NOISE[2:], NOISE[:2]]):
         together = calibrate_ranges(small(), parts)

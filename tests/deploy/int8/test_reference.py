@@ -41,7 +41,7 @@ def by_hand(layer: Conv, x: np.ndarray, *shortcut: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", [*range(6), 7, 8])  # the last two have shortcuts
-def test_every_convolution_is_what_it_is_by_hand(seed: int) -> None:
+def test_convolutions_equal_a_direct_loop(seed: int) -> None:
     network = random_network(seed)
     rng = np.random.default_rng(seed)
     for layer, shape in zip(network.layers, network.shapes[1:], strict=True):
@@ -110,7 +110,7 @@ def test_integer_detections_are_the_float_ones(offsets: bool) -> None:
     assert believed > 50
 
 
-def test_equal_neighbours_are_one_detection_the_first() -> None:
+def test_equal_neighbouring_cells_give_the_first_detection_only() -> None:
     network = network_with(offsets=False)
     levels = {name: np.full(network.grid_shape, -128, np.int8) for name in network.heads}
     levels["confidence"][1, 1:3] = 127
@@ -131,7 +131,7 @@ def test_the_heads_are_channels_of_their_tensor() -> None:
     assert all(grid.shape == network.grid_shape for grid in got.values())
 
 
-def test_a_cell_that_reaches_the_threshold_is_believed() -> None:
+def test_cell_at_the_threshold_is_detected() -> None:
     network = network_with(offsets=False)
     levels = {name: np.full(network.grid_shape, -128, np.int8) for name in network.heads}
     assert -128 < network.threshold_q <= 127

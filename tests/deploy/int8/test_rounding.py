@@ -42,7 +42,7 @@ def test_correlated_rounding_beats_nearest_rounding(groups: int, gain: float) ->
     assert better < worse / gain
 
 
-def test_moments_are_mean_products_of_inputs_and_one() -> None:
+def test_second_moments_are_mean_products_of_inputs() -> None:
     one = layer(1)
     moments = measure_moments(FloatGraph((one,), ()), SMOOTH)[0]
     x = normalize_images(SMOOTH)
@@ -53,7 +53,7 @@ def test_moments_are_mean_products_of_inputs_and_one() -> None:
     assert moments[0, 27, 27] == 1
 
 
-def test_inputs_that_are_always_zero_do_no_harm() -> None:
+def test_constant_zero_inputs_fall_back_to_nearest_rounding() -> None:
     one = layer(1)
     moments = measure_moments(FloatGraph((one,), ()), [np.full((8, 8, 3), 128, np.uint8)])[0]
     scale = np.abs(one.weight).max(axis=(1, 2, 3)) / MAX_LEVEL

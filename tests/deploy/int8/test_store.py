@@ -48,7 +48,7 @@ def test_pickled_arrays_are_refused(tmp_path: Path) -> None:
         load_network(tmp_path)
 
 
-def test_samples_come_back(tmp_path: Path) -> None:
+def test_sample_images_round_trip(tmp_path: Path) -> None:
     images = np.random.default_rng(0).integers(0, 256, (2, 8, 16, 3)).astype(np.uint8)
     save_samples(images, tmp_path)
     np.testing.assert_array_equal(load_samples(tmp_path), images)

@@ -11,7 +11,7 @@ RNG = np.random.default_rng(0)
 @pytest.mark.parametrize("kernel", [1, 2, 3])
 @pytest.mark.parametrize("stride", [1, 2, 3])
 @pytest.mark.parametrize("dilation", [1, 2])
-def test_every_tap_stands_in_raster_order(kernel: int, stride: int, dilation: int) -> None:
+def test_convolution_taps_are_in_raster_order(kernel: int, stride: int, dilation: int) -> None:
     x = RNG.integers(-9, 9, (2, 3, 11, 8))
     found = extract_taps(x, kernel, stride, dilation)
     reach = dilation * (kernel - 1)

@@ -51,7 +51,7 @@ def flight(
     return CalibrationFlight(image_s, seen, uv[seen], time_s, attitude, peers)
 
 
-def test_mount_and_delay_are_found_again() -> None:
+def test_mount_and_delay_are_recovered() -> None:
     found = calibrate_mount([flight(0, images=1200)], AIDECK, Noise(3.0, 0.005))
     assert found is not None
     assert np.degrees(found.camera.mount_rad) == pytest.approx(np.degrees(TRUE.mount_rad), abs=0.3)
@@ -70,7 +70,7 @@ def test_exact_mount_and_delay_stay_unchanged() -> None:
 
 
 @pytest.mark.heavy
-def test_several_flights_are_left_out_in_turn() -> None:
+def test_mount_std_of_several_flights_is_cross_validated() -> None:
     found = calibrate_mount(
         [flight(seed, images=150) for seed in range(4)], AIDECK, Noise(3.0, 0.005)
     )
@@ -79,7 +79,7 @@ def test_several_flights_are_left_out_in_turn() -> None:
     assert 0 < max(found.mount_std_rad) < np.radians(0.5)
 
 
-def test_detections_that_fit_nothing_give_nothing() -> None:
+def test_unmatched_detections_give_no_calibration() -> None:
     assert calibrate_mount([flight(2, outliers=1.0, images=60)], AIDECK, Noise()) is None
 
 
@@ -119,7 +119,7 @@ def _tilting(time_s: np.ndarray) -> np.ndarray:
     return tilt
 
 
-def test_tilts_that_come_at_once_do_not_shift_the_delay() -> None:
+def test_abrupt_tilts_do_not_bias_the_delay() -> None:
     rng = np.random.default_rng(11)
     clean = flight(6, images=600)
     log_s = np.arange(0.0, clean.image_s[-1] + 1, 0.01)
@@ -137,7 +137,7 @@ def test_tilts_that_come_at_once_do_not_shift_the_delay() -> None:
 
 
 @pytest.mark.heavy
-def test_a_path_that_is_far_off_for_seconds_does_not_turn_the_mount() -> None:
+def test_temporary_path_errors_do_not_bias_the_mount() -> None:
     # Only what lay within 25 px was kept: of a path that is 30 px off to either side, one half.
     clean = flight(8, images=900, outliers=0.0)
     peer = clean.peers["cf2"]

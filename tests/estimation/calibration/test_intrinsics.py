@@ -41,7 +41,7 @@ def normalised(camera: Camera, made: Intrinsics) -> Array:
     return np.asarray(errors / (*made.focal_std_px, *made.centre_std_px))
 
 
-def test_the_same_boards_give_the_same_digits_each_time() -> None:
+def test_intrinsics_are_reproducible() -> None:
     rng = np.random.default_rng(0)
     seen = [corners_of(*pose(rng)) for _ in range(8)]
     views = [(at + rng.normal(0, 0.1, at.shape)).astype(np.float32) for at in seen]
@@ -59,7 +59,7 @@ def test_exact_corners_give_the_exact_camera() -> None:
 
 
 @pytest.mark.heavy
-def test_a_drawn_board_gives_the_camera_that_drew_it() -> None:
+def test_intrinsics_of_rendered_boards_equal_the_true_camera() -> None:
     pairs = shown(AIDECK, np.random.default_rng(0), 10)
     assert len(pairs) >= 8
     made = calibrated(AIDECK, pairs)
@@ -79,7 +79,7 @@ def test_corners_are_found_to_a_twentieth_of_a_pixel() -> None:
     assert np.abs(errors).max() < 0.4
 
 
-def test_a_large_picture_is_looked_at_smaller_and_measured_whole(
+def test_corners_are_found_downscaled_and_refined_at_full_size(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rng = np.random.default_rng(1)
@@ -106,7 +106,7 @@ def _only(pixels: int) -> Callable[..., Any]:
 
 
 @pytest.mark.slow
-def test_sigmas_of_thirty_lenses_hold() -> None:
+def test_sigmas_of_thirty_lenses_are_consistent() -> None:
     squares = []
     for seed in range(30):
         rng = np.random.default_rng(100 + seed)

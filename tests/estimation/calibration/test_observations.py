@@ -39,14 +39,14 @@ def seen() -> Array:
     return uv
 
 
-def test_a_peer_is_expected_where_it_was_at_the_exposure() -> None:
+def test_predicted_pixels_use_the_exposure_time() -> None:
     uv, jacobian = predict_pixels(flight([], np.zeros((0, 2))), CAMERA, PATH, IMAGES_S)
     assert uv == pytest.approx(seen(), abs=1e-6)
     assert jacobian.shape == (4, 3, 5)
     assert with_mount(AIDECK, np.array([0.02, -0.03, 0.05, 0.25])) == CAMERA
 
 
-def test_positions_are_known_between_samples_that_are_near() -> None:
+def test_path_covers_times_between_near_samples() -> None:
     times = np.array([0.0, 0.1, 0.2, 0.44, 0.7, 0.8])
     path = PeerPath(times, XYZ[:6], np.stack([k * np.eye(3) for k in range(6)]))
     at_s = np.array([-0.1, 0.0, 0.05, 0.3, 0.5, 0.75, 0.8, 0.9])
@@ -55,7 +55,7 @@ def test_positions_are_known_between_samples_that_are_near() -> None:
     assert path.nearest_covariance(at_s)[:, 0, 0].tolist() == [0, 0, 1, 3, 4, 5, 5, 5]
 
 
-def test_the_nearest_detection_within_reach_is_the_peers() -> None:
+def test_nearest_detection_within_the_radius_is_matched() -> None:
     uv = seen()
     off = np.array([[3.0, 0], [0, -2.0], [90.0, 0], [0, 9.0], [0, 30.5]])
     here = flight([0, 0, 1, 2, 3], uv[[0, 0, 1, 2, 3]] + off)
@@ -74,7 +74,7 @@ def test_the_nearest_detection_within_reach_is_the_peers() -> None:
     assert match_detections([(here, outside)], CAMERA, 900.0, Noise()).expected == 0
 
 
-def test_a_peer_is_expected_where_its_path_is_known_at_the_exposure() -> None:
+def test_expected_count_needs_a_path_at_the_exposure_time() -> None:
     """The path lasts from 0 to 9.9 s, and images are stamped a quarter of a second late."""
     one = flight([2], np.array([[178.0, 91.0]]))
     late = replace(one, image_s=np.array([0.1, 0.2, 5.0, 10.0]))

@@ -18,7 +18,7 @@ def test_sign_correction_applies_to_one_robot() -> None:
     assert again.own is pair.own
 
 
-def test_velocities_of_the_take_off_frame_are_turned_back() -> None:
+def test_velocities_in_the_take_off_frame_are_rotated_back() -> None:
     pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
     heading = np.cumsum(pair.peer.yaw_rate_radps) * pair.dt_s
     x, y = pair.peer.vx_mps, pair.peer.vy_mps

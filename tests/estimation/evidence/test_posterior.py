@@ -34,7 +34,7 @@ def test_a_model_adds_its_unknowns_for_its_robot_alone(candidate: Candidate) -> 
 
 
 @pytest.mark.heavy
-def test_a_gyroscope_that_jumps_is_named_and_its_error_taken_out() -> None:
+def test_gyroscope_step_is_identified_and_corrected() -> None:
     flight = flown("in_view", "calibrated", 1002, 60.0)
     pair = pair_of(flight)
     late = pair.time_s > 30.0
@@ -50,7 +50,7 @@ def test_a_gyroscope_that_jumps_is_named_and_its_error_taken_out() -> None:
     assert error < worse
 
 
-def test_silent_sensors_are_causes_and_windows_are_joined() -> None:
+def test_dropouts_are_causes_and_windows_are_joined() -> None:
     pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
     assert find_dropouts(pair, pair) == ()
     gap = (pair.time_s > 5) & (pair.time_s < 8)

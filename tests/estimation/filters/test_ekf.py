@@ -70,7 +70,7 @@ def test_the_simulation_preset_ignores_heights() -> None:
     assert steps_of(1000, "published-firmware").height_m.any()
 
 
-def test_a_range_is_the_length_of_all_three_sides() -> None:
+def test_predicted_range_is_three_dimensional() -> None:
     states = np.array([[3.0, 4.0, 0.7], [0.0, 0.0, 0.1]])
     range_m, by_state = predict_range(states, np.array([12.0, -2.0]))
     assert range_m == pytest.approx([13.0, 2.0], abs=1e-3)

@@ -83,7 +83,7 @@ def test_pairs_without_conflict_are_unchanged() -> None:
     assert not resolve_conflicts(blind, both_ways({("a", "b"): at(LEFT), ("a", "c"): at(LEFT)}))
 
 
-def test_the_camera_of_a_robot_that_is_second_by_name_counts_as_well() -> None:
+def test_conflicts_in_the_camera_of_the_second_robot_are_resolved() -> None:
     pair, _ = still_pair()
     sees = candidates(LEFT, RIGHT)
     pairs = {

@@ -99,7 +99,7 @@ def test_the_statuses_are_those_of_the_schema() -> None:
 
 
 @pytest.mark.heavy
-def test_the_batch_solve_beats_the_published_filter() -> None:
+def test_batch_solve_is_more_accurate_than_the_published_filter() -> None:
     seeds = (1000, 1001, 1002, 1003)
     pairs = [pair_of(flown("in_view", "calibrated", seed, LONG_S)) for seed in seeds]
     published = [
@@ -138,7 +138,7 @@ def test_both_directions_are_transforms_of_one_solve() -> None:
         ("hover", "realistic"),
     ],
 )
-def test_motion_that_leaves_the_bearing_open_is_never_ok(
+def test_unobservable_bearing_is_ambiguous_with_a_reason(
     trajectory: Trajectory, noise: str
 ) -> None:
     (estimate, _) = solved(trajectory, noise, 1000)
@@ -151,7 +151,7 @@ def test_motion_that_leaves_the_bearing_open_is_never_ok(
 @pytest.mark.parametrize("seed", range(1000, 1005))
 @pytest.mark.parametrize("trajectory", ["observer_static", "parallel", "both_static", "hover"])
 @pytest.mark.parametrize("noise", ["realistic", "harsh"])
-def test_motion_that_leaves_the_bearing_open_is_ambiguous_in_other_flights(
+def test_unobservable_bearing_is_ambiguous_in_other_flights(
     trajectory: Trajectory, noise: str, seed: int
 ) -> None:
     (estimate, _) = solved(trajectory, noise, seed)
@@ -211,7 +211,7 @@ def test_a_flight_without_ranges_is_ambiguous() -> None:
     assert (estimate.status == room.AMBIGUOUS).all()
 
 
-def test_pairs_of_different_length_are_estimated_together_as_alone() -> None:
+def test_pairs_of_different_length_equal_separate_estimates() -> None:
     pairs = [pair_of(flown("in_view", "calibrated", 1000 + k, 4.0 + k)) for k in range(2)]
     together = estimate_pairs(pairs)
     for pair, (estimate, _) in zip(pairs, together, strict=True):

@@ -50,7 +50,7 @@ def errors(flight: Flight, estimates: Estimates) -> np.ndarray:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize(("noise", "share"), [("calibrated", 1.0), ("realistic", 1.02)])
-def test_all_together_are_as_near_the_truth_as_pair_by_pair(noise: str, share: float) -> None:
+def test_swarm_solve_is_as_accurate_as_pairwise_solves(noise: str, share: float) -> None:
     """With little noise nearer; else, where a sure pair contradicts, they are the pairs' own."""
     flight, _, pairwise, swarm = solved("in_view", noise)
     assert set(swarm) == set(pairwise)
@@ -73,7 +73,7 @@ def test_swarm_covariances_cover_truth_and_ok_positions_are_accurate() -> None:
 
 
 @pytest.mark.heavy
-def test_the_frame_is_one_positions_agree_around_a_triangle() -> None:
+def test_swarm_positions_are_consistent_around_a_triangle() -> None:
     *_, swarm = solved("random", "realistic")
     one, two, three = (swarm[n].state for n in (("cf1", "cf2"), ("cf2", "cf3"), ("cf1", "cf3")))
     turn = np.exp(1j * one[:, 2])
@@ -129,7 +129,7 @@ def test_swarm_estimate_inconsistent_with_pair_is_detected() -> None:
 
 
 @pytest.mark.heavy
-def test_a_peer_whose_clock_is_late_is_found_in_a_swarm_too() -> None:
+def test_clock_offset_is_estimated_in_a_swarm() -> None:
     late_s = 0.06
     flight = simulate(Scenario(3, 40.0, "random"), NOISE["calibrated"], 1)
     pairs = {names: pair_of(flight, *names) for names in combinations(flight.robots, 2)}

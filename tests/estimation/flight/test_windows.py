@@ -34,7 +34,7 @@ def test_windows_cover_a_flight_and_overlap() -> None:
     assert whole.is_last
 
 
-def test_carried_information_is_that_of_the_earlier_keyframes() -> None:
+def test_carried_prior_equals_information_of_earlier_keyframes() -> None:
     """With the later measurements it gives the covariance of all of them together."""
     problem, values = flight()
     values = Values(values.state, values.constants)

@@ -7,7 +7,7 @@ GRID = np.arange(200) / 100
 STILL = SensorTrack(*np.zeros((4, 200)), np.zeros(200, bool))
 
 
-def test_ranges_that_no_radio_gives_are_not_usable() -> None:
+def test_impossible_ranges_are_not_usable() -> None:
     time_s = np.arange(7.0)
     range_m = np.array([1.0, 0.0, -1.0, 65535.0, np.nan, np.inf, 2.0])
     assert usable_ranges(time_s, range_m).tolist() == [True, *[False] * 5, True]

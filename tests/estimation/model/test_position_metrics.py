@@ -45,7 +45,7 @@ def test_consistent_estimator_has_nees_2_and_coverage_95_percent() -> None:
     assert found.rmse_m == pytest.approx(np.sqrt(0.05), rel=0.02)
 
 
-def test_errors_before_settling_count_for_the_gate_only() -> None:
+def test_errors_before_settling_affect_gate_figures_only() -> None:
     errors = np.zeros((100, 2))
     errors[:50, 0] = 5.0
     kept = np.arange(100) >= 40
@@ -101,7 +101,7 @@ def test_truth_covers_times_between_dense_samples() -> None:
     assert not is_covered_by_truth(at_ns, true_ns[:0]).any()
 
 
-def test_figures_are_those_of_a_plain_count() -> None:
+def test_figures_equal_a_direct_computation() -> None:
     rng = np.random.default_rng(5)
     count, settle_s = 101, 3.0  # one sample stands at the border, and counts
     root = rng.normal(size=(count, 2, 2)) * 0.2
@@ -140,7 +140,7 @@ def test_figures_are_those_of_a_plain_count() -> None:
 
 
 @pytest.mark.parametrize(("share", "wrong"), [(0.49, 0.0), (0.51, 1.0)])
-def test_half_the_distance_is_a_wrong_basin(share: float, wrong: float) -> None:
+def test_median_error_over_half_the_distance_is_a_wrong_basin(share: float, wrong: float) -> None:
     errors = np.tile([0.0, 1.5 * share], (9, 1))
     assert compute_figures(judged(errors), 0.0).wrong_basin == wrong
     errors[:4] = 1.5 * (1 - share)  # fewer than half of them say nothing

@@ -67,7 +67,7 @@ def test_ok_positions_meet_the_stated_error_rate() -> None:
     assert bad[ok].max() < bad[more].max() and bad[more].mean() <= 0.1
 
 
-def test_a_bearing_is_open_by_its_worst_direction_over_the_distance() -> None:
+def test_bearing_is_open_by_its_largest_axis_over_the_distance() -> None:
     along = np.diag([0.5**2, 0.02**2, 0.01])
     for distance_m, open_ in ((1.4, True), (1.5, False)):  # 0.5 m over 1.43 m is 0.35 rad
         at = np.tile([distance_m, 0.0, 0.0], (5, 1))

@@ -16,7 +16,7 @@ from dmrl.estimation.solver.keyframes import build_problem
 from ..flights import flown, pair_of, truth_at
 
 
-def test_hypotheses_fill_the_circle_of_the_range() -> None:
+def test_hypotheses_cover_the_range_circle() -> None:
     found = range_circle(2.0, 1.0)
     assert found.shape == (96, 3)
     assert np.hypot(*found.T[:2]) == pytest.approx(np.sqrt(3))
@@ -49,7 +49,7 @@ def test_states_are_compared_at_both_ends_modulo_full_turns() -> None:
 
 
 @pytest.mark.heavy
-def test_the_likeliest_track_is_near_the_truth_whatever_its_start() -> None:
+def test_most_likely_track_is_near_the_truth() -> None:
     flight = flown("random", "calibrated", 1001, 60.0)
     problem = build_problem({(0, 1): pair_of(flight)})
     tracks = follow_hypotheses(problem)

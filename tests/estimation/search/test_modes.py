@@ -33,7 +33,7 @@ def straight(nearest_m: float) -> np.ndarray:
     return np.column_stack([along, np.full(21, nearest_m), np.zeros(21)])
 
 
-def test_a_close_pass_is_flipped_and_the_rest_stays() -> None:
+def test_mirror_copy_flips_a_close_pass_only() -> None:
     path = straight(0.2)
     (copy,) = mirror_copies(path, 5.0)
     assert copy[10] == pytest.approx([0.0, -0.2, 0.0])
@@ -54,7 +54,7 @@ def test_mirror_copies_swap_side_between_close_passes() -> None:
     assert np.abs(mirrored - loop).max() > 1.0
 
 
-def test_the_nearest_pass_is_flipped_first() -> None:
+def test_nearest_pass_is_mirrored_first() -> None:
     path = np.concatenate([straight(0.4), straight(0.1), straight(0.3)])
     path[:, 0] = np.concatenate([np.linspace(-2, 2, 21) * way for way in (1, -1, 1)])
     first = mirror_copies(path, 5.0)[0]
@@ -76,7 +76,7 @@ def test_modes_are_distinct_and_nearly_as_good_as_the_best() -> None:
     assert len(select_modes([at(k, 10.0) for k in range(9)])) == MAX_MODES
 
 
-def test_the_coarse_copy_has_one_range_a_keyframe_and_white_noise() -> None:
+def test_coarse_problem_has_one_range_per_keyframe_and_white_noise() -> None:
     problem, true = flight()
     coarse = coarsen(problem)
     assert len(coarse.links[0].range_m) <= len(problem.keyframe_s)
@@ -106,7 +106,7 @@ def test_values_are_built_from_a_track_or_from_dead_reckoning() -> None:
     assert (reckoned.constants == 0.5).all()
 
 
-def test_a_composite_is_the_likeliest_track_of_each_stretch() -> None:
+def test_composite_track_takes_the_most_likely_segments() -> None:
     def track(x_m: float, turns: int, *scores: float) -> Track:
         pose = np.tile([x_m, 0.0, 2 * np.pi * turns], (6, 1))
         return Track(pose, np.zeros(2), np.repeat(scores, 3))
@@ -128,7 +128,7 @@ def test_the_modes_of_a_flight_contain_the_truth() -> None:
 
 
 @pytest.mark.heavy
-def test_ranges_that_are_too_short_lead_no_solve_around_the_observer() -> None:
+def test_too_short_ranges_do_not_collapse_the_solve() -> None:
     world = flown("in_view", "calibrated", 1003, 60.0)
     pair = pair_of(world)
     short = replace(pair, range_m=np.maximum(pair.range_m - 0.4, 0.02))

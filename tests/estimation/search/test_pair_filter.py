@@ -32,7 +32,7 @@ def lanes(count: int) -> list[Lane]:
 
 
 @pytest.mark.parametrize("way", [0, 1])
-def test_from_the_truth_a_filter_stays_there_either_way(way: int) -> None:
+def test_filter_started_at_truth_stays_there_in_both_directions(way: int) -> None:
     made, true = inputs()
     lane = lanes(len(true))[way]
     run = run_lanes(made, [lane], true[lane.keyframe[:1]], ONE, len(true))
@@ -42,7 +42,7 @@ def test_from_the_truth_a_filter_stays_there_either_way(way: int) -> None:
     assert run.log_likelihood.shape == (len(true), 1)
 
 
-def test_without_measurements_a_step_back_undoes_a_step() -> None:
+def test_backward_prediction_inverts_forward_prediction() -> None:
     made, true = inputs()
     blind = replace(made, range_m=np.full(len(true), np.nan))
     ahead = run_lanes(blind, [Lane(np.arange(5, 9), True)], true[5:6], ONE, 4)
@@ -69,7 +69,7 @@ def test_bias_jacobian_changes_sign_backward_in_time() -> None:
         assert run.step[0, 0, 2, 3:] == pytest.approx([seconds, -seconds])
 
 
-def test_a_range_pulls_along_its_line_and_a_far_one_less() -> None:
+def test_range_update_is_radial_and_robust() -> None:
     made, true = inputs()
     results = []
     for excess in (0.0, 0.2, 5.0):
@@ -91,7 +91,7 @@ def test_a_range_pulls_along_its_line_and_a_far_one_less() -> None:
     assert towards @ kept @ towards == pytest.approx(spread * (1 - wanted * level), rel=0.02)
 
 
-def test_an_image_turns_the_peer_to_where_it_was_seen() -> None:
+def test_bearing_update_rotates_the_peer_to_the_detection() -> None:
     problem, values = flight()
     true = relative_path(values.state)
     made = build_inputs(problem)

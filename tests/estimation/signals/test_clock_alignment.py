@@ -59,7 +59,7 @@ def worst_s(clock: Clock | None) -> float:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_offset_and_drift_come_back_to_5_ms_over_5_minutes(seed: int) -> None:
+def test_clock_is_recovered_within_5_ms_over_5_minutes(seed: int) -> None:
     clock = estimate_from_exchanges(*exchanges(seed))
     assert worst_s(clock) < 0.005
     assert clock is not None and clock.sigma_s < 0.001
@@ -121,7 +121,7 @@ def test_clocks_compose_and_invert() -> None:
     assert chained.sigma_s == pytest.approx(0.005)
 
 
-def test_the_surest_links_are_taken() -> None:
+def test_most_certain_clock_links_are_used() -> None:
     pairs = {
         ("a", "b"): Clock(1.0, sigma_s=0.001),
         ("c", "b"): Clock(5.0, sigma_s=0.001),
@@ -148,7 +148,7 @@ def test_random_clocks_compose_and_invert(one: Clock, two: Clock) -> None:
 
 @settings(max_examples=12, phases=[Phase.generate])
 @given(st.floats(-50, 50), st.floats(-20e-6, 20e-6), st.floats(0.1, 5), st.integers(0, 99))
-def test_any_offset_and_drift_come_back(
+def test_random_offset_and_drift_are_recovered(
     offset_s: float, drift: float, scale: float, seed: int
 ) -> None:
     seen_s, also_s = np.arange(0, 60, 0.05), np.arange(0.02, 60, 0.07)
@@ -230,7 +230,7 @@ def test_given_clocks_have_zero_sigma() -> None:
 @pytest.mark.parametrize(
     ("lasts_s", "enough"), [(MIN_OVERLAP_S - 0.5, False), (MIN_OVERLAP_S + 0.5, True)]
 )
-def test_a_series_lasts_twenty_seconds_at_least(lasts_s: float, enough: bool) -> None:
+def test_clock_series_needs_twenty_seconds(lasts_s: float, enough: bool) -> None:
     time_s = np.arange(0, lasts_s, 0.1)
     assert (_Series.from_samples(time_s, np.sin(time_s)) is not None) == enough
 

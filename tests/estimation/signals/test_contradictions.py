@@ -27,7 +27,7 @@ def runaway(start_s: float = 16.0, end_s: float = np.inf) -> Array:
 
 
 @pytest.mark.parametrize("robot", ["own", "peer"])
-def test_a_crashed_robot_lies_still_on_the_floor(robot: str) -> None:
+def test_log_of_a_crashed_robot_becomes_motionless_on_the_floor(robot: str) -> None:
     flight = pair(track(), track())
     found = drop_contradictions(replace(flight, **{robot: track(runaway())}))
     gone, other = (getattr(found, k) for k in (robot, "peer" if robot == "own" else "own"))
@@ -46,7 +46,7 @@ def test_an_estimate_that_comes_back_is_no_crash() -> None:
     assert (found.own.height_m == 1.0).all()
 
 
-def test_fast_robots_whose_ranges_follow_are_not_touched() -> None:
+def test_fast_motion_consistent_with_ranges_is_kept() -> None:
     """One flies past the other at 8 m/s; then both fly side by side."""
     away = np.abs(8.0 * (RANGES_S - 10)) + 1.0
     past = pair(track(8.0), track(), np.minimum(away, 59.0))
@@ -73,7 +73,7 @@ def test_no_contradiction_is_found_without_ranges() -> None:
     assert drop_contradictions(few) is few
 
 
-def test_a_height_farther_than_the_peer_is_impossible() -> None:
+def test_height_difference_beyond_the_range_is_dropped() -> None:
     high = np.where((GRID_S > 5) & (GRID_S < 6), 9.0, 1.0)
     found = drop_contradictions(pair(track(), track(height=high)))
     assert found.peer.height_dropout is not None

@@ -22,7 +22,7 @@ def test_a_shift_is_found_to_a_fifth_of_a_pixel(moved: tuple[float, float]) -> N
     assert found == pytest.approx(moved, abs=0.2)
 
 
-def test_pictures_with_nothing_in_common_have_no_shift() -> None:
+def test_unrelated_images_have_no_shift() -> None:
     assert estimate_shift(*RNG.normal(size=(2, 56, 80))) is None
     assert estimate_shift(np.zeros((56, 80)), np.zeros((56, 80))) is None
     assert estimate_shift(np.zeros((56, 80)), np.zeros((56, 81))) is None

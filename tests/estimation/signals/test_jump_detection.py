@@ -27,7 +27,7 @@ def test_heights_that_do_not_jump_stay_as_they_are() -> None:
         assert (remove_height_steps(TIME_S, height) == height).all()
 
 
-def test_a_signal_that_begins_and_one_that_ends_too_large() -> None:
+def test_steps_at_both_ends_of_a_signal_are_found() -> None:
     values = np.zeros(400)
     values[:50], values[380:] = 1.0, 2.0
     found = step_offsets(values, 0.1, 0.45, 3)
@@ -43,7 +43,7 @@ def test_step_that_never_returns_is_no_level() -> None:
 
 
 @pytest.mark.parametrize(("jump", "seen"), [(0.44, False), (0.46, True)])
-def test_a_jump_is_larger_than_the_least(jump: float, seen: bool) -> None:
+def test_step_must_exceed_the_minimum(jump: float, seen: bool) -> None:
     values = np.zeros(400)
     values[100:150] = jump
     found = step_offsets(values, 0.1, 0.45, 3)

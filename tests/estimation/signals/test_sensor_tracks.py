@@ -19,13 +19,13 @@ def test_zero_optical_flow_is_a_dropout() -> None:
     assert (found.dropout == stuck).mean() > 0.99
 
 
-def test_a_log_that_repeats_its_samples_or_stands_still_is_not_frozen() -> None:
+def test_upsampled_and_constant_zero_logs_are_not_frozen() -> None:
     slow = np.repeat(noisy()[::20], 20, axis=0)
     assert not find_frozen(GRID_S, slow, GRID_S).any()
     assert not find_frozen(GRID_S, np.zeros((len(GRID_S), 2)), GRID_S).any()
 
 
-def test_each_sensor_stands_in_its_place_and_any_ones_silence_is_a_gap() -> None:
+def test_track_columns_match_sensors_and_dropouts_are_marked() -> None:
     forward = noisy() * 0.01 + [1.0, -0.5]
     turn = np.full((len(GRID_S), 1), 0.3)
     high = np.ones((len(GRID_S), 1))
@@ -60,7 +60,7 @@ def test_signal_with_mostly_repeated_samples_is_not_frozen(share: float, told: b
     assert find_frozen(GRID_S, values, GRID_S).any() == told
 
 
-def test_heights_are_smoothed_by_parabolas_over_half_a_second() -> None:
+def test_heights_are_smoothed_by_local_parabolas() -> None:
     high = 1 + 0.3 * GRID_S - 0.02 * GRID_S**2
     still = np.zeros((len(GRID_S), 1))
     logs = (GRID_S, still), (GRID_S, noisy())

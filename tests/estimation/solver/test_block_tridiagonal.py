@@ -86,7 +86,7 @@ def test_a_matrix_that_is_not_positive_definite_is_an_error() -> None:
         solve_step(replace(found, diagonal=-found.diagonal))
 
 
-def test_eliminated_keyframes_leave_their_information() -> None:
+def test_eliminated_keyframes_leave_the_schur_complement() -> None:
     found, dense, vector = random_equations()
     information, pull = eliminate_before(found, 3)
     gone = np.arange(3 * WIDTH)

@@ -90,7 +90,7 @@ def test_denoising_keeps_fast_and_slow_motion() -> None:
         assert 0.5 * speed < relative < 1.2 * speed
 
 
-def test_robots_that_move_alike_do_not_move_relative_to_each_other() -> None:
+def test_equal_motions_have_no_relative_motion() -> None:
     task, rng = problem(), np.random.default_rng(2)
     way = 0.5 * np.exp(2j * np.pi * KEY_S[1:] / 6.0)
     own, relative = speeds(task, moving(task, way + noise_of(task, rng), way + noise_of(task, rng)))

@@ -34,7 +34,7 @@ def estimate(seed: int = 0) -> Estimate:
 
 
 @given(st.floats(3, 4.5))
-def test_between_keyframes_all_goes_over_evenly(time_s: float) -> None:
+def test_estimate_is_interpolated_linearly_between_keyframes(time_s: float) -> None:
     found = estimate()
     xy, spread, status = found.interpolate_at(np.array([time_s]))
     for got, columns in ((xy, found.state[:, :2]), (spread, found.covariance[:, :2, :2])):
@@ -44,14 +44,14 @@ def test_between_keyframes_all_goes_over_evenly(time_s: float) -> None:
     assert status.tolist() == [OK]
 
 
-def test_outside_a_flight_its_ends_are_held_and_not_ok() -> None:
+def test_estimate_is_held_and_unconverged_outside_the_flight() -> None:
     found = replace(estimate(), status=np.array([OK, OK, AMBIGUOUS, AMBIGUOUS], np.int8))
     xy, _, status = found.interpolate_at(np.array([2.99, 3.0, 3.49, 3.51, 4.5, 4.51]))
     assert status.tolist() == [UNCONVERGED, OK, OK, AMBIGUOUS, AMBIGUOUS, AMBIGUOUS]
     assert xy[[0, 1, 4, 5]] == pytest.approx(found.state[[0, 0, -1, -1], :2])
 
 
-def test_the_observer_is_where_its_peer_sees_it() -> None:
+def test_transform_to_peer_inverts_the_relative_pose() -> None:
     rng = np.random.default_rng(1)
     place, heading = rng.normal(size=(2, 9)) + 1j * rng.normal(size=(2, 9)), rng.normal(size=(2, 9))
 
@@ -82,7 +82,7 @@ def test_covariance_seen_from_peer_is_transformed_by_the_jacobian() -> None:
     assert other.covariance == pytest.approx(wanted, rel=1e-6, abs=1e-6)
 
 
-def test_seen_from_the_peer_own_constants_are_the_peer_s() -> None:
+def test_seen_from_peer_swaps_constants() -> None:
     found = estimate(3)
     other = seen_from_peer(found)
     for name in ("gyro_bias", "velocity_scale", "vx_bias", "vy_bias", "height_offset"):

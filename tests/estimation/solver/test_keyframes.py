@@ -51,7 +51,7 @@ def test_keyframes_hold_motion_between_them_and_around_each_range() -> None:
     )
 
 
-def test_a_robot_without_odometry_has_dropped_out_of_its_own_steps() -> None:
+def test_odometry_dropout_affects_its_own_robot_only() -> None:
     dense, quiet = np.arange(3.0, 23.0, 0.1), (TIME_S > 10) & (TIME_S < 11)
     flight = pair(dense)
     flight = replace(flight, peer=replace(flight.peer, dropout=quiet))
@@ -69,7 +69,7 @@ def test_log_with_most_dropouts_is_used_for_a_robot() -> None:
         assert first.dropout_s.sum() == pytest.approx(1.0, abs=0.02)
 
 
-def test_silence_of_ranges_lasts_over_half_a_second() -> None:
+def test_range_dropout_lasts_over_half_a_second() -> None:
     dense = np.arange(3.0, 23.0, 0.1)
     times = np.arange(4.0, 22.0, 0.1)
     assert not range_dropout(pair(dense), times).any()
@@ -77,7 +77,7 @@ def test_silence_of_ranges_lasts_over_half_a_second() -> None:
     assert times[gap][[0, -1]] == pytest.approx([10.0, 10.7], abs=0.06)
 
 
-def test_a_time_beside_a_silent_sample_is_silent() -> None:
+def test_dropout_extends_to_neighbouring_times() -> None:
     flight = pair(np.arange(3.0, 23.0, 0.1))
     alone = np.arange(len(TIME_S)) == 1000
     flight = replace(flight, peer=replace(flight.peer, dropout=alone))
@@ -97,7 +97,7 @@ def test_range_step_offset_is_detected_above_the_minimum() -> None:
         assert not levels[(dense < 8.5) | (dense > 11.5)].any()
 
 
-def test_a_fast_change_of_the_distance_is_no_shadow() -> None:
+def test_fast_relative_motion_is_no_range_step() -> None:
     """Robots that fly apart at 3 m/s in a second, by their own odometry."""
     speed = 1.5 * ((TIME_S > 9) & (TIME_S < 9.4))
     own = replace(arc(0.0, 0.0, 0.0), vx_mps=-speed)
@@ -109,7 +109,7 @@ def test_a_fast_change_of_the_distance_is_no_shadow() -> None:
     assert range_step_offsets(Pair(TIME_S, still, still, ranges_s, range_m)).any()
 
 
-def test_an_averaged_range_is_the_median_at_its_keyframe() -> None:
+def test_averaged_range_is_the_median_per_keyframe() -> None:
     ranges_s = np.arange(3.0, 22.99, 0.02)
     range_m = 2 + 0.5 * (ranges_s - 3)
     range_m[::11] += 3.0

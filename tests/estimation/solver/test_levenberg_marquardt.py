@@ -38,7 +38,7 @@ def test_an_iteration_ends_at_a_known_solution() -> None:
     assert is_same_solution(early.values, whole.values, 0.02)
 
 
-def test_two_solutions_are_the_same_that_are_nowhere_apart() -> None:
+def test_solutions_are_equal_if_their_relative_paths_are() -> None:
     _, true = flight()
     state = true.state.copy()
     state[7, 3] += 0.06

@@ -153,7 +153,7 @@ def test_measured_motion_has_the_errors_of_its_sensors() -> None:
     assert found.rows[:, 1, 0, -1] * std == pytest.approx(0.1, abs=5e-3)
 
 
-def test_a_late_clock_shows_what_was_a_moment_ago() -> None:
+def test_clock_derivative_shifts_odometry_in_time() -> None:
     problem, _ = flight()
     by_clock = problem.robots[1].clock_derivative
     # The turn rate is -0.3 + 0.3 sin t, so a step's turn changes by 0.3 cos t per second.
@@ -223,7 +223,7 @@ def test_bearing_factor_is_zero_at_truth_with_exact_jacobian(side: int) -> None:
         assert change == pytest.approx(0.02 / 0.03)
 
 
-def test_an_image_far_off_has_no_weight_and_a_constant_cost() -> None:
+def test_outlier_image_has_zero_weight_and_constant_cost() -> None:
     problem, values = flight()
     layout, view = problem.layout, problem.views[0]
     costs = []

@@ -30,14 +30,14 @@ def test_weight_and_curvature_are_derivatives_of_the_cost(loss: Loss) -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_small_residuals_count_in_full(loss: Loss) -> None:
+def test_small_residuals_have_full_weight(loss: Loss) -> None:
     small = np.array([0.0, 1e-8])
     assert loss.cost(small) == pytest.approx(small)
     assert loss.weight(small) == pytest.approx(1.0)
     assert loss.curvature(small) == pytest.approx(1.0)
 
 
-def test_a_residual_at_the_scale_of_cauchy_counts_half() -> None:
+def test_residual_at_the_cauchy_scale_has_half_weight() -> None:
     assert Cauchy(3.0).weight(np.array([9.0])) == pytest.approx(0.5)
     assert Huber(2.0).weight(np.array([16.0])) == pytest.approx(0.5)
 

@@ -52,7 +52,7 @@ def test_the_sensor_file_has_the_rows_with_a_key() -> None:
     assert set(SCALES) == {"range_scale", "velocity_scale"}
 
 
-def test_every_owner_has_its_column() -> None:
+def test_layout_has_one_column_per_owner() -> None:
     layout = build_layout(TABLE, 3, [(0, 1), (1, 2)])
     subjects = [subject for subject, _ in layout.constants]
     assert [own for name, own in subjects if name == "range_offset"] == [(0, 1), (1, 2)]
@@ -72,13 +72,13 @@ def test_every_owner_has_its_column() -> None:
         layout.find("range_offset", 0, 2)
 
 
-def test_a_flight_unknown_belongs_to_all_measurements_once() -> None:
+def test_flight_unknown_applies_once_to_each_measurement() -> None:
     shared = Unknown("all", "m", 0.1, "flight", range=ROWS["range_offset"].range)
     layout = build_layout((shared,), 2, [(0, 1)])
     assert [row.name for row, *_ in layout.measured((0, 1), "range")] == ["all"]
 
 
-def test_from_the_peer_own_constants_are_the_peer_s_and_clocks_negated() -> None:
+def test_from_peer_swaps_constants_and_negates_clocks() -> None:
     layout = build_layout(TABLE, 2, [(0, 1)])
     values = np.arange(1.0, 1 + len(layout.constants))
     other = from_peer(layout, values)

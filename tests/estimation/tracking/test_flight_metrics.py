@@ -41,7 +41,7 @@ def mask(*spans: tuple[int, int]) -> np.ndarray:
     return out
 
 
-def test_stretches_are_found_at_both_ends() -> None:
+def test_spans_of_true_values_are_found() -> None:
     found = find_stretches(np.array([True, False, True, True, False, True]))
     assert found.tolist() == [[0, 1], [2, 4], [5, 6]]
     assert not len(find_stretches(np.zeros(3, bool)))
@@ -58,7 +58,7 @@ def test_stretches_are_found_at_both_ends() -> None:
         (8.2, [-0.8, 0.0, 0.0], 5.0),
     ],
 )
-def test_a_peer_is_lost_far_away_or_off_the_axis_for_three_seconds(
+def test_peer_is_lost_after_three_seconds_far_away_or_off_axis(
     end_s: float, xyz: list[float], held_s: float
 ) -> None:
     figures = compute_flight_figures(flight(true_m=places(5.0, end_s, xyz)))
@@ -66,7 +66,7 @@ def test_a_peer_is_lost_far_away_or_off_the_axis_for_three_seconds(
     assert figures["held_to_end"] == (held_s == 20.0)
 
 
-def test_contacts_are_counted_once_each() -> None:
+def test_each_contact_is_counted_once() -> None:
     path = places(3.0, 3.5, [0.19, 0.0, 0.0])
     path[TRUE_S > 19.5] = 0.0, 0.1, 0.1
     figures = compute_flight_figures(flight(true_m=path))
@@ -74,7 +74,7 @@ def test_contacts_are_counted_once_each() -> None:
     assert figures["least_m"] == pytest.approx(math.hypot(0.1, 0.1))
 
 
-def test_silences_are_stretches_in_view_without_a_detection() -> None:
+def test_detection_gaps_count_only_images_in_view() -> None:
     figures = compute_flight_figures(
         flight(in_view=mask((50, 60)), detected=mask((10, 12), (48, 66), (190, 200)))
     )
@@ -86,7 +86,7 @@ def test_silences_are_stretches_in_view_without_a_detection() -> None:
     assert figures["find_again_s"] == pytest.approx(0.6)  # it is back at 60, detected at 66
 
 
-def test_alarms_have_a_duration() -> None:
+def test_false_alarms_have_durations() -> None:
     false = np.zeros(IMAGES)
     false[20:24], false[100:102] = 1, 3
     figures = compute_flight_figures(flight(false=false))
@@ -95,7 +95,7 @@ def test_alarms_have_a_duration() -> None:
     assert figures["longest_alarm_s"] == pytest.approx(0.4)
 
 
-def test_long_silences_end_loops_and_weak_detections_do_not() -> None:
+def test_long_detection_gaps_end_loops() -> None:
     short, long = mask(*((k, k + 5) for k in range(0, 150, 15))), mask((30, 45), (90, 110))
     times = {
         name: compute_flight_figures(flight(found=found))["loop_s"]

@@ -39,12 +39,12 @@ def test_a_range_fits_within_two_sigmas_of_itself_and_the_track(sigmas: float, n
 
 
 @pytest.mark.parametrize(("misfit", "named"), [(1.4, False), (1.6, True)])
-def test_every_other_name_must_fit_clearly_worse(misfit: float, named: bool) -> None:
+def test_name_needs_a_clear_margin_over_others(misfit: float, named: bool) -> None:
     other = 2.0 + RANGE_STD_M * np.sqrt(misfit)
     assert bool(names([Track(1, 2.0)], cf2=2.0, cf3=other)) == named
 
 
-def test_two_tracks_share_the_names_as_they_fit_together() -> None:
+def test_names_are_assigned_jointly_to_two_tracks() -> None:
     assert names([Track(1, 1.0), Track(2, 3.0)], cf2=3.0, cf3=1.0) == {1: "cf3", 2: "cf2"}
 
 
@@ -60,7 +60,7 @@ def test_single_range_outlier_is_bounded_and_forgotten() -> None:
     assert found == {1: "cf2"}
 
 
-def test_a_track_that_is_gone_and_one_that_no_one_ranged_have_no_name() -> None:
+def test_ended_and_unranged_tracks_have_no_name() -> None:
     identity = TrackIdentity()
     assert identity.assign([Track(1, 2.0)], {"cf2": 2.0}, 0.1) == {1: "cf2"}  # type: ignore[list-item]
     assert identity.assign([], {}, 0.1) == {}

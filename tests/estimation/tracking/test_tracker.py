@@ -28,7 +28,7 @@ def test_a_peer_is_followed_through_misses_and_false_alarms() -> None:
     assert np.sqrt(np.mean(run.track_m2)) < 0.4
 
 
-def test_the_filter_knows_its_error_while_its_model_holds() -> None:
+def test_tracker_covariance_is_consistent_under_its_model() -> None:
     """No false alarms, no misses: what is left is the filter's own arithmetic."""
     squared: list[float] = []
     for seed in range(8):
@@ -77,7 +77,7 @@ NOTHING = ImageDetections(np.zeros((0, 2)), np.zeros(0), 0.0, 0.0, np.zeros(0))
 STILL = EgoMotion(DT_S, np.zeros(3), 0.0)
 
 
-def test_a_standing_peer_has_no_velocity_whatever_the_observer_does() -> None:
+def test_static_peer_has_zero_velocity_for_a_moving_observer() -> None:
     tracker = Tracker(AIDECK, TUNING)
     peer, own, yaw = np.array([1.8, 0.0, 0.1]), np.zeros(3), 0.0
     for k in range(60):
@@ -146,7 +146,7 @@ def test_weak_detections_keep_an_expected_track_accurate() -> None:
     assert held.existence > 0.9
 
 
-def test_silence_lowers_existence_slowly_and_near_more_than_far() -> None:
+def test_missed_detections_lower_existence_more_at_short_distance() -> None:
     fallen = []
     for distance_m in (0.75, 1.75):
         tracker = Tracker(AIDECK, TUNING)
@@ -174,7 +174,7 @@ def test_two_tracks_keep_numbers_and_are_named_by_range() -> None:
         assert names[track.number] == ("cf2", "cf3")[nearest]
 
 
-def test_a_track_that_no_range_fits_has_no_name() -> None:
+def test_track_without_matching_range_has_no_name() -> None:
     tracker, identity = Tracker(AIDECK, TUNING), TrackIdentity()
     for _ in range(40):
         tracks = tracker.step(STILL, view_of(np.array([[1.0, 0.0, 0.0]])))
@@ -220,7 +220,7 @@ def test_predicted_covariance_matches_simulated_motion_model() -> None:
     assert np.sqrt(np.diag(covariance)) == pytest.approx(drawn.std(axis=0), rel=0.08)
 
 
-def test_a_track_moves_against_the_observer() -> None:
+def test_prediction_subtracts_the_observer_motion() -> None:
     states = started(np.array([[2.0, 0.3, 0.1]]))
     states.mean[0, 3:6] = 0.5, 0.0, -0.2  # over ground, along the axes before the turn
     states.predict(EgoMotion(0.5, np.array([0.4, 0.1, 0.05]), np.pi / 2), TUNING)
@@ -232,7 +232,7 @@ def test_a_track_moves_against_the_observer() -> None:
     assert mean == pytest.approx([*place, 0.0, -0.5 * calm, -0.2 * calm])
 
 
-def test_a_depth_s_own_deviation_counts_by_its_share_of_the_depth() -> None:
+def test_depth_noise_is_sigma_relative_to_depth() -> None:
     view = replace(
         view_of(np.ones((3, 3))),
         depth_m=np.array([2.0, 4.0, 1.0]),
@@ -243,7 +243,7 @@ def test_a_depth_s_own_deviation_counts_by_its_share_of_the_depth() -> None:
     assert noise[:, :2].max() == noise[:, 2, :2].max() == 0.0
 
 
-def test_a_new_track_is_as_unsure_as_detections_that_are_drawn() -> None:
+def test_covariance_of_a_new_track_matches_sampled_detections() -> None:
     tracker, rng, count = Tracker(AIDECK, replace(TUNING, pixel_std_px=2.0)), default_rng(0), 4_000
     true, tilt = np.array([[1.6, 0.3, -0.2]]), np.array([0.1, -0.05])
     uv, depth_m, _ = pixels_from_horizontal(true, tilt[:1], tilt[1:], AIDECK)

@@ -40,7 +40,7 @@ def test_chip_maps_are_probabilities_and_metres_at_image_time(frames: Path, tmp_
     np.testing.assert_allclose(values[1], np.exp(-0.211 * levels), rtol=1e-5)
 
 
-def test_half_a_pair_and_pairs_of_two_sizes_are_refused(frames: Path, tmp_path: Path) -> None:
+def test_incomplete_or_unequal_map_pairs_are_refused(frames: Path, tmp_path: Path) -> None:
     pgm(frames / "gap8-maps/dep00009.ppm", np.zeros((2, 4), int))
     with pytest.raises(SourceError, match=r"dep00009\.ppm differs in size"):
         dmrl.convert(frames, tmp_path / "out.mcap")

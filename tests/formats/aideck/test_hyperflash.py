@@ -58,7 +58,7 @@ def test_pictures_come_back_to_the_pixel(dump: Path) -> None:
     np.testing.assert_array_equal(found[2][:, :158], halves[:, :158])
 
 
-def test_numbers_come_back_to_the_bit(dump: Path) -> None:
+def test_numbers_are_decoded_exactly(dump: Path) -> None:
     wanted = np.array(VALUES, np.float32).astype(float)
     logged = [list(s.fields.values()) for s in samples(dump, "log")]
     assert (np.array(logged) == wanted).all()
@@ -78,12 +78,12 @@ def test_the_peer_is_labelled_where_the_firmware_had_it(dump: Path) -> None:
     assert peer["depth_m"] == pytest.approx(1.1, abs=0.02)
 
 
-def test_times_are_nominal(dump: Path) -> None:
+def test_times_follow_the_nominal_rate(dump: Path) -> None:
     times = [s.time_ns for s in samples(dump, "CompressedImage", Options(rate_hz=4))]
     assert times == [0, 250_000_000, 500_000_000]
 
 
-def test_nothing_after_the_end_marker_is_read(dump: Path) -> None:
+def test_reading_stops_at_the_end_marker(dump: Path) -> None:
     dump.write_bytes(dump.read_bytes() + dump.read_bytes())
     assert len(samples(dump, "CompressedImage")) == 3
 
@@ -121,7 +121,7 @@ def test_an_erased_flash_holds_no_record(tmp_path: Path) -> None:
         hyperflash.load_content(path, Options())
 
 
-def test_it_is_known_by_its_numbers(dump: Path) -> None:
+def test_hyperflash_dump_is_recognized_by_plausible_numbers(dump: Path) -> None:
     assert find_format(dump).name == "hyperflash"
     noise = np.random.default_rng(0).integers(0, 256, 100_000, np.uint8).tobytes()
     dump.write_bytes(noise)

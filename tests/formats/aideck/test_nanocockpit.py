@@ -88,7 +88,7 @@ def test_a_row_without_its_picture_is_left_out(folder: Path) -> None:
     assert counted.counts == {"rows without their picture": 1}
 
 
-def test_it_is_known_by_its_table(folder: Path) -> None:
+def test_nanocockpit_folder_is_recognized_by_its_table(folder: Path) -> None:
     assert find_format(folder).name == "nanocockpit"
 
 
@@ -98,7 +98,7 @@ def test_differences_of_counts_that_wrap_are_the_short_way() -> None:
     assert nanocockpit._wrap_to_int32(ticks).tolist() == short
 
 
-def test_a_state_that_stands_counts_once_and_none_before_the_first(folder: Path) -> None:
+def test_repeated_state_is_written_once(folder: Path) -> None:
     path = folder / "metadata.csv"
     head, *lines = path.read_text().splitlines()
     at = head.split(",").index("state_gap8_timestamp")
@@ -115,7 +115,7 @@ def test_a_state_that_stands_counts_once_and_none_before_the_first(folder: Path)
     assert samples(folder).keys() == {"/cf1/camera/image"}
 
 
-def test_a_camera_that_is_given_stands_before_the_pictures(folder: Path) -> None:
+def test_given_calibration_is_written_before_the_images(folder: Path) -> None:
     camera = replace(AIDECK, width_px=32, height_px=24)
     first, *rest = nanocockpit.load_content(folder, Options(robot="me", camera=camera)).samples
     while first.topic != "/me/camera/calibration":  # a state may have come before

@@ -115,7 +115,7 @@ def test_a_leaning_beam_is_longer_than_the_height() -> None:
     assert [s.fields["height_m"] for s in found] == pytest.approx([lean, 2 * lean])
 
 
-def test_ranges_are_metres_and_fresh() -> None:
+def test_ranges_are_in_metres_and_repeated_values_dropped() -> None:
     floats = block("a", ranging__distance2=[1.5, 1.5, 2.5])
     whole = LogBlock("b", TIMES, {"ranging.distance3": np.array([1500, 61_000, 1200], np.uint16)})
     found = [
@@ -132,7 +132,7 @@ def test_ranges_are_metres_and_fresh() -> None:
     ]
 
 
-def test_a_place_without_a_turn_is_level_and_looks_along_x() -> None:
+def test_pose_without_orientation_is_level_and_faces_x() -> None:
     place = TimeSeries(np.arange(3), np.arange(9.0).reshape(3, 3))
     found = _combine_pose(place, None)
     assert found is not None and _combine_pose(None, place) is None
@@ -203,7 +203,7 @@ def test_state_in_millimetres_is_taken_where_there_is_none_in_metres() -> None:
     assert find_in_metres([packed, plain], "x y z") is None
 
 
-def test_a_turn_of_which_only_a_part_is_logged_is_level_else() -> None:
+def test_missing_angles_of_an_orientation_are_zero() -> None:
     found = find_orientation([block("a", stateEstimate__yaw=[90.0], stateEstimate__pitch=[20.0])])
     wanted = euler_to_quaternion(np.array([[0.0, np.radians(-20), np.pi / 2]]))
     assert found is not None and found.values == pytest.approx(wanted)

@@ -60,7 +60,7 @@ def test_rates_of_a_real_log_are_those_that_were_set(data: Path) -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_both_versions_are_read(version: int) -> None:
+def test_both_log_versions_are_read(version: int) -> None:
     raw = foreign.usd_log(version)
     log = usd_log.decode_log(raw)
     assert (log.version, log.warnings) == (version, ())

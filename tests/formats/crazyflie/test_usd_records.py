@@ -72,7 +72,7 @@ def test_records_are_those_of_a_walk_from_one_to_the_next(
         assert {name: row.tobytes() for name, row in rows.items()} == wanted
 
 
-def test_a_record_is_packed() -> None:
+def test_record_layout_has_no_padding() -> None:
     event = EventType(1, "a", (("x", "B"), ("y", "I")), "<u8")
     assert event.dtype.itemsize == 2 + 8 + 1 + 4
     assert list(event.dtype.fields or ()) == ["id", "time", "v0", "v1"]

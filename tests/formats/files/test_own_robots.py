@@ -101,7 +101,7 @@ LAYOUTS = ("a file a robot", "columns of robots", "rows of robots")
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_one_table_serves_all_robots(layout: str, tmp_path: Path) -> None:
+def test_one_column_map_serves_all_robots(layout: str, tmp_path: Path) -> None:
     source = write(tmp_path, layout)
     out = dmrl.convert(source, tmp_path / "out.mcap", columns=tmp_path / "map.toml").path
     time_s, logs = drive()

@@ -114,7 +114,9 @@ def test_guessed_dialect_is_reported_with_the_deciding_key(
     assert said in err and bool(said) == ("[file]" in err)
 
 
-def test_a_dialect_decides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_given_dialect_overrides_guessing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "a.csv").write_bytes(plain(";", ",", before="! über\n").encode("cp1252"))
     dialect = Dialect(";", ",", "cp1252", "!")
     found = read_table(tmp_path / "a.csv", WANTED, dialect).parse_numbers("d2")
@@ -165,7 +167,9 @@ def test_unusable_cells_and_rows_are_counted_by_line(tmp_path: Path) -> None:
         (["1714564800123456789e-9", "1714564801.123456789"], (1714564800, 1)),
     ],
 )
-def test_dates_are_times(cells: list[str], times_s: tuple[float, float], tmp_path: Path) -> None:
+def test_dates_are_parsed_as_times(
+    cells: list[str], times_s: tuple[float, float], tmp_path: Path
+) -> None:
     quoted = "\n".join(f'"{cell}",1' for cell in cells)
     (tmp_path / "a.csv").write_text(f"t,d2\n{quoted}\n")
     _, time_ns = read_table(tmp_path / "a.csv", ["t", "d2"]).order_by_time("t", 1e9)
@@ -255,7 +259,9 @@ def test_rows_before_time_0_are_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("held", "count", "counted"), [("", 20, 180), ("true", 20, 0)])
-def test_held_ranges_count_once(held: str, count: int, counted: int, tmp_path: Path) -> None:
+def test_repeated_ranges_are_counted_once(
+    held: str, count: int, counted: int, tmp_path: Path
+) -> None:
     key = f"held = {held}\n" if held else ""
     (tmp_path / "map.toml").write_text(TABLE + key)
     rows = [f"{0.02 * k:.2f},0,0,0,{2 + 0.37 * np.sin(k // 10):.3f}" for k in range(200)]

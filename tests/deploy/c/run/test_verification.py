@@ -36,7 +36,7 @@ ANSWER = HarnessResult(
 )
 
 
-def test_answers_are_the_same_in_every_grid_and_every_detection() -> None:
+def test_results_are_equal_if_all_grids_and_detections_are() -> None:
     assert is_same_result(ANSWER, replace(ANSWER, stack_bytes=9))
     for name in ("confidence", "depth"):
         assert not is_same_result(
@@ -48,7 +48,7 @@ def test_answers_are_the_same_in_every_grid_and_every_detection() -> None:
     )
 
 
-def test_proved_is_what_was_tried_without_an_error_or_a_difference() -> None:
+def test_target_is_proved_only_without_errors_and_mismatches() -> None:
     right, wrong = BuildResult("-O1", 3, 0, 0), BuildResult("-O2", 3, 2, 0)
     assert TargetResult("gcc", [right]).proved
     for result in (
@@ -68,7 +68,7 @@ def test_proved_is_what_was_tried_without_an_error_or_a_difference() -> None:
         (0, 1, "answered 1 of 2 images"),
     ],
 )
-def test_a_build_answers_every_image_within_its_stack(
+def test_build_must_answer_every_image_within_its_stack(
     stack: int, drop: int, words: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     network = random_network(1)
@@ -124,7 +124,7 @@ def test_the_header_states_the_bytes_of_the_state(tmp_path: Path) -> None:
         parse_state_memory(random_network(1), tmp_path)
 
 
-def test_the_cost_of_an_image_is_what_a_second_one_adds(
+def test_instructions_per_image_are_the_increment_of_a_second_image(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image, flags = np.zeros((4, 5, 3), np.uint8), []
