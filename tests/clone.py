@@ -1,4 +1,4 @@
-"""A copy of the sources, in which a test adds things."""
+"""A copy of the sources, to which a test adds code."""
 
 import json
 import os

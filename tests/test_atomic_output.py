@@ -1,4 +1,4 @@
-"""Outputs are whole under their name, or absent."""
+"""Atomic outputs: complete under their final name, or absent."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""Where a command ends: one line and an exit status, whatever happened."""
+"""The end of a command: one line and an exit status in every case."""
 
 import errno
 import os

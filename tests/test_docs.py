@@ -1,4 +1,4 @@
-"""What the pages say is so: generated parts are fresh, commands parse, links lead somewhere."""
+"""Documentation: generated parts are current, commands parse, links resolve."""
 
 import re
 import runpy

@@ -1,4 +1,4 @@
-"""Every example in a command's help can be typed, and does what it says."""
+"""Examples in the help of commands: they parse and run."""
 
 import shlex
 import shutil

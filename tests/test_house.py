@@ -1,4 +1,4 @@
-"""What holds for every source file: it says what it is for, and it is short.
+"""Rules for every source file: a docstring, and limited length.
 
 How well it reads is for people to say; this only stops what is plainly too long.
 """

@@ -1,4 +1,4 @@
-"""The tool that changes code: what it changes, and what it leaves alone."""
+"""The mutation tool: which changes it makes."""
 
 from pathlib import Path
 

@@ -1,9 +1,8 @@
-"""Held by the source itself: what comes from a file becomes a path in `dmrl.guards.safe_names`
-alone.
+"""Static checks: one module makes paths of names from files, one parses documents.
 
-A path may be joined with a text that stands in the source. What else it is joined with goes
-through a function of `dmrl.guards.safe_names`, or stands below with the reason why it needs none.
-Documents of strangers are parsed in `dmrl.guards.bounded_parsing` alone, which knows their budgets.
+A path may be joined with a literal of the source. Any other name goes through a function of
+`dmrl.guards.safe_names`, or is listed below with the reason why it needs none. Untrusted documents
+are parsed in `dmrl.guards.bounded_parsing` alone, which has limits for them.
 """
 
 import ast

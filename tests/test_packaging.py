@@ -1,4 +1,4 @@
-"""What is installed: every package listed, data files present, one top-level name."""
+"""Packaging: all packages listed, data files present, one top-level name."""
 
 import re
 import subprocess

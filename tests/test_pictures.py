@@ -1,4 +1,4 @@
-"""The pictures of README.md and docs/ are those that the present code draws."""
+"""Images of README.md and docs/ are those of the present code."""
 
 import re
 import runpy

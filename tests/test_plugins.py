@@ -1,4 +1,4 @@
-"""What another package adds by entry points: it works, it is lazy, and broken it harms nobody."""
+"""Plug-ins by entry points: they work, load lazily, and fail safely."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Recipes: every fault named, nothing done before."""
+"""Recipes: every fault is named before anything runs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

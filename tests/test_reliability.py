@@ -1,4 +1,4 @@
-"""The tables of docs/reliability.md and SECURITY.md: what they name is there."""
+"""The tables of docs/reliability.md and SECURITY.md name existing tests."""
 
 import re
 import tomllib

@@ -1,4 +1,4 @@
-"""The same seed gives the same bytes, whatever the machine, its settings and its user."""
+"""The same seed gives the same bytes on any machine and with any settings."""
 
 import hashlib
 import os

@@ -1,4 +1,4 @@
-"""The schemas: fresh, explained, and with the names that other programs read."""
+"""Schemas: generated files are current, fields documented, names compatible."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Examples and programs on pages have no fault that pyright finds, strictly, after the set-up."""
+"""Examples and programs on pages pass pyright in strict mode."""
 
 import json
 import re

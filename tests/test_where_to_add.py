@@ -1,4 +1,4 @@
-"""docs/architecture.md's "Where to add": each row, done in a copy of the sources and used.
+"""docs/architecture.md's "Where to add": each row, tried in a copy of the sources.
 
 A test edits the copy as the row says, and counts the files that it touched: the table must say so.
 """

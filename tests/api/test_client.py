@@ -1,4 +1,4 @@
-"""A program that uses dmrl passes mypy --strict, and what is wrong in it is found."""
+"""Type checks of a program that uses dmrl: mypy --strict passes it, and finds its errors."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""A dataset from Python: arrays, frames, and what torch makes of it."""
+"""The Python interface to datasets: arrays, images, and batches for torch."""
 
 from pathlib import Path
 

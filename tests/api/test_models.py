@@ -1,4 +1,4 @@
-"""A network from Python finds what ``dmrl predict`` finds."""
+"""The Python interface to networks: the same detections as ``dmrl predict``."""
 
 from pathlib import Path
 from typing import Any

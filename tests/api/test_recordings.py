@@ -1,4 +1,4 @@
-"""A recording from Python says what the file says."""
+"""The Python interface to recordings: the contents of the file."""
 
 from pathlib import Path
 

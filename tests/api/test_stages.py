@@ -1,4 +1,4 @@
-"""Stages as functions write what their commands write."""
+"""Stages as Python functions: the same outputs as their commands."""
 
 import gc
 import json

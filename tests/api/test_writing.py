@@ -1,4 +1,4 @@
-"""A recording of one's own holds what was written, and is checked as any other."""
+"""Recordings written from Python: round trips and checks."""
 
 import math
 from pathlib import Path

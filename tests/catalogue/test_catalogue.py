@@ -1,4 +1,4 @@
-"""A catalogue says what its recordings hold, looks again at what changed, and answers queries."""
+"""Catalogues: their rows, updates after changes, and queries."""
 
 import json
 import os

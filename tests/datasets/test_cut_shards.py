@@ -1,4 +1,4 @@
-"""A shard that is cut while it is mapped ends the reader in one line that names it."""
+"""Shards truncated while they are mapped: the reader ends with one line that names the shard."""
 
 import os
 import subprocess

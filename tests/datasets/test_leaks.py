@@ -1,4 +1,4 @@
-"""What a test split shares with train: pictures that look alike, moments, poses, recordings."""
+"""Leaks from train to test splits: similar images, times, poses and recordings."""
 
 from pathlib import Path
 

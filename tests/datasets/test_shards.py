@@ -1,4 +1,4 @@
-"""Shards of strangers: what is not laid out as a dataset is refused before it is looked at."""
+"""Untrusted shards: invalid layouts are refused before their data are read."""
 
 import shutil
 import struct

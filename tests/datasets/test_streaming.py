@@ -1,4 +1,4 @@
-"""Datasets read from afar and by several: a static file server, and processes of torchrun."""
+"""Datasets read over HTTP and by several processes of torchrun."""
 
 import functools
 import json

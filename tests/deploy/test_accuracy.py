@@ -1,4 +1,4 @@
-"""Detections of a backend, and figures of them."""
+"""Accuracy figures of a backend's detections."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The published chip's own maps of two real frames."""
+"""Comparison with the published chip's maps of two real images."""
 
 import runpy
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""One model, opened for every way to compute it, says the same."""
+"""Detectors opened with each backend give the same results."""
 
 import json
 import os

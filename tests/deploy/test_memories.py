@@ -1,4 +1,4 @@
-"""Two memories: what lies in which, and that layers work in the near one alone."""
+"""Two memories: placement of buffers, and layers that use near memory only."""
 
 import re
 import shutil

@@ -1,4 +1,4 @@
-"""Where the C keeps its rows."""
+"""Ring buffers of the exported C."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""ONNX files of strangers: what they ask for is known before onnxruntime sees them."""
+"""Untrusted ONNX files: their demands are checked before onnxruntime loads them."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Every export says how to use it, in programs that compile, run, and find the same robots."""
+"""Usage programs of every export: they compile, run and give the same detections."""
 
 import py_compile
 import re

@@ -1,4 +1,4 @@
-"""Chessboards as a camera shows them, with corners that are known."""
+"""Rendered chessboards with known corners."""
 
 from dataclasses import dataclass
 

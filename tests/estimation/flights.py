@@ -1,4 +1,4 @@
-"""Simulated flights as pairs, with the truth beside them."""
+"""Simulated flights as pairs, with their truth."""
 
 from functools import cache
 

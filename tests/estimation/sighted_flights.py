@@ -1,4 +1,4 @@
-"""What a detector would see in the flights of `flights`: exact, noisy, or something else."""
+"""Detections in the flights of `flights`: exact, noisy, or false."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Whole flights with what cameras saw in the solve: where ranges tell too little, and where not."""
+"""Solves of whole flights with detections, with and without enough information in the ranges."""
 
 from dataclasses import replace
 

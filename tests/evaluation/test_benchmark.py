@@ -1,4 +1,4 @@
-"""The benchmark: strangers' networks and labels are scored, and copies of the truth refused."""
+"""The benchmark: submitted networks and labels are scored, and copies of the truth refused."""
 
 import csv
 import json

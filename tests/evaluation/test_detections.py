@@ -1,4 +1,4 @@
-"""Which labels and detections meet, and which images count."""
+"""Pairing of labels and detections, and which images count."""
 
 from collections.abc import Sequence
 from pathlib import Path

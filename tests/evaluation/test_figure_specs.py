@@ -1,4 +1,4 @@
-"""What a recipe wants its page to begin with: checked with the recipe, and read from documents."""
+"""Figures of a recipe: checked with the recipe, and read from JSON files."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The judge of labels: its faults change what they name, and its figures are right."""
+"""The label benchmark: its faults change the named signals, and its figures are right."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The limit of a simulated flight in what `evaluate` says."""
+"""The bound of a simulated flight in the output of `evaluate`."""
 
 from dataclasses import asdict, replace
 from pathlib import Path

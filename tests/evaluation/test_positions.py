@@ -1,4 +1,4 @@
-"""Estimated positions beside the truth: axes, covariances, and what is not told."""
+"""Estimated positions against the truth: axes, covariances, and missing estimates."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Datasets for other trainers, read by their own libraries, and back again within 0.01 px."""
+"""Datasets in other formats, read by their own libraries and converted back within 0.01 px."""
 
 import gc
 import json

@@ -1,4 +1,4 @@
-"""What the tests of faults share: how many cases are tried, and the table of counts."""
+"""Fixtures of the fault tests: the number of cases, and the table of counts."""
 
 import os
 import subprocess

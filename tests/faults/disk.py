@@ -1,4 +1,4 @@
-"""Commands run in children of one process that has everything loaded, on a disk that can fail.
+"""Commands run in children of one process with everything loaded, on a disk that can fail.
 
 The process is started once with disk.c before all libraries, and forks for each command: a trial
 takes no longer than the command's own work. Processes that a command starts are on the same disk.

@@ -1,4 +1,4 @@
-"""How a command may end."""
+"""Possible endings of a command."""
 
 import io
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The parts of an MCAP file, taken apart and put together again with every sum and place right.
+"""The parts of an MCAP file, separated and joined again with correct checksums and offsets.
 
 What no checksum and no index refuses has to be met by the code behind them. Written by the
 specification, apart from dmrl and from mcap: both would stop at the first wrong byte.

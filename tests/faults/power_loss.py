@@ -1,4 +1,4 @@
-"""What a disk holds after the power has failed, from the recorded calls of a command.
+"""Possible disk contents after a power failure, from the recorded calls of a command.
 
 strace records what a command and its libraries write, sync, name and remove. `Recorded.survivors`
 gives the folder as it may be after a power loss at any moment: what was synced is there; of what

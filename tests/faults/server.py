@@ -1,4 +1,4 @@
-"""The process that has everything loaded, and forks for each command. Started by disk.py."""
+"""The process with everything loaded, which forks for each command. Started by disk.py."""
 
 import gc
 import importlib

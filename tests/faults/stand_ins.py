@@ -1,4 +1,4 @@
-"""What would take most of the time of a trial, and writes no output.
+"""Substitutes for work that takes long and writes no output.
 
 Blender, new processes, compilers, most of a search, the drawing of figures: what uses them is as
 it always is.

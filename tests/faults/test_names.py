@@ -1,4 +1,4 @@
-"""Outputs with hostile names, of every command that writes: made, or one line and nothing left."""
+"""Hostile output names for every command that writes: an output, or one line and no output."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The power fails at any moment: what has its final name is whole, and what grew is old or new.
+"""Power failures at any moment: outputs are complete, and extended ones old or new.
 
 What counts as written is what was synced by then; see `power_loss`. The calls are those of the
 command and of its libraries, as the system sees them.

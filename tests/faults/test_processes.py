@@ -1,4 +1,4 @@
-"""Several processes: writers of one output, and recorders of a flight on a bad day."""
+"""Concurrent writers of one output, and recorders of a flight under faults."""
 
 import errno
 import json

@@ -1,4 +1,4 @@
-"""Mutated recordings: read as something, or refused in one line; quickly and in little memory."""
+"""Mutated recordings: read, or refused in one line, quickly and in little memory."""
 
 import io
 import os

@@ -1,4 +1,4 @@
-"""Foreign files that are large, or say that they are: one line, and no more memory than the file.
+"""Large third-party files, or files that claim to be: one line, and bounded memory.
 
 Each is converted in a process of its own, by the name of its format, as nothing would guess it.
 """

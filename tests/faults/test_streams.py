@@ -1,4 +1,4 @@
-"""Standard output that is closed or full: one line, and the work that was done stays."""
+"""Closed or full standard output: one line, and finished work stays."""
 
 from pathlib import Path
 

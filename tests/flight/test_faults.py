@@ -1,4 +1,4 @@
-"""A fault does what it says where it says so, and nothing else."""
+"""Simulated faults: each has its stated effect only."""
 
 from dataclasses import replace
 from typing import Any, get_args

@@ -1,4 +1,4 @@
-"""Pilots without a simulation: what they command for what they are told."""
+"""Pilots without a simulation: their commands for given observations."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The noise that comes out is the noise of the table."""
+"""Simulated noise against the noise table."""
 
 from dataclasses import fields
 from functools import cache

@@ -1,4 +1,4 @@
-"""Flights in steps: the contract's dynamics, and measurements that match a flight at once."""
+"""Stepped flights: specified dynamics, and the same measurements as whole flights."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Small sources of every binary format, made here, for tests of their readers."""
+"""Small sources of every binary format, for tests of their readers."""
 
 import struct
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Micro-SD logs written and read value by value: what the fast decoder is held against."""
+"""Micro-SD logs written and read value by value, as reference of the fast decoder."""
 
 import struct
 import zlib

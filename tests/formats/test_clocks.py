@@ -1,4 +1,4 @@
-"""Clocks of files: what a counter, a reset, an unset clock and a simulation make of true times."""
+"""Clocks of files: counters, resets, unset clocks and simulated time."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Poses of a Crazyflie's log: which turn belongs to which place."""
+"""Poses of a Crazyflie log: the orientation that belongs to a position."""
 
 import numpy as np
 from hypothesis import given

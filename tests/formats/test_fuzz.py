@@ -1,4 +1,4 @@
-"""Damaged sources of every binary format: one line or a part of it, and nothing worse."""
+"""Damaged sources of every binary format: one line or partial data, and nothing worse."""
 
 import os
 import resource

@@ -1,4 +1,4 @@
-"""Which format a source is taken for, and what is said where it is none."""
+"""Detection of the format of a source, and the errors if there is none."""
 
 import os
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Documents of strangers: what asks for too much is a ValueError, before it gets it."""
+"""Untrusted documents: excessive demands are a ValueError before they are met."""
 
 import io
 import zipfile

@@ -1,4 +1,4 @@
-"""What a library does on a stranger's words ends in one line, whatever it is."""
+"""Queries in a sandboxed process: every failure ends in one line."""
 
 import os
 import socket

@@ -1,4 +1,4 @@
-"""Folders of strangers: what would be read without end is refused before it is opened."""
+"""Untrusted folders: pipes and devices are refused before they are opened."""
 
 import os
 import socket

@@ -1,4 +1,4 @@
-"""A small pipeline: pictures, a recording of them, and something made of that."""
+"""A small pipeline of images, a recording of them, and a derived output."""
 
 HEAD = 'kind = "pipeline"\n'
 PICTURES = f"""{HEAD}

@@ -1,4 +1,4 @@
-"""A folder in, a folder out: the same bytes with any number of processes, whatever fails."""
+"""Folders of recordings: the same bytes with any number of processes, despite failures."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The demo: the flight that ships, and its figures with dmrl-nano."""
+"""The demo: the shipped flight, and its figures with dmrl-nano."""
 
 import hashlib
 import json

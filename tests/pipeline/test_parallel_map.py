@@ -1,4 +1,4 @@
-"""Work spread over processes: order, errors, deaths, and nobody who stays behind."""
+"""Work in several processes: order, errors, deaths, and no leftover process."""
 
 import multiprocessing
 import os

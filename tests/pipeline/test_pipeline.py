@@ -1,4 +1,4 @@
-"""Pipelines in their processes: the same bytes, kills, and who owns a folder."""
+"""Pipelines in processes: the same bytes, kills, and ownership of a folder."""
 
 import errno
 import json

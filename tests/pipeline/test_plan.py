@@ -1,4 +1,4 @@
-"""Recipes checked whole: every stage, input, output and setting."""
+"""Plans of recipes: every stage, input, output and setting."""
 
 import hashlib
 import json

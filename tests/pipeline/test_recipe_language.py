@@ -1,4 +1,4 @@
-"""What one table of a recipe stands for."""
+"""Expansion of recipe tables into steps."""
 
 import tomllib
 from typing import Any

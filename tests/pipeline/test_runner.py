@@ -1,4 +1,4 @@
-"""What is run, what is not, and what becomes of what was there before."""
+"""Steps that are run or skipped, and the fate of earlier outputs."""
 
 import json
 import os

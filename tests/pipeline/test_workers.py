@@ -1,4 +1,4 @@
-"""Every command with --workers writes and says the same with any number of them."""
+"""Every command with --workers gives the same output with any number of them."""
 
 import inspect
 import os

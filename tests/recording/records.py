@@ -1,4 +1,4 @@
-"""A small recording, and where its records lie."""
+"""A small recording, and the offsets of its records."""
 
 from collections.abc import Iterator
 from pathlib import Path

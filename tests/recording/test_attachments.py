@@ -1,4 +1,4 @@
-"""What recordings carry beside messages: splits, licences, counts, times of an index."""
+"""Data beside messages: splits, licences, counts, times of an index."""
 
 import struct
 from collections import Counter

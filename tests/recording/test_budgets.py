@@ -1,4 +1,4 @@
-"""Recordings that ask for much more than they are: refused before they get it."""
+"""Recordings with excessive demands: refused before they are met."""
 
 import struct
 import subprocess

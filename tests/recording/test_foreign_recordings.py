@@ -1,4 +1,4 @@
-"""Recordings of other writers that were lost in part, or refused, without need."""
+"""Recordings of other writers that were once read in part, or refused without reason."""
 
 import struct
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Topics of a recording that are held in memory."""
+"""Topics of a recording loaded into memory."""
 
 from pathlib import Path
 

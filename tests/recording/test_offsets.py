@@ -1,4 +1,4 @@
-"""Places in an index that lie past the end, before the start, or in another record; sums right."""
+"""Index offsets past the end, before the start, or in another record, with correct checksums."""
 
 import struct
 import zlib

@@ -1,4 +1,4 @@
-"""Ancestors that many inputs share."""
+"""Provenance with ancestors that several inputs share."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What an output says of its inputs."""
+"""Inputs recorded in the provenance of an output."""
 
 from dataclasses import dataclass
 from hashlib import sha256

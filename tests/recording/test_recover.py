@@ -1,4 +1,4 @@
-"""What recover says of what it could not bring back."""
+"""Losses reported by recover."""
 
 from math import sin
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Records of other writers, lost or there twice: noticed without any checksum."""
+"""Lost and repeated records of other writers: noticed without any checksum."""
 
 import struct
 import zlib

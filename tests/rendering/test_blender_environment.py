@@ -1,4 +1,4 @@
-"""Blender's environment where it cannot be made."""
+"""Failures to set up Blender's environment."""
 
 import shutil
 import subprocess

@@ -1,4 +1,4 @@
-"""Cores that a worker shows to Blender's libraries while they are loaded."""
+"""The CPU cores shown to Blender's libraries while they load."""
 
 import os
 

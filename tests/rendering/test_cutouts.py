@@ -1,4 +1,4 @@
-"""Cut-outs: labels that fit the pixels, and a look that fits the image behind."""
+"""Cut-outs: labels that fit the pixels, and appearance that fits the background."""
 
 from pathlib import Path
 

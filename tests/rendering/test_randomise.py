@@ -1,4 +1,4 @@
-"""Looks drawn at random."""
+"""Random appearance of robots and scenes."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What Blender makes of one scene. Skips where it is not set up."""
+"""Scenes rendered by Blender. Skips where it is not set up."""
 
 from dataclasses import replace
 from pathlib import Path

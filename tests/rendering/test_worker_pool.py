@@ -1,4 +1,4 @@
-"""Workers over a pipe: protocol, order, and what happens when one dies."""
+"""Workers behind pipes: protocol, order, and worker deaths."""
 
 import sys
 from io import BytesIO

@@ -1,4 +1,4 @@
-"""A folder whose surroundings are watched, and hostile things to put into it."""
+"""A folder whose surroundings are watched, and hostile inputs for it."""
 
 import hashlib
 import os

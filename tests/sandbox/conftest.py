@@ -1,4 +1,4 @@
-"""A folder whose surroundings are watched, and everything that a stranger can give."""
+"""A folder whose surroundings are watched, with every kind of untrusted input."""
 
 import shutil
 import tempfile

@@ -1,4 +1,4 @@
-"""What datasets and models say of themselves: their names and numbers lead nowhere else."""
+"""Names and numbers in untrusted datasets and models: no path, code or NaN comes of them."""
 
 import json
 import shutil

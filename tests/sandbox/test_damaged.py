@@ -1,4 +1,4 @@
-"""Damaged inputs to every command: an error of one line, and nothing half-written."""
+"""Damaged inputs to every command: a one-line error, and no partial output."""
 
 import os
 from typing import Any

@@ -1,4 +1,4 @@
-"""Hostile recipes, and the other TOML of a stranger, to every command that takes one."""
+"""Hostile recipes and other untrusted TOML, to every command that reads TOML."""
 
 from dataclasses import fields
 from math import isfinite

@@ -1,4 +1,4 @@
-"""A small flight to learn from: bright squares on dark noise, labelled in their middle."""
+"""A small labelled flight for training: bright squares on dark noise."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What a network would have found on a simulated flight, without drawing its images."""
+"""Detections of a network on a simulated flight, without rendering its images."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""``dmrl align`` by what cameras and motion capture saw."""
+"""``dmrl align`` by camera images and motion capture."""
 
 from collections.abc import Callable
 from dataclasses import replace

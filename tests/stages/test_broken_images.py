@@ -1,4 +1,4 @@
-"""Images that cannot be decoded are left out, counted and named; if all are, it is an error."""
+"""Undecodable images are omitted, counted and named; if all are, it is an error."""
 
 import json
 from collections.abc import Callable

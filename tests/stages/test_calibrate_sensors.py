@@ -1,4 +1,4 @@
-"""Robots whose sensors are off in every flight, and what is made of it."""
+"""Calibration of constant sensor errors over several flights."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What convert leaves out is counted in one place: stderr, --json, provenance, --strict."""
+"""Omissions of convert, counted alike in stderr, --json, provenance and --strict."""
 
 import json
 from pathlib import Path

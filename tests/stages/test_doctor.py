@@ -1,4 +1,4 @@
-"""``dmrl doctor`` says what is there and what is not, and ends well where the base works."""
+"""``dmrl doctor`` lists installed and missing parts."""
 
 import importlib.metadata
 import json

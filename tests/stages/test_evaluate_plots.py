@@ -1,4 +1,4 @@
-"""What `dmrl evaluate` draws, and what it says where it cannot."""
+"""Plots of `dmrl evaluate`, and the error without matplotlib."""
 
 from pathlib import Path
 

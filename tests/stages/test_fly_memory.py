@@ -1,4 +1,4 @@
-"""What a flight holds of itself, counted by Python and NumPy: no other work disturbs it."""
+"""Memory of a simulated flight, counted by Python and NumPy."""
 
 import tracemalloc
 from pathlib import Path

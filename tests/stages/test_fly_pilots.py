@@ -1,4 +1,4 @@
-"""Flights that pilots fly by what they see: what is recorded, and what it depends on."""
+"""Flights of pilots with simulated vision: recorded topics, and reproducibility."""
 
 import json
 import signal

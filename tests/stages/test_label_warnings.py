@@ -1,4 +1,4 @@
-"""What `dmrl label` says of a flight that is not as it should be."""
+"""Warnings of `dmrl label` about faulty flights."""
 
 from collections.abc import Callable
 from dataclasses import replace

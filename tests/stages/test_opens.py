@@ -1,4 +1,4 @@
-"""Commands open their input a few times: to read it, to hash it, to copy it."""
+"""Number of times a command opens its input."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""Every command goes over a recording once: chunks that are unpacked, over chunks in the file."""
+"""Number of passes of each command over a recording, in decompressed chunks."""
 
 from collections import Counter
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Robots of the user's own: which files are read, and what a preview shows of them."""
+"""Robot models of the user: readable files, and previews."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""A run whose recipe has figures ends with a page; nothing is drawn again for nothing."""
+"""Runs of recipes: the report is redrawn, and steps repeated, only on changes."""
 
 import json
 from pathlib import Path

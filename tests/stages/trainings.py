@@ -1,4 +1,4 @@
-"""The shortest training that there is."""
+"""Settings of the shortest training."""
 
 from dmrl.stages.train import Settings
 

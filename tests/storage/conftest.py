@@ -1,4 +1,4 @@
-"""A server of buckets on this machine, and how much is read from it."""
+"""A local bucket server, and the number of bytes read from it."""
 
 import logging
 from collections.abc import Iterator

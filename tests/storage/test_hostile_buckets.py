@@ -1,4 +1,4 @@
-"""Servers of buckets that lie: listings without end, other bytes, uploads that are not stored."""
+"""Hostile bucket servers: endless listings, wrong bytes, uploads that are not stored."""
 
 import hashlib
 import os

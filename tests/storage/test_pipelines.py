@@ -1,4 +1,4 @@
-"""Pipelines whose folder lies in a bucket."""
+"""Pipelines whose folder is in a bucket."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Inputs and outputs in a bucket: the bytes are those of files here, whole or not there at all."""
+"""Inputs and outputs in a bucket: the same bytes as local files, complete or absent."""
 
 import os
 import pickle
@@ -321,6 +321,7 @@ def test_keys_with_special_characters_stay_in_the_output_folder(lab: Any, tmp_pa
     assert {task.out for task in tasks} == {tmp_path / "out" / name for name in names}
 
 
+@pytest.mark.heavy
 def test_python_api_reads_and_writes_buckets(lab: Any, tmp_path: Path) -> None:
     source = pictured(tmp_path / "py.mcap")
     lab.put(str(source), "lab/py/a.mcap")

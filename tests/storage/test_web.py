@@ -1,4 +1,4 @@
-"""Web servers of strangers: no more is read than was asked for, and nothing of another file."""
+"""Hostile web servers: only requested bytes of the requested file are read."""
 
 import os
 import socket

@@ -1,4 +1,4 @@
-"""The user's wish to end, as an event."""
+"""Signals to stop, as an event."""
 
 import signal
 import threading

@@ -1,4 +1,4 @@
-"""What is in an .rrd file."""
+"""Contents of an .rrd file."""
 
 from collections import Counter
 from operator import itemgetter

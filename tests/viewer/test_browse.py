@@ -1,4 +1,4 @@
-"""What the layout ``dataset`` logs: rows, worst first."""
+"""Logged data of the layout ``dataset``: rows, worst first."""
 
 from collections.abc import Callable
 from pathlib import Path

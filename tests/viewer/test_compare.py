@@ -1,4 +1,4 @@
-"""What the layout ``compare`` logs: two models in the same images."""
+"""Logged data of the layout ``compare``: two models in the same images."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The label desk in a browser: labels are moved, drawn, accepted and flagged, and come back."""
+"""The label desk in a browser: labels are moved, drawn, accepted, flagged and saved."""
 
 from pathlib import Path
 

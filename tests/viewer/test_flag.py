@@ -1,4 +1,4 @@
-"""Rows of a dataset that a page names, saved as CSV, are left out of the next dataset."""
+"""Flagged rows of a dataset, saved as CSV, are omitted from the next dataset."""
 
 import csv
 import json

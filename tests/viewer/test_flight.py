@@ -1,4 +1,4 @@
-"""What the layout ``flight`` logs, read back from the .rrd files."""
+"""Logged data of the layout ``flight``, read back from the .rrd files."""
 
 import sys
 from collections.abc import Callable

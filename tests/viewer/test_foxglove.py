@@ -1,4 +1,4 @@
-"""The layout for Foxglove names topics, fields and colours that there are."""
+"""The Foxglove layout names existing topics, fields and colours."""
 
 import json
 import re

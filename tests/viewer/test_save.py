@@ -1,4 +1,4 @@
-"""What is logged, read back from the .rrd files."""
+"""Logged data, read back from the .rrd files."""
 
 import errno
 from collections.abc import Callable

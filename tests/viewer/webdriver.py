@@ -1,4 +1,4 @@
-"""A browser that tests steer: Chromium by chromedriver's HTTP protocol (W3C WebDriver)."""
+"""A browser controlled by chromedriver's HTTP protocol (W3C WebDriver)."""
 
 import json
 import shutil

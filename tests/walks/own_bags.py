@@ -1,4 +1,4 @@
-"""Bags of one's own robots: odometry, ranges and motion capture, as a ROS driver would write them.
+"""Bags of own robots: odometry, ranges and motion capture, as a ROS driver writes them.
 
 Nothing of dmrl's readers or writers is in here: messages are made by rosbags alone.
 """

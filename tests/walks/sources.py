@@ -1,4 +1,4 @@
-"""A source of every kind that docs/sources.md names, small and whole, and ways to damage one."""
+"""A small source of every kind in docs/sources.md, and ways to damage one."""
 
 from collections.abc import Callable
 from pathlib import Path

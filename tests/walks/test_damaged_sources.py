@@ -1,4 +1,4 @@
-"""A walk: files of every kind arrive damaged, in five ways each.
+"""Sources of every kind, each damaged in five ways.
 
 What a person must see is one of two things. A line that names the file and the way out, and then
 there is no recording. Or a recording of all that is whole, and then a line that says what is not:

@@ -1,4 +1,4 @@
-"""A walk: pictures of one's own camera, labelled by hand, to a dataset that tells what it is."""
+"""Hand-labelled images of an own camera, converted to a dataset with a card."""
 
 from pathlib import Path
 

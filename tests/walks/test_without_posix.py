@@ -1,4 +1,4 @@
-"""Commands start and work where modules, functions and signals of POSIX are hidden.
+"""Commands start and work where modules, functions and signals of POSIX are missing.
 
 This is not Windows: it shows that nothing that only POSIX has is needed. README.md says what was
 tried on which system.

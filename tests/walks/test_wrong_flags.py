@@ -1,4 +1,4 @@
-"""A walk: every flag of every command for data is given something that it cannot mean.
+"""Every flag of every data command with an invalid value.
 
 What a person must see is one line that names the flag, or the file that it names, and no output.
 """

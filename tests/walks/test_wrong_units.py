@@ -1,4 +1,4 @@
-"""Every unit doubted: a flight whose columns are in another unit is not taken silently.
+"""Flights with columns in wrong units are doubted.
 
 What is said comes from ``dmrl convert`` or from ``dmrl check`` of what it wrote.
 """

@@ -1,4 +1,4 @@
-"""Datasets that grow: what is there stays as it is, what is added comes once, whoever dies."""
+"""Appending to datasets: existing data stay, new data are added once, kills are harmless."""
 
 import json
 import os

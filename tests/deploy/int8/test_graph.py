@@ -1,4 +1,4 @@
-"""From torch to plain layers."""
+"""Conversion of torch networks to plain layers."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Promises of layers and heads, at their borders."""
+"""Invariants of integer layers and heads, at their limits."""
 
 from dataclasses import replace
 from typing import Any

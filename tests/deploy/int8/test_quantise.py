@@ -1,4 +1,4 @@
-"""From float to int8."""
+"""Quantization of float networks to int8."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The integer rules, against arithmetic done by hand."""
+"""Integer arithmetic against hand-computed values."""
 
 import numpy as np
 import pytest

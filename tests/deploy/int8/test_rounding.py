@@ -1,4 +1,4 @@
-"""Weights rounded so that their errors cancel."""
+"""Rounding of weights with error compensation."""
 
 from dataclasses import replace
 

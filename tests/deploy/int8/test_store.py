@@ -1,4 +1,4 @@
-"""Integer networks on disk."""
+"""Integer networks written to and read from disk."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What a convolution and a max-pool see, against loops over every place."""
+"""Windows of convolutions and max-pools against loops over all positions."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Mount and errors of paths in one solve, against dense equations and shifted paths."""
+"""Joint solve of mount and path errors, against dense equations and shifted paths."""
 
 from dataclasses import replace
 

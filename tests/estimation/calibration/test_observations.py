@@ -1,4 +1,4 @@
-"""What cameras saw of peers: where they are expected, and which detection is whose."""
+"""Camera observations of peers: predicted pixels and matched detections."""
 
 from dataclasses import replace
 

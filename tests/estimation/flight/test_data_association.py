@@ -1,4 +1,4 @@
-"""Candidates that two peers of one camera took: they stay with the one whom they fit better."""
+"""Conflicts between two peers over the detections of one camera."""
 
 from dataclasses import replace
 

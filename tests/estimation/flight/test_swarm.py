@@ -1,4 +1,4 @@
-"""All robots at once: at least as right as pair by pair, and as honest."""
+"""Joint solve of all robots: as accurate and consistent as pairwise solves."""
 
 from dataclasses import replace
 from functools import cache

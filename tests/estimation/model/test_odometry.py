@@ -1,4 +1,4 @@
-"""Dead reckoning of motions that are known."""
+"""Preintegration of known motions."""
 
 import numpy as np
 import pytest

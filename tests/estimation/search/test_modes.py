@@ -1,4 +1,4 @@
-"""Modes of a flight: solved, mirrored, kept when nearly as good."""
+"""Modes of a flight: solved, mirrored, and kept if nearly as good."""
 
 from dataclasses import replace
 

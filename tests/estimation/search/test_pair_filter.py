@@ -1,4 +1,4 @@
-"""The filter of a pair: forwards, backwards, and its updates."""
+"""The pair filter: forward, backward, and its updates."""
 
 from dataclasses import replace
 

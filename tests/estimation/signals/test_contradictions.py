@@ -1,4 +1,4 @@
-"""Odometry and heights that contradict the ranges, and those that only are fast."""
+"""Odometry and heights that contradict the ranges, and fast motion that does not."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Clocks by single exchanges: offset, drift, and how well each is known."""
+"""Clocks from single range exchanges: offset, drift and their stds."""
 
 import numpy as np
 import pytest

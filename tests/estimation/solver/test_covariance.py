@@ -1,4 +1,4 @@
-"""Covariances count motion, and no noise."""
+"""Covariances that count motion but no noise."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What an estimate says between its keyframes, and seen from the other robot."""
+"""Estimates between keyframes, and seen from the other robot."""
 
 from dataclasses import fields, replace
 

@@ -1,4 +1,4 @@
-"""A flight cut into keyframes, of motions that are known."""
+"""Keyframes of flights with known motion."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The solve of whole flights, and the evidence of a model."""
+"""Solves of whole flights, and the evidence of a model."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Every factor: its Jacobian is that of finite differences, and its rows are zero at the truth."""
+"""Factors: exact Jacobians by finite differences, and zero residuals at the truth."""
 
 from collections.abc import Callable
 from dataclasses import replace

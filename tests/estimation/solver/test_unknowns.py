@@ -1,4 +1,4 @@
-"""The table of unknowns: everything derives from it, and a new unknown is one row."""
+"""The table of unknowns, from which the layout, priors and files derive."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Peers that wander, and a detector that sees them as the tuning says."""
+"""Peers that move at random, and a detector with the errors of the tuning."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

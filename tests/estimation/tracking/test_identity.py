@@ -1,4 +1,4 @@
-"""Names of tracks, by ranges: when one is clear, and when it is not."""
+"""Names of tracks by ranges: clear and ambiguous cases."""
 
 from dataclasses import dataclass, field
 

@@ -1,4 +1,4 @@
-"""Figures of tracks, of errors that are written down."""
+"""Track figures of given errors."""
 
 from dataclasses import replace
 

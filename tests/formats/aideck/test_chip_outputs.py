@@ -1,4 +1,4 @@
-"""Maps that a chip computed, beside the pictures: a level is 0.211 in logit and log depth."""
+"""Maps computed by a chip, beside the images: a level is 0.211 in logit and log depth."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Packets of a stream of bytes: where they begin and end, whatever lies between."""
+"""Packets in a stream of bytes: their boundaries in any noise."""
 
 import struct
 

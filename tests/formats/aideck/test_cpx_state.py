@@ -1,4 +1,4 @@
-"""The state of a robot in a few bytes, as its firmware packs it."""
+"""The robot state as its firmware packs it."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What is known of a Crazyflie's log variables, against rotations that are worked out apart."""
+"""Crazyflie log variables, against independently computed rotations."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What a log of the micro-SD card becomes: units, signs, and what is left out."""
+"""Samples of a micro-SD log: units, signs, and omissions."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Records of several kinds, against a walk from one to the next."""
+"""Records of several kinds, against sequential parsing."""
 
 import numpy as np
 from hypothesis import given

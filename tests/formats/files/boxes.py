@@ -1,4 +1,4 @@
-"""Pictures with boxes, and what becomes of them."""
+"""Images with boxes, and the labels expected of them."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""What tests of files may use."""
+"""Fixtures of the tests of files."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Tables that say what columns of a CSV are: their units, and every fault of them."""
+"""Column maps of CSV files: their units, and their faults."""
 
 from pathlib import Path
 from textwrap import dedent

@@ -1,4 +1,4 @@
-"""Pictures of another size, with their labels and calibration."""
+"""Crops of larger images, with their labels and calibration."""
 
 import numpy as np
 import pytest

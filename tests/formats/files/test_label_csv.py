@@ -1,4 +1,4 @@
-"""Labels of pictures in a CSV file: what is written is read, and where a value ends to be one."""
+"""Label CSV files: round trips, and limits of values."""
 
 import io
 from pathlib import Path

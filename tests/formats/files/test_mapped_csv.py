@@ -1,4 +1,4 @@
-"""CSV files of others, by tables that say what their columns are."""
+"""Third-party CSV files read by column maps."""
 
 from pathlib import Path
 

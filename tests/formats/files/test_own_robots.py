@@ -1,4 +1,4 @@
-"""Sensors of anybody's robots, by one table for all: a file a robot, columns or rows of robots."""
+"""Sensors of other robots read by one column map: a file per robot, columns, or rows."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Bags of rosbags' own writer, with messages that a test states by a few numbers."""
+"""Bags written by rosbags, with messages given by a few numbers."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path

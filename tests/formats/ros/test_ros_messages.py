@@ -1,4 +1,4 @@
-"""Messages of ROS in dmrl's frames and units."""
+"""ROS messages converted to dmrl's frames and units."""
 
 from io import BytesIO
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Settings of a training: where each ends to be one, and what is off if nobody asks for it."""
+"""Training settings: their limits, and which are off by default."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Recordings on two Ray nodes of this machine: the bytes are those of one process, whoever dies.
+"""Recordings on two local Ray nodes: the same bytes as in one process, even if a node dies.
 
 Ray is told to stay on loopback, and has no dashboard.
 """

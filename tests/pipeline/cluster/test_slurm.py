@@ -1,4 +1,4 @@
-"""A plan as an array job: every element does its part, and the same command then finds it done."""
+"""A plan as a Slurm array job: each element does its part, and a repeated command finds it done."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Images and their camera as `dmrl check` judges them."""
+"""Checks of images and their camera calibration."""
 
 from pathlib import Path
 from typing import Any

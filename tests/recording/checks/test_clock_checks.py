@@ -1,4 +1,4 @@
-"""Do times belong together? Of spans that are written down."""
+"""Checks of clocks, on given time spans."""
 
 from collections import Counter
 from types import SimpleNamespace

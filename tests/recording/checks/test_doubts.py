@@ -1,4 +1,4 @@
-"""Doubts about a recording that is whole: values, images and labels that no flight gives."""
+"""Warnings about intact recordings with implausible values, images and labels."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Signs and frames are doubted where a recording has poses to hold them against."""
+"""Checks of signs and frames against recorded poses."""
 
 from pathlib import Path
 

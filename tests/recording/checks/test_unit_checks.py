@@ -1,4 +1,4 @@
-"""Values and periods that cannot be in their units, counted without keeping them."""
+"""Checks of units of values and periods, in constant memory."""
 
 import numpy as np
 import pyarrow as pa

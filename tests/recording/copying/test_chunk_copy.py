@@ -1,4 +1,4 @@
-"""Copies by the chunk: what goes over as it is, what as slices, and what is refused."""
+"""Copies by chunk: which are copied whole, sliced, or refused."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Copies of what other programs wrote: their compression, their indexes, or none."""
+"""Copies of recordings of other writers: their compression, with or without indexes."""
 
 from collections.abc import Callable
 from pathlib import Path

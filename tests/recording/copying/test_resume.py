@@ -1,4 +1,4 @@
-"""Going on with an interrupted recording."""
+"""Resuming an interrupted recording."""
 
 import random
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Chunks, packed by hand: what stands in them comes out, and nothing else does."""
+"""Parsing of hand-made chunks: exactly their contents."""
 
 import struct
 import zlib

@@ -1,4 +1,4 @@
-"""Chunks that are filled: one message at a time, or many, they hold the same."""
+"""Building chunks: message by message and in batches, with equal results."""
 
 import zlib
 from collections import Counter

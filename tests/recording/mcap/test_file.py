@@ -1,4 +1,4 @@
-"""A recording's file: how it begins and ends, and that it stays what was hashed."""
+"""Recording files: their start and end, and that hashed files stay unchanged."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Blocks of messages: whatever is done to one, each message keeps its times and its bytes."""
+"""Message batches: every operation keeps times and bytes of each message."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""As many messages as the statistics say, and no other number."""
+"""Message counts against the statistics record."""
 
 from collections import Counter
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""A summary whose numbers contradict each other is damaged."""
+"""Contradictory summaries are damage."""
 
 from contextlib import nullcontext
 from types import SimpleNamespace

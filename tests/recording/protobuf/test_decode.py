@@ -1,4 +1,4 @@
-"""The bulk decoder against protobuf's own parser."""
+"""The bulk decoder against Google's protobuf parser."""
 
 from contextlib import suppress
 from typing import Any

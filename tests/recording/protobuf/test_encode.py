@@ -1,4 +1,4 @@
-"""Columns to messages: the bytes that protobuf itself writes."""
+"""Columns encoded as messages: the bytes of Google's protobuf."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Grain that is told apart from the texture of what is seen, and from how bright that is."""
+"""Noise estimates that are independent of texture and brightness."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The Crazyflie drawn by code."""
+"""The procedural mesh of the Crazyflie."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The violet robot drawn by code, and the names of all that are drawn."""
+"""The procedural mesh of the violet robot, and the names of all designs."""
 
 from typing import get_args, get_type_hints
 

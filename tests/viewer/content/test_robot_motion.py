@@ -1,4 +1,4 @@
-"""What is drawn of poses and positions that a recording may say."""
+"""Drawing of recorded poses and positions, valid or not."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Names of entities: what a robot is called is no order to rerun."""
+"""Names of entities: robot names are escaped in rerun's patterns."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Where the texts of labels stand, and what a legend says."""
+"""Positions of label texts, and the legend."""
 
 import numpy as np
 import pyarrow as pa

@@ -1,4 +1,4 @@
-"""Pictures, windows and pages, with rerun's own viewer."""
+"""Screenshots, windows and pages of rerun's viewer."""
 
 import signal
 import socket

@@ -1,4 +1,4 @@
-"""What is shown while robots are recorded, read back from an .rrd file."""
+"""The live view while robots are recorded, read back from an .rrd file."""
 
 from collections import Counter
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The server of the page: who gets an answer, and what the page may load."""
+"""The page server: who gets an answer, and what the page may load."""
 
 import http.client
 from collections.abc import Iterator

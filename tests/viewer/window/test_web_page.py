@@ -1,4 +1,4 @@
-"""The page, in a real browser without a screen: what a user sees, and that it draws."""
+"""The page in a headless browser: what a user sees, and that it draws."""
 
 import base64
 import json

@@ -1,4 +1,4 @@
-"""What counts as proved: every grid, every detection, every build, and the stack."""
+"""Verification of C: all grids, detections and builds must match, within the stack."""
 
 from dataclasses import replace
 from pathlib import Path

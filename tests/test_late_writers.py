@@ -1,4 +1,4 @@
-"""A writer that comes just after another has finished leaves nothing, and takes nothing away."""
+"""Late concurrent writers leave nothing and remove nothing."""
 
 from collections.abc import Callable
 from pathlib import Path

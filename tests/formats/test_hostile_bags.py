@@ -1,4 +1,4 @@
-"""ROS bags of strangers: bombs, views that never end, definitions that would be code."""
+"""Hostile ROS bags: decompression bombs, endless views, definitions with code."""
 
 import bz2
 import os

@@ -1,12 +1,12 @@
-"""Files of strangers, damaged or meant to harm: one line or a result, and nothing outside OUT."""
+"""Damaged or hostile third-party files: one line or a result, and nothing outside OUT."""
 
 from pathlib import Path
 
 import pytest
 
 from .conftest import Count, cases_of
+from .damaged_files import SOURCES
 from .disk import Disk
-from .strangers import SOURCES
 
 AT_ONCE = 25
 """Cases that a process goes through before a fresh one."""
@@ -20,13 +20,13 @@ def damaged(name: str, disk: Disk, folder: Path, cases: int, count: Count) -> No
     victim = folder / "victim"
     victim.write_text("precious")
     (folder / "out").mkdir()
-    assert disk.call("strangers:begin", name=name, folder=str(folder)) == 0
+    assert disk.call("damaged_files:begin", name=name, folder=str(folder)) == 0
     before = {path for path in folder.rglob("*") if "out" not in path.parts}
     refused = 0
     for seed in range(-(-cases // AT_ONCE)):
         some = min(AT_ONCE, cases - seed * AT_ONCE)
         refused += disk.call(
-            "strangers:damage", name=name, folder=str(folder), seed=seed, cases=some
+            "damaged_files:damage", name=name, folder=str(folder), seed=seed, cases=some
         )
         assert disk.rss_kb < MEMORY_KB, f"seed {seed}: {disk.rss_kb / 1e6:.1f} GB"
     assert victim.read_text() == "precious"

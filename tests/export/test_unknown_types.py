@@ -1,4 +1,4 @@
-"""Recordings of types that dmrl does not know, as bags and tables: all of it, or one line."""
+"""Recordings of unknown types exported to bags and tables: complete, or a one-line error."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What reads files of strangers, on damaged ones. Runs in children of the process of server.py."""
+"""Read damaged third-party files, in children of the process of server.py."""
 
 import shutil
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Pictures of strangers: depth of the pixels, order, hidden files, cut files; and siblings."""
+"""Third-party images: pixel depth, order, hidden files, truncated files."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""Bags of other people: what can be read is kept, what cannot is counted and named."""
+"""Third-party bags: readable data are kept, the rest is counted and named."""
 
 import math
 from collections import Counter

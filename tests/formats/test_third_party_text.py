@@ -1,4 +1,4 @@
-"""Text logs and clocks of strangers, as they were handed over with what is expected of them."""
+"""Third-party text logs and clocks, with their expected contents."""
 
 import json
 from pathlib import Path
