@@ -67,7 +67,7 @@ def test_front_matter_has_the_fields_of_the_hub(built: Path) -> None:
     assert features == opened["train"].features
 
 
-def test_it_counts_images_and_peers(built: Path) -> None:
+def test_card_counts_images_and_peers(built: Path) -> None:
     text = (built / "README.md").read_text()
     counts = re.findall(r"^\| (?:train|test) \| (\d+) \| (\d+) \| (\d+) \|", text, re.M)
     assert sorted(counts) == [("2", "1", "1"), ("3", "2", "3")]
@@ -107,9 +107,7 @@ def test_writing_it_again_gives_the_same_bytes(built: Path) -> None:
     assert {p: p.read_bytes() for p in built.rglob("*") if p.is_file()} == before
 
 
-def test_a_card_can_be_written_elsewhere_and_the_one_before_stays(
-    built: Path, tmp_path: Path
-) -> None:
+def test_card_can_be_written_to_another_folder(built: Path, tmp_path: Path) -> None:
     before = (built / "README.md").read_bytes()
     card = run_card(built, CardSettings(title="Elsewhere"), tmp_path / "card")
     assert card == tmp_path / "card" / "README.md"
@@ -138,7 +136,7 @@ def test_card_warns_of_label_bias_exclusions_leaks_and_licence(
     assert (tmp_path / "out" / "README.md").read_text() == text
 
 
-def test_a_picture_in_train_and_test_is_a_leak(record: Record, tmp_path: Path) -> None:
+def test_image_in_train_and_test_is_reported_as_leak(record: Record, tmp_path: Path) -> None:
     path = record(split={"train": "[[0, 250000000]]", "test": "[[300000000, 600000000]]"}, seed=3)
     twin = record("twin.mcap", split={"test": "[[0, 600000000]]"}, seed=3)
     run([path, twin], tmp_path / "out", Settings())
@@ -202,7 +200,7 @@ def test_unknown_licence_is_refused(built: Path, record: Record, tmp_path: Path)
 
 
 @pytest.mark.heavy
-def test_the_backend_of_a_notebook_stops_no_figure(tmp_path: Path) -> None:
+def test_figures_are_saved_with_the_matplotlib_backend_of_a_notebook(tmp_path: Path) -> None:
     code = (
         "import os, sys\nfrom pathlib import Path\nimport numpy as np\nfrom dmrl import plots\n"
         "plots.plot_depth_histogram({'train': np.ones(3)}, Path(sys.argv[1]))\n"
@@ -220,7 +218,9 @@ def test_the_backend_of_a_notebook_stops_no_figure(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", [{}, {"png": True}, {"parquet": True}])
-def test_its_code_runs(record: Record, tmp_path: Path, options: dict[str, bool]) -> None:
+def test_python_examples_of_the_card_run(
+    record: Record, tmp_path: Path, options: dict[str, bool]
+) -> None:
     flight = record()
     run([flight], tmp_path / "out", Settings(split="none", **options))  # type: ignore[arg-type]  # bools
     text = (tmp_path / "out" / "README.md").read_text()
@@ -254,7 +254,7 @@ def test_card_lists_limitations_and_sensors(built: Path, tmp_path: Path) -> None
     assert re.search(r"Camera of `f.mcap: cf1`, .*: 320 x 224 px, fx 183\.7", text)
 
 
-def test_many_recordings_are_a_few_lines_of_a_card() -> None:
+def test_card_abbreviates_long_lists_of_recordings() -> None:
     names = [f"{k:03d}.mcap" for k in range(100)]
     cameras = {f"{name}: cf1": "320 x 224 px" for name in names} | {"other.mcap: cf1": "64 x 48 px"}
     facts = Facts(used=dict.fromkeys(names, "truth"), findings={n: ["a bias"] for n in names})
@@ -307,7 +307,7 @@ def test_invalid_facts_give_one_line_error(built: Path, text: str) -> None:
         write_card(built)
 
 
-def test_facts_cannot_leave_their_line(built: Path) -> None:
+def test_facts_are_escaped_in_the_card(built: Path) -> None:
     bad = "a`<img src=x>`b\n# heading"
     facts = {
         "left_out": {bad: 1},
@@ -321,7 +321,7 @@ def test_facts_cannot_leave_their_line(built: Path) -> None:
     assert re.search(r"(?<!\\)<img", re.sub(r"(`+)[^`].*?(?<!`)\1(?!`)", "", text)) is None
 
 
-def test_a_card_that_is_no_text_is_one_line(built: Path) -> None:
+def test_card_that_is_not_utf_8_is_reported(built: Path) -> None:
     (built / "README.md").write_bytes(b"\xff\xfe")
     with pytest.raises(DatasetError, match="not UTF-8"):
         write_card(built)

@@ -34,7 +34,7 @@ def fly(pilot: Pilot, places: Places, first: int = 0, steps: int = 10) -> list[C
     return [pilot.command(observe(0.1 * (first + k), places)) for k in range(steps)]
 
 
-def test_it_flies_to_a_far_leader_from_a_near_one_and_turns_to_it() -> None:
+def test_pilot_keeps_its_distance_and_faces_the_leader() -> None:
     far = fly(Follow(TASK), [(1.1, 0.3)])[-1]
     near = fly(Follow(TASK), [(0.5, 0.0)])[-1]
     assert far.vx_mps > 0.2 and far.vy_mps > 0.05 and far.yaw_rate_radps > 0.5
