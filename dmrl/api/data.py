@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dmrl.api import notebook_display
 from dmrl.datasets import Dataset, Split, layout, open_dataset
 from dmrl.errors import DatasetError, MissingExtra
-from dmrl.export.csv_parquet import flatten_table
+from dmrl.exchange.csv_parquet import flatten_table
 from dmrl.storage import to_path
 
 if TYPE_CHECKING:

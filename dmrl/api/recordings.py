@@ -15,7 +15,7 @@ from dmrl.api import notebook_display
 from dmrl.api.images import Images
 from dmrl.api.topic import Topic, to_data_frame, to_log_time
 from dmrl.errors import MissingTopic, SettingError
-from dmrl.export.csv_parquet import flatten_table
+from dmrl.exchange.csv_parquet import flatten_table
 from dmrl.recording import (
     Finding,
     Provenance,

@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dmrl.errors import MissingExtra
-from dmrl.export.csv_parquet import flatten_table
+from dmrl.exchange.csv_parquet import flatten_table
 from dmrl.messages import to_status_name
 from dmrl.recording import TopicInfo, read_table
 

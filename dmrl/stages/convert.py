@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from dmrl.formats.base import Options
 
 DATASET_WRITERS = {
-    "yolo": ("dmrl.export.detection_sets", "write_yolo"),
-    "coco": ("dmrl.export.detection_sets", "write_coco"),
-    "webdataset": ("dmrl.export.detection_sets", "write_webdataset"),
-    "lerobot": ("dmrl.export.lerobot", "write_lerobot"),
+    "yolo": ("dmrl.exchange.detection_sets", "write_yolo"),
+    "coco": ("dmrl.exchange.detection_sets", "write_coco"),
+    "webdataset": ("dmrl.exchange.detection_sets", "write_webdataset"),
+    "lerobot": ("dmrl.exchange.lerobot", "write_lerobot"),
 }
 """Writers of datasets for other trainers, by ``--to``."""
 BOX_SETTINGS = {"camera", "robot_width_m"}
@@ -144,11 +144,11 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
     if settings.to in DATASET_WRITERS:
         return _export_dataset(source, out, settings)
     if settings.to == "ros2":
-        from dmrl.export.ros2 import write_bag
+        from dmrl.exchange.ros2 import write_bag
 
         return write_bag(source, out)
     if settings.to is not None:
-        from dmrl.export.csv_parquet import write_tables
+        from dmrl.exchange.csv_parquet import write_tables
 
         return write_tables(source, out, "csv" if settings.to == "csv" else "parquet")
     from dmrl.ingest.foreign_source import record_source
@@ -163,7 +163,7 @@ def _export_dataset(source: Path, out: Path, settings: Settings) -> dict[str, in
     """Write a dataset for other trainers; return images by split."""
     from dmrl.atomic_output import atomic_folder
     from dmrl.datasets import open_dataset
-    from dmrl.export.dataset_rows import BoxOptions, ExportRows
+    from dmrl.exchange.dataset_rows import BoxOptions, ExportRows
     from dmrl.geometry.camera_file import find_camera
     from dmrl.recording import build_provenance
 

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dmrl.datasets.layout import PNG_TYPE, format_json
-from dmrl.export.dataset_rows import ExportRow, ExportRows, to_attributes
+from dmrl.exchange.dataset_rows import ExportRow, ExportRows, to_attributes
 
 VERSION = "v3.0"
 CHUNK_FILES = 1000

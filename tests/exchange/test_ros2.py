@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from dmrl.export.ros2 import write_bag
+from dmrl.exchange.ros2 import write_bag
 from dmrl.images.codec import encode_png
 from dmrl.messages import LogType, message_class
 from dmrl.recording import RecordingWriter, build_provenance, read, read_summary

@@ -154,7 +154,7 @@ def test_boxes_come_back_within_a_hundredth_of_a_pixel(to: str, source: Path) ->
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_webdataset_reads_its_shards(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wds = pytest.importorskip("webdataset")
-    monkeypatch.setattr("dmrl.export.detection_sets.SHARD_IMAGES", 4)
+    monkeypatch.setattr("dmrl.exchange.detection_sets.SHARD_IMAGES", 4)
     out = export(source, "webdataset")
     names = ["train-000000.tar", "train-000001.tar", "val-000000.tar"]
     assert sorted(path.name for path in out.glob("*.tar")) == names

@@ -11,8 +11,8 @@ from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSe
 from rosbags.highlevel import AnyReader
 
 from dmrl.errors import RecordingError
-from dmrl.export.csv_parquet import write_tables
-from dmrl.export.ros2 import write_bag
+from dmrl.exchange.csv_parquet import write_tables
+from dmrl.exchange.ros2 import write_bag
 from dmrl.messages import message_class
 from dmrl.recording import Channel, RawMessage, RecordingWriter, build_provenance, read_raw
 from dmrl.terminal.left_out import count_left_out

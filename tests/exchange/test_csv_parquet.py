@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 
 from dmrl.errors import OutputError, UnsafeName
-from dmrl.export import csv_parquet
-from dmrl.export.csv_parquet import write_tables
+from dmrl.exchange import csv_parquet
+from dmrl.exchange.csv_parquet import write_tables
 from dmrl.images.codec import encode_png
 from dmrl.messages import message_class
 from dmrl.recording import Channel, RawMessage, RecordingWriter, build_provenance

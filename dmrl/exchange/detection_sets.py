@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.datasets.layout import format_json
-from dmrl.export.dataset_rows import ExportRow, ExportRows, to_attributes
+from dmrl.exchange.dataset_rows import ExportRow, ExportRows, to_attributes
 from dmrl.terminal.progress import say
 
 SHARD_IMAGES = 1000

@@ -1,0 +1,1 @@
+"""Write recordings and datasets in the formats of other programs, for `dmrl convert --to`."""
