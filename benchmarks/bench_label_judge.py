@@ -1,7 +1,7 @@
-"""Judge labels: flights without a fault, with 96 injected ones, with cameras, and real ones.
+"""Judge labels: flights without a fault, with injected ones, with cameras, and real ones.
 
 Run as ``make bench-labels``, or ``python benchmarks/bench_label_judge.py FOLDER [--state
-NAME=COMMAND ...] [--sets sound faults thirds eyes real] [--noise calibrated] [--flights 5]
+NAME=COMMAND ...] [--sets sound faults thirds unlisted eyes real] [--noise calibrated] [--flights 5]
 [--only PATTERN] [--data DIR] [--json FILE]``. FOLDER keeps the flights, which are made once, and
 the figures of each flight by state: what is there is not run again. A state is a command that runs
 some checkout's dmrl; without one, this environment's counts.
@@ -172,7 +172,7 @@ MIN_KEPT, MIN_KEPT_OF_SOUND = 0.01, 0.6
 
 def summarise(table: Sequence[dict[str, Any]]) -> None:
     """Print how many lines of faults are honest, useful, and have their cause named."""
-    lines = [line for line in table if line["set"] in ("faults", "thirds")]
+    lines = [line for line in table if line["set"] in ("faults", "thirds", "unlisted")]
     for kind, state in dict.fromkeys((line["set"], line["state"]) for line in lines):
         mine = [line for line in lines if (line["set"], line["state"]) == (kind, state)]
         mine = [line for line in mine if line["row"] != "none"]

@@ -12,10 +12,11 @@ from label_judge import real
 from label_judge.faults import ROWS
 from label_judge.flights import HOPS, MOTIONS, Base, Eye, fly, look, write
 from label_judge.injection import Row
+from label_judge.unlisted_rows import UNLISTED_ROWS
 
-SETS = ("sound", "faults", "thirds", "eyes", "real")
+SETS = ("sound", "faults", "thirds", "unlisted", "eyes", "real")
 NOISES = ("calibrated", "realistic")
-FIRST_SEED = {"sound": 7100, "faults": 8100, "thirds": 8100, "eyes": 9100}
+FIRST_SEED = {"sound": 7100, "faults": 8100, "thirds": 8100, "unlisted": 8600, "eyes": 9100}
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,9 @@ def list_sound(flights: int, noises: Sequence[str]) -> Iterator[Job]:
 def list_faults(kind: str, flights: int, noises: Sequence[str]) -> Iterator[Job]:
     """Yield flights with one injected fault each, and the same without."""
     none = Row("none", lambda logs, size, rng: None, 0.0, "")
-    rows = ROWS if kind == "faults" else [row.shrunk for row in ROWS if row.size]
+    rows = {"faults": ROWS, "unlisted": UNLISTED_ROWS}.get(
+        kind, tuple(row.shrunk for row in ROWS if row.size)
+    )
     for noise in noises:
         for row in (none, *rows):
             for k in range(flights):
@@ -140,7 +143,7 @@ def list_jobs(
     for kind in sets:
         if kind == "sound":
             jobs += list_sound(flights, noises)
-        elif kind in ("faults", "thirds"):
+        elif kind in ("faults", "thirds", "unlisted"):
             jobs += list_faults(kind, flights, noises)
         elif kind == "eyes":
             jobs += list_eyes(flights, noises)

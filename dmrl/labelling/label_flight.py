@@ -1,6 +1,6 @@
 """Label one flight: estimate its pairs, project the positions, and write them with the labels."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,6 +9,7 @@ import numpy as np
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError, SettingError
 from dmrl.estimation.model.pair import BearingMeasurements
+from dmrl.estimation.solver.estimate import Innovation
 from dmrl.labelling.camera_bearings import add_bearings, detections_to_bearings
 from dmrl.labelling.flight_log import (
     OBSERVER_TOPICS,
@@ -48,6 +49,8 @@ class LabelledFlight:
         PeerLabels messages by robot that has images.
     reports
         One per ordered pair.
+    innovations
+        What the signals of each ordered pair show beyond the model.
     warnings
         One line for each thing that was left out or looks wrong.
     """
@@ -55,6 +58,7 @@ class LabelledFlight:
     positions: dict[RobotPair, PeerPositions]
     labels: dict[str, list[TimedMessage]]
     reports: list[PairReport]
+    innovations: Mapping[RobotPair, Sequence[Innovation]]
     warnings: list[str]
 
     @property
@@ -202,7 +206,9 @@ def label_flight(
         labels[robot] = list(build_label_messages(flight, logs, robot, mine, options))
     reports = [report_pair(flight, pair, positions[pair], estimates[pair]) for pair in positions]
     warnings = [*logs.warnings, *_warn_without_camera(flight, filming, options.cameras)]
-    return LabelledFlight(positions, labels, reports, [*warnings, *explain_causes(reports)])
+    warnings += explain_causes(reports)
+    innovations = {pair: estimate.innovations for pair, estimate in estimates.items()}
+    return LabelledFlight(positions, labels, reports, innovations, warnings)
 
 
 def _warn_without_camera(
@@ -236,7 +242,7 @@ def write_labelled(
         Keep all other messages; else labels of other sources are left out as well.
     """
     series = [build_position_series(*pair, found) for pair, found in labelled.positions.items()]
-    causes = build_cause_messages(flight.start_ns, labelled.reports)
+    causes = build_cause_messages(flight.start_ns, labelled.reports, labelled.innovations)
     if copy:
         replaced = [topics.LABELS(robot) for robot in labelled.labels]
         replaced += [

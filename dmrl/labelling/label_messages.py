@@ -1,7 +1,7 @@
 """Positions and labels as messages."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -9,8 +9,9 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.estimation.model.pair import Array
+from dmrl.estimation.solver.estimate import Innovation
 from dmrl.geometry.frames import Camera
-from dmrl.labelling.flight_log import FlightLog, Times
+from dmrl.labelling.flight_log import FlightLog, RobotPair, Times
 from dmrl.labelling.image_labels import (
     MIN_DEPTH_M,
     SOURCE,
@@ -44,7 +45,9 @@ def build_position_series(observer: str, peer: str, found: PeerPositions) -> Ser
 
 
 def build_cause_messages(
-    start_ns: int, reports: Iterable[PairReport]
+    start_ns: int,
+    reports: Iterable[PairReport],
+    innovations: Mapping[RobotPair, Sequence[Innovation]],
 ) -> Iterator[list[TimedMessage]]:
     """Yield the PeerCauses message of each ordered pair.
 
@@ -54,14 +57,26 @@ def build_cause_messages(
         Log time from which the seconds of causes count.
     reports
         Reports of the pairs.
+    innovations
+        What the signals of each pair show beyond the model.
     """
     for report in reports:
+        both = report.robot, report.peer
         causes = [
             message_class("Cause")(**{**asdict(cause), "robot": cause.robot or ""})
             for cause in report.causes
         ]
-        made = message_class("PeerCauses")(causes=causes)
-        yield [TimedMessage(start_ns, topics.CAUSES(report.robot, report.peer), made)]
+        shown = [
+            message_class("Innovation")(
+                signal=one.signal,
+                robot="" if one.robot is None else both[one.robot],
+                at_s=one.time_s.round(2).tolist(),
+                size=one.size.tolist(),
+            )
+            for one in innovations.get(both, ())
+        ]
+        made = message_class("PeerCauses")(causes=causes, innovations=shown)
+        yield [TimedMessage(start_ns, topics.CAUSES(*both), made)]
 
 
 def build_label_messages(

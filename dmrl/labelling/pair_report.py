@@ -1,5 +1,6 @@
 """Report the estimate of each ordered pair in numbers, with the causes of its errors."""
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dmrl.estimation.model.position_metrics import is_covered_by_truth
-from dmrl.estimation.solver.estimate import Estimate
+from dmrl.estimation.solver.estimate import MISFIT, Estimate
 from dmrl.labelling.flight_log import FlightLog
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
 from dmrl.labelling.peer_positions import PeerPositions
@@ -30,6 +31,10 @@ REMEDIES = {
     "robots": "Fly different ways, or exchange the names of the robots",
 }
 """What to do about a cause, by the first word of its name."""
+MISFIT_REMEDY = "No known error explains it; positions around are refused. Try: dmrl view"
+"""What to do about a signal that does not fit."""
+FITS = re.compile(" fits? (if|in) ")
+"""Words of a cause that is corrected: a discrete mistake."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +58,12 @@ class PairCause:
     def __str__(self) -> str:
         """Return the cause in a line, with what to do about it."""
         owner = f"{self.robot}'s " if self.robot else ""
-        remedy = REMEDIES[self.name.split()[0]]
+        if self.name.endswith(MISFIT):
+            remedy = MISFIT_REMEDY
+        elif FITS.search(self.name):
+            remedy = "The labels use it so; write the log so too"
+        else:
+            remedy = REMEDIES[self.name.split()[0]]
         return (
             f"{owner}{self.name} ({self.probability:.0%}, {self.from_s:.0f} to {self.to_s:.0f} s). "
             f"{remedy}"

@@ -10,7 +10,14 @@ import numpy as np
 import pyarrow as pa
 
 from dmrl import topics
-from dmrl.estimation.model.pair import GRID_RATE_HZ, Array, Pair, SensorTrack, usable_ranges
+from dmrl.estimation.model.pair import (
+    GRID_RATE_HZ,
+    MAX_RANGE_M,
+    Array,
+    Pair,
+    SensorTrack,
+    usable_ranges,
+)
 from dmrl.estimation.signals.sensor_tracks import Signals, build_track
 from dmrl.labelling.flight_log import SENSOR_FIELDS, FlightLog, RobotPair, Samples
 from dmrl.labelling.sensor_file import SensorConstants
@@ -120,24 +127,13 @@ def build_sensor_logs(
         if log is not None:
             robots[name] = log
     pairs = {}
-    for one, other in combinations(names, 2):
-        links = [link for link in ((one, other), (other, one)) if link in flight.ranges]
-        found = [
-            _to_signals(flight, topics.RANGE, topics.RANGE(*link), samples, warnings)
-            for link in links
-            for samples in (flight.ranges[link],)
-        ]
-        ranges = [
-            (r[0], known.correct_ranges((one, other), r[1] - range_offset_m), links[k][0] == other)
-            for k, r in enumerate(found)
-            if r is not None
-        ]
-        sighted = bool(seeing & {one, other})
-        pair = _build_pair(robots, (one, other), ranges, known, warnings, sighted=sighted)
+    for both in combinations(names, 2):
+        ranges = _list_ranges(flight, both, range_offset_m, known, warnings)
+        pair = _build_pair(robots, both, ranges, known, warnings, sighted=bool(seeing & {*both}))
         if pair is not None:
-            pairs[one, other] = pair
-        elif found:
-            leave_out("pairs of robots without the logs that they need", f"{one}-{other}")
+            pairs[both] = pair
+        elif any(link in flight.ranges for link in (both, both[::-1])):
+            leave_out("pairs of robots without the logs that they need", "-".join(both))
     flying = _find_flying(flight)
     paired = {name for pair in pairs for name in pair}
     warnings += [
@@ -145,6 +141,25 @@ def build_sensor_logs(
         for name in sorted(flying - paired if pairs else ())
     ]
     return SensorLogs(flight.start_ns, robots, pairs, flying, warnings)
+
+
+def _list_ranges(
+    flight: FlightLog,
+    names: RobotPair,
+    range_offset_m: float,
+    known: SensorConstants,
+    warnings: list[str],
+) -> list[SentRanges]:
+    """Return the ranges of each direction of a pair that has usable ones."""
+    out = []
+    for link in (names, names[::-1]):
+        if link in flight.ranges:
+            topic = topics.RANGE(*link)
+            found = _to_signals(flight, topics.RANGE, topic, flight.ranges[link], warnings)
+            if found is not None:
+                range_m = known.correct_ranges(names, found[1] - range_offset_m)
+                out.append((found[0], range_m, link != names))
+    return out
 
 
 def _find_flying(flight: FlightLog) -> frozenset[str]:
@@ -247,7 +262,10 @@ def _select_ranges(
     sender = np.concatenate([np.full(len(r[0]), float(r[2])) for r in ranges])
     order = np.argsort(time_s, kind="stable")
     time_s, range_m, sender = time_s[order], range_m[order], sender[order]
-    good = usable_ranges(time_s, range_m)
+    # Where most are too long, they are in another unit, which the estimator finds.
+    positive = range_m[np.isfinite(range_m) & (range_m > 0)]
+    far = len(positive) > 0 and np.median(positive) > MAX_RANGE_M
+    good = usable_ranges(time_s, range_m, np.inf if far else MAX_RANGE_M)
     if bad := int((~good).sum()):
         leave_out(f"ranges of {name} that are not in (0, 60] m", name, bad)
     good &= (time_s >= start_s) & (time_s <= end_s)

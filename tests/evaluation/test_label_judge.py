@@ -19,10 +19,11 @@ def _judge(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_faults_change_signals_of_one_robot_and_no_truth() -> None:
     from label_judge.faults import ROWS  # noqa: PLC0415  # of benchmarks/
     from label_judge.flights import Base, fly  # noqa: PLC0415
+    from label_judge.unlisted_rows import UNLISTED_ROWS  # noqa: PLC0415
 
     base = Base("room", "calibrated", 30.0, 1)
     assert len({row.name for row in ROWS}) == len(ROWS) > 90
-    for row in ROWS:
+    for row in (*ROWS, *UNLISTED_ROWS):
         logs, sound = fly(base), fly(base)
         row.inject(logs, row.size, np.random.default_rng(1))
         signals = [

@@ -9,10 +9,16 @@ import numpy as np
 import pytest
 
 from dmrl import topics
+from dmrl.estimation.solver.estimate import Innovation
 from dmrl.geometry.frames import AIDECK, Camera, pixels_from_horizontal
 from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.image_labels import MIN_DEPTH_M, CameraOptions
-from dmrl.labelling.label_messages import build_label_messages, build_position_series
+from dmrl.labelling.label_messages import (
+    build_cause_messages,
+    build_label_messages,
+    build_position_series,
+)
+from dmrl.labelling.pair_report import PairCause, PairReport
 from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.labelling.sensor_logs import RobotLog, SensorLogs
 from dmrl.messages import STATUS_OK, STATUS_UNCONVERGED, message_class
@@ -122,3 +128,21 @@ def test_without_any_calibration_there_are_no_labels(tmp_path: Path) -> None:
         read_flight(path), logs(), "cf1", {"cf2": at([2.0])}, CameraOptions(0.01)
     )
     assert list(made) == []
+
+
+def test_causes_and_innovations_name_their_robots() -> None:
+    report = PairReport(
+        "cf2", "cf1", 1, 1.0, 0.0, 0.0, 0.1, None, None,
+        [PairCause("flow does not fit", 1.0, 3.0, 5.0, "cf1")],
+    )  # fmt: skip
+    shown = Innovation("flow", np.array([1.0, 3.0]), np.array([0.5, 9.0]), 1)
+    ranged = replace(shown, signal="range", robot=None)
+    both = {("cf2", "cf1"): (shown, ranged)}
+    ((made,),) = build_cause_messages(START_NS, [report], both)
+    assert made.topic == topics.CAUSES("cf2", "cf1")
+    assert [(one.signal, one.robot) for one in made.message.innovations] == [
+        ("flow", "cf1"), ("range", ""),
+    ]  # fmt: skip
+    assert list(made.message.innovations[0].at_s) == [1.0, 3.0]
+    assert made.message.causes[0].name == "flow does not fit"
+    assert "No known error explains it" in str(report.causes[0])

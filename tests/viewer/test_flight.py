@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from dmrl import recipe as recipes
+from dmrl import topics
 from dmrl.colours import RGB, STATUS_RGB
 from dmrl.errors import SettingError
-from dmrl.recording import sample_topics
+from dmrl.messages import message_class
+from dmrl.recording import Provenance, RecordingWriter, sample_topics
 from dmrl.recording.mcap import batch_reader
 from dmrl.recording.mcap.chunks import chunk_builder, chunk_reader
 from dmrl.stages import fly as fly_stage
@@ -281,3 +283,17 @@ def test_piloted_flight_shows_commands_maps_and_detection_gaps(tmp_path: Path, r
     assert {"commands, m/s", "detections, per image", "cf1 confidence", "cf1 depth, m"} <= shown
     states = column(rrd, "/cf1/detections/sight", "StateChange:state")
     assert {state for (state,) in states} <= {"detected", "not detected"}
+
+
+def test_innovations_and_causes_of_a_pair_are_plots(fly: Make, rrd: Path, tmp_path: Path) -> None:
+    cause = {"name": "flow does not fit", "probability": 0.9, "from_s": 0.5, "to_s": 1.0}
+    innovation = {"signal": "range", "at_s": [0.25, 1.5], "size": [0.5, 4.0]}
+    made = message_class("PeerCauses")(causes=[{**cause, "robot": "cf2"}], innovations=[innovation])
+    with RecordingWriter(tmp_path / "causes.mcap", Provenance("test")) as sink:
+        sink.write(0, topics.CAUSES("cf1", "cf2"), made)
+    save([fly(), tmp_path / "causes.mcap"], rrd, Settings())
+    path = topics.CAUSES("cf1", "cf2")
+    assert column(rrd, f"{path}/innovation/range", "Scalars:scalars") == [[0.5], [4.0]]
+    drawn = column(rrd, f"{path}/cause/cf2_flow_does_not_fit", "Scalars:scalars")
+    assert [value for (value,) in drawn] == pytest.approx([0, 0, 0.9, 0.9, 0, 0])
+    assert {"innovations, sigmas", "causes, probability"} <= set(panels(rrd))

@@ -10,6 +10,7 @@ from dmrl.colours import RGB
 from dmrl.terminal.progress import say
 from dmrl.topics import Topic
 from dmrl.viewer import layouts
+from dmrl.viewer.content.causes import draw_causes, list_cause_panels
 from dmrl.viewer.content.flight_streamer import FlightStreamer
 from dmrl.viewer.content.robot_motion import FlightMotion, Names, sample_motion
 from dmrl.viewer.drawing import archetypes, space, time_plots
@@ -61,7 +62,15 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     for pair in pairs:
         draws += [_build_sensor_rule(row, *pair, own=False) for row in topics.PAIR_SENSORS]
     spaces = _build_spaces(selection, seen, pairs, robots, eyes)
-    panels = {f"{a} sees {b}": _build_pair_plots(selection, seen, (a, b)) for a, b in pairs}
+    read = read_first_messages(selection, [topics.CAUSES(*pair) for pair in pairs])
+    causes = {pair: read[topic] for pair in pairs if (topic := topics.CAUSES(*pair)) in read}
+    panels = {
+        f"{a} sees {b}": [
+            *_build_pair_plots(selection, seen, (a, b)),
+            *(list_cause_panels((a, b), causes[a, b]) if (a, b) in causes else ()),
+        ]
+        for a, b in pairs
+    }
     if not pairs:
         panels = {robots[0]: _build_sensor_plots(selection, robots)} if robots else {}
     return Scene(
@@ -70,6 +79,7 @@ def scene(selection: Selection, settings: Settings) -> Scene:
         [
             *((None, entity) for entity in _iter_static_entities(selection, seen, robots)),
             *(bar for eye in eyes if scales for bar in build_colour_bars(eye, scales)),
+            *(drawn for pair, message in causes.items() for drawn in draw_causes(pair, message)),
         ],
         eyes,
         sources,

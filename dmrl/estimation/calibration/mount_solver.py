@@ -103,14 +103,6 @@ class _PathErrors:
     prior: csr_array
 
 
-@dataclass(slots=True)
-class _Nuisance:
-    """Nuisance states beside mount and delay: of each path, and (F, 2) tilts of the flights."""
-
-    paths: list[Array]
-    levels: Array
-
-
 def solve_mount(
     views: Sequence[PeerView],
     camera: Camera,
@@ -122,8 +114,6 @@ def solve_mount(
     fix_delay: bool = False,
 ) -> MountEstimate:
     """Solve for mount, delay and path errors by iteratively reweighted least squares.
-
-    The Schur complement eliminates the errors of each path, then of each flight.
 
     Parameters
     ----------
@@ -143,32 +133,29 @@ def solve_mount(
         Whether the delay keeps its value.
     """
     paths = _linearize_paths(views, camera, matched, start)
-    flights = 1 + max(path.flight for path in paths)
-    level = 1 / (CONSTANT_TILT_SHARE * noise.attitude_std_rad) ** 2
+    shown, prior = _stack_errors(paths, 1 / (CONSTANT_TILT_SHARE * noise.attitude_std_rad) ** 2)
     values = np.clip(start, -0.99 * MAX_VALUES, 0.99 * MAX_VALUES)
-    errors = _Nuisance([np.zeros(path.prior.shape[0]) for path in paths], np.zeros((flights, 2)))
-    information = np.eye(4)
+    errors, covariance = np.zeros(len(prior.diagonal())), np.eye(4)
     for _ in range(MAX_ROUNDS):
-        apart = pixel_residuals(views, camera, matched, values)
+        left = pixel_residuals(views, camera, matched, values).ravel() - shown @ errors
         slopes = pixel_jacobian(views, camera, matched, values)
         if fix_delay:
             slopes[:, :, 3] = 0.0
-        information, step = _solve_step(paths, errors, level, apart, slopes, spread_px)
-        moved = np.clip(values + step, -MAX_VALUES, MAX_VALUES)
+        design = csr_array(hstack([csr_array(slopes.reshape(-1, 4)), shown]))
+        covariance, step = _solve_step(design, prior, errors, left, spread_px)
+        errors = errors + step[4:]
+        moved = np.clip(values + step[:4], -MAX_VALUES, MAX_VALUES)
         settled = np.abs(moved - values).max() < TOLERANCE
         values = moved
         if settled:
             break
-    left = _remaining_residuals(paths, errors, pixel_residuals(views, camera, matched, values))
-    square = (left**2).sum(axis=1)
-    cost = _cauchy_cost(square / spread_px**2) + 0.5 * level * float((errors.levels**2).sum())
-    cost += sum(
-        0.5 * float(e @ path.prior @ e) for path, e in zip(paths, errors.paths, strict=True)
-    )
+    left = pixel_residuals(views, camera, matched, values).ravel() - shown @ errors
+    square = (left.reshape(-1, 2) ** 2).sum(axis=1)
+    cost = _cauchy_cost(square / spread_px**2) + 0.5 * float(errors @ prior @ errors)
     missed = matched.expected - len(matched.time_s)
     cost += missed * _cauchy_cost(np.array([(matched.radius_px / spread_px) ** 2]))
     found_px = float(np.sqrt(np.median(square) / MEDIAN_SQUARED_NORM))
-    return MountEstimate(values, np.asarray(np.linalg.inv(information)), float(cost), found_px)
+    return MountEstimate(values, covariance, float(cost), found_px)
 
 
 def _cauchy_cost(square: Array) -> float:
@@ -176,84 +163,50 @@ def _cauchy_cost(square: Array) -> float:
     return float(0.5 * CAUCHY_SIGMAS**2 * np.log1p(square / CAUCHY_SIGMAS**2).sum())
 
 
-def _remaining_residuals(paths: Sequence[_PathErrors], errors: _Nuisance, apart: Array) -> Array:
-    """Return (N, 2) residuals of all detections without the part of the path errors, pixels."""
-    out = apart.copy()
-    for path, error in zip(paths, errors.paths, strict=True):
-        explained = path.errors @ error + path.level @ errors.levels[path.flight]
-        out[path.rows] -= explained.reshape(-1, 2)
-    return out
+def _stack_errors(paths: Sequence[_PathErrors], level: float) -> tuple[csr_array, csr_array]:
+    """Stack the errors of all paths, then the tilts of the flights, (2 N, E) and (E, E).
+
+    Parameters
+    ----------
+    paths
+        Paths, in the order of their detections.
+    level
+        Information of a tilt.
+    """
+    flights = 1 + max(path.flight for path in paths)
+    tilts = [np.kron(np.eye(flights)[path.flight], path.level) for path in paths]
+    shown = hstack([block_diag([path.errors for path in paths]), csr_array(np.concatenate(tilts))])
+    prior = block_diag([*(path.prior for path in paths), level * eye_array(2 * flights)])
+    return csr_array(shown), csr_array(prior)
 
 
 def _solve_step(
-    paths: Sequence[_PathErrors],
-    errors: _Nuisance,
-    level: float,
-    apart: Array,
-    slopes: Array,
-    spread_px: float,
+    design: csr_array, prior: csr_array, errors: Array, left: Array, spread_px: float
 ) -> tuple[Array, Array]:
-    """Return information (4, 4) and step (4,) of mount and delay; update ``errors`` in place."""
-    left = _remaining_residuals(paths, errors, apart)
-    halves = [
-        _reduce_path(path, error, left[path.rows], slopes[path.rows], spread_px)
-        for path, error in zip(paths, errors.paths, strict=True)
-    ]
-    # A fixed delay has no derivative; this term keeps the matrix regular.
-    information, score, rests = np.diag([0.0, 0.0, 0.0, WEAK_INFORMATION]), np.zeros(4), []
-    for flight, held in enumerate(errors.levels):
-        mine = [half for path, half in zip(paths, halves, strict=True) if path.flight == flight]
-        joint = sum((half.information for half in mine), np.zeros((6, 6)))
-        pull = sum((half.score for half in mine), np.zeros(6))
-        joint[[4, 5], [4, 5]] += level
-        pull[4:] -= level * held
-        rest = np.linalg.solve(joint[4:, 4:], np.column_stack([pull[4:], joint[4:, :4]]))
-        information += joint[:4, :4] - joint[:4, 4:] @ rest[:, 1:]
-        score += pull[:4] - joint[:4, 4:] @ rest[:, 0]
-        rests.append(rest)
-    step = np.asarray(np.linalg.solve(information, score), np.float64)
-    levels = np.stack([rest[:, 0] - rest[:, 1:] @ step for rest in rests])
-    for k, (path, half) in enumerate(zip(paths, halves, strict=True)):
-        errors.paths[k] = errors.paths[k] + half.back_substitute(np.r_[step, levels[path.flight]])
-    errors.levels = errors.levels + levels
-    return information, step
+    """Return the covariance (4, 4) of mount and delay, and the step (4 + E,) of all unknowns.
 
-
-@dataclass(frozen=True, slots=True)
-class _SchurBlock:
-    """Normal equations of one path in mount, delay and tilt, with its errors eliminated.
-
-    ``own`` (E,) is the step of the errors at fixed mount, delay and tilt. ``cross`` (E, 6) is the
-    negated derivative of that step by them.
+    Parameters
+    ----------
+    design
+        (2 N, 4 + E) derivatives of the pixels.
+    prior, errors
+        Information and present values of the errors.
+    left
+        (2 N,) residuals, pixels.
+    spread_px
+        Standard deviation of a single detection.
     """
-
-    information: Array
-    score: Array
-    own: Array
-    cross: Array
-
-    def back_substitute(self, step: Array) -> Array:
-        """Return (E,) the step of the errors, given the step of mount, delay and tilt."""
-        return np.asarray(self.own - self.cross @ step)
-
-
-def _reduce_path(
-    path: _PathErrors, error: Array, left: Array, slopes: Array, spread_px: float
-) -> _SchurBlock:
-    """Build the reduced normal equations of one path."""
     # The Cauchy weight 1 / (1 + r^2 / c^2), as its root on either side of the normal equations.
-    far = (left**2).sum(axis=1) / (CAUCHY_SIGMAS * spread_px) ** 2
+    far = (left.reshape(-1, 2) ** 2).sum(axis=1) / (CAUCHY_SIGMAS * spread_px) ** 2
     root = np.repeat(1.0 / (spread_px * np.sqrt(1.0 + far)), 2)
-    errors = csr_array(path.errors.multiply(root[:, None]))
-    slopes = root[:, None] * np.hstack([slopes.reshape(len(root), -1), path.level])
-    rest = root * left.ravel()
-    cross = errors.T @ slopes
-    pull = errors.T @ rest - path.prior @ error
-    solved = splu(csc_array(errors.T @ errors + path.prior)).solve(np.column_stack([pull, cross]))
-    own, across = solved[:, 0], solved[:, 1:]
-    return _SchurBlock(
-        slopes.T @ slopes - cross.T @ across, slopes.T @ rest - cross.T @ own, own, across
-    )
+    design = csr_array(design.multiply(root[:, None]))
+    # A fixed delay has no derivative; this term keeps the matrix regular.
+    weak = diags_array([0.0, 0.0, 0.0, WEAK_INFORMATION])
+    normal = design.T @ design + block_diag([weak, prior])
+    score = design.T @ (root * left)
+    score[4:] -= prior @ errors
+    solved = splu(csc_array(normal)).solve(np.column_stack([score, np.eye(len(score), 4)]))
+    return solved[:4, 1:], solved[:, 0]
 
 
 def _linearize_paths(

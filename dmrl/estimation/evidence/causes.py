@@ -7,7 +7,7 @@ import numpy as np
 
 from dmrl.estimation.evidence.posterior import Mixture
 from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Pair
-from dmrl.estimation.solver.estimate import Cause
+from dmrl.estimation.solver.estimate import Cause, Innovation
 
 MIN_DROPOUT_SHARE = 0.01
 """Share of a flight from which a silent sensor is reported."""
@@ -34,17 +34,40 @@ def find_causes(mixture: Mixture, span_s: tuple[float, float]) -> tuple[Cause, .
 
 
 def join_causes(causes: Sequence[Cause]) -> tuple[Cause, ...]:
-    """Return causes with those of the same name and robot as one."""
-    out: dict[tuple[str, int | None], Cause] = {}
-    for cause in causes:
-        before = out.get((cause.name, cause.robot), cause)
-        out[cause.name, cause.robot] = replace(
-            before,
-            probability=max(before.probability, cause.probability),
-            from_s=min(before.from_s, cause.from_s),
-            to_s=max(before.to_s, cause.to_s),
+    """Return causes with those of the same name and robot as one, if their times touch."""
+    out: list[Cause] = []
+    for cause in sorted(causes, key=lambda one: one.from_s):
+        before = next(
+            (
+                k
+                for k, one in enumerate(out)
+                if (one.name, one.robot) == (cause.name, cause.robot)
+                and cause.from_s <= one.to_s + MAX_DROPOUT_S
+            ),
+            None,
         )
-    return tuple(sorted(out.values(), key=lambda cause: -cause.probability))
+        if before is None:
+            out.append(cause)
+        else:
+            one = out[before]
+            probability = max(one.probability, cause.probability)
+            out[before] = replace(one, probability=probability, to_s=max(one.to_s, cause.to_s))
+    return tuple(sorted(out, key=lambda cause: -cause.probability))
+
+
+def join_innovations(parts: Sequence[Sequence[Innovation]]) -> tuple[Innovation, ...]:
+    """Join the innovations of the windows of a flight, by signal and robot."""
+    found: dict[tuple[str, int | None], list[Innovation]] = {}
+    for one in (one for part in parts for one in part):
+        found.setdefault((one.signal, one.robot), []).append(one)
+    return tuple(
+        replace(
+            some[0],
+            time_s=np.concatenate([one.time_s for one in some]),
+            size=np.concatenate([one.size for one in some]),
+        )
+        for some in found.values()
+    )
 
 
 def find_dropouts(logged: Pair, used: Pair) -> tuple[Cause, ...]:

@@ -1,12 +1,41 @@
-"""Discrete mistakes of a log, such as a sign: tried where no noise explains it."""
+"""Discrete mistakes of a log, such as a sign or a unit: tried where no noise explains it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
-from dmrl.estimation.model.pair import Pair, SensorTrack
+from dmrl.estimation.model.pair import (
+    MAX_RANGE_M,
+    BearingMeasurements,
+    Pair,
+    SensorTrack,
+    usable_ranges,
+)
+from dmrl.estimation.search.modes import find_modes
+from dmrl.estimation.signals.clock_alignment import estimate_clock
+from dmrl.estimation.signals.contradictions import drop_contradictions
+from dmrl.estimation.solver.keyframes import build_problem
+
+MISTAKE_S = 50.0
+"""Time from the start of a flight in which a mistake is sought, seconds."""
+MAX_COST, MISTAKE_GAIN = 0.6, 0.3
+"""Largest cost of a keyframe of a flight that fits, and reduction that shows a mistake. Sound
+flights have 0.2 to 0.3, units that are wrong by a factor of three 0.8."""
+DROPPED_COST = 2.0
+"""Cost of a keyframe without odometry: what is dropped fits everything."""
+SHIFTS_S, FINE_SHIFTS_S = (-4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0), (0.5, 0.25)
+"""Shifts of a clock that are tried where one robot ranges alone, seconds; and their halvings."""
+MIN_SHIFT_S = 0.5
+"""Smallest shift that is a mistake, seconds: the error model of clocks has smaller ones."""
+FOOT_M = 0.3048
+"""Length of a foot, metres."""
+MAX_SPEED_MPS, MAX_HEIGHT_M = 5.0, 10.0
+"""Medians of a speed and a height beyond which centimetres and millimetres are tried."""
+
+Correction = Callable[[Pair, int | None], Pair]
+"""Function from a pair and the robot with the wrong log to the corrected pair."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,20 +47,165 @@ class Mistake:
     name
         Name of the cause.
     correct
-        Corrected log of one robot, from the log and its step, seconds.
+        The correction.
+    robots
+        Robots that it may concern. None: the pair.
+    applies
+        Whether it is tried, by the pair and the robot. None: always.
     heading_is_open
         Whether the robot's heading remains unknown by a constant angle.
+    shift_s
+        Seconds that are added to the clock of the second robot.
     """
 
     name: str
-    correct: Callable[[SensorTrack, float], SensorTrack]
+    correct: Correction
+    robots: tuple[int | None, ...] = (0, 1)
+    applies: Callable[[Pair, int | None], bool] | None = None
     heading_is_open: bool = False
+    shift_s: float = 0.0
 
-    def apply(self, pair: Pair, robot: int) -> Pair:
-        """Return the pair with the corrected log of a robot."""
-        tracks = [pair.own, pair.peer]
-        tracks[robot] = self.correct(tracks[robot], pair.dt_s)
-        return replace(pair, own=tracks[0], peer=tracks[1])
+
+def find_mistake(pair: Pair) -> tuple[Mistake, int | None] | None:
+    """Find the discrete mistake without which a flight fits; None if there is none.
+
+    Parameters
+    ----------
+    pair
+        Sensor data of both robots, which no noise explains.
+    """
+    part = pair.crop(pair.time_s[0], pair.time_s[0] + MISTAKE_S)
+
+    def compute_cost(choice: tuple[Mistake, int | None]) -> float:
+        return compute_misfit(choice[0].correct(part, choice[1]))
+
+    enough = min(MAX_COST, compute_misfit(part) - MISTAKE_GAIN)
+    every = [
+        (one, robot)
+        for one in (*_list_clock_mistakes(pair), *MISTAKES)
+        for robot in one.robots
+        if one.applies is None or one.applies(pair, robot)
+    ]
+    # What the measurements show by themselves comes first.
+    shown = [choice for choice in every if choice[0].shift_s or choice[0].applies]
+    for some in (shown, [choice for choice in every if choice not in shown]):
+        costs = [compute_cost(choice) for choice in some]
+        if costs and min(costs) < enough:
+            return some[int(np.argmin(costs))]
+    best = None if _is_mutual(pair) else _search_shift(compute_cost)
+    return best if best and compute_cost(best) < enough else None
+
+
+def compute_misfit(pair: Pair) -> float:
+    """Return the cost of a keyframe of the best solution of a coarse copy of a flight."""
+    if not len(pair.range_m) and pair.own_bearings is pair.peer_bearings is None:
+        return np.inf
+    used = drop_contradictions(pair)
+    problem = build_problem({(0, 1): used})
+    dropped = (used.own.dropout | used.peer.dropout).mean()
+    dropped -= (pair.own.dropout | pair.peer.dropout).mean()
+    try:
+        cost = find_modes(problem)[0].cost / len(problem.keyframe_s)
+    except np.linalg.LinAlgError:
+        return np.inf
+    return float(cost + DROPPED_COST * dropped)
+
+
+def _is_mutual(pair: Pair) -> bool:
+    """Return whether both robots range, so that their ranges show the clocks."""
+    return pair.range_sender is not None and len(np.unique(pair.range_sender)) == 2
+
+
+def _list_clock_mistakes(pair: Pair) -> Iterator[Mistake]:
+    """Yield the shift of the clock that aligns the ranges of both robots, if it is large."""
+    if _is_mutual(pair):
+        here, there = (pair.range_sender == robot for robot in (0, 1))
+        series = (
+            series[at] for at in (here, there) for series in (pair.range_time_s, pair.range_m)
+        )
+        clock = estimate_clock(*series)
+        if clock is not None and abs(clock.offset_s) > MIN_SHIFT_S:
+            yield _clock_mistake(clock.offset_s)
+
+
+def _search_shift(
+    compute_cost: Callable[[tuple[Mistake, int | None]], float],
+) -> tuple[Mistake, int | None]:
+    """Return the shift of the second robot's clock with the least cost."""
+    tried = [(_clock_mistake(shift_s), 1) for shift_s in SHIFTS_S]
+    best = min(tried, key=compute_cost)
+    for step_s in FINE_SHIFTS_S:
+        near = [(_clock_mistake(best[0].shift_s + way * step_s), 1) for way in (-1, 1)]
+        best = min([best, *near], key=compute_cost)
+    return best
+
+
+def _clock_mistake(shift_s: float) -> Mistake:
+    """Return the mistake of a clock that is off by seconds."""
+
+    def correct(pair: Pair, _robot: int | None) -> Pair:
+        return move_clock(pair, shift_s)
+
+    return Mistake(f"clock fits if it is moved by {shift_s:+.2f} s", correct, (1,), shift_s=shift_s)
+
+
+def move_clock(pair: Pair, shift_s: float) -> Pair:
+    """Return a pair with seconds added to the times of the second robot.
+
+    Parameters
+    ----------
+    pair
+        Sensor data of both robots.
+    shift_s
+        The seconds.
+    """
+    start_s, end_s = pair.time_s[[0, -1]]
+    at_s = pair.time_s - shift_s
+    index = np.rint((np.clip(at_s, start_s, end_s) - start_s) / pair.dt_s).astype(int)
+    peer = pair.peer.select(index)
+    peer = replace(peer, dropout=peer.dropout | (at_s < start_s) | (at_s > end_s))
+    mine = 0 if pair.range_sender is None else pair.range_sender == 1
+    time_s = pair.range_time_s + shift_s * mine
+    order = np.argsort(time_s, kind="stable")
+    order = order[(time_s[order] >= start_s) & (time_s[order] <= end_s)]
+    sees = pair.peer_bearings
+    return replace(
+        pair, peer=peer, range_time_s=time_s[order], range_m=pair.range_m[order],
+        range_sender=None if pair.range_sender is None else pair.range_sender[order],
+        peer_bearings=sees and BearingMeasurements(sees.time_s + shift_s, sees.bearing, sees.std),
+    )  # fmt: skip
+
+
+def _correct_track(change: Callable[[SensorTrack, float], SensorTrack]) -> Correction:
+    """Return the correction of the log of one robot, from the log and its step, seconds."""
+
+    def correct(pair: Pair, robot: int | None) -> Pair:
+        if robot == 0:
+            return replace(pair, own=change(pair.own, pair.dt_s))
+        return replace(pair, peer=change(pair.peer, pair.dt_s))
+
+    return correct
+
+
+def _scale(factor: float, *names: str) -> Correction:
+    """Return the correction that multiplies signals of a robot."""
+    return _correct_track(
+        lambda track, _: replace(track, **{name: factor * getattr(track, name) for name in names})
+    )
+
+
+def _scale_ranges(factor: float) -> Correction:
+    """Return the correction that multiplies the ranges."""
+
+    def correct(pair: Pair, _robot: int | None) -> Pair:
+        range_m = factor * pair.range_m
+        good = usable_ranges(pair.range_time_s, range_m)
+        sender = None if pair.range_sender is None else pair.range_sender[good]
+        return replace(
+            pair, range_time_s=pair.range_time_s[good], range_m=range_m[good], range_sender=sender
+        )
+
+    return correct
 
 
 def _from_take_off_frame(track: SensorTrack, dt_s: float) -> SensorTrack:
@@ -42,22 +216,69 @@ def _from_take_off_frame(track: SensorTrack, dt_s: float) -> SensorTrack:
     return replace(track, vx_mps=x, vy_mps=y)
 
 
-def _negate(name: str) -> Callable[[SensorTrack, float], SensorTrack]:
-    """Return the correction that negates a signal."""
-
-    def correct(track: SensorTrack, _dt_s: float) -> SensorTrack:
-        return replace(track, **{name: -getattr(track, name)})
-
-    return correct
+def _swap_axes(track: SensorTrack, _dt_s: float) -> SensorTrack:
+    """Return a log whose velocities were exchanged."""
+    return replace(track, vx_mps=track.vy_mps, vy_mps=track.vx_mps)
 
 
+def _exchange_logs(pair: Pair, _robot: int | None) -> Pair:
+    """Return a pair whose robots have each other's log."""
+    return replace(pair, own=pair.peer, peer=pair.own)
+
+
+def _is_fast(pair: Pair, robot: int | None) -> bool:
+    """Return whether no robot flies at the logged speed."""
+    track = (pair.own, pair.peer)[robot or 0]
+    return bool(np.median(np.hypot(track.vx_mps, track.vy_mps)) > MAX_SPEED_MPS)
+
+
+def _is_high(pair: Pair, robot: int | None) -> bool:
+    """Return whether no robot flies at the logged height."""
+    return bool(np.median((pair.own, pair.peer)[robot or 0].height_m) > MAX_HEIGHT_M)
+
+
+def ranges_are_far(pair: Pair, _robot: int | None = None) -> bool:
+    """Return whether no radio measures the logged ranges, if they are in metres."""
+    return bool(len(pair.range_m) and np.median(pair.range_m) > MAX_RANGE_M)
+
+
+def _is_seen(pair: Pair, _robot: int | None) -> bool:
+    """Return whether a camera shows which robot is which: ranges and odometry do not."""
+    return pair.own_bearings is not None or pair.peer_bearings is not None
+
+
+FLOW, TURN = ("vx_mps", "vy_mps"), "yaw_rate_radps"
+PAIR = (None,)
 MISTAKES: tuple[Mistake, ...] = (
-    Mistake("yaw rate fits if it is negated", _negate("yaw_rate_radps")),
-    Mistake("flow fits if vx is negated", _negate("vx_mps")),
-    Mistake("flow fits if vy is negated", _negate("vy_mps")),
+    Mistake("yaw rate fits if it is negated", _scale(-1.0, TURN)),
+    Mistake("yaw rate fits if it is taken as degrees", _scale(np.pi / 180, TURN)),
+    Mistake("flow fits if vx is negated", _scale(-1.0, "vx_mps")),
+    Mistake("flow fits if vy is negated", _scale(-1.0, "vy_mps")),
+    Mistake("flow fits if vx and vy are swapped", _correct_track(_swap_axes)),
     Mistake(
-        "flow fits if vx and vy are swapped",
-        lambda track, _: replace(track, vx_mps=track.vy_mps, vy_mps=track.vx_mps),
+        "flow fits in the world frame", _correct_track(_from_take_off_frame), heading_is_open=True
     ),
-    Mistake("flow fits in the world frame", _from_take_off_frame, heading_is_open=True),
+    Mistake("flow fits if it is taken as feet", _scale(FOOT_M, *FLOW)),
+    Mistake("range fits if it is taken as feet", _scale_ranges(FOOT_M), PAIR),
+    Mistake("robots fit if their logs are exchanged", _exchange_logs, PAIR, _is_seen),
+    *(
+        mistake
+        for size in (100, 1000)
+        for mistake in (
+            Mistake(
+                f"range fits if it is divided by {size}",
+                _scale_ranges(1 / size),
+                PAIR,
+                ranges_are_far,
+            ),
+            Mistake(
+                f"flow fits if it is divided by {size}", _scale(1 / size, *FLOW), applies=_is_fast
+            ),
+            Mistake(
+                f"height fits if it is divided by {size}",
+                _scale(1 / size, "height_m"),
+                applies=_is_high,
+            ),
+        )
+    ),
 )

@@ -1,1 +1,1 @@
-"""Kalman filters of a pair."""
+"""Published Kalman filter of a pair."""

@@ -1,14 +1,15 @@
-"""Published relative EKF (Li et al. 2020), vectorized; `filterpy_ekf` is its reference.
+"""Published relative EKF (Li et al. 2020), by filterpy.
 
-State (x, y, psi); the inputs are both robots' velocities and yaw rates. The filters start at (0, 0,
-0), as published, which is why they can converge to a wrong position.
+State (x, y, psi); the inputs are both robots' velocities and yaw rates. The filter starts at (0, 0,
+0), as published, which is why it can converge to a wrong position.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
 
-from dmrl.estimation.model.pair import Array, Mask, Pair
+from dmrl.estimation.model.pair import Array, Pair
 
 RANGE_MARGIN_M = 1e-4
 """Added to every range, metres. It avoids a division by zero at the start (0, 0), as in the
@@ -47,16 +48,16 @@ PRESETS = {
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Inputs of B filters at K steps. `build_steps` makes them for one pair.
+    """Inputs of a filter at K steps.
 
     Parameters
     ----------
     inputs
-        (K, B, 6): vx, vy, yaw rate of the peer, then of the observer.
+        (K, 6): vx, vy, yaw rate of the peer, then of the observer.
     height_m
-        (K, B) peer's height minus the observer's, metres.
+        (K,) peer's height minus the observer's, metres.
     range_m
-        (K, B) range that arrived with the step, metres; NaN without one.
+        (K,) range that arrived with the step, metres; NaN without one.
     dt_s
         Seconds per step.
     """
@@ -68,7 +69,7 @@ class Steps:
 
 
 def build_steps(pair: Pair, preset: Preset) -> Steps:
-    """Build the inputs of the filter for one pair, B = 1.
+    """Build the inputs of the filter for one pair.
 
     Ranges go to the nearest step. If several fall on one step, as where both robots range, the last
     counts.
@@ -81,64 +82,45 @@ def build_steps(pair: Pair, preset: Preset) -> Steps:
     range_m = np.full(len(pair.time_s), np.nan)
     nearest = np.rint((pair.range_time_s - pair.time_s[0]) / pair.dt_s).astype(int)
     range_m[nearest] = pair.range_m
-    return Steps(inputs[:, None], height_m[:, None], range_m[:, None], pair.dt_s)
-
-
-def stack_pairs(steps: list[Steps]) -> Steps:
-    """Stack pairs of equal length side by side."""
-    return Steps(
-        np.concatenate([s.inputs for s in steps], axis=1),
-        np.concatenate([s.height_m for s in steps], axis=1),
-        np.concatenate([s.range_m for s in steps], axis=1),
-        steps[0].dt_s,
-    )
+    return Steps(inputs, height_m, range_m, pair.dt_s)
 
 
 def propagate_state(state: Array, inputs: Array, dt_s: float) -> tuple[Array, Array, Array]:
-    """Propagate B filters by one step; return the states and their Jacobians.
+    """Propagate a state by one step; return it with its Jacobians.
 
     Parameters
     ----------
     state
-        (B, 3) x, y (m), psi (rad).
+        (3,) x, y (m), psi (rad).
     inputs
-        (B, 6) as in `Steps`.
+        (6,) as in `Steps`.
     dt_s
         Seconds.
 
     Returns
     -------
     state : Array
-        (B, 3).
+        (3,).
     by_state : Array
-        (B, 3, 3) Jacobian by the state, at the state before the step.
+        (3, 3) Jacobian by the state, at the state before the step.
     by_input : Array
-        (B, 3, 6) Jacobian by the inputs.
+        (3, 6) Jacobian by the inputs.
     """
-    x, y, psi = state.T
-    vxj, vyj, rj, vxi, vyi, ri = inputs.T
+    x, y, psi = state
+    vxj, vyj, rj, vxi, vyi, ri = inputs
     c, s = np.cos(psi), np.sin(psi)
-    rate = np.stack(
-        [c * vxj - s * vyj - vxi + ri * y, s * vxj + c * vyj - vyi - ri * x, rj - ri], axis=-1
-    )
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    by_state = np.broadcast_to(np.eye(3), (len(x), 3, 3)).copy()
-    by_state[:, 0, 1], by_state[:, 1, 0] = dt_s * ri, -dt_s * ri
-    by_state[:, 0, 2], by_state[:, 1, 2] = dt_s * (-s * vxj - c * vyj), dt_s * (c * vxj - s * vyj)
-    rows = [
-        [c, -s, zero, -one, zero, y],
-        [s, c, zero, zero, -one, -x],
-        [zero, zero, one, zero, zero, -one],
-    ]
-    by_input = dt_s * np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+    there = np.array([c * vxj - s * vyj, s * vxj + c * vyj])
+    rate = np.array([there[0] - vxi + ri * y, there[1] - vyi - ri * x, rj - ri])
+    by_state = np.eye(3) + dt_s * np.array([[0, ri, -there[1]], [-ri, 0, there[0]], [0, 0, 0]])
+    by_input = dt_s * np.array([[c, -s, 0, -1, 0, y], [s, c, 0, 0, -1, -x], [0, 0, 1, 0, 0, -1]])
     return state + dt_s * rate, by_state, by_input
 
 
-def predict_range(state: Array, height_m: Array) -> tuple[Array, Array]:
-    """Return the predicted range (B,) of B states, metres, and its Jacobian (B, 3)."""
-    x, y = state[:, 0], state[:, 1]
+def predict_range(state: Array, height_m: float) -> tuple[Array, Array]:
+    """Return the predicted range (1,) of a state, metres, and its Jacobian (1, 3)."""
+    x, y, _ = state
     range_m = np.sqrt(x**2 + y**2 + height_m**2) + RANGE_MARGIN_M
-    return range_m, np.stack([x / range_m, y / range_m, np.zeros_like(x)], axis=-1)
+    return np.array([range_m]), np.array([[x / range_m, y / range_m, 0.0]])
 
 
 def input_variance(preset: Preset) -> Array:
@@ -147,43 +129,49 @@ def input_variance(preset: Preset) -> Array:
     return np.diag([v, v, r, v, v, r])
 
 
-def filter_many(steps: Steps, preset: Preset) -> tuple[Array, Array]:
-    """Run B filters; return states (K, B, 3) and covariances (K, B, 3, 3).
+class RelativeEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
+    """Extended Kalman filter of filterpy with the relative motion as its prediction."""
 
-    This is the vectorized twin of `filterpy_ekf.filter_reference`.
+    def __init__(self, preset: Preset, dt_s: float) -> None:
+        super().__init__(dim_x=3, dim_z=1)
+        # Flat: filterpy's default, a column, broadcasts to (3, 3) in the update.
+        self.x = np.zeros(3)
+        self.P = np.diag(preset.initial_var)
+        self.R = np.array([[preset.range_std_m**2]])
+        self._noise = input_variance(preset)
+        self._dt_s = dt_s
+
+    def predict_x(self, u: Array) -> None:
+        """Propagate the state. filterpy's ``predict`` calls this before it moves the covariance."""
+        self.x, self.F, by_input = propagate_state(self.x, u, self._dt_s)
+        self.Q = by_input @ self._noise @ by_input.T
+
+
+def filter_pair(steps: Steps, preset: Preset) -> tuple[Array, Array]:
+    """Filter one pair; return states (K, 3) and covariances (K, 3, 3).
+
+    It calls ``predict`` and then ``update``, because filterpy's ``predict_update`` evaluates the
+    Jacobian of the range before the prediction.
 
     Parameters
     ----------
     steps
-        Inputs of B pairs.
+        Inputs of the pair.
     preset
         Noise and initial variances.
     """
-    count, filters = steps.height_m.shape
-    noise = input_variance(preset)
-    state = np.zeros((filters, 3))
-    covariance = np.broadcast_to(np.diag(preset.initial_var), (filters, 3, 3)).copy()
-    states, covariances = np.empty((count, filters, 3)), np.empty((count, filters, 3, 3))
-    arrived = np.isfinite(steps.range_m)
-    for k in range(count):
-        state, by_state, by_input = propagate_state(state, steps.inputs[k], steps.dt_s)
-        covariance = by_state @ covariance @ by_state.swapaxes(1, 2)
-        covariance = covariance + by_input @ noise @ by_input.swapaxes(1, 2)
-        if arrived[k].any():
-            _update_ranges(state, covariance, steps, k, arrived[k], preset.range_std_m**2)
-        states[k], covariances[k] = state, covariance
+    ekf = RelativeEkf(preset, steps.dt_s)
+    states, covariances = np.empty((len(steps.inputs), 3)), np.empty((len(steps.inputs), 3, 3))
+    rows = zip(steps.inputs, steps.height_m.tolist(), steps.range_m.tolist(), strict=True)
+    for k, (inputs, height_m, range_m) in enumerate(rows):
+        ekf.predict(inputs)
+        if np.isfinite(range_m):
+            ekf.update(
+                np.array([range_m]),
+                lambda x, height_m: predict_range(x, height_m)[1],
+                lambda x, height_m: predict_range(x, height_m)[0],
+                args=(height_m,),
+                hx_args=(height_m,),
+            )
+        states[k], covariances[k] = ekf.x, ekf.P
     return states, covariances
-
-
-def _update_ranges(
-    state: Array, covariance: Array, steps: Steps, k: int, arrived: Mask, variance: float
-) -> None:
-    """Update the filters with the ranges of step k, in place (Joseph form)."""
-    expected, row = predict_range(state[arrived], steps.height_m[k, arrived])
-    prior = covariance[arrived]
-    cross = np.einsum("bij,bj->bi", prior, row)
-    gain = cross / (np.einsum("bi,bi->b", row, cross) + variance)[:, None]
-    state[arrived] += gain * (steps.range_m[k, arrived] - expected)[:, None]
-    keep = np.eye(3) - gain[:, :, None] * row[:, None, :]
-    spread = variance * gain[:, :, None] * gain[:, None, :]
-    covariance[arrived] = keep @ prior @ keep.swapaxes(1, 2) + spread

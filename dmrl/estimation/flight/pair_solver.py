@@ -1,10 +1,12 @@
 """Solve one window of a pair: modes, noise model, full solve and covariance."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from dmrl.estimation.evidence.posterior import Member, Mixture, weigh_models
 from dmrl.estimation.model.bearings import ASSOCIATION_GATE
 from dmrl.estimation.model.pair import Array
+from dmrl.estimation.search.hypotheses import Track
 from dmrl.estimation.search.modes import (
     SAME_TRACK_M,
     coarsen,
@@ -20,10 +22,11 @@ from dmrl.estimation.solver.covariance import compute_covariance
 from dmrl.estimation.solver.levenberg_marquardt import (
     ROUGH_TOLERANCE,
     Carried,
+    MapEstimate,
     Solver,
     is_same_solution,
 )
-from dmrl.estimation.solver.noise_selection import range_noise_ratio, select_model
+from dmrl.estimation.solver.noise_selection import range_noise_ratio, select_noise
 from dmrl.estimation.solver.problem import CameraView, NoiseModel, Problem
 from dmrl.estimation.solver.residuals import Values, bearing_factor
 
@@ -86,45 +89,66 @@ def solve_pair(
         Without error models beyond the plain one.
     """
     tracks = find_tracks(problem)
-    modes = find_modes(problem, tracks)
-    full = [convert_values(m.values, coarsen(problem).layout, problem.layout) for m in modes]
-    kept = replace(problem, views=consistent_views(problem, full[0]))
-    full = [convert_values(values, problem.layout, kept.layout) for values in full]
-    problem = kept
-    if noise is None:
-        problem, first = select_model(problem, full[0])
-        full[0] = first.values
-    else:
-        problem = replace(problem, noise=noise)
+    problem, starts = _select_noise(problem, tracks, noise)
     solver = Solver(problem, carried if carried and carried.fits(problem.layout) else None)
-    full = [_with_step_offsets(problem, values) for values in full]
     if solver.carried is not None:
-        full.append(dead_reckon(problem, solver.carried.mean))
-    found = [solver.solve(full[0])]
-    for values in full[1:]:
-        found.append(solver.solve(values, found, ROUGH_TOLERANCE))
-    found = select_modes(found)
-    if (
-        noise is None
-        and (ratio := range_noise_ratio(problem, found[0].values)) > MIN_RANGE_NOISE_RATIO
-    ):
-        wider = replace(problem.noise, range_std_m=problem.noise.range_std_m * ratio)
-        problem = replace(problem, noise=wider)
-        solver = replace(solver, problem=problem)
-        found = select_modes([solver.solve(mode.values) for mode in found])
+        starts.append(dead_reckon(problem, solver.carried.mean))
+    solver, found = _solve_modes(solver, starts, widen=noise is None)
     if plain or noise is not None:
         members = [Member(solver, mode, -mode.cost) for mode in found]
         mixture = Mixture(members, mode_weights(found))
     else:
-        others = find_flexible_modes(problem, tracks)
-        distinct = [
+        others = [
             values
-            for values in others
+            for values in find_flexible_modes(problem, tracks)
             if not any(is_same_solution(values, mode.values, SAME_TRACK_M) for mode in found)
         ]
-        mixture = weigh_models(solver, found, distinct)
+        mixture = weigh_models(solver, found, others)
     covariances = [compute_covariance(one.solver, one.values) for one in mixture.members]
     return PairSolution(mixture, covariances)
+
+
+def _select_noise(
+    problem: Problem, tracks: Sequence[Track], noise: NoiseModel | None
+) -> tuple[Problem, list[Values]]:
+    """Return a flight with its noise and consistent images, and its modes as first guesses."""
+    modes = find_modes(problem, tracks)
+    starts = [convert_values(m.values, coarsen(problem).layout, problem.layout) for m in modes]
+    kept = replace(problem, views=consistent_views(problem, starts[0]))
+    starts = [convert_values(values, problem.layout, kept.layout) for values in starts]
+    if noise is None:
+        kept, first = select_noise(kept, starts[0])
+        starts[0] = first.values
+    else:
+        kept = replace(kept, noise=noise)
+    return kept, [_with_step_offsets(kept, values) for values in starts]
+
+
+def _solve_modes(
+    solver: Solver, starts: Sequence[Values], *, widen: bool
+) -> tuple[Solver, list[MapEstimate]]:
+    """Return the distinct solutions from some first guesses, best first, and their solver.
+
+    Parameters
+    ----------
+    solver
+        The flight.
+    starts
+        First guesses, the best first.
+    widen
+        Whether ranges that average out slowly get more noise.
+    """
+    found = [solver.solve(starts[0])]
+    for values in starts[1:]:
+        found.append(solver.solve(values, found, ROUGH_TOLERANCE))
+    found = select_modes(found)
+    ratio = range_noise_ratio(solver.problem, found[0].values) if widen else 1.0
+    if ratio > MIN_RANGE_NOISE_RATIO:
+        noise = solver.problem.noise
+        wider = replace(noise, range_std_m=noise.range_std_m * ratio)
+        solver = replace(solver, problem=replace(solver.problem, noise=wider))
+        found = select_modes([solver.solve(mode.values) for mode in found])
+    return solver, found
 
 
 def _with_step_offsets(problem: Problem, values: Values) -> Values:

@@ -8,15 +8,17 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from dmrl.estimation.evidence.causes import find_causes, find_dropouts
-from dmrl.estimation.evidence.mistakes import MISTAKES, Mistake
-from dmrl.estimation.filters import ekf
+from dmrl.estimation.evidence.goodness_of_fit import check_fit
+from dmrl.estimation.evidence.mistakes import find_mistake, ranges_are_far
 from dmrl.estimation.flight.pair_output import (
+    MAJORITY_SHARE,
     OUTPUT_HZ,
     _first_samples,
     clip_to_ranges,
     height_errors,
     interpolate_at,
     join_estimates,
+    list_refused,
     list_sighted,
     mix_members,
     motion_energy,
@@ -31,7 +33,6 @@ from dmrl.estimation.flight.windows import carry_information, split_windows
 from dmrl.estimation.model.gate import DEFAULT_GATE, Gate
 from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Mask, Pair
 from dmrl.estimation.model.status import UNCONVERGED, classify_positions
-from dmrl.estimation.search.modes import find_modes
 from dmrl.estimation.signals.contradictions import drop_contradictions, drop_held_ranges
 from dmrl.estimation.solver.estimate import (
     PAIR_LAYOUT,
@@ -48,12 +49,8 @@ from dmrl.estimation.solver.unknowns import TABLE
 CONTRADICTED_SIGMAS, CONTRADICTED_RANGE_SIGMAS = 15.0, 3.0
 """Odometry that differs from the solution by more has dropped out for the status, in sigmas; and so
 has a second in which most ranges differ by more."""
-MISFIT_GRADE, MISTAKE_S = 1.8, 50.0
-"""Grade of the noise from which a log may be written wrongly: harsh sensors have 1.4; and the time
-in which a mistake is sought, seconds."""
-MAX_COST, MISTAKE_GAIN = 0.8, 0.3
-"""Largest cost of a keyframe of a flight that fits, and reduction that shows a mistake. Sound
-flights have 0.3."""
+MISFIT_GRADE = 1.8
+"""Grade of the noise from which a log may be written wrongly: harsh sensors have 1.4."""
 SHARED_NAMES = {row.name for row in TABLE}
 """Names of the unknowns of the plain model, which both directions of a pair report."""
 MIN_CAMERA_S = 3.0
@@ -80,55 +77,48 @@ def estimate_pairs(
     plain
         Without error models beyond the plain one, as `dmrl calibrate` pools flights.
     """
-    out = []
-    for logged in pairs:
-        pair = drop_contradictions(drop_held_ranges(logged))
-        pieces = list(_solve_pieces(pair, noise, plain=plain))
-        gaps = find_dropouts(logged, pair)
-        mistake = None if plain or noise else find_mistake(pair, pieces)
-        if mistake is not None:
-            pair = mistake[0].apply(pair, mistake[1])
-            pieces = list(_solve_pieces(pair, noise, plain=plain))
-            span = float(pair.time_s[0]), float(pair.time_s[-1])
-            gaps = (*gaps, Cause(mistake[0].name, 1.0, *span, mistake[1]))
-        found = _both_directions(pair, pieces, gate)
-        if mistake is not None and mistake[0].heading_is_open:
-            side = mistake[1]
-            blind = np.full(len(found[side].time_s), UNCONVERGED, np.int8)
-            left = replace(found[side], status=np.maximum(found[side].status, blind))
-            found = (left, found[1]) if side == 0 else (found[0], left)
-        out.append(
-            (
-                replace(found[0], causes=(*gaps, *found[0].causes)),
-                replace(found[1], causes=(*(c.seen_from_peer() for c in gaps), *found[1].causes)),
-            )
-        )
-    return out
+    return [_estimate_pair(pair, noise, gate, plain=plain) for pair in pairs]
 
 
-def find_mistake(pair: Pair, pieces: Sequence["Piece"]) -> tuple[Mistake, int] | None:
-    """Find the discrete mistake without which a flight fits; None if it fits as it is.
+def _estimate_pair(
+    logged: Pair, noise: NoiseModel | None, gate: Gate, *, plain: bool
+) -> tuple[Estimate, Estimate]:
+    """Estimate both directions of a pair, with a discrete mistake of its logs corrected."""
+    logged, blind, shift_s = drop_held_ranges(logged), None, 0.0
+    mistakes: tuple[Cause, ...] = ()
+    pair = drop_contradictions(logged)
+    possible = not ranges_are_far(pair)
+    pieces = list(_solve_pieces(pair, noise, plain=plain)) if possible else []
+    searched = not plain and noise is None and not _explains(pieces)
+    if searched and (found := find_mistake(logged)) is not None:
+        mistake, robot = found
+        logged, shift_s = mistake.correct(logged, robot), mistake.shift_s
+        pair, pieces = drop_contradictions(logged), []
+        mistakes = (Cause(mistake.name, 1.0, float(pair.time_s[0]), float(pair.time_s[-1]), robot),)
+        blind = robot if mistake.heading_is_open else None
+    pieces = pieces or list(_solve_pieces(pair, noise, plain=plain))
+    gaps = (*mistakes, *find_dropouts(logged, pair))
+    own, peer = (
+        replace(one, status=np.maximum(one.status, np.int8(UNCONVERGED * (side == blind))))
+        for side, one in enumerate(_both_directions(pair, pieces, gate))
+    )
+    return (
+        replace(own, causes=(*gaps, *own.causes)),
+        replace(
+            peer,
+            # The second robot's positions and images have the times of its own clock.
+            time_s=peer.time_s - shift_s,
+            causes=(*(cause.seen_from_peer() for cause in gaps), *peer.causes),
+        ),
+    )
 
-    Parameters
-    ----------
-    pair
-        Sensor data of both robots.
-    pieces
-        Its estimate.
-    """
-    if max(piece.estimate.noise.grade for piece in pieces) < MISFIT_GRADE:
-        return None
-    part = pair.crop(pair.time_s[0], pair.time_s[0] + MISTAKE_S)
 
-    def search(tried: Pair) -> float:
-        problem = build_problem({(0, 1): drop_contradictions(tried)})
-        return find_modes(problem)[0].cost / len(problem.keyframe_s)
-
-    choices = [(mistake, robot) for mistake in MISTAKES for robot in (0, 1)]
-    costs = [search(mistake.apply(part, robot)) for mistake, robot in choices]
-    best = int(np.argmin(costs))
-    as_logged = search(part)
-    return choices[best] if costs[best] < min(MAX_COST, as_logged - MISTAKE_GAIN) else None
+def _explains(pieces: Sequence["Piece"]) -> bool:
+    """Return whether some error model explains most of a flight."""
+    if not pieces or max(piece.estimate.noise.grade for piece in pieces) >= MISFIT_GRADE:
+        return False
+    refused = np.concatenate([one.silent | list_refused(one.estimate) for one in pieces])
+    return bool(refused.mean() <= MAJORITY_SHARE)
 
 
 class Piece(NamedTuple):
@@ -152,7 +142,8 @@ def _solve_pieces(pair: Pair, noise: NoiseModel | None, *, plain: bool) -> Itera
         part = pair.crop(window.start_s, window.end_s)
         solution = solve_pair(build_problem({(0, 1): part}), noise, carried, plain=plain)
         times = output_times(pair.time_s[0], window.from_s, window.until_s)
-        yield _to_piece(solution, part, times)
+        piece = _to_piece(solution, part, times)
+        yield piece if plain or noise else _with_fit(piece, solution)
         if not window.is_last:
             carried = carry_information(solution.solver, solution.values, window.next_s)
 
@@ -187,6 +178,15 @@ def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
     step = np.clip(np.searchsorted(key_s, time_s, "right") - 1, 0, len(key_s) - 2)
     silent = odometry_dropout(pair, time_s) | find_contradicted_steps(problem, values)[step]
     return Piece(estimate, silent, list_sighted(solution, time_s), motion_energy(problem, values))
+
+
+def _with_fit(piece: Piece, solution: PairSolution) -> Piece:
+    """Return the estimate of a window with its goodness of fit."""
+    estimate = piece.estimate
+    ends = float(estimate.time_s[0]), float(estimate.time_s[-1])
+    innovations, misfits = check_fit(solution.solver, solution.values, ends)
+    causes = (*estimate.causes, *misfits)
+    return piece._replace(estimate=replace(estimate, causes=causes, innovations=innovations))
 
 
 def find_contradicted_steps(problem: Problem, values: Values) -> Mask:
@@ -254,12 +254,14 @@ def estimate_ekf(pairs: list[Pair], preset: str, *, gate: Gate = DEFAULT_GATE) -
     gate
         As in `estimate_pairs`.
     """
+    from dmrl.estimation.filters import ekf  # noqa: PLC0415 - filterpy takes 0.8 cpu-s to import
+
     out = []
     for pair in pairs:
         steps = ekf.build_steps(pair, ekf.PRESETS[preset])
-        state, spread = ekf.filter_many(steps, ekf.PRESETS[preset])
+        state, spread = ekf.filter_pair(steps, ekf.PRESETS[preset])
         none, constants = np.zeros(len(state), np.int8), np.zeros(len(PAIR_LAYOUT.constants))
-        made = Estimate(pair.time_s, state[:, 0], spread[:, 0], none, constants, NoiseModel())
+        made = Estimate(pair.time_s, state, spread, none, constants, NoiseModel())
         status = classify_positions(made.state, made.covariance, gate)
         out.append(replace(made, status=status))
     return out

@@ -113,7 +113,7 @@ class Pair:
     ------
     ValueError
         If a value is not finite, a length is wrong, a time decreases or leaves the grid, or a range
-        is not in (0, 60] m. Use ``usable_ranges`` and ``resample`` first.
+        is not positive. Use ``usable_ranges`` and ``resample`` first.
     """
 
     time_s: Array
@@ -142,10 +142,9 @@ class Pair:
     def _check_ranges(self) -> None:
         if len(self.range_time_s) != len(self.range_m):
             raise ValueError("range_time_s: pass as many range times as ranges")
-        if not usable_ranges(self.range_time_s, self.range_m).all():
+        if not usable_ranges(self.range_time_s, self.range_m, np.inf).all():
             raise ValueError(
-                "range_m: ranges are not finite, in (0, 60] m and in time order. "
-                "Use `usable_ranges`"
+                "range_m: ranges are not finite, positive and in time order. Use `usable_ranges`"
             )
         outside = (self.range_time_s < self.time_s[0]) | (self.range_time_s > self.time_s[-1])
         if outside.any():
@@ -181,8 +180,8 @@ class Pair:
         return Pair(time_s, *tracks, *ranges, own, peer, self.known_std, sender)
 
 
-def usable_ranges(time_s: Array, range_m: Array) -> Mask:
-    """Return (R,) whether ranges are finite, in (0, 60] m, and in time order.
+def usable_ranges(time_s: Array, range_m: Array, longest_m: float = MAX_RANGE_M) -> Mask:
+    """Return (R,) whether ranges are finite, positive, not too long, and in time order.
 
     Parameters
     ----------
@@ -190,9 +189,11 @@ def usable_ranges(time_s: Array, range_m: Array) -> Mask:
         (R,) times in the order of arrival, seconds.
     range_m
         (R,) measured distances, metres.
+    longest_m
+        Longest plausible range, metres.
     """
     latest = np.fmax.accumulate(np.concatenate([[-np.inf], time_s]))[:-1]
-    good = np.isfinite(range_m) & (range_m > 0) & (range_m <= MAX_RANGE_M)
+    good = np.isfinite(range_m) & (range_m > 0) & (range_m <= longest_m)
     return np.asarray(good & (time_s >= latest))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import median_filter
 
-from dmrl.estimation.model.pair import Array
+from dmrl.estimation.model.pair import Array, Mask
 
 MIN_OFFSET_SHARE = 0.5
 """After a jump down, an offset below this share of the jump counts as zero. No record of how the
@@ -59,7 +59,7 @@ def step_offsets(
     change[:reach], change[-reach:] = 0.0, 0.0
     jumps = []
     plain = np.abs(change + reach * trend) - np.broadcast_to(moved, values.shape)[1:]
-    for first, last in _find_runs((np.abs(change) > may) & (plain > least / 4)):
+    for first, last in find_runs((np.abs(change) > may) & (plain > least / 4)):
         jump = float(change[first + int(np.argmax(np.abs(change[first:last])))])
         jumps.append((first + int(np.argmax(np.sign(jump) * single[first:last])) + 1, jump))
     return _offsets_between_jumps(jumps, len(values), round(MAX_OFFSET_S / step_s))
@@ -115,7 +115,7 @@ def find_held(values: Array) -> Array:
     return np.zeros(len(values), bool) if coarse else same
 
 
-def _find_runs(marked: Array) -> list[tuple[int, int]]:
+def find_runs(marked: Mask) -> list[tuple[int, int]]:
     """Return start and end (exclusive) of each run of marked samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(int), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -23,6 +23,8 @@ REASONS = {
     "imprecise": "positions are imprecise",
 }
 """Names of the reasons why no position of a flight is OK."""
+MISFIT = "does not fit"
+"""End of the name of a cause that refuses its stretch: a signal that no error model explains."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +49,39 @@ class Cause:
     to_s: float
     robot: int | None = None
 
+    @property
+    def refuses(self) -> bool:
+        """Whether no position of its stretch may be OK."""
+        return self.name.endswith(MISFIT)
+
     def seen_from_peer(self) -> "Cause":
         """Return the cause with observer and peer exchanged."""
+        return self if self.robot is None else replace(self, robot=1 - self.robot)
+
+
+@dataclass(frozen=True, slots=True)
+class Innovation:
+    """Size of what a signal shows beyond the model, over windows.
+
+    Parameters
+    ----------
+    signal
+        range, flow, yaw rate, bearing or height.
+    time_s
+        (W,) middles of the windows, seconds.
+    size
+        (W,) roots of chi-square over its degrees of freedom; about 1 if the model is true.
+    robot
+        0: the observer's sensor, 1: the peer's. None: the pair's.
+    """
+
+    signal: str
+    time_s: Array
+    size: Array
+    robot: int | None = None
+
+    def seen_from_peer(self) -> "Innovation":
+        """Return the innovation with observer and peer exchanged."""
         return self if self.robot is None else replace(self, robot=1 - self.robot)
 
 
@@ -84,6 +117,8 @@ class Estimate:
         Number of solutions of nearly equal probability that the covariance contains.
     causes
         Errors of sensors that the flight shows, and a reason if no position is OK.
+    innovations
+        What every signal shows beyond the model.
     """
 
     time_s: Array
@@ -99,6 +134,7 @@ class Estimate:
     constants_covariance: Array | None = None
     modes: int = 1
     causes: tuple[Cause, ...] = ()
+    innovations: tuple[Innovation, ...] = ()
 
     def value(self, name: str, *robots: int) -> float:
         """Return a constant of the flight by name and robots (0: observer, 1: peer)."""
@@ -143,5 +179,6 @@ def seen_from_peer(estimate: Estimate) -> Estimate:
         constants=from_peer(estimate.layout, estimate.constants),
         constants_covariance=None,
         causes=tuple(cause.seen_from_peer() for cause in estimate.causes),
+        innovations=tuple(one.seen_from_peer() for one in estimate.innovations),
         height_m=None if estimate.height_m is None else -estimate.height_m,
     )

@@ -1,4 +1,4 @@
-"""Select the noise grade and the range model of a flight by evidence."""
+"""Select the noise grade of a flight by evidence."""
 
 from dataclasses import replace
 
@@ -9,7 +9,6 @@ from dmrl.estimation.solver.keyframes import average_ranges
 from dmrl.estimation.solver.levenberg_marquardt import ROUGH_TOLERANCE, MapEstimate, Solver
 from dmrl.estimation.solver.problem import NoiseModel, Problem
 from dmrl.estimation.solver.residuals import Values, range_factor
-from dmrl.estimation.solver.unknowns import RANGE_MODELS, with_rows
 
 GRADES = (0.4, 0.55, 0.75, 1.0, 1.4, 2.0, 2.8)
 """Grades of the velocity noise that are compared, in steps of a third. The first is a tenth better
@@ -26,15 +25,13 @@ losses, as the costs of modes do."""
 MIN_CONSTANTS_GRADE = 0.8
 """Smallest grade of the priors of constants. A flight shows a constant scale once at most, and real
 flow with little noise was measured 7 % off."""
-FADING_MARGIN = 15.0
-"""Log evidence that range errors that fade must gain, as clean ranges show some."""
 RANGE_AVERAGING_S, MIN_AVERAGED_RANGES, HALF_WEIGHT_SIGMAS = 1.0, 4, 2.0
 """Averaging of range residuals: time, seconds; fewest ranges; residual with half weight, in sigmas,
 so that outliers on one side do not look like correlated noise."""
 
 
-def select_model(problem: Problem, start: Values) -> tuple[Problem, MapEstimate]:
-    """Return the flight with the selected noise and table, and its solution with averaged ranges.
+def select_noise(problem: Problem, start: Values) -> tuple[Problem, MapEstimate]:
+    """Return the flight with the selected noise, and its solution with averaged ranges.
 
     Parameters
     ----------
@@ -44,21 +41,12 @@ def select_model(problem: Problem, start: Values) -> tuple[Problem, MapEstimate]
         Solution under a similar model, in the layout of the problem.
     """
     links = tuple(average_ranges(link, problem.keyframe_s) for link in problem.links)
-    short = replace(problem, links=links)
-    plain, likelihood, solution = _search_grade(short, start)
-    fading = replace(short, table=with_rows(problem.table, RANGE_MODELS["fading"]))
-    # Errors of ranges that fade look like noisy velocities, so both grades are tried.
-    for grade in {1.0, plain.noise.grade}:
-        solver = Solver(replace(fading, noise=_graded(short, grade)))
-        solved = solver.solve(solution.values, tolerance=ROUGH_TOLERANCE)
-        if solver.log_evidence(solved) > likelihood + FADING_MARGIN:
-            plain, _, solution = _search_grade(fading, solved.values)
-            break
-    return replace(problem, table=plain.table, noise=plain.noise), solution
+    grade, solution = _search_grade(replace(problem, links=links), start)
+    return replace(problem, noise=_graded(problem, grade)), solution
 
 
-def _search_grade(problem: Problem, start: Values) -> tuple[Problem, float, MapEstimate]:
-    """Return the flight at the mean grade, the best log evidence, and the best solution."""
+def _search_grade(problem: Problem, start: Values) -> tuple[float, MapEstimate]:
+    """Return the mean grade and the best solution."""
     found: dict[int, tuple[float, MapEstimate]] = {}
 
     def evaluate(number: int, values: Values) -> float:
@@ -85,8 +73,7 @@ def _search_grade(problem: Problem, start: Values) -> tuple[Problem, float, MapE
     )
     weight = np.exp(weight - weight.max())
     grade = GRADE_BIAS * float(np.sqrt((weight * np.exp(2 * log_grade)).sum() / weight.sum()))
-    likely = max(found, key=lambda n: found[n][0])
-    return replace(problem, noise=_graded(problem, grade)), *found[likely]
+    return grade, max(found.values(), key=lambda one: one[0])[1]
 
 
 def _soften(residual: Array) -> Array:

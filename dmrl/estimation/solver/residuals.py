@@ -224,19 +224,9 @@ def bearing_factor(problem: Problem, layout: Layout, view: CameraView, values: V
     states = [c for _, c, constant, _ in used if not constant]
     border = [c for _, c, constant, _ in used if constant]
     columns = one + layout.pose(view.robots[1]) + states
-    x, y = at.offset.T
-    level2 = np.maximum(x * x + y * y, 1e-6)
-    square, level = level2 + at.up**2, np.sqrt(level2)
-    heading = values.state[view.keyframe, one[2]] + view.own_turn_rad
-    polar = np.column_stack(
-        [np.arctan2(y, x) - heading, np.arctan2(at.up, level), np.log(square) / 2]
-    )
-    by_offset = np.zeros((len(x), 3, 3))
-    by_offset[:, 0, 0], by_offset[:, 0, 1] = -y / level2, x / level2
-    by_offset[:, 1, :2] = -at.offset * (at.up / (level * square))[:, None]
-    by_offset[:, 1, 2] = level / square
-    by_offset[:, 2, :2], by_offset[:, 2, 2] = at.offset / square[:, None], at.up / square
-    out = np.zeros((len(x), 3, len(columns) + len(border) + 1))
+    polar, by_offset = _to_polar(at)
+    polar[:, 0] -= values.state[view.keyframe, one[2]] + view.own_turn_rad
+    out = np.zeros((len(polar), 3, len(columns) + len(border) + 1))
     out[..., 0:2], out[..., 3:5] = -by_offset[..., :2], by_offset[..., :2]
     out[..., 2] = rotate_rows(by_offset, at.by_own_turn)
     out[..., 5] = rotate_rows(by_offset, at.by_peer_turn)
@@ -250,20 +240,52 @@ def bearing_factor(problem: Problem, layout: Layout, view: CameraView, values: V
             out[..., column] = effect
             value = values.constants[c] if constant else values.state[view.keyframe, c][:, None]
             polar = polar + effect * value
-    off = -subtract_bearings(view.bearing, polar[:, None]) / view.std
-    squared = np.where(np.isnan(off).any(axis=-1), np.inf, (off**2).sum(axis=-1))
-    nearest, images = squared.argmin(axis=1), np.arange(len(x))
-    std = view.std[images, nearest]
-    out[..., -1] = off[images, nearest]
-    out[..., :-1] /= std[..., None]
-    lost = squared.min(axis=1) > MAX_OUTLIER_SIGMAS**2 * (1 + (AZIMUTH_MARGIN_RAD / std[:, 0]) ** 2)
-    most = MAX_OUTLIER_SIGMAS * np.sqrt(1 + (AZIMUTH_MARGIN_RAD / std[:, 0]) ** 2)
-    # A lost image costs the same wherever it is.
-    out[lost], out[lost, 0, -1] = 0.0, most[lost]
+    _set_nearest(out, view, polar)
     return _pad_rows(
         out, view.keyframe, view.weight, len(values.state),
         (columns, border, problem.noise.bearing_loss),
     )  # fmt: skip
+
+
+def _to_polar(at: _Geometry) -> tuple[Array, Array]:
+    """Return (N, 3) azimuths in the flight's frame, elevations and log distances of offsets.
+
+    Also (N, 3, 3) their derivatives by the offset.
+    """
+    x, y = at.offset.T
+    level2 = np.maximum(x * x + y * y, 1e-6)
+    square, level = level2 + at.up**2, np.sqrt(level2)
+    polar = np.column_stack([np.arctan2(y, x), np.arctan2(at.up, level), np.log(square) / 2])
+    out = np.zeros((len(x), 3, 3))
+    out[:, 0, 0], out[:, 0, 1] = -y / level2, x / level2
+    out[:, 1, :2] = -at.offset * (at.up / (level * square))[:, None]
+    out[:, 1, 2] = level / square
+    out[:, 2, :2], out[:, 2, 2] = at.offset / square[:, None], at.up / square
+    return polar, out
+
+
+def _set_nearest(rows: Array, view: CameraView, polar: Array) -> None:
+    """Whiten (N, 3, w) rows by the candidate nearest to each prediction, and set its residual.
+
+    Parameters
+    ----------
+    rows
+        Derivatives; changed in place.
+    view
+        Images with candidates.
+    polar
+        (N, 3) predicted azimuth, elevation and log distance.
+    """
+    off = -subtract_bearings(view.bearing, polar[:, None]) / view.std
+    squared = np.where(np.isnan(off).any(axis=-1), np.inf, (off**2).sum(axis=-1))
+    nearest, images = squared.argmin(axis=1), np.arange(len(polar))
+    std = view.std[images, nearest]
+    rows[..., -1] = off[images, nearest]
+    rows[..., :-1] /= std[..., None]
+    spread = 1 + (AZIMUTH_MARGIN_RAD / std[:, 0]) ** 2
+    lost = squared.min(axis=1) > MAX_OUTLIER_SIGMAS**2 * spread
+    # A lost image costs the same wherever it is.
+    rows[lost], rows[lost, 0, -1] = 0.0, MAX_OUTLIER_SIGMAS * np.sqrt(spread)[lost]
 
 
 def rotate_rows(by_offset: Array, by_turn: Array) -> Array:

@@ -230,22 +230,6 @@ optical flow on small drones (docs/flights.md, preset "realistic", rounded up). 
 gyroscope or a clock is mostly good and sometimes far off, so their priors have Cauchy tails at 1.5
 to 2 sigmas. A scale keeps a Gaussian prior: otherwise it could shrink the path to nothing."""
 
-RANGE_MODELS: dict[str, Unknown] = {
-    "jump": next(row for row in TABLE if row.name == "range_error"),
-    "fading": Unknown(
-        "range_error",
-        "m",
-        0.1,
-        "pair",
-        Cauchy(5.0),
-        "fading",
-        1.0,
-        range=longer,
-    ),
-}
-"""Models of the temporary excess of ranges: jumps behind an obstacle, or reflections that fade in a
-second. Each is one row; `noise_selection` compares their evidence."""
-
 YAW_RATE_ERROR = Unknown(
     "yaw_rate_error",
     "rad/s",

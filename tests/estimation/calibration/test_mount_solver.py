@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from dmrl.estimation.calibration import mount_solver
 from dmrl.estimation.calibration.extrinsics import (
@@ -27,9 +28,8 @@ from dmrl.estimation.calibration.mount_solver import (
     _error_axes,
     _linearize_paths,
     _markov_information,
-    _Nuisance,
-    _remaining_residuals,
     _solve_step,
+    _stack_errors,
     pixel_jacobian,
     solve_mount,
 )
@@ -143,43 +143,35 @@ def test_path_error_is_linear_between_knots() -> None:
 def test_gauss_newton_step_equals_dense_solve(held: bool) -> None:
     rng = np.random.default_rng(4)
     paths = _linearize_paths(VIEWS, TRUE, MATCHED, VALUES)
-    starts = [0.3 * rng.normal(size=path.prior.shape[0]) for path in paths]
-    errors = _Nuisance(list(starts), 0.01 * rng.normal(size=(2, 2)))
-    levels = errors.levels.copy()
-    apart = pixel_residuals(VIEWS, TRUE, MATCHED, VALUES)
-    slopes = pixel_jacobian(VIEWS, TRUE, MATCHED, VALUES)
-    if held:
-        slopes[:, :, 3] = 0
     weight = 1 / (CONSTANT_TILT_SHARE * NOISE.attitude_std_rad) ** 2
-    sizes = [len(one) for one in starts]
+    shown, prior = _stack_errors(paths, weight)
+    sizes = [path.prior.shape[0] for path in paths]
     count = 4 + sum(sizes) + 4
-    normal, right = np.zeros((count, count)), np.zeros(count)
-    normal[3, 3] = WEAK_INFORMATION
-    left = _remaining_residuals(paths, errors, apart)
+    dense, information = np.zeros((2 * len(MATCHED.uv), count - 4)), np.zeros((count - 4,) * 2)
     for k, path in enumerate(paths):
-        own = slice(4 + sum(sizes[:k]), 4 + sum(sizes[: k + 1]))
-        tilt = slice(count - 4 + 2 * k, count - 2 + 2 * k)
-        design = np.zeros((2 * len(path.rows), count))
-        design[:, :4] = slopes[path.rows].reshape(-1, 4)
-        design[:, own], design[:, tilt] = path.errors.toarray(), path.level
-        explained = path.errors @ starts[k] + path.level @ levels[k]
-        assert left[path.rows].ravel() == pytest.approx(apart[path.rows].ravel() - explained)
-        far = (left[path.rows] ** 2).sum(axis=1) / (CAUCHY_SIGMAS * 3.0) ** 2
-        counts = np.repeat(1 / (9.0 * (1 + far)), 2)
-        normal += design.T @ (counts[:, None] * design)
-        right += design.T @ (counts * left[path.rows].ravel())
-        normal[own, own] += path.prior.toarray()
-        right[own] -= path.prior.toarray() @ starts[k]
-        normal[tilt, tilt] += weight * np.eye(2)
-        right[tilt] -= weight * levels[k]
-    wanted = np.linalg.solve(normal, right)
-    information, step = _solve_step(paths, errors, weight, apart, slopes, 3.0)
-    assert step == pytest.approx(wanted[:4], rel=1e-6, abs=1e-9)
-    assert np.linalg.inv(information) == pytest.approx(np.linalg.inv(normal)[:4, :4], rel=1e-5)
-    for k, own in enumerate(starts):
-        begin = 4 + sum(sizes[:k])
-        assert errors.paths[k] - own == pytest.approx(wanted[begin : begin + sizes[k]], abs=1e-7)
-    assert (errors.levels - levels).ravel() == pytest.approx(wanted[-4:], abs=1e-8)
+        own = slice(sum(sizes[:k]), sum(sizes[: k + 1]))
+        tilt = slice(count - 8 + 2 * k, count - 6 + 2 * k)
+        rows = np.ravel(2 * path.rows[:, None] + [0, 1])
+        dense[rows, own], dense[rows, tilt] = path.errors.toarray(), path.level
+        information[own, own], information[tilt, tilt] = path.prior.toarray(), weight * np.eye(2)
+    assert shown.toarray() == pytest.approx(dense)
+    assert prior.toarray() == pytest.approx(information)
+    errors = 0.1 * rng.normal(size=count - 4)
+    slopes = pixel_jacobian(VIEWS, TRUE, MATCHED, VALUES).reshape(-1, 4)
+    if held:
+        slopes[:, 3] = 0
+    left = pixel_residuals(VIEWS, TRUE, MATCHED, VALUES).ravel() - dense @ errors
+    design = np.hstack([slopes, dense])
+    far = (left.reshape(-1, 2) ** 2).sum(axis=1) / (CAUCHY_SIGMAS * 3.0) ** 2
+    counts = np.repeat(1 / (9.0 * (1 + far)), 2)
+    normal = design.T @ (counts[:, None] * design)
+    normal[3, 3] += WEAK_INFORMATION
+    normal[4:, 4:] += information
+    right = design.T @ (counts * left)
+    right[4:] -= information @ errors
+    covariance, step = _solve_step(csr_array(design), prior, errors, left, 3.0)
+    assert step == pytest.approx(np.linalg.solve(normal, right), rel=1e-6, abs=1e-8)
+    assert covariance == pytest.approx(np.linalg.inv(normal)[:4, :4], rel=1e-5)
 
 
 def test_cauchy_cost_is_quadratic_then_logarithmic() -> None:

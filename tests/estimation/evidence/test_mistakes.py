@@ -3,7 +3,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.evidence.mistakes import MISTAKES
+from dmrl.estimation.evidence.mistakes import (
+    MISTAKES,
+    Mistake,
+    compute_misfit,
+    find_mistake,
+    move_clock,
+    ranges_are_far,
+)
+from dmrl.estimation.model.pair import Pair
 
 from ..flights import flown, pair_of
 
@@ -13,7 +21,7 @@ BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
 def test_sign_correction_applies_to_one_robot() -> None:
     pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
     wrong = replace(pair, peer=replace(pair.peer, yaw_rate_radps=-pair.peer.yaw_rate_radps))
-    again = BY_NAME["yaw rate fits if it is negated"].apply(wrong, 1)
+    again = BY_NAME["yaw rate fits if it is negated"].correct(wrong, 1)
     assert np.array_equal(again.peer.yaw_rate_radps, pair.peer.yaw_rate_radps)
     assert again.own is pair.own
 
@@ -29,6 +37,80 @@ def test_velocities_in_the_take_off_frame_are_rotated_back() -> None:
     )
     mistake = BY_NAME["flow fits in the world frame"]
     assert mistake.heading_is_open
-    again = mistake.apply(replace(pair, peer=turned), 1)
+    again = mistake.correct(replace(pair, peer=turned), 1)
     assert again.peer.vx_mps == pytest.approx(x)
     assert again.peer.vy_mps == pytest.approx(y)
+
+
+def both_ranging(length_s: float) -> Pair:
+    """A pair of which each robot ranges."""
+    flight = flown("in_view", "calibrated", 1000, length_s)
+    pair, other = pair_of(flight), flight.ranges["cf2", "cf1"]
+    time_s = np.concatenate([pair.range_time_s, other.time_s])
+    order = np.argsort(time_s, kind="stable")
+    order = order[(time_s[order] >= pair.time_s[0]) & (time_s[order] <= pair.time_s[-1])]
+    sender = np.repeat([0, 1], [len(pair.range_m), len(other.range_m)]).astype(np.int8)
+    range_m = np.concatenate([pair.range_m, other.range_m])
+    return replace(
+        pair, range_time_s=time_s[order], range_m=range_m[order], range_sender=sender[order]
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "names", "factor"),
+    [
+        ("flow fits if it is divided by 100", ("vx_mps", "vy_mps"), 100.0),
+        ("flow fits if it is divided by 1000", ("vx_mps", "vy_mps"), 1000.0),
+        ("flow fits if it is taken as feet", ("vx_mps", "vy_mps"), 1 / 0.3048),
+        ("height fits if it is divided by 100", ("height_m",), 100.0),
+        ("yaw rate fits if it is taken as degrees", ("yaw_rate_radps",), 180 / np.pi),
+    ],
+)
+def test_a_unit_of_a_robot_is_corrected(name: str, names: tuple[str, ...], factor: float) -> None:
+    pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
+    wrong = {key: factor * getattr(pair.peer, key) for key in names}
+    mistake = BY_NAME[name]
+    given = replace(pair, peer=replace(pair.peer, **wrong))
+    again = mistake.correct(given, 1)
+    for key in names:
+        assert getattr(again.peer, key) == pytest.approx(getattr(pair.peer, key))
+    if mistake.applies is not None:
+        assert mistake.applies(given, 1)
+        assert not mistake.applies(pair, 1) and not mistake.applies(given, 0)
+
+
+def test_ranges_in_centimetres_are_corrected_and_fill_values_left_out() -> None:
+    pair = both_ranging(20.0)
+    fill = np.arange(len(pair.range_m)) == 3
+    wrong = replace(pair, range_m=np.where(fill, 65535.0, 100 * pair.range_m))
+    assert ranges_are_far(wrong) and not ranges_are_far(pair)
+    again = BY_NAME["range fits if it is divided by 100"].correct(wrong, None)
+    assert again.range_m == pytest.approx(pair.range_m[~fill])
+    assert again.range_sender is not None and len(again.range_sender) == len(again.range_m)
+
+
+def test_a_clock_moves_with_all_that_it_stamps() -> None:
+    pair = both_ranging(20.0)
+    moved = move_clock(pair, 2.0)
+    at = slice(300, 1500)
+    assert moved.peer.vx_mps[500:1700] == pytest.approx(pair.peer.vx_mps[at])
+    assert moved.peer.dropout[:190].all() and moved.own is pair.own
+    assert moved.range_sender is not None and pair.range_sender is not None
+    for robot, shift_s in ((0, 0.0), (1, 2.0)):
+        before = pair.range_m[pair.range_sender == robot]
+        after = moved.range_m[moved.range_sender == robot]
+        assert after.tolist() == before[: len(after)].tolist()
+        first = moved.range_time_s[moved.range_sender == robot][0]
+        assert first - pair.range_time_s[pair.range_sender == robot][0] == pytest.approx(shift_s)
+
+
+@pytest.mark.heavy
+def test_a_clock_that_is_seconds_off_is_found_by_the_ranges_of_both() -> None:
+    late = move_clock(both_ranging(60.0), 3.2)
+    found = find_mistake(late)
+    assert found is not None
+    mistake, robot = found
+    assert mistake.name.startswith("clock fits if it is moved by -3.2") and robot == 1
+    assert mistake.shift_s == pytest.approx(-3.2, abs=0.05)
+    assert isinstance(mistake, Mistake)
+    assert compute_misfit(mistake.correct(late, robot)) < 0.6

@@ -6,13 +6,11 @@ from dmrl.estimation.filters.ekf import (
     PRESETS,
     Steps,
     build_steps,
-    filter_many,
+    filter_pair,
     input_variance,
     predict_range,
     propagate_state,
-    stack_pairs,
 )
-from dmrl.estimation.filters.filterpy_ekf import filter_reference
 from dmrl.estimation.model.pair import Pair, SensorTrack
 
 from ..flights import flown, pair_of
@@ -22,47 +20,49 @@ def steps_of(seed: int, preset: str) -> Steps:
     return build_steps(pair_of(flown("in_view", "realistic", seed, 8.0)), PRESETS[preset])
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_vectorized_ekf_equals_filterpy(preset: str) -> None:
-    flights = [steps_of(seed, preset) for seed in (1000, 1001)]
-    state, covariance = filter_many(stack_pairs(flights), PRESETS[preset])
-    for k, steps in enumerate(flights):
-        reference, reference_covariance = filter_reference(steps, PRESETS[preset])
-        assert np.abs(state[:, k] - reference).max() < 1e-9
-        scale = np.abs(reference_covariance).max()
-        assert np.abs(covariance[:, k] - reference_covariance).max() < 1e-9 * max(scale, 1.0)
-
-
 def test_filterpy_needs_a_one_dimensional_state() -> None:
     ekf = ExtendedKalmanFilter(dim_x=3, dim_z=1)
     assert ekf.x.shape == (3, 1)  # the default, with which a flat gain broadcasts to (3, 3)
-    state, _ = filter_reference(steps_of(1000, "published-sim"), PRESETS["published-sim"])
+    state, _ = filter_pair(steps_of(1000, "published-sim"), PRESETS["published-sim"])
     assert state.shape[1:] == (3,)
+
+
+def test_a_range_is_an_update_after_the_prediction() -> None:
+    preset = PRESETS["published-sim"]
+    steps = Steps(np.ones((1, 6)), np.zeros(1), np.array([0.5]), 0.1)
+    state, covariance = filter_pair(steps, preset)
+    ahead, by_state, by_input = propagate_state(np.zeros(3), steps.inputs[0], 0.1)
+    prior = by_state @ np.diag(preset.initial_var) @ by_state.T
+    prior += by_input @ input_variance(preset) @ by_input.T
+    expected, row = predict_range(ahead, 0.0)
+    gain = prior @ row.T / (row @ prior @ row.T + preset.range_std_m**2)
+    assert state[0] == pytest.approx(ahead + gain @ (0.5 - expected))
+    assert covariance[0] == pytest.approx((np.eye(3) - gain @ row) @ prior)
 
 
 def test_the_published_filter_starts_at_zero_and_first_predicts() -> None:
     steps = steps_of(1000, "published-sim")
     silent = Steps(steps.inputs, steps.height_m, steps.range_m * np.nan, steps.dt_s)
-    state, _ = filter_many(silent, PRESETS["published-sim"])
-    expected, _, _ = propagate_state(np.zeros((1, 3)), steps.inputs[0], steps.dt_s)
+    state, _ = filter_pair(silent, PRESETS["published-sim"])
+    expected, _, _ = propagate_state(np.zeros(3), steps.inputs[0], steps.dt_s)
     assert np.allclose(state[0], expected)
 
 
 def test_the_jacobians_are_those_of_finite_differences() -> None:
     rng = np.random.default_rng(0)
-    state, inputs, step = rng.normal(size=(5, 3)), rng.normal(size=(5, 6)), 1e-6
-    _, by_state, by_input = propagate_state(state, inputs, 0.01)
-    for column in range(3):
-        change = step * np.eye(3)[column]
-        ahead, behind = (propagate_state(state + s * change, inputs, 0.01)[0] for s in (1, -1))
-        assert np.allclose((ahead - behind) / (2 * step), by_state[:, :, column], atol=1e-8)
-        ahead, behind = (predict_range(state + s * change, np.ones(5))[0] for s in (1, -1))
-        row = predict_range(state, np.ones(5))[1][:, column]
-        assert np.allclose((ahead - behind) / (2 * step), row, atol=1e-3)
-    for column in range(6):
-        change = step * np.eye(6)[column]
-        ahead, behind = (propagate_state(state, inputs + s * change, 0.01)[0] for s in (1, -1))
-        assert np.allclose((ahead - behind) / (2 * step), by_input[:, :, column], atol=1e-8)
+    step = 1e-6
+    for _ in range(5):
+        state, inputs = rng.normal(size=3), rng.normal(size=6)
+        _, by_state, by_input = propagate_state(state, inputs, 0.01)
+        for column, change in enumerate(step * np.eye(3)):
+            ahead, behind = (propagate_state(state + s * change, inputs, 0.01)[0] for s in (1, -1))
+            assert np.allclose((ahead - behind) / (2 * step), by_state[:, column], atol=1e-8)
+            ahead, behind = (predict_range(state + s * change, 1.0)[0] for s in (1, -1))
+            row = predict_range(state, 1.0)[1][:, column]
+            assert np.allclose((ahead - behind) / (2 * step), row, atol=1e-3)
+        for column, change in enumerate(step * np.eye(6)):
+            ahead, behind = (propagate_state(state, inputs + s * change, 0.01)[0] for s in (1, -1))
+            assert np.allclose((ahead - behind) / (2 * step), by_input[:, column], atol=1e-8)
 
 
 def test_the_simulation_preset_ignores_heights() -> None:
@@ -71,10 +71,10 @@ def test_the_simulation_preset_ignores_heights() -> None:
 
 
 def test_predicted_range_is_three_dimensional() -> None:
-    states = np.array([[3.0, 4.0, 0.7], [0.0, 0.0, 0.1]])
-    range_m, by_state = predict_range(states, np.array([12.0, -2.0]))
-    assert range_m == pytest.approx([13.0, 2.0], abs=1e-3)
+    range_m, by_state = predict_range(np.array([3.0, 4.0, 0.7]), 12.0)
+    assert range_m == pytest.approx([13.0], abs=1e-3)
     assert by_state[0] == pytest.approx([3 / 13, 4 / 13, 0.0], abs=1e-3)
+    assert predict_range(np.array([0.0, 0.0, 0.1]), -2.0)[0] == pytest.approx([2.0], abs=1e-3)
 
 
 def test_ekf_steps_hold_inputs_and_ranges_go_to_the_nearest_step() -> None:
@@ -86,15 +86,13 @@ def test_ekf_steps_hold_inputs_and_ranges_go_to_the_nearest_step() -> None:
     pair = Pair(time_s, own, peer, np.array([7.004, 7.006, 7.012, 7.49]), np.array([1.0, 2, 3, 4]))
     steps = build_steps(pair, PRESETS["published-firmware"])
     assert steps.dt_s == pytest.approx(0.01)
-    assert steps.height_m[:, 0] == pytest.approx(peer.height_m - own.height_m)
+    assert steps.height_m == pytest.approx(peer.height_m - own.height_m)
     columns = [peer.vx_mps, peer.vy_mps, peer.yaw_rate_radps]
     columns += [own.vx_mps, own.vy_mps, own.yaw_rate_radps]
-    assert steps.inputs[:, 0] == pytest.approx(np.column_stack(columns))
+    assert steps.inputs == pytest.approx(np.column_stack(columns))
     heard = {0: 1.0, 1: 3.0, 49: 4.0}  # of two of one step the last
-    for k, range_m in enumerate(steps.range_m[:, 0]):
+    for k, range_m in enumerate(steps.range_m):
         assert range_m == heard[k] if k in heard else np.isnan(range_m)
-    twice = stack_pairs([steps, steps])
-    assert twice.inputs.shape == (50, 2, 6) and twice.range_m.shape == (50, 2)
 
 
 def test_input_covariance_has_velocity_and_yaw_rate_variances() -> None:

@@ -1,0 +1,116 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.evidence.causes import join_causes, join_innovations
+from dmrl.estimation.evidence.goodness_of_fit import (
+    WINDOW_S,
+    SignalScores,
+    check_fit,
+    compute_scores,
+)
+from dmrl.estimation.flight.pair_output import with_status
+from dmrl.estimation.flight.pair_solver import solve_pair
+from dmrl.estimation.model.gate import DEFAULT_GATE
+from dmrl.estimation.model.pair import Array, Pair
+from dmrl.estimation.model.status import OK, UNCONVERGED
+from dmrl.estimation.search.modes import convert_values
+from dmrl.estimation.solver.estimate import Cause, Estimate, Innovation
+from dmrl.estimation.solver.keyframes import build_problem
+from dmrl.estimation.solver.levenberg_marquardt import Solver
+from dmrl.estimation.solver.problem import NoiseModel, RangeLink, Sight
+from dmrl.estimation.solver.residuals import Values
+from dmrl.estimation.solver.robust_loss import Gaussian
+from dmrl.estimation.solver.unknowns import Unknown, with_rows
+
+from ..flights import flown, pair_of
+
+LENGTH_S = 30.0
+
+
+def pair() -> Pair:
+    return pair_of(flown("in_view", "calibrated", 1003, LENGTH_S))
+
+
+def solve(given: Pair) -> tuple[Solver, Values]:
+    found = solve_pair(build_problem({(0, 1): given}), NoiseModel(), plain=True)
+    return found.solver, found.values
+
+
+def test_a_sound_flight_fits() -> None:
+    innovations, causes = check_fit(*solve(pair()), (0.0, LENGTH_S))
+    assert causes == ()
+    assert {(one.signal, one.robot) for one in innovations} == {
+        ("flow", 0), ("flow", 1), ("yaw rate", 0), ("yaw rate", 1), ("range", None),
+    }  # fmt: skip
+    sizes = np.concatenate([one.size for one in innovations])
+    assert 0.3 < np.sqrt(np.nanmean(sizes**2)) < 1.2
+
+
+def test_a_stretch_of_swapped_axes_does_not_fit() -> None:
+    sound = pair()
+    at = (sound.time_s > 10) & (sound.time_s < 20)
+    y = np.where(at, sound.own.vx_mps, sound.own.vy_mps)
+    x = np.where(at, sound.own.vy_mps, sound.own.vx_mps)
+    wrong = replace(sound, own=replace(sound.own, vx_mps=x, vy_mps=y))
+    _, causes = check_fit(*solve(wrong), (0.0, LENGTH_S))
+    assert causes and all(cause.refuses and cause.probability > 0.98 for cause in causes)
+    assert any(cause.from_s < 20 and cause.to_s > 10 for cause in causes)
+
+
+def test_a_statistic_is_the_fall_of_the_cost_if_the_error_were_estimated() -> None:
+    problem = build_problem({(0, 1): pair()})
+    square = Gaussian()
+    noise = NoiseModel(range_loss=square, motion_loss=square)
+    rows = [replace(row, loss=square, pull_weight=0.0) for row in problem.table]
+    problem = replace(problem, noise=noise, table=tuple(rows))
+    start = solve(pair())[1]
+    solver = Solver(problem)
+    found = solver.solve(start, tolerance=1e-12)
+    scores = {one.signal: one for one in compute_scores(solver, found.values)}["range"]
+    window = 5
+    keyframes = (problem.keyframe_s - problem.keyframe_s[0]) // WINDOW_S == window
+
+    def bump(link: RangeLink, _sight: Sight) -> Array:
+        return problem.noise.range_std_m * link.std_share * keyframes[link.keyframe]
+
+    freed = Unknown("bump", "1", 1e3, "pair", range=bump)
+    wider = Solver(replace(problem, table=with_rows(problem.table, freed)))
+    again = convert_values(found.values, solver.layout, wider.layout)
+    fall = found.cost - wider.solve(again, tolerance=1e-12).cost
+    statistic, freedom = scores.chi_square(slice(window, window + 1))
+    assert freedom == 1
+    assert statistic == pytest.approx(2 * fall, rel=0.05)
+
+
+def test_directions_that_the_unknowns_explain_are_not_tested() -> None:
+    covariance = np.diag([1.0, 0.25, 0.0]).reshape(3, 1, 3, 1)
+    one = SignalScores("flow", 0, np.arange(3.0), np.array([[2.0], [1.0], [5.0]]), covariance)
+    assert one.chi_square(slice(0, 2)) == (pytest.approx(4 + 4), 2)
+    assert one.chi_square(slice(2, 3)) == (0.0, 0)
+    assert np.isnan(one.to_innovation().size[2])
+
+
+def test_no_position_of_a_stretch_that_does_not_fit_is_ok() -> None:
+    time_s = np.arange(0.0, 100.0)
+    state = np.tile([2.0, 0.0, 0.0], (100, 1))
+    spread = np.tile(np.diag([1e-4, 1e-4, 1e-4]), (100, 1, 1))
+    cause = Cause("range does not fit", 1.0, 40.0, 50.0)
+    none = np.zeros(100, np.int8)
+    given = Estimate(time_s, state, spread, none, np.zeros(0), NoiseModel(), causes=(cause,))
+    out = with_status(given, none.astype(bool), (9.0, 9.0), DEFAULT_GATE)
+    assert (out.status[40:51] == UNCONVERGED).all()
+    assert (out.status[[0, 20, 70, 99]] == OK).all()
+    everything = replace(given, causes=(replace(cause, from_s=0.0, to_s=99.0),))
+    refused = with_status(everything, none.astype(bool), (9.0, 9.0), DEFAULT_GATE)
+    assert (refused.status == UNCONVERGED).all() and refused.causes == everything.causes
+
+
+def test_stretches_apart_stay_apart_and_windows_of_a_flight_are_joined() -> None:
+    one, two = Cause("range does not fit", 1.0, 0.0, 5.0), Cause("range does not fit", 1.0, 40, 50)
+    assert join_causes([two, one]) == (one, two)
+    first = Innovation("flow", np.array([1.0]), np.array([2.0]), 1)
+    (joined,) = join_innovations([[first], [replace(first, time_s=np.array([3.0]))]])
+    assert joined.time_s.tolist() == [1.0, 3.0] and joined.robot == 1
+    assert joined.seen_from_peer().robot == 0
