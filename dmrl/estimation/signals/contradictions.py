@@ -8,7 +8,7 @@ away. No speed is impossible by itself, so fast flights are not affected.
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import binary_dilation, median_filter
+from scipy.ndimage import binary_dilation, median_filter, uniform_filter1d
 
 from dmrl.estimation.model.odometry import preintegrate
 from dmrl.estimation.model.pair import GRID_RATE_HZ, MAX_DROPOUT_S, Array, Mask, Pair, SensorTrack
@@ -24,6 +24,11 @@ RANGE_MEDIAN = 21
 """Number of ranges in the median that a contradiction uses: twice the outliers in a row."""
 SURROUNDING_S = 1.0
 """Time around a contradiction that is dropped too, seconds: it may belong to the fall."""
+
+
+MAX_ACCELERATION_MPS2 = 30.0
+"""Largest sideways acceleration that a log shows over `WINDOWS_S[0]`, m/s^2: three times gravity.
+Small drones lift twice their weight. A crashed robot's log spins at 110 m/s^2."""
 
 
 def drop_held_ranges(pair: Pair) -> Pair:
@@ -83,7 +88,7 @@ def find_contradictions(pair: Pair, distance: Array) -> tuple[Mask, Mask]:
     """
     paths = [preintegrate(track, pair.time_s).position_m for track in (pair.own, pair.peer)]
     speeds = [np.hypot(track.vx_mps, track.vy_mps) for track in (pair.own, pair.peer)]
-    wrong = np.zeros((2, len(pair.time_s)), bool)
+    wrong = np.stack([_find_spins(track) for track in (pair.own, pair.peer)])
     for window_s in WINDOWS_S:
         reach = round(window_s * GRID_RATE_HZ)
         if reach >= len(pair.time_s):
@@ -98,6 +103,16 @@ def find_contradictions(pair: Pair, distance: Array) -> tuple[Mask, Mask]:
     around = np.ones(2 * round(SURROUNDING_S * GRID_RATE_HZ) + 1, bool)
     own, peer = (binary_dilation(w, around) if w.any() else w for w in wrong)
     return own, peer
+
+
+def _find_spins(track: SensorTrack) -> Mask:
+    """Return (K,) where a log turns faster than its speed allows: it contradicts itself.
+
+    A spin goes round in circles, so its displacement does not contradict the ranges.
+    """
+    sideways = np.hypot(track.vx_mps, track.vy_mps) * np.abs(track.yaw_rate_radps)
+    size = round(WINDOWS_S[0] * GRID_RATE_HZ)
+    return np.asarray(uniform_filter1d(sideways, size) > MAX_ACCELERATION_MPS2)
 
 
 def _drop_odometry(track: SensorTrack, wrong: Mask, time_s: Array) -> SensorTrack:

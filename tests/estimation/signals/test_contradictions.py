@@ -39,6 +39,16 @@ def test_log_of_a_crashed_robot_becomes_motionless_on_the_floor(robot: str) -> N
     assert not other.dropout.any() and (other.height_m == 1.0).all()
 
 
+def test_log_that_spins_faster_than_its_speed_allows_is_a_crash() -> None:
+    """9 m/s at 12 rad/s goes round in 0.75 m, so its displacement fits the ranges."""
+    late = GRID_S > 16
+    spinning = replace(track(9.0 * late), yaw_rate_radps=0.1 + 11.9 * late)
+    found = drop_contradictions(pair(spinning, track()))
+    assert found.own.dropout[GRID_S > 16.5].all() and not found.own.dropout[GRID_S < 14].any()
+    turning = replace(track(4.0), yaw_rate_radps=np.full(len(GRID_S), 3.5))
+    assert not drop_contradictions(pair(turning, track())).own.dropout.any()
+
+
 def test_an_estimate_that_comes_back_is_no_crash() -> None:
     found = drop_contradictions(pair(track(runaway(8.0, 11.0)), track()))
     assert found.own.dropout[(GRID_S > 9) & (GRID_S < 11)].all()
