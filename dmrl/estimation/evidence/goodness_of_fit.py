@@ -182,7 +182,9 @@ def _sum_scores(factor: Rows, window: Index, equations: NormalEquations) -> _Sco
     equations
         Equations of the flight, for its shape.
     """
-    weight = (factor.weight * factor.loss.weight(factor.square))[..., None]
+    # A lost image has no derivatives: its residual is a constant cost.
+    shown = (factor.rows[..., :-1] != 0).any(axis=(-2, -1))
+    weight = (shown * factor.weight * factor.loss.weight(factor.square))[..., None]
     # Odometry has a measurement for each component, the others one with all of them.
     several = 2 if factor.steps else 1
     rows = (factor.rows * weight[..., None]).sum(axis=several)

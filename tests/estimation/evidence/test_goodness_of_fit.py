@@ -7,6 +7,7 @@ from dmrl.estimation.evidence.causes import join_causes, join_innovations
 from dmrl.estimation.evidence.goodness_of_fit import (
     WINDOW_S,
     SignalScores,
+    _sum_scores,
     check_fit,
     compute_scores,
 )
@@ -16,11 +17,12 @@ from dmrl.estimation.model.gate import DEFAULT_GATE
 from dmrl.estimation.model.pair import Array, Pair
 from dmrl.estimation.model.status import OK, UNCONVERGED
 from dmrl.estimation.search.modes import convert_values
+from dmrl.estimation.solver.block_tridiagonal import NormalEquations
 from dmrl.estimation.solver.estimate import Cause, Estimate, Innovation
 from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.levenberg_marquardt import Solver
 from dmrl.estimation.solver.problem import NoiseModel, RangeLink, Sight
-from dmrl.estimation.solver.residuals import Values
+from dmrl.estimation.solver.residuals import Rows, Values
 from dmrl.estimation.solver.robust_loss import Gaussian
 from dmrl.estimation.solver.unknowns import Unknown, with_rows
 
@@ -92,6 +94,16 @@ def test_directions_that_the_unknowns_explain_are_not_tested() -> None:
     assert np.isnan(one.to_innovation().size[2])
 
 
+def test_a_lost_image_has_no_score() -> None:
+    rows = np.zeros((2, 1, 3, 3))
+    rows[:, 0, 0, -1] = 5.0
+    rows[1, 0, 0, 0] = 1.0
+    factor = Rows(rows, [0, 1], [], Gaussian(), np.ones((2, 1)))
+    scores = _sum_scores(factor, np.array([0, 1]), NormalEquations.zeros(2, 2, 0))
+    assert not scores.score[0].any() and not scores.information[0].any()
+    assert scores.score[1].tolist() == [5.0, 0.0, 0.0]
+
+
 def test_no_position_of_a_stretch_that_does_not_fit_is_ok() -> None:
     time_s = np.arange(0.0, 100.0)
     state = np.tile([2.0, 0.0, 0.0], (100, 1))
@@ -100,8 +112,8 @@ def test_no_position_of_a_stretch_that_does_not_fit_is_ok() -> None:
     none = np.zeros(100, np.int8)
     given = Estimate(time_s, state, spread, none, np.zeros(0), NoiseModel(), causes=(cause,))
     out = with_status(given, none.astype(bool), (9.0, 9.0), DEFAULT_GATE)
-    assert (out.status[40:51] == UNCONVERGED).all()
-    assert (out.status[[0, 20, 70, 99]] == OK).all()
+    assert (out.status[10:81] == UNCONVERGED).all()
+    assert (out.status[[0, 9, 81, 99]] == OK).all()
     everything = replace(given, causes=(replace(cause, from_s=0.0, to_s=99.0),))
     refused = with_status(everything, none.astype(bool), (9.0, 9.0), DEFAULT_GATE)
     assert (refused.status == UNCONVERGED).all() and refused.causes == everything.causes
