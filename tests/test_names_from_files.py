@@ -83,6 +83,7 @@ REASONS = {
     "card/figures.py: name": OURS,
     "html_report/collect.py: name": LISTED,
     "html_report/report_sections.py: name": LISTED,
+    "html_report/report_sections.py: file": OURS,
     "html_report/recipe_figures.py: name": "only read, and nothing outside the folder",
     "pipeline/batch.py: n": LISTED,
     "pipeline/batch.py: name": LISTED,

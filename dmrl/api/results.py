@@ -64,7 +64,7 @@ def evaluate_recordings(recordings: Sequence[Path], settings: Any) -> Result:
         kind = import_module(f"dmrl.evaluation.{'tracks' if 'robots' in found else 'positions'}")
         columns = [kind.EACH, *(words for _, words, _ in kind.COLUMNS)]
         return Result(found, f"{named}: {kind.TITLE}", columns, kind.rows(found))
-    headers, rows = report.build_band_table(found.bands)
     document = report.describe_evaluation(recordings, found)
+    headers, rows = report.build_band_table([document["overall"], *document["bands"]])
     columns = ["label minus detection", *headers]
     return Result(document, f"{named}: {found.pairs.images} images", columns, rows)

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.errors import SettingError
-from dmrl.evaluation.detections import LabelledDetections, join_by_image
+from dmrl.evaluation.comparison import HEADERS, align_images, build_rows, compare_models, note
+from dmrl.evaluation.detections import LabelledDetections, concatenate_parts, join_each
 from dmrl.evaluation.figure_tables import (
     band_to_json,
     build_band_table,
@@ -68,6 +69,8 @@ class Evaluation:
         Figures over all distances, then by band.
     threshold
         The one that was used.
+    paired
+        Differences of two recordings with the same images and labels, as JSON values; else None.
     """
 
     criteria: DetectionCriteria
@@ -75,6 +78,7 @@ class Evaluation:
     scored: ScoredDetections
     bands: list[BandMetrics]
     threshold: float
+    paired: dict[str, Any] | None = None
 
 
 def evaluate_detections(
@@ -98,8 +102,9 @@ def evaluate_detections(
     SettingError
         If one has no labels of that source, no such split, or no image to evaluate.
     """
-    pairs = join_by_image(recordings, criteria.against, criteria.split, partial=criteria.partial)
-    scored = score_detections(pairs.images, pairs.labels, pairs.detections)
+    parts = join_each(recordings, criteria.against, criteria.split, partial=criteria.partial)
+    pairs = concatenate_parts(parts)
+    scored = _score(pairs)
     threshold = _choose_threshold(scored, pairs, criteria)
     if pairs.images * criteria.draws < MIN_PARALLEL_DRAWS:
         workers = 1
@@ -110,7 +115,15 @@ def evaluate_detections(
         seed=criteria.seed,
         across=lambda function, items: spread(function, items, workers),
     )
-    return Evaluation(criteria, pairs, scored, bands, threshold)
+    paired = None
+    if len(parts) == 2 and (both := align_images(*parts)):
+        chosen = [_choose_threshold(_score(part), part, criteria) for part in both]
+        paired = compare_models(both, chosen, criteria.draws, criteria.seed)
+    return Evaluation(criteria, pairs, scored, bands, threshold, paired)
+
+
+def _score(pairs: LabelledDetections) -> ScoredDetections:
+    return score_detections(pairs.images, pairs.labels, pairs.detections)
 
 
 def _choose_threshold(
@@ -163,13 +176,14 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
         "bands": bands,
         "curves": curves_to_json(evaluation.scored),
         "definitions": METRIC_DEFINITIONS,
+        **({"paired": evaluation.paired} if evaluation.paired else {}),
     }
 
 
 def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None:
     """Print the figures, one column per band that holds labels."""
     criteria = evaluation.criteria
-    headers, rows = build_band_table(evaluation.bands)
+    headers, rows = build_band_table([band_to_json(band) for band in evaluation.bands])
     split = f", split {criteria.split}" if criteria.split else ""
     name = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
     part = ", only those with detections" if criteria.partial else ""
@@ -178,8 +192,8 @@ def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None
     notes = [f"{count} {why}" for why, count in evaluation.pairs.left_out.items()]
     if unmatched := evaluation.bands[0].unmatched:
         notes.append(f"{unmatched} labels without any detection")
-    for note in notes:
-        print_line(f"left out: {note}")
+    for words in notes:
+        print_line(f"left out: {words}")
     if unseen := evaluation.pairs.unseen:
         print_line(
             f"{unseen} images have no Detections message: nothing was found there. "
@@ -191,6 +205,9 @@ def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None
             f"nobody in view: an alarm in {quiet.alarmed_images} of {quiet.empty_images} images, "
             f"{quiet.false_alarms:.3f} an image"
         )
+    if evaluation.paired:
+        print_table("the two on their common images", HEADERS, build_rows(evaluation.paired))
+        print_line(note(evaluation.paired))
     print_line(
         f"in brackets: 95 % intervals, bootstrap over images; precision, recall and F1 at "
         f"confidence {evaluation.threshold:g}, within 16 px"

@@ -74,6 +74,13 @@ class LabelledDetections:
 def join_by_image(
     recordings: Sequence[Path], against: str, split: str | None = None, *, partial: bool = False
 ) -> LabelledDetections:
+    """Join as `join_each`, and return all recordings together."""
+    return concatenate_parts(join_each(recordings, against, split, partial=partial))
+
+
+def join_each(
+    recordings: Sequence[Path], against: str, split: str | None = None, *, partial: bool = False
+) -> list[LabelledDetections]:
     """Join labels and detections of every image that can be evaluated, recording by recording.
 
     An image without a Detections message counts as one without detections: images that a detector
@@ -98,9 +105,7 @@ def join_by_image(
         If a recording has no labels from that source, no such split, or no image to evaluate.
     """
     refuse_duplicates(recordings)
-    return _concatenate_parts(
-        [_join_recording(path, against, split, partial) for path in track(recordings, "Reading")]
-    )
+    return [_join_recording(path, against, split, partial) for path in track(recordings, "Reading")]
 
 
 def _join_recording(
@@ -118,7 +123,7 @@ def _join_recording(
         )
     spans = _find_spans(recording, read_splits(recording, held.summary), split)
     _require_source(held, robots, against)
-    pairs = _concatenate_parts(
+    pairs = concatenate_parts(
         [_join_robot(held, robot, against, spans, partial) for robot in robots]
     )
     if not pairs.images:
@@ -266,7 +271,7 @@ def _build_points(entries: pa.Array, mine: Mask | None, rows: Times, numbers: Ti
     return Points(image[order], **{name: value[order] for name, value in values.items()})
 
 
-def _concatenate_parts(parts: list[LabelledDetections]) -> LabelledDetections:
+def concatenate_parts(parts: list[LabelledDetections]) -> LabelledDetections:
     """Concatenate the images of several robots or recordings."""
     first = np.cumsum([0, *(part.images for part in parts)])
     left_out: Counter[str] = Counter()

@@ -1,13 +1,12 @@
 """Format the metrics of detections: a table with a column per range of depth, and JSON values."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 from dmrl.learn.inference.detection_metrics import (
     BandMetrics,
-    MetricValue,
     ScoredDetections,
     compute_curves,
 )
@@ -35,32 +34,36 @@ FIGURE_ROWS = (
 )
 
 
-def build_band_table(bands: Sequence[BandMetrics]) -> tuple[list[str], list[list[object]]]:
+def build_band_table(
+    bands: Sequence[Mapping[str, Any]],
+) -> tuple[list[str], list[list[object]]]:
     """Build headers and rows: all labels, then each band of depth that has labels.
 
     Parameters
     ----------
     bands
-        Metrics by band, all distances first.
+        Metrics by band as JSON values, all distances first; see `band_to_json`.
     """
     overall, *others = bands
-    shown = [overall, *(band for band in others if band.labels)]
-    rows: list[list[object]] = [["labels", *(str(band.labels) for band in shown)]]
+    shown = [overall, *(band for band in others if band.get("labels", 1))]
+    rows: list[list[object]] = [["labels", *(str(band.get("labels", "-")) for band in shown)]]
     for name, words, form in FIGURE_ROWS:
-        rows.append([words, *(_format_cell(band.figures[name], form) for band in shown)])
-    return ["all", *(_format_range(band) for band in shown[1:])], rows
+        if name in overall:
+            rows.append([words, *(format_interval(band[name], form) for band in shown)])
+    return ["all", *(_format_range(band["from_m"], band["to_m"]) for band in shown[1:])], rows
 
 
-def _format_range(band: BandMetrics) -> str:
-    to = f" to {band.to_m:g} m" if math.isfinite(band.to_m) else " m and more"
-    return f"{band.from_m:g}{to}"
+def _format_range(from_m: float, to_m: float | None) -> str:
+    return f"{from_m:g}{' m and more' if to_m is None else f' to {to_m:g} m'}"
 
 
-def _format_cell(figure: MetricValue, form: str) -> str:
-    if math.isnan(figure.value):
+def format_interval(figure: Mapping[str, Any], form: str) -> str:
+    """Format a metric with its interval in brackets; a dash if there is nothing to measure."""
+    ends = [figure["low"], figure["high"]]
+    if figure["value"] is None:
         return "-"
-    low, high = format(figure.low, form), format(figure.high, form)
-    return f"{figure.value:{form}} [{low.removesuffix('%')}, {high.removesuffix('%')}]"
+    within = ", ".join(format(end, form).removesuffix("%") for end in ends if end is not None)
+    return f"{format(figure['value'], form)} [{within}]"
 
 
 def band_to_json(band: BandMetrics) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from dmrl.estimation.model.position_metrics import ErrorTrace
 from dmrl.evaluation.detections import ImageKey, LabelledDetections
 from dmrl.guards.safe_names import safe_join
 from dmrl.images.codec import decode
-from dmrl.learn.inference.detection_metrics import ScoredDetections
+from dmrl.learn.inference.detection_metrics import SCORE_RADIUS_PX, ScoredDetections
 from dmrl.learn.inference.matching import Points
 from dmrl.plots import Example, GalleryImage
 from dmrl.recording import read, read_summary
@@ -134,7 +134,7 @@ def _build_example(
     labels_px = np.column_stack([labels.u_px, labels.v_px])
     several = len({at.recording for at in pairs.at}) > 1
     return Example(
-        title=f"{recording.stem}, " * several + f"{_format_time(at)}, error {worst_px:.1f} px",
+        title=f"{recording.stem}, " * several + f"{_format_time(at)}, {_describe_error(worst_px)}",
         rgb=rgb,
         confidence=maps["confidence"],
         depth_m=maps["depth_m"],
@@ -142,6 +142,14 @@ def _build_example(
         detections_px=_select_detections(pairs.detections, image, len(labels_px), threshold),
         source=source,
     )
+
+
+def _describe_error(error_px: float) -> str:
+    """Return the error of an image's worst label in words, and whether it is a failure."""
+    if not np.isfinite(error_px):
+        return "failure: a label without a detection"
+    failure = f"failure: over {SCORE_RADIUS_PX:g} px, " if error_px > SCORE_RADIUS_PX else ""
+    return f"{failure}error {error_px:.1f} px"
 
 
 def _read_maps(recording: Path, robot: str, time_ns: int) -> dict[str, Array]:

@@ -1,7 +1,7 @@
 """Report a folder of outputs as one HTML page: contents, metrics and provenance.
 
 `collect` finds recordings, datasets, models and evaluations. `report_sections` summarizes them,
-`html` builds a self-contained page, and `write_report` writes the file.
+`blocks` fills them into templates as a self-contained page, and `write_report` writes the file.
 """
 
 from dmrl.html_report.collect import ReportInputs, collect_outputs

@@ -6,7 +6,7 @@ from typing import Any
 
 from dmrl.atomic_output import replace_file
 from dmrl.guards.bounded_parsing import parse_json
-from dmrl.html_report.html import build_page, build_table
+from dmrl.html_report.blocks import Block, Table, build_page
 
 PAGE = "benchmark.html"
 TITLES = {
@@ -30,13 +30,13 @@ def write_benchmark_page(folder: Path) -> Path | None:
     return folder / PAGE
 
 
-def _build_task(task: str, documents: list[Mapping[str, Any]]) -> str:
+def _build_task(task: str, documents: list[Mapping[str, Any]]) -> list[Block]:
     scored = [one for one in documents if task in one["tasks"]]
     if not scored:
-        return ""
+        return []
     names = list(scored[0]["tasks"][task])
     rows = [[one["submission"], *map(_format, one["tasks"][task].values())] for one in scored]
-    return build_table(["submission", *names], rows)
+    return [Table(["submission", *names], rows)]
 
 
 def _format(figure: Mapping[str, Any]) -> str:

@@ -1,29 +1,32 @@
 """Summarize a catalogue: recordings by camera and source of labels, and their errors."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import pyarrow as pa
 
-from dmrl.html_report.html import build_table, to_html_text
+from dmrl.html_report.blocks import Block, Heading, Table, Text
 
 MAX_LISTED_ERRORS = 12
 """Recordings that are listed with their errors, at most."""
 
 
-def build_catalogue_section(name: str, catalogue: pa.Table) -> str:
-    """Build the section of one catalogue, HTML."""
-    return "".join(
-        (
-            f"<h3>{to_html_text(name)}</h3><p>{to_html_text(_summarize(catalogue))}</p>",
-            build_table(("camera", "recordings", "images"), _count_by_camera(catalogue["cameras"])),
-            build_table(("camera", "labels from", "OK", "all"), _count_labels(catalogue["labels"])),
-            build_table(("made by", "recordings"), _count_values(catalogue["stage"])),
-            _list_errors(catalogue),
-            _list_causes(catalogue),
-        )
-    )
+def build_catalogue_section(catalogues: Mapping[str, pa.Table]) -> list[Block]:
+    """Build the section of all catalogues."""
+    return [block for one in catalogues.items() for block in _show_catalogue(*one)]
+
+
+def _show_catalogue(name: str, catalogue: pa.Table) -> list[Block]:
+    listed = {"error": _list_errors(catalogue), "causes": _list_causes(catalogue)}
+    return [
+        Heading(name),
+        Text(_summarize(catalogue)),
+        Table(("camera", "recordings", "images"), _count_by_camera(catalogue["cameras"])),
+        Table(("camera", "labels from", "OK", "all"), _count_labels(catalogue["labels"])),
+        Table(("made by", "recordings"), _count_values(catalogue["stage"])),
+        *(Table(("recording", what), rows) for what, rows in listed.items() if rows),
+    ]
 
 
 def _summarize(catalogue: pa.Table) -> str:
@@ -62,22 +65,22 @@ def _count_values(column: pa.ChunkedArray) -> list[tuple[str, int]]:
     return Counter(value or "unknown" for value in column.to_pylist()).most_common()
 
 
-def _list_causes(catalogue: pa.Table) -> str:
-    """Return a table of the sensor errors that `dmrl label` found, worst recordings first."""
+def _list_causes(catalogue: pa.Table) -> list[tuple[str, str]]:
+    """List the sensor errors that `dmrl label` found, worst recordings first."""
     found = []
     columns = (catalogue[name].to_pylist() for name in ("recording", "findings"))
     for name, findings in zip(*columns, strict=True):
         causes = [one["text"] for one in findings or () if one["topic"].endswith("/causes")]
         found += [(len(causes), name, "; ".join(causes))] if causes else []
     rows = [(name, text) for _, name, text in sorted(found, key=lambda one: -one[0])]
-    return build_table(("recording", "causes"), rows[:MAX_LISTED_ERRORS]) if rows else ""
+    return rows[:MAX_LISTED_ERRORS]
 
 
-def _list_errors(catalogue: pa.Table) -> str:
+def _list_errors(catalogue: pa.Table) -> list[tuple[str, str]]:
     columns = (catalogue[name].to_pylist() for name in ("recording", "error", "findings"))
     found = []
     for name, error, findings in zip(*columns, strict=True):
         worst = [one["text"] for one in findings or () if one["level"] == "error"]
         if error or worst:
             found.append((name, error or worst[0]))
-    return build_table(("recording", "error"), found[:MAX_LISTED_ERRORS]) if found else ""
+    return found[:MAX_LISTED_ERRORS]

@@ -24,6 +24,7 @@ DOCUMENT_KINDS = {
     "evaluation.json": "evaluations",
     "positions.json": "positions",
     "tracks.json": "tracks",
+    "flight.json": "flights",
     "quantisation.json": "int8",
     "model.json": "models",
 }

@@ -1,14 +1,24 @@
-"""Build a graph from provenance: stages in columns, each to the right of its inputs."""
+"""Draw a graph of provenance: stages in columns, arrows in lanes that strike no box."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
+from itertools import pairwise
 
+from dmrl.html_report.blocks import fill_template
 from dmrl.recording import Input, Provenance
 
 MAX_FILE_BOXES = 12
 """Source files with a box of their own; the others share one."""
 Graph = tuple[list[list[str]], list[tuple[str, str]]]
 """Columns of boxes, and arrows between boxes."""
+Slot = Hashable
+"""A box, by its words, or a lane: the box that an arrow comes from, and the column it crosses."""
+Route = list[tuple[int, Slot]]
+"""Columns and slots of an arrow."""
+BOX_PX, GAP_PX, ROW_PX, MARGIN_PX = (156, 28), 64, 40, 40
+"""Width and height of a box, width between columns, height of a row, space around all."""
+SWEEPS = 4
+"""Passes over the columns that bring arrows closer to straight lines."""
 
 
 def build_lineage(made: Mapping[str, Provenance]) -> Graph:
@@ -65,3 +75,82 @@ class _LineageBuilder:
         self.depth.setdefault(box, 0)
         self._rounds.setdefault(box, Counter())
         return box
+
+
+def draw_lineage(made: Mapping[str, Provenance]) -> str:
+    """Draw the graph of `build_lineage` as SVG; empty without outputs.
+
+    An arrow over several columns has a lane of its own in each of them, a row without a box. It
+    changes rows between the columns alone, so it strikes no box.
+    """
+    columns, arrows = build_lineage(made)
+    place = {box: k for k, column in enumerate(columns) for box in column}
+    routes = [_find_route(*arrow, place) for arrow in arrows]
+    slots: list[list[Slot]] = [list(column) for column in columns]
+    for k, slot in dict.fromkeys(one for route in routes for one in route[1:-1]):
+        slots[k].append(slot)
+    _order_slots(slots, routes)
+    tallest = max(map(len, slots), default=0)
+    middle_px = {
+        slot: _find_middle(k, row, len(column), tallest)
+        for k, column in enumerate(slots)
+        for row, slot in enumerate(column)
+    }
+    paths = [
+        _draw_path([middle_px[slot] for _, slot in route], forward=route[0][0] < route[-1][0])
+        for route in routes
+    ]
+    size_px = (
+        2 * MARGIN_PX + len(columns) * (BOX_PX[0] + GAP_PX) - GAP_PX,
+        2 * MARGIN_PX + tallest * ROW_PX,
+    )
+    boxes = [(box, *middle_px[box]) for box in place]
+    values = {"boxes": boxes, "paths": paths, "size_px": size_px, "box_px": BOX_PX}
+    return fill_template("lineage.svg", **values) if columns else ""
+
+
+def _find_route(source: str, result: str, place: Mapping[str, int]) -> Route:
+    """Return the columns and slots of an arrow, from box to box."""
+    first, last = place[source], place[result]
+    # An arrow back has lanes in the columns of both boxes too.
+    between = range(first + 1, last) if first < last else range(first, last - 1, -1)
+    lanes = [(k, (source, k, first < last)) for k in between]
+    return [(first, source), *lanes, (last, result)]
+
+
+def _order_slots(slots: list[list[Slot]], routes: Sequence[Route]) -> None:
+    """Order the slots of each column by the rows of their neighbours, in place."""
+    beside: dict[Slot, set[tuple[int, Slot]]] = {}
+    for route in routes:
+        for one, other in pairwise(route):
+            beside.setdefault(one[1], set()).add(other)
+            beside.setdefault(other[1], set()).add(one)
+    for sweep in range(SWEEPS):
+        step = 1 if sweep % 2 else -1
+        for k in range(len(slots))[::-step]:
+            side = slots[k + step] if 0 <= k + step < len(slots) else []
+            rows, level = {slot: row for row, slot in enumerate(side)}, {}
+            for row, slot in enumerate(slots[k]):
+                near = [rows[other] for _, other in beside.get(slot, ()) if other in rows]
+                level[slot] = sum(near) / len(near) if near else row
+            slots[k].sort(key=level.__getitem__)
+
+
+def _find_middle(column: int, row: int, rows: int, tallest: int) -> tuple[float, float]:
+    x = MARGIN_PX + BOX_PX[0] / 2 + column * (BOX_PX[0] + GAP_PX)
+    return x, MARGIN_PX + ROW_PX * (row + (tallest - rows + 1) / 2)
+
+
+def _draw_path(middles: Sequence[tuple[float, float]], *, forward: bool) -> str:
+    """Return the SVG path from box to box: curves between columns, lines across lanes.
+
+    It leaves its first box at the right and enters its last at the left.
+    """
+    half, bend, last = BOX_PX[0] / 2, GAP_PX / 2, len(middles) - 2
+    words = []
+    for k, ((x0, y0), (x1, y1)) in enumerate(pairwise(middles)):
+        out, into = (1 if forward or k == 0 else -1), (-1 if forward or k == last else 1)
+        start, end = x0 + out * half, x1 + into * half
+        curve = f"{start + out * bend:g},{y0:g} {end + into * bend:g},{y1:g} {end:g},{y1:g}"
+        words.append(f"{'L' if k else 'M'}{start:g},{y0:g} C{curve}")
+    return " ".join(words)

@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 from dmrl import plots, topics
 from dmrl.evaluation.figure_specs import FigureSpec, ReportedValue, find_value
 from dmrl.guards.bounded_parsing import parse_json
-from dmrl.html_report.collect import MAX_DOCUMENT_BYTES, ReportInputs
-from dmrl.html_report.html import (
+from dmrl.html_report.blocks import (
     INVALID_DATA_ERRORS,
+    Block,
+    Figure,
+    Heading,
     ImageEmbedder,
-    build_chart,
+    Table,
+    Text,
     build_row,
-    build_table,
-    to_html_text,
 )
+from dmrl.html_report.collect import MAX_DOCUMENT_BYTES, ReportInputs
 from dmrl.images.codec import decode
 from dmrl.plots import charts
 from dmrl.recording import LoadedRecording, read, read_summary
@@ -30,22 +32,22 @@ MAX_MAPS = 3
 """Images of a figure of maps, at most."""
 
 
-def build_recipe_figures(found: ReportInputs, pictures: ImageEmbedder) -> str:
-    """Build the HTML of a recipe's figures, in its order; a figure that fails shows its error."""
-    parts = []
+def build_recipe_figures(found: ReportInputs, pictures: ImageEmbedder) -> list[Block]:
+    """Build a recipe's figures, in its order; a figure that fails shows its error."""
+    blocks: list[Block] = []
     for shown in found.story:
         try:
             body = FIGURE_BUILDERS[shown.shows](found, shown, pictures)
         except INVALID_DATA_ERRORS as e:
-            body = f"<p>cannot be drawn: {to_html_text(str(e) or repr(e))}</p>"
-        words = f"<p>{to_html_text(shown.words)}</p>" if shown.words else ""
-        parts.append(f"<h3>{to_html_text(shown.title)}</h3>{words}{body}")
-    return "".join(parts)
+            body = [Text(f"cannot be drawn: {str(e) or repr(e)}")]
+        words = [Text(shown.words)] if shown.words else []
+        blocks += [Heading(shown.title), *words, *body]
+    return blocks
 
 
-def _build_numbers(found: ReportInputs, shown: FigureSpec, _: ImageEmbedder) -> str:
+def _build_numbers(found: ReportInputs, shown: FigureSpec, _: ImageEmbedder) -> list[Block]:
     rows = [(one.what, one.published, _format_value(found, one)) for one in shown.rows]
-    return build_table(("", "published", "here"), rows)
+    return [Table(("", "published", "here"), rows)]
 
 
 def _format_value(found: ReportInputs, number: ReportedValue) -> str:
@@ -72,30 +74,26 @@ def _resolve_output(found: ReportInputs, name: str) -> Path:
     return path
 
 
-def _build_losses(found: ReportInputs, shown: FigureSpec, _: ImageEmbedder) -> str:
+def _build_losses(found: ReportInputs, shown: FigureSpec, _: ImageEmbedder) -> list[Block]:
     drawn = []
     for key, words in LOSS_LABELS.items():
         curves = {}
         for k, name in enumerate(shown.of):
             history = _read_document(found, f"{name}/model.json")["training"]["history"]
             curves[shown.output_label(k)] = [float(epoch[key]) for epoch in history]
-        drawn.append(build_chart(charts.plot_losses(curves, words), f"{words} over the epochs"))
+        drawn.append(Figure(f"{words} over the epochs", svg=charts.plot_losses(curves, words)))
     return build_row(drawn)
 
 
-def _build_images(found: ReportInputs, shown: FigureSpec, pictures: ImageEmbedder) -> str:
-    full = shown.shows == "images"
+def _build_images(found: ReportInputs, shown: FigureSpec, pictures: ImageEmbedder) -> list[Block]:
+    full, file = shown.shows == "images", IMAGE_FILES[shown.shows]
+    paths = [_resolve_output(found, f"{name}/{file}") for name in shown.of]
     return build_row(
-        pictures.build_figure(
-            _resolve_output(found, f"{name}/{IMAGE_FILES[shown.shows]}"),
-            shown.output_label(k),
-            full=full,
-        )
-        for k, name in enumerate(shown.of)
+        pictures.embed(path, shown.output_label(k), full=full) for k, path in enumerate(paths)
     )
 
 
-def _build_maps(found: ReportInputs, shown: FigureSpec, pictures: ImageEmbedder) -> str:
+def _build_maps(found: ReportInputs, shown: FigureSpec, pictures: ImageEmbedder) -> list[Block]:
     every = {shown.output_label(k): _resolve_output(found, name) for k, name in enumerate(shown.of)}
     names = {who: path for who, path in every.items() if path.exists()}  # some are optional
     drawn = _read_map_pairs(names)
@@ -103,11 +101,11 @@ def _build_maps(found: ReportInputs, shown: FigureSpec, pictures: ImageEmbedder)
         raise ValueError(f"{', '.join(shown.of)} have no maps of the same images")
     with tempfile.TemporaryDirectory() as place:
         plots.plot_map_pairs(drawn, Path(place) / "maps")
-        picture = pictures.build_figure(Path(place) / "maps.png", ", ".join(names), full=True)
-    return build_row([picture, _compare_maps(drawn)])
+        picture = pictures.embed(Path(place) / "maps.png", ", ".join(names), full=True)
+    return [*build_row([picture]), _compare_maps(drawn)]
 
 
-def _compare_maps(drawn: Sequence[plots.MapPair]) -> str:
+def _compare_maps(drawn: Sequence[plots.MapPair]) -> Table:
     """Build a table that compares the maps with those of the first recording."""
     first, *others = drawn[0].maps
     rows = []
@@ -117,7 +115,7 @@ def _compare_maps(drawn: Sequence[plots.MapPair]) -> str:
             a, b = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
             like = f"{np.corrcoef(a, b)[0, 1]:.3f}" if np.ptp(a) and np.ptp(b) else "-"
             rows.append((who, words, like, f"{np.abs(a - b).mean():.4f}"))
-    return build_table((f"against {first}", "map", "correlation", "mean difference"), rows)
+    return Table((f"against {first}", "map", "correlation", "mean difference"), rows)
 
 
 def _read_map_pairs(names: Mapping[str, Path]) -> list[plots.MapPair]:

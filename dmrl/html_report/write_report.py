@@ -5,8 +5,8 @@ from pathlib import Path
 
 from dmrl.atomic_output import atomic_file, replace_file
 from dmrl.errors import OutputError
+from dmrl.html_report.blocks import REPORT_MARK
 from dmrl.html_report.collect import collect_outputs
-from dmrl.html_report.html import REPORT_MARK
 from dmrl.html_report.report_sections import build_report
 
 REPORT_FILE = "report.html"

@@ -105,7 +105,7 @@ def draw_stacked_bars(
     """
     tops = np.cumsum([np.zeros(len(edges) - 1), *counts.values()], axis=0)
     most = max(float(tops[-1].max()), 1.0)
-    panel = _Panel(title, xlabel, (float(edges[0]), float(edges[-1])), (0.0, 1.05 * most))
+    panel = _Panel(title, xlabel, (float(edges[0]), float(edges[-1])), (0.0, 1.25 * most))
     ticks = _find_ticks(float(edges[-1]), whole=middle)
     panel.add_ticks(
         [t for t in ticks if t < edges[-1] or not middle], _find_ticks(most, whole=True)

@@ -9,75 +9,61 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.plots.style import STYLE, Figure, MaxNLocator, mpl, use_plain_numbers
+from dmrl.plots.style import STYLE, Figure, MaxNLocator, add_legend_below, mpl, use_plain_numbers
 
 Array = NDArray[np.float64]
 
 INK_PLACEHOLDER = "#010203"
 """Placeholder of the page's text colour, which SVG names currentColor."""
-LINE_COLOURS = (
-    "#0072b2",
-    "#e69f00",
-    "#009e73",
-    "#d55e00",
-    "#cc79a7",
-    "#56b4e9",
-    "#7f7f7f",
-    "#b8a800",
-)
+LINE_COLOURS = ["#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#7f7f7f"]
 """Line colours after Okabe and Ito, legible on white and on black."""
-THEME = STYLE | {
-    "svg.fonttype": "none",
-    "font.family": "sans-serif",
-    "text.color": INK_PLACEHOLDER,
-    "axes.edgecolor": INK_PLACEHOLDER,
-    "axes.labelcolor": INK_PLACEHOLDER,
-    "xtick.color": INK_PLACEHOLDER,
-    "ytick.color": INK_PLACEHOLDER,
-    "axes.prop_cycle": f"cycler(color={LINE_COLOURS})",
-}
+INKED = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
+THEME = STYLE | dict.fromkeys(INKED, INK_PLACEHOLDER)
+THEME |= {"svg.fonttype": "none", "font.family": "sans-serif"}
+THEME["axes.prop_cycle"] = f"cycler(color={LINE_COLOURS})"
 SIZE_INCHES = (4.8, 3.6)
 MAX_SHORT_NAME = 28
 """Maximum letters of a name in a legend with two columns."""
 
 
 @contextmanager
-def _svg_chart(size: tuple[float, float] = SIZE_INCHES) -> Iterator[tuple[Figure, list[str]]]:
-    """Yield a themed figure, and a list that receives its SVG at the end."""
-    made: list[str] = []
+def _open_chart(size: tuple[float, float] = SIZE_INCHES, **axes: Any) -> Iterator[Any]:
+    """Yield the axes of a themed figure, which have a list ``svg`` that receives its SVG."""
     with mpl.rc_context(THEME):
         figure = Figure(size, layout="constrained")
-        yield figure, made
+        drawn: Any = figure.subplots()
+        drawn.svg = []
+        yield drawn
+        drawn.set(**axes)
+        drawn.grid(alpha=0.25)
         stream = io.StringIO()
         metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
         figure.savefig(stream, format="svg", transparent=True, metadata=metadata)
     svg = stream.getvalue()
     svg = svg[svg.index("<svg") :].replace(INK_PLACEHOLDER, "currentColor")
     # Remove the size: the page determines it.
-    made.append(re.sub(r'(<svg[^>]*?) height="[^"]*"([^>]*?) width="[^"]*"', r"\1\2", svg, count=1))
+    size_of = r'(<svg[^>]*?) height="[^"]*"([^>]*?) width="[^"]*"'
+    drawn.svg.append(re.sub(size_of, r"\1\2", svg, count=1))
 
 
 def _add_legend(axes: Any) -> None:
-    """Add a legend below the axes, where it covers no curve. A single curve has none."""
-    handles, names = axes.get_legend_handles_labels()
+    """Add a legend below the axes, unless there is a single curve."""
+    names = axes.get_legend_handles_labels()[1]
     if len(names) > 1:
         columns = 2 if max(map(len, names)) < MAX_SHORT_NAME else 1
-        how = {"fontsize": 8, "frameon": False, "ncols": columns}
-        axes.figure.legend(handles, names, loc="outside lower left", **how)
+        add_legend_below(axes.figure, axes, loc="outside lower left", ncols=columns)
 
 
 def plot_losses(histories: Mapping[str, Sequence[float]], words: str = "loss") -> str:
     """Plot the loss over the epochs of a training, one line per model."""
-    with _svg_chart() as (figure, made):
-        axes = figure.subplots()
+    with _open_chart(xlabel="epoch", ylabel=words) as axes:
+        axes.set_yscale("log")
         for name, values in histories.items():
             axes.plot(range(1, len(values) + 1), values, label=name)
-        axes.set(xlabel="epoch", ylabel=words, yscale="log")
         use_plain_numbers(axes.yaxis)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.grid(alpha=0.25)
         _add_legend(axes)
-    return made[0]
+    return str(axes.svg[0])
 
 
 def plot_by_distance(
@@ -93,9 +79,10 @@ def plot_by_distance(
     words
         Label of the vertical axis.
     """
-    with _svg_chart() as (figure, made):
-        axes = figure.subplots()
-        ranges = sorted({row[:2] for rows in figures.values() for row in rows})
+    ranges = sorted({row[:2] for rows in figures.values() for row in rows})
+    told = [f"{low:g}-{high:g}" if high < np.inf else f"{low:g}-" for low, high in ranges]
+    depth = "depth of the label, m; bars: 95 % intervals"
+    with _open_chart(xlabel=depth, ylabel=words, ylim=(0, None)) as axes:
         beside = min(0.15, 0.8 / len(figures))  # offsets stay within the range's column
         for k, (name, rows) in enumerate(figures.items()):
             at = np.array([ranges.index(row[:2]) for row in rows], float)
@@ -103,26 +90,18 @@ def plot_by_distance(
             value, low, high = np.array([row[2:] for row in rows], float).reshape(-1, 3).T
             reach = np.maximum([value - low, high - value], 0.0)
             axes.errorbar(at, value, reach, fmt="o", markersize=4, capsize=2, label=name)
-        for k in range(1, len(ranges)):
-            axes.axvline(k - 0.5, color=INK_PLACEHOLDER, linewidth=0.5, alpha=0.25)
-        told = [f"{low:g}-{high:g}" if high < np.inf else f"{low:g}-" for low, high in ranges]
-        axes.set(xticks=range(len(ranges)), xticklabels=told, ylabel=words, ylim=(0, None))
-        axes.set_xlabel("depth of the label, m; bars: 95 % intervals")
-        axes.grid(axis="y", alpha=0.25)
+        axes.set(xticks=range(len(ranges)), xticklabels=told)
         _add_legend(axes)
-    return made[0]
+    return str(axes.svg[0])
 
 
 def plot_precision_recall(curves: Mapping[str, tuple[Array, Array]]) -> str:
     """Plot precision over recall, one line per evaluation: (K,) recall and precision each."""
-    with _svg_chart() as (figure, made):
-        axes = figure.subplots()
+    with _open_chart(xlabel="recall", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02)) as axes:
         for name, (recall, precision) in curves.items():
             axes.plot(recall, precision, label=name)
-        axes.set(xlabel="recall", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02))
-        axes.grid(alpha=0.25)
         _add_legend(axes)
-    return made[0]
+    return str(axes.svg[0])
 
 
 def plot_reliability(bins: Mapping[str, tuple[Array, Array, Array]]) -> str:
@@ -133,17 +112,15 @@ def plot_reliability(bins: Mapping[str, tuple[Array, Array, Array]]) -> str:
     bins
         By evaluation: (K,) mean confidence, share of correct ones, and number of detections.
     """
-    with _svg_chart() as (figure, made):
-        axes = figure.subplots()
+    words: dict[str, Any] = {"xlabel": "confidence", "ylabel": "share that is right"}
+    with _open_chart(**words, xlim=(0, 1), ylim=(0, 1.02)) as axes:
         axes.plot((0, 1), (0, 1), color=INK_PLACEHOLDER, linewidth=0.8, linestyle=":")
         for k, (name, (confidence, right, count)) in enumerate(bins.items()):
             colour = LINE_COLOURS[k % len(LINE_COLOURS)]
             axes.plot(confidence, right, color=colour, label=name)
             axes.scatter(confidence, right, 8 + 40 * count / max(count.max(), 1), color=colour)
-        axes.set(xlabel="confidence", ylabel="share that is right", xlim=(0, 1), ylim=(0, 1.02))
-        axes.grid(alpha=0.25)
         _add_legend(axes)
-    return made[0]
+    return str(axes.svg[0])
 
 
 def plot_positions(
@@ -160,29 +137,19 @@ def plot_positions(
     kept
         (N,) whether the estimator keeps the position.
     """
-    with _svg_chart((4.6, 4.4)) as (figure, made):
-        axes = figure.subplots()
+    words: dict[str, Any] = {"xlabel": "to the right, m", "ylabel": "forward, m", "aspect": "equal"}
+    blue, orange = LINE_COLOURS[:2]
+    with _open_chart((4.6, 4.4), **words) as axes:
         for k in np.flatnonzero(kept)[:: max(1, int(kept.sum()) // 30)]:
-            axes.plot(
-                *_to_plot_axes(_confidence_ellipse(estimate_m[k], covariance[k])),
-                color=LINE_COLOURS[0],
-                alpha=0.35,
-            )
-        axes.plot(
-            *_to_plot_axes(estimate_m[kept]),
-            ".",
-            markersize=3,
-            color=LINE_COLOURS[0],
-            label="estimate",
-        )
-        axes.plot(
-            *_to_plot_axes(true_m), ".", markersize=1.5, color=LINE_COLOURS[1], label="ground truth"
-        )
+            ellipse = _confidence_ellipse(estimate_m[k], covariance[k])
+            axes.plot(*_to_plot_axes(ellipse), color=blue, alpha=0.35)
+        of_estimate = {"markersize": 3, "color": blue, "label": "estimate"}
+        axes.plot(*_to_plot_axes(estimate_m[kept]), ".", **of_estimate)
+        of_truth = {"markersize": 1.5, "color": orange, "label": "ground truth"}
+        axes.plot(*_to_plot_axes(true_m), ".", **of_truth)
         axes.plot(0, 0, "^", color=INK_PLACEHOLDER, label="observer, looks up")
-        axes.set(xlabel="to the right, m", ylabel="forward, m", aspect="equal")
-        axes.grid(alpha=0.25)
-        axes.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return made[0]
+        _add_legend(axes)
+    return str(axes.svg[0])
 
 
 def _to_plot_axes(xy_m: Array) -> tuple[Array, Array]:
@@ -197,39 +164,3 @@ def _confidence_ellipse(centre_m: Array, covariance: Array, inside: float = 0.95
     radii = np.sqrt(-2 * np.log(1 - inside) * np.maximum(values, 0.0))
     circle = np.stack((np.cos(turn), np.sin(turn)), axis=-1)
     return np.asarray(centre_m + (circle * radii) @ axes.T)
-
-
-def plot_lineage(columns: Sequence[Sequence[str]], arrows: Sequence[tuple[str, str]]) -> str:
-    """Plot the lineage of results: boxes in columns, from sources to results.
-
-    Parameters
-    ----------
-    columns
-        Texts of the boxes, each once, from left to right.
-    arrows
-        (from, to), by texts.
-    """
-    tallest = max(len(column) for column in columns)
-    with _svg_chart((1.9 * len(columns), max(0.5 * tallest, 1.0))) as (figure, made):
-        axes = figure.subplots()
-        at = {
-            words: (x, (len(column) - 1) / 2 - y)
-            for x, column in enumerate(columns)
-            for y, words in enumerate(column)
-        }
-        for source, result in arrows:
-            (x0, y0), (x1, y1) = at[source], at[result]
-            arrow = {
-                "arrowstyle": "->",
-                "color": INK_PLACEHOLDER,
-                "alpha": 0.5,
-                "shrinkA": 0,
-                "shrinkB": 0,
-            }
-            axes.annotate("", (x1 - 0.42, y1), (x0 + 0.42, y0), arrowprops=arrow)
-        box = {"boxstyle": "round", "facecolor": "none", "edgecolor": INK_PLACEHOLDER, "alpha": 0.6}
-        for words, (x, y) in at.items():
-            axes.text(x, y, words, ha="center", va="center", fontsize=8, bbox=box)
-        axes.set(xlim=(-0.5, len(columns) - 0.5), ylim=(-tallest / 2, tallest / 2))
-        axes.axis("off")
-    return made[0]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.plots.style import SIZE_INCHES, STYLE, Figure, mpl, save_figure, use_plain_numbers
+from dmrl.plots.style import SIZE_INCHES, add_legend_below, open_figure, use_plain_numbers
 
 
 def plot_error_violins(
@@ -22,15 +22,13 @@ def plot_error_violins(
     stem
         Path without suffix.
     """
-    with mpl.rc_context(STYLE):
-        figure = Figure(SIZE_INCHES, layout="constrained")
+    with open_figure(stem) as figure:
         pixels, metres = figure.subplots(1, 2, width_ratios=(2, 1))
         _draw_violins(pixels, {"u": u_px, "v": v_px}, 24.0)
         pixels.set(ylabel="pixel error, px", title=f"{len(u_px)} labels")
         _draw_violins(metres, {"depth": depth_m}, 0.6)
         metres.set(ylabel="depth error, m")
         figure.supxlabel("label minus detection; line: median, bar: middle half", fontsize=9)
-    save_figure(figure, stem)
 
 
 def _draw_violins(axes: Any, errors: Mapping[str, NDArray[np.float64]], least: float) -> None:
@@ -77,8 +75,7 @@ def plot_error_trace(
         Path without suffix.
     """
     colours = ["tab:red", "black"][-len(errors_m) :]
-    with mpl.rc_context(STYLE):
-        figure = Figure((SIZE_INCHES[0], 2.2 * sigma_m.shape[1]), layout="constrained")
+    with open_figure(stem, (SIZE_INCHES[0], 2.2 * sigma_m.shape[1])) as figure:
         rows: Any = figure.subplots(sigma_m.shape[1], 1, sharex=True, sharey=True)
         for k, axes in enumerate(rows):
             band = 3 * sigma_m[:, k]
@@ -94,10 +91,7 @@ def plot_error_trace(
         axes.set_ylim(-1.2 * max(0.3, float(limit)), 1.2 * max(0.3, float(limit)))
         axes.set_xlabel("time, s")
         figure.axes[0].set_title(title)
-        handles, names = figure.axes[0].get_legend_handles_labels()
-        how = {"fontsize": 8, "markerscale": 4, "frameon": False, "ncols": 4}
-        figure.legend(handles, names, loc="outside lower center", **how)
-    save_figure(figure, stem)
+        add_legend_below(figure, figure.axes[0], markerscale=4, ncols=4)
 
 
 def plot_error_by_distance(
@@ -124,8 +118,7 @@ def plot_error_by_distance(
         Width of the distance bins of the medians, metres.
     """
     found = np.isfinite(error_px) & np.isfinite(distance_m)
-    with mpl.rc_context(STYLE):
-        figure = Figure((SIZE_INCHES[0], 5.0), layout="constrained")
+    with open_figure(stem, (SIZE_INCHES[0], 5.0)) as figure:
         pixels, metres = figure.subplots(2, 1, sharex=True)
         # Errors below a tenth of a pixel are only noise on a logarithmic axis.
         shown_px = np.maximum(error_px[found], 0.1)
@@ -144,10 +137,7 @@ def plot_error_by_distance(
         metres.axhline(0, color="grey", linewidth=0.8)
         metres.set(ylabel="depth error, m\n(label minus detection)", xlabel="depth of the label, m")
         metres.set_xlim(left=0)
-        handles, names = metres.get_legend_handles_labels()
-        how = {"fontsize": 9, "frameon": False, "ncols": 2}
-        figure.legend(handles, names, loc="outside lower center", **how)
-    save_figure(figure, stem)
+        add_legend_below(figure, metres, fontsize=9, ncols=2)
 
 
 def _medians_by_step(

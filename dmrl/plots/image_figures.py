@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.colours import RGB
-from dmrl.plots.style import STYLE, Figure, mpl, save_figure, withStroke
+from dmrl.plots.style import add_legend_below, open_figure, withStroke
 
 Box = tuple[float, float, float, float]
 CELL_INCHES = (3.4, 2.6)
@@ -61,8 +61,7 @@ def plot_examples(shown: Sequence[Example], stem: Path, *, depth_max_m: float = 
     depth_max_m
         Depth at the end of the colour map, metres.
     """
-    with mpl.rc_context(STYLE):
-        figure = Figure((10.5, 2.6 * len(shown) + 0.6), layout="constrained")
+    with open_figure(stem, (10.5, 2.6 * len(shown) + 0.6)) as figure:
         grid = figure.subplots(len(shown), 3, squeeze=False)
         maps: list[Any] = []
         for row, example in zip(grid, shown, strict=True):
@@ -81,9 +80,7 @@ def plot_examples(shown: Sequence[Example], stem: Path, *, depth_max_m: float = 
             zip(maps, ("confidence", "depth, m"), strict=True), start=1
         ):
             figure.colorbar(image, ax=grid[:, column], location="bottom", shrink=0.8, label=name)
-        handles, names = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower left", ncols=2, frameon=False)
-    save_figure(figure, stem)
+        add_legend_below(figure, grid[0, 0], loc="outside lower left", fontsize=10, ncols=2)
 
 
 def _draw_markers(axes: Any, example: Example) -> None:
@@ -142,8 +139,7 @@ def plot_gallery(shown: Sequence[GalleryImage], stem: Path, *, columns: int = 3)
     """
     columns = min(columns, len(shown))
     rows = -(-len(shown) // columns)
-    with mpl.rc_context(STYLE):
-        figure = Figure((CELL_INCHES[0] * columns, CELL_INCHES[1] * rows), layout="constrained")
+    with open_figure(stem, (CELL_INCHES[0] * columns, CELL_INCHES[1] * rows)) as figure:
         places = figure.subplots(rows, columns, squeeze=False).ravel()
         for axes in places:
             axes.axis("off")
@@ -153,7 +149,6 @@ def plot_gallery(shown: Sequence[GalleryImage], stem: Path, *, columns: int = 3)
             axes.set_title(example.title, fontsize=8, loc="left")
             _draw_circles(axes, example, width, height)
             axes.set(xlim=(0, width), ylim=(height, 0))
-    save_figure(figure, stem)
 
 
 def _draw_circles(axes: Any, example: GalleryImage, width: int, height: int) -> None:
@@ -244,9 +239,8 @@ def plot_map_pairs(shown: Sequence[MapPair], stem: Path) -> None:
     """
     names = list(shown[0].maps)
     words = ("confidence", "depth, m")
-    with mpl.rc_context(STYLE):
-        across = 1 + 2 * len(names)
-        figure = Figure((2.6 * across, 2.1 * len(shown) + 1.1), layout="constrained")
+    across = 1 + 2 * len(names)
+    with open_figure(stem, (2.6 * across, 2.1 * len(shown) + 1.1)) as figure:
         figure.get_layout_engine().set(h_pad=0.12)  # type: ignore[call-arg, union-attr]
         grid = figure.subplots(len(shown), across, squeeze=False)
         for row, pair in zip(grid, shown, strict=True):
@@ -263,4 +257,3 @@ def plot_map_pairs(shown: Sequence[MapPair], stem: Path) -> None:
             figure.colorbar(drawn, ax=block, location="bottom", shrink=0.6, label=name)
         for axes in grid.flat:
             axes.set(xticks=[], yticks=[])
-    save_figure(figure, stem)

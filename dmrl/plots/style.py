@@ -37,16 +37,7 @@ try:
 except ImportError as e:
     raise MissingExtra("matplotlib", "plot", "a figure") from e
 
-__all__ = [
-    "SIZE_INCHES",
-    "STYLE",
-    "Figure",
-    "MaxNLocator",
-    "mpl",
-    "save_figure",
-    "use_plain_numbers",
-    "withStroke",
-]
+__all__ = ["Figure", "MaxNLocator", "mpl", "withStroke"]
 
 # No date, version or random ids, so that equal input gives equal bytes.
 STYLE: dict[Any, Any] = {
@@ -74,8 +65,18 @@ def use_plain_numbers(axis: Any) -> None:
     axis.set_minor_formatter(_PlainFormatter(minor_thresholds=(1.5, 0.5)))
 
 
-def save_figure(figure: Figure, stem: Path) -> None:
-    """Write ``<stem>.png`` and ``<stem>.svg``."""
-    for suffix, metadata in METADATA.items():
-        with mpl.rc_context(STYLE):
+@contextmanager
+def open_figure(stem: Path, size: tuple[float, float] = SIZE_INCHES) -> Iterator[Figure]:
+    """Yield a figure of this size, inches; write ``<stem>.png`` and ``<stem>.svg`` at the end."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(size, layout="constrained")
+        yield figure
+        for suffix, metadata in METADATA.items():
             figure.savefig(stem.with_name(stem.name + suffix), dpi=150, metadata=metadata)
+
+
+def add_legend_below(figure: Figure, axes: Any, **how: Any) -> None:
+    """Add the legend of some axes below all axes, where it covers no curve."""
+    handles, names = axes.get_legend_handles_labels()
+    at: dict[str, Any] = {"loc": "outside lower center", "fontsize": 8, "frameon": False}
+    figure.legend(handles, names, **(at | how))

@@ -126,8 +126,8 @@ def command(
     Parameters
     ----------
     recordings
-        Recordings with images, labels and detections, or folders of them, judged together; or
-        one with true positions and tracks or estimates.
+        Recordings with images, labels and detections, or folders of them, judged together; two
+        with the same images are compared too. Or one with true positions and tracks or estimates.
     plots_to
         Folder to write plots to, and evaluation.json, positions.json or tracks.json. Must not
         exist.

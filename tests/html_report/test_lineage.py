@@ -1,6 +1,10 @@
 """The graph of a provenance: one box a stage and round, arrows from what it was made from."""
 
-from dmrl.html_report.lineage import build_lineage
+import re
+
+import numpy as np
+
+from dmrl.html_report.lineage import BOX_PX, build_lineage, draw_lineage
 from dmrl.recording import Input, Provenance
 
 
@@ -34,3 +38,38 @@ def test_files_of_others_are_sources() -> None:
 
 def test_lineage_without_outputs_is_empty() -> None:
     assert build_lineage({}) == ([], [])
+
+
+def _points_of(path: str) -> np.ndarray:
+    """Points of an SVG path of lines and cubic curves."""
+    numbers = [np.array(p.split(","), float) for p in re.findall(r"[-\d.]+,[-\d.]+", path)]
+    found, share = [], np.linspace(0, 1, 41)[:, None]
+    for a, b, c, d in zip(*(numbers[k::4] for k in range(4)), strict=True):
+        if found:
+            found.append(found[-1][-1] + share * (a - found[-1][-1]))
+        one = 1 - share
+        found.append(one**3 * a + 3 * one**2 * share * b + 3 * one * share**2 * c + share**3 * d)
+    return np.concatenate(found)
+
+
+def test_no_arrow_strikes_a_box() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        made = {"0": _made("fly")}
+        for k in range(1, 9):
+            before = rng.choice(sorted(made), rng.integers(1, min(4, k) + 1), replace=False)
+            stage = str(rng.choice(["label", "train", "predict", "track", "dataset", "merge"]))
+            made[f"{k}"] = _made(stage, *(Input(n, n, made[n]) for n in map(str, before)))
+        svg = draw_lineage(made)
+        corners = np.array(re.findall(r'<rect x="([\d.]+)" y="([\d.]+)"', svg), float)
+        paths = re.findall(r'<path d="(M[^"]+)" stroke', svg)
+        assert len(corners) > 1 and paths
+        for path in paths:
+            inside = _points_of(path)[:, None] - corners
+            assert not ((inside > 0.1) & (inside < np.array(BOX_PX) - 0.1)).all(axis=-1).any()
+
+
+def test_texts_of_boxes_are_escaped_and_cut() -> None:
+    svg = draw_lineage({"a": _made("convert", Input("<b>" + "x" * 60 + ".csv", "1"))})
+    assert "<b>" not in svg and "&lt;b&gt;" in svg and "x..." in svg
+    assert draw_lineage({}) == ""

@@ -56,6 +56,7 @@ def test_the_page_shows_what_is_there_and_fetches_nothing(outputs: Path) -> None
     assert html.count("<svg") >= 6 and html.count("data:image/png") == 2
     assert "0.5 (0.5, 0.6)" in html and "24778" in html and "flight.mcap" in html
     assert "cf2 relative to cf1, from above; 95 % ellipses" in html
+    assert "label minus detection" in html and ">0 to 1 m<" in html and "median error, px" in html
 
 
 @pytest.mark.heavy
@@ -68,7 +69,8 @@ def test_report_of_images_has_card_figures_and_no_positions(
     drawn = {path.stem for path in (tmp_path / "dataset/figures").glob("*.png")}
     assert drawn
     html = build_report(collect_outputs(tmp_path))
-    assert all(f"dataset: {name}<" in html for name in drawn)
+    assert all(f"dataset: {name}<" in html for name in {*drawn, "samples"})
+    assert re.search(r">dataset</td>.*>train</td>.*>8</td>", html)
     assert "Positions" not in _Seen(html).headings
 
 
