@@ -51,7 +51,7 @@ METRICS = {
     "ap_16_px": ("AP at 16 px", ".3f"),
 }
 EVALUATION_IMAGES = {
-    "examples.png": "images, confidence and depth, at 20, 50, 80 and 95 % of the errors of all images; "
+    "examples.png": "images, confidence and depth, at 20, 50, 80 and 95 % of all errors; "
     "a failure is named above its image",
     "error-violins.png": "errors",
     "error-by-distance.png": "errors by distance",
