@@ -9,10 +9,8 @@ import signal
 import socket
 import threading
 import time
-from collections import deque
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -40,9 +38,10 @@ OUTPUT_WAIT_S = 60.0
 """Longest wait, seconds, for an output that another task may still be writing."""
 TASKS_AHEAD_PER_CORE = 4
 """Tasks per core that Ray is given at a time."""
-CONNECT_TIMEOUT_S, TERMINATE_TIMEOUT_S, NODE_POLL_S = 10.0, 30.0, 2.0
+CONNECT_TIMEOUT_S, TERMINATE_TIMEOUT_S = 10.0, 30.0
 HEAD = ("node", "", "done", "failed", "s of work")
 HERE, LOST = "there", "lost"
+LOST_TASK = f"it was lost {MAX_RESTARTS + 1} times"
 
 
 def _run_on_node(line: str, version: str, folder: str, exclusive: bool) -> JobResult:
@@ -69,35 +68,6 @@ def _run_on_node(line: str, version: str, folder: str, exclusive: bool) -> JobRe
 _run_on_node.__module__ = "__main__"  # so that it is sent by value
 
 
-@dataclass(slots=True)
-class _RayTask:
-    """A task that waits for Ray, or runs there.
-
-    Parameters
-    ----------
-    line, exclusive
-        As `RayExecutor.submit` takes them.
-    future
-        Future of the result.
-    tries
-        Number of nodes that were tried.
-    until_s
-        End of the wait for an output that is being written.
-    not_before_s
-        Earliest start.
-    node
-        Id of the preferred node; empty: any.
-    """
-
-    line: str
-    exclusive: bool
-    future: Future[JobResult] = field(default_factory=Future)
-    tries: int = 1
-    until_s: float = 0.0
-    not_before_s: float = 0.0
-    node: str = ""
-
-
 class RayExecutor:
     """A cluster, for as many tasks at a time as it has cores.
 
@@ -119,15 +89,13 @@ class RayExecutor:
         _connect(address)
         self._refuse_other_versions()
         self.workers = max(1, int(ray.cluster_resources().get("CPU", 1)))
-        self._waiting: deque[_RayTask] = deque()
-        self._running: dict[Any, _RayTask] = {}
+        self._threads = ThreadPoolExecutor(TASKS_AHEAD_PER_CORE * self.workers)
+        self._running: set[Any] = set()
         self._by_node: dict[str, tuple[int, int, float]] = {}
         self._known: dict[str, tuple[str, str]] = {}
         self._lock = threading.Lock()
-        self._update_nodes()
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run_loop, daemon=True)
-        self._thread.start()
+        self.list_nodes()
 
     def __enter__(self) -> Self:
         return self
@@ -138,44 +106,36 @@ class RayExecutor:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._over.set()
-        self._thread.join()
+        with self._lock:
+            self._over.set()
+        self._threads.shutdown(wait=False, cancel_futures=True)
         with suppress(RayError, ConnectionError):
             if self._running:
                 _cancel_tasks(list(self._running))
-            self._update_nodes()
+        self._threads.shutdown()
+        rows = self.list_nodes()[1:]
         ray.shutdown()
-        for name, state, done, bad, work_s in self.list_nodes()[1:]:
+        for name, state, done, bad, work_s in rows:
             gone = ", lost" if state == LOST else ""
             say(f"node {name}: {done} done, {bad} failed, {work_s:.1f} s of work{gone}")
 
     def list_nodes(self) -> Lines:
         """Return name, state, tasks done and failed, and seconds of work of each node."""
         with self._lock:
+            with suppress(RayError, ConnectionError):
+                for node in ray.nodes():
+                    name, told = node["NodeID"], node["NodeManagerHostname"]
+                    if node["Alive"] or name in self._known:  # others were lost before this run
+                        self._known[name] = told, HERE if node["Alive"] else LOST
             rows = [
                 (f"{name} ({node[:6]})", state, *self._by_node.get(node, (0, 0, 0.0)))
                 for node, (name, state) in self._known.items()
             ]
         return [HEAD, *rows]
 
-    def _update_nodes(self) -> None:
-        """Update the list of living and lost nodes."""
-        found = {
-            node["NodeID"]: (node["NodeManagerHostname"], HERE if node["Alive"] else LOST)
-            for node in ray.nodes()
-        }
-        with self._lock:
-            # Nodes that were lost before this run are left out.
-            self._known = {
-                node: told for node, told in found.items() if told[1] == HERE or node in self._known
-            }
-
     def submit(self, job: str, *, exclusive: bool) -> Future[JobResult]:
         """Return the future of a job's result; see `ProcessPool.submit`."""
-        given = _RayTask(job, exclusive)
-        with self._lock:
-            self._waiting.append(given)
-        return given.future
+        return self._threads.submit(self._run_job, job, exclusive)
 
     def _refuse_other_versions(self) -> None:
         here = [node["NodeID"] for node in ray.nodes() if node["Alive"]]
@@ -185,84 +145,40 @@ class RayExecutor:
                 ray.shutdown()
                 raise ClusterError(answer["error"])
 
-    def _run_loop(self) -> None:
-        """Start waiting tasks and deliver results, until the end."""
-        looked_s = time.monotonic()
-        while not self._over.is_set():
-            try:
-                if time.monotonic() > looked_s + NODE_POLL_S:
-                    self._update_nodes()
-                    looked_s = time.monotonic()
-                self._start_waiting()
-                ready = self._wait_for_results()
-            except (RayError, ConnectionError) as e:
-                return self._fail_all(e)
-            for ref in ready:
-                self._deliver(self._running.pop(ref), ref)
-        return None
-
-    def _start_waiting(self) -> None:
-        now_s = time.monotonic()
-        with self._lock:
-            for _ in range(len(self._waiting)):
-                if len(self._running) >= TASKS_AHEAD_PER_CORE * self.workers:
-                    return
-                given = self._waiting.popleft()
-                if given.not_before_s > now_s:
-                    self._waiting.append(given)
+    def _run_job(self, job: str, exclusive: bool) -> JobResult:
+        """Run a job until it is done, or no other try can help."""
+        node, tries, until_s = "", 1, 0.0
+        while True:
+            answer = self._run_once(job, node, exclusive=exclusive)
+            until_s = until_s or time.monotonic() + OUTPUT_WAIT_S
+            retry, own = answer.get("retry"), answer.pop("node", "")
+            if retry == "later" and time.monotonic() < until_s and not self._over.wait(0.5):
+                continue
+            if retry == "elsewhere" and tries < MAX_NODES_TRIED:
+                node, tries = _find_other_node(own), tries + 1
+                if node:
                     continue
-                task = _build_task(given.node, exclusive=given.exclusive)
-                ref = task.remote(given.line, __version__, str(Path.cwd()), given.exclusive)
-                self._running[ref] = given
-
-    def _wait_for_results(self) -> list[Any]:
-        if not self._running:
-            time.sleep(0.02)
-            return []
-        found: list[Any] = ray.wait(list(self._running), timeout=0.1)[0]
-        return found
-
-    def _deliver(self, given: _RayTask, ref: Any) -> None:
-        try:
-            answer: JobResult = ray.get(ref)
-        except RayError as e:
-            why = str(e).strip().splitlines()[0]
-            answer = {"error": f"it was lost {MAX_RESTARTS + 1} times ({type(e).__name__}: {why})"}
-        if self._retry(given, answer):
-            return
-        if node := answer.pop("node", ""):
             seconds, bad = answer.pop("seconds", 0.0), int(has_failed(answer))
             with self._lock:
-                done, worse, work_s = self._by_node.get(node, (0, 0, 0.0))
-                self._by_node[node] = (done + 1 - bad, worse + bad, work_s + seconds)
-        given.future.set_result(answer)
+                done, worse, work_s = self._by_node.get(own, (0, 0, 0.0))
+                self._by_node[own] = (done + 1 - bad, worse + bad, work_s + seconds)
+            return answer
 
-    def _retry(self, given: _RayTask, answer: JobResult) -> bool:
-        """Return whether a task is tried again: an output was busy, or its node failed."""
-        now_s = time.monotonic()
-        given.until_s = given.until_s or now_s + OUTPUT_WAIT_S
-        match answer.get("retry"):
-            case "later" if now_s < given.until_s:
-                given.not_before_s = now_s + 0.5
-            case "elsewhere" if given.tries < MAX_NODES_TRIED and (
-                node := _find_other_node(answer["node"])
-            ):
-                given.tries, given.node = given.tries + 1, node
-            case _:
-                return False
-        with self._lock:
-            self._waiting.append(given)
-        return True
-
-    def _fail_all(self, error: Exception) -> None:
-        """Fail all tasks: the cluster is lost."""
-        why = (str(error).strip().splitlines() or [""])[0]
-        with self._lock:
-            given = [*self._running.values(), *self._waiting]
-            self._running.clear()
-            self._waiting.clear()
-        for one in given:
-            one.future.set_result({"error": f"the cluster is lost ({type(error).__name__}: {why})"})
+    def _run_once(self, job: str, node: str, *, exclusive: bool) -> JobResult:
+        """Run a job on one node. Ray repeats it if that node dies."""
+        try:
+            with self._lock:
+                if self._over.is_set():
+                    raise RuntimeError("no task begins any more")
+                task = _build_task(node, exclusive=exclusive)
+                ref = task.remote(job, __version__, str(Path.cwd()), exclusive)
+                self._running.add(ref)
+            answer: JobResult = ray.get(ref)
+            self._running.discard(ref)
+            return answer
+        except (RayError, ConnectionError) as e:
+            lost = "the cluster is lost" if isinstance(e, ConnectionError) else LOST_TASK
+            return {"error": f"{lost} ({type(e).__name__}: {str(e).strip().partition(chr(10))[0]})"}
 
 
 def _build_task(node: str, *, exclusive: bool, cores: float = 1) -> Any:

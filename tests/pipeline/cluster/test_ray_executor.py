@@ -225,18 +225,17 @@ def test_job_that_fails_on_one_node_is_retried_elsewhere(nodes: Nodes, tmp_path:
     """A full disk is one node's: the answer says that another may do it."""
     nodes.whole()
     with open_executor("ray", None) as crew:
-        again = crew._again  # type: ignore[attr-defined]
-        seen = []
+        run_once = crew._run_once  # type: ignore[attr-defined]
+        seen: list[str] = []
 
-        def watched(given: Any, answer: Any) -> bool:
-            if not seen:
-                seen.append(answer["node"])
-                answer = {"error": "no space left", "retry": "elsewhere", "node": answer["node"]}
-            else:
-                seen.append(answer["node"])
-            return bool(again(given, answer))
+        def watched(*given: Any, **named: Any) -> Any:
+            seen.append(run_once(*given, **named)["node"])
+            if len(seen) == 1:
+                (tmp_path / "b.mcap").unlink()
+                return {"error": "no space left", "retry": "elsewhere", "node": seen[0]}
+            return {"result": 1, "node": seen[1]}
 
-        crew._again = watched  # type: ignore[attr-defined]
+        crew._run_once = watched  # type: ignore[attr-defined]
         source = record(tmp_path / "a.mcap")
         line = build_job(
             "trim", tmp_path / "b.mcap", {"recording": source}, {"to_s": 1.0}, keep=True
