@@ -26,7 +26,6 @@ from dmrl.recording.checks.scan import (
 )
 from dmrl.recording.checks.unit_checks import check_periods
 from dmrl.recording.loaded import LoadedRecording
-from dmrl.recording.mcap.message_batch import Ints
 from dmrl.terminal.progress import say
 from dmrl.topics import CALIBRATION, CAMERA_IMAGE, find_topic, parse_topic
 
@@ -55,27 +54,15 @@ def check(path: Path, *, quick: bool = False, values: bool = False) -> list[Find
     RecordingError
         If the file is not a complete recording.
     """
-    rules: tuple[Callable[[CheckData], Iterator[Finding]], ...] = (
-        _check_times,
-        _check_clocks,
-        _check_units,
-        check_labels,
-    )
     data = collect_from_index(LoadedRecording(path, *KEPT_TOPICS)) if quick else collect(path)
     if quick and values:
         collect_values(data)
-    if not quick:
-        rules = (
-            _check_types,
-            _check_times,
-            _check_clocks,
-            _check_units,
-            _check_images,
-            _check_calibrations,
-            check_labels,
-            check_causes,
-        )
-    findings = [finding for rule in rules for finding in rule(data)]
+    findings = [
+        finding
+        for rule, of_times_and_labels in RULES.items()
+        if of_times_and_labels or not quick
+        for finding in rule(data)
+    ]
     if data.contents.summary.contradiction:
         findings.append(Finding("warning", "", data.contents.summary.contradiction))
     if not data.contents.summary.count:
@@ -133,45 +120,30 @@ def _check_times(data: CheckData) -> Iterator[Finding]:
     """Report times that go back or repeat in the file, and gaps in periodic topics."""
     for topic, time_ns in data.times.items():
         step_ns = np.diff(time_ns)
-        if (back := step_ns[step_ns < 0]).size:
-            yield Finding(
-                "warning",
-                topic,
-                f"{back.size} messages go back in time, by up to {-back.min() / 1e9:.3f} s",
-            )
+        back, ahead = step_ns[step_ns < 0], step_ns[step_ns > 0]
+        if back.size:
+            text = f"{back.size} messages go back in time, by up to {-back.min() / 1e9:.3f} s"
+            yield Finding("warning", topic, text)
         if repeated := int((step_ns == 0).sum()):
             yield Finding("warning", topic, f"{repeated} messages repeat the time before them")
-        yield from _check_gaps(topic, step_ns[step_ns > 0])
+        period_s = float(np.median(ahead)) / 1e9 if ahead.size >= GAP_PERIODS else np.inf
+        gaps = ahead[ahead > max(GAP_PERIODS * period_s, GAP_MIN_S) * 1e9] / 1e9
+        if gaps.size:
+            text = f"{gaps.size} gaps, the longest {gaps.max():.3f} s; the usual period"
+            yield Finding("warning", topic, f"{text}: {period_s:.3f} s")
 
 
-def _check_clocks(data: CheckData) -> Iterator[Finding]:
-    """Report clocks that do not fit together."""
-    return (Finding("warning", topic, text) for topic, text in check_clocks(data))
-
-
-def _check_units(data: CheckData) -> Iterator[Finding]:
-    """Report values and times that contradict the unit, frame or sign of their topic."""
+def _check_signals(data: CheckData) -> Iterator[Finding]:
+    """Report clocks that do not fit, and values that contradict the unit or sign of their topic."""
     for topic, text in (
-        *data.magnitudes.find_not_finite_fields(),
-        *data.magnitudes.find_implausible_fields(),
+        *check_clocks(data),
+        *data.values.find_not_finite_fields(),
+        *data.values.find_implausible_fields(),
         *check_periods(data.times),
         *data.motion.find_contradictions(),
         *data.images.find_blind_cameras(),
     ):
         yield Finding("warning", topic, text)
-
-
-def _check_gaps(topic: str, step_ns: Ints) -> Iterator[Finding]:
-    if step_ns.size < GAP_PERIODS:
-        return
-    period_s = float(np.median(step_ns)) / 1e9
-    gaps = step_ns[step_ns > max(GAP_PERIODS * period_s, GAP_MIN_S) * 1e9] / 1e9
-    if gaps.size:
-        yield Finding(
-            "warning",
-            topic,
-            f"{gaps.size} gaps, the longest {gaps.max():.3f} s; the usual period: {period_s:.3f} s",
-        )
 
 
 def _check_images(data: CheckData) -> Iterator[Finding]:
@@ -192,23 +164,19 @@ def _check_sizes(
 ) -> Iterator[Finding]:
     if unreadable := sizes.pop(None, 0):
         first_ns = ", ".join(f"{ns} ns" for ns in sorted(data.undecodable_ns[topic])[:3])
-        yield Finding(
-            "error", topic, f"{unreadable} messages contain no readable image: {first_ns}"
-        )
+        text = f"{unreadable} messages contain no readable image: {first_ns}"
+        yield Finding("error", topic, text)
     listed = ", ".join(f"{w}x{h}" for w, h in sorted(k for k in sizes if k))
     if len(sizes) > 1:
         yield Finding("warning", topic, f"images of {len(sizes)} sizes: {listed}")
     if calibration_topic not in data.times or calibration_topic in data.broken or not sizes:
         return
     table = data.contents.get_table(calibration_topic, ["width", "height"])
-    calibrated_sizes = set(
-        zip(table["width"].to_pylist(), table["height"].to_pylist(), strict=True)
-    )
-    if calibrated_sizes and not calibrated_sizes & sizes.keys():
-        width, height = sorted(calibrated_sizes)[0]
-        yield Finding(
-            "error", topic, f"images of {listed}, but the calibration is for {width}x{height}"
-        )
+    calibrated = set(zip(table["width"].to_pylist(), table["height"].to_pylist(), strict=True))
+    if calibrated and not calibrated & sizes.keys():
+        width, height = min(calibrated)
+        text = f"images of {listed}, but the calibration is for {width}x{height}"
+        yield Finding("error", topic, text)
 
 
 def _check_calibrations(data: CheckData) -> Iterator[Finding]:
@@ -223,3 +191,15 @@ def _check_calibrations(data: CheckData) -> Iterator[Finding]:
             if why := find_calibration_fault(width_px, height_px, k, d):
                 yield Finding("error" if any(k) else "warning", topic, why)
                 break
+
+
+RULES: dict[Callable[[CheckData], Iterator[Finding]], bool] = {
+    _check_types: False,
+    _check_times: True,
+    _check_signals: True,
+    _check_images: False,
+    _check_calibrations: False,
+    check_labels: True,
+    check_causes: False,
+}
+"""Rules, in the order of their findings, and whether each belongs to a quick check."""

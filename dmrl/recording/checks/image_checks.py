@@ -25,11 +25,8 @@ DARK_MAX, PLAIN_MAX = 16, 4
 class ImageSamples:
     """Samples of the images of each camera."""
 
-    seen: Counter[str] = field(default_factory=Counter)
-    repeated: Counter[str] = field(default_factory=Counter)
-    decoded: Counter[str] = field(default_factory=Counter)
-    dark: Counter[str] = field(default_factory=Counter)
-    plain: Counter[str] = field(default_factory=Counter)
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
+    """Images by topic and what they are: seen, repeated, decoded, black, of one colour."""
     last_crc: dict[str, int] = field(default_factory=dict)
 
     def add_batch(self, topic: str, batch: pa.RecordBatch, total: int) -> None:
@@ -38,29 +35,29 @@ class ImageSamples:
         for value in batch["data"]:
             data = value.as_buffer()
             crc = zlib.crc32(data)
-            self.repeated[topic] += self.last_crc.get(topic) == crc
+            self.counts[topic, "repeated"] += self.last_crc.get(topic) == crc
             self.last_crc[topic] = crc
-            if total >= IMAGES_MIN and self.seen[topic] % every == 0:
+            if total >= IMAGES_MIN and self.counts[topic, "seen"] % every == 0:
                 self._look_at(topic, data.to_pybytes())
-            self.seen[topic] += 1
+            self.counts[topic, "seen"] += 1
 
     def _look_at(self, topic: str, data: bytes) -> None:
         try:
             low, high = np.percentile(decode(data)[::2, ::2], (1, 99))
         except DmrlError:
             return  # images that cannot be decoded are another finding
-        self.decoded[topic] += 1
-        self.dark[topic] += bool(high <= DARK_MAX)
-        self.plain[topic] += bool(DARK_MAX < high <= low + PLAIN_MAX)
+        self.counts[topic, "decoded"] += 1
+        self.counts[topic, "black"] += bool(high <= DARK_MAX)
+        self.counts[topic, "of one colour"] += bool(DARK_MAX < high <= low + PLAIN_MAX)
 
     def find_blind_cameras(self) -> Iterator[tuple[str, str]]:
         """Yield topic and text for each camera that is frozen, or sees nothing."""
-        for topic, count in self.seen.items():
-            if count < IMAGES_MIN:
-                continue
-            if self.repeated[topic] > FROZEN_SHARE * count:
-                yield topic, f"{self.repeated[topic]} of {count} images repeat the one before them"
-            looked = self.decoded[topic]
-            for what, found in (("black", self.dark[topic]), ("of one colour", self.plain[topic])):
-                if looked and found > BLIND_SHARE * looked:
+        for topic in self.last_crc:
+            seen, repeated, looked = (
+                self.counts[topic, what] for what in ("seen", "repeated", "decoded")
+            )
+            if seen >= IMAGES_MIN and repeated > FROZEN_SHARE * seen:
+                yield topic, f"{repeated} of {seen} images repeat the one before them"
+            for what in ("black", "of one colour"):
+                if (found := self.counts[topic, what]) > BLIND_SHARE * looked:
                     yield topic, f"{found} of {looked} images looked at are {what}. Is it covered?"

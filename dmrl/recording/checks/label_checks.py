@@ -52,7 +52,7 @@ def check_labels(data: CheckData) -> Iterator[Finding]:
         for source in sorted(set(peers["source"].to_pylist())):
             labels = _build_labels(source, peers.filter(pc.equal(peers["source"], source)), size_px)
             yield from (Finding("error", topic, text) for text in _check_pixels(labels))
-            for rule in (_check_size, _check_plausibility, _check_boxes):
+            for rule in (_check_plausibility, _check_boxes):
                 yield from (Finding("warning", topic, text) for text in rule(labels))
 
 
@@ -104,10 +104,8 @@ def check_causes(data: CheckData) -> Iterator[Finding]:
         for causes in data.contents.get_table(topic)["causes"].to_pylist():
             for one in causes:
                 owner = f"{one['robot']}'s " if one["robot"] else ""
-                text = (
-                    f"{owner}{one['name']}, {one['probability']:.0%}, "
-                    f"{one['from_s']:.0f} to {one['to_s']:.0f} s"
-                )
+                span = f"{one['from_s']:.0f} to {one['to_s']:.0f} s"
+                text = f"{owner}{one['name']}, {one['probability']:.0%}, {span}"
                 both = "-".join(sorted(parts.values()))
                 # Both directions of a pair have the same causes.
                 found.setdefault(f"{both}: {text}", (one["probability"], topic))
@@ -121,13 +119,10 @@ def _check_images(data: CheckData, topic: str, image: str, table: pa.Table) -> I
         if not any(parse_topic(DETECTIONS, name) for name in data.times):
             yield Finding("error", topic, f"labels without any image on {image}")
         return
-    without_image = int((~np.isin(table["log_time"].to_numpy(), data.times[image])).sum())
-    if without_image:
-        yield Finding(
-            "error",
-            topic,
-            f"{without_image} of {table.num_rows} messages have no image at their time",
-        )
+    alone = int((~np.isin(table["log_time"].to_numpy(), data.times[image])).sum())
+    if alone:
+        text = f"{alone} of {table.num_rows} messages have no image at their time"
+        yield Finding("error", topic, text)
 
 
 def _find_image_size(data: CheckData, robot: str) -> tuple[int, int] | None:
@@ -141,8 +136,7 @@ def _find_image_size(data: CheckData, robot: str) -> tuple[int, int] | None:
 
 def _flatten_peers(peers: pa.ChunkedArray) -> pa.Table:
     """Return a table with one row per peer and source."""
-    flat = pc.list_flatten(peers)
-    return pa.table({f.name: pc.struct_field(flat, f.name) for f in flat.type})
+    return pa.Table.from_struct_array(pc.list_flatten(peers))
 
 
 def _check_pixels(labels: _Labels) -> Iterator[str]:
@@ -152,20 +146,15 @@ def _check_pixels(labels: _Labels) -> Iterator[str]:
         yield f"{wrong} {labels.name} have no pixel, or a depth that is not positive"
 
 
-def _check_size(labels: _Labels) -> Iterator[str]:
-    if labels.size_px is not None and (
-        outside := int((~is_inside(labels.uv, *labels.size_px)).sum())
-    ):
-        count, (width, height) = len(labels.uv), labels.size_px
-        yield f"{outside} of {count} {labels.name} lie outside the {width}x{height} image"
-
-
 def _check_plausibility(labels: _Labels) -> Iterator[str]:
-    """Report labels in the wrong unit."""
-    uv = labels.uv
+    """Report labels outside the image, or in the wrong unit."""
+    uv, size_px = labels.uv, labels.size_px
+    if size_px and (outside := int((~is_inside(uv, *size_px)).sum())):
+        size = "{}x{}".format(*size_px)
+        yield f"{outside} of {len(uv)} {labels.name} lie outside the {size} image"
     if len(uv) < DOUBT_LABELS_MIN:
         return
-    if labels.size_px is not None and ((uv >= 0) & (uv <= 1)).all():
+    if size_px and ((uv >= 0) & (uv <= 1)).all():
         yield f"{labels.name} all lie in the first pixel. Are they normalised?"
     if (depth_m := float(np.median(labels.depth_m))) > DEPTH_MAX_M:
         yield f"{labels.name} have a median depth of {depth_m:.0f} m. Is it in mm?"

@@ -59,41 +59,30 @@ class MotionSamples:
 
     def find_contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield topic and text for each signal that contradicts its robot's poses."""
-        of = {topic: _build_signal(parts) for topic, parts in self.parts.items()}
-        yield from _find_floor_ranges(of)
-        for topic, (_, values) in of.items():
-            if (
-                topics.parse_topic(topics.RANGE, topic)
-                and len(values) >= SAMPLES_MIN
-                and not np.ptp(values)
-            ):
-                yield topic, f"all ranges are {values[0, 0]:.3g} m. Does the sensor measure?"
-        for kind in (topics.VELOCITY, topics.ATTITUDE):
+        every = {topic: _build_signal(parts) for topic, parts in self.parts.items()}
+        of = {topic: signal for topic, signal in every.items() if len(signal[0]) >= SAMPLES_MIN}
+        yield from _check_ranges(of)
+        for kind, doubts in (
+            (topics.VELOCITY, _check_velocity),
+            (topics.ATTITUDE, _check_attitude),
+        ):
             for topic in sorted(topic for topic in of if topics.parse_topic(kind, topic)):
                 robot = topics.list_robots([topic], kind)[0]
                 pose = of.get(topics.TRUE_POSE(robot), of.get(topics.POSE(robot)))
-                if (
-                    pose is not None
-                    and len(pose[0]) >= SAMPLES_MIN
-                    and len(of[topic][0]) >= SAMPLES_MIN
-                ):
-                    doubts = _check_velocity if kind == topics.VELOCITY else _check_attitude
-                    yield from ((topic, text) for text in doubts(of[topic], _derive_motion(*pose)))
+                motion = {} if pose is None else _derive_motion(*pose)
+                yield from ((topic, text) for text in doubts(of[topic], motion))
 
 
-def _find_floor_ranges(of: Mapping[str, Signal]) -> Iterator[tuple[str, str]]:
-    """Yield ranges to a peer that are the height of the robot that measured them."""
-    for topic, ranges in sorted(of.items()):
+def _check_ranges(of: Mapping[str, Signal]) -> Iterator[tuple[str, str]]:
+    """Yield ranges that never change, or are the height of the robot that measured them."""
+    for topic, (time_s, range_m) in sorted(of.items()):
         names = topics.parse_topic(topics.RANGE, topic)
+        if names and not np.ptp(range_m):
+            yield topic, f"all ranges are {range_m[0, 0]:.3g} m. Does the sensor measure?"
         height = of.get(topics.HEIGHT(names["robot"])) if names else None
-        if (
-            names is None
-            or height is None
-            or len(ranges[0]) < SAMPLES_MIN
-            or len(height[0]) < SAMPLES_MIN
-        ):
+        if names is None or height is None:
             continue
-        near = np.abs(ranges[1] - _interpolate(height, ranges[0])) < FLOOR_NEAR_M
+        near = np.abs(range_m - _interpolate(height, time_s)) < FLOOR_NEAR_M
         if near.mean() > FLOOR_SHARE:
             text = f"{near.mean():.0%} of the ranges are the robot's own height"
             yield topic, f"{text}. Is it a range to the floor, and not to {names['peer']}?"
@@ -105,10 +94,9 @@ def _extract_rows(batch: pa.RecordBatch, fields: tuple[str, ...]) -> NDArray[np.
     if fields:
         columns += [batch[name].to_numpy(zero_copy_only=False) for name in fields]
     else:
-        pose = batch["pose"]
-        for part, axes in (("position", "xy"), ("orientation", "xyzw")):
-            inner = pose.field(part)
-            columns += [inner.field(axis).to_numpy(zero_copy_only=False) for axis in axes]
+        place, turn = (batch["pose"].field(part) for part in ("position", "orientation"))
+        axes = *(place.field(axis) for axis in "xy"), *(turn.field(axis) for axis in "xyzw")
+        columns += [axis.to_numpy(zero_copy_only=False) for axis in axes]
     return np.column_stack(columns).astype(float)
 
 
@@ -129,12 +117,11 @@ def _derive_motion(time_s: Array, pose: Array) -> Mapping[str, Signal]:
     angles = quaternion_to_euler(pose[:, 2:] / size[:, None])
     angles[:, 2] = np.unwrap(angles[:, 2])
     middle = np.arange(time_s[0] + SLOPE_WINDOW_S, time_s[-1] - SLOPE_WINDOW_S, SAMPLE_STEP_S)
-    before, after = (_interpolate((time_s, np.column_stack([pose[:, :2], angles])), middle + way)
-                     for way in (-SLOPE_WINDOW_S / 2, SLOPE_WINDOW_S / 2))  # fmt: skip
+    sides = middle[:, None] + np.array([-SLOPE_WINDOW_S, SLOPE_WINDOW_S])
+    held = time_s, np.column_stack([pose[:, :2], angles])
+    before, after = (_interpolate(held, (middle + side) / 2) for side in sides.T)
     slope, mean = (after - before) / SLOPE_WINDOW_S, (after + before) / 2
-    near = np.searchsorted(time_s, middle + SLOPE_WINDOW_S) - np.searchsorted(
-        time_s, middle - SLOPE_WINDOW_S
-    )
+    near = np.diff(np.searchsorted(time_s, sides), axis=1)[:, 0]
     dense = near >= 4  # not where motion capture lost the markers
     return {
         "velocity": (middle[dense], slope[dense, :2]),
@@ -191,14 +178,9 @@ def _check_attitude(measured: Signal, motion: Mapping[str, Signal]) -> Iterator[
         ("yaw_rate_radps", "positive to the left", TURNING_MIN_RADPS),
     )
     for k, (name, rule, least) in enumerate(names):
-        measured_part, true_part = (
-            measured_values[:, k] - measured_values[:, k].mean(),
-            true[:, k] - true[:, k].mean(),
-        )
-        if (
-            min(_rms(measured_part), _rms(true_part)) > least
-            and _correlate(measured_part, true_part) < -CORRELATION_LOW
-        ):
+        one, other = (part[:, k] - part[:, k].mean() for part in (measured_values, true))
+        opposite = _correlate(one, other) < -CORRELATION_LOW
+        if opposite and min(_rms(one), _rms(other)) > least:
             yield f"{name} has the opposite sign to the robot's poses: use {rule}, {ALIGN_HINT}"
 
 

@@ -12,7 +12,7 @@ from dmrl.errors import DmrlError, RecordingError
 from dmrl.images.codec import is_decodable, read_size
 from dmrl.recording.checks.image_checks import ImageSamples
 from dmrl.recording.checks.odometry_checks import MotionSamples
-from dmrl.recording.checks.unit_checks import FINITE_TOPICS, MagnitudeHistograms
+from dmrl.recording.checks.unit_checks import FINITE_TOPICS, ValueCounts
 from dmrl.recording.loaded import LoadedRecording
 from dmrl.recording.log_times import read_log_times
 from dmrl.recording.mcap.batch_reader import iter_batches_in_file_order, join_batches
@@ -52,8 +52,8 @@ class CheckData:
         Log times of the images that cannot be decoded, by topic.
     unset_stamps
         Messages with time stamp 0 and another log time, by topic.
-    magnitudes
-        Histograms of the sensor values.
+    values
+        Counts of the sensor values.
     motion
         Samples of odometry and poses.
     images
@@ -66,9 +66,16 @@ class CheckData:
     sizes: dict[str, Counter[ImageSize]] = field(default_factory=lambda: defaultdict(Counter))
     undecodable_ns: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
     unset_stamps: Counter[str] = field(default_factory=Counter)
-    magnitudes: MagnitudeHistograms = field(default_factory=MagnitudeHistograms)
+    values: ValueCounts = field(default_factory=ValueCounts)
     motion: MotionSamples = field(default_factory=MotionSamples)
     images: ImageSamples = field(default_factory=ImageSamples)
+
+    def add_batch(self, topic: str, batch: pa.RecordBatch, total: int) -> None:
+        """Add the values of a topic that has ``total`` messages."""
+        self.values.add_batch(topic, batch)
+        self.motion.add_batch(topic, batch)
+        if parse_topic(CAMERA_IMAGE, topic):
+            self.images.add_batch(topic, batch, total)
 
 
 def carries_own_type(topic: str, schema: str) -> bool:
@@ -121,20 +128,15 @@ def collect_from_index(contents: LoadedRecording) -> CheckData:
 def collect_values(data: CheckData) -> None:
     """Add the first values of sensors and poses, and samples of the first images, of each topic."""
     for topic, info in data.contents.topics.items():
-        own, total = carries_own_type(topic, info.schema), 0
+        own, seen = carries_own_type(topic, info.schema), 0
         is_image = parse_topic(CAMERA_IMAGE, topic) is not None
         if not own or not (is_image or any(parse_topic(p, topic) for p in FINITE_TOPICS)):
             continue
-        limit = FIRST_IMAGES if is_image else FIRST_VALUES
-        fields = ["data"] if is_image else None
+        limit, fields = (FIRST_IMAGES, ["data"]) if is_image else (FIRST_VALUES, None)
         for batch in iter_columns(data.contents.path, topic, fields=fields):
-            total += len(batch)
-            if is_image:
-                data.images.add_batch(topic, batch, min(info.count, limit))
-            else:
-                data.magnitudes.add_batch(topic, batch)
-                data.motion.add_batch(topic, batch)
-            if total >= limit:
+            seen += len(batch)
+            data.add_batch(topic, batch, min(info.count, limit))
+            if seen >= limit:
                 break
 
 
@@ -169,10 +171,8 @@ def _collect_from_messages(
     names = batch.schema.names
     if stamped and "timestamp" in names and pa.types.is_struct(batch["timestamp"].type):
         collected.unset_stamps[topic] += _count_unset_stamps(batch)
-    collected.magnitudes.add_batch(topic, batch)
-    collected.motion.add_batch(topic, batch)
+    collected.add_batch(topic, batch, collected.contents.topics[topic].count)
     if parse_topic(CAMERA_IMAGE, topic):
-        collected.images.add_batch(topic, batch, collected.contents.topics[topic].count)
         for time_ns, data in zip(batch["log_time"].to_pylist(), batch["data"], strict=True):
             size = _decode_size(data.as_buffer())
             collected.sizes[topic][size] += 1

@@ -4,11 +4,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from dmrl.recording.checks.unit_checks import MagnitudeHistograms, check_periods
+from dmrl.recording.checks.unit_checks import ValueCounts, check_periods
 
 
 def _doubted(topic: str, name: str, values: np.ndarray) -> list[tuple[str, str]]:
-    sizes = MagnitudeHistograms()
+    sizes = ValueCounts()
     for part in np.array_split(values, 3):
         sizes.add_batch(topic, pa.RecordBatch.from_pydict({name: pa.array(part)}))
     return [*sizes.find_not_finite_fields(), *sizes.find_implausible_fields()]
