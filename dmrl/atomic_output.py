@@ -9,9 +9,10 @@ reached the disk.
 import errno
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from dmrl.errors import FullDisk, OutputError
 from dmrl.guards.durability import clear_folder, sync, sync_entry
@@ -121,29 +122,8 @@ def atomic_file(path: Path, *, keep_on_error: bool = False) -> Iterator[Path]:
         If ``path`` exists, another process is writing it, or the system refuses a write.
     """
     refuse_existing(path)
-    if isinstance(path, RemotePath):
-        with _register_remote(path), upload_file(path) as local:
-            yield local
-        return
-    partial = to_partial_path(path)
-    with _translate_errors(path, partial):
-        descriptor, keep = None, keep_on_error
-        try:
-            descriptor = take_file(partial)  # inside try: Ctrl-C can come between any two lines
-            _register_output(path, partial)
-            yield partial
-            sync(partial)
-            _publish_file(partial, path)
-        except _NameTaken:
-            keep = True
-            raise
-        finally:
-            if descriptor is not None:
-                if not keep or is_same_file(path, descriptor):
-                    with suppress(OSError):  # it would hide the original error
-                        partial.unlink(missing_ok=True)
-                os.close(descriptor)
-                _ended_outputs.append(path)
+    with _write_partial(path, _FILE, fresh=True, keep_on_error=keep_on_error) as partial:
+        yield partial
 
 
 @contextmanager
@@ -157,22 +137,8 @@ def replace_file(path: Path) -> Iterator[Path]:
     OutputError
         If another process is writing it, or the system refuses a write.
     """
-    if isinstance(path, RemotePath):
-        with upload_file(path) as local:
-            yield local
-        return
-    partial = to_partial_path(path)
-    with _translate_errors(path, partial):
-        descriptor = take_file(partial)
-        try:
-            yield partial
-            sync(partial)
-            partial.replace(path)
-            sync_entry(path.parent)
-        finally:
-            with suppress(OSError):
-                partial.unlink(missing_ok=True)
-            os.close(descriptor)
+    with _write_partial(path, _REPLACED_FILE) as partial:
+        yield partial
 
 
 @contextmanager
@@ -196,28 +162,10 @@ def atomic_folder(
         If ``path`` exists, another process is writing it, or the system refuses a write.
     """
     refuse_existing(path)
-    if isinstance(path, RemotePath):
-        with _register_remote(path), upload_folder(path) as local:
-            yield local
-        return
-    partial = to_partial_path(path)
-    with _translate_errors(path, partial):
-        descriptor, keep = take_folder(partial), keep_on_error
-        try:
-            _register_output(path, partial)
-            if not resume:
-                clear_folder(partial)
-            yield partial
-            sync(partial)
-            _publish_folder(partial, path)
-        except _NameTaken:
-            keep = True
-            raise
-        finally:
-            if not keep:
-                shutil.rmtree(partial, ignore_errors=True)
-            os.close(descriptor)
-            _ended_outputs.append(path)
+    with _write_partial(path, _FOLDER, fresh=True, keep_on_error=keep_on_error) as partial:
+        if not resume and not isinstance(path, RemotePath):
+            clear_folder(partial)
+        yield partial
 
 
 @contextmanager
@@ -239,21 +187,78 @@ def extend_folder(path: Path, last: str) -> Iterator[Path]:
     OutputError
         If another process is writing it, or the system refuses a write.
     """
-    if isinstance(path, RemotePath):
-        with upload_into_folder(path, last) as local:
-            yield local
-        return
-    partial = to_partial_path(path)
-    with _translate_errors(path, partial):
-        descriptor = take_folder(partial)
-        try:
+
+    def move(partial: Path, path: Path) -> None:
+        _move_files(partial, path, last)
+
+    kind = _Kind(True, move, lambda remote: upload_into_folder(remote, last))
+    with _write_partial(path, kind) as partial:
+        if not isinstance(path, RemotePath):
             clear_folder(partial)
+        yield partial
+
+
+class _Kind(NamedTuple):
+    """Kind of output: file or folder, how it gets its name, and how it is uploaded to a bucket."""
+
+    is_folder: bool
+    publish: Callable[[Path, Path], object]
+    upload: Callable[[Any], AbstractContextManager[Path]]
+
+
+@contextmanager
+def _write_partial(
+    path: Path, kind: _Kind, *, fresh: bool = False, keep_on_error: bool = False
+) -> Iterator[Path]:
+    """Yield the partial path of an output; publish it if the block ends without an error.
+
+    Parameters
+    ----------
+    path
+        The final path.
+    kind
+        How to write it.
+    fresh
+        The name must be free, and the output is registered.
+    keep_on_error
+        Keep the partial path after an error.
+    """
+    if isinstance(path, RemotePath):
+        _started_outputs.extend([path] * fresh)
+        try:
+            with kind.upload(path) as local:
+                yield local
+        finally:
+            _ended_outputs.extend([path] * fresh)
+        return
+    partial, keep, descriptor = to_partial_path(path), keep_on_error, None
+    with _translate_errors(path, partial):
+        try:
+            # Inside try: Ctrl-C can come between any two lines.
+            descriptor = take_folder(partial) if kind.is_folder else take_file(partial)
+            if fresh:
+                _register_output(path, partial)
             yield partial
             sync(partial)
-            _move_files(partial, path, last)
+            kind.publish(partial, path)
+        except _NameTaken:
+            keep = True
+            raise
         finally:
-            shutil.rmtree(partial, ignore_errors=True)
-            os.close(descriptor)
+            if descriptor is not None:
+                if not keep or is_same_file(path, descriptor):
+                    _remove(partial)
+                os.close(descriptor)
+                _ended_outputs.extend([path] * fresh)
+
+
+def _remove(partial: Path) -> None:
+    """Remove a partial output. An error would hide the original one."""
+    if partial.is_dir():
+        shutil.rmtree(partial, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 def _move_files(partial: Path, path: Path, last: str) -> None:
@@ -268,16 +273,6 @@ def _move_files(partial: Path, path: Path, last: str) -> None:
     if files:
         (partial / last).replace(path / last)
         sync_entry(path)
-
-
-@contextmanager
-def _register_remote(path: Path) -> Iterator[None]:
-    """Register an output in a bucket as started, and as ended after the block."""
-    _started_outputs.append(path)
-    try:
-        yield
-    finally:
-        _ended_outputs.append(path)
 
 
 def _register_output(path: Path, partial: Path) -> None:
@@ -333,6 +328,12 @@ def _publish_file(partial: Path, path: Path) -> None:
         raise
 
 
+def _replace(partial: Path, path: Path) -> None:
+    """Give a complete file its name, in place of the file that has it."""
+    partial.replace(path)
+    sync_entry(path.parent)
+
+
 def _publish_folder(partial: Path, path: Path) -> None:
     """Give a complete folder its name; the system refuses if that is taken."""
     try:
@@ -346,3 +347,8 @@ def _publish_folder(partial: Path, path: Path) -> None:
     except BaseException:
         path.rename(partial)
         raise
+
+
+_FILE = _Kind(False, _publish_file, upload_file)
+_REPLACED_FILE = _Kind(False, _replace, upload_file)
+_FOLDER = _Kind(True, _publish_folder, upload_folder)
