@@ -6,7 +6,6 @@ upload is complete once the server reports its size and hash.
 """
 
 import hashlib
-import shutil
 import time
 from collections.abc import AsyncIterator
 from functools import partial
@@ -28,7 +27,6 @@ from dmrl.storage.server_answers import (
     wrong_bytes_error,
 )
 
-READ_STEP_BYTES = 8 << 20
 """Bytes per request when an object is copied."""
 PART_BYTES = 50 << 20
 """Size of the parts of an upload; an object has at most `PARTS` of them."""
@@ -78,20 +76,6 @@ class BucketFileSystem(S3FileSystem):  # type: ignore[misc]
             return await read_range(answer["Body"], found, start, end, f"s3://{path}")
         finally:
             answer["Body"].close()
-
-    async def _get_file(self, rpath: str, lpath: str, **_: Any) -> None:
-        """Copy one version of an object."""
-        info = await self._info(rpath)
-        size, version = int(info["size"]), {"ETag": info["ETag"]}
-        free = shutil.disk_usage(Path(lpath).parent).free
-        if size > free:
-            raise StorageError(
-                f"s3://{rpath} has {size} bytes, but only {free} are free. Free some"
-            )
-        with Path(lpath).open("wb") as out:
-            for start in range(0, size, READ_STEP_BYTES):
-                end = min(start + READ_STEP_BYTES, size)
-                out.write(await self._cat_file(rpath, start, end, version))
 
     async def _list_pages(self, method: str, **given: Any) -> AsyncIterator[dict[str, Any]]:
         """Yield the pages of a listing that makes progress, up to the limit of objects."""

@@ -7,6 +7,7 @@ that opens it by name (`os.fspath`) gets a local copy, which is kept until this 
 import hashlib
 import io
 import os
+import shutil
 import stat
 import tempfile
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from typing import Any
 from dmrl.errors import StorageError
 from dmrl.guards.paths import refuse_pipe
 from dmrl.guards.safe_names import safe_join, truncate
-from dmrl.storage.remote_stream import WHOLE_FILE_STEP_BYTES, RangeReader
+from dmrl.storage.remote_stream import RangeReader
 from dmrl.storage.system import get_filesystem, translate_errors
 
 SCHEMES = ("s3", "gs", "gcs", "az", "abfs", "http", "https")
@@ -179,10 +180,9 @@ class RemotePath(PosixPath):
             )
             if stored_hash and len(stored_hash) == 64:
                 return str(stored_hash)
-        digest, stream, at = hashlib.sha256(), self.open_ranges(), 0
-        while data := stream.fetch(at, WHOLE_FILE_STEP_BYTES):
-            digest.update(data)
-            at += len(data)
+        digest = hashlib.sha256()
+        for block in self.open_ranges().iter_blocks():
+            digest.update(block)
         return digest.hexdigest()
 
     def mkdir(self, *_: Any, **__: Any) -> None:
@@ -268,6 +268,11 @@ def _download(path: RemotePath) -> str:
         for part in () if is_file else one.parts[len(path.parts) :]:
             to = safe_join(to, part, f"{path}: a file")
         to.parent.mkdir(parents=True, exist_ok=True)
-        with translate_errors(str(one)):
-            get_filesystem(path.scheme).get_file(one.key, str(to))
+        stream, free = one.open_ranges(), shutil.disk_usage(to.parent).free
+        if stream.size > free:
+            raise StorageError(
+                f"{one} has {stream.size} bytes, but only {free} are free. Free some"
+            )
+        with to.open("wb") as out:
+            out.writelines(stream.iter_blocks())
     return str(place)

@@ -1,7 +1,7 @@
 """Read a remote file by byte ranges, fetching only the ranges that are read."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from dmrl.errors import StorageError
@@ -43,7 +43,7 @@ class RangeReader(io.RawIOBase):
     def __init__(self, system: Any, name: str, url: str, info: dict[str, Any]) -> None:
         super().__init__()
         self._system, self._name, self._url = system, name, url
-        self._size = int(info.get("size") or 0)
+        self.size = int(info.get("size") or 0)
         checks = getattr(system, "checks_version", False)
         self._more = {"version": get_version(info)} if checks else {}
         self._at = 0
@@ -54,6 +54,11 @@ class RangeReader(io.RawIOBase):
         """Register the next reads, in order, so that they are fetched in groups."""
         self._expected, self._prefetched = list(reversed(places)), {}
 
+    def iter_blocks(self) -> Iterator[bytes]:
+        """Yield the whole file, block by block."""
+        for start in range(0, self.size, WHOLE_FILE_STEP_BYTES):
+            yield self.fetch(start, WHOLE_FILE_STEP_BYTES)
+
     def should_fetch(self, start: int, size: int) -> bool:
         """Return whether a range should be fetched unbuffered: it is large, or registered."""
         place = start, size
@@ -62,7 +67,7 @@ class RangeReader(io.RawIOBase):
 
     def fetch(self, start: int, size: int) -> bytes:
         """Return the bytes of a range; fewer at the end of the file."""
-        size = max(0, min(size, self._size - start))
+        size = max(0, min(size, self.size - start))
         if not size:
             return b""
         place = start, size
@@ -119,7 +124,7 @@ class RangeReader(io.RawIOBase):
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
         """Move the stream position, and return it."""
-        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
+        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self.size}[whence]
         return self._at
 
     def tell(self) -> int:

@@ -36,10 +36,16 @@ def upload_file(path: RemotePath) -> Iterator[Path]:
     StorageError
         If the server cannot be reached, or refuses.
     """
-    with tempfile.TemporaryDirectory(prefix="dmrl-") as folder:
-        local = safe_join(Path(folder), path.name, f"{path}: its name")
+    with _make_local(path) as local:
         yield local
         _upload(local, path)
+
+
+@contextmanager
+def _make_local(path: RemotePath) -> Iterator[Path]:
+    """Yield a local path of the same name, which is removed after the block."""
+    with tempfile.TemporaryDirectory(prefix="dmrl-") as folder:
+        yield safe_join(Path(folder), path.name, f"{path}: its name")
 
 
 @contextmanager
@@ -53,8 +59,7 @@ def upload_folder(path: RemotePath) -> Iterator[Path]:
     StorageError
         If the server cannot be reached, or refuses. Uploaded files are then removed.
     """
-    with tempfile.TemporaryDirectory(prefix="dmrl-") as folder:
-        local = safe_join(Path(folder), path.name, f"{path}: its name")
+    with _make_local(path) as local:
         local.mkdir()
         yield local
         mark = path / UNFINISHED_MARK
@@ -80,8 +85,7 @@ def upload_into_folder(path: RemotePath, last: str) -> Iterator[Path]:
     StorageError
         If the server cannot be reached, or refuses.
     """
-    with tempfile.TemporaryDirectory(prefix="dmrl-") as folder:
-        local = safe_join(Path(folder), path.name, f"{path}: its name")
+    with _make_local(path) as local:
         local.mkdir()
         yield local
         files = [one.relative_to(local) for one in local.rglob("*") if one.is_file()]

@@ -4,24 +4,19 @@ fsspec reads the whole answer of a server into memory. Here an answer is read up
 requested size, and must be that range of the same version of the file.
 """
 
-import shutil
-from pathlib import Path
 from typing import Any
 
 from fsspec.implementations.http import HTTPFileSystem
 
 from dmrl.errors import StorageError
 from dmrl.storage.inner_addresses import RedirectGuard
-from dmrl.storage.remote_stream import get_version
 from dmrl.storage.server_answers import (
     build_timeout,
     changed_error,
     read_range,
-    read_up_to,
     wrong_bytes_error,
 )
 
-COPY_STEP_BYTES = 1 << 20
 """Bytes that are read at a time when a file is copied."""
 HTTP_PARTIAL_CONTENT = 206
 
@@ -70,30 +65,6 @@ class WebFileSystem(HTTPFileSystem):  # type: ignore[misc]
             _check_version(url, answer, version or {})
             found = answer.headers.get("Content-Range", "")
             return await read_range(answer.content, found, start, end, url)
-
-    async def _get_file(self, url: str, path: str, **_: Any) -> None:
-        """Copy a file of the size that the server reported."""
-        info = await self._info(url)
-        size, free = info["size"], shutil.disk_usage(Path(path).parent).free
-        if size > free:
-            raise StorageError(f"{url} has {size} bytes, but only {free} are free. Free some")
-        session = await self.set_session()
-        with Path(path).open("wb") as out:
-            async with session.get(
-                self.encode_url(url),
-                headers={"Accept-Encoding": "identity"},
-                timeout=build_timeout(size),
-            ) as answer:
-                self._raise_not_found_for_status(answer, url)
-                _check_version(url, answer, get_version(info))
-                left = size
-                while left and (
-                    data := await read_up_to(answer.content, min(left, COPY_STEP_BYTES), url)
-                ):
-                    out.write(data)
-                    left -= len(data)
-        if left:
-            raise wrong_bytes_error(url)
 
     async def _find(self, *_: Any, **__: Any) -> list[str]:
         """Return nothing: web pages with links are not folders, and could go on for ever."""

@@ -279,7 +279,7 @@ def test_bucket_bytes_beyond_the_request_are_not_read(
 def test_a_copy_of_an_object_that_is_replaced_is_refused(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dmrl.storage.bucket.READ_STEP_BYTES", 500)
+    monkeypatch.setattr("dmrl.storage.remote_stream.WHOLE_FILE_STEP_BYTES", 500)
     store.wrong = "replaced"
     store.objects["a.mcap"] += bytes(2_000)  # another than the copies before
     with pytest.raises(StorageError, match="changed while it was read"):

@@ -279,7 +279,7 @@ def test_addresses_of_machines_and_private_networks_are_inner(address: str, inne
         ("", None),
         ("endless", None),
         ("huge", "bytes, but only"),
-        ("short", "sent other bytes"),
+        ("short", None),  # only ranges are asked for
         ("changes", "changed while it was read"),
     ],
 )
