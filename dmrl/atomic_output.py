@@ -247,18 +247,11 @@ def _write_partial(
         finally:
             if descriptor is not None:
                 if not keep or is_same_file(path, descriptor):
-                    _remove(partial)
+                    shutil.rmtree(partial, ignore_errors=True)  # an error would hide another
+                    with suppress(OSError):
+                        partial.unlink(missing_ok=True)
                 os.close(descriptor)
                 _ended_outputs.extend([path] * fresh)
-
-
-def _remove(partial: Path) -> None:
-    """Remove a partial output. An error would hide the original one."""
-    if partial.is_dir():
-        shutil.rmtree(partial, ignore_errors=True)
-    else:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
 
 
 def _move_files(partial: Path, path: Path, last: str) -> None:

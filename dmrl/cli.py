@@ -7,7 +7,6 @@ act on become one line and exit status 1.
 import gc
 import sys
 from collections.abc import Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NoReturn, get_args, get_origin
 
@@ -25,6 +24,7 @@ from rich.console import Console
 from rich.text import Text
 
 from dmrl import __version__, boundary, entry_points
+from dmrl.errors import suggest
 from dmrl.guards.numeric_threads import set_one_blas_thread
 from dmrl.guards.safe_names import truncate_middle
 from dmrl.guards.temporary_folder import use_own_temporary_folder
@@ -32,42 +32,6 @@ from dmrl.storage import to_path
 from dmrl.terminal import help_pages
 from dmrl.terminal.signals import end_on_signal
 
-# In the order of the work. The help line is the first line of the function's docstring;
-# it stands here too so that `dmrl --help` loads nothing (a test holds the two together).
-COMMANDS = {
-    "demo": "Run the whole pipeline, small, on a flight that ships and on pictures it draws.",
-    "run": "Run the steps of a pipeline recipe whose outputs are not up to date, side by side.",
-    "doctor": "List packages, programs and devices that dmrl uses, and how to get missing ones.",
-    "record": "Record logs and images of flying Crazyflies, until Ctrl-C.",
-    "convert": "Convert a foreign file or folder into a recording, or a recording into files.",
-    "fly": "Simulate a flight of robots that measure themselves and each other.",
-    "render": "Render images of robots with exact labels, as a recipe says, into a recording.",
-    "sketch": "Draw a folder of pictures of small drones, with exact labels.",
-    "likeness": "Fit a render recipe to your own frames, and show both side by side.",
-    "fake-drone": "Send a simulated flight as Crazyflies and AI-decks do, to try record with.",
-    "calibrate": "Calibrate cameras by boards or flights, and other sensors by several flights.",
-    "align": "Synchronise clocks by ranges of pairs, by images, or by motion capture.",
-    "label": "Find every robot's peers from ranges and odometry, and label the images with them.",
-    "dataset": "Build an Arrow dataset and its card from recordings.",
-    "train": "Train a network on a dataset.",
-    "predict": "Run a network on every image of a recording.",
-    "track": "Follow detected peers over time: 3D tracks with covariance.",
-    "evaluate": "Evaluate detections against labels; tracks and positions against the truth.",
-    "score": "Score a submission to the benchmark over the sealed seeds.",
-    "quantize": "Quantise a network to int8, and measure the loss of accuracy.",
-    "export": "Write a network as ONNX and as C.",
-    "verify": "Prove that the C of an export computes the int8 network, bit for bit.",
-    "view": "Show recordings in rerun, or save them as an .rrd file or a picture.",
-    "report": "Show the results in a folder as one HTML page that needs nothing else.",
-    "info": "Show the contents and the origin of a recording.",
-    "check": "Check a recording: schemas, times, gaps, calibration, labels.",
-    "index": "List the recordings of a folder in catalogue.parquet, for dmrl find.",
-    "find": "Find recordings by their contents: the table of dmrl index, queried in SQL.",
-    "recover": "Recover the messages of a damaged or unfinished recording.",
-    "merge": "Merge recordings into one, by time.",
-    "trim": "Cut a time range out of a recording, or keep some of its topics.",
-    "card": "Write a dataset's card and figures again; text below its last line is kept.",
-}
 GROUPS = {
     "Start": ("demo", "run", "doctor"),
     "Make recordings": ("record", "convert", "fly", "render", "sketch", "likeness", "fake-drone"),
@@ -78,7 +42,8 @@ GROUPS = {
     "Files": ("recover", "merge", "trim"),
     "Share": ("card",),
 }
-"""Commands by what they are for. One that is in no group is listed last."""
+"""Commands by what they are for, in the order of the work."""
+COMMANDS = tuple(name for names in GROUPS.values() for name in names)
 COMPLETION = "--install-completion"
 
 
@@ -91,11 +56,8 @@ def format_usage_error(error: CycloptsError) -> Text:
         return Text(f"dmrl: {truncate_middle(str(error))}")
     # The error's own text would load every command, and fail where an extra is missing.
     word = error.unused_tokens[0]
-    near = get_close_matches(
-        word, [*COMMANDS, *entry_points.find_plugins(entry_points.STAGES)], n=1
-    )
-    hint = f"Did you mean {near[0]}?" if near else "Try: dmrl --help"
-    return Text(f"dmrl: no command {word}. {hint}")
+    known = [*COMMANDS, *entry_points.find_plugins(entry_points.STAGES)]
+    return Text(f"dmrl: no command {word}. {suggest(word, known, 'Try: dmrl --help')}")
 
 
 def convert_strictly(kind: Any, tokens: Sequence[Token] | Sequence[str]) -> Any:
@@ -134,12 +96,11 @@ app = App(
 app.register_install_completion_command(
     name=COMPLETION, help="Have the shell (bash, zsh, fish) complete commands, flags and choices."
 )
-_groups: dict[str, Group] = {}
 for _place, (_title, _names) in enumerate(GROUPS.items()):
-    _groups |= dict.fromkeys(_names, Group(_title, sort_key=_place))
-for _order, (_name, _help) in enumerate(COMMANDS.items()):
-    _run = f"dmrl.stages.{_name.replace('-', '_')}:command"
-    app.command(_run, name=_name, help=_help, group=_groups.get(_name), sort_key=_order)
+    _group = Group(_title, sort_key=_place)
+    for _name in _names:  # its line of help is the first one of its docstring
+        _run = f"dmrl.stages.{_name.replace('-', '_')}:command"
+        app.command(_run, name=_name, group=_group, sort_key=COMMANDS.index(_name))
 
 
 def add_plugin_commands() -> App:
@@ -163,6 +124,8 @@ def main() -> NoReturn:
     name, *words = sys.argv[1:] or [""]
     if name not in COMMANDS:
         add_plugin_commands()
+    for one in COMMANDS if name in ("--help", "-h") or not sys.argv[1:] else ():
+        app[one]  # is loaded for its line of help
     wants_help = name in COMMANDS and not set(app.help_flags).isdisjoint(words)
     status = boundary.run_to_status((lambda: print_help(name)) if wants_help else app)
     end_on_signal(boundary.describe_interrupt)  # what libraries do at exit loses an exception

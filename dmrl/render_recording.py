@@ -4,10 +4,10 @@ import json
 from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from dmrl import recipe as recipes
 from dmrl import topics
@@ -44,7 +44,8 @@ PREVIEW_SAMPLES = 64
 """Samples of a pixel of a preview."""
 
 
-class Rendered(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Rendered:
     """Numbers of images, labels, images without a label, broken photos and resumed images."""
 
     images: int

@@ -6,7 +6,6 @@ docs/add-a-format.md.
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -14,7 +13,7 @@ from pkgutil import walk_packages
 
 from dmrl import entry_points, formats
 from dmrl.entry_points import Plugin
-from dmrl.errors import PluginError, SourceError
+from dmrl.errors import PluginError, SourceError, suggest
 from dmrl.formats.base import Content, Format, Options
 from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say
@@ -76,9 +75,9 @@ def find_format(source: Path, name: str | None = None) -> Format:
     if name in added:
         return _load_plugin_format(added[name])
     if name is not None and name not in load_builtin_formats():
-        near = get_close_matches(name, [*load_builtin_formats(), *added], n=1)
-        hint = f"Did you mean {near[0]}? " if near else ""
-        raise SourceError(f"--from {name}: no such format. {hint}Formats: {known}")
+        hint = suggest(name, [*load_builtin_formats(), *added], "")
+        words = f"--from {name}: no such format.", hint, f"Formats: {known}"
+        raise SourceError(" ".join(filter(None, words)))
     if name is not None:
         return load_builtin_formats()[name]
     if source.is_file() and source.stat().st_size == 0:

@@ -5,7 +5,6 @@ All faults are found and reported in one line, before anything runs.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path, PurePosixPath
@@ -13,18 +12,19 @@ from types import MappingProxyType
 from typing import Any
 
 from dmrl import recipe as recipes
-from dmrl.errors import RecipeError, UnsafeName
+from dmrl.errors import RecipeError, UnsafeName, suggest
 from dmrl.evaluation import figure_specs
 from dmrl.geometry.camera_file import NAMED_CAMERAS
 from dmrl.guards.safe_names import check_file_name
 from dmrl.learn import pretrained
-from dmrl.pipeline.recipe_language import expand_steps
+from dmrl.pipeline.recipe_language import expand_steps, iter_strings
 from dmrl.pipeline.stage_signature import StageSignature, signature_of
 from dmrl.simulation.settings import NAMED_EYES
 
 RECIPE_KEYS = ("kind", "each", "defaults", "step", figure_specs.TITLE_KEY, figure_specs.FIGURE_KEY)
 STEP_KEYS = ("stage", "out", "optional", "recipe")
 DATA = "{data}"
+OTHER_SOURCE = "Name a step's out, or {data}/..."
 SUBMITTED = ("network", "labels")
 """Names of ``[each]`` that flags of ``dmrl run`` add a row to."""
 RECIPE_FILE, STATE_FILE, UNFINISHED = "recipe.toml", "pipeline.json", "unfinished"
@@ -97,15 +97,6 @@ class Plan:
         return TopologicalSorter(
             {step.out: find_producers(step.names, outs) for step in self.steps}
         )
-
-
-def iter_strings(value: Any) -> Iterator[str]:
-    """Yield every text in a TOML value."""
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, dict | list):
-        for one in value.values() if isinstance(value, dict) else value:
-            yield from iter_strings(one)
 
 
 def map_strings(value: Any, function: Callable[[str], Any]) -> Any:
@@ -245,8 +236,7 @@ def _check_input(takes: StageSignature, role: str, value: Any) -> str:
 
 
 def _unknown_key(stage: str, key: str, takes: StageSignature) -> str:
-    near = get_close_matches(key, takes.keys, n=1)
-    hint = f"Did you mean {near[0]}?" if near else f"See: dmrl {stage} --help"
+    hint = suggest(key, takes.keys, f"See: dmrl {stage} --help")
     return f"{stage} has no such input or setting. {hint}"
 
 
@@ -280,9 +270,10 @@ def _check_names(found: Sequence[tuple[int, Step]]) -> Iterator[str]:
 def _check_output_name(name: str) -> str:
     try:
         check_file_name(name, "out")
+        plain = "{" not in name and "}" not in name
     except UnsafeName:
-        return f"{name[:80]!r} is no plain name. No slashes, no braces, no dot in front"
-    if "{" in name or "}" in name:
+        plain = False
+    if not plain:
         return f"{name[:80]!r} is no plain name. No slashes, no braces, no dot in front"
     if name.casefold() in RESERVED_NAMES or name.casefold().endswith(".partial"):
         return f"{name} is a name that dmrl uses itself. Choose another"
@@ -294,17 +285,9 @@ def _check_source_name(name: str, outs: set[str]) -> str:
     head, *_ = name.split("/")
     if ".." in PurePosixPath(name).parts:
         return "which leads out of its folder. Write it without .."
-    if (
-        head in outs
-        or head == DATA
-        or name in NAMED_CAMERAS
-        or name in NAMED_EYES
-        or name in pretrained.list_pretrained()
-        or recipes.locate_recording(name)
-    ):
+    shipped = (*NAMED_CAMERAS, *NAMED_EYES, *pretrained.list_pretrained())
+    if head in (*outs, DATA) or name in shipped or recipes.locate_recording(name):
         return ""
     if name.startswith("/"):
         return "" if Path(name).exists() else "which is not there. Check the name"
-    near = get_close_matches(head, outs, n=1)
-    hint = f"Did you mean {near[0]}?" if near else "Name a step's out, or {data}/..."
-    return f"which no step writes. {hint}"
+    return f"which no step writes. {suggest(head, outs, OTHER_SOURCE)}"

@@ -8,11 +8,11 @@ step is a table that is filled in, and `plan` interprets it.
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from difflib import get_close_matches
 from itertools import product
 from math import prod
 from typing import Any
 
+from dmrl.errors import suggest
 from dmrl.guards import limits
 
 NAME = re.compile(r"\{([A-Za-z_]\w*)(?:\.([A-Za-z_]\w*))?\}")
@@ -51,7 +51,7 @@ def expand_steps(recipe: Mapping[str, Any], faults: list[str]) -> list[tuple[int
         return []
     made: list[tuple[int, Table]] = []
     room = [limits.STEPS, limits.GATHERED_VALUES, limits.STEP_CHARACTERS]
-    used = _find_used_names(steps, defaults)
+    used = {*_find_names(steps), *_find_names(defaults)}
     for number, step in enumerate(steps, start=1):
         where = f"step.{number}"
         if wrong := _check_step(step, each, room):
@@ -117,24 +117,19 @@ def _parse_defaults(table: Any, faults: list[str]) -> dict[str, Table]:
     return {}
 
 
-def _iter_strings(value: Any) -> Iterator[str]:
+def iter_strings(value: Any) -> Iterator[str]:
+    """Yield the strings in nested lists and tables."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict | list):
         for one in value.values() if isinstance(value, dict) else value:
-            yield from _iter_strings(one)
+            yield from iter_strings(one)
 
 
 def _find_names(value: Any) -> dict[tuple[str, str | None], None]:
     """Return the names in a value in order, each with its row's key or None."""
-    found = (m.groups() for text in _iter_strings(value) for m in NAME.finditer(text))
+    found = (m.groups() for text in iter_strings(value) for m in NAME.finditer(text))
     return {(name, key): None for name, key in found if name != DATA}
-
-
-def _find_used_names(
-    steps: list[Any], defaults: Mapping[str, Table]
-) -> set[tuple[str, str | None]]:
-    return {*_find_names(steps), *_find_names(defaults)}
 
 
 def _check_step(step: Any, each: Mapping[str, Values], room: list[int]) -> str:
@@ -151,7 +146,7 @@ def _check_step(step: Any, each: Mapping[str, Values], room: list[int]) -> str:
     count = prod(len(each[name]) for name in repeats)
     gathered = sum(
         prod(len(each[name]) for name in {n for n, _ in _find_names(text)} - repeats)
-        for text in _iter_strings(step)
+        for text in iter_strings(step)
     )
     for k, needs in enumerate((count, count * gathered, count * len(str(step)))):
         if needs > room[k]:
@@ -162,8 +157,7 @@ def _check_step(step: Any, each: Mapping[str, Values], room: list[int]) -> str:
 
 def _check_name(name: str, key: str | None, each: Mapping[str, Values]) -> str:
     if name not in each:
-        near = get_close_matches(name, each, n=1)
-        return f"no {name} in [each]. " + (f"Did you mean {near[0]}?" if near else "Add it")
+        return f"no {name} in [each]. {suggest(name, each, 'Add it')}"
     rows = isinstance(each[name][0], dict)
     if rows and key is None:
         return f"{{{name}}} has rows. Name a value of theirs: {{{name}.{min(each[name][0])}}}"

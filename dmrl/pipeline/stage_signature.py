@@ -18,7 +18,6 @@ Fields of settings whose annotation contains ``Path`` are inputs as well.
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -27,10 +26,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 from dmrl import entry_points
-from dmrl.errors import RecipeError
-
-if TYPE_CHECKING:
-    from dmrl.recording import Provenance
+from dmrl.errors import RecipeError, suggest
 
 if TYPE_CHECKING:
     from dmrl.recording import Provenance
@@ -158,27 +154,18 @@ def _load_stage(stage: str) -> Any:
         return added[stage].load()
     known += list(added)
     if stage not in known:
-        near = get_close_matches(stage, known, n=1)
-        hint = f"Did you mean {near[0]}?" if near else "See: dmrl --help"
-        raise RecipeError(f"no stage {stage!r}. {hint}")
+        raise RecipeError(f"no stage {stage!r}. {suggest(stage, known, 'See: dmrl --help')}")
     return import_module(f"{package}.{stage.replace('-', '_')}")
 
 
 def _takes_paths(hint: Any) -> bool | None:
     """Return whether an annotation is a list of paths; False: one path; None: neither."""
-    kinds = (
-        [kind for kind in get_args(hint) if kind is not type(None)]
-        if _is_optional(hint)
-        else [hint]
-    )
+    members = get_args(hint)
+    kinds = [one for one in members if one is not type(None)] if type(None) in members else [hint]
     if kinds == [Path]:
         return False
     many = len(kinds) == 1 and get_origin(kinds[0]) in (list, tuple, Sequence)
     return True if many and get_args(kinds[0])[:1] == (Path,) else None
-
-
-def _is_optional(hint: Any) -> bool:
-    return type(None) in get_args(hint)
 
 
 def _mentions_path(hint: Any) -> bool:

@@ -68,76 +68,59 @@ def command(
         raise SettingError("check wants a recording, or a folder of them. Name one")
     if len(recordings) > 1 or is_collection(recordings[0]) or on is not None:
         return _check_side_by_side(recordings, open_executor(on, workers), as_json=as_json)
-    found = run(recordings[0])
-    errors = sum(f.level == "error" for f in found.findings)
+    found = asdict(run(recordings[0]))
     if as_json:
-        told = [asdict(f) for f in found.findings]
-        print_json({"recording": recordings[0].name, "findings": told})
-        return 1 if errors else 0
-    for finding in found.findings:
-        where = f" {finding.topic}:" if finding.topic else ""
-        print_line(f"{finding.level}:{where} {finding.text}")
-    print_line(
-        f"{recordings[0]}: {found.messages} messages on {found.topics} topics, "
-        f"{errors} errors, {len(found.findings) - errors} warnings"
-    )
-    return 1 if errors else 0
+        print_json({"recording": recordings[0].name, "findings": found["findings"]})
+    else:
+        for line in map(_describe_finding, found["findings"]):
+            print_line(line)
+        print_line(f"{recordings[0]}: {_describe_size(found)}")
+    return 1 if _count(found, "error") else 0
 
 
 def _check_side_by_side(named: Sequence[Path], crew: Executor, *, as_json: bool) -> int:
     """Check recordings side by side; return 1 if one has an error or cannot be read."""
     found = {path: path for path in find_all_recordings(named)}
     tasks = build_tasks("check", "recording", found, None)
-    done: list[tuple[Task, JobResult]] = []
     with crew:
-        for task, answer in iter_results(tasks, crew, "Checking"):
-            done.append((task, answer))
+        done = list(iter_results(tasks, crew, "Checking"))
     documents = sorted((_document(task, answer) for task, answer in done), key=_badness)
     for one in documents:
         if not as_json and "error" not in one:
-            print_line(f"{one['recording']}: {_summary_line(one)}")
-    errors, warnings = (
-        sum(one["level"] == level for each in documents for one in each["findings"])
-        for level in ("error", "warning")
-    )
-    sound = sum(_is_sound(one) for one in documents)
+            worst = "".join(f"; {_describe_finding(finding)}" for finding in one["findings"][:1])
+            print_line(f"{one['recording']}: {_describe_size(one)}{worst}")
+    errors, warnings = (sum(_count(d, level) for d in documents) for level in ("error", "warning"))
+    sound = sum(not (_count(one, "error") or "error" in one) for one in documents)
     if as_json:
         totals = {"sound": sound, "errors": errors, "warnings": warnings}
         print_json({"recordings": documents, **totals})
     else:
-        print_line(
-            f"{len(documents)} recordings: {sound} without errors; {errors} errors, "
-            f"{warnings} warnings"
-        )
+        totals_line = f"{sound} without errors; {errors} errors, {warnings} warnings"
+        print_line(f"{len(documents)} recordings: {totals_line}")
     report_failures(done)
     return 0 if sound == len(documents) else 1
 
 
+def _count(document: dict[str, Any], level: str) -> int:
+    """Count the findings of a level."""
+    return sum(one["level"] == level for one in document["findings"])
+
+
 def _badness(document: dict[str, Any]) -> tuple[int, int, str]:
     """Return the order of a recording: worst first, then by name."""
-    levels = [one["level"] for one in document["findings"]]
-    unread = 10**6 if "error" in document else 0
-    return -unread - levels.count("error"), -levels.count("warning"), document["recording"]
+    errors = _count(document, "error") + 10**6 * ("error" in document)
+    return -errors, -_count(document, "warning"), document["recording"]
 
 
-def _is_sound(document: dict[str, Any]) -> bool:
-    """Return whether a recording could be read and has no error."""
-    wrong = any(one["level"] == "error" for one in document["findings"])
-    return not (wrong or "error" in document)
+def _describe_finding(finding: dict[str, Any]) -> str:
+    where = f" {finding['topic']}:" if finding["topic"] else ""
+    return f"{finding['level']}:{where} {finding['text']}"
 
 
-def _summary_line(found: dict[str, Any]) -> str:
-    """Return the size of a recording and its worst finding, in one line."""
-    findings = found["findings"]
-    errors = sum(one["level"] == "error" for one in findings)
-    worst = ""
-    if findings:
-        where = f"{findings[0]['topic']}: " if findings[0]["topic"] else ""
-        worst = f"; {findings[0]['level']}: {where}{findings[0]['text']}"
-    return (
-        f"{found['messages']} messages on {found['topics']} topics, {errors} errors, "
-        f"{len(findings) - errors} warnings{worst}"
-    )
+def _describe_size(found: dict[str, Any]) -> str:
+    """Return the size of a recording and the number of its findings."""
+    counts = f"{_count(found, 'error')} errors, {_count(found, 'warning')} warnings"
+    return f"{found['messages']} messages on {found['topics']} topics, {counts}"
 
 
 def _document(task: Task, answer: JobResult) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter, validators
 
@@ -212,20 +212,11 @@ def _to_options(settings: Settings) -> "Options":
         raise SettingError(f"--width-px and --height-px must be over 0, {SIDE_MAX_PX} at most")
     if (width_px is None) != (height_px is None):
         raise SettingError("--width-px and --height-px go together. Give both, or neither")
-    return Options(
-        robot=settings.robot,
-        names=_parse_names(settings.names),
-        rate_hz=settings.rate_hz,
-        labels=settings.labels,
-        camera=None if settings.camera is None else find_camera(settings.camera),
-        size_px=None if width_px is None or height_px is None else (width_px, height_px),
-        raw=settings.raw,
-        columns=settings.columns,
-        bits=settings.bits,
-        as_stored=settings.as_stored,
-        robot_width_m=settings.robot_width_m,
-        unlabelled=settings.unlabelled,
-    )
+    given: dict[str, Any] = {f.name: getattr(settings, f.name, None) for f in fields(Options)}
+    given["names"] = _parse_names(settings.names)
+    given["camera"] = None if settings.camera is None else find_camera(settings.camera)
+    given["size_px"] = None if None in (width_px, height_px) else (width_px, height_px)
+    return Options(**given)
 
 
 def _parse_names(text: str | None) -> dict[str, str]:

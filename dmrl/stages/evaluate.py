@@ -1,7 +1,7 @@
 """``dmrl evaluate``: detections against labels; positions and tracks against the truth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -96,13 +96,7 @@ def run(
     from dmrl.evaluation.evaluate_recordings import evaluate_recordings
 
     criteria = DetectionCriteria(
-        settings.against,
-        settings.split,
-        settings.partial,
-        settings.threshold,
-        settings.false_alarms,
-        settings.draws,
-        settings.seed,
+        **{one.name: getattr(settings, one.name) for one in fields(DetectionCriteria)}
     )
     what, settle_s = settings.what, settings.settle_s
     return evaluate_recordings(recordings, out, what, criteria, settle_s, workers, parallel_map)

@@ -1,12 +1,12 @@
 """``dmrl index``: a folder of recordings as one table, which `dmrl find` asks."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dmrl.pipeline.batch import build_tasks, error_text, find_recordings, iter_results
-from dmrl.pipeline.executor import Executor, open_executor
+from dmrl.pipeline.executor import open_executor
 from dmrl.pipeline.job import has_failed
 from dmrl.terminal.arguments import AsJson, On, Workers
 from dmrl.terminal.progress import say
@@ -14,7 +14,6 @@ from dmrl.terminal.tables import print_json, print_line
 
 if TYPE_CHECKING:
     from dmrl.catalogue import Row
-    from dmrl.catalogue.row_buffer import RowBuffer
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +56,10 @@ def update(folder: Path, workers: int | None = None, on: str | None = None) -> R
     UnicodeEncodeError
         If a file's name is no text.
     """
+    import pyarrow as pa
+
     from dmrl.catalogue import open_catalogue
-    from dmrl.catalogue.row_buffer import RowBuffer
-    from dmrl.catalogue.table import file_stamp
+    from dmrl.catalogue.table import file_stamp, to_table
 
     before = open_catalogue(folder, new=True)
     found = {name.as_posix(): path for name, path in find_recordings(folder).items()}
@@ -67,13 +67,13 @@ def update(folder: Path, workers: int | None = None, on: str | None = None) -> R
         name.encode()  # what no table can hold is said before the work, not after
     stamps = {name: file_stamp(path) for name, path in found.items()}
     kept = before.find_unchanged(stamps)
-    rows = RowBuffer()
-    new = {name: path for name, path in found.items() if name not in kept}
+    rows = [to_table([])]
+    new = {path: name for name, path in found.items() if name not in kept}
     try:
-        if new:
-            _describe_all(new, stamps, rows, open_executor(on, workers))
+        for row in _iter_rows(new, stamps, on, workers) if new else ():
+            rows.append(to_table([row]))
     finally:
-        fresh = rows.to_table()
+        fresh = pa.concat_tables(rows)
         after = before.replace_rows(kept, fresh)
         if not after.table.equals(before.table) or not before.file.exists():
             after.save()
@@ -82,22 +82,19 @@ def update(folder: Path, workers: int | None = None, on: str | None = None) -> R
     return Result(after.table.num_rows, fresh.num_rows, len(kept), gone, bad)
 
 
-def _describe_all(
-    new: Mapping[str, Path], stamps: Mapping[str, str], rows: "RowBuffer", crew: Executor
-) -> None:
-    """Describe recordings side by side."""
+def _iter_rows(
+    new: Mapping[Path, str], stamps: Mapping[str, str], on: str | None, workers: int | None
+) -> "Iterator[Row]":
+    """Yield the rows of recordings, which are described side by side."""
     from dmrl.catalogue import unreadable_row
 
-    names = {path: name for name, path in new.items()}
-    tasks = build_tasks("index", "recording", {path: path for path in names}, None)
-    with crew:
+    tasks = build_tasks("index", "recording", {path: path for path in new}, None)
+    with open_executor(on, workers) as crew:
         for task, answer in iter_results(tasks, crew, "Indexing"):
-            row = (
-                unreadable_row(error_text(task, answer)) if has_failed(answer) else answer["result"]
-            )
-            name = names[task.source]
+            bad, name = has_failed(answer), new[task.source]
+            row = unreadable_row(error_text(task, answer)) if bad else answer["result"]
             size = int(stamps[name].split()[0])
-            rows.add({**row, "recording": name, "bytes": size, "stamp": stamps[name]})
+            yield {**row, "recording": name, "bytes": size, "stamp": stamps[name]}
 
 
 def command(

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter, validators
 
@@ -15,21 +15,13 @@ from dmrl.terminal.arguments import AsJson, Flat, On, Recipe
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_table
 
+if TYPE_CHECKING:
+    from dmrl.render_recording import Rendered
+
 Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 
 
-@dataclass(frozen=True, slots=True)
-class Result:
-    """Numbers of images, labels in them, images without, and broken photos left out."""
-
-    images: int
-    labels: int
-    empty_images: int
-    broken_photos: int
-    resumed_images: int
-
-
-def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
+def run(out: Path, settings: Settings, *, resume: bool = False) -> "Rendered":
     """Render and write the recording ``out``, as images arrive.
 
     Parameters
@@ -56,7 +48,7 @@ def run(out: Path, settings: Settings, *, resume: bool = False) -> Result:
     """
     from dmrl.render_recording import render_recording
 
-    return Result(*render_recording(out, settings, resume=resume))
+    return render_recording(out, settings, resume=resume)
 
 
 @dataclass(frozen=True, slots=True)

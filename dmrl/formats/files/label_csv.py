@@ -4,11 +4,10 @@ import csv
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TextIO
 
-from dmrl.errors import SourceError
+from dmrl.errors import SourceError, suggest
 from dmrl.guards import limits
 from dmrl.guards.safe_names import check_split_name
 
@@ -151,8 +150,7 @@ def read_labels(path: Path, files: Collection[str]) -> dict[str, list[LabelRow]]
 def _check_columns(path: Path, columns: Sequence[str]) -> None:
     for column in columns:
         if column not in COLUMNS:
-            near = get_close_matches(column, COLUMNS, n=1)
-            hint = f"Did you mean {near[0]}?" if near else f"Known are {', '.join(COLUMNS)}"
+            hint = suggest(column, COLUMNS, f"Known are {', '.join(COLUMNS)}")
             raise SourceError(f"{path}:1: unknown column {column!r}. {hint}")
     if missing := [column for column in REQUIRED_COLUMNS if column not in columns]:
         raise SourceError(
@@ -171,8 +169,7 @@ def _parse_cells(
         raise SourceError(f"{where}: not as many cells as the header. Fix the line")
     row = {str(name): str(cell).strip() for name, cell in cells.items()}
     if row["file"] not in files:
-        near = get_close_matches(row["file"], files, n=1)
-        hint = f"Did you mean {near[0]}?" if near else "Add the image, or delete the line"
+        hint = suggest(row["file"], files, "Add the image, or delete the line")
         raise SourceError(f"{where}: no image {row['file']!r} in the folder. {hint}")
     return row
 
