@@ -267,7 +267,7 @@ COMMAND = '''
 
 def test_a_command(clone: Clone) -> None:
     clone.write("dmrl/stages/hello.py", COMMAND)
-    clone.after("dmrl/cli.py", "COMMANDS = {\n", '    "hello": "Greet somebody.",\n')
+    clone.after("dmrl/cli.py", "GROUPS = {\n", '    "Greet": ("hello",),\n')
     assert clone.touched() == promised("a command")
     greeted, shouted, told, helped, listed = clone.dmrl(
         ["hello", "cf1"],

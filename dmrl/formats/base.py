@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from dmrl.errors import SettingError
+from dmrl.errors import SettingError, SourceError
 from dmrl.geometry.frames import Camera
 from dmrl.samples.flight import merge_by_time
 from dmrl.samples.sample import Columns, Intervals, Sample
@@ -105,11 +105,23 @@ class Options:
         why
             Reason, as the rest of a sentence: "has no effect on a recorded stream".
         """
-        default = next(one for one in fields(self) if one.name == name)
-        usual = default.default_factory() if callable(default.default_factory) else default.default
-        if getattr(self, name) != usual:
+        if getattr(self, name) != getattr(Options(), name):
             flags = FLAGS.get(name) or f"--{name.replace('_', '-')}"
             raise SettingError(f"{flags} {why}. Leave it out")
+
+
+def read_text(path: Path, encoding: str = "utf-8-sig") -> str:
+    """Read a text file of a source.
+
+    Raises
+    ------
+    SourceError
+        If it cannot be read, or is in another encoding.
+    """
+    try:
+        return path.read_text(encoding=encoding)
+    except (OSError, UnicodeDecodeError) as e:
+        raise SourceError(f"{path} cannot be read as text: {e}. Restore the file") from None
 
 
 FLAGS = {"size_px": "--width-px and --height-px"}

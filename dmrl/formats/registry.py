@@ -15,6 +15,7 @@ from dmrl import entry_points, formats
 from dmrl.entry_points import Plugin
 from dmrl.errors import PluginError, SourceError, suggest
 from dmrl.formats.base import Content, Format, Options
+from dmrl.guards.paths import refuse_pipes
 from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say
 
@@ -68,10 +69,7 @@ def find_format(source: Path, name: str | None = None) -> Format:
     known = ", ".join([*load_builtin_formats(), *added])
     if not source.exists():
         raise SourceError(f"no file or folder {source}. Pass one that exists")
-    if not (source.is_file() or source.is_dir()):
-        raise SourceError(f"{source} is neither a file nor a folder. Save it to a file first")
-    if odd := next((p for p in _iter_contents(source) if _is_special_file(p)), None):
-        raise SourceError(f"{odd} is neither a file nor a folder. Move it out of {source}")
+    refuse_pipes(source)
     if name in added:
         return _load_plugin_format(added[name])
     if name is not None and name not in load_builtin_formats():
@@ -89,15 +87,6 @@ def find_format(source: Path, name: str | None = None) -> Format:
     if source.suffix == ".mcap":
         raise SourceError(f"{source} is a recording already. Pass --to: csv, parquet, ros2")
     raise SourceError(f"{source} matches no known format. Pass --from: {known}")
-
-
-def _iter_contents(source: Path) -> Iterator[Path]:
-    return source.rglob("*") if source.is_dir() else iter(())
-
-
-def _is_special_file(path: Path) -> bool:
-    """Return whether a path is a pipe, device or socket, which would block its reader."""
-    return path.exists() and not (path.is_file() or path.is_dir())
 
 
 def _guess_format(source: Path, added: Iterable[Plugin]) -> Format | None:

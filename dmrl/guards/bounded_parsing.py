@@ -3,6 +3,7 @@
 import json
 import lzma
 import struct
+import tokenize
 import tomllib
 import zipfile
 import zlib
@@ -93,8 +94,8 @@ def parse_xml(data: bytes) -> ElementTree.Element:
 
 
 ARCHIVE_ERRORS = (
-    *(MemoryError, RuntimeError, LookupError, SyntaxError),
-    *(struct.error, zlib.error, lzma.LZMAError),
+    *(MemoryError, RuntimeError, LookupError, SyntaxError, TypeError, EOFError),
+    *(struct.error, zlib.error, lzma.LZMAError, zipfile.BadZipFile, tokenize.TokenError),
 )
 """Errors that NumPy and zipfile raise on corrupt archives beside the documented ones."""
 _TOO_DEEP = f"it nests deeper than {limits.DEPTH}"

@@ -226,11 +226,8 @@ def _to_fields(value: Any, names: Mapping[str, str]) -> Any:
     found = {}
     for field, held in value.ListFields():
         if field.message_type is not None:
-            held = (
-                [_to_fields(one, names) for one in held]
-                if field.is_repeated
-                else (_to_fields(held, names))
-            )
+            parts = [_to_fields(one, names) for one in (held if field.is_repeated else [held])]
+            held = parts if field.is_repeated else parts[0]
         elif field.name in FIELDS_WITH_ROBOTS:
             held = "/".join(names.get(part, part) for part in held.split("/"))
         found[field.name] = list(held) if field.is_repeated else held

@@ -11,7 +11,7 @@ from dmrl.recording.attachments import read_splits as read_splits
 from dmrl.recording.checks.check_recording import check as check
 from dmrl.recording.checks.check_recording import list_label_findings as list_label_findings
 from dmrl.recording.checks.check_recording import print_findings as print_findings
-from dmrl.recording.checks.finding import Finding as Finding
+from dmrl.recording.checks.scan import Finding as Finding
 from dmrl.recording.copying.edit import merge as merge
 from dmrl.recording.copying.edit import trim as trim
 from dmrl.recording.copying.resume import InterruptedRecording as InterruptedRecording
@@ -42,7 +42,7 @@ from dmrl.recording.reader import read as read
 from dmrl.recording.reader import read_raw as read_raw
 from dmrl.recording.reader import read_table as read_table
 from dmrl.recording.recover import recover as recover
-from dmrl.recording.recovery_report import Recovery as Recovery
+from dmrl.recording.recovery_scan import Recovery as Recovery
 from dmrl.recording.summary import SPLIT_METADATA as SPLIT_METADATA
 from dmrl.recording.summary import Summary as Summary
 from dmrl.recording.summary import TopicInfo as TopicInfo

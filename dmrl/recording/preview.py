@@ -9,7 +9,7 @@ from mcap.records import ChunkIndex
 
 from dmrl.recording.mcap.batch_reader import iter_batches, select_chunks
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunks.chunk_reader import read_chunk
+from dmrl.recording.mcap.chunks.chunk_reader import iter_chunks
 from dmrl.recording.mcap.file import open_mcap
 from dmrl.recording.mcap.message_batch import MessageBatch, concatenate_all
 from dmrl.recording.mcap.summary_section import SummarySection, read_summary_section
@@ -77,8 +77,8 @@ def _sample_chunks(
             return [], {}
         channels = {n: c for n, c in index.channels_by_id.items() if c.topic in names}
         batches = []
-        for chunk in _choose_chunks(index, channels, start_ns, end_ns):
-            batch = read_chunk(stream, chunk, channels, index)
+        chosen = _choose_chunks(index, channels, start_ns, end_ns)
+        for batch in iter_chunks(stream, chosen, channels, index):
             batch = batch.take((batch.time_ns >= start_ns) & (batch.time_ns < end_ns))
             batches.append(batch.compact())
     return [block for block in batches if len(block)], channels

@@ -12,7 +12,6 @@ from mcap.records import (
     McapRecord,
     Message,
     Metadata,
-    Schema,
 )
 from mcap.records import Channel as McapChannel
 
@@ -37,9 +36,9 @@ from dmrl.recording.mcap.file import (
 from dmrl.recording.mcap.message_batch import MessageBatch
 from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
 from dmrl.recording.provenance_inputs import hash_file
-from dmrl.recording.recovery_report import Recovery
 from dmrl.recording.recovery_scan import (
     IndexedCount,
+    Recovery,
     RecoveryState,
     iter_records,
     read_listed_section,
@@ -75,11 +74,9 @@ def recover(path: Path, out: Path) -> Recovery:
             raise RecordingError(
                 f"{path} does not begin like a recording: nothing to recover. Make it again"
             )
-        state = RecoveryState(path, Recovery(), read_listed_section(path, stream))
-        for record in (
-            *state.summary_section.schemas.values(),
-            *state.summary_section.channels.values(),
-        ):
+        section = read_listed_section(path, stream)
+        state = RecoveryState(path=path, recovery=Recovery(), summary_section=section)
+        for record in (*section.schemas.values(), *section.channels.values()):
             # A topic is defined in the chunk with its first message. If that chunk is corrupt,
             # later messages would have no topic.
             _register_record(state, record)
@@ -188,26 +185,15 @@ def _iter_valid_units(
 
 
 def _register_record(state: RecoveryState, record: McapRecord) -> None:
-    """Register a definition, metadata record or attachment."""
-    match record:
-        case Schema():
-            if state.schemas.get(record.id, record) != record:
-                state.recovery.contradictions.append(f"{record.name} is defined in two ways")
-            state.schemas[record.id] = record
-        case McapChannel() if not record.schema_id or record.schema_id in state.schemas:
-            if state.channel_records.get(record.id, record) != record:
-                state.recovery.contradictions.append(f"{record.topic} is defined in two ways")
-            state.channels.define(record, state.schemas)
-            state.incomplete.pop(record.id, None)
-            state.channel_records[record.id] = record
-        case McapChannel():
+    """Register a definition, metadata or an attachment."""
+    if isinstance(record, McapChannel):
+        if record.schema_id and record.schema_id not in state.schemas:
             state.incomplete[record.id] = record.topic
-        case Metadata():
-            state.extras += 1
-            state.metadata.setdefault(record.name, []).append(dict(record.metadata))
-        case Attachment():
-            state.extras += 1
-            state.attachments.append(record)
+            return
+        state.incomplete.pop(record.id, None)
+    if wrong := state.add_record(record):
+        state.recovery.contradictions.append(wrong)
+    state.extras += isinstance(record, Metadata | Attachment)
 
 
 def _complete_report(state: RecoveryState) -> None:

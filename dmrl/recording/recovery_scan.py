@@ -25,7 +25,6 @@ from mcap.summary import Summary as McapSummary
 
 from dmrl.errors import RecordingError
 from dmrl.recording.mcap import checksums
-from dmrl.recording.mcap.channel import ChannelTable
 from dmrl.recording.mcap.extra_records import has_valid_crc
 from dmrl.recording.mcap.file import (
     CORRUPTION_ERRORS,
@@ -34,8 +33,8 @@ from dmrl.recording.mcap.file import (
     BoundedReader,
 )
 from dmrl.recording.mcap.message_index import ENTRY_BYTES
+from dmrl.recording.mcap.record_scan import ScannedFile
 from dmrl.recording.mcap.summary_section import read_raw_section
-from dmrl.recording.recovery_report import Recovery
 
 MESSAGE_INDEX_HEADER = struct.Struct(
     "<HI"
@@ -50,18 +49,55 @@ class IndexedCount(NamedTuple):
 
 
 @dataclass(slots=True)
-class RecoveryState:
+class Recovery:
+    """Report about a recovered recording.
+
+    Parameters
+    ----------
+    messages
+        Messages written, bit-exact.
+    damaged_chunks
+        Chunks that were left out because they failed their CRC.
+    nameless
+        Messages left out because the definition of their topic was in a corrupt chunk.
+    timeless
+        Messages left out because their time is beyond the year 2262.
+    lost_bytes
+        Bytes outside of complete records: after the last one, or before the next listed one.
+    missing
+        Messages that were not recovered, by topic, as far as the file lists them. Their topic is
+        "unknown" where the file states only how many there were.
+    counted
+        Whether ``missing`` covers the whole file: its Statistics record was readable.
+    contradictions
+        What the file states about itself that is not so, a phrase each.
+    doubtful
+        Whether metadata or attachments are missing or fail their checksum. They are kept as they
+        are.
+    whole
+        Whether the file has its footer and nothing was lost.
+    """
+
+    messages: int = 0
+    damaged_chunks: int = 0
+    nameless: int = 0
+    timeless: int = 0
+    lost_bytes: int = 0
+    missing: dict[str, int] = field(default_factory=dict)
+    counted: bool = False
+    contradictions: list[str] = field(default_factory=list)
+    doubtful: bool = False
+    whole: bool = False
+
+
+@dataclass(slots=True, kw_only=True)
+class RecoveryState(ScannedFile):
     """State while the records of a file are read one after the other."""
 
     path: Path
     recovery: Recovery
     summary_section: McapSummary  # Summary section, as far as it can be read
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: ChannelTable = field(default_factory=ChannelTable)
-    channel_records: dict[int, McapChannel] = field(default_factory=dict)  # Channel records
     incomplete: dict[int, str] = field(default_factory=dict)  # topics without their schema
-    metadata: dict[str, list[dict[str, str]]] = field(default_factory=dict)
-    attachments: list[Attachment] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)  # messages by channel id
     skipped: Counter[int] = field(default_factory=Counter)  # in corrupt chunks, by their indexes
     running_checksums: checksums.Checksums = field(default_factory=checksums.Checksums)

@@ -203,12 +203,9 @@ class RecordingWriter:
                 made = replace(self._provenance, left_out=left_out)
                 self._file.add_metadata(METADATA_NAME, made.to_metadata())
             self.chunk_writer.finish()
-        except OSError as e:
+        except (OSError, OutputError) as e:
             self._abandon(e)
-            raise as_output_error(self._path, e) from e
-        except OutputError as e:
-            self._abandon(e)
-            raise
+            raise (as_output_error(self._path, e) if isinstance(e, OSError) else e) from e
         self._resources.close()
 
 

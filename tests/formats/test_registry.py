@@ -9,7 +9,7 @@ import pytest
 
 from dmrl import entry_points
 from dmrl.entry_points import Plugin
-from dmrl.errors import PluginError, SourceError
+from dmrl.errors import PluginError, SourceError, UnsafeName
 from dmrl.formats import registry
 from dmrl.formats.base import Content, Format, Options
 from dmrl.formats.registry import GUESS_ORDER, find_format, load_builtin_formats
@@ -99,9 +99,9 @@ def test_empty_folder_missing_path_and_pipe_are_reported(tmp_path: Path) -> None
     (tmp_path / "below").mkdir()
     os.mkfifo(tmp_path / "below" / "pipe")
     for name in (None, "images"):
-        with pytest.raises(SourceError, match=r"pipe is neither a file nor a folder. Move it out"):
+        with pytest.raises(UnsafeName, match=r"pipe is a pipe or a device, not a file. Remove it"):
             find_format(tmp_path, name)
-    with pytest.raises(SourceError, match=r"pipe is neither a file nor a folder. Save it"):
+    with pytest.raises(UnsafeName, match=r"pipe is a pipe or a device, not a file. Name a file"):
         find_format(tmp_path / "below" / "pipe")
 
 

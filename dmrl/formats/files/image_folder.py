@@ -32,7 +32,7 @@ from pathlib import Path
 from dmrl.errors import SourceError
 from dmrl.formats.aideck import published_firmware
 from dmrl.formats.aideck.chip_outputs import load_chip_maps
-from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.base import Content, Format, Options, read_text
 from dmrl.formats.files.crop import Crop
 from dmrl.formats.files.label_csv import read_labels
 from dmrl.formats.files.labelled_pictures import (
@@ -159,10 +159,7 @@ def _parse_time_ns(path: Path, *, seconds: bool = False) -> int | None:
 def _load_aideck_labels(path: Path, files: Collection[str]) -> dict[str, list[float]]:
     """Load six numbers per image from ``label.txt``, if it exists."""
     found: dict[str, list[float]] = {}
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    except (OSError, UnicodeDecodeError) as e:
-        raise SourceError(f"{path} cannot be read as text: {e}. Restore the file") from None
+    lines = read_text(path).splitlines() if path.is_file() else []
     for number, line in enumerate(lines, 1):
         name, *words = line.replace(",", " ").split() or [""]
         if not name:

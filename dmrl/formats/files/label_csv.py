@@ -63,7 +63,7 @@ class LabelRow:
     visible_share: float = 0.0
     source: str = "hand"
     split: str | None = None
-    sigmas: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sigmas: tuple[float, ...] = (0.0, 0.0, 0.0)
     depth_from_box: bool = False
 
     def is_centre_in_box(self) -> bool:
@@ -179,8 +179,13 @@ def _parse_row(where: str, cells: Mapping[str | None, Any], files: Collection[st
     split = row.get("split") or None
     if split is not None:
         check_split_name(split, f"{where}: the split")
+    source = row.get("source") or "hand"
     if not row["peer"]:
-        return _parse_empty_row(where, row, split)
+        if filled := next(filter(row.get, (*POINT_COLUMNS, *BOX_COLUMNS, *SIGMA_COLUMNS)), None):
+            raise SourceError(
+                f"{where}: {filled} without a peer. Name the peer, or leave the cells empty"
+            )
+        return LabelRow(row["file"], "", source=source, split=split)
     box = tuple(_parse_number(where, row, name) for name in BOX_COLUMNS if row.get(name))
     middle = [sum(box[k::2]) / 2 if len(box) == 4 else None for k in (0, 1)]
     u_px, v_px = (
@@ -190,7 +195,7 @@ def _parse_row(where: str, cells: Mapping[str | None, Any], files: Collection[st
     known = bool(row.get("depth_m"))
     depth_m = _parse_number(where, row, "depth_m") if known else 0.0
     unknown = (0.0, 0.0, 0.0 if known else math.inf)
-    sigma_u, sigma_v, sigma_depth = (
+    sigmas = tuple(
         _parse_number(where, row, *pair) for pair in zip(SIGMA_COLUMNS, unknown, strict=True)
     )
     share = _parse_number(where, row, "visible_share", 0.0)
@@ -198,27 +203,9 @@ def _parse_row(where: str, cells: Mapping[str | None, Any], files: Collection[st
         raise SourceError(
             f"{where}: depth_m is {depth_m:g}; it must be over 0, or empty. Fix the cell"
         )
-    _check_values(where, box, share, (sigma_u, sigma_v, sigma_depth))
-    return LabelRow(
-        file=row["file"],
-        peer=row["peer"],
-        u_px=u_px,
-        v_px=v_px,
-        depth_m=depth_m,
-        box_px=box,
-        visible_share=share,
-        source=row.get("source") or "hand",
-        split=split,
-        sigmas=(sigma_u, sigma_v, sigma_depth),
-    )
-
-
-def _parse_empty_row(where: str, row: Mapping[str, str], split: str | None) -> LabelRow:
-    if filled := [name for name in (*POINT_COLUMNS, *BOX_COLUMNS, *SIGMA_COLUMNS) if row.get(name)]:
-        raise SourceError(
-            f"{where}: {filled[0]} without a peer. Name the peer, or leave the cells empty"
-        )
-    return LabelRow(row["file"], "", source=row.get("source") or "hand", split=split)
+    _check_values(where, box, share, sigmas)
+    row_name = row["file"], row["peer"]
+    return LabelRow(*row_name, u_px, v_px, depth_m, box, share, source, split, sigmas)
 
 
 def _parse_number(

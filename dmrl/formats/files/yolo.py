@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.errors import MissingExtra, SourceError
-from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.base import Content, Format, Options, read_text
 from dmrl.formats.files.label_csv import LabelRow
 from dmrl.formats.files.labelled_pictures import (
     LABELLED_OPTIONS,
@@ -114,12 +114,12 @@ def _read_description(source: Path) -> _Description:
     found = next((source / n for n in DESCRIPTIONS if (source / n).is_file()), None)
     if found is None:
         listed = next((source / n for n in NAME_FILES if (source / n).is_file()), None)
-        lines = _read_text(listed).splitlines() if listed else []
+        lines = read_text(listed).splitlines() if listed else []
         if listed is None:
             say(f"{source}: no class names, so they are class0, class1, ... (--names class0=cf2)")
         return _Description(dict(enumerate(filter(None, map(str.strip, lines)))))
     try:
-        told = parse_yaml(_read_text(found))
+        told = parse_yaml(read_text(found))
         names = told.get("names", {})
         pairs = names.items() if isinstance(names, dict) else enumerate(names)
         listed_names = {int(number): str(name) for number, name in pairs}
@@ -140,7 +140,7 @@ def _read_splits(source: Path, told: Mapping[str, Any]) -> dict[str, str]:
         for text in [stated] if isinstance(stated, str) else stated:
             place = locate(source, str(text))
             if place is not None and place.suffix == ".txt":
-                lines = _read_text(source / place).split("\n")
+                lines = read_text(source / place).split("\n")
                 places = [locate(source, line.strip()) for line in lines if line.strip()]
             else:
                 places = [place]
@@ -172,7 +172,7 @@ def _read_rows(
         return None if options.unlabelled else []
     boxes, line = [], 0
     try:
-        for text in _read_text(label).splitlines():
+        for text in read_text(label).splitlines():
             line += 1
             if words := text.split():
                 boxes.append(_parse_line(words, about))
@@ -194,13 +194,6 @@ def _parse_line(words: Sequence[str], about: _Description) -> tuple[str, tuple[f
     if len(values) < 6 or len(values) % 2:
         raise ValueError(f"{len(words)} numbers are no box and no polygon")
     return name, (min(values[::2]), min(values[1::2]), max(values[::2]), max(values[1::2]))
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as e:
-        raise SourceError(f"{path} cannot be read as text: {e}. Restore the file") from None
 
 
 FORMAT = Format("yolo", "a YOLO set", can_read, load_content, LABELLED_OPTIONS | {"unlabelled"})

@@ -25,7 +25,7 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import SourceError
-from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.base import Content, Format, Options, read_text
 from dmrl.geometry.frames import PUBLISHED_RENDER, Array, camera_from_horizontal, project
 from dmrl.images import codec
 from dmrl.samples.sample import Sample, build_calibration, build_image, build_labels, find_intervals
@@ -136,11 +136,7 @@ def _parse_file(path: Path, *, head: int, width: int, optional: bool = False) ->
     if optional and not path.is_file():
         return {}
     found: dict[str, _LabelLine] = {}
-    try:
-        texts = path.read_text(encoding="ascii").splitlines()
-    except (OSError, UnicodeDecodeError) as e:
-        raise SourceError(f"{path} cannot be read as text: {e}. Restore the file") from None
-    for number, text in enumerate(texts, 1):
+    for number, text in enumerate(read_text(path, "ascii").splitlines(), 1):
         where = f"{path}:{number}"
         name, *words = text.split() or [""]
         name = name.rsplit("/", 1)[-1]
@@ -181,6 +177,7 @@ def _build_image(
     if (line.robots[:, 0] <= 0).any():
         raise SourceError(f"{line.where}: a robot behind the camera, x <= 0. Delete the line")
     label = train.get(name) or test.get(name)
+    published = _match_robots(name, line, {name: label}) if label else np.empty((0, 4))
     return LocanetImage(
         path=path,
         number=int(path.stem),
@@ -189,9 +186,7 @@ def _build_image(
         xyz_camera=line.robots[:, :3],
         attitude_rad=line.robots[:, 3:],
         box_px=_to_box_px(_match_robots(name, line, boxes)) if boxes else np.empty((0, 4)),
-        published=_to_published(
-            _match_robots(name, line, {name: label}) if label else np.empty((0, 4))
-        ),
+        published=published[:, :3] * (1.0, 1.0, 1e-3),
         split="train" if name in train else "test" if name in test else None,
     )
 
@@ -213,10 +208,6 @@ def _to_box_px(robots: Array) -> Array:
     """Convert first and last pixels to edges; v is printed one too high."""
     limit = (PUBLISHED_RENDER.width_px, PUBLISHED_RENDER.height_px) * 2
     return np.clip(robots[:, :4] + (0.0, -1.0, 1.0, 0.0), 0.0, limit)
-
-
-def _to_published(robots: Array) -> Array:
-    return robots[:, :3] * (1.0, 1.0, 1e-3)
 
 
 def to_attitude_zyx(roll_rad: float, pitch_rad: float) -> tuple[float, float]:

@@ -8,10 +8,7 @@ from motion capture and are far better than a drone's. Ranges are unchanged, abo
 """
 
 import re
-import struct
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,27 +17,12 @@ import numpy as np
 from dmrl.errors import SourceError
 from dmrl.formats.base import Content, Format, Options
 from dmrl.geometry.frames import Array
-from dmrl.guards.bounded_parsing import load_npz
+from dmrl.guards.bounded_parsing import ARCHIVE_ERRORS, load_npz
 from dmrl.samples import flight
 from dmrl.samples.flight import log_from_poses, merge_by_time, to_nanoseconds
 from dmrl.samples.sample import Sample
 
 RATE_HZ = 10.0
-# Errors of zipfile, zlib and NumPy on damaged archives.
-ARCHIVE_ERRORS = (
-    OSError,
-    ValueError,
-    TypeError,
-    KeyError,
-    EOFError,
-    SyntaxError,
-    RuntimeError,
-    MemoryError,
-    struct.error,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 POSE_ARRAY = re.compile(r"optitrack_turtle(\d{1,3})_pose_np")
 RANGE_ARRAY = re.compile(r"uwb_range_(\d{1,3})_(\d{1,3})_np")
 MAX_ROBOTS = 64
@@ -54,7 +36,7 @@ def can_read(source: Path) -> bool:
     try:
         with zipfile.ZipFile(source) as archive:
             names = [name.removesuffix(".npy") for name in archive.namelist()]
-    except ARCHIVE_ERRORS:
+    except (OSError, ValueError, *ARCHIVE_ERRORS):
         return False
     return any(map(POSE_ARRAY.fullmatch, names)) and any(map(RANGE_ARRAY.fullmatch, names))
 
@@ -98,7 +80,7 @@ def load_content(source: Path, _options: Options | None = None) -> Content:
 def _load_arrays(source: Path) -> dict[str, Array]:
     try:
         found = {n: np.asarray(v, float) for n, v in load_npz(source).items() if v.itemsize >= 4}
-    except ARCHIVE_ERRORS as e:
+    except (OSError, ValueError, *ARCHIVE_ERRORS) as e:
         why = " ".join(str(e).split())
         raise SourceError(f"{source} cannot be read: {why}. Download it again") from e
     ranges = [values for name, values in found.items() if RANGE_ARRAY.fullmatch(name)]

@@ -10,7 +10,7 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import SourceError
-from dmrl.geometry.frames import Array
+from dmrl.geometry.frames import Array, camera_from_horizontal
 from dmrl.geometry.rotations import quaternion_to_euler
 from dmrl.guards import limits
 from dmrl.images import codec
@@ -177,9 +177,7 @@ def _build_velocity(robot: str, time_ns: int, level: Array) -> Sample:
 
 def _rotate_from_body(body: Array, angles: Array) -> Array:
     """Rotate a vector from the body's frame to the robot's horizontal one."""
-    roll, pitch, _ = angles.tolist()
-    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
-    return np.array([[cp, sp * sr, sp * cr], [0, cr, -sr], [-sp, cp * sr, cp * cr]]) @ body
+    return camera_from_horizontal(angles[0], angles[1]).T @ body
 
 
 def _rotate_from_fixed(fixed: Array, angles: Array) -> Array:

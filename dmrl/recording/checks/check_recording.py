@@ -13,11 +13,11 @@ import numpy as np
 from dmrl.errors import RecordingError
 from dmrl.geometry.calibration import find_calibration_fault
 from dmrl.recording.checks.clock_checks import check_clocks
-from dmrl.recording.checks.finding import Finding
 from dmrl.recording.checks.label_checks import check_causes, check_labels
 from dmrl.recording.checks.scan import (
     KEPT_TOPICS,
     CheckData,
+    Finding,
     ImageSize,
     carries_own_type,
     collect,

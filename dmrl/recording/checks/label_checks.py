@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from dmrl.errors import RecordingError
 from dmrl.geometry.frames import Array, is_inside
-from dmrl.recording.checks.finding import Finding
-from dmrl.recording.checks.scan import CheckData, find_first_size
+from dmrl.recording.checks.scan import CheckData, Finding, find_first_size
 from dmrl.topics import CALIBRATION, CAMERA_IMAGE, CAUSES, DETECTIONS, LABELS, parse_topic
 
 BIAS_LABELS_MIN = 20

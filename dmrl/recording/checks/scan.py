@@ -3,6 +3,7 @@
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -32,6 +33,25 @@ FIRST_VALUES, FIRST_IMAGES = 20_000, 500
 
 ImageSize = tuple[int, int] | None
 """Width and height of an image; None for data that are not an image."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A problem of a recording.
+
+    Parameters
+    ----------
+    level
+        "error" or "warning".
+    topic
+        Topic with the problem; empty for the recording as a whole.
+    text
+        Description in one line.
+    """
+
+    level: Literal["error", "warning"]
+    topic: str
+    text: str
 
 
 @dataclass(slots=True)

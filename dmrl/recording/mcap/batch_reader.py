@@ -14,7 +14,7 @@ from mcap.records import ChunkIndex
 
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunks.chunk import select_channels
-from dmrl.recording.mcap.chunks.chunk_reader import locate_chunk, read_chunk
+from dmrl.recording.mcap.chunks.chunk_reader import iter_chunks
 from dmrl.recording.mcap.file import BoundedReader, open_mcap
 from dmrl.recording.mcap.message_batch import (
     EMPTY_BATCH,
@@ -104,9 +104,7 @@ def iter_batches_in_file_order(path: Path) -> Iterator[tuple[MessageBatch, dict[
         channels = summary.channels_by_id
         counts: Counter[int] = Counter()
         chunks = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
-        stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
-        for chunk in chunks:
-            batch = read_chunk(stream, chunk, channels, summary)
+        for batch in iter_chunks(stream, chunks, channels, summary):
             count_messages(counts, batch)
             yield batch, channels
         check_counts(summary.statistics, channels, counts)
@@ -140,12 +138,10 @@ def _iter_in_time_order(
     chunks = select_chunks(summary, channels.keys(), low, high)
     last = _find_image_channels(channels)
     pending: MessageBatch | None = None
-    stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
     if (low, high) != (0, MAX_TIME_NS) and stream.remote_stream is None:
         # The messages cannot be compared with the statistics, but all message indexes can.
         verify_indexes(stream, summary)
-    for k, chunk in enumerate(chunks):
-        batch = read_chunk(stream, chunk, channels, summary)
+    for k, batch in enumerate(iter_chunks(stream, chunks, channels, summary)):
         batch = batch.take((batch.time_ns >= low) & (batch.time_ns < high))
         pending = concatenate(pending, batch).sort_by_time(last)
         if k + 1 == len(chunks):

@@ -130,7 +130,8 @@ FileIdentity = tuple[int, int, int]
 _HASHED_INPUTS: dict[Path, tuple[int, FileIdentity]] = {}
 
 
-def _identify_file(stream: BoundedReader) -> FileIdentity:
+def identify_file(stream: BoundedReader) -> FileIdentity:
+    """Return what tells a file from another, or from itself after a change."""
     status = stream.status
     return status.st_ino, status.st_size, status.st_mtime_ns
 
@@ -142,12 +143,12 @@ def expect_unchanged(path: Path) -> None:
     until this process has finished its next output.
     """
     with BoundedReader(path) as stream:
-        _HASHED_INPUTS[path] = count_ended_outputs(), _identify_file(stream)
+        _HASHED_INPUTS[path] = count_ended_outputs(), identify_file(stream)
 
 
 def _refuse_changed(stream: BoundedReader) -> None:
     when, stamp = _HASHED_INPUTS.get(stream.path, (-1, None))
-    if when == count_ended_outputs() and stamp != _identify_file(stream):
+    if when == count_ended_outputs() and stamp != identify_file(stream):
         raise RecordingError(f"{stream.path} was changed while it was read. Run it again")
 
 

@@ -5,11 +5,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from dmrl.recording.mcap.file import BoundedReader
+from dmrl.recording.mcap.file import BoundedReader, FileIdentity, identify_file
 
 CACHED_AGE_MIN_NS, CACHE_ENTRIES_MAX = 1_000_000_000, 12
 """Age from which the time stamp of a file is trusted, nanoseconds; and entries of the cache."""
-_CACHE: dict[tuple[Path, str], tuple[tuple[int, int, int], Any]] = {}
+_CACHE: dict[tuple[Path, str], tuple[FileIdentity, Any]] = {}
 Made = TypeVar("Made")
 
 
@@ -20,7 +20,7 @@ def get_cached(kind: str, stream: BoundedReader, make: Callable[[], Made]) -> Ma
     less than a second old are not cached: a later write might leave the same time stamp.
     """
     status = stream.status
-    stamp = status.st_ino, status.st_size, status.st_mtime_ns
+    stamp = identify_file(stream)
     key = stream.path, kind
     if key in _CACHE and _CACHE[key][0] == stamp:
         cached: Made = _CACHE[key][1]

@@ -1,7 +1,7 @@
 """Hold many messages as arrays of offsets into the bytes that contain them."""
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -78,14 +78,11 @@ class MessageBatch:
 
     def take(self, rows: Ints | NDArray[np.bool_]) -> "MessageBatch":
         """Return a batch of these rows over the same bytes."""
-        return MessageBatch(
-            self.data,
-            self.channel[rows],
-            self.time_ns[rows],
-            self.publish_ns[rows],
-            self.start[rows],
-            self.end[rows],
-        )
+        return MessageBatch(self.data, *(column[rows] for column in self._columns))
+
+    @property
+    def _columns(self) -> tuple[Ints, ...]:
+        return self.channel, self.time_ns, self.publish_ns, self.start, self.end
 
     @property
     def time_span_ns(self) -> tuple[int, int]:
@@ -119,23 +116,14 @@ class MessageBatch:
         view = self.data.data
         for first in range(0, len(self), ROWS_AT_A_TIME):
             part = slice(first, first + ROWS_AT_A_TIME)
-            columns = (self.channel, self.time_ns, self.publish_ns, self.start, self.end)
-            for number, time_ns, publish_ns, start, end in zip(
-                *(column[part].tolist() for column in columns), strict=True
-            ):
+            rows = zip(*(column[part].tolist() for column in self._columns), strict=True)
+            for number, time_ns, publish_ns, start, end in rows:
                 yield number, time_ns, publish_ns, bytes(view[start:end])
 
     def compact(self) -> "MessageBatch":
         """Copy the batch without bytes between its records."""
         records, at = self.copy_records()
-        return MessageBatch(
-            records,
-            self.channel,
-            self.time_ns,
-            self.publish_ns,
-            at[:-1] + MESSAGE_PREFIX_BYTES,
-            at[1:],
-        )
+        return replace(self, data=records, start=at[:-1] + MESSAGE_PREFIX_BYTES, end=at[1:])
 
     def copy_records(self) -> tuple[Bytes, Ints]:
         """Copy the records into one array; return it and the (N + 1,) offsets of their bounds."""

@@ -12,7 +12,7 @@ from mcap.records import Statistics
 
 from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.chunks.chunk_reader import locate_chunk, read_chunk
+from dmrl.recording.mcap.chunks.chunk_reader import iter_chunks
 from dmrl.recording.mcap.extra_records import read_metadata
 from dmrl.recording.mcap.file import BoundedReader
 from dmrl.recording.mcap.file_cache import get_cached
@@ -173,9 +173,7 @@ def _get_stated(section: SummarySection) -> MessageCount | None:
 def _iter_chunk_times(stream: BoundedReader, section: SummarySection) -> Iterator[tuple[int, Ints]]:
     """Yield channel id and log times of the messages of every chunk."""
     chunks = sorted(section.chunk_indexes, key=lambda c: c.chunk_start_offset)
-    stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
-    for chunk in chunks:
-        batch = read_chunk(stream, chunk, section.channels_by_id, section)
+    for batch in iter_chunks(stream, chunks, section.channels_by_id, section):
         for number in batch.list_channel_ids():
             yield number, batch.time_ns[batch.channel == number]
 

@@ -47,6 +47,27 @@ class ScannedFile:
     attachments: list[Attachment] = field(default_factory=list)
     statistics: Statistics | None = None
 
+    def add_record(self, record: McapRecord) -> str:
+        """Add a record; return how it contradicts an earlier one, or an empty text."""
+        wrong = ""
+        match record:
+            case Schema():
+                if self.schemas.get(record.id, record) != record:
+                    wrong = f"schema {record.id}, {record.name}, is defined twice"
+                self.schemas[record.id] = record
+            case McapChannel():
+                if self.channel_records.get(record.id, record) != record:
+                    wrong = f"channel {record.id}, {record.topic}, is defined twice"
+                self.channels.define(record, self.schemas)
+                self.channel_records[record.id] = record
+            case Metadata():
+                self.metadata.setdefault(record.name, []).append(dict(record.metadata))
+            case Attachment():
+                self.attachments.append(record)
+            case Statistics():
+                self.statistics = record
+        return wrong
+
 
 def scan_file(stream: BoundedReader) -> ScannedFile:
     """Read everything in a complete recording, with or without an index.
@@ -68,12 +89,12 @@ def scan_file(stream: BoundedReader) -> ScannedFile:
                 raise BudgetError(f"it decompresses to more than {size / 1e6:.0f} MB")
             scan = parse_records(decompress(record, stream.tell()))
             for definition in scan.iter_definitions():
-                _register_record(content, definition)
+                _add_or_refuse(content, definition)
             content.batches.append(select_channels(scan.batch, content.channels, content.channels))
         elif isinstance(record, Message):
             messages.append(record)
         else:
-            _register_record(content, record)
+            _add_or_refuse(content, record)
     if messages:
         content.batches.append(
             select_channels(batch_from_messages(messages), content.channels, content.channels)
@@ -81,18 +102,6 @@ def scan_file(stream: BoundedReader) -> ScannedFile:
     return content
 
 
-def _register_record(scanned: ScannedFile, record: McapRecord) -> None:
-    match record:
-        case Schema():
-            if scanned.schemas.setdefault(record.id, record) != record:
-                raise McapError(f"schema {record.id} is defined twice, as two kinds")
-        case McapChannel():
-            if scanned.channel_records.setdefault(record.id, record) != record:
-                raise McapError(f"channel {record.id} is defined twice, as two topics")
-            scanned.channels.define(record, scanned.schemas)
-        case Metadata():
-            scanned.metadata.setdefault(record.name, []).append(dict(record.metadata))
-        case Attachment():
-            scanned.attachments.append(record)
-        case Statistics():
-            scanned.statistics = record
+def _add_or_refuse(scanned: ScannedFile, record: McapRecord) -> None:
+    if wrong := scanned.add_record(record):
+        raise McapError(wrong)

@@ -52,13 +52,11 @@ def check_statistics(summary_section: McapSummary) -> None:
 def check_extra_counts(summary_section: McapSummary) -> None:
     """Raise unless there are as many metadata and attachments as Statistics states."""
     statistics = summary_section.statistics
+    if statistics is None:
+        return
     for what, number, indexes in (
-        (
-            ("metadata records", statistics.metadata_count, summary_section.metadata_indexes),
-            ("attachments", statistics.attachment_count, summary_section.attachment_indexes),
-        )
-        if statistics
-        else ()
+        ("metadata records", statistics.metadata_count, summary_section.metadata_indexes),
+        ("attachments", statistics.attachment_count, summary_section.attachment_indexes),
     ):
         if len(indexes) != number:
             raise McapError(f"it has {len(indexes)} of {number} {what}")

@@ -22,24 +22,22 @@ from numpy.typing import NDArray
 from dmrl.guards import limits
 from dmrl.recording.mcap.message_batch import Bytes, Ints
 from dmrl.recording.protobuf.wire_scan import (
-    DELIMITED,
-    FIXED32,
-    FIXED64,
     MAX_DEPTH,
-    START_GROUP,
-    VARINT,
     FieldSpans,
     concatenate_spans,
     find_fields,
 )
 from dmrl.recording.protobuf.wire_values import (
+    DELIMITED,
     FIXED_DTYPES,
+    VARINT,
     VARINT_DTYPES,
     WireError,
     decode_fixed,
     decode_integers,
     decode_present,
     decode_strings,
+    find_wire_type,
 )
 from dmrl.terminal.progress import say_once
 
@@ -247,12 +245,7 @@ def _decode_field(
 
 
 def _check_wire_type(field: FieldDescriptor, wire: int, *, packed: bool) -> None:
-    if field.type in VARINT_DTYPES:
-        expected = VARINT
-    elif field.type in FIXED_DTYPES:
-        expected = FIXED64 if np.dtype(FIXED_DTYPES[field.type]).itemsize == 8 else FIXED32
-    else:
-        expected = START_GROUP if field.type == F.TYPE_GROUP else DELIMITED
+    expected = find_wire_type(field)
     if wire != expected and not (packed and wire == DELIMITED):
         raise WireError(f"{field.full_name} has wire type {wire}, not {expected}")
 

@@ -14,8 +14,12 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from numpy.typing import ArrayLike, NDArray
 
 from dmrl.recording.mcap.message_batch import Bytes, Ints
-from dmrl.recording.protobuf.wire_scan import DELIMITED, FIXED32, FIXED64, VARINT
-from dmrl.recording.protobuf.wire_values import FIXED_DTYPES, VARINT_DTYPES
+from dmrl.recording.protobuf.wire_values import (
+    DELIMITED,
+    FIXED_DTYPES,
+    VARINT_DTYPES,
+    find_wire_type,
+)
 
 ColumnValue = ArrayLike | Mapping[str, "ColumnValue"]
 """Values of a field.
@@ -101,7 +105,7 @@ def _encode_field(field: FieldDescriptor, value: ColumnValue, count: int) -> Cel
         return _encode_delimited(field, body, np.asarray(body.there.any(axis=1)))
     body, zero = _encode_scalar(field, np.broadcast_to(array, count))
     cells = _concatenate_cells(
-        [_repeat_bytes(_encode_tag(field, _find_wire_type(field)), count), body], count
+        [_repeat_bytes(_encode_tag(field, find_wire_type(field)), count), body], count
     )
     return cells._replace(there=cells.there & ~zero[:, None])
 
@@ -161,12 +165,6 @@ def _encode_delimited(field: FieldDescriptor, body: Cells, there: Mask) -> Cells
         [_repeat_bytes(_encode_tag(field, DELIMITED), len(there)), size, body], len(there)
     )
     return cells._replace(there=cells.there & there[:, None])
-
-
-def _find_wire_type(field: FieldDescriptor) -> int:
-    if field.type in FIXED_DTYPES:
-        return FIXED64 if np.dtype(FIXED_DTYPES[field.type]).itemsize == 8 else FIXED32
-    return VARINT
 
 
 def _encode_tag(field: FieldDescriptor, wire: int) -> bytes:

@@ -10,9 +10,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmrl.recording.mcap.message_batch import Bytes, Ints
-from dmrl.recording.protobuf.wire_values import WireError, decode_varints
+from dmrl.recording.protobuf.wire_values import (
+    DELIMITED,
+    END_GROUP,
+    FIXED32,
+    FIXED64,
+    START_GROUP,
+    VARINT,
+    WireError,
+    decode_varints,
+)
 
-VARINT, FIXED64, DELIMITED, START_GROUP, END_GROUP, FIXED32 = range(6)
 MAX_DEPTH = 100
 """Nesting of messages, the limit of Google's own decoders."""
 

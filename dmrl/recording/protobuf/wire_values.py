@@ -33,6 +33,18 @@ VARINT_DTYPES = {
 }
 
 
+VARINT, FIXED64, DELIMITED, START_GROUP, END_GROUP, FIXED32 = range(6)
+
+
+def find_wire_type(field: FieldDescriptor) -> int:
+    """Return the wire type of a field's values, where they are not packed."""
+    if field.type in VARINT_DTYPES:
+        return VARINT
+    if field.type in FIXED_DTYPES:
+        return FIXED64 if np.dtype(FIXED_DTYPES[field.type]).itemsize == 8 else FIXED32
+    return START_GROUP if field.type == F.TYPE_GROUP else DELIMITED
+
+
 class WireError(ValueError):
     """The bytes are not messages of the given type."""
 

@@ -1,6 +1,6 @@
 """Read one chunk and verify it against its Chunk Index and Message Index records."""
 
-from collections.abc import Container, Mapping
+from collections.abc import Container, Iterator, Mapping, Sequence
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -33,6 +33,18 @@ from dmrl.recording.mcap.summary_section import SummarySection
 def locate_chunk(chunk: ChunkIndex) -> tuple[int, int]:
     """Return the offset of a chunk, and its size with its message indexes, bytes."""
     return chunk.chunk_start_offset, chunk.chunk_length + chunk.message_index_length
+
+
+def iter_chunks(
+    stream: BoundedReader,
+    chunks: Sequence[ChunkIndex],
+    channels: Mapping[int, Channel],
+    summary: SummarySection,
+) -> Iterator[MessageBatch]:
+    """Yield the messages of chunks, one chunk after the other; see `read_chunk`."""
+    stream.expect_reads([locate_chunk(chunk) for chunk in chunks])
+    for chunk in chunks:
+        yield read_chunk(stream, chunk, channels, summary)
 
 
 def read_chunk(
