@@ -241,6 +241,7 @@ def _end_with(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> object:
         raise error
 
     monkeypatch.setattr(cli, "app", fail)
+    monkeypatch.setattr(sys, "argv", ["dmrl", "command-of-a-plugin"])
     with pytest.raises(SystemExit) as end:
         cli.main()
     return end.value.code
