@@ -107,7 +107,7 @@ def test_a_missing_folder_is_named_with_the_way_out(tmp_path: Path) -> None:
         (errno.EACCES, "cannot write a.mcap: Permission denied. Choose another place"),
     ],
 )
-def test_refused_writes_are_one_line_with_the_way_out(code: int, words: str) -> None:
+def test_refused_writes_give_one_line_errors_with_a_remedy(code: int, words: str) -> None:
     text = str(as_output_error(Path("a.mcap"), OSError(code, os.strerror(code))))
     assert text.startswith(words)
     assert "\n" not in text
@@ -174,7 +174,7 @@ KINDS = pytest.mark.parametrize("kind", ["atomic_file", "atomic_folder"])
 
 @KINDS
 @pytest.mark.parametrize("stopped", [False, True])
-def test_a_second_writer_gets_one_line_and_the_first_its_output(
+def test_second_concurrent_writer_gets_one_line_error(
     kind: str, stopped: bool, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -281,7 +281,7 @@ def test_a_read_only_disk_is_one_error(
         pytest.fail("the block ran")
 
 
-def test_everything_is_on_the_disk_before_it_has_its_name(
+def test_output_is_synced_before_it_is_renamed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, seen = tmp_path / "set", []

@@ -27,7 +27,7 @@ def _end_of(error: BaseException) -> int:
     return boundary.run_to_status(fail)
 
 
-def test_a_bug_is_one_line_that_names_the_file_with_its_traceback(
+def test_internal_error_gives_one_line_with_the_traceback_file(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.delenv("DMRL_DEBUG", raising=False)
@@ -43,7 +43,7 @@ def test_a_bug_is_one_line_that_names_the_file_with_its_traceback(
     assert "in fail" in text
 
 
-def test_a_bug_keeps_its_traceback_where_someone_looks_for_it(
+def test_internal_error_keeps_its_traceback_in_debug_mode(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("DMRL_DEBUG", "1")
@@ -73,7 +73,9 @@ def test_os_error_gives_one_line_error(
     assert said.count("\n") == 1
 
 
-def test_a_link_to_itself_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_link_to_itself_gives_one_line_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (link := tmp_path / "a.mcap").symlink_to("a.mcap")
     words = ["merge", str(link), str(link), str(tmp_path / "b.mcap")]
     assert boundary.run_to_status(lambda: app(words)) == 1
@@ -185,7 +187,7 @@ main()
 @pytest.mark.parametrize(
     ("words", "longest_s"), [(["train", "dataset", "m"], 3.0), (["info", "a.mcap"], 0.3)]
 )
-def test_ctrl_c_at_any_moment_is_one_line_and_status_130(
+def test_ctrl_c_gives_one_line_and_status_130(
     words: list[str], longest_s: float, tmp_path: Path
 ) -> None:
     """At 15 moments of each: while modules are imported, and after."""

@@ -139,7 +139,7 @@ def bare() -> dict[str, Said]:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_of_a_command_loads_no_package_that_only_its_work_needs(
+def test_help_loads_no_package_that_only_the_command_needs(
     name: str, light: dict[str, Said]
 ) -> None:
     mine = {package for package in light[name][3] if not package.startswith("_")}
@@ -228,7 +228,7 @@ def test_flag_without_robot_name_shows_the_right_form(tmp_path: Path) -> None:
     )
 
 
-def test_a_line_that_is_far_too_long_keeps_its_file_and_its_way_out() -> None:
+def test_overlong_error_keeps_its_file_and_remedy() -> None:
     line = f"flight.mcap has {'far ' * 500}too much. Try: dmrl trim"
     short = truncate_middle(line)
     assert len(short) < 500
@@ -255,7 +255,7 @@ def test_ctrl_c_ends_with_one_line_and_status_130(
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_ctrl_c_ends_so_where_an_output_s_storage_does_not_answer(
+def test_ctrl_c_ends_a_command_that_waits_for_storage(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def standing() -> list[Path]:
@@ -273,7 +273,7 @@ def _subclasses(error: type[Exception]) -> Iterator[type[Exception]]:
         yield from _subclasses(child)
 
 
-def test_the_tree_of_errors_in_the_docstring_is_the_tree_of_errors() -> None:
+def test_documented_error_tree_equals_the_classes() -> None:
     tree = sys.modules[DmrlError.__module__].__doc__ or ""
     drawn = [
         line.split()[1] for line in tree.splitlines() if line.lstrip()[:2] in ("* ", "- ", "+ ")

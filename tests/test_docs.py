@@ -259,7 +259,7 @@ def _code(page: Path) -> str:
     return " ".join(block or quoted for block, quoted in found)
 
 
-def test_make_demo_installs_what_the_first_evening_types() -> None:
+def test_make_demo_installs_the_documented_packages() -> None:
     makefile = (ROOT / "Makefile").read_text()
     (installed,) = re.findall(r"^\$\(VENV\)/\.demo:.*\n\t.*'\.\[(.*)\]'", makefile, re.MULTILINE)
     typed = {line.split()[1] for line in command_lines(ROOT / "docs/first_evening.md")}

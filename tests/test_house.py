@@ -28,7 +28,7 @@ def name_of(path: Path) -> str:
 
 
 @pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_a_module_opens_with_what_it_is_for_and_is_short(path: Path) -> None:
+def test_modules_have_a_docstring_and_limited_length(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     said = ast.get_docstring(parsed(path)) or ""
     assert len(said.split()) >= 3

@@ -69,7 +69,7 @@ def test_every_change_can_be_compiled(found: list[Mutant]) -> None:
         compile(source[: mutant.start] + mutant.after.encode() + source[mutant.end :], "a", "exec")
 
 
-def test_a_seed_draws_the_same_again_and_every_kind_alike(found: list[Mutant]) -> None:
+def test_mutants_are_drawn_evenly_and_reproducibly(found: list[Mutant]) -> None:
     first, again, other = (drawn("room", 6, seed, ()) for seed in (1, 1, 2))
     assert first == again != other
     assert {m.kind for m in first} == {m.kind for m in found}

@@ -131,6 +131,7 @@ def test_a_wheel_holds_every_module_and_data_file(wheel: zipfile.ZipFile) -> Non
     assert not [name for name in names if any(p.startswith("test") for p in Path(name).parts)]
 
 
+@pytest.mark.heavy
 def test_a_wheel_holds_the_licence(wheel: zipfile.ZipFile) -> None:
     (licence,) = [name for name in wheel.namelist() if name.endswith("licenses/LICENSE")]
     assert b"Apache License" in wheel.read(licence)

@@ -119,9 +119,7 @@ def test_a_format_of_another_package_is_converted_from(
     assert read_summary(out).topics["/cf1/height"].schema == "dmrl.v1.Height"
 
 
-def test_names_of_plugins_are_offered_and_none_is_imported_before(
-    install: Install, tmp_path: Path
-) -> None:
+def test_plugin_names_are_listed_without_import(install: Install, tmp_path: Path) -> None:
     install("alt-logs", "raise AssertionError('imported')", formats="altitudes = alt_logs:FORMAT")
     (tmp_path / "flight.bin").write_bytes(b"\0\1")
     with pytest.raises(SourceError, match=r"Did you mean altitudes.* Formats: .*images, altitudes"):
@@ -129,7 +127,7 @@ def test_names_of_plugins_are_offered_and_none_is_imported_before(
     assert "alt_logs" not in sys.modules
 
 
-def test_dmrls_own_names_stay_dmrls(install: Install, tmp_path: Path) -> None:
+def test_plugins_cannot_override_built_in_names(install: Install, tmp_path: Path) -> None:
     install(
         "alt-logs", FORMAT, formats="csv = alt_logs:FORMAT", networks="locanet = alt_logs:FORMAT"
     )

@@ -149,7 +149,7 @@ def test_a_file_too_long_for_a_recipe_is_not_read_to_its_end(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("name", recipe.list_names() + recipe.list_pretrained_names())
-def test_shipped_recipes_start_with_what_they_do_and_the_command(name: str) -> None:
+def test_shipped_recipes_start_with_purpose_and_command(name: str) -> None:
     head = recipe.read_text(name).partition("\n\n")[0].splitlines()
     assert all(line.startswith("# ") for line in head)
     sentence = " ".join(line for line in head if not line.startswith("# dmrl "))
@@ -159,7 +159,7 @@ def test_shipped_recipes_start_with_what_they_do_and_the_command(name: str) -> N
     assert set(commands) <= set(COMMANDS)
 
 
-def test_shipped_recipes_are_those_of_the_folder() -> None:
+def test_shipped_recipes_equal_the_folder() -> None:
     assert recipe.list_names() == sorted(path.stem for path in RECIPES.glob("*.toml"))
     trained = sorted(path.stem for path in RECIPES.glob("pretrained/*.toml"))
     assert recipe.list_pretrained_names() == trained

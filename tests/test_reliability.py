@@ -16,7 +16,7 @@ def require_test(file: str, name: str) -> None:
     assert re.search(rf"^def {name}\(", text, re.MULTILINE), f"{file}::{name}"
 
 
-def test_every_claim_of_the_page_on_security_has_its_test() -> None:
+def test_every_claim_of_security_md_has_a_test() -> None:
     page = (TESTS.parent / "SECURITY.md").read_text(encoding="utf-8")
     table = page.partition("## Which test holds what")[2].partition("\n## ")[0]
     rows = re.findall(
@@ -27,7 +27,7 @@ def test_every_claim_of_the_page_on_security_has_its_test() -> None:
         require_test(file, name)
 
 
-def test_every_test_and_every_change_that_the_table_names_is_there() -> None:
+def test_tests_and_mutants_of_reliability_md_exist() -> None:
     _, _, table = PAGE.read_text(encoding="utf-8").partition("## Which test holds what")
     rows = ROW.findall(table)
     assert len(rows) == table.count("\n| ") - 1 > 30  # all but the head

@@ -41,7 +41,7 @@ def test_contract_fields_are_there(name: str) -> None:
     assert set(CONTRACT[name].split()) <= {field.name for field in full.fields}
 
 
-def test_status_values_are_those_of_the_schema() -> None:
+def test_status_values_equal_the_schema() -> None:
     enum = find_descriptor("PeerLabel").fields_by_name["status"].enum_type
     values = {value.name: value.number for value in enum.values}
     assert values == {

@@ -25,7 +25,7 @@ def test_a_topic_made_from_a_pattern_is_found_in_its_own_row_only(row: topics.To
     assert find_topic(topic) is row
 
 
-def test_no_pattern_stands_twice() -> None:
+def test_topic_patterns_are_unique() -> None:
     assert len({row.pattern for row in TOPICS}) == len(TOPICS)
 
 

@@ -10,7 +10,7 @@ import dmrl
 from dmrl.errors import ModelError, SettingError
 
 
-def test_detections_are_those_of_predict(flight: Path, tmp_path: Path) -> None:
+def test_detections_equal_dmrl_predict(flight: Path, tmp_path: Path) -> None:
     model = dmrl.load("dmrl-nano")
     images = dmrl.open(flight).images("cf1")
     found = model.detect(images, threshold=0.05)

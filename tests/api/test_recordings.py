@@ -11,7 +11,7 @@ from dmrl.images.codec import decode
 from dmrl.recording import read, read_table
 
 
-def test_topics_robots_and_time(flight: Path) -> None:
+def test_recording_lists_topics_robots_and_time(flight: Path) -> None:
     rec = dmrl.open(flight)
     assert rec.robots == ["cf1", "cf2"]
     assert "/cf1/attitude" in rec and rec.topics["/cf1/attitude"].schema == "dmrl.v1.Attitude"

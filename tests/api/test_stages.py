@@ -13,7 +13,7 @@ from dmrl.cli import app
 from dmrl.errors import RecipeError, SettingError
 
 
-def test_the_bytes_are_those_of_the_command(flight: Path, tmp_path: Path) -> None:
+def test_python_stages_write_the_bytes_of_their_commands(flight: Path, tmp_path: Path) -> None:
     app(
         ["label", str(flight), str(tmp_path / "a.mcap"), "--gate-m", "0.4"],
         result_action="return_value",
@@ -22,7 +22,7 @@ def test_the_bytes_are_those_of_the_command(flight: Path, tmp_path: Path) -> Non
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
-def test_a_recording_without_a_name_lives_as_long_as_its_object(flight: Path) -> None:
+def test_temporary_recording_lives_as_long_as_its_object(flight: Path) -> None:
     made = dmrl.trim(dmrl.open(flight), from_s=1.0, to_s=2.0)
     path = made.path
     assert path.exists() and 90 <= len(made["/cf1/height"]) <= 110
@@ -31,7 +31,7 @@ def test_a_recording_without_a_name_lives_as_long_as_its_object(flight: Path) ->
     assert not path.exists()
 
 
-def test_topics_and_images_keep_a_temporary_recording_there(flight: Path) -> None:
+def test_topics_and_images_keep_a_temporary_recording_alive(flight: Path) -> None:
     topic = dmrl.trim(flight, from_s=1.0, to_s=2.0)["/cf1/height"]
     images = dmrl.trim(flight, from_s=1.0, to_s=2.0).images("cf1")[:1]
     gc.collect()
@@ -61,7 +61,7 @@ def test_empty_list_is_refused_and_one_recording_is_accepted(flight: Path, tmp_p
     assert len(dmrl.make_dataset(flight, tmp_path / "set")) > 0
 
 
-def test_figures_are_those_that_the_command_prints(
+def test_evaluate_returns_the_printed_figures(
     flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen = dmrl.predict("dmrl-nano", flight, tmp_path / "seen.mcap")

@@ -191,7 +191,7 @@ def test_non_utf_8_name_is_refused_before_indexing(
 
 
 @pytest.mark.heavy
-def test_a_file_that_is_no_catalogue_is_left_alone(flights: Path) -> None:
+def test_file_that_is_no_catalogue_is_not_overwritten(flights: Path) -> None:
     with pytest.raises(RecordingError, match=r"has no catalogue\. Make it: dmrl index"):
         open_catalogue(flights)
     (flights / FILE_NAME).write_text("my notes")
@@ -226,7 +226,7 @@ def test_the_commands_print_tables_paths_and_json(
 
 
 @pytest.mark.heavy
-def test_a_dataset_of_what_a_query_finds(
+def test_dataset_is_made_of_query_results(
     flights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     index.update(flights, workers=1)

@@ -92,7 +92,7 @@ def test_card_lists_the_lineage_with_hashes(built: Path) -> None:
     assert "seed = 1" in text
 
 
-def test_figures_stand_beside_it(built: Path) -> None:
+def test_card_includes_its_figures(built: Path) -> None:
     text = (built / "README.md").read_text()
     for name in ("depth.png", "position.png", "peers.png", "samples.jpg"):
         assert f"](figures/{name})" in text
@@ -186,7 +186,7 @@ def test_the_day_of_publication_stays_and_must_be_a_date(built: Path) -> None:
 
 
 @pytest.mark.parametrize("license_id", ["cc0-1.0", "Apache-2.0 OR MIT", "odc-by", "other"])
-def test_licences_that_are_known_are_taken(built: Path, license_id: str) -> None:
+def test_known_licences_are_accepted(built: Path, license_id: str) -> None:
     run_card(built, CardSettings(license=license_id))
     assert front_of(built)["license"] == license_id
 
@@ -281,7 +281,7 @@ def test_a_folder_that_is_no_dataset_gets_no_card(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_broken_provenance_is_one_line(built: Path) -> None:
+def test_broken_provenance_gives_one_line_error(built: Path) -> None:
     (built / "provenance.json").write_text("[]")
     with pytest.raises(DatasetError, match=r"provenance.json cannot be read .* again$"):
         write_card(built)

@@ -53,7 +53,7 @@ def test_test_images_that_look_like_one_in_train_are_counted(
     assert "3 images of a test split have the pixels of one in train, 3 are near" in text
 
 
-def test_moments_and_poses_that_train_has_too_are_counted(record: Record, tmp_path: Path) -> None:
+def test_times_and_poses_shared_with_train_are_counted(record: Record, tmp_path: Path) -> None:
     spans = {"train": "[[0, 50000000]]", "test": "[[100000000, 600000000]]"}
     poses = [[peer(u_px=20.49)], [peer(u_px=20.51)], [peer(u_px=22.0)], [peer(depth_m=1.7)]]
     path = record(peers=poses, split=spans)

@@ -133,7 +133,7 @@ def test_datasets_reads_features_from_parquet(record: Record, tmp_path: Path) ->
     )
 
 
-def test_an_absent_split_names_those_that_are_there(built: Path) -> None:
+def test_missing_split_error_lists_existing_ones(built: Path) -> None:
     with pytest.raises(DatasetError, match=r"no split val in .*out. It has: train, test"):
         open_dataset(built).split("val")
 
@@ -176,7 +176,7 @@ def test_a_missing_parquet_shard_is_named(record: Record, tmp_path: Path) -> Non
         open_dataset(tmp_path / "out").split("train")
 
 
-def test_broken_json_is_one_line(built: Path) -> None:
+def test_broken_json_gives_one_line_error(built: Path) -> None:
     (built / "manifest.json").unlink()  # as if datasets had saved it
     (built / "train" / "state.json").write_text("{")
     with pytest.raises(DatasetError, match=r"state.json is not JSON"):

@@ -131,7 +131,7 @@ def _many_peers(table: pa.Table) -> pa.Array:
         ),
     ],
 )
-def test_what_is_not_laid_out_as_a_dataset_is_refused(
+def test_invalid_dataset_layout_is_refused(
     shard: Path, change: Callable[[pa.Table], pa.Table], complaint: str
 ) -> None:
     rewritten(shard, change(table_of(shard)))
@@ -162,7 +162,7 @@ def test_a_split_without_images_and_a_shard_named_twice_are_refused(shard: Path)
         open_dataset(folder).split("train")
 
 
-def test_pictures_of_another_size_than_their_labels_are_refused(
+def test_images_whose_size_differs_from_their_labels_are_refused(
     record: Record, tmp_path: Path
 ) -> None:
     run([record()], tmp_path / "set", Settings(split="none", png=True))

@@ -97,7 +97,7 @@ def test_a_large_split_is_shuffled_in_windows_of_blocks(monkeypatch: pytest.Monk
     assert np.ptp(rows[:640]) > 5_000 and (np.diff(rows[:640]) < 0).sum() > 200
 
 
-def test_a_batch_decodes_its_own_pictures_alone(
+def test_batch_decodes_only_its_own_images(
     record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = dmrl.dataset(grown(record, tmp_path / "set", parquet=True))["train"]

@@ -66,7 +66,7 @@ def best(model: Path, backend: str, image: np.ndarray) -> list[float]:
 
 
 @pytest.mark.parametrize("name", ["float", "network"])
-def test_the_program_for_onnxruntime_finds_what_dmrl_finds(folders: Path, name: str) -> None:
+def test_onnxruntime_program_finds_the_same_detections(folders: Path, name: str) -> None:
     folder, image = folders / name, seen(folders)
     first, node = programs(folder, "python")
     (folder / "detect.py").write_text(first)
@@ -108,9 +108,7 @@ def test_the_programs_in_c_and_cpp_compile_cleanly_and_find_the_same(
 @pytest.mark.parametrize(
     ("maps", "decoded"), [("model.onnx", "decoded.onnx"), ("model.int8.onnx", "decoded.int8.onnx")]
 )
-def test_detections_out_of_onnx_are_those_of_its_maps(
-    folders: Path, maps: str, decoded: str
-) -> None:
+def test_onnx_detections_equal_decoded_maps(folders: Path, maps: str, decoded: str) -> None:
     ort = pytest.importorskip("onnxruntime")
     images = dmrl.open(folders / "pictures.mcap").images().to_numpy()
     options = ort.SessionOptions()
@@ -134,7 +132,7 @@ def test_detections_out_of_onnx_are_those_of_its_maps(
 
 
 @pytest.mark.parametrize("name", list_pretrained())
-def test_a_shipped_network_has_its_int8_network_beside_it(name: str, tmp_path: Path) -> None:
+def test_shipped_network_exports_its_int8_network(name: str, tmp_path: Path) -> None:
     """Of the weights that ship: else its outputs would be others. See benchmarks/ship_int8.py."""
     app(["export", name, str(tmp_path / "out")], result_action="return_value")
     assert (tmp_path / "out/model.int8.onnx").is_file() and list((tmp_path / "out").glob("*.c"))

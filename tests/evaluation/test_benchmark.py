@@ -136,6 +136,7 @@ def test_submitted_labels_are_scored_by_their_input_and_truth_is_refused(
         score_labels(tmp_path / "odd.csv", [whole], inputs)
 
 
+@pytest.mark.heavy
 def test_network_trained_on_sealed_flight_is_refused(
     scene: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:

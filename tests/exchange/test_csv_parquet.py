@@ -36,7 +36,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_tables_hold_what_the_recording_holds(recording: Path, tmp_path: Path, kind: str) -> None:
+def test_exported_tables_equal_the_recording(recording: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / "out"
     counts = write_tables(recording, out, kind)  # type: ignore[arg-type]
     assert counts == {

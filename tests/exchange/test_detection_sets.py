@@ -129,7 +129,7 @@ def test_pycocotools_reads_coco(source: Path) -> None:
 
 
 @pytest.mark.parametrize("to", ["yolo", "coco"])
-def test_boxes_come_back_within_a_hundredth_of_a_pixel(to: str, source: Path) -> None:
+def test_boxes_round_trip_within_a_hundredth_of_a_pixel(to: str, source: Path) -> None:
     out = export(source, to)
     again = source.parent / "again.mcap"
     with count_left_out() as counted:
@@ -271,7 +271,7 @@ def test_invalid_export_gives_one_line_error(source: Path, tmp_path: Path) -> No
     assert not out.exists()
 
 
-def test_a_set_in_which_nothing_has_a_box_is_one_line(tmp_path: Path) -> None:
+def test_export_without_boxes_gives_one_line_error(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "flight.mcap", Provenance("test")) as sink:
         image = message_class("CompressedImage")(data=encode_png(pixels_of(0)), format="png")
         peer = {"peer": "cf2", "u_px": 9, "v_px": 9, "depth_m": 1, "source": "hand"}

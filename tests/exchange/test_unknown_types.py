@@ -113,7 +113,7 @@ def test_a_list_of_bytes_is_base64_in_a_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_a_text_that_is_not_utf_8_is_one_line(kind: str, tmp_path: Path) -> None:
+def test_text_that_is_not_utf_8_gives_one_line_error(kind: str, tmp_path: Path) -> None:
     path = recorded(tmp_path, {"type": F.TYPE_STRING}, data=b"\x0a\x02\xed\xa0")
     with pytest.raises(RecordingError, match="/cf1/m: a text is not UTF-8"):
         write_tables(path, tmp_path / "out", kind)  # type: ignore[arg-type]

@@ -111,6 +111,7 @@ def killed(broken: FaultTrials, count: Count, moments: int) -> None:
     broken.report("kill -9", count)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("work", QUICK)
 def test_killed_command_leaves_no_partial_output(
     work: Workload, disk: Disk, folder: Path, count: Count

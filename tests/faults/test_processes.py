@@ -153,7 +153,7 @@ def recorder(out: Path, fleet: Fleet) -> subprocess.Popen[bytes]:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_soak_of_recording_loses_nothing_but_what_was_away(
+def test_long_recording_loses_only_disconnected_packets(
     flight: Path, tmp_path: Path, count: Count
 ) -> None:
     """Three minutes of three drones that are switched off and on, and lose packets."""

@@ -29,7 +29,7 @@ def _still_flight(duration_s: float, rate_hz: float) -> Flight:
     return Flight(dict.fromkeys(truth), truth, ranges, dict.fromkeys(truth, Clock()))  # type: ignore[arg-type]
 
 
-def test_a_random_walk_in_white_noise_has_its_closed_form() -> None:
+def test_bound_of_a_random_walk_in_white_noise_equals_closed_form() -> None:
     noise = Noise(uwb_white_m=0.1, velocity_white_mps=0.3)
     bound = compute_bound(_still_flight(40.0, 50.0), noise, yaw_spread_rad=0.0)
     step_s = 0.2

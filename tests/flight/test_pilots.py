@@ -41,7 +41,7 @@ def test_pilot_keeps_its_distance_and_faces_the_leader() -> None:
     assert near.vx_mps < -0.1 and abs(near.yaw_rate_radps) < 0.05
 
 
-def test_it_flies_slower_to_a_leader_that_it_misses() -> None:
+def test_pilot_slows_down_while_detections_are_missing() -> None:
     pilot = Follow(TASK)
     before = fly(pilot, [(1.0, 0.0)])[-1].vx_mps
     speeds = [pilot.command(observe(1.0 + 0.1 * k, [])).vx_mps for k in range(6)]

@@ -53,7 +53,7 @@ Preset = tuple[Noise, list[tuple[Flight, Flight]]]
         ("pitch_rad", "attitude_white_rad", "attitude_bias_rad"),
     ],
 )
-def test_white_noise_and_bias_are_those_of_the_table(
+def test_white_noise_and_bias_match_the_noise_table(
     preset: Preset, column: str, white: str, bias: str
 ) -> None:
     noise, pairs = preset
@@ -80,7 +80,7 @@ def test_velocity_noise_is_white_and_coloured(preset: Preset) -> None:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", PRESETS)
-def test_velocity_scale_and_bias_are_those_of_the_table(name: str) -> None:
+def test_velocity_scale_and_bias_match_the_noise_table(name: str) -> None:
     preset = NOISE[name]
     constant = Noise(
         velocity_scale=preset.velocity_scale, velocity_bias_mps=preset.velocity_bias_mps
@@ -120,7 +120,7 @@ def range_errors(flight: Flight) -> tuple[Array, int]:
 
 
 @pytest.mark.heavy
-def test_ranges_have_the_noise_of_the_table(preset: Preset) -> None:
+def test_range_noise_matches_the_noise_table(preset: Preset) -> None:
     noise, pairs = preset
     every, whites = [], []
     for noisy, _ in pairs:
@@ -140,14 +140,14 @@ def test_ranges_have_the_noise_of_the_table(preset: Preset) -> None:
 
 
 @pytest.mark.heavy
-def test_the_share_of_lost_ranges_is_that_of_the_table(preset: Preset) -> None:
+def test_share_of_lost_ranges_matches_the_noise_table(preset: Preset) -> None:
     noise, pairs = preset
     got = np.mean([[len(r.time_s) for r in noisy.ranges.values()] for noisy, _ in pairs])
     assert got / (15.0 * noise.ranging_rate_hz) == pytest.approx(1 - noise.ranging_loss, abs=0.01)
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_bias_and_scale_of_a_pair_are_those_of_the_table(name: str) -> None:
+def test_pair_bias_and_scale_match_the_noise_table(name: str) -> None:
     noise = NOISE[name]
     drawn = np.array([draw_pair_errors(np.random.default_rng(k), noise) for k in range(2000)])
     assert drawn[:, 0].std() == pytest.approx(noise.uwb_bias_m, rel=0.06)

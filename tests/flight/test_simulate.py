@@ -96,7 +96,7 @@ def test_flight_depends_only_on_arguments_and_seed() -> None:
     assert not np.array_equal(one.robots["cf2"].vx_mps, other.robots["cf2"].vx_mps)
 
 
-def test_more_robots_change_nothing_for_those_already_there() -> None:
+def test_adding_robots_does_not_change_the_others() -> None:
     two, six = (
         simulate(replace(SHORT, robots=n, trajectory="random"), NOISE["harsh"], 1) for n in (2, 6)
     )

@@ -22,7 +22,7 @@ def fly(command: Command, seconds: float, scenario: Scenario = EIGHT) -> Stepped
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_leader_flies_the_eight_of_the_contract(seed: int) -> None:
+def test_leader_flies_the_specified_figure_eight(seed: int) -> None:
     truth = simulate(replace(EIGHT, flown=0), NOISE["ideal"], seed).truth["cf2"]
     assert np.abs(truth.position[:, :2]).max(axis=0) == pytest.approx([1.6, 1.2], abs=0.01)
     assert np.hypot(*truth.velocity[:, :2].T).max() <= 0.6 + 1e-9

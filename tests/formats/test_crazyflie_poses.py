@@ -11,7 +11,7 @@ GROWING = st.lists(st.integers(0, 9), min_size=1, max_size=6).map(sorted)
 
 
 @given(GROWING, GROWING)
-def test_a_pose_takes_the_turn_of_its_own_time_or_the_next_one(
+def test_pose_takes_the_orientation_of_its_time_or_the_next(
     places: list[int], turns: list[int]
 ) -> None:
     place = TimeSeries(np.array(places), np.arange(3.0 * len(places)).reshape(-1, 3))

@@ -57,7 +57,7 @@ def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return added
 
 
-def test_formats_stand_in_the_order_in_which_they_are_tried() -> None:
+def test_formats_are_listed_in_detection_order() -> None:
     names = list(load_builtin_formats())
     assert tuple(names[: len(GUESS_ORDER)]) == GUESS_ORDER
     assert names[-1] == "images"
@@ -119,7 +119,7 @@ def test_misspelled_format_suggests_the_nearest(tmp_path: Path, plug: Callable[.
         assert str(e.value).endswith("images, theirs")
 
 
-def test_a_plug_in_is_asked_after_our_own_and_by_its_name(
+def test_plugin_formats_are_tried_after_built_in_ones_and_by_name(
     tmp_path: Path, plug: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     plug(broken="BROKEN", theirs="FORMAT", none="NONE")

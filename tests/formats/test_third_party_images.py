@@ -165,7 +165,7 @@ def test_images_opened_by_pillow_become_rgb(
 
 
 @pytest.mark.parametrize("as_stored", [False, True])
-def test_exif_turns_pictures_upright(as_stored: bool, convert: Convert, tmp_path: Path) -> None:
+def test_exif_orientation_is_applied(as_stored: bool, convert: Convert, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     exif = PIL.Image.Exif()
     exif[0x0112] = 6  # to be turned by 90 degrees clockwise

@@ -75,7 +75,7 @@ def test_steady_rate_filter_reduces_jitter_causally() -> None:
     assert np.std(errors_ms[100:]) < 0.4 * np.std(raw_ms[100:])
 
 
-def test_after_a_pause_arrivals_stand_as_they_are() -> None:
+def test_arrivals_after_a_pause_are_unchanged() -> None:
     sender = SteadyRateFilter()
     for k in range(20):
         sender(50 * MS * k)
@@ -127,7 +127,7 @@ def test_steady_rate_filter_starts_at_the_eighth_arrival() -> None:
     assert sender(352 * MS) == pytest.approx((300 + pace + 0.02 * (52 - pace)) * MS, abs=1)
 
 
-def test_the_pace_is_that_of_the_last_64_arrivals() -> None:
+def test_rate_is_estimated_from_the_last_64_arrivals() -> None:
     sender, now = SteadyRateFilter(), 0
     for step in [50] * 100 + [40] * 64:
         now += step * MS
@@ -177,7 +177,7 @@ def plain_line(x: list[int], y: list[int]) -> list[int]:
 
 
 @given(st.lists(st.tuples(st.integers(1, 9), st.integers(0, 90)), min_size=3, max_size=12))
-def test_times_are_those_of_the_highest_line_under_all_arrivals(
+def test_times_follow_the_highest_line_below_all_arrivals(
     steps: list[tuple[int, int]],
 ) -> None:
     number = np.cumsum([step for step, _ in steps])

@@ -8,7 +8,7 @@ from dmrl.geometry.frames import AIDECK, PUBLISHED_RENDER, Camera
 
 
 @pytest.mark.parametrize("camera", [AIDECK, PUBLISHED_RENDER])
-def test_a_camera_comes_back_as_written(camera: Camera, tmp_path: Path) -> None:
+def test_camera_file_round_trips(camera: Camera, tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
     path.write_text(format_camera(camera))
     assert read_camera(path) == camera

@@ -82,7 +82,7 @@ def test_axis_of_a_camera_pitched_10_degrees_hits_the_floor_ahead() -> None:
     np.testing.assert_allclose(pixel((ahead_m, 0.0, -height_m), 0, 10), [160, 112])
 
 
-def test_pitch_turns_before_roll_when_both_are_there() -> None:
+def test_pitch_is_applied_before_roll() -> None:
     """Nose down 90 degrees, then rolled about the camera's own axis, which points down."""
     turn = camera_from_horizontal(np.radians(90), np.radians(90))
     down, ahead = np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0])
@@ -196,7 +196,7 @@ def test_projection_with_distortion_equals_opencv() -> None:
         assert depth_m[k] == pytest.approx((turn @ xyz[k])[2])
 
 
-def test_without_distortion_the_pixels_are_those_of_project() -> None:
+def test_projection_without_distortion_equals_project() -> None:
     rng = np.random.default_rng(1)
     roll, pitch = rng.uniform(-0.4, 0.4, (2, 20))
     xyz = rng.uniform([1.0, -0.8, -0.6], [4.0, 0.8, 0.6], (20, 3))
@@ -226,7 +226,7 @@ def test_projection_jacobian_equals_finite_differences() -> None:
         assert np.abs(slope - jacobian[:, :, column]).max() < 1e-4
 
 
-def test_behind_the_camera_there_is_no_pixel() -> None:
+def test_points_behind_the_camera_have_no_pixel() -> None:
     uv, depth_m, _ = pixels_from_horizontal(
         np.array([[-1.0, 0.2, 0.1]]), np.zeros(1), np.zeros(1), AIDECK
     )

@@ -10,7 +10,7 @@ from dmrl.geometry.frames import AIDECK
 from dmrl.geometry.lens import distort, undistort
 
 
-def test_a_lens_that_folds_back_gives_no_pixel_out_there() -> None:
+def test_folded_lens_model_gives_no_pixel_far_out() -> None:
     bent, _ = distort(np.array([[0.1, 0.0], [3.0, 0.0]]), (-0.3,))
     assert np.isfinite(bent[0]).all()
     assert np.isnan(bent[1]).any()
@@ -33,7 +33,7 @@ def test_the_model_is_opencvs() -> None:
     np.testing.assert_allclose(distort(PLANE, LENS[:2])[0], distort(PLANE, (*LENS[:2], 0, 0, 0))[0])
 
 
-def test_the_derivatives_are_those_of_small_steps() -> None:
+def test_distortion_derivatives_equal_finite_differences() -> None:
     _, jacobian = distort(PLANE, LENS)
     for k, step in enumerate(1e-6 * np.eye(2)):
         slope = (distort(PLANE + step, LENS)[0] - distort(PLANE - step, LENS)[0]) / 2e-6

@@ -39,7 +39,7 @@ def test_roll_is_first_then_pitch_then_yaw(roll: float, pitch: float, yaw: float
 
 
 @given(TURN, TILT, TURN, st.sampled_from([1.0, -1.0]))
-def test_angles_come_back_from_either_quaternion(
+def test_euler_angles_round_trip_through_quaternions(
     roll: float, pitch: float, yaw: float, sign: float
 ) -> None:
     angles = np.array([[roll, pitch, yaw], [0.1, 0.2, 0.3]])
@@ -58,7 +58,7 @@ def test_angles_come_back_from_either_quaternion(
         ((0, 0, 0, 1), (0, 0, 0)),
     ],
 )
-def test_turns_about_one_axis_by_hand(
+def test_single_axis_rotations_equal_hand_computed_values(
     quaternion: tuple[float, ...], angles: tuple[float, float, float]
 ) -> None:
     np.testing.assert_allclose(quaternion_to_euler(np.array([quaternion]))[0], angles, atol=1e-7)

@@ -37,7 +37,7 @@ def test_whole_numbers_have_64_bits(number: int) -> None:
     assert parse_json("[18446744073709551615, true, 1e300]") == [2**64 - 1, True, 1e300]
 
 
-def test_arrays_come_back(tmp_path: Path) -> None:
+def test_arrays_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     np.savez_compressed(path, one=np.arange(5), two=np.zeros((2, 3)))
     found = load_npz(path)

@@ -54,7 +54,7 @@ def test_bytes_go_in_and_come_out() -> None:
     assert run("echo", b"abc") == b"cba"
 
 
-def test_an_error_of_dmrl_comes_back() -> None:
+def test_dmrl_error_is_raised_in_the_caller() -> None:
     with pytest.raises(SettingError, match=r"^'?x is refused. Ask for less"):
         run("refuse", b"x")
 
@@ -65,7 +65,7 @@ def test_memory_limit_stops_large_queries_only() -> None:
         run("take_memory", b"2000000000")
 
 
-def test_a_crash_is_one_line() -> None:
+def test_crash_gives_one_line_error() -> None:
     with pytest.raises(SettingError, match="the query 'x'"):
         run("abort")
 

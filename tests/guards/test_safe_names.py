@@ -42,7 +42,7 @@ def test_split_name_must_be_a_word(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["Data", "readme.MD", "con", "AUX", "nul.x", "Com1", "lpt9"])
-def test_a_split_has_a_folder_of_its_own_on_every_disk(name: str) -> None:
+def test_splits_have_distinct_folders_on_every_file_system(name: str) -> None:
     with pytest.raises(UnsafeName, match="Rename it"):
         check_split_name(name, "it")
     assert check_split_name(f"x-{name}", "it") == f"x-{name}"
@@ -73,7 +73,7 @@ def test_nothing_ends_a_comment(text: str) -> None:
     assert not set(comment_safe(text)) & set("*/\\\n\r?\"'$`\u2028<>[]#")
 
 
-def test_markup_is_shown_and_not_obeyed() -> None:
+def test_markup_in_names_is_escaped() -> None:
     assert (
         escape_markdown("a|b<img src=x>[x](http://y)\nc") == r"a\|b\<img src=x\>\[x\](http:\//y) c"
     )
@@ -84,7 +84,7 @@ def test_markup_is_shown_and_not_obeyed() -> None:
     assert to_one_line("a\x1b]0;x\x07\u202eb\r\nc") == r"a\x1b]0;x\x07\u202eb c"
 
 
-def test_an_error_is_one_line_whatever_it_quotes() -> None:
+def test_errors_are_one_line_whatever_they_quote() -> None:
     """A library's words of a damaged schema held a line end, and so did the error from Python."""
     error = RecordingError("a.mcap is damaged (invalid name (\nheight\x1b[2J)). Try: dmrl recover")
     assert str(error) == r"a.mcap is damaged (invalid name ( height\x1b[2J)). Try: dmrl recover"

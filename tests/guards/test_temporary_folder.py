@@ -44,7 +44,7 @@ def test_temporary_folder_of_a_killed_command_is_removed_at_next_start(tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_folder_of_a_living_command_stays(tmp_path: Path) -> None:
+def test_temporary_folder_of_a_running_command_is_kept(tmp_path: Path) -> None:
     environment = os.environ | {"TMPDIR": str(tmp_path)}
     with subprocess.Popen(
         [sys.executable, "-c", WAITS],

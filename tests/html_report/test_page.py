@@ -44,7 +44,7 @@ class _Seen(HTMLParser):
 
 
 @pytest.mark.heavy
-def test_the_page_shows_what_is_there_and_fetches_nothing(outputs: Path) -> None:
+def test_report_shows_outputs_and_loads_nothing_external(outputs: Path) -> None:
     html = build_report(collect_outputs(outputs))
     seen = _Seen(html)
     wanted = ["Detections", "Positions", "Training", "Images", "Recordings"]
@@ -166,7 +166,7 @@ def test_log_axis_labels_are_plain_text_and_legend_is_outside() -> None:
     assert svg.rindex('id="axes_1"') < legend and svg.count('id="legend_') == 1
 
 
-def test_ranges_of_distance_stand_in_order_whoever_has_them() -> None:
+def test_distance_bands_are_in_order() -> None:
     near, far, rest = (0.0, 0.5), (0.5, 1.0), (1.0, np.inf)
     few = [(*far, 5.0, 4.0, 6.0), (*rest, 7.0, 6.0, 9.0)]
     all_of_them = [(*near, 3.0, 2.0, 4.0), *few]
@@ -174,7 +174,7 @@ def test_ranges_of_distance_stand_in_order_whoever_has_them() -> None:
     assert re.findall(r">(0-0\.5|0\.5-1|1-)<", svg) == ["0-0.5", "0.5-1", "1-"]
 
 
-def test_no_depth_stands_on_another_or_outside_the_image() -> None:
+def test_depth_texts_do_not_overlap_and_stay_in_the_image() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
         uv_px = rng.uniform([0, 0], [320, 224], (2, 2))

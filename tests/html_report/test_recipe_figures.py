@@ -113,7 +113,7 @@ def test_figure_sources_outside_the_folder_are_not_shown(pipeline: Path, tmp_pat
 
 
 @pytest.mark.heavy
-def test_a_recipe_that_is_none_is_named_and_the_page_written(pipeline: Path) -> None:
+def test_invalid_recipe_is_reported_on_the_report(pipeline: Path) -> None:
     (pipeline / "recipe.toml").write_text("[[figure]]\nshows = 3\n")
     html = build_report(collect_outputs(pipeline))
     assert "recipe.toml" in html[html.index("Unreadable files</h2>") :]

@@ -27,7 +27,7 @@ def raw(rows: int, values: int, size: int, spare: int = 0) -> tuple[np.ndarray, 
     return found, lines.ravel()
 
 
-def test_the_table_is_that_of_ros() -> None:
+def test_encoding_table_equals_ros() -> None:
     assert set(LAYOUTS) == set(ROS)
 
 
@@ -78,7 +78,7 @@ def test_a_colour_sensor_s_picture_gets_its_colours(pattern: str, bits: int) -> 
         ("nv21", HEIGHT * 3 // 2, cv2.COLOR_YUV2RGB_NV21),
     ],
 )
-def test_luma_and_chroma_are_those_of_opencv(encoding: str, rows: int, code: int) -> None:
+def test_luma_and_chroma_conversion_equals_opencv(encoding: str, rows: int, code: int) -> None:
     count = 1 if encoding == "nv21" else 2
     values, data = raw(rows, WIDTH * count, 1)
     values = values.clip(16, 235)

@@ -206,7 +206,7 @@ def test_topics_that_the_table_does_not_name_are_left_out_by_name(tmp_path: Path
         (TABLE.replace('"cf1"', "3"), r"\[names\]: not new names"),
     ],
 )
-def test_a_table_that_fits_no_topic_is_one_line(text: str, why: str, tmp_path: Path) -> None:
+def test_table_that_fits_no_topic_gives_one_line_error(text: str, why: str, tmp_path: Path) -> None:
     source = in_json(tmp_path / "a", messages("red"))
     (tmp_path / "map.toml").write_text(text)
     with pytest.raises(SourceError, match=why) as e:

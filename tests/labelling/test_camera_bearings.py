@@ -68,7 +68,7 @@ def test_images_have_as_many_candidates_as_they_show() -> None:
     assert len(detections_to_bearings(none, START_NS, 3.0, 0.01).time_s) == 0
 
 
-def test_both_robots_of_a_pair_get_what_their_cameras_showed() -> None:
+def test_both_robots_of_a_pair_get_their_bearings() -> None:
     pair, _ = still_pair()
     sees = detections_to_bearings(seen(), START_NS, 3.0, 0.01)
     pairs = add_bearings({("a", "b"): pair, ("b", "c"): pair}, {"b": sees})

@@ -63,7 +63,7 @@ def test_roll_and_pitch_move_labels_in_the_documented_direction() -> None:
 
 @pytest.mark.parametrize("attitude_std_rad", [0.0, 0.03])
 @pytest.mark.parametrize("spread_m", [0.0, 0.05])
-def test_sigmas_are_those_of_drawn_positions_and_attitudes(
+def test_label_sigmas_match_sampled_positions_and_attitudes(
     attitude_std_rad: float, spread_m: float
 ) -> None:
     shape = np.array([[1.0, 0.3, 0.1], [0.3, 0.6, -0.2], [0.1, -0.2, 0.4]])
@@ -88,7 +88,7 @@ def test_the_view_is_as_wide_and_as_high_as_the_image() -> None:
 
 
 @pytest.mark.parametrize(("axis", "edge"), [(0, 0.0), (0, 320.0), (1, 0.0), (1, 224.0)])
-def test_a_peer_just_outside_is_named_as_far_as_it_may_be_inside(axis: int, edge: float) -> None:
+def test_peer_just_outside_the_image_is_labelled_within_its_sigma(axis: int, edge: float) -> None:
     sigma_px, outward = 6.0, 1 if edge else -1
     covariance = np.diag([0.0, (sigma_px * 2 / 180) ** 2, (sigma_px * 2 / 190) ** 2])
     for sigmas, named in ((MARGIN_SIGMAS - 0.1, True), (MARGIN_SIGMAS + 0.1, False)):

@@ -83,9 +83,7 @@ def test_position_message_has_time_frame_covariance_and_status(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.5])
-def test_a_label_stands_at_its_image_and_shows_when_that_was_taken(
-    tmp_path: Path, delay_s: float
-) -> None:
+def test_label_has_the_image_time_and_its_exposure_time(tmp_path: Path, delay_s: float) -> None:
     logged_s = [2.0, 4.0, 6.0]
     taken_s = [moment - delay_s for moment in logged_s]
     found = at([0.25, *taken_s, 9.0])  # and positions between the images
@@ -101,7 +99,7 @@ def test_a_label_stands_at_its_image_and_shows_when_that_was_taken(
         assert entry.message.sources == ["estimate"]
 
 
-def test_labels_of_others_stay_and_estimates_of_before_go(tmp_path: Path) -> None:
+def test_labels_of_other_sources_stay_and_old_estimates_are_replaced(tmp_path: Path) -> None:
     kinds = [{"peer": "cf2", "source": source, "depth_m": 1.0} for source in ("truth", "estimate")]
     before = message_class("PeerLabels")(peers=kinds, sources=["truth", "estimate"])
     image_ns, other_ns = START_NS + 2 * SECOND_NS, START_NS + 3 * SECOND_NS

@@ -84,7 +84,7 @@ def test_a_threshold_that_is_given_counts_in_place_of_the_detectors(tmp_path: Pa
     assert sight_of(tmp_path / "b.mcap", rows, 0.4).detections[:, 0].tolist() == [10]
 
 
-def test_attitude_is_that_of_the_exposure(tmp_path: Path) -> None:
+def test_attitude_is_interpolated_at_the_exposure(tmp_path: Path) -> None:
     sight = sight_of(tmp_path / "a.mcap", [seen(4.0), *motion()], delay_s=0.5)
     assert (sight.log_time_ns[0], sight.time_ns[0]) == (4 * SECOND_NS, 3.5 * SECOND_NS)
     view = sight.view(0)

@@ -70,13 +70,13 @@ def test_without_truth_there_is_no_error(tmp_path: Path) -> None:
         assert (got.rmse_ok_m, got.rmse_m) == (None, None)
 
 
-def test_a_row_stands_under_its_headers(tmp_path: Path) -> None:
+def test_report_columns_match_their_headers(tmp_path: Path) -> None:
     got = report(flight(tmp_path / "a.mcap", [0.0, 4.0]))
     assert PairReport.columns() == tuple(field.name for field in fields(PairReport))
     assert dict(zip(got.columns(), got.row(), strict=True))["range_bias_m"] == pytest.approx(0.35)
 
 
-def test_probable_causes_are_lines_with_the_robot_and_what_to_do(tmp_path: Path) -> None:
+def test_probable_causes_name_the_robot_and_a_remedy(tmp_path: Path) -> None:
     got = report(flight(tmp_path / "a.mcap", [0.0, 4.0]))
     assert [(cause.name, cause.robot) for cause in got.causes] == [
         ("yaw rate bias", "cf2"),

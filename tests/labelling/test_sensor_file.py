@@ -52,7 +52,7 @@ def test_logged_values_are_corrected_by_sensor_constants() -> None:
     assert KNOWN.correct_ranges(("cf1", "cf3"), np.array([2.0])) == pytest.approx([2.0])
 
 
-def test_sigmas_stand_where_the_solve_looks_for_them() -> None:
+def test_sensor_sigmas_reach_the_solve() -> None:
     assert KNOWN.to_prior_std(("cf1", "cf2")) == {
         ("range_offset", (0, 1)): 0.04,
         ("range_scale", (0, 1)): 0.01,
@@ -82,7 +82,7 @@ def test_sigmas_stand_where_the_solve_looks_for_them() -> None:
         ('[[pairs]]\nrobots = ["b", "a"]\nrange_scale = [0.1, 0.1]', "in the order of their names"),
     ],
 )
-def test_a_file_of_something_else_is_one_line(tmp_path: Path, text: str, words: str) -> None:
+def test_other_file_gives_one_line_error(tmp_path: Path, text: str, words: str) -> None:
     path = tmp_path / "sensors.toml"
     path.write_text(text)
     with pytest.raises(SourceError, match=words):
@@ -91,7 +91,7 @@ def test_a_file_of_something_else_is_one_line(tmp_path: Path, text: str, words: 
         read_sensors(tmp_path / "other.toml")
 
 
-def test_a_recording_is_read_without_what_is_known_to_be_off(tmp_path: Path) -> None:
+def test_known_sensor_errors_are_removed_on_reading(tmp_path: Path) -> None:
     found = logs(tmp_path / "a.mcap", flight, ranges).pairs["cf1", "cf2"]
     known = build_sensor_logs(read_flight(tmp_path / "a.mcap"), 0.1, KNOWN).pairs["cf1", "cf2"]
     assert known.range_m == pytest.approx((found.range_m - 0.1 - 0.35) / 1.02)

@@ -52,7 +52,7 @@ def logs(path: Path, *parts: Callable[[Write], None], offset_m: float = 0.0) -> 
     return build_sensor_logs(read_flight(path), offset_m)
 
 
-def test_a_pair_stands_on_one_grid_with_the_ranges_of_both(tmp_path: Path) -> None:
+def test_pair_has_one_time_grid_and_ranges_of_both_robots(tmp_path: Path) -> None:
     back = lambda write: ranges(write, "cf2", "cf1", 30)  # noqa: E731
     found = logs(tmp_path / "a.mcap", flight, ranges, back, offset_m=0.5)
     assert (found.start_ns, found.warnings, found.flying) == (START_NS, [], {"cf1", "cf2"})

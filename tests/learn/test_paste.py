@@ -29,7 +29,7 @@ def test_pasted_robots_are_labelled_and_covered_ones_are_not(
                 assert near.max() > 120
 
 
-def test_a_robot_with_a_mask_is_pasted_without_what_was_around_it(
+def test_robot_with_a_mask_is_pasted_without_background(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(augment, "DISTRACTOR_FRACTION", 0.0)
@@ -56,7 +56,7 @@ def squares_and_nothing(plain: ExampleSet) -> NDArray[np.float32]:
     return np.concatenate([plain.robots, np.full_like(plain.robots, np.nan)])
 
 
-def test_no_more_robots_than_there_is_room_for_are_labelled() -> None:
+def test_labels_per_augmented_image_are_limited() -> None:
     crowd = squares(1)
     robots = np.repeat(crowd.robots[:, :1], augment.MAX_ROBOTS_PER_IMAGE + 3, axis=1)
     maker = Augmenter(ExampleSet(crowd.pixels, robots), Augmentation(flip_share=0.5), seed=0)
@@ -171,7 +171,7 @@ def test_a_mosaic_shows_other_images_in_its_other_parts(monkeypatch: pytest.Monk
     assert np.mean([count == 1 for count in counts]) == pytest.approx(0.5, abs=0.08)
 
 
-def test_patches_come_as_often_as_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_patch_probability_is_met(monkeypatch: pytest.MonkeyPatch) -> None:
     maker, rng, asked = augmenter(paste=1.5), np.random.default_rng(3), []
     monkeypatch.setattr(maker, "_paste_patch", lambda canvas, robots, _: asked.append(1) or robots)
     for _ in range(400):
@@ -179,7 +179,7 @@ def test_patches_come_as_often_as_asked_for(monkeypatch: pytest.MonkeyPatch) -> 
     assert len(asked) / 400 == pytest.approx(1.5, abs=0.15)
 
 
-def test_a_patch_takes_every_place_that_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_patches_are_pasted_at_every_position(monkeypatch: pytest.MonkeyPatch) -> None:
     examples = boxed()
     examples.robots[1, 1, 6:10] = 20, 20, 135, 100  # with its margin 152 x 108 of 160 x 112
     found = Patches(Augmenter(examples, Augmentation(), seed=0), monkeypatch)

@@ -64,7 +64,7 @@ def test_without_a_checkpoint_there_is_nothing_to_resume(
         trained(examples, tmp_path / "run", resume=True)
 
 
-def test_a_damaged_checkpoint_is_one_line(examples: ExampleSet, tmp_path: Path) -> None:
+def test_damaged_checkpoint_gives_one_line_error(examples: ExampleSet, tmp_path: Path) -> None:
     stopped(examples, tmp_path / "run", 1, 1)
     (tensors,) = (tmp_path / "run").glob("checkpoint-*.safetensors")
     tensors.write_bytes(tensors.read_bytes()[:-9])
@@ -72,9 +72,7 @@ def test_a_damaged_checkpoint_is_one_line(examples: ExampleSet, tmp_path: Path) 
         trained(examples, tmp_path / "run", resume=True)
 
 
-def test_one_checkpoint_is_kept_and_none_after_the_end(
-    examples: ExampleSet, tmp_path: Path
-) -> None:
+def test_one_checkpoint_is_kept_until_training_ends(examples: ExampleSet, tmp_path: Path) -> None:
     stopped(examples, tmp_path / "run", 3, 1)
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {"checkpoint.json", "checkpoint-0003.safetensors", "tensorboard"}

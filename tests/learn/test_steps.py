@@ -27,7 +27,7 @@ def test_the_learning_rate_rises_for_two_epochs_and_falls_to_its_end() -> None:
     assert rates[-1] == pytest.approx(1e-6)
 
 
-def test_gradients_of_one_step_are_gone_before_the_next(examples: ExampleSet) -> None:
+def test_gradients_are_cleared_between_steps(examples: ExampleSet) -> None:
     network = build_network("locanet").train()
     optimizer = torch.optim.SGD(network.parameters(), lr=0.0)
     batch = collate(examples, [0, 1])
@@ -70,7 +70,7 @@ def test_reported_loss_is_the_mean_since_the_last_report(
     assert [shown[6], shown[13]] == pytest.approx([epoch["loss"] for epoch in training.history])
 
 
-def test_curves_stand_at_the_steps_of_what_they_show(
+def test_logged_curves_have_the_right_step_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows: list[tuple[str, float, int]] = []

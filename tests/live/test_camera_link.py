@@ -124,7 +124,7 @@ def test_invalid_address_is_refused(text: str) -> None:
         parse_address(text)
 
 
-def test_without_a_port_the_decks_own_is_taken() -> None:
+def test_default_port_of_the_deck_is_used() -> None:
     assert parse_address("192.168.4.1") == ("192.168.4.1", 5000)
 
 

@@ -13,7 +13,7 @@ SMOOTH = np.clip(
 ).astype(np.uint8)
 
 
-def test_the_whole_sensor_is_cut_to_what_the_calibration_is_of() -> None:
+def test_full_sensor_images_are_cropped_to_the_calibration() -> None:
     raw = bayer.to_bayer(pad_to_sensor(SMOOTH))
     data, kind = encode_image(Image(324, 244, "raw", raw.tobytes()), "colour")
     assert kind == "png"

@@ -47,7 +47,7 @@ def test_blocks_count_alone() -> None:
     assert lost == 1
 
 
-def test_a_restarted_drone_counts_anew() -> None:
+def test_packet_count_restarts_with_the_drone() -> None:
     packets = PacketCount()
     for t in range(60_000, 61_000, 10):
         packets.add_packet("b", 10, t, START_NS + t * MS)
@@ -73,7 +73,7 @@ def test_images_lost_in_a_pause_are_counted(pause: int) -> None:
     assert lost == pause
 
 
-def test_a_restarted_camera_counts_anew() -> None:
+def test_image_count_restarts_with_the_camera() -> None:
     frames = FrameCount()
     ids = [(200, 9_000_000), (201, 9_100_000), (3, 10_000), (4, 110_000), (6, 310_000)]
     lost = [

@@ -33,7 +33,7 @@ def test_settled_times_keep_the_senders_steps() -> None:
     assert np.abs(steps - 10 * MS).max() <= SenderClock.MAX_SLEW * 10 * MS + 1
 
 
-def test_a_clock_of_another_pace_is_left_alone() -> None:
+def test_sender_clock_of_another_rate_is_not_followed() -> None:
     clock = SenderClock()
     for k in range(2000):
         clock.add_sample(40 * MS * k, BASE_NS + 10 * MS * k)

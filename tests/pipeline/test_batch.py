@@ -67,7 +67,7 @@ def test_every_recording_is_found_by_its_place_and_nothing_else(flights: Path) -
     assert [str(name) for name in find_recordings(flights, but=outs)] == names
 
 
-def test_signs_in_the_name_of_a_file_are_no_pattern(tmp_path: Path) -> None:
+def test_special_characters_in_file_names_are_no_pattern(tmp_path: Path) -> None:
     assert not is_collection(record(tmp_path / "a[1].mcap"))
     assert is_collection(tmp_path / "b[1].mcap")
 
@@ -116,6 +116,7 @@ def test_a_recording_that_fails_does_not_cost_its_process(
     assert len(list((tmp_path / "out").rglob("*.mcap"))) == 3
 
 
+@pytest.mark.heavy
 def test_up_to_date_outputs_are_kept(
     flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

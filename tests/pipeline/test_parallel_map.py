@@ -67,14 +67,14 @@ def test_one_worker_or_one_item_runs_in_process() -> None:
         assert {one[1] for one in parallel_map(twice, items, workers)} == {os.getpid()}
 
 
-def test_an_error_is_the_callers_own_when_its_turn_comes() -> None:
+def test_worker_error_is_raised_in_order_in_the_caller() -> None:
     results = parallel_map(refuse, range(4), 2)
     assert next(results) == 0
     with pytest.raises(RecordingError, match=r"one\.mcap is damaged"):
         next(results)
 
 
-def test_a_process_that_was_killed_is_one_line() -> None:
+def test_killed_process_gives_one_line_error() -> None:
     with pytest.raises(SettingError, match="Try fewer --workers"):
         list(parallel_map(die, range(2), 2))
 

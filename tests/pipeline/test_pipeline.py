@@ -73,7 +73,7 @@ def test_an_edited_recipe_goes_on_in_the_same_folder(tmp_path: Path) -> None:
     assert [d.stage for d in done if not d.skipped] == ["trim"]
 
 
-def test_data_must_be_named_and_be_there_before_anything_is_done(tmp_path: Path) -> None:
+def test_missing_data_is_an_error_before_any_step(tmp_path: Path) -> None:
     text = SMALL.replace('source = "pictures-{n}"', 'source = "{data}/{n}"')
     recipe, data, out = write(tmp_path, text), tmp_path / "data", tmp_path / "out"
     with pytest.raises(SettingError, match="Say where: --data DIR"):
@@ -88,7 +88,7 @@ def test_data_must_be_named_and_be_there_before_anything_is_done(tmp_path: Path)
     assert not out.exists()
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_foreign_folder_is_not_overwritten(tmp_path: Path) -> None:
     foreign = tmp_path / "foreign"
     foreign.mkdir()
     (foreign / "recipe.toml").write_text("mine")
@@ -184,7 +184,7 @@ def test_no_process_outlives_a_run_that_is_stopped(tmp_path: Path, number: signa
 
 
 @pytest.mark.heavy
-def test_a_killed_worker_is_one_line(tmp_path: Path) -> None:
+def test_killed_worker_gives_one_line_error(tmp_path: Path) -> None:
     before = set(children(os.getpid()))
     with ProcessPool(1) as crew:
         line = build_job("sketch", tmp_path / "a", {}, {"images": 9000}, resume=False)

@@ -34,7 +34,7 @@ def load(folder: Path, text: str) -> pipeline.Plan:
     return pipeline.load_plan(path)
 
 
-def test_inputs_go_by_role_and_what_is_none_is_a_setting(tmp_path: Path) -> None:
+def test_step_keys_become_inputs_or_settings(tmp_path: Path) -> None:
     plan = load(tmp_path, SMALL)
     assert plan.steps == (
         Step("sketch", "pictures", settings={"images": 2}),
@@ -49,7 +49,7 @@ def test_one_name_for_an_input_of_many_is_a_list_of_one(tmp_path: Path) -> None:
     assert load(tmp_path, HEAD + text).steps[0].inputs == {"recordings": ["{data}/f.mcap"]}
 
 
-def test_the_order_of_the_work_is_that_of_the_names_not_of_the_file(tmp_path: Path) -> None:
+def test_step_order_follows_dependencies(tmp_path: Path) -> None:
     _, *blocks = SMALL.split("[[step]]")
     plan = load(tmp_path, HEAD + "".join(f"[[step]]{block}\n" for block in reversed(blocks)))
     assert list(plan.order.static_order()) == ["pictures", "pictures.mcap", "both.mcap"]
@@ -130,7 +130,7 @@ def test_every_fault_is_named_with_its_step(tmp_path: Path) -> None:
         ("images = 2", "images = 0", "step.1.images: must be >= 1"),
     ],
 )
-def test_a_wrong_step_is_one_line(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_wrong_step_gives_one_line_error(tmp_path: Path, old: str, new: str, words: str) -> None:
     assert old in SMALL
     with pytest.raises(RecipeError) as caught:
         load(tmp_path, SMALL.replace(old, new))
@@ -249,7 +249,7 @@ def test_recipes_of_the_paper_have_figures_that_name_their_steps(name: str) -> N
     assert pipeline.load_plan(name).pictured
 
 
-def test_a_figure_of_what_no_step_writes_is_a_fault_of_the_recipe(tmp_path: Path) -> None:
+def test_figure_of_an_unknown_output_is_a_fault(tmp_path: Path) -> None:
     figure = '[[figure]]\ntitle = "Losses"\nshows = "losses"\nof = ["model"]\n'
     with pytest.raises(RecipeError, match=r"figure\.1\.of: no step writes model"):
         load(tmp_path, SMALL + figure)

@@ -189,7 +189,7 @@ def test_a_folder_takes_the_place_of_a_folder(run: Run, tmp_path: Path) -> None:
     assert not any((tmp_path / "unfinished").iterdir())
 
 
-def test_a_killed_step_goes_on_where_it_was_unless_it_is_another(run: Run, tmp_path: Path) -> None:
+def test_killed_step_resumes_unless_it_changed(run: Run, tmp_path: Path) -> None:
     partial = to_partial_path(tmp_path / "unfinished" / "r.mcap")
 
     def render(seed: int) -> tuple[bool, bool]:
@@ -220,13 +220,13 @@ def test_an_output_that_was_whole_at_a_kill_is_not_made_twice(run: Run, tmp_path
     assert not crew.made and (tmp_path / "a").is_file() and not done[0].left_out
 
 
-def test_a_stage_with_processes_of_its_own_runs_alone(run: Run) -> None:
+def test_stage_with_own_processes_runs_exclusively(run: Run) -> None:
     rendered = Step("render", "r", settings={"images": 1})
     _, crew = run(A, rendered, B)
     assert crew.alone == ["r"] and crew.made == ["a", "r", "b"]
 
 
-def test_a_damaged_memory_is_one_line(run: Run, tmp_path: Path) -> None:
+def test_damaged_build_cache_gives_one_line_error(run: Run, tmp_path: Path) -> None:
     for text in ("{", "[]", '{"done": 3}'):
         (tmp_path / "pipeline.json").write_text(text)
         with pytest.raises(OutputError, match="is damaged"):

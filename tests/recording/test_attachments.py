@@ -58,14 +58,14 @@ def test_a_split_is_its_intervals_by_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["[[1]]", "[1, 2]", '[["a", 2]]', "{", "[[null, 3]]"])
-def test_a_split_that_is_none_is_one_line(text: str, tmp_path: Path) -> None:
+def test_invalid_split_gives_one_line_error(text: str, tmp_path: Path) -> None:
     path = recording(tmp_path / "a.mcap", ("dmrl.split", {"train": text}))
     with pytest.raises(RecordingError, match=r"a\.mcap: its split is not a list") as e:
         read_splits(path, read_summary(path))
     assert "\n" not in str(e.value)
 
 
-def test_metadata_and_attachments_go_along_but_no_provenance_or_recipe(tmp_path: Path) -> None:
+def test_metadata_and_attachments_are_copied_without_provenance_and_recipe(tmp_path: Path) -> None:
     one = recording(tmp_path / "a.mcap", ("own", {"k": "v"}), ("own", {"k": "w"}))
     other = tmp_path / "b.mcap"
     with RecordingWriter(other, Provenance("other")) as sink:
@@ -178,7 +178,7 @@ def test_log_times_are_half_open(tmp_path: Path) -> None:
     assert read_log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == list(range(0, 100, 10))
 
 
-def test_messages_of_a_stretch_come_in_blocks_of_it(tmp_path: Path) -> None:
+def test_messages_of_a_span_come_in_batches(tmp_path: Path) -> None:
     path = recording(tmp_path / "a.mcap")
     for start, end, times in (
         (20, 50, [20, 30, 40]),
@@ -236,7 +236,7 @@ def test_statistics_count_the_written_records(times: list[int], tmp_path: Path) 
 
 
 @pytest.mark.parametrize("time_ns", [2**64 - 1, 2**63, 99])
-def test_times_of_a_message_index_are_those_of_its_chunk(time_ns: int, tmp_path: Path) -> None:
+def test_message_index_times_must_lie_within_the_chunk(time_ns: int, tmp_path: Path) -> None:
     """No sum tells in another program's file: a time that was -1 was left out without a word."""
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:

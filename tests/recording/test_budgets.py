@@ -105,7 +105,7 @@ def test_bombs_are_refused(tmp_path: Path) -> None:
         assert "nothing to recover" in recovered, name
 
 
-def test_a_chunk_has_a_budget_of_its_own_in_a_file_of_any_size() -> None:
+def test_decompressed_chunk_size_is_limited_in_any_file() -> None:
     """A file of 10 MB may unpack to a GB, but not at once."""
     with pytest.raises(BudgetError, match="the chunk at byte 8 decompresses to 268 MB"):
         decompress(chunk(zeros(1 << 28), 1 << 28), 8)

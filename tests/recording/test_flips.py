@@ -188,7 +188,7 @@ def test_checksums_copied_by_other_programs_are_ignored(tmp_path: Path) -> None:
     assert recover(copy, tmp_path / "c.mcap").whole
 
 
-def test_recover_does_not_call_whole_what_has_messages_too_many(tmp_path: Path) -> None:
+def test_recover_reports_repeated_chunks_as_not_whole(tmp_path: Path) -> None:
     path = small(tmp_path / "a.mcap")
     data = path.read_bytes()
     parts = [(opcode, data[start:end]) for opcode, start, end in records(data)]

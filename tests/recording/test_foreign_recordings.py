@@ -40,7 +40,7 @@ def test_attachments_of_one_name_keep_their_types_and_times(data: Path, tmp_path
         }
 
 
-def test_bytes_behind_the_known_fields_are_no_damage(data: Path, tmp_path: Path) -> None:
+def test_trailing_bytes_of_a_record_are_accepted(data: Path, tmp_path: Path) -> None:
     path = stranger(data, "mcap-padded-TenMessages")
     assert not [f for f in check(path) if f.level == "error"]
     trim(path, tmp_path / "out.mcap")
@@ -68,7 +68,7 @@ def test_a_chunk_index_that_omits_a_channel_is_an_error(data: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize("stated", [True, False])
-def test_a_doctored_chunk_index_of_our_own_is_an_error(stated: bool, tmp_path: Path) -> None:
+def test_altered_chunk_index_is_an_error(stated: bool, tmp_path: Path) -> None:
     """Without a checksum that tells: the lengths of the message indexes do, or a record there."""
     path = small(tmp_path / "a.mcap")
     data = path.read_bytes()

@@ -45,7 +45,7 @@ def with_place(data: bytes, opcode: int, at: int, place: int) -> bytes:
 
 @pytest.mark.parametrize("place", ["past", "end", 2**62, 2**64 - 1, 0])
 @pytest.mark.parametrize("opcode", FIELDS, ids=lambda opcode: Opcode(opcode).name)
-def test_a_place_that_is_none_is_one_line_and_nothing_is_lost(
+def test_invalid_offset_gives_one_line_error_and_loses_nothing(
     opcode: Opcode, place: int | str, sound: Path, tmp_path: Path
 ) -> None:
     data = sound.read_bytes()

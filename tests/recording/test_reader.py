@@ -70,7 +70,7 @@ def test_any_complete_file_is_read_in_time_order(
     assert 100 <= found[0] < found[-1] < 400
 
 
-def test_a_stretch_of_time_is_half_open(flight: Path) -> None:
+def test_time_spans_are_half_open(flight: Path) -> None:
     got = list(read(flight, "/cf1/range/cf2", start_ns=100_000_000, end_ns=300_000_000))
     assert [s.time_ns for s in got] == [100_000_000, 200_000_000]
     (batch,) = iter_columns(flight, "/cf1/range/cf2", start_ns=100_000_000, end_ns=300_000_000)
@@ -85,7 +85,7 @@ def test_equal_times_keep_their_order_in_the_file(tmp_path: Path) -> None:
     assert [s.message.height_m for s in read(path)] == list(range(30_000))
 
 
-def test_columns_hold_what_the_messages_hold(flight: Path) -> None:
+def test_columns_equal_messages(flight: Path) -> None:
     table = read_table(flight, "/cf1/attitude")
     got = [
         (s.time_ns, s.message.roll_rad, s.message.pitch_rad) for s in read(flight, "/cf1/attitude")
@@ -210,7 +210,7 @@ def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_every_flipped_byte_is_an_error_or_harmless(flight: Path, tmp_path: Path) -> None:
+def test_every_flipped_byte_is_an_error_or_changes_nothing(flight: Path, tmp_path: Path) -> None:
     """No single damaged byte gives another exception than ours, or silently other values."""
     data = flight.read_bytes()
     good = list(read_raw(flight))
@@ -250,7 +250,7 @@ def test_an_empty_recording_has_no_messages(tmp_path: Path) -> None:
     assert io.BytesIO(path.read_bytes()).read(8) == b"\x89MCAP0\r\n"
 
 
-def test_a_stretch_without_messages_is_a_table_without_rows(flight: Path) -> None:
+def test_span_without_messages_gives_an_empty_table(flight: Path) -> None:
     table = read_table(flight, "/cf1/attitude", start_ns=10**15)
     assert table.num_rows == 0
     assert table.schema == read_table(flight, "/cf1/attitude").schema

@@ -64,7 +64,7 @@ def test_optional_records_of_other_writers_may_be_missing(
     assert not [finding for finding in check(path) if finding.level == "error"]
 
 
-def test_a_lost_channel_is_noticed_without_any_crc(tmp_path: Path) -> None:
+def test_lost_channel_is_detected_without_crc(tmp_path: Path) -> None:
     """The statistics and indexes tell, where a writer left out the sums."""
     path = foreign(tmp_path / "a.mcap", enable_crcs=False)
     data = path.read_bytes()
@@ -99,7 +99,7 @@ def rejoined(path: Path, parts: list[tuple[int, bytes]]) -> None:
         (Opcode.CHUNK, Opcode.DATA_END, "lacks the chunk"),
     ],
 )
-def test_a_record_that_is_there_twice_is_noticed_without_any_crc(
+def test_repeated_record_is_detected_without_crc(
     tmp_path: Path, kind: Opcode, place: Opcode, complaint: str
 ) -> None:
     path = small(tmp_path / "a.mcap")

@@ -79,7 +79,7 @@ def test_a_negative_time_is_refused(tmp_path: Path) -> None:
         write_heights(tmp_path / "a.mcap", [-1])
 
 
-def test_provenance_and_recipe_stand_before_the_first_message(flight: Path) -> None:
+def test_provenance_and_recipe_precede_the_first_message(flight: Path) -> None:
     found = read_summary(flight)
     assert found.provenance == Provenance("test", {"level": 1}, seed=3)
     assert found.attachments[0].data == b'kind = "test"\nlevel = 1\n'
@@ -166,7 +166,7 @@ def filmed(path: Path, moments: int = 400) -> Path:
     return path
 
 
-def test_pictures_stand_apart_and_numbers_are_read_without_them(
+def test_images_have_separate_chunks_from_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = filmed(tmp_path / "a.mcap")
@@ -184,7 +184,7 @@ def test_pictures_stand_apart_and_numbers_are_read_without_them(
     assert 80 * 8000 < sum(read_bytes) < 80 * 8200
 
 
-def test_mcaps_own_reader_sees_what_dmrl_sees(tmp_path: Path) -> None:
+def test_mcap_library_reads_the_same_messages(tmp_path: Path) -> None:
     path = filmed(tmp_path / "a.mcap")
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)

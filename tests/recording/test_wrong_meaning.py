@@ -169,7 +169,7 @@ def places(tmp_path: Path) -> tuple[Path, Path, Path]:
 
 
 @pytest.mark.parametrize("part", range(5))
-def test_a_hundred_wrong_files_lose_nothing_in_silence(
+def test_hundred_inconsistent_files_lose_no_message_silently(
     places: tuple[Path, Path, Path], part: int
 ) -> None:
     for seed in range(part, SAMPLE, 5):
@@ -177,7 +177,7 @@ def test_a_hundred_wrong_files_lose_nothing_in_silence(
 
 
 @pytest.mark.slow
-def test_ten_thousand_wrong_files_lose_nothing_in_silence(
+def test_ten_thousand_inconsistent_files_lose_no_message_silently(
     places: tuple[Path, Path, Path], record_property: Callable[[str, object], None]
 ) -> None:
     """Files by fault are a property of ``--junitxml FILE -o junit_family=xunit1``."""

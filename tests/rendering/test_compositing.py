@@ -70,7 +70,7 @@ def test_a_robot_wholly_hidden_has_no_box() -> None:
     assert np.isnan(shot.box_px[0]).all()
 
 
-def test_the_lens_bends_box_and_centre_alike() -> None:
+def test_lens_distortion_applies_to_box_and_centre() -> None:
     canvas = pinhole_canvas(AIDECK)
     corner = np.array([30, 150])
     layer = square(*(corner + canvas.shift_px.astype(int)).tolist(), 20, 1.0)

@@ -80,7 +80,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, folders: tuple[Path,
     assert first.read_bytes() == second.read_bytes()
 
 
-def test_a_cutout_takes_over_colour_light_and_grain() -> None:
+def test_cutout_is_matched_to_colour_light_and_noise() -> None:
     rng = np.random.default_rng(0)
     light = np.concatenate([np.tile([0.5, 0.1, 0.1], (20, 30, 1)), np.ones((20, 30, 1))], axis=2)
     light = light.astype(np.float32)

@@ -29,7 +29,7 @@ def test_strong_colours_are_two_hues_on_all_non_emissive_parts() -> None:
     assert len(hues) == 2
 
 
-def test_two_robots_are_not_painted_alike() -> None:
+def test_two_robots_have_different_colours() -> None:
     rng = np.random.default_rng(3)
     assert random_two_colours(rng, CRAZYFLIE) != random_two_colours(rng, CRAZYFLIE)
 

@@ -108,7 +108,7 @@ def test_the_nearer_robot_hides_the_farther(plain: Look) -> None:
     assert 0 < one.visible_share[1] < 0.8
 
 
-def test_half_outside_the_image_the_box_ends_there(plain: Look) -> None:
+def test_box_is_clipped_at_the_image_edge(plain: Look) -> None:
     sketch = render_sketch(CAMERA, [at(0.3, 0.27, 0.0)], plain)
     assert sketch.box_px[0, 0] == 0.0
     assert sketch.box_px[0, 2] < 60

@@ -51,7 +51,7 @@ def double(worker: Worker, number: int) -> float:
     return float(arrays["out"][0])
 
 
-def test_messages_come_back_as_they_were_sent() -> None:
+def test_worker_messages_round_trip() -> None:
     stream = BytesIO()
     arrays = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.zeros((0, 4), np.int64)}
     protocol.send(stream, {"name": "ü", "n": [1, 2]}, arrays)

@@ -70,7 +70,7 @@ def test_every_command_takes_damaged_inputs_as_errors(
         ("", {"K": [0.0] * 9}),
     ],
 )
-def test_messages_that_cannot_be_read_are_one_line(
+def test_undecodable_messages_give_one_line_errors(
     junk: str, calibration: dict[str, Any], box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad, out = with_junk(box.root / "in" / "bad.mcap", junk, calibration), box.out
@@ -92,7 +92,7 @@ def test_messages_that_cannot_be_read_are_one_line(
 
 
 @pytest.mark.usefixtures("empty_figures")
-def test_an_input_that_is_changed_meanwhile_is_one_line(
+def test_input_changed_during_the_run_gives_one_line_error(
     box: Box, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = with_junk(box.root / "in" / "flight.mcap", "", {})
@@ -128,7 +128,7 @@ def test_non_utf_8_name_gives_one_line_error(box: Box, capsys: pytest.CaptureFix
         run_in(box, capsys, *words)
 
 
-def test_a_pipe_in_place_of_a_file_is_one_line(
+def test_pipe_in_place_of_a_file_gives_one_line_error(
     box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Opening it would wait for somebody who writes."""

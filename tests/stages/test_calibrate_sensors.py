@@ -77,7 +77,9 @@ def test_workers_change_no_byte(flights: list[Path], known: Path, tmp_path: Path
     assert (tmp_path / "two.toml").read_bytes() == known.read_bytes()
 
 
-def test_too_little_is_one_line(flights: list[Path], known: Path, tmp_path: Path) -> None:
+def test_invalid_sensor_calibration_gives_one_line_error(
+    flights: list[Path], known: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "sensors.toml"
     with pytest.raises(RecordingError, match="no pair of robots has 2 flights"):
         calibrate.run(flights[:1], out, SENSORS)

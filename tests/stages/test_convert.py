@@ -211,7 +211,7 @@ def test_the_command_prints_counts_and_exits_by_kind_of_error(
     assert dmrl(str(pictures), str(out), "--rate-hz", "0").returncode == 2
 
 
-def test_an_empty_file_is_one_line(tmp_path: Path) -> None:
+def test_empty_file_gives_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "log00").write_bytes(b"")
     with pytest.raises(SourceError, match=r"log00 is empty, 0 bytes\. Pass another file"):
         run(tmp_path / "log00", tmp_path / "out.mcap", Settings())

@@ -28,7 +28,7 @@ def test_doctor_finds_the_base_installation(capsys: pytest.CaptureFixture[str]) 
     assert "The base works." in capsys.readouterr().out
 
 
-def test_every_extra_is_named_with_what_it_is_for() -> None:
+def test_every_extra_is_listed_with_its_purpose() -> None:
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     section = text.partition("[project.optional-dependencies]")[2].partition("\n\n")[0]
     said = dict(re.findall(r"^(\w+) = \[.*?#\s*(.+)$", section, re.MULTILINE))

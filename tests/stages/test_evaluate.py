@@ -69,7 +69,7 @@ def figures(path: Path, settings: Settings = FAST) -> dict[str, Any]:
     return {k: v["value"] if isinstance(v, dict) else v for k, v in overall.items()}
 
 
-def test_labels_and_detections_of_one_image_meet(write: Callable[..., Path]) -> None:
+def test_labels_and_detections_of_one_image_are_matched(write: Callable[..., Path]) -> None:
     path = write({"cf1": [([peer(10, 10)], [found(13, 14)]), ([peer(40, 10)], [found(40, 10)])]})
     got = figures(path)
     assert (got["labels"], got["images"], got["unmatched_labels"]) == (2, 2, 0)
@@ -269,7 +269,9 @@ def test_missing_labels_or_detections_are_reported(write: Callable[..., Path], d
         run([dots], None, FAST)
 
 
-def test_labels_and_detections_at_other_times_do_not_meet(write: Callable[..., Path]) -> None:
+def test_labels_and_detections_at_different_times_are_not_matched(
+    write: Callable[..., Path],
+) -> None:
     path = write({"cf1": [([peer(10, 10)], None), (None, [found(10, 10)])]})
     assert figures(path)["recall"] == 0
     with pytest.raises(SettingError, match="has no image with labels from truth and detections"):

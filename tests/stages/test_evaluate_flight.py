@@ -44,7 +44,7 @@ def test_tracks_of_such_a_flight_are_evaluated_on_request(flown: Path) -> None:
     assert evaluated(flown, "tracks")["robots"][0]["robot"] == "cf1"
 
 
-def test_without_truth_there_is_nothing_to_hold(flown: Path, tmp_path: Path) -> None:
+def test_flight_without_truth_is_refused(flown: Path, tmp_path: Path) -> None:
     short = tmp_path / "short.mcap"
     kept = [t for t in read_summary(flown).topics if not topics.parse_topic(topics.TRUTH, t)]
     trim(flown, short, topics=[t for t in kept if t != "/tf"])

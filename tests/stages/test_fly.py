@@ -27,7 +27,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_every_topic_is_there_at_its_rate(seen: Path) -> None:
+def test_every_topic_has_its_rate(seen: Path) -> None:
     counts = {topic: info.count for topic, info in read_summary(seen).topics.items()}
     assert counts["/cf3/attitude"] == counts["/cf3/velocity"] == counts["/cf3/height"] == 401
     assert counts["/cf2/peer/cf3/truth"] == counts["/tf"] == 80

@@ -50,7 +50,7 @@ def commands(path: Path, robot: str = "cf1") -> np.ndarray:
     return np.column_stack([table[name].to_numpy() for name in names])
 
 
-def test_the_topics_of_the_contract_are_there_at_their_rates(ideal: Path) -> None:
+def test_specified_topics_have_their_rates(ideal: Path) -> None:
     counts = {topic: info.count for topic, info in read_summary(ideal).topics.items()}
     assert counts["/cf1/attitude"] == counts["/cf2/velocity"] == counts["/cf1/height"] == 401
     assert counts["/cf1/command"] == counts["/cf1/peer/cf2/truth"] == counts["/tf"] == 81
@@ -94,9 +94,7 @@ def test_follower_without_detections_loses_the_leader(tmp_path: Path) -> None:
     assert read_summary(out).topics["/cf1/command"].count == 241
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_another_flight(
-    ideal: Path, tmp_path: Path
-) -> None:
+def test_flight_bytes_depend_only_on_the_seed(ideal: Path, tmp_path: Path) -> None:
     for seed in (2, 3):
         fly.run(tmp_path / f"{seed}.mcap", replace(SHORT, seed=seed))
     assert (tmp_path / "2.mcap").read_bytes() == ideal.read_bytes()
@@ -104,7 +102,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_another_flight(
 
 
 @pytest.mark.heavy
-def test_a_flight_is_made_again_from_its_own_recipe(seen: Path, tmp_path: Path) -> None:
+def test_flight_is_reproduced_from_its_recorded_recipe(seen: Path, tmp_path: Path) -> None:
     recipe = tmp_path / "again.toml"
     made = read_summary(seen).provenance
     assert made.inputs[0].name == "dmrl-nano" and made.settings["backend"] in ("onnx", "torch")
@@ -115,9 +113,7 @@ def test_a_flight_is_made_again_from_its_own_recipe(seen: Path, tmp_path: Path) 
 
 
 @pytest.mark.heavy
-def test_predict_and_track_find_in_the_recording_what_the_drone_found(
-    seen: Path, tmp_path: Path
-) -> None:
+def test_predict_and_track_reproduce_onboard_results(seen: Path, tmp_path: Path) -> None:
     backend = read_summary(seen).provenance.settings["backend"]
     predict.run(Path("dmrl-nano"), seen, tmp_path / "found.mcap", predict.Settings(backend=backend))
     track.run(seen, tmp_path / "tracks.mcap", track.Settings())

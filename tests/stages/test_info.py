@@ -7,7 +7,7 @@ from dmrl.recording import Provenance, RecordingWriter, read_summary
 from dmrl.recording.overview import topic_rows
 
 
-def test_the_rate_of_a_topic_is_that_of_its_own_time(tmp_path: Path) -> None:
+def test_rate_of_a_topic_uses_its_own_time_span(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(2000):

@@ -138,6 +138,7 @@ def test_detections_improve_labels(flight: Path, labelled: Path, tmp_path: Path)
     assert not (tmp_path / "none.mcap").exists()
 
 
+@pytest.mark.heavy
 def test_labelling_again_changes_no_position(labelled: Path, tmp_path: Path) -> None:
     out = tmp_path / "again.mcap"
     label.run(labelled, out, LENIENT)
@@ -147,6 +148,7 @@ def test_labelling_again_changes_no_position(labelled: Path, tmp_path: Path) -> 
     ]
 
 
+@pytest.mark.heavy
 def test_the_same_input_gives_the_same_bytes(flight: Path, labelled: Path, tmp_path: Path) -> None:
     label.run(flight, tmp_path / "labelled.mcap", LENIENT)
     assert (tmp_path / "labelled.mcap").read_bytes() == labelled.read_bytes()
@@ -164,7 +166,7 @@ def test_the_report_knows_the_error_where_the_truth_is_recorded(
         assert not [text for text in result.warnings if "nothing is kept" not in text]
 
 
-def test_an_output_that_exists_is_left_alone(flight: Path) -> None:
+def test_existing_output_is_not_overwritten(flight: Path) -> None:
     with pytest.raises(OutputError, match="exists"):
         label.run(flight, flight, Settings())
 

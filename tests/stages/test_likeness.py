@@ -56,7 +56,7 @@ def off(found: ImageStatistics, real: ImageStatistics) -> float:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_figures_of_the_fitted_preset_are_those_of_the_frames(camera: str, tmp_path: Path) -> None:
+def test_fitted_preset_reproduces_the_figures_of_the_frames(camera: str, tmp_path: Path) -> None:
     result = run(frames(tmp_path / "own", camera), tmp_path / "own.toml", Settings())
     assert result.frames == 32
     assert off(result.fitted, result.real) < 0.2
@@ -134,7 +134,7 @@ def folder_of(path: Path, frames: list[NDArray[np.uint8]]) -> Path:
         ([np.zeros((1100, 1930, 3), np.uint8)], "1930x1100 px are too large.*1920x1080"),
     ],
 )
-def test_frames_that_show_no_camera_are_one_line(
+def test_frames_that_show_no_camera_give_one_line_errors(
     frames: list[NDArray[np.uint8]], said: str, tmp_path: Path
 ) -> None:
     own = folder_of(tmp_path / "own", frames)

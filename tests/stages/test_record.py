@@ -172,7 +172,7 @@ def test_undecodable_packet_restarts_the_connection_only(
     assert result.healths[0].connections >= 2 and result.messages["/cf1/attitude"] > 50
 
 
-def test_a_drone_that_starts_anew_is_connected_again(
+def test_restarted_drone_is_reconnected(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, seconds in {
@@ -201,7 +201,7 @@ def attitudes_in(partial: Path, mended: Path) -> int:
 
 
 @pytest.mark.heavy
-def test_a_killed_session_comes_back_to_its_last_second(flight: Path, tmp_path: Path) -> None:
+def test_killed_session_is_recovered_up_to_its_last_second(flight: Path, tmp_path: Path) -> None:
     out, mended = tmp_path / "out.mcap", tmp_path / "mended.mcap"
     partial = tmp_path / "out.mcap.partial"
     with drone_fleet.fleet(flight, ANY, (0, 0), fake_drone.Settings()) as fleet:

@@ -36,7 +36,7 @@ def test_every_image_is_labelled_including_empty_ones(folder: Path) -> None:
     assert [row["split"] for row in rows if row["file"] >= names[10]].count("train") == 0
 
 
-def test_converted_labels_are_what_was_drawn(folder: Path, tmp_path: Path) -> None:
+def test_converted_labels_equal_the_drawn_ones(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "sketch.mcap"
     counts = convert.run(folder, out, convert.Settings())
     assert counts == {"/cf1/camera/calibration": 1, "/cf1/camera/image": 12, "/cf1/labels": 12}

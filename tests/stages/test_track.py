@@ -96,7 +96,7 @@ def test_other_messages_stay_and_old_tracks_go(
     )
 
 
-def test_the_rates_in_a_recording_are_those_of_the_tracker(detected: Path, tmp_path: Path) -> None:
+def test_recorded_detector_rates_are_used_by_the_tracker(detected: Path, tmp_path: Path) -> None:
     """With rates of a detector whose detections are nearly all false, nobody is followed."""
     told, out = tmp_path / "told.mcap", tmp_path / "out.mcap"
     rates = {

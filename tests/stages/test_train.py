@@ -303,7 +303,7 @@ def test_flags_win_over_the_recipe(dots_dataset: Path, tmp_path: Path) -> None:
     assert (said["epochs"], said["batch_size"], said["warmup_epochs"]) == (1, 10, 0)
 
 
-def test_a_flag_out_of_range_is_one_line() -> None:
+def test_flag_out_of_range_gives_one_line_error() -> None:
     with pytest.raises(SettingError, match="epochs: must not be negative"):
         recipe.load("dmrl_nano", "train", Settings, Flags(epochs=-1))
 

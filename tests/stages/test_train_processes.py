@@ -41,7 +41,9 @@ def test_two_processes_train_one_network(dots_dataset: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_torchrun_trains_what_two_processes_train(dots_dataset: Path, tmp_path: Path) -> None:
+def test_torchrun_and_two_processes_train_equal_networks(
+    dots_dataset: Path, tmp_path: Path
+) -> None:
     script = tmp_path / "two.py"
     script.write_text(TORCHRUN)
     words = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]

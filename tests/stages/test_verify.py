@@ -59,7 +59,7 @@ def everything(folder: Path) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_every_target_computes_what_the_reference_does(everything: dict[str, Any]) -> None:
+def test_every_target_equals_the_reference(everything: dict[str, Any]) -> None:
     assert [t["target"] for t in everything["targets"]] == ["gcc", "clang", "sanitizers", "riscv32"]
     assert all(t["mismatches"] == 0 for t in everything["targets"])
     assert not any(t["skipped"] or t["error"] for t in everything["targets"])
@@ -94,7 +94,7 @@ def one_level(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.heavy
 @needs_gcc
 @pytest.mark.usefixtures("one_level")
-def test_c_of_another_network_is_found_out(
+def test_c_of_another_network_is_detected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     network = random_network(SEED)
@@ -119,7 +119,7 @@ def test_a_proof_is_written_only_where_the_c_is_right(folder: Path, tmp_path: Pa
     assert sorted(p.name for p in tmp_path.glob("*.json*")) == ["proof.json"]
 
 
-def test_no_proof_of_a_target_that_is_required_and_not_there(
+def test_required_but_missing_target_gives_no_proof(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))

@@ -214,7 +214,9 @@ def store(inputs: Inputs, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
     get_filesystem.cache_clear()
 
 
-def test_a_sound_server_is_read_and_written(store: Store, inputs: Inputs, tmp_path: Path) -> None:
+def test_valid_bucket_server_is_read_and_written(
+    store: Store, inputs: Inputs, tmp_path: Path
+) -> None:
     """Or the tests below would pass for another reason."""
     cli("trim", "s3://lab/a.mcap", "s3://lab/out/b.mcap", "--to-s", 0.9)
     shutil.copy(inputs.dots, tmp_path / "a.mcap")
@@ -235,7 +237,7 @@ def test_a_sound_server_is_read_and_written(store: Store, inputs: Inputs, tmp_pa
         ("a page that drips", "the server is too slow"),
     ],
 )
-def test_a_listing_ends(
+def test_endless_listing_is_stopped(
     wrong: str, said: str, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "LISTED_FILES", 3_000)

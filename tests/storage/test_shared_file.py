@@ -28,7 +28,7 @@ def test_readers_of_one_file_have_their_own_positions(tmp_path: Path) -> None:
         open_raw(path)
 
 
-def test_a_file_that_is_not_there_is_left_to_its_readers(tmp_path: Path) -> None:
+def test_sharing_a_missing_file_raises_on_open_only(tmp_path: Path) -> None:
     with share_file(tmp_path / "none"), pytest.raises(FileNotFoundError):
         open_raw(tmp_path / "none")
 

@@ -295,7 +295,7 @@ def test_a_name_in_a_bucket_leads_nowhere_else_on_this_machine(
 
 
 @pytest.mark.parametrize("key", ["x//b.mcap", "./b.mcap", "/b.mcap", "b?versionId=3.mcap"])
-def test_a_key_that_no_path_stands_for_is_not_taken_for_another(key: str, lab: Any) -> None:
+def test_keys_that_cannot_be_paths_are_refused(key: str, lab: Any) -> None:
     folder = f"lab/odd-{len(key)}-{key[0] == '/'}"
     for name in (f"{folder}/b", f"{folder}/b.mcap", f"{folder}/x/b.mcap", f"{folder}/sub/"):
         lab.pipe_file(name, b"another")

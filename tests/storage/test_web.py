@@ -200,9 +200,7 @@ def test_server_bytes_beyond_the_request_are_not_read(wrong: str, site: Site) ->
         ("huge", "is cut short"),
     ],
 )
-def test_a_server_that_sends_what_was_not_asked_is_one_line(
-    wrong: str, said: str, site: Site
-) -> None:
+def test_wrong_server_answer_gives_one_line_error(wrong: str, said: str, site: Site) -> None:
     site.wrong = wrong
     for command in ("info", "check"):
         site.asked = 0
@@ -211,7 +209,7 @@ def test_a_server_that_sends_what_was_not_asked_is_one_line(
     assert site.most_sent < MOST_SENT
 
 
-def test_a_server_that_drips_is_not_waited_for(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_server_is_abandoned(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server_answers, "PATIENCE_S", 0.3)
     get_filesystem.cache_clear()
     web.WebFileSystem.clear_instance_cache()
@@ -247,7 +245,7 @@ def test_redirects_to_internal_addresses_are_refused(site: Site, inputs: Inputs)
     assert not secret.paths and not secret.asked
 
 
-def test_a_server_may_lead_to_another_page_of_its_own(site: Site) -> None:
+def test_redirects_within_a_server_are_followed(site: Site) -> None:
     site.wrong = "leads /b/a.mcap once"
     assert to_path(site.url).stat().st_size == len(site.data)
     assert Path(os.fspath(to_path(site.url))).read_bytes() == site.data

@@ -59,7 +59,7 @@ def test_models_are_compared_without_labels_too(
 
 
 @pytest.mark.parametrize("names", [("old.mcap",), ("old.mcap", "new.mcap", "newest.mcap")])
-def test_other_than_two_models_are_refused(make: Make, rrd: Path, names: tuple[str, ...]) -> None:
+def test_compare_needs_exactly_two_models(make: Make, rrd: Path, names: tuple[str, ...]) -> None:
     with pytest.raises(RecordingError, match=r"compare takes two. Try: dmrl predict"):
         save([make(name) for name in names], rrd, COMPARE)
     assert list(rrd.parent.glob("*.rrd*")) == []

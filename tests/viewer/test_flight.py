@@ -210,13 +210,13 @@ def test_every_thins_images_and_leaves_plots_whole(fly: Make, rrd: Path) -> None
     assert moving(rrd)[f"{POSITION}/nees", "Scalars"] == 20
 
 
-def test_an_empty_stretch_of_a_flight_is_refused(fly: Make, rrd: Path) -> None:
+def test_empty_time_span_is_refused(fly: Make, rrd: Path) -> None:
     recording = fly(without=("camera", "labels", "detections"))
     with pytest.raises(SettingError, match=r"lasts from 0 to 1.900 s. Change --from-s or --to-s"):
         save([recording], rrd, Settings(from_s=1.0, to_s=1.0))
 
 
-def test_a_robot_that_is_not_there_is_named_with_those_that_are(fly: Make, rrd: Path) -> None:
+def test_unknown_robot_error_lists_known_ones(fly: Make, rrd: Path) -> None:
     with pytest.raises(SettingError, match=r"no robot cf9 in .*It has: cf1, cf2"):
         save([fly()], rrd, Settings(robot="cf9"))
 

@@ -28,7 +28,7 @@ def leaves(node: Any) -> Iterator[str]:
         yield from leaves(node["second"])
 
 
-def test_every_panel_stands_in_the_layout_once() -> None:
+def test_every_panel_is_in_the_layout_once() -> None:
     assert sorted(leaves(LAYOUT["layout"])) == sorted(PANELS)
     assert all(panel["foxglovePanelTitle"] for panel in PANELS.values())
 
@@ -56,7 +56,7 @@ def test_images_and_frusta_are_topics_that_foxglove_draws() -> None:
     assert None not in rows
 
 
-def test_colours_mean_what_they_mean_elsewhere() -> None:
+def test_colours_equal_those_of_other_views() -> None:
     known = {f"#{bytes(colour).hex()}" for colour in (*RGB.values(), OWN_RGB, PEER_RGB)}
     assert {line["color"] for _, line in LINES if "color" in line} <= known
 

@@ -131,7 +131,7 @@ def test_a_recording_of_images_only_has_one_panel(make: Make, rrd: Path) -> None
     assert {path for path, kind in logged(rrd) if "static" not in kind} == {IMAGES}
 
 
-def test_from_to_and_every_choose_images_with_what_belongs_to_them(make: Make, rrd: Path) -> None:
+def test_from_to_and_every_select_images_and_their_data(make: Make, rrd: Path) -> None:
     assert save([make()], rrd, Settings(from_s=0.2, to_s=0.8, every=2)) == 3
     moving = {n for (_, kind), n in logged(rrd).items() if "static" not in kind}
     assert moving == {3}
@@ -190,7 +190,7 @@ def test_without_images_the_missing_topic_is_named(make: Make, rrd: Path) -> Non
     assert list(rrd.parent.glob("*.rrd*")) == []
 
 
-def test_labels_of_a_robot_without_images_are_not_dropped_in_silence(
+def test_labels_of_a_robot_without_images_are_reported(
     make: Make, rrd: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pictures, others = make(), make("others.mcap", ("cf7",), without=("camera",))
@@ -218,7 +218,7 @@ def test_an_output_is_never_overwritten(make: Make, rrd: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_a_full_disk_ends_it_with_the_reason_and_never_hangs(make: Make) -> None:
+def test_full_disk_raises_an_error_while_saving(make: Make) -> None:
     """rerun itself would say no reason, and now and then wait for ever."""
     show = prepare_show([make()], Settings())
     for _ in range(20):
@@ -238,7 +238,7 @@ def test_a_recording_that_is_cut_short_leaves_no_file(make: Make, rrd: Path) -> 
     assert list(rrd.parent.glob("*.rrd*")) == []
 
 
-def test_an_image_that_is_none_is_named(tmp_path: Path, rrd: Path) -> None:
+def test_undecodable_image_is_reported(tmp_path: Path, rrd: Path) -> None:
     with RecordingWriter(tmp_path / "bad.mcap", Provenance("test")) as sink:
         sink.write(0, IMAGES, message_class("CompressedImage")(data=b"no picture", format="png"))
     with pytest.raises(SourceError, match="no image of /cf1/camera/image can be decoded"):

@@ -136,7 +136,9 @@ def test_existing_recordings_and_images_are_not_added_twice(
     assert add([all_there], out, PLAIN).tally.kept == 0
 
 
-def test_a_name_twice_or_a_part_of_what_is_there_is_refused(record: Record, tmp_path: Path) -> None:
+def test_append_refuses_repeated_names_parts_and_other_sizes(
+    record: Record, tmp_path: Path
+) -> None:
     out = tmp_path / "set"
     (first,) = flights(record, 0)
     run([first], out, PLAIN)

@@ -32,7 +32,7 @@ def test_labelled_images_become_rows_with_recording_and_time(
     assert set(rows["split"].to_pylist()) == {"train"}
 
 
-def test_pixels_are_those_of_the_image(record: Record, tmp_path: Path) -> None:
+def test_dataset_pixels_equal_the_image(record: Record, tmp_path: Path) -> None:
     run([record()], tmp_path / "out", PLAIN)
     (got,) = open_dataset(tmp_path / "out").split("train").pixels
     assert np.array_equal(got, np.stack([pixels_of(k) for k in range(6)]))
@@ -95,7 +95,7 @@ def test_estimated_labels_precede_truth_and_the_choice_is_reported(
         assert told in (out / "README.md").read_text()
 
 
-def test_without_being_asked_for_masks_are_left_out(record: Record, tmp_path: Path) -> None:
+def test_masks_are_omitted_by_default(record: Record, tmp_path: Path) -> None:
     run([record(masks={0: np.ones((48, 64), np.uint8)})], tmp_path / "out", PLAIN)
     split = open_dataset(tmp_path / "out").split("train")
     assert "masks" not in split.table.schema.names

@@ -42,7 +42,7 @@ def test_invalid_flag_error_names_its_line(tmp_path: Path, text: str, says: str)
         read_flags(flags(tmp_path, text))
 
 
-def test_a_file_that_is_not_there_is_one_line(record: Record, tmp_path: Path) -> None:
+def test_missing_file_gives_one_line_error(record: Record, tmp_path: Path) -> None:
     with pytest.raises(DmrlError, match=r"no file .*none\.csv"):
         run([record()], tmp_path / "out", Settings(without=tmp_path / "none.csv"))
     assert not (tmp_path / "out").exists()

@@ -44,7 +44,7 @@ def outputs(graph: FloatGraph, images: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["locanet", "dmrl-nano", "dmrl-nano-fine"])
-def test_the_layers_compute_what_torch_computes(name: str) -> None:
+def test_layers_equal_torch(name: str) -> None:
     network = settled(name)
     with torch.no_grad():
         wanted = network(torch_input(IMAGES)).numpy()

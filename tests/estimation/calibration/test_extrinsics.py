@@ -190,7 +190,7 @@ def test_delay_std_follows_curvature_of_the_cost(
     assert np.array(asked) == pytest.approx(0.001 * np.array(PROBE_SIGMAS))
 
 
-def test_two_delays_that_explain_the_images_alike_are_refused() -> None:
+def test_two_equally_likely_delays_are_refused() -> None:
     best = mount_of(np.array([0, 0, 0, 0.05]), 0.001)
     for apart_s, worse, refused in (
         (1.01 * SAME_DELAY_S, 0.99 * MIN_LOG_LIKELIHOOD_GAP, True),

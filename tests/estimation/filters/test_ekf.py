@@ -48,7 +48,7 @@ def test_the_published_filter_starts_at_zero_and_first_predicts() -> None:
     assert np.allclose(state[0], expected)
 
 
-def test_the_jacobians_are_those_of_finite_differences() -> None:
+def test_ekf_jacobians_equal_finite_differences() -> None:
     rng = np.random.default_rng(0)
     step = 1e-6
     for _ in range(5):

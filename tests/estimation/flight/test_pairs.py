@@ -90,7 +90,7 @@ def test_modes_of_equal_cost_have_equal_weights() -> None:
     )
 
 
-def test_the_statuses_are_those_of_the_schema() -> None:
+def test_statuses_equal_the_schema() -> None:
     assert (room.OK, room.UNCONVERGED, room.AMBIGUOUS) == (
         messages.STATUS_OK,
         messages.STATUS_UNCONVERGED,
@@ -211,6 +211,7 @@ def test_a_flight_without_ranges_is_ambiguous() -> None:
     assert (estimate.status == room.AMBIGUOUS).all()
 
 
+@pytest.mark.heavy
 def test_pairs_of_different_length_equal_separate_estimates() -> None:
     pairs = [pair_of(flown("in_view", "calibrated", 1000 + k, 4.0 + k)) for k in range(2)]
     together = estimate_pairs(pairs)

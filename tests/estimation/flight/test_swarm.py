@@ -90,7 +90,7 @@ def test_unobservable_swarm_motion_has_no_ok_positions(trajectory: Trajectory) -
 
 
 @pytest.mark.heavy
-def test_an_observer_that_stands_still_has_no_bearings() -> None:
+def test_static_observer_has_ambiguous_bearings() -> None:
     *_, swarm = solved("observer_static", "calibrated", duration_s=20.0)
     for peer in ("cf2", "cf3"):
         assert (swarm["cf1", peer].status == AMBIGUOUS).mean() > 0.9

@@ -22,7 +22,7 @@ def test_a_range_from_before_the_last_one_is_not_usable() -> None:
     ]
 
 
-def test_a_pair_takes_only_what_is_finite_and_forward() -> None:
+def test_pair_drops_non_finite_and_backward_samples() -> None:
     Pair(GRID, STILL, STILL, np.array([0.5]), np.array([1.0]))
     with pytest.raises(ValueError, match="time order"):
         Pair(GRID, STILL, STILL, np.array([0.5]), np.array([-1.0]))
@@ -51,7 +51,7 @@ def test_a_pair_seen_from_the_peer_has_the_same_ranges() -> None:
     assert pair.dt_s == pytest.approx(0.01)
 
 
-def test_resampling_leaves_out_what_is_not_finite_or_goes_back() -> None:
+def test_resampling_drops_non_finite_and_backward_samples() -> None:
     time_s = np.array([0.0, 0.1, 0.2, 0.15, 0.3])
     values = np.array([[0.0], [1.0], [np.nan], [99.0], [3.0]])
     # 0.15 comes after 0.2, so it is out, although 0.2 itself has no value.

@@ -71,7 +71,7 @@ def test_covariances_that_are_unknown_or_exact_are_not_judged() -> None:
         assert found.kept == 1.0
 
 
-def test_nothing_to_measure_is_not_a_number() -> None:
+def test_metrics_without_data_are_nan() -> None:
     found = compute_figures(judged(np.ones((10, 2)), kept=False), settle_s=100.0)
     assert np.isnan([found.rmse_m, found.wrong_basin, found.precision, found.recall]).all()
     assert np.isnan(combine_figures([found]).precision)

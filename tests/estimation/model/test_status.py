@@ -23,7 +23,7 @@ def test_the_probability_of_a_round_error_is_rayleighs() -> None:
     assert found == pytest.approx(np.exp([-4.5, -0.5]))
 
 
-def test_the_probability_of_a_long_error_is_that_of_samples() -> None:
+def test_probability_of_an_elongated_error_matches_samples() -> None:
     covariance = np.array([[0.04, 0.015], [0.015, 0.01]])
     errors = np.random.default_rng(0).multivariate_normal([0, 0], covariance, 200_000)
     share = (np.hypot(*errors.T) > 0.3).mean()

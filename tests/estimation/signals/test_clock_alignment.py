@@ -89,7 +89,7 @@ def test_clock_sigma_is_consistent_for_independent_ranges() -> None:
     assert 0.3 < np.sqrt(np.mean(np.square(errors))) < 2.5
 
 
-def test_a_signal_of_another_scale_aligns_as_well() -> None:
+def test_clock_alignment_is_independent_of_signal_scale() -> None:
     """As the turn that a camera saw, in pixels, against a gyroscope."""
     time, rng = np.arange(0, 300, 0.01), np.random.default_rng(3)
     seen = np.arange(0, 300, 0.05)

@@ -49,7 +49,7 @@ def test_log_that_spins_faster_than_its_speed_allows_is_a_crash() -> None:
     assert not drop_contradictions(pair(turning, track())).own.dropout.any()
 
 
-def test_an_estimate_that_comes_back_is_no_crash() -> None:
+def test_temporary_estimate_error_is_no_crash() -> None:
     found = drop_contradictions(pair(track(runaway(8.0, 11.0)), track()))
     assert found.own.dropout[(GRID_S > 9) & (GRID_S < 11)].all()
     assert not found.own.dropout[(GRID_S < 7) | (GRID_S > 13)].any()

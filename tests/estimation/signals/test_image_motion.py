@@ -35,7 +35,7 @@ def test_pictures_are_shrunk_by_means_whatever_their_size() -> None:
     assert shrink_image(np.zeros((10, 12), np.uint8)).shape == (10, 12)
 
 
-def test_rates_leave_out_gaps_and_what_was_not_found() -> None:
+def test_image_rates_omit_gaps_and_unmatched_images() -> None:
     time = np.array([0.0, 0.1, 0.2, 0.3, 2.0])
     moved = np.array([[1.0, 2.0], [np.nan, np.nan], [-1.0, 0.0], [5.0, 5.0]])
     middle, speed = shift_rates(time, moved)

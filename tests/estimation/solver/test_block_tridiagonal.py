@@ -56,7 +56,7 @@ def test_normal_equations_equal_dense_jtj() -> None:
     assert found.globals_gradient == pytest.approx(vector[-GLOBALS:])
 
 
-def test_a_step_is_that_of_the_dense_matrix() -> None:
+def test_step_equals_dense_solve() -> None:
     found, dense, vector = random_equations()
     step = solve_step(found)
     wanted = -np.linalg.solve(dense, vector)

@@ -106,7 +106,7 @@ def test_a_constant_velocity_within_the_bias_is_no_motion() -> None:
     assert own == pytest.approx(0.2, rel=0.2)
 
 
-def test_a_relative_covariance_is_that_of_draws() -> None:
+def test_relative_covariance_matches_samples() -> None:
     rng = np.random.default_rng(0)
     state = np.array([[0.4, -0.3, 0.7, 1.5, 0.8, -0.2]])
     root = 0.01 * rng.normal(size=(6, 6))

@@ -312,7 +312,7 @@ def test_carried_information_is_least_at_its_optimum() -> None:
     assert costs == pytest.approx([0.0, 4 * 0.04 / 2])
 
 
-def test_noise_of_odometry_is_that_of_the_model_and_of_dropouts() -> None:
+def test_odometry_noise_follows_model_and_dropouts() -> None:
     problem, values = flight()
     noise = NoiseModel(velocity_psd=0.01, yaw_rate_psd=0.02, grade=2.0)
     gap_s = np.full(len(problem.robots[0].steps_s), 0.1)

@@ -92,7 +92,7 @@ def test_from_peer_swaps_constants_and_negates_clocks() -> None:
     assert from_peer(layout, other) == pytest.approx(values)
 
 
-def test_known_and_graded_priors_are_those_of_the_noise_model() -> None:
+def test_known_and_scaled_priors_follow_the_noise_model() -> None:
     layout = build_layout(TABLE, 2, [(0, 1)])
     noise = NoiseModel(constants_grade=2.0, known_std={("gyro_bias", (1,)): 1e-4})
     std = noise.prior_std(layout)

@@ -58,7 +58,7 @@ def test_only_false_tracks_count_before_settling() -> None:
     assert compute_figures(replace(judged(), length_s=0.0), 0.0)["false_tracks_per_min"] is None
 
 
-def test_the_ellipsoid_is_that_of_95_percent_in_three_dimensions() -> None:
+def test_coverage_uses_the_95_percent_ellipsoid_in_three_dimensions() -> None:
     rng = np.random.default_rng(0)
     shape = np.array([[0.04, 0.01, 0.0], [0.01, 0.02, -0.01], [0.0, -0.01, 0.03]])
     errors = rng.multivariate_normal(np.zeros(3), shape, 4000)

@@ -35,7 +35,7 @@ def read(data: bytes, step: int = 1400) -> tuple[list[Image], ImageReader]:
 
 
 @pytest.mark.parametrize("step", [1, 7, 1400, 1 << 20])
-def test_raw_and_jpeg_images_come_back_however_the_bytes_are_cut(step: int) -> None:
+def test_raw_and_jpeg_images_round_trip_for_any_chunking(step: int) -> None:
     sent = [raw(40, 51), Image(324, 244, "jpeg", JPEG), raw(2, 2)]
     got, reader = read(b"".join(pack_image(image) for image in sent), step)
     assert got == sent
@@ -132,7 +132,7 @@ def test_console_text_and_other_functions_are_passed_over() -> None:
     assert (got, reader.broken, reader.skipped_bytes) == ([image], 0, 0)
 
 
-def test_quaternions_come_back_to_a_quarter_of_a_degree() -> None:
+def test_quaternions_round_trip_within_a_quarter_of_a_degree() -> None:
     for xyzw in RNG.normal(size=(50, 4)):
         xyzw /= np.linalg.norm(xyzw)
         back = np.array(decompress_quaternion(compress_quaternion(tuple(xyzw))))
@@ -182,7 +182,7 @@ def test_a_picture_s_side_is_4096_pixels_at_most(size: tuple[int, int], whole: b
     assert (len(got), reader.broken) == (whole, not whole)
 
 
-def test_an_image_cut_at_the_end_is_broken_once() -> None:
+def test_truncated_last_image_is_counted_once() -> None:
     reader = ImageReader()
     list(reader.feed(pack_image(raw(60, 50))[:1500]))
     reader.finish()
@@ -225,7 +225,7 @@ def test_an_image_ends_with_its_first_packet_that_is_not_full(width: int, packet
 
 
 @pytest.mark.parametrize("width", [100, 4080 - 12 - 148, 4080 - 12 - 147, 4500, 8996, 12_001])
-def test_streamer_images_of_many_packets_come_back(width: int) -> None:
+def test_streamer_images_of_many_packets_round_trip(width: int) -> None:
     sent = [raw(width, 1, time_us=7 + k, frame_id=k) for k in range(2)]
     data = b"".join(pack_image(image, "streamer") for image in sent)
     got, reader = read(data)

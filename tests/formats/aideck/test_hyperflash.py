@@ -46,7 +46,7 @@ def samples(path: Path, message: str, options: Options | None = None) -> list[Sa
     return [s for s in found if (s.message if isinstance(s.message, str) else "log") == message]
 
 
-def test_pictures_come_back_to_the_pixel(dump: Path) -> None:
+def test_images_are_decoded_exactly(dump: Path) -> None:
     found = [decode(s.fields["data"]) for s in samples(dump, "CompressedImage")]
     plain, ramp, halves = known_pictures()
     assert len(found) == 3

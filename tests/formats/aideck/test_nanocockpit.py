@@ -64,7 +64,7 @@ def test_lost_pictures_are_counted_by_their_numbers(
     assert "2 images were lost in transmission" in capsys.readouterr().err
 
 
-def test_a_table_that_does_not_fit_is_one_line(folder: Path) -> None:
+def test_table_that_does_not_fit_gives_one_line_error(folder: Path) -> None:
     path = folder / "metadata.csv"
     path.write_text(path.read_text().replace("frame_id", "frame"))
     with pytest.raises(SourceError, match=r"metadata\.csv:1: no column frame_id"):

@@ -67,7 +67,7 @@ def test_a_label_ends_at_the_picture_s_edges() -> None:
     assert len(seen(0.049, 50, 40)) == 0
 
 
-def test_a_picture_s_first_edges_are_in_it_and_its_last_are_not() -> None:
+def test_left_and_top_image_edges_are_inside() -> None:
     """In numbers that floats hold exactly."""
     camera = Camera(128, 64, 32.0, 32.0, 64.0, 32.0, ())
     for u, v, count in ((0, 0, 1), (128, 32, 0), (64, 64, 0), (127, 63, 1)):

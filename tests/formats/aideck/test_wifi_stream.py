@@ -113,7 +113,7 @@ def test_damaged_stream_keeps_whole_images_and_reports_the_rest(
     assert "images that are broken" in capsys.readouterr().err
 
 
-def test_a_file_without_a_picture_is_one_line(tmp_path: Path) -> None:
+def test_file_without_a_picture_gives_one_line_error(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="has no whole image of a CPX stream"):
         samples(tmp_path / "a.cpx", b"\0" * 1000)
     assert not wifi_stream.can_read(tmp_path / "a.cpx")
@@ -157,7 +157,7 @@ def test_a_camera_that_started_again_is_refused_with_its_image() -> None:
 
 
 @pytest.mark.parametrize(("garbage", "known"), [(1000, True), (65_000, True), (66_000, False)])
-def test_a_stream_is_known_by_a_whole_picture_near_its_start(
+def test_stream_is_recognized_by_a_whole_image_near_its_start(
     garbage: int, known: bool, tmp_path: Path
 ) -> None:
     image = pack_image(Image(32, 24, "raw", foreign.pictures(1)[0].tobytes()))

@@ -177,7 +177,7 @@ def test_attitude_is_put_together_from_several_blocks(tmp_path: Path) -> None:
         ("Timestamp," + ",".join(f"a{k}" for k in range(1001)) + "\n", "columns"),
     ],
 )
-def test_a_header_without_end_is_one_line(tmp_path: Path, text: str, complaint: str) -> None:
+def test_header_without_end_gives_one_line_error(tmp_path: Path, text: str, complaint: str) -> None:
     path = tmp_path / "log.csv"
     path.write_text(text)
     with pytest.raises(SourceError, match=complaint):

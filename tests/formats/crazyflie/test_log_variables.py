@@ -194,7 +194,7 @@ def test_quaternions_far_from_unit_norm_are_dropped(norm: float, kept: int) -> N
     assert find_quaternions([block("a", **{name: [0.0] for name in names})]) is None
 
 
-def test_state_in_millimetres_is_taken_where_there_is_none_in_metres() -> None:
+def test_state_in_millimetres_is_used_if_metres_are_missing() -> None:
     packed = block("z", stateEstimateZ__x=[1500.0], stateEstimateZ__y=[-20.0])
     plain = block("p", stateEstimate__x=[3.0], stateEstimate__y=[4.0])
     for blocks, wanted in (([packed, plain], [[3.0, 4.0]]), ([packed], [[1.5, -0.02]])):

@@ -49,7 +49,7 @@ def test_real_logs_equal_an_independent_decode(data: Path, name: str) -> None:
     same(log, raw)
 
 
-def test_rates_of_a_real_log_are_those_that_were_set(data: Path) -> None:
+def test_rates_of_a_real_log_match_its_settings(data: Path) -> None:
     raw = (data / "crazyflie-usd" / "eckart00_brushless_flights").read_bytes()
     rates = {
         b.name: (len(b.time_ns) - 1) / ((b.time_ns[-1] - b.time_ns[0]) * 1e-9)
@@ -102,7 +102,7 @@ def test_a_log_cut_anywhere_gives_every_whole_record_and_a_warning(
     assert len(times)
 
 
-def test_an_empty_log_is_one_line(tmp_path: Path) -> None:
+def test_empty_log_gives_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "log00").write_bytes(b"")
     with pytest.raises(SourceError, match=r"log00 is empty.* Pass another log") as e:
         usd_log.load_content(tmp_path / "log00", Options())
@@ -119,7 +119,7 @@ def test_an_empty_log_is_one_line(tmp_path: Path) -> None:
         (lambda raw: raw.replace(b"gyro.x(f)", b"gyro.x(q)"), "without name or known type"),
     ],
 )
-def test_a_damaged_header_is_one_line(damage: object, text: str) -> None:
+def test_damaged_header_gives_one_line_error(damage: object, text: str) -> None:
     with pytest.raises(SourceError, match=text):
         usd_log.decode_log(damage(foreign.usd_log()), "log07")  # type: ignore[operator]
 
@@ -180,7 +180,7 @@ def test_milliseconds_that_wrap_go_on() -> None:
         (b"\xbc\1\0\1", False),
     ],
 )
-def test_a_log_is_known_by_five_bytes(head: bytes, known: bool, tmp_path: Path) -> None:
+def test_log_is_recognized_by_five_bytes(head: bytes, known: bool, tmp_path: Path) -> None:
     (tmp_path / "log").write_bytes(head)
     assert usd_log.can_read(tmp_path / "log") == known
     assert usd_log.can_read(tmp_path) == known
@@ -198,7 +198,7 @@ def test_a_log_is_known_by_five_bytes(head: bytes, known: bool, tmp_path: Path) 
         ({1: ("a", [("x", "d")])}, "without name or known type"),
     ],
 )
-def test_variables_have_names_of_their_own_and_known_types(
+def test_variables_need_distinct_names_and_known_types(
     events: dict[int, tuple[str, list[tuple[str, str]]]], words: str
 ) -> None:
     head = b"\xbc" + struct.pack("<HH", 2, len(events))

@@ -22,7 +22,7 @@ def samples(path: Path, options: Options | None = None) -> dict[str, list[Sample
     return found
 
 
-def test_units_and_signs_are_those_of_dmrl(tmp_path: Path) -> None:
+def test_units_and_signs_follow_dmrl_conventions(tmp_path: Path) -> None:
     path = tmp_path / "log"
     path.write_bytes(foreign.usd_log())
     found = samples(path, Options(robot="cf7", names={"2": "cf9"}))
@@ -54,7 +54,7 @@ def test_units_and_signs_are_those_of_dmrl(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("logged", ["roll", "pitch"])
-def test_the_sign_of_each_angle_alone(tmp_path: Path, logged: str) -> None:
+def test_sign_of_each_angle_is_checked_alone(tmp_path: Path, logged: str) -> None:
     names = ("roll", "pitch", "yaw")
     events = {1: ("state", [(f"stateEstimate.{name}", "f") for name in names])}
     values = tuple(10.0 if name == logged else 0.0 for name in names)

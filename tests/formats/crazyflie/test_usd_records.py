@@ -40,7 +40,7 @@ def plain(
     rest=st.binary(max_size=7),
     seed=st.integers(0, 9),
 )
-def test_records_are_those_of_a_walk_from_one_to_the_next(
+def test_records_equal_sequential_parsing(
     numbers: list[int],
     codes: list[str],
     time: str,

@@ -66,7 +66,7 @@ def test_coco_with_splits(pictures: str, file: str, prefix: str, tmp_path: Path)
     assert content.split == {"train": [(0, 500_000_000)], "val": [(600_000_000, 800_000_000)]}
 
 
-def test_coco_leaves_out_what_cannot_be_used(tmp_path: Path) -> None:
+def test_unusable_coco_annotations_are_omitted(tmp_path: Path) -> None:
     for k in range(1, 6):
         write_picture(tmp_path / f"p{k}.png", k)
     told = coco("", range(1, 5), "p")
@@ -98,7 +98,7 @@ def test_coco_leaves_out_what_cannot_be_used(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", ['{"images": [{}], ', '{"images": [{"id": 1}]}', '[{"images": []}]', '{"images": [3]}']
 )
-def test_a_file_that_is_not_coco_s_is_one_line(text: str, tmp_path: Path) -> None:
+def test_invalid_coco_file_gives_one_line_error(text: str, tmp_path: Path) -> None:
     write_picture(tmp_path / "a.png", 1)
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(SourceError, match=r"a\.json is not a COCO file: .*Restore"):

@@ -35,7 +35,7 @@ def test_a_label_goes_where_the_camera_of_the_result_sees_it(crop: Crop) -> None
     assert (crop.crop_camera(whole).width_px, crop.crop_camera(whole).height_px) == (320, 240)
 
 
-def test_boxes_are_clipped_and_gone_outside() -> None:
+def test_boxes_are_clipped_and_dropped_outside_the_image() -> None:
     left, _ = WIDE.corner_px
 
     def box(*box_px: float) -> tuple[float, ...]:
@@ -49,7 +49,7 @@ def test_boxes_are_clipped_and_gone_outside() -> None:
 
 
 @pytest.mark.parametrize("crop", [WIDE, HIGH])
-def test_pixels_are_those_of_the_part(crop: Crop) -> None:
+def test_cropped_pixels_equal_the_region(crop: Crop) -> None:
     v, u = np.mgrid[: crop.from_height_px, : crop.from_width_px]
     rgb = np.stack([u // 4, v // 4, 0 * u], axis=-1).astype(np.uint8)
     got = crop.crop_image(rgb)
@@ -69,7 +69,7 @@ def test_a_part_that_is_cut_out_is_not_scaled() -> None:
     assert (crop.crop_image(rgb) == rgb[10:234, 2:322]).all()
 
 
-def test_a_box_that_only_touches_an_edge_is_gone() -> None:
+def test_box_that_only_touches_an_edge_is_dropped() -> None:
     left, _ = WIDE.corner_px
     for box in ((left + 100, -9, left + 200, 0), (left + 100, 500, left + 200, 501)):
         assert WIDE.crop_label(LabelRow("a.png", "cf2", box_px=box)).box_px == ()

@@ -78,7 +78,7 @@ def test_pictures_beside_the_log_come_along(flight: Path) -> None:
     assert [(s.time_ns, s.fields["data"]) for s in images] == [(1_005_000_000, picture)]
 
 
-def test_robots_get_the_names_that_are_asked_for(flight: Path) -> None:
+def test_robots_get_the_given_names(flight: Path) -> None:
     folder = flight / "cf1"
     folder.mkdir()
     (folder / "0000001050000000.png").write_bytes(encode_png(np.zeros((224, 320, 3), np.uint8)))

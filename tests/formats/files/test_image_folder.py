@@ -246,7 +246,7 @@ def test_coloured_pictures_are_not_raw(folder: Path) -> None:
         samples(folder, "CompressedImage", Options(raw=True))
 
 
-def test_pictures_of_the_whole_sensor_are_cut_to_what_the_camera_is_of(tmp_path: Path) -> None:
+def test_full_sensor_images_are_cropped_to_the_camera(tmp_path: Path) -> None:
     whole = np.random.default_rng(0).integers(0, 256, (244, 324, 3), np.uint8)
     (tmp_path / "a.png").write_bytes(encode_png(whole))
     (tmp_path / "labels.csv").write_text("file,peer,u_px,v_px,depth_m\na.png,cf2,102,110,1\n")

@@ -29,7 +29,7 @@ def written(*rows: LabelRow) -> str:
     return stream.getvalue()
 
 
-def test_rows_come_back_as_they_were(tmp_path: Path) -> None:
+def test_label_rows_are_read_as_written(tmp_path: Path) -> None:
     bare = LabelRow("b.png", "cf3", 4.0, 5.0, 6.0)
     nobody = LabelRow("a.png", "", source="truth", split="train")
     assert read(tmp_path, written(FULL, bare)) == {"a.png": [FULL], "b.png": [bare]}
@@ -38,7 +38,7 @@ def test_rows_come_back_as_they_were(tmp_path: Path) -> None:
     assert bare.sigmas == (0.0, 0.0, 0.0)
 
 
-def test_cells_stand_under_their_names_and_what_is_not_known_is_empty() -> None:
+def test_cells_match_their_columns_and_unknown_values_are_empty() -> None:
     head, full, bare, nobody = written(
         FULL, LabelRow("b.png", "cf3", 4.0, 5.0, 6.0), LabelRow("b.png", "")
     ).splitlines()
@@ -48,7 +48,7 @@ def test_cells_stand_under_their_names_and_what_is_not_known_is_empty() -> None:
     assert nobody == "b.png,,,,,,,,,,hand,,,,"
 
 
-def test_fields_are_those_of_a_label() -> None:
+def test_label_csv_columns_equal_label_fields() -> None:
     assert FULL.to_fields() == {
         **{"peer": "cf2", "u_px": 1.5, "v_px": -2.25, "depth_m": 0.75, "visible_share": 0.5},
         **{"source": "truth", "sigma_u_px": 0.5, "sigma_v_px": 1.5, "sigma_depth_m": 0.25},

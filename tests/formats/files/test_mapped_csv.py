@@ -266,7 +266,7 @@ def test_a_folder_is_a_robot_per_file_by_its_name(table: Path) -> None:
     assert {topic.split("/")[1] for topic in found} - {"tf"} == {"left", "b"}
 
 
-def test_a_column_that_stands_twice_is_refused(table: Path) -> None:
+def test_repeated_column_is_refused(table: Path) -> None:
     log = table.with_name("log.csv")
     log.write_text(log.read_text().replace(";note", ";vx"))
     with pytest.raises(SourceError, match="a column appears twice"):
@@ -282,7 +282,7 @@ def test_most_frequent_delimiter_is_used(separator: str, table: Path) -> None:
     assert len(samples(log, Options(columns=table))["/cf1/height"]) == 2
 
 
-def test_every_quantity_of_a_table_comes_where_it_belongs(tmp_path: Path) -> None:
+def test_every_quantity_of_the_column_map_reaches_its_topic(tmp_path: Path) -> None:
     """A log in which every column has a number of its own."""
     frames = {f"v{axis}": 'frame = "world"\n' for axis in "xyz"}
     first = {"rad": "rad", "rad/s": "rad/s", "m": "m", "m/s": "m/s", "1": "1", "s": "s"}

@@ -130,7 +130,7 @@ def test_own_sensors_are_labelled_both_ways(tmp_path: Path) -> None:
         assert (position["status"] == "OK").mean() > 0.25
 
 
-def test_a_robot_may_lack_what_another_has(
+def test_robots_may_have_different_sensors(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = write(tmp_path, "a file a robot")

@@ -283,7 +283,7 @@ CELLS = st.one_of(
 
 
 @given(st.lists(st.tuples(CELLS, CELLS, CELLS), min_size=3, max_size=20), st.sampled_from(",;\t|"))
-def test_numbers_and_missing_values_are_those_of_pandas(
+def test_numbers_and_missing_values_are_parsed_as_by_pandas(
     rows: list[tuple[str, ...]], separator: str
 ) -> None:
     names = ["t", "roll", "pitch", "d2"]
@@ -308,7 +308,7 @@ MOMENTS = st.datetimes(pandas.Timestamp("1970-01-02"), pandas.Timestamp("2200-01
     st.sampled_from(["T", " "]),
     st.sampled_from(["", "Z", "+00:00", "+05:30", "-0800"]),
 )
-def test_iso_times_are_those_of_pandas(moments: list[Any], between: str, zone: str) -> None:
+def test_iso_times_are_parsed_as_by_pandas(moments: list[Any], between: str, zone: str) -> None:
     moments = sorted(moments, key=lambda moment: moment.timestamp())
     cells = [moment.isoformat(between) + zone for moment in moments]
     wanted = pandas.to_datetime(pandas.Series(cells), format="ISO8601", utc=True)

@@ -171,7 +171,7 @@ def test_image_without_label_file_is_empty_unless_unlabelled_is_set(
         "!!python/object/apply:os.system [ls]",
     ],
 )
-def test_a_description_that_is_none_is_one_line(text: str, small: Path) -> None:
+def test_invalid_description_gives_one_line_error(text: str, small: Path) -> None:
     (small / "data.yaml").write_text(text)
     with pytest.raises(SourceError, match=r"data\.yaml does not describe a YOLO set: .*Fix") as e:
         read(small, "yolo")

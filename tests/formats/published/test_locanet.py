@@ -261,7 +261,7 @@ def test_boxes_end_at_the_picture_s_edges() -> None:
     assert found.tolist() == [[0, 0, 320, 224], [0, 0, 320, 224]]
 
 
-def test_the_whole_of_a_published_attitude_is_known_by_two_angles() -> None:
+def test_published_two_angle_attitude_is_converted_to_zyx() -> None:
     for roll, pitch in ((0.3, 0.0), (0.0, -0.2), (0.3, -0.2), (-0.1, 0.25)):
         found = locanet.to_attitude_zyx(roll, pitch)
         up = (_rx(roll) @ _ry(pitch)).T @ [0, 0, 1]  # seen from the camera
@@ -309,7 +309,7 @@ def test_image_number_sets_its_time_and_rows(folder: Path) -> None:
     assert [truth[2].fields[n] for n in "xyz"] == pytest.approx(wanted)
 
 
-def test_a_robot_at_the_camera_s_own_place_is_not_before_it(folder: Path) -> None:
+def test_robot_at_the_camera_position_is_refused(folder: Path) -> None:
     inner = folder / "synImgs"
     for x, fits in (("0.001", True), ("0", False)):
         _spoil("posLabel.txt", 1, f"p/0000.jpg 0.1,-0.2 {x},0,0,0,0,0")(inner)

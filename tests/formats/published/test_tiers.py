@@ -79,7 +79,7 @@ def test_the_public_file_reads(data: Path) -> None:
         },
     ],
 )
-def test_arrays_of_strange_shapes_and_numbers_are_one_line(
+def test_arrays_of_strange_shapes_and_numbers_give_one_line_errors(
     tmp_path: Path, arrays: dict[str, Any]
 ) -> None:
     path = tmp_path / "a.npz"
@@ -120,7 +120,7 @@ def test_sixty_four_robots_are_the_most(robots: int, fits: bool, tmp_path: Path)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -1.0])
-def test_a_range_that_is_none_is_left_out(value: float, ranges: Path) -> None:
+def test_invalid_range_is_omitted(value: float, ranges: Path) -> None:
     with np.load(ranges) as archive:
         arrays = dict(archive)
     arrays["uwb_range_3_1_np"][4] = value

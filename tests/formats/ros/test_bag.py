@@ -81,7 +81,7 @@ def test_robots_are_named_as_the_user_wants(tmp_path: Path) -> None:
     assert "/a/range/b" in found and "/a/attitude" in found
 
 
-def test_a_bag_without_anything_known_is_one_line(tmp_path: Path) -> None:
+def test_bag_without_known_topics_gives_one_line_error(tmp_path: Path) -> None:
     lines, why = ros.plan_topics([("/chatter", "std_msgs/msg/String", 3)], Options())
     assert (lines, list(why)) == ({}, [("/chatter", "std_msgs/msg/String")])
     path = tmp_path / "a.db3"
@@ -214,7 +214,7 @@ def test_a_header_s_stamp_is_whole_nanoseconds(
         ("a.txt", b"SQLite format 3\0", False),
     ],
 )
-def test_a_bag_is_known_by_its_first_bytes(
+def test_bag_is_recognized_by_its_first_bytes(
     name: str, head: bytes, known: bool, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_bytes(head)

@@ -81,7 +81,7 @@ def odometry(child: str, linear: tuple[float, ...]) -> SimpleNamespace:
     )
 
 
-def test_odometry_in_the_robot_s_own_frame_is_levelled() -> None:
+def test_odometry_in_the_body_frame_is_levelled() -> None:
     found = given("nav_msgs/msg/Odometry", odometry("cf1/base_link", (1.0, 2.0, 3.0)))
     pose, height, attitude, velocity = found
     assert [s.topic for s in found] == [
@@ -118,7 +118,7 @@ def test_quaternion_far_from_unit_norm_gives_no_angles(norm: float, there: bool)
     assert found is None or found == pytest.approx(np.array(TILT))
 
 
-def test_an_imu_and_a_twist_count_where_there_is_no_odometry(
+def test_imu_and_twist_are_used_without_odometry(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     imu = SimpleNamespace(orientation=TURN, angular_velocity=xyzw(0.1, 0.2, 0.4))
@@ -180,9 +180,7 @@ def frames(*stamps: tuple[int, int]) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize(("stamp", "time_ns"), [((2, 5), 2_000_000_005), ((0, 0), 1_500_000_000)])
-def test_frames_stand_at_their_stamp_or_when_they_came(
-    stamp: tuple[int, int], time_ns: int
-) -> None:
+def test_transforms_use_their_stamp_or_receive_time(stamp: tuple[int, int], time_ns: int) -> None:
     (found,) = given("tf2_msgs/msg/TFMessage", frames(stamp))
     assert found.time_ns == time_ns
     (entry,) = found.fields["transforms"]
@@ -255,9 +253,7 @@ def test_vectors_and_rates_are_turned_as_the_robot_is(
         ("mapped", "x", False),
     ],
 )
-def test_frames_that_do_not_turn_are_known_by_their_names(
-    frame: str, parent: str, fixed: bool
-) -> None:
+def test_fixed_frames_are_recognized_by_name(frame: str, parent: str, fixed: bool) -> None:
     assert _is_fixed_frame(frame, parent) == fixed
 
 

@@ -84,7 +84,9 @@ def test_a_range_to_the_floor_is_no_range_to_a_peer(
         ("/robot/odom", "/robot/camera/image_raw", "robot"),
     ],
 )
-def test_namespaces_are_no_robots(odom: str, camera: str, robot: str, tmp_path: Path) -> None:
+def test_ros_namespaces_are_not_taken_for_robots(
+    odom: str, camera: str, robot: str, tmp_path: Path
+) -> None:
     found, left = read(ros.write(tmp_path / "bag", odometry(odom) + images(camera)))
     assert {topic.split("/")[1] for topic in found} == {robot} and not left
     assert len(found[f"/{robot}/camera/image"]) == len(found[f"/{robot}/pose"]) == 5
@@ -109,7 +111,7 @@ def test_guessed_robot_name_is_reported_and_can_be_given(
         run(path, tmp_path / "b.mcap", Settings(names="/lab/alpha/odom=c f"))
 
 
-def test_numbers_that_are_none_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_non_finite_numbers_are_omitted_and_counted(tmp_path: Path) -> None:
     nan, sent = math.nan, []
     turns = [(0.0, 0.0, 0.0, 1.0), (nan, 0.0, 0.0, 1.0), (0.0,) * 4, (0.0, 0.0, 0.0, 1.0)]
     for t, z, turn in zip(times(4), (1.0, 1.0, 1.0, math.inf), turns, strict=True):
@@ -172,7 +174,7 @@ def test_video_and_torn_pictures_spare_the_others(tmp_path: Path) -> None:
     }
 
 
-def test_a_calibration_is_that_of_the_camera_whose_pictures_are_kept(tmp_path: Path) -> None:
+def test_calibration_belongs_to_the_camera_of_the_kept_images(tmp_path: Path) -> None:
     sent = images("/cf1/color/image_raw") + images("/cf1/depth/image_raw", "16UC1", 9)
     for t in times(9):
         sent.append(Sent("/cf1/depth/camera_info", t, ros.camera_info(t, 100.0)))

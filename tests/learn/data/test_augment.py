@@ -105,7 +105,7 @@ def test_noise_differs_between_epochs_and_stays_below_its_std() -> None:
     assert 0.5 * 0.05 < loud.max() < 1.02 * 0.05  # anything up to what is asked for
 
 
-def test_every_key_of_a_recipe_varies_what_it_is_called() -> None:
+def test_every_augmentation_key_changes_its_own_property() -> None:
     values = {
         "flip_share": 0.11,
         "zoom": (0.7, 1.3),
@@ -185,7 +185,7 @@ def test_a_tint_changes_contrast_about_the_middle_and_brightness() -> None:
     )
 
 
-def test_defocus_spreads_a_point_over_its_neighbours_alike() -> None:
+def test_defocus_blurs_a_point_symmetrically() -> None:
     maker, rng, middles = augmenter(blur_share=0.5), np.random.default_rng(4), []
     for _ in range(600):
         canvas = np.zeros((7, 9, 3), np.uint8)
@@ -281,7 +281,7 @@ def layered(
 
 
 @pytest.mark.parametrize("rect", [(0, 0, 160, 112), (20, 10, 120, 66), (5, 7, 45, 107)])
-def test_a_window_looks_anywhere_in_its_source_and_not_past_it(
+def test_crop_windows_cover_their_source_without_leaving_it(
     rect: tuple[int, int, int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     maker = augmenter(zoom=(1.5, 2.5))

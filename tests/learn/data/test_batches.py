@@ -25,7 +25,7 @@ def numbered(*sizes: int) -> ExampleSet:
     return ExampleSet(np.split(images, np.cumsum(sizes)[:-1]), robots)
 
 
-def test_every_image_comes_once_with_its_own_robots() -> None:
+def test_every_image_is_used_once_with_its_labels() -> None:
     seen: list[int] = []
     for images, robots in iter_batches(numbered(5, 0, 7, 1), 4):
         numbers = images[:, 0, 0, 0].tolist()

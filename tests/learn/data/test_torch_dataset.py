@@ -47,7 +47,7 @@ def test_in_order_each_row_is_read_once(parts: int) -> None:
     assert max(map(len, mine)) - min(map(len, mine)) <= 1
 
 
-def test_shuffled_all_read_equally_many_and_none_twice() -> None:
+def test_shuffled_parts_are_equal_and_disjoint() -> None:
     mine = [ProcessSampler(10, (k, 3), shuffle=True, seed=1) for k in range(3)]
     first, second = ([list(part) for part in mine] for _ in range(2))
     for read in (first, second):

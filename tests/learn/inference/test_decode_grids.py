@@ -50,7 +50,7 @@ def test_the_best_cell_is_kept_however_low() -> None:
     assert (found.u_px[:, 0].tolist(), found.v_px[:, 0].tolist()) == ([20.0, 4.0], [20.0, 4.0])
 
 
-def test_no_more_than_asked_for() -> None:
+def test_number_of_detections_is_limited() -> None:
     confidence = np.zeros((1, 9, 9))
     confidence[0, ::2, ::2] = np.arange(1, 26).reshape(5, 5) / 30
     found = decode(confidence, np.ones((1, 9, 9)), most=3)
@@ -70,7 +70,7 @@ def test_plateau_gives_one_peak_and_first_maximum_is_a_peak(
             assert max(abs(rows[a] - rows[b]), abs(cols[a] - cols[b])) > 1
 
 
-def test_depth_error_and_class_are_those_of_the_peak() -> None:
+def test_depth_sigma_and_class_are_taken_at_the_peak() -> None:
     confidence, offset = np.zeros((1, 4, 9)), np.zeros((1, 2, 4, 9))
     confidence[0, 1, [1, 7]] = 0.7, 0.9
     spread, class_id = np.full((1, 4, 9), 0.1), np.zeros((1, 4, 9), np.int64)

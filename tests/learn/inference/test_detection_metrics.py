@@ -230,7 +230,7 @@ def off_by(*errors: tuple[float, float, float]) -> dict[str, float]:
     return {name: float(value[0]) for name, value in got.items()}
 
 
-def test_figures_of_unlike_errors_by_hand() -> None:
+def test_metrics_of_different_errors_equal_hand_computed_values() -> None:
     got = off_by((3.0, 4.0, 0.1), (0.0, 12.0, -0.2), (-8.0, 0.0, 0.4), (30.0, 40.0, 0.0))
     assert got["mean_px"] == pytest.approx((5 + 12 + 8 + 50) / 4)
     assert got["rmse_px"] == pytest.approx(((25 + 144 + 64 + 2500) / 4) ** 0.5)
@@ -258,7 +258,7 @@ def test_a_band_holds_its_lower_end() -> None:
         assert bands[held].images == 1
 
 
-def test_resamples_draw_as_many_images_as_there_are() -> None:
+def test_bootstrap_samples_have_the_number_of_images() -> None:
     labels, found = scene(7)
     rows = np.concatenate(list(iter_bootstrap_weights(score_detections(7, labels, found), 500, 3)))
     assert rows.shape == (500, 7)
@@ -268,7 +268,7 @@ def test_resamples_draw_as_many_images_as_there_are() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 3)), min_size=1, max_size=12))
-def test_a_weighted_quantile_is_that_of_repeated_values(pairs: list[tuple[int, int]]) -> None:
+def test_weighted_quantile_equals_quantile_of_repeated_values(pairs: list[tuple[int, int]]) -> None:
     values_, counts = (np.array(x, float) for x in zip(*pairs, strict=True))
     repeated = np.repeat(values_, counts.astype(int))
     for share in (0.25, 0.5, 0.95):

@@ -29,7 +29,7 @@ def anything(seed: int, images: int) -> tuple[Points, Points]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_weights_are_how_often_an_image_was_there(seed: int) -> None:
+def test_image_weights_equal_repetition_counts(seed: int) -> None:
     images, rng = 9, np.random.default_rng(seed)
     labels, found = anything(seed, images)
     scored = score_detections(images, labels, found)
@@ -55,7 +55,7 @@ def test_weights_are_how_often_an_image_was_there(seed: int) -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.sampled_from("rwn")), min_size=1, max_size=15),
        st.integers(1, 9))  # fmt: skip
-def test_average_precision_is_that_of_every_threshold(
+def test_average_precision_equals_a_sum_over_thresholds(
     rows: list[tuple[int, str]], more: int
 ) -> None:
     confidence = np.array([c / 7 for c, _ in rows])

@@ -36,7 +36,7 @@ def scored(images: int = 4000) -> ScoredDetections:
     return score_detections(images, labels, found)
 
 
-def test_rates_are_those_that_the_detections_were_drawn_with() -> None:
+def test_detector_rates_are_recovered_from_samples() -> None:
     rates = measure_rates(scored())
     assert rates is not None
     assert set(rates) == set(RATE_FIELDS)

@@ -68,7 +68,7 @@ def test_dmrl_nano_predicts_an_offset_within_the_cell(tmp_path: Path) -> None:
     assert said["outputs"] == ["log_depth", "confidence", "offset_u", "offset_v"]
 
 
-def test_a_model_with_more_channels_comes_back_with_them(tmp_path: Path) -> None:
+def test_model_with_extra_channels_round_trips(tmp_path: Path) -> None:
     extra = ("log_spread", "class_0", "class_1")
     network = build_network("dmrl-nano", seed=1, extra=extra).eval()
     with torch.no_grad():
@@ -141,7 +141,7 @@ def test_anything_else_is_not_a_model(tmp_path: Path, content: bytes) -> None:
         load_model(path)
 
 
-def test_a_missing_model_is_one_line(tmp_path: Path) -> None:
+def test_missing_model_gives_one_line_error(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="no model"):
         load_model(tmp_path / "nothing")
     with pytest.raises(ModelError, match=r"no model\.safetensors in"):
@@ -172,7 +172,7 @@ def test_wrong_tensors_are_named(run: Path, change: object, text: str) -> None:
         load_model(run)
 
 
-def test_damaged_weights_are_one_line(run: Path) -> None:
+def test_damaged_weights_give_one_line_errors(run: Path) -> None:
     whole = (run / "model.safetensors").read_bytes()
     (run / "model.safetensors").write_bytes(whole[:-100])
     with pytest.raises(ModelError, match="is damaged"):
@@ -206,9 +206,7 @@ def test_images_that_do_not_divide_into_cells_are_refused(run: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [torch.int64, torch.bool, torch.complex64, torch.float8_e4m3fn])
-def test_weights_of_another_kind_than_numbers_with_a_point_are_refused(
-    run: Path, kind: torch.dtype
-) -> None:
+def test_weights_of_other_dtypes_are_refused(run: Path, kind: torch.dtype) -> None:
     tensors = load_file(run / "model.safetensors")
     save_file({k: v.to(kind) for k, v in tensors.items()}, run / "model.safetensors")
     with pytest.raises(ModelError, match=r"holds torch\.\w+. Give weights in float32"):

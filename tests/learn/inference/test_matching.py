@@ -84,7 +84,7 @@ def test_the_radius_itself_is_a_hit() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_images_do_not_touch_each_other(seed: int) -> None:
+def test_detections_match_within_their_image_only(seed: int) -> None:
     rng = np.random.default_rng(seed)
 
     def some(image: int) -> tuple[Points, Points]:

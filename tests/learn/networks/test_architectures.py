@@ -112,7 +112,7 @@ def test_kernels_begin_as_wide_as_keeps_the_size_of_gradients(name: str) -> None
     assert 1 / (1 + math.exp(-empty.pop(1))) < 0.05 and not any(empty)
 
 
-def test_locanet_is_layer_by_layer_what_was_published() -> None:
+def test_locanet_layers_equal_the_publication() -> None:
     network = build_network("locanet", seed=4).eval()
     assert isinstance(network, LocaNet)
     images = torch.randn(1, 3, 32, 40)
@@ -132,7 +132,7 @@ def test_locanet_is_layer_by_layer_what_was_published() -> None:
     assert [conv.out_channels for conv in network.convs] == [8, 16, 32, 64]  # type: ignore[union-attr]
 
 
-def test_a_block_adds_to_what_it_was_given() -> None:
+def test_residual_block_adds_its_input() -> None:
     block = ResidualBlock(4, 2).eval()
     x = torch.randn(1, 4, 9, 11)
     wanted = (x + block.pointwise(block.depthwise(x))).clamp(min=0)

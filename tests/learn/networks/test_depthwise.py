@@ -10,7 +10,9 @@ from dmrl.learn.networks.depthwise import DepthwiseConv
     ("stride", "dilation", "shape"),
     [(1, 1, (28, 40)), (1, 2, (9, 11)), (1, 4, (28, 40)), (1, 8, (28, 40)), (2, 1, (12, 8))],
 )
-def test_gradients_are_those_of_torch(stride: int, dilation: int, shape: tuple[int, int]) -> None:
+def test_depthwise_gradients_equal_torch(
+    stride: int, dilation: int, shape: tuple[int, int]
+) -> None:
     torch.manual_seed(0)
     layer = DepthwiseConv(6, stride=stride, dilation=dilation).double()
     x = torch.randn(3, 6, *shape, dtype=torch.double).requires_grad_()
@@ -37,7 +39,7 @@ def test_an_odd_size_and_half_precision_work_too() -> None:
 @pytest.mark.parametrize("shape", [(7, 8), (8, 7), (7, 9), (8, 8), (1, 1)])
 @pytest.mark.parametrize(("stride", "dilation"), [(2, 1), (1, 3), (1, 5), (2, 2)])
 @pytest.mark.parametrize("training", [True, False])
-def test_any_size_gives_what_torch_gives(
+def test_depthwise_outputs_equal_torch_for_any_size(
     shape: tuple[int, int], stride: int, dilation: int, training: bool
 ) -> None:
     torch.manual_seed(1)

@@ -61,7 +61,7 @@ def by_hand(values: Variables, image: NDArray[np.float64]) -> NDArray[np.float64
     return head + values["conv2d_4/conv2d_4/bias:0"]
 
 
-def test_keras_weights_give_what_keras_would_compute(tmp_path: Path) -> None:
+def test_keras_weights_give_the_outputs_of_keras(tmp_path: Path) -> None:
     values = variables()
     network = load_model(write(tmp_path / "weights.h5", values)).network
     pixels = np.random.default_rng(1).integers(0, 256, (16, 24, 3), np.uint8)
@@ -88,7 +88,7 @@ def test_a_missing_layer_is_named(tmp_path: Path) -> None:
         load_keras_weights(path)
 
 
-def test_a_file_cut_short_is_one_line(tmp_path: Path) -> None:
+def test_file_cut_short_gives_one_line_error(tmp_path: Path) -> None:
     whole = write(tmp_path / "weights.h5", variables()).read_bytes()
     path = tmp_path / "cut.h5"
     path.write_bytes(whole[: len(whole) // 2])
@@ -111,7 +111,7 @@ def test_published_weights_load(data: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["soft", "external", "raw file", "virtual"])
-def test_weights_that_stand_elsewhere_are_not_followed(tmp_path: Path, kind: str) -> None:
+def test_external_hdf5_links_are_not_followed(tmp_path: Path, kind: str) -> None:
     """A file of a stranger must not bring in what stands in other files of ours."""
     ours, key = write(tmp_path / "ours.h5", variables()), "conv2d_4/conv2d_4/bias:0"
     path = write(tmp_path / "w.h5", {k: v for k, v in variables().items() if k != key})

@@ -83,7 +83,7 @@ def test_a_recipe_s_own_channels_are_the_spread_then_the_classes() -> None:
     )
 
 
-def test_the_last_epochs_are_plain_where_that_is_asked_for() -> None:
+def test_plain_epochs_disable_augmentation_at_the_end() -> None:
     settings = TrainConfig(epochs=10, plain_epochs=3, rotation_deg=5.0)
     turns = [settings.augmentation(epoch).rotation_deg for epoch in range(10)]
     assert turns == [5.0] * 7 + [0.0] * 3

@@ -35,7 +35,7 @@ def test_all_processes_run_and_rank_0_returns(work: ModuleType) -> None:
     assert not distributed.is_initialized()
 
 
-def test_one_that_was_killed_is_one_line(work: ModuleType) -> None:
+def test_killed_process_gives_one_line_error(work: ModuleType) -> None:
     with pytest.raises(SettingError, match=r"one of the 2 processes was killed.*--resume"):
         run_distributed(2, work.half_dies)
     assert not distributed.is_initialized()

@@ -70,7 +70,7 @@ def test_without_focus_it_is_cross_entropy_and_cells_can_weigh_less() -> None:
     )
 
 
-def test_offset_loss_is_the_sum_of_both_ways_where_there_is_a_robot() -> None:
+def test_offset_loss_sums_both_axes_in_cells_with_robots() -> None:
     predicted = torch.tensor([[[[0.5, 9.0]], [[0.0, 9.0]]]])
     wanted = torch.tensor([[[[0.1, 0.0]], [[-0.3, 0.0]]]])
     weight = torch.tensor([[[0.5, 0.0]]])

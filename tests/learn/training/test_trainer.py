@@ -232,7 +232,7 @@ def test_weight_ema_follows_early_steps_and_averages_later_ones() -> None:
     assert float(next(mean.network.parameters()).flatten()[0]) < 299 - 20
 
 
-def test_a_teacher_s_share_of_the_loss_is_the_one_that_is_asked_for(examples: ExampleSet) -> None:
+def test_distillation_weight_is_the_configured_share(examples: ExampleSet) -> None:
     settings = replace(SETTINGS, architecture="dmrl-nano")
     pupil, teacher = (build_network("dmrl-nano", seed=seed).eval() for seed in (1, 2))
     batch = collate(examples, [0, 1])
@@ -258,6 +258,6 @@ def test_both_sides_of_images_fit_a_network(width: int, height: int, fits: int) 
             build_initial_network(SETTINGS, images)
 
 
-def test_terms_of_the_loss_stand_in_this_order() -> None:
+def test_loss_terms_have_a_fixed_order() -> None:
     names = ("confidence", "depth", "offset", "spread", "class")
     assert tuple(f"{name}_loss" for name in names) == LOSS_NAMES

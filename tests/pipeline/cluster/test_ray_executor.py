@@ -167,7 +167,7 @@ def labelled(flown: Path) -> Path:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_labels_are_those_of_one_process_whenever_a_node_dies(
+def test_labels_equal_one_process_even_if_a_node_dies(
     seed: int, nodes: Nodes, flown: Path, labelled: Path, tmp_path: Path
 ) -> None:
     nodes.whole()
@@ -256,7 +256,7 @@ def test_failing_recording_does_not_stop_the_others(
     assert len(bytes_in(tmp_path / "out")) == 10
 
 
-def test_other_versions_and_wrong_addresses_are_one_line(
+def test_other_versions_and_wrong_addresses_give_one_line_errors(
     nodes: Nodes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dmrl.pipeline.cluster.ray_executor.__version__", "9.9.9")

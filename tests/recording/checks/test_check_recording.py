@@ -58,7 +58,7 @@ def labelled(write: Write, shift_v_px: float = 0.0) -> None:
         write(k * 10**9, "/cf1/labels", message_class("PeerLabels")(peers=[true, other]))
 
 
-def test_a_sound_recording_has_no_findings(tmp_path: Path) -> None:
+def test_valid_recording_has_no_findings(tmp_path: Path) -> None:
     assert record(tmp_path / "a.mcap", labelled) == []
 
 
@@ -156,7 +156,7 @@ def test_an_empty_recording_is_an_error(tmp_path: Path) -> None:
     assert record(tmp_path / "a.mcap", lambda _: None) == ["error  has no messages"]
 
 
-def test_a_topic_without_messages_is_no_trouble(tmp_path: Path) -> None:
+def test_topic_without_messages_gives_no_finding(tmp_path: Path) -> None:
     """Other writers announce topics that nothing is ever sent on."""
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
@@ -292,7 +292,7 @@ def test_boxes_cut_by_the_image_edge_are_ignored_for_bias(tmp_path: Path) -> Non
         )
 
 
-def test_topics_that_are_not_dmrl_s_are_left_alone(tmp_path: Path) -> None:
+def test_unknown_topics_are_not_checked(tmp_path: Path) -> None:
     def fill(write: Write) -> None:
         for k in range(3):
             write(k, "/cf1/own", message_class("Height")())

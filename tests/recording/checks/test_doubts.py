@@ -111,7 +111,7 @@ def seen(level: float, noise: float = 4.0, texture: float = 40.0) -> np.ndarray:
     return np.clip(rgb, 0, 255).astype(np.uint8)
 
 
-def test_cameras_that_see_are_not_doubted(tmp_path: Path) -> None:
+def test_working_cameras_give_no_finding(tmp_path: Path) -> None:
     assert images(tmp_path, [encode_png(seen(120)) for _ in range(30)]) == []
     dusk = [encode_jpeg(seen(12, texture=10)) for _ in range(30)]
     assert images(tmp_path, dusk, "jpeg") == []

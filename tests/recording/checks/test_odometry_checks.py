@@ -177,7 +177,7 @@ def test_a_velocity_half_like_or_like_no_other_is_not_doubted(share: float, coun
 
 
 @pytest.mark.parametrize(("share", "count"), [(-0.85, 1), (-0.75, 0)])
-def test_a_velocity_is_doubted_that_is_like_another(share: float, count: int) -> None:
+def test_velocity_that_matches_another_frame_is_doubted(share: float, count: int) -> None:
     time_s, motion = moving(1.0)
     forward = motion["velocity"][1][:, 0]  # type: ignore[index]
     said = share * forward + (1 - share**2) ** 0.5 * 2**0.5 * np.cos(4 * np.pi * time_s)
@@ -206,7 +206,7 @@ def test_slow_turns_are_not_doubted(rate: float, count: int) -> None:
     assert not list(_check_attitude((time_s, weak), motion))  # type: ignore[arg-type]
 
 
-def test_only_the_first_of_many_are_kept_and_only_of_what_moves(
+def test_motion_samples_are_limited_in_number_and_topics(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(check_motion, "SAMPLES_MAX", 7)

@@ -81,9 +81,7 @@ def test_trim_copies_whole_chunks_within_the_span(flight: Path, tmp_path: Path) 
     assert len(set(packed(flight)) & set(packed(out))) >= 2
 
 
-def test_a_stretch_that_begins_with_a_chunk_defines_what_it_holds(
-    flight: Path, tmp_path: Path
-) -> None:
+def test_span_from_a_chunk_start_includes_channel_definitions(flight: Path, tmp_path: Path) -> None:
     for k, chunk in enumerate(chunks(flight)[2:4]):
         out, start_ns = tmp_path / f"{k}.mcap", chunk.message_start_time
         trim(flight, out, start_ns=start_ns, topics=["/*/attitude", "/*/height"])
@@ -108,7 +106,7 @@ def test_merging_trimmed_parts_restores_the_recording(flight: Path, tmp_path: Pa
     assert again.read_bytes() == out.read_bytes()
 
 
-def test_message_indexes_of_whole_chunks_go_along_as_they_are(flight: Path, tmp_path: Path) -> None:
+def test_message_indexes_of_whole_chunks_are_copied(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     rewrite(flight, out, MADE, without=())
     before, after = (indexes(path) for path in (flight, out))
@@ -151,9 +149,7 @@ def test_recordings_whose_channels_have_the_same_numbers_are_merged(tmp_path: Pa
     assert len(channels(out)) == 2
 
 
-def test_an_index_that_gives_a_message_to_another_channel_is_damage(
-    flight: Path, tmp_path: Path
-) -> None:
+def test_index_with_a_wrong_channel_is_damage(flight: Path, tmp_path: Path) -> None:
     bad, data = tmp_path / "bad.mcap", bytearray(flight.read_bytes())
     chunk = chunks(flight)[1]
     first, second = sorted(chunk.message_index_offsets.values())[:2]

@@ -85,7 +85,7 @@ def test_a_chunk_that_defines_a_channel_otherwise_is_not_copied(tmp_path: Path) 
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_an_empty_index_of_another_writer_does_not_go_along(
+def test_empty_index_of_another_writer_is_not_copied(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Some list every channel with every chunk, with messages there or without."""
@@ -114,7 +114,7 @@ def test_an_empty_index_of_another_writer_does_not_go_along(
     assert packed(out)[0] == packed(path)[0]
 
 
-def test_a_large_chunk_of_definitions_alone_is_no_bug(tmp_path: Path) -> None:
+def test_large_chunk_of_definitions_only_is_copied(tmp_path: Path) -> None:
     """Some programs start with a chunk of all schemas, too large to be joined with the next."""
     layout = Layout(crcs=False)
     layout.schemas[1] = "Kind", "jsonschema", b" " * 100_000
@@ -142,7 +142,7 @@ def test_a_recording_without_index_is_copied(tmp_path: Path) -> None:
     assert list(read_raw(out)) == list(read_raw(path))
 
 
-def test_a_calibration_at_time_0_in_a_chunk_of_its_own_goes_along(tmp_path: Path) -> None:
+def test_calibration_at_time_0_in_its_own_chunk_is_copied(tmp_path: Path) -> None:
     def fill(writer: Writer, schema: int) -> None:
         told = message_class("CameraCalibration")(width=320, distortion_model="x" * 500)
         camera = writer.register_channel(

@@ -58,7 +58,7 @@ def test_a_recording_merged_with_itself_is_refused(tmp_path: Path, flight: Path)
         merge([flight, flight], tmp_path / "out.mcap")
 
 
-def test_trimming_keeps_the_stretch_and_the_calibration(tmp_path: Path, flight: Path) -> None:
+def test_trim_keeps_the_span_and_the_calibration(tmp_path: Path, flight: Path) -> None:
     out = tmp_path / "out.mcap"
     assert trim(flight, out, start_ns=10**9, end_ns=2 * 10**9) == 110
     kept = list(read_raw(out))
@@ -67,7 +67,7 @@ def test_trimming_keeps_the_stretch_and_the_calibration(tmp_path: Path, flight: 
     assert {r.time_ns // 10**9 for r in kept} == {1}
 
 
-def test_seconds_of_a_stretch_count_from_where_it_begins(tmp_path: Path, flight: Path) -> None:
+def test_trim_seconds_count_from_the_recording_start(tmp_path: Path, flight: Path) -> None:
     last, few = tmp_path / "last.mcap", tmp_path / "few.mcap"
     stage.run(flight, last, stage.Settings(from_s=30.0))
     stage.run(last, few, stage.Settings(to_s=3.0))
@@ -185,7 +185,7 @@ def test_messages_without_a_definition_are_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seconds", [float("nan"), float("inf")])
-def test_a_time_that_is_none_trims_nothing(tmp_path: Path, flight: Path, seconds: float) -> None:
+def test_trim_refuses_non_finite_times(tmp_path: Path, flight: Path, seconds: float) -> None:
     with pytest.raises(SettingError, match="is no time"):
         stage.run(flight, tmp_path / "b.mcap", stage.Settings(to_s=seconds))
 
@@ -212,7 +212,7 @@ def test_merging_parts_of_one_recording_does_not_warn(
     assert capsys.readouterr().err == ""
 
 
-def test_a_stretch_that_ends_before_it_begins_is_refused(tmp_path: Path, flight: Path) -> None:
+def test_span_that_ends_before_it_begins_is_refused(tmp_path: Path, flight: Path) -> None:
     with pytest.raises(SettingError, match="--from 20 is not before --to 10"):
         stage.run(flight, tmp_path / "b.mcap", stage.Settings(from_s=20, to_s=10))
 

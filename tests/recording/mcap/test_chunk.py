@@ -70,7 +70,7 @@ def test_records_fill_a_chunk_to_its_last_byte() -> None:
     assert parse_records(bytes_of(record(Opcode.MESSAGE, bytes(22)))).messages == [0]
 
 
-def test_only_the_channels_that_are_asked_for() -> None:
+def test_only_requested_channels_are_parsed() -> None:
     assert list(select_channels(block(), {7}, {7, 300}).iter_rows()) == [ROWS[0], ROWS[2]]
     assert list(select_channels(block(), {300}, {7, 300}).iter_rows()) == [ROWS[1]]
     assert list(select_channels(block(), {7, 300, 9}, {7, 300, 9}).iter_rows()) == ROWS

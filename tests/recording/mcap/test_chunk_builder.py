@@ -54,7 +54,7 @@ def test_batch_fill_equals_single_messages(alone: int, skipped: int, defined: in
     )
 
 
-def test_a_chunk_takes_what_fits_and_is_full_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunk_is_full_when_messages_no_longer_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     records, at = records_of([(1, k, k, b"x") for k in range(5)])
     each = MESSAGE_PREFIX_BYTES + 1
     for room_bytes, count in ((3 * each - 1, 2), (3 * each, 3), (5 * each, 5), (99 * each, 5)):

@@ -29,7 +29,7 @@ def test_a_summary_is_not_made_again_while_the_file_is_the_same(tmp_path: Path) 
     assert read_summary(path) is read_summary(path)
 
 
-def test_a_file_written_anew_under_its_name_is_read_anew(tmp_path: Path) -> None:
+def test_rewritten_file_is_read_again(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, 3)
     settled(path, 1_000_000_000)

@@ -65,7 +65,7 @@ def test_concatenated_batch_copies_only_its_messages() -> None:
     assert len(large.take(np.array([5])).compact().data) == MESSAGE_PREFIX_BYTES + 10
 
 
-def test_rows_of_several_parts_are_all_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gathered_rows_of_several_parts_are_complete(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "ROWS_AT_A_TIME", 3)
     rows = [(1, k, 2 * k, bytes([k])) for k in range(7)]
     assert list(block_of(rows).iter_rows()) == rows

@@ -109,7 +109,7 @@ def packed(*files: FileDescriptorProto) -> bytes:
     return FileDescriptorSet(file=files).SerializeToString()
 
 
-def test_imports_that_no_file_needs_or_has_are_no_damage(tmp_path: Path) -> None:
+def test_missing_imports_of_definitions_are_accepted(tmp_path: Path) -> None:
     """Options of nanopb or of a validator are imported, and their files seldom come along."""
     file = proto("m.proto", dependency=["nanopb.proto", "other.proto"])
     message(file, "M", x=F.TYPE_DOUBLE, far=".other.Far")
@@ -309,9 +309,7 @@ def test_third_party_protobuf_files_are_read(
     assert table["log_time"][0].as_py() == 10**18
 
 
-def test_a_field_with_the_name_of_a_time_stands_beside_it_in_csv(
-    data: Path, tmp_path: Path
-) -> None:
+def test_field_named_like_a_time_column_gets_its_own_csv_column(data: Path, tmp_path: Path) -> None:
     name = "field_named_log_time"
     source = data / "strangers" / f"pb-{name}" / f"{name}.mcap"
     run(source, tmp_path / "out", Settings(to="csv"))

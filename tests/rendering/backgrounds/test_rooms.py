@@ -61,7 +61,7 @@ def test_tiles_get_smaller_with_distance() -> None:
     assert wide[1] / wide[0] == pytest.approx((135.5 - 70) / (100.5 - 70), rel=0.15)
 
 
-def test_a_bent_lens_bends_what_the_walls_and_the_items_show() -> None:
+def test_lens_distortion_applies_to_walls_and_items() -> None:
     view = level_view(bend=0.1)
     uv, depth = view.project(np.array([[2.0, 1.5, 1.0]]))
     straight, _ = level_view().project(np.array([[2.0, 1.5, 1.0]]))

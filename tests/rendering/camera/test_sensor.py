@@ -10,12 +10,12 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-def test_a_mosaic_of_one_colour_comes_back_whole() -> None:
+def test_demosaicing_restores_uniform_colour() -> None:
     picture = np.broadcast_to(np.array([0.2, 0.5, 0.8], np.float32), (8, 10, 3))
     assert np.allclose(demosaic(apply_mosaic(picture)), picture)
 
 
-def test_a_mosaic_keeps_what_each_pixel_measured() -> None:
+def test_mosaic_keeps_measured_pixel_values() -> None:
     picture = rng().random((8, 10, 3), np.float32)
     back = demosaic(apply_mosaic(picture))
     assert np.array_equal(back[::2, ::2, 0], picture[::2, ::2, 0])
@@ -47,7 +47,7 @@ def test_corners_are_darker_under_vignetting() -> None:
     assert rgb[0, 0, 1] < 0.4 * rgb[10, 10, 1]
 
 
-def test_noise_has_the_spread_that_was_asked_for() -> None:
+def test_noise_has_the_configured_std() -> None:
     light = np.ones((200, 200, 3), np.float32)
     sensor = Sensor(brightness=0.5, contrast_gamma=1.0, shot_noise=0.002, read_noise=0.01)
     rgb = expose(light, sensor, rng()) / 255

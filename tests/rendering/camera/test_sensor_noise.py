@@ -67,13 +67,13 @@ def test_noise_estimate_is_independent_of_brightness() -> None:
     assert bright.grain == pytest.approx(dim.grain, rel=0.03)
 
 
-def test_black_and_white_show_no_grain() -> None:
+def test_constant_images_have_no_noise_estimate() -> None:
     for level in (0.0, 255.0):
         grain = estimate_noise(measure_blocks(np.full(SHAPE, level, np.float32)))
         assert np.isnan(grain.grain) and np.isnan(grain.grain_correlation)
 
 
-def test_a_block_is_not_chosen_by_its_own_noise() -> None:
+def test_noise_blocks_are_ranked_by_their_neighbours() -> None:
     blocks = measure_blocks(np.random.default_rng(0).random((64, 8 * 5), np.float32) * 9 + 100)
     assert blocks.shape == (64 // BLOCK_PX * 4, 4)  # the fifth has none beside it
     assert np.array_equal(blocks[0::2, 3], blocks[1::2, 1])

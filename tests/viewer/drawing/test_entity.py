@@ -10,7 +10,7 @@ from dmrl.viewer.drawing.entity import escape_path
 @pytest.mark.parametrize(
     "name", ["**", "$origin", "- /x", "+ /**", "a\n- /**", "{x}", "a\\", "..", "x\x1b[2J", "a b"]
 )
-def test_a_name_is_no_pattern_and_no_line_of_a_view_s_contents(name: str) -> None:
+def test_robot_name_is_escaped_in_view_contents(name: str) -> None:
     path = escape_path(f"/{name}/camera/image")
     assert path.startswith("/") and path.endswith("/camera/image")
     assert path.isprintable() and re.search(r"(?<!\\)[*$+ ]", path) is None

@@ -9,12 +9,12 @@ from dmrl.viewer.drawing.label_overlay import _place_texts
 from dmrl.viewer.drawing.legend import _fit_names
 
 
-def test_a_text_stands_above_its_peer() -> None:
+def test_label_text_is_above_its_peer() -> None:
     places = _place_texts(np.array([[100.0, 80.0], [100.0, 80.0]]), np.array([0, 1]), 320)
     assert places == pytest.approx(np.array([[100.0, 80 - 320 / 12]] * 2))
 
 
-def test_no_text_stands_on_another() -> None:
+def test_label_texts_do_not_overlap() -> None:
     rng = np.random.default_rng(0)
     for count in range(2, 7):
         tops = rng.uniform([100, 0], [180, 120], (count, 2))

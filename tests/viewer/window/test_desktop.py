@@ -159,7 +159,7 @@ def test_a_port_in_use_is_named(make: Make) -> None:
             Page([make()], Settings(), Web(port=port))
 
 
-def test_an_address_that_is_none_is_named(make: Make) -> None:
+def test_invalid_address_is_reported(make: Make) -> None:
     with pytest.raises(SettingError, match=r"Try: --bind 127\.0\.0\.1"):
         Page([make()], Settings(), Web(bind="192.0.2.1"))
 

@@ -72,7 +72,7 @@ def test_names_of_this_computer_are_answered(server: PageServer, host: str) -> N
     assert ask(server, DATA_NAME, Host=host)[0] == 200
 
 
-def test_without_the_token_is_nothing(server: PageServer) -> None:
+def test_request_without_token_is_refused(server: PageServer) -> None:
     port = urlsplit(server.url).port or 0
     for path in ("/", f"/{DATA_NAME}", f"/token/{DATA_NAME}", "/../etc/passwd", "/re_viewer.js"):
         assert ask_path(port, path)[0] == 404
