@@ -208,13 +208,13 @@ def test_one_of_many_writers_succeeds_with_complete_output(kind: str, tmp_path: 
         )
         for word in words
     ]
-    said = [process.communicate(timeout=PATIENCE_S)[1] for process in started]
+    output = [process.communicate(timeout=PATIENCE_S)[1] for process in started]
     won = [k for k, process in enumerate(started) if process.returncode == 0]
     assert len(won) == 1
     inner = out / "a" if kind == "atomic_folder" else out
     assert inner.read_text() == words[won[0]] * 2
     assert list(tmp_path.iterdir()) == [out]
-    lost = [text for k, text in enumerate(said) if k not in won]
+    lost = [text for k, text in enumerate(output) if k not in won]
     assert all("is being written by" in text or "exists" in text for text in lost)
     assert all(text.count("\n") == 1 for text in lost)
 

@@ -33,10 +33,10 @@ def test_internal_error_gives_one_line_with_the_traceback_file(
     monkeypatch.delenv("DMRL_DEBUG", raising=False)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert _end_of(KeyError("a\nb")) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert said.startswith("dmrl: internal error, KeyError: ")
-    found = re.search(r"in (\S+)$", said)
+    output = capsys.readouterr().err
+    assert output.count("\n") == 1
+    assert output.startswith("dmrl: internal error, KeyError: ")
+    found = re.search(r"in (\S+)$", output)
     assert found is not None
     text = Path(found[1]).read_text()
     assert "Traceback (most recent call last)" in text
@@ -68,9 +68,9 @@ def test_os_error_gives_one_line_error(
 ) -> None:
     monkeypatch.delenv("DMRL_DEBUG", raising=False)
     assert _end_of(error) == 1
-    said = capsys.readouterr().err
-    assert words in said
-    assert said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert words in output
+    assert output.count("\n") == 1
 
 
 def test_link_to_itself_gives_one_line_error(
@@ -99,11 +99,11 @@ def test_signal_reports_that_no_output_is_complete(number: signal.Signals, tmp_p
                 assert time.monotonic() < until
                 time.sleep(0.05)
             process.send_signal(number)
-            _, said = process.communicate(timeout=PATIENCE_S)
+            _, output = process.communicate(timeout=PATIENCE_S)
         finally:
             process.kill()
     assert process.returncode == 128 + number
-    assert said == "dmrl: stopped. Nothing stands under its final name\n"
+    assert output == "dmrl: stopped. Nothing stands under its final name\n"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -208,12 +208,12 @@ def test_ctrl_c_gives_one_line_and_status_130(
             assert process.stdout is not None and process.stdout.readline() == "begun\n"
             time.sleep(0.02 + longest_s * k / 15)
             process.send_signal(signal.SIGINT)
-            _, said = process.communicate(timeout=PATIENCE_S)
+            _, output = process.communicate(timeout=PATIENCE_S)
         if process.returncode or words[0] == "train":  # info may have ended before
-            ended.append((process.returncode, said.replace("dmrl: loading torch\n", "")))
+            ended.append((process.returncode, output.replace("dmrl: loading torch\n", "")))
             ended[-1] = (ended[-1][0], ended[-1][1].replace("loading torch\n", ""))
     assert ended and {status for status, _ in ended} == {130}
-    assert all(re.fullmatch(r"dmrl: stopped\. .*\n", said) for _, said in ended), ended
+    assert all(re.fullmatch(r"dmrl: stopped\. .*\n", output) for _, output in ended), ended
 
 
 def test_python_dash_m_dmrl_is_the_command() -> None:

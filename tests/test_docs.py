@@ -142,10 +142,10 @@ def test_the_page_on_python_runs_as_it_stands(
     capsys.readouterr()
     code = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     exec("\n".join(code), {})
-    said = capsys.readouterr().out
-    assert "/cf1/labels dmrl.v1.PeerLabels 20\n" in said
-    assert "16 (16, 28, 40)\n" in said
-    assert "torch.Size([8, 3, 224, 320]) torch.Size([8, 28, 40])" in said
+    output = capsys.readouterr().out
+    assert "/cf1/labels dmrl.v1.PeerLabels 20\n" in output
+    assert "16 (16, 28, 40)\n" in output
+    assert "torch.Size([8, 3, 224, 320]) torch.Size([8, 28, 40])" in output
 
 
 STOP = re.compile(

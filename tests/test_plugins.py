@@ -283,9 +283,9 @@ def test_plugins_are_light_and_have_no_other_names() -> None:
         "except AttributeError as e: print(e)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded, said = done.stdout.splitlines()
+    loaded, output = done.stdout.splitlines()
     assert loaded == "[]"
-    assert said.startswith("dmrl.plugins has no Former. It has: Closing, Columns, Command")
+    assert output.startswith("dmrl.plugins has no Former. It has: Closing, Columns, Command")
 
 
 @pytest.mark.heavy

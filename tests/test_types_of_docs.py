@@ -40,12 +40,12 @@ def run_pyright(folder: Path) -> list[tuple[str, str]]:
     line = [str(PYRIGHT), "--pythonpath", sys.executable, "--outputjson", "."]
     done = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
     try:
-        said = json.loads(done.stdout[done.stdout.index("{") :])
+        output = json.loads(done.stdout[done.stdout.index("{") :])
     except ValueError:
         pytest.skip(f"pyright does not start here: {(done.stderr or done.stdout)[-300:]}")
     return [
         (Path(one["file"]).name, f"{one['range']['start']['line'] + 1}: {one['message']}")
-        for one in said["generalDiagnostics"]
+        for one in output["generalDiagnostics"]
         if one["severity"] == "error"
     ]
 

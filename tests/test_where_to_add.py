@@ -148,8 +148,8 @@ def test_a_foreign_format(clone: Clone, tmp_path: Path) -> None:
     assert clone.touched() == promised("a foreign format")
     source, out = tmp_path / "flight.alt", tmp_path / "out.mcap"
     source.write_text("1000 0.5\n2000 0.75\n")
-    (said,) = clone.dmrl(["convert", source, out])
-    assert "/cf1/height" in said
+    (output,) = clone.dmrl(["convert", source, out])
+    assert "/cf1/height" in output
 
 
 NETWORK = """
@@ -177,7 +177,7 @@ def test_a_network(clone: Clone, tmp_path: Path) -> None:
     assert clone.touched() == promised("a network")
     made, out = tmp_path / "tiny", tmp_path / "export"
     made.mkdir()
-    said = clone.python(
+    output = clone.python(
         "-c",
         "import sys\n"
         "from pathlib import Path\n"
@@ -188,7 +188,7 @@ def test_a_network(clone: Clone, tmp_path: Path) -> None:
         f"sys.argv = ['dmrl', 'export', {str(made)!r}, {str(out)!r}]\n"
         "main()\n",
     )
-    assert "model.onnx" in said
+    assert "model.onnx" in output
 
 
 LOSS = """
@@ -207,7 +207,7 @@ def test_a_loss(clone: Clone) -> None:
     term = '    LossTerm("certain_loss", "certain_weight", ("confidence",), _certain),\n'
     clone.after(name, "TERMS = (\n", term)
     assert clone.touched() == promised("a loss")
-    said = clone.python(
+    output = clone.python(
         "-c",
         "import torch\n"
         "from dmrl.learn.data.batches import Batch\n"
@@ -221,7 +221,7 @@ def test_a_loss(clone: Clone) -> None:
         "    parts = compute_losses(network, batch, TrainConfig(certain_weight=weight))\n"
         "    print(float(parts.detach()[LOSS_NAMES.index('certain_loss')]) > 0)\n",
     )
-    assert said.split() == ["False", "True"]
+    assert output.split() == ["False", "True"]
 
 
 COMMAND = '''

@@ -73,9 +73,9 @@ def test_evaluate_reports_the_bound_of_a_smoother(
     )
     assert "limit" in made["definitions"]
     print_document(path, made)
-    said = capsys.readouterr().out
-    assert "bound, m" in said
-    assert f"{limit['kept_share']['0.02']:.0%} at 2% bad" in said
+    output = capsys.readouterr().out
+    assert "bound, m" in output
+    assert f"{limit['kept_share']['0.02']:.0%} at 2% bad" in output
 
 
 def test_bound_of_the_kept_share_assumes_gaussian_errors() -> None:

@@ -91,8 +91,8 @@ def begin(inputs: Inputs, name: str, folder: str) -> int:
     sound = source.made(inputs)
     copy = place / sound.name
     shutil.copytree(sound, copy) if sound.is_dir() else shutil.copy(sound, copy)
-    status, said = ended(lambda: source.use(inputs, copy, _out(place)))
-    assert status == 0, said
+    status, output = ended(lambda: source.use(inputs, copy, _out(place)))
+    assert status == 0, output
     _clear(_out(place).parent)
     return status
 
@@ -109,9 +109,9 @@ def damage(inputs: Inputs, name: str, folder: str, seed: int, cases: int) -> int
         damaged = mutated(data, rng)
         file.write_bytes(damaged)
         try:
-            status, said = ended(lambda: source.use(inputs, copy, _out(place)))
+            status, output = ended(lambda: source.use(inputs, copy, _out(place)))
             assert status in (0, 1, 2), status
-            assert (status == 0) == _out(place).exists() or name.endswith("judged"), said
+            assert (status == 0) == _out(place).exists() or name.endswith("judged"), output
         except BaseException as e:
             kept = place / f"found-{seed}-{k}{file.suffix}"
             kept.write_bytes(damaged)

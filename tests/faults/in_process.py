@@ -49,13 +49,13 @@ class InProcess:
         self.orders.order(folder, fault)
         try:
             with small_files(most_bytes):
-                status, said = ended(lambda: run(self.inputs, folder / out))
+                status, output = ended(lambda: run(self.inputs, folder / out))
         except AssertionError as e:
             raise AssertionError(f"{work}, {fault}: {e}") from e
         finally:
             self.orders.rest()
         failed = os.fsdecode(self.orders.failed).replace(str(folder), "")
-        return Ending(status, said, self.orders.count, failed, time.monotonic() - begun_s)
+        return Ending(status, output, self.orders.count, failed, time.monotonic() - begun_s)
 
     def prepare(self, work: str, folder: Path, out: str) -> None:
         """Make what a workload needs before it starts."""

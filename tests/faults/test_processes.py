@@ -71,9 +71,9 @@ def recovered(folder: Path) -> bool:
     if not to_partial_path(out).exists():
         return False
     mended = folder / "mended.mcap"
-    status, said = ended(lambda: recover(to_partial_path(out), mended))
+    status, output = ended(lambda: recover(to_partial_path(out), mended))
     if status:
-        assert "nothing to recover" in said or "no recording" in said, said
+        assert "nothing to recover" in output or "no recording" in output, output
         return False
     assert not [f for f in check(mended) if f.level == "error"]
     return True
@@ -167,11 +167,11 @@ def test_long_recording_loses_only_disconnected_packets(
                 time.sleep(0.2)
             time.sleep(1.0)
             process.send_signal(signal.SIGINT)
-            said, _ = process.communicate()
+            output, _ = process.communicate()
         sent = sum(drone.sent for drone in fleet.drones)
     assert process.returncode in (0, 130)
     assert not [f for f in check(out) if f.level == "error"]
-    told = json.loads(said)
+    told = json.loads(output)
     received = sum(link["received"] for link in told["links"])
     assert all(link["connections"] > 1 for link in told["links"]), told["links"]
     assert received >= 0.99 * sent

@@ -256,10 +256,10 @@ def test_names_are_seconds_if_all_are(
     (tmp_path / "in").mkdir()
     for name in names:
         (tmp_path / "in" / f"{name}.png").write_bytes(encode_png(COLOURS))
-    said = convert(tmp_path / "in")["stderr"]
+    output = convert(tmp_path / "in")["stderr"]
     table = dmrl.open(tmp_path / "out.mcap")["/cf1/camera/image"].to_pandas()
     assert tuple(table["log_time"].astype("int64")) == times
-    assert ("taken for times in seconds" in said) == (times[0] != 0)
+    assert ("taken for times in seconds" in output) == (times[0] != 0)
 
 
 def test_depths_in_millimetres_and_boxes_elsewhere_are_doubted(
@@ -271,10 +271,10 @@ def test_depths_in_millimetres_and_boxes_elsewhere_are_doubted(
         "file,peer,u_px,v_px,depth_m,left_px,top_px,right_px,bottom_px\n"
         "a.png,cf2,10,12,1200,20,20,30,30\na.png,cf1,25,25,1,20,20,30,30\n"
     )
-    said = convert(tmp_path / "in")["stderr"]
-    assert "doubt: 1 of 2 labels have a depth over 100 m: millimetres?" in said
-    assert "doubt: 1 of 2 labels have their centre outside their box" in said
-    assert "doubt: 1 of 2 labels are of cf1, which carries the camera" in said
+    output = convert(tmp_path / "in")["stderr"]
+    assert "doubt: 1 of 2 labels have a depth over 100 m: millimetres?" in output
+    assert "doubt: 1 of 2 labels have their centre outside their box" in output
+    assert "doubt: 1 of 2 labels are of cf1, which carries the camera" in output
 
 
 def test_decoding_scales_what_recordings_hold_too() -> None:

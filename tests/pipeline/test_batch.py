@@ -91,9 +91,9 @@ def test_failing_recording_does_not_stop_the_batch_and_is_reported(
     with pytest.raises(DmrlError, match=r"1 of 5 recordings failed"):
         trimmed(flights, tmp_path / "out")
     assert len(bytes_in(tmp_path / "out")) == 4
-    said = capfd.readouterr()
-    assert [line for line in said.err.splitlines() if line.startswith("failed: ")] == [
-        line for line in said.err.splitlines() if "aa.mcap" in line
+    output = capfd.readouterr()
+    assert [line for line in output.err.splitlines() if line.startswith("failed: ")] == [
+        line for line in output.err.splitlines() if "aa.mcap" in line
     ]
 
 
@@ -125,9 +125,9 @@ def test_up_to_date_outputs_are_kept(
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.mcap")}
     (out / "b.mcap").unlink()
     trimmed(flights, out)
-    said = capfd.readouterr().out.splitlines()
-    assert [line.split()[1:3] for line in said if "/b.mcap" in line][-1] == ["made", "15"]
-    assert sum("was there" in line for line in said) == 3
+    output = capfd.readouterr().out.splitlines()
+    assert [line.split()[1:3] for line in output if "/b.mcap" in line][-1] == ["made", "15"]
+    assert sum("was there" in line for line in output) == 3
     after = {path: path.stat().st_mtime_ns for path in out.rglob("*.mcap")}
     assert {path: after[path] for path in before if path.name != "b.mcap"} == {
         path: when for path, when in before.items() if path.name != "b.mcap"
@@ -232,8 +232,8 @@ def test_ctrl_c_ends_the_workers_and_leaves_nothing_half_written(tmp_path: Path)
     workers = children(running.pid)
     assert len(workers) == 2
     running.send_signal(signal.SIGINT)
-    _, said = running.communicate()
+    _, output = running.communicate()
     assert running.returncode == 130
-    assert "Traceback" not in said and "stopped" in said
+    assert "Traceback" not in output and "stopped" in output
     assert not [path for path in (tmp_path / "out").iterdir() if path.suffix == ".partial"]
     assert not any(Path(f"/proc/{number}").exists() for number in workers)

@@ -154,7 +154,7 @@ def children(parent: int) -> list[int]:
     return [int(number) for task in tasks for number in task.read_text().split()]
 
 
-def gone(number: int) -> bool:
+def is_process_gone(number: int) -> bool:
     """Whether there is no such process, or one that waits to be buried."""
     try:
         return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
@@ -172,11 +172,11 @@ def test_no_process_outlives_a_run_that_is_stopped(tmp_path: Path, number: signa
     with pytest.raises(OutputError, match="another dmrl run is at work"):
         pipeline.run(recipe, out)
     running.send_signal(number)
-    _, said = running.communicate()
+    _, output = running.communicate()
     assert running.returncode in (130, -signal.SIGKILL)
-    while not all(map(gone, workers)):
+    while not all(map(is_process_gone, workers)):
         time.sleep(0.05)
-    assert "Traceback" not in said
+    assert "Traceback" not in output
     left = [path.name for path in (out / "unfinished").iterdir()]
     assert bool(left) == (number == signal.SIGKILL)  # who is told tidies up
     done = pipeline.run(write(tmp_path, SMALL), out, workers=2)

@@ -205,7 +205,7 @@ SELF_SUPERVISED = "b48563588f4cb89d31ea5f7cb9756e611f05039ee0a33cb01c6c5c916dba6
 """Of 1805 steps: what the recipe stood for when it said each of them, in 326 lines."""
 
 
-def told(step: Step) -> dict[str, Any]:
+def step_as_dict(step: Step) -> dict[str, Any]:
     """A step with those of its settings that are not as they usually are."""
     takes = step.signature
     assert takes.settings is not None
@@ -222,7 +222,7 @@ def test_recipe_self_supervised_has_its_number_of_steps() -> None:
         **{"fly": 148, "label": 864, "predict": 748, "dataset": 7, "train": 7},
         **{"evaluate": 30, "view": 1},
     }
-    rows = sorted((told(step) for step in steps), key=lambda row: str(row["out"]))
+    rows = sorted((step_as_dict(step) for step in steps), key=lambda row: str(row["out"]))
     text = json.dumps(rows, sort_keys=True)
     assert hashlib.sha256(text.encode()).hexdigest() == SELF_SUPERVISED
 

@@ -55,8 +55,8 @@ def test_what_came_out_otherwise_is_printed(
         lambda path: replace(summary, provenance=other) if path == short else read_summary(path),
     )
     run.command(str(short), out=tmp_path / "new.mcap", data=inputs.dots.parent)
-    said = capsys.readouterr().out
-    assert "came out otherwise" in said and "0.0.1" in said and "differs from" in said
+    output = capsys.readouterr().out
+    assert "came out otherwise" in output and "0.0.1" in output and "differs from" in output
 
 
 def test_a_recording_of_others_is_refused(tmp_path: Path) -> None:

@@ -50,9 +50,9 @@ def read_bounded(*paths: Path, spare: int = SPARE_BYTES) -> list[list[str]]:
     words = [sys.executable, "-c", BOUNDED, str(spare), *map(str, paths)]
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
-    said = done.stdout.splitlines()
-    assert len(said) == 4 * len(paths)
-    return [said[k : k + 4] for k in range(0, len(said), 4)]
+    output = done.stdout.splitlines()
+    assert len(output) == 4 * len(paths)
+    return [output[k : k + 4] for k in range(0, len(output), 4)]
 
 
 def zeros(size: int, *, telling: bool = True) -> bytes:

@@ -55,10 +55,10 @@ def test_invalid_offset_gives_one_line_error_and_loses_nothing(
     for at in FIELDS[opcode]:
         bad.write_bytes(with_place(data, opcode, at, number))
         for command in ("info", "check"):
-            status, said = ended(lambda c=command: cli(c, bad))
-            assert status == 0 or "bad.mcap" in said
-        status, said = ended(lambda: cli("trim", bad, out))
-        assert (status == 0) == out.exists() and (status == 0 or "dmrl recover" in said), said
+            status, output = ended(lambda c=command: cli(c, bad))
+            assert status == 0 or "bad.mcap" in output
+        status, output = ended(lambda: cli("trim", bad, out))
+        assert (status == 0) == out.exists() and (status == 0 or "dmrl recover" in output), output
         if status == 0:
             assert read_summary(out).topics == read_summary(sound).topics
             out.unlink()

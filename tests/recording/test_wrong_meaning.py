@@ -48,7 +48,7 @@ def same_everywhere(out: Path, want: dict[str, list]) -> None:
     assert sorted(got) == sorted((m[0][0], m[1], m[3], m[4]) for m in want["messages"])
 
 
-def told(read: Callable[[], Any]) -> Any:
+def result_or_none(read: Callable[[], Any]) -> Any:
     """What a command returns; None if it says that it cannot."""
     try:
         return read()
@@ -80,7 +80,7 @@ def copies(path: Path, empty: Path, out: Path, content: Content) -> None:
             )
         )
     for copy, expected in tried:
-        if told(copy) is None:
+        if result_or_none(copy) is None:
             assert not out.exists()
             continue
         assert not content.unreadable
@@ -95,22 +95,22 @@ def reads(path: Path, content: Content) -> None:
     """What is counted and read is complete, or an error."""
     want = content.comparable()["messages"]
     counts = Counter(channel[0] for channel, *_ in want)
-    if (overview := told(lambda: info.run(path).to_document())) is not None:
+    if (overview := result_or_none(lambda: info.run(path).to_document())) is not None:
         topics = {topic: one["count"] for topic, one in overview["topics"].items()}
         assert topics == {c[0]: counts[c[0]] for c in content.comparable()["channels"]}
         assert overview["start_ns"] == min((m[1] for m in want), default=0)
         assert not content.unreadable
-    if (checked := told(lambda: check.run(path))) is not None and not any(
+    if (checked := result_or_none(lambda: check.run(path))) is not None and not any(
         finding.level == "error" for finding in checked.findings
     ):
         assert checked.messages == len(want)
         assert not content.unreadable
-    held = told(lambda: open_recording(path))
+    held = result_or_none(lambda: open_recording(path))
     assert held is None or held._summary.count == len(want)
     for topic in counts:
         rows = sorted((m[1], m[2], m[4]) for m in want if m[0][0] == topic)
         for low, high in ((None, None), (rows[0][0], rows[-1][0])):
-            found = told(
+            found = result_or_none(
                 lambda topic=topic, low=low, high=high: [
                     (raw.time_ns, raw.publish_ns, raw.data)
                     for raw in read_raw(path, topic, start_ns=low, end_ns=high)
@@ -124,7 +124,7 @@ def reads(path: Path, content: Content) -> None:
 def recovers(path: Path, out: Path, content: Content) -> None:
     """Every readable message is brought back, and what was lost is told."""
     want = content.comparable()
-    report = told(lambda: recover(path, out))
+    report = result_or_none(lambda: recover(path, out))
     if report is None:
         assert not want["messages"]
         return

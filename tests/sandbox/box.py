@@ -102,21 +102,23 @@ def untouched(box: Box) -> Iterator[None]:
 
 def run_in(box: Box, capsys: pytest.CaptureFixture[str], *words: object) -> int:
     """Exit status of a command that touches nothing; it is 0, or 1 with one line."""
-    return said_in(box, capsys, *words)[0]
+    return run_and_capture(box, capsys, *words)[0]
 
 
-def said_in(box: Box, capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
+def run_and_capture(
+    box: Box, capsys: pytest.CaptureFixture[str], *words: object
+) -> tuple[int, str]:
     """The same, and what it said on standard error."""
     with untouched(box):
         status = boundary.run_to_status(lambda: app([str(word) for word in words]))
-    said = capsys.readouterr()
-    assert "internal error" not in said.err, said.err
-    assert "\x1b" not in said.out + said.err
-    assert status in (0, 1), said.err
-    last = said.err.strip().splitlines()[-1:]
+    output = capsys.readouterr()
+    assert "internal error" not in output.err, output.err
+    assert "\x1b" not in output.out + output.err
+    assert status in (0, 1), output.err
+    last = output.err.strip().splitlines()[-1:]
     told = words[0] == "check" and not last  # what it found, on standard output
-    assert status == 0 or told or last[0].startswith("dmrl: "), said.err
-    return status, said.err
+    assert status == 0 or told or last[0].startswith("dmrl: "), output.err
+    return status, output.err
 
 
 def hostile(

@@ -15,7 +15,16 @@ from dmrl.deploy.int8.store import INTEGER_NAME
 from dmrl.images.codec import encode_png
 
 from ..deploy.networks import random_network
-from .box import ELSEWHERE, HOSTILE_TEXT, Box, hostile, quantised, run_in, said_in, untouched
+from .box import (
+    ELSEWHERE,
+    HOSTILE_TEXT,
+    Box,
+    hostile,
+    quantised,
+    run_and_capture,
+    run_in,
+    untouched,
+)
 
 
 @pytest.mark.heavy
@@ -48,8 +57,8 @@ def test_two_splits_that_a_disk_takes_for_one_are_refused(
     halves = {"near": "[[0, 100000001]]", "Near": "[[200000000, 900000000]]"}
     bad = hostile(box.root / "in" / "bad.mcap", halves, ("cf1",))
     words = ("dataset", bad, box.out / "set", "--split", "auto", *extra)
-    status, said = said_in(box, capsys, *words)
-    assert status == 1 and "the splits near and Near differ only in case" in said
+    status, output = run_and_capture(box, capsys, *words)
+    assert status == 1 and "the splits near and Near differ only in case" in output
     assert list(box.out.iterdir()) == []
 
 
@@ -130,9 +139,9 @@ def refused_by_export(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["export", str(folder), str(box.out / "x")]
     with untouched(box):
         assert boundary.run_to_status(lambda: app(words)) == 1
-    said = capsys.readouterr().err
-    assert "internal error" not in said
-    assert "Quantise" in said, said
+    output = capsys.readouterr().err
+    assert "internal error" not in output
+    assert "Quantise" in output, output
     assert list(box.out.iterdir()) == []
 
 

@@ -103,8 +103,8 @@ def test_input_changed_during_the_run_gives_one_line_error(
 
     monkeypatch.setattr("dmrl.datasets.writing.parts.reject_duplicates", replace_it)
     assert boundary.run_to_status(lambda: app(["dataset", str(path), str(box.out / "set")])) == 1
-    said = capsys.readouterr().err
-    assert "flight.mcap was changed while it was read. Run it again" in said
+    output = capsys.readouterr().err
+    assert "flight.mcap was changed while it was read. Run it again" in output
     assert list(box.out.iterdir()) == []
 
 

@@ -11,7 +11,7 @@ from dmrl import recipe
 from dmrl.images.codec import encode_png
 from dmrl.stages import fly, render, train
 
-from .box import Box, hostile, said_in
+from .box import Box, hostile, run_and_capture
 
 COMMANDS = {
     "run": ("run", "TOML", "--out", "OUT/run"),
@@ -69,9 +69,9 @@ def test_hostile_toml_is_one_line_that_names_it(
     ]
     for name, text in TEXTS.items():
         path.write_bytes(text.encode("utf-8", "surrogateescape"))
-        status, said = said_in(given, capsys, *words)
-        assert (status, said.count("\n")) == (1, 1), (name, said)
-        assert "strange.toml" in said and len(said) < 600, (name, said)
+        status, output = run_and_capture(given, capsys, *words)
+        assert (status, output.count("\n")) == (1, 1), (name, output)
+        assert "strange.toml" in output and len(output) < 600, (name, output)
         assert list(given.out.iterdir()) == [], name
 
 

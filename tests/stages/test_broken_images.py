@@ -82,44 +82,44 @@ def test_predict_skips_broken_images(
     run: Run, recording: Path, broken: bytes, model: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out.mcap"
-    rc, told, said = run("predict", model, recording, out, "--json", "--backend", "torch")
+    rc, told, output = run("predict", model, recording, out, "--json", "--backend", "torch")
     assert (rc, told["images"], told["left_out"]) == (0, COUNT - 1, UNDECODABLE)
-    assert f"at {time_of(recording, broken)} ns" in said
+    assert f"at {time_of(recording, broken)} ns" in output
     times = [raw.time_ns for raw in read_raw(out, "/cf1/detections")]
     assert sorted({*times, time_of(recording, broken)}) == [k * STEP_NS for k in range(COUNT)]
     assert len(times) == COUNT - 1
     made = read_summary(out).provenance
     assert made is not None and made.left_out == UNDECODABLE
-    rc, _, said = run("predict", model, recording, tmp_path / "no.mcap", "--json", "--strict")
-    assert rc == 1 and "--strict" in said and not list(tmp_path.glob("no*"))
+    rc, _, output = run("predict", model, recording, tmp_path / "no.mcap", "--json", "--strict")
+    assert rc == 1 and "--strict" in output and not list(tmp_path.glob("no*"))
 
 
 def test_dataset_skips_broken_images(
     run: Run, recording: Path, broken: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rc, told, said = run("dataset", recording, tmp_path / "set", "--json", "--test-share", 0)
+    rc, told, output = run("dataset", recording, tmp_path / "set", "--json", "--test-share", 0)
     assert (rc, told["left_out"]) == (0, {"cannot be decoded": 1})
-    assert f"at {time_of(recording, broken)} ns" in said
+    assert f"at {time_of(recording, broken)} ns" in output
     times = open_dataset(tmp_path / "set").split("train").table["log_time"].to_pylist()
     assert sorted({*times, time_of(recording, broken)}) == [k * STEP_NS for k in range(COUNT)]
     assert len(times) == COUNT - 1
-    rc, _, said = run("dataset", recording, tmp_path / "no", "--json", "--strict")
-    assert rc == 1 and "--strict" in said and not list(tmp_path.glob("no*"))
+    rc, _, output = run("dataset", recording, tmp_path / "no", "--json", "--strict")
+    assert rc == 1 and "--strict" in output and not list(tmp_path.glob("no*"))
 
 
 def test_trim_only_decodable_removes_broken_images(
     run: Run, recording: Path, broken: bytes, tmp_path: Path
 ) -> None:
     at_ns = time_of(recording, broken)
-    rc, _, said = run("trim", recording, tmp_path / "out.mcap", "--only-decodable")
-    assert rc == 0 and f"at {at_ns} ns" in said
+    rc, _, output = run("trim", recording, tmp_path / "out.mcap", "--only-decodable")
+    assert rc == 0 and f"at {at_ns} ns" in output
     kept = [(raw.topic, raw.time_ns, raw.data) for raw in read_raw(tmp_path / "out.mcap")]
     want = [(raw.topic, raw.time_ns, raw.data) for raw in read_raw(recording)]
     lost = [one for one in want if one[:2] == (CAMERA_IMAGE("cf1"), at_ns)]
     assert len(lost) == 1
     assert sorted(kept) == sorted(set(want) - set(lost))
-    rc, _, said = run("trim", recording, tmp_path / "all.mcap")
-    assert rc == 0 and not said
+    rc, _, output = run("trim", recording, tmp_path / "all.mcap")
+    assert rc == 0 and not output
     assert sum(1 for _ in read_raw(tmp_path / "all.mcap")) == len(want)
 
 
@@ -132,10 +132,10 @@ def test_check_reports_broken_images(run: Run, recording: Path, broken: bytes) -
 
 def test_view_skips_broken_images(run: Run, recording: Path, broken: bytes, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
-    rc, _, said = run("view", recording, "--save", tmp_path / "out.rrd")
+    rc, _, output = run("view", recording, "--save", tmp_path / "out.rrd")
     assert rc == 0
     where = f"{CAMERA_IMAGE('cf1')} at {time_of(recording, broken)} ns"
-    assert f"left out: 1 images that cannot be decoded (at {where})" in said
+    assert f"left out: 1 images that cannot be decoded (at {where})" in output
 
 
 def test_evaluate_skips_broken_images(
@@ -164,9 +164,9 @@ def test_third_party_recording_with_broken_image_is_processed(
 ) -> None:
     recording = data / "strangers/frame-jpeg_cut/bo_jpeg_cut_half.mcap"
     out = tmp_path / "out.mcap"
-    rc, told, said = run("predict", "dmrl-nano", recording, out, "--json", "--backend", "torch")
+    rc, told, output = run("predict", "dmrl-nano", recording, out, "--json", "--backend", "torch")
     assert (rc, told["images"], told["left_out"]) == (0, 19, UNDECODABLE)
-    assert "at 700000000 ns" in said
+    assert "at 700000000 ns" in output
     _, told, _ = run("check", recording, "--json")
     assert any("700000000 ns" in finding["text"] for finding in told["findings"])
 

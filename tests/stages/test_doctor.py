@@ -14,16 +14,16 @@ from dmrl.cli import app
 ROOT = Path(__file__).parents[2]
 
 
-def _said(capsys: pytest.CaptureFixture[str]) -> dict[str, dict[str, object]]:
+def run_doctor_json(capsys: pytest.CaptureFixture[str]) -> dict[str, dict[str, object]]:
     app(["doctor", "--json"], result_action="return_value")
     return {part["name"]: part for part in json.loads(capsys.readouterr().out)}
 
 
 def test_doctor_finds_the_base_installation(capsys: pytest.CaptureFixture[str]) -> None:
-    said = _said(capsys)
-    assert said["base packages"]["there"] and said["Python"]["there"]
-    assert "pyarrow" in str(said["base packages"]["found"])
-    assert all(part["there"] or not part["needed"] for part in said.values())
+    output = run_doctor_json(capsys)
+    assert output["base packages"]["there"] and output["Python"]["there"]
+    assert "pyarrow" in str(output["base packages"]["found"])
+    assert all(part["there"] or not part["needed"] for part in output.values())
     app(["doctor"], result_action="return_value")
     assert "The base works." in capsys.readouterr().out
 
@@ -44,12 +44,12 @@ def test_doctor_reports_missing_packages_with_install_commands(
         installation, "_find_installed_version", lambda name: known.get(name, real(name))
     )
     monkeypatch.setattr(shutil, "which", lambda _: None)
-    said = _said(capsys)
-    assert said["dmrl[label]"]["found"] == "no filterpy"
-    assert said["dmrl[label]"]["way"] == "pip install 'dmrl[label]'"
-    assert str(said["dmrl[ros]"]["found"]).startswith("rosbags 0.1, not ")
-    assert said["C compiler"]["way"] == "apt-get install gcc"
-    assert not said["NVIDIA GPU"]["there"]
+    output = run_doctor_json(capsys)
+    assert output["dmrl[label]"]["found"] == "no filterpy"
+    assert output["dmrl[label]"]["way"] == "pip install 'dmrl[label]'"
+    assert str(output["dmrl[ros]"]["found"]).startswith("rosbags 0.1, not ")
+    assert output["C compiler"]["way"] == "apt-get install gcc"
+    assert not output["NVIDIA GPU"]["there"]
 
 
 def test_a_base_that_does_not_work_is_an_error(

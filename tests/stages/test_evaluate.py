@@ -123,10 +123,10 @@ def test_recordings_are_judged_together(
     near = write({"cf1": [([peer(10, 10)], [found(13, 14)])] * 2}, name="near.mcap")
     far = write({"cf1": [([peer(50, 40)], [found(50, 10)])]}, name="far.mcap")
     evaluate.command([near, far], settings=FAST, plots_to=tmp_path / "plots", as_json=True)
-    said = json.loads(capsys.readouterr().out)
-    assert [source["name"] for source in said["recordings"]] == ["near.mcap", "far.mcap"]
-    assert (said["images"], said["overall"]["median_px"]["value"]) == (3, 5)
-    assert said["overall"]["mean_px"]["value"] == pytest.approx(40 / 3)
+    output = json.loads(capsys.readouterr().out)
+    assert [source["name"] for source in output["recordings"]] == ["near.mcap", "far.mcap"]
+    assert (output["images"], output["overall"]["median_px"]["value"]) == (3, 5)
+    assert output["overall"]["mean_px"]["value"] == pytest.approx(40 / 3)
     assert (tmp_path / "plots" / "examples.png").is_file()
     evaluate.command([near, far], settings=FAST)
     assert "2 recordings: 3 images against truth" in capsys.readouterr().out
@@ -284,14 +284,16 @@ def test_the_json_document_is_complete_and_clean(
     predict.run(model, dots, tmp_path / "out.mcap", predict.Settings())
     words = ["evaluate", str(tmp_path / "out.mcap"), "--split", "test", "--json", "--draws", "9"]
     app(words, result_action="return_value")
-    said = json.loads(capsys.readouterr().out)
-    assert said["images"] == said["labels"] == said["overall"]["labels"] == 10
-    assert (said["against"], said["split"], said["threshold"]) == ("truth", "test", 0.4)
-    assert said["recording"]["name"] == "out.mcap"
-    assert [band["from_m"] for band in said["bands"]] == [0.0, 0.5, 1.0, 1.5, 2.0]
-    assert said["bands"][-1]["to_m"] is None
-    assert said["bands"][0]["median_px"] == {"value": None, "low": None, "high": None}
-    assert set(said["definitions"]) >= {n for n, v in said["overall"].items() if type(v) is dict}
+    output = json.loads(capsys.readouterr().out)
+    assert output["images"] == output["labels"] == output["overall"]["labels"] == 10
+    assert (output["against"], output["split"], output["threshold"]) == ("truth", "test", 0.4)
+    assert output["recording"]["name"] == "out.mcap"
+    assert [band["from_m"] for band in output["bands"]] == [0.0, 0.5, 1.0, 1.5, 2.0]
+    assert output["bands"][-1]["to_m"] is None
+    assert output["bands"][0]["median_px"] == {"value": None, "low": None, "high": None}
+    assert set(output["definitions"]) >= {
+        n for n, v in output["overall"].items() if type(v) is dict
+    }
 
 
 def test_the_table_has_a_column_for_each_band_with_labels(

@@ -57,10 +57,10 @@ def test_export_lists_its_files(
 ) -> None:
     out = tmp_path / "export"
     app(["export", str(quantised), str(out), "--json"], result_action="return_value")
-    said = json.loads(capsys.readouterr().out)
+    output = json.loads(capsys.readouterr().out)
     names = {path.name for path in out.iterdir()}
     c = quantised.name.replace("-", "_")
-    assert said["files"].keys() == names
+    assert output["files"].keys() == names
     assert names >= {"model.onnx", "model.int8.onnx", "integer.npz", f"{c}.c", f"{c}.h"}
     made = json.loads((out / "provenance.json").read_text())
     assert made["inputs"][0]["provenance"]["stage"] == "quantize"

@@ -83,9 +83,9 @@ def test_likeness_reads_recordings_and_prints_json(
 ) -> None:
     out = tmp_path / "dots.toml"
     app(["likeness", str(dots), str(out), "--frames", "5", "--json"], result_action="return_value")
-    said = capsys.readouterr()
-    assert "5 frames: few" in said.err
-    made = json.loads(said.out)
+    output = capsys.readouterr()
+    assert "5 frames: few" in output.err
+    made = json.loads(output.out)
     assert made["frames"] == 5 and set(made["fitted"]) == set(FIGURES)
     assert tomllib.loads(out.read_text())["preset"] == "himax"
 
@@ -151,10 +151,10 @@ def test_unmeasurable_figures_are_reported_and_kept(
         monkeypatch.setattr(preset_fitting, name, (1, 2))
     own, out = folder_of(tmp_path / "own", [STRIPES]), tmp_path / "a.toml"
     app(["likeness", str(own), str(out)], result_action="return_value")
-    said = capsys.readouterr()
-    assert "holds 1 frame: few" in said.err and "50% of the pixels" in said.err
-    assert "does not show grain, levels of 256, grain, neighbours alike" in said.err
-    grain = next(line for line in said.out.splitlines() if "levels of 256" in line)
+    output = capsys.readouterr()
+    assert "holds 1 frame: few" in output.err and "50% of the pixels" in output.err
+    assert "does not show grain, levels of 256, grain, neighbours alike" in output.err
+    grain = next(line for line in output.out.splitlines() if "levels of 256" in line)
     assert grain.split()[4] == "-" and grain.split()[-2:] == ["-", "-"]
     assert "noise" not in out.read_text()
 

@@ -187,9 +187,9 @@ def test_json_counts_images_and_detections(
 ) -> None:
     settings = replace(Settings(), threshold=1.0)
     predict.command(model, dots, tmp_path / "out.mcap", settings=settings, as_json=True)
-    said = json.loads(capsys.readouterr().out)
-    assert said.pop("left_out") == {}
-    assert said == {"recording": str(tmp_path / "out.mcap"), "images": 30, "believed": 0}
+    output = json.loads(capsys.readouterr().out)
+    assert output.pop("left_out") == {}
+    assert output == {"recording": str(tmp_path / "out.mcap"), "images": 30, "believed": 0}
 
 
 def test_fastest_backend_is_chosen_and_reported(

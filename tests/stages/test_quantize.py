@@ -123,8 +123,8 @@ def test_the_command_prints_layers_and_accuracies(
     assert "most confident cell kept" in printed.out
     assert "pip install 'dmrl[plot]'" in printed.err
     app(["quantize", *flags, str(tmp_path / "b"), "--json"], result_action="return_value")
-    said = json.loads(capsys.readouterr().out)
-    assert said == json.loads((tmp_path / "b" / "quantisation.json").read_text())
+    output = json.loads(capsys.readouterr().out)
+    assert output == json.loads((tmp_path / "b" / "quantisation.json").read_text())
 
 
 @pytest.mark.slow

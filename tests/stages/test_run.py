@@ -64,10 +64,10 @@ def test_replaced_outputs_are_kept_and_reported_with_the_reason(
         recipe.write_text(steps.replace("images = 2", f"images = {images}"))
         capsys.readouterr()
         run.command(str(recipe), out=out, dry_run=True, as_json=True)
-        said = json.loads(capsys.readouterr().out)["steps"]
-        assert [one["action"] for one in said] == ["replace", "replace"]
-        assert said[0]["reason"] == f"images {images - 1} -> {images}"
-        assert said[1]["reason"] == "pictures is made again"
+        output = json.loads(capsys.readouterr().out)["steps"]
+        assert [one["action"] for one in output] == ["replace", "replace"]
+        assert output[0]["reason"] == f"images {images - 1} -> {images}"
+        assert output[1]["reason"] == "pictures is made again"
         run.command(str(recipe), out=out, workers=1)
         assert f"pictures is replaced: images {images - 1}" in capsys.readouterr().err
     kept = out / "previous"

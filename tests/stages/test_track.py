@@ -149,9 +149,9 @@ def test_without_velocity_and_height_it_warns_and_goes_on(
     gone = ("/cf1/velocity", "/cf1/height")
     trim(detected, short, topics=[t for t in read_summary(detected).topics if t not in gone])
     track.run(short, out, Settings())
-    said = capsys.readouterr().err
-    assert "taken to stand still" in said
-    assert "taken to keep its height" in said
+    output = capsys.readouterr().err
+    assert "taken to stand still" in output
+    assert "taken to keep its height" in output
 
 
 def test_an_existing_output_is_refused(detected: Path, tracked: Path) -> None:

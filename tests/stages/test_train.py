@@ -325,6 +325,6 @@ def test_json_names_the_model(
     dots_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     train.command(dots_dataset, tmp_path / "run", flags=Flags(epochs=1, device="cpu"), as_json=True)
-    said = json.loads(capsys.readouterr().out)
-    assert said["model"] == str(tmp_path / "run")
-    assert said["images"] == 18  # two are held out, to choose the threshold on
+    output = json.loads(capsys.readouterr().out)
+    assert output["model"] == str(tmp_path / "run")
+    assert output["images"] == 18  # two are held out, to choose the threshold on

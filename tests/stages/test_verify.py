@@ -147,10 +147,10 @@ def test_targets_without_tools_are_skipped_and_reported(
     monkeypatch.setenv("PATH", str(tmp_path))
     words = ["verify", str(folder), "--images", "1", "--noise", "0"]
     assert app(words, result_action="return_value") == 0
-    said = capsys.readouterr().out
-    assert said.count("skipped: no ") == 4
-    assert "apt-get install gcc-riscv64-unknown-elf" in said
-    assert "apt-get install clang" in said
+    output = capsys.readouterr().out
+    assert output.count("skipped: no ") == 4
+    assert "apt-get install gcc-riscv64-unknown-elf" in output
+    assert "apt-get install clang" in output
     assert app([*words, "--require"], result_action="return_value") == 1
 
 

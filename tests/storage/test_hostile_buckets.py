@@ -297,8 +297,8 @@ def test_an_upload_that_is_not_stored_is_an_error(wrong: str, store: Store) -> N
     with pytest.raises(StorageError), atomic_folder(folder) as here:
         (here / "b").write_bytes(b"a dataset")
     assert list(store.objects) == ["a.mcap"]
-    status, said = ended(lambda: cli("trim", "s3://lab/a.mcap", "s3://lab/b.mcap"))
-    assert status == 1 and "s3://lab/b.mcap: the server does not store" in said, said
+    status, output = ended(lambda: cli("trim", "s3://lab/a.mcap", "s3://lab/b.mcap"))
+    assert status == 1 and "s3://lab/b.mcap: the server does not store" in output, output
 
 
 @pytest.mark.parametrize("key", ["t\x1b[2J.mcap", "a\rb.mcap", "a\x7f/b.mcap", "\u202egnp.mcap"])
@@ -310,5 +310,5 @@ def test_a_key_with_control_characters_becomes_no_file(
     monkeypatch.setattr(get_filesystem("s3"), "find", lambda _: names)
     with pytest.raises(StorageError, match="cannot be a path"):
         list(folder.iterdir())
-    status, said = ended(lambda: cli("trim", folder, tmp_path / "out"))
-    assert status == 1 and said.isprintable() and not list(tmp_path.iterdir()), said
+    status, output = ended(lambda: cli("trim", folder, tmp_path / "out"))
+    assert status == 1 and output.isprintable() and not list(tmp_path.iterdir()), output

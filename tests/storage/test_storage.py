@@ -31,7 +31,7 @@ from .conftest import _forget
 pytestmark = pytest.mark.filterwarnings("ignore")  # of botocore and aiohttp
 
 
-def said(capsys: pytest.CaptureFixture[str], status: int, *words: object) -> Any:
+def run_command(capsys: pytest.CaptureFixture[str], status: int, *words: object) -> Any:
     """What a command prints, if it ends as it should."""
     given = [str(word) for word in words]
     found = boundary.run_to_status(lambda: app(given, result_action="return_value"))
@@ -76,13 +76,13 @@ def test_command_between_buckets_equals_local_output(
 ) -> None:
     source = record(tmp_path / "a.mcap")
     lab.put_file(str(source), "lab/one/a.mcap")
-    said(capsys, 0, "trim", source, tmp_path / "b.mcap", "--to-s", 1)
-    said(capsys, 0, "trim", "s3://lab/one/a.mcap", "s3://lab/one/b.mcap", "--to-s", 1)
+    run_command(capsys, 0, "trim", source, tmp_path / "b.mcap", "--to-s", 1)
+    run_command(capsys, 0, "trim", "s3://lab/one/a.mcap", "s3://lab/one/b.mcap", "--to-s", 1)
     assert lab.cat_file("lab/one/b.mcap") == (tmp_path / "b.mcap").read_bytes()
-    again = said(capsys, 1, "trim", source, "s3://lab/one/b.mcap", "--to-s", 1)
+    again = run_command(capsys, 1, "trim", source, "s3://lab/one/b.mcap", "--to-s", 1)
     assert again.err.startswith("dmrl: s3://lab/one/b.mcap exists.")
     assert sorted(lab.find("lab/one")) == ["lab/one/a.mcap", "lab/one/b.mcap"]
-    assert "10 messages" in said(capsys, 0, "info", "s3://lab/one/b.mcap").out
+    assert "10 messages" in run_command(capsys, 0, "info", "s3://lab/one/b.mcap").out
 
 
 @pytest.mark.heavy
@@ -92,14 +92,16 @@ def test_a_folder_in_a_bucket_is_done_and_indexed(
     for name in ("a.mcap", "b/c.mcap", ".hidden/d.mcap"):
         lab.put_file(str(record(tmp_path / name)), f"lab/many/{name}")
     words = ("trim", "s3://lab/many", "s3://lab/cut", "--to-s", 1, "--workers", 1)
-    assert said(capsys, 0, *words).out.count("made") == 2
+    assert run_command(capsys, 0, *words).out.count("made") == 2
     assert sorted(lab.find("lab/cut")) == ["lab/cut/a.mcap", "lab/cut/b/c.mcap"]
-    assert said(capsys, 0, *words).out.count("was there") == 2
-    said(capsys, 0, "index", "s3://lab/many", "--workers", 1)
-    assert "2 known" in said(capsys, 0, "index", "s3://lab/many").out
-    found = said(capsys, 0, "find", "messages = 20", "s3://lab/many", "--paths").out.splitlines()
+    assert run_command(capsys, 0, *words).out.count("was there") == 2
+    run_command(capsys, 0, "index", "s3://lab/many", "--workers", 1)
+    assert "2 known" in run_command(capsys, 0, "index", "s3://lab/many").out
+    found = run_command(
+        capsys, 0, "find", "messages = 20", "s3://lab/many", "--paths"
+    ).out.splitlines()
     assert found == ["s3://lab/many/a.mcap", "s3://lab/many/b/c.mcap"]
-    assert said(capsys, 0, "check", "s3://lab/many/*.mcap").out.count("20 messages") == 1
+    assert run_command(capsys, 0, "check", "s3://lab/many/*.mcap").out.count("20 messages") == 1
 
 
 @pytest.mark.heavy
@@ -177,8 +179,8 @@ def test_a_dataset_is_made_and_opened_in_a_bucket(
     source = pictured(tmp_path / "a.mcap")
     lab.put_file(str(source), "lab/sets/a.mcap")
     words = ("--split", "none", "--workers", 1)
-    said(capsys, 0, "dataset", source, tmp_path / "set", *words)
-    said(capsys, 0, "dataset", "s3://lab/sets/a.mcap", "s3://lab/sets/set", *words)
+    run_command(capsys, 0, "dataset", source, tmp_path / "set", *words)
+    run_command(capsys, 0, "dataset", "s3://lab/sets/a.mcap", "s3://lab/sets/set", *words)
     here = open_dataset(tmp_path / "set").split("train")
     there = open_dataset(to_path("s3://lab/sets/set")).split("train")
     assert there.table.equals(here.table)
@@ -194,11 +196,11 @@ def test_a_dataset_in_a_bucket_grows_and_nothing_else_is_written(
     first, second = (pictured(tmp_path / f"{k}.mcap", seed=k) for k in range(2))
     words = ("--split", "none", "--shard-images", 200, "--workers", 1)
     for out in (tmp_path / "set", "s3://lab/grows/set"):
-        said(capsys, 0, "dataset", first, out, *words)
+        run_command(capsys, 0, "dataset", first, out, *words)
     before = {name: lab.info(name)["LastModified"] for name in lab.find("lab/grows/set")}
     shards = {name: lab.cat_file(name) for name in before if name.endswith(".arrow")}
     for out in (tmp_path / "set", "s3://lab/grows/set"):
-        told = said(capsys, 0, "dataset", second, out, "--add", "--workers", 1)
+        told = run_command(capsys, 0, "dataset", second, out, "--add", "--workers", 1)
     assert "the card is as it was" in told.err
     assert {name: lab.cat_file(name) for name in shards} == shards
     made = tmp_path / "set"
@@ -206,7 +208,7 @@ def test_a_dataset_in_a_bucket_grows_and_nothing_else_is_written(
         name = path.relative_to(made).as_posix()
         if name != "croissant.json":
             assert lab.cat_file(f"lab/grows/set/{name}") == path.read_bytes(), name
-    again = said(capsys, 0, "dataset", second, "s3://lab/grows/set", "--add")
+    again = run_command(capsys, 0, "dataset", second, "s3://lab/grows/set", "--add")
     assert "1 of 1 recordings are in" in again.err
     assert len(open_dataset(to_path("s3://lab/grows/set")).split("train")) == 600
 
@@ -224,20 +226,20 @@ def test_bucket_errors_are_one_line(
         (("trim", "s3://lab/wrong/good.mcap", "s3://nobody/a.mcap"), "there is no such bucket"),
         (("trim", "s3://lab/wrong/good.mcap", "https://host/a.mcap"), "web servers are read only"),
     ):
-        line = said(capsys, 1, *words).err
+        line = run_command(capsys, 1, *words).err
         assert why in line and line.startswith("dmrl: ") and line.count("\n") == 1
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.delenv(name)
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nowhere")
     _forget()
-    assert "there are no credentials" in said(capsys, 1, "info", "s3://lab/a.mcap").err
+    assert "there are no credentials" in run_command(capsys, 1, "info", "s3://lab/a.mcap").err
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", "test")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "test")
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:1")
     monkeypatch.setattr("s3fs.core.S3FileSystem.retries", 1)
     _forget()
-    assert "no server answers" in said(capsys, 1, "info", "s3://lab/a.mcap").err
+    assert "no server answers" in run_command(capsys, 1, "info", "s3://lab/a.mcap").err
     monkeypatch.undo()
     _forget()
 
@@ -248,16 +250,16 @@ def test_label_reads_little_more_than_the_numbers(
 ) -> None:
     source = tmp_path / "flight.mcap"
     words = ("--duration-s", 12, "--seed", 1, "--camera")
-    said(capsys, 0, "fly", "fly_in_view", source, *words)
-    said(capsys, 0, "trim", source, "s3://lab/flight.mcap")  # an object that knows its hash
+    run_command(capsys, 0, "fly", "fly_in_view", source, *words)
+    run_command(capsys, 0, "trim", source, "s3://lab/flight.mcap")  # an object that knows its hash
     path = to_path("s3://lab/flight.mcap")
     numbers, pictures = _sizes(path)
     assert pictures > 3 * numbers
     fetched.clear()
     made = tmp_path / "labels.mcap"
-    said(capsys, 0, "label", path, made, "--no-copy")
+    run_command(capsys, 0, "label", path, made, "--no-copy")
     assert sum(fetched) <= 1.2 * numbers, (sum(fetched), numbers, pictures)
-    said(capsys, 0, "label", path, tmp_path / "all.mcap")
+    run_command(capsys, 0, "label", path, tmp_path / "all.mcap")
     topic = topics.LABELS("cf1")
     ours = [m.peers for m in _estimates(tmp_path / "all.mcap", topic)]
     assert ours == [m.peers for m in _estimates(made, topic)]

@@ -214,8 +214,8 @@ def test_slow_server_is_abandoned(site: Site, monkeypatch: pytest.MonkeyPatch) -
     get_filesystem.cache_clear()
     web.WebFileSystem.clear_instance_cache()
     site.wrong = "drips"
-    status, said = ended(lambda: cli("info", site.url))
-    assert status == 1 and "the server is too slow" in said, said
+    status, output = ended(lambda: cli("info", site.url))
+    assert status == 1 and "the server is too slow" in output, output
     monkeypatch.undo()
     get_filesystem.cache_clear()
     web.WebFileSystem.clear_instance_cache()  # its session has that patience
@@ -225,8 +225,8 @@ def test_slow_server_is_abandoned(site: Site, monkeypatch: pytest.MonkeyPatch) -
 def test_redirects_to_local_files_are_refused(address: str, site: Site) -> None:
     site.wrong = f"leads {address}"
     for command in ("info", "check"):
-        status, said = ended(lambda c=command: cli(c, site.url))
-        assert status == 1 and site.url in said, said
+        status, output = ended(lambda c=command: cli(c, site.url))
+        assert status == 1 and site.url in output, output
     with pytest.raises((StorageError, FileNotFoundError)):
         os.fspath(to_path(site.url))
 
@@ -238,8 +238,8 @@ def test_redirects_to_internal_addresses_are_refused(site: Site, inputs: Inputs)
     with serve_locally(handler) as port:
         for host in ("127.0.0.1", "localhost", "[::ffff:127.0.0.1]", "0.0.0.0"):
             site.wrong = f"leads http://{host}:{port}/a.mcap"
-            status, said = ended(lambda: cli("info", site.url))
-            assert status == 1 and f"{site.url}: the server redirects to" in said, said
+            status, output = ended(lambda: cli("info", site.url))
+            assert status == 1 and f"{site.url}: the server redirects to" in output, output
             with pytest.raises(StorageError, match="an inner address"):
                 os.fspath(to_path(site.url))
     assert not secret.paths and not secret.asked

@@ -48,9 +48,9 @@ def test_damage_is_refused_or_reported(
         assert "\n" not in str(e) and len(str(e)) <= ERROR_CHARACTERS_MAX
         assert path.name in str(e) or source.name in str(e)
         return
-    said = capsys.readouterr().err
+    output = capsys.readouterr().err
     lost = {topic: count for topic, count in whole.items() if counts.get(topic, 0) < count}
-    assert not lost or said, f"lost without a word: {lost}"
+    assert not lost or output, f"lost without a word: {lost}"
 
 
 @pytest.mark.parametrize("damage", sources.DAMAGES, ids=lambda damage: damage.__name__)

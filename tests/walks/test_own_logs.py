@@ -23,9 +23,9 @@ def test_every_sd_card_log_gives_motion_or_a_reason(
     for card in sorted((data / "crazypad").glob("*_log*")):
         out = tmp_path / f"{card.name}.mcap"
         counts = convert.run(card, out, convert.Settings(robot="cf7"))
-        said = capsys.readouterr().err
+        output = capsys.readouterr().err
         for topic, reason in (("attitude", "no attitude: no"), ("velocity", "no velocity: no")):
-            assert (f"/cf7/{topic}" in counts) != (reason in said), (card.name, topic)
+            assert (f"/cf7/{topic}" in counts) != (reason in output), (card.name, topic)
         # Whatever was logged is there, and the licence that lay beside it.
         assert counts["/cf7/log/fixedFrequency"] > 2500
         assert read_summary(out).metadata["dmrl.licences"] == [{card.name: "MIT License"}]

@@ -87,10 +87,10 @@ def _refused(
         status = boundary.run_to_status(lambda: cli.app(words))
     except SystemExit as end:
         status = int(end.code or 0)
-    said = capsys.readouterr()
-    assert status in (1, 2), said
-    lines = said.err.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("dmrl: ") and not said.out
+    output = capsys.readouterr()
+    assert status in (1, 2), output
+    lines = output.err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("dmrl: ") and not output.out
     assert [path.name for path in folder.iterdir()] == ["flight.mcap"]
     return lines[0]
 
@@ -104,8 +104,8 @@ def test_a_value_that_a_flag_cannot_have_is_refused_by_name(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    said = _refused(folder, command, [flag, value], capsys, monkeypatch)
-    assert flag.removesuffix("-s") in said or flag.strip("-").replace("-", "_") in said
+    output = _refused(folder, command, [flag, value], capsys, monkeypatch)
+    assert flag.removesuffix("-s") in output or flag.strip("-").replace("-", "_") in output
 
 
 @pytest.mark.parametrize(("command", "named", "flags"), CONTRADICTIONS)

@@ -65,7 +65,7 @@ def flight(folder: Path, column: str = "", factor: float = 1.0) -> Path:
     return folder
 
 
-def said(source: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
+def convert_and_read_stderr(source: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """What convert and check say besides their tables."""
     words = [["convert", str(source), str(out)], ["check", str(out)]]
     status = [
@@ -78,7 +78,7 @@ def said(source: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def test_right_units_give_no_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert said(flight(tmp_path / "flight"), tmp_path / "out.mcap", capsys) == ""
+    assert convert_and_read_stderr(flight(tmp_path / "flight"), tmp_path / "out.mcap", capsys) == ""
 
 
 @pytest.mark.parametrize("name", UNITS)
@@ -86,7 +86,9 @@ def test_wrong_unit_is_reported_with_its_column(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     column, factor = UNITS[name]
-    text = said(flight(tmp_path / "flight", column, factor), tmp_path / "out.mcap", capsys)
+    text = convert_and_read_stderr(
+        flight(tmp_path / "flight", column, factor), tmp_path / "out.mcap", capsys
+    )
     asked = {"roll": "degrees", "pitch": "degrees", "yaw": "degrees per second", "time": "Were"}
     asked |= {"velocity": "mm/s or cm/s", "height": "mm or cm", "range": "left out"}
     wanted = "Are these ms" if name == "time_ns" else asked[name.partition("_")[0]]

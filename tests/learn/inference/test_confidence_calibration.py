@@ -100,7 +100,7 @@ def test_network_with_another_last_layer_is_not_calibrated() -> None:
     assert not apply_calibration(network, PlattScaling(2.0, 0.0))
 
 
-def told(confidence: list[float], right: list[bool]) -> ScoredDetections:
+def score_points(confidence: list[float], right: list[bool]) -> ScoredDetections:
     """One detection an image, of which it is known whether it is right."""
     image, u = np.arange(len(right)), np.full(len(right), 50.0)
     truth = Points(image, np.where(right, u, 150.0), u, np.ones(len(u)), np.ones(len(u)))
@@ -119,16 +119,16 @@ def test_thirty_of_each_are_needed_and_faint_ones_do_not_count() -> None:
         sure = [True] * (right * 3 // 4) + [False] * (wrong // 4)
         weak = [True] * (right - right * 3 // 4) + [False] * (wrong - wrong // 4)
         confidence = [0.8] * len(sure) + [0.3] * len(weak)
-        assert (fit_calibration(told(confidence, sure + weak)) is not None) == known
+        assert (fit_calibration(score_points(confidence, sure + weak)) is not None) == known
         below = [MIN_CONFIDENCE - 1e-3] * 200
-        faint = told(confidence + below, sure + weak + [False] * 200)
-        assert fit_calibration(faint) == fit_calibration(told(confidence, sure + weak))
+        faint = score_points(confidence + below, sure + weak + [False] * 200)
+        assert fit_calibration(faint) == fit_calibration(score_points(confidence, sure + weak))
 
 
 def test_two_confidence_levels_are_calibrated_to_their_precision() -> None:
     confidence = [0.8] * 100 + [0.3] * 100
     right = [True] * 90 + [False] * 10 + [True] * 40 + [False] * 60
-    found = fit_calibration(told(confidence, right))
+    found = fit_calibration(score_points(confidence, right))
     assert found is not None
     said = [found.slope * np.log(p / (1 - p)) + found.offset for p in (0.8, 0.3)]
     assert said == pytest.approx([np.log(9), np.log(2 / 3)], abs=1e-3)
@@ -143,7 +143,7 @@ def test_calibration_rejects_slopes_that_are_too_flat_or_steep(slope: float, kno
     right = [True] * round(share * count) + [False] * round((1 - share) * count)
     mirrored = [not one for one in right]
     confidence = [1 / (1 + np.exp(-logit))] * len(right) + [1 / (1 + np.exp(logit))] * len(right)
-    found = fit_calibration(told(confidence, right + mirrored))
+    found = fit_calibration(score_points(confidence, right + mirrored))
     assert (found is not None) == known
     assert found is None or found == pytest.approx((slope, 0.0), abs=0.05)
 

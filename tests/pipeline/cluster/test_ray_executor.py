@@ -281,8 +281,8 @@ def test_ctrl_c_ends_the_tasks(nodes: Nodes, flights: Path, tmp_path: Path) -> N
     while not list(out.rglob("*.mcap")) and process.poll() is None:
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=120)
-    assert process.returncode == 130 and "stopped." in said
+    _, output = process.communicate(timeout=120)
+    assert process.returncode == 130 and "stopped." in output
     made = bytes_in(out)
     time.sleep(2.0)
     assert bytes_in(out) == made

@@ -41,9 +41,9 @@ def test_slurm_array_outputs_equal_local_outputs(
     monkeypatch.setattr(slurm, "MAX_ELEMENTS", 2)
     out = tmp_path / "out"
     run_over_folder("trim", flights, out, KEPT, workers=None, on="slurm")
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     script = out / ".dmrl-job.sh"
-    assert said == f"3 tasks in 2 elements. Now: sbatch {script}\n"
+    assert output == f"3 tasks in 2 elements. Now: sbatch {script}\n"
     assert "#SBATCH --array=0-1\n" in script.read_text()
     assert not list(out.glob("*.mcap"))
     first = run(script, 0)

@@ -247,10 +247,10 @@ def test_check_after_writing_skips_images(
                 sink.write(second * 10**9, topic, kind())
     monkeypatch.setattr(check_recording, "FINDINGS_PRINTED_MAX", 2)
     print_findings(path)
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 3
-    assert all("1 gaps, the longest 88.000 s" in line for line in said[:2])
-    assert said[-1] == f"1 more: dmrl check {path}"
+    output = capsys.readouterr().err.splitlines()
+    assert len(output) == 3
+    assert all("1 gaps, the longest 88.000 s" in line for line in output[:2])
+    assert output[-1] == f"1 more: dmrl check {path}"
 
 
 @pytest.mark.parametrize("topic", ["height", "camera/calibration", "labels", "camera/image"])
