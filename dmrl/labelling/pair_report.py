@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -70,6 +70,20 @@ class PairCause:
         )
 
 
+COLUMNS = (
+    ("robot", "robot", ""),
+    ("peer", "peer", ""),
+    ("positions", "positions", "d"),
+    ("kept_share", "kept", ".1%"),
+    ("ambiguous_share", "ambiguous", ".1%"),
+    ("range_bias_m", "range bias, m", ".2f"),
+    ("sigma_m", "median sigma, m", ".2f"),
+    ("rmse_ok_m", "RMSE of kept, m", ".2f"),
+    ("rmse_m", "RMSE, m", ".2f"),
+)
+"""Name of a value, its words in the table, and its format."""
+
+
 @dataclass(frozen=True, slots=True)
 class PairReport:
     """One ordered pair.
@@ -103,15 +117,16 @@ class PairReport:
     rmse_m: float | None
     causes: list[PairCause]
 
-    @classmethod
-    def columns(cls) -> tuple[str, ...]:
+    @staticmethod
+    def columns() -> tuple[str, ...]:
         """Return the headers of a table of reports."""
-        return tuple(field.name for field in fields(cls))
+        return (*(words for _, words, _ in COLUMNS), "causes")
 
-    def row(self) -> tuple[Any, ...]:
-        """Return the values under the headers."""
-        values = (getattr(self, name) for name in self.columns()[:-1])
-        return (*values, "; ".join(cause.name for cause in self.causes))
+    def row(self) -> tuple[str, ...]:
+        """Return the texts under the headers; a dash for an unknown value."""
+        values = [(getattr(self, name), form) for name, _, form in COLUMNS]
+        cells = ("-" if value is None else format(value, form) for value, form in values)
+        return (*cells, "; ".join(cause.name for cause in self.causes))
 
 
 def report_pair(
