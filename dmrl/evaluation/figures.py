@@ -1,6 +1,6 @@
 """Draw the figures of an evaluation: error plots, and a few example images."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -86,7 +86,7 @@ def _choose_gallery(pairs: LabelledDetections, threshold: float) -> list[Gallery
         shown.append(
             GalleryImage(
                 f"{at.recording.stem}, {_format_time(at)}",
-                _read_image(at),
+                read_image(at),
                 np.column_stack([found.u_px, found.v_px]),
                 found.depth_m,
             )
@@ -99,7 +99,8 @@ def _format_time(at: ImageKey) -> str:
     return f"{(at.time_ns - read_summary(at.recording).start_ns) / 1e9:.2f} s"
 
 
-def _read_image(at: ImageKey) -> NDArray[np.uint8]:
+def read_image(at: ImageKey) -> NDArray[np.uint8]:
+    """Read and decode an image."""
     recording, robot, time_ns = at
     topic = topics.CAMERA_IMAGE(robot)
     taken = next(read(recording, topic, start_ns=time_ns, end_ns=time_ns + 1))
@@ -128,7 +129,7 @@ def _build_example(
 ) -> Example:
     at = pairs.at[image]
     recording, robot, time_ns = at
-    rgb = _read_image(at)
+    rgb = read_image(at)
     maps = _read_maps(recording, robot, time_ns)
     labels = pairs.labels.select(pairs.labels.image == image)
     labels_px = np.column_stack([labels.u_px, labels.v_px])
@@ -155,14 +156,19 @@ def _describe_error(error_px: float) -> str:
 def _read_maps(recording: Path, robot: str, time_ns: int) -> dict[str, Array]:
     """Read the grid maps by channel; all NaN if the recording has none."""
     out = {name: np.full((1, 1), np.nan) for name in ("confidence", "depth_m")}
-    topic = topics.GRID(robot)
-    if topic not in read_summary(recording).topics:
-        return out
-    for grid in read(recording, topic, start_ns=time_ns, end_ns=time_ns + 1):
-        values = np.frombuffer(grid.message.data, "<f4")
-        shape = (len(grid.message.channels), grid.message.rows, grid.message.cols)
-        out.update(zip(grid.message.channels, values.reshape(shape).astype(float), strict=True))
+    if topics.GRID(robot) in read_summary(recording).topics:
+        for _, maps in iter_maps(recording, robot, start_ns=time_ns, end_ns=time_ns + 1):
+            out.update(maps)
     return out
+
+
+def iter_maps(recording: Path, robot: str, **span: int) -> Iterator[tuple[int, dict[str, Array]]]:
+    """Yield log time and the grid maps by channel; ``span`` as `dmrl.recording.read`."""
+    for stamped in read(recording, topics.GRID(robot), **span):
+        grid = stamped.message
+        shape = (len(grid.channels), grid.rows, grid.cols)
+        values = np.frombuffer(grid.data, "<f4").reshape(shape).astype(float)
+        yield stamped.time_ns, dict(zip(grid.channels, values, strict=True))
 
 
 def _select_detections(points: Points, image: int, least: int, threshold: float) -> Array:

@@ -1,15 +1,16 @@
 """Draw the figures that a recipe defines for the top of its report."""
 
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dmrl import plots, topics
+from dmrl.evaluation.detections import ImageKey
 from dmrl.evaluation.figure_specs import FigureSpec, ReportedValue, find_value
+from dmrl.evaluation.figures import iter_maps, read_image
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.html_report.blocks import (
     INVALID_DATA_ERRORS,
@@ -22,9 +23,8 @@ from dmrl.html_report.blocks import (
     build_row,
 )
 from dmrl.html_report.collect import MAX_DOCUMENT_BYTES, ReportInputs
-from dmrl.images.codec import decode
 from dmrl.plots import charts
-from dmrl.recording import LoadedRecording, read, read_summary
+from dmrl.recording import LoadedRecording, read_summary
 
 IMAGE_FILES = {"images": "circles.png", "errors": "error-violins.png"}
 LOSS_LABELS = {"confidence_loss": "confidence loss", "depth_loss": "depth loss"}
@@ -127,36 +127,21 @@ def _read_map_pairs(names: Mapping[str, Path]) -> list[plots.MapPair]:
     )
     if robot is None:
         return []
-    grids = {who: dict(_iter_grids(path, robot)) for who, path in names.items()}
+    grids = {who: dict(iter_maps(path, robot)) for who, path in names.items()}
     times = sorted(set.intersection(*(set(one) for one in grids.values())))
     start_ns = read_summary(first).start_ns  # as in dmrl view --time
     chosen = times[:: max(1, -(-len(times) // MAX_MAPS))]
     return [
         plots.MapPair(
             f"{robot}, {(time_ns - start_ns) / 1e9:.2f} s",
-            _read_image(first, robot, time_ns),
-            {who: one[time_ns] for who, one in grids.items()},
+            read_image(ImageKey(first, robot, time_ns)),
+            {
+                who: (one[time_ns]["confidence"], one[time_ns]["depth_m"])
+                for who, one in grids.items()
+            },
         )
         for time_ns in chosen
     ]
-
-
-Maps = tuple[NDArray[np.float64], NDArray[np.float64]]
-
-
-def _iter_grids(path: Path, robot: str) -> Iterator[tuple[int, Maps]]:
-    for stamped in read(path, topics.GRID(robot)):
-        grid = stamped.message
-        shape = (len(grid.channels), grid.rows, grid.cols)
-        values = np.frombuffer(grid.data, "<f4").reshape(shape).astype(float)
-        named = dict(zip(grid.channels, values, strict=True))
-        yield stamped.time_ns, (named["confidence"], named["depth_m"])
-
-
-def _read_image(path: Path, robot: str, time_ns: int) -> NDArray[np.uint8]:
-    topic = topics.CAMERA_IMAGE(robot)
-    taken = next(read(path, topic, start_ns=time_ns, end_ns=time_ns + 1))
-    return decode(taken.message.data, what=f"{path}: {topic} at {time_ns} ns")
 
 
 FIGURE_BUILDERS = {

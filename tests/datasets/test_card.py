@@ -203,7 +203,7 @@ def test_unknown_licence_is_refused(built: Path, record: Record, tmp_path: Path)
 def test_figures_are_saved_with_the_matplotlib_backend_of_a_notebook(tmp_path: Path) -> None:
     code = (
         "import os, sys\nfrom pathlib import Path\nimport numpy as np\nfrom dmrl import plots\n"
-        "plots.plot_depth_histogram({'train': np.ones(3)}, Path(sys.argv[1]))\n"
+        "plots.plot_error_violins(*np.ones((3, 9)), Path(sys.argv[1]))\n"
         "print(os.environ['MPLBACKEND'])"
     )
     inline = "module://matplotlib_inline.backend_inline"
@@ -236,6 +236,9 @@ def test_python_examples_of_the_card_run(
 def test_the_hub_reads_the_front_matter(built: Path) -> None:
     card = huggingface_hub.DatasetCard((built / "README.md").read_text())
     assert card.data.pretty_name == "Two flights: a test"
+    assert (card.data.license, card.data.size_categories) == ("cc-by-4.0", ["n<1K"])
+    assert card.data.task_categories == ["object-detection", "depth-estimation", "robotics"]
+    huggingface_hub.DatasetCardData(**card.data.to_dict(), ignore_metadata_errors=False)
     infos = datasets.info.DatasetInfosDict.from_dataset_card_data(card.data)
     assert infos["default"].splits["train"].num_examples in (2, 3)
     assert infos["default"].features == datasets.load_from_disk(str(built))["train"].features
