@@ -63,9 +63,7 @@ class Camera:
     def camera_from_body(self) -> Array:
         """(3, 3) rotation of the camera's mount."""
         roll, pitch, yaw = self.mount_rad
-        c, s = np.cos(yaw), np.sin(yaw)
-        turned = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        return np.asarray(camera_from_horizontal(roll, pitch) @ turned)
+        return np.asarray(camera_from_horizontal(roll, pitch) @ yaw_matrix(yaw))
 
     @property
     def image_from_optical(self) -> Array:
@@ -86,6 +84,12 @@ AIDECK_PINHOLE = replace(AIDECK, distortion=())
 
 PUBLISHED_RENDER = Camera(320, 224, 120.0, 120.0, 160.0, 112.0)
 """Camera of the published synthetic images."""
+
+
+def yaw_matrix(yaw_rad: float) -> Array:
+    """Return (3, 3) the rotation into a frame that is turned about z by an angle."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def camera_from_horizontal(roll_rad: float, pitch_rad: float) -> Array:

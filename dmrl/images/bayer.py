@@ -1,12 +1,15 @@
 """Conversion between raw Bayer images and RGB, with OpenCV."""
 
 from types import ModuleType
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dmrl.errors import MissingExtra
 from dmrl.images.codec import Grey, Rgb
 
+Value = TypeVar("Value", bound=np.generic)
 BAYER_MIN_PX = 4
 """Smallest width and height of a raw image whose colours can be interpolated."""
 
@@ -58,8 +61,8 @@ def demosaic(raw: Grey, pattern: str = "RGGB") -> Rgb:
     return np.asarray(cv2.cvtColor(raw, getattr(cv2, f"COLOR_Bayer{pattern}2RGB")), np.uint8)
 
 
-def to_bayer(rgb: Rgb) -> Grey:
-    """Convert RGB to a raw (H, W) uint8 RGGB image with one colour per pixel."""
+def to_bayer(rgb: NDArray[Value]) -> NDArray[Value]:
+    """Convert (H, W, 3) RGB to a raw (H, W) RGGB image with one colour per pixel."""
     raw = rgb[..., 1].copy()
     raw[::2, ::2] = rgb[::2, ::2, 0]
     raw[1::2, 1::2] = rgb[1::2, 1::2, 2]

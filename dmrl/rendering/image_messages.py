@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dmrl import topics
 from dmrl.geometry.frames import Array, camera_from_horizontal
@@ -110,31 +111,12 @@ def _transforms_sample(time_ns: int, scene: RandomScene, horizontal_from_camera:
             "parent_frame_id": parent,
             "child_frame_id": child,
             "translation": dict(zip("xyz", xyz.tolist(), strict=True)),
-            "rotation": dict(zip("xyzw", to_quaternion(turn), strict=True)),
+            "rotation": dict(
+                zip(
+                    "xyzw", Rotation.from_matrix(turn).as_quat(canonical=True).tolist(), strict=True
+                )
+            ),
         }
         for parent, child, xyz, turn in poses
     ]
     return Sample(time_ns, topics.TRANSFORMS, "FrameTransforms", {"transforms": transforms})
-
-
-def to_quaternion(matrix: Array) -> list[float]:
-    """Return the quaternion x, y, z, w of a rotation, with w >= 0.
-
-    Parameters
-    ----------
-    matrix
-        (3, 3) rotation.
-    """
-    # The largest eigenvector of Bar-Itzhack's matrix is exact for any angle, without branches.
-    m = matrix
-    k = np.array(
-        [
-            [m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]],
-            [0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1], m[0, 2] - m[2, 0]],
-            [0, 0, m[2, 2] - m[0, 0] - m[1, 1], m[1, 0] - m[0, 1]],
-            [0, 0, 0, m[0, 0] + m[1, 1] + m[2, 2]],
-        ]
-    )
-    _, vectors = np.linalg.eigh(k, UPLO="U")
-    found = vectors[:, -1]
-    return [float(value) for value in (found if found[3] >= 0 else -found)]

@@ -6,49 +6,20 @@ from functools import cache
 
 import numpy as np
 
-from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
+from dmrl.geometry.frames import Array, Camera
 from dmrl.images.canvas import Levels
 from dmrl.rendering.backgrounds.rooms import draw_room
 from dmrl.rendering.robots.quadrotor import RADIUS_M
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch_renderer import Look, Pose, Sketch, render_sketch
 from dmrl.rendering.sketch_scene import random_look, random_noise
+from dmrl.samples.flight import RobotPose
 
 MIN_DEPTH_M = 2 * RADIUS_M
 """Minimum depth of a drawn robot, metres: nearer ones would touch the image plane."""
 
 
-@dataclass(frozen=True, slots=True)
-class WorldPose:
-    """Pose of a robot in the world frame, z up.
-
-    Parameters
-    ----------
-    xyz_world
-        (3,) centre, metres.
-    yaw_rad, roll_rad, pitch_rad
-        Attitude Rz(yaw) Ry(pitch) Rx(roll).
-    """
-
-    xyz_world: Array
-    yaw_rad: float
-    roll_rad: float
-    pitch_rad: float
-
-    @property
-    def horizontal_from_world(self) -> Array:
-        """(3, 3) rotation from the world to the robot's horizontal frame."""
-        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
-        return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-
-    @property
-    def body_from_world(self) -> Array:
-        """(3, 3) rotation to the body. The camera looks along the body's x, from its centre."""
-        tilt = camera_from_horizontal(self.roll_rad, self.pitch_rad)
-        return np.asarray(tilt @ self.horizontal_from_world)
-
-
-def relative_pose(peer: WorldPose, observer: WorldPose) -> Pose:
+def relative_pose(peer: RobotPose, observer: RobotPose) -> Pose:
     """Return the pose of a peer in the camera frame of ``observer``."""
     camera_from_world = observer.body_from_world
     return Pose(
@@ -80,7 +51,7 @@ class CameraView:
         Seed of the flight, index of the camera, index of the image.
     """
 
-    here: WorldPose
+    here: RobotPose
     poses: Mapping[str, Pose]
     velocity_mps: Mapping[str, Array]
     turning_rps: Array
@@ -95,7 +66,7 @@ DIFFERENCE_STEP_S = 0.005
 
 
 def build_view(
-    bodies: Callable[[float], Mapping[str, WorldPose]],
+    bodies: Callable[[float], Mapping[str, RobotPose]],
     robot: str,
     time_s: float,
     key: tuple[int, int, int],
@@ -179,7 +150,7 @@ class SketchedPlace:
         return np.concatenate(walls + walls[:again], axis=1), random_look(rng, camera)
 
 
-def _cut_window(walls: Levels, camera: Camera, here: WorldPose) -> Levels:
+def _cut_window(walls: Levels, camera: Camera, here: RobotPose) -> Levels:
     """Return the part of the walls that a robot sees: its columns by yaw, its rows by pitch."""
     around_px = WALLS * round(2 * np.pi * camera.fx_px / WALLS)
     left = round(-here.yaw_rad * camera.fx_px) % around_px

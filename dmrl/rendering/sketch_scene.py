@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 from numpy.random import Generator
 
-from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
+from dmrl.geometry.frames import Array, Camera, camera_from_horizontal, yaw_matrix
 from dmrl.images.canvas import FloatImage, Levels
 from dmrl.rendering.backgrounds.photos import Photos
 from dmrl.rendering.backgrounds.rooms import draw_numbered_room
@@ -57,9 +57,7 @@ def _draw_position(rng: Generator, camera: Camera) -> Array:
 def _draw_attitude(rng: Generator) -> Array:
     """Draw the rotation horizontal_from_body: Rz(yaw) Ry(pitch) Rx(roll)."""
     roll, pitch = rng.uniform(-TILT_MAX_RAD, TILT_MAX_RAD, 2).tolist()
-    yaw = rng.uniform(-np.pi, np.pi)
-    c, s = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    turn = yaw_matrix(rng.uniform(-np.pi, np.pi)).T
     return np.asarray(turn @ camera_from_horizontal(roll, pitch).T)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.geometry.frames import Array
+from dmrl.geometry.frames import Array, camera_from_horizontal, yaw_matrix
 from dmrl.samples.sample import Sample
 
 Times = NDArray[np.int64]
@@ -112,12 +112,26 @@ def iter_truth(robot: str, peer: str, time_ns: Times, xyz_m: Array) -> Iterator[
 
 @dataclass(frozen=True, slots=True)
 class RobotPose:
-    """A robot in the world: centre (3,) in metres, attitude Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Pose of a robot in the world frame, z up.
+
+    Parameters
+    ----------
+    xyz_world
+        (3,) centre, metres.
+    yaw_rad, roll_rad, pitch_rad
+        Attitude Rz(yaw) Ry(pitch) Rx(roll).
+    """
 
     xyz_world: Array
     yaw_rad: float
     roll_rad: float
     pitch_rad: float
+
+    @property
+    def body_from_world(self) -> Array:
+        """(3, 3) rotation to the body. The camera looks along the body's x, from its centre."""
+        tilt = camera_from_horizontal(self.roll_rad, self.pitch_rad)
+        return np.asarray(tilt @ yaw_matrix(self.yaw_rad))
 
 
 def build_transforms(time_ns: int, robots: Mapping[str, RobotPose]) -> Sample:

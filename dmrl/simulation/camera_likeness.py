@@ -16,6 +16,7 @@ from dmrl.datasets.backgrounds import open_backgrounds
 from dmrl.errors import RecordingError, SettingError
 from dmrl.formats.files.image_folder import list_images
 from dmrl.images.codec import Rgb, decode, read_size
+from dmrl.images.contact_sheet import even_indices, make_contact_sheet
 from dmrl.recording import read, read_summary
 from dmrl.rendering import settings as looks
 from dmrl.rendering.camera.image_statistics import (
@@ -24,7 +25,6 @@ from dmrl.rendering.camera.image_statistics import (
     ImageStatistics,
     measure_images,
 )
-from dmrl.rendering.contact_sheet import even_indices, make_contact_sheet
 from dmrl.rendering.preset_fitting import KNOBS, ROUNDS, iter_fits, sample_scenes, simulate_images
 from dmrl.simulation.settings import LikenessSettings
 from dmrl.terminal.progress import track

@@ -22,8 +22,8 @@ from dmrl.images.codec import encode_jpeg
 from dmrl.recording import Provenance, RecordingWriter, build_provenance
 from dmrl.rendering import flight_images, renderer
 from dmrl.rendering.blender_environment import ensure_environment
-from dmrl.rendering.onboard_camera import ViewRenderer, WorldPose, build_view, render_sketches
-from dmrl.samples.flight import START_NS, merge_by_time
+from dmrl.rendering.onboard_camera import ViewRenderer, build_view, render_sketches
+from dmrl.samples.flight import START_NS, RobotPose, merge_by_time
 from dmrl.samples.sample import (
     Sample,
     build_calibration,
@@ -249,7 +249,7 @@ def _camera_stream(
     time_s = np.arange(period_s / 2, settings.duration_s, period_s)
     yield build_calibration(START_NS, robot, AIDECK_PINHOLE)
 
-    def bodies(moment_s: float) -> dict[str, WorldPose]:
+    def bodies(moment_s: float) -> dict[str, RobotPose]:
         return {name: body_at(truth, moment_s) for name, truth in flight.truth.items()}
 
     views = (

@@ -8,11 +8,10 @@ import numpy as np
 
 from dmrl.flight import Clock, Flight, Truth
 from dmrl.geometry.frames import Array
-from dmrl.rendering.onboard_camera import WorldPose
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch_renderer import Sketch
 from dmrl.samples import flight as samples
-from dmrl.samples.flight import START_NS, Times, to_nanoseconds
+from dmrl.samples.flight import START_NS, RobotPose, Times, to_nanoseconds
 from dmrl.samples.sample import Sample
 
 TRUTH_RATE_HZ = 20.0
@@ -64,18 +63,14 @@ def iter_peer_truth(flight: Flight, robot: str, peer: str, true_time_s: Array) -
 def build_flight_transforms(flight: Flight, true_time_s: float) -> Sample:
     """Return every robot's frames, on true time."""
     bodies = {robot: body_at(truth, true_time_s) for robot, truth in flight.truth.items()}
-    attitudes = {
-        robot: samples.RobotPose(b.xyz_world, b.yaw_rad, b.roll_rad, b.pitch_rad)
-        for robot, b in bodies.items()
-    }
     time_ns = int(log_times(Clock(), np.array([true_time_s]))[0])
-    return samples.build_transforms(time_ns, attitudes)
+    return samples.build_transforms(time_ns, bodies)
 
 
-def body_at(truth: Truth, true_time_s: float) -> WorldPose:
+def body_at(truth: Truth, true_time_s: float) -> RobotPose:
     """Return the pose of a robot at a true time, seconds."""
     at = np.array([true_time_s])
-    return WorldPose(
+    return RobotPose(
         truth.position_at(at)[0],
         float(truth.yaw_at(at)[0]),
         float(np.interp(true_time_s, truth.time_s, truth.roll)),

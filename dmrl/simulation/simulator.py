@@ -16,11 +16,11 @@ from dmrl.rendering.onboard_camera import (
     CameraView,
     SketchedPlace,
     ViewRenderer,
-    WorldPose,
     build_view,
 )
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch_renderer import Sketch
+from dmrl.samples.flight import RobotPose
 from dmrl.simulation.flight_samples import body_at
 from dmrl.simulation.settings import CameraRenderer, Preset
 from dmrl.terminal.progress import say
@@ -174,7 +174,7 @@ class Simulation:
     def view(self, robot: str) -> CameraView:
         """Return the true poses of all peers in front of a robot's camera."""
 
-        def bodies(moment_s: float) -> dict[str, WorldPose]:
+        def bodies(moment_s: float) -> dict[str, RobotPose]:
             truth = self.motion.flight.truth
             return {name: body_at(one, moment_s) for name, one in truth.items()}
 

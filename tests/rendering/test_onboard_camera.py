@@ -7,20 +7,20 @@ from dmrl.geometry.frames import AIDECK, project
 from dmrl.rendering.onboard_camera import (
     MIN_DEPTH_M,
     CameraView,
-    WorldPose,
     build_view,
     is_in_front,
     relative_pose,
     render_sketches,
 )
+from dmrl.samples.flight import RobotPose
 
 CAMERA = replace(AIDECK, distortion=())
 
 
 def body(
     x: float, y: float, z: float, yaw: float = 0, roll: float = 0, pitch: float = 0
-) -> WorldPose:
-    return WorldPose(np.array([x, y, z]), yaw, roll, pitch)
+) -> RobotPose:
+    return RobotPose(np.array([x, y, z]), yaw, roll, pitch)
 
 
 def test_a_peer_ahead_is_at_the_principal_point_whatever_the_yaw() -> None:
@@ -67,7 +67,7 @@ def test_a_sketch_shows_the_peer_where_it_is() -> None:
 
 
 def test_view_has_velocities_of_peers_and_camera() -> None:
-    def bodies(time_s: float) -> dict[str, WorldPose]:
+    def bodies(time_s: float) -> dict[str, RobotPose]:
         here = body(0, 0, 0, yaw=0.5 * time_s, pitch=0.2 * time_s)
         return {"cf1": here, "cf2": body(2, time_s, 0), "cf3": body(-2, 0, 0)}
 

@@ -19,7 +19,6 @@ from dmrl.recording import check, read, read_summary
 from dmrl.recording.licences import licences_in
 from dmrl.render_recording import read_render_camera
 from dmrl.rendering.camera.distortion import image_from_pinhole
-from dmrl.rendering.image_messages import to_quaternion
 from dmrl.rendering.randomise import SceneSource, draw_scene
 from dmrl.rendering.renderer import Renderer, RobotModel
 from dmrl.rendering.robots import crazyflie
@@ -213,11 +212,3 @@ def test_outputs_are_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "out.mcap").write_text("mine")
     with pytest.raises(OutputError, match="never overwritten"):
         run(tmp_path / "out.mcap", SMALL)
-
-
-@pytest.mark.parametrize("angle_rad", [0.0, 1.0, 3.0])
-def test_a_quaternion_turns_as_its_matrix(angle_rad: float) -> None:
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    wanted = [0, 0, np.sin(angle_rad / 2), np.cos(angle_rad / 2)]
-    assert to_quaternion(turn) == pytest.approx(wanted, abs=1e-9)

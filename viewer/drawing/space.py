@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dmrl.colours import OWN_RGB, RGB, STATUS_RGB
 from dmrl.geometry.frames import Array
@@ -165,24 +166,7 @@ def _principal_axes(covariance: Array) -> tuple[Array, Array]:
     variance, axes = np.linalg.eigh(covariance)
     # A rotation, not a reflection.
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-    return ELLIPSE_SIGMAS * np.sqrt(np.maximum(variance, 0)), _to_quaternions(axes)
-
-
-def _to_quaternions(matrices: Array) -> Array:
-    """Convert rotations (N, 3, 3) to quaternions xyzw (N, 4), from the largest component."""
-    m = matrices
-    diagonal = np.einsum("nii->ni", m)
-    trace = diagonal.sum(axis=1, keepdims=True)
-    # Rows of 4 q q^T, in the order x, y, z, w.
-    outer = np.empty((len(m), 4, 4))
-    outer[:, :3, :3] = m + m.transpose(0, 2, 1)
-    for k in range(3):
-        outer[:, k, k] = 1 + 2 * diagonal[:, k] - trace[:, 0]
-    turn = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], 1)
-    outer[:, :3, 3] = outer[:, 3, :3] = turn
-    outer[:, 3, 3] = 1 + trace[:, 0]
-    row = outer[np.arange(len(m)), np.einsum("nii->ni", outer).argmax(axis=1)]
-    return np.asarray(row / np.linalg.norm(row, axis=1, keepdims=True))
+    return ELLIPSE_SIGMAS * np.sqrt(np.maximum(variance, 0)), Rotation.from_matrix(axes).as_quat()
 
 
 def draw_trail(path: str, frame: str, steps: Array, source: str) -> Entity:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
-from dmrl.geometry.frames import Array
+from dmrl.geometry.frames import Array, yaw_matrix
 from dmrl.images.canvas import LEVELS, Canvas, Colour, FloatImage, Outline
 
 Place = Array | Sequence[float]
@@ -281,9 +281,7 @@ class RoomView:
 
 def place(points: Array, at: Place, yaw: float) -> Array:
     """Return (..., 3) points turned by a yaw and moved to a place."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    return np.asarray(points @ turn + at)
+    return np.asarray(points @ yaw_matrix(yaw) + at)
 
 
 def build_turn(yaw: float, pitch: float, roll: float) -> Array:

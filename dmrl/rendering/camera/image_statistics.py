@@ -6,7 +6,6 @@ compare sets of images and do not calibrate a camera.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from dmrl.geometry.frames import Array
 from dmrl.images.codec import Rgb
 from dmrl.rendering.camera.distortion import FloatImage
+from dmrl.rendering.camera.sensor import radius_squared
 from dmrl.rendering.camera.sensor_noise import estimate_noise, measure_blocks
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
@@ -170,10 +170,3 @@ def _measure_corners(luma: FloatImage) -> list[float]:
     return [
         float(luma[part].mean()) for part in (radius2 > CORNER_RADIUS2, radius2 < MIDDLE_RADIUS2)
     ]
-
-
-@cache
-def radius_squared(height: int, width: int) -> NDArray[np.float64]:
-    """Return the (H, W) squared distance from the middle, 1 in the corners."""
-    v, u = np.mgrid[:height, :width] + 0.5
-    return np.asarray(((u / width * 2 - 1) ** 2 + (v / height * 2 - 1) ** 2) / 2)

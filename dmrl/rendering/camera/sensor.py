@@ -7,6 +7,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from dmrl.images.bayer import to_bayer
 from dmrl.rendering.camera.distortion import FloatImage
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
@@ -72,9 +73,11 @@ def expose(light: FloatImage, sensor: Sensor, rng: Generator) -> NDArray[np.uint
     # Row by row: NumPy is ten times slower where the innermost axis is three colours.
     values = (values.reshape(height, -1) * np.tile(gain, width)).reshape(light.shape)
     if sensor.bayer:
-        values = apply_mosaic(values)
+        values = to_bayer(values)
     if sensor.vignetting > 0:
-        falloff = 1 - np.float32(sensor.vignetting) * _radius_squared(height, width)
+        falloff = 1 - np.float32(sensor.vignetting) * radius_squared(height, width).astype(
+            np.float32
+        )
         values *= falloff if sensor.bayer else falloff[..., None]
     grey = sensor.saturation == 0 and not sensor.bayer  # one value and one noise per pixel
     values = _add_noise(values[..., :1].copy() if grey else values, sensor, rng)
@@ -108,11 +111,10 @@ def _add_noise(values: FloatImage, sensor: Sensor, rng: Generator) -> FloatImage
 
 
 @cache
-def _radius_squared(height: int, width: int) -> FloatImage:
+def radius_squared(height: int, width: int) -> NDArray[np.float64]:
     """Return the squared distance from the middle, 1 in the corners."""
     v, u = np.mgrid[:height, :width] + 0.5
-    u, v = u / width * 2 - 1, v / height * 2 - 1
-    return np.asarray((u * u + v * v) / 2, np.float32)
+    return np.asarray(((u / width * 2 - 1) ** 2 + (v / height * 2 - 1) ** 2) / 2)
 
 
 def gaussian_blur(picture: FloatImage, sigma_px: float) -> FloatImage:
@@ -138,14 +140,6 @@ def gaussian_blur(picture: FloatImage, sigma_px: float) -> FloatImage:
             pair *= weights[k]
             picture += pair
     return picture
-
-
-def apply_mosaic(picture: FloatImage) -> FloatImage:
-    """Convert (H, W, 3) to an (H, W) Bayer mosaic of red, green / green, blue squares."""
-    raw = picture[..., 1].copy()
-    raw[::2, ::2] = picture[::2, ::2, 0]
-    raw[1::2, 1::2] = picture[1::2, 1::2, 2]
-    return raw
 
 
 def demosaic(raw: FloatImage) -> FloatImage:

@@ -9,7 +9,7 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.geometry.frames import Array
+from dmrl.geometry.frames import Array, yaw_matrix
 
 MOTOR_ANGLES_RAD = np.pi / 4 + np.pi / 2 * np.arange(4)
 CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
@@ -141,8 +141,7 @@ def make_cylinder(
 def rotate_part(part: Part, angle: float) -> Part:
     """Rotate a part about the z axis."""
     name, points, faces = part
-    c, s = np.cos(angle), np.sin(angle)
-    return name, points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]), faces
+    return name, points @ yaw_matrix(angle), faces
 
 
 def make_chamfered_box(

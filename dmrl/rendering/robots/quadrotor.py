@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.geometry.frames import Array
+from dmrl.geometry.frames import Array, yaw_matrix
 
 ARM_M = 0.046
 ROTOR_RADIUS_M = 0.0235
@@ -74,9 +74,7 @@ def _iter_boxes() -> Iterator[tuple[tuple[float, float, float], Array, float, Ar
 def _build_mesh() -> Mesh:
     corners, normals, colours, glows = [], [], [], []
     for centre, half, yaw, colour, glow in _iter_boxes():
-        c, s = np.cos(yaw), np.sin(yaw)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        box = (CORNER_SIGNS * half) @ turn.T
+        box = (CORNER_SIGNS * half) @ yaw_matrix(yaw)
         outward = box[BOX_FACES].mean(axis=1)
         corners.append(box[BOX_FACES] + centre)
         normals.append(outward / np.linalg.norm(outward, axis=1, keepdims=True))

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from dmrl.geometry.frames import yaw_matrix
 from dmrl.rendering.robots.primitives import MOTOR_ANGLES_RAD, Part, read_design
 
 FIT_SCALE = 0.97
@@ -46,12 +47,9 @@ def _make_blades(hub: tuple[float, float], at_rad: float, way: int) -> Part:
             np.column_stack([k, k + count + 1, k + count]),
         ]
     )
-    both = [edges, edges * np.array([-1, -1, 1])]
-    points = np.concatenate(both)
+    points = np.concatenate([edges, edges * np.array([-1, -1, 1])])
     faces = np.concatenate([strip, strip + len(edges)])
-    c, s = np.cos(at_rad), np.sin(at_rad)
-    points = points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    return "blade", points + np.array([*hub, ROTOR_Z_M]), faces
+    return "blade", points @ yaw_matrix(at_rad) + np.array([*hub, ROTOR_Z_M]), faces
 
 
 VIOLET = read_design("violet", _blade_parts, FIT_SCALE, FIT_OFFSET_Z_M)

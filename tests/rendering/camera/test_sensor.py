@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from dmrl.rendering.camera.sensor import Sensor, apply_mosaic, demosaic, expose, gaussian_blur
+from dmrl.images.bayer import to_bayer
+from dmrl.rendering.camera.sensor import Sensor, demosaic, expose, gaussian_blur
 
 
 def rng() -> np.random.Generator:
@@ -12,12 +13,12 @@ def rng() -> np.random.Generator:
 
 def test_demosaicing_restores_uniform_colour() -> None:
     picture = np.broadcast_to(np.array([0.2, 0.5, 0.8], np.float32), (8, 10, 3))
-    assert np.allclose(demosaic(apply_mosaic(picture)), picture)
+    assert np.allclose(demosaic(to_bayer(picture)), picture)
 
 
 def test_mosaic_keeps_measured_pixel_values() -> None:
     picture = rng().random((8, 10, 3), np.float32)
-    back = demosaic(apply_mosaic(picture))
+    back = demosaic(to_bayer(picture))
     assert np.array_equal(back[::2, ::2, 0], picture[::2, ::2, 0])
     assert np.array_equal(back[1::2, 1::2, 2], picture[1::2, 1::2, 2])
     assert np.array_equal(back[::2, 1::2, 1], picture[::2, 1::2, 1])
