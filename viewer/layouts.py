@@ -5,6 +5,7 @@ Panels of one robot have equal bounds, so a map's cell has the same position as 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -208,14 +209,19 @@ def build_dataset_layout(
     return build_window(panels, timeline=timeline)
 
 
-def build_window(panels: rrb.Container, timeline: str = TIMELINE) -> rrb.Blueprint:
-    """Build a window with these panels, paused at the start."""
+def build_window(
+    panels: rrb.Container,
+    timeline: str = TIMELINE,
+    *,
+    play: Literal["paused", "following"] = "paused",
+) -> rrb.Blueprint:
+    """Build a window with these panels, paused at the start or following what arrives."""
     return rrb.Blueprint(
         panels,
         rrb.TopPanel(state="hidden"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=timeline, play_state="paused"),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state=play),
         auto_layout=False,
         auto_views=False,
     )

@@ -77,9 +77,14 @@ class Selection:
         """Log time that is shown as 0 s; None where log times count from 1970: those are dates."""
         return None if self.shown_ns[1] > DURATION_BELOW_NS else self.start_ns
 
+    @property
+    def topics(self) -> list[str]:
+        """Topics with messages, sorted."""
+        return _list_topics(self.recordings)
+
     def find_names(self, pattern: str) -> list[dict[str, str]]:
         """Return robots and peers of the topics of a pattern that have messages, sorted."""
-        names = (topics.parse_topic(pattern, topic) for topic in _list_topics(self.recordings))
+        names = (topics.parse_topic(pattern, topic) for topic in self.topics)
         return [n for n in names if n is not None]
 
     def find_pairs(self, robot: str | None) -> list[Names]:

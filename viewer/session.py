@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
 from threading import Thread
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import rerun as rr
 
@@ -76,12 +76,14 @@ def prepare_show(
     As `save`.
     """
     if any(path.is_dir() for path in paths):
-        browse: Callable[..., Show] = _load(_DATASET)
+        # Imported when shown: compare and dataset import model evaluation, which takes time.
+        browse: Callable[..., Show] = resolve_name("dmrl.viewer.browse:browse")
         return browse(paths, settings, rank=rank if picture else None)
     selection = select_recordings(paths, settings)
     if picture:
         selection = select_time(selection, time_s)
-    scene: Scene = _load(f"dmrl.viewer.views.{selection.layout}:scene")(selection, settings)
+    build_scene = resolve_name(f"dmrl.viewer.views.{selection.layout}:scene")
+    scene: Scene = build_scene(selection, settings)
     shown_ns = choose_moment_ns(selection, time_s)
     return Show(
         " + ".join(recording.stem for recording in selection.recordings),
@@ -153,11 +155,3 @@ def log_show(
         if not wanted():
             return
         logger.log_entity(times, entity)
-
-
-# Imported when they are shown: compare and dataset import model evaluation, which takes time.
-_DATASET = "dmrl.viewer.browse:browse"
-
-
-def _load(name: str) -> Callable[..., Any]:
-    return cast(Callable[..., Any], resolve_name(name))

@@ -52,7 +52,7 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     draws: list[DrawRule] = []
     for eye in eyes:
         draws += build_image_rules(eye, sources[eye.robot])
-        if topics.DETECTIONS(eye.robot) in _list_topics(selection):
+        if topics.DETECTIONS(eye.robot) in selection.topics:
             draws += build_model_rules(eye, scales, smooth=False)
             named["detection"] = RGB["detection"]
     for robot in robots:
@@ -86,15 +86,6 @@ def scene(selection: Selection, settings: Settings) -> Scene:
         named,
         partial(FlightStreamer, pairs, seen, selection.shown_ns[0]),
     )
-
-
-def _list_topics(selection: Selection) -> set[str]:
-    return {
-        topic
-        for kept in selection.recordings.values()
-        for topic, info in kept.topics.items()
-        if info.count
-    }
 
 
 def _choose_pairs(selection: Selection, robot: str | None) -> list[Names]:
@@ -138,7 +129,7 @@ def _iter_static_entities(
     selection: Selection, seen: FlightMotion, robots: Sequence[str]
 ) -> Iterator[Entity]:
     """Yield the bodies of robots, and the fixed frames below those of /tf."""
-    present = _list_topics(selection)
+    present = selection.topics
     calibrations = read_first_messages(selection, map(topics.CALIBRATION, robots))
     for robot in robots:
         if camera_frame(robot) not in seen.poses and topics.ATTITUDE(robot) not in present:
@@ -264,7 +255,7 @@ def _collect_curves(
     selection: Selection, rows: Sequence[Topic], pairs: Sequence[Names]
 ) -> dict[str, list[str]]:
     """Return the lines of sensors that have data, by the title of their panel."""
-    present, found = _list_topics(selection), dict[str, list[str]]()
+    present, found = selection.topics, dict[str, list[str]]()
     for row in rows:
         for robot, peer in pairs:
             topic = row.pattern.format(robot=robot, peer=peer)
@@ -274,7 +265,7 @@ def _collect_curves(
 
 
 def _build_sensor_plots(selection: Selection, robots: Sequence[str]) -> list[PlotPanel]:
-    present = _list_topics(selection)
+    present = selection.topics
     tilted = [t for r in robots if (t := topics.ATTITUDE(r)) in present]
     curves = _collect_curves(selection, topics.OWN_CURVES, [(robot, "") for robot in robots])
     panels = [PlotPanel(title, tuple(lines)) for title, lines in curves.items()]

@@ -16,7 +16,7 @@ from dmrl.errors import SettingError
 from dmrl.live.queue import ReceivedSample
 from dmrl.samples.sample import Sample
 from dmrl.viewer.drawing.entity import escape_path
-from dmrl.viewer.layouts import BACKGROUND, TIMELINE
+from dmrl.viewer.layouts import BACKGROUND, TIMELINE, build_window
 from dmrl.viewer.window.desktop import open_window
 
 PLOT_INTERVAL_NS = 100_000_000
@@ -56,14 +56,7 @@ def build_layout(robots: Sequence[str], cameras: Sequence[str]) -> rrb.Blueprint
         for title, lines in contents.items()
     ]
     columns = [rrb.Vertical(*pictures), rrb.Vertical(*curves)] if pictures else curves
-    return rrb.Blueprint(
-        rrb.Horizontal(*columns),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
-        auto_layout=False,
-        auto_views=False,
-    )
+    return build_window(rrb.Horizontal(*columns), play="following")
 
 
 class LiveView:

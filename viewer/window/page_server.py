@@ -26,7 +26,6 @@ from dmrl.viewer.window.viewer_process import (
     build_command,
     find_free_port,
     last_line,
-    require_free_port,
     run_viewer,
     wait_until_listening,
 )
@@ -116,8 +115,7 @@ class PageServer:
     """
 
     def __init__(self, web: Web) -> None:
-        port = web.port or find_free_port(web.bind)
-        require_free_port(web.bind, port)
+        port = find_free_port(web.bind, web.port)
         host = gethostname() if web.bind in ANY_ADDRESS else web.bind
         token = secrets.token_urlsafe(16)
         address = f"http://{f'[{host}]' if ':' in host else host}:{port}/{token}/"

@@ -123,43 +123,27 @@ def build_proxy_url(port: int, host: str = LOOPBACK) -> str:
     return f"rerun+http://{host}:{port}/proxy"
 
 
-def find_free_port(bind: str) -> int:
-    """Find a free port.
+def find_free_port(bind: str, wanted: int | None = None) -> int:
+    """Find a free port, or make sure that the wanted one is free.
 
     Raises
     ------
     SettingError
-        If the address is not one of this computer's.
+        If the port is in use, or the address is not one of this computer's.
     """
-    with _open_socket(bind) as probe:
-        return _bind_socket(probe, bind, 0)
-
-
-def require_free_port(bind: str, port: int) -> None:
-    """Raise SettingError unless a port is free and the address is one of this computer's."""
-    with _open_socket(bind) as probe:
-        _bind_socket(probe, bind, port)
-
-
-def _open_socket(bind: str) -> socket.socket:
-    return socket.socket(socket.AF_INET6 if ":" in bind else socket.AF_INET)
-
-
-def _bind_socket(probe: socket.socket, bind: str, port: int) -> int:
-    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        probe.bind((bind, port))
-    except socket.gaierror:
-        raise SettingError(f"{bind} is not an address. Try: --bind {LOOPBACK}") from None
-    except OSError as e:
-        if e.errno == errno.EADDRINUSE:
-            raise SettingError(
-                f"port {port} is in use. Choose another --port, or leave it out"
-            ) from None
-        raise SettingError(
-            f"cannot listen on {bind}, port {port}: {e.strerror}. Try: --bind {LOOPBACK}"
-        ) from None
-    return int(probe.getsockname()[1])
+    with socket.socket(socket.AF_INET6 if ":" in bind else socket.AF_INET) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((bind, wanted or 0))
+        except socket.gaierror:
+            raise SettingError(f"{bind} is not an address. Try: --bind {LOOPBACK}") from None
+        except OSError as e:
+            why = f"cannot listen on {bind}, port {wanted or 0}: {e.strerror}"
+            hint = f"Try: --bind {LOOPBACK}"
+            if e.errno == errno.EADDRINUSE:
+                why, hint = f"port {wanted} is in use", "Choose another --port, or leave it out"
+            raise SettingError(f"{why}. {hint}") from None
+        return int(probe.getsockname()[1])
 
 
 def last_line(said: str) -> str:
