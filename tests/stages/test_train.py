@@ -304,7 +304,7 @@ def test_flags_win_over_the_recipe(dots_dataset: Path, tmp_path: Path) -> None:
 
 
 def test_flag_out_of_range_gives_one_line_error() -> None:
-    with pytest.raises(SettingError, match="epochs: must not be negative"):
+    with pytest.raises(SettingError, match="epochs: must be between 0 and"):
         recipe.load("dmrl_nano", "train", Settings, Flags(epochs=-1))
 
 

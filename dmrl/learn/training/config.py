@@ -1,6 +1,6 @@
 """Training configuration: every setting of ``dmrl train`` and its default."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 from dmrl.learn.data.augment import Augmentation
@@ -148,27 +148,20 @@ class TrainConfig(LossSettings):
     processes: int = 1
 
     def __post_init__(self) -> None:
-        for name in POSITIVE_SETTINGS:
-            _raise_if(getattr(self, name) < 1, f"{name}: must be at least 1")
+        for name, (low, high) in LIMITS.items():
+            value = getattr(self, name)
+            inside = value is None or low <= value <= high
+            _raise_if(not inside, f"{name}: must be between {low} and {high}")
         falls = 0 <= self.final_learning_rate <= self.learning_rate
         _raise_if(
             self.learning_rate <= 0 or not falls,
             "learning_rate: must be over 0 and not below final_learning_rate",
         )
-        for name in NON_NEGATIVE_SETTINGS:
-            _raise_if(getattr(self, name) < 0, f"{name}: must not be negative")
-        for name, most in MAX_SETTINGS.items():
-            _raise_if(getattr(self, name) > most, f"{name}: must be at most {most}")
-        for name in FRACTION_SETTINGS:
-            value = getattr(self, name)
-            _raise_if(value is not None and not 0 <= value <= 1, f"{name}: must be between 0 and 1")
-        _raise_if(self.validation_share > 0.5, "validation_share: must be at most 0.5")
         least, greatest = self.zoom
         _raise_if(not 0 < least <= greatest, "zoom: must be over 0, the lesser first")
-        focal_px = self.intrinsics[:2] if self.intrinsics else (1.0,)
-        _raise_if(min(focal_px) <= 0, "intrinsics: fx and fy must be over 0")
-        wide = max(map(abs, self.intrinsics or (0.0,))) > MAX_SETTING
-        _raise_if(wide, f"intrinsics: must be at most {MAX_SETTING}")
+        camera = self.intrinsics or (1.0, 1.0)
+        known = min(camera[:2]) > 0 and max(map(abs, camera)) <= MAX_SETTING
+        _raise_if(not known, f"intrinsics: fx and fy must be over 0, all at most {MAX_SETTING}")
         beyond = any(not 0 <= share <= MAX_SETTING for share in self.shares.values())
         _raise_if(beyond, f"shares: must be between 0 and {MAX_SETTING}")
 
@@ -180,45 +173,30 @@ class TrainConfig(LossSettings):
 
     def augmentation(self, epoch: int) -> Augmentation:
         """Return the augmentation of an epoch, counted from 0."""
-        whole = Augmentation(
-            self.flip_share,
-            self.zoom,
-            self.rotation_deg,
-            self.mosaic_share,
-            self.paste,
-            self.colour,
-            self.noise,
-            self.blur_share,
-            self.intrinsics,
-            self.grey_share,
-        )
+        whole = Augmentation(**{one.name: getattr(self, one.name) for one in fields(Augmentation)})
         return whole if epoch < self.epochs - self.plain_epochs else whole.without_geometry
 
 
-FRACTION_SETTINGS = (
-    *("validation_share", "threshold", "flip_share", "mosaic_share"),
-    *("blur_share", "colour", "noise", "distill_share", "grey_share", "hard_share"),
-    "init_share",
-)
-POSITIVE_SETTINGS = ("batch_size", "processes")
-NON_NEGATIVE_SETTINGS = (
-    *("epochs", "epoch_images"),
-    *("warmup_epochs", "weight_decay", "ema_steps", "target_sigma_cells", "focus", "seed"),
-    *(term.weight for term in TERMS),
-    *("rotation_deg", "paste"),
-    *("plain_epochs", "frozen_norm_epochs", "false_alarms"),
-)
 MAX_SETTING = 10_000_000
 """Upper bound of settings without a tighter one."""
-MAX_SETTINGS = dict.fromkeys(
-    ("learning_rate", *POSITIVE_SETTINGS, *NON_NEGATIVE_SETTINGS), MAX_SETTING
-) | {
-    "processes": 256,
-    "paste": 100,
-    "seed": 2**63 - 1,
+NON_NEGATIVE_SETTINGS = (
+    *("epochs", "epoch_images", "learning_rate", "warmup_epochs", "weight_decay", "ema_steps"),
+    *("target_sigma_cells", "focus", "rotation_deg", "plain_epochs", "frozen_norm_epochs"),
+    *(term.weight for term in TERMS),
+    "false_alarms",
+)
+FRACTION_SETTINGS = (
+    *("threshold", "flip_share", "mosaic_share", "blur_share", "colour", "noise"),
+    *("distill_share", "grey_share", "hard_share", "init_share"),
+)
+LIMITS: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(NON_NEGATIVE_SETTINGS, (0, MAX_SETTING)),
+    **dict.fromkeys(FRACTION_SETTINGS, (0, 1)),
+    **{"validation_share": (0, 0.5), "batch_size": (1, MAX_SETTING), "processes": (1, 256)},
+    **{"paste": (0, 100), "seed": (0, 2**63 - 1)},
 }
-"""Upper bounds, which no real training reaches. A recipe may come from a stranger, so it must not
-start arbitrarily many processes, paste arbitrarily many patches, or overflow float32."""
+"""Bounds, which no real training exceeds. A recipe may come from a stranger, so it must not start
+arbitrarily many processes, paste arbitrarily many patches, or overflow float32."""
 
 
 def _raise_if(wrong: bool, why: str) -> None:

@@ -5,14 +5,7 @@ from typing import Any
 import pytest
 
 from dmrl.learn.networks.architectures import CLASS_PREFIX, SPREAD_CHANNEL
-from dmrl.learn.training.config import (
-    FRACTION_SETTINGS,
-    MAX_SETTING,
-    MAX_SETTINGS,
-    NON_NEGATIVE_SETTINGS,
-    POSITIVE_SETTINGS,
-    TrainConfig,
-)
+from dmrl.learn.training.config import LIMITS, MAX_SETTING, TrainConfig
 from dmrl.learn.training.losses import TERMS
 
 
@@ -25,31 +18,20 @@ def refused(**settings: Any) -> bool:
     return False
 
 
-@pytest.mark.parametrize("name", POSITIVE_SETTINGS)
-def test_counts_begin_at_one(name: str) -> None:
-    assert [refused(**{name: value}) for value in (0, 1)] == [True, False]
-
-
-@pytest.mark.parametrize("name", NON_NEGATIVE_SETTINGS)
-def test_non_negative_settings_refuse_negative_values(name: str) -> None:
-    assert [refused(**{name: value}) for value in (-1e-9, 0)] == [True, False]
-    assert {term.weight for term in TERMS} <= set(NON_NEGATIVE_SETTINGS)
-
-
-@pytest.mark.parametrize("name", FRACTION_SETTINGS)
-def test_shares_are_from_nothing_to_all(name: str) -> None:
-    most = 0.5 if name == "validation_share" else 1.0
-    values = (-1e-9, 0.0, most, most + 1e-9)
+@pytest.mark.parametrize("name", sorted(LIMITS.keys() - {"learning_rate"}))
+def test_a_setting_ends_where_its_limits_say(name: str) -> None:
+    """A recipe of a stranger: 2^63 images an epoch, a billion patches, shares below nothing."""
+    low, high = LIMITS[name]
+    above = high + 1 if high > 1 else high + 1e-9
+    values = (low - 1e-9, low, high, above)
     assert [refused(**{name: value}) for value in values] == [True, False, False, True]
 
 
-@pytest.mark.parametrize("name", MAX_SETTINGS)
-def test_settings_have_upper_limits(name: str) -> None:
-    """A recipe of a stranger: 2^63 images an epoch, a rate of 1e308, a billion patches."""
-    assert [refused(**{name: value}) for value in (MAX_SETTINGS[name], MAX_SETTINGS[name] + 1)] == [
-        False,
-        True,
-    ]
+def test_limits_are_those_of_counts_shares_and_weights() -> None:
+    assert (LIMITS["batch_size"][0], LIMITS["processes"]) == (1, (1, 256))
+    assert (LIMITS["flip_share"], LIMITS["validation_share"]) == ((0, 1), (0, 0.5))
+    assert (LIMITS["paste"], LIMITS["seed"]) == ((0, 100), (0, 2**63 - 1))
+    assert {LIMITS[term.weight] for term in TERMS} == {(0, MAX_SETTING)}
 
 
 def test_rates_windows_and_cameras_that_cannot_be() -> None:
@@ -59,6 +41,8 @@ def test_rates_windows_and_cameras_that_cannot_be() -> None:
         (1e-3, 0.0, False),
         (1e-3, -1e-9, True),
         (0.0, 0.0, True),
+        (MAX_SETTING, 0.0, False),
+        (1e308, 0.0, True),
     ):
         assert refused(learning_rate=rate, final_learning_rate=last) == wrong
     for zoom, wrong in (((1.0, 1.0), False), ((1.1, 1.0), True), ((0.0, 1.0), True)):
