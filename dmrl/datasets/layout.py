@@ -27,28 +27,11 @@ from dmrl.guards.safe_names import check_split_name
 PIXELS, IMAGE, MASKS = "pixels", "image", "masks"
 CONFIDENCE, DEPTH = "confidence", "depth"
 MANIFEST_FILE = "manifest.json"
-COLUMN_NAMES = (
-    PIXELS,
-    IMAGE,
-    MASKS,
-    "peers",
-    CONFIDENCE,
-    DEPTH,
-    "robot",
-    "source",
-    "log_time",
-    "split",
-)
-
 PEER_TYPE = pa.struct(
     [
         ("peer", pa.string()),
-        ("u_px", pa.float64()),
-        ("v_px", pa.float64()),
-        ("depth_m", pa.float64()),
-        ("sigma_u_px", pa.float64()),
-        ("sigma_v_px", pa.float64()),
-        ("sigma_depth_m", pa.float64()),
+        *((name, pa.float64()) for name in ("u_px", "v_px", "depth_m")),
+        *((f"sigma_{name}", pa.float64()) for name in ("u_px", "v_px", "depth_m")),
         ("box_px", pa.list_(pa.float64())),
         ("visible_share", pa.float64()),
         ("status", pa.string()),
@@ -144,3 +127,6 @@ def shard_path(folder: Path, split: str, index: int, count: int, *, parquet: boo
 def format_json(document: Any) -> str:
     """Format a small JSON document with sorted keys, so that equal content gives equal bytes."""
     return json.dumps(document, indent=1, sort_keys=True) + "\n"
+
+
+COLUMN_NAMES = {IMAGE, *build_schema(STRIDE_PX, STRIDE_PX, masks=True).names}

@@ -6,7 +6,7 @@ such as ``parts/00001`` with its provenance and the hashes of its images.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +65,7 @@ class Manifest:
     def write(self, folder: Path) -> None:
         """Write the manifest into the folder of a dataset."""
         splits = [
-            {"split": name, "shards": [_shard_to_json(shard) for shard in shards]}
+            {"split": name, "shards": [asdict(shard) for shard in shards]}
             for name, shards in self.splits.items()
         ]
         document = {"parquet": self.parquet, "parts": self.parts, "splits": splits}
@@ -105,10 +105,6 @@ def read_manifest(folder: Path) -> Manifest | None:
         return Manifest(splits, _parse_count(said["parts"]), said["parquet"] is True)
     except (OSError, KeyError, TypeError, ValueError, AttributeError) as e:
         raise DatasetError(f"{path} is damaged ({e}). Make the dataset again") from e
-
-
-def _shard_to_json(shard: Shard) -> dict[str, Any]:
-    return {"file": shard.file, "rows": shard.rows, "bytes": shard.bytes}
 
 
 def _parse_shard(said: Mapping[str, Any], path: Path) -> Shard:

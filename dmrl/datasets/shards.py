@@ -5,6 +5,8 @@ validated, and a shard that does not follow `dmrl.datasets.layout` is rejected.
 """
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pyarrow as pa
@@ -39,19 +41,9 @@ def open_shard(path: Path, rows: int | None) -> pa.Table:
     """
     if path.exists() and not path.is_file():
         raise DatasetError(f"shard {path} is not a file. {REBUILD_HINT}")
-    try:
-        with MemoryLimit(path.stat().st_size):
-            table = _map_table(path)
-            table.validate(full=True)
-    except FileNotFoundError:
-        raise DatasetError(f"shard {path} is missing. {REBUILD_HINT}") from None
-    except MemoryError:
-        raise DatasetError(
-            f"shard {path} decompresses to much more than its size explains. {REBUILD_HINT}"
-        ) from None
-    except (pa.ArrowException, OSError, ValueError) as e:
-        why = " ".join(str(e).split())
-        raise DatasetError(f"shard {path} is cut short or damaged: {why}. {REBUILD_HINT}") from None
+    with _named_in_errors(path), MemoryLimit(path.stat().st_size):
+        table = _map_table(path)
+        table.validate(full=True)
     # A stream that ends between two batches reads without an error.
     if rows is not None and table.num_rows != rows:
         found = f"{table.num_rows} of {rows} rows"
@@ -69,17 +61,26 @@ def read_schema(path: Path) -> pa.Schema:
     DatasetError
         If the shard is missing or damaged.
     """
+    with _named_in_errors(path), path.open("rb") as stream:
+        if path.suffix == ".parquet":
+            return pq.read_schema(stream)
+        return pa.ipc.open_stream(stream).schema
+
+
+@contextmanager
+def _named_in_errors(path: Path) -> Iterator[None]:
+    """Name a shard in the error if it cannot be read."""
     try:
-        with path.open("rb") as stream:
-            if path.suffix == ".parquet":
-                return pq.read_schema(stream)
-            return pa.ipc.open_stream(stream).schema
+        yield
     except FileNotFoundError:
         raise DatasetError(f"shard {path} is missing. {REBUILD_HINT}") from None
-    except (pa.ArrowException, OSError, ValueError) as e:
+    except MemoryError:
         raise DatasetError(
-            f"shard {path} is damaged: {' '.join(str(e).split())}. {REBUILD_HINT}"
+            f"shard {path} decompresses to much more than its size explains. {REBUILD_HINT}"
         ) from None
+    except (pa.ArrowException, OSError, ValueError) as e:
+        why = " ".join(str(e).split())
+        raise DatasetError(f"shard {path} is cut short or damaged: {why}. {REBUILD_HINT}") from None
 
 
 def _map_table(path: Path) -> pa.Table:

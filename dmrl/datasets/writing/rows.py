@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from dmrl import topics
@@ -132,12 +131,8 @@ def find_label_sources(held: LoadedRecording) -> set[str]:
     for topic in held.topics:
         if topics.parse_topic(topics.LABELS, topic):
             table = held.get_table(topic, SOURCE_FIELDS).combine_chunks()
-            present.update(collect_sources(*(_first_chunk(table, name) for name in SOURCE_FIELDS)))
+            present |= collect_sources(*(table.column(name).chunk(0) for name in SOURCE_FIELDS))
     return present
-
-
-def _first_chunk(table: pa.Table, name: str) -> pa.Array:
-    return table.column(name).chunk(0)
 
 
 def choose_label_source(held: LoadedRecording, wanted: str) -> str:
@@ -241,11 +236,8 @@ def iter_labelled_images(
         _reject_duplicate_times(held.path, images)
         for image in images:
             robot = _parse_robot(image)
-            yield (
-                image,
-                labels[robot].find_at(image.time_ns) if robot in labels else None,
-                covered.get(robot),
-            )
+            seen = labels[robot].find_at(image.time_ns) if robot in labels else None
+            yield image, seen, covered.get(robot)
 
 
 def _read_once(path: Path, wanted: list[str]) -> Iterator[Stamped]:
