@@ -68,7 +68,7 @@ def run(name: str, out: Path, material: list[str]) -> str:
 
 
 def draw(out: Path) -> None:
-    """What others take, times dmrl's, as bars: of what is there."""
+    """Draw the times of others, relative to dmrl's, as bars; missing ones are left out."""
     bars: list[tuple[str, float]] = []
     if (path := out / "recording.json").exists():
         rows = json.loads(path.read_text())

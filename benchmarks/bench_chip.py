@@ -59,7 +59,7 @@ def agreement(chip: NDArray[np.float64], ours: NDArray[np.floating]) -> Agreemen
 
 
 def backends(data: Path) -> dict[str, Backend]:
-    """The published weights in float and in our int8."""
+    """Return the published weights as a float backend and as an int8 one."""
     model = load_model(data / "locanet-weights" / "real.h5")
     graph = build_graph(trace_operations(model.network))
     seen = [image_of(data, name)[None] for name in CALIBRATION]
@@ -74,7 +74,7 @@ def backends(data: Path) -> dict[str, Backend]:
 
 
 def image_of(data: Path, name: str) -> NDArray[np.uint8]:
-    """A frame of the AI-deck."""
+    """Return a frame of the AI-deck."""
     file = data / "aideck-frames" / f"img{name}.ppm"
     return decode(file.read_bytes(), file)
 

@@ -42,7 +42,7 @@ def spent(work: Callable[[], object]) -> tuple[float, float]:
 
 @contextmanager
 def nodes(count: int) -> Iterator[None]:
-    """A cluster of nodes with a core each on this machine, which ``--on ray`` finds."""
+    """Start a cluster of one-core nodes on this machine, which ``--on ray`` finds."""
     from ray.cluster_utils import Cluster  # noqa: PLC0415 - reads the environment
 
     node = {"num_cpus": 1, "object_store_memory": 80_000_000, "node_ip_address": "127.0.0.1"}

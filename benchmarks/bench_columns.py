@@ -24,7 +24,7 @@ TOPIC = "/cf1/attitude"
 
 
 def write(path: Path, messages: int) -> None:
-    """A recording with that many attitudes at 100 Hz."""
+    """Write a recording with this number of attitudes, at 100 Hz."""
     attitude = message_class("Attitude")
     with RecordingWriter(path, Provenance("bench")) as out:
         for k in range(messages):

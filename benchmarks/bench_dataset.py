@@ -53,7 +53,7 @@ def order_of(count: int) -> Iterator[np.ndarray]:
 
 
 def from_dmrl(split: Split) -> Iterator[torch.Tensor]:
-    """The loader that `dmrl train` uses; it gathers the robots as well."""
+    """Yield images from the loader of `dmrl train`, which gathers the robots as well."""
     examples = build_examples(split)
     chosen = epoch_indices(len(examples), seed=1, epoch=0)
     for start in range(0, len(chosen), BATCH):
@@ -126,7 +126,7 @@ def build(folder: Path, count: int) -> None:
 
 
 def ways_of(folder: Path) -> dict[str, Callable[[], Batches]]:
-    """What opens the images anew, for each way to load them."""
+    """Return a function for each loader that opens the images again."""
     raw = str(folder / "raw")
     pixels = open_dataset(folder / "raw").split("train")
     shape = (HEIGHT_PX, WIDTH_PX, 3)

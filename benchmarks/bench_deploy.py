@@ -24,7 +24,7 @@ PEER = "onnxruntime int8"
 
 
 def ways(folder: Path) -> dict[str, Callable[[], object]]:
-    """What runs one image, by name."""
+    """Return functions that run one image, by name."""
     network, image = load_network(folder), load_samples(folder)[0]
     seen = to_network_input(network, image)
     out: dict[str, Callable[[], object]] = {}

@@ -81,7 +81,7 @@ CASES = {
 
 
 def sights(flight: Flight, wrong: float, seed: int) -> dict[str, ObserverLog]:
-    """What every robot's camera shows to the detector."""
+    """Return the detections in the images of every robot's camera."""
     rng = np.random.default_rng(seed + 10_000)
     return {robot: _sight(flight, robot, wrong, rng) for robot in flight.robots}
 
@@ -123,7 +123,7 @@ def ranges_alone(pairs: dict[Names, Pair], _: dict[str, ObserverLog]) -> dict[Na
 
 
 def one_solve(pairs: dict[Names, Pair], seen: dict[str, ObserverLog]) -> dict[Names, Estimate]:
-    """The same with detections in the solve."""
+    """Solve the pairs with detections."""
     found = {
         robot: detections_to_bearings(sight, 0, SAID_PX, ATTITUDE_STD_RAD)
         for robot, sight in seen.items()
@@ -185,7 +185,7 @@ class Row:
 
 
 def rows_of(name: str, noise: str, seeds: range) -> Iterator[Row]:
-    """A case, solved each way."""
+    """Yield a row for each way to solve a case."""
     case = CASES[name]
     scenario = Scenario(case.robots, case.duration_s, case.trajectory)
     flights = [simulate(scenario, NOISE[noise], seed, FAULTS[case.fault].faults) for seed in seeds]

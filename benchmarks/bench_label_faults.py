@@ -46,7 +46,7 @@ Found = tuple[Array, Array, Mask]
 
 
 def pair_of(flight: Flight, one: str, other: str) -> Pair:
-    """A pair as `dmrl label` would read it from a recording of the flight."""
+    """Return a pair as `dmrl label` would read it from a recording of the flight."""
     logs = [_signals(flight, robot) for robot in (one, other)]
     start_s, end_s = max(log.start_s for log in logs), min(log.end_s for log in logs)
     grid_s = start_s + np.arange(int((end_s - start_s) * GRID_RATE_HZ) + 1) / GRID_RATE_HZ
@@ -79,7 +79,7 @@ def batch(pairs: list[Pair]) -> list[tuple[Found, Found]]:
 
 
 def published(pairs: list[Pair]) -> list[tuple[Found, Found]]:
-    """The filter of Li et al. 2020, as ``dmrl label --method ekf``."""
+    """Run the filter of Li et al. 2020, as ``dmrl label --method ekf``."""
     both = [*pairs, *(pair.swap_robots() for pair in pairs)]
     found = [_at(e, p) for e, p in zip(estimate_ekf(both, "published-sim"), both, strict=True)]
     return list(zip(found[: len(pairs)], found[len(pairs) :], strict=True))
@@ -91,7 +91,7 @@ def _at(estimate: Estimate, pair: Pair) -> Found:
 
 
 def graph(pairs: list[Pair]) -> list[tuple[Found, Found]]:
-    """The plain factor graph."""
+    """Solve the factor graph without causes."""
     import graph_peer  # noqa: PLC0415  # gtsam is optional
 
     out = []
@@ -163,7 +163,7 @@ class Row:
 def judged(
     flight: Flight, robot: str, peer: str, time_s: Array, found: Found
 ) -> EvaluatedPositions:
-    """What was found beside the truth."""
+    """Compare the estimates with the truth."""
     xy, covariance, kept = found
     truth = flight.peer_in_horizontal(robot, peer, flight.clocks[robot].to_true_time(time_s))[:, :2]
     distance = np.linalg.norm(truth, axis=1)
@@ -180,7 +180,7 @@ def outside(flight: Flight, true_s: Array) -> Mask:
 
 
 def rows_of(name: str, noise: str, seeds: range, methods: list[str]) -> list[Row]:
-    """A fault under every method."""
+    """Yield the figures of a fault for every method."""
     flights = [simulate(Scenario(), NOISE[noise], seed, CASES[name].faults) for seed in seeds]
     pairs = [pair_of(flight, "cf1", "cf2") for flight in flights]
     rows = []
@@ -241,7 +241,7 @@ def _root(size_m: Array) -> float:
 
 
 def _held(row: Row) -> Row:
-    """The row with the ceilings that it is over."""
+    """Return the row with the limits that it exceeds."""
     if row.method != "batch":
         return row
     case, (bad, worst) = CASES[row.fault], BAD[row.noise]

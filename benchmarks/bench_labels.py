@@ -61,7 +61,7 @@ class Flown:
 
 
 def pair_of(flight: Flight, robot: str, peer: str) -> Pair:
-    """What cf1 would know: both logs as they are stamped, and its own ranges."""
+    """Return the data that cf1 would have: both logs with their time stamps, and its own ranges."""
     logs = flight.robots[robot], flight.robots[peer]
     start, end = max(log.time_s[0] for log in logs), min(log.time_s[-1] for log in logs)
     grid_s = start + np.arange(int((end - start) * 100)) / 100
@@ -73,14 +73,14 @@ def pair_of(flight: Flight, robot: str, peer: str) -> Pair:
 
 
 def track_of(log: RobotLog, grid_s: Array) -> SensorTrack:
-    """A robot's log on a common time grid."""
+    """Resample a robot's log on a common time grid."""
     velocity = np.stack([log.vx_mps, log.vy_mps], axis=1)
     yaw_rate, height = log.yaw_rate_radps[:, None], log.height_m[:, None]
     return sensed(*((log.time_s, values) for values in (yaw_rate, velocity, height)), grid_s)
 
 
 def judged(flight: Flight, robot: str, peer: str, estimate: Estimate) -> Flown:
-    """An estimate beside the truth, 20 times a second."""
+    """Compare an estimate with the truth, 20 times a second."""
     time_s = np.arange(estimate.time_s[0], estimate.time_s[-1], 0.05)
     position, covariance, status = estimate.interpolate_at(time_s)
     truth = flight.peer_in_horizontal(robot, peer, flight.clocks[robot].to_true_time(time_s))[:, :2]

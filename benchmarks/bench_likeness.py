@@ -78,7 +78,7 @@ def variants(path: Path | None) -> list[Variant]:
 
 
 def robot_of(item: LocanetImage) -> Robot:
-    """The drone of a published image."""
+    """Return the drone of a published image."""
     tilt = Rotation.from_euler("XY", (item.roll_rad, item.pitch_rad))
     roll, pitch, yaw = item.attitude_rad[0]
     body = Rotation.from_euler("XZY", (roll, yaw, pitch))
@@ -163,7 +163,7 @@ def sharpness(pictures: list[Rgb]) -> tuple[float, float]:
 
 
 def sheet(shown: list[tuple[Rgb, Rgb, NDArray[np.uint8]]], columns: int = 6) -> bytes:
-    """Published beside rendered, around the drone."""
+    """Draw published and rendered images side by side, around the drone."""
     tiles = []
     for rgb, again, mask in shown[: 4 * columns]:
         left, top, width, height = cv2.boundingRect(mask)

@@ -71,7 +71,7 @@ def cost(*words: str) -> tuple[float, float]:
 
 
 def measure(folder: Path, count: int) -> list[tuple[str, int, float, float, float]]:
-    """A row for each command."""
+    """Measure every command; return a row for each."""
     flights, out = folder / "flights", folder / "set"
     write_recordings(flights, count)
     works = {

@@ -38,7 +38,7 @@ WORK: Mapping[str, tuple[str, ...]] = {
 
 
 def peak_mb(words: tuple[str, ...], folder: Path) -> float:
-    """The most memory that a command held, MB."""
+    """Return the peak memory of a command, MB."""
     process = subprocess.Popen(
         [sys.executable, "-m", "dmrl.cli", *words], cwd=folder, stdout=subprocess.DEVNULL
     )
@@ -51,7 +51,7 @@ def peak_mb(words: tuple[str, ...], folder: Path) -> float:
 
 
 def measure(folder: Path, seconds: float, only: list[str]) -> list[dict[str, Any]]:
-    """A row for each command: MB with the short flight and with the long one."""
+    """Measure every command; return a row for each: MB with the short flight and the long one."""
     peaks: dict[str, list[float]] = {name: [] for name in WORK}
     megabytes = []
     for place, lasts_s in ((folder / "short", seconds), (folder / "long", TIMES * seconds)):

@@ -58,7 +58,7 @@ def plain_loops(model: Path, recording: Path) -> tuple[int, dict[str, Callable[[
 
 
 def measure(folder: Path, rounds: int) -> list[dict[str, Any]]:
-    """A row for each: milliseconds of CPU an image, and their ratio to the plain loop's."""
+    """Measure each backend: milliseconds of CPU an image, and their ratio to the plain loop's."""
     model, recording = resolve_model_path(Path("dmrl-nano")), folder / "flight.mcap"
     fly.run(recording, fly.Settings(2, DURATION_S, camera=True, camera_rate_hz=5.0, seed=1))
     count, work = plain_loops(model, recording)

@@ -67,7 +67,7 @@ class Flown:
 
 
 def read(path: Path) -> Flown:
-    """A flight of a file, cut to what was in the air."""
+    """Read a flight from a file, cropped to the time in the air."""
     series = {s.topic: s for s in mapped_csv.load_content(path, Options(robot="cf")).series}
     pose = series["/cf/pose/truth"]
     place, turn = pose.fields["pose"]["position"], pose.fields["pose"]["orientation"]
@@ -92,7 +92,7 @@ def read(path: Path) -> Flown:
 
 
 def crashed(flown: Flown, at_s: float) -> Flown:
-    """The same flight with a crash: it lies still from then on, and its estimate runs away."""
+    """Add a crash to a flight: the drone lies still from then on, and its estimate diverges."""
     share = np.clip((flown.time_s - at_s) / RAMP_S, 0.0, 1.0)
     down = flown.time_s >= at_s
     place, yaw = flown.place_m.copy(), flown.yaw_rad.copy()
@@ -109,7 +109,7 @@ def crashed(flown: Flown, at_s: float) -> Flown:
 
 
 def beside(flown: Flown, rng: np.random.Generator) -> Flown:
-    """The same flight, turned about its middle and put beside where it was."""
+    """Turn a flight about its middle and move it aside."""
     turn, bearing = rng.uniform(-np.pi, np.pi, 2)
     middle = flown.place_m[:, :2].mean(axis=0)
     away = rng.uniform(NEAR_M, FAR_M) * np.array([np.cos(bearing), np.sin(bearing)])
@@ -124,7 +124,7 @@ def _at(flown: Flown, time_s: Array) -> Array:
 
 
 def measured(one: Flown, other: Flown, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Times and ranges of both directions, in order."""
+    """Simulate times and ranges of both directions, in order."""
     noise, (bias_m, scale) = NOISE_OF_RANGES, draw_pair_errors(rng, NOISE_OF_RANGES)
     end_s = min(one.time_s[-1], other.time_s[-1])
     time_s = np.sort(rng.uniform(0.0, end_s, int(2 * noise.ranging_rate_hz * end_s)))
@@ -137,7 +137,7 @@ def measured(one: Flown, other: Flown, rng: np.random.Generator) -> tuple[Array,
 
 
 def pair_of(one: Flown, other: Flown, rng: np.random.Generator) -> Pair:
-    """What the estimators are given."""
+    """Build the input of the estimators."""
     start_s = max(flown.log.start_s for flown in (one, other))
     end_s = min(flown.log.end_s for flown in (one, other))
     grid_s = start_s + np.arange(int((end_s - start_s) * GRID_RATE_HZ) + 1) / GRID_RATE_HZ

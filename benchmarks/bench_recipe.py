@@ -105,7 +105,7 @@ def rows(
 
 
 def shortened(title: str, name: str, epochs: int) -> Settings:
-    """The settings of a row; the end of the training is as large a part as in the recipe."""
+    """Return the settings of a row; the end of the training has the same share as in the recipe."""
     if title == PUBLISHED:
         settings = recipe.load("locanet", "train", Settings)
         return replace(settings, epochs=PUBLISHED_EPOCHS, validation_share=HELD_OUT)

@@ -36,7 +36,7 @@ Work = Callable[[Path, Path], object]
 
 
 def flights(folder: Path) -> dict[str, Path]:
-    """The recordings that are read and copied."""
+    """Make the recordings that are read and copied."""
     found = {"17 topics, cameras": folder / "pair.mcap", "211 topics": folder / "swarm.mcap"}
     pair = fly.Settings(2, 50.0, camera=True, camera_rate_hz=5.0, seed=1)
     for path, settings in zip(found.values(), (pair, fly.Settings(10, 20.0, seed=1)), strict=True):
@@ -65,7 +65,7 @@ def write_dmrl(_: Path, out: Path) -> None:
 
 
 def write_columns(_: Path, out: Path) -> None:
-    """The same from arrays."""
+    """Write the same recording from arrays."""
     fields = {"roll_rad": ROLL, "pitch_rad": PITCH, "yaw_rate_radps": YAW}
     with RecordingWriter(out, MADE) as sink:
         for part in np.array_split(np.arange(MESSAGES), MESSAGES // 10_000):
@@ -98,7 +98,7 @@ def write_foxglove(_: Path, out: Path) -> None:
 
 
 def build_only(_: Path, out: Path) -> None:
-    """Building and serialising alone, which everyone does who writes one at a time."""
+    """Build and serialise alone, as every writer of single messages does."""
     out.write_bytes(b"")
     for _time_ns, made in messages():
         made.SerializeToString()
@@ -128,7 +128,7 @@ def copy_dmrl(path: Path, out: Path) -> None:
 
 
 def copy_mcap(path: Path, out: Path) -> None:
-    """The same by mcap's reader and writer."""
+    """Copy a recording by mcap's reader and writer."""
     with path.open("rb") as source, out.open("wb") as sink:
         writer, numbers = Writer(sink, chunk_size=256 * 1024), dict[int, int]()
         writer.start()
@@ -156,7 +156,7 @@ def paired(work: dict[str, Work], path: Path, out: Path, rounds: int) -> dict[st
 
 
 def rows(spent: dict[str, list[float]], what: str, count: int, size: int) -> list[dict[str, Any]]:
-    """A row for everyone: microseconds a message, and times what dmrl takes."""
+    """Return a row for each program: microseconds a message, and their ratio to dmrl's."""
     ours = next(iter(spent.values()))
     return [
         {

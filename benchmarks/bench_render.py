@@ -171,7 +171,7 @@ Way = tuple[Callable[[int], dict[str, float]], int]
 
 
 def ways_of(model: Path | None, backgrounds: Path | None, images: int) -> dict[str, Way]:
-    """The published way, as published and lean, and ours; without its model ours alone."""
+    """Return the published renderer, as published and lean, and ours; without a model only ours."""
     one = {"backgrounds": backgrounds or Path("rooms"), "robots_max": 1}
     own: dict[str, Way] = {
         "ours, default model": (
@@ -199,7 +199,7 @@ def ways_of(model: Path | None, backgrounds: Path | None, images: int) -> dict[s
 def speed(
     model: Path | None, backgrounds: Path | None, images: int, rounds: int
 ) -> dict[str, object]:
-    """The published way, and ours with its model and with our own, turn by turn in one run.
+    """Measure the published renderer and ours, with its model and our own, in turns in one run.
 
     The published way, twice, and the first two of ours take equal samples; what is called by a
     recipe's name is as that recipe says.

@@ -39,7 +39,7 @@ STEPS, TURNS = 3, 8
 
 
 def build(folder: Path, count: int) -> ExampleSet:
-    """A dataset of smooth pictures, one peer each, opened as training opens it."""
+    """Make a dataset of smooth images with one peer each, and open it as training does."""
     ramp = np.linspace(0, 200, WIDTH_PX)[None, :, None] + np.zeros((HEIGHT_PX, 1, 3))
     with RecordingWriter(folder / "flight.mcap", Provenance("bench")) as sink:
         for k in range(count):
@@ -67,7 +67,7 @@ def endless(examples: ExampleSet, settings: TrainConfig) -> Iterator[Batch]:
 
 
 def ways(examples: ExampleSet, settings: TrainConfig) -> dict[str, Callable[[], object]]:
-    """What is measured, by name: functions that do one step."""
+    """Return functions that do one step each, by name."""
     fresh = endless(examples, settings)
     ready = next(fresh)
     chosen = epoch_indices(len(examples), seed=0, epoch=0)[: settings.batch_size]

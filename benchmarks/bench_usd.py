@@ -24,7 +24,7 @@ KEPT_BYTES = 1 << 24
 
 
 def text(data: bytes, at: int) -> tuple[str, int]:
-    """A string that ends in 0, and where it ends."""
+    """Return a string that ends in 0, and its end."""
     end = data.index(0, at)
     return data[at:end].decode(), end + 1
 

@@ -30,7 +30,7 @@ ROWS, COLS = 28, 40
 
 
 def write(path: Path, minutes: float) -> int:
-    """The flight; returns the number of images."""
+    """Write the flight; return the number of images."""
     flown = path.with_name(f"flown-{path.name}")
     settings = fly.Settings(duration_s=60 * minutes, camera=True, camera_rate_hz=1.0)
     fly.run(flown, settings)
@@ -97,7 +97,7 @@ def with_dmrl(path: Path, out: Path, layout: str) -> dict[str, float]:
 
 
 def with_rerun(path: Path, out: Path) -> dict[str, float]:
-    """The same of rerun's own importer of MCAP."""
+    """Measure rerun's own importer of MCAP."""
     program = viewer_process.build_command(viewer_process.LOOPBACK)[0]
     subprocess.run([program, "mcap", "convert", str(path), "-o", str(out)], check=True)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -121,7 +121,7 @@ def apart(*arguments: object) -> dict[str, float]:
 
 
 def measure(what: str, path: Path, layout: str) -> dict[str, float]:
-    """The measurement of that name."""
+    """Run the measurement of this name."""
     out = path.with_suffix(f".{what}.rrd")
     try:
         return with_rerun(path, out) if what == "rerun" else with_dmrl(path, out, layout)

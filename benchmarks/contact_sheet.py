@@ -19,7 +19,7 @@ TILE_PX = (160, 112)
 
 
 def tile(data: bytes, name: object) -> np.ndarray:
-    """An image at the size of a tile, (112, 160, 3)."""
+    """Return an image at the size of a tile, (112, 160, 3)."""
     rgb = decode(data, name)
     return crop_and_scale(rgb, (0, 0, rgb.shape[1], rgb.shape[0]), *TILE_PX)
 

@@ -34,7 +34,7 @@ Set = tuple[list[Rgb], list[NDArray[np.float64]]]
 
 
 def fitted(path: Path) -> Rgb:
-    """An image of the size that the networks take, cut in the middle and scaled."""
+    """Read an image, crop its middle and scale it to the size that the networks take."""
     rgb = decode(path.read_bytes(), path)
     height, width, _ = rgb.shape
     scale = min(width / SIZE_PX[0], height / SIZE_PX[1])
@@ -44,7 +44,7 @@ def fitted(path: Path) -> Rgb:
 
 
 def published(folder: Path, *, split: str | None) -> Set:
-    """The published renders of a split, with their true projection."""
+    """Load the published renders of a split, with their true projection."""
     found = [item for item in load_images(folder) if split is None or item.split == split]
     labels = []
     for item in found:
@@ -54,7 +54,7 @@ def published(folder: Path, *, split: str | None) -> Set:
 
 
 def frames(folder: Path) -> Set:
-    """The real frames with a drone; depths are unknown."""
+    """Load the real frames with a drone; depths are unknown."""
     paths = sorted(path for path in folder.glob("img*.ppm") if path.stem in FRAMES_PX)
     labels = [np.array([[*FRAMES_PX[path.stem], np.nan]]) for path in paths]
     return [decode(path.read_bytes(), path) for path in paths], labels
@@ -89,7 +89,7 @@ def composites(cutouts: Path, behind: Sequence[Rgb], seed: int) -> Set:
 
 
 def renders(recording: Path) -> Set:
-    """The images of a rendered recording, and their labels."""
+    """Load the images of a rendered recording, and their labels."""
     images = [decode(one.message.data, recording) for one in read(recording, "/cf1/camera/image")]
     peers = [
         row

@@ -34,7 +34,7 @@ Solved = tuple[Array, Array, Array]
 
 
 def solve(pair: Pair) -> tuple[Solved, Solved]:
-    """The peer seen by the observer, and the observer seen by the peer."""
+    """Solve a pair: the peer seen by the observer, and the observer seen by the peer."""
     key_s = np.arange(pair.time_s[0], pair.time_s[-1], 1 / KEY_HZ)
     moves = [
         preintegrate(track, pair.time_s).relative_motion(key_s[:-1], key_s[1:])

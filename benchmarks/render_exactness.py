@@ -95,7 +95,7 @@ def reprojection(recipe: str, images: int) -> dict[str, float]:
 
 
 def grain(recipe: str, images: int, backgrounds: Path) -> dict[str, float]:
-    """What light paths leave of noise on robots, and the sensor's own, grey levels of 256.
+    """Measure the noise of light paths on robots, and the sensor's own, grey levels of 256.
 
     Standard deviations, over pixels that a robot covers wholly, of the difference from a picture
     of many paths; the sensor is noiseless but where its noise is told.
@@ -140,7 +140,7 @@ def _noiseless(sensor: Sensor) -> Sensor:
 
 
 def _difference(found: list[Shot], exact: list[Shot]) -> float:
-    """Standard deviation where a robot covers pixels wholly."""
+    """Return the standard deviation where a robot covers pixels wholly."""
     apart = [
         (one.rgb.astype(float) - other.rgb)[(other.opacity == 255).any(axis=0)].ravel()
         for one, other in zip(found, exact, strict=True)

@@ -18,7 +18,7 @@ COLOURS = ("#c0392b", "#1e8449", "#2471a3")
 
 
 def poses(recording: Path, topic: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times (N,) s, places (N, 3) m, and roll, pitch, yaw (N, 3) degrees."""
+    """Return times (N,) s, places (N, 3) m, and roll, pitch, yaw (N, 3) degrees."""
     table = read_table(recording, topic)
     rows = table["pose"].to_pylist()
     place = np.array([[row["position"][n] for n in "xyz"] for row in rows])

@@ -32,13 +32,13 @@ standard error. Exit status: 0 done, 1 an error in one line, 2 a bad command lin
 
 
 def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    """A Markdown table."""
+    """Format a Markdown table."""
     lines = [head, ("---",) * len(head), *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def topics() -> str:
-    """The table of topics, from dmrl/topics.py."""
+    """Format the table of topics, from dmrl/topics.py."""
     rows = [
         (
             f"`{t.pattern.replace('{', '<').replace('}', '>')}`",
@@ -56,7 +56,7 @@ def topics() -> str:
 
 
 def extras() -> str:
-    """The table of extras, from pyproject.toml: what each brings, and for what."""
+    """Format the table of extras, from pyproject.toml."""
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     listed = tomllib.loads(text)["project"]["optional-dependencies"]
     rows = [
@@ -88,7 +88,7 @@ def commands() -> str:
 
 
 def filled(page: Path) -> str:
-    """A page with each part between ``<!-- name -->`` and ``<!-- /name -->`` made again."""
+    """Fill each part of a page between ``<!-- name -->`` and ``<!-- /name -->`` again."""
     text = page.read_text(encoding="utf-8")
     for name, body in (("topics", topics()), ("extras", extras())):
         text = re.sub(

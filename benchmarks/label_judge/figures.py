@@ -127,7 +127,7 @@ def _mahalanobis_squared(error: Array, covariance: Array) -> Array:
 
 
 def _find_words(result: Mapping[str, Any]) -> dict[str, str]:
-    """What was said: causes as the labels give them, or the lines of earlier states."""
+    """Return the causes that the labels name, or the lines of earlier states."""
     inner = result.get("result") or {}
     causes = [cause for pair in inner.get("pairs", ()) for cause in pair.get("causes") or ()]
     sure = [c for c in causes if c.get("probability", 1.0) >= 0.5]

@@ -48,7 +48,7 @@ class Corrected:
     later_ns: int = 0
 
     def earliest_ns(self) -> int:
-        """The first time of all messages, corrected: every robot's own first one counts."""
+        """Return the earliest corrected time, of the first messages of every robot."""
         found = []
         for topic in self.held.topics:
             if topic == topics.TRANSFORMS:  # whose they are stands inside
@@ -77,7 +77,7 @@ class Corrected:
         return self._lacking_ns(self._clock_of(topic, _robot(topic)), time_ns)
 
     def _lacking_ns(self, clock: Clock | None, time_ns: Times) -> Times:
-        """What times lack on the reference's clock. As floats they are exact enough."""
+        """Return the offsets of times to the reference's clock. As floats they are exact enough."""
         if clock is None:
             return np.full(time_ns.shape, self.later_ns)
         elapsed_s = (time_ns - self.held.start_ns) * 1e-9
@@ -85,7 +85,7 @@ class Corrected:
         return np.asarray(self.later_ns + np.rint(lacking_s * 1e9).astype(np.int64))
 
     def _clock_of(self, topic: str, robot: str) -> Clock | None:
-        """What corrects a message's times: its robot's clock, its camera's, or the mocap's."""
+        """Return the clock that corrects a message's times: of robot, camera or motion capture."""
         if topic.startswith(f"/{robot}/camera/") and f"{robot}/camera" in self.clocks:
             return self.clocks[f"{robot}/camera"]
         if MOCAP in self.clocks and (topic == topics.TRANSFORMS or topic.endswith("/truth")):
@@ -93,13 +93,13 @@ class Corrected:
         return self.clocks.get(robot)
 
     def _of_stamped(self, raw: RawMessage) -> RawMessage:
-        """A message that holds its time."""
+        """Correct a message that contains its time."""
         even_ns = self.steady.get(raw.topic, {}).get(raw.time_ns, raw.time_ns)
         shift_ns = int(self._shift_ns(raw.topic, np.array(even_ns)))
         return self._at(raw, even_ns + shift_ns, raw.publish_ns + shift_ns)
 
     def _of_transforms(self, raw: RawMessage) -> RawMessage:
-        """A message of transforms: it is of the robot whose the first frame is."""
+        """Correct a message of transforms by the clock of the robot of its first frame."""
         robot = ""
         if _is_stamped(raw.schema_name):
             frames = parse_message(raw, message_class("FrameTransforms"), self.held.path).transforms
@@ -109,7 +109,7 @@ class Corrected:
         return self._at(raw, raw.time_ns + shift_ns, raw.publish_ns + shift_ns)
 
     def _at(self, raw: RawMessage, time_ns: int, publish_ns: int) -> RawMessage:
-        """The message at another time, its own time set as well, where it has one."""
+        """Return the message at another time; its own time, if it has one, is set as well."""
         data = raw.data
         if time_ns != raw.time_ns and _is_stamped(raw.schema_name):
             name = raw.schema_name.removeprefix("foxglove.")
