@@ -140,7 +140,7 @@ def _separate_paths(paths: Sequence[Path], settings: Settings) -> tuple[Path, li
 
 def _rank_rows(folder: Path, recordings: Sequence[Path], settings: Settings) -> RankedRows:
     """Return the selected rows: by error if a model is given, else in their order."""
-    rows = _read_rows(folder, settings)
+    rows = _load_rows(folder, settings)
     filtered = settings.error_from_px is not None or settings.error_to_px is not None
     if recordings:
         return _rank_by_error(folder, rows, recordings, settings, filtered=filtered)
@@ -154,7 +154,7 @@ def _rank_rows(folder: Path, recordings: Sequence[Path], settings: Settings) -> 
     return RankedRows(rows.take(chosen), len(rows), unknown, unknown, None)
 
 
-def _read_rows(folder: Path, settings: Settings) -> pa.Table:
+def _load_rows(folder: Path, settings: Settings) -> pa.Table:
     """Read the rows of the selected split and robot; of all by default."""
     dataset = open_dataset(folder)
     splits = dataset.splits if settings.split is None else (settings.split,)
@@ -263,7 +263,7 @@ def _draw_rows(
         yield from archetypes.draw_detections(
             eye.detections, frame, mine.to_detections(), eye.width_px
         )
-        maps = mine.read_maps()
+        maps = mine.load_maps()
     yield from archetypes.draw_grids(
         eye.grid, frame, _build_true_maps(batch) if maps is None else maps, scales, smooth=smooth
     )

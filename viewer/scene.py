@@ -195,7 +195,7 @@ def _build_legend(eye: CameraPanel, sources: set[str], named: Mapping[str, Colou
     return draw_legend(eye.robot, colours, eye.width_px, eye.height_px)
 
 
-def read_first_messages(
+def load_first_messages(
     selection: Selection, wanted: Iterable[str], only: Path | None = None
 ) -> dict[str, dict[str, Any]]:
     """Read the first message of each of these topics, if any."""
@@ -228,12 +228,12 @@ def build_camera_panels(
     SourceError
         If no image of a robot can be decoded.
     """
-    grids = read_first_messages(selection, map(topics.GRID, robots), model) if scales else {}
+    grids = load_first_messages(selection, map(topics.GRID, robots), model) if scales else {}
     prefix = "" if model is None else f"/{model.stem}"
     eyes = []
     for robot in robots:
         picture, grid = topics.CAMERA_IMAGE(robot), topics.GRID(robot)
-        width_px, height_px = _read_image_size(selection, picture)
+        width_px, height_px = _find_image_size(selection, picture)
         channels = grids[grid]["channels"] if grid in grids else ()
         eyes.append(
             CameraPanel(
@@ -251,7 +251,7 @@ def build_camera_panels(
     return eyes
 
 
-def _read_image_size(selection: Selection, picture: str) -> tuple[int, int]:
+def _find_image_size(selection: Selection, picture: str) -> tuple[int, int]:
     held = (
         LoadedRecording(path)
         for path, kept in selection.recordings.items()

@@ -108,7 +108,7 @@ def select_recordings(paths: Sequence[Path], settings: Settings) -> Selection:
     layout, robots = _choose_layout(_list_topics(found), names, settings)
     whole = _find_extent(found)
     asked = _parse_span(settings, whole)
-    image_ns = _read_image_times(found, robots, *asked)
+    image_ns = _load_image_times(found, robots, *asked)
     chosen = {r: times[:: settings.every] for r, times in image_ns.items() if times.size}
     lasts = max(asked[0], whole[0]) < min(asked[1], whole[1])
     if not lasts or (layout in IMAGE_LAYOUTS and not chosen):
@@ -238,7 +238,7 @@ def choose_moment_ns(selection: Selection, time_s: float | None) -> int:
     return min(max(selection.start_ns + _to_nanoseconds(time_s), first), end - 1)
 
 
-def _read_image_times(
+def _load_image_times(
     found: Mapping[Path, Summary], robots: Sequence[str], start_ns: int, end_ns: int
 ) -> dict[str, Times]:
     of_topic = {topics.CAMERA_IMAGE(robot): robot for robot in robots}

@@ -14,9 +14,9 @@ from dmrl.card.front_matter import check_license
 from dmrl.card.recording_facts import RecordingFacts, build_facts, read_recording_facts
 from dmrl.datasets.huggingface_metadata import hash_document, write_json_if_changed, write_metadata
 from dmrl.datasets.layout import MANIFEST_FILE
-from dmrl.datasets.manifest import Manifest, part_folder, read_manifest
+from dmrl.datasets.manifest import Manifest, load_manifest, part_folder
 from dmrl.datasets.settings import Settings
-from dmrl.datasets.writing.append import ExistingDataset, open_existing, read_combined_provenance
+from dmrl.datasets.writing.append import ExistingDataset, load_combined_provenance, open_existing
 from dmrl.datasets.writing.builder import (
     has_masks,
     iter_rows,
@@ -24,9 +24,9 @@ from dmrl.datasets.writing.builder import (
     warn_about_other_sources,
     warn_about_unused_flags,
 )
-from dmrl.datasets.writing.corrections import read_corrections
+from dmrl.datasets.writing.corrections import load_corrections
 from dmrl.datasets.writing.dataset_writer import write_shards
-from dmrl.datasets.writing.exclusions import read_flags
+from dmrl.datasets.writing.exclusions import load_flags
 from dmrl.datasets.writing.inputs import warn_about_lenses
 from dmrl.datasets.writing.near_duplicates import ImageHashes
 from dmrl.datasets.writing.parts import assign_splits
@@ -129,7 +129,7 @@ def _write_part(
     sources = {path: one.source for path, one in known.items()}
     warn_about_other_sources(sources, {path: one.others for path, one in known.items()})
     warn_about_lenses([px for one in known.values() for px in one.focal_px])
-    tally, seen = ExclusionCounts(), ImageHashes(before.read_image_hashes())
+    tally, seen = ExclusionCounts(), ImageHashes(before.load_image_hashes())
     found = iter_rows(
         held,
         sources,
@@ -180,16 +180,16 @@ def _assign_splits(
 
 
 def _select_images(settings: Settings) -> RowFilter:
-    flagged = frozenset() if settings.without is None else read_flags(settings.without)
-    corrected = read_corrections(settings.corrections)
+    flagged = frozenset() if settings.without is None else load_flags(settings.without)
+    corrected = load_corrections(settings.corrections)
     return RowFilter(settings.keep_all, settings.masks, flagged, corrected)
 
 
 def _describe(folder: Path) -> None:
     """Write the files that follow from manifest and parts: names, provenance, facts, card."""
-    manifest = read_manifest(folder)
+    manifest = load_manifest(folder)
     assert manifest is not None
-    made = read_combined_provenance(
+    made = load_combined_provenance(
         folder, manifest
     ).to_json()  # a kilobyte for each recording: once
     settings = made["settings"]

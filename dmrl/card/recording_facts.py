@@ -7,7 +7,7 @@ from pathlib import Path
 from dmrl import topics
 from dmrl.card.facts import Facts
 from dmrl.card.sensor_facts import describe_cameras, find_sensor_patterns
-from dmrl.datasets.writing.inputs import read_focal_lengths
+from dmrl.datasets.writing.inputs import find_focal_lengths
 from dmrl.datasets.writing.near_duplicates import ImageHashes
 from dmrl.datasets.writing.rows import (
     ExclusionCounts,
@@ -64,7 +64,7 @@ def read_recording_facts(
             source,
             tuple(sorted(find_label_sources(held) - {source})),
             images,
-            tuple(read_focal_lengths(held)),
+            tuple(find_focal_lengths(held)),
             tuple(find_sensor_patterns(held.topics)),
             tuple(list_label_findings(held)),
             dict(sorted(licences_in(held.summary))),

@@ -10,7 +10,7 @@ import pyarrow as pa
 from dmrl.atomic_output import replace_file
 from dmrl.datasets import layout
 from dmrl.datasets.manifest import Manifest
-from dmrl.datasets.shards import read_schema
+from dmrl.datasets.shards import load_schema
 from dmrl.guards.safe_names import safe_join
 
 
@@ -34,7 +34,7 @@ def write_metadata(
         return
     for name, shards in manifest.splits.items():
         place = safe_join(folder, name, "a split")
-        schema = read_schema(manifest.shard_path(folder, name, shards[0]))
+        schema = load_schema(manifest.shard_path(folder, name, shards[0]))
         write_json_if_changed(place / "state.json", _build_state(manifest, name, fingerprint))
         write_json_if_changed(
             place / "dataset_info.json", _build_info(manifest, name, schema, about)

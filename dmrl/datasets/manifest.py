@@ -77,7 +77,7 @@ def part_folder(folder: Path, number: int) -> Path:
     return folder / PARTS_FOLDER / f"{number:05d}"
 
 
-def read_manifest(folder: Path) -> Manifest | None:
+def load_manifest(folder: Path) -> Manifest | None:
     """Read the manifest of a dataset; None if there is none, as in datasets of other programs.
 
     Raises

@@ -15,7 +15,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dmrl.datasets import layout
-from dmrl.datasets.manifest import Manifest, read_manifest
+from dmrl.datasets.manifest import Manifest, load_manifest
 from dmrl.datasets.shards import open_shard
 from dmrl.errors import DatasetError, MissingSplit
 from dmrl.geometry.frames import STRIDE_PX
@@ -215,12 +215,12 @@ class Dataset:
             return [(self.manifest.shard_path(self.path, name, shard), shard.rows) for shard in own]
         return self._find_parquet_shards(name) if self.parquet else self._read_arrow_shards(name)
 
-    def _read_arrow_shards(self, name: str) -> list[tuple[Path, int | None]]:
+    def _find_arrow_shards(self, name: str) -> list[tuple[Path, int | None]]:
         folder = safe_join(self.path, name, f"{self.path}: a split")
         state, about = folder / "state.json", folder / "dataset_info.json"
         try:
-            files = [str(item["filename"]) for item in _read_json(state)["_data_files"]]
-            info = (_read_json(about).get("splits") or {}).get(name, {})
+            files = [str(item["filename"]) for item in _load_json(state)["_data_files"]]
+            info = (_load_json(about).get("splits") or {}).get(name, {})
             rows = info.get("shard_lengths") or [None] * len(files)
             named = list(zip(files, rows, strict=True))
             if len(set(files)) < len(files):
@@ -262,12 +262,12 @@ def open_dataset(path: Path) -> Dataset:
     """
     require_text_path(path)
     refuse_pipes(path)
-    manifest = read_manifest(path)
+    manifest = load_manifest(path)
     if manifest is not None and manifest.splits:
         return Dataset(path, tuple(manifest.splits), manifest.parquet, manifest)
     parquet = not (path / "dataset_dict.json").is_file()
     if not parquet:
-        splits = _read_split_names(path / "dataset_dict.json")
+        splits = _load_split_names(path / "dataset_dict.json")
     else:
         splits = tuple(sorted({split for split, _, _ in _parse_parquet_names(path)}, reverse=True))
     if not splits:
@@ -278,8 +278,8 @@ def open_dataset(path: Path) -> Dataset:
     )
 
 
-def _read_split_names(file: Path) -> tuple[str, ...]:
-    said = _read_json(file)
+def _load_split_names(file: Path) -> tuple[str, ...]:
+    said = _load_json(file)
     found = said.get("splits") if isinstance(said, dict) else None
     if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
         raise DatasetError(f"{file} has no list of splits. Make the dataset again")
@@ -293,7 +293,7 @@ def _parse_parquet_names(folder: Path) -> list[tuple[str, int, int]]:
     return [(m["split"], int(m["index"]), int(m["count"])) for m in matches if m]
 
 
-def _read_json(path: Path) -> Any:
+def _load_json(path: Path) -> Any:
     try:
         return parse_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

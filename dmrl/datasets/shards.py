@@ -53,7 +53,7 @@ def open_shard(path: Path, rows: int | None) -> pa.Table:
     return table.select([name for name in table.schema.names if name in layout.COLUMN_NAMES])
 
 
-def read_schema(path: Path) -> pa.Schema:
+def load_schema(path: Path) -> pa.Schema:
     """Read the columns of a shard from its header alone.
 
     Raises

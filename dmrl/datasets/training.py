@@ -32,11 +32,11 @@ with optional_imports("train", "dmrl train"):
     from dmrl.learn.inference.loaded_model import (
         PUBLISHED_THRESHOLD,
         Model,
+        assign_weights,
         get_weights,
         interpolate_weights,
         load_model,
         save_model,
-        set_weights,
         transfer_weights,
     )
     from dmrl.learn.inference.threshold import (
@@ -265,7 +265,7 @@ def _build_network(settings: TrainConfig, examples: ExampleSet, init: Path | Non
                 f"{init} is a {known.architecture}, not the {settings.architecture} to train. "
                 f'Set architecture = "{known.architecture}" in the recipe, or give another --init'
             )
-        set_weights(network, transfer_weights(known.network, network), init)
+        assign_weights(network, transfer_weights(known.network, network), init)
     return network
 
 

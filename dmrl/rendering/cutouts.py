@@ -43,7 +43,7 @@ class Cutout:
     width_px: int
 
 
-def read_cutout(path: Path) -> Cutout:
+def load_cutout(path: Path) -> Cutout:
     """Read a PNG with alpha whose visible part is one robot.
 
     Raises
@@ -79,7 +79,7 @@ def open_cutouts(folder: Path) -> list[Cutout]:
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".png")
     if not paths:
         raise SettingError(f"{folder} contains no PNG. Save robots with alpha there, or use others")
-    return [read_cutout(path) for path in paths]
+    return [load_cutout(path) for path in paths]
 
 
 class CutoutRenderer:

@@ -133,7 +133,7 @@ class SketchedPlace:
             rng = np.random.default_rng(one.key)
             seen = replace(
                 look,
-                background=_cut_window(walls, camera, one.here),
+                background=_crop_walls(walls, camera, one.here),
                 light_camera=one.here.body_from_world @ look.light_camera,
                 blade_rad=rng.uniform(0, np.pi),
                 noise=random_noise(rng, camera),
@@ -150,7 +150,7 @@ class SketchedPlace:
         return np.concatenate(walls + walls[:again], axis=1), random_look(rng, camera)
 
 
-def _cut_window(walls: Levels, camera: Camera, here: RobotPose) -> Levels:
+def _crop_walls(walls: Levels, camera: Camera, here: RobotPose) -> Levels:
     """Return the part of the walls that a robot sees: its columns by yaw, its rows by pitch."""
     around_px = WALLS * round(2 * np.pi * camera.fx_px / WALLS)
     left = round(-here.yaw_rad * camera.fx_px) % around_px

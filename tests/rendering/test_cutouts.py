@@ -12,7 +12,7 @@ from dmrl.geometry.camera_file import find_camera
 from dmrl.images.codec import decode, encode_png
 from dmrl.recording import iter_columns, read
 from dmrl.render_recording import read_render_settings, render_recording
-from dmrl.rendering.cutouts import match_backdrop, open_cutouts, read_cutout
+from dmrl.rendering.cutouts import load_cutout, match_backdrop, open_cutouts
 
 CUTOUTS = Path(__file__).parents[3] / "shared/data/cutouts"
 WIDTH_M = 0.2
@@ -106,13 +106,13 @@ def test_invalid_cutouts_are_refused(tmp_path: Path, folders: tuple[Path, Path])
     with pytest.raises(SettingError, match="no PNG"):
         open_cutouts(tmp_path)
     with pytest.raises(SourceError, match="no alpha"):
-        read_cutout(photos / "0.png")
+        load_cutout(photos / "0.png")
     Image.fromarray(np.zeros((9, 9, 4), np.uint8)).save(tmp_path / "clear.png")
     with pytest.raises(SourceError, match="transparent everywhere"):
-        read_cutout(tmp_path / "clear.png")
+        load_cutout(tmp_path / "clear.png")
     (tmp_path / "torn.png").write_bytes((cutouts / "cross.png").read_bytes()[:60])
     with pytest.raises(DmrlError, match="torn"):
-        read_cutout(tmp_path / "torn.png")
+        load_cutout(tmp_path / "torn.png")
 
 
 def test_real_cutouts_are_read() -> None:

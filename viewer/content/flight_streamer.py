@@ -22,9 +22,9 @@ from dmrl.viewer.content.robot_motion import (
     Timed,
     Times,
     concatenate_parts,
-    read_poses,
-    read_positions,
-    read_ranges,
+    parse_poses,
+    parse_positions,
+    parse_ranges,
     select_rows,
 )
 from dmrl.viewer.drawing import space, time_plots
@@ -152,13 +152,13 @@ class FlightStreamer:
     def draw_batch(self, stretch: Mapping[str, pa.RecordBatch]) -> Iterator[Rows]:
         """Yield the rows that can be drawn after another batch."""
         if topics.TRANSFORMS in stretch:
-            yield from self._draw_frames(read_poses(stretch[topics.TRANSFORMS]))
+            yield from self._draw_frames(parse_poses(stretch[topics.TRANSFORMS]))
         fresh: dict[str, Timed] = {}
         for topic in self._ranges & stretch.keys():
-            fresh[topic] = read_ranges(stretch[topic])
+            fresh[topic] = parse_ranges(stretch[topic])
         for topic, (pair, source, heard) in self._positions.items():
             if topic in stretch:
-                positions = fresh[topic] = read_positions(stretch[topic])
+                positions = fresh[topic] = parse_positions(stretch[topic])
                 heard.add_part(positions)
                 for entity in _draw_positions(topic, pair, positions, source):
                     yield positions.time_ns, entity

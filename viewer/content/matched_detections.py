@@ -50,7 +50,7 @@ class MatchedDetections:
         (batch,) = every.take(self.place % len(every)).combine_chunks().to_batches()
         return batch
 
-    def read_maps(self) -> pa.RecordBatch | None:
+    def load_maps(self) -> pa.RecordBatch | None:
         """Read the columns of GridMap; None unless every row has one."""
         if any(where is None for where in self.where):
             return None

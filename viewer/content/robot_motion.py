@@ -164,22 +164,22 @@ def sample_motion(
     held: dict[str, dict[Names, Positions]] = {"estimates": {}, "truths": {}}
     for topic, (kind, pair) in kinds.items():
         if topic in found:
-            held[kind][pair] = concatenate_parts([read_positions(batch) for batch in found[topic]])
+            held[kind][pair] = concatenate_parts([parse_positions(batch) for batch in found[topic]])
     poses: dict[str, list[Poses]] = {}
     for batch in found.get(topics.TRANSFORMS, ()):
-        for frame, part in read_poses(batch).items():
+        for frame, part in parse_poses(batch).items():
             poses.setdefault(frame, []).append(part)
     return FlightMotion({frame: concatenate_parts(parts) for frame, parts in poses.items()}, **held)
 
 
-def read_poses(batch: pa.RecordBatch) -> dict[str, Poses]:
+def parse_poses(batch: pa.RecordBatch) -> dict[str, Poses]:
     """Read the poses by frame from columns of foxglove.FrameTransforms."""
     column = batch["transforms"]
     rows = np.repeat(np.arange(len(column)), column.value_lengths().to_numpy())
     parts = column.flatten()
     time_ns = batch["log_time"].to_numpy()[rows]
-    xyz = read_vectors(parts.field("translation"), "xyz")
-    xyzw = read_vectors(parts.field("rotation"), "xyzw")
+    xyz = parse_vectors(parts.field("translation"), "xyz")
+    xyzw = parse_vectors(parts.field("rotation"), "xyzw")
     children = parts.field("child_frame_id").to_numpy(zero_copy_only=False)
     out = {}
     for frame in dict.fromkeys(children):
@@ -200,20 +200,20 @@ def _mask_undrawable(values: Array) -> Array:
     return np.where(abs(values) < MAX_DRAWN, values, np.nan)
 
 
-def read_positions(batch: pa.RecordBatch) -> Positions:
+def parse_positions(batch: pa.RecordBatch) -> Positions:
     """Read the columns of PeerPosition."""
     xyz = np.stack([batch[axis].to_numpy() for axis in "xyz"], axis=1)
-    covariance = read_covariances(batch["covariance"])
+    covariance = parse_covariances(batch["covariance"])
     time_ns, status = (batch[name].to_numpy() for name in ("log_time", "status"))
     return Positions(time_ns, _mask_undrawable(xyz), covariance, status)
 
 
-def read_ranges(batch: pa.RecordBatch) -> Ranges:
+def parse_ranges(batch: pa.RecordBatch) -> Ranges:
     """Read the columns of UwbRange."""
     return Ranges(batch["log_time"].to_numpy(), _mask_undrawable(batch["range_m"].to_numpy()))
 
 
-def read_covariances(column: pa.ListArray) -> Array:
+def parse_covariances(column: pa.ListArray) -> Array:
     """Read a list column of covariances, (N, 3, 3); NaN where missing."""
     given = column.value_lengths().to_numpy() == 9
     out = np.full((len(column), 3, 3), np.nan)
@@ -221,6 +221,6 @@ def read_covariances(column: pa.ListArray) -> Array:
     return _mask_undrawable(out)
 
 
-def read_vectors(column: pa.StructArray, axes: str) -> Array:
+def parse_vectors(column: pa.StructArray, axes: str) -> Array:
     """Read these fields of a column of structs, (N, k); NaN where too large to draw."""
     return _mask_undrawable(np.stack([column.field(axis).to_numpy() for axis in axes], axis=1))

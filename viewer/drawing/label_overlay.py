@@ -74,7 +74,7 @@ class _SourceLabels:
 
     def iter_entities(self, path: str, source: str) -> Iterator[Entity]:
         dot, dust, outline, curve = _label_styles(source)
-        boxed, corners = _read_boxes(self.peers)
+        boxed, corners = _parse_boxes(self.peers)
         centres = corners.mean(axis=1)
         uv_px = points_px(self.peers)
 
@@ -105,7 +105,7 @@ class _SourceLabels:
         return columns.partition(np.bincount(row_of, minlength=self.rows))
 
 
-def _read_boxes(peers: pa.StructArray) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def _parse_boxes(peers: pa.StructArray) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Return which labels have a box, (N,), and the corners of those, (M, 2, 2)."""
     edges = peers.field("box_px")
     boxed = edges.value_lengths().to_numpy() == 4
@@ -114,7 +114,7 @@ def _read_boxes(peers: pa.StructArray) -> tuple[NDArray[np.bool_], NDArray[np.fl
 
 def _top_centres(peers: pa.StructArray) -> NDArray[np.float64]:
     """Return the middle of the upper edge of each label's box, (N, 2); without a box, the label."""
-    boxed, corners = _read_boxes(peers)
+    boxed, corners = _parse_boxes(peers)
     out = points_px(peers)
     out[boxed] = np.column_stack([corners.mean(axis=1)[:, 0], corners[:, 0, 1]])
     return out

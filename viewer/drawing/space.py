@@ -21,8 +21,8 @@ from dmrl.viewer.content.robot_motion import (
     Poses,
     Positions,
     Ranges,
-    read_covariances,
-    read_vectors,
+    parse_covariances,
+    parse_vectors,
 )
 from dmrl.viewer.drawing.entity import (
     ELLIPSE_SIGMAS,
@@ -227,7 +227,7 @@ def draw_tracks(path: str, robot: str, batch: pa.RecordBatch) -> Iterator[Entity
     column, frame = batch["tracks"], horizontal_frame(robot)
     lengths = column.value_lengths().to_numpy()
     found = column.flatten()
-    xyz = read_vectors(found, "xyz")
+    xyz = parse_vectors(found, "xyz")
     velocity = np.stack([found.field(f"v{axis}_mps").to_numpy() for axis in "xyz"], axis=1)
     names = [
         f"{peer or 'track'} {number}"
@@ -244,5 +244,5 @@ def draw_tracks(path: str, robot: str, batch: pa.RecordBatch) -> Iterator[Entity
     thin = rr.Arrows3D.from_fields(colors=[colour], radii=[LINE_UI])
     yield Entity(f"{path}/velocity", arrows, (thin,), frame)
     colours = np.full((len(xyz), 3), colour, np.uint8)
-    covariance = read_covariances(found.field("covariance"))
+    covariance = parse_covariances(found.field("covariance"))
     yield from _draw_ellipsoids(f"{path}/covariance", frame, xyz, covariance, colours, lengths)

@@ -29,7 +29,7 @@ from dmrl.viewer.scene import (
     build_colour_bars,
     build_image_rules,
     build_model_rules,
-    read_first_messages,
+    load_first_messages,
 )
 from dmrl.viewer.selection import MAX_PAIRS, Selection
 from dmrl.viewer.settings import Settings
@@ -130,7 +130,7 @@ def _iter_static_entities(
 ) -> Iterator[Entity]:
     """Yield the bodies of robots, and the fixed frames below those of /tf."""
     present = selection.topics
-    calibrations = read_first_messages(selection, map(topics.CALIBRATION, robots))
+    calibrations = load_first_messages(selection, map(topics.CALIBRATION, robots))
     for robot in robots:
         if camera_frame(robot) not in seen.poses and topics.ATTITUDE(robot) not in present:
             yield space.build_fixed_frame(camera_frame(robot), horizontal_frame(robot))

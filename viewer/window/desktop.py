@@ -59,7 +59,7 @@ def show_in_window(paths: Sequence[Path], settings: Settings) -> None:
             if wait_until_listening(viewer, LOOPBACK, port):
                 stream_to(show, viewer, port)
             viewer.wait()
-        said = viewer.read_errors()
+        said = viewer.collect_errors()
     if viewer.ended.is_set():
         return
     if NO_SCREEN_MESSAGE in said:
@@ -150,7 +150,7 @@ def _take_screenshot(show: Show) -> bytes:
         with run_viewer(build_command(LOOPBACK, *where)) as viewer:
             if picture := _wait_for_screenshot(show, viewer, port):
                 return _crop_top_bar(picture)
-            said = viewer.read_errors()
+            said = viewer.collect_errors()
     if NO_VULKAN_MESSAGE in said:
         raise _ViewerStopped("no Vulkan driver. Install one: apt-get install mesa-vulkan-drivers")
     raise _ViewerStopped(f"rerun's viewer stopped: {last_line(said)}. Try: dmrl view --save")

@@ -171,7 +171,8 @@ def _load_viewer_files() -> dict[str, bytes]:
     with run_viewer(build_command(LOOPBACK, *words)) as viewer:
         if not wait_until_listening(viewer, LOOPBACK, port):
             raise SettingError(
-                f"rerun's viewer stopped: {last_line(viewer.read_errors())}. Try: dmrl view --save"
+                f"rerun's viewer stopped: {last_line(viewer.collect_errors())}. "
+                "Try: dmrl view --save"
             )
         direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         files = {}

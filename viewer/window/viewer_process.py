@@ -60,7 +60,7 @@ class ViewerProcess:
         while self.wanted:
             self.ended.wait(POLL_INTERVAL_S)
 
-    def read_errors(self) -> str:
+    def collect_errors(self) -> str:
         """Read its messages on standard error."""
         self._errors.seek(0)
         return self._errors.read().decode(errors="replace")

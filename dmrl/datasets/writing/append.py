@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.datasets import layout
-from dmrl.datasets.manifest import PARTS_FOLDER, Manifest, part_folder, read_manifest
-from dmrl.datasets.shards import read_schema
-from dmrl.datasets.writing.near_duplicates import read_hashes
+from dmrl.datasets.manifest import PARTS_FOLDER, Manifest, load_manifest, part_folder
+from dmrl.datasets.shards import load_schema
+from dmrl.datasets.writing.near_duplicates import load_hashes
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.recording import Input, Provenance
@@ -43,7 +43,7 @@ class ExistingDataset:
         """Files that the dataset was made from."""
         return self.made.inputs if self.made is not None else ()
 
-    def read_image_hashes(self) -> list[NDArray[np.void]]:
+    def load_image_hashes(self) -> list[NDArray[np.void]]:
         """Read the hashes of its images, one array per part.
 
         Raises
@@ -53,7 +53,7 @@ class ExistingDataset:
         """
         if self.folder is None:
             return []
-        found = [read_hashes(part_folder(self.folder, k)) for k in range(self.manifest.parts)]
+        found = [load_hashes(part_folder(self.folder, k)) for k in range(self.manifest.parts)]
         if sum(map(len, found)) != sum(map(self.manifest.count_rows, self.manifest.splits)):
             raise DatasetError(
                 f"{self.folder / PARTS_FOLDER} has hashes of {sum(map(len, found))} images, which "
@@ -71,19 +71,19 @@ def open_existing(folder: Path) -> ExistingDataset:
     DatasetError
         If the folder is no dataset, is damaged, or was made by a dmrl that wrote no manifest.
     """
-    manifest = read_manifest(folder)
+    manifest = load_manifest(folder)
     if manifest is None or not manifest.parts or not any(manifest.splits.values()):
         raise DatasetError(
             f"{folder} cannot be extended: it has no {layout.MANIFEST_FILE}. Make it again "
             "with dmrl dataset, without --add"
         )
     split, shards = next(one for one in manifest.splits.items() if one[1])
-    grid = read_schema(manifest.shard_path(folder, split, shards[0])).field(layout.CONFIDENCE).type
+    grid = load_schema(manifest.shard_path(folder, split, shards[0])).field(layout.CONFIDENCE).type
     size_px = grid.value_type.list_size * STRIDE_PX, grid.list_size * STRIDE_PX
-    return ExistingDataset(folder, manifest, read_combined_provenance(folder, manifest), size_px)
+    return ExistingDataset(folder, manifest, load_combined_provenance(folder, manifest), size_px)
 
 
-def read_combined_provenance(folder: Path, manifest: Manifest) -> Provenance:
+def load_combined_provenance(folder: Path, manifest: Manifest) -> Provenance:
     """Read the provenance of a dataset: settings of its creation, inputs of all parts.
 
     Raises

@@ -6,9 +6,9 @@ from pathlib import Path
 from dmrl import topics
 from dmrl.datasets.manifest import Manifest
 from dmrl.datasets.settings import Settings
-from dmrl.datasets.writing.corrections import read_corrections
+from dmrl.datasets.writing.corrections import load_corrections
 from dmrl.datasets.writing.dataset_writer import Row
-from dmrl.datasets.writing.exclusions import read_flags
+from dmrl.datasets.writing.exclusions import load_flags
 from dmrl.datasets.writing.rows import ExclusionCounts, RowFilter, iter_row_builders
 from dmrl.datasets.writing.splits import SplitLookup
 from dmrl.errors import RecordingError, SourceError
@@ -111,11 +111,11 @@ def require_same_size(path: Path, row: Row, size_px: tuple[int, int]) -> None:
 def warn_about_unused_flags(settings: Settings, tally: ExclusionCounts) -> None:
     """Report flags that match no image: they may belong to another recording."""
     if settings.without is not None:
-        flags = len(read_flags(settings.without))
+        flags = len(load_flags(settings.without))
         if flags > tally.flagged:
             say(f"{settings.without}: {flags - tally.flagged} of {flags} flags name no image here")
     if settings.corrections:
-        count = len(read_corrections(settings.corrections))
+        count = len(load_corrections(settings.corrections))
         say(f"labels of {tally.corrected} images are corrected by hand")
         if count > tally.corrected:
             say(f"{count - tally.corrected} of {count} corrections name no image here")

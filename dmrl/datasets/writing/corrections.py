@@ -19,7 +19,7 @@ Corrections = Mapping[FlaggedImage, Sequence[Any]]
 """PeerLabel messages of each corrected image."""
 
 
-def read_corrections(paths: Sequence[Path]) -> Corrections:
+def load_corrections(paths: Sequence[Path]) -> Corrections:
     """Read the corrected labels of all images.
 
     Raises

@@ -20,7 +20,7 @@ FlaggedImage = tuple[str, str, int]
 """File name of a recording, robot whose camera took the image, log time in nanoseconds."""
 
 
-def read_flags(path: Path) -> frozenset[FlaggedImage]:
+def load_flags(path: Path) -> frozenset[FlaggedImage]:
     """Read the flagged images.
 
     Raises

@@ -55,7 +55,7 @@ def _iter_source_hashes(recording: Input) -> Iterator[str]:
             yield from _iter_source_hashes(source)
 
 
-def read_focal_lengths(held: LoadedRecording) -> list[float]:
+def find_focal_lengths(held: LoadedRecording) -> list[float]:
     """Return the focal lengths of a recording's calibrated cameras, pixels."""
     found = []
     for topic in held.topics:

@@ -69,7 +69,7 @@ class ImageHashes:
     Parameters
     ----------
     before
-        Hashes of the existing images, from `read_hashes`.
+        Hashes of the existing images, from `load_hashes`.
     """
 
     def __init__(self, before: Sequence[NDArray[np.void]] = ()) -> None:
@@ -159,7 +159,7 @@ class ImageHashes:
         (folder / HASHES_FILE).write_bytes(self._collect_added().tobytes())
 
 
-def read_hashes(folder: Path) -> NDArray[np.void]:
+def load_hashes(folder: Path) -> NDArray[np.void]:
     """Map the hashes that `ImageHashes.write` wrote.
 
     Raises

@@ -225,7 +225,9 @@ def iter_labelled_images(
     labels = _group_labels(held)
     wanted = [t for t in held.topics if topics.parse_topic(topics.CAMERA_IMAGE, t)]
     wanted += [t for t in held.topics if masks and topics.parse_topic(topics.MASKS, t)]
-    for _, same_time in groupby(_read_once(held.path, wanted), key=lambda stamped: stamped.time_ns):
+    for _, same_time in groupby(
+        _iter_stamped(held.path, wanted), key=lambda stamped: stamped.time_ns
+    ):
         images: list[Stamped] = []
         covered: dict[str, Stamped] = {}
         for stamped in same_time:
@@ -240,7 +242,7 @@ def iter_labelled_images(
             yield image, seen, covered.get(robot)
 
 
-def _read_once(path: Path, wanted: list[str]) -> Iterator[Stamped]:
+def _iter_stamped(path: Path, wanted: list[str]) -> Iterator[Stamped]:
     with share_file(path):
         yield from read(path, *wanted)
 

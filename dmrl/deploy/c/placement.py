@@ -75,7 +75,7 @@ class Placement:
             places["net->zeros"] = 0
         return places
 
-    def staged(self, step: Step) -> dict[str, StagedBuffer]:
+    def stage_buffers(self, step: Step) -> dict[str, StagedBuffer]:
         """Return the content of the scratch buffer of a step: its tables, and rows of far rings.
 
         Returns
@@ -109,7 +109,7 @@ class Placement:
     @property
     def stage_bytes(self) -> int:
         """Bytes of the scratch buffer; 0 with one memory."""
-        ends = (item.end for step in self.plan.steps for item in self.staged(step).values())
+        ends = (item.end for step in self.plan.steps for item in self.stage_buffers(step).values())
         return max(ends, default=0)
 
     @property
@@ -123,7 +123,7 @@ class Placement:
         return sum(
             item.size_bytes * item.count * self.plan.output_of(step).rows
             for step in self.plan.steps
-            for item in self.staged(step).values()
+            for item in self.stage_buffers(step).values()
         )
 
     def near_bytes(self, *, bayer: bool) -> int:

@@ -78,7 +78,7 @@ def _require_sizes(graph: Any, most_bytes: int) -> None:
     constants = set(shapes)
     sizes = {one.name: _count_bytes(one.data_type, one.dims) for one in graph.initializer}
     for value in (*graph.input, *graph.value_info, *graph.output):
-        shape = _read_shape(value)
+        shape = _parse_shape(value)
         shapes.setdefault(value.name, shape)
         sizes.setdefault(value.name, _count_bytes(value.type.tensor_type.elem_type, shape))
     last_use = {name: k for k, node in enumerate(graph.node) for name in node.input}
@@ -103,7 +103,7 @@ def _require_sizes(graph: Any, most_bytes: int) -> None:
         living -= sum(sizes[name] for name in ended if name not in constants)
 
 
-def _read_shape(value: Any) -> list[int]:
+def _parse_shape(value: Any) -> list[int]:
     """Return the sides of a tensor.
 
     Raises

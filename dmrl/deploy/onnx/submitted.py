@@ -74,9 +74,9 @@ class SubmittedNetwork:
             for name, value in zip(self.names, values, strict=True)
         }
         grid = (image.shape[0] // STRIDE_PX, image.shape[1] // STRIDE_PX)
-        return _read_maps(found, grid) or self._read_boxes(found, grid)
+        return _maps_to_grids(found, grid) or self._boxes_to_grids(found, grid)
 
-    def _read_boxes(
+    def _boxes_to_grids(
         self, found: dict[str, Array], grid: tuple[int, int]
     ) -> tuple[Array, Array, Array]:
         """Return boxes as grids: each in the cell of its centre, the best one of a cell."""
@@ -110,7 +110,9 @@ class SubmittedNetwork:
         return ModelError(f"{self._file} has {said}. It needs {wanted}; see docs/benchmark.md")
 
 
-def _read_maps(found: dict[str, Array], grid: tuple[int, int]) -> tuple[Array, Array, Array] | None:
+def _maps_to_grids(
+    found: dict[str, Array], grid: tuple[int, int]
+) -> tuple[Array, Array, Array] | None:
     """Return confidence, depth and offset, if the outputs are maps of this size."""
     maps = {name: value.reshape(grid) for name, value in found.items()
             if value.shape[-2:] == grid and value.size == grid[0] * grid[1]}  # fmt: skip

@@ -254,7 +254,7 @@ def _error_metrics(
             result: Array = (by @ values) / by.sum(axis=1)
             return result
 
-        def explained(errors: Array, values: Array, by: Array) -> Array:
+        def r_squared(errors: Array, values: Array, by: Array) -> Array:
             """Return R2: the share of the labels' variance that detections explain."""
             variance = mean(values**2, by) - mean(values, by) ** 2
             result: Array = 1 - mean(errors**2, by) / variance
@@ -274,9 +274,9 @@ def _error_metrics(
             "bias_v_px": compute_weighted_quantile(error.v_px[inside][found], matched, 0.5),
             "depth_mae_m": mean(np.abs(depth_m), by_depth),
             "depth_rmse_m": np.sqrt(mean(depth_m**2, by_depth)),
-            "r2_u": explained(error.u_px[inside][found], labels.u_px[found], matched),
-            "r2_v": explained(error.v_px[inside][found], labels.v_px[found], matched),
-            "r2_depth": explained(depth_m, labels.depth_m[known], by_depth),
+            "r2_u": r_squared(error.u_px[inside][found], labels.u_px[found], matched),
+            "r2_v": r_squared(error.v_px[inside][found], labels.v_px[found], matched),
+            "r2_depth": r_squared(depth_m, labels.depth_m[known], by_depth),
         }
 
 

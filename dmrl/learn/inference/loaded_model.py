@@ -164,7 +164,7 @@ def transfer_weights(known: Network, network: Network) -> dict[str, Tensor]:
     return weights
 
 
-def set_weights(network: Network, weights: dict[str, Tensor], where: object) -> None:
+def assign_weights(network: Network, weights: dict[str, Tensor], where: object) -> None:
     """Copy weights into a network.
 
     Raises
@@ -245,7 +245,7 @@ def load_model(path: Path) -> Model:
         head = stream.read(16)
     if head.startswith(b"\x89HDF\r\n\x1a\n"):
         network = build_network("locanet")
-        set_weights(network, load_keras_weights(path), path)
+        assign_weights(network, load_keras_weights(path), path)
         return Model(network.eval(), "locanet", path.name)
     if head[4:9] != b"\0\0\0\0{":
         if head.startswith((b"PK\x03\x04", b"\x80")):
@@ -261,13 +261,13 @@ def _load_safetensors(weights: Path, description: Path, name: str) -> Model:
     for file in (weights, description):
         if not file.is_file():
             raise ModelError(f"no {file.name} in {file.parent}. Give a run folder of dmrl train")
-    said = _read_description(description)
+    said = _load_description(description)
     network = build_network(said["architecture"], extra=_extra_channels(said, description))
     try:
         tensors = load_file(weights)
     except (SafetensorError, OSError) as e:
         raise ModelError(f"{weights} is damaged: {e}. Copy it again or train again") from None
-    set_weights(network, tensors, weights)
+    assign_weights(network, tensors, weights)
     known = ("width_px", "height_px", "threshold", "label_source", "training")
     fields = {k: said[k] for k in known} | {"rates": said.get("rates")}
     return Model(network.eval(), said["architecture"], name, **fields)
@@ -285,7 +285,7 @@ def _extra_channels(said: dict[str, Any], path: Path) -> list[str]:
     return wanted
 
 
-def _read_description(path: Path) -> dict[str, Any]:
+def _load_description(path: Path) -> dict[str, Any]:
     kinds: dict[str, type | tuple[type, ...]] = {
         "architecture": str,
         "width_px": int,

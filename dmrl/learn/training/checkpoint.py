@@ -19,7 +19,7 @@ from torch.optim import Optimizer
 from dmrl.errors import ModelError, SettingError
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.safe_names import safe_join
-from dmrl.learn.inference.loaded_model import get_weights, set_weights, write_tensors
+from dmrl.learn.inference.loaded_model import assign_weights, get_weights, write_tensors
 from dmrl.learn.networks.architectures import Network
 
 CHECKPOINT_NAME = "checkpoint.json"
@@ -96,7 +96,7 @@ def load_checkpoint(
         for role, network in networks.items():
             start = f"{role}."
             mine = {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
-            set_weights(network, mine, folder)
+            assign_weights(network, mine, folder)
         _load_optimizer_state(optimizer, tensors)
     except (ValueError, LookupError, TypeError, RuntimeError, OSError, SafetensorError) as e:
         raise ModelError(

@@ -191,7 +191,7 @@ class Trainer:
             for epoch in range(first, self._settings.epochs):
                 left = self._settings.epochs - epoch
                 frozen = left <= self._settings.frozen_norm_epochs
-                _set_train_mode(self._learning, frozen_norms=frozen)
+                _switch_to_training(self._learning, frozen_norms=frozen)
                 said = yield from self._train_epoch(epoch, board)
                 self._learning.eval()
                 if self._validation is not None and self._group.is_main:
@@ -303,7 +303,7 @@ def _keep_freed_memory() -> None:
         mallopt(M_MMAP_THRESHOLD, 2**31 - 1)
 
 
-def _set_train_mode(network: Network, *, frozen_norms: bool) -> None:
+def _switch_to_training(network: Network, *, frozen_norms: bool) -> None:
     """Set train mode; with frozen norms, batch normalisation keeps its running statistics."""
     network.train()
     if frozen_norms:

@@ -61,7 +61,7 @@ class Passes:
                 return {"light": _captured["Combined"], "depth": _captured["Depth"][..., 0]}
             self._use_files()
         bpy.ops.render.render()
-        light, depth = (_read_exr(self._path(name)) for name in CHANNELS)
+        light, depth = (_load_exr(self._path(name)) for name in CHANNELS)
         return {"light": light, "depth": depth[..., 0].copy()}
 
     def _use_files(self):
@@ -84,7 +84,7 @@ class Passes:
         return Path(self.folder.name) / f"{name}{self.scene.frame_current:04d}.exr"
 
 
-def _read_exr(path):
+def _load_exr(path):
     image = bpy.data.images.load(str(path))
     try:
         width, height = image.size

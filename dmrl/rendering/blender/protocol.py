@@ -45,17 +45,17 @@ def receive(stream: IO[bytes]) -> tuple[dict[str, Any], Arrays]:
     EOFError
         If the other side closed the pipe.
     """
-    (length,) = _LENGTH.unpack(_read_exactly(stream, _LENGTH.size))
-    message = json.loads(_read_exactly(stream, length))
+    (length,) = _LENGTH.unpack(_receive_exactly(stream, _LENGTH.size))
+    message = json.loads(_receive_exactly(stream, length))
     arrays: Arrays = {}
     for name, (dtype, shape) in message["arrays"].items():
         kind = np.dtype(dtype)
-        data = _read_exactly(stream, kind.itemsize * int(np.prod(shape)))
+        data = _receive_exactly(stream, kind.itemsize * int(np.prod(shape)))
         arrays[name] = np.frombuffer(data, kind).reshape(shape)
     return message["head"], arrays
 
 
-def _read_exactly(stream: IO[bytes], count: int) -> bytes:
+def _receive_exactly(stream: IO[bytes], count: int) -> bytes:
     data = b""
     while len(data) < count:
         part = stream.read(count - len(data))

@@ -96,7 +96,7 @@ class RenderScene:
         self.scene.collection.objects.link(thing)
         return thing
 
-    def read_vertices(self):
+    def get_vertices(self):
         """Return the (N, 3) vertices of the robot."""
         found = np.empty(3 * len(self.robot.data.vertices), np.float32)
         self.robot.data.vertices.foreach_get("co", found)
@@ -160,7 +160,7 @@ def main():
                 why = " ".join(str(error).split())
                 send(answers, {"error": f"{head['model']} is no model that Blender reads: {why}"})
                 return
-            send(answers, {"version": bpy.app.version_string}, {"points": stage.read_vertices()})
+            send(answers, {"version": bpy.app.version_string}, {"points": stage.get_vertices()})
         elif "panorama" in head:
             send(answers, {}, {"panorama": load_panorama(head["panorama"])})
         else:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from dmrl.geometry.frames import Array
-from dmrl.rendering.robots.primitives import MOTOR_ANGLES_RAD, ROTOR, Part, read_design
+from dmrl.rendering.robots.primitives import MOTOR_ANGLES_RAD, ROTOR, Part, load_design
 
 ARM_M = 0.046
 ROTOR_RADIUS_M = 0.0225
@@ -32,7 +32,7 @@ def _rotor_parts() -> Iterator[Part]:
         yield "rotor", np.column_stack([points, np.full(sides + 1, ROTOR_Z_M)]), fan
 
 
-CRAZYFLIE = read_design("crazyflie", _rotor_parts)
+CRAZYFLIE = load_design("crazyflie", _rotor_parts)
 
 
 def outline_points(scale: float, first_rad: float, sweep_rad: float) -> Array:

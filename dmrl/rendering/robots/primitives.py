@@ -172,7 +172,7 @@ MAKERS: Mapping[str, Callable[..., Part]] = {
 }
 
 
-def read_design(
+def load_design(
     name: str, more: Callable[[], Iterable[Part]], scale: float = 1.0, lift_m: float = 0.0
 ) -> RobotDesign:
     """Read a robot's table, a TOML file beside this one.

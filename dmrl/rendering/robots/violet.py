@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from dmrl.geometry.frames import yaw_matrix
-from dmrl.rendering.robots.primitives import MOTOR_ANGLES_RAD, Part, read_design
+from dmrl.rendering.robots.primitives import MOTOR_ANGLES_RAD, Part, load_design
 
 FIT_SCALE = 0.97
 FIT_OFFSET_Z_M = 0.001
@@ -52,4 +52,4 @@ def _make_blades(hub: tuple[float, float], at_rad: float, way: int) -> Part:
     return "blade", points @ yaw_matrix(at_rad) + np.array([*hub, ROTOR_Z_M]), faces
 
 
-VIOLET = read_design("violet", _blade_parts, FIT_SCALE, FIT_OFFSET_Z_M)
+VIOLET = load_design("violet", _blade_parts, FIT_SCALE, FIT_OFFSET_Z_M)

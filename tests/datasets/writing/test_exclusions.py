@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.datasets.writing.exclusions import read_flags
+from dmrl.datasets.writing.exclusions import load_flags
 from dmrl.errors import DmrlError, SettingError
 from dmrl.stages.dataset import Settings, run
 
@@ -21,7 +21,7 @@ def flags(folder: Path, text: str) -> Path:
 
 def test_flags_are_read_with_reasons_or_without(tmp_path: Path) -> None:
     text = "log_time,reason,robot,source\n5,blurred,cf1,a.mcap\n5,,cf1,a.mcap\n"
-    assert read_flags(flags(tmp_path, text)) == {("a.mcap", "cf1", 5)}
+    assert load_flags(flags(tmp_path, text)) == {("a.mcap", "cf1", 5)}
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_flags_are_read_with_reasons_or_without(tmp_path: Path) -> None:
 )
 def test_invalid_flag_error_names_its_line(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(SettingError, match=says):
-        read_flags(flags(tmp_path, text))
+        load_flags(flags(tmp_path, text))
 
 
 def test_missing_file_gives_one_line_error(record: Record, tmp_path: Path) -> None:

@@ -10,12 +10,12 @@ from safetensors.torch import load_file, save_file
 from dmrl.errors import ModelError, SettingError
 from dmrl.learn.inference.loaded_model import (
     Model,
+    assign_weights,
     describe,
     get_weights,
     interpolate_weights,
     load_model,
     save_model,
-    set_weights,
     transfer_weights,
 )
 from dmrl.learn.networks.architectures import build_network
@@ -97,7 +97,7 @@ def test_a_known_network_lends_its_weights_to_one_with_more_channels() -> None:
     )
     wanted, new = get_weights(known), get_weights(fresh)
     got = transfer_weights(known, fresh)
-    set_weights(fresh, got, "here")
+    assign_weights(fresh, got, "here")
     assert torch.equal(got["head.weight"][:4], wanted["head.weight"])
     assert torch.equal(got["head.weight"][4:], new["head.weight"][4:])
     assert torch.equal(got["body.0.0.weight"], wanted["body.0.0.weight"])

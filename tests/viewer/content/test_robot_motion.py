@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from dmrl.viewer.content.robot_motion import read_poses, read_positions, read_ranges
+from dmrl.viewer.content.robot_motion import parse_poses, parse_positions, parse_ranges
 
 HOSTILE = [float("nan"), float("inf"), -float("inf"), 1e300, -1e300]
 
@@ -33,14 +33,14 @@ def test_invalid_poses_are_omitted_without_warnings(bad: float) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         places, turns = [still, [bad] * 3, still, still], [turn, [bad] * 4, turn, turn]
-        found = read_poses(transforms(places, turns))["cf1"]
+        found = parse_poses(transforms(places, turns))["cf1"]
         seen = found.to_parent(np.array([[0.5, 0.0, 0.0]] * 4), np.array([-5, 5, 10, 35]))
     assert seen[[0, 3]].tolist() == [[1.5, 2.0, 3.0]] * 2
     assert np.isnan(seen[[1, 2]]).all()
 
 
 def test_turns_have_length_one() -> None:
-    found = read_poses(transforms([[0.0] * 3], [[0.0, 0.0, 2.0, 2.0]]))["cf1"]
+    found = parse_poses(transforms([[0.0] * 3], [[0.0, 0.0, 2.0, 2.0]]))["cf1"]
     assert found.xyzw[0] == pytest.approx([0, 0, 0.5**0.5, 0.5**0.5])
 
 
@@ -48,8 +48,8 @@ def test_turns_have_length_one() -> None:
 def test_positions_and_ranges_that_cannot_be_drawn_are_no_numbers(bad: float) -> None:
     columns = {"log_time": [0, 10], "x": [1.0, bad], "y": [2.0, 2.0], "z": [3.0, 3.0]}
     columns |= {"covariance": [[1.0] * 9, [bad] * 9], "status": np.zeros(2, np.int32)}
-    found = read_positions(pa.RecordBatch.from_pydict(columns))
+    found = parse_positions(pa.RecordBatch.from_pydict(columns))
     assert found.xyz[0].tolist() == [1, 2, 3] and np.isnan(found.xyz[1, 0])
     assert (found.covariance[0] == 1).all() and np.isnan(found.covariance[1]).all()
     heard = pa.RecordBatch.from_pydict({"log_time": [0, 10], "range_m": [1.5, bad]})
-    assert np.isnan(read_ranges(heard).range_m).tolist() == [False, True]
+    assert np.isnan(parse_ranges(heard).range_m).tolist() == [False, True]

@@ -153,13 +153,13 @@ ${values | wrapped}
 /*%- endmacro %*/
 /*# The address of a table, brought into the near memory where there are two. #*/
 /*% macro near_table(step, kind, type) %*/
-/*% set at = placement.staged(step).get(kind) %*/
+/*% set at = placement.stage_buffers(step).get(kind) %*/
 /*% if at %*/(const ${type} *)brought(at_stage(net, ${at.at}), ${step.name}_${kind}, ${at.size_bytes})/*% else %*/${step.name}_${kind}/*% endif %*/
 /*%- endmacro %*/
 /*# The address of a row of input `number`, behind `skipped` columns of its padding. #*/
 /*% macro input_row(step, number, row, pointer, skipped) %*/
 /*% set buffer = plan.buffers[step.sources[number]] %*/
-/*% set at = placement.staged(step).get(number | string) %*/
+/*% set at = placement.stage_buffers(step).get(number | string) %*/
 /*% if at %*/(const uint8_t *)brought(at_stage(net, ${at.at} + ${pointer} * ${at.size_bytes}), row_of_${buffer.name}(${args}, ${row}), ${at.size_bytes})/*% else %*/row_of_${buffer.name}(${args}, ${row})/*% endif %*/ + ${skipped * buffer.channels}
 /*%- endmacro %*/
 /* Weights: of each output channel the kernel's rows, of each row the pixels, of each pixel
@@ -257,7 +257,7 @@ INLINE const uint8_t *row_of_${buffer.name}(${params}, int row)
 /*% set call = call_of[loop.index0] %*/
 /*% set reads = step.reads %*/
 /*% set gap = out.gap * out.channels %*/
-/*% set staged = placement.staged(step).get("out") %*/
+/*% set staged = placement.stage_buffers(step).get("out") %*/
 /* ${step.name}: ${describe(layer)}${", 2x2 max-pool" if step.pooled else ""}, ${source.cols} x ${source.rows} x ${source.channels} -> ${out.cols} x ${out.rows} x ${out.channels}. */
 APART void make_${step.name}(${params}, int row)
 {
