@@ -110,6 +110,7 @@ MAY_PARSE = {
     "deploy/usage.py": "what json.dumps has just made",
     "terminal/help_pages.py": "a table of the package",
     "rendering/robots/primitives.py": "a table of the package",
+    "rendering/robots/quadrotor.py": "a table of the package",
     "rendering/backgrounds/room_items.py": "a table of the package",
     "rendering/settings.py": "a table of the package",
     "guards/bounded_parsing.py": "the home",

@@ -16,7 +16,7 @@ from dmrl.rendering.backgrounds.photos import SRGB_TO_LINEAR, Photos
 from dmrl.rendering.camera.image_statistics import ImageMeasurements, mean_of_figure, measure_images
 from dmrl.rendering.camera.sensor import expose
 from dmrl.rendering.randomise import clip_highlights, process_backdrop, random_sensor
-from dmrl.rendering.settings import LIMITS, Settings
+from dmrl.rendering.settings import LIMITS, TABLE, Settings
 
 COARSE, FINE = (8, 32), (5, 192)
 """Rounds and images of each stage: few images first, then enough to average out chance."""
@@ -46,33 +46,18 @@ class Knob:
         remaining share.
     gain
         Step relative to the remaining difference.
+    least
+        Lower bound of the fitted range, in place of that of the key. A range at 0 would never move.
     """
 
     key: str
     figure: str
     by: Literal["factor", "square", "lost"]
     gain: float
+    least: float | None = None
 
 
-KNOBS = (
-    Knob("brightness", "brightness", "factor", 0.8),
-    Knob("background_contrast", "contrast", "factor", 0.6),
-    Knob("contrast_gamma", "contrast", "factor", -0.2),
-    Knob("warmth", "cast", "factor", 1.4),
-    Knob("saturation", "colour", "factor", 0.7),
-    Knob("vignetting", "corners", "lost", 0.7),
-    Knob("defocus_px", "edge_px", "square", 0.12),
-    Knob("read_noise", "grain", "factor", 0.8),
-    Knob("shot_noise", "grain", "factor", 1.6),
-)
-MIN_VALUES = {
-    "contrast_gamma": 1.0,  # of a sensor; the rest of the contrast belongs to the scene
-    "read_noise": 2e-4,
-    "shot_noise": 1e-6,
-    "saturation": 0.02,
-    "vignetting": 0.0,
-}
-"""Lower bounds of fitted ranges. A range at 0 would never move."""
+KNOBS = tuple(Knob(**row) for row in TABLE["knobs"])
 
 
 def sample_scenes(
@@ -179,9 +164,9 @@ def _step_range(
     if not len(want) or not len(got):
         return limits
     least, most = LIMITS[knob.key]
-    least = max(least, MIN_VALUES.get(knob.key, 0.0))
+    least = max(least, knob.least or 0.0)
     wanted, found = (max(mean_of_figure(knob.figure, values), 1e-3) for values in (want, got))
-    ends = np.clip(limits, max(least, MIN_VALUES.get(knob.key, 0.02)), most)
+    ends = np.clip(limits, max(least, 0.02 if knob.least is None else knob.least), most)
     if knob.by == "factor":
         want, got = np.log(np.maximum(want, 1e-3)), np.log(np.maximum(got, 1e-3))
         bounds = np.log([max(least, 1e-9), most])

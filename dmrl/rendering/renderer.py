@@ -117,27 +117,22 @@ class Renderer:
         self.lights = [
             str(p) for p in (list_shipped_panoramas(python) if lights is None else lights)
         ]
-        self._pool = WorkerPool(
+        self.pool = WorkerPool(
             _build_start(python, model, self.lights, samples), workers or _count_cores()
         )
-        self.version = self._pool.version
-        self.points = _hull_points(self._pool.points)
-        self.box = np.array([self._pool.points.min(axis=0), self._pool.points.max(axis=0)])
+        self.version = self.pool.version
+        self.points = _hull_points(self.pool.points)
+        self.box = np.array([self.pool.points.min(axis=0), self.pool.points.max(axis=0)])
         """(2, 3) minimum and maximum x, y and z of the robot, body frame, metres."""
         size_m = float(np.ptp(self.box, axis=0).max())
         if not MIN_ROBOT_SIZE_M <= size_m <= MAX_ROBOT_SIZE_M:
-            self._pool.__exit__()
+            self.pool.__exit__()
             raise SettingError(_size_error(model, size_m))
 
     @property
     def radius_m(self) -> float:
         """Radius of a ball about the origin that contains a robot, metres."""
         return float(np.linalg.norm(self.points, axis=1).max())
-
-    @property
-    def pool(self) -> WorkerPool:
-        """The worker processes."""
-        return self._pool
 
     def render_shots(self, scenes: Iterable[Scene]) -> Iterator[Shot]:
         """Yield the shots of scenes, in their order. Few scenes are read ahead.
@@ -147,47 +142,27 @@ class Renderer:
         BlenderError
             If Blender exits repeatedly on one scene.
         """
-        return self._pool.map(self._render_shot, scenes)
+        return self.pool.map(self._render_shot, scenes)
 
     def _render_shot(self, worker: Worker, scene: Scene) -> Shot:
-        return render_shot(worker, scene, self.points)
+        camera, robots, look = scene
+        layers = {}
+        for number, asked in build_requests(camera, robots, look, self.points):
+            _, arrays = worker.request(asked)
+            left, top, _, _ = asked["crop_px"]
+            layers[number] = Layer(left, top, arrays["light"], arrays["depth"])
+        return compose_shot(camera, robots, look, layers)
 
     def load_panorama(self, name: str) -> FloatImage:
         """Return the (H, W, 3) linear light of a panorama."""
-        _, arrays = self._pool.call(lambda worker: worker.request({"panorama": name}))
+        _, arrays = self.pool.call(lambda worker: worker.request({"panorama": name}))
         return np.array(arrays["panorama"], np.float32)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._pool.__exit__()
-
-
-def render_shot(worker: Worker, scene: Scene, points: Array) -> Shot:
-    """Render one shot with one worker.
-
-    Parameters
-    ----------
-    worker
-        Renders the robots.
-    scene
-        Camera, robots and look.
-    points
-        (N, 3) points whose convex hull contains a robot, body frame.
-
-    Raises
-    ------
-    EOFError, OSError
-        If the worker has exited.
-    """
-    camera, robots, look = scene
-    layers = {}
-    for number, asked in build_requests(camera, robots, look, points):
-        _, arrays = worker.request(asked)
-        left, top, _, _ = asked["crop_px"]
-        layers[number] = Layer(left, top, arrays["light"], arrays["depth"])
-    return compose_shot(camera, robots, look, layers)
+        self.pool.__exit__()
 
 
 def _count_cores() -> int:

@@ -90,22 +90,14 @@ class FloatGraph:
 
 
 REPLACEMENTS = {
-    "ConvTranspose2d": "a convolution at the finer stride",
+    **dict.fromkeys(("LeakyReLU", "ReLU6", "SiLU", "GELU", "Hardswish", "PReLU"), "ReLU"),
+    **dict.fromkeys(("GroupNorm", "LayerNorm", "InstanceNorm2d"), "BatchNorm2d"),
+    **dict.fromkeys(
+        ("ConvTranspose2d", "Upsample", "interpolate"), "a convolution at the finer stride"
+    ),
+    **dict.fromkeys(("Sigmoid", "sigmoid"), "the logit, as the other networks return"),
     "AvgPool2d": "a strided convolution or a 2x2 max-pool",
     "AdaptiveAvgPool2d": "a strided convolution",
-    "LeakyReLU": "ReLU",
-    "ReLU6": "ReLU",
-    "SiLU": "ReLU",
-    "GELU": "ReLU",
-    "Hardswish": "ReLU",
-    "PReLU": "ReLU",
-    "Sigmoid": "the logit, as the other networks return",
-    "sigmoid": "the logit, as the other networks return",
-    "GroupNorm": "BatchNorm2d",
-    "LayerNorm": "BatchNorm2d",
-    "InstanceNorm2d": "BatchNorm2d",
-    "Upsample": "a convolution at the finer stride",
-    "interpolate": "a convolution at the finer stride",
     "mul": "a convolution, a residual sum or a 2x2 max-pool",
     "concatenate": "a residual sum (only outputs can be concatenated)",
 }

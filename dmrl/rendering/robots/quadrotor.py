@@ -3,8 +3,10 @@
 Body frame: origin between the motors, x forward, y left, z up, metres.
 """
 
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.resources import files
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,26 +51,15 @@ class Mesh:
 
 def _iter_boxes() -> Iterator[tuple[tuple[float, float, float], Array, float, Array, bool]]:
     """Yield centre, half sizes, yaw, colour and glow of every box."""
-    black, dark = np.array([0.05, 0.05, 0.06]), np.array([0.12, 0.12, 0.13])
-    metal, grey = np.array([0.45, 0.45, 0.47]), np.array([0.3, 0.31, 0.33])
+    table = tomllib.loads(files(__package__).joinpath("quadrotor.toml").read_text("utf-8"))
+    colours = {name: np.array(rgb) for name, rgb in table["colours"].items()}
     for angle in ARM_ANGLES_RAD:
         x, y = np.cos(angle), np.sin(angle)
-        middle = ARM_M * 0.6
-        yield (x * middle, y * middle, 0.0), np.array([0.019, 0.003, 0.001]), angle, dark, False
-        motor = (x * ARM_M, y * ARM_M, 0.001)
-        yield motor, np.array([0.0038, 0.0038, 0.009]), angle, metal, False
-        foot = (x * ARM_M, y * ARM_M, -0.0105)
-        yield foot, np.array([0.003, 0.003, 0.004]), angle, dark, False
-        # LEDs of the Crazyflie: blue at the back, red and green in front.
-        led = np.array([0.2, 0.35, 1.0]) if x < 0 else np.array([1.0, 0.2, 0.1])
-        at = (x * ARM_M * 0.72, y * ARM_M * 0.72, 0.0018)
-        yield at, np.array([0.0017, 0.0017, 0.001]), angle, led, True
-    yield (0.0, 0.0, 0.0), np.array([0.0155, 0.0155, 0.001]), 0.0, black, False
-    yield (0.0, 0.0, 0.0055), np.array([0.0175, 0.010, 0.0035]), 0.0, grey, False
-    yield (0.0, 0.0, 0.0115), np.array([0.0145, 0.0145, 0.0008]), 0.0, black, False
-    yield (-0.006, 0.0, 0.0145), np.array([0.004, 0.012, 0.0022]), 0.0, metal, False
-    yield (0.0, 0.0, -0.006), np.array([0.0145, 0.0145, 0.0008]), 0.0, black, False
-    yield (0.013, 0.0, -0.0085), np.array([0.003, 0.003, 0.003]), 0.0, dark, False
+        for along_m, up_m, half_m, name in table["arm_behind" if x < 0 else "arm_ahead"]:
+            at = (x * along_m, y * along_m, up_m)
+            yield at, np.array(half_m), angle, colours[name], name in table["glowing"]
+    for centre, half_m, name in table["body"]:
+        yield tuple(centre), np.array(half_m), 0.0, colours[name], False
 
 
 def _build_mesh() -> Mesh:
