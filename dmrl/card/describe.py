@@ -16,7 +16,7 @@ from dmrl.card.leakage import find_leaks
 from dmrl.card.statistics import SplitCounts, count_split, summarize_sigmas
 from dmrl.datasets import Dataset, Split, layout
 from dmrl.datasets.manifest import part_folder
-from dmrl.datasets.writing.near_duplicates import NEAR_DUPLICATE_BITS, read_hashes
+from dmrl.datasets.writing.near_duplicates import NEAR_DUPLICATE_BITS, load_hashes
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.recording import Provenance
@@ -105,7 +105,7 @@ def _iter_parts(dataset: Dataset) -> Iterator[dict[str, Any]]:
         made = read_provenance(folder)
         if made is not None:
             names = [source.name for source in made.inputs if not source.name.endswith(".csv")]
-            yield {"version": made.dmrl_version, "names": names, "images": len(read_hashes(folder))}
+            yield {"version": made.dmrl_version, "names": names, "images": len(load_hashes(folder))}
 
 
 @cache

@@ -213,7 +213,7 @@ class Dataset:
         if self.manifest is not None:
             own = self.manifest.splits[name]
             return [(self.manifest.shard_path(self.path, name, shard), shard.rows) for shard in own]
-        return self._find_parquet_shards(name) if self.parquet else self._read_arrow_shards(name)
+        return self._find_parquet_shards(name) if self.parquet else self._find_arrow_shards(name)
 
     def _find_arrow_shards(self, name: str) -> list[tuple[Path, int | None]]:
         folder = safe_join(self.path, name, f"{self.path}: a split")
