@@ -23,26 +23,13 @@ from dmrl.recording.provenance_inputs import read_provenance
 
 FIGURES = {
     "detect": {
-        "median_px": "overall.median_px.value",
-        "within_20_px": "overall.within_20_px.value",
-        "depth_mae_m": "overall.depth_mae_m.value",
-        "ap_16_px": "overall.ap_16_px.value",
-        "recall": "overall.recall.value",
-        "precision": "overall.precision.value",
+        name: f"overall.{name}.value"
+        for name in ("median_px", "within_20_px", "depth_mae_m", "ap_16_px", "recall", "precision")
     },
-    "follow": {
-        "held": "flights.0.held_to_end",
-        "held_s": "flights.0.held_s",
-        "contacts": "flights.0.contacts",
-        "recall": "flights.0.recall",
-        "false_per_image": "flights.0.false_per_image",
-    },
-    "label_with_uwb": {
-        "kept": "overall.kept",
-        "good_of_kept": "overall.precision",
-        "kept_rmse_m": "overall.kept_rmse_m",
-        "rmse_m": "overall.rmse_m",
-    },
+    "follow": {"held": "flights.0.held_to_end"}
+    | {name: f"flights.0.{name}" for name in ("held_s", "contacts", "recall", "false_per_image")},
+    "label_with_uwb": {"kept": "overall.kept", "good_of_kept": "overall.precision"}
+    | {name: f"overall.{name}" for name in ("kept_rmse_m", "rmse_m")},
 }
 """Figures of each task, by their place in the document of ``dmrl evaluate``."""
 FIGURES["label_without_uwb"] = FIGURES["label_with_uwb"]

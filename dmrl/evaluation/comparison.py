@@ -7,7 +7,12 @@ from typing import Any
 import numpy as np
 
 from dmrl.evaluation.detections import LabelledDetections
-from dmrl.evaluation.figure_tables import FIGURE_ROWS, finite_or_none, format_interval
+from dmrl.evaluation.figure_tables import (
+    finite_values,
+    format_interval,
+    format_values,
+    metric_columns,
+)
 from dmrl.learn.inference.detection_metrics import (
     DEPTH_BANDS_M,
     ScoredDetections,
@@ -82,17 +87,16 @@ def compare_models(
     drawn = iter_bootstrap_weights(widest, draws, seed)
     blocks = [[_measure(*one, weights) for one in known] for weights in drawn]
     figures = {}
-    for name in (name for name, *_ in FIGURE_ROWS):
+    for name, *_ in metric_columns():
         first, second = (float(value[name][0]) for value in values)
         sample = np.concatenate([block[1][name] - block[0][name] for block in blocks])
         sample = sample[np.isfinite(sample)]
         measured = len(sample) and np.isfinite(second - first)
         ends = np.quantile(sample, (0.025, 0.975)) if measured else (np.nan, np.nan)
-        low, high = (finite_or_none(float(end)) for end in ends)
+        low, high = map(float, ends)
         figures[name] = {
-            "first": finite_or_none(first),
-            "second": finite_or_none(second),
-            "difference": {"value": finite_or_none(second - first), "low": low, "high": high},
+            **finite_values({"first": first, "second": second}),
+            "difference": finite_values({"value": second - first, "low": low, "high": high}),
         }
     names = [part.at[0].recording.name for part in both]
     return {
@@ -111,14 +115,14 @@ def _measure(scored: ScoredDetections, threshold: float, weights: Any) -> Mappin
 def build_rows(made: Mapping[str, Any]) -> list[list[str]]:
     """Return a row per metric of a comparison: both values, and their difference."""
     rows = []
-    for name, words, form in FIGURE_ROWS:
+    for name, title, form in metric_columns():
         found = made["figures"][name]
         change = found["difference"]
-        sides = ["-" if found[k] is None else format(found[k], form) for k in ("first", "second")]
+        sides = format_values(found, [(side, "", form) for side in ("first", "second")])
         ends = [change["low"], change["high"]]
         differs = None not in ends and (ends[0] > 0 or ends[1] < 0)
         signed = format_interval(change, f"+{form}")
-        rows.append([words, *sides, signed, "yes" if differs else ""])
+        rows.append([title, *sides, signed, "yes" if differs else ""])
     return rows
 
 

@@ -12,7 +12,8 @@ from dmrl.evaluation.figure_tables import (
     band_to_json,
     build_band_table,
     curves_to_json,
-    finite_or_none,
+    describe_source,
+    finite_values,
 )
 from dmrl.learn.inference.detection_metrics import (
     BandMetrics,
@@ -28,7 +29,6 @@ from dmrl.learn.inference.threshold import (
     count_false_alarms,
     select_threshold,
 )
-from dmrl.recording import build_input
 from dmrl.terminal.tables import print_line, print_table
 
 Spread = Callable[[Callable[..., Any], Sequence[Any], int], Iterator[Any]]
@@ -151,7 +151,8 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
     One recording is ``recording``, several are ``recordings``.
     """
     criteria = evaluation.criteria
-    sources = [{"name": s.name, "sha256": s.sha256} for s in map(build_input, recordings)]
+    sources = [describe_source(path) for path in recordings]
+    alarms = count_false_alarms(evaluation.scored, evaluation.threshold)
     overall, *bands = [band_to_json(band) for band in evaluation.bands]
     return {
         **({"recordings": sources} if len(sources) > 1 else {"recording": sources[0]}),
@@ -164,12 +165,7 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
         "partial": criteria.partial,
         "images_without_detections": evaluation.pairs.unseen,
         "left_out": evaluation.pairs.left_out,
-        **{
-            name: finite_or_none(value)
-            for name, value in asdict(
-                count_false_alarms(evaluation.scored, evaluation.threshold)
-            ).items()
-        },
+        **finite_values(asdict(alarms)),
         "rates": measure_rates(evaluation.scored),
         "bootstrap": {"draws": criteria.draws, "seed": criteria.seed},
         "overall": overall,

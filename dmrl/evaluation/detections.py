@@ -140,7 +140,7 @@ def read_split_labels(split: Split, rows: Sequence[int]) -> Points:
     """Read the labels inside some images of a split; images are numbered by their position."""
     height_px, width_px = split.image_shape
     entries = _combine_column(split.table, "peers")
-    labels = _build_points(entries, None, np.array(rows, np.int64), np.arange(len(rows)))
+    labels = build_points(entries, None, np.array(rows, np.int64), np.arange(len(rows)))
     return labels.select(_is_in_view(labels, width_px, height_px))
 
 
@@ -194,14 +194,14 @@ def _join_robot(
     usable &= seen
     judged = times[usable]
     _, in_judged, in_detections = np.intersect1d(judged, seen_at, return_indices=True)
-    labels = _build_points(peers, mine, np.flatnonzero(usable), np.arange(len(judged)))
+    labels = build_points(peers, mine, np.flatnonzero(usable), np.arange(len(judged)))
     size_px = held.read_image_size(topics.CAMERA_IMAGE(robot))
     if size_px is None:
         raise RecordingError(f"{held.path} has no image of {robot}. Give the whole recording")
     shown = _is_in_view(labels, *size_px)
     left_out["labels outside their image"] += int((~shown).sum())
     every = _combine_column(detected, "detections")
-    detections = _build_points(every, None, in_detections, in_judged)
+    detections = build_points(every, None, in_detections, in_judged)
     threshold = float(np.max(_combine_column(detected, "threshold").to_numpy(), initial=0.0))
     at = [ImageKey(held.path, robot, int(time_ns)) for time_ns in judged]
     unseen = len(judged) - len(in_judged)
@@ -249,7 +249,7 @@ def _select_usable(
     return mine, within & ~foreign & ~not_ok
 
 
-def _build_points(entries: pa.Array, mine: Mask | None, rows: Times, numbers: Times) -> Points:
+def build_points(entries: pa.Array, mine: Mask | None, rows: Times, numbers: Times) -> Points:
     """Build points from the entries of chosen rows of a list column, with these image numbers."""
     place = np.full(len(entries), -1, np.int64)
     place[rows] = numbers

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from dmrl.learn.inference.detection_metrics import (
@@ -10,28 +11,28 @@ from dmrl.learn.inference.detection_metrics import (
     ScoredDetections,
     compute_curves,
 )
+from dmrl.learn.inference.metric_definitions import METRICS
+from dmrl.recording import build_input
 
-# Name of a figure, its words in the table, and its format.
-FIGURE_ROWS = (
-    ("median_px", "median error, px", ".2f"),
-    ("mean_px", "mean error, px", ".1f"),
-    ("rmse_px", "RMS error, px", ".1f"),
-    ("p95_px", "95th percentile, px", ".1f"),
-    ("within_8_px", "within 8 px", ".1%"),
-    ("within_20_px", "within 20 px", ".1%"),
-    ("bias_u_px", "median error in u, px", ".2f"),
-    ("bias_v_px", "median error in v, px", ".2f"),
-    ("depth_mae_m", "depth MAE, m", ".3f"),
-    ("depth_rmse_m", "depth RMSE, m", ".3f"),
-    ("r2_u", "R2 of u", ".2f"),
-    ("r2_v", "R2 of v", ".2f"),
-    ("r2_depth", "R2 of depth", ".2f"),
-    ("precision", "precision", ".1%"),
-    ("recall", "recall", ".1%"),
-    ("f1", "F1", ".3f"),
-    ("ap_8_px", "AP at 8 px", ".3f"),
-    ("ap_16_px", "AP at 16 px", ".3f"),
-)
+Columns = Sequence[tuple[str, str, str]]
+"""Key of a value, its title in a table, and its format."""
+
+
+def metric_columns(*names: str) -> Columns:
+    """Return the columns of metrics of detections; all without names."""
+    return [(name, METRICS[name]["title"], METRICS[name]["format"]) for name in names or METRICS]
+
+
+def format_values(values: Mapping[str, Any], columns: Columns) -> list[str]:
+    """Format the values of a row of a table; a dash for None."""
+    found = [(values.get(key), form) for key, _, form in columns]
+    return ["-" if value is None else format(value, form) for value, form in found]
+
+
+def describe_source(recording: Path) -> dict[str, str]:
+    """Return the name and the hash of a recording as JSON values."""
+    source = build_input(recording)
+    return {"name": source.name, "sha256": source.sha256}
 
 
 def build_band_table(
@@ -47,9 +48,9 @@ def build_band_table(
     overall, *others = bands
     shown = [overall, *(band for band in others if band.get("labels", 1))]
     rows: list[list[object]] = [["labels", *(str(band.get("labels", "-")) for band in shown)]]
-    for name, words, form in FIGURE_ROWS:
+    for name, title, form in metric_columns():
         if name in overall:
-            rows.append([words, *(format_interval(band[name], form) for band in shown)])
+            rows.append([title, *(format_interval(band[name], form) for band in shown)])
     return ["all", *(_format_range(band["from_m"], band["to_m"]) for band in shown[1:])], rows
 
 
@@ -70,25 +71,22 @@ def band_to_json(band: BandMetrics) -> dict[str, Any]:
     """Return the metrics of one range of depth as JSON values."""
     return {
         "from_m": band.from_m,
-        "to_m": finite_or_none(band.to_m),
+        "to_m": band.to_m if math.isfinite(band.to_m) else None,
         "labels": band.labels,
         "images": band.images,
         "unmatched_labels": band.unmatched,
-        **{
-            name: {key: finite_or_none(value) for key, value in asdict(figure).items()}
-            for name, figure in band.figures.items()
-        },
+        **{name: finite_values(asdict(figure)) for name, figure in band.figures.items()},
     }
 
 
 def curves_to_json(scored: ScoredDetections) -> dict[str, list[float | None]]:
     """Return precision, recall and other curves over the confidence as JSON values."""
-    found = asdict(compute_curves(scored))
     return {
-        name: [finite_or_none(value) for value in values.tolist()] for name, values in found.items()
+        name: list(finite_values(dict(enumerate(values.tolist()))).values())
+        for name, values in asdict(compute_curves(scored)).items()
     }
 
 
-def finite_or_none(value: float) -> float | None:
-    """Return a number if it is finite, else None: JSON has neither NaN nor infinity."""
-    return value if math.isfinite(value) else None
+def finite_values(values: Mapping[Any, float]) -> dict[Any, float | None]:
+    """Return numbers that are finite, else None: JSON has neither NaN nor infinity."""
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}

@@ -16,12 +16,13 @@ from dmrl.estimation.tracking.flight_metrics import (
     compute_bands,
     compute_flight_figures,
 )
+from dmrl.evaluation.figure_tables import describe_source, format_values
 from dmrl.evaluation.tracks import interpolate_truth, read_track_camera
 from dmrl.geometry.frames import Array, pixels_from_horizontal
 from dmrl.labelling.flight_log import OBSERVER_TOPICS, TRUTH_TOPICS, FlightLog, read_flight
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
 from dmrl.labelling.observer_log import ObserverLog, read_observer_log
-from dmrl.recording import build_input, read_summary
+from dmrl.recording import read_summary
 
 TITLE, EACH = "flight", "observer, peer"
 RIGHT_PX = 16.0
@@ -120,9 +121,8 @@ def lasts_s(judged: list[PairFlight]) -> float:
 
 def document(recording: Path, judged: list[PairFlight], settle_s: float) -> dict[str, Any]:
     """Return all figures as JSON values; null where a figure is undefined."""
-    source = build_input(recording)
     return {
-        "recording": {"name": source.name, "sha256": source.sha256},
+        "recording": describe_source(recording),
         "flights": [
             {
                 "robot": one.robot,
@@ -171,9 +171,5 @@ def note(made: Mapping[str, Any]) -> str:
 def rows(made: Mapping[str, Any]) -> list[list[str]]:
     """Return one row per pair of a ``document``."""
     return [
-        [
-            f"{one['robot']}, {one['peer']}",
-            *("-" if one[key] is None else format(one[key], form) for key, _, form in COLUMNS),
-        ]
-        for one in made["flights"]
+        [f"{one['robot']}, {one['peer']}", *format_values(one, COLUMNS)] for one in made["flights"]
     ]

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.evaluation import positions, tracks
+from dmrl.evaluation.figure_tables import format_values, metric_columns
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.terminal.tables import print_json, print_line, print_table
 
@@ -24,14 +25,9 @@ class StepOutcome:
 EVALUATION_FILE = "evaluation.json"
 ERRORS_3D = {"positions": positions, "tracks": tracks}
 """Evaluations of 3D positions, in files of their name, with the module that formats each."""
-FIGURE_COLUMNS = {
-    "median_px": ("median, px", ".1f"),
-    "within_8_px": ("within 8 px", ".1%"),
-    "within_20_px": ("within 20 px", ".1%"),
-    "depth_mae_m": ("depth MAE, m", ".3f"),
-    "f1": ("F1", ".3f"),
-    "ap_16_px": ("AP at 16 px", ".3f"),
-}
+METRIC_COLUMNS = metric_columns(
+    *("median_px", "within_8_px", "within_20_px", "depth_mae_m", "f1", "ap_16_px")
+)
 
 
 def print_report(done: Sequence[StepOutcome], *, as_json: bool = False) -> None:
@@ -64,7 +60,7 @@ def print_report(done: Sequence[StepOutcome], *, as_json: bool = False) -> None:
             print_table(name, ["", *headers], module.rows(document))
             print_line(module.note(document))
     rows = [(name, *_format_row(document)) for name, document in evaluations.items()]
-    headers = [words for words, _ in FIGURE_COLUMNS.values()]
+    headers = [title for _, title, _ in METRIC_COLUMNS]
     if rows:
         print_table("", ["evaluation", "against", "images", *headers], rows)
     for picture in pictures:
@@ -81,9 +77,8 @@ def _read_documents(done: Sequence[StepOutcome], name: str) -> dict[str, dict[st
 
 
 def _format_row(document: dict[str, Any]) -> list[str]:
-    figures = document["overall"]
-    values = [(figures[name]["value"], form) for name, (_, form) in FIGURE_COLUMNS.items()]
-    cells = ["-" if value is None else format(value, form) for value, form in values]
+    values = {name: document["overall"][name]["value"] for name, _, _ in METRIC_COLUMNS}
+    cells = format_values(values, METRIC_COLUMNS)
     return [document["against"], str(document["images"]), *cells]
 
 

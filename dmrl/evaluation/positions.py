@@ -1,6 +1,5 @@
 """Evaluate the estimated positions of a recording against the ground truth, pair by pair."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,18 +15,18 @@ from dmrl.estimation.model.position_metrics import (
     MAX_GOOD_ERROR_M,
     ErrorTrace,
     EvaluatedPositions,
-    PairFigures,
     combine_figures,
     compute_figures,
     is_covered_by_truth,
 )
+from dmrl.evaluation.figure_tables import describe_source, finite_values, format_values
 from dmrl.evaluation.limit import Bound, describe_limit, find_limit
 from dmrl.geometry.frames import Array
 from dmrl.labelling.flight_log import TRUTH_TOPICS, FlightLog, read_flight
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
 from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.messages import STATUS_OK
-from dmrl.recording import build_input, read_summary
+from dmrl.recording import read_summary
 
 TITLE, EACH = "estimated positions against truth", "pair"
 Times = NDArray[np.int64]
@@ -209,12 +208,14 @@ def lasts_s(pairs: list[EvaluatedPair]) -> float:
 
 def document(recording: Path, pairs: list[EvaluatedPair], settle_s: float) -> dict[str, Any]:
     """Return all metrics as JSON values; null where a metric is undefined."""
-    source = build_input(recording)
     each = [compute_figures(pair.judged, settle_s) for pair in pairs]
     return {
-        "recording": {"name": source.name, "sha256": source.sha256},
+        "recording": describe_source(recording),
         "settle_s": settle_s,
-        "overall": {"covered": _compute_coverage(pairs), **_to_json_values(combine_figures(each))},
+        "overall": {
+            "covered": _compute_coverage(pairs),
+            **finite_values(asdict(combine_figures(each))),
+        },
         "limit": _describe_limit(pairs, settle_s),
         "pairs": [
             {
@@ -222,7 +223,7 @@ def document(recording: Path, pairs: list[EvaluatedPair], settle_s: float) -> di
                 "peer": pair.peer,
                 "without_truth": pair.without_truth,
                 "covered": _compute_coverage([pair]),
-                **_to_json_values(measured),
+                **finite_values(asdict(measured)),
                 "limit": _describe_limit([pair], settle_s),
             }
             for pair, measured in zip(pairs, each, strict=True)
@@ -240,11 +241,6 @@ def _describe_limit(pairs: Sequence[EvaluatedPair], settle_s: float) -> dict[str
 
 def _compute_coverage(pairs: list[EvaluatedPair]) -> float:
     return sum(pair.covered for pair in pairs) / sum(pair.true for pair in pairs)
-
-
-def _to_json_values(measured: PairFigures) -> dict[str, float | None]:
-    values = asdict(measured).items()
-    return {name: value if math.isfinite(value) else None for name, value in values}
 
 
 # Name of a figure, its words in the table, and its format.
@@ -284,13 +280,9 @@ def rows(made: Mapping[str, Any]) -> list[list[str]]:
     named = [(f"{pair['robot']} sees {pair['peer']}", pair) for pair in made["pairs"]]
     if len(named) > 1:
         named.append(("all", {**made["overall"], "limit": made.get("limit")}))
+    # Of the limit, the figure that stands beside the RMSE.
+    limits = [(values.get("limit") or {}).get("settled_rmse_m") for _, values in named]
     return [
-        [name, *(_format_cell(values.get(key), form) for key, _, form in COLUMNS)]
-        for name, values in named
+        [name, *format_values({**values, "limit": limit}, COLUMNS)]
+        for (name, values), limit in zip(named, limits, strict=True)
     ]
-
-
-def _format_cell(value: Any, form: str) -> str:
-    """Format a figure; of the limit, the one that stands beside the RMSE."""
-    value = value["settled_rmse_m"] if isinstance(value, dict) else value
-    return "-" if value is None else format(value, form)

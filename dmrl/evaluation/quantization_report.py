@@ -20,6 +20,7 @@ from dmrl.deploy.int8.store import INTEGER_NAME, save_network
 from dmrl.deploy.samples import SAMPLE_COUNT, save_samples
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation.detections import read_split_labels
+from dmrl.evaluation.figure_tables import format_values, metric_columns
 from dmrl.learn.inference.loaded_model import Model, load_model, save_model
 from dmrl.learn.inference.metric_definitions import METRIC_DEFINITIONS
 from dmrl.recording import Provenance
@@ -228,21 +229,15 @@ def describe_quantization(result: QuantizationReport) -> dict[str, Any]:
     }
 
 
-# Name of a figure, its words in the table, and its format.
-ROWS = (
-    ("median_px", "median error, px", ".2f"),
-    ("within_8_px", "within 8 px", ".1%"),
-    ("within_20_px", "within 20 px", ".1%"),
-    ("depth_mae_m", "depth MAE, m", ".4f"),
-    ("depth_rmse_m", "depth RMSE, m", ".4f"),
-    ("f1", "F1", ".3f"),
-    ("ap_16_px", "AP at 16 px", ".3f"),
+COMPARED_METRICS = (
+    *("median_px", "within_8_px", "within_20_px", "depth_mae_m", "depth_rmse_m", "f1"),
+    "ap_16_px",
 )
 
 
 def print_quantization(out: Path, result: QuantizationReport) -> None:
     """Print the layers, then float beside int8."""
-    columns = ("layer", "kind", "output", "MMAC", "range", "SQNR, dB", "saturated")
+    headers = ("layer", "kind", "output", "MMAC", "range", "SQNR, dB", "saturated")
     rows = [
         (
             layer.name,
@@ -255,16 +250,15 @@ def print_quantization(out: Path, result: QuantizationReport) -> None:
         )
         for layer in result.layers
     ]
-    print_table(f"{out}: {result.network.macs / 1e6:.1f} MMAC an image", columns, rows)
-    accuracy = result.accuracy
-    compared = [
-        [words, *(_format_figure(accuracy[name][key], form) for name in ("float", "int8"))]
-        for key, words, form in ROWS
+    print_table(f"{out}: {result.network.macs / 1e6:.1f} MMAC an image", headers, rows)
+    # A tenth of a millimetre shows what is lost.
+    columns = [
+        (name, title, ".4f" if name.endswith("_m") else form)
+        for name, title, form in metric_columns(*COMPARED_METRICS)
     ]
+    both = [format_values(result.accuracy[name], columns) for name in ("float", "int8")]
+    titles = [title for _, title, _ in columns]
+    compared = [list(row) for row in zip(titles, *both, strict=True)]
     compared.append(["most confident cell kept", "", f"{result.argmax_kept:.1%}"])
     title = f"{result.images} images of split {result.split}"
     print_table(title, ("label minus detection", "float", "int8"), compared)
-
-
-def _format_figure(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)

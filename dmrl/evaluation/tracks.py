@@ -18,6 +18,7 @@ from dmrl.estimation.tracking.track_metrics import (
     compute_figures,
     match_positions,
 )
+from dmrl.evaluation.figure_tables import describe_source, format_values
 from dmrl.geometry.camera_file import parse_camera
 from dmrl.geometry.frames import (
     Array,
@@ -30,7 +31,7 @@ from dmrl.labelling.flight_log import OBSERVER_TOPICS, TRUTH_TOPICS, FlightLog, 
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
 from dmrl.labelling.observer_log import ObserverLog, read_observer_log
 from dmrl.labelling.recorded_camera import find_recorded_camera
-from dmrl.recording import build_input, read_summary
+from dmrl.recording import read_summary
 
 TITLE, EACH = "tracks against truth", "observer"
 CAMERAS_METADATA = "dmrl.cameras"
@@ -79,7 +80,7 @@ def judge(recording: Path) -> list[EvaluatedTracks]:
 
 
 def read_track_camera(held: FlightLog, robot: str) -> Camera:
-    """The camera that the tracks were made with: its mount, delay and lens may be other ones."""
+    """Return the camera of the tracks; mount, delay and lens may differ from the recording's."""
     used = held.metadata.get(CAMERAS_METADATA, [{}])[-1].get(robot)
     camera = parse_camera(used, held.path) if used else find_recorded_camera(held, robot)
     if camera is None:
@@ -118,7 +119,7 @@ def _evaluate_observer(held: FlightLog, robot: str, peers: list[str]) -> Evaluat
 
 
 def _iter_image_tracks(held: FlightLog, sight: ObserverLog) -> Iterator[tuple[int, list[Any]]]:
-    """Number of an image, and the tracks at its time; times without an image are left out."""
+    """Yield the number of an image and its tracks; times without an image are left out."""
     number = {int(time_ns): k for k, time_ns in enumerate(sight.log_time_ns)}
     for stamped in held.tracks[sight.robot]:
         if (k := number.get(stamped.time_ns)) is not None:
@@ -204,9 +205,8 @@ def lasts_s(judged: list[EvaluatedTracks]) -> float:
 
 def document(recording: Path, judged: list[EvaluatedTracks], settle_s: float) -> dict[str, Any]:
     """Return all metrics as JSON values; null where a metric is undefined."""
-    source = build_input(recording)
     return {
-        "recording": {"name": source.name, "sha256": source.sha256},
+        "recording": describe_source(recording),
         "settle_s": settle_s,
         "robots": [{"robot": one.robot, **compute_figures(one, settle_s)} for one in judged],
         "definitions": DEFINITIONS,
@@ -240,11 +240,4 @@ def note(made: Mapping[str, Any]) -> str:
 
 def rows(made: Mapping[str, Any]) -> list[list[str]]:
     """Return one row per observer of a ``document``."""
-    return [
-        [one["robot"], *(_format_cell(one[key], form) for key, _, form in COLUMNS)]
-        for one in made["robots"]
-    ]
-
-
-def _format_cell(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
+    return [[one["robot"], *format_values(one, COLUMNS)] for one in made["robots"]]

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.errors import RecordingError
+from dmrl.evaluation.detections import build_points
 from dmrl.geometry.frames import Array, is_inside
-from dmrl.learn.inference.matching import Points, compute_errors
+from dmrl.learn.inference.matching import compute_errors
 from dmrl.recording import Provenance, iter_topic_batches, read_summary
 
 RowKey = tuple[str, str, int]
@@ -155,12 +156,14 @@ def compute_row_errors(
 ) -> tuple[Array, Array]:
     """Compute the errors of each row's worst label, pixels and metres of depth; NaN if unknown."""
     peers = rows["peers"].combine_chunks()
-    labels = _build_points(peers, np.arange(len(peers)))
+    every = np.arange(len(peers))
+    labels = build_points(peers, None, every, every)
     uv = np.stack([labels.u_px, labels.v_px], axis=1)
     labels = labels.select(is_inside(uv, *size_px) & ~(labels.depth_m <= 0))
     messages = found.messages["detections"].combine_chunks()
     (known,) = np.nonzero(found.place >= 0)
-    detections = _build_points(messages.take(pa.array(found.place[known])), known)
+    mine = messages.take(pa.array(found.place[known]))
+    detections = build_points(mine, None, np.arange(len(mine)), known)
     judged = np.isin(labels.image, known)
     labels = labels.select(judged)
     off = compute_errors(labels, detections)
@@ -175,17 +178,3 @@ def _largest_per_image(count: int, image: NDArray[np.int64], values: Array) -> A
     out = np.full(count, -1.0)
     np.maximum.at(out, image, np.nan_to_num(values, nan=np.inf))
     return np.where(out < 0, np.nan, out)
-
-
-def _build_points(column: pa.ListArray, numbers: NDArray[np.int64]) -> Points:
-    """Build points from the entries of a list column; ``numbers`` are the indices of its rows."""
-    flat = column.flatten()
-    image = np.repeat(numbers, column.value_lengths().to_numpy())
-    u_px, v_px, depth_m = (flat.field(name).to_numpy() for name in ("u_px", "v_px", "depth_m"))
-    names = {flat.type.field(k).name for k in range(flat.type.num_fields)}
-    if "sigma_depth_m" in names:
-        depth_m = np.where(np.isinf(flat.field("sigma_depth_m").to_numpy()), np.nan, depth_m)
-    known = "confidence" in names
-    confidence = flat.field("confidence").to_numpy() if known else np.ones(len(flat))
-    order = np.lexsort((-confidence, image))
-    return Points(image, u_px, v_px, depth_m, confidence).select(order)
