@@ -65,6 +65,11 @@ class Camera:
         roll, pitch, yaw = self.mount_rad
         return np.asarray(camera_from_horizontal(roll, pitch) @ yaw_matrix(yaw))
 
+    def point_at(self, u_px: float, v_px: float, depth_m: float) -> Array:
+        """Return (3,) the point at a pixel and a depth in the camera frame, without distortion."""
+        left, up = (self.cx_px - u_px) / self.fx_px, (self.cy_px - v_px) / self.fy_px
+        return np.array([depth_m, depth_m * left, depth_m * up])
+
     @property
     def image_from_optical(self) -> Array:
         """(3, 3) intrinsic matrix, pixels."""

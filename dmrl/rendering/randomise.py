@@ -22,8 +22,8 @@ from dmrl.rendering.robots.primitives import RobotDesign
 from dmrl.rendering.settings import Range, Settings
 from dmrl.rendering.shot import Light, Look, Robot
 from dmrl.rendering.sketch_renderer import Pose
+from dmrl.rendering.sketch_scene import place_apart
 
-MAX_TRIES_PER_ROBOT = 30
 """Attempts per robot to find a free place."""
 HIGHLIGHT_LIMIT = 3.0
 """Clip panoramas at this multiple of their mean: suns and lamps would hide everything else."""
@@ -107,15 +107,11 @@ def _draw_poses(world: SceneSource, rng: Generator, tilt: Array) -> list[Pose]:
     settings = world.settings
     empty = rng.random() < settings.empty_share
     count = 0 if empty else int(rng.integers(1, settings.robots_max + 1))
-    poses: list[Pose] = []
-    for _ in range(count * MAX_TRIES_PER_ROBOT):
-        if len(poses) == count:
-            break
-        pose = Pose(_draw_position(world, rng), tilt @ _draw_attitude(settings, rng))
-        apart = (np.linalg.norm(pose.xyz_camera - other.xyz_camera) for other in poses)
-        if all(distance > 2 * world.radius_m for distance in apart):
-            poses.append(pose)
-    return poses
+    return place_apart(
+        count,
+        lambda: Pose(_draw_position(world, rng), tilt @ _draw_attitude(settings, rng)),
+        lambda one, other: bool(np.linalg.norm(one - other) > 2 * world.radius_m),
+    )
 
 
 def _draw_position(world: SceneSource, rng: Generator) -> Array:
@@ -127,9 +123,7 @@ def _draw_position(world: SceneSource, rng: Generator) -> Array:
     u_px, v_px = pinhole_from_image(uv, camera)
     draw = _draw_uniform if settings.depth_spacing == "linear" else _draw_log_uniform
     depth_m = draw(rng, settings.depth_m)
-    left = (camera.cx_px - u_px) / camera.fx_px
-    up = (camera.cy_px - v_px) / camera.fy_px
-    return np.array([depth_m, depth_m * left, depth_m * up])
+    return camera.point_at(u_px, v_px, depth_m)
 
 
 def _draw_attitude(settings: Settings, rng: Generator) -> Array:

@@ -1,5 +1,6 @@
 """Random poses and looks of sketches."""
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -36,12 +37,33 @@ def random_poses(rng: Generator, camera: Camera, count: int) -> list[Pose]:
         Requested number of robots.
     """
     tilt = camera_from_horizontal(*rng.uniform(-TILT_MAX_RAD, TILT_MAX_RAD, 2).tolist())
+    return place_apart(
+        count,
+        lambda: Pose(_draw_position(rng, camera), tilt @ _draw_attitude(rng)),
+        _are_apart,
+    )
+
+
+def place_apart(
+    count: int, draw: Callable[[], Pose], are_apart: Callable[[Array, Array], bool]
+) -> list[Pose]:
+    """Draw poses until a number of them are apart; fewer where there is no room.
+
+    Parameters
+    ----------
+    count
+        Requested number of robots.
+    draw
+        Draws a pose.
+    are_apart
+        Whether two places in the camera frame, (3,) each, may both be taken.
+    """
     poses: list[Pose] = []
     for _ in range(count * MAX_TRIES_PER_ROBOT):
         if len(poses) == count:
             break
-        pose = Pose(_draw_position(rng, camera), tilt @ _draw_attitude(rng))
-        if all(_are_apart(pose.xyz_camera, other.xyz_camera) for other in poses):
+        pose = draw()
+        if all(are_apart(pose.xyz_camera, other.xyz_camera) for other in poses):
             poses.append(pose)
     return poses
 
@@ -49,9 +71,7 @@ def random_poses(rng: Generator, camera: Camera, count: int) -> list[Pose]:
 def _draw_position(rng: Generator, camera: Camera) -> Array:
     u_px, v_px = rng.uniform((0, 0), (camera.width_px, camera.height_px))
     depth_m = np.exp(rng.uniform(*np.log(DEPTH_M)))
-    left = (camera.cx_px - u_px) / camera.fx_px
-    up = (camera.cy_px - v_px) / camera.fy_px
-    return np.array([depth_m, depth_m * left, depth_m * up])
+    return camera.point_at(u_px, v_px, depth_m)
 
 
 def _draw_attitude(rng: Generator) -> Array:

@@ -3,7 +3,7 @@
 Styles are logged once but requested for every batch, so they are cached.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -19,6 +19,7 @@ from dmrl.viewer.content.robot_motion import Positions
 from dmrl.viewer.drawing.archetypes import Colour, row_indices
 from dmrl.viewer.drawing.entity import Entity
 
+SIGHT_COLOURS = (("detected", STATUS_RGB["OK"]), ("not detected", STATUS_RGB["AMBIGUOUS"]))
 BOUND_SIGMAS = 3.0
 NEES_95_LIMIT = 5.991
 """95th percentile of a chi-square distribution with two degrees of freedom."""
@@ -146,12 +147,8 @@ def draw_sight(path: str, batch: pa.RecordBatch) -> Iterator[Entity]:
     believed = column.flatten().field("confidence").to_numpy() >= least
     number = np.bincount(row_indices(column)[believed], minlength=batch.num_rows)
     states = np.where(number > 0, "detected", "not detected").tolist()
-    yield Entity(f"{path}/sight", rr.StateChange.columns(state=states), (_sight_style(),))
-
-
-@cache
-def _sight_style() -> rr.StateConfiguration:
-    return _state_style({"detected": STATUS_RGB["OK"], "not detected": STATUS_RGB["AMBIGUOUS"]})
+    style = _state_style(SIGHT_COLOURS)
+    yield Entity(f"{path}/sight", rr.StateChange.columns(state=states), (style,))
 
 
 def draw_status(path: str, positions: Positions) -> Iterator[Entity]:
@@ -159,17 +156,15 @@ def draw_status(path: str, positions: Positions) -> Iterator[Entity]:
     kind = find_descriptor("PeerPosition").fields_by_name["status"].enum_type
     names = {} if kind is None else {n: v.name for n, v in kind.values_by_number.items()}
     states = [names.get(number, str(number)) for number in positions.status.tolist()]
-    yield Entity(f"{path}/status", rr.StateChange.columns(state=states), (_status_style(),))
+    style = _state_style(tuple(STATUS_RGB.items()))
+    yield Entity(f"{path}/status", rr.StateChange.columns(state=states), (style,))
 
 
 @cache
-def _status_style() -> rr.StateConfiguration:
-    return _state_style(STATUS_RGB)
-
-
-def _state_style(colours: Mapping[str, Colour]) -> rr.StateConfiguration:
-    packed = np.array([_pack_rgba(colour) for colour in colours.values()], np.uint32)
-    return rr.StateConfiguration(values=list(colours), labels=list(colours), colors=packed)
+def _state_style(colours: tuple[tuple[str, Colour], ...]) -> rr.StateConfiguration:
+    names = [name for name, _ in colours]
+    packed = np.array([_pack_rgba(colour) for _, colour in colours], np.uint32)
+    return rr.StateConfiguration(values=names, labels=names, colors=packed)
 
 
 def _pack_rgba(colour: Sequence[int]) -> int:

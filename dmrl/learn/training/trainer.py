@@ -238,15 +238,6 @@ class Trainer:
                     chosen, epoch=epoch, index=index * self._group.size + self._group.rank
                 )
 
-    def _epoch_weights(self) -> SampleWeights:
-        """Return how often each image appears in the next epoch, with hard negatives if enabled."""
-        share = self._settings.hard_share
-        return (
-            mine_hard_negatives(self.network, self._examples, self._shares, share)
-            if share
-            else self._shares
-        )
-
     def _train_epoch(
         self, epoch: int, board: boards.ScalarWriter
     ) -> Generator[StepProgress, None, dict[str, float]]:
@@ -254,7 +245,9 @@ class Trainer:
         size = self._settings.batch_size
         seen: list[Tensor] = []
         total, loss = torch.zeros(len(LOSS_NAMES)), math.nan
-        shares = self._epoch_weights()
+        shares, hard = self._shares, self._settings.hard_share
+        if hard:
+            shares = mine_hard_negatives(self.network, self._examples, shares, hard)
         for index, batch in enumerate(prefetch(self._iter_batches(epoch, shares)), start=1):
             step = epoch * self._steps_per_epoch + index
             rate = learning_rate_at(step, self._steps_per_epoch, self._settings)

@@ -76,26 +76,18 @@ class TargetResult:
         return not (self.skipped or self.error or self.mismatches)
 
 
-@dataclass(frozen=True, slots=True)
-class ExpectedResults:
-    """Images in the network's format, raw mosaics of some, and the expected results of both."""
-
-    images: Sequence[Image]
-    raws: Sequence[Image]
-    of_images: list[HarnessResult]
-    of_raws: list[HarnessResult]
+ExpectedResults = dict[bool, list[tuple[Image, HarnessResult]]]
+"""Images and their results: in the network's format (False), and raw mosaics of some (True)."""
 
 
 def compute_expected(network: IntegerNetwork, images: Sequence[Image]) -> ExpectedResults:
     """Compute the reference results of (height, width, channels) images."""
     raws = [to_mosaic(image) for image in images[:BAYER_IMAGES]]
-    seen = [demosaic(raw, channels=network.channels) for raw in raws]
-    return ExpectedResults(
-        images,
-        raws,
-        [_reference_result(network, i) for i in images],
-        [_reference_result(network, i) for i in seen],
-    )
+    seen = [(raw, demosaic(raw, channels=network.channels)) for raw in raws]
+    return {
+        bayer: [(given, _reference_result(network, image)) for given, image in pairs]
+        for bayer, pairs in ((False, [(image, image) for image in images]), (True, seen))
+    }
 
 
 def _reference_result(network: IntegerNetwork, image: Image) -> HarnessResult:
@@ -136,8 +128,7 @@ def verify_target(
 def _verify_build(
     network: IntegerNetwork, folder: Path, build: Build, wanted: ExpectedResults
 ) -> BuildResult:
-    images = wanted.raws if build.bayer else wanted.images
-    right = wanted.of_raws if build.bayer else wanted.of_images
+    images, right = zip(*wanted[build.bayer], strict=True)
     with tempfile.TemporaryDirectory(prefix="dmrl-verify-") as place:
         command = build.compile_program(network, folder, Path(place))
         data = b"".join(image.tobytes() for image in images)

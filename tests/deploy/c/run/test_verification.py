@@ -79,8 +79,8 @@ def test_build_must_answer_every_image_within_its_stack(
     )
     wanted = compute_expected(network, images)
     given = {
-        False: [replace(a, stack_bytes=stack) for a in wanted.of_images],
-        True: list(wanted.of_raws),
+        False: [replace(a, stack_bytes=stack) for a in (a for _, a in wanted[False])],
+        True: [a for _, a in wanted[True]],
     }
     given[True][1] = replace(given[True][1], detections=FOUND)
     monkeypatch.setattr(Build, "compile_program", lambda build, *_: [build])
