@@ -113,6 +113,7 @@ MAY_PARSE = {
     "rendering/robots/quadrotor.py": "a table of the package",
     "rendering/backgrounds/room_items.py": "a table of the package",
     "rendering/settings.py": "a table of the package",
+    "learn/inference/metric_definitions.py": "a table of the package",
     "guards/bounded_parsing.py": "the home",
     "rendering/blender/protocol.py": "what our own processes say to each other",
     "pipeline/process_pool.py": "what our own processes say to each other",

@@ -239,12 +239,7 @@ class OnboardFilter:
         density = 1.0 / (6.283185307179586 * root(det) * near * near * near)
         return (0.0 if squared > _K["GATE"] else density), rx, ry, ixx, ixy, iyy
 
-    def _update(
-        self,
-        candidate: tuple[float, float, float, float, float, float],
-        place: tuple[float, ...],
-        age_s: float,
-    ) -> None:
+    def _update(self, candidate: tuple[float, ...], place: tuple[float, ...], age_s: float) -> None:
         _, rx, ry, ixx, ixy, iyy = candidate
         p = self.covariance
         # Columns of the covariance of state and measurement, then the gain.
@@ -265,11 +260,11 @@ class OnboardFilter:
         x, y = pose.c * dx + pose.s * dy, pose.c * dy - pose.s * dx
         vx, vy = pose.c * m[2] + pose.s * m[3], pose.c * m[3] - pose.s * m[2]
         drift_x, drift_y = vx - state.vx_mps, vy - state.vy_mps
+        stale = state.time_s - self.image_s > _K["STALE_S"]
         if state.time_s - self.seen_s > _K["BLIND_S"]:
-            turn = self.side * _K["SEARCH_RATE"]
-            return (0.0, 0.0, 0.0, 0.0 if self._is_stale(state) else turn)
+            return (0.0, 0.0, 0.0, 0.0 if stale else self.side * _K["SEARCH_RATE"])
         self.side = 1.0 if y + 0.7 * drift_y > 0.0 else -1.0
-        if self._is_stale(state):
+        if stale:
             return (0.0, 0.0, 0.0, 0.0)
         away = root(x * x + y * y) + 0.001
         to_x, to_y = x / away, y / away
@@ -298,9 +293,6 @@ class OnboardFilter:
         """
         short = _K["GAIN"] * (away - self.distance_m)
         return short * (x / away), short * (y / away)
-
-    def _is_stale(self, state: RobotState) -> bool:
-        return state.time_s - self.image_s > _K["STALE_S"]
 
 
 def turn_of(angle_rad: float) -> tuple[float, float]:
