@@ -62,7 +62,7 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     for pair in pairs:
         draws += [_build_sensor_rule(row, *pair, own=False) for row in topics.PAIR_SENSORS]
     spaces = _build_spaces(selection, seen, pairs, robots, eyes)
-    read = read_first_messages(selection, [topics.CAUSES(*pair) for pair in pairs])
+    read = load_first_messages(selection, [topics.CAUSES(*pair) for pair in pairs])
     causes = {pair: read[topic] for pair in pairs if (topic := topics.CAUSES(*pair)) in read}
     panels = {
         f"{a} sees {b}": [
