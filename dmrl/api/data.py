@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dmrl.api import notebook_display
 from dmrl.datasets import Dataset, Split, layout, open_dataset
-from dmrl.errors import DatasetError, MissingExtra
+from dmrl.errors import DatasetError, MissingExtra, optional_imports
 from dmrl.exchange.csv_parquet import flatten_table
 from dmrl.storage import to_path
 
@@ -280,7 +280,5 @@ def dataset(path: str | os.PathLike[str]) -> Data:
 
 
 def _import_torch_dataset() -> Any:
-    try:
+    with optional_imports("train", "a loader"):
         return import_module("dmrl.learn.data.torch_dataset")
-    except ModuleNotFoundError as e:
-        raise MissingExtra(str(e.name), "train", "a loader") from None

@@ -1,7 +1,6 @@
 """Writer of recordings: messages by topic and fields, images as arrays."""
 
 from collections.abc import Mapping
-from types import TracebackType
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -211,14 +210,9 @@ class Writer:
         self._sink.__enter__()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: Any) -> None:
         self._done = True
-        self._sink.__exit__(kind, error, traceback)
+        self._sink.__exit__(*raised)
 
 
 def writer(path: PathLike, /, **settings: Any) -> Writer:

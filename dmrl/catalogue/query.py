@@ -11,7 +11,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from dmrl.catalogue.table import FILE_NAME, Catalogue, file_stamp, open_catalogue
-from dmrl.errors import MissingExtra, RecordingError, SettingError
+from dmrl.errors import RecordingError, SettingError, optional_imports
 from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.cage import run_caged
@@ -77,10 +77,8 @@ def select_names(request: bytes) -> bytes:
     SettingError
         As `find_rows`.
     """
-    try:
+    with optional_imports("index", "dmrl find"):
         import duckdb  # noqa: PLC0415 - only the caged process needs it
-    except ModuleNotFoundError as e:
-        raise MissingExtra("duckdb", "index", "dmrl find") from e
 
     table = pa.ipc.open_stream(request).read_all()
     query = table.schema.metadata[QUERY_KEY].decode()

@@ -20,64 +20,37 @@ from dmrl.guards.memory import MemoryLimit
 FILE_NAME = "catalogue.parquet"
 FORMAT_MARK = {b"dmrl.catalogue": b"1"}
 """Metadata of the file that identifies a catalogue and its version."""
-SHA256_COLUMN = ("sha256", pa.string())
+TEXT, COUNT, NUMBER = pa.string(), pa.int64(), pa.float64()
+
+
+def _list_of(**fields: pa.DataType) -> pa.DataType:
+    return pa.list_(pa.struct(fields))
+
+
 COLUMNS = pa.schema(
-    [
-        ("recording", pa.string()),
-        ("bytes", pa.int64()),
-        ("stamp", pa.string()),
-        SHA256_COLUMN,
-        ("error", pa.string()),
-        ("start_ns", pa.int64()),
-        ("duration_s", pa.float64()),
-        ("messages", pa.int64()),
-        ("robots", pa.list_(pa.string())),
-        (
-            "topics",
-            pa.list_(
-                pa.struct([("topic", pa.string()), ("message", pa.string()), ("count", pa.int64())])
-            ),
+    {
+        "recording": TEXT,
+        "bytes": COUNT,
+        "stamp": TEXT,
+        "sha256": TEXT,
+        "error": TEXT,
+        "start_ns": COUNT,
+        "duration_s": NUMBER,
+        "messages": COUNT,
+        "robots": pa.list_(TEXT),
+        "topics": _list_of(topic=TEXT, message=TEXT, count=COUNT),
+        "cameras": _list_of(
+            camera=TEXT, images=COUNT, width_px=COUNT, height_px=COUNT, focal_px=NUMBER
         ),
-        (
-            "cameras",
-            pa.list_(
-                pa.struct(
-                    [
-                        ("camera", pa.string()),
-                        ("images", pa.int64()),
-                        ("width_px", pa.int64()),
-                        ("height_px", pa.int64()),
-                        ("focal_px", pa.float64()),
-                    ]
-                )
-            ),
-        ),
-        (
-            "labels",
-            pa.list_(
-                pa.struct(
-                    [
-                        ("camera", pa.string()),
-                        ("source", pa.string()),
-                        ("status", pa.string()),
-                        ("count", pa.int64()),
-                    ]
-                )
-            ),
-        ),
-        ("stage", pa.string()),
-        ("dmrl_version", pa.string()),
-        ("settings", pa.string()),
-        ("inputs", pa.list_(pa.struct([("name", pa.string()), SHA256_COLUMN]))),
-        ("errors", pa.int64()),
-        ("warnings", pa.int64()),
-        (
-            "findings",
-            pa.list_(
-                pa.struct([("level", pa.string()), ("topic", pa.string()), ("text", pa.string())])
-            ),
-        ),
-    ],
+        "labels": _list_of(camera=TEXT, source=TEXT, status=TEXT, count=COUNT),
+        "stage": TEXT,
+        "dmrl_version": TEXT,
+        "settings": TEXT,
+        "inputs": _list_of(name=TEXT, sha256=TEXT),
+        "errors": COUNT,
+        "warnings": COUNT,
+        "findings": _list_of(level=TEXT, topic=TEXT, text=TEXT),
+    },
     metadata=FORMAT_MARK,
 )
 """One row per recording, with lists of structs for repeated items."""

@@ -9,17 +9,6 @@ import os
 from types import SimpleNamespace
 from typing import Any
 
-__all__ = [
-    "HAS_LOCKS",
-    "O_CLOEXEC",
-    "O_DIRECTORY",
-    "O_NOFOLLOW",
-    "O_NONBLOCK",
-    "fcntl",
-    "getuid",
-    "resource",
-]
-
 fcntl: Any
 resource: Any
 

@@ -1,7 +1,6 @@
 """Executors of tasks: processes of this machine, or a cluster."""
 
 from concurrent.futures import Future
-from types import TracebackType
 from typing import Protocol, Self
 
 from dmrl.errors import SettingError
@@ -28,12 +27,7 @@ class Executor(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None: ...
+    def __exit__(self, *_: object) -> None: ...
 
     def list_nodes(self) -> Lines:
         """Return a table of the machines, its head first; empty: it is this one alone."""

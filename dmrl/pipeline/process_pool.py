@@ -8,7 +8,6 @@ import sys
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from types import TracebackType
 from typing import Self
 
 from dmrl.pipeline.job import JobResult
@@ -47,12 +46,7 @@ class ProcessPool:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object = None, *_: object) -> None:
         with self._lock:
             self._over, self._idle, found = True, [], self._all
         stop_processes(found, in_order=kind is not None)

@@ -26,7 +26,6 @@ from dmrl.pipeline.plan import (
     STATE_FILE,
     UNFINISHED,
     Plan,
-    Step,
     Table,
     load_plan,
     locate_input,
@@ -35,17 +34,6 @@ from dmrl.pipeline.runner import Runner, keep_previous
 from dmrl.storage import RemotePath
 from dmrl.storage.upload import require_bucket
 from dmrl.terminal.progress import say
-
-__all__ = [
-    "Forecast",
-    "Plan",
-    "Step",
-    "StepOutcome",
-    "forecast",
-    "load_plan",
-    "read_recipe_text",
-    "run",
-]
 
 LEFTOVER_NAMES = (UNFINISHED, to_partial_path(Path(STATE_FILE)).name)
 """Files that remain if a disk failed before a pipeline began."""

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from google.protobuf.descriptor import Descriptor
@@ -189,14 +188,9 @@ class RecordingWriter:
     def _abandon(self, error: BaseException) -> None:
         self._resources.__exit__(type(error), error, error.__traceback__)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        if error is not None:
-            self._resources.__exit__(kind, error, traceback)
+    def __exit__(self, *raised: Any) -> None:
+        if raised[1] is not None:
+            self._resources.__exit__(*raised)
             return
         try:
             if left_out := count_so_far():  # readers take the last record of this name

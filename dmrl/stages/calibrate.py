@@ -4,13 +4,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import Parameter, validators
+from cyclopts import Parameter
 
 from dmrl.atomic_output import atomic_file, refuse_existing
 from dmrl.errors import SettingError, optional_imports
 from dmrl.estimation.calibration.noise import Noise
 from dmrl.pipeline.stage_command import stage_command
-from dmrl.terminal.arguments import Robot
+from dmrl.terminal.arguments import Count, Positive, Robot, Share
 from dmrl.terminal.closing import Closing, Given
 from dmrl.terminal.tables import print_table
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from dmrl.labelling.sensor_file import SensorConstants
 
 NOISE = Noise()
-Positive = Annotated[float, Parameter(validator=validators.Number(gt=0, lt=1e6))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +52,10 @@ class Settings:
     robot: Robot | None = None
     against: Literal["estimate", "truth"] = "estimate"
     camera: Path | None = None
-    threshold: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1))] = None
+    threshold: Share | None = None
     pixel_std_px: Positive = NOISE.pixel_std_px
     attitude_std_rad: Positive = NOISE.attitude_std_rad
-    every: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 10
+    every: Count = 10
 
 
 @dataclass(frozen=True, slots=True)

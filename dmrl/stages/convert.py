@@ -17,7 +17,7 @@ from dmrl.errors import SettingError, SourceError
 from dmrl.guards.paths import refuse_pipes
 from dmrl.pipeline.batch import find_recordings
 from dmrl.pipeline.stage_command import stage_command
-from dmrl.terminal.arguments import Strict
+from dmrl.terminal.arguments import Count, Strict
 from dmrl.terminal.closing import Closing, Given
 from dmrl.terminal.tables import print_table
 
@@ -37,7 +37,6 @@ NEW_NAME = re.compile(r"[A-Za-z0-9_-]+|(/[A-Za-z0-9_-]+)+")
 
 RATE_MAX_HZ = 1e6
 SIDE_MAX_PX = 8192
-Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +96,8 @@ class Settings:
     rate_hz: Annotated[float, Parameter(validator=validators.Number(gt=0))] = 10.0
     labels: Path | None = None
     camera: Path | None = None
-    width_px: Positive | None = None
-    height_px: Positive | None = None
+    width_px: Count | None = None
+    height_px: Count | None = None
     columns: Path | None = None
     raw: Annotated[bool, Parameter(negative=())] = False
     bits: Annotated[int, Parameter(validator=validators.Number(gte=9, lte=16))] = 16

@@ -11,7 +11,7 @@ from dmrl.pipeline.batch import find_all_recordings
 from dmrl.pipeline.parallel_map import parallel_map
 from dmrl.pipeline.process_pool import count_cores
 from dmrl.pipeline.single_run import run_on_cluster
-from dmrl.terminal.arguments import AsJson, Flat, On, Workers
+from dmrl.terminal.arguments import AsJson, Count, Flat, On, Share, Workers
 from dmrl.terminal.tables import print_json, print_line
 
 if TYPE_CHECKING:
@@ -56,9 +56,9 @@ class Settings:
     against: Literal["truth", "estimate", "hand", "published"] = "truth"
     split: str | None = None
     partial: Annotated[bool, Parameter(negative=())] = False
-    threshold: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1))] = None
+    threshold: Share | None = None
     false_alarms: Finite = None
-    draws: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1000
+    draws: Count = 1000
     seed: int = 0
     settle_s: Finite = None
 

@@ -11,14 +11,12 @@ from dmrl.errors import optional_imports
 from dmrl.estimation.model.gate import BAD_SHARE, GATE_M, Gate
 from dmrl.pipeline.parallel_map import parallel_map
 from dmrl.pipeline.stage_command import stage_command
-from dmrl.terminal.arguments import In, Strict
+from dmrl.terminal.arguments import In, Positive, Strict
 from dmrl.terminal.closing import Closing, Given
 from dmrl.terminal.tables import print_table
 
 if TYPE_CHECKING:
     from dmrl.labelling.pair_report import PairReport
-
-Positive = Annotated[float, Parameter(validator=validators.Number(gt=0, lt=1e6))]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,15 +9,12 @@ from cyclopts import Parameter, validators
 from dmrl.deploy.backend_names import BackendName
 from dmrl.learn.inference.tta_views import TTA_VIEWS
 from dmrl.pipeline.stage_command import stage_command
-from dmrl.terminal.arguments import In, Model, Strict
+from dmrl.terminal.arguments import Count, In, Model, Share, Strict
 from dmrl.terminal.closing import Closing
 
 if TYPE_CHECKING:
     from dmrl.deploy.detector import Detector
     from dmrl.recording import Provenance
-
-Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))]
-Positive = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +48,9 @@ class Settings:
     backend: BackendName | None = None
     threshold: Share | None = None
     min_confidence: Share = 0.01
-    most: Positive = 20
+    most: Count = 20
     views: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=len(TTA_VIEWS)))] = 1
-    batch_size: Positive = 16
+    batch_size: Count = 16
     strict: Strict = False
 
 

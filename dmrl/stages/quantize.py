@@ -2,20 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import Parameter, validators
+from typing import TYPE_CHECKING, Any
 
 from dmrl.atomic_output import refuse_existing
 from dmrl.errors import optional_imports
 from dmrl.pipeline.stage_command import stage_command
-from dmrl.terminal.arguments import Model
+from dmrl.terminal.arguments import Count, Model
 from dmrl.terminal.closing import Closing, Given
 
 if TYPE_CHECKING:
     from dmrl.evaluation.quantization_report import QuantizationReport
-
-Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 
 
 @dataclass(frozen=True, slots=True)

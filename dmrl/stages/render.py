@@ -5,20 +5,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Parameter, validators
+from cyclopts import Parameter
 
 from dmrl.errors import SettingError
 from dmrl.pipeline.single_run import run_on_cluster
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.settings import filled as filled
-from dmrl.terminal.arguments import AsJson, Flat, On, Recipe
+from dmrl.terminal.arguments import AsJson, Count, Flat, On, Recipe
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_table
 
 if TYPE_CHECKING:
     from dmrl.render_recording import Rendered
-
-Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 
 
 def run(out: Path, settings: Settings, *, resume: bool = False) -> "Rendered":

@@ -14,7 +14,7 @@ from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
 
 if TYPE_CHECKING:
-    from dmrl.pipeline.recipe_run import Forecast
+    from dmrl.pipeline.forecast import Forecast
 
 
 def command(
@@ -58,6 +58,7 @@ def command(
     """
     from dmrl.evaluation.pipeline_summary import print_report
     from dmrl.pipeline import recipe_run as pipeline
+    from dmrl.pipeline.plan import load_plan
 
     if recipe.endswith(".mcap"):
         _rebuild(to_path(recipe), out, data, as_json=as_json)
@@ -67,7 +68,7 @@ def command(
     if dry_run:
         _print_forecast(pipeline.forecast(recipe, folder, data, given), as_json=as_json)
         return
-    plan, before = pipeline.load_plan(recipe, given), pipeline.read_recipe_text(folder)
+    plan, before = load_plan(recipe, given), pipeline.read_recipe_text(folder)
     done = pipeline.run(recipe, folder, data, workers=workers, on=on, submitted=given)
     print_report(done, as_json=as_json)
     if any(one.stage == "score" for one in done):

@@ -2,23 +2,20 @@
 
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter, validators
+from typing import TYPE_CHECKING
 
 from dmrl import topics
 from dmrl.atomic_output import refuse_existing
 from dmrl.errors import MissingTopic, SettingError, optional_imports
 from dmrl.estimation.tracking.tuning import Tuning
 from dmrl.pipeline.stage_command import stage_command
-from dmrl.terminal.arguments import In
+from dmrl.terminal.arguments import In, Positive, Share
 from dmrl.terminal.closing import Closing
 
 if TYPE_CHECKING:
     from dmrl.labelling.peer_tracks import RobotReport
 
 TUNING = Tuning()
-Positive = Annotated[float, Parameter(validator=validators.Number(gt=0, lt=1e6))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +43,7 @@ class Settings:
         A robot's camera, with mount and delay, as dmrl calibrate wrote it: --camera.cf1 FILE.
     """
 
-    threshold: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1))] = None
+    threshold: Share | None = None
     pixel_std_px: Positive = TUNING.pixel_std_px
     depth_std_ratio: Positive = TUNING.depth_std_ratio
     depth_bias_ratio: Positive = TUNING.depth_bias_ratio

@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import Group, Parameter, validators
 
 from dmrl.errors import SettingError
-from dmrl.terminal.arguments import Flat, Strict
+from dmrl.terminal.arguments import Count, Flat, Strict
 from dmrl.terminal.left_out import count_left_out
 from dmrl.terminal.tables import print_line
 from dmrl.viewer.settings import Settings, Web
@@ -48,7 +48,7 @@ def command(
     flag_to: Annotated[Path | None, Parameter(name="--flag", group=OUTPUT)] = None,
     serve_web: Annotated[bool, Parameter(name="--serve", negative="", group=OUTPUT)] = False,
     time_s: Annotated[float | None, Parameter(name=["--time-s", "--time"])] = None,
-    rank: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 1,
+    rank: Count = 1,
     strict: Strict = False,
     web: Flat[Web] = WEB,
     settings: Flat[Settings] = DEFAULTS,

@@ -67,6 +67,8 @@ Strict = Annotated[bool, Parameter(negative=())]
 Seed = Annotated[int, Parameter(validator=validators.Number(gte=0))]
 """Seed of all random numbers."""
 Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))]
+Positive = Annotated[float, Parameter(validator=validators.Number(gt=0, lt=1e6))]
+Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
 On = Annotated[
     str | None,
     Parameter(

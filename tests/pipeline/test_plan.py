@@ -14,7 +14,7 @@ import pytest
 from dmrl import entry_points, recipe
 from dmrl.errors import RecipeError, SettingError
 from dmrl.pipeline import recipe_run as pipeline
-from dmrl.pipeline.plan import Step
+from dmrl.pipeline.plan import Plan, Step, load_plan
 from dmrl.pipeline.stage_signature import signature_of
 from dmrl.stages.run import command as run_command
 
@@ -28,10 +28,10 @@ out = "both.mcap"
 """
 
 
-def load(folder: Path, text: str) -> pipeline.Plan:
+def load(folder: Path, text: str) -> Plan:
     path = folder / "mine.toml"
     path.write_text(text, encoding="utf-8")
-    return pipeline.load_plan(path)
+    return load_plan(path)
 
 
 def test_step_keys_become_inputs_or_settings(tmp_path: Path) -> None:
@@ -216,7 +216,7 @@ def step_as_dict(step: Step) -> dict[str, Any]:
 
 
 def test_recipe_self_supervised_has_its_number_of_steps() -> None:
-    steps = pipeline.load_plan("self_supervised").steps
+    steps = load_plan("self_supervised").steps
     assert len(recipe.read_text("self_supervised").splitlines()) <= 100
     assert Counter(step.stage for step in steps) == {
         **{"fly": 148, "label": 864, "predict": 748, "dataset": 7, "train": 7},
@@ -241,12 +241,12 @@ def test_recipes_of_the_page_can_be_loaded(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize("name", recipe.list_names())
 def test_every_shipped_pipeline_can_be_loaded(name: str) -> None:
     if recipe.read(name)["kind"] == "pipeline":
-        assert pipeline.load_plan(name).steps
+        assert load_plan(name).steps
 
 
 @pytest.mark.parametrize("name", ["paper", "published"])
 def test_recipes_of_the_paper_have_figures_that_name_their_steps(name: str) -> None:
-    assert pipeline.load_plan(name).pictured
+    assert load_plan(name).pictured
 
 
 def test_figure_of_an_unknown_output_is_a_fault(tmp_path: Path) -> None:

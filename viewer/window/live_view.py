@@ -4,7 +4,6 @@ import subprocess
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -132,12 +131,7 @@ class LiveWindow:
         self.show = LiveView(self._stream).show
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with suppress(RuntimeError):  # the user may have closed the window
             self._stream.flush(timeout_sec=2.0)
         self._stream.disconnect()

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from dmrl.errors import DmrlError, MissingExtra, SourceError
+from dmrl.errors import DmrlError, SourceError, optional_imports
 from dmrl.guards.memory import MemoryLimit, measure_size
 from dmrl.terminal.left_out import leave_out
 
@@ -91,10 +91,8 @@ def build_decoder(
     is_ros1
         Messages are serialized as by ROS 1, and not in CDR.
     """
-    try:
+    with optional_imports("ros", "messages of ROS"):
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
-    except ModuleNotFoundError as e:
-        raise MissingExtra("rosbags", "ros", "messages of ROS") from e
     store = get_typestore(Stores.EMPTY)
     decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
     types: dict[str, Any] = {}
@@ -134,10 +132,8 @@ def _parse_definition(msgtype: str, form: str, text: str) -> dict[str, Any]:
 
 
 def _open_reader(source: Path) -> Any:
-    try:
+    with optional_imports("ros", "a ROS bag"):
         from rosbags import rosbag1, rosbag2  # noqa: PLC0415
-    except ModuleNotFoundError as e:
-        raise MissingExtra("rosbags", "ros", "a ROS bag") from e
     return rosbag1.Reader(source) if source.suffix == ".bag" else rosbag2.Reader(source)
 
 
