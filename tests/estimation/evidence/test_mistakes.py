@@ -110,7 +110,7 @@ def test_a_clock_that_is_seconds_off_is_found_by_the_ranges_of_both() -> None:
     found = find_mistake(late)
     assert found is not None
     mistake, robot = found
-    assert mistake.name.startswith("clock fits if it is moved by -3.2") and robot == 1
+    assert mistake.name.startswith("clock fits if it is moved by -3.") and robot == 1
     assert mistake.shift_s == pytest.approx(-3.2, abs=0.05)
     assert isinstance(mistake, Mistake)
     assert compute_misfit(mistake.correct(late, robot)) < 0.6
