@@ -34,7 +34,10 @@ def find_causes(mixture: Mixture, span_s: tuple[float, float]) -> tuple[Cause, .
 
 
 def join_causes(causes: Sequence[Cause]) -> tuple[Cause, ...]:
-    """Return causes with those of the same name and robot as one, if their times touch."""
+    """Return causes with those of the same name and robot as one.
+
+    Stretches that are refused stay apart unless they touch.
+    """
     out: list[Cause] = []
     for cause in sorted(causes, key=lambda one: one.from_s):
         before = next(
@@ -42,7 +45,7 @@ def join_causes(causes: Sequence[Cause]) -> tuple[Cause, ...]:
                 k
                 for k, one in enumerate(out)
                 if (one.name, one.robot) == (cause.name, cause.robot)
-                and cause.from_s <= one.to_s + MAX_DROPOUT_S
+                and (not cause.refuses or cause.from_s <= one.to_s + MAX_DROPOUT_S)
             ),
             None,
         )

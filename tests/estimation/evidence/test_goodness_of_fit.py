@@ -122,6 +122,8 @@ def test_no_position_of_a_stretch_that_does_not_fit_is_ok() -> None:
 def test_stretches_apart_stay_apart_and_windows_of_a_flight_are_joined() -> None:
     one, two = Cause("range does not fit", 1.0, 0.0, 5.0), Cause("range does not fit", 1.0, 40, 50)
     assert join_causes([two, one]) == (one, two)
+    listed = [replace(cause, name="range offset") for cause in (one, two)]
+    assert join_causes(listed) == (replace(listed[0], to_s=50),)
     first = Innovation("flow", np.array([1.0]), np.array([2.0]), 1)
     (joined,) = join_innovations([[first], [replace(first, time_s=np.array([3.0]))]])
     assert joined.time_s.tolist() == [1.0, 3.0] and joined.robot == 1
