@@ -192,6 +192,7 @@ class TrainSettings(TypedDict, total=False):
     offset_weight: float
     spread_weight: float
     class_weight: float
+    consistency_weight: float
     classes: Sequence[str]
     architecture: str
     epochs: int

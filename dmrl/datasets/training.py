@@ -47,6 +47,7 @@ with optional_imports("train", "dmrl train"):
     from dmrl.learn.networks.architectures import Network
     from dmrl.learn.training.checkpoint import has_checkpoint, remove_checkpoint
     from dmrl.learn.training.config import AUTO, DEFAULT_ARCHITECTURE, TrainConfig
+    from dmrl.learn.training.consistency import UnlabelledImages
     from dmrl.learn.training.distributed import ProcessGroup, run_distributed
     from dmrl.learn.training.trainer import (
         StepProgress,
@@ -76,6 +77,7 @@ def train_network(
     *,
     init: Path | None = None,
     teacher: Path | None = None,
+    unlabelled: UnlabelledImages | None = None,
     resume: bool = False,
 ) -> Result:
     """Train on the train split of a dataset and write the run folder.
@@ -95,6 +97,8 @@ def train_network(
         Model whose weights to start from. None: new weights, by the seed.
     teacher
         Model that is learnt from beside the labels. None: the labels alone.
+    unlabelled
+        Images without labels, for the consistency loss. None: none.
     resume
         Go on with the interrupted training in ``<out>.partial``; from the start, if that had
         not come to the end of its first epoch.
@@ -115,7 +119,8 @@ def train_network(
         raise SettingError("init_share requires an initial model. Pass --init MODEL")
     if not settings.epochs and init is None:
         raise SettingError("epochs: 0 trains nothing. Give --init MODEL to calibrate, or epochs")
-    given = Given(init and resolve_model_path(init), teacher and resolve_model_path(teacher))
+    start, guide = (path and resolve_model_path(path) for path in (init, teacher))
+    given = Given(start, guide, unlabelled)
     settings = _with_architecture(settings, given.init)
     processes = settings.processes if select_device(settings.device).type == "cpu" else 1
     return run_distributed(
@@ -133,10 +138,11 @@ def _with_architecture(settings: TrainConfig, init: Path | None) -> TrainConfig:
 
 
 class Given(NamedTuple):
-    """Models of a training: the one to start from, and the teacher."""
+    """Models of a training, the one to start from and the teacher, and images without labels."""
 
     init: Path | None
     teacher: Path | None
+    unlabelled: UnlabelledImages | None
 
 
 def _train_in_process(
@@ -158,7 +164,8 @@ def _train_in_process(
     network = _build_network(settings, examples, given.init)
     first = {name: value.clone() for name, value in get_weights(network).items()}
     teacher = _load_teacher(given.teacher, network) if given.teacher else None
-    inputs = [dataset, *filter(None, given)]
+    models = [path for path in (given.init, given.teacher) if path]
+    inputs = [dataset, *models, *(given.unlabelled.paths if given.unlabelled else ())]
     made = build_provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
     identity = " ".join(source.sha256 for source in made.inputs)
     mine = atomic_folder(out, keep_on_error=True, resume=resume)
@@ -172,6 +179,7 @@ def _train_in_process(
             shares=shares,
             identity=identity,
             teacher=teacher,
+            unlabelled=given.unlabelled,
             group=group,
             resume=resume and has_checkpoint(folder),
         )

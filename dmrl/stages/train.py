@@ -11,9 +11,9 @@ from dmrl.terminal.arguments import AsJson, Flat, Model, Recipe
 from dmrl.terminal.closing import Closing, Given
 from dmrl.terminal.progress import announce_import
 
-TRAINING = "dmrl.datasets.training"
+TRAINING = "dmrl.labelling.unlabelled_training"
 __getattr__ = import_lazily(
-    __name__, {"run": f"{TRAINING}:train_network", "Settings": f"{TRAINING}:TrainConfig"}
+    __name__, {"run": f"{TRAINING}:train_with_flights", "Settings": f"{TRAINING}:TrainConfig"}
 )
 
 
@@ -60,6 +60,7 @@ def command(
     recipe: Recipe = "dmrl_nano",
     init: Model | None = None,
     teacher: Model | None = None,
+    unlabelled: Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)] = (),
     resume: bool = False,
     flags: Flat[Flags] = NO_FLAGS,
     as_json: AsJson = False,
@@ -79,16 +80,27 @@ def command(
     teacher
         Model to learn from beside the labels, by the recipe's distill_share; as a rule a larger
         one, such as dmrl-large, trained on the same dataset.
+    unlabelled
+        Recording of a flight with detections, whose images must agree with its odometry; see
+        consistency_weight. Repeat for more.
     resume
         Go on with the interrupted training in OUT_DIR.partial.
     """
     announce_import("torch")
     from dmrl import recipe as recipes
-    from dmrl.datasets.training import train_network
+    from dmrl.labelling.unlabelled_training import train_with_flights
     from dmrl.learn.training.config import TrainConfig
 
     settings = recipes.load(recipe, "train", TrainConfig, flags)
-    result = train_network(dataset, out, settings, init=init, teacher=teacher, resume=resume)
+    result = train_with_flights(
+        dataset,
+        out,
+        settings,
+        init=init,
+        teacher=teacher,
+        unlabelled=unlabelled,
+        resume=resume,
+    )
     row = (result.images, settings.epochs, result.loss, result.seconds, result.images_per_s)
     columns = ("images", "epochs", "last loss", "seconds", "images/s")
     closing = Closing(columns=columns, rows=lambda *_: [row], path_key="model")

@@ -38,11 +38,13 @@ T = TypeVar("T")
 class Batch(NamedTuple):
     """Images and their robots.
 
-    ``images`` (N, 3, H, W) uint8, channels last in memory; ``robots`` (N, K, 11) float32.
+    ``images`` (N, 3, H, W) uint8, channels last in memory; ``robots`` (N, K, 11) float32; ``poses``
+    (N, 11) of the camera, where images have no labels and 2k and 2k + 1 are a pair.
     """
 
     images: Tensor
     robots: Tensor
+    poses: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,8 @@ class Targets(NamedTuple):
         (N, 2, rows, cols) robot centre minus cell centre, (u, v), cells.
     class_id
         (N, rows, cols) int64 class of the robot; -1 where it is unknown or there is no robot.
+    poses
+        (N, 11) of the camera, for pairs of images without labels; else None.
     """
 
     confidence: Tensor
@@ -50,6 +52,7 @@ class Targets(NamedTuple):
     depth_m: Tensor
     offset: Tensor
     class_id: Tensor
+    poses: Tensor | None = None
 
 
 def build_targets(

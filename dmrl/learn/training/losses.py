@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, one_hot
 
-from dmrl.learn.data.targets import Targets
+from dmrl.learn.data.targets import MIN_PRESENCE, Targets
 from dmrl.learn.networks.architectures import CLASS_PREFIX, SPREAD_CHANNEL
+from dmrl.learn.training.consistency import carry_over, fuse
 
 DepthLoss = Literal["squared", "log"]
 OutputChannels = Mapping[str, Tensor]
@@ -42,6 +43,8 @@ class LossSettings:
         Weight of the loss of the depth uncertainty channel. 0: no such channel.
     class_weight
         Weight of the class loss.
+    consistency_weight
+        Weight of the consistency loss of images without labels (dmrl train --unlabelled).
     classes
         Classes of robots, each a pattern of peer names: ["cf2", "cf[3-9]"] defines two. Empty: the
         network does not classify.
@@ -54,6 +57,7 @@ class LossSettings:
     offset_weight: float = 0.5
     spread_weight: float = 0.0
     class_weight: float = 1.0
+    consistency_weight: float = 3.0
     classes: tuple[str, ...] = ()
 
 
@@ -207,12 +211,31 @@ def _class_term(out: OutputChannels, wanted: Targets, settings: LossSettings) ->
     return class_loss(logits, wanted.class_id, wanted.weight)
 
 
+def _consistency_term(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Tensor:
+    """Compare pairs of images without labels; see `consistency`."""
+    logit, log_depth = out["confidence"], out["log_depth"]
+    if wanted.poses is None:
+        return logit.new_zeros(())
+    offset = wanted.offset
+    if "offset_u" in out:
+        offset = torch.stack((out["offset_u"], out["offset_v"]), dim=1)
+    with torch.no_grad():
+        sure = logit.sigmoid()
+        support, depth_m = carry_over(sure, log_depth, offset, wanted.poses)
+        weight = sure * support * (support >= MIN_PRESENCE)
+    found = confidence_loss(logit, fuse(sure, support), focus=0.0)
+    return found + depth_loss(log_depth, depth_m, weight, settings.depth_loss)
+
+
 TERMS = (
     LossTerm("confidence_loss", "confidence_weight", ("confidence",), _confidence_term),
     LossTerm("depth_loss", "depth_weight", ("log_depth",), _depth_term),
     LossTerm("offset_loss", "offset_weight", ("offset_u", "offset_v"), _offset_term),
     LossTerm("spread_loss", "spread_weight", (SPREAD_CHANNEL, "log_depth"), _compute_spread_term),
     LossTerm("class_loss", "class_weight", (f"{CLASS_PREFIX}0",), _class_term),
+    LossTerm(
+        "consistency_loss", "consistency_weight", ("confidence", "log_depth"), _consistency_term
+    ),
 )
 """All terms of the loss; training minimises their weighted sum."""
 

@@ -9,6 +9,7 @@ from dmrl.learn.data.batches import Batch
 from dmrl.learn.data.targets import build_targets, build_teacher_targets
 from dmrl.learn.networks.architectures import Network, normalize_images, unbind_channels
 from dmrl.learn.training.config import TrainConfig
+from dmrl.learn.training.consistency import LENS
 from dmrl.learn.training.distributed import ProcessGroup
 from dmrl.learn.training.losses import TERMS, compute_loss_terms
 
@@ -24,7 +25,7 @@ def compute_losses(
     With a teacher, a fraction ``distill_share`` of each loss is against the teacher's output.
     """
     device = next(network.parameters()).device
-    images, robots = (t.to(device, non_blocking=True) for t in batch)
+    images, robots = (t.to(device, non_blocking=True) for t in batch[:2])
     pixels = normalize_images(images)
     out = _forward(network, pixels, settings)
     wanted = build_targets(
@@ -34,6 +35,11 @@ def compute_losses(
         stride_px=network.stride_px,
         label_noise=settings.label_noise,
     )
+    if batch.poses is not None:
+        poses = batch.poses.to(device, copy=True)
+        poses[:, LENS] /= network.stride_px
+        nothing = torch.zeros_like(wanted.confidence)
+        wanted = wanted._replace(confidence_weight=nothing, poses=poses)
     named = unbind_channels(network.channels, out)
     parts = compute_loss_terms(named, wanted, settings)
     if teacher is None:
@@ -63,6 +69,7 @@ def train_step(
     group: ProcessGroup = SINGLE_PROCESS,
     share: float = 1.0,
     teacher: Network | None = None,
+    unlabelled: Batch | None = None,
 ) -> Tensor:
     """Take one optimizer step on a batch.
 
@@ -82,6 +89,8 @@ def train_step(
         Weight of ``batch`` in the whole batch. 0: ``batch`` does not contribute.
     teacher
         Network whose output is learned in addition to the labels.
+    unlabelled
+        Pairs of images without labels, for the consistency loss.
 
     Returns
     -------
@@ -91,6 +100,8 @@ def train_step(
     for parameters in optimizer.param_groups:
         parameters["lr"] = learning_rate
     parts = compute_losses(network, batch, settings, teacher)
+    if unlabelled is not None:
+        parts = parts + compute_losses(network, unlabelled, settings)
     optimizer.zero_grad(set_to_none=True)
     parts.sum().backward()  # type: ignore[no-untyped-call]
     parts = group.all_reduce_mean(network, parts.detach(), share)

@@ -29,6 +29,7 @@ from dmrl.learn.networks.architectures import Network, build_network
 from dmrl.learn.training import tensorboard_log as boards
 from dmrl.learn.training.checkpoint import TrainingProgress, load_checkpoint, save_checkpoint
 from dmrl.learn.training.config import TrainConfig
+from dmrl.learn.training.consistency import UnlabelledImages
 from dmrl.learn.training.distributed import ProcessGroup
 from dmrl.learn.training.hard_negatives import mine_hard_negatives
 from dmrl.learn.training.optimizer import build_optimizer
@@ -116,6 +117,8 @@ class Trainer:
         Identity of the data; a training is resumed only on the same data.
     teacher
         Network whose output is learned in addition to the labels. None: labels only.
+    unlabelled
+        Images without labels, of which pairs make half a batch for the consistency loss.
     group
         Processes that train this network together; only the first writes to ``folder``.
     resume
@@ -140,11 +143,13 @@ class Trainer:
         shares: NDArray[np.float64] | None = None,
         identity: str = "",
         teacher: Network | None = None,
+        unlabelled: UnlabelledImages | None = None,
         group: ProcessGroup = SINGLE_PROCESS,
         resume: bool = False,
     ) -> None:
         self._group = group
         self._learning = network.to(select_device(settings.device))
+        self._unlabelled = unlabelled
         self._teacher = teacher and teacher.to(select_device(settings.device)).eval()
         self._examples, self._validation, self._shares = examples, validation, shares
         self._settings, self._folder = settings, folder
@@ -252,7 +257,7 @@ class Trainer:
             step = epoch * self._steps_per_epoch + index
             rate = learning_rate_at(step, self._steps_per_epoch, self._settings)
             whole = min(size, self._epoch_images - (index - 1) * size)
-            parts = self._train_batch(batch, rate, whole)
+            parts = self._train_batch(batch, rate, whole, step)
             if self._average:
                 self._average.update(step)
             seen.append(parts * whole)
@@ -268,19 +273,24 @@ class Trainer:
         means = (total / self._epoch_images).tolist()
         return {"loss": sum(means), **dict(zip(LOSS_NAMES, means, strict=True))}
 
-    def _train_batch(self, batch: Batch, rate: float, whole: int) -> Tensor:
+    def _train_batch(self, batch: Batch, rate: float, whole: int, step: int) -> Tensor:
         """Take one step on this process's part of a batch of ``whole`` images; return losses."""
-        group = self._group
+        group, settings = self._group, self._settings
+        seed = (settings.seed, step, group.rank)
+        pairs = None
+        if self._unlabelled is not None:
+            pairs = self._unlabelled.draw(settings.batch_size // 4, seed)
         share = len(group.select_part(np.arange(whole))) / whole
         return train_step(
             self._learning,
             self._optimizer,
             batch,
-            self._settings,
+            settings,
             rate,
             group,
             share,
             self._teacher,
+            pairs,
         )
 
 

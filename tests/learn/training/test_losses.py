@@ -118,9 +118,11 @@ def test_every_weight_changes_the_loss_by_its_own_term(key: str) -> None:
     settings = TrainConfig(classes=("a", "b"), spread_weight=1.0)
     network = build_network("dmrl-nano", extra=settings.extra_channels).eval()
     robots = torch.tensor([[[20.0, 12.0, 1.5, 1.0, 1.0, 0.1, 15.0, 8.0, 25.0, 16.0, 1.0]]])
-    wanted = build_targets(robots, (4, 5), sigma_cells=0.7)
+    wanted = build_targets(robots.repeat(2, 1, 1), (4, 5), sigma_cells=0.7)
+    # A pair of images of a camera at rest, whose lens is given in cells.
+    wanted = wanted._replace(poses=torch.tensor([[0.0] * 7 + [5.0, 5.0, 2.5, 2.0]] * 2))
     with torch.no_grad():
-        out = unbind_channels(network.channels, network(torch.ones(1, 3, 32, 40)))
+        out = unbind_channels(network.channels, network(torch.ones(2, 3, 32, 40)))
     before = compute_loss_terms(out, wanted, settings)
     after = compute_loss_terms(out, wanted, replace(settings, **{key: 3 * getattr(settings, key)}))
     own = next(k for k, term in enumerate(TERMS) if term.weight == key)
@@ -169,5 +171,6 @@ def test_default_loss_settings_are_documented_values() -> None:
         "offset_weight": 0.5,
         "spread_weight": 0.0,
         "class_weight": 1.0,
+        "consistency_weight": 3.0,
         "classes": (),
     }

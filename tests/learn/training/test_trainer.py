@@ -112,7 +112,7 @@ def test_distillation_loss_is_zero_for_an_identical_teacher(examples: ExampleSet
             network.head.bias[1] = 1.0  # type: ignore[union-attr, index, operator]
     itself = compute_losses(student, batch, settings, student)
     other = compute_losses(student, batch, settings, teacher)
-    assert itself.tolist() == pytest.approx([0.0] * 5, abs=1e-6)
+    assert itself.tolist() == pytest.approx([0.0] * 6, abs=1e-6)
     assert (other[:3] > 1e-3).all()
     half = compute_losses(student, batch, replace(settings, distill_share=0.5), teacher)
     labels = compute_losses(student, batch, settings)
@@ -259,5 +259,5 @@ def test_both_sides_of_images_fit_a_network(width: int, height: int, fits: int) 
 
 
 def test_loss_terms_have_a_fixed_order() -> None:
-    names = ("confidence", "depth", "offset", "spread", "class")
+    names = ("confidence", "depth", "offset", "spread", "class", "consistency")
     assert tuple(f"{name}_loss" for name in names) == LOSS_NAMES
