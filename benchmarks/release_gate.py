@@ -1,7 +1,7 @@
 """The release gate of a shipped network: every figure, with a floor that it must not fall below.
 
     python benchmarks/release_gate.py MODEL DATA [--part choose|judge] [--held HELD.mcap ...]
-        [--floors NAME] [--json] [--curve OUT.png]
+        [--flights N] [--floors NAME] [--json] [--curve OUT.png]
         [--calibrate OUT [--threshold-anew] [--renders-only]]
 
 DATA is a folder with the published renders, real frames and cut-outs (`locanet-synthetic`,
@@ -9,8 +9,9 @@ DATA is a folder with the published renders, real frames and cut-outs (`locanet-
 left out. `--part choose` reads what settings may be chosen on: the published training images,
 which no shipped network learned from, and every second empty frame. `--part judge` reads the
 published test images and the other frames, for a release. `--held` adds renders, several times if
-need be, with recall by distance. `--calibrate OUT` writes the network with confidence calibrated on
-the part `choose` and these renders; `--renders-only` leaves real frames out of that.
+need be, with recall by distance. `--flights N` flies `fly_follow` N times with the network, seeds
+500 and on, or 600 and on for the part `judge`. `--calibrate OUT` writes the network with confidence
+calibrated on the part `choose` and these renders; `--renders-only` leaves real frames out of that.
 
 A composite is a cut-out of a Crazyflie, 18 to 110 px wide, on an empty frame; two of them on
 every frame. Right: the most confident detection is within 16 px. Believed: it is above the
@@ -21,6 +22,7 @@ is beyond its own.
 import argparse
 import json
 import sys
+import tempfile
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,6 +31,9 @@ from pathlib import Path
 import numpy as np
 from gate_sets import SIZE_PX, Set, composites, empty, frames, join, published, renders
 
+from dmrl import recipe as recipes
+from dmrl.estimation.tracking.flight_metrics import compute_flight_figures
+from dmrl.evaluation.flights import judge
 from dmrl.images.codec import Rgb
 from dmrl.learn.inference.confidence_calibration import apply_calibration, fit_calibration
 from dmrl.learn.inference.decode_grids import decode as decode_grids
@@ -42,9 +47,11 @@ from dmrl.learn.inference.loaded_model import Model, load_model, save_model
 from dmrl.learn.inference.matching import Points
 from dmrl.learn.inference.threshold import count_false_alarms, find_unlabelled_images
 from dmrl.learn.pretrained import resolve_model_path
+from dmrl.simulation.flight_recording import FlySettings, record_flight
 from dmrl.terminal.tables import print_table
 
 FLOORS = Path(__file__).with_suffix(".toml")
+FLIGHT_SEEDS = {"choose": 500, "judge": 600}
 
 
 def calibrate(model: Model, scored: dict[str, ScoredDetections], out: Path, *, anew: bool) -> None:
@@ -177,6 +184,24 @@ def far(name: str, scored: ScoredDetections) -> dict[str, float]:
     }
 
 
+def fly(eye: Path, part: str, count: int) -> dict[str, float]:
+    """Seconds that a follower holds its leader in view, mean and least of some flights."""
+    recipe = recipes.load("fly_follow", "fly", FlySettings)
+    held_s, false = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for seed in range(FLIGHT_SEEDS[part], FLIGHT_SEEDS[part] + count):
+            out = Path(folder) / f"{seed}.mcap"
+            record_flight(out, replace(recipe, eye=eye, seed=seed))
+            found = compute_flight_figures(judge(out)[0])
+            held_s.append(found["held_s"] or 0.0)
+            false.append(found["false_per_image"] or 0.0)
+    return {
+        "flights.held_s": float(np.mean(held_s)),
+        "flights.least_held_s": float(np.min(held_s)),
+        "flights.false_an_image": float(np.mean(false)),
+    }
+
+
 def gate(
     model: Model, data: Path, part: str, held: Sequence[Path]
 ) -> tuple[dict[str, float], dict[str, ScoredDetections]]:
@@ -238,6 +263,7 @@ def main() -> int:
     parser.add_argument("data", type=Path)
     parser.add_argument("--part", choices=("choose", "judge"), default="choose")
     parser.add_argument("--held", type=Path, action="append", default=[])
+    parser.add_argument("--flights", type=int, default=0, metavar="N")
     parser.add_argument("--floors", help="network of release_gate.toml; default: the model's name")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--curve", type=Path)
@@ -245,8 +271,11 @@ def main() -> int:
     parser.add_argument("--threshold-anew", action="store_true")
     parser.add_argument("--renders-only", action="store_true")
     given = parser.parse_args()
-    model = load_model(resolve_model_path(given.model))
+    path = resolve_model_path(given.model)
+    model = load_model(path)
     figures, scored = gate(model, given.data, given.part, given.held)
+    if given.flights:
+        figures |= fly(path, given.part, given.flights)
     if given.renders_only:  # a network for the published renders: real frames are no matter
         scored.pop("composites_and_empty", None)
     if given.calibrate:
