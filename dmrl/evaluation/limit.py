@@ -54,7 +54,8 @@ def find_limit(held: FlightLog) -> Bound | None:
         if settings.get("pilot"):
             return None  # what it flew by cannot be simulated again
         known = [field.name for field in fields(Scenario) if field.name in settings]
-        scenario = Scenario(**{name: settings[name] for name in known})
+        # Without a pilot, none of the robots is flown by one.
+        scenario = Scenario(**{name: settings[name] for name in known} | {"flown": 0})
         robots, duration_s = scenario.robots, scenario.duration_s
         true = robots * (robots - 1) * duration_s / TRUTH_STEP_S
         recorded = sum(len(time_ns) for time_ns, _ in paths.values())

@@ -3,7 +3,7 @@
 import struct
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dmrl.formats.aideck import cpx
@@ -67,6 +67,8 @@ def test_header_limits_are_checked(header: tuple[int, ...], broken: int) -> None
 def plain_packets(data: bytes) -> tuple[list[bytes], int]:
     """Packets of a whole stream and the bytes beside them, looked for byte by byte."""
 
+    streamer = False
+
     def size(at: int) -> int | None:
         if at + 4 > len(data):
             return None
@@ -77,7 +79,8 @@ def plain_packets(data: bytes) -> tuple[list[bytes], int]:
             and (of, last) in {(k, last) for k in (1, 2, 4) for last in (0, 1)}
             and function in (*range(1, 7), 14, 15)
         )
-        return length - 2 if known and 2 <= length <= 4094 else -1
+        counted = 0 if streamer or function == 6 else 2
+        return length - counted if known and counted <= length <= 4094 else -1
 
     found, at, skipped, in_step = [], 0, 0, True
     while (here := size(at)) is not None:
@@ -92,6 +95,7 @@ def plain_packets(data: bytes) -> tuple[list[bytes], int]:
         if at + 4 + here > len(data):
             break
         found.append(data[at + 4 : at + 4 + here])
+        streamer |= data[at + 3] == 6
         at, in_step = at + 4 + here, True
     return found, skipped + len(data) - at
 
@@ -99,6 +103,7 @@ def plain_packets(data: bytes) -> tuple[list[bytes], int]:
 NOISE = st.sampled_from([b"", bytes(3), b"\0\0\x63\5", b"\2\0\x63", b"\6\0\x63\5\0", b"\x0b\1"])
 
 
+@example([(b"\2\0\x63", 4)], 1)  # noise and a length that together are a header
 @given(st.lists(st.tuples(NOISE, st.integers(0, 5)), max_size=9), st.integers(1, 9))
 def test_packets_in_noise_equal_a_bytewise_search(
     parts: list[tuple[bytes, int]], step: int
