@@ -15,6 +15,9 @@ from pathlib import Path
 from rich.console import Console
 
 from dmrl.cli import COMMANDS, print_help
+from dmrl.estimation.evidence.error_models import MODELS, ErrorModel
+from dmrl.estimation.solver.robust_loss import Cauchy
+from dmrl.estimation.solver.unknowns import Unknown
 from dmrl.topics import TOPICS
 
 ROOT = Path(__file__).parents[1]
@@ -70,6 +73,35 @@ def extras() -> str:
     return table(("extra", "brings", "for"), rows)
 
 
+def error_models() -> str:
+    """Format the table of error models, from dmrl/estimation/evidence/error_models.py."""
+    rows = [
+        (model.name, "; ".join(_describe_changes(model)), f"{model.log_odds:g}") for model in MODELS
+    ]
+    return table(("cause", "unknowns, or factor of a noise", "log odds"), rows)
+
+
+def _describe_changes(model: ErrorModel) -> list[str]:
+    factors = (("range noise", model.range_factor), ("velocity noise", model.flow_factor))
+    return [
+        *(_describe_unknown(row) for row in model.rows),
+        *(f"{factor:g} times the {noise}" for noise, factor in factors if factor != 1.0),
+    ]
+
+
+def _describe_unknown(row: Unknown) -> str:
+    unit = "" if row.unit == "1" else f" {row.unit}"
+    loss = f", Cauchy {row.loss.sigmas:g}" if isinstance(row.loss, Cauchy) else ""
+    match row.evolution:
+        case "constant":
+            kind = f"{row.std:g}{unit}"
+        case "fading":
+            kind = f"{row.std:g}{unit}, fading in {row.time_s:g} s"
+        case _:
+            kind = f"{row.start_std:g}{unit} at first, steps of {row.std:g}{unit}/sqrt(s)"
+    return f"`{row.name}` {kind}{loss}"
+
+
 def _remark(pyproject: str, extra: str) -> str:
     found = re.search(rf"^{extra} = .*?#\s*(.*)$", pyproject, re.MULTILINE)
     return found.group(1) if found else ""
@@ -90,7 +122,8 @@ def commands() -> str:
 def filled(page: Path) -> str:
     """Fill each part of a page between ``<!-- name -->`` and ``<!-- /name -->`` again."""
     text = page.read_text(encoding="utf-8")
-    for name, body in (("topics", topics()), ("extras", extras())):
+    parts = {"topics": topics(), "extras": extras(), "error models": error_models()}
+    for name, body in parts.items():
         text = re.sub(
             rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)",
             lambda found, body=body: f"{found[1]}{body}\n{found[2]}",
@@ -102,7 +135,8 @@ def filled(page: Path) -> str:
 
 def pages() -> dict[Path, str]:
     """Every page that is generated, or in part, with its text."""
-    made = {page: filled(page) for page in (ROOT / "docs/index.md", ROOT / "docs/formats.md")}
+    names = ("index", "formats", "labelling")
+    made = {page: filled(page) for page in (ROOT / f"docs/{name}.md" for name in names)}
     typed = runpy.run_path(str(ROOT / "docs/settings_types.py"))["settings_types"]()
     types = ROOT / "dmrl/api/settings.pyi"
     return {**made, ROOT / "docs/commands.md": commands(), types: format_code(typed, types)}
