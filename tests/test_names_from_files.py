@@ -34,7 +34,7 @@ REASONS = {
     "deploy/usage.py: f'{header}.h'": LISTED,
     "deploy/usage.py: page": OURS,
     "viewer/flag_page.py: name": OURS,
-    "pipeline/forecast.py: out": CHECKED_BEFORE,
+    "pipeline/recipe_run.py: out": CHECKED_BEFORE,
     "pipeline/runner.py: name": LISTED,
     "deploy/c/pilot_code.py: name": OURS,
     "rendering/robots/primitives.py: f'{name}.toml'": OURS,

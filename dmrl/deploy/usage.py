@@ -13,7 +13,7 @@ OFFSETS = {"offset_u": "col", "offset_v": "row"}
 
 
 def write_usage(folder: Path) -> None:
-    """Write the programs into README.md of an export folder, below what stands there."""
+    """Write the programs into README.md of an export folder, below its text."""
     described = json.loads((folder / DESCRIPTION_NAME).read_text(encoding="utf-8"))
     stride = described["stride_px"]
     headers = sorted(path.stem for path in folder.glob("*.h") if _is_network(path))

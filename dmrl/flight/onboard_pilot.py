@@ -55,7 +55,7 @@ class RawDetection(NamedTuple):
 
 
 class RobotState(NamedTuple):
-    """What the robot measures: seconds, radians, metres per second along its axes, and metres."""
+    """Measurements of the robot: seconds, radians, metres per second along its axes, and metres."""
 
     time_s: float
     roll_rad: float
@@ -329,7 +329,7 @@ def angle_of(x: float, y: float) -> float:
 
 
 def to_raw(seen: Observation) -> tuple[RobotState, float, list[RawDetection]]:
-    """Return the arguments of `OnboardFilter.step`: what the C gets."""
+    """Return the arguments of `OnboardFilter.step`: as the C takes them."""
     attitude = seen.roll_rad, seen.pitch_rad, seen.yaw_rate_radps
     vx, vy = seen.velocity_mps.tolist()
     state = RobotState(seen.time_s, *attitude, vx, vy, seen.height_m)

@@ -59,7 +59,7 @@ class PeerTrack:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a drone knows: the measurements of its own sensors, and its tracks.
+    """Measurements of the sensors of a drone, and its tracks.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ class LabelledFlight:
     reports
         One per ordered pair.
     innovations
-        What the signals of each ordered pair show beyond the model.
+        Misfit of the signals of each ordered pair.
     warnings
         One line for each thing that was left out or looks wrong.
     """

@@ -58,7 +58,7 @@ def build_cause_messages(
     reports
         Reports of the pairs.
     innovations
-        What the signals of each pair show beyond the model.
+        Misfit of the signals of each pair.
     """
     for report in reports:
         both = report.robot, report.peer

@@ -134,7 +134,7 @@ def load_plan(name: str | Path, rows: Mapping[str, Table] = NOTHING) -> Plan:
     name
         Path, or the name of a shipped recipe.
     rows
-        Further rows of its ``[each]``, by name: what the command line submits.
+        Further rows of its ``[each]``, by name, from the command line.
 
     Raises
     ------

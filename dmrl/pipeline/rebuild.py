@@ -31,7 +31,7 @@ LIVE = "record"
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """What two recordings differ in.
+    """One difference of two recordings.
 
     Parameters
     ----------

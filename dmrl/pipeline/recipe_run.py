@@ -8,16 +8,17 @@ import errno
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 from dmrl.atomic_output import as_output_error, replace_file, to_partial_path
 from dmrl.errors import OutputError, SettingError
 from dmrl.evaluation.pipeline_summary import StepOutcome
 from dmrl.guards.paths import require_text_path
 from dmrl.guards.posix import fcntl
-from dmrl.pipeline.build_cache import BuildCache
+from dmrl.pipeline.build_cache import BuildCache, build_key
 from dmrl.pipeline.executor import open_executor
-from dmrl.pipeline.forecast import Forecast, forecast_steps
 from dmrl.pipeline.plan import (
     DATA,
     NOTHING,
@@ -27,6 +28,7 @@ from dmrl.pipeline.plan import (
     UNFINISHED,
     Plan,
     Table,
+    find_producers,
     load_plan,
     locate_input,
 )
@@ -35,8 +37,20 @@ from dmrl.storage import RemotePath
 from dmrl.storage.upload import require_bucket
 from dmrl.terminal.progress import say
 
+MAX_VALUE_CHARACTERS = 40
+"""Length of a setting's value in a reason."""
 LEFTOVER_NAMES = (UNFINISHED, to_partial_path(Path(STATE_FILE)).name)
 """Files that remain if a disk failed before a pipeline began."""
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """Action of a run on one output, and its reason."""
+
+    stage: str
+    out: Path
+    action: Literal["keep", "make", "replace"]
+    reason: str
 
 
 def run(
@@ -113,13 +127,72 @@ def forecast(
     plan = load_plan(name, submitted)
     _check_data(name, plan, data)
     _refuse_foreign_folder(out)
-    return forecast_steps(Runner(plan, out, data, BuildCache.load(out / STATE_FILE)))
+    return _forecast_steps(Runner(plan, out, data, BuildCache.load(out / STATE_FILE)))
+
+
+def _forecast_steps(runner: Runner) -> list[Forecast]:
+    """Return a forecast of every step, in the order of the recipe. Nothing is written.
+
+    Raises
+    ------
+    OutputError
+        If an output exists that the pipeline did not write.
+    OSError
+        If an input cannot be read.
+    """
+    found: dict[str, Forecast] = {}
+    for out in runner.order.static_order():
+        step, path = runner.steps[out], runner.folder / out
+        changed = [
+            f"{name} is made again" if found[name].action == "replace" else f"{name} is made first"
+            for name in find_producers(step.names, runner.outs)
+            if found[name].action != "keep"
+        ]
+        if not path.exists():
+            found[out] = Forecast(step.stage, path, "make", "; ".join(changed) or "it is missing")
+            continue
+        runner.refuse_foreign_output(step)
+        if changed:
+            found[out] = Forecast(step.stage, path, "replace", "; ".join(changed))
+            continue
+        made_of = runner.describe_step(step)
+        if runner.memory.is_up_to_date(path, build_key(made_of)):
+            found[out] = Forecast(step.stage, path, "keep", "up to date")
+            continue
+        reason = "; ".join(_iter_changes(runner.memory.made_of.get(out), made_of))
+        found[out] = Forecast(step.stage, path, "replace", reason)
+    return [found[out] for out in runner.steps]
+
+
+def _iter_changes(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the differences between the recorded and the present settings and inputs."""
+    if before is None:
+        yield "its settings or inputs have changed"
+        return
+    if before == now:
+        yield "it was changed after the run"
+        return
+    for what in ("dmrl", "stage"):
+        if before[what] != now[what]:
+            yield f"{what} {before[what]} -> {now[what]}"
+    for key in sorted({*before["settings"], *now["settings"]}):
+        old, new = (_to_text(one["settings"].get(key)) for one in (before, now))
+        if old != new:
+            yield f"{key} {old} -> {new}"
+    for role in sorted({*before["inputs"], *now["inputs"]}):
+        if before["inputs"].get(role) != now["inputs"].get(role):
+            yield f"the input {role} has changed"
+
+
+def _to_text(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= MAX_VALUE_CHARACTERS else text[: MAX_VALUE_CHARACTERS - 3] + "..."
 
 
 def _announce_replacements(runner: Runner) -> None:
     """Print a line for each output that the run replaces."""
     with suppress(OSError, OutputError):  # the runner reports them, with their step
-        for one in forecast_steps(runner):
+        for one in _forecast_steps(runner):
             if one.action == "replace":
                 place = one.out.parent / PREVIOUS
                 say(f"{one.out.name} is replaced: {one.reason}. The one before moves to {place}")

@@ -70,7 +70,7 @@ class Recovery:
     counted
         Whether ``missing`` covers the whole file: its Statistics record was readable.
     contradictions
-        What the file states about itself that is not so, a phrase each.
+        False statements of the file about itself, a phrase each.
     doubtful
         Whether metadata or attachments are missing or fail their checksum. They are kept as they
         are.

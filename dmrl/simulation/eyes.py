@@ -20,7 +20,7 @@ IDEAL_RNG = 1000
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What an eye finds in one image: the fields of Detections, and those of a GridMap or None."""
+    """Detections of one image: the fields of Detections, and those of a GridMap or None."""
 
     detections: dict[str, Any]
     grid: dict[str, Any] | None = None
@@ -30,7 +30,7 @@ class Eye(Protocol):
     """Function that finds peers in the images of one robot, in their order."""
 
     def __call__(self, view: CameraView, time_s: float, rgb: Rgb | None) -> Look:
-        """Return what it finds in the image of a view, taken at a true time in seconds."""
+        """Return the detections in the image of a view, taken at a true time in seconds."""
 
 
 class IdealEye:

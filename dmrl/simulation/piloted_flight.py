@@ -223,7 +223,7 @@ class PilotedFlight:
             drone.waiting.append(Waiting(now, ready, look.detections))
 
     def _deliver(self, drone: Drone, now: int) -> None:
-        """Give the tracker what has arrived."""
+        """Give the tracker the images that have arrived."""
         while drone.waiting and drone.waiting[0].ready <= now:
             image = drone.waiting.pop(0)
             ranges = self._simulation.observe(drone.robot).range_m

@@ -182,7 +182,7 @@ class Simulation:
         return build_view(bodies, robot, self.time_s, (self._place, number, self.motion.sample))
 
     def render(self, robot: str) -> Sketch | Shot:
-        """Render what a robot's camera sees now: the image, with the true labels.
+        """Render the present image of a robot's camera, with the true labels.
 
         Raises
         ------
@@ -257,7 +257,7 @@ class Simulation:
         return {robot: self.observe(robot) for robot in self.motion.flown}
 
     def observe(self, robot: str) -> Observation:
-        """Return what a robot's sensors measure now; a silent one keeps its last value."""
+        """Return the present measurements of a robot; a silent sensor keeps its last value."""
         roll, pitch, rate, vx, vy, height = (
             self.reckoning[robot].sensors[:, self.motion.sample].tolist()
         )

@@ -14,7 +14,7 @@ from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_json, print_line, print_table
 
 if TYPE_CHECKING:
-    from dmrl.pipeline.forecast import Forecast
+    from dmrl.pipeline.recipe_run import Forecast
 
 
 def command(

@@ -169,7 +169,8 @@ def of_interface(stage: str) -> tuple[Any, ...]:
 
 def test_stage_interface_is_read_from_its_run_signature() -> None:
     one, maybe, many = (False, True), (False, False), (True, True)
-    train = {"dataset": one, "init": maybe, "teacher": maybe}
+    few = (True, False)
+    train = {"dataset": one, "init": maybe, "teacher": maybe, "unlabelled": few}
     assert of_interface("train") == (train, set(), True, True)
     assert of_interface("calibrate") == ({"sources": many}, {"camera"}, False, False)
     assert of_interface("verify") == ({"folder": one}, {"dataset"}, False, False)

@@ -61,7 +61,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Innovation:
-    """Size of what a signal shows beyond the model, over windows.
+    """Size of the misfit of a signal, over windows.
 
     Parameters
     ----------

@@ -146,7 +146,7 @@ class RangeLink:
 
 
 class Sight(NamedTuple):
-    """What the owner of an unknown sees at R ranges.
+    """Direction and bearing at R ranges, for the owner of an unknown.
 
     ``distance`` (R,) true distances, metres; ``bearing`` (R,) of the other robot in the owner's
     frame, radians; ``sent`` (R,) share of each range that the owner measured.

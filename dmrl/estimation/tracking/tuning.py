@@ -34,7 +34,7 @@ class Tuning:
     edge_px
         Width of the margin of the image in which the detection probability falls.
     capture_std_m
-        Error of a silent track, if what it follows may be a false object.
+        Error of a silent track that may follow a false object.
     confidence_s
         Correlation time of a detection's confidence.
     appearing_per_s

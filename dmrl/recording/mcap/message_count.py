@@ -151,7 +151,7 @@ def check_counts(
 
 
 def _get_stated(section: SummarySection) -> MessageCount | None:
-    """Return what the Statistics record states, if it is complete and fits the chunk indexes."""
+    """Return the counts of the Statistics record, if it is complete and fits the chunk indexes."""
     statistics, chunks = section.statistics, section.chunk_indexes
     if statistics is None or (statistics.message_count and not section.counts):
         return None
