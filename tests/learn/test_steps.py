@@ -149,7 +149,7 @@ def test_trainer_passes_recipe_settings_to_each_step(
             {"loss": len(LOSS_NAMES) * means, **dict.fromkeys(LOSS_NAMES, means)}
         )
         assert shown[3 * epoch + 2][1] == pytest.approx(len(LOSS_NAMES) * means)
-    for number, (*_, (given, rate, group, share, taught)) in enumerate(asked, start=1):
+    for number, (*_, (given, rate, group, share, taught, *_)) in enumerate(asked, start=1):
         assert (given, rate) == (settings, learning_rate_at(number, 3, settings))
         assert (group.size, share) == (1, 1.0)  # type: ignore[attr-defined]
         assert taught is teacher and not teacher.training

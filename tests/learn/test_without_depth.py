@@ -33,7 +33,7 @@ def test_every_noise_and_width_masks_the_depth_alone() -> None:
     for noise in ("ignore", "weight", "soften"):
         for sigma in (0.0, 1.0):
             made = build_targets(both, SHAPE, sigma_cells=sigma, label_noise=noise)
-            assert all(torch.isfinite(part).all() for part in made)
+            assert all(torch.isfinite(part).all() for part in made if part is not None)
             assert made.confidence[0, 2, 2] > 0.4
             assert made.offset_weight[0, 2, 2] > 0
             assert made.weight[0, 2, 2] == 0

@@ -27,7 +27,7 @@ def numbered(*sizes: int) -> ExampleSet:
 
 def test_every_image_is_used_once_with_its_labels() -> None:
     seen: list[int] = []
-    for images, robots in iter_batches(numbered(5, 0, 7, 1), 4):
+    for images, robots, _ in iter_batches(numbered(5, 0, 7, 1), 4):
         numbers = images[:, 0, 0, 0].tolist()
         assert (images == images[:, :1, :1, :1]).all()
         assert robots[:, 1, 9].tolist() == numbers
