@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dmrl.errors import MissingExtra, ModelError
 from dmrl.learn.inference.loaded_model import load_model
-from dmrl.learn.networks import keras_weights
+from dmrl.learn.networks import hdf5_arrays
 from dmrl.learn.networks.architectures import normalize_images
 from dmrl.learn.networks.keras_weights import load_keras_weights
 
@@ -98,7 +98,7 @@ def test_file_cut_short_gives_one_line_error(tmp_path: Path) -> None:
 
 def test_without_h5py_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "weights.h5", variables())
-    monkeypatch.setattr(keras_weights, "h5py", None)
+    monkeypatch.setattr(hdf5_arrays, "find_spec", lambda _: None)
     with pytest.raises(MissingExtra, match=r"pip install 'dmrl\[keras\]'"):
         load_model(path)
 
