@@ -39,19 +39,24 @@ def draw_causes(pair: Names, message: Message) -> Iterator[tuple[Times, Entity]]
         yield _to_times(message, one["at_s"]), line
     ends = [0.0, *(one["at_s"][-1] for one in message["innovations"] if one["at_s"])]
     for path, name, robot, some in _list_causes(pair, message):
-        steps = [(0.0, 0.0), (max(ends), 0.0)] + [
-            step
-            for one in some
-            for step in (
-                (one["from_s"] - EDGE_S, 0.0),
-                (one["from_s"], one["probability"]),
-                (one["to_s"], one["probability"]),
-                (one["to_s"] + EDGE_S, 0.0),
-            )
-        ]
-        at_s, values = np.array(sorted(steps)).T
+        at_s, values = _build_steps(some, max(ends))
         colour = PEER_RGB if robot == pair[1] else OWN_RGB
         yield _to_times(message, at_s), draw_line(path, values, name, colour)
+
+
+def _build_steps(stretches: Sequence[Message], end_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and probabilities of a cause from 0 to the end; 0 between its stretches."""
+    steps = [
+        (at_s, 0.0)
+        for at_s in (0.0, end_s)
+        if not any(one["from_s"] <= at_s <= one["to_s"] for one in stretches)
+    ]
+    for one in stretches:
+        begin_s, stop_s, probability = one["from_s"], one["to_s"], one["probability"]
+        steps += [(begin_s - EDGE_S, 0.0), (begin_s, probability)]
+        steps += [(stop_s, probability), (stop_s + EDGE_S, 0.0)]
+    at_s, values = np.array(sorted(steps)).T
+    return at_s, values
 
 
 def _list_innovations(pair: Names, message: Message) -> list[tuple[str, str, str, Message]]:
