@@ -41,7 +41,7 @@ def draw_causes(pair: Names, message: Message) -> Iterator[tuple[Times, Entity]]
     for path, name, robot, some in _list_causes(pair, message):
         at_s, values = _build_steps(some, max(ends))
         colour = PEER_RGB if robot == pair[1] else OWN_RGB
-        yield _to_times(message, at_s), draw_line(path, values, name, colour)
+        yield _to_times(message, at_s), draw_line(path, values, name, colour, exact=True)
 
 
 def _build_steps(stretches: Sequence[Message], end_s: float) -> tuple[np.ndarray, np.ndarray]:

@@ -30,18 +30,30 @@ WIDTH_UI, THIN_UI, MARKER_UI = 1.5, 0.8, 0.8
 
 
 def draw_line(
-    path: str, values: Array, name: str, colour: Colour, width: float = WIDTH_UI
+    path: str,
+    values: Array,
+    name: str,
+    colour: Colour,
+    width: float = WIDTH_UI,
+    *,
+    exact: bool = False,
 ) -> Entity:
-    """Draw one line from (N,) values; NaN leaves a gap."""
-    style = _line_style((colour,), (name,), width)
+    """Draw one line from (N,) values; NaN leaves a gap.
+
+    ``exact`` draws every point; else rerun joins those of one pixel, and steps become slopes.
+    """
+    style = _line_style((colour,), (name,), width, exact=exact)
     return Entity(path, rr.Scalars.columns(scalars=values), (style,))
 
 
 @cache
 def _line_style(
-    colours: tuple[Colour, ...], names: tuple[str, ...], width: float
+    colours: tuple[Colour, ...], names: tuple[str, ...], width: float, *, exact: bool = False
 ) -> rr.SeriesLines:
-    return rr.SeriesLines(colors=colours, names=names, widths=[width] * len(names))
+    policy = rr.components.AggregationPolicy.Off if exact else None
+    return rr.SeriesLines(
+        colors=colours, names=names, widths=[width] * len(names), aggregation_policy=policy
+    )
 
 
 def draw_dots(path: str, values: Array, name: str, colour: Colour) -> Entity:
