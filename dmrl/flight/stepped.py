@@ -76,9 +76,8 @@ class SteppedFlight:
         """Last sample that is there."""
         self.samples = scenario.samples
         count = range(scenario.robots)
-        self._errors = [
-            sensors.draw_log_errors(create_rng(seed, "log", k), self.samples, noise) for k in count
-        ]
+        self._noise = noise
+        self._errors: dict[int, sensors.LogErrors] = {}
         self._links = {
             (self.names[i], self.names[j]): draw_link(i, j, scenario, noise, seed)
             for i, j in permutations(count, 2)
@@ -90,7 +89,9 @@ class SteppedFlight:
         }
         for name, flyer in self._flyers.items():
             self._plan.truth[name], self._plan.yaw_rate[name] = flyer.truth, flyer.yaw_rate
-        logs = {name: RobotLog(*np.full((7, self.samples), np.nan)) for name in self.names}
+        # A first step over the whole flight makes the logs.
+        names = self.names if samples < self.samples else ()
+        logs = {name: RobotLog(*np.full((7, self.samples), np.nan)) for name in names}
         self.flight = Flight(logs, self._plan.truth, {}, self._plan.clocks, self._plan.events)
         """Logs and truth up to the present; the ranges of the last step only."""
         self.advance({}, samples)
@@ -122,9 +123,8 @@ class SteppedFlight:
         truth, clocks = self._plan.truth, self._plan.clocks
         logs: dict[str, RobotLog] = {}
         for k, name in enumerate(self.names):
-            logs[name] = sensors.measure_log(
-                truth[name], self._plan.yaw_rate[name], clocks[name], self._errors[k], part
-            )
+            drawn, yaw_rate = self._draw_errors(k), self._plan.yaw_rate[name]
+            logs[name] = sensors.measure_log(truth[name], yaw_rate, clocks[name], drawn, part)
         ranges: dict[tuple[str, str], Ranges] = {}
         for (robot, peer), errors in self._links.items():
             begin = self._ranged[robot, peer]
@@ -134,11 +134,23 @@ class SteppedFlight:
                 truth[robot], truth[peer], clocks[robot], errors, slice(begin, end)
             )
         self._apply_faults(logs, ranges, part)
+        if not self.flight.robots:
+            self.flight.robots.update(logs)
         for name, log in logs.items():
             for column in RobotLog.__slots__:
                 getattr(self.flight.robots[name], column)[part] = getattr(log, column)
         self.flight.ranges.clear()
         self.flight.ranges.update(ranges)
+
+    def _draw_errors(self, number: int) -> sensors.LogErrors:
+        """Return the errors of a robot's log. They are kept only while samples are to come."""
+        rng = create_rng(self._seed, "log", number)
+        errors = self._errors.pop(number, None) or sensors.draw_log_errors(
+            rng, self.samples, self._noise
+        )
+        if self.sample < self.samples - 1:
+            self._errors[number] = errors
+        return errors
 
     def _apply_faults(
         self, logs: dict[str, RobotLog], ranges: dict[tuple[str, str], Ranges], part: slice

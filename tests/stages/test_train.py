@@ -64,7 +64,7 @@ def test_a_share_of_the_first_weights_is_kept(dots_dataset: Path, tmp_path: Path
     assert (trained != first).any()
     np.testing.assert_allclose(back, first, atol=1e-6)
     np.testing.assert_allclose(mixed, 0.25 * first + 0.75 * trained, atol=1e-6)
-    with pytest.raises(SettingError, match="Give --init"):
+    with pytest.raises(SettingError, match="requires an initial model"):
         run(dots_dataset, tmp_path / "c", replace(SETTINGS, init_share=0.5))
 
 
@@ -122,15 +122,15 @@ KILLED = """
 import sys, time
 from pathlib import Path
 from dmrl.images.codec import encode_png
-from dmrl.learn import fit
+from dmrl.learn.training import trainer
 from dmrl.stages.train import Settings, run
-step = fit.train_step
+step = trainer.train_step
 checkpoint = Path(sys.argv[2] + ".partial", "checkpoint.json")
 def until_the_first_checkpoint(*args):
     if checkpoint.exists():
         time.sleep(1000)  # to be killed
     return step(*args)
-fit.train_step = until_the_first_checkpoint
+trainer.train_step = until_the_first_checkpoint
 run(
     Path(sys.argv[1]),
     Path(sys.argv[2]),

@@ -65,7 +65,7 @@ def read_request(request: bytes) -> bytes:
         why = " ".join(str(e).split())
         raise ModelError(f"{path} cannot be read: {why}. Download it again") from None
     out = io.BytesIO()
-    np.savez(out, **arrays)
+    np.savez(out, **arrays)  # type: ignore[arg-type]  # one of its flags is a keyword too
     return out.getvalue()
 
 
