@@ -14,7 +14,7 @@ from dmrl.terminal.closing import Closing, Given
 from dmrl.terminal.progress import say
 
 if TYPE_CHECKING:
-    from dmrl.estimation.signals.clock_alignment import Clock
+    from dmrl.estimation.signals.clock_estimation import Clock
 
 METADATA = "dmrl.clocks"
 ALL = "*"
@@ -71,7 +71,7 @@ def run(recording: In, out: Path, settings: Settings) -> "dict[str, Clock]":
     OutputError
         If ``out`` exists.
     """
-    from dmrl.estimation.signals.clock_alignment import Clock
+    from dmrl.estimation.signals.clock_estimation import Clock
     from dmrl.labelling.clocks.clock_alignment import SIGNALS, Sources, align_clocks, describe_clock
     from dmrl.recording import (
         LoadedRecording,

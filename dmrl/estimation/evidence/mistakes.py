@@ -14,7 +14,7 @@ from dmrl.estimation.model.pair import (
     usable_ranges,
 )
 from dmrl.estimation.search.modes import find_modes
-from dmrl.estimation.signals.clock_alignment import estimate_clock
+from dmrl.estimation.signals.clock_estimation import estimate_clock
 from dmrl.estimation.signals.contradictions import drop_contradictions
 from dmrl.estimation.solver.keyframes import build_problem
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.estimation.signals.clock_alignment import (
+from dmrl.estimation.signals.clock_estimation import (
     HUBER_SIGMAS,
     MAX_ITERATIONS,
     Array,

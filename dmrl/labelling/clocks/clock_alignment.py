@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
-from dmrl.estimation.signals.clock_alignment import Clock, connect_clocks
+from dmrl.estimation.signals.clock_estimation import Clock, connect_clocks
 from dmrl.formats.timestamps import dejitter
 from dmrl.labelling.clocks.retiming import MOCAP, Corrected
 from dmrl.labelling.clocks.time_alignment import (

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.estimation.signals.clock_alignment import Clock
+from dmrl.estimation.signals.clock_estimation import Clock
 from dmrl.messages import message_class
 from dmrl.recording import (
     LoadedRecording,

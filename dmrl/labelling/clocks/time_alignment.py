@@ -11,7 +11,7 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import SourceError
-from dmrl.estimation.signals.clock_alignment import Clock, estimate_clock
+from dmrl.estimation.signals.clock_estimation import Clock, estimate_clock
 from dmrl.estimation.signals.image_motion import estimate_shift, shift_rates, shrink_image
 from dmrl.estimation.signals.ranging_clocks import estimate_from_exchanges
 from dmrl.geometry.frames import Array

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.signals import ranging_clocks
-from dmrl.estimation.signals.clock_alignment import Clock
+from dmrl.estimation.signals.clock_estimation import Clock
 from dmrl.estimation.signals.ranging_clocks import (
     MAX_RANGE_DIFFERENCE_M,
     MAX_TIME_DIFFERENCE_S,

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from dmrl import topics
-from dmrl.estimation.signals.clock_alignment import Clock
+from dmrl.estimation.signals.clock_estimation import Clock
 from dmrl.labelling.clocks.retiming import MOCAP, Corrected
 from dmrl.messages import message_class
 from dmrl.recording import LoadedRecording, Provenance, RecordingWriter, read, read_raw

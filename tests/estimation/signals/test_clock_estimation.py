@@ -3,7 +3,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from dmrl.estimation.signals.clock_alignment import (
+from dmrl.estimation.signals.clock_estimation import (
     GRID_STEP_S,
     MIN_OVERLAP_S,
     TREND_WINDOW_S,
