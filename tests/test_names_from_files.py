@@ -118,6 +118,7 @@ MAY_PARSE = {
     "rendering/blender/protocol.py": "what our own processes say to each other",
     "pipeline/process_pool.py": "what our own processes say to each other",
     "pipeline/job_worker.py": "what our own processes say to each other",
+    "learn/networks/hdf5_arrays.py": "what our own processes say to each other",
     "recipe.py": "what json.dumps has just made",
     "recording/provenance_inputs.py": "what json.dumps has just made",
     "learn/training/checkpoint.py": "what json.dumps has just made",

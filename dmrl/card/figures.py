@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from dmrl.atomic_output import replace_file
 from dmrl.datasets import Split
 from dmrl.errors import DatasetError
 from dmrl.geometry.frames import STRIDE_PX
@@ -32,7 +33,8 @@ def draw_figures(folder: Path, about: Mapping[str, Any]) -> int:
     shown = list(_iter_samples(about["splits"], about["images"]))
     files = _draw_distributions(about) | {"samples.jpg": panels.draw_samples(shown)}
     for name, data in files.items():
-        (folder / name).write_bytes(data)
+        with replace_file(folder / name) as partial:
+            partial.write_bytes(data)
     return len(shown)
 
 
