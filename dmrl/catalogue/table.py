@@ -108,8 +108,11 @@ class Catalogue:
         OutputError
             If the file system rejects it.
         """
+        # In memory first: Arrow's writer prints a traceback when a file cannot be closed.
+        packed = pa.BufferOutputStream()
+        pq.write_table(self.table.combine_chunks(), packed, compression="zstd")
         with replace_file(self.file) as partial:
-            pq.write_table(self.table.combine_chunks(), partial, compression="zstd")
+            partial.write_bytes(packed.getvalue())
 
 
 def file_stamp(path: Path) -> str:
