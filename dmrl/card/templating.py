@@ -8,6 +8,7 @@ from pathlib import Path
 import jinja2
 
 from dmrl.guards.safe_names import escape_markdown, markdown_code
+from dmrl.guards.templates import open_templates
 
 MAX_NAMES_ON_A_LINE = 3
 """Names on a line, at most."""
@@ -23,14 +24,8 @@ def fill_template(template: str, **values: object) -> str:
 
 @cache
 def _environment() -> jinja2.Environment:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        autoescape=False,
-    )
+    folder = Path(__file__).parent / "templates"
+    environment = open_templates(folder, keep_trailing_newline=True, autoescape=False)
     environment.filters |= {"text": escape_markdown, "code": markdown_code, "names": _join_names}
     environment.filters["bibtex"] = lambda text: "".join(c for c in text if c not in "{}\\")
     environment.filters |= {

@@ -16,6 +16,7 @@ from markupsafe import Markup
 
 from dmrl.errors import DmrlError, to_one_line
 from dmrl.guards import limits
+from dmrl.guards.templates import open_templates
 from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
 
 REPORT_MARK = "<!-- written by dmrl report -->"
@@ -113,13 +114,7 @@ def fill_template(template: str, **values: object) -> str:
 
 @cache
 def _environment() -> jinja2.Environment:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        autoescape=True,
-    )
+    environment = open_templates(Path(__file__).parent / "templates", autoescape=True)
     environment.filters["line"] = _escape_line
     return environment
 

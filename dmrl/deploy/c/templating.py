@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dmrl import __version__
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.guards.safe_names import comment_safe
+from dmrl.guards.templates import open_templates
 
 RESERVED_FILE_NAMES = ("main", "harness", "count")
 """Names of other C files in the same folder, which a network must not use."""
@@ -35,11 +36,8 @@ def fill_template(template: str, **values: object) -> str:
 
 @cache
 def _environment() -> jinja2.Environment:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    environment = open_templates(
+        Path(__file__).parent / "templates",
         keep_trailing_newline=True,
         autoescape=False,
         block_start_string="/*%",
