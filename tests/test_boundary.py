@@ -177,8 +177,14 @@ def test_removed_working_folder_is_reported_before_libraries_abort(
 EARLY = """
 import sys
 sys.argv = ["dmrl", *sys.argv[1:]]
-print("begun", flush=True)
 from dmrl.__main__ import main
+
+class Announcer:  # of the first import within main: before it no code of dmrl can hear a signal
+    def find_spec(self, *_):
+        sys.meta_path.remove(self)
+        print("begun", flush=True)
+
+sys.meta_path.insert(0, Announcer())
 main()
 """
 

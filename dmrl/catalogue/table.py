@@ -149,8 +149,9 @@ def open_catalogue(folder: Path, *, new: bool = False) -> Catalogue:
             return Catalogue(folder, to_table([]))
         raise RecordingError(f"{folder} has no catalogue. Make it: dmrl index {folder}")
     try:
-        with MemoryLimit(file.stat().st_size):
-            table = pq.read_table(file)
+        # By a stream: Arrow cannot open a path that is no text.
+        with MemoryLimit(file.stat().st_size), file.open("rb") as stream:
+            table = pq.read_table(stream)
             table.validate(full=True)
         _check_table(table)
     except (pa.ArrowException, OSError, ValueError, MemoryError) as e:
