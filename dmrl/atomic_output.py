@@ -250,7 +250,8 @@ def _write_partial(
                     shutil.rmtree(partial, ignore_errors=True)  # an error would hide another
                     with suppress(OSError):
                         partial.unlink(missing_ok=True)
-                os.close(descriptor)
+                with suppress(OSError):  # what is written was synced; the lock goes in any case
+                    os.close(descriptor)
                 _ended_outputs.extend([path] * fresh)
 
 

@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dmrl.datasets.layout import PNG_TYPE, format_json
+from dmrl.datasets.writing.parquet_writer import ParquetWriter
 from dmrl.exchange.dataset_rows import ExportRow, ExportRows, to_attributes
 
 VERSION = "v3.0"
@@ -44,7 +45,7 @@ def write_lerobot(rows: ExportRows, folder: Path) -> dict[str, int]:
         path = folder / "data" / FILE.format(**place)
         path.parent.mkdir(parents=True, exist_ok=True)
         length, pending = 0, list[dict[str, Any]]()
-        with pq.ParquetWriter(path, schema) as sink:
+        with ParquetWriter(path, schema) as sink:
             for row in images:
                 frame = _to_frame(row, rows) | {"timestamp": length / fps, "frame_index": length}
                 frame |= {"episode_index": number, "index": index + length, "task_index": 0}

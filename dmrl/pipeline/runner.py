@@ -194,14 +194,14 @@ class Runner:
     def _install_output(self, one: RunningStep, sha256: str) -> None:
         """Rename a complete output to its name; the one before moves to ``previous/``."""
         out, new = self.folder / one.step.out, self.folder / UNFINISHED / one.step.out
+        self.memory.done[one.step.out] = [one.key, sha256]
+        self.memory.made_of[one.step.out] = self._made_of[one.step.out]
+        self.memory.save()  # before the rename: a run cut off after it would build the step again
         if out.exists() or out.is_symlink():
             keep_previous(out)
         new.replace(out)
         register_output(out)
-        self.memory.done[one.step.out] = [one.key, sha256]
-        self.memory.made_of[one.step.out] = self._made_of[one.step.out]
         self.memory.set_sha256(out, sha256)
-        self.memory.save()
         seconds = perf_counter() - one.begun_s
         self._mark_done(one.step, StepOutcome(one.step.stage, out, seconds, skipped=False))
 

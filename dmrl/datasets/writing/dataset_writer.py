@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from dmrl.datasets import layout
 from dmrl.datasets.manifest import Manifest, Shard
+from dmrl.datasets.writing.parquet_writer import ParquetWriter
 from dmrl.errors import UnsafeName
 from dmrl.images.codec import encode_png
 
@@ -130,7 +130,7 @@ class SplitWriter:
         path.parent.mkdir(exist_ok=True)
         if self.parquet:
             plain = {"compression": "zstd", "use_dictionary": False, "write_statistics": False}
-            self._sink = pq.ParquetWriter(path, self.schema, **plain)
+            self._sink = ParquetWriter(path, self.schema, **plain)
         else:
             self._sink = pa.ipc.new_stream(str(path), self.schema)
         self._files.append(path)
