@@ -24,7 +24,7 @@ from dmrl.datasets.writing.builder import (
     warn_about_other_sources,
     warn_about_unused_flags,
 )
-from dmrl.datasets.writing.corrections import load_corrections
+from dmrl.datasets.writing.corrections import find_corrected, load_corrections
 from dmrl.datasets.writing.dataset_writer import write_shards
 from dmrl.datasets.writing.exclusions import load_flags
 from dmrl.datasets.writing.inputs import warn_about_lenses
@@ -220,9 +220,13 @@ def _read_labels(
     known: dict[Path, RecordingFacts] = {}
     held: dict[Path, LoadedRecording] = {}
     images = 0
+    corrected = find_corrected(recordings, settings.corrections)
     for path in recordings:
         known[path], labels = read_recording_facts(
-            path, settings.labels, with_splits=settings.split == "auto"
+            path,
+            settings.labels,
+            with_splits=settings.split == "auto",
+            corrected=path.name in corrected,
         )
         images += known[path].images
         if images <= MAX_HELD_IMAGES:

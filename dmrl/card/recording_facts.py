@@ -36,7 +36,7 @@ class RecordingFacts:
 
 
 def read_recording_facts(
-    path: Path, wanted: str, *, with_splits: bool
+    path: Path, wanted: str, *, with_splits: bool, corrected: bool = False
 ) -> tuple[RecordingFacts, LoadedRecording]:
     """Read the facts of a recording, and its labels, which may be needed again soon.
 
@@ -48,6 +48,8 @@ def read_recording_facts(
         Source of the labels; see `choose_label_source`.
     with_splits
         Whether to read the split that the source of the recording defines.
+    corrected
+        Whether corrections label its images; see `count_images`.
 
     Raises
     ------
@@ -58,8 +60,8 @@ def read_recording_facts(
     """
     with share_file(path):
         held = LoadedRecording(path, topics.LABELS, topics.CALIBRATION)
-        images = count_images(held)
-        source = choose_label_source(held, wanted)
+        images = count_images(held, corrected=corrected)
+        source = choose_label_source(held, wanted, corrected=corrected)
         about = RecordingFacts(
             source,
             tuple(sorted(find_label_sources(held) - {source})),

@@ -7,6 +7,7 @@ import pytest
 
 import dmrl
 from dmrl.cli import app
+from dmrl.errors import MissingTopic, SettingError
 from dmrl.viewer.label_suspicion import score_suspicion
 
 from .webdriver import MISSING, Browser, open_browser, wait_for
@@ -126,6 +127,45 @@ def test_edits_on_the_label_desk_reach_the_dataset(
     drawn = frame[frame["log_time"] == int(times[second])]
     assert len(drawn) == before + 1 and np.isinf(drawn["sigma_depth_m"]).sum() == 1
     assert int(times[third]) not in set(frame["log_time"]) and len(made["train"]) == 23
+
+
+@browser_only
+def test_pictures_that_were_never_labelled_become_a_dataset_on_the_desk(
+    seen: Path, tmp_path: Path
+) -> None:
+    pictures = tmp_path / "plain.mcap"
+    dmrl.trim(seen / "flight.mcap", pictures, topic=["/cf1/camera/*"])
+    with pytest.raises(MissingTopic, match="by hand: dmrl view"):
+        dmrl.make_dataset(pictures, tmp_path / "none")
+    page = tmp_path / "desk.html"
+    app(["view", str(pictures), "--flag", str(page)], result_action="return_value")
+    with open_browser(tmp_path, 390) as browser:
+        browser.open(page)
+        browser.click("#row-3")
+        browser.press("n")
+        at = screen_place(browser, 40, 60)
+        browser.drag(at, at)
+        assert "no depth" in browser.run("return byId('facts').textContent;")
+        browser.press("j")
+        browser.press("e")
+        assert "nobody in view" in browser.run("return byId('facts').textContent;")
+        browser.press("j")
+        browser.press("e")
+        browser.press("z")  # undone: not labelled again
+        unsaved = "return !dispatchEvent(new Event('beforeunload', {cancelable: true}));"
+        assert browser.run(unsaved)
+        browser.press("\ue00c")
+        browser.run("byId('save').click();")
+        wait_for(tmp_path / "corrections-plain.mcap")
+        assert not browser.run(unsaved)
+    corrections = [tmp_path / "corrections-plain.mcap"]
+    frame = dmrl.make_dataset(pictures, tmp_path / "mine", split="none", corrections=corrections)[
+        "train"
+    ].to_pandas()
+    assert frame["row"].nunique() == 2
+    assert frame["label_source"].dropna().tolist() == ["hand"]
+    with pytest.raises(SettingError, match=r"corrects plain.mcap, which is not among"):
+        dmrl.make_dataset(seen / "flight.mcap", tmp_path / "other", corrections=corrections)
 
 
 def truth_of(table: list[dict[str, object]], time_ns: str) -> list[object]:

@@ -8,11 +8,12 @@ const svgTag = (name, attributes) => {
   return made;
 };
 const rows = DATA.rows.map((row, index) => ({...row, index, first: JSON.stringify(row.labels),
-  flagged: false, seen: false}));
-const changed = row => JSON.stringify(row.labels) !== row.first;
+  flagged: false, seen: false, empty: false}));
+const changed = row => row.empty || JSON.stringify(row.labels) !== row.first;
 const sigmaOf = row => Math.max(0, ...row.labels.map(l => Math.max(l.sigma_u_px, l.sigma_v_px)));
 const confidenceOf = row => Math.max(0, ...row.found.map(f => f.confidence));
 let shown = [], current = null, chosen = 0;
+const UNIT = WIDE / 320; // marks keep their size on large pictures
 
 // The picture of a row with its labels (solid) and detections (dashed).
 function draw(row, large) {
@@ -21,11 +22,11 @@ function draw(row, large) {
   for (const f of row.found) {
     if (f.confidence < 0.05) continue;
     const weak = f.confidence < DATA.threshold ? ' weak' : '';
-    svg.append(svgTag('rect', {class: 'found' + weak, x: f.u_px - 10, y: f.v_px - 10, width: 20, height: 20}));
+    svg.append(svgTag('rect', {class: 'found' + weak, x: f.u_px - 10 * UNIT, y: f.v_px - 10 * UNIT, width: 20 * UNIT, height: 20 * UNIT}));
   }
   row.labels.forEach((l, k) => {
     const kind = `label${l.source === 'hand' ? ' hand' : ''}${large && k === chosen ? ' chosen' : ''}`;
-    svg.append(svgTag('circle', {class: kind, cx: l.u_px, cy: l.v_px, r: 14, 'data-label': k}));
+    svg.append(svgTag('circle', {class: kind, cx: l.u_px, cy: l.v_px, r: 14 * UNIT, 'data-label': k}));
   });
   return svg;
 }
@@ -85,8 +86,8 @@ function open(row) {
 }
 function paint() {
   byId('stage').replaceChildren(draw(current, true));
-  const words = current.labels.map(l => `${l.peer} ${l.depth_m.toFixed(2)} m, ${l.source}`);
-  byId('facts').textContent = `${caption(current)}. Labels: ${words.join('; ') || 'none'}`;
+  const words = current.labels.map(l => `${l.peer}, ${l.depth_m > 0 ? l.depth_m.toFixed(2) + ' m' : 'no depth'}, ${l.source}`);
+  byId('facts').textContent = `${caption(current)}. Labels: ${words.join('; ') || (current.empty ? 'nobody in view' : 'none')}`;
   refresh(current); count();
 }
 function point(event) {
@@ -103,6 +104,7 @@ function newLabel(u_px, v_px, depth_m) {
   const known = depth_m > 0;
   const label = {peer, depth_m: known ? depth_m : 0, sigma_depth_m: known ? 0 : Infinity, visible_share: 0};
   move(label, u_px, v_px);
+  current.empty = false;
   current.labels.push(label); chosen = current.labels.length - 1;
 }
 const apart = (a, b) => Math.hypot(a.u_px - b.u_px, a.v_px - b.v_px);
@@ -125,7 +127,7 @@ byId('stage').addEventListener('pointerdown', event => {
   if (drawing) { newLabel(u, v, 0); drawing = false; dragged = current.labels[chosen]; }
   else {
     const place = current.labels.map((l, k) => [apart(l, {u_px: u, v_px: v}), k]).sort((a, b) => a[0] - b[0])[0];
-    if (!place || place[0] > 24) return;
+    if (!place || place[0] > 24 * UNIT) return;
     chosen = place[1]; dragged = current.labels[chosen];
   }
   byId('stage').setPointerCapture(event.pointerId);
@@ -139,9 +141,10 @@ const KEYS = {
   ArrowRight: () => step(1), j: () => step(1), ArrowLeft: () => step(-1), k: () => step(-1),
   a: accept,
   n: () => { drawing = true; },
+  e: () => { current.labels = []; current.empty = true; },
   x: () => { current.labels.splice(chosen, 1); chosen = 0; },
   f: () => { current.flagged = !current.flagged; },
-  z: () => { current.labels = JSON.parse(current.first, (k, v) => v); current.flagged = false; revive(current); },
+  z: () => { current.labels = JSON.parse(current.first, (k, v) => v); current.flagged = current.empty = false; revive(current); },
   Tab: () => { chosen = (chosen + 1) % Math.max(current.labels.length, 1); },
 };
 function step(by) {
@@ -161,7 +164,7 @@ for (const button of document.querySelectorAll('[data-key]'))
   button.addEventListener('click', () => press(button.dataset.key));
 byId('help').addEventListener('click', () => alert(
   'Solid circles: labels. Dashed squares: detections. In the editor: drag a label; a accepts the detections; ' +
-  'n, then a click, draws a label; x deletes the chosen one, Tab chooses another; f flags; z undoes; arrows or j, k move.'));
+  'n, then a click, draws a label; e says that nobody is in view; x deletes the chosen one, Tab chooses another; f flags; z undoes; arrows or j, k move.'));
 
 // Corrections as recordings (MCAP), one for each source, with all labels of the corrected images.
 const utf8 = new TextEncoder();
@@ -209,6 +212,15 @@ function recording(source, corrected) {
   parts.push(record(15, u32(0)), record(2, u64(0), u64(0), u32(0)), magic);
   return joined(parts);
 }
+const UNSAVED = {
+  save: () => JSON.stringify(rows.filter(changed).map(row => [row.index, row.labels])),
+  flags: () => JSON.stringify(rows.filter(row => row.flagged).map(row => row.index)),
+};
+const saved = {save: UNSAVED.save(), flags: UNSAVED.flags()};
+for (const name of ['save', 'flags']) byId(name).addEventListener('click', () => { saved[name] = UNSAVED[name](); });
+addEventListener('beforeunload', event => {
+  if (Object.keys(saved).some(name => saved[name] !== UNSAVED[name]())) event.preventDefault();
+});
 function download(name, content, type) {
   const link = document.createElement('a');
   link.href = URL.createObjectURL(new Blob([content], {type}));

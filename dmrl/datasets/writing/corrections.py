@@ -44,3 +44,20 @@ def load_corrections(paths: Sequence[Path]) -> Corrections:
             peers = stamped.message.peers
             found[key] = [one for one in peers if one.source == CORRECTION_SOURCE]
     return found
+
+
+def find_corrected(recordings: Sequence[Path], corrections: Sequence[Path]) -> set[str]:
+    """Return the names of the recordings that are corrected.
+
+    Raises
+    ------
+    SettingError
+        If the corrections are of none of the recordings, or one cannot be used.
+    """
+    named = {recording for recording, _, _ in load_corrections(corrections)}
+    if named and not named & {path.name for path in recordings}:
+        raise SettingError(
+            f"{corrections[0]} corrects {', '.join(sorted(named))}, which is not among the "
+            "recordings. Name that one, or leave out --corrections"
+        )
+    return named

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.datasets.layout import PEER_TYPE
-from dmrl.datasets.writing.corrections import Corrections
+from dmrl.datasets.writing.corrections import CORRECTION_SOURCE, Corrections
 from dmrl.datasets.writing.dataset_writer import Row
 from dmrl.datasets.writing.exclusions import FlaggedImage
 from dmrl.datasets.writing.splits import SplitLookup
@@ -43,8 +43,6 @@ TRAINING_SOURCES = ("estimate", "truth", "hand", "published")
 
 Estimates come first: who labels a flight that has true positions wants to measure the estimates.
 """
-
-TOPIC_PATTERNS = (topics.CAMERA_IMAGE("*"), topics.LABELS("*"))
 
 Mask = NDArray[np.uint8]
 """(H, W) index of the peer that each pixel shows, from 1 among the labels; 0 for the background."""
@@ -111,8 +109,15 @@ class ExclusionCounts:
         }
 
 
-def count_images(held: LoadedRecording) -> int:
+def count_images(held: LoadedRecording, *, corrected: bool = False) -> int:
     """Count the images of a recording, labelled or not.
+
+    Parameters
+    ----------
+    held
+        The recording.
+    corrected
+        Whether corrections label its images, so that it needs no labels of its own.
 
     Raises
     ------
@@ -121,7 +126,10 @@ def count_images(held: LoadedRecording) -> int:
     RecordingError
         If one of these topics contains another message type.
     """
-    found = held.matching(*TOPIC_PATTERNS)
+    wanted = (
+        [topics.CAMERA_IMAGE("*")] if corrected else [topics.CAMERA_IMAGE("*"), topics.LABELS("*")]
+    )
+    found = held.matching(*wanted)
     return sum(held.topics[t].count for t in found if topics.parse_topic(topics.CAMERA_IMAGE, t))
 
 
@@ -135,7 +143,7 @@ def find_label_sources(held: LoadedRecording) -> set[str]:
     return present
 
 
-def choose_label_source(held: LoadedRecording, wanted: str) -> str:
+def choose_label_source(held: LoadedRecording, wanted: str, *, corrected: bool = False) -> str:
     """Choose the source whose labels are used for a recording.
 
     Parameters
@@ -145,6 +153,8 @@ def choose_label_source(held: LoadedRecording, wanted: str) -> str:
     wanted
         One of `LABEL_SOURCES`; "best" for the first of them that the recording has; "auto" for the
         first of `TRAINING_SOURCES`.
+    corrected
+        Whether corrections label its images: their source is that of a recording without labels.
 
     Raises
     ------
@@ -154,7 +164,7 @@ def choose_label_source(held: LoadedRecording, wanted: str) -> str:
     present = find_label_sources(held)
     order = {"best": LABEL_SOURCES, "auto": TRAINING_SOURCES}.get(wanted, (wanted,))
     if not present:
-        return order[0]
+        return CORRECTION_SOURCE if corrected else order[0]
     usable = [source for source in order if source in present]
     if not usable:
         has = ", ".join(sorted(present))
