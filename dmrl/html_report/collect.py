@@ -66,6 +66,8 @@ class ReportInputs:
         Figures that the folder's recipe puts first.
     title
         Heading of these figures.
+    order
+        Numbers of the recipe's outputs: documents are shown in this order, others after them.
     """
 
     folder: Path
@@ -78,10 +80,15 @@ class ReportInputs:
     unread: dict[str, str] = field(default_factory=dict)
     story: list[FigureSpec] = field(default_factory=list)
     title: str = "The recipe's figures"
+    order: Mapping[str, int] = field(default_factory=dict)
 
     def documents_of_kind(self, kind: str) -> dict[str, Mapping[str, Any]]:
-        """Return the documents of one kind."""
-        return self.documents.get(kind, {})
+        """Return the documents of one kind, in the order of the recipe, then by name."""
+        held = self.documents.get(kind, {})
+        return {name: held[name] for name in sorted(held, key=self._turn)}
+
+    def _turn(self, name: str) -> tuple[int, str]:
+        return self.order.get(name, len(self.order)), name
 
 
 def collect_outputs(folder: Path) -> ReportInputs:
@@ -97,7 +104,7 @@ def collect_outputs(folder: Path) -> ReportInputs:
             f"{folder} is not a folder. Name one with recordings, models, evaluations"
         )
     refuse_pipes(folder)
-    found = _iter_licences(folder)
+    found = _read_recipe(folder)
     files = list(_iter_files(folder))
     together: set[Path] = set()
     for path in sorted(files, key=lambda path: path.name != CATALOGUE):
@@ -115,15 +122,18 @@ def collect_outputs(folder: Path) -> ReportInputs:
     return found
 
 
-def _iter_licences(folder: Path) -> ReportInputs:
-    """Read the figures that the folder's recipe defines."""
+def _read_recipe(folder: Path) -> ReportInputs:
+    """Read the figures that the folder's recipe defines, and the order of its outputs."""
     recipe = folder / RECIPE_FILE
     if not recipe.is_file() or recipe.is_symlink():
         return ReportInputs(folder)
     try:
         keys = recipes.read(recipe)
         title = str(keys.get(story.TITLE_KEY, ReportInputs.__dataclass_fields__["title"].default))
-        return ReportInputs(folder, story=story.read_figures(recipe, keys), title=title)
+        steps = [step for step in keys.get("step", ()) if isinstance(step, dict)]
+        order = {str(step.get("out")): k for k, step in enumerate(steps)}
+        figures = story.read_figures(recipe, keys)
+        return ReportInputs(folder, story=figures, title=title, order=order)
     except DmrlError as e:
         return ReportInputs(folder, unread={RECIPE_FILE: str(e)})
 

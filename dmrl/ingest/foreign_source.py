@@ -72,7 +72,7 @@ def record_source(
             sink.add_metadata(LICENCES_METADATA, {source.name: extract_licence_title(licence)})
         counts = write_content(content, sink)
         if not counts:
-            raise SourceError(f"{source}: nothing in it can be used. Pass another")
+            raise SourceError(f"{source}: nothing in it can be used. The lines above say why")
     print_findings(out, values=True)
     return counts
 

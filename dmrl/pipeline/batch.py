@@ -79,7 +79,10 @@ def find_recordings(source: Path, *, but: Path | None = None) -> dict[Path, Path
     else:
         return {Path(source.name): source}
     if not found:
-        raise RecordingError(f"no recording (.mcap) in {source}. Name another folder")
+        raise RecordingError(
+            f"no recording (.mcap) in {source}. Name another folder, or make one of its files: "
+            f"dmrl convert {source} OUT.mcap"
+        )
     return {path.relative_to(base): path for path in found}
 
 

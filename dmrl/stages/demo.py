@@ -32,4 +32,5 @@ def command(
         print(f"""{page}: open it in a browser. Now try:
   dmrl view {out}/flight_tracks.mcap     # the flight in rerun: images, detections, tracks
   dmrl fly fly_in_view flight.mcap && dmrl label flight.mcap labelled.mcap
-  dmrl predict dmrl-nano YOUR.mcap found.mcap   # the network that ships, on your own images""")
+  dmrl convert PHOTOS photos.mcap --width-px 640 --height-px 480    # a folder of your own pictures
+  dmrl predict dmrl-nano photos.mcap found.mcap && dmrl view found.mcap""")

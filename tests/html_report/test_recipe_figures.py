@@ -1,6 +1,7 @@
 """The figures of a recipe come first on its page, drawn from what its steps wrote."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -141,3 +142,11 @@ def test_unusable_figure_sources_show_a_reason(pipeline: Path) -> None:
 def test_figures_that_are_no_tables_are_named_on_the_page(pipeline: Path) -> None:
     (pipeline / "recipe.toml").write_text('kind = "pipeline"\nfigure = 3\n')
     assert "must be [[figure]] tables" in collect_outputs(pipeline).unread["recipe.toml"]
+
+
+def test_results_stand_in_the_order_of_the_recipe(outputs: Path) -> None:
+    shutil.copytree(outputs / "judged", outputs / "another")
+    assert list(collect_outputs(outputs).documents_of_kind("evaluations")) == ["another", "judged"]
+    steps = '[[step]]\nout = "judged"\n[[step]]\nout = "another"\n'
+    (outputs / "recipe.toml").write_text(f'kind = "pipeline"\n{steps}')
+    assert list(collect_outputs(outputs).documents_of_kind("evaluations")) == ["judged", "another"]

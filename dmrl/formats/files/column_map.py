@@ -195,6 +195,8 @@ def _iter_errors(key: str, table: Any) -> Iterator[str]:
     else:
         wrong = {name: "no such key" for name in table if name not in COLUMN_KEYS}
         wrong |= _find_wrong_values(units, table)
+        if key == f"range.{ANY_PEER}" and "{peer}" not in str(table.get("name", "{peer}")):
+            wrong["name"] = "no {peer} in it; the range to one peer is [range.PEER]"
         yield from (f"[{key}] {name}: {what}" for name, what in wrong.items())
 
 

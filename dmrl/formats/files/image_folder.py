@@ -1,4 +1,4 @@
-"""A folder of images, with labels in a CSV file if there is one.
+"""A folder of images, with labels in a CSV file if there is one; or a single image.
 
 Images: files of ``IMAGE_SUFFIXES``, in the natural order of their names: img2 before img10. If
 every name is a number of 12 digits or more, the numbers are times in nanoseconds; if every name
@@ -48,6 +48,7 @@ from dmrl.formats.files.pictures import crop_camera
 from dmrl.geometry.camera_file import read_camera
 from dmrl.guards.paths import refuse_pipes
 from dmrl.samples.sample import Sample
+from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 
 LABELS_FILE = "labels.csv"
@@ -60,9 +61,22 @@ NS_PER_S = 1_000_000_000
 MAX_TIME_NS = 2**63 - 1
 
 
+UNREAD_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".mp4", ".mov", ".avi", ".mkv")
+"""Photos and videos that stand in folders of pictures and are not read."""
+UNREAD = (
+    "photos and videos of other kinds: save photos as JPEG, cut videos into pictures "
+    "(ffmpeg -i VIDEO -r 5 FOLDER/%05d.png)"
+)
+
+
 def can_read(source: Path) -> bool:
-    """Return whether a folder has an image."""
-    return source.is_dir() and any(is_picture(path) for path in source.iterdir())
+    """Return whether a source is an image, or a folder with one, or with photos or videos."""
+    files = source.iterdir() if source.is_dir() else [source]
+    return any(is_picture(path) or _is_unread(path) for path in files)
+
+
+def _is_unread(path: Path) -> bool:
+    return path.suffix.lower() in UNREAD_SUFFIXES and path.name[0] != "." and path.is_file()
 
 
 def load_content(source: Path, options: Options) -> Content:
@@ -118,10 +132,13 @@ def list_images(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
     SourceError
         If there is none, only some are named by times, or two have the same time.
     """
-    if not source.is_dir():
+    if not source.exists():
         raise SourceError(f"no folder {source}. Pass a folder of images")
     refuse_pipes(source)
-    paths = sorted(filter(is_picture, source.iterdir()), key=natural_key)
+    files = sorted(source.iterdir() if source.is_dir() else [source], key=natural_key)
+    unread = list(filter(_is_unread, files))
+    leave_out(UNREAD, unread[0] if unread else source, len(unread))
+    paths = list(filter(is_picture, files))
     if not paths:
         raise SourceError(
             f"no image ({', '.join(IMAGE_SUFFIXES)}) in {source}. Pass another folder"
@@ -201,4 +218,4 @@ def _iter_samples(
 
 
 IMAGE_OPTIONS = LABELLED_OPTIONS | {"labels"}
-FORMAT = Format("images", "a folder of pictures", can_read, load_content, IMAGE_OPTIONS)
+FORMAT = Format("images", "a picture, or a folder of them", can_read, load_content, IMAGE_OPTIONS)

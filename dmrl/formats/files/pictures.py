@@ -22,6 +22,12 @@ PICTURE_OPTIONS = SOURCE_OPTIONS | {"camera", "size_px", "raw", "bits", "as_stor
 """Options that have an effect on encoded pictures."""
 
 
+SCALE_HINT = (
+    f"Recordings take {limits.FRAME_PIXELS // 1_000_000} million pixels an image. Scale them: "
+    "--width-px 640 --height-px 480"
+)
+
+
 def scaling_words(bits: int) -> str:
     """Return the words that state how pixels of 16 bits become 8."""
     return f"16 bits scaled to 8, {2**bits - 1} to 255 (--bits)"
@@ -77,8 +83,12 @@ class PictureConverter:
         ------
         SettingError
             If the camera does not have the size of the picture, or the picture is not raw.
+        SourceError
+            If the picture is larger than any command reads from a recording.
         """
         crop = _build_crop(rgb.shape[1], rgb.shape[0], where, self.options)
+        if crop.width_px * crop.height_px > limits.FRAME_PIXELS:
+            raise SourceError(f"{where} is {crop.width_px} x {crop.height_px} px. {SCALE_HINT}")
         if crop.changes:
             rgb, kept = crop.crop_image(rgb), None
         image = build_image(time_ns, self.options.robot, *(kept or (codec.encode_png(rgb), "png")))

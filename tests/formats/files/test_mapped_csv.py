@@ -318,3 +318,15 @@ def test_every_quantity_of_the_column_map_reaches_its_topic(tmp_path: Path) -> N
         pose = found[topic][0].fields["pose"]
         assert pose["position"] == pytest.approx({n: row[f"{before}{n}"] for n in "xyz"})
         assert pose["orientation"] == pytest.approx({n: row[f"{before}q{n}"] for n in "xyzw"})
+
+
+def test_ranges_to_any_peer_need_the_peer_in_the_name(table: Path) -> None:
+    table.write_text(TABLE.replace("[range.cf2]", '[range."*"]'))
+    with pytest.raises(SourceError, match=r"\[range\.\*\] name: no \{peer\} in it"):
+        samples(table.with_name("log.csv"), Options(columns=table))
+
+
+def test_a_table_of_unknown_columns_names_the_flag_that_states_them(table: Path) -> None:
+    for source in (table.parent, table.with_name("log.csv")):
+        with pytest.raises(SourceError, match=r"--columns map\.toml"):
+            find_format(source)
