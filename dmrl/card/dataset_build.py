@@ -127,7 +127,8 @@ def _write_part(
     made = _provenance(recordings, settings)
     known, held = _read_labels(recordings, settings)
     sources = {path: one.source for path, one in known.items()}
-    warn_about_other_sources(sources, {path: one.others for path, one in known.items()})
+    if settings.labels in ("auto", "best"):
+        warn_about_other_sources(sources, {path: one.others for path, one in known.items()})
     warn_about_lenses([px for one in known.values() for px in one.focal_px])
     tally, seen = ExclusionCounts(), ImageHashes(before.load_image_hashes())
     found = iter_rows(

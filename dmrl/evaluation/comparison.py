@@ -89,7 +89,8 @@ def compare_models(
     figures = {}
     for name, *_ in metric_columns():
         first, second = (float(value[name][0]) for value in values)
-        sample = np.concatenate([block[1][name] - block[0][name] for block in blocks])
+        with np.errstate(invalid="ignore"):  # both infinite where neither model finds anything
+            sample = np.concatenate([block[1][name] - block[0][name] for block in blocks])
         sample = sample[np.isfinite(sample)]
         measured = len(sample) and np.isfinite(second - first)
         ends = np.quantile(sample, (0.025, 0.975)) if measured else (np.nan, np.nan)

@@ -184,7 +184,10 @@ def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None
     name = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
     part = ", only those with detections" if criteria.partial else ""
     title = f"{name}: {evaluation.pairs.images} images against {criteria.against}{split}{part}"
-    print_table(title, ["label minus detection", *headers], rows)
+    if evaluation.paired and 2 * evaluation.paired["images"] == evaluation.pairs.images:
+        print_line(f"{title}, each by two models: below is their comparison, not their mean")
+    else:
+        print_table(title, ["label minus detection", *headers], rows)
     notes = [f"{count} {why}" for why, count in evaluation.pairs.left_out.items()]
     if unmatched := evaluation.bands[0].unmatched:
         notes.append(f"{unmatched} labels without any detection")

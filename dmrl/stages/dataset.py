@@ -1,5 +1,6 @@
 """``dmrl dataset``: recordings to an Arrow dataset, with its card."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,6 +96,8 @@ def add(
 
 
 DEFAULTS = Settings()
+MAX_NAMED = 20
+"""Recordings that the table of a dataset names; more are counted."""
 
 
 def command(
@@ -151,4 +154,8 @@ def command(
         return
     title = f"{out}, added" if into else str(out)
     print_table(title, ("split", "images"), list(result.images.items()))
-    print_table("", ("recording", "labels from"), list(result.sources.items()))
+    if len(result.sources) <= MAX_NAMED:
+        print_table("", ("recording", "labels from"), list(result.sources.items()))
+    else:
+        counted = Counter(result.sources.values()).most_common()
+        print_table("", ("labels from", "recordings"), counted)

@@ -134,6 +134,17 @@ def test_recordings_are_judged_together(
         run([near, far, near], None, FAST)
 
 
+def test_two_models_on_the_same_images_are_compared_and_not_pooled(
+    write: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = ("a.mcap", "b.mcap")
+    both = [write({"cf1": [([peer(10, 10)], [found(13, k)])] * 2}, name=names[k]) for k in (0, 1)]
+    evaluate.command(both, settings=FAST)
+    said = capsys.readouterr().out
+    assert "4 images against truth, each by two models" in said
+    assert said.count("median error, px") == 1  # that of the comparison
+
+
 def test_only_the_chosen_source_counts(write: Callable[..., Path]) -> None:
     both = [peer(10, 10), peer(10, 18, source="published")]
     path = write({"cf1": [(both, [found(10, 10)])]})

@@ -90,11 +90,13 @@ def has_masks(recording: Path) -> bool:
 def warn_about_other_sources(
     sources: Mapping[Path, str], others: Mapping[Path, Sequence[str]]
 ) -> None:
-    """Report the source of labels used where both truth and estimates exist."""
-    for path, used in sources.items():
-        if {"truth", "estimate"} <= {*others[path], used}:
-            other = "estimate" if used == "truth" else "truth"
-            say(f"{path}: labels from {used}, not from {other}, which it has too (--labels)")
+    """Report once for each source that recordings with both truth and estimates are used by."""
+    for used, other in (("truth", "estimate"), ("estimate", "truth")):
+        both = [path for path in sources if sources[path] == used and other in others[path]]
+        if both:
+            more = f" and {len(both) - 1} more" if both[1:] else ""
+            beside = f"not from {other}, which is there too (--labels)"
+            say(f"{both[0]}{more}: labels from {used}, {beside}")
 
 
 def require_same_size(path: Path, row: Row, size_px: tuple[int, int]) -> None:

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dmrl.cli import app
 from dmrl.datasets import open_dataset
 from dmrl.datasets.writing import dataset_writer
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError
@@ -13,7 +14,7 @@ from dmrl.messages import STATUS_AMBIGUOUS, STATUS_UNCONVERGED, message_class, s
 from dmrl.recording import Channel, Provenance, RawMessage, RecordingWriter, read
 from dmrl.stages import convert
 from dmrl.stages import dataset as stage
-from dmrl.stages.dataset import Settings, run
+from dmrl.stages.dataset import MAX_NAMED, Settings, run
 from dmrl.topics import CAMERA_IMAGE, LABELS
 
 from ..conftest import HEIGHT_PX, STEP_NS, WIDTH_PX, Record, peer, pixels_of
@@ -90,9 +91,22 @@ def test_estimated_labels_precede_truth_and_the_choice_is_reported(
         out = tmp_path / wanted
         settings = Settings(split="none") if wanted == "auto" else Settings(wanted, split="none")
         assert run([flight], out, settings).sources == {"flight.mcap": used}
-        assert f"labels from {used}, not from {other}, which it" in capsys.readouterr().err
+        assert f"labels from {used}, not from {other}, which is" in capsys.readouterr().err
         told = f"- `flight.mcap`: labels from `{used}` are used. It also has labels from `{other}`."
         assert told in (out / "README.md").read_text()
+
+
+def test_thousands_of_recordings_are_counted_and_not_listed(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    both = [[peer(u_px=20.0), peer(source="estimate", u_px=30.0)]]
+    flights = [record(f"f{k}.mcap", peers=both, seed=k) for k in range(MAX_NAMED + 1)]
+    app(["dataset", *map(str, flights), str(tmp_path / "out")], result_action="return_value")
+    said = capsys.readouterr()
+    assert f"f0.mcap and {MAX_NAMED} more: labels from estimate" in said.err
+    assert said.err.count("labels from") == 1 and "f1.mcap" not in said.out
+    run(flights[:1], tmp_path / "stated", Settings(labels="truth", split="none"))
+    assert "labels from" not in capsys.readouterr().err
 
 
 def test_masks_are_omitted_by_default(record: Record, tmp_path: Path) -> None:
