@@ -7,13 +7,9 @@ import numpy as np
 
 from dmrl.recording.mcap.batch_reader import iter_batches
 from dmrl.recording.mcap.file import open_mcap
+from dmrl.recording.mcap.index_reader import iter_index_times
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS, Ints
-from dmrl.recording.mcap.message_count import (
-    count_chunks,
-    count_scanned,
-    iter_index_times,
-    verify_indexes,
-)
+from dmrl.recording.mcap.message_count import count_chunks, count_scanned, verify_indexes
 from dmrl.recording.mcap.record_scan import scan_file
 from dmrl.recording.mcap.summary_section import read_summary_section
 from dmrl.recording.protobuf.message_types import require_types
@@ -92,9 +88,10 @@ def read_indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
     with open_mcap(path) as stream:
         summary = read_summary_section(stream)
         if summary is not None and all(c.message_index_offsets for c in summary.chunk_indexes):
-            for number, times in iter_index_times(stream, summary, topics):
-                if (topic := summary.channels[number].topic) in parts:
-                    parts[topic].append(times)
+            by_topic = {t: [n for n, c in summary.channels.items() if c.topic == t] for t in topics}
+            for ids, times in iter_index_times(stream, summary, topics):
+                for topic, numbers in by_topic.items():
+                    parts[topic].append(times[np.isin(ids, numbers)])
             return {topic: np.concatenate(times) for topic, times in parts.items()}
     for batch, found in iter_batches(path, topics):
         for number, channel in found.items():

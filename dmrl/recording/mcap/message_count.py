@@ -1,10 +1,8 @@
 """Count the messages of a recording, and compare them with its Statistics record."""
 
-import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -16,13 +14,9 @@ from dmrl.recording.mcap.chunks.chunk_reader import iter_chunks
 from dmrl.recording.mcap.extra_records import read_metadata
 from dmrl.recording.mcap.file import BoundedReader
 from dmrl.recording.mcap.file_cache import get_cached
-from dmrl.recording.mcap.message_batch import Ints
-from dmrl.recording.mcap.message_index import (
-    ENTRY_BYTES,
-    MESSAGE_INDEX_STRUCT,
-    check_all_listed,
-    parse_index_entries,
-)
+from dmrl.recording.mcap.index_reader import iter_index_times
+from dmrl.recording.mcap.message_batch import MAX_TIME_NS, Ints
+from dmrl.recording.mcap.message_index import ENTRY_BYTES, MESSAGE_INDEX_STRUCT
 from dmrl.recording.mcap.record_scan import ScannedFile
 from dmrl.recording.mcap.summary_section import SummarySection
 from dmrl.terminal.progress import say_once
@@ -33,7 +27,9 @@ COUNTED_BYTES = 128_000_000
 It costs a few tenths of a second, once a process. The chunks of larger files are verified when
 they are read.
 """
-Times = Iterable[tuple[int, Ints]]
+MAX_CHANNELS = 2**16
+Times = Iterable[tuple[Ints, Ints]]
+"""(N,) channel ids and log times of some messages at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +63,7 @@ def count_scanned(scanned: ScannedFile) -> MessageCount:
     McapError
         If the Statistics record states another number.
     """
-    times = (
-        (number, batch.time_ns[batch.channel == number])
-        for batch in scanned.batches
-        for number in batch.list_channel_ids()
-    )
+    times = ((batch.channel, batch.time_ns) for batch in scanned.batches)
     return _compare(scanned.statistics, scanned.channels, times)
 
 
@@ -102,7 +94,9 @@ def count_recording(stream: BoundedReader, section: SummarySection) -> MessageCo
 
 def count_chunks(stream: BoundedReader, section: SummarySection) -> MessageCount:
     """Count the messages of every chunk, each read and verified; raise as `count_recording`."""
-    times = _iter_chunk_times(stream, section)
+    chunks = sorted(section.chunk_indexes, key=lambda c: c.chunk_start_offset)
+    batches = iter_chunks(stream, chunks, section.channels_by_id, section)
+    times = ((batch.channel, batch.time_ns) for batch in batches)
     return _compare(section.statistics, section.channels_by_id, times)
 
 
@@ -170,64 +164,11 @@ def _get_stated(section: SummarySection) -> MessageCount | None:
     return MessageCount(Counter(section.counts), *times)
 
 
-def _iter_chunk_times(stream: BoundedReader, section: SummarySection) -> Iterator[tuple[int, Ints]]:
-    """Yield channel id and log times of the messages of every chunk."""
-    chunks = sorted(section.chunk_indexes, key=lambda c: c.chunk_start_offset)
-    for batch in iter_chunks(stream, chunks, section.channels_by_id, section):
-        for number in batch.list_channel_ids():
-            yield number, batch.time_ns[batch.channel == number]
-
-
-def iter_index_times(
-    stream: BoundedReader, section: SummarySection, topics: frozenset[str] | None = None
-) -> Iterator[tuple[int, Ints]]:
-    """Yield channel id and log times of every message index by chunk, then verify the CRC of all.
-
-    For a file in a bucket, only indexes of chunks with the topics are read, without that CRC.
-
-    Raises
-    ------
-    McapError
-        If an index contradicts its chunk, is not listed, or fails the CRC.
-    """
-    stored_checksums = read_metadata(stream, section).get(checksums.METADATA_NAME)
-    crc = 0
-    chunks = sorted(section.chunk_indexes, key=lambda c: c.chunk_start_offset)
-    if stream.remote_stream is not None:
-        stored_checksums = None
-        wanted = {n for n, c in section.channels.items() if topics is None or c.topic in topics}
-        chunks = [chunk for chunk in chunks if wanted & chunk.message_index_offsets.keys()]
-    firsts = [chunk.chunk_start_offset + chunk.chunk_length for chunk in chunks]
-    stream.expect_reads([(k, c.message_index_length) for k, c in zip(firsts, chunks, strict=True)])
-    for first, chunk in zip(firsts, chunks, strict=True):
-        stream.seek(first)
-        raw = stream.read(chunk.message_index_length)
-        crc = zlib.crc32(raw, crc)
-        places = {n: at - first for n, at in chunk.message_index_offsets.items()}
-        _, times, _, counts = parse_index_entries(raw, places)
-        check_all_listed(raw, places)
-        low, high = chunk.message_start_time, chunk.message_end_time
-        if len(times) and not low <= int(times.min()) <= int(times.max()) <= high:
-            raise McapError(f"a message index at byte {first} has times of another chunk")
-        bounds = pairwise([0, *np.cumsum(counts).tolist()])
-        for number, (begin, end) in zip(places, bounds, strict=True):
-            yield number, times[begin:end]
-    if stored_checksums and stored_checksums[-1].get("indexes") != checksums.format_crc(crc):
-        raise McapError("its message indexes fail their CRC")
-
-
 def _compare(
     statistics: Statistics | None, channels: Mapping[int, Channel], times: Times
 ) -> MessageCount:
     """Count messages by their times and compare them with the Statistics record."""
-    counts: Counter[int] = Counter()
-    spans: dict[int, tuple[int, int]] = {}
-    for number, time_ns in times:
-        if len(time_ns):
-            counts[number] += len(time_ns)
-            low, high = int(time_ns.min()), int(time_ns.max())
-            before = spans.get(number, (low, high))
-            spans[number] = min(low, before[0]), max(high, before[1])
+    counts, spans = _tally(times)
     start_ns = min((low for low, _ in spans.values()), default=0)
     end_ns = max((high for _, high in spans.values()), default=0)
     check_counts(statistics, channels, counts)
@@ -242,3 +183,18 @@ def _compare(
     )
     agrees = stated == (start_ns, end_ns) or not counts
     return MessageCount(counts, start_ns, end_ns, "" if agrees else contradiction, spans)
+
+
+def _tally(times: Times) -> tuple[Counter[int], dict[int, tuple[int, int]]]:
+    """Return number of messages, and first and last log time, by channel id."""
+    counts = np.zeros(MAX_CHANNELS, np.int64)
+    low, high = np.full(MAX_CHANNELS, MAX_TIME_NS), np.full(MAX_CHANNELS, -1)
+    for channel, time_ns in times:
+        found = np.bincount(channel)
+        counts[: len(found)] += found
+        np.minimum.at(low, channel, time_ns)
+        np.maximum.at(high, channel, time_ns)
+    numbers = np.flatnonzero(counts)
+    spans = zip(low[numbers].tolist(), high[numbers].tolist(), strict=True)
+    by_channel = dict(zip(numbers.tolist(), counts[numbers].tolist(), strict=True))
+    return Counter(by_channel), dict(zip(numbers.tolist(), spans, strict=True))

@@ -103,14 +103,14 @@ def check_all_listed(records: bytes, offsets: Mapping[int, int]) -> None:
 
 
 class IndexEntries(NamedTuple):
-    """Entries of the message indexes of a chunk, channel by channel.
+    """Entries of message indexes, record by record.
 
     Parameters
     ----------
     channel, time_ns, offset
         (N,) channel id and log time of each message, and the offset of its record in the chunk.
     counts
-        (C,) number of messages of each channel.
+        (C,) number of messages of each record.
     """
 
     channel: Ints
@@ -120,7 +120,7 @@ class IndexEntries(NamedTuple):
 
 
 def parse_index_entries(raw: bytes, offsets: Mapping[int, int]) -> IndexEntries:
-    """Parse the message indexes of some channels.
+    """Parse the message indexes of some channels of a chunk.
 
     Parameters
     ----------
@@ -136,7 +136,30 @@ def parse_index_entries(raw: bytes, offsets: Mapping[int, int]) -> IndexEntries:
     """
     numbers = np.fromiter(offsets.keys(), np.int64, len(offsets))
     at = np.fromiter(offsets.values(), np.int64, len(offsets))
-    if len(at) and not 0 <= at.min() <= at.max() <= len(raw) - MESSAGE_INDEX_STRUCT.size:
+    return parse_index_records(raw, numbers, at, (0, len(raw)))
+
+
+def parse_index_records(
+    raw: bytes, numbers: Ints, at: Ints, limits: tuple[Ints | int, Ints | int]
+) -> IndexEntries:
+    """Parse message indexes of one or more chunks.
+
+    Parameters
+    ----------
+    raw
+        Bytes that contain the records.
+    numbers, at
+        (C,) channel id of each record, and its offset in ``raw``.
+    limits
+        Where the records of the chunk begin and end in ``raw``, of each record or of all.
+
+    Raises
+    ------
+    McapError
+        If a record is truncated, or is not the Message Index of its channel.
+    """
+    begin, end = limits
+    if ((at < begin) | (at + MESSAGE_INDEX_STRUCT.size > end)).any():
         raise McapError("a message index is cut")
     heads = gather(raw, _HEADER_DTYPE, at)
     size = heads["size"].astype(np.int64)
@@ -144,7 +167,7 @@ def parse_index_entries(raw: bytes, offsets: Mapping[int, int]) -> IndexEntries:
     right &= (heads["length"] >= size + 6) & (size % ENTRY_BYTES == 0)  # bytes may follow
     if not right.all():
         raise McapError(f"message index of channel {numbers[~right][0]} is wrong")
-    if (at + RECORD_STRUCT.size + heads["length"].astype(np.int64) > len(raw)).any():
+    if (at + RECORD_STRUCT.size + heads["length"].astype(np.int64) > end).any():
         raise McapError("a message index is cut")
     counts = size // ENTRY_BYTES
     entries = gather(raw, _ENTRY_DTYPE, _compute_entry_offsets(at, counts))
