@@ -113,6 +113,13 @@ def _measure(scored: ScoredDetections, threshold: float, weights: Any) -> Mappin
     return compute_metrics(scored, DEPTH_BANDS_M[0], threshold, weights)
 
 
+def is_pooled(said: Mapping[str, Any]) -> bool:
+    """Return whether all images of an evaluation are pairs: its own figures are of two models."""
+    paired = said.get("paired")
+    common = paired.get("images") if isinstance(paired, Mapping) else None
+    return isinstance(common, int) and 2 * common == said.get("images")
+
+
 def build_rows(made: Mapping[str, Any]) -> list[list[str]]:
     """Return a row per metric of a comparison: both values, and their difference."""
     rows = []

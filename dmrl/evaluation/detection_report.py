@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.errors import SettingError
-from dmrl.evaluation.comparison import HEADERS, align_images, build_rows, compare_models, note
+from dmrl.evaluation.comparison import (
+    HEADERS,
+    align_images,
+    build_rows,
+    compare_models,
+    is_pooled,
+    note,
+)
 from dmrl.evaluation.detections import LabelledDetections, concatenate_parts, join_each
 from dmrl.evaluation.figure_tables import (
     band_to_json,
@@ -184,7 +191,7 @@ def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None
     name = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
     part = ", only those with detections" if criteria.partial else ""
     title = f"{name}: {evaluation.pairs.images} images against {criteria.against}{split}{part}"
-    if evaluation.paired and 2 * evaluation.paired["images"] == evaluation.pairs.images:
+    if is_pooled({"images": evaluation.pairs.images, "paired": evaluation.paired}):
         print_line(f"{title}, each by two models: below is their comparison, not their mean")
     else:
         print_table(title, ["label minus detection", *headers], rows)

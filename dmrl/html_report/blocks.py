@@ -3,6 +3,7 @@
 Templates escape all text of blocks; a figure's SVG is code of this package.
 """
 
+import re
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -48,6 +49,10 @@ class Text:
     code: str = ""
 
 
+NUMBER = re.compile(r"[-+]?\d[\d.,]*%?(?=\s|$)")
+"""Start of a cell with a number, such as ``0.71 (0.6, 0.9)``; a name such as 2026-11/a is none."""
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
     """A table; columns of numbers, or of texts that begin with one, are right-aligned."""
@@ -66,7 +71,7 @@ class Table:
         """Class of each column: n for numbers."""
         rows = self.cells
         number = [
-            bool(rows) and all(row[k][:1].lstrip("-").isdigit() or not row[k] for row in rows)
+            bool(rows) and all(NUMBER.match(row[k]) or row[k] in ("", "-") for row in rows)
             for k in range(len(self.columns))
         ]
         return ["n" if n else "" for n in number]

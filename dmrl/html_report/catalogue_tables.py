@@ -8,8 +8,8 @@ import pyarrow as pa
 
 from dmrl.html_report.blocks import Block, Heading, Table, Text
 
-MAX_LISTED_ERRORS = 12
-"""Recordings that are listed with their errors, at most."""
+MAX_LISTED = 12
+"""Recordings that are listed with their errors or causes, at most."""
 
 
 def build_catalogue_section(catalogues: Mapping[str, pa.Table]) -> list[Block]:
@@ -25,8 +25,16 @@ def _show_catalogue(name: str, catalogue: pa.Table) -> list[Block]:
         Table(("camera", "recordings", "images"), _count_by_camera(catalogue["cameras"])),
         Table(("camera", "labels from", "OK", "all"), _count_labels(catalogue["labels"])),
         Table(("made by", "recordings"), _count_values(catalogue["stage"])),
-        *(Table(("recording", what), rows) for what, rows in listed.items() if rows),
+        *(block for what, rows in listed.items() for block in _show_first(what, rows)),
     ]
+
+
+def _show_first(what: str, rows: list[tuple[str, str]]) -> Iterable[Block]:
+    """Yield the table of the first rows, and how many more there are."""
+    if rows:
+        yield Table(("recording", what), rows[:MAX_LISTED])
+    if len(rows) > MAX_LISTED:
+        yield Text(f"and {len(rows) - MAX_LISTED} more recordings: dmrl find")
 
 
 def _summarize(catalogue: pa.Table) -> str:
@@ -72,8 +80,7 @@ def _list_causes(catalogue: pa.Table) -> list[tuple[str, str]]:
     for name, findings in zip(*columns, strict=True):
         causes = [one["text"] for one in findings or () if one["topic"].endswith("/causes")]
         found += [(len(causes), name, "; ".join(causes))] if causes else []
-    rows = [(name, text) for _, name, text in sorted(found, key=lambda one: -one[0])]
-    return rows[:MAX_LISTED_ERRORS]
+    return [(name, text) for _, name, text in sorted(found, key=lambda one: -one[0])]
 
 
 def _list_errors(catalogue: pa.Table) -> list[tuple[str, str]]:
@@ -83,4 +90,4 @@ def _list_errors(catalogue: pa.Table) -> list[tuple[str, str]]:
         worst = [one["text"] for one in findings or () if one["level"] == "error"]
         if error or worst:
             found.append((name, error or worst[0]))
-    return found[:MAX_LISTED_ERRORS]
+    return found

@@ -103,19 +103,22 @@ def _summarize(found: ReportInputs) -> str:
 
 
 def _detections_section(found: ReportInputs, pictures: ImageEmbedder) -> list[Block]:
-    judged = found.documents_of_kind("evaluations")
-    if not judged:
+    every = found.documents_of_kind("evaluations")
+    if not every:
         return []
+    # The pooled figures of a comparison are of no model; its section has those of both.
+    judged = {name: said for name, said in every.items() if not comparison.is_pooled(said)}
     heads = ("evaluation", "against", "images", *(words for words, _ in METRICS.values()))
     rows = extract_valid(
         judged, lambda said: [said["against"], said["images"], *_metric_cells(said["overall"])]
     )
     few = dict(list(judged.items())[:MAX_SHOWN])
+    shown = dict(list(every.items())[:MAX_SHOWN])
     return [
-        Table(heads, [[name, *cells] for name, cells in rows.items()]),
-        Text("In brackets: 95 % intervals from a bootstrap over images."),
+        *_table(heads, [[name, *cells] for name, cells in rows.items()]),
+        *([Text("In brackets: 95 % intervals from a bootstrap over images.")] if rows else []),
         *build_row(_iter_detection_charts(few)),
-        *show_documents(few, lambda name, said: _evaluation_details(found, name, said, pictures)),
+        *show_documents(shown, lambda name, said: _evaluation_details(found, name, said, pictures)),
     ]
 
 
@@ -181,11 +184,13 @@ def _evaluation_details(
     partial = " Images without Detections were left out (--partial)." if said.get("partial") else ""
     words = f"{said['labels']} labels, threshold {float(said['threshold']):.2f}.{partial}"
     headers, rows = build_band_table([said["overall"], *said["bands"]])
+    rows = [] if comparison.is_pooled(said) else rows
+    table = _table(["label minus detection", *headers], rows)
     figures = (
         pictures.embed_if_present(found.folder / name / file, caption, full=k == 0)
         for k, (file, caption) in enumerate(EVALUATION_IMAGES.items())
     )
-    return [Text(words, ran), Table(["label minus detection", *headers], rows), *build_row(figures)]
+    return [Text(words, ran), *table, *build_row(figures)]
 
 
 def _differences_section(found: ReportInputs) -> list[Block]:

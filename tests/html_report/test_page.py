@@ -13,6 +13,8 @@ import pytest
 import dmrl
 from dmrl.errors import OutputError, SettingError
 from dmrl.html_report import build_report, collect_outputs, write_html_report
+from dmrl.html_report.blocks import Table, Text
+from dmrl.html_report.catalogue_tables import MAX_LISTED, _show_first
 from dmrl.images.codec import encode_png
 from dmrl.plots import charts
 from dmrl.plots.image_figures import _place_texts
@@ -182,3 +184,24 @@ def test_depth_texts_do_not_overlap_and_stay_in_the_image() -> None:
         (u, v), (other_u, other_v) = _place_texts(uv_px, 320, 224)
         assert abs(u - other_u) >= 50 or abs(v - other_v) >= 14, uv_px
         assert 25 < u < 295 and 5 < v < 219
+
+
+def test_the_pooled_figures_of_a_comparison_are_not_shown(outputs: Path) -> None:
+    said = json.loads((outputs / "judged/evaluation.json").read_text())
+    for common, shown in ((10, True), (5, False)):
+        said |= {"images": 10, "paired": {"images": common}}
+        (outputs / "judged/evaluation.json").write_text(json.dumps(said))
+        html = build_report(collect_outputs(outputs))
+        assert ("label minus detection" in html) == shown
+
+
+def test_columns_of_names_that_begin_with_a_digit_are_not_of_numbers() -> None:
+    rows = [["2026-11/f1.mcap", "0.5 (0.4, 0.6)", "12"], ["7.mcap", "-", "99.1% (98%, 100%)"]]
+    assert Table(("recording", "error", "within"), rows).kinds == ["", "n", "n"]
+
+
+def test_a_catalogue_says_how_many_recordings_it_does_not_list() -> None:
+    rows = [(f"f{k}.mcap", "cut short") for k in range(MAX_LISTED + 3)]
+    table, more = _show_first("error", rows)
+    assert isinstance(table, Table) and len(list(table.rows)) == MAX_LISTED
+    assert isinstance(more, Text) and more.words.startswith("and 3 more")
