@@ -6,6 +6,9 @@ heavy; processes that it starts inherit them.
 """
 
 import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 OPT_OUT = {
     # onnxruntime 1.29 and later: an identifier in the temporary folder, uploads to Microsoft.
@@ -20,3 +23,16 @@ OPT_OUT = {
 def disable_telemetry() -> None:
     """Set the opt-out variable of every dependency, overriding the environment."""
     os.environ.update(OPT_OUT)
+
+
+@contextmanager
+def hide_module(name: str) -> Iterator[None]:
+    """Make an optional package look absent to what is imported in the block."""
+    if name in sys.modules:
+        yield
+        return
+    sys.modules[name] = None  # type: ignore[assignment] # as the import system documents it
+    try:
+        yield
+    finally:
+        del sys.modules[name]

@@ -41,6 +41,17 @@ class WorkerStart:
     arrays: Arrays = field(default_factory=dict)
 
 
+def _build_environment(python: Path) -> dict[str, str]:
+    """Return the environment variables of a worker.
+
+    It is another Python: variables for this one would hide its modules. Blender keeps caches of
+    extensions and thumbnails, by default among the user's.
+    """
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+    own = str(python.parent.parent / "user")
+    return kept | {"BLENDER_USER_RESOURCES": own, "XDG_CACHE_HOME": own}
+
+
 class Worker:
     """A Blender process with one robot in its scene.
 
@@ -61,8 +72,7 @@ class Worker:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            # It is another Python: variables for this one would hide its modules.
-            env={k: v for k, v in os.environ.items() if not k.startswith("PYTHON")},
+            env=_build_environment(start.python),
         )
         self._last_words: deque[bytes] = deque(maxlen=20)
         self._listener = threading.Thread(target=self._collect_errors, daemon=True)

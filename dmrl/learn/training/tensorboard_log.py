@@ -5,7 +5,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from torch.utils.tensorboard import SummaryWriter
+from dmrl.guards.telemetry import hide_module
+
+with hide_module("botocore"):  # TensorBoard imports it, if it is installed; it opens a socket
+    from torch.utils.tensorboard import SummaryWriter
 
 ScalarWriter = Callable[[str, float, int], None]
 """Function that logs the name of a curve, its value and the step."""
