@@ -35,6 +35,11 @@ CONTENTS = {
     INTEGER_NAME: "the int8 network as arrays: what dmrl verify compares with",
     SAMPLES_NAME: "images to verify on",
     DESCRIPTION_NAME: "size of the image, outputs, threshold",
+    "main.c": "a self-test: make test",
+    "Makefile": "builds and runs the self-test",
+    "pilot.c": "C that follows a drone by the detections",
+    "pilot.h": "its header",
+    "provenance.json": "the origin of the network",
 }
 """Content of each file, by its name."""
 
@@ -115,5 +120,8 @@ def list_files(folder: Path) -> list[Written]:
 
 
 def _describe_file(path: Path) -> Written:
-    content = CONTENTS.get(path.name, "C" if path.suffix in (".c", ".h") else "")
-    return Written(path.name, content, path.stat().st_size)
+    kinds = {".c": "C of the network: your program needs it and its header", ".h": "its header"}
+    other = (
+        "images of the self-test" if path.stem.endswith("_vectors") else kinds.get(path.suffix, "")
+    )
+    return Written(path.name, CONTENTS.get(path.name, other), path.stat().st_size)

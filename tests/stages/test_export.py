@@ -6,6 +6,7 @@ import pytest
 
 from dmrl.cli import app
 from dmrl.deploy import detector
+from dmrl.deploy.export_folder import list_files
 from dmrl.errors import MissingExtra, ModelError, SettingError
 from dmrl.recording import read, read_summary
 from dmrl.stages import predict
@@ -153,3 +154,9 @@ def test_damaged_description_is_reported(exported: Path, tmp_path: Path) -> None
     (copy / "model.json").write_text("{}")
     with pytest.raises(ModelError, match=r"model.json is damaged"):
         detector.open_detector(copy, "onnx")
+
+
+def test_every_file_of_an_export_is_described(exported: Path) -> None:
+    told = {one.name: one.what for one in list_files(exported)}
+    assert len(told) > 10 and [name for name, what in told.items() if not what] == []
+    assert told["main.c"] != next(told[n] for n in told if n.endswith("_vectors.h"))

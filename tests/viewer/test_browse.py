@@ -135,7 +135,7 @@ def test_a_recording_of_other_images_is_refused(folder: Path, make: Make, rrd: P
 
 def test_invalid_dataset_or_layout_is_reported(tmp_path: Path, folder: Path, rrd: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DatasetError, match=r"empty is not a dataset"):
+    with pytest.raises(DatasetError, match=r"empty is not a dataset.*dmrl convert"):
         save([tmp_path / "empty"], rrd, Settings())
     with pytest.raises(SettingError, match=r"leave --layout flight out"):
         save([folder], rrd, Settings(layout="flight"))
