@@ -21,10 +21,12 @@ Mask = NDArray[np.bool_]
 
 NS_PER_S = 1_000_000_000
 WRAP_PERIODS_NS = (
-    *(tick_ns << bits for tick_ns in (1000, 1_000_000) for bits in (24, 31, 32)),
-    *(1_000_000 << 16, NS_PER_S, 86_400 * NS_PER_S, 604_800 * NS_PER_S),
+    *(tick_ns << bits for tick_ns in (1000, 1_000_000) for bits in (16, 24, 31, 32)),
+    *(1_000_000 << 8, 1 << 32, NS_PER_S, 86_400 * NS_PER_S, 604_800 * NS_PER_S),
 )
-"""Periods of common counters, nanoseconds: 16 to 32 bits of ms or us; second, day, GPS week."""
+"""Periods of common counters, nanoseconds: 8 to 32 bits of ms, us or ns; second, day, GPS week."""
+SHORT_PERIOD_NS = NS_PER_S
+"""Periods below it may be shorter than rows that are only out of order step back."""
 DISORDER_S, DISORDER_PERIODS = 1.0, 10
 """Largest step back of rows that are only out of order: seconds and median periods, the smaller.
 
@@ -38,6 +40,8 @@ SHUFFLED_SHARE = 0.1
 """Share of steps back from which rows are shuffled, and not several flights."""
 CLOCK_SET_NS = 10**17
 """Step forward, three years, that is no gap but a clock that was set."""
+REGULAR_CHANGES_MIN = 6
+"""Changes, all of them a multiple of some rows apart, from which a logger holds values."""
 CHANCE_MIN = 2
 """Repeats beyond those by chance from which values were held."""
 UNSET_MIN_NS = 60 * NS_PER_S
@@ -149,9 +153,7 @@ def settle_times(times_ns: ArrayLike, name_row: Callable[[int], str]) -> Settled
     if not _is_shuffled(times[rows]):
         rows = rows[~_find_glitches(times[rows], lambda k: name_row(int(rows[k])))]
     kept = times[rows]
-    back = np.flatnonzero(np.diff(kept) < -_find_tolerance(kept))
-    if len(back):
-        kept = _unwrap_or_refuse(kept, back, lambda k: name_row(int(rows[k])))
+    kept = _unwrap_or_refuse(kept, lambda k: name_row(int(rows[k])))
     if (np.diff(kept) < 0).any():
         first = int(np.flatnonzero(np.diff(kept) < 0)[0]) + 1
         say(f"{name_row(int(rows[first]))}: rows are not in time order from here on; sorted")
@@ -215,29 +217,35 @@ def _find_glitches(times: Ints, name_row: Callable[[int], str]) -> Mask:
     return bad
 
 
-def _unwrap_or_refuse(times: Ints, back: Ints, name_row: Callable[[int], str]) -> Ints:
-    """Return the times of a counter that wrapped; the same times, if the rows are shuffled.
+def _unwrap_or_refuse(times: Ints, name_row: Callable[[int], str]) -> Ints:
+    """Return the times of a counter that wrapped; the same times, if rows are out of order.
 
     Raises
     ------
     SourceError
         If the clock starts again.
     """
-    first, tolerance = int(back[0]), _find_tolerance(times)
-    for period in sorted(WRAP_PERIODS_NS):
+    tolerance = _find_tolerance(times)
+    back = np.flatnonzero(np.diff(times) < -tolerance)
+    # Wraps of a short counter step back no further than rows that are only out of order.
+    is_short = len(times) > 0 and np.ptp(times) < SHORT_PERIOD_NS
+    falls = np.flatnonzero(np.diff(times) < 0) if is_short else back
+    for period in sorted(WRAP_PERIODS_NS) if len(falls) else ():
         half = period // 2
         steps = (np.diff(times) + half) % period - half
-        ahead = np.delete(steps, back)
+        ahead = np.delete(steps, falls)
         gap_ns = max(WRAP_GAP_PERIODS * np.median(ahead), 2 * ahead.max()) if len(ahead) else 0
-        if period > np.ptp(times) and (steps >= -tolerance).all() and (steps[back] <= gap_ns).all():
-            say(f"{name_row(first + 1)}: the clock wrapped after {period * 1e-9:.9g} s; continued")
+        goes_on = (steps >= -tolerance).all() and (steps[falls] >= 0).all()
+        if period > np.ptp(times) and goes_on and (steps[falls] <= gap_ns).all():
+            first = name_row(int(falls[0]) + 1)
+            say(f"{first}: the clock wrapped after {period * 1e-9:.9g} s; continued")
             return np.concatenate([times[:1], times[0] + np.cumsum(steps)])
-    if _is_shuffled(times):
+    if not len(back) or _is_shuffled(times):
         return times
     raise SourceError(
-        f"{name_row(first + 1)}: time goes back from {times[first] * 1e-9:.9g} s to "
-        f"{times[first + 1] * 1e-9:.9g} s: a second flight, another robot, or a clock that started "
-        "again. Split the file there"
+        f"{name_row(int(back[0]) + 1)}: time goes back from {times[back[0]] * 1e-9:.9g} s to "
+        f"{times[back[0] + 1] * 1e-9:.9g} s: a second flight, another robot, or a clock that "
+        "started again. Split the file there"
     )
 
 
@@ -265,8 +273,11 @@ def find_new_values(values: NDArray[Any], *, polled: bool = False) -> Mask:
     values = np.asarray(values, float)
     known = np.isfinite(values)
     repeated = np.concatenate([[False], known[1:] & (values[1:] == values[:-1])])[: len(values)]
-    steps = np.abs(np.diff(values))
-    steps = steps[np.isfinite(steps) & (steps > 0)]
+    steps = np.abs(np.diff(values[known]))
+    steps = steps[steps > 0]
+    changes = np.flatnonzero(known & ~repeated)
+    if len(changes) >= REGULAR_CHANGES_MIN and np.gcd.reduce(np.diff(changes)) > 1:
+        polled = True
     if not polled and len(steps):
         levels = np.diff(np.unique(values[known]))
         by_chance = min(float(levels.min() / np.median(steps)), 1.0)

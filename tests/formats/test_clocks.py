@@ -14,6 +14,7 @@ from dmrl.terminal.left_out import count_left_out
 
 S = 1_000_000_000
 WRAPS = {
+    "u32 ns": (1, 32),
     "u16 ms": (1_000_000, 16),
     "u24 ms": (1_000_000, 24),
     "u24 us": (1_000, 24),
@@ -52,6 +53,24 @@ def test_a_counter_that_wraps_goes_on(
     found = settle_times(true % period_ns, row)
     np.testing.assert_array_equal(found.time_ns - found.time_ns[0], true - true[0])
     assert found.rows.tolist() == list(range(len(true)))
+
+
+@pytest.mark.parametrize(
+    ("period_ns", "rate_hz"),
+    [(256_000_000, 20), (256_000_000, 42), (256_000_000, 200), (65_536_000, 50), (65_536_000, 400)],
+)
+def test_a_short_counter_that_wraps_at_every_few_rows_goes_on(period_ns: int, rate_hz: int) -> None:
+    true = np.rint(np.arange(200) / rate_hz * 1e3).astype(np.int64) * 10**6
+    found = settle_times(true % period_ns, row)
+    np.testing.assert_array_equal(found.time_ns, true)
+    assert found.rows.tolist() == list(range(200))
+
+
+def test_rows_of_a_short_file_that_are_out_of_order_are_sorted() -> None:
+    true = steady(0.5, 100)
+    told = true.copy()
+    told[[10, 11, 20, 21]] = told[[11, 10, 21, 20]]
+    np.testing.assert_array_equal(settle_times(told, row).time_ns, true)
 
 
 @example(first_s=2.0, second_s=2.0, start_s=1.0, rate_hz=5)
@@ -223,3 +242,16 @@ def test_one_wrong_stamp_refuses_no_bag(stamp: Callable[[int], int], kept: int) 
     times = times_of([("odom", stamp(k), WALL + k * S // 10) for k in range(120)])
     assert sum(time is not None for time in times) == kept
     assert times[-1] == WALL + 119 * S // 10
+
+
+def test_values_that_change_every_few_rows_are_held_though_their_steps_are_equal() -> None:
+    approaching = np.repeat(np.arange(5.0, 2.0, -0.1), 10)
+    assert np.flatnonzero(find_new_values(approaching)).tolist() == list(range(0, 300, 10))
+
+
+def test_values_that_are_held_between_gaps_are_not_new() -> None:
+    measured = 2 + np.random.default_rng(0).random(20)
+    values = np.repeat(measured, 10)
+    values[np.arange(200) % 10 >= 3] = np.nan
+    new = find_new_values(values) & np.isfinite(values)
+    assert np.flatnonzero(new).tolist() == list(range(0, 200, 10))
