@@ -102,7 +102,7 @@ def test_unusable_topics_are_reported(tmp_path: Path) -> None:
     found, left = convert(foxglove(tmp_path / "a.mcap", sent), tmp_path / "b.mcap")
     assert list(found.topics) == ["/a/camera/image"]
     assert left == {
-        "messages on /a/video: another topic has this of a": 3,
+        "messages on /a/video: another topic has this of a, /a/image": 3,
         f"{UNDECODABLE}, of format 'h264'": 3,
         "samples of /b/pose with values that are not finite": 3,
         "orientations of c that are no unit quaternion": 3,

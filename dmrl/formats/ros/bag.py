@@ -21,6 +21,8 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
 from dmrl.formats.files.pictures import scaling_words
@@ -121,7 +123,7 @@ def iter_samples(
     options
         ``bits``.
     """
-    calibrated: set[str] = set()
+    calibrated: dict[str, Mapping[str, Any]] = {}
     unstamped: Counter[str] = Counter()
     scaled: set[str] = set()
     moving = {line.robot for line in lines.values() if line.kind == ODOMETRY}
@@ -173,7 +175,8 @@ def convert_message(
     """Yield the samples of a decoded message."""
     if not line.kind.startswith(DMRL_PREFIX):
         try:
-            yield from list(CONVERTERS[line.kind](decoded, time_ns, where))
+            with np.errstate(invalid="ignore"):  # what is not finite is left out, and counted
+                yield from list(CONVERTERS[line.kind](decoded, time_ns, where))
         except (AttributeError, TypeError, ValueError, LookupError, ArithmeticError):
             # The file's definition of a standard type may be another.
             leave_out(f"messages on {line.topic} that cannot be decoded", where.source)
@@ -184,21 +187,26 @@ def convert_message(
 
 
 def select_usable(
-    samples: Iterator[Sample], where: object, calibrated: set[str]
+    samples: Iterator[Sample], where: object, calibrated: dict[str, Mapping[str, Any]]
 ) -> Iterator[Sample]:
     """Yield the samples whose numbers are finite, and of calibrations the first of each topic.
 
-    A calibration is sent with every image and does not change. ``calibrated`` holds the topics that
-    have one. dmrl's own messages may hold infinite numbers, such as unknown sigmas.
+    A calibration is sent with every image and seldom changes. ``calibrated`` holds the one of each
+    topic. dmrl's own messages may hold infinite numbers, such as unknown sigmas.
     """
     for sample in samples:
-        is_calibration = sample.message == "CameraCalibration"
         if sample.message in FOREIGN_OUTPUTS and not _is_finite(sample.fields):
             reason = f"samples of {sample.topic} with values that are not finite"
             leave_out(reason, f"{where} at {sample.time_ns} ns")
-        elif not (is_calibration and sample.topic in calibrated):
-            calibrated.update([sample.topic] if is_calibration else [])
+        elif sample.message != "CameraCalibration":
             yield sample
+        else:
+            fields = {k: v for k, v in sample.fields.items() if k != "timestamp"}
+            if (first := calibrated.setdefault(sample.topic, fields)) is fields:
+                yield sample
+            elif first != fields:
+                reason = f"calibrations on {sample.topic} that differ from the first"
+                leave_out(reason, f"{where} at {sample.time_ns} ns")
 
 
 def _is_finite(value: Any) -> bool:

@@ -140,7 +140,7 @@ def _to_array(vector: Any) -> Array:
 
 def _to_euler(q: Any) -> Array | None:
     """Return roll, pitch, yaw; None if the quaternion is not a unit one."""
-    values = np.array([q.x, q.y, q.z, q.w])
+    values = np.array([q.x, q.y, q.z, q.w], float)
     norm = float(np.linalg.norm(values))
     return quaternion_to_euler(values[None] / norm)[0] if abs(norm - 1) < 0.1 else None
 

@@ -37,7 +37,7 @@ MOTION_CAPTURE = re.compile(
 CONTENT_PART = re.compile(
     r"(odom\w*|pose\w*|imu|data|raw|twist|velocity|image\w*|colou?r|cam(era)?([_-]\w*)?|rgbd?|mono|"
     r"gr[ae]y|depth\w*|compressed\w*|info|camera_info|filtered|fused|local\w*|global\w*|position|"
-    r"setpoint\w*|estimat\w*|state\w*|vrpn\w*|mavros|px4|fmu|fcu|out|in|truth|ground_truth|gt|"
+    r"setpoint\w*|estimat\w*|state\w*|vrpn\w*|mavros|px4(?![_-]?\d)|fmu|fcu|out|in|truth|ground_truth|gt|"
     r"calibration|uwb\w*|rang(e|es|ing)([_-]\w*)?|dist(ance|ances)?([_-]\w*)?|peers?|to|from|"
     r"front|rear|back|left|right|up|down(ward)?|top|bottom|forward|floor|ground|tof|lidar\w*|"
     r"laser\w*|sonar\w*|ultraso\w*|flow|optical_flow|multi_?ranger?|zrange|height|altitude|"
@@ -52,6 +52,7 @@ HOLDER_PART = re.compile(
     re.IGNORECASE,
 )
 """Parts that seldom name a robot: they do where no other part can."""
+DEPTH_NAME = re.compile(r"depth|disparity", re.IGNORECASE)
 NUMBERED_NAME = re.compile(r"([A-Za-z][A-Za-z_-]*?)[_-]?\d+")
 UWB_PART = re.compile(
     r"uwb\w*|dwm?\d+\w*|lps|loco\w*|p2p|peers?|link_?track|nooploop", re.IGNORECASE
@@ -69,6 +70,11 @@ class TopicPlan:
     robot: str
     peer: str = ""
     captured: bool = False
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Topic and type."""
+        return self.topic, self.kind
 
 
 Held = Sequence[tuple[str, str, int]]
@@ -113,23 +119,41 @@ def plan_topics(
         elif kind == RANGE:
             known = {line.robot for line in lines.values()}
             if (pair := names.find_pair(topic, known)) is None:
-                why[topic, kind] = "it names no two robots, so it is no range to a peer"
+                why[topic, kind] = (
+                    "it names no two robots, so it is no range to a peer "
+                    f"(--names {topic}=/ROBOT/range/PEER)"
+                )
             else:
                 lines[topic, kind] = TopicPlan(topic, kind, count, *pair)
         else:
             captured = bool(MOTION_CAPTURE.search(options.names.get(topic, topic)))
             robot = names.find_robot(topic)
             lines[topic, kind] = TopicPlan(topic, kind, count, robot, captured=captured)
-    for line in _find_doubles(lines, is_camera):
+    for line in [one for one in lines.values() if _is_depth(one, options, is_camera)]:
         del lines[line.topic, line.kind]
-        why[line.topic, line.kind] = f"another topic has this of {line.robot}"
+        choice = f"--names {line.topic}={topics.CAMERA_IMAGE(line.robot)} takes it as images"
+        why[line.topic, line.kind] = f"its name and encoding are those of depths ({choice})"
+    for line, better in _find_doubles(lines, options, is_camera):
+        del lines[line.topic, line.kind]
+        why[line.topic, line.kind] = f"another topic has this of {line.robot}, {better.topic}"
     return lines, why
 
 
+def _is_depth(line: TopicPlan, options: Options, is_camera: Callable[[str, str], bool]) -> bool:
+    """Return whether a topic is a map of depths by its name and its encoding (REP 118)."""
+    is_named = line.kind in IMAGE_TYPES and DEPTH_NAME.search(line.topic)
+    return bool(is_named) and line.topic not in options.names and not is_camera(*line.key)
+
+
 def _find_doubles(
-    lines: Mapping[tuple[str, str], TopicPlan], is_camera: Callable[[str, str], bool]
-) -> list[TopicPlan]:
-    """Return the topics beside better ones of the same content: mixed, they would contradict."""
+    lines: Mapping[tuple[str, str], TopicPlan],
+    options: Options,
+    is_camera: Callable[[str, str], bool],
+) -> list[tuple[TopicPlan, TopicPlan]]:
+    """Return the topics beside better ones of the same content: mixed, they would contradict.
+
+    A topic that the user names is the best.
+    """
     groups: dict[tuple[object, ...], list[TopicPlan]] = {}
     for line in lines.values():
         kind = "image" if line.kind in IMAGE_TYPES else line.kind
@@ -140,20 +164,22 @@ def _find_doubles(
     cameras: dict[str, str] = {}
 
     def rank(line: TopicPlan) -> tuple[object, ...]:
+        unnamed = line.topic not in options.names
         if line.kind in IMAGE_TYPES:
-            return not is_camera(line.topic, line.kind), -line.count, line.kind != IMAGE_TYPES[0]
+            is_other = unnamed and not is_camera(line.topic, line.kind)
+            return unnamed, is_other, -line.count, line.kind != IMAGE_TYPES[0]
         if line.kind == CAMERA_INFO:
             camera = cameras.get(line.robot, "").split("/")
             shared = sum(map(str.__eq__, camera, line.topic.split("/")))
-            return -shared, -line.count
-        return line.kind == POSE, -line.count
+            return unnamed, -shared, -line.count
+        return unnamed, line.kind == POSE, -line.count
 
     for key in sorted(groups, key=lambda one: one[0] == CAMERA_INFO):  # after the images
         found = groups[key]
         best[key] = min(found, key=rank) if len(found) > 1 else found[0]
         if key[0] == "image":
             cameras[best[key].robot] = best[key].topic
-    return [line for key, found in groups.items() for line in found if line is not best[key]]
+    return [(x, best[key]) for key, found in groups.items() for x in found if x is not best[key]]
 
 
 class _TopicNames:

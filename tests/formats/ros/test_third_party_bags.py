@@ -68,7 +68,8 @@ def test_a_range_to_the_floor_is_no_range_to_a_peer(
     found, left = read(ros.write(tmp_path / "bag", sent))
     wanted = [f"/{pair[0]}/range/{pair[1]}"] if pair else []
     assert [t for t in found if "/range/" in t] == wanted
-    reason = f"messages on {topic}: it names no two robots, so it is no range to a peer"
+    why = "it names no two robots, so it is no range to a peer"
+    reason = f"messages on {topic}: {why} (--names {topic}=/ROBOT/range/PEER)"
     assert left == ({} if pair else {reason: 5})
 
 
@@ -153,7 +154,54 @@ def test_images_that_are_no_picture_spare_the_camera(
     sent = images(other, encoding, 9) + images("/cf1/camera/image_raw") + odometry("/cf1/odom")
     found, left = read(ros.write(tmp_path / "bag", sent))
     assert len(found["/cf1/camera/image"]) == len(found["/cf1/height"]) == 5
-    assert left == {f"messages on {other}: another topic has this of cf1": 9}
+    (reason,) = left
+    assert left == {reason: 9} and reason.startswith(f"messages on {other}: ")
+    why = "those of depths" if "depth" in other else "this of cf1, /cf1/camera/image_raw"
+    assert why in reason
+
+
+def test_depths_alone_are_no_pictures_unless_they_are_named(tmp_path: Path) -> None:
+    depth = "/cf1/depth/image_rect_raw"
+    path = ros.write(tmp_path / "bag", images(depth, "16UC1") + odometry("/cf1/odom"))
+    found, left = read(path)
+    assert "/cf1/camera/image" not in found and len(found["/cf1/height"]) == 5
+    assert left == {
+        f"messages on {depth}: its name and encoding are those of depths "
+        f"(--names {depth}=/cf1/camera/image takes it as images)": 5
+    }
+    found, left = read(path, names={depth: "/cf1/camera/image"})
+    assert len(found["/cf1/camera/image"]) == 5 and not left
+
+
+def test_the_topics_that_the_user_names_are_taken_among_several(tmp_path: Path) -> None:
+    sent = images("/cf1/front/image_raw", "rgb8", 9) + images("/cf1/down/image_raw")
+    for name, focal in (("front", 100.0), ("down", 55.0)):
+        sent += [Sent(f"/cf1/{name}/camera_info", t, ros.camera_info(t, focal)) for t in times()]
+    path = ros.write(tmp_path / "bag", sent)
+    names = {"/cf1/down/image_raw": "/cf1/camera/image"}
+    found, left = read(path, names=names)
+    assert len(found["/cf1/camera/image"]) == 5
+    assert found["/cf1/camera/calibration"][0].fields["K"][0] == 55.0
+    assert (
+        "messages on /cf1/front/image_raw: another topic has this of cf1, /cf1/down/image_raw"
+        in (left)
+    )
+
+
+def test_calibrations_that_change_are_counted(tmp_path: Path) -> None:
+    sent = [
+        Sent("/cf1/camera_info", t, ros.camera_info(t, 50.0 + k)) for k, t in enumerate(times())
+    ]
+    sent.append(Sent("/cf1/camera_info", times()[-1] + 1, ros.camera_info(times()[-1] + 1, 50.0)))
+    found, left = read(ros.write(tmp_path / "bag", sent))
+    assert len(found["/cf1/camera/calibration"]) == 1
+    assert left == {"calibrations on /cf1/camera/calibration that differ from the first": 4}
+
+
+def test_numbered_vehicles_of_px4_are_robots(tmp_path: Path) -> None:
+    sent = odometry("/px4_1/fmu/out/odom") + odometry("/px4_2/fmu/out/odom")
+    found, left = read(ros.write(tmp_path / "bag", sent))
+    assert {topic.split("/")[1] for topic in found} == {"px4_1", "px4_2"} and not left
 
 
 def test_video_and_torn_pictures_spare_the_others(tmp_path: Path) -> None:
@@ -168,7 +216,7 @@ def test_video_and_torn_pictures_spare_the_others(tmp_path: Path) -> None:
     found, left = read(ros.write(tmp_path / "bag", sent, "sqlite3"))
     assert len(found["/cf1/camera/image"]) == 6 and "/cf2/camera/image" not in found
     assert left == {
-        "messages on /cf1/cam/h264: another topic has this of cf1": 8,
+        "messages on /cf1/cam/h264: another topic has this of cf1, /cf1/cam/compressed": 8,
         f"{UNDECODABLE}, of format 'jpeg'": 2,
         f"{UNDECODABLE}, of format 'h264'": 8,
     }
@@ -226,7 +274,7 @@ def test_a_pose_beside_odometry_is_no_second_pose(tmp_path: Path) -> None:
     sent = odometry("/cf1/odom") + [Sent("/cf1/pose", t, ros.pose(t)) for t in times(9)]
     found, left = read(ros.write(tmp_path / "bag", sent))
     assert len(found["/cf1/pose"]) == 5
-    assert left == {"messages on /cf1/pose: another topic has this of cf1": 9}
+    assert left == {"messages on /cf1/pose: another topic has this of cf1, /cf1/odom": 9}
 
 
 @pytest.mark.parametrize(
