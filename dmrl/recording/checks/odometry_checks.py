@@ -36,6 +36,8 @@ MOTION_FIELDS = {
 }
 FLOOR_NEAR_M, FLOOR_SHARE = 0.05, 0.9
 """Distance from the robot's height within which this share of the ranges are to the floor."""
+HELD_SHARE = 0.4
+"""Share of repeated ranges from which a logger seems to hold them."""
 ALIGN_HINT = "or align its clock with the poses': dmrl align --mocap"
 Signal = tuple[Array, Array]
 """Increasing times (N,), seconds, and values (N, K)."""
@@ -74,11 +76,15 @@ class MotionSamples:
 
 
 def _check_ranges(of: Mapping[str, Signal]) -> Iterator[tuple[str, str]]:
-    """Yield ranges that never change, or are the height of the robot that measured them."""
+    """Yield ranges that never change, are held, or are the height of their own robot."""
     for topic, (time_s, range_m) in sorted(of.items()):
         names = topics.parse_topic(topics.RANGE, topic)
+        repeated = float((np.diff(range_m[:, 0]) == 0).mean())
         if names and not np.ptp(range_m):
             yield topic, f"all ranges are {range_m[0, 0]:.3g} m. Does the sensor measure?"
+        elif names and repeated > HELD_SHARE:
+            text = f"{repeated:.0%} of the ranges repeat the one before them"
+            yield topic, f"{text}. Does the log hold them? A held value is no measurement"
         height = of.get(topics.HEIGHT(names["robot"])) if names else None
         if names is None or height is None:
             continue

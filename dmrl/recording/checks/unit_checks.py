@@ -19,6 +19,10 @@ MESSAGES_MIN = 20
 """Messages needed to measure a period or a magnitude."""
 FINITE_TOPICS = ({row.pattern for row in SENSORS} - {CAMERA_IMAGE}) | {POSE, TRUE_POSE}
 """Topics whose values must be finite."""
+IMPOSSIBLE = 1000
+"""A single value over this many largest plausible ones is reported."""
+BELOW_FLOOR_M = -0.3
+"""Heights below it are under the floor, and not noise."""
 Times = NDArray[np.int64]
 
 
@@ -30,6 +34,8 @@ class ValueCounts:
         default_factory=lambda: defaultdict(lambda: np.zeros(3, np.int64))
     )
     not_finite: Counter[tuple[str, str]] = field(default_factory=Counter)
+    impossible: Counter[tuple[str, str]] = field(default_factory=Counter)
+    below_floor: Counter[tuple[str, str]] = field(default_factory=Counter)
 
     def add_batch(self, topic: str, batch: pa.RecordBatch) -> None:
         """Add the values of a topic."""
@@ -42,10 +48,14 @@ class ValueCounts:
                 self.not_finite[topic, one.name] += int((~np.isfinite(values)).sum())
         for limit in _find_limits(topic):
             if limit.field in batch.schema.names:
-                size = np.abs(batch[limit.field].to_numpy(zero_copy_only=False).astype(float))
+                values = batch[limit.field].to_numpy(zero_copy_only=False).astype(float)
+                size = np.abs(values)
                 size = size[np.isfinite(size) & (size > 0)]
                 counts = len(size), (size > limit.over).sum(), (size < limit.under).sum()
                 self.sizes[topic, limit.field] += counts
+                self.impossible[topic, limit.field] += int((size > IMPOSSIBLE * limit.over).sum())
+                if limit.field == "height_m":
+                    self.below_floor[topic, limit.field] += int((values < BELOW_FLOOR_M).sum())
 
     def find_not_finite_fields(self) -> Iterator[tuple[str, str]]:
         """Yield fields with NaN or infinite values."""
@@ -62,6 +72,12 @@ class ValueCounts:
             if total >= MESSAGES_MIN and over * 10 > total:
                 share = f"{name}: {over / total:.0%} of the values are over {limit.over:g}"
                 yield topic, f"{share} {limit.unit}. Are they {limit.perhaps}?"
+            elif count := self.impossible[topic, name]:
+                most = f"{IMPOSSIBLE * limit.over:g} {limit.unit}"
+                yield topic, f"{name}: {count} values are over {most}, which no flight gives"
+            elif total >= MESSAGES_MIN and 2 * self.below_floor[topic, name] > total:
+                share = self.below_floor[topic, name] / total
+                yield topic, f"{name}: {share:.0%} of the values are below the floor. Is z down?"
 
 
 def check_units(topic: str, table: pa.Table) -> list[str]:

@@ -39,6 +39,20 @@ def test_unit_finding_needs_more_than_a_tenth_of_the_values() -> None:
     assert text == "height_m: 11% of the values are over 30 m. Are they mm or cm?"
 
 
+def test_single_values_that_no_flight_gives_are_found() -> None:
+    values = np.full(100, 0.5)
+    values[3] = -1e30
+    ((_, text),) = _doubted("/cf1/velocity", "vx_mps", values)
+    assert text == "vx_mps: 1 values are over 20000 m/s, which no flight gives"
+
+
+def test_heights_that_count_downwards_are_found() -> None:
+    ((_, text),) = _doubted("/cf1/height", "height_m", np.full(100, -1.2))
+    assert text == "height_m: 100% of the values are below the floor. Is z down?"
+    assert _doubted("/cf1/height", "height_m", np.full(100, -0.1)) == []
+    assert _doubted("/cf1/height", "height_m", np.r_[np.full(50, -1.0), np.full(50, 1.0)]) == []
+
+
 def test_unit_check_ignores_zeros_non_finite_values_and_short_series() -> None:
     odd = np.array([np.nan, np.inf, -np.inf, 0.0] * 30)
     ((_, text),) = _doubted("/cf1/height", "height_m", odd)
