@@ -15,6 +15,7 @@ import numpy as np
 from dmrl.errors import MissingExtra, SourceError
 from dmrl.geometry.frames import Camera
 from dmrl.guards.bounded_parsing import parse_json, parse_xml, parse_yaml
+from dmrl.terminal.progress import say
 
 SUFFIXES = (".yaml", ".yml", ".json", ".xml")
 OPENCV_ONLY = re.compile(r"^%YAML.*$|!!opencv-(nd-)?matrix", re.MULTILINE)
@@ -26,12 +27,22 @@ PLUMB_BOB = ("", "plumb_bob", "radtan", "rational_polynomial", "none")
 """Names of the model, and of OpenCV's with more coefficients."""
 KEYS = {
     "matrix": ("cameramatrix", "intrinsicmatrix", "mtx", "k", "m1"),
-    "distortion": ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "dist", "d", "d1"),
+    "distortion": (
+        "distortioncoefficients",
+        "distcoeffs",
+        "distortioncoeffs",
+        "distcoeff",
+        "dist",
+        "d",
+        "d1",
+    ),
     "size": ("resolution", "imagesize", "imgsize"),
     "width": ("imagewidth", "width"),
     "height": ("imageheight", "height"),
 }
 """Keys in lower case without underscores: of ROS, of Kalibr, and of OpenCV's samples."""
+NAMES = {"matrix": "camera_matrix", "width": "image_width", "height": "image_height"}
+"""Keys in errors."""
 
 
 def parse_foreign_camera(text: str, path: Path) -> Camera:
@@ -50,10 +61,12 @@ def parse_foreign_camera(text: str, path: Path) -> Camera:
         elif path.suffix.lower() == ".xml":
             document = {one.tag: _parse_element(one) for one in parse_xml(text.encode())}
         else:
-            document = parse_yaml(OPENCV_ONLY.sub("", text))
+            # `ros2 topic echo` ends each message with a line of three dashes.
+            first = OPENCV_ONLY.sub("", text).lstrip().removeprefix("---")
+            document = parse_yaml(re.split(r"^---\s*$", first, maxsplit=1, flags=re.MULTILINE)[0])
         if not isinstance(document, dict):
             raise ValueError("it is not a table of keys")
-        return _build_camera(document)
+        camera = _build_camera(document)
     except ModuleNotFoundError as e:
         raise MissingExtra("pyyaml", "yolo", str(path)) from e
     except (ValueError, TypeError, OverflowError) as e:
@@ -62,6 +75,9 @@ def parse_foreign_camera(text: str, path: Path) -> Camera:
             f"{path} is no calibration of ROS, Kalibr or OpenCV: {why}. Write the camera as TOML: "
             "see docs/sources.md"
         ) from None
+    if not camera.distortion and not re.search(r"model\W+none\b", text):
+        say(f"{path}: no distortion coefficients found in it, so the lens is taken to have none")
+    return camera
 
 
 def _build_camera(document: Mapping[str, Any]) -> Camera:
@@ -109,7 +125,7 @@ def _find(held: Mapping[str, Any], what: str, *default: Any) -> Any:
             return held[key]
     if default:
         return default[0]
-    raise ValueError(f"it has no key {KEYS[what][0]}")
+    raise ValueError(f"it has no {NAMES.get(what, what)}")
 
 
 def _to_numbers(what: str, value: Any, count: int | None) -> list[float]:

@@ -56,7 +56,7 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("text", [ROS, MESSAGE])
+@pytest.mark.parametrize("text", [ROS, MESSAGE, f"{MESSAGE}---\n", f"---\n{MESSAGE}---\n{MESSAGE}"])
 def test_files_of_ros(text: str, tmp_path: Path) -> None:
     assert read_camera(write(tmp_path / "camera.yaml", text)) == WANTED
 
@@ -99,7 +99,7 @@ def test_a_pixel_of_opencv_s_projection_is_half_a_pixel_from_ours(tmp_path: Path
         (KALIBR.replace("radtan", "equidistant"), "its lens model is equidistant, not plumb_bob"),
         (KALIBR.replace("pinhole", "omni"), "its camera_model is omni"),
         (KALIBR.replace("[320, 240]", "[320]"), "its size has no 2 numbers"),
-        (ROS.replace("image_width: 320", ""), "it has no key imagewidth"),
+        (ROS.replace("image_width: 320", ""), "it has no image_width"),
         (ROS.replace("-0.002, 0.0]", "-0.002, 0.0, 0.1, 0.2, 0.3]"), "has 8 coefficients, not 5"),
         (ROS.replace("[210, 0.0", "[.nan, 0.0"), "its matrix has no 9 numbers"),
         (ROS.replace("[210, 0.0", "[210, 3.0"), "has a skew"),
@@ -124,3 +124,22 @@ def test_other_json_gives_one_line_error(tmp_path: Path) -> None:
 def test_third_party_calibration_file_is_read(data: Path) -> None:
     found = read_camera(data / "strangers" / "camera-ros" / "ros.yaml")
     assert (found.width_px, found.height_px, found.fx_px, found.cx_px) == (320, 240, 210.0, 160.5)
+
+
+def test_a_file_without_known_coefficients_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = {"image_width": 320, "image_height": 240, "camera_matrix": K.tolist()}
+    path = write(tmp_path / "a.json", json.dumps({**given, "my_lens": [D]}))
+    assert read_camera(path).distortion == ()
+    assert "no distortion coefficients found" in capsys.readouterr().err
+    path = write(tmp_path / "b.json", json.dumps({**given, "dist_coeff": [D]}))
+    assert read_camera(path) == WANTED
+    read_camera(write(tmp_path / "c.yaml", KALIBR.replace("radtan", "none")))
+    assert "no distortion coefficients" not in capsys.readouterr().err
+
+
+def test_a_file_without_a_size_names_the_key(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.json", json.dumps({"camera_matrix": K.tolist()}))
+    with pytest.raises(SourceError, match="it has no image_width"):
+        read_camera(path)

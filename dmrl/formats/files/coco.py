@@ -9,7 +9,7 @@ a label, as ``dmrl convert --to coco`` writes them.
 
 import math
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -122,13 +122,20 @@ def _read_file(
         why = " ".join(f"{type(e).__name__}: {e}".split())[:200]
         raise SourceError(f"{path} is not a COCO file: {why}. Restore the file") from None
     split = _find_split(path, root)
+    counts = Counter(number for number, _, _ in images)
+    orphans = [a for number, held in by_image.items() if number not in counts for a in held]
+    leave_out("boxes of no picture in the file", path, len(orphans))
     for number, name, image in images:
         picture = found.find(name, split, path.parent) if name.strip("/\\") else None
         if picture is None:
             leave_out("pictures of a JSON file that are not there", f"{path}: {name}")
             continue
         where = f"{path}: {name}"
-        rows = _build_rows(where, picture.name, by_image.get(number, []), classes, options)
+        if counts[number] > 1:
+            rows = None
+            leave_out("labels of pictures that share an id", f"{where}, {number}")
+        else:
+            rows = _build_rows(where, picture.name, by_image.get(number, []), classes, options)
         size = image.get("width"), image.get("height")
         yield LabelledPicture(picture, split, rows, None if None in size else size)
 
@@ -147,7 +154,7 @@ def _build_rows(
         boxes = [_parse_box(annotation, classes) for annotation in single]
         return list(map(_add_attributes, build_rows(file, boxes, options.names), single))
     except (ValueError, TypeError, KeyError, AttributeError) as e:
-        why = " ".join(f"{type(e).__name__}: {e}".split())[:200]
+        why = " ".join(str(e).split())[:200]
         leave_out("pictures with a box that cannot be read", f"{where}: {why}")
         return None
 
@@ -155,6 +162,8 @@ def _build_rows(
 def _parse_box(
     annotation: Record, classes: Mapping[Any, str]
 ) -> tuple[str, tuple[float, float, float, float]]:
+    if not isinstance(annotation.get("bbox"), list):
+        raise ValueError("no bbox")
     left, top, width, height = map(float, annotation["bbox"])
     kind = annotation["category_id"]
     return classes.get(kind, f"class{kind}"), (left, top, left + width, top + height)

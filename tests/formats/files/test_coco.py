@@ -103,3 +103,19 @@ def test_invalid_coco_file_gives_one_line_error(text: str, tmp_path: Path) -> No
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(SourceError, match=r"a\.json is not a COCO file: .*Restore"):
         read(tmp_path, "coco")
+
+
+def test_labels_of_ids_that_fit_no_picture_or_two_are_left_out(tmp_path: Path) -> None:
+    document = coco("", range(3), "")
+    document["images"][2]["id"] = document["images"][1]["id"]
+    (tmp_path / "a.json").write_text(json.dumps(document))
+    for k in range(3):
+        write_picture(tmp_path / f"{k}.png", k)
+    with count_left_out() as left:
+        found = list(find_format(tmp_path, None).content(tmp_path, Options()).samples)
+    labels = [sample for sample in found if sample.topic.endswith("/labels")]
+    assert len(found) - len(labels) == 3 and [one.time_ns for one in labels] == [0]
+    assert left.counts == {
+        "boxes of no picture in the file": len(boxes_of(2)),
+        "labels of pictures that share an id": 2,
+    }
