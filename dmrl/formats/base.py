@@ -5,9 +5,11 @@ A format is one file with two functions, ``can_read(source) -> bool`` and
 finds it.
 """
 
+from collections import ChainMap, Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any, cast
 
 from dmrl.errors import SettingError, SourceError
 from dmrl.geometry.frames import Camera
@@ -43,11 +45,48 @@ def build_content(streams: Iterable[Iterable[Sample]]) -> Content:
     """Build the content of several streams, of which some may be columns.
 
     The content can be iterated once: either ``samples``, or ``series`` and ``others``.
+
+    Raises
+    ------
+    SettingError
+        If two columns are of the same topic: ``--names`` made one robot of two.
     """
     held = list(streams)
     series = tuple(stream for stream in held if isinstance(stream, Columns))
+    refuse_doubles(stream.topic for stream in series)
     others = merge_by_time(stream for stream in held if not isinstance(stream, Columns))
     return Content(merge_by_time(held), series=series, others=others)
+
+
+def add_names(names: Mapping[str, str], others: Mapping[str, str]) -> Mapping[str, str]:
+    """Return new names with others below them; `Names` still sees which are asked for."""
+    return ChainMap(cast("dict[str, str]", names), dict(others))  # it is only read
+
+
+def refuse_doubles(topics: Iterable[str]) -> None:
+    """Raise SettingError if two robots of a source would write the same topic."""
+    counts = Counter(topics)
+    if twice := [topic for topic, count in counts.items() if count > 1]:
+        raise SettingError(
+            f"two robots of the source would write {twice[0]}. Give each a name of its own: --names"
+        )
+
+
+class Names(dict[str, str]):
+    """New names by old ones, which knows those that a source did not ask for."""
+
+    def __init__(self, names: Mapping[str, str]) -> None:
+        super().__init__(names)
+        self.unused = set(names)
+
+    def __contains__(self, name: object) -> bool:
+        self.unused.discard(name)
+        return super().__contains__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return the new name."""
+        self.unused.discard(name)
+        return super().get(name, default)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,11 +3,12 @@
 import json
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
 from dmrl.errors import SettingError, SourceError
-from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.base import Content, Format, Names, Options
 from dmrl.formats.registry import find_format
 from dmrl.guards.paths import refuse_pipes
 from dmrl.ingest import foreign_recording, mapped_topics
@@ -23,7 +24,7 @@ from dmrl.recording import (
     print_findings,
 )
 from dmrl.terminal.left_out import leave_out
-from dmrl.terminal.progress import track
+from dmrl.terminal.progress import say, track
 
 
 def record_source(
@@ -61,7 +62,8 @@ def record_source(
     """
     form = _find_format(source, kind)
     form.refuse_unused(options)
-    content = form.content(source, options)
+    names = Names(options.names)
+    content = form.content(source, replace(options, names=names))
     read = [path for path in files if path and path.is_file()]
     licence = find_licence_file(source)
     if licence is not None and source.is_file():
@@ -73,8 +75,18 @@ def record_source(
         counts = write_content(content, sink)
         if not counts:
             raise SourceError(f"{source}: nothing in it can be used. The lines above say why")
+        _report_unused(names, source)
     print_findings(out, values=True)
     return counts
+
+
+def _report_unused(names: Names, source: Path) -> None:
+    """Report the old names that a source does not have; raise SettingError if it has none."""
+    unused = ", ".join(sorted(names.unused))
+    if unused and len(names.unused) == len(names):
+        raise SettingError(f"--names has no effect: {source} has no {unused}. Leave it out")
+    if unused:
+        say(f"{source}: --names has names that are not in it: {unused}")
 
 
 def _find_format(source: Path, kind: str | None) -> Format:

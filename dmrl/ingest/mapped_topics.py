@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 
 from dmrl.errors import SourceError
-from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
+from dmrl.formats.base import (
+    SOURCE_OPTIONS,
+    Content,
+    Format,
+    Options,
+    add_names,
+    build_content,
+)
 from dmrl.formats.files.column_map import Column, read_column_map
 from dmrl.formats.files.mapped_csv import iter_robot_streams
 from dmrl.formats.files.robot_columns import RobotLog, resolve_robots
@@ -53,7 +60,7 @@ def load_content(source: Path, options: Options) -> Content:
     table = read_column_map(Path(options.columns or ""), time_column=LOG_TIME)
     if fixed := [key for key, column in table.columns.items() if column.value is not None]:
         raise SourceError(f"[{fixed[0]}] value: constants are for text files. Name a field")
-    options = replace(options, names={**table.renames, **options.names}, columns=None)
+    options = replace(options, names=add_names(options.names, table.renames), columns=None)
     is_bag = not foreign_recording.can_read(source)
     kinds = {topic: kind for topic, kind, count in _list_topics(source, is_bag=is_bag) if count}
     fields = {name.rpartition(":")[2] for name in table.names}

@@ -24,7 +24,7 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import SourceError
-from dmrl.formats.base import Content, Format, Options
+from dmrl.formats.base import Content, Format, Options, refuse_doubles
 from dmrl.formats.clocks import Ints
 from dmrl.formats.crazyflie.log_variables import build_ranges
 from dmrl.formats.files import image_folder
@@ -121,6 +121,7 @@ def load_content(source: Path, options: Options | None = None) -> Content:
     if not any((source / log.robot).is_dir() for log in logs):
         for name in ("camera", "size_px"):
             options.refuse(name, f"has no effect: {source} has no folder of pictures of a robot")
+    refuse_doubles(topics.ATTITUDE(options.names.get(log.robot, log.robot)) for log in logs)
     streams = [stream for log in logs for stream in _iter_streams(log, options.names)]
     streams += [
         stream for log in logs for stream in _iter_image_streams(source / log.robot, options)

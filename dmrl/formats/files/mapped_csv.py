@@ -14,7 +14,14 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import SourceError
-from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
+from dmrl.formats.base import (
+    SOURCE_OPTIONS,
+    Content,
+    Format,
+    Options,
+    add_names,
+    build_content,
+)
 from dmrl.formats.clocks import find_new_values
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock, TimeSeries
@@ -101,7 +108,7 @@ def load_content(source: Path, options: Options) -> Content:
     logs = read_robot_logs(files, table)
     if source.is_dir() or [log.robot for log in logs] != [options.robot]:
         options.refuse("robot", f"has no effect: {source} names its robots. Use --names")
-    options = replace(options, names={**table.renames, **options.names})
+    options = replace(options, names=add_names(options.names, table.renames))
     return build_content(s for log in logs for s in iter_robot_streams(log, options))
 
 
@@ -145,6 +152,8 @@ def _to_values(
             f"{text.name_row(0)}: {column.name} is {cell!r}, and no cell of it is a number. Fix it"
         )
     values = cells[column.name] * column.scale
+    if np.isnan(values).all():
+        say(f"{text.path}: no row has a value in {column.name}, so there is no {key}")
     infinite = np.flatnonzero(np.isinf(values))
     if len(infinite):
         leave_out(f"infinite values of {key}", text.path, len(infinite))
@@ -207,12 +216,16 @@ def _iter_sensor_streams(
     yield from log_variables.derive_streams(robot, [block], {}, path)
     lacking = {
         "attitude": attitude is None,
-        "velocity": "vx" not in values,
-        "height": not {"height", "z"} & values.keys(),
+        "velocity": not _has_values(values, "vx"),
+        "height": not (_has_values(values, "height") or _has_values(values, "z")),
     }
     if any(lacking.values()) and not all(lacking.values()):
         absent = " and no ".join(name for name, lacks in lacking.items() if lacks)
-        say(f"{path}: no {absent} in the table, which dmrl label needs")
+        say(f"{path}: no {absent}, which dmrl label needs")
+
+
+def _has_values(values: Mapping[str, Array], key: str) -> bool:
+    return key in values and bool(np.isfinite(values[key]).any())
 
 
 def _complete_attitude(path: Path, time_ns: Times, values: dict[str, Array]) -> None:

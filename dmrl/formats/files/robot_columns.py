@@ -1,15 +1,16 @@
 """Robots of text tables and their columns: a file, some columns or some rows for each robot."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
 
 from dmrl.errors import SourceError
 from dmrl.formats.files.column_map import ANY_PEER, Column, ColumnMap
-from dmrl.formats.files.text_table import TextTable, name_missing, read_table
+from dmrl.formats.files.text_table import TextTable, read_table
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 
@@ -70,7 +71,9 @@ def _iter_robots(name: str, path: Path, table: ColumnMap) -> Iterator[RobotLog]:
                 f"{name_missing(path, [table.robot_column], text.columns)}. Fix [robot]"
             )
         cells = [cell.strip() for cell in text.columns[table.robot_column]]
-        for robot in sorted(set(cells)):
+        if nameless := [k for k, cell in enumerate(cells) if not cell]:
+            leave_out("rows without a robot", text.name_row(nameless[0]), len(nameless))
+        for robot in sorted({*cells} - {""}):
             yield _resolve(robot, text.select(np.flatnonzero(np.array(cells) == robot)), table)
         return
     for robot in _find_robots(text, table) or [name]:
@@ -143,3 +146,10 @@ def _check_missing(logs: Sequence[RobotLog]) -> None:
         if log.missing:
             absent = ", ".join(sorted(log.missing))
             say(f"{log.text.path}: no column {absent}, which other robots have")
+
+
+def name_missing(path: Path, missing: Collection[str], names: Collection[str]) -> str:
+    """Return the words for columns that a file does not have, with similar ones."""
+    near = {m: get_close_matches(m, names, n=1) for m in sorted(missing)}
+    hints = [f"did you mean {found[0]} for {m}?" for m, found in near.items() if found]
+    return f"{path}: no column {', '.join(sorted(missing))}" + "".join(f"; {h}" for h in hints)

@@ -8,7 +8,6 @@ import csv
 import re
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +33,8 @@ BYTE_ORDER_MARKS = (
     (b"\xff\xfe", "utf-16"),
     (b"\xfe\xff", "utf-16"),
 )
+NO_TEXT, NO_TEXT_BYTES = re.compile(rb"[\0-\x08\x0e-\x1a\x1c-\x1f]"), 4096
+"""Characters that no encoding of text in one byte has, and the beginning that is searched."""
 DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*")
 UNIT_SUFFIX = re.compile(r"\s*[\[(<{/]\s*([^\])>}]+?)\s*[\])>}]?\s*")
 
@@ -162,7 +163,7 @@ def read_table(
         if known and known not in names:
             units[known], names[k] = _strip_unit(name, known) or "", known
     marks = (dialect.comment,) if dialect.comment else COMMENT_MARKS
-    body = [(n, _cut_comment(line, marks)) for n, line in lines[head + 1 :]]
+    body = [(n, _cut_comment(line, marks, separator, len(names))) for n, line in lines[head + 1 :]]
     body = [(n, line) for n, line in body if line.strip()]
     numbers, rows = _split_rows(path, body, separator, names)
     if rows and not any(is_number(cell) for cell in rows[0]):
@@ -207,11 +208,15 @@ def _decode(path: Path, data: bytes, encoding: str, *, whole: bool = True) -> st
         encoding = next((name for mark, name in BYTE_ORDER_MARKS if data.startswith(mark)), "")
     if not encoding and data[1:400:2].count(0) > 100:
         encoding = "utf-16-le"
+    if not encoding and data[:400:2].count(0) > 100:
+        encoding = "utf-16-be"
     if encoding:
         return data.decode(encoding, "strict" if whole else "ignore")
     try:
         return data.decode("utf-8", "strict" if whole else "ignore")
     except UnicodeDecodeError:
+        if NO_TEXT.search(data[:NO_TEXT_BYTES]):
+            raise SourceError(f"{path} is no text. Pass a table in text, such as CSV") from None
         say(f"{path}: is not UTF-8; read as Latin-1. [file] encoding in the table decides it")
         return data.decode("latin-1")
 
@@ -232,7 +237,8 @@ def _find_header(
             raise SourceError(f"{path}, line {number}: has {len(line)} characters. Pass a table")
     for place, (_, line) in enumerate(lines[:HEADER_LINES_MAX]):
         for separator in separators if wanted else ():
-            for text in dict.fromkeys((line, _uncomment(line, marks))):
+            plain = _uncomment(line, marks)
+            for text in dict.fromkeys((line, plain, _cut_comment(plain, marks))):
                 names = _split(text, separator)
                 score = sum(any(_is_named(name, w) for name in names) for w in set(wanted))
                 if score > best[0]:
@@ -241,10 +247,10 @@ def _find_header(
             break
     if best[0]:
         return best[1], best[2], _tidy(path, best[3], wanted)
-    plain = [k for k, (_, line) in enumerate(lines) if not line.lstrip().startswith(marks)]
-    if not plain:
+    rows = [k for k, (_, line) in enumerate(lines) if not line.lstrip().startswith(marks)]
+    if not rows:
         raise SourceError(f"{path} has no line of names. Pass another file")
-    place = plain[0]
+    place = rows[0]
     separator = max(separators, key=lambda s: len(_split(lines[place][1], s)))
     if place and all(map(is_number, _split(lines[place][1], separator))):
         place -= 1
@@ -256,12 +262,17 @@ def _uncomment(line: str, marks: tuple[str, ...]) -> str:
     return line.lstrip().lstrip("".join(marks)) if line.lstrip().startswith(marks) else line
 
 
-def _cut_comment(line: str, marks: tuple[str, ...]) -> str:
-    """Cut a comment: from a mark at the beginning, or behind a space in a line without quotes."""
+def _cut_comment(line: str, marks: tuple[str, ...], separator: str = "", width: int = 0) -> str:
+    """Cut a comment: from a mark at the beginning, or behind a space in a line without quotes.
+
+    A mark without which fewer than ``width`` cells would be left is part of a cell: ``80 %``.
+    """
     if line.lstrip().startswith(marks):
         return ""
     for mark in marks if '"' not in line else ():
-        line = line.partition(f" {mark}")[0]
+        places = (found.start() for found in re.finditer(f" {re.escape(mark)}", line))
+        whole = (k for k in places if not width or len(_split(line[:k], separator)) >= width)
+        line = line[: next(whole, None)]
     return line
 
 
@@ -332,13 +343,7 @@ def _split_rows(
 
 def _find_commas(rows: list[list[str]]) -> bool:
     """Return whether numbers have a decimal comma: some cells do, and no number has a point."""
-    cells = [cell for row in rows[:HEADER_LINES_MAX] for cell in row]
-    commas = sum(bool(DECIMAL_COMMA.fullmatch(cell)) for cell in cells)
-    return commas > 0 and not any("." in cell and is_number(cell) for cell in cells)
-
-
-def name_missing(path: Path, missing: Collection[str], names: Collection[str]) -> str:
-    """Return the words for columns that a file does not have, with similar ones."""
-    near = {m: get_close_matches(m, names, n=1) for m in sorted(missing)}
-    hints = [f"did you mean {found[0]} for {m}?" for m, found in near.items() if found]
-    return f"{path}: no column {', '.join(sorted(missing))}" + "".join(f"; {h}" for h in hints)
+    cells = (cell for row in rows for cell in row)
+    if not any("," in cell and DECIMAL_COMMA.fullmatch(cell) for cell in cells):
+        return False
+    return not any("." in cell and is_number(cell) for row in rows for cell in row)

@@ -330,3 +330,21 @@ def test_a_table_of_unknown_columns_names_the_flag_that_states_them(table: Path)
     for source in (table.parent, table.with_name("log.csv")):
         with pytest.raises(SourceError, match=r"--columns map\.toml"):
             find_format(source)
+
+
+def test_columns_without_a_value_are_named(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [row.replace(";500;", ";NaN;").replace(";510;", ";-;") for row in ROWS]
+    table.with_name("log.csv").write_text("\n".join([HEADER, *rows]) + "\n")
+    assert "/cf1/height" not in samples(table.with_name("log.csv"), Options(columns=table))
+    err = capsys.readouterr().err
+    assert "log.csv: no row has a value in h, so there is no height\n" in err
+    assert "log.csv: no height, which dmrl label needs" in err
+
+
+def test_rows_without_a_robot_are_left_out(table: Path) -> None:
+    rows = [f"{row};{robot}" for row, robot in zip(ROWS, ("cf1", ""), strict=True)]
+    table.with_name("log.csv").write_text("\n".join([f"{HEADER};id", *rows]) + "\n")
+    table.write_text(f'{TABLE}[robot]\nname = "id"\n')
+    with count_left_out() as left:
+        found = samples(table.with_name("log.csv"), Options(columns=table))
+    assert left.counts == {"rows without a robot": 1} and len(found["/cf1/height"]) == 1

@@ -143,7 +143,7 @@ def test_robots_may_have_different_sensors(
     assert "/rover/height" in found and "/boat/height" not in found
     err = capsys.readouterr().err
     assert "boat.csv: no column height, which other robots have" in err
-    assert "boat.csv: no height in the table, which dmrl label needs" in err
+    assert "boat.csv: no height, which dmrl label needs" in err
     with pytest.raises(SourceError, match=r"boat\.csv: no column height\. Fix the table"):
         mapped_csv.load_content(boat, options)
     text = (tmp_path / "map.toml").read_text().replace('name = "height"', "value = 0.2")

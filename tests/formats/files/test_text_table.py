@@ -314,3 +314,36 @@ def test_iso_times_are_parsed_as_by_pandas(moments: list[Any], between: str, zon
     wanted = pandas.to_datetime(pandas.Series(cells), format="ISO8601", utc=True)
     wanted_ns = wanted.dt.as_unit("ns").astype("int64").tolist()
     assert [parse_time_ns(cell, 1e9, has_decimal_commas=False) for cell in cells] == wanted_ns
+
+
+def test_marks_of_comments_in_cells_are_kept(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("t,bat,note,d2 # unit m\n0,80 %,lap #3,1.5\n1,79 %,lap #4,1.6 # far\n")
+    with count_left_out() as left:
+        table = read_table(path, ("t", "d2"))
+    assert not left.counts
+    assert table.columns["bat"] == ["80 %", "79 %"] and table.columns["d2"] == ["1.5", "1.6"]
+    assert table.columns["note"] == ["lap #3", "lap #4"]
+
+
+def test_decimal_commas_far_below_the_header_are_found(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("t;d2\n" + "".join(f"{k};0\n" for k in range(300)) + "300;0,25\n")
+    table = read_table(path, ("t", "d2"))
+    values = table.parse_numbers("d2")
+    assert values is not None and values[-1] == 0.25
+
+
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
+def test_utf_16_needs_no_mark(encoding: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes(plain().encode(encoding))
+    assert set(read_table(path, WANTED).columns) == set(WANTED)
+
+
+@pytest.mark.parametrize("start", [b"PK\x03\x04", b"\x1f\x8b\x08\0", b"\x89PNG\r\n\x1a\n"])
+def test_files_that_are_no_text_are_refused_as_such(start: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes(start + bytes(range(256)) * 8)
+    with pytest.raises(SourceError, match=r"a\.csv is no text"):
+        read_table(path, WANTED)
