@@ -74,7 +74,8 @@ class ValueCounts:
                 yield topic, f"{share} {limit.unit}. Are they {limit.perhaps}?"
             elif count := self.impossible[topic, name]:
                 most = f"{IMPOSSIBLE * limit.over:g} {limit.unit}"
-                yield topic, f"{name}: {count} values are over {most}, which no flight gives"
+                share = f"{name}: {count} of {total} values are over {most}"
+                yield topic, f"{share}, which no flight gives"
             elif total >= MESSAGES_MIN and 2 * self.below_floor[topic, name] > total:
                 share = self.below_floor[topic, name] / total
                 yield topic, f"{name}: {share:.0%} of the values are below the floor. Is z down?"

@@ -8,7 +8,6 @@ import pytest
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats.base import Options
 from dmrl.formats.files import image_folder
-from dmrl.formats.registry import find_format
 from dmrl.geometry.camera_file import format_camera
 from dmrl.geometry.frames import AIDECK, project
 from dmrl.images.bayer import demosaic
@@ -346,32 +345,3 @@ def test_raw_pictures_are_of_four_by_four_pixels_at_least(
     with count_left_out() as counted:
         assert not samples(tmp_path, "CompressedImage", Options(raw=True))
     assert counted.counts == {"images that cannot be decoded": 1}
-
-
-def test_a_single_picture_is_a_folder_of_one(folder: Path) -> None:
-    assert find_format(folder / "b.JPG").name == "images"
-    (image,) = samples(folder / "b.JPG", "CompressedImage")
-    assert image.fields["data"] == (folder / "b.JPG").read_bytes()
-
-
-def test_photos_and_videos_of_other_kinds_are_named_with_the_way_out(
-    folder: Path, tmp_path: Path
-) -> None:
-    (folder / "IMG_1.HEIC").write_bytes(b"photo")
-    with count_left_out() as tally:
-        assert len(samples(folder, "CompressedImage")) == 3
-    assert [(n, "save photos as JPEG" in why) for why, n in tally.counts.items()] == [(1, True)]
-    (only := tmp_path / "videos").mkdir()
-    (only / "a.MOV").write_bytes(b"video")
-    with pytest.raises(SourceError, match="no image"), count_left_out():
-        find_format(only).content(only, Options())
-
-
-def test_a_picture_that_no_command_could_read_is_left_out_with_the_flags_that_scale_it(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("dmrl.guards.limits.FRAME_PIXELS", 64 * 48 - 1)
-    assert samples(folder, "CompressedImage") == []
-    assert "a.png is 64 x 48 px" in (said := capsys.readouterr().err)
-    assert "--width-px 640" in said
-    assert len(samples(folder, "CompressedImage", Options(size_px=(32, 24)))) == 3

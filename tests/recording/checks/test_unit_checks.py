@@ -43,7 +43,7 @@ def test_single_values_that_no_flight_gives_are_found() -> None:
     values = np.full(100, 0.5)
     values[3] = -1e30
     ((_, text),) = _doubted("/cf1/velocity", "vx_mps", values)
-    assert text == "vx_mps: 1 values are over 20000 m/s, which no flight gives"
+    assert text == "vx_mps: 1 of 100 values are over 20000 m/s, which no flight gives"
 
 
 def test_heights_that_count_downwards_are_found() -> None:

@@ -1,0 +1,62 @@
+"""Single pictures, photos of a phone, and pictures larger than commands read."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats.base import Options
+from dmrl.formats.files import image_folder
+from dmrl.formats.registry import find_format
+from dmrl.images.codec import encode_jpeg, encode_png
+from dmrl.samples.sample import Sample
+from dmrl.terminal.left_out import count_left_out
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three pictures of 64 x 48: PNG, JPEG and PPM."""
+    path = tmp_path / "pictures"
+    path.mkdir()
+    rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    (path / "a.png").write_bytes(encode_png(rgb))
+    (path / "b.JPG").write_bytes(encode_jpeg(rgb))
+    (path / "c.ppm").write_bytes(b"P6\n# hi\n64 48\n255\n" + rgb.tobytes() + b"junk")
+    (path / "notes.txt").write_text("no picture")
+    return path
+
+
+def samples(folder: Path, kind: str, options: Options | None = None) -> list[Sample]:
+    """Samples of one message type."""
+    found = image_folder.load_content(folder, options or Options()).samples
+    return [sample for sample in found if sample.message == kind]
+
+
+def test_a_single_picture_is_a_folder_of_one(folder: Path) -> None:
+    assert find_format(folder / "b.JPG").name == "images"
+    (image,) = samples(folder / "b.JPG", "CompressedImage")
+    assert image.fields["data"] == (folder / "b.JPG").read_bytes()
+
+
+def test_photos_and_videos_of_other_kinds_are_named_with_the_way_out(
+    folder: Path, tmp_path: Path
+) -> None:
+    (folder / "IMG_1.HEIC").write_bytes(b"photo")
+    with count_left_out() as tally:
+        assert len(samples(folder, "CompressedImage")) == 3
+    assert [(n, "save photos as JPEG" in why) for why, n in tally.counts.items()] == [(1, True)]
+    (only := tmp_path / "videos").mkdir()
+    (only / "a.MOV").write_bytes(b"video")
+    with pytest.raises(SourceError, match="no image"), count_left_out():
+        find_format(only).content(only, Options())
+
+
+def test_a_picture_that_no_command_could_read_is_left_out_with_the_flags_that_scale_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("dmrl.guards.limits.FRAME_PIXELS", 64 * 48 - 1)
+    assert samples(folder, "CompressedImage") == []
+    assert "a.png is 64 x 48 px" in (said := capsys.readouterr().err)
+    assert "--width-px 640" in said
+    assert len(samples(folder, "CompressedImage", Options(size_px=(32, 24)))) == 3
