@@ -11,8 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dmrl.errors import SourceError
 from dmrl.formats.base import (
     SOURCE_OPTIONS,
@@ -25,6 +23,7 @@ from dmrl.formats.base import (
 from dmrl.formats.files.column_map import Column, read_column_map
 from dmrl.formats.files.mapped_csv import iter_robot_streams
 from dmrl.formats.files.robot_columns import RobotLog, resolve_robots
+from dmrl.formats.files.text_cells import is_number
 from dmrl.formats.files.text_table import TextTable
 from dmrl.formats.ros import bag
 from dmrl.formats.ros.reader import iter_messages, list_topics
@@ -107,10 +106,10 @@ def _read_cells(
     for topic, time_ns, message in _iter_objects(source, columns, kinds, is_bag=is_bag):
         for name, column in cells[topic].items():
             path = name.rpartition(":")[2].split(".")
-            column.append(str(time_ns) if name == LOG_TIME else _find_number(message, path))
+            column.append(str(time_ns) if name == LOG_TIME else _find_cell(message, path))
     for topic, held in cells.items():
         for name, column in held.items():
-            if not any(column):
+            if not any(is_number(cell) for cell in column):
                 raise SourceError(f"{source}: no message on {topic} has a number in {name}")
     return cells
 
@@ -134,10 +133,11 @@ def _iter_objects(
             yield topic, time_ns if stamp_ns is None else stamp_ns, message
 
 
-def _find_number(value: Any, path: Sequence[str]) -> str:
-    """Return the number in a field, in an item of a list, or in a part of it; empty: there is none.
+def _find_cell(value: Any, path: Sequence[str]) -> str:
+    """Return the text of a field, of an item of a list, or of a part of it; empty: there is none.
 
-    A time of ROS or protobuf is a number of nanoseconds.
+    A time of ROS or protobuf is a number of nanoseconds. What is no number is counted where cells
+    are parsed.
     """
     for part in path:
         if isinstance(value, Mapping):
@@ -152,7 +152,7 @@ def _find_number(value: Any, path: Sequence[str]) -> str:
     )
     if seconds is not None and nanos is not None:
         value = seconds * 1_000_000_000 + nanos
-    return str(value) if isinstance(value, int | float | np.number) else ""
+    return "" if value is None else str(value)
 
 
 def _select_topic(log: RobotLog, topic: str, cells: Mapping[str, list[str]]) -> RobotLog | None:

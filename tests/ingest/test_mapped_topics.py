@@ -193,6 +193,16 @@ def test_topics_that_the_table_does_not_name_are_left_out_by_name(tmp_path: Path
     assert dict(left.counts) == {"messages on /chat: my.Uwb in json is not converted": 1}
 
 
+def test_fields_that_are_no_number_are_counted(tmp_path: Path) -> None:
+    some = messages("red")
+    some[1][3]["alt"], some[4][3]["alt"] = "low", None  # JSON's null is no value, not a wrong one
+    source = in_json(tmp_path / "a", some)
+    (tmp_path / "map.toml").write_text(TABLE)
+    with count_left_out() as left:
+        run(source, tmp_path / "out.mcap", Settings(columns=tmp_path / "map.toml"))
+    assert dict(left.counts) == {"cells of '/red/move:alt' that are no number": 1}
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [

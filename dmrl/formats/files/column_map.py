@@ -189,7 +189,12 @@ def _iter_errors(key: str, table: Any) -> Iterator[str]:
     units = LENGTH_UNITS if key.startswith("range.") else QUANTITIES.get(key)
     if units is None:
         near = get_close_matches(key, QUANTITIES, n=1)
-        yield f"[{key}]: no such quantity" + (f", did you mean {near[0]}?" if near else "")
+        known = (
+            f"did you mean {near[0]}?"
+            if near
+            else "there are " + ", ".join((*QUANTITIES, "range.PEER"))
+        )
+        yield f"[{key}]: no such quantity, {known}"
     elif not isinstance(table, dict):
         yield f"{key}: no table with name and unit"
     else:
