@@ -6,6 +6,9 @@ from typing import Any
 
 NEAR_PX = 8.0
 """A detection within this distance supports a label, pixels; or within 3 sigma of the label."""
+NEAR_AT_1_M_PX = 3.0
+"""The same for a robot at 1 m, in inverse proportion to depth: a third of the half-width that a
+Crazyflie has in the AI-deck's camera. The centre of a large robot is less certain in pixels."""
 SCATTER_PX, DEPTH_SCATTER = 80.0, 0.5
 """Scales on which a moved label is less likely to be the robot of a detection: distance in pixels,
 and difference of log depth."""
@@ -59,4 +62,6 @@ def _distance_px(label: Mapping[str, Any], one: Mapping[str, Any]) -> float:
 
 def _is_near(label: Mapping[str, Any], one: Mapping[str, Any]) -> bool:
     sigma = max(label["sigma_u_px"], label["sigma_v_px"])
-    return bool(_distance_px(label, one) <= max(NEAR_PX, 3 * sigma))
+    depth_m = label.get("depth_m", 0.0)
+    large_px = NEAR_AT_1_M_PX / depth_m if depth_m > 0 else 0.0
+    return bool(_distance_px(label, one) <= max(NEAR_PX, 3 * sigma, large_px))
