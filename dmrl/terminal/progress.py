@@ -1,4 +1,4 @@
-"""Progress on standard error or in a notebook, silent when that is neither."""
+"""Progress on standard error: a bar in a terminal or notebook, a line a minute in a file."""
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
@@ -25,6 +25,8 @@ Item = TypeVar("Item")
 Lines = Sequence[Sequence[object]]
 NOTEBOOK_PERIOD_S = 0.3
 """Time between two updates of the line in a notebook, seconds."""
+LOG_PERIOD_S = 60.0
+"""Time between two lines where standard error is a file or a pipe, seconds."""
 
 
 class _Progress(Progress):
@@ -83,7 +85,7 @@ def track(
         yield from _track_in_notebook(items, what, total, describe)
         return
     if not console.is_terminal:
-        yield from items
+        yield from _track_in_log(items, what, total, describe)
         return
     columns = (
         TextColumn("{task.description}"),
@@ -119,6 +121,23 @@ def _track_in_notebook(
             shown.update(text(f"{words}: {done}" + (f" of {total}" if total else "")), raw=True)
         yield item
     shown.update(text(""), raw=True)
+
+
+def _track_in_log(
+    items: Iterable[Item], what: str, total: int | None, describe: Callable[[Item], str] | None
+) -> Iterator[Item]:
+    """Yield items, with a line now and then for work that lasts."""
+    begun_s = monotonic()
+    due_s = begun_s + LOG_PERIOD_S
+    for done, item in enumerate(items):
+        if done and (now_s := monotonic()) >= due_s:
+            due_s = now_s + LOG_PERIOD_S
+            words = f"{what if describe is None else describe(item)}: {done}"
+            if total:
+                left_min = (now_s - begun_s) / done * (total - done) / 60
+                words += f" of {total}, about {left_min:.0f} min left"
+            say(words)
+        yield item
 
 
 def say(line: str) -> None:

@@ -9,6 +9,20 @@ def test_a_pipe_sees_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr() == ("", "")
 
 
+def test_a_log_gets_a_line_now_and_then(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dmrl.terminal.progress.LOG_PERIOD_S", 0.0)
+    assert list(track(range(3), "Counting")) == [0, 1, 2]
+    assert list(track(iter("ab"), "Counting", describe=lambda letter: f"at {letter}")) == ["a", "b"]
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [
+        "Counting: 1 of 3, about 0 min left",
+        "Counting: 2 of 3, about 0 min left",
+        "at b: 1",
+    ]
+
+
 def test_a_terminal_sees_a_bar(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
