@@ -216,6 +216,8 @@ def _choose_place(settings: FlySettings) -> int:
 
 
 def _check(settings: FlySettings) -> None:
+    if not 1 <= settings.duration_s <= 3600:  # the validator of the flag lets NaN pass
+        raise SettingError(f"--duration-s {settings.duration_s}: choose 1 to 3600")
     if settings.seed < 0 or settings.cameras_max < 1:
         raise SettingError("--seed must be 0 or more, cameras_max 1 or more. Change them")
     if not 0 < settings.camera_rate_hz <= 100:
