@@ -215,7 +215,15 @@ def _choose_place(settings: FlySettings) -> int:
     return settings.seed if settings.place is None else settings.place
 
 
+PILOT_SETTINGS = ("flown", "distance_m", "eye", "backend", "vision")
+"""Settings that only a pilot uses."""
+
+
 def _check(settings: FlySettings) -> None:
+    plain = FlySettings()
+    for name in () if settings.pilot else PILOT_SETTINGS:
+        if getattr(settings, name) != getattr(plain, name):
+            raise SettingError(f"{name} has no effect without a pilot. Name one: --pilot follow")
     if not 1 <= settings.duration_s <= 3600:  # the validator of the flag lets NaN pass
         raise SettingError(f"--duration-s {settings.duration_s}: choose 1 to 3600")
     if settings.seed < 0 or settings.cameras_max < 1:
