@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.errors import SourceError
+from dmrl.evaluation import positions
 from dmrl.flight import Scenario, simulate
 from dmrl.flight.flight_arrays import Flight
 from dmrl.flight.noise import NOISE
 from dmrl.recording import LoadedRecording, check, read_summary, read_table
-from dmrl.stages import align, convert, evaluate, label
+from dmrl.stages import align, convert, label
+from dmrl.terminal.left_out import count_left_out
 
 from .own_bags import Bag
 
@@ -59,7 +60,7 @@ def test_odometry_velocities_are_rotated_to_the_robot(flight: Flight, tmp_path: 
     velocity = read_table(out, "/cf2/velocity")
     np.testing.assert_allclose(velocity["vx_mps"], flight.robots["cf2"].vx_mps[::2], atol=1e-5)
     label.run(out, tmp_path / "labelled.mcap", label.Settings())
-    judged = evaluate.positions.judge(tmp_path / "labelled.mcap")
+    judged = positions.judge(tmp_path / "labelled.mcap")
     assert len(judged) == 6  # by the motion capture of the bag
     kept = np.concatenate([np.hypot(*p.judged.error_m[p.judged.kept].T) for p in judged])
     assert len(kept) > 2000 and np.median(kept) < 0.12
@@ -84,12 +85,12 @@ def test_robots_with_boot_clocks_are_aligned(
     assert max(starts.values()) - min(starts.values()) < 50_000_000
     if reference == "mocap":
         label.run(tmp_path / "aligned.mcap", tmp_path / "labelled.mcap", label.Settings())
-        judged = evaluate.positions.judge(tmp_path / "labelled.mcap")
+        judged = positions.judge(tmp_path / "labelled.mcap")
         kept = np.concatenate([np.hypot(*p.judged.error_m[p.judged.kept].T) for p in judged])
         assert np.median(kept) < 0.12
 
 
-def test_times_before_zero_are_refused(flight: Flight, tmp_path: Path) -> None:
+def test_times_before_zero_are_left_out_and_counted(flight: Flight, tmp_path: Path) -> None:
     folder = tmp_path / "flight"
     folder.mkdir()
     for robot, peer in (("cf1", "cf2"), ("cf2", "cf1")):
@@ -100,6 +101,8 @@ def test_times_before_zero_are_refused(flight: Flight, tmp_path: Path) -> None:
         rows = np.column_stack([values[0] - 5.0, *values[1:], there])
         text = "\n".join(",".join(f"{v:.6f}" for v in row) for row in rows)
         (folder / f"{robot}.csv").write_text(f"{columns},range_{peer}_m\n{text}\n")
-    with pytest.raises(SourceError, match="begins before time 0"):
+    with count_left_out() as left_out:
         convert.run(folder, tmp_path / "flight.mcap", convert.Settings())
-    assert not (tmp_path / "flight.mcap").exists()
+    (count,) = (n for why, n in left_out.counts.items() if "before 0" in why)
+    early = sum(int((flight.robots[robot].time_s < 5.0).sum()) for robot in ("cf1", "cf2"))
+    assert count == early

@@ -52,6 +52,6 @@ def test_own_images_become_a_dataset_with_a_complete_card(
         "labels of source 'hand' are biased: ",
         "- Left out: 1 images had no labels.",
         "- Leaks: no images",
-        "- Licence beside `hall`: CC BY 4.0.",
+        "- Licence of `hall`: CC BY 4.0.",
     ):
         assert line in card

@@ -4,6 +4,7 @@ Errors make a recording unusable. Warnings describe problems to consider before 
 `scan` collects all data in one pass over the file; the rules here evaluate them.
 """
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,6 +34,7 @@ GAP_PERIODS = 10
 """Length of a gap, in median periods of the topic."""
 GAP_MIN_S = 0.5
 """Shortest gap that is reported, seconds."""
+NUMBER = re.compile(r"\d[\d.e+-]*")
 FINDINGS_PRINTED_MAX = 5
 """Findings that a stage prints about its output. ``dmrl check`` prints all."""
 
@@ -98,10 +100,22 @@ def print_findings(path: Path, *, values: bool = False) -> None:
     except RecordingError as e:
         say(f"warning: {e}")
         return
-    for finding in findings[:FINDINGS_PRINTED_MAX]:
+    for finding in _sort_by_novelty(findings)[:FINDINGS_PRINTED_MAX]:
         say(f"{finding.level}: {finding.topic}: {finding.text}")
     if len(findings) > FINDINGS_PRINTED_MAX:
         say(f"{len(findings) - FINDINGS_PRINTED_MAX} more: dmrl check {path}")
+
+
+def _sort_by_novelty(findings: list[Finding]) -> list[Finding]:
+    """Return errors, then warnings, in each one finding of every kind before the second of any."""
+    seen: Counter[tuple[str, str]] = Counter()
+    turns = []
+    for finding in findings:
+        kind = finding.level, NUMBER.sub("", finding.text)
+        turns.append((finding.level, seen[kind]))
+        seen[kind] += 1
+    order = sorted(range(len(findings)), key=turns.__getitem__)
+    return [findings[k] for k in order]
 
 
 def _check_types(data: CheckData) -> Iterator[Finding]:

@@ -11,24 +11,11 @@ from dmrl.formats.files import image_folder
 from dmrl.geometry.camera_file import format_camera
 from dmrl.geometry.frames import AIDECK, project
 from dmrl.images.bayer import demosaic
-from dmrl.images.codec import decode, encode_jpeg, encode_png
+from dmrl.images.codec import decode, encode_png
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import count_left_out
 
 HEADER = "file,peer,u_px,v_px,depth_m\n"
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """Three pictures of 64 x 48: PNG, JPEG and PPM."""
-    path = tmp_path / "pictures"
-    path.mkdir()
-    rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
-    (path / "a.png").write_bytes(encode_png(rgb))
-    (path / "b.JPG").write_bytes(encode_jpeg(rgb))
-    (path / "c.ppm").write_bytes(b"P6\n# hi\n64 48\n255\n" + rgb.tobytes() + b"junk")
-    (path / "notes.txt").write_text("no picture")
-    return path
 
 
 def samples(folder: Path, kind: str, options: Options | None = None) -> list[Sample]:

@@ -2,35 +2,14 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from dmrl.errors import SourceError
 from dmrl.formats.base import Options
-from dmrl.formats.files import image_folder
 from dmrl.formats.registry import find_format
-from dmrl.images.codec import encode_jpeg, encode_png
-from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import count_left_out
 
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """Three pictures of 64 x 48: PNG, JPEG and PPM."""
-    path = tmp_path / "pictures"
-    path.mkdir()
-    rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
-    (path / "a.png").write_bytes(encode_png(rgb))
-    (path / "b.JPG").write_bytes(encode_jpeg(rgb))
-    (path / "c.ppm").write_bytes(b"P6\n# hi\n64 48\n255\n" + rgb.tobytes() + b"junk")
-    (path / "notes.txt").write_text("no picture")
-    return path
-
-
-def samples(folder: Path, kind: str, options: Options | None = None) -> list[Sample]:
-    """Samples of one message type."""
-    found = image_folder.load_content(folder, options or Options()).samples
-    return [sample for sample in found if sample.message == kind]
+from .test_image_folder import samples
 
 
 def test_a_single_picture_is_a_folder_of_one(folder: Path) -> None:
