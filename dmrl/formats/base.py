@@ -13,6 +13,7 @@ from typing import Any, cast
 
 from dmrl.errors import SettingError, SourceError
 from dmrl.geometry.frames import Camera
+from dmrl.guards import limits
 from dmrl.samples.flight import merge_by_time
 from dmrl.samples.sample import Columns, Intervals, Sample
 
@@ -155,9 +156,14 @@ def read_text(path: Path, encoding: str = "utf-8-sig") -> str:
     Raises
     ------
     SourceError
-        If it cannot be read, or is in another encoding.
+        If it cannot be read, is in another encoding, or is larger than `limits.TEXT_BYTES`.
     """
     try:
+        if (size := path.stat().st_size) > limits.TEXT_BYTES:
+            raise SourceError(
+                f"{path} has {size / limits.MB:.0f} MB, and a text file of this kind may have "
+                f"{limits.TEXT_BYTES // limits.MB}. Split it, or leave it out"
+            )
         return path.read_text(encoding=encoding)
     except (OSError, UnicodeDecodeError) as e:
         raise SourceError(f"{path} cannot be read as text: {e}. Restore the file") from None

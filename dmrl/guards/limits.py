@@ -83,6 +83,9 @@ DEPTH = 200
 TOML_CHARACTERS = 100_000
 """Length of a recipe or a camera file. The time for long dotted keys grows with their square."""
 
+TEXT_BYTES = 50 * MB
+"""Size of a text file that is read whole: labels, class names, lists of pictures."""
+
 XML_BYTES = 10 * MB
 """Size of an XML file of labels, or of a camera."""
 

@@ -178,7 +178,7 @@ def _read_rows(
                 boxes.append(_parse_line(words, about))
         return build_rows(picture.name, boxes, options.names)
     except (ValueError, SourceError) as e:
-        leave_out(UNREADABLE, f"{label}:{line}: {e}")
+        leave_out(UNREADABLE, f"{label}:{line}: {str(e)[:200]}")
         return None
 
 

@@ -8,6 +8,7 @@ import pytest
 from dmrl.errors import SourceError
 from dmrl.formats.base import Options
 from dmrl.formats.registry import find_format
+from dmrl.guards import limits
 from dmrl.terminal.left_out import count_left_out
 
 from .boxes import HEIGHT, WIDTH, boxes_of, check, labels_of, read, write_picture, yolo_lines
@@ -135,6 +136,14 @@ def test_a_label_file_that_is_broken_leaves_its_picture(line: str, small: Path) 
     (count,) = counted.counts.values()
     assert count == 1
     assert "1.txt" in next(iter(counted.first.values()))
+
+
+def test_a_huge_label_file_leaves_its_picture(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (small / "labels/1.txt").write_bytes(bytes(2_000))
+    monkeypatch.setattr(limits, "TEXT_BYTES", 1_000)
+    with count_left_out() as counted:
+        check(read(small, "yolo"), [2])
+    assert "Split it" in next(iter(counted.first.values()))
 
 
 def test_a_set_in_pixels_is_refused(small: Path) -> None:
