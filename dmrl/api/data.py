@@ -99,7 +99,10 @@ class Rows:
 
     @property
     def images(self) -> list[NDArray[np.uint8]]:
-        """Images, (n_i, H, W, 3) RGB for each shard or batch; views of the files where raw."""
+        """Images, (n_i, H, W, 3) RGB for each shard or batch: views of the files where raw.
+
+        PNG and JPEG images are decoded on use; ``np.asarray`` decodes a batch.
+        """
         return self._split.pixels
 
     def to_arrow(self) -> pa.Table:

@@ -176,6 +176,7 @@ class DatasetSettings(TypedDict, total=False):
     val: str
     seed: int
     masks: bool
+    pixels: Literal["raw", "png", "jpeg"]
     png: bool
     parquet: bool
     without: str | PathLike[str] | None

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from dmrl import recipe as recipes
 from dmrl.atomic_output import atomic_folder, extend_folder, register_output
@@ -57,6 +57,8 @@ def build_dataset(
 ) -> Written:
     """Write a dataset to ``out``; see ``dmrl.stages.dataset.run``."""
     check_license(settings.license)
+    if settings.png and settings.pixels == "jpeg":
+        raise SettingError("--png and --pixels jpeg contradict each other. Leave out one")
     before = ExistingDataset(manifest=Manifest(parquet=settings.parquet))
     with atomic_folder(out) as partial:
         written = _write_part(partial, recordings, settings, before, workers)
@@ -144,7 +146,7 @@ def _write_part(
     shards = write_shards(
         folder,
         seen.filter_new(found, tally.count_duplicate if before.made else None),
-        png=settings.png or settings.parquet,
+        packed=_choose_storage(settings) != "raw",
         shard_images=settings.shard_images,
         before=before.manifest,
     )
@@ -183,7 +185,15 @@ def _assign_splits(
 def _select_images(settings: Settings) -> RowFilter:
     flagged = frozenset() if settings.without is None else load_flags(settings.without)
     corrected = load_corrections(settings.corrections)
-    return RowFilter(settings.keep_all, settings.masks, flagged, corrected)
+    return RowFilter(
+        settings.keep_all, settings.masks, flagged, corrected, _choose_storage(settings)
+    )
+
+
+def _choose_storage(settings: Settings) -> Literal["raw", "png", "jpeg"]:
+    """Return how images are stored; Parquet files hold packed ones."""
+    packed = settings.png or settings.parquet
+    return "png" if packed and settings.pixels == "raw" else settings.pixels
 
 
 def _describe(folder: Path) -> None:

@@ -8,12 +8,11 @@ from dmrl import topics
 from dmrl.card.facts import Facts
 from dmrl.card.sensor_facts import describe_cameras, find_sensor_patterns
 from dmrl.datasets.writing.inputs import find_focal_lengths
+from dmrl.datasets.writing.label_choice import choose_label_source, find_label_sources
 from dmrl.datasets.writing.near_duplicates import ImageHashes
 from dmrl.datasets.writing.rows import (
     ExclusionCounts,
-    choose_label_source,
     count_images,
-    find_label_sources,
 )
 from dmrl.recording import LoadedRecording, list_label_findings, read_splits
 from dmrl.recording.licences import licences_in

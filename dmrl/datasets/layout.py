@@ -40,12 +40,12 @@ PEER_TYPE = pa.struct(
 )
 """One peer of one image: the fields of ``dmrl.v1.PeerLabel``, with the name of the status."""
 
-PNG_TYPE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+IMAGE_TYPE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
 """Storage type of the Image feature of ``datasets``."""
 
 
 def build_schema(
-    height_px: int, width_px: int, *, png: bool = False, masks: bool = False
+    height_px: int, width_px: int, *, packed: bool = False, masks: bool = False
 ) -> pa.Schema:
     """Build the Arrow schema of a dataset; all images have one size.
 
@@ -53,8 +53,8 @@ def build_schema(
     ----------
     height_px, width_px
         Size of the images, multiples of 8.
-    png
-        Column ``image`` with PNG bytes in place of ``pixels`` with raw RGB.
+    packed
+        Column ``image`` with PNG or JPEG bytes in place of ``pixels`` with raw RGB.
     masks
         Add a column ``masks``: one byte per pixel, 0 for the background or the index of the peer in
         ``peers``, from 1.
@@ -65,7 +65,7 @@ def build_schema(
         With the features under the metadata key ``huggingface``, from which ``datasets`` takes the
         types of shards and Parquet files.
     """
-    picture = (IMAGE, PNG_TYPE) if png else (PIXELS, pa.binary(height_px * width_px * 3))
+    picture = (IMAGE, IMAGE_TYPE) if packed else (PIXELS, pa.binary(height_px * width_px * 3))
     row = pa.list_(pa.float32(), width_px // STRIDE_PX)
     grid = pa.list_(row, height_px // STRIDE_PX)
     covered = [(MASKS, pa.binary(height_px * width_px))] if masks else []

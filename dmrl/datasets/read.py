@@ -6,9 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
-from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -16,15 +15,14 @@ from numpy.typing import NDArray
 
 from dmrl.datasets import layout
 from dmrl.datasets.manifest import Manifest, load_manifest
+from dmrl.datasets.packed_images import PackedImages
 from dmrl.datasets.shards import open_shard
 from dmrl.errors import DatasetError, MissingSplit
 from dmrl.geometry.frames import STRIDE_PX
-from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.mapped_files import MappedFile, require_whole
 from dmrl.guards.paths import refuse_pipes, require_text_path
 from dmrl.guards.safe_names import check_split_name, safe_join
-from dmrl.images.codec import decode
 
 PARQUET_NAME_PATTERN = re.compile(r"(?P<split>.+)-(?P<index>\d{5})-of-(?P<count>\d{5})\.parquet")
 
@@ -70,22 +68,21 @@ class Split:
     def pixels(self) -> list[NDArray[np.uint8]]:
         """Images, one (n_i, H, W, 3) RGB array per record batch, in the order of ``table``.
 
-        For raw pixels these are read-only views of the mapped files, which load on use. A dataset
-        of PNGs is decoded once, as a whole, into memory.
+        For raw pixels these are read-only views of the mapped files, which load on use. PNG and
+        JPEG images are `PackedImages`, which act like arrays and decode on use, each time.
         """
         if layout.PIXELS in self.table.schema.names:
             return [self._view_bytes(chunk) for chunk in self.table[layout.PIXELS].chunks]
-        return [self._decode_images(chunk) for chunk in self.table[layout.IMAGE].chunks]
+        shape = (*self.image_shape, 3)
+        chunks = self.table[layout.IMAGE].chunks
+        packed = [PackedImages(chunk.field("bytes"), shape, self.name) for chunk in chunks]
+        return cast("list[NDArray[np.uint8]]", packed)
 
     def images(self, rows: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
-        """Yield the images of these rows, (H, W, 3) each; PNGs of other rows are not decoded."""
+        """Yield the images of these rows, (H, W, 3) each; images of other rows are not decoded."""
         self.require_whole()
-        packed = layout.IMAGE in self.table.schema.names and "pixels" not in self.__dict__
         for chunk, place in map(self._locate_row, rows):
-            if packed:
-                yield self._decode_images(self.table[layout.IMAGE].chunk(chunk).slice(place, 1))[0]
-            else:
-                yield self.pixels[chunk][place]
+            yield self.pixels[chunk][place]
 
     def grids(self, name: str, rows: Sequence[int]) -> NDArray[np.float32]:
         """Return the grid labels of these rows alone, (n, rows, cols)."""
@@ -143,20 +140,6 @@ class Split:
         width = chunk.type.byte_width
         mine = every[chunk.offset * width : (chunk.offset + len(chunk)) * width]
         return mine.reshape(len(chunk), *self.image_shape, -1)
-
-    def _decode_images(self, chunk: pa.Array) -> NDArray[np.uint8]:
-        shape = (len(chunk), *self.image_shape, 3)
-        if prod(shape) > limits.max_unpacked_bytes(chunk.nbytes):
-            raise DatasetError(f"images of split {self.name} unpack to too much. Make it again")
-        out = np.empty(shape, np.uint8)
-        for image, data in zip(out, chunk.field("bytes"), strict=True):
-            rgb = decode(data.as_py(), f"an image of split {self.name}")
-            if rgb.shape != image.shape:
-                raise DatasetError(
-                    f"an image of split {self.name} has another size than its labels. Make it again"
-                )
-            image[:] = rgb
-        return out
 
     def _concatenate_grid(self, name: str) -> NDArray[np.float32]:
         parts = self._grids[name]

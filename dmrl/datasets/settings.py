@@ -35,11 +35,15 @@ class Settings:
     masks
         Keep the masks of rendered robots. A training can then paste robots without their
         surroundings. Images that show a peer and have no mask are left out.
+    pixels
+        Storage of the images. "raw": pixels, mapped into memory without decoding. "png": smaller,
+        decoded at each use. "jpeg": the recorded JPEG bytes unchanged, and PNG for other images:
+        the smallest, decoded at each use.
     png
-        Store PNG images in place of raw pixels: smaller on disk, but decoded at each opening.
+        The same as --pixels png.
     parquet
-        Write Parquet files in place of Arrow shards, for publishing. Images are PNG then, which
-        other tools display.
+        Write Parquet files in place of Arrow shards, for publishing. Images are packed then, as PNG
+        unless --pixels jpeg is given; other tools display them.
     corrections
         Recordings of corrected labels, as the page of dmrl view --flag saves them: of their images,
         these labels are used. Repeat for more.
@@ -62,6 +66,7 @@ class Settings:
     val: str = ""
     seed: int = 0
     masks: bool = False
+    pixels: Literal["raw", "png", "jpeg"] = "raw"
     png: bool = False
     parquet: bool = False
     without: Path | None = None

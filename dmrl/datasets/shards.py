@@ -117,7 +117,7 @@ def _find_column_error(table: pa.Table, height_px: int, width_px: int) -> str:
     """Return an error if a column has the wrong type or nulls; empty if all are right."""
     names = table.schema.names
     known = layout.build_schema(height_px, width_px, masks=layout.MASKS in names)
-    packed = layout.build_schema(height_px, width_px, png=True).field(layout.IMAGE)
+    packed = layout.build_schema(height_px, width_px, packed=True).field(layout.IMAGE)
     for wanted in (*known, packed):
         if wanted.name not in names:
             continue

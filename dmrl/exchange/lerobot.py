@@ -17,7 +17,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dmrl.datasets.layout import PNG_TYPE, format_json
+from dmrl.datasets.layout import IMAGE_TYPE, format_json
 from dmrl.datasets.writing.parquet_writer import ParquetWriter
 from dmrl.exchange.dataset_rows import ExportRow, ExportRows, to_attributes
 
@@ -83,7 +83,7 @@ def _build_schema(most: int) -> pa.Schema:
     vector = pa.float32() if most == 1 else pa.list_(pa.float32(), most)
     return pa.schema(
         [
-            (IMAGE, PNG_TYPE),
+            (IMAGE, IMAGE_TYPE),
             *((f"labels.{name}", vector) for name in LABELS),
             ("timestamp", pa.float32()),
             *((name, pa.int64()) for name in INTEGERS),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.images.codec import encode_png
+from dmrl.images.codec import encode_jpeg, encode_png
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 from dmrl.topics import CAMERA_IMAGE, LABELS
@@ -44,6 +44,7 @@ def recorder(folder: Path) -> Record:
         sizes_px: Mapping[int, tuple[int, int]] | None = None,
         masks: Mapping[int, Any] | None = None,
         begin_ns: int = 0,
+        jpeg: bool = False,
     ) -> Path:
         path = folder / name
         path.parent.mkdir(exist_ok=True)
@@ -53,8 +54,10 @@ def recorder(folder: Path) -> Record:
             for k, listed in enumerate(peers):
                 size_px = (sizes_px or {}).get(k, (HEIGHT_PX, WIDTH_PX))
                 at = begin_ns + k * STEP_NS
-                data = encode_png(pixels_of(1000 * seed + k, *size_px))
-                picture = message_class("CompressedImage")(data=data, format="png")
+                rgb = pixels_of(1000 * seed + k, *size_px)
+                data = encode_jpeg(rgb, 80) if jpeg else encode_png(rgb)
+                kind = "jpeg" if jpeg else "png"
+                picture = message_class("CompressedImage")(data=data, format=kind)
                 sink.write(at, CAMERA_IMAGE("cf1"), picture)
                 if k in (masks or {}):
                     covered = message_class("CompressedImage")(

@@ -8,7 +8,9 @@ import pytest
 
 from dmrl.datasets import open_dataset
 from dmrl.datasets.layout import build_schema
-from dmrl.errors import DatasetError
+from dmrl.datasets.training_examples import build_examples
+from dmrl.errors import DatasetError, SettingError
+from dmrl.images.codec import decode, encode_jpeg
 from dmrl.stages.dataset import Settings, run
 
 from .conftest import HEIGHT_PX, WIDTH_PX, Record, pixels_of
@@ -112,6 +114,27 @@ def test_every_format_opens_with_the_same_rows(
     assert split.image_shape == (HEIGHT_PX, WIDTH_PX)
 
 
+@pytest.mark.parametrize("parquet", [False, True])
+def test_recorded_jpegs_are_kept(record: Record, tmp_path: Path, parquet: bool) -> None:
+    flights = [record(jpeg=True), record("other.mcap", seed=1)]
+    run(flights, tmp_path / "out", Settings(split="none", pixels="jpeg", parquet=parquet))
+    split = open_dataset(tmp_path / "out").split("train")
+    stored = split.table["image"].to_pylist()
+    camera = [encode_jpeg(pixels_of(k), 80) for k in range(6)]
+    assert [image["bytes"] for image in stored[:6]] == camera
+    assert [image["path"][-3:] for image in stored] == ["jpg"] * 6 + ["png"] * 6
+    shown = np.concatenate(split.pixels)
+    assert np.array_equal(shown[:6], [decode(data) for data in camera])
+    assert np.array_equal(shown[6:], [pixels_of(1000 + k) for k in range(6)])
+    part = build_examples(split).select(np.arange(12) % 4 == 1)
+    assert np.array_equal(part.get_image(2), pixels_of(1003))
+
+
+def test_png_and_jpeg_contradict(record: Record, tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="--png and --pixels jpeg"):
+        run([record()], tmp_path / "out", Settings(png=True, pixels="jpeg"))
+
+
 def test_datasets_shows_png_as_images(record: Record, tmp_path: Path) -> None:
     run([record()], tmp_path / "out", Settings(split="none", png=True))
     opened = datasets.load_from_disk(str(tmp_path / "out"))["train"]
@@ -124,7 +147,7 @@ def test_datasets_reads_features_from_parquet(record: Record, tmp_path: Path) ->
     run(flights, tmp_path / "out", Settings(parquet=True))
     opened = datasets.load_dataset(str(tmp_path / "out"), cache_dir=str(tmp_path / "cache"))
     assert set(opened) == {"train", "test"}
-    wanted = datasets.Features.from_arrow_schema(build_schema(HEIGHT_PX, WIDTH_PX, png=True))
+    wanted = datasets.Features.from_arrow_schema(build_schema(HEIGHT_PX, WIDTH_PX, packed=True))
     assert opened["train"].features == wanted
     assert isinstance(opened["train"].features["image"], datasets.Image)
     shown = opened["train"][3]

@@ -103,9 +103,10 @@ def test_batch_decodes_only_its_own_images(
     rows = dmrl.dataset(grown(record, tmp_path / "set", parquet=True))["train"]
     whole = list(open_dataset(tmp_path / "set").split("train").pixels)
     decoded: list[str] = []
-    real = dmrl.datasets.read.decode
+    real = dmrl.datasets.packed_images.decode
     monkeypatch.setattr(
-        "dmrl.datasets.read.decode", lambda data, what: (decoded.append(what), real(data, what))[1]
+        "dmrl.datasets.packed_images.decode",
+        lambda data, what: (decoded.append(what), real(data, what))[1],
     )
     batch = next(iter(rows.loader(3, shuffle=True, seed=2)))
     assert len(decoded) == 3

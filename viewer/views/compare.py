@@ -9,7 +9,7 @@ import rerun as rr
 
 from dmrl import topics
 from dmrl.colours import RGB, SECOND_DETECTION_RGB
-from dmrl.datasets.writing.rows import choose_label_source
+from dmrl.datasets.writing.label_choice import choose_label_source
 from dmrl.errors import DmrlError, RecordingError, SettingError
 from dmrl.evaluation import detections
 from dmrl.geometry.frames import Array

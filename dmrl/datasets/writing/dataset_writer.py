@@ -13,8 +13,9 @@ from dmrl.datasets import layout
 from dmrl.datasets.manifest import Manifest, Shard
 from dmrl.datasets.writing.parquet_writer import ParquetWriter
 from dmrl.errors import UnsafeName
-from dmrl.images.codec import encode_png
 
+JPEG_START = b"\xff\xd8\xff"
+"""First bytes of a JPEG file."""
 MAX_BATCH_IMAGES = 64
 """Rows per record batch: 14 MB of 320 x 224 pixels. A split keeps no more rows in memory."""
 MAX_BATCH_PIXELS = 20_000_000
@@ -39,6 +40,8 @@ class Row:
         File name of the recording.
     time_ns
         Log time of the image.
+    encoded
+        The image as PNG or JPEG, for a dataset of packed images. Empty in others.
     mask
         (H, W) index of the peer that each pixel shows, from 1 in ``peers``; 0 for the background.
         None: the dataset has no masks.
@@ -50,6 +53,7 @@ class Row:
     robot: str
     source: str
     time_ns: int
+    encoded: bytes = b""
     mask: NDArray[np.uint8] | None = None
 
     @property
@@ -146,7 +150,7 @@ def write_shards(
     folder: Path,
     rows: Iterable[tuple[str, Row]],
     *,
-    png: bool,
+    packed: bool,
     shard_images: int,
     before: Manifest,
 ) -> dict[str, list[Shard]]:
@@ -158,8 +162,8 @@ def write_shards(
         Folder of the dataset, which exists.
     rows
         Name of the split and row; all images have one size.
-    png
-        PNG bytes in place of raw pixels.
+    packed
+        The encoded images of the rows in place of raw pixels.
     shard_images
         See `SplitWriter`.
     before
@@ -174,7 +178,9 @@ def write_shards(
     for split, row in rows:
         if split not in writers:
             _reject_case_conflict(split, (*writers, *before.splits))
-            schema = layout.build_schema(*row.rgb.shape[:2], png=png, masks=row.mask is not None)
+            schema = layout.build_schema(
+                *row.rgb.shape[:2], packed=packed, masks=row.mask is not None
+            )
             first = len(before.splits.get(split, ()))
             writers[split] = SplitWriter(folder, split, schema, before.parquet, shard_images, first)
         writers[split].add(row)
@@ -205,13 +211,15 @@ def _build_record_batch(rows: list[Row], schema: pa.Schema, split: str) -> pa.Re
     if layout.PIXELS in schema.names:
         columns[layout.PIXELS] = _build_bytes_column(np.stack([row.rgb for row in rows]))
     else:
-        pictures = [
-            {"bytes": encode_png(row.rgb), "path": f"{row.robot}_{row.time_ns}.png"} for row in rows
-        ]
-        columns[layout.IMAGE] = pa.array(pictures, layout.PNG_TYPE)
+        columns[layout.IMAGE] = pa.array(map(_pack_image, rows), layout.IMAGE_TYPE)
     if masks := [row.mask for row in rows if row.mask is not None]:
         columns[layout.MASKS] = _build_bytes_column(np.stack(masks))
     return pa.record_batch([columns[name] for name in schema.names], schema=schema)
+
+
+def _pack_image(row: Row) -> dict[str, Any]:
+    suffix = "jpg" if row.encoded.startswith(JPEG_START) else "png"
+    return {"bytes": row.encoded, "path": f"{row.robot}_{row.time_ns}.{suffix}"}
 
 
 def _build_bytes_column(values: NDArray[np.uint8]) -> pa.Array:

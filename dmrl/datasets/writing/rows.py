@@ -15,34 +15,25 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.datasets.layout import PEER_TYPE
-from dmrl.datasets.writing.corrections import CORRECTION_SOURCE, Corrections
-from dmrl.datasets.writing.dataset_writer import Row
+from dmrl.datasets.writing.corrections import Corrections
+from dmrl.datasets.writing.dataset_writer import JPEG_START, Row
 from dmrl.datasets.writing.exclusions import FlaggedImage
 from dmrl.datasets.writing.splits import SplitLookup
-from dmrl.errors import RecordingError, SettingError, SourceError
+from dmrl.errors import RecordingError, SourceError
 from dmrl.geometry.frames import STRIDE_PX, build_grid_label
-from dmrl.images.codec import UNDECODABLE, decode
+from dmrl.images.codec import UNDECODABLE, Rgb, decode, encode_png
 from dmrl.messages import STATUS_OK, to_status_name
 from dmrl.recording import LoadedRecording, Stamped, read
-from dmrl.recording.label_sources import SOURCE_FIELDS, collect_sources, get_message_sources
+from dmrl.recording.label_sources import get_message_sources
 from dmrl.storage.shared_file import share_file
 from dmrl.terminal.left_out import leave_out
-
-LABEL_SOURCES = ("truth", "estimate", "hand", "published")
-"""Sources of labels, best first."""
-
-TRAINING_SOURCES = ("estimate", "truth", "hand", "published")
-"""Sources of labels in the order of training.
-
-Estimates come first: who labels a flight that has true positions wants to measure the estimates.
-"""
 
 Mask = NDArray[np.uint8]
 """(H, W) index of the peer that each pixel shows, from 1 among the labels; 0 for the background."""
@@ -63,12 +54,16 @@ class RowFilter:
         Images that are left out.
     corrected
         Labels of images that replace those of the recording.
+    pixels
+        "png" or "jpeg": rows hold the image encoded, the latter as recorded if it was JPEG. "raw":
+        they do not.
     """
 
     keep_all: bool = False
     masks: bool = False
     flagged: Set[FlaggedImage] = frozenset()
     corrected: Corrections = field(default_factory=dict)
+    pixels: Literal["raw", "png", "jpeg"] = "raw"
 
 
 @dataclass(slots=True)
@@ -133,45 +128,6 @@ def count_images(held: LoadedRecording, *, corrected: bool = False) -> int:
     return sum(held.topics[t].count for t in found if topics.parse_topic(topics.CAMERA_IMAGE, t))
 
 
-def find_label_sources(held: LoadedRecording) -> set[str]:
-    """Return every source of labels that a recording has."""
-    present: set[str] = set()
-    for topic in held.topics:
-        if topics.parse_topic(topics.LABELS, topic):
-            table = held.get_table(topic, SOURCE_FIELDS).combine_chunks()
-            present |= collect_sources(*(table.column(name).chunk(0) for name in SOURCE_FIELDS))
-    return present
-
-
-def choose_label_source(held: LoadedRecording, wanted: str, *, corrected: bool = False) -> str:
-    """Choose the source whose labels are used for a recording.
-
-    Parameters
-    ----------
-    held
-        A recording that `count_images` accepts, best with its labels loaded.
-    wanted
-        One of `LABEL_SOURCES`; "best" for the first of them that the recording has; "auto" for the
-        first of `TRAINING_SOURCES`.
-    corrected
-        Whether corrections label its images: their source is that of a recording without labels.
-
-    Raises
-    ------
-    SettingError
-        If the recording has labels, but none from that source.
-    """
-    present = find_label_sources(held)
-    order = {"best": LABEL_SOURCES, "auto": TRAINING_SOURCES}.get(wanted, (wanted,))
-    if not present:
-        return CORRECTION_SOURCE if corrected else order[0]
-    usable = [source for source in order if source in present]
-    if not usable:
-        has = ", ".join(sorted(present))
-        raise SettingError(f"{held.path} has no labels from {wanted}. Try one of --labels {has}")
-    return usable[0]
-
-
 def iter_row_builders(
     held: LoadedRecording,
     source: str,
@@ -189,7 +145,7 @@ def iter_row_builders(
         A recording that `count_images` accepts, best with its labels loaded: each of its chunks is
         then decompressed once.
     source
-        Source of the labels; see `choose_label_source`.
+        Source of the labels; see `label_choice.choose_label_source`.
     split_of
         Split of a log time.
     tally
@@ -220,7 +176,7 @@ def iter_row_builders(
             tally.not_ok += 1
         else:
             tally.kept += 1
-            yield split, partial(_build_row, held.path, image, mine, covered, masks=masks)
+            yield split, partial(_build_row, held.path, image, mine, covered, wanted)
             continue
         yield None
 
@@ -328,8 +284,15 @@ def _peer_to_dict(label: Any) -> dict[str, Any]:
     return {**peer, "box_px": list(label.box_px), "status": to_status_name(label.status)}
 
 
+def _encode(recorded: bytes, rgb: Rgb, wanted: RowFilter) -> bytes:
+    if wanted.pixels == "raw":
+        return b""
+    keeps = wanted.pixels == "jpeg" and recorded.startswith(JPEG_START)
+    return recorded if keeps else encode_png(rgb)
+
+
 def _build_row(
-    path: Path, image: Stamped, labels: list[Any], covered: Stamped | None, *, masks: bool
+    path: Path, image: Stamped, labels: list[Any], covered: Stamped | None, wanted: RowFilter
 ) -> Row:
     what = f"{path}: the image of {image.topic} at {image.time_ns} ns"
     rgb = decode(image.message.data, what)
@@ -346,5 +309,6 @@ def _build_row(
     ahead = uv_depth[np.isfinite(uv_depth).all(axis=1) & ((uv_depth[:, 2] > 0) | unknown)]
     shape = (height_px // STRIDE_PX, width_px // STRIDE_PX)
     grid = build_grid_label(ahead[:, :2], ahead[:, 2], shape=shape)
-    row = Row(rgb, peers, grid, _parse_robot(image), path.name, image.time_ns)
-    return replace(row, mask=_decode_mask(path, row, covered)) if masks else row
+    encoded = _encode(image.message.data, rgb, wanted)
+    row = Row(rgb, peers, grid, _parse_robot(image), path.name, image.time_ns, encoded)
+    return replace(row, mask=_decode_mask(path, row, covered)) if wanted.masks else row

@@ -54,7 +54,7 @@ class ExampleSet:
     Parameters
     ----------
     pixels
-        Arrays of (n_i, H, W, 3) uint8, RGB, such as zero-copy views of a mapped file.
+        (n_i, H, W, 3) uint8, RGB: views of a mapped file, or images that are decoded on use.
     robots
         (N, K, 11) float32, ``ROBOT_FIELDS`` of up to K robots in each of the N images, N the sum of
         the n_i. Sigmas are 0 where the label is exact; a box or class is NaN where there is none.
@@ -96,7 +96,7 @@ class ExampleSet:
         """Return the chosen images, one chunk each, not copied."""
         numbers = np.flatnonzero(chosen)
         places = [self._locate_image(index) for index in numbers.tolist()]
-        chunks = [self.pixels[chunk][place][None] for chunk, place in places]
+        chunks = [self.pixels[chunk][place : place + 1] for chunk, place in places]
         masks = [self.masks[chunk][place][None] for chunk, place in places if self.masks]
         return ExampleSet(chunks, self.robots[numbers], masks, self.require_whole)
 
