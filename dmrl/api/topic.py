@@ -127,8 +127,9 @@ class Topic:
     ) -> "pd.DataFrame":
         """Return a data frame over ``time_s``, seconds from the start of the recording.
 
-        Fields of a message within are columns of their own, ``pose.position.x``; of a list of
-        messages, such as the peers of PeerLabels, each is a row.
+        Fields of a message within are columns of their own, ``pose.position.x``. A message is one
+        row, unless it holds a list of messages, such as the peers of PeerLabels: then each item is
+        a row, and a message without items one row with empty cells. Row k has item k of every list.
 
         Raises
         ------
@@ -149,7 +150,8 @@ class Topic:
     ) -> NDArray[np.void]:
         """Return an (N,) structured array: ``array["height_m"]`` is a field of all messages.
 
-        Texts, bytes and lists are objects.
+        Its rows are those of `to_pandas`, so N is not the number of messages if these hold lists
+        of messages. Texts, bytes and lists of values are objects.
         """
         table = flatten_table(self.to_arrow(fields=fields, start_s=start_s, end_s=end_s))
         columns = {name: table[name].to_numpy() for name in table.column_names}

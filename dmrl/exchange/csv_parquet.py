@@ -18,6 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -26,6 +27,7 @@ from dmrl.atomic_output import atomic_folder
 from dmrl.errors import MissingExtra, RecordingError, UnreadableTopic, UnsafeName
 from dmrl.guards.safe_names import safe_join, to_topic_file_name
 from dmrl.recording import iter_columns, read_summary, read_table
+from dmrl.recording.mcap.message_batch import Ints
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import track
 
@@ -54,7 +56,7 @@ def write_tables(recording: Path, out: Path, kind: TableFormat) -> dict[str, int
     MissingExtra
         If pandas, which writes CSV, is not installed.
     RecordingError
-        If the recording cannot be read, or a topic is not protobuf.
+        If the recording cannot be read, or none of its topics is protobuf. Others are left out.
     OutputError
         If ``out`` exists or cannot be written.
     """
@@ -97,9 +99,9 @@ def _check_free(path: Path, topic: str) -> None:
 def _write_images(recording: Path, topic: str, folder: Path) -> pa.Table:
     """Write images to files; return the table with their names in place of their bytes."""
     _check_free(folder, topic)
-    folder.mkdir()
     batches, seen = [], Counter[str]()
     for batch in iter_columns(recording, topic):
+        folder.mkdir(exist_ok=True)  # only now, for a topic may be unreadable
         names = []
         for time_ns, kind in zip(batch["log_time"], batch["format"], strict=True):
             stem = f"{time_ns.as_py():0{TIME_DIGITS}d}"
@@ -121,29 +123,45 @@ def _image_suffix(kind: str) -> str:
 
 
 def flatten_table(table: pa.Table) -> pa.Table:
-    """Convert lists of structs to rows and structs to columns, until none remain."""
-    while True:
-        lists = [f.name for f in table.schema if _is_struct_list(f.type)]
-        if lists:
-            table = _explode_list(table, lists[0])
-        elif any(pa.types.is_struct(field.type) for field in table.schema):
-            table = table.flatten()
-        else:
-            return table
+    """Convert structs to columns, and lists of structs to rows: row k has item k of each list.
+
+    The columns of a shorter list are null in the rows after its last item. A row without items
+    remains one row.
+    """
+    return _flatten(table)[0]
+
+
+def _flatten(table: pa.Table) -> tuple[pa.Table, Ints]:
+    """Return a table as `flatten_table` does, and (N,) the row of ``table`` that each row is of."""
+    total = len(table)
+    while any(map(pa.types.is_struct, table.schema.types)):
+        table = table.flatten()
+    lists = [field.name for field in table.schema if _is_struct_list(field.type)]
+    if not lists:
+        return table, np.arange(total)
+    parts = [_flatten_items(table[name].combine_chunks(), name) for name in lists]
+    heights = np.max([np.bincount(of, minlength=total) for _, of in parts], 0, initial=1)
+    rows, starts = np.repeat(np.arange(total), heights), heights.cumsum() - heights
+    plain = table.drop_columns(lists)
+    columns = dict(zip(plain.column_names, plain.take(rows).columns, strict=True))
+    for items, of in parts:
+        places = np.full(len(rows), -1)
+        rank = np.arange(len(of)) - np.searchsorted(of, of)
+        places[starts[of] + rank] = np.arange(len(of))
+        taken = items.take(pa.array(places, mask=places < 0))
+        columns |= zip(taken.column_names, taken.columns, strict=True)
+    return pa.table(columns), rows
+
+
+def _flatten_items(lists: pa.Array, name: str) -> tuple[pa.Table, Ints]:
+    """Return the items of lists as a flat table, and (N,) the list that each row is of."""
+    items, of = _flatten(pa.table({name: pc.list_flatten(lists)}))
+    lengths = pc.fill_null(pc.list_value_length(lists), 0).to_numpy(zero_copy_only=False)
+    return items, np.repeat(np.arange(len(lists)), lengths)[of]
 
 
 def _is_struct_list(kind: pa.DataType) -> bool:
     return bool(pa.types.is_list(kind) and pa.types.is_struct(kind.value_type))
-
-
-def _explode_list(table: pa.Table, name: str) -> pa.Table:
-    """Return one row per item of a list, and one empty row per list without items."""
-    column = table[name].combine_chunks()
-    empty = pc.fill_null(pc.equal(pc.list_value_length(column), 0), True)
-    filled = pc.if_else(empty, pa.scalar([None], column.type), column)
-    at = table.schema.get_field_index(name)
-    taken = table.remove_column(at).take(pc.list_parent_indices(filled))
-    return taken.append_column(name, pc.list_flatten(filled))
 
 
 def _write_table(table: pa.Table, path: Path, kind: TableFormat) -> None:

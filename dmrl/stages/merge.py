@@ -31,7 +31,7 @@ def command(
 ) -> None:
     """Merge recordings into one, by time.
 
-    Of equal times, messages of the earlier named recording come first.
+    Chunks are copied whole, so messages of equal times may come in any order.
     """
     *named, out = recordings or [Path()]
     inputs = find_all_recordings(named)

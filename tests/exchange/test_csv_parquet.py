@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 
 from dmrl.errors import OutputError, UnsafeName
 from dmrl.exchange import csv_parquet
-from dmrl.exchange.csv_parquet import write_tables
+from dmrl.exchange.csv_parquet import flatten_table, write_tables
 from dmrl.images.codec import encode_png
 from dmrl.messages import message_class
 from dmrl.recording import Channel, RawMessage, RecordingWriter, build_provenance
@@ -64,6 +65,33 @@ def test_exported_tables_equal_the_recording(recording: Path, tmp_path: Path, ki
     assert (out / name).read_bytes() == PNG
     data = table("cf1.detections.grid")["data"][0]
     assert (base64.b64decode(data) if kind == "csv" else data) == b"\0\1"
+
+
+def test_items_of_two_lists_of_a_message_are_each_in_one_row() -> None:
+    """Not in their product."""
+    table = pa.table(
+        {
+            "log_time": [1, 2, 3],
+            "a": [[{"x": k, "within": [{"z": 7}, {"z": 8}]} for k in range(3)], [], None],
+            "b": [[{"y": k} for k in range(3)], [{"y": 9}], None],
+        }
+    )
+    flat = flatten_table(table).to_pydict()
+    assert flat["log_time"] == [1] * 6 + [2, 3]
+    assert flat["a.x"] == [0, 0, 1, 1, 2, 2, None, None]
+    assert flat["a.within.z"] == [7, 8] * 3 + [None, None]
+    assert flat["b.y"] == [0, 1, 2, None, None, None, 9, None]
+    assert flatten_table(table.slice(1)).to_pydict() == {n: v[6:] for n, v in flat.items()}
+
+
+def test_an_unreadable_image_topic_leaves_no_folder(recording: Path, tmp_path: Path) -> None:
+    path, out = tmp_path / "json.mcap", tmp_path / "out"
+    channel = Channel("/x", "foxglove.CompressedImage", b"{}", "jsonschema", "json")
+    with RecordingWriter(path, build_provenance("test")) as sink:
+        sink.write_raw(RawMessage(0, 0, channel, b"{}"))
+        sink.write(0, "/cf1/height", message_class("Height")())
+    write_tables(path, out, "parquet")
+    assert [one.name for one in out.iterdir()] == ["cf1.height.parquet"]
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
