@@ -137,7 +137,8 @@ class UnreadableTopic(RecordingError):
     def __init__(self, where: object, topic: str, why: str) -> None:
         self.reason = f"messages on {topic}, which {why}"
         super().__init__(
-            f"{where}: {topic} {why}. Leave it out (dmrl trim), or convert it: dmrl convert --help"
+            f"{where}: {topic} {why}. Leave it out (dmrl trim), or convert it: "
+            f"dmrl convert {where} OUT.mcap"
         )
 
 

@@ -109,8 +109,10 @@ class LoadedRecording:
             yield Stamped(time_ns, topic, parse_message(raw, kinds[number], self.path))
 
     def matching(self, *wanted: str) -> frozenset[str]:
-        """Return the topics that names and patterns ask for; raise what `reader.matching` does."""
-        return select_topics(self.path, self.topics, wanted)
+        """Return the topics that names and patterns ask for; raise what `match_topics` does."""
+        found = select_topics(self.path, self.topics, wanted)
+        require_types(self.path, self.topics, found)
+        return found
 
     def first(self, topic: str) -> Stamped | None:
         """Return the first message of a topic, and load no other; None if it has none."""

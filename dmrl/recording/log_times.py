@@ -12,7 +12,6 @@ from dmrl.recording.mcap.message_batch import MAX_TIME_NS, Ints
 from dmrl.recording.mcap.message_count import count_chunks, count_scanned, verify_indexes
 from dmrl.recording.mcap.record_scan import scan_file
 from dmrl.recording.mcap.summary_section import read_summary_section
-from dmrl.recording.protobuf.message_types import require_types
 from dmrl.recording.summary import read_summary
 
 _NO_TIMES: Ints = np.empty(0, np.int64)
@@ -44,7 +43,6 @@ def read_log_times(
     """
     present = read_summary(path).topics
     names = frozenset(topic for topic in topics if topic in present)
-    require_types(path, present, names)
     low = 0 if start_ns is None else start_ns
     high = MAX_TIME_NS if end_ns is None else end_ns
     found = {topic: np.sort(times) for topic, times in read_indexed_times(path, names).items()}
@@ -59,8 +57,6 @@ def read_time_spans(path: Path) -> dict[str, tuple[int, int]]:
     RecordingError
         If the file is not a complete recording, or its message indexes contradict its statistics.
     """
-    present = read_summary(path).topics
-    require_types(path, present, present)
     with open_mcap(path) as stream:
         section = read_summary_section(stream)
         if section is None:

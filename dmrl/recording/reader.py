@@ -46,13 +46,22 @@ def match_topics(path: Path, wanted: Sequence[str]) -> frozenset[str]:
     RecordingError
         If one of dmrl's topics carries another message type.
     """
-    return select_topics(path, read_summary(path).topics, wanted)
+    topics = read_summary(path).topics
+    found = select_topics(path, topics, wanted)
+    require_types(path, topics, found)
+    return found
 
 
 def select_topics(
     path: Path, topics: Mapping[str, TopicInfo], wanted: Sequence[str]
 ) -> frozenset[str]:
-    """Return the topics that names and patterns ask for; raise what `match_topics` does."""
+    """Return the topics that names and patterns ask for, of any message type.
+
+    Raises
+    ------
+    MissingTopic
+        If a name or pattern matches nothing.
+    """
     found: set[str] = set()
     for want in wanted:
         hits = {want} & topics.keys()
@@ -62,7 +71,6 @@ def select_topics(
         if not hits:
             raise MissingTopic(want, topics, path)
         found |= hits
-    require_types(path, topics, found)
     return frozenset(found)
 
 

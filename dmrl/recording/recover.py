@@ -178,6 +178,7 @@ def _iter_valid_units(
     state.recovery.timeless += int((named & ~timed).sum())
     good = named & timed
     if not good.all():
+        count_messages(state.left_out, batch.take(~good))
         batch, chunk = batch.take(good), None
     if len(batch):
         count_messages(state.counts, batch)
@@ -202,7 +203,7 @@ def _complete_report(state: RecoveryState) -> None:
     statistics, found = section.statistics, state.counts.total()
     stated = Counter(statistics.channel_message_counts) if statistics is not None else None
     had = stated or state.counts + state.skipped
-    for number, count in sorted((had - state.counts).items()):
+    for number, count in sorted((had - state.counts - state.left_out).items()):
         channel = state.channels.get(number)
         topic = channel.topic if channel else f"channel {number}"
         recovery.missing[topic] = recovery.missing.get(topic, 0) + count
@@ -210,7 +211,8 @@ def _complete_report(state: RecoveryState) -> None:
     recovery.contradictions += [f"the schema of {topic} is missing" for topic in lost]
     recovery.counted = statistics is not None
     if statistics is not None:
-        unknown = statistics.message_count - found - sum(recovery.missing.values())
+        unread = statistics.message_count - found - state.left_out.total()
+        unknown = unread - sum(recovery.missing.values())
         if unknown > 0:
             recovery.missing["unknown"] = unknown
         if state.counts - had or unknown < 0:  # duplicates, or messages of another recording

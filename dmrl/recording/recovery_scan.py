@@ -65,8 +65,9 @@ class Recovery:
     lost_bytes
         Bytes outside of complete records: after the last one, or before the next listed one.
     missing
-        Messages that were not recovered, by topic, as far as the file lists them. Their topic is
-        "unknown" where the file states only how many there were.
+        Messages that were not read, by topic, as far as the file lists them. Their topic is
+        "unknown" where the file states only how many there were. ``nameless`` and ``timeless``
+        messages are not among them.
     counted
         Whether ``missing`` covers the whole file: its Statistics record was readable.
     contradictions
@@ -99,6 +100,7 @@ class RecoveryState(ScannedFile):
     summary_section: McapSummary  # Summary section, as far as it can be read
     incomplete: dict[int, str] = field(default_factory=dict)  # topics without their schema
     counts: Counter[int] = field(default_factory=Counter)  # messages by channel id
+    left_out: Counter[int] = field(default_factory=Counter)  # readable, of no topic or valid time
     skipped: Counter[int] = field(default_factory=Counter)  # in corrupt chunks, by their indexes
     running_checksums: checksums.Checksums = field(default_factory=checksums.Checksums)
     extras: int = 0  # number of metadata and attachments

@@ -24,10 +24,11 @@ SPLIT_METADATA = "dmrl.split"
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """Message type and number of messages of one topic."""
+    """Message type, number and encoding of the messages of one topic."""
 
     schema: str
     count: int
+    encoding: str = "protobuf"
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +119,9 @@ def _build_summary(path: Path, stream: BoundedReader) -> Summary:
     topics: dict[str, TopicInfo] = {}
     for number, channel in sorted(definitions.channels.items()):
         before = topics[channel.topic].count if channel.topic in topics else 0
-        topics[channel.topic] = TopicInfo(channel.schema_name, before + count.by_channel[number])
+        topics[channel.topic] = TopicInfo(
+            channel.schema_name, before + count.by_channel[number], channel.encoding
+        )
     return Summary(
         dict(sorted(topics.items())),
         count.start_ns,

@@ -18,7 +18,7 @@ from dmrl.pipeline.batch import (
 from dmrl.pipeline.executor import Executor, open_executor
 from dmrl.pipeline.job import JobResult, has_failed
 from dmrl.terminal.arguments import AsJson, In, On, Workers
-from dmrl.terminal.tables import print_json, print_line
+from dmrl.terminal.tables import count_things, print_json, print_line
 
 if TYPE_CHECKING:
     from dmrl.recording import Finding
@@ -26,11 +26,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """Size of a recording, and the findings of its checks."""
+    """Size of a recording, the findings of its checks, and the encodings it did not decode."""
 
     messages: int
     topics: int
     findings: "list[Finding]"
+    undecoded: dict[str, str]
 
 
 def run(recording: Path) -> Checked:
@@ -42,9 +43,15 @@ def run(recording: Path) -> Checked:
         If it is not a complete recording.
     """
     from dmrl.recording import check, read_summary
+    from dmrl.recording.checks.scan import is_decoded
 
     findings, held = check(recording), read_summary(recording)
-    return Checked(held.count, len(held.topics), findings)
+    undecoded = {
+        topic: info.encoding
+        for topic, info in held.topics.items()
+        if info.count and not is_decoded(topic, info)
+    }
+    return Checked(held.count, len(held.topics), findings, undecoded)
 
 
 def command(
@@ -70,7 +77,8 @@ def command(
         return _check_side_by_side(recordings, open_executor(on, workers), as_json=as_json)
     found = asdict(run(recordings[0]))
     if as_json:
-        print_json({"recording": recordings[0].name, "findings": found["findings"]})
+        shown = {key: found[key] for key in ("findings", "undecoded")}
+        print_json({"recording": recordings[0].name, **shown})
     else:
         for line in map(_describe_finding, found["findings"]):
             print_line(line)
@@ -95,8 +103,8 @@ def _check_side_by_side(named: Sequence[Path], crew: Executor, *, as_json: bool)
         totals = {"sound": sound, "errors": errors, "warnings": warnings}
         print_json({"recordings": documents, **totals})
     else:
-        totals_line = f"{sound} without errors; {errors} errors, {warnings} warnings"
-        print_line(f"{len(documents)} recordings: {totals_line}")
+        totals_line = f"{sound} without errors; {_count_findings(errors, warnings)}"
+        print_line(f"{count_things(len(documents), 'recording')}: {totals_line}")
     report_failures(done)
     return 0 if sound == len(documents) else 1
 
@@ -113,14 +121,26 @@ def _badness(document: dict[str, Any]) -> tuple[int, int, str]:
 
 
 def _describe_finding(finding: dict[str, Any]) -> str:
-    where = f" {finding['topic']}:" if finding["topic"] else ""
-    return f"{finding['level']}:{where} {finding['text']}"
+    from dmrl.recording import Finding
+
+    return Finding(**finding).to_line()
+
+
+def _count_findings(errors: int, warnings: int) -> str:
+    return f"{count_things(errors, 'error')}, {count_things(warnings, 'warning')}"
 
 
 def _describe_size(found: dict[str, Any]) -> str:
-    """Return the size of a recording and the number of its findings."""
-    counts = f"{_count(found, 'error')} errors, {_count(found, 'warning')} warnings"
-    return f"{found['messages']} messages on {found['topics']} topics, {counts}"
+    """Return the size of a recording, what was not decoded, and the number of its findings."""
+    counts = _count_findings(_count(found, "error"), _count(found, "warning"))
+    size = (
+        f"{count_things(found['messages'], 'message')} on {count_things(found['topics'], 'topic')}"
+    )
+    if undecoded := found["undecoded"]:
+        names = {"": "no encoding", "protobuf": "protobuf of other types"}
+        kinds = ", ".join(sorted({names.get(one, one) for one in undecoded.values()}))
+        size += f" ({count_things(len(undecoded), 'topic')} not decoded: {kinds})"
+    return f"{size}, {counts}"
 
 
 def _document(task: Task, answer: JobResult) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from cyclopts import Parameter
 
 from dmrl.errors import SettingError
 from dmrl.pipeline.batch import find_all_recordings
-from dmrl.terminal.tables import print_line
+from dmrl.terminal.arguments import AsJson
+from dmrl.terminal.tables import count_things, print_json, print_line
 
 
 def run(recordings: Sequence[Path], out: Path) -> int:
@@ -28,6 +29,7 @@ def command(
             help="Two recordings or more, or a folder of them; then the one to write.",
         ),
     ],
+    as_json: AsJson = False,
 ) -> None:
     """Merge recordings into one, by time.
 
@@ -39,4 +41,8 @@ def command(
         raise SettingError(
             "merge wants two recordings or more and OUT: dmrl merge A.mcap B.mcap OUT.mcap"
         )
-    print_line(f"{out}: {run(inputs, out)} messages of {len(inputs)} recordings")
+    count = run(inputs, out)
+    if as_json:
+        print_json({"recording": str(out), "messages": count, "recordings": len(inputs)})
+    else:
+        print_line(f"{out}: {count_things(count, 'message')} of {len(inputs)} recordings")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from dmrl.pipeline.stage_command import stage_command
 from dmrl.terminal.closing import Closing
+from dmrl.terminal.tables import count_things
 
 if TYPE_CHECKING:
     from dmrl.recording import Recovery
@@ -38,11 +39,11 @@ def describe_losses(result: "Recovery") -> str:
     missing = ", ".join(f"{topic} {count}" for topic, count in result.missing.items())
     unknown = "it does not say how many messages there were"
     parts = (
-        f"{sum(result.missing.values())} messages missing ({missing})" * bool(missing),
-        f"{result.damaged_chunks} damaged chunks left out" * bool(result.damaged_chunks),
-        f"{result.nameless} messages left out whose topic they defined" * bool(result.nameless),
-        f"{result.timeless} messages left out whose time is impossible" * bool(result.timeless),
-        f"{result.lost_bytes} bytes that are no whole record lost" * bool(result.lost_bytes),
+        _count(sum(result.missing.values()), "message", f"missing ({missing})"),
+        _count(result.damaged_chunks, "damaged chunk", "left out"),
+        _count(result.nameless, "message", "left out whose topic they defined"),
+        _count(result.timeless, "message", "left out whose time is after the year 2262"),
+        _count(result.lost_bytes, "byte", "that are no whole record lost"),
         "metadata or attachments missing, or damaged and kept as they stand" * result.doubtful,
         *result.contradictions,
         unknown * (not result.counted),
@@ -50,11 +51,16 @@ def describe_losses(result: "Recovery") -> str:
     return ", ".join(part for part in parts if part)
 
 
+def _count(count: int, thing: str, what: str) -> str:
+    return f"{count_things(count, thing)} {what}" if count else ""
+
+
 command = stage_command(
     run,
     Closing(
         lines=lambda result, given: [
-            f"{given.out}: {result.messages} messages brought back; {describe_losses(result)}"
+            f"{given.out}: {count_things(result.messages, 'message')} brought back; "
+            f"{describe_losses(result)}"
         ],
         document=lambda result, _: asdict(result),
     ),

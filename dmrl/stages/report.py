@@ -5,6 +5,7 @@ from typing import Any
 
 from dmrl.pipeline.stage_command import stage_command
 from dmrl.terminal.closing import Closing
+from dmrl.terminal.tables import format_size
 
 
 def run(folder: Path, out: Path | None = None) -> Path:
@@ -35,7 +36,7 @@ def _document(page: Path, _: Any) -> dict[str, Any]:
 
 
 def _lines(page: Path, _: Any) -> list[str]:
-    return [f"{page}: {page.stat().st_size / 1e6:.1f} MB. Open it in a browser"]
+    return [f"{page}: {format_size(page.stat().st_size)}. Open it in a browser"]
 
 
 command = stage_command(run, Closing(lines=_lines, document=_document))

@@ -10,6 +10,7 @@ from dmrl.errors import SettingError
 from dmrl.pipeline.stage_command import stage_command
 from dmrl.terminal.arguments import complete_topic
 from dmrl.terminal.closing import Closing
+from dmrl.terminal.tables import count_things
 
 if TYPE_CHECKING:
     from dmrl.recording import Provenance
@@ -115,6 +116,10 @@ def _compute_kept_ns(recording: Path, settings: Settings) -> tuple[int | None, i
 
 command = stage_command(
     run,
-    Closing(lines=lambda kept, given: [f"{given.out}: {kept} messages"]),
+    Closing(
+        lines=lambda kept, given: [f"{given.out}: {count_things(kept, 'message')}"],
+        path_key="recording",
+        result_key="messages",
+    ),
     folder="recording",
 )

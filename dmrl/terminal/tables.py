@@ -56,6 +56,18 @@ def _cell_text(cell: object) -> str:
     return f"{cell:.4g}" if isinstance(cell, float) else to_one_line(str(cell))
 
 
+def count_things(count: int, thing: str) -> str:
+    """Return a number with its thing, in the plural where it is not one: ``2 topics``."""
+    return f"{count} {thing}{'' if count == 1 else 's'}"
+
+
+def format_size(size: int) -> str:
+    """Return a size in bytes, kB or MB, as large as its unit."""
+    if size < 1e5:
+        return f"{size / 1e3:.1f} kB" if size >= 1000 else count_things(size, "byte")
+    return f"{size / 1e6:.1f} MB"
+
+
 def print_line(line: str) -> None:
     """Print one line of results, with control characters escaped."""
     sys.stdout.write(to_one_line(line) + "\n")

@@ -76,7 +76,9 @@ def through_commands(path: Path, folder: Path) -> None:
     assert list(told["topics"]) == sorted({topic for topic, *_ in want["channels"]})
     assert told["attachments"] == [name for name, *_ in want["attachments"]]
     assert list(told["metadata"]) == [name for name, _ in want["metadata"]]
-    assert {f.text for f in checked.findings if f.level == "error"} <= {"has no messages"}
+    assert {f.text for f in checked.findings if f.level == "error"} <= {
+        "the recording has no messages"
+    }
     out = folder / "out.mcap"
     other = path.with_name(OTHER.get(path.name, "NoData.mcap"))
     for copy in (

@@ -11,6 +11,7 @@ from mcap.writer import Writer
 from dmrl.errors import RecordingError
 from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import Provenance, RecordingWriter, read_raw, recover
+from dmrl.stages.recover import describe_losses
 
 TOPICS = ("/cf1/height", "/cf2/height")
 
@@ -85,6 +86,8 @@ def test_messages_beyond_2262_are_left_out_and_counted(tmp_path: Path) -> None:
         writer.finish()
     found = recover(path, tmp_path / "b.mcap")
     assert (found.messages, found.timeless, found.whole) == (2, 3, False)
+    assert found.missing == {}
+    assert describe_losses(found) == "3 messages left out whose time is after the year 2262"
     assert [raw.time_ns for raw in read_raw(tmp_path / "b.mcap")] == [1, 2**63 - 2]
 
 

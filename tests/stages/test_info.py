@@ -15,6 +15,6 @@ def test_rate_of_a_topic_uses_its_own_time_span(tmp_path: Path) -> None:
             if k >= 1000:  # 100 Hz as well, from 10 s on
                 sink.write(k * 10_000_000, "/cf2/height", message_class("Height")())
         sink.write(0, "/cf3/height", message_class("Height")())
-    rates = {topic: rate for topic, _, _, rate in topic_rows(path, read_summary(path))}
+    rates = {topic: rate for topic, *_, rate in topic_rows(path, read_summary(path))}
     assert rates.pop("/cf3/height") is None
     assert rates == pytest.approx({"/cf1/height": 100.0, "/cf2/height": 100.0})

@@ -20,13 +20,13 @@ from dmrl.recording.checks.scan import (
     CheckData,
     Finding,
     ImageSize,
-    carries_own_type,
     collect,
     collect_from_index,
     collect_values,
 )
 from dmrl.recording.checks.unit_checks import check_periods
 from dmrl.recording.loaded import LoadedRecording
+from dmrl.recording.protobuf.message_types import carries_own_type
 from dmrl.terminal.progress import say
 from dmrl.topics import CALIBRATION, CAMERA_IMAGE, find_topic, parse_topic
 
@@ -47,7 +47,7 @@ def check(path: Path, *, quick: bool = False, values: bool = False) -> list[Find
     path
         A recording.
     quick
-        Check times and labels only, without decoding images.
+        Check types, times and labels only, without decoding images.
     values
         Check the values of sensors and samples of the images as well, if ``quick``.
 
@@ -68,7 +68,7 @@ def check(path: Path, *, quick: bool = False, values: bool = False) -> list[Find
     if data.contents.summary.contradiction:
         findings.append(Finding("warning", "", data.contents.summary.contradiction))
     if not data.contents.summary.count:
-        findings.append(Finding("error", "", "has no messages"))
+        findings.append(Finding("error", "", "the recording has no messages"))
     return sorted(findings, key=lambda f: f.level)
 
 
@@ -101,7 +101,7 @@ def print_findings(path: Path, *, values: bool = False) -> None:
         say(f"warning: {e}")
         return
     for finding in _sort_by_novelty(findings)[:FINDINGS_PRINTED_MAX]:
-        say(f"{finding.level}: {finding.topic}: {finding.text}")
+        say(finding.to_line())
     if len(findings) > FINDINGS_PRINTED_MAX:
         say(f"{len(findings) - FINDINGS_PRINTED_MAX} more: dmrl check {path}")
 
@@ -208,7 +208,7 @@ def _check_calibrations(data: CheckData) -> Iterator[Finding]:
 
 
 RULES: dict[Callable[[CheckData], Iterator[Finding]], bool] = {
-    _check_types: False,
+    _check_types: True,
     _check_times: True,
     _check_signals: True,
     _check_images: False,

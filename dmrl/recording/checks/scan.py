@@ -20,8 +20,10 @@ from dmrl.recording.mcap.batch_reader import iter_batches_in_file_order, join_ba
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.message_batch import Ints, MessageBatch
 from dmrl.recording.protobuf.columns import decode_topic, group_by_topic
+from dmrl.recording.protobuf.message_types import carries_own_type
 from dmrl.recording.reader import iter_columns
-from dmrl.topics import CALIBRATION, CAMERA_IMAGE, CAUSES, LABELS, find_topic, parse_topic
+from dmrl.recording.summary import TopicInfo
+from dmrl.topics import CALIBRATION, CAMERA_IMAGE, CAUSES, LABELS, parse_topic
 
 STAMPED_TYPES = ("CompressedImage", "PoseInFrame")
 """Message types that contain a time stamp."""
@@ -52,6 +54,10 @@ class Finding:
     level: Literal["error", "warning"]
     topic: str
     text: str
+
+    def to_line(self) -> str:
+        """Return the line that is printed."""
+        return f"{self.level}: {self.topic + ': ' if self.topic else ''}{self.text}"
 
 
 @dataclass(slots=True)
@@ -98,10 +104,10 @@ class CheckData:
             self.images.add_batch(topic, batch, total)
 
 
-def carries_own_type(topic: str, schema: str) -> bool:
-    """Return whether a topic is one of dmrl's and has the right message type."""
-    row = find_topic(topic)
-    return row is not None and row.accepts_message(schema)
+def is_decoded(topic: str, info: TopicInfo) -> bool:
+    """Return whether a check decodes the messages of a topic, at least their time stamps."""
+    own = carries_own_type(topic, info.schema)
+    return info.encoding == "protobuf" and (own or _is_stamped(info.schema))
 
 
 def collect(path: Path) -> CheckData:
@@ -178,7 +184,7 @@ def _collect_from_messages(
 ) -> None:
     """Decode messages of a topic of dmrl's, and collect their data."""
     path, schema = collected.contents.path, collected.contents.topics[topic].schema
-    stamped = schema.rpartition(".")[2] in STAMPED_TYPES
+    stamped = _is_stamped(schema)
     if topic in collected.broken or not (carries_own_type(topic, schema) or stamped):
         return
     fields = None if carries_own_type(topic, schema) else ["timestamp"]
@@ -198,6 +204,10 @@ def _collect_from_messages(
             collected.sizes[topic][size] += 1
             if size is None:
                 collected.undecodable_ns[topic].append(time_ns)
+
+
+def _is_stamped(schema: str) -> bool:
+    return schema.rpartition(".")[2] in STAMPED_TYPES
 
 
 def _count_unset_stamps(batch: pa.RecordBatch) -> int:

@@ -18,9 +18,10 @@ from dmrl.recording.copying.chunk_copy import (
 from dmrl.recording.log_times import read_log_times, read_time_spans
 from dmrl.recording.mcap.channel import RawMessage
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS
+from dmrl.recording.protobuf.message_types import carries_own_type
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.provenance_inputs import build_provenance, refuse_duplicates
-from dmrl.recording.reader import match_topics, read_raw
+from dmrl.recording.reader import read_raw, select_topics
 from dmrl.recording.summary import Summary, read_summary
 from dmrl.recording.writer import RecordingWriter
 from dmrl.terminal.progress import say
@@ -134,7 +135,9 @@ def trim(
         If ``out`` exists or cannot be written.
     """
     source = read_summary(path)
-    topics_to_keep = match_topics(path, topics) if topics else frozenset(source.topics)
+    topics_to_keep = frozenset(source.topics)
+    if topics:
+        topics_to_keep = select_topics(path, source.topics, topics)
     if origin is None:
         settings = {"start_ns": start_ns, "end_ns": end_ns, "topics": list(topics)}
         origin = build_provenance("trim", settings, [path])
@@ -143,7 +146,8 @@ def trim(
     with RecordingWriter(out, origin) as sink:
         copy_metadata_and_attachments(source, sink)
         adopt_channels(path, topics_to_keep, sink)
-        for raw in _iter_calibrations(path, topics_to_keep, low, high):
+        typed = frozenset(t for t in topics_to_keep if carries_own_type(t, source.topics[t].schema))
+        for raw in _iter_calibrations(path, typed, low, high):
             sink.write_raw(raw)
         selection = TopicSelection(topics_to_keep, start_ns or 0, high, only_decodable)
         count = sum(write_unit(piece, selection, sink) for piece in iter_units(path, selection))

@@ -1,4 +1,4 @@
-"""Read the Metadata and Attachment records that the Summary section lists, each verified."""
+"""Read the Header, and the Metadata and Attachment records that the Summary lists, verified."""
 
 import zlib
 from io import BytesIO
@@ -6,12 +6,22 @@ from io import BytesIO
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, AttachmentIndex, MetadataIndex
+from mcap.records import Attachment, AttachmentIndex, Header, MetadataIndex
 from mcap.records import Metadata as McapMetadata
 from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.mcap import checksums
-from dmrl.recording.mcap.file import RECORD_STRUCT, BoundedReader
+from dmrl.recording.mcap.file import MAGIC, RECORD_STRUCT, BoundedReader
+
+
+def read_header(stream: BoundedReader) -> Header:
+    """Read the Header record: profile and library of the writer. Both are empty without one."""
+    stream.seek(len(MAGIC))
+    opcode, length = RECORD_STRUCT.unpack(stream.read(RECORD_STRUCT.size))
+    if opcode != Opcode.HEADER:
+        return Header("", "")
+    header: Header = Header.read(ReadDataStream(BytesIO(stream.read(length))))
+    return header
 
 
 def read_metadata(stream: BoundedReader, section: McapSummary) -> dict[str, list[dict[str, str]]]:

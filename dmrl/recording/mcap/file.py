@@ -174,8 +174,8 @@ def _check_magic(stream: BoundedReader) -> None:
         raise RecordingError(f"{path} is empty. Make it again")
     if start != MAGIC:
         raise RecordingError(
-            f"{path} is not an MCAP file: it begins with {start!r}. To import other formats, "
-            "see: dmrl convert --help"
+            f"{path} is not an MCAP file: it begins with {start!r}. To import "
+            f"another format: dmrl convert {path} OUT.mcap"
         )
     stream.seek(max(0, stream.size - len(MAGIC)))
     if stream.size < 2 * len(MAGIC) or stream.read() != MAGIC:

@@ -4,7 +4,7 @@ A recording contains its own schemas. For the types of dmrl, the built-in schema
 have all fields of the recording's.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -28,13 +28,24 @@ def require_types(path: Path, topics: Mapping[str, TopicInfo], chosen: Iterable[
     RecordingError
         If a topic carries another type.
     """
+    for why in iter_wrong_types(topics, chosen):
+        raise RecordingError(
+            f"{path}: {why}. Convert the recording: dmrl convert {path} OUT{path.suffix}"
+        )
+
+
+def iter_wrong_types(topics: Mapping[str, TopicInfo], chosen: Iterable[str]) -> Iterator[str]:
+    """Yield which of dmrl's topics carry another message type than that of `dmrl.topics`."""
     for topic in sorted(chosen):
-        row = find_topic(topic)
-        if row is not None and not row.accepts_message(topics[topic].schema):
-            raise RecordingError(
-                f"{path}: {topic} carries {topics[topic].schema or 'no schema'}, not "
-                f"{row.message}. Convert the recording: dmrl convert --help"
-            )
+        row, schema = find_topic(topic), topics[topic].schema
+        if row is not None and not row.accepts_message(schema):
+            yield f"{topic} carries {schema or 'no schema'}, not {row.message}"
+
+
+def carries_own_type(topic: str, schema: str) -> bool:
+    """Return whether a topic is one of dmrl's and has the right message type."""
+    row = find_topic(topic)
+    return row is not None and row.accepts_message(schema)
 
 
 def find_channel_descriptor(path: Path, channel: Channel) -> Descriptor:

@@ -153,7 +153,7 @@ def test_labels_without_their_image_are_found(tmp_path: Path) -> None:
 
 
 def test_an_empty_recording_is_an_error(tmp_path: Path) -> None:
-    assert record(tmp_path / "a.mcap", lambda _: None) == ["error  has no messages"]
+    assert record(tmp_path / "a.mcap", lambda _: None) == ["error  the recording has no messages"]
 
 
 def test_topic_without_messages_gives_no_finding(tmp_path: Path) -> None:
