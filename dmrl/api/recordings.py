@@ -170,7 +170,10 @@ class Recording:
         return self._read_per_image(topics.LABELS, "peers", robot)
 
     def detections(self, robot: str | None = None) -> "pd.DataFrame":
-        """Return a row per detection: position, depth, confidence, and the network's threshold.
+        """Return a row per candidate: position, depth, confidence, and the network's threshold.
+
+        Candidates below the threshold are in it too. The detections are
+        ``found[found.confidence >= found.threshold]``.
 
         Raises
         ------

@@ -287,11 +287,17 @@ def _load_teacher(path: Path, network: Network) -> Network:
     return teacher
 
 
+def describe_step(step: StepProgress, epochs: int) -> str:
+    """Return the words of the progress line, without a loss until the epoch has one."""
+    loss = "" if step.loss is None else f", loss {step.loss:.3f}"
+    return f"Epoch {step.epoch}/{epochs}{loss}"
+
+
 def _run_steps(
     training: Trainer, settings: TrainConfig, images: int, group: ProcessGroup
 ) -> Result:
     def words(step: StepProgress) -> str:
-        return f"Epoch {step.epoch}/{settings.epochs}, loss {step.loss:.3f}"
+        return describe_step(step, settings.epochs)
 
     left, begun = training.steps_left, time.perf_counter()
     steps = training.train_steps()

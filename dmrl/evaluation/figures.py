@@ -1,6 +1,7 @@
 """Draw the figures of an evaluation: error plots, and a few example images."""
 
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Protocol
 
@@ -37,9 +38,13 @@ class HasErrors(Protocol):
 
 
 def draw_error_plots(folder: Path, judged: Sequence[HasErrors]) -> None:
-    """Write error plots of the first `MAX_ERROR_PLOTS` pairs or observers into a folder."""
-    for one in judged[:MAX_ERROR_PLOTS]:
-        trace = one.trace
+    """Write error plots of the first `MAX_ERROR_PLOTS` pairs or observers into a folder.
+
+    One without a known error, such as an observer that never had a peer in view, has no plot.
+    """
+    traces = (one.trace for one in judged)
+    known = (t for t in traces if any(np.isfinite(e).any() for e in t.errors_m.values()))
+    for trace in islice(known, MAX_ERROR_PLOTS):
         stem = safe_join(folder, trace.name, "a trace")
         plots.plot_error_trace(trace.title, trace.time_s, trace.sigma_m, trace.errors_m, stem)
 

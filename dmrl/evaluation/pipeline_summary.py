@@ -26,7 +26,7 @@ EVALUATION_FILE = "evaluation.json"
 ERRORS_3D = {"positions": positions, "tracks": tracks}
 """Evaluations of 3D positions, in files of their name, with the module that formats each."""
 METRIC_COLUMNS = metric_columns(
-    *("median_px", "within_8_px", "within_20_px", "depth_mae_m", "f1", "ap_16_px")
+    *("median_px", "within_8_px", "within_20_px", "depth_mae_m", "recall", "f1", "ap_16_px")
 )
 
 

@@ -206,7 +206,7 @@ def label_flight(
         labels[robot] = list(build_label_messages(flight, logs, robot, mine, options))
     reports = [report_pair(flight, pair, positions[pair], estimates[pair]) for pair in positions]
     warnings = [*logs.warnings, *_warn_without_camera(flight, filming, options.cameras)]
-    warnings += explain_causes(reports)
+    warnings += explain_causes(reports, solver.gate)
     innovations = {pair: estimate.innovations for pair, estimate in estimates.items()}
     return LabelledFlight(positions, labels, reports, innovations, warnings)
 

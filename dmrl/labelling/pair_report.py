@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from dmrl.estimation.model.gate import DEFAULT_GATE, Gate
 from dmrl.estimation.model.position_metrics import is_covered_by_truth
-from dmrl.estimation.solver.estimate import MISFIT, Estimate
+from dmrl.estimation.solver.estimate import MISFIT, REASONS, Estimate
 from dmrl.labelling.flight_log import FlightLog
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
 from dmrl.labelling.peer_positions import PeerPositions
@@ -16,9 +17,20 @@ from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
 
 SURE = 0.5
 """Smallest probability of a cause that is printed."""
+LATE = (
+    "Subtract the sensor's delay from its times; where all sensors of the robot are late: "
+    "dmrl align"
+)
 REMEDIES = {
     "yaw": "Let its gyroscope settle before the flight",
-    "flow": "Is its height right? Where it is so in every flight: dmrl calibrate --sensors",
+    "yaw rate late": LATE,
+    "flow": "Fly over a lit floor with texture",
+    "flow scale": "Is its height right? Where it is so in every flight: dmrl calibrate --sensors",
+    "flow bias": "Where it is so in every flight: dmrl calibrate --sensors",
+    "flow bias changes": "Fly over a lit floor with texture, and level the sensor",
+    "flow mounted askew": "Turn the sensor straight, or its values when the log is written",
+    "flow follows the turning": "Where is the sensor? Mount it in the middle of the robot",
+    "flow late": LATE,
     "range": "Measure the offset once, and give it with --range-offset-m, or let flights "
     "determine it: dmrl calibrate --sensors",
     "antenna": "Turn the antennas upright, away from metal",
@@ -27,10 +39,10 @@ REMEDIES = {
     "robot": "The ranges then show no bearing. Let both fly about, different ways",
     "sensors": "Try: dmrl info",
     "bearing": "Fly longer and faster, with turns; with a third robot try --method swarm",
-    "positions": "See docs/labelling.md; a wider --gate-m takes more",
+    "positions": "A wider --gate-m takes more: see docs/labelling.md",
     "robots": "Fly different ways, or exchange the names of the robots",
 }
-"""What to do about a cause, by the first word of its name."""
+"""What to do about a cause, by the words that its name begins with; the most words count."""
 MISFIT_REMEDY = "No known error explains it; positions around are refused. Try: dmrl view"
 """What to do about a signal that does not fit."""
 FITS = re.compile(" fits? (if|in) ")
@@ -63,7 +75,7 @@ class PairCause:
         elif FITS.search(self.name):
             remedy = "The labels use it so; write the log so too"
         else:
-            remedy = REMEDIES[self.name.split()[0]]
+            remedy = REMEDIES[max(filter(self.name.startswith, REMEDIES), key=len)]
         return (
             f"{owner}{self.name} ({self.probability:.0%}, {self.from_s:.0f} to {self.to_s:.0f} s). "
             f"{remedy}"
@@ -173,15 +185,29 @@ def name_causes(pair: tuple[str, str], estimate: Estimate) -> list[PairCause]:
     ]  # fmt: skip
 
 
-def explain_causes(reports: Iterable[PairReport]) -> list[str]:
-    """Return a line for each probable cause of a pair, once for both directions."""
-    lines: dict[str, None] = {}
+def explain_causes(reports: Iterable[PairReport], gate: Gate = DEFAULT_GATE) -> list[str]:
+    """Return a line for each probable cause of a pair, once for both directions.
+
+    Where positions are imprecise, it says what the gate compares.
+    """
+    lines: dict[tuple[str, PairCause], str] = {}
     for report in reports:
         names = "-".join(sorted((report.robot, report.peer)))
         for cause in report.causes:
             if cause.probability >= SURE:
-                lines[f"{names}: {cause}"] = None
-    return list(lines)
+                lines.setdefault(
+                    (names, cause), f"{names}: {cause}{_name_gate(report, cause, gate)}"
+                )
+    return list(lines.values())
+
+
+def _name_gate(report: PairReport, cause: PairCause, gate: Gate) -> str:
+    if cause.name != REASONS["imprecise"]:
+        return ""
+    return (
+        f". With a median sigma of {report.sigma_m:.2f} m, over {gate.bad_share:.0%} (--bad-share) "
+        f"even of the best would be over {gate.error_m:g} m (--gate-m) off"
+    )
 
 
 def _rms(error: Any, chosen: Any) -> float | None:

@@ -1,5 +1,6 @@
 """``dmrl demo``: the whole pipeline, small, on shipped data."""
 
+import sys
 from pathlib import Path
 
 from dmrl.terminal.arguments import AsJson
@@ -29,8 +30,20 @@ def command(
     print_report(pipeline.run("demo", out), as_json=as_json)
     page = write_html_report(out)
     if not as_json:
-        print(f"""{page}: open it in a browser. Now try:
-  dmrl view {out}/flight_tracks.mcap     # the flight in rerun: images, detections, tracks
-  dmrl fly fly_in_view flight.mcap && dmrl label flight.mcap labelled.mcap
-  dmrl convert PHOTOS photos.mcap --width-px 640 --height-px 480    # a folder of your own pictures
-  dmrl predict dmrl-nano photos.mcap found.mcap && dmrl view found.mcap""")
+        print(f"{page}: open it in a browser. Now try:\n{suggest_commands(out, sys.argv[0])}")
+
+
+def suggest_commands(out: Path, program: str) -> str:
+    """Return commands to try next, as the shell that ran ``program`` finds them.
+
+    ``make demo`` runs dmrl by its path, since the environment is not active.
+    """
+    activate = Path(program).with_name("activate")
+    lines = [f"source {activate}"] if "/" in program and activate.is_file() else []
+    lines += [
+        f"dmrl view {out}/flight_tracks.mcap     # the flight in rerun: images, detections, tracks",
+        "dmrl fly fly_in_view flight.mcap && dmrl label flight.mcap labelled.mcap",
+        "dmrl convert PHOTOS photos.mcap --width-px 640 --height-px 480    # your own pictures",
+        "dmrl predict dmrl-nano photos.mcap found.mcap && dmrl view found.mcap",
+    ]
+    return "\n".join(f"  {line}" for line in lines)

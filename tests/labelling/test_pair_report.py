@@ -1,5 +1,6 @@
 """The numbers of a pair."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,10 @@ import pytest
 
 from dmrl import topics
 from dmrl.estimation.evidence.error_models import MODELS
+from dmrl.estimation.model.gate import Gate
 from dmrl.estimation.solver.estimate import PAIR_LAYOUT, REASONS, Cause, Estimate
 from dmrl.labelling.flight_log import read_flight
-from dmrl.labelling.pair_report import REMEDIES, PairReport, explain_causes, report_pair
+from dmrl.labelling.pair_report import REMEDIES, PairCause, PairReport, explain_causes, report_pair
 from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, STATUS_UNCONVERGED, message_class
 from dmrl.recording import Provenance, RecordingWriter
@@ -90,4 +92,22 @@ def test_probable_causes_name_the_robot_and_a_remedy(tmp_path: Path) -> None:
 
 def test_every_cause_has_a_remedy() -> None:
     names = [model.name for model in MODELS] + list(REASONS.values())
-    assert {name.split()[0] for name in names} <= set(REMEDIES)
+    assert all(any(map(name.startswith, REMEDIES)) for name in names)
+
+
+def test_a_remedy_fits_the_error_and_not_only_the_sensor() -> None:
+    def remedy(name: str) -> str:
+        return str(PairCause(name, 1.0, 0.0, 9.0, "cf1"))
+
+    assert "height" in remedy("flow scale") and "height" in remedy("flow scale changes")
+    assert all("delay" in remedy(f"{name} late") for name in ("flow", "yaw rate"))
+    others = [m.name for m in MODELS if m.name.startswith("flow") and "scale" not in m.name]
+    assert not [name for name in others if "height" in remedy(name).replace(name, "")]
+
+
+def test_imprecise_positions_come_with_the_numbers_of_the_gate(tmp_path: Path) -> None:
+    got = report(flight(tmp_path / "a.mcap", [0.0, 4.0]))
+    imprecise = PairCause(REASONS["imprecise"], 1.0, 0.0, 9.0, None)
+    both = [replace(got, causes=[imprecise]), replace(got, sigma_m=0.3, causes=[imprecise])]
+    (line,) = explain_causes(both, Gate(0.25, 0.05))
+    assert all(words in line for words in ("0.20 m", "5% (--bad-share)", "0.25 m (--gate-m)"))

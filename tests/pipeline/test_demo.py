@@ -11,6 +11,7 @@ from mcap.reader import make_reader
 from dmrl import recipe
 from dmrl.pipeline import recipe_run
 from dmrl.pipeline.plan import locate_input
+from dmrl.stages.demo import suggest_commands
 
 FLIGHT = Path(__file__).parents[2] / "recipes/demo_flight.mcap"
 SHA256 = "ccd119a831c802188a0c78f2ad84d02a0363806670633ffa6a8a68fa8eaf1b74"
@@ -36,6 +37,13 @@ def test_a_step_reads_the_flight_by_its_name(tmp_path: Path) -> None:
     assert locate_input("demo_flight.mcap", {"demo_flight.mcap"}, tmp_path, None).parent == tmp_path
     assert recipe.locate_recording("../demo_flight.mcap") is None
     assert recipe.locate_recording("demo.toml") is None
+
+
+def test_the_closing_lines_activate_an_environment_that_is_not_on_the_path(tmp_path: Path) -> None:
+    (tmp_path / "activate").touch()
+    assert suggest_commands(Path("demo"), f"{tmp_path}/dmrl").startswith(f"  source {tmp_path}/act")
+    assert suggest_commands(Path("demo"), "dmrl").startswith("  dmrl view demo/")
+    assert suggest_commands(Path("demo"), "/usr/bin/dmrl").startswith("  dmrl view demo/")
 
 
 @pytest.mark.heavy

@@ -45,10 +45,13 @@ LOG_EVERY_STEPS = 10
 
 
 class StepProgress(NamedTuple):
-    """Progress after a training step: epoch from 1, and the mean loss of the last few steps."""
+    """Progress after a training step: epoch from 1, and the mean loss of the last few steps.
+
+    The loss is None until the epoch has read one.
+    """
 
     epoch: int
-    loss: float
+    loss: float | None
 
 
 def select_device(name: str) -> torch.device:
@@ -249,7 +252,8 @@ class Trainer:
         """Train one epoch and return its mean losses."""
         size = self._settings.batch_size
         seen: list[Tensor] = []
-        total, loss = torch.zeros(len(LOSS_NAMES)), math.nan
+        loss: float | None = None
+        total = torch.zeros(len(LOSS_NAMES))
         shares, hard = self._shares, self._settings.hard_share
         if hard:
             shares = mine_hard_negatives(self.network, self._examples, shares, hard)

@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from dmrl.datasets.training import describe_step
 from dmrl.errors import SettingError
 from dmrl.learn.data.batches import CLASS_ID, ROBOT_FIELDS, ExampleSet, collate
 from dmrl.learn.inference.decode_grids import decode
@@ -28,6 +29,18 @@ def test_same_seed_same_bytes_and_another_seed_others(examples: ExampleSet, tmp_
         trained(examples, tmp_path / name, replace(SETTINGS, epochs=1, seed=seed))
         weights.append((tmp_path / name / "model.safetensors").read_bytes())
     assert weights[0] == weights[1] != weights[2]
+
+
+@pytest.mark.heavy
+def test_progress_shows_no_loss_until_an_epoch_has_read_one(
+    examples: ExampleSet, tmp_path: Path
+) -> None:
+    settings = replace(SETTINGS, epochs=2, batch_size=1)
+    network = build_initial_network(settings, examples)
+    training = Trainer(network, examples, settings, tmp_path, identity="dots")
+    lines = [describe_step(step, 2) for step in training.train_steps()]
+    assert lines[0] == "Epoch 1/2" and "Epoch 2/2" in lines
+    assert lines[-1].startswith("Epoch 2/2, loss ") and not [x for x in lines if "nan" in x]
 
 
 @pytest.mark.heavy
