@@ -135,6 +135,7 @@ def main() -> NoReturn:
 def print_help(name: str, console: Console | None = None) -> None:
     """Print a command's help and its examples; load nothing that only its work needs."""
     gc.disable()  # it prints a page and ends: a collection would only cost time
+    app[name].usage = help_pages.format_usage(app, name)
     app.help_print([name], console=console)
     help_pages.print_examples(name, console or Console())
 

@@ -66,6 +66,22 @@ def test_help_lists_every_command_in_the_order_of_the_work(
     assert titles == [*(title.split()[0] for title in cli.GROUPS), "Others"]
 
 
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        *(("merge", "IN... OUT"), ("check", "IN..."), ("find", "QUERY [FOLDER]")),
+        *(("report", "FOLDER [OUT]"), ("dataset", "IN... OUT"), ("trim", "RECORDING OUT")),
+        ("fake-drone", ""),
+    ],
+)
+def test_usage_names_every_argument_and_which_take_several(name: str, arguments: str) -> None:
+    page = io.StringIO()
+    cli.print_help(name, Console(file=page, width=88))
+    usage = page.getvalue().splitlines()[0]
+    assert usage.startswith(f"Usage: dmrl {name} ")
+    assert usage.partition("[OPTIONS]")[2].strip() == arguments
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_lines_are_filled_before_wrapping(name: str) -> None:
     page = io.StringIO()

@@ -54,11 +54,11 @@ class Settings:
         numbers in logs are else cf0, cf1, ... ROS bags and MCAP: also robots or topics of dmrl by
         topics: /lab/odom=cf2,/image=/cf1/camera/image.
     rate_hz
-        Pictures per second, where the source has no times.
+        Images per second, where the source has no times.
     labels
         images: CSV file with labels. Without it, labels.csv in the folder, if there.
     camera
-        Camera that took the pictures as they are stored: aideck, published, a TOML file, or a
+        Camera that took the images as they are stored: aideck, published, a TOML file, or a
         YAML, JSON or XML file of ROS, Kalibr or OpenCV.
         Without it, calibration.toml in the folder, if there.
     width_px
@@ -69,18 +69,18 @@ class Settings:
         TOML file that describes the columns of a CSV file, or fields of topics of a bag or an MCAP
         file, with their units, frames and signs, or nanobench.
     raw
-        images: grey pictures are as the AI-deck's colour sensor gave them; make them RGB.
+        images: grey images are as the AI-deck's colour sensor gave them; make them RGB.
     bits
         Significant bits of pixels of 16 bits: 2^bits - 1 becomes 255. 12 for the values of a 12-bit
         sensor.
     as_stored
-        images: keep pictures as they are stored. Without it, they are turned upright as their EXIF
+        images: keep them as they are stored. Without it, they are turned upright as their EXIF
         orientation says.
     robot_width_m
         Width of the robots, metres: labels without depth get one from the width of their box.
         Needs the camera.
     unlabelled
-        yolo: pictures without a label file are not labelled. Without it, they show nobody.
+        yolo: images without a label file are not labelled. Without it, they show nobody.
     strict
         End with an error if anything of the source cannot be used. Without it, such things are left
         out and counted.
@@ -114,11 +114,11 @@ def run(source: Path, out: Path, settings: Settings) -> dict[str, int]:
     Parameters
     ----------
     source
-        A foreign file or folder: pictures, flight logs, dumps of a camera deck, ROS bags. With a
-        folder as OUT, each thing in it is a source of its own.
+        A foreign file or folder: images, flight logs, dumps of a camera deck, ROS bags. If OUT is a
+        folder, each file or folder in SOURCE is a source of its own.
     out
-        Recording to write, NAME.mcap; with --to, a folder. Must not exist. Another name: the folder
-        of recordings, one for each thing in SOURCE.
+        Recording to write. Must not exist. If its name does not end in .mcap, a folder is written,
+        with a recording for each source in SOURCE. With --to, a folder of files.
     settings
         See `Settings`.
 

@@ -12,12 +12,28 @@ from rich.console import Console, ConsoleOptions
 from rich.text import Text
 
 if TYPE_CHECKING:
+    from cyclopts import App
     from cyclopts.help import HelpPanel
 
 
 def fill_paragraphs(text: str) -> str:
     """Return a text with one line for each paragraph, list item or indented line."""
     return re.sub(r"(?<=\S)[ ]*\n(?=[^\s*-])", " ", text)
+
+
+def format_usage(app: "App", name: str) -> str:
+    """Return the line of usage of a command, with the names of all arguments without a flag."""
+    from cyclopts.help import format_usage as format_flags  # noqa: PLC0415 - help alone
+
+    words = [str(format_flags(app, [name])).partition("[OPTIONS]")[0] + "[OPTIONS]"]
+    for argument in app[name].assemble_argument_collection(parse_docstring=False):
+        if argument.index is None or not argument.show:
+            continue
+        takes_several = argument.token_count()[1]
+        label = argument.name.upper() + "..." * (takes_several and "..." not in argument.name)
+        # A command with any number of arguments, *recordings, checks itself that there is one.
+        words.append(label if argument.required or takes_several else f"[{label}]")
+    return " ".join(words)
 
 
 def read_examples(command: str) -> list[str]:
