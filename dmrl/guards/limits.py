@@ -11,7 +11,7 @@ UNPACKED_BYTES = 128 * MB
 """Largest chunk of a recording, decompressed. dmrl's own have 256 KiB and a message."""
 
 UNPACKED_TIMES = 100
-"""A recording may decompress to `UNPACKED_BYTES` and this many times its own size.
+"""A recording may decompress to `UNPACKED_BYTES` plus this many times its own size.
 
 dmrl's own topics reach about 20; images reach 1.
 """
@@ -20,7 +20,7 @@ MEMORY_BYTES = 500 * MB
 """Memory that a library may use to read a whole file (see `dmrl.guards.memory`), bytes."""
 
 MEMORY_TIMES = 10
-"""A library may use `MEMORY_BYTES` and this many times the size of the file."""
+"""A library may use `MEMORY_BYTES` plus this many times the size of the file."""
 
 ANSWER_BYTES = 4 * MB
 """Answer of a server of buckets that is no object. A page of 1,000 long keys has 3.5 MB."""

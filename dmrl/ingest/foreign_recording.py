@@ -82,14 +82,13 @@ def load_content(source: Path, options: Options, *, skip: Collection[str] = ()) 
     Raises
     ------
     SourceError
-        If no topic can be converted, or the recording is dmrl's own and nothing is renamed.
+        If no topic can be converted, or the recording is dmrl's own, without foreign topics, and
+        nothing is renamed.
     SettingError
         If a name fits no topic.
     """
     summary = read_summary(source)
     kinds = {channel.topic: _to_kind(channel) for channel in _list_channels(source)}
-    if summary.provenance is not None and not (options.names or skip):
-        raise SourceError(f"{source} is a recording already. Pass --to: csv, parquet, ros2")
     own = {old: new for old, new in _iter_own(summary, options) if old not in skip}
     held = []
     for topic, info in summary.topics.items():
@@ -100,6 +99,8 @@ def load_content(source: Path, options: Options, *, skip: Collection[str] = ()) 
         return found[0] is not None and is_camera_image(found[0])
 
     plan, why = plan_topics(held, options, is_camera)
+    if summary.provenance is not None and not (plan or options.names or skip):
+        raise SourceError(f"{source} is a recording already. Pass --to: csv, parquet, ros2")
     for topic, kind, count in held:
         if (topic, kind) in why:
             leave_out(f"messages on {topic}: {why[topic, kind]}", source, count)

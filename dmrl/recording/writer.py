@@ -47,6 +47,8 @@ class RecordingWriter:
         counts of `dmrl.terminal.left_out`, if something was left out.
     recipe
         Text of the recipe of the run. None: the settings as TOML.
+    profile
+        Profile of the Header record, such as that of a recording that is copied.
     keep_on_error
         Keep ``<name>.partial`` after an error, for work that can be resumed.
 
@@ -63,6 +65,7 @@ class RecordingWriter:
         provenance: Provenance,
         *,
         recipe: str | None = None,
+        profile: str = "dmrl",
         keep_on_error: bool = False,
     ) -> None:
         if SUFFIX not in path.suffixes:  # a resumed recording is out.mcap.kept for a while
@@ -72,7 +75,7 @@ class RecordingWriter:
         self._resources = ExitStack()
         partial = self._resources.enter_context(atomic_file(path, keep_on_error=keep_on_error))
         try:
-            self._file = McapFileWriter(partial, f"dmrl {provenance.dmrl_version}")
+            self._file = McapFileWriter(partial, f"dmrl {provenance.dmrl_version}", profile)
             self._resources.callback(self._file.close)
             # Work that can be resumed leaves complete moments: images with their numbers.
             self.chunk_writer = ChunkWriter(

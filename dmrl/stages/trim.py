@@ -26,9 +26,9 @@ class Settings:
     Parameters
     ----------
     from_s
-        First time kept, seconds from the recording's start.
+        Start of the stretch, seconds from the recording's start. Messages of this time are kept.
     to_s
-        First time left out, seconds from the recording's start.
+        End of the stretch, seconds from the recording's start. Messages of this time are not kept.
     topic
         Topic to keep, or a pattern such as /*/labels. Repeat for more. Without it, all.
     only_decodable

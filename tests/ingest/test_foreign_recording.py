@@ -20,7 +20,7 @@ import dmrl
 from dmrl.errors import MissingTopic, SettingError, SourceError
 from dmrl.images.codec import UNDECODABLE, decode, encode_png
 from dmrl.messages import message_class
-from dmrl.recording import Provenance, RecordingWriter, match_topics, read_summary
+from dmrl.recording import Provenance, RecordingWriter, match_topics, read_summary, recover
 from dmrl.stages.convert import Settings, run
 from dmrl.terminal.left_out import count_left_out
 
@@ -174,6 +174,13 @@ def test_missing_topic_error_suggests_renaming(tmp_path: Path) -> None:
     path = foxglove(tmp_path / "a.mcap", sent)
     with pytest.raises(MissingTopic, match="--names /camera/image=/cf1/camera/image"):
         match_topics(path, ["/*/camera/image"])
+
+
+def test_a_copy_that_dmrl_made_of_a_foreign_file_is_converted(tmp_path: Path) -> None:
+    """It has dmrl's provenance, and foreign topics."""
+    sent = {"/cf7/camera/picture": CompressedImage(data=encode_png(PIXELS), format="png")}
+    recover(foxglove(tmp_path / "a.mcap", sent), tmp_path / "b.mcap")
+    assert run(tmp_path / "b.mcap", tmp_path / "c.mcap", Settings()) == {"/cf7/camera/image": 3}
 
 
 def test_robots_of_a_recording_of_dmrl_are_renamed(tmp_path: Path) -> None:

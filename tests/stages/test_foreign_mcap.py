@@ -84,6 +84,7 @@ def test_info_as_json_names_encodings_and_the_container(foreign: Path) -> None:
 def test_trim_and_merge_copy_topics_of_other_types(foreign: Path, tmp_path: Path) -> None:
     part = tmp_path / "part.mcap"
     assert trim(foreign, part, topics=["/cf1/pose", "/cf1/camera/*"], start_ns=12) == 6
+    assert info.run(part).to_document()["profile"] == "ros2"
     assert merge([foreign, part], tmp_path / "both.mcap") == 17
     assert read_summary(tmp_path / "both.mcap").topics["/cf1/pose"].count == 8
 

@@ -17,6 +17,8 @@ from dmrl.recording.copying.chunk_copy import (
 )
 from dmrl.recording.log_times import read_log_times, read_time_spans
 from dmrl.recording.mcap.channel import RawMessage
+from dmrl.recording.mcap.extra_records import read_header
+from dmrl.recording.mcap.file import open_mcap
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS
 from dmrl.recording.protobuf.message_types import carries_own_type
 from dmrl.recording.provenance import Provenance
@@ -143,7 +145,9 @@ def trim(
         origin = build_provenance("trim", settings, [path])
     low = source.start_ns if start_ns is None else max(start_ns, source.start_ns)
     high = MAX_TIME_NS if end_ns is None else end_ns
-    with RecordingWriter(out, origin) as sink:
+    with open_mcap(path) as stream:
+        profile = read_header(stream).profile
+    with RecordingWriter(out, origin, profile=profile) as sink:
         copy_metadata_and_attachments(source, sink)
         adopt_channels(path, topics_to_keep, sink)
         typed = frozenset(t for t in topics_to_keep if carries_own_type(t, source.topics[t].schema))

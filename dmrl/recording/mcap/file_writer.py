@@ -84,11 +84,11 @@ class McapFileWriter:
     ----------
     path
         File to write.
-    library
-        Name of the writer for the Header record.
+    library, profile
+        Name of the writer, and of what its channels conform to, for the Header record.
     """
 
-    def __init__(self, path: Path, library: str) -> None:
+    def __init__(self, path: Path, library: str, profile: str = "dmrl") -> None:
         self._stream = io.FileIO(path, "wb")
         self._at = self._crc = 0
         self._checksums = checksums.Checksums()
@@ -98,7 +98,7 @@ class McapFileWriter:
         self._metadata: list[MetadataIndex] = []
         self._attachments: list[AttachmentIndex] = []
         try:
-            self._append(MAGIC + serialize(Header("dmrl", library)))
+            self._append(MAGIC + serialize(Header(profile, library)))
         except OSError:
             self.close()
             raise
