@@ -42,7 +42,7 @@ OUTPUT_HZ = 10.0
 """Rate of the estimates, Hz: positions between keyframes follow the odometry."""
 
 
-CONFORMAL_S, CONFORMAL_FACTOR = (20.0, 60.0), (0.8, 0.9)
+SIGMA_FACTOR_S, SIGMA_FACTOR = (20.0, 60.0), (0.8, 0.9)
 """Lengths of a flight, seconds, and the factors on its sigmas, interpolated between them. Chosen on
 16 simulated flights without a fault: calibrated and realistic, seeds 43000 to 43102."""
 
@@ -111,7 +111,7 @@ def mix_members(solution: PairSolution, time_s: Array) -> tuple[Array, Array]:
     between = np.einsum("m,mki,mkj->kij", weight, apart, apart)
     covariance = np.tensordot(weight, np.stack(spreads), 1) + between
     key_s = solution.problem.keyframe_s
-    factor = float(np.interp(key_s[-1] - key_s[0], CONFORMAL_S, CONFORMAL_FACTOR))
+    factor = float(np.interp(key_s[-1] - key_s[0], SIGMA_FACTOR_S, SIGMA_FACTOR))
     return states[0] + mean, np.asarray(covariance * factor**2)
 
 

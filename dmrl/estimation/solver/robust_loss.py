@@ -44,7 +44,11 @@ class Gaussian:
 
 @dataclass(frozen=True, slots=True)
 class Cauchy:
-    """s^2 log(1 + r^2 / s^2): the negative log likelihood of Student's t, up to factors.
+    """s^2 log(1 + r^2 / s^2), the loss that equals that of Student's t with nu = s^2 - 1.
+
+    The likelihood is exp(-cost / 2) = (1 + r^2 / s^2)^(-s^2 / 2): Student's t with nu = s^2 - 1
+    degrees of freedom, scaled by s / sqrt(nu). For s = 1.25, nu is 0.56. For s of 1 or less it
+    cannot be normalized: it is a weight, not a probability.
 
     Parameters
     ----------

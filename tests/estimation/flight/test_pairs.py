@@ -6,7 +6,7 @@ import pytest
 
 from dmrl import messages
 from dmrl.estimation.evidence.posterior import Member, Mixture
-from dmrl.estimation.flight.pair_output import CONFORMAL_FACTOR, mix_members
+from dmrl.estimation.flight.pair_output import SIGMA_FACTOR, mix_members
 from dmrl.estimation.flight.pair_solver import PairSolution
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs
 from dmrl.estimation.model import status as room
@@ -74,7 +74,7 @@ def test_covariance_includes_distance_between_modes() -> None:
     mean, covariance = mix_members(found, problem.keyframe_s[:3])
     assert mean == pytest.approx(np.tile([2.5, 0.0, 0.0], (3, 1)))
     assert covariance == pytest.approx(
-        np.tile(np.diag([0.25, 0.0, 0.0]) * CONFORMAL_FACTOR[0] ** 2, (3, 1, 1)), abs=1e-12
+        np.tile(np.diag([0.25, 0.0, 0.0]) * SIGMA_FACTOR[0] ** 2, (3, 1, 1)), abs=1e-12
     )
 
 
