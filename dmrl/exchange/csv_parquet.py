@@ -56,7 +56,8 @@ def write_tables(recording: Path, out: Path, kind: TableFormat) -> dict[str, int
     MissingExtra
         If pandas, which writes CSV, is not installed.
     RecordingError
-        If the recording cannot be read, or none of its topics is protobuf. Others are left out.
+        If the recording cannot be read, or none of its topics. Topics that are not protobuf, or
+        carry another type than dmrl's of that name, are left out.
     OutputError
         If ``out`` exists or cannot be written.
     """
@@ -83,7 +84,7 @@ def write_tables(recording: Path, out: Path, kind: TableFormat) -> dict[str, int
             counts[topic] = table.num_rows
         if found.topics and not counts:
             raise RecordingError(
-                f"{recording} has no topic in protobuf. Try: dmrl info {recording}"
+                f"{recording} has no topic that can be read. Try: dmrl info {recording}"
             )
     return counts
 

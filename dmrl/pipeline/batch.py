@@ -22,7 +22,7 @@ from dmrl.pipeline.job import JobResult, build_job, has_failed
 from dmrl.storage import RemotePath
 from dmrl.terminal.left_out import count_so_far
 from dmrl.terminal.progress import say, track
-from dmrl.terminal.tables import print_json, print_line, print_table
+from dmrl.terminal.tables import count_things, print_json, print_line, print_table
 
 MAX_NUMBERS = 4
 """Most numbers of a result in the table."""
@@ -341,9 +341,9 @@ def _get_texts(result: Any, name: str) -> list[str]:
 def _summarize(result: Any) -> str:
     """Return the numbers of a result as text; for counts by topic, their sum."""
     if isinstance(result, int):
-        return f"{result} messages"
+        return count_things(result, "message")
     found = result.items() if isinstance(result, dict) else ()
     numbers = {name: value for name, value in found if isinstance(value, int | float)}
     if any(name.startswith("/") for name in numbers):
-        return f"{sum(numbers.values())} messages"
+        return count_things(int(sum(numbers.values())), "message")
     return ", ".join(f"{name} {value}" for name, value in list(numbers.items())[:MAX_NUMBERS])

@@ -60,11 +60,11 @@ class Overview:
 
     def _list_warnings(self) -> list[str]:
         """Return why commands that decode a topic refuse it, and the way out."""
-        topics, path = self.summary.topics, self.path
-        wrong = [
-            f"{why}: commands that read it refuse it" for why in iter_wrong_types(topics, topics)
+        topics, way = self.summary.topics, f"dmrl convert {self.path} OUT.mcap"
+        return [
+            f"{topic} {why}: commands that read it refuse it. Convert the recording: {way}"
+            for topic, why in iter_wrong_types(topics, topics)
         ]
-        return [f"{why}. Convert the recording: dmrl convert {path} OUT.mcap" for why in wrong]
 
 
 @dataclass(frozen=True, slots=True)

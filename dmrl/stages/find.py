@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dmrl.terminal.arguments import AsJson
-from dmrl.terminal.tables import print_json, print_line, print_table
+from dmrl.terminal.tables import count_things, print_json, print_line, print_table
 
 
 def command(
@@ -40,4 +40,6 @@ def command(
         for name in found["recording"].to_pylist():
             print_line(str(folder / name))
     else:
-        print_table(f"{found.num_rows} recordings in {folder}", HEADS, display_rows(found))
+        print_table(
+            f"{count_things(found.num_rows, 'recording')} in {folder}", HEADS, display_rows(found)
+        )

@@ -10,7 +10,7 @@ from dmrl.pipeline.executor import open_executor
 from dmrl.pipeline.job import has_failed
 from dmrl.terminal.arguments import AsJson, On, Workers
 from dmrl.terminal.progress import say
-from dmrl.terminal.tables import print_json, print_line
+from dmrl.terminal.tables import count_things, print_json, print_line
 
 if TYPE_CHECKING:
     from dmrl.catalogue import Row
@@ -119,8 +119,8 @@ def command(
         print_json({"catalogue": str(catalogue.file), **asdict(result)})
         return
     print_line(
-        f"{catalogue.file}: {result.recordings} recordings; {result.looked_at} looked at, "
-        f"{result.known} known, {result.gone} gone"
+        f"{catalogue.file}: {count_things(result.recordings, 'recording')}; "
+        f"{result.looked_at} looked at, {result.known} known, {result.gone} gone"
     )
     if result.unread:
         say(f"{result.unread} cannot be read: dmrl find 'error is not null' {folder}")

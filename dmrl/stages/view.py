@@ -9,7 +9,7 @@ from cyclopts import Group, Parameter, validators
 from dmrl.errors import SettingError
 from dmrl.terminal.arguments import Count, Flat, Strict
 from dmrl.terminal.left_out import count_left_out
-from dmrl.terminal.tables import print_line
+from dmrl.terminal.tables import count_things, print_line
 from dmrl.viewer.settings import Settings, Web
 
 DEFAULTS = Settings()
@@ -90,13 +90,13 @@ def command(
     with count_left_out(strict=strict):
         if save_to is not None:
             count = save(recording, save_to, settings)
-            print_line(f"{save_to}: {count} images")
+            print_line(f"{save_to}: {count_things(count, 'image')}")
         elif screenshot_to is not None:
             shown = screenshot(recording, screenshot_to, settings, time_s=time_s, rank=rank)
             print_line(f"{screenshot_to}: {shown}")
         elif flag_to is not None:
             count = flag(recording, flag_to, settings)
-            print_line(f"{flag_to}: {count} rows. Open it in a browser")
+            print_line(f"{flag_to}: {count_things(count, 'row')}. Open it in a browser")
         elif serve_web:
             serve(recording, settings, web)
         else:

@@ -10,8 +10,11 @@ from mcap.writer import Writer
 from dmrl import boundary
 from dmrl.cli import app
 from dmrl.errors import RecordingError
-from dmrl.recording import merge, read_summary, read_table, trim
+from dmrl.exchange.csv_parquet import write_tables
+from dmrl.messages import message_class
+from dmrl.recording import Provenance, RecordingWriter, merge, read_summary, read_table, trim
 from dmrl.stages import check, info
+from dmrl.terminal.left_out import count_left_out
 from dmrl.terminal.tables import format_size
 
 SITE = {"name": "lab", "floor": "3"}
@@ -87,6 +90,20 @@ def test_trim_and_merge_copy_topics_of_other_types(foreign: Path, tmp_path: Path
     assert info.run(part).to_document()["profile"] == "ros2"
     assert merge([foreign, part], tmp_path / "both.mcap") == 17
     assert read_summary(tmp_path / "both.mcap").topics["/cf1/pose"].count == 8
+
+
+def test_tables_leave_out_topics_of_another_type(foreign: Path, tmp_path: Path) -> None:
+    with_height = tmp_path / "height.mcap"
+    with RecordingWriter(with_height, Provenance("test")) as sink:
+        sink.write(0, "/cf1/height", message_class("Height")())
+    both = tmp_path / "both.mcap"
+    merge([foreign, with_height], both)
+    with count_left_out() as left_out:
+        assert write_tables(both, tmp_path / "tables", "parquet") == {"/cf1/height": 1}
+    assert left_out.counts.total() == 11
+    assert any("/cf1/pose, which carries geometry_msgs" in reason for reason in left_out.counts)
+    with pytest.raises(RecordingError, match="no topic that can be read"):
+        write_tables(foreign, tmp_path / "none", "parquet")
 
 
 def test_check_counts_topics_that_it_did_not_decode(

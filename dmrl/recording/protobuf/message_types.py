@@ -12,7 +12,7 @@ from pathlib import Path
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.message import DecodeError
 
-from dmrl.errors import RecordingError, UnreadableTopic
+from dmrl.errors import UnreadableTopic
 from dmrl.messages import PACKAGES, find_descriptor, serialize_schema
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.protobuf.definitions import build_type
@@ -21,25 +21,25 @@ from dmrl.topics import find_topic
 
 
 def require_types(path: Path, topics: Mapping[str, TopicInfo], chosen: Iterable[str]) -> None:
-    """Raise RecordingError unless dmrl's topics carry the message types of `dmrl.topics`.
+    """Raise UnreadableTopic unless dmrl's topics carry the message types of `dmrl.topics`.
 
     Raises
     ------
-    RecordingError
+    UnreadableTopic
         If a topic carries another type.
     """
-    for why in iter_wrong_types(topics, chosen):
-        raise RecordingError(
-            f"{path}: {why}. Convert the recording: dmrl convert {path} OUT{path.suffix}"
-        )
+    for topic, why in iter_wrong_types(topics, chosen):
+        raise UnreadableTopic(path, topic, why)
 
 
-def iter_wrong_types(topics: Mapping[str, TopicInfo], chosen: Iterable[str]) -> Iterator[str]:
-    """Yield which of dmrl's topics carry another message type than that of `dmrl.topics`."""
+def iter_wrong_types(
+    topics: Mapping[str, TopicInfo], chosen: Iterable[str]
+) -> Iterator[tuple[str, str]]:
+    """Yield dmrl's topics with another message type than that of `dmrl.topics`, and which."""
     for topic in sorted(chosen):
         row, schema = find_topic(topic), topics[topic].schema
         if row is not None and not row.accepts_message(schema):
-            yield f"{topic} carries {schema or 'no schema'}, not {row.message}"
+            yield topic, f"carries {schema or 'no schema'}, not {row.message}"
 
 
 def carries_own_type(topic: str, schema: str) -> bool:
