@@ -212,6 +212,11 @@ MODELS: tuple[ErrorModel, ...] = (
         log_odds=COMMON,
     ),
     ErrorModel(
+        "flow scale of both robots",
+        (Unknown("flow_scale_common", "1", 0.15, "flight", motion_scale=(1.0, 1.0)),),
+        log_odds=COMMON,
+    ),
+    ErrorModel(
         "flow scale changes", (_changing("flow_scale_error", "1", 0.02, 0.1, motion=_scaled_shift),)
     ),
     ErrorModel(
@@ -248,7 +253,7 @@ MODELS: tuple[ErrorModel, ...] = (
         (Unknown("range_offset_free", "m", 0.4, "pair", range=longer),),
         log_odds=COMMON,
     ),
-    ErrorModel("range scale", (Unknown("range_scale_free", "1", 0.1, "pair", range_scale=1.0),)),
+    ErrorModel("range scale", (Unknown("range_scale_free", "1", 0.05, "pair", range_scale=1.0),)),
     ErrorModel(
         "range offset changes",
         (

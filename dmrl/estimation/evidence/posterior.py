@@ -4,7 +4,7 @@ The most likely model is combined with further ones, greedily. What is left are 
 several models and in several modes, with their probabilities: a mixture.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,9 @@ GRADE_SHARE, MIN_GRADE, MAX_GRADE = 0.75, 0.35, 3.0
 MIN_STEP_GAIN = -4.0
 """Gain of a model by one Gauss-Newton step below which it is not solved, in log odds. Models that
 change over time show their gain after some steps only."""
+RIVAL_ODDS = -7.0
+"""Log odds of a model against the leading one from which it is tried with the later models, too:
+the price of a rare model."""
 MODEL_TOLERANCE = 3e-5
 """Relative change of the cost that ends the solve of a model."""
 MIN_WEIGHT, MAX_MEMBERS = 0.02, 6
@@ -106,7 +109,7 @@ def weigh_models(
         Member(solver, mode, plain.score - (mode.cost - modes[0].cost) / COST_SCALE)
         for mode in modes[1:]
     ]
-    best = plain
+    best, rounds = plain, []
     for _ in range(MAX_MODELS):
         tried = [
             one
@@ -118,10 +121,31 @@ def weigh_models(
         members += tried
         if leader.score < best.score:
             break
+        rounds.append((leader.models[-1], _list_rivals(leader, tried)))
         best = _select_grade(leader)
         members.append(best)
         others = ()
+    members += _extend_rivals(rounds)
     return _mix([_widen(one) for one in _select_likely(members)])
+
+
+def _list_rivals(leader: Member, tried: Sequence[Member]) -> list[Member]:
+    """Return the solutions under other models that are nearly as likely as the leading one."""
+    least = leader.score + RIVAL_ODDS
+    return [one for one in tried if one.models != leader.models and one.score > least]
+
+
+def _extend_rivals(rounds: Sequence[tuple[Candidate, Sequence[Member]]]) -> Iterator[Member]:
+    """Yield rivals of each round with the models of the later rounds.
+
+    Without them, a rival that explains as much as the leader, such as the scale of the flow for the
+    scale of the ranges, would lose its weight to the first model that both lack.
+    """
+    for number, (_, rivals) in enumerate(rounds[:-1], 1):
+        for rival in rivals:
+            for candidate, _ in rounds[number:]:
+                rival = next(iter(_try_model(rival, candidate, ())), rival)
+            yield _select_grade(rival)
 
 
 def _prior(models: Sequence[Candidate]) -> float:

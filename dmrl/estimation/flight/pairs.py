@@ -44,6 +44,7 @@ from dmrl.estimation.solver.keyframes import build_problem, odometry_dropout, ra
 from dmrl.estimation.solver.levenberg_marquardt import Carried
 from dmrl.estimation.solver.problem import NoiseModel, Problem
 from dmrl.estimation.solver.residuals import Values, odometry_factor, range_factor
+from dmrl.estimation.solver.robust_loss import Gaussian
 from dmrl.estimation.solver.unknowns import TABLE
 
 CONTRADICTED_SIGMAS, CONTRADICTED_RANGE_SIGMAS = 15.0, 3.0
@@ -51,6 +52,9 @@ CONTRADICTED_SIGMAS, CONTRADICTED_RANGE_SIGMAS = 15.0, 3.0
 has a second in which most ranges differ by more."""
 MISFIT_GRADE = 1.8
 """Grade of the noise from which a log may be written wrongly: harsh sensors have 1.4."""
+MAX_PRIOR_SIGMAS = 5.0
+"""Largest value of a constant that explains a flight, in standard deviations of its prior: once in
+two million flights. A range scale of 2.28 "explains" ranges in feet."""
 SHARED_NAMES = {row.name for row in TABLE}
 """Names of the unknowns of the plain model, which both directions of a pair report."""
 MIN_CAMERA_S = 3.0
@@ -117,6 +121,8 @@ def _explains(pieces: Sequence["Piece"]) -> bool:
     """Return whether some error model explains most of a flight."""
     if not pieces or max(piece.estimate.noise.grade for piece in pieces) >= MISFIT_GRADE:
         return False
+    if max(piece.prior_sigmas for piece in pieces) > MAX_PRIOR_SIGMAS:
+        return False
     refused = np.concatenate([one.silent | list_refused(one.estimate) for one in pieces])
     return bool(refused.mean() <= MAJORITY_SHARE)
 
@@ -126,13 +132,15 @@ class Piece(NamedTuple):
 
     ``silent`` (K,) dropouts of odometry or contradictory odometry, ``sighted`` (2, K) consistent
     images of either robot nearby, ``energy`` (3,) mean squares of the own, peer and relative
-    velocity without noise, relative to that noise.
+    velocity without noise, relative to that noise; ``prior_sigmas`` the largest constant, in
+    standard deviations of its prior.
     """
 
     estimate: Estimate
     silent: Mask
     sighted: Mask
     energy: Array
+    prior_sigmas: float = 0.0
 
 
 def _solve_pieces(pair: Pair, noise: NoiseModel | None, *, plain: bool) -> Iterator[Piece]:
@@ -177,7 +185,15 @@ def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
     )
     step = np.clip(np.searchsorted(key_s, time_s, "right") - 1, 0, len(key_s) - 2)
     silent = odometry_dropout(pair, time_s) | find_contradicted_steps(problem, values)[step]
-    return Piece(estimate, silent, list_sighted(solution, time_s), motion_energy(problem, values))
+    sighted, energy = list_sighted(solution, time_s), motion_energy(problem, values)
+    return Piece(estimate, silent, sighted, energy, _find_prior_sigmas(problem, values))
+
+
+def _find_prior_sigmas(problem: Problem, values: Values) -> float:
+    """Return the largest constant with a Gaussian prior, in standard deviations of that."""
+    sigmas = np.abs(values.constants) / problem.noise.prior_std(problem.layout)
+    bounded = [isinstance(row.loss, Gaussian) for _, row in problem.layout.constants]
+    return float(sigmas[bounded].max(initial=0.0))
 
 
 def _with_fit(piece: Piece, solution: PairSolution) -> Piece:
