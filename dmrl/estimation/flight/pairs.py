@@ -6,10 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
+from scipy.special import chdtrc
 
 from dmrl.estimation.evidence.causes import find_causes, find_dropouts
 from dmrl.estimation.evidence.goodness_of_fit import check_fit
-from dmrl.estimation.evidence.mistakes import find_mistake, ranges_are_far
+from dmrl.estimation.evidence.mistakes import (
+    Mistake,
+    find_clock_mistake,
+    find_mistake,
+    ranges_are_far,
+)
 from dmrl.estimation.flight.pair_output import (
     MAJORITY_SHARE,
     OUTPUT_HZ,
@@ -52,9 +58,10 @@ CONTRADICTED_SIGMAS, CONTRADICTED_RANGE_SIGMAS = 15.0, 3.0
 has a second in which most ranges differ by more."""
 MISFIT_GRADE = 1.8
 """Grade of the noise from which a log may be written wrongly: harsh sensors have 1.4."""
-MAX_PRIOR_SIGMAS = 5.0
-"""Largest value of a constant that explains a flight, in standard deviations of its prior: once in
-two million flights. A range scale of 2.28 "explains" ranges in feet."""
+MIN_PRIOR_CHANCE = 1e-4
+"""Smallest probability, by their priors, of the constants of a flight that is explained: four
+sigmas for one of them. Sound simulated flights have 0.7 to 1. A range scale of 2.28 "explains"
+ranges in feet."""
 SHARED_NAMES = {row.name for row in TABLE}
 """Names of the unknowns of the plain model, which both directions of a pair report."""
 MIN_CAMERA_S = 3.0
@@ -89,16 +96,19 @@ def _estimate_pair(
 ) -> tuple[Estimate, Estimate]:
     """Estimate both directions of a pair, with a discrete mistake of its logs corrected."""
     logged, blind, shift_s = drop_held_ranges(logged), None, 0.0
-    mistakes: tuple[Cause, ...] = ()
+    mistakes: list[Cause] = []
+    if not plain and noise is None and (clock := find_clock_mistake(logged)) is not None:
+        logged, shift_s = clock.correct(logged, 1), clock.shift_s
+        mistakes.append(_to_cause(clock, logged, 1))
     pair = drop_contradictions(logged)
     possible = not ranges_are_far(pair)
     pieces = list(_solve_pieces(pair, noise, plain=plain)) if possible else []
     searched = not plain and noise is None and not _explains(pieces)
     if searched and (found := find_mistake(logged)) is not None:
         mistake, robot = found
-        logged, shift_s = mistake.correct(logged, robot), mistake.shift_s
+        logged, shift_s = mistake.correct(logged, robot), shift_s + mistake.shift_s
         pair, pieces = drop_contradictions(logged), []
-        mistakes = (Cause(mistake.name, 1.0, float(pair.time_s[0]), float(pair.time_s[-1]), robot),)
+        mistakes.append(_to_cause(mistake, logged, robot))
         blind = robot if mistake.heading_is_open else None
     pieces = pieces or list(_solve_pieces(pair, noise, plain=plain))
     gaps = (*mistakes, *find_dropouts(logged, pair))
@@ -117,11 +127,15 @@ def _estimate_pair(
     )
 
 
+def _to_cause(mistake: Mistake, pair: Pair, robot: int | None) -> Cause:
+    return Cause(mistake.name, 1.0, float(pair.time_s[0]), float(pair.time_s[-1]), robot)
+
+
 def _explains(pieces: Sequence["Piece"]) -> bool:
     """Return whether some error model explains most of a flight."""
     if not pieces or max(piece.estimate.noise.grade for piece in pieces) >= MISFIT_GRADE:
         return False
-    if max(piece.prior_sigmas for piece in pieces) > MAX_PRIOR_SIGMAS:
+    if min(piece.chance for piece in pieces) < MIN_PRIOR_CHANCE:
         return False
     refused = np.concatenate([one.silent | list_refused(one.estimate) for one in pieces])
     return bool(refused.mean() <= MAJORITY_SHARE)
@@ -132,15 +146,15 @@ class Piece(NamedTuple):
 
     ``silent`` (K,) dropouts of odometry or contradictory odometry, ``sighted`` (2, K) consistent
     images of either robot nearby, ``energy`` (3,) mean squares of the own, peer and relative
-    velocity without noise, relative to that noise; ``prior_sigmas`` the largest constant, in
-    standard deviations of its prior.
+    velocity without noise, relative to that noise; ``chance`` the probability of larger
+    constants by their priors.
     """
 
     estimate: Estimate
     silent: Mask
     sighted: Mask
     energy: Array
-    prior_sigmas: float = 0.0
+    chance: float = 1.0
 
 
 def _solve_pieces(pair: Pair, noise: NoiseModel | None, *, plain: bool) -> Iterator[Piece]:
@@ -186,14 +200,21 @@ def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
     step = np.clip(np.searchsorted(key_s, time_s, "right") - 1, 0, len(key_s) - 2)
     silent = odometry_dropout(pair, time_s) | find_contradicted_steps(problem, values)[step]
     sighted, energy = list_sighted(solution, time_s), motion_energy(problem, values)
-    return Piece(estimate, silent, sighted, energy, _find_prior_sigmas(problem, values))
+    return Piece(estimate, silent, sighted, energy, _compute_prior_chance(problem, values))
 
 
-def _find_prior_sigmas(problem: Problem, values: Values) -> float:
-    """Return the largest constant with a Gaussian prior, in standard deviations of that."""
-    sigmas = np.abs(values.constants) / problem.noise.prior_std(problem.layout)
-    bounded = [isinstance(row.loss, Gaussian) for _, row in problem.layout.constants]
-    return float(sigmas[bounded].max(initial=0.0))
+def _compute_prior_chance(problem: Problem, values: Values) -> float:
+    """Return the chi-square probability of larger constants and first values, by their priors."""
+    layout = problem.layout
+    bounded = [isinstance(row.loss, Gaussian) for _, row in layout.constants]
+    constants = (values.constants / problem.noise.prior_std(layout))[bounded]
+    first = [
+        values.state[0, 3 * layout.robots + k] / row.start_std
+        for k, (_, row) in enumerate(layout.states)
+        if row.evolution in ("walk", "jump")
+    ]
+    sigmas = np.append(constants, first)
+    return float(chdtrc(max(len(sigmas), 1), (sigmas**2).sum()))
 
 
 def _with_fit(piece: Piece, solution: PairSolution) -> Piece:

@@ -1,14 +1,18 @@
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
+from dmrl.estimation.evidence import posterior
 from dmrl.estimation.evidence.causes import find_dropouts, join_causes
 from dmrl.estimation.evidence.error_models import MODELS, Candidate, list_candidates
+from dmrl.estimation.evidence.posterior import Member
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.solver.estimate import Cause
 from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.unknowns import TABLE
+from dmrl.messages import STATUS_OK
 
 from ..flights import flown, pair_of, truth_at
 
@@ -48,6 +52,35 @@ def test_gyroscope_step_is_identified_and_corrected() -> None:
     assert not any(cause.probability > 0.5 and "yaw" in cause.name for cause in sound.causes)
     assert any(cause.probability > 0.5 and "yaw rate" in cause.name for cause in found.causes)
     assert error < worse
+
+
+@pytest.mark.heavy
+def test_a_scale_of_both_flows_is_no_scale_of_the_ranges() -> None:
+    flight = flown("in_view", "calibrated", 1000, 60.0)
+    pair = pair_of(flight)
+    fast = [
+        replace(one, vx_mps=1.3 * one.vx_mps, vy_mps=1.3 * one.vy_mps)
+        for one in (pair.own, pair.peer)
+    ]
+    ((found, _),) = estimate_pairs([replace(pair, own=fast[0], peer=fast[1])])
+    error = np.hypot(*(found.state[:, :2] - truth_at(flight, found.time_s)).T)
+    assert any(cause.name == "flow scale of both robots" for cause in found.causes)
+    kept = found.status == STATUS_OK
+    assert (error[kept] > 0.3).mean() < 0.02 if kept.any() else True
+
+
+def test_rivals_of_a_round_get_the_models_of_later_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, rival, second = list(list_candidates())[:3]
+
+    def extended(base: Member, candidate: Candidate, _others: object) -> list[Member]:
+        return [replace(base, models=(*base.models, candidate), score=base.score + 1.0)]
+
+    monkeypatch.setattr(posterior, "_try_model", extended)
+    monkeypatch.setattr(posterior, "_select_grade", lambda member: member)
+    solver, values = Mock(), Mock()
+    member = Member(solver, values, -3.0, (rival,))
+    (found,) = posterior._extend_rivals([(first, [member]), (second, [member])])
+    assert found.models == (rival, second) and found.score == -2.0
 
 
 def test_dropouts_are_causes_and_windows_are_joined() -> None:
