@@ -28,9 +28,9 @@ class Settings:
     robot
         Only images and measurements of this robot. Without it: every robot, in compare the first.
     from_s
-        First image shown, seconds from the start of the earliest recording.
+        Start of what is shown, seconds from the start of the earliest recording.
     to_s
-        First image left out, seconds from the start.
+        End of what is shown, seconds from the same start. Images of this time are not shown.
     every
         Show one image in this many, with its labels and detections.
     depth_max_m
