@@ -30,7 +30,7 @@ from difflib import get_close_matches
 
 def suggest(wrong: str, known: Iterable[str], otherwise: str) -> str:
     """Return "Did you mean ...?" with the known name nearest to a wrong one, or other words."""
-    near = get_close_matches(wrong, sorted(known), n=1)
+    near = get_close_matches(wrong, sorted(known), n=1, cutoff=0.55)  # two of three letters right
     return f"Did you mean {near[0]}?" if near else otherwise
 
 

@@ -60,7 +60,7 @@ def choose_backend(model: Path, recording: Path, given: BackendName | None) -> B
     if (size_px := next(filter(None, sizes), None)) is None:
         return given or "torch"
     backend = select_fastest_backend(resolve_model_path(model), size_px)
-    say(f"{recording}: the network runs by {backend} (--backend)")
+    say(f"{recording}: the network runs by {backend}; --backend chooses another")
     return backend
 
 

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from dmrl import __version__, atomic_output, cli
 from dmrl.cli import COMMANDS, app
-from dmrl.errors import DmrlError, StorageError
+from dmrl.errors import DmrlError, StorageError, suggest
 from dmrl.guards.safe_names import truncate_middle
 
 HEAVY = {
@@ -202,6 +202,11 @@ def test_without_the_extras_a_command_names_the_extra(
     assert (done.returncode, done.stdout) == (1, ""), done.stderr
     assert "Install it with: pip install 'dmrl[" in done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
+
+
+def test_a_short_command_with_a_letter_too_many_is_suggested() -> None:
+    assert suggest("f" + "lie", COMMANDS, "") == "Did you mean fly?"
+    assert suggest("qqqq", COMMANDS, "Try: dmrl --help") == "Try: dmrl --help"
 
 
 def test_unknown_command_suggests_the_nearest_with_or_without_extras() -> None:

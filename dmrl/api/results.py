@@ -66,5 +66,5 @@ def evaluate_recordings(recordings: Sequence[Path], settings: Any) -> Result:
         return Result(found, f"{named}: {kind.TITLE}", columns, kind.rows(found))
     document = report.describe_evaluation(recordings, found)
     headers, rows = report.build_band_table([document["overall"], *document["bands"]])
-    columns = ["label minus detection", *headers]
+    columns = ["detection minus label", *headers]
     return Result(document, f"{named}: {found.pairs.images} images", columns, rows)

@@ -23,7 +23,7 @@ from dmrl.learn.inference.detection_metrics import (
 from dmrl.learn.inference.matching import Points
 
 Pair = tuple[LabelledDetections, LabelledDetections]
-HEADERS = ("label minus detection", "first", "second", "second minus first", "differs")
+HEADERS = ("detection minus label", "first", "second", "second minus first", "differs")
 
 
 def align_images(first: LabelledDetections, second: LabelledDetections) -> Pair | None:

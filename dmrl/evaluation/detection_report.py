@@ -194,7 +194,7 @@ def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None
     if is_pooled({"images": evaluation.pairs.images, "paired": evaluation.paired}):
         print_line(f"{title}, each by two models: below is their comparison, not their mean")
     else:
-        print_table(title, ["label minus detection", *headers], rows)
+        print_table(title, ["detection minus label", *headers], rows)
     notes = [f"{count} {why}" for why, count in evaluation.pairs.left_out.items()]
     if unmatched := evaluation.bands[0].unmatched:
         notes.append(f"{unmatched} labels without any detection")

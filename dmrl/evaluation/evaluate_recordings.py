@@ -20,7 +20,7 @@ from dmrl.evaluation.detection_report import (
 )
 from dmrl.recording import read_summary
 from dmrl.terminal.progress import say
-from dmrl.terminal.tables import print_line, print_table
+from dmrl.terminal.tables import print_note, print_table
 
 figures: ModuleType | None
 try:
@@ -137,4 +137,4 @@ def print_document(recording: Path, made: Document) -> None:
     kind = flights if "flights" in made else tracks if "robots" in made else positions
     headers = [words for _, words, _ in kind.COLUMNS]
     print_table(f"{recording}: {kind.TITLE}", [kind.EACH, *headers], kind.rows(made))
-    print_line(kind.note(made))
+    print_note(kind.note(made))

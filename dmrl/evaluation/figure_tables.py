@@ -64,7 +64,7 @@ def format_interval(figure: Mapping[str, Any], form: str) -> str:
     if figure["value"] is None:
         return "-"
     within = ", ".join(format(end, form).removesuffix("%") for end in ends if end is not None)
-    return f"{format(figure['value'], form)} [{within}]"
+    return format(figure["value"], form) + (f" [{within}]" if within else "")
 
 
 def band_to_json(band: BandMetrics) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 from dmrl.evaluation import positions, tracks
 from dmrl.evaluation.figure_tables import format_values, metric_columns
 from dmrl.guards.bounded_parsing import parse_json
-from dmrl.terminal.tables import print_json, print_line, print_table
+from dmrl.terminal.tables import print_json, print_line, print_note, print_table
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ def print_report(done: Sequence[StepOutcome], *, as_json: bool = False) -> None:
         for name, document in documents.items():
             headers = [words for _, words, _ in module.COLUMNS]
             print_table(name, ["", *headers], module.rows(document))
-            print_line(module.note(document))
+            print_note(module.note(document))
     rows = [(name, *_format_row(document)) for name, document in evaluations.items()]
     headers = [title for _, title, _ in METRIC_COLUMNS]
     if rows:

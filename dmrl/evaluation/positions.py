@@ -254,8 +254,8 @@ COLUMNS = (
     ("nees", "NEES", ".1f"),
     ("coverage_95", "in 95 %", ".0%"),
     ("kept", "kept", ".0%"),
-    ("precision", "good of kept", ".1%"),
-    ("recall", "kept of good", ".0%"),
+    ("precision", "precision", ".1%"),
+    ("recall", "recall", ".0%"),
     ("kept_rmse_m", "RMSE of kept, m", ".2f"),
 )
 
@@ -267,10 +267,12 @@ def note(made: Mapping[str, Any]) -> str:
     bound = f"; bound: the least RMSE with this noise, which allows to keep {kept}" if kept else ""
     return (
         "errors are horizontal; covered: share of the truth that has an estimate; kept: status "
-        f"OK; good: error of {MAX_GOOD_ERROR_M:g} m at most; these cover the whole flight. From "
-        f"{made['settle_s']:g} s on: RMSE; 95 %: 95th percentile of the error; wrong: share of "
-        "pairs with an error of half their distance; NEES: squared error over covariance, 2 if "
-        "the covariance is right; in 95 %: share of the truth inside the 95 % ellipse"
+        f"OK; good: error of {MAX_GOOD_ERROR_M:g} m at most; precision: share of "
+        "the kept that is good; recall: share of the good that is kept; these cover the whole "
+        f"flight. From {made['settle_s']:g} s on: RMSE; 95 %: 95th percentile of the error; wrong: "
+        "share of pairs with an error of half their distance; NEES: squared error over "
+        "covariance, 2 if the covariance is right; in 95 %: share of the truth "
+        "inside the 95 % ellipse"
         f"{bound}"
     )
 

@@ -261,4 +261,4 @@ def print_quantization(out: Path, result: QuantizationReport) -> None:
     compared = [list(row) for row in zip(titles, *both, strict=True)]
     compared.append(["most confident cell kept", "", f"{result.argmax_kept:.1%}"])
     title = f"{result.images} images of split {result.split}"
-    print_table(title, ("label minus detection", "float", "int8"), compared)
+    print_table(title, ("detection minus label", "float", "int8"), compared)

@@ -16,7 +16,7 @@ from dmrl import __version__
 from dmrl.datasets import open_dataset
 from dmrl.errors import DmrlError
 from dmrl.evaluation import comparison, flights, positions, tracks
-from dmrl.evaluation.figure_tables import build_band_table
+from dmrl.evaluation.figure_tables import build_band_table, format_interval
 from dmrl.html_report.blocks import (
     Block,
     Figure,
@@ -51,8 +51,8 @@ METRICS = {
     "ap_16_px": ("AP at 16 px", ".3f"),
 }
 EVALUATION_IMAGES = {
-    "examples.png": "images, confidence and depth, at 20, 50, 80 and 95 % of all errors; "
-    "a failure is named above its image",
+    "examples.png": "images, confidence and depth, at 20, 50, 80 and 95 % of all errors, with "
+    "detections of any confidence; a failure is named above its image",
     "error-violins.png": "errors",
     "error-by-distance.png": "errors by distance",
 }
@@ -123,15 +123,7 @@ def _detections_section(found: ReportInputs, pictures: ImageEmbedder) -> list[Bl
 
 
 def _metric_cells(overall: Mapping[str, Any]) -> list[str]:
-    return [_format_interval(overall[name], form) for name, (_, form) in METRICS.items()]
-
-
-def _format_interval(figure: Mapping[str, Any], form: str) -> str:
-    if figure["value"] is None:
-        return "-"
-    ends = [figure["low"], figure["high"]]
-    within = "" if None in ends else f" ({', '.join(format(end, form) for end in ends)})"
-    return format(figure["value"], form) + within
+    return [format_interval(overall[name], form) for name, (_, form) in METRICS.items()]
 
 
 def _iter_detection_charts(few: Mapping[str, Any]) -> Iterable[Figure]:
@@ -144,7 +136,10 @@ def _iter_detection_charts(few: Mapping[str, Any]) -> Iterable[Figure]:
         words = "precision over recall, matches within 16 px"
         yield draw_or_explain(charts.plot_precision_recall, curves, caption=words)
     if bins := extract_valid(few, _reliability_bins):
-        words = "share of correct detections over their confidence; calibrated is the diagonal"
+        words = (
+            "share of correct detections over their confidence; calibrated is the diagonal, around "
+            "which the dots of few detections scatter"
+        )
         yield draw_or_explain(charts.plot_reliability, bins, caption=words)
 
 
@@ -185,7 +180,7 @@ def _evaluation_details(
     words = f"{said['labels']} labels, threshold {float(said['threshold']):.2f}.{partial}"
     headers, rows = build_band_table([said["overall"], *said["bands"]])
     rows = [] if comparison.is_pooled(said) else rows
-    table = _table(["label minus detection", *headers], rows)
+    table = _table(["detection minus label", *headers], rows)
     figures = (
         pictures.embed_if_present(found.folder / name / file, caption, full=k == 0)
         for k, (file, caption) in enumerate(EVALUATION_IMAGES.items())

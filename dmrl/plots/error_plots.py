@@ -18,7 +18,7 @@ def plot_error_violins(
     Parameters
     ----------
     u_px, v_px, depth_m
-        (N,) label minus detection, NaN where there was no detection.
+        (N,) detection minus label, NaN where there was no detection.
     stem
         Path without suffix.
     """
@@ -28,7 +28,7 @@ def plot_error_violins(
         pixels.set(ylabel="pixel error, px", title=f"{len(u_px)} labels")
         _draw_violins(metres, {"depth": depth_m}, 0.6)
         metres.set(ylabel="depth error, m")
-        figure.supxlabel("label minus detection; line: median, bar: middle half", fontsize=9)
+        figure.supxlabel("detection minus label; line: median, bar: middle half", fontsize=9)
 
 
 def _draw_violins(axes: Any, errors: Mapping[str, NDArray[np.float64]], least: float) -> None:
@@ -111,7 +111,7 @@ def plot_error_by_distance(
     error_px
         (N,) length of the pixel error, not finite where there was no detection.
     depth_error_m
-        (N,) label minus detection, metres.
+        (N,) detection minus label, metres.
     stem
         Path without suffix.
     step_m
@@ -135,7 +135,7 @@ def plot_error_by_distance(
                 f"{radius_px} px", (1, radius_px), xycoords=("axes fraction", "data"), fontsize=8
             )
         metres.axhline(0, color="grey", linewidth=0.8)
-        metres.set(ylabel="depth error, m\n(label minus detection)", xlabel="depth of the label, m")
+        metres.set(ylabel="depth error, m\n(detection minus label)", xlabel="depth of the label, m")
         metres.set_xlim(left=0)
         add_legend_below(figure, metres, fontsize=9, ncols=2)
 

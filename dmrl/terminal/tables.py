@@ -11,6 +11,7 @@ from rich.table import Table
 
 from dmrl.errors import to_one_line
 
+NOTE_CHARACTERS = 100
 NOT_A_TERMINAL_COLUMNS = 200  # a pipe has no width; wrapped rows cannot be searched
 
 
@@ -71,6 +72,18 @@ def format_size(size: int) -> str:
 def print_line(line: str) -> None:
     """Print one line of results, with control characters escaped."""
     sys.stdout.write(to_one_line(line) + "\n")
+
+
+def print_note(words: str) -> None:
+    """Print definitions, which "; " separates, as many in a line as fit ``NOTE_CHARACTERS``."""
+    lines: list[str] = []
+    for part in words.split("; "):
+        if lines and len(lines[-1]) + len(part) + 2 <= NOTE_CHARACTERS:
+            lines[-1] += f"; {part}"
+        else:
+            lines.append(part)
+    for line in lines:
+        print_line(line)
 
 
 def print_json(document: Any) -> None:

@@ -149,7 +149,7 @@ def test_only_the_chosen_source_counts(write: Callable[..., Path]) -> None:
     both = [peer(10, 10), peer(10, 18, source="published")]
     path = write({"cf1": [(both, [found(10, 10)])]})
     assert figures(path)["bias_v_px"] == 0
-    assert figures(path, Settings(against="published", draws=5))["bias_v_px"] == 8
+    assert figures(path, Settings(against="published", draws=5))["bias_v_px"] == -8
 
 
 def test_images_that_cannot_be_judged_are_left_out_and_counted(

@@ -196,7 +196,7 @@ def test_fastest_backend_is_chosen_and_reported(
     dots: Path, settled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(settled, dots, tmp_path / "out.mcap", Settings())
-    assert "the network runs by onnx (--backend)" in capsys.readouterr().err
+    assert "the network runs by onnx; --backend chooses another" in capsys.readouterr().err
     run(settled, dots, tmp_path / "named.mcap", Settings(backend="onnx"))
     assert "--backend" not in capsys.readouterr().err
     assert (tmp_path / "out.mcap").read_bytes() == (tmp_path / "named.mcap").read_bytes()

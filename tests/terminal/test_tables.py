@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl.terminal.tables import print_json, print_table
+from dmrl.terminal.tables import print_json, print_note, print_table
 
 
 def test_a_table_holds_every_cell_unwrapped(capsys: pytest.CaptureFixture[str]) -> None:
@@ -25,3 +25,11 @@ def test_json_is_one_document(capsys: pytest.CaptureFixture[str]) -> None:
     assert json.loads(capsys.readouterr().out) == {"b": 1.5, "a": [None, "x.mcap"]}
     with pytest.raises(ValueError, match="JSON"):
         print_json(float("nan"))
+
+
+def test_a_note_breaks_between_its_definitions(capsys: pytest.CaptureFixture[str]) -> None:
+    parts = [f"word {k}: {'x' * 30}" for k in range(6)]
+    print_note("; ".join(parts))
+    lines = capsys.readouterr().out.splitlines()
+    assert "; ".join(lines) == "; ".join(parts)
+    assert len(lines) == 3 and max(map(len, lines)) <= 100

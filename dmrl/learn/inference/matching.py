@@ -70,7 +70,7 @@ class Points:
 
 @dataclass(frozen=True, slots=True)
 class LabelErrors:
-    """Label minus detection, one row per label; NaN if an image has too few detections.
+    """Detection minus label, one row per label; NaN if an image has too few detections.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def compute_errors(labels: Points, detections: Points) -> LabelErrors:
     def difference(label: Array, detection: Array) -> Array:
         if not len(detection):
             return np.full(len(label), np.nan)
-        return np.where(missing, np.nan, label - detection[rows])
+        return np.where(missing, np.nan, detection[rows] - label)
 
     names = ("u_px", "v_px", "depth_m")
     return LabelErrors(*(difference(getattr(labels, k), getattr(detections, k)) for k in names))

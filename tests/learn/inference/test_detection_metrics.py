@@ -77,7 +77,7 @@ def test_curves_without_detections_or_labels_are_empty() -> None:
 def test_figures_of_a_known_offset() -> None:
     labels, found = scene(10, offset_px=12)
     got = values(overall(labels, found, 10))
-    assert got["median_px"] == got["mean_px"] == got["rmse_px"] == got["bias_u_px"] == 12
+    assert got["median_px"] == got["mean_px"] == got["rmse_px"] == -got["bias_u_px"] == 12
     assert (got["within_8_px"], got["within_20_px"]) == (0, 1)
     assert (got["ap_8_px"], got["ap_16_px"], got["recall"]) == (0, 1, 1)
 
@@ -236,8 +236,8 @@ def test_metrics_of_different_errors_equal_hand_computed_values() -> None:
     assert got["rmse_px"] == pytest.approx(((25 + 144 + 64 + 2500) / 4) ** 0.5)
     assert got["median_px"] == pytest.approx(10)
     assert got["p95_px"] == pytest.approx(50)
-    assert got["bias_u_px"] == pytest.approx(-1.5)  # label minus detection: -3, 0, 8, -30
-    assert got["bias_v_px"] == pytest.approx(-8)
+    assert got["bias_u_px"] == pytest.approx(1.5)  # detection minus label: 3, 0, -8, 30
+    assert got["bias_v_px"] == pytest.approx(8)
     assert got["depth_mae_m"] == pytest.approx(0.7 / 4)
     assert got["depth_rmse_m"] == pytest.approx((0.21 / 4) ** 0.5)
     assert (got["within_8_px"], got["within_20_px"]) == (0.5, 0.75)

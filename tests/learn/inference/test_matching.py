@@ -47,8 +47,8 @@ def test_one_label_takes_the_most_confident_detection_not_the_nearest() -> None:
     labels = points((0, 10, 10, 1, 1))
     found = points((0, 100, 10, 2, 0.9), (0, 11, 10, 1, 0.8))
     assert assign_detections(labels, found).tolist() == [0]
-    assert compute_errors(labels, found).u_px.tolist() == [-90.0]
-    assert compute_errors(labels, found).depth_m.tolist() == [-1.0]
+    assert compute_errors(labels, found).u_px.tolist() == [90.0]
+    assert compute_errors(labels, found).depth_m.tolist() == [1.0]
 
 
 def test_two_labels_are_assigned_at_least_total_distance() -> None:
