@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
-from scipy.special import chdtrc
+from scipy.special import chdtrc, erfc
 
 from dmrl.estimation.evidence.causes import find_causes, find_dropouts
 from dmrl.estimation.evidence.goodness_of_fit import check_fit
@@ -58,9 +58,9 @@ CONTRADICTED_SIGMAS, CONTRADICTED_RANGE_SIGMAS = 15.0, 3.0
 has a second in which most ranges differ by more."""
 MISFIT_GRADE = 1.8
 """Grade of the noise from which a log may be written wrongly: harsh sensors have 1.4."""
-MIN_PRIOR_CHANCE = 1e-4
+MIN_PRIOR_CHANCE = 1e-3
 """Smallest probability, by their priors, of the constants of a flight that is explained: four
-sigmas for one of them. Sound simulated flights have 0.7 to 1. A range scale of 2.28 "explains"
+sigmas for one of fifteen. Sound simulated flights have 0.7 to 1. A range scale of 2.28 "explains"
 ranges in feet."""
 SHARED_NAMES = {row.name for row in TABLE}
 """Names of the unknowns of the plain model, which both directions of a pair report."""
@@ -204,7 +204,10 @@ def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
 
 
 def _compute_prior_chance(problem: Problem, values: Values) -> float:
-    """Return the chi-square probability of larger constants and first values, by their priors."""
+    """Return the probability of larger constants and first values, by their priors.
+
+    It is that of all of them (chi-square), or of the largest (Bonferroni), whichever is less.
+    """
     layout = problem.layout
     bounded = [isinstance(row.loss, Gaussian) for _, row in layout.constants]
     constants = (values.constants / problem.noise.prior_std(layout))[bounded]
@@ -214,7 +217,8 @@ def _compute_prior_chance(problem: Problem, values: Values) -> float:
         if row.evolution in ("walk", "jump")
     ]
     sigmas = np.append(constants, first)
-    return float(chdtrc(max(len(sigmas), 1), (sigmas**2).sum()))
+    largest = len(sigmas) * erfc(np.abs(sigmas).max(initial=0.0) / np.sqrt(2.0))
+    return float(min(chdtrc(max(len(sigmas), 1), (sigmas**2).sum()), largest))
 
 
 def _with_fit(piece: Piece, solution: PairSolution) -> Piece:
