@@ -122,14 +122,22 @@ def read(
     RecordingError
         If the file is not a complete recording, or a message is not of its type.
     """
+    names = match_topics(path, topics) if topics else None
     classes: dict[Channel, Any] = {}
-    for raw in read_raw(path, *topics, start_ns=start_ns, end_ns=end_ns):
-        kind = classes.get(raw.channel)
-        if kind is None:
-            kind = classes[raw.channel] = GetMessageClass(
-                find_channel_descriptor(path, raw.channel)
-            )
-        yield Stamped(raw.time_ns, raw.channel.topic, parse_message(raw, kind, path))
+    for batch, channels in iter_batches(path, names, start_ns=start_ns, end_ns=end_ns):
+        known: dict[int, tuple[str, Any]] = {}  # by number: hashing a channel takes long
+        for number, time_ns, _, data in batch.iter_rows():
+            if number not in known:
+                channel = channels[number]
+                if channel not in classes:
+                    classes[channel] = GetMessageClass(find_channel_descriptor(path, channel))
+                known[number] = channel.topic, classes[channel]
+            topic, kind = known[number]
+            try:
+                message = kind.FromString(data)
+            except DecodeError as e:
+                raise corrupt_error(path, f"{topic} at {time_ns} ns: {e}") from e
+            yield Stamped(time_ns, topic, message)
 
 
 def parse_message(raw: RawMessage, kind: Any, path: Path) -> Any:
