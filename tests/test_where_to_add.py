@@ -103,7 +103,8 @@ def test_a_sensor(clone: Clone, tmp_path: Path) -> None:
     )
     assert "ranges to up" not in converted
     held = json.loads(info)["topics"]
-    assert held["/cf1/pressure"] == {"message": "dmrl.v1.Pressure", "count": 3}
+    assert held["/cf1/pressure"]["message"] == "dmrl.v1.Pressure"
+    assert held["/cf1/pressure"]["count"] == 3
     assert held["/cf1/range_up"]["count"] == held["/cf1/sonar/cf2"]["count"] == 3
     assert "/cf1/range/up" not in held
     assert "both have /cf1/pressure" in merged
