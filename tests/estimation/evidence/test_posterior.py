@@ -66,7 +66,8 @@ def test_a_scale_of_both_flows_is_no_scale_of_the_ranges() -> None:
     error = np.hypot(*(found.state[:, :2] - truth_at(flight, found.time_s)).T)
     assert any(cause.name == "flow scale of both robots" for cause in found.causes)
     kept = found.status == STATUS_OK
-    assert (error[kept] > 0.3).mean() < 0.02 if kept.any() else True
+    assert np.median(error) < 0.4  # 0.6 where the scale is taken for that of the ranges
+    assert not (error[kept] > 0.3).any()
 
 
 def test_rivals_of_a_round_get_the_models_of_later_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
