@@ -7,6 +7,7 @@ PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3.13 python3,$(she
 BIN := $(VENV)/bin
 ABSOLUTE_BIN := "$(if $(filter /%,$(VENV)),$(VENV),$(CURDIR)/$(VENV))/bin"
 LAYOUT := build/layout
+LEROBOT := build/lerobot
 # One process for each core, each with one thread: more would take the cores from each other.
 # Tests of a file stay together, with what they share.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --dist loadfile
@@ -20,7 +21,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help int8 bench bench-labels reliability demo test test-heavy test-all test-faults mutants golden check format lint types imports spell schemas constraints docs pictures site examples wheels layout clean
+.PHONY: help int8 bench bench-labels reliability demo test test-heavy test-all test-lerobot test-faults mutants golden check format lint types imports spell schemas constraints docs pictures site examples wheels layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -46,6 +47,15 @@ bench-labels: $(VENV)/.dev ## Judge labels, sound and with faults: build/judge/.
 
 mutants: $(VENV)/.dev ## Change the code a little, often; see if tests notice. ARGS="geometry --seed 1".
 	$(BIN)/python tests/mutants.py $(ARGS)
+
+test-lerobot: export DMRL_LEROBOT_PYTHON = $(LEROBOT)/bin/python
+test-lerobot: $(VENV)/.dev $(LEROBOT)/.installed ## Read a dataset written for LeRobot by lerobot itself, in its own environment (8 GB).
+	$(PYTEST) --numprocesses 0 -m heavy tests/exchange -k lerobot $(ARGS)
+
+$(LEROBOT)/.installed:
+	python3 -m venv $(LEROBOT)
+	$(LEROBOT)/bin/pip install --quiet lerobot==0.4.4
+	touch $@
 
 test-faults: $(VENV)/.dev ## Break disks, processes and files in every way; prints what came of it.
 	$(PYTEST) -m "slow or not slow" --timeout 3600 tests/faults tests/recording/test_flips.py tests/recording/test_renames.py tests/recording/test_budgets.py tests/formats/test_fuzz.py $(ARGS)

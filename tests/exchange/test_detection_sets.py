@@ -2,6 +2,8 @@
 
 import gc
 import json
+import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -222,11 +224,40 @@ def test_lerobot_s_layout_is_read_by_its_schema(source: Path) -> None:
         np.testing.assert_allclose(np.array(edges).T, boxes_of(k)[:, :2], atol=0.001)
 
 
-def test_lerobot_reads_it(source: Path) -> None:
-    lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset")
-    found = lerobot.LeRobotDataset("dmrl/test", root=export(source, "lerobot"))
-    assert (found.num_frames, found.num_episodes) == (9, 2)
-    assert found[8]["log_time"] == 8 * STEP_NS
+READ_BY_LEROBOT = """
+import sys
+
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("dmrl/test", root=sys.argv[1])
+assert (dataset.num_frames, dataset.num_episodes, dataset.fps) == (9, 2, 20)
+rows = [dataset[k] for k in range(len(dataset))]
+names = [n for n in rows[0] if n.startswith("labels.") or n in ("log_time", "episode_index")]
+columns = {n: np.stack([row[n].numpy() for row in rows]) for n in names}
+images = np.stack([row["observation.images.camera"].numpy() for row in rows])
+np.savez(sys.argv[2], images=images, **columns)
+"""
+
+
+@pytest.mark.heavy
+def test_lerobot_reads_it(source: Path, tmp_path: Path) -> None:
+    python = os.environ.get("DMRL_LEROBOT_PYTHON")
+    if not python:
+        pytest.skip("lerobot needs an environment of its own: make test-lerobot")
+    read_by_lerobot = [python, "-c", READ_BY_LEROBOT, export(source, "lerobot"), tmp_path / "rows"]
+    subprocess.run(read_by_lerobot, check=True, env={**os.environ, "HF_HUB_OFFLINE": "1"})
+    rows = np.load(tmp_path / "rows.npz")
+    assert rows["episode_index"].tolist() == [0] * 6 + [1] * 3
+    assert rows["log_time"].tolist() == [k * STEP_NS for k in range(COUNT)]
+    for k, image in enumerate(rows["images"]):
+        np.testing.assert_allclose(image.transpose(1, 2, 0) * 255, pixels_of(k), atol=0.001)
+        count = len(peers_of(k))
+        box = [rows[f"labels.{name}_px"][k] for name in ("left", "top", "right", "bottom")]
+        np.testing.assert_allclose(np.array(box).T[:count], boxes_of(k), atol=0.01)
+        assert np.isnan(np.array(box).T[count:]).all()
+        depths = [peer["depth_m"] or np.nan for peer in peers_of(k)]
+        np.testing.assert_allclose(rows["labels.depth_m"][k][:count], depths, atol=1e-5)
 
 
 @pytest.mark.parametrize("to", ["yolo", "coco", "lerobot", "webdataset"])
