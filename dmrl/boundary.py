@@ -32,12 +32,7 @@ from dmrl import atomic_output
 from dmrl.errors import DmrlError, SettingError, describe_error, to_one_line
 from dmrl.guards.safe_names import truncate_middle
 from dmrl.guards.temporary_folder import find_system_folder
-from dmrl.terminal.signals import (
-    NOTHING_WRITTEN,
-    TERMINATION_SIGNALS,
-    handle_signals,
-    is_importing,
-)
+from dmrl.terminal.signals import NOTHING_WRITTEN, TERMINATION_SIGNALS, handle_signals, is_importing
 
 RETRY_S = 0.02
 """Time between two looks whether an import has ended, seconds."""

@@ -19,9 +19,5 @@ SECOND_DETECTION_RGB = (80, 140, 255)
 OWN_RGB, PEER_RGB = (240, 240, 240), (150, 150, 150)
 """Colours of a robot's own sensors, and of its peer's."""
 
-STATUS_RGB = {
-    "OK": (70, 120, 175),
-    "UNCONVERGED": (130, 130, 130),
-    "AMBIGUOUS": (200, 60, 60),
-}
+STATUS_RGB = {"OK": (70, 120, 175), "UNCONVERGED": (130, 130, 130), "AMBIGUOUS": (200, 60, 60)}
 """Colours of the values of ``dmrl.v1.Status``, by name."""

@@ -19,10 +19,7 @@ from dmrl.guards.bounded_parsing import parse_json
 CROISSANT_FILE = "croissant.json"
 CONTEXT_FILE = "croissant_context.json"
 """The fixed beginning of the document: MLCommons' names of its keys."""
-ENCODING_FORMATS = {
-    True: "application/x-parquet",
-    False: "application/vnd.apache.arrow.stream",
-}
+ENCODING_FORMATS = {True: "application/x-parquet", False: "application/vnd.apache.arrow.stream"}
 """Format of the shards, by whether they are Parquet, which Croissant's loaders read."""
 
 
@@ -108,10 +105,7 @@ def _describe_field(place: str, name: str, words: str) -> dict[str, Any]:
 
 def _describe_values(split: str, column: str, values: pa.Field, path: str) -> dict[str, Any]:
     """Describe the type of a column's values, and where they are."""
-    source: dict[str, Any] = {
-        "fileSet": {"@id": f"{split}-shards"},
-        "extract": {"column": column},
-    }
+    source: dict[str, Any] = {"fileSet": {"@id": f"{split}-shards"}, "extract": {"column": column}}
     at = {"transform": {"jsonPath": path}} if path else {}
     return {"dataType": _name_data_type(values), "source": source | at}
 

@@ -67,11 +67,7 @@ def build_dataset(
 
 
 def extend_dataset(
-    recordings: Sequence[Path],
-    out: Path,
-    settings: Settings,
-    given: Collection[str],
-    workers: int,
+    recordings: Sequence[Path], out: Path, settings: Settings, given: Collection[str], workers: int
 ) -> Written:
     """Add recordings to the dataset ``out``; see ``dmrl.stages.dataset.add``.
 

@@ -10,10 +10,7 @@ from dmrl.card.sensor_facts import describe_cameras, find_sensor_patterns
 from dmrl.datasets.writing.inputs import find_focal_lengths
 from dmrl.datasets.writing.label_choice import choose_label_source, find_label_sources
 from dmrl.datasets.writing.near_duplicates import ImageHashes
-from dmrl.datasets.writing.rows import (
-    ExclusionCounts,
-    count_images,
-)
+from dmrl.datasets.writing.rows import ExclusionCounts, count_images
 from dmrl.recording import LoadedRecording, list_label_findings, read_splits
 from dmrl.recording.licences import licences_in
 from dmrl.storage.shared_file import share_file

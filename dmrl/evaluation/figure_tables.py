@@ -6,11 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from dmrl.learn.inference.detection_metrics import (
-    BandMetrics,
-    ScoredDetections,
-    compute_curves,
-)
+from dmrl.learn.inference.detection_metrics import BandMetrics, ScoredDetections, compute_curves
 from dmrl.learn.inference.metric_definitions import METRICS
 from dmrl.recording import build_input
 
@@ -35,9 +31,7 @@ def describe_source(recording: Path) -> dict[str, str]:
     return {"name": source.name, "sha256": source.sha256}
 
 
-def build_band_table(
-    bands: Sequence[Mapping[str, Any]],
-) -> tuple[list[str], list[list[object]]]:
+def build_band_table(bands: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[object]]]:
     """Build headers and rows: all labels, then each band of depth that has labels.
 
     Parameters

@@ -120,10 +120,7 @@ HARSH = Noise(
 # Li et al. 2020, the simulation on which the paper's filter was tuned: white noise only, one
 # range per step.
 PUBLISHED = Noise(
-    uwb_white_m=0.1,
-    ranging_rate_hz=100.0,
-    velocity_white_mps=0.25,
-    yaw_rate_white_radps=0.4,
+    uwb_white_m=0.1, ranging_rate_hz=100.0, velocity_white_mps=0.25, yaw_rate_white_radps=0.4
 )
 
 NOISE: dict[str, Noise] = {

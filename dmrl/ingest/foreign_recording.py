@@ -236,9 +236,5 @@ def _to_fields(value: Any, names: Mapping[str, str]) -> Any:
 
 
 FORMAT = Format(
-    "mcap",
-    "an MCAP file of another program",
-    can_read,
-    load_content,
-    SOURCE_OPTIONS | {"bits"},
+    "mcap", "an MCAP file of another program", can_read, load_content, SOURCE_OPTIONS | {"bits"}
 )

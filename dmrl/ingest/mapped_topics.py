@@ -12,14 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.errors import SourceError
-from dmrl.formats.base import (
-    SOURCE_OPTIONS,
-    Content,
-    Format,
-    Options,
-    add_names,
-    build_content,
-)
+from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, add_names, build_content
 from dmrl.formats.files.column_map import Column, read_column_map
 from dmrl.formats.files.mapped_csv import iter_robot_streams
 from dmrl.formats.files.robot_columns import RobotLog, resolve_robots

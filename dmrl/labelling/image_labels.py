@@ -45,11 +45,7 @@ class CameraOptions:
 
 
 def label_images(
-    peer: str,
-    positions: PeerPositions,
-    attitude_rad: Array,
-    camera: Camera,
-    options: CameraOptions,
+    peer: str, positions: PeerPositions, attitude_rad: Array, camera: Camera, options: CameraOptions
 ) -> Iterator[dict[str, Any] | None]:
     """Yield the fields of the peer's PeerLabel in each image, None if it is surely out of view.
 

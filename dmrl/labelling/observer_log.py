@@ -172,11 +172,7 @@ def _finite(samples: Samples | None) -> tuple[Times, Array] | None:
 
 
 def _dead_reckon(
-    flight: FlightLog,
-    robot: str,
-    heading: tuple[Times, Array],
-    time_ns: Times,
-    warnings: list[str],
+    flight: FlightLog, robot: str, heading: tuple[Times, Array], time_ns: Times, warnings: list[str]
 ) -> Array:
     """Return (K, 3) positions at the images, integrated from velocity along the heading."""
     path_m = np.zeros((len(time_ns), 3))

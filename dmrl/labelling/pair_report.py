@@ -142,10 +142,7 @@ class PairReport:
 
 
 def report_pair(
-    flight: FlightLog,
-    pair: tuple[str, str],
-    positions: PeerPositions,
-    estimate: Estimate,
+    flight: FlightLog, pair: tuple[str, str], positions: PeerPositions, estimate: Estimate
 ) -> PairReport:
     """Return the report of one ordered pair.
 

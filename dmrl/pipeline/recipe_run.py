@@ -115,10 +115,7 @@ def run(
 
 
 def forecast(
-    name: str | Path,
-    out: Path,
-    data: Path | None = None,
-    submitted: Mapping[str, Table] = NOTHING,
+    name: str | Path, out: Path, data: Path | None = None, submitted: Mapping[str, Table] = NOTHING
 ) -> list[Forecast]:
     """Return what `run` would do, step by step. Nothing is written.
 

@@ -6,13 +6,7 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from mcap.records import (
-    Attachment,
-    Chunk,
-    McapRecord,
-    Message,
-    Metadata,
-)
+from mcap.records import Attachment, Chunk, McapRecord, Message, Metadata
 from mcap.records import Channel as McapChannel
 
 from dmrl.errors import RecordingError
@@ -27,12 +21,7 @@ from dmrl.recording.mcap.chunks.chunk import (
     decompress,
     parse_records,
 )
-from dmrl.recording.mcap.file import (
-    CORRUPTION_ERRORS,
-    MAGIC,
-    BoundedReader,
-    over_budget_error,
-)
+from dmrl.recording.mcap.file import CORRUPTION_ERRORS, MAGIC, BoundedReader, over_budget_error
 from dmrl.recording.mcap.message_batch import MessageBatch
 from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
 from dmrl.recording.provenance_inputs import hash_file

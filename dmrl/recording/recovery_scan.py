@@ -12,26 +12,14 @@ from typing import Any, NamedTuple
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    Chunk,
-    McapRecord,
-    Message,
-    Metadata,
-    Schema,
-)
+from mcap.records import Attachment, Chunk, McapRecord, Message, Metadata, Schema
 from mcap.records import Channel as McapChannel
 from mcap.summary import Summary as McapSummary
 
 from dmrl.errors import RecordingError
 from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.extra_records import has_valid_crc
-from dmrl.recording.mcap.file import (
-    CORRUPTION_ERRORS,
-    MAGIC,
-    RECORD_STRUCT,
-    BoundedReader,
-)
+from dmrl.recording.mcap.file import CORRUPTION_ERRORS, MAGIC, RECORD_STRUCT, BoundedReader
 from dmrl.recording.mcap.message_index import ENTRY_BYTES
 from dmrl.recording.mcap.record_scan import ScannedFile
 from dmrl.recording.mcap.summary_section import read_raw_section

@@ -110,10 +110,7 @@ class FlightRenderer:
         """Return a robot's paint with the rotor angles of one image."""
         turns = float(rng.uniform(*self._settings.rotor_speed_rps)) * shutter_s
         first = float(rng.uniform(0, np.pi))
-        return self._paint(name) | {
-            "rotor_first_rad": first,
-            "rotor_sweep_rad": 2 * np.pi * turns,
-        }
+        return self._paint(name) | {"rotor_first_rad": first, "rotor_sweep_rad": 2 * np.pi * turns}
 
 
 def _ambient_level(panorama: FloatImage) -> float:

@@ -258,12 +258,7 @@ def clip_highlights(light: FloatImage) -> FloatImage:
 
 
 def _draw_light(
-    settings: Settings,
-    rng: Generator,
-    name: str,
-    turn: tuple[float, float, float],
-    *,
-    pasted: bool,
+    settings: Settings, rng: Generator, name: str, turn: tuple[float, float, float], *, pasted: bool
 ) -> Light:
     towards = rng.normal((0.0, 0.0, 1.2), 1.0)
     towards = camera_from_horizontal(*turn[:2]) @ (towards / np.linalg.norm(towards))

@@ -38,9 +38,7 @@ def random_poses(rng: Generator, camera: Camera, count: int) -> list[Pose]:
     """
     tilt = camera_from_horizontal(*rng.uniform(-TILT_MAX_RAD, TILT_MAX_RAD, 2).tolist())
     return place_apart(
-        count,
-        lambda: Pose(_draw_position(rng, camera), tilt @ _draw_attitude(rng)),
-        _are_apart,
+        count, lambda: Pose(_draw_position(rng, camera), tilt @ _draw_attitude(rng)), _are_apart
     )
 
 

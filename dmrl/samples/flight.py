@@ -18,14 +18,7 @@ from dmrl.samples.sample import Sample
 
 Times = NDArray[np.int64]
 
-LOG_COLUMNS = (
-    "roll_rad",
-    "pitch_rad",
-    "yaw_rate_radps",
-    "vx_mps",
-    "vy_mps",
-    "height_m",
-)
+LOG_COLUMNS = ("roll_rad", "pitch_rad", "yaw_rate_radps", "vx_mps", "vy_mps", "height_m")
 """Columns of a robot's log, as ``iter_robot_log`` needs them."""
 
 START_NS = 1_000_000_000

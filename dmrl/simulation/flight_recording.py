@@ -24,13 +24,7 @@ from dmrl.rendering import flight_images, renderer
 from dmrl.rendering.blender_environment import ensure_environment
 from dmrl.rendering.onboard_camera import ViewRenderer, build_view, render_sketches
 from dmrl.samples.flight import START_NS, RobotPose, merge_by_time
-from dmrl.samples.sample import (
-    Sample,
-    build_calibration,
-    build_image,
-    build_labels,
-    round_samples,
-)
+from dmrl.samples.sample import Sample, build_calibration, build_image, build_labels, round_samples
 from dmrl.simulation.flight_samples import (
     JPEG_QUALITY,
     TRUTH_RATE_HZ,

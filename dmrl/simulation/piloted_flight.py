@@ -9,12 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dmrl import topics
-from dmrl.deploy.detector import (
-    BACKEND_PACKAGES,
-    open_detector,
-    read_rates,
-    select_fastest_backend,
-)
+from dmrl.deploy.detector import BACKEND_PACKAGES, open_detector, read_rates, select_fastest_backend
 from dmrl.deploy.image_detection import DetectionOptions
 from dmrl.errors import SettingError
 from dmrl.flight.flight_arrays import RATE_HZ, Flight, Ranges, RobotLog
@@ -27,13 +22,7 @@ from dmrl.prediction import describe_weights
 from dmrl.recording import Provenance, RecordingWriter, build_provenance
 from dmrl.rendering.onboard_camera import CameraView
 from dmrl.samples.flight import START_NS, merge_by_time
-from dmrl.samples.sample import (
-    Sample,
-    build_calibration,
-    build_image,
-    build_labels,
-    round_samples,
-)
+from dmrl.samples.sample import Sample, build_calibration, build_image, build_labels, round_samples
 from dmrl.simulation.eyes import IDEAL_CONFIDENCE, Eye, IdealEye, NetworkEye
 from dmrl.simulation.flight_samples import (
     JPEG_QUALITY,

@@ -12,12 +12,7 @@ from dmrl.flight.dead_reckoning import DeadReckoning
 from dmrl.flight.pilot import Command, Observation
 from dmrl.flight.stepped import SteppedFlight
 from dmrl.geometry.frames import AIDECK_PINHOLE, Array
-from dmrl.rendering.onboard_camera import (
-    CameraView,
-    SketchedPlace,
-    ViewRenderer,
-    build_view,
-)
+from dmrl.rendering.onboard_camera import CameraView, SketchedPlace, ViewRenderer, build_view
 from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch_renderer import Sketch
 from dmrl.samples.flight import RobotPose

@@ -55,10 +55,7 @@ def run(recording: Path) -> Checked:
 
 
 def command(
-    *recordings: In,
-    workers: Workers = None,
-    on: On = None,
-    as_json: AsJson = False,
+    *recordings: In, workers: Workers = None, on: On = None, as_json: AsJson = False
 ) -> int:
     """Check a recording: schemas, times, gaps, calibration, labels.
 

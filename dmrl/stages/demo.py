@@ -6,11 +6,7 @@ from pathlib import Path
 from dmrl.terminal.arguments import AsJson
 
 
-def command(
-    *,
-    out: Path = Path("demo"),
-    as_json: AsJson = False,
-) -> None:
+def command(*, out: Path = Path("demo"), as_json: AsJson = False) -> None:
     """Run the whole pipeline, small, on a flight that ships and on pictures it draws.
 
     First, the network that ships finds and tracks a drone in a rendered flight. Then dmrl draws

@@ -93,13 +93,7 @@ def command(
 
     settings = recipes.load(recipe, "train", TrainConfig, flags)
     result = train_with_flights(
-        dataset,
-        out,
-        settings,
-        init=init,
-        teacher=teacher,
-        unlabelled=unlabelled,
-        resume=resume,
+        dataset, out, settings, init=init, teacher=teacher, unlabelled=unlabelled, resume=resume
     )
     row = (result.images, settings.epochs, result.loss, result.seconds, result.images_per_s)
     columns = ("images", "epochs", "last loss", "seconds", "images/s")

@@ -10,12 +10,7 @@ from fsspec.implementations.http import HTTPFileSystem
 
 from dmrl.errors import StorageError
 from dmrl.storage.inner_addresses import RedirectGuard
-from dmrl.storage.server_answers import (
-    build_timeout,
-    changed_error,
-    read_range,
-    wrong_bytes_error,
-)
+from dmrl.storage.server_answers import build_timeout, changed_error, read_range, wrong_bytes_error
 
 """Bytes that are read at a time when a file is copied."""
 HTTP_PARTIAL_CONTENT = 206

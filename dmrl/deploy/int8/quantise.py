@@ -12,12 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.int8.activation_ranges import ActivationRanges
-from dmrl.deploy.int8.graph import (
-    FloatAdd,
-    FloatConv,
-    FloatGraph,
-    FloatPool,
-)
+from dmrl.deploy.int8.graph import FloatAdd, FloatConv, FloatGraph, FloatPool
 from dmrl.deploy.int8.layers import (
     GAIN_SHIFT,
     PIXEL_ZERO,

@@ -101,9 +101,7 @@ def _min_spacing(at: NDArray[np.float32]) -> float:
 
 
 def calibrate_intrinsics(
-    boards: Iterable[NDArray[np.float32]],
-    shape: tuple[int, int],
-    size_px: tuple[int, int],
+    boards: Iterable[NDArray[np.float32]], shape: tuple[int, int], size_px: tuple[int, int]
 ) -> Intrinsics:
     """Calibrate the camera from views of a board.
 

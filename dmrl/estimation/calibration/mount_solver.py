@@ -11,15 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import (
-    block_diag,
-    csc_array,
-    csr_array,
-    diags_array,
-    eye_array,
-    hstack,
-    kron,
-)
+from scipy.sparse import block_diag, csc_array, csr_array, diags_array, eye_array, hstack, kron
 from scipy.sparse.linalg import splu
 
 from dmrl.estimation.calibration.noise import Noise

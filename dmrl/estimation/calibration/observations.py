@@ -93,10 +93,7 @@ class CalibrationFlight:
         step = -(-len(self.image_s) // max(most, 1))
         kept = self.image % step == 0
         return replace(
-            self,
-            image_s=self.image_s[::step],
-            image=self.image[kept] // step,
-            uv=self.uv[kept],
+            self, image_s=self.image_s[::step], image=self.image[kept] // step, uv=self.uv[kept]
         )
 
 

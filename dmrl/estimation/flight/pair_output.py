@@ -9,31 +9,14 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from dmrl.estimation.evidence.causes import join_causes, join_innovations
-from dmrl.estimation.flight.pair_solver import (
-    PairSolution,
-    squared_distances,
-)
+from dmrl.estimation.flight.pair_solver import PairSolution, squared_distances
 from dmrl.estimation.model.bearings import ASSOCIATION_GATE
 from dmrl.estimation.model.gate import Gate
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Mask, Pair
-from dmrl.estimation.model.status import (
-    AMBIGUOUS,
-    OK,
-    UNCONVERGED,
-    Statuses,
-    classify_positions,
-)
-from dmrl.estimation.solver.covariance import (
-    calm_motion,
-    odometry_energy,
-    relative_covariance,
-)
-from dmrl.estimation.solver.estimate import (
-    REASONS,
-    Cause,
-    Estimate,
-)
+from dmrl.estimation.model.status import AMBIGUOUS, OK, UNCONVERGED, Statuses, classify_positions
+from dmrl.estimation.solver.covariance import calm_motion, odometry_energy, relative_covariance
+from dmrl.estimation.solver.estimate import REASONS, Cause, Estimate
 from dmrl.estimation.solver.levenberg_marquardt import relative_path
 from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import Values

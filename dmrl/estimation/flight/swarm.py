@@ -145,9 +145,7 @@ Part = tuple[Solver, Values, tuple[Array, Array], Array]
 
 
 def _solve_windows(
-    pairs: Mapping[Names, Pair],
-    estimates: Mapping[Names, Estimate],
-    shared_s: tuple[float, float],
+    pairs: Mapping[Names, Pair], estimates: Mapping[Names, Estimate], shared_s: tuple[float, float]
 ) -> Iterator[Part]:
     """Solve all robots window by window."""
     carried: Carried | None = None

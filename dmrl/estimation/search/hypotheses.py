@@ -124,11 +124,7 @@ def _circle_at(inputs: FilterInputs, start: int) -> Array:
 
 
 def _select_hypotheses(
-    inputs: FilterInputs,
-    lanes: list[Lane],
-    start_of: list[int],
-    circles: list[Array],
-    steps: int,
+    inputs: FilterInputs, lanes: list[Lane], start_of: list[int], circles: list[Array], steps: int
 ) -> list[list[int]]:
     """Return the likely and distinct hypotheses of each start."""
     count = BEARING_COUNT * HEADING_COUNT

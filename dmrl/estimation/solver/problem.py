@@ -8,9 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.estimation.model.odometry import Odometry, RelativeMotion
-from dmrl.estimation.model.pair import (
-    Array,
-)
+from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.layout import Layout, Subject, build_layout
 from dmrl.estimation.solver.robust_loss import Cauchy, Loss
 from dmrl.estimation.solver.unknowns import TABLE, Unknown

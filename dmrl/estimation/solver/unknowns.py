@@ -174,15 +174,7 @@ TABLE: tuple[Unknown, ...] = (
     ),
     Unknown("vx_bias", "m/s", 0.02, "robot", key="vx_bias_mps", motion=along_x),
     Unknown("vy_bias", "m/s", 0.02, "robot", key="vy_bias_mps", motion=along_y),
-    Unknown(
-        "clock",
-        "s",
-        0.02,
-        "clock",
-        Cauchy(2.0),
-        negated=True,
-        motion=later,
-    ),
+    Unknown("clock", "s", 0.02, "clock", Cauchy(2.0), negated=True, motion=later),
     Unknown("height_offset", "m", 0.03, "robot", height=1.0),
     Unknown(
         "velocity_error_x",
@@ -231,14 +223,7 @@ gyroscope or a clock is mostly good and sometimes far off, so their priors have 
 to 2 sigmas. A scale keeps a Gaussian prior: otherwise it could shrink the path to nothing."""
 
 YAW_RATE_ERROR = Unknown(
-    "yaw_rate_error",
-    "rad/s",
-    0.003,
-    "robot",
-    Cauchy(2.0),
-    "jump",
-    motion=turn,
-    start_std=0.03,
+    "yaw_rate_error", "rad/s", 0.003, "robot", Cauchy(2.0), "jump", motion=turn, start_std=0.03
 )
 """Bias of a yaw rate that changes over time, by small steps or by jumps."""
 

@@ -25,12 +25,7 @@ from dmrl.estimation.tracking.track_states import (
 )
 from dmrl.estimation.tracking.tracker_input import EgoMotion, ImageDetections
 from dmrl.estimation.tracking.tuning import Tuning
-from dmrl.geometry.frames import (
-    Array,
-    Camera,
-    horizontal_from_pixels,
-    pixels_from_horizontal,
-)
+from dmrl.geometry.frames import Array, Camera, horizontal_from_pixels, pixels_from_horizontal
 
 LOG_DEPTH_SPAN = np.log(20.0)
 """Range of the log depth of false alarms, uniform from near to twenty times that. No record of how

@@ -234,9 +234,5 @@ def _iter_image_streams(folder: Path, options: Options) -> Iterator[Iterator[Sam
 
 
 FORMAT = Format(
-    "csv",
-    "a folder of flight logs",
-    can_read,
-    load_content,
-    PICTURE_OPTIONS - {"robot"},
+    "csv", "a folder of flight logs", can_read, load_content, PICTURE_OPTIONS - {"robot"}
 )

@@ -14,14 +14,7 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import SourceError
-from dmrl.formats.base import (
-    SOURCE_OPTIONS,
-    Content,
-    Format,
-    Options,
-    add_names,
-    build_content,
-)
+from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, add_names, build_content
 from dmrl.formats.clocks import find_new_values
 from dmrl.formats.crazyflie import log_variables
 from dmrl.formats.crazyflie.log_block import LogBlock, TimeSeries
@@ -36,11 +29,7 @@ from dmrl.formats.files.column_map import (
     read_column_map,
 )
 from dmrl.formats.files.robot_columns import RobotLog, read_robot_logs
-from dmrl.formats.files.text_table import (
-    TABLE_SUFFIXES,
-    TextTable,
-    read_names,
-)
+from dmrl.formats.files.text_table import TABLE_SUFFIXES, TextTable, read_names
 from dmrl.geometry.frames import Array
 from dmrl.samples.flight import Times
 from dmrl.samples.sample import Columns

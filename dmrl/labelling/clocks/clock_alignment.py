@@ -106,9 +106,7 @@ def _choose_reference(held: FlightLog, robots: set[str], wanted: Sources) -> str
 
 
 def _camera_clocks(
-    held: FlightLog,
-    clocks: Mapping[str, Clock],
-    steady: Mapping[str, Mapping[int, int]],
+    held: FlightLog, clocks: Mapping[str, Clock], steady: Mapping[str, Mapping[int, int]]
 ) -> dict[str, Clock]:
     """Return the clock of every camera whose images show the turns of its robot."""
     found = {}

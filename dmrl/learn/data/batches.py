@@ -122,12 +122,7 @@ class ExampleSet:
 
 
 def epoch_indices(
-    count: int,
-    *,
-    seed: int,
-    epoch: int,
-    shares: NDArray[np.float64] | None = None,
-    images: int = 0,
+    count: int, *, seed: int, epoch: int, shares: NDArray[np.float64] | None = None, images: int = 0
 ) -> NDArray[np.int64]:
     """Return the image indices of an epoch, determined by seed and epoch only.
 

@@ -121,9 +121,7 @@ def verify_indexes(stream: BoundedReader, section: SummarySection) -> MessageCou
 
 
 def check_counts(
-    statistics: Statistics | None,
-    channels: Mapping[int, Channel],
-    counts: Counter[int],
+    statistics: Statistics | None, channels: Mapping[int, Channel], counts: Counter[int]
 ) -> None:
     """Raise McapError unless the counts of messages equal those of the Statistics record.
 

@@ -6,10 +6,7 @@ from mcap.exceptions import McapError
 from mcap.summary import Summary as McapSummary
 
 from dmrl.guards import limits
-from dmrl.recording.mcap.file import (
-    BoundedReader,
-    BudgetError,
-)
+from dmrl.recording.mcap.file import BoundedReader, BudgetError
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS
 
 

@@ -28,13 +28,7 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary as McapSummary
 
 from dmrl.recording.mcap.channel import ChannelTable, build_channels
-from dmrl.recording.mcap.file import (
-    DEFINITIONS,
-    FOOTER_STRUCT,
-    MAGIC,
-    RECORD_STRUCT,
-    BoundedReader,
-)
+from dmrl.recording.mcap.file import DEFINITIONS, FOOTER_STRUCT, MAGIC, RECORD_STRUCT, BoundedReader
 from dmrl.recording.mcap.file_cache import get_cached
 from dmrl.recording.mcap.file_writer import index_attachment
 from dmrl.recording.mcap.message_batch import Ints

@@ -21,12 +21,7 @@ from numpy.typing import NDArray
 
 from dmrl.guards import limits
 from dmrl.recording.mcap.message_batch import Bytes, Ints
-from dmrl.recording.protobuf.wire_scan import (
-    MAX_DEPTH,
-    FieldSpans,
-    concatenate_spans,
-    find_fields,
-)
+from dmrl.recording.protobuf.wire_scan import MAX_DEPTH, FieldSpans, concatenate_spans, find_fields
 from dmrl.recording.protobuf.wire_values import (
     DELIMITED,
     FIXED_DTYPES,
@@ -282,11 +277,7 @@ def _expand_runs(span: FieldSpans, size: int) -> tuple[Ints, Ints]:
 
 
 def _decode_values(
-    data: Bytes,
-    start: Ints,
-    end: Ints,
-    present: NDArray[np.bool_] | None,
-    field: FieldDescriptor,
+    data: Bytes, start: Ints, end: Ints, present: NDArray[np.bool_] | None, field: FieldDescriptor
 ) -> pa.Array:
     """Decode the values in some spans; use the field's default where ``present`` is false."""
     if field.message_type is not None:
@@ -309,11 +300,7 @@ def _decode_values(
 
 
 def _decode_texts(
-    data: Bytes,
-    start: Ints,
-    end: Ints,
-    present: NDArray[np.bool_] | None,
-    field: FieldDescriptor,
+    data: Bytes, start: Ints, end: Ints, present: NDArray[np.bool_] | None, field: FieldDescriptor
 ) -> pa.Array:
     kind = pa.string() if field.type == F.TYPE_STRING else pa.binary()
     try:

@@ -112,10 +112,7 @@ def make_prism(outline: Array, low: float, high: float) -> tuple[Array, NDArray[
     after = (k + 1) % count
     fan = np.column_stack([np.zeros(count - 2, int), k[1:-1], k[2:]])
     sides = np.concatenate(
-        [
-            np.column_stack([k, after, after + count]),
-            np.column_stack([k, after + count, k + count]),
-        ]
+        [np.column_stack([k, after, after + count]), np.column_stack([k, after + count, k + count])]
     )
     return points, np.concatenate([fan[:, ::-1], fan + count, sides])
 

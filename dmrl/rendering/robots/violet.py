@@ -42,10 +42,7 @@ def _make_blades(hub: tuple[float, float], at_rad: float, way: int) -> Part:
     count = len(radius)
     k = np.arange(count - 1)
     strip = np.concatenate(
-        [
-            np.column_stack([k, k + 1, k + count + 1]),
-            np.column_stack([k, k + count + 1, k + count]),
-        ]
+        [np.column_stack([k, k + 1, k + count + 1]), np.column_stack([k, k + count + 1, k + count])]
     )
     points = np.concatenate([edges, edges * np.array([-1, -1, 1])])
     faces = np.concatenate([strip, strip + len(edges)])

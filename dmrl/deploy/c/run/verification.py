@@ -96,10 +96,7 @@ def _reference_result(network: IntegerNetwork, image: Image) -> HarnessResult:
 
 
 def verify_target(
-    network: IntegerNetwork,
-    folder: Path,
-    target: Target,
-    wanted: ExpectedResults,
+    network: IntegerNetwork, folder: Path, target: Target, wanted: ExpectedResults
 ) -> TargetResult:
     """Verify every build of a target on every image.
 

@@ -140,7 +140,7 @@ def _read_whole_chunk(
             at, found = chunk_index.chunk_start_offset, len(parse_records(data).messages)
             raise McapError(
                 f"the message indexes of the chunk at byte {at} do not list each of its "
-                f"{found} messages once",
+                f"{found} messages once"
             )
     else:
         others, counts = parse_records(data), {}
@@ -151,10 +151,7 @@ def _read_whole_chunk(
 
 
 def _select_by_index(
-    raw: bytes,
-    data: Bytes,
-    chunk_index: ChunkIndex,
-    channels: Container[int],
+    raw: bytes, data: Bytes, chunk_index: ChunkIndex, channels: Container[int]
 ) -> tuple[MessageBatch, dict[int, int]]:
     """Return the messages of some channels, and the number that each message index lists."""
     at = chunk_index.chunk_start_offset
@@ -188,7 +185,7 @@ def _check_time_range(chunk_index: ChunkIndex, batch: MessageBatch) -> MessageBa
     if len(batch) and not low <= batch.time_span_ns[0] <= batch.time_span_ns[1] <= high:
         raise McapError(
             f"messages in the chunk at byte {chunk_index.chunk_start_offset} are "
-            "outside the time range that it states",
+            "outside the time range that it states"
         )
     return batch
 
