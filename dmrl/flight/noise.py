@@ -57,64 +57,29 @@ class Noise:
     clock_drift_ppm: float = 0.0
 
 
-CALIBRATED = Noise(
-    uwb_white_m=0.10,
-    uwb_bias_m=0.03,
-    uwb_scale=0.01,
-    nlos_share=0.05,
-    nlos_mean_m=0.4,
-    ranging_loss=0.15,
-    velocity_white_mps=0.10,
-    velocity_coloured_mps=0.05,
-    velocity_scale=0.02,
-    velocity_bias_mps=0.01,
-    yaw_rate_white_radps=0.02,
-    yaw_rate_bias_radps=0.003,
-    height_white_m=0.02,
-    height_bias_m=0.01,
-    attitude_white_rad=0.005,
-    attitude_bias_rad=0.005,
-)
-
-REALISTIC = Noise(
-    uwb_white_m=0.10,
-    uwb_bias_m=0.10,
-    uwb_scale=0.02,
-    nlos_share=0.07,
-    nlos_mean_m=0.5,
-    ranging_loss=0.15,
-    velocity_white_mps=0.10,
-    velocity_coloured_mps=0.08,
-    velocity_scale=0.05,
-    velocity_bias_mps=0.015,
-    yaw_rate_white_radps=0.02,
-    yaw_rate_bias_radps=0.005,
-    height_white_m=0.02,
-    height_bias_m=0.02,
-    attitude_white_rad=0.005,
-    attitude_bias_rad=0.01,
-    clock_drift_ppm=10.0,
-)
-
-HARSH = Noise(
-    uwb_white_m=0.10,
-    uwb_bias_m=0.20,
-    uwb_scale=0.03,
-    nlos_share=0.12,
-    nlos_mean_m=0.8,
-    ranging_loss=0.20,
-    velocity_white_mps=0.25,
-    velocity_coloured_mps=0.12,
-    velocity_scale=0.10,
-    velocity_bias_mps=0.03,
-    yaw_rate_white_radps=0.03,
-    yaw_rate_bias_radps=0.01,
-    height_white_m=0.03,
-    height_bias_m=0.03,
-    attitude_white_rad=0.01,
-    attitude_bias_rad=0.02,
-    clock_offset_s=0.04,
-    clock_drift_ppm=20.0,
+LEVELS = {
+    "uwb_white_m": (0.10, 0.10, 0.10),
+    "uwb_bias_m": (0.03, 0.10, 0.20),
+    "uwb_scale": (0.01, 0.02, 0.03),
+    "nlos_share": (0.05, 0.07, 0.12),
+    "nlos_mean_m": (0.4, 0.5, 0.8),
+    "ranging_loss": (0.15, 0.15, 0.20),
+    "velocity_white_mps": (0.10, 0.10, 0.25),
+    "velocity_coloured_mps": (0.05, 0.08, 0.12),
+    "velocity_scale": (0.02, 0.05, 0.10),
+    "velocity_bias_mps": (0.01, 0.015, 0.03),
+    "yaw_rate_white_radps": (0.02, 0.02, 0.03),
+    "yaw_rate_bias_radps": (0.003, 0.005, 0.01),
+    "height_white_m": (0.02, 0.02, 0.03),
+    "height_bias_m": (0.01, 0.02, 0.03),
+    "attitude_white_rad": (0.005, 0.005, 0.01),
+    "attitude_bias_rad": (0.005, 0.01, 0.02),
+    "clock_offset_s": (0.0, 0.0, 0.04),
+    "clock_drift_ppm": (0.0, 10.0, 20.0),
+}
+"""Values of the presets "calibrated", "realistic" and "harsh"."""
+CALIBRATED, REALISTIC, HARSH = (
+    Noise(**dict(zip(LEVELS, values, strict=True))) for values in zip(*LEVELS.values(), strict=True)
 )
 
 # Li et al. 2020, the simulation on which the paper's filter was tuned: white noise only, one

@@ -73,23 +73,6 @@ class Canvas:
         images = [self._rgb] if self._cover is None else [self._rgb, self._cover]
         self._over = [(ImageDraw.Draw(one), ImageDraw.Draw(one, "RGBA")) for one in images]
 
-    def fill_polygon(self, corners_px: Array, colour: Colour, opacity: float = 1.0) -> None:
-        """Draw a polygon over the existing content.
-
-        Parameters
-        ----------
-        corners_px
-            (K, 2) pixels of the image, in order around the polygon.
-        colour
-            Colour of the polygon.
-        opacity
-            1 for opaque.
-        """
-        corners = ((corners_px - (self.left_px, self.top_px)) * self._fineness).ravel().tolist()
-        scale = LEVELS / self._brightest
-        levels = [min(max(round(value * scale), 0), LEVELS) for value in colour.tolist()]
-        self.draw_outline((corners, (*levels, round(opacity * LEVELS))))
-
     def make_outlines(
         self, corners_px: Array, colours: Array, opacity: float | Array
     ) -> list[Outline]:
@@ -98,11 +81,11 @@ class Canvas:
         Parameters
         ----------
         corners_px
-            (F, K, 2) as in `fill_polygon`.
+            (F, K, 2) pixels of the image, in order around each polygon.
         colours
             (F, 3) of each.
         opacity
-            Of all of them, or (F,) of each.
+            Of all of them, or (F,) of each; 1 for opaque.
         """
         fine = (corners_px - (self.left_px, self.top_px)) * self._fineness
         inks = np.empty((len(fine), 4))

@@ -146,9 +146,9 @@ def test_a_polygon_covers_its_area_in_its_place(opacity: float) -> None:
         c, s = np.cos(turn), np.sin(turn)
         at = rng.uniform((35, 45), (65, 55))
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        canvas.fill_polygon(
-            (signs * half) @ [[c, s], [-s, c]] + at, np.array([1.0, 0.5, 0.0]), opacity
-        )
+        corners = (signs * half) @ [[c, s], [-s, c]] + at
+        (outline,) = canvas.make_outlines(corners[None], np.array([[1.0, 0.5, 0.0]]), opacity)
+        canvas.draw_outline(outline)
         cover = canvas.to_opacity()[..., 0]
         np.testing.assert_allclose(
             canvas.to_rgb(), cover[..., None] * np.array([1.0, 0.5, 0.0]), atol=0.01
@@ -164,7 +164,8 @@ def test_a_polygon_covers_its_area_in_its_place(opacity: float) -> None:
 def test_polygon_is_composited_over_the_background(plain: Look) -> None:
     ground = np.full((8, 8, 3), 64, np.uint8)
     canvas = Canvas(0, 0, 8, 8, ground=ground)
-    canvas.fill_polygon(np.array([[0, 0], [4, 0], [4, 8], [0, 8]]), np.ones(3), 0.5)
+    corners = np.array([[[0, 0], [4, 0], [4, 8], [0, 8]]])
+    canvas.draw_outline(canvas.make_outlines(corners, np.ones((1, 3)), 0.5)[0])
     row = canvas.to_rgb()[3, :, 0]
     np.testing.assert_allclose(row[[0, 1, 2, 5, 6, 7]], [0.625] * 3 + [0.25] * 3, atol=0.005)
     with pytest.raises(ValueError, match="no opacity"):

@@ -22,7 +22,6 @@ Shape = tuple[int, int, int]
 PIXEL_ZERO = 128
 """Zero point of the image: the pixel value of input 0.0, since input is ``x / 128 - 1``. Also the
 padding of images."""
-Q_LEVELS = 256
 GAIN_SHIFT = 8
 """Fractional bits of a shortcut's gain, needed where a step of the sum is larger than its own."""
 SIGNED_OFFSET = 128

@@ -70,29 +70,3 @@ class Cauchy:
         """Return half the second derivatives, at least 0."""
         out = square / self.sigmas**2
         return np.asarray(np.maximum(1 - out, 0.0) / (1 + out) ** 2)
-
-
-@dataclass(frozen=True, slots=True)
-class Huber:
-    """The square up to a residual s, its tangent beyond.
-
-    Parameters
-    ----------
-    sigmas
-        The residual s, in standard deviations.
-    """
-
-    sigmas: float
-
-    def cost(self, square: Array) -> Array:
-        """Return the losses."""
-        size = np.sqrt(square)
-        return np.where(size > self.sigmas, self.sigmas * (2 * size - self.sigmas), square)
-
-    def weight(self, square: Array) -> Array:
-        """Return the IRLS weights."""
-        return np.asarray(np.minimum(1.0, self.sigmas / np.sqrt(np.maximum(square, 1e-12))))
-
-    def curvature(self, square: Array) -> Array:
-        """Return half the second derivatives, at least 0."""
-        return np.asarray(square <= self.sigmas**2, float)

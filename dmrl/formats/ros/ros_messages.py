@@ -27,7 +27,6 @@ DEPTH_ENCODINGS = ("16UC1", "32FC1")
 MAX_SIDE_PX = 10_000
 FIXED_FRAMES = ("odom", "map", "world", "earth")
 """Last parts of the names of frames that do not turn with a robot (REP 105)."""
-LETTERS = {"uint32": "I", "int32": "i", "float32": "f", "float64": "d"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,8 +39,6 @@ from dmrl.learn.pretrained import DESCRIPTION_NAME, WEIGHTS_NAME
 PUBLISHED_THRESHOLD = 0.33
 """Confidence threshold of the published evaluation, 0 to 1."""
 
-GridArray = NDArray[np.float32]
-
 
 def predict_grids(network: Network, images: Tensor) -> Grids:
     """Run a network, in its present mode and on its device, on (N, 3, H, W) uint8 images."""

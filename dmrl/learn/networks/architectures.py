@@ -3,8 +3,19 @@
 To add one, write a subclass of `Network` and a row of ``ARCHITECTURES``, or a plug-in.
 
 A network takes images as `normalize_images` returns them and returns (N, C, rows, cols). One
-cell covers ``stride_px`` pixels both ways. ``channels`` names each of the C outputs; see
-``CHANNEL_MEANINGS``. The first two are the same for all architectures.
+cell covers ``stride_px`` pixels both ways. ``channels`` names each of the C outputs. The first two
+are the same for all architectures.
+
+========== =======================================================================
+channel    meaning
+========== =======================================================================
+log_depth  natural log of the depth, metres
+confidence logit of the confidence that a robot's centre lies in the cell
+offset_u   centre minus middle of the cell, to the right, in cells
+offset_v   the same, downwards
+log_spread natural log of the scale b of log depth's error, exp(-abs(error) / b)
+class_0    logit that the robot is of class 0; class_1 and so on for the others
+========== =======================================================================
 """
 
 from abc import ABC, abstractmethod
@@ -20,14 +31,6 @@ from dmrl.errors import SettingError
 from dmrl.learn.networks.depthwise import DepthwiseConv
 
 INPUT_CHANNELS = 3
-CHANNEL_MEANINGS = {
-    "log_depth": "natural log of the depth, metres",
-    "confidence": "logit of the confidence that a robot's centre lies in the cell",
-    "offset_u": "centre minus middle of the cell, to the right, in cells",
-    "offset_v": "the same, downwards",
-    "log_spread": "natural log of the scale b of log depth's error, exp(-|error| / b)",
-    "class_0": "logit that the robot is of class 0; class_1 and so on for the others",
-}
 DETECTION_CHANNELS = ("log_depth", "confidence")
 """Channels of a network that locates a robot to the cell."""
 SUB_CELL_CHANNELS = (*DETECTION_CHANNELS, "offset_u", "offset_v")
@@ -43,7 +46,7 @@ class Network(nn.Module, ABC):
     """Base class of all architectures, as training, prediction and export use it.
 
     ``stride_px`` is the side of a grid cell; images measure a whole number of cells. ``channels``
-    are names in ``CHANNEL_MEANINGS``, in output order: first the architecture's ``own`` channels,
+    are names of the table above, in output order: first the architecture's ``own`` channels,
     then the extra ones that the caller requested.
     """
 

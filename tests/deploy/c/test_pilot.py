@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dmrl.deploy.c.pilot_code import PILOT_BYTES, CompiledPilot, write_pilot
+from dmrl.deploy.c.pilot_code import PILOT_BYTES, write_pilot
 from dmrl.deploy.c.run.compiled import CompiledNetwork
 from dmrl.deploy.int8 import reference
 from dmrl.deploy.int8.network import IntegerNetwork
@@ -32,6 +32,8 @@ from dmrl.learn.pretrained import resolve_model_path
 from dmrl.simulation import Simulation
 from dmrl.simulation.drawn_pictures import draw_picture
 from dmrl.simulation.settings import SketchSettings
+
+from .compiled_pilot import CompiledPilot
 
 DISTANCE_M = 0.7
 

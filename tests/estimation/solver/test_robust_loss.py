@@ -1,6 +1,6 @@
 """Losses as objects: weight and curvature are derivatives of the cost."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -8,9 +8,36 @@ import pytest
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.problem import NoiseModel
-from dmrl.estimation.solver.robust_loss import Cauchy, Gaussian, Huber, Loss
+from dmrl.estimation.solver.robust_loss import Array, Cauchy, Gaussian, Loss
 
 from ..flights import flown, pair_of
+
+
+@dataclass(frozen=True, slots=True)
+class Huber:
+    """The square up to a residual s, its tangent beyond.
+
+    Parameters
+    ----------
+    sigmas
+        The residual s, in standard deviations.
+    """
+
+    sigmas: float
+
+    def cost(self, square: Array) -> Array:
+        """Return the losses."""
+        size = np.sqrt(square)
+        return np.where(size > self.sigmas, self.sigmas * (2 * size - self.sigmas), square)
+
+    def weight(self, square: Array) -> Array:
+        """Return the IRLS weights."""
+        return np.asarray(np.minimum(1.0, self.sigmas / np.sqrt(np.maximum(square, 1e-12))))
+
+    def curvature(self, square: Array) -> Array:
+        """Return half the second derivatives, at least 0."""
+        return np.asarray(square <= self.sigmas**2, float)
+
 
 LOSSES = (Gaussian(), Cauchy(1.5), Cauchy(4.0), Huber(1.5))
 RESIDUALS = np.array([-6.0, -1.0, -0.3, 0.2, 0.9, 1.4, 2.0, 7.0])
