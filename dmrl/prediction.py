@@ -184,7 +184,7 @@ def _iter_batches(
     batch: list[tuple[RawMessage, ImageHeader]] = []
     pixels = 0
     for raw in raws:
-        name = _name_image(recording, raw)
+        name = f"{recording}: the image of {raw.topic} at {raw.time_ns} ns"
         data = parse_message(raw, message_class("CompressedImage"), recording).data
         try:
             image = read_header(data, name)
@@ -224,10 +224,6 @@ def _iter_usable(
             leave_out(UNDECODABLE, rgb)
         else:
             yield raw, rgb
-
-
-def _name_image(recording: Path, image: RawMessage) -> str:
-    return f"{recording}: the image of {image.topic} at {image.time_ns} ns"
 
 
 def detection_fields(

@@ -123,7 +123,7 @@ def check(name: str | Path, keys: Mapping[str, Any], schema: type[Settings]) -> 
     """
     if wrong := find_faults(keys, schema):
         raise recipe_error(name, wrong)
-    return _create_instance(keys, schema)
+    return schema(**_validate_keys(keys, schema))
 
 
 def _recipe_files() -> Traversable:
@@ -262,7 +262,3 @@ def describe_unknown_key(key: str, known: Iterable[str]) -> str:
     """Return the fault of a key that does not exist, with the nearest one that does."""
     near = suggest(key, known, "").replace("Did", "did")
     return f"{key}: extra inputs are not permitted" + (f" ({near})" if near else "")
-
-
-def _create_instance(keys: Mapping[str, Any], schema: type[Settings]) -> Settings:
-    return schema(**_validate_keys(keys, schema))

@@ -16,7 +16,6 @@ from dmrl.datasets.backgrounds import open_backgrounds
 from dmrl.errors import OutputError, RecipeError
 from dmrl.geometry.camera_file import NAMED_CAMERAS, find_camera
 from dmrl.geometry.frames import Camera
-from dmrl.messages import message_class
 from dmrl.recording import (
     LICENCES_METADATA,
     SPLIT_METADATA,
@@ -37,7 +36,7 @@ from dmrl.rendering.randomise import RandomScene, SceneSource, draw_scene
 from dmrl.rendering.renderer import Renderer, RobotModel, Scene, list_panoramas
 from dmrl.rendering.robots.robot_models import DESIGNS
 from dmrl.rendering.settings import Settings, filled
-from dmrl.samples.sample import Sample, build_calibration, find_intervals
+from dmrl.samples.sample import build_calibration, find_intervals
 from dmrl.terminal.progress import say, track
 
 PREVIEW_SAMPLES = 64
@@ -241,7 +240,7 @@ def _write_images(
     """Write every image from number ``done`` on, in order, as it arrives."""
     settings, camera = world.settings, world.camera
     if not done:
-        _write(sink, build_calibration(0, OBSERVER, camera))
+        sink.write_sample(build_calibration(0, OBSERVER, camera))
     drawn: deque[RandomScene] = deque()
 
     def scenes() -> Iterator[Scene]:
@@ -252,8 +251,4 @@ def _write_images(
     shots = track(renderer.render_shots(scenes()), "Rendering", settings.images - done)
     for index, shot in enumerate(shots, done):
         for sample in build_samples(_time_ns(settings, index), settings, drawn.popleft(), shot):
-            _write(sink, sample)
-
-
-def _write(sink: RecordingWriter, sample: Sample) -> None:
-    sink.write(sample.time_ns, sample.topic, message_class(sample.message)(**sample.fields))
+            sink.write_sample(sample)

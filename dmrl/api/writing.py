@@ -165,7 +165,7 @@ class Writer:
         data = encode_png(whole) if quality is None else encode_jpeg(whole, quality)
         kind = "png" if quality is None else "jpeg"
         (time_ns,) = self._log_times(topics.CAMERA_IMAGE(robot), [time_s])
-        self._send_sample(sample.build_image(int(time_ns), robot, data, kind))
+        self._sink.write_sample(sample.build_image(int(time_ns), robot, data, kind))
 
     def camera(self, robot: str, camera: Camera | PathLike, time_s: float = 0.0) -> None:
         """Append the calibration of a robot's camera, or of a camera file.
@@ -177,7 +177,7 @@ class Writer:
         """
         known = camera if isinstance(camera, Camera) else read_camera(to_path(camera))
         (time_ns,) = self._log_times(topics.CALIBRATION(robot), [time_s])
-        self._send_sample(sample.build_calibration(int(time_ns), robot, known))
+        self._sink.write_sample(sample.build_calibration(int(time_ns), robot, known))
 
     def _log_times(self, topic: str, time_s: ArrayLike) -> NDArray[np.int64]:
         """Return (N,) log times, nanoseconds."""
@@ -194,9 +194,6 @@ class Writer:
     def _misfit_error(self, topic: str, kind: str, error: Exception) -> RecordingError:
         why = str(error).rstrip(".")
         return RecordingError(f"{self.path}: {topic} carries {kind}: {why}. Fix its fields")
-
-    def _send_sample(self, made: sample.Sample) -> None:
-        self._sink.write(made.time_ns, made.topic, message_class(made.message)(**made.fields))
 
     def flush(self) -> None:
         """Write everything so far to the file, so that a killed process loses none of it."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
-from dmrl.errors import MissingTopic, RecordingError
+from dmrl.errors import RecordingError
 from dmrl.estimation.model.position_metrics import is_covered_by_truth
 from dmrl.estimation.tracking.track_metrics import (
     DEFINITIONS,
@@ -30,7 +30,7 @@ from dmrl.geometry.frames import (
 from dmrl.labelling.flight_log import OBSERVER_TOPICS, TRUTH_TOPICS, FlightLog, read_flight
 from dmrl.labelling.ground_truth import find_true_path, list_true_pairs
 from dmrl.labelling.observer_log import ObserverLog, read_observer_log
-from dmrl.labelling.recorded_camera import find_recorded_camera
+from dmrl.labelling.recorded_camera import require_camera
 from dmrl.recording import read_summary
 
 TITLE, EACH = "tracks against truth", "observer"
@@ -82,10 +82,7 @@ def judge(recording: Path) -> list[EvaluatedTracks]:
 def read_track_camera(held: FlightLog, robot: str) -> Camera:
     """Return the camera of the tracks; mount, delay and lens may differ from the recording's."""
     used = held.metadata.get(CAMERAS_METADATA, [{}])[-1].get(robot)
-    camera = parse_camera(used, held.path) if used else find_recorded_camera(held, robot)
-    if camera is None:
-        raise MissingTopic(topics.CALIBRATION(robot), held.topics, held.path)
-    return camera
+    return require_camera(held, robot, parse_camera(used, held.path) if used else None)
 
 
 class _PeerRow(NamedTuple):

@@ -169,7 +169,10 @@ def _write_table(table: pa.Table, path: Path, kind: TableFormat) -> None:
     if kind == "parquet":
         pq.write_table(table, path)
         return
-    frame = table.to_pandas(types_mapper=_to_nullable_type)
+    import pandas as pd  # noqa: PLC0415
+
+    # pandas' Arrow types support empty cells beside integers and nested values.
+    frame = table.to_pandas(types_mapper=pd.ArrowDtype)
     ends = "\n"
     for field in table.schema:
         if pa.types.is_list(field.type):
@@ -178,17 +181,10 @@ def _write_table(table: pa.Table, path: Path, kind: TableFormat) -> None:
             frame[field.name] = [_to_base64(v) for v in table[field.name].to_pylist()]
         elif pa.types.is_string(field.type):
             shown = pc.replace_substring_regex(table[field.name], _FORMULA_START, r"'\1")
-            frame[field.name] = shown.to_pandas(types_mapper=_to_nullable_type)
+            frame[field.name] = shown.to_pandas(types_mapper=pd.ArrowDtype)
             if pc.any(pc.match_substring(shown, "\r")).as_py():
                 ends = "\r\n"  # only then does csv quote a cell with \r, which also ends a line
     frame.to_csv(path, index=False, lineterminator=ends)
-
-
-def _to_nullable_type(kind: pa.DataType) -> Any:
-    """Return a pandas type that supports empty cells beside integers and nested values."""
-    import pandas as pd  # noqa: PLC0415
-
-    return pd.ArrowDtype(kind)
 
 
 def _to_json(value: list[Any] | None) -> str | None:

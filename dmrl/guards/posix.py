@@ -46,3 +46,8 @@ O_CLOEXEC, O_DIRECTORY, O_NOFOLLOW, O_NONBLOCK = (
 def getuid() -> int:
     """Return the number of the user; 0, which owns all files, where users have none."""
     return int(getattr(os, "getuid", int)())
+
+
+def count_cores() -> int:
+    """Return the number of cores that this process may use; all cores on macOS and Windows."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

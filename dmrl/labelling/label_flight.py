@@ -31,7 +31,7 @@ from dmrl.labelling.observer_log import read_observer_log
 from dmrl.labelling.pair_estimation import PairSolver, Spread, estimate_all, orient_pair
 from dmrl.labelling.pair_report import PairReport, explain_causes, report_pair
 from dmrl.labelling.peer_positions import PeerPositions, sample_positions
-from dmrl.labelling.recorded_camera import find_recorded_camera
+from dmrl.labelling.recorded_camera import require_camera
 from dmrl.labelling.sensor_file import SensorConstants, read_sensors
 from dmrl.labelling.sensor_logs import SensorLogs, build_sensor_logs
 from dmrl.recording import Provenance, TimedMessage, rewrite
@@ -158,9 +158,7 @@ def read_bearings(
         raise MissingTopic(topics.DETECTIONS("*"), flight.topics, flight.path)
     out = {}
     for robot in (robot for robot in sorted(flight.detections) if robot in logs.robots):
-        camera = options.cameras.get(robot) or find_recorded_camera(flight, robot)
-        if camera is None:
-            raise MissingTopic(topics.CALIBRATION(robot), flight.topics, flight.path)
+        camera = require_camera(flight, robot, options.cameras.get(robot))
         if not options.distorted:
             camera = replace(camera, distortion=())
         observer = read_observer_log(flight, robot, camera, None)

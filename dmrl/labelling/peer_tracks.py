@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from dmrl import topics
-from dmrl.errors import MissingTopic
 from dmrl.estimation.tracking.detector_rates import DetectorRates
 from dmrl.estimation.tracking.identity import TrackIdentity
 from dmrl.estimation.tracking.tracker import Track, Tracker
@@ -15,7 +14,7 @@ from dmrl.estimation.tracking.tuning import Tuning
 from dmrl.geometry.frames import Camera
 from dmrl.labelling.flight_log import FlightLog
 from dmrl.labelling.observer_log import ObserverLog, read_observer_log
-from dmrl.labelling.recorded_camera import find_recorded_camera, read_robot_camera
+from dmrl.labelling.recorded_camera import read_robot_camera, require_camera
 from dmrl.messages import message_class
 from dmrl.recording import TimedMessage
 from dmrl.samples.sample import Sample
@@ -43,11 +42,8 @@ def choose_camera(
     MissingTopic
         If there is neither.
     """
-    camera = (
-        read_robot_camera(flight, robot, given) if given else find_recorded_camera(flight, robot)
-    )
-    if camera is None:
-        raise MissingTopic(topics.CALIBRATION(robot), flight.topics, flight.path)
+    named = read_robot_camera(flight, robot, given) if given else None
+    camera = require_camera(flight, robot, named)
     return replace(camera, distortion=()) if undistorted else camera
 
 

@@ -39,6 +39,22 @@ def find_recorded_camera(flight: FlightLog, robot: str) -> Camera | None:
     return Camera(found.width, found.height, fx, fy, cx, cy, tuple(found.D[:5]))
 
 
+def require_camera(flight: FlightLog, robot: str, given: Camera | None = None) -> Camera:
+    """Return the camera given for a robot, or else the recording's.
+
+    Raises
+    ------
+    MissingTopic
+        If there is neither.
+    RecordingError
+        As `find_recorded_camera` does.
+    """
+    camera = given or find_recorded_camera(flight, robot)
+    if camera is None:
+        raise MissingTopic(topics.CALIBRATION(robot), flight.topics, flight.path)
+    return camera
+
+
 def read_robot_camera(flight: FlightLog, robot: str, path: Path) -> Camera:
     """Read the camera of a TOML file, for a robot's images.
 

@@ -12,7 +12,7 @@ from dmrl.geometry.frames import Array
 from dmrl.images.codec import Rgb, decode
 from dmrl.labelling.flight_log import OBSERVER_TOPICS, read_flight
 from dmrl.labelling.observer_log import read_observer_log
-from dmrl.labelling.recorded_camera import find_recorded_camera
+from dmrl.labelling.recorded_camera import require_camera
 from dmrl.learn.training.config import TrainConfig
 from dmrl.learn.training.consistency import UnlabelledImages
 from dmrl.recording import read
@@ -56,9 +56,7 @@ def read_unlabelled(paths: Sequence[Path]) -> UnlabelledImages:
         if not flight.detections:
             raise MissingTopic(topics.DETECTIONS("*"), flight.topics, path)
         for robot in sorted(flight.detections):
-            camera = find_recorded_camera(flight, robot)
-            if camera is None:
-                raise MissingTopic(topics.CALIBRATION(robot), flight.topics, path)
+            camera = require_camera(flight, robot)
             log = read_observer_log(flight, robot, camera, None)
             lens = camera.image_from_optical[[0, 1, 0, 1], [0, 1, 2, 2]]
             lens = np.tile(lens, (len(log.time_ns), 1))

@@ -7,6 +7,7 @@ are of the same instant.
 
 import math
 import re
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -16,17 +17,18 @@ from dmrl.samples.sample import Sample
 
 BLOCK_BYTES = 26
 MAX_BLOCKS = 16
-VARIABLE_BYTES = {
-    "uint8_t": 1,
-    "int8_t": 1,
-    "uint16_t": 2,
-    "int16_t": 2,
-    "FP16": 2,
-    "uint32_t": 4,
-    "int32_t": 4,
-    "float": 4,
+LOG_TYPES = {
+    "uint8_t": (1, "B"),
+    "uint16_t": (2, "H"),
+    "uint32_t": (3, "I"),
+    "int8_t": (4, "b"),
+    "int16_t": (5, "h"),
+    "int32_t": (6, "i"),
+    "float": (7, "f"),
+    "FP16": (8, "e"),
 }
-"""Bytes of a variable by its type, in cflib's names."""
+"""Number and `struct` format of each type of variable, by cflib's name."""
+VARIABLE_BYTES = {name: struct.calcsize(f"<{code}") for name, (_, code) in LOG_TYPES.items()}
 
 MOTION_VARIABLES = ("roll", "pitch", "yaw", "vx", "vy")
 YAW_RATE_VARIABLE, PITCH_RATE_VARIABLE = "gyro.z", "gyro.y"

@@ -71,7 +71,7 @@ def find_recordings(source: Path, *, but: Path | None = None) -> dict[Path, Path
     if source.is_dir():
         base, found = source, _list_below(source, but)
     elif is_collection(source):
-        base, found = _find_fixed_parent(source), []
+        base, found = next(parent for parent in source.parents if not has_magic(str(parent))), []
         for path in sorted(base.glob(str(source.relative_to(base)))):
             if any(part.startswith(".") for part in path.relative_to(base).parts):
                 continue
@@ -134,11 +134,6 @@ def _iter_remote(folder: RemotePath, but: Path | None) -> Iterator[Path]:
 
 def _is_same(path: Path, other: Path | None) -> bool:
     return other is not None and other.exists() and path.samefile(other)
-
-
-def _find_fixed_parent(pattern: Path) -> Path:
-    """Return the folder above all files of a pattern."""
-    return next(parent for parent in pattern.parents if not has_magic(str(parent)))
 
 
 def build_tasks(

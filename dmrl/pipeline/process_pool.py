@@ -10,6 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Self
 
+from dmrl.guards.posix import count_cores
 from dmrl.pipeline.job import JobResult
 from dmrl.terminal.progress import Lines
 
@@ -163,8 +164,3 @@ def stop_processes(processes: list[WorkerProcess], *, in_order: bool) -> None:
             if stream is not None:
                 with suppress(BrokenPipeError):
                     stream.close()
-
-
-def count_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

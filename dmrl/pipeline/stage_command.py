@@ -12,8 +12,8 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
+from dmrl.guards.posix import count_cores
 from dmrl.pipeline.batch import is_collection, run_over_folder
-from dmrl.pipeline.process_pool import count_cores
 from dmrl.pipeline.stage_signature import resolve_hints
 from dmrl.terminal.arguments import AsJson, Flat, FolderWorkers, On, Workers
 from dmrl.terminal.closing import Closing, Given

@@ -13,7 +13,7 @@ from dmrl.images.codec import encode_jpeg, encode_png
 from dmrl.rendering.randomise import RandomScene
 from dmrl.rendering.settings import Settings
 from dmrl.rendering.shot import Robot, Shot
-from dmrl.samples.sample import Sample, build_image, build_labels
+from dmrl.samples.sample import Sample, build_image, build_labels, to_timestamp
 
 OBSERVER = "cf1"
 """Name of the robot that carries the camera."""
@@ -96,7 +96,6 @@ def _truth_sample(time_ns: int, name: str, xyz: Array) -> Sample:
 
 def _transforms_sample(time_ns: int, scene: RandomScene, horizontal_from_camera: Array) -> Sample:
     """Return the true poses of camera and peers. The observer's horizontal frame is the world."""
-    seconds, nanos = divmod(time_ns, 1_000_000_000)
     poses = [("world", f"{OBSERVER}/horizontal", np.zeros(3), np.eye(3))]
     poses.append(
         (f"{OBSERVER}/horizontal", f"{OBSERVER}/camera", np.zeros(3), horizontal_from_camera)
@@ -105,18 +104,16 @@ def _transforms_sample(time_ns: int, scene: RandomScene, horizontal_from_camera:
         xyz = horizontal_from_camera @ robot.pose.xyz_camera
         turn = horizontal_from_camera @ robot.pose.camera_from_body
         poses.append((f"{OBSERVER}/horizontal", peer_name(k, robot), xyz, turn))
-    transforms = [
-        {
-            "timestamp": {"seconds": seconds, "nanos": nanos},
-            "parent_frame_id": parent,
-            "child_frame_id": child,
-            "translation": dict(zip("xyz", xyz.tolist(), strict=True)),
-            "rotation": dict(
-                zip(
-                    "xyzw", Rotation.from_matrix(turn).as_quat(canonical=True).tolist(), strict=True
-                )
-            ),
-        }
-        for parent, child, xyz, turn in poses
-    ]
+    transforms = []
+    for parent, child, xyz, turn in poses:
+        quaternion = Rotation.from_matrix(turn).as_quat(canonical=True).tolist()
+        transforms.append(
+            {
+                "timestamp": to_timestamp(time_ns),
+                "parent_frame_id": parent,
+                "child_frame_id": child,
+                "translation": dict(zip("xyz", xyz.tolist(), strict=True)),
+                "rotation": dict(zip("xyzw", quaternion, strict=True)),
+            }
+        )
     return Sample(time_ns, topics.TRANSFORMS, "FrameTransforms", {"transforms": transforms})

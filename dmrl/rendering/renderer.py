@@ -5,7 +5,6 @@ with Renderer(ensure_environment(report), RobotModel()) as renderer:
         ...
 """
 
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 
 from dmrl.errors import SettingError
 from dmrl.geometry.frames import Array, Camera
+from dmrl.guards.posix import count_cores
 from dmrl.rendering.camera.distortion import FloatImage
 from dmrl.rendering.compositing import compose_shot
 from dmrl.rendering.robots.crazyflie import BLADE_HALF_WIDTH_M, CRAZYFLIE, ROTOR_STEP_RAD
@@ -118,7 +118,7 @@ class Renderer:
             str(p) for p in (list_shipped_panoramas(python) if lights is None else lights)
         ]
         self.pool = WorkerPool(
-            _build_start(python, model, self.lights, samples), workers or _count_cores()
+            _build_start(python, model, self.lights, samples), workers or count_cores()
         )
         self.version = self.pool.version
         self.points = _hull_points(self.pool.points)
@@ -163,13 +163,6 @@ class Renderer:
 
     def __exit__(self, *_: object) -> None:
         self.pool.__exit__()
-
-
-def _count_cores() -> int:
-    """Return the number of cores available to this process; all cores on macOS and Windows."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def list_shipped_panoramas(python: Path) -> list[Path]:

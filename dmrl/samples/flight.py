@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.geometry.frames import Array, camera_from_horizontal, yaw_matrix
-from dmrl.samples.sample import Sample
+from dmrl.samples.sample import Sample, to_timestamp
 
 Times = NDArray[np.int64]
 
@@ -132,9 +132,8 @@ def build_transforms(time_ns: int, robots: Mapping[str, RobotPose]) -> Sample:
 
     The camera is assumed at the robot's centre, with its axis along the robot's x.
     """
-    seconds, nanos = divmod(time_ns, 1_000_000_000)
     frames = [
-        {"timestamp": {"seconds": seconds, "nanos": nanos}, **frame}
+        {"timestamp": to_timestamp(time_ns), **frame}
         for robot, placed in robots.items()
         for frame in _iter_frames(robot, placed)
     ]

@@ -10,8 +10,8 @@ from cyclopts import Parameter
 
 from dmrl.datasets.settings import Settings
 from dmrl.errors import SettingError
+from dmrl.guards.posix import count_cores
 from dmrl.pipeline.batch import find_all_recordings, find_changed_settings
-from dmrl.pipeline.process_pool import count_cores
 from dmrl.pipeline.single_run import run_on_cluster
 from dmrl.terminal.arguments import AsJson, Flat, On, Strict, Workers
 from dmrl.terminal.left_out import count_left_out

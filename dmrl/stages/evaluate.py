@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter, validators
 
+from dmrl.guards.posix import count_cores
 from dmrl.pipeline.batch import find_all_recordings
 from dmrl.pipeline.parallel_map import parallel_map
-from dmrl.pipeline.process_pool import count_cores
 from dmrl.pipeline.single_run import run_on_cluster
 from dmrl.terminal.arguments import AsJson, Count, Flat, On, Share, Workers
 from dmrl.terminal.tables import print_json, print_line

@@ -127,10 +127,6 @@ class RangeReader(io.RawIOBase):
         self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self.size}[whence]
         return self._at
 
-    def tell(self) -> int:
-        """Return the stream position."""
-        return self._at
-
     def readinto(self, buffer: Any, /) -> int:
         """Read into a buffer, and return the number of bytes."""
         data = self.fetch(self._at, len(buffer))

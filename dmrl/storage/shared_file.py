@@ -125,9 +125,6 @@ class _Reader(io.RawIOBase):
     def fileno(self) -> int:
         return self._descriptor
 
-    def tell(self) -> int:
-        return self._position
-
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
         size = os.fstat(self._descriptor).st_size if whence == io.SEEK_END else 0
         start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: size}[whence]

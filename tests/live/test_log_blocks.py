@@ -5,13 +5,13 @@ import pytest
 from dmrl.errors import SettingError
 from dmrl.live.log_blocks import (
     BLOCK_BYTES,
+    LOG_TYPES,
     MAX_BLOCKS,
     VARIABLE_BYTES,
     LogDecoder,
     parse_robot_number,
     plan_blocks,
 )
-from dmrl.live.simulated.crazyflie_server import LOG_TYPES
 
 TOC = {
     **{f"stateEstimate.{name}": "float" for name in ("roll", "pitch", "yaw", "vx", "vy", "z")},

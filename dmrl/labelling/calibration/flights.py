@@ -6,13 +6,13 @@ from typing import Any, Literal
 import numpy as np
 
 from dmrl import topics
-from dmrl.errors import MissingTopic, RecordingError
+from dmrl.errors import RecordingError
 from dmrl.estimation.calibration.extrinsics import MIN_MATCHES, Calibration, calibrate_mount
 from dmrl.estimation.calibration.noise import Noise
 from dmrl.geometry.frames import Camera
 from dmrl.labelling.calibration.calibration_flight import read_calibration_flight
 from dmrl.labelling.flight_log import OBSERVER_TOPICS, TRUTH_TOPICS, read_flight
-from dmrl.labelling.recorded_camera import choose_robot, find_recorded_camera, read_robot_camera
+from dmrl.labelling.recorded_camera import choose_robot, read_robot_camera, require_camera
 from dmrl.terminal.progress import track
 
 
@@ -56,9 +56,7 @@ def calibrate_by_flights(
         held = read_flight(source, *OBSERVER_TOPICS, positions, *more, sizes_of=sizes_of)
         if camera_file:
             camera = read_robot_camera(held, name, camera_file)
-        camera = camera or find_recorded_camera(held, name)
-        if camera is None:
-            raise MissingTopic(topics.CALIBRATION(name), held.topics, source)
+        camera = require_camera(held, name, camera)
         flights.append(read_calibration_flight(held, name, threshold, positions))
     assert camera is not None
     found = calibrate_mount(flights, camera, noise)

@@ -16,21 +16,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dmrl.errors import SettingError
-from dmrl.live.log_blocks import BLOCK_BYTES, MAX_BLOCKS
+from dmrl.live.log_blocks import BLOCK_BYTES, LOG_TYPES, MAX_BLOCKS
 from dmrl.live.simulated.flight_source import FlightClock, SimulatedFaults, SimulatedFlight
 
 PARAM, COMMANDER, MEMORY, LOG, GENERIC, PLATFORM, LINK = 2, 3, 4, 5, 7, 13, 15
 PROTOCOL_VERSION = 10
-LOG_TYPES = {
-    "uint8_t": (1, "B"),
-    "uint16_t": (2, "H"),
-    "uint32_t": (3, "I"),
-    "int8_t": (4, "b"),
-    "int16_t": (5, "h"),
-    "int32_t": (6, "i"),
-    "float": (7, "f"),
-    "FP16": (8, "e"),
-}
 FORMATS = dict(LOG_TYPES.values())
 PARAMETERS = (
     ("firmware.revision0", 0x0A | 0x40, struct.pack("<I", 0x0D32A1)),

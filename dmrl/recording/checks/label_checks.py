@@ -46,7 +46,7 @@ def check_labels(data: CheckData) -> Iterator[Finding]:
             yield Finding("error", topic, str(e))
             continue
         yield from _check_images(data, topic, CAMERA_IMAGE(parts["robot"]), table)
-        peers = _flatten_peers(table["peers"])
+        peers = pa.Table.from_struct_array(pc.list_flatten(table["peers"]))
         size_px = _find_image_size(data, parts["robot"])
         for source in sorted(set(peers["source"].to_pylist())):
             labels = _build_labels(source, peers.filter(pc.equal(peers["source"], source)), size_px)
@@ -131,11 +131,6 @@ def _find_image_size(data: CheckData, robot: str) -> tuple[int, int] | None:
         calibrated = data.contents.get_table(topic, ["width", "height"])
         return calibrated["width"][0].as_py(), calibrated["height"][0].as_py()
     return find_first_size(data, image) if image in data.times else None
-
-
-def _flatten_peers(peers: pa.ChunkedArray) -> pa.Table:
-    """Return a table with one row per peer and source."""
-    return pa.Table.from_struct_array(pc.list_flatten(peers))
 
 
 def _check_pixels(labels: _Labels) -> Iterator[str]:
