@@ -10,6 +10,7 @@ from dmrl.estimation.flight.swarm import estimate_swarm
 from dmrl.estimation.model.gate import Gate
 from dmrl.estimation.model.pair import Pair
 from dmrl.estimation.solver.estimate import Estimate
+from dmrl.guards.memory import keep_freed_memory
 from dmrl.labelling.flight_log import RobotPair
 from dmrl.terminal.progress import track
 
@@ -17,6 +18,8 @@ MAX_GROUP = 15
 """Most pairs that are filtered side by side: more are no faster, and need more memory."""
 MIN_GROUP = 4
 """Fewest pairs of a process."""
+KEPT_BYTES = 64 << 20
+"""Freed bytes that a process keeps: the arrays of an iteration over a window."""
 MIN_PARALLEL_S = 300.0
 """Flight time of all pairs from which more processes pay off, seconds: each starts in a second."""
 
@@ -45,6 +48,7 @@ class PairSolver:
 
     def solve(self, pairs: list[Pair]) -> Sequence[tuple[Estimate, Estimate | None]]:
         """Return the estimates of the peer and, unless the method is "ekf", of the observer."""
+        keep_freed_memory(KEPT_BYTES)
         if self.method == "ekf":
             return [(one, None) for one in estimate_ekf(pairs, self.preset, gate=self.gate)]
         return estimate_pairs(pairs, gate=self.gate)

@@ -13,9 +13,11 @@ from dmrl.estimation.evidence.error_models import Candidate, list_candidates
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.search.modes import COST_SCALE, SAME_TRACK_M, convert_values
 from dmrl.estimation.solver.block_tridiagonal import solve_step
+from dmrl.estimation.solver.covariance import MIN_MOTION_ENERGY, odometry_energy
 from dmrl.estimation.solver.equations import total_cost
 from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, Solver, is_same_solution
 from dmrl.estimation.solver.noise_selection import GRADE_BIAS, MIN_CONSTANTS_GRADE
+from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import Values
 from dmrl.estimation.solver.unknowns import YAW_RATE_ERROR
 
@@ -110,10 +112,11 @@ def weigh_models(
         for mode in modes[1:]
     ]
     best, rounds = plain, []
+    candidates = _list_shown(solver.problem)
     for _ in range(MAX_MODELS):
         tried = [
             one
-            for candidate in list_candidates()
+            for candidate in candidates
             if candidate not in best.models
             for one in _try_model(best, candidate, others)
         ]
@@ -127,6 +130,20 @@ def weigh_models(
         others = ()
     members += _extend_rivals(rounds)
     return _mix([_widen(one) for one in _select_likely(members)])
+
+
+def _list_shown(problem: Problem) -> list[Candidate]:
+    """Return the error models that a flight can show.
+
+    A robot that does not move shows no scale of its motion, but a scale would explain its noise.
+    """
+    moves = [odometry_energy(problem, k) >= MIN_MOTION_ENERGY for k in range(len(problem.robots))]
+    return [
+        one
+        for one in list_candidates()
+        if not any(row.motion_scale for row in one.model.rows)
+        or (any(moves) if one.robot is None else moves[one.robot])
+    ]
 
 
 def _list_rivals(leader: Member, tried: Sequence[Member]) -> list[Member]:
@@ -209,7 +226,8 @@ def _step_score(solver: Solver, start: Values, models: tuple[Candidate, ...]) ->
     slope = float((equations.gradient * solved.state).sum())
     slope += float(equations.globals_gradient @ solved.constants)
     begun = MapEstimate(start, total_cost(factors))
-    return solver.log_evidence(begun, solved) - slope / 2 + _prior(models)
+    score = solver.laplace_evidence(begun, factors, solved.log_det) + _prior(models)
+    return score - slope / 2
 
 
 def _select_grade(member: Member) -> Member:

@@ -15,7 +15,12 @@ from dmrl.estimation.model.gate import Gate
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Mask, Pair
 from dmrl.estimation.model.status import AMBIGUOUS, OK, UNCONVERGED, Statuses, classify_positions
-from dmrl.estimation.solver.covariance import calm_motion, odometry_energy, relative_covariance
+from dmrl.estimation.solver.covariance import (
+    MIN_MOTION_ENERGY,
+    calm_motion,
+    odometry_energy,
+    relative_covariance,
+)
 from dmrl.estimation.solver.estimate import REASONS, Cause, Estimate
 from dmrl.estimation.solver.levenberg_marquardt import relative_path
 from dmrl.estimation.solver.problem import Problem
@@ -32,11 +37,6 @@ SIGMA_FACTOR_S, SIGMA_FACTOR = (20.0, 60.0), (0.8, 0.9)
 
 RANGE_MEDIAN, RANGE_MARGIN_M = 21, 0.5
 """Number of ranges in the median that bounds a position; and margin of that bound, metres."""
-
-
-MIN_MOTION_ENERGY = 1.0
-"""Smallest energy of a motion that makes the bearing observable, relative to that of the odometry
-noise over a second: 0.06 m/s with the default noise, 0.04 m/s with calibrated sensors."""
 
 
 MISFIT_MARGIN_S = 30.0

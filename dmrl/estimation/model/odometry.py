@@ -124,4 +124,6 @@ def preintegrate(track: SensorTrack, time_s: Array) -> Odometry:
 
 def rotate(matrices: Array, vectors: Array) -> Array:
     """Multiply (..., 2, 2) matrices with (..., 2) vectors, pair by pair."""
-    return np.asarray((matrices @ vectors[..., None])[..., 0])
+    x, y = vectors[..., 0], vectors[..., 1]
+    rotated = [row[0] * x + row[1] * y for row in np.moveaxis(matrices, (-2, -1), (0, 1))]
+    return np.moveaxis(np.stack(rotated), 0, -1)

@@ -29,6 +29,9 @@ MAX_MOTION_HZ = 1.0
 MIN_ENERGY_RATIO = 2.5
 """Motion must exceed the energy of its noise by this factor. The mean of three bins of pure noise,
 chi-square with six degrees of freedom, exceeds it in 2 % of all cases."""
+MIN_MOTION_ENERGY = 1.0
+"""Smallest energy of a motion that makes the bearing observable, relative to that of the odometry
+noise over a second: 0.06 m/s with the default noise, 0.04 m/s with calibrated sensors."""
 
 
 def compute_covariance(solver: Solver, values: Values) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.block_tridiagonal import NormalEquations, Solved, solve_step
+from dmrl.estimation.solver.block_tridiagonal import NormalEquations, solve_step
 from dmrl.estimation.solver.equations import build_equations, linearize, total_cost
 from dmrl.estimation.solver.layout import Layout
 from dmrl.estimation.solver.priors import CarriedPrior, Chain, ConstantPrior
@@ -140,14 +140,27 @@ class Solver:
             equations = build_equations(layout, factors, len(values.state))
         return MapEstimate(values, best)
 
-    def log_evidence(self, found: MapEstimate, solved: Solved | None = None) -> float:
+    def log_evidence(self, found: MapEstimate) -> float:
         """Return the Laplace approximation of the log evidence at a solution.
 
         It lacks a constant that depends on the measurements alone, so models (rows of the table
         and grades of noise) with the same measurements can be compared.
         """
         equations, factors = self.equations(found.values)
-        solved = solved or solve_step(equations)
+        return self.laplace_evidence(found, factors, solve_step(equations).log_det)
+
+    def laplace_evidence(self, found: MapEstimate, factors: list[Factor], log_det: float) -> float:
+        """Return the evidence as `log_evidence`, from factors that are linearized already.
+
+        Parameters
+        ----------
+        found
+            The solution.
+        factors
+            Factors there.
+        log_det
+            Log determinant of their normal equations.
+        """
         noise, normalizer = self.problem.noise, 0.0
         for robot in range(len(self.problem.robots)):
             normalizer += float(np.log(odometry_variance(self.problem, robot)).sum()) / 2
@@ -166,7 +179,7 @@ class Solver:
                 pull += factor.row.pull_weight * float(np.log1p(square).sum()) / 2
             elif isinstance(factor, ConstantPrior):
                 normalizer += float(np.log(factor.std).sum())
-        return pull - found.cost - normalizer - solved.log_det / 2
+        return pull - found.cost - normalizer - log_det / 2
 
 
 def relative_path(state: Array, one: int = 0, other: int = 1) -> Array:

@@ -80,7 +80,7 @@ class Rows:
         """Add the weighted rows to the normal equations."""
         root = np.sqrt(self.weight * self.loss.weight(self.square))
         flat = (self.rows * root[..., None, None]).reshape(len(self.rows), -1, self.rows.shape[-1])
-        equations.add_rows(flat.swapaxes(1, 2) @ flat, self.columns, self.border, self.steps)
+        equations.add_rows(flat, self.columns, self.border, self.steps)
 
     def with_residuals_of(self, other: "Rows") -> "Rows":
         """Return the rows with the residuals, and so the weights, of another linearization."""
@@ -95,7 +95,7 @@ def odometry_variance(problem: Problem, robot: int) -> Array:
     shift = noise.velocity_psd * (noise.grade * steps.noise_factor) ** 2 * steps.steps_s
     shift = shift + noise.dropout_speed_mps**2 * steps.dropout_s
     turn = noise.yaw_rate_psd * steps.steps_s + noise.dropout_turn_radps**2 * steps.turn_dropout_s
-    return np.column_stack([shift, shift, turn])
+    return np.stack([shift, shift, turn]).T
 
 
 def motion_gain(layout: Layout, robot: int, constants: Array) -> Array:
@@ -116,7 +116,7 @@ def odometry_factor(problem: Problem, layout: Layout, robot: int, values: Values
     columns = layout.pose(robot) + [c for row, c, constant in mine if row.motion and not constant]
     border = [c for row, c, constant in mine if constant and (row.motion or row.motion_scale)]
     size = len(columns)
-    out = np.zeros((len(way), 3, 2 * size + len(border) + 1))
+    out = np.zeros((2 * size + len(border) + 1, 3, len(way))).T
     gain = motion_gain(layout, robot, values.constants)
     for row, c, constant in mine:
         if row.motion_scale and constant:
@@ -137,7 +137,7 @@ def odometry_factor(problem: Problem, layout: Layout, robot: int, values: Values
     out[:, :2, 2] = -gain * (way @ QUARTER_TURN.T)
     out[:, 2, 2], out[:, 2, size + 2] = -1.0, 1.0
     out /= np.sqrt(odometry_variance(problem, robot))[..., None]
-    rows, ones = out[:, :, None], np.ones((len(way), 3))
+    rows, ones = out[:, :, None], np.ones((3, len(way))).T
     return Rows(rows, columns, border, problem.noise.motion_loss, ones, steps=True)
 
 
@@ -157,14 +157,15 @@ class _Geometry(NamedTuple):
 def _geometry(measured: RangeLink | CameraView, layout: Layout, values: Values) -> _Geometry:
     """Return the relative position at each measurement."""
     one, other = measured.robots
-    here, there = (values.state[measured.keyframe][:, layout.pose(k)] for k in (one, other))
-    own = rotate(rotation_matrix(here[:, 2]), measured.own_shift_m)
-    peer = rotate(rotation_matrix(there[:, 2]), measured.peer_shift_m)
+    here, there = (values.state[:, layout.pose(k)] for k in (one, other))
+    at = measured.keyframe
+    own = rotate(rotation_matrix(here[:, 2])[at], measured.own_shift_m)
+    peer = rotate(rotation_matrix(there[:, 2])[at], measured.peer_shift_m)
     up = measured.height_m.copy()
     for row, c, constant, side in layout.measured(measured.robots, "height"):
-        error = values.constants[c] if constant else values.state[measured.keyframe, c]
+        error = values.constants[c] if constant else values.state[at, c]
         up = up + side * row.height * error
-    offset = there[:, :2] + peer - here[:, :2] - own
+    offset = np.take((there - here)[:, :2].T, at, axis=1).T + peer - own
     return _Geometry(offset, up, -own @ QUARTER_TURN.T, peer @ QUARTER_TURN.T)
 
 
@@ -183,13 +184,13 @@ def _sights(
 def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Values) -> Rows:
     """Linearize the ranges of one pair: predicted minus measured."""
     at = _geometry(link, layout, values)
-    distance = np.sqrt((at.offset**2).sum(axis=1) + at.up**2) + 1e-6
+    distance = np.sqrt(_dot(at.offset, at.offset) + at.up**2) + 1e-6
     towards = at.offset / distance[:, None]
     used = layout.measured(link.robots, "range")
     states = [c for _, c, constant, _ in used if not constant]
     border = [c for _, c, constant, _ in used if constant]
     columns = layout.pose(link.robots[0]) + layout.pose(link.robots[1]) + states
-    out = np.zeros((len(distance), len(columns) + len(border) + 1))
+    out = np.zeros((len(columns) + len(border) + 1, len(distance))).T
     gain, error, heights = np.ones(len(distance)), np.zeros(len(distance)), []
     sights = _sights(link, layout, values, at.offset, distance)
     for row, c, constant, side in used:
@@ -208,13 +209,18 @@ def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Valu
     out[:, heights] *= gain[:, None]
     out[:, 0:2], out[:, 3:5] = -gain[:, None] * towards, gain[:, None] * towards
     for column, by_turn in ((2, at.by_own_turn), (5, at.by_peer_turn)):
-        out[:, column] = gain * (towards * by_turn).sum(axis=1)
+        out[:, column] = gain * _dot(towards, by_turn)
     out[:, -1] = gain * distance + error - link.range_m
     out /= (problem.noise.range_std_m * link.std_share)[:, None]
     return _pad_rows(
         out[:, None], link.keyframe, np.ones(len(out)), len(values.state),
         (columns, border, problem.noise.range_loss),
     )  # fmt: skip
+
+
+def _dot(one: Array, other: Array) -> Array:
+    """Return (N,) scalar products of (N, 2) vectors."""
+    return one[:, 0] * other[:, 0] + one[:, 1] * other[:, 1]
 
 
 def bearing_factor(problem: Problem, layout: Layout, view: CameraView, values: Values) -> Rows:
@@ -303,7 +309,12 @@ def _pad_rows(
     """Return rows (N, q, w) of sorted keyframes as (K, m, q, w), padded with weight 0."""
     count = np.bincount(keyframe, minlength=keyframes)
     slot = np.arange(len(rows)) - (np.cumsum(count) - count)[keyframe]
-    out = np.zeros((keyframes, max(int(count.max(initial=0)), 1), *rows.shape[1:]))
-    factor = np.zeros(out.shape[:2])
-    out[keyframe, slot], factor[keyframe, slot] = rows, weight
-    return Rows(out, *rest, factor)
+    most = max(int(count.max(initial=0)), 1)
+    # Keyframes are last in memory, as `NormalEquations.add_rows` adds them.
+    out, factor = np.zeros((*rows.shape[:0:-1], most, keyframes)), np.zeros((most, keyframes))
+    place = slot * keyframes + keyframe
+    factor.ravel()[place] = weight
+    columns = out.reshape(-1, most * keyframes)
+    for column, values in zip(columns, rows.T.reshape(len(columns), -1), strict=True):
+        column[place] = values
+    return Rows(out.T, *rest, factor.T)

@@ -1,8 +1,6 @@
 """Trainer: the training loop, seeded, resumable and logged to TensorBoard."""
 
-import ctypes
 import math
-import platform
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from dmrl.errors import SettingError
+from dmrl.guards.memory import keep_freed_memory
 from dmrl.learn.data.augment import Augmenter
 from dmrl.learn.data.batches import (
     Batch,
@@ -38,8 +37,6 @@ from dmrl.learn.training.validation import validate
 
 SampleWeights = NDArray[np.float64] | None
 """(N,) how often each image appears in an epoch, 1 on average; None: once."""
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""Parameters of glibc's ``mallopt``, from malloc.h."""
 LOG_EVERY_STEPS = 10
 """Steps between two readings of the loss, since each reading synchronises an accelerator."""
 
@@ -194,7 +191,7 @@ class Trainer:
             If the loss is not finite.
         """
         first = self._state.epochs_done
-        _keep_freed_memory()
+        keep_freed_memory(2**31 - 1)
         with self._open_log(first * self._steps_per_epoch + 1) as board:
             for epoch in range(first, self._settings.epochs):
                 left = self._settings.epochs - epoch
@@ -296,18 +293,6 @@ class Trainer:
             self._teacher,
             pairs,
         )
-
-
-def _keep_freed_memory() -> None:
-    """Let the C library keep freed memory, so that a step does not fault in each page again.
-
-    Otherwise glibc returns the largest tensors of a step to the system: 5,000 page faults a step
-    of 16 images, 4-8 % of its time.
-    """
-    if platform.libc_ver()[0] == "glibc":
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
-        mallopt(M_MMAP_THRESHOLD, 2**31 - 1)
 
 
 def _switch_to_training(network: Network, *, frozen_norms: bool) -> None:

@@ -12,6 +12,7 @@ from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.solver.estimate import Cause
 from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.unknowns import TABLE
+from dmrl.flight import Trajectory
 from dmrl.messages import STATUS_OK
 
 from ..flights import flown, pair_of, truth_at
@@ -35,6 +36,20 @@ def test_a_model_adds_its_unknowns_for_its_robot_alone(candidate: Candidate) -> 
     assert {name for name, _ in added} == {row.name for row in candidate.model.rows}
     if candidate.robot is not None:
         assert {own for _, own in added} <= {(candidate.robot,)}
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "shown"),
+    [("in_view", {0, 1, None}), ("observer_static", {1, None}), ("both_static", set())],
+)
+def test_only_motion_shows_a_scale_of_the_flow(
+    trajectory: Trajectory, shown: set[int | None]
+) -> None:
+    problem = build_problem({(0, 1): pair_of(flown(trajectory, "calibrated", 1000, 20.0))})
+    listed = posterior._list_shown(problem)
+    scales = {one.robot for one in listed if any(row.motion_scale for row in one.model.rows)}
+    assert scales == shown
+    assert Candidate(MODELS[0], 0) in listed
 
 
 @pytest.mark.heavy

@@ -30,7 +30,7 @@ def random_equations(seed: int = 0) -> tuple[NormalEquations, Array, Array]:
         count = KEYS - steps
         width = len(columns) * (1 + steps) + len(border) + 1
         rows = rng.normal(size=(count, 4, width))
-        out.add_rows(rows.swapaxes(1, 2) @ rows, columns, border, bool(steps))
+        out.add_rows(rows, columns, border, bool(steps))
         for key in range(count):
             at = [key * WIDTH + c for c in columns]
             at += [(key + 1) * WIDTH + c for c in columns] if steps else []
