@@ -1,5 +1,8 @@
 """Colours by meaning, the same in every image, plot and view."""
 
+import numpy as np
+from numpy.typing import NDArray
+
 # After Okabe and Ito, distinguishable with colour blindness, but bright enough for text on grey.
 RGB = {
     "truth": (60, 235, 160),
@@ -13,7 +16,7 @@ RGB = {
 }
 """Colours of the sources of positions, and of other measurements."""
 
-SECOND_DETECTION_RGB = (80, 140, 255)
+SECOND_DETECTION_RGB = (255, 125, 245)
 """Colour of a second model's detections, beside those of a first."""
 
 OWN_RGB, PEER_RGB = (240, 240, 240), (150, 150, 150)
@@ -21,3 +24,18 @@ OWN_RGB, PEER_RGB = (240, 240, 240), (150, 150, 150)
 
 STATUS_RGB = {"OK": (70, 120, 175), "UNCONVERGED": (130, 130, 130), "AMBIGUOUS": (200, 60, 60)}
 """Colours of the values of ``dmrl.v1.Status``, by name."""
+
+MIN_DEPTH_CONFIDENCE = 0.05
+"""Confidence below which a cell of a map is drawn without a depth: it belongs to no robot."""
+
+VIRIDIS_RGB = np.array(
+    [(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], float
+)
+
+
+def paint_viridis(shares: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return the colours, (..., 3), of values of 0 to 1; values outside get the nearest colour."""
+    place = np.asarray(shares, float) * (len(VIRIDIS_RGB) - 1)
+    stops = np.arange(len(VIRIDIS_RGB))
+    rgb = [np.interp(place, stops, channel) for channel in VIRIDIS_RGB.T]
+    return np.stack(rgb, axis=-1).astype(np.uint8)

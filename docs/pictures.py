@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 HASH_KEY = "dmrl.drawn-by"
 FLIGHT = (
     "dmrl fly fly_rendered flight.mcap --seed 3",
-    "dmrl label flight.mcap labelled.mcap",
+    "dmrl label flight.mcap labelled.mcap --gate-m 0.5",
     "dmrl predict dmrl-nano labelled.mcap nano.mcap",
 )
 """A rendered flight of two drones, its labels and the detections of the network that ships."""
@@ -103,18 +103,18 @@ PICTURES = {
     "docs/images/view-image.png": Picture(
         (
             *FLIGHT,
-            "dmrl view nano.mcap --layout image --robot cf1 --screenshot picture.png --time 10",
+            "dmrl view nano.mcap --layout image --robot cf1 --screenshot picture.png --time 18.9",
         ),
         VIEWER,
     ),
     "docs/images/view-flight.png": Picture(
-        (*FLIGHT, "dmrl view nano.mcap --screenshot picture.png --time 20"), VIEWER
+        (*FLIGHT, "dmrl view nano.mcap --screenshot picture.png --time 18.4"), VIEWER
     ),
     "docs/images/view-compare.png": Picture(
         (
             *FLIGHT,
             "dmrl predict dmrl-nano-violet labelled.mcap violet.mcap",
-            "dmrl view violet.mcap nano.mcap --layout compare --screenshot picture.png --time 20",
+            "dmrl view violet.mcap nano.mcap --layout compare --screenshot picture.png --time 18.4",
         ),
         VIEWER,
     ),

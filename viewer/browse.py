@@ -97,7 +97,7 @@ def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Sh
         )
     scales = archetypes.build_scales(settings.depth_max_m)
     rows, cols = grid_shape(ranked.rows)
-    eye = CameraPanel(
+    camera = CameraPanel(
         ROBOT,
         folder.name,
         cols * STRIDE_PX,
@@ -114,9 +114,9 @@ def browse(paths: Sequence[Path], settings: Settings, *, rank: int | None) -> Sh
     return Show(
         folder.name,
         layouts.build_dataset_layout(
-            eye, scales, plot, FACTS_PATH, timeline=TIMELINE, overlay=settings.overlay
+            camera, scales, plot, FACTS_PATH, timeline=TIMELINE, overlay=settings.overlay
         ),
-        partial(_iter_entities, ranked, eye, scales, settings, rank),
+        partial(_iter_entities, ranked, camera, scales, settings, rank),
         len(ranked.rows) if rank is None else 1,
         (TIMELINE, rank or 1),
         f"row {rank or 1} of {len(ranked.rows)}",
@@ -209,7 +209,7 @@ def image_size(rows: pa.Table) -> tuple[int, int]:
 
 def _iter_entities(
     ranked: RankedRows,
-    eye: CameraPanel,
+    camera: CameraPanel,
     scales: Mapping[str, ColourScale],
     settings: Settings,
     rank: int | None,
@@ -224,17 +224,17 @@ def _iter_entities(
             ),
         )
     named = {} if ranked.found is None else {"detection": RGB["detection"]}
-    shown = {name: scales[name] for name in eye.channels}
-    for entity in draw_colour_bars(ROBOT, shown, eye.width_px, eye.height_px):
+    shown = {name: scales[name] for name in camera.channels}
+    for entity in draw_colour_bars(ROBOT, shown, camera.width_px, camera.height_px):
         yield None, entity
     sources: set[str] = set()
     chosen = every if rank is None else every[[rank - 1]]
     for start in range(0, len(chosen), BATCH_ROWS):
         part = chosen[start : start + BATCH_ROWS]
-        for entity in _draw_rows(ranked, part, eye, shown, sources, smooth=settings.overlay):
+        for entity in _draw_rows(ranked, part, camera, shown, sources, smooth=settings.overlay):
             yield _rank_column(part), entity
     colours = {name: RGB.get(name, RGB["other"]) for name in sorted(sources)} | named
-    yield None, draw_legend(ROBOT, colours, eye.width_px, eye.height_px)
+    yield None, draw_legend(ROBOT, colours, camera.width_px, camera.height_px)
 
 
 def _rank_column(rows: NDArray[np.int64]) -> rr.TimeColumn:
@@ -244,7 +244,7 @@ def _rank_column(rows: NDArray[np.int64]) -> rr.TimeColumn:
 def _draw_rows(
     ranked: RankedRows,
     part: NDArray[np.int64],
-    eye: CameraPanel,
+    camera: CameraPanel,
     scales: Mapping[str, ColourScale],
     sources: set[str],
     *,
@@ -253,37 +253,37 @@ def _draw_rows(
     rows = ranked.rows.take(part).combine_chunks()
     frame = image_frame(ROBOT)
     (batch,) = rows.to_batches()
-    yield _draw_images(eye, batch)
+    yield _draw_images(camera, batch)
     yield from draw_labels(
-        eye.labels, frame, batch.select(["peers"]), sources, (eye.width_px, eye.height_px)
+        camera.labels, frame, batch.select(["peers"]), sources, (camera.width_px, camera.height_px)
     )
     maps = None
     if ranked.found is not None:
         mine = ranked.found.select_rows(part)
         yield from archetypes.draw_detections(
-            eye.detections, frame, mine.to_detections(), eye.width_px
+            camera.detections, frame, mine.to_detections(), camera.width_px
         )
         maps = mine.load_maps()
     yield from archetypes.draw_grids(
-        eye.grid, frame, _build_true_maps(batch) if maps is None else maps, scales, smooth=smooth
+        camera.grid, frame, _build_true_maps(batch) if maps is None else maps, scales, smooth=smooth
     )
     words = [_describe_row(ranked, int(k)) for k in part]
     columns = rr.TextDocument.columns(text=words, media_type=["text/markdown"] * len(words))
     yield Entity(FACTS_PATH, columns)
 
 
-def _draw_images(eye: CameraPanel, batch: pa.RecordBatch) -> Entity:
+def _draw_images(camera: CameraPanel, batch: pa.RecordBatch) -> Entity:
     frame = image_frame(ROBOT)
     if layout.PIXELS not in batch.schema.names:
         blobs = batch[layout.IMAGE].field("bytes").to_pylist()
         columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/png"] * len(blobs))
-        return Entity(eye.picture, columns, frame=frame)
+        return Entity(camera.picture, columns, frame=frame)
     form = rr.components.ImageFormat(
-        width=eye.width_px, height=eye.height_px, color_model="RGB", channel_datatype="U8"
+        width=camera.width_px, height=camera.height_px, color_model="RGB", channel_datatype="U8"
     )
     pixels = batch[layout.PIXELS].to_pylist()
     return Entity(
-        eye.picture, rr.Image.columns(buffer=pixels, format=[form] * len(pixels)), frame=frame
+        camera.picture, rr.Image.columns(buffer=pixels, format=[form] * len(pixels)), frame=frame
     )
 
 

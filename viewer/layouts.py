@@ -65,7 +65,7 @@ class SpacePanel:
     trails
         Entities that show their last seconds.
     position, target
-        Position of the eye, and the point that it faces, metres.
+        Position of the viewpoint, and the point that it faces, metres.
     """
 
     frame: str
@@ -98,13 +98,13 @@ class PlotPanel:
 
 
 def build_image_layout(
-    eyes: Sequence[CameraPanel], scales: Mapping[str, ColourScale], *, overlay: bool
+    cameras: Sequence[CameraPanel], scales: Mapping[str, ColourScale], *, overlay: bool
 ) -> rrb.Blueprint:
     """Build a layout of images with labels and detections, and their maps beside them.
 
     Parameters
     ----------
-    eyes
+    cameras
         A single camera fills the window and gets an extra panel: confidence laid over the image.
         Several cameras get a row each.
     scales
@@ -112,24 +112,24 @@ def build_image_layout(
     overlay
         Lay every map over the image.
     """
-    if len(eyes) == 1:
-        views = build_camera_views(eyes[0], scales, both=not overlay, overlay=overlay)
+    if len(cameras) == 1:
+        views = build_camera_views(cameras[0], scales, both=not overlay, overlay=overlay)
         if len(views) == 3:
             beside = rrb.Vertical(*views[1:])
             return build_window(rrb.Horizontal(views[0], beside, column_shares=[1.4, 1]))
         return build_window(rrb.Grid(*views, grid_columns=min(len(views), 2)))
-    return build_window(_build_rows(eyes, scales, overlay=overlay))
+    return build_window(_build_rows(cameras, scales, overlay=overlay))
 
 
 def _build_rows(
-    eyes: Sequence[CameraPanel], scales: Mapping[str, ColourScale], *, overlay: bool
+    cameras: Sequence[CameraPanel], scales: Mapping[str, ColourScale], *, overlay: bool
 ) -> rrb.Container:
-    rows = [build_camera_views(eye, scales, overlay=overlay) for eye in eyes]
+    rows = [build_camera_views(camera, scales, overlay=overlay) for camera in cameras]
     return rrb.Vertical(*(rrb.Horizontal(*row) for row in rows))
 
 
 def build_compare_layout(
-    eyes: Sequence[CameraPanel],
+    cameras: Sequence[CameraPanel],
     scales: Mapping[str, ColourScale],
     plots: Sequence[PlotPanel],
     table: str,
@@ -137,7 +137,7 @@ def build_compare_layout(
     overlay: bool,
 ) -> rrb.Blueprint:
     """Build a layout with a row per model; below them, their errors over time and a table."""
-    rows = _build_rows(eyes, scales, overlay=overlay)
+    rows = _build_rows(cameras, scales, overlay=overlay)
     if not plots:
         return build_window(rows)
     words = rrb.TextDocumentView(origin=escape_path(table), name="both models")
@@ -147,7 +147,7 @@ def build_compare_layout(
 
 def build_flight_layout(
     spaces: Sequence[SpacePanel],
-    eyes: Sequence[CameraPanel],
+    cameras: Sequence[CameraPanel],
     plots: Mapping[str, Sequence[PlotPanel]],
     scales: Mapping[str, ColourScale],
 ) -> rrb.Blueprint:
@@ -157,14 +157,14 @@ def build_flight_layout(
     ----------
     spaces
         3D views, in tabs.
-    eyes
+    cameras
         Cameras whose images are shown.
     plots
         Panels by tab.
     scales
         Colours of the maps that are shown beside the images.
     """
-    views = [view for eye in eyes for view in build_camera_views(eye, scales)]
+    views = [view for camera in cameras for view in build_camera_views(camera, scales)]
     spatial = rrb.Tabs(*(_build_space_view(space) for space in spaces))
     above: rrb.Container = spatial
     if len(views) == 1:
@@ -189,7 +189,7 @@ def _choose_columns(panels: int) -> int:
 
 
 def build_dataset_layout(
-    eye: CameraPanel,
+    camera: CameraPanel,
     scales: Mapping[str, ColourScale],
     plot: PlotPanel | None,
     facts: str,
@@ -198,7 +198,7 @@ def build_dataset_layout(
     overlay: bool,
 ) -> rrb.Blueprint:
     """Build a layout for one row at a time: image and maps, facts about the row, and its error."""
-    views = build_camera_views(eye, scales, both=not overlay, overlay=overlay)
+    views = build_camera_views(camera, scales, both=not overlay, overlay=overlay)
     words = rrb.TextDocumentView(origin=escape_path(facts), name="row")
     side = [words] if plot is None else [words, build_plot_view(plot)]
     panels = rrb.Horizontal(
@@ -228,27 +228,29 @@ def build_window(
 
 
 def build_camera_views(
-    eye: CameraPanel,
+    camera: CameraPanel,
     scales: Mapping[str, ColourScale],
     *,
     both: bool = False,
     overlay: bool = False,
 ) -> list[rrb.View]:
     """Build views of the image and of each map; ``both``: also confidence over the image."""
-    picture = escape_path(eye.picture)
-    found = [eye.detections, texts_path(eye.detections)]
-    marks = [f"{escape_path(eye.labels)}/**", *map(escape_path, found)]
-    cell = escape_path(f"{eye.grid}/best")
+    picture = escape_path(camera.picture)
+    found = [camera.detections, texts_path(camera.detections)]
+    marks = [f"{escape_path(camera.labels)}/**", *map(escape_path, found)]
+    cell = escape_path(f"{camera.grid}/best")
     views = [
-        _build_image_view(eye, "image", [picture, *marks, escape_path(legend_path(eye.robot))])
+        _build_image_view(
+            camera, "image", [picture, *marks, escape_path(legend_path(camera.robot))]
+        )
     ]
     heat = {
         channel: [
-            escape_path(channel_path(eye.grid, channel)),
-            f"{escape_path(bar_path(eye.robot, channel))}/**",
+            escape_path(channel_path(camera.grid, channel)),
+            f"{escape_path(bar_path(camera.robot, channel))}/**",
             cell,
         ]
-        for channel in eye.channels
+        for channel in camera.channels
         if channel in scales
     }
     over = list(heat) if overlay else ["confidence"] if both and "confidence" in heat else []
@@ -256,17 +258,19 @@ def build_camera_views(
         contents = [picture, *heat[channel], *(marks if overlay else [])]
         what, comma, unit = scales[channel].title.partition(",")
         name = f"{what} over image{comma}{unit}"
-        views.append(_build_image_view(eye, name, contents, texts=False, opacity=BELOW_MAP_OPACITY))
+        views.append(
+            _build_image_view(camera, name, contents, texts=False, opacity=BELOW_MAP_OPACITY)
+        )
     if not overlay:
         for channel, paths in heat.items():
             views.append(
-                _build_image_view(eye, scales[channel].title, [*paths, *marks], texts=False)
+                _build_image_view(camera, scales[channel].title, [*paths, *marks], texts=False)
             )
     return views
 
 
 def _build_image_view(
-    eye: CameraPanel,
+    camera: CameraPanel,
     name: str,
     contents: list[str],
     *,
@@ -274,17 +278,17 @@ def _build_image_view(
     opacity: float = IMAGE_OPACITY,
 ) -> rrb.View:
     bounds = rrb.VisualBounds2D(
-        x_range=(-MARGIN_PX, eye.width_px + MARGIN_PX),
-        y_range=(-MARGIN_PX, eye.height_px + LEGEND_HEIGHT_PX),
+        x_range=(-MARGIN_PX, camera.width_px + MARGIN_PX),
+        y_range=(-MARGIN_PX, camera.height_px + LEGEND_HEIGHT_PX),
     )
     kinds = () if texts else (rr.Points2D, rr.Boxes2D)
     return rrb.Spatial2DView(
-        origin=escape_path(eye.robot),
-        name=f"{eye.title} {name}",
+        origin=escape_path(camera.robot),
+        name=f"{camera.title} {name}",
         contents=contents,
         visual_bounds=bounds,
         background=BACKGROUND,
-        spatial_information=rrb.SpatialInformation(target_frame=image_frame(eye.robot)),
+        spatial_information=rrb.SpatialInformation(target_frame=image_frame(camera.robot)),
         defaults=[
             rr.EncodedImage.from_fields(opacity=opacity),
             rr.Image.from_fields(opacity=opacity),

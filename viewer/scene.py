@@ -69,7 +69,7 @@ class Scene:
         How topics are drawn, image by image or message by message.
     stills
         Entities that need no reading: with log times, or static.
-    eyes
+    cameras
         Cameras that have a legend.
     sources
         Robot to sources of its labels; updated as they are read.
@@ -82,7 +82,7 @@ class Scene:
     blueprint: rrb.Blueprint
     draws: list[DrawRule]
     stills: list[PreparedEntity]
-    eyes: Sequence[CameraPanel]
+    cameras: Sequence[CameraPanel]
     sources: dict[str, set[str]] = field(default_factory=dict)
     named: dict[str, Colour] = field(default_factory=dict)
     follower: Callable[[], FlightStreamer] | None = None
@@ -141,11 +141,11 @@ def _with_times(selection: Selection, stills: Iterable[PreparedEntity]) -> Itera
 
 def _iter_changed_legends(scene: Scene, shown: dict[str, set[str]]) -> Iterator[TimedEntity]:
     """Yield the legends that differ from those already ``shown``."""
-    for robot, eye in {eye.robot: eye for eye in scene.eyes}.items():
+    for robot, camera in {camera.robot: camera for camera in scene.cameras}.items():
         sources = scene.sources.get(robot, set())
         if shown.get(robot) != sources and (sources or scene.named):
             shown[robot] = set(sources)
-            yield None, _build_legend(eye, sources, scene.named)
+            yield None, _build_legend(camera, sources, scene.named)
 
 
 def _iter_batches(selection: Selection, scene: Scene, path: Path) -> Iterator[TopicBatches]:
@@ -188,11 +188,11 @@ def _time_column(selection: Selection, time_ns: Times) -> Any:
     return build_time_column(TIMELINE, time_ns, selection.zero_ns)
 
 
-def _build_legend(eye: CameraPanel, sources: set[str], named: Mapping[str, Colour]) -> Entity:
+def _build_legend(camera: CameraPanel, sources: set[str], named: Mapping[str, Colour]) -> Entity:
     first = [name for name in RGB if name in sources]
     ordered = [*first, *sorted(sources - set(first))]
     colours = {name: RGB.get(name, RGB["other"]) for name in ordered} | dict(named)
-    return draw_legend(eye.robot, colours, eye.width_px, eye.height_px)
+    return draw_legend(camera.robot, colours, camera.width_px, camera.height_px)
 
 
 def load_first_messages(
@@ -230,12 +230,12 @@ def build_camera_panels(
     """
     grids = load_first_messages(selection, map(topics.GRID, robots), model) if scales else {}
     prefix = "" if model is None else f"/{model.stem}"
-    eyes = []
+    cameras = []
     for robot in robots:
         picture, grid = topics.CAMERA_IMAGE(robot), topics.GRID(robot)
         width_px, height_px = _find_image_size(selection, picture)
         channels = grids[grid]["channels"] if grid in grids else ()
-        eyes.append(
+        cameras.append(
             CameraPanel(
                 robot,
                 robot if model is None else model.stem,
@@ -248,7 +248,7 @@ def build_camera_panels(
                 tuple(name for name in channels if name in scales),
             )
         )
-    return eyes
+    return cameras
 
 
 def _find_image_size(selection: Selection, picture: str) -> tuple[int, int]:
@@ -263,27 +263,29 @@ def _find_image_size(selection: Selection, picture: str) -> tuple[int, int]:
     return size_px
 
 
-def build_image_rules(eye: CameraPanel, sources: set[str]) -> list[DrawRule]:
+def build_image_rules(camera: CameraPanel, sources: set[str]) -> list[DrawRule]:
     """Return how a camera's images and their labels are drawn."""
-    frame = image_frame(eye.robot)
+    frame = image_frame(camera.robot)
     return [
-        DrawRule(eye.picture, partial(entities.draw_images, eye.picture, frame), eye.robot),
         DrawRule(
-            eye.labels,
+            camera.picture, partial(entities.draw_images, camera.picture, frame), camera.robot
+        ),
+        DrawRule(
+            camera.labels,
             partial(
                 draw_labels,
-                eye.labels,
+                camera.labels,
                 frame,
                 sources=sources,
-                size_px=(eye.width_px, eye.height_px),
+                size_px=(camera.width_px, camera.height_px),
             ),
-            eye.robot,
+            camera.robot,
         ),
     ]
 
 
 def build_model_rules(
-    eye: CameraPanel,
+    camera: CameraPanel,
     scales: Mapping[str, ColourScale],
     colour: Colour = RGB["detection"],
     *,
@@ -291,18 +293,20 @@ def build_model_rules(
     recording: Path | None = None,
 ) -> list[DrawRule]:
     """Return how the detections and maps of a camera are drawn."""
-    frame, robot = image_frame(eye.robot), eye.robot
-    shown = {name: scales[name] for name in eye.channels if name in scales}
+    frame, robot = image_frame(camera.robot), camera.robot
+    shown = {name: scales[name] for name in camera.channels if name in scales}
     found = partial(
-        entities.draw_detections, eye.detections, frame, width_px=eye.width_px, colour=colour
+        entities.draw_detections, camera.detections, frame, width_px=camera.width_px, colour=colour
     )
-    maps = partial(entities.draw_grids, eye.grid, frame, scales=shown, smooth=smooth)
+    maps = partial(entities.draw_grids, camera.grid, frame, scales=shown, smooth=smooth)
     draws = [DrawRule(topics.DETECTIONS(robot), found, robot, recording)]
     return [*draws, DrawRule(topics.GRID(robot), maps, robot, recording)] if shown else draws
 
 
-def build_colour_bars(eye: CameraPanel, scales: Mapping[str, ColourScale]) -> list[PreparedEntity]:
+def build_colour_bars(
+    camera: CameraPanel, scales: Mapping[str, ColourScale]
+) -> list[PreparedEntity]:
     """Return the colour bars of a camera's maps."""
-    shown = {channel: scales[channel] for channel in eye.channels}
-    drawn = draw_colour_bars(eye.robot, shown, eye.width_px, eye.height_px)
+    shown = {channel: scales[channel] for channel in camera.channels}
+    drawn = draw_colour_bars(camera.robot, shown, camera.width_px, camera.height_px)
     return [(None, entity) for entity in drawn]

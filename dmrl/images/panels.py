@@ -10,15 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from dmrl.colours import paint_viridis
+
 SIZE_PX = (900, 540)
 FRAME_PX = (90, 50, 870, 460)
 """Left, upper, right and lower edge of the axes in a panel."""
 INK, PAPER, SOFT = "#1b1f24", "#ffffff", "#d0d7de"
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 """Colours of the splits, after Okabe and Ito."""
-VIRIDIS = np.array(
-    [(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], float
-)
 TILE_PX, CAPTION_PX, SAMPLE_COLUMNS = 320, 24, 3
 TEXT_PX = 18
 
@@ -134,16 +133,14 @@ def draw_heat(counts: NDArray[np.float64], size_px: tuple[int, int], title: str)
         Text above.
     """
     most = max(float(counts.max()), 1.0)
-    place = counts / most * (len(VIRIDIS) - 1)
-    stops = np.arange(len(VIRIDIS))
-    rgb = np.stack([np.interp(place, stops, VIRIDIS[:, k]) for k in range(3)], axis=-1)
+    rgb = paint_viridis(counts / most)
     rgb[counts == 0] = 255
     left, top, right, bottom = FRAME_PX
     scale = min((right - left) / size_px[0], (bottom - top) / size_px[1])
     shown = round(size_px[0] * scale), round(size_px[1] * scale)
     x_range, y_range = (0.0, (right - left) / scale), ((bottom - top) / scale, 0.0)
     panel = _Panel(title, f"u, px; v, px down; yellow: {most:g}", x_range, y_range)
-    heat = Image.fromarray(rgb.astype(np.uint8)).resize(shown, Image.Resampling.NEAREST)
+    heat = Image.fromarray(rgb).resize(shown, Image.Resampling.NEAREST)
     panel.add_ticks(_find_ticks(size_px[0]), _find_ticks(size_px[1]))
     panel.image.paste(heat, (left, top))
     panel.draw.rectangle((left, top, left + shown[0], top + shown[1]), outline=SOFT)

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from dmrl.colours import RGB
+from dmrl.colours import RGB, paint_viridis
 from dmrl.errors import OutputError, RecordingError, SettingError, SourceError
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter, read_table
 from dmrl.stages import view
 from dmrl.viewer import Settings, save
+from dmrl.viewer.drawing.archetypes import NO_VALUE_COLOUR
 from dmrl.viewer.session import prepare_show, write_rrd
 
 from .rrd import column, logged, panels, queries
@@ -42,7 +43,7 @@ def test_every_topic_becomes_its_archetypes(make: Make, rrd: Path) -> None:
         ("/cf1/detections/texts", "Points2D"): 10,
         ("/cf1/detections/weak", "Points2D"): 10,
         ("/cf1/detections/grid/confidence", "DepthImage"): 10,
-        ("/cf1/detections/grid/depth_m", "DepthImage"): 10,
+        ("/cf1/detections/grid/depth_m", "Image"): 10,
         ("/cf1/detections/grid/best", "Boxes2D"): 10,
         ("/cf1/labels/truth/sigmas", "Ellipses2D"): 10,
         ("/cf1/labels/published/sigmas", "Ellipses2D"): 10,
@@ -103,17 +104,13 @@ def test_a_detection_below_the_threshold_is_in_no_view_and_has_no_text(
 def test_maps_have_fixed_ranges_and_cells_of_eight_pixels(make: Make, rrd: Path) -> None:
     save([make()], rrd, Settings(depth_max_m=2.5))
     grid = "/cf1/detections/grid"
-    ranges = {
-        channel: column(rrd, f"{grid}/{channel}", "DepthImage:depth_range")
-        for channel in ("confidence", "depth_m")
-    }
-    assert ranges == {"confidence": [[[0.0, 1.0]]], "depth_m": [[[0.0, 2.5]]]}
+    assert column(rrd, f"{grid}/confidence", "DepthImage:depth_range") == [[[0.0, 1.0]]]
     assert column(rrd, f"{grid}/depth_m", "Transform3D:scale") == [[[8.0, 8.0, 1.0]]]
-    cells = np.frombuffer(bytes(column(rrd, f"{grid}/depth_m", "DepthImage:buffer")[0][0]), "<f4")
-    cells = cells.reshape(6, 8)
-    assert cells[1, 2] == np.float32(1.2)
-    # Dark where nobody is believed to be.
-    assert cells[3, 4] == 0 and cells[4, 4] == np.float32(1.8)
+    colours = np.frombuffer(bytes(column(rrd, f"{grid}/depth_m", "Image:buffer")[0][0]), np.uint8)
+    colours = colours.reshape(6, 8, 3)
+    assert (colours[[1, 4], [2, 4]] == paint_viridis(np.array([1.2, 1.8]) / 2.5)).all()
+    # Grey, not the colour of 0 m, where nobody is believed to be.
+    assert (colours[3, 4] == NO_VALUE_COLOUR).all()
 
 
 def test_a_single_robot_gets_four_panels_and_two_get_three_each(make: Make, tmp_path: Path) -> None:

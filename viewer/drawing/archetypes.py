@@ -3,17 +3,17 @@
 All are in the ``<robot>/image`` frame, so maps, labels and detections match the image's pixels.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from dmrl.colours import RGB
+from dmrl.colours import MIN_DEPTH_CONFIDENCE, RGB, paint_viridis
 from dmrl.viewer.drawing.entity import (
     DETECTION_TEXT_WIDTH,
     FAINT_POINT_UI,
@@ -30,12 +30,12 @@ STRIDE_PX = 8
 """Pixels per cell of a GridMap without a stride; the published network's."""
 
 MEDIA_TYPES = {"jpg": "image/jpeg"}
-CELL_COLOUR = (255, 255, 255)
+MAP_ORDER = -20.0
+"""Drawing order of a map; that of a camera's image is -10."""
+CELL_COLOUR, NO_VALUE_COLOUR = (255, 255, 255), (48, 48, 48)
 HALF_HEIGHT_M, FOCAL_WIDTHS, NEAR_M = 0.03, 0.57, 0.1
 """Offset of a text below a detection: half the height of a small drone, metres; focal length in
 image widths; smallest depth that is used, metres."""
-MIN_DEPTH_CONFIDENCE = 0.05
-"""Confidence below which a cell's depth is drawn dark, since it belongs to no robot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,25 +46,25 @@ class ColourScale:
     ----------
     title
         Quantity and unit.
-    colormap
-        One of rerun's.
     last
         Value of the last colour.
     unit
         Suffix of a value.
+    has_gaps
+        Cells may have no value: they are grey, which no value of a map of rerun can be.
     """
 
     title: str
-    colormap: Literal["inferno", "viridis"]
     last: float
     unit: str
+    has_gaps: bool
 
 
 def build_scales(depth_max_m: float) -> dict[str, ColourScale]:
     """Return the colours of the channels that are shown, by name of the channel."""
     return {
-        "confidence": ColourScale("confidence", "inferno", 1.0, ""),
-        "depth_m": ColourScale("depth, m", "viridis", depth_max_m, " m"),
+        "confidence": ColourScale("confidence", 1.0, "", has_gaps=False),
+        "depth_m": ColourScale("depth, m", depth_max_m, " m", has_gaps=True),
     }
 
 
@@ -160,8 +160,8 @@ def draw_grids(
 ) -> Iterator[Entity]:
     """Draw heat maps of confidence and depth, and the cell with the highest confidence.
 
-    Depth is drawn as 0, the darkest colour, where confidence is low. A network outputs a depth in
-    every cell but learned depth near robots only.
+    A cell of low confidence has no depth. A network outputs a depth in every cell but learned depth
+    near robots only.
 
     Parameters
     ----------
@@ -174,90 +174,89 @@ def draw_grids(
     smooth
         Interpolate between cells; otherwise each cell is a square of the pixels that it covers.
     """
-    sizes = zip(batch["cols"].to_pylist(), batch["rows"].to_pylist(), strict=True)
-    formats = [
-        rr.components.ImageFormat(width=cols, height=rows, channel_datatype="F32")
-        for cols, rows in sizes
-    ]
-    stride_px = batch["stride_px"][0].as_py() or STRIDE_PX
     # A topic's channels do not change from message to message.
     names = batch["channels"][0].as_py()
-    data = batch["data"].to_pylist()
-
-    def buffers_of(channel: str) -> list[bytes]:
-        return [_slice_channel(one, names.index(channel), len(names)) for one in data]
-
-    for channel in filter(scales.__contains__, names):
-        buffers = buffers_of(channel)
+    stride_px = batch["stride_px"][0].as_py() or STRIDE_PX
+    sizes = zip(batch["rows"].to_pylist(), batch["cols"].to_pylist(), strict=True)
+    maps = [
+        np.frombuffer(data, "<f4").reshape(len(names), *size)
+        for data, size in zip(batch["data"].to_pylist(), sizes, strict=True)
+    ]
+    for index, channel in enumerate(names):
+        if channel not in scales:
+            continue
+        values = [one[index] for one in maps]
         if channel == "depth_m" and "confidence" in names:
-            beliefs = buffers_of("confidence")
-            buffers = [_mask_depth(*two) for two in zip(buffers, beliefs, strict=True)]
-        yield draw_map(
-            channel_path(path, channel),
-            frame,
-            scales[channel],
-            rr.DepthImage.columns(buffer=buffers, format=formats),
-            stride_px=stride_px,
-            smooth=smooth,
-        )
+            sure = [one[names.index("confidence")] >= MIN_DEPTH_CONFIDENCE for one in maps]
+            values = [np.where(*two, np.nan) for two in zip(sure, values, strict=True)]
+        own = f"{frame}{channel_path(path, channel)}"
+        place = rr.Transform3D(scale=[stride_px, stride_px, 1], child_frame=own, parent_frame=frame)
+        style = map_style(scales[channel], smooth=smooth)
+        columns = _build_map_columns(scales[channel], values)
+        yield Entity(channel_path(path, channel), columns, (style, place), own)
         if channel == "confidence":
-            yield _draw_best_cells(f"{path}/best", frame, buffers, formats, stride_px)
-
-
-def draw_map(
-    path: str,
-    frame: str,
-    scale: ColourScale,
-    columns: Iterable[rr.ComponentColumn],
-    *,
-    stride_px: int = STRIDE_PX,
-    smooth: bool = False,
-) -> Entity:
-    """Draw a map over an image; each cell has the size of the pixels that it covers."""
-    own = f"{frame}{path}"
-    place = rr.Transform3D(scale=[stride_px, stride_px, 1], child_frame=own, parent_frame=frame)
-    return Entity(path, columns, (map_style(scale, smooth=smooth), place), own)
+            yield _draw_best_cells(f"{path}/best", frame, values, stride_px)
 
 
 def _draw_best_cells(
-    path: str,
-    frame: str,
-    buffers: Sequence[bytes],
-    formats: Sequence[rr.components.ImageFormat],
-    stride_px: int,
+    path: str, frame: str, maps: Sequence[NDArray[np.float32]], stride_px: int
 ) -> Entity:
     """Draw an outline of the cell with the highest confidence."""
-    best = np.array([np.frombuffer(buffer, "<f4").argmax() for buffer in buffers])
-    cols = np.array([form.width for form in formats])
-    centres = (np.column_stack([best % cols, best // cols]) + 0.5) * stride_px
+    best = np.array([np.unravel_index(one.argmax(), one.shape) for one in maps])
+    centres = (best[:, ::-1] + 0.5) * stride_px
     columns = rr.Boxes2D.columns(centers=centres, half_sizes=np.full((len(best), 2), stride_px / 2))
     return Entity(path, columns, (_cell_style(),), frame)
+
+
+def _build_map_columns(
+    scale: ColourScale, maps: Sequence[NDArray[np.floating]]
+) -> rr.ComponentColumnList:
+    """Return a row per map, (rows, cols)."""
+    buffers, formats = zip(*(_encode_map(scale, one) for one in maps), strict=True)
+    kind = rr.Image if scale.has_gaps else rr.DepthImage
+    return kind.columns(buffer=buffers, format=formats)
+
+
+def build_still_map(scale: ColourScale, values: NDArray[np.float32]) -> rr.AsComponents:
+    """Return one map, (rows, cols)."""
+    buffer, form = _encode_map(scale, values)
+    kind = rr.Image if scale.has_gaps else rr.DepthImage
+    return kind.from_fields(buffer=buffer, format=form)
+
+
+def _encode_map(
+    scale: ColourScale, values: NDArray[np.floating]
+) -> tuple[bytes, rr.components.ImageFormat]:
+    """Return values, or colours if there may be none: those that are not finite are grey."""
+    high, wide = values.shape
+    if not scale.has_gaps:
+        form = rr.components.ImageFormat(width=wide, height=high, channel_datatype="F32")
+        return values.tobytes(), form
+    known = np.isfinite(values)
+    rgb = paint_viridis(np.where(known, values, 0.0) / scale.last)
+    rgb[~known] = NO_VALUE_COLOUR
+    form = rr.components.ImageFormat(
+        width=wide, height=high, color_model="RGB", channel_datatype="U8"
+    )
+    return rgb.tobytes(), form
+
+
+@cache
+def map_style(scale: ColourScale, *, smooth: bool = False) -> rr.AsComponents:
+    """Return the style of a map: a fixed range; sharp cells unless they are smoothed."""
+    upscaling: Any = "linear" if smooth else "nearest"
+    if scale.has_gaps:  # as a DepthImage: opaque in every view, below a camera's image
+        return rr.Image.from_fields(
+            opacity=1.0, draw_order=MAP_ORDER, magnification_filter=upscaling
+        )
+    return rr.DepthImage.from_fields(
+        colormap="inferno", depth_range=[0.0, scale.last], magnification_filter=upscaling
+    )
 
 
 @cache
 def _cell_style() -> rr.Boxes2D:
     return rr.Boxes2D.from_fields(colors=[CELL_COLOUR], radii=[LINE_UI], draw_order=35.0)
-
-
-@cache
-def map_style(scale: ColourScale, *, smooth: bool = False) -> rr.DepthImage:
-    """Return the style of a map: a fixed range; sharp cells unless they are smoothed."""
-    return rr.DepthImage.from_fields(
-        colormap=scale.colormap,
-        depth_range=[0.0, scale.last],
-        magnification_filter="linear" if smooth else "nearest",
-    )
-
-
-def _slice_channel(data: bytes, index: int, parts: int) -> bytes:
-    size = len(data) // parts
-    return data[index * size : (index + 1) * size]
-
-
-def _mask_depth(depth: bytes, confidence: bytes) -> bytes:
-    """Set the depth to 0 where the confidence is below ``MIN_DEPTH_CONFIDENCE``."""
-    believed = np.frombuffer(confidence, "<f4") >= MIN_DEPTH_CONFIDENCE
-    return np.where(believed, np.frombuffer(depth, "<f4"), np.float32(0)).tobytes()
 
 
 def row_indices(column: pa.ListArray) -> NDArray[np.intp]:

@@ -54,7 +54,8 @@ def draw_labels(
     places = np.array([ordered.index(source) for source in source_of], int)
     first = np.lexsort([places, row_of])
     texts_px = np.empty((len(peers), 2))
-    texts_px[first] = _place_texts(_top_centres(peers)[first], row_of[first], size_px[0])
+    tops_px, bottoms_px = (_edge_centres(peers, edge)[first] for edge in (0, 1))
+    texts_px[first] = _place_texts(tops_px, bottoms_px[:, 1], row_of[first], size_px[0])
     for source in ordered:
         (at,) = np.nonzero(source_of == source)
         mine = _SourceLabels(peers.take(at), row_of[at], texts_px[at], batch.num_rows, size_px)
@@ -112,23 +113,33 @@ def _parse_boxes(peers: pa.StructArray) -> tuple[NDArray[np.bool_], NDArray[np.f
     return boxed, edges.filter(pa.array(boxed)).flatten().to_numpy().reshape(-1, 2, 2)
 
 
-def _top_centres(peers: pa.StructArray) -> NDArray[np.float64]:
-    """Return the middle of the upper edge of each label's box, (N, 2); without a box, the label."""
+def _edge_centres(peers: pa.StructArray, edge: int) -> NDArray[np.float64]:
+    """Return the middle of an edge of each label's box, (N, 2); without a box, the label.
+
+    The upper edge is 0, the lower one is 1.
+    """
     boxed, corners = _parse_boxes(peers)
     out = points_px(peers)
-    out[boxed] = np.column_stack([corners.mean(axis=1)[:, 0], corners[:, 0, 1]])
+    out[boxed] = np.column_stack([corners.mean(axis=1)[:, 0], corners[:, edge, 1]])
     return out
 
 
 def _place_texts(
-    tops_px: NDArray[np.float64], row_of: NDArray[np.intp], width_px: int
+    tops_px: NDArray[np.float64],
+    bottoms_px: NDArray[np.float64],
+    row_of: NDArray[np.intp],
+    width_px: int,
 ) -> NDArray[np.float64]:
     """Place texts above their peers without overlap; the texts of detections are below.
+
+    A text that has no room above goes below those of detections.
 
     Parameters
     ----------
     tops_px
         (N, 2) points below the texts; the first ones have the first choice.
+    bottoms_px
+        (N,) heights below which a detection of the same peer has its text.
     row_of
         (N,) index of the image, sorted.
     width_px
@@ -141,7 +152,8 @@ def _place_texts(
     for begin, end in zip(begins, ends, strict=True):
         for k in range(begin + 1, end):
             near = abs(out[begin:k, 0] - out[k, 0]) < wide_px
-            out[k, 1] = _find_free_height(out[k, 1], out[begin:k, 1][near], high_px)
+            taken = np.concatenate([out[begin:k, 1][near], bottoms_px[begin:k][near]])
+            out[k, 1] = _find_free_height(out[k, 1], taken, high_px)
     return out
 
 

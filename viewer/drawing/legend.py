@@ -6,7 +6,7 @@ from itertools import takewhile
 import numpy as np
 import rerun as rr
 
-from dmrl.viewer.drawing.archetypes import Colour, ColourScale, map_style
+from dmrl.viewer.drawing.archetypes import Colour, ColourScale, build_still_map, map_style
 from dmrl.viewer.drawing.entity import LINE_UI, Entity, image_frame
 
 LEGEND_HEIGHT_PX = 26
@@ -98,6 +98,6 @@ def draw_colour_bars(
             child_frame=frame,
             parent_frame=image_frame(robot),
         )
-        bar = rr.DepthImage(steps[None]), map_style(scale), place
+        bar = build_still_map(scale, steps[None]), map_style(scale), place
         yield Entity(f"{path}/bar", style=bar, frame=frame)
         yield Entity(f"{path}/ticks", style=(ticks,), frame=image_frame(robot))

@@ -63,25 +63,25 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     """
     robot, models = _find_models(selection, settings.robot)
     scales = archetypes.build_scales(settings.depth_max_m)
-    eyes = [
-        eye
+    cameras = [
+        camera
         for path in models
-        for eye in build_camera_panels(selection, [robot], scales, model=path)
+        for camera in build_camera_panels(selection, [robot], scales, model=path)
     ]
     judged = {path: found for path in models if (found := _compute_errors(path, robot, selection))}
     scene = Scene(
         layouts.build_compare_layout(
-            eyes, scales, _build_plots(models, judged), TABLE_PATH, overlay=settings.overlay
+            cameras, scales, _build_plots(models, judged), TABLE_PATH, overlay=settings.overlay
         ),
-        build_image_rules(eyes[0], set()),
-        [*build_colour_bars(eyes[0], scales), *_iter_prepared_entities(models, judged)],
-        eyes[:1],
+        build_image_rules(cameras[0], set()),
+        [*build_colour_bars(cameras[0], scales), *_iter_prepared_entities(models, judged)],
+        cameras[:1],
     )
     sources = scene.sources.setdefault(robot, set())
-    scene.draws = build_image_rules(eyes[0], sources)
-    for eye, path, colour in zip(eyes, models, MODEL_COLOURS, strict=True):
+    scene.draws = build_image_rules(cameras[0], sources)
+    for camera, path, colour in zip(cameras, models, MODEL_COLOURS, strict=True):
         scene.draws += build_model_rules(
-            eye, scales, colour, smooth=settings.overlay, recording=path
+            camera, scales, colour, smooth=settings.overlay, recording=path
         )
         scene.named[path.stem] = colour
     return scene

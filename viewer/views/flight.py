@@ -46,14 +46,14 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     robots = _choose_robots(selection, pairs, settings.robot)
     piloted = {n["robot"] for n in selection.find_names(topics.COMMAND)}
     scales = archetypes.build_scales(settings.depth_max_m) if piloted else {}
-    eyes = build_camera_panels(selection, sorted(selection.image_ns)[:MAX_CAMERAS], scales)
-    sources: dict[str, set[str]] = {eye.robot: set() for eye in eyes}
+    cameras = build_camera_panels(selection, sorted(selection.image_ns)[:MAX_CAMERAS], scales)
+    sources: dict[str, set[str]] = {camera.robot: set() for camera in cameras}
     named = {}
     draws: list[DrawRule] = []
-    for eye in eyes:
-        draws += build_image_rules(eye, sources[eye.robot])
-        if topics.DETECTIONS(eye.robot) in selection.topics:
-            draws += build_model_rules(eye, scales, smooth=False)
+    for camera in cameras:
+        draws += build_image_rules(camera, sources[camera.robot])
+        if topics.DETECTIONS(camera.robot) in selection.topics:
+            draws += build_model_rules(camera, scales, smooth=False)
             named["detection"] = RGB["detection"]
     for robot in robots:
         draws += _build_robot_rules(selection, seen, robot, own=robot == robots[0])
@@ -61,7 +61,7 @@ def scene(selection: Selection, settings: Settings) -> Scene:
         draws.append(DrawRule(topic, partial(time_plots.draw_sight, topic)))
     for pair in pairs:
         draws += [_build_sensor_rule(row, *pair, own=False) for row in topics.PAIR_SENSORS]
-    spaces = _build_spaces(selection, seen, pairs, robots, eyes)
+    spaces = _build_spaces(selection, seen, pairs, robots, cameras)
     read = load_first_messages(selection, [topics.CAUSES(*pair) for pair in pairs])
     causes = {pair: read[topic] for pair in pairs if (topic := topics.CAUSES(*pair)) in read}
     panels = {
@@ -74,14 +74,14 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     if not pairs:
         panels = {robots[0]: _build_sensor_plots(selection, robots)} if robots else {}
     return Scene(
-        layouts.build_flight_layout(spaces, eyes, panels, scales),
+        layouts.build_flight_layout(spaces, cameras, panels, scales),
         draws,
         [
             *((None, entity) for entity in _iter_static_entities(selection, seen, robots)),
-            *(bar for eye in eyes if scales for bar in build_colour_bars(eye, scales)),
+            *(bar for camera in cameras if scales for bar in build_colour_bars(camera, scales)),
             *(drawn for pair, message in causes.items() for drawn in draw_causes(pair, message)),
         ],
-        eyes,
+        cameras,
         sources,
         named,
         partial(FlightStreamer, pairs, seen, selection.shown_ns[0]),
@@ -151,15 +151,15 @@ def _build_spaces(
     motion: FlightMotion,
     pairs: Sequence[Names],
     robots: Sequence[str],
-    eyes: Sequence[CameraPanel],
+    cameras: Sequence[CameraPanel],
 ) -> list[SpacePanel]:
     """Return a view of the world, or of each observer's horizontal frame if there is no world."""
     groups: dict[str, list[str]] = {}
     for robot in robots:
         groups.setdefault(motion.display_frame(robot), []).append(robot)
-    lookers = {pair[0] for pair in pairs} | {eye.robot for eye in eyes}
+    lookers = {pair[0] for pair in pairs} | {camera.robot for camera in cameras}
     return [
-        _build_space(motion, frame, [p for p in pairs if p[0] in members], members, eyes)
+        _build_space(motion, frame, [p for p in pairs if p[0] in members], members, cameras)
         for frame, members in groups.items()
         if frame == WORLD_FRAME or lookers & set(members) or len(groups) == 1
     ]
@@ -170,7 +170,7 @@ def _build_space(
     frame: str,
     pairs: Sequence[Names],
     robots: Sequence[str],
-    eyes: Sequence[CameraPanel],
+    cameras: Sequence[CameraPanel],
 ) -> SpacePanel:
     contents, trails = [], []
     for robot in robots:
@@ -179,7 +179,7 @@ def _build_space(
             topics.TRACKS(robot),
             *_child_paths(topics.TRACKS(robot), "velocity", "covariance"),
         ]
-    contents += [eye.picture for eye in eyes if eye.robot in robots]
+    contents += [camera.picture for camera in cameras if camera.robot in robots]
     for pair in pairs:
         contents += _child_paths(topics.RANGE(*pair), "line", "sphere")
         for path in (topics.POSITION(*pair), topics.TRUTH(*pair)):
@@ -187,8 +187,8 @@ def _build_space(
             trails.append(f"{path}/trail")
     low, high = _find_extent(motion, frame, pairs, robots)
     middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 1.2)
-    eye = middle + size * np.array([-0.45, -0.5, 0.45])
-    return SpacePanel(frame, tuple(contents), tuple(trails), _to_tuple(eye), _to_tuple(middle))
+    camera = middle + size * np.array([-0.45, -0.5, 0.45])
+    return SpacePanel(frame, tuple(contents), tuple(trails), _to_tuple(camera), _to_tuple(middle))
 
 
 def _child_paths(path: str, *names: str) -> list[str]:

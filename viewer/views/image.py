@@ -18,13 +18,13 @@ from dmrl.viewer.settings import Settings
 def scene(selection: Selection, settings: Settings) -> Scene:
     """Build the scene with the images and maps of every robot."""
     scales = archetypes.build_scales(settings.depth_max_m)
-    eyes = build_camera_panels(selection, sorted(selection.image_ns), scales)
-    blueprint = layouts.build_image_layout(eyes, scales, overlay=settings.overlay)
-    shown = Scene(blueprint, [], [], eyes)
-    for eye in eyes:
-        shown.draws += build_image_rules(eye, shown.sources.setdefault(eye.robot, set()))
-        shown.draws += build_model_rules(eye, scales, smooth=settings.overlay)
-        shown.stills += build_colour_bars(eye, scales)
-        if any(n["robot"] == eye.robot for n in selection.find_names(topics.DETECTIONS)):
+    cameras = build_camera_panels(selection, sorted(selection.image_ns), scales)
+    blueprint = layouts.build_image_layout(cameras, scales, overlay=settings.overlay)
+    shown = Scene(blueprint, [], [], cameras)
+    for camera in cameras:
+        shown.draws += build_image_rules(camera, shown.sources.setdefault(camera.robot, set()))
+        shown.draws += build_model_rules(camera, scales, smooth=settings.overlay)
+        shown.stills += build_colour_bars(camera, scales)
+        if any(n["robot"] == camera.robot for n in selection.find_names(topics.DETECTIONS)):
             shown.named["detection"] = RGB["detection"]
     return shown

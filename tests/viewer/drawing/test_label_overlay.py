@@ -10,7 +10,8 @@ from dmrl.viewer.drawing.legend import _fit_names
 
 
 def test_label_text_is_above_its_peer() -> None:
-    places = _place_texts(np.array([[100.0, 80.0], [100.0, 80.0]]), np.array([0, 1]), 320)
+    tops = np.array([[100.0, 80.0], [100.0, 80.0]])
+    places = _place_texts(tops, tops[:, 1], np.array([0, 1]), 320)
     assert places == pytest.approx(np.array([[100.0, 80 - 320 / 12]] * 2))
 
 
@@ -18,7 +19,7 @@ def test_label_texts_do_not_overlap() -> None:
     rng = np.random.default_rng(0)
     for count in range(2, 7):
         tops = rng.uniform([100, 0], [180, 120], (count, 2))
-        places = _place_texts(tops, np.zeros(count, int), 320)
+        places = _place_texts(tops, tops[:, 1], np.zeros(count, int), 320)
         assert (places[:, 1] >= 0).all()
         apart = abs(places[:, None] - places)[np.triu_indices(count, 1)]
         assert ((apart[:, 0] >= 80) | (apart[:, 1] >= 26)).all(), (tops, places)
@@ -27,8 +28,14 @@ def test_label_texts_do_not_overlap() -> None:
 def test_texts_of_two_estimates_do_not_overlap() -> None:
     # The upper one's text has its own place, the lower one's would stand on it.
     tops = np.array([[100.0, 80.0], [110.0, 90.0]])
-    places = _place_texts(tops, np.zeros(2, int), 320)
+    places = _place_texts(tops, tops[:, 1], np.zeros(2, int), 320)
     assert abs(places[0, 1] - places[1, 1]) >= 320 / 12 - 0.5
+
+
+def test_an_estimate_near_the_upper_edge_has_its_text_below_that_of_a_detection() -> None:
+    tops, bottoms = np.array([[100.0, 15.0], [120.0, 20.0]]), np.array([30.0, 20.0])
+    places = _place_texts(tops, bottoms, np.zeros(2, int), 320)
+    assert places[1, 1] >= bottoms[0] + 320 / 12 - 0.5
 
 
 def test_more_confident_of_overlapping_detections_keeps_its_text() -> None:
