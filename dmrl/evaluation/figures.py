@@ -1,6 +1,7 @@
 """Draw the figures of an evaluation: error plots, and a few example images."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Protocol
@@ -9,20 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import plots, topics
+from dmrl.colours import MIN_DEPTH_CONFIDENCE
 from dmrl.estimation.model.position_metrics import ErrorTrace
 from dmrl.evaluation.detections import ImageKey, LabelledDetections
 from dmrl.guards.safe_names import safe_join
 from dmrl.images.codec import decode
-from dmrl.learn.inference.detection_metrics import SCORE_RADIUS_PX, ScoredDetections
-from dmrl.learn.inference.matching import Points
+from dmrl.learn.inference.detection_metrics import ScoredDetections
 from dmrl.plots import Example, GalleryImage
 from dmrl.recording import read, read_summary
 
 Array = NDArray[np.float64]
 
-EXAMPLE_QUANTILES = (0.2, 0.5, 0.8, 0.95)
-"""Quantiles of the error at which examples are drawn: typical images, and the tail."""
-
+HIT_QUANTILES, MISS_QUANTILES = (0.5, 0.95), (0.25, 0.75)
+"""Quantiles of hits by distance, and of misses in their order, at which examples are drawn."""
 MAX_ERROR_PLOTS = 12
 """Pairs or observers whose errors are plotted, at most."""
 GALLERY_IMAGES = 6
@@ -65,14 +65,19 @@ def draw_figures(
     source
         Source of the labels.
     threshold
-        Detections below this confidence are drawn over images only if a label is matched with them.
+        Detections below this confidence are not drawn over images.
     """
     error, depth_m = scored.label_error, scored.labels.depth_m
     plots.plot_error_violins(error.u_px, error.v_px, error.depth_m, folder / "error-violins")
     plots.plot_error_by_distance(
         depth_m, error.norm_px, error.depth_m, folder / "error-by-distance"
     )
-    if shown := _choose_examples(pairs, error.norm_px, source, threshold):
+    outcomes = _Outcomes.of(scored, threshold)
+    shown = [
+        _build_example(pairs, image, outcomes.describe(image), source, threshold)
+        for image in outcomes.choose()
+    ]
+    if shown:
         plots.plot_examples(shown, folder / "examples")
     if pairs.images:
         plots.plot_gallery(_choose_gallery(pairs, threshold), folder / "circles")
@@ -112,50 +117,89 @@ def read_image(at: ImageKey) -> NDArray[np.uint8]:
     return decode(taken.message.data, what=f"{recording}: {topic} at {time_ns} ns")
 
 
-def _choose_examples(
-    pairs: LabelledDetections, error_px: Array, source: str, threshold: float
-) -> list[Example]:
-    """Return the images at fixed quantiles of their largest label error, best first."""
-    worst_px = np.full(pairs.images, -1.0)
-    np.maximum.at(worst_px, pairs.labels.image, error_px)
-    labelled = np.flatnonzero(worst_px >= 0)
-    order = labelled[np.argsort(worst_px[labelled], kind="stable")]
-    places = dict.fromkeys(
-        int(share * (len(order) - 1)) for share in EXAMPLE_QUANTILES if len(order)
-    )
-    return [
-        _build_example(pairs, order[place], worst_px[order[place]], source, threshold)
-        for place in places
-    ]
+@dataclass(frozen=True, slots=True)
+class _Outcomes:
+    """Outcome of each image at a threshold, (N,).
+
+    Parameters
+    ----------
+    hit_px
+        Largest distance of a correct detection from its label; -1: no hit.
+    missed
+        Number of labels without a correct detection.
+    false_confidence
+        Largest confidence of a false detection; 0: none.
+    """
+
+    hit_px: Array
+    missed: NDArray[np.int64]
+    false_confidence: Array
+
+    @staticmethod
+    def of(scored: ScoredDetections, threshold: float) -> "_Outcomes":
+        """Classify labels and detections as the metrics do."""
+        labels, found, right = scored.labels, scored.detections, scored.right_16_px
+        sure = found.confidence >= threshold
+        (hits,) = np.nonzero(sure & (right >= 0))
+        of = right[hits]
+        off_px = np.hypot(found.u_px[hits] - labels.u_px[of], found.v_px[hits] - labels.v_px[of])
+        hit_px, false_confidence = np.full(scored.images, -1.0), np.zeros(scored.images)
+        np.maximum.at(hit_px, found.image[hits], off_px)
+        wrong = found.select(sure & (right < 0))
+        np.maximum.at(false_confidence, wrong.image, wrong.confidence)
+        missed = np.bincount(np.delete(labels.image, of), minlength=scored.images)
+        return _Outcomes(hit_px, missed, false_confidence)
+
+    def choose(self) -> list[int]:
+        """Return images with a hit only, with a miss, and with a false detection, two of each.
+
+        Hits are typical and poor ones; misses are spread over the images; the most confident false
+        detections come first.
+        """
+        good = np.flatnonzero(
+            (self.hit_px >= 0) & (self.missed == 0) & (self.false_confidence == 0)
+        )
+        good = good[np.argsort(self.hit_px[good], kind="stable")]
+        missed, false = np.flatnonzero(self.missed), np.flatnonzero(self.false_confidence)
+        chosen = [*_take_at(good, HIT_QUANTILES), *_take_at(missed, MISS_QUANTILES)]
+        false = np.setdiff1d(false, chosen)
+        false = false[np.argsort(-self.false_confidence[false], kind="stable")]
+        return [*chosen, *false[:2].tolist()]
+
+    def describe(self, image: int) -> str:
+        """Return the outcome of an image in words."""
+        words = [f"hit: {self.hit_px[image]:.1f} px"] * bool(self.hit_px[image] >= 0)
+        words += ["miss"] * bool(self.missed[image])
+        confidence = self.false_confidence[image]
+        words += [f"false detection: confidence {confidence:.2f}"] * bool(confidence > 0)
+        return ", ".join(words)
+
+
+def _take_at(images: NDArray[np.intp], shares: Sequence[float]) -> list[int]:
+    """Return the images at these quantiles of their order, each once."""
+    places = {round(share * (len(images) - 1)): None for share in shares if len(images)}
+    return [int(images[place]) for place in places]
 
 
 def _build_example(
-    pairs: LabelledDetections, image: int, worst_px: float, source: str, threshold: float
+    pairs: LabelledDetections, image: int, outcome: str, source: str, threshold: float
 ) -> Example:
     at = pairs.at[image]
     recording, robot, time_ns = at
-    rgb = read_image(at)
     maps = _read_maps(recording, robot, time_ns)
     labels = pairs.labels.select(pairs.labels.image == image)
-    labels_px = np.column_stack([labels.u_px, labels.v_px])
+    found = pairs.detections
+    found = found.select((found.image == image) & (found.confidence >= threshold))
     several = len({at.recording for at in pairs.at}) > 1
     return Example(
-        title=f"{recording.stem}, " * several + f"{_format_time(at)}, {_describe_error(worst_px)}",
-        rgb=rgb,
+        title=f"{recording.stem}, " * several + f"{_format_time(at)}, {outcome}",
+        rgb=read_image(at),
         confidence=maps["confidence"],
-        depth_m=maps["depth_m"],
-        labels_px=labels_px,
-        detections_px=_select_detections(pairs.detections, image, len(labels_px), threshold),
+        depth_m=np.where(maps["confidence"] >= MIN_DEPTH_CONFIDENCE, maps["depth_m"], np.nan),
+        labels_px=np.column_stack([labels.u_px, labels.v_px]),
+        detections_px=np.column_stack([found.u_px, found.v_px]),
         source=source,
     )
-
-
-def _describe_error(error_px: float) -> str:
-    """Return the error of an image's worst label in words, and whether it is a failure."""
-    if not np.isfinite(error_px):
-        return "failure: a label without a detection"
-    failure = f"failure: over {SCORE_RADIUS_PX:g} px, " if error_px > SCORE_RADIUS_PX else ""
-    return f"{failure}error {error_px:.1f} px"
 
 
 def _read_maps(recording: Path, robot: str, time_ns: int) -> dict[str, Array]:
@@ -174,10 +218,3 @@ def iter_maps(recording: Path, robot: str, **span: int) -> Iterator[tuple[int, d
         shape = (len(grid.channels), grid.rows, grid.cols)
         values = np.frombuffer(grid.data, "<f4").reshape(shape).astype(float)
         yield stamped.time_ns, dict(zip(grid.channels, values, strict=True))
-
-
-def _select_detections(points: Points, image: int, least: int, threshold: float) -> Array:
-    """Return the pixels of detections above the threshold or among the first ``least``."""
-    mine = points.select(points.image == image)
-    mine = mine.select((mine.confidence >= threshold) | (np.arange(len(mine)) < least))
-    return np.column_stack([mine.u_px, mine.v_px])

@@ -51,8 +51,8 @@ METRICS = {
     "ap_16_px": ("AP at 16 px", ".3f"),
 }
 EVALUATION_IMAGES = {
-    "examples.png": "images, confidence and depth, at 20, 50, 80 and 95 % of all errors, with "
-    "detections of any confidence; a failure is named above its image",
+    "examples.png": "images, confidence and depth at the threshold: hits, misses and false "
+    "detections, two of each if there are any",
     "error-violins.png": "errors",
     "error-by-distance.png": "errors by distance",
 }

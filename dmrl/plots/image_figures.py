@@ -12,6 +12,7 @@ from dmrl.colours import RGB
 from dmrl.plots.style import add_legend_below, open_figure, withStroke
 
 Box = tuple[float, float, float, float]
+NO_VALUE_GREY = "0.8"
 CELL_INCHES = (3.4, 2.6)
 """Size of an image in a gallery."""
 CIRCLE_POINTS, TEXT_POINTS = (19.0, 19.0), (42.0, 11.0)
@@ -33,7 +34,7 @@ class Example:
     rgb
         (H, W, 3) uint8.
     confidence, depth_m
-        (rows, cols) of the network.
+        (rows, cols) of the network; a depth of NaN is drawn grey.
     labels_px, detections_px
         (N, 2) pixels, u right and v down.
     source
@@ -73,6 +74,7 @@ def plot_examples(shown: Sequence[Example], stem: Path, *, depth_max_m: float = 
                 row[1].imshow(example.confidence, vmin=0, vmax=1, cmap="inferno", **at),
                 row[2].imshow(example.depth_m, vmin=0, vmax=depth_max_m, cmap="viridis", **at),
             ]
+            row[2].set_facecolor(NO_VALUE_GREY)
             for axes in row:
                 _draw_markers(axes, example)
                 axes.set(xticks=[], yticks=[])
