@@ -121,7 +121,10 @@ def is_pooled(said: Mapping[str, Any]) -> bool:
 
 
 def build_rows(made: Mapping[str, Any]) -> list[list[str]]:
-    """Return a row per metric of a comparison: both values, and their difference."""
+    """Return a row per metric of a comparison: both values, and their difference.
+
+    The difference from a value that says nothing, "< -1", is left out.
+    """
     rows = []
     for name, title, form in metric_columns():
         found = made["figures"][name]
@@ -129,7 +132,8 @@ def build_rows(made: Mapping[str, Any]) -> list[list[str]]:
         sides = format_values(found, [(side, "", form) for side in ("first", "second")])
         ends = [change["low"], change["high"]]
         differs = None not in ends and (ends[0] > 0 or ends[1] < 0)
-        signed = format_interval(change, f"+{form}")
+        told = not any(side.startswith("<") for side in sides)
+        signed = format_interval(change, f"+{form.partition(' ')[0]}") if told else "-"
         rows.append([title, *sides, signed, "yes" if differs else ""])
     return rows
 

@@ -195,9 +195,9 @@ def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None
         print_line(f"{title}, each by two models: below is their comparison, not their mean")
     else:
         print_table(title, ["detection minus label", *headers], rows)
-    notes = [f"{count} {why}" for why, count in evaluation.pairs.left_out.items()]
+    notes = [f"{why}: {count}" for why, count in evaluation.pairs.left_out.items()]
     if unmatched := evaluation.bands[0].unmatched:
-        notes.append(f"{unmatched} labels without any detection")
+        notes.append(f"labels without any detection: {unmatched}")
     for words in notes:
         print_line(f"left out: {words}")
     if unseen := evaluation.pairs.unseen:

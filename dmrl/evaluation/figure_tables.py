@@ -11,7 +11,7 @@ from dmrl.learn.inference.metric_definitions import METRICS
 from dmrl.recording import build_input
 
 Columns = Sequence[tuple[str, str, str]]
-"""Key of a value, its title in a table, and its format."""
+"""Key of a value, its title in a table, and its format: see `format_value`."""
 
 
 def metric_columns(*names: str) -> Columns:
@@ -22,7 +22,13 @@ def metric_columns(*names: str) -> Columns:
 def format_values(values: Mapping[str, Any], columns: Columns) -> list[str]:
     """Format the values of a row of a table; a dash for None."""
     found = [(values.get(key), form) for key, _, form in columns]
-    return ["-" if value is None else format(value, form) for value, form in found]
+    return ["-" if value is None else format_value(value, form) for value, form in found]
+
+
+def format_value(value: float, form: str) -> str:
+    """Format a value; ``.2f from -1`` names the smallest that says anything: others are "< -1"."""
+    form, _, least = form.partition(" from ")
+    return f"< {least}" if least and value < float(least) else format(value, form)
 
 
 def describe_source(recording: Path) -> dict[str, str]:
@@ -57,8 +63,9 @@ def format_interval(figure: Mapping[str, Any], form: str) -> str:
     ends = [figure["low"], figure["high"]]
     if figure["value"] is None:
         return "-"
-    within = ", ".join(format(end, form).removesuffix("%") for end in ends if end is not None)
-    return format(figure["value"], form) + (f" [{within}]" if within else "")
+    within = ", ".join(format_value(end, form).removesuffix("%") for end in ends if end is not None)
+    value = format_value(figure["value"], form)
+    return value if not within or value.startswith("<") else f"{value} [{within}]"
 
 
 def band_to_json(band: BandMetrics) -> dict[str, Any]:

@@ -122,7 +122,7 @@ def ancestry_lines(made: Provenance | None) -> list[str]:
     if made is None:
         return ["made by: not known (no dmrl.provenance metadata)"]
     lines = [f"made by: {_origin(made)}"]
-    lines += [f"left out: {count} {reason}" for reason, count in made.left_out.items()]
+    lines += [f"left out: {reason}: {count}" for reason, count in made.left_out.items()]
     listed: set[str] = set()
     for depth, source in made.iter_ancestors():
         how = ", as above" if source.sha256 in listed else ""

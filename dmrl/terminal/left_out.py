@@ -62,7 +62,7 @@ def leave_out(reason: str, where: object, count: int = 1) -> None:
         return
     held = _open[-1]
     if held.strict:
-        raise SourceError(f"{where}: {count} {reason}. Fix the source, or drop --strict")
+        raise SourceError(f"{where}: {reason}: {count}. Fix the source, or drop --strict")
     held.counts[reason] += count
     held.first.setdefault(reason, str(where))
 
@@ -86,4 +86,4 @@ def count_so_far() -> dict[str, int]:
 
 
 def _describe(reason: str, count: int, where: object) -> str:
-    return f"left out: {count} {reason} ({'at' if count == 1 else 'first at'} {where})"
+    return f"left out: {reason}: {count} ({'at' if count == 1 else 'first at'} {where})"

@@ -129,7 +129,7 @@ def test_card_warns_of_label_bias_exclusions_leaks_and_licence(
     text = (tmp_path / "out" / "README.md").read_text()
     assert "labels from `published`: 30 of 30 have a sigma, median 0.0 px in u, 3.0 px in" in text
     assert "labels of source 'published' are biased: +0.0 px in u and +10.0 px in v" in text
-    assert "- Left out: 1 images had no labels." in text
+    assert "- Left out: images that had no labels: 1." in text
     assert "- Leaks: no images of a test split" in text
     assert "- No licence was found" in text
     write_card(tmp_path / "out")

@@ -35,8 +35,12 @@ def test_an_error_common_to_both_is_not_in_the_interval_of_the_difference() -> N
     assert np.allclose([mean["difference"][k] for k in ("value", "low", "high")], 0.5)
     rows = {row[0]: row[1:] for row in build_rows(made)}
     assert rows["mean error, px"][2:] == ["+0.5 [+0.5, +0.5]", "yes"]
+    made["figures"]["r2_depth"]["second"] = -30.0
+    row = next(row[1:] for row in build_rows(made) if row[0] == "R2 of depth")
+    assert row == ["1.00", "< -1", "-", ""]
     assert rows["recall"][3] == "" and len(rows["recall"]) == len(HEADERS) - 1
     assert "first: a.mcap, second: b.mcap; 200 common images" in note(made)
+    made["figures"]["r2_depth"]["second"] = 1.0
     assert compare_models(both, (0.5, 0.5), draws=200, seed=3) == made
 
 

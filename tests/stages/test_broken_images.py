@@ -135,7 +135,7 @@ def test_view_skips_broken_images(run: Run, recording: Path, broken: bytes, tmp_
     rc, _, output = run("view", recording, "--save", tmp_path / "out.rrd")
     assert rc == 0
     where = f"{CAMERA_IMAGE('cf1')} at {time_of(recording, broken)} ns"
-    assert f"left out: 1 images that cannot be decoded (at {where})" in output
+    assert f"left out: images that cannot be decoded: 1 (at {where})" in output
 
 
 def test_evaluate_skips_broken_images(

@@ -44,11 +44,11 @@ def test_counts_are_in_json_provenance_and_info(
     counts = json.loads(told.out)["left_out"]
     ((reason, count),) = counts.items()
     assert reason == "bytes that are no whole record" and count > 0
-    assert f"left out: {count} {reason} (first at {cut_log}: byte" in told.err
+    assert f"left out: {reason}: {count} (first at {cut_log}: byte" in told.err
     made = read_summary(out).provenance
     assert made is not None and made.left_out == counts
     assert main(["info", str(out)]) == 0
-    assert f"left out: {count} {reason}" in capsys.readouterr().out
+    assert f"left out: {reason}: {count}" in capsys.readouterr().out
 
 
 def test_strict_leaves_nothing_behind(

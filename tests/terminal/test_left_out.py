@@ -16,8 +16,8 @@ def test_omissions_are_counted_by_reason_and_reported_once(
         assert capsys.readouterr().err == ""
     assert held.counts == {"rows without a time": 3, "bytes at the end": 12}
     assert capsys.readouterr().err.splitlines() == [
-        "left out: 3 rows without a time (first at a.csv:3)",
-        "left out: 12 bytes at the end (first at b.bin: byte 70)",
+        "left out: rows without a time: 3 (first at a.csv:3)",
+        "left out: bytes at the end: 12 (first at b.bin: byte 70)",
     ]
     assert count_so_far() == {}
 
@@ -31,9 +31,9 @@ def test_the_innermost_count_counts() -> None:
 
 
 def test_strict_raises_at_the_first_thing(capsys: pytest.CaptureFixture[str]) -> None:
-    match = r"a\.csv:3: 1 rows without a time.*--strict"
+    match = r"a\.csv:3: rows without a time: 1.*--strict"
     with pytest.raises(SourceError, match=match), count_left_out(strict=True):
         leave_out("rows without a time", "a.csv:3")
     assert count_so_far() == {}
     leave_out("rows", "b.csv:1")
-    assert capsys.readouterr().err == "left out: 1 rows (at b.csv:1)\n"
+    assert capsys.readouterr().err == "left out: rows: 1 (at b.csv:1)\n"

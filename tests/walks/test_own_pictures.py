@@ -45,12 +45,12 @@ def test_own_images_become_a_dataset_with_a_complete_card(
     with pytest.raises(SettingError, match="neither SPDX nor"):
         dataset.run([recording], tmp_path / "d", dataset.Settings(license="ccby"))
     dataset.run([recording], tmp_path / "d", dataset.Settings(license="cc-by-4.0"))
-    assert "left out: 1 images had no labels" in capsys.readouterr().err
+    assert "left out: images that had no labels: 1" in capsys.readouterr().err
     card = (tmp_path / "d" / "README.md").read_text()
     for line in (
         "30 of 30 have a sigma, median 2.0 px in u, 3.0 px in v",
         "labels of source 'hand' are biased: ",
-        "- Left out: 1 images had no labels.",
+        "- Left out: images that had no labels: 1.",
         "- Leaks: no images",
         "- Licence of `hall`: CC BY 4.0.",
     ):

@@ -133,7 +133,7 @@ def report_left_out(
     RecordingError
         If no image can be used.
     """
-    reasons = [f"{count} images {why}" for why, count in tally.count_by_reason().items() if count]
+    reasons = [f"images that {why}: {n}" for why, n in tally.count_by_reason().items() if n]
     if not (tally.kept or tally.twice):
         names = ", ".join(str(path) for path in recordings)
         raise RecordingError(

@@ -130,7 +130,8 @@ def test_existing_recordings_and_images_are_not_added_twice(
     result = add([more], out, PLAIN)
     assert result.images == {"train": 1} and result.tally.twice == 6
     assert len(open_dataset(out).split("train")) == 7
-    assert "6 images are in the dataset already" in (out / "README.md").read_text().replace("`", "")
+    card = (out / "README.md").read_text().replace("`", "")
+    assert "are in the dataset already: same camera, time and pixels: 6" in card
     all_there = record("all.mcap", [[peer(depth_m=2.0)]] * 6, seed=0)
     assert add([all_there], out, PLAIN).images == {}
     assert add([all_there], out, PLAIN).tally.kept == 0

@@ -80,7 +80,10 @@ def test_images_without_masks_are_omitted_and_reported(
     zeros = np.zeros((48, 64), np.uint8)
     part = record("part.mcap", masks={0: zeros, 1: zeros}, seed=1)
     assert run([part], tmp_path / "out", Settings(masks=True)).images == {"train": 2}
-    assert "left out: 4 images show a peer, but have no mask" in capsys.readouterr().err
+    assert (
+        "left out: images that show a peer, but have no mask (--masks): 4"
+        in capsys.readouterr().err
+    )
 
 
 def test_estimated_labels_precede_truth_and_the_choice_is_reported(
@@ -138,7 +141,7 @@ def test_images_without_peers_stay_and_unlabelled_ones_are_omitted(
 ) -> None:
     result = run([record(peers=[[peer()], [], None, None])], tmp_path / "out", PLAIN)
     assert result.images == {"train": 2}
-    assert "left out: 2 images had no labels" in capsys.readouterr().err
+    assert "left out: images that had no labels: 2" in capsys.readouterr().err
 
 
 def test_the_best_source_wins_and_the_others_are_dropped(record: Record, tmp_path: Path) -> None:
@@ -282,7 +285,7 @@ def test_a_topic_with_another_message_is_refused(tmp_path: Path) -> None:
 
 def test_recording_without_usable_images_reports_the_reason(record: Record, tmp_path: Path) -> None:
     flight = record(peers=[[peer(status=STATUS_AMBIGUOUS)]] * 3)
-    with pytest.raises(RecordingError, match=r"3 images had a label that is not OK"):
+    with pytest.raises(RecordingError, match=r"images that had a label that is not OK .*: 3\."):
         run([flight], tmp_path / "out", PLAIN)
     assert [p.name for p in tmp_path.iterdir()] == ["flight.mcap"]
 

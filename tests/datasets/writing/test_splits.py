@@ -37,7 +37,10 @@ def test_images_outside_every_span_are_left_out(
 ) -> None:
     own = {"train": "[[0, 0]]", "test": f"[[{STEP_NS}, {STEP_NS}]]"}
     run([record(split=own)], tmp_path / "out", Settings())
-    assert "left out: 4 images belong to no split" in capsys.readouterr().err
+    assert (
+        "left out: images that belong to no split of their source (--split): 4"
+        in capsys.readouterr().err
+    )
 
 
 def test_the_split_of_the_source_can_be_ignored(record: Record, tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_truncated_record_is_omitted_and_reported(
 ) -> None:
     dump.write_bytes(dump.read_bytes()[: 2 * 71_704 + length])
     assert len(samples(dump, "CompressedImage")) == 2
-    said = f"left out: 1 records that are cut short (at {dump}: its last {length} bytes)"
+    said = f"left out: records that are cut short: 1 (at {dump}: its last {length} bytes)"
     assert said in capsys.readouterr().err
 
 
@@ -110,7 +110,7 @@ def test_impossible_numbers_make_no_label(dump: Path, capsys: pytest.CaptureFixt
     values = ((float("nan"), 0, 1, 0, 0, 1), *VALUES[1:])
     dump.write_bytes(foreign.flash_dump([to_bayer(p) for p in known_pictures()], values))
     assert len(samples(dump, "CompressedImage")) == 3
-    assert "left out: 1 labels of records with impossible numbers" in capsys.readouterr().err
+    assert "left out: labels of records with impossible numbers: 1" in capsys.readouterr().err
     assert len(samples(dump, "PeerLabels")) == 2
 
 

@@ -178,7 +178,9 @@ def test_a_table_s_last_line_may_be_cut(
         return
     cut = "a,1" in text
     assert len(samples(folder)["/cf1/camera/image"]) == text.count("{row}")
-    assert ("left out: 1 lines with fewer or more cells" in capsys.readouterr().err) == cut
+    assert (
+        "left out: lines with fewer or more cells than the header: 1" in capsys.readouterr().err
+    ) == cut
 
 
 def test_every_number_of_a_state_is_in_its_place(folder: Path) -> None:

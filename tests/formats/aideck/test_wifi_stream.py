@@ -133,7 +133,7 @@ def test_truncated_stream_reports_the_broken_image(
     path.write_bytes(whole[: int(len(whole) * share)])
     found = wifi_stream.load_content(path, Options()).samples
     assert len([s for s in found if s.message == "CompressedImage"]) == int(3 * share)
-    assert "left out: 1 images that are broken or cut short" in capsys.readouterr().err
+    assert "left out: images that are broken or cut short: 1" in capsys.readouterr().err
     path.write_bytes(whole)
     list(wifi_stream.load_content(path, Options()).samples)
     assert not capsys.readouterr().err

@@ -114,7 +114,7 @@ def test_truncated_last_line_is_omitted_and_reported(
     path = swarm / "cf1" / "state-20221011T10-33-31.csv"
     path.write_text(path.read_text()[:-8])
     assert len(samples(path)["/cf1/attitude"]) == 9
-    assert "left out: 1 lines with fewer or more cells than the header" in capsys.readouterr().err
+    assert "left out: lines with fewer or more cells than the header: 1" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -226,7 +226,7 @@ def test_ranges_are_limited_to_60_m_and_zeros_are_not_reported(
     found = samples(LogBlock("r", times, {"ranging.distance2": np.array(metres)}))["/cf1/range/cf2"]
     assert [(s.time_ns, s.fields["range_m"]) for s in found] == [(0, 59.99), (6 * MS, 0.01)]
     assert (
-        "left out: 3 ranges to cf2 that are not over 0 and under 60 m (first at the log)"
+        "left out: ranges to cf2 that are not over 0 and under 60 m: 3 (first at the log)"
         in capsys.readouterr().err
     )
 
@@ -248,7 +248,11 @@ def test_event_ranges_are_assigned_by_id_and_own_id_is_dropped() -> None:
     [
         (np.array([61.0, 1500.0]), [0.061, 1.5], "61 or more: read as millimetres"),
         (np.array([59.0, 2.0]), [59.0, 2.0], ""),
-        (np.array([61.5, 2.0]), [2.0], "left out: 1 ranges to cf2 that"),
+        (
+            np.array([61.5, 2.0]),
+            [2.0],
+            "left out: ranges to cf2 that are not over 0 and under 60 m: 1",
+        ),
         (np.array([61, 1500]), [0.061, 1.5], ""),
         (np.array([2, 59]), [0.002, 0.059], "but is 59 at most. Are they metres?"),
     ],

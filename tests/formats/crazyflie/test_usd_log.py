@@ -130,7 +130,7 @@ def test_an_id_that_is_unknown_ends_the_log_with_a_warning(
     raw = foreign.usd_log()
     log = usd_log.decode_log(raw[:-4] + b"\x55\x55" + b"\0" * 30)
     assert [len(b.time_ns) for b in log.blocks] == [100, 20, 20]
-    assert "left out: 32 bytes that are no whole record" in capsys.readouterr().err
+    assert "left out: bytes that are no whole record: 32" in capsys.readouterr().err
 
 
 def test_bytes_that_look_like_ids_are_no_records() -> None:

@@ -186,7 +186,7 @@ def test_ranges_that_cannot_be_are_left_out(
     samples = [s for s in flight_csv.load_content(flight).samples if s.topic == "/cf1/range/cf2"]
     assert [s.fields["range_m"] for s in samples] == [1.5] * 19
     (line,) = capsys.readouterr().err.splitlines()
-    assert "left out: 1 ranges to cf2 that are not over 0 and under 60 m" in line
+    assert "left out: ranges to cf2 that are not over 0 and under 60 m: 1" in line
 
 
 def test_a_robot_without_its_file_is_warned_of(

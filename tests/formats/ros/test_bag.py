@@ -57,7 +57,7 @@ def test_bags_of_every_kind_give_the_same(
     assert found["/cf1/attitude"][0].fields["yaw_rate_radps"] == pytest.approx(0.2)
     pixels = decode(found["/cf1/camera/image"][0].fields["data"])
     np.testing.assert_array_equal(pixels, demosaic(foreign.pictures(1)[0]))
-    assert "left out: 5 messages on /chatter: std_msgs/msg/String" in capsys.readouterr().err
+    assert "left out: messages on /chatter: std_msgs/msg/String" in capsys.readouterr().err
 
 
 def test_receive_time_becomes_publish_time(tmp_path: Path) -> None:
