@@ -141,7 +141,9 @@ def build_rows(made: Mapping[str, Any]) -> list[list[str]]:
 def note(made: Mapping[str, Any]) -> str:
     """Describe a comparison in one line."""
     first, second = made["recordings"]
+    own = " and ".join(f"{threshold:.3g}" for threshold in made["thresholds"])
     return (
         f"first: {first}, second: {second}; {made['images']} common images. In brackets: 95 % "
-        "interval of the difference, both models on the same images of a bootstrap"
+        "interval of the difference, both models on the same images of a bootstrap. Precision, "
+        f"recall and F1 are at confidence {own}"
     )

@@ -191,7 +191,8 @@ def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None
     name = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
     part = ", only those with detections" if criteria.partial else ""
     title = f"{name}: {evaluation.pairs.images} images against {criteria.against}{split}{part}"
-    if is_pooled({"images": evaluation.pairs.images, "paired": evaluation.paired}):
+    pooled = is_pooled({"images": evaluation.pairs.images, "paired": evaluation.paired})
+    if pooled:
         print_line(f"{title}, each by two models: below is their comparison, not their mean")
     else:
         print_table(title, ["detection minus label", *headers], rows)
@@ -214,7 +215,8 @@ def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None
     if evaluation.paired:
         print_table("the two on their common images", HEADERS, build_rows(evaluation.paired))
         print_line(note(evaluation.paired))
-    print_line(
-        f"in brackets: 95 % intervals, bootstrap over images; precision, recall and F1 at "
-        f"confidence {evaluation.threshold:g}, within 16 px"
-    )
+    if not pooled:
+        print_line(
+            f"in brackets: 95 % intervals, bootstrap over images; precision, recall and F1 at "
+            f"confidence {evaluation.threshold:g}, within 16 px"
+        )

@@ -40,6 +40,7 @@ def test_an_error_common_to_both_is_not_in_the_interval_of_the_difference() -> N
     assert row == ["1.00", "< -1", "-", ""]
     assert rows["recall"][3] == "" and len(rows["recall"]) == len(HEADERS) - 1
     assert "first: a.mcap, second: b.mcap; 200 common images" in note(made)
+    assert note(made).endswith("Precision, recall and F1 are at confidence 0.5 and 0.5")
     made["figures"]["r2_depth"]["second"] = 1.0
     assert compare_models(both, (0.5, 0.5), draws=200, seed=3) == made
 
