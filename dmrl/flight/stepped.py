@@ -144,10 +144,10 @@ class SteppedFlight:
 
     def _draw_errors(self, number: int) -> sensors.LogErrors:
         """Return the errors of a robot's log. They are kept only while samples are to come."""
-        rng = create_rng(self._seed, "log", number)
-        errors = self._errors.pop(number, None) or sensors.draw_log_errors(
-            rng, self.samples, self._noise
-        )
+        errors = self._errors.pop(number, None)
+        if errors is None:
+            rng = create_rng(self._seed, "log", number)
+            errors = sensors.draw_log_errors(rng, self.samples, self._noise)
         if self.sample < self.samples - 1:
             self._errors[number] = errors
         return errors

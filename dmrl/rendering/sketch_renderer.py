@@ -6,6 +6,7 @@ poses and look give the same image. ``sketch_scene`` draws them at random.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -229,8 +230,7 @@ def _apply_sensor(levels: Levels, look: Look) -> Levels:
     dim_v = ((1 - look.vignette / 2 * v) ** look.gamma).astype(np.float32)
     dim_u = (look.gain * (1 - look.vignette / 2 * u)) ** look.gamma
     gain = (255 * dim_u).astype(np.float32).ravel()
-    # Powers of float32 depend on the processor; those of float64, rounded to float32, do not.
-    curve = (np.linspace(0, 1, CURVE_STEPS) ** look.gamma).astype(np.float32)
+    curve = _build_curve(look.gamma)
     noise = look.noise.reshape(height, -1)
     deviation = np.float32(255 * look.noise_deviation)
     flat = levels.reshape(height, -1)
@@ -246,6 +246,13 @@ def _apply_sensor(levels: Levels, look: Look) -> Levels:
         band += grains
         out[rows] = np.clip(band, 0, 255, out=band)
     return out.reshape(levels.shape)
+
+
+@lru_cache(maxsize=1)  # the images of a flight have one
+def _build_curve(gamma: float) -> FloatImage:
+    """Return the brightness, 0 to 1, of every step of light."""
+    # Powers of float32 depend on the processor; those of float64, rounded to float32, do not.
+    return (np.linspace(0, 1, CURVE_STEPS) ** gamma).astype(np.float32)
 
 
 def _blur_rows(near: Levels, blur: float) -> NDArray[np.intp]:

@@ -54,6 +54,8 @@ def round_values(value: Any) -> Any:
     """
     if isinstance(value, float):
         return round(value, DECIMALS) + 0.0  # no negative zero
+    if isinstance(value, str | int):  # most of the others; a test for Mapping takes far longer
+        return value
     if isinstance(value, Mapping):
         return {name: round_values(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

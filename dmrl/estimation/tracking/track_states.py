@@ -136,10 +136,11 @@ def cartesian_from_polar(polar: Array) -> tuple[Array, Array]:
     azimuth, elevation, log_range = polar.T
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     r = np.exp(log_range)
-    place_m = np.stack([r * ce * ca, r * ce * sa, r * se], axis=1)
-    by_polar = np.zeros((len(polar), 3, 3))
+    flat, up = r * ce, r * se
+    place_m, by_polar = np.empty((len(polar), 3)), np.zeros((len(polar), 3, 3))
+    place_m[:, 0], place_m[:, 1], place_m[:, 2] = flat * ca, flat * sa, up
     by_polar[:, 0, 0], by_polar[:, 1, 0] = -place_m[:, 1], place_m[:, 0]
-    by_polar[:, :, 1] = np.stack([-r * se * ca, -r * se * sa, r * ce], axis=1)
+    by_polar[:, 0, 1], by_polar[:, 1, 1], by_polar[:, 2, 1] = -up * ca, -up * sa, flat
     by_polar[:, :, 2] = place_m
     return place_m, by_polar
 
