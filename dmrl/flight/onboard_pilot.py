@@ -16,6 +16,8 @@ CONSTANTS = {
     "MAX_AGE_S": 0.6,  # an older image is not used
     "STALE_S": 1.0,  # without a younger image the robot hovers
     "BLIND_S": 1.2,  # so long after the last detection it searches
+    "UNSURE_S": 3.0,  # so long after the last sure detection it stops; held leaders had up to 2.3
+    "SURE": 19661,  # confidence, of 65536, of a sure detection: 0.3
     "FOUND": 45875,  # confidence, of 65536, at which a lost leader is found again: 0.7
     "LOST_ODDS": 0.2,
     "MAX_ODDS": 50.0,
@@ -107,6 +109,7 @@ class OnboardFilter:
     odds: float = _K["START_ODDS"]
     side: float = 1.0
     seen_s: float = 0.0
+    sure_s: float = 0.0
     image_s: float = -1.0
 
     def step(
@@ -144,7 +147,7 @@ class OnboardFilter:
         self.mean = [x, y, 0.0, 0.0]
         diagonal = (variance, variance, _K["SPEED_VAR"], _K["SPEED_VAR"])
         self.covariance = [[diagonal[i] if i == j else 0.0 for j in range(4)] for i in range(4)]
-        self.height_m, self.odds, self.seen_s = z, 1.0, time_s
+        self.height_m, self.odds, self.seen_s, self.sure_s = z, 1.0, time_s, time_s
 
     def _move(self, state: RobotState) -> None:
         """Reckon the own pose, and predict the leader."""
@@ -187,7 +190,7 @@ class OnboardFilter:
             ratio = share * _K["EVIDENCE"] * p / (1.0 - p) * candidate[0] / _K["FALSE_PER_M2"]
             total += ratio
             if best is None or ratio > best[0]:
-                best = (ratio, candidate, place)
+                best = (ratio, candidate, place, found.confidence)
             if found.confidence >= _K["FOUND"] and (sure is None or found.confidence > sure[0]):
                 sure = (found.confidence, place)
         miss = 1.0 - share
@@ -195,9 +198,9 @@ class OnboardFilter:
         self.odds = max(self.odds, 0.001)
         if best is not None and best[0] > miss:
             self._update(best[1], best[2], age_s)
+            self.sure_s = self.image_s if best[3] >= _K["SURE"] else self.sure_s
         elif self.odds < _K["LOST_ODDS"] and sure is not None:
-            x, y, z, along, _, _, _ = sure[1]
-            self._restart(x, y, z, along, self.image_s)
+            self._restart(*sure[1][:4], self.image_s)
 
     def _locate(
         self, then: _Pose, found: RawDetection
@@ -278,10 +281,11 @@ class OnboardFilter:
             less += max(towards - less, 0.0) + 2.0 * (_K["NEAR"] - away)
         wx, wy = wx - less * to_x, wy - less * to_y
         near = max(away * away, _K["NEAR"] * _K["NEAR"])
-        passing = trust * (x * drift_y - y * drift_x) / near
-        turn = _K["TURN_GAIN"] * angle_of(x, y) + passing
+        turn = _K["TURN_GAIN"] * angle_of(x, y) + trust * (x * drift_y - y * drift_x) / near
         climb = trust * _K["CLIMB_GAIN"] * (self.above_m + self.height_m - state.height_m)
-        return (wx, wy, climb, turn)
+        # A false object keeps its apparent distance: who flies after it, or away, never stops.
+        unsure = state.time_s - self.sure_s > _K["UNSURE_S"]
+        return (0.0, 0.0, 0.0, turn) if unsure else (wx, wy, climb, turn)
 
     def aim(self, x: float, y: float, away: float) -> tuple[float, float]:
         """Return the velocity towards the wanted place, in the robot's horizontal frame.

@@ -1,5 +1,7 @@
 """Pilots without a simulation: their commands for given observations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -58,6 +60,19 @@ def test_it_stops_and_turns_to_where_the_leader_was_heading() -> None:
         assert all(np.hypot(c.vx_mps, c.vy_mps) < 1.0 for c in after)
         assert np.hypot(after[-1].vx_mps, after[-1].vy_mps) < 0.1
         assert sum(c.yaw_rate_radps for c in after) * side > 0
+
+
+@pytest.mark.parametrize("apparent_m", [0.3, 1.0])
+def test_pilot_does_not_fly_off_with_a_spot_in_the_image(apparent_m: float) -> None:
+    """A spot that a network takes for a peer keeps its apparent distance, wherever one flies."""
+    pilot, way_m, vx_mps = Follow(TASK), 0.0, 0.0
+    fly(pilot, [(0.7, 0.0)])
+    for k in range(200):
+        seen = observe(1.0 + 0.1 * k, [(apparent_m, 0.0)], confidence=0.2)
+        command = pilot.command(replace(seen, velocity_mps=np.array([vx_mps, 0.0])))
+        vx_mps = min(max(command.vx_mps, -1.0), 1.0)
+        way_m += 0.1 * vx_mps
+    assert abs(way_m) < 4.0
 
 
 def test_another_robot_in_view_is_not_followed() -> None:

@@ -90,7 +90,7 @@ static void restart(pilot_t *p, double x, double y, double z, double variance, d
     p->mean[1] = y;
     p->height = z;
     p->odds = 1.0;
-    p->seen_s = time_s;
+    p->seen_s = p->sure_s = time_s;
 }
 
 void pilot_start(pilot_t *pilot, double distance)
@@ -228,7 +228,7 @@ static void look(pilot_t *p, double age, const pilot_detection_t *found, int cou
     double total = 0.0, most = 0.0;
     candidate_t best = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     place_t best_at = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0}, sure_at = best_at;
-    int sure = -1;
+    int sure = -1, confidence = 0;
     for (int k = 0; k < count && k < PILOT_DETECTIONS_MAX; k++) {
         const place_t at = locate(then, &found[k]);
         const candidate_t c = compare(p, &at, age);
@@ -240,6 +240,7 @@ static void look(pilot_t *p, double age, const pilot_detection_t *found, int cou
             most = ratio;
             best = c;
             best_at = at;
+            confidence = found[k].confidence;
         }
         if (found[k].confidence >= ${FOUND} && found[k].confidence > sure) {
             sure = found[k].confidence;
@@ -248,9 +249,11 @@ static void look(pilot_t *p, double age, const pilot_detection_t *found, int cou
     }
     p->odds = smaller(p->odds * (miss + total), ${MAX_ODDS});
     p->odds = larger(p->odds, 0.001);
-    if (count > 0 && most > miss)
+    if (count > 0 && most > miss) {
         update(p, &best, &best_at, age);
-    else if (p->odds < ${LOST_ODDS} && sure >= 0)
+        if (confidence >= ${SURE})
+            p->sure_s = p->image_s;
+    } else if (p->odds < ${LOST_ODDS} && sure >= 0)
         restart(p, sure_at.x, sure_at.y, sure_at.z, sure_at.along, p->image_s);
 }
 
@@ -270,7 +273,7 @@ static void steer(pilot_t *p, const pilot_state_t *state, pilot_command_t *comma
     const double vx = pose->c * m[2] + pose->s * m[3], vy = pose->c * m[3] - pose->s * m[2];
     const double drift_x = vx - state->vx, drift_y = vy - state->vy;
     const int stale = state->time_s - p->image_s > PILOT_STALE_S;
-    double away, to_x, to_y, variance, trust, gap, wx, wy, towards, less, near, passing;
+    double away, to_x, to_y, variance, trust, gap, wx, wy, towards, less, near, turn;
     if (state->time_s - p->seen_s > ${BLIND_S}) {
         give(command, 0.0, 0.0, 0.0, stale ? 0.0 : p->side * ${SEARCH_RATE});
         return;
@@ -293,9 +296,12 @@ static void steer(pilot_t *p, const pilot_state_t *state, pilot_command_t *comma
     if (away < ${NEAR})
         less += larger(towards - less, 0.0) + 2.0 * (${NEAR} - away);
     near = larger(away * away, ${NEAR} * ${NEAR});
-    passing = trust * (x * drift_y - y * drift_x) / near;
-    give(command, wx - less * to_x, wy - less * to_y,
-         trust * ${CLIMB_GAIN} * (p->height - state->height), ${TURN_GAIN} * angle_of(x, y) + passing);
+    turn = ${TURN_GAIN} * angle_of(x, y) + trust * (x * drift_y - y * drift_x) / near;
+    if (state->time_s - p->sure_s > ${UNSURE_S})
+        give(command, 0.0, 0.0, 0.0, turn);
+    else
+        give(command, wx - less * to_x, wy - less * to_y,
+             trust * ${CLIMB_GAIN} * (p->height - state->height), turn);
 }
 
 void pilot_step(pilot_t *p, const pilot_state_t *state, double image_s,
