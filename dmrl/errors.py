@@ -111,10 +111,10 @@ class MissingTopic(RecordingError):
 
     def __init__(self, topic: str, present: Iterable[str], where: object) -> None:
         near = get_close_matches(topic, sorted(present), n=1)
-        way = f"Try: dmrl info {where}"
+        remedy = f"Try: dmrl info {where}"
         if topic.endswith("/labels"):
-            way = f"Label it with dmrl label, or by hand: dmrl view {where} --flag desk.html"
-        hint = suggest(topic, present, way)
+            remedy = f"Label it with dmrl label, or by hand: dmrl view {where} --flag desk.html"
+        hint = suggest(topic, present, remedy)
         if near and topic.startswith("/*/"):  # a stage asks for it, and not the user
             name = f"{near[0]}={topic.replace('*', 'cf1', 1)}"
             hint += f" Rename it: dmrl convert {where} OUT.mcap --names {name}"

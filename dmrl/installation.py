@@ -55,7 +55,7 @@ class Part:
         Version, path or number that was found.
     serves
         Commands and features that use it.
-    way
+    remedy
         Line to type if it is missing.
     needed
         Whether dmrl needs it.
@@ -65,7 +65,7 @@ class Part:
     there: bool
     found: str
     serves: str
-    way: str = ""
+    remedy: str = ""
     needed: bool = False
 
 
@@ -84,8 +84,8 @@ def list_parts() -> list[Part]:
 def _find_machine() -> Iterator[Part]:
     python = platform.python_version()
     good = sys.version_info >= (3, 11)
-    way = "" if good else "install Python 3.11 or newer"
-    yield Part("Python", good, python, "everything", way, needed=True)
+    remedy = "" if good else "install Python 3.11 or newer"
+    yield Part("Python", good, python, "everything", remedy, needed=True)
     yield Part("cores", True, str(os.cpu_count() or 1), "workers of dmrl render, run, train")
     free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
     yield Part("free disk here", True, f"{free_gb:.0f} GB", "outputs")
@@ -98,7 +98,7 @@ def _find_packages() -> Iterator[Part]:
         yield _check_group(f"dmrl[{extra}]", extra, serves, f"pip install 'dmrl[{extra}]'")
 
 
-def _check_group(name: str, extra: str, serves: str, way: str, *, needed: bool = False) -> Part:
+def _check_group(name: str, extra: str, serves: str, remedy: str, *, needed: bool = False) -> Part:
     """Check packages that come together: all are installed, in versions that dmrl takes."""
     present, lacking = [], []
     for wanted in map(Requirement, requires("dmrl") or ()):
@@ -114,7 +114,7 @@ def _check_group(name: str, extra: str, serves: str, way: str, *, needed: bool =
         elif not wanted.specifier.contains(found, prereleases=True):
             lacking.append(f"{wanted.name} {found}, not {wanted.specifier}")
     shown = ", ".join(lacking or present)
-    return Part(name, not lacking, shown, serves, way if lacking else "", needed)
+    return Part(name, not lacking, shown, serves, remedy if lacking else "", needed)
 
 
 def _find_installed_version(package: str) -> str:
@@ -130,12 +130,12 @@ def _find_programs() -> Iterator[Part]:
         compiler = toolchain.find_host_compiler()
         yield Part("C compiler", True, compiler, "dmrl verify, predict --backend c")
     except ToolError:
-        way = "apt-get install gcc"
-        yield Part("C compiler", False, "", "dmrl verify, predict --backend c", way)
+        remedy = "apt-get install gcc"
+        yield Part("C compiler", False, "", "dmrl verify, predict --backend c", remedy)
     for name in (toolchain.RISCV, toolchain.EMULATOR):
         path = shutil.which(name) or ""
-        way = "" if path else f"apt-get install {toolchain.DEBIAN_PACKAGES[name]}"
-        yield Part(name, bool(path), path, "dmrl verify: proof on RISC-V", way)
+        remedy = "" if path else f"apt-get install {toolchain.DEBIAN_PACKAGES[name]}"
+        yield Part(name, bool(path), path, "dmrl verify: proof on RISC-V", remedy)
 
 
 def _find_vulkan() -> Part:
@@ -148,8 +148,8 @@ def _find_vulkan() -> Part:
     files += [str(file) for place in DRIVERS for file in sorted(Path(place).glob("*.json"))]
     there = bool(files) and find_library("vulkan") is not None
     found = f"{len(files)} drivers" if there else ""
-    way = "" if there else "apt-get install mesa-vulkan-drivers"
-    return Part("Vulkan driver", there, found, serves, way)
+    remedy = "" if there else "apt-get install mesa-vulkan-drivers"
+    return Part("Vulkan driver", there, found, serves, remedy)
 
 
 def _find_blender() -> Part:
@@ -157,8 +157,8 @@ def _find_blender() -> Part:
     python = blender_environment.find_python()
     lacking = [name for name in BLENDER_LIBRARIES if find_library(name) is None]
     if platform.system() == "Linux" and lacking:
-        way = f"apt-get install {blender_environment.SYSTEM_LIBRARIES}"
-        return Part("Blender", False, f"no lib{lacking[0]}", serves, way)
+        remedy = f"apt-get install {blender_environment.SYSTEM_LIBRARIES}"
+        return Part("Blender", False, f"no lib{lacking[0]}", serves, remedy)
     if python is None:
         return Part("Blender", False, "", serves, "dmrl render --setup")
     return Part(

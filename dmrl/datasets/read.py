@@ -254,11 +254,11 @@ def open_dataset(path: Path) -> Dataset:
     else:
         splits = tuple(sorted({split for split, _, _ in _parse_parquet_names(path)}, reverse=True))
     if not splits:
-        what, out, way = "does not exist", path, ""
+        what, out, other = "does not exist", path, ""
         if path.exists():
-            way = f"; or a recording of its files: dmrl convert {path} OUT.mcap"
+            other = f"; or a recording of its files: dmrl convert {path} OUT.mcap"
             what, out = "is not a dataset", Path("OUT")
-        words = f"Make one with: dmrl dataset RECORDING.mcap {out}{way}"
+        words = f"Make one with: dmrl dataset RECORDING.mcap {out}{other}"
         raise DatasetError(f"{path} {what}. {words}")
     return Dataset(
         path, tuple(check_split_name(name, f"{path}: a split") for name in splits), parquet

@@ -56,9 +56,9 @@ class DeadReckoning:
         self.yaw_rad[first + 1 : part.stop] = yaw
         over_ground = np.exp(1j * self.yaw_rad[grown]) * (vx + 1j * vy)
         steps = dt_s * (over_ground[1:] + over_ground[:-1]) / 2
-        way = complex(*self.path_m[first, :2]) + np.cumsum(steps)
-        self.path_m[first + 1 : part.stop, 0] = way.real
-        self.path_m[first + 1 : part.stop, 1] = way.imag
+        place = complex(*self.path_m[first, :2]) + np.cumsum(steps)
+        self.path_m[first + 1 : part.stop, 0] = place.real
+        self.path_m[first + 1 : part.stop, 1] = place.imag
         self.path_m[grown, 2] = height
 
     def _mean_height(self, sample: int) -> float:
@@ -66,7 +66,7 @@ class DeadReckoning:
         return float(self.path_m[max(sample - HEIGHT_SAMPLES, 0) : sample + 1, 2].mean())
 
     def motion(self, first: int, last: int) -> tuple[float, Array, float]:
-        """Return seconds, the (3,) way in the frame of the first of two samples, and the turn."""
+        """Return seconds, the (3,) displacement in the frame of the first sample, and the turn."""
         c, s = np.cos(self.yaw_rad[first]), np.sin(self.yaw_rad[first])
         x, y, _ = self.path_m[last] - self.path_m[first]
         z = self._mean_height(last) - self._mean_height(first)

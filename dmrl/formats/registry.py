@@ -88,8 +88,8 @@ def find_format(source: Path, name: str | None = None) -> Format:
         raise SourceError(f"{source} is a recording already. Pass --to: csv, parquet, ros2")
     files = source.iterdir() if source.is_dir() else [source]
     if any(path.suffix.lower() in (".csv", ".tsv") for path in files):
-        way = "State them: --columns map.toml (docs/sources.md)"
-        raise SourceError(f"{source} has columns that dmrl does not know. {way}")
+        remedy = "State them: --columns map.toml (docs/sources.md)"
+        raise SourceError(f"{source} has columns that dmrl does not know. {remedy}")
     raise SourceError(f"{source} matches no known format. Pass --from: {known}")
 
 

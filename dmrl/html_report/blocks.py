@@ -64,7 +64,7 @@ class Table:
     @property
     def cells(self) -> list[list[str]]:
         """Texts of the cells."""
-        return [[to_line(cell) for cell in row] for row in self.rows]
+        return [[_join_interval(to_line(cell)) for cell in row] for row in self.rows]
 
     @property
     def kinds(self) -> list[str]:
@@ -105,6 +105,11 @@ def to_line(value: object) -> str:
     if value is None:
         return ""
     return f"{value:.4g}" if isinstance(value, float) else to_one_line(str(value))
+
+
+def _join_interval(text: str) -> str:
+    """Return a text whose interval in brackets breaks before it, not inside."""
+    return re.sub(r"\[[^\]]*\]", lambda found: found[0].replace(" ", "\u00a0"), text)
 
 
 def _escape_line(value: object) -> Markup:

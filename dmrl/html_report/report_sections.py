@@ -177,9 +177,11 @@ def _evaluation_details(
     split = f" --split {said['split']}" if said["split"] not in (None, "all") else ""
     ran = f"dmrl evaluate {inputs} --against {said['against']}{split} --plots {name}"
     partial = " Images without Detections were left out (--partial)." if said.get("partial") else ""
-    words = f"{said['labels']} labels, threshold {float(said['threshold']):.2f}.{partial}"
+    pooled = comparison.is_pooled(said)
+    threshold = "" if pooled else f", threshold {float(said['threshold']):.2f}"
+    words = f"{said['labels']} labels{threshold}.{partial}"
     headers, rows = build_band_table([said["overall"], *said["bands"]])
-    rows = [] if comparison.is_pooled(said) else rows
+    rows = [] if pooled else rows
     table = _table(["detection minus label", *headers], rows)
     figures = (
         pictures.embed_if_present(found.folder / name / file, caption, full=k == 0)

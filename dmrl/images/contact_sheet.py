@@ -24,10 +24,10 @@ def make_contact_sheet(image_sets: Sequence[Sequence[Rgb]]) -> bytes:
         Sets of (H, W, 3) uint8 images, at least one image each.
     """
     rows = []
-    for way in image_sets:
+    for images in image_sets:
         tiles = [
-            crop_and_scale(way[k], (0, 0, way[k].shape[1], way[k].shape[0]), *TILE_PX)
-            for k in even_indices(len(way), ROWS * COLUMNS)
+            crop_and_scale(images[k], (0, 0, images[k].shape[1], images[k].shape[0]), *TILE_PX)
+            for k in even_indices(len(images), ROWS * COLUMNS)
         ]
         tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
         rows += [np.hstack(tiles[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]

@@ -60,9 +60,9 @@ class Overview:
 
     def _list_warnings(self) -> list[str]:
         """Return why commands that decode a topic refuse it, and the way out."""
-        topics, way = self.summary.topics, f"dmrl convert {self.path} OUT.mcap"
+        topics, command = self.summary.topics, f"dmrl convert {self.path} OUT.mcap"
         return [
-            f"{topic} {why}: commands that read it refuse it. Convert the recording: {way}"
+            f"{topic} {why}: commands that read it refuse it. Convert the recording: {command}"
             for topic, why in iter_wrong_types(topics, topics)
         ]
 

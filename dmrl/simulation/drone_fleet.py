@@ -76,10 +76,10 @@ def fleet(
     clock = FlightClock(settings.speed, max(f.end_s for f in flights.values()))
     start_ns = read_summary(flight).start_ns
     drones: list[SimulatedCrazyflie] = []
-    eyes: list[SimulatedCamera] = []
+    sending: list[SimulatedCamera] = []
     # Each has its socket as soon as it is made, so what was made is ended if the next fails.
     with ExitStack() as made:
-        made.callback(_end, drones, eyes)
+        made.callback(_end, drones, sending)
         for k, (robot, uri) in enumerate(zip(robots, uris, strict=False)):
             seed = settings.seed * 1000 + k
             behaves = flights[robot], clock, faults[robot], seed
@@ -87,10 +87,10 @@ def fleet(
         for k, (robot, port) in enumerate(zip(robots, cameras, strict=False)):
             pictures, seed = _pictures(flight, robot, start_ns), settings.seed * 1000 + 500 + k
             sends = pictures, clock, faults[robot], settings.sends, seed
-            eyes.append(SimulatedCamera(robot, (LOOPBACK, port), *sends))
-        for thread in (*drones, *eyes):
+            sending.append(SimulatedCamera(robot, (LOOPBACK, port), *sends))
+        for thread in (*drones, *sending):
             thread.start()
-        yield Fleet(tuple(drones), tuple(eyes), clock)
+        yield Fleet(tuple(drones), tuple(sending), clock)
 
 
 def _end(drones: Sequence[SimulatedCrazyflie], cameras: Sequence[SimulatedCamera]) -> None:

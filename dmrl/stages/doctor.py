@@ -22,10 +22,10 @@ def command(*, as_json: AsJson = False) -> None:
     if as_json:
         print_json([asdict(part) for part in found])
     else:
-        rows = [(part.name, part.found or "-", part.serves, part.way) for part in found]
+        rows = [(part.name, part.found or "-", part.serves, part.remedy) for part in found]
         print_table("", ("what", "found", "for", "to get it"), rows)
     if lacking := [part for part in found if part.needed and not part.there]:
-        raise SettingError(f"{lacking[0].name}: {lacking[0].found}. Try: {lacking[0].way}")
+        raise SettingError(f"{lacking[0].name}: {lacking[0].found}. Try: {lacking[0].remedy}")
     if not as_json:
         print_line(_conclude(found))
 

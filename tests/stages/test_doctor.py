@@ -71,4 +71,4 @@ def test_doctor_reports_missing_vulkan_driver(
     monkeypatch.delenv("VK_ICD_FILENAMES", raising=False)
     monkeypatch.delenv("VK_DRIVER_FILES", raising=False)
     assert not installation._find_vulkan().there
-    assert installation._find_vulkan().way == "apt-get install mesa-vulkan-drivers"
+    assert installation._find_vulkan().remedy == "apt-get install mesa-vulkan-drivers"

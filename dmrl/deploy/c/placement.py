@@ -154,15 +154,15 @@ def place_buffers(plan: BufferPlan, most_bytes: int | None) -> Placement:
     whole = Placement(plan)
     if most_bytes is None or whole.near_bytes(bayer=True) <= most_bytes:
         return whole
-    ways = [Placement(plan, frozenset(far)) for far in _list_choices(whole)]
-    sizes = [way.near_bytes(bayer=True) for way in ways]
+    placements = [Placement(plan, frozenset(far)) for far in _list_choices(whole)]
+    sizes = [one.near_bytes(bayer=True) for one in placements]
     fitting = [
-        (way.traffic_bytes, size, k)
-        for k, (way, size) in enumerate(zip(ways, sizes, strict=True))
+        (one.traffic_bytes, size, k)
+        for k, (one, size) in enumerate(zip(placements, sizes, strict=True))
         if size <= most_bytes
     ]
     if fitting:
-        return ways[min(fitting)[-1]]
+        return placements[min(fitting)[-1]]
     least = min([*sizes, whole.near_bytes(bayer=True)])
     raise SettingError(
         f"{plan.network.name} needs at least {least:,} bytes of near memory, of which "

@@ -32,10 +32,10 @@ def _blade_parts() -> Iterator[Part]:
         yield _make_blades(hub, BLADE_ANGLES_RAD[k], 1 if k % 2 else -1)
 
 
-def _make_blades(hub: tuple[float, float], at_rad: float, way: int) -> Part:
+def _make_blades(hub: tuple[float, float], at_rad: float, turn_sign: int) -> Part:
     """Build two twisted blades, opposite each other."""
     radius, half = BLADE_PROFILE_M.T
-    across, up = half * np.cos(BLADE_PITCH_RAD), way * half * np.sin(BLADE_PITCH_RAD)
+    across, up = half * np.cos(BLADE_PITCH_RAD), turn_sign * half * np.sin(BLADE_PITCH_RAD)
     edges = np.concatenate(
         [np.column_stack([radius, side * across, side * up]) for side in (-1, 1)]
     )
