@@ -11,7 +11,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from dmrl.catalogue.table import FILE_NAME, Catalogue, file_stamp, open_catalogue
-from dmrl.errors import RecordingError, SettingError, optional_imports
+from dmrl.errors import RecordingError, SettingError, optional_imports, suggest
 from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.cage import run_caged
@@ -144,4 +144,7 @@ def _convert_quotes(query: str, columns: list[str]) -> str:
 
 def _query_error(query: str, said: str, columns: list[str]) -> str:
     why = said.splitlines()[0].removesuffix("!") if said else "it cannot be answered"
-    return f"the query {query!r}: {why}. Columns: {', '.join(columns)}"
+    if unknown := re.search(r'Referenced column "([^"]+)" not found', why):
+        why = f"there is no column {unknown[1]}. {suggest(unknown[1], columns, '')}"
+    end = " " if why.endswith("?") else ". "
+    return f"the query {query!r}: {why.rstrip('. ')}{end}Columns: {', '.join(columns)}"

@@ -140,6 +140,11 @@ def test_invalid_query_gives_one_line_error_and_reads_no_other_file(
     assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
 
 
+def test_a_misspelt_column_is_named_with_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=r"no column image\. Did you mean images\? Columns:"):
+        find_rows(Catalogue(tmp_path, to_table([])), "image > 3")
+
+
 @pytest.mark.heavy
 def test_only_changed_recordings_are_indexed_again(flights: Path) -> None:
     index.update(flights, workers=1)

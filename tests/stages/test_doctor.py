@@ -46,9 +46,9 @@ def test_doctor_reports_missing_packages_with_install_commands(
     monkeypatch.setattr(shutil, "which", lambda _: None)
     output = run_doctor_json(capsys)
     assert output["dmrl[label]"]["found"] == "no filterpy"
-    assert output["dmrl[label]"]["way"] == "pip install 'dmrl[label]'"
+    assert output["dmrl[label]"]["remedy"] == "pip install 'dmrl[label]'"
     assert str(output["dmrl[ros]"]["found"]).startswith("rosbags 0.1, not ")
-    assert output["C compiler"]["way"] == "apt-get install gcc"
+    assert output["C compiler"]["remedy"] == "apt-get install gcc"
     assert not output["NVIDIA GPU"]["there"]
 
 
