@@ -33,6 +33,15 @@ OBSERVER_TOPICS = (topics.DETECTIONS, topics.CALIBRATION, *SENSOR_TOPICS)
 TRUTH_TOPICS = (topics.TRUTH, topics.TRUE_POSE)
 """Topics that hold true positions."""
 
+POSITION_FIELDS = ("x", "y", "z", "covariance", "status")
+COLUMN_FIELDS = {
+    **SENSOR_FIELDS,
+    topics.POSITION: POSITION_FIELDS,
+    topics.TRUTH: POSITION_FIELDS,
+    topics.TRUE_POSE: ("pose",),
+}
+"""Fields of the topics with one row a message, by pattern of topics."""
+
 Times = NDArray[np.int64]
 RobotPair = tuple[str, str]
 """An observer and its peer."""
@@ -146,7 +155,11 @@ def read_flight(path: Path, *wanted: str, sizes_of: Collection[str] = ()) -> Fli
     """
     wanted = wanted or (*READERS, topics.CAMERA_IMAGE, topics.TRANSFORMS)
     with share_file(path):
-        held = LoadedRecording(path, *(p for p in wanted if p != topics.CAMERA_IMAGE))
+        columns = {
+            pattern: COLUMN_FIELDS[pattern] for pattern in wanted if pattern in COLUMN_FIELDS
+        }
+        messages = [p for p in wanted if p not in columns and p != topics.CAMERA_IMAGE]
+        held = LoadedRecording(path, *messages, columns=columns)
         log = to_flight_log(held, *wanted)
         images = _find_topics(log.topics, topics.CAMERA_IMAGE)
         if topics.CAMERA_IMAGE in wanted:
@@ -205,7 +218,7 @@ def _sample_reader(pattern: str) -> Callable[[LoadedRecording, str], Samples]:
 
 
 def _read_poses(held: LoadedRecording, topic: str) -> Samples:
-    table = held.get_table(topic, ("pose",))
+    table = held.get_table(topic, COLUMN_FIELDS[topics.TRUE_POSE])
     pose = pa.Table.from_struct_array(table["pose"])
     place, turn = (pa.Table.from_struct_array(pose[n]) for n in ("position", "orientation"))
     return _to_samples(table, [place[n] for n in "xyz"] + [turn[n] for n in "xyzw"])
@@ -213,7 +226,7 @@ def _read_poses(held: LoadedRecording, topic: str) -> Samples:
 
 def _read_positions(held: LoadedRecording, topic: str) -> PeerPositions:
     """Read PeerPosition messages; a covariance that is missing becomes NaN."""
-    table = held.get_table(topic, ("x", "y", "z", "covariance", "status"))
+    table = held.get_table(topic, POSITION_FIELDS)
     lists = table["covariance"]
     lengths = pc.list_value_length(lists).to_numpy()
     full = lengths == 9

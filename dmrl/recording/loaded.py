@@ -11,10 +11,10 @@ from google.protobuf.message_factory import GetMessageClass
 from dmrl.errors import MissingTopic
 from dmrl.images.codec import is_decodable, read_size
 from dmrl.recording.log_times import read_log_times
-from dmrl.recording.mcap.batch_reader import iter_batches
+from dmrl.recording.mcap.batch_reader import iter_batches, join_batches
 from dmrl.recording.mcap.channel import Channel, RawMessage
 from dmrl.recording.mcap.message_batch import EMPTY_BATCH, Ints, MessageBatch, concatenate_all
-from dmrl.recording.protobuf.columns import decode_topic, group_by_topic
+from dmrl.recording.protobuf.columns import decode_by_topic, decode_topic, group_by_topic
 from dmrl.recording.protobuf.message_types import find_channel_descriptor, require_types
 from dmrl.recording.reader import Stamped, parse_message, read, select_topics
 from dmrl.recording.summary import TopicInfo, read_channel, read_summary
@@ -26,8 +26,8 @@ PLACEHOLDER = re.compile(r"\\{\w+\\}")
 class LoadedRecording:
     """A recording with the messages of some topics in memory.
 
-    Messages are kept encoded and decoded on request. Other topics are read on request, each in a
-    pass of its own.
+    Messages are kept encoded and decoded on request, but for those of ``columns``. Other topics are
+    read on request, each in a pass of its own.
 
     Parameters
     ----------
@@ -36,6 +36,9 @@ class LoadedRecording:
     wanted
         Topics, or patterns as in ``dmrl.topics``: ``/{robot}/labels``. They may be missing.
         Read large topics, such as images, with `read` instead.
+    columns
+        Patterns of further topics, and the fields to which their messages are decoded as they are
+        read. Columns take a third of the memory of messages.
 
     Raises
     ------
@@ -43,26 +46,42 @@ class LoadedRecording:
         If the file is not a complete recording, or one of dmrl's topics carries another type.
     """
 
-    def __init__(self, path: Path, *wanted: str) -> None:
+    def __init__(
+        self, path: Path, *wanted: str, columns: Mapping[str, Sequence[str]] | None = None
+    ) -> None:
         self.path, self.summary = path, read_summary(path)
         self._messages: dict[str, tuple[MessageBatch, dict[int, Channel]]] = {}
-        patterns = [re.compile(PLACEHOLDER.sub("[^/]+", re.escape(want))) for want in wanted]
-        names = frozenset(t for t in self.topics if any(p.fullmatch(t) for p in patterns))
-        require_types(path, self.topics, names)
-        self._load_topics(names)
+        self._fields = {
+            topic: tuple(fields)
+            for pattern, fields in (columns or {}).items()
+            for topic in self._match(pattern)
+        }
+        self._columns: dict[str, list[pa.RecordBatch]] = {topic: [] for topic in self._fields}
+        names = frozenset(topic for pattern in wanted for topic in self._match(pattern))
+        require_types(path, self.topics, names | self._fields.keys())
+        self._load_topics(names - self._fields.keys(), self._fields)
 
-    def _load_topics(self, names: frozenset[str]) -> None:
+    def _match(self, pattern: str) -> list[str]:
+        expression = re.compile(PLACEHOLDER.sub("[^/]+", re.escape(pattern)))
+        return [topic for topic in self.topics if expression.fullmatch(topic)]
+
+    def _load_topics(self, names: frozenset[str], fields: Mapping[str, Sequence[str]]) -> None:
+        """Keep the messages of some topics, and the columns of others."""
         parts: list[MessageBatch] = []
         channels: dict[int, Channel] = {}
-        for batch, own in iter_batches(self.path, names) if names else ():
-            parts.append(batch)
-            channels = own
+        every = names | fields.keys()
+        for batch, channels in join_batches(iter_batches(self.path, every)) if every else ():
+            kept = [n for n, channel in channels.items() if channel.topic in names]
+            parts.append(batch.select_channels(kept).compact() if fields else batch)
+            decoded = batch.select_channels(channels.keys() - set(kept))
+            for topic, made in decode_by_topic(self.path, decoded, channels, fields).items():
+                self._columns[topic].append(made)
         self.add_topics(names, parts, channels)
 
     def add_topics(
-        self, names: frozenset[str], parts: Sequence[MessageBatch], channels: dict[int, Channel]
+        self, names: frozenset[str], parts: list[MessageBatch], channels: dict[int, Channel]
     ) -> None:
-        """Keep all messages of these topics, which were read already."""
+        """Keep all messages of these topics, which were read already; empty the list of them."""
         batches = group_by_topic(concatenate_all(parts).sort_by_time(), channels) if parts else {}
         for topic in names:
             own = {n: channel for n, channel in channels.items() if channel.topic == topic}
@@ -88,6 +107,8 @@ class LoadedRecording:
     def get_table(self, topic: str, fields: Sequence[str] | None = None) -> pa.Table:
         """Return one topic as an Arrow table, possibly without rows; see `iter_columns`.
 
+        Decoded columns are handed over. Asked for again, their topic is read again.
+
         Raises
         ------
         MissingTopic
@@ -95,6 +116,9 @@ class LoadedRecording:
         RecordingError
             If a message is not of its type.
         """
+        held = fields is not None and self._fields.get(topic) == tuple(fields)
+        if held and (decoded := self._columns.pop(topic, None)):
+            return pa.Table.from_batches(decoded)
         batch, channels = self._get_messages(topic)
         return pa.Table.from_batches([decode_topic(self.path, topic, batch, channels, fields)])
 
@@ -130,5 +154,5 @@ class LoadedRecording:
             raise MissingTopic(topic, self.topics, self.path)
         if topic not in self._messages:
             require_types(self.path, self.topics, [topic])
-            self._load_topics(frozenset([topic]))
+            self._load_topics(frozenset([topic]), {})
         return self._messages[topic]

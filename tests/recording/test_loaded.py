@@ -29,6 +29,20 @@ def test_loaded_topics_equal_read_topics(flight: Path) -> None:
         assert (held.start_ns, held.topics.keys()) == (0, held.summary.topics.keys())
 
 
+def test_decoded_columns_equal_those_of_the_messages(flight: Path) -> None:
+    columns = {"/{robot}/attitude": ("roll_rad",), "/{robot}/range/{peer}": ("range_m",)}
+    calibration = "/cf1/camera/calibration"
+    held = LoadedRecording(flight, "/{robot}/camera/calibration", "/cf1/attitude", columns=columns)
+    for topic, fields in (("/cf1/attitude", ["roll_rad"]), ("/cf1/range/cf2", ["range_m"])):
+        wanted = read_table(flight, topic, fields=fields)
+        assert held.get_table(topic, fields) == wanted
+        # The columns were handed over; the topic is read again.
+        assert held.get_table(topic, fields) == wanted
+        assert held.get_table(topic) == read_table(flight, topic)
+        assert held.get_times(topic).tolist() == wanted["log_time"].to_pylist()
+    assert held.get_table(calibration) == read_table(flight, calibration)
+
+
 def broken(path: Path, topic: str, schema: str) -> Path:
     """One message that is no message of its type."""
     with path.open("wb") as stream:
@@ -47,6 +61,7 @@ def test_errors_name_the_file_and_the_topic(tmp_path: Path, flight: Path) -> Non
     for call in (
         lambda: LoadedRecording(path).get_table("/cf1/height"),
         lambda: LoadedRecording(path, "/{robot}/height").get_table("/cf1/height"),
+        lambda: LoadedRecording(path, columns={"/{robot}/height": ("height_m",)}),
         lambda: read_table(path, "/cf1/height"),
     ):
         with pytest.raises(RecordingError, match=where):
