@@ -133,7 +133,10 @@ def test_imu_and_twist_are_used_without_odometry(
     assert not given("geometry_msgs/msg/TwistStamped", moved, odometry=True)
     moved.header.frame_id = "cf1/odom"
     assert not given("geometry_msgs/msg/TwistStamped", moved)
-    assert "velocities of cf1 in a frame that does not turn with the robot: 1" in capsys.readouterr().err
+    assert (
+        "velocities of cf1 in a frame that does not turn with the robot: 1"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize(("range_m", "count"), [(0.0, 0), (0.01, 1), (59.99, 1), (60.0, 0)])
