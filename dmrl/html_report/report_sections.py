@@ -69,9 +69,12 @@ def build_report(found: ReportInputs) -> str:
         (found.title, build_recipe_figures(found, pictures)),
         ("Detections", _detections_section(found, pictures)),
         ("Differences", _differences_section(found)),
-        ("Positions", build_row(_draw_position_maps(found)) + _judged(found, positions, pictures)),
-        ("Tracks", _judged(found, tracks, pictures)),
-        ("Flights", _judged(found, flights, pictures)),
+        (
+            "Positions",
+            build_row(_draw_position_maps(found)) + _show_judged(found, positions, pictures),
+        ),
+        ("Tracks", _show_judged(found, tracks, pictures)),
+        ("Flights", _show_judged(found, flights, pictures)),
         ("Training", _training_section(found)),
         ("int8", _int8_section(found, pictures)),
         ("Datasets", _datasets_section(found, pictures)),
@@ -198,7 +201,7 @@ def _differences_section(found: ReportInputs) -> list[Block]:
     return show_documents({name: said["paired"] for name, said in judged if "paired" in said}, show)
 
 
-def _judged(found: ReportInputs, kind: ModuleType, pictures: ImageEmbedder) -> list[Block]:
+def _show_judged(found: ReportInputs, kind: ModuleType, pictures: ImageEmbedder) -> list[Block]:
     """Show the tables of ``dmrl evaluate`` against the truth."""
     what = kind.__name__.rpartition(".")[2]
 

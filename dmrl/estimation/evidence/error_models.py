@@ -100,7 +100,7 @@ class Candidate:
         )
 
 
-def _scaled_turn(steps: "Steps") -> Array:
+def _scale_turn(steps: "Steps") -> Array:
     """Return the effect of a scale of the yaw rate."""
     none = np.zeros(len(steps.steps_s))
     return np.column_stack([none, none, steps.motion.turn_rad])
@@ -130,7 +130,7 @@ def _later_flow(steps: "Steps") -> Array:
     return out
 
 
-def _scaled_shift(steps: "Steps") -> Array:
+def _scale_shift(steps: "Steps") -> Array:
     """Return the effect of a scale of the velocities that changes over time."""
     return _shift_only(steps.motion.shift_m)
 
@@ -197,7 +197,7 @@ MODELS: tuple[ErrorModel, ...] = (
         log_odds=COMMON,
     ),
     ErrorModel("yaw rate bias changes", (YAW_RATE_ERROR,), log_odds=COMMON),
-    ErrorModel("yaw rate scale", (_constant("yaw_rate_scale", "1", 0.1, motion=_scaled_turn),)),
+    ErrorModel("yaw rate scale", (_constant("yaw_rate_scale", "1", 0.1, motion=_scale_turn),)),
     ErrorModel(
         "yaw rate follows the speed",
         (_constant("yaw_rate_by_speed", "rad/m", 0.1, motion=_turn_by_speed),),
@@ -217,7 +217,7 @@ MODELS: tuple[ErrorModel, ...] = (
         log_odds=COMMON,
     ),
     ErrorModel(
-        "flow scale changes", (_changing("flow_scale_error", "1", 0.02, 0.1, motion=_scaled_shift),)
+        "flow scale changes", (_changing("flow_scale_error", "1", 0.02, 0.1, motion=_scale_shift),)
     ),
     ErrorModel(
         "flow scale follows height",

@@ -164,7 +164,7 @@ def run_lanes(
         (filters, SIZE), (filters, SIZE, SIZE), (filters, SIZE), (filters, SIZE, SIZE),
         (filters, SIZE, SIZE), (filters,),
     )))  # fmt: skip
-    keys = np.stack([_padded(lane.keyframe, count) for lane in lanes])
+    keys = np.stack([_pad_with_none(lane.keyframe, count) for lane in lanes])
     columns = [np.flatnonzero(lane_of == number) for number in range(len(lanes))]
     for t in range(count):
         out.prior[t], out.prior_covariance[t] = state, covariance
@@ -183,7 +183,7 @@ def run_lanes(
     return out
 
 
-def _padded(keyframe: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+def _pad_with_none(keyframe: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     return np.concatenate([keyframe[:count], np.full(max(count - len(keyframe), 0), -1)])
 
 
