@@ -85,7 +85,7 @@ def test_flagged_rows_are_omitted_and_recorded_in_provenance(
     assert made.images == {"train": 8} and made.tally.flagged == 2
     said = json.loads((tmp_path / "clean/provenance.json").read_text())
     assert [one["name"] for one in said["inputs"]] == ["flight.mcap", "flags.csv"]
-    assert "2 images were flagged" in (tmp_path / "clean/README.md").read_text()
+    assert "images that were flagged (--without): 2" in (tmp_path / "clean/README.md").read_text()
 
 
 @pytest.mark.heavy
