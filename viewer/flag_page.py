@@ -111,8 +111,9 @@ def write_flag_page(paths: Sequence[Path], out: Path, settings: Settings) -> int
     """
     found = any(path.is_dir() for path in paths)
     desk = _read_dataset(paths, settings) if found else _read_recordings(paths, settings)
-    for row in desk.rows:
-        row.suspicion = score_suspicion(row.labels, row.found, desk.size_px)
+    scores = score_suspicion([(row.labels, row.found) for row in desk.rows], desk.size_px)
+    for row, suspicion in zip(desk.rows, scores.tolist(), strict=True):
+        row.suspicion = suspicion
     with atomic_file(out) as partial:
         partial.write_text(build_page(desk), encoding="utf-8")
     return len(desk.rows)

@@ -8,31 +8,11 @@ import pytest
 import dmrl
 from dmrl.cli import app
 from dmrl.errors import MissingTopic, SettingError
-from dmrl.viewer.label_suspicion import score_suspicion
 
 from .webdriver import MISSING, Browser, open_browser, wait_for
 
 browser_only = pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}")
 pytestmark = [pytest.mark.heavy, pytest.mark.timeout(600)]
-
-
-def at(u_px: float, v_px: float, confidence: float = 0.0, sigma: float = 0.0) -> dict[str, float]:
-    return {
-        "u_px": u_px,
-        "v_px": v_px,
-        "confidence": confidence,
-        "sigma_u_px": sigma,
-        "sigma_v_px": sigma,
-    }
-
-
-def test_suspicion_is_high_if_label_and_confident_detection_disagree() -> None:
-    right = score_suspicion([at(50, 50)], [at(52, 51, 0.9)])
-    moved = score_suspicion([at(50, 50)], [at(120, 51, 0.9)])
-    missing = score_suspicion([], [at(120, 51, 0.9)])
-    not_found = score_suspicion([at(50, 50)], [])
-    assert moved > missing > not_found > right
-    assert score_suspicion([at(50, 50, sigma=30)], [at(120, 51, 0.9)]) < moved
 
 
 @pytest.fixture(scope="module")
