@@ -203,8 +203,6 @@ def _try_model(base: Member, candidate: Candidate, others: Sequence[Values]) -> 
         Solutions with yaw rate biases that change, as further starts of that model.
     """
     solver = replace(base.solver, problem=candidate.apply(base.solver.problem))
-    if solver.carried is not None and not solver.carried.fits(solver.layout):
-        solver = replace(solver, carried=None)
     before, models = base.solver.layout, (*base.models, candidate)
     starts = [base.values, *(others if YAW_RATE_ERROR in candidate.model.rows else ())]
     values = [convert_values(start, before, solver.layout) for start in starts]

@@ -21,12 +21,12 @@ from dmrl.estimation.search.modes import (
 from dmrl.estimation.solver.covariance import compute_covariance
 from dmrl.estimation.solver.levenberg_marquardt import (
     ROUGH_TOLERANCE,
-    Carried,
     MapEstimate,
     Solver,
     is_same_solution,
 )
 from dmrl.estimation.solver.noise_selection import range_noise_ratio, select_noise
+from dmrl.estimation.solver.priors import Carried
 from dmrl.estimation.solver.problem import CameraView, NoiseModel, Problem
 from dmrl.estimation.solver.residuals import Values, bearing_factor
 
@@ -90,9 +90,9 @@ def solve_pair(
     """
     tracks = find_tracks(problem)
     problem, starts = _select_noise(problem, tracks, noise)
-    solver = Solver(problem, carried if carried and carried.fits(problem.layout) else None)
+    solver = Solver(problem, carried)
     if solver.carried is not None:
-        starts.append(dead_reckon(problem, solver.carried.mean))
+        starts.append(dead_reckon(problem, solver.carried.convert(problem.layout).mean))
     solver, found = _solve_modes(solver, starts, widen=noise is None)
     if plain or noise is not None:
         members = [Member(solver, mode, -mode.cost) for mode in found]

@@ -47,7 +47,7 @@ from dmrl.estimation.solver.estimate import (
     seen_from_peer,
 )
 from dmrl.estimation.solver.keyframes import build_problem, odometry_dropout, range_dropout
-from dmrl.estimation.solver.levenberg_marquardt import Carried
+from dmrl.estimation.solver.priors import Carried
 from dmrl.estimation.solver.problem import NoiseModel, Problem
 from dmrl.estimation.solver.residuals import Values, odometry_factor, range_factor
 from dmrl.estimation.solver.robust_loss import Gaussian

@@ -37,10 +37,10 @@ from dmrl.estimation.solver.keyframes import (
 from dmrl.estimation.solver.layout import Layout
 from dmrl.estimation.solver.levenberg_marquardt import (
     ROUGH_TOLERANCE,
-    Carried,
     Solver,
     relative_path,
 )
+from dmrl.estimation.solver.priors import Carried
 from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import Values
 
@@ -162,7 +162,7 @@ def _solve_windows(
         start = Values(start.state, np.zeros(len(kept.layout.constants)))
         if kept.layout.width != problem.layout.width:
             start = Values(_initial_state(kept, names, estimates), start.constants)
-        solver = Solver(kept, carried if carried and carried.fits(kept.layout) else None)
+        solver = Solver(kept, carried)
         values = solver.solve(start, tolerance=ROUGH_TOLERANCE).values
         first = next(iter(pairs.values()))
         times = output_times(first.time_s[0], window.from_s, window.until_s)

@@ -15,8 +15,8 @@ from dmrl.estimation.model.odometry import rotation_matrix
 from dmrl.estimation.solver.block_tridiagonal import eliminate_before
 from dmrl.estimation.solver.equations import build_equations
 from dmrl.estimation.solver.keyframes import select_measurements
-from dmrl.estimation.solver.levenberg_marquardt import Carried, Solver
-from dmrl.estimation.solver.priors import ConstantPrior
+from dmrl.estimation.solver.levenberg_marquardt import Solver
+from dmrl.estimation.solver.priors import Carried, ConstantPrior
 from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import Rows, Values
 
@@ -84,8 +84,8 @@ def carry_information(solver: Solver, values: Values, time_s: float) -> Carried:
     for robot in range(robots):
         mean[3 * robot : 3 * robot + 2] = back @ (mean[3 * robot : 3 * robot + 2] - here[:2])
         mean[3 * robot + 2] -= here[2]
-    information = CARRIED_SHARE * turn @ information @ turn.T
-    return Carried(mean, (information + information.T) / 2, CARRIED_SHARE * turn @ vector)
+    information = turn @ (information + information.T) @ turn.T / 2
+    return Carried(cut.layout, mean, CARRIED_SHARE * information, CARRIED_SHARE * turn @ vector)
 
 
 def _without_last(rows: Rows) -> Rows:

@@ -1,9 +1,11 @@
 """Equations of a problem: the rows of all factors, assembled into one bordered system."""
 
+from collections.abc import Collection
+
 import numpy as np
 
 from dmrl.estimation.solver.block_tridiagonal import NormalEquations
-from dmrl.estimation.solver.layout import Layout
+from dmrl.estimation.solver.layout import Layout, Subject
 from dmrl.estimation.solver.priors import ANCHOR_INFORMATION, WEAK_INFORMATION, Chain, ConstantPrior
 from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import (
@@ -16,7 +18,7 @@ from dmrl.estimation.solver.residuals import (
 
 
 def linearize(
-    problem: Problem, layout: Layout, values: Values, *, begins: bool = True
+    problem: Problem, layout: Layout, values: Values, *, known: Collection[Subject] = ()
 ) -> list[Factor]:
     """Linearize all factors of a flight at the values of its unknowns.
 
@@ -26,8 +28,8 @@ def linearize(
         The flight, and the columns of its unknowns.
     values
         Values of all unknowns.
-    begins
-        Whether walks and jumps begin here. Else carried information knows their first values.
+    known
+        Walks and jumps that began earlier: carried information knows their first values.
     """
     out: list[Factor] = [
         odometry_factor(problem, layout, robot, values) for robot in range(layout.robots)
@@ -35,11 +37,11 @@ def linearize(
     out += [range_factor(problem, layout, link, values) for link in problem.links]
     out += [bearing_factor(problem, layout, view, values) for view in problem.views]
     steps_s = problem.robots[0].steps_s
-    for k, (_, row) in enumerate(layout.states):
+    for k, (subject, row) in enumerate(layout.states):
         kept, std = row.step_model(steps_s)
         grade = problem.noise.grade if row.graded else 1.0
         start = (row.std if row.evolution == "fading" else row.start_std) * grade
-        start = start if begins or row.evolution == "fading" else np.inf
+        start = np.inf if subject in known and row.evolution != "fading" else start
         column = 3 * layout.robots + k
         value = values.state[:, column]
         out.append(Chain(row, column, value, kept, std * grade, start))

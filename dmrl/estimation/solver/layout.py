@@ -2,15 +2,11 @@
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from dmrl.estimation.model.pair import Array
-
-if TYPE_CHECKING:
-    pass
-
 from dmrl.estimation.solver.unknowns import SIGHTED, Owner, Unknown
 
 Subject = tuple[str, tuple[int, ...]]
@@ -37,6 +33,12 @@ class Layout:
     def width(self) -> int:
         """Number of columns of a keyframe."""
         return 3 * self.robots + len(self.states)
+
+    def subjects(self) -> dict[Subject, int]:
+        """Return the columns of all unknowns; constants follow the keyframe's."""
+        poses = [("pose", (robot, k)) for robot in range(self.robots) for k in range(3)]
+        others = [subject for subject, _ in (*self.states, *self.constants)]
+        return {subject: column for column, subject in enumerate([*poses, *others])}
 
     def pose(self, robot: int) -> list[int]:
         """Return the columns of a robot's pose."""

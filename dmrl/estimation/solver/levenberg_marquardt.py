@@ -10,7 +10,7 @@ from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.block_tridiagonal import NormalEquations, solve_step
 from dmrl.estimation.solver.equations import build_equations, linearize, total_cost
 from dmrl.estimation.solver.layout import Layout
-from dmrl.estimation.solver.priors import CarriedPrior, Chain, ConstantPrior
+from dmrl.estimation.solver.priors import Carried, Chain, ConstantPrior
 from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import Factor, Values, motion_gain, odometry_variance
 
@@ -22,25 +22,6 @@ compared."""
 SAME_SOLUTION_M = 0.05
 """Largest distance between two relative paths that are the same solution, metres: half the standard
 deviation of a range."""
-
-
-@dataclass(frozen=True, slots=True)
-class Carried:
-    """Information about the first keyframe and the constants from before the flight begins.
-
-    Parameters
-    ----------
-    mean, information, vector
-        As in `CarriedPrior`.
-    """
-
-    mean: Array
-    information: Array
-    vector: Array
-
-    def fits(self, layout: Layout) -> bool:
-        """Return whether the information has the columns of a layout."""
-        return len(self.mean) == layout.width + len(layout.constants)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,13 +62,12 @@ class Solver:
 
     def linearize(self, values: Values, layout: Layout | None = None) -> list[Factor]:
         """Linearize all factors at the values of the unknowns."""
-        carried = self.carried is not None
-        out = linearize(self.problem, layout or self.layout, values, begins=not carried)
-        if self.carried is not None:
-            here = np.concatenate([values.state[0], values.constants])
-            known = self.carried
-            loss = self.problem.noise.motion_loss
-            out.append(CarriedPrior(known.mean, known.information, known.vector, here, loss))
+        layout, carried = layout or self.layout, self.carried
+        if carried is None:
+            return linearize(self.problem, layout, values)
+        out = linearize(self.problem, layout, values, known=dict(carried.layout.states))
+        here = np.concatenate([values.state[0], values.constants])
+        out.append(carried.convert(layout).to_factor(here, self.problem.noise.motion_loss))
         return out
 
     def equations(self, values: Values) -> tuple[NormalEquations, list[Factor]]:
@@ -173,7 +153,9 @@ class Solver:
         pull = 0.0
         for factor in factors:
             if isinstance(factor, Chain):
-                normalizer += float(np.log(factor.std).sum() + np.log(factor.start_std))
+                normalizer += float(np.log(factor.std).sum())
+                if np.isfinite(factor.start_std):
+                    normalizer += float(np.log(factor.start_std))
                 # The pull to zero is not a normalized density, so it is no evidence.
                 square = (factor.value / factor.row.pull_std) ** 2
                 pull += factor.row.pull_weight * float(np.log1p(square).sum()) / 2

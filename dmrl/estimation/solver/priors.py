@@ -6,6 +6,7 @@ import numpy as np
 
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.block_tridiagonal import NormalEquations
+from dmrl.estimation.solver.layout import Layout
 from dmrl.estimation.solver.robust_loss import Loss
 from dmrl.estimation.solver.unknowns import Unknown
 
@@ -106,6 +107,52 @@ class ConstantPrior:
         constrains a constant that is as far out as the prior is wide.
         """
         return np.asarray(self._each("curvature") / self.std**2)
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """Information about the first keyframe and the constants from before the flight begins.
+
+    Parameters
+    ----------
+    layout
+        Columns of the unknowns.
+    mean, information, vector
+        As in `CarriedPrior`.
+    """
+
+    layout: Layout
+    mean: Array
+    information: Array
+    vector: Array
+
+    def convert(self, layout: Layout) -> "Carried":
+        """Return the information about the unknowns of another layout.
+
+        Nothing is known of those that only it has. Those that it lacks are eliminated, so that
+        error models with other unknowns are compared under the same information.
+        """
+        if layout == self.layout:
+            return self
+        mine, wanted = self.layout.subjects(), layout.subjects()
+        kept = [mine[subject] for subject in wanted if subject in mine]
+        gone = [at for subject, at in mine.items() if subject not in wanted]
+        between = self.information[np.ix_(kept, gone)]
+        share = between @ np.linalg.pinv(self.information[np.ix_(gone, gone)], hermitian=True)
+        at = [column for subject, column in wanted.items() if subject in mine]
+        mean, vector = np.zeros(len(wanted)), np.zeros(len(wanted))
+        information = np.zeros((len(wanted), len(wanted)))
+        mean[at], vector[at] = self.mean[kept], self.vector[kept] - share @ self.vector[gone]
+        information[np.ix_(at, at)] = self.information[np.ix_(kept, kept)] - share @ between.T
+        return Carried(layout, mean, information, vector)
+
+    def to_factor(self, value: Array, loss: Loss) -> "CarriedPrior":
+        """Return the factor at (n + G,) values. A heading may differ by whole turns."""
+        heading, full_turn = np.arange(2, 3 * self.layout.robots, 3), 2 * np.pi
+        value = value.copy()
+        apart = value[heading] - self.mean[heading]
+        value[heading] -= full_turn * np.round(apart / full_turn)
+        return CarriedPrior(self.mean, self.information, self.vector, value, loss)
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,7 +44,7 @@ def test_carried_prior_equals_information_of_earlier_keyframes() -> None:
     assert len(late.problem.links[0].range_m) == (solver.problem.links[0].keyframe <= at).sum()
     size = layout.width + len(layout.constants)
     assert carried.information.shape == (size, size)
-    assert carried.fits(layout)
+    assert carried.convert(layout) == carried
     assert np.linalg.eigvalsh(carried.information).min() > -1e-6
     # Information about the relative position is there, about the absolute one is not.
     absolute = np.zeros(size)
@@ -74,6 +74,7 @@ def test_windowed_solve_is_as_accurate_as_whole_flight(monkeypatch: pytest.Monke
     assert rms[1] < 1.5 * rms[0] + 0.02
     assert np.abs(np.diff(parts[0].state[:, :2], axis=0)).max() < 0.3
     assert (parts[0].status == OK).mean() > 0.6
+    assert [cause for cause in parts[0].causes if cause.probability >= 0.5] == []
 
 
 @pytest.mark.heavy

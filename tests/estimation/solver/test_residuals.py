@@ -11,8 +11,8 @@ from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array, BearingMeasurements, Pair, SensorTrack
 from dmrl.estimation.solver.equations import linearize, total_cost
 from dmrl.estimation.solver.keyframes import build_problem
-from dmrl.estimation.solver.levenberg_marquardt import Carried, Solver
-from dmrl.estimation.solver.priors import CarriedPrior, Chain, ConstantPrior
+from dmrl.estimation.solver.levenberg_marquardt import Solver
+from dmrl.estimation.solver.priors import Chain, ConstantPrior
 from dmrl.estimation.solver.problem import NoiseModel, Problem
 from dmrl.estimation.solver.residuals import (
     Rows,
@@ -283,8 +283,8 @@ def test_chain_factor_is_a_random_walk_with_start_prior() -> None:
     assert chain.cost() == pytest.approx(loss / 2)
     problem, values = flight()
     begun, carried = (
-        [f for f in linearize(problem, problem.layout, values, begins=b) if isinstance(f, Chain)]
-        for b in (True, False)
+        [f for f in linearize(problem, problem.layout, values, known=k) if isinstance(f, Chain)]
+        for k in ((), dict(problem.layout.states))
     )
     for one, other in zip(begun, carried, strict=True):
         if one.row.evolution == "jump":
@@ -298,18 +298,6 @@ def test_priors_hold_constants_with_their_losses() -> None:
     assert prior.cost() == pytest.approx((4 * np.log(2.0) + 9) / 2)
     assert prior.information() == pytest.approx([50.0, 100.0])
     assert prior.curvature() == pytest.approx([0.0, 100.0])
-
-
-def test_carried_information_is_least_at_its_optimum() -> None:
-    information, best = np.diag([4.0, 1.0, 2.0]), np.array([0.5, -1.0, 2.0])
-    mean = np.array([1.0, 0.0, 0.0])
-    carried = Carried(mean, information, information @ (mean - best))
-    values = [np.array([0.5, -1.0, 2.0]), np.array([0.7, -1.0, 2.0])]
-    costs = [
-        CarriedPrior(carried.mean, carried.information, carried.vector, v, Gaussian()).cost()
-        for v in values
-    ]
-    assert costs == pytest.approx([0.0, 4 * 0.04 / 2])
 
 
 def test_odometry_noise_follows_model_and_dropouts() -> None:

@@ -1,0 +1,69 @@
+"""Information that a window takes from the one before it, under any error model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, Solver
+from dmrl.estimation.solver.priors import Carried
+from dmrl.estimation.solver.robust_loss import Gaussian
+from dmrl.estimation.solver.unknowns import Unknown, turn
+
+from .test_residuals import flight
+
+
+def carry(solver: Solver) -> Carried:
+    """Return definite information about a solver's unknowns."""
+    layout = solver.layout
+    size = layout.width + len(layout.constants)
+    roots = np.random.default_rng(3).normal(size=(size, size))
+    return Carried(layout, np.linspace(-1, 1, size), roots @ roots.T, roots[0])
+
+
+def test_carried_information_is_least_at_its_optimum() -> None:
+    carried = carry(Solver(flight()[0]))
+    best = carried.mean - np.linalg.solve(carried.information, carried.vector)
+    off = best.copy()
+    off[-1] += 0.2
+    costs = [carried.to_factor(value, Gaussian()).cost() for value in (best, off)]
+    expected = carried.information[-1, -1] * 0.04 / 2
+    assert costs == pytest.approx([0.0, expected], rel=1e-6, abs=1e-6)
+
+
+def test_carried_heading_may_differ_by_whole_turns() -> None:
+    carried = carry(Solver(flight()[0]))
+    turned = carried.mean.copy()
+    turned[[2, 5]] += 2 * np.pi * np.array([1, -4])
+    costs = [carried.to_factor(value, Gaussian()).cost() for value in (carried.mean, turned)]
+    assert costs[1] == pytest.approx(costs[0])
+
+
+def test_carried_information_is_of_the_unknowns_that_both_layouts_have() -> None:
+    """Those that one lacks are marginalized; nothing is known of those that it alone has."""
+    problem, _ = flight()
+    carried = carry(Solver(problem))
+    free = Unknown("scale_free", "1", 0.1, "robot", motion=turn)
+    more = replace(problem, table=(*problem.table, free)).layout
+    fewer = replace(problem, table=problem.table[:-1]).layout
+    wide = carried.convert(more)
+    new = [column for subject, column in more.subjects().items() if subject[0] == "scale_free"]
+    assert not wide.information[new].any() and not wide.vector[new].any()
+    small, mine = carried.convert(fewer), carried.layout.subjects()
+    kept = [mine[subject] for subject in fewer.subjects()]
+    assert len(kept) < len(mine)
+    marginal = np.linalg.inv(carried.information)[np.ix_(kept, kept)]
+    assert np.linalg.inv(small.information) == pytest.approx(marginal)
+    best = [one.mean - np.linalg.solve(one.information, one.vector) for one in (carried, small)]
+    assert best[1] == pytest.approx(best[0][kept])
+    back = wide.convert(carried.layout)
+    assert back.information == pytest.approx(carried.information)
+
+
+def test_evidence_is_finite_after_an_earlier_window() -> None:
+    """The first values of walks are then known: their broad prior is no part of the evidence."""
+    problem, values = flight()
+    solver = Solver(problem)
+    found = MapEstimate(values, 0.0)
+    later = replace(solver, carried=carry(solver))
+    assert np.isfinite([solver.log_evidence(found), later.log_evidence(found)]).all()
