@@ -67,9 +67,13 @@ class PairCause:
     to_s: float
     robot: str | None
 
+    @property
+    def title(self) -> str:
+        """Name of the cause, and whose sensor it is."""
+        return f"{self.robot}'s {self.name}" if self.robot else self.name
+
     def __str__(self) -> str:
         """Return the cause in a line, with what to do about it."""
-        owner = f"{self.robot}'s " if self.robot else ""
         if self.name.endswith(MISFIT):
             remedy = MISFIT_REMEDY
         elif FITS.search(self.name):
@@ -77,7 +81,7 @@ class PairCause:
         else:
             remedy = REMEDIES[max(filter(self.name.startswith, REMEDIES), key=len)]
         return (
-            f"{owner}{self.name} ({self.probability:.0%}, {self.from_s:.0f} to {self.to_s:.0f} s). "
+            f"{self.title} ({self.probability:.0%}, {self.from_s:.0f} to {self.to_s:.0f} s). "
             f"{remedy}"
         )
 
@@ -138,7 +142,10 @@ class PairReport:
         """Return the texts under the headers; a dash for an unknown value."""
         values = [(getattr(self, name), form) for name, _, form in COLUMNS]
         cells = ("-" if value is None else format(value, form) for value, form in values)
-        return (*cells, "; ".join(cause.name for cause in self.causes))
+        return (
+            *cells,
+            "; ".join(cause.title for cause in self.causes if cause.probability >= SURE),
+        )
 
 
 def report_pair(

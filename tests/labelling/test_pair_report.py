@@ -86,6 +86,7 @@ def test_probable_causes_name_the_robot_and_a_remedy(tmp_path: Path) -> None:
         ("yaw rate bias", "cf2"),
         ("range offset", None),
     ]
+    assert got.row()[-1] == "cf2's yaw rate bias"
     (line,) = explain_causes([got, got])
     assert line.startswith("cf1-cf2: cf2's yaw rate bias (90%, 1 to 2 s). Let its gyroscope settle")
 
