@@ -136,6 +136,7 @@ def document(recording: Path, judged: list[PairFlight], settle_s: float) -> dict
     }
 
 
+BAND_UNITS = {"distance_m": "m", "turn_radps": "rad/s"}
 # Name of a figure, its words in the table, and its format.
 COLUMNS = (
     ("held_s", "held, s", ".1f"),
@@ -155,17 +156,18 @@ def note(made: Mapping[str, Any]) -> str:
     """Describe the columns of the table, and list recall by distance and turn rate."""
     lines = [
         "held: until the peer is lost; recall, false: at the detector's threshold; silences: in "
-        "view, not detected; loop: time in view between silences that end closed loops"
+        "view, not detected; loop: time in view between silences that can end a closed loop"
     ]
     for one in made["flights"]:
         parts = [
-            f"{band['by']} from {band['from']:g}: {band['recall']:.0%} of {band['in_view']:.0f}"
+            f"from {band['from']:g} {BAND_UNITS[band['by']]}: {band['recall']:.0%} of "
+            f"{band['in_view']:.0f}"
             for band in one["bands"]
             if band["recall"] is not None
         ]
         if parts:
-            lines.append(f"{one['robot']}, {one['peer']}: recall by {'; '.join(parts)}")
-    return "\n".join(lines)
+            lines.append(f"{one['robot']}, {one['peer']}: recall {', '.join(parts)}")
+    return ".\n".join(lines)
 
 
 def rows(made: Mapping[str, Any]) -> list[list[str]]:

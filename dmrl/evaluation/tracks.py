@@ -231,7 +231,8 @@ def note(made: Mapping[str, Any]) -> str:
     return (
         "3D errors of the peers in view; of images: errors of the detections in single images; "
         f"followed, detected: share of peers with a track, a detection within {MAX_MATCH_M:g} m; "
-        f"false: tracks near no peer; all but false from {made['settle_s']:g} s on"
+        "false: tracks near no peer. Before "
+        f"{made['settle_s']:g} s, while tracks settle, only false counts"
     )
 
 

@@ -49,8 +49,9 @@ class Text:
     code: str = ""
 
 
-NUMBER = re.compile(r"[-+]?\d[\d.,]*%?(?=\s|$)")
-"""Start of a cell with a number, such as ``0.71 (0.6, 0.9)``; a name such as 2026-11/a is none."""
+NUMBER = re.compile(r"(< )?[-+]?\d[\d.,]*%?(?=\s|$)")
+"""Start of a cell with a number, such as ``0.71 (0.6, 0.9)`` or ``< -1``; a name such as 2026-11/a
+is none."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ Slot = Hashable
 """A box, by its words, or a lane: the box that an arrow comes from, and the column it crosses."""
 Route = list[tuple[int, Slot]]
 """Columns and slots of an arrow."""
-BOX_PX, GAP_PX, ROW_PX, MARGIN_PX = (156, 28), 64, 40, 40
+BOX_PX, GAP_PX, ROW_PX, MARGIN_PX = (156, 28), 40, 40, 24
 """Width and height of a box, width between columns, height of a row, space around all."""
 SWEEPS = 4
 """Passes over the columns that bring arrows closer to straight lines."""

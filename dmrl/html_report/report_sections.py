@@ -31,7 +31,7 @@ from dmrl.html_report.blocks import (
 )
 from dmrl.html_report.catalogue_tables import build_catalogue_section
 from dmrl.html_report.collect import ReportInputs
-from dmrl.html_report.lineage import draw_lineage
+from dmrl.html_report.provenance_section import build_provenance_section
 from dmrl.html_report.recipe_figures import build_recipe_figures
 from dmrl.plots import charts
 from dmrl.topics import list_robots
@@ -56,10 +56,6 @@ EVALUATION_IMAGES = {
     "error-violins.png": "errors",
     "error-by-distance.png": "errors by distance",
 }
-OMITTED_VALUES: tuple[Any, ...] = (None, False, "", [], {})
-"""Values of settings that are omitted from a command line."""
-MAX_VALUE_CHARACTERS = 60
-"""Characters of a setting's value in a command line, at most."""
 
 
 def build_report(found: ReportInputs) -> str:
@@ -81,7 +77,7 @@ def build_report(found: ReportInputs) -> str:
         ("Images", build_row(pictures.embed(p, p.name) for p in found.pictures[:MAX_SHOWN])),
         ("Catalogue", build_catalogue_section(found.catalogues)),
         ("Recordings", _recordings_section(found)),
-        ("Provenance", _provenance_section(found)),
+        ("Provenance", build_provenance_section(found)),
         ("Unreadable files", _table(("file", "why"), list(found.unread.items()))),
     ]
     return build_page(found.folder.resolve().name, _summarize(found), bodies)
@@ -312,23 +308,3 @@ def _recordings_section(found: ReportInputs) -> list[Block]:
         lasts = f"{(held.end_ns - held.start_ns) / 1e9:.1f}"
         rows.append((name, f"{size:.1f}", lasts, len(held.topics), held.count, who, made))
     return _table(("recording", "MB", "s", "topics", "messages", "cameras", "made by"), rows)
-
-
-def _provenance_section(found: ReportInputs) -> list[Block]:
-    svg = draw_lineage(found.made)
-    libraries: dict[str, set[str]] = {}
-    for made in found.made.values():
-        for package, version in {"dmrl": made.dmrl_version, **made.libraries}.items():
-            libraries.setdefault(package, set()).add(str(version))
-    versions = [(package, ", ".join(sorted(known))) for package, known in sorted(libraries.items())]
-    rows = [(name, _format_command(made.stage, made.settings)) for name, made in found.made.items()]
-    drawn = Figure("stages, from sources to results", svg=svg, full=True) if svg else None
-    made_by = _table(("output", "made by"), rows)
-    return build_row([drawn]) + made_by + _table(("package", "version"), versions)
-
-
-def _format_command(stage: str, settings: Mapping[str, Any]) -> str:
-    known = {key: str(value) for key, value in settings.items() if value not in OMITTED_VALUES}
-    most = MAX_VALUE_CHARACTERS
-    words = (f"{k}={v if len(v) <= most else v[: most - 3] + '...'}" for k, v in known.items())
-    return f"dmrl {stage} {' '.join(words)}"

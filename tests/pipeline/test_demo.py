@@ -57,3 +57,13 @@ def test_the_demo_finds_and_tracks_the_drone_of_the_flight(tmp_path: Path) -> No
     tracked = json.loads((tmp_path / "out/flight_errors/tracks.json").read_text())
     observer = next(one for one in tracked["robots"] if one["robot"] == "cf1")
     assert observer["rmse_m"] < 0.12 < observer["single_rmse_m"]
+
+
+@pytest.mark.heavy
+def test_the_demo_follows_the_other_drone_to_the_end(tmp_path: Path) -> None:
+    *_, flight = recipe.read_text("demo").partition("[[step]]   # one drone follows")
+    (tmp_path / "follow.toml").write_text(f'kind = "pipeline"\n[[step]]#{flight}', "utf-8")
+    recipe_run.run(tmp_path / "follow.toml", tmp_path / "out", workers=1)
+    (flown,) = json.loads((tmp_path / "out/follow_figures/flight.json").read_text())["flights"]
+    assert flown["held_to_end"]
+    assert flown["recall"] > 0.5
