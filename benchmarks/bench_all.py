@@ -25,7 +25,7 @@ WORK: Mapping[str, tuple[str, ...]] = {
     "recording": ("bench_recording.py", "--json"),
     "predict": ("bench_predict.py", "--json"),
     "commands": ("bench_commands.py", "--json"),
-    "memory": ("bench_memory.py", "--json"),
+    "growth": ("bench_growth.py", "--json"),
     "training": ("bench_training.py",),
     "render": ("bench_render.py", "speed", "--images", "100", "--rounds", "2", "--json"),
     "dataset": ("bench_dataset.py",),
