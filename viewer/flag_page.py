@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.atomic_output import atomic_file
+from dmrl.colours import RGB
 from dmrl.datasets import layout
 from dmrl.datasets.writing.exclusions import REQUIRED_COLUMNS
 from dmrl.errors import DmrlError, SettingError, to_one_line
@@ -131,6 +132,7 @@ def build_page(desk: Desk) -> str:
         "size": desk.size_px,
         "threshold": desk.threshold,
         "near_px": NEAR_PX,
+        "colours": {name: f"rgb{rgb}" for name, rgb in RGB.items()},
         "ok": STATUS_OK,
         "statuses": STATUSES,
         "peers": sorted({label["peer"] for row in desk.rows for label in row.labels}),

@@ -7,6 +7,7 @@ import pytest
 
 import dmrl
 from dmrl.cli import app
+from dmrl.colours import RGB
 from dmrl.errors import MissingTopic, SettingError
 
 from .webdriver import MISSING, Browser, open_browser, wait_for
@@ -52,6 +53,15 @@ def test_edits_on_the_label_desk_reach_the_dataset(
         browser.open(page)
         assert browser.run("return document.documentElement.scrollWidth <= innerWidth;")
         assert browser.run("return shown.length;") == 24
+        # Marks have the colours of all other pictures, and a legend.
+        marks = "label: truth", "label: hand", "detection of 0.52 or more", "less sure"
+        legend = browser.run("return byId('legend').textContent;")
+        assert [part.strip() for part in legend.split("\u00a0") if part.strip()] == list(marks)
+        for mark, name in ((".label", "truth"), (".found", "detection")):
+            colour = browser.run(
+                f"return document.querySelector('#rows {mark}').getAttribute('stroke');"
+            )
+            assert colour == f"rgb{RGB[name]}"
         # The page of a dataset is by error; rows are told by their time.
         times = browser.run("return rows.map(row => row.time_ns);")
         row = next(k for k, t in enumerate(times) if len(truth_of(truth, t)) >= 1)

@@ -15,19 +15,18 @@ const confidenceOf = row => Math.max(0, ...row.found.map(f => f.confidence));
 let shown = [], current = null, chosen = 0;
 const UNIT = WIDE / 320; // marks keep their size on large pictures
 
-// The picture of a row with its labels (solid) and detections (dashed).
+// Marks: a solid circle for a label, in the colour of its source, a dashed square for a detection.
+const drawLabel = (l, kind, k) => svgTag('circle', {class: `label${kind}`, stroke: DATA.colours[l.source] ?? DATA.colours.other,
+  cx: l.u_px, cy: l.v_px, r: 14 * UNIT, 'data-label': k});
+const drawFound = f => svgTag('rect', {class: `found${f.confidence < DATA.threshold ? ' weak' : ''}`, stroke: DATA.colours.detection,
+  x: f.u_px - 10 * UNIT, y: f.v_px - 10 * UNIT, width: 20 * UNIT, height: 20 * UNIT});
+
+// The picture of a row with its labels and detections.
 function draw(row, large) {
   const svg = svgTag('svg', {viewBox: `0 0 ${WIDE} ${HIGH}`});
   svg.append(svgTag('image', {width: WIDE, height: HIGH, href: row.image}));
-  for (const f of row.found) {
-    if (f.confidence < 0.05) continue;
-    const weak = f.confidence < DATA.threshold ? ' weak' : '';
-    svg.append(svgTag('rect', {class: 'found' + weak, x: f.u_px - 10 * UNIT, y: f.v_px - 10 * UNIT, width: 20 * UNIT, height: 20 * UNIT}));
-  }
-  row.labels.forEach((l, k) => {
-    const kind = `label${l.source === 'hand' ? ' hand' : ''}${large && k === chosen ? ' chosen' : ''}`;
-    svg.append(svgTag('circle', {class: kind, cx: l.u_px, cy: l.v_px, r: 14 * UNIT, 'data-label': k}));
-  });
+  for (const f of row.found) if (f.confidence >= 0.05) svg.append(drawFound(f));
+  row.labels.forEach((l, k) => svg.append(drawLabel(l, large && k === chosen ? ' chosen' : '', k)));
   return svg;
 }
 
@@ -243,6 +242,15 @@ function revive(row) { for (const label of row.labels) if (label.sigma_depth_m =
 rows.forEach(row => revive(row));
 for (const status of new Set(rows.flatMap(row => row.labels.map(l => DATA.statuses[l.status]))))
   byId('status').append(Object.assign(document.createElement('option'), {textContent: status}));
+const LEGEND = [...new Set([...rows.flatMap(row => row.labels.map(l => l.source)), 'hand'])].map(source =>
+  [drawLabel({source, u_px: 0, v_px: 0}, ''), `label: ${source}`]);
+if (rows.some(row => row.found.length)) LEGEND.push([drawFound({u_px: 0, v_px: 0, confidence: 1}), `detection of ${DATA.threshold.toPrecision(2)} or more`],
+  [drawFound({u_px: 0, v_px: 0, confidence: 0}), 'less sure']);
+for (const [mark, words] of LEGEND) {
+  const picture = svgTag('svg', {viewBox: [-18, -18, 36, 36].map(px => px * UNIT).join(' ')});
+  picture.append(mark);
+  byId('legend').append(picture, ` ${words}\u00a0 `);
+}
 byId('filters').addEventListener('input', list);
 if (!rows.some(row => row.found.length)) byId('order').value = 'time';
 list();
