@@ -106,7 +106,7 @@ def fit_exponent(times: Sequence[int], cpu_s: Sequence[float]) -> float | None:
 
 def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Draw CPU time and peak memory over the size of the recording."""
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # noqa: PLC0415 - only for the picture
 
     figure = Figure(figsize=(11, 4.8), layout="constrained", dpi=110)
     left, right = figure.subplots(1, 2)
