@@ -2,15 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 from pathlib import PurePosixPath
-from typing import Any
 
 from dmrl.html_report.blocks import Block, Figure, Table, build_row
 from dmrl.html_report.collect import ReportInputs
 from dmrl.html_report.lineage import draw_lineage
 from dmrl.recording import Input, Provenance
 
-OMITTED_VALUES: tuple[Any, ...] = (None, False, "", [], {})
-"""Values of settings that are omitted from a command line."""
 MAX_VALUE_CHARACTERS = 60
 """Characters of a setting's value in a command line, at most."""
 JUDGED_KINDS = ("evaluations", "positions", "tracks", "flights")
@@ -25,7 +22,7 @@ def build_provenance_section(found: ReportInputs) -> list[Block]:
         for package, version in {"dmrl": made.dmrl_version, **made.libraries}.items():
             libraries.setdefault(package, set()).add(str(version))
     versions = [(package, ", ".join(sorted(known))) for package, known in sorted(libraries.items())]
-    rows = [(name, _format_command(made.stage, made.settings)) for name, made in found.made.items()]
+    rows = [(name, _format_command(made)) for name, made in found.made.items()]
     tables = [Table(("output", "made by"), rows), Table(("package", "version"), versions)]
     drawn = Figure("stages, from sources to results", svg=svg, full=True) if svg else None
     return build_row([drawn]) + [table for table in tables if table.rows]
@@ -50,17 +47,10 @@ def _iter_evaluations(found: ReportInputs) -> Iterator[tuple[str, Provenance]]:
             )
 
 
-def _format_command(stage: str, settings: Mapping[str, Any]) -> str:
-    words = " ".join(_iter_words(settings))
-    return f"dmrl {stage} {words}"
-
-
-def _iter_words(settings: Mapping[str, Any], table: str = "") -> Iterator[str]:
-    """Yield settings as in a recipe: a key of a table follows its name and a dot."""
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _iter_words(value, f"{table}{key}.")
-        elif value not in OMITTED_VALUES:
-            text = str(value)
-            most = MAX_VALUE_CHARACTERS
-            yield f"{table}{key}={text if len(text) <= most else text[: most - 3] + '...'}"
+def _format_command(made: Provenance) -> str:
+    most = MAX_VALUE_CHARACTERS
+    words = (
+        f"{name}={text if len(text) <= most else text[: most - 3] + '...'}"
+        for name, text in made.list_settings()
+    )
+    return " ".join(["dmrl", made.stage, *words])

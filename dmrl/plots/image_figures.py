@@ -142,6 +142,7 @@ def plot_gallery(shown: Sequence[GalleryImage], stem: Path, *, columns: int = 3)
     columns = min(columns, len(shown))
     rows = -(-len(shown) // columns)
     with open_figure(stem, (CELL_INCHES[0] * columns, CELL_INCHES[1] * rows)) as figure:
+        figure.supxlabel("circles: detections over the threshold, with their depths", fontsize=8)
         places = figure.subplots(rows, columns, squeeze=False).ravel()
         for axes in places:
             axes.axis("off")

@@ -97,8 +97,14 @@ def _iter_attached(found: Summary) -> Iterator[str]:
         yield f"attachment: {one.name}, {one.media_type or 'no type'}, {format_size(len(one.data))}"
     for name, records in found.metadata.items():
         for values in records if name != METADATA_NAME else ():
-            shown = ", ".join(f"{key}={value}" for key, value in values.items())
+            shown = ", ".join(f"{key}{_show_value(value)}" for key, value in values.items())
             yield truncate_middle(f"metadata: {name}: {shown}")
+
+
+def _show_value(value: str) -> str:
+    """Return a value of one line; of a text such as a camera file, the number of its lines."""
+    lines = value.strip().splitlines()
+    return f"={value}" if len(lines) < 2 else f" ({count_things(len(lines), 'line')})"
 
 
 def topic_rows(path: Path, found: Summary) -> list[tuple[str, str, str, int, float | None]]:
@@ -135,9 +141,7 @@ def ancestry_lines(made: Provenance | None) -> list[str]:
 
 
 def _origin(made: Provenance) -> str:
-    settings = "".join(
-        f" {key}={value}" for key, value in made.settings.items() if value is not None
-    )
+    settings = "".join(f" {name}={text}" for name, text in made.list_settings())
     seed = f" seed={made.seed}" if made.seed is not None and "seed" not in made.settings else ""
     libraries = "".join(f" {name} {version}" for name, version in made.libraries.items())
     return f"dmrl {made.dmrl_version} {made.stage}{settings}{seed}{libraries}"

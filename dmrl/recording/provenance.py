@@ -72,6 +72,10 @@ class Provenance:
     dmrl_version: str = __version__
     left_out: Mapping[str, int] = field(default_factory=dict)
 
+    def list_settings(self) -> list[tuple[str, str]]:
+        """Return names and texts of the settings that are set; those of a table as "table.name"."""
+        return list(_iter_settings(self.settings))
+
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries, lists and values, with each input's provenance nested once."""
         return asdict(self._remove_repeats(), dict_factory=_drop_empty_count)
@@ -154,6 +158,14 @@ class Provenance:
         """Write ``provenance.json`` into a dataset or run folder."""
         text = json.dumps(self.to_json(), indent=1, sort_keys=True)
         (folder / FILE_NAME).write_text(text + "\n", encoding="utf-8")
+
+
+def _iter_settings(settings: Mapping[str, Any], table: str = "") -> Iterator[tuple[str, str]]:
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _iter_settings(value, f"{table}{name}.")
+        elif value is not None and value is not False and value not in ("", [], ()):
+            yield f"{table}{name}", str(value)
 
 
 def _drop_empty_count(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from dmrl.recording import Input, Provenance
 
 def report(document: Mapping[str, Any], *names: str) -> tuple[str, list[Any]]:
     """Return the graph, and what made the outputs."""
-    settings = {"views": 1, "lens": None, "vision": {"delay_images": 1, "lost": [0, 1], "no": {}}}
+    settings = {"views": 1, "lens": None, "vision": {"lost_share": 0.0, "lost": [0, 1], "no": {}}}
     made = Provenance("predict", settings, inputs=(Input("flight.mcap", "1"),))
     found = ReportInputs(
         Path("demo"),
@@ -47,5 +47,5 @@ def test_documents_of_another_form_do_no_harm(document: dict[str, Any]) -> None:
 
 def test_settings_in_tables_are_written_as_in_a_recipe() -> None:
     _, rows = report({}, "seen.mcap")
-    said = "dmrl predict views=1 vision.delay_images=1 vision.lost=[0, 1]"
+    said = "dmrl predict views=1 vision.lost_share=0.0 vision.lost=[0, 1]"
     assert rows == [("seen.mcap", said)]

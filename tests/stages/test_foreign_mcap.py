@@ -17,7 +17,7 @@ from dmrl.stages import check, info
 from dmrl.terminal.left_out import count_left_out
 from dmrl.terminal.tables import format_size
 
-SITE = {"name": "lab", "floor": "3"}
+SITE = {"name": "lab", "floor": "3", "camera": "fx = 1\nfy = 2\n"}
 
 
 Run = Callable[..., tuple[int, str]]
@@ -69,7 +69,7 @@ def test_info_shows_topics_that_dmrl_cannot_read_and_how_to_convert_them(
     assert any(line.startswith("/cf1/pose geometry_msgs/msg/PoseStamped cdr 5") for line in lines)
     assert "/state no schema json 1" in lines
     assert lines.count("attachment: notes.txt, text/plain, 5 bytes") == 2
-    assert "metadata: site: name=lab, floor=3" in lines
+    assert "metadata: site: name=lab, floor=3, camera (2 lines)" in lines
     warnings = [line for line in lines if line.startswith("warning")]
     assert [line.split()[1] for line in warnings] == ["/cf1/camera/calibration", "/cf1/pose"]
     assert all(line.endswith(f"dmrl convert {foreign} OUT.mcap") for line in warnings)
