@@ -11,6 +11,7 @@ from dmrl import topics
 from dmrl.errors import RecordingError
 from dmrl.estimation.tracking.detector_rates import DetectorRates
 from dmrl.estimation.tracking.flight_metrics import (
+    CONTACT_M,
     DEFINITIONS,
     PairFlight,
     compute_bands,
@@ -154,9 +155,11 @@ COLUMNS = (
 
 def note(made: Mapping[str, Any]) -> str:
     """Describe the columns of the table, and list recall by distance and turn rate."""
-    lines = [
-        "held: until the peer is lost; recall, false: at the detector's threshold; silences: in "
-        "view, not detected; loop: time in view between silences that can end a closed loop"
+    words = [
+        f"held: until the peer is lost; contacts: nearer than {CONTACT_M:g} m; recall, false: at "
+        "the detector's threshold; silences, mean, longest: in view, not detected; find again: "
+        "from its return into view to its detection; alarm: images in a row with false detections; "
+        "loop: time in view between silences that can end a closed loop"
     ]
     for one in made["flights"]:
         parts = [
@@ -166,8 +169,8 @@ def note(made: Mapping[str, Any]) -> str:
             if band["recall"] is not None
         ]
         if parts:
-            lines.append(f"{one['robot']}, {one['peer']}: recall {', '.join(parts)}")
-    return ".\n".join(lines)
+            words.append(f"{one['robot']}, {one['peer']}: recall {'; '.join(parts)}")
+    return "; ".join(words)
 
 
 def rows(made: Mapping[str, Any]) -> list[list[str]]:

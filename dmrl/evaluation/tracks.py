@@ -230,8 +230,9 @@ def note(made: Mapping[str, Any]) -> str:
     """Describe the columns of the table of a ``document``."""
     return (
         "3D errors of the peers in view; of images: errors of the detections in single images; "
+        "less by: by how much less the RMSE of the tracks is; in 95 %: inside the 95 % ellipsoid; "
         f"followed, detected: share of peers with a track, a detection within {MAX_MATCH_M:g} m; "
-        "false: tracks near no peer. Before "
+        "false: tracks near no peer; named right: tracks with their peer's name; before "
         f"{made['settle_s']:g} s, while tracks settle, only false counts"
     )
 
