@@ -169,8 +169,11 @@ def check_kind(name: str | Path, keys: Mapping[str, Any], kind: str) -> None:
 def recipe_error(name: str | Path, wrong: Iterable[str]) -> RecipeError:
     """Return the one-line error that names all faults of a recipe."""
     lines = list(wrong)
-    keys = "1 wrong key" if len(lines) == 1 else f"{len(lines)} wrong keys"
-    return RecipeError(f"{name} has {keys}: {'; '.join(lines)}. Fix them all")
+    many = len(lines) > 1
+    keys, fix = (f"{len(lines)} wrong keys", "them all") if many else ("1 wrong key", "it")
+    words = "; ".join(lines)
+    end = "" if words.endswith("?") else "."
+    return RecipeError(f"{name} has {keys}: {words}{end} Fix {fix}")
 
 
 def find_argument_fault(value: Any, hint: Any) -> str:

@@ -95,7 +95,7 @@ def test_values_are_not_coerced(write: Write, line: str, key: str | None) -> Non
 
 
 def test_a_setting_without_a_default_must_be_given(write: Write) -> None:
-    with pytest.raises(RecipeError, match=r"has 1 wrong key: robot: field required"):
+    with pytest.raises(RecipeError, match=r"has 1 wrong key: robot: field required\. Fix it$"):
         recipe.load(write('kind = "fly"\n'), "fly", Needy)
 
 

@@ -81,6 +81,11 @@ def test_keys_come_before_those_of_a_recipe_and_its_preset(tmp_path: Path) -> No
         load(tmp_path, HEAD + text.replace('stage = "render"', 'stage = "fly"'))
 
 
+def test_an_error_that_ends_with_a_question_has_no_period_behind_it(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match=r"1 wrong key: .* Did you mean images\? Fix it$"):
+        load(tmp_path, SMALL.replace("images = 2", "imags = 2"))
+
+
 def test_every_fault_is_named_with_its_step(tmp_path: Path) -> None:
     text = SMALL.replace("images = 2", "imags = 2\nseed = 1.5").replace("source =", "sources =")
     with pytest.raises(RecipeError) as caught:
