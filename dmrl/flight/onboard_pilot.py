@@ -8,6 +8,7 @@ and /, in the order of the C: both give the same commands, bit for bit.
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from dmrl.flight.onboard_arithmetic import angle_of, root, turn_of
 from dmrl.flight.pilot import Observation
 from dmrl.geometry.frames import AIDECK_PINHOLE, Camera
 
@@ -18,7 +19,7 @@ CONSTANTS = {
     "BLIND_S": 1.2,  # so long after the last detection it searches
     "UNSURE_S": 3.0,  # so long after the last sure detection it stops; held leaders had up to 2.3
     "SURE": 19661,  # confidence, of 65536, of a sure detection: 0.3
-    "FOUND": 45875,  # confidence, of 65536, at which a lost leader is found again: 0.7
+    "FOUND": 32768,  # confidence, of 65536, at which a lost leader is found again: 0.5
     "LOST_ODDS": 0.2,
     "MAX_ODDS": 50.0,
     "START_ODDS": 9.0,
@@ -26,20 +27,26 @@ CONSTANTS = {
     "SPEED_VAR": 0.09,  # (m/s)^2 along each axis
     "SPEED_S": 1.5,
     "DRIFT_VAR": 0.004,  # m^2/s, of the robot's own path
-    "DEPTH_RATIO": 0.15,
-    "SIDE_RATIO": 0.015,
+    "DEPTH_RATIO": 0.33,  # standard deviation of a depth of confidence 0, of the depth,
+    "DEPTH_SURE": 0.22,  # and so much less at confidence 1
+    "SIDE_RATIO": 0.02,  # radians, of a direction
     "IN_VIEW": 0.8,  # tangent of the angle off the axis within which a leader is in the image
     "SEEN_SHARE": 0.7,
     "UNSEEN_SHARE": 0.05,
-    "EVIDENCE": 2.0,  # odds of a detection of confidence 0.5
-    "FALSE_PER_M2": 0.12,
+    # Detections of the leader by false ones of confidence 0.5, in a radian left, a radian up and an
+    # e-fold of distance; at other confidences by the square of their odds, as counted in flights,
+    "EVIDENCE": 50.0,
+    "OTHERS": 30.0,  # and at most so many, for the detection may be another robot's
+    "VIEW": 3.0,  # radians times radians times e-folds of distance in which a network sees
+    "ELSEWHERE_SHARE": 0.35,  # of images in which a leader that was lost is detected
     "GATE": 20.0,  # squared residual, in variances, beyond which a detection is another object's
     "TRUST_VAR": 0.1225,  # m^2, at which it flies at half its speed
     "GAIN": 1.2,
     "CLIMB_GAIN": 0.8,
     "TURN_GAIN": 3.0,
-    "RETREAT": 0.2,  # m/s
     "SEARCH_RATE": 0.8,  # rad/s
+    "SWEEP": 2.0,  # standard deviations of the leader's direction that a search shows
+    "HALF_VIEW": 0.68,  # radians of them in the image when it looks at the middle
     "NEAR": 0.45,  # m
 }
 """Constants of the pilot, here and in the C; lengths in metres, times in seconds."""
@@ -84,6 +91,21 @@ class _Pose(NamedTuple):
 _START = _Pose(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
 
 
+class _Place(NamedTuple):
+    """Place of a detection, variances, direction and distance from the camera, and its odds."""
+
+    x: float
+    y: float
+    z: float
+    along: float
+    across: float
+    upward: float
+    to_x: float
+    to_y: float
+    away: float
+    odds: float
+
+
 @dataclass(slots=True)
 class OnboardFilter:
     """State of the pilot; see `step`.
@@ -106,6 +128,7 @@ class OnboardFilter:
     mean: list[float] = field(default_factory=list)
     covariance: list[list[float]] = field(default_factory=list)
     height_m: float = 0.0
+    height_var: float = 0.0
     odds: float = _K["START_ODDS"]
     side: float = 1.0
     seen_s: float = 0.0
@@ -147,7 +170,8 @@ class OnboardFilter:
         self.mean = [x, y, 0.0, 0.0]
         diagonal = (variance, variance, _K["SPEED_VAR"], _K["SPEED_VAR"])
         self.covariance = [[diagonal[i] if i == j else 0.0 for j in range(4)] for i in range(4)]
-        self.height_m, self.odds, self.seen_s, self.sure_s = z, 1.0, time_s, time_s
+        self.height_m, self.height_var = z, variance
+        self.odds, self.seen_s, self.sure_s = 1.0, time_s, time_s
 
     def _move(self, state: RobotState) -> None:
         """Reckon the own pose, and predict the leader."""
@@ -170,42 +194,44 @@ class OnboardFilter:
             columns[i][i] += _K["DRIFT_VAR"] * dt
             columns[i + 2][i + 2] += (1.0 - keep * keep) * _K["SPEED_VAR"]
         self.covariance = columns
+        self.height_var += _K["DRIFT_VAR"] * dt
 
     def _look(self, age_s: float, detections: list[RawDetection]) -> None:
         """Use an image: choose the likeliest detection, or count a miss."""
-        then = self.past[0]
-        for pose in self.past:
-            if pose.time_s >= self.image_s:
-                then = pose
-        m = self.mean
-        dx, dy = m[0] - age_s * m[2] - then.x, m[1] - age_s * m[3] - then.y
-        ahead, aside = then.c * dx + then.s * dy, then.c * dy - then.s * dx
-        in_view = ahead > 0.1 and abs(aside) < _K["IN_VIEW"] * ahead
-        share = _K["SEEN_SHARE"] if in_view else _K["UNSEEN_SHARE"]
+        then = next((one for one in reversed(self.past) if one.time_s >= self.image_s), self.pose)
+        share = _K["SEEN_SHARE"] if self._is_in_view(then, age_s) else _K["UNSEEN_SHARE"]
+        miss, elsewhere = 1.0 - share, 1.0 - _K["ELSEWHERE_SHARE"]
         best, total, sure = None, 0.0, None
         for found in detections[:DETECTIONS_MAX]:
             place = self._locate(then, found)
             candidate = self._compare(place, age_s)
-            p = (found.confidence + 0.5) / 65536.0
-            ratio = share * _K["EVIDENCE"] * p / (1.0 - p) * candidate[0] / _K["FALSE_PER_M2"]
+            evidence = 1.0 / (1.0 / (_K["EVIDENCE"] * place.odds * place.odds) + 1.0 / _K["OTHERS"])
+            ratio = share * evidence * candidate[0]
             total += ratio
+            elsewhere += _K["ELSEWHERE_SHARE"] * evidence / _K["VIEW"]
             if best is None or ratio > best[0]:
                 best = (ratio, candidate, place, found.confidence)
             if found.confidence >= _K["FOUND"] and (sure is None or found.confidence > sure[0]):
                 sure = (found.confidence, place)
-        miss = 1.0 - share
-        self.odds = min(self.odds * (miss + total), _K["MAX_ODDS"])
+        # The leader is at its place, or somewhere else in view or out of it.
+        self.odds = min(self.odds * (miss + total) / elsewhere, _K["MAX_ODDS"])
         self.odds = max(self.odds, 0.001)
         if best is not None and best[0] > miss:
-            self._update(best[1], best[2], age_s)
+            self._update(best[1], best[2], age_s, best[0] / (miss + total))
             self.sure_s = self.image_s if best[3] >= _K["SURE"] else self.sure_s
         elif self.odds < _K["LOST_ODDS"] and sure is not None:
-            self._restart(*sure[1][:4], self.image_s)
+            place = sure[1]
+            self._restart(place.x, place.y, place.z, place.along, self.image_s)
 
-    def _locate(
-        self, then: _Pose, found: RawDetection
-    ) -> tuple[float, float, float, float, float, float, float]:
-        """Return x, y, height, variances along and across, and direction of a detection."""
+    def _is_in_view(self, then: _Pose, age_s: float) -> bool:
+        """Return whether the leader is expected in an image taken at a pose."""
+        m = self.mean
+        dx, dy = m[0] - age_s * m[2] - then.x, m[1] - age_s * m[3] - then.y
+        ahead, aside = then.c * dx + then.s * dy, then.c * dy - then.s * dx
+        return ahead > 0.1 and abs(aside) < _K["IN_VIEW"] * ahead
+
+    def _locate(self, then: _Pose, found: RawDetection) -> _Place:
+        """Return the place of a detection."""
         depth = found.depth_mm / 1000.0
         left = (self.camera.cx_px - found.u_q4 / 16.0) / self.camera.fx_px * depth
         up = (self.camera.cy_px - found.v_q4 / 16.0) / self.camera.fy_px * depth
@@ -217,15 +243,18 @@ class OnboardFilter:
         y = then.y + (then.s * ahead + then.c * aside)
         z = then.height + (cp * level - sp * depth)
         away = root(ahead * ahead + aside * aside) + 0.001
-        along, across = _K["DEPTH_RATIO"] * away, _K["SIDE_RATIO"] * away
+        p = (found.confidence + 0.5) / 65536.0
+        along, across = (_K["DEPTH_RATIO"] - _K["DEPTH_SURE"] * p) * away, _K["SIDE_RATIO"] * away
         to_x, to_y = (x - then.x) / away, (y - then.y) / away
-        return x, y, z, along * along, across * across, to_x, to_y
+        up = (z - then.height) / away * along
+        variances = along * along, across * across, across * across + up * up
+        return _Place(x, y, z, *variances, to_x, to_y, away, p / (1.0 - p))
 
     def _compare(
-        self, place: tuple[float, ...], age_s: float
+        self, place: _Place, age_s: float
     ) -> tuple[float, float, float, float, float, float]:
-        """Return the density of a detection's place, its residual, and the inverse covariance."""
-        x, y, _, along, across, to_x, to_y = place
+        """Return the likelihood of a place by that of a false one, residual, inverse covariance."""
+        x, y, z, along, across, upward, to_x, to_y, away, _ = place
         m, p = self.mean, self.covariance
         rx, ry = x - (m[0] - age_s * m[2]), y - (m[1] - age_s * m[3])
         aa = age_s * age_s
@@ -237,24 +266,32 @@ class OnboardFilter:
         syy += along * to_y * to_y + across * to_x * to_x
         det = sxx * syy - sxy * sxy
         ixx, ixy, iyy = syy / det, -sxy / det, sxx / det
-        squared = rx * (ixx * rx + ixy * ry) + ry * (ixy * rx + iyy * ry)
+        rz, szz = z - self.height_m, self.height_var + upward
+        squared = rx * (ixx * rx + ixy * ry) + ry * (ixy * rx + iyy * ry) + rz * rz / szz
         near = 1.0 + squared / 6.0  # a density with heavier tails than the Gaussian, without exp
-        density = 1.0 / (6.283185307179586 * root(det) * near * near * near)
-        return (0.0 if squared > _K["GATE"] else density), rx, ry, ixx, ixy, iyy
+        density = 1.0 / (15.749609945722419 * root(det * szz) * near * near * near)
+        # False detections are as frequent in every direction and e-fold of distance.
+        ratio = density * away * away * away
+        return (0.0 if squared > _K["GATE"] else ratio), rx, ry, ixx, ixy, iyy
 
-    def _update(self, candidate: tuple[float, ...], place: tuple[float, ...], age_s: float) -> None:
+    def _update(
+        self, candidate: tuple[float, ...], place: _Place, age_s: float, weight: float
+    ) -> None:
+        """Move by the residual, as far as the detection is probably the leader's."""
         _, rx, ry, ixx, ixy, iyy = candidate
         p = self.covariance
         # Columns of the covariance of state and measurement, then the gain.
         hx = [p[i][0] - age_s * p[i][2] for i in range(4)]
         hy = [p[i][1] - age_s * p[i][3] for i in range(4)]
-        kx = [hx[i] * ixx + hy[i] * ixy for i in range(4)]
-        ky = [hx[i] * ixy + hy[i] * iyy for i in range(4)]
+        kx = [weight * (hx[i] * ixx + hy[i] * ixy) for i in range(4)]
+        ky = [weight * (hx[i] * ixy + hy[i] * iyy) for i in range(4)]
         self.mean = [self.mean[i] + (kx[i] * rx + ky[i] * ry) for i in range(4)]
         self.covariance = [
             [p[i][j] - (kx[i] * hx[j] + ky[i] * hy[j]) for j in range(4)] for i in range(4)
         ]
-        self.height_m += 0.5 * (place[2] - self.height_m)
+        kz = weight * self.height_var / (self.height_var + place.upward)
+        self.height_m += kz * (place.z - self.height_m)
+        self.height_var -= kz * self.height_var
         self.seen_s = self.image_s
 
     def _command(self, state: RobotState) -> tuple[float, float, float, float]:
@@ -264,28 +301,32 @@ class OnboardFilter:
         vx, vy = pose.c * m[2] + pose.s * m[3], pose.c * m[3] - pose.s * m[2]
         drift_x, drift_y = vx - state.vx_mps, vy - state.vy_mps
         stale = state.time_s - self.image_s > _K["STALE_S"]
-        if state.time_s - self.seen_s > _K["BLIND_S"]:
-            return (0.0, 0.0, 0.0, 0.0 if stale else self.side * _K["SEARCH_RATE"])
-        self.side = 1.0 if y + 0.7 * drift_y > 0.0 else -1.0
-        if stale:
-            return (0.0, 0.0, 0.0, 0.0)
-        away = root(x * x + y * y) + 0.001
-        to_x, to_y = x / away, y / away
-        variance = 0.5 * (p[0][0] + p[1][1])
-        trust = self.odds / (1.0 + self.odds) / (1.0 + variance / _K["TRUST_VAR"])
-        go_x, go_y = self.aim(x, y, away)
-        wx, wy = trust * vx + go_x, trust * vy + go_y
-        towards = wx * to_x + wy * to_y
-        less = (1.0 - trust) * (max(towards, 0.0) + _K["RETREAT"])
-        if away < _K["NEAR"]:
-            less += max(towards - less, 0.0) + 2.0 * (_K["NEAR"] - away)
-        wx, wy = wx - less * to_x, wy - less * to_y
-        near = max(away * away, _K["NEAR"] * _K["NEAR"])
-        turn = _K["TURN_GAIN"] * angle_of(x, y) + trust * (x * drift_y - y * drift_x) / near
-        climb = trust * _K["CLIMB_GAIN"] * (self.above_m + self.height_m - state.height_m)
+        angle, blind_s = angle_of(x, y), state.time_s - self.seen_s
         # A false object keeps its apparent distance: who flies after it, or away, never stops.
         unsure = state.time_s - self.sure_s > _K["UNSURE_S"]
-        return (0.0, 0.0, 0.0, turn) if unsure else (wx, wy, climb, turn)
+        away = root(x * x + y * y) + 0.001
+        variance = 0.5 * (p[0][0] + p[1][1])
+        if stale or unsure or blind_s > _K["BLIND_S"]:
+            return (0.0, 0.0, 0.0, 0.0 if stale else self._search(angle, root(variance) / away))
+        self.side = 1.0 if y + 0.7 * drift_y > 0.0 else -1.0
+        to_x, to_y = x / away, y / away
+        trust = self.odds / (1.0 + self.odds) / (1.0 + variance / _K["TRUST_VAR"])
+        go_x, go_y = self.aim(x, y, away)
+        wx, wy = trust * (vx + go_x), trust * (vy + go_y)
+        if away < _K["NEAR"]:
+            towards = wx * to_x + wy * to_y
+            less = max(towards, 0.0) + 2.0 * trust * (_K["NEAR"] - away)
+            wx, wy = wx - less * to_x, wy - less * to_y
+        near = max(away * away, _K["NEAR"] * _K["NEAR"])
+        turn = _K["TURN_GAIN"] * angle + trust * (x * drift_y - y * drift_x) / near
+        climb = trust * _K["CLIMB_GAIN"] * (self.above_m + self.height_m - state.height_m)
+        return (wx, wy, climb, turn)
+
+    def _search(self, angle: float, deviation: float) -> float:
+        """Return the turn of a search: from side to side, to show the likely directions."""
+        if -self.side * angle > max(_K["SWEEP"] * deviation - _K["HALF_VIEW"], 0.0):
+            self.side = -self.side
+        return self.side * _K["SEARCH_RATE"]
 
     def aim(self, x: float, y: float, away: float) -> tuple[float, float]:
         """Return the velocity towards the wanted place, in the robot's horizontal frame.
@@ -297,39 +338,6 @@ class OnboardFilter:
         """
         short = _K["GAIN"] * (away - self.distance_m)
         return short * (x / away), short * (y / away)
-
-
-def turn_of(angle_rad: float) -> tuple[float, float]:
-    """Return cosine and sine of a small angle, from the tangent of its half."""
-    half = angle_rad / 2.0
-    scale = 1.0 / (1.0 + half * half)
-    return (1.0 - half * half) * scale, 2.0 * half * scale
-
-
-def root(value: float) -> float:
-    """Return the square root, by Newton's method."""
-    if value <= 0.0:
-        return 0.0
-    guess = max(value, 1.0)
-    for _ in range(40):
-        guess = 0.5 * (guess + value / guess)
-    return guess
-
-
-def angle_of(x: float, y: float) -> float:
-    """Return the direction of a point, radians to the left of x (Abramowitz and Stegun 4.4.49)."""
-    wide, high = abs(x), abs(y)
-    if wide + high == 0.0:
-        return 0.0
-    t = min(wide, high) / max(wide, high)
-    q = t * t
-    a = 0.9998660 + q * (-0.3302995 + q * (0.1801410 + q * (-0.0851330 + q * 0.0208351)))
-    a *= t
-    if high > wide:
-        a = 1.5707963267948966 - a
-    if x < 0.0:
-        a = 3.141592653589793 - a
-    return a if y >= 0.0 else -a
 
 
 def to_raw(seen: Observation) -> tuple[RobotState, float, list[RawDetection]]:

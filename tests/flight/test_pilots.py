@@ -75,6 +75,32 @@ def test_pilot_does_not_fly_off_with_a_spot_in_the_image(apparent_m: float) -> N
     assert abs(way_m) < 4.0
 
 
+@pytest.mark.parametrize(("v_px", "depth_m"), [(200.0, 0.25), (30.0, 0.25)])
+def test_weak_spots_above_or_below_the_leader_are_not_its(v_px: float, depth_m: float) -> None:
+    pilot, way_m, vx_mps = Follow(TASK), 0.0, 0.0
+    fly(pilot, [(0.7, 0.0)])
+    spot = (AIDECK_PINHOLE.cx_px, v_px, depth_m, 0.15)
+    for k in range(30):
+        seen = observe(1.0 + 0.1 * k, [])
+        seen = replace(seen, detections=(spot,), velocity_mps=np.array([vx_mps, 0.0]))
+        vx_mps = min(max(pilot.command(seen).vx_mps, -1.0), 1.0)
+        way_m += 0.1 * vx_mps
+    assert abs(way_m) < 0.3
+
+
+def test_a_leader_that_is_only_missed_stays_in_view_for_seconds() -> None:
+    """A network that sees nothing of a leader ahead must not turn away from it."""
+    pilot, yaw_rad, rate = Follow(TASK), 0.0, 0.0
+    fly(pilot, [(0.7, 0.0)])
+    yaws = []
+    for k in range(60):
+        seen = replace(observe(1.0 + 0.1 * k, []), yaw_rate_radps=rate)
+        rate = pilot.command(seen).yaw_rate_radps
+        yaw_rad += 0.1 * rate
+        yaws.append(yaw_rad)
+    assert max(np.abs(yaws[:25])) < 0.68 < -min(yaws) < 3.0
+
+
 def test_another_robot_in_view_is_not_followed() -> None:
     pilot = Follow(TASK)
     fly(pilot, [(0.8, 0.0)])

@@ -7,7 +7,7 @@ from dmrl import __version__
 from dmrl.deploy.c.templating import fill_template
 from dmrl.geometry.frames import Camera
 
-PILOT_BYTES = 1248
+PILOT_BYTES = 1256
 """Memory of the pilot's state, which the caller owns; it has no other."""
 
 

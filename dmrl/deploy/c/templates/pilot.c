@@ -33,11 +33,11 @@ int pilot_unpack(const uint8_t *packet, int size, uint32_t *time_ms,
 }
 
 typedef struct {
-    double x, y, z, along, across, to_x, to_y;
+    double x, y, z, along, across, upward, to_x, to_y, away, odds;
 } place_t;
 
 typedef struct {
-    double density, rx, ry, ixx, ixy, iyy;
+    double likelihood, rx, ry, ixx, ixy, iyy;
 } candidate_t;
 
 static double larger(double a, double b) { return b > a ? b : a; }
@@ -89,6 +89,7 @@ static void restart(pilot_t *p, double x, double y, double z, double variance, d
     p->mean[0] = x;
     p->mean[1] = y;
     p->height = z;
+    p->height_var = variance;
     p->odds = 1.0;
     p->seen_s = p->sure_s = time_s;
 }
@@ -136,12 +137,14 @@ static void move(pilot_t *p, const pilot_state_t *state)
         p->covariance[i][i] += ${DRIFT_VAR} * dt;
         p->covariance[i + 2][i + 2] += (1.0 - keep * keep) * ${SPEED_VAR};
     }
+    p->height_var += ${DRIFT_VAR} * dt;
 }
 
 static place_t locate(const pilot_pose_t *then, const pilot_detection_t *found)
 {
     place_t place;
-    double cr, sr, cp, sp, away, along, across;
+    double cr, sr, cp, sp, along, across, rise;
+    const double sureness = (found->confidence + 0.5) / 65536.0;
     const double depth = found->depth_mm / 1000.0;
     const double left = (${CX} - found->u_q4 / 16.0) / ${FX} * depth;
     const double up = (${CY} - found->v_q4 / 16.0) / ${FY} * depth;
@@ -154,13 +157,16 @@ static place_t locate(const pilot_pose_t *then, const pilot_detection_t *found)
     place.x = then->x + (then->c * ahead - then->s * aside);
     place.y = then->y + (then->s * ahead + then->c * aside);
     place.z = then->height + (cp * level - sp * depth);
-    away = root(ahead * ahead + aside * aside) + 0.001;
-    along = ${DEPTH_RATIO} * away;
-    across = ${SIDE_RATIO} * away;
-    place.to_x = (place.x - then->x) / away;
-    place.to_y = (place.y - then->y) / away;
+    place.away = root(ahead * ahead + aside * aside) + 0.001;
+    along = (${DEPTH_RATIO} - ${DEPTH_SURE} * sureness) * place.away;
+    across = ${SIDE_RATIO} * place.away;
+    rise = (place.z - then->height) / place.away * along;
+    place.to_x = (place.x - then->x) / place.away;
+    place.to_y = (place.y - then->y) / place.away;
     place.along = along * along;
     place.across = across * across;
+    place.upward = across * across + rise * rise;
+    place.odds = sureness / (1.0 - sureness);
     return place;
 }
 
@@ -171,6 +177,7 @@ static candidate_t compare(const pilot_t *pilot, const place_t *at, double age)
     double sxx = p[0][0] - age * (p[0][2] + p[2][0]) + aa * p[2][2];
     double sxy = p[0][1] - age * (p[0][3] + p[2][1]) + aa * p[2][3];
     double syy = p[1][1] - age * (p[1][3] + p[3][1]) + aa * p[3][3];
+    const double rz = at->z - pilot->height, szz = pilot->height_var + at->upward;
     double det, squared, near;
     c.rx = at->x - (m[0] - age * m[2]);
     c.ry = at->y - (m[1] - age * m[3]);
@@ -181,28 +188,33 @@ static candidate_t compare(const pilot_t *pilot, const place_t *at, double age)
     c.ixx = syy / det;
     c.ixy = -sxy / det;
     c.iyy = sxx / det;
-    squared = c.rx * (c.ixx * c.rx + c.ixy * c.ry) + c.ry * (c.ixy * c.rx + c.iyy * c.ry);
+    squared =
+        c.rx * (c.ixx * c.rx + c.ixy * c.ry) + c.ry * (c.ixy * c.rx + c.iyy * c.ry) + rz * rz / szz;
     near = 1.0 + squared / 6.0;
-    c.density = 1.0 / (6.283185307179586 * root(det) * near * near * near);
+    c.likelihood = 1.0 / (15.749609945722419 * root(det * szz) * near * near * near) * at->away *
+                   at->away * at->away;
     if (squared > ${GATE})
-        c.density = 0.0;
+        c.likelihood = 0.0;
     return c;
 }
 
-static void update(pilot_t *pilot, const candidate_t *c, const place_t *at, double age)
+static void update(pilot_t *pilot, const candidate_t *c, const place_t *at, double age,
+                   double weight)
 {
+    const double kz = weight * pilot->height_var / (pilot->height_var + at->upward);
     double hx[4], hy[4], kx[4], ky[4], (*p)[4] = pilot->covariance;
     for (int i = 0; i < 4; i++) {
         hx[i] = p[i][0] - age * p[i][2];
         hy[i] = p[i][1] - age * p[i][3];
-        kx[i] = hx[i] * c->ixx + hy[i] * c->ixy;
-        ky[i] = hx[i] * c->ixy + hy[i] * c->iyy;
+        kx[i] = weight * (hx[i] * c->ixx + hy[i] * c->ixy);
+        ky[i] = weight * (hx[i] * c->ixy + hy[i] * c->iyy);
         pilot->mean[i] = pilot->mean[i] + (kx[i] * c->rx + ky[i] * c->ry);
     }
     for (int i = 0; i < 4; i++)
         for (int j = 0; j < 4; j++)
             p[i][j] = p[i][j] - (kx[i] * hx[j] + ky[i] * hy[j]);
-    pilot->height += 0.5 * (at->z - pilot->height);
+    pilot->height += kz * (at->z - pilot->height);
+    pilot->height_var -= kz * pilot->height_var;
     pilot->seen_s = pilot->image_s;
 }
 
@@ -225,18 +237,19 @@ static void look(pilot_t *p, double age, const pilot_detection_t *found, int cou
     const double ahead = then->c * dx + then->s * dy, aside = then->c * dy - then->s * dx;
     const int in_view = ahead > 0.1 && size_of(aside) < ${IN_VIEW} * ahead;
     const double share = in_view ? ${SEEN_SHARE} : ${UNSEEN_SHARE}, miss = 1.0 - share;
-    double total = 0.0, most = 0.0;
+    double total = 0.0, elsewhere = 1.0 - ${ELSEWHERE_SHARE}, most = 0.0;
     candidate_t best = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
-    place_t best_at = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0}, sure_at = best_at;
+    place_t best_at = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0}, sure_at = best_at;
     int sure = -1, confidence = 0;
     for (int k = 0; k < count && k < PILOT_DETECTIONS_MAX; k++) {
         const place_t at = locate(then, &found[k]);
         const candidate_t c = compare(p, &at, age);
-        const double sureness = (found[k].confidence + 0.5) / 65536.0;
-        const double ratio =
-            share * ${EVIDENCE} * sureness / (1.0 - sureness) * c.density / ${FALSE_PER_M2};
+        const double evidence =
+            1.0 / (1.0 / (${EVIDENCE} * at.odds * at.odds) + 1.0 / ${OTHERS});
+        const double ratio = share * evidence * c.likelihood;
         total += ratio;
-        if (k == 0 || ratio > most) {
+        elsewhere += ${ELSEWHERE_SHARE} * evidence / ${VIEW};
+        if (ratio > most) {
             most = ratio;
             best = c;
             best_at = at;
@@ -247,10 +260,10 @@ static void look(pilot_t *p, double age, const pilot_detection_t *found, int cou
             sure_at = at;
         }
     }
-    p->odds = smaller(p->odds * (miss + total), ${MAX_ODDS});
+    p->odds = smaller(p->odds * (miss + total) / elsewhere, ${MAX_ODDS});
     p->odds = larger(p->odds, 0.001);
-    if (count > 0 && most > miss) {
-        update(p, &best, &best_at, age);
+    if (most > miss) {
+        update(p, &best, &best_at, age, most / (miss + total));
         if (confidence >= ${SURE})
             p->sure_s = p->image_s;
     } else if (p->odds < ${LOST_ODDS} && sure >= 0)
@@ -273,35 +286,36 @@ static void steer(pilot_t *p, const pilot_state_t *state, pilot_command_t *comma
     const double vx = pose->c * m[2] + pose->s * m[3], vy = pose->c * m[3] - pose->s * m[2];
     const double drift_x = vx - state->vx, drift_y = vy - state->vy;
     const int stale = state->time_s - p->image_s > PILOT_STALE_S;
-    double away, to_x, to_y, variance, trust, gap, wx, wy, towards, less, near, turn;
-    if (state->time_s - p->seen_s > ${BLIND_S}) {
-        give(command, 0.0, 0.0, 0.0, stale ? 0.0 : p->side * ${SEARCH_RATE});
-        return;
-    }
-    p->side = y + 0.7 * drift_y > 0.0 ? 1.0 : -1.0;
+    const int unsure = state->time_s - p->sure_s > ${UNSURE_S};
+    const double angle = angle_of(x, y), away = root(x * x + y * y) + 0.001;
+    const double variance = 0.5 * (p->covariance[0][0] + p->covariance[1][1]);
+    double to_x, to_y, trust, gap, wx, wy, towards, less, near;
     if (stale) {
         give(command, 0.0, 0.0, 0.0, 0.0);
         return;
     }
-    away = root(x * x + y * y) + 0.001;
+    if (unsure || state->time_s - p->seen_s > ${BLIND_S}) {
+        if (-p->side * angle > larger(${SWEEP} * (root(variance) / away) - ${HALF_VIEW}, 0.0))
+            p->side = -p->side;
+        give(command, 0.0, 0.0, 0.0, p->side * ${SEARCH_RATE});
+        return;
+    }
+    p->side = y + 0.7 * drift_y > 0.0 ? 1.0 : -1.0;
     to_x = x / away;
     to_y = y / away;
-    variance = 0.5 * (p->covariance[0][0] + p->covariance[1][1]);
     trust = p->odds / (1.0 + p->odds) / (1.0 + variance / ${TRUST_VAR});
     gap = ${GAIN} * (away - p->distance);
-    wx = trust * vx + gap * to_x;
-    wy = trust * vy + gap * to_y;
-    towards = wx * to_x + wy * to_y;
-    less = (1.0 - trust) * (larger(towards, 0.0) + ${RETREAT});
-    if (away < ${NEAR})
-        less += larger(towards - less, 0.0) + 2.0 * (${NEAR} - away);
+    wx = trust * (vx + gap * to_x);
+    wy = trust * (vy + gap * to_y);
+    if (away < ${NEAR}) {
+        towards = wx * to_x + wy * to_y;
+        less = larger(towards, 0.0) + 2.0 * trust * (${NEAR} - away);
+        wx = wx - less * to_x;
+        wy = wy - less * to_y;
+    }
     near = larger(away * away, ${NEAR} * ${NEAR});
-    turn = ${TURN_GAIN} * angle_of(x, y) + trust * (x * drift_y - y * drift_x) / near;
-    if (state->time_s - p->sure_s > ${UNSURE_S})
-        give(command, 0.0, 0.0, 0.0, turn);
-    else
-        give(command, wx - less * to_x, wy - less * to_y,
-             trust * ${CLIMB_GAIN} * (p->height - state->height), turn);
+    give(command, wx, wy, trust * ${CLIMB_GAIN} * (p->height - state->height),
+         ${TURN_GAIN} * angle + trust * (x * drift_y - y * drift_x) / near);
 }
 
 void pilot_step(pilot_t *p, const pilot_state_t *state, double image_s,

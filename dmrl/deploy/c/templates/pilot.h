@@ -40,7 +40,7 @@ typedef struct {
     double distance;
     pilot_pose_t past[PILOT_PAST]; /* a ring; the newest is at `newest` */
     int32_t newest, count;
-    double mean[4], covariance[4][4], height, odds, side, seen_s, sure_s, image_s;
+    double mean[4], covariance[4][4], height, height_var, odds, side, seen_s, sure_s, image_s;
 } pilot_t;
 
 /* distance: metres to keep. */
