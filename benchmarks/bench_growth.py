@@ -118,9 +118,14 @@ def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         left.plot(row["input_mb"], row["cpu_s"], label=label, **style)
         right.plot(row["input_mb"], row["peak_mb"], **style)
     for axes, title in ((left, "CPU time, s"), (right, "peak memory, MB")):
+        sizes = rows[0]["input_mb"]
         axes.set(xscale="log", xlabel="recording, MB", title=title)
+        axes.set_xticks(sizes, [f"{size:.0f}" for size in sizes])
+        axes.xaxis.set_minor_formatter("")
         axes.grid(alpha=0.3)
     left.set_yscale("log")
+    left.yaxis.set_major_formatter("{x:g}")
+    left.yaxis.set_minor_formatter("{x:g}")
     right.set_ylim(bottom=0)
     figure.legend(loc="outside right center", fontsize=9)
     figure.savefig(path)

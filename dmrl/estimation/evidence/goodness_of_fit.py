@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.sparse import csc_array
 from scipy.special import chdtrc
 
 from dmrl.estimation.model.pair import Array
@@ -35,6 +36,8 @@ SPANS = (1, 2, 5)
 MIN_OPEN_SHARE = 1e-7
 """Smallest share of a score's information that the unknowns leave open. Below it, rounding decides.
 """
+BLOCK = 64
+"""Number of scores whose covariance is computed at once: more would need more memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,9 +130,13 @@ def compute_scores(solver: Solver, values: Values) -> list[SignalScores]:
     out = []
     for factor, signals in zip(rows, _list_signals(solver.problem), strict=True):
         scores = _sum_scores(factor, window, equations)
-        flat = scores.by_state.reshape(len(border), -1)
-        rest = scores.by_constant.reshape(size, -1) - response.T @ flat
-        explained = flat.T @ cho_solve_banded((bands, False), flat) + rest.T @ constants @ rest
+        by_state = scores.by_state
+        rest = scores.by_constant.reshape(size, -1) - (by_state.T @ response).T
+        explained = rest.T @ constants @ rest
+        for first in range(0, by_state.shape[1], BLOCK):
+            part = by_state[:, first : first + BLOCK].toarray(order="F")
+            solved = cho_solve_banded((bands, False), part, overwrite_b=True)
+            explained[:, first : first + BLOCK] += by_state.T @ solved
         scale = 1 / np.sqrt(np.maximum(scores.information, 1e-9))
         open_part = np.diag(scores.information.ravel()) - explained
         open_part *= scale.ravel() * scale.ravel()[:, None]
@@ -160,13 +167,13 @@ def _list_signals(problem: Problem) -> Iterator[list[Signal]]:
 class _Scores(NamedTuple):
     """Slopes of the cost by errors that are constant over a window.
 
-    ``score`` and ``information`` (W, D) of each window and component; ``by_state`` (K, n, W, D)
+    ``score`` and ``information`` (W, D) of each window and component; ``by_state`` (K n, W D)
     and ``by_constant`` (G, W, D) products of the errors with the unknowns.
     """
 
     score: Array
     information: Array
-    by_state: Array
+    by_state: csc_array
     by_constant: Array
 
 
@@ -191,21 +198,23 @@ def _sum_scores(factor: Rows, window: Index, equations: NormalEquations) -> _Sco
     held = np.broadcast_to(weight, factor.rows.shape[:-1]).sum(axis=several)
     at, key = window[: len(rows)], np.arange(len(rows))
     size, shape = len(factor.columns), (window[-1] + 1, rows.shape[1])
-    out = _Scores(
-        np.zeros(shape),
-        np.zeros(shape),
-        np.zeros((*equations.gradient.shape, *shape)),
-        np.zeros((len(equations.globals_block), *shape)),
+    score, information = np.zeros(shape), np.zeros(shape)
+    np.add.at(score, at, rows[..., -1])
+    np.add.at(information, at, held)
+    keyframes, width = equations.gradient.shape
+    state = (key[:, None] + np.arange(1 + factor.steps)).repeat(size, 1) * width
+    state += np.tile(factor.columns, 1 + factor.steps)
+    values = rows[..., : state.shape[1]].transpose(0, 2, 1)
+    error = np.arange(score.size).reshape(shape)[at][:, None]
+    places = np.broadcast_arrays(state[..., None], error)
+    by_state = csc_array(
+        (values.ravel(), [place.ravel() for place in places]),
+        shape=(keyframes * width, score.size),
     )
-    np.add.at(out.score, at, rows[..., -1])
-    np.add.at(out.information, at, held)
-    for number, column in enumerate(factor.columns):
-        out.by_state[key, column, at] += rows[..., number]
-        if factor.steps:
-            out.by_state[key + 1, column, at] += rows[..., size + number]
+    by_constant = np.zeros((len(equations.globals_block), *shape))
     for number, column in enumerate(factor.border, size * (1 + factor.steps)):
-        np.add.at(out.by_constant[column], at, rows[..., number])
-    return out
+        np.add.at(by_constant[column], at, rows[..., number])
+    return _Scores(score, information, by_state, by_constant)
 
 
 def _test_signal(one: SignalScores, limit: float) -> Iterator[tuple[Cause, float]]:
