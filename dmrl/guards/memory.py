@@ -65,8 +65,9 @@ def return_large_blocks() -> None:
 def keep_freed_memory(most_bytes: int) -> None:
     """Let the C library keep up to so many bytes that are freed from now on.
 
-    What was freed before goes back to the system: reading leaves many small blocks. Otherwise it returns large arrays to the system, and each new one faults in its pages again: a
-    third of the time of linear algebra on arrays of megabytes, 4 to 8 % of a training step.
+    What was freed before goes back to the system: reading leaves many small blocks. Otherwise the
+    library returns large arrays to the system, and each new one faults in its pages again: a third
+    of the time of linear algebra on arrays of megabytes, 4 to 8 % of a training step.
     """
     with suppress(AttributeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,7 +1,8 @@
 """Layout ``flight``: space, images, and plots of every pair of robots."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -48,13 +49,12 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     scales = archetypes.build_scales(settings.depth_max_m) if piloted else {}
     cameras = build_camera_panels(selection, sorted(selection.image_ns)[:MAX_CAMERAS], scales)
     sources: dict[str, set[str]] = {camera.robot: set() for camera in cameras}
-    named = {}
+    modelled = [c for c in cameras if topics.DETECTIONS(c.robot) in selection.topics]
     draws: list[DrawRule] = []
     for camera in cameras:
         draws += build_image_rules(camera, sources[camera.robot])
-        if topics.DETECTIONS(camera.robot) in selection.topics:
+        if camera in modelled:
             draws += build_model_rules(camera, scales, smooth=False)
-            named["detection"] = RGB["detection"]
     for robot in robots:
         draws += _build_robot_rules(selection, seen, robot, own=robot == robots[0])
     for topic in map(topics.DETECTIONS, sorted(piloted)):
@@ -64,15 +64,7 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     spaces = _build_spaces(selection, seen, pairs, robots, cameras)
     read = load_first_messages(selection, [topics.CAUSES(*pair) for pair in pairs])
     causes = {pair: read[topic] for pair in pairs if (topic := topics.CAUSES(*pair)) in read}
-    panels = {
-        f"{a} sees {b}": [
-            *_build_pair_plots(selection, seen, (a, b)),
-            *(list_cause_panels((a, b), causes[a, b]) if (a, b) in causes else ()),
-        ]
-        for a, b in pairs
-    }
-    if not pairs:
-        panels = {robots[0]: _build_sensor_plots(selection, robots)} if robots else {}
+    panels = _build_panels(selection, seen, pairs, robots, causes)
     return Scene(
         layouts.build_flight_layout(spaces, cameras, panels, scales),
         draws,
@@ -83,9 +75,28 @@ def scene(selection: Selection, settings: Settings) -> Scene:
         ],
         cameras,
         sources,
-        named,
+        {"detection": RGB["detection"]} if modelled else {},
         partial(FlightStreamer, pairs, seen, selection.shown_ns[0]),
     )
+
+
+def _build_panels(
+    selection: Selection,
+    seen: FlightMotion,
+    pairs: Sequence[Names],
+    robots: Sequence[str],
+    causes: Mapping[Names, Mapping[str, Any]],
+) -> dict[str, list[PlotPanel]]:
+    """Return the plots of each pair, or of the robots' sensors where there is no pair."""
+    if not pairs:
+        return {robots[0]: _build_sensor_plots(selection, robots)} if robots else {}
+    return {
+        f"{a} sees {b}": [
+            *_build_pair_plots(selection, seen, (a, b)),
+            *(list_cause_panels((a, b), causes[a, b]) if (a, b) in causes else ()),
+        ]
+        for a, b in pairs
+    }
 
 
 def _choose_pairs(selection: Selection, robot: str | None) -> list[Names]:

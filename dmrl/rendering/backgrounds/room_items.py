@@ -115,6 +115,7 @@ def _draw_part(
     base = _draw_numbers(rng, part["at"]) + moved
     start = place((base if part["shape"] == "bar" else base + ring) * size, at, yaw)
     radius = _draw_number(rng, part.get("radius", 1))
+    lit = part["colour"] != "glow"
     match part["shape"]:
         case "bar":
             end = place((_draw_numbers(rng, part["to"]) + moved + ring) * size, at, yaw)
@@ -124,31 +125,42 @@ def _draw_part(
         case "disc":
             half_m = part.get("radius_m")
             half_m = radius * size[0] if half_m is None else _draw_number(rng, half_m)
-            view.draw_discs(start, half_m, colour, lit=part["colour"] != "glow")
-        case "panel":
-            width, _, height = _draw_numbers(rng, part["size"]) * size
-            unit = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]]) * (width, 0, height)
-            faces = place(unit, np.zeros(3), yaw) + start[:, None]
-            view.draw_faces(faces, colour, lit=part["colour"] != "glow")
+            view.draw_discs(start, half_m, colour, lit=lit)
         case "leaf":
             leaves = rng.standard_normal((count, 4, 3)) * radius * size
             view.draw_faces(start[:, None] + leaves, colour)
-        case "flat":
-            shape = _regular_polygon(part["corners"]) * radius * size[:2]
+        case "walk":
+            path = _draw_walk(rng, start, yaw)
+            thick_m = _draw_number(rng, part["thick_m"])
+            view.draw_bars(np.stack([path[:-1], path[1:]], 1), thick_m, colour)
+        case _:
+            outline = _draw_outline(rng, part, size, radius, yaw)
             opacity = _draw_number(rng, part.get("opacity", 1))
-            view.draw_faces(_lay(shape, yaw) + start[:, None], colour, opacity)
-        case "cells":
+            view.draw_faces(outline + start[:, None], colour, opacity, lit=lit)
+
+
+def _draw_outline(rng: Generator, part: Item, size: Array, radius: float, yaw: float) -> Array:
+    """Return the (N, K, 3) corners of an upright panel, a flat polygon or a pattern of cells."""
+    match part["shape"]:
+        case "panel":
+            width, _, height = _draw_numbers(rng, part["size"]) * size
+            unit = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]]) * (width, 0, height)
+            return place(unit, np.zeros(3), yaw)
+        case "flat":
+            return _lay(_regular_polygon(part["corners"]) * radius * size[:2], yaw)
+        case _:
             cells = int(rng.integers(4, 8))
             middles = (np.indices((cells, cells)).reshape(2, -1).T + 0.5) / cells - 0.5
             white = (np.abs(middles).max(axis=1) < 0.5 - 1 / cells) & (rng.random(cells**2) < 0.5)
             squares = middles[white, None] + _regular_polygon(4) / np.sqrt(2) / cells
-            view.draw_faces(_lay(0.8 * squares * size[:2], yaw) + start[:, None], colour)
-        case "walk":
-            heading = yaw + np.cumsum(rng.normal(0, 0.5, 14))
-            steps = 0.15 * np.column_stack([np.cos(heading), np.sin(heading), 0 * heading])
-            path = start + np.cumsum(steps, axis=0)
-            thick_m = _draw_number(rng, part["thick_m"])
-            view.draw_bars(np.stack([path[:-1], path[1:]], 1), thick_m, colour)
+            return _lay(0.8 * squares * size[:2], yaw)
+
+
+def _draw_walk(rng: Generator, start: Array, yaw: float) -> Array:
+    """Return the (14, 3) points of a line that wanders over the floor."""
+    heading = yaw + np.cumsum(rng.normal(0, 0.5, 14))
+    steps = 0.15 * np.column_stack([np.cos(heading), np.sin(heading), 0 * heading])
+    return np.asarray(start + np.cumsum(steps, axis=0))
 
 
 def _lay(outline: Array, yaw: float) -> Array:
