@@ -122,8 +122,10 @@ def require_pairs(
             f"{', '.join(logs.robots) or 'nobody'}. Calibrate with flights of these robots"
         )
     if not logs.pairs:
-        why = "; ".join(logs.warnings) or "there are no ranges"
-        raise RecordingError(f"{flight.path}: no pair can be estimated: {why}. Try: dmrl info")
+        absent = [] if logs.robots else ["no robot has attitude, velocity and height"]
+        why = "; ".join(logs.warnings or [*absent, "there are no ranges"])
+        why += "" if why.endswith("?") else "."
+        raise RecordingError(f"{flight.path}: no pair can be estimated: {why} Try: dmrl info")
     if unknown := set(cameras) - set(logs.robots):
         raise SettingError(f"--camera.{min(unknown)}: {flight.path} has {', '.join(logs.robots)}")
     return logs

@@ -125,7 +125,7 @@ def test_clocks_an_hour_apart_are_an_error_of_one_line(
         hour = 3600 * SECOND_NS if stamped.topic.startswith("/cf2") else 0
         return [Stamped(stamped.time_ns + hour, stamped.topic, stamped.message)]
 
-    with pytest.raises(RecordingError, match=r"share 0\.0 s.*Do their clocks agree") as caught:
+    with pytest.raises(RecordingError, match=r"share 0\.0 s.*clocks agree\? Try") as caught:
         warnings_of(changed(late))
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.glob("out*"))
@@ -140,5 +140,5 @@ def test_recording_without_ranges_is_refused(changed: Callable[[Change], Path]) 
     with RecordingWriter(bare, Provenance("test")) as sink:
         for stamped in read(out, "/*/attitude"):
             sink.write(stamped.time_ns, stamped.topic, stamped.message)
-    with pytest.raises(RecordingError, match="there are no ranges"):
+    with pytest.raises(RecordingError, match=r"no robot has attitude.*; there are no ranges"):
         label.run(bare, out.with_name("out.mcap"), Settings())
