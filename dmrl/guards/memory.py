@@ -65,14 +65,19 @@ def return_large_blocks() -> None:
 def keep_freed_memory(most_bytes: int) -> None:
     """Let the C library keep up to so many bytes that are freed from now on.
 
-    What was freed before goes back to the system: reading leaves many small blocks. Otherwise the
-    library returns large arrays to the system, and each new one faults in its pages again: a third
-    of the time of linear algebra on arrays of megabytes, 4 to 8 % of a training step.
+    What was freed before goes back to the system. Otherwise the library returns large arrays, and
+    each new one faults in its pages again: a third of the time of linear algebra on arrays of
+    megabytes, 4 to 8 % of a training step.
     """
-    with suppress(AttributeError):  # another C library
-        ctypes.CDLL(None).malloc_trim(0)
+    return_freed_memory()
     _set_allocator(M_TRIM_THRESHOLD, most_bytes)
     _set_allocator(M_MMAP_THRESHOLD, most_bytes)
+
+
+def return_freed_memory() -> None:
+    """Give freed memory back to the system: decoding leaves many small blocks among others."""
+    with suppress(AttributeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _set_allocator(parameter: int, value: int) -> None:

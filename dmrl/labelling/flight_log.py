@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.estimation.model.pair import Array
+from dmrl.guards.memory import return_freed_memory
 from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.recording import LoadedRecording, Stamped, TopicInfo
 from dmrl.storage.shared_file import share_file
@@ -167,6 +168,8 @@ def read_flight(path: Path, *wanted: str, sizes_of: Collection[str] = ()) -> Fli
         for robot in images.keys() & sizes_of:
             if (size_px := held.read_image_size(images[robot])) is not None:
                 log.image_size_px[robot] = size_px
+    del held
+    return_freed_memory()
     return log
 
 

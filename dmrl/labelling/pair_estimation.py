@@ -18,7 +18,7 @@ MAX_GROUP = 15
 """Most pairs that are filtered side by side: more are no faster, and need more memory."""
 MIN_GROUP = 4
 """Fewest pairs of a process."""
-KEPT_BYTES = 64 << 20
+KEPT_BYTES = 24 << 20
 """Freed bytes that a process keeps: the arrays of an iteration over a window."""
 MIN_PARALLEL_S = 300.0
 """Flight time of all pairs from which more processes pay off, seconds: each starts in a second."""

@@ -188,8 +188,11 @@ def _build_robot_log(
     )
     if attitude is None or velocity is None or height is None:
         return None
-    attitude[1][:, 2] = known.correct_yaw_rate(name, attitude[1][:, 2])
-    return RobotLog(attitude, (velocity[0], known.correct_velocity(name, velocity[1])), height)
+    if name in known.robots:
+        yaw_rate = known.correct_yaw_rate(name, attitude[1][:, 2])
+        attitude = attitude[0], np.column_stack([attitude[1][:, :2], yaw_rate])
+        velocity = velocity[0], known.correct_velocity(name, velocity[1])
+    return RobotLog(attitude, velocity, height)
 
 
 def _to_signals(
@@ -209,6 +212,8 @@ def _to_signals(
     if not good.any():
         warnings.append(f"{topic}: nothing to use; its pairs are left out")
         return None
+    if good.all():  # the arrays of long flights are shared
+        return flight.to_seconds(samples.time_ns), values
     return flight.to_seconds(samples.time_ns[good]), values[good]
 
 

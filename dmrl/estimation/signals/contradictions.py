@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter, uniform_filter1d
 
-from dmrl.estimation.model.odometry import preintegrate
+from dmrl.estimation.model.odometry import dead_reckon_path
 from dmrl.estimation.model.pair import GRID_RATE_HZ, MAX_DROPOUT_S, Array, Mask, Pair, SensorTrack
 from dmrl.estimation.signals.jump_detection import find_held
 
@@ -86,7 +86,7 @@ def find_contradictions(pair: Pair, distance: Array) -> tuple[Mask, Mask]:
     distance
         (K,) distance at every time, metres; infinite where it is unknown.
     """
-    paths = [preintegrate(track, pair.time_s).position_m for track in (pair.own, pair.peer)]
+    paths = [dead_reckon_path(track, pair.time_s) for track in (pair.own, pair.peer)]
     speeds = [np.hypot(track.vx_mps, track.vy_mps) for track in (pair.own, pair.peer)]
     wrong = np.stack([_find_spins(track) for track in (pair.own, pair.peer)])
     for window_s in WINDOWS_S:
