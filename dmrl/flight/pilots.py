@@ -12,7 +12,8 @@ import numpy as np
 
 from dmrl import entry_points
 from dmrl.errors import SettingError
-from dmrl.flight.onboard_pilot import CONSTANTS, OnboardFilter, to_raw
+from dmrl.flight.onboard_input import to_raw
+from dmrl.flight.onboard_pilot import CONSTANTS, OnboardFilter
 from dmrl.flight.pilot import Command, Observation, PeerTrack, Pilot, Task
 
 NEAR_M = CONSTANTS["NEAR"]

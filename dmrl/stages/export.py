@@ -67,7 +67,8 @@ def run(model: Model, out: Path, settings: Settings) -> "list[Written]":
     from dmrl.deploy.c.pilot_code import write_pilot
     from dmrl.deploy.export_folder import list_files, refuse_export, write_decoded, write_export
     from dmrl.deploy.usage import write_usage
-    from dmrl.flight.onboard_pilot import CONSTANTS, DETECTIONS_MAX
+    from dmrl.flight.onboard_input import DETECTIONS_MAX
+    from dmrl.flight.onboard_pilot import CONSTANTS
     from dmrl.geometry.frames import AIDECK_PINHOLE
     from dmrl.recording import build_provenance
 

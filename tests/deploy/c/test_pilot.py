@@ -14,14 +14,8 @@ from dmrl.deploy.c.run.compiled import CompiledNetwork
 from dmrl.deploy.int8 import reference
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.quantise_model import quantise_model
-from dmrl.flight.onboard_pilot import (
-    CONSTANTS,
-    DETECTIONS_MAX,
-    OnboardFilter,
-    RawDetection,
-    RobotState,
-    to_raw,
-)
+from dmrl.flight.onboard_input import DETECTIONS_MAX, RawDetection, RobotState, to_raw
+from dmrl.flight.onboard_pilot import CONSTANTS, OnboardFilter
 from dmrl.formats.aideck.cpx import Image, ImageReader
 from dmrl.formats.aideck.cpx_detections import pack_detections, parse_detections
 from dmrl.formats.aideck.cpx_encode import pack_image
