@@ -125,7 +125,7 @@ def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         axes.grid(alpha=0.3)
     left.set_yscale("log")
     left.yaxis.set_major_formatter("{x:g}")
-    left.yaxis.set_minor_formatter("{x:g}")
+    left.yaxis.set_minor_formatter("")
     right.set_ylim(bottom=0)
     figure.legend(loc="outside right center", fontsize=9)
     figure.savefig(path)

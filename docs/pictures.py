@@ -133,6 +133,13 @@ PICTURES = {
         ),
         (*RENDERER, "benchmarks/contact_sheet.py"),
     ),
+    "docs/images/growth.png": Picture(
+        (
+            "python {root}/benchmarks/bench_growth.py --seconds 10 --times 1 10 100"
+            " --plot picture.png",
+        ),
+        ("benchmarks/bench_growth.py",),
+    ),
     "docs/images/eckart00.png": Picture(
         (
             "dmrl convert {data}/eckart00_brushless_flights eckart00.mcap",

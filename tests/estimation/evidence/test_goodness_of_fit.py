@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from dmrl.estimation.evidence.causes import join_causes, join_innovations
 from dmrl.estimation.evidence.goodness_of_fit import (
@@ -84,6 +85,31 @@ def test_a_statistic_is_the_fall_of_the_cost_if_the_error_were_estimated() -> No
     statistic, freedom = scores.chi_square(slice(window, window + 1))
     assert freedom == 1
     assert statistic == pytest.approx(2 * fall, rel=0.05)
+
+
+def test_the_covariance_lacks_what_all_unknowns_explain() -> None:
+    """The unknowns of the keyframes and the constants: by the inverse of the whole matrix."""
+    solver, values = solve(pair())
+    equations, factors = solver.equations(values)
+    found = compute_scores(solver, values)[0]
+    window = ((solver.problem.keyframe_s - solver.problem.keyframe_s[0]) / WINDOW_S).astype(int)
+    window[-1] = window[-2]
+    (factor, *_) = (one for one in factors if isinstance(one, Rows))
+    scores = _sum_scores(factor, window, equations)
+    constants = scores.by_constant.reshape(len(equations.globals_block), -1)
+    effect = np.vstack([scores.by_state.toarray(), constants])
+    border = equations.coupling.reshape(-1, len(constants))
+    states = block_diag(*equations.diagonal)
+    size = equations.diagonal.shape[1]
+    for k, block in enumerate(equations.off_diagonal):
+        states[k * size : (k + 1) * size, (k + 1) * size : (k + 2) * size] = block
+        states[(k + 1) * size : (k + 2) * size, k * size : (k + 1) * size] = block.T
+    whole = np.block([[states, border], [border.T, equations.globals_block]])
+    left = np.diag(scores.information.ravel()) - effect.T @ np.linalg.solve(whole, effect)
+    scale = 1 / np.sqrt(np.maximum(scores.information, 1e-9).ravel())
+    shape = (*scores.information.shape, *scores.information.shape)
+    expected = (left * scale * scale[:, None]).reshape(shape)[:, :2, :, :2]
+    assert found.covariance == pytest.approx(expected, abs=1e-9)
 
 
 def test_directions_that_the_unknowns_explain_are_not_tested() -> None:
