@@ -99,5 +99,7 @@ def test_one_port_is_open(server: PageServer) -> None:
     children = Path("/proc/self/task")
     if not children.is_dir():
         pytest.skip("no /proc")
-    found = [path.read_text() for path in children.glob("*/children")]
-    assert not "".join(found).split(), "the viewer's program runs on"
+    found = "".join(path.read_text() for path in children.glob("*/children")).split()
+    # Other tests of this process may have left a helper of multiprocessing.
+    programs = [Path(f"/proc/{number}/cmdline").read_bytes() for number in found]
+    assert not [words for words in programs if b"rerun" in words], "the viewer's program runs on"
