@@ -145,28 +145,50 @@ class _Geometry(NamedTuple):
     """Relative position of two robots at N measurements, and its derivatives.
 
     ``offset`` (N, 2) in the frame of the flight, ``up`` (N,) height difference, ``by_turn`` (N, 2)
-    and (N, 2) derivatives of the offset by either heading.
+    and (N, 2) derivatives of the offset by either heading, ``by_scale`` (N, 2) those by constants
+    that scale a robot's motion.
     """
 
     offset: Array
     up: Array
     by_own_turn: Array
     by_peer_turn: Array
+    by_scale: dict[int, Array]
 
 
 def _geometry(measured: RangeLink | CameraView, layout: Layout, values: Values) -> _Geometry:
     """Return the relative position at each measurement."""
-    one, other = measured.robots
-    here, there = (values.state[:, layout.pose(k)] for k in (one, other))
+    here, there = (values.state[:, layout.pose(k)] for k in measured.robots)
     at = measured.keyframe
-    own = rotate(rotation_matrix(here[:, 2])[at], measured.own_shift_m)
-    peer = rotate(rotation_matrix(there[:, 2])[at], measured.peer_shift_m)
+    own, by_own_scale = _correct_shift(measured, 0, layout, values)
+    peer, by_scale = _correct_shift(measured, 1, layout, values)
+    for c, effect in by_own_scale.items():
+        by_scale[c] = by_scale.get(c, 0.0) - effect
     up = measured.height_m.copy()
     for row, c, constant, side in layout.measured(measured.robots, "height"):
         error = values.constants[c] if constant else values.state[at, c]
         up = up + side * row.height * error
     offset = np.take((there - here)[:, :2].T, at, axis=1).T + peer - own
-    return _Geometry(offset, up, -own @ QUARTER_TURN.T, peer @ QUARTER_TURN.T)
+    return _Geometry(offset, up, -own @ QUARTER_TURN.T, peer @ QUARTER_TURN.T, by_scale)
+
+
+def _correct_shift(
+    measured: RangeLink | CameraView, side: int, layout: Layout, values: Values
+) -> tuple[Array, dict[int, Array]]:
+    """Return a robot's motion from the keyframe to each measurement, in the frame of the flight.
+
+    A scale of the measured motion counts between keyframes too: without it, many ranges show the
+    error of those few centimetres. Its (N, 2) derivatives are returned by constant.
+    """
+    robot, shift = measured.robots[side], (measured.own_shift_m, measured.peer_shift_m)[side]
+    turned = rotation_matrix(values.state[:, layout.pose(robot)[2]])[measured.keyframe]
+    gain = motion_gain(layout, robot, values.constants)
+    by_scale = {
+        c: rotate(turned, -shift / gain**2 * np.array(row.motion_scale))
+        for row, c, constant in layout.of(robot)
+        if row.motion_scale and constant and shift.any()
+    }
+    return rotate(turned, shift / gain), by_scale
 
 
 def _sights(
@@ -188,7 +210,7 @@ def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Valu
     towards = at.offset / distance[:, None]
     used = layout.measured(link.robots, "range")
     states = [c for _, c, constant, _ in used if not constant]
-    border = [c for _, c, constant, _ in used if constant]
+    border = [*(c for _, c, constant, _ in used if constant), *at.by_scale]
     columns = layout.pose(link.robots[0]) + layout.pose(link.robots[1]) + states
     out = np.zeros((len(columns) + len(border) + 1, len(distance))).T
     gain, error, heights = np.ones(len(distance)), np.zeros(len(distance)), []
@@ -207,6 +229,8 @@ def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Valu
             out[:, column] = effect
             error = error + effect * value
     out[:, heights] *= gain[:, None]
+    for c, effect in at.by_scale.items():
+        out[:, len(columns) + border.index(c)] = gain * _dot(towards, effect)
     out[:, 0:2], out[:, 3:5] = -gain[:, None] * towards, gain[:, None] * towards
     for column, by_turn in ((2, at.by_own_turn), (5, at.by_peer_turn)):
         out[:, column] = gain * _dot(towards, by_turn)
@@ -228,7 +252,7 @@ def bearing_factor(problem: Problem, layout: Layout, view: CameraView, values: V
     at, one = _geometry(view, layout, values), layout.pose(view.robots[0])
     used = layout.measured(view.robots, "bearing")
     states = [c for _, c, constant, _ in used if not constant]
-    border = [c for _, c, constant, _ in used if constant]
+    border = [*(c for _, c, constant, _ in used if constant), *at.by_scale]
     columns = one + layout.pose(view.robots[1]) + states
     polar, by_offset = _to_polar(at)
     polar[:, 0] -= values.state[view.keyframe, one[2]] + view.own_turn_rad
@@ -237,6 +261,8 @@ def bearing_factor(problem: Problem, layout: Layout, view: CameraView, values: V
     out[..., 2] = rotate_rows(by_offset, at.by_own_turn)
     out[..., 5] = rotate_rows(by_offset, at.by_peer_turn)
     out[:, 0, 2] -= 1.0
+    for c, effect in at.by_scale.items():
+        out[..., len(columns) + border.index(c)] = rotate_rows(by_offset, effect)
     for row, c, constant, side in used:
         column = len(columns) + border.index(c) if constant else columns.index(c)
         if row.height:
