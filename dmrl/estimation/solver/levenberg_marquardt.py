@@ -154,7 +154,7 @@ class Solver:
         for factor in factors:
             if isinstance(factor, Chain):
                 normalizer += float(np.log(factor.std).sum())
-                if np.isfinite(factor.start_std):
+                if np.isfinite(factor.start_std):  # else the window before knows the first value
                     normalizer += float(np.log(factor.start_std))
                 # The pull to zero is not a normalized density, so it is no evidence.
                 square = (factor.value / factor.row.pull_std) ** 2
