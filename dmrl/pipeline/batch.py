@@ -2,7 +2,7 @@
 
 A plan is a list of tasks, each an input, an output and a line of JSON. Any process with dmrl and
 access to the files can run one. An executor takes the lines: `ProcessPool`, whose
-processes are on this machine, or `cluster.Ray`; or an array job of Slurm does them.
+processes are on this machine, or `cluster.Ray`.
 """
 
 import os
@@ -16,13 +16,12 @@ from typing import Any
 from dmrl.atomic_output import register_output
 from dmrl.errors import DmrlError, OutputError, RecordingError, SettingError
 from dmrl.guards.paths import require_text_path
-from dmrl.pipeline.cluster.slurm import write_array_job
-from dmrl.pipeline.executor import SLURM, Executor, open_executor
+from dmrl.pipeline.executor import Executor, open_executor
 from dmrl.pipeline.job import JobResult, build_job, has_failed
 from dmrl.storage import RemotePath
 from dmrl.terminal.left_out import count_so_far
 from dmrl.terminal.progress import say, track
-from dmrl.terminal.tables import count_things, print_json, print_line, print_table
+from dmrl.terminal.tables import count_things, print_json, print_table
 
 MAX_NUMBERS = 4
 """Most numbers of a result in the table."""
@@ -232,8 +231,7 @@ def run_over_folder(
     workers
         Processes, at most. None: as many as there are cores.
     on
-        Cluster that runs the tasks in place of processes here; see `open_executor`. "slurm": an
-        array job is written, and nothing runs yet.
+        Cluster that runs the tasks in place of processes here; see `open_executor`.
     as_json
         Print one JSON document in place of the table.
     found
@@ -249,9 +247,6 @@ def run_over_folder(
     found, out = _name_outputs(source, out) if found is None else (found, out)
     tasks = build_tasks(stage, role, found, out, settings, inputs)
     made = _make_folders(out, tasks)
-    if on == SLURM:
-        print_line(write_array_job(tasks, out))
-        return
     with open_executor(on, workers) as crew:
         done = list(iter_results(tasks, crew, f"dmrl {stage}"))
     for folder in made:

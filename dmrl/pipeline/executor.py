@@ -8,7 +8,7 @@ from dmrl.pipeline.job import JobResult
 from dmrl.pipeline.process_pool import ProcessPool
 from dmrl.terminal.progress import Lines
 
-RAY, SLURM = "ray", "slurm"
+RAY = "ray"
 
 
 class Executor(Protocol):

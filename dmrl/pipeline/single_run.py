@@ -7,7 +7,7 @@ from typing import Any
 from dmrl.atomic_output import register_output
 from dmrl.errors import DmrlError, SettingError
 from dmrl.pipeline.batch import Task, error_text, find_changed_settings
-from dmrl.pipeline.executor import SLURM, open_executor
+from dmrl.pipeline.executor import open_executor
 from dmrl.pipeline.job import build_job, has_failed
 from dmrl.pipeline.stage_signature import signature_of
 
@@ -44,8 +44,6 @@ def run_on_cluster(
         )
     line = build_job(stage, out, dict(inputs), find_changed_settings(settings), keep=True)
     task = Task(out, out, line)
-    if on == SLURM:
-        raise SettingError("--on slurm is for a folder of recordings. Name one, or --on ray")
     with open_executor(on, None) as crew:
         answer = crew.submit(line, exclusive=signature_of(stage).exclusive).result()
     if has_failed(answer):

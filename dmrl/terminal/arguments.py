@@ -73,8 +73,7 @@ On = Annotated[
     str | None,
     Parameter(
         help="Do it on a cluster: ray for the Ray cluster that this machine is part of (or this "
-        "machine alone), ray://HOST:PORT for another, slurm to write an array job. Does not affect "
-        "the output."
+        "machine alone), ray://HOST:PORT for another. Does not affect the output."
     ),
 ]
 """Cluster that runs the command; None: this machine."""

@@ -67,7 +67,6 @@ HOSTILE: dict[str, tuple[tuple[str, ...], ...]] = {
     "trim": (
         ("IN/bad.mcap", "OUT/trimmed.mcap"),
         ("IN/link", "OUT/trimmed2.mcap"),
-        ("IN/folder", "OUT/job", "--on", "slurm"),
     ),
 }
 """What every command is given: inputs full of hostile names, links to what is not theirs."""

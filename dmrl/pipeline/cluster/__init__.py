@@ -1,1 +1,1 @@
-"""Run jobs on a cluster: Ray and Slurm."""
+"""Run jobs on a Ray cluster."""
