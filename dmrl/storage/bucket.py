@@ -5,7 +5,9 @@ for stored. Here an answer has a size and a time limit, belongs to one version o
 upload is complete once the server reports its size and hash.
 """
 
+import asyncio
 import hashlib
+import re
 import time
 from collections.abc import AsyncIterator
 from functools import partial
@@ -13,21 +15,16 @@ from pathlib import Path
 from typing import Any
 
 from aiobotocore.httpsession import AIOHTTPSession
+from aiohttp import ClientTimeout
 from botocore.exceptions import ConnectTimeoutError, HTTPClientError, ReadTimeoutError
 from s3fs import S3FileSystem
 
 from dmrl.errors import DmrlError, StorageError
 from dmrl.guards import limits
-from dmrl.storage.server_answers import (
-    build_timeout,
-    changed_error,
-    read_range,
-    read_up_to,
-    slow_server_error,
-    wrong_bytes_error,
-)
 
-"""Bytes per request when an object is copied."""
+PATIENCE_S, SLOWEST_BPS = 30.0, 50_000
+"""Timeout of an answer: a fixed part, seconds, and a minimum rate, bytes per second."""
+CONTENT_RANGE = re.compile(r"bytes (\d+)-(\d+)/(?:\d+|\*)")
 PART_BYTES = 50 << 20
 """Size of the parts of an upload; an object has at most `PARTS` of them."""
 PARTS = 10_000
@@ -50,16 +47,15 @@ class BucketFileSystem(S3FileSystem):  # type: ignore[misc]
         path: str,
         start: int | None = None,
         end: int | None = None,
-        version: dict[str, str] | None = None,
+        version: str | None = None,
         **_: Any,
     ) -> bytes:
         """Return the bytes from ``start`` to ``end`` of one version of an object."""
         if start is None or end is None:
             info = await self._info(path)
-            start, end, version = 0, int(info["size"]), {"ETag": info["ETag"]}
+            start, end, version = 0, int(info["size"]), info["ETag"]
         bucket, key, _version_id = self.split_path(path)
-        tag = (version or {}).get("ETag")
-        condition = {"IfMatch": tag} if tag else {}
+        condition = {"IfMatch": version} if version else {}
         asked = {"Range": f"bytes={start}-{end - 1}"} if end > start else {}
         try:
             answer = await self._call_s3("get_object", Bucket=bucket, Key=key, **condition, **asked)
@@ -68,7 +64,7 @@ class BucketFileSystem(S3FileSystem):  # type: ignore[misc]
                 raise changed_error(f"s3://{path}") from None
             raise
         try:
-            if tag and answer.get("ETag", tag) != tag:
+            if version and answer.get("ETag", version) != version:
                 raise changed_error(f"s3://{path}")
             if end == start:
                 return b""
@@ -149,7 +145,7 @@ class _LimitedRequests:
         sent = int(given["headers"].get("Content-Length", 0))
         start, _, last = given["headers"].get("Range", "").removeprefix("bytes=").partition("-")
         size = sent + (int(last) - int(start) if last else limits.ANSWER_BYTES)
-        given["timeout"] = build_timeout(size)
+        given["timeout"] = ClientTimeout(total=compute_patience_s(size))
         answer = await self._session.request(method, url=url, allow_redirects=False, **given)
         answer.read = partial(_read_document, answer)
         return answer
@@ -175,3 +171,59 @@ def _not_stored_error(path: str) -> StorageError:
         f"s3://{path}: the server does not store what it was sent. Check the bucket, and run it "
         "again"
     )
+
+
+async def read_up_to(stream: Any, size: int, url: str) -> bytes:
+    """Read ``size`` bytes of an answer, or all if there are fewer.
+
+    Raises
+    ------
+    StorageError
+        If the server is too slow.
+    """
+    parts, left = [], size
+    try:
+        async with asyncio.timeout(compute_patience_s(size)):
+            while left and (data := await stream.read(left)):
+                parts.append(data)
+                left -= len(data)
+    except TimeoutError:
+        raise slow_server_error(url) from None
+    return b"".join(parts)
+
+
+async def read_range(stream: Any, content_range: str, start: int, end: int, url: str) -> bytes:
+    """Return the bytes from ``start`` to ``end``, as the answer to a request for them.
+
+    Raises
+    ------
+    StorageError
+        If the server sends another range, or is too slow.
+    """
+    found = CONTENT_RANGE.fullmatch(content_range)
+    data = await read_up_to(stream, end - start, url)
+    if not found or int(found[1]) != start or len(data) != end - start:
+        raise wrong_bytes_error(url)
+    return data
+
+
+def compute_patience_s(size: int) -> float:
+    """Return the time for an answer of this size, seconds."""
+    return PATIENCE_S + size / SLOWEST_BPS
+
+
+def slow_server_error(url: str) -> StorageError:
+    """Return the error for an answer that does not end in time."""
+    return StorageError(f"{url}: the server is too slow. Try later, or copy the file")
+
+
+def wrong_bytes_error(url: str) -> StorageError:
+    """Return the error for an answer of other bytes."""
+    return StorageError(
+        f"{url}: the server sent other bytes than requested. Copy the file, and check it"
+    )
+
+
+def changed_error(url: str) -> StorageError:
+    """Return the error for a file that was replaced between two reads."""
+    return StorageError(f"{url} changed while it was read. Run it again")

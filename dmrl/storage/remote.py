@@ -22,7 +22,7 @@ from dmrl.guards.safe_names import safe_join, truncate
 from dmrl.storage.remote_stream import RangeReader
 from dmrl.storage.system import get_filesystem, translate_errors
 
-SCHEMES = ("s3", "gs", "gcs", "az", "abfs", "http", "https")
+SCHEMES = ("s3", "gs", "gcs", "az", "abfs")
 """Schemes of a remote name, before ``://``."""
 UNFINISHED_MARK = ".dmrl-unfinished"
 """Mark in a folder that is being written. A folder with it counts as missing."""
@@ -44,8 +44,7 @@ class RemotePath(PosixPath):
     @property
     def key(self) -> str:
         """Name in the file system of its scheme."""
-        rest = "/".join(self.parts[1:])
-        return f"{self.scheme}://{rest}" if self.scheme.startswith("http") else rest
+        return "/".join(self.parts[1:])
 
     @property
     def bucket(self) -> "RemotePath":
@@ -238,6 +237,8 @@ def to_path(name: str | os.PathLike[str]) -> Path:
     ------
     UnsafeName
         If it names a pipe or a device, where a read could block or never end.
+    StorageError
+        If it is the address of a file on a web server.
     """
     if isinstance(name, Path):
         return name
@@ -245,6 +246,8 @@ def to_path(name: str | os.PathLike[str]) -> Path:
     scheme, mark, _ = name.partition("://")
     if mark and scheme in SCHEMES:
         return RemotePath(name)
+    if mark and scheme in ("http", "https"):
+        raise StorageError(f"{name} is on a web server. Copy the file first: curl -O {name}")
     refuse_pipe(Path(name))
     return Path(name)
 

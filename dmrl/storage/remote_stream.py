@@ -13,16 +13,9 @@ BUFFER_BYTES = 512
 """Buffer size of small reads. Larger ranges are fetched unbuffered."""
 WHOLE_FILE_STEP_BYTES = 8 << 20
 """Bytes per request when a whole file is read."""
-VERSION_HEADERS = ("ETag", "Last-Modified")
-"""Properties that identify the version of a file."""
 
 ByteRange = tuple[int, int]
 """Start and size of a range, bytes."""
-
-
-def get_version(info: dict[str, Any]) -> dict[str, str]:
-    """Return the version of a file, from what its server reports about it."""
-    return {name: info[name] for name in VERSION_HEADERS if info.get(name)}
 
 
 class RangeReader(io.RawIOBase):
@@ -45,7 +38,7 @@ class RangeReader(io.RawIOBase):
         self._system, self._name, self._url = system, name, url
         self.size = int(info.get("size") or 0)
         checks = getattr(system, "checks_version", False)
-        self._more = {"version": get_version(info)} if checks else {}
+        self._more = {"version": info.get("ETag")} if checks else {}
         self._at = 0
         self._expected: list[ByteRange] = []
         self._prefetched: dict[ByteRange, bytes] = {}

@@ -8,7 +8,6 @@ from typing import Any
 from dmrl.errors import MissingExtra, StorageError
 
 SCHEME_PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
-SCHEME_PACKAGES |= {"http": "aiohttp", "https": "aiohttp"}
 """Package that each scheme needs."""
 
 
@@ -24,12 +23,7 @@ def get_filesystem(scheme: str) -> Any:
     try:
         import fsspec  # noqa: PLC0415 - an extra
 
-        # Imported here, as they need packages of the same extra.
-        if scheme in ("http", "https"):
-            from dmrl.storage.web import WebFileSystem  # noqa: PLC0415
-
-            return WebFileSystem(use_listings_cache=False)
-        if scheme == "s3":
+        if scheme == "s3":  # imported here, as it needs packages of the same extra
             from dmrl.storage.bucket import BucketFileSystem  # noqa: PLC0415
 
             return BucketFileSystem(use_listings_cache=False, skip_instance_cache=True)

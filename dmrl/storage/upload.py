@@ -19,8 +19,6 @@ from dmrl.storage.system import get_filesystem, translate_errors
 
 def require_bucket(path: RemotePath) -> None:
     """Raise StorageError unless the bucket of a path exists and can be written."""
-    if path.scheme.startswith("http"):
-        raise StorageError(f"{path}: web servers are read only. Name a bucket, or a folder here")
     with translate_errors(str(path)):
         exists = get_filesystem(path.scheme).exists(path.bucket.key)
     if not exists:

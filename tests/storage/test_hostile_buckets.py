@@ -16,7 +16,7 @@ import pytest
 from dmrl.atomic_output import atomic_file, atomic_folder
 from dmrl.errors import StorageError
 from dmrl.guards import limits
-from dmrl.storage import server_answers, to_path
+from dmrl.storage import bucket, to_path
 from dmrl.storage.system import get_filesystem
 
 from ..faults.ending import ended
@@ -243,8 +243,8 @@ def test_endless_listing_is_stopped(
     monkeypatch.setattr(limits, "LISTED_FILES", 3_000)
     monkeypatch.setattr(limits, "LISTING_S", 0.5)
     monkeypatch.setattr(limits, "ANSWER_BYTES", 100_000)
-    monkeypatch.setattr(server_answers, "PATIENCE_S", 0.5)
-    monkeypatch.setattr(server_answers, "SLOWEST_BPS", 1e6)
+    monkeypatch.setattr(bucket, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(bucket, "SLOWEST_BPS", 1e6)
     store.wrong = wrong
     with pytest.raises(StorageError, match=said):
         to_path("s3://lab/set").list_files()  # type: ignore[attr-defined]
@@ -269,7 +269,7 @@ def test_endless_listing_is_stopped(
 def test_bucket_bytes_beyond_the_request_are_not_read(
     wrong: str, said: str | None, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server_answers, "PATIENCE_S", 0.5 if wrong == "drips" else 30)
+    monkeypatch.setattr(bucket, "PATIENCE_S", 0.5 if wrong == "drips" else 30)
     store.wrong = wrong
     for command in ("info", "check"):
         store.reads = 0

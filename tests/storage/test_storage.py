@@ -226,7 +226,7 @@ def test_bucket_errors_are_one_line(
         (("info", "s3://lab/nothing.mcap"), "no recording s3://lab/nothing.mcap"),
         (("info", "s3://lab/wrong/text.mcap"), "is not an MCAP file"),
         (("trim", "s3://lab/wrong/good.mcap", "s3://nobody/a.mcap"), "there is no such bucket"),
-        (("trim", "s3://lab/wrong/good.mcap", "https://host/a.mcap"), "web servers are read only"),
+        (("trim", "s3://lab/wrong/good.mcap", "https://host/a.mcap"), "is on a web server. Copy"),
     ):
         line = run_command(capsys, 1, *words).err
         assert why in line and line.startswith("dmrl: ") and line.count("\n") == 1
