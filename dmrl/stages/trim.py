@@ -31,9 +31,6 @@ class Settings:
         End of the stretch, seconds from the recording's start. Messages of this time are not kept.
     topic
         Topic to keep, or a pattern such as /*/labels. Repeat for more. Without it, all.
-    only_decodable
-        Leave out images that cannot be decoded; each is decoded to see. Without it, images are
-        copied as they are.
     """
 
     from_s: Annotated[float | None, Parameter(name=["--from-s", "--from"])] = None
@@ -41,7 +38,6 @@ class Settings:
     topic: Annotated[
         tuple[str, ...], Parameter(negative=(), show_default=False, completer=complete_topic)
     ] = ()
-    only_decodable: Annotated[bool, Parameter(negative=())] = False
 
 
 def run(recording: Path, out: Path, settings: Settings) -> int:
@@ -88,7 +84,6 @@ def run(recording: Path, out: Path, settings: Settings) -> int:
         start_ns=low_ns,
         end_ns=high_ns,
         topics=settings.topic,
-        only_decodable=settings.only_decodable,
         origin=origin(recording, settings),
     )
 

@@ -107,22 +107,6 @@ def test_dataset_skips_broken_images(
     assert rc == 1 and "--strict" in output and not list(tmp_path.glob("no*"))
 
 
-def test_trim_only_decodable_removes_broken_images(
-    run: Run, recording: Path, broken: bytes, tmp_path: Path
-) -> None:
-    at_ns = time_of(recording, broken)
-    rc, _, output = run("trim", recording, tmp_path / "out.mcap", "--only-decodable")
-    assert rc == 0 and f"at {at_ns} ns" in output
-    kept = [(raw.topic, raw.time_ns, raw.data) for raw in read_raw(tmp_path / "out.mcap")]
-    want = [(raw.topic, raw.time_ns, raw.data) for raw in read_raw(recording)]
-    lost = [one for one in want if one[:2] == (CAMERA_IMAGE("cf1"), at_ns)]
-    assert len(lost) == 1
-    assert sorted(kept) == sorted(set(want) - set(lost))
-    rc, _, output = run("trim", recording, tmp_path / "all.mcap")
-    assert rc == 0 and not output
-    assert sum(1 for _ in read_raw(tmp_path / "all.mcap")) == len(want)
-
-
 def test_check_reports_broken_images(run: Run, recording: Path, broken: bytes) -> None:
     rc, told, _ = run("check", recording, "--json")
     texts = [finding["text"] for finding in told["findings"]]

@@ -11,13 +11,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from google.protobuf.message import DecodeError
 from mcap.records import Chunk
 from numpy.typing import NDArray
 
-from dmrl.errors import SourceError
-from dmrl.images.codec import UNDECODABLE, decode
-from dmrl.messages import message_class
 from dmrl.recording.mcap.batch_reader import count_messages, select_chunks
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunks.chunk import ParsedChunk
@@ -30,7 +26,6 @@ from dmrl.recording.mcap.record_scan import scan_file
 from dmrl.recording.mcap.summary_section import read_summary_section
 from dmrl.recording.summary import Definitions, read_summary
 from dmrl.recording.writer import RecordingWriter
-from dmrl.terminal.left_out import leave_out
 
 IMAGE_TYPE = "foxglove.CompressedImage"
 
@@ -75,42 +70,21 @@ class TopicSelection:
         Topics to copy.
     low_ns, high_ns
         Log times to copy, in [low_ns, high_ns), nanoseconds.
-    only_decodable
-        Leave out images that cannot be decoded.
     """
 
     topics: frozenset[str]
     low_ns: int = 0
     high_ns: int = MAX_TIME_NS
-    only_decodable: bool = False
 
     def mask_rows(self, unit: CopyUnit) -> NDArray[np.bool_]:
         """Return an (N,) mask of the selected messages of a unit."""
         batch, present = unit.batch, unit.batch.list_channel_ids()
         topics = {number: unit.channels[number].topic for number in present}
         in_range = np.asarray((batch.time_ns >= self.low_ns) & (batch.time_ns < self.high_ns))
-        if self.only_decodable:
-            in_range &= _mask_decodable(unit)
         if in_range.all() and self.topics.issuperset(topics.values()):
             return in_range
         mine = batch.mask_channels([n for n, topic in topics.items() if topic in self.topics])
         return np.asarray(mine & in_range)
-
-
-def _mask_decodable(unit: CopyUnit) -> NDArray[np.bool_]:
-    """Return an (N,) mask of the messages that are no images, or images that can be decoded."""
-    kept = np.ones(len(unit.batch), bool)
-    for k, (number, time_ns, _, data) in enumerate(unit.batch.iter_rows()):
-        channel = unit.channels[number]
-        if channel.schema_name != IMAGE_TYPE:
-            continue
-        try:
-            image = message_class("CompressedImage").FromString(data)
-            decode(image.data, f"the image of {channel.topic} at {time_ns} ns")
-        except (SourceError, DecodeError) as e:
-            leave_out(UNDECODABLE, e)
-            kept[k] = False
-    return kept
 
 
 def copy_messages(path: Path, selection: TopicSelection, sink: RecordingWriter) -> int:

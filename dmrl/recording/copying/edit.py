@@ -108,7 +108,6 @@ def trim(
     start_ns: int | None = None,
     end_ns: int | None = None,
     topics: Sequence[str] = (),
-    only_decodable: bool = False,
     origin: Provenance | None = None,
 ) -> int:
     """Write the messages of a time range, or of some topics, and return how many.
@@ -124,8 +123,6 @@ def trim(
         Log times to keep, in [start_ns, end_ns), nanoseconds.
     topics
         Topics or patterns to keep. Empty: all.
-    only_decodable
-        Leave out images that cannot be decoded.
     origin
         Provenance of ``out``. None: it has the settings above.
 
@@ -153,7 +150,7 @@ def trim(
         typed = frozenset(t for t in topics_to_keep if carries_own_type(t, source.topics[t].schema))
         for raw in _iter_calibrations(path, typed, low, high):
             sink.write_raw(raw)
-        selection = TopicSelection(topics_to_keep, start_ns or 0, high, only_decodable)
+        selection = TopicSelection(topics_to_keep, start_ns or 0, high)
         count = sum(write_unit(piece, selection, sink) for piece in iter_units(path, selection))
         if not count and source.count:
             raise RecordingError(
