@@ -7,25 +7,12 @@ import numpy as np
 import pytest
 
 from dmrl.geometry.frames import AIDECK
-from dmrl.rendering import worker_pool
-from dmrl.rendering.blender import protocol
 from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.renderer import Renderer, RobotModel, Scene
 from dmrl.rendering.shot import Light, Look, Robot
 from dmrl.rendering.sketch_renderer import Pose
 
 CAMERA = replace(AIDECK, distortion=())
-
-# A Blender that keeps its pixels to itself.
-SHUT = f"""
-import sys
-sys.path.insert(0, {str(Path(protocol.__file__).parent)!r})
-import passes, worker
-def refuse(result):
-    raise AttributeError("foreach_get")
-passes._take = refuse
-worker.main()
-"""
 
 
 def scene(light: str, depth_m: float) -> Scene:
@@ -34,24 +21,6 @@ def scene(light: str, depth_m: float) -> Scene:
     grey = np.full((CAMERA.height_px, CAMERA.width_px, 3), 0.3, np.float32)
     robot = Robot(Pose(np.array([depth_m, 0.1, -0.1]), np.eye(3)))
     return CAMERA, (robot,), Look(grey, shining, Sensor())
-
-
-@pytest.mark.heavy
-def test_pixels_come_through_files_where_memory_is_shut(
-    blender: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with Renderer(blender, RobotModel(), workers=1, samples=2) as renderer:
-        asked = [scene(renderer.lights[0], depth_m) for depth_m in (0.5, 1.0)]
-        expected = list(renderer.render_shots(asked))
-    monkeypatch.setattr(worker_pool, "WORKER_SCRIPT", tmp_path / "worker.py")
-    worker_pool.WORKER_SCRIPT.write_text(SHUT)
-    with Renderer(blender, RobotModel(), workers=1, samples=2) as renderer:
-        found = list(renderer.render_shots(asked))
-        assert renderer.pool.replaced == 0
-    for one, other in zip(found, expected, strict=True):
-        assert np.array_equal(one.rgb, other.rgb)
-        assert np.array_equal(one.surface_m, other.surface_m)
-        assert other.surface_m.max() > 0.4
 
 
 @pytest.mark.heavy

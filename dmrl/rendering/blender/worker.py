@@ -25,7 +25,7 @@ with limit_to_one_core():
 import numpy as np
 from light import Sky, load_panorama
 from mathutils import Matrix
-from passes import Passes
+from passes import render_passes
 from protocol import receive, send
 from robot import build_mesh, load_mesh
 
@@ -65,7 +65,6 @@ class RenderScene:
         # Blender keeps a mesh that two objects share. It would transform the mesh of a single
         # object and rebuild its BVH whenever the robot or the sun change.
         self.add_object("twin", mesh).matrix_world = Matrix.Translation((HIDDEN_OFFSET_M, 0, 0))
-        self.passes = Passes(self.scene)
 
     def configure_cycles(self, head):
         """Set Cycles' options."""
@@ -117,7 +116,7 @@ class RenderScene:
         # Required for changed properties. Without the refresh type, the mesh would be copied.
         self.robot.update_tag(refresh={"OBJECT"})
         self.scene.cycles.seed = head["seed"]
-        return self.passes.render()
+        return render_passes()
 
     def aim_camera(self, head):
         """Set the camera's intrinsics and the crop."""
