@@ -6,7 +6,6 @@ For arrays in and out. Stages on many recordings are jobs with names of files, s
 
 import multiprocessing
 import os
-import signal
 import threading
 import traceback
 from collections.abc import Callable, Generator, Sequence
@@ -16,6 +15,7 @@ from typing import Any, TypeVar
 
 from dmrl.errors import SettingError
 from dmrl.pipeline.process_pool import ONE_THREAD
+from dmrl.terminal.signals import block_ctrl_c
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
@@ -66,7 +66,8 @@ def _start_worker(function: Callable[[Item], Made], crew: dict[Connection, BaseP
     context = multiprocessing.get_context("spawn")  # a fork would copy threads half-way
     here, there = context.Pipe()
     process = context.Process(target=_run_worker, args=(there,), daemon=True)
-    process.start()
+    with block_ctrl_c():
+        process.start()
     crew[here] = process
     there.close()
     here.send(function)  # its imports run after the process is limited to one core
@@ -102,7 +103,6 @@ def _iter_in_order(items: Sequence[Any], idle: list[Connection]) -> Generator[An
 def _run_worker(pipe: Connection) -> None:
     """Run items in a new process: on one core, no longer than its parent lives."""
     os.environ.update(ONE_THREAD)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent ends us
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     function = pipe.recv()
     while True:

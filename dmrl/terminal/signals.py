@@ -74,3 +74,23 @@ def set_on_signal(ended: threading.Event) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def block_ctrl_c() -> Iterator[None]:
+    """Hold Ctrl-C back until the block ends; processes started in it never hear it.
+
+    A terminal sends it to all of them, and Python prints a traceback where it comes before any code
+    of ours runs. The process that starts them hears it, and ends them.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    from multiprocessing import resource_tracker  # noqa: PLC0415 - every command loads this file
+
+    resource_tracker.ensure_running()  # its start, with the first process, ends a block
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -25,6 +25,15 @@ if __name__ == "__main__":
     list(parallel_map(wait_there, [Path(sys.argv[1])] * 2, 2))
 """
 
+HEARS = """
+import signal
+from test_parallel_map import hears_ctrl_c
+from dmrl.pipeline.parallel_map import parallel_map
+
+if __name__ == "__main__":
+    print(list(parallel_map(hears_ctrl_c, [0, 1], 2)), hears_ctrl_c(0))
+"""
+
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,6 +62,21 @@ def much(value: int) -> bytes:
 def wait_there(folder: Path) -> None:
     (folder / str(os.getpid())).touch()
     time.sleep(60)
+
+
+def hears_ctrl_c(_: int) -> bool:
+    return signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_only_the_process_that_starts_others_hears_ctrl_c(tmp_path: Path) -> None:
+    """One that still starts would print a traceback."""
+    script = tmp_path / "hears.py"
+    script.write_text(HEARS)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+    done = subprocess.run(
+        [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "[False, False] True\n"
 
 
 def test_results_come_in_order_from_other_processes_of_one_core_each() -> None:

@@ -6,7 +6,6 @@ normalisations are then averaged, so that all processes have the same network af
 
 import multiprocessing
 import os
-import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -24,6 +23,7 @@ from torch._C._distributed_c10d import HashStore
 
 from dmrl.errors import DmrlError, SettingError
 from dmrl.learn.networks.architectures import Network
+from dmrl.terminal.signals import block_ctrl_c
 
 ResultT = TypeVar("ResultT")
 GroupWork = Callable[["ProcessGroup"], ResultT]
@@ -219,7 +219,8 @@ def _start_process(
     process = SPAWN.Process(
         target=_run_follower, args=(there, meeting, rank, size, work), daemon=True
     )
-    process.start()
+    with block_ctrl_c():  # rank 0 ends it
+        process.start()
     there.close()  # so that the other end detects the end of the process
     return here, process
 
@@ -228,7 +229,6 @@ def _run_follower(
     ready: Connection, meeting: str, rank: int, size: int, work: GroupWork[Any]
 ) -> None:
     """Run as a process other than rank 0."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # rank 0 ends it
     torch.set_num_threads(max(torch.get_num_threads() // size, 1))
     ready.send(True)
     with suppress(DmrlError):  # rank 0 reports it
