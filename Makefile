@@ -133,8 +133,9 @@ $(VERSIONS): constraints.txt
 	@mkdir -p $(@D)
 	@sed -e '/--hash/d' -e 's/ *\\$$//' $< > $@
 
+# The types of pandas are for editors: pandas brings none.
 $(VENV)/.demo: $(VENV)/.pip pyproject.toml $(VERSIONS)
-	$(INSTALL) '.[train,label,view,plot]'
+	$(INSTALL) '.[train,label,view,plot]' pandas-stubs
 	@$(POINT_TO_LAYOUT)
 	@touch $@
 

@@ -1,6 +1,6 @@
 """Detections of a network in a ROS 2 bag, read back with rosbags, which needs no ROS.
 
-Run it in an empty folder: python ros2_detections.py
+Needs ``pip install 'dmrl[ros]'``. Run it in an empty folder: python ros2_detections.py
 """
 
 from pathlib import Path
