@@ -7,7 +7,7 @@ corrections as recordings of source ``hand`` and flags as a CSV file; ``dmrl dat
 import json
 from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from hashlib import sha256
 from html import escape
 from importlib.resources import files
@@ -38,6 +38,7 @@ from dmrl.recording.provenance_inputs import read_provenance
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import track
 from dmrl.viewer.browse import RankedRows, image_size, rank_dataset
+from dmrl.viewer.content.faint_detections import DETECTION_FIELDS, GRID_FIELDS, find_faint
 from dmrl.viewer.label_suspicion import NEAR_PX, score_suspicion
 from dmrl.viewer.settings import Settings
 
@@ -61,6 +62,8 @@ class DeskRow:
         JPEG as the address of an image.
     labels, found
         Fields of its PeerLabel and Detection messages.
+    faint
+        Detections that only its confidence map holds; they are not shown.
     error_px
         Error of the worst label; None if unknown.
     suspicion
@@ -73,6 +76,7 @@ class DeskRow:
     image: str
     labels: list[dict[str, Any]]
     found: list[dict[str, Any]] = field(default_factory=list)
+    faint: list[dict[str, float]] = field(default_factory=list)
     error_px: float | None = None
     suspicion: float = 0.0
 
@@ -112,7 +116,8 @@ def write_flag_page(paths: Sequence[Path], out: Path, settings: Settings) -> int
     """
     found = any(path.is_dir() for path in paths)
     desk = _read_dataset(paths, settings) if found else _read_recordings(paths, settings)
-    scores = score_suspicion([(row.labels, row.found) for row in desk.rows], desk.size_px)
+    seen = [(row.labels, [*row.found, *row.faint]) for row in desk.rows]
+    scores = score_suspicion(seen, desk.size_px)
     for row, suspicion in zip(desk.rows, scores.tolist(), strict=True):
         row.suspicion = suspicion
     with atomic_file(out) as partial:
@@ -142,7 +147,9 @@ def build_page(desk: Desk) -> str:
         "metadata_name": METADATA_NAME,
         "provenance": provenance,
         "flag_columns": REQUIRED_COLUMNS,
-        "rows": [asdict(row) | {"time_ns": str(row.time_ns)} for row in desk.rows],
+        "rows": [
+            asdict(replace(row, faint=[])) | {"time_ns": str(row.time_ns)} for row in desk.rows
+        ],
     }
     # A closing tag inside a text would end the script that holds the data.
     plain = json.dumps(_without_infinities(data)).replace("<", "\\u003c")
@@ -179,7 +186,7 @@ def _read_dataset(paths: Sequence[Path], settings: Settings) -> Desk:
     size_px = image_size(ranked.rows)
     made = read_provenance(folder)
     inputs = {source.name: source for source in (made.inputs if made else ())}
-    threshold, found = _read_found(ranked)
+    threshold, found, faint = _read_found(ranked)
     rows = []
     for k in track(range(len(ranked.rows)), "Drawing"):
         row = ranked.rows.slice(k, 1).to_pylist()[0]
@@ -192,6 +199,7 @@ def _read_dataset(paths: Sequence[Path], settings: Settings) -> Desk:
                 _to_address(_pixels(row, *size_px), size_px),
                 [_fill_label(peer) for peer in row["peers"]],
                 found[k],
+                faint[k],
                 None if np.isnan(error) else min(error, 1e9),
             )
         )
@@ -199,13 +207,19 @@ def _read_dataset(paths: Sequence[Path], settings: Settings) -> Desk:
     return Desk(folder.name, size_px, rows, named, threshold)
 
 
-def _read_found(ranked: RankedRows) -> tuple[float, list[list[dict[str, Any]]]]:
-    """Return the threshold of a model, and its detections of each row."""
+def _read_found(
+    ranked: RankedRows,
+) -> tuple[float, list[list[dict[str, Any]]], list[list[dict[str, float]]]]:
+    """Return the threshold of a model, its detections of each row, and those of its map alone."""
+    faint: list[list[dict[str, float]]] = [[] for _ in range(len(ranked.rows))]
     if ranked.found is None:
-        return DEFAULT_THRESHOLD, [[] for _ in range(len(ranked.rows))]
+        return DEFAULT_THRESHOLD, [[] for _ in faint], faint
     batch = ranked.found.to_detections()
     threshold = max(batch["threshold"].to_pylist(), default=0.0) or DEFAULT_THRESHOLD
-    return threshold, batch["detections"].to_pylist()
+    found = batch["detections"].to_pylist()
+    for row, grid in ranked.found.iter_maps():
+        faint[row] = find_faint(grid.to_pylist()[0], found[row])
+    return threshold, found, faint
 
 
 def _fill_label(peer: Mapping[str, Any]) -> dict[str, Any]:
@@ -232,34 +246,29 @@ def _read_recordings(paths: Sequence[Path], settings: Settings) -> Desk:
 
 def _iter_rows(path: Path, robot: str) -> Iterator[tuple[DeskRow, float, tuple[int, int]]]:
     """Yield the images of a robot, the threshold of their detections, and their size."""
-    wanted = (topics.CAMERA_IMAGE(robot), topics.LABELS(robot), topics.DETECTIONS(robot))
+    kinds = {topics.LABELS: "PeerLabels", topics.DETECTIONS: "Detections", topics.GRID: "GridMap"}
     present = read_summary(path).topics
-    messages: dict[str, dict[int, Any]] = {topic: {} for topic in wanted}
-    for topic in wanted[1:]:
-        if topic in present:
-            messages[topic] = {one.time_ns: one.message for one in read(path, topic)}
-    nothing = message_class("PeerLabels")(), message_class("Detections")()
-    for stamped in read(path, wanted[0]):
-        labels, found = (
-            messages[topic].get(stamped.time_ns, none)
-            for topic, none in zip(wanted[1:], nothing, strict=True)
-        )
+    messages: list[tuple[dict[int, Any], Any]] = []
+    for topic, kind in ((of(robot), kind) for of, kind in kinds.items()):
+        told = read(path, topic) if topic in present else ()
+        messages.append(({one.time_ns: one.message for one in told}, message_class(kind)()))
+    for stamped in read(path, topics.CAMERA_IMAGE(robot)):
+        labels, found, grid = (held.get(stamped.time_ns, none) for held, none in messages)
         try:
             pixels = decode(stamped.message.data, f"{path}: image at {stamped.time_ns} ns")
         except DmrlError as e:
             leave_out("images that cannot be decoded", e)
             continue
         high, wide = pixels.shape[:2]
+        detections = [_message_fields(one, DETECTION_FIELDS) for one in found.detections]
         row = DeskRow(
             path.name,
             robot,
             stamped.time_ns,
             _to_address(pixels, (wide, high)),
             [_message_fields(one, LABEL_FIELDS) for one in labels.peers],
-            [
-                _message_fields(one, ("u_px", "v_px", "depth_m", "confidence"))
-                for one in found.detections
-            ],
+            detections,
+            find_faint(_message_fields(grid, GRID_FIELDS), detections),
         )
         yield row, float(found.threshold), (wide, high)
 

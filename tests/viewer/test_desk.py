@@ -1,5 +1,6 @@
 """The label desk in a browser: labels are moved, drawn, accepted, flagged and saved."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,7 @@ def test_edits_on_the_label_desk_reach_the_dataset(
         row = next(k for k, t in enumerate(times) if len(truth_of(truth, t)) >= 1)
         # 1: drag a label.
         browser.click(f"#row-{row}")
+        assert re.search(r", suspicion \d+ %[,.]", browser.run("return byId('facts').textContent;"))
         first = label(browser, row, 0)
         browser.drag(
             screen_place(browser, first["u_px"], first["v_px"]), screen_place(browser, 200, 100)
@@ -135,7 +137,8 @@ def test_pictures_that_were_never_labelled_become_a_dataset_on_the_desk(
         browser.press("n")
         at = screen_place(browser, 40, 60)
         browser.drag(at, at)
-        assert "no depth" in browser.run("return byId('facts').textContent;")
+        facts = browser.run("return byId('facts').textContent;")
+        assert "no depth" in facts and "suspicion" not in facts
         browser.press("j")
         browser.press("e")
         assert "nobody in view" in browser.run("return byId('facts').textContent;")

@@ -14,6 +14,7 @@ from dmrl.stages import dataset
 from dmrl.stages.view import command
 from dmrl.viewer import Settings
 from dmrl.viewer.flag_page import write_flag_page
+from dmrl.viewer.label_suspicion import score_suspicion
 
 from .conftest import Make
 
@@ -99,3 +100,24 @@ def test_names_of_recordings_cannot_become_markup(make: Make, tmp_path: Path) ->
 def test_a_page_is_called_html(make: Make, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"--flag \.html"):
         command([make()], flag_to=tmp_path / "flag.csv")
+
+
+@pytest.mark.parametrize("what", [["set", "flight.mcap"], ["flight.mcap"]])
+def test_suspicion_knows_the_peaks_of_maps_that_predict_left_out(
+    what: list[str], built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known: list[Any] = []
+
+    def score(images: list[Any], size_px: Any) -> Any:
+        known.extend(images)
+        return score_suspicion(images, size_px)
+
+    monkeypatch.setattr("dmrl.viewer.flag_page.score_suspicion", score)
+    write_flag_page([tmp_path / name for name in what], tmp_path / "flag.html", Settings())
+    assert len(known) == 10
+    for _, found in known:
+        sure, weak, faint = found
+        assert (sure["confidence"], weak["confidence"]) == (0.9, 0.1)
+        assert faint == pytest.approx({"u_px": 36, "v_px": 36, "depth_m": 1.8, "confidence": 0.06})
+    shown = [one for row in rows_of(tmp_path / "flag.html") for one in row["found"]]
+    assert len(shown) == 20

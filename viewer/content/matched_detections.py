@@ -51,20 +51,24 @@ class MatchedDetections:
         (batch,) = every.take(self.place % len(every)).combine_chunks().to_batches()
         return batch
 
+    def iter_maps(self) -> Iterator[tuple[int, pa.RecordBatch]]:
+        """Yield the number of each row that has a map, and the columns of its GridMap."""
+        rows: dict[tuple[Path, str], dict[int, list[int]]] = {}
+        for row, where in enumerate(self.where):
+            if where is not None:
+                rows.setdefault(where[:2], {}).setdefault(where[2], []).append(row)
+        for (path, robot), at in rows.items():
+            for time_ns, columns in _iter_maps(path, robot, list(at)):
+                yield from ((row, columns) for row in at[time_ns])
+
     def load_maps(self) -> pa.RecordBatch | None:
         """Read the columns of GridMap; None unless every row has one."""
         if any(where is None for where in self.where):
             return None
-        times: dict[tuple[Path, str], list[int]] = {}
-        for path, robot, time_ns in filter(None, self.where):
-            times.setdefault((path, robot), []).append(time_ns)
-        held = {}
-        for (path, robot), wanted_ns in times.items():
-            for time_ns, row in _iter_maps(path, robot, wanted_ns):
-                held[path, robot, time_ns] = row
-        if not all(where in held for where in self.where):
+        held = dict(self.iter_maps())
+        if len(held) < len(self.where):
             return None
-        rows = pa.Table.from_batches([held[where] for where in self.where if where])
+        rows = pa.Table.from_batches([held[row] for row in range(len(self.where))])
         (batch,) = rows.combine_chunks().to_batches()
         return batch
 

@@ -9,6 +9,7 @@ const svgTag = (name, attributes) => {
 };
 const rows = DATA.rows.map((row, index) => ({...row, index, first: JSON.stringify(row.labels),
   flagged: false, seen: false, empty: false}));
+const PREDICTED = rows.some(row => row.found.length);
 const changed = row => row.empty || JSON.stringify(row.labels) !== row.first;
 const sigmaOf = row => Math.max(0, ...row.labels.map(l => Math.max(l.sigma_u_px, l.sigma_v_px)));
 const confidenceOf = row => Math.max(0, ...row.found.map(f => f.confidence));
@@ -32,6 +33,7 @@ function draw(row, large) {
 
 function caption(row) {
   const parts = [row.source, row.robot, `${(Number(row.time_ns) / 1e9).toFixed(2)} s`];
+  if (PREDICTED) parts.push(`suspicion ${(100 * row.suspicion).toFixed(0)} %`);
   if (row.error_px !== null) parts.push(`error ${row.error_px < 1e6 ? row.error_px.toFixed(1) + ' px' : 'not found'}`);
   const sigma = sigmaOf(row);
   if (sigma > 0) parts.push(`sigma ${sigma.toFixed(1)} px`);
@@ -244,7 +246,7 @@ for (const status of new Set(rows.flatMap(row => row.labels.map(l => DATA.status
   byId('status').append(Object.assign(document.createElement('option'), {textContent: status}));
 const LEGEND = [...new Set([...rows.flatMap(row => row.labels.map(l => l.source)), 'hand'])].map(source =>
   [drawLabel({source, u_px: 0, v_px: 0}, ''), `label: ${source}`]);
-if (rows.some(row => row.found.length)) LEGEND.push([drawFound({u_px: 0, v_px: 0, confidence: 1}), `detection of ${DATA.threshold.toPrecision(2)} or more`],
+if (PREDICTED) LEGEND.push([drawFound({u_px: 0, v_px: 0, confidence: 1}), `detection of ${DATA.threshold.toPrecision(2)} or more`],
   [drawFound({u_px: 0, v_px: 0, confidence: 0}), 'less sure']);
 for (const [mark, words] of LEGEND) {
   const picture = svgTag('svg', {viewBox: [-18, -18, 36, 36].map(px => px * UNIT).join(' ')});
@@ -252,5 +254,5 @@ for (const [mark, words] of LEGEND) {
   byId('legend').append(picture, ` ${words}\u00a0 `);
 }
 byId('filters').addEventListener('input', list);
-if (!rows.some(row => row.found.length)) byId('order').value = 'time';
+if (!PREDICTED) byId('order').value = 'time';
 list();
