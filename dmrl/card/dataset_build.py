@@ -29,9 +29,8 @@ from dmrl.datasets.writing.dataset_writer import write_shards
 from dmrl.datasets.writing.exclusions import load_flags
 from dmrl.datasets.writing.inputs import warn_about_lenses
 from dmrl.datasets.writing.near_duplicates import ImageHashes
-from dmrl.datasets.writing.parts import assign_splits
 from dmrl.datasets.writing.rows import ExclusionCounts, RowFilter
-from dmrl.datasets.writing.splits import SplitLookup
+from dmrl.datasets.writing.splits import SplitLookup, assign_splits
 from dmrl.errors import SettingError
 from dmrl.recording import LoadedRecording, Provenance, build_provenance
 from dmrl.recording.provenance import FILE_NAME as PROVENANCE

@@ -1,12 +1,13 @@
 """Collect facts about the recordings of a dataset before their labels leave memory."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from dmrl import topics
 from dmrl.card.facts import Facts
-from dmrl.card.sensor_facts import describe_cameras, find_sensor_patterns
 from dmrl.datasets.writing.inputs import find_focal_lengths
 from dmrl.datasets.writing.label_choice import choose_label_source, find_label_sources
 from dmrl.datasets.writing.near_duplicates import ImageHashes
@@ -14,6 +15,40 @@ from dmrl.datasets.writing.rows import ExclusionCounts, count_images
 from dmrl.recording import LoadedRecording, list_label_findings, read_splits
 from dmrl.recording.licences import licences_in
 from dmrl.storage.shared_file import share_file
+
+NOT_SENSORS = (topics.CAMERA_IMAGE, topics.LABELS, topics.DETECTIONS, topics.GRID, topics.TRACKS)
+"""Topics that a dataset consists of, or that models compute: no sensors."""
+
+
+def find_sensor_patterns(names: Iterable[str]) -> list[str]:
+    """Return the patterns of sensor topics among these topics, in the order of the table."""
+    names = set(names)
+    patterns = (row.pattern for row in topics.TOPICS if row.pattern not in NOT_SENSORS)
+    return [p for p in patterns if any(topics.parse_topic(p, name) is not None for name in names)]
+
+
+def describe_cameras(held: Iterable[LoadedRecording]) -> dict[str, str]:
+    """Describe the first calibration of each robot's camera, by recording and robot."""
+    found = {}
+    for one in held:
+        for topic in one.topics:
+            if (names := topics.parse_topic(topics.CALIBRATION, topic)) is None:
+                continue
+            for stamped in islice(one.iter_messages(topic), 1):
+                if words := _describe_camera(stamped.message):
+                    found[f"{one.path.name}: {names['robot']}"] = words
+    return found
+
+
+def _describe_camera(calibration: Any) -> str:
+    """Describe a CameraCalibration in words; empty unless K is a row-major 3 x 3 matrix."""
+    if len(calibration.K) != 9:
+        return ""
+    fx, _, cx, _, fy, cy, *_ = calibration.K
+    size = f"{calibration.width} x {calibration.height} px"
+    words = f"{size}, fx {fx:.2f}, fy {fy:.2f}, cx {cx:.2f}, cy {cy:.2f}"
+    bent = ", ".join(f"{value:.4g}" for value in calibration.D)
+    return f"{words}, distortion {bent}" if any(calibration.D) else words
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,10 +4,6 @@ Times are log times in nanoseconds. `reader` reads messages, `writer` writes a r
 `summary` reads its topics and metadata. No other package imports mcap.
 """
 
-from dmrl.recording.attachments import (
-    copy_metadata_and_attachments as copy_metadata_and_attachments,
-)
-from dmrl.recording.attachments import read_splits as read_splits
 from dmrl.recording.checks.check_recording import check as check
 from dmrl.recording.checks.check_recording import list_label_findings as list_label_findings
 from dmrl.recording.checks.check_recording import print_findings as print_findings
@@ -46,5 +42,6 @@ from dmrl.recording.recovery_scan import Recovery as Recovery
 from dmrl.recording.summary import SPLIT_METADATA as SPLIT_METADATA
 from dmrl.recording.summary import Summary as Summary
 from dmrl.recording.summary import TopicInfo as TopicInfo
+from dmrl.recording.summary import read_splits as read_splits
 from dmrl.recording.summary import read_summary as read_summary
 from dmrl.recording.writer import RecordingWriter as RecordingWriter

@@ -11,7 +11,6 @@ from mcap.records import Channel as McapChannel
 
 from dmrl.errors import RecordingError
 from dmrl.guards import limits
-from dmrl.recording.attachments import copy_metadata_and_attachments
 from dmrl.recording.copying.chunk_copy import CopyUnit, adopt_definitions, write_unit
 from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.batch_reader import count_messages
@@ -81,9 +80,7 @@ def recover(path: Path, out: Path) -> Recovery:
             unused = state.channels.keys() - (+state.counts).keys()
             definitions = Definitions(state.schemas, state.channel_records, state.channels, unused)
             adopt_definitions(definitions, None, sink)
-            copy_metadata_and_attachments(
-                Summary({}, 0, 0, state.metadata, state.attachments), sink
-            )
+            sink.copy_extras(Summary({}, 0, 0, state.metadata, state.attachments))
     _complete_report(state)
     return state.recovery
 

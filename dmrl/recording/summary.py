@@ -8,6 +8,8 @@ from mcap.records import Attachment, Schema
 from mcap.records import Channel as McapChannel
 
 from dmrl.errors import RecordingError
+from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.safe_names import check_split_name
 from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.extra_records import read_attachment, read_metadata
@@ -147,3 +149,34 @@ def _parse_provenance(path: Path, metadata: dict[str, list[dict[str, str]]]) -> 
         return Provenance.from_metadata(metadata[METADATA_NAME][-1])
     except (ValueError, KeyError, TypeError, AttributeError) as e:
         raise RecordingError(f"{path}: its provenance is damaged ({e}). Make it again") from e
+
+
+def read_splits(path: Path, summary: Summary) -> dict[str, list[tuple[int, int]]]:
+    """Return the split that the source defines: name to log times in [first, last], nanoseconds.
+
+    Parameters
+    ----------
+    path
+        The recording, for errors.
+    found
+        Summary of the recording.
+
+    Raises
+    ------
+    RecordingError
+        If the metadata is malformed.
+    UnsafeName
+        If the name of a split cannot be a folder name.
+    """
+    out: dict[str, list[tuple[int, int]]] = {}
+    try:
+        for record in summary.metadata.get(SPLIT_METADATA, []):
+            for name, ranges in record.items():
+                check_split_name(name, f"{path}: a split")
+                out.setdefault(name, []).extend((int(a), int(b)) for a, b in parse_json(ranges))
+    except (ValueError, TypeError) as e:
+        raise RecordingError(
+            f"{path}: its split is not a list of [start_ns, end_ns] ({e}). "
+            "Convert it again, or ignore it with --split recordings"
+        ) from None
+    return out

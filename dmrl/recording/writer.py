@@ -16,6 +16,7 @@ from dmrl.atomic_output import as_output_error, atomic_file
 from dmrl.errors import OutputError, RecordingError
 from dmrl.messages import message_class as message_class
 from dmrl.messages import serialize_schema
+from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.channel import Channel, RawMessage
 from dmrl.recording.mcap.chunks.chunk_builder import ChunkBuilder
 from dmrl.recording.mcap.chunks.chunk_writer import OPEN_CHUNK_AGE_MAX, ChunkWriter
@@ -23,6 +24,7 @@ from dmrl.recording.mcap.file_writer import McapFileWriter
 from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, Ints
 from dmrl.recording.protobuf.encode import ColumnValue, encode
 from dmrl.recording.provenance import METADATA_NAME, Provenance
+from dmrl.recording.summary import Summary
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import count_so_far
 from dmrl.topics import find_topic
@@ -183,6 +185,19 @@ class RecordingWriter:
     def copy_attachment(self, attachment: Attachment) -> None:
         """Append an attachment of another recording, with its times and media type."""
         self._file.add_attachment(attachment)
+
+    def copy_extras(self, source: Summary) -> None:
+        """Copy metadata and attachments of another recording.
+
+        Provenance and recipe are left out: the provenance of this recording includes them.
+        """
+        for name, records in source.metadata.items():
+            if name not in (METADATA_NAME, checksums.METADATA_NAME):
+                for values in records:
+                    self.add_metadata(name, values)
+        for attachment in source.attachments:
+            if attachment.name != RECIPE_NAME:
+                self.copy_attachment(attachment)
 
     def flush(self) -> None:
         """Write the open chunks, so that they survive a kill of the process."""

@@ -73,12 +73,7 @@ def run(recording: In, out: Path, settings: Settings) -> "dict[str, Clock]":
     """
     from dmrl.estimation.signals.clock_estimation import Clock
     from dmrl.labelling.clocks.clock_alignment import SIGNALS, Sources, align_clocks, describe_clock
-    from dmrl.recording import (
-        LoadedRecording,
-        RecordingWriter,
-        build_provenance,
-        copy_metadata_and_attachments,
-    )
+    from dmrl.recording import LoadedRecording, RecordingWriter, build_provenance
 
     refuse_existing(out)
     held = LoadedRecording(recording, *SIGNALS)
@@ -89,7 +84,7 @@ def run(recording: In, out: Path, settings: Settings) -> "dict[str, Clock]":
         clocks[ALL] = Clock(later_ns * 1e-9, by="no time before 0")
     made = build_provenance("align", settings, [recording], libraries=("numpy",))
     with RecordingWriter(out, made) as sink:
-        copy_metadata_and_attachments(held.summary, sink)
+        sink.copy_extras(held.summary)
         described = {name: describe_clock(c, held.start_ns) for name, c in clocks.items()}
         sink.add_metadata(METADATA, {name: json.dumps(one) for name, one in described.items()})
         replace(corrected, later_ns=later_ns).write(sink)

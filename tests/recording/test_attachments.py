@@ -13,8 +13,16 @@ from mcap.writer import IndexType, Writer
 
 from dmrl.errors import RecordingError
 from dmrl.messages import message_class, serialize_schema
-from dmrl.recording import Provenance, RecordingWriter, check, merge, read_raw, read_summary, trim
-from dmrl.recording.attachments import copy_metadata_and_attachments, read_splits
+from dmrl.recording import (
+    Provenance,
+    RecordingWriter,
+    check,
+    merge,
+    read_raw,
+    read_splits,
+    read_summary,
+    trim,
+)
 from dmrl.recording.licences import (
     LICENCES_METADATA,
     extract_licence_title,
@@ -69,7 +77,7 @@ def test_metadata_and_attachments_are_copied_without_provenance_and_recipe(tmp_p
     one = recording(tmp_path / "a.mcap", ("own", {"k": "v"}), ("own", {"k": "w"}))
     other = tmp_path / "b.mcap"
     with RecordingWriter(other, Provenance("other")) as sink:
-        copy_metadata_and_attachments(read_summary(one), sink)
+        sink.copy_extras(read_summary(one))
     found = read_summary(other)
     assert found.metadata["own"] == [{"k": "v"}, {"k": "w"}]
     assert found.provenance is not None and found.provenance.stage == "other"

@@ -101,7 +101,7 @@ def test_input_changed_during_the_run_gives_one_line_error(
     def replace_it(*_: object) -> None:
         other.replace(path)
 
-    monkeypatch.setattr("dmrl.datasets.writing.parts.reject_duplicates", replace_it)
+    monkeypatch.setattr("dmrl.datasets.writing.splits.reject_duplicates", replace_it)
     assert boundary.run_to_status(lambda: app(["dataset", str(path), str(box.out / "set")])) == 1
     output = capsys.readouterr().err
     assert "flight.mcap was changed while it was read. Run it again" in output

@@ -33,7 +33,6 @@ from dmrl.errors import SourceError
 from dmrl.formats.aideck import published_firmware
 from dmrl.formats.aideck.chip_outputs import load_chip_maps
 from dmrl.formats.base import Content, Format, Options, read_text
-from dmrl.formats.files.crop import Crop
 from dmrl.formats.files.label_csv import read_labels
 from dmrl.formats.files.labelled_pictures import (
     IMAGE_SUFFIXES,
@@ -44,7 +43,7 @@ from dmrl.formats.files.labelled_pictures import (
     iter_picture_samples,
     natural_key,
 )
-from dmrl.formats.files.pictures import crop_camera
+from dmrl.formats.files.pictures import Crop, crop_camera
 from dmrl.geometry.camera_file import read_camera
 from dmrl.guards.paths import refuse_pipes
 from dmrl.samples.sample import Sample

@@ -14,9 +14,8 @@ from pathlib import Path, PurePosixPath
 
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats.base import Content, Options
-from dmrl.formats.files.crop import Crop
 from dmrl.formats.files.label_csv import LabelRow
-from dmrl.formats.files.pictures import PICTURE_OPTIONS, PictureConverter
+from dmrl.formats.files.pictures import PICTURE_OPTIONS, Crop, PictureConverter
 from dmrl.geometry.frames import Camera
 from dmrl.guards import limits
 from dmrl.guards.paths import refuse_pipes

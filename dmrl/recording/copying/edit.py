@@ -7,7 +7,6 @@ from itertools import combinations
 from pathlib import Path
 
 from dmrl.errors import RecordingError
-from dmrl.recording.attachments import copy_metadata_and_attachments
 from dmrl.recording.copying.chunk_copy import (
     CopyUnit,
     TopicSelection,
@@ -49,7 +48,7 @@ def merge(paths: Sequence[Path], out: Path) -> int:
     wanted = [TopicSelection(frozenset(read_summary(path).topics)) for path in paths]
     with RecordingWriter(out, build_provenance("merge", inputs=paths)) as sink:
         for path, every in zip(paths, wanted, strict=True):
-            copy_metadata_and_attachments(read_summary(path), sink)
+            sink.copy_extras(read_summary(path))
             adopt_channels(path, every.topics, sink)
         streams = [
             _iter_timed_units(path, every) for path, every in zip(paths, wanted, strict=True)
@@ -145,7 +144,7 @@ def trim(
     with open_mcap(path) as stream:
         profile = read_header(stream).profile
     with RecordingWriter(out, origin, profile=profile) as sink:
-        copy_metadata_and_attachments(source, sink)
+        sink.copy_extras(source)
         adopt_channels(path, topics_to_keep, sink)
         typed = frozenset(t for t in topics_to_keep if carries_own_type(t, source.topics[t].schema))
         for raw in _iter_calibrations(path, typed, low, high):

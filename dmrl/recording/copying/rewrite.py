@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dmrl.recording.attachments import copy_metadata_and_attachments
 from dmrl.recording.copying.chunk_copy import (
     TopicSelection,
     adopt_channels,
@@ -91,7 +90,7 @@ def rewrite(
         source = read_summary(recording)
         kept = frozenset(topic for topic in source.topics if topic not in without)
         with RecordingWriter(out, made) as sink:
-            copy_metadata_and_attachments(source, sink)
+            sink.copy_extras(source)
             for name, values in (metadata or {}).items():
                 sink.add_metadata(name, values)
             copy_messages(recording, TopicSelection(kept), sink)

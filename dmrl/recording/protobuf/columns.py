@@ -12,7 +12,7 @@ from dmrl.recording.mcap.file import corrupt_error
 from dmrl.recording.mcap.message_batch import MessageBatch
 from dmrl.recording.protobuf.decode import decode
 from dmrl.recording.protobuf.message_types import find_channel_descriptor
-from dmrl.recording.protobuf.wire_values import WireError
+from dmrl.recording.protobuf.wire_format import WireError
 from dmrl.terminal.progress import say_once
 
 TIMES = {"log_time": "time_ns", "publish_time": "publish_ns"}

@@ -1,6 +1,6 @@
 """Decode protobuf messages to Arrow columns, thousands at a time.
 
-The wire format is decoded field by field over all messages of a batch at once (`wire_scan`). A
+The wire format is decoded field by field over all messages of a batch at once (`wire_format`). A
 batch of messages of one layout (nearly every sensor topic) takes a few NumPy calls per field.
 Source: Protocol Buffers encoding specification.
 """
@@ -21,17 +21,20 @@ from numpy.typing import NDArray
 
 from dmrl.guards import limits
 from dmrl.recording.mcap.message_batch import Bytes, Ints
-from dmrl.recording.protobuf.wire_scan import MAX_DEPTH, FieldSpans, concatenate_spans, find_fields
-from dmrl.recording.protobuf.wire_values import (
+from dmrl.recording.protobuf.wire_format import (
     DELIMITED,
     FIXED_DTYPES,
+    MAX_DEPTH,
     VARINT,
     VARINT_DTYPES,
+    FieldSpans,
     WireError,
+    concatenate_spans,
     decode_fixed,
     decode_integers,
     decode_present,
     decode_strings,
+    find_fields,
     find_wire_type,
 )
 from dmrl.terminal.progress import say_once

@@ -14,7 +14,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from numpy.typing import ArrayLike, NDArray
 
 from dmrl.recording.mcap.message_batch import Bytes, Ints
-from dmrl.recording.protobuf.wire_values import (
+from dmrl.recording.protobuf.wire_format import (
     DELIMITED,
     FIXED_DTYPES,
     VARINT_DTYPES,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dmrl.formats.files.crop import Crop
 from dmrl.formats.files.label_csv import LabelRow
+from dmrl.formats.files.pictures import Crop
 from dmrl.geometry.frames import Camera, pixels_from_horizontal
 
 WIDE, HIGH = Crop(1000, 500, 320, 240), Crop(400, 900, 320, 240)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from dmrl.messages import message_class
 from dmrl.recording.protobuf.decode import decode
-from dmrl.recording.protobuf.wire_values import WireError, decode_varints
+from dmrl.recording.protobuf.wire_format import WireError, decode_varints
 
 F = FieldDescriptorProto
 TYPES = {

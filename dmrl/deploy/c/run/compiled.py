@@ -11,12 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.c import c_name, write_c
-from dmrl.deploy.c.harness import (
-    DETECTION_DTYPE,
-    MAX_DETECTIONS,
-    HarnessResult,
-    to_detections,
-)
+from dmrl.deploy.c.harness import DETECTION_DTYPE, MAX_DETECTIONS, HarnessResult, to_detections
 from dmrl.deploy.c.run.compile_targets import Build
 from dmrl.deploy.c.run.toolchain import find_host_compiler
 from dmrl.deploy.int8.network import IntegerNetwork
