@@ -95,7 +95,6 @@ REASONS = {
     "plots/style.py: stem.name + suffix": GIVEN,
     "recording/copying/resume.py: kept.name + '.new'": GIVEN,
     "recording/copying/resume.py: out.name + '.kept'": GIVEN,
-    "rendering/blender/passes.py: f'{name}{self.scene.frame_current:04d}.exr'": OURS,
     "rendering/blender_environment.py: f'{target.name}.partial-{os.getpid()}'": GIVEN,
     "stages/card.py: card.name": OURS,
     "stages/find.py: name": "validated as part of the catalogue, and only printed",
