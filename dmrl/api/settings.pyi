@@ -21,7 +21,7 @@ class LabelSettings(TypedDict, total=False):
     strict: bool
 
 class PredictSettings(TypedDict, total=False):
-    backend: Literal["torch", "onnx", "onnx-int8", "integer", "c"] | None
+    backend: Literal["torch", "onnx", "onnx-int8", "integer", "c", "riscv32"] | None
     threshold: float | None
     min_confidence: float
     most: int
@@ -97,7 +97,7 @@ class FlySettings(TypedDict, total=False):
     flown: int
     distance_m: float
     eye: Literal["truth", "ideal"] | str | PathLike[str]
-    backend: Literal["torch", "onnx", "onnx-int8", "integer", "c"] | None
+    backend: Literal["torch", "onnx", "onnx-int8", "integer", "c", "riscv32"] | None
     vision: Mapping[str, Any]
 
 class RenderSettings(TypedDict, total=False):

@@ -2,4 +2,4 @@
 
 from typing import Literal
 
-BackendName = Literal["torch", "onnx", "onnx-int8", "integer", "c"]
+BackendName = Literal["torch", "onnx", "onnx-int8", "integer", "c", "riscv32"]

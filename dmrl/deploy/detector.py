@@ -38,6 +38,7 @@ BACKEND_PACKAGES: dict[BackendName, tuple[str, ...]] = {
     "onnx-int8": ("onnxruntime", "numpy"),
     "integer": ("numpy",),
     "c": ("numpy",),
+    "riscv32": ("numpy",),
 }
 """Packages whose version can change the output of a backend."""
 
@@ -95,8 +96,8 @@ def open_detector(model: Path, backend: BackendName) -> Detector:
     model
         Run folder, .safetensors, Keras .h5, quantised model or export folder.
     backend
-        "torch" and "onnx" are float. "integer" (NumPy), "onnx-int8" and "c" are int8 and require
-        a quantised model or an export folder.
+        "torch" and "onnx" are float. "integer" (NumPy), "onnx-int8", "c" and "riscv32" (the C,
+        emulated) are int8 and require a quantised model or an export folder.
 
     Raises
     ------
@@ -218,11 +219,12 @@ def _open_c(model: Path, backend: BackendName) -> Detector:
     network = _load_int8_network(model, backend)
     # With their template engine, these are not for the backends that start fast.
     from dmrl.deploy.c import c_name  # noqa: PLC0415
-    from dmrl.deploy.c.run.compiled import CompiledNetwork  # noqa: PLC0415
+    from dmrl.deploy.c.run.compiled import RISCV32, CompiledNetwork, EmulatedNetwork  # noqa: PLC0415
 
     source = model / f"{c_name(network)}.c"
     exported = source.is_file()
-    runs = Int8Backend(network, CompiledNetwork(network, model if exported else None).run)
+    kind = EmulatedNetwork if backend == RISCV32 else CompiledNetwork
+    runs = Int8Backend(network, kind(network, model if exported else None).run)
     return _build_detector(model, network, runs, source if exported else _integer_path(model))
 
 
@@ -304,4 +306,5 @@ OPENERS: dict[BackendName, Callable[[Path, BackendName], Detector]] = {
     "onnx-int8": _open_onnx_int8,
     "integer": _open_integer,
     "c": _open_c,
+    "riscv32": _open_c,
 }

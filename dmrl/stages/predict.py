@@ -24,9 +24,10 @@ class Settings:
     Parameters
     ----------
     backend
-        Backend. torch and onnx are float; onnx-int8, integer (NumPy) and c are int8, and need
-        a quantised model or an export folder. Without it, onnx where it is installed and
-        supports all outputs of the network, else torch.
+        Backend. torch and onnx are float; onnx-int8, integer (NumPy), c and riscv32 (the C
+        in an emulator, seconds an image) are int8, and need a quantised model or an export
+        folder. Without it, onnx where it is installed and supports all outputs of the network,
+        else torch.
     threshold
         Confidence threshold, 0 to 1, stored with the detections. Without it, the model's.
     min_confidence

@@ -10,20 +10,25 @@ import pytest
 import torch
 
 from dmrl.deploy.backends import build_reference_backend, to_grids, to_network_input
+from dmrl.deploy.c.run.toolchain import EMULATOR, RISCV, find_missing
 from dmrl.deploy.detector import Detector, open_detector
 from dmrl.deploy.int8.graph import rgb_to_grey
 from dmrl.deploy.int8.store import INTEGER_NAME, save_network
 from dmrl.deploy.onnx import float_cache
 from dmrl.deploy.onnx.float_model import float_onnx_of
-from dmrl.errors import ModelError, SettingError
+from dmrl.errors import ModelError, SettingError, ToolError
 from dmrl.learn.inference.loaded_model import Model, load_model, save_model
 from dmrl.learn.networks.architectures import build_network
 
 from .graphs import quantised_network
 
+needs_riscv = pytest.mark.skipif(bool(find_missing(RISCV, EMULATOR)), reason="no RISC-V tools")
+
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("backend", ["integer", "onnx-int8", "c"])
+@pytest.mark.parametrize(
+    "backend", ["integer", "onnx-int8", "c", pytest.param("riscv32", marks=needs_riscv)]
+)
 def test_int8_backends_give_equal_outputs(backend: str, tmp_path: Path) -> None:
     network = replace(quantised_network(11), threshold=0.37)
     save_network(network, tmp_path / INTEGER_NAME)
@@ -78,7 +83,7 @@ def test_float_backends_and_export_give_equal_outputs(tmp_path: Path) -> None:
     assert [d.file for d in found.values()] == [weights, weights, onnx]
     with pytest.raises(ModelError, match=r"is an export folder, which torch cannot run"):
         open_detector(export, "torch")
-    for backend in ("integer", "onnx-int8", "c"):
+    for backend in ("integer", "onnx-int8", "c", "riscv32"):
         with pytest.raises(ModelError, match=f"as --backend {backend} needs"):
             open_detector(run, backend)  # type: ignore[arg-type]
         with pytest.raises(ModelError, match=f"--backend {backend} is int8"):
@@ -132,6 +137,15 @@ def test_extreme_logits_do_not_overflow() -> None:
     assert (grids.offset[:, 0] == far).all()
     assert (grids.offset[:, 1] == 2 * far).all()
     assert to_grids({"confidence": far, "log_depth": far, "offset_u": far}).offset is None
+
+
+def test_missing_risc_v_tools_error_names_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_network(quantised_network(0), tmp_path / INTEGER_NAME)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ToolError, match="apt-get install gcc-riscv64-unknown-elf"):
+        open_detector(tmp_path, "riscv32")
 
 
 def test_the_cache_keeps_the_newest_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""C of a network, run as a shared library (``--backend c``)."""
+"""C of a network, run as a shared library (``--backend c``) or emulated (``riscv32``)."""
 
 import ctypes
 import platform
@@ -11,21 +11,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.deploy.c import c_name, write_c
-from dmrl.deploy.c.harness import DETECTION_DTYPE, MAX_DETECTIONS, HarnessResult, to_detections
-from dmrl.deploy.c.run.compile_targets import Build
-from dmrl.deploy.c.run.toolchain import find_host_compiler
+from dmrl.deploy.c.harness import (
+    DETECTION_DTYPE,
+    MAX_DETECTIONS,
+    HarnessResult,
+    parse_results,
+    to_detections,
+)
+from dmrl.deploy.c.run.compile_targets import Build, list_targets
+from dmrl.deploy.c.run.toolchain import find_host_compiler, run_program
 from dmrl.deploy.int8.network import IntegerNetwork
-from dmrl.errors import ModelError
+from dmrl.errors import ModelError, ToolError
 
+RISCV32 = "riscv32"
 LIBRARY_FLAGS = ("-O3", "-shared", "-fPIC", "-DHARNESS_SHARED")
 # Rows are short: 512-bit vectors would spend their time on remainders.
 X86_FLAGS = ("-march=native", "-mprefer-vector-width=256")
 
 
-class CompiledNetwork:
-    """A network, compiled for this machine. Not thread-safe: the C has one state.
+class BuiltNetwork:
+    """Folder of a compiled network, removed with this object.
 
-    The library lies in a folder that is removed with this object.
+    Parameters
+    ----------
+    network
+        Network of the C.
+    folder
+        Export folder with the C. None: the C is generated.
+
+    Raises
+    ------
+    ModelError
+        If the folder has no C, or the C does not support the network.
+    """
+
+    def __init__(self, network: IntegerNetwork, folder: Path | None) -> None:
+        self.network = network
+        self.build = Path(tempfile.mkdtemp(prefix="dmrl-c-"))
+        self._remove = weakref.finalize(self, shutil.rmtree, self.build, ignore_errors=True)
+        self.folder = folder or self.build
+        if folder is None:
+            write_c(network, self.build, [])
+        require_c_files(network, self.folder)
+
+
+class CompiledNetwork(BuiltNetwork):
+    """A network, compiled for this machine. Not thread-safe: the C has one state.
 
     Parameters
     ----------
@@ -47,15 +78,10 @@ class CompiledNetwork:
     def __init__(
         self, network: IntegerNetwork, folder: Path | None = None, compiler: str | None = None
     ) -> None:
-        self.network = network
-        place = Path(tempfile.mkdtemp(prefix="dmrl-c-"))
-        self._remove = weakref.finalize(self, shutil.rmtree, place, ignore_errors=True)
-        if folder is None:
-            write_c(network, place, [])
-        require_c_files(network, folder or place)
+        super().__init__(network, folder)
         own = X86_FLAGS if platform.machine() in ("x86_64", "AMD64") else ()
         build = Build("library", compiler or find_host_compiler(), (*LIBRARY_FLAGS, *own))
-        (library,) = build.compile_program(network, folder or place, place)
+        (library,) = build.compile_program(network, self.folder, self.build)
         self._run = ctypes.CDLL(str(library)).harness_run
 
     def run_detections(self, image: NDArray[np.uint8], most: int = MAX_DETECTIONS) -> HarnessResult:
@@ -73,6 +99,43 @@ class CompiledNetwork:
     def run(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
         """Return every head's grid, as `run_network` of ``reference`` does."""
         return self.run_detections(image).grids
+
+
+class EmulatedNetwork(BuiltNetwork):
+    """A network, compiled for rv32imc and emulated. An image takes seconds.
+
+    Output is that of the chip; speed is not.
+
+    Parameters
+    ----------
+    network
+        Network of the C.
+    folder
+        Export folder with the C. None: the C is generated.
+
+    Raises
+    ------
+    ToolError
+        If the compiler or the emulator is missing, or compilation fails.
+    ModelError
+        If the folder has no C, or the C does not support the network.
+    """
+
+    def __init__(self, network: IntegerNetwork, folder: Path | None = None) -> None:
+        target = next(t for t in list_targets() if t.name == RISCV32)
+        if target.skipped:
+            raise ToolError(f"--backend {RISCV32}: {target.skipped}")
+        super().__init__(network, folder)
+        self._what = f"{c_name(network)}.c on {RISCV32}"
+        self._program = target.builds[0].compile_program(network, self.folder, self.build)
+
+    def run(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
+        """Return every head's grid, as `run_network` of ``reference`` does."""
+        said = run_program(self._program, self._what, data=np.ascontiguousarray(image).tobytes())
+        found = parse_results(self.network, said)
+        if len(found) != 1:
+            raise ToolError(f"{self._what}: {len(found)} results for one image. Export it again")
+        return found[0].grids
 
 
 def require_c_files(network: IntegerNetwork, folder: Path) -> None:
