@@ -57,9 +57,9 @@ class ErrorModel:
     log_odds: float = RARE
 
     @property
-    def changes(self) -> bool:
-        """Whether the error changes over time."""
-        return any(not row.is_constant for row in self.rows)
+    def adds_constants(self) -> bool:
+        """Whether it adds unknowns, all of them constants."""
+        return bool(self.rows) and all(row.is_constant for row in self.rows)
 
     def owners(self) -> tuple[int | None, ...]:
         """Return the robots of a pair whose sensor it may be; None: the pair's."""

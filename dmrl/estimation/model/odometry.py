@@ -134,5 +134,7 @@ def _integrate(rate: Array, time_s: Array) -> Array:
 def rotate(matrices: Array, vectors: Array) -> Array:
     """Multiply (..., 2, 2) matrices with (..., 2) vectors, pair by pair."""
     x, y = vectors[..., 0], vectors[..., 1]
-    rotated = [row[0] * x + row[1] * y for row in np.moveaxis(matrices, (-2, -1), (0, 1))]
-    return np.moveaxis(np.stack(rotated), 0, -1)
+    out = np.empty(np.broadcast_shapes(matrices.shape[:-1], vectors.shape))
+    for k in range(2):
+        out[..., k] = matrices[..., k, 0] * x + matrices[..., k, 1] * y
+    return out

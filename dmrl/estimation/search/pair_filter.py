@@ -165,6 +165,7 @@ def run_lanes(
         (filters, SIZE, SIZE), (filters,),
     )))  # fmt: skip
     keys = np.stack([_pad_with_none(lane.keyframe, count) for lane in lanes])
+    motions = _list_motions(inputs, keys)
     columns = [np.flatnonzero(lane_of == number) for number in range(len(lanes))]
     for t in range(count):
         out.prior[t], out.prior_covariance[t] = state, covariance
@@ -176,10 +177,10 @@ def run_lanes(
                 _update_image(state, covariance, inputs, int(keys[number, t]), mine, image, out, t)
         out.state[t], out.covariance[t] = state, covariance
         if t < count - 1:
-            state, step, variance = _propagate(state, inputs, key, keys[lane_of, t + 1])
+            state, step = _propagate(state, motions, lane_of, t)
             out.step[t] = step
             covariance = step @ covariance @ step.swapaxes(1, 2)
-            covariance[:, range(SIZE), range(SIZE)] += variance
+            covariance[:, range(SIZE), range(SIZE)] += motions.variance[lane_of, t]
     return out
 
 
@@ -187,20 +188,45 @@ def _pad_with_none(keyframe: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     return np.concatenate([keyframe[:count], np.full(max(count - len(keyframe), 0), -1)])
 
 
+@dataclass(frozen=True, slots=True)
+class _Motions:
+    """Motions of L lanes from each of T keyframes to the next; none after the end of a lane.
+
+    ``seconds`` (L, T - 1), negative backwards; ``turns`` (L, T - 1, 2), ``shifts``
+    (L, T - 1, 2, 2) of observer and peer, ``variance`` (L, T - 1, 5).
+    """
+
+    seconds: Array
+    turns: Array
+    shifts: Array
+    variance: Array
+
+
+def _list_motions(inputs: FilterInputs, keys: NDArray[np.intp]) -> _Motions:
+    """Return the motions of lanes whose (L, T) keyframes are given, -1 after the end.
+
+    Backwards a step is its inverse: the turn negated, the shift seen from its end.
+    """
+    before, after = keys[:, :-1], keys[:, 1:]
+    moving = after >= 0
+    step = np.where(moving, np.minimum(before, after), 0)
+    sign = np.where(after > before, 1.0, -1.0) * moving
+    turns = inputs.turns[step]
+    seen_from = np.where((sign < 0)[..., None], -turns, 0.0)
+    return _Motions(
+        sign * inputs.step_s[step],
+        sign[..., None] * turns,
+        sign[..., None, None] * rotate(rotation_matrix(seen_from), inputs.shifts[step]),
+        inputs.step_var[step] * moving[..., None],
+    )
+
+
 def _propagate(
-    state: Array, inputs: FilterInputs, key: NDArray[np.intp], after: NDArray[np.intp]
-) -> tuple[Array, Array, Array]:
-    """Return (B, 5) states at the next keyframe, (B, 5, 5) Jacobians and (B, 5) variances."""
-    moving, forwards = after >= 0, after > key
-    step = np.where(moving, np.minimum(key, after), 0)
-    seconds = np.where(moving, np.where(forwards, 1.0, -1.0), 0.0) * inputs.step_s[step]
-    turns, shifts = inputs.turns[step], inputs.shifts[step]
-    # Backwards a step is its inverse: the turn negated, the shift seen from its end.
-    sign = np.where(forwards, 1.0, -1.0)
-    turned = rotation_matrix(np.where(forwards[:, None], 0.0, -turns))
-    shifts = sign[:, None, None] * np.einsum("brij,brj->bri", turned, shifts)
-    shifts *= moving[:, None, None]
-    turns = turns * (sign * moving)[:, None] - seconds[:, None] * state[:, 3:5]
+    state: Array, motions: _Motions, lane: NDArray[np.intp], t: int
+) -> tuple[Array, Array]:
+    """Return (B, 5) states at the next keyframe of their lanes, and (B, 5, 5) Jacobians."""
+    seconds, shifts = motions.seconds[lane, t], motions.shifts[lane, t]
+    turns = motions.turns[lane, t] - seconds[:, None] * state[:, 3:5]
     peer = rotate(rotation_matrix(state[:, 2]), shifts[:, 1])
     back = rotation_matrix(-turns[:, 0])
     out = state.copy()
@@ -212,7 +238,7 @@ def _propagate(
     jacobian[:, :2, 3] = seconds[:, None] * (out[:, :2] @ QUARTER_TURN.T)
     jacobian[:, [2, 3, 4], [2, 3, 4]] = 1.0
     jacobian[:, 2, 3], jacobian[:, 2, 4] = seconds, -seconds
-    return out, jacobian, inputs.step_var[step] * moving[:, None]
+    return out, jacobian
 
 
 def _update_ranges(

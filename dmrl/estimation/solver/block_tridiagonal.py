@@ -133,6 +133,36 @@ def solve_step(equations: NormalEquations) -> Solved:
         If the matrix is not positive definite.
     """
     size, width = len(equations.globals_block), equations.diagonal.shape[1]
+    log_det, solved, rest, vector = _eliminate_states(equations)
+    covariance = np.linalg.inv(rest)
+    constants = -covariance @ vector
+    state = -solved[:, 0] - solved[:, 1:] @ constants
+    return Solved(
+        state.reshape(-1, width),
+        constants,
+        solved[:, 1:].reshape(-1, width, size),
+        covariance,
+        log_det + float(np.linalg.slogdet(rest)[1]),
+    )
+
+
+def reduce_to_constants(equations: NormalEquations) -> tuple[Array, Array]:
+    """Eliminate all keyframes; return (G, G) information and (G,) gradient of the constants.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the keyframes' matrix is not positive definite.
+    """
+    return _eliminate_states(equations)[2:]
+
+
+def _eliminate_states(equations: NormalEquations) -> tuple[float, Array, Array, Array]:
+    """Return the log determinant of the keyframes' matrix C, and C^-1 by gradient and coupling.
+
+    Then (G, G) and (G,) of the Schur complement.
+    """
+    size = len(equations.globals_block)
     factor = cholesky_banded(
         to_upper_bands(equations.diagonal, equations.off_diagonal), check_finite=False
     )
@@ -144,16 +174,8 @@ def solve_step(equations: NormalEquations) -> Solved:
     )
     border = equations.coupling.reshape(-1, size)
     rest = equations.globals_block - border.T @ solved[:, 1:]
-    covariance = np.linalg.inv(rest)
-    constants = -covariance @ (equations.globals_gradient - border.T @ solved[:, 0])
-    state = -solved[:, 0] - solved[:, 1:] @ constants
-    return Solved(
-        state.reshape(-1, width),
-        constants,
-        solved[:, 1:].reshape(-1, width, size),
-        covariance,
-        float(2 * np.log(factor[-1]).sum() + np.linalg.slogdet(rest)[1]),
-    )
+    vector = equations.globals_gradient - border.T @ solved[:, 0]
+    return float(2 * np.log(factor[-1]).sum()), solved, rest, vector
 
 
 def marginal_covariances(diagonal: Array, above: Array) -> Array:
