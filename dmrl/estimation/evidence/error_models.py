@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 COMMON, RARE = -4.5, -7.0
 """Prior log odds of models against the plain one: errors that most labs have met, and others."""
+FOR_A_WHILE = RARE - 2 * np.log(50)
+"""Prior log odds of noise in a stretch: its ends are two of the 50 windows of a flight of 100 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +48,8 @@ class ErrorModel:
         Unknowns that it adds to the table.
     range_factor, flow_factor
         Factors of the noise of ranges, and of the velocity noise of one robot.
+    for_a_while
+        Whether the velocity of one robot has another noise in stretches, which `posterior` finds.
     log_odds
         Prior log odds against the plain model.
     """
@@ -54,6 +58,7 @@ class ErrorModel:
     rows: tuple[Unknown, ...] = ()
     range_factor: float = 1.0
     flow_factor: float = 1.0
+    for_a_while: bool = False
     log_odds: float = RARE
 
     @property
@@ -63,7 +68,7 @@ class ErrorModel:
 
     def owners(self) -> tuple[int | None, ...]:
         """Return the robots of a pair whose sensor it may be; None: the pair's."""
-        if self.flow_factor != 1.0:
+        if self.flow_factor != 1.0 or self.for_a_while:
             return 0, 1
         if not self.rows:
             return (None,)
@@ -248,6 +253,7 @@ MODELS: tuple[ErrorModel, ...] = (
         ),
     ),
     ErrorModel("flow noise", flow_factor=4.0, log_odds=COMMON),
+    ErrorModel("flow noise for a while", for_a_while=True, log_odds=FOR_A_WHILE),
     ErrorModel(
         "range offset",
         (Unknown("range_offset_free", "m", 0.4, "pair", range=longer),),

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from dmrl.estimation.evidence.posterior import Member, Mixture, weigh_models
+from dmrl.estimation.evidence.model_trials import Member
+from dmrl.estimation.evidence.posterior import Mixture, weigh_models
 from dmrl.estimation.model.bearings import ASSOCIATION_GATE
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.search.hypotheses import Track

@@ -244,10 +244,11 @@ def find_contradicted_steps(problem: Problem, values: Values) -> Mask:
     for robot in range(len(problem.robots)):
         rows = odometry_factor(problem, layout, robot, values)
         wrong |= (rows.square > CONTRADICTED_SIGMAS**2).any(axis=1)
-    for k, (_, row) in enumerate(layout.states):
+    for k, ((_, own), row) in enumerate(layout.states):
         if row.motion and row.evolution == "fading":
             error = np.abs(values.state[:, 3 * layout.robots + k]) / (row.std * problem.noise.grade)
-            wrong |= np.maximum(error[1:], error[:-1]) > CONTRADICTED_SIGMAS
+            sigmas = np.maximum(error[1:], error[:-1]) / problem.robots[own[0]].grade
+            wrong |= sigmas > CONTRADICTED_SIGMAS
     around = round(MAX_DROPOUT_S / float(np.median(np.diff(problem.keyframe_s))))
     for link in problem.links:
         found = range_factor(problem, layout, link, values)

@@ -39,8 +39,10 @@ def linearize(
     steps_s = problem.robots[0].steps_s
     for k, (subject, row) in enumerate(layout.states):
         kept, std = row.step_model(steps_s)
-        grade = problem.noise.grade if row.graded else 1.0
-        start = (row.std if row.evolution == "fading" else row.start_std) * grade
+        grade = np.full(len(std), problem.noise.grade if row.graded else 1.0)
+        if row.graded and row.motion:
+            grade *= problem.robots[subject[1][0]].grade
+        start = (row.std if row.evolution == "fading" else row.start_std) * grade[0]
         start = np.inf if subject in known and row.evolution != "fading" else start
         column = 3 * layout.robots + k
         value = values.state[:, column]

@@ -93,7 +93,9 @@ class Steps:
     height_m
         (K,) measured heights.
     noise_factor
-        Factor of the robot's velocity noise, beside the grade of the flight.
+        Factor of the white noise of the robot's velocity, beside the grade of the flight.
+    grade
+        (S,) factor of all noise of the velocity of each step, beside the grade of the flight.
     """
 
     steps_s: Array
@@ -104,6 +106,7 @@ class Steps:
     path: Odometry
     height_m: Array
     noise_factor: float = 1.0
+    grade: Array | float = 1.0
 
 
 @dataclass(frozen=True, slots=True)

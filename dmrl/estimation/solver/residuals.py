@@ -92,7 +92,9 @@ class Rows:
 def odometry_variance(problem: Problem, robot: int) -> Array:
     """Return (S, 3) variances of the measured motions between keyframes."""
     steps, noise = problem.robots[robot], problem.noise
-    shift = noise.velocity_psd * (noise.grade * steps.noise_factor) ** 2 * steps.steps_s
+    shift = (
+        noise.velocity_psd * (noise.grade * steps.noise_factor * steps.grade) ** 2 * steps.steps_s
+    )
     shift = shift + noise.dropout_speed_mps**2 * steps.dropout_s
     turn = noise.yaw_rate_psd * steps.steps_s + noise.dropout_turn_radps**2 * steps.turn_dropout_s
     return np.stack([shift, shift, turn]).T

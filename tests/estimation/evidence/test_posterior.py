@@ -7,7 +7,7 @@ import pytest
 from dmrl.estimation.evidence import posterior
 from dmrl.estimation.evidence.causes import find_dropouts, join_causes
 from dmrl.estimation.evidence.error_models import MODELS, Candidate, list_candidates
-from dmrl.estimation.evidence.posterior import Member
+from dmrl.estimation.evidence.model_trials import Member
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.solver.estimate import Cause
 from dmrl.estimation.solver.keyframes import build_problem
@@ -91,8 +91,8 @@ def test_rivals_of_a_round_get_the_models_of_later_rounds(monkeypatch: pytest.Mo
     def extended(base: Member, candidate: Candidate, _others: object) -> list[Member]:
         return [replace(base, models=(*base.models, candidate), score=base.score + 1.0)]
 
-    monkeypatch.setattr(posterior, "_try_model", extended)
-    monkeypatch.setattr(posterior, "_select_grade", lambda member: member)
+    monkeypatch.setattr(posterior, "try_model", extended)
+    monkeypatch.setattr(posterior, "select_grade", lambda member: member)
     solver, values = Mock(), Mock()
     member = Member(solver, values, -3.0, (rival,))
     (found,) = posterior._extend_rivals([(first, [member]), (second, [member])])

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from dmrl import messages
-from dmrl.estimation.evidence.posterior import Member, Mixture
+from dmrl.estimation.evidence.model_trials import Member
+from dmrl.estimation.evidence.posterior import Mixture
 from dmrl.estimation.flight.pair_output import SIGMA_FACTOR, mix_members
 from dmrl.estimation.flight.pair_solver import PairSolution
 from dmrl.estimation.flight.pairs import estimate_ekf, estimate_pairs

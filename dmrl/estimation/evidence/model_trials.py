@@ -1,0 +1,213 @@
+"""Solve a flight under one more error model, from its solution without it.
+
+A model that gains too little by one Gauss-Newton step is not solved. All models of constants are
+scored by one linearization.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dmrl.estimation.evidence.error_models import Candidate
+from dmrl.estimation.evidence.noisy_stretch import find_noisy_steps
+from dmrl.estimation.search.modes import convert_values
+from dmrl.estimation.solver.block_tridiagonal import reduce_to_constants, solve_step
+from dmrl.estimation.solver.equations import total_cost
+from dmrl.estimation.solver.layout import Subject
+from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, Solver
+from dmrl.estimation.solver.noise_selection import MIN_CONSTANTS_GRADE
+from dmrl.estimation.solver.residuals import Values
+from dmrl.estimation.solver.unknowns import YAW_RATE_ERROR
+
+GRADE_SHARE, MIN_GRADE, MAX_GRADE = 0.75, 0.35, 3.0
+"""Ratio of neighbouring grades of the noise, the smallest and the largest."""
+MIN_STEP_GAIN = -6.0
+"""Gain of a model by one Gauss-Newton step below which it is not solved, in log odds. Models that
+change over time show their whole gain after some steps only: of 149 trials in 11 flights of the
+judge, those that gained after all had -3.7 or more."""
+STRETCH_FACTORS = (2.0, 4.0, 8.0, 16.0)
+"""Factors of the noise of a velocity in a stretch that are compared."""
+MODEL_TOLERANCE = 3e-5
+"""Relative change of the cost that ends the solve of a model."""
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A solution under an error model.
+
+    Parameters
+    ----------
+    solver
+        Flight under the model.
+    found
+        The solution.
+    score
+        Log evidence with the prior log odds of its models.
+    models
+        Models that it has beyond the plain one.
+    """
+
+    solver: Solver
+    found: MapEstimate
+    score: float
+    models: tuple[Candidate, ...] = ()
+
+    @property
+    def values(self) -> Values:
+        """Values of the unknowns."""
+        return self.found.values
+
+
+def _prior(models: Sequence[Candidate]) -> float:
+    """Return the prior log odds of some models."""
+    return sum(one.model.log_odds for one in models)
+
+
+def with_grade(solver: Solver, grade: float) -> Solver:
+    """Return a flight at another grade of its noise."""
+    noise = replace(
+        solver.problem.noise, grade=grade, constants_grade=max(grade, MIN_CONSTANTS_GRADE)
+    )
+    return replace(solver, problem=replace(solver.problem, noise=noise))
+
+
+def solve_under(
+    solver: Solver, start: Values, models: tuple[Candidate, ...], tolerance: float = MODEL_TOLERANCE
+) -> Member | None:
+    """Return the solution of a flight under its models; None if it has none."""
+    try:
+        found = solver.solve(start, tolerance=tolerance)
+        score = solver.log_evidence(found) + _prior(models)
+    except np.linalg.LinAlgError:
+        return None
+    return Member(solver, found, score, models)
+
+
+def try_models(
+    base: Member, candidates: Sequence[Candidate], others: Sequence[Values]
+) -> list[Member]:
+    """Return the solutions with one more model each, of the models that may gain.
+
+    Parameters
+    ----------
+    base
+        Solution without them.
+    candidates
+        The models.
+    others
+        As in `try_model`.
+    """
+    further = [one for one in candidates if one not in base.models]
+    hopeless = _list_hopeless(base, further)
+    return [
+        member for one in further if one not in hopeless for member in try_model(base, one, others)
+    ]
+
+
+def try_model(base: Member, candidate: Candidate, others: Sequence[Values]) -> list[Member]:
+    """Return the solutions with one more model.
+
+    Parameters
+    ----------
+    base
+        Solution without it.
+    candidate
+        The model.
+    others
+        Solutions with yaw rate biases that change, as further starts of that model.
+    """
+    if candidate.model.for_a_while:
+        return _try_stretch(base, candidate)
+    solver = replace(base.solver, problem=candidate.apply(base.solver.problem))
+    before, models = base.solver.layout, (*base.models, candidate)
+    starts = [base.values, *(others if YAW_RATE_ERROR in candidate.model.rows else ())]
+    values = [convert_values(start, before, solver.layout) for start in starts]
+    rough = np.inf if candidate.model.adds_constants else _step_score(solver, values[0], models)
+    if rough < base.score + MIN_STEP_GAIN:
+        values = values[1:]
+    found = [solve_under(solver, start, models) for start in values]
+    return [one for one in found if one is not None]
+
+
+def _list_hopeless(base: Member, candidates: Sequence[Candidate]) -> set[Candidate]:
+    """Return the models of constants that gain too little by one Gauss-Newton step.
+
+    One linearization has the constants of all models, and each model takes its columns of the
+    Schur complement.
+    """
+    constant = [one for one in candidates if one.model.adds_constants]
+    problem, own = base.solver.problem, base.solver.layout
+    added = {}
+    for one in constant:
+        added[one] = one.apply(base.solver.problem).layout.subjects().keys() - own.subjects().keys()
+        problem = one.apply(problem)
+    solver = replace(base.solver, problem=problem)
+    values = convert_values(base.values, own, solver.layout)
+    try:
+        information, vector = reduce_to_constants(solver.equations(values)[0])
+    except np.linalg.LinAlgError:
+        return set()
+    log_std = np.log(solver.problem.noise.prior_std(solver.layout))
+    subjects = [subject for subject, _ in solver.layout.constants]
+    known = {subject for subject, _ in own.constants}
+
+    def evidence(names: Collection[Subject]) -> float:
+        at = [k for k, subject in enumerate(subjects) if subject in known or subject in names]
+        block, slope = information[np.ix_(at, at)], vector[at]
+        gain = slope @ np.linalg.solve(block, slope)
+        return float(gain - np.linalg.slogdet(block)[1]) / 2 - float(log_std[at].sum())
+
+    plain = evidence(())
+    return {
+        one
+        for one, names in added.items()
+        if evidence(names) - plain + one.model.log_odds < MIN_STEP_GAIN
+    }
+
+
+def _try_stretch(base: Member, candidate: Candidate) -> list[Member]:
+    """Return the solution with more noise of one robot in the stretches that show it."""
+    assert candidate.robot is not None
+    noisy = find_noisy_steps(base.solver, base.values, candidate.robot)
+    best: Member | None = None
+    for factor in () if noisy is None else STRETCH_FACTORS:
+        problem, robots = base.solver.problem, list(base.solver.problem.robots)
+        robots[candidate.robot] = replace(
+            robots[candidate.robot], grade=np.where(noisy, factor, 1.0)
+        )
+        solver = replace(base.solver, problem=replace(problem, robots=tuple(robots)))
+        one = solve_under(solver, base.values, (*base.models, candidate))
+        if one is None:
+            continue
+        one = select_grade(one)
+        if best is not None and one.score < best.score:
+            break
+        best = one
+    return [] if best is None else [best]
+
+
+def _step_score(solver: Solver, start: Values, models: tuple[Candidate, ...]) -> float:
+    """Return the score that one Gauss-Newton step leads to."""
+    try:
+        equations, factors = solver.equations(start)
+        solved = solve_step(equations)
+    except np.linalg.LinAlgError:
+        return -np.inf
+    slope = float((equations.gradient * solved.state).sum())
+    slope += float(equations.globals_gradient @ solved.constants)
+    begun = MapEstimate(start, total_cost(factors))
+    score = solver.laplace_evidence(begun, factors, solved.log_det) + _prior(models)
+    return score - slope / 2
+
+
+def select_grade(member: Member) -> Member:
+    """Return the solution at the likeliest of the grades around."""
+    best = member
+    for way in (GRADE_SHARE, 1 / GRADE_SHARE):
+        while MIN_GRADE <= (grade := best.solver.problem.noise.grade * way) <= MAX_GRADE:
+            one = solve_under(with_grade(best.solver, grade), best.values, member.models)
+            if one is None or one.score < best.score:
+                break
+            best = one
+    return best

@@ -1,0 +1,77 @@
+"""Find the stretches of a flight in which the velocity of one robot is noisier than elsewhere."""
+
+import numpy as np
+
+from dmrl.estimation.model.pair import Array, Mask
+from dmrl.estimation.solver.levenberg_marquardt import Solver
+from dmrl.estimation.solver.priors import Chain
+from dmrl.estimation.solver.residuals import Values, odometry_factor
+
+WINDOW_S = 2.0
+"""Length of a window, seconds."""
+FREEDOM = 4.0
+"""Degrees of freedom of the velocity errors of a window: two axes, each with about two independent
+values that the ranges determine."""
+RATIOS = (4.0, 16.0, 64.0)
+"""Ratios of the variance in a stretch to that elsewhere that are compared."""
+
+
+def find_noisy_steps(solver: Solver, values: Values, robot: int) -> Mask | None:
+    """Return (S,) the steps in noisy stretches; None where one level of noise fits as well.
+
+    The windows are states of a hidden Markov chain with two levels. Its likeliest path is found by
+    the Viterbi algorithm. A change of the level costs the logarithm of the number of windows.
+
+    Parameters
+    ----------
+    solver, values
+        Flight under its models, and the solution.
+    robot
+        The robot.
+    """
+    step_s = solver.problem.robots[robot].steps_s
+    window = ((np.cumsum(step_s) - step_s / 2) / WINDOW_S).astype(int)
+    square = _velocity_squares(solver, values, robot)
+    level = np.bincount(window, square) / np.maximum(np.bincount(window), 1)
+    if len(level) < 3:
+        return None
+    quiet = level / max(float(np.median(level)), 1e-12)
+    paths = [_decode_levels(quiet, ratio) for ratio in RATIOS]
+    gain, noisy = max(paths, key=lambda one: one[0])
+    return noisy[window] if gain > 0 else None
+
+
+def _velocity_squares(solver: Solver, values: Values, robot: int) -> Array:
+    """Return (S,) squares of the velocity errors of a robot, relative to their noise."""
+    problem, layout = solver.problem, solver.layout
+    square = odometry_factor(problem, layout, robot, values).square[:, :2].sum(axis=1)
+    chains = [factor for factor in solver.linearize(values) if isinstance(factor, Chain)]
+    for (subject, row), chain in zip(layout.states, chains, strict=True):
+        if row.motion and row.evolution == "fading" and subject[1] == (robot,):
+            square += chain.residual[1:] ** 2
+    return square
+
+
+def _decode_levels(level: Array, ratio: float) -> tuple[float, Mask]:
+    """Return the gain in log likelihood of the likeliest path, and its noisy windows.
+
+    Parameters
+    ----------
+    level
+        (W,) mean squares of the windows, relative to the quiet level.
+    ratio
+        Noisy level.
+    """
+    gain = FREEDOM / 2 * (level * (1 - 1 / ratio) - np.log(ratio))
+    change = np.log(len(level))
+    score = np.array([0.0, gain[0] - change])
+    came_from = np.zeros((len(level), 2), int)
+    for k in range(1, len(level)):
+        moved = score[:, None] - change * (1 - np.eye(2))
+        came_from[k] = moved.argmax(axis=0)
+        score = moved.max(axis=0) + np.array([0.0, gain[k]])
+    path = np.zeros(len(level), int)
+    path[-1] = score.argmax()
+    for k in range(len(level) - 1, 0, -1):
+        path[k - 1] = came_from[k, path[k]]
+    return float(score.max()), path.astype(bool)

@@ -1,0 +1,75 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.evidence import model_trials
+from dmrl.estimation.evidence.error_models import MODELS, Candidate, list_candidates
+from dmrl.estimation.evidence.model_trials import MIN_STEP_GAIN, Member, solve_under, try_model
+from dmrl.estimation.evidence.noisy_stretch import find_noisy_steps
+from dmrl.estimation.flight.pair_solver import solve_pair
+from dmrl.estimation.model.pair import Array, Pair
+from dmrl.estimation.search.modes import convert_values
+from dmrl.estimation.solver.keyframes import build_problem
+from dmrl.estimation.solver.levenberg_marquardt import Solver
+
+from ..flights import flown, pair_of
+
+FOR_A_WHILE = next(model for model in MODELS if model.for_a_while)
+
+
+def solve_plain(pair: Pair) -> Member:
+    """The plain solution of a flight."""
+    solution = solve_pair(build_problem({(0, 1): pair}), plain=True)
+    found = solve_under(solution.solver, solution.values, ())
+    assert found is not None
+    return found
+
+
+def add_flow_noise(pair: Pair, where: Array, seed: int = 5) -> Pair:
+    """The pair with noise of 0.5 m/s over 0.3 s in the first robot's flow."""
+    rng = np.random.default_rng(seed)
+    steps = rng.normal(0.0, 1.0, (2, len(pair.time_s)))
+    kept = np.exp(-0.01 / 0.3)
+    noise = np.zeros_like(steps)
+    for k in range(1, noise.shape[1]):
+        noise[:, k] = kept * noise[:, k - 1] + np.sqrt(1 - kept**2) * steps[:, k]
+    vx, vy = 0.5 * noise * where
+    own = replace(pair.own, vx_mps=pair.own.vx_mps + vx, vy_mps=pair.own.vy_mps + vy)
+    return replace(pair, own=own)
+
+
+def test_models_of_constants_are_scored_by_one_linearization_as_by_their_own() -> None:
+    base = solve_plain(pair_of(flown("in_view", "calibrated", 1000, 20.0)))
+    candidates = [one for one in list_candidates() if one.model.adds_constants]
+    hopeless, scores = model_trials._list_hopeless(base, candidates), {}
+    for one in candidates:
+        solver = Solver(one.apply(base.solver.problem))
+        start = convert_values(base.values, base.solver.layout, solver.layout)
+        scores[one] = model_trials._step_score(solver, start, (one,)) - base.score
+    assert len(candidates) > 20 and hopeless
+    for one, score in scores.items():
+        assert (one in hopeless) == (score < MIN_STEP_GAIN), (one, score)
+
+
+def test_quiet_flight_has_no_noisy_stretch() -> None:
+    base = solve_plain(pair_of(flown("in_view", "calibrated", 1000, 40.0)))
+    assert [find_noisy_steps(base.solver, base.values, robot) for robot in (0, 1)] == [None, None]
+
+
+@pytest.mark.heavy
+def test_noise_for_a_while_is_found_and_widens_its_stretch_alone() -> None:
+    pair = pair_of(flown("room", "calibrated", 1003, 60.0))
+    where = (pair.time_s > 20) & (pair.time_s < 35)
+    base = solve_plain(add_flow_noise(pair, where))
+    found = [try_model(base, Candidate(FOR_A_WHILE, robot), ()) for robot in (0, 1)]
+    best = max((one for some in found for one in some), key=lambda one: one.score)
+    assert best.score > base.score + 10
+    robot = best.models[0].robot
+    assert robot is not None
+    problem = best.solver.problem
+    noisy = np.asarray(problem.robots[robot].grade) > 1
+    middle_s = (problem.keyframe_s[1:] + problem.keyframe_s[:-1]) / 2
+    inside = (middle_s > 20) & (middle_s < 35)
+    assert noisy[inside].mean() > 0.7 and noisy[~inside].mean() < 0.15
+    assert problem.noise.grade < base.solver.problem.noise.grade
