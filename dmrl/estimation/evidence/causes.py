@@ -86,8 +86,8 @@ def find_dropouts(logged: Pair, used: Pair) -> tuple[Cause, ...]:
         turning = before.dropout if before.turn_dropout is None else before.turn_dropout
         height = np.zeros_like(turning) if after.height_dropout is None else after.height_dropout
         masks = {
-            "yaw rate silent or in spikes": turning,
-            "flow silent or stuck": before.dropout & ~turning,
+            "yaw rate silent, in spikes or saturated": turning,
+            "flow silent, stuck or saturated": before.dropout & ~turning,
             "height silent or impossible": height,
             "flow runs away or robot lies still": after.dropout & ~before.dropout,
         }

@@ -11,7 +11,7 @@ from dmrl.estimation.model.pair import (
     SensorTrack,
     resample,
 )
-from dmrl.estimation.signals.jump_detection import remove_height_steps
+from dmrl.estimation.signals.jump_detection import find_runs, remove_height_steps
 
 HEIGHT_SMOOTHING_S = 0.5
 """Window of the parabolic smoothing of heights, seconds. The noise of a range finder is 2 cm in
@@ -23,6 +23,11 @@ value was chosen."""
 SPIKE_SAMPLES, MIN_SPIKE_RADPS = 41, 2.5
 """Samples of the median of a yaw rate, and smallest difference of a spike from it, rad/s. A
 Crazyflie turns by 3.5 rad/s at most by default, and needs 0.2 s for it."""
+
+MIN_SATURATED_RUN, MAX_EQUAL_SHARE = 3, 0.05
+"""Samples in a row at the end of a signal's range that show a saturated sensor: noise makes three
+equal ones of a continuous signal impossible. Signals whose other samples equal their neighbours
+more often are rounded, and do not show it."""
 
 Signals = tuple[Array, Array]
 """Times (N,), seconds, and (N, C) values."""
@@ -46,9 +51,11 @@ def build_track(
     """
     spiky = find_spikes(yaw_rate[1][:, 0])
     turn, turn_gap = resample(yaw_rate[0][~spiky], yaw_rate[1][~spiky], grid_s)
-    turn_gap |= find_frozen(*yaw_rate, grid_s) | _near(yaw_rate[0][spiky], grid_s)
+    limited = spiky | find_saturated(yaw_rate[1][:, 0])
+    turn_gap |= find_frozen(*yaw_rate, grid_s) | _near(yaw_rate[0][limited], grid_s)
     speed, gap = resample(*velocity, grid_s)
-    gap |= find_frozen(*velocity, grid_s)
+    limited = find_saturated(velocity[1][:, 0]) | find_saturated(velocity[1][:, 1])
+    gap |= find_frozen(*velocity, grid_s) | _near(velocity[0][limited], grid_s)
     level = remove_height_steps(height[0], height[1][:, 0])
     above, height_gap = resample(height[0], level[:, None], grid_s)
     smooth_m = _smooth_parabola(above[:, 0], int(HEIGHT_SMOOTHING_S * GRID_RATE_HZ / 2))
@@ -68,6 +75,26 @@ def find_spikes(yaw_rate_radps: Array) -> Mask:
     """
     middle = median_filter(yaw_rate_radps, SPIKE_SAMPLES, mode="nearest")
     return np.asarray(np.abs(yaw_rate_radps - middle) > MIN_SPIKE_RADPS)
+
+
+def find_saturated(values: Array) -> Mask:
+    """Return (N,) whether a signal stays at the largest or smallest of its values.
+
+    Parameters
+    ----------
+    values
+        (N,) samples of a signal.
+    """
+    out = np.zeros(len(values), bool)
+    if len(values) < MIN_SATURATED_RUN or np.ptp(values) == 0:
+        return out
+    ends = (values == values.max()) | (values == values.min())
+    equal = np.diff(values) == 0
+    if (equal & ~ends[1:]).mean() > MAX_EQUAL_SHARE:
+        return out
+    for first, last in find_runs(ends):
+        out[first:last] = last - first >= MIN_SATURATED_RUN
+    return out
 
 
 def _near(time_s: Array, grid_s: Array) -> Mask:
@@ -96,9 +123,8 @@ def find_frozen(time_s: Array, values: Array, grid_s: Array) -> Mask:
     same = (np.diff(values, axis=0) == 0).all(axis=1)
     if len(time_s) < 2 or same.mean() > MAX_REPEATED_SHARE:
         return np.zeros(len(grid_s), bool)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]]))).reshape(-1, 2)
     out = np.zeros(len(grid_s), bool)
-    for first, last in edges:
+    for first, last in find_runs(same):
         if time_s[last] - time_s[first] > MAX_DROPOUT_S:
             out |= (grid_s >= time_s[first]) & (grid_s <= time_s[last])
     return out

@@ -105,7 +105,7 @@ def test_dropouts_are_causes_and_windows_are_joined() -> None:
     gap = (pair.time_s > 5) & (pair.time_s < 8)
     quiet = replace(pair.peer, dropout=gap, turn_dropout=np.zeros_like(gap))
     (cause,) = find_dropouts(replace(pair, peer=quiet), replace(pair, peer=quiet))
-    assert (cause.name, cause.robot) == ("flow silent or stuck", 1)
+    assert (cause.name, cause.robot) == ("flow silent, stuck or saturated", 1)
     assert (cause.from_s, cause.to_s) == pytest.approx((5, 8), abs=0.05)
     one, two = Cause("a", 0.4, 0.0, 5.0, 1), Cause("a", 0.9, 5.0, 9.0, 1)
     assert join_causes([one, two]) == (Cause("a", 0.9, 0.0, 9.0, 1),)

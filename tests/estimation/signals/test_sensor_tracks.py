@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.signals.sensor_tracks import build_track, find_frozen
+from dmrl.estimation.signals.sensor_tracks import build_track, find_frozen, find_saturated
 
 GRID_S = np.arange(0, 20, 0.01)
 
@@ -73,3 +73,20 @@ def test_heights_are_smoothed_by_local_parabolas() -> None:
         np.abs(build_track(*logs, (GRID_S, spike[:, None]), GRID_S).height_m - 1) > 1e-9
     )
     assert (reach.min(), reach.max()) == (975, 1025)
+
+
+@pytest.mark.parametrize(("limit", "share"), [(0.8, 0.25), (10.0, 0.0)])
+def test_signal_that_stays_at_its_limit_is_saturated(limit: float, share: float) -> None:
+    rng = np.random.default_rng(3)
+    true = np.sin(np.arange(4000) / 100) + rng.normal(0, 0.02, 4000)
+    values = np.clip(true, -limit, limit)
+    found = find_saturated(values)
+    assert found.mean() == pytest.approx(2 * share * 0.82, abs=0.06)
+    assert (np.abs(values[found]) == limit).all()
+
+
+def test_rounded_signals_and_short_logs_do_not_show_saturation() -> None:
+    rounded = np.round(np.sin(np.arange(4000) / 100), 1)
+    assert not find_saturated(rounded).any()
+    assert not find_saturated(np.zeros(2)).any()
+    assert not find_saturated(np.zeros(4000)).any()
