@@ -19,6 +19,7 @@ from dmrl.estimation.search.modes import (
     mode_weights,
     select_modes,
 )
+from dmrl.estimation.solver.camera_noise import calibrate_views
 from dmrl.estimation.solver.covariance import compute_covariance
 from dmrl.estimation.solver.levenberg_marquardt import (
     ROUGH_TOLERANCE,
@@ -149,6 +150,9 @@ def _solve_modes(
         wider = replace(noise, range_std_m=noise.range_std_m * ratio)
         solver = replace(solver, problem=replace(solver.problem, noise=wider))
         found = select_modes([solver.solve(mode.values) for mode in found])
+    if widen and solver.problem.views:
+        solver, best = calibrate_views(solver, found[0])
+        found = select_modes([best, *(solver.solve(mode.values) for mode in found[1:])])
     return solver, found
 
 

@@ -211,7 +211,7 @@ TABLE: tuple[Unknown, ...] = (
         pull_weight=0.04,
     ),
     Unknown("height_error", "m", 0.03, "robot", evolution="fading", time_s=4.0, height=1.0),
-    Unknown("camera_azimuth", "rad", 0.1, "antenna", bearing=_aside),
+    Unknown("camera_azimuth", "rad", 0.03, "antenna", Cauchy(2.0), bearing=_aside),
     Unknown("camera_elevation", "rad", 0.1, "antenna", bearing=_upwards),
     Unknown("camera_distance", "1", 0.3, "antenna", bearing=_farther),
 )
@@ -220,7 +220,8 @@ TABLE: tuple[Unknown, ...] = (
 Standard deviations are those of sensors that nobody calibrated: the constants of UWB modules and of
 optical flow on small drones (docs/flights.md, preset "realistic", rounded up). Losses: an offset, a
 gyroscope or a clock is mostly good and sometimes far off, so their priors have Cauchy tails at 1.5
-to 2 sigmas. A scale keeps a Gaussian prior: otherwise it could shrink the path to nothing."""
+to 2 sigmas. So has the azimuth of a camera: a board that is plugged in points within two degrees.
+A scale keeps a Gaussian prior: otherwise it could shrink the path to nothing."""
 
 YAW_RATE_ERROR = Unknown(
     "yaw_rate_error", "rad/s", 0.003, "robot", Cauchy(2.0), "jump", motion=turn, start_std=0.03

@@ -1,0 +1,142 @@
+"""Estimate the noise of a camera's detections from their residuals."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from dmrl.estimation.model.bearings import ASSOCIATION_GATE
+from dmrl.estimation.model.pair import Array
+from dmrl.estimation.solver.block_tridiagonal import marginal_covariances, solve_step
+from dmrl.estimation.solver.levenberg_marquardt import ROUGH_TOLERANCE, MapEstimate, Solver
+from dmrl.estimation.solver.problem import CameraView
+from dmrl.estimation.solver.residuals import Rows, Values, bearing_factor
+
+MIN_IMAGES = 50
+"""Fewest consistent images that show their noise: a standard deviation to a tenth."""
+FIRST_RATIO, MIN_RATIO, MAX_RATIO, ROUNDS = 0.35, 0.1, 2.0, 3
+"""Ratio of the noise to the assumed one: of the first solve, the smallest, the largest; and number
+of solves. Residuals of a solve that trusts a camera too little are those of the other sensors, so
+the first one trusts it much: 0.35 are two pixels."""
+NORMAL_MEDIAN = 0.6745
+"""Median size of a normal value, in standard deviations."""
+MAX_MEMORY_S, MIN_CORRELATION = 3.0, 0.1
+"""Longest time over which errors count as repeated, seconds, and smallest correlation that counts:
+twice its standard error in 400 images."""
+
+
+def calibrate_views(solver: Solver, found: MapEstimate) -> tuple[Solver, MapEstimate]:
+    """Return a flight with the noise that its detections show, and the solution.
+
+    The standard deviation of each component is that of the residuals, over the share of them that
+    the solution leaves open. Errors that last then count as many images as they last.
+
+    Parameters
+    ----------
+    solver, found
+        Flight, and its solution.
+    """
+    views = solver.problem.views
+    known = [_count_consistent(solver, view, found.values) >= MIN_IMAGES for view in views]
+    if not any(known):
+        return solver, found
+    ratios = [np.full(3, FIRST_RATIO if one else 1.0) for one in known]
+    trusted, best = solver, found
+    for number in range(ROUNDS + 1):
+        made = tuple(
+            replace(view, std=view.std * ratio, weight=np.ones_like(view.weight)) if one else view
+            for view, ratio, one in zip(views, ratios, known, strict=True)
+        )
+        trusted = replace(solver, problem=replace(solver.problem, views=made))
+        best = trusted.solve(best.values, tolerance=ROUGH_TOLERANCE)
+        if number == ROUNDS:
+            break
+        posterior = _Posterior.at(trusted, best.values)
+        for k, view in enumerate(made):
+            if known[k]:
+                rows = bearing_factor(trusted.problem, trusted.layout, view, best.values)
+                more = _noise_ratio(rows, posterior)
+                if number == ROUNDS - 1:
+                    more = more * np.sqrt(count_repeated(rows, view))
+                ratios[k] = np.clip(ratios[k] * more, MIN_RATIO, MAX_RATIO)
+    return trusted, trusted.solve(best.values)
+
+
+class _Posterior(NamedTuple):
+    """Covariance of a solution.
+
+    ``states`` (K, n, n) of the keyframes where the constants are known, ``response`` (K, n, G)
+    negated derivative of the keyframes by the constants, ``constants`` (G, G) covariance of these.
+    """
+
+    states: Array
+    response: Array
+    constants: Array
+
+    @classmethod
+    def at(cls, solver: Solver, values: Values) -> "_Posterior":
+        """Return the covariance at a solution."""
+        equations = solver.equations(values)[0]
+        solved = solve_step(equations)
+        states = marginal_covariances(equations.diagonal, equations.off_diagonal)
+        return cls(states, solved.response, solved.covariance)
+
+    def leverage(self, rows: Rows) -> Array:
+        """Return (K, m, q) variance of the predicted measurements over that of their noise."""
+        size, at = len(rows.columns), np.array(rows.columns)
+        by_state, by_constant = (
+            rows.rows[..., :size],
+            np.zeros((*rows.rows.shape[:-1], len(self.constants))),
+        )
+        by_constant[..., rows.border] = rows.rows[..., size:-1]
+        by_constant -= by_state @ self.response[:, at][:, None]
+        own = (by_state @ self.states[:, at[:, None], at][:, None]) * by_state
+        return np.asarray(
+            own.sum(axis=-1) + ((by_constant @ self.constants) * by_constant).sum(axis=-1)
+        )
+
+
+def _noise_ratio(rows: Rows, posterior: _Posterior) -> Array:
+    """Return (3,) standard deviations of consistent residuals, over their assumed ones."""
+    used = rows.weight > 0
+    residual = rows.rows[..., -1][used]
+    near = (residual**2).sum(axis=1) < ASSOCIATION_GATE / FIRST_RATIO**2
+    open_share = 1 - np.minimum(posterior.leverage(rows)[used][near], 0.9).mean(axis=0)
+    size = np.median(np.abs(residual[near]), axis=0) / NORMAL_MEDIAN
+    return np.asarray(size / np.sqrt(open_share))
+
+
+def _count_consistent(solver: Solver, view: CameraView, values: Values) -> int:
+    """Return the number of images with a detection where the solution expects it."""
+    rows = bearing_factor(solver.problem, solver.layout, view, values)
+    return int(((rows.square < ASSOCIATION_GATE) & (rows.weight > 0)).sum())
+
+
+def count_repeated(rows: Rows, view: CameraView) -> Array:
+    """Return (3,) number of images over which an error repeats itself: 1 for independent errors.
+
+    It is the integrated correlation time of the residuals of consistent images.
+
+    Parameters
+    ----------
+    rows
+        Linearized detections of the camera.
+    view
+        The camera.
+    """
+    residual = rows.rows[..., -1][rows.weight > 0]
+    near = (residual**2).sum(axis=1) < ASSOCIATION_GATE
+    if near.sum() < MIN_IMAGES:
+        return np.ones(3)
+    step_s = float(np.median(np.diff(view.time_s)))
+    place = np.rint((view.time_s - view.time_s[0]) / step_s).astype(int)[near]
+    grid, seen = np.zeros((place.max() + 1, 3)), np.zeros(place.max() + 1)
+    grid[place], seen[place] = residual[near] - residual[near].mean(axis=0), 1.0
+    power = (grid**2).sum(axis=0) / seen.sum()
+    total, lasts = np.ones(3), np.ones(3, bool)
+    for lag in range(1, min(round(MAX_MEMORY_S / step_s), len(seen) // 4) + 1):
+        pairs = (seen[lag:] * seen[:-lag]).sum()
+        correlation = (grid[lag:] * grid[:-lag]).sum(axis=0) / max(pairs, 1.0) / power
+        lasts &= correlation > MIN_CORRELATION
+        total += 2 * correlation * lasts
+    return total
