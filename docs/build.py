@@ -76,13 +76,15 @@ def extras() -> str:
 def error_models() -> str:
     """Format the table of error models, from dmrl/estimation/evidence/error_models.py."""
     rows = [
-        (model.name, "; ".join(_describe_changes(model)), f"{model.log_odds:g}") for model in MODELS
+        (model.name, "; ".join(_describe_changes(model)), f"{model.log_odds:.3g}") for model in MODELS
     ]
     return table(("cause", "unknowns, or factor of a noise", "log odds"), rows)
 
 
 def _describe_changes(model: ErrorModel) -> list[str]:
     factors = (("range noise", model.range_factor), ("velocity noise", model.flow_factor))
+    if model.for_a_while:
+        return ["2 to 16 times the velocity noise in stretches"]
     return [
         *(_describe_unknown(row) for row in model.rows),
         *(f"{factor:g} times the {noise}" for noise, factor in factors if factor != 1.0),
