@@ -137,6 +137,9 @@ def _explains(pieces: Sequence["Piece"]) -> bool:
         return False
     if min(piece.chance for piece in pieces) < MIN_PRIOR_CHANCE:
         return False
+    # Noise fits everything badly: a log that is written wrongly is a better explanation.
+    if any(piece.noisy.any() for piece in pieces):
+        return False
     refused = np.concatenate([one.silent | list_refused(one.estimate) for one in pieces])
     return bool(refused.mean() <= MAJORITY_SHARE)
 
@@ -146,14 +149,15 @@ class Piece(NamedTuple):
 
     ``silent`` (K,) dropouts of odometry or contradictory odometry, ``sighted`` (2, K) consistent
     images of either robot nearby, ``energy`` (3,) mean squares of the own, peer and relative
-    velocity without noise, relative to that noise; ``chance`` the probability of larger
-    constants by their priors.
+    velocity without noise, relative to that noise; ``noisy`` (K,) odometry that is noisier than
+    elsewhere, ``chance`` the probability of larger constants by their priors.
     """
 
     estimate: Estimate
     silent: Mask
     sighted: Mask
     energy: Array
+    noisy: Mask
     chance: float = 1.0
 
 
@@ -198,9 +202,11 @@ def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
         causes=find_causes(solution.mixture, (float(time_s[0]), float(time_s[-1]))),
     )
     step = np.clip(np.searchsorted(key_s, time_s, "right") - 1, 0, len(key_s) - 2)
-    silent = odometry_dropout(pair, time_s) | find_contradicted_steps(problem, values)[step]
+    noisy = problem.list_noisy_steps()[step]
+    silent = odometry_dropout(pair, time_s) | noisy
+    silent |= find_contradicted_steps(problem, values)[step]
     sighted, energy = list_sighted(solution, time_s), motion_energy(problem, values)
-    return Piece(estimate, silent, sighted, energy, _compute_prior_chance(problem, values))
+    return Piece(estimate, silent, sighted, energy, noisy, _compute_prior_chance(problem, values))
 
 
 def _compute_prior_chance(problem: Problem, values: Values) -> float:
@@ -281,7 +287,8 @@ def join_pieces(pieces: Sequence[Piece]) -> Piece:
     first = _first_samples([piece.estimate for piece in pieces])
     silent = np.concatenate([p.silent[k:] for p, k in zip(pieces, first, strict=True)])
     sighted = np.concatenate([p.sighted[:, k:] for p, k in zip(pieces, first, strict=True)], axis=1)
-    return Piece(made, silent, sighted, np.mean([p.energy for p in pieces], axis=0))
+    noisy = np.concatenate([p.noisy[k:] for p, k in zip(pieces, first, strict=True)])
+    return Piece(made, silent, sighted, np.mean([p.energy for p in pieces], axis=0), noisy)
 
 
 def estimate_ekf(pairs: list[Pair], preset: str, *, gate: Gate = DEFAULT_GATE) -> list[Estimate]:

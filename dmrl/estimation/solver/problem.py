@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.estimation.model.odometry import Odometry, RelativeMotion
-from dmrl.estimation.model.pair import Array
+from dmrl.estimation.model.pair import Array, Mask
 from dmrl.estimation.solver.layout import Layout, Subject, build_layout
 from dmrl.estimation.solver.robust_loss import Cauchy, Loss
 from dmrl.estimation.solver.unknowns import TABLE, Unknown
@@ -225,6 +225,13 @@ class Problem:
         sighted = {robot for view in self.views for robot in view.robots}
         links = [link.robots for link in self.links]
         return build_layout(self.table, len(self.robots), links, sighted, self.unused)
+
+    def list_noisy_steps(self) -> Mask:
+        """Return (S,) the steps in which some robot's velocity is noisier than elsewhere."""
+        noisy = np.zeros(len(self.keyframe_s) - 1, bool)
+        for steps in self.robots:
+            noisy |= np.asarray(steps.grade) > 1.0
+        return noisy
 
     @property
     def fading_psd(self) -> float:
