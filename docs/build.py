@@ -76,7 +76,8 @@ def extras() -> str:
 def error_models() -> str:
     """Format the table of error models, from dmrl/estimation/evidence/error_models.py."""
     rows = [
-        (model.name, "; ".join(_describe_changes(model)), f"{model.log_odds:.3g}") for model in MODELS
+        (model.name, "; ".join(_describe_changes(model)), f"{model.log_odds:.3g}")
+        for model in MODELS
     ]
     return table(("cause", "unknowns, or factor of a noise", "log odds"), rows)
 

@@ -170,8 +170,10 @@ def _try_stretch(base: Member, candidate: Candidate) -> list[Member]:
     """Return the solution with more noise of one robot in the stretches that show it."""
     assert candidate.robot is not None
     noisy = find_noisy_steps(base.solver, base.values, candidate.robot)
+    if noisy is None:
+        return []
     best: Member | None = None
-    for factor in () if noisy is None else STRETCH_FACTORS:
+    for factor in STRETCH_FACTORS:
         problem, robots = base.solver.problem, list(base.solver.problem.robots)
         robots[candidate.robot] = replace(
             robots[candidate.robot], grade=np.where(noisy, factor, 1.0)

@@ -49,7 +49,7 @@ def _velocity_squares(solver: Solver, values: Values, robot: int) -> Array:
     for (subject, row), chain in zip(layout.states, chains, strict=True):
         if row.motion and row.evolution == "fading" and subject[1] == (robot,):
             square += chain.residual[1:] ** 2
-    return square
+    return np.asarray(square)
 
 
 def _decode_levels(level: Array, ratio: float) -> tuple[float, Mask]:

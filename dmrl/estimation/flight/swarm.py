@@ -26,6 +26,7 @@ from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array, Mask, Pair
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.signals.contradictions import drop_contradictions
+from dmrl.estimation.solver.camera_noise import calibrate_views
 from dmrl.estimation.solver.covariance import compute_covariance, relative_covariance
 from dmrl.estimation.solver.estimate import PAIR_LAYOUT, REASONS, Estimate
 from dmrl.estimation.solver.keyframes import (
@@ -163,7 +164,8 @@ def _solve_windows(
         if kept.layout.width != problem.layout.width:
             start = Values(_initial_state(kept, names, estimates), start.constants)
         solver = Solver(kept, carried)
-        values = solver.solve(start, tolerance=ROUGH_TOLERANCE).values
+        solver, found = calibrate_views(solver, solver.solve(start, tolerance=ROUGH_TOLERANCE))
+        values = found.values
         first = next(iter(pairs.values()))
         times = output_times(first.time_s[0], window.from_s, window.until_s)
         yield solver, values, compute_covariance(solver, values), times

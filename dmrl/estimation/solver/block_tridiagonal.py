@@ -134,7 +134,7 @@ def solve_step(equations: NormalEquations) -> Solved:
     """
     size, width = len(equations.globals_block), equations.diagonal.shape[1]
     log_det, solved, rest, vector = _eliminate_states(equations)
-    covariance = np.linalg.inv(rest)
+    covariance: Array = np.asarray(np.linalg.inv(rest), float)
     constants = -covariance @ vector
     state = -solved[:, 0] - solved[:, 1:] @ constants
     return Solved(

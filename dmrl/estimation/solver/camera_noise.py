@@ -1,5 +1,6 @@
 """Estimate the noise of a camera's detections from their residuals."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -40,26 +41,32 @@ def calibrate_views(solver: Solver, found: MapEstimate) -> tuple[Solver, MapEsti
     known = [_count_consistent(solver, view, found.values) >= MIN_IMAGES for view in views]
     if not any(known):
         return solver, found
-    ratios = [np.full(3, FIRST_RATIO if one else 1.0) for one in known]
-    trusted, best = solver, found
-    for number in range(ROUNDS + 1):
-        made = tuple(
-            replace(view, std=view.std * ratio, weight=np.ones_like(view.weight)) if one else view
-            for view, ratio, one in zip(views, ratios, known, strict=True)
-        )
-        trusted = replace(solver, problem=replace(solver.problem, views=made))
-        best = trusted.solve(best.values, tolerance=ROUGH_TOLERANCE)
-        if number == ROUNDS:
-            break
-        posterior = _Posterior.at(trusted, best.values)
-        for k, view in enumerate(made):
-            if known[k]:
-                rows = bearing_factor(trusted.problem, trusted.layout, view, best.values)
-                more = _noise_ratio(rows, posterior)
-                if number == ROUNDS - 1:
-                    more = more * np.sqrt(count_repeated(rows, view))
-                ratios[k] = np.clip(ratios[k] * more, MIN_RATIO, MAX_RATIO)
-    return trusted, trusted.solve(best.values)
+    ratios = [np.full(3, FIRST_RATIO) if one else None for one in known]
+    for number in range(ROUNDS):
+        trusted = _with_ratios(solver, ratios)
+        found = trusted.solve(found.values, tolerance=ROUGH_TOLERANCE)
+        posterior = _Posterior.at(trusted, found.values)
+        for k, view in enumerate(trusted.problem.views):
+            if (before := ratios[k]) is None:
+                continue
+            rows = bearing_factor(trusted.problem, trusted.layout, view, found.values)
+            more = _noise_ratio(rows, posterior)
+            if number == ROUNDS - 1:
+                more = more * np.sqrt(count_repeated(rows, view))
+            ratios[k] = np.clip(before * more, MIN_RATIO, MAX_RATIO)
+    trusted = _with_ratios(solver, ratios)
+    return trusted, trusted.solve(found.values)
+
+
+def _with_ratios(solver: Solver, ratios: Sequence[Array | None]) -> Solver:
+    """Return a flight with ratios of the noise of its cameras to the assumed one."""
+    views = tuple(
+        view
+        if ratio is None
+        else replace(view, std=view.std * ratio, weight=np.ones_like(view.weight))
+        for view, ratio in zip(solver.problem.views, ratios, strict=True)
+    )
+    return replace(solver, problem=replace(solver.problem, views=views))
 
 
 class _Posterior(NamedTuple):
