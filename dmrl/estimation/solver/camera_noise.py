@@ -15,7 +15,7 @@ from dmrl.estimation.solver.residuals import Rows, Values, bearing_factor
 
 MIN_IMAGES = 50
 """Fewest consistent images that show their noise: a standard deviation to a tenth."""
-FIRST_RATIO, MIN_RATIO, MAX_RATIO, ROUNDS = 0.35, 0.1, 2.0, 3
+FIRST_RATIO, MIN_RATIO, MAX_RATIO, ROUNDS = 0.35, 0.1, 10.0, 3
 """Ratio of the noise to the assumed one: of the first solve, the smallest, the largest; and number
 of solves. Residuals of a solve that trusts a camera too little are those of the other sensors, so
 the first one trusts it much: 0.35 are two pixels."""

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.evidence import model_trials
+from dmrl.estimation.evidence import model_trials, noisy_stretch
 from dmrl.estimation.evidence.error_models import MODELS, Candidate, list_candidates
 from dmrl.estimation.evidence.model_trials import MIN_STEP_GAIN, Member, solve_under, try_model
 from dmrl.estimation.evidence.noisy_stretch import find_noisy_steps
@@ -55,6 +55,17 @@ def test_models_of_constants_are_scored_by_one_linearization_as_by_their_own() -
 def test_quiet_flight_has_no_noisy_stretch() -> None:
     base = solve_plain(pair_of(flown("in_view", "calibrated", 1000, 40.0)))
     assert [find_noisy_steps(base.solver, base.values, robot) for robot in (0, 1)] == [None, None]
+
+
+def test_levels_are_decoded_to_the_ends_of_the_flight() -> None:
+    level = np.ones(30)
+    level[20:] = 20.0
+    gain, noisy = noisy_stretch._decode_levels(level, 16.0)
+    assert gain > 0 and noisy.tolist() == [False] * 20 + [True] * 10
+    level[:] = 1.0
+    level[7] = 3.0
+    gain, noisy = noisy_stretch._decode_levels(level, 16.0)
+    assert gain == 0 and not noisy.any()
 
 
 @pytest.mark.heavy
