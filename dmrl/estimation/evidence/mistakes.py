@@ -57,6 +57,8 @@ class Mistake:
         Whether the robot's heading remains unknown by a constant angle.
     shift_s
         Seconds that are added to the clock of the second robot.
+    with_camera
+        Whether it is tried where a camera shows the peer alone, or only elsewhere. None: always.
     """
 
     name: str
@@ -65,6 +67,7 @@ class Mistake:
     applies: Callable[[Pair, int | None], bool] | None = None
     heading_is_open: bool = False
     shift_s: float = 0.0
+    with_camera: bool | None = None
 
 
 def find_mistake(pair: Pair) -> tuple[Mistake, int | None] | None:
@@ -85,7 +88,8 @@ def find_mistake(pair: Pair) -> tuple[Mistake, int | None] | None:
         (one, robot)
         for one in MISTAKES
         for robot in one.robots
-        if one.applies is None or one.applies(pair, robot)
+        if one.with_camera in (None, has_camera(pair, robot))
+        and (one.applies is None or one.applies(pair, robot))
     ]
     # What the measurements show by themselves comes first.
     shown = [choice for choice in every if choice[0].applies]
@@ -249,9 +253,10 @@ def ranges_are_far(pair: Pair, _robot: int | None = None) -> bool:
     return bool(len(pair.range_m) and np.median(pair.range_m) > MAX_RANGE_M)
 
 
-def _is_seen(pair: Pair, _robot: int | None) -> bool:
-    """Return whether a camera shows which robot is which: ranges and odometry do not."""
-    return pair.own_bearings is not None or pair.peer_bearings is not None
+def has_camera(pair: Pair, robot: int | None) -> bool:
+    """Return whether a robot's detections show the peer in its frame; None: any robot's."""
+    views = (pair.own_bearings, pair.peer_bearings)
+    return any(view is not None for view in (views if robot is None else [views[robot]]))
 
 
 FLOW, TURN = ("vx_mps", "vy_mps"), "yaw_rate_radps"
@@ -259,15 +264,22 @@ PAIR = (None,)
 MISTAKES: tuple[Mistake, ...] = (
     Mistake("yaw rate fits if it is negated", _scale(-1.0, TURN)),
     Mistake("yaw rate fits if it is taken as degrees", _scale(np.pi / 180, TURN)),
-    Mistake("flow fits if vx is negated", _scale(-1.0, "vx_mps")),
-    Mistake("flow fits if vy is negated", _scale(-1.0, "vy_mps")),
-    Mistake("flow fits if vx and vy are swapped", _correct_track(_swap_axes)),
+    # Three mirrors that differ by a turn of the robot's frame, which ranges do not show.
+    Mistake(
+        "flow fits if one axis is negated or both are swapped",
+        _scale(-1.0, "vx_mps"),
+        heading_is_open=True,
+        with_camera=False,
+    ),
+    Mistake("flow fits if vx is negated", _scale(-1.0, "vx_mps"), with_camera=True),
+    Mistake("flow fits if vy is negated", _scale(-1.0, "vy_mps"), with_camera=True),
+    Mistake("flow fits if vx and vy are swapped", _correct_track(_swap_axes), with_camera=True),
     Mistake(
         "flow fits in the world frame", _correct_track(_from_take_off_frame), heading_is_open=True
     ),
     Mistake("flow fits if it is taken as feet", _scale(FOOT_M, *FLOW)),
     Mistake("range fits if it is taken as feet", _scale_ranges(FOOT_M), PAIR),
-    Mistake("robots fit if their logs are exchanged", _exchange_logs, PAIR, _is_seen),
+    Mistake("robots fit if their logs are exchanged", _exchange_logs, PAIR, with_camera=True),
     *(
         mistake
         for size in (100, 1000)

@@ -14,6 +14,7 @@ from dmrl.estimation.evidence.mistakes import (
     Mistake,
     find_clock_mistake,
     find_mistake,
+    has_camera,
     ranges_are_far,
 )
 from dmrl.estimation.flight.pair_output import (
@@ -109,7 +110,7 @@ def _estimate_pair(
         logged, shift_s = mistake.correct(logged, robot), shift_s + mistake.shift_s
         pair, pieces = drop_contradictions(logged), []
         mistakes.append(_to_cause(mistake, logged, robot))
-        blind = robot if mistake.heading_is_open else None
+        blind = robot if mistake.heading_is_open and not has_camera(logged, robot) else None
     pieces = pieces or list(_solve_pieces(pair, noise, plain=plain))
     gaps = (*mistakes, *find_dropouts(logged, pair))
     own, peer = (

@@ -8,11 +8,13 @@ from dmrl.estimation.evidence.mistakes import (
     Mistake,
     compute_misfit,
     find_clock_mistake,
+    has_camera,
     move_clock,
     ranges_are_far,
 )
 from dmrl.estimation.flight.pairs import estimate_pairs
-from dmrl.estimation.model.pair import Pair
+from dmrl.estimation.model.pair import BearingMeasurements, Pair
+from dmrl.messages import STATUS_OK
 
 from ..flights import flown, pair_of, truth_at
 
@@ -135,3 +137,27 @@ def test_a_clock_that_is_seconds_off_fits_when_it_is_moved() -> None:
     mistake = find_clock_mistake(late)
     assert mistake is not None
     assert compute_misfit(mistake.correct(late, 1)) < 0.6
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("change", ["vx", "vy", "both"])
+def test_a_mirrored_flow_leaves_the_heading_of_its_robot_open(change: str) -> None:
+    flight = flown("in_view", "calibrated", 1001, 60.0)
+    pair = pair_of(flight)
+    vx, vy = pair.peer.vx_mps, pair.peer.vy_mps
+    vx, vy = {"vx": (-vx, vy), "vy": (vx, -vy), "both": (vy, vx)}[change]
+    wrong = replace(pair, peer=replace(pair.peer, vx_mps=vx, vy_mps=vy))
+    ((own, peer),) = estimate_pairs([wrong])
+    assert any(c.name.startswith("flow fits if one axis") and c.robot == 1 for c in own.causes)
+    error = np.hypot(*(own.state[:, :2] - truth_at(flight, own.time_s)).T)
+    kept = own.status == STATUS_OK
+    assert kept.mean() > 0.5 and (error[kept] < 0.5).all()
+    assert not (peer.status == STATUS_OK).any()
+
+
+def test_a_camera_shows_which_axis_is_wrong() -> None:
+    pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
+    seen = BearingMeasurements(np.zeros(1), np.zeros((1, 1, 3)), np.ones((1, 1, 3)))
+    assert not has_camera(pair, None) and not has_camera(pair, 0)
+    looking = replace(pair, peer_bearings=seen)
+    assert has_camera(looking, None) and has_camera(looking, 1) and not has_camera(looking, 0)
