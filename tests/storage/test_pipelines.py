@@ -40,6 +40,7 @@ def test_demo_pipeline_in_a_bucket_equals_the_local_one(lab: Any, tmp_path: Path
     assert [one.stage for one in made] == [
         *("predict", "evaluate", "track", "evaluate"),
         *("sketch", "convert", "dataset", "train", "predict", "evaluate"),
+        *("fly", "evaluate"),
     ]
     here, compared = tmp_path / "here", 0
     for path in sorted(p for p in here.rglob("*") if p.is_file()):
