@@ -24,6 +24,8 @@ NORMAL_MEDIAN = 0.6745
 MAX_MEMORY_S, MIN_CORRELATION = 3.0, 0.1
 """Longest time over which errors count as repeated, seconds, and smallest correlation that counts:
 twice its standard error in 400 images."""
+MIN_INTERVAL_S = 0.01
+"""Shortest interval between images, seconds: copies of an image have equal times."""
 
 
 def calibrate_views(solver: Solver, found: MapEstimate) -> tuple[Solver, MapEstimate]:
@@ -108,6 +110,8 @@ def _noise_ratio(rows: Rows, posterior: _Posterior) -> Array:
     used = rows.weight > 0
     residual = rows.rows[..., -1][used]
     near = (residual**2).sum(axis=1) < ASSOCIATION_GATE / FIRST_RATIO**2
+    if near.sum() < MIN_IMAGES:
+        return np.ones(3)
     open_share = 1 - np.minimum(posterior.leverage(rows)[used][near], 0.9).mean(axis=0)
     size = np.median(np.abs(residual[near]), axis=0) / NORMAL_MEDIAN
     return np.asarray(size / np.sqrt(open_share))
@@ -135,11 +139,11 @@ def count_repeated(rows: Rows, view: CameraView) -> Array:
     near = (residual**2).sum(axis=1) < ASSOCIATION_GATE
     if near.sum() < MIN_IMAGES:
         return np.ones(3)
-    step_s = float(np.median(np.diff(view.time_s)))
+    step_s = max(float(np.median(np.diff(view.time_s))), MIN_INTERVAL_S)
     place = np.rint((view.time_s - view.time_s[0]) / step_s).astype(int)[near]
     grid, seen = np.zeros((place.max() + 1, 3)), np.zeros(place.max() + 1)
     grid[place], seen[place] = residual[near] - residual[near].mean(axis=0), 1.0
-    power = (grid**2).sum(axis=0) / seen.sum()
+    power = np.maximum((grid**2).sum(axis=0) / seen.sum(), 1e-12)  # exact detections have none
     total, lasts = np.ones(3), np.ones(3, bool)
     for lag in range(1, min(round(MAX_MEMORY_S / step_s), len(seen) // 4) + 1):
         pairs = (seen[lag:] * seen[:-lag]).sum()

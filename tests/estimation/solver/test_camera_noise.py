@@ -117,3 +117,24 @@ def test_noise_is_the_residuals_over_the_share_that_is_open(
         monkeypatch.setattr(camera_noise._Posterior, "leverage", lambda *_, half=half: half)
         ratios.append(camera_noise._noise_ratio(rows, posterior))
     assert ratios[1] == pytest.approx(2 * ratios[0])
+
+
+def test_exact_and_repeated_images_have_a_noise() -> None:
+    solver, found = solve_sighted(see())
+    (view,) = solver.problem.views
+    rows = bearing_factor(solver.problem, solver.layout, view, found.values)
+    exact = rows.rows.copy()
+    exact[..., -1] = 0.0
+    assert count_repeated(replace(rows, rows=exact), view) == pytest.approx(np.ones(3))
+    twice = replace(view, time_s=np.repeat(view.time_s[::2], 2)[: len(view.time_s)])
+    assert np.isfinite(count_repeated(rows, twice)).all()
+
+
+def test_a_camera_that_no_longer_fits_keeps_its_noise() -> None:
+    solver, found = solve_sighted(see())
+    (view,) = solver.problem.views
+    rows = bearing_factor(solver.problem, solver.layout, view, found.values)
+    far = rows.rows.copy()
+    far[..., -1] = 100.0
+    posterior = camera_noise._Posterior.at(solver, found.values)
+    assert (camera_noise._noise_ratio(replace(rows, rows=far), posterior) == 1).all()
