@@ -169,7 +169,8 @@ def _list_hopeless(base: Member, candidates: Sequence[Candidate]) -> set[Candida
 def _try_stretch(base: Member, candidate: Candidate) -> list[Member]:
     """Return the solution with more noise of one robot in the stretches that show it."""
     assert candidate.robot is not None
-    noisy = find_noisy_steps(base.solver, base.values, candidate.robot)
+    price = -candidate.model.log_odds
+    noisy = find_noisy_steps(base.solver, base.values, candidate.robot, price)
     if noisy is None:
         return []
     best: Member | None = None

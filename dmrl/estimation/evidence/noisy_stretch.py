@@ -16,7 +16,9 @@ RATIOS = (4.0, 16.0, 64.0)
 """Ratios of the variance in a stretch to that elsewhere that are compared."""
 
 
-def find_noisy_steps(solver: Solver, values: Values, robot: int) -> Mask | None:
+def find_noisy_steps(
+    solver: Solver, values: Values, robot: int, least_gain: float = 0.0
+) -> Mask | None:
     """Return (S,) the steps in noisy stretches; None where one level of noise fits as well.
 
     The windows are states of a hidden Markov chain with two levels. Its likeliest path is found by
@@ -28,6 +30,8 @@ def find_noisy_steps(solver: Solver, values: Values, robot: int) -> Mask | None:
         Flight under its models, and the solution.
     robot
         The robot.
+    least_gain
+        Gain in log likelihood over one level that counts.
     """
     step_s = solver.problem.robots[robot].steps_s
     window = ((np.cumsum(step_s) - step_s / 2) / WINDOW_S).astype(int)
@@ -38,7 +42,7 @@ def find_noisy_steps(solver: Solver, values: Values, robot: int) -> Mask | None:
     quiet = level / max(float(np.median(level)), 1e-12)
     paths = [_decode_levels(quiet, ratio) for ratio in RATIOS]
     gain, noisy = max(paths, key=lambda one: one[0])
-    return noisy[window] if gain > 0 else None
+    return noisy[window] if gain > least_gain else None
 
 
 def _velocity_squares(solver: Solver, values: Values, robot: int) -> Array:

@@ -55,6 +55,7 @@ def test_models_of_constants_are_scored_by_one_linearization_as_by_their_own() -
 def test_quiet_flight_has_no_noisy_stretch() -> None:
     base = solve_plain(pair_of(flown("in_view", "calibrated", 1000, 40.0)))
     assert [find_noisy_steps(base.solver, base.values, robot) for robot in (0, 1)] == [None, None]
+    assert find_noisy_steps(base.solver, base.values, 0, -1.0) is not None
 
 
 def test_levels_are_decoded_to_the_ends_of_the_flight() -> None:
