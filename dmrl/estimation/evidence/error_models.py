@@ -49,7 +49,7 @@ class ErrorModel:
     range_factor, flow_factor
         Factors of the noise of ranges, and of the velocity noise of one robot.
     for_a_while
-        Whether the velocity of one robot has another noise in stretches, which `posterior` finds.
+        Whether the velocity of one robot is noisier in stretches, which `noisy_stretch` finds.
     log_odds
         Prior log odds against the plain model.
     """

@@ -5,7 +5,7 @@ import numpy as np
 from dmrl.estimation.model.pair import Array, Mask
 from dmrl.estimation.solver.levenberg_marquardt import Solver
 from dmrl.estimation.solver.priors import Chain
-from dmrl.estimation.solver.residuals import Values, odometry_factor
+from dmrl.estimation.solver.residuals import Rows, Values
 
 WINDOW_S = 2.0
 """Length of a window, seconds."""
@@ -47,10 +47,11 @@ def find_noisy_steps(
 
 def _velocity_squares(solver: Solver, values: Values, robot: int) -> Array:
     """Return (S,) squares of the velocity errors of a robot, relative to their noise."""
-    problem, layout = solver.problem, solver.layout
-    square = odometry_factor(problem, layout, robot, values).square[:, :2].sum(axis=1)
-    chains = [factor for factor in solver.linearize(values) if isinstance(factor, Chain)]
-    for (subject, row), chain in zip(layout.states, chains, strict=True):
+    factors = solver.linearize(values)
+    odometry = [factor for factor in factors if isinstance(factor, Rows) and factor.steps][robot]
+    square = odometry.square[:, :2].sum(axis=1)
+    chains = [factor for factor in factors if isinstance(factor, Chain)]
+    for (subject, row), chain in zip(solver.layout.states, chains, strict=True):
         if row.motion and row.evolution == "fading" and subject[1] == (robot,):
             square += chain.residual[1:] ** 2
     return np.asarray(square)
