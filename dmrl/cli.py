@@ -118,7 +118,13 @@ def add_plugin_commands() -> App:
 def main() -> NoReturn:
     """Run the command; turn errors into one line and an exit status."""
     boundary.open_standard_streams()
-    boundary.install_signal_handlers()
+    boundary.install_signal_handlers()  # from here on a signal is an exception of _run_command
+    status = boundary.run_to_status(_run_command)
+    end_on_signal(boundary.describe_interrupt)  # what libraries do at exit loses an exception
+    raise SystemExit(status)
+
+
+def _run_command() -> None:
     set_one_blas_thread()
     use_own_temporary_folder()
     name, *words = sys.argv[1:] or [""]
@@ -126,10 +132,10 @@ def main() -> NoReturn:
         add_plugin_commands()
     for one in COMMANDS if name in ("--help", "-h") or not sys.argv[1:] else ():
         app[one]  # is loaded for its line of help
-    wants_help = name in COMMANDS and not set(app.help_flags).isdisjoint(words)
-    status = boundary.run_to_status((lambda: print_help(name)) if wants_help else app)
-    end_on_signal(boundary.describe_interrupt)  # what libraries do at exit loses an exception
-    raise SystemExit(status)
+    if name in COMMANDS and not set(app.help_flags).isdisjoint(words):
+        print_help(name)
+    else:
+        app()
 
 
 def print_help(name: str, console: Console | None = None) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dmrl import __version__, boundary
+from dmrl import __version__, boundary, cli
 from dmrl.cli import COMMANDS, app
 from dmrl.errors import OutputError
 
@@ -220,6 +220,20 @@ def test_ctrl_c_gives_one_line_and_status_130(
             ended[-1] = (ended[-1][0], ended[-1][1].replace("loading torch\n", ""))
     assert ended and {status for status, _ in ended} == {130}
     assert all(re.fullmatch(r"dmrl: stopped\. .*\n", output) for _, output in ended), ended
+
+
+def test_ctrl_c_before_the_command_itself_gives_status_130(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt() -> None:
+        raise boundary.Interrupted(signal.SIGINT)
+
+    monkeypatch.setattr(cli, "use_own_temporary_folder", interrupt)
+    monkeypatch.setattr(cli, "end_on_signal", lambda _: None)
+    monkeypatch.setattr(boundary, "install_signal_handlers", lambda: None)
+    with pytest.raises(SystemExit, match="130"):
+        cli.main()
+    assert capsys.readouterr().err.startswith("dmrl: stopped. ")
 
 
 def test_python_dash_m_dmrl_is_the_command() -> None:
