@@ -133,9 +133,9 @@ $(VERSIONS): constraints.txt
 	@mkdir -p $(@D)
 	@sed -e '/--hash/d' -e 's/ *\\$$//' $< > $@
 
-# The types of pandas are for editors: pandas brings none.
+# So an editor resolves every import of examples and pages.
 $(VENV)/.demo: $(VENV)/.pip pyproject.toml $(VERSIONS)
-	$(INSTALL) '.[train,label,view,plot]' pandas-stubs
+	$(INSTALL) '.[train,label,view,plot,ros]' --group examples
 	@$(POINT_TO_LAYOUT)
 	@touch $@
 

@@ -1,13 +1,17 @@
 """Examples and programs on pages pass pyright in strict mode."""
 
+import ast
 import json
 import re
 import shutil
 import subprocess
 import sys
+import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 FRAGMENTS = {"rendering.md", "tracking.md"}
@@ -48,6 +52,33 @@ def run_pyright(folder: Path) -> list[tuple[str, str]]:
         for one in output["generalDiagnostics"]
         if one["severity"] == "error"
     ]
+
+
+def imported(code: str) -> set[str]:
+    """Top-level names of the packages that code imports."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add(str(node.module))
+    return {name.split(".")[0] for name in found} - sys.stdlib_module_names
+
+
+def test_make_demo_installs_what_pages_and_examples_import() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    line = re.search(r"\.demo:.*\n\t.*'\.\[([a-z,]+)\]' --group (\w+)\n", makefile)
+    assert line
+    tables = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    extras = tables["project"]["optional-dependencies"]
+    listed = [*tables["project"]["dependencies"], *tables["dependency-groups"][line[2]]]
+    listed += [text for extra in line[1].split(",") for text in extras[extra]]
+    installed = {Requirement(text).name for text in listed} | {"dmrl"}
+    packages = packages_distributions()
+    wanted = {name for code in programs().values() for name in imported(code)}
+    assert {"gymnasium", "rosbags", "datasets", "torch", "cv2"} <= wanted
+    lacking = [name for name in wanted - {"dmrl"} if not installed & set(packages[name])]
+    assert lacking == []
 
 
 @pytest.mark.heavy
