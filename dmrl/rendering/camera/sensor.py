@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
+from scipy.ndimage import correlate1d, gaussian_filter1d
 
 from dmrl.images.bayer import to_bayer
 from dmrl.rendering.camera.distortion import FloatImage
@@ -122,43 +123,20 @@ def gaussian_blur(picture: FloatImage, sigma_px: float) -> FloatImage:
     if sigma_px < 0.2:
         return picture
     reach = int(np.ceil(2.5 * sigma_px))
-    steps = np.arange(-reach, reach + 1)
-    weights = np.exp(-0.5 * (steps / sigma_px) ** 2)
-    weights = (weights / weights.sum()).astype(np.float32)
     for axis in (0, 1):
-        pad = [(reach, reach) if k == axis else (0, 0) for k in range(3)]
-        padded = np.pad(picture, pad, mode="edge")
-        size = picture.shape[axis]
-        parts = [
-            padded[k : k + size] if axis == 0 else padded[:, k : k + size]
-            for k in range(2 * reach + 1)
-        ]
-        picture = weights[reach] * parts[reach]
-        pair = np.empty_like(picture)
-        for k in range(reach):  # both sides of the middle weigh the same
-            np.add(parts[k], parts[-1 - k], out=pair)
-            pair *= weights[k]
-            picture += pair
+        picture = gaussian_filter1d(picture, sigma_px, axis, mode="nearest", radius=reach)
     return picture
 
 
 def demosaic(raw: FloatImage) -> FloatImage:
     """Interpolate an (H, W, 3) image from a Bayer mosaic, linearly per colour."""
-    height, width = raw.shape
-    across = np.pad(raw, ((0, 0), (1, 1)), mode="reflect")
-    sides = (across[:, :-2] + across[:, 2:]) * np.float32(0.5)
-    down = np.pad(raw, ((1, 1), (0, 0)), mode="reflect")
-    ends = (down[:-2] + down[2:]) * np.float32(0.5)
-    both = np.pad(sides, ((1, 1), (0, 0)), mode="reflect")
-    corners = (both[:-2] + both[2:]) * np.float32(0.5)
-    out = np.empty((height, width, 3), np.float32)
-    for channel, row, col in ((0, 0, 0), (2, 1, 1)):
-        here, there = np.s_[row::2, col::2], np.s_[1 - row :: 2, 1 - col :: 2]
-        out[..., channel][here] = raw[here]
-        out[..., channel][row::2, 1 - col :: 2] = sides[row::2, 1 - col :: 2]
-        out[..., channel][1 - row :: 2, col::2] = ends[1 - row :: 2, col::2]
-        out[..., channel][there] = corners[there]
-    cross = (sides + ends) * np.float32(0.5)
-    out[..., 1] = raw
-    out[::2, ::2, 1], out[1::2, 1::2, 1] = cross[::2, ::2], cross[1::2, 1::2]
+    out = np.zeros((*raw.shape, 3), np.float32)
+    green = raw.copy()
+    for channel, first in ((0, 0), (2, 1)):
+        places = np.s_[first::2, first::2]
+        out[..., channel][places], green[places] = raw[places], 0
+        for axis in (0, 1):
+            correlate1d(out[..., channel], (0.5, 1, 0.5), axis, out[..., channel], mode="mirror")
+    beside = (correlate1d(green, (0.25, 0, 0.25), axis, mode="mirror") for axis in (0, 1))
+    out[..., 1] = green + sum(beside)
     return out
