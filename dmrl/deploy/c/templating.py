@@ -1,7 +1,7 @@
 """C text from templates and arrays."""
 
 import re
-from collections.abc import Iterable
+import textwrap
 from functools import cache
 from pathlib import Path
 
@@ -18,6 +18,7 @@ RESERVED_FILE_NAMES = ("main", "harness", "count")
 """Names of other C files in the same folder, which a network must not use."""
 MAX_NAME_LENGTH = 40
 LINE_WIDTH = 100
+INDENT = "    "
 
 
 def fill_template(template: str, **values: object) -> str:
@@ -62,17 +63,10 @@ def format_numbers(values: NDArray[np.integer]) -> str:
     """
     if values.dtype.kind not in "iu":
         raise TypeError(f"an array is of {values.dtype}, not of integers")
-    return "\n".join(_wrap(f"{v}," for v in values.ravel().tolist()))
-
-
-def _wrap(words: Iterable[str]) -> list[str]:
-    lines, line = [], "    "
-    for word in words:
-        if len(line) + len(word) > LINE_WIDTH:
-            lines.append(line.rstrip())
-            line = "    "
-        line += word + " "
-    return [*lines, line.rstrip()]
+    text = " ".join(f"{value}," for value in values.ravel().tolist())
+    return textwrap.fill(
+        text, LINE_WIDTH, initial_indent=INDENT, subsequent_indent=INDENT, break_on_hyphens=False
+    )
 
 
 def c_name(network: IntegerNetwork) -> str:
