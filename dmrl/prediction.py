@@ -30,13 +30,13 @@ from dmrl.recording import (
     LoadedRecording,
     Provenance,
     RawMessage,
-    TimedMessage,
     build_provenance,
     parse_message,
     read_raw,
     rewrite,
 )
 from dmrl.recording.provenance_inputs import hash_file
+from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say, track
 
@@ -151,7 +151,7 @@ def _iter_messages(
     batch_size: int,
     tally: Counter[str],
     rates: dict[str, Any] | None,
-) -> Iterator[TimedMessage]:
+) -> Iterator[Sample]:
     """Yield Detections and GridMap of every image, and count them on the way."""
     images = [t for t in held.topics if topics.parse_topic(topics.CAMERA_IMAGE, t)]
     total = sum(held.topics[t].count for t in images)
@@ -168,11 +168,11 @@ def _iter_messages(
                 tally["believed"] += sum(
                     d["confidence"] >= detector.threshold for d in fields["detections"]
                 )
-                made = message_class("Detections")(**fields)
                 robot = (topics.parse_topic(topics.CAMERA_IMAGE, raw.topic) or {})["robot"]
-                yield TimedMessage(raw.time_ns, topics.DETECTIONS(robot), made, raw.publish_ns)
-                grid = message_class("GridMap")(**grid_fields(grids, k, detector.stride_px))
-                yield TimedMessage(raw.time_ns, topics.GRID(robot), grid, raw.publish_ns)
+                topic = topics.DETECTIONS(robot)
+                yield Sample(raw.time_ns, topic, "Detections", fields, raw.publish_ns)
+                grid = grid_fields(grids, k, detector.stride_px)
+                yield Sample(raw.time_ns, topics.GRID(robot), "GridMap", grid, raw.publish_ns)
     if total and not tally["images"]:
         raise RecordingError(f"{held.path}: no image can be decoded. Restore the recording")
 

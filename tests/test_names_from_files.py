@@ -31,8 +31,6 @@ BY_ROWS = "checked, or made of letters and digits, by ExportRows"
 READ = "only read: names of files beside each other"
 REASONS = {
     "deploy/export_folder.py: decoded": OURS,
-    "deploy/usage.py: f'{header}.h'": LISTED,
-    "deploy/usage.py: page": OURS,
     "viewer/flag_page.py: name": OURS,
     "pipeline/recipe_run.py: out": CHECKED_BEFORE,
     "pipeline/runner.py: name": LISTED,

@@ -12,7 +12,6 @@ from dmrl.formats.base import Content, Format, Names, Options
 from dmrl.formats.registry import find_format
 from dmrl.guards.paths import refuse_pipes
 from dmrl.ingest import foreign_recording, mapped_topics
-from dmrl.messages import message_class
 from dmrl.recording import (
     LICENCES_METADATA,
     SPLIT_METADATA,
@@ -111,7 +110,7 @@ def write_content(content: Content, sink: RecordingWriter) -> dict[str, int]:
     for first_ns, end_ns in iter_time_slices([one.time_ns for one in content.series]):
         for series in content.series:
             part = series.crop_to_time(first_ns, end_ns)
-            sink.write_columns(part.topic, message_class(part.message), part.time_ns, part.fields)
+            sink.write_series(part)
             counts[part.topic] += len(part.time_ns)
         while waiting is not None and waiting.time_ns < end_ns:
             sink.write_sample(waiting)

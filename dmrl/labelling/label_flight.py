@@ -34,7 +34,8 @@ from dmrl.labelling.peer_positions import PeerPositions, sample_positions
 from dmrl.labelling.recorded_camera import require_camera
 from dmrl.labelling.sensor_file import SensorConstants, read_sensors
 from dmrl.labelling.sensor_logs import SensorLogs, build_sensor_logs
-from dmrl.recording import Provenance, TimedMessage, rewrite
+from dmrl.recording import Provenance, rewrite
+from dmrl.samples.sample import Sample
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,7 @@ class LabelledFlight:
     """
 
     positions: dict[RobotPair, PeerPositions]
-    labels: dict[str, list[TimedMessage]]
+    labels: dict[str, list[Sample]]
     reports: list[PairReport]
     innovations: Mapping[RobotPair, Sequence[Innovation]]
     warnings: list[str]

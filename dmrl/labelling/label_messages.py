@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -24,12 +24,12 @@ from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.labelling.recorded_camera import find_recorded_camera
 from dmrl.labelling.sensor_logs import SensorLogs
 from dmrl.messages import message_class
-from dmrl.recording import Series, Stamped, TimedMessage
+from dmrl.recording import Stamped
 from dmrl.recording.label_sources import get_message_sources
-from dmrl.samples.sample import round_values
+from dmrl.samples.sample import Columns, Sample, round_values
 
 
-def build_position_series(observer: str, peer: str, found: PeerPositions) -> Series:
+def build_position_series(observer: str, peer: str, found: PeerPositions) -> Columns:
     """Return the PeerPosition messages of one pair."""
     x, y, z = found.xyz_m.T
     fields = {
@@ -40,15 +40,14 @@ def build_position_series(observer: str, peer: str, found: PeerPositions) -> Ser
         "covariance": found.covariance.reshape(-1, 9),
         "status": found.status,
     }
-    topic = topics.POSITION(observer, peer)
-    return Series(topic, message_class("PeerPosition"), found.time_ns, fields)
+    return Columns(topics.POSITION(observer, peer), "PeerPosition", found.time_ns, fields)
 
 
 def build_cause_messages(
     start_ns: int,
     reports: Iterable[PairReport],
     innovations: Mapping[RobotPair, Sequence[Innovation]],
-) -> Iterator[list[TimedMessage]]:
+) -> Iterator[list[Sample]]:
     """Yield the PeerCauses message of each ordered pair.
 
     Parameters
@@ -75,8 +74,8 @@ def build_cause_messages(
             )
             for one in innovations.get(both, ())
         ]
-        made = message_class("PeerCauses")(causes=causes, innovations=shown)
-        yield [TimedMessage(start_ns, topics.CAUSES(*both), made)]
+        fields = {"causes": causes, "innovations": shown}
+        yield [Sample(start_ns, topics.CAUSES(*both), "PeerCauses", fields)]
 
 
 def build_label_messages(
@@ -85,7 +84,7 @@ def build_label_messages(
     robot: str,
     positions: Mapping[str, PeerPositions],
     options: CameraOptions,
-) -> Iterator[TimedMessage]:
+) -> Iterator[Sample]:
     """Yield PeerLabels of every image that has a position or had labels, in time order.
 
     If any peer is located in an image, every other robot that has a log gets a label too, as one
@@ -111,23 +110,21 @@ def build_label_messages(
     for time_ns in sorted({*kept, *fresh}):
         peers = [*kept.get(time_ns, []), *fresh.get(time_ns, [])]
         names = sorted(sources[time_ns] | ({SOURCE} if time_ns in fresh else set()))
-        made = message_class("PeerLabels")(peers=peers, sources=names)
-        yield TimedMessage(time_ns, topics.LABELS(robot), made)
+        fields = {"peers": peers, "sources": names}
+        yield Sample(time_ns, topics.LABELS(robot), "PeerLabels", fields)
 
 
-def select_estimated(made: Iterable[TimedMessage]) -> Iterator[TimedMessage]:
+def select_estimated(made: Iterable[Sample]) -> Iterator[Sample]:
     """Yield PeerLabels without the labels of other sources."""
     for labels in made:
-        if SOURCE in labels.message.sources:
-            peers = [peer for peer in labels.message.peers if peer.source == SOURCE]
-            yield labels._replace(
-                message=message_class("PeerLabels")(peers=peers, sources=[SOURCE])
-            )
+        if SOURCE in labels.fields["sources"]:
+            peers = [peer for peer in labels.fields["peers"] if peer.source == SOURCE]
+            yield replace(labels, fields={"peers": peers, "sources": [SOURCE]})
 
 
-def count_estimated(made: Iterable[Iterable[TimedMessage]]) -> int:
+def count_estimated(made: Iterable[Iterable[Sample]]) -> int:
     """Return the number of estimated labels, without those of other sources."""
-    peers = (peer for messages in made for m in messages for peer in m.message.peers)
+    peers = (peer for messages in made for m in messages for peer in m.fields["peers"])
     return sum(peer.source == SOURCE for peer in peers)
 
 

@@ -13,10 +13,8 @@ from dmrl.estimation.tracking.tracker import Track, Tracker
 from dmrl.estimation.tracking.tuning import Tuning
 from dmrl.geometry.frames import Camera
 from dmrl.labelling.flight_log import FlightLog
-from dmrl.labelling.observer_log import ObserverLog, read_observer_log
+from dmrl.labelling.observer_log import read_observer_log
 from dmrl.labelling.recorded_camera import read_robot_camera, require_camera
-from dmrl.messages import message_class
-from dmrl.recording import TimedMessage
 from dmrl.samples.sample import Sample
 from dmrl.terminal.progress import say, track
 
@@ -49,7 +47,7 @@ def choose_camera(
 
 def track_peers(
     flight: FlightLog, robot: str, camera: Camera, threshold: float | None, tuning: Tuning
-) -> tuple[list[TimedMessage], RobotReport]:
+) -> tuple[list[Sample], RobotReport]:
     """Return the Tracks messages of one robot, one per image, and their numbers.
 
     Parameters
@@ -70,7 +68,7 @@ def track_peers(
     for warning in sight.warnings:
         say(f"{flight.path}: {warning}")
     tracker, identity = Tracker(sight.camera, tuning, rates), TrackIdentity()
-    made: list[TimedMessage] = []
+    made: list[Sample] = []
     seen: dict[int, str] = {}
     entries = 0
     for k in track(range(len(sight.time_ns)), f"Following from {robot}"):
@@ -78,7 +76,7 @@ def track_peers(
         names = identity.assign(tracks, sight.ranges(k), sight.motion(k).dt_s)
         seen |= {t.number: names.get(t.number) or seen.get(t.number, "") for t in tracks}
         entries += len(tracks)
-        made.append(_message(sight, k, tracks, names))
+        made.append(build_tracks(robot, int(sight.log_time_ns[k]), tracks, names, None))
     images = len(sight.time_ns)
     named = sum(bool(name) for name in seen.values())
     return made, RobotReport(robot, images, len(seen), named, round(entries / max(images, 1), 3))
@@ -105,10 +103,3 @@ def build_tracks(
         )
     fields = {"frame_id": f"{robot}/horizontal", "tracks": entries}
     return Sample(time_ns, topics.TRACKS(robot), "Tracks", fields, publish_ns)
-
-
-def _message(
-    sight: ObserverLog, k: int, tracks: list[Track], names: dict[int, str]
-) -> TimedMessage:
-    made = build_tracks(sight.robot, int(sight.log_time_ns[k]), tracks, names, None)
-    return TimedMessage(made.time_ns, made.topic, message_class("Tracks")(**made.fields))

@@ -12,8 +12,6 @@ from dmrl.recording.copying.edit import merge as merge
 from dmrl.recording.copying.edit import trim as trim
 from dmrl.recording.copying.resume import InterruptedRecording as InterruptedRecording
 from dmrl.recording.copying.resume import recover_interrupted as recover_interrupted
-from dmrl.recording.copying.rewrite import Series as Series
-from dmrl.recording.copying.rewrite import TimedMessage as TimedMessage
 from dmrl.recording.copying.rewrite import iter_time_slices as iter_time_slices
 from dmrl.recording.copying.rewrite import rewrite as rewrite
 from dmrl.recording.copying.rewrite import shift_times as shift_times

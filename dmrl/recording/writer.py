@@ -25,7 +25,7 @@ from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, Ints
 from dmrl.recording.protobuf.encode import ColumnValue, encode
 from dmrl.recording.provenance import METADATA_NAME, Provenance
 from dmrl.recording.summary import Summary
-from dmrl.samples.sample import Sample
+from dmrl.samples.sample import Columns, Sample
 from dmrl.terminal.left_out import count_so_far
 from dmrl.topics import find_topic
 
@@ -168,6 +168,11 @@ class RecordingWriter:
         records, at = encode(kind.DESCRIPTOR, fields, len(time_ns), MESSAGE_PREFIX_BYTES)
         publish_ns = time_ns if publish_ns is None else publish_ns
         self.chunk_writer.add_records(channel, records, at, time_ns, publish_ns)
+
+    def write_series(self, series: Columns) -> None:
+        """Append samples of one topic as messages; see `write_columns`."""
+        kind = message_class(series.message)
+        self.write_columns(series.topic, kind, series.time_ns, series.fields)
 
     def write_raw(self, raw: RawMessage) -> None:
         """Append a message of another recording, its payload bit for bit."""

@@ -73,7 +73,7 @@ def test_position_message_has_time_frame_covariance_and_status(tmp_path: Path) -
     series = build_position_series("cf1", "cf2", found)
     assert series.topic == "/cf1/peer/cf2/position"
     with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
-        sink.write_columns(*series)
+        sink.write_series(series)
     first, second = read(tmp_path / "a.mcap")
     assert (first.time_ns, first.topic) == (START_NS + SECOND_NS, "/cf1/peer/cf2/position")
     said = second.message
@@ -93,10 +93,10 @@ def test_label_has_the_image_time_and_its_exposure_time(tmp_path: Path, delay_s:
     for entry, taken, xyz_m in zip(made, taken_s, found.xyz_m[1:4], strict=True):
         tilt = np.array([ROLL_RATE * taken]), np.array([PITCH_RATE * taken])
         (uv,), (depth_m,), _ = pixels_from_horizontal(xyz_m[None], *tilt, AIDECK)
-        (label,) = entry.message.peers
+        (label,) = entry.fields["peers"]
         assert (label.u_px, label.v_px) == pytest.approx(tuple(uv))
         assert label.depth_m == pytest.approx(depth_m)
-        assert entry.message.sources == ["estimate"]
+        assert entry.fields["sources"] == ["estimate"]
 
 
 def test_labels_of_other_sources_stay_and_old_estimates_are_replaced(tmp_path: Path) -> None:
@@ -105,16 +105,16 @@ def test_labels_of_other_sources_stay_and_old_estimates_are_replaced(tmp_path: P
     image_ns, other_ns = START_NS + 2 * SECOND_NS, START_NS + 3 * SECOND_NS
     path = flight(tmp_path / "a.mcap", [2.0, 3.0], [(image_ns, before), (other_ns, before)])
     first, second = written(path, {"cf2": at([2.0])}, AIDECK, logs())
-    assert [p.source for p in first.message.peers] == ["truth", "estimate"]
-    assert list(first.message.sources) == ["estimate", "truth"]
-    assert [p.source for p in second.message.peers] == ["truth"]
-    assert list(second.message.sources) == ["truth"]
+    assert [p.source for p in first.fields["peers"]] == ["truth", "estimate"]
+    assert list(first.fields["sources"]) == ["estimate", "truth"]
+    assert [p.source for p in second.fields["peers"]] == ["truth"]
+    assert list(second.fields["sources"]) == ["truth"]
 
 
 def test_robot_without_position_is_unconverged_in_every_labelled_image(tmp_path: Path) -> None:
     path = flight(tmp_path / "a.mcap", [2.0, 3.0])
     (only,) = written(path, {"cf2": at([2.0])}, AIDECK, logs(["cf1", "cf2", "cf3", "cf4"]))
-    known, *unknown = only.message.peers
+    known, *unknown = only.fields["peers"]
     assert (known.peer, known.status) == ("cf2", STATUS_OK)
     assert [(p.peer, p.status) for p in unknown] == [(f"cf{k}", STATUS_UNCONVERGED) for k in (3, 4)]
     assert {(p.u_px, p.v_px, p.depth_m) for p in unknown} == {(160.0, 112.0, MIN_DEPTH_M)}
@@ -138,9 +138,9 @@ def test_causes_and_innovations_name_their_robots() -> None:
     both = {("cf2", "cf1"): (shown, ranged)}
     ((made,),) = build_cause_messages(START_NS, [report], both)
     assert made.topic == topics.CAUSES("cf2", "cf1")
-    assert [(one.signal, one.robot) for one in made.message.innovations] == [
+    assert [(one.signal, one.robot) for one in made.fields["innovations"]] == [
         ("flow", "cf1"), ("range", ""),
     ]  # fmt: skip
-    assert list(made.message.innovations[0].at_s) == [1.0, 3.0]
-    assert made.message.causes[0].name == "flow does not fit"
+    assert list(made.fields["innovations"][0].at_s) == [1.0, 3.0]
+    assert made.fields["causes"][0].name == "flow does not fit"
     assert "No known error explains it" in str(report.causes[0])

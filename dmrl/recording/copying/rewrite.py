@@ -5,7 +5,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,38 +17,11 @@ from dmrl.recording.copying.chunk_copy import (
 )
 from dmrl.recording.mcap.channel import RawMessage
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS, ROWS_AT_A_TIME, Ints
-from dmrl.recording.protobuf.encode import ColumnValue
 from dmrl.recording.provenance import Provenance
 from dmrl.recording.summary import read_summary
 from dmrl.recording.writer import RecordingWriter
+from dmrl.samples.sample import Columns, Sample
 from dmrl.storage.shared_file import share_file
-
-
-class TimedMessage(NamedTuple):
-    """A message to write: log time, topic, message and, if it differs, publish time."""
-
-    time_ns: int
-    topic: str
-    message: Any
-    publish_ns: int | None = None
-
-
-class Series(NamedTuple):
-    """Messages of one topic as columns, by increasing time; see `RecordingWriter.write_columns`."""
-
-    topic: str
-    kind: Any
-    time_ns: Ints
-    fields: Mapping[str, ColumnValue]
-
-    def slice_time(self, first_ns: int, end_ns: int) -> "Series":
-        """Return the messages with log times in [first_ns, end_ns)."""
-        rows = slice(*np.searchsorted(self.time_ns, (first_ns, end_ns)).tolist())
-        parts = {
-            name: value[rows] if isinstance(value, np.ndarray) else value
-            for name, value in self.fields.items()
-        }
-        return self._replace(time_ns=self.time_ns[rows], fields=parts)
 
 
 def rewrite(
@@ -58,8 +30,8 @@ def rewrite(
     made: Provenance,
     *,
     without: Collection[str],
-    fresh: Iterable[Iterable[TimedMessage]] = (),
-    series: Sequence[Series] = (),
+    fresh: Iterable[Iterable[Sample]] = (),
+    series: Sequence[Columns] = (),
     metadata: Mapping[str, dict[str, str]] | None = None,
 ) -> None:
     """Copy a recording bit for bit without some topics, and add new messages.
@@ -95,17 +67,11 @@ def rewrite(
                 sink.add_metadata(name, values)
             copy_messages(recording, TopicSelection(kept), sink)
             sink.flush()  # new messages start at the first time again, so they get their own chunks
-            for part in _iter_by_time(series):
-                sink.write_columns(*part)
-            for item in heapq.merge(*fresh, key=lambda m: m.time_ns):
-                sink.write(item.time_ns, item.topic, item.message, publish_ns=item.publish_ns)
-
-
-def _iter_by_time(series: Sequence[Series]) -> Iterator[Series]:
-    """Yield the columns of all series, one time slice after another."""
-    for first_ns, end_ns in iter_time_slices([one.time_ns for one in series]):
-        for one in series:
-            yield one.slice_time(first_ns, end_ns)
+            for first_ns, end_ns in iter_time_slices([one.time_ns for one in series]):
+                for one in series:
+                    sink.write_series(one.crop_to_time(first_ns, end_ns))
+            for sample in heapq.merge(*fresh, key=lambda sample: sample.time_ns):
+                sink.write_sample(sample)
 
 
 def iter_time_slices(times_ns: Sequence[Ints]) -> Iterator[tuple[int, int]]:

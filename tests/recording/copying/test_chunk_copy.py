@@ -10,7 +10,6 @@ from dmrl.messages import message_class
 from dmrl.recording import (
     Provenance,
     RecordingWriter,
-    TimedMessage,
     merge,
     read_raw,
     read_summary,
@@ -19,6 +18,7 @@ from dmrl.recording import (
     trim,
 )
 from dmrl.recording.mcap.chunks import chunk_reader
+from dmrl.samples.sample import Sample
 
 from ..records import channels, chunks, packed, unchanged
 
@@ -54,7 +54,7 @@ def test_rewrite_copies_whole_chunks_in_one_pass(
     monkeypatch.setattr(
         chunk_reader, "decompress", lambda c, at: opened.append(at) or unpacked(c, at)
     )
-    fresh = [TimedMessage(k * 100, "/cf1/labels", message_class("PeerLabels")()) for k in range(20)]
+    fresh = [Sample(k * 100, "/cf1/labels", "PeerLabels", {}) for k in range(20)]
     out = tmp_path / "out.mcap"
     rewrite(flight, out, MADE, without=(), fresh=[fresh])
     assert len(opened) == len(set(opened)) == len(chunks(flight)) > 8
