@@ -85,10 +85,8 @@ class ReportInputs:
     def documents_of_kind(self, kind: str) -> dict[str, Mapping[str, Any]]:
         """Return the documents of one kind, in the order of the recipe, then by name."""
         held = self.documents.get(kind, {})
-        return {name: held[name] for name in sorted(held, key=self._turn)}
-
-    def _turn(self, name: str) -> tuple[int, str]:
-        return self.order.get(name, len(self.order)), name
+        names = sorted(sorted(held), key=lambda name: self.order.get(name, len(self.order)))
+        return {name: held[name] for name in names}
 
 
 def collect_outputs(folder: Path) -> ReportInputs:
@@ -164,7 +162,7 @@ def _collect_file(found: ReportInputs, path: Path) -> None:
             found.made[name] = held.provenance
     elif path.name in DOCUMENT_KINDS:
         name = _relative_name(found, path.parent)
-        found.documents.setdefault(DOCUMENT_KINDS[path.name], {})[name] = _read_document(path)
+        found.documents.setdefault(DOCUMENT_KINDS[path.name], {})[name] = read_document(path)
         _store_provenance(found, path.parent)
     elif path.name == "dataset_dict.json" or path.suffix == ".parquet":
         # DATASET/dataset_dict.json, DATASET/data/SPLIT-00000.parquet
@@ -191,7 +189,14 @@ def _store_provenance(found: ReportInputs, output: Path) -> None:
         found.made[_relative_name(found, output)] = made
 
 
-def _read_document(path: Path) -> Mapping[str, Any]:
+def read_document(path: Path) -> Mapping[str, Any]:
+    """Read the JSON document of an output.
+
+    Raises
+    ------
+    ValueError
+        If it is too large, or is not a table.
+    """
     if path.stat().st_size > MAX_DOCUMENT_BYTES:
         raise ValueError(f"{path.name} is larger than {MAX_DOCUMENT_BYTES >> 20} MB")
     document = parse_json(path.read_text(encoding="utf-8"))

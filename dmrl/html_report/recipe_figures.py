@@ -3,7 +3,6 @@
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -11,7 +10,6 @@ from dmrl import plots, topics
 from dmrl.evaluation.detections import ImageKey
 from dmrl.evaluation.figure_specs import FigureSpec, ReportedValue, find_value
 from dmrl.evaluation.figures import iter_maps, read_image
-from dmrl.guards.bounded_parsing import parse_json
 from dmrl.html_report.blocks import (
     INVALID_DATA_ERRORS,
     Block,
@@ -22,7 +20,7 @@ from dmrl.html_report.blocks import (
     Text,
     build_row,
 )
-from dmrl.html_report.collect import MAX_DOCUMENT_BYTES, ReportInputs
+from dmrl.html_report.collect import ReportInputs, read_document
 from dmrl.plots import charts
 from dmrl.recording import LoadedRecording, read_summary
 
@@ -51,17 +49,10 @@ def _build_numbers(found: ReportInputs, shown: FigureSpec, _: ImageEmbedder) -> 
 
 
 def _format_value(found: ReportInputs, number: ReportedValue) -> str:
-    value = find_value(_read_document(found, number.of), number.at)
+    value = find_value(read_document(_resolve_output(found, number.of)), number.at)
     if value is None or isinstance(value, str):
         return value or "-"
     return format(value, number.form)
-
-
-def _read_document(found: ReportInputs, name: str) -> Any:
-    path = _resolve_output(found, name)
-    if path.stat().st_size > MAX_DOCUMENT_BYTES:
-        raise ValueError(f"{name} is larger than {MAX_DOCUMENT_BYTES >> 20} MB")
-    return parse_json(path.read_text(encoding="utf-8"))
 
 
 def _resolve_output(found: ReportInputs, name: str) -> Path:
@@ -79,7 +70,8 @@ def _build_losses(found: ReportInputs, shown: FigureSpec, _: ImageEmbedder) -> l
     for key, words in LOSS_LABELS.items():
         curves = {}
         for k, name in enumerate(shown.of):
-            history = _read_document(found, f"{name}/model.json")["training"]["history"]
+            model = read_document(_resolve_output(found, f"{name}/model.json"))
+            history = model["training"]["history"]
             curves[shown.output_label(k)] = [float(epoch[key]) for epoch in history]
         drawn.append(Figure(f"{words} over the epochs", svg=charts.plot_losses(curves, words)))
     return build_row(drawn)

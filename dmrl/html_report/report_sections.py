@@ -5,7 +5,8 @@ are shown.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -127,7 +128,7 @@ def _metric_cells(overall: Mapping[str, Any]) -> list[str]:
 
 def _iter_detection_charts(few: Mapping[str, Any]) -> Iterable[Figure]:
     for key, words in (("median_px", "median error, px"), ("depth_mae_m", "depth MAE, m")):
-        found = extract_valid(few, _distance_bands(key)).items()
+        found = extract_valid(few, partial(_distance_bands, key)).items()
         if bands := {name: rows for name, rows in found if rows}:
             caption = f"{words} by distance"
             yield draw_or_explain(charts.plot_by_distance, bands, words, caption=caption)
@@ -142,17 +143,14 @@ def _iter_detection_charts(few: Mapping[str, Any]) -> Iterable[Figure]:
         yield draw_or_explain(charts.plot_reliability, bins, caption=words)
 
 
-def _distance_bands(key: str) -> Callable[[Any], list[tuple[float, ...]]]:
-    def take(said: Any) -> list[tuple[float, ...]]:
-        out = []
-        for band in said["bands"]:
-            value, low, high = (band[key][end] for end in ("value", "low", "high"))
-            if None not in (value, low, high):
-                ends = band["from_m"], math.inf if band["to_m"] is None else band["to_m"]
-                out.append(tuple(map(float, (*ends, value, low, high))))
-        return out
-
-    return take
+def _distance_bands(key: str, said: Any) -> list[tuple[float, ...]]:
+    out = []
+    for band in said["bands"]:
+        value, low, high = (band[key][end] for end in ("value", "low", "high"))
+        if None not in (value, low, high):
+            ends = band["from_m"], math.inf if band["to_m"] is None else band["to_m"]
+            out.append(tuple(map(float, (*ends, value, low, high))))
+    return out
 
 
 def _precision_recall(said: Any) -> tuple[Any, Any]:
