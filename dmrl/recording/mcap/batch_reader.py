@@ -138,19 +138,21 @@ def _iter_in_time_order(
     chunks = select_chunks(summary, channels.keys(), low, high)
     last = _find_image_channels(channels)
     pending: MessageBatch | None = None
-    if (low, high) != (0, MAX_TIME_NS) and stream.remote_stream is None:
+    whole = (low, high) == (0, MAX_TIME_NS)
+    if not whole and stream.remote_stream is None:
         # The messages cannot be compared with the statistics, but all message indexes can.
         verify_indexes(stream, summary)
     for k, batch in enumerate(iter_chunks(stream, chunks, channels, summary)):
-        batch = batch.take((batch.time_ns >= low) & (batch.time_ns < high))
+        if not whole:
+            batch = batch.take((batch.time_ns >= low) & (batch.time_ns < high))
         pending = concatenate(pending, batch).sort_by_time(last)
         if k + 1 == len(chunks):
             break
         # A later chunk may still hold messages from its start time on.
         split = int(np.searchsorted(pending.time_ns, chunks[k + 1].message_start_time))
         if split:
-            yield pending.take(np.arange(split))
-            pending = pending.take(np.arange(split, len(pending))).compact()
+            yield pending.take(slice(split))
+            pending = pending.take(slice(split, None)).compact() if split < len(pending) else None
     if pending is not None and len(pending):
         yield pending
 

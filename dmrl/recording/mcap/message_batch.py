@@ -76,7 +76,7 @@ class MessageBatch:
     def __len__(self) -> int:
         return len(self.start)
 
-    def take(self, rows: Ints | NDArray[np.bool_]) -> "MessageBatch":
+    def take(self, rows: Ints | NDArray[np.bool_] | slice) -> "MessageBatch":
         """Return a batch of these rows over the same bytes."""
         return MessageBatch(self.data, *(column[rows] for column in self._columns))
 

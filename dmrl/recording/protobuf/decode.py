@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from dmrl.guards import limits
 from dmrl.recording.mcap.message_batch import Bytes, Ints
+from dmrl.recording.protobuf.equal_messages import decode_equal
 from dmrl.recording.protobuf.wire_format import (
     DELIMITED,
     FIXED_DTYPES,
@@ -144,6 +145,9 @@ def _parse(build: Any, data: Bytes, first: int, last: int) -> Any:
 def _decode_fields(
     data: Bytes, start: Ints, end: Ints, fields: dict[str, FieldDescriptor]
 ) -> dict[str, pa.Array]:
+    alike = decode_equal(data, start, end, fields)
+    if alike is not None:
+        return {name: pa.array(values) for name, values in alike.items()}
     numbers = {f.number: f for f in fields.values()}
     found = find_fields(data, start, end, set(numbers))
     for number, spans in found.items():

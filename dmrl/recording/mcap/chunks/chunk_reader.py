@@ -9,7 +9,6 @@ from mcap.records import Chunk, ChunkIndex
 
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunks.chunk import (
-    MESSAGE_PREFIX_DTYPE,
     RECORD_HEADER_BYTES,
     ParsedChunk,
     build_batch_at,
@@ -21,7 +20,7 @@ from dmrl.recording.mcap.chunks.chunk import (
 )
 from dmrl.recording.mcap.file import BoundedReader
 from dmrl.recording.mcap.file_writer import CHUNK_STRUCT
-from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, Bytes, MessageBatch, gather
+from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, Bytes, MessageBatch
 from dmrl.recording.mcap.message_index import (
     MessageIndex,
     compute_indexes_size,
@@ -159,20 +158,16 @@ def _select_by_index(
         n: place - at for n, place in chunk_index.message_index_offsets.items() if n in channels
     }
     entries = parse_index_entries(raw, places)
-    if (
-        len(entries.offset)
-        and not 0
-        <= entries.offset.min()
-        <= entries.offset.max()
-        <= len(data) - MESSAGE_PREFIX_BYTES
-    ):
+    offset, channel, time_ns = entries.offset, entries.channel, entries.time_ns
+    if (offset[1:] < offset[:-1]).any():  # of several channels
+        order = np.argsort(offset)
+        offset, channel, time_ns = offset[order], channel[order], time_ns[order]
+    if len(offset) and not 0 <= offset[0] <= offset[-1] <= len(data) - MESSAGE_PREFIX_BYTES:
         raise McapError(f"index beyond the chunk at byte {at}")
     # Message indexes have no CRC, so they are compared with the records they point at.
-    heads = gather(data, MESSAGE_PREFIX_DTYPE, entries.offset)
-    batch = build_batch_at(data, np.sort(entries.offset.astype(np.uint32)).astype(np.int64))
-    right = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == entries.channel)
-    right &= heads["time"].view(np.int64) == entries.time_ns
-    if not (right & (batch.end <= len(data))).all():
+    batch = build_batch_at(data, offset)
+    right = (data[offset] == Opcode.MESSAGE) & (batch.channel == channel)
+    if not (right & (batch.time_ns == time_ns) & (batch.end <= len(data))).all():
         raise McapError(f"index of the chunk at byte {at} is wrong")
     return _check_time_range(chunk_index, require_valid_times(batch)), dict(
         zip(places, entries.counts.tolist(), strict=True)
@@ -182,7 +177,8 @@ def _select_by_index(
 def _check_time_range(chunk_index: ChunkIndex, batch: MessageBatch) -> MessageBatch:
     """Return the batch; raise McapError if its times exceed the range of its Chunk Index."""
     low, high = chunk_index.message_start_time, chunk_index.message_end_time
-    if len(batch) and not low <= batch.time_span_ns[0] <= batch.time_span_ns[1] <= high:
+    first, last = batch.time_span_ns if len(batch) else (low, high)
+    if not low <= first <= last <= high:
         raise McapError(
             f"messages in the chunk at byte {chunk_index.chunk_start_offset} are "
             "outside the time range that it states"
