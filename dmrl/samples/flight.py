@@ -6,7 +6,6 @@ Times are (N,) int64 nanoseconds, values (N,) arrays.
 import heapq
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -14,29 +13,15 @@ from numpy.typing import NDArray
 
 from dmrl import topics
 from dmrl.geometry.frames import Array, camera_from_horizontal, yaw_matrix
-from dmrl.samples.sample import Sample, to_timestamp
+from dmrl.samples.sample import Columns, Sample, to_timestamp
 
 Times = NDArray[np.int64]
 
 LOG_COLUMNS = ("roll_rad", "pitch_rad", "yaw_rate_radps", "vx_mps", "vy_mps", "height_m")
-"""Columns of a robot's log, as ``iter_robot_log`` needs them."""
+"""Columns of a robot's log, as ``build_robot_log`` needs them."""
 
 START_NS = 1_000_000_000
 """Log time of a simulated start: clocks that run late must not show a time before zero."""
-ZERO_COVARIANCE = [0.0] * 9
-ROWS_PER_SLICE = 256
-"""Rows converted to Python numbers at a time, which take ten times the memory of an array."""
-
-
-def iter_slices(count: int) -> Iterator[slice]:
-    """Yield slices of a column, short enough for hundreds of streams in memory."""
-    return (slice(first, first + ROWS_PER_SLICE) for first in range(0, count, ROWS_PER_SLICE))
-
-
-def iter_rows(*columns: NDArray[Any]) -> Iterator[tuple[Any, ...]]:
-    """Yield rows of Python numbers from (N,) columns, converted slice by slice."""
-    for part in iter_slices(len(columns[0])):
-        yield from zip(*(column[part].tolist() for column in columns), strict=True)
 
 
 def integrate_yaw(time_ns: Times, rate: Array) -> Array:
@@ -48,8 +33,8 @@ def integrate_yaw(time_ns: Times, rate: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(turned)])
 
 
-def iter_robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> Iterator[Sample]:
-    """Yield attitude, velocity and height of one robot, three samples per time.
+def build_robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> list[Columns]:
+    """Build attitude, velocity and height of one robot.
 
     A sensor whose values are not all finite has no sample at that time.
 
@@ -62,45 +47,39 @@ def iter_robot_log(robot: str, time_ns: Times, columns: Mapping[str, Array]) -> 
     columns
         (N,) for each of ``LOG_COLUMNS``; and ``yaw_rad``, else see `integrate_yaw`.
     """
-    yaw = columns.get("yaw_rad")
-    if yaw is None:
-        yaw = integrate_yaw(time_ns, columns["yaw_rate_radps"])
-    names = topics.ATTITUDE(robot), topics.VELOCITY(robot), topics.HEIGHT(robot)
-    series = [*(columns[name] for name in LOG_COLUMNS), yaw]
-    for moment, *row in iter_rows(time_ns, *series):
-        roll, pitch, yaw_rate, vx, vy, height, yaw_rad = row
-        attitude = {"roll_rad": roll, "pitch_rad": pitch, "yaw_rad": yaw_rad}
-        if isfinite(roll) and isfinite(pitch) and isfinite(yaw_rate):
-            yield Sample(moment, names[0], "Attitude", {**attitude, "yaw_rate_radps": yaw_rate})
-        if isfinite(vx) and isfinite(vy):
-            yield Sample(moment, names[1], "Velocity", {"vx_mps": vx, "vy_mps": vy})
-        if isfinite(height):
-            yield Sample(moment, names[2], "Height", {"height_m": height})
+    log = dict(columns)
+    if "yaw_rad" not in log:
+        log["yaw_rad"] = integrate_yaw(time_ns, log["yaw_rate_radps"])
+    return [
+        build_sensor(topic(robot), message, time_ns, {name: log[name] for name in names})
+        for topic, message, names in (
+            (topics.ATTITUDE, "Attitude", ("roll_rad", "pitch_rad", "yaw_rad", "yaw_rate_radps")),
+            (topics.VELOCITY, "Velocity", ("vx_mps", "vy_mps")),
+            (topics.HEIGHT, "Height", ("height_m",)),
+        )
+    ]
 
 
-def iter_ranges(robot: str, peer: str, time_ns: Times, range_m: Array) -> Iterator[Sample]:
-    """Yield UWB distances that a robot measured to a peer."""
-    topic = topics.RANGE(robot, peer)
-    for moment, value in iter_rows(time_ns, range_m):
-        yield Sample(moment, topic, "UwbRange", {"range_m": value})
+def iter_ranges(robot: str, peer: str, time_ns: Times, range_m: Array) -> Columns:
+    """Return UWB distances that a robot measured to a peer."""
+    return Columns(topics.RANGE(robot, peer), "UwbRange", time_ns, {"range_m": range_m})
 
 
-def iter_sensor(
-    topic: str, message: str, time_ns: Times, columns: Mapping[str, Array]
-) -> Iterator[Sample]:
-    """Yield the messages of a sensor where all of its (N,) columns, named as fields, are finite."""
-    values = np.stack(list(columns.values()), axis=1)
-    known = np.isfinite(values).all(axis=1)
-    for moment, *row in iter_rows(time_ns[known], *values[known].T):
-        yield Sample(moment, topic, message, dict(zip(columns, row, strict=True)))
+def build_sensor(topic: str, message: str, time_ns: Times, columns: Mapping[str, Array]) -> Columns:
+    """Build the messages of a sensor where all of its (N,) columns, named as fields, are finite."""
+    known = np.isfinite(np.stack(list(columns.values()))).all(axis=0)
+    fields = {name: column[known] for name, column in columns.items()}
+    return Columns(topic, message, time_ns[known], fields)
 
 
-def iter_truth(robot: str, peer: str, time_ns: Times, xyz_m: Array) -> Iterator[Sample]:
-    """Yield exact positions of a peer, (N, 3) in the robot's horizontal frame, metres."""
-    topic, frame = topics.TRUTH(robot, peer), f"{robot}/horizontal"
-    for moment, x, y, z in iter_rows(time_ns, *xyz_m.T):
-        fields = {"frame_id": frame, "x": x, "y": y, "z": z, "covariance": ZERO_COVARIANCE}
-        yield Sample(moment, topic, "PeerPosition", fields)
+def build_truth(robot: str, peer: str, time_ns: Times, xyz_m: Array) -> Columns:
+    """Build exact positions of a peer, (N, 3) in the robot's horizontal frame, metres."""
+    fields = {
+        "frame_id": f"{robot}/horizontal",
+        **dict(zip("xyz", xyz_m.T, strict=True)),
+        "covariance": [0.0] * 9,
+    }
+    return Columns(topics.TRUTH(robot, peer), "PeerPosition", time_ns, fields)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from dmrl.messages import LogType
 
 DECIMALS = 8
 """Decimals of computed values: metres, radians and pixels."""
+ROWS_PER_SLICE = 256
+"""Rows converted to Python numbers at a time, which take ten times the memory of an array."""
 Intervals = dict[str, list[tuple[int, int]]]
 
 
@@ -84,7 +87,7 @@ class Columns:
 
     def __iter__(self) -> Iterator[Sample]:
         rows = _iter_rows(self.fields, len(self.time_ns))
-        for moment, fields in zip(self.time_ns.tolist(), rows, strict=True):
+        for moment, fields in zip(_iter_values(self.time_ns), rows, strict=True):
             yield Sample(moment, self.topic, self.message, fields)
 
     def crop_to_time(self, first_ns: int, end_ns: int) -> "Columns":
@@ -100,11 +103,23 @@ def _iter_rows(fields: Mapping[str, Any], count: int) -> Iterator[dict[str, Any]
         if isinstance(value, Mapping):
             columns.append(_iter_rows(value, count))
         else:
-            columns.append(value.tolist() if isinstance(value, np.ndarray) else [value] * count)
+            columns.append(
+                _iter_values(value) if isinstance(value, np.ndarray) else repeat(value, count)
+            )
     if not columns:
         yield from ({} for _ in range(count))
     for row in zip(*columns, strict=True) if columns else ():
         yield dict(zip(fields, row, strict=True))
+
+
+def iter_slices(count: int) -> Iterator[slice]:
+    """Yield slices of a column, short enough for hundreds of streams in memory."""
+    return (slice(first, first + ROWS_PER_SLICE) for first in range(0, count, ROWS_PER_SLICE))
+
+
+def _iter_values(column: NDArray[Any]) -> Iterator[Any]:
+    for part in iter_slices(len(column)):
+        yield from column[part].tolist()
 
 
 def _select_rows(fields: Mapping[str, Any], there: NDArray[np.bool_]) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Messages of a simulated flight: sensors, truth, and labels of images."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import permutations
 from typing import Any
 
@@ -12,7 +12,7 @@ from dmrl.rendering.shot import Shot
 from dmrl.rendering.sketch_renderer import Sketch
 from dmrl.samples import flight as samples
 from dmrl.samples.flight import START_NS, RobotPose, Times, to_nanoseconds
-from dmrl.samples.sample import Sample
+from dmrl.samples.sample import Sample, iter_slices
 
 TRUTH_RATE_HZ = 20.0
 JPEG_QUALITY = 92
@@ -25,7 +25,7 @@ def log_times(clock: Clock, true_time_s: Array) -> Times:
 
 def iter_sensor_streams(
     flight: Flight, yaw_rad: Mapping[str, Array] | None = None
-) -> Iterator[Iterator[Sample]]:
+) -> Iterator[Iterable[Sample]]:
     """Yield the messages of every robot's own sensors, and of the ranges of every pair.
 
     Parameters
@@ -39,13 +39,13 @@ def iter_sensor_streams(
         columns = {name: getattr(log, name) for name in samples.LOG_COLUMNS}
         if yaw_rad is not None:
             columns["yaw_rad"] = yaw_rad[robot]
-        yield samples.iter_robot_log(robot, START_NS + to_nanoseconds(log.time_s), columns)
+        yield from samples.build_robot_log(robot, START_NS + to_nanoseconds(log.time_s), columns)
     for (robot, peer), ranges in flight.ranges.items():
         time_ns = START_NS + to_nanoseconds(ranges.time_s)
         yield samples.iter_ranges(robot, peer, time_ns, ranges.range_m)
 
 
-def iter_truth_streams(flight: Flight, time_s: Array) -> Iterator[Iterator[Sample]]:
+def iter_truth_streams(flight: Flight, time_s: Array) -> Iterator[Iterable[Sample]]:
     """Yield the true positions of every pair, and the frames of all robots, at (N,) true times."""
     for robot, peer in permutations(flight.truth, 2):
         yield iter_peer_truth(flight, robot, peer, time_s)
@@ -54,10 +54,10 @@ def iter_truth_streams(flight: Flight, time_s: Array) -> Iterator[Iterator[Sampl
 
 def iter_peer_truth(flight: Flight, robot: str, peer: str, true_time_s: Array) -> Iterator[Sample]:
     """Yield the true position of a peer at (N,) true times, on the observer's clock."""
-    for part in samples.iter_slices(len(true_time_s)):
+    for part in iter_slices(len(true_time_s)):
         time_s = true_time_s[part]
         xyz = flight.peer_in_horizontal(robot, peer, time_s)
-        yield from samples.iter_truth(robot, peer, log_times(flight.clocks[robot], time_s), xyz)
+        yield from samples.build_truth(robot, peer, log_times(flight.clocks[robot], time_s), xyz)
 
 
 def build_flight_transforms(flight: Flight, true_time_s: float) -> Sample:

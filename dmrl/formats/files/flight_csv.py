@@ -183,19 +183,19 @@ def _iter_streams(log: CsvLog, names: Mapping[str, str]) -> Iterator[Iterable[Sa
         return names.get(robot, robot)
 
     own, time_ns = name(log.robot), log.time_ns
-    yield flight.iter_robot_log(own, time_ns, log.columns)
+    yield from flight.build_robot_log(own, time_ns, log.columns)
     for peer in log.range_peers:
         range_m = log.columns[f"range_{peer}_m"]
         yield build_ranges(own, name(peer), time_ns, range_m, log.path)
     for peer in log.truth_peers:
         xyz = np.stack([log.columns[f"{peer}_{axis}_m"] for axis in "xyz"], axis=1)
         known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
-        yield flight.iter_truth(own, name(peer), time_ns[known], xyz[known])
+        yield flight.build_truth(own, name(peer), time_ns[known], xyz[known])
     for row in OTHER_SENSORS:
         for peer, columns in _iter_sensor_columns(row, log):
             who = {"robot": own} | ({"peer": name(peer)} if peer else {})
             topic = topics.format_topic(row.pattern, **who)
-            yield flight.iter_sensor(topic, row.message, time_ns, columns)
+            yield flight.build_sensor(topic, row.message, time_ns, columns)
 
 
 def _iter_sensor_columns(row: Topic, log: CsvLog) -> Iterator[tuple[str, dict[str, Array]]]:

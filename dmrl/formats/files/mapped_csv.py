@@ -31,7 +31,7 @@ from dmrl.formats.files.column_map import (
 from dmrl.formats.files.robot_columns import RobotLog, read_robot_logs
 from dmrl.formats.files.text_table import TABLE_SUFFIXES, TextTable, read_names
 from dmrl.geometry.frames import Array
-from dmrl.samples.flight import Times
+from dmrl.samples.flight import Times, integrate_yaw
 from dmrl.samples.sample import Columns
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
@@ -225,11 +225,8 @@ def _complete_attitude(path: Path, time_ns: Times, values: dict[str, Array]) -> 
     if "roll" not in values:
         say(f"{path}: no roll and pitch in the table: the robot is taken as level")
         values |= {"roll": np.zeros(len(time_ns)), "pitch": np.zeros(len(time_ns))}
-    known = np.isfinite(rate)
-    if "yaw" not in values and known.any():
-        rate = np.interp(time_ns, time_ns[known], rate[known])
-        turned = np.diff(time_ns) * 1e-9 * (rate[1:] + rate[:-1]) / 2
-        values["yaw"] = np.concatenate([[0.0], np.cumsum(turned)])
+    if "yaw" not in values and np.isfinite(rate).any():
+        values["yaw"] = integrate_yaw(time_ns, rate)
 
 
 def _drop_bad_quaternions(path: Path, values: dict[str, Array]) -> None:

@@ -9,7 +9,6 @@ from motion capture and are far better than a drone's. Ranges are unchanged, abo
 
 import re
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ from dmrl.geometry.frames import Array
 from dmrl.guards.bounded_parsing import ARCHIVE_ERRORS, load_npz
 from dmrl.samples import flight
 from dmrl.samples.flight import log_from_poses, merge_by_time, to_nanoseconds
-from dmrl.samples.sample import Sample
+from dmrl.samples.sample import Columns
 
 RATE_HZ = 10.0
 POSE_ARRAY = re.compile(r"optitrack_turtle(\d{1,3})_pose_np")
@@ -58,12 +57,12 @@ def load_content(source: Path, _options: Options | None = None) -> Content:
         raise SourceError(f"{source} has no uwb_range_*_np and optitrack_*_pose_np. Pass another")
     arrays = _load_arrays(source)
     poses = {int(m[1]): _build_pose(arrays, m[1]) for m in map(POSE_ARRAY.fullmatch, arrays) if m}
-    streams: list[Iterator[Sample]] = []
+    streams: list[Columns] = []
     for number, (time_s, xy_m, yaw) in sorted(poses.items()):
         log = log_from_poses(time_s, xy_m, yaw)
-        streams.append(flight.iter_robot_log(f"turtle{number}", to_nanoseconds(time_s), log))
+        streams += flight.build_robot_log(f"turtle{number}", to_nanoseconds(time_s), log)
         streams += [
-            flight.iter_truth(
+            flight.build_truth(
                 f"turtle{number}",
                 f"turtle{peer}",
                 to_nanoseconds(time_s),
@@ -73,7 +72,7 @@ def load_content(source: Path, _options: Options | None = None) -> Content:
             if peer != number
         ]
     for match in filter(None, map(RANGE_ARRAY.fullmatch, arrays)):
-        streams.append(_iter_ranges(match[1], match[2], arrays[match[0]]))
+        streams.append(_build_ranges(match[1], match[2], arrays[match[0]]))
     return Content(merge_by_time(streams))
 
 
@@ -106,7 +105,7 @@ def _to_horizontal(here: Array, yaw: Array, peer: Array) -> Array:
     return np.stack([c * x + s * y, c * y - s * x, np.zeros(len(yaw))], axis=1)
 
 
-def _iter_ranges(one: str, other: str, range_m: Array) -> Iterator[Sample]:
+def _build_ranges(one: str, other: str, range_m: Array) -> Columns:
     time_ns = to_nanoseconds(np.arange(len(range_m)) / RATE_HZ)
     kept = np.isfinite(range_m) & (range_m > 0)
     return flight.iter_ranges(
