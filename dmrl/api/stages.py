@@ -25,28 +25,13 @@ from dmrl.terminal.left_out import count_left_out
 if TYPE_CHECKING:
     from typing import Unpack
 
-    from dmrl.api.settings import (
-        AlignSettings,
-        CalibrateSettings,
-        ConvertSettings,
-        DatasetSettings,
-        EvaluateSettings,
-        FlySettings,
-        LabelSettings,
-        PredictSettings,
-        QuantizeSettings,
-        RenderSettings,
-        SketchSettings,
-        TrackSettings,
-        TrainSettings,
-        TrimSettings,
-    )
+    from dmrl.api import settings as typed
 
 OneOrMore: TypeAlias = PathLike | Sequence[PathLike]
 
 
 def label(
-    recording: PathLike, out: PathLike | None = None, **settings: "Unpack[LabelSettings]"
+    recording: PathLike, out: PathLike | None = None, **settings: "Unpack[typed.LabelSettings]"
 ) -> Recording:
     """Estimate positions of peers and label the images: ``dmrl label``.
 
@@ -71,7 +56,7 @@ def predict(
     model: PathLike,
     recording: PathLike,
     out: PathLike | None = None,
-    **settings: "Unpack[PredictSettings]",
+    **settings: "Unpack[typed.PredictSettings]",
 ) -> Recording:
     """Run a network on every image of a recording: ``dmrl predict``.
 
@@ -82,21 +67,21 @@ def predict(
 
 
 def track(
-    recording: PathLike, out: PathLike | None = None, **settings: "Unpack[TrackSettings]"
+    recording: PathLike, out: PathLike | None = None, **settings: "Unpack[typed.TrackSettings]"
 ) -> Recording:
     """Track detected peers over time: ``dmrl track``. Parameters, errors as `label`."""
     return _run_to_recording("track", out, settings, recording=to_path(recording))
 
 
 def align(
-    recording: PathLike, out: PathLike | None = None, **settings: "Unpack[AlignSettings]"
+    recording: PathLike, out: PathLike | None = None, **settings: "Unpack[typed.AlignSettings]"
 ) -> Recording:
     """Align the clocks of robots and cameras: ``dmrl align``. Parameters, errors as `label`."""
     return _run_to_recording("align", out, settings, recording=to_path(recording))
 
 
 def trim(
-    recording: PathLike, out: PathLike | None = None, **settings: "Unpack[TrimSettings]"
+    recording: PathLike, out: PathLike | None = None, **settings: "Unpack[typed.TrimSettings]"
 ) -> Recording:
     """Copy a part of a recording, or some topics: ``dmrl trim``. Parameters, errors as `label`."""
     return _run_to_recording("trim", out, settings, recording=to_path(recording))
@@ -111,7 +96,7 @@ def merge(recordings: Sequence[PathLike], out: PathLike | None = None) -> Record
 
 
 def convert(
-    source: PathLike, out: PathLike | None = None, **settings: "Unpack[ConvertSettings]"
+    source: PathLike, out: PathLike | None = None, **settings: "Unpack[typed.ConvertSettings]"
 ) -> Recording:
     """Convert a foreign file or folder: ``dmrl convert``. Parameters, errors as `label`."""
     return _run_to_recording("convert", out, settings, source=to_path(source))
@@ -121,7 +106,7 @@ def fly(
     out: PathLike | None = None,
     *,
     recipe: PathLike | None = None,
-    **settings: "Unpack[FlySettings]",
+    **settings: "Unpack[typed.FlySettings]",
 ) -> Recording:
     """Simulate a flight: ``dmrl fly``.
 
@@ -145,7 +130,7 @@ def fly(
 def render(
     scene: PathLike = "synthetic_first_look",
     out: PathLike | None = None,
-    **settings: "Unpack[RenderSettings]",
+    **settings: "Unpack[typed.RenderSettings]",
 ) -> Recording:
     """Render images of robots with exact labels, by Blender: ``dmrl render``.
 
@@ -166,13 +151,13 @@ def render(
     return _run_to_recording("render", out, _recipe_keys("render", scene) | settings)
 
 
-def sketch(out: PathLike, **settings: "Unpack[SketchSettings]") -> Path:
+def sketch(out: PathLike, **settings: "Unpack[typed.SketchSettings]") -> Path:
     """Draw a folder of images with exact labels: ``dmrl sketch``. Errors as `label`."""
     return _run_to_path("sketch", to_path(out), settings)
 
 
 def make_dataset(
-    recordings: OneOrMore, out: PathLike, **settings: "Unpack[DatasetSettings]"
+    recordings: OneOrMore, out: PathLike, **settings: "Unpack[typed.DatasetSettings]"
 ) -> Data:
     """Build a dataset with its card: ``dmrl dataset``. Errors as `label`."""
     given = _to_paths("make_dataset", recordings)
@@ -185,7 +170,7 @@ def train(
     *,
     recipe: PathLike | None = None,
     init: PathLike | None = None,
-    **settings: "Unpack[TrainSettings]",
+    **settings: "Unpack[typed.TrainSettings]",
 ) -> Model:
     """Train a network on a dataset: ``dmrl train``.
 
@@ -216,7 +201,10 @@ def train(
 
 
 def quantize(
-    model: PathLike, data: PathLike | Data, out: PathLike, **settings: "Unpack[QuantizeSettings]"
+    model: PathLike,
+    data: PathLike | Data,
+    out: PathLike,
+    **settings: "Unpack[typed.QuantizeSettings]",
 ) -> Model:
     """Quantize a network to int8: ``dmrl quantize``. Errors as `label`."""
     images = data.path if isinstance(data, Data) else to_path(data)
@@ -225,14 +213,16 @@ def quantize(
     )
 
 
-def calibrate(sources: OneOrMore, out: PathLike, **settings: "Unpack[CalibrateSettings]") -> Path:
+def calibrate(
+    sources: OneOrMore, out: PathLike, **settings: "Unpack[typed.CalibrateSettings]"
+) -> Path:
     """Calibrate a camera by chessboards or flights: ``dmrl calibrate``. Errors as `label`."""
     return _run_to_path(
         "calibrate", to_path(out), settings, sources=_to_paths("calibrate", sources)
     )
 
 
-def evaluate(recordings: OneOrMore, **settings: "Unpack[EvaluateSettings]") -> Result:
+def evaluate(recordings: OneOrMore, **settings: "Unpack[typed.EvaluateSettings]") -> Result:
     """Evaluate detections, tracks or positions: ``dmrl evaluate``.
 
     Parameters

@@ -19,7 +19,7 @@ from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.quantise import HEAD_OF_CHANNEL
 from dmrl.deploy.int8.store import INTEGER_NAME, load_network
 from dmrl.deploy.onnx.float_cache import build_float_onnx_once
-from dmrl.errors import MissingExtra, ModelError, SettingError
+from dmrl.errors import MissingExtra, ModelError, SettingError, optional_imports
 from dmrl.geometry.frames import STRIDE_PX
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.paths import refuse_pipes, require_text_path
@@ -294,10 +294,8 @@ def read_rates(model: Path) -> dict[str, Any] | None:
 
 
 def _import_optional(name: str, extra: str, what: str) -> ModuleType:
-    try:
+    with optional_imports(extra, what):
         return import_module(name)
-    except ModuleNotFoundError as e:
-        raise MissingExtra(str(e.name), extra, what) from None
 
 
 OPENERS: dict[BackendName, Callable[[Path, BackendName], Detector]] = {

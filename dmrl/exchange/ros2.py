@@ -15,7 +15,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.message_factory import GetMessageClass
 
 from dmrl.atomic_output import atomic_folder
-from dmrl.errors import MissingExtra, RecordingError, UnreadableTopic
+from dmrl.errors import RecordingError, UnreadableTopic, optional_imports
 from dmrl.formats.ros.ros_messages import DMRL_PREFIX, HALF_PX
 from dmrl.recording import RawMessage, parse_message, read_raw, read_summary
 from dmrl.recording.protobuf.message_types import find_channel_descriptor
@@ -57,10 +57,8 @@ def write_bag(recording: Path, out: Path) -> dict[str, int]:
     OutputError
         If ``out`` exists or cannot be written.
     """
-    try:
+    with optional_imports("ros", "convert --to ros2"):
         from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415
-    except ModuleNotFoundError as e:
-        raise MissingExtra("rosbags", "ros", "convert --to ros2") from e
     found = read_summary(recording)
     types = _RosTypes(recording)
     counts = dict.fromkeys(found.topics, 0)

@@ -244,7 +244,7 @@ def run_over_folder(
     """
     if _is_same(source, out):
         raise SettingError(f"{out} is the folder that is read. Name another for what is made")
-    found, out = _name_outputs(source, out) if found is None else (found, out)
+    found = find_recordings(source, but=out) if found is None else found
     tasks = build_tasks(stage, role, found, out, settings, inputs)
     made = _make_folders(out, tasks)
     with open_executor(on, workers) as crew:
@@ -266,13 +266,6 @@ def run_over_folder(
         ]
         print_table(str(out), ("recording", "", "holds"), rows)
     report_failures(done, "; the others are done. Run it again when these are fixed")
-
-
-def _name_outputs(source: Path, out: Path) -> tuple[Mapping[Path, Path], Path]:
-    """Return inputs by the names of their outputs, and the folder of these."""
-    if is_collection(source):
-        return find_recordings(source, but=out), out
-    return {Path(out.name): source}, out.parent
 
 
 def _make_folders(out: Path, tasks: Iterable[Task]) -> list[Path]:

@@ -75,7 +75,7 @@ def recover(path: Path, out: Path) -> Recovery:
             raise RecordingError(f"{path} holds no whole chunk: nothing to recover. Make it again")
         with RecordingWriter(out, _build_provenance(state)) as sink:
             for piece in chain([first] if first else [], pieces):
-                sink.chunk_writer.adopt_channels(state.channels, state.channel_records)
+                sink.chunk_writer.registry.adopt_channels(state.channels, state.channel_records)
                 state.recovery.messages += write_unit(piece, None, sink)
             unused = state.channels.keys() - (+state.counts).keys()
             definitions = Definitions(state.schemas, state.channel_records, state.channels, unused)

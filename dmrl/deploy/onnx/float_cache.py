@@ -15,7 +15,7 @@ from typing import Any
 
 from dmrl import entry_points
 from dmrl.atomic_output import replace_file
-from dmrl.errors import MissingExtra, OutputError
+from dmrl.errors import OutputError, optional_imports
 from dmrl.guards.bounded_parsing import parse_json
 from dmrl.learn.pretrained import DESCRIPTION_NAME, WEIGHTS_NAME
 
@@ -48,11 +48,9 @@ def build_float_onnx_once(model: Path, *, grey: bool) -> tuple[bytes, dict[str, 
     cached = _cache_folder() / f"{key}.onnx"
     with suppress(OSError, ValueError):
         return cached.read_bytes(), parse_json(cached.with_suffix(".json").read_text("utf-8"))
-    try:
+    with optional_imports("train", "a model to ONNX"):
         trained = import_module("dmrl.learn.inference.loaded_model")
         exporter = import_module("dmrl.deploy.onnx.float_model")
-    except ModuleNotFoundError as e:
-        raise MissingExtra(str(e.name), "train", "a model to ONNX") from None
     loaded = trained.load_model(model)
     made, said = exporter.float_onnx_of(loaded, grey=grey), trained.describe(loaded)
     if said["architecture"] not in entry_points.find_plugins(entry_points.NETWORKS):

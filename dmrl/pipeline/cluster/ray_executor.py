@@ -15,19 +15,17 @@ from pathlib import Path
 from typing import Any, Self
 
 from dmrl import __version__
-from dmrl.errors import ClusterError, MissingExtra
+from dmrl.errors import ClusterError, optional_imports
 from dmrl.guards.temporary_folder import find_system_folder
 from dmrl.pipeline.job import JobResult, has_failed
 from dmrl.terminal.progress import Lines, say
 from dmrl.terminal.signals import TERMINATION_SIGNALS as SIGNALS
 
-try:
+with optional_imports("cluster", "dmrl --on ray"):
     import ray
     from ray._private import ray_constants, services
     from ray.exceptions import RayError
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-except ModuleNotFoundError as e:
-    raise MissingExtra("ray", "cluster", "dmrl --on ray") from e
 
 MAX_RESTARTS = 5
 """Most restarts of a task whose node or process died."""

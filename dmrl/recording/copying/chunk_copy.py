@@ -27,8 +27,6 @@ from dmrl.recording.mcap.summary_section import read_summary_section
 from dmrl.recording.summary import Definitions, read_summary
 from dmrl.recording.writer import RecordingWriter
 
-IMAGE_TYPE = "foxglove.CompressedImage"
-
 
 @dataclass(frozen=True, slots=True)
 class CopyUnit:
@@ -114,11 +112,11 @@ def adopt_definitions(
 ) -> None:
     """Do what `adopt_channels` does for definitions that were read (topics None: for all)."""
     kept = {n: c for n, c in found.channels.items() if topics is None or c.topic in topics}
-    sink.chunk_writer.adopt_channels(kept, found.channel_records)
+    sink.chunk_writer.registry.adopt_channels(kept, found.channel_records)
     unused = [channel for n, channel in kept.items() if n in found.unused]
     needed = {record.schema_id for record in found.channel_records.values()}
     schemas = [schema for number, schema in found.schemas.items() if number not in needed]
-    sink.chunk_writer.keep_definitions(unused, schemas)
+    sink.chunk_writer.registry.keep_definitions(unused, schemas)
 
 
 def write_unit(unit: CopyUnit, selection: TopicSelection | None, sink: RecordingWriter) -> int:

@@ -70,11 +70,6 @@ class TargetResult:
         """Images, over all builds, in which something differs."""
         return sum(build.mismatches for build in self.builds)
 
-    @property
-    def proved(self) -> bool:
-        """Whether it was tried and everything matches the reference."""
-        return not (self.skipped or self.error or self.mismatches)
-
 
 ExpectedResults = dict[bool, list[tuple[Image, HarnessResult]]]
 """Images and their results: in the network's format (False), and raw mosaics of some (True)."""

@@ -1,12 +1,11 @@
 """Collect messages into chunks, images and numbers apart, and write each chunk when it is full."""
 
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from mcap.records import Channel as McapChannel
-from mcap.records import Chunk, Schema
+from mcap.records import Chunk
 
 from dmrl.atomic_output import as_output_error
 from dmrl.errors import RecordingError
@@ -36,11 +35,16 @@ class ChunkWriter:
         File that receives the full chunks.
     age_max
         A chunk is written, full or not, after this many later chunks of the other kind.
+
+    Attributes
+    ----------
+    registry
+        Ids of the channels; a copy may reserve those of its source.
     """
 
     def __init__(self, path: Path, file: McapFileWriter, age_max: int = OPEN_CHUNK_AGE_MAX) -> None:
         self._path, self._file, self._age_max = path, file, age_max
-        self._registry = ChannelRegistry()
+        self.registry = ChannelRegistry()
         self._numbers, self._images = ChunkBuilder(), ChunkBuilder(images=True)
 
     def add_message(
@@ -54,20 +58,10 @@ class ChunkWriter:
             If a time is negative.
         """
         if time_ns < 0 or publish_ns < 0:
-            raise self._negative_time_error(time_ns, self._registry.get_topic(channel_id))
+            raise self._negative_time_error(time_ns, self.registry.get_topic(channel_id))
         chunk.add_message(channel_id, time_ns, publish_ns, payload)
         if chunk.full:
             self._write_chunk(chunk)
-
-    def adopt_channels(
-        self, channels: Mapping[int, Channel], records: Mapping[int, McapChannel]
-    ) -> None:
-        """Assign the channel ids of a recording that is copied; see `ChannelRegistry`."""
-        self._registry.adopt_channels(channels, records)
-
-    def keep_definitions(self, channels: Iterable[Channel], schemas: Iterable[Schema]) -> None:
-        """Define channels and schemas of a copied recording, even if no message needs them."""
-        self._registry.keep_definitions(channels, schemas)
 
     def append_batch(self, batch: MessageBatch, channels: Mapping[int, Channel]) -> None:
         """Append a batch of messages, their payloads bit for bit.
@@ -146,7 +140,7 @@ class ChunkWriter:
             return False
         index = build_message_index(batch) if index is None else index
         pictured = {channels[number].carries_images for number in index.counts}
-        if len(pictured) != 1 or not self._registry.can_copy_chunk(batch, others, channels):
+        if len(pictured) != 1 or not self.registry.can_copy_chunk(batch, others, channels):
             return False
         self._require_nonnegative_times(batch, channels)
         before = self._images if pictured.pop() else self._numbers
@@ -211,16 +205,16 @@ class ChunkWriter:
         """
         self.flush()
         try:
-            unused = self._registry.take_unwritten_definitions()
-            self._file.finish(*self._registry.list_written_definitions(), unused)
+            unused = self.registry.take_unwritten_definitions()
+            self._file.finish(*self.registry.list_written_definitions(), unused)
         except OSError as e:
             raise as_output_error(self._path, e) from e
 
     def define_channel(self, channel: Channel) -> tuple[int, ChunkBuilder]:
         """Return a channel's id and its chunk; define the channel there if it is new."""
-        number = self._registry.get_channel_id(channel)
+        number = self.registry.get_channel_id(channel)
         chunk = self._images if channel.carries_images else self._numbers
-        chunk.add_definition(self._registry.definition_records(number))
+        chunk.add_definition(self.registry.definition_records(number))
         return number, chunk
 
     def _write_chunk(self, chunk: ChunkBuilder) -> None:
