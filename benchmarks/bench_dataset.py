@@ -7,6 +7,7 @@ and Image columns, as `save_to_disk` writes them, and `datasets` on our files. T
 is dropped before the first pass of each. One thread.
 """
 
+import gc
 import os
 import sys
 import tempfile
@@ -83,7 +84,8 @@ def save(split: Split, folder: Path, feature: object) -> None:
 
 
 def evict(folder: Path) -> None:
-    """Drop every file of a folder from the page cache."""
+    """Drop every file of a folder from the page cache, which keeps what is mapped."""
+    gc.collect()
     for path in folder.rglob("*.arrow"):
         with path.open("rb") as stream:
             os.fsync(stream.fileno())
@@ -95,23 +97,34 @@ def content_sum(batches: Iterator[torch.Tensor]) -> int:
     return sum(int(batch.sum(dtype=torch.int64)) for batch in batches)
 
 
-def rates(folder: Path, open_way: Callable[[], Batches]) -> tuple[int, int]:
+def read_mb() -> float:
+    """MB that this process has read from disk so far; Linux counts them."""
+    lines = Path("/proc/self/io").read_text(encoding="utf-8").splitlines()
+    return int(next(one for one in lines if one.startswith("read_bytes")).split()[1]) / 1e6
+
+
+def rates(folder: Path, open_way: Callable[[], Batches]) -> tuple[int, int, str]:
     """Images per cpu-second of a pass from disk and of the pass after it, over `PASSES` openings.
+
+    The last value is what an opening reads from disk, MB.
 
     The files leave the page cache before each opening. Without that the first pass looks two to
     five times as fast, depending on how the files came into the cache: freshly written ones
     are mapped in larger pieces than those that were copied or read back.
     """
-    spent, images = np.zeros(2), np.zeros(2, int)
+    spent, images, opened_mb = np.zeros(2), np.zeros(2, int), []
     for _ in range(PASSES):
+        batches = None  # or the map of the round before keeps its pages
         evict(folder)
+        before_mb = read_mb()
         batches = open_way()
+        opened_mb.append(read_mb() - before_mb)
         for later in (0, 1):
             start = time.process_time()
             images[later] += sum(len(batch) for batch in batches())
             spent[later] += time.process_time() - start
     first, later = images / spent
-    return round(first), round(later)
+    return round(first), round(later), f"{np.median(opened_mb):.1f}"
 
 
 def build(folder: Path, count: int) -> None:
@@ -169,7 +182,7 @@ def main() -> None:
             raise SystemExit(f"the ways gave different images: {sums}")
         rows = [(way, *rates(folder, open_way)) for way, open_way in ways.items()]
         title = "load, images per cpu-second; every way gave the same bytes"
-        print_table(title, ("way", "from disk", "pass after it"), rows)
+        print_table(title, ("way", "from disk", "pass after it", "MB read to open"), rows)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ Arrow's own reader trusts a file: it follows an offset beyond a buffer. Every sh
 validated, and a shard that does not follow `dmrl.datasets.layout` is rejected.
 """
 
+import mmap
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -41,14 +42,14 @@ def open_shard(path: Path, rows: int | None) -> pa.Table:
     """
     if path.exists() and not path.is_file():
         raise DatasetError(f"shard {path} is not a file. {REBUILD_HINT}")
-    with _named_in_errors(path), MemoryLimit(path.stat().st_size):
-        table = _map_table(path)
+    with _named_in_errors(path), MemoryLimit(path.stat().st_size), _open_table(path) as table:
         table.validate(full=True)
+        wrong = _find_layout_error(table)
     # A stream that ends between two batches reads without an error.
     if rows is not None and table.num_rows != rows:
         found = f"{table.num_rows} of {rows} rows"
         raise DatasetError(f"shard {path} is cut short: {found}. {REBUILD_HINT}")
-    if wrong := _find_layout_error(table):
+    if wrong:
         raise DatasetError(f"shard {path} {wrong}. Make it with: dmrl dataset")
     return table.select([name for name in table.schema.names if name in layout.COLUMN_NAMES])
 
@@ -83,10 +84,24 @@ def _named_in_errors(path: Path) -> Iterator[None]:
         raise DatasetError(f"shard {path} is cut short or damaged: {why}. {REBUILD_HINT}") from None
 
 
-def _map_table(path: Path) -> pa.Table:
+@contextmanager
+def _open_table(path: Path) -> Iterator[pa.Table]:
+    """Open a shard. In the block, what is read of a mapped file is read from disk alone.
+
+    Arrow's own maps, and the system's readahead, would read most images from disk: as much as a
+    pass of training, and more than memory holds.
+    """
     if path.suffix == ".parquet":
-        return pq.ParquetFile(os.fspath(path), memory_map=True).read()
-    return pa.ipc.open_stream(pa.memory_map(os.fspath(path))).read_all()
+        yield pq.ParquetFile(os.fspath(path), memory_map=True).read()
+        return
+    with path.open("rb") as stream:
+        data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    can_advise = hasattr(mmap, "MADV_RANDOM")  # not on Windows
+    if can_advise:
+        data.madvise(mmap.MADV_RANDOM)
+    yield pa.ipc.open_stream(pa.BufferReader(pa.py_buffer(data))).read_all()
+    if can_advise:
+        data.madvise(mmap.MADV_NORMAL)
 
 
 def _find_layout_error(table: pa.Table) -> str:

@@ -2,6 +2,7 @@
 
 import shutil
 import struct
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from dmrl.datasets import open_dataset
+from dmrl.datasets import open_dataset, shards
 from dmrl.datasets.layout import MANIFEST_FILE, build_schema
 from dmrl.datasets.shards import open_shard
 from dmrl.errors import DatasetError
@@ -176,3 +177,27 @@ def test_images_whose_size_differs_from_their_labels_are_refused(
     rewritten(path, table)
     with pytest.raises(DatasetError, match="another size than its labels"):
         _ = open_dataset(tmp_path / "set").split("train").pixels[0][0]
+
+
+def flags_of(path: Path) -> list[str]:
+    """The kernel's flags of the map of a file: rr is read from disk as it is used, alone."""
+    lines = iter(Path("/proc/self/smaps").read_text(encoding="utf-8").splitlines())
+    assert any(line.endswith(str(path)) for line in lines)
+    return next(line for line in lines if line.startswith("VmFlags")).split()[1:]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks Linux how files are mapped")
+def test_opening_a_shard_reads_no_images_ahead_but_training_does(
+    shard: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[list[str]] = []
+    whole = shards._find_layout_error
+
+    def watch(table: pa.Table) -> str:
+        seen.append(flags_of(shard))
+        return whole(table)
+
+    monkeypatch.setattr(shards, "_find_layout_error", watch)
+    table = open_shard(shard, None)
+    assert len(seen) == 1 and "rr" in seen[0]
+    assert table.num_rows and "rr" not in flags_of(shard)
