@@ -12,7 +12,7 @@ import numpy as np
 from dmrl.estimation.evidence.error_models import Candidate
 from dmrl.estimation.evidence.noisy_stretch import find_noisy_steps
 from dmrl.estimation.search.modes import convert_values
-from dmrl.estimation.solver.block_tridiagonal import reduce_to_constants, solve_step
+from dmrl.estimation.solver.block_tridiagonal import eliminate_states, solve_step
 from dmrl.estimation.solver.equations import total_cost
 from dmrl.estimation.solver.layout import Subject
 from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, Solver
@@ -145,7 +145,7 @@ def _list_hopeless(base: Member, candidates: Sequence[Candidate]) -> set[Candida
     solver = replace(base.solver, problem=problem)
     values = convert_values(base.values, own, solver.layout)
     try:
-        information, vector = reduce_to_constants(solver.equations(values)[0])
+        left = eliminate_states(solver.equations(values)[0])
     except np.linalg.LinAlgError:
         return set()
     log_std = np.log(solver.problem.noise.prior_std(solver.layout))
@@ -154,7 +154,7 @@ def _list_hopeless(base: Member, candidates: Sequence[Candidate]) -> set[Candida
 
     def evidence(names: Collection[Subject]) -> float:
         at = [k for k, subject in enumerate(subjects) if subject in known or subject in names]
-        block, slope = information[np.ix_(at, at)], vector[at]
+        block, slope = left.information[np.ix_(at, at)], left.gradient[at]
         gain = slope @ np.linalg.solve(block, slope)
         return float(gain - np.linalg.slogdet(block)[1]) / 2 - float(log_std[at].sum())
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dtbtrs
 
 from dmrl.estimation.model.pair import Array
 
@@ -109,19 +110,54 @@ class Solved:
     ----------
     state, constants
         (K, n) and (G,) Gauss-Newton steps.
-    response
-        (K, n, G) negated derivative of the keyframes by the constants.
     covariance
         (G, G) of the constants.
     log_det
         Log determinant of the whole matrix.
+    eliminated
+        Equations of the constants, without the keyframes.
     """
 
     state: Array
     constants: Array
-    response: Array
     covariance: Array
     log_det: float
+    eliminated: "Eliminated"
+
+    def response(self) -> Array:
+        """Return the (K, n, G) negated derivative of the keyframes by the constants."""
+        return self.eliminated.substitute(self.eliminated.half[:, 1:]).reshape(
+            *self.state.shape, len(self.constants)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Eliminated:
+    """Equations of the constants, after the keyframes were eliminated.
+
+    Parameters
+    ----------
+    factor
+        Upper bands of the Cholesky factor U of the keyframes' matrix U^T U.
+    half
+        (K n, 1 + G) U^-T by the gradient and by the coupling.
+    information, gradient
+        (G, G) and (G,) Schur complement.
+    """
+
+    factor: Array
+    half: Array
+    information: Array
+    gradient: Array
+
+    def substitute(self, half: Array) -> Array:
+        """Return U^-1 by (K n, m) columns."""
+        solved, _ = dtbtrs(self.factor, half)
+        return np.asarray(solved)
+
+    def log_det(self) -> float:
+        """Return the log determinant of the keyframes' matrix."""
+        return float(2 * np.log(self.factor[-1]).sum())
 
 
 def solve_step(equations: NormalEquations) -> Solved:
@@ -132,35 +168,23 @@ def solve_step(equations: NormalEquations) -> Solved:
     numpy.linalg.LinAlgError
         If the matrix is not positive definite.
     """
-    size, width = len(equations.globals_block), equations.diagonal.shape[1]
-    log_det, solved, rest, vector = _eliminate_states(equations)
-    covariance: Array = np.asarray(np.linalg.inv(rest), float)
-    constants = -covariance @ vector
-    state = -solved[:, 0] - solved[:, 1:] @ constants
-    return Solved(
-        state.reshape(-1, width),
-        constants,
-        solved[:, 1:].reshape(-1, width, size),
-        covariance,
-        log_det + float(np.linalg.slogdet(rest)[1]),
-    )
+    left = eliminate_states(equations)
+    covariance: Array = np.asarray(np.linalg.inv(left.information), float)
+    constants = -covariance @ left.gradient
+    state = -left.substitute(left.half @ np.concatenate([[1.0], constants])[:, None])
+    log_det = left.log_det() + float(np.linalg.slogdet(left.information)[1])
+    return Solved(state.reshape(equations.gradient.shape), constants, covariance, log_det, left)
 
 
-def reduce_to_constants(equations: NormalEquations) -> tuple[Array, Array]:
-    """Eliminate all keyframes; return (G, G) information and (G,) gradient of the constants.
+def eliminate_states(equations: NormalEquations) -> Eliminated:
+    """Eliminate all keyframes from the equations.
+
+    Only half of the substitution is needed for the Schur complement.
 
     Raises
     ------
     numpy.linalg.LinAlgError
         If the keyframes' matrix is not positive definite.
-    """
-    return _eliminate_states(equations)[2:]
-
-
-def _eliminate_states(equations: NormalEquations) -> tuple[float, Array, Array, Array]:
-    """Return the log determinant of the keyframes' matrix C, and C^-1 by gradient and coupling.
-
-    Then (G, G) and (G,) of the Schur complement.
     """
     size = len(equations.globals_block)
     factor = cholesky_banded(
@@ -169,13 +193,14 @@ def _eliminate_states(equations: NormalEquations) -> tuple[float, Array, Array, 
     # In the order of LAPACK, which then copies nothing.
     right = np.empty((size + 1, *equations.gradient.shape))
     right[0], right[1:] = equations.gradient, equations.coupling.transpose(2, 0, 1)
-    solved = cho_solve_banded(
-        (factor, False), right.reshape(size + 1, -1).T, overwrite_b=True, check_finite=False
+    half, _ = dtbtrs(factor, right.reshape(size + 1, -1).T, trans="T", overwrite_b=True)
+    products = half[:, 1:].T @ half
+    return Eliminated(
+        factor,
+        half,
+        equations.globals_block - products[:, 1:],
+        equations.globals_gradient - products[:, 0],
     )
-    border = equations.coupling.reshape(-1, size)
-    rest = equations.globals_block - border.T @ solved[:, 1:]
-    vector = equations.globals_gradient - border.T @ solved[:, 0]
-    return float(2 * np.log(factor[-1]).sum()), solved, rest, vector
 
 
 def marginal_covariances(diagonal: Array, above: Array) -> Array:

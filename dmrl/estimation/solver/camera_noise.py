@@ -88,7 +88,7 @@ class _Posterior(NamedTuple):
         equations = solver.equations(values)[0]
         solved = solve_step(equations)
         states = marginal_covariances(equations.diagonal, equations.off_diagonal)
-        return cls(states, solved.response, solved.covariance)
+        return cls(states, solved.response(), solved.covariance)
 
     def leverage(self, rows: Rows) -> Array:
         """Return (K, m, q) variance of the predicted measurements over that of their noise."""

@@ -52,7 +52,8 @@ def compute_covariance(solver: Solver, values: Values) -> tuple[Array, Array]:
             equations.globals_block[...] += np.diag(held)
     solved = solve_step(equations)
     spread = marginal_covariances(equations.diagonal, equations.off_diagonal)
-    by_constants = solved.response @ solved.covariance @ solved.response.swapaxes(1, 2)
+    response = solved.response()
+    by_constants = response @ solved.covariance @ response.swapaxes(1, 2)
     return spread + by_constants, solved.covariance
 
 

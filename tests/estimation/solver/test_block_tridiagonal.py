@@ -65,7 +65,7 @@ def test_step_equals_dense_solve() -> None:
     assert step.covariance == pytest.approx(inverse[-GLOBALS:, -GLOBALS:])
     assert step.log_det == pytest.approx(np.linalg.slogdet(dense)[1])
     spread = marginal_covariances(found.diagonal, found.off_diagonal)
-    spread = spread + step.response @ step.covariance @ step.response.swapaxes(1, 2)
+    spread = spread + step.response() @ step.covariance @ step.response().swapaxes(1, 2)
     for key in range(KEYS):
         mine = slice(key * WIDTH, (key + 1) * WIDTH)
         assert spread[key] == pytest.approx(inverse[mine, mine])
