@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,8 @@ from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK
 
 SURE = 0.5
 """Smallest probability of a cause that is printed."""
+MANY_PAIRS = 4
+"""Number of pairs with the same cause that share a line."""
 LATE = (
     "Subtract the sensor's delay from its times; where all sensors of the robot are late: "
     "dmrl align"
@@ -192,24 +194,46 @@ def name_causes(pair: tuple[str, str], estimate: Estimate) -> list[PairCause]:
 def explain_causes(reports: Iterable[PairReport], gate: Gate = DEFAULT_GATE) -> list[str]:
     """Return a line for each probable cause of a pair, once for both directions.
 
-    Where positions are imprecise, it says what the gate compares.
+    A cause that many pairs share has one line. Where positions are imprecise, it says what the gate
+    compares.
     """
-    lines: dict[tuple[str, PairCause], str] = {}
+    shared: dict[str, dict[tuple[str, PairCause], PairReport]] = {}
     for report in reports:
         names = "-".join(sorted((report.robot, report.peer)))
         for cause in report.causes:
             if cause.probability >= SURE:
-                lines.setdefault(
-                    (names, cause), f"{names}: {cause}{_name_gate(report, cause, gate)}"
-                )
-    return list(lines.values())
+                shared.setdefault(cause.title, {}).setdefault((names, cause), report)
+    lines: list[str] = []
+    for found in shared.values():
+        pairs = list(dict.fromkeys(names for names, _ in found))
+        if len(pairs) < MANY_PAIRS:
+            lines += [
+                f"{names}: {cause}{_name_gate([report], cause, gate)}"
+                for (names, cause), report in found.items()
+            ]
+            continue
+        cause = _join([cause for _, cause in found])
+        some = f"{len(pairs)} pairs ({', '.join(pairs[:3])}, ...)"
+        lines.append(f"{some}: {cause}{_name_gate(list(found.values()), cause, gate)}")
+    return lines
 
 
-def _name_gate(report: PairReport, cause: PairCause, gate: Gate) -> str:
+def _join(causes: list[PairCause]) -> PairCause:
+    """Return a cause of several pairs: its largest probability, from its first to its last time."""
+    return replace(
+        causes[0],
+        probability=max(one.probability for one in causes),
+        from_s=min(one.from_s for one in causes),
+        to_s=max(one.to_s for one in causes),
+    )
+
+
+def _name_gate(reports: list[PairReport], cause: PairCause, gate: Gate) -> str:
     if cause.name != REASONS["imprecise"]:
         return ""
+    sigma = " to ".join(dict.fromkeys(f"{f(r.sigma_m for r in reports):.2f}" for f in (min, max)))
     return (
-        f". With a median sigma of {report.sigma_m:.2f} m, over {gate.bad_share:.0%} (--bad-share) "
+        f". With a median sigma of {sigma} m, over {gate.bad_share:.0%} (--bad-share) "
         f"even of the best would be over {gate.error_m:g} m (--gate-m) off"
     )
 

@@ -112,3 +112,20 @@ def test_imprecise_positions_come_with_the_numbers_of_the_gate(tmp_path: Path) -
     both = [replace(got, causes=[imprecise]), replace(got, sigma_m=0.3, causes=[imprecise])]
     (line,) = explain_causes(both, Gate(0.25, 0.05))
     assert all(words in line for words in ("0.20 m", "5% (--bad-share)", "0.25 m (--gate-m)"))
+
+
+def test_a_cause_of_many_pairs_has_one_line(tmp_path: Path) -> None:
+    got = report(flight(tmp_path / "a.mcap", [0.0, 4.0]))
+    reports = [
+        replace(
+            got,
+            peer=f"cf{k}",
+            sigma_m=0.1 * k,
+            causes=[PairCause(REASONS["imprecise"], 0.1 * k, float(k), 20.0 - k, None)],
+        )
+        for k in range(3, 8)
+    ]
+    assert len(explain_causes(reports[:-1])) == 2  # the others are not probable
+    (line,) = explain_causes([*reports, replace(got, peer="cf8", causes=reports[-1].causes)])
+    assert line.startswith("4 pairs (cf1-cf5, cf1-cf6, cf1-cf7, ...): positions are imprecise")
+    assert "(70%, 5 to 15 s)" in line and "median sigma of 0.20 to 0.70 m" in line
