@@ -14,8 +14,11 @@ from dmrl.estimation.solver.priors import Carried, Chain, ConstantPrior
 from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import Factor, Values, motion_gain, odometry_variance
 
-MAX_ITERATIONS, MAX_DAMPING = 25, 1e4
-"""Largest number of iterations; and the damping beyond which no smaller step is tried."""
+MAX_ITERATIONS = 25
+"""Largest number of iterations."""
+MIN_DAMPING, MAX_DAMPING, SMALL_DAMPING = 1e-4, 1e4, 1e-5
+"""Damping after a first step that fails; damping beyond which no smaller step is tried; and the
+largest one with which a small gain is convergence. A damped step may be small far from it."""
 TOLERANCE, ROUGH_TOLERANCE = 1e-5, 1e-4
 """Relative change of the cost that ends the iteration; the second where solutions are only
 compared."""
@@ -110,10 +113,11 @@ class Solver:
             if not cost < best:
                 if damping > MAX_DAMPING:
                     break
-                damping = max(10 * damping, 1e-2)
+                damping = max(10 * damping, MIN_DAMPING)
                 continue
-            gained, best, values, damping = best - cost, cost, tried, damping / 10
-            if gained < tolerance * best or any(
+            converged = best - cost < tolerance * best and damping <= SMALL_DAMPING
+            best, values, damping = cost, tried, damping / 10
+            if converged or any(
                 is_same_solution(values, other.values, same_m) for other in previous
             ):
                 break

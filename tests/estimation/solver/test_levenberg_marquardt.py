@@ -5,8 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dmrl.estimation.search.modes import coarsen, place_peer
+from dmrl.estimation.solver.block_tridiagonal import NormalEquations
 from dmrl.estimation.solver.keyframes import average_ranges, build_problem
 from dmrl.estimation.solver.levenberg_marquardt import (
+    MAX_ITERATIONS,
+    MIN_DAMPING,
+    SMALL_DAMPING,
     MapEstimate,
     Solver,
     is_same_solution,
@@ -28,6 +33,26 @@ def test_solve_converges_to_the_true_flight() -> None:
     assert np.abs(error[:, :2]).max() < 0.01 < np.abs(start.state - true.state).max()
     again = Solver(problem).solve(found.values)
     assert again.cost == pytest.approx(found.cost, rel=1e-3)
+
+
+def test_a_small_gain_of_a_damped_step_does_not_end_the_iteration(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From a peer that faces away the first steps fail, and the next ones are damped."""
+    flown_pair = pair_of(flown("random", "realistic", 1004, 20.0))
+    problem = coarsen(build_problem({(0, 1): flown_pair}))
+    pose = np.tile([1.5, 0.0, 0.0], (len(problem.keyframe_s), 1))
+    start, used = place_peer(problem, pose, np.zeros(2)), []
+    damped = NormalEquations.damped
+
+    def record(equations: NormalEquations, damping: float) -> NormalEquations:
+        used.append(damping)
+        return damped(equations, damping)
+
+    monkeypatch.setattr(NormalEquations, "damped", record)
+    Solver(problem).solve(start, tolerance=0.01)
+    assert max(used) >= MIN_DAMPING
+    assert used[-1] <= SMALL_DAMPING or len(used) == MAX_ITERATIONS
 
 
 def test_an_iteration_ends_at_a_known_solution() -> None:
