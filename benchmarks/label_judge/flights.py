@@ -16,7 +16,7 @@ from dmrl.flight.trajectories import Motion, Start
 from dmrl.geometry.frames import AIDECK_PINHOLE, pixels_from_horizontal
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
-from dmrl.samples.flight import LOG_COLUMNS, START_NS, ZERO_COVARIANCE
+from dmrl.samples.flight import LOG_COLUMNS, START_NS
 from dmrl.samples.sample import build_calibration
 from dmrl.simulation.flight_recording import FlySettings
 
@@ -157,7 +157,7 @@ def write(logs: Logs, base: Base, what: Mapping[str, Any], path: Path) -> None:
             _write_columns(sink, topics.RANGE(robot, peer), "UwbRange", time_s, range_m=range_m)
         for (robot, peer), rows in logs.truth.items():
             time_s, x, y, z = rows.T
-            exact = np.tile(np.array(ZERO_COVARIANCE), (len(rows), 1))
+            exact = np.zeros((len(rows), 9))
             values = {"x": x, "y": y, "z": z, "covariance": exact}
             _write_columns(sink, topics.TRUTH(robot, peer), "PeerPosition", time_s, **values)
         for robot, (time_s, found) in logs.detections.items():

@@ -8,7 +8,7 @@ import numpy as np
 from dmrl import topics
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
-from dmrl.samples.flight import START_NS, ZERO_COVARIANCE
+from dmrl.samples.flight import START_NS
 
 OFFSET_M = 0.35
 """Antenna delay of the TIERS group's ranges, metres."""
@@ -71,5 +71,5 @@ def _write_pair(number: int, folder: Path, path: Path) -> None:
             add(topics.HEIGHT(robot), "Height", at_s, height_m=np.ravel(height))
             add(topics.RANGE(robot, peer), "UwbRange", time_s[mine], range_m=range_m[mine])
             x, y = odometry.truth(flown, away, moments_s).T
-            exact = np.tile(np.array(ZERO_COVARIANCE), (len(x), 1))
+            exact = np.zeros((len(x), 9))
             add(topics.TRUTH(robot, peer), "PeerPosition", moments_s, x=x, y=y, covariance=exact)
