@@ -35,6 +35,7 @@ REMEDIES = {
     "flow late": LATE,
     "range": "Measure the offset once, and give it with --range-offset-m, or let flights "
     "determine it: dmrl calibrate --sensors",
+    "range late": LATE,
     "antenna": "Turn the antennas upright, away from metal",
     "height": "Fly over a level floor, within reach of the range finder",
     "clock": "Try: dmrl align",

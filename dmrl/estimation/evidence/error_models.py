@@ -168,6 +168,14 @@ def _one_direction(_link: "RangeLink", sight: "Sight") -> Array:
     return sight.sent - 0.5
 
 
+def _earlier(link: "RangeLink", sight: "Sight") -> Array:
+    """Return the effect of late ranges: the distance shown is that of before."""
+    time_s, half_s = link.time_s, 0.1
+    before, after = np.maximum(time_s - half_s, time_s[0]), np.minimum(time_s + half_s, time_s[-1])
+    gained = np.interp(after, time_s, sight.distance) - np.interp(before, time_s, sight.distance)
+    return np.asarray(-gained / np.maximum(after - before, half_s))
+
+
 def _harmonic(order: int, phase_rad: float) -> "Callable[[RangeLink, Sight], Array]":
     """Return the effect of a harmonic of the antenna pattern over the bearing."""
 
@@ -260,6 +268,7 @@ MODELS: tuple[ErrorModel, ...] = (
         log_odds=COMMON,
     ),
     ErrorModel("range scale", (Unknown("range_scale_free", "1", 0.05, "pair", range_scale=1.0),)),
+    ErrorModel("range late", (Unknown("range_delay", "s", 0.2, "pair", range=_earlier),)),
     ErrorModel(
         "range offset changes",
         (

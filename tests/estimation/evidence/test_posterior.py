@@ -85,6 +85,21 @@ def test_a_scale_of_both_flows_is_no_scale_of_the_ranges() -> None:
     assert not (error[kept] > 0.3).any()
 
 
+@pytest.mark.heavy
+def test_late_ranges_are_identified_and_corrected() -> None:
+    flight = flown("in_view", "calibrated", 1001, 60.0)
+    pair = pair_of(flight)
+    kept = pair.range_time_s < pair.time_s[-1] - 0.2
+    late = replace(pair, range_time_s=pair.range_time_s[kept] + 0.2, range_m=pair.range_m[kept])
+    ((plain, _),) = estimate_pairs([late], plain=True)
+    ((found, _),) = estimate_pairs([late])
+    error, worse = (
+        np.hypot(*(e.state[:, :2] - truth_at(flight, e.time_s)).T).mean() for e in (found, plain)
+    )
+    assert [cause.name for cause in found.causes if cause.probability > 0.5] == ["range late"]
+    assert error < 0.85 * worse
+
+
 def test_rivals_of_a_round_get_the_models_of_later_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
     first, rival, second = list(list_candidates())[:3]
 
