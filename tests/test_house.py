@@ -4,8 +4,10 @@ How well it reads is for people to say; this only stops what is plainly too long
 """
 
 import ast
+import importlib.util
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -42,6 +44,29 @@ def test_files_beside_the_package_are_short_too() -> None:
     lines = {name_of(path): len(path.read_text(encoding="utf-8").splitlines()) for path in beside}
     assert len(lines) > 300
     assert {name: count for name, count in lines.items() if count > LINES} == {}
+
+
+def has_name(module: ModuleType, name: str) -> bool:
+    """Whether a module has an attribute or a submodule."""
+    if hasattr(module, name):
+        return True
+    is_package = hasattr(module, "__path__")
+    return is_package and importlib.util.find_spec(f"{module.__name__}.{name}") is not None
+
+
+@pytest.mark.heavy
+def test_benchmarks_and_examples_import_names_that_exist() -> None:
+    """No other test runs most of them."""
+    missing = [
+        f"{name_of(path)}: {node.module}.{one.name}"
+        for folder in ("benchmarks", "examples")
+        for path in (ROOT / folder).rglob("*.py")
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "dmrl"
+        for one in node.names
+        if not has_name(importlib.import_module(node.module or ""), one.name)
+    ]
+    assert missing == []
 
 
 def lines_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
