@@ -12,6 +12,7 @@ from dmrl.estimation.model.pair import Array, Pair
 from dmrl.estimation.search.modes import convert_values
 from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.levenberg_marquardt import Solver
+from dmrl.estimation.solver.residuals import Rows, Values
 
 from ..flights import flown, pair_of
 
@@ -85,3 +86,16 @@ def test_noise_for_a_while_is_found_and_widens_its_stretch_alone() -> None:
     inside = (middle_s > 20) & (middle_s < 35)
     assert noisy[inside].mean() > 0.7 and noisy[~inside].mean() < 0.15
     assert problem.noise.grade < base.solver.problem.noise.grade
+
+
+def test_velocity_errors_count_coloured_noise_of_their_robot_alone() -> None:
+    problem = build_problem({(0, 1): pair_of(flown("in_view", "calibrated", 1000, 20.0))})
+    solver, layout = Solver(problem), problem.layout
+    state = np.zeros((len(problem.keyframe_s), layout.width))
+    state[50, layout.state_column("velocity_error_x", 0)] = 0.5
+    values = Values(state, np.zeros(len(layout.constants)))
+    motions = [one for one in solver.linearize(values) if isinstance(one, Rows) and one.steps]
+    for robot, steps in ((0, [49, 50]), (1, [])):
+        coloured = noisy_stretch._velocity_squares(solver, values, robot)
+        coloured -= motions[robot].square[:, :2].sum(axis=1)
+        assert np.flatnonzero(coloured > 1).tolist() == steps
