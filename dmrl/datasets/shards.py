@@ -95,7 +95,12 @@ def _open_table(path: Path) -> Iterator[pa.Table]:
         yield pq.ParquetFile(os.fspath(path), memory_map=True).read()
         return
     with path.open("rb") as stream:
-        data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        try:
+            number = stream.fileno()
+        except OSError:  # in a bucket
+            yield pa.ipc.open_stream(stream).read_all()
+            return
+        data = mmap.mmap(number, 0, access=mmap.ACCESS_READ)
     can_advise = hasattr(mmap, "MADV_RANDOM")  # not on Windows
     if can_advise:
         data.madvise(mmap.MADV_RANDOM)

@@ -171,6 +171,8 @@ def _one_direction(_link: "RangeLink", sight: "Sight") -> Array:
 def _earlier(link: "RangeLink", sight: "Sight") -> Array:
     """Return the effect of late ranges: the distance shown is that of before."""
     time_s, half_s = link.time_s, 0.1
+    if not len(time_s):
+        return np.zeros(0)
     before, after = np.maximum(time_s - half_s, time_s[0]), np.minimum(time_s + half_s, time_s[-1])
     gained = np.interp(after, time_s, sight.distance) - np.interp(before, time_s, sight.distance)
     return np.asarray(-gained / np.maximum(after - before, half_s))
