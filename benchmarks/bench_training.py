@@ -20,6 +20,7 @@ import torch
 from dmrl import recipe
 from dmrl.datasets import open_dataset
 from dmrl.datasets.training_examples import build_examples
+from dmrl.guards.memory import keep_freed_memory
 from dmrl.images.codec import encode_png
 from dmrl.learn.data.augment import Augmenter
 from dmrl.learn.data.batches import Batch, ExampleSet, collate, epoch_indices
@@ -109,6 +110,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
+    keep_freed_memory(2**31 - 1)  # as training does
     settings = replace(recipe.load(args.recipe, "train", TrainConfig), device="cpu")
     spent: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as name:

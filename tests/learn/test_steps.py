@@ -11,8 +11,9 @@ import torch
 
 from dmrl.learn.data.batches import Batch, ExampleSet, collate
 from dmrl.learn.networks.architectures import Network, build_network
+from dmrl.learn.training import train_step as steps
 from dmrl.learn.training import trainer
-from dmrl.learn.training.train_step import LOSS_NAMES, train_step
+from dmrl.learn.training.train_step import LOSS_NAMES, compute_losses, train_step
 from dmrl.learn.training.trainer import Trainer, build_initial_network, learning_rate_at
 
 from .fitting import PUBLISHED, SETTINGS, dots
@@ -36,6 +37,19 @@ def test_gradients_are_cleared_between_steps(examples: ExampleSet) -> None:
         train_step(network, optimizer, batch, SETTINGS, 0.0)
         sizes.append([float(p.grad.norm()) for p in network.parameters() if p.grad is not None])
     assert sizes[1] == pytest.approx(sizes[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("able", [True, False])
+def test_bfloat16_is_computed_only_on_processors_that_have_it(
+    examples: ExampleSet, monkeypatch: pytest.MonkeyPatch, able: bool
+) -> None:
+    monkeypatch.setattr(steps, "computes_bfloat16", lambda device: able)
+    network, batch = build_network("locanet"), collate(examples, [0])
+    half, single = (
+        compute_losses(network, batch, replace(SETTINGS, precision=precision))
+        for precision in ("bfloat16", "float32")
+    )
+    assert torch.equal(half, single) != able
 
 
 def test_epochs_differ_in_order_and_are_reproducible(examples: ExampleSet, tmp_path: Path) -> None:

@@ -100,7 +100,7 @@ class TrainConfig(LossSettings):
         Probability that colours are removed, for models that shall also work with grey cameras.
     precision
         "bfloat16": body in bfloat16, weights, head and losses in float32; 1.5 times as fast on CPUs
-        that support it.
+        that compute in bfloat16. Other CPUs compute in float32.
     seed
         Seed of the initial weights, the image order and the augmentation.
     device
