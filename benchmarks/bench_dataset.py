@@ -5,6 +5,10 @@
 Peers, in the same run on the same images: `datasets` with its torch format on its own Array3D
 and Image columns, as `save_to_disk` writes them, and `datasets` on our files. The page cache
 is dropped before the first pass of each. One thread.
+
+The last table compares first passes with a memory map of the images' bytes, of which each batch is
+read in the order of the file: pairs in turn, both opened beforehand, files of either out of the
+page cache.
 """
 
 import gc
@@ -29,7 +33,7 @@ from dmrl.stages.dataset import Settings, run
 from dmrl.terminal.tables import print_table
 from dmrl.topics import CAMERA_IMAGE, LABELS
 
-HEIGHT_PX, WIDTH_PX, BATCH, PASSES = 224, 320, 32, 3
+HEIGHT_PX, WIDTH_PX, BATCH, PASSES, PAIRS = 224, 320, 32, 3, 5
 Batches = Callable[[], Iterator[torch.Tensor]]
 
 
@@ -86,7 +90,7 @@ def save(split: Split, folder: Path, feature: object) -> None:
 def evict(folder: Path) -> None:
     """Drop every file of a folder from the page cache, which keeps what is mapped."""
     gc.collect()
-    for path in folder.rglob("*.arrow"):
+    for path in (*folder.rglob("*.arrow"), *folder.rglob("*.bytes")):
         with path.open("rb") as stream:
             os.fsync(stream.fileno())
             os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
@@ -166,6 +170,51 @@ def ways_of(folder: Path) -> dict[str, Callable[[], Batches]]:
     }
 
 
+def sorted_map(path: Path, count: int) -> Iterator[torch.Tensor]:
+    """Yield shuffled batches of a file of raw images, each read in the order of the file."""
+    images = np.memmap(path, np.uint8, "r", shape=(count, HEIGHT_PX, WIDTH_PX, 3))
+    yield torch.empty(0)
+    for batch in order_of(count):
+        out = np.empty((len(batch), HEIGHT_PX, WIDTH_PX, 3), np.uint8)
+        for place in np.argsort(batch):
+            out[place] = images[batch[place]]
+        yield torch.from_numpy(out)
+
+
+def opened_dmrl(folder: Path) -> Iterator[torch.Tensor]:
+    """Yield nothing once the dataset is open, then the batches of `from_dmrl`."""
+    split = open_dataset(folder / "raw").split("train")
+    yield torch.empty(0)
+    yield from from_dmrl(split)
+
+
+def compare_cold(folder: Path, count: int) -> None:
+    """Print CPU and wall time of first passes over a sorted map's, and what they read."""
+    with (folder / "flat.bytes").open("wb") as flat:
+        for batch in from_dmrl(open_dataset(folder / "raw").split("train")):
+            flat.write(batch.numpy().tobytes())
+    loaders = [lambda: opened_dmrl(folder), lambda: sorted_map(folder / "flat.bytes", count)]
+    spent = np.zeros((PAIRS + 1, 2, 3))  # CPU-s, s, MB
+    for turn in range(PAIRS + 1):
+        for which in (0, 1) if turn % 2 else (1, 0):
+            evict(folder)
+            batches = loaders[which]()
+            next(batches)
+            before = np.array([time.process_time(), time.perf_counter(), read_mb()])
+            for batch in batches:
+                batch.sum(dtype=torch.int64)
+            spent[turn, which] = time.process_time(), time.perf_counter(), read_mb()
+            spent[turn, which] -= before
+    ratios = spent[1:, 1, :2] / spent[1:, 0, :2]  # the first pair warms up
+    rows = [
+        (name, *(f"{value:.2f}" for value in (np.median(r), r.min(), r.max())))
+        for name, r in zip(("CPU time", "wall time"), ratios.T, strict=True)
+    ]
+    mb = " and ".join(f"{each:.0f}" for each in np.median(spent[1:, :, 2], axis=0))
+    title = f"rate from disk over that of a sorted map, {PAIRS} pairs; {mb} MB read"
+    print_table(title, ("by", "median", "least", "most"), rows)
+
+
 def main() -> None:
     """Print the tables."""
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 1024
@@ -183,6 +232,7 @@ def main() -> None:
         rows = [(way, *rates(folder, open_way)) for way, open_way in ways.items()]
         title = "load, images per cpu-second; every way gave the same bytes"
         print_table(title, ("way", "from disk", "pass after it", "MB read to open"), rows)
+        compare_cold(folder, count)
 
 
 if __name__ == "__main__":

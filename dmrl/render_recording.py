@@ -16,6 +16,7 @@ from dmrl.datasets.backgrounds import open_backgrounds
 from dmrl.errors import OutputError, RecipeError
 from dmrl.geometry.camera_file import NAMED_CAMERAS, find_camera
 from dmrl.geometry.frames import Camera
+from dmrl.guards.memory import keep_freed_memory
 from dmrl.recording import (
     LICENCES_METADATA,
     SPLIT_METADATA,
@@ -39,6 +40,8 @@ from dmrl.rendering.settings import Settings, filled
 from dmrl.samples.sample import build_calibration, find_intervals
 from dmrl.terminal.progress import say, track
 
+KEPT_BYTES = 64 << 20
+"""Freed bytes that the process keeps. An image's arrays would fault in their pages again."""
 PREVIEW_SAMPLES = 64
 """Samples of a pixel of a preview."""
 
@@ -96,6 +99,7 @@ def read_render_camera(settings: Settings) -> Camera:
 def render_recording(out: Path, settings: Settings, *, resume: bool = False) -> Rendered:
     """Render and write the recording ``out``, as images arrive; see ``dmrl.stages.render.run``."""
     refuse_existing(out)
+    keep_freed_memory(KEPT_BYTES)
     before = recover_interrupted(out, resume=resume, has_images=True)
     camera = read_render_camera(settings)
     photos = None if settings.backgrounds is None else open_backgrounds(settings.backgrounds)
