@@ -13,6 +13,7 @@ from dmrl.estimation.evidence.error_models import Candidate, list_candidates
 from dmrl.estimation.evidence.model_trials import (
     MIN_GRADE,
     Member,
+    Others,
     select_grade,
     solve_under,
     try_model,
@@ -25,7 +26,6 @@ from dmrl.estimation.solver.covariance import MIN_MOTION_ENERGY, odometry_energy
 from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, Solver, is_same_solution
 from dmrl.estimation.solver.noise_selection import GRADE_BIAS
 from dmrl.estimation.solver.problem import Problem
-from dmrl.estimation.solver.residuals import Values
 
 MAX_MODELS = 3
 """Largest number of error models that are combined."""
@@ -60,9 +60,7 @@ class Mixture:
         return out
 
 
-def weigh_models(
-    solver: Solver, modes: Sequence[MapEstimate], others: Sequence[Values] = ()
-) -> Mixture:
+def weigh_models(solver: Solver, modes: Sequence[MapEstimate], others: Others = tuple) -> Mixture:
     """Return the mixture of a flight's solutions under all error models.
 
     Parameters
@@ -72,7 +70,7 @@ def weigh_models(
     modes
         Its distinct solutions, best first.
     others
-        Solutions with yaw rate biases that change, in the layout of the flight.
+        Returns solutions with yaw rate biases that change, in the layout of the flight.
     """
     # The noise of the output is wider than the likeliest one, which compares models.
     solver = with_grade(solver, max(solver.problem.noise.grade / GRADE_BIAS, MIN_GRADE))
@@ -94,7 +92,7 @@ def weigh_models(
         rounds.append((leader.models[-1], _list_rivals(leader, tried)))
         best = select_grade(leader)
         members.append(best)
-        others = ()
+        others = tuple
     members += _extend_rivals(rounds)
     return _mix([_widen(one) for one in _select_likely(members)])
 
@@ -128,7 +126,7 @@ def _extend_rivals(rounds: Sequence[tuple[Candidate, Sequence[Member]]]) -> Iter
     for number, (_, rivals) in enumerate(rounds[:-1], 1):
         for rival in rivals:
             for candidate, _ in rounds[number:]:
-                rival = next(iter(try_model(rival, candidate, ())), rival)
+                rival = next(iter(try_model(rival, candidate)), rival)
             yield select_grade(rival)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 from dmrl.estimation.evidence.model_trials import Member
 from dmrl.estimation.evidence.posterior import Mixture, weigh_models
@@ -100,14 +101,20 @@ def solve_pair(
         members = [Member(solver, mode, -mode.cost) for mode in found]
         mixture = Mixture(members, mode_weights(found))
     else:
-        others = [
-            values
-            for values in find_flexible_modes(problem, tracks)
-            if not any(is_same_solution(values, mode.values, SAME_TRACK_M) for mode in found)
-        ]
-        mixture = weigh_models(solver, found, others)
+        mixture = weigh_models(solver, found, cache(lambda: _find_others(problem, tracks, found)))
     covariances = [compute_covariance(one.solver, one.values) for one in mixture.members]
     return PairSolution(mixture, covariances)
+
+
+def _find_others(
+    problem: Problem, tracks: Sequence[Track], found: Sequence[MapEstimate]
+) -> list[Values]:
+    """Return the solutions with yaw rate biases that change that are no solution without."""
+    return [
+        values
+        for values in find_flexible_modes(problem, tracks)
+        if not any(is_same_solution(values, mode.values, SAME_TRACK_M) for mode in found)
+    ]
 
 
 def _select_noise(

@@ -1,8 +1,10 @@
 """Bordered block-tridiagonal normal equations: assembly, solution, marginals and elimination."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 
@@ -83,6 +85,24 @@ class NormalEquations:
         self.globals_block[np.ix_(edge, edge)] += rest[:-1, :-1]
         self.globals_gradient[edge] += rest[:-1, -1]
 
+    def select(self, states: Sequence[int], constants: Sequence[int]) -> "NormalEquations":
+        """Return the equations of some columns of the keyframes and of the constants."""
+        at, edge = np.array(states, int), np.array(constants, int)
+
+        def take(blocks: Array, columns: NDArray[np.intp]) -> Array:
+            # The keyframes are last in memory.
+            found: Array = blocks.transpose(1, 2, 0)[np.ix_(at, columns)]
+            return found.transpose(2, 0, 1)
+
+        return NormalEquations(
+            take(self.diagonal, at),
+            take(self.off_diagonal, at),
+            take(self.coupling, edge),
+            self.globals_block[np.ix_(edge, edge)],
+            self.gradient[:, at],
+            self.globals_gradient[edge],
+        )
+
     def damped(self, damping: float) -> "NormalEquations":
         """Return the equations with Marquardt damping of the keyframes, not of the constants."""
         eye = np.eye(self.diagonal.shape[1])
@@ -154,6 +174,13 @@ class Eliminated:
         """Return U^-1 by (K n, m) columns."""
         solved, _ = dtbtrs(self.factor, half)
         return np.asarray(solved)
+
+    def step_evidence(self, constants: Sequence[int]) -> float:
+        """Return the gain of the step with some constants, less half of the log determinant."""
+        at = np.array(constants, int)
+        block, slope = self.information[np.ix_(at, at)], self.gradient[at]
+        gain = (self.half[:, 0] ** 2).sum() + slope @ np.linalg.solve(block, slope)
+        return float(gain - self.log_det() - np.linalg.slogdet(block)[1]) / 2
 
     def log_det(self) -> float:
         """Return the log determinant of the keyframes' matrix."""

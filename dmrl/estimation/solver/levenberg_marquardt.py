@@ -98,6 +98,17 @@ class Solver:
         same_m
             Largest distance between two paths that are the same solution, metres.
         """
+        return self._iterate(start, previous, tolerance, same_m)[0]
+
+    def solve_with_evidence(self, start: Values, tolerance: float) -> tuple[MapEstimate, float]:
+        """Return the most likely flight near a first guess, and its log evidence."""
+        found, factors = self._iterate(start, (), tolerance, SAME_SOLUTION_M)
+        return found, self.laplace_evidence(found, factors)
+
+    def _iterate(
+        self, start: Values, previous: Sequence[MapEstimate], tolerance: float, same_m: float
+    ) -> tuple[MapEstimate, list[Factor]]:
+        """Return a solution as `solve`, and the factors there."""
         layout, values = self.layout, start
         factors = self.linearize(values, layout)
         best, damping = total_cost(factors), 0.0
@@ -106,8 +117,8 @@ class Solver:
             try:
                 step = solve_step(equations.damped(damping))
                 tried = Values(values.state + step.state, values.constants + step.constants)
-                factors = self.linearize(tried, layout)
-                cost = total_cost(factors)
+                ahead = self.linearize(tried, layout)
+                cost = total_cost(ahead)
             except np.linalg.LinAlgError:
                 cost = np.inf
             if not cost < best:
@@ -116,13 +127,13 @@ class Solver:
                 damping = max(10 * damping, MIN_DAMPING)
                 continue
             converged = best - cost < tolerance * best and damping <= SMALL_DAMPING
-            best, values, damping = cost, tried, damping / 10
+            best, values, factors, damping = cost, tried, ahead, damping / 10
             if converged or any(
                 is_same_solution(values, other.values, same_m) for other in previous
             ):
                 break
             equations = build_equations(layout, factors, len(values.state))
-        return MapEstimate(values, best)
+        return MapEstimate(values, best), factors
 
     def log_evidence(self, found: MapEstimate) -> float:
         """Return the Laplace approximation of the log evidence at a solution.
@@ -130,10 +141,11 @@ class Solver:
         It lacks a constant that depends on the measurements alone, so models (rows of the table
         and grades of noise) with the same measurements can be compared.
         """
-        equations, factors = self.equations(found.values)
-        return self.laplace_evidence(found, factors, solve_step(equations).log_det)
+        return self.laplace_evidence(found, self.linearize(found.values))
 
-    def laplace_evidence(self, found: MapEstimate, factors: list[Factor], log_det: float) -> float:
+    def laplace_evidence(
+        self, found: MapEstimate, factors: list[Factor], log_det: float | None = None
+    ) -> float:
         """Return the evidence as `log_evidence`, from factors that are linearized already.
 
         Parameters
@@ -143,8 +155,11 @@ class Solver:
         factors
             Factors there.
         log_det
-            Log determinant of their normal equations.
+            Log determinant of their normal equations. None: computed.
         """
+        if log_det is None:
+            equations = build_equations(self.layout, factors, len(found.values.state))
+            log_det = solve_step(equations).log_det
         noise, normalizer = self.problem.noise, 0.0
         for robot in range(len(self.problem.robots)):
             normalizer += float(np.log(odometry_variance(self.problem, robot)).sum()) / 2
@@ -157,9 +172,7 @@ class Solver:
         pull = 0.0
         for factor in factors:
             if isinstance(factor, Chain):
-                normalizer += float(np.log(factor.std).sum())
-                if np.isfinite(factor.start_std):  # else the window before knows the first value
-                    normalizer += float(np.log(factor.start_std))
+                normalizer += factor.log_std
                 # The pull to zero is not a normalized density, so it is no evidence.
                 square = (factor.value / factor.row.pull_std) ** 2
                 pull += factor.row.pull_weight * float(np.log1p(square).sum()) / 2

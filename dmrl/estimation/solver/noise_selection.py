@@ -53,9 +53,9 @@ def _search_grade(problem: Problem, start: Values) -> tuple[float, MapEstimate]:
 
     def evaluate(number: int, values: Values) -> float:
         solver = Solver(replace(problem, noise=_graded(problem, GRADES[number])))
-        solution = solver.solve(values, tolerance=ROUGH_TOLERANCE)
-        found[number] = solver.log_evidence(solution), solution
-        return found[number][0]
+        solution, evidence = solver.solve_with_evidence(values, ROUGH_TOLERANCE)
+        found[number] = evidence, solution
+        return evidence
 
     first = GRADES.index(1.0)
     best = evaluate(first, start)

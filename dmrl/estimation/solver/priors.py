@@ -48,6 +48,12 @@ class Chain:
         steps = (self.value[1:] - self.kept * self.value[:-1]) / self.std
         return np.concatenate([self.value[:1] / self.start_std, steps])
 
+    @property
+    def log_std(self) -> float:
+        """Sum of the logarithms of the standard deviations."""
+        known = np.isfinite(self.start_std)  # else the window before knows the first value
+        return float(np.log(self.std).sum()) + (float(np.log(self.start_std)) if known else 0.0)
+
     def cost(self) -> float:
         """Return half the sum of the losses."""
         pull = self.row.pull_weight * np.log1p((self.value / self.row.pull_std) ** 2).sum()

@@ -1,11 +1,19 @@
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from dmrl.estimation.evidence import model_trials, noisy_stretch
 from dmrl.estimation.evidence.error_models import MODELS, Candidate, list_candidates
-from dmrl.estimation.evidence.model_trials import MIN_STEP_GAIN, Member, solve_under, try_model
+from dmrl.estimation.evidence.model_trials import (
+    MIN_STEP_GAIN,
+    Member,
+    score_steps,
+    solve_under,
+    try_model,
+    try_models,
+)
 from dmrl.estimation.evidence.noisy_stretch import find_noisy_steps
 from dmrl.estimation.flight.pair_solver import solve_pair
 from dmrl.estimation.model.pair import Array, Pair
@@ -40,17 +48,34 @@ def add_flow_noise(pair: Pair, where: Array, seed: int = 5) -> Pair:
     return replace(pair, own=own)
 
 
-def test_models_of_constants_are_scored_by_one_linearization_as_by_their_own() -> None:
+def test_models_are_scored_by_one_linearization_as_by_their_own() -> None:
     base = solve_plain(pair_of(flown("in_view", "calibrated", 1000, 20.0)))
-    candidates = [one for one in list_candidates() if one.model.adds_constants]
-    hopeless, scores = model_trials._list_hopeless(base, candidates), {}
+    candidates = [one for one in list_candidates() if not one.model.for_a_while]
+    gains = score_steps(base, candidates)
+    assert min(gains.values()) < MIN_STEP_GAIN < max(gains.values())
     for one in candidates:
         solver = Solver(one.apply(base.solver.problem))
         start = convert_values(base.values, base.solver.layout, solver.layout)
-        scores[one] = model_trials._step_score(solver, start, (one,)) - base.score
-    assert len(candidates) > 20 and hopeless
-    for one, score in scores.items():
-        assert (one in hopeless) == (score < MIN_STEP_GAIN), (one, score)
+        own = model_trials._step_score(solver, start, (one,)) - base.score
+        assert gains[one] == pytest.approx(own, abs=1e-3), one
+
+
+def test_models_without_gain_are_not_solved_after_a_leading_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    lead, near, far = list(list_candidates())[:3]
+    gains = {far: -4.0, near: -2.0, lead: 20.0}
+    monkeypatch.setattr(model_trials, "score_steps", lambda _base, _some: gains)
+    base = Member(Mock(), Mock(), 100.0)
+    monkeypatch.setattr(
+        model_trials,
+        "try_model",
+        lambda _base, one, _others: [replace(base, score=100.0 + gains[one], models=(one,))],
+    )
+    found = try_models(base, list(gains))
+    assert [member.models[0] for member in found] == [lead, near]
+    gains[lead] = 10.0
+    assert len(try_models(base, list(gains))) == 3
 
 
 def test_quiet_flight_has_no_noisy_stretch() -> None:
@@ -75,7 +100,7 @@ def test_noise_for_a_while_is_found_and_widens_its_stretch_alone() -> None:
     pair = pair_of(flown("room", "calibrated", 1003, 60.0))
     where = (pair.time_s > 20) & (pair.time_s < 35)
     base = solve_plain(add_flow_noise(pair, where))
-    found = [try_model(base, Candidate(FOR_A_WHILE, robot), ()) for robot in (0, 1)]
+    found = [try_model(base, Candidate(FOR_A_WHILE, robot)) for robot in (0, 1)]
     best = max((one for some in found for one in some), key=lambda one: one.score)
     assert best.score > base.score + 10
     robot = best.models[0].robot

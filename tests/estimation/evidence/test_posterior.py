@@ -103,7 +103,7 @@ def test_late_ranges_are_identified_and_corrected() -> None:
 def test_rivals_of_a_round_get_the_models_of_later_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
     first, rival, second = list(list_candidates())[:3]
 
-    def extended(base: Member, candidate: Candidate, _others: object) -> list[Member]:
+    def extended(base: Member, candidate: Candidate) -> list[Member]:
         return [replace(base, models=(*base.models, candidate), score=base.score + 1.0)]
 
     monkeypatch.setattr(posterior, "try_model", extended)
