@@ -49,10 +49,13 @@ RobotPair = tuple[str, str]
 
 
 class Samples(NamedTuple):
-    """Messages of one topic: (N,) log times, (N,) publish times and (N, C) values."""
+    """Messages of one topic: (N,) log times and (N, C) values.
+
+    ``set_back`` is the number of messages that were published a second before the previous one.
+    """
 
     time_ns: Times
-    publish_ns: Times
+    set_back: int
     values: Array
 
 
@@ -206,7 +209,9 @@ def _find_topics(held: Collection[str], pattern: str) -> dict[Any, str]:
 
 def _to_samples(table: pa.Table, columns: list[Any]) -> Samples:
     values = np.column_stack([column.to_numpy() for column in columns]).astype(float)
-    return Samples(table["log_time"].to_numpy(), table["publish_time"].to_numpy(), values)
+    # Messages are in log-time order; their order of arrival shows a clock that was set back.
+    set_back = int((np.diff(table["publish_time"].to_numpy()) < -1_000_000_000).sum())
+    return Samples(table["log_time"].to_numpy(), set_back, values)
 
 
 def _sample_reader(pattern: str) -> Callable[[LoadedRecording, str], Samples]:

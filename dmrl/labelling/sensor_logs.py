@@ -206,9 +206,10 @@ def _to_signals(
     if bad := int((~good).sum()):
         reason = f"samples of {topic} that are not finite, or {MAX_VALUE:g} and more"
         leave_out(reason, flight.path, bad)
-    # Messages are in log-time order; their order of arrival shows a clock that was set back.
-    if back := int((np.diff(samples.publish_ns) < -1_000_000_000).sum()):
-        warnings.append(f"{topic}: its clock goes back {back} times; samples overlap there")
+    if samples.set_back:
+        warnings.append(
+            f"{topic}: its clock goes back {samples.set_back} times; samples overlap there"
+        )
     if not good.any():
         warnings.append(f"{topic}: nothing to use; its pairs are left out")
         return None

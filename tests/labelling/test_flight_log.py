@@ -40,7 +40,7 @@ def test_a_flight_has_the_columns_of_its_sensors(path: Path) -> None:
     assert flight.ranges["a", "b"].values.tolist() == [[6]]
     assert (flight.height, flight.positions, flight.calibrations) == ({}, {}, {})
     assert flight.to_seconds(flight.velocity["a"].time_ns).tolist() == [1.0]
-    assert flight.velocity["a"].publish_ns.tolist() == [3]
+    assert flight.velocity["a"].set_back == 0
 
 
 def test_a_covariance_that_is_missing_is_unknown(path: Path) -> None:

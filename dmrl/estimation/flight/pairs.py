@@ -53,6 +53,7 @@ from dmrl.estimation.solver.problem import NoiseModel, Problem
 from dmrl.estimation.solver.residuals import Values, odometry_factor, range_factor
 from dmrl.estimation.solver.robust_loss import Gaussian
 from dmrl.estimation.solver.unknowns import TABLE
+from dmrl.guards.memory import return_freed_memory
 
 CONTRADICTED_SIGMAS, CONTRADICTED_RANGE_SIGMAS = 15.0, 3.0
 """Odometry that differs from the solution by more has dropped out for the status, in sigmas; and so
@@ -166,6 +167,7 @@ def _solve_pieces(pair: Pair, noise: NoiseModel | None, *, plain: bool) -> Itera
     """Yield the estimates of the windows of a flight."""
     carried: Carried | None = None
     for window in split_windows(float(pair.time_s[0]), float(pair.time_s[-1])):
+        return_freed_memory()  # of the signals of the whole flight, and of the window before
         part = pair.crop(window.start_s, window.end_s)
         solution = solve_pair(build_problem({(0, 1): part}), noise, carried, plain=plain)
         times = output_times(pair.time_s[0], window.from_s, window.until_s)

@@ -64,12 +64,14 @@ def probability_beyond(covariance: Array, error_m: float) -> Array:
     error_m
         The limit, metres.
     """
-    small, large = np.maximum(np.linalg.eigvalsh(covariance), 1e-8).T[..., None]
-    angle = (np.arange(DIRECTION_COUNT) + 0.5) * np.pi / DIRECTION_COUNT
-    q = np.cos(angle) ** 2 / small + np.sin(angle) ** 2 / large
-    weight = 1 / q
-    beyond = (weight * np.exp(-q * error_m**2 / 2)).sum(axis=1)
-    return np.asarray(beyond / weight.sum(axis=1))
+    small, large = np.maximum(np.linalg.eigvalsh(covariance), 1e-8).T
+    beyond, total = np.zeros((2, len(covariance)))
+    for angle in (np.arange(DIRECTION_COUNT) + 0.5) * np.pi / DIRECTION_COUNT:
+        q = np.cos(angle) ** 2 / small + np.sin(angle) ** 2 / large
+        weight = 1 / q
+        total += weight
+        beyond += weight * np.exp(-q * error_m**2 / 2)
+    return beyond / total
 
 
 def select_within_budget(probability: Array, share: float) -> Mask:
