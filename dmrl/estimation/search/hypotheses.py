@@ -129,7 +129,8 @@ def _select_hypotheses(
     """Return the likely and distinct hypotheses of each start."""
     count = BEARING_COUNT * HEADING_COUNT
     begun = np.concatenate([circles[s] for s in start_of])
-    run = run_lanes(inputs, lanes, begun, np.repeat(np.arange(len(lanes)), count), steps)
+    lane_of = np.repeat(np.arange(len(lanes)), count)
+    run = run_lanes(inputs, lanes, begun, lane_of, steps, smoothed=False)
     score = run.log_likelihood.sum(axis=0).reshape(len(lanes), count)
     ends = np.stack(
         [

@@ -139,7 +139,13 @@ def _select_images(views: Sequence[CameraView]) -> dict[int, list[tuple[float, A
 
 
 def run_lanes(
-    inputs: FilterInputs, lanes: Sequence[Lane], start: Array, lane_of: NDArray[np.intp], steps: int
+    inputs: FilterInputs,
+    lanes: Sequence[Lane],
+    start: Array,
+    lane_of: NDArray[np.intp],
+    steps: int,
+    *,
+    smoothed: bool = True,
 ) -> FilterRun:
     """Run B filters side by side, each along its lane, for a number of keyframes at most.
 
@@ -155,30 +161,37 @@ def run_lanes(
         (B,) index of each filter's lane.
     steps
         Largest number of keyframes. A lane that ends before waits.
+    smoothed
+        Whether the run is smoothed afterwards. Otherwise it holds states and likelihoods alone.
     """
     count, filters = min(steps, max(len(lane.keyframe) for lane in lanes)), len(start)
     state = np.zeros((filters, SIZE))
     state[:, :3] = start
     covariance = np.broadcast_to(np.diag(HYPOTHESIS_STD**2), (filters, SIZE, SIZE)).copy()
-    out = FilterRun(*(np.zeros((count, *shape)) for shape in (
-        (filters, SIZE), (filters, SIZE, SIZE), (filters, SIZE), (filters, SIZE, SIZE),
-        (filters, SIZE, SIZE), (filters,),
+    held, square = count * smoothed, (filters, SIZE, SIZE)
+    out = FilterRun(*(np.zeros(shape) for shape in (
+        (count, filters, SIZE), (held, *square), (held, filters, SIZE), (held, *square),
+        (held, *square), (count, filters),
     )))  # fmt: skip
     keys = np.stack([_pad_with_none(lane.keyframe, count) for lane in lanes])
     motions = _list_motions(inputs, keys)
     columns = [np.flatnonzero(lane_of == number) for number in range(len(lanes))]
     for t in range(count):
-        out.prior[t], out.prior_covariance[t] = state, covariance
+        if smoothed:
+            out.prior[t], out.prior_covariance[t] = state, covariance
         key = keys[lane_of, t]
         alive = key >= 0
         _update_ranges(state, covariance, inputs, np.where(alive, key, 0), alive, out, t)
         for number, mine in enumerate(columns):
             for image in inputs.images.get(int(keys[number, t]), ()):
                 _update_image(state, covariance, inputs, int(keys[number, t]), mine, image, out, t)
-        out.state[t], out.covariance[t] = state, covariance
+        out.state[t] = state
+        if smoothed:
+            out.covariance[t] = covariance
         if t < count - 1:
             state, step = _propagate(state, motions, lane_of, t)
-            out.step[t] = step
+            if smoothed:
+                out.step[t] = step
             covariance = step @ covariance @ step.swapaxes(1, 2)
             covariance[:, range(SIZE), range(SIZE)] += motions.variance[lane_of, t]
     return out

@@ -121,6 +121,9 @@ def test_parallel_lanes_equal_single_lanes_and_short_ones_stay_constant() -> Non
     both = [Lane(np.arange(len(true)), True), Lane(np.arange(3, -1, -1), False)]
     start = np.stack([true[0], true[3]])
     run = run_lanes(made, both, start, np.arange(2), len(true))
+    light = run_lanes(made, both, start, np.arange(2), len(true), smoothed=False)
+    assert (light.state == run.state).all() and not len(light.covariance)
+    assert (light.log_likelihood == run.log_likelihood).all()
     for number, lane in enumerate(both):
         alone = run_lanes(made, [lane], start[number : number + 1], ONE, len(lane.keyframe))
         count = len(lane.keyframe)
