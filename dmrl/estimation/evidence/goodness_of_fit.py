@@ -64,18 +64,22 @@ class SignalScores:
     score: Array
     covariance: Array
 
-    def chi_square(self, part: slice) -> tuple[float, int]:
-        """Return the statistic of some windows, and its degrees of freedom."""
-        score = self.score[part].ravel()
-        energy, axes = np.linalg.eigh(self.covariance[part][:, :, part].reshape(len(score), -1))
+    def chi_squares(self, span: int) -> tuple[Array, NDArray[np.intp]]:
+        """Return the statistics of every span of windows, and their degrees of freedom."""
+        at = np.arange(len(self.score) - span + 1)[:, None] + np.arange(span)
+        score = self.score[at].reshape(len(at), -1, 1)
+        block = self.covariance.swapaxes(1, 2)[at[:, :, None], at[:, None, :]]
+        block = block.swapaxes(2, 3).reshape(len(at), score.shape[1], -1)
+        energy, axes = np.linalg.eigh(block)
         known = energy > MIN_OPEN_SHARE
-        return float(((axes.T @ score)[known] ** 2 / energy[known]).sum()), int(known.sum())
+        square = (axes.swapaxes(1, 2) @ score)[..., 0] ** 2 / np.where(known, energy, np.inf)
+        return np.asarray(square.sum(axis=1)), known.sum(axis=1)
 
     def to_innovation(self) -> Innovation:
         """Return the size of every window's scores."""
-        each = [self.chi_square(slice(k, k + 1)) for k in range(len(self.time_s))]
-        size = [np.sqrt(square / freedom) if freedom else np.nan for square, freedom in each]
-        return Innovation(self.signal, self.time_s, np.array(size), self.robot)
+        square, freedom = self.chi_squares(1)
+        size = np.sqrt(square / np.where(freedom, freedom, np.nan))
+        return Innovation(self.signal, self.time_s, size, self.robot)
 
 
 def check_fit(
@@ -221,17 +225,17 @@ def _test_signal(one: SignalScores, limit: float) -> Iterator[tuple[Cause, float
     """Yield the stretches whose scores are less likely than a limit, and their probabilities."""
     least = np.ones(len(one.time_s))
     for span in (span for span in SPANS if span <= len(least)):
-        for first in range(len(least) - span + 1):
-            part = slice(first, first + span)
-            square, freedom = one.chi_square(part)
-            if freedom:
-                least[part] = np.minimum(least[part], chdtrc(freedom, square))
+        square, freedom = one.chi_squares(span)
+        chance = np.where(freedom, chdtrc(freedom, square), 1.0)
+        for first in range(span):
+            part = slice(first, first + len(chance))
+            least[part] = np.minimum(least[part], chance)
     half = WINDOW_S / 2
     for first, last in find_runs(least < limit):
         ends = float(one.time_s[first]) - half, float(one.time_s[last - 1]) + half
-        chance = float(least[first:last].min())
-        probability = 1.0 - chance * FALSE_ALARM / limit
-        yield Cause(f"{one.signal} {MISFIT}", probability, *ends, one.robot), chance
+        smallest = float(least[first:last].min())
+        probability = 1.0 - smallest * FALSE_ALARM / limit
+        yield Cause(f"{one.signal} {MISFIT}", probability, *ends, one.robot), smallest
 
 
 def _select_leading(

@@ -82,7 +82,7 @@ def test_a_statistic_is_the_fall_of_the_cost_if_the_error_were_estimated() -> No
     wider = Solver(replace(problem, table=with_rows(problem.table, freed)))
     again = convert_values(found.values, solver.layout, wider.layout)
     fall = found.cost - wider.solve(again, tolerance=1e-12).cost
-    statistic, freedom = scores.chi_square(slice(window, window + 1))
+    statistic, freedom = (each[window] for each in scores.chi_squares(1))
     assert freedom == 1
     assert statistic == pytest.approx(2 * fall, rel=0.05)
 
@@ -115,8 +115,10 @@ def test_the_covariance_lacks_what_all_unknowns_explain() -> None:
 def test_directions_that_the_unknowns_explain_are_not_tested() -> None:
     covariance = np.diag([1.0, 0.25, 0.0]).reshape(3, 1, 3, 1)
     one = SignalScores("flow", 0, np.arange(3.0), np.array([[2.0], [1.0], [5.0]]), covariance)
-    assert one.chi_square(slice(0, 2)) == (pytest.approx(4 + 4), 2)
-    assert one.chi_square(slice(2, 3)) == (0.0, 0)
+    square, freedom = one.chi_squares(2)
+    assert (square[0], freedom[0]) == (pytest.approx(4 + 4), 2)
+    square, freedom = one.chi_squares(1)
+    assert (square[2], freedom[2]) == (0.0, 0)
     assert np.isnan(one.to_innovation().size[2])
 
 
