@@ -6,7 +6,7 @@ import numpy as np
 
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.keyframes import average_ranges
-from dmrl.estimation.solver.levenberg_marquardt import ROUGH_TOLERANCE, MapEstimate, Solver
+from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, Solver
 from dmrl.estimation.solver.problem import NoiseModel, Problem
 from dmrl.estimation.solver.residuals import Values, range_factor
 
@@ -19,6 +19,8 @@ GRADE_STD = 0.4
 GRADE_BIAS = 1.2
 """Ratio of the true grade to the likeliest one, on 30 simulated flights of three noise presets: the
 solution takes a part of the noise for motion."""
+GRADE_TOLERANCE = 5e-4
+"""Relative change of the cost that ends a solve: half of what counts below, at a cost of 4,000."""
 EVIDENCE_SCALE = 4.0
 """Difference of the log evidence that counts as one. Evidence contains the approximations of the
 losses, as the costs of modes do."""
@@ -53,7 +55,7 @@ def _search_grade(problem: Problem, start: Values) -> tuple[float, MapEstimate]:
 
     def evaluate(number: int, values: Values) -> float:
         solver = Solver(replace(problem, noise=_graded(problem, GRADES[number])))
-        solution, evidence = solver.solve_with_evidence(values, ROUGH_TOLERANCE)
+        solution, evidence = solver.solve_with_evidence(values, GRADE_TOLERANCE)
         found[number] = evidence, solution
         return evidence
 

@@ -145,17 +145,41 @@ class RangeLink:
     offset_guess_m: Array
     sent: Array
 
+    def list_sights(
+        self, distance: Array, offset: Array, here: Array, there: Array
+    ) -> "dict[float, Sight]":
+        """Return what either robot sees at the ranges, by the sides 1 and -1 of the robots.
+
+        Parameters
+        ----------
+        distance, offset
+            (R,) and (R, 2) from the first robot to the second, metres.
+        here, there
+            (R,) headings of both, radians.
+        """
+        return {
+            1.0: Sight(distance, offset, here, self.sent),
+            -1.0: Sight(distance, -offset, there, 1 - self.sent),
+        }
+
 
 class Sight(NamedTuple):
     """Direction and bearing at R ranges, for the owner of an unknown.
 
-    ``distance`` (R,) true distances, metres; ``bearing`` (R,) of the other robot in the owner's
-    frame, radians; ``sent`` (R,) share of each range that the owner measured.
+    ``distance`` (R,) true distances, metres; ``offset`` (R, 2) of the other robot in the flight's
+    frame, metres; ``heading`` (R,) of the owner, radians; ``sent`` (R,) share of each range that
+    the owner measured.
     """
 
     distance: Array
-    bearing: Array
+    offset: Array
+    heading: Array
     sent: Array
+
+    @property
+    def bearing(self) -> Array:
+        """(R,) bearing of the other robot in the owner's frame, radians."""
+        return np.asarray(np.arctan2(self.offset[:, 1], self.offset[:, 0]) - self.heading)
 
 
 @dataclass(frozen=True, slots=True)
