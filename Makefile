@@ -21,7 +21,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help int8 bench bench-labels reliability demo test test-heavy test-all test-lerobot test-faults mutants golden check format lint types imports spell schemas constraints docs pictures site examples wheels layout clean
+.PHONY: help int8 bench bench-scale bench-labels reliability demo test test-heavy test-all test-lerobot test-faults mutants golden check format lint types imports spell schemas constraints docs pictures site examples wheels layout clean
 
 help: ## Show this list.
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -41,6 +41,13 @@ test-all: $(VENV)/.dev ## Run every test, those too that take minutes.
 bench: $(VENV)/.dev ## Time dmrl beside others, on flights it makes: build/bench/. ARGS="--only predict".
 	$(BIN)/pip install --quiet --group bench
 	$(BIN)/python benchmarks/bench_all.py build/bench $(ARGS)
+
+bench-scale: $(VENV)/.dev ## Time long recordings and thousands of them, for an hour or more: build/bench/.
+	@mkdir -p build/bench
+	$(BIN)/python benchmarks/bench_columns.py --messages 10000000
+	$(BIN)/python benchmarks/bench_items.py
+	$(BIN)/python benchmarks/bench_many.py
+	$(BIN)/python benchmarks/bench_growth.py --seconds 10 --times 1 10 100 --json build/bench/scale.json --plot build/bench/growth.png
 
 bench-labels: $(VENV)/.dev ## Judge labels, sound and with faults: build/judge/. ARGS="--sets sound --flights 2".
 	$(BIN)/python benchmarks/bench_label_judge.py build/judge $(ARGS)

@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 HERE = Path(__file__).parent
 WORK: Mapping[str, tuple[str, ...]] = {
     "recording": ("bench_recording.py", "--json"),
+    "columns": ("bench_columns.py",),
     "predict": ("bench_predict.py", "--json"),
     "commands": ("bench_commands.py", "--json"),
     "growth": ("bench_growth.py", "--json"),

@@ -32,7 +32,7 @@ class DepthwiseConv(nn.Conv2d):
     def forward(self, x: Tensor) -> Tensor:
         """Return (N, C, H / stride, W / stride) for an input (N, C, H, W)."""
         stride, dilation = self.stride[0], self.dilation[0]
-        odd = x.shape[2] % stride or x.shape[3] % stride or (stride > 1 and dilation > 1)
+        odd = x.shape[2] % stride or x.shape[3] % stride
         slow = self.training or dilation > FAST_DILATION
         if not slow or x.device.type != "cpu" or odd:
             return super().forward(x)
@@ -46,30 +46,34 @@ class DepthwiseConv(nn.Conv2d):
 class _DepthwiseFunction(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, stride: int, dilation: int) -> Tensor:
-        ctx.shape, ctx.stride, ctx.dilation = x.shape, stride, dilation
-        x = _split_into_grids(x, dilation)
         ctx.save_for_backward(x, weight)
-        return _join_grids(_convolve(x, weight, stride), dilation, ctx.shape)
+        ctx.stride, ctx.dilation = stride, dilation
+        return _convolve(x, weight, stride, dilation)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
         x, weight = ctx.saved_tensors
         stride, dilation = ctx.stride, ctx.dilation
         grad = grad.contiguous(memory_format=torch.channels_last)
-        grad = spread = _split_into_grids(grad, dilation)
+        spread = grad
         if stride > 1:
             spread = torch.zeros_like(x, memory_format=torch.channels_last)
             spread[:, :, ::stride, ::stride] = grad
-        of_x = _join_grids(_convolve(spread, weight.flip(2, 3)), dilation, ctx.shape)
+        of_x = _convolve(spread, weight.flip(2, 3), 1, dilation)
+        if dilation > 1 and stride == 1:
+            x, grad, dilation = _split_into_grids(x, dilation), _split_into_grids(grad, dilation), 1
         of_weight = torch.ops.aten.convolution_backward(
-            *(grad, x, weight, [0], [stride, stride], [1, 1], [1, 1]),
+            *(grad, x, weight, [0], [stride, stride], [dilation, dilation], [dilation, dilation]),
             *(False, [0, 0], len(weight), [False, True, False]),
         )[1]
         return of_x, of_weight, None, None
 
 
-def _convolve(x: Tensor, weight: Tensor, stride: int = 1) -> Tensor:
-    return conv2d(x, weight, None, stride, 1, 1, len(weight))
+def _convolve(x: Tensor, weight: Tensor, stride: int, dilation: int) -> Tensor:
+    if stride > 1 or dilation <= FAST_DILATION:
+        return conv2d(x, weight, None, stride, dilation, dilation, len(weight))
+    out = conv2d(_split_into_grids(x, dilation), weight, None, 1, 1, 1, len(weight))
+    return _join_grids(out, dilation, x.shape)
 
 
 def _split_into_grids(x: Tensor, apart: int) -> Tensor:
@@ -77,8 +81,6 @@ def _split_into_grids(x: Tensor, apart: int) -> Tensor:
 
     Zeros pad the end of each grid.
     """
-    if apart == 1:
-        return x
     images, channels, height, width = x.shape
     rows, cols = -(-height // apart), -(-width // apart)
     x = pad(x, (0, cols * apart - width, 0, rows * apart - height)).permute(0, 2, 3, 1)
@@ -88,8 +90,6 @@ def _split_into_grids(x: Tensor, apart: int) -> Tensor:
 
 def _join_grids(x: Tensor, apart: int, shape: torch.Size) -> Tensor:
     """Join grids to (N, C, H, W) images of a shape, as `_split_into_grids` split them."""
-    if apart == 1:
-        return x
     images, channels, height, width = shape
     rows, cols = x.shape[2:]
     x = x.permute(0, 2, 3, 1).reshape(images, apart, apart, rows, cols, channels)

@@ -61,7 +61,7 @@ def _forward(network: Network, pixels: Tensor, settings: TrainConfig) -> Tensor:
 
 
 def computes_bfloat16(device: torch.device) -> bool:
-    """Return whether a device computes in bfloat16. CPUs that emulate it take 20 times as long."""
+    """Return whether a device computes in bfloat16. CPUs without it take ten times as long."""
     if device.type != "cpu":
         return True
     mkldnn = torch.backends.mkldnn
