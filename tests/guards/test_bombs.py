@@ -13,6 +13,7 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import lz4.frame
@@ -30,6 +31,8 @@ pytestmark = pytest.mark.slow
 SPARE_KB, FILE_TIMES, WAIT_S = 600_000, 10, 120
 HUGE = 1 << 40
 Make = Callable[[Inputs, Path], None]
+Content = Callable[[], bytes]
+"""Makes what a test needs when it runs: every run of pytest imports this file."""
 
 
 def png(width: int, height: int, bits: int = 8) -> bytes:
@@ -46,10 +49,11 @@ def png(width: int, height: int, bits: int = 8) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
-def with_image(data: bytes, count: int = 1) -> Make:
+def with_image(content: Content, count: int = 1) -> Make:
     """A recording of one image, again and again."""
 
     def make(_: Inputs, path: Path) -> None:
+        data = content()
         with RecordingWriter(path, Provenance("test")) as sink:
             for k in range(count):
                 message = message_class("CompressedImage")(data=data, format="png")
@@ -58,26 +62,30 @@ def with_image(data: bytes, count: int = 1) -> Make:
     return make
 
 
-def picture(data: bytes) -> Make:
+def picture(content: Content) -> Make:
     """A folder of one picture."""
 
     def make(_: Inputs, path: Path) -> None:
         path.mkdir()
-        (path / "a.png").write_bytes(data)
+        (path / "a.png").write_bytes(content())
 
     return make
 
 
-def text(data: str | bytes) -> Make:
+def text(data: str | Content) -> Make:
     """A file of these characters."""
-    content = data.encode() if isinstance(data, str) else data
-    return lambda _, path: path.write_bytes(content) and None
+    content = data.encode if isinstance(data, str) else data
+    return lambda _, path: path.write_bytes(content()) and None
 
 
 def chunk_bomb(kind: str) -> Make:
     """A recording of one chunk that decompresses to gigabytes."""
-    data = zeros(6 << 30) if kind == "zstd" else lz4.frame.compress(bytes(1 << 30))
-    return lambda _, path: recording(path, chunk(data, 1000, kind)) and None
+
+    def make(_: Inputs, path: Path) -> None:
+        data = zeros(6 << 30) if kind == "zstd" else lz4.frame.compress(bytes(1 << 30))
+        recording(path, chunk(data, 1000, kind))
+
+    return make
 
 
 def int8(size: int) -> Make:
@@ -175,25 +183,25 @@ BOMBS: dict[str, tuple[str, str, str, Make]] = {
         "any",
         "predict {model} {bomb} {out}.mcap --backend torch",
         "predict {model} {dots} {out}.mcap --backend torch",
-        with_image(png(3840, 2160), 4),
+        with_image(partial(png, 3840, 2160), 4),
     ),
     "image of 13,000 px": (
         "one",
         "predict {model} {bomb} {out}.mcap --backend torch",
         "predict {model} {dots} {out}.mcap --backend torch",
-        with_image(png(13_000, 13_000)),
+        with_image(partial(png, 13_000, 13_000)),
     ),
     "picture of 13,000 px": (
         "one",
         "convert {bomb} {out}.mcap",
         "convert {pictures} {out}.mcap",
-        picture(png(13_000, 13_000)),
+        picture(partial(png, 13_000, 13_000)),
     ),
     "picture of 16 bits": (
         "any",
         "convert {bomb} {out}.mcap",
         "convert {pictures} {out}.mcap",
-        picture(png(7_900, 7_900, 16)),
+        picture(partial(png, 7_900, 7_900, 16)),
     ),
     "arrays": ("one", "verify {bomb}", "doctor", int8(4 << 30)),
     **{
@@ -224,7 +232,7 @@ BOMBS: dict[str, tuple[str, str, str, Make]] = {
         "one",
         "convert {bomb} {out}.mcap",
         "info {dots}",
-        text(b"t_s," + b"1," * 5_000_000),
+        text(lambda: b"t_s," + b"1," * 5_000_000),
     ),
     "query": (
         "one",
@@ -236,7 +244,7 @@ BOMBS: dict[str, tuple[str, str, str, Make]] = {
         "one",
         "convert {bomb} {out}.mcap",
         "info {dots}",
-        text(b"#ROSBAG V2.0\n" + bz2.compress(bytes(1 << 28))),
+        text(lambda: b"#ROSBAG V2.0\n" + bz2.compress(bytes(1 << 28))),
     ),
 }
 SUFFIXES = {"chunk": ".mcap", "blank": ".mcap", "image": ".mcap", "HDF5": ".h5", "bag": ".bag"}
