@@ -140,9 +140,13 @@ def try_model(base: Member, candidate: Candidate, others: Others = tuple) -> lis
 def score_steps(base: Member, candidates: Sequence[Candidate]) -> dict[Candidate, float]:
     """Return the gain of each model by one Gauss-Newton step, in log odds.
 
-    A stretch of noise has no such step, so it is always tried.
+    A stretch of noise has no such step, so it is always tried. All are, where the step is singular.
     """
-    gains = _score_unknowns(base, [one for one in candidates if one.model.rows])
+    unknowns = [one for one in candidates if one.model.rows]
+    try:
+        gains = _score_unknowns(base, unknowns)
+    except np.linalg.LinAlgError:
+        gains = dict.fromkeys(unknowns, np.inf)
     for one in candidates:
         if one.model.for_a_while:
             gains[one] = np.inf
