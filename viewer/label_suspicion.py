@@ -37,7 +37,7 @@ log depth. A tenth of them is the least."""
 
 
 class _Image(NamedTuple):
-    """An image: L labels inside it and D detections; what lies between the two is (L, D)."""
+    """An image with L labels inside it and D detections; distances and gaps are (L, D)."""
 
     label_facts: Array
     found_facts: Array
@@ -79,7 +79,7 @@ def score_suspicion(
 def _compare(
     labels: Sequence[Fields], found: Sequence[Fields], size_px: tuple[float, float]
 ) -> _Image:
-    """Return what lies between the labels and the detections of an image."""
+    """Return the facts of labels and detections of an image, and the distances between them."""
     place, seen = _columns(labels, "u_px", "v_px"), _columns(found, "u_px", "v_px")
     inside = ((place >= 0) & (place < size_px)).all(axis=1)
     depth, seen_depth = _log_depths(labels)[inside], _log_depths(found)

@@ -86,7 +86,7 @@ def _named_in_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _open_table(path: Path) -> Iterator[pa.Table]:
-    """Open a shard. In the block, what is read of a mapped file is read from disk alone.
+    """Open a shard. In the block, only the pages in use are read from disk.
 
     Arrow's own maps, and the system's readahead, would read most images from disk: as much as a
     pass of training, and more than memory holds.

@@ -68,8 +68,8 @@ def compare_models(
 ) -> dict[str, Any]:
     """Compare the detections of two models on the same images, as JSON values.
 
-    A bootstrap sample draws the same images for both, so the interval of a difference leaves out
-    what is hard or easy for both.
+    A bootstrap sample draws the same images for both, so images that are hard or easy for both do
+    not widen the interval of a difference.
 
     Parameters
     ----------

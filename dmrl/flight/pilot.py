@@ -1,4 +1,4 @@
-"""What a pilot is: it gets what a drone has, and answers with a command.
+"""Base class of pilots, which map the sensor readings of a drone to a command.
 
 A pilot of another package is a subclass of `Pilot` with an entry point in the group
 ``dmrl.pilots``. All vectors are in the robot's own horizontal frame: x forward, y left, z up.

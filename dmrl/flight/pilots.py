@@ -1,7 +1,7 @@
 """Pilots that ship with dmrl: follow, keep apart, formation.
 
 The first and the last know their leader by one Kalman filter, `OnboardFilter`, which is also
-exported as C. It forgives what a small network misses: the less certain the leader's place, the
+exported as C. It bridges the misses of a small network: the less certain the leader's place, the
 slower a robot flies; when the leader is gone, it stops and turns to where the leader was heading.
 """
 

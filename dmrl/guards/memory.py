@@ -65,9 +65,9 @@ def return_large_blocks() -> None:
 def keep_freed_memory(most_bytes: int) -> None:
     """Let the C library keep up to so many bytes that are freed from now on.
 
-    What was freed before goes back to the system. Otherwise the library returns large arrays, and
-    each new one faults in its pages again: a third of the time of linear algebra on arrays of
-    megabytes, 4 to 8 % of a training step.
+    Memory that was freed before goes back to the system. Otherwise the library returns large
+    arrays, and each new one faults in its pages again: a third of the time of linear algebra on
+    arrays of megabytes, 4 to 8 % of a training step.
     """
     return_freed_memory()
     _set_allocator(M_TRIM_THRESHOLD, most_bytes)

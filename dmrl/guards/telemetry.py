@@ -27,7 +27,7 @@ def disable_telemetry() -> None:
 
 @contextmanager
 def hide_module(name: str) -> Iterator[None]:
-    """Make an optional package look absent to what is imported in the block."""
+    """Make an optional package look absent to modules that are imported in the block."""
     if name in sys.modules:
         yield
         return

@@ -156,7 +156,7 @@ def read_topics(source: Path, wanted: Iterable[str]) -> Iterator[RawMessage]:
 
 
 def parse(raw: RawMessage, source: Path) -> Any:
-    """Return a protobuf message, the value of a JSON one, or None for what is neither."""
+    """Return a protobuf or ROS message or the value of a JSON one; None if it cannot be decoded."""
     try:
         if raw.channel.encoding == "json":
             return parse_json(raw.data)

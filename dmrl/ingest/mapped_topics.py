@@ -129,8 +129,8 @@ def _iter_objects(
 def _find_cell(value: Any, path: Sequence[str]) -> str:
     """Return the text of a field, of an item of a list, or of a part of it; empty: there is none.
 
-    A time of ROS or protobuf is a number of nanoseconds. What is no number is counted where cells
-    are parsed.
+    A time of ROS or protobuf is a number of nanoseconds. Cells that are not numbers are counted
+    when they are parsed.
     """
     for part in path:
         if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Read the records of a damaged recording one by one, and skip what is corrupt."""
+"""Read the records of a damaged recording one by one, and skip corrupt ones."""
 
 import struct
 from bisect import bisect_right

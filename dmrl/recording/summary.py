@@ -70,7 +70,7 @@ class Summary:
     definitions
         Schemas and channels.
     contradiction
-        What the recording's statistics state about times that its messages do not; empty if none.
+        How times in its statistics differ from those of its messages; empty if they agree.
     """
 
     topics: dict[str, TopicInfo]

@@ -1,7 +1,6 @@
 """Cut-outs: photographs of a robot, put over other images with exact labels and without Blender.
 
-The cut-out takes over what the image behind it has: mean light, colour cast and saturation, blur
-and grain.
+The cut-out takes over mean light, colour cast, saturation, blur and grain of the image behind it.
 """
 
 from collections.abc import Iterable, Iterator

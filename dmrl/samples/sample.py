@@ -52,8 +52,8 @@ def round_samples(samples: Iterable[Sample]) -> Iterator[Sample]:
 def round_values(value: Any) -> Any:
     """Round computed values, nested in any way, to `DECIMALS`.
 
-    Sines and exponentials differ in their last bits between processors; what is computed from
-    them has the same bytes after rounding, but for one value in some millions.
+    Sines and exponentials differ in their last bits between processors. Values computed
+    from them have the same bytes after rounding, but for one in some millions.
     """
     if isinstance(value, float):
         return round(value, DECIMALS) + 0.0  # no negative zero

@@ -128,7 +128,7 @@ def _count_findings(errors: int, warnings: int) -> str:
 
 
 def _describe_size(found: dict[str, Any]) -> str:
-    """Return the size of a recording, what was not decoded, and the number of its findings."""
+    """Return the size of a recording, its undecoded messages, and the number of its findings."""
     counts = _count_findings(_count(found, "error"), _count(found, "warning"))
     size = (
         f"{count_things(found['messages'], 'message')} on {count_things(found['topics'], 'topic')}"

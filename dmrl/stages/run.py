@@ -102,7 +102,7 @@ def _rebuild(source: Path, out: Path | None, data: Path | None, *, as_json: bool
 
 
 def _print_forecast(found: "list[Forecast]", *, as_json: bool) -> None:
-    """Print what a run would do, a row for each step."""
+    """Print the plan of a run, a row for each step."""
     if as_json:
         print_json({"steps": [asdict(one) for one in found]})
         return

@@ -1,6 +1,6 @@
 """Open a recording once for several reads, each with a position of its own, and hash it.
 
-What is read after a file was hashed must be the bytes that were hashed: a disk, a cable or a
+Bytes that are read after a file was hashed must be those that were hashed: a disk, a cable or a
 memory may flip a bit in one of two reads.
 """
 

@@ -1,4 +1,4 @@
-"""Count what a command leaves out, by reason.
+"""Count the things that a command leaves out, by reason.
 
 Readers call `leave_out` for each thing that they cannot use. The command that runs them opens a
 count: it prints one line for each reason, and the counts go into ``--json`` and the provenance.
@@ -69,7 +69,7 @@ def leave_out(reason: str, where: object, count: int = 1) -> None:
 
 @contextmanager
 def count_left_out(*, strict: bool = False) -> Iterator[LeftOut]:
-    """Count what is left out in the block; print one line for each reason at its end."""
+    """Count the things left out in the block; print one line for each reason at its end."""
     held = LeftOut(strict)
     _open.append(held)
     try:

@@ -170,7 +170,7 @@ def _parse_box(
 
 
 def _add_attributes(row: LabelRow, annotation: Record) -> LabelRow:
-    """Return a label with what the attributes of its annotation add to the box."""
+    """Return a label with the attributes of its annotation in addition to the box."""
     told = annotation.get("attributes") or {}
 
     def number(name: str, default: float) -> float:

@@ -103,7 +103,7 @@ def _find_robots(text: TextTable, table: ColumnMap) -> list[str]:
 
 
 def _match(name: str, text: TextTable, placeholder: str) -> dict[str, str]:
-    """Return the columns whose name has this form, by what stands for the placeholder."""
+    """Return the columns whose name has this form, by the text in place of the placeholder."""
     form = re.escape(name).replace(re.escape(placeholder), "(.+)", 1)
     form = form.replace(re.escape(placeholder), r"\1")
     return {m[1]: column for column in text.columns if (m := re.fullmatch(form, column))}

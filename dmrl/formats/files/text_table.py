@@ -65,7 +65,7 @@ class Dialect:
 class TextTable:
     """Rows of a text file: column names, line number of each row, and cells by column.
 
-    ``units`` holds what the header says about the unit of a column.
+    ``units`` holds the units that the header states, by column.
     """
 
     path: Path

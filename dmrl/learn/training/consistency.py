@@ -1,4 +1,4 @@
-"""Consistency of what a network sees in two images with the camera's own motion between them.
+"""Consistency of a network's output for two images with the camera's own motion between them.
 
 A loss without labels, after the state consistency of arXiv 2603.02936: the confidence and depth of
 an image are compared with those of another one, carried over by the odometry of the robot. A peer

@@ -1,4 +1,4 @@
-"""Keep what was read of the latest files in memory, as long as the files stay the same."""
+"""Cache the parsed parts of the latest files in memory, as long as the files stay the same."""
 
 import time
 from collections.abc import Callable

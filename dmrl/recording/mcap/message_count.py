@@ -43,7 +43,7 @@ class MessageCount:
     start_ns, end_ns
         First and last log time, nanoseconds; both 0 without messages.
     contradiction
-        What the Statistics record states otherwise; empty if it agrees.
+        How the Statistics record differs; empty if it agrees.
     spans_ns
         First and last log time by channel id; empty if only the Statistics record was read.
     """

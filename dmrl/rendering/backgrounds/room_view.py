@@ -182,8 +182,8 @@ class RoomView:
     def _iter_outlines(self, canvas: Canvas) -> Iterator[tuple[tuple[float, float], Outline]]:
         """Yield the visible polygons: item's and own distance, both negative, and outline.
 
-        All polygons with equal numbers of corners are projected together. What lies on the floor
-        and hangs on walls is in the order in which it was drawn.
+        All polygons with equal numbers of corners are projected together. Things
+        on the floor and on walls are in the order in which they were drawn.
         """
         for corner_count in {part.corners.shape[1] for part in self._polygons}:
             parts = [
