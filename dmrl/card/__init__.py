@@ -32,7 +32,7 @@ def write_card(
     folder: Path,
     *,
     title: str | None = None,
-    license_id: str | None = None,
+    license: str | None = None,
     published: str | None = None,
     into: Path | None = None,
 ) -> Path:
@@ -42,7 +42,7 @@ def write_card(
     ----------
     folder
         A dataset.
-    title, license_id, published
+    title, license, published
         None: those of the old card, or of the dataset's settings.
     into
         Another folder for the card. None: the dataset's own, where it replaces the old card.
@@ -54,8 +54,8 @@ def write_card(
     SettingError
         If the licence is unknown.
     """
-    if license_id is not None:
-        check_license(license_id)
+    if license is not None:
+        check_license(license)
     dataset = open_dataset(folder)
     about = describe_dataset(dataset, read_provenance_file(folder))
     made, old, readme = about["made"], folder / "README.md", (into or folder) / "README.md"
@@ -64,7 +64,7 @@ def write_card(
     before = read_front_matter(old)
     about["title"] = title or _choose_title(before.get("pretty_name"), about)
     about["license_id"] = str(
-        license_id or before.get("license") or made.settings.get("license", "unknown")
+        license or before.get("license") or made.settings.get("license", "unknown")
     )
     about["published"] = published or read_publication_date(folder)
     about |= {"facts": facts} | (describe_facts(facts) if facts else {})

@@ -1,9 +1,9 @@
 """Build a dataset from recordings, or add to one: shards, manifest, facts and card."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from dmrl import recipe as recipes
 from dmrl.atomic_output import atomic_folder, extend_folder, register_output
@@ -43,7 +43,8 @@ MAX_HELD_IMAGES = 5_000
 twice, so that memory does not grow with the number of recordings."""
 
 
-class Written(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Written:
     """Images per split, label source per recording, and the images left out."""
 
     images: dict[str, int]

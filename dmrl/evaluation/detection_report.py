@@ -22,6 +22,7 @@ from dmrl.evaluation.figure_tables import (
     describe_source,
     finite_values,
 )
+from dmrl.evaluation.settings import Settings
 from dmrl.learn.inference.detection_metrics import (
     BandMetrics,
     ScoredDetections,
@@ -48,25 +49,12 @@ DEFAULT_THRESHOLD = 0.33
 
 
 @dataclass(frozen=True, slots=True)
-class DetectionCriteria:
-    """Labels, images and threshold of an evaluation; see ``dmrl.stages.evaluate.Settings``."""
-
-    against: str
-    split: str | None
-    partial: bool
-    threshold: float | None
-    false_alarms: float | None
-    draws: int
-    seed: int
-
-
-@dataclass(frozen=True, slots=True)
 class Evaluation:
     """Evaluated recordings.
 
     Parameters
     ----------
-    criteria
+    settings
         How they were evaluated.
     pairs
         Labels and detections.
@@ -80,7 +68,7 @@ class Evaluation:
         Differences of two recordings with the same images and labels, as JSON values; else None.
     """
 
-    criteria: DetectionCriteria
+    settings: Settings
     pairs: LabelledDetections
     scored: ScoredDetections
     bands: list[BandMetrics]
@@ -89,7 +77,7 @@ class Evaluation:
 
 
 def evaluate_detections(
-    recordings: Sequence[Path], criteria: DetectionCriteria, workers: int, spread: Spread
+    recordings: Sequence[Path], settings: Settings, workers: int, spread: Spread
 ) -> Evaluation:
     """Evaluate the detections of all recordings, image by image.
 
@@ -97,7 +85,7 @@ def evaluate_detections(
     ----------
     recordings
         With images, labels and detections.
-    criteria
+    settings
         Labels, images and threshold.
     workers, spread
         Most processes that draw the intervals, and the function that runs them.
@@ -109,24 +97,24 @@ def evaluate_detections(
     SettingError
         If one has no labels of that source, no such split, or no image to evaluate.
     """
-    parts = join_each(recordings, criteria.against, criteria.split, partial=criteria.partial)
+    parts = join_each(recordings, settings.against, settings.split, partial=settings.partial)
     pairs = concatenate_parts(parts)
     scored = _score(pairs)
-    threshold = _choose_threshold(scored, pairs, criteria)
-    if pairs.images * criteria.draws < MIN_PARALLEL_DRAWS:
+    threshold = _choose_threshold(scored, pairs, settings)
+    if pairs.images * settings.draws < MIN_PARALLEL_DRAWS:
         workers = 1
     bands = compute_band_metrics(
         scored,
         threshold=threshold,
-        draws=criteria.draws,
-        seed=criteria.seed,
+        draws=settings.draws,
+        seed=settings.seed,
         across=lambda function, items: spread(function, items, workers),
     )
     paired = None
     if len(parts) == 2 and (both := align_images(*parts)):
-        chosen = [_choose_threshold(_score(part), part, criteria) for part in both]
-        paired = compare_models(both, chosen, criteria.draws, criteria.seed)
-    return Evaluation(criteria, pairs, scored, bands, threshold, paired)
+        chosen = [_choose_threshold(_score(part), part, settings) for part in both]
+        paired = compare_models(both, chosen, settings.draws, settings.seed)
+    return Evaluation(settings, pairs, scored, bands, threshold, paired)
 
 
 def _score(pairs: LabelledDetections) -> ScoredDetections:
@@ -134,16 +122,16 @@ def _score(pairs: LabelledDetections) -> ScoredDetections:
 
 
 def _choose_threshold(
-    scored: ScoredDetections, pairs: LabelledDetections, criteria: DetectionCriteria
+    scored: ScoredDetections, pairs: LabelledDetections, settings: Settings
 ) -> float:
     """Return the given threshold, that of the rate of false alarms, or the detector's own."""
-    if criteria.false_alarms is None:
+    if settings.false_alarms is None:
         own = pairs.threshold or DEFAULT_THRESHOLD
-        return own if criteria.threshold is None else criteria.threshold
-    if criteria.threshold is not None:
+        return own if settings.threshold is None else settings.threshold
+    if settings.threshold is not None:
         raise SettingError("--threshold and --false-alarms cannot be combined. Pass one of them")
     empty = count_false_alarms(scored, 0.0).empty_images
-    chosen = select_threshold(scored, criteria.false_alarms)
+    chosen = select_threshold(scored, settings.false_alarms)
     if chosen is None or empty < MIN_EMPTY_IMAGES:
         raise SettingError(
             f"--false-alarms wants {MIN_LABELS} labels, some of them found, and {MIN_EMPTY_IMAGES} "
@@ -157,24 +145,24 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
 
     One recording is ``recording``, several are ``recordings``.
     """
-    criteria = evaluation.criteria
+    settings = evaluation.settings
     sources = [describe_source(path) for path in recordings]
     alarms = count_false_alarms(evaluation.scored, evaluation.threshold)
     overall, *bands = [band_to_json(band) for band in evaluation.bands]
     return {
         **({"recordings": sources} if len(sources) > 1 else {"recording": sources[0]}),
-        "against": criteria.against,
-        "split": criteria.split,
+        "against": settings.against,
+        "split": settings.split,
         "threshold": evaluation.threshold,
         "images": evaluation.pairs.images,
         "labels": len(evaluation.pairs.labels),
         "detections": len(evaluation.pairs.detections),
-        "partial": criteria.partial,
+        "partial": settings.partial,
         "images_without_detections": evaluation.pairs.unseen,
         "left_out": evaluation.pairs.left_out,
         **finite_values(asdict(alarms)),
         "rates": measure_rates(evaluation.scored),
-        "bootstrap": {"draws": criteria.draws, "seed": criteria.seed},
+        "bootstrap": {"draws": settings.draws, "seed": settings.seed},
         "overall": overall,
         "bands": bands,
         "curves": curves_to_json(evaluation.scored),
@@ -185,12 +173,12 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
 
 def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None:
     """Print the figures, one column per band that holds labels."""
-    criteria = evaluation.criteria
+    settings = evaluation.settings
     headers, rows = build_band_table([band_to_json(band) for band in evaluation.bands])
-    split = f", split {criteria.split}" if criteria.split else ""
+    split = f", split {settings.split}" if settings.split else ""
     name = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
-    part = ", only those with detections" if criteria.partial else ""
-    title = f"{name}: {evaluation.pairs.images} images against {criteria.against}{split}{part}"
+    part = ", only those with detections" if settings.partial else ""
+    title = f"{name}: {evaluation.pairs.images} images against {settings.against}{split}{part}"
     pooled = is_pooled({"images": evaluation.pairs.images, "paired": evaluation.paired})
     if pooled:
         print_line(f"{title}, each by two models: below is their comparison, not their mean")

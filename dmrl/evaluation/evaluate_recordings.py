@@ -12,12 +12,12 @@ from dmrl.atomic_output import atomic_folder, refuse_existing
 from dmrl.errors import MissingExtra, SettingError
 from dmrl.evaluation import flights, positions, tracks
 from dmrl.evaluation.detection_report import (
-    DetectionCriteria,
     Evaluation,
     Spread,
     describe_evaluation,
     evaluate_detections,
 )
+from dmrl.evaluation.settings import Settings
 from dmrl.recording import read_summary
 from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_note, print_table
@@ -38,9 +38,7 @@ SETTLE_S, SHORT_FLIGHT_S = 20.0, 30.0
 def evaluate_recordings(
     recordings: Sequence[Path],
     out: Path | None,
-    what: str,
-    criteria: DetectionCriteria,
-    settle_s: float | None,
+    settings: Settings,
     workers: int,
     spread: Spread,
 ) -> Evaluation | Document:
@@ -52,12 +50,8 @@ def evaluate_recordings(
         With images, labels and detections; or one with true positions and tracks or estimates.
     out
         Folder to write plots and the figures to. None: nothing is written.
-    what
-        "auto", "detections", "flight", "positions" or "tracks".
-    criteria
-        Of detections.
-    settle_s
-        Errors of positions and tracks before it do not count, seconds.
+    settings
+        Kind of results, labels, images and threshold.
     workers, spread
         Most processes that draw the intervals, and the function that runs them.
 
@@ -74,21 +68,21 @@ def evaluate_recordings(
         refuse_existing(out)
         if figures is None:
             raise MissingExtra("matplotlib", "plot", "dmrl evaluate --plots")
-    what = what if what != "auto" else _choose_kind(recordings[0])
+    what = settings.what if settings.what != "auto" else _choose_kind(recordings[0])
     if what == "detections":
-        evaluation = evaluate_detections(recordings, criteria, workers, spread)
+        evaluation = evaluate_detections(recordings, settings, workers, spread)
         if out is not None:
             made = describe_evaluation(recordings, evaluation)
             with _write_folder(out, "evaluation", made) as folder:
                 assert figures is not None
                 scored, threshold = evaluation.scored, evaluation.threshold
-                figures.draw_figures(folder, evaluation.pairs, scored, criteria.against, threshold)
+                figures.draw_figures(folder, evaluation.pairs, scored, settings.against, threshold)
         return evaluation
     if len(recordings) > 1:
         raise SettingError(
             f"{what} are judged one recording at a time. Name one, or give --what detections"
         )
-    return _evaluate_against_truth(what, recordings[0], out, settle_s)
+    return _evaluate_against_truth(what, recordings[0], out, settings.settle_s)
 
 
 def _choose_kind(recording: Path) -> str:

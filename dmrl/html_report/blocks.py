@@ -7,18 +7,17 @@ import re
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from html import escape
 from pathlib import Path
 from typing import Any, ClassVar
 
-import jinja2
 from markupsafe import Markup
 
-from dmrl.errors import DmrlError, to_one_line
+from dmrl.errors import DmrlError
 from dmrl.guards import limits
 from dmrl.guards.templates import open_templates
 from dmrl.images.codec import crop_and_scale, decode, encode_jpeg
+from dmrl.terminal.tables import to_cell_text
 
 REPORT_MARK = "<!-- written by dmrl report -->"
 """Comment in every report: a file with it may be replaced."""
@@ -65,7 +64,7 @@ class Table:
     @property
     def cells(self) -> list[list[str]]:
         """Texts of the cells."""
-        return [[_join_interval(to_line(cell)) for cell in row] for row in self.rows]
+        return [[_join_interval(to_cell_text(cell)) for cell in row] for row in self.rows]
 
     @property
     def kinds(self) -> list[str]:
@@ -101,13 +100,6 @@ Block = Heading | Text | Table | Row
 Documents = Mapping[str, Mapping[str, Any]]
 
 
-def to_line(value: object) -> str:
-    """Convert any value to one line of text."""
-    if value is None:
-        return ""
-    return f"{value:.4g}" if isinstance(value, float) else to_one_line(str(value))
-
-
 def _join_interval(text: str) -> str:
     """Return a text whose interval in brackets breaks before it, not inside."""
     return re.sub(r"\[[^\]]*\]", lambda found: found[0].replace(" ", "\u00a0"), text)
@@ -115,19 +107,17 @@ def _join_interval(text: str) -> str:
 
 def _escape_line(value: object) -> Markup:
     """Escape one line of text, also for an attribute in double quotes."""
-    return Markup(escape(to_line(value), quote=False).replace('"', "&quot;"))
+    return Markup(escape(to_cell_text(value), quote=False).replace('"', "&quot;"))
 
 
 def fill_template(template: str, **values: object) -> str:
     """Fill in a template of ``templates/``, which escapes all texts."""
-    return _environment().get_template(template).render(values)
+    return _TEMPLATES.get_template(template).render(values)
 
 
-@cache
-def _environment() -> jinja2.Environment:
-    environment = open_templates(Path(__file__).parent / "templates", autoescape=True)
-    environment.filters["line"] = _escape_line
-    return environment
+_TEMPLATES = open_templates(
+    Path(__file__).parent / "templates", {"line": _escape_line}, autoescape=True
+)
 
 
 def build_page(title: str, lead: str, sections: Iterable[tuple[str, Sequence[Block]]]) -> str:

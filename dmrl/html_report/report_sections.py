@@ -17,7 +17,12 @@ from dmrl import __version__
 from dmrl.datasets import open_dataset
 from dmrl.errors import DmrlError
 from dmrl.evaluation import comparison, flights, positions, tracks
-from dmrl.evaluation.figure_tables import build_band_table, format_interval
+from dmrl.evaluation.figure_tables import (
+    build_band_table,
+    format_interval,
+    format_values,
+    metric_columns,
+)
 from dmrl.html_report.blocks import (
     Block,
     Figure,
@@ -41,16 +46,10 @@ CARD_FIGURES = ("samples.jpg", "position.png", "depth.png", "peers.png")
 """Images that `dmrl card` draws."""
 MAX_SHOWN = 12
 """Evaluations, models or pairs that are drawn, at most; tables list all."""
-METRICS = {
-    "median_px": ("median, px", ".1f"),
-    "within_8_px": ("within 8 px", ".1%"),
-    "within_20_px": ("within 20 px", ".1%"),
-    "depth_mae_m": ("depth MAE, m", ".3f"),
-    "precision": ("precision", ".1%"),
-    "recall": ("recall", ".1%"),
-    "f1": ("F1", ".3f"),
-    "ap_16_px": ("AP at 16 px", ".3f"),
-}
+METRICS = metric_columns(
+    *("median_px", "within_8_px", "within_20_px", "depth_mae_m", "precision", "recall", "f1"),
+    "ap_16_px",
+)
 EVALUATION_IMAGES = {
     "examples.png": "images, confidence and depth at the threshold: hits, misses and false "
     "detections, two of each if there are any",
@@ -108,7 +107,7 @@ def _detections_section(found: ReportInputs, pictures: ImageEmbedder) -> list[Bl
         return []
     # The pooled figures of a comparison are of no model; its section has those of both.
     judged = {name: said for name, said in every.items() if not comparison.is_pooled(said)}
-    heads = ("evaluation", "against", "images", *(words for words, _ in METRICS.values()))
+    heads = ("evaluation", "against", "images", *(words for _, words, _ in METRICS))
     rows = extract_valid(
         judged, lambda said: [said["against"], said["images"], *_metric_cells(said["overall"])]
     )
@@ -123,7 +122,7 @@ def _detections_section(found: ReportInputs, pictures: ImageEmbedder) -> list[Bl
 
 
 def _metric_cells(overall: Mapping[str, Any]) -> list[str]:
-    return [format_interval(overall[name], form) for name, (_, form) in METRICS.items()]
+    return [format_interval(overall[name], form) for name, _, form in METRICS]
 
 
 def _iter_detection_charts(few: Mapping[str, Any]) -> Iterable[Figure]:
@@ -256,18 +255,13 @@ def _loss_history(said: Any) -> list[float]:
 
 def _int8_section(found: ReportInputs, pictures: ImageEmbedder) -> list[Block]:
     def show(name: str, said: Mapping[str, Any]) -> list[Block]:
-        rows = [
-            [kind, *(format(float(figures[key]), form) for key, (_, form) in METRICS.items())]
-            for kind, figures in said["accuracy"].items()
-        ]
+        accuracy = said["accuracy"].items()
+        rows = [[kind, *format_values(figures, METRICS)] for kind, figures in accuracy]
         path = found.folder / name / "maps.png"
         maps = pictures.embed_if_present(path, "images and maps, float, int8", full=True)
-        table = Table(("", *(words for words, _ in METRICS.values())), rows)
-        return [
-            Text(f"{said['images']} images of split {said['split']}"),
-            table,
-            *build_row([maps]),
-        ]
+        table = Table(("", *(words for _, words, _ in METRICS)), rows)
+        head = Text(f"{said['images']} images of split {said['split']}")
+        return [head, table, *build_row([maps])]
 
     return show_documents(found.documents_of_kind("int8"), show)
 

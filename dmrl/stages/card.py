@@ -1,6 +1,6 @@
 """``dmrl card``: write the card of a dataset again, or compare the dataset with an older one."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,15 +72,10 @@ def run(
 
         return compare_datasets(dataset, since)
     _check_date(settings.published)
-    words: dict[str, Any] = {
-        "title": settings.title,
-        "license_id": settings.license,
-        "published": settings.published,
-    }
     if out is None:
-        return write_card(dataset, **words)
+        return write_card(dataset, **asdict(settings))
     with atomic_folder(out) as folder:
-        card = write_card(dataset, into=folder, **words)
+        card = write_card(dataset, **asdict(settings), into=folder)
     return out / card.name
 
 

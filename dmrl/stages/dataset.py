@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,21 +17,12 @@ from dmrl.terminal.left_out import count_left_out
 from dmrl.terminal.tables import print_json, print_line, print_table
 
 if TYPE_CHECKING:
-    from dmrl.datasets.writing.rows import ExclusionCounts
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """Images per split, label source per recording, and the images left out."""
-
-    images: dict[str, int]
-    sources: dict[str, str]
-    tally: "ExclusionCounts"
+    from dmrl.card.dataset_build import Written
 
 
 def run(
     recordings: Sequence[Path], out: Path, settings: Settings, *, workers: int | None = None
-) -> Result:
+) -> "Written":
     """Write a dataset to ``out``.
 
     Parameters
@@ -58,12 +48,12 @@ def run(
     """
     from dmrl.card.dataset_build import build_dataset
 
-    return Result(*build_dataset(recordings, out, settings, workers or count_cores()))
+    return build_dataset(recordings, out, settings, workers or count_cores())
 
 
 def add(
     recordings: Sequence[Path], out: Path, settings: Settings, *, workers: int | None = None
-) -> Result:
+) -> "Written":
     """Add recordings to the dataset ``out``.
 
     Of its files only the manifest is written again, and those that are made of it: the card, the
@@ -92,7 +82,7 @@ def add(
     from dmrl.card.dataset_build import extend_dataset
 
     given = find_changed_settings(settings).keys()
-    return Result(*extend_dataset(recordings, out, settings, given, workers or count_cores()))
+    return extend_dataset(recordings, out, settings, given, workers or count_cores())
 
 
 DEFAULTS = Settings()
@@ -136,15 +126,15 @@ def command(
     if into and on is not None:
         raise SettingError("--add is done here. Leave out --on")
     named = find_all_recordings(recordings, from_index)
-    result: Result | None = None
     if on is None:
         with count_left_out(strict=strict):
             result = (add if into else run)(named, out, settings, workers=workers)
     elif said := run_on_cluster(on, "dataset", out, {"recordings": named}, settings):
+        from dmrl.card.dataset_build import Written
         from dmrl.datasets.writing.rows import ExclusionCounts
 
-        result = Result(said["images"], said["sources"], ExclusionCounts(**said["tally"]))
-    if result is None:
+        result = Written(said["images"], said["sources"], ExclusionCounts(**said["tally"]))
+    else:
         print_line(f"{out} was there, made of the same by the same settings")
         return
     left_out = {why: count for why, count in result.tally.count_by_reason().items() if count}

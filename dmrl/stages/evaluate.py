@@ -1,66 +1,21 @@
 """``dmrl evaluate``: detections against labels; positions and tracks against the truth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
-from cyclopts import Parameter, validators
+from cyclopts import Parameter
 
+from dmrl.evaluation.settings import Settings
 from dmrl.guards.posix import count_cores
 from dmrl.pipeline.batch import find_all_recordings
 from dmrl.pipeline.parallel_map import parallel_map
 from dmrl.pipeline.single_run import run_on_cluster
-from dmrl.terminal.arguments import AsJson, Count, Flat, On, Share, Workers
+from dmrl.terminal.arguments import AsJson, Flat, On, Workers
 from dmrl.terminal.tables import print_json, print_line
 
 if TYPE_CHECKING:
     from dmrl.evaluation.detection_report import Evaluation
-
-Finite = Annotated[float | None, Parameter(validator=validators.Number(gte=0, lt=1e6))]
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Kind of results, labels, images and threshold of an evaluation.
-
-    Parameters
-    ----------
-    what
-        "auto": flight where a pilot flew a robot, tracks where there are any with true positions,
-        else detections, else estimated positions. flight: seconds held, contacts, silent stretches
-        and alarms over time.
-    against
-        Whose labels.
-    split
-        Only images of this split of the recording's source, such as test. Without it, all.
-    partial
-        Judge only images that have a Detections message. Without it, one without counts as an
-        image in which nothing was found.
-    threshold
-        Confidence from which a detection counts in precision, recall and F1, 0 to 1. Without
-        it, the one in the recording.
-    false_alarms
-        Choose the threshold on these images: that of the best F1 among those at which an image
-        without a robot has at most so many detections, on average, such as 0.05.
-    draws
-        Bootstrap samples behind the 95 % intervals.
-    seed
-        Of the bootstrap.
-    settle_s
-        positions, tracks: errors in the first seconds do not count, except for kept positions.
-        Without it, 20 s, or half of a flight under 30 s.
-    """
-
-    what: Literal["auto", "detections", "flight", "positions", "tracks"] = "auto"
-    against: Literal["truth", "estimate", "hand", "published"] = "truth"
-    split: str | None = None
-    partial: Annotated[bool, Parameter(negative=())] = False
-    threshold: Share | None = None
-    false_alarms: Finite = None
-    draws: Count = 1000
-    seed: int = 0
-    settle_s: Finite = None
 
 
 def run(
@@ -92,14 +47,9 @@ def run(
     OutputError
         If ``out`` exists.
     """
-    from dmrl.evaluation.detection_report import DetectionCriteria
     from dmrl.evaluation.evaluate_recordings import evaluate_recordings
 
-    criteria = DetectionCriteria(
-        **{one.name: getattr(settings, one.name) for one in fields(DetectionCriteria)}
-    )
-    what, settle_s = settings.what, settings.settle_s
-    return evaluate_recordings(recordings, out, what, criteria, settle_s, workers, parallel_map)
+    return evaluate_recordings(recordings, out, settings, workers, parallel_map)
 
 
 DEFAULTS = Settings()

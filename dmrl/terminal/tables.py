@@ -45,13 +45,14 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
         number = bool(cells) and all(isinstance(cell, int | float) for cell in cells)
         table.add_column(column, justify="right" if number else "left")
     for row in rows:
-        table.add_row(*[_cell_text(cell) for cell in row])
+        table.add_row(*[to_cell_text(cell) for cell in row])
     width = None if sys.stdout.isatty() else NOT_A_TERMINAL_COLUMNS
     # Markup and highlighting off: file names hold square brackets.
     Console(width=width, highlight=False, markup=False).print(table)
 
 
-def _cell_text(cell: object) -> str:
+def to_cell_text(cell: object) -> str:
+    """Return the text of a cell of a table, on one line; empty for None."""
     if cell is None:
         return ""
     return f"{cell:.4g}" if isinstance(cell, float) else to_one_line(str(cell))

@@ -56,7 +56,7 @@ def test_report_shows_outputs_and_loads_nothing_external(outputs: Path) -> None:
     assert "url(" not in re.sub(r"url\(#", "", html) and "@import" not in html
     assert "default-src 'none'" in html
     assert html.count("<svg") >= 6 and html.count("data:image/png") == 2
-    assert "0.5 [0.5,\u00a00.6]" in html  # breaks before the bracket only
+    assert "0.50 [0.45,\u00a00.55]" in html  # breaks before the bracket only
     assert "24778" in html and "flight.mcap" in html
     assert "cf2 relative to cf1, from above; 95 % ellipses" in html
     assert "detection minus label" in html and ">0 to 1 m<" in html and "median error, px" in html

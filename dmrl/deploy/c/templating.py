@@ -2,10 +2,8 @@
 
 import re
 import textwrap
-from functools import cache
 from pathlib import Path
 
-import jinja2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,25 +30,7 @@ def fill_template(template: str, **values: object) -> str:
     jinja2.UndefinedError
         If a name has no value.
     """
-    return _environment().get_template(template).render(values)
-
-
-@cache
-def _environment() -> jinja2.Environment:
-    environment = open_templates(
-        Path(__file__).parent / "templates",
-        keep_trailing_newline=True,
-        autoescape=False,
-        block_start_string="/*%",
-        block_end_string="%*/",
-        variable_start_string="${",
-        variable_end_string="}",
-        comment_start_string="/*#",
-        comment_end_string="#*/",
-    )
-    environment.globals["zip"] = zip
-    environment.filters["wrapped"] = format_numbers
-    return environment
+    return _TEMPLATES.get_template(template).render(values)
 
 
 def format_numbers(values: NDArray[np.integer]) -> str:
@@ -67,6 +47,20 @@ def format_numbers(values: NDArray[np.integer]) -> str:
     return textwrap.fill(
         text, LINE_WIDTH, initial_indent=INDENT, subsequent_indent=INDENT, break_on_hyphens=False
     )
+
+
+_TEMPLATES = open_templates(
+    Path(__file__).parent / "templates",
+    {"wrapped": format_numbers},
+    keep_trailing_newline=True,
+    block_start_string="/*%",
+    block_end_string="%*/",
+    variable_start_string="${",
+    variable_end_string="}",
+    comment_start_string="/*#",
+    comment_end_string="#*/",
+)
+_TEMPLATES.globals["zip"] = zip
 
 
 def c_name(network: IntegerNetwork) -> str:
