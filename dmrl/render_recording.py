@@ -209,9 +209,8 @@ def _describe(settings: Settings, blender: str) -> Provenance:
     if str(settings.camera) not in NAMED_CAMERAS:
         inputs.append(settings.camera)
     plain = replace(settings, workers=0)
-    made = build_provenance(
-        "render", plain, inputs, seed=settings.seed, libraries=("numpy", "pillow")
-    )
+    libraries = ("numpy", "pillow")
+    made = build_provenance("render", plain, inputs, seed=settings.seed, libraries=libraries)
     return replace(made, libraries={**made.libraries, "blender": blender})
 
 

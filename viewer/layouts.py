@@ -201,11 +201,8 @@ def build_dataset_layout(
     views = build_camera_views(camera, scales, both=not overlay, overlay=overlay)
     words = rrb.TextDocumentView(origin=escape_path(facts), name="row")
     side = [words] if plot is None else [words, build_plot_view(plot)]
-    panels = rrb.Horizontal(
-        rrb.Grid(*views, grid_columns=2),
-        rrb.Vertical(*side),
-        column_shares=[3, 1],
-    )
+    images = rrb.Grid(*views, grid_columns=2)
+    panels = rrb.Horizontal(images, rrb.Vertical(*side), column_shares=[3, 1])
     return build_window(panels, timeline=timeline)
 
 

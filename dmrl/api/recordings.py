@@ -150,9 +150,8 @@ class Recording:
             raise SettingError(f"{self.path} has images of {', '.join(filming)}. Name one of them")
         topic = topics.CAMERA_IMAGE(robot or (filming[0] if filming else "*"))
         match_topics(self.path, [topic])
-        return Images.load_topic(self.path, topic, self.start_ns, self._kept).between(
-            start_s, end_s
-        )
+        images = Images.load_topic(self.path, topic, self.start_ns, self._kept)
+        return images.between(start_s, end_s)
 
     def labels(self, robot: str | None = None) -> "pd.DataFrame":
         """Return a row per labelled peer of an image: position, sigmas, status and source.

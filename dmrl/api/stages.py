@@ -217,9 +217,8 @@ def calibrate(
     sources: OneOrMore, out: PathLike, **settings: "Unpack[typed.CalibrateSettings]"
 ) -> Path:
     """Calibrate a camera by chessboards or flights: ``dmrl calibrate``. Errors as `label`."""
-    return _run_to_path(
-        "calibrate", to_path(out), settings, sources=_to_paths("calibrate", sources)
-    )
+    given = _to_paths("calibrate", sources)
+    return _run_to_path("calibrate", to_path(out), settings, sources=given)
 
 
 def evaluate(recordings: OneOrMore, **settings: "Unpack[typed.EvaluateSettings]") -> Result:

@@ -58,9 +58,8 @@ class Manifest:
     def shard_path(self, folder: Path, split: str, shard: Shard) -> Path:
         """Return the path of a shard in the dataset's folder."""
         own = "data" if self.parquet else split
-        return safe_join(
-            safe_join(folder, own, f"{folder}: a split"), shard.file, f"{folder}: a shard"
-        )
+        place = safe_join(folder, own, f"{folder}: a split")
+        return safe_join(place, shard.file, f"{folder}: a shard")
 
     def write(self, folder: Path) -> None:
         """Write the manifest into the folder of a dataset."""

@@ -274,9 +274,8 @@ def _load_split_names(file: Path) -> tuple[str, ...]:
 
 
 def _parse_parquet_names(folder: Path) -> list[tuple[str, int, int]]:
-    matches = (
-        PARQUET_NAME_PATTERN.fullmatch(path.name) for path in (folder / "data").glob("*.parquet")
-    )
+    paths = (folder / "data").glob("*.parquet")
+    matches = (PARQUET_NAME_PATTERN.fullmatch(path.name) for path in paths)
     return [(m["split"], int(m["index"]), int(m["count"])) for m in matches if m]
 
 

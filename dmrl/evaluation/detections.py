@@ -123,9 +123,8 @@ def _join_recording(
         )
     spans = _find_spans(recording, read_splits(recording, held.summary), split)
     _require_source(held, robots, against)
-    pairs = concatenate_parts(
-        [_join_robot(held, robot, against, spans, partial) for robot in robots]
-    )
+    parts = [_join_robot(held, robot, against, spans, partial) for robot in robots]
+    pairs = concatenate_parts(parts)
     if not pairs.images:
         seen = " and detections" if partial else ""
         where = f"in split {split}" if split else "in it"

@@ -85,12 +85,10 @@ def draw_figures(
 
 def _choose_gallery(pairs: LabelledDetections, threshold: float) -> list[GalleryImage]:
     """Return images evenly spread over all, with their detections above the threshold."""
-    places = np.unique(
-        np.linspace(0, pairs.images - 1, GALLERY_IMAGES + 2)[1:-1].astype(int)
-    ).tolist()
+    places = np.linspace(0, pairs.images - 1, GALLERY_IMAGES + 2)[1:-1].astype(int)
     mine = pairs.detections.select(pairs.detections.confidence >= threshold)
     shown = []
-    for image in places:
+    for image in np.unique(places).tolist():
         found = mine.select(mine.image == image)
         at = pairs.at[image]
         shown.append(
@@ -156,9 +154,8 @@ class _Outcomes:
         Hits are typical and poor ones; misses are spread over the images; the most confident false
         detections come first.
         """
-        good = np.flatnonzero(
-            (self.hit_px >= 0) & (self.missed == 0) & (self.false_confidence == 0)
-        )
+        spoilt = (self.missed > 0) | (self.false_confidence > 0)
+        good = np.flatnonzero((self.hit_px >= 0) & ~spoilt)
         good = good[np.argsort(self.hit_px[good], kind="stable")]
         missed, false = np.flatnonzero(self.missed), np.flatnonzero(self.false_confidence)
         chosen = [*_take_at(good, HIT_QUANTILES), *_take_at(missed, MISS_QUANTILES)]

@@ -161,9 +161,7 @@ def read_paths(recording: Path) -> dict[tuple[str, str], PairPaths]:
     held = read_flight(recording, topics.POSITION, *TRUTH_TOPICS)
     known = list_true_pairs(held.topics)
     pairs = [pair for pair in _find_estimated_pairs(held.topics) if pair in known]
-    return {
-        pair: _match_truth(held.positions[pair], *find_true_path(held, *pair)) for pair in pairs
-    }
+    return {p: _match_truth(held.positions[p], *find_true_path(held, *p)) for p in pairs}
 
 
 def _match_truth(estimate: PeerPositions, true_ns: Times, true_m: Array) -> PairPaths:

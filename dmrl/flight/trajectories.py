@@ -254,9 +254,8 @@ def fly_rows(rng: Generator, start: Start, _leader: Motion | None) -> Motion:
     ends = np.cumsum([lasts for lasts, _ in round_trip])
     phase = (np.arange(start.samples) / RATE_HZ) % ends[-1]
     ways = np.array([way for _, way in round_trip])[np.searchsorted(ends, phase, side="right")]
-    return _integrate_motion(
-        start, apply_lag(speed * ways, VELOCITY_LAG_S), np.zeros(start.samples)
-    )
+    velocity = apply_lag(speed * ways, VELOCITY_LAG_S)
+    return _integrate_motion(start, velocity, np.zeros(start.samples))
 
 
 def fly_eight(rng: Generator, start: Start, _leader: Motion | None) -> Motion:

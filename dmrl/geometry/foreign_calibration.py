@@ -130,9 +130,8 @@ def _find(held: Mapping[str, Any], what: str, *default: Any) -> Any:
 
 def _to_numbers(what: str, value: Any, count: int | None) -> list[float]:
     """Return the finite numbers of a list, of a list of lists, or of a matrix with ``data``."""
-    numbers = list(
-        _flatten(value["data"] if isinstance(value, dict) and "data" in value else value)
-    )
+    held = value["data"] if isinstance(value, dict) and "data" in value else value
+    numbers = list(_flatten(held))
     if (count is not None and len(numbers) != count) or not np.isfinite(numbers).all():
         raise ValueError(f"its {what} has no {count or 'finite'} numbers")
     return numbers

@@ -106,9 +106,8 @@ def draw_stacked_bars(
     most = max(float(tops[-1].max()), 1.0)
     panel = _Panel(title, xlabel, (float(edges[0]), float(edges[-1])), (0.0, 1.25 * most))
     ticks = _find_ticks(float(edges[-1]), whole=middle)
-    panel.add_ticks(
-        [t for t in ticks if t < edges[-1] or not middle], _find_ticks(most, whole=True)
-    )
+    shown = [t for t in ticks if t < edges[-1] or not middle]
+    panel.add_ticks(shown, _find_ticks(most, whole=True))
     for k, name in enumerate(counts):
         colour = COLOURS[k % len(COLOURS)]
         for j in np.flatnonzero(tops[k + 1] > tops[k]).tolist():

@@ -158,9 +158,8 @@ def _select_topic(log: RobotLog, topic: str, cells: Mapping[str, list[str]]) -> 
     if not (columns or ranges):
         return None
     lines = list(range(len(next(iter(cells.values())))))
-    text = replace(
-        log.text, path=Path(f"{log.text.path}: {topic}"), columns=dict(cells), lines=lines
-    )
+    path = Path(f"{log.text.path}: {topic}")
+    text = replace(log.text, path=path, columns=dict(cells), lines=lines)
     return RobotLog(log.robot, text, {"time": log.columns["time"]} | columns, ranges, frozenset())
 
 

@@ -212,9 +212,8 @@ class CameraClient(threading.Thread):
             return
         self._post_calibration((image.width_px, image.height_px), time_ns, arrival_ns)
         self.health.last_arrival_ns = arrival_ns
-        self._feed.post_sample(
-            ReceivedSample(image_sample(time_ns, self.robot, data, kind), arrival_ns)
-        )
+        sample = image_sample(time_ns, self.robot, data, kind)
+        self._feed.post_sample(ReceivedSample(sample, arrival_ns))
         self.health.received += 1
 
     def _post_calibration(self, sent_px: tuple[int, int], time_ns: int, arrival_ns: int) -> None:

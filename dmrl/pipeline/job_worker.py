@@ -105,9 +105,8 @@ def _build_origin(stage: str, takes: StageSignature, **given: Any) -> Provenance
     settings = given.get("settings")
     values = [given[role] for role in takes.roles if role in given]
     values += [getattr(settings, name) for name in takes.paths]
-    return build_provenance(
-        stage, settings, [path for path in _iter_paths(values) if path.exists()]
-    )
+    paths = [path for path in _iter_paths(values) if path.exists()]
+    return build_provenance(stage, settings, paths)
 
 
 def _iter_paths(value: Any) -> Iterator[Path]:

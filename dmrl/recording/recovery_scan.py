@@ -24,9 +24,8 @@ from dmrl.recording.mcap.message_index import ENTRY_BYTES
 from dmrl.recording.mcap.record_scan import ScannedFile
 from dmrl.recording.mcap.summary_section import read_raw_section
 
-MESSAGE_INDEX_HEADER = struct.Struct(
-    "<HI"
-)  # of a Message Index record: channel id, bytes of entries
+MESSAGE_INDEX_HEADER = struct.Struct("<HI")
+"""Of a Message Index record: channel id, bytes of entries."""
 
 
 class IndexedCount(NamedTuple):

@@ -105,11 +105,8 @@ def _build_summary(path: Path, stream: BoundedReader) -> Summary:
     section = read_summary_section(stream)
     if section is None:
         scanned = scan_file(stream)
-        count, metadata, attachments = (
-            count_scanned(scanned),
-            scanned.metadata,
-            scanned.attachments,
-        )
+        count = count_scanned(scanned)
+        metadata, attachments = scanned.metadata, scanned.attachments
         definitions = Definitions(scanned.schemas, scanned.channel_records, scanned.channels)
     else:
         count = count_recording(stream, section)

@@ -121,9 +121,8 @@ class RecordingWriter:
             self._topics[topic] = cached
         _, number, chunk = cached
         publish_ns = time_ns if publish_ns is None else publish_ns
-        self.chunk_writer.add_message(
-            number, chunk, time_ns, publish_ns, message.SerializeToString()
-        )
+        data = message.SerializeToString()
+        self.chunk_writer.add_message(number, chunk, time_ns, publish_ns, data)
 
     def write_sample(self, sample: Sample) -> None:
         """Append one sample as a message; see `write`."""

@@ -139,11 +139,9 @@ class CutoutRenderer:
         if (low >= high).any():
             return None
         seen = cutout.light[:, ::-1] if mirrored else cutout.light
-        left, top, right, bottom = (
-            ((np.stack([low, high]) - (uv[0] - half)) * scale).ravel().tolist()
-        )
+        box = ((np.stack([low, high]) - (uv[0] - half)) * scale).ravel().tolist()
         width, height = (high - low).tolist()
-        light = turn_and_scale(seen, turn_deg, (left, top, right, bottom), (width, height))
+        light = turn_and_scale(seen, turn_deg, box, (width, height))
         light = match_backdrop(light, backdrop, rng, brightness=self._matched)
         flat = np.where(light[..., 3] > 0, np.float32(depth_m[0]), np.float32(0))
         return Layer(int(low[0]), int(low[1]), light, flat)

@@ -191,9 +191,6 @@ def _select_quality(
 ) -> tuple[int, int]:
     """Return the next lower quality where the noise correlates less than 1/1.2 of the real one."""
     want, got = (one.figure_mean("grain_correlation") or 0.0 for one in (real, have))
-    at = (
-        JPEG_QUALITIES.index(settings.jpeg_quality)
-        if settings.jpeg_quality in JPEG_QUALITIES
-        else 0
-    )
+    known = settings.jpeg_quality in JPEG_QUALITIES
+    at = JPEG_QUALITIES.index(settings.jpeg_quality) if known else 0
     return JPEG_QUALITIES[min(at + (want > 1.2 * got), len(JPEG_QUALITIES) - 1)]

@@ -215,9 +215,8 @@ def draw_ranges(
     length = np.linalg.norm(there, axis=1, keepdims=True)
     known = np.isfinite(length[:, 0]) & (length[:, 0] > 0)
     ends = there[known] / length[known] * range_m[known, None]
-    lines = rr.LineStrips3D.columns(
-        strips=_build_strips(np.stack([np.zeros_like(ends), ends], axis=1))
-    )
+    ends = np.stack([np.zeros_like(ends), ends], axis=1)
+    lines = rr.LineStrips3D.columns(strips=_build_strips(ends))
     style = rr.LineStrips3D.from_fields(colors=[RGB["range"]], radii=[RANGE_UI])
     yield Entity(f"{path}/line", lines.partition(known.astype(int)), (style,), frame)
 

@@ -80,9 +80,8 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     sources = scene.sources.setdefault(robot, set())
     scene.draws = build_image_rules(cameras[0], sources)
     for camera, path, colour in zip(cameras, models, MODEL_COLOURS, strict=True):
-        scene.draws += build_model_rules(
-            camera, scales, colour, smooth=settings.overlay, recording=path
-        )
+        smooth = settings.overlay
+        scene.draws += build_model_rules(camera, scales, colour, smooth=smooth, recording=path)
         scene.named[path.stem] = colour
     return scene
 

@@ -178,9 +178,8 @@ def write_shards(
     for split, row in rows:
         if split not in writers:
             _reject_case_conflict(split, (*writers, *before.splits))
-            schema = layout.build_schema(
-                *row.rgb.shape[:2], packed=packed, masks=row.mask is not None
-            )
+            shape, masks = row.rgb.shape[:2], row.mask is not None
+            schema = layout.build_schema(*shape, packed=packed, masks=masks)
             first = len(before.splits.get(split, ()))
             writers[split] = SplitWriter(folder, split, schema, before.parquet, shard_images, first)
         writers[split].add(row)

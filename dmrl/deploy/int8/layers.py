@@ -116,10 +116,8 @@ class Conv:
 
     def output_shape(self, inputs: tuple[Shape, ...]) -> Shape:
         """Return channels, rows and columns of its output."""
-        reach = self.dilation * (self.kernel - 1) + 1
-        rows, cols = (
-            (side + 2 * self.padding - reach) // self.stride + 1 for side in inputs[0][1:]
-        )
+        reach = self.dilation * (self.kernel - 1) + 1 - 2 * self.padding
+        rows, cols = ((side - reach) // self.stride + 1 for side in inputs[0][1:])
         return self.weight.shape[0], rows, cols
 
     def count_macs(self, inputs: tuple[Shape, ...]) -> int:

@@ -67,9 +67,8 @@ def quantise_model(model: Model, source: ImageSource, most: int, *, grey: bool) 
     graph, ranges = equalise_channels(graph, ranges)
     rows = pick_evenly(len(source), min(most, MAX_ROUNDING_IMAGES))
     moments = measure_moments(graph, track(source.images(rows), "Rounding", len(rows)))
-    return Quantised(
-        graph, quantise_network(graph, ranges, _describe(model), moments), ranges.images
-    )
+    network = quantise_network(graph, ranges, _describe(model), moments)
+    return Quantised(graph, network, ranges.images)
 
 
 def pick_evenly(count: int, most: int) -> list[int]:

@@ -54,9 +54,8 @@ def iter_samples(
         return
     roll, pitch = math.radians(values[0]), -math.radians(values[1])
     xyz = dict(zip("xyz", values[2:5], strict=True))
-    yield Sample(
-        time_ns, topics.ATTITUDE(robot), "Attitude", {"roll_rad": roll, "pitch_rad": pitch}
-    )
+    attitude = {"roll_rad": roll, "pitch_rad": pitch}
+    yield Sample(time_ns, topics.ATTITUDE(robot), "Attitude", attitude)
     place = {"frame_id": f"{robot}/horizontal", **xyz}
     yield Sample(time_ns, topics.POSITION(robot, peer), "PeerPosition", place)
     if values[5] > 0:

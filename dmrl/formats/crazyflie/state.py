@@ -39,9 +39,8 @@ def find_quaternions(blocks: Sequence[LogBlock], group: str = "stateEstimate") -
     logged = find_series(blocks, [f"{group}.{name}" for name in ("qx", "qy", "qz", "qw")])
     packed = find_series(blocks, ["stateEstimateZ.quat"]) if group == "stateEstimate" else None
     if logged is None and packed is not None:
-        logged = TimeSeries(
-            packed.time_ns, unpack_quaternions(packed.values[:, 0].astype(np.int64))
-        )
+        numbers = packed.values[:, 0].astype(np.int64)
+        logged = TimeSeries(packed.time_ns, unpack_quaternions(numbers))
     if logged is None:
         return None
     norm = np.linalg.norm(logged.values, axis=1)

@@ -76,9 +76,7 @@ class LabelledPicture:
 
 def is_picture(path: Path) -> bool:
     """Return whether a path is a picture by its name; hidden files are not."""
-    return (
-        path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
-    )
+    return path.suffix.lower() in IMAGE_SUFFIXES and path.name[0] != "." and path.is_file()
 
 
 def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:

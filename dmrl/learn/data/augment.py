@@ -276,9 +276,8 @@ class Augmenter:
     ) -> list[RobotRow]:
         """Render a window into the canvas; return the robots that are then visible."""
         left, top, right, bottom = rect
-        pixels = sample_window(
-            self._examples.get_image(source), window, (bottom - top, right - left)
-        )
+        image = self._examples.get_image(source)
+        pixels = sample_window(image, window, (bottom - top, right - left))
         pixels = self._jitter_colours(pixels, rng)
         place = canvas[top:bottom, left:right]
         place[:] = pixels if opacity is None else alpha_blend(place, pixels, opacity)

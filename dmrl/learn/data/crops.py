@@ -161,9 +161,8 @@ def sample_window(
     matrix = to_part @ window.matrix @ _PIXEL_CENTRE_SHIFT
     part: Any = raw[top:bottom, left:right]
     if sharp:
-        part = cv2.sepFilter2D(
-            part, -1, _SHARPENING_KERNEL, _SHARPENING_KERNEL, borderType=_BORDER_MODE
-        )
+        kernel = _SHARPENING_KERNEL
+        part = cv2.sepFilter2D(part, -1, kernel, kernel, borderType=_BORDER_MODE)
     colours = part.shape[2:] == (3,)
     part = cv2.cvtColor(part, cv2.COLOR_RGB2RGBA) if colours else part
     seen: Any = cv2.warpPerspective(
@@ -275,9 +274,8 @@ def move_labels(robots: Sequence[RobotRow], window: CropWindow, rect: Rect) -> l
         u, v = apply_homography(back, robot[U], robot[V])
         u, v, nearer = u + rect[0], v + rect[1], window.zoom
         if window.camera:  # a rotation keeps the distance, not the depth
-            nearer *= ray_length(window.camera, u, v) / ray_length(
-                window.camera, robot[U], robot[V]
-            )
+            camera = window.camera
+            nearer *= ray_length(camera, u, v) / ray_length(camera, robot[U], robot[V])
         there = [*robot]
         there[U], there[V] = u, v
         there[DEPTH], there[SIGMA_DEPTH] = robot[DEPTH] / nearer, robot[SIGMA_DEPTH] / nearer

@@ -259,10 +259,8 @@ def build_network(name: str, *, seed: int = 0, extra: Sequence[str] = ()) -> Net
     PluginError
         If it belongs to a plug-in that cannot be loaded.
     """
-    form, plugin = (
-        find_architecture(name),
-        entry_points.find_plugins(entry_points.NETWORKS).get(name),
-    )
+    form = find_architecture(name)
+    plugin = entry_points.find_plugins(entry_points.NETWORKS).get(name)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         with plugin.naming_the_package("cannot be built") if plugin else nullcontext():

@@ -58,9 +58,7 @@ def read_request(request: bytes) -> bytes:
         with h5py.File(io.BytesIO(data), "r") as file:
             inner = file.get("model_weights", getlink=True)
             group = file["model_weights"] if isinstance(inner, h5py.HardLink) else file
-            arrays = {
-                name: _read_array(path, group, name, *shape) for name, shape in shapes.items()
-            }
+            arrays = {n: _read_array(path, group, n, *shape) for n, shape in shapes.items()}
     except (OSError, RuntimeError, ValueError, TypeError, LookupError, MemoryError) as e:
         why = " ".join(str(e).split())
         raise ModelError(f"{path} cannot be read: {why}. Download it again") from None
@@ -76,10 +74,8 @@ def _read_array(path: str, group: Any, name: str, *wanted: int) -> NDArray[np.fl
     found = group
     for part in (layer, layer, f"{variable}:0"):
         # A soft or external link could lead to any other file of this machine.
-        own = isinstance(found, h5py.Group) and isinstance(
-            found.get(part, getlink=True), h5py.HardLink
-        )
-        found = found[part] if own else None
+        link = found.get(part, getlink=True) if isinstance(found, h5py.Group) else None
+        found = found[part] if isinstance(link, h5py.HardLink) else None
     if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
         raise ModelError(f"{path} has no {name}. Give weights of locanet")
     if found.shape != wanted:

@@ -22,6 +22,5 @@ def resolve_model_path(model: Path) -> Path:
         A path, or a name in `list_pretrained`. Anything else is returned unchanged, so that the
         function that opens it reports the error.
     """
-    return (
-        PRETRAINED_DIR / model if not model.exists() and str(model) in list_pretrained() else model
-    )
+    ships = not model.exists() and str(model) in list_pretrained()
+    return PRETRAINED_DIR / model if ships else model

@@ -46,9 +46,8 @@ def compute_losses(
         return parts
     with torch.no_grad():
         said = _forward(teacher, pixels, settings)
-    taught = compute_loss_terms(
-        named, build_teacher_targets(teacher.channels, said, wanted), settings
-    )
+    targets = build_teacher_targets(teacher.channels, said, wanted)
+    taught = compute_loss_terms(named, targets, settings)
     return torch.lerp(parts, taught, settings.distill_share)
 
 

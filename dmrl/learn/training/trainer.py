@@ -206,9 +206,8 @@ class Trainer:
                         board(name.replace("_", "/", 1), said[name], at)
                 self._state = TrainingProgress(self._state.run, epoch + 1, [*self.history, said])
                 if self._group.is_main:
-                    save_checkpoint(
-                        self._folder, self._networks_by_role(), self._optimizer, self._state
-                    )
+                    networks = self._networks_by_role()
+                    save_checkpoint(self._folder, networks, self._optimizer, self._state)
 
     @contextmanager
     def _open_log(self, first_step: int) -> Iterator[boards.ScalarWriter]:

@@ -83,9 +83,8 @@ class SimulatedFlight:
         for peer, (ranged_s, range_m) in self.ranges.items():
             # Before the first ranging, the firmware's variable is 0.
             distance = np.concatenate([[-math.inf], ranged_s]), np.concatenate([[0.0], range_m])
-            known[f"ranging.distance{parse_robot_number(peer)}"] = SimulatedVariable(
-                "float", distance
-            )
+            name = f"ranging.distance{parse_robot_number(peer)}"
+            known[name] = SimulatedVariable("float", distance)
         left_v = BATTERY_FULL_V - (BATTERY_FULL_V - BATTERY_EMPTY_V) * time_s / BATTERY_S
         known["pm.vbat"] = SimulatedVariable("float", (time_s, np.maximum(left_v, BATTERY_EMPTY_V)))
         return known

@@ -85,9 +85,8 @@ def list_label_findings(contents: LoadedRecording) -> list[str]:
     RecordingError
         If the file is not a complete recording.
     """
-    return [
-        f"{finding.topic}: {finding.text}" for finding in check_labels(collect_from_index(contents))
-    ]
+    found = check_labels(collect_from_index(contents))
+    return [f"{finding.topic}: {finding.text}" for finding in found]
 
 
 def print_findings(path: Path, *, values: bool = False) -> None:

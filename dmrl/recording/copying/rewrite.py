@@ -115,10 +115,8 @@ def shift_times(
     every = TopicSelection(frozenset(read_summary(recording).topics))
     adopt_channels(recording, every.topics, sink)
     for unit in iter_units(recording, every):
-        batch, topics = (
-            unit.batch,
-            {n: unit.channels[n].topic for n in unit.batch.list_channel_ids()},
-        )
+        batch = unit.batch
+        topics = {n: unit.channels[n].topic for n in batch.list_channel_ids()}
         converted = [number for number, topic in topics.items() if topic in converters]
         shift_ns = np.zeros(len(batch), np.int64)
         for number in topics.keys() - converted:

@@ -151,9 +151,8 @@ class McapFileWriter:
         )
         statistics = self._statistics
         earlier = statistics.message_count > 0
-        statistics.message_start_time = (
-            min(statistics.message_start_time, first) if earlier else first
-        )
+        known = statistics.message_start_time if earlier else first
+        statistics.message_start_time = min(known, first)
         statistics.message_end_time = max(statistics.message_end_time, last)
         statistics.message_count += sum(index.counts.values())
         self._counts.update(index.counts)

@@ -104,9 +104,8 @@ def _draw_surfaces(rng: Generator, *, outdoors: bool) -> list[Surface]:
 def _draw_wall(rng: Generator, paint: Colour, *, outdoors: bool) -> Surface:
     """Draw paint, bricks, a curtain, or the windows of a street."""
     if outdoors:
-        glass = (
-            greyish_colour(rng, 0.02, 0.3) if rng.random() < 0.7 else greyish_colour(rng, 0.6, 1)
-        )
+        limits = (0.02, 0.3) if rng.random() < 0.7 else (0.6, 1)
+        glass = greyish_colour(rng, *limits)
         cell_m = (float(rng.uniform(1.2, 3)), float(rng.uniform(2, 3.5)))
         return Surface(greyish_colour(rng, 0.2, 0.8), glass, "windows", cell_m, stain=0.3)
     kind = rng.random()

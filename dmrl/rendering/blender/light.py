@@ -29,9 +29,8 @@ class Sky:
     def __init__(self, scene, lights):
         columns, rows = LIGHT_SIZE_PX
         atlas = bpy.data.images.new("light", columns, rows * len(lights), float_buffer=True)
-        atlas.pixels.foreach_set(
-            np.concatenate([downsample_panorama(name) for name in lights]).ravel()
-        )
+        drawn = [downsample_panorama(name) for name in lights]
+        atlas.pixels.foreach_set(np.concatenate(drawn).ravel())
         self.numbers = {name: k for k, name in enumerate(lights)}
         scene.world = world = bpy.data.worlds.new("world")
         world.use_nodes = True

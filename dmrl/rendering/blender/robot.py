@@ -103,9 +103,8 @@ def _add_rotor_blur(material, head):
     sweep = add_property(tree, "rotor_sweep_rad").outputs["Fac"]
     # Half a turn of two blades covers the whole disc.
     sweep = add_math(tree, "MINIMUM", add_math(tree, "MAXIMUM", sweep, 0.02), math.pi)
-    first = add_math(
-        tree, "ADD", first, add_math(tree, "MULTIPLY", number, head["between_rotors_rad"])
-    )
+    turn = add_math(tree, "MULTIPLY", number, head["between_rotors_rad"])
+    first = add_math(tree, "ADD", first, turn)
     angle = add_math(tree, "SUBTRACT", add_math(tree, "ARCTAN2", y, x), first)
     after = add_math(tree, "FLOORED_MODULO", angle, math.pi)
     radius = add_node(tree, "VectorMath", place.outputs["Vector"], (1, 1, 0), operation="MULTIPLY")

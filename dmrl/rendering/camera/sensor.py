@@ -76,9 +76,8 @@ def expose(light: FloatImage, sensor: Sensor, rng: Generator) -> NDArray[np.uint
     if sensor.bayer:
         values = to_bayer(values)
     if sensor.vignetting > 0:
-        falloff = 1 - np.float32(sensor.vignetting) * radius_squared(height, width).astype(
-            np.float32
-        )
+        distance = radius_squared(height, width).astype(np.float32)
+        falloff = 1 - np.float32(sensor.vignetting) * distance
         values *= falloff if sensor.bayer else falloff[..., None]
     grey = sensor.saturation == 0 and not sensor.bayer  # one value and one noise per pixel
     values = _add_noise(values[..., :1].copy() if grey else values, sensor, rng)

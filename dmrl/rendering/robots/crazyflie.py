@@ -48,9 +48,8 @@ def outline_points(scale: float, first_rad: float, sweep_rad: float) -> Array:
         Rotation of all rotors during the exposure.
     """
     whole = CRAZYFLIE.build_mesh()
-    body = whole.vertices[
-        np.unique(whole.faces[whole.material != CRAZYFLIE.materials.index(ROTOR)])
-    ]
+    rotor = CRAZYFLIE.materials.index(ROTOR)
+    body = whole.vertices[np.unique(whole.faces[whole.material != rotor])]
     radius = np.linspace(0.004, ROTOR_RADIUS_M, 12)
     half = BLADE_HALF_WIDTH_M / radius
     rim = np.linspace(-half[-1], min(sweep_rad, np.pi) + half[-1], 60)

@@ -105,9 +105,8 @@ def join_parts(parts: Iterable[Part], materials: tuple[str, ...]) -> Mesh:
 def make_prism(outline: Array, low: float, high: float) -> tuple[Array, NDArray[np.int64]]:
     """Make a prism of a convex (K, 2) outline, anticlockwise from above, between two heights."""
     count = len(outline)
-    points = np.concatenate(
-        [np.column_stack([outline, np.full(count, z)]) for z in (low, high)], axis=0
-    )
+    rings = [np.column_stack([outline, np.full(count, z)]) for z in (low, high)]
+    points = np.concatenate(rings, axis=0)
     k = np.arange(count)
     after = (k + 1) % count
     fan = np.column_stack([np.zeros(count - 2, int), k[1:-1], k[2:]])
