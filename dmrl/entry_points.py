@@ -107,11 +107,8 @@ def find_plugins(group: str) -> dict[str, Plugin]:
     """Return the plug-ins of a group by name; of two of one name, the first package's."""
     from importlib.metadata import entry_points  # noqa: PLC0415 - 30 ms of every start
 
-    every = [
-        _to_plugin(entry)
-        for entry in entry_points(group=group)
-        if PLUGIN_NAME.fullmatch(entry.name)
-    ]
+    found = entry_points(group=group)
+    every = [_to_plugin(entry) for entry in found if PLUGIN_NAME.fullmatch(entry.name)]
     by_name: dict[str, Plugin] = {}
     for plugin in sorted(every, key=lambda plugin: (plugin.name, plugin.package)):
         by_name.setdefault(plugin.name, plugin)

@@ -236,11 +236,8 @@ def build_camera_views(
     found = [camera.detections, texts_path(camera.detections)]
     marks = [f"{escape_path(camera.labels)}/**", *map(escape_path, found)]
     cell = escape_path(f"{camera.grid}/best")
-    views = [
-        _build_image_view(
-            camera, "image", [picture, *marks, escape_path(legend_path(camera.robot))]
-        )
-    ]
+    shown = [picture, *marks, escape_path(legend_path(camera.robot))]
+    views = [_build_image_view(camera, "image", shown)]
     heat = {
         channel: [
             escape_path(channel_path(camera.grid, channel)),

@@ -252,12 +252,8 @@ def build_camera_panels(
 
 
 def _find_image_size(selection: Selection, picture: str) -> tuple[int, int]:
-    held = (
-        LoadedRecording(path)
-        for path, kept in selection.recordings.items()
-        if picture in kept.topics
-    )
-    found = (one.read_image_size(picture) for one in held)
+    paths = (path for path, kept in selection.recordings.items() if picture in kept.topics)
+    found = (LoadedRecording(path).read_image_size(picture) for path in paths)
     if (size_px := next(filter(None, found), None)) is None:
         raise SourceError(f"no image of {picture} can be decoded. Restore the recording")
     return size_px

@@ -218,10 +218,8 @@ def select_time(selection: Selection, time_s: float | None) -> Selection:
     wanted_ns = min((int(t[0]) for t in selection.image_ns.values()), default=selection.shown_ns[0])
     if time_s is not None:
         wanted_ns = selection.start_ns + _to_nanoseconds(time_s)
-    nearest = {
-        robot: times[[np.abs(times - wanted_ns).argmin()]]
-        for robot, times in selection.image_ns.items()
-    }
+    every = selection.image_ns.items()
+    nearest = {robot: times[[np.abs(times - wanted_ns).argmin()]] for robot, times in every}
     moment = replace(selection, image_ns=nearest, all_images=False)
     # A screenshot of a layout with plots shows their whole time span.
     if selection.layout != "image":

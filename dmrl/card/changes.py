@@ -75,9 +75,6 @@ def _iter_quantities(folder: Path) -> Iterator[tuple[str, Any]]:
 
 def _join_names(about: Mapping[str, Any], column: Callable[[pa.Table], Any]) -> str:
     """Return the names in a column of all splits."""
-    names = {
-        name
-        for split in about["splits"].values()
-        for name in pc.unique(column(split.table)).to_pylist()
-    }
+    columns = (column(split.table) for split in about["splits"].values())
+    names = {name for one in columns for name in pc.unique(one).to_pylist()}
     return ", ".join(sorted(names))

@@ -196,9 +196,8 @@ def _describe(folder: Path) -> None:
     """Write the files that follow from manifest and parts: names, provenance, facts, card."""
     manifest = load_manifest(folder)
     assert manifest is not None
-    made = load_combined_provenance(
-        folder, manifest
-    ).to_json()  # a kilobyte for each recording: once
+    # A kilobyte for each recording: once.
+    made = load_combined_provenance(folder, manifest).to_json()
     settings = made["settings"]
     about = {"description": str(settings["title"]), "license": str(settings["license"])}
     write_metadata(folder, manifest, fingerprint=hash_document(made), about=about)

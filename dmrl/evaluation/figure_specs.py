@@ -115,11 +115,9 @@ def iter_faults(recipe: Mapping[str, Any], outs: Set[str] | None = None) -> Iter
         return
     for number, table in enumerate(tables, start=1):
         where = f"{FIGURE_KEY}.{number}"
-        wrong = (
-            list(recipes.find_faults(table, FigureSpec))
-            if isinstance(table, dict)
-            else ["must be a table"]
-        )
+        wrong = ["must be a table"]
+        if isinstance(table, dict):
+            wrong = list(recipes.find_faults(table, FigureSpec))
         yield from (f"{where}.{fault}" for fault in wrong)
         if not wrong:
             shown = recipes.check("", table, FigureSpec)

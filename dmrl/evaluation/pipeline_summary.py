@@ -44,14 +44,8 @@ def print_report(done: Sequence[StepOutcome], *, as_json: bool = False) -> None:
     judged = {kind: _read_documents(done, f"{kind}.json") for kind in ERRORS_3D}
     pictures = [picture for d in done if _is_result(d) for picture in _list_images(d.out)]
     if as_json:
-        print_json(
-            {
-                "steps": [asdict(d) for d in done],
-                "evaluations": evaluations,
-                **judged,
-                "pictures": pictures,
-            }
-        )
+        steps = [asdict(d) for d in done]
+        print_json({"steps": steps, "evaluations": evaluations, **judged, "pictures": pictures})
         return
     for kind, documents in judged.items():
         module = ERRORS_3D[kind]

@@ -120,11 +120,8 @@ def judge(recording: Path) -> list[EvaluatedPair]:
     if not estimated:
         raise RecordingError(f"{recording} has no positions. Try: dmrl label {recording} OUT.mcap")
     limit = find_limit(held)
-    pairs = [
-        evaluate_pair(held, limit, *names, held.positions[names])
-        for names in estimated
-        if names in known
-    ]
+    judged = [names for names in estimated if names in known]
+    pairs = [evaluate_pair(held, limit, *names, held.positions[names]) for names in judged]
     pairs = [pair for pair in pairs if len(pair.judged.time_s)]
     if not pairs:
         raise RecordingError(

@@ -46,10 +46,8 @@ def draw_log_errors(rng: Generator, samples: int, noise: Noise) -> LogErrors:
     scale[:2] += rng.normal(0.0, noise.velocity_scale)
     bias = [rng.normal(0.0, noise.velocity_bias_mps, (2, 1))]
     white = [rng.normal(0.0, noise.velocity_white_mps, (2, samples))]
-    slow = [
-        draw_coloured_noise(rng, samples, noise.velocity_coloured_mps, noise.velocity_tau_s)
-        for _ in range(2)
-    ]
+    colour = noise.velocity_coloured_mps, noise.velocity_tau_s
+    slow = [draw_coloured_noise(rng, samples, *colour) for _ in range(2)]
     attitude = noise.attitude_bias_rad, noise.attitude_white_rad
     rate = noise.yaw_rate_bias_radps, noise.yaw_rate_white_radps
     for bias_std, white_std in (

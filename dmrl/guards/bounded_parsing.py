@@ -113,11 +113,8 @@ def _check_limits(value: Any) -> Any:
         containers = [one for one in level if isinstance(one, dict | list)]
         if not containers:
             return value
-        level = [
-            inner
-            for one in containers
-            for inner in (one.values() if isinstance(one, dict) else one)
-        ]
+        rows = (one.values() if isinstance(one, dict) else one for one in containers)
+        level = [inner for row in rows for inner in row]
     raise ValueError(_TOO_DEEP)
 
 

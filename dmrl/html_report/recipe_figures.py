@@ -113,10 +113,8 @@ def _compare_maps(drawn: Sequence[plots.MapPair]) -> Table:
 def _read_map_pairs(names: Mapping[str, Path]) -> list[plots.MapPair]:
     """Return a few images of which all recordings have maps."""
     first = next(iter(names.values()))
-    robot = next(
-        iter(topics.list_robots(list(LoadedRecording(first, topics.GRID).topics), topics.GRID)),
-        None,
-    )
+    held = list(LoadedRecording(first, topics.GRID).topics)
+    robot = next(iter(topics.list_robots(held, topics.GRID)), None)
     if robot is None:
         return []
     grids = {who: dict(iter_maps(path, robot)) for who, path in names.items()}

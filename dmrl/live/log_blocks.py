@@ -118,11 +118,8 @@ def plan_blocks(
     rest = [RequestedVariable(name, toc[name]) for name in (height, *distances)]
     blocks = [RequestedBlock(period_ms, tuple(motion)), *_pack_blocks(rest, period_ms)]
     if BATTERY_VARIABLE in toc:
-        blocks.append(
-            RequestedBlock(
-                SLOW_PERIOD_MS, (RequestedVariable(BATTERY_VARIABLE, toc[BATTERY_VARIABLE]),)
-            )
-        )
+        battery = RequestedVariable(BATTERY_VARIABLE, toc[BATTERY_VARIABLE])
+        blocks.append(RequestedBlock(SLOW_PERIOD_MS, (battery,)))
     if len(blocks) > MAX_BLOCKS:
         raise SettingError(
             f"{robot}: {len(distances)} distances need more than {MAX_BLOCKS} blocks. "

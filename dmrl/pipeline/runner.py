@@ -131,11 +131,8 @@ class Runner:
         if takes.settings is not None:
             filled |= asdict(recipes.check(step.out, own, takes.settings))
         filled |= map_strings(step.path_settings, self._hash_input)
-        matter = {
-            k: v
-            for k, v in recipes.to_json_values(filled).items()
-            if k not in SETTINGS_WITHOUT_EFFECT
-        }
+        plain = recipes.to_json_values(filled).items()
+        matter = {k: v for k, v in plain if k not in SETTINGS_WITHOUT_EFFECT}
         return describe_build(step.stage, matter, map_strings(dict(step.inputs), self._hash_input))
 
     def _hash_input(self, name: str) -> list[str]:

@@ -146,8 +146,6 @@ def _medians_by_step(
     """Return edges of equal bins from zero, and the median in each, NaN in empty ones."""
     edges = np.arange(0.0, at.max(initial=step) + step, step)
     place = np.digitize(at, edges) - 1
-    medians = [
-        np.median(values[place == k]) if (place == k).any() else np.nan
-        for k in range(len(edges) - 1)
-    ]
+    steps = (values[place == k] for k in range(len(edges) - 1))
+    medians = [np.median(step) if step.size else np.nan for step in steps]
     return edges, np.array(medians)

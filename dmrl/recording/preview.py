@@ -60,11 +60,9 @@ def sample_topics(
         missing -= _list_topics([batch], own)
         if not missing:
             break
-    return (
-        decode_by_topic(path, concatenate_all(batches).sort_by_time(), channels, fields)
-        if batches
-        else {}
-    )
+    if not batches:
+        return {}
+    return decode_by_topic(path, concatenate_all(batches).sort_by_time(), channels, fields)
 
 
 def _sample_chunks(

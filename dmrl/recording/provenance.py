@@ -135,10 +135,8 @@ class Provenance:
 
     def to_metadata(self) -> dict[str, str]:
         """Return MCAP metadata: strings, or JSON for other values."""
-        return {
-            k: v if isinstance(v, str) else json.dumps(v, sort_keys=True)
-            for k, v in self.to_json().items()
-        }
+        values = self.to_json().items()
+        return {k: v if isinstance(v, str) else json.dumps(v, sort_keys=True) for k, v in values}
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> Self:

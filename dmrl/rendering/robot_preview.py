@@ -99,12 +99,8 @@ def render_sides(renderer: Renderer, design: RobotDesign) -> Iterator[Side]:
     look = _neutral_look(renderer.lights[0])
     shots = renderer.render_shots((camera, [Robot(pose, paint)], look) for pose in poses)
     for (name, *_), pose, shot in zip(SIDES, poses, shots, strict=True):
-        yield Side(
-            name,
-            shot.rgb,
-            _project_to_pixels(axes, pose, camera),
-            _project_to_pixels(edges, pose, camera),
-        )
+        places = (_project_to_pixels(one, pose, camera) for one in (axes, edges))
+        yield Side(name, shot.rgb, *places)
 
 
 def _look_at_pose(

@@ -196,11 +196,8 @@ def _draw_robot(camera: Camera, pose: Pose, look: Look) -> Canvas | None:
     if left >= right or top >= bottom:
         return None
     canvas = Canvas(left, top, right - left, bottom - top, brightest=MAX_BRIGHTNESS)
-    outlines = [
-        one
-        for part in groups
-        for one in canvas.make_outlines(part.uv_px, part.colours, part.opacity)
-    ]
+    drawn = (canvas.make_outlines(p.uv_px, p.colours, p.opacity) for p in groups)
+    outlines = [outline for part in drawn for outline in part]
     distance_m = np.concatenate([part.distance_m for part in groups])
     for k in np.argsort(-distance_m, kind="stable").tolist():
         canvas.draw_outline(outlines[k])

@@ -95,11 +95,9 @@ def _measure_memory(written: "list[Written]", out: Path) -> "StateMemory | None"
     from dmrl.deploy.c.run.measure import parse_state_memory
     from dmrl.deploy.int8.store import INTEGER_NAME, load_network
 
-    return (
-        parse_state_memory(load_network(out), out)
-        if any(f.name == INTEGER_NAME for f in written)
-        else None
-    )
+    if not any(file.name == INTEGER_NAME for file in written):
+        return None
+    return parse_state_memory(load_network(out), out)
 
 
 def _document(written: "list[Written]", given: Given) -> dict[str, Any]:

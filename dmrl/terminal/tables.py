@@ -34,12 +34,8 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
     """
     if wrong := [row for row in rows if len(row) != len(columns)]:
         raise ValueError(f"a row of {len(wrong[0])} cells in a table of {len(columns)} columns")
-    table = Table(
-        title=to_one_line(title) or None,
-        title_justify="left",
-        title_style="bold",
-        box=box.SIMPLE_HEAD,
-    )
+    head = to_one_line(title) or None
+    table = Table(title=head, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
     for index, column in enumerate(columns):
         cells = [row[index] for row in rows if row[index] is not None]
         number = bool(cells) and all(isinstance(cell, int | float) for cell in cells)

@@ -228,12 +228,9 @@ def draw_tracks(path: str, robot: str, batch: pa.RecordBatch) -> Iterator[Entity
     found = column.flatten()
     xyz = parse_vectors(found, "xyz")
     velocity = np.stack([found.field(f"v{axis}_mps").to_numpy() for axis in "xyz"], axis=1)
-    names = [
-        f"{peer or 'track'} {number}"
-        for peer, number in zip(
-            found.field("peer").to_pylist(), found.field("id").to_pylist(), strict=True
-        )
-    ]
+    peers, numbers = (found.field(name).to_pylist() for name in ("peer", "id"))
+    pairs = zip(peers, numbers, strict=True)
+    names = [f"{peer or 'track'} {number}" for peer, number in pairs]
     colour = RGB["track"]
     points = rr.Points3D.columns(positions=xyz, labels=names).partition(lengths)
     dot = rr.Points3D.from_fields(colors=[colour], radii=[POINT_UI], show_labels=True)

@@ -63,11 +63,8 @@ def scene(selection: Selection, settings: Settings) -> Scene:
     """
     robot, models = _find_models(selection, settings.robot)
     scales = archetypes.build_scales(settings.depth_max_m)
-    cameras = [
-        camera
-        for path in models
-        for camera in build_camera_panels(selection, [robot], scales, model=path)
-    ]
+    panels = (build_camera_panels(selection, [robot], scales, model=path) for path in models)
+    cameras = [camera for row in panels for camera in row]
     judged = {path: found for path in models if (found := _compute_errors(path, robot, selection))}
     scene = Scene(
         layouts.build_compare_layout(

@@ -113,10 +113,8 @@ class SplitWriter:
         for file, name in zip(self._files, names, strict=True):
             file.rename(name)
         sizes = [name.stat().st_size for name in names]
-        return [
-            Shard(name.name, *found)
-            for name, *found in zip(names, self._lengths, sizes, strict=True)
-        ]
+        shards = zip(names, self._lengths, sizes, strict=True)
+        return [Shard(name.name, *found) for name, *found in shards]
 
     def _shard_path(self, index: int, count: int) -> Path:
         return layout.shard_path(self.folder, self.name, index, count, parquet=self.parquet)

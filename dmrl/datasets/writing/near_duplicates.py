@@ -147,10 +147,8 @@ class ImageHashes:
         others = every[:: max(1, -(-len(every) * len(train) // MAX_COMPARED_PAIRS))]
         if not len(train):
             return 0, len(every), len(every)
-        parts = (
-            others[k : k + COMPARED_AT_ONCE, None] ^ train
-            for k in range(0, len(others), COMPARED_AT_ONCE)
-        )
+        starts = range(0, len(others), COMPARED_AT_ONCE)
+        parts = (others[k : k + COMPARED_AT_ONCE, None] ^ train for k in starts)
         alike = (np.bitwise_count(one).min(axis=1) <= NEAR_DUPLICATE_BITS for one in parts)
         return sum(int(one.sum()) for one in alike), len(others), len(every)
 

@@ -131,11 +131,8 @@ def assign_splits(
     by_source = {path: recordings[path] for path in learnt if recordings[path]}
     rest = {path: hashes[path] for path in learnt if path not in by_source}
     share = 0.0 if whole else test_share
-    test = (
-        choose_test_recordings(rest, share, seed)
-        if there is None
-        else choose_test_independently(rest, share, seed)
-    )
+    choose = choose_test_recordings if there is None else choose_test_independently
+    test = choose(rest, share, seed)
     named = {path: _constant_split("test" if path in test else "train") for path in rest}
     named |= {path: build_split_lookup(path, parts) for path, parts in by_source.items()}
     return named | {path: _constant_split("val") for path in watched}

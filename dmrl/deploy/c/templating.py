@@ -69,11 +69,8 @@ def c_name(network: IntegerNetwork) -> str:
     It has letters, digits and underscores only: dmrl-nano becomes dmrl_nano.
     """
     name = re.sub(r"[^a-z0-9]+", "_", network.architecture.lower()).strip("_")[:MAX_NAME_LENGTH]
-    return (
-        name
-        if name[:1].isalpha() and name not in RESERVED_FILE_NAMES
-        else f"net_{name}".rstrip("_")
-    )
+    good = name[:1].isalpha() and name not in RESERVED_FILE_NAMES
+    return name if good else f"net_{name}".rstrip("_")
 
 
 def template_values(network: IntegerNetwork) -> dict[str, str]:

@@ -194,11 +194,8 @@ def int8_onnx(network: IntegerNetwork) -> bytes:
             else:
                 value = _add_max_pool(out, reals[0], f"{layer.name}.largest")
             tensors.append(_add_quantize(out, value, layer.name, layer.scale, zero))
-    names = {
-        OUTPUT_OF[channel]: name
-        for channel, name in HEAD_OF_CHANNEL.items()
-        if name in network.heads
-    }
+    heads = network.heads
+    names = {OUTPUT_OF[key]: name for key, name in HEAD_OF_CHANNEL.items() if name in heads}
     for output, name in names.items():
         _add_head(out, network, network.heads[name], output, tensors)
     image = (network.height_px, network.width_px, network.channels)

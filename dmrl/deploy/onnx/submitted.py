@@ -69,10 +69,8 @@ class SubmittedNetwork:
             values = self._session.run(self.names, {self._input.name: data})
         except Exception as e:  # onnxruntime's exceptions have no common base
             raise ModelError(f"{self._file}: {' '.join(str(e).split())}. Check its input") from None
-        found = {
-            name: np.asarray(value, np.float64)
-            for name, value in zip(self.names, values, strict=True)
-        }
+        named = zip(self.names, values, strict=True)
+        found = {name: np.asarray(value, np.float64) for name, value in named}
         grid = (image.shape[0] // STRIDE_PX, image.shape[1] // STRIDE_PX)
         return _maps_to_grids(found, grid) or self._boxes_to_grids(found, grid)
 

@@ -186,11 +186,8 @@ class ImageReader:
     def _finish_image(self, begun: "_PartialImage") -> Image | None:
         data = bytes(begun.data)
         if begun.image is None:
-            return (
-                self._parse_streamer_image(data)
-                if begun.checksum in (0, compute_checksum(data))
-                else None
-            )
+            whole = begun.checksum in (0, compute_checksum(data))
+            return self._parse_streamer_image(data) if whole else None
         image = begun.image
         if image.encoding == "jpeg" and not data.startswith(b"\xff\xd8"):
             return None

@@ -162,11 +162,8 @@ def load_content(source: Path, options: Options) -> Content:
     SourceError
         If a log cannot be used. Empty files of a folder are left out and reported.
     """
-    streams = [
-        s
-        for robot, path in _iter_logs(source, options)
-        for s in _load_streams(robot, path, options)
-    ]
+    logs = _iter_logs(source, options)
+    streams = [s for robot, path in logs for s in _load_streams(robot, path, options)]
     return build_content(streams)
 
 

@@ -189,11 +189,8 @@ def _iter_errors(key: str, table: Any) -> Iterator[str]:
     units = LENGTH_UNITS if key.startswith("range.") else QUANTITIES.get(key)
     if units is None:
         near = get_close_matches(key, QUANTITIES, n=1)
-        known = (
-            f"did you mean {near[0]}?"
-            if near
-            else "there are " + ", ".join((*QUANTITIES, "range.PEER"))
-        )
+        known = "there are " + ", ".join((*QUANTITIES, "range.PEER"))
+        known = f"did you mean {near[0]}?" if near else known
         yield f"[{key}]: no such quantity, {known}"
     elif not isinstance(table, dict):
         yield f"{key}: no table with name and unit"

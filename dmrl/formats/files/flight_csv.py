@@ -205,11 +205,8 @@ def _iter_sensor_columns(row: Topic, log: CsvLog) -> Iterator[tuple[str, dict[st
     else:
         before, _, unit = row.csv[0].rpartition("_")
         found = re.compile(f"{before}_(.+)_{unit}")
-        peers = [
-            m[1]
-            for name in log.columns
-            if name not in OWN_SENSOR_COLUMNS and (m := found.fullmatch(name))
-        ]
+        others = (name for name in log.columns if name not in OWN_SENSOR_COLUMNS)
+        peers = [m[1] for name in others if (m := found.fullmatch(name))]
     for peer in peers:
         named = {
             field: f"_{peer}_".join(field.rsplit("_", 1)) if peer else field for field in row.csv

@@ -105,15 +105,8 @@ def load_content(source: Path, options: Options) -> Content:
     path = options.labels or source / LABELS_FILE
     known = {picture.name for _, picture in pictures}
     rows = read_labels(path, known) if options.labels or path.is_file() else {}
-    labelled = [
-        (
-            time_ns,
-            LabelledPicture(p, rows[p.name][0].split, rows[p.name])
-            if p.name in rows
-            else LabelledPicture(p),
-        )
-        for time_ns, p in pictures
-    ]
+    labels = {name: (held[0].split, held) for name, held in rows.items()}
+    labelled = [(time_ns, LabelledPicture(p, *labels.get(p.name, ()))) for time_ns, p in pictures]
     states = _load_aideck_labels(source / AIDECK_LABELS_FILE, known)
     if states.keys() - rows.keys() and options.camera is None:
         say(

@@ -78,10 +78,8 @@ class LabelRow:
 
     def to_fields(self) -> dict[str, Any]:
         """Return the fields of a PeerLabel."""
-        point = {
-            name: getattr(self, name)
-            for name in ("peer", *POINT_COLUMNS, "visible_share", "source")
-        }
+        names = ("peer", *POINT_COLUMNS, "visible_share", "source")
+        point = {name: getattr(self, name) for name in names}
         return (
             point
             | dict(zip(SIGMA_COLUMNS, self.sigmas, strict=True))

@@ -145,11 +145,9 @@ def epoch_indices(
     rng = np.random.default_rng([seed, epoch])
     images = images or count
     if shares is None and images == count:
-        return (
-            _shuffle_windows(count, rng)
-            if count > SHUFFLE_WINDOW_IMAGES
-            else rng.permutation(count)
-        )
+        if count > SHUFFLE_WINDOW_IMAGES:
+            return _shuffle_windows(count, rng)
+        return rng.permutation(count)
     shares = np.ones(count) if shares is None else shares
     # Systematic sampling: every image appears floor or ceil of its share, and the sum is exact.
     ticks = np.floor(np.cumsum(shares[rng.permutation(count)]) * images / shares.sum() + 1e-9)

@@ -136,11 +136,8 @@ def _op_from_function(
 def _pool_settings(given: dict[str, Any]) -> dict[str, Any]:
     """Return kernel and stride of a max-pool, and each further setting that is not the default."""
     usual: dict[str, Any] = {"padding": 0, "dilation": 1, "ceil": False}
-    odd = {
-        k: _collapse_pair(v)
-        for k, v in given.items()
-        if k in usual and _collapse_pair(v) != usual[k]
-    }
+    values = {k: _collapse_pair(v) for k, v in given.items() if k in usual}
+    odd = {k: v for k, v in values.items() if v != usual[k]}
     kernel = _collapse_pair(given["kernel"])
     return {"kernel": kernel, "stride": _collapse_pair(given.get("stride") or kernel), **odd}
 

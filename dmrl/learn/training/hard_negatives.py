@@ -47,12 +47,8 @@ def mine_hard_negatives(
     wanted = empty & (before > 0)  # weight 0: excluded from training
     if not wanted.any() or not before[~empty].sum():
         return shares
-    weight = (
-        np.maximum(
-            compute_peak_confidences(network, examples, np.flatnonzero(wanted)), MIN_CONFIDENCE
-        )
-        ** 2
-    )
+    peaks = compute_peak_confidences(network, examples, np.flatnonzero(wanted))
+    weight = np.maximum(peaks, MIN_CONFIDENCE) ** 2
     out = before.copy()
     out[wanted] = hard_share * weight / weight.sum()
     out[~empty] *= (1 - hard_share) / before[~empty].sum()

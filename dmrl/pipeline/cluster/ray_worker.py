@@ -24,16 +24,12 @@ def run_job_here(line: str, folder: str, *, exclusive: bool) -> JobResult:
     """
     begun_s = perf_counter()
     if not Path(folder).is_dir():
-        words = f"{socket.gethostname()} has no folder {folder}"
-        return {
-            "error": f"{words}. Nodes have to see files by the same names",
-            "retry": "elsewhere",
-        }
-    process = (
-        _idle.pop()
-        if _idle and not exclusive
-        else WorkerProcess(worker_environment(exclusive=exclusive), folder)
-    )
+        name = socket.gethostname()
+        words = f"{name} has no folder {folder}. Nodes have to see files by the same names"
+        return {"error": words, "retry": "elsewhere"}
+    environment = worker_environment(exclusive=exclusive)
+    free = bool(_idle) and not exclusive
+    process = _idle.pop() if free else WorkerProcess(environment, folder)
     try:
         answer = process.run_job(line)
     except KeyboardInterrupt:

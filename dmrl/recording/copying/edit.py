@@ -93,11 +93,8 @@ def _warn_about_shared_sensors(one: Path, other: Path) -> None:
 
 def _collect_source_hashes(summary: Summary) -> set[str]:
     """Return the SHA-256 of every direct and indirect input of a recording."""
-    return (
-        {source.sha256 for _, source in summary.provenance.iter_ancestors()}
-        if summary.provenance
-        else set()
-    )
+    made = summary.provenance
+    return {source.sha256 for _, source in made.iter_ancestors()} if made else set()
 
 
 def trim(

@@ -47,12 +47,8 @@ class InterruptedRecording:
         """Raise RecordingError unless it was made with the same settings, inputs and versions."""
         if self.path is None:
             return
-        source_provenance = read_summary(self.path).provenance
-        source = (
-            source_provenance.inputs[0].provenance
-            if source_provenance is not None and source_provenance.inputs
-            else None
-        )
+        known = read_summary(self.path).provenance
+        source = known.inputs[0].provenance if known is not None and known.inputs else None
         # Converted to text and back, as in the file: tuples become lists.
         same = Provenance.from_metadata(made.to_metadata())
         if source is None or source.to_metadata() != same.to_metadata():

@@ -96,10 +96,8 @@ class ChannelRegistry:
         if channel_id in self.written:
             return b""
         self.written.add(channel_id)
-        schema_id, record = (
-            self._channels[channel_id].schema_id,
-            self._records[Opcode.CHANNEL, channel_id],
-        )
+        schema_id = self._channels[channel_id].schema_id
+        record = self._records[Opcode.CHANNEL, channel_id]
         if schema_id in self._written_schemas:
             return record
         self._written_schemas.add(schema_id)

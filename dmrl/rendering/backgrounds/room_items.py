@@ -23,12 +23,8 @@ Item = dict[str, Any]
 def list_items(where: str) -> tuple[Item, ...]:
     """Return the items of a place: wall, flat, standing or small; frequent ones repeatedly."""
     table = tomllib.loads(files(__package__).joinpath("room_items.toml").read_text("utf-8"))
-    return tuple(
-        item
-        for item in table["item"]
-        if item["place"] == where
-        for _ in range(item.get("weight", 1))
-    )
+    items = (item for item in table["item"] if item["place"] == where)
+    return tuple(item for item in items for _ in range(item.get("weight", 1)))
 
 
 def greyish_colour(rng: Generator, low: float, high: float) -> Colour:

@@ -204,11 +204,8 @@ class RoomView:
             outlines = canvas.make_outlines(uv, colours, opacity)
             keys = zip((-item_m).tolist(), nearness, strict=True)
             ahead = (depth.min(axis=1) > NEAREST_M).tolist()
-            yield from (
-                (key, outline)
-                for key, outline, shown in zip(keys, outlines, ahead, strict=True)
-                if shown
-            )
+            drawn = zip(keys, outlines, ahead, strict=True)
+            yield from ((key, outline) for key, outline, shown in drawn if shown)
 
     def _paint_box(self, low: Array, high: Array, surfaces: Sequence[Surface]) -> FloatImage:
         """Return the (H, W, 3) light of the box that surrounds the camera."""
@@ -232,10 +229,8 @@ class RoomView:
                 continue
             mine_rays = [ray[mine] for ray in rays]
             mine_far = far[mine]
-            hit = [
-                np.float32(begin) + mine_far * ray
-                for begin, ray in zip(start, mine_rays, strict=True)
-            ]
+            moves = zip(start, mine_rays, strict=True)
+            hit = [np.float32(begin) + mine_far * ray for begin, ray in moves]
             shine = self._light_on(hit)
             along = [hit[i] for i in range(3) if i != axis]
             for channel, paint in enumerate(_paint_surface(surface, along, mine_far)):

@@ -27,9 +27,8 @@ from dmrl.recording.mcap.message_batch import (
 
 RECORD_HEADER_BYTES = 1 + 8  # opcode, length
 MESSAGE_OPCODE = int(Opcode.MESSAGE)
-MESSAGE_HEADER_BYTES = (
-    MESSAGE_PREFIX_BYTES - RECORD_HEADER_BYTES
-)  # channel id, sequence, log time, publish time
+MESSAGE_HEADER_BYTES = MESSAGE_PREFIX_BYTES - RECORD_HEADER_BYTES
+"""Of channel id, sequence, log time and publish time."""
 MESSAGE_PREFIX_DTYPE = np.dtype(
     [
         ("opcode", "u1"),
@@ -117,11 +116,8 @@ def write_message_prefixes(
         The prefixes are empty: write opcode and length as well.
     """
     at, size = at[:-1], np.diff(at)
-    heads = (
-        np.zeros(len(at), MESSAGE_PREFIX_DTYPE)
-        if fresh
-        else gather(records, MESSAGE_PREFIX_DTYPE, at)
-    )
+    kind = MESSAGE_PREFIX_DTYPE
+    heads = np.zeros(len(at), kind) if fresh else gather(records, kind, at)
     heads["channel"], heads["time"], heads["publish"] = channel_ids, time_ns, publish_ns
     if fresh:
         heads["opcode"], heads["length"] = MESSAGE_OPCODE, size - RECORD_HEADER_BYTES

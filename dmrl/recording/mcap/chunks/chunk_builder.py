@@ -27,12 +27,10 @@ SAMPLE_SHARE, PACKED_SHARE_MAX = 8, 0.95
 
 JPEG and PNG do not get smaller. Chunks of them are stored as they are.
 """
-MESSAGE_PREFIX_STRUCT = struct.Struct(
-    "<BQHIQQ"
-)  # opcode, length, channel, sequence, log and publish time
-PREFIX_BODY_BYTES = (
-    MESSAGE_PREFIX_BYTES - RECORD_HEADER_BYTES
-)  # part of the prefix that the record length counts
+MESSAGE_PREFIX_STRUCT = struct.Struct("<BQHIQQ")
+"""Opcode, length, channel, sequence, log time and publish time."""
+PREFIX_BODY_BYTES = MESSAGE_PREFIX_BYTES - RECORD_HEADER_BYTES
+"""Part of the prefix that the record length counts."""
 
 
 class ChunkBuilder:
