@@ -37,6 +37,9 @@ CONSTANTS = {
     # e-fold of distance; at other confidences by the square of their odds, as counted in flights,
     "EVIDENCE": 50.0,
     "OTHERS": 30.0,  # and at most so many, for the detection may be another robot's
+    # Detections of the leader by those of a false object that stays where the leader is expected:
+    # so many and the squared odds of the confidence. A weak one there tells as much as a miss.
+    "STAYING": 0.5,
     "VIEW": 3.0,  # radians times radians times e-folds of distance in which a network sees
     "ELSEWHERE_SHARE": 0.35,  # of images in which a leader that was lost is detected
     "GATE": 20.0,  # squared residual, in variances, beyond which a detection is another object's
@@ -178,28 +181,32 @@ class OnboardFilter:
         """Use an image: choose the likeliest detection, or count a miss."""
         then = next((one for one in reversed(self.past) if one.time_s >= self.image_s), self.pose)
         share = _K["SEEN_SHARE"] if self._is_in_view(then, age_s) else _K["UNSEEN_SHARE"]
-        miss, elsewhere = 1.0 - share, 1.0 - _K["ELSEWHERE_SHARE"]
-        best, total, sure = None, 0.0, None
-        for found in detections[:DETECTIONS_MAX]:
-            place = self._locate(then, found)
+        miss, total, others = 1.0 - share, 0.0, 0.0
+        best, sure = (miss, -1, (0.0,) * 6, 0.0), -1
+        places = [self._locate(then, found) for found in detections[:DETECTIONS_MAX]]
+        for k, place in enumerate(places):
             candidate = self._compare(place, age_s)
-            evidence = 1.0 / (1.0 / (_K["EVIDENCE"] * place.odds * place.odds) + 1.0 / _K["OTHERS"])
+            square = place.odds * place.odds
+            evidence = 1.0 / (1.0 / (_K["EVIDENCE"] * square) + 1.0 / _K["OTHERS"])
             ratio = share * evidence * candidate[0]
-            total += ratio
-            elsewhere += _K["ELSEWHERE_SHARE"] * evidence / _K["VIEW"]
-            if best is None or ratio > best[0]:
-                best = (ratio, candidate, place, found.confidence)
-            if found.confidence >= _K["FOUND"] and (sure is None or found.confidence > sure[0]):
-                sure = (found.confidence, place)
+            total += min(ratio, share * min(_K["STAYING"] + square, _K["OTHERS"]))
+            others += evidence
+            if ratio > best[0]:
+                best = (ratio, k, candidate, evidence)
+            least = _K["FOUND"] if sure < 0 else detections[sure].confidence + 1
+            sure = k if detections[k].confidence >= least else sure
         # The leader is at its place, or somewhere else in view or out of it.
+        elsewhere = _K["ELSEWHERE_SHARE"] * (others - best[3]) / _K["VIEW"]
+        elsewhere += 1.0 - _K["ELSEWHERE_SHARE"]
         self.odds = min(self.odds * (miss + total) / elsewhere, _K["MAX_ODDS"])
         self.odds = max(self.odds, 0.001)
-        if best is not None and best[0] > miss:
-            self._update(best[1], best[2], age_s, best[0] / (miss + total))
-            self.sure_s = self.image_s if best[3] >= _K["SURE"] else self.sure_s
-        elif self.odds < _K["LOST_ODDS"] and sure is not None:
-            place = sure[1]
+        if self.odds < _K["LOST_ODDS"] and sure >= 0 and sure != best[1]:
+            place = places[sure]
             self._restart(place.x, place.y, place.z, place.along, self.image_s)
+        elif best[1] >= 0:
+            self._update(best[2], places[best[1]], age_s, best[0] / (miss + best[0]))
+            is_sure = detections[best[1]].confidence >= _K["SURE"]
+            self.sure_s = self.image_s if is_sure else self.sure_s
 
     def _is_in_view(self, then: _Pose, age_s: float) -> bool:
         """Return whether the leader is expected in an image taken at a pose."""

@@ -88,6 +88,22 @@ def test_weak_spots_above_or_below_the_leader_are_not_its(v_px: float, depth_m: 
     assert abs(way_m) < 0.3
 
 
+def test_pilot_leaves_a_weak_spot_for_a_sure_leader_elsewhere() -> None:
+    """A weak false object that stays where the leader is expected does not hide the leader."""
+    pilot = Follow(TASK)
+    fly(pilot, [(0.7, 0.0)])
+    commands = []
+    for k in range(30):
+        spot, leader = (
+            observe(1.0 + 0.1 * k, [place], confidence).detections
+            for place, confidence in (((0.75, 0.0), 0.2), ((1.1, -0.4), 0.9))
+        )
+        seen = replace(observe(1.0 + 0.1 * k, []), detections=(*leader, *spot))
+        commands.append(pilot.command(seen))
+    assert abs(commands[0].yaw_rate_radps) < 0.2  # one image is not enough
+    assert commands[-1].yaw_rate_radps < -0.5 and commands[-1].vx_mps > 0.2
+
+
 def test_a_leader_that_is_only_missed_stays_in_view_for_seconds() -> None:
     """A network that sees nothing of a leader ahead must not turn away from it."""
     pilot, yaw_rad, rate = Follow(TASK), 0.0, 0.0

@@ -237,37 +237,41 @@ static void look(pilot_t *p, double age, const pilot_detection_t *found, int cou
     const double ahead = then->c * dx + then->s * dy, aside = then->c * dy - then->s * dx;
     const int in_view = ahead > 0.1 && size_of(aside) < ${IN_VIEW} * ahead;
     const double share = in_view ? ${SEEN_SHARE} : ${UNSEEN_SHARE}, miss = 1.0 - share;
-    double total = 0.0, elsewhere = 1.0 - ${ELSEWHERE_SHARE}, most = 0.0;
+    double total = 0.0, others = 0.0, most = miss, own = 0.0, elsewhere;
     candidate_t best = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     place_t best_at = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0}, sure_at = best_at;
-    int sure = -1, confidence = 0;
+    int sure = -1, chosen = -1;
     for (int k = 0; k < count && k < PILOT_DETECTIONS_MAX; k++) {
         const place_t at = locate(then, &found[k]);
         const candidate_t c = compare(p, &at, age);
-        const double evidence =
-            1.0 / (1.0 / (${EVIDENCE} * at.odds * at.odds) + 1.0 / ${OTHERS});
+        const double square = at.odds * at.odds;
+        const double evidence = 1.0 / (1.0 / (${EVIDENCE} * square) + 1.0 / ${OTHERS});
         const double ratio = share * evidence * c.likelihood;
-        total += ratio;
-        elsewhere += ${ELSEWHERE_SHARE} * evidence / ${VIEW};
+        total += smaller(ratio, share * smaller(${STAYING} + square, ${OTHERS}));
+        others += evidence;
         if (ratio > most) {
             most = ratio;
             best = c;
             best_at = at;
-            confidence = found[k].confidence;
+            own = evidence;
+            chosen = k;
         }
-        if (found[k].confidence >= ${FOUND} && found[k].confidence > sure) {
-            sure = found[k].confidence;
+        if (found[k].confidence >= (sure < 0 ? ${FOUND} : found[sure].confidence + 1)) {
+            sure = k;
             sure_at = at;
         }
     }
+    elsewhere = ${ELSEWHERE_SHARE} * (others - own) / ${VIEW};
+    elsewhere += 1.0 - ${ELSEWHERE_SHARE};
     p->odds = smaller(p->odds * (miss + total) / elsewhere, ${MAX_ODDS});
     p->odds = larger(p->odds, 0.001);
-    if (most > miss) {
-        update(p, &best, &best_at, age, most / (miss + total));
-        if (confidence >= ${SURE})
-            p->sure_s = p->image_s;
-    } else if (p->odds < ${LOST_ODDS} && sure >= 0)
+    if (p->odds < ${LOST_ODDS} && sure >= 0 && sure != chosen)
         restart(p, sure_at.x, sure_at.y, sure_at.z, sure_at.along, p->image_s);
+    else if (chosen >= 0) {
+        update(p, &best, &best_at, age, most / (miss + most));
+        if (found[chosen].confidence >= ${SURE})
+            p->sure_s = p->image_s;
+    }
 }
 
 static void give(pilot_command_t *command, double vx, double vy, double vz, double yaw_rate)
