@@ -43,6 +43,8 @@ MISFIT_MARGIN_S = 30.0
 """Time around a stretch that does not fit that is refused too, seconds: the error bends the
 solution as far as the smoother remembers, 25 s. Chosen on 6 flights with unlisted faults, seed
 62001."""
+CAMERA_SIGNALS = ("bearing", "height")
+"""Signals of an image: where they do not fit, images do not end the error."""
 
 
 MAJORITY_SHARE = 0.5
@@ -183,6 +185,7 @@ def with_status(
     gate: Gate,
     *,
     sighted: bool = False,
+    placed: Mask | None = None,
 ) -> Estimate:
     """Return an estimate with its statuses and, if no position is OK, the reason.
 
@@ -198,13 +201,15 @@ def with_status(
         Gate of the positions.
     sighted
         Whether the observer's camera shows the bearing, whatever the motion.
+    placed
+        As in `list_refused`.
     """
     status = classify_positions(estimate.state, estimate.covariance, gate)
     status = np.maximum(status, silent * np.int8(UNCONVERGED))
     if min(energy) < MIN_MOTION_ENERGY and not sighted:
         status[:] = AMBIGUOUS
     causes = estimate.causes
-    refused = list_refused(estimate)
+    refused = list_refused(estimate, placed)
     status = np.maximum(status, refused * np.int8(UNCONVERGED))
     if not (status == OK).any() and refused.mean() <= MAJORITY_SHARE:
         span = float(estimate.time_s[0]), float(estimate.time_s[-1])
@@ -213,13 +218,26 @@ def with_status(
     return replace(estimate, status=status, causes=causes)
 
 
-def list_refused(estimate: Estimate) -> Mask:
-    """Return (K,) whether a cause refuses the positions."""
-    out = np.zeros(len(estimate.time_s), bool)
+def list_refused(estimate: Estimate, placed: Mask | None = None) -> Mask:
+    """Return (K,) whether a cause refuses the positions.
+
+    Parameters
+    ----------
+    estimate
+        Estimate of a pair.
+    placed
+        (K,) whether a consistent image of either robot is near: the error of another sensor bends
+        the solution no farther. None: nowhere.
+    """
+    time_s, out = estimate.time_s, np.zeros(len(estimate.time_s), bool)
     for cause in estimate.causes:
-        if cause.refuses:
-            around = cause.from_s - MISFIT_MARGIN_S, cause.to_s + MISFIT_MARGIN_S
-            out |= (estimate.time_s >= around[0]) & (estimate.time_s <= around[1])
+        if not cause.refuses:
+            continue
+        from_s, to_s = cause.from_s - MISFIT_MARGIN_S, cause.to_s + MISFIT_MARGIN_S
+        if placed is not None and not cause.name.startswith(CAMERA_SIGNALS):
+            from_s = max([from_s, *time_s[placed & (time_s < cause.from_s)][-1:]])
+            to_s = min([to_s, *time_s[placed & (time_s > cause.to_s)][:1]])
+        out |= (time_s >= from_s) & (time_s <= to_s)
     return out
 
 

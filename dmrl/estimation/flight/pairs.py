@@ -142,7 +142,9 @@ def _explains(pieces: Sequence["Piece"]) -> bool:
     # Noise fits everything badly: a log that is written wrongly is a better explanation.
     if any(piece.noisy.any() for piece in pieces):
         return False
-    refused = np.concatenate([one.silent | list_refused(one.estimate) for one in pieces])
+    refused = np.concatenate(
+        [one.silent | list_refused(one.estimate, np.logical_or(*one.sighted)) for one in pieces]
+    )
     return bool(refused.mean() <= MAJORITY_SHARE)
 
 
@@ -273,15 +275,18 @@ def _both_directions(pair: Pair, pieces: Sequence[Piece], gate: Gate) -> tuple[E
     joined = join_pieces(pieces)
     estimate, far = clip_to_ranges(pair, joined.estimate)
     # Consistent images replace missing ranges; without any range the covariance decides.
-    quiet = range_dropout(pair, estimate.time_s) & ~joined.sighted.any(axis=0)
+    placed = np.logical_or(*joined.sighted)
+    quiet = range_dropout(pair, estimate.time_s) & ~placed
     quiet &= len(pair.range_m) > 0
     floor = joined.silent | quiet | far
     own, peer, relative = joined.energy
     enough = [bool(at.sum() >= MIN_CAMERA_S * OUTPUT_HZ) for at in joined.sighted]
-    return (
-        with_status(estimate, floor, (own, relative), gate, sighted=enough[0]),
-        with_status(seen_from_peer(estimate), floor, (peer, relative), gate, sighted=enough[1]),
+    sides = (estimate, own), (seen_from_peer(estimate), peer)
+    one, other = (
+        with_status(side, floor, (energy, relative), gate, sighted=known, placed=placed)
+        for (side, energy), known in zip(sides, enough, strict=True)
     )
+    return one, other
 
 
 def join_pieces(pieces: Sequence[Piece]) -> Piece:

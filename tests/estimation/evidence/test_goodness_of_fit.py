@@ -147,6 +147,25 @@ def test_no_position_of_a_stretch_that_does_not_fit_is_ok() -> None:
     assert (refused.status == UNCONVERGED).all() and refused.causes == everything.causes
 
 
+@pytest.mark.parametrize(
+    ("signal", "refused"), [("yaw rate", range(38, 53)), ("bearing", range(10, 81))]
+)
+def test_consistent_images_end_the_error_of_another_sensor(signal: str, refused: range) -> None:
+    time_s = np.arange(0.0, 100.0)
+    state = np.tile([2.0, 0.0, 0.0], (100, 1))
+    spread = np.tile(np.diag([1e-4, 1e-4, 1e-4]), (100, 1, 1))
+    cause = Cause(f"{signal} does not fit", 1.0, 40.0, 50.0)
+    none = np.zeros(100, np.int8)
+    given = Estimate(time_s, state, spread, none, np.zeros(0), NoiseModel(), causes=(cause,))
+    # Images inside the stretch, or none at all, end nothing.
+    for placed, expected in (
+        (np.isin(time_s, [5, 38, 45, 52, 90]), refused),
+        (np.isin(time_s, [45]), range(10, 81)),
+    ):
+        out = with_status(given, none.astype(bool), (9.0, 9.0), DEFAULT_GATE, placed=placed)
+        assert np.flatnonzero(out.status == UNCONVERGED).tolist() == list(expected)
+
+
 def test_stretches_apart_stay_apart_and_windows_of_a_flight_are_joined() -> None:
     one, two = Cause("range does not fit", 1.0, 0.0, 5.0), Cause("range does not fit", 1.0, 40, 50)
     assert join_causes([two, one]) == (one, two)
