@@ -201,6 +201,7 @@ def test_commands_of_a_page_run_as_written(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_own_camera_refinement_commands_run_as_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
