@@ -27,9 +27,10 @@ def run_job_here(line: str, folder: str, *, exclusive: bool) -> JobResult:
         name = socket.gethostname()
         words = f"{name} has no folder {folder}. Nodes have to see files by the same names"
         return {"error": words, "retry": "elsewhere"}
-    environment = worker_environment(exclusive=exclusive)
-    free = bool(_idle) and not exclusive
-    process = _idle.pop() if free else WorkerProcess(environment, folder)
+    if _idle and not exclusive:
+        process = _idle.pop()
+    else:
+        process = WorkerProcess(worker_environment(exclusive=exclusive), folder)
     try:
         answer = process.run_job(line)
     except KeyboardInterrupt:
