@@ -87,6 +87,28 @@ class _Place(NamedTuple):
     odds: float
 
 
+class _Residual(NamedTuple):
+    """A detection's place less the leader's, inverse covariance, likelihood by a false one's."""
+
+    x: float
+    y: float
+    ixx: float
+    ixy: float
+    iyy: float
+    likelihood: float
+
+
+class _Candidate(NamedTuple):
+    """A detection that may be the leader's."""
+
+    confidence: int
+    place: _Place
+    residual: _Residual
+    evidence: float  # detections of the leader by false ones of its confidence, anywhere
+    ratio: float  # the same where it is, of the images in which the leader is detected
+    most_ratio: float  # and at most so many, for it may be a false object that stays there
+
+
 @dataclass(slots=True)
 class OnboardFilter:
     """State of the pilot; see `step`.
@@ -182,31 +204,35 @@ class OnboardFilter:
         then = next((one for one in reversed(self.past) if one.time_s >= self.image_s), self.pose)
         share = _K["SEEN_SHARE"] if self._is_in_view(then, age_s) else _K["UNSEEN_SHARE"]
         miss, total, others = 1.0 - share, 0.0, 0.0
-        best, sure = (miss, -1, (0.0,) * 6, 0.0), -1
-        places = [self._locate(then, found) for found in detections[:DETECTIONS_MAX]]
-        for k, place in enumerate(places):
-            candidate = self._compare(place, age_s)
-            square = place.odds * place.odds
-            evidence = 1.0 / (1.0 / (_K["EVIDENCE"] * square) + 1.0 / _K["OTHERS"])
-            ratio = share * evidence * candidate[0]
-            total += min(ratio, share * min(_K["STAYING"] + square, _K["OTHERS"]))
-            others += evidence
-            if ratio > best[0]:
-                best = (ratio, k, candidate, evidence)
-            least = _K["FOUND"] if sure < 0 else detections[sure].confidence + 1
-            sure = k if detections[k].confidence >= least else sure
+        found = [self._weigh(then, one, age_s, share) for one in detections[:DETECTIONS_MAX]]
+        for one in found:
+            total += min(one.ratio, one.most_ratio)
+            others += one.evidence
+        likely = [one for one in found if one.ratio > miss]
+        best = max(likely, key=lambda one: one.ratio, default=None)
         # The leader is at its place, or somewhere else in view or out of it.
-        elsewhere = _K["ELSEWHERE_SHARE"] * (others - best[3]) / _K["VIEW"]
+        elsewhere = _K["ELSEWHERE_SHARE"] * (others - (best.evidence if best else 0.0)) / _K["VIEW"]
         elsewhere += 1.0 - _K["ELSEWHERE_SHARE"]
         self.odds = min(self.odds * (miss + total) / elsewhere, _K["MAX_ODDS"])
         self.odds = max(self.odds, 0.001)
-        if self.odds < _K["LOST_ODDS"] and sure >= 0 and sure != best[1]:
-            place = places[sure]
+        clear = [one for one in found if one.confidence >= _K["FOUND"]]
+        clearest = max(clear, key=lambda one: one.confidence, default=None)
+        if self.odds < _K["LOST_ODDS"] and clearest and clearest is not best:
+            place = clearest.place
             self._restart(place.x, place.y, place.z, place.along, self.image_s)
-        elif best[1] >= 0:
-            self._update(best[2], places[best[1]], age_s, best[0] / (miss + best[0]))
-            is_sure = detections[best[1]].confidence >= _K["SURE"]
-            self.sure_s = self.image_s if is_sure else self.sure_s
+        elif best:
+            self._update(best, age_s, best.ratio / (miss + best.ratio))
+            self.sure_s = self.image_s if best.confidence >= _K["SURE"] else self.sure_s
+
+    def _weigh(self, then: _Pose, found: RawDetection, age_s: float, share: float) -> _Candidate:
+        """Return how likely a detection is that of a leader seen in a share of images."""
+        place = self._locate(then, found)
+        residual = self._compare(place, age_s)
+        square = place.odds * place.odds
+        evidence = 1.0 / (1.0 / (_K["EVIDENCE"] * square) + 1.0 / _K["OTHERS"])
+        ratio = share * evidence * residual.likelihood
+        most_ratio = share * min(_K["STAYING"] + square, _K["OTHERS"])
+        return _Candidate(found.confidence, place, residual, evidence, ratio, most_ratio)
 
     def _is_in_view(self, then: _Pose, age_s: float) -> bool:
         """Return whether the leader is expected in an image taken at a pose."""
@@ -235,10 +261,8 @@ class OnboardFilter:
         variances = along * along, across * across, across * across + up * up
         return _Place(x, y, z, *variances, to_x, to_y, away, p / (1.0 - p))
 
-    def _compare(
-        self, place: _Place, age_s: float
-    ) -> tuple[float, float, float, float, float, float]:
-        """Return the likelihood of a place by that of a false one, residual, inverse covariance."""
+    def _compare(self, place: _Place, age_s: float) -> _Residual:
+        """Return the residual of a place."""
         x, y, z, along, across, upward, to_x, to_y, away, _ = place
         m, p = self.mean, self.covariance
         rx, ry = x - (m[0] - age_s * m[2]), y - (m[1] - age_s * m[3])
@@ -257,20 +281,17 @@ class OnboardFilter:
         density = 1.0 / (15.749609945722419 * root(det * szz) * near * near * near)
         # False detections are as frequent in every direction and e-fold of distance.
         ratio = density * away * away * away
-        return (0.0 if squared > _K["GATE"] else ratio), rx, ry, ixx, ixy, iyy
+        return _Residual(rx, ry, ixx, ixy, iyy, 0.0 if squared > _K["GATE"] else ratio)
 
-    def _update(
-        self, candidate: tuple[float, ...], place: _Place, age_s: float, weight: float
-    ) -> None:
+    def _update(self, found: _Candidate, age_s: float, weight: float) -> None:
         """Move by the residual, as far as the detection is probably the leader's."""
-        _, rx, ry, ixx, ixy, iyy = candidate
-        p = self.covariance
+        place, residual, p = found.place, found.residual, self.covariance
         # Columns of the covariance of state and measurement, then the gain.
         hx = [p[i][0] - age_s * p[i][2] for i in range(4)]
         hy = [p[i][1] - age_s * p[i][3] for i in range(4)]
-        kx = [weight * (hx[i] * ixx + hy[i] * ixy) for i in range(4)]
-        ky = [weight * (hx[i] * ixy + hy[i] * iyy) for i in range(4)]
-        self.mean = [self.mean[i] + (kx[i] * rx + ky[i] * ry) for i in range(4)]
+        kx = [weight * (hx[i] * residual.ixx + hy[i] * residual.ixy) for i in range(4)]
+        ky = [weight * (hx[i] * residual.ixy + hy[i] * residual.iyy) for i in range(4)]
+        self.mean = [self.mean[i] + (kx[i] * residual.x + ky[i] * residual.y) for i in range(4)]
         self.covariance = [
             [p[i][j] - (kx[i] * hx[j] + ky[i] * hy[j]) for j in range(4)] for i in range(4)
         ]
