@@ -12,6 +12,7 @@ from dmrl.estimation.search.pair_filter import (
     build_inputs,
     run_lanes,
     smooth_rts,
+    trace_lanes,
 )
 from dmrl.estimation.solver.problem import Problem
 
@@ -130,11 +131,11 @@ def _select_hypotheses(
     count = BEARING_COUNT * HEADING_COUNT
     begun = np.concatenate([circles[s] for s in start_of])
     lane_of = np.repeat(np.arange(len(lanes)), count)
-    run = run_lanes(inputs, lanes, begun, lane_of, steps, smoothed=False)
-    score = run.log_likelihood.sum(axis=0).reshape(len(lanes), count)
+    paths = trace_lanes(inputs, lanes, begun, lane_of, steps)
+    score = paths.log_likelihood.sum(axis=0).reshape(len(lanes), count)
     ends = np.stack(
         [
-            run.state[min(steps, len(lane.keyframe)) - 1, k * count : (k + 1) * count, :3]
+            paths.state[min(steps, len(lane.keyframe)) - 1, k * count : (k + 1) * count, :3]
             for k, lane in enumerate(lanes)
         ]
     )

@@ -5,8 +5,9 @@ rates. A lane is one run through the flight from a start in either direction; hy
 lanes run side by side.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,21 +69,29 @@ class FilterInputs:
     images: dict[int, list[tuple[float, Array, Array]]]
 
 
-@dataclass(frozen=True, slots=True)
-class FilterRun:
-    """Run of B filters over T keyframes.
+class FilterPaths(NamedTuple):
+    """Paths of B filters over T keyframes.
 
-    ``state``, ``covariance`` (T, B, ...) after the update, ``prior``, ``prior_covariance`` before,
-    ``step`` (T, B, 5, 5) Jacobian to the next keyframe, ``log_likelihood`` (T, B) of each
-    keyframe's measurements.
+    ``state`` (T, B, 5) after the update, ``log_likelihood`` (T, B) of each keyframe's measurements.
     """
 
     state: Array
+    log_likelihood: Array
+
+
+class FilterRun(NamedTuple):
+    """Run of B filters over T keyframes, or at one of them, with what smoothing needs.
+
+    ``state``, ``log_likelihood`` as in `FilterPaths`, ``covariance`` (T, B, 5, 5) after the update,
+    ``prior``, ``prior_covariance`` before, ``step`` (T, B, 5, 5) Jacobian from the keyframe before.
+    """
+
+    state: Array
+    log_likelihood: Array
     covariance: Array
     prior: Array
     prior_covariance: Array
     step: Array
-    log_likelihood: Array
 
 
 def build_inputs(problem: Problem, range_excess_m: float = 0.0) -> FilterInputs:
@@ -139,13 +148,7 @@ def _select_images(views: Sequence[CameraView]) -> dict[int, list[tuple[float, A
 
 
 def run_lanes(
-    inputs: FilterInputs,
-    lanes: Sequence[Lane],
-    start: Array,
-    lane_of: NDArray[np.intp],
-    steps: int,
-    *,
-    smoothed: bool = True,
+    inputs: FilterInputs, lanes: Sequence[Lane], start: Array, lane_of: NDArray[np.intp], steps: int
 ) -> FilterRun:
     """Run B filters side by side, each along its lane, for a number of keyframes at most.
 
@@ -161,40 +164,52 @@ def run_lanes(
         (B,) index of each filter's lane.
     steps
         Largest number of keyframes. A lane that ends before waits.
-    smoothed
-        Whether the run is smoothed afterwards. Otherwise it holds states and likelihoods alone.
     """
-    count, filters = min(steps, max(len(lane.keyframe) for lane in lanes)), len(start)
-    state = np.zeros((filters, SIZE))
+    count = min(steps, max(len(lane.keyframe) for lane in lanes))
+    return FilterRun(*_stack(_iter_keyframes(inputs, lanes, start, lane_of, count), count))
+
+
+def trace_lanes(
+    inputs: FilterInputs, lanes: Sequence[Lane], start: Array, lane_of: NDArray[np.intp], steps: int
+) -> FilterPaths:
+    """Run filters as `run_lanes` does, without the memory that smoothing takes."""
+    count = min(steps, max(len(lane.keyframe) for lane in lanes))
+    every = _iter_keyframes(inputs, lanes, start, lane_of, count)
+    return FilterPaths(*_stack(((one.state, one.log_likelihood) for one in every), count))
+
+
+def _stack(rows: Iterable[Sequence[Array]], count: int) -> list[Array]:
+    """Stack the arrays of a number of rows, and hold one row at a time."""
+    out: list[Array] = []
+    for t, row in enumerate(rows):
+        out = out or [np.empty((count, *array.shape)) for array in row]
+        for stacked, array in zip(out, row, strict=True):
+            stacked[t] = array
+    return out
+
+
+def _iter_keyframes(
+    inputs: FilterInputs, lanes: Sequence[Lane], start: Array, lane_of: NDArray[np.intp], count: int
+) -> Iterator[FilterRun]:
+    """Yield the filters at each of a number of keyframes: arrays without the axis of time."""
+    state, step = np.zeros((len(start), SIZE)), np.zeros((len(start), SIZE, SIZE))
     state[:, :3] = start
-    covariance = np.broadcast_to(np.diag(HYPOTHESIS_STD**2), (filters, SIZE, SIZE)).copy()
-    held, square = count * smoothed, (filters, SIZE, SIZE)
-    out = FilterRun(*(np.zeros(shape) for shape in (
-        (count, filters, SIZE), (held, *square), (held, filters, SIZE), (held, *square),
-        (held, *square), (count, filters),
-    )))  # fmt: skip
+    covariance = np.broadcast_to(np.diag(HYPOTHESIS_STD**2), step.shape).copy()
     keys = np.stack([_pad_with_none(lane.keyframe, count) for lane in lanes])
     motions = _list_motions(inputs, keys)
     columns = [np.flatnonzero(lane_of == number) for number in range(len(lanes))]
     for t in range(count):
-        if smoothed:
-            out.prior[t], out.prior_covariance[t] = state, covariance
-        key = keys[lane_of, t]
-        alive = key >= 0
-        _update_ranges(state, covariance, inputs, np.where(alive, key, 0), alive, out, t)
-        for number, mine in enumerate(columns):
-            for image in inputs.images.get(int(keys[number, t]), ()):
-                _update_image(state, covariance, inputs, int(keys[number, t]), mine, image, out, t)
-        out.state[t] = state
-        if smoothed:
-            out.covariance[t] = covariance
-        if t < count - 1:
-            state, step = _propagate(state, motions, lane_of, t)
-            if smoothed:
-                out.step[t] = step
+        if t > 0:
+            state, step = _propagate(state, motions, lane_of, t - 1)
             covariance = step @ covariance @ step.swapaxes(1, 2)
-            covariance[:, range(SIZE), range(SIZE)] += motions.variance[lane_of, t]
-    return out
+            covariance[:, range(SIZE), range(SIZE)] += motions.variance[lane_of, t - 1]
+        prior = state.copy(), covariance.copy()
+        filters = FilterRun(state, np.zeros(len(start)), covariance, *prior, step)
+        _update_ranges(filters, inputs, keys[lane_of, t])
+        for key, mine in zip(keys[:, t].tolist(), columns, strict=True):
+            for image in inputs.images.get(key, ()):
+                _update_image(filters, mine, image, float(inputs.height_m[key]))
+        yield filters
 
 
 def _pad_with_none(keyframe: NDArray[np.intp], count: int) -> NDArray[np.intp]:
@@ -254,16 +269,10 @@ def _propagate(
     return out, jacobian
 
 
-def _update_ranges(
-    state: Array,
-    covariance: Array,
-    inputs: FilterInputs,
-    key: NDArray[np.intp],
-    alive: NDArray[np.bool_],
-    out: FilterRun,
-    t: int,
-) -> None:
-    """Update the filters with the ranges of their keyframes, in place."""
+def _update_ranges(filters: FilterRun, inputs: FilterInputs, keys: NDArray[np.intp]) -> None:
+    """Update filters with the ranges of their (B,) keyframes, -1 after the end, in place."""
+    state, log_likelihood, covariance = filters[:3]
+    alive, key = keys >= 0, np.maximum(keys, 0)
     measured, variance = inputs.range_m[key], inputs.range_var[key]
     seen = alive & np.isfinite(measured)
     variance = np.where(seen, variance, 1.0)
@@ -273,7 +282,7 @@ def _update_ranges(
     spread = np.einsum("bi,bi->b", towards, cross[:, :2]) + variance
     innovation = np.where(seen, measured - expected, 0.0)
     size = np.abs(innovation) / np.sqrt(spread)
-    out.log_likelihood[t] -= seen * (0.5 * np.log(spread) + np.log1p(0.5 * size**2))
+    log_likelihood -= seen * (0.5 * np.log(spread) + np.log1p(0.5 * size**2))
     # A large innovation counts as a noisy range.
     spread += variance * (np.maximum(1.0, size / SOFT_SIGMAS) ** 2 - 1)
     gain = np.where(seen, 1 / spread, 0.0)[:, None] * cross
@@ -282,22 +291,19 @@ def _update_ranges(
 
 
 def _update_image(
-    state: Array,
-    covariance: Array,
-    inputs: FilterInputs,
-    key: int,
+    filters: FilterRun,
     mine: NDArray[np.intp],
     image: tuple[float, Array, Array],
-    out: FilterRun,
-    t: int,
+    height_m: float,
 ) -> None:
     """Update some filters with the candidate nearest to each, in place. The azimuth alone counts.
 
     A filter far from every candidate stays as it is.
     """
+    state, log_likelihood, covariance = filters[:3]
     sign, bearing, std = image
     x, y = sign * state[mine, :2].T
-    up = sign * inputs.height_m[key]
+    up = sign * height_m
     level2 = np.maximum(x * x + y * y, 1e-4)
     turned = sign < 0
     polar = np.column_stack(
@@ -317,11 +323,11 @@ def _update_image(
     spread = spread + std**2
     off = subtract_bearings(bearing, polar[:, None])
     squared = (off**2 / spread).sum(axis=2)
-    nearest, filters = squared.argmin(axis=1), np.arange(len(mine))
-    least, variance = squared[filters, nearest], spread[filters, nearest, 0]
-    out.log_likelihood[t, mine] -= 0.5 * np.log(variance) + np.log1p(0.5 * least)
+    nearest, each = squared.argmin(axis=1), np.arange(len(mine))
+    least, variance = squared[each, nearest], spread[each, nearest, 0]
+    log_likelihood[mine] -= 0.5 * np.log(variance) + np.log1p(0.5 * least)
     gain = np.where(least < IMAGE_GATE, 1 / variance, 0.0)[:, None] * cross
-    state[mine] += gain * off[filters, nearest, :1]
+    state[mine] += gain * off[each, nearest, :1]
     covariance[mine] -= gain[:, :, None] * cross[:, None, :]
 
 
@@ -332,5 +338,5 @@ def smooth_rts(run: FilterRun) -> Array:
         back = np.linalg.solve(
             run.prior_covariance[t + 1], (state[t + 1] - run.prior[t + 1])[..., None]
         )
-        state[t] += (run.covariance[t] @ run.step[t].swapaxes(1, 2) @ back)[..., 0]
+        state[t] += (run.covariance[t] @ run.step[t + 1].swapaxes(1, 2) @ back)[..., 0]
     return state
