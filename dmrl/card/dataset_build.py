@@ -124,14 +124,11 @@ def _write_part(
         raise SettingError(f"{recordings[0]} has no masks; renders have. Leave out --masks")
     made = _provenance(recordings, settings)
     known, held = _read_labels(recordings, settings)
-    sources = {path: one.source for path, one in known.items()}
-    if settings.labels in ("auto", "best"):
-        warn_about_other_sources(sources, {path: one.others for path, one in known.items()})
-    warn_about_lenses([px for one in known.values() for px in one.focal_px])
+    _warn_about_labels(known, settings)
     tally, seen = ExclusionCounts(), ImageHashes(before.load_image_hashes())
     found = iter_rows(
         held,
-        sources,
+        {path: one.source for path, one in known.items()},
         _assign_splits(known, made, settings, before),
         tally,
         _select_images(settings),
@@ -149,16 +146,33 @@ def _write_part(
     manifest = before.manifest.with_part(shards)
     report_left_out(recordings, manifest, tally, settings)
     warn_about_unused_flags(settings, tally)
-    place = part_folder(folder, before.manifest.parts)
-    place.mkdir(parents=True)
-    made.write(place)
-    build_facts(known, tally, seen).write(place)
-    seen.write(place)
+    _write_documents(part_folder(folder, before.manifest.parts), made, known, tally, seen)
     manifest.write(folder)  # last: from here on the part belongs to the dataset
     images = {
         name: sum(one.rows for one in shards[name]) for name in manifest.splits if name in shards
     }
-    return Written(images, {path.name: source for path, source in sources.items()}, tally)
+    return Written(images, {path.name: one.source for path, one in known.items()}, tally)
+
+
+def _warn_about_labels(known: Mapping[Path, RecordingFacts], settings: Settings) -> None:
+    if settings.labels in ("auto", "best"):
+        sources = {path: one.source for path, one in known.items()}
+        warn_about_other_sources(sources, {path: one.others for path, one in known.items()})
+    warn_about_lenses([px for one in known.values() for px in one.focal_px])
+
+
+def _write_documents(
+    place: Path,
+    made: Provenance,
+    known: Mapping[Path, RecordingFacts],
+    tally: ExclusionCounts,
+    seen: ImageHashes,
+) -> None:
+    """Write the provenance, the facts and the hashes of a part."""
+    place.mkdir(parents=True)
+    made.write(place)
+    build_facts(known, tally, seen).write(place)
+    seen.write(place)
 
 
 def _assign_splits(

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from dmrl.atomic_output import atomic_folder, refuse_existing, to_partial_path
 from dmrl.datasets import Split, open_dataset
@@ -21,7 +20,7 @@ from dmrl.recording import build_provenance
 from dmrl.terminal.progress import track
 
 with optional_imports("train", "dmrl train"):
-    from dmrl.datasets.training_examples import load_training_data
+    from dmrl.datasets.training_examples import TrainingData, load_training_data
     from dmrl.learn.data.batches import ROBOT_FIELDS, ExampleSet
     from dmrl.learn.inference.confidence_calibration import (
         PlattScaling,
@@ -144,6 +143,12 @@ class Given(NamedTuple):
     teacher: Path | None
     unlabelled: UnlabelledImages | None
 
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Files and folders of all of them."""
+        models = (path for path in (self.init, self.teacher) if path)
+        return (*models, *(self.unlabelled.paths if self.unlabelled else ()))
+
 
 def _train_in_process(
     dataset: Path,
@@ -159,25 +164,22 @@ def _train_in_process(
         refuse_existing(out)
         _refuse_unfinished(to_partial_path(out), resume=resume)
     data = open_dataset(dataset)
-    train = data.split("train")
-    examples, held_out, shares, sources = load_training_data(data, settings)
-    network = _build_network(settings, examples, given.init)
+    train, loaded = data.split("train"), load_training_data(data, settings)
+    network = _build_network(settings, loaded.examples, given.init)
     first = {name: value.clone() for name, value in get_weights(network).items()}
     teacher = _load_teacher(given.teacher, network) if given.teacher else None
-    models = [path for path in (given.init, given.teacher) if path]
-    inputs = [dataset, *models, *(given.unlabelled.paths if given.unlabelled else ())]
+    inputs = [dataset, *given.paths]
     made = build_provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
-    identity = " ".join(source.sha256 for source in made.inputs)
     mine = atomic_folder(out, keep_on_error=True, resume=resume)
     with mine if group.is_main else nullcontext(to_partial_path(out)) as folder:
         training = Trainer(
             network,
-            examples,
+            loaded.examples,
             settings,
             folder,
-            validation=held_out,
-            shares=shares,
-            identity=identity,
+            validation=loaded.held_out,
+            shares=loaded.shares,
+            identity=" ".join(source.sha256 for source in made.inputs),
             teacher=teacher,
             unlabelled=given.unlabelled,
             group=group,
@@ -185,11 +187,10 @@ def _train_in_process(
         )
         if group.is_main:
             made.write(folder)
-        result = _run_steps(training, settings, len(examples), group)
+        result = _run_steps(training, settings, len(loaded.examples), group)
         if group.is_main:
             interpolate_weights(training.network, first, settings.init_share)
-            judged = _calibrate(training.network, held_out, sources, settings)
-            save_model(_to_model(training, settings, train, len(examples), judged), folder)
+            _write_model(training, settings, train, loaded, folder)
             remove_checkpoint(folder)
     return result
 
@@ -217,17 +218,13 @@ class Calibrated(NamedTuple):
     promise: dict[str, Any] | None = None
 
 
-def _calibrate(
-    network: Network,
-    held_out: ExampleSet | None,
-    sources: NDArray[np.int64] | None,
-    settings: TrainConfig,
-) -> Calibrated:
+def _calibrate(network: Network, loaded: TrainingData, settings: TrainConfig) -> Calibrated:
     """Calibrate the network on the images held out, and choose its threshold there."""
+    held_out = loaded.held_out
     if held_out is None:
         return Calibrated(_or_published(settings.threshold), None, None)
     scored = score_examples(network, held_out)
-    found = fit_calibration(scored, sources)
+    found = fit_calibration(scored, loaded.sources)
     if found is not None and apply_calibration(network, found):
         scored = score_examples(network, held_out)
     else:
@@ -309,13 +306,15 @@ def _run_steps(
     return Result(images, loss, seconds, seen / seconds)
 
 
-def _to_model(
-    training: Trainer, settings: TrainConfig, train: Split, images: int, judged: Calibrated
-) -> Model:
+def _write_model(
+    training: Trainer, settings: TrainConfig, train: Split, loaded: TrainingData, folder: Path
+) -> None:
+    """Calibrate the trained network, and write it with what is known of it."""
+    judged = _calibrate(training.network, loaded, settings)
     height_px, width_px = train.image_shape
     peers = pc.list_flatten(train.table.column("peers"))
     sources = pc.unique(pc.struct_field(peers, "source")).to_pylist()
-    return Model(
+    model = Model(
         training.network,
         settings.architecture,
         width_px=width_px,
@@ -324,10 +323,11 @@ def _to_model(
         label_source=", ".join(sorted(sources)),
         rates=judged.rates,
         training={
-            "images": images,
+            "images": len(loaded.examples),
             "calibration": judged.calibration and judged.calibration._asdict(),
             "threshold": judged.promise,
             "settings": asdict(settings),
             "history": training.history,
         },
     )
+    save_model(model, folder)

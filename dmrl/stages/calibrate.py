@@ -101,17 +101,30 @@ def run(
         If ``out`` exists.
     """
     with optional_imports("calibrate", "dmrl calibrate"):
-        from dmrl.labelling.calibration.board import calibrate_by_board
-        from dmrl.labelling.calibration.flights import calibrate_by_flights
         from dmrl.labelling.sensor_file import write_sensors
     from dmrl.geometry.camera_file import format_camera
 
     refuse_existing(out)
-    if settings.sensors:
-        if settings.board is not None:
-            raise SettingError("--sensors and --board cannot be combined. Run one after the other")
-        result = _calibrate_sensors(sources, workers)
+    if not settings.sensors:
+        result = _calibrate_camera(sources, settings)
     elif settings.board is None:
+        result = _calibrate_sensors(sources, workers)
+    else:
+        raise SettingError("--sensors and --board cannot be combined. Run one after the other")
+    with atomic_file(out) as partial:
+        text = format_camera(result.camera) if result.camera else ""
+        text = write_sensors(result.sensors) if result.sensors else text
+        partial.write_text(text, encoding="utf-8")
+    return result
+
+
+def _calibrate_camera(sources: list[Path], settings: Settings) -> Result:
+    """Calibrate a camera, by a board if the settings have one, else by flights."""
+    with optional_imports("calibrate", "dmrl calibrate"):
+        from dmrl.labelling.calibration.board import calibrate_by_board
+        from dmrl.labelling.calibration.flights import calibrate_by_flights
+
+    if settings.board is None:
         if folder := next((source for source in sources if source.is_dir()), None):
             raise SettingError(f"{folder} is a folder. Name its board's inner corners: --board 9x6")
         camera, figures = calibrate_by_flights(
@@ -122,19 +135,13 @@ def run(
             threshold=settings.threshold,
             noise=Noise(settings.pixel_std_px, settings.attitude_std_rad),
         )
-        result = Result(camera, None, figures)
     elif len(sources) > 1:
         raise SettingError(f"--board takes one source, not {len(sources)}. Put all in one folder")
     else:
         camera, figures = calibrate_by_board(
             sources[0], settings.board, robot=settings.robot, every=settings.every
         )
-        result = Result(camera, None, figures)
-    with atomic_file(out) as partial:
-        text = format_camera(result.camera) if result.camera else ""
-        text = write_sensors(result.sensors) if result.sensors else text
-        partial.write_text(text, encoding="utf-8")
-    return result
+    return Result(camera, None, figures)
 
 
 def _calibrate_sensors(sources: list[Path], workers: int) -> Result:

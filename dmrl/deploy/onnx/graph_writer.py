@@ -105,27 +105,14 @@ def build_float_onnx(
         Rows and columns of the output.
     """
     out = _OnnxWriter()
-    planes = out.add_node("Transpose", [INPUT_NAME], "planes", perm=[0, 3, 1, 2])
-    pixels = out.add_node("Cast", [planes], "pixels", to=TensorProto.FLOAT)
-    zero = out.add_constant("pixel_zero", np.array(PIXEL_ZERO, np.float32))
-    centred = out.add_node("Sub", [pixels, zero], "pixels_centred")
-    tensors = [centred]
-    if not _can_fold_input_scale(graph):
-        scale = out.add_constant("pixel_scale", np.array(1 / PIXEL_ZERO, np.float32))
-        tensors = [out.add_node("Mul", [centred, scale], "input")]
+    folded = _can_fold_input_scale(graph)
+    tensors = [_add_pixels(out, scaled=not folded)]
     for layer in graph.layers:
         inputs = [tensors[k] for k in layer.sources]
         name = f"{layer.name}.sum" if layer.relu else layer.name
         if isinstance(layer, FloatConv):
-            weights = layer.weight.astype(np.float32)
-            if inputs[0] == centred:
-                weights /= np.float32(PIXEL_ZERO)  # a power of two: bit-identical to scaled pixels
-            weight = out.add_constant(f"{layer.name}.weight", weights)
-            bias = out.add_constant(f"{layer.name}.bias", layer.bias.astype(np.float32))
-            value = f"{name}.conv" if inputs[1:] else name
-            out.add_node("Conv", [inputs[0], weight, bias], value, **_conv_attributes(layer))
-            if inputs[1:]:
-                value = out.add_node("Add", [value, inputs[1]], name)
+            unscaled = folded and layer.sources[0] == 0
+            value = _add_float_convolution(out, layer, inputs, name, unscaled=unscaled)
         elif isinstance(layer, FloatAdd):
             value = out.add_node("Add", inputs, name)
         else:
@@ -140,6 +127,33 @@ def build_float_onnx(
             )
     image = (*size_px, graph.channels)
     return out.serialize_model("float", image, dict.fromkeys(names.values(), grid_shape))
+
+
+def _add_pixels(out: _OnnxWriter, *, scaled: bool) -> str:
+    """Add the pixels around 0, scaled to -1 to 1 if wanted."""
+    planes = out.add_node("Transpose", [INPUT_NAME], "planes", perm=[0, 3, 1, 2])
+    pixels = out.add_node("Cast", [planes], "pixels", to=TensorProto.FLOAT)
+    zero = out.add_constant("pixel_zero", np.array(PIXEL_ZERO, np.float32))
+    centred = out.add_node("Sub", [pixels, zero], "pixels_centred")
+    if not scaled:
+        return centred
+    scale = out.add_constant("pixel_scale", np.array(1 / PIXEL_ZERO, np.float32))
+    return out.add_node("Mul", [centred, scale], "input")
+
+
+def _add_float_convolution(
+    out: _OnnxWriter, layer: FloatConv, inputs: Sequence[str], name: str, *, unscaled: bool
+) -> str:
+    """Add a convolution with its optional shortcut; its weights scale pixels that are not."""
+    weights = layer.weight.astype(np.float32)
+    if unscaled:
+        weights /= np.float32(PIXEL_ZERO)  # a power of two: bit-identical to scaled pixels
+    weight = out.add_constant(f"{layer.name}.weight", weights)
+    bias = out.add_constant(f"{layer.name}.bias", layer.bias.astype(np.float32))
+    source, *shortcut = inputs
+    value = f"{name}.conv" if shortcut else name
+    out.add_node("Conv", [source, weight, bias], value, **_conv_attributes(layer))
+    return out.add_node("Add", [value, shortcut[0]], name) if shortcut else value
 
 
 def _can_fold_input_scale(graph: FloatGraph) -> bool:

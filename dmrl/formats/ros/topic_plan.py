@@ -102,10 +102,7 @@ def plan_topics(
     SettingError
         If ``names`` gives a topic of dmrl's for one of another content.
     """
-    for topic, kind, _ in held:
-        wanted = options.names.get(topic, "")
-        if "/" in wanted and not any(topics.parse_topic(t, wanted) for t in TARGETS.get(kind, ())):
-            raise SettingError(f"--names {topic}={wanted}: {kind} is not converted to {wanted}")
+    _check_names(held, options)
     names = _TopicNames([topic for topic, kind, _ in held if kind in CONVERTERS], options)
     lines: dict[tuple[str, str], TopicPlan] = {}
     why: dict[tuple[str, str], str] = {}
@@ -129,6 +126,24 @@ def plan_topics(
             captured = bool(MOTION_CAPTURE.search(options.names.get(topic, topic)))
             robot = names.find_robot(topic)
             lines[topic, kind] = TopicPlan(topic, kind, count, robot, captured=captured)
+    removed = _remove_depths_and_doubles(lines, options, is_camera)
+    return lines, why | removed
+
+
+def _check_names(held: Held, options: Options) -> None:
+    for topic, kind, _ in held:
+        wanted = options.names.get(topic, "")
+        if "/" in wanted and not any(topics.parse_topic(t, wanted) for t in TARGETS.get(kind, ())):
+            raise SettingError(f"--names {topic}={wanted}: {kind} is not converted to {wanted}")
+
+
+def _remove_depths_and_doubles(
+    lines: dict[tuple[str, str], TopicPlan],
+    options: Options,
+    is_camera: Callable[[str, str], bool],
+) -> dict[tuple[str, str], str]:
+    """Remove depths and doubles of other topics from the lines, and return why."""
+    why = {}
     for line in [one for one in lines.values() if _is_depth(one, options, is_camera)]:
         del lines[line.topic, line.kind]
         choice = f"--names {line.topic}={topics.CAMERA_IMAGE(line.robot)} takes it as images"
@@ -136,7 +151,7 @@ def plan_topics(
     for line, better in _find_doubles(lines, options, is_camera):
         del lines[line.topic, line.kind]
         why[line.topic, line.kind] = f"another topic has this of {line.robot}, {better.topic}"
-    return lines, why
+    return why
 
 
 def _is_depth(line: TopicPlan, options: Options, is_camera: Callable[[str, str], bool]) -> bool:
