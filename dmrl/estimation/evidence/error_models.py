@@ -61,11 +61,6 @@ class ErrorModel:
     for_a_while: bool = False
     log_odds: float = RARE
 
-    @property
-    def adds_constants(self) -> bool:
-        """Whether it adds unknowns, all of them constants."""
-        return bool(self.rows) and all(row.is_constant for row in self.rows)
-
     def owners(self) -> tuple[int | None, ...]:
         """Return the robots of a pair whose sensor it may be; None: the pair's."""
         if self.flow_factor != 1.0 or self.for_a_while:

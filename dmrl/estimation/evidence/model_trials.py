@@ -6,7 +6,6 @@ scored by one linearization.
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -175,21 +174,20 @@ def _score_unknowns(base: Member, candidates: Sequence[Candidate]) -> dict[Candi
             price[factor.column] = factor.log_std
         elif isinstance(factor, ConstantPrior):
             price[width:] = np.log(factor.std)
-    every = tuple(range(len(layout.constants)))
-    eliminate = lru_cache(1)(lambda *at: eliminate_states(equations.select(*at)))
+    every, columns = tuple(range(len(layout.constants))), layout.subjects().items()
+    own_states = tuple(column for subject, column in columns if subject in own and column < width)
+    shared = eliminate_states(equations.select(own_states, every))
 
     def evidence(names: Collection[Subject]) -> float:
-        used = [column for subject, column in layout.subjects().items() if subject in names]
+        used = [column for subject, column in columns if subject in names]
         states = tuple(column for column in used if column < width)
-        constants = tuple(column - width for column in used if column >= width)
-        shared = len(states) == base.solver.layout.width
-        left = eliminate(states, every if shared else constants)
-        at = constants if shared else every[: len(constants)]
+        left, at = shared, tuple(column - width for column in used if column >= width)
+        if states != own_states:
+            left, at = eliminate_states(equations.select(states, at)), every[: len(at)]
         return left.step_evidence(at) - float(price[used].sum())
 
     plain = evidence(own)
-    ordered = sorted(candidates, key=lambda one: not one.model.adds_constants)
-    return {one: evidence(own | added[one]) - plain + one.model.log_odds for one in ordered}
+    return {one: evidence(own | added[one]) - plain + one.model.log_odds for one in candidates}
 
 
 def _try_stretch(base: Member, candidate: Candidate) -> list[Member]:
