@@ -60,6 +60,13 @@ def test_models_are_scored_by_one_linearization_as_by_their_own() -> None:
         assert gains[one] == pytest.approx(own, abs=1e-3), one
 
 
+def test_all_models_are_tried_where_the_step_is_singular(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = solve_plain(pair_of(flown("in_view", "calibrated", 1000, 20.0)))
+    candidates = [one for one in list_candidates() if one.model.rows]
+    monkeypatch.setattr(model_trials, "eliminate_states", Mock(side_effect=np.linalg.LinAlgError))
+    assert score_steps(base, candidates) == dict.fromkeys(candidates, np.inf)
+
+
 def test_models_without_gain_are_not_solved_after_a_leading_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.search.modes import coarsen, place_peer
-from dmrl.estimation.solver.block_tridiagonal import NormalEquations
+from dmrl.estimation.solver import levenberg_marquardt
+from dmrl.estimation.solver.block_tridiagonal import NormalEquations, solve_step
 from dmrl.estimation.solver.keyframes import average_ranges, build_problem
+from dmrl.estimation.solver.layout import Layout
 from dmrl.estimation.solver.levenberg_marquardt import (
     MAX_ITERATIONS,
     MIN_DAMPING,
@@ -18,7 +20,7 @@ from dmrl.estimation.solver.levenberg_marquardt import (
     relative_path,
 )
 from dmrl.estimation.solver.problem import NoiseModel
-from dmrl.estimation.solver.residuals import Values
+from dmrl.estimation.solver.residuals import Factor, Values
 from dmrl.estimation.solver.unknowns import TABLE, without_rows
 
 from ..flights import flown, pair_of
@@ -53,6 +55,27 @@ def test_a_small_gain_of_a_damped_step_does_not_end_the_iteration(
     Solver(problem).solve(start, tolerance=0.01)
     assert max(used) >= MIN_DAMPING
     assert used[-1] <= SMALL_DAMPING or len(used) == MAX_ITERATIONS
+
+
+def test_a_singular_step_is_damped_until_it_can_be_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, true = flight()
+    build, singular = levenberg_marquardt.build_equations, []
+
+    def build_indefinite_first(
+        layout: Layout, factors: list[Factor], count: int
+    ) -> NormalEquations:
+        equations = build(layout, factors, count)
+        if not singular:
+            equations = replace(equations, diagonal=0.9 * equations.diagonal)
+            singular.append(equations)
+        return equations
+
+    monkeypatch.setattr(levenberg_marquardt, "build_equations", build_indefinite_first)
+    found = Solver(problem).solve(moved(true, 3))
+    error = relative_path(found.values.state) - relative_path(true.state)
+    assert np.abs(error[:, :2]).max() < 0.01
+    with pytest.raises(np.linalg.LinAlgError):
+        solve_step(singular[0])
 
 
 def test_an_iteration_ends_at_a_known_solution() -> None:
