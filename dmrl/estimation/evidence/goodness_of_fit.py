@@ -4,7 +4,8 @@ A smoother bends its solution to the measurements, so residuals are small even w
 wrong. The tests are therefore score tests: how much would the cost fall if a sensor had another
 error, constant over each two seconds? The covariance of the scores is the part of their information
 that the unknowns leave open. It contains the leverage of every measurement and the correlation of
-the windows. With a true model the statistic is chi-square.
+the windows. With a true model the statistic is chi-square. A solve ends a little before the
+optimum, so the scores are those after one more Gauss-Newton step, as in Neyman's C(alpha) test.
 
 A score is a sum of slopes of the loss, so outliers that the loss takes do not fail the test.
 """
@@ -15,13 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg import cho_solve_banded
 from scipy.sparse import csc_array
 from scipy.special import chdtrc
 
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.signals.jump_detection import find_runs
-from dmrl.estimation.solver.block_tridiagonal import NormalEquations, to_upper_bands
+from dmrl.estimation.solver.block_tridiagonal import NormalEquations, solve_step
 from dmrl.estimation.solver.estimate import MISFIT, Cause, Innovation
 from dmrl.estimation.solver.levenberg_marquardt import Solver
 from dmrl.estimation.solver.problem import Problem
@@ -123,10 +124,8 @@ def compute_scores(solver: Solver, values: Values) -> list[SignalScores]:
     """
     equations, factors = solver.equations(values)
     key_s, size = solver.problem.keyframe_s, len(equations.globals_block)
-    bands = cholesky_banded(to_upper_bands(equations.diagonal, equations.off_diagonal))
-    border = equations.coupling.reshape(-1, size)
-    response = cho_solve_banded((bands, False), border)
-    constants = np.linalg.inv(equations.globals_block - border.T @ response)
+    step = solve_step(equations)
+    response = step.response().reshape(-1, size)
     window = ((key_s[:-1] - key_s[0]) / WINDOW_S).astype(int)
     window = np.append(window, window[-1])
     middle_s = key_s[0] + (np.arange(window[-1] + 1) + 0.5) * WINDOW_S
@@ -134,19 +133,21 @@ def compute_scores(solver: Solver, values: Values) -> list[SignalScores]:
     out = []
     for factor, signals in zip(rows, _list_signals(solver.problem), strict=True):
         scores = _sum_scores(factor, window, equations)
-        by_state = scores.by_state
-        rest = scores.by_constant.reshape(size, -1) - (by_state.T @ response).T
-        explained = rest.T @ constants @ rest
+        by_state, by_constant = scores.by_state, scores.by_constant.reshape(size, -1)
+        score = by_state.T @ step.state.ravel() + by_constant.T @ step.constants
+        score = scores.score + score.reshape(scores.score.shape)
+        rest = by_constant - (by_state.T @ response).T
+        explained = rest.T @ step.covariance @ rest
         for first in range(0, by_state.shape[1], BLOCK):
             part = by_state[:, first : first + BLOCK].toarray(order="F")
-            solved = cho_solve_banded((bands, False), part, overwrite_b=True)
+            solved = cho_solve_banded((step.eliminated.factor, False), part, overwrite_b=True)
             explained[:, first : first + BLOCK] += by_state.T @ solved
         scale = 1 / np.sqrt(np.maximum(scores.information, 1e-9))
         open_part = np.diag(scores.information.ravel()) - explained
         open_part *= scale.ravel() * scale.ravel()[:, None]
         covariance = open_part.reshape(*scale.shape, *scale.shape)
         out += [
-            SignalScores(name, robot, middle_s, (scores.score * scale)[:, at], part[..., at])
+            SignalScores(name, robot, middle_s, (score * scale)[:, at], part[..., at])
             for name, robot, at in signals
             for part in (covariance[:, at],)
         ]

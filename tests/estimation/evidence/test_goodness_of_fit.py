@@ -87,6 +87,17 @@ def test_a_statistic_is_the_fall_of_the_cost_if_the_error_were_estimated() -> No
     assert statistic == pytest.approx(2 * fall, rel=0.05)
 
 
+def test_scores_are_those_of_the_optimum_where_a_solve_ended_before_it() -> None:
+    solver, values = solve(pair())
+    optimum = solver.solve(values, tolerance=1e-12).values
+    before = Values(optimum.state.copy(), optimum.constants.copy())
+    before.state[:, solver.layout.pose(0)[2]] += 2e-4 * np.arange(len(before.state))
+    for there, here in zip(
+        compute_scores(solver, optimum), compute_scores(solver, before), strict=True
+    ):
+        assert here.score == pytest.approx(there.score, abs=0.03)
+
+
 def test_the_covariance_lacks_what_all_unknowns_explain() -> None:
     """The unknowns of the keyframes and the constants: by the inverse of the whole matrix."""
     solver, values = solve(pair())
