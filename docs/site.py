@@ -1,6 +1,11 @@
-"""Hooks of mkdocs: pages that lie outside docs/ join the site, links to code become plain words."""
+"""Hooks of mkdocs: pages that lie outside docs/ join the site, and links fit it.
+
+A link that shows the name of a page's file shows its title instead; links to code become plain
+words.
+"""
 
 import re
+from functools import cache
 from pathlib import Path, PurePosixPath
 from posixpath import relpath
 from typing import Any
@@ -24,10 +29,22 @@ FENCE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages that lie outside docs/, and the pictures in README.md."""
     for source, name in PAGES.items():
-        text = (ROOT / source).read_text(encoding="utf-8")
-        text = re.sub(r"\A---\n.*?\n---\n", "", text, flags=re.DOTALL)  # a card's front matter
-        files.append(File.generated(config, name, content=text))
+        files.append(File.generated(config, name, content=_read_page(source)))
     return files
+
+
+def _read_page(source: str) -> str:
+    """Return a page of the repository without the front matter of a card."""
+    text = (ROOT / source).read_text(encoding="utf-8")
+    return re.sub(r"\A---\n.*?\n---\n", "", text, flags=re.DOTALL)
+
+
+@cache
+def _read_title(source: str) -> str:
+    """Return the heading of a page, up to its colon."""
+    heading = re.search(r"^# ([^:\n]+)", _read_page(source), re.MULTILINE)
+    assert heading is not None, f"{source} has no heading"
+    return heading[1]
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
@@ -50,6 +67,8 @@ def _mended(text: str, source: str, name: str) -> str:
             on_site = target.removeprefix("docs/")
         else:
             return words  # code, schemas and folders are in the repository
+        if words in (place, PurePosixPath(place).name) and place.endswith(".md"):
+            words = _read_title(target)
         return f"{bang}[{words}]({relpath(on_site, PurePosixPath(name).parent)}{anchor})"
 
     return LINK.sub(mend, text)

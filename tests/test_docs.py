@@ -5,6 +5,7 @@ import runpy
 import shlex
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -113,6 +114,24 @@ def test_the_index_names_every_page() -> None:
     index = ROOT / "docs/index.md"
     named = {path for path, _ in links(index)} | {index}
     assert sorted(p.name for p in set(ROOT.glob("docs/*.md")) - named) == []
+
+
+@pytest.mark.parametrize(
+    ("page", "link", "shown"),
+    [
+        ("index.md", "[catalogue.md](catalogue.md#queries)", "[Catalogue](catalogue.md#queries)"),
+        ("index.md", "[SECURITY.md](../SECURITY.md)", "[Security](security.md)"),
+        ("contributing.md", "[docs/faq.md](docs/faq.md)", "[Common errors](faq.md)"),
+        ("index.md", "[the terms](concepts.md)", "[the terms](concepts.md)"),
+        ("index.md", "[CHANGELOG.md](../CHANGELOG.md)", "CHANGELOG.md"),
+    ],
+)
+def test_the_site_shows_titles_in_place_of_file_names(page: str, link: str, shown: str) -> None:
+    mend = runpy.run_path(str(ROOT / "docs/site.py"))["on_page_markdown"]
+    found = mend(
+        f"See {link}\n```\n{link}\n```\n", SimpleNamespace(file=SimpleNamespace(src_uri=page))
+    )
+    assert found == f"See {shown}\n```\n{link}\n```\n"
 
 
 def test_architecture_page_lists_the_checked_layers_and_packages() -> None:
