@@ -4,6 +4,7 @@
     python benchmarks/bench_render.py grain --images 24 --backgrounds DIR
     python benchmarks/bench_render.py speed [--model crazyflie-published.blend --backgrounds DIR]
     python benchmarks/bench_render.py memory [--images 3000]
+    python benchmarks/bench_render.py parts --images 120 [--rounds 3]
 
 CPU seconds are those of all processes together, start-up included where not said otherwise.
 """
@@ -24,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 from render_exactness import grain, grey, reprojection
+from render_parts import measure_parts
 
 from dmrl.render_recording import read_render_camera, read_render_settings
 from dmrl.rendering.blender_environment import ensure_environment
@@ -248,7 +250,7 @@ def speed(
 def main() -> None:
     """Print the figures that were asked for, as JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("reprojection", "grain", "speed", "memory"))
+    parser.add_argument("what", choices=("reprojection", "grain", "speed", "memory", "parts"))
     parser.add_argument("--images", type=int, default=500)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--model", type=Path)
@@ -259,6 +261,8 @@ def main() -> None:
         result: object = {p: reprojection(p, asked.images) for p in ("published", "himax")}
     elif asked.what == "memory":
         result = memory(asked.images)
+    elif asked.what == "parts":
+        result = measure_parts("synthetic_paper", asked.images, asked.rounds)
     elif asked.what == "speed":
         result = speed(asked.model, asked.backgrounds, asked.images, asked.rounds)
     elif asked.backgrounds is None:

@@ -8,9 +8,10 @@ import numpy as np
 
 from dmrl.geometry.frames import Array, Camera, project
 from dmrl.render_recording import read_render_camera, read_render_settings
+from dmrl.rendering.backgrounds.panorama import Panorama
 from dmrl.rendering.backgrounds.photos import open_photos
 from dmrl.rendering.blender_environment import ensure_environment
-from dmrl.rendering.camera.distortion import FloatImage, image_from_pinhole
+from dmrl.rendering.camera.distortion import image_from_pinhole
 from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.randomise import SceneSource, draw_scene
 from dmrl.rendering.renderer import Renderer, RobotModel
@@ -130,9 +131,9 @@ def grain(recipe: str, images: int, backgrounds: Path) -> dict[str, float]:
     return {name: _difference(found, exact) for name, found in shots.items()}
 
 
-def grey(name: str) -> FloatImage:
-    """(8, 16, 3) a panorama of nothing."""
-    return np.full((8, 16, 3), 0.3, np.float32)
+def grey(name: str) -> Panorama:
+    """Return a panorama of nothing."""
+    return Panorama(np.full((8, 16, 3), 0.3, np.float32))
 
 
 def _noiseless(sensor: Sensor) -> Sensor:

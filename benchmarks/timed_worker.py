@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""dmrl's Blender worker that also tells how long rendering took: run in Blender's Python.
+
+DMRL_RENDER_TIMES names a file. Each image adds a line of two numbers: CPU seconds of this process
+so far, and of bpy.ops.render.render in it: Cycles, and Blender's update of the scene and its BVH.
+"""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+WORKER_FOLDER = Path(__file__).parents[1] / "dmrl" / "rendering" / "blender"
+sys.path.insert(0, str(WORKER_FOLDER))
+
+import worker  # noqa: E402
+
+OUT = Path(os.environ["DMRL_RENDER_TIMES"])
+_send, _render_passes = worker.send, worker.render_passes
+spent_s = 0.0
+
+
+def timed_render():
+    global spent_s
+    begin = time.process_time()
+    found = _render_passes()
+    spent_s += time.process_time() - begin
+    return found
+
+
+def timed_send(*message):
+    _send(*message)
+    with OUT.open("a") as out:
+        out.write(f"{time.process_time():.6f} {spent_s:.6f}\n")
+
+
+worker.render_passes, worker.send = timed_render, timed_send
+worker.main()
