@@ -1,7 +1,7 @@
 """Sensor model of a small camera, from light to bytes: lens, Bayer mosaic, noise, exposure."""
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.random import Generator
@@ -12,6 +12,8 @@ from dmrl.images.bayer import to_bayer
 from dmrl.rendering.camera.distortion import FloatImage
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+VALUE_BINS = 4096
+"""Bins of a value from 0 to 1. None has two levels' limits, for a gamma of 0.5 to 3."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +87,38 @@ def expose(light: FloatImage, sensor: Sensor, rng: Generator) -> NDArray[np.uint
         values = demosaic(values)
     elif grey:
         values = values.repeat(3, axis=2)
-    if sensor.contrast_gamma != 1:
-        values = np.power(values, np.float32(1 / sensor.contrast_gamma))
-    levels = values * np.float32(255)
-    levels += np.float32(0.5)
-    return np.clip(levels, 0, 255, out=levels).astype(np.uint8)
+    return _quantize(values, sensor.contrast_gamma)
+
+
+def _quantize(values: FloatImage, gamma: float) -> NDArray[np.uint8]:
+    """Round values from 0 to 1, to the power of 1 / gamma, to 256 levels.
+
+    A value is compared with a single threshold, the one in its bin. A power takes twice as long,
+    and its last bits depend on the C library and on the processor.
+    """
+    levels_of_bins, thresholds = _tabulate_levels(gamma)
+    bins = _find_bins(values)
+    levels = levels_of_bins.take(bins)
+    levels += values >= thresholds.take(bins)
+    return levels
+
+
+@lru_cache(64)
+def _tabulate_levels(gamma: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Return the level at the start of each bin, and the value in it where the next one starts."""
+    steps = (((np.arange(255) + 0.5) / 255) ** gamma).astype(np.float32)
+    bins = _find_bins(steps)
+    levels = np.searchsorted(bins, np.arange(VALUE_BINS + 1)).astype(np.uint8)
+    thresholds = np.full(VALUE_BINS + 1, np.inf, np.float32)
+    thresholds[bins] = steps
+    return levels, thresholds
+
+
+def _find_bins(values: FloatImage) -> NDArray[np.intp]:
+    """Return the bins of values, equally spaced by their square roots: dark levels are narrow."""
+    places = np.sqrt(values)
+    places *= np.float32(VALUE_BINS)
+    return places.astype(np.intp)
 
 
 def _mix_channels(light: FloatImage, saturation: float) -> FloatImage:

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from dmrl.images.bayer import to_bayer
-from dmrl.rendering.camera.sensor import Sensor, demosaic, expose, gaussian_blur
+from dmrl.rendering.camera.sensor import (
+    Sensor,
+    _tabulate_levels,
+    demosaic,
+    expose,
+    gaussian_blur,
+)
 
 
 def rng() -> np.random.Generator:
@@ -67,3 +73,19 @@ def test_a_grey_camera_has_one_value_a_pixel() -> None:
     rgb = expose(light, sensor, np.random.default_rng(1))
     assert (rgb == rgb[..., :1]).all()
     assert len(np.unique(rgb)) > 20
+
+
+@pytest.mark.parametrize("gamma", [0.5, 1.0, 1.2, 2.2, 3.0])
+def test_levels_are_powers_of_the_light(gamma: float) -> None:
+    light = rng().random((100, 200, 3)).astype(np.float32) ** 3
+    light[0, :2] = [[0, 0, 0], [1, 1, 1]]
+    rgb = expose(light, Sensor(brightness=None, contrast_gamma=gamma), rng())
+    exact = 255 * light.astype(float) ** (1 / gamma)
+    assert np.abs(rgb - exact).max() < 0.5 + 1e-4
+    assert rgb[0, :2].tolist() == [[0, 0, 0], [255, 255, 255]]
+
+
+def test_no_bin_of_values_has_two_levels_limits() -> None:
+    for gamma in np.linspace(0.5, 3, 101):
+        _, thresholds = _tabulate_levels(float(gamma))
+        assert np.isfinite(thresholds).sum() == 255
