@@ -95,25 +95,47 @@ def _bounding_box(
 
 def _find_image_region(
     canvas: PinholeCanvas, camera: Camera, layer: Layer, margin_px: Array
-) -> tuple[Region, FloatImage] | None:
-    """Return the image region that shows a blurred layer, and its pixels' places in the layer."""
-    height, width = layer.depth_m.shape
-    u, v = np.linspace(0, width, 9), np.linspace(0, height, 9)
-    rim = np.concatenate([np.column_stack([u, v * 0 + y]) for y in (0, height)])
-    rim = np.concatenate([rim, *(np.column_stack([u * 0 + x, v]) for x in (0, width))])
-    corner = np.array([layer.left_px, layer.top_px])
-    bent = image_from_pinhole(rim + corner - canvas.shift_px, camera)
+) -> Region | None:
+    """Return the image region that shows a blurred layer."""
+    bent = image_from_pinhole(_outline(canvas, layer) - canvas.shift_px, camera)
     reach = np.ceil(margin_px) + 1
     limit = (camera.width_px, camera.height_px)
     left, top = np.clip(np.floor(bent.min(axis=0) - reach), 0, limit).astype(int).tolist()
     right, bottom = np.clip(np.ceil(bent.max(axis=0) + reach), 0, limit).astype(int).tolist()
     if left >= right or top >= bottom:
         return None
-    part = np.s_[top:bottom, left:right]
+    return np.s_[top:bottom, left:right]
+
+
+def _outline(canvas: PinholeCanvas, layer: Layer) -> Array:
+    """Return (N, 2) points of a layer's border on the canvas. Without distortion, two corners."""
+    height, width = layer.depth_m.shape
+    corner = np.array([layer.left_px, layer.top_px], float)
     if canvas.places_px is None:
-        grid = np.mgrid[top:bottom, left:right][::-1] + 0.5
-        return part, np.moveaxis(grid, 0, 2).astype(np.float32) - corner.astype(np.float32)
-    return part, canvas.places_px[part] - corner.astype(np.float32)
+        return np.array([corner, corner + np.array([width, height])])
+    u, v = np.linspace(0, width, 9), np.linspace(0, height, 9)
+    rim = np.concatenate([np.column_stack([u, v * 0 + y]) for y in (0, height)])
+    rim = np.concatenate([rim, *(np.column_stack([u * 0 + x, v]) for x in (0, width))])
+    return np.asarray(rim + corner)
+
+
+def _find_places(canvas: PinholeCanvas, layer: Layer, part: Region) -> FloatImage:
+    """Return (H, W, 2) places in a layer of the pixels of an image region."""
+    corner = np.array([layer.left_px, layer.top_px], np.float32)
+    if canvas.places_px is not None:
+        return canvas.places_px[part] - corner
+    grid = np.mgrid[part][::-1] + 0.5
+    return np.moveaxis(grid, 0, 2).astype(np.float32) - corner
+
+
+def _place_in_region(values: FloatImage, layer: Layer, part: Region) -> FloatImage:
+    """Return values of a layer's pixels in an image region around it, 0 outside the layer."""
+    rows, columns = part
+    shape = (rows.stop - rows.start, columns.stop - columns.start, *values.shape[2:])
+    found = np.zeros(shape, np.float32)
+    top, left = layer.top_px - rows.start, layer.left_px - columns.start
+    found[top : top + values.shape[0], left : left + values.shape[1]] = values
+    return found
 
 
 def _draw_masks(
@@ -125,21 +147,30 @@ def _draw_masks(
     surface_m: FloatImage,
 ) -> None:
     """Write a robot's visible opacity, and the depth of its surface, into the image."""
-    found = _find_image_region(canvas, camera, layer, np.zeros(2))
-    if found is None:
+    part = _find_image_region(canvas, camera, layer, np.zeros(2))
+    if part is None:
         return
-    part, places = found
-    height, width = layer.depth_m.shape
-    u, v = np.floor(places).astype(int).reshape(-1, 2).T  # nearest: depths do not mix
-    within = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    u, v = u * within, v * within
-    shape = places.shape[:2]
-    alpha = (visible[v, u] * within).reshape(shape)
-    depth = layer.depth_m[v, u].reshape(shape)
+    if canvas.places_px is None:
+        alpha = _place_in_region(visible, layer, part)
+        depth = _place_in_region(layer.depth_m, layer, part)
+    else:
+        alpha, depth = _sample_nearest(layer, visible, _find_places(canvas, layer, part))
     opacity[part] = np.round(alpha * 255)
     seen = (alpha > MIN_COVERED_OPACITY) & (depth < MAX_DEPTH_M)
     near = seen & ((surface_m[part] == 0) | (depth < surface_m[part]))
     surface_m[part] = np.where(near, depth, surface_m[part])
+
+
+def _sample_nearest(
+    layer: Layer, visible: FloatImage, places: FloatImage
+) -> tuple[FloatImage, FloatImage]:
+    """Return the visible opacity and the depth at places. Depths do not mix."""
+    height, width = layer.depth_m.shape
+    u, v = np.floor(places).astype(int).reshape(-1, 2).T
+    within = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    u, v = u * within, v * within
+    shape = places.shape[:2]
+    return (visible[v, u] * within).reshape(shape), layer.depth_m[v, u].reshape(shape)
 
 
 def _draw_robot(
@@ -152,11 +183,15 @@ def _draw_robot(
 ) -> None:
     """Draw a robot over the image, with motion blur."""
     move_px = _image_motion_px(camera, robot)
-    found = _find_image_region(canvas, camera, layer, np.abs(move_px) / 2 + 3 * look.robot_blur_px)
-    if found is None:
+    margin_px = np.abs(move_px) / 2 + 3 * look.robot_blur_px
+    part = _find_image_region(canvas, camera, layer, margin_px)
+    if part is None:
         return
-    part, places = found
-    light = gaussian_blur(_apply_motion_blur(layer.light, places, move_px), look.robot_blur_px)
+    if canvas.places_px is None and not move_px.any():
+        light = _place_in_region(layer.light, layer, part)
+    else:
+        light = _apply_motion_blur(layer.light, _find_places(canvas, layer, part), move_px)
+    light = gaussian_blur(light, look.robot_blur_px)
     gain = np.float32(look.robot_gain)
     picture[part] = picture[part] * (1 - light[..., 3:]) + gain * light[..., :3]
 

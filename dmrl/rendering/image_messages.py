@@ -104,16 +104,16 @@ def _transforms_sample(time_ns: int, scene: RandomScene, horizontal_from_camera:
         xyz = horizontal_from_camera @ robot.pose.xyz_camera
         turn = horizontal_from_camera @ robot.pose.camera_from_body
         poses.append((f"{OBSERVER}/horizontal", peer_name(k, robot), xyz, turn))
-    transforms = []
-    for parent, child, xyz, turn in poses:
-        quaternion = Rotation.from_matrix(turn).as_quat(canonical=True).tolist()
-        transforms.append(
-            {
-                "timestamp": to_timestamp(time_ns),
-                "parent_frame_id": parent,
-                "child_frame_id": child,
-                "translation": dict(zip("xyz", xyz.tolist(), strict=True)),
-                "rotation": dict(zip("xyzw", quaternion, strict=True)),
-            }
-        )
+    turns = Rotation.from_matrix(np.stack([turn for *_, turn in poses]))
+    quaternions = turns.as_quat(canonical=True).tolist()
+    transforms = [
+        {
+            "timestamp": to_timestamp(time_ns),
+            "parent_frame_id": parent,
+            "child_frame_id": child,
+            "translation": dict(zip("xyz", xyz.tolist(), strict=True)),
+            "rotation": dict(zip("xyzw", quaternion, strict=True)),
+        }
+        for (parent, child, xyz, _), quaternion in zip(poses, quaternions, strict=True)
+    ]
     return Sample(time_ns, topics.TRANSFORMS, "FrameTransforms", {"transforms": transforms})

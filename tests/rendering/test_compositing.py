@@ -70,6 +70,22 @@ def test_a_robot_wholly_hidden_has_no_box() -> None:
     assert np.isnan(shot.box_px[0]).all()
 
 
+def test_a_lens_that_barely_distorts_gives_the_image_of_none() -> None:
+    light = np.random.default_rng(0).random((30, 30, 4), np.float32)
+    depth_m = np.linspace(0.9, 1.1, 900, dtype=np.float32).reshape(30, 30)
+    shots = []
+    for camera in (PINHOLE, replace(AIDECK, distortion=(1e-9,))):
+        left, top = pinhole_canvas(camera).shift_px.astype(int).tolist()
+        layers = {0: Layer(left, top + 60, light, depth_m)}  # at the border
+        blurred = replace(look(camera), robot_blur_px=0.4)
+        shots.append(compose_shot(camera, [robot(1.0)], blurred, layers))
+    plain, bent = shots
+    assert np.abs(plain.rgb.astype(int) - bent.rgb).max() <= 1
+    assert np.abs(plain.opacity.astype(int) - bent.opacity).max() <= 1
+    assert np.allclose(plain.surface_m, bent.surface_m)
+    assert np.allclose(plain.box_px, bent.box_px, atol=1e-3)
+
+
 def test_lens_distortion_applies_to_box_and_centre() -> None:
     canvas = pinhole_canvas(AIDECK)
     corner = np.array([30, 150])

@@ -25,7 +25,9 @@ def image_from_pinhole(uv: Array, camera: Camera) -> Array:
     The result is NaN where the lens cannot project the point.
     """
     focal, centre = _focal_and_centre(camera)
-    bent, _ = distort((uv - centre) / focal, camera.distortion)
+    bent = (uv - centre) / focal
+    if any(camera.distortion):
+        bent, _ = distort(bent, camera.distortion)
     return np.asarray(bent * focal + centre)
 
 
@@ -119,42 +121,44 @@ def sample_bilinear(picture: FloatImage, places_px: FloatImage) -> FloatImage:
     height, width, channels = picture.shape
     padded = np.zeros((height + 2, width + 2, channels), np.float32)
     padded[1:-1, 1:-1] = picture
-    return interpolate_bilinear(
-        padded, np.clip(places_px + 0.5, 0, (width + 0.999, height + 0.999))
-    )
+    places_px = np.clip(places_px + 0.5, 0, (width + 0.999, height + 0.999))
+    return interpolate_bilinear(padded, places_px[..., 0], places_px[..., 1])
 
 
-def interpolate_bilinear(
-    picture: FloatImage, places_px: FloatImage, *, around: bool = False
-) -> FloatImage:
+def interpolate_bilinear(picture: FloatImage, u_px: FloatImage, v_px: FloatImage) -> FloatImage:
     """Interpolate an image bilinearly at places relative to its first pixel's centre.
 
     Parameters
     ----------
     picture
-        (h, w, C).
-    places_px
-        (H, W, 2) from the centre of the first pixel, right and down, above the last row.
-    around
-        Whether the first column follows the last. Otherwise places are left of the last column.
+        (h, w, C). Fastest with four channels.
+    u_px, v_px
+        (...) places from the centre of the first pixel, right and down, at least 0, left of the
+        last column and above the last row.
 
     Returns
     -------
     FloatImage
-        (H, W, C).
+        (..., C).
     """
     _, width, channels = picture.shape
-    corner = np.floor(places_px).astype(np.intp)
-    share = np.subtract(places_px, corner, dtype=np.float32)
-    # NumPy multiplies whole arrays three times as fast as it broadcasts to a few channels.
-    share_u, share_v = (np.repeat(share[..., k : k + 1], channels, axis=-1) for k in (0, 1))
-    column, row = corner[..., 0], corner[..., 1] * width
-    left, right = (column % width, (column + 1) % width) if around else (column, column + 1)
+    left, top = np.floor(u_px), np.floor(v_px)
+    share_u = _repeat_last_axis(np.subtract(u_px, left, dtype=np.float32), channels)
+    share_v = _repeat_last_axis(np.subtract(v_px, top, dtype=np.float32), channels)
+    place = top.astype(np.intp) * width + left.astype(np.intp)
     flat = picture.reshape(-1, channels)
-    above = _lerp_in_place(flat.take(row + left, axis=0), flat.take(row + right, axis=0), share_u)
-    row += width
-    below = _lerp_in_place(flat.take(row + left, axis=0), flat.take(row + right, axis=0), share_u)
+    above = _lerp_in_place(flat.take(place, axis=0), flat.take(place + 1, axis=0), share_u)
+    place += width
+    below = _lerp_in_place(flat.take(place, axis=0), flat.take(place + 1, axis=0), share_u)
     return _lerp_in_place(above, below, share_v)
+
+
+def _repeat_last_axis(values: FloatImage, channels: int) -> FloatImage:
+    """Repeat values for every channel. NumPy's own functions are four times slower here."""
+    repeated = np.empty((*values.shape, channels), np.float32)
+    for channel in range(channels):
+        repeated[..., channel] = values
+    return repeated
 
 
 def _lerp_in_place(first: FloatImage, second: FloatImage, share: FloatImage) -> FloatImage:
