@@ -14,6 +14,7 @@ from dmrl.errors import SettingError, SourceError
 from dmrl.geometry.frames import Camera, project
 from dmrl.guards.paths import refuse_pipes
 from dmrl.images.layers import decode_with_alpha, turn_and_scale
+from dmrl.rendering.backgrounds.panorama import Panorama
 from dmrl.rendering.backgrounds.photos import SRGB_TO_LINEAR
 from dmrl.rendering.camera.distortion import FloatImage, pinhole_canvas
 from dmrl.rendering.camera.image_statistics import measure_images
@@ -117,7 +118,7 @@ class CutoutRenderer:
             }
             yield compose_shot(camera, robots, look, layers)
 
-    def load_panorama(self, name: str) -> FloatImage:
+    def load_panorama(self, name: str) -> Panorama:
         """Refuse: cut-outs are put over photos."""
         raise SettingError(f"cut-outs want photos behind them, not {name!r}. Use --backgrounds")
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dmrl.geometry.frames import Array, Camera
-from dmrl.rendering.backgrounds.photos import apply_motion_blur, render_panorama
+from dmrl.rendering.backgrounds.photos import apply_motion_blur
 from dmrl.rendering.camera.distortion import FloatImage
 from dmrl.rendering.camera.sensor import gaussian_blur
 from dmrl.rendering.onboard_camera import CameraView
@@ -54,7 +54,7 @@ class FlightRenderer:
         self._place = renderer.lights[int(rng.integers(len(renderer.lights)))]
         self._panorama = renderer.load_panorama(self._place)
         self._turn_rad = float(rng.uniform(-np.pi, np.pi))
-        self._level = _ambient_level(self._panorama)
+        self._level = _ambient_level(self._panorama.light)
         towards = rng.normal((0.0, 0.0, 1.2), 1.0)
         self._sun_world = towards / np.linalg.norm(towards)
         self._sun: dict[str, Any] = {
@@ -85,7 +85,7 @@ class FlightRenderer:
         rng = np.random.default_rng(view.key)
         here = view.here
         turn = (here.roll_rad, here.pitch_rad, here.yaw_rad + self._turn_rad)
-        backdrop = gaussian_blur(render_panorama(self._panorama, camera, turn), soft_px)
+        backdrop = gaussian_blur(self._panorama.render(camera, turn), soft_px)
         move_px = view.turning_rps * (camera.fx_px, camera.fy_px) * shutter_s
         backdrop = apply_motion_blur(
             np.minimum(backdrop, HIGHLIGHT_LIMIT * self._level), move_px.tolist()

@@ -9,12 +9,8 @@ from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from dmrl.geometry.frames import Array, Camera, camera_from_horizontal
-from dmrl.rendering.backgrounds.photos import (
-    Photos,
-    apply_motion_blur,
-    render_panorama,
-    stretch_contrast,
-)
+from dmrl.rendering.backgrounds.panorama import Panorama
+from dmrl.rendering.backgrounds.photos import Photos, apply_motion_blur, stretch_contrast
 from dmrl.rendering.camera.distortion import FloatImage, pinhole_from_image
 from dmrl.rendering.camera.sensor import Sensor, gaussian_blur
 from dmrl.rendering.robots.crazyflie import CRAZYFLIE
@@ -45,7 +41,7 @@ class SceneSource:
     lights
         Names of the panoramas.
     panorama
-        Returns the image of a panorama.
+        Returns a panorama by its name.
     photos
         Backgrounds, or None to show the panoramas.
     design
@@ -56,7 +52,7 @@ class SceneSource:
     camera: Camera
     radius_m: float
     lights: tuple[str, ...]
-    panorama: Callable[[str], FloatImage]
+    panorama: Callable[[str], Panorama]
     photos: Photos | None
     design: RobotDesign = CRAZYFLIE
 
@@ -216,7 +212,7 @@ def _draw_look(
         if settings.recoloured_share and rng.random() < settings.recoloured_share:
             backdrop = backdrop[..., rng.permutation(3)]
     else:
-        backdrop = render_panorama(world.panorama(name), world.camera, turn)
+        backdrop = world.panorama(name).render(world.camera, turn)
     backdrop = process_backdrop(settings, rng, backdrop, world.camera.fx_px * shutter_s)
     gain = _draw_log_uniform(rng, settings.robot_gain)
     if not pasted:

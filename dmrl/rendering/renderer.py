@@ -15,7 +15,7 @@ import numpy as np
 from dmrl.errors import SettingError
 from dmrl.geometry.frames import Array, Camera
 from dmrl.guards.posix import count_cores
-from dmrl.rendering.camera.distortion import FloatImage
+from dmrl.rendering.backgrounds.panorama import Panorama
 from dmrl.rendering.compositing import compose_shot
 from dmrl.rendering.robots.crazyflie import BLADE_HALF_WIDTH_M, CRAZYFLIE, ROTOR_STEP_RAD
 from dmrl.rendering.robots.primitives import RobotDesign
@@ -153,10 +153,10 @@ class Renderer:
             layers[number] = Layer(left, top, arrays["light"], arrays["depth"])
         return compose_shot(camera, robots, look, layers)
 
-    def load_panorama(self, name: str) -> FloatImage:
-        """Return the (H, W, 3) linear light of a panorama."""
+    def load_panorama(self, name: str) -> Panorama:
+        """Load a panorama by its name."""
         _, arrays = self.pool.call(lambda worker: worker.request({"panorama": name}))
-        return np.array(arrays["panorama"], np.float32)
+        return Panorama(arrays["panorama"])
 
     def __enter__(self) -> Self:
         return self

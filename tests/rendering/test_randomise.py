@@ -9,6 +9,7 @@ import pytest
 
 from dmrl.geometry.frames import PUBLISHED_RENDER, Camera, project
 from dmrl.images.codec import encode_png
+from dmrl.rendering.backgrounds.panorama import Panorama
 from dmrl.rendering.backgrounds.photos import open_photos
 from dmrl.rendering.camera.sensor import expose
 from dmrl.rendering.randomise import SceneSource, draw_scene, random_two_colours
@@ -42,7 +43,7 @@ def world(settings: Settings, folder: Path, camera: Camera = PUBLISHED_RENDER) -
         camera,
         0.1,
         ("sky",),
-        lambda _: np.ones((8, 16, 3), np.float32),
+        lambda _: Panorama(np.ones((8, 16, 3), np.float32)),
         open_photos(folder),
     )
 
@@ -61,7 +62,7 @@ def test_pasted_robots_leave_the_photo_unchanged(tmp_path: Path) -> None:
 
 
 def test_without_photos_nothing_is_pasted(tmp_path: Path) -> None:
-    bright = np.full((8, 16, 3), 5, np.float32)
+    bright = Panorama(np.full((8, 16, 3), 5, np.float32))
     scenes = replace(world(Settings(pasted=True), tmp_path), photos=None, panorama=lambda _: bright)
     look = draw_scene(scenes, 0).look
     assert look.sensor.brightness is not None

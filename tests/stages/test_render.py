@@ -18,6 +18,7 @@ from dmrl.images.codec import decode, encode_png
 from dmrl.recording import check, read, read_summary
 from dmrl.recording.licences import licences_in
 from dmrl.render_recording import read_render_camera
+from dmrl.rendering.backgrounds.panorama import Panorama
 from dmrl.rendering.camera.distortion import image_from_pinhole
 from dmrl.rendering.randomise import SceneSource, draw_scene
 from dmrl.rendering.renderer import Renderer, RobotModel
@@ -130,7 +131,7 @@ def test_resume_requires_equal_settings(recording: Path, tmp_path: Path) -> None
 def test_a_worker_killed_on_the_way_changes_no_pixel(blender: Path) -> None:
     settings = Settings(images=6, robots_max=2, empty_share=0.0, samples=2)
     camera = read_render_camera(settings)
-    grey = np.full((8, 16, 3), 0.3, np.float32)
+    grey = Panorama(np.full((8, 16, 3), 0.3, np.float32))
     shots = []
     for kill in (False, True):
         with Renderer(blender, RobotModel(), workers=1) as renderer:
@@ -149,7 +150,7 @@ def test_a_worker_killed_on_the_way_changes_no_pixel(blender: Path) -> None:
 def test_boxes_are_where_the_mesh_is(blender: Path) -> None:
     settings = Settings(images=30, empty_share=0.0, depth_m=(0.3, 1.0), seed=1)
     camera = read_render_camera(settings)
-    grey = np.full((8, 16, 3), 0.3, np.float32)
+    grey = Panorama(np.full((8, 16, 3), 0.3, np.float32))
     errors = []
     with Renderer(blender, RobotModel()) as renderer:
         lights = tuple(renderer.lights)

@@ -1,20 +1,19 @@
-"""Backdrops from photos and from panoramas."""
+"""Backdrops from photos."""
 
 import math
 from collections.abc import Callable, Sequence
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.random import Generator
 
 from dmrl.errors import SettingError, SourceError
-from dmrl.geometry.frames import Array, Camera
-from dmrl.geometry.lens import undistort
+from dmrl.geometry.frames import Camera
 from dmrl.guards import limits
 from dmrl.guards.paths import refuse_pipes
 from dmrl.images.codec import Rgb, crop_and_scale, decode, read_size
-from dmrl.rendering.camera.distortion import FloatImage, interpolate_bilinear
+from dmrl.rendering.camera.distortion import FloatImage
 from dmrl.rendering.camera.sensor import LUMINANCE
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".pgm")
@@ -153,46 +152,6 @@ def _has_valid_header(path: Path) -> bool:
     except (SourceError, OSError):
         return False
     return True
-
-
-def render_panorama(
-    panorama: FloatImage, camera: Camera, turn_rad: tuple[float, float, float]
-) -> FloatImage:
-    """Return the (H, W, 3) linear light of a panorama in a camera's view.
-
-    Parameters
-    ----------
-    panorama
-        (h, w, 3), all around. The middle column points along -x, the top row up.
-    camera
-        Camera with its distortion.
-    turn_rad
-        Roll and pitch of the camera, and the panorama's rotation about the vertical.
-    """
-    x, y, z = _panorama_from_camera(turn_rad).astype(np.float32) @ _camera_rays(camera)
-    height, width, _ = panorama.shape
-    u = (0.5 - np.arctan2(y, x) / np.float32(2 * np.pi)) * width - 0.5
-    v = (0.5 - np.arctan2(z, np.hypot(x, y)) / np.float32(np.pi)) * height - 0.5
-    places = np.stack([u, np.clip(v, 0, height - 1.001)], axis=-1)
-    shape = (camera.height_px, camera.width_px, 2)
-    return interpolate_bilinear(panorama, places.reshape(shape), around=True)
-
-
-@cache
-def _camera_rays(camera: Camera) -> FloatImage:
-    """Return the (3, H * W) rays of all pixels, camera frame."""
-    v, u = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
-    right = (u - camera.cx_px) / camera.fx_px
-    down = (v - camera.cy_px) / camera.fy_px
-    x, y = np.moveaxis(undistort(np.stack([right, down], axis=-1), camera.distortion), 2, 0)
-    return np.stack([np.ones_like(u), -x, -y]).reshape(3, -1).astype(np.float32)
-
-
-def _panorama_from_camera(turn_rad: tuple[float, float, float]) -> Array:
-    """Return Rz(turn) Ry(pitch) Rx(roll), the order of Blender's XYZ angles."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(turn_rad), np.sin(turn_rad)
-    tilt = np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
-    return np.asarray(np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]]) @ tilt)
 
 
 def stretch_contrast(light: FloatImage, power: float) -> FloatImage:

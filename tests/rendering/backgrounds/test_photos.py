@@ -1,4 +1,4 @@
-"""Photos and panoramas behind the robots."""
+"""Photos behind the robots."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,6 @@ from dmrl.rendering.backgrounds.photos import (
     SRGB_TO_LINEAR,
     apply_motion_blur,
     open_photos,
-    render_panorama,
 )
 
 CAMERA = replace(AIDECK, distortion=())
@@ -67,24 +66,6 @@ def test_a_folder_without_a_photo_is_refused(tmp_path: Path) -> None:
 def test_photo_is_converted_from_srgb_to_linear_light() -> None:
     assert SRGB_TO_LINEAR[[0, 255]].tolist() == [0, 1]
     assert SRGB_TO_LINEAR[188] == pytest.approx(0.5, abs=0.01)
-
-
-@pytest.mark.parametrize(
-    ("turn_rad", "column", "row"),
-    [
-        ((0.0, 0.0, 0.0), 0.5, 0.5),  # x forward is the middle of the panorama
-        ((0.0, 0.0, np.pi / 2), 0.25, 0.5),  # turned left by a quarter
-        ((0.0, np.pi / 4, 0.0), 0.5, 0.75),  # nose down
-    ],
-)
-def test_the_camera_sees_the_right_part_of_a_panorama(
-    turn_rad: tuple[float, float, float], column: float, row: float
-) -> None:
-    v, u = (np.mgrid[:64, :128] + 0.5) / np.array([64, 128])[:, None, None]
-    panorama = np.stack([u, v, u], axis=-1).astype(np.float32)
-    view = render_panorama(panorama, CAMERA, turn_rad)
-    middle = view[int(CAMERA.cy_px), int(CAMERA.cx_px)]
-    assert middle[:2] == pytest.approx([column, row], abs=0.01)
 
 
 def test_motion_blur_keeps_brightness_and_centroid() -> None:

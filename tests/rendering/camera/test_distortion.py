@@ -9,7 +9,6 @@ from dmrl.errors import SettingError
 from dmrl.geometry.frames import AIDECK
 from dmrl.rendering.camera.distortion import (
     image_from_pinhole,
-    interpolate_bilinear,
     pinhole_canvas,
     pinhole_from_image,
     sample_bilinear,
@@ -46,13 +45,6 @@ def test_the_canvas_holds_all_that_the_image_shows() -> None:
     straight = pinhole_canvas(replace(AIDECK, distortion=()))
     assert straight.places_px is None
     assert straight.inside.all()
-
-
-def test_the_first_column_follows_the_last_around_a_panorama() -> None:
-    picture = np.arange(12, dtype=np.float32).reshape(2, 6, 1)
-    places = np.array([[[5.5, 0.0], [-0.5, 0.0], [5.5, 0.5]]], np.float32)
-    found = interpolate_bilinear(picture, places, around=True)[0, :, 0]
-    assert found.tolist() == [2.5, 2.5, 5.5]
 
 
 def test_oversized_image_is_refused() -> None:
