@@ -96,7 +96,7 @@ def _fields(settings: Settings) -> dict[str, object]:
 def test_a_killed_run_goes_on_to_the_same_bytes(blender: Path, tmp_path: Path) -> None:
     # Pictures without loss, so that chunks of the file fill and are written early.
     recipe = tmp_path / "r.toml"
-    recipe.write_text('kind = "render"\nimages = 14\nsamples = 1\nimage_format = "png"\n')
+    recipe.write_text('kind = "render"\nimages = 24\nsamples = 1\nimage_format = "png"\n')
     whole, killed = tmp_path / "whole.mcap", tmp_path / "killed.mcap"
     command = [sys.executable, "-m", "dmrl.cli", "render", str(recipe)]
     subprocess.run([*command, str(whole), "--workers", "1"], check=True, capture_output=True)
@@ -105,6 +105,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(blender: Path, tmp_path: Path) -
         while not (partial.exists() and partial.stat().st_size > 300_000):
             assert process.poll() is None, "it ended before it could be killed"
             time.sleep(0.01)
+        time.sleep(0.1)  # the labels of these images are written after them
         os.kill(process.pid, signal.SIGKILL)
     assert not killed.exists()
     again = subprocess.run([*command, str(killed)], capture_output=True, text=True, check=False)
