@@ -23,6 +23,10 @@ MISTAKE_S = 50.0
 MAX_COST, MISTAKE_GAIN = 0.6, 0.3
 """Largest cost of a keyframe of a flight that fits, and reduction that shows a mistake. Sound
 flights have 0.2 to 0.3, units that are wrong by a factor of three 0.8."""
+ALIKE = 0.05
+"""Difference of the costs of a keyframe within which two corrections fit alike: twelve over the
+sought stretch. A yaw rate taken as degrees hardly turns, so velocities in the world frame fit it as
+well: the costs differed by 0.005 there, and by 0.14 to 4 where another mistake was the true one."""
 DROPPED_COST = 2.0
 """Cost of a keyframe without odometry: what is dropped fits everything."""
 SHIFTS_S, FINE_SHIFTS_S = (-4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0), (0.5, 0.25)
@@ -96,7 +100,10 @@ def find_mistake(pair: Pair) -> tuple[Mistake, int | None] | None:
     for some in (shown, [choice for choice in every if choice not in shown]):
         costs = [compute_cost(choice) for choice in some]
         if costs and min(costs) < enough:
-            return some[int(np.argmin(costs))]
+            least = min(costs)
+            alike = [one for one, cost in zip(some, costs, strict=True) if cost < least + ALIKE]
+            likeliest = some[costs.index(least)]
+            return next((one for one in alike if one[0].heading_is_open), likeliest)
     best = None if _is_mutual(pair) else _search_shift(compute_cost)
     return best if best and compute_cost(best) < enough else None
 
