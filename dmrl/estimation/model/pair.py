@@ -16,6 +16,8 @@ MAX_DROPOUT_S = 0.5
 chosen."""
 MAX_RANGE_M = 60.0
 """Longest plausible UWB range, metres. It rejects 65535 and other fill values."""
+NORMAL_MEDIAN = 0.6745
+"""Median absolute value of a standard normal distribution."""
 
 
 @dataclass(frozen=True, slots=True)

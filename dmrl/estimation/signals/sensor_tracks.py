@@ -6,6 +6,7 @@ from scipy.ndimage import median_filter
 from dmrl.estimation.model.pair import (
     GRID_RATE_HZ,
     MAX_DROPOUT_S,
+    NORMAL_MEDIAN,
     Array,
     Mask,
     SensorTrack,
@@ -23,6 +24,9 @@ value was chosen."""
 SPIKE_SAMPLES, MIN_SPIKE_RADPS = 41, 2.5
 """Samples of the median of a yaw rate, and smallest difference of a spike from it, rad/s. A
 Crazyflie turns by 3.5 rad/s at most by default, and needs 0.2 s for it."""
+MIN_SPIKE_SIGMAS = 8.0
+"""Smallest difference of a spike in standard deviations of all differences. A yaw rate in degrees
+per second differs by over 2.5 most of the time, and its log is corrected later."""
 
 MIN_SATURATED_RUN, MAX_EQUAL_SHARE = 3, 0.05
 """Samples in a row at the end of a signal's range that show a saturated sensor: noise makes three
@@ -73,8 +77,9 @@ def find_spikes(yaw_rate_radps: Array) -> Mask:
     yaw_rate_radps
         (N,) samples, rad/s.
     """
-    middle = median_filter(yaw_rate_radps, SPIKE_SAMPLES, mode="nearest")
-    return np.asarray(np.abs(yaw_rate_radps - middle) > MIN_SPIKE_RADPS)
+    size = np.abs(yaw_rate_radps - median_filter(yaw_rate_radps, SPIKE_SAMPLES, mode="nearest"))
+    deviation = np.median(size) / NORMAL_MEDIAN if len(size) else 0.0
+    return np.asarray(size > max(MIN_SPIKE_RADPS, MIN_SPIKE_SIGMAS * deviation))
 
 
 def find_saturated(values: Array) -> Mask:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dmrl.estimation.model.bearings import ASSOCIATION_GATE
-from dmrl.estimation.model.pair import Array
+from dmrl.estimation.model.pair import NORMAL_MEDIAN, Array
 from dmrl.estimation.solver.block_tridiagonal import marginal_covariances, solve_step
 from dmrl.estimation.solver.levenberg_marquardt import ROUGH_TOLERANCE, MapEstimate, Solver
 from dmrl.estimation.solver.problem import CameraView
@@ -19,8 +19,6 @@ FIRST_RATIO, MIN_RATIO, MAX_RATIO, ROUNDS = 0.35, 0.1, 10.0, 3
 """Ratio of the noise to the assumed one: of the first solve, the smallest, the largest; and number
 of solves. Residuals of a solve that trusts a camera too little are those of the other sensors, so
 the first one trusts it much: 0.35 are two pixels."""
-NORMAL_MEDIAN = 0.6745
-"""Median size of a normal value, in standard deviations."""
 MAX_MEMORY_S, MIN_CORRELATION = 3.0, 0.1
 """Longest time over which errors count as repeated, seconds, and smallest correlation that counts:
 twice its standard error in 400 images."""

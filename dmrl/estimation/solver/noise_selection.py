@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dmrl.estimation.model.pair import Array
+from dmrl.estimation.model.pair import NORMAL_MEDIAN, Array
 from dmrl.estimation.solver.keyframes import average_ranges
 from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, Solver
 from dmrl.estimation.solver.problem import NoiseModel, Problem
@@ -27,8 +27,6 @@ losses, as the costs of modes do."""
 MIN_CONSTANTS_GRADE = 0.8
 """Smallest grade of the priors of constants. A flight shows a constant scale once at most, and real
 flow with little noise was measured 7 % off."""
-NORMAL_QUARTILE = 0.6745
-"""Median absolute value of a standard normal distribution."""
 RANGE_AVERAGING_S, MIN_AVERAGED_RANGES, HALF_WEIGHT_SIGMAS = 1.0, 4, 2.0
 """Averaging of range residuals: time, seconds; fewest ranges; residual with half weight, in sigmas,
 so that outliers on one side do not look like correlated noise."""
@@ -104,7 +102,7 @@ def range_noise_ratio(problem: Problem, values: Values) -> float:
         rows = range_factor(problem, layout, link, values)
         residual = rows.rows[..., 0, -1][rows.weight > 0]
         if len(residual):
-            ratios.append(float(np.median(np.abs(residual))) / NORMAL_QUARTILE)
+            ratios.append(float(np.median(np.abs(residual))) / NORMAL_MEDIAN)
         second = ((link.time_s - problem.keyframe_s[0]) / RANGE_AVERAGING_S).astype(int)
         second = np.maximum(second, 0)
         count = np.bincount(second)

@@ -1,13 +1,26 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.signals.sensor_tracks import build_track, find_frozen, find_saturated
+from dmrl.estimation.signals.sensor_tracks import (
+    build_track,
+    find_frozen,
+    find_saturated,
+    find_spikes,
+)
 
 GRID_S = np.arange(0, 20, 0.01)
 
 
 def noisy() -> np.ndarray:
     return np.random.default_rng(0).normal(0, 0.1, (len(GRID_S), 2))
+
+
+def test_a_spike_is_rare_in_its_log() -> None:
+    turn = 0.5 * np.sin(2 * GRID_S) + noisy()[:, 0] / 5
+    turn[700] += 3.0
+    assert np.flatnonzero(find_spikes(turn)).tolist() == [700]
+    assert find_spikes(np.degrees(turn)).sum() < 3
+    assert not find_spikes(np.zeros(0)).any()
 
 
 def test_zero_optical_flow_is_a_dropout() -> None:
