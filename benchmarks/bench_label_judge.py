@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from label_judge import real
 from label_judge.figures import FlightFigures, RowFigures, combine, judge_flight
-from label_judge.jobs import NOISES, SETS, Job, list_jobs
+from label_judge.jobs import NOISES, SETS, Job, list_jobs, shift_seeds
 
 FOLDER_SIZE = 10
 """Recordings of one run of the command."""
@@ -202,6 +202,9 @@ def main() -> None:
     parser.add_argument("--noise", nargs="+", choices=NOISES, default=list(NOISES))
     parser.add_argument("--flights", type=int, default=5, help="of each row")
     parser.add_argument("--only", help="pattern of rows")
+    parser.add_argument(
+        "--seed-shift", type=int, default=0, help="added to all seeds; with a FOLDER of its own"
+    )
     parser.add_argument("--data", type=Path, help="folder of nanobench and uwb-tiers")
     parser.add_argument("--no-run", action="store_true", help="print the figures that are there")
     parser.add_argument("--json", type=Path, help="write the table there too")
@@ -210,6 +213,7 @@ def main() -> None:
     commands = dict(text.split("=", 1) for text in given.state) or {"here": here}
     given.folder.mkdir(parents=True, exist_ok=True)
     jobs = list_jobs(given.sets, given.flights, given.noise, given.only or "", given.data)
+    jobs = shift_seeds(jobs, given.seed_shift)
     states = {
         name: read_figures(given.folder / f"{name}.jsonl")
         if given.no_run

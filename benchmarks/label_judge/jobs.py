@@ -3,7 +3,7 @@
 import re
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -155,3 +155,11 @@ def list_jobs(
             )
     wanted = re.compile(only, re.IGNORECASE)
     return [job for job in jobs if wanted.search(job.row) or job.row == "none"]
+
+
+def shift_seeds(jobs: Sequence[Job], shift: int) -> list[Job]:
+    """Return the same jobs with other simulated flights."""
+    return [
+        replace(job, base=job.base and replace(job.base, seed=job.base.seed + shift))
+        for job in jobs
+    ]
