@@ -76,7 +76,7 @@ def run(recording: Path, out: Path, settings: Settings) -> int:
             raise SettingError(f"{flag} {value} is no time. Give seconds from the start")
     first, last = settings.from_s, settings.to_s
     if first is not None and last is not None and first >= last:
-        raise SettingError(f"--from {first:g} is not before --to {last:g}. Swap them")
+        raise SettingError(f"--from-s {first:g} is not before --to-s {last:g}. Swap them")
     low_ns, high_ns = _compute_kept_ns(recording, settings)
     return trim(
         recording,

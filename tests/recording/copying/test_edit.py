@@ -213,7 +213,7 @@ def test_merging_parts_of_one_recording_does_not_warn(
 
 
 def test_span_that_ends_before_it_begins_is_refused(tmp_path: Path, flight: Path) -> None:
-    with pytest.raises(SettingError, match="--from 20 is not before --to 10"):
+    with pytest.raises(SettingError, match="--from-s 20 is not before --to-s 10"):
         stage.run(flight, tmp_path / "b.mcap", stage.Settings(from_s=20, to_s=10))
 
 
