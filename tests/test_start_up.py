@@ -14,10 +14,10 @@ HEAVY = {
 }
 TABLE = {
     "info flight.mcap": set(),
-    "check flight.mcap": {"pandas"},
+    "check flight.mcap": set(),
     "trim flight.mcap trimmed.mcap --to-s 1": set(),
     "convert flight.mcap tables --to csv": {"pandas"},
-    "label flight.mcap labelled.mcap --gate-m 9": {"scipy.optimize", "pandas"},
+    "label flight.mcap labelled.mcap --gate-m 9": {"scipy.optimize"},
     "predict dmrl-nano flight.mcap found.mcap --backend onnx": {"onnxruntime"},
     "predict dmrl-nano flight.mcap torch.mcap --backend torch": {
         "torch",
@@ -26,8 +26,7 @@ TABLE = {
         "h5py",
     },
 }
-"""Packages of `HEAVY` that a command may load. pyarrow loads pandas, where it is installed, as it
-makes its first array of Python or NumPy values."""
+"""Packages of `HEAVY` that a command may load."""
 LISTED = f"print(*(m for m in {sorted(HEAVY)} if m in sys.modules), file=open('loaded', 'w'))"
 CODE = f"import sys\nfrom dmrl.cli import main\ntry:\n    main()\nfinally:\n    {LISTED}"
 

@@ -23,6 +23,7 @@ from dmrl.learn.inference.matching import Points
 from dmrl.messages import STATUS_OK
 from dmrl.recording import LoadedRecording, read_splits
 from dmrl.recording.label_sources import SOURCE_FIELDS, collect_sources
+from dmrl.recording.protobuf.arrow_arrays import to_numpy
 from dmrl.recording.provenance_inputs import refuse_duplicates
 from dmrl.terminal.progress import track
 
@@ -182,7 +183,7 @@ def _join_robot(
     labelled = held.get_table(topics.LABELS(robot), SOURCE_FIELDS)
     detected = _read_detections(held, robot)
     times, (peers, looked) = _merge_by_time(labelled)
-    seen_at = _combine_column(detected, "log_time").to_numpy()
+    seen_at = to_numpy(_combine_column(detected, "log_time"))
     mine, usable = _select_usable(peers, looked, against, _is_within(times, spans), left_out)
     seen = np.isin(times, seen_at)
     if partial:
@@ -201,7 +202,7 @@ def _join_robot(
     left_out["labels outside their image"] += int((~shown).sum())
     every = _combine_column(detected, "detections")
     detections = build_points(every, None, in_detections, in_judged)
-    threshold = float(np.max(_combine_column(detected, "threshold").to_numpy(), initial=0.0))
+    threshold = float(np.max(to_numpy(_combine_column(detected, "threshold")), initial=0.0))
     at = [ImageKey(held.path, robot, int(time_ns)) for time_ns in judged]
     unseen = len(judged) - len(in_judged)
     return LabelledDetections(at, labels.select(shown), detections, threshold, left_out, unseen)
@@ -218,11 +219,11 @@ def _read_detections(held: LoadedRecording, robot: str) -> pa.Table:
 
 def _merge_by_time(labelled: pa.Table) -> tuple[Times, list[pa.Array]]:
     """Merge messages of equal log time; return the times and the merged columns of `LOOKED`."""
-    times, first = np.unique(_combine_column(labelled, "log_time").to_numpy(), return_index=True)
+    times, first = np.unique(to_numpy(_combine_column(labelled, "log_time")), return_index=True)
     found = []
     for name in SOURCE_FIELDS:
         entries = _combine_column(labelled, name)
-        ends = entries.offsets.to_numpy()
+        ends = to_numpy(entries.offsets)
         starts = np.append(ends[first], ends[-1]) - ends[0]
         found.append(pa.ListArray.from_arrays(starts, entries.flatten()))
     return times, found
@@ -234,14 +235,14 @@ def _select_usable(
     """Select the peers from one source, and the images that they can evaluate."""
     image = _image_indices(peers)
     flat = peers.flatten()
-    mine = pc.equal(flat.field("source"), against).to_numpy(zero_copy_only=False)
-    bad = mine & (flat.field("status").to_numpy(zero_copy_only=False) != STATUS_OK)
+    mine = to_numpy(pc.equal(flat.field("source"), against))
+    bad = mine & (to_numpy(flat.field("status")) != STATUS_OK)
     count = np.bincount(image, minlength=len(peers))
     own = np.bincount(image[mine], minlength=len(peers))
     not_ok = np.bincount(image[bad], minlength=len(peers)) > 0
-    asked = pc.equal(looked.flatten(), against).to_numpy(zero_copy_only=False)
+    asked = to_numpy(pc.equal(looked.flatten(), against))
     own += np.bincount(_image_indices(looked)[asked], minlength=len(peers))
-    known = count + np.diff(looked.offsets.to_numpy()) > 0
+    known = count + np.diff(to_numpy(looked.offsets)) > 0
     foreign = known & (own == 0)
     left_out["images with labels from other sources only"] += int((within & foreign).sum())
     left_out["images with a label that is not OK"] += int((within & not_ok).sum())
@@ -257,7 +258,7 @@ def build_points(entries: pa.Array, mine: Mask | None, rows: Times, numbers: Tim
     flat = entries.flatten()
     names = {flat.type.field(i).name for i in range(flat.type.num_fields)}
     values = {
-        name: flat.field(name).to_numpy(zero_copy_only=False)[keep]
+        name: to_numpy(flat.field(name))[keep]
         for name in ("u_px", "v_px", "depth_m", "confidence", "sigma_depth_m")
         if name in names
     }
@@ -297,7 +298,7 @@ def _is_within(times: Times, spans: list[tuple[int, int]] | None) -> Mask:
 
 def _image_indices(entries: pa.Array) -> Times:
     """Return the row of a list column that each of its M entries belongs to, (M,)."""
-    return np.repeat(np.arange(len(entries)), np.diff(entries.offsets.to_numpy()))
+    return np.repeat(np.arange(len(entries)), np.diff(to_numpy(entries.offsets)))
 
 
 def _combine_column(table: pa.Table, name: str) -> pa.Array:

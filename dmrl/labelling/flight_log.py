@@ -18,6 +18,7 @@ from dmrl.estimation.model.pair import Array
 from dmrl.guards.memory import return_freed_memory
 from dmrl.labelling.peer_positions import PeerPositions
 from dmrl.recording import LoadedRecording, Stamped, TopicInfo
+from dmrl.recording.protobuf.arrow_arrays import to_numpy
 from dmrl.storage.shared_file import share_file
 
 SENSOR_FIELDS = {
@@ -208,10 +209,10 @@ def _find_topics(held: Collection[str], pattern: str) -> dict[Any, str]:
 
 
 def _to_samples(table: pa.Table, columns: list[Any]) -> Samples:
-    values = np.column_stack([column.to_numpy() for column in columns]).astype(float)
+    values = np.column_stack([to_numpy(column) for column in columns]).astype(float)
     # Messages are in log-time order; their order of arrival shows a clock that was set back.
-    set_back = int((np.diff(table["publish_time"].to_numpy()) < -1_000_000_000).sum())
-    return Samples(table["log_time"].to_numpy(), set_back, values)
+    set_back = int((np.diff(to_numpy(table["publish_time"])) < -1_000_000_000).sum())
+    return Samples(to_numpy(table["log_time"]), set_back, values)
 
 
 def _sample_reader(pattern: str) -> Callable[[LoadedRecording, str], Samples]:
@@ -236,16 +237,18 @@ def _read_positions(held: LoadedRecording, topic: str) -> PeerPositions:
     """Read PeerPosition messages; a covariance that is missing becomes NaN."""
     table = held.get_table(topic, POSITION_FIELDS)
     lists = table["covariance"]
-    lengths = pc.list_value_length(lists).to_numpy()
+    lengths = to_numpy(pc.list_value_length(lists))
     full = lengths == 9
-    covariance = np.full((len(table), 9), np.nan)
-    flat = pc.list_flatten(lists).to_numpy()
-    covariance[full] = flat[np.repeat(full, lengths)].reshape(-1, 9)
+    covariance = np.broadcast_to(np.nan, (len(table), 9))
+    if full.any():  # ground truth has none, and an hour of it is 100,000 positions
+        covariance = covariance.copy()
+        flat = to_numpy(pc.list_flatten(lists))
+        covariance[full] = flat[np.repeat(full, lengths)].reshape(-1, 9)
     return PeerPositions(
-        table["log_time"].to_numpy(),
-        np.column_stack([table[axis].to_numpy() for axis in "xyz"]),
+        to_numpy(table["log_time"]),
+        np.column_stack([to_numpy(table[axis]) for axis in "xyz"]),
         covariance.reshape(-1, 3, 3),
-        table["status"].to_numpy(),
+        to_numpy(table["status"]),
     )
 
 
@@ -258,12 +261,12 @@ def _read_detections(held: LoadedRecording, topic: str) -> DetectionTable:
     known = {column.name for column in flat.type}  # recordings of before have no sigma
     zero = np.zeros(len(flat))
     rows = [
-        flat.field(n).to_numpy(zero_copy_only=False) if n in known else zero
+        to_numpy(flat.field(n)) if n in known else zero
         for n in ("u_px", "v_px", "depth_m", "sigma_depth_m", "confidence")
     ]
-    threshold = np.array(table["threshold"].to_numpy())
-    first = lists.offsets.to_numpy() - lists.offsets[0].as_py()
-    columns = table["log_time"].to_numpy(), threshold, first, np.column_stack(rows)
+    threshold = np.array(to_numpy(table["threshold"]))
+    first = to_numpy(lists.offsets) - lists.offsets[0].as_py()
+    columns = to_numpy(table["log_time"]), threshold, first, np.column_stack(rows)
     return DetectionTable(*columns, _read_rates(_read_first(held, topic)))
 
 

@@ -22,6 +22,7 @@ from dmrl.estimation.signals.sensor_tracks import Signals, build_track
 from dmrl.labelling.flight_log import SENSOR_FIELDS, FlightLog, RobotPair, Samples
 from dmrl.labelling.sensor_file import SensorConstants
 from dmrl.recording.checks.unit_checks import check_units
+from dmrl.recording.protobuf.arrow_arrays import to_arrow
 from dmrl.terminal.left_out import leave_out
 
 MIN_DURATION_S = 5.0
@@ -200,7 +201,8 @@ def _to_signals(
 ) -> Signals | None:
     """Return the usable samples of a topic; None, with a warning, if there are none."""
     values = samples.values
-    table = pa.table(dict(zip(SENSOR_FIELDS[pattern], values.T, strict=True)))
+    columns = map(to_arrow, values.T)
+    table = pa.table(dict(zip(SENSOR_FIELDS[pattern], columns, strict=True)))
     warnings += [f"{topic}: {doubt}" for doubt in check_units(topic, table)]
     good = np.asarray((abs(values) < MAX_VALUE).all(axis=1))
     if bad := int((~good).sum()):

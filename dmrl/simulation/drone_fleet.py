@@ -22,6 +22,7 @@ from dmrl.live.simulated.flight_source import (
     SimulatedFlight,
 )
 from dmrl.recording import read, read_summary, read_table
+from dmrl.recording.protobuf.arrow_arrays import to_numpy
 from dmrl.simulation.settings import DroneSettings
 
 LOOPBACK = "127.0.0.1"
@@ -169,8 +170,8 @@ def _flight(path: Path, robot: str) -> SimulatedFlight:
         table = read_table(path, topic, fields=fields)
         if not table.num_rows:
             raise RecordingError(f"{path}: {topic} is empty. Take another flight")
-        values = np.column_stack([table[field].to_numpy() for field in fields]).astype(float)
-        return (table["log_time"].to_numpy() - start_ns) * 1e-9, values
+        values = np.column_stack([to_numpy(table[field]) for field in fields]).astype(float)
+        return (to_numpy(table["log_time"]) - start_ns) * 1e-9, values
 
     angles = ("roll_rad", "pitch_rad", "yaw_rad", "yaw_rate_radps")
     height_s, height = signal_of(topics.HEIGHT(robot), "height_m")

@@ -15,6 +15,7 @@ from dmrl.labelling.clocks.time_alignment import (
 )
 from dmrl.labelling.flight_log import FlightLog, to_flight_log
 from dmrl.recording import LoadedRecording, read_splits, read_table
+from dmrl.recording.protobuf.arrow_arrays import to_numpy
 from dmrl.terminal.progress import say
 
 SIGNALS = (topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT, topics.RANGE, topics.TRUE_POSE)
@@ -151,8 +152,8 @@ def _even_times(held: LoadedRecording) -> dict[str, dict[int, int]]:
     found = {}
     for topic in _camera_topics(held):
         table = read_table(held.path, topic, fields=[])
-        arrival = table["log_time"].to_numpy()
-        if (arrival == table["publish_time"].to_numpy()).all():
+        arrival = to_numpy(table["log_time"])
+        if (arrival == to_numpy(table["publish_time"])).all():
             found[topic] = dict(zip(arrival.tolist(), dejitter(arrival).tolist(), strict=True))
     return found
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dmrl.errors import RecordingError
 from dmrl.geometry.frames import Array, is_inside
 from dmrl.recording.checks.scan import CheckData, Finding, find_first_size
+from dmrl.recording.protobuf.arrow_arrays import to_arrow, to_numpy
 from dmrl.topics import CALIBRATION, CAMERA_IMAGE, CAUSES, DETECTIONS, LABELS, parse_topic
 
 BIAS_LABELS_MIN = 20
@@ -81,14 +82,14 @@ class _Labels:
 
 
 def _build_labels(source: str, peers: pa.Table, size_px: tuple[int, int] | None) -> _Labels:
-    has_box = pc.equal(pc.list_value_length(peers["box_px"]), 4).to_numpy()
+    has_box = to_numpy(pc.equal(pc.list_value_length(peers["box_px"]), 4))
     return _Labels(
         f"labels of source {source!r}",
-        np.column_stack([peers["u_px"].to_numpy(), peers["v_px"].to_numpy()]),
-        peers["depth_m"].to_numpy(),
-        ~np.isinf(peers["sigma_depth_m"].to_numpy()),
+        np.column_stack([to_numpy(peers["u_px"]), to_numpy(peers["v_px"])]),
+        to_numpy(peers["depth_m"]),
+        ~np.isinf(to_numpy(peers["sigma_depth_m"])),
         has_box,
-        pc.list_flatten(peers.filter(pa.array(has_box))["box_px"]).to_numpy().reshape(-1, 4),
+        to_numpy(pc.list_flatten(peers.filter(to_arrow(has_box))["box_px"])).reshape(-1, 4),
         size_px,
     )
 
@@ -118,7 +119,7 @@ def _check_images(data: CheckData, topic: str, image: str, table: pa.Table) -> I
         if not any(parse_topic(DETECTIONS, name) for name in data.times):
             yield Finding("error", topic, f"labels without any image on {image}")
         return
-    alone = int((~np.isin(table["log_time"].to_numpy(), data.times[image])).sum())
+    alone = int((~np.isin(to_numpy(table["log_time"]), data.times[image])).sum())
     if alone:
         text = f"{alone} of {table.num_rows} messages have no image at their time"
         yield Finding("error", topic, text)

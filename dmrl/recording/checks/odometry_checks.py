@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dmrl import topics
 from dmrl.geometry.frames import Array
 from dmrl.geometry.rotations import quaternion_to_euler
+from dmrl.recording.protobuf.arrow_arrays import to_numpy
 
 SAMPLE_STEP_S, SLOPE_WINDOW_S = 0.05, 0.3
 """Interval of the compared samples, and window of the slope of a pose, seconds."""
@@ -96,13 +97,13 @@ def _check_ranges(of: Mapping[str, Signal]) -> Iterator[tuple[str, str]]:
 
 def _extract_rows(batch: pa.RecordBatch, fields: tuple[str, ...]) -> NDArray[np.float64]:
     """Return (N, 1 + K) seconds and values; for a pose x, y and a quaternion."""
-    columns = [batch["log_time"].to_numpy() * 1e-9]
+    columns = [to_numpy(batch["log_time"]) * 1e-9]
     if fields:
-        columns += [batch[name].to_numpy(zero_copy_only=False) for name in fields]
+        columns += [to_numpy(batch[name]) for name in fields]
     else:
         place, turn = (batch["pose"].field(part) for part in ("position", "orientation"))
         axes = *(place.field(axis) for axis in "xy"), *(turn.field(axis) for axis in "xyzw")
-        columns += [axis.to_numpy(zero_copy_only=False) for axis in axes]
+        columns += [to_numpy(axis) for axis in axes]
     return np.column_stack(columns).astype(float)
 
 

@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from dmrl.errors import DmrlError, RecordingError
 from dmrl.images.codec import is_decodable, read_size
@@ -19,6 +18,7 @@ from dmrl.recording.log_times import read_log_times
 from dmrl.recording.mcap.batch_reader import iter_batches_in_file_order, join_batches
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.message_batch import Ints, MessageBatch
+from dmrl.recording.protobuf.arrow_arrays import to_numpy
 from dmrl.recording.protobuf.columns import decode_topic, group_by_topic
 from dmrl.recording.protobuf.message_types import carries_own_type
 from dmrl.recording.reader import iter_columns
@@ -213,10 +213,10 @@ def _is_stamped(schema: str) -> bool:
 def _count_unset_stamps(batch: pa.RecordBatch) -> int:
     """Count the messages with time stamp 0 and another log time."""
     stamp = batch["timestamp"]
-    zero = [pc.equal(pc.fill_null(pc.struct_field(stamp, n), 0), 0) for n in ("seconds", "nanos")]
+    seconds, nanos = (to_numpy(stamp.field(name)) for name in ("seconds", "nanos"))
     # A message without a stamp is not counted.
-    wrong = pc.and_(pc.and_(*zero), pc.and_(stamp.is_valid(), pc.not_equal(batch["log_time"], 0)))
-    return int(pc.sum(wrong).as_py() or 0)
+    wrong = to_numpy(stamp.is_valid()) & (seconds == 0) & (nanos == 0)
+    return int((wrong & (to_numpy(batch["log_time"]) != 0)).sum())
 
 
 def _decode_size(data: pa.Buffer) -> ImageSize:

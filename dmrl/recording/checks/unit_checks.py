@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from dmrl.recording.protobuf.arrow_arrays import to_numpy
 from dmrl.topics import CAMERA_IMAGE, POSE, SENSORS, TRUE_POSE, UnitCheck, parse_topic
 
 PERIOD_MAX_S, PERIOD_MIN_S = 5.0, 1e-5
@@ -44,11 +45,11 @@ class ValueCounts:
             while any(map(pa.types.is_struct, table.schema.types)):
                 table = table.flatten()
             for one in filter(lambda one: pa.types.is_floating(one.type), table.schema):
-                values = table[one.name].drop_null().to_numpy()
+                values = to_numpy(table[one.name].drop_null())
                 self.not_finite[topic, one.name] += int((~np.isfinite(values)).sum())
         for limit in _find_limits(topic):
             if limit.field in batch.schema.names:
-                values = batch[limit.field].to_numpy(zero_copy_only=False).astype(float)
+                values = to_numpy(batch[limit.field]).astype(float)
                 size = np.abs(values)
                 size = size[np.isfinite(size) & (size > 0)]
                 counts = len(size), (size > limit.over).sum(), (size < limit.under).sum()

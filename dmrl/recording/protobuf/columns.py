@@ -10,6 +10,7 @@ from google.protobuf.descriptor import Descriptor
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.file import corrupt_error
 from dmrl.recording.mcap.message_batch import MessageBatch
+from dmrl.recording.protobuf.arrow_arrays import to_arrow
 from dmrl.recording.protobuf.decode import decode
 from dmrl.recording.protobuf.message_types import find_channel_descriptor
 from dmrl.recording.protobuf.wire_format import WireError
@@ -74,7 +75,7 @@ def decode_topic(
         these = np.flatnonzero(np.isin(batch.channel, [n for n, k in kinds.items() if k is kind]))
         parts.append(_decode_batch(path, topic, batch.take(these), kind, fields))
         rows.append(these)
-    order = pa.array(np.argsort(np.concatenate(rows)))
+    order = to_arrow(np.argsort(np.concatenate(rows)))
     joined = pa.concat_tables(_align_names(topic, parts), promote_options="permissive")
     return joined.take(order).combine_chunks().to_batches(max_chunksize=None)[0]
 
@@ -119,7 +120,7 @@ def _decode_batch(
         body = decode(batch.data, batch.start, batch.end, kind, fields)
     except WireError as e:
         raise corrupt_error(path, f"{topic}: {e}") from e
-    columns = {name: pa.array(getattr(batch, of)) for name, of in TIMES.items()}
+    columns = {name: to_arrow(getattr(batch, of)) for name, of in TIMES.items()}
     for name, values in body.items():
         free = name
         while free in columns or (free != name and free in body):

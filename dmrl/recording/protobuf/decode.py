@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from dmrl.guards import limits
 from dmrl.recording.mcap.message_batch import Bytes, Ints
+from dmrl.recording.protobuf.arrow_arrays import to_arrow
 from dmrl.recording.protobuf.equal_messages import decode_equal
 from dmrl.recording.protobuf.wire_format import (
     DELIMITED,
@@ -147,7 +148,7 @@ def _decode_fields(
 ) -> dict[str, pa.Array]:
     alike = decode_equal(data, start, end, fields)
     if alike is not None:
-        return {name: pa.array(values) for name, values in alike.items()}
+        return {name: to_arrow(values) for name, values in alike.items()}
     numbers = {f.number: f for f in fields.values()}
     found = find_fields(data, start, end, set(numbers))
     for number, spans in found.items():
@@ -174,9 +175,9 @@ def _decode_struct(
         return _decode_to_json(data, start, end, kind, absent)
     columns = _decode_fields(data, start, end, list_columns(kind))
     if not columns:
-        mask = None if absent is None else pa.array(~absent).buffers()[1]
+        mask = None if absent is None else to_arrow(~absent).buffers()[1]
         return pa.Array.from_buffers(pa.struct([]), len(start), [mask])
-    mask = None if absent is None else pa.array(absent)
+    mask = None if absent is None else to_arrow(absent)
     return pa.StructArray.from_arrays(list(columns.values()), list(columns), mask=mask)
 
 
@@ -234,7 +235,7 @@ def _decode_field(
         start = concatenate_spans(s.start for s in found)[order]
         end = concatenate_spans(s.end for s in found)[order]
         values = _decode_values(data, start, end, None, field)
-        return pa.ListArray.from_arrays(pa.array(offsets), values)
+        return pa.ListArray.from_arrays(to_arrow(offsets), values)
     # The last scalar wins, as the specification requires. Absent: an empty span.
     start, end = np.zeros(count, np.int64), np.zeros(count, np.int64)
     present = np.zeros(count, np.bool_)
@@ -293,7 +294,7 @@ def _decode_values(
     default = None if field.is_repeated else field.default_value
     if field.type in FIXED_DTYPES:
         dtype = np.dtype(FIXED_DTYPES[field.type])
-        return pa.array(
+        return to_arrow(
             decode_present(present, start, lambda at: decode_fixed(data, at, dtype), dtype, default)
         )
     if field.type in VARINT_DTYPES:
@@ -302,7 +303,7 @@ def _decode_values(
         values = decode_present(
             present, start, lambda at: decode_integers(data, at, dtype, zigzag), dtype, default
         )
-        return pa.array(values)
+        return to_arrow(values)
     return _decode_texts(data, start, end, present, field)
 
 
@@ -320,4 +321,4 @@ def _decode_texts(
         texts = pa.array([value.decode(errors="backslashreplace") for value in held], kind)
     if present is None or not field.default_value or present.all():
         return texts
-    return pc.if_else(pa.array(present), texts, pa.scalar(field.default_value, kind))
+    return pc.if_else(to_arrow(present), texts, pa.scalar(field.default_value, kind))
