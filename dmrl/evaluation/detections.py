@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from dmrl import topics
@@ -23,7 +22,7 @@ from dmrl.learn.inference.matching import Points
 from dmrl.messages import STATUS_OK
 from dmrl.recording import LoadedRecording, read_splits
 from dmrl.recording.label_sources import SOURCE_FIELDS, collect_sources
-from dmrl.recording.protobuf.arrow_arrays import to_numpy
+from dmrl.recording.protobuf.arrow_arrays import match_text, to_numpy
 from dmrl.recording.provenance_inputs import refuse_duplicates
 from dmrl.terminal.progress import track
 
@@ -235,12 +234,12 @@ def _select_usable(
     """Select the peers from one source, and the images that they can evaluate."""
     image = _image_indices(peers)
     flat = peers.flatten()
-    mine = to_numpy(pc.equal(flat.field("source"), against))
+    mine = match_text(flat.field("source"), against)
     bad = mine & (to_numpy(flat.field("status")) != STATUS_OK)
     count = np.bincount(image, minlength=len(peers))
     own = np.bincount(image[mine], minlength=len(peers))
     not_ok = np.bincount(image[bad], minlength=len(peers)) > 0
-    asked = to_numpy(pc.equal(looked.flatten(), against))
+    asked = match_text(looked.flatten(), against)
     own += np.bincount(_image_indices(looked)[asked], minlength=len(peers))
     known = count + np.diff(to_numpy(looked.offsets)) > 0
     foreign = known & (own == 0)

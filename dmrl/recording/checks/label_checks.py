@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dmrl.errors import RecordingError
 from dmrl.geometry.frames import Array, is_inside
 from dmrl.recording.checks.scan import CheckData, Finding, find_first_size
-from dmrl.recording.protobuf.arrow_arrays import to_arrow, to_numpy
+from dmrl.recording.protobuf.arrow_arrays import match_text, to_arrow, to_numpy
 from dmrl.topics import CALIBRATION, CAMERA_IMAGE, CAUSES, DETECTIONS, LABELS, parse_topic
 
 BIAS_LABELS_MIN = 20
@@ -50,7 +50,8 @@ def check_labels(data: CheckData) -> Iterator[Finding]:
         peers = pa.Table.from_struct_array(pc.list_flatten(table["peers"]))
         size_px = _find_image_size(data, parts["robot"])
         for source in sorted(set(peers["source"].to_pylist())):
-            labels = _build_labels(source, peers.filter(pc.equal(peers["source"], source)), size_px)
+            mine = peers.filter(to_arrow(match_text(peers["source"], source)))
+            labels = _build_labels(source, mine, size_px)
             yield from (Finding("error", topic, text) for text in _check_pixels(labels))
             for rule in (_check_plausibility, _check_boxes):
                 yield from (Finding("warning", topic, text) for text in rule(labels))
@@ -82,7 +83,7 @@ class _Labels:
 
 
 def _build_labels(source: str, peers: pa.Table, size_px: tuple[int, int] | None) -> _Labels:
-    has_box = to_numpy(pc.equal(pc.list_value_length(peers["box_px"]), 4))
+    has_box = to_numpy(pc.list_value_length(peers["box_px"])) == 4
     return _Labels(
         f"labels of source {source!r}",
         np.column_stack([to_numpy(peers["u_px"]), to_numpy(peers["v_px"])]),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 
@@ -43,3 +44,19 @@ def to_numpy(column: pa.Array | pa.ChunkedArray) -> NDArray[Any]:
         return np.asarray(column.to_numpy(zero_copy_only=False))
     parts = [np.from_dlpack(chunk) for chunk in chunks]
     return np.concatenate(parts) if len(parts) > 1 else np.asarray(parts[0])
+
+
+def match_text(column: pa.Array | pa.ChunkedArray, text: str) -> NDArray[np.bool_]:
+    """Return (N,) whether a text of an Arrow column is a given one.
+
+    Parameters
+    ----------
+    column
+        Strings.
+    text
+        The text.
+    """
+    encoded = text.encode()
+    ends = np.array([0, len(encoded)], np.int32)
+    wanted = pa.StringArray.from_buffers(1, pa.py_buffer(ends), pa.py_buffer(encoded))
+    return to_numpy(pc.is_in(column, value_set=wanted))

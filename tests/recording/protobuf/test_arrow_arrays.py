@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 from numpy.typing import NDArray
 
-from dmrl.recording.protobuf.arrow_arrays import to_arrow, to_numpy
+from dmrl.recording.protobuf.arrow_arrays import match_text, to_arrow, to_numpy
 
 VALUES = [
     np.array([True, False, True] * 5),
@@ -42,6 +42,12 @@ def test_null_numbers_are_nan() -> None:
     assert to_numpy(pa.array([1.0, None]))[0] == 1
     assert np.isnan(to_numpy(pa.array([1.0, None]))[1])
     assert np.isnan(to_numpy(pa.array([1, None]))[1])
+
+
+def test_texts_are_matched() -> None:
+    texts = pa.array(["motion", "", "mo", "motion"])
+    assert match_text(texts, "motion").tolist() == [True, False, False, True]
+    assert match_text(pa.chunked_array([texts]), "").tolist() == [False, True, False, False]
 
 
 def test_pandas_is_not_loaded() -> None:
