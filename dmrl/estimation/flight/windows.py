@@ -78,7 +78,7 @@ def carry_information(solver: Solver, values: Values, time_s: float) -> Carried:
     information, vector = eliminate_before(equations, at)
     # The frame of the next window begins at the first robot.
     here, robots = values.state[at], cut.layout.robots
-    back = rotation_matrix(-here[2:3])[0]
+    back = rotation_matrix(-here[2])
     turn = block_diag(*[block_diag(back, 1.0)] * robots, np.eye(len(information) - 3 * robots))
     mean = np.concatenate([here, values.constants])
     for robot in range(robots):

@@ -6,6 +6,7 @@ import pytest
 from dmrl.estimation.evidence.mistakes import (
     MISTAKES,
     Mistake,
+    _search_shift,
     compute_misfit,
     find_clock_mistake,
     find_mistake,
@@ -119,14 +120,20 @@ def test_a_clock_moves_with_all_that_it_stamps() -> None:
         assert first - pair.range_time_s[pair.range_sender == robot][0] == pytest.approx(shift_s)
 
 
-@pytest.mark.parametrize("shift_s", [0.12, -0.3, 3.2])
+@pytest.mark.parametrize("shift_s", [k / 4 for k in range(-19, 20) if k])
+def test_a_shift_of_a_clock_is_found_to_a_quarter_of_a_second(shift_s: float) -> None:
+    mistake, robot = _search_shift(lambda choice: abs(choice[0].shift_s - shift_s))
+    assert (mistake.shift_s, robot) == (shift_s, 1)
+
+
+@pytest.mark.parametrize("shift_s", [0.07, 0.12, -0.3, 3.2])
 def test_the_ranges_of_both_robots_show_an_offset_of_the_clock(shift_s: float) -> None:
     sound = both_ranging(60.0)
     late = move_clock(sound, shift_s)
     mistake = find_clock_mistake(late)
     assert isinstance(mistake, Mistake)
     assert mistake.name.startswith("clock fits if it is moved by ")
-    assert mistake.shift_s == pytest.approx(-shift_s, abs=0.05)
+    assert mistake.shift_s == pytest.approx(-shift_s, abs=0.03)
     assert find_clock_mistake(sound) is None
     assert find_clock_mistake(mistake.correct(late, 1)) is None
     here = late.range_sender == 0

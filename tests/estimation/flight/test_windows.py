@@ -9,6 +9,7 @@ import pytest
 from dmrl.estimation.flight import windows
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.flight.windows import carry_information, split_windows
+from dmrl.estimation.model.odometry import rotation_matrix
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.levenberg_marquardt import Solver
 from dmrl.estimation.solver.residuals import Values
@@ -54,6 +55,25 @@ def test_carried_prior_equals_information_of_earlier_keyframes() -> None:
     known, unknown = (v @ carried.information @ v for v in (relative, absolute))
     assert known > 1e3 * unknown
     assert carried.mean[:3] == pytest.approx(0.0)
+
+
+def test_carried_prior_does_not_depend_on_the_frame_of_its_window() -> None:
+    """The frame of the next window begins at the first robot: a turned flight carries the same."""
+    problem, values = flight()
+    solver, by = Solver(problem), 0.7
+    turned = values.state.copy()
+    for robot in range(2):
+        x, y, heading = problem.layout.pose(robot)
+        turned[:, [x, y]] = values.state[:, [x, y]] @ rotation_matrix(np.array(by)).T + [3.0, -2.0]
+        turned[:, heading] += by
+    time_s = float(problem.keyframe_s[9])
+    here, there = (
+        carry_information(solver, Values(state, values.constants), time_s)
+        for state in (values.state, turned)
+    )
+    assert there.mean == pytest.approx(here.mean, abs=1e-9)
+    for one, other in ((here.information, there.information), (here.vector, there.vector)):
+        assert other == pytest.approx(one, rel=1e-3, abs=1e-3 * np.abs(one).max())
 
 
 @pytest.mark.heavy

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dmrl.estimation.solver.block_tridiagonal import NormalEquations
 from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, Solver
 from dmrl.estimation.solver.priors import Carried
-from dmrl.estimation.solver.robust_loss import Gaussian
+from dmrl.estimation.solver.robust_loss import Cauchy, Gaussian, Loss
 from dmrl.estimation.solver.unknowns import Unknown, turn
 
 from .test_residuals import flight
@@ -29,6 +30,23 @@ def test_carried_information_is_least_at_its_optimum() -> None:
     costs = [carried.to_factor(value, Gaussian()).cost() for value in (best, off)]
     expected = carried.information[-1, -1] * 0.04 / 2
     assert costs == pytest.approx([0.0, expected], rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("loss", [Gaussian(), Cauchy(3.0)])
+def test_carried_information_adds_the_gradient_of_its_cost(loss: Loss) -> None:
+    carried = carry(Solver(flight()[0]))
+    width, size = carried.layout.width, len(carried.mean)
+    value, step = carried.mean + 0.1 * np.random.default_rng(4).normal(size=size), 1e-5
+    equations = NormalEquations.zeros(2, width, size - width)
+    carried.to_factor(value, loss).add_to(equations)
+    ends = [
+        [carried.to_factor(value + way * one, loss).cost() for one in step * np.eye(size)]
+        for way in (1, -1)
+    ]
+    slope = np.subtract(*ends) / (2 * step)
+    found = np.concatenate([equations.gradient[0], equations.globals_gradient])
+    assert found == pytest.approx(slope, rel=1e-4, abs=1e-4)
+    assert not equations.gradient[1].any()
 
 
 def test_carried_heading_may_differ_by_whole_turns() -> None:

@@ -190,6 +190,37 @@ def test_range_factor_is_zero_at_truth_with_exact_jacobian() -> None:
     assert found.rows[..., 0, -1][found.weight > 0].mean() * std == pytest.approx(0.4, abs=5e-3)
 
 
+def test_either_robot_sees_the_other_at_the_ranges_that_it_measured() -> None:
+    """The second looks back, and measured what the first did not."""
+    (link,) = flight()[0].links
+    sent, far = np.linspace(0.0, 1.0, len(link.range_m)), np.ones(len(link.range_m))
+    ahead, own, other = np.outer(far, [2.0, 0.0]), 0.1 * far, 0.3 * far
+    sights = replace(link, sent=sent).list_sights(2 * far, ahead, own, other)
+    assert sights[1.0].sent == pytest.approx(sent)
+    assert sights[-1.0].sent == pytest.approx(1 - sent)
+    assert sights[1.0].bearing == pytest.approx(-0.1)
+    assert np.cos(sights[-1.0].bearing) == pytest.approx(np.cos(np.pi - 0.3))
+
+
+def test_ranges_at_keyframes_show_no_scale_of_the_motion_between() -> None:
+    problem, values = flight()
+    (link,), layout = problem.links, problem.layout
+    scale = layout.find("velocity_scale", 1)
+    assert scale in range_factor(problem, layout, link, values).border
+    still = replace(link, peer_shift_m=np.zeros_like(link.peer_shift_m))
+    assert scale not in range_factor(problem, layout, still, values).border
+
+
+def test_steps_are_noisy_where_the_grade_of_a_robot_is_raised() -> None:
+    problem, _ = flight()
+    assert not problem.list_noisy_steps().any()
+    steps = len(problem.keyframe_s) - 1
+    raised = [np.where(np.arange(steps) == at, 2.0, 1.0) for at in (3, 5)]
+    robots = [replace(one, grade=grade) for one, grade in zip(problem.robots, raised, strict=True)]
+    noisy = replace(problem, robots=tuple(robots)).list_noisy_steps()
+    assert np.flatnonzero(noisy).tolist() == [3, 5]
+
+
 def test_a_measured_height_is_the_true_one_and_its_error() -> None:
     """The peer is 0.4 m higher: a peer whose height reads high is nearer in height."""
     problem, values = flight()

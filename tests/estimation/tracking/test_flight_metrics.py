@@ -107,6 +107,12 @@ def test_long_detection_gaps_end_loops() -> None:
     assert compute_flight_figures(flight(false=false))["loop_s"] == pytest.approx(20 / 2.5)
 
 
+@pytest.mark.parametrize(("images", "loop_s"), [(7, 50.0), (8, 25 / 1.5)])
+def test_a_detection_gap_of_a_second_ends_a_loop(images: int, loop_s: float) -> None:
+    eighths = flight(image_s=0.125 * np.arange(IMAGES), found=mask((30, 30 + images)))
+    assert compute_flight_figures(eighths)["loop_s"] == pytest.approx(loop_s)
+
+
 def test_detection_gaps_are_weighted_by_distance_distribution() -> None:
     """Half the images are at 0.8 m, where loops are most of the time, and half at 2.5 m."""
     distance_m = np.where(np.arange(IMAGES) < 100, 0.8, 2.5)

@@ -38,14 +38,21 @@ def test_a_range_fits_within_two_sigmas_of_itself_and_the_track(sigmas: float, n
     assert bool(names([Track(1, 2.0, std_m)], cf2=2.0 - apart)) == named
 
 
-@pytest.mark.parametrize(("misfit", "named"), [(1.4, False), (1.6, True)])
-def test_name_needs_a_clear_margin_over_others(misfit: float, named: bool) -> None:
-    other = 2.0 + RANGE_STD_M * np.sqrt(misfit)
-    assert bool(names([Track(1, 2.0)], cf2=2.0, cf3=other)) == named
+@pytest.mark.parametrize(
+    ("best", "misfit", "named"),
+    [(0.0, 1.4, False), (0.0, 1.6, True), (1.0, 2.4, False), (1.0, 2.6, True)],
+)
+def test_name_needs_a_clear_margin_over_others(best: float, misfit: float, named: bool) -> None:
+    one, other = 2.0 - RANGE_STD_M * np.sqrt([best, misfit])
+    assert bool(names([Track(1, 2.0)], cf2=one, cf3=other)) == named
 
 
 def test_names_are_assigned_jointly_to_two_tracks() -> None:
     assert names([Track(1, 1.0), Track(2, 3.0)], cf2=3.0, cf3=1.0) == {1: "cf3", 2: "cf2"}
+
+
+def test_a_name_stands_by_itself_where_another_track_fits_no_peer() -> None:
+    assert names([Track(1, 1.0), Track(2, 3.0)], cf2=5.0, cf3=1.0) == {1: "cf3"}
 
 
 def test_single_range_outlier_is_bounded_and_forgotten() -> None:

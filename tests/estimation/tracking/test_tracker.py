@@ -1,4 +1,5 @@
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -128,6 +129,32 @@ def test_confidence_decides_when_a_lasting_detection_is_a_peer(
     else:
         assert True in seen[1 : images + 3]
         assert not seen[0]
+
+
+@pytest.mark.parametrize(
+    ("share_of_memory", "confidences", "told"),
+    [
+        (1e-6, (0.8, 0.8), 0.0),  # nothing is new
+        (1e-6, (0.8, 0.95), 0.5),  # half of the change
+        (50.0, (0.8, 0.95), 1.0),  # all of it: the image before is forgotten
+    ],
+)
+def test_a_confidence_tells_what_the_image_before_did_not(
+    monkeypatch: pytest.MonkeyPatch,
+    share_of_memory: float,
+    confidences: tuple[float, float],
+    told: float,
+) -> None:
+    peer = np.array([[1.2, 0.1, 0.0]])
+    tracker, spy = Tracker(AIDECK, TUNING), Mock(side_effect=associate)
+    monkeypatch.setattr("dmrl.estimation.tracking.tracker.associate", spy)
+    first, second = confidences
+    tracker.step(STILL, view_of(peer, confidence=first))
+    later = replace(STILL, dt_s=share_of_memory * TUNING.confidence_s)
+    tracker.step(later, view_of(peer, confidence=second))
+    before, now = tracker.rates.log_ratio(np.array(confidences))
+    bright = spy.call_args.args[3]
+    assert np.log(bright) == pytest.approx(told * (now - (told < 1) * before), abs=1e-4)
 
 
 def test_weak_detections_keep_an_expected_track_accurate() -> None:
