@@ -116,10 +116,7 @@ def compute_misfit(pair: Pair) -> float:
     problem = build_problem({(0, 1): used})
     dropped = (used.own.dropout | used.peer.dropout).mean()
     dropped -= (pair.own.dropout | pair.peer.dropout).mean()
-    try:
-        cost = find_modes(problem)[0].cost / len(problem.keyframe_s)
-    except np.linalg.LinAlgError:
-        return np.inf
+    cost = find_modes(problem)[0].cost / len(problem.keyframe_s)
     return float(cost + DROPPED_COST * dropped)
 
 

@@ -133,10 +133,7 @@ def _extend_rivals(rounds: Sequence[tuple[Candidate, Sequence[Member]]]) -> Iter
 def _widen(member: Member) -> Member:
     """Return a solution with the noise that counts for its covariance."""
     solver = with_grade(member.solver, member.solver.problem.noise.grade * GRADE_BIAS)
-    try:
-        return replace(member, solver=solver, found=solver.solve(member.values))
-    except np.linalg.LinAlgError:
-        return member
+    return replace(member, solver=solver, found=solver.solve(member.values))
 
 
 def _select_likely(members: Sequence[Member]) -> list[Member]:
