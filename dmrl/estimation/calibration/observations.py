@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from dmrl.estimation.calibration.noise import Noise
+from dmrl.estimation.model.pair import SIGMA_OF_MEDIAN
 from dmrl.geometry.frames import Array, Camera, is_inside, pixels_from_horizontal
 
 MAX_GAP_S = 0.25
@@ -104,10 +105,9 @@ def _smooth_bilateral(values: Array) -> Array:
     """
     if len(values) < 3:
         return values
-    # The second difference of white noise has 1 + 4 + 1 times its variance; 1.4826 converts the
-    # median of absolute values to a standard deviation.
+    # The second difference of white noise has 1 + 4 + 1 times its variance.
     bends = np.median(np.abs(np.diff(values, n=2, axis=0)), axis=0)
-    noise = np.maximum(1.4826 * bends / np.sqrt(6.0), 1e-9)[:, None]
+    noise = np.maximum(SIGMA_OF_MEDIAN * bends / np.sqrt(6.0), 1e-9)[:, None]
     side = np.ceil(3 * SMOOTHING_STD_SAMPLES).astype(int)
     near = np.exp(-0.5 * (np.arange(-side, side + 1) / SMOOTHING_STD_SAMPLES) ** 2)
     around = _windows_around(values, side)

@@ -18,6 +18,8 @@ MAX_RANGE_M = 60.0
 """Longest plausible UWB range, metres. It rejects 65535 and other fill values."""
 NORMAL_MEDIAN = 0.6745
 """Median absolute value of a standard normal distribution."""
+SIGMA_OF_MEDIAN = 1.4826
+"""Standard deviation of a normal distribution over the median of its absolute values."""
 
 
 @dataclass(frozen=True, slots=True)

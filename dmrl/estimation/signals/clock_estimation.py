@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.estimation.model.pair import SIGMA_OF_MEDIAN
+
 Array = NDArray[np.float64]
 
 GRID_STEP_S = 0.05
@@ -219,8 +221,7 @@ def _linearize(one: _Series, then: Array, from_middle: Array, wanted: Array, dri
     jacobian = np.stack([rate, rate * from_middle, seen, np.ones(len(seen))], axis=1)[known]
     scale_bias = np.linalg.lstsq(jacobian[:, 2:], wanted[known], rcond=None)[0]
     residual = wanted[known] - jacobian[:, 2:] @ scale_bias
-    # The median absolute deviation of a normal distribution is its sigma / 1.4826.
-    spread = 1.4826 * np.median(np.abs(residual)) + 1e-12
+    spread = SIGMA_OF_MEDIAN * np.median(np.abs(residual)) + 1e-12
     weight = np.minimum(1.0, HUBER_SIGMAS * spread / np.maximum(np.abs(residual), 1e-12))
     full = jacobian * (scale_bias[0], scale_bias[0], 1.0, 1.0)
     # Smoothing correlates neighbouring samples: this many of them count as one.

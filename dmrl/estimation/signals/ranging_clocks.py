@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from dmrl.estimation.model.pair import SIGMA_OF_MEDIAN
 from dmrl.estimation.signals.clock_estimation import (
     HUBER_SIGMAS,
     MAX_ITERATIONS,
@@ -92,7 +93,7 @@ def _fit_line(x: Array, y: Array) -> tuple[float, float, tuple[float, float]]:
         slope, middle = np.linalg.solve(normal, design.T @ (weight * y))
         residual = np.abs(y - slope * x - middle)
         # A polled log is late by whole periods, which are no outliers.
-        spread = max(1.4826 * float(np.median(residual)), MIN_JITTER_S)
+        spread = max(SIGMA_OF_MEDIAN * float(np.median(residual)), MIN_JITTER_S)
         weight = np.minimum(1.0, HUBER_SIGMAS * spread / np.maximum(residual, 1e-9))
     covariance = np.linalg.inv(normal) * float((weight * residual**2).mean())
     return float(slope), float(middle), tuple(np.sqrt(np.diag(covariance)).tolist())
