@@ -11,6 +11,7 @@ from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.layout import build_layout, from_peer
 from dmrl.estimation.solver.levenberg_marquardt import relative_path
 from dmrl.estimation.solver.problem import NoiseModel, RangeLink, Sight
+from dmrl.estimation.solver.robust_loss import Cauchy, Gaussian
 from dmrl.estimation.solver.unknowns import SIGHTED, TABLE, Unknown, with_rows, without_rows
 from dmrl.labelling.sensor_file import OF_PAIR, OF_ROBOT, SCALES
 
@@ -33,6 +34,20 @@ EVOLUTIONS = {
     "range_error": ("jump", 0.002, np.inf),
     "height_error": ("fading", 0.03, 4.0),
 }
+
+
+LOSSES = {
+    "range_offset": Cauchy(1.5), "gyro_bias": Cauchy(2.0), "clock": Cauchy(2.0),
+    "velocity_error_x": Cauchy(5.0), "velocity_error_y": Cauchy(5.0), "range_error": Cauchy(1.0),
+    "camera_azimuth": Cauchy(2.0),
+}  # fmt: skip
+
+
+def test_rows_that_may_be_far_off_have_wide_tails() -> None:
+    assert {r.name: r.loss for r in TABLE if r.loss != Gaussian()} == LOSSES
+    (jump,) = (r for r in TABLE if r.pull_weight)
+    known = jump.name, jump.start_std, jump.pull_std, jump.pull_weight
+    assert known == ("range_error", 0.02, 0.05, 0.04)
 
 
 def test_rows_have_the_units_and_priors_of_their_sensors() -> None:
