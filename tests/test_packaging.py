@@ -138,6 +138,7 @@ def test_a_wheel_holds_the_licence(wheel: zipfile.ZipFile) -> None:
     assert b"Apache License" in wheel.read(licence)
 
 
+@pytest.mark.heavy
 def test_an_sdist_can_be_built_from(built: Path) -> None:
     with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}

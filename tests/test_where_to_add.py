@@ -266,6 +266,7 @@ COMMAND = '''
 '''
 
 
+@pytest.mark.heavy
 def test_a_command(clone: Clone) -> None:
     clone.write("dmrl/stages/hello.py", COMMAND)
     clone.after("dmrl/cli.py", "GROUPS = {\n", '    "Greet": ("hello",),\n')

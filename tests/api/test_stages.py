@@ -13,6 +13,7 @@ from dmrl.cli import app
 from dmrl.errors import RecipeError, SettingError
 
 
+@pytest.mark.heavy
 def test_python_stages_write_the_bytes_of_their_commands(flight: Path, tmp_path: Path) -> None:
     app(
         ["label", str(flight), str(tmp_path / "a.mcap"), "--gate-m", "0.4"],
@@ -61,6 +62,7 @@ def test_empty_list_is_refused_and_one_recording_is_accepted(flight: Path, tmp_p
     assert len(dmrl.make_dataset(flight, tmp_path / "set")) > 0
 
 
+@pytest.mark.heavy
 def test_evaluate_returns_the_printed_figures(
     flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -300,6 +300,7 @@ def test_invalid_catalogue_gives_one_line_error(
         open_catalogue(tmp_path)
 
 
+@pytest.mark.heavy
 def test_a_query_takes_no_disk_and_little_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

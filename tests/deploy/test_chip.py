@@ -3,9 +3,12 @@
 import runpy
 from pathlib import Path
 
+import pytest
+
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "bench_chip.py"
 
 
+@pytest.mark.heavy
 def test_int8_maps_agree_with_the_chip_as_well_as_float(data: Path) -> None:
     found, pictures = runpy.run_path(str(BENCHMARK))["compare"](data)
     assert len(pictures) == 2

@@ -94,6 +94,7 @@ def test_too_little_copied_traffic_is_detected(tmp_path: Path) -> None:
     ).error
 
 
+@pytest.mark.heavy
 @no_gcc
 def test_the_c_with_two_memories_is_strict_c99_without_a_warning(tmp_path: Path) -> None:
     flags = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")

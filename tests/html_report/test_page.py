@@ -187,12 +187,13 @@ def test_depth_texts_do_not_overlap_and_stay_in_the_image() -> None:
         assert 25 < u < 295 and 5 < v < 219
 
 
-def test_the_pooled_figures_of_a_comparison_are_not_shown(outputs: Path) -> None:
-    said = json.loads((outputs / "judged/evaluation.json").read_text())
+def test_the_pooled_figures_of_a_comparison_are_not_shown(
+    evaluation: Evaluation, tmp_path: Path
+) -> None:
     for common, shown in ((10, True), (5, False)):
-        said |= {"images": 10, "paired": {"images": common}}
-        (outputs / "judged/evaluation.json").write_text(json.dumps(said))
-        html = build_report(collect_outputs(outputs))
+        said = evaluation() | {"images": 10, "paired": {"images": common}}
+        (tmp_path / "evaluation.json").write_text(json.dumps(said))
+        html = build_report(collect_outputs(tmp_path))
         assert ("detection minus label" in html) == shown
 
 

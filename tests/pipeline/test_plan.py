@@ -5,6 +5,7 @@ import json
 import re
 from collections import Counter
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -32,6 +33,9 @@ def load(folder: Path, text: str) -> Plan:
     path = folder / "mine.toml"
     path.write_text(text, encoding="utf-8")
     return load_plan(path)
+
+
+load_shipped = cache(load_plan)
 
 
 def test_step_keys_become_inputs_or_settings(tmp_path: Path) -> None:
@@ -222,7 +226,7 @@ def step_as_dict(step: Step) -> dict[str, Any]:
 
 
 def test_recipe_self_supervised_has_its_number_of_steps() -> None:
-    steps = load_plan("self_supervised").steps
+    steps = load_shipped("self_supervised").steps
     assert len(recipe.read_text("self_supervised").splitlines()) <= 100
     assert Counter(step.stage for step in steps) == {
         **{"fly": 148, "label": 864, "predict": 748, "dataset": 7, "train": 7},
@@ -247,12 +251,12 @@ def test_recipes_of_the_page_can_be_loaded(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize("name", recipe.list_names())
 def test_every_shipped_pipeline_can_be_loaded(name: str) -> None:
     if recipe.read(name)["kind"] == "pipeline":
-        assert load_plan(name).steps
+        assert load_shipped(name).steps
 
 
 @pytest.mark.parametrize("name", ["paper", "published"])
 def test_recipes_of_the_paper_have_figures_that_name_their_steps(name: str) -> None:
-    assert load_plan(name).pictured
+    assert load_shipped(name).pictured
 
 
 def test_figure_of_an_unknown_output_is_a_fault(tmp_path: Path) -> None:

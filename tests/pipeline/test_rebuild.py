@@ -65,6 +65,7 @@ def test_a_recording_of_others_is_refused(tmp_path: Path) -> None:
         rebuild(tmp_path / "a.mcap", tmp_path / "b.mcap")
 
 
+@pytest.mark.heavy
 def test_a_simulated_flight_and_its_detections_are_made_again(tmp_path: Path) -> None:
     """Settings alone determine the flight; the network ships and is found by its name."""
     settings = fly.Settings(duration_s=2.0, camera=True, camera_renderer="sketch", seed=5)
@@ -73,7 +74,7 @@ def test_a_simulated_flight_and_its_detections_are_made_again(tmp_path: Path) ->
         Path("dmrl-nano"),
         tmp_path / "flight.mcap",
         tmp_path / "found.mcap",
-        predict.Settings(backend="integer", most=3),
+        predict.Settings(backend="integer", most=1),
     )
     (tmp_path / "flight.mcap").unlink()
     assert rebuild(tmp_path / "found.mcap", tmp_path / "new.mcap") == []

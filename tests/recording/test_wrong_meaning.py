@@ -168,7 +168,9 @@ def places(tmp_path: Path) -> tuple[Path, Path, Path]:
     return tmp_path / "in.mcap", tmp_path / "out.mcap", empty
 
 
-@pytest.mark.parametrize("part", range(5))
+@pytest.mark.parametrize(
+    "part", [0, *(pytest.param(part, marks=pytest.mark.heavy) for part in range(1, 5))]
+)
 def test_hundred_inconsistent_files_lose_no_message_silently(
     places: tuple[Path, Path, Path], part: int
 ) -> None:

@@ -113,6 +113,7 @@ def test_a_float_model_has_no_int8_backend(settled: Path, backend: str) -> None:
         detector.open_detector(settled, backend)
 
 
+@pytest.mark.heavy
 def test_an_export_is_no_model_for_torch(exported: Path, tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="is an export folder, which torch cannot run"):
         detector.open_detector(exported, "torch")

@@ -209,6 +209,7 @@ def test_every_shipped_pilot_flies_any_recipe(pilot: str, tmp_path: Path) -> Non
         assert counts["/{robot}/command"] == 21 * settings.flown
 
 
+@pytest.mark.heavy
 def test_three_robots_of_a_formation_keep_apart(tmp_path: Path) -> None:
     out = tmp_path / "flight.mcap"
     flags = Flags(duration_s=15.0, eye="truth", seed=1)
@@ -306,6 +307,7 @@ def test_integer_and_c_backends_give_equal_commands(seed: int, int8: Path, tmp_p
     np.testing.assert_array_equal(flown[0], flown[1])
 
 
+@pytest.mark.heavy
 def test_flights_with_one_place_share_the_room_only(tmp_path: Path) -> None:
     first = []
     for name, seed, place in (("a", 1, None), ("b", 2, 1), ("c", 2, None)):

@@ -159,6 +159,7 @@ def test_unmeasurable_figures_are_reported_and_kept(
     assert "noise" not in out.read_text()
 
 
+@pytest.mark.heavy
 def test_a_picture_that_a_killed_run_left_is_no_obstacle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

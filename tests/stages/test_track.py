@@ -96,6 +96,7 @@ def test_other_messages_stay_and_old_tracks_go(
     )
 
 
+@pytest.mark.heavy
 def test_recorded_detector_rates_are_used_by_the_tracker(detected: Path, tmp_path: Path) -> None:
     """With rates of a detector whose detections are nearly all false, nobody is followed."""
     told, out = tmp_path / "told.mcap", tmp_path / "out.mcap"

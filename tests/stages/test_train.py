@@ -321,6 +321,7 @@ def test_no_epochs_calibrate_a_model_and_train_nothing(dots_dataset: Path, tmp_p
     assert all(bool((before.state_dict()[k] == after.state_dict()[k]).all()) for k in names)
 
 
+@pytest.mark.heavy
 def test_json_names_the_model(
     dots_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

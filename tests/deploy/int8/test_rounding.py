@@ -62,6 +62,7 @@ def test_constant_zero_inputs_fall_back_to_nearest_rounding() -> None:
     np.testing.assert_allclose(bias, one.bias)
 
 
+@pytest.mark.heavy
 def test_random_networks_lose_less_than_by_nearest_weights() -> None:
     gained_db = []
     for seed in range(40):

@@ -119,6 +119,7 @@ def _tilting(time_s: np.ndarray) -> np.ndarray:
     return tilt
 
 
+@pytest.mark.heavy
 def test_abrupt_tilts_do_not_bias_the_delay() -> None:
     rng = np.random.default_rng(11)
     clean = flight(6, images=600)

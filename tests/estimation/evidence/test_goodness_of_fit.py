@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -41,8 +42,13 @@ def solve(given: Pair) -> tuple[Solver, Values]:
     return found.solver, found.values
 
 
+@cache
+def solve_sound() -> tuple[Solver, Values]:
+    return solve(pair())
+
+
 def test_a_sound_flight_fits() -> None:
-    innovations, causes = check_fit(*solve(pair()), (0.0, LENGTH_S))
+    innovations, causes = check_fit(*solve_sound(), (0.0, LENGTH_S))
     assert causes == ()
     assert {(one.signal, one.robot) for one in innovations} == {
         ("flow", 0), ("flow", 1), ("yaw rate", 0), ("yaw rate", 1), ("range", None),
@@ -68,7 +74,7 @@ def test_a_statistic_is_the_fall_of_the_cost_if_the_error_were_estimated() -> No
     noise = NoiseModel(range_loss=square, motion_loss=square)
     rows = [replace(row, loss=square, pull_weight=0.0) for row in problem.table]
     problem = replace(problem, noise=noise, table=tuple(rows))
-    start = solve(pair())[1]
+    start = solve_sound()[1]
     solver = Solver(problem)
     found = solver.solve(start, tolerance=1e-12)
     scores = {one.signal: one for one in compute_scores(solver, found.values)}["range"]
@@ -88,7 +94,7 @@ def test_a_statistic_is_the_fall_of_the_cost_if_the_error_were_estimated() -> No
 
 
 def test_scores_are_those_of_the_optimum_where_a_solve_ended_before_it() -> None:
-    solver, values = solve(pair())
+    solver, values = solve_sound()
     optimum = solver.solve(values, tolerance=1e-12).values
     before = Values(optimum.state.copy(), optimum.constants.copy())
     before.state[:, solver.layout.pose(0)[2]] += 2e-4 * np.arange(len(before.state))
@@ -100,7 +106,7 @@ def test_scores_are_those_of_the_optimum_where_a_solve_ended_before_it() -> None
 
 def test_the_covariance_lacks_what_all_unknowns_explain() -> None:
     """The unknowns of the keyframes and the constants: by the inverse of the whole matrix."""
-    solver, values = solve(pair())
+    solver, values = solve_sound()
     equations, factors = solver.equations(values)
     found = compute_scores(solver, values)[0]
     window = ((solver.problem.keyframe_s - solver.problem.keyframe_s[0]) / WINDOW_S).astype(int)

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import cache
 from unittest.mock import Mock
 
 import numpy as np
@@ -35,6 +36,11 @@ def solve_plain(pair: Pair) -> Member:
     return found
 
 
+@cache
+def solve_sound() -> Member:
+    return solve_plain(pair_of(flown("in_view", "calibrated", 1000, 20.0)))
+
+
 def add_flow_noise(pair: Pair, where: Array, seed: int = 5) -> Pair:
     """The pair with noise of 0.5 m/s over 0.3 s in the first robot's flow."""
     rng = np.random.default_rng(seed)
@@ -49,7 +55,7 @@ def add_flow_noise(pair: Pair, where: Array, seed: int = 5) -> Pair:
 
 
 def test_models_are_scored_by_one_linearization_as_by_their_own() -> None:
-    base = solve_plain(pair_of(flown("in_view", "calibrated", 1000, 20.0)))
+    base = solve_sound()
     candidates = [one for one in list_candidates() if not one.model.for_a_while]
     gains = score_steps(base, candidates)
     assert min(gains.values()) < MIN_STEP_GAIN < max(gains.values())
@@ -61,7 +67,7 @@ def test_models_are_scored_by_one_linearization_as_by_their_own() -> None:
 
 
 def test_all_models_are_tried_where_the_step_is_singular(monkeypatch: pytest.MonkeyPatch) -> None:
-    base = solve_plain(pair_of(flown("in_view", "calibrated", 1000, 20.0)))
+    base = solve_sound()
     candidates = [one for one in list_candidates() if one.model.rows]
     monkeypatch.setattr(model_trials, "eliminate_states", Mock(side_effect=np.linalg.LinAlgError))
     assert score_steps(base, candidates) == dict.fromkeys(candidates, np.inf)
@@ -85,6 +91,7 @@ def test_models_without_gain_are_not_solved_after_a_leading_one(
     assert len(try_models(base, list(gains))) == 3
 
 
+@pytest.mark.heavy
 def test_quiet_flight_has_no_noisy_stretch() -> None:
     base = solve_plain(pair_of(flown("in_view", "calibrated", 1000, 40.0)))
     assert [find_noisy_steps(base.solver, base.values, robot) for robot in (0, 1)] == [None, None]

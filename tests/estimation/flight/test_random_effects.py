@@ -52,6 +52,7 @@ def test_flight_information_excludes_the_prior() -> None:
     assert out.information_vector * USUAL == pytest.approx(seen @ likeliest * USUAL, rel=1e-4)
 
 
+@pytest.mark.heavy
 def test_pooled_std_predicts_error_of_the_next_flight() -> None:
     """Of many labs, whose robots' constants stay but for a little, as in their priors' units."""
     rng = np.random.default_rng(1)

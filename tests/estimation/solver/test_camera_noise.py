@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -25,6 +26,11 @@ def solve_sighted(sees: BearingMeasurements) -> tuple[Solver, MapEstimate]:
 
 def see(hz: float = 10.0) -> BearingMeasurements:
     return sightings(flown("in_view", "calibrated", 1000, 60.0), "cf1", ("cf2",), hz=hz)
+
+
+@cache
+def solve_seen() -> tuple[Solver, MapEstimate]:
+    return solve_sighted(see())
 
 
 @pytest.mark.heavy
@@ -65,7 +71,7 @@ def test_few_images_keep_their_noise() -> None:
 
 
 def test_independent_residuals_are_not_repeated() -> None:
-    solver, found = solve_sighted(see())
+    solver, found = solve_seen()
     (view,) = solver.problem.views
     rows = bearing_factor(solver.problem, solver.layout, view, found.values)
     rng = np.random.default_rng(1)
@@ -107,7 +113,7 @@ def test_leverage_is_that_of_the_whole_matrix() -> None:
 def test_noise_is_the_residuals_over_the_share_that_is_open(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    solver, found = solve_sighted(see())
+    solver, found = solve_seen()
     (view,) = solver.problem.views
     rows = bearing_factor(solver.problem, solver.layout, view, found.values)
     posterior = camera_noise._Posterior.at(solver, found.values)
@@ -120,7 +126,7 @@ def test_noise_is_the_residuals_over_the_share_that_is_open(
 
 
 def test_exact_and_repeated_images_have_a_noise() -> None:
-    solver, found = solve_sighted(see())
+    solver, found = solve_seen()
     (view,) = solver.problem.views
     rows = bearing_factor(solver.problem, solver.layout, view, found.values)
     exact = rows.rows.copy()
@@ -131,7 +137,7 @@ def test_exact_and_repeated_images_have_a_noise() -> None:
 
 
 def test_a_camera_that_no_longer_fits_keeps_its_noise() -> None:
-    solver, found = solve_sighted(see())
+    solver, found = solve_seen()
     (view,) = solver.problem.views
     rows = bearing_factor(solver.problem, solver.layout, view, found.values)
     far = rows.rows.copy()

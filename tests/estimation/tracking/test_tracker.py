@@ -29,6 +29,7 @@ def test_a_peer_is_followed_through_misses_and_false_alarms() -> None:
     assert np.sqrt(np.mean(run.track_m2)) < 0.4
 
 
+@pytest.mark.heavy
 def test_tracker_covariance_is_consistent_under_its_model() -> None:
     """No false alarms, no misses: what is left is the filter's own arithmetic."""
     squared: list[float] = []
@@ -43,6 +44,7 @@ def test_tracker_covariance_is_consistent_under_its_model() -> None:
     assert 0.88 <= np.mean(np.array(squared) <= chi2.ppf(0.95, 3)) <= 0.99
 
 
+@pytest.mark.heavy
 def test_tracker_weights_depths_by_their_sigma() -> None:
     """Every other depth is off by 40 %, the rest by 3 %: one tracker is told which."""
     told, untold, squared = [], [], []

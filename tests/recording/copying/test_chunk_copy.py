@@ -134,13 +134,16 @@ def test_a_trim_cuts_the_chunks_at_both_its_ends(
     assert len(list(read_raw(out))) == 2 * (end_ns - start_ns)
 
 
+@pytest.mark.heavy
 def test_recordings_whose_channels_have_the_same_numbers_are_merged(tmp_path: Path) -> None:
     paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     rng = np.random.default_rng(0)
     for path, robot in zip(paths, ("cf1", "cf2"), strict=True):
         with RecordingWriter(path, MADE) as sink:
-            for k in range(12_000):
-                sink.write(k, f"/{robot}/height", message_class("Height")(height_m=rng.normal()))
+            heights = {"height_m": rng.normal(size=12_000)}
+            sink.write_columns(
+                f"/{robot}/height", message_class("Height"), np.arange(12_000), heights
+            )
     assert {*channels(paths[0])} == {*channels(paths[1])}
     out = tmp_path / "out.mcap"
     assert merge(paths, out) == 24_000
