@@ -9,7 +9,7 @@ import pytest
 
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array, BearingMeasurements, Pair, SensorTrack
-from dmrl.estimation.solver.equations import linearize, total_cost
+from dmrl.estimation.solver.equations import total_cost
 from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.levenberg_marquardt import Solver
 from dmrl.estimation.solver.priors import Chain, ConstantPrior
@@ -21,8 +21,6 @@ from dmrl.estimation.solver.residuals import (
     odometry_factor,
     range_factor,
 )
-from dmrl.estimation.solver.robust_loss import Cauchy, Gaussian
-from dmrl.estimation.solver.unknowns import Unknown
 
 TIME_S = np.arange(0, 4.001, 0.01)
 
@@ -266,6 +264,28 @@ def test_outlier_image_has_zero_weight_and_constant_cost() -> None:
     assert costs[0] == pytest.approx(costs[1])
 
 
+@pytest.mark.parametrize(("off_rad", "is_lost"), [(0.25, False), (0.33, True)])
+def test_an_azimuth_may_be_farther_off_than_its_noise(off_rad: float, is_lost: bool) -> None:
+    """Five sigmas of 0.03 and 0.05 rad together are 0.29 rad."""
+    problem, values = flight()
+    view = problem.views[0]
+    off = replace(view, bearing=view.bearing + np.array([off_rad, 0.0, 0.0]))
+    rows = bearing_factor(problem, problem.layout, off, values)
+    assert bool(rows.rows[..., :-1].any()) != is_lost
+
+
+def test_rows_take_the_residuals_and_weights_of_another_linearization() -> None:
+    problem, values = flight()
+    here, there = (
+        range_factor(problem, problem.layout, problem.links[0], at)
+        for at in (values, moved(values, 2))
+    )
+    found = here.with_residuals_of(replace(there, weight=there.weight / 2))
+    assert found.rows[..., :-1] == pytest.approx(here.rows[..., :-1])
+    assert found.rows[..., -1] == pytest.approx(there.rows[..., -1])
+    assert found.weight == pytest.approx(there.weight / 2)
+
+
 def test_simultaneous_images_share_one_weight() -> None:
     problem, _ = flight()
     view = problem.views[0]
@@ -303,32 +323,6 @@ def test_equations_are_the_gradient_of_the_cost() -> None:
             ends.append(total_cost(solver.linearize(Values(at.state, constants))))
         slope = (ends[0] - ends[1]) / (2 * step)
         assert equations.globals_gradient[column] == pytest.approx(slope, rel=1e-4, abs=1e-2)
-
-
-def test_chain_factor_is_a_random_walk_with_start_prior() -> None:
-    row = Unknown("a", "m", 0.1, "pair", Cauchy(1.0), "jump", pull_std=0.05, pull_weight=0.04)
-    value, kept, std = np.array([0.3, 0.2, 0.6]), np.array([0.5, 0.9]), np.array([0.1, 0.2])
-    chain = Chain(row, 0, value, kept, std, 0.4)
-    assert chain.residual == pytest.approx([0.75, (0.2 - 0.15) / 0.1, (0.6 - 0.18) / 0.2])
-    loss = np.log1p(chain.residual**2).sum() + 0.04 * np.log1p((value / 0.05) ** 2).sum()
-    assert chain.cost() == pytest.approx(loss / 2)
-    problem, values = flight()
-    begun, carried = (
-        [f for f in linearize(problem, problem.layout, values, known=k) if isinstance(f, Chain)]
-        for k in ((), dict(problem.layout.states))
-    )
-    for one, other in zip(begun, carried, strict=True):
-        if one.row.evolution == "jump":
-            assert (one.start_std, other.start_std) == (one.row.start_std, np.inf)
-        else:
-            assert one.start_std == other.start_std == one.row.std
-
-
-def test_priors_hold_constants_with_their_losses() -> None:
-    prior = ConstantPrior(np.array([0.2, 0.3]), np.array([0.1, 0.1]), (Cauchy(2.0), Gaussian()))
-    assert prior.cost() == pytest.approx((4 * np.log(2.0) + 9) / 2)
-    assert prior.information() == pytest.approx([50.0, 100.0])
-    assert prior.curvature() == pytest.approx([0.0, 100.0])
 
 
 def test_odometry_noise_follows_model_and_dropouts() -> None:
