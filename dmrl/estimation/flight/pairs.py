@@ -9,9 +9,10 @@ from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from scipy.special import chdtrc, erfc
 
 from dmrl.estimation.evidence.causes import find_causes, find_dropouts
+from dmrl.estimation.evidence.delays import Delay, find_delay, join_delays, move_signal
+from dmrl.estimation.evidence.error_models import Candidate
 from dmrl.estimation.evidence.goodness_of_fit import check_fit
 from dmrl.estimation.evidence.mistakes import (
-    Mistake,
     find_clock_mistake,
     find_mistake,
     has_camera,
@@ -66,6 +67,8 @@ sigmas for one of fifteen. Sound simulated flights have 0.7 to 1. A range scale 
 ranges in feet."""
 SHARED_NAMES = {row.name for row in TABLE}
 """Names of the unknowns of the plain model, which both directions of a pair report."""
+MAX_MOVES = 3
+"""Most times that a late signal is moved and the flight is solved again."""
 MIN_CAMERA_S = 3.0
 """Shortest time with consistent images that replaces motion, seconds."""
 
@@ -101,7 +104,7 @@ def _estimate_pair(
     mistakes: list[Cause] = []
     if not plain and noise is None and (clock := find_clock_mistake(logged)) is not None:
         logged, shift_s = clock.correct(logged, 1), clock.shift_s
-        mistakes.append(_to_cause(clock, logged, 1))
+        mistakes.append(_to_cause(clock.name, logged, 1))
     pair = drop_contradictions(logged)
     possible = not ranges_are_far(pair)
     pieces = list(_solve_pieces(pair, noise, plain=plain)) if possible else []
@@ -110,27 +113,66 @@ def _estimate_pair(
         mistake, robot = found
         logged, shift_s = mistake.correct(logged, robot), shift_s + mistake.shift_s
         pair, pieces = drop_contradictions(logged), []
-        mistakes.append(_to_cause(mistake, logged, robot))
+        mistakes.append(_to_cause(mistake.name, logged, robot))
         blind = robot if mistake.heading_is_open and not has_camera(logged, robot) else None
     pieces = pieces or list(_solve_pieces(pair, noise, plain=plain))
+    logged, pair, pieces, late = _move_late(logged, pair, pieces)
+    mistakes += [_to_cause(one.model.name, pair, one.robot) for one in late]
     gaps = (*mistakes, *find_dropouts(logged, pair))
     own, peer = (
         replace(one, status=np.maximum(one.status, np.int8(UNCONVERGED * (side == blind))))
         for side, one in enumerate(_both_directions(pair, pieces, gate))
     )
     return (
-        replace(own, causes=(*gaps, *own.causes)),
+        replace(own, causes=_add_causes(gaps, own.causes)),
         replace(
             peer,
             # The second robot's positions and images have the times of its own clock.
             time_s=peer.time_s - shift_s,
-            causes=(*(cause.seen_from_peer() for cause in gaps), *peer.causes),
+            causes=_add_causes([cause.seen_from_peer() for cause in gaps], peer.causes),
         ),
     )
 
 
-def _to_cause(mistake: Mistake, pair: Pair, robot: int | None) -> Cause:
-    return Cause(mistake.name, 1.0, float(pair.time_s[0]), float(pair.time_s[-1]), robot)
+def _add_causes(found: Sequence[Cause], causes: Sequence[Cause]) -> tuple[Cause, ...]:
+    """Return causes after others, without what these name already."""
+    named = {(one.name, one.robot) for one in found}
+    return (*found, *(one for one in causes if (one.name, one.robot) not in named))
+
+
+def _move_late(
+    logged: Pair, pair: Pair, pieces: list["Piece"]
+) -> tuple[Pair, Pair, list["Piece"], list[Candidate]]:
+    """Solve a flight again while it shows late signals, with these moved.
+
+    Parameters
+    ----------
+    logged, pair
+        The pair as logged, and as it was solved.
+    pieces
+        Its windows.
+
+    Returns
+    -------
+    logged, pair, pieces
+        The same without long delays.
+    models
+        Error models of the delays.
+    """
+    models: dict[Candidate, None] = {}
+    for _ in range(MAX_MOVES):
+        if (delay := join_delays([piece.delay for piece in pieces])) is None:
+            break
+        logged = move_signal(logged, delay)
+        models[delay.model] = None
+        pair = drop_contradictions(logged)
+        pieces = list(_solve_pieces(pair, None, plain=False))
+    return logged, pair, pieces, list(models)
+
+
+def _to_cause(name: str, pair: Pair, robot: int | None) -> Cause:
+    """Return a cause of a whole flight."""
+    return Cause(name, 1.0, float(pair.time_s[0]), float(pair.time_s[-1]), robot)
 
 
 def _explains(pieces: Sequence["Piece"]) -> bool:
@@ -163,6 +205,7 @@ class Piece(NamedTuple):
     energy: Array
     noisy: Mask
     chance: float = 1.0
+    delay: Delay | None = None
 
 
 def _solve_pieces(pair: Pair, noise: NoiseModel | None, *, plain: bool) -> Iterator[Piece]:
@@ -211,7 +254,9 @@ def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
     silent = odometry_dropout(pair, time_s) | noisy
     silent |= find_contradicted_steps(problem, values)[step]
     sighted, energy = list_sighted(solution, time_s), motion_energy(problem, values)
-    return Piece(estimate, silent, sighted, energy, noisy, _compute_prior_chance(problem, values))
+    chance = _compute_prior_chance(problem, values)
+    delay = find_delay(solution.mixture, covariances[1])
+    return Piece(estimate, silent, sighted, energy, noisy, chance, delay)
 
 
 def _compute_prior_chance(problem: Problem, values: Values) -> float:
