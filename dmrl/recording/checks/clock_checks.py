@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.recording.checks.scan import CheckData
+from dmrl.recording.mcap.message_batch import MAX_TIME_NS
 from dmrl.topics import CALIBRATION, TRANSFORMS, parse_topic
 
 Times = Mapping[str, NDArray[np.int64]]
@@ -22,7 +23,7 @@ MESSAGES_MIN = 2
 
 def check_clocks(data: CheckData) -> Problems:
     """Yield robots, or topics of a robot, that share no time; and zero times and stamps."""
-    times = {topic: np.sort(t) for topic, t in data.times.items() if len(t)}
+    times = {topic: t for topic, t in data.times.items() if len(t)}
     yield from _find_zero_times(times)
     robots = _collect_spans(times)
     for spans in robots.values():
@@ -36,7 +37,7 @@ def check_clocks(data: CheckData) -> Problems:
 
 
 def _find_zero_times(times: Times) -> Problems:
-    if not times or max(int(t[-1]) for t in times.values()) < UNIX_TIME_MIN_NS:
+    if not times or max(int(t.max()) for t in times.values()) < UNIX_TIME_MIN_NS:
         return
     for topic, moments in times.items():
         if zeros := int((moments == 0).sum()):
@@ -47,12 +48,13 @@ def _collect_spans(times: Times) -> dict[str, dict[str, Span]]:
     """Return the first and last time of each topic, by robot."""
     robots: dict[str, dict[str, Span]] = {}
     for topic, moments in times.items():
-        moments = moments[moments > 0]  # zeros are reported separately
+        counted = moments > 0  # zeros are reported separately
         # A topic without a leading robot name has no clock to compare.
         of_a_robot = topic.startswith("/") and topic != TRANSFORMS
-        if of_a_robot and len(moments) >= MESSAGES_MIN and not parse_topic(CALIBRATION, topic):
-            robot = topic.split("/")[1]
-            robots.setdefault(robot, {})[topic] = (int(moments[0]), int(moments[-1]))
+        enough = np.count_nonzero(counted) >= MESSAGES_MIN
+        if of_a_robot and enough and not parse_topic(CALIBRATION, topic):
+            first = int(moments.min(where=counted, initial=MAX_TIME_NS))
+            robots.setdefault(topic.split("/")[1], {})[topic] = (first, int(moments.max()))
     return robots
 
 
