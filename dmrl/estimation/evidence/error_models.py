@@ -50,6 +50,8 @@ class ErrorModel:
         Factors of the noise of ranges, and of the velocity noise of one robot.
     for_a_while
         Whether the velocity of one robot is noisier in stretches, which `noisy_stretch` finds.
+    sudden
+        Whether its unknown jumps, which one Gauss-Newton step does not show: it is always solved.
     log_odds
         Prior log odds against the plain model.
     """
@@ -59,6 +61,7 @@ class ErrorModel:
     range_factor: float = 1.0
     flow_factor: float = 1.0
     for_a_while: bool = False
+    sudden: bool = False
     log_odds: float = RARE
 
     def owners(self) -> tuple[int | None, ...]:
@@ -269,10 +272,12 @@ MODELS: tuple[ErrorModel, ...] = (
     ErrorModel(
         "range offset changes",
         (
+            # Steps of the Cauchy distribution: a wall or a person in the way is of any size.
             Unknown(
-                "range_step", "m", 0.02, "pair", Cauchy(2.0), "jump", range=longer, start_std=0.1
+                "range_step", "m", 0.02, "pair", Cauchy(2**0.5), "jump", range=longer, start_std=0.1
             ),
         ),
+        sudden=True,
         log_odds=COMMON,
     ),
     ErrorModel(

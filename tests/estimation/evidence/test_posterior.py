@@ -100,6 +100,24 @@ def test_late_ranges_are_identified_and_corrected() -> None:
     assert error < 0.85 * worse
 
 
+@pytest.mark.heavy
+def test_ranges_that_jump_in_one_place_are_identified_and_corrected() -> None:
+    flight = flown("room", "calibrated", 1006, 60.0)
+    pair = pair_of(flight)
+    far = truth_at(flight, pair.range_time_s)[:, 0] > 0.5
+    assert 8 < np.abs(np.diff(far.astype(int))).sum() < 100 and 0.1 < far.mean() < 0.9
+    jumping = replace(pair, range_m=pair.range_m + 0.5 * far)
+    ((plain, _),) = estimate_pairs([jumping], plain=True)
+    ((found, _),) = estimate_pairs([jumping])
+    error, worse = (
+        np.hypot(*(e.state[:, :2] - truth_at(flight, e.time_s)).T).mean() for e in (found, plain)
+    )
+    assert [cause.name for cause in found.causes if cause.probability > 0.5] == [
+        "range offset changes"
+    ]
+    assert error < 0.5 * worse
+
+
 def test_rivals_of_a_round_get_the_models_of_later_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
     first, rival, second = list(list_candidates())[:3]
 
