@@ -22,6 +22,7 @@ from dmrl.estimation.evidence.model_trials import (
 )
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.search.modes import COST_SCALE, SAME_TRACK_M
+from dmrl.estimation.signals.jump_detection import find_spacing
 from dmrl.estimation.solver.covariance import MIN_MOTION_ENERGY, odometry_energy
 from dmrl.estimation.solver.levenberg_marquardt import MapEstimate, Solver, is_same_solution
 from dmrl.estimation.solver.noise_selection import GRADE_BIAS
@@ -101,13 +102,18 @@ def _list_shown(problem: Problem) -> list[Candidate]:
     """Return the error models that a flight can show.
 
     A robot that does not move shows no scale of its motion, but a scale would explain its noise.
+    Ranges that are rounded coarsely jump by what they are rounded to.
     """
+    coarse = any(find_spacing(link.range_m) > problem.noise.range_std_m for link in problem.links)
     moves = [odometry_energy(problem, k) >= MIN_MOTION_ENERGY for k in range(len(problem.robots))]
     return [
         one
         for one in list_candidates()
-        if not any(row.motion_scale for row in one.model.rows)
-        or (any(moves) if one.robot is None else moves[one.robot])
+        if not (coarse and one.model.sudden)
+        and (
+            not any(row.motion_scale for row in one.model.rows)
+            or (any(moves) if one.robot is None else moves[one.robot])
+        )
     ]
 
 

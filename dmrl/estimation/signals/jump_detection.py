@@ -115,6 +115,18 @@ def find_held(values: Array) -> Array:
     return np.zeros(len(values), bool) if coarse else same
 
 
+def find_spacing(values: Array) -> float:
+    """Return the median distance between neighbouring values: the unit of a rounded log.
+
+    Parameters
+    ----------
+    values
+        (N,) samples in any order.
+    """
+    distinct = np.unique(values)
+    return float(np.median(np.diff(distinct))) if len(distinct) > 1 else 0.0
+
+
 def find_runs(marked: Mask) -> list[tuple[int, int]]:
     """Return start and end (exclusive) of each run of marked samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(int), [0]])))

@@ -52,6 +52,14 @@ def test_only_motion_shows_a_scale_of_the_flow(
     assert Candidate(MODELS[0], 0) in listed
 
 
+def test_rounded_ranges_do_not_show_jumps() -> None:
+    pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
+    for unit_m, shown in ((0.01, True), (0.4, False)):
+        rounded = replace(pair, range_m=np.round(pair.range_m / unit_m).clip(1) * unit_m)
+        listed = posterior._list_shown(build_problem({(0, 1): rounded}))
+        assert any(one.model.sudden for one in listed) == shown
+
+
 @pytest.mark.heavy
 def test_gyroscope_step_is_identified_and_corrected() -> None:
     flight = flown("in_view", "calibrated", 1002, 60.0)
