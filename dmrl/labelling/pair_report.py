@@ -23,6 +23,7 @@ LATE = (
     "Subtract the sensor's delay from its times; where all sensors of the robot are late: "
     "dmrl align"
 )
+CLEAR_LINE = "Keep walls, people and metal out of the line between the antennas"
 REMEDIES = {
     "yaw": "Let its gyroscope settle before the flight",
     "yaw rate late": LATE,
@@ -36,6 +37,8 @@ REMEDIES = {
     "range": "Measure the offset once, and give it with --range-offset-m, or let flights "
     "determine it: dmrl calibrate --sensors",
     "range late": LATE,
+    "range offset changes": CLEAR_LINE,
+    "range errors": CLEAR_LINE,
     "antenna": "Turn the antennas upright, away from metal",
     "height": "Fly over a level floor, within reach of the range finder",
     "clock": "Try: dmrl align",

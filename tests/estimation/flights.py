@@ -1,5 +1,6 @@
 """Simulated flights as pairs, with their truth."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -28,6 +29,19 @@ def pair_of(flight: Flight, own: str = "cf1", peer: str = "cf2") -> Pair:
     good &= (found.time_s >= grid_s[0]) & (found.time_s <= grid_s[-1])
     tracks = [track(flight.robots[name], grid_s) for name in (own, peer)]
     return Pair(grid_s, tracks[0], tracks[1], found.time_s[good], found.range_m[good])
+
+
+def both_ranging(flight: Flight) -> Pair:
+    """The pair with the ranges of both directions, as each robot stamped them."""
+    pair, other = pair_of(flight), flight.ranges["cf2", "cf1"]
+    time_s = np.concatenate([pair.range_time_s, other.time_s])
+    order = np.argsort(time_s, kind="stable")
+    order = order[(time_s[order] >= pair.time_s[0]) & (time_s[order] <= pair.time_s[-1])]
+    sender = np.repeat([0, 1], [len(pair.range_m), len(other.range_m)]).astype(np.int8)
+    range_m = np.concatenate([pair.range_m, other.range_m])
+    return replace(
+        pair, range_time_s=time_s[order], range_m=range_m[order], range_sender=sender[order]
+    )
 
 
 def truth_at(flight: Flight, time_s: Array, own: str = "cf1", peer: str = "cf2") -> Array:

@@ -166,6 +166,16 @@ def _one_direction(_link: "RangeLink", sight: "Sight") -> Array:
     return sight.sent - 0.5
 
 
+def _of_first(_link: "RangeLink", sight: "Sight") -> Array:
+    """Return the effect of an excess of the ranges of the first robot."""
+    return sight.sent
+
+
+def _of_second(_link: "RangeLink", sight: "Sight") -> Array:
+    """Return the effect of an excess of the ranges of the second robot."""
+    return 1.0 - sight.sent
+
+
 def _earlier(link: "RangeLink", sight: "Sight") -> Array:
     """Return the effect of late ranges: the distance shown is that of before."""
     time_s, half_s = link.time_s, 0.1
@@ -295,6 +305,16 @@ MODELS: tuple[ErrorModel, ...] = (
     ErrorModel(
         "range errors fade",
         (Unknown("range_fading", "m", 0.15, "pair", Cauchy(5.0), "fading", 4.0, range=longer),),
+    ),
+    ErrorModel(
+        "range errors of each direction fade",
+        tuple(
+            Unknown(name, "m", 0.15, "pair", Cauchy(5.0), "fading", 4.0, range=effect)
+            for name, effect in (
+                ("range_fading_first", _of_first),
+                ("range_fading_second", _of_second),
+            )
+        ),
     ),
     ErrorModel("range noise", range_factor=3.0, log_odds=COMMON),
     ErrorModel(

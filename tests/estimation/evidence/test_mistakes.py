@@ -18,7 +18,7 @@ from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.model.pair import BearingMeasurements, Pair
 from dmrl.messages import STATUS_OK
 
-from ..flights import flown, pair_of, truth_at
+from ..flights import both_ranging, flown, pair_of, truth_at
 
 BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
 
@@ -58,20 +58,6 @@ def test_of_corrections_that_fit_alike_the_open_one_is_taken() -> None:
     assert find_mistake(wrong) == (in_world, 1)
 
 
-def both_ranging(length_s: float) -> Pair:
-    """A pair of which each robot ranges."""
-    flight = flown("in_view", "calibrated", 1000, length_s)
-    pair, other = pair_of(flight), flight.ranges["cf2", "cf1"]
-    time_s = np.concatenate([pair.range_time_s, other.time_s])
-    order = np.argsort(time_s, kind="stable")
-    order = order[(time_s[order] >= pair.time_s[0]) & (time_s[order] <= pair.time_s[-1])]
-    sender = np.repeat([0, 1], [len(pair.range_m), len(other.range_m)]).astype(np.int8)
-    range_m = np.concatenate([pair.range_m, other.range_m])
-    return replace(
-        pair, range_time_s=time_s[order], range_m=range_m[order], range_sender=sender[order]
-    )
-
-
 @pytest.mark.parametrize(
     ("name", "names", "factor"),
     [
@@ -96,7 +82,7 @@ def test_a_unit_of_a_robot_is_corrected(name: str, names: tuple[str, ...], facto
 
 
 def test_ranges_in_centimetres_are_corrected_and_fill_values_left_out() -> None:
-    pair = both_ranging(20.0)
+    pair = both_ranging(flown("in_view", "calibrated", 1000, 20.0))
     fill = np.arange(len(pair.range_m)) == 3
     wrong = replace(pair, range_m=np.where(fill, 65535.0, 100 * pair.range_m))
     assert ranges_are_far(wrong) and not ranges_are_far(pair)
@@ -106,7 +92,7 @@ def test_ranges_in_centimetres_are_corrected_and_fill_values_left_out() -> None:
 
 
 def test_a_clock_moves_with_all_that_it_stamps() -> None:
-    pair = both_ranging(20.0)
+    pair = both_ranging(flown("in_view", "calibrated", 1000, 20.0))
     moved = move_clock(pair, 2.0)
     at = slice(300, 1500)
     assert moved.peer.vx_mps[500:1700] == pytest.approx(pair.peer.vx_mps[at])
@@ -128,7 +114,7 @@ def test_a_shift_of_a_clock_is_found_to_a_quarter_of_a_second(shift_s: float) ->
 
 @pytest.mark.parametrize("shift_s", [0.07, 0.12, -0.3, 3.2])
 def test_the_ranges_of_both_robots_show_an_offset_of_the_clock(shift_s: float) -> None:
-    sound = both_ranging(60.0)
+    sound = both_ranging(flown("in_view", "calibrated", 1000, 60.0))
     late = move_clock(sound, shift_s)
     mistake = find_clock_mistake(late)
     assert isinstance(mistake, Mistake)
@@ -152,7 +138,7 @@ def test_ranges_in_feet_are_corrected_although_scales_explain_them() -> None:
 
 @pytest.mark.heavy
 def test_a_clock_that_is_seconds_off_fits_when_it_is_moved() -> None:
-    late = move_clock(both_ranging(60.0), 3.2)
+    late = move_clock(both_ranging(flown("in_view", "calibrated", 1000, 60.0)), 3.2)
     mistake = find_clock_mistake(late)
     assert mistake is not None
     assert compute_misfit(mistake.correct(late, 1)) < 0.6

@@ -15,7 +15,7 @@ from dmrl.estimation.solver.unknowns import TABLE
 from dmrl.flight import Trajectory
 from dmrl.messages import STATUS_OK
 
-from ..flights import flown, pair_of, truth_at
+from ..flights import both_ranging, flown, pair_of, truth_at
 
 
 def test_names_of_models_and_of_their_unknowns_are_distinct() -> None:
@@ -124,6 +124,24 @@ def test_ranges_that_jump_in_one_place_are_identified_and_corrected() -> None:
         "range offset changes"
     ]
     assert error < 0.5 * worse
+
+
+@pytest.mark.heavy
+def test_ranges_that_fade_in_each_direction_are_identified_and_corrected() -> None:
+    flight = flown("in_view", "calibrated", 1007, 60.0)
+    pair, rng = both_ranging(flight), np.random.default_rng(3)
+    slow_s = np.arange(0.0, 61.0, 2.5)
+    fading = [np.interp(pair.range_time_s, slow_s, rng.normal(0, 0.25, len(slow_s))) for _ in "12"]
+    excess_m = np.where(pair.range_sender == 0, *fading)
+    faded = replace(pair, range_m=np.maximum(pair.range_m + excess_m, 0.05))
+    ((plain, _),) = estimate_pairs([faded], plain=True)
+    ((found, _),) = estimate_pairs([faded])
+    error, worse = (
+        np.hypot(*(e.state[:, :2] - truth_at(flight, e.time_s)).T).mean() for e in (found, plain)
+    )
+    names = [cause.name for cause in found.causes if cause.probability > 0.5]
+    assert "range errors of each direction fade" in names
+    assert error < 0.8 * worse
 
 
 def test_rivals_of_a_round_get_the_models_of_later_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
