@@ -94,7 +94,7 @@ def _describe_changes(model: ErrorModel) -> list[str]:
 
 def _describe_unknown(row: Unknown) -> str:
     unit = "" if row.unit == "1" else f" {row.unit}"
-    loss = f", Cauchy {row.loss.sigmas:.3g}" if isinstance(row.loss, Cauchy) else ""
+    loss = f", Cauchy {row.loss.sigmas:g}" if isinstance(row.loss, Cauchy) else ""
     match row.evolution:
         case "constant":
             kind = f"{row.std:g}{unit}"

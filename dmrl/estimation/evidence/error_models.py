@@ -282,9 +282,8 @@ MODELS: tuple[ErrorModel, ...] = (
     ErrorModel(
         "range offset changes",
         (
-            # Steps of the Cauchy distribution: a wall or a person in the way is of any size.
             Unknown(
-                "range_step", "m", 0.02, "pair", Cauchy(2**0.5), "jump", range=longer, start_std=0.1
+                "range_step", "m", 0.02, "pair", Cauchy(2.0), "jump", range=longer, start_std=0.1
             ),
         ),
         sudden=True,
