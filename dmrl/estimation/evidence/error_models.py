@@ -308,11 +308,8 @@ MODELS: tuple[ErrorModel, ...] = (
     ErrorModel(
         "range errors of each direction fade",
         tuple(
-            Unknown(name, "m", 0.15, "pair", Cauchy(5.0), "fading", 4.0, range=effect)
-            for name, effect in (
-                ("range_fading_first", _of_first),
-                ("range_fading_second", _of_second),
-            )
+            Unknown(f"range_fading_{k}", "m", 0.15, "pair", Cauchy(5.0), "fading", 4.0, range=one)
+            for k, one in (("first", _of_first), ("second", _of_second))
         ),
     ),
     ErrorModel("range noise", range_factor=3.0, log_odds=COMMON),
