@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dmrl.estimation.evidence.error_models import Candidate
+from dmrl.estimation.evidence.mistakes import MIN_SHIFT_S, MIN_SHIFT_SIGMAS
 from dmrl.estimation.evidence.posterior import Mixture
 from dmrl.estimation.model.pair import Array, Pair, SensorTrack
 
@@ -20,8 +21,6 @@ SIGNALS = {
     "range_delay": (),
 }
 """Signals of a robot that each unknown delays; none: the ranges of the pair."""
-MIN_DELAY_S, MIN_DELAY_SIGMAS = 0.05, 5.0
-"""Shortest delay that is moved, seconds and standard deviations: the same as of a clock."""
 MIN_PROBABILITY = 0.5
 """Smallest probability of the error model of a delay that is moved."""
 
@@ -65,7 +64,7 @@ def find_delay(mixture: Mixture, constants_covariance: Array) -> Delay | None:
             k = best.solver.problem.layout.find(name, *owners)
             delay_s, sigma_s = best.values.constants[k], np.sqrt(constants_covariance[k, k])
             if (
-                abs(delay_s) >= max(MIN_DELAY_S, MIN_DELAY_SIGMAS * sigma_s)
+                abs(delay_s) >= max(MIN_SHIFT_S, MIN_SHIFT_SIGMAS * sigma_s)
                 and probable[model] >= MIN_PROBABILITY
             ):
                 return Delay(name, model, float(delay_s))
@@ -120,4 +119,7 @@ def _move_track(track: SensorTrack, names: Sequence[str], steps: int) -> SensorT
     index = np.clip(at, 0, len(at) - 1)
     gone = track.dropout[index] | (at != index)
     moved = {name: getattr(track, name)[index] for name in names}
-    return replace(track, **moved, dropout=track.dropout | gone)
+    turn = track.turn_dropout
+    if turn is not None and "yaw_rate_radps" in names:
+        turn = turn | turn[index] | (at != index)
+    return replace(track, **moved, dropout=track.dropout | gone, turn_dropout=turn)

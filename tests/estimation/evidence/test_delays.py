@@ -30,6 +30,16 @@ def test_every_signal_has_its_error_model() -> None:
     assert MODELS.keys() == SIGNALS.keys()
 
 
+def test_gaps_of_a_late_yaw_rate_move_with_it() -> None:
+    pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
+    gap = np.arange(len(pair.time_s)) // 100 == 5
+    peer = replace(pair.peer, dropout=gap, turn_dropout=gap)
+    delay = Delay("yaw_rate_delay", MODELS["yaw_rate_delay"], 0.3)
+    moved = move_signal(replace(pair, peer=peer), delay).peer
+    assert moved.turn_dropout is not None
+    assert moved.turn_dropout[470:600].all() and not moved.turn_dropout[:470].any()
+
+
 @pytest.mark.parametrize("unknown", list(SIGNALS))
 def test_one_signal_is_moved_and_no_other(unknown: str) -> None:
     pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
