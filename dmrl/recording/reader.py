@@ -233,8 +233,10 @@ def read_table(
     end_ns: int | None = None,
 ) -> pa.Table:
     """Read one topic into an Arrow table, possibly without rows; see ``iter_columns``."""
-    batches = list(iter_columns(path, topic, fields=fields, start_ns=start_ns, end_ns=end_ns))
-    if not batches:
+    names = match_topics(path, [topic])
+    batches = join_batches(iter_batches(path, names, start_ns=start_ns, end_ns=end_ns))
+    decoded = [decode_topic(path, topic, *each, fields) for each in batches]
+    if not decoded:
         channels = {0: read_channel(path, topic)}
-        batches = [decode_topic(path, topic, EMPTY_BATCH, channels, fields)]
-    return pa.Table.from_batches(batches)
+        decoded = [decode_topic(path, topic, EMPTY_BATCH, channels, fields)]
+    return pa.Table.from_batches(decoded)

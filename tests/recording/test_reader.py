@@ -77,6 +77,14 @@ def test_time_spans_are_half_open(flight: Path) -> None:
     assert batch["log_time"].to_pylist() == [100_000_000, 200_000_000]
 
 
+@pytest.mark.parametrize("times_ns", [SHUFFLED, [400, *range(400), *range(401, 500)]])
+def test_any_window_of_overlapping_chunks_is_whole(tmp_path: Path, times_ns: list[int]) -> None:
+    path = foreign(tmp_path / "a.mcap", times_ns)
+    for low, high in ((0, 1), (17, 18), (100, 399), (399, 402), (499, 500), (500, 900), (30, 30)):
+        found = read_table(path, "/cf1/height", start_ns=low, end_ns=high)
+        assert found["log_time"].to_pylist() == list(range(low, min(high, 500)))
+
+
 def test_equal_times_keep_their_order_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:

@@ -167,10 +167,10 @@ def select_chunks(
     summary: SummarySection, channel_ids: Set[int], low: int, high: int
 ) -> list[ChunkIndex]:
     """Return the chunks that may contain messages of these channels in [low, high), by time."""
-    chunks, starts, ends = summary.chunks_by_time
-    inside = [chunks[k] for k in np.flatnonzero((ends >= low) & (starts < high)).tolist()]
-    seen = [chunk.message_index_offsets for chunk in inside]
-    return [c for c, n in zip(inside, seen, strict=True) if not (n and channel_ids.isdisjoint(n))]
+    chunks, starts, latest_ends = summary.chunks_by_time
+    near = chunks[np.searchsorted(latest_ends, low) : np.searchsorted(starts, high)]
+    inside = [(c, c.message_index_offsets) for c in near if c.message_end_time >= low]
+    return [c for c, n in inside if not (n and channel_ids.isdisjoint(n))]
 
 
 def _scan_unindexed(

@@ -107,10 +107,11 @@ def open_mcap(path: Path) -> Iterator[BoundedReader]:
     RecordingError
         If it is absent, not MCAP or truncated, or a read in the block meets corrupt data.
     """
-    if path.is_dir():
-        raise RecordingError(f"{path} is a folder, not a recording. Name a .mcap file")
-    if path.exists() and not path.is_file():  # opening a pipe waits for its other end
-        raise RecordingError(f"{path} is not a regular file. Save it to one first")
+    if not path.is_file():
+        if path.is_dir():
+            raise RecordingError(f"{path} is a folder, not a recording. Name a .mcap file")
+        if path.exists():  # opening a pipe waits for its other end
+            raise RecordingError(f"{path} is not a regular file. Save it to one first")
     try:
         with BoundedReader(path) as stream:
             _refuse_changed(stream)

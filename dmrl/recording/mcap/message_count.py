@@ -110,10 +110,10 @@ def verify_indexes(stream: BoundedReader, section: SummarySection) -> MessageCou
     McapError
         If they state another number or other times, one is not listed, or they fail dmrl's CRC.
     """
-    if not all(chunk.message_index_offsets for chunk in section.chunk_indexes):
-        return None
 
-    def count() -> MessageCount:
+    def count() -> MessageCount | None:
+        if not all(chunk.message_index_offsets for chunk in section.chunk_indexes):
+            return None
         times = iter_index_times(stream, section)
         return _compare(section.statistics, section.channels_by_id, times)
 

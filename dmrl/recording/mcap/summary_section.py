@@ -71,13 +71,13 @@ class SummarySection(McapSummary):
 
     @cached_property
     def chunks_by_time(self) -> tuple[list[ChunkIndex], Ints, Ints]:
-        """Chunk indexes by their first log time, and (N,) first and last log times."""
+        """Chunk indexes by first log time; (N,) first log times, and last ones up to each chunk."""
         found = sorted(
             self.chunk_indexes, key=lambda c: (c.message_start_time, c.chunk_start_offset)
         )
         times = [(chunk.message_start_time, chunk.message_end_time) for chunk in found]
         starts, ends = np.array(times, np.int64).reshape(-1, 2).T
-        return found, starts, ends
+        return found, starts, np.maximum.accumulate(ends)
 
     @property
     def counts(self) -> dict[int, int]:

@@ -133,11 +133,13 @@ def decode_strings(data: Bytes, start: Ints, end: Ints, kind: pa.DataType) -> pa
     if offsets[-1] > np.iinfo(np.int32).max:
         raise WireError("more than 2 GiB of text in one batch")
     if len(size) and offsets[-1] > GATHER_BYTES * len(size):
-        view = data.data
-        body = b"".join(view[a:b] for a, b in zip(start.tolist(), end.tolist(), strict=True))
+        # An array, since NumPy asks for huge pages: bytes cause a page fault for each 4 kB.
+        body = np.empty(offsets[-1], np.uint8)
+        view, to = data.data, body.data
+        for at, a, b in zip(offsets.tolist(), start.tolist(), end.tolist(), strict=False):
+            to[at : at + b - a] = view[a:b]
     else:
-        index = np.arange(offsets[-1]) + np.repeat(start - offsets[:-1], size)
-        body = data[index].tobytes()
+        body = data[np.arange(offsets[-1]) + np.repeat(start - offsets[:-1], size)]
     buffers = [None, pa.py_buffer(offsets.astype(np.int32)), pa.py_buffer(body)]
     made = pa.Array.from_buffers(kind, len(size), buffers)
     try:

@@ -9,6 +9,7 @@ from mcap.records import Chunk, ChunkIndex
 
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunks.chunk import (
+    MESSAGE_OPCODE,
     RECORD_HEADER_BYTES,
     ParsedChunk,
     build_batch_at,
@@ -166,7 +167,7 @@ def _select_by_index(
         raise McapError(f"index beyond the chunk at byte {at}")
     # Message indexes have no CRC, so they are compared with the records they point at.
     batch = build_batch_at(data, offset)
-    right = (data[offset] == Opcode.MESSAGE) & (batch.channel == channel)
+    right = (data[offset] == MESSAGE_OPCODE) & (batch.channel == channel)
     if not (right & (batch.time_ns == time_ns) & (batch.end <= len(data))).all():
         raise McapError(f"index of the chunk at byte {at} is wrong")
     return _check_time_range(chunk_index, require_valid_times(batch)), dict(
@@ -202,4 +203,5 @@ def _parse_chunk_record(raw: bytes, chunk_index: ChunkIndex) -> Chunk:
         or end > chunk_index.chunk_length
     ):
         raise McapError(f"the chunk at byte {at} differs from its index in the summary")
-    return Chunk(compression, raw[begin:end], last, first, crc, size)
+    body = memoryview(raw)[begin:end]  # a slice would be a copy
+    return Chunk(compression, body, last, first, crc, size)  # type: ignore[arg-type]
