@@ -112,14 +112,13 @@ class NormalEquations:
 def to_upper_bands(diagonal: Array, above: Array) -> Array:
     """Return (2n, K n) upper bands of a matrix of (K, n, n) blocks, in the layout of SciPy."""
     size = diagonal.shape[1]
-    width = 2 * size - 1
-    out = np.zeros((width + 1, len(diagonal), size))
-    for row in range(size):
-        at = width + row - np.arange(row, size)
-        out[at, :, np.arange(row, size)] = diagonal[:, row, row:].T
-        at = width + row - np.arange(size) - size
-        out[at, 1:, np.arange(size)] = above[:, row].T
-    return out.reshape(width + 1, -1)
+    out = np.zeros((len(diagonal), size, 2 * size))
+    for column in range(size):
+        first = size - 1 - column
+        out[1:, column, first : first + size] = above[:, :, column]
+        out[:, column, first + size :] = diagonal[:, : column + 1, column]
+    # In the order of LAPACK, which then copies nothing.
+    return out.reshape(-1, 2 * size).T
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +185,10 @@ class Eliminated:
         """Return the log determinant of the keyframes' matrix."""
         return float(2 * np.log(self.factor[-1]).sum())
 
+    def whole_log_det(self) -> float:
+        """Return the log determinant of the whole matrix."""
+        return self.log_det() + float(np.linalg.slogdet(self.information)[1])
+
 
 def solve_step(equations: NormalEquations) -> Solved:
     """Solve for the Gauss-Newton step and the terms of the covariance.
@@ -199,8 +202,8 @@ def solve_step(equations: NormalEquations) -> Solved:
     covariance: Array = np.asarray(np.linalg.inv(left.information), float)
     constants = -covariance @ left.gradient
     state = -left.substitute(left.half @ np.concatenate([[1.0], constants])[:, None])
-    log_det = left.log_det() + float(np.linalg.slogdet(left.information)[1])
-    return Solved(state.reshape(equations.gradient.shape), constants, covariance, log_det, left)
+    state = state.reshape(equations.gradient.shape)
+    return Solved(state, constants, covariance, left.whole_log_det(), left)
 
 
 def eliminate_states(equations: NormalEquations) -> Eliminated:
@@ -215,9 +218,10 @@ def eliminate_states(equations: NormalEquations) -> Eliminated:
     """
     size = len(equations.globals_block)
     factor = cholesky_banded(
-        to_upper_bands(equations.diagonal, equations.off_diagonal), check_finite=False
+        to_upper_bands(equations.diagonal, equations.off_diagonal),
+        overwrite_ab=True,
+        check_finite=False,
     )
-    # In the order of LAPACK, which then copies nothing.
     right = np.empty((size + 1, *equations.gradient.shape))
     right[0], right[1:] = equations.gradient, equations.coupling.transpose(2, 0, 1)
     half, _ = dtbtrs(factor, right.reshape(size + 1, -1).T, trans="T", overwrite_b=True)

@@ -7,7 +7,7 @@ import numpy as np
 
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array
-from dmrl.estimation.solver.block_tridiagonal import NormalEquations, solve_step
+from dmrl.estimation.solver.block_tridiagonal import NormalEquations, eliminate_states, solve_step
 from dmrl.estimation.solver.equations import build_equations, linearize, total_cost
 from dmrl.estimation.solver.layout import Layout
 from dmrl.estimation.solver.priors import Carried, Chain, ConstantPrior
@@ -159,7 +159,7 @@ class Solver:
         """
         if log_det is None:
             equations = build_equations(self.layout, factors, len(found.values.state))
-            log_det = solve_step(equations).log_det
+            log_det = eliminate_states(equations).whole_log_det()
         noise, normalizer = self.problem.noise, 0.0
         for robot in range(len(self.problem.robots)):
             normalizer += float(np.log(odometry_variance(self.problem, robot)).sum()) / 2
@@ -174,8 +174,7 @@ class Solver:
             if isinstance(factor, Chain):
                 normalizer += factor.log_std
                 # The pull to zero is not a normalized density, so it is no evidence.
-                square = (factor.value / factor.row.pull_std) ** 2
-                pull += factor.row.pull_weight * float(np.log1p(square).sum()) / 2
+                pull += factor.pull()
             elif isinstance(factor, ConstantPrior):
                 normalizer += float(np.log(factor.std).sum())
         return pull - found.cost - normalizer - log_det / 2

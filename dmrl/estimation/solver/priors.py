@@ -1,6 +1,7 @@
 """Prior factors: of constants, of chains that evolve, and carried from the window before."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -19,7 +20,7 @@ ANCHOR_INFORMATION = 1e6
 """Information on the first robot's first pose, which defines the frame of the flight."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Chain:
     """Evolution of one state over the flight, and the pull of each value to zero.
 
@@ -42,7 +43,7 @@ class Chain:
     std: Array
     start_std: float
 
-    @property
+    @cached_property
     def residual(self) -> Array:
         """(K,) whitened first value and steps."""
         steps = (self.value[1:] - self.kept * self.value[:-1]) / self.std
@@ -56,18 +57,25 @@ class Chain:
 
     def cost(self) -> float:
         """Return half the sum of the losses."""
-        pull = self.row.pull_weight * np.log1p((self.value / self.row.pull_std) ** 2).sum()
-        return float(self.row.loss.cost(self.residual**2).sum() + pull) / 2
+        return float(self.row.loss.cost(self.residual**2).sum()) / 2 + self.pull()
+
+    def pull(self) -> float:
+        """Return the cost of the pull to zero."""
+        if not self.row.pull_weight:
+            return 0.0
+        square = (self.value / self.row.pull_std) ** 2
+        return self.row.pull_weight * float(np.log1p(square).sum()) / 2
 
     def add_to(self, equations: NormalEquations) -> None:
         """Add the weighted rows to the normal equations."""
         at, residual = self.column, self.residual
         weight = self.row.loss.weight(residual**2)
-        pull = self.row.pull_weight / (self.row.pull_std**2 + self.value**2)
         weight_start, weight = weight[0] / self.start_std**2, weight[1:] / self.std**2
         diagonal, gradient = equations.diagonal[:, at, at], equations.gradient[:, at]
-        diagonal += pull
-        gradient += pull * self.value
+        if self.row.pull_weight:
+            pull = self.row.pull_weight / (self.row.pull_std**2 + self.value**2)
+            diagonal += pull
+            gradient += pull * self.value
         diagonal[0] += weight_start
         gradient[0] += weight_start * self.value[0]
         diagonal[1:] += weight

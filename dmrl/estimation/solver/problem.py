@@ -1,7 +1,8 @@
 """The problem to solve: keyframes with their odometry, ranges and images, and the noise."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -72,7 +73,7 @@ class NoiseModel:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class Steps:
     """Measured motion of one robot between K keyframes, S = K - 1.
 
@@ -108,8 +109,21 @@ class Steps:
     noise_factor: float = 1.0
     grade: Array | float = 1.0
 
+    @cached_property
+    def _effects(self) -> "dict[Callable[[Steps], Array], Array]":
+        return {}
 
-@dataclass(frozen=True, slots=True)
+    def effect_of(self, motion: "Callable[[Steps], Array]") -> Array:
+        """Return the (3, S) effect of an unknown on the measured motion.
+
+        No effect depends on the values of unknowns, so all linearizations take the same.
+        """
+        if motion not in self._effects:
+            self._effects[motion] = np.ascontiguousarray(motion(self).T)
+        return self._effects[motion]
+
+
+@dataclass(frozen=True, eq=False)
 class RangeLink:
     """R ranges between two robots.
 
@@ -145,6 +159,38 @@ class RangeLink:
     offset_guess_m: Array
     sent: Array
 
+    @cached_property
+    def place(self) -> NDArray[np.intp]:
+        """(R,) number of each range among those of its keyframe."""
+        count = np.bincount(self.keyframe)
+        return np.asarray(np.arange(len(self.keyframe)) - (np.cumsum(count) - count)[self.keyframe])
+
+    @cached_property
+    def _padded(self) -> "dict[int, PaddedRanges]":
+        return {}
+
+    def pad(self, keyframes: int) -> "PaddedRanges":
+        """Return the ranges with equally many at each of a number of keyframes.
+
+        Every linearization of a link takes the same, so they are kept.
+        """
+        if keyframes not in self._padded:
+            most = int(self.place.max(initial=0)) + 1
+            at = self.place * keyframes + self.keyframe
+            kept = {"range_m": self.range_m, "std_share": self.std_share, "height_m": self.height_m}
+            kept |= {"own_shift_m": self.own_shift_m, "peer_shift_m": self.peer_shift_m}
+            full = {}
+            for name, values in kept.items():
+                # Axes are contiguous: half of the time of interleaved ones.
+                out = np.full((*values.shape[1:], most * keyframes), float(name == "std_share")).T
+                out[at] = values
+                full[name] = out
+            key = np.tile(np.arange(keyframes), most)
+            weight = np.zeros((most, keyframes))
+            weight.ravel()[at] = 1.0
+            self._padded[keyframes] = PaddedRanges(self.robots, key, at, weight, **full)
+        return self._padded[keyframes]
+
     def list_sights(
         self, distance: Array, offset: Array, here: Array, there: Array
     ) -> "dict[float, Sight]":
@@ -161,6 +207,26 @@ class RangeLink:
             1.0: Sight(distance, offset, here, self.sent),
             -1.0: Sight(distance, -offset, there, 1 - self.sent),
         }
+
+
+@dataclass(frozen=True, slots=True)
+class PaddedRanges:
+    """Ranges of a link at K keyframes, m at each. The number of a range comes before its keyframe.
+
+    ``keyframe``, ``range_m``, ``std_share``, ``height_m`` (m K,), ``own_shift_m`` and
+    ``peer_shift_m`` (m K, 2) as in `RangeLink`; ``at`` (R,) places of the ranges of the link;
+    ``weight`` (m, K) 1 for a range, 0 for a filling.
+    """
+
+    robots: tuple[int, int]
+    keyframe: NDArray[np.intp]
+    at: NDArray[np.intp]
+    weight: Array
+    range_m: Array
+    std_share: Array
+    height_m: Array
+    own_shift_m: Array
+    peer_shift_m: Array
 
 
 class Sight(NamedTuple):

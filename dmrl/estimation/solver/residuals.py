@@ -6,17 +6,18 @@ normal equations and return their loss, so a new factor is one function that ret
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.estimation.model.bearings import subtract_bearings
-from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation_matrix
+from dmrl.estimation.model.odometry import QUARTER_TURN
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.block_tridiagonal import NormalEquations
 from dmrl.estimation.solver.layout import Layout
-from dmrl.estimation.solver.problem import CameraView, Problem, RangeLink
+from dmrl.estimation.solver.problem import CameraView, PaddedRanges, Problem, RangeLink
 from dmrl.estimation.solver.robust_loss import Loss
 
 MAX_OUTLIER_SIGMAS, AZIMUTH_MARGIN_RAD = 5.0, 0.05
@@ -41,7 +42,7 @@ class Factor(Protocol):
         """Add the weighted rows to the normal equations."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Rows:
     """Whitened rows of one kind of measurement.
 
@@ -67,7 +68,7 @@ class Rows:
     weight: Array
     steps: bool = False
 
-    @property
+    @cached_property
     def square(self) -> Array:
         """(B, m) squared whitened residuals."""
         return np.asarray((self.rows[..., -1] ** 2).sum(axis=-1))
@@ -111,35 +112,38 @@ def motion_gain(layout: Layout, robot: int, constants: Array) -> Array:
 
 def odometry_factor(problem: Problem, layout: Layout, robot: int, values: Values) -> Rows:
     """Linearize the measured motions of one robot: predicted minus measured shift and turn."""
-    steps, pose = problem.robots[robot], values.state[:, layout.pose(robot)]
-    back = rotation_matrix(-pose[:-1, 2])
-    way = rotate(back, np.diff(pose[:, :2], axis=0))
+    steps, pose = problem.robots[robot], values.state[:, layout.pose(robot)].T
+    cos, sin = np.cos(pose[2, :-1]), np.sin(pose[2, :-1])
+    moved = np.diff(pose)
+    way = np.stack([cos * moved[0] + sin * moved[1], cos * moved[1] - sin * moved[0]])
     mine = list(layout.of(robot))
     columns = layout.pose(robot) + [c for row, c, constant in mine if row.motion and not constant]
     border = [c for row, c, constant in mine if constant and (row.motion or row.motion_scale)]
     size = len(columns)
-    out = np.zeros((2 * size + len(border) + 1, 3, len(way))).T
+    # Steps are last in memory, as `NormalEquations.add_rows` adds them.
+    out = np.zeros((2 * size + len(border) + 1, 3, len(cos)))
     gain = motion_gain(layout, robot, values.constants)
     for row, c, constant in mine:
         if row.motion_scale and constant:
-            out[:, :2, 2 * size + border.index(c)] += way * np.array(row.motion_scale)
+            out[2 * size + border.index(c), :2] += way * np.array(row.motion_scale)[:, None]
         if row.motion and constant:
-            effect = row.motion(steps)
-            out[:, :, 2 * size + border.index(c)] += effect
-            out[..., -1] += effect * values.constants[c]
+            effect = steps.effect_of(row.motion)
+            out[2 * size + border.index(c)] += effect
+            out[-1] += effect * values.constants[c]
         elif row.motion:
             # A state acts by the mean of its values at both ends.
-            effect, at = row.motion(steps) / 2, columns.index(c)
-            out[:, :, at] = out[:, :, size + at] = effect
-            out[..., -1] += effect * (values.state[:-1, c] + values.state[1:, c])[:, None]
-    out[:, :2, -1] += gain * way - steps.motion.shift_m
-    out[:, 2, -1] += np.diff(pose[:, 2]) - steps.motion.turn_rad
-    ahead = gain[:, None] * back
-    out[:, :2, :2], out[:, :2, size : size + 2] = -ahead, ahead
-    out[:, :2, 2] = -gain * (way @ QUARTER_TURN.T)
-    out[:, 2, 2], out[:, 2, size + 2] = -1.0, 1.0
-    out /= np.sqrt(odometry_variance(problem, robot))[..., None]
-    rows, ones = out[:, :, None], np.ones((3, len(way))).T
+            effect, at = steps.effect_of(row.motion) / 2, columns.index(c)
+            out[at] = out[size + at] = effect
+            out[-1] += effect * (values.state[:-1, c] + values.state[1:, c])
+    out[-1, :2] += gain[:, None] * way - steps.motion.shift_m.T
+    out[-1, 2] += moved[2] - steps.motion.turn_rad
+    out[size, :2] = gain[0] * cos, -gain[1] * sin
+    out[size + 1, :2] = gain[0] * sin, gain[1] * cos
+    out[:2, :2] = -out[size : size + 2, :2]
+    out[2, :2] = gain[0] * way[1], -gain[1] * way[0]
+    out[2, 2], out[size + 2, 2] = -1.0, 1.0
+    out /= np.sqrt(odometry_variance(problem, robot)).T
+    rows, ones = out.T[:, :, None], np.ones((3, len(cos))).T
     return Rows(rows, columns, border, problem.noise.motion_loss, ones, steps=True)
 
 
@@ -158,7 +162,7 @@ class _Geometry(NamedTuple):
     by_scale: dict[int, Array]
 
 
-def _geometry(measured: RangeLink | CameraView, layout: Layout, values: Values) -> _Geometry:
+def _geometry(measured: PaddedRanges | CameraView, layout: Layout, values: Values) -> _Geometry:
     """Return the relative position at each measurement."""
     here, there = (values.state[:, layout.pose(k)] for k in measured.robots)
     at = measured.keyframe
@@ -175,7 +179,7 @@ def _geometry(measured: RangeLink | CameraView, layout: Layout, values: Values) 
 
 
 def _correct_shift(
-    measured: RangeLink | CameraView, side: int, layout: Layout, values: Values
+    measured: PaddedRanges | CameraView, side: int, layout: Layout, values: Values
 ) -> tuple[Array, dict[int, Array]]:
     """Return a robot's motion from the keyframe to each measurement, in the frame of the flight.
 
@@ -202,43 +206,42 @@ def _correct_shift(
 
 def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Values) -> Rows:
     """Linearize the ranges of one pair: predicted minus measured."""
-    at = _geometry(link, layout, values)
+    padded, keyframes = link.pad(len(values.state)), len(values.state)
+    at = _geometry(padded, layout, values)
     distance = np.sqrt(_dot(at.offset, at.offset) + at.up**2) + 1e-6
     towards = at.offset / distance[:, None]
     used = layout.measured(link.robots, "range")
     states = [c for _, c, constant, _ in used if not constant]
     border = [*(c for _, c, constant, _ in used if constant), *at.by_scale]
     columns = layout.pose(link.robots[0]) + layout.pose(link.robots[1]) + states
-    out = np.zeros((len(columns) + len(border) + 1, len(distance))).T
+    # Keyframes are last in memory, as `NormalEquations.add_rows` adds them.
+    out = np.zeros((len(columns) + len(border) + 1, len(distance)))
     gain, error, heights = 1.0, 0.0, []
     headings = (values.state[link.keyframe, layout.pose(k)[2]] for k in link.robots)
-    sights = link.list_sights(distance, at.offset, *headings)
+    sights = link.list_sights(distance[padded.at], at.offset[padded.at], *headings)
     for row, c, constant, side in used:
         column = len(columns) + border.index(c) if constant else columns.index(c)
-        value = values.constants[c] if constant else values.state[link.keyframe, c]
+        value = values.constants[c] if constant else values.state[padded.keyframe, c]
         if row.height:
             heights.append((column, side * row.height))
         elif row.range_scale:
             gain = gain + row.range_scale * value
-            out[:, column] = row.range_scale * distance
+            out[column] = row.range_scale * distance
         elif row.range:
-            effect = row.range(link, sights[side])
-            out[:, column] = effect
-            error = error + effect * value
+            out[column, padded.at] = row.range(link, sights[side])
+            error = error + out[column] * value
     for column, share in heights:
-        out[:, column] = (share * gain) * at.up / distance
+        out[column] = (share * gain) * at.up / distance
     towards *= np.reshape(gain, (-1, 1))
     for c, effect in at.by_scale.items():
-        out[:, len(columns) + border.index(c)] = _dot(towards, effect)
-    out[:, 0:2], out[:, 3:5] = -towards, towards
+        out[len(columns) + border.index(c)] = _dot(towards, effect)
+    out[0:2], out[3:5] = -towards.T, towards.T
     for column, by_turn in ((2, at.by_own_turn), (5, at.by_peer_turn)):
-        out[:, column] = _dot(towards, by_turn)
-    out[:, -1] = gain * distance + error - link.range_m
-    out *= (1 / (problem.noise.range_std_m * link.std_share))[:, None]
-    return _pad_rows(
-        out[:, None], link.keyframe, np.ones(len(out)), len(values.state),
-        (columns, border, problem.noise.range_loss),
-    )  # fmt: skip
+        out[column] = _dot(towards, by_turn)
+    out[-1] = gain * distance + error - padded.range_m
+    out *= padded.weight.ravel() / (problem.noise.range_std_m * padded.std_share)
+    rows = out.reshape(len(out), 1, -1, keyframes).T
+    return Rows(rows, columns, border, problem.noise.range_loss, padded.weight.T)
 
 
 def _dot(one: Array, other: Array) -> Array:
