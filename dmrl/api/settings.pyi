@@ -254,6 +254,7 @@ class EvaluateSettings(TypedDict, total=False):
     partial: bool
     threshold: float | None
     false_alarms: float | None
+    robot_width_m: float | None
     draws: int
     seed: int
     settle_s: float | None

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.errors import SettingError
+from dmrl.evaluation.box_precision import BoxPrecision, compute_box_precision
 from dmrl.evaluation.comparison import (
     HEADERS,
     align_images,
@@ -66,6 +67,8 @@ class Evaluation:
         The one that was used.
     paired
         Differences of two recordings with the same images and labels, as JSON values; else None.
+    boxes
+        Precision of the detections as boxes. None: the width of the robots is not given.
     """
 
     settings: Settings
@@ -74,6 +77,7 @@ class Evaluation:
     bands: list[BandMetrics]
     threshold: float
     paired: dict[str, Any] | None = None
+    boxes: BoxPrecision | None = None
 
 
 def evaluate_detections(
@@ -93,9 +97,12 @@ def evaluate_detections(
     Raises
     ------
     RecordingError
-        If a recording cannot be read, or has no detections, labels or images.
+        If a recording cannot be read, or has no detections, labels or images; with boxes, if it
+        has no calibration of the camera.
     SettingError
         If one has no labels of that source, no such split, or no image to evaluate.
+    MissingExtra
+        If boxes are wanted and pycocotools is not installed.
     """
     parts = join_each(recordings, settings.against, settings.split, partial=settings.partial)
     pairs = concatenate_parts(parts)
@@ -114,7 +121,9 @@ def evaluate_detections(
     if len(parts) == 2 and (both := align_images(*parts)):
         chosen = [_choose_threshold(_score(part), part, settings) for part in both]
         paired = compare_models(both, chosen, settings.draws, settings.seed)
-    return Evaluation(settings, pairs, scored, bands, threshold, paired)
+    width_m = settings.robot_width_m
+    boxes = None if width_m is None else compute_box_precision(pairs, width_m)
+    return Evaluation(settings, pairs, scored, bands, threshold, paired, boxes)
 
 
 def _score(pairs: LabelledDetections) -> ScoredDetections:
@@ -168,6 +177,7 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
         "curves": curves_to_json(evaluation.scored),
         "definitions": METRIC_DEFINITIONS,
         **({"paired": evaluation.paired} if evaluation.paired else {}),
+        **({"boxes": evaluation.boxes.to_json()} if evaluation.boxes else {}),
     }
 
 
@@ -203,6 +213,8 @@ def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None
     if evaluation.paired:
         print_table("the two on their common images", HEADERS, build_rows(evaluation.paired))
         print_line(note(evaluation.paired))
+    if evaluation.boxes and not pooled:
+        evaluation.boxes.print()
     if not pooled:
         print_line(
             f"in brackets: 95 % intervals, bootstrap over images; precision, recall and F1 at "

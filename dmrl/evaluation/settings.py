@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter, validators
 
-from dmrl.terminal.arguments import Count, Share
+from dmrl.terminal.arguments import Count, Positive, Share
 
 Finite = Annotated[float | None, Parameter(validator=validators.Number(gte=0, lt=1e6))]
 
@@ -33,6 +33,9 @@ class Settings:
     false_alarms
         Choose the threshold on these images: that of the best F1 among those at which an image
         without a robot has at most so many detections, on average, such as 0.05.
+    robot_width_m
+        Width of the robots, metres, such as 0.13 for a Crazyflie with its propellers: detections
+        are also judged as boxes so wide, by COCO's average precision. Needs dmrl[coco].
     draws
         Bootstrap samples behind the 95 % intervals.
     seed
@@ -48,6 +51,7 @@ class Settings:
     partial: Annotated[bool, Parameter(negative=())] = False
     threshold: Share | None = None
     false_alarms: Finite = None
+    robot_width_m: Positive | None = None
     draws: Count = 1000
     seed: int = 0
     settle_s: Finite = None

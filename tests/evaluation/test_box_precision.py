@@ -1,0 +1,105 @@
+"""Boxes of labels and detections, judged by COCO's rules."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dmrl import topics
+from dmrl.errors import MissingExtra, MissingTopic
+from dmrl.evaluation.box_precision import BoxPrecision, compute_box_precision
+from dmrl.evaluation.detections import join_by_image
+from dmrl.images.codec import encode_png
+from dmrl.messages import message_class
+from dmrl.recording import Provenance, RecordingWriter
+
+WIDTH_M = 0.2
+PICTURE = message_class("CompressedImage")(
+    data=encode_png(np.zeros((48, 64, 3), np.uint8)), format="png"
+)
+CAMERA = message_class("CameraCalibration")(width=64, height=48, K=[50, 0, 32, 0, 50, 24, 0, 0, 1])
+Point = tuple[float, float, float]
+
+
+def judged(
+    path: Path, images: list[tuple[list[Point], list[Point]]], calibrated: bool = True
+) -> BoxPrecision:
+    """Judge images with the (u, v, depth) of their labels and detections."""
+    with RecordingWriter(path, Provenance("test")) as sink:
+        if calibrated:
+            sink.write(0, topics.CALIBRATION("cf1"), CAMERA)
+        for k, sides in enumerate(images):
+            peers, found = (
+                [dict(zip(("u_px", "v_px", "depth_m"), point, strict=True)) for point in side]
+                for side in sides
+            )
+            labels = [{**one, "source": "truth"} for one in peers]
+            sink.write(k, topics.CAMERA_IMAGE("cf1"), PICTURE)
+            sink.write(k, topics.LABELS("cf1"), message_class("PeerLabels")(peers=labels))
+            seen = [{**one, "confidence": 0.9 - 0.1 * n} for n, one in enumerate(found)]
+            sink.write(k, topics.DETECTIONS("cf1"), message_class("Detections")(detections=seen))
+    return compute_box_precision(join_by_image([path], "truth"), WIDTH_M)
+
+
+def test_equal_boxes_have_full_precision(tmp_path: Path) -> None:
+    point = (30.0, 20.0, 1.0)
+    got = judged(tmp_path / "a.mcap", [([point], [point]), ([], [])])
+    assert got.figures == {
+        **dict.fromkeys(("ap", "ap50", "ap75", "ap_small", "ar"), pytest.approx(1)),
+        **dict.fromkeys(("ap_medium", "ap_large")),
+    }
+    assert got.to_json() == {"robot_width_m": WIDTH_M, "images": 2, "left_out": 0, **got.figures}
+
+
+def test_a_wrong_depth_shrinks_the_box(tmp_path: Path) -> None:
+    # Intersection over union is (1 / 1.2)^2 = 0.69: enough for 0.5, 0.55, 0.6 and 0.65.
+    got = judged(tmp_path / "a.mcap", [([(30.0, 20.0, 1.0)], [(30.0, 20.0, 1.2)])])
+    assert (got.figures["ap"], got.figures["ar"]) == (pytest.approx(0.4), pytest.approx(0.4))
+    assert (got.figures["ap50"], got.figures["ap75"]) == (pytest.approx(1), 0)
+
+
+def test_boxes_end_at_the_border_of_the_image(tmp_path: Path) -> None:
+    # Both have a width of 10 px; 5 and 2.5 of them are in the image.
+    got = judged(tmp_path / "a.mcap", [([(0.0, 20.0, 1.0)], [(-2.5, 20.0, 1.0)])])
+    assert (got.figures["ap50"], got.figures["ap75"]) == (pytest.approx(1), 0)
+
+
+def test_a_false_detection_in_an_empty_image_counts(tmp_path: Path) -> None:
+    point = (30.0, 20.0, 1.0)
+    images = [([point], [(5.0, 5.0, 1.0), point]), ([], [point])]
+    assert judged(tmp_path / "a.mcap", images).figures["ap"] == pytest.approx(1 / 3, abs=0.01)
+
+
+def test_without_detections_the_precision_is_zero(tmp_path: Path) -> None:
+    got = judged(tmp_path / "a.mcap", [([(30.0, 20.0, 1.0)], [])])
+    assert (got.figures["ap"], got.figures["ar"]) == (0, 0)
+
+
+def test_an_image_with_a_label_without_depth_is_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    point, flat = (30.0, 20.0, 1.0), (10.0, 10.0, float("nan"))
+    got = judged(tmp_path / "a.mcap", [([point], [point]), ([point, flat], [])])
+    assert (got.images, got.left_out, got.figures["ap"]) == (1, 1, pytest.approx(1))
+    got.print()
+    said = capsys.readouterr().out
+    assert "boxes 0.2 m wide in 1 images" in said
+    assert "left out: images with a label without a depth: 1" in said
+
+
+def test_a_recording_without_calibration_is_refused(tmp_path: Path) -> None:
+    point = (30.0, 20.0, 1.0)
+    with pytest.raises(MissingTopic, match="/cf1/camera/calibration"):
+        judged(tmp_path / "a.mcap", [([point], [point])], calibrated=False)
+
+
+def test_a_missing_package_is_named_with_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none: Any = None
+    monkeypatch.setitem(sys.modules, "pycocotools.coco", none)
+    point = (30.0, 20.0, 1.0)
+    with pytest.raises(MissingExtra, match=r"pip install 'dmrl\[coco\]'"):
+        judged(tmp_path / "a.mcap", [([point], [point])])
