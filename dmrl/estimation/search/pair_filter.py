@@ -179,33 +179,38 @@ def trace_lanes(
 
 
 def _stack(rows: Iterable[Sequence[Array]], count: int) -> list[Array]:
-    """Stack the arrays of a number of rows, and hold one row at a time."""
+    """Stack the arrays (..., B) of a number of rows to (T, B, ...), and hold one row at a time."""
     out: list[Array] = []
     for t, row in enumerate(rows):
         out = out or [np.empty((count, *array.shape)) for array in row]
         for stacked, array in zip(out, row, strict=True):
             stacked[t] = array
-    return out
+    return [np.moveaxis(stacked, -1, 1) for stacked in out]
 
 
 def _iter_keyframes(
     inputs: FilterInputs, lanes: Sequence[Lane], start: Array, lane_of: NDArray[np.intp], count: int
 ) -> Iterator[FilterRun]:
-    """Yield the filters at each of a number of keyframes: arrays without the axis of time."""
-    state, step = np.zeros((len(start), SIZE)), np.zeros((len(start), SIZE, SIZE))
-    state[:, :3] = start
-    covariance = np.broadcast_to(np.diag(HYPOTHESIS_STD**2), step.shape).copy()
+    """Yield the filters at each of a number of keyframes: arrays without the axis of time.
+
+    Filters are last in memory: an operation on all of them is faster than one on small matrices.
+    """
+    state, step = np.zeros((SIZE, len(start))), np.zeros((SIZE, SIZE, len(start)))
+    state[:3] = start.T
+    step[range(SIZE), range(SIZE)] = 1.0
+    covariance = step * (HYPOTHESIS_STD**2)[:, None, None]
+    step[:] = 0.0
     keys = np.stack([_pad_with_none(lane.keyframe, count) for lane in lanes])
-    motions = _list_motions(inputs, keys)
+    motions, ranges = _list_motions(inputs, keys), _list_ranges(inputs, keys)
     columns = [np.flatnonzero(lane_of == number) for number in range(len(lanes))]
     for t in range(count):
         if t > 0:
-            state, step = _propagate(state, motions, lane_of, t - 1)
-            covariance = step @ covariance @ step.swapaxes(1, 2)
-            covariance[:, range(SIZE), range(SIZE)] += motions.variance[lane_of, t - 1]
+            state, covariance, step = _propagate(
+                state, covariance, motions[t - 1].take(lane_of, axis=1)
+            )
         prior = state.copy(), covariance.copy()
         filters = FilterRun(state, np.zeros(len(start)), covariance, *prior, step)
-        _update_ranges(filters, inputs, keys[lane_of, t])
+        _update_ranges(filters, ranges[t].take(lane_of, axis=1))
         for key, mine in zip(keys[:, t].tolist(), columns, strict=True):
             for image in inputs.images.get(key, ()):
                 _update_image(filters, mine, image, float(inputs.height_m[key]))
@@ -216,24 +221,18 @@ def _pad_with_none(keyframe: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     return np.concatenate([keyframe[:count], np.full(max(count - len(keyframe), 0), -1)])
 
 
-@dataclass(frozen=True, slots=True)
-class _Motions:
-    """Motions of L lanes from each of T keyframes to the next; none after the end of a lane.
+def _list_motions(inputs: FilterInputs, keys: NDArray[np.intp]) -> Array:
+    """Return (T - 1, 12, L) motions of lanes from each keyframe to the next; 0 after their ends.
 
-    ``seconds`` (L, T - 1), negative backwards; ``turns`` (L, T - 1, 2), ``shifts``
-    (L, T - 1, 2, 2) of observer and peer, ``variance`` (L, T - 1, 5).
-    """
-
-    seconds: Array
-    turns: Array
-    shifts: Array
-    variance: Array
-
-
-def _list_motions(inputs: FilterInputs, keys: NDArray[np.intp]) -> _Motions:
-    """Return the motions of lanes whose (L, T) keyframes are given, -1 after the end.
-
+    They are seconds, negative backwards; turns of observer and peer; shifts of both; variances.
     Backwards a step is its inverse: the turn negated, the shift seen from its end.
+
+    Parameters
+    ----------
+    inputs
+        Measurements of the pair.
+    keys
+        (L, T) keyframes, -1 after the end of a lane.
     """
     before, after = keys[:, :-1], keys[:, 1:]
     moving = after >= 0
@@ -241,53 +240,83 @@ def _list_motions(inputs: FilterInputs, keys: NDArray[np.intp]) -> _Motions:
     sign = np.where(after > before, 1.0, -1.0) * moving
     turns = inputs.turns[step]
     seen_from = np.where((sign < 0)[..., None], -turns, 0.0)
-    return _Motions(
-        sign * inputs.step_s[step],
+    shifts = rotate(rotation_matrix(seen_from), inputs.shifts[step])
+    every = [
+        (sign * inputs.step_s[step])[..., None],
         sign[..., None] * turns,
-        sign[..., None, None] * rotate(rotation_matrix(seen_from), inputs.shifts[step]),
+        sign[..., None] * shifts.reshape(*sign.shape, 4),
         inputs.step_var[step] * moving[..., None],
-    )
+    ]
+    return np.ascontiguousarray(np.concatenate(every, axis=-1).transpose(1, 2, 0))
 
 
-def _propagate(
-    state: Array, motions: _Motions, lane: NDArray[np.intp], t: int
-) -> tuple[Array, Array]:
-    """Return (B, 5) states at the next keyframe of their lanes, and (B, 5, 5) Jacobians."""
-    seconds, shifts = motions.seconds[lane, t], motions.shifts[lane, t]
-    turns = motions.turns[lane, t] - seconds[:, None] * state[:, 3:5]
-    peer = rotate(rotation_matrix(state[:, 2]), shifts[:, 1])
-    back = rotation_matrix(-turns[:, 0])
-    out = state.copy()
-    out[:, :2] = rotate(back, state[:, :2] + peer - shifts[:, 0])
-    out[:, 2] += turns[:, 1] - turns[:, 0]
-    jacobian = np.zeros((len(state), SIZE, SIZE))
-    jacobian[:, :2, :2] = back
-    jacobian[:, :2, 2] = rotate(back, peer @ QUARTER_TURN.T)
-    jacobian[:, :2, 3] = seconds[:, None] * (out[:, :2] @ QUARTER_TURN.T)
-    jacobian[:, [2, 3, 4], [2, 3, 4]] = 1.0
-    jacobian[:, 2, 3], jacobian[:, 2, 4] = seconds, -seconds
-    return out, jacobian
+def _list_ranges(inputs: FilterInputs, keys: NDArray[np.intp]) -> Array:
+    """Return (T, 4, L) ranges of lanes: whether there is one, range, variance, squared height."""
+    key = np.maximum(keys, 0)
+    seen = (keys >= 0) & np.isfinite(inputs.range_m[key])
+    measured = np.where(seen, inputs.range_m[key], 0.0)
+    variance = np.where(seen, inputs.range_var[key], 1.0)
+    every = np.stack([seen, measured, variance, inputs.height_m[key] ** 2])
+    return np.ascontiguousarray(every.transpose(2, 0, 1))
 
 
-def _update_ranges(filters: FilterRun, inputs: FilterInputs, keys: NDArray[np.intp]) -> None:
-    """Update filters with the ranges of their (B,) keyframes, -1 after the end, in place."""
+def _propagate(state: Array, covariance: Array, motion: Array) -> tuple[Array, Array, Array]:
+    """Return the filters at the next keyframe of their lanes.
+
+    Parameters
+    ----------
+    state, covariance
+        (5, B) and (5, 5, B) before.
+    motion
+        (12, B), see `_list_motions`.
+
+    Returns
+    -------
+    state, covariance, step : Array
+        (5, B) and (5, 5, B) after, and (5, 5, B) Jacobians.
+    """
+    seconds, shift, peer = motion[0], motion[3:5], motion[5:7]
+    turn, peer_turn = motion[1:3] - seconds * state[3:]
+    cos, sin = np.cos(state[2]), np.sin(state[2])
+    x, y = cos * peer[0] - sin * peer[1], sin * peer[0] + cos * peer[1]
+    far_x, far_y = state[0] + x - shift[0], state[1] + y - shift[1]
+    cos, sin = np.cos(turn), np.sin(turn)
+    out, step = state.copy(), np.zeros_like(covariance)
+    out[0], out[1] = cos * far_x + sin * far_y, cos * far_y - sin * far_x
+    out[2] += peer_turn - turn
+    step[0, 0] = step[1, 1] = cos
+    step[0, 1], step[1, 0] = sin, -sin
+    step[0, 2], step[1, 2] = sin * x - cos * y, sin * y + cos * x
+    step[0, 3], step[1, 3] = -seconds * out[1], seconds * out[0]
+    step[[2, 3, 4], [2, 3, 4]] = 1.0
+    step[2, 3], step[2, 4] = seconds, -seconds
+    # Only x, y and psi move, and x and y do not depend on the peer's bias.
+    moved = covariance.copy()
+    moved[:2] = np.einsum("ikb,kjb->ijb", step[:2, :4], covariance[:4])
+    moved[2] += seconds * (covariance[3] - covariance[4])
+    spread = moved.copy()
+    spread[:, :2] = np.einsum("ikb,jkb->ijb", moved[:, :4], step[:2, :4])
+    spread[:, 2] += seconds * (moved[:, 3] - moved[:, 4])
+    np.einsum("iib->ib", spread)[...] += motion[7:]
+    return out, spread, step
+
+
+def _update_ranges(filters: FilterRun, ranges: Array) -> None:
+    """Update filters with the ranges (4, B) of their keyframes (`_list_ranges`), in place."""
     state, log_likelihood, covariance = filters[:3]
-    alive, key = keys >= 0, np.maximum(keys, 0)
-    measured, variance = inputs.range_m[key], inputs.range_var[key]
-    seen = alive & np.isfinite(measured)
-    variance = np.where(seen, variance, 1.0)
-    expected = np.sqrt((state[:, :2] ** 2).sum(axis=1) + inputs.height_m[key] ** 2) + 1e-6
-    towards = state[:, :2] / expected[:, None]
-    cross = np.einsum("bij,bj->bi", covariance[:, :, :2], towards)
-    spread = np.einsum("bi,bi->b", towards, cross[:, :2]) + variance
-    innovation = np.where(seen, measured - expected, 0.0)
+    seen, measured, variance, height2 = ranges
+    expected = np.sqrt(state[0] * state[0] + state[1] * state[1] + height2) + 1e-6
+    x, y = state[:2] / expected
+    cross = covariance[:, 0] * x + covariance[:, 1] * y
+    spread = x * cross[0] + y * cross[1] + variance
+    innovation = seen * (measured - expected)
     size = np.abs(innovation) / np.sqrt(spread)
     log_likelihood -= seen * (0.5 * np.log(spread) + np.log1p(0.5 * size**2))
     # A large innovation counts as a noisy range.
     spread += variance * (np.maximum(1.0, size / SOFT_SIGMAS) ** 2 - 1)
-    gain = np.where(seen, 1 / spread, 0.0)[:, None] * cross
-    state += gain * innovation[:, None]
-    covariance -= gain[:, :, None] * cross[:, None, :]
+    gain = seen / spread * cross
+    state += gain * innovation
+    covariance -= gain[:, None] * cross
 
 
 def _update_image(
@@ -302,33 +331,34 @@ def _update_image(
     """
     state, log_likelihood, covariance = filters[:3]
     sign, bearing, std = image
-    x, y = sign * state[mine, :2].T
+    x, y = sign * state[:2, mine]
     up = sign * height_m
     level2 = np.maximum(x * x + y * y, 1e-4)
     turned = sign < 0
     polar = np.column_stack(
         [
-            np.arctan2(y, x) - turned * state[mine, 2],
+            np.arctan2(y, x) - turned * state[2, mine],
             np.arctan2(up, np.sqrt(level2)),
             np.log(level2 + up * up) / 2,
         ]
     )
-    row = np.column_stack([-y, x, np.zeros(len(x))]) * (sign / level2)[:, None]
-    row[:, 2] = -1.0 * turned
-    farther = np.column_stack([x, y]) * (sign / (level2 + up * up))[:, None]
-    cross = np.einsum("bij,bj->bi", covariance[mine][..., :3], row)
+    row = np.stack([-y, x, np.zeros(len(x))]) * (sign / level2)
+    row[2] = -1.0 * turned
+    farther = np.stack([x, y]) * (sign / (level2 + up * up))
+    part = covariance[:, :, mine]
+    cross = np.einsum("ijb,jb->ib", part[:, :3], row)
     spread = np.zeros((len(mine), 1, 3))
-    spread[:, 0, 0] = np.einsum("bi,bi->b", row, cross[:, :3])
-    spread[:, 0, 2] = np.einsum("bi,bij,bj->b", farther, covariance[mine][:, :2, :2], farther)
+    spread[:, 0, 0] = np.einsum("ib,ib->b", row, cross[:3])
+    spread[:, 0, 2] = np.einsum("ib,ijb,jb->b", farther, part[:2, :2], farther)
     spread = spread + std**2
     off = subtract_bearings(bearing, polar[:, None])
     squared = (off**2 / spread).sum(axis=2)
     nearest, each = squared.argmin(axis=1), np.arange(len(mine))
     least, variance = squared[each, nearest], spread[each, nearest, 0]
     log_likelihood[mine] -= 0.5 * np.log(variance) + np.log1p(0.5 * least)
-    gain = np.where(least < IMAGE_GATE, 1 / variance, 0.0)[:, None] * cross
-    state[mine] += gain * off[each, nearest, :1]
-    covariance[mine] -= gain[:, :, None] * cross[:, None, :]
+    gain = np.where(least < IMAGE_GATE, 1 / variance, 0.0) * cross
+    state[:, mine] += gain * off[each, nearest, 0]
+    covariance[:, :, mine] -= gain[:, None] * cross
 
 
 def smooth_rts(run: FilterRun) -> Array:
@@ -338,5 +368,6 @@ def smooth_rts(run: FilterRun) -> Array:
         back = np.linalg.solve(
             run.prior_covariance[t + 1], (state[t + 1] - run.prior[t + 1])[..., None]
         )
-        state[t] += (run.covariance[t] @ run.step[t + 1].swapaxes(1, 2) @ back)[..., 0]
+        pulled = np.einsum("bki,bk->bi", run.step[t + 1], back[..., 0])
+        state[t] += np.einsum("bik,bk->bi", run.covariance[t], pulled)
     return state
