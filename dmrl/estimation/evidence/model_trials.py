@@ -207,7 +207,8 @@ def score_steps(base: Member, candidates: Sequence[Candidate]) -> dict[Candidate
 
     A stretch of noise has no such step, so it is always tried. All are, where the step is singular.
     """
-    unknowns, always = [one for one in candidates if one.model.rows], Forecast(np.inf, np.inf)
+    unknowns = [one for one in candidates if one.model.rows and not one.model.sudden]
+    always = Forecast(np.inf, np.inf)
     try:
         forecasts = _score_unknowns(base, unknowns)
     except np.linalg.LinAlgError:

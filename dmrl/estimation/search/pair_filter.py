@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.estimation.model.bearings import subtract_bearings
-from dmrl.estimation.model.odometry import QUARTER_TURN, rotate, rotation_matrix
+from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.keyframes import average_ranges
 from dmrl.estimation.solver.problem import CameraView, Problem

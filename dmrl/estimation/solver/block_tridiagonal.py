@@ -49,7 +49,7 @@ class NormalEquations:
         )
 
     def add_rows(self, rows: Array, columns: list[int], border: list[int], steps: bool) -> None:
-        """Add the products of weighted Jacobian rows, in place.
+        """Add the products of weighted Jacobian rows, in place; `mirror` completes the diagonal.
 
         Parameters
         ----------
@@ -74,9 +74,7 @@ class NormalEquations:
                 if first // size != second // size:
                     self.off_diagonal[:, at, other] += product
                     continue
-                self.diagonal[part, at, other] += product
-                if at != other:
-                    self.diagonal[part, other, at] += product
+                self.diagonal[part, min(at, other), max(at, other)] += product
             for constant, product in zip(border, products[corner - first : -1], strict=True):
                 self.coupling[part, at, constant] += product
             self.gradient[part, at] += products[-1]
@@ -84,6 +82,11 @@ class NormalEquations:
         rest = flat @ flat.T
         self.globals_block[np.ix_(edge, edge)] += rest[:-1, :-1]
         self.globals_gradient[edge] += rest[:-1, -1]
+
+    def mirror(self) -> None:
+        """Copy the upper triangle of every diagonal block to the lower one, in place."""
+        for row in range(1, self.diagonal.shape[1]):
+            self.diagonal[:, row, :row] = self.diagonal[:, :row, row]
 
     def select(self, states: Sequence[int], constants: Sequence[int]) -> "NormalEquations":
         """Return the equations of some columns of the keyframes and of the constants."""
@@ -145,7 +148,9 @@ class Solved:
 
     def gain(self, equations: NormalEquations) -> float:
         """Return by how much the step reduces the cost of its equations."""
-        slope = (equations.gradient * self.state).sum() + equations.globals_gradient @ self.constants
+        slope = (
+            equations.gradient * self.state
+        ).sum() + equations.globals_gradient @ self.constants
         return -float(slope) / 2
 
     def response(self) -> Array:

@@ -71,6 +71,7 @@ def build_equations(
     equations = NormalEquations.zeros(keyframes, layout.width, len(layout.constants))
     for factor in factors:
         factor.add_to(equations)
+    equations.mirror()
     at = np.arange(layout.width)
     equations.diagonal[:, at, at] += WEAK_INFORMATION
     equations.diagonal[0, :3, :3] += anchored * ANCHOR_INFORMATION * np.eye(3)

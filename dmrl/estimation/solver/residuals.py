@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.estimation.model.bearings import subtract_bearings
-from dmrl.estimation.model.odometry import QUARTER_TURN
 from dmrl.estimation.model.pair import Array
 from dmrl.estimation.solver.block_tridiagonal import NormalEquations
 from dmrl.estimation.solver.layout import Layout
@@ -175,7 +174,10 @@ def _geometry(measured: PaddedRanges | CameraView, layout: Layout, values: Value
         error = values.constants[c] if constant else values.state[at, c]
         up = up + side * row.height * error
     offset = np.take((there - here)[:, :2].T, at, axis=1).T + peer - own
-    return _Geometry(offset, up, -own @ QUARTER_TURN.T, peer @ QUARTER_TURN.T, by_scale)
+    by_own_turn, by_peer_turn = (
+        np.stack([-way * v[:, 1], way * v[:, 0]]).T for way, v in ((-1.0, own), (1.0, peer))
+    )
+    return _Geometry(offset, up, by_own_turn, by_peer_turn, by_scale)
 
 
 def _correct_shift(
@@ -188,20 +190,21 @@ def _correct_shift(
     """
     robot, shift = measured.robots[side], (measured.own_shift_m, measured.peer_shift_m)[side]
     heading = values.state[:, layout.pose(robot)[2]]
-    cos, sin = np.cos(heading)[measured.keyframe], np.sin(heading)[measured.keyframe]
+    cos, sin = (part.take(measured.keyframe) for part in (np.cos(heading), np.sin(heading)))
+    # Axes are contiguous: half of the time of interleaved ones.
+    ahead, aside = shift.T
+    turned = np.stack([cos * ahead, sin * ahead]), np.stack([-sin * aside, cos * aside])
     gain = motion_gain(layout, robot, values.constants)
 
-    def turn(factor: Array) -> Array:
-        # The two axes are contiguous: half of the time of interleaved ones.
-        x, y = shift[:, 0] * factor[0], shift[:, 1] * factor[1]
-        return np.stack([cos * x - sin * y, sin * x + cos * y]).T
+    def scale(factor: Array) -> Array:
+        return np.asarray(turned[0] * factor[0] + turned[1] * factor[1]).T
 
     by_scale = {
-        c: turn(-np.array(row.motion_scale) / gain**2)
+        c: scale(-np.array(row.motion_scale) / gain**2)
         for row, c, constant in layout.of(robot)
         if row.motion_scale and constant and shift.any()
     }
-    return turn(1 / gain), by_scale
+    return scale(1 / gain), by_scale
 
 
 def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Values) -> Rows:
@@ -217,8 +220,9 @@ def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Valu
     # Keyframes are last in memory, as `NormalEquations.add_rows` adds them.
     out = np.zeros((len(columns) + len(border) + 1, len(distance)))
     gain, error, heights = 1.0, 0.0, []
-    headings = (values.state[link.keyframe, layout.pose(k)[2]] for k in link.robots)
-    sights = link.list_sights(distance[padded.at], at.offset[padded.at], *headings)
+    headings = (values.state[:, layout.pose(k)[2]].take(link.keyframe) for k in link.robots)
+    offset = at.offset.T.take(padded.at, axis=1).T
+    sights = link.list_sights(distance.take(padded.at), offset, *headings)
     for row, c, constant, side in used:
         column = len(columns) + border.index(c) if constant else columns.index(c)
         value = values.constants[c] if constant else values.state[padded.keyframe, c]

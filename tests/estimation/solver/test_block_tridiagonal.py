@@ -38,6 +38,7 @@ def random_equations(seed: int = 0) -> tuple[NormalEquations, Array, Array]:
             jacobian, residual = rows[key, :, :-1], rows[key, :, -1]
             dense[np.ix_(at, at)] += jacobian.T @ jacobian
             vector[at] += jacobian.T @ residual
+    out.mirror()
     return out, dense, vector
 
 
