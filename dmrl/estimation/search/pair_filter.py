@@ -196,18 +196,15 @@ def _iter_keyframes(
     Filters are last in memory: an operation on all of them is faster than one on small matrices.
     """
     state, step = np.zeros((SIZE, len(start))), np.zeros((SIZE, SIZE, len(start)))
-    state[:3] = start.T
-    step[range(SIZE), range(SIZE)] = 1.0
-    covariance = step * (HYPOTHESIS_STD**2)[:, None, None]
-    step[:] = 0.0
+    state[:3], covariance = start.T, np.zeros_like(step)
+    covariance[range(SIZE), range(SIZE)] = (HYPOTHESIS_STD**2)[:, None]
     keys = np.stack([_pad_with_none(lane.keyframe, count) for lane in lanes])
     motions, ranges = _list_motions(inputs, keys), _list_ranges(inputs, keys)
     columns = [np.flatnonzero(lane_of == number) for number in range(len(lanes))]
     for t in range(count):
         if t > 0:
-            state, covariance, step = _propagate(
-                state, covariance, motions[t - 1].take(lane_of, axis=1)
-            )
+            motion = motions[t - 1].take(lane_of, axis=1)
+            state, covariance, step = _propagate(state, covariance, motion)
         prior = state.copy(), covariance.copy()
         filters = FilterRun(state, np.zeros(len(start)), covariance, *prior, step)
         _update_ranges(filters, ranges[t].take(lane_of, axis=1))
@@ -225,14 +222,8 @@ def _list_motions(inputs: FilterInputs, keys: NDArray[np.intp]) -> Array:
     """Return (T - 1, 12, L) motions of lanes from each keyframe to the next; 0 after their ends.
 
     They are seconds, negative backwards; turns of observer and peer; shifts of both; variances.
-    Backwards a step is its inverse: the turn negated, the shift seen from its end.
-
-    Parameters
-    ----------
-    inputs
-        Measurements of the pair.
-    keys
-        (L, T) keyframes, -1 after the end of a lane.
+    Backwards a step is its inverse: the turn negated, the shift seen from its end. ``keys`` (L, T)
+    are the keyframes, -1 after the end of a lane.
     """
     before, after = keys[:, :-1], keys[:, 1:]
     moving = after >= 0
@@ -261,19 +252,9 @@ def _list_ranges(inputs: FilterInputs, keys: NDArray[np.intp]) -> Array:
 
 
 def _propagate(state: Array, covariance: Array, motion: Array) -> tuple[Array, Array, Array]:
-    """Return the filters at the next keyframe of their lanes.
+    """Return states (5, B), covariances and Jacobians (5, 5, B) at the next keyframe of each lane.
 
-    Parameters
-    ----------
-    state, covariance
-        (5, B) and (5, 5, B) before.
-    motion
-        (12, B), see `_list_motions`.
-
-    Returns
-    -------
-    state, covariance, step : Array
-        (5, B) and (5, 5, B) after, and (5, 5, B) Jacobians.
+    ``motion`` (12, B) as in `_list_motions`.
     """
     seconds, shift, peer = motion[0], motion[3:5], motion[5:7]
     turn, peer_turn = motion[1:3] - seconds * state[3:]
@@ -335,13 +316,9 @@ def _update_image(
     up = sign * height_m
     level2 = np.maximum(x * x + y * y, 1e-4)
     turned = sign < 0
-    polar = np.column_stack(
-        [
-            np.arctan2(y, x) - turned * state[2, mine],
-            np.arctan2(up, np.sqrt(level2)),
-            np.log(level2 + up * up) / 2,
-        ]
-    )
+    azimuth = np.arctan2(y, x) - turned * state[2, mine]
+    elevation, log_distance = np.arctan2(up, np.sqrt(level2)), np.log(level2 + up * up) / 2
+    polar = np.column_stack([azimuth, elevation, log_distance])
     row = np.stack([-y, x, np.zeros(len(x))]) * (sign / level2)
     row[2] = -1.0 * turned
     farther = np.stack([x, y]) * (sign / (level2 + up * up))

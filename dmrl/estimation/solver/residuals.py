@@ -174,10 +174,8 @@ def _geometry(measured: PaddedRanges | CameraView, layout: Layout, values: Value
         error = values.constants[c] if constant else values.state[at, c]
         up = up + side * row.height * error
     offset = np.take((there - here)[:, :2].T, at, axis=1).T + peer - own
-    by_own_turn, by_peer_turn = (
-        np.stack([-way * v[:, 1], way * v[:, 0]]).T for way, v in ((-1.0, own), (1.0, peer))
-    )
-    return _Geometry(offset, up, by_own_turn, by_peer_turn, by_scale)
+    by_turn = np.stack([own[:, 1], -own[:, 0]]).T, np.stack([-peer[:, 1], peer[:, 0]]).T
+    return _Geometry(offset, up, *by_turn, by_scale)
 
 
 def _correct_shift(
