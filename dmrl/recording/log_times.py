@@ -1,6 +1,6 @@
 """Read the log times of topics from the message indexes."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,6 @@ from dmrl.recording.mcap.message_count import count_chunks, count_scanned, verif
 from dmrl.recording.mcap.record_scan import scan_file
 from dmrl.recording.mcap.summary_section import read_summary_section
 from dmrl.recording.summary import read_summary
-
-_NO_TIMES: Ints = np.empty(0, np.int64)
 
 
 def read_log_times(
@@ -45,8 +43,10 @@ def read_log_times(
     names = frozenset(topic for topic in topics if topic in present)
     low = 0 if start_ns is None else start_ns
     high = MAX_TIME_NS if end_ns is None else end_ns
-    found = {topic: np.sort(times) for topic, times in read_indexed_times(path, names).items()}
-    return {topic: t[(t >= low) & (t < high)] for topic, t in found.items()}
+    parts: dict[str, list[Ints]] = {topic: [np.empty(0, np.int64)] for topic in names}
+    for topic, t in iter_sorted_times(path, names):
+        parts[topic].append(t[(t >= low) & (t < high)])
+    return {topic: np.concatenate(times) for topic, times in parts.items()}
 
 
 def read_time_spans(path: Path) -> dict[str, tuple[int, int]]:
@@ -72,24 +72,35 @@ def read_time_spans(path: Path) -> dict[str, tuple[int, int]]:
     return spans
 
 
-def read_indexed_times(path: Path, topics: frozenset[str]) -> dict[str, Ints]:
-    """Read log times in the order of the message indexes, without decompressing chunks.
+def iter_sorted_times(path: Path, topics: frozenset[str]) -> Iterator[tuple[str, Ints]]:
+    """Yield log times from the message indexes, without decompressing chunks.
+
+    Memory is bounded by the chunks that overlap in time.
+
+    Yields
+    ------
+    tuple
+        Topic, and (N,) its next log times, nanoseconds. Those of a topic are sorted.
 
     Raises
     ------
     RecordingError
         If the file is not a complete recording, or its message indexes are corrupt.
     """
-    parts: dict[str, list[Ints]] = {topic: [_NO_TIMES] for topic in topics}
     with open_mcap(path) as stream:
         summary = read_summary_section(stream)
         if summary is not None and all(c.message_index_offsets for c in summary.chunk_indexes):
             by_topic = {t: [n for n, c in summary.channels.items() if c.topic == t] for t in topics}
-            for ids, times in iter_index_times(stream, summary, topics):
+            pending = dict.fromkeys(topics, np.empty(0, np.int64))
+            for ids, times, later_ns in iter_index_times(stream, summary, topics):
                 for topic, numbers in by_topic.items():
-                    parts[topic].append(times[np.isin(ids, numbers)])
-            return {topic: np.concatenate(times) for topic, times in parts.items()}
+                    held = np.concatenate([pending[topic], times[np.isin(ids, numbers)]])
+                    held.sort()
+                    split = np.searchsorted(held, later_ns)
+                    yield topic, held[:split]
+                    pending[topic] = held[split:]
+            return
     for batch, found in iter_batches(path, topics):
-        for number, channel in found.items():
-            parts[channel.topic].append(batch.time_ns[batch.channel == number])
-    return {topic: np.concatenate(times) for topic, times in parts.items()}
+        for topic in topics:
+            numbers = [number for number, channel in found.items() if channel.topic == topic]
+            yield topic, batch.time_ns[batch.mask_channels(numbers)]

@@ -9,8 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
-
 from dmrl.errors import RecordingError
 from dmrl.geometry.calibration import find_calibration_fault
 from dmrl.recording.checks.clock_checks import check_clocks
@@ -131,24 +129,20 @@ def _check_types(data: CheckData) -> Iterator[Finding]:
 
 def _check_times(data: CheckData) -> Iterator[Finding]:
     """Report times that go back or repeat in the file, and gaps in periodic topics."""
-    for topic, time_ns in data.times.items():
-        # Sorted in place, so that what follows are views: a long topic has many steps.
-        step_ns = np.diff(time_ns)
-        step_ns.sort()
-        first, last = np.searchsorted(step_ns, 0, "left"), np.searchsorted(step_ns, 0, "right")
+    for topic, times in data.times.items():
+        first, last = times.count_steps(-1), times.count_steps(0)
         if first:
-            text = f"{first} messages go back in time, by up to {-step_ns[0] / 1e9:.3f} s"
+            text = f"{first} messages go back in time, by up to {-times.shortest_ns / 1e9:.3f} s"
             yield Finding("warning", topic, text)
-        if repeated := int(last - first):
+        if repeated := last - first:
             yield Finding("warning", topic, f"{repeated} messages repeat the time before them")
-        ahead = step_ns[last:]
-        if ahead.size < GAP_PERIODS:
+        if len(times) - 1 - last < GAP_PERIODS:
             continue
-        period_s = float(np.median(ahead, overwrite_input=True)) / 1e9
+        period_s = times.compute_median_step_ns(last) / 1e9
         limit_ns = int(max(GAP_PERIODS * period_s, GAP_MIN_S) * 1e9)
-        gaps = int(np.count_nonzero(ahead > limit_ns))
+        gaps = len(times) - 1 - times.count_steps(limit_ns)
         if gaps:
-            text = f"{gaps} gaps, the longest {ahead.max() / 1e9:.3f} s; the usual period"
+            text = f"{gaps} gaps, the longest {times.longest_ns / 1e9:.3f} s; the usual period"
             yield Finding("warning", topic, f"{text}: {period_s:.3f} s")
 
 
@@ -158,7 +152,7 @@ def _check_signals(data: CheckData) -> Iterator[Finding]:
         *check_clocks(data),
         *data.values.find_not_finite_fields(),
         *data.values.find_implausible_fields(),
-        *check_periods(data.times),
+        *check_periods(data.times, data.sort_times),
         *data.motion.find_contradictions(),
         *data.images.find_blind_cameras(),
     ):

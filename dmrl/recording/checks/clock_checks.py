@@ -3,14 +3,11 @@
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import combinations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dmrl.recording.checks.scan import CheckData
-from dmrl.recording.mcap.message_batch import MAX_TIME_NS
+from dmrl.recording.checks.topic_times import TopicTimes
 from dmrl.topics import CALIBRATION, TRANSFORMS, parse_topic
 
-Times = Mapping[str, NDArray[np.int64]]
+Times = Mapping[str, TopicTimes]
 Problems = Iterator[tuple[str, str]]
 Span = tuple[int, int]
 """Log times of a first and a last message, nanoseconds."""
@@ -37,10 +34,10 @@ def check_clocks(data: CheckData) -> Problems:
 
 
 def _find_zero_times(times: Times) -> Problems:
-    if not times or max(int(t.max()) for t in times.values()) < UNIX_TIME_MIN_NS:
+    if not times or max(t.last_ns for t in times.values()) < UNIX_TIME_MIN_NS:
         return
     for topic, moments in times.items():
-        if zeros := int((moments == 0).sum()):
+        if zeros := moments.zeros:
             yield topic, f"{zeros} messages are at time 0, others of the recording after 2001"
 
 
@@ -48,13 +45,12 @@ def _collect_spans(times: Times) -> dict[str, dict[str, Span]]:
     """Return the first and last time of each topic, by robot."""
     robots: dict[str, dict[str, Span]] = {}
     for topic, moments in times.items():
-        counted = moments > 0  # zeros are reported separately
         # A topic without a leading robot name has no clock to compare.
         of_a_robot = topic.startswith("/") and topic != TRANSFORMS
-        enough = np.count_nonzero(counted) >= MESSAGES_MIN
+        enough = moments.count - moments.zeros >= MESSAGES_MIN  # zeros are reported separately
         if of_a_robot and enough and not parse_topic(CALIBRATION, topic):
-            first = int(moments.min(where=counted, initial=MAX_TIME_NS))
-            robots.setdefault(topic.split("/")[1], {})[topic] = (first, int(moments.max()))
+            span = moments.first_ns, moments.last_ns
+            robots.setdefault(topic.split("/")[1], {})[topic] = span
     return robots
 
 

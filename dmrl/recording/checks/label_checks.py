@@ -120,7 +120,8 @@ def _check_images(data: CheckData, topic: str, image: str, table: pa.Table) -> I
         if not any(parse_topic(DETECTIONS, name) for name in data.times):
             yield Finding("error", topic, f"labels without any image on {image}")
         return
-    alone = int((~np.isin(to_numpy(table["log_time"]), data.times[image])).sum())
+    images_ns = np.concatenate([*data.image_times_ns[image], np.empty(0, np.int64)])
+    alone = int((~np.isin(to_numpy(table["log_time"]), images_ns)).sum())
     if alone:
         text = f"{alone} of {table.num_rows} messages have no image at their time"
         yield Finding("error", topic, text)

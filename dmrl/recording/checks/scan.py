@@ -1,21 +1,20 @@
 """Collect the data that the checks evaluate, in one pass over a recording."""
 
-from array import array
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import pyarrow as pa
 
 from dmrl.errors import DmrlError, RecordingError
 from dmrl.images.codec import is_decodable, read_size
 from dmrl.recording.checks.image_checks import ImageSamples
 from dmrl.recording.checks.odometry_checks import MotionSamples
+from dmrl.recording.checks.topic_times import TopicTimes
 from dmrl.recording.checks.unit_checks import FINITE_TOPICS, ValueCounts
 from dmrl.recording.loaded import LoadedRecording
-from dmrl.recording.log_times import read_log_times
+from dmrl.recording.log_times import iter_sorted_times
 from dmrl.recording.mcap.batch_reader import iter_batches_in_file_order, join_batches
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.message_batch import Ints, MessageBatch
@@ -71,6 +70,8 @@ class CheckData:
         The recording, with labels and calibrations in memory.
     times
         Log times by topic, in file order, or sorted if only the index was read.
+    image_times_ns
+        Log times of the images, by topic.
     broken
         Error text by topic, for messages that are not of their type.
     sizes
@@ -88,7 +89,8 @@ class CheckData:
     """
 
     contents: LoadedRecording
-    times: dict[str, Ints]
+    times: dict[str, TopicTimes]
+    image_times_ns: dict[str, list[Ints]] = field(default_factory=lambda: defaultdict(list))
     broken: dict[str, str] = field(default_factory=dict)
     sizes: dict[str, Counter[ImageSize]] = field(default_factory=lambda: defaultdict(Counter))
     undecodable_ns: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
@@ -96,6 +98,19 @@ class CheckData:
     values: ValueCounts = field(default_factory=ValueCounts)
     motion: MotionSamples = field(default_factory=MotionSamples)
     images: ImageSamples = field(default_factory=ImageSamples)
+
+    def add_times(self, topic: str, time_ns: Ints) -> None:
+        """Add the next log times of a topic, nanoseconds."""
+        self.times[topic].add(time_ns)
+        if parse_topic(CAMERA_IMAGE, topic):
+            self.image_times_ns[topic].append(time_ns)
+
+    def sort_times(self, topic: str) -> TopicTimes:
+        """Read the times of a topic that go back in the file, sorted."""
+        found = TopicTimes()
+        for _, time_ns in iter_sorted_times(self.contents.path, frozenset([topic])):
+            found.add(time_ns)
+        return found
 
     def add_batch(self, topic: str, batch: pa.RecordBatch, total: int) -> None:
         """Add the values of a topic that has ``total`` messages."""
@@ -120,18 +135,15 @@ def collect(path: Path) -> CheckData:
         If the file is not a complete recording.
     """
     contents = LoadedRecording(path)
-    data = CheckData(contents, {})
-    # An array that grows in place: blocks, and their concatenation, would take twice the memory.
-    times = {topic: array("q") for topic in contents.topics}
+    data = CheckData(contents, {topic: TopicTimes() for topic in contents.topics})
     kept: dict[str, list[MessageBatch]] = {t: [] for t in contents.topics if _is_kept(contents, t)}
     channels: dict[int, Channel] = {}
     for batch, channels in join_batches(iter_batches_in_file_order(path)):
         for topic, mine in group_by_topic(batch, channels).items():
-            times[topic].frombytes(mine.time_ns.astype(np.int64, copy=False).tobytes())
+            data.add_times(topic, mine.time_ns)
             if topic in kept:
                 kept[topic].append(mine.compact())
             _collect_from_messages(data, topic, mine, channels)
-    data.times = {topic: np.frombuffer(held, np.int64) for topic, held in times.items()}
     parts = [block for batches in kept.values() for block in batches]
     contents.add_topics(frozenset(kept), parts, channels)
     return data
@@ -150,7 +162,10 @@ def collect_from_index(contents: LoadedRecording) -> CheckData:
     RecordingError
         If the file is not a complete recording.
     """
-    return CheckData(contents, read_log_times(contents.path, contents.topics))
+    data = CheckData(contents, {topic: TopicTimes() for topic in contents.topics})
+    for topic, time_ns in iter_sorted_times(contents.path, frozenset(data.times)):
+        data.add_times(topic, time_ns)
+    return data
 
 
 def collect_values(data: CheckData) -> None:

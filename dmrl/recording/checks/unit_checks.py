@@ -4,13 +4,14 @@ Values are counted as messages pass, so that memory is constant. Findings are to
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from dmrl.recording.checks.topic_times import TopicTimes
 from dmrl.recording.protobuf.arrow_arrays import to_numpy
 from dmrl.topics import CAMERA_IMAGE, POSE, SENSORS, TRUE_POSE, UnitCheck, parse_topic
 
@@ -24,7 +25,6 @@ IMPOSSIBLE = 1000
 """A single value over this many largest plausible ones is reported."""
 BELOW_FLOOR_M = -0.3
 """Heights below it are under the floor, and not noise."""
-Times = NDArray[np.int64]
 
 
 @dataclass(slots=True)
@@ -98,15 +98,23 @@ def check_units(topic: str, table: pa.Table) -> list[str]:
     return [text for _, text in counts.find_implausible_fields()]
 
 
-def check_periods(times: Mapping[str, Times]) -> Iterator[tuple[str, str]]:
-    """Yield sensors whose period is so long or short that their times have the wrong unit."""
-    for topic, time_ns in times.items():
+def check_periods(
+    times: Mapping[str, TopicTimes], sort_times: Callable[[str], TopicTimes]
+) -> Iterator[tuple[str, str]]:
+    """Yield sensors whose period is so long or short that their times have the wrong unit.
+
+    Parameters
+    ----------
+    times
+        Log times by topic.
+    sort_times
+        Function that returns the times of a topic that go back, sorted.
+    """
+    for topic, found in times.items():
         is_sensor = any(parse_topic(row.pattern, topic) for row in SENSORS)
-        if len(time_ns) >= MESSAGES_MIN and is_sensor:
-            step_ns = np.diff(time_ns)
-            if step_ns.min() < 0:
-                step_ns = np.diff(np.sort(time_ns))
-            period_s = float(np.median(step_ns, overwrite_input=True)) * 1e-9
+        if len(found) >= MESSAGES_MIN and is_sensor:
+            in_order = found if found.shortest_ns >= 0 else sort_times(topic)
+            period_s = in_order.compute_median_step_ns(0) * 1e-9
             units = "ms, us or ns" if period_s > PERIOD_MAX_S else "s, ms or us"
             if period_s > PERIOD_MAX_S or 0 < period_s < PERIOD_MIN_S:
                 yield topic, f"one message in {period_s:.3g} s. Were its times in {units}?"

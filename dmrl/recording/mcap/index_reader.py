@@ -10,7 +10,7 @@ from mcap.records import ChunkIndex
 from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.extra_records import read_metadata
 from dmrl.recording.mcap.file import BoundedReader
-from dmrl.recording.mcap.message_batch import Ints
+from dmrl.recording.mcap.message_batch import MAX_TIME_NS, Ints
 from dmrl.recording.mcap.message_index import (
     ENTRY_BYTES,
     MESSAGE_INDEX_STRUCT,
@@ -25,7 +25,7 @@ GROUP_BYTES = 1_000_000
 
 def iter_index_times(
     stream: BoundedReader, section: SummarySection, topics: frozenset[str] | None = None
-) -> Iterator[tuple[Ints, Ints]]:
+) -> Iterator[tuple[Ints, Ints, int]]:
     """Yield the message indexes of some chunks at a time, then verify the CRC of all.
 
     For a file in a bucket, only indexes of chunks with the topics are read, without that CRC.
@@ -34,7 +34,7 @@ def iter_index_times(
     ------
     tuple
         (N,) channel ids and log times, chunk by chunk in the order of the file, each chunk channel
-        by channel.
+        by channel; and the least log time that may follow.
 
     Raises
     ------
@@ -49,10 +49,14 @@ def iter_index_times(
         wanted = {n for n, c in section.channels.items() if topics is None or c.topic in topics}
         chunks = [chunk for chunk in chunks if wanted & chunk.message_index_offsets.keys()]
     stream.expect_reads([(_get_start(chunk), chunk.message_index_length) for chunk in chunks])
+    later_ns = [MAX_TIME_NS]
+    for chunk in reversed(chunks):
+        later_ns.append(min(later_ns[-1], chunk.message_start_time))
     for group in _iter_groups(chunks):
         raw = b"".join(_iter_records(stream, group))
         crc = zlib.crc32(raw, crc)
-        yield _parse_group(raw, group)
+        del later_ns[-len(group) :]
+        yield *_parse_group(raw, group), later_ns[-1]
     if stored_checksums and stored_checksums[-1].get("indexes") != checksums.format_crc(crc):
         raise McapError("its message indexes fail their CRC")
 

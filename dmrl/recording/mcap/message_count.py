@@ -114,7 +114,7 @@ def verify_indexes(stream: BoundedReader, section: SummarySection) -> MessageCou
     def count() -> MessageCount | None:
         if not all(chunk.message_index_offsets for chunk in section.chunk_indexes):
             return None
-        times = iter_index_times(stream, section)
+        times = ((ids, time_ns) for ids, time_ns, _ in iter_index_times(stream, section))
         return _compare(section.statistics, section.channels_by_id, times)
 
     return get_cached("message indexes", stream, count)

@@ -7,13 +7,17 @@ import numpy as np
 import pytest
 
 from dmrl.recording.checks.clock_checks import UNIX_TIME_MIN_NS, check_clocks
+from dmrl.recording.checks.topic_times import TopicTimes
 
 S = 1_000_000_000
 
 
 def find_clock_findings(times: dict[str, list[float]], **unset: int) -> list[tuple[str, str]]:
     """What is said of topics with messages at these seconds."""
-    held = {topic: np.round(np.array(t) * S).astype(np.int64) for topic, t in times.items()}
+    held = {
+        topic: TopicTimes.of(np.round(np.array(t) * S).astype(np.int64))
+        for topic, t in times.items()
+    }
     seen = SimpleNamespace(times=held, unset_stamps=Counter(unset))
     return list(check_clocks(seen))  # type: ignore[arg-type]
 

@@ -4,6 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from dmrl.recording.checks.topic_times import TopicTimes
 from dmrl.recording.checks.unit_checks import ValueCounts, check_periods
 
 
@@ -61,16 +62,25 @@ def test_unit_check_ignores_zeros_non_finite_values_and_short_series() -> None:
     assert _doubted("/own/topic", "height_m", np.full(99, 500.0)) == []
 
 
+def find_period(times: np.ndarray, topic: str = "/cf1/height") -> list[str]:
+    """What is said of the period of a topic with messages at these times, in this order."""
+    held = {topic: TopicTimes.of(times)}
+    return [text for _, text in check_periods(held, lambda _: TopicTimes.of(np.sort(times)))]
+
+
 def test_sensor_periods_out_of_range_are_found() -> None:
     times = np.arange(100) * 10_000_000
-    assert list(check_periods({"/cf1/height": times})) == []
-    ((_, rare),) = check_periods({"/cf1/height": times * 1000})
-    assert rare == "one message in 10 s. Were its times in ms, us or ns?"
-    ((_, often),) = check_periods({"/cf1/height": times // 1_000_000})
-    assert "in s, ms or us" in often
-    assert (
-        list(check_periods({"/cf1/labels": times * 1000, "/cf1/height": times[:19] * 1000})) == []
-    )
+    assert find_period(times) == []
+    assert find_period(times * 1000) == ["one message in 10 s. Were its times in ms, us or ns?"]
+    assert "in s, ms or us" in find_period(times // 1_000_000)[0]
+    assert find_period(times * 1000, "/cf1/labels") == []
+    assert find_period(times[:19] * 1000) == []
+
+
+def test_the_period_of_times_that_go_back_is_that_of_the_sorted_ones() -> None:
+    times = np.arange(100) * 10_000_000
+    assert find_period(np.random.default_rng(0).permutation(times)) == []
+    assert find_period(times[::-1] * 1000) == find_period(times * 1000) != []
 
 
 @pytest.mark.parametrize(
@@ -78,8 +88,8 @@ def test_sensor_periods_out_of_range_are_found() -> None:
 )
 def test_sensor_period_limits_are_exact(period_ns: int, said: int) -> None:
     times = np.arange(20) * period_ns
-    assert len(list(check_periods({"/cf1/height": times}))) == said
-    assert list(check_periods({"/cf1/height": times[:19]})) == []
+    assert len(find_period(times)) == said
+    assert find_period(times[:19]) == []
 
 
 def test_magnitudes_are_binned_to_a_fifth_of_the_limit() -> None:
