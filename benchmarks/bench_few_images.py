@@ -1,0 +1,134 @@
+"""What a network learns of a new robot and a new lens from 10, 25 and 50 labelled images.
+
+    python benchmarks/bench_few_images.py FOLDER PHOTOS [--seeds 3] [--init dmrl-nano]
+
+The robot is a grey hexacopter, 0.35 m wide, and the lens has a focal length of 230 px and a barrel
+distortion. Blender renders it over photos. Three photos are the places of the user; training images
+are of these three, or of the first alone. Every network is judged in the same three places with
+other crops, poses and light, and in the other photos. FOLDER keeps what is made.
+"""
+
+import argparse
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+import dmrl
+from dmrl.geometry.camera_file import format_camera
+from dmrl.geometry.frames import Camera
+from dmrl.terminal.tables import print_table
+
+CAMERA = Camera(320, 224, 230.0, 230.0, 157.0, 115.0, (-0.18, 0.03, 0.0, 0.0, 0.0))
+PLACES, JUDGED = 3, 300
+SETS = (("10", 3, 10), ("25", 3, 25), ("50", 3, 50), ("50 of one place", 1, 50))
+"""Titles, places and images of the training sets."""
+
+
+def write_boxes(path: Path) -> None:
+    """Write the hexacopter as an OBJ of boxes: a body, six arms and six rotors; metres, z up."""
+    parts = [((0.0, 0.0, 0.0), (0.10, 0.08, 0.05), 0.0)]
+    for angle in np.arange(6) * np.pi / 3:
+        x, y = np.cos(angle), np.sin(angle)
+        parts.append(((0.07 * x, 0.07 * y, 0.01), (0.14, 0.012, 0.012), angle))
+        parts.append(((0.14 * x, 0.14 * y, 0.03), (0.07, 0.07, 0.006), angle + 0.4))
+    lines = []
+    for number, (middle, size, angle) in enumerate(parts):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        for sx, sy, sz in np.ndindex(2, 2, 2):
+            corner = (np.array([sx, sy, sz]) - 0.5) * size
+            x, y = turn @ corner[:2] + middle[:2]
+            lines.append(f"v {x:.5f} {y:.5f} {corner[2] + middle[2]:.5f}")
+        faces = ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4")
+        lines += [
+            "f " + " ".join(str(8 * number + int(corner)) for corner in face.split())
+            for face in faces
+        ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def copy_photos(folder: Path, photos: Path) -> dict[str, Path]:
+    """Copy the photos to folders: the first place, the user's places, and the others."""
+    every = sorted(photos.glob("*.jpg"))
+    groups = {"place": every[:1], "places": every[:PLACES], "others": every[PLACES:]}
+    for name, some in groups.items():
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        for photo in some:
+            shutil.copy(photo, folder / name)
+    return {name: folder / name for name in groups}
+
+
+def render(out: Path, backgrounds: Path, images: int, seed: int) -> Path:
+    """Render the robot over photos, unless it is done."""
+    robot, camera = out.parent / "hexacopter.obj", out.parent / "camera.toml"
+    write_boxes(robot)
+    camera.write_text(format_camera(CAMERA), encoding="utf-8")
+    if not out.exists():
+        dmrl.render(
+            "synthetic_first_look", out, preset="himax", robots_max=1, depth_m=(0.4, 3.0),
+            test_share=0.0, model=robot, model_up="z", scale=1.0, camera=camera, distorted=True,
+            backgrounds=backgrounds, images=images, seed=seed, masks=False, depths=False,
+        )  # fmt: skip
+    return out
+
+
+def train(
+    folder: Path, photos: dict[str, Path], init: str, seed: int
+) -> Iterator[tuple[str, Path]]:
+    """Yield the title and the model of each training set."""
+    for title, places, images in SETS:
+        name = f"{images}-of-{places}-{seed}"
+        own = render(
+            folder / f"{name}.mcap", photos["places" if places > 1 else "place"], images, 100 + seed
+        )
+        if not (folder / name).exists():
+            dmrl.make_dataset(own, folder / f"{name}-data", labels="truth", split="none")
+            dmrl.train(
+                folder / f"{name}-data", folder / name, recipe="own_camera", init=init, seed=seed
+            )
+        yield title, folder / name
+
+
+def judge(model: str | Path, recording: Path, seen: Path) -> float:
+    """Return the share of robots that a network finds within 20 px."""
+    if not seen.exists():
+        dmrl.predict(model, recording, seen)
+    return float(dmrl.evaluate(seen, draws=1)["overall"]["within_20_px"]["value"])
+
+
+def main() -> None:
+    """Render, train, and print the shares."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("photos", type=Path)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--init", default="dmrl-nano")
+    given = parser.parse_args()
+    folder = given.folder
+    photos = copy_photos(folder, given.photos)
+    sets = {
+        name: render(folder / f"judge-{name}.mcap", photos[name], JUDGED, 900)
+        for name in ("places", "others")
+    }
+    found: dict[str, list[list[float]]] = {}
+    for seed in range(given.seeds):
+        models = [("none", given.init), *train(folder, photos, given.init, seed)]
+        for title, model in models:
+            name = Path(model).name
+            shares = [
+                judge(model, recording, folder / f"{name}-on-{where}.mcap")
+                for where, recording in sets.items()
+            ]
+            found.setdefault(title, []).append(shares)
+    rows = [
+        [title, *(f"{100 * m:.0f} +- {100 * s:.0f} %" for m, s in zip(*spread, strict=True))]
+        for title, shares in found.items()
+        for spread in ((np.mean(shares, axis=0), np.std(shares, axis=0)),)
+    ]
+    headers = ["images", "the same places", "other places"]
+    print_table(f"within 20 px, mean and spread of {given.seeds} seeds", headers, rows)
+
+
+if __name__ == "__main__":
+    main()
