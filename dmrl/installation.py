@@ -29,6 +29,7 @@ EXTRAS = {
     "bayer": "raw pictures of the AI-deck",
     "ros": "ROS bags, in and out",
     "yolo": "data.yaml of YOLO sets",
+    "coco": "dmrl evaluate --robot-width-m",
     "table": "dmrl convert --to csv",
     "record": "dmrl record; cflib: GPL-3.0",
     "deploy": "ONNX: dmrl export, predict",

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dmrl.estimation.evidence.clock_shifts import MIN_SHIFT_S, MIN_SHIFT_SIGMAS
 from dmrl.estimation.evidence.error_models import Candidate
-from dmrl.estimation.evidence.mistakes import MIN_SHIFT_S, MIN_SHIFT_SIGMAS
 from dmrl.estimation.evidence.posterior import Mixture
 from dmrl.estimation.model.pair import Array, Pair, SensorTrack
 

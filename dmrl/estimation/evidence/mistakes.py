@@ -5,16 +5,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dmrl.estimation.evidence.clock_shifts import ClockShift, is_mutual
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import (
     MAX_RANGE_M,
-    BearingMeasurements,
     Pair,
     SensorTrack,
     usable_ranges,
 )
 from dmrl.estimation.search.modes import find_modes
-from dmrl.estimation.signals.clock_estimation import estimate_clock
 from dmrl.estimation.signals.contradictions import drop_contradictions
 from dmrl.estimation.solver.keyframes import build_problem
 
@@ -31,9 +30,6 @@ DROPPED_COST = 2.0
 """Cost of a keyframe without odometry: what is dropped fits everything."""
 SHIFTS_S, FINE_SHIFTS_S = (-4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0), (0.5, 0.25)
 """Shifts of a clock that are tried where one robot ranges alone, seconds; and their halvings."""
-MIN_SHIFT_S, MIN_SHIFT_SIGMAS = 0.05, 5.0
-"""Smallest shift that mutual ranges correct, seconds and standard deviations: the plain model has
-smaller ones. The offset of sound simulated flights is known to 5 to 10 ms."""
 FOOT_M = 0.3048
 """Length of a foot, metres."""
 MAX_SPEED_MPS, MAX_HEIGHT_M = 5.0, 10.0
@@ -59,8 +55,8 @@ class Mistake:
         Whether it is tried, by the pair and the robot. None: always.
     heading_is_open
         Whether the robot's heading remains unknown by a constant angle.
-    shift_s
-        Seconds that are added to the clock of the second robot.
+    shift
+        Shift of the second robot's clock. None: its times stay.
     with_camera
         Whether it is tried where a camera shows the peer alone, or only elsewhere. None: always.
     """
@@ -70,7 +66,7 @@ class Mistake:
     robots: tuple[int | None, ...] = (0, 1)
     applies: Callable[[Pair, int | None], bool] | None = None
     heading_is_open: bool = False
-    shift_s: float = 0.0
+    shift: ClockShift | None = None
     with_camera: bool | None = None
 
 
@@ -104,8 +100,10 @@ def find_mistake(pair: Pair) -> tuple[Mistake, int | None] | None:
             alike = [one for one, cost in zip(some, costs, strict=True) if cost < least + ALIKE]
             likeliest = some[costs.index(least)]
             return next((one for one in alike if one[0].heading_is_open), likeliest)
-    best = None if _is_mutual(pair) else _search_shift(compute_cost)
-    return best if best and compute_cost(best) < enough else None
+    if is_mutual(pair):
+        return None
+    moved = _move_clock(_search_shift(lambda shift_s: compute_cost(_move_clock(shift_s))))
+    return moved if compute_cost(moved) < enough else None
 
 
 def compute_misfit(pair: Pair) -> float:
@@ -120,75 +118,18 @@ def compute_misfit(pair: Pair) -> float:
     return float(cost + DROPPED_COST * dropped)
 
 
-def _is_mutual(pair: Pair) -> bool:
-    """Return whether both robots range, so that their ranges show the clocks."""
-    return pair.range_sender is not None and len(np.unique(pair.range_sender)) == 2
+def _move_clock(shift_s: float) -> tuple[Mistake, int | None]:
+    """Return the mistake of a second clock that is off by seconds, and its robot."""
+    shift = ClockShift(shift_s)
+    return Mistake(shift.name, lambda pair, _robot: shift.move(pair), (1,), shift=shift), 1
 
 
-def find_clock_mistake(pair: Pair) -> Mistake | None:
-    """Return the shift of the second clock by which the ranges of both robots agree.
-
-    Parameters
-    ----------
-    pair
-        Sensor data of both robots. None is found unless both range.
-    """
-    if not _is_mutual(pair):
-        return None
-    here, there = (pair.range_sender == robot for robot in (0, 1))
-    series = (series[at] for at in (here, there) for series in (pair.range_time_s, pair.range_m))
-    clock = estimate_clock(*series)
-    if clock is None or abs(clock.offset_s) < max(MIN_SHIFT_S, MIN_SHIFT_SIGMAS * clock.sigma_s):
-        return None
-    return _clock_mistake(clock.offset_s)
-
-
-def _search_shift(
-    compute_cost: Callable[[tuple[Mistake, int | None]], float],
-) -> tuple[Mistake, int | None]:
-    """Return the shift of the second robot's clock with the least cost."""
-    tried = [(_clock_mistake(shift_s), 1) for shift_s in SHIFTS_S]
-    best = min(tried, key=compute_cost)
+def _search_shift(compute_cost: Callable[[float], float]) -> float:
+    """Return the shift of the second robot's clock with the least cost, seconds."""
+    best_s = min(SHIFTS_S, key=compute_cost)
     for step_s in FINE_SHIFTS_S:
-        near = [(_clock_mistake(best[0].shift_s + way * step_s), 1) for way in (-1, 1)]
-        best = min([best, *near], key=compute_cost)
-    return best
-
-
-def _clock_mistake(shift_s: float) -> Mistake:
-    """Return the mistake of a clock that is off by seconds."""
-
-    def correct(pair: Pair, _robot: int | None) -> Pair:
-        return move_clock(pair, shift_s)
-
-    return Mistake(f"clock fits if it is moved by {shift_s:+.2f} s", correct, (1,), shift_s=shift_s)
-
-
-def move_clock(pair: Pair, shift_s: float) -> Pair:
-    """Return a pair with seconds added to the times of the second robot.
-
-    Parameters
-    ----------
-    pair
-        Sensor data of both robots.
-    shift_s
-        The seconds.
-    """
-    start_s, end_s = pair.time_s[[0, -1]]
-    at_s = pair.time_s - shift_s
-    index = np.rint((np.clip(at_s, start_s, end_s) - start_s) / pair.dt_s).astype(int)
-    peer = pair.peer.select(index)
-    peer = replace(peer, dropout=peer.dropout | (at_s < start_s) | (at_s > end_s))
-    mine = 0 if pair.range_sender is None else pair.range_sender == 1
-    time_s = pair.range_time_s + shift_s * mine
-    order = np.argsort(time_s, kind="stable")
-    order = order[(time_s[order] >= start_s) & (time_s[order] <= end_s)]
-    sees = pair.peer_bearings
-    return replace(
-        pair, peer=peer, range_time_s=time_s[order], range_m=pair.range_m[order],
-        range_sender=None if pair.range_sender is None else pair.range_sender[order],
-        peer_bearings=sees and BearingMeasurements(sees.time_s + shift_s, sees.bearing, sees.std),
-    )  # fmt: skip
+        best_s = min([best_s, best_s - step_s, best_s + step_s], key=compute_cost)
+    return best_s
 
 
 def _correct_track(change: Callable[[SensorTrack, float], SensorTrack]) -> Correction:

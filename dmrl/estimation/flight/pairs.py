@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from dmrl.estimation.evidence.causes import find_dropouts
+from dmrl.estimation.evidence.clock_shifts import ClockShift, find_clock_shift
 from dmrl.estimation.evidence.delays import join_delays, move_signal
 from dmrl.estimation.evidence.error_models import Candidate
 from dmrl.estimation.evidence.mistakes import (
-    find_clock_mistake,
     find_mistake,
     has_camera,
     ranges_are_far,
@@ -23,7 +23,7 @@ from dmrl.estimation.flight.pair_output import (
 )
 from dmrl.estimation.flight.pieces import Piece, join_pieces, solve_pieces
 from dmrl.estimation.model.gate import DEFAULT_GATE, Gate
-from dmrl.estimation.model.pair import Pair
+from dmrl.estimation.model.pair import Array, Pair
 from dmrl.estimation.model.status import UNCONVERGED, classify_positions
 from dmrl.estimation.signals.contradictions import drop_contradictions, drop_held_ranges
 from dmrl.estimation.solver.estimate import (
@@ -41,6 +41,8 @@ MIN_PRIOR_CHANCE = 1e-3
 """Smallest probability, by their priors, of the constants of a flight that is explained: four
 sigmas for one of fifteen. Sound simulated flights have 0.7 to 1. A range scale of 2.28 "explains"
 ranges in feet."""
+MAX_SHIFTS = 4
+"""Most jumps and offsets of a clock that are corrected."""
 MAX_MOVES = 3
 """Most times that a late signal is moved and the flight is solved again."""
 MIN_CAMERA_S = 3.0
@@ -74,18 +76,19 @@ def _estimate_pair(
     logged: Pair, noise: NoiseModel | None, gate: Gate, *, plain: bool
 ) -> tuple[Estimate, Estimate]:
     """Estimate both directions of a pair, with a discrete mistake of its logs corrected."""
-    logged, blind, shift_s = drop_held_ranges(logged), None, 0.0
-    mistakes: list[Cause] = []
-    if not plain and noise is None and (clock := find_clock_mistake(logged)) is not None:
-        logged, shift_s = clock.correct(logged, 1), clock.shift_s
-        mistakes.append(_to_cause(clock.name, logged, 1))
+    logged, blind = drop_held_ranges(logged), None
+    shifts: list[ClockShift] = []
+    if not plain and noise is None:
+        logged, shifts = _move_clock(logged)
+    mistakes = [_to_cause(shift.name, logged, 1) for shift in shifts]
     pair = drop_contradictions(logged)
     possible = not ranges_are_far(pair)
     pieces = list(solve_pieces(pair, noise, plain=plain)) if possible else []
     searched = not plain and noise is None and not _explains(pieces)
     if searched and (found := find_mistake(logged)) is not None:
         mistake, robot = found
-        logged, shift_s = mistake.correct(logged, robot), shift_s + mistake.shift_s
+        logged = mistake.correct(logged, robot)
+        shifts += [mistake.shift] if mistake.shift else []
         pair, pieces = drop_contradictions(logged), []
         mistakes.append(_to_cause(mistake.name, logged, robot))
         blind = robot if mistake.heading_is_open and not has_camera(logged, robot) else None
@@ -102,10 +105,26 @@ def _estimate_pair(
         replace(
             peer,
             # The second robot's positions and images have the times of its own clock.
-            time_s=peer.time_s - shift_s,
+            time_s=_to_log_times(peer.time_s, shifts),
             causes=_add_causes([cause.seen_from_peer() for cause in gaps], peer.causes),
         ),
     )
+
+
+def _move_clock(pair: Pair) -> tuple[Pair, list[ClockShift]]:
+    """Return a pair with the clocks of both robots alike, and the shifts of the second one."""
+    shifts: list[ClockShift] = []
+    while len(shifts) < MAX_SHIFTS and (shift := find_clock_shift(pair)) is not None:
+        pair = shift.move(pair)
+        shifts.append(shift)
+    return pair, shifts
+
+
+def _to_log_times(time_s: Array, shifts: Sequence[ClockShift]) -> Array:
+    """Return (N,) times on the second robot's clock before its shifts."""
+    for shift in reversed(shifts):
+        time_s = shift.to_log_times(time_s)
+    return time_s
 
 
 def _add_causes(found: Sequence[Cause], causes: Sequence[Cause]) -> tuple[Cause, ...]:

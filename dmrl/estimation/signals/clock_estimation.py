@@ -125,16 +125,16 @@ def estimate_clock(
     """
     if min(len(reference_s), len(time_s)) < 10:
         return None
-    one = _Series.from_samples(reference_s, reference)
-    other = _Series.from_samples(time_s, values)
+    one = Series.from_samples(reference_s, reference)
+    other = Series.from_samples(time_s, values)
     if one is None or other is None:
         return None
-    lag_s = _cross_correlate(one, other)
-    return None if lag_s is None else _refine_lag(one, other, lag_s)
+    lag_s = cross_correlate(one, other)
+    return None if lag_s is None else refine_lag(one, other, lag_s)
 
 
 @dataclass(frozen=True, slots=True)
-class _Series:
+class Series:
     """A smoothed series on a grid of ``GRID_STEP_S``, with the samples that are not in a gap."""
 
     start_s: float
@@ -143,10 +143,15 @@ class _Series:
 
     @property
     def time_s(self) -> Array:
+        """(N,) times, seconds."""
         return np.asarray(self.start_s + GRID_STEP_S * np.arange(len(self.values)))
 
+    def without_trend(self) -> Array:
+        """Return the values less their running mean."""
+        return np.asarray(self.values - _running_mean(self.values))
+
     @classmethod
-    def from_samples(cls, time_s: Array, values: Array) -> "_Series | None":
+    def from_samples(cls, time_s: Array, values: Array) -> "Series | None":
         """Resample and smooth a series; None if it is too short."""
         count = int((time_s[-1] - time_s[0]) / GRID_STEP_S) + 1
         if count * GRID_STEP_S < MIN_OVERLAP_S:
@@ -172,9 +177,11 @@ def _smooth_gaussian(values: Array, std_s: float) -> Array:
     return np.convolve(padded, kernel / kernel.sum(), mode="valid")
 
 
-def _cross_correlate(one: _Series, other: _Series) -> float | None:
+def cross_correlate(
+    one: Series, other: Series, min_overlap_s: float = MIN_OVERLAP_S
+) -> float | None:
     """Return the seconds to add to the other's times, to one step; None without correlation."""
-    a, b = (np.where(s.known, s.values - _running_mean(s.values), 0.0) for s in (one, other))
+    a, b = (np.where(s.known, s.without_trend(), 0.0) for s in (one, other))
     size = 1 << int(np.ceil(np.log2(len(a) + len(b))))
 
     def correlate(x: Array, y: Array) -> Array:
@@ -185,7 +192,7 @@ def _cross_correlate(one: _Series, other: _Series) -> float | None:
     shared = correlate(one.known.astype(float), other.known.astype(float))
     energy = correlate(a**2, other.known.astype(float)) * correlate(one.known.astype(float), b**2)
     score = correlate(a, b) / np.sqrt(np.maximum(energy, 1e-12))
-    score[shared * GRID_STEP_S < MIN_OVERLAP_S] = -1
+    score[shared * GRID_STEP_S < min_overlap_s] = -1
     best = int(np.argmax(score))
     # Half the final threshold: this search ignores the drift and fractions of a step.
     if score[best] < MIN_CORRELATION / 2:
@@ -212,7 +219,7 @@ class _Fit(NamedTuple):
     correlation: float
 
 
-def _linearize(one: _Series, then: Array, from_middle: Array, wanted: Array, drift: float) -> _Fit:
+def _linearize(one: Series, then: Array, from_middle: Array, wanted: Array, drift: float) -> _Fit:
     """Linearize one series at the times ``then`` against another's values ``wanted``."""
     seen = np.interp(then, one.time_s, one.values)
     known = np.interp(then, one.time_s, one.known) > 0.5
@@ -235,7 +242,7 @@ def _linearize(one: _Series, then: Array, from_middle: Array, wanted: Array, dri
     return _Fit(normal, gradient, variance, correlation)
 
 
-def _refine_lag(one: _Series, other: _Series, lag_s: float) -> Clock | None:
+def refine_lag(one: Series, other: Series, lag_s: float) -> Clock | None:
     """Refine a lag by Gauss-Newton; None if the series do not correlate."""
     time_s, grid_s = other.time_s, one.time_s
     share = other.known & (time_s + lag_s > grid_s[0]) & (time_s + lag_s < grid_s[-1])

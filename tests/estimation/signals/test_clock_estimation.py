@@ -8,8 +8,8 @@ from dmrl.estimation.signals.clock_estimation import (
     MIN_OVERLAP_S,
     TREND_WINDOW_S,
     Clock,
+    Series,
     _running_mean,
-    _Series,
     _smooth_gaussian,
     connect_clocks,
     estimate_clock,
@@ -203,7 +203,7 @@ def test_resampled_series_rejects_outliers_and_marks_gaps() -> None:
     values = np.sin(time_s / 3)
     spoilt = values.copy()
     spoilt[7:-7:9] += 5.0
-    clean, heard = (_Series.from_samples(time_s, v) for v in (values, spoilt))
+    clean, heard = (Series.from_samples(time_s, v) for v in (values, spoilt))
     assert clean is not None and heard is not None
     assert np.abs(heard.values - clean.values).max() < 0.05
     inner = slice(30, -30)  # the ends stand for what lies beyond them
@@ -217,7 +217,7 @@ def test_resampled_series_rejects_outliers_and_marks_gaps() -> None:
 @pytest.mark.parametrize(("gap_s", "unknown"), [(0.95, False), (1.05, True)])
 def test_a_second_without_samples_is_not_known(gap_s: float, unknown: bool) -> None:
     time_s = np.concatenate([np.arange(0, 30, 0.1), 29.9 + gap_s + np.arange(0, 30, 0.1)])
-    found = _Series.from_samples(time_s, np.sin(time_s / 3))
+    found = Series.from_samples(time_s, np.sin(time_s / 3))
     assert found is not None
     assert (~found.known).any() == unknown
 
@@ -232,7 +232,7 @@ def test_given_clocks_have_zero_sigma() -> None:
 )
 def test_clock_series_needs_twenty_seconds(lasts_s: float, enough: bool) -> None:
     time_s = np.arange(0, lasts_s, 0.1)
-    assert (_Series.from_samples(time_s, np.sin(time_s)) is not None) == enough
+    assert (Series.from_samples(time_s, np.sin(time_s)) is not None) == enough
 
 
 @given(st.lists(st.floats(-5, 5), min_size=1, max_size=30))

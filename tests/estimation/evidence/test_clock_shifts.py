@@ -1,0 +1,86 @@
+"""Shifts of a clock that the ranges of both robots show: offsets and jumps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dmrl.estimation.evidence.clock_shifts import ClockShift, find_clock_shift
+from dmrl.estimation.evidence.mistakes import compute_misfit
+from dmrl.estimation.flight.pairs import estimate_pairs
+
+from ..flights import both_ranging, flown, pair_of, truth_at
+
+
+def test_a_clock_moves_with_all_that_it_stamps() -> None:
+    pair = both_ranging(flown("in_view", "calibrated", 1000, 20.0))
+    moved = ClockShift(2.0).move(pair)
+    at = slice(300, 1500)
+    assert moved.peer.vx_mps[500:1700] == pytest.approx(pair.peer.vx_mps[at])
+    assert moved.peer.dropout[:190].all() and moved.own is pair.own
+    assert moved.range_sender is not None and pair.range_sender is not None
+    for robot, shift_s in ((0, 0.0), (1, 2.0)):
+        before = pair.range_m[pair.range_sender == robot]
+        after = moved.range_m[moved.range_sender == robot]
+        assert after.tolist() == before[: len(after)].tolist()
+        first = moved.range_time_s[moved.range_sender == robot][0]
+        assert first - pair.range_time_s[pair.range_sender == robot][0] == pytest.approx(shift_s)
+
+
+def test_a_jump_moves_what_comes_after_it() -> None:
+    pair = both_ranging(flown("in_view", "calibrated", 1000, 20.0))
+    moved = ClockShift(-0.4, 10.0).move(pair)
+    assert moved.peer.vx_mps[:950] == pytest.approx(pair.peer.vx_mps[:950])
+    assert moved.peer.vx_mps[970:1900] == pytest.approx(pair.peer.vx_mps[1010:1940])
+    assert moved.range_sender is not None
+    mine = moved.range_time_s[moved.range_sender == 1]
+    assert not ((mine > 8.5) & (mine < 11.1)).any()
+
+
+@pytest.mark.parametrize("shift", [ClockShift(0.3), ClockShift(-0.4, 10.0), ClockShift(0.4, 10.0)])
+def test_times_return_to_the_log(shift: ClockShift) -> None:
+    log_s = np.array([1.0, 9.0, 9.9, 12.0, 15.0])
+    assert shift.to_log_times(log_s + shift.shift_s * (log_s >= shift.from_s))[[0, 1, 3, 4]] == (
+        pytest.approx(log_s[[0, 1, 3, 4]])
+    )
+    assert (np.diff(shift.to_log_times(np.linspace(0.0, 20.0, 401))) >= 0).all()
+
+
+@pytest.mark.parametrize("shift_s", [0.07, 0.12, -0.3, 3.2])
+def test_the_ranges_of_both_robots_show_an_offset_of_the_clock(shift_s: float) -> None:
+    sound = both_ranging(flown("in_view", "calibrated", 1000, 60.0))
+    late = ClockShift(shift_s).move(sound)
+    found = find_clock_shift(late)
+    assert found is not None
+    assert found.name == f"clock fits if it is moved by {found.shift_s:+.2f} s"
+    assert found.shift_s == pytest.approx(-shift_s, abs=0.03)
+    assert find_clock_shift(sound) is None
+    assert find_clock_shift(found.move(late)) is None
+    here = late.range_sender == 0
+    single = replace(late, range_time_s=late.range_time_s[here], range_m=late.range_m[here])
+    assert find_clock_shift(replace(single, range_sender=np.zeros(here.sum(), np.int8))) is None
+
+
+@pytest.mark.heavy
+def test_a_clock_that_is_seconds_off_fits_when_it_is_moved() -> None:
+    late = ClockShift(3.2).move(both_ranging(flown("in_view", "calibrated", 1000, 60.0)))
+    found = find_clock_shift(late)
+    assert found is not None
+    assert compute_misfit(found.move(late)) < 0.6
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("shift_s", [-0.4, 0.5])
+def test_a_flight_whose_clock_jumps_is_solved_as_if_it_did_not(shift_s: float) -> None:
+    flight = flown("in_view", "realistic", 1000, 100.0)
+    jumping = ClockShift(shift_s, 40.0).move(both_ranging(flight))
+    ((own, peer),) = estimate_pairs([jumping])
+    name = own.causes[0].name
+    assert name.startswith(f"clock fits if it is moved by {-shift_s:+.1f}"[:-1])
+    assert name.endswith(" s on")
+    assert own.causes[0].probability == 1.0 and peer.causes[0].name == name
+    error = np.hypot(*(own.state[:, :2] - truth_at(flight, own.time_s)).T)
+    assert np.sqrt((error**2).mean()) < 0.2
+    assert (np.diff(peer.time_s) >= 0).all()
+    sound = pair_of(flight)
+    assert own.time_s[-1] == pytest.approx(sound.time_s[-1], abs=0.1)
