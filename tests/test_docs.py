@@ -284,7 +284,7 @@ def test_make_demo_installs_the_documented_packages() -> None:
     (installed,) = re.findall(r"^\$\(VENV\)/\.demo:.*\n\t.*'\.\[(.*)\]'", makefile, re.MULTILINE)
     typed = {line.split()[1] for line in command_lines(ROOT / "docs/first_evening.md")}
     needed = {e for e, words in EXTRAS.items() if typed & set(re.findall(r"[a-z]+", words))}
-    optional = {"table", "deploy"}  # for --to csv, and for ONNX where torch is
+    optional = {"table", "deploy", "coco"}  # for --to csv, for ONNX where torch is, and for boxes
     assert {"label", "view"} <= needed <= set(installed.split(",")) | optional
 
 
