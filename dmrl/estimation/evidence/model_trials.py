@@ -1,12 +1,11 @@
 """Solve a flight under one more error model, from its solution without it.
 
 A model that gains too little by one Gauss-Newton step is not solved. All models of constants are
-scored by one linearization. A solve ends once its solution would have no weight in the mixture.
+scored by one linearization.
 """
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,12 +15,7 @@ from dmrl.estimation.search.modes import convert_values
 from dmrl.estimation.solver.block_tridiagonal import eliminate_states, solve_step
 from dmrl.estimation.solver.equations import total_cost
 from dmrl.estimation.solver.layout import Subject
-from dmrl.estimation.solver.levenberg_marquardt import (
-    REACH,
-    ROUGH_TOLERANCE,
-    MapEstimate,
-    Solver,
-)
+from dmrl.estimation.solver.levenberg_marquardt import ROUGH_TOLERANCE, MapEstimate, Solver
 from dmrl.estimation.solver.noise_selection import MIN_CONSTANTS_GRADE
 from dmrl.estimation.solver.priors import Chain, ConstantPrior
 from dmrl.estimation.solver.residuals import Values
@@ -39,11 +33,6 @@ LEAD, MIN_LED_GAIN = 12.0, -3.0
 """Gain of a solved model, in log odds, from which others are solved only if one step gains them the
 second. Of 350 trials in 21 flights of the judge, 8 pairs of a swarm and 7 windows of a long flight,
 45 are left out so; none of them came within 7 of the leading model."""
-RIVAL_ODDS = -7.0
-"""Log odds of a model against the leading one from which it is tried with the later models, too:
-the price of a rare model."""
-MIN_WEIGHT = 0.02
-"""Least weight of a solution of a mixture."""
 STRETCH_FACTORS = (2.0, 4.0, 8.0, 16.0)
 """Factors of the noise of a velocity in a stretch that are compared."""
 LARGER_STEPS = 10.0
@@ -80,13 +69,6 @@ class Member:
         return self.found.values
 
 
-class Forecast(NamedTuple):
-    """Gain of a model by one Gauss-Newton step, in log odds, and what it can gain at most."""
-
-    gain: float
-    reach: float
-
-
 def _prior(models: Sequence[Candidate]) -> float:
     """Return the prior log odds of some models."""
     return sum(one.model.log_odds for one in models)
@@ -101,19 +83,14 @@ def with_grade(solver: Solver, grade: float) -> Solver:
 
 
 def solve_under(
-    solver: Solver,
-    start: Values,
-    models: tuple[Candidate, ...],
-    tolerance: float = MODEL_TOLERANCE,
-    least: float = -np.inf,
+    solver: Solver, start: Values, models: tuple[Candidate, ...], tolerance: float = MODEL_TOLERANCE
 ) -> Member | None:
-    """Return the solution of a flight under its models; None if it has none or scores too low."""
+    """Return the solution of a flight under its models; None if it has none."""
     try:
-        prior = _prior(models)
-        found, evidence = solver.solve_with_evidence(start, tolerance, least - prior)
+        found, evidence = solver.solve_with_evidence(start, tolerance)
     except np.linalg.LinAlgError:
         return None
-    return Member(solver, found, evidence + prior, models) if evidence > -np.inf else None
+    return Member(solver, found, evidence + _prior(models), models)
 
 
 def try_models(
@@ -130,33 +107,18 @@ def try_models(
     others
         As in `try_model`.
     """
-    forecasts = score_steps(base, [one for one in candidates if one not in base.models])
-    ordered = sorted(forecasts, key=lambda one: -forecasts[one].gain)
+    gains = score_steps(base, [one for one in candidates if one not in base.models])
     out: list[Member] = []
-    tried: set[Candidate] = set()
-
-    def leading() -> float:
-        return max([base.score, *(member.score for member in out)])
-
-    # Without a leading model only solutions with a weight in the mixture count, else its rivals.
-    for odds in (float(np.log(MIN_WEIGHT)), RIVAL_ODDS):
-        for one in (one for one in ordered if one not in tried):
-            gained = leading() > base.score + LEAD
-            if forecasts[one].gain < (MIN_LED_GAIN if gained else MIN_STEP_GAIN):
-                break
-            least = leading() + odds
-            if base.score + forecasts[one].reach >= least:
-                found = try_model(base, one, others, least)
-                out += found
-                tried |= {one} if found else set()
-        if leading() == base.score:
-            break
+    least = MIN_STEP_GAIN
+    for one in sorted(gains, key=lambda one: -gains[one]):
+        if gains[one] >= least:
+            out += try_model(base, one, others)
+            if any(member.score > base.score + LEAD for member in out):
+                least = MIN_LED_GAIN
     return out
 
 
-def try_model(
-    base: Member, candidate: Candidate, others: Others = tuple, least: float = -np.inf
-) -> list[Member]:
+def try_model(base: Member, candidate: Candidate, others: Others = tuple) -> list[Member]:
     """Return the solutions with one more model.
 
     Parameters
@@ -167,21 +129,16 @@ def try_model(
         The model.
     others
         Returns solutions with yaw rate biases that change, as further starts of that model.
-    least
-        Score that matters: solves end without a solution where it is out of reach.
     """
     if candidate.model.for_a_while:
         return _try_stretch(base, candidate)
     solver = replace(base.solver, problem=candidate.apply(base.solver.problem))
     first = _solve_with_larger_steps(base, candidate) if candidate.model.sudden else base
-    # Jumps are found one by one, and each step promises little.
-    least = -np.inf if candidate.model.sudden else least
     starts = [(first.values, first.solver.layout)]
     if YAW_RATE_ERROR in candidate.model.rows:
         starts += [(values, base.solver.layout) for values in others()]
-    models = (*base.models, candidate)
     found = [
-        solve_under(solver, convert_values(*start, solver.layout), models, least=least)
+        solve_under(solver, convert_values(*start, solver.layout), (*base.models, candidate))
         for start in starts
     ]
     return [one for one in found if one is not None]
@@ -202,28 +159,27 @@ def _solve_with_larger_steps(base: Member, candidate: Candidate) -> Member:
     return solve_under(solver, start, (*base.models, wide), ROUGH_TOLERANCE) or base
 
 
-def score_steps(base: Member, candidates: Sequence[Candidate]) -> dict[Candidate, Forecast]:
-    """Return what each model gains by one Gauss-Newton step.
+def score_steps(base: Member, candidates: Sequence[Candidate]) -> dict[Candidate, float]:
+    """Return the gain of each model by one Gauss-Newton step, in log odds.
 
     A stretch of noise has no such step, so it is always tried. All are, where the step is singular.
     """
     unknowns = [one for one in candidates if one.model.rows and not one.model.sudden]
-    always = Forecast(np.inf, np.inf)
     try:
-        forecasts = _score_unknowns(base, unknowns)
+        gains = _score_unknowns(base, unknowns)
     except np.linalg.LinAlgError:
-        forecasts = dict.fromkeys(unknowns, always)
+        gains = dict.fromkeys(unknowns, np.inf)
     for one in candidates:
         if one.model.for_a_while or one.model.sudden:
-            forecasts[one] = always
+            gains[one] = np.inf
         elif not one.model.rows:
             solver = replace(base.solver, problem=one.apply(base.solver.problem))
-            forecasts[one] = _step_score(solver, base, (*base.models, one))
-    return forecasts
+            gains[one] = _step_score(solver, base.values, (*base.models, one)) - base.score
+    return gains
 
 
-def _score_unknowns(base: Member, candidates: Sequence[Candidate]) -> dict[Candidate, Forecast]:
-    """Return what each model that adds unknowns gains.
+def _score_unknowns(base: Member, candidates: Sequence[Candidate]) -> dict[Candidate, float]:
+    """Return the gain of each model that adds unknowns.
 
     One linearization has the unknowns of all models, and each model takes its rows and columns.
     Models of constants share the elimination of the keyframes.
@@ -245,23 +201,16 @@ def _score_unknowns(base: Member, candidates: Sequence[Candidate]) -> dict[Candi
     own_states = tuple(column for subject, column in columns if subject in own and column < width)
     shared = eliminate_states(equations.select(own_states, every))
 
-    def evidence(names: Collection[Subject]) -> tuple[float, float]:
+    def evidence(names: Collection[Subject]) -> float:
         used = [column for subject, column in columns if subject in names]
         states = tuple(column for column in used if column < width)
         left, at = shared, tuple(column - width for column in used if column >= width)
         if states != own_states:
             left, at = eliminate_states(equations.select(states, at)), every[: len(at)]
-        score, gain = left.step_evidence(at)
-        return score - float(price[used].sum()), gain
+        return left.step_evidence(at) - float(price[used].sum())
 
-    plain, _ = evidence(own)
-
-    def forecast(one: Candidate) -> Forecast:
-        score, gain = evidence(own | added[one])
-        found = score - plain + one.model.log_odds
-        return Forecast(found, found + REACH * gain)
-
-    return {one: forecast(one) for one in candidates}
+    plain = evidence(own)
+    return {one: evidence(own | added[one]) - plain + one.model.log_odds for one in candidates}
 
 
 def _try_stretch(base: Member, candidate: Candidate) -> list[Member]:
@@ -288,18 +237,18 @@ def _try_stretch(base: Member, candidate: Candidate) -> list[Member]:
     return [] if best is None else [best]
 
 
-def _step_score(solver: Solver, base: Member, models: tuple[Candidate, ...]) -> Forecast:
-    """Return what a flight under its models gains on its base by one Gauss-Newton step."""
-    start = convert_values(base.values, base.solver.layout, solver.layout)
+def _step_score(solver: Solver, start: Values, models: tuple[Candidate, ...]) -> float:
+    """Return the score that one Gauss-Newton step leads to."""
     try:
         equations, factors = solver.equations(start)
         solved = solve_step(equations)
     except np.linalg.LinAlgError:
-        return Forecast(-np.inf, -np.inf)
-    here = solver.laplace_evidence(MapEstimate(start, total_cost(factors)), factors, solved.log_det)
-    score = here + _prior(models) - base.score
-    gain = solved.gain(equations)
-    return Forecast(score + gain, score + (1 + REACH) * gain)
+        return -np.inf
+    slope = float((equations.gradient * solved.state).sum())
+    slope += float(equations.globals_gradient @ solved.constants)
+    begun = MapEstimate(start, total_cost(factors))
+    score = solver.laplace_evidence(begun, factors, solved.log_det) + _prior(models)
+    return score - slope / 2
 
 
 def select_grade(member: Member) -> Member:

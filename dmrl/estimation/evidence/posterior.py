@@ -12,8 +12,6 @@ import numpy as np
 from dmrl.estimation.evidence.error_models import Candidate, list_candidates
 from dmrl.estimation.evidence.model_trials import (
     MIN_GRADE,
-    MIN_WEIGHT,
-    RIVAL_ODDS,
     Member,
     Others,
     select_grade,
@@ -32,8 +30,11 @@ from dmrl.estimation.solver.problem import Problem
 
 MAX_MODELS = 3
 """Largest number of error models that are combined."""
-MAX_MEMBERS = 6
-"""Largest number of the solutions of a mixture."""
+RIVAL_ODDS = -7.0
+"""Log odds of a model against the leading one from which it is tried with the later models, too:
+the price of a rare model."""
+MIN_WEIGHT, MAX_MEMBERS = 0.02, 6
+"""Least weight, and largest number, of the solutions of a mixture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +88,7 @@ def weigh_models(solver: Solver, modes: Sequence[MapEstimate], others: Others = 
         tried = try_models(best, candidates, others)
         leader = max(tried, key=lambda one: one.score, default=best)
         members += tried
-        if leader.score <= best.score:
+        if leader.score < best.score:
             break
         rounds.append((leader.models[-1], _list_rivals(leader, tried)))
         best = select_grade(leader)

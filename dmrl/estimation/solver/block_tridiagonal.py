@@ -146,13 +146,6 @@ class Solved:
     log_det: float
     eliminated: "Eliminated"
 
-    def gain(self, equations: NormalEquations) -> float:
-        """Return by how much the step reduces the cost of its equations."""
-        slope = (
-            equations.gradient * self.state
-        ).sum() + equations.globals_gradient @ self.constants
-        return -float(slope) / 2
-
     def response(self) -> Array:
         """Return the (K, n, G) negated derivative of the keyframes by the constants."""
         return self.eliminated.substitute(self.eliminated.half[:, 1:]).reshape(
@@ -184,15 +177,12 @@ class Eliminated:
         solved, _ = dtbtrs(self.factor, half)
         return np.asarray(solved)
 
-    def step_evidence(self, constants: Sequence[int]) -> tuple[float, float]:
-        """Return the gain of the step with some constants, less half of the log determinant.
-
-        Also the gain alone.
-        """
+    def step_evidence(self, constants: Sequence[int]) -> float:
+        """Return the gain of the step with some constants, less half of the log determinant."""
         at = np.array(constants, int)
         block, slope = self.information[np.ix_(at, at)], self.gradient[at]
-        gain = float((self.half[:, 0] ** 2).sum() + slope @ np.linalg.solve(block, slope)) / 2
-        return gain - (self.log_det() + float(np.linalg.slogdet(block)[1])) / 2, gain
+        gain = (self.half[:, 0] ** 2).sum() + slope @ np.linalg.solve(block, slope)
+        return float(gain - self.log_det() - np.linalg.slogdet(block)[1]) / 2
 
     def log_det(self) -> float:
         """Return the log determinant of the keyframes' matrix."""
