@@ -6,9 +6,11 @@ and of a drift, which a jump would explain in part.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from dmrl.estimation.model.pair import SIGMA_OF_MEDIAN
 from dmrl.estimation.signals.clock_estimation import (
@@ -16,7 +18,6 @@ from dmrl.estimation.signals.clock_estimation import (
     GRID_STEP_S,
     MIN_OVERLAP_S,
     Array,
-    Clock,
     Series,
     cross_correlate,
     refine_lag,
@@ -27,7 +28,7 @@ OFFSETS_S = GRID_STEP_S * np.arange(-40, 41)
 DRIFTS = np.linspace(-5e-3, 5e-3, 101)
 """Drifts that are compared, seconds per second: a hundred times those of quartz clocks."""
 BLOCK = round(CORRELATED_SAMPLES)
-"""Samples that count as one: their costs are summed before drifts are compared."""
+"""Samples that count as one, whose costs are summed: half a second."""
 OUTLIER_SIGMAS = 3.0
 """Residual from which the cost is constant, standard deviations."""
 
@@ -74,45 +75,91 @@ def find_clock_jump(
     lag_s = cross_correlate(one, other, half_s)
     if lag_s is None:
         return None
-    at_s, residual = _compute_residuals(one, other, lag_s)
-    side = round(MIN_OVERLAP_S / GRID_STEP_S)
-    if len(at_s) <= 2 * side:
+    split = _split(_Aligned.from_series(one, other, lag_s))
+    if split is None:
         return None
-    best = residual[np.abs(residual).sum(axis=1).argmin()]
-    cost = np.minimum(residual**2, OUTLIER_SIGMAS**2 * _estimate_variance(best))
+    clocks = []
+    sides = time_s < split.from_s, time_s >= split.from_s
+    for at, offset_s in zip(sides, split.offsets_s, strict=True):
+        part = Series.from_samples(time_s[at], values[at])
+        clock = None if part is None else refine_lag(one, part, lag_s + offset_s)
+        if clock is None:
+            return None
+        clocks.append(clock)
+    earlier, later = clocks
+    sigma_s = float(np.hypot(earlier.sigma_s, later.sigma_s))
+    return ClockJump(split.from_s, later.offset_s - earlier.offset_s, sigma_s, split.gain)
+
+
+@dataclass(frozen=True, slots=True)
+class _Aligned:
+    """A clock's series beside the reference, at the T times that overlap at all `OFFSETS_S`.
+
+    ``time_s`` and ``values`` (T,) of the clock's series, ``lag_s`` to the reference ``grid_s``,
+    ``wanted`` of it; ``known`` (T,) whether neither has a gap at any of the offsets.
+    """
+
+    time_s: Array
+    values: Array
+    lag_s: float
+    grid_s: Array
+    wanted: Array
+    known: NDArray[np.bool_]
+
+    @classmethod
+    def from_series(cls, one: Series, other: Series, lag_s: float) -> Self:
+        """Align a series to the reference ``one``."""
+        grid_s, then = one.time_s, other.time_s + lag_s
+        used = (then + OFFSETS_S[0] >= grid_s[0]) & (then + OFFSETS_S[-1] <= grid_s[-1])
+        around = minimum_filter1d(one.known.astype(float), len(OFFSETS_S) + 2)
+        known = other.known[used] & (np.interp(then[used], grid_s, around) == 1)
+        values = other.without_trend()[used]
+        return cls(other.time_s[used], values, lag_s, grid_s, one.without_trend(), known)
+
+    @property
+    def block_s(self) -> Array:
+        """(B,) first times of blocks of `BLOCK` samples."""
+        return self.time_s[::BLOCK]
+
+    def residual(self, number: int) -> Array:
+        """Return (T,) residuals at one of `OFFSETS_S`; zero where a series has a gap."""
+        then = self.time_s + self.lag_s + OFFSETS_S[number]
+        return np.asarray((np.interp(then, self.grid_s, self.wanted) - self.values) * self.known)
+
+    def sum_costs(self) -> Array:
+        """Return (D, B) squared residuals at `OFFSETS_S`, limited, and summed over blocks."""
+        numbers = range(len(OFFSETS_S))
+        best = min(numbers, key=lambda number: np.abs(self.residual(number)).sum())
+        most = OUTLIER_SIGMAS**2 * _estimate_variance(self.residual(best))
+        first = np.arange(0, len(self.time_s), BLOCK)
+        each = (np.minimum(self.residual(number) ** 2, most) for number in numbers)
+        return np.stack([np.add.reduceat(square, first) for square in each])
+
+
+class _Split(NamedTuple):
+    """Time of the likeliest jump, offsets before and after it, and the gain of the jump."""
+
+    from_s: float
+    offsets_s: tuple[float, float]
+    gain: float
+
+
+def _split(both: _Aligned) -> _Split | None:
+    """Return the likeliest jump; None if the series are too short for one."""
+    side = round(MIN_OVERLAP_S / GRID_STEP_S / BLOCK)
+    if len(both.block_s) <= 2 * side:
+        return None
+    cost = both.sum_costs()
     before = cost.cumsum(axis=1)
     after = before[:, -1:] - before
-    split = side + int((before.min(axis=0) + after.min(axis=0))[side:-side].argmin())
-    first, second = int(before[:, split].argmin()), int(after[:, split].argmin())
-    rest = np.append(residual[first, :split], residual[second, split:])
-    single = min(before[:, -1].min(), _sum_along_drifts(cost, at_s))
-    gain = single - before[first, split] - after[second, split]
+    last = side + int((before.min(axis=0) + after.min(axis=0))[side:-side].argmin())
+    first, second = int(before[:, last].argmin()), int(after[:, last].argmin())
+    from_s = float(both.block_s[last + 1])
+    rest = np.where(both.time_s < from_s, both.residual(first), both.residual(second))
+    single = min(before[:, -1].min(), _sum_along_drifts(cost, both.block_s))
+    gain = single - before[first, last] - after[second, last]
     gain /= 2 * _estimate_variance(rest) * CORRELATED_SAMPLES
-    from_s = float(at_s[split])
-
-    def refine(at: NDArray[np.bool_], number: int) -> Clock | None:
-        part = Series.from_samples(time_s[at], values[at])
-        offset_s = lag_s + float(OFFSETS_S[number])
-        return None if part is None else refine_lag(one, part, offset_s)
-
-    earlier, later = refine(time_s < from_s, first), refine(time_s >= from_s, second)
-    if earlier is None or later is None:
-        return None
-    sigma_s = float(np.hypot(earlier.sigma_s, later.sigma_s))
-    return ClockJump(from_s, later.offset_s - earlier.offset_s, sigma_s, float(gain))
-
-
-def _compute_residuals(one: Series, other: Series, lag_s: float) -> tuple[Array, Array]:
-    """Return (T,) times on the other clock, and (D, T) residuals at `OFFSETS_S` from a lag.
-
-    Residuals are zero where either series has a gap at one of the offsets.
-    """
-    grid_s, time_s = one.time_s, other.time_s + lag_s
-    used = (time_s + OFFSETS_S[0] >= grid_s[0]) & (time_s + OFFSETS_S[-1] <= grid_s[-1])
-    then = time_s[used] + OFFSETS_S[:, None]
-    residual = np.interp(then, grid_s, one.without_trend()) - other.without_trend()[used]
-    known = (np.interp(then, grid_s, one.known) > 0.5).all(axis=0) & other.known[used]
-    return other.time_s[used], residual * known
+    return _Split(from_s, (float(OFFSETS_S[first]), float(OFFSETS_S[second])), float(gain))
 
 
 def _estimate_variance(residual: Array) -> float:
@@ -122,11 +169,10 @@ def _estimate_variance(residual: Array) -> float:
 
 
 def _sum_along_drifts(cost: Array, at_s: Array) -> float:
-    """Return the least sum of (D, T) costs along a clock that drifts."""
-    first = np.arange(0, len(at_s), BLOCK)
-    block = np.add.reduceat(cost, first, axis=1)
-    step = np.outer(DRIFTS, at_s[first] - at_s.mean()) / GRID_STEP_S
-    offset = np.arange(len(cost))[:, None, None] + np.rint(step).astype(int)
-    inside = ((offset >= 0) & (offset < len(cost))).all(axis=-1)
-    sums = block[np.clip(offset, 0, len(cost) - 1), np.arange(len(first))].sum(axis=-1)
-    return float(np.where(inside, sums, np.inf).min())
+    """Return the least sum of (D, B) costs along a clock that drifts."""
+    blocks, best = np.arange(len(at_s)), np.inf
+    for drift in DRIFTS:
+        step = np.rint(drift * (at_s - at_s.mean()) / GRID_STEP_S).astype(int)
+        offset = np.arange(max(0, -step.min()), len(cost) - max(0, step.max()))[:, None] + step
+        best = min(best, cost[offset, blocks].sum(axis=1).min(initial=np.inf))
+    return float(best)
