@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from dmrl import topics
 from dmrl.errors import SettingError
-from dmrl.evaluation.box_precision import BoxPrecision, compute_box_precision
 from dmrl.evaluation.comparison import (
     HEADERS,
     align_images,
@@ -24,6 +24,9 @@ from dmrl.evaluation.figure_tables import (
     finite_values,
 )
 from dmrl.evaluation.settings import Settings
+from dmrl.labelling.flight_log import read_flight
+from dmrl.labelling.recorded_camera import require_camera
+from dmrl.learn.inference.box_precision import BoxPrecision, compute_box_precision
 from dmrl.learn.inference.detection_metrics import (
     BandMetrics,
     ScoredDetections,
@@ -121,9 +124,17 @@ def evaluate_detections(
     if len(parts) == 2 and (both := align_images(*parts)):
         chosen = [_choose_threshold(_score(part), part, settings) for part in both]
         paired = compare_models(both, chosen, settings.draws, settings.seed)
-    width_m = settings.robot_width_m
-    boxes = None if width_m is None else compute_box_precision(pairs, width_m)
+    boxes = None if settings.robot_width_m is None else judge_boxes(pairs, settings.robot_width_m)
     return Evaluation(settings, pairs, scored, bands, threshold, paired, boxes)
+
+
+def judge_boxes(pairs: LabelledDetections, robot_width_m: float) -> BoxPrecision:
+    """Judge detections as boxes of robots of a width, metres; see `evaluate_detections`."""
+    taken = {(key.recording, key.robot) for key in pairs.at}
+    flights = {path: read_flight(path, topics.CALIBRATION) for path, _ in taken}
+    found = {(path, robot): require_camera(flights[path], robot) for path, robot in taken}
+    cameras = [found[key.recording, key.robot] for key in pairs.at]
+    return compute_box_precision(cameras, pairs.labels, pairs.detections, robot_width_m)
 
 
 def _score(pairs: LabelledDetections) -> ScoredDetections:

@@ -13,12 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl import topics
 from dmrl.errors import optional_imports
-from dmrl.evaluation.detections import ImageKey, LabelledDetections
 from dmrl.geometry.frames import Camera
-from dmrl.labelling.flight_log import read_flight
-from dmrl.labelling.recorded_camera import require_camera
 from dmrl.learn.inference.matching import Points
 from dmrl.terminal.tables import print_line, print_table
 
@@ -78,13 +74,17 @@ class BoxPrecision:
             print_line(f"left out: images with a label without a depth: {self.left_out}")
 
 
-def compute_box_precision(pairs: LabelledDetections, robot_width_m: float) -> BoxPrecision:
+def compute_box_precision(
+    cameras: Sequence[Camera], labels: Points, detections: Points, robot_width_m: float
+) -> BoxPrecision:
     """Compute the average precision of boxes.
 
     Parameters
     ----------
-    pairs
-        Labels and detections of images.
+    cameras
+        Camera of each image.
+    labels, detections
+        Those of the images.
     robot_width_m
         Width of the robots, metres.
 
@@ -92,26 +92,14 @@ def compute_box_precision(pairs: LabelledDetections, robot_width_m: float) -> Bo
     ------
     MissingExtra
         If pycocotools is not installed.
-    MissingTopic
-        If a recording has no calibration of the camera.
     """
-    cameras = _read_cameras(pairs.at)
-    unknown = pairs.labels.image[~(pairs.labels.depth_m > 0)]
-    used = np.setdiff1d(np.arange(pairs.images), unknown)
+    unknown = labels.image[~(labels.depth_m > 0)]
+    used = np.setdiff1d(np.arange(len(cameras)), unknown)
     boxes = [
-        _to_annotations(points, cameras, robot_width_m, used)
-        for points in (pairs.labels, pairs.detections)
+        _to_annotations(points, cameras, robot_width_m, used) for points in (labels, detections)
     ]
     figures = _evaluate_boxes(used.tolist(), *boxes)
-    return BoxPrecision(robot_width_m, len(used), pairs.images - len(used), figures)
-
-
-def _read_cameras(at: Sequence[ImageKey]) -> list[Camera]:
-    """Return the camera of each image."""
-    taken = {(key.recording, key.robot) for key in at}
-    flights = {path: read_flight(path, topics.CALIBRATION) for path, _ in taken}
-    cameras = {(path, robot): require_camera(flights[path], robot) for path, robot in taken}
-    return [cameras[key.recording, key.robot] for key in at]
+    return BoxPrecision(robot_width_m, len(used), len(cameras) - len(used), figures)
 
 
 def _to_annotations(

@@ -9,9 +9,10 @@ import pytest
 
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic
-from dmrl.evaluation.box_precision import BoxPrecision, compute_box_precision
+from dmrl.evaluation.detection_report import judge_boxes
 from dmrl.evaluation.detections import join_by_image
 from dmrl.images.codec import encode_png
+from dmrl.learn.inference.box_precision import BoxPrecision
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 
@@ -40,7 +41,7 @@ def judged(
             sink.write(k, topics.LABELS("cf1"), message_class("PeerLabels")(peers=labels))
             seen = [{**one, "confidence": 0.9 - 0.1 * n} for n, one in enumerate(found)]
             sink.write(k, topics.DETECTIONS("cf1"), message_class("Detections")(detections=seen))
-    return compute_box_precision(join_by_image([path], "truth"), WIDTH_M)
+    return judge_boxes(join_by_image([path], "truth"), WIDTH_M)
 
 
 def test_equal_boxes_have_full_precision(tmp_path: Path) -> None:
