@@ -71,7 +71,8 @@ class Evaluation:
     paired
         Differences of two recordings with the same images and labels, as JSON values; else None.
     boxes
-        Precision of the detections as boxes. None: the width of the robots is not given.
+        Precision of the detections as boxes: of all recordings together, or of each of two that are
+        compared. Empty: the width of the robots is not given.
     """
 
     settings: Settings
@@ -80,7 +81,7 @@ class Evaluation:
     bands: list[BandMetrics]
     threshold: float
     paired: dict[str, Any] | None = None
-    boxes: BoxPrecision | None = None
+    boxes: Sequence[BoxPrecision] = ()
 
 
 def evaluate_detections(
@@ -124,7 +125,8 @@ def evaluate_detections(
     if len(parts) == 2 and (both := align_images(*parts)):
         chosen = [_choose_threshold(_score(part), part, settings) for part in both]
         paired = compare_models(both, chosen, settings.draws, settings.seed)
-    boxes = None if settings.robot_width_m is None else judge_boxes(pairs, settings.robot_width_m)
+    width_m, judged = settings.robot_width_m, parts if paired else [pairs]
+    boxes = [] if width_m is None else [judge_boxes(one, width_m) for one in judged]
     return Evaluation(settings, pairs, scored, bands, threshold, paired, boxes)
 
 
@@ -188,7 +190,7 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
         "curves": curves_to_json(evaluation.scored),
         "definitions": METRIC_DEFINITIONS,
         **({"paired": evaluation.paired} if evaluation.paired else {}),
-        **({"boxes": evaluation.boxes.to_json()} if evaluation.boxes else {}),
+        **({"boxes": [one.to_json() for one in evaluation.boxes]} if evaluation.boxes else {}),
     }
 
 
@@ -224,8 +226,9 @@ def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None
     if evaluation.paired:
         print_table("the two on their common images", HEADERS, build_rows(evaluation.paired))
         print_line(note(evaluation.paired))
-    if evaluation.boxes and not pooled:
-        evaluation.boxes.print()
+    names = [str(path) for path in recordings] if evaluation.paired else [name]
+    for judged, boxes in zip(names, evaluation.boxes, strict=False):
+        boxes.print(judged)
     if not pooled:
         print_line(
             f"in brackets: 95 % intervals, bootstrap over images; precision, recall and F1 at "

@@ -65,10 +65,10 @@ class BoxPrecision:
         counts = {"images": self.images, "left_out": self.left_out}
         return {"robot_width_m": self.robot_width_m, **counts, **self.figures}
 
-    def print(self) -> None:
-        """Print the figures as a table."""
+    def print(self, name: str) -> None:
+        """Print the figures as a table, with the name of what is judged."""
         values = ["-" if value is None else f"{value:.3f}" for value in self.figures.values()]
-        title = f"boxes {self.robot_width_m:g} m wide in {self.images} images, by COCO's rules"
+        title = f"{name}: {self.images} images, boxes {self.robot_width_m:g} m wide, COCO's rules"
         print_table(title, [name for name, _ in FIGURES.values()], [values])
         if self.left_out:
             print_line(f"left out: images with a label without a depth: {self.left_out}")

@@ -9,12 +9,13 @@ import pytest
 
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic
-from dmrl.evaluation.detection_report import judge_boxes
+from dmrl.evaluation.detection_report import describe_evaluation, judge_boxes, print_evaluation
 from dmrl.evaluation.detections import join_by_image
 from dmrl.images.codec import encode_png
 from dmrl.learn.inference.box_precision import BoxPrecision
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
+from dmrl.stages.evaluate import Settings, run
 
 WIDTH_M = 0.2
 PICTURE = message_class("CompressedImage")(
@@ -24,10 +25,11 @@ CAMERA = message_class("CameraCalibration")(width=64, height=48, K=[50, 0, 32, 0
 Point = tuple[float, float, float]
 
 
-def judged(
-    path: Path, images: list[tuple[list[Point], list[Point]]], calibrated: bool = True
-) -> BoxPrecision:
-    """Judge images with the (u, v, depth) of their labels and detections."""
+Images = list[tuple[list[Point], list[Point]]]
+
+
+def record(path: Path, images: Images, calibrated: bool = True) -> Path:
+    """Write images with the (u, v, depth) of their labels and detections."""
     with RecordingWriter(path, Provenance("test")) as sink:
         if calibrated:
             sink.write(0, topics.CALIBRATION("cf1"), CAMERA)
@@ -41,7 +43,12 @@ def judged(
             sink.write(k, topics.LABELS("cf1"), message_class("PeerLabels")(peers=labels))
             seen = [{**one, "confidence": 0.9 - 0.1 * n} for n, one in enumerate(found)]
             sink.write(k, topics.DETECTIONS("cf1"), message_class("Detections")(detections=seen))
-    return judge_boxes(join_by_image([path], "truth"), WIDTH_M)
+    return path
+
+
+def judged(path: Path, images: Images, calibrated: bool = True) -> BoxPrecision:
+    """Judge images with the (u, v, depth) of their labels and detections."""
+    return judge_boxes(join_by_image([record(path, images, calibrated)], "truth"), WIDTH_M)
 
 
 def test_equal_boxes_have_full_precision(tmp_path: Path) -> None:
@@ -84,9 +91,9 @@ def test_an_image_with_a_label_without_depth_is_left_out(
     point, flat = (30.0, 20.0, 1.0), (10.0, 10.0, float("nan"))
     got = judged(tmp_path / "a.mcap", [([point], [point]), ([point, flat], [])])
     assert (got.images, got.left_out, got.figures["ap"]) == (1, 1, pytest.approx(1))
-    got.print()
+    got.print("seen.mcap")
     said = capsys.readouterr().out
-    assert "boxes 0.2 m wide in 1 images" in said
+    assert "seen.mcap: 1 images, boxes 0.2 m wide" in said
     assert "left out: images with a label without a depth: 1" in said
 
 
@@ -104,3 +111,22 @@ def test_a_missing_package_is_named_with_its_extra(
     point = (30.0, 20.0, 1.0)
     with pytest.raises(MissingExtra, match=r"pip install 'dmrl\[coco\]'"):
         judged(tmp_path / "a.mcap", [([point], [point])])
+
+
+def test_boxes_of_two_models_are_judged_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    label = (30.0, 20.0, 1.0)
+    paths = [
+        record(tmp_path / f"{depth_m}.mcap", [([label], [(30.0, 20.0, depth_m)])])
+        for depth_m in (1.0, 1.2)
+    ]
+    settings = Settings(draws=5, robot_width_m=WIDTH_M)
+    both = describe_evaluation(paths, run(paths, None, settings))
+    assert [one["ap"] for one in both["boxes"]] == pytest.approx([1.0, 0.4])
+    alone = describe_evaluation(paths[1:], run(paths[1:], None, settings))
+    assert [one["ap"] for one in alone["boxes"]] == pytest.approx([0.4])
+    assert "boxes" not in describe_evaluation(paths, run(paths, None, Settings(draws=5)))
+    print_evaluation(paths, run(paths, None, settings))
+    printed = capsys.readouterr().out.replace("\n", "")
+    assert all(f"{path}: 1 images, boxes 0.2 m wide" in printed for path in paths)
