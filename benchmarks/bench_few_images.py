@@ -1,15 +1,14 @@
 """What a network learns of a new robot and a new lens from 10, 25 and 50 labelled images.
 
-    python benchmarks/bench_few_images.py FOLDER PHOTOS [--seeds 3] [--init dmrl-nano]
+    python benchmarks/bench_few_images.py FOLDER [--seeds 3] [--init dmrl-nano]
 
 The robot is a grey hexacopter, 0.35 m wide, and the lens has a focal length of 230 px and a barrel
-distortion. Blender renders it over photos. Three photos are the places of the user; training images
-are of these three, or of the first alone. Every network is judged in the same three places with
-other crops, poses and light, and in the other photos. FOLDER keeps what is made.
+distortion. The places are Blender's panoramas. Three are those of the user: training images are of
+these, or of the first alone. Every network is judged in the same three places in other directions,
+with other poses and light, and in the other panoramas. FOLDER keeps what is made.
 """
 
 import argparse
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,10 +17,13 @@ import numpy as np
 import dmrl
 from dmrl.geometry.camera_file import format_camera
 from dmrl.geometry.frames import Camera
+from dmrl.rendering.blender_environment import ensure_environment
+from dmrl.rendering.renderer import list_shipped_panoramas
+from dmrl.terminal.progress import say
 from dmrl.terminal.tables import print_table
 
 CAMERA = Camera(320, 224, 230.0, 230.0, 157.0, 115.0, (-0.18, 0.03, 0.0, 0.0, 0.0))
-PLACES, JUDGED = 3, 300
+PLACES, JUDGED = ("courtyard", "interior", "city"), 300
 SETS = (("10", 3, 10), ("25", 3, 25), ("50", 3, 50), ("50 of one place", 1, 50))
 """Titles, places and images of the training sets."""
 
@@ -48,19 +50,21 @@ def write_boxes(path: Path) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def copy_photos(folder: Path, photos: Path) -> dict[str, Path]:
-    """Copy the photos to folders: the first place, the user's places, and the others."""
-    every = sorted(photos.glob("*.jpg"))
-    groups = {"place": every[:1], "places": every[:PLACES], "others": every[PLACES:]}
+def link_panoramas(folder: Path) -> dict[str, Path]:
+    """Link Blender's panoramas in folders: the first place, all of the user, and the others."""
+    every = {path.stem: path for path in list_shipped_panoramas(ensure_environment(say))}
+    others = tuple(sorted(every.keys() - set(PLACES)))
+    groups = {"place": PLACES[:1], "places": PLACES, "others": others}
     for name, some in groups.items():
         (folder / name).mkdir(parents=True, exist_ok=True)
-        for photo in some:
-            shutil.copy(photo, folder / name)
+        for stem in some:
+            if not (link := folder / name / every[stem].name).exists():
+                link.symlink_to(every[stem])
     return {name: folder / name for name in groups}
 
 
-def render(out: Path, backgrounds: Path, images: int, seed: int) -> Path:
-    """Render the robot over photos, unless it is done."""
+def render(out: Path, lights: Path, images: int, seed: int) -> Path:
+    """Render the robot in the panoramas of a folder, unless it is done."""
     robot, camera = out.parent / "hexacopter.obj", out.parent / "camera.toml"
     write_boxes(robot)
     camera.write_text(format_camera(CAMERA), encoding="utf-8")
@@ -68,19 +72,22 @@ def render(out: Path, backgrounds: Path, images: int, seed: int) -> Path:
         dmrl.render(
             "synthetic_first_look", out, preset="himax", robots_max=1, depth_m=(0.4, 3.0),
             test_share=0.0, model=robot, model_up="z", scale=1.0, camera=camera, distorted=True,
-            backgrounds=backgrounds, images=images, seed=seed, masks=False, depths=False,
+            lights=lights, images=images, seed=seed, masks=False, depths=False,
         )  # fmt: skip
     return out
 
 
 def train(
-    folder: Path, photos: dict[str, Path], init: str, seed: int
+    folder: Path, panoramas: dict[str, Path], init: str, seed: int
 ) -> Iterator[tuple[str, Path]]:
     """Yield the title and the model of each training set."""
     for title, places, images in SETS:
         name = f"{images}-of-{places}-{seed}"
         own = render(
-            folder / f"{name}.mcap", photos["places" if places > 1 else "place"], images, 100 + seed
+            folder / f"{name}.mcap",
+            panoramas["places" if places > 1 else "place"],
+            images,
+            100 + seed,
         )
         if not (folder / name).exists():
             dmrl.make_dataset(own, folder / f"{name}-data", labels="truth", split="none")
@@ -101,19 +108,18 @@ def main() -> None:
     """Render, train, and print the shares."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("photos", type=Path)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--init", default="dmrl-nano")
     given = parser.parse_args()
     folder = given.folder
-    photos = copy_photos(folder, given.photos)
+    panoramas = link_panoramas(folder)
     sets = {
-        name: render(folder / f"judge-{name}.mcap", photos[name], JUDGED, 900)
+        name: render(folder / f"judge-{name}.mcap", panoramas[name], JUDGED, 900)
         for name in ("places", "others")
     }
     found: dict[str, list[list[float]]] = {}
     for seed in range(given.seeds):
-        models = [("none", given.init), *train(folder, photos, given.init, seed)]
+        models = [("none", given.init), *train(folder, panoramas, given.init, seed)]
         for title, model in models:
             name = Path(model).name
             shares = [
