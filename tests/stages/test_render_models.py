@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 
 from dmrl.errors import BlenderError, OutputError, SettingError
-from dmrl.geometry.frames import Array
+from dmrl.geometry.frames import AIDECK, Array
 from dmrl.images.codec import decode
 from dmrl.recording import read_table
 from dmrl.render_recording import read_render_settings
+from dmrl.rendering.camera.sensor import Sensor
 from dmrl.rendering.renderer import Renderer, RobotModel
 from dmrl.rendering.robot_preview import render_sides
 from dmrl.rendering.robots import crazyflie
 from dmrl.rendering.settings import Settings
+from dmrl.rendering.shot import Light, Look, Robot
+from dmrl.rendering.sketch_renderer import Pose
 from dmrl.stages.render import command, run
 
 CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + (
@@ -41,6 +44,26 @@ def test_an_obj_stands_upright(
         sides = np.ptp(renderer.points, axis=0)
     assert sides[2] == pytest.approx(height_m, abs=1e-6)
     assert sorted(sides) == pytest.approx([0.1, 0.2, 0.3], abs=1e-6)
+
+
+@pytest.mark.heavy
+def test_a_face_of_a_model_has_no_speckle(blender: Path, tmp_path: Path) -> None:
+    path = tmp_path / "cube.obj"
+    path.write_text(CUBE)
+    camera = replace(AIDECK, distortion=())
+    backdrop = np.full((camera.height_px, camera.width_px, 3), 0.3, np.float32)
+    with Renderer(blender, RobotModel(path, 0.3), workers=1) as renderer:
+        light = Light(
+            renderer.lights[0], (0, 0, 0), 1.0, np.array([-1.0, 0, 1]), 2.0, (1, 1, 1), 0.1
+        )
+        robot = Robot(Pose(np.array([0.8, 0.0, 0.0]), np.eye(3)))
+        (shot,) = renderer.render_shots([(camera, (robot,), Look(backdrop, light, Sensor()))])
+    rows, columns = (
+        slice(int(at.min()) + 8, int(at.max()) - 8) for at in np.nonzero(shot.opacity[0])
+    )
+    face = shot.rgb[rows, columns].astype(float)
+    assert face.shape[0] > 30 and (shot.opacity[0][rows, columns] == 255).all()
+    assert np.abs(np.diff(face, axis=1)).mean() < 1.0
 
 
 @pytest.mark.heavy
