@@ -39,8 +39,7 @@ class ClockShift:
     @property
     def name(self) -> str:
         """Name of the cause."""
-        part = f" from {self.from_s:.0f} s on" if np.isfinite(self.from_s) else ""
-        return f"clock fits if it is moved by {self.shift_s:+.2f} s{part}"
+        return f"clock fits if it is moved by {self.shift_s:+.2f} s"
 
     def to_log_times(self, time_s: Array) -> Array:
         """Return (N,) times on the second robot's clock."""

@@ -80,7 +80,7 @@ def _estimate_pair(
     shifts: list[ClockShift] = []
     if not plain and noise is None:
         logged, shifts = _move_clock(logged)
-    mistakes = [_to_cause(shift.name, logged, 1) for shift in shifts]
+    mistakes = [_to_cause(shift.name, logged, 1, shift.from_s) for shift in shifts]
     pair = drop_contradictions(logged)
     possible = not ranges_are_far(pair)
     pieces = list(solve_pieces(pair, noise, plain=plain)) if possible else []
@@ -163,9 +163,9 @@ def _move_late(
     return logged, pair, pieces, list(models)
 
 
-def _to_cause(name: str, pair: Pair, robot: int | None) -> Cause:
-    """Return a cause of a whole flight."""
-    return Cause(name, 1.0, float(pair.time_s[0]), float(pair.time_s[-1]), robot)
+def _to_cause(name: str, pair: Pair, robot: int | None, from_s: float = -np.inf) -> Cause:
+    """Return a cause of a whole flight, or from some second on."""
+    return Cause(name, 1.0, max(from_s, float(pair.time_s[0])), float(pair.time_s[-1]), robot)
 
 
 def _explains(pieces: Sequence[Piece]) -> bool:
