@@ -15,7 +15,7 @@ smaller ones. The offset of sound simulated flights is known to 5 to 10 ms."""
 MIN_JUMP_GAIN = -RARE + np.log(200)
 """Smallest gain of a jump in log odds: the price of a rare error, and of the choice among its times
 in a flight of 100 s, to half a second. Sound and otherwise faulty flights of the judge gain 6 at
-most, those with a jump 78 and more."""
+most, those with a jump 77 and more."""
 JUMP_MARGIN_S = 1.5
 """Time around a jump whose ranges by the second robot are dropped, seconds. Jumps in two flights of
 the judge were located to 0.8 and 1.2 s. Odometry moved wrongly for so long is an outlier."""
