@@ -164,6 +164,18 @@ def test_no_position_of_a_stretch_that_does_not_fit_is_ok() -> None:
     assert (refused.status == UNCONVERGED).all() and refused.causes == everything.causes
 
 
+@pytest.mark.parametrize(("precise", "kept"), [(9, 0), (10, 10)])
+def test_a_flight_of_which_little_is_precise_is_refused(precise: int, kept: int) -> None:
+    state = np.tile([2.0, 0.0, 0.0], (100, 1))
+    spread = np.tile(np.diag([0.04, 0.04, 1e-4]), (100, 1, 1))
+    spread[50 : 50 + precise] *= 0.01
+    none = np.zeros(100, np.int8)
+    given = Estimate(np.arange(0.0, 100.0), state, spread, none, np.zeros(0), NoiseModel())
+    out = with_status(given, none.astype(bool), (9.0, 9.0), DEFAULT_GATE)
+    assert (out.status == OK).sum() == kept
+    assert [cause.name for cause in out.causes] == ["positions are imprecise"] * (not kept)
+
+
 @pytest.mark.parametrize(
     ("signal", "refused"), [("yaw rate", range(38, 53)), ("bearing", range(10, 81))]
 )
