@@ -17,9 +17,9 @@ from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Mask, Pair
 from dmrl.estimation.model.status import AMBIGUOUS, OK, UNCONVERGED, Statuses, classify_positions
 from dmrl.estimation.solver.covariance import (
     MIN_MOTION_ENERGY,
+    Covariances,
     calm_motion,
     odometry_energy,
-    relative_covariance,
 )
 from dmrl.estimation.solver.estimate import REASONS, Cause, Estimate
 from dmrl.estimation.solver.levenberg_marquardt import relative_path
@@ -88,10 +88,10 @@ def mix_members(solution: PairSolution, time_s: Array) -> tuple[Array, Array]:
         (T,) times, seconds.
     """
     states, spreads = [], []
-    for member, (keyframes, _) in zip(solution.mixture.members, solution.covariances, strict=True):
+    for member, covariances in zip(solution.mixture.members, solution.covariances, strict=True):
         problem, state = member.solver.problem, member.values.state
         states.append(relative_path(interpolate_states(problem, state, time_s)))
-        spread = relative_covariance(state, keyframes)
+        spread = covariances.relative(state)
         spreads.append(interpolate_at(time_s, problem.keyframe_s, spread))
     weight, apart = solution.mixture.weight, np.stack(states) - states[0]
     apart[..., 2] = np.angle(np.exp(1j * apart[..., 2]))
@@ -112,7 +112,7 @@ def interpolate_at(time_s: Array, key_s: Array, values: Array) -> Array:
 
 
 def height_errors(
-    problem: Problem, values: Values, covariances: tuple[Array, Array], both: tuple[int, int]
+    problem: Problem, values: Values, covariances: Covariances, both: tuple[int, int]
 ) -> tuple[Array, Array]:
     """Return (K,) errors of the height difference of two robots, and their standard deviations.
 
@@ -121,7 +121,7 @@ def height_errors(
     problem, values
         Flight and its solution.
     covariances
-        (K, n, n) and (G, G) of keyframes and constants.
+        Covariances of the solution.
     both
         Observer and peer.
     """
@@ -129,7 +129,8 @@ def height_errors(
     for row, c, constant, side in problem.layout.measured(both, "height"):
         value = values.constants[c] if constant else values.state[:, c]
         error = error - side * row.height * value
-        variance = variance + row.height**2 * covariances[constant][..., c, c]
+        spread = covariances.constants if constant else covariances.keyframes
+        variance = variance + row.height**2 * spread[..., c, c]
     return error, np.sqrt(variance)
 
 

@@ -21,7 +21,7 @@ from dmrl.estimation.search.modes import (
     select_modes,
 )
 from dmrl.estimation.solver.camera_noise import calibrate_views
-from dmrl.estimation.solver.covariance import compute_covariance
+from dmrl.estimation.solver.covariance import Covariances, compute_covariance
 from dmrl.estimation.solver.levenberg_marquardt import (
     ROUGH_TOLERANCE,
     MapEstimate,
@@ -49,11 +49,11 @@ class PairSolution:
     mixture
         Solutions under likely models, best first, with their weights.
     covariances
-        (K, n, n) of the keyframes and (G, G) of the constants of each.
+        Covariances of each.
     """
 
     mixture: Mixture
-    covariances: list[tuple[Array, Array]]
+    covariances: list[Covariances]
 
     @property
     def solver(self) -> Solver:

@@ -106,7 +106,7 @@ def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
         interpolate_at(time_s, key_s, heights),
         interpolate_at(time_s, key_s, height_std),
         None if error is None else np.interp(time_s, key_s, values.state[:, error]),
-        constants_covariance=covariances[1][np.ix_(shared, shared)],
+        constants_covariance=covariances.constants[np.ix_(shared, shared)],
         modes=len(solution.mixture.members),
         causes=find_causes(solution.mixture, (float(time_s[0]), float(time_s[-1]))),
     )
@@ -116,7 +116,7 @@ def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
     silent |= find_contradicted_steps(problem, values)[step]
     sighted, energy = list_sighted(solution, time_s), motion_energy(problem, values)
     chance = _compute_prior_chance(problem, values)
-    delay = find_delay(solution.mixture, covariances[1])
+    delay = find_delay(solution.mixture, covariances.constants)
     return Piece(estimate, silent, sighted, energy, noisy, chance, delay)
 
 

@@ -27,7 +27,7 @@ from dmrl.estimation.model.pair import Array, Mask, Pair
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.signals.contradictions import drop_contradictions
 from dmrl.estimation.solver.camera_noise import calibrate_views
-from dmrl.estimation.solver.covariance import compute_covariance, relative_covariance
+from dmrl.estimation.solver.covariance import Covariances, compute_covariance
 from dmrl.estimation.solver.estimate import PAIR_LAYOUT, REASONS, Estimate
 from dmrl.estimation.solver.keyframes import (
     build_problem,
@@ -141,8 +141,8 @@ def _estimate_group(
     return out
 
 
-Part = tuple[Solver, Values, tuple[Array, Array], Array]
-"""A window: its solver, values, covariances of keyframes and constants, and output times."""
+Part = tuple[Solver, Values, Covariances, Array]
+"""A window: its solver, values, covariances, and output times."""
 
 
 def _solve_windows(
@@ -218,10 +218,10 @@ def _initial_state(flight: Problem, names: list[str], estimates: Mapping[Names, 
 
 def _select_pair(part: Part, both: tuple[int, int]) -> Estimate:
     """Return the estimate of one ordered pair in a window, without statuses."""
-    solver, values, (keyframes, constants), time_s = part
+    solver, values, covariances, time_s = part
     problem, key_s = solver.problem, solver.problem.keyframe_s
-    spread = relative_covariance(values.state, keyframes, *both)
-    heights, height_std = height_errors(problem, values, (keyframes, constants), both)
+    spread = covariances.relative(values.state, *both)
+    heights, height_std = height_errors(problem, values, covariances, both)
     return Estimate(
         time_s,
         relative_path(interpolate_states(problem, values.state, time_s), *both),

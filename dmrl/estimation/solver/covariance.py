@@ -7,7 +7,13 @@ log of a robot at rest seems to fix the bearing, as a flight would.
 Therefore the equations are linearized at a calm copy of the solution. A short-time Fourier
 transform separates each robot's velocity into frequencies. Those without more energy than the noise
 of the odometry vanish. Slow motion that lasts has its energy at low frequencies and stays.
+
+What vanishes adds up over time, so the calm copy is some tenths of a metre off and sees the peer in
+another direction. The ranges fix the distance there, not a direction of the solution. So relative
+covariances are turned by the difference of the bearings.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +40,46 @@ MIN_MOTION_ENERGY = 1.0
 noise over a second: 0.06 m/s with the default noise, 0.04 m/s with calibrated sensors."""
 
 
-def compute_covariance(solver: Solver, values: Values) -> tuple[Array, Array]:
-    """Compute the covariances of a solution's keyframes (K, n, n) and constants (G, G)."""
+class Covariances(NamedTuple):
+    """Covariances of a solution.
+
+    Parameters
+    ----------
+    keyframes, constants
+        (K, n, n) of the keyframes and (G, G) of the constants.
+    calm
+        (K, n) states at which the equations are linearized.
+    """
+
+    keyframes: Array
+    constants: Array
+    calm: Array
+
+    def relative(self, state: Array, one: int = 0, other: int = 1) -> Array:
+        """Return (K, 3, 3) covariances of one robot's pose in another's horizontal frame.
+
+        Parameters
+        ----------
+        state
+            (K, n) states of the solution.
+        one, other
+            Observer and peer.
+        """
+        linearized_m, seen_m = (relative_path(s, one, other)[:, :2] for s in (self.calm, state))
+        back = rotation_matrix(-self.calm[:, 3 * one + 2])
+        by_both = np.zeros((len(state), 3, 6))
+        by_both[:, :2, :2], by_both[:, :2, 3:5] = -back, back
+        by_both[:, :2, 2] = -linearized_m @ QUARTER_TURN.T
+        by_both[:, 2, 2], by_both[:, 2, 5] = -1.0, 1.0
+        bearing, calm_bearing = (np.arctan2(xy[:, 1], xy[:, 0]) for xy in (seen_m, linearized_m))
+        by_both[:, :2] = rotation_matrix(bearing - calm_bearing) @ by_both[:, :2]
+        at = np.concatenate([3 * one + np.arange(3), 3 * other + np.arange(3)])
+        spread = self.keyframes[:, at[:, None], at]
+        return np.asarray(by_both @ spread @ by_both.swapaxes(1, 2))
+
+
+def compute_covariance(solver: Solver, values: Values) -> Covariances:
+    """Compute the covariances of a solution."""
     layout = solver.layout
     calm = Values(calm_motion(solver.problem, values.state), values.constants)
     factors = []
@@ -54,26 +98,7 @@ def compute_covariance(solver: Solver, values: Values) -> tuple[Array, Array]:
     spread = marginal_covariances(equations.diagonal, equations.off_diagonal)
     response = solved.response()
     by_constants = response @ solved.covariance @ response.swapaxes(1, 2)
-    return spread + by_constants, solved.covariance
-
-
-def relative_covariance(state: Array, spread: Array, one: int = 0, other: int = 1) -> Array:
-    """Return (K, 3, 3) covariances of one robot's pose in another's horizontal frame.
-
-    Parameters
-    ----------
-    state, spread
-        (K, n) and (K, n, n) keyframes and their covariances.
-    one, other
-        Observer and peer.
-    """
-    xy = relative_path(state, one, other)[:, :2]
-    back = rotation_matrix(-state[:, 3 * one + 2])
-    by_both = np.zeros((len(state), 3, 6))
-    by_both[:, :2, :2], by_both[:, :2, 3:5], by_both[:, :2, 2] = -back, back, -xy @ QUARTER_TURN.T
-    by_both[:, 2, 2], by_both[:, 2, 5] = -1.0, 1.0
-    at = np.concatenate([3 * one + np.arange(3), 3 * other + np.arange(3)])
-    return np.asarray(by_both @ spread[:, at[:, None], at] @ by_both.swapaxes(1, 2))
+    return Covariances(spread + by_constants, solved.covariance, calm.state)
 
 
 def calm_motion(problem: Problem, state: Array) -> Array:

@@ -9,9 +9,9 @@ from dmrl.estimation.model.odometry import rotation_matrix
 from dmrl.estimation.model.pair import Pair
 from dmrl.estimation.solver import covariance
 from dmrl.estimation.solver.covariance import (
+    Covariances,
     calm_motion,
     compute_covariance,
-    relative_covariance,
 )
 from dmrl.estimation.solver.equations import build_equations
 from dmrl.estimation.solver.keyframes import build_problem
@@ -113,8 +113,21 @@ def test_relative_covariance_matches_samples() -> None:
     spread = root @ root.T
     drawn = state + rng.multivariate_normal(np.zeros(6), spread, 100_000)
     for both in ((0, 1), (1, 0)):
-        found = relative_covariance(state, spread[None], *both)[0]
+        found = Covariances(spread[None], np.zeros((0, 0)), state).relative(state, *both)[0]
         assert found == pytest.approx(np.cov(relative_path(drawn, *both).T), rel=0.05, abs=2e-6)
+
+
+def test_relative_covariance_keeps_its_sides_to_the_peer() -> None:
+    calm = np.array([[0.0, 0.0, 0.3, 2.0, 0.0, 0.0]])
+    state = np.array([[0.0, 0.0, 0.3, 0.0, 2.5, 0.0]])
+    spread = np.diag([0.0, 0.0, 0.01, 0.04, 0.25, 0.0])[None]
+    found = Covariances(spread, np.zeros((0, 0)), calm).relative(state)[0, :2, :2]
+    bearing = np.pi / 2 - 0.3
+    ahead = np.array([np.cos(bearing), np.sin(bearing)])
+    across = np.array([-ahead[1], ahead[0]])
+    assert ahead @ found @ ahead == pytest.approx(0.04)
+    assert across @ found @ across == pytest.approx(0.25 + 2.0**2 * 0.01)
+    assert ahead @ found @ across == pytest.approx(0.0, abs=1e-12)
 
 
 def test_covariance_without_motion_noise_is_the_inverse_normal_matrix(
@@ -126,7 +139,7 @@ def test_covariance_without_motion_noise_is_the_inverse_normal_matrix(
     width = quiet.layout.width
     values = type(values)(values.state[:, :width], np.zeros(len(quiet.layout.constants)))
     solver = Solver(quiet)
-    keyframes, constants = compute_covariance(solver, values)
+    keyframes, constants, _ = compute_covariance(solver, values)
     equations = build_equations(solver.layout, solver.linearize(values), len(values.state))
     size = len(values.state) * width
     dense = np.zeros((size + len(constants),) * 2)
