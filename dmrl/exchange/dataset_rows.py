@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dmrl.datasets import Dataset, layout
+from dmrl.geometry.boxes import clip_box, square_box
 from dmrl.geometry.frames import Camera
 from dmrl.guards.safe_names import check_split_name
 from dmrl.images.codec import encode_png
@@ -76,9 +77,8 @@ class BoxOptions:
         """Return the box of a label: its own, or one as wide as the robot at its depth."""
         if peer["box_px"] or self.camera is None or not self.robot_width_m or not peer["depth_m"]:
             return list(peer["box_px"])
-        half = self.camera.fx_px * self.robot_width_m / peer["depth_m"] / 2
-        u, v = peer["u_px"], peer["v_px"]
-        return [u - half, v - half, u + half, v + half]
+        seen = (peer["u_px"], peer["v_px"], peer["depth_m"])
+        return square_box(self.camera, *seen, self.robot_width_m)
 
 
 @dataclass(frozen=True)
@@ -135,8 +135,8 @@ class ExportRows:
             if any(not box for _, box in boxes):
                 leave_out(WITHOUT_BOX, f"{self.data.path}: {row.name}")
                 continue
-            clipped = [peer | {"box_px": _clip(box, row.size_px)} for peer, box in boxes]
-            yield replace(row, peers=[peer for peer in clipped if peer["box_px"]])
+            clipped = [peer | {"box_px": clip_box(box, *row.size_px)} for peer, box in boxes]
+            yield replace(row, peers=[peer for peer in clipped if _has_area(*peer["box_px"])])
 
     def _iter_rows(self) -> Iterator[ExportRow]:
         for name in self.data.splits:
@@ -160,11 +160,8 @@ class ExportRows:
                 )
 
 
-def _clip(box_px: list[float], size_px: tuple[int, int]) -> list[float]:
-    left, top, right, bottom = (
-        min(max(edge, 0.0), float(size_px[k % 2])) for k, edge in enumerate(box_px)
-    )
-    return [left, top, right, bottom] if left < right and top < bottom else []
+def _has_area(left: float, top: float, right: float, bottom: float) -> bool:
+    return left < right and top < bottom
 
 
 def to_attributes(peer: Mapping[str, Any]) -> dict[str, Any]:

@@ -79,7 +79,7 @@ def _estimate_pair(
     logged, blind = drop_held_ranges(logged), None
     shifts: list[ClockShift] = []
     if not plain and noise is None:
-        logged, shifts = _move_clock(logged)
+        logged, shifts = _align_clocks(logged)
     mistakes = [_to_cause(shift.name, logged, 1, shift.from_s) for shift in shifts]
     pair = drop_contradictions(logged)
     possible = not ranges_are_far(pair)
@@ -111,7 +111,7 @@ def _estimate_pair(
     )
 
 
-def _move_clock(pair: Pair) -> tuple[Pair, list[ClockShift]]:
+def _align_clocks(pair: Pair) -> tuple[Pair, list[ClockShift]]:
     """Return a pair with the clocks of both robots alike, and the shifts of the second one."""
     shifts: list[ClockShift] = []
     while len(shifts) < MAX_SHIFTS and (shift := find_clock_shift(pair)) is not None:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.errors import optional_imports
+from dmrl.geometry.boxes import clip_box, square_box
 from dmrl.geometry.frames import Camera
 from dmrl.learn.inference.matching import Points
 from dmrl.terminal.tables import print_line, print_table
@@ -107,26 +108,21 @@ def _to_annotations(
 ) -> list[dict[str, Any]]:
     """Return labels or detections in some images as annotations of COCO."""
     shown = points.select(np.isin(points.image, used) & (points.depth_m > 0))
-    taken = [cameras[image] for image in shown.image]
-    sizes = np.array([(c.fx_px, c.width_px, c.height_px) for c in taken]).reshape(-1, 3)
-    half = (sizes[:, 0] * robot_width_m / shown.depth_m / 2)[:, None]
-    middle = np.column_stack([shown.u_px, shown.v_px])
-    low, high = (np.clip(middle + way * half, 0, sizes[:, 1:]) for way in (-1, 1))
-    boxes = np.column_stack([low, high - low]).tolist()
-    return [
-        {
-            "id": number,
-            "image_id": image,
-            "category_id": CLASS_ID,
-            "bbox": box,
-            "area": box[2] * box[3],
-            "iscrowd": 0,
-            "score": score,
-        }
-        for number, (image, box, score) in enumerate(
-            zip(shown.image.tolist(), boxes, shown.confidence.tolist(), strict=True), start=1
+    columns = (shown.image, shown.u_px, shown.v_px, shown.depth_m, shown.confidence)
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    found = []
+    for number, (image, u_px, v_px, depth_m, score) in enumerate(rows, start=1):
+        camera = cameras[image]
+        box = square_box(camera, u_px, v_px, depth_m, robot_width_m)
+        left, top, right, bottom = clip_box(box, camera.width_px, camera.height_px)
+        width, height = right - left, bottom - top
+        found.append(
+            {
+                **{"id": number, "image_id": image, "category_id": CLASS_ID, "iscrowd": 0},
+                **{"bbox": [left, top, width, height], "area": width * height, "score": score},
+            }
         )
-    ]
+    return found
 
 
 def _evaluate_boxes(
