@@ -16,11 +16,12 @@ from dmrl.ingest.settings import RecordSettings
 from dmrl.live.camera_link import CameraClient
 from dmrl.live.cflib_session import load_cflib
 from dmrl.live.crazyflie_link import CrazyflieLink
-from dmrl.live.links import build_cameras, build_links, check_robots, describe_no_data, stop_all
+from dmrl.live.links import build_cameras, build_links, check_robots, describe_no_data
 from dmrl.live.queue import LinkStatus, ReceivedSample, SampleQueue
 from dmrl.live.receive_clocks import HostClock
 from dmrl.live.robot_options import RobotOptions
 from dmrl.live.status_table import StatusTable
+from dmrl.live.threads import stop_all
 from dmrl.recording import RecordingWriter, build_provenance
 from dmrl.terminal.progress import say
 from dmrl.terminal.signals import set_on_signal

@@ -1,7 +1,6 @@
 """Camera of an AI-deck over WiFi: images as samples, with automatic reconnection."""
 
 import socket
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,6 +12,7 @@ from dmrl.geometry.frames import AIDECK, AIDECK_SENSOR_PX, Camera
 from dmrl.live.image_assembly import ColourMode, StoredFormat, encode_image
 from dmrl.live.queue import LinkStatus, ReceivedSample, SampleQueue
 from dmrl.live.receive_clocks import HostClock, SenderClock
+from dmrl.live.threads import StoppableThread
 from dmrl.samples.sample import build_calibration
 from dmrl.samples.sample import build_image as image_sample
 
@@ -99,7 +99,7 @@ class FrameCount:
         return max(step - 1, 0)
 
 
-class CameraClient(threading.Thread):
+class CameraClient(StoppableThread):
     """Thread that receives the images of one camera until it is stopped.
 
     Parameters
@@ -135,20 +135,15 @@ class CameraClient(threading.Thread):
         camera: Camera | None = None,
         robot_time: RobotTime = lambda _: None,
     ) -> None:
-        super().__init__(name=f"camera {robot}", daemon=True)
+        super().__init__(f"camera {robot}")
         self.health = LinkStatus(f"{robot} camera")
         self.robot, self._where = robot, (host, port)
         self._feed, self._now = feed, now
         self._form = colours, stored
         self._camera, self._robot_time = camera, robot_time
-        self._stop_wanted = threading.Event()
         self._size_px: tuple[int, int] | None = None
         self._warned: set[str] = set()
         self._frames = FrameCount()
-
-    def stop(self) -> None:
-        """Request the thread to end; `join` waits for it."""
-        self._stop_wanted.set()
 
     def run(self) -> None:
         """Connect and post images, again after each loss, until stopped."""

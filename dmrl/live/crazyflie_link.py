@@ -13,6 +13,7 @@ from dmrl.live.cflib_session import CflibSession
 from dmrl.live.log_blocks import LogDecoder, LogPlan, plan_blocks
 from dmrl.live.queue import LinkStatus, ReceivedSample, SampleQueue
 from dmrl.live.receive_clocks import HostClock, SenderClock
+from dmrl.live.threads import StoppableThread
 
 NS_PER_MS = 1_000_000
 TIMESTAMP_BITS = 24
@@ -94,7 +95,7 @@ class _LinkConnection:
                 yield ReceivedSample(sample, arrival_ns)
 
 
-class CrazyflieLink(threading.Thread):
+class CrazyflieLink(StoppableThread):
     """Thread that receives one drone's log until stopped, and reconnects after each loss.
 
     It never sends a set-point, so a flying drone is not affected by this program.
@@ -124,20 +125,15 @@ class CrazyflieLink(threading.Thread):
         feed: SampleQueue,
         now: HostClock,
     ) -> None:
-        super().__init__(name=f"link {robot}", daemon=True)
+        super().__init__(f"link {robot}")
         self.health = LinkStatus(robot)
         self.robot, self.uri = robot, uri
         self.reading: LogDecoder | None = None
         self._peers, self._period_ms, self._feed, self._now = peers, period_ms, feed, now
-        self._stop_wanted = threading.Event()
         self._flight: _LinkConnection | None = None
         self._packets = PacketCount()
         self._lock = threading.Lock()
         self._fault: Exception | None = None
-
-    def stop(self) -> None:
-        """Request the thread to end; `join` waits for it."""
-        self._stop_wanted.set()
 
     def to_host_time_ns(self, robot_ms: float) -> int | None:
         """Convert a time of the drone's clock to this computer's; None while unknown.

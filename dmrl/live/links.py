@@ -102,15 +102,6 @@ def build_cameras(
     ]
 
 
-def stop_all(threads: Sequence[CrazyflieLink | CameraClient]) -> None:
-    """Stop all threads, and wait for their end."""
-    for thread in threads:
-        thread.stop()
-    for thread in threads:
-        if thread.is_alive():
-            thread.join(timeout=10.0)
-
-
 def describe_no_data(out: object, links: Sequence[CrazyflieLink]) -> str:
     """Return the error text for a recording without any sample."""
     states = ", ".join(f"{link.robot} at {link.uri}: {link.health.state}" for link in links)

@@ -41,7 +41,6 @@ class LinkStatus:
     broken: int = 0
     connections: int = 0
     last_arrival_ns: int = 0
-    detail: str = ""
 
 
 class SampleQueue:

@@ -253,7 +253,8 @@ def run_over_folder(
         with suppress(OSError):  # it is not empty
             folder.rmdir()
     for task, answer in done:
-        for warning in _get_texts(answer.get("result"), "warnings"):
+        result = answer.get("result")
+        for warning in result.get("warnings", []) if isinstance(result, dict) else []:
             say(f"{task.source}: {warning}")
     if as_json:
         held = {"left_out": count_so_far()} if count_so_far() else {}
@@ -315,10 +316,6 @@ def _to_document(task: Task, answer: JobResult) -> dict[str, Any]:
     if has_failed(answer):
         return {**told, "error": error_text(task, answer)}
     return told | {key: answer[key] for key in ("result", "left_out") if key in answer}
-
-
-def _get_texts(result: Any, name: str) -> list[str]:
-    return result.get(name, []) if isinstance(result, dict) else []
 
 
 def _summarize(result: Any) -> str:

@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dmrl import __version__
 from dmrl.atomic_output import replace_file
 from dmrl.errors import OutputError
 from dmrl.guards.bounded_parsing import parse_json
@@ -98,23 +97,6 @@ class BuildCache:
     def drop_missing_files(self) -> None:
         """Remove the hashes of missing files."""
         self.hashes = {path: known for path, known in self.hashes.items() if Path(path).exists()}
-
-
-def describe_build(
-    stage: str, settings: Mapping[str, Any], inputs: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Describe everything that determines the bytes of an output.
-
-    Parameters
-    ----------
-    stage
-        Command name.
-    settings
-        Settings that affect the output, as JSON values.
-    inputs
-        Name and SHA-256 of every input, by role.
-    """
-    return {"dmrl": __version__, "stage": stage, "settings": settings, "inputs": inputs}
 
 
 def build_key(made_of: Mapping[str, Any]) -> str:

@@ -12,7 +12,6 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterator
 from dataclasses import asdict, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any
 from dmrl import recipe as recipes
 from dmrl.errors import BusyOutput, FullDisk, MissingExtra, OutputError, describe_error
 from dmrl.pipeline.job import JobResult, has_failed
+from dmrl.pipeline.recipe_language import iter_leaves
 from dmrl.pipeline.stage_signature import StageSignature, signature_of
 from dmrl.recording import Provenance, build_provenance
 from dmrl.recording.provenance_inputs import build_input, hash_file, hash_folder
@@ -105,16 +105,8 @@ def _build_origin(stage: str, takes: StageSignature, **given: Any) -> Provenance
     settings = given.get("settings")
     values = [given[role] for role in takes.roles if role in given]
     values += [getattr(settings, name) for name in takes.paths]
-    paths = [path for path in _iter_paths(values) if path.exists()]
+    paths = [path for path in iter_leaves(values, Path) if path.exists()]
     return build_provenance(stage, settings, paths)
-
-
-def _iter_paths(value: Any) -> Iterator[Path]:
-    if isinstance(value, Path):
-        yield value
-    elif isinstance(value, dict | list | tuple):
-        for one in value.values() if isinstance(value, dict) else value:
-            yield from _iter_paths(one)
 
 
 def main() -> None:

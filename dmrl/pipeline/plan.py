@@ -17,7 +17,7 @@ from dmrl.evaluation import figure_specs
 from dmrl.geometry.camera_file import NAMED_CAMERAS
 from dmrl.guards.safe_names import check_file_name
 from dmrl.learn import pretrained
-from dmrl.pipeline.recipe_language import expand_steps, iter_strings
+from dmrl.pipeline.recipe_language import expand_steps, iter_leaves
 from dmrl.pipeline.stage_signature import StageSignature, signature_of
 from dmrl.simulation.settings import NAMED_EYES
 
@@ -74,7 +74,7 @@ class Step:
     @property
     def names(self) -> list[str]:
         """Names of all inputs."""
-        return [*iter_strings(list(self.inputs.values())), *iter_strings(self.path_settings)]
+        return list(iter_leaves([dict(self.inputs), self.path_settings], str))
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from dmrl.learn.pretrained import resolve_model_path
 from dmrl.pipeline.job import build_job
 from dmrl.pipeline.job_worker import run_job
 from dmrl.pipeline.plan import map_strings
+from dmrl.pipeline.recipe_language import iter_leaves
 from dmrl.pipeline.stage_signature import StageSignature, signature_of
 from dmrl.recording import Provenance, read_raw, read_summary
 from dmrl.recording.provenance import Input
@@ -89,8 +90,7 @@ def _make(made: Provenance, out: Path, source: Path, folders: list[Path], scratc
         )
     for key in takes.paths & settings.keys():
         settings[key] = map_strings(settings[key], lambda name: str(named.get(name, name)))
-        taken = set[str]()
-        map_strings(made.settings[key], taken.add)
+        taken = set(iter_leaves(made.settings[key], str))
         paths = [(name, path) for name, path in paths if name not in taken]
     say(f"{made.stage} {' '.join(name for name, _ in paths)}".rstrip())
     inputs = _assign_inputs(takes, [path for _, path in paths])

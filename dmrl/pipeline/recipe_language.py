@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import product
 from math import prod
-from typing import Any
+from typing import Any, TypeVar
 
 from dmrl.errors import suggest
 from dmrl.guards import limits
@@ -21,6 +21,7 @@ DATA = "data"
 """``{data}`` is no name of a recipe: it is the folder given with ``--data``."""
 
 Table = dict[str, Any]
+Leaf = TypeVar("Leaf")
 Values = Sequence[Any]
 Bound = Mapping[str, Any]
 
@@ -117,18 +118,18 @@ def _parse_defaults(table: Any, faults: list[str]) -> dict[str, Table]:
     return {}
 
 
-def iter_strings(value: Any) -> Iterator[str]:
-    """Yield the strings in nested lists and tables."""
-    if isinstance(value, str):
+def iter_leaves(value: Any, kind: type[Leaf]) -> Iterator[Leaf]:
+    """Yield the values of a type in nested lists and tables."""
+    if isinstance(value, kind):
         yield value
-    elif isinstance(value, dict | list):
+    elif isinstance(value, dict | list | tuple):
         for one in value.values() if isinstance(value, dict) else value:
-            yield from iter_strings(one)
+            yield from iter_leaves(one, kind)
 
 
 def _find_names(value: Any) -> dict[tuple[str, str | None], None]:
     """Return the names in a value in order, each with its row's key or None."""
-    found = (m.groups() for text in iter_strings(value) for m in NAME.finditer(text))
+    found = (m.groups() for text in iter_leaves(value, str) for m in NAME.finditer(text))
     return {(name, key): None for name, key in found if name != DATA}
 
 
@@ -146,7 +147,7 @@ def _check_step(step: Any, each: Mapping[str, Values], room: list[int]) -> str:
     count = prod(len(each[name]) for name in repeats)
     gathered = sum(
         prod(len(each[name]) for name in {n for n, _ in _find_names(text)} - repeats)
-        for text in iter_strings(step)
+        for text in iter_leaves(step, str)
     )
     for k, needs in enumerate((count, count * gathered, count * len(str(step)))):
         if needs > room[k]:

@@ -9,11 +9,12 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+from dmrl import __version__
 from dmrl import recipe as recipes
 from dmrl.atomic_output import register_output, to_partial_path
 from dmrl.errors import DmrlError, OutputError
 from dmrl.evaluation.pipeline_summary import StepOutcome
-from dmrl.pipeline.build_cache import BuildCache, build_key, describe_build
+from dmrl.pipeline.build_cache import BuildCache, build_key
 from dmrl.pipeline.executor import Executor
 from dmrl.pipeline.job import JobResult, build_job
 from dmrl.pipeline.plan import (
@@ -133,7 +134,8 @@ class Runner:
         filled |= map_strings(step.path_settings, self._hash_input)
         plain = recipes.to_json_values(filled).items()
         matter = {k: v for k, v in plain if k not in SETTINGS_WITHOUT_EFFECT}
-        return describe_build(step.stage, matter, map_strings(dict(step.inputs), self._hash_input))
+        inputs = map_strings(dict(step.inputs), self._hash_input)
+        return {"dmrl": __version__, "stage": step.stage, "settings": matter, "inputs": inputs}
 
     def _hash_input(self, name: str) -> list[str]:
         """Return name and SHA-256 of an input; for a built-in name, the name alone."""

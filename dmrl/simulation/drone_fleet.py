@@ -21,6 +21,7 @@ from dmrl.live.simulated.flight_source import (
     SimulatedFaults,
     SimulatedFlight,
 )
+from dmrl.live.threads import stop_all
 from dmrl.recording import read, read_summary, read_table
 from dmrl.recording.protobuf.arrow_arrays import to_numpy
 from dmrl.simulation.settings import DroneSettings
@@ -80,29 +81,20 @@ def fleet(
     sending: list[SimulatedCamera] = []
     # Each has its socket as soon as it is made, so what was made is ended if the next fails.
     with ExitStack() as made:
-        made.callback(_end, drones, sending)
         for k, (robot, uri) in enumerate(zip(robots, uris, strict=False)):
             seed = settings.seed * 1000 + k
             behaves = flights[robot], clock, faults[robot], seed
             drones.append(SimulatedCrazyflie(robot, address(uri), *behaves))
+            made.callback(drones[-1].close)
         for k, (robot, port) in enumerate(zip(robots, cameras, strict=False)):
             pictures, seed = _pictures(flight, robot, start_ns), settings.seed * 1000 + 500 + k
             sends = pictures, clock, faults[robot], settings.sends, seed
             sending.append(SimulatedCamera(robot, (LOOPBACK, port), *sends))
+            made.callback(sending[-1].close)
+        made.callback(stop_all, [*drones, *sending])
         for thread in (*drones, *sending):
             thread.start()
         yield Fleet(tuple(drones), tuple(sending), clock)
-
-
-def _end(drones: Sequence[SimulatedCrazyflie], cameras: Sequence[SimulatedCamera]) -> None:
-    """Stop all, then wait for each: they end at the same time."""
-    threads: tuple[SimulatedCrazyflie | SimulatedCamera, ...] = (*drones, *cameras)
-    for thread in threads:
-        thread.stop()
-    for thread in threads:
-        thread.close()
-        if thread.is_alive():
-            thread.join(timeout=5.0)
 
 
 def _robots(flight: Path, uris: Sequence[str], cameras: Sequence[int]) -> list[str]:

@@ -1,7 +1,6 @@
 """Simulated AI-deck that sends a flight's images over CPX, in any of the layouts."""
 
 import socket
-import threading
 from contextlib import suppress
 from typing import Literal
 
@@ -14,6 +13,7 @@ from dmrl.formats.aideck.cpx_state import RobotState
 from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX
 from dmrl.images import bayer, codec
 from dmrl.live.simulated.flight_source import FlightClock, FlightImages, SimulatedFaults
+from dmrl.live.threads import StoppableThread
 
 SentLayout = Literal["plain", "stamped", "streamer", "jpeg"]
 """The layouts of raw images, or plain JPEG."""
@@ -26,7 +26,7 @@ UART_LATENCY_US = 1_500
 JPEG_QUALITY = 90
 
 
-class SimulatedCamera(threading.Thread):
+class SimulatedCamera(StoppableThread):
     """Thread of one simulated camera. Like the deck, it serves one client at a time.
 
     Parameters
@@ -62,12 +62,11 @@ class SimulatedCamera(threading.Thread):
         sends: SentLayout,
         seed: int,
     ) -> None:
-        super().__init__(name=f"fake camera {robot}", daemon=True)
+        super().__init__(f"fake camera {robot}")
         self.robot, self.sent, self.dropped = robot, 0, 0
         self._address, self._pictures = address, pictures
         self._clock, self._faults, self._sends = clock, faults, sends
         self._chance = np.random.default_rng(seed)
-        self._stop_wanted = threading.Event()
         self._number = 0
         self._listener = self._open_listener()
 
@@ -86,10 +85,6 @@ class SimulatedCamera(threading.Thread):
     def port(self) -> int:
         """Port at which it listens."""
         return self._address[1]
-
-    def stop(self) -> None:
-        """Request the thread to end; `join` waits for it."""
-        self._stop_wanted.set()
 
     def close(self) -> None:
         """Release the port, if the thread was never started."""

@@ -8,7 +8,6 @@ is connected (link, platform, log, memories, parameters), and then sends log blo
 import errno
 import socket
 import struct
-import threading
 import zlib
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ import numpy as np
 from dmrl.errors import SettingError
 from dmrl.live.log_blocks import BLOCK_BYTES, LOG_TYPES, MAX_BLOCKS
 from dmrl.live.simulated.flight_source import FlightClock, SimulatedFaults, SimulatedFlight
+from dmrl.live.threads import StoppableThread
 
 PARAM, COMMANDER, MEMORY, LOG, GENERIC, PLATFORM, LINK = 2, 3, 4, 5, 7, 13, 15
 PROTOCOL_VERSION = 10
@@ -44,7 +44,7 @@ class _ServedBlock:
         return struct.calcsize("<" + "".join(kind for _, kind in self.variables))
 
 
-class SimulatedCrazyflie(threading.Thread):
+class SimulatedCrazyflie(StoppableThread):
     """Thread of one simulated drone.
 
     Parameters
@@ -77,13 +77,12 @@ class SimulatedCrazyflie(threading.Thread):
         faults: SimulatedFaults,
         seed: int,
     ) -> None:
-        super().__init__(name=f"fake {robot}", daemon=True)
+        super().__init__(f"fake {robot}")
         self.robot, self.sent, self.dropped, self.setpoints = robot, 0, 0, 0
         self._variables = list(flight.build_variables().items())
         self._clock, self._faults = clock, faults
         self._chance = np.random.default_rng(seed)
         self._blocks: dict[int, _ServedBlock] = {}
-        self._stop_wanted = threading.Event()
         self._rows = [_pack_toc_row(name, LOG_TYPES[v.kind][0]) for name, v in self._variables]
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -103,10 +102,6 @@ class SimulatedCrazyflie(threading.Thread):
     def is_logging(self) -> bool:
         """Whether any of its blocks is started."""
         return any(block.period_ms for block in list(self._blocks.values()))
-
-    def stop(self) -> None:
-        """Request the thread to end; `join` waits for it."""
-        self._stop_wanted.set()
 
     def close(self) -> None:
         """Release the port, if the thread was never started."""
