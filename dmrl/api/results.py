@@ -65,6 +65,7 @@ def evaluate_recordings(recordings: Sequence[Path], settings: Any) -> Result:
         columns = [kind.EACH, *(words for _, words, _ in kind.COLUMNS)]
         return Result(found, f"{named}: {kind.TITLE}", columns, kind.rows(found))
     document = report.describe_evaluation(recordings, found)
-    headers, rows = report.build_band_table([document["overall"], *document["bands"]])
+    tables = import_module("dmrl.evaluation.figure_tables")
+    headers, rows = tables.build_band_table([document["overall"], *document["bands"]])
     columns = ["detection minus label", *headers]
     return Result(document, f"{named}: {found.pairs.images} images", columns, rows)

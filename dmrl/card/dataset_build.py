@@ -16,21 +16,15 @@ from dmrl.datasets.huggingface_metadata import hash_document, write_json_if_chan
 from dmrl.datasets.layout import MANIFEST_FILE
 from dmrl.datasets.manifest import Manifest, load_manifest, part_folder
 from dmrl.datasets.settings import Settings
+from dmrl.datasets.writing import builder
 from dmrl.datasets.writing.append import ExistingDataset, load_combined_provenance, open_existing
-from dmrl.datasets.writing.builder import (
-    has_masks,
-    iter_rows,
-    report_left_out,
-    warn_about_other_sources,
-    warn_about_unused_flags,
-)
 from dmrl.datasets.writing.corrections import find_corrected, load_corrections
 from dmrl.datasets.writing.dataset_writer import write_shards
 from dmrl.datasets.writing.exclusions import load_flags
 from dmrl.datasets.writing.inputs import warn_about_lenses
 from dmrl.datasets.writing.near_duplicates import ImageHashes
 from dmrl.datasets.writing.rows import ExclusionCounts, RowFilter
-from dmrl.datasets.writing.splits import SplitLookup, assign_splits
+from dmrl.datasets.writing.splits import assign_splits
 from dmrl.errors import SettingError
 from dmrl.recording import LoadedRecording, Provenance, build_provenance
 from dmrl.recording.provenance import FILE_NAME as PROVENANCE
@@ -120,16 +114,17 @@ def _write_part(
     workers: int,
 ) -> Written:
     """Write the shards of recordings, the manifest with them, and their facts."""
-    if settings.masks and not any(has_masks(path) for path in recordings):
+    if settings.masks and not any(builder.has_masks(path) for path in recordings):
         raise SettingError(f"{recordings[0]} has no masks; renders have. Leave out --masks")
     made = _provenance(recordings, settings)
     known, held = _read_labels(recordings, settings)
     _warn_about_labels(known, settings)
     tally, seen = ExclusionCounts(), ImageHashes(before.load_image_hashes())
-    found = iter_rows(
+    splits = {path: one.splits for path, one in known.items()}
+    found = builder.iter_rows(
         held,
         {path: one.source for path, one in known.items()},
-        _assign_splits(known, made, settings, before),
+        assign_splits(splits, made, settings, before.inputs if before.made else None),
         tally,
         _select_images(settings),
         total=sum(one.images for one in known.values()),
@@ -144,8 +139,8 @@ def _write_part(
         before=before.manifest,
     )
     manifest = before.manifest.with_part(shards)
-    report_left_out(recordings, manifest, tally, settings)
-    warn_about_unused_flags(settings, tally)
+    builder.report_left_out(recordings, manifest, tally, settings)
+    builder.warn_about_unused_flags(settings, tally)
     _write_documents(part_folder(folder, before.manifest.parts), made, known, tally, seen)
     manifest.write(folder)  # last: from here on the part belongs to the dataset
     images = {
@@ -157,7 +152,7 @@ def _write_part(
 def _warn_about_labels(known: Mapping[Path, RecordingFacts], settings: Settings) -> None:
     if settings.labels in ("auto", "best"):
         sources = {path: one.source for path, one in known.items()}
-        warn_about_other_sources(sources, {path: one.others for path, one in known.items()})
+        builder.warn_about_other_sources(sources, {path: one.others for path, one in known.items()})
     warn_about_lenses([px for one in known.values() for px in one.focal_px])
 
 
@@ -173,23 +168,6 @@ def _write_documents(
     made.write(place)
     build_facts(known, tally, seen).write(place)
     seen.write(place)
-
-
-def _assign_splits(
-    known: Mapping[Path, RecordingFacts],
-    made: Provenance,
-    settings: Settings,
-    before: ExistingDataset,
-) -> dict[Path, SplitLookup]:
-    return assign_splits(
-        {path: one.splits for path, one in known.items()},
-        made,
-        whole=settings.split == "none",
-        val=settings.val,
-        test_share=settings.test_share,
-        seed=settings.seed,
-        there=before.inputs if before.made else None,
-    )
 
 
 def _select_images(settings: Settings) -> RowFilter:

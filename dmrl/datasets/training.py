@@ -15,29 +15,14 @@ from dmrl.datasets import Split, open_dataset
 from dmrl.datasets.backgrounds import open_backgrounds
 from dmrl.errors import ModelError, OutputError, SettingError, optional_imports
 from dmrl.geometry.frames import AIDECK_PINHOLE
-from dmrl.learn.pretrained import resolve_model_path
 from dmrl.recording import build_provenance
 from dmrl.terminal.progress import track
 
 with optional_imports("train", "dmrl train"):
     from dmrl.datasets.training_examples import TrainingData, load_training_data
     from dmrl.learn.data.batches import ROBOT_FIELDS, ExampleSet
-    from dmrl.learn.inference.confidence_calibration import (
-        PlattScaling,
-        apply_calibration,
-        fit_calibration,
-    )
+    from dmrl.learn.inference import confidence_calibration, loaded_model
     from dmrl.learn.inference.detector_rates import measure_rates
-    from dmrl.learn.inference.loaded_model import (
-        PUBLISHED_THRESHOLD,
-        Model,
-        assign_weights,
-        get_weights,
-        interpolate_weights,
-        load_model,
-        save_model,
-        transfer_weights,
-    )
     from dmrl.learn.inference.threshold import (
         count_false_alarms,
         find_unlabelled_images,
@@ -69,16 +54,35 @@ class Result:
     images_per_s: float
 
 
-def train_network(
-    dataset: Path,
-    out: Path,
-    settings: TrainConfig,
-    *,
-    init: Path | None = None,
-    teacher: Path | None = None,
-    unlabelled: UnlabelledImages | None = None,
-    resume: bool = False,
-) -> Result:
+class Given(NamedTuple):
+    """What a training is given beside its dataset.
+
+    Parameters
+    ----------
+    init
+        Model whose weights to start from. None: new weights, by the seed.
+    teacher
+        Model that is learnt from beside the labels. None: the labels alone.
+    unlabelled
+        Images without labels, for the consistency loss. None: none.
+    resume
+        Go on with the interrupted training in ``<out>.partial``; from the start, if that had
+        not come to the end of its first epoch.
+    """
+
+    init: Path | None = None
+    teacher: Path | None = None
+    unlabelled: UnlabelledImages | None = None
+    resume: bool = False
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Files and folders of all of them."""
+        models = (path for path in (self.init, self.teacher) if path)
+        return (*models, *(self.unlabelled.paths if self.unlabelled else ()))
+
+
+def train_network(dataset: Path, out: Path, settings: TrainConfig, given: Given) -> Result:
     """Train on the train split of a dataset and write the run folder.
 
     Confidence is calibrated, and the threshold chosen, on images held out: the split named val
@@ -92,15 +96,8 @@ def train_network(
         Run folder to write. Until the training is done it is ``<out>.partial``.
     settings
         See `FitSettings`.
-    init
-        Model whose weights to start from. None: new weights, by the seed.
-    teacher
-        Model that is learnt from beside the labels. None: the labels alone.
-    unlabelled
-        Images without labels, for the consistency loss. None: none.
-    resume
-        Go on with the interrupted training in ``<out>.partial``; from the start, if that had
-        not come to the end of its first epoch.
+    given
+        Models and images beside the dataset, and whether to resume.
 
     Raises
     ------
@@ -109,22 +106,18 @@ def train_network(
     DatasetError
         If ``dataset`` is not one, or has no train split.
     ModelError
-        If ``init`` or ``teacher`` cannot be used, or there is nothing to resume.
+        If a model cannot be used, or there is nothing to resume.
     SettingError
         If the network cannot take the images, its grid is not the teacher's, or the loss is no
         longer a number.
     """
-    if settings.init_share and init is None:
+    if settings.init_share and given.init is None:
         raise SettingError("init_share requires an initial model. Pass --init MODEL")
-    if not settings.epochs and init is None:
+    if not settings.epochs and given.init is None:
         raise SettingError("epochs: 0 trains nothing. Give --init MODEL to calibrate, or epochs")
-    start, guide = (path and resolve_model_path(path) for path in (init, teacher))
-    given = Given(start, guide, unlabelled)
     settings = _with_architecture(settings, given.init)
     processes = settings.processes if select_device(settings.device).type == "cpu" else 1
-    return run_distributed(
-        processes, partial(_train_in_process, dataset, out, settings, given, resume=resume)
-    )
+    return run_distributed(processes, partial(_train_in_process, dataset, out, settings, given))
 
 
 def _with_architecture(settings: TrainConfig, init: Path | None) -> TrainConfig:
@@ -132,45 +125,26 @@ def _with_architecture(settings: TrainConfig, init: Path | None) -> TrainConfig:
     if settings.architecture != AUTO:
         return settings
     return replace(
-        settings, architecture=load_model(init).architecture if init else DEFAULT_ARCHITECTURE
+        settings,
+        architecture=loaded_model.load_model(init).architecture if init else DEFAULT_ARCHITECTURE,
     )
 
 
-class Given(NamedTuple):
-    """Models of a training, the one to start from and the teacher, and images without labels."""
-
-    init: Path | None
-    teacher: Path | None
-    unlabelled: UnlabelledImages | None
-
-    @property
-    def paths(self) -> tuple[Path, ...]:
-        """Files and folders of all of them."""
-        models = (path for path in (self.init, self.teacher) if path)
-        return (*models, *(self.unlabelled.paths if self.unlabelled else ()))
-
-
 def _train_in_process(
-    dataset: Path,
-    out: Path,
-    settings: TrainConfig,
-    given: Given,
-    group: ProcessGroup,
-    *,
-    resume: bool,
+    dataset: Path, out: Path, settings: TrainConfig, given: Given, group: ProcessGroup
 ) -> Result:
     """Train in one process of a group. All compute; the leading one alone writes and prints."""
     if group.is_main:
         refuse_existing(out)
-        _refuse_unfinished(to_partial_path(out), resume=resume)
+        _refuse_unfinished(to_partial_path(out), resume=given.resume)
     data = open_dataset(dataset)
     train, loaded = data.split("train"), load_training_data(data, settings)
     network = _build_network(settings, loaded.examples, given.init)
-    first = {name: value.clone() for name, value in get_weights(network).items()}
+    first = {name: value.clone() for name, value in loaded_model.get_weights(network).items()}
     teacher = _load_teacher(given.teacher, network) if given.teacher else None
     inputs = [dataset, *given.paths]
     made = build_provenance("train", settings, inputs, seed=settings.seed, libraries=LIBRARIES)
-    mine = atomic_folder(out, keep_on_error=True, resume=resume)
+    mine = atomic_folder(out, keep_on_error=True, resume=given.resume)
     with mine if group.is_main else nullcontext(to_partial_path(out)) as folder:
         training = Trainer(
             network,
@@ -183,13 +157,13 @@ def _train_in_process(
             teacher=teacher,
             unlabelled=given.unlabelled,
             group=group,
-            resume=resume and has_checkpoint(folder),
+            resume=given.resume and has_checkpoint(folder),
         )
         if group.is_main:
             made.write(folder)
         result = _run_steps(training, settings, len(loaded.examples), group)
         if group.is_main:
-            interpolate_weights(training.network, first, settings.init_share)
+            loaded_model.interpolate_weights(training.network, first, settings.init_share)
             _write_model(training, settings, train, loaded, folder)
             remove_checkpoint(folder)
     return result
@@ -213,7 +187,7 @@ class Calibrated(NamedTuple):
     """Threshold, calibration and rates of a network, and how the threshold was chosen."""
 
     threshold: float
-    calibration: PlattScaling | None
+    calibration: confidence_calibration.PlattScaling | None
     rates: dict[str, Any] | None
     promise: dict[str, Any] | None = None
 
@@ -224,8 +198,8 @@ def _calibrate(network: Network, loaded: TrainingData, settings: TrainConfig) ->
     if held_out is None:
         return Calibrated(_or_published(settings.threshold), None, None)
     scored = score_examples(network, held_out)
-    found = fit_calibration(scored, loaded.sources)
-    if found is not None and apply_calibration(network, found):
+    found = confidence_calibration.fit_calibration(scored, loaded.sources)
+    if found is not None and confidence_calibration.apply_calibration(network, found):
         scored = score_examples(network, held_out)
     else:
         found = None
@@ -258,24 +232,26 @@ def _add_empty_rooms(held_out: ExampleSet, seed: int) -> ExampleSet:
 
 
 def _or_published(threshold: float | None) -> float:
-    return PUBLISHED_THRESHOLD if threshold is None else threshold
+    return loaded_model.PUBLISHED_THRESHOLD if threshold is None else threshold
 
 
 def _build_network(settings: TrainConfig, examples: ExampleSet, init: Path | None) -> Network:
     network = build_initial_network(settings, examples)
     if init is not None:
-        known = load_model(init)
+        known = loaded_model.load_model(init)
         if known.architecture != settings.architecture:
             raise SettingError(
                 f"{init} is a {known.architecture}, not the {settings.architecture} to train. "
                 f'Set architecture = "{known.architecture}" in the recipe, or give another --init'
             )
-        assign_weights(network, transfer_weights(known.network, network), init)
+        loaded_model.assign_weights(
+            network, loaded_model.transfer_weights(known.network, network), init
+        )
     return network
 
 
 def _load_teacher(path: Path, network: Network) -> Network:
-    teacher = load_model(path).network
+    teacher = loaded_model.load_model(path).network
     if teacher.stride_px != network.stride_px:
         raise SettingError(
             f"{path} has cells of {teacher.stride_px} px, the network to train "
@@ -314,7 +290,7 @@ def _write_model(
     height_px, width_px = train.image_shape
     peers = pc.list_flatten(train.table.column("peers"))
     sources = pc.unique(pc.struct_field(peers, "source")).to_pylist()
-    model = Model(
+    model = loaded_model.Model(
         training.network,
         settings.architecture,
         width_px=width_px,
@@ -330,4 +306,4 @@ def _write_model(
             "history": training.history,
         },
     )
-    save_model(model, folder)
+    loaded_model.save_model(model, folder)

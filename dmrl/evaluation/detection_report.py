@@ -7,32 +7,14 @@ from typing import Any
 
 from dmrl import topics
 from dmrl.errors import SettingError
-from dmrl.evaluation.comparison import (
-    HEADERS,
-    align_images,
-    build_rows,
-    compare_models,
-    is_pooled,
-    note,
-)
+from dmrl.evaluation import comparison, figure_tables
 from dmrl.evaluation.detections import LabelledDetections, concatenate_parts, join_each
-from dmrl.evaluation.figure_tables import (
-    band_to_json,
-    build_band_table,
-    curves_to_json,
-    describe_source,
-    finite_values,
-)
 from dmrl.evaluation.settings import Settings
 from dmrl.labelling.flight_log import read_flight
 from dmrl.labelling.recorded_camera import require_camera
+from dmrl.learn.inference import detection_metrics
 from dmrl.learn.inference.box_precision import BoxPrecision, compute_box_precision
-from dmrl.learn.inference.detection_metrics import (
-    BandMetrics,
-    ScoredDetections,
-    compute_band_metrics,
-    score_detections,
-)
+from dmrl.learn.inference.detection_metrics import BandMetrics, ScoredDetections
 from dmrl.learn.inference.detector_rates import measure_rates
 from dmrl.learn.inference.metric_definitions import METRIC_DEFINITIONS
 from dmrl.learn.inference.threshold import (
@@ -114,7 +96,7 @@ def evaluate_detections(
     threshold = _choose_threshold(scored, pairs, settings)
     if pairs.images * settings.draws < MIN_PARALLEL_DRAWS:
         workers = 1
-    bands = compute_band_metrics(
+    bands = detection_metrics.compute_band_metrics(
         scored,
         threshold=threshold,
         draws=settings.draws,
@@ -122,9 +104,9 @@ def evaluate_detections(
         across=lambda function, items: spread(function, items, workers),
     )
     paired = None
-    if len(parts) == 2 and (both := align_images(*parts)):
+    if len(parts) == 2 and (both := comparison.align_images(*parts)):
         chosen = [_choose_threshold(_score(part), part, settings) for part in both]
-        paired = compare_models(both, chosen, settings.draws, settings.seed)
+        paired = comparison.compare_models(both, chosen, settings.draws, settings.seed)
     width_m, judged = settings.robot_width_m, parts if paired else [pairs]
     boxes = [] if width_m is None else [judge_boxes(one, width_m) for one in judged]
     return Evaluation(settings, pairs, scored, bands, threshold, paired, boxes)
@@ -140,7 +122,7 @@ def judge_boxes(pairs: LabelledDetections, robot_width_m: float) -> BoxPrecision
 
 
 def _score(pairs: LabelledDetections) -> ScoredDetections:
-    return score_detections(pairs.images, pairs.labels, pairs.detections)
+    return detection_metrics.score_detections(pairs.images, pairs.labels, pairs.detections)
 
 
 def _choose_threshold(
@@ -168,9 +150,9 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
     One recording is ``recording``, several are ``recordings``.
     """
     settings = evaluation.settings
-    sources = [describe_source(path) for path in recordings]
+    sources = [figure_tables.describe_source(path) for path in recordings]
     alarms = count_false_alarms(evaluation.scored, evaluation.threshold)
-    overall, *bands = [band_to_json(band) for band in evaluation.bands]
+    overall, *bands = [figure_tables.band_to_json(band) for band in evaluation.bands]
     return {
         **({"recordings": sources} if len(sources) > 1 else {"recording": sources[0]}),
         "against": settings.against,
@@ -182,12 +164,12 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
         "partial": settings.partial,
         "images_without_detections": evaluation.pairs.unseen,
         "left_out": evaluation.pairs.left_out,
-        **finite_values(asdict(alarms)),
+        **figure_tables.finite_values(asdict(alarms)),
         "rates": measure_rates(evaluation.scored),
         "bootstrap": {"draws": settings.draws, "seed": settings.seed},
         "overall": overall,
         "bands": bands,
-        "curves": curves_to_json(evaluation.scored),
+        "curves": figure_tables.curves_to_json(evaluation.scored),
         "definitions": METRIC_DEFINITIONS,
         **({"paired": evaluation.paired} if evaluation.paired else {}),
         **({"boxes": [one.to_json() for one in evaluation.boxes]} if evaluation.boxes else {}),
@@ -197,12 +179,14 @@ def describe_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> d
 def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None:
     """Print the figures, one column per band that holds labels."""
     settings = evaluation.settings
-    headers, rows = build_band_table([band_to_json(band) for band in evaluation.bands])
+    headers, rows = figure_tables.build_band_table(
+        [figure_tables.band_to_json(band) for band in evaluation.bands]
+    )
     split = f", split {settings.split}" if settings.split else ""
     name = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
     part = ", only those with detections" if settings.partial else ""
     title = f"{name}: {evaluation.pairs.images} images against {settings.against}{split}{part}"
-    pooled = is_pooled({"images": evaluation.pairs.images, "paired": evaluation.paired})
+    pooled = comparison.is_pooled({"images": evaluation.pairs.images, "paired": evaluation.paired})
     if pooled:
         print_line(f"{title}, each by two models: below is their comparison, not their mean")
     else:
@@ -224,8 +208,12 @@ def print_evaluation(recordings: Sequence[Path], evaluation: Evaluation) -> None
             f"{quiet.false_alarms:.3f} an image"
         )
     if evaluation.paired:
-        print_table("the two on their common images", HEADERS, build_rows(evaluation.paired))
-        print_line(note(evaluation.paired))
+        print_table(
+            "the two on their common images",
+            comparison.HEADERS,
+            comparison.build_rows(evaluation.paired),
+        )
+        print_line(comparison.note(evaluation.paired))
     names = [str(path) for path in recordings] if evaluation.paired else [name]
     for judged, boxes in zip(names, evaluation.boxes, strict=False):
         boxes.print(judged)

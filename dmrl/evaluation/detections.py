@@ -28,6 +28,8 @@ from dmrl.terminal.progress import track
 
 Mask = NDArray[np.bool_]
 Times = NDArray[np.int64]
+Spans = list[tuple[int, int]] | None
+"""First and last log times of a split, nanoseconds; None: the whole recording."""
 
 
 class ImageKey(NamedTuple):
@@ -69,13 +71,6 @@ class LabelledDetections:
     def images(self) -> int:
         """Number of images."""
         return len(self.at)
-
-
-def join_by_image(
-    recordings: Sequence[Path], against: str, split: str | None = None, *, partial: bool = False
-) -> LabelledDetections:
-    """Join as `join_each`, and return all recordings together."""
-    return concatenate_parts(join_each(recordings, against, split, partial=partial))
 
 
 def join_each(
@@ -148,9 +143,7 @@ def _is_in_view(labels: Points, width_px: int, height_px: int) -> Mask:
     return is_inside(uv, width_px, height_px) & ~(labels.depth_m <= 0)
 
 
-def _find_spans(
-    recording: Path, own: dict[str, list[tuple[int, int]]], split: str | None
-) -> list[tuple[int, int]] | None:
+def _find_spans(recording: Path, own: dict[str, list[tuple[int, int]]], split: str | None) -> Spans:
     if split is None:
         return None
     if split not in own:
@@ -172,11 +165,7 @@ def _require_source(held: LoadedRecording, robots: Iterable[str], against: str) 
 
 
 def _join_robot(
-    held: LoadedRecording,
-    robot: str,
-    against: str,
-    spans: list[tuple[int, int]] | None,
-    partial: bool,
+    held: LoadedRecording, robot: str, against: str, spans: Spans, partial: bool
 ) -> LabelledDetections:
     left_out: Counter[str] = Counter()
     labelled = held.get_table(topics.LABELS(robot), SOURCE_FIELDS)
@@ -286,7 +275,7 @@ def concatenate_parts(parts: list[LabelledDetections]) -> LabelledDetections:
     )
 
 
-def _is_within(times: Times, spans: list[tuple[int, int]] | None) -> Mask:
+def _is_within(times: Times, spans: Spans) -> Mask:
     if spans is None:
         return np.ones(len(times), bool)
     within = np.zeros(len(times), bool)

@@ -10,13 +10,8 @@ from typing import Any
 from dmrl import topics
 from dmrl.atomic_output import atomic_folder, refuse_existing
 from dmrl.errors import MissingExtra, SettingError
-from dmrl.evaluation import flights, positions, tracks
-from dmrl.evaluation.detection_report import (
-    Evaluation,
-    Spread,
-    describe_evaluation,
-    evaluate_detections,
-)
+from dmrl.evaluation import detection_report, flights, positions, tracks
+from dmrl.evaluation.detection_report import Evaluation, Spread
 from dmrl.evaluation.settings import Settings
 from dmrl.recording import read_summary
 from dmrl.terminal.progress import say
@@ -36,11 +31,7 @@ SETTLE_S, SHORT_FLIGHT_S = 20.0, 30.0
 
 
 def evaluate_recordings(
-    recordings: Sequence[Path],
-    out: Path | None,
-    settings: Settings,
-    workers: int,
-    spread: Spread,
+    recordings: Sequence[Path], out: Path | None, settings: Settings, workers: int, spread: Spread
 ) -> Evaluation | Document:
     """Evaluate detections of all recordings together, or one recording's positions or tracks.
 
@@ -70,9 +61,9 @@ def evaluate_recordings(
             raise MissingExtra("matplotlib", "plot", "dmrl evaluate --plots")
     what = settings.what if settings.what != "auto" else _choose_kind(recordings[0])
     if what == "detections":
-        evaluation = evaluate_detections(recordings, settings, workers, spread)
+        evaluation = detection_report.evaluate_detections(recordings, settings, workers, spread)
         if out is not None:
-            made = describe_evaluation(recordings, evaluation)
+            made = detection_report.describe_evaluation(recordings, evaluation)
             with _write_folder(out, "evaluation", made) as folder:
                 assert figures is not None
                 scored, threshold = evaluation.scored, evaluation.threshold

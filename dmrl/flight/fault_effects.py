@@ -94,10 +94,8 @@ def apply_sensor_fault(rng: Generator, log: RobotLog, time_s: Array, event: Faul
             return replace(log, **silent)
         case "crash":
             since = np.maximum(time_s - event.windows_s[0, 0], 0.0)
-            speed, heading = (
-                amount * (1 - np.exp(-since / DIVERGENCE_TIME_CONSTANT_S)),
-                rng.uniform(-np.pi, np.pi),
-            )
+            speed = amount * (1 - np.exp(-since / DIVERGENCE_TIME_CONSTANT_S))
+            heading = rng.uniform(-np.pi, np.pi)
             vx, vy = log.vx_mps + speed * np.cos(heading), log.vy_mps + speed * np.sin(heading)
             return replace(log, vx_mps=vx, vy_mps=vy)
     return log

@@ -16,25 +16,9 @@ import pyarrow.compute as pc
 from dmrl import __version__
 from dmrl.datasets import open_dataset
 from dmrl.errors import DmrlError
-from dmrl.evaluation import comparison, flights, positions, tracks
-from dmrl.evaluation.figure_tables import (
-    build_band_table,
-    format_interval,
-    format_values,
-    metric_columns,
-)
-from dmrl.html_report.blocks import (
-    Block,
-    Figure,
-    ImageEmbedder,
-    Table,
-    Text,
-    build_page,
-    build_row,
-    draw_or_explain,
-    extract_valid,
-    show_documents,
-)
+from dmrl.evaluation import comparison, figure_tables, flights, positions, tracks
+from dmrl.html_report import blocks
+from dmrl.html_report.blocks import Block, Figure, ImageEmbedder, Table, Text
 from dmrl.html_report.catalogue_tables import build_catalogue_section
 from dmrl.html_report.collect import ReportInputs
 from dmrl.html_report.provenance_section import build_provenance_section
@@ -46,7 +30,7 @@ CARD_FIGURES = ("samples.jpg", "position.png", "depth.png", "peers.png")
 """Images that `dmrl card` draws."""
 MAX_SHOWN = 12
 """Evaluations, models or pairs that are drawn, at most; tables list all."""
-METRICS = metric_columns(
+METRICS = figure_tables.metric_columns(
     *("median_px", "within_8_px", "within_20_px", "depth_mae_m", "precision", "recall", "f1"),
     "ap_16_px",
 )
@@ -67,20 +51,20 @@ def build_report(found: ReportInputs) -> str:
         ("Differences", _differences_section(found)),
         (
             "Positions",
-            build_row(_draw_position_maps(found)) + _show_judged(found, positions, pictures),
+            blocks.build_row(_draw_position_maps(found)) + _show_judged(found, positions, pictures),
         ),
         ("Tracks", _show_judged(found, tracks, pictures)),
         ("Flights", _show_judged(found, flights, pictures)),
         ("Training", _training_section(found)),
         ("int8", _int8_section(found, pictures)),
         ("Datasets", _datasets_section(found, pictures)),
-        ("Images", build_row(pictures.embed(p, p.name) for p in found.pictures[:MAX_SHOWN])),
+        ("Images", blocks.build_row(pictures.embed(p, p.name) for p in found.pictures[:MAX_SHOWN])),
         ("Catalogue", build_catalogue_section(found.catalogues)),
         ("Recordings", _recordings_section(found)),
         ("Provenance", build_provenance_section(found)),
         ("Unreadable files", _table(("file", "why"), list(found.unread.items()))),
     ]
-    return build_page(found.folder.resolve().name, _summarize(found), bodies)
+    return blocks.build_page(found.folder.resolve().name, _summarize(found), bodies)
 
 
 def _table(columns: Iterable[str], rows: list[Any]) -> list[Block]:
@@ -108,7 +92,7 @@ def _detections_section(found: ReportInputs, pictures: ImageEmbedder) -> list[Bl
     # The pooled figures of a comparison are of no model; its section has those of both.
     judged = {name: said for name, said in every.items() if not comparison.is_pooled(said)}
     heads = ("evaluation", "against", "images", *(words for _, words, _ in METRICS))
-    rows = extract_valid(
+    rows = blocks.extract_valid(
         judged, lambda said: [said["against"], said["images"], *_metric_cells(said["overall"])]
     )
     few = dict(list(judged.items())[:MAX_SHOWN])
@@ -116,30 +100,32 @@ def _detections_section(found: ReportInputs, pictures: ImageEmbedder) -> list[Bl
     return [
         *_table(heads, [[name, *cells] for name, cells in rows.items()]),
         *([Text("In brackets: 95 % intervals from a bootstrap over images.")] if rows else []),
-        *build_row(_iter_detection_charts(few)),
-        *show_documents(shown, lambda name, said: _evaluation_details(found, name, said, pictures)),
+        *blocks.build_row(_iter_detection_charts(few)),
+        *blocks.show_documents(
+            shown, lambda name, said: _evaluation_details(found, name, said, pictures)
+        ),
     ]
 
 
 def _metric_cells(overall: Mapping[str, Any]) -> list[str]:
-    return [format_interval(overall[name], form) for name, _, form in METRICS]
+    return [figure_tables.format_interval(overall[name], form) for name, _, form in METRICS]
 
 
 def _iter_detection_charts(few: Mapping[str, Any]) -> Iterable[Figure]:
     for key, words in (("median_px", "median error, px"), ("depth_mae_m", "depth MAE, m")):
-        found = extract_valid(few, partial(_distance_bands, key)).items()
+        found = blocks.extract_valid(few, partial(_distance_bands, key)).items()
         if bands := {name: rows for name, rows in found if rows}:
             caption = f"{words} by distance"
-            yield draw_or_explain(charts.plot_by_distance, bands, words, caption=caption)
-    if curves := extract_valid(few, _precision_recall):
+            yield blocks.draw_or_explain(charts.plot_by_distance, bands, words, caption=caption)
+    if curves := blocks.extract_valid(few, _precision_recall):
         words = "precision over recall, matches within 16 px"
-        yield draw_or_explain(charts.plot_precision_recall, curves, caption=words)
-    if bins := extract_valid(few, _reliability_bins):
+        yield blocks.draw_or_explain(charts.plot_precision_recall, curves, caption=words)
+    if bins := blocks.extract_valid(few, _reliability_bins):
         words = (
             "share of correct detections over their confidence; calibrated is the diagonal, around "
             "which the dots of few detections scatter"
         )
-        yield draw_or_explain(charts.plot_reliability, bins, caption=words)
+        yield blocks.draw_or_explain(charts.plot_reliability, bins, caption=words)
 
 
 def _distance_bands(key: str, said: Any) -> list[tuple[float, ...]]:
@@ -176,14 +162,14 @@ def _evaluation_details(
     pooled = comparison.is_pooled(said)
     threshold = "" if pooled else f", threshold {float(said['threshold']):.2f}"
     words = f"{said['labels']} labels{threshold}.{partial}"
-    headers, rows = build_band_table([said["overall"], *said["bands"]])
+    headers, rows = figure_tables.build_band_table([said["overall"], *said["bands"]])
     rows = [] if pooled else rows
     table = _table(["detection minus label", *headers], rows)
     figures = (
         pictures.embed_if_present(found.folder / name / file, caption, full=k == 0)
         for k, (file, caption) in enumerate(EVALUATION_IMAGES.items())
     )
-    return [Text(words, ran), *table, *build_row(figures)]
+    return [Text(words, ran), *table, *blocks.build_row(figures)]
 
 
 def _differences_section(found: ReportInputs) -> list[Block]:
@@ -191,7 +177,9 @@ def _differences_section(found: ReportInputs) -> list[Block]:
         return [Text(comparison.note(said)), Table(comparison.HEADERS, comparison.build_rows(said))]
 
     judged = found.documents_of_kind("evaluations").items()
-    return show_documents({name: said["paired"] for name, said in judged if "paired" in said}, show)
+    return blocks.show_documents(
+        {name: said["paired"] for name, said in judged if "paired" in said}, show
+    )
 
 
 def _show_judged(found: ReportInputs, kind: ModuleType, pictures: ImageEmbedder) -> list[Block]:
@@ -205,9 +193,9 @@ def _show_judged(found: ReportInputs, kind: ModuleType, pictures: ImageEmbedder)
         drawn = sorted((found.folder / name).glob("*.png"))[:2]
         figures = (pictures.embed_if_present(p, f"{p.stem}, 3-sigma bands") for p in drawn)
         note = Text(f"{kind.note(said)}.", f"{ran} --plots {name}")
-        return [Table(heads, kind.rows(dict(said))), note, *build_row(figures)]
+        return [Table(heads, kind.rows(dict(said))), note, *blocks.build_row(figures)]
 
-    return show_documents(found.documents_of_kind(what), show)
+    return blocks.show_documents(found.documents_of_kind(what), show)
 
 
 def _draw_position_maps(found: ReportInputs) -> Iterable[Figure]:
@@ -226,19 +214,21 @@ def _draw_position_maps(found: ReportInputs) -> Iterable[Figure]:
                 drawn += 1
                 words = f"{name}: {peer} relative to {robot}, from above; 95 % ellipses"
                 places = path.true_m, path.estimate_m, path.covariance, path.kept
-                yield draw_or_explain(charts.plot_positions, *places, caption=words)
+                yield blocks.draw_or_explain(charts.plot_positions, *places, caption=words)
 
 
 def _training_section(found: ReportInputs) -> list[Block]:
     models = found.documents_of_kind("models")
     heads = ("model", "architecture", "parameters", "training images", "labels", "threshold")
-    rows = extract_valid(models, _model_cells)
-    losses = extract_valid(dict(list(models.items())[:MAX_SHOWN]), _loss_history)
+    rows = blocks.extract_valid(models, _model_cells)
+    losses = blocks.extract_valid(dict(list(models.items())[:MAX_SHOWN]), _loss_history)
     histories = {name: values for name, values in losses.items() if len(values) > 1}
     words = "loss over the epochs"
-    drawn = [draw_or_explain(charts.plot_losses, histories, caption=words)] if histories else []
+    drawn = (
+        [blocks.draw_or_explain(charts.plot_losses, histories, caption=words)] if histories else []
+    )
     table = Table(heads, [[name, *cells] for name, cells in rows.items()])
-    return [table, *build_row(drawn)] if models else []
+    return [table, *blocks.build_row(drawn)] if models else []
 
 
 def _model_cells(said: Any) -> list[Any]:
@@ -256,14 +246,16 @@ def _loss_history(said: Any) -> list[float]:
 def _int8_section(found: ReportInputs, pictures: ImageEmbedder) -> list[Block]:
     def show(name: str, said: Mapping[str, Any]) -> list[Block]:
         accuracy = said["accuracy"].items()
-        rows = [[kind, *format_values(figures, METRICS)] for kind, figures in accuracy]
+        rows = [
+            [kind, *figure_tables.format_values(figures, METRICS)] for kind, figures in accuracy
+        ]
         path = found.folder / name / "maps.png"
         maps = pictures.embed_if_present(path, "images and maps, float, int8", full=True)
         table = Table(("", *(words for _, words, _ in METRICS)), rows)
         head = Text(f"{said['images']} images of split {said['split']}")
-        return [head, table, *build_row([maps])]
+        return [head, table, *blocks.build_row([maps])]
 
-    return show_documents(found.documents_of_kind("int8"), show)
+    return blocks.show_documents(found.documents_of_kind("int8"), show)
 
 
 def _datasets_section(found: ReportInputs, pictures: ImageEmbedder) -> list[Block]:
@@ -280,7 +272,7 @@ def _datasets_section(found: ReportInputs, pictures: ImageEmbedder) -> list[Bloc
             caption = f"{name}: {file.partition('.')[0]}"
             drawn.append(pictures.embed_if_present(folder / "figures" / file, caption))
     heads = ("dataset", "split", "images", "with a peer", "labels", "recordings")
-    return _table(heads, rows) + build_row([f for f in drawn if f is not None][:MAX_SHOWN])
+    return _table(heads, rows) + blocks.build_row([f for f in drawn if f is not None][:MAX_SHOWN])
 
 
 def _count_splits(folder: Any) -> Iterable[tuple[Any, ...]]:

@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from dmrl import topics
-from dmrl.datasets.training import Result, train_network
+from dmrl.datasets.training import Given, Result, train_network
 from dmrl.errors import MissingTopic, RecordingError
 from dmrl.geometry.frames import Array
 from dmrl.images.codec import Rgb, decode
 from dmrl.labelling.flight_log import OBSERVER_TOPICS, read_flight
 from dmrl.labelling.observer_log import read_observer_log
 from dmrl.labelling.recorded_camera import require_camera
+from dmrl.learn.pretrained import resolve_model_path
 from dmrl.learn.training.config import TrainConfig
 from dmrl.learn.training.consistency import UnlabelledImages
 from dmrl.recording import read
@@ -30,12 +31,12 @@ def train_with_flights(
 ) -> Result:
     """Train on a dataset, and on the flights in ``unlabelled`` by the consistency loss.
 
-    The other parameters and the errors are those of `train_network` and `read_unlabelled`.
+    The other parameters are those of `Given`, and the errors those of `train_network` and
+    `read_unlabelled`.
     """
+    start, guide = (path and resolve_model_path(path) for path in (init, teacher))
     flights = read_unlabelled(unlabelled) if unlabelled else None
-    return train_network(
-        dataset, out, settings, init=init, teacher=teacher, unlabelled=flights, resume=resume
-    )
+    return train_network(dataset, out, settings, Given(start, guide, flights, resume))
 
 
 def read_unlabelled(paths: Sequence[Path]) -> UnlabelledImages:

@@ -11,6 +11,7 @@ from mcap.records import Channel as McapChannel
 
 from dmrl.errors import RecordingError
 from dmrl.guards import limits
+from dmrl.recording import recovery_scan
 from dmrl.recording.copying.chunk_copy import CopyUnit, adopt_definitions, write_unit
 from dmrl.recording.mcap import checksums
 from dmrl.recording.mcap.batch_reader import count_messages
@@ -24,13 +25,7 @@ from dmrl.recording.mcap.file import CORRUPTION_ERRORS, MAGIC, BoundedReader, ov
 from dmrl.recording.mcap.message_batch import MessageBatch
 from dmrl.recording.provenance import METADATA_NAME, Input, Provenance
 from dmrl.recording.provenance_inputs import hash_file
-from dmrl.recording.recovery_scan import (
-    IndexedCount,
-    Recovery,
-    RecoveryState,
-    iter_records,
-    read_listed_section,
-)
+from dmrl.recording.recovery_scan import Recovery, RecoveryState
 from dmrl.recording.summary import Definitions, Summary
 from dmrl.recording.writer import RECIPE_NAME, RecordingWriter
 
@@ -62,7 +57,7 @@ def recover(path: Path, out: Path) -> Recovery:
             raise RecordingError(
                 f"{path} does not begin like a recording: nothing to recover. Make it again"
             )
-        section = read_listed_section(path, stream)
+        section = recovery_scan.read_listed_section(path, stream)
         state = RecoveryState(path=path, recovery=Recovery(), summary_section=section)
         for record in (*section.schemas.values(), *section.channels.values()):
             # A topic is defined in the chunk with its first message. If that chunk is corrupt,
@@ -106,14 +101,14 @@ def _build_provenance(state: RecoveryState) -> Provenance:
 def _iter_units(stream: BoundedReader, state: RecoveryState) -> Iterator[CopyUnit]:
     """Yield everything that is readable and has a known topic, in file order."""
     damaged = False  # whether the chunk before the next message indexes is corrupt
-    for at, record in iter_records(stream, state):
+    for at, record in recovery_scan.iter_records(stream, state):
         if isinstance(record, Chunk):
             state.chunks += 1
             scan = _load_chunk(stream, state, record, at)
             damaged = scan is None
             if scan is not None:
                 yield from _iter_valid_units(state, scan.batch, record, scan)
-        elif isinstance(record, IndexedCount):
+        elif isinstance(record, recovery_scan.IndexedCount):
             if damaged:
                 state.skipped[record.channel] += record.messages
         elif isinstance(record, Message):

@@ -13,14 +13,9 @@ from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.frames import Array
 from dmrl.live.log_blocks import parse_robot_number
+from dmrl.live.simulated import flight_source
 from dmrl.live.simulated.aideck_server import SimulatedCamera
 from dmrl.live.simulated.crazyflie_server import SimulatedCrazyflie
-from dmrl.live.simulated.flight_source import (
-    FlightClock,
-    FlightImages,
-    SimulatedFaults,
-    SimulatedFlight,
-)
 from dmrl.live.threads import stop_all
 from dmrl.recording import read, read_summary, read_table
 from dmrl.recording.protobuf.arrow_arrays import to_numpy
@@ -36,7 +31,7 @@ class Fleet:
 
     drones: tuple[SimulatedCrazyflie, ...]
     cameras: tuple[SimulatedCamera, ...]
-    clock: FlightClock
+    clock: flight_source.FlightClock
 
     def has_listeners(self) -> bool:
         """Return whether a client still reads the log of a drone."""
@@ -75,7 +70,7 @@ def fleet(
     robots = _robots(flight, uris, cameras)
     faults = _faults(robots, settings)
     flights = {robot: _flight(flight, robot) for robot in robots}
-    clock = FlightClock(settings.speed, max(f.end_s for f in flights.values()))
+    clock = flight_source.FlightClock(settings.speed, max(f.end_s for f in flights.values()))
     start_ns = read_summary(flight).start_ns
     drones: list[SimulatedCrazyflie] = []
     sending: list[SimulatedCamera] = []
@@ -132,7 +127,9 @@ def address(uri: str) -> tuple[str, int]:
     return host, port
 
 
-def _faults(robots: Sequence[str], settings: DroneSettings) -> dict[str, SimulatedFaults]:
+def _faults(
+    robots: Sequence[str], settings: DroneSettings
+) -> dict[str, flight_source.SimulatedFaults]:
     dead: dict[str, tuple[float, float]] = {}
     for text in settings.dies:
         found = DIES.fullmatch(text)
@@ -144,14 +141,14 @@ def _faults(robots: Sequence[str], settings: DroneSettings) -> dict[str, Simulat
         dead[found["robot"]] = float(found["first"]), last
     alive = (float("inf"), float("inf"))
     return {
-        robot: SimulatedFaults(
+        robot: flight_source.SimulatedFaults(
             settings.drop, dead.get(robot, alive), settings.boot_ms, k * settings.drift_ppm
         )
         for k, robot in enumerate(robots)
     }
 
 
-def _flight(path: Path, robot: str) -> SimulatedFlight:
+def _flight(path: Path, robot: str) -> flight_source.SimulatedFlight:
     start_ns, held = read_summary(path).start_ns, read_summary(path).topics
     numbered = (
         n for t in held if (n := topics.parse_topic(topics.RANGE, t)) and n["robot"] == robot
@@ -168,7 +165,7 @@ def _flight(path: Path, robot: str) -> SimulatedFlight:
     angles = ("roll_rad", "pitch_rad", "yaw_rad", "yaw_rate_radps")
     height_s, height = signal_of(topics.HEIGHT(robot), "height_m")
     ranges = {peer: signal_of(topics.RANGE(robot, peer), "range_m") for peer in peers}
-    return SimulatedFlight(
+    return flight_source.SimulatedFlight(
         signal_of(topics.ATTITUDE(robot), *angles),
         signal_of(topics.VELOCITY(robot), "vx_mps", "vy_mps"),
         (height_s, height[:, 0]),
@@ -176,6 +173,6 @@ def _flight(path: Path, robot: str) -> SimulatedFlight:
     )
 
 
-def _pictures(path: Path, robot: str, start_ns: int) -> FlightImages:
+def _pictures(path: Path, robot: str, start_ns: int) -> flight_source.FlightImages:
     for stamped in read(path, topics.CAMERA_IMAGE(robot)):
         yield (stamped.time_ns - start_ns) * 1e-9, stamped.message.data

@@ -147,7 +147,8 @@ def record_flight(out: Path, settings: FlySettings) -> dict[str, int]:
     with ExitStack() as stack:
         if settings.camera:
             draw, made = _open_renderer(settings, made, stack)
-            streams += map(round_samples, _camera_streams(flight, settings, draw))
+            for k, robot in enumerate([*flight.truth][: settings.cameras_max]):
+                streams.append(round_samples(_camera_stream(flight, robot, k, settings, draw)))
         sink = stack.enter_context(RecordingWriter(out, made))
         for sample in track(merge_by_time(streams), "Flying", _estimate_total(flight, settings)):
             sink.write_sample(sample)
@@ -236,13 +237,6 @@ def _estimate_total(flight: Flight, settings: FlySettings) -> int:
         2 * min(robots, settings.cameras_max) * int(settings.duration_s * settings.camera_rate_hz)
     )
     return logs + ranged + truth + settings.camera * pictures
-
-
-def _camera_streams(
-    flight: Flight, settings: FlySettings, draw: ViewRenderer
-) -> Iterator[Iterator[Sample]]:
-    for k, robot in enumerate(list(flight.truth)[: settings.cameras_max]):
-        yield _camera_stream(flight, robot, k, settings, draw)
 
 
 def _camera_stream(

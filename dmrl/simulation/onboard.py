@@ -13,7 +13,7 @@ from dmrl.estimation.tracking.tuning import Tuning
 from dmrl.flight.dead_reckoning import DeadReckoning
 from dmrl.flight.flight_arrays import RATE_HZ
 from dmrl.flight.pilot import PeerTrack
-from dmrl.geometry.frames import AIDECK_PINHOLE
+from dmrl.geometry.frames import AIDECK_PINHOLE, yaw_matrix
 from dmrl.labelling.peer_tracks import build_tracks
 from dmrl.samples.sample import Sample
 
@@ -86,8 +86,7 @@ class OnboardTracker:
         if self._sample is None:
             return ()
         dt_s, shift_m, turn_rad = self._reckoning.motion(self._sample, sample)
-        c, s = np.cos(turn_rad), np.sin(turn_rad)
-        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        turn = yaw_matrix(turn_rad)
         found = []
         for track in self._tracks:
             moved = np.hstack([np.eye(3), dt_s * np.eye(3)])

@@ -15,7 +15,13 @@ from dmrl.errors import SettingError
 from dmrl.flight.flight_arrays import RATE_HZ, Flight, Ranges, RobotLog
 from dmrl.flight.pilot import Command, PeerTrack, Pilot, Task
 from dmrl.flight.pilots import find_pilot
-from dmrl.geometry.frames import AIDECK_PINHOLE, is_inside, pixels_from_horizontal, project
+from dmrl.geometry.frames import (
+    AIDECK_PINHOLE,
+    is_inside,
+    pixels_from_horizontal,
+    project,
+    yaw_matrix,
+)
 from dmrl.images.codec import decode, encode_jpeg
 from dmrl.learn.pretrained import resolve_model_path
 from dmrl.prediction import describe_weights
@@ -23,15 +29,8 @@ from dmrl.recording import Provenance, RecordingWriter, build_provenance
 from dmrl.rendering.onboard_camera import CameraView
 from dmrl.samples.flight import START_NS, merge_by_time
 from dmrl.samples.sample import Sample, build_calibration, build_image, build_labels, round_samples
+from dmrl.simulation import flight_samples
 from dmrl.simulation.eyes import IDEAL_CONFIDENCE, Eye, IdealEye, NetworkEye
-from dmrl.simulation.flight_samples import (
-    JPEG_QUALITY,
-    TRUTH_RATE_HZ,
-    iter_label_fields,
-    iter_sensor_streams,
-    iter_truth_streams,
-    log_times,
-)
 from dmrl.simulation.onboard import OnboardTracker
 from dmrl.simulation.settings import NAMED_EYES
 from dmrl.simulation.simulator import STEPS_PER_COMMAND, Simulation
@@ -102,10 +101,10 @@ class FlightWriter:
             for link, parts in self._ranges.items()
         }
         block = Flight(logs, flight.truth, ranges, flight.clocks)
-        every = round(RATE_HZ / TRUTH_RATE_HZ)
+        every = round(RATE_HZ / flight_samples.TRUTH_RATE_HZ)
         moments = np.arange(-(-part.start // every) * every, end, every) / RATE_HZ
-        truth = map(round_samples, iter_truth_streams(block, moments))
-        streams = [*iter_sensor_streams(block, yaw), *truth]
+        truth = map(round_samples, flight_samples.iter_truth_streams(block, moments))
+        streams = [*flight_samples.iter_sensor_streams(block, yaw), *truth]
         events = sorted(round_samples(self._events), key=lambda sample: sample.time_ns)
         for sample in merge_by_time([*streams, events]):
             self._sink.write_sample(sample)
@@ -136,10 +135,8 @@ class PilotedFlight:
         writer: FlightWriter,
     ) -> None:
         self._settings, self._simulation, self._writer = settings, simulation, writer
-        form, leader = (
-            find_pilot(settings.pilot),
-            "".join(simulation.motion.names[settings.flown : settings.flown + 1]),
-        )
+        form = find_pilot(settings.pilot)
+        leader = "".join(simulation.motion.names[settings.flown : settings.flown + 1])
         self._drones = [
             Drone(
                 robot,
@@ -193,9 +190,9 @@ class PilotedFlight:
             samples = []
             if self._settings.camera:
                 picture = self._simulation.draw(view)
-                data = encode_jpeg(picture.rgb, JPEG_QUALITY)
+                data = encode_jpeg(picture.rgb, flight_samples.JPEG_QUALITY)
                 rgb = decode(data)  # what is recorded, so that dmrl predict finds the same in it
-                peers = list(iter_label_fields(list(view.poses), picture))
+                peers = list(flight_samples.iter_label_fields(list(view.poses), picture))
                 samples = [build_image(time_ns, drone.robot, data, "jpeg")]
             else:
                 peers = list(_project_labels(view))
@@ -244,21 +241,18 @@ class PilotedFlight:
         """Return the true positions of all peers, as tracks."""
         simulation, found = self._simulation, []
         truth, now = simulation.motion.flight.truth, simulation.motion.sample
-        c, s = np.cos(truth[robot].yaw[now]), np.sin(truth[robot].yaw[now])
-        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        turn = yaw_matrix(truth[robot].yaw[now])
         for k, peer in enumerate(simulation.motion.names):
             if peer != robot:
-                position, velocity = (
-                    simulation.peer_position(robot, peer),
-                    turn @ truth[peer].velocity[now],
-                )
+                position = simulation.peer_position(robot, peer)
+                velocity = turn @ truth[peer].velocity[now]
                 exact = TRUTH_STD_M**2 * np.eye(3)
                 found.append(PeerTrack(k, peer, position, velocity, exact, 0.0))
         return tuple(found)
 
     def _log_time(self, robot: str, sample: int) -> int:
         clock = self._simulation.motion.flight.clocks[robot]
-        return int(log_times(clock, np.array([sample / RATE_HZ]))[0])
+        return int(flight_samples.log_times(clock, np.array([sample / RATE_HZ]))[0])
 
 
 def detect_tracks(

@@ -6,15 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dmrl.errors import SettingError
-from dmrl.pipeline.batch import (
-    Task,
-    build_tasks,
-    error_text,
-    find_all_recordings,
-    is_collection,
-    iter_results,
-    report_failures,
-)
+from dmrl.pipeline import batch
 from dmrl.pipeline.executor import Executor, open_executor
 from dmrl.pipeline.job import JobResult, has_failed
 from dmrl.terminal.arguments import AsJson, In, On, Workers
@@ -70,7 +62,7 @@ def command(
     """
     if not recordings:
         raise SettingError("check wants a recording, or a folder of them. Name one")
-    if len(recordings) > 1 or is_collection(recordings[0]) or on is not None:
+    if len(recordings) > 1 or batch.is_collection(recordings[0]) or on is not None:
         return _check_side_by_side(recordings, open_executor(on, workers), as_json=as_json)
     found = asdict(run(recordings[0]))
     if as_json:
@@ -85,10 +77,10 @@ def command(
 
 def _check_side_by_side(named: Sequence[Path], crew: Executor, *, as_json: bool) -> int:
     """Check recordings side by side; return 1 if one has an error or cannot be read."""
-    found = {path: path for path in find_all_recordings(named)}
-    tasks = build_tasks("check", "recording", found, None)
+    found = {path: path for path in batch.find_all_recordings(named)}
+    tasks = batch.build_tasks("check", "recording", found, None)
     with crew:
-        done = list(iter_results(tasks, crew, "Checking"))
+        done = list(batch.iter_results(tasks, crew, "Checking"))
     documents = sorted((_document(task, answer) for task, answer in done), key=_badness)
     for one in documents:
         if not as_json and "error" not in one:
@@ -102,7 +94,7 @@ def _check_side_by_side(named: Sequence[Path], crew: Executor, *, as_json: bool)
     else:
         totals_line = f"{sound} without errors; {_count_findings(errors, warnings)}"
         print_line(f"{count_things(len(documents), 'recording')}: {totals_line}")
-    report_failures(done)
+    batch.report_failures(done)
     return 0 if sound == len(documents) else 1
 
 
@@ -140,8 +132,8 @@ def _describe_size(found: dict[str, Any]) -> str:
     return f"{size}, {counts}"
 
 
-def _document(task: Task, answer: JobResult) -> dict[str, Any]:
+def _document(task: batch.Task, answer: JobResult) -> dict[str, Any]:
     named = {"recording": str(task.source)}
     if has_failed(answer):
-        return {**named, "error": error_text(task, answer), "findings": []}
+        return {**named, "error": batch.error_text(task, answer), "findings": []}
     return {**named, **answer["result"]}

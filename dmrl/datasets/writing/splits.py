@@ -7,6 +7,7 @@ from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 
+from dmrl.datasets.settings import Settings
 from dmrl.datasets.writing.inputs import reject_duplicates
 from dmrl.errors import RecordingError, SettingError
 from dmrl.recording import Input, Provenance
@@ -91,12 +92,8 @@ def build_split_lookup(path: Path, own: Mapping[str, Sequence[tuple[int, int]]])
 def assign_splits(
     recordings: Mapping[Path, Mapping[str, Sequence[tuple[int, int]]]],
     made: Provenance,
-    *,
-    whole: bool,
-    val: str,
-    test_share: float,
-    seed: int,
-    there: Sequence[Input] | None = None,
+    settings: Settings,
+    there: Sequence[Input] | None,
 ) -> dict[Path, SplitLookup]:
     """Return the split of every log time, by recording.
 
@@ -106,10 +103,8 @@ def assign_splits(
         Recordings of the dataset, each with the split that its source defines, if it counts.
     made
         Its provenance, whose first inputs are these recordings.
-    whole
-        Whether all other recordings become train.
-    val, test_share, seed
-        The settings of ``dmrl dataset``.
+    settings
+        Of ``dmrl dataset``; here count ``split``, ``val``, ``test_share`` and ``seed``.
     there
         Inputs of the dataset so far. None: it is new.
 
@@ -123,16 +118,16 @@ def assign_splits(
     """
     hashes = {path: source.sha256 for path, source in zip(recordings, made.inputs, strict=False)}
     reject_duplicates(list(recordings), made, there or ())
-    watched = [path for path in recordings if fnmatchcase(path.name, val)]
-    if val and not watched and there is None:
+    watched = [path for path in recordings if fnmatchcase(path.name, settings.val)]
+    if settings.val and not watched and there is None:
         names = ", ".join(path.name for path in recordings)
-        raise SettingError(f"--val {val} matches none of {names}. Give another pattern")
+        raise SettingError(f"--val {settings.val} matches none of {names}. Give another pattern")
     learnt = [path for path in recordings if path not in watched]
     by_source = {path: recordings[path] for path in learnt if recordings[path]}
     rest = {path: hashes[path] for path in learnt if path not in by_source}
-    share = 0.0 if whole else test_share
+    share = 0.0 if settings.split == "none" else settings.test_share
     choose = choose_test_recordings if there is None else choose_test_independently
-    test = choose(rest, share, seed)
+    test = choose(rest, share, settings.seed)
     named = {path: _constant_split("test" if path in test else "train") for path in rest}
     named |= {path: build_split_lookup(path, parts) for path, parts in by_source.items()}
     return named | {path: _constant_split("val") for path in watched}

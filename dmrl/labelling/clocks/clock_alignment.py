@@ -7,12 +7,8 @@ from dmrl import topics
 from dmrl.errors import RecordingError, SettingError
 from dmrl.estimation.signals.clock_estimation import Clock, connect_clocks
 from dmrl.formats.timestamps import dejitter
+from dmrl.labelling.clocks import time_alignment
 from dmrl.labelling.clocks.retiming import MOCAP, Corrected
-from dmrl.labelling.clocks.time_alignment import (
-    estimate_camera_clock,
-    estimate_mocap_clocks,
-    estimate_range_clocks,
-)
 from dmrl.labelling.flight_log import FlightLog, to_flight_log
 from dmrl.recording import LoadedRecording, read_splits, read_table
 from dmrl.recording.protobuf.arrow_arrays import to_numpy
@@ -69,10 +65,10 @@ def align_clocks(held: LoadedRecording, wanted: Sources) -> tuple[dict[str, Cloc
 
 def _robot_clocks(held: FlightLog, wanted: Sources) -> dict[str, Clock]:
     """Return the clocks of all robots that ranges or motion capture tie to the reference."""
-    pairs = estimate_range_clocks(held)
+    pairs = time_alignment.estimate_range_clocks(held)
     robots = {name for link in held.ranges for name in link}
     if wanted.mocap:
-        seen = estimate_mocap_clocks(held)
+        seen = time_alignment.estimate_mocap_clocks(held)
         if not seen:
             raise RecordingError(
                 f"{held.path} has no poses of robots on /tf or /<robot>/pose/truth. "
@@ -112,7 +108,7 @@ def _camera_clocks(
     """Return the clock of every camera whose images show the turns of its robot."""
     found = {}
     for topic, robot in _camera_topics(held).items():
-        clock = estimate_camera_clock(held, robot, steady.get(topic, {}))
+        clock = time_alignment.estimate_camera_clock(held, robot, steady.get(topic, {}))
         if clock is None:
             say(
                 f"{held.path}: images and attitude of {robot} show no common turn, for 20 s at "

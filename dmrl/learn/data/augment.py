@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from dmrl.learn.data import crops
 from dmrl.learn.data.batches import BOX, DEPTH, ROBOT_FIELDS, Batch, ExampleSet, U, V
 from dmrl.learn.data.crops import (
     CropWindow,
-    Intrinsics,
     Opacity,
     Pixels,
     Point,
@@ -27,20 +27,6 @@ from dmrl.learn.data.crops import (
     Rng,
     RobotRow,
     StepMatrix,
-    add_noise,
-    alpha_blend,
-    blur_pixels,
-    build_crop_homography,
-    build_feather_mask,
-    build_rotation_homography,
-    is_covered,
-    is_inside,
-    list_robots,
-    move_labels,
-    sample_window,
-    scale_channels,
-    tile_mosaic,
-    to_luma,
 )
 
 MAX_ROBOTS_PER_IMAGE = 12
@@ -96,7 +82,7 @@ class Augmentation:
     colour: float = 0.0
     noise: float = 0.0
     blur_share: float = 0.0
-    intrinsics: Intrinsics | None = None
+    intrinsics: crops.Intrinsics | None = None
     grey_share: float = 0.0
 
     @property
@@ -164,7 +150,7 @@ class Augmenter:
         robots: list[RobotRow] = []
         whole = (0, 0, self._width, self._height)
         mosaic = rng.random() < self._settings.mosaic_share
-        rects = tile_mosaic(whole, rng) if mosaic else [whole]
+        rects = crops.tile_mosaic(whole, rng) if mosaic else [whole]
         others = rng.integers(len(self._examples), size=len(rects) - 1)
         for rect, source in zip(rects, (number, *others.tolist()), strict=True):
             robots = self._draw_layer(canvas, rect, source, robots, rng)
@@ -178,7 +164,7 @@ class Augmenter:
     ) -> list[RobotRow]:
         """Draw a window of a source in a rectangle; return the robots of the canvas after it."""
         width, height = rect[2] - rect[0], rect[3] - rect[1]
-        mine = list_robots(self._examples.robots[source])
+        mine = crops.list_robots(self._examples.robots[source])
         focus = mine[int(rng.integers(len(mine)))] if mine else None
         zoom = self._sample_zoom(focus, rng)
         zoom = max(zoom, width / self._width, height / self._height)  # stay inside the source
@@ -224,12 +210,12 @@ class Augmenter:
             centre = (rng.uniform(0, self._width), rng.uniform(0, self._height))
         turn = self._sample_rotation(zoom, rng)
         window = self._build_window(turn, zoom, centre, shown, rect)
-        opacity = build_feather_mask(height, width)
+        opacity = crops.build_feather_mask(height, width)
         if mask is not None:
             about = self._build_window(turn, zoom, middle, shown, rect)
-            cut = sample_window(255 * mask, about, (height, width), sharp=False)
+            cut = crops.sample_window(255 * mask, about, (height, width), sharp=False)
             opacity = np.asarray(cut / np.float32(255), np.float32)
-        mine = list_robots(self._examples.robots[source])
+        mine = crops.list_robots(self._examples.robots[source])
         return self._render_window(canvas, rect, source, window, mine, robots, rng, opacity)
 
     def _sample_zoom(self, robot: RobotRow | None, rng: Rng) -> float:
@@ -255,13 +241,13 @@ class Augmenter:
         """Build the window of a rectangle that maps a source point to one of its points."""
         camera = self._settings.intrinsics
         if camera:
-            matrix = build_rotation_homography(camera, turn, seen, shown, (rect[0], rect[1]))
+            matrix = crops.build_rotation_homography(camera, turn, seen, shown, (rect[0], rect[1]))
             x, y, whole = matrix[2].tolist()
             right, down = x * (rect[2] - rect[0]), y * (rect[3] - rect[1])
             ahead = (whole, whole + right, whole + down, whole + right + down)
             if min(ahead) > MIN_DEPTH_RATIO * max(ahead):
                 return CropWindow(matrix, zoom, camera)
-        return CropWindow(build_crop_homography(turn, seen, shown), zoom)
+        return CropWindow(crops.build_crop_homography(turn, seen, shown), zoom)
 
     def _render_window(
         self,
@@ -277,14 +263,16 @@ class Augmenter:
         """Render a window into the canvas; return the robots that are then visible."""
         left, top, right, bottom = rect
         image = self._examples.get_image(source)
-        pixels = sample_window(image, window, (bottom - top, right - left))
+        pixels = crops.sample_window(image, window, (bottom - top, right - left))
         pixels = self._jitter_colours(pixels, rng)
         place = canvas[top:bottom, left:right]
-        place[:] = pixels if opacity is None else alpha_blend(place, pixels, opacity)
+        place[:] = pixels if opacity is None else crops.alpha_blend(place, pixels, opacity)
         whole = (0, 0, self._width, self._height)
-        new = move_labels([robot for robot in mine if is_inside(robot, whole)], window, rect)
-        kept = [robot for robot in robots if not is_covered(robot, rect, opacity)]
-        return kept + [robot for robot in new if is_covered(robot, rect, opacity)]
+        new = crops.move_labels(
+            [robot for robot in mine if crops.is_inside(robot, whole)], window, rect
+        )
+        kept = [robot for robot in robots if not crops.is_covered(robot, rect, opacity)]
+        return kept + [robot for robot in new if crops.is_covered(robot, rect, opacity)]
 
     def _jitter_colours(self, pixels: Pixels, rng: Rng) -> Pixels:
         """Return the pixels with random contrast, brightness and white balance."""
@@ -293,18 +281,18 @@ class Augmenter:
             return pixels
         contrast, *white, light = rng.normal(0, spread, 5).tolist()
         gain = [math.exp(contrast + channel / 2) for channel in white]
-        return scale_channels(pixels, gain, [128 * (1 - times + light) for times in gain])
+        return crops.scale_channels(pixels, gain, [128 * (1 - times + light) for times in gain])
 
     def _degrade_image(self, canvas: Pixels, rng: Rng) -> None:
         """Apply defocus, sensor noise and loss of colours, in place."""
         if rng.random() < self._settings.blur_share:
-            canvas[:] = blur_pixels(canvas, rng.uniform(0.1, 1 / 3))
+            canvas[:] = crops.blur_pixels(canvas, rng.uniform(0.1, 1 / 3))
         if self._settings.noise:
             at = int(rng.integers(len(self._grain) - canvas.size))
             grain = self._grain[at : at + canvas.size]
-            canvas[:] = add_noise(canvas, grain, 255 * self._settings.noise * rng.random())
+            canvas[:] = crops.add_noise(canvas, grain, 255 * self._settings.noise * rng.random())
         if self._settings.grey_share and rng.random() < self._settings.grey_share:
-            canvas[:] = to_luma(canvas)
+            canvas[:] = crops.to_luma(canvas)
 
 
 def _sample_centre(whole: float, half: float, held: float | None, rng: Rng) -> float:

@@ -14,15 +14,9 @@ from torch import Tensor, nn
 
 from dmrl.errors import SettingError
 from dmrl.guards.memory import keep_freed_memory
+from dmrl.learn.data import batches
 from dmrl.learn.data.augment import Augmenter
-from dmrl.learn.data.batches import (
-    Batch,
-    ExampleSet,
-    collate,
-    count_batches,
-    epoch_indices,
-    prefetch,
-)
+from dmrl.learn.data.batches import Batch, ExampleSet
 from dmrl.learn.inference.decode_grids import require_whole_cells
 from dmrl.learn.networks.architectures import Network, build_network
 from dmrl.learn.training import tensorboard_log as boards
@@ -156,7 +150,7 @@ class Trainer:
         self._optimizer = build_optimizer(network, settings.optimizer, settings.weight_decay)
         self._average = WeightEma(network, settings.ema_steps) if settings.ema_steps else None
         self._epoch_images = settings.epoch_images or len(examples)
-        self._steps_per_epoch = count_batches(self._epoch_images, settings.batch_size)
+        self._steps_per_epoch = batches.count_batches(self._epoch_images, settings.batch_size)
         run = {**asdict(settings), "data": identity}
         self._state = TrainingProgress(run)
         if resume:
@@ -224,7 +218,7 @@ class Trainer:
 
     def _iter_batches(self, epoch: int, shares: SampleWeights) -> Iterator[Batch]:
         size, seed = self._settings.batch_size, self._settings.seed
-        indices = epoch_indices(
+        indices = batches.epoch_indices(
             len(self._examples), seed=seed, epoch=epoch, shares=shares, images=self._epoch_images
         )
         augmentation = self._settings.augmentation(epoch)
@@ -236,7 +230,7 @@ class Trainer:
             # With more processes than images, the others compute an image of weight 0.
             chosen = self._group.select_part(whole) if len(whole) >= self._group.size else whole[:1]
             if augmenter is None:
-                yield collate(self._examples, chosen)
+                yield batches.collate(self._examples, chosen)
             else:
                 yield augmenter.augment_batch(
                     chosen, epoch=epoch, index=index * self._group.size + self._group.rank
@@ -253,7 +247,7 @@ class Trainer:
         shares, hard = self._shares, self._settings.hard_share
         if hard:
             shares = mine_hard_negatives(self.network, self._examples, shares, hard)
-        for index, batch in enumerate(prefetch(self._iter_batches(epoch, shares)), start=1):
+        for index, batch in enumerate(batches.prefetch(self._iter_batches(epoch, shares)), start=1):
             step = epoch * self._steps_per_epoch + index
             rate = learning_rate_at(step, self._steps_per_epoch, self._settings)
             whole = min(size, self._epoch_images - (index - 1) * size)

@@ -5,12 +5,8 @@ import torch
 from numpy.typing import NDArray
 
 from dmrl.learn.data.batches import DEPTH, SIGMA_DEPTH, SIGMA_U, ExampleSet, U, V, iter_batches
+from dmrl.learn.inference import detection_metrics
 from dmrl.learn.inference.decode_grids import decode
-from dmrl.learn.inference.detection_metrics import (
-    ScoredDetections,
-    compute_metrics,
-    score_detections,
-)
 from dmrl.learn.inference.loaded_model import predict_grids
 from dmrl.learn.inference.matching import Points
 from dmrl.learn.networks.architectures import Network
@@ -42,14 +38,16 @@ def validate(network: Network, examples: ExampleSet, settings: TrainConfig) -> d
         for batch in iter_batches(examples, settings.batch_size):
             total += float(compute_losses(network, batch, settings).sum()) * len(batch.images)
     scored = score_examples(network, examples)
-    found = compute_metrics(scored, ALL_DEPTHS_M, 0.5, np.ones((1, len(examples))))
+    found = detection_metrics.compute_metrics(
+        scored, ALL_DEPTHS_M, 0.5, np.ones((1, len(examples)))
+    )
     watched = {f"validation_{name}": float(found[name][0]) for name in VALIDATION_METRICS}
     return {"validation_loss": total / len(examples), **watched}
 
 
 def score_examples(
     network: Network, examples: ExampleSet, batch_size: int = 16
-) -> ScoredDetections:
+) -> detection_metrics.ScoredDetections:
     """Detect robots in images and match the detections with the labels.
 
     A hit may be off by twice the label's standard deviation, beside the radius of the metric.
@@ -60,7 +58,7 @@ def score_examples(
         parts.append(Points.from_detections(found))
     first = np.arange(0, len(examples), batch_size)
     sigma_px = examples.robots[..., SIGMA_U : SIGMA_U + 2].max(axis=-1)[_find_visible(examples)]
-    return score_detections(
+    return detection_metrics.score_detections(
         len(examples),
         select_visible_labels(examples),
         Points.concatenate(parts, first),

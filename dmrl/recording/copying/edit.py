@@ -7,13 +7,7 @@ from itertools import combinations
 from pathlib import Path
 
 from dmrl.errors import RecordingError
-from dmrl.recording.copying.chunk_copy import (
-    CopyUnit,
-    TopicSelection,
-    adopt_channels,
-    iter_units,
-    write_unit,
-)
+from dmrl.recording.copying import chunk_copy
 from dmrl.recording.log_times import read_log_times, read_time_spans
 from dmrl.recording.mcap.channel import RawMessage
 from dmrl.recording.mcap.extra_records import read_header
@@ -45,23 +39,23 @@ def merge(paths: Sequence[Path], out: Path) -> int:
     refuse_duplicates(paths)
     for one, other in combinations(paths, 2):
         _warn_about_shared_sensors(one, other)
-    wanted = [TopicSelection(frozenset(read_summary(path).topics)) for path in paths]
+    wanted = [chunk_copy.TopicSelection(frozenset(read_summary(path).topics)) for path in paths]
     with RecordingWriter(out, build_provenance("merge", inputs=paths)) as sink:
         for path, every in zip(paths, wanted, strict=True):
             sink.copy_extras(read_summary(path))
-            adopt_channels(path, every.topics, sink)
+            chunk_copy.adopt_channels(path, every.topics, sink)
         streams = [
             _iter_timed_units(path, every) for path, every in zip(paths, wanted, strict=True)
         ]
         by_time = heapq.merge(*streams, key=lambda item: item[0])
-        return sum(write_unit(piece, every, sink) for _, piece, every in by_time)
+        return sum(chunk_copy.write_unit(piece, every, sink) for _, piece, every in by_time)
 
 
 def _iter_timed_units(
-    path: Path, wanted: TopicSelection
-) -> Iterator[tuple[int, CopyUnit, TopicSelection]]:
+    path: Path, wanted: chunk_copy.TopicSelection
+) -> Iterator[tuple[int, chunk_copy.CopyUnit, chunk_copy.TopicSelection]]:
     """Yield the copy units of a recording with their first log times."""
-    return ((piece.start_ns, piece, wanted) for piece in iter_units(path, wanted))
+    return ((piece.start_ns, piece, wanted) for piece in chunk_copy.iter_units(path, wanted))
 
 
 def _warn_about_shared_sensors(one: Path, other: Path) -> None:
@@ -142,12 +136,15 @@ def trim(
         profile = read_header(stream).profile
     with RecordingWriter(out, origin, profile=profile) as sink:
         sink.copy_extras(source)
-        adopt_channels(path, topics_to_keep, sink)
+        chunk_copy.adopt_channels(path, topics_to_keep, sink)
         typed = frozenset(t for t in topics_to_keep if carries_own_type(t, source.topics[t].schema))
         for raw in _iter_calibrations(path, typed, low, high):
             sink.write_raw(raw)
-        selection = TopicSelection(topics_to_keep, start_ns or 0, high)
-        count = sum(write_unit(piece, selection, sink) for piece in iter_units(path, selection))
+        selection = chunk_copy.TopicSelection(topics_to_keep, start_ns or 0, high)
+        count = sum(
+            chunk_copy.write_unit(piece, selection, sink)
+            for piece in chunk_copy.iter_units(path, selection)
+        )
         if not count and source.count:
             raise RecordingError(
                 f"{path} has no message in that time range; it lasts "

@@ -8,13 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmrl.recording.copying.chunk_copy import (
-    TopicSelection,
-    adopt_channels,
-    copy_messages,
-    iter_units,
-    write_unit,
-)
+from dmrl.recording.copying import chunk_copy
 from dmrl.recording.mcap.channel import RawMessage
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS, ROWS_AT_A_TIME, Ints
 from dmrl.recording.provenance import Provenance
@@ -65,7 +59,7 @@ def rewrite(
             sink.copy_extras(source)
             for name, values in (metadata or {}).items():
                 sink.add_metadata(name, values)
-            copy_messages(recording, TopicSelection(kept), sink)
+            chunk_copy.copy_messages(recording, chunk_copy.TopicSelection(kept), sink)
             sink.flush()  # new messages start at the first time again, so they get their own chunks
             for first_ns, end_ns in iter_time_slices([one.time_ns for one in series]):
                 for one in series:
@@ -112,9 +106,9 @@ def shift_times(
     OutputError
         If the output cannot be written.
     """
-    every = TopicSelection(frozenset(read_summary(recording).topics))
-    adopt_channels(recording, every.topics, sink)
-    for unit in iter_units(recording, every):
+    every = chunk_copy.TopicSelection(frozenset(read_summary(recording).topics))
+    chunk_copy.adopt_channels(recording, every.topics, sink)
+    for unit in chunk_copy.iter_units(recording, every):
         batch = unit.batch
         topics = {n: unit.channels[n].topic for n in batch.list_channel_ids()}
         converted = [number for number, topic in topics.items() if topic in converters]
@@ -123,7 +117,7 @@ def shift_times(
             rows = batch.channel == number
             shift_ns[rows] = compute_shift_ns(topics[number], batch.time_ns[rows])
         if not converted and not shift_ns.any():
-            write_unit(unit, every, sink)
+            chunk_copy.write_unit(unit, every, sink)
             continue
         shifted = replace(
             batch,

@@ -7,16 +7,10 @@ import numpy as np
 from mcap.exceptions import McapError
 from mcap.records import ChunkIndex
 
-from dmrl.recording.mcap import checksums
+from dmrl.recording.mcap import checksums, message_index
 from dmrl.recording.mcap.extra_records import read_metadata
 from dmrl.recording.mcap.file import BoundedReader
 from dmrl.recording.mcap.message_batch import MAX_TIME_NS, Ints
-from dmrl.recording.mcap.message_index import (
-    ENTRY_BYTES,
-    MESSAGE_INDEX_STRUCT,
-    check_all_listed,
-    parse_index_records,
-)
 from dmrl.recording.mcap.summary_section import SummarySection
 
 GROUP_BYTES = 1_000_000
@@ -94,12 +88,14 @@ def _parse_group(raw: bytes, chunks: Sequence[ChunkIndex]) -> tuple[Ints, Ints]:
     numbers = np.fromiter((n for one in offsets for n in one), np.int64, len(owner))
     places = (at - _get_start(c) for c in chunks for at in c.message_index_offsets.values())
     at = starts[owner] + np.fromiter(places, np.int64, len(owner))
-    entries = parse_index_records(raw, numbers, at, (starts[owner], (starts + sizes)[owner]))
-    ends = at + MESSAGE_INDEX_STRUCT.size + ENTRY_BYTES * entries.counts
+    entries = message_index.parse_index_records(
+        raw, numbers, at, (starts[owner], (starts + sizes)[owner])
+    )
+    ends = at + message_index.MESSAGE_INDEX_STRUCT.size + message_index.ENTRY_BYTES * entries.counts
     if not _fills(len(raw), at, ends):
         for chunk, start, size in zip(chunks, starts.tolist(), sizes.tolist(), strict=True):
             own = {n: at - _get_start(chunk) for n, at in chunk.message_index_offsets.items()}
-            check_all_listed(raw[start : start + size], own)
+            message_index.check_all_listed(raw[start : start + size], own)
     low = np.array([chunk.message_start_time for chunk in chunks])
     high = np.array([chunk.message_end_time for chunk in chunks])
     owner = np.repeat(owner, entries.counts)

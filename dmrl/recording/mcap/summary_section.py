@@ -27,17 +27,12 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader
 from mcap.summary import Summary as McapSummary
 
+from dmrl.recording.mcap import summary_checks
 from dmrl.recording.mcap.channel import ChannelTable, build_channels
 from dmrl.recording.mcap.file import DEFINITIONS, FOOTER_STRUCT, MAGIC, RECORD_STRUCT, BoundedReader
 from dmrl.recording.mcap.file_cache import get_cached
 from dmrl.recording.mcap.file_writer import index_attachment
 from dmrl.recording.mcap.message_batch import Ints
-from dmrl.recording.mcap.summary_checks import (
-    check_budget,
-    check_extra_counts,
-    check_statistics,
-    check_times,
-)
 
 DATA_OPCODES = {
     Opcode.HEADER,
@@ -144,12 +139,12 @@ def read_verified_section(stream: BoundedReader) -> SummarySection | None:
     summary_section, start = read_raw_section(stream)
     if summary_section is None or not _indexes_messages(summary_section):
         return None
-    check_budget(stream, summary_section)
-    check_statistics(summary_section)
-    check_times(summary_section)
+    summary_checks.check_budget(stream, summary_section)
+    summary_checks.check_statistics(summary_section)
+    summary_checks.check_times(summary_section)
     if not _lists_all_messages(stream, summary_section, start):
         return None
-    check_extra_counts(summary_section)
+    summary_checks.check_extra_counts(summary_section)
     return summary_section
 
 

@@ -21,24 +21,10 @@ from numpy.typing import NDArray
 
 from dmrl.guards import limits
 from dmrl.recording.mcap.message_batch import Bytes, Ints
+from dmrl.recording.protobuf import wire_format
 from dmrl.recording.protobuf.arrow_arrays import to_arrow
 from dmrl.recording.protobuf.equal_messages import decode_equal
-from dmrl.recording.protobuf.wire_format import (
-    DELIMITED,
-    FIXED_DTYPES,
-    MAX_DEPTH,
-    VARINT,
-    VARINT_DTYPES,
-    FieldSpans,
-    WireError,
-    concatenate_spans,
-    decode_fixed,
-    decode_integers,
-    decode_present,
-    decode_strings,
-    find_fields,
-    find_wire_type,
-)
+from dmrl.recording.protobuf.wire_format import FieldSpans, WireError
 from dmrl.terminal.progress import say_once
 
 F = FieldDescriptor
@@ -150,7 +136,7 @@ def _decode_fields(
     if alike is not None:
         return {name: to_arrow(values) for name, values in alike.items()}
     numbers = {f.number: f for f in fields.values()}
-    found = find_fields(data, start, end, set(numbers))
+    found = wire_format.find_fields(data, start, end, set(numbers))
     for number, spans in found.items():
         found[number] = _select_valid(data, numbers[number], spans)
     return {
@@ -189,7 +175,7 @@ def _count_columns(kind: Descriptor) -> float:
     def count(inner: Descriptor, depth: int) -> float:
         if inner not in counts:
             counts[inner] = float("inf")  # until its fields are counted: it would contain itself
-            if depth < MAX_DEPTH:
+            if depth < wire_format.MAX_DEPTH:
                 fields = [f.message_type for f in list_columns(inner).values()]
                 counts[inner] = sum(1 if f is None else count(f, depth + 1) for f in fields)
         return counts[inner]
@@ -228,12 +214,12 @@ def _decode_field(
 ) -> pa.Array:
     """Decode one field of all messages, in row order."""
     if field.is_repeated:
-        row = concatenate_spans(s.row for s in found)
+        row = wire_format.concatenate_spans(s.row for s in found)
         order = np.argsort(row, kind="stable")
         offsets = np.zeros(count + 1, np.int32)
         np.cumsum(np.bincount(row, minlength=count), out=offsets[1:])
-        start = concatenate_spans(s.start for s in found)[order]
-        end = concatenate_spans(s.end for s in found)[order]
+        start = wire_format.concatenate_spans(s.start for s in found)[order]
+        end = wire_format.concatenate_spans(s.end for s in found)[order]
         values = _decode_values(data, start, end, None, field)
         return pa.ListArray.from_arrays(to_arrow(offsets), values)
     # The last scalar wins, as the specification requires. Absent: an empty span.
@@ -248,8 +234,8 @@ def _decode_field(
 
 
 def _check_wire_type(field: FieldDescriptor, wire: int, *, packed: bool) -> None:
-    expected = find_wire_type(field)
-    if wire != expected and not (packed and wire == DELIMITED):
+    expected = wire_format.find_wire_type(field)
+    if wire != expected and not (packed and wire == wire_format.DELIMITED):
         raise WireError(f"{field.full_name} has wire type {wire}, not {expected}")
 
 
@@ -257,23 +243,23 @@ def _expand_packed(
     data: Bytes, field: FieldDescriptor, found: list[FieldSpans]
 ) -> list[FieldSpans]:
     """Split packed runs into spans of single values."""
-    scalar = field.type in FIXED_DTYPES or field.type in VARINT_DTYPES
+    scalar = field.type in wire_format.FIXED_DTYPES or field.type in wire_format.VARINT_DTYPES
     out = []
     for span in found:
         _check_wire_type(field, span.wire, packed=scalar)
-        if not (scalar and span.wire == DELIMITED):
+        if not (scalar and span.wire == wire_format.DELIMITED):
             out.append(span)
-        elif field.type in FIXED_DTYPES:
-            size = np.dtype(FIXED_DTYPES[field.type]).itemsize
+        elif field.type in wire_format.FIXED_DTYPES:
+            size = np.dtype(wire_format.FIXED_DTYPES[field.type]).itemsize
             if ((span.end - span.start) % size).any():
                 raise WireError(f"{field.full_name} is cut within a value")
             start, row = _expand_runs(span, size)
-            out.append(FieldSpans(row, VARINT, start, start + size))
+            out.append(FieldSpans(row, wire_format.VARINT, start, start + size))
         else:
             byte, row = _expand_runs(span, 1)
             last = data[byte] < 0x80
             first = np.concatenate([[True], last[:-1]])[: len(last)]
-            out.append(FieldSpans(row[first], VARINT, byte[first], byte[last] + 1))
+            out.append(FieldSpans(row[first], wire_format.VARINT, byte[first], byte[last] + 1))
     return out
 
 
@@ -292,16 +278,22 @@ def _decode_values(
         absent = None if present is None or present.all() else ~present
         return _decode_struct(data, start, end, field.message_type, absent)
     default = None if field.is_repeated else field.default_value
-    if field.type in FIXED_DTYPES:
-        dtype = np.dtype(FIXED_DTYPES[field.type])
+    if field.type in wire_format.FIXED_DTYPES:
+        dtype = np.dtype(wire_format.FIXED_DTYPES[field.type])
         return to_arrow(
-            decode_present(present, start, lambda at: decode_fixed(data, at, dtype), dtype, default)
+            wire_format.decode_present(
+                present, start, lambda at: wire_format.decode_fixed(data, at, dtype), dtype, default
+            )
         )
-    if field.type in VARINT_DTYPES:
-        dtype = np.dtype(VARINT_DTYPES[field.type])
+    if field.type in wire_format.VARINT_DTYPES:
+        dtype = np.dtype(wire_format.VARINT_DTYPES[field.type])
         zigzag = field.type in (F.TYPE_SINT32, F.TYPE_SINT64)
-        values = decode_present(
-            present, start, lambda at: decode_integers(data, at, dtype, zigzag), dtype, default
+        values = wire_format.decode_present(
+            present,
+            start,
+            lambda at: wire_format.decode_integers(data, at, dtype, zigzag),
+            dtype,
+            default,
         )
         return to_arrow(values)
     return _decode_texts(data, start, end, present, field)
@@ -312,12 +304,12 @@ def _decode_texts(
 ) -> pa.Array:
     kind = pa.string() if field.type == F.TYPE_STRING else pa.binary()
     try:
-        texts = decode_strings(data, start, end, kind)
+        texts = wire_format.decode_strings(data, start, end, kind)
     except UnicodeDecodeError:
         features = getattr(field, "_GetFeatures", lambda: None)()
         if getattr(features, "utf8_validation", 0) != WITHOUT_UTF8_CHECK:
             raise WireError("a text is not UTF-8") from None
-        held = decode_strings(data, start, end, pa.binary()).to_pylist()
+        held = wire_format.decode_strings(data, start, end, pa.binary()).to_pylist()
         texts = pa.array([value.decode(errors="backslashreplace") for value in held], kind)
     if present is None or not field.default_value or present.all():
         return texts

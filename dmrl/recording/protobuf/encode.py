@@ -14,12 +14,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from numpy.typing import ArrayLike, NDArray
 
 from dmrl.recording.mcap.message_batch import Bytes, Ints
-from dmrl.recording.protobuf.wire_format import (
-    DELIMITED,
-    FIXED_DTYPES,
-    VARINT_DTYPES,
-    find_wire_type,
-)
+from dmrl.recording.protobuf import wire_format
 
 ColumnValue = ArrayLike | Mapping[str, "ColumnValue"]
 """Values of a field.
@@ -105,22 +100,22 @@ def _encode_field(field: FieldDescriptor, value: ColumnValue, count: int) -> Cel
         return _encode_delimited(field, body, np.asarray(body.there.any(axis=1)))
     body, zero = _encode_scalar(field, np.broadcast_to(array, count))
     cells = _concatenate_cells(
-        [_repeat_bytes(_encode_tag(field, find_wire_type(field)), count), body], count
+        [_repeat_bytes(_encode_tag(field, wire_format.find_wire_type(field)), count), body], count
     )
     return cells._replace(there=cells.there & ~zero[:, None])
 
 
 def _encode_scalar(field: FieldDescriptor, array: NDArray[np.generic]) -> tuple[Cells, Mask]:
     """Encode the values of a field, and return which of them are its default."""
-    if field.type in FIXED_DTYPES:
-        values = np.ascontiguousarray(array, dtype=FIXED_DTYPES[field.type])
+    if field.type in wire_format.FIXED_DTYPES:
+        values = np.ascontiguousarray(array, dtype=wire_format.FIXED_DTYPES[field.type])
         data = values.view(np.uint8).reshape(len(values), -1)
         # As in protobuf, -0.0 is not the default.
         return Cells(data, np.ones(data.shape, bool)), ~np.asarray(data.any(axis=1))
-    if field.type not in VARINT_DTYPES:
+    if field.type not in wire_format.VARINT_DTYPES:
         raise TypeError(f"{field.full_name} has a type that cannot be written from columns")
     with np.errstate(invalid="ignore"):  # NaN is rejected below
-        values = array.astype(VARINT_DTYPES[field.type])
+        values = array.astype(wire_format.VARINT_DTYPES[field.type])
     if not np.array_equal(values, array):
         raise ValueError(f"{field.full_name} takes integers within its range")
     signed = values.astype(np.int64)
@@ -132,9 +127,9 @@ def _encode_scalar(field: FieldDescriptor, array: NDArray[np.generic]) -> tuple[
 
 def _encode_repeated(field: FieldDescriptor, array: NDArray[np.generic], count: int) -> Cells:
     """Encode a packed repeated field from (N, K) values."""
-    if field.type not in FIXED_DTYPES or array.ndim != 2 or len(array) != count:
+    if field.type not in wire_format.FIXED_DTYPES or array.ndim != 2 or len(array) != count:
         raise ValueError(f"{field.full_name} takes {count} rows of numbers of fixed size")
-    values = np.ascontiguousarray(array, dtype=FIXED_DTYPES[field.type])
+    values = np.ascontiguousarray(array, dtype=wire_format.FIXED_DTYPES[field.type])
     data = values.view(np.uint8).reshape(count, -1)
     return Cells(data, np.ones(data.shape, bool))
 
@@ -162,7 +157,8 @@ def _encode_delimited(field: FieldDescriptor, body: Cells, there: Mask) -> Cells
     """Put the tag and length of a field before its payloads."""
     size = _encode_varint(body.there.sum(axis=1).astype(np.uint64))
     cells = _concatenate_cells(
-        [_repeat_bytes(_encode_tag(field, DELIMITED), len(there)), size, body], len(there)
+        [_repeat_bytes(_encode_tag(field, wire_format.DELIMITED), len(there)), size, body],
+        len(there),
     )
     return cells._replace(there=cells.there & there[:, None])
 

@@ -10,14 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.deploy.c import c_name, write_c
-from dmrl.deploy.c.harness import (
-    DETECTION_DTYPE,
-    MAX_DETECTIONS,
-    HarnessResult,
-    parse_results,
-    to_detections,
-)
+from dmrl.deploy.c import c_name, harness, write_c
 from dmrl.deploy.c.run.compile_targets import Build, list_targets
 from dmrl.deploy.c.run.toolchain import find_host_compiler, run_program
 from dmrl.deploy.int8.network import IntegerNetwork
@@ -84,17 +77,19 @@ class CompiledNetwork(BuiltNetwork):
         (library,) = build.compile_program(network, self.folder, self.build)
         self._run = ctypes.CDLL(str(library)).harness_run
 
-    def run_detections(self, image: NDArray[np.uint8], most: int = MAX_DETECTIONS) -> HarnessResult:
+    def run_detections(
+        self, image: NDArray[np.uint8], most: int = harness.MAX_DETECTIONS
+    ) -> harness.HarnessResult:
         """Return grids and detections of a (height, width, channels) image."""
         network = self.network
         assert image.shape == (network.height_px, network.width_px, network.channels)
         pixels = np.ascontiguousarray(image, np.uint8)
         grids = np.empty((len(network.heads), *network.grid_shape), np.int8)
-        found = np.zeros(most, DETECTION_DTYPE)
+        found = np.zeros(most, harness.DETECTION_DTYPE)
         pointers = (ctypes.c_void_p(a.ctypes.data) for a in (pixels, grids, found))
         count = self._run(*pointers, most)
         named = dict(zip(network.heads, grids, strict=True))
-        return HarnessResult(named, to_detections(found[:count]), 0)
+        return harness.HarnessResult(named, harness.to_detections(found[:count]), 0)
 
     def run(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
         """Return every head's grid, as `run_network` of ``reference`` does."""
@@ -132,7 +127,7 @@ class EmulatedNetwork(BuiltNetwork):
     def run(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.int8]]:
         """Return every head's grid, as `run_network` of ``reference`` does."""
         said = run_program(self._program, self._what, data=np.ascontiguousarray(image).tobytes())
-        found = parse_results(self.network, said)
+        found = harness.parse_results(self.network, said)
         if len(found) != 1:
             raise ToolError(f"{self._what}: {len(found)} results for one image. Export it again")
         return found[0].grids

@@ -10,15 +10,10 @@ from numpy.typing import NDArray
 
 from dmrl.deploy.backends import to_network_input
 from dmrl.deploy.c import MAX_L1_STATE_BYTES
+from dmrl.deploy.c.run import measure
 from dmrl.deploy.c.run.compile_targets import list_targets
 from dmrl.deploy.c.run.compiled import require_c_files
-from dmrl.deploy.c.run.measure import (
-    ExecutionCost,
-    StateMemory,
-    estimate_rates,
-    measure_cost,
-    parse_state_memory,
-)
+from dmrl.deploy.c.run.measure import ExecutionCost, StateMemory
 from dmrl.deploy.c.run.verification import TargetResult, compute_expected, verify_target
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.store import load_network
@@ -91,7 +86,7 @@ class Proof:
             "instructions_per_mac": executed / network.macs if executed else None,
             "gap8_estimates": [
                 {"images_per_s": rate, "assuming": assumption}
-                for rate, assumption in estimate_rates(network, found, self.memory)
+                for rate, assumption in measure.estimate_rates(network, found, self.memory)
             ],
         }
 
@@ -107,7 +102,7 @@ class Proof:
         tried = f"{self.pictures} images and {self.noise} of noise"
         print_table(f"{folder}: the C against the integer reference, {tried}", columns, rows)
         print_table("Cost of the C", ("what", "", "how"), self._cost_rows())
-        for rate, assumption in estimate_rates(self.network, self.cost, self.memory):
+        for rate, assumption in measure.estimate_rates(self.network, self.cost, self.memory):
             print_line(f"estimated {rate:.2f} images/s on a GAP8: {assumption}")
 
     def _cost_rows(self) -> list[tuple[object, ...]]:
@@ -200,8 +195,8 @@ def prove_export(
         # C that a target could not compile or run is not worth measuring.
         ExecutionCost()
         if any(t.error for t in tried)
-        else measure_cost(network, folder, images[0]),
-        parse_state_memory(network, folder),
+        else measure.measure_cost(network, folder, images[0]),
+        measure.parse_state_memory(network, folder),
     )
 
 

@@ -7,6 +7,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Chunk, ChunkIndex
 
+from dmrl.recording.mcap import message_index
 from dmrl.recording.mcap.channel import Channel
 from dmrl.recording.mcap.chunks.chunk import (
     MESSAGE_OPCODE,
@@ -22,11 +23,6 @@ from dmrl.recording.mcap.chunks.chunk import (
 from dmrl.recording.mcap.file import BoundedReader
 from dmrl.recording.mcap.file_writer import CHUNK_STRUCT
 from dmrl.recording.mcap.message_batch import MESSAGE_PREFIX_BYTES, Bytes, MessageBatch
-from dmrl.recording.mcap.message_index import (
-    MessageIndex,
-    compute_indexes_size,
-    parse_index_entries,
-)
 from dmrl.recording.mcap.summary_section import SummarySection
 
 
@@ -85,7 +81,7 @@ def read_chunk(
 
 def read_chunk_for_copy(
     stream: BoundedReader, chunk_index: ChunkIndex, summary: SummarySection
-) -> tuple[Chunk, MessageBatch, ParsedChunk, MessageIndex | None]:
+) -> tuple[Chunk, MessageBatch, ParsedChunk, message_index.MessageIndex | None]:
     """Read a chunk for a copy: still compressed, with all its messages and message indexes.
 
     Parameters
@@ -113,10 +109,10 @@ def read_chunk_for_copy(
     records = raw[chunk_index.chunk_length :]
     after = chunk_index.chunk_start_offset + chunk_index.chunk_length
     places = {n: at - after for n, at in chunk_index.message_index_offsets.items()}
-    own_layout = all(counts.values()) and len(records) == compute_indexes_size(counts)
+    own_layout = all(counts.values()) and len(records) == message_index.compute_indexes_size(counts)
     if not own_layout or min(places.values(), default=-1) < 0:
         return chunk, batch, others, None
-    return chunk, batch, others, MessageIndex(records, places, counts)
+    return chunk, batch, others, message_index.MessageIndex(records, places, counts)
 
 
 def _load_chunk(stream: BoundedReader, chunk_index: ChunkIndex) -> tuple[bytes, Chunk, Bytes]:
@@ -158,7 +154,7 @@ def _select_by_index(
     places = {
         n: place - at for n, place in chunk_index.message_index_offsets.items() if n in channels
     }
-    entries = parse_index_entries(raw, places)
+    entries = message_index.parse_index_entries(raw, places)
     offset, channel, time_ns = entries.offset, entries.channel, entries.time_ns
     if (offset[1:] < offset[:-1]).any():  # of several channels
         order = np.argsort(offset)
