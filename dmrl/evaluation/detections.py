@@ -73,6 +73,13 @@ class LabelledDetections:
         return len(self.at)
 
 
+def join_by_image(
+    recordings: Sequence[Path], against: str, split: str | None = None, *, partial: bool = False
+) -> LabelledDetections:
+    """Join as `join_each`, and return all recordings together."""
+    return concatenate_parts(join_each(recordings, against, split, partial=partial))
+
+
 def join_each(
     recordings: Sequence[Path], against: str, split: str | None = None, *, partial: bool = False
 ) -> list[LabelledDetections]:

@@ -89,16 +89,10 @@ def _choose_gallery(pairs: LabelledDetections, threshold: float) -> list[Gallery
     mine = pairs.detections.select(pairs.detections.confidence >= threshold)
     shown = []
     for image in np.unique(places).tolist():
-        found = mine.select(mine.image == image)
-        at = pairs.at[image]
-        shown.append(
-            GalleryImage(
-                f"{at.recording.stem}, {_format_time(at)}",
-                read_image(at),
-                np.column_stack([found.u_px, found.v_px]),
-                found.depth_m,
-            )
-        )
+        found, at = mine.select(mine.image == image), pairs.at[image]
+        title = f"{at.recording.stem}, {_format_time(at)}"
+        uv_px = np.column_stack([found.u_px, found.v_px])
+        shown.append(GalleryImage(title, read_image(at), uv_px, found.depth_m))
     return shown
 
 

@@ -79,22 +79,12 @@ def _follow_peers(flight: FlightLog, robot: str, peers: list[str]) -> list[PairF
     weak, _ = _match_detections(sight, truth, shown, np.full(len(threshold), floor))
     image_s = (sight.time_ns - sight.time_ns[0]) * 1e-9
     turn = np.abs(np.gradient(sight.yaw_rad, image_s)) if len(image_s) > 1 else np.zeros(1)
-    return [
-        PairFlight(
-            robot,
-            peer,
-            (at - at[0]) * 1e-9,
-            xyz,
-            image_s,
-            np.linalg.norm(truth[j], axis=1),
-            turn,
-            shown[j],
-            right[j],
-            weak[j],
-            false,
-        )
-        for j, (peer, (at, xyz)) in enumerate(zip(peers, paths, strict=True))
-    ]
+    found = []
+    for j, (peer, (at, xyz)) in enumerate(zip(peers, paths, strict=True)):
+        distance_m = np.linalg.norm(truth[j], axis=1)
+        seen = (image_s, distance_m, turn, shown[j], right[j], weak[j], false)
+        found.append(PairFlight(robot, peer, (at - at[0]) * 1e-9, xyz, *seen))
+    return found
 
 
 def _match_detections(

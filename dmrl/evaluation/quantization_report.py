@@ -163,19 +163,18 @@ def _compare(
         say("no picture of the maps: that needs matplotlib. pip install 'dmrl[plot]'")
     else:
         _draw_maps(split, rows, outputs, folder)
+    accuracy = {}
+    for name, each in outputs.items():
+        points = decode_points(each, network.stride_px)
+        accuracy[name] = compute_accuracy(len(rows), labels, points, model.threshold)
     return QuantizationReport(
         network,
-        compute_layer_errors(quantised.graph, network, split.images(few)),
-        quantised.images,
-        split.name,
-        len(rows),
-        {
-            name: compute_accuracy(
-                len(rows), labels, decode_points(each, network.stride_px), model.threshold
-            )
-            for name, each in outputs.items()
-        },
-        compare_peaks(outputs["float"], outputs["int8"]),
+        layers=compute_layer_errors(quantised.graph, network, split.images(few)),
+        calibration_images=quantised.images,
+        split=split.name,
+        images=len(rows),
+        accuracy=accuracy,
+        argmax_kept=compare_peaks(outputs["float"], outputs["int8"]),
     )
 
 
@@ -213,11 +212,7 @@ def describe_quantization(result: QuantizationReport) -> dict[str, Any]:
     network = result.network
     return {
         "architecture": network.architecture,
-        "input": {
-            "width_px": network.width_px,
-            "height_px": network.height_px,
-            "channels": network.channels,
-        },
+        "input": {k: getattr(network, k) for k in ("width_px", "height_px", "channels")},
         "macs": network.macs,
         "calibration_images": result.calibration_images,
         "split": result.split,

@@ -92,14 +92,7 @@ class OnboardTracker:
             moved = np.hstack([np.eye(3), dt_s * np.eye(3)])
             covariance = moved @ track.state_covariance @ moved.T
             place_m = track.position_m + dt_s * track.velocity_mps - shift_m
-            found.append(
-                PeerTrack(
-                    track.number,
-                    self._names.get(track.number, ""),
-                    turn @ place_m,
-                    turn @ track.velocity_mps,
-                    turn @ covariance @ turn.T,
-                    dt_s + track.unseen_s,
-                )
-            )
+            turned = turn @ place_m, turn @ track.velocity_mps, turn @ covariance @ turn.T
+            name, age_s = self._names.get(track.number, ""), dt_s + track.unseen_s
+            found.append(PeerTrack(track.number, name, *turned, age_s))
         return tuple(found)

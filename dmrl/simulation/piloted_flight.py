@@ -137,15 +137,11 @@ class PilotedFlight:
         self._settings, self._simulation, self._writer = settings, simulation, writer
         form = find_pilot(settings.pilot)
         leader = "".join(simulation.motion.names[settings.flown : settings.flown + 1])
-        self._drones = [
-            Drone(
-                robot,
-                form(Task(robot, k, leader, settings.distance_m)),
-                eyes[k],
-                OnboardTracker(robot, simulation.reckoning[robot]),
-            )
-            for k, robot in enumerate(simulation.motion.flown)
-        ]
+        self._drones: list[Drone] = []
+        for k, robot in enumerate(simulation.motion.flown):
+            pilot = form(Task(robot, k, leader, settings.distance_m))
+            tracker = OnboardTracker(robot, simulation.reckoning[robot])
+            self._drones.append(Drone(robot, pilot, eyes[k], tracker))
         self._commands: dict[str, Command] = {}
         self._images, self._lost = 0, np.random.default_rng((settings.seed, 999))
 

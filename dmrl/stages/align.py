@@ -101,28 +101,17 @@ def _document(clocks: "dict[str, Clock]", given: Given) -> dict[str, Any]:
 
 
 def _rows(clocks: "dict[str, Clock]", _: Given) -> list[tuple[str, ...]]:
-    return [
-        (
-            name,
-            f"{c.offset_s * 1e3:.3f}",
-            f"{c.drift * 1e6:.3f}",
-            f"{c.sigma_s * 1e3:.3f}",
-            f"{c.sigma_drift * 1e6:.3f}",
-            f"{c.correlation:.3f}",
-            c.by,
-        )
-        for name, c in sorted(clocks.items())
-    ]
+    rows = []
+    for name, c in sorted(clocks.items()):
+        offset = (c.offset_s * 1e3, c.drift * 1e6)
+        numbers = (*offset, c.sigma_s * 1e3, c.sigma_drift * 1e6, c.correlation)
+        rows.append((name, *(f"{number:.3f}" for number in numbers), c.by))
+    return rows
 
 
+COLUMNS = ("clock", "offset, ms", "drift, ppm", "sigma, ms", "sigma, ppm", "correlation", "by")
 command = stage_command(
     run,
-    Closing(
-        columns=(
-            *("clock", "offset, ms", "drift, ppm", "sigma, ms", "sigma, ppm", "correlation", "by"),
-        ),
-        rows=_rows,
-        document=_document,
-    ),
+    Closing(columns=COLUMNS, rows=_rows, document=_document),
     folder="recording",
 )

@@ -10,11 +10,6 @@ from dmrl.terminal.tables import print_json, print_line, print_table
 __all__ = ["Closing", "Given"]
 
 
-def no_lines(_result: Any, _given: Given) -> Iterable[str]:
-    """Return no line."""
-    return ()
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Closing:
     """Describe how the result of a stage is printed.
@@ -41,7 +36,7 @@ class Closing:
 
     columns: Sequence[str] = ()
     rows: Callable[[Any, Given], Iterable[Sequence[Any]]] | None = None
-    lines: Callable[[Any, Given], Iterable[str]] = no_lines
+    lines: Callable[[Any, Given], Iterable[str]] = lambda _result, _given: ()
     show: Callable[[Any, Given], None] | None = None
     path_key: str = ""
     result_key: str = ""

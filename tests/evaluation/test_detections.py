@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dmrl import topics
-from dmrl.evaluation.detections import LabelledDetections, concatenate_parts, join_each
+from dmrl.evaluation.detections import LabelledDetections, join_by_image
 from dmrl.images.codec import encode_png
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message_class
 from dmrl.recording import SPLIT_METADATA, Provenance, RecordingWriter
@@ -38,7 +38,7 @@ def joined(path: Path, images: Sequence[Image], **options: Any) -> LabelledDetec
             sink.write(k, topics.LABELS("cf1"), labels)
             seen = message_class("Detections")(detections=detections, threshold=0.4)
             sink.write(k, topics.DETECTIONS("cf1"), seen)
-    return concatenate_parts(join_each([path], "truth", **options))
+    return join_by_image([path], "truth", **options)
 
 
 def test_detections_come_best_first_however_they_were_written(tmp_path: Path) -> None:

@@ -198,25 +198,13 @@ def _build_call(plan: BufferPlan, step: Step) -> KernelCall | None:
     if not isinstance(conv, Conv):
         return None
     width, kernel = source.channels, _list_kernels(plan, step)[-1]
-    taps = step.reads.taps
-    shape = {
+    taps, stride = step.reads.taps, conv.stride * width
+    shapes = {
         "depthwise_along": {"channels": width, "dilation": conv.dilation, "pad": conv.pad_value},
-        "depthwise": {
-            "across": conv.dilation * width,
-            "step": conv.stride * width,
-            "channels": width,
-        },
-    }.get(kernel.template) or {
-        "taps": taps,
-        "run": width * conv.kernel**2 // taps,
-        "step": conv.stride * width,
-        "outs": len(conv.bias),
+        "depthwise": {"across": conv.dilation * width, "step": stride, "channels": width},
     }
-    return KernelCall(
-        kernel,
-        len(step.sources) > 1,
-        plan.output_of(step).cols,
-        tuple(shape.items()),
-        conv.signed,
-        conv.shift,
-    )
+    run = width * conv.kernel**2 // taps
+    dense = {"taps": taps, "run": run, "step": stride, "outs": len(conv.bias)}
+    shape = tuple(shapes.get(kernel.template, dense).items())
+    shortcut, cols = len(step.sources) > 1, plan.output_of(step).cols
+    return KernelCall(kernel, shortcut, cols, shape, conv.signed, conv.shift)

@@ -10,7 +10,7 @@ import pytest
 from dmrl import topics
 from dmrl.errors import MissingExtra, MissingTopic
 from dmrl.evaluation.detection_report import describe_evaluation, judge_boxes, print_evaluation
-from dmrl.evaluation.detections import join_each
+from dmrl.evaluation.detections import join_by_image
 from dmrl.images.codec import encode_png
 from dmrl.learn.inference.box_precision import BoxPrecision
 from dmrl.messages import message_class
@@ -48,7 +48,7 @@ def record(path: Path, images: Images, calibrated: bool = True) -> Path:
 
 def judged(path: Path, images: Images, calibrated: bool = True) -> BoxPrecision:
     """Judge images with the (u, v, depth) of their labels and detections."""
-    return judge_boxes(*join_each([record(path, images, calibrated)], "truth"), WIDTH_M)
+    return judge_boxes(join_by_image([record(path, images, calibrated)], "truth"), WIDTH_M)
 
 
 def test_equal_boxes_have_full_precision(tmp_path: Path) -> None:

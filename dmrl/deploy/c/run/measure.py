@@ -170,20 +170,15 @@ def estimate_rates(
         memory = (
             f"no waiting for the {kept.traffic_bytes:,} bytes that are copied from L2 and to it"
         )
+    clock = f"{CLUSTER_HZ / 1e6:.0f} MHz"
     if found.instructions:
-        out.append(
-            (
-                CLUSTER_HZ / found.instructions,
-                f"this C on one of the cluster's 8 cores at {CLUSTER_HZ / 1e6:.0f} MHz, one "
-                f"rv32imc instruction a cycle, {memory}",
-            )
+        words = (
+            f"this C on one of the cluster's 8 cores at {clock}, one rv32imc instruction a cycle"
         )
-    out.append(
-        (
-            CLUSTER_HZ * KERNEL_MACS_PER_CYCLE / network.macs,
-            f"hand-written 8-bit SIMD kernels (not exported) on all 8 cores at "
-            f"{CLUSTER_HZ / 1e6:.0f} MHz, {KERNEL_MACS_PER_CYCLE} multiply-accumulates a cycle, "
-            f"{memory}",
-        )
+        out.append((CLUSTER_HZ / found.instructions, f"{words}, {memory}"))
+    words = (
+        f"hand-written 8-bit SIMD kernels (not exported) on all 8 cores at {clock}, "
+        f"{KERNEL_MACS_PER_CYCLE} multiply-accumulates a cycle"
     )
+    out.append((CLUSTER_HZ * KERNEL_MACS_PER_CYCLE / network.macs, f"{words}, {memory}"))
     return out

@@ -187,17 +187,11 @@ def prove_export(
     wanted = compute_expected(network, list(track(images, "Computing the reference")))
     chosen = [target for target in list_targets() if target.name in names]
     tried = [verify_target(network, folder, t, wanted) for t in track(chosen, "Proving the C")]
-    return Proof(
-        network,
-        len(pictures),
-        noise_images,
-        tried,
-        # C that a target could not compile or run is not worth measuring.
-        ExecutionCost()
-        if any(t.error for t in tried)
-        else measure.measure_cost(network, folder, images[0]),
-        measure.parse_state_memory(network, folder),
-    )
+    # C that a target could not compile or run is not worth measuring.
+    broken = any(t.error for t in tried)
+    cost = ExecutionCost() if broken else measure.measure_cost(network, folder, images[0])
+    memory = measure.parse_state_memory(network, folder)
+    return Proof(network, len(pictures), noise_images, tried, cost, memory)
 
 
 def require_proof(folder: Path, result: Proof, *, all_targets: bool) -> None:
