@@ -43,6 +43,8 @@ class TimeSeries:
 
     def interpolate(self, time_ns: Times) -> Array:
         """Interpolate (M, C) values at other times: linear, constant before and after."""
+        if np.array_equal(time_ns, self.time_ns):
+            return self.values  # also where rows share a time
         return np.stack([np.interp(time_ns, self.time_ns, v) for v in self.values.T], axis=1)
 
 

@@ -65,9 +65,12 @@ def compute_yaw_rate(blocks: Sequence[LogBlock], attitude: TimeSeries) -> Array:
         alone = find_series(blocks, [name])
         if alone is not None:
             return np.asarray(alone.interpolate(attitude.time_ns)[:, 0] * unit)
-    time_s = (attitude.time_ns - attitude.time_ns[0]) * 1e-9
-    usable = len(yaw) > 1 and (np.diff(time_s) > 0).all()
-    return np.asarray(np.gradient(yaw, time_s) if usable else 0 * yaw)
+    # Rows may share a time, between which there is no slope.
+    time_ns, first = np.unique(attitude.time_ns, return_index=True)
+    if len(time_ns) < 2:
+        return 0 * yaw
+    slope = np.gradient(yaw[first], (time_ns - time_ns[0]) * 1e-9)
+    return np.interp(attitude.time_ns, time_ns, slope)
 
 
 def find_in_metres(blocks: Sequence[LogBlock], names: str) -> TimeSeries | None:

@@ -30,6 +30,20 @@ def test_the_slope_of_a_yaw_needs_times_that_go_on(step_ns: int) -> None:
     assert found == pytest.approx(2.0 if step_ns else 0.0)
 
 
+def test_rows_that_share_a_time_keep_their_angles_and_the_slope_of_the_yaw() -> None:
+    degrees = np.arange(6.0)
+    shared = LogBlock(
+        "a",
+        np.array([0, 1, 1, 3, 4, 5]) * MS,
+        {f"stabilizer.{name}": degrees for name in ("roll", "pitch", "yaw")},
+    )
+    attitude = find_attitude([shared])
+    assert attitude is not None
+    np.testing.assert_allclose(np.degrees(attitude.values), np.outer(degrees, [1, -1, 1]))
+    rate = np.degrees(compute_yaw_rate([], attitude)) * 1e-3
+    np.testing.assert_allclose(rate, [1, 1, 1, 1, 1, 1], atol=0.2)
+
+
 @given(ANGLE, ANGLE, ANGLE)
 def test_angles_that_were_logged_are_the_turn_of_a_pose(
     roll: float, pitch: float, yaw: float
