@@ -138,7 +138,8 @@ def iter_samples(
         line, bag_ns = lines[message.topic, message.kind], message.bag_ns
         odometry = line.robot in moving
         where = MessageContext(
-            source, line.robot, line.peer, line.captured, odometry, options.bits, scaled
+            *(source, line.robot, line.peer, line.captured, line.rectified),
+            *(odometry, options.bits, scaled),
         )
         # Without a time in the header, the bag's own time is the best estimate.
         stamp_ns = header_time_ns(message.decoded)

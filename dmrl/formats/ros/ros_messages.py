@@ -41,6 +41,8 @@ class MessageContext:
         Robot of the message, and the peer that it ranges to.
     captured
         The message comes from motion capture.
+    rectified
+        The robot's images are rectified.
     odometry
         The robot has odometry, which replaces other messages.
     bits
@@ -53,6 +55,7 @@ class MessageContext:
     robot: str
     peer: str = ""
     captured: bool = False
+    rectified: bool = False
     odometry: bool = False
     bits: int = codec.BITS
     scaled: set[str] = field(default_factory=set)
@@ -122,15 +125,36 @@ def _convert_camera_info(message: Any, time_ns: int, where: MessageContext) -> I
         return
     k[[2, 5]] += HALF_PX
     p[[2, 6]] += HALF_PX
+    width, height = _crop_and_bin(message, k.reshape(3, 3), p.reshape(3, 4))
+    model = message.distortion_model
+    if where.rectified and p[0] > 0:
+        k, d, r, model = p.reshape(3, 4)[:, :3].ravel(), np.zeros(0), np.eye(3).ravel(), ""
     fields = {
         "timestamp": to_timestamp(time_ns),
         "frame_id": f"{where.robot}/optical",
-        "width": message.width,
-        "height": message.height,
-        "distortion_model": message.distortion_model,
+        "width": width,
+        "height": height,
+        "distortion_model": model,
         **{name: value.tolist() for name, value in zip("DKRP", (d, k, r, p), strict=True)},
     }
     yield Sample(time_ns, topics.CALIBRATION(where.robot), "CameraCalibration", fields)
+
+
+def _crop_and_bin(message: Any, *matrices: Array) -> tuple[int, int]:
+    """Change the sensor's matrices to those of its images; return their width and height.
+
+    A CameraInfo is of the whole sensor: ``roi`` and then ``binning`` say what images have of it.
+    """
+    roi = getattr(message, "roi", None)
+    corner = (roi.x_offset, roi.y_offset) if roi else (0, 0)
+    width, height = (
+        getattr(roi, side, 0) or getattr(message, side) for side in ("width", "height")
+    )
+    bins = [max(getattr(message, f"binning_{axis}", 1), 1) for axis in "xy"]
+    for matrix in matrices:
+        matrix[:2, 2] -= corner
+        matrix[:2] /= np.array(bins)[:, None]
+    return width // bins[0], height // bins[1]
 
 
 def _to_array(vector: Any) -> Array:
@@ -218,6 +242,12 @@ def _convert_odometry(message: Any, time_ns: int, where: MessageContext) -> Iter
 def _convert_imu(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
     if where.odometry:
         return
+    for what in ("orientation", "angular_velocity"):
+        # By sensor_msgs/Imu, a covariance that begins with -1 marks what was not measured.
+        if getattr(message, f"{what}_covariance", [0.0])[0] == -1:
+            reason = f"IMU messages of {where.robot} without {what.replace('_', ' ')}"
+            leave_out(reason, f"{where.source} at {time_ns} ns")
+            return
     angles = _find_angles(message.orientation, where, time_ns)
     if angles is not None:
         yaw_rate = _compute_yaw_rate(_to_array(message.angular_velocity), angles)
@@ -244,11 +274,15 @@ def _convert_pose(message: Any, time_ns: int, where: MessageContext) -> Iterator
 def _convert_range(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
     value = float(message.range)
     topic = topics.RANGE(where.robot, where.peer)
-    if 0 < value < MAX_RANGE_M:
-        yield Sample(time_ns, topic, "UwbRange", {"range_m": value})
-    else:
+    low, high = (getattr(message, name, 0.0) for name in ("min_range", "max_range"))
+    if not 0 < value < MAX_RANGE_M:
         reason = f"ranges of {topic} that are not over 0 and under {MAX_RANGE_M:.0f} m"
         leave_out(reason, f"{where.source} at {time_ns} ns")
+    elif low < high and not low <= value <= high:
+        reason = f"ranges of {topic} outside their own min_range and max_range"
+        leave_out(reason, f"{where.source} at {time_ns} ns")
+    else:
+        yield Sample(time_ns, topic, "UwbRange", {"range_m": value})
 
 
 def _convert_transforms(message: Any, time_ns: int, _where: MessageContext) -> Iterator[Sample]:

@@ -8,7 +8,7 @@ share, then the first. ``Options.names`` decides by part or by topic.
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from dmrl import topics
 from dmrl.errors import SettingError
@@ -58,11 +58,16 @@ UWB_PART = re.compile(
     r"uwb\w*|dwm?\d+\w*|lps|loco\w*|p2p|peers?|link_?track|nooploop", re.IGNORECASE
 )
 """Parts that say that a range is one between radios."""
+RECTIFIED_PART = re.compile(r"(image_)?rect(_\w+|ified\w*)?", re.IGNORECASE)
+"""Parts that say that the lens was removed from images, as ``image_proc`` does."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicPlan:
-    """Conversion of one topic: its type, message count, robot, peer; ``captured``: a true pose."""
+    """Conversion of one topic: its type, message count, robot, peer.
+
+    ``captured``: a true pose. ``rectified``: a calibration of rectified images.
+    """
 
     topic: str
     kind: str
@@ -70,6 +75,7 @@ class TopicPlan:
     robot: str
     peer: str = ""
     captured: bool = False
+    rectified: bool = False
 
     @property
     def key(self) -> tuple[str, str]:
@@ -127,7 +133,21 @@ def plan_topics(
             robot = names.find_robot(topic)
             lines[topic, kind] = TopicPlan(topic, kind, count, robot, captured=captured)
     removed = _remove_depths_and_doubles(lines, options, is_camera)
-    return lines, why | removed
+    return _mark_rectified(lines), why | removed
+
+
+def _mark_rectified(
+    lines: Mapping[tuple[str, str], TopicPlan],
+) -> dict[tuple[str, str], TopicPlan]:
+    """Mark the calibrations of robots whose images are rectified, by the names of their topics."""
+    images = {line.robot: line.topic for line in lines.values() if line.kind in IMAGE_TYPES}
+    found = dict(lines)
+    for line in lines.values():
+        topic = images.get(line.robot, "")
+        if line.kind == CAMERA_INFO and any(map(RECTIFIED_PART.fullmatch, topic.split("/"))):
+            say(f"{topic} is rectified by its name: the calibration is P of {line.topic}")
+            found[line.key] = replace(line, rectified=True)
+    return found
 
 
 def _check_names(held: Held, options: Options) -> None:
@@ -187,7 +207,8 @@ def _find_doubles(
             camera = cameras.get(line.robot, "").split("/")
             shared = sum(map(str.__eq__, camera, line.topic.split("/")))
             return unnamed, -shared, -line.count
-        return unnamed, line.kind == POSE, -line.count
+        # By REP 145, imu/data_raw has no orientation, which imu/data has.
+        return unnamed, line.kind == POSE, line.topic.endswith("_raw"), -line.count
 
     for key in sorted(groups, key=lambda one: one[0] == CAMERA_INFO):  # after the images
         found = groups[key]

@@ -26,6 +26,8 @@ from dmrl.images.codec import decode, encode_jpeg, encode_png
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import count_left_out
 
+from .ros_writer import camera_info
+
 QUARTER = np.pi / 2
 
 
@@ -147,6 +149,26 @@ def test_ranges_are_over_0_and_under_60_m(range_m: float, count: int) -> None:
     ] * count
 
 
+@pytest.mark.parametrize(("limits", "count"), [((0.0, 0.0), 1), ((0.2, 1.0), 1), ((0.2, 0.9), 0)])
+def test_ranges_outside_their_own_limits_are_left_out(
+    limits: tuple[float, float], count: int
+) -> None:
+    told = SimpleNamespace(range=1.0, min_range=limits[0], max_range=limits[1])
+    assert len(given("sensor_msgs/msg/Range", told, peer="cf2")) == count
+
+
+@pytest.mark.parametrize("what", ["orientation", "angular_velocity"])
+def test_what_an_imu_does_not_measure_is_no_attitude(
+    what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    level = {"orientation": xyzw(0.0, 0.0, 0.0, 1.0), "angular_velocity": xyzw(0.0, 0.0, 0.0)}
+    for first, count in ((0.0, 1), (-1.0, 0)):
+        covariance = {f"{what}_covariance": np.array([first, *[0.0] * 8])}
+        imu = SimpleNamespace(**level, **covariance)
+        assert len(given("sensor_msgs/msg/Imu", imu)) == count
+    assert f"IMU messages of cf1 without {what.replace('_', ' ')}: 1" in capsys.readouterr().err
+
+
 def test_motion_capture_s_poses_are_true() -> None:
     held = SimpleNamespace(pose=SimpleNamespace(position=xyzw(1, 2, 3), orientation=TURN))
     kind = "geometry_msgs/msg/PoseStamped"
@@ -170,6 +192,22 @@ def test_a_camera_s_centre_moves_by_half_a_pixel(names: str) -> None:
     assert (found.fields["width"], found.fields["height"]) == (64, 48)
     assert found.fields["timestamp"] == {"seconds": 1, "nanos": 500_000_000}
     assert k[2] == 2  # what was given stays as it was
+
+
+@pytest.mark.parametrize(("rectified", "fx", "cx"), [(False, 200, 90), (True, 180, 91.5)])
+def test_a_calibration_is_of_the_part_the_binning_and_the_rectification_of_its_images(
+    fx: float, cx: float, *, rectified: bool
+) -> None:
+    told = camera_info(1_500_000_000, 400.0)
+    told.k[:] = [400, 0, 279.5, 0, 400, 239.5, 0, 0, 1]
+    told.p[:] = [360, 0, 282.5, 0, 0, 360, 239.5, 0, 0, 0, 1, 0]
+    told.width, told.height, told.binning_x, told.binning_y = 640, 480, 2, 2
+    told.d = np.array([0.1, 0.0, 0.0, 0.0, 0.0])
+    told.roi.x_offset, told.roi.y_offset, told.roi.width, told.roi.height = 100, 40, 400, 300
+    (found,) = given("sensor_msgs/msg/CameraInfo", told, rectified=rectified)
+    assert (found.fields["width"], found.fields["height"]) == (200, 150)
+    assert found.fields["K"] == [fx, 0, cx, 0, fx, 100, 0, 0, 1]
+    assert found.fields["D"] == ([] if rectified else [0.1, 0, 0, 0, 0])
 
 
 def frames(*stamps: tuple[int, int]) -> SimpleNamespace:

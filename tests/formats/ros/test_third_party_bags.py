@@ -232,6 +232,36 @@ def test_calibration_belongs_to_the_camera_of_the_kept_images(tmp_path: Path) ->
     assert calibration.fields["K"][0] == 55.0
 
 
+@pytest.mark.parametrize(
+    ("name", "rectified"), [("image_rect_color", True), ("image_raw", False), ("rectangle", False)]
+)
+def test_rectified_images_have_the_calibration_without_the_lens(
+    tmp_path: Path, name: str, *, rectified: bool
+) -> None:
+    told = ros.camera_info(times()[0], 55.0)
+    told.p[[0, 5]] = 44.0
+    sent = [*images(f"/cf1/camera/{name}"), Sent("/cf1/camera/camera_info", times()[0], told)]
+    found, _ = read(ros.write(tmp_path / "bag", sent))
+    (calibration,) = found["/cf1/camera/calibration"]
+    assert calibration.fields["K"][0] == (44.0 if rectified else 55.0)
+
+
+def test_an_imu_with_an_orientation_comes_before_a_longer_raw_one(tmp_path: Path) -> None:
+    sent = []
+    for name, count, first in (("data_raw", 9, -1.0), ("data", 4, 0.0)):
+        for t in times(count):
+            held = ros.odometry(t)
+            turn, rate = held.pose.pose.orientation, held.twist.twist.angular
+            told = ros.TYPES["sensor_msgs/msg/Imu"](
+                *(held.header, turn, np.array([first, *[0.0] * 8])),
+                *(rate, np.zeros(9), rate, np.zeros(9)),
+            )
+            sent.append(Sent(f"/cf1/imu/{name}", t, told))
+    found, left = read(ros.write(tmp_path / "bag", sent))
+    assert len(found["/cf1/attitude"]) == 4
+    assert list(left.values()) == [9]
+
+
 def test_messages_that_cannot_be_decoded_spare_the_others(tmp_path: Path) -> None:
     sent = odometry("/cf1/odom")
     kind = "nav_msgs/msg/Odometry"
