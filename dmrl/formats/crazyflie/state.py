@@ -68,9 +68,9 @@ def compute_yaw_rate(blocks: Sequence[LogBlock], attitude: TimeSeries) -> Array:
     # Rows may share a time, between which there is no slope.
     time_ns, first = np.unique(attitude.time_ns, return_index=True)
     if len(time_ns) < 2:
-        return 0 * yaw
+        return np.asarray(0 * yaw)
     slope = np.gradient(yaw[first], (time_ns - time_ns[0]) * 1e-9)
-    return np.interp(attitude.time_ns, time_ns, slope)
+    return np.asarray(np.interp(attitude.time_ns, time_ns, slope))
 
 
 def find_in_metres(blocks: Sequence[LogBlock], names: str) -> TimeSeries | None:
