@@ -1,9 +1,9 @@
 """A folder of images, with labels in a CSV file if there is one; or a single image.
 
 Images: files of ``IMAGE_SUFFIXES``, in the natural order of their names: img2 before img10. If
-every name is a number of 12 digits or more, the numbers are times in nanoseconds; if every name
-is a number like ``SECONDS``, in seconds; otherwise the images get nominal times, evenly spaced
-from 0.
+every name is a number of 12 digits or more, the numbers are times in nanoseconds, or in the unit
+of ``UNITS_NS`` in which a camera can be that fast; if every name is a number like ``SECONDS``, in
+seconds; otherwise the images get nominal times, evenly spaced from 0.
 
 Labels: ``labels.csv`` in the folder, or another file. It has one row per peer and image; a row
 with an empty peer means that no peer is in view. An image without a row is not labelled.
@@ -23,11 +23,12 @@ unless 324x244 is requested.
 """
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 from dmrl.errors import SourceError
 from dmrl.formats.aideck import published_firmware
@@ -57,6 +58,9 @@ MIN_TIME_DIGITS = 12  # fewer would be under 17 minutes after 1970: a counter, n
 SECONDS = re.compile(r"[0-9]+\.[0-9]+|1[0-9]{9}")
 """Names that are seconds: with a decimal point, or whole ones of the years 2001 to 2033."""
 NS_PER_S = 1_000_000_000
+UNITS_NS = {"nanoseconds": 1, "microseconds": 1000, "milliseconds": 1_000_000}
+MIN_PERIOD_NS = 2_000_000
+"""Least period of a camera. Names that are nearer to each other are times of a larger unit."""
 MAX_TIME_NS = 2**63 - 1
 
 
@@ -100,7 +104,8 @@ def load_content(source: Path, options: Options) -> Content:
     if options.camera is None and own.is_file():
         options = replace(options, camera=read_camera(own))
     pictures = list_images(source, options.rate_hz)
-    if all(len(picture.stem) >= MIN_TIME_DIGITS for _, picture in pictures):
+    nominal = _list_nominal_times(len(pictures), options.rate_hz)
+    if [time_ns for time_ns, _ in pictures] != nominal:
         options.refuse("rate_hz", f"has no effect: the pictures of {source} are named by times")
     path = options.labels or source / LABELS_FILE
     known = {picture.name for _, picture in pictures}
@@ -135,31 +140,47 @@ def list_images(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
         raise SourceError(
             f"no image ({', '.join(IMAGE_SUFFIXES)}) in {source}. Pass another folder"
         )
-    if seconds := all(SECONDS.fullmatch(path.stem) for path in paths):
-        say(f"{source}: the names of the pictures are taken for times in seconds")
-    timed = [path for path in paths if _parse_time_ns(path, seconds=seconds) is not None]
-    if not timed:
-        return [(round(k * NS_PER_S / rate_hz), path) for k, path in enumerate(paths)]
-    if odd := sorted(set(paths) - set(timed)):
-        raise SourceError(
-            f"{odd[0]} is not named by its time in nanoseconds as {timed[0].name} is. "
-            "Rename it, or move it out of the folder"
-        )
-    moments = sorted((_parse_time_ns(path, seconds=seconds) or 0, path) for path in paths)
+    if not (unit_ns := _find_unit_ns(source, paths)):
+        return list(zip(_list_nominal_times(len(paths), rate_hz), paths, strict=True))
+    moments = sorted((_parse_time_ns(path, unit_ns), path) for path in paths)
     for (time_ns, path), (next_ns, following) in pairwise(moments):
         if time_ns == next_ns:
             raise SourceError(f"{path} and {following.name} have the same time. Remove one")
     return moments
 
 
-def _parse_time_ns(path: Path, *, seconds: bool = False) -> int | None:
-    """Return the time that a name states: nanoseconds of 12 digits or more, or seconds."""
-    if seconds:
-        time_ns = int(Decimal(path.stem) * NS_PER_S)
-    elif path.stem.isdecimal() and len(path.stem) >= MIN_TIME_DIGITS:
-        time_ns = int(path.stem)
-    else:
-        return None
+def _list_nominal_times(count: int, rate_hz: float) -> list[int]:
+    return [round(k * NS_PER_S / rate_hz) for k in range(count)]
+
+
+def _find_unit_ns(source: Path, paths: Sequence[Path]) -> int:
+    """Return the unit of the times that the names state, nanoseconds; 0: they are no times.
+
+    Raises
+    ------
+    SourceError
+        If only some of the names are times.
+    """
+    if all(SECONDS.fullmatch(path.stem) for path in paths):
+        say(f"{source}: the names of the pictures are taken for times in seconds")
+        return NS_PER_S
+    timed = [p for p in paths if p.stem.isdecimal() and len(p.stem) >= MIN_TIME_DIGITS]
+    if timed and (odd := sorted(set(paths) - set(timed))):
+        raise SourceError(
+            f"{odd[0]} is not named by its time in nanoseconds as {timed[0].name} is. "
+            "Rename it, or move it out of the folder"
+        )
+    steps = [after - before for before, after in pairwise(sorted(int(p.stem) for p in timed))]
+    period = median(steps) if any(steps) else MIN_PERIOD_NS
+    units = [unit for unit, size_ns in UNITS_NS.items() if period * size_ns >= MIN_PERIOD_NS]
+    if timed and units != [*UNITS_NS]:
+        taken = f"for times in {units[0]}" if units else "for numbers, too near for times"
+        say(f"{source}: the names of the pictures are taken {taken}")
+    return UNITS_NS[units[0]] if timed and units else 0
+
+
+def _parse_time_ns(path: Path, unit_ns: int) -> int:
+    time_ns = int(Decimal(path.stem) * unit_ns)
     if time_ns > MAX_TIME_NS:
         raise SourceError(f"{path}: time after the year 2262. Name it by nanoseconds since 1970")
     return time_ns

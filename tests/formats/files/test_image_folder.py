@@ -302,23 +302,6 @@ def test_missing_camera_is_reported_only_if_labels_depend_on_it(
     assert ("gives no labels without a camera" in capsys.readouterr().err) == bool(said)
 
 
-def test_names_beyond_64_bits_are_not_times(tmp_path: Path) -> None:
-    (tmp_path / f"{2**63 - 1}.png").write_bytes(b"")
-    (tmp_path / "000000000007.png").write_bytes(b"")
-    found = image_folder.list_images(tmp_path, 10.0)
-    assert [time_ns for time_ns, _ in found] == [7, 2**63 - 1]
-    (tmp_path / f"{2**63}.png").write_bytes(b"")
-    with pytest.raises(SourceError, match="time after the year 2262"):
-        image_folder.list_images(tmp_path, 10.0)
-
-
-@pytest.mark.parametrize(("digits", "timed"), [(11, False), (12, True)])
-def test_a_time_has_twelve_digits(digits: int, timed: bool, tmp_path: Path) -> None:
-    (tmp_path / f"{5:0{digits}}.png").write_bytes(b"")
-    ((time_ns, _),) = image_folder.list_images(tmp_path, 10.0)
-    assert time_ns == (5 if timed else 0)
-
-
 @pytest.mark.parametrize("size", [(3, 8), (8, 3), (4, 4)])
 def test_raw_pictures_are_of_four_by_four_pixels_at_least(
     size: tuple[int, int], tmp_path: Path

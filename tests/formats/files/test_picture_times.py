@@ -1,0 +1,68 @@
+"""Times of pictures by their names."""
+
+from pathlib import Path
+
+import pytest
+
+from dmrl.errors import SettingError, SourceError
+from dmrl.formats.base import Options
+from dmrl.formats.files import image_folder
+
+
+def test_names_beyond_64_bits_are_not_times(tmp_path: Path) -> None:
+    (tmp_path / f"{2**63 - 1}.png").write_bytes(b"")
+    (tmp_path / "000000000007.png").write_bytes(b"")
+    found = image_folder.list_images(tmp_path, 10.0)
+    assert [time_ns for time_ns, _ in found] == [7, 2**63 - 1]
+    (tmp_path / f"{2**63}.png").write_bytes(b"")
+    with pytest.raises(SourceError, match="time after the year 2262"):
+        image_folder.list_images(tmp_path, 10.0)
+
+
+@pytest.mark.parametrize(("digits", "timed"), [(11, False), (12, True)])
+def test_a_time_has_twelve_digits(digits: int, timed: bool, tmp_path: Path) -> None:
+    (tmp_path / f"{5:0{digits}}.png").write_bytes(b"")
+    ((time_ns, _),) = image_folder.list_images(tmp_path, 10.0)
+    assert time_ns == (5 if timed else 0)
+
+
+@pytest.mark.parametrize(
+    ("names", "times", "said"),
+    [
+        (("1700000000123", "1700000000156"), (1_700_000_000_123_000_000, 33_000_000), "milli"),
+        (
+            ("1700000000123456", "1700000000156789"),
+            (1_700_000_000_123_456_000, 33_333_000),
+            "micro",
+        ),
+        (
+            ("1700000000123456789", "1700000000126456789"),
+            (1_700_000_000_123_456_789, 3_000_000),
+            "",
+        ),
+        (("000000000001", "000000000002"), (0, 100_000_000), "numbers, too near for times"),
+    ],
+)
+def test_numbers_are_times_in_a_unit_in_which_a_camera_can_be_that_fast(
+    names: tuple[str, ...],
+    times: tuple[int, int],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name in names:
+        (tmp_path / f"{name}.png").write_bytes(b"")
+    (first, _), (second, _) = image_folder.list_images(tmp_path, 10.0)
+    assert (first, second - first) == times
+    assert said in capsys.readouterr().err
+
+
+def test_a_rate_has_an_effect_unless_names_are_times(folder: Path) -> None:
+    for path in sorted(folder.glob("[abc].*")):
+        path.rename(folder / f"frame_{path.stem:0>9}{path.suffix}")
+    found = image_folder.load_content(folder, Options(rate_hz=20)).samples
+    assert [s.time_ns for s in found if s.message == "CompressedImage"][1] == 50_000_000
+    for k, path in enumerate(sorted(folder.glob("frame_*"))):
+        path.rename(folder / f"{k}.5{path.suffix}")
+    with pytest.raises(SettingError, match="are named by times"):
+        image_folder.load_content(folder, Options(rate_hz=20))
