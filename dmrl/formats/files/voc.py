@@ -5,7 +5,7 @@
 ``ImageSets/Main/train.txt``, ``val.txt`` or ``test.txt``, else that of its folder.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -57,19 +57,42 @@ def load_content(source: Path, options: Options) -> Content:
     SourceError
         If no XML file can be read, or there is no picture.
     """
-    labels = {path.stem: path for path in sorted(_iter_annotation_files(source), key=natural_key)}
+    paths, files = list_pictures(source), sorted(_iter_annotation_files(source), key=natural_key)
+    labels = _match_labels(paths, files)
     splits = _read_image_sets(source)
     pictures = []
-    for path in list_pictures(source):
-        label = labels.get(path.stem)
+    for path in paths:
+        label = labels.get(path)
         split = splits.get(path.stem) or find_split(path.relative_to(source), {})
         rows, size = (None, None) if label is None else _read_rows(label, path, options)
         pictures.append(LabelledPicture(path, split, rows, size))
     if not any(picture.rows is not None for picture in pictures):
         raise SourceError(f"{source}: no picture has an XML file that can be read. Pass another")
-    for lost in sorted(labels.keys() - {picture.path.stem for picture in pictures}):
-        leave_out("XML files without a picture", labels[lost])
+    for lost in sorted({*files} - {*labels.values()}):
+        leave_out("XML files without a picture", lost)
     return build_set_content(source, pictures, options)
+
+
+def _match_labels(paths: Sequence[Path], files: Sequence[Path]) -> dict[Path, Path]:
+    """Return the XML file of each picture: of the same name, and in folders of the same names.
+
+    An XML file that is nearer to another picture of the name, such as that of another split, is not
+    the picture's.
+    """
+
+    def count_shared(one: Path, other: Path) -> int:
+        return len({*one.parent.parts} & {*other.parent.parts})
+
+    named: dict[str, tuple[list[Path], list[Path]]] = {}
+    for k, path in ((k, path) for k, held in enumerate((paths, files)) for path in held):
+        named.setdefault(path.stem, ([], []))[k].append(path)
+    found = {}
+    for twins, labels in named.values():
+        for path in twins if labels else ():
+            label = max(labels, key=lambda one: count_shared(one, path))
+            if count_shared(label, path) == max(count_shared(label, one) for one in twins):
+                found[path] = label
+    return found
 
 
 def _read_image_sets(source: Path) -> dict[str, str]:

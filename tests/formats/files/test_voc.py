@@ -77,3 +77,14 @@ def test_an_xml_file_that_is_broken_leaves_its_picture(text: str, tmp_path: Path
     check(samples, [2], apart_px=1)
     unreadable = "XML files that are not VOC's; their pictures have no labels"
     assert counted.counts == {unreadable: 1, "XML files without a picture": 1}
+
+
+def test_pictures_of_one_name_have_the_labels_of_their_own_folders(tmp_path: Path) -> None:
+    for k, (pictures, labels) in enumerate((("P/x", "Annotations/x"), ("P/y", "Annotations/y"))):
+        write_picture(tmp_path / pictures / "1.png", k)
+        (tmp_path / labels).mkdir(parents=True)
+        (tmp_path / labels / "1.xml").write_text(voc(boxes_of(k)))
+    write_picture(tmp_path / "P/z" / "1.png", 2)  # it has no label
+    samples = read(tmp_path, "voc")
+    assert sum(s.message == "CompressedImage" for s in samples) == 3
+    check(samples, [0, 1], apart_px=1)
