@@ -101,7 +101,8 @@ def read_block(path: Path) -> LogBlock:
     if time_ms is None or not len(known):
         raise SourceError(f"{path}: no number in {TIME_COLUMN}. Pass another file")
     leave_out("rows without a time", path, len(time_ms) - len(known))
-    time_ns = unwrap(time_ms[known], TIMESTAMP_BITS) * NS_PER_MS
+    parts_ms, whole_ms = np.modf(time_ms[known])
+    time_ns = unwrap(whole_ms, TIMESTAMP_BITS) * NS_PER_MS + np.rint(parts_ms * 1e6).astype(int)
     found = settle_times(time_ns, lambda row: text.name_row(int(known[row])))
     rows = known[found.rows]
     columns = {

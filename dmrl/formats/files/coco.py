@@ -181,8 +181,8 @@ def _add_attributes(row: LabelRow, annotation: Record) -> LabelRow:
     depth_m = number("depth_m", 0.0)
     return replace(
         row,
-        peer=str(told.get("peer", row.peer)),
-        source=str(told.get("source", row.source)),
+        peer=str(told.get("peer") or row.peer),
+        source=str(told.get("source") or row.source),
         u_px=number("u_px", row.u_px),
         v_px=number("v_px", row.v_px),
         depth_m=depth_m,

@@ -232,3 +232,11 @@ def test_a_client_that_logged_two_flights_is_refused_with_the_line(tmp_path: Pat
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(SourceError, match=r"a\.csv:302: time goes back from 7\.99 s to 0 s"):
         cfclient.read_block(tmp_path / "a.csv")
+
+
+def test_parts_of_a_millisecond_are_kept(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(
+        "Timestamp,stateEstimate.z\n16777215.75,0.5\n2.25,0.6\n10.5,0.7\n"
+    )
+    times = [s.time_ns for s in samples(tmp_path)["/cf1/height"]]
+    assert np.diff(times).tolist() == [2_500_000, 8_250_000]

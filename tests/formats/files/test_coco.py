@@ -119,3 +119,12 @@ def test_labels_of_ids_that_fit_no_picture_or_two_are_left_out(tmp_path: Path) -
         "boxes of no picture in the file": len(boxes_of(2)),
         "labels of pictures that share an id": 2,
     }
+
+
+def test_an_empty_peer_in_the_attributes_is_that_of_the_category(tmp_path: Path) -> None:
+    document = coco("", [1], "")
+    for annotation in document["annotations"]:
+        annotation["attributes"] = {"peer": "", "source": None}
+    (tmp_path / "a.json").write_text(json.dumps(document))
+    write_picture(tmp_path / "1.png", 1)
+    check(list(find_format(tmp_path).content(tmp_path, Options()).samples), [1])
