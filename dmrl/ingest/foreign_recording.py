@@ -136,11 +136,10 @@ def _iter_samples(
 
     def messages(topics: Collection[str]) -> Generator[BagMessage | Sample]:
         for raw in read_topics(source, topics):
-            if raw.topic in own:
-                message = parse(raw, source)
+            if raw.topic in own and (message := parse(raw, source)) is not None:
                 fields = _to_fields(message, options.names)
                 yield Sample(raw.time_ns, own[raw.topic], _to_type(message), fields, raw.publish_ns)
-            elif (held := _decode(raw, source)) is not None:
+            elif raw.topic in lines and (held := _decode(raw, source)) is not None:
                 kind = lines[raw.topic].kind
                 yield BagMessage(raw.topic, kind, raw.time_ns, held, raw.publish_ns)
             elif topics is not lines:  # those are read again
@@ -163,7 +162,7 @@ def parse(raw: RawMessage, source: Path) -> Any:
         if raw.channel.encoding in ROS_ENCODINGS:
             return _build_decoder(raw.channel)(raw.data, _to_kind(raw.channel))
         return GetMessageClass(find_channel_descriptor(source, raw.channel)).FromString(raw.data)
-    except (ValueError, DecodeError):
+    except (ValueError, DecodeError, RecordingError):  # a schema may lack the message
         return None
 
 

@@ -13,6 +13,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer as PlainWriter
+from mcap_protobuf.schema import build_file_descriptor_set
 from mcap_protobuf.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -106,6 +107,32 @@ def test_unusable_topics_are_reported(tmp_path: Path) -> None:
         f"{UNDECODABLE}, of format 'h264'": 3,
         "samples of /b/pose with values that are not finite": 3,
         "orientations of c that are no unit quaternion": 3,
+    }
+
+
+def test_messages_and_schemas_that_cannot_be_used_spare_the_others(tmp_path: Path) -> None:
+    height = message_class("Height")
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        writer = PlainWriter(stream)
+        writer.start(library="another")
+        wrong = build_file_descriptor_set(CompressedImage).SerializeToString()
+        right = build_file_descriptor_set(height).SerializeToString()
+        for topic, name, schema, data in (
+            ("/cf1/height", "dmrl.v1.Height", right, height(height_m=2.0).SerializeToString()),
+            ("/cf2/height", "dmrl.v1.Height", right, b"\xff\xff\xff"),
+            ("/cf1/log/a", "dmrl.log.A", wrong, b""),
+            ("/cf3/pose", "foxglove.PoseInFrame", wrong, a_pose().SerializeToString()),
+        ):
+            channel = writer.register_channel(
+                topic, "protobuf", writer.register_schema(name, "protobuf", schema)
+            )
+            writer.add_message(channel, 5, data, 5)
+        writer.finish()
+    found, left = convert(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    assert list(found.topics) == ["/cf1/height"]
+    assert left == {
+        f"messages on {topic} that cannot be decoded": 1
+        for topic in ("/cf2/height", "/cf1/log/a", "/cf3/pose")
     }
 
 
