@@ -14,6 +14,7 @@ from dmrl.estimation.model import status as room
 from dmrl.estimation.model.odometry import Odometry
 from dmrl.estimation.model.pair import Pair, SensorTrack
 from dmrl.estimation.search.modes import COST_SCALE, mode_weights
+from dmrl.estimation.solver.covariance import Covariances
 from dmrl.estimation.solver.estimate import (
     PAIR_LAYOUT,
     REASONS,
@@ -70,7 +71,7 @@ def test_covariance_includes_distance_between_modes() -> None:
     members = [
         Member(Solver(still), MapEstimate(Values(s, np.zeros(0)), 7.0), 0.0) for s in (state, other)
     ]
-    spread = np.zeros((count, width, width)), np.zeros((0, 0))
+    spread = Covariances(np.zeros((count, width, width)), np.zeros((0, 0)), state)
     found = PairSolution(Mixture(members, np.array([0.5, 0.5])), [spread, spread])
     mean, covariance = mix_members(found, problem.keyframe_s[:3])
     assert mean == pytest.approx(np.tile([2.5, 0.0, 0.0], (3, 1)))
