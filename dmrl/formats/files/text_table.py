@@ -14,7 +14,7 @@ import numpy as np
 
 from dmrl.errors import SourceError
 from dmrl.formats.clocks import Ints, settle_times
-from dmrl.formats.files.text_cells import DATE, is_number, parse_cells, parse_time_ns
+from dmrl.formats.files.text_cells import DATE, MISSING, is_number, parse_cells, parse_time_ns
 from dmrl.geometry.frames import Array
 from dmrl.guards import limits
 from dmrl.terminal.left_out import leave_out
@@ -113,7 +113,8 @@ class TextTable:
             If no row has a time from 1970 to 2262, or the clock starts again.
         """
         cells = self.columns[name]
-        if any(found and not found[8] for found in map(DATE.fullmatch, map(str.strip, cells[:1]))):
+        known = (text for text in map(str.strip, cells) if text.lower() not in MISSING)
+        if (date := DATE.fullmatch(next(known, ""))) and not date[8]:
             say(f"{self.path}: times without a zone are read as UTC. Write them with one, as in Z")
         told = [parse_time_ns(cell, scale, self.has_decimal_commas) for cell in cells]
         rows = [k for k, time_ns in enumerate(told) if time_ns is not None]
