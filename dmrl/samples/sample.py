@@ -12,6 +12,8 @@ from dmrl import topics
 from dmrl.geometry.frames import Camera
 from dmrl.messages import LogType
 
+LABEL_SOURCES = ("truth", "estimate", "hand", "published")
+"""Sources of labels, best first."""
 DECIMALS = 8
 """Decimals of computed values: metres, radians and pixels."""
 ROWS_PER_SLICE = 256

@@ -5,9 +5,7 @@ from dmrl.datasets.writing.corrections import CORRECTION_SOURCE
 from dmrl.errors import SettingError
 from dmrl.recording import LoadedRecording
 from dmrl.recording.label_sources import SOURCE_FIELDS, collect_sources
-
-LABEL_SOURCES = ("truth", "estimate", "hand", "published")
-"""Sources of labels, best first."""
+from dmrl.samples.sample import LABEL_SOURCES
 
 TRAINING_SOURCES = ("estimate", "truth", "hand", "published")
 """Sources of labels in the order of training.

@@ -28,6 +28,7 @@ from dmrl.formats.files.labelled_pictures import (
     list_pictures,
 )
 from dmrl.guards.bounded_parsing import parse_json
+from dmrl.samples.sample import LABEL_SOURCES
 from dmrl.terminal.left_out import leave_out
 
 HEAD_BYTES = 1 << 20
@@ -182,7 +183,7 @@ def _add_attributes(row: LabelRow, annotation: Record) -> LabelRow:
     return replace(
         row,
         peer=str(told.get("peer") or row.peer),
-        source=str(told.get("source") or row.source),
+        source=told["source"] if told.get("source") in LABEL_SOURCES else row.source,
         u_px=number("u_px", row.u_px),
         v_px=number("v_px", row.v_px),
         depth_m=depth_m,

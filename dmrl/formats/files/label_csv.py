@@ -10,6 +10,7 @@ from typing import Any, TextIO
 from dmrl.errors import SourceError, suggest
 from dmrl.guards import limits
 from dmrl.guards.safe_names import check_split_name
+from dmrl.samples.sample import LABEL_SOURCES
 
 POINT_COLUMNS = ("u_px", "v_px", "depth_m")
 BOX_COLUMNS = ("left_px", "top_px", "right_px", "bottom_px")
@@ -178,6 +179,8 @@ def _parse_row(where: str, cells: Mapping[str | None, Any], files: Collection[st
     if split is not None:
         check_split_name(split, f"{where}: the split")
     source = row.get("source") or "hand"
+    if source not in LABEL_SOURCES:
+        raise SourceError(f"{where}: source is {source!r}. It must be {', '.join(LABEL_SOURCES)}")
     if not row["peer"]:
         if filled := next(filter(row.get, (*POINT_COLUMNS, *BOX_COLUMNS, *SIGMA_COLUMNS)), None):
             raise SourceError(

@@ -121,10 +121,12 @@ def test_labels_of_ids_that_fit_no_picture_or_two_are_left_out(tmp_path: Path) -
     }
 
 
-def test_an_empty_peer_in_the_attributes_is_that_of_the_category(tmp_path: Path) -> None:
+def test_attributes_of_other_programs_leave_the_peer_and_the_source(tmp_path: Path) -> None:
     document = coco("", [1], "")
     for annotation in document["annotations"]:
-        annotation["attributes"] = {"peer": "", "source": None}
+        annotation["attributes"] = {"peer": "", "source": "manual"}
     (tmp_path / "a.json").write_text(json.dumps(document))
     write_picture(tmp_path / "1.png", 1)
-    check(list(find_format(tmp_path).content(tmp_path, Options()).samples), [1])
+    samples = list(find_format(tmp_path).content(tmp_path, Options()).samples)
+    check(samples, [1])
+    assert [s.fields["sources"] for s in samples if s.message == "PeerLabels"] == [["hand"]]

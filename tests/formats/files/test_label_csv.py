@@ -91,6 +91,11 @@ def test_label_values_have_limits(tmp_path: Path, cells: str, complaint: str) ->
         read(tmp_path, text)
 
 
+def test_a_source_that_no_command_can_choose_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"2: source is 'Truth'\. It must be truth, estimate"):
+        read(tmp_path, "file,peer,u_px,v_px,source\na.png,cf2,1,2,Truth\n")
+
+
 @pytest.mark.parametrize("cell", range(7))
 def test_row_without_peer_must_have_empty_cells(tmp_path: Path, cell: int) -> None:
     cells = ["5" if k == cell else "" for k in range(8)]
