@@ -136,13 +136,18 @@ def select_fastest_backend(model: Path, size_px: tuple[int, int]) -> BackendName
         return "onnx"
     try:
         import_module("dmrl.deploy.onnx.runtime")
-        if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():
+        if is_export_folder(model):
             return "onnx"
         said = _build_float_onnx(model)[1]
     except (MissingExtra, ModelError):
         return "torch"  # which then reports the error
     told = set(said["outputs"]) <= set(HEAD_OF_CHANNEL)
     return "onnx" if told and size_px == (said["width_px"], said["height_px"]) else "torch"
+
+
+def is_export_folder(model: Path) -> bool:
+    """Return whether a folder holds a float network for other programs, and no weights."""
+    return (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file()
 
 
 def _build_float_onnx(model: Path) -> tuple[bytes, dict[str, Any]]:
@@ -152,7 +157,7 @@ def _build_float_onnx(model: Path) -> tuple[bytes, dict[str, Any]]:
 
 
 def _open_torch(model: Path, _backend: BackendName) -> Detector:
-    if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():
+    if is_export_folder(model):
         raise ModelError(
             f"{model} is an export folder, which torch cannot run. Give --backend onnx, or the "
             "model that was exported"

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from dmrl.deploy.backends import to_network_input
 from dmrl.deploy.c import CORE_STACKS_BYTES, write_c
-from dmrl.deploy.detector import FLOAT_ONNX_NAME, INT8_ONNX_NAME
+from dmrl.deploy.detector import FLOAT_ONNX_NAME, INT8_ONNX_NAME, is_export_folder
 from dmrl.deploy.int8.network import IntegerNetwork
 from dmrl.deploy.int8.store import INTEGER_NAME, load_network
 from dmrl.deploy.samples import SAMPLES_NAME, load_samples
 from dmrl.errors import ModelError, optional_imports
-from dmrl.learn.pretrained import DESCRIPTION_NAME, WEIGHTS_NAME
+from dmrl.learn.pretrained import DESCRIPTION_NAME
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ def write_decoded(folder: Path) -> None:
 
 def refuse_export(model: Path) -> None:
     """Raise ModelError if a model is an export folder already."""
-    if (model / FLOAT_ONNX_NAME).is_file() and not (model / WEIGHTS_NAME).is_file():
+    if is_export_folder(model):
         raise ModelError(f"{model} is an export folder already. Give the model it was made from")
 
 

@@ -7,6 +7,8 @@ from dmrl.geometry.frames import Array
 
 HEIGHT_SAMPLES = 10
 """Number of samples before the present over which the height is averaged: 0.1 s."""
+SENSORS = ("roll_rad", "pitch_rad", "yaw_rate_radps", "vx_mps", "vy_mps", "height_m")
+"""Fields of a `RobotLog`."""
 
 
 class DeadReckoning:
@@ -27,22 +29,13 @@ class DeadReckoning:
         """(N,) heading relative to the start."""
         self.path_m = np.zeros((count, 3))
         """(N, 3) position over the start, along the heading at the start; z is the height."""
-        self.sensors = np.zeros((6, count))
-        """(6, N) roll, pitch, yaw rate, vx, vy and height."""
+        self.sensors = np.zeros((len(SENSORS), count))
+        """(6, N) values of `SENSORS`."""
 
     def extend(self, part: slice) -> None:
         """Integrate the samples of a part that follows the last one."""
         log = self._log
-        fresh = np.stack(
-            [
-                log.roll_rad[part],
-                log.pitch_rad[part],
-                log.yaw_rate_radps[part],
-                log.vx_mps[part],
-                log.vy_mps[part],
-                log.height_m[part],
-            ]
-        )
+        fresh = np.stack([getattr(log, name)[part] for name in SENSORS])
         first = max(part.start - 1, 0)
         for row, held in zip(fresh, self.sensors[:, first], strict=True):
             if np.isnan(row).any():

@@ -154,17 +154,17 @@ def project(xyz_camera: Array, image_from_optical: Array) -> tuple[Array, Array]
     return uvw[:, :2] / uvw[:, 2:], depth_m
 
 
-def is_inside(uv: Array, width_px: int, height_px: int) -> NDArray[np.bool_]:
-    """Return (N,) whether pixels are in the image, [0, width) x [0, height).
+def is_inside(uv: NDArray[np.floating], width_px: int, height_px: int) -> NDArray[np.bool_]:
+    """Return (...) whether pixels are in the image, [0, width) x [0, height).
 
     Parameters
     ----------
     uv
-        (N, 2) pixels.
+        (..., 2) pixels.
     width_px, height_px
         Size of the image.
     """
-    return np.asarray(((uv >= 0) & (uv < (width_px, height_px))).all(axis=1))
+    return np.asarray(((uv >= 0) & (uv < (width_px, height_px))).all(axis=-1))
 
 
 def build_grid_label(

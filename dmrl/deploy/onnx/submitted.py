@@ -13,7 +13,7 @@ from dmrl.deploy.backends import Images
 from dmrl.deploy.int8.graph import rgb_to_grey
 from dmrl.deploy.onnx.runtime import open_session
 from dmrl.errors import ModelError
-from dmrl.geometry.frames import AIDECK_PINHOLE, STRIDE_PX
+from dmrl.geometry.frames import AIDECK_PINHOLE, STRIDE_PX, is_inside
 from dmrl.learn.inference.decode_grids import Grids
 
 ROBOT_WIDTH_M = 0.13
@@ -92,7 +92,8 @@ class SubmittedNetwork:
         rows = rows[np.argsort(rows[:, 4], kind="stable")]  # the best is written last
         high, wide = grid
         at = (rows[:, :2] + rows[:, 2:4]) / 2 / STRIDE_PX
-        rows, at = (part[((at >= 0) & (at < (wide, high))).all(axis=1)] for part in (rows, at))
+        inside = is_inside(at, wide, high)
+        rows, at = rows[inside], at[inside]
         col, row = at.astype(int).T
         confidence, depth = np.zeros((high, wide)), np.ones((high, wide))
         offset = np.zeros((2, high, wide))

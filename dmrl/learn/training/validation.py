@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from dmrl.geometry.frames import is_inside
 from dmrl.learn.data.batches import DEPTH, SIGMA_DEPTH, SIGMA_U, ExampleSet, U, V, iter_batches
 from dmrl.learn.inference import detection_metrics
 from dmrl.learn.inference.decode_grids import decode
@@ -19,6 +20,8 @@ ALL_DEPTHS_M = (0.0, np.inf)
 """Depth band of all labels, metres."""
 SIGMAS_OF_HIT = 2.0
 """Standard deviations of a label by which a hit may be off, beside the radius."""
+SCORED_IMAGES = 16
+"""Images of a batch that is scored."""
 
 
 def validate(network: Network, examples: ExampleSet, settings: TrainConfig) -> dict[str, float]:
@@ -45,18 +48,16 @@ def validate(network: Network, examples: ExampleSet, settings: TrainConfig) -> d
     return {"validation_loss": total / len(examples), **watched}
 
 
-def score_examples(
-    network: Network, examples: ExampleSet, batch_size: int = 16
-) -> detection_metrics.ScoredDetections:
+def score_examples(network: Network, examples: ExampleSet) -> detection_metrics.ScoredDetections:
     """Detect robots in images and match the detections with the labels.
 
     A hit may be off by twice the label's standard deviation, beside the radius of the metric.
     """
     parts = []
-    for batch in iter_batches(examples, batch_size):
+    for batch in iter_batches(examples, SCORED_IMAGES):
         found = decode(*predict_grids(network, batch.images), stride_px=network.stride_px)
         parts.append(Points.from_detections(found))
-    first = np.arange(0, len(examples), batch_size)
+    first = np.arange(0, len(examples), SCORED_IMAGES)
     sigma_px = examples.robots[..., SIGMA_U : SIGMA_U + 2].max(axis=-1)[_find_visible(examples)]
     return detection_metrics.score_detections(
         len(examples),
@@ -78,6 +79,4 @@ def select_visible_labels(examples: ExampleSet) -> Points:
 def _find_visible(examples: ExampleSet) -> NDArray[np.bool_]:
     """Return (N, K) whether the centre of each robot is inside its image."""
     height_px, width_px, _ = examples.image_shape
-    u, v = examples.robots[..., U], examples.robots[..., V]
-    with np.errstate(invalid="ignore"):
-        return np.asarray((u >= 0) & (u < width_px) & (v >= 0) & (v < height_px))
+    return is_inside(examples.robots[..., [U, V]], width_px, height_px)
