@@ -200,7 +200,9 @@ def iter_range_streams(
             np.where((range_m == 0) | np.isinf(range_m), np.nan, range_m),
             where,
         )
-        if peer != robot and len(found.time_ns):
+        if peer == robot:
+            leave_out(f"ranges of {robot} to itself", where, len(found.time_ns))
+        elif len(found.time_ns):
             yield found
 
 

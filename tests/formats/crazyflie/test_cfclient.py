@@ -44,7 +44,9 @@ def samples(source: Path) -> dict[str, list[Sample]]:
 
 def test_a_folder_of_folders_is_a_swarm(swarm: Path) -> None:
     assert find_format(swarm).name == "cfclient"
-    found = samples(swarm)
+    with count_left_out() as left:
+        found = samples(swarm)
+    assert left.counts == {"ranges of cf2 to itself": 2}
     assert {topic: len(v) for topic, v in found.items() if topic.startswith("/cf1")} == {
         "/cf1/attitude": 10,
         "/cf1/velocity": 10,
