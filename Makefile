@@ -32,7 +32,7 @@ demo: $(VENV)/.demo ## Run the whole pipeline, small; pictures and a table end u
 test: $(VENV)/.dev ## Run the tests, but for those below. ARGS="-k name" picks some.
 	$(PYTEST) $(ARGS)
 
-test-heavy: $(VENV)/.dev ## Run the tests that take a second of CPU or more.
+test-heavy: $(VENV)/.dev ## Run the tests that take a tenth of a second of CPU or more.
 	$(PYTEST) -m "heavy and not slow" $(ARGS)
 
 test-all: $(VENV)/.dev ## Run every test, those too that take minutes.

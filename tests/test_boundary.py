@@ -107,6 +107,7 @@ def test_signal_reports_that_no_output_is_complete(number: signal.Signals, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.heavy
 def test_signal_reports_complete_outputs(tmp_path: Path) -> None:
     code = (
         "import os, sys, signal; from pathlib import Path\n"
@@ -130,6 +131,7 @@ def test_signal_reports_complete_outputs(tmp_path: Path) -> None:
     ("where", "words"),
     [(">&-", "Bad file descriptor"), (">/dev/full", "No space left on device")],
 )
+@pytest.mark.heavy
 def test_unwritable_stdout_gives_one_line_error(where: str, words: str) -> None:
     shell = f'"$@" {where}'
     command = ["sh", "-c", shell, "sh", *DMRL, "--help"]
@@ -140,6 +142,7 @@ def test_unwritable_stdout_gives_one_line_error(where: str, words: str) -> None:
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.heavy
 def test_no_file_is_opened_as_a_closed_standard_stream(tmp_path: Path) -> None:
     code = (
         "from pathlib import Path; import os\n"
@@ -236,6 +239,7 @@ def test_ctrl_c_before_the_command_itself_gives_status_130(
     assert capsys.readouterr().err.startswith("dmrl: stopped. ")
 
 
+@pytest.mark.heavy
 def test_python_dash_m_dmrl_is_the_command() -> None:
     line = [sys.executable, "-m", "dmrl", "--version"]
     assert subprocess.run(line, capture_output=True, text=True).stdout == f"{__version__}\n"

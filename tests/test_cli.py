@@ -38,6 +38,7 @@ def dmrl(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], []])
+@pytest.mark.heavy
 def test_help_and_version_load_nothing_heavy(arguments: list[str]) -> None:
     code = (
         "import sys\n"
@@ -50,6 +51,7 @@ def test_help_and_version_load_nothing_heavy(arguments: list[str]) -> None:
     assert done.stderr.strip() == "[]"
 
 
+@pytest.mark.heavy
 def test_version_is_the_package_s() -> None:
     done = dmrl("--version")
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, __version__, "")
@@ -83,6 +85,7 @@ def test_usage_names_every_argument_and_which_take_several(name: str, arguments:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.heavy
 def test_help_lines_are_filled_before_wrapping(name: str) -> None:
     page = io.StringIO()
     cli.print_help(name, Console(file=page, width=88))
@@ -155,6 +158,7 @@ def bare() -> dict[str, Said]:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.heavy
 def test_help_loads_no_package_that_only_the_command_needs(
     name: str, light: dict[str, Said]
 ) -> None:
@@ -172,12 +176,14 @@ def test_help_loads_no_package_that_only_the_command_needs(
 
 
 @pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.heavy
 def test_help_of_a_command_is_quick(name: str, light: dict[str, Said]) -> None:
     """0.35 s of CPU for the first, which loads the command line; here less for each."""
     assert light[name][4] < 0.35
 
 
 @pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.heavy
 def test_help_needs_no_extra(name: str, light: dict[str, Said], bare: dict[str, Said]) -> None:
     assert bare[name][:3] == light[name][:3]
     assert light[name][0] in (0, None) and light[name][1].startswith(f"Usage: dmrl {name}")
@@ -209,6 +215,7 @@ def test_a_short_command_with_a_letter_too_many_is_suggested() -> None:
     assert suggest("qqqq", COMMANDS, "Try: dmrl --help") == "Try: dmrl --help"
 
 
+@pytest.mark.heavy
 def test_unknown_command_suggests_the_nearest_with_or_without_extras() -> None:
     hide = f"import sys\nsys.modules.update(dict.fromkeys({OPTIONAL}))\n"
     code = "sys.argv = ['dmrl', 'trian']\nfrom dmrl.cli import main\nmain()"
@@ -232,6 +239,7 @@ def test_usage_error_is_on_stderr_with_status_2(arguments: list[str]) -> None:
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.heavy
 def test_a_known_error_is_one_line_on_stderr_with_status_1(tmp_path: Path) -> None:
     done = dmrl("info", str(tmp_path / "absent.mcap"))
     assert (done.returncode, done.stdout) == (1, "")

@@ -70,6 +70,7 @@ def generated() -> dict[Path, str]:
 @pytest.mark.parametrize(
     "page", ["docs/index.md", "docs/commands.md", "docs/formats.md", "dmrl/api/settings.pyi"]
 )
+@pytest.mark.heavy
 def test_generated_parts_are_fresh(page: str, generated: dict[Path, str]) -> None:
     assert (ROOT / page).read_text(encoding="utf-8") == generated[ROOT / page], "run: make docs"
 

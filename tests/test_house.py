@@ -11,6 +11,8 @@ from types import ModuleType
 
 import pytest
 
+pytestmark = pytest.mark.heavy
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("dmrl", "viewer", "schemas", "recipes")
 MODULES = sorted(path for name in PACKAGES for path in (ROOT / name).rglob("*.py"))
@@ -54,7 +56,6 @@ def has_name(module: ModuleType, name: str) -> bool:
     return is_package and importlib.util.find_spec(f"{module.__name__}.{name}") is not None
 
 
-@pytest.mark.heavy
 def test_benchmarks_and_examples_import_names_that_exist() -> None:
     """No other test runs most of them."""
     missing = [

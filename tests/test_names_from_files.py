@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 import dmrl
 
 SOURCE = Path(dmrl.__file__).resolve().parent
@@ -238,12 +240,14 @@ def joins() -> set[str]:
     }
 
 
+@pytest.mark.heavy
 def test_a_path_is_joined_with_checked_names_alone() -> None:
     found = joins()
     assert found - REASONS.keys() == set(), "use dmrl.guards.safe_names, or add the reason"
     assert REASONS.keys() - found == set(), "these are no more"
 
 
+@pytest.mark.heavy
 def test_untrusted_documents_are_parsed_in_one_module() -> None:
     found = {
         name

@@ -14,6 +14,7 @@ PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
 
 
 @pytest.mark.parametrize("name", MODULE["PICTURES"])
+@pytest.mark.heavy
 def test_a_picture_was_drawn_by_the_present_recipe_and_code(name: str) -> None:
     assert MODULE["read_hash"](ROOT / name) == MODULE["compute_hash"](name), (
         f"make pictures, or .venv/bin/python docs/pictures.py {name}; then look at it"

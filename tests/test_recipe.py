@@ -187,6 +187,7 @@ def test_pretrained_recipes_are_found_by_name() -> None:
     ],
     ids=["lists", "tables", "dotted keys", "long"],
 )
+@pytest.mark.heavy
 def test_depth_and_length_of_a_recipe_have_a_budget(
     write: Write, text: str, complaint: str
 ) -> None:

@@ -12,6 +12,7 @@ from dmrl.errors import SettingError
 from dmrl.simulation import Command, Simulation
 
 
+@pytest.mark.heavy
 def test_the_same_seed_and_commands_give_the_same_numbers() -> None:
     def fly(seed: int) -> list[np.ndarray]:
         simulation = Simulation(robots=3, flown=2, duration_s=5.0)
@@ -38,6 +39,7 @@ def test_reset_starts_the_same_flight_again() -> None:
     assert again.time_s == 0.0 and again.height_m == start.height_m
 
 
+@pytest.mark.heavy
 def test_an_image_shows_the_peers_that_are_in_front() -> None:
     simulation = Simulation(robots=2, flown=1)
     simulation.reset(1)
@@ -52,6 +54,7 @@ def test_an_image_shows_the_peers_that_are_in_front() -> None:
     assert len(simulation.render("cf1").depth_m) == 0
 
 
+@pytest.mark.heavy
 def test_ten_robots_fly_their_own_commands() -> None:
     simulation = Simulation(robots=10, trajectory="random", duration_s=3.0, noise="ideal")
     simulation.reset(0)

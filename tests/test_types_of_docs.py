@@ -65,6 +65,7 @@ def imported(code: str) -> set[str]:
     return {name.split(".")[0] for name in found} - sys.stdlib_module_names
 
 
+@pytest.mark.heavy
 def test_make_demo_installs_what_pages_and_examples_import() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     line = re.search(r"\.demo:.*\n\t.*'\.\[([a-z,]+)\]' --group (\w+)\n", makefile)

@@ -13,6 +13,8 @@ import pytest
 from .clone import ROOT, Clone
 from .viewer.rrd import panels
 
+pytestmark = pytest.mark.heavy
+
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 
 
@@ -74,7 +76,6 @@ SENSORS = """    Topic(
 """
 
 
-@pytest.mark.heavy
 def test_a_sensor(clone: Clone, tmp_path: Path) -> None:
     pytest.importorskip("grpc_tools")
     own = 'syntax = "proto3";\npackage dmrl.v1;\nmessage {} {{\n  double {} = 1;\n}}\n'
@@ -143,7 +144,6 @@ FORMAT = '''
 '''
 
 
-@pytest.mark.heavy
 def test_a_foreign_format(clone: Clone, tmp_path: Path) -> None:
     clone.write("dmrl/formats/altitudes.py", FORMAT)
     assert clone.touched() == promised("a foreign format")
@@ -170,7 +170,6 @@ class Tiny(Network):
 """
 
 
-@pytest.mark.heavy
 def test_a_network(clone: Clone, tmp_path: Path) -> None:
     name = "dmrl/learn/networks/architectures.py"
     clone.after(name, "    widths: ClassVar[tuple[int, int, int]] = (24, 64, 96)\n", "\n" + NETWORK)
@@ -200,7 +199,6 @@ def _certain(out: OutputChannels, wanted: Targets, settings: LossSettings) -> Te
 """
 
 
-@pytest.mark.heavy
 def test_a_loss(clone: Clone) -> None:
     name = "dmrl/learn/training/losses.py"
     clone.after(name, "    classes: tuple[str, ...] = ()\n", "    certain_weight: float = 0.0\n")
@@ -266,7 +264,6 @@ COMMAND = '''
 '''
 
 
-@pytest.mark.heavy
 def test_a_command(clone: Clone) -> None:
     clone.write("dmrl/stages/hello.py", COMMAND)
     clone.after("dmrl/cli.py", "GROUPS = {\n", '    "Greet": ("hello",),\n')
@@ -311,7 +308,6 @@ VIEW = '''
 '''
 
 
-@pytest.mark.heavy
 def test_a_view(clone: Clone, tmp_path: Path) -> None:
     clone.write("viewer/views/heights.py", VIEW)
     assert clone.touched() == promised("a view")

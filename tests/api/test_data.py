@@ -28,6 +28,7 @@ def test_dataset_rows_equal_arrays_of_the_split(data: Path) -> None:
     assert rows._repr_html_().count("<img") == min(len(rows), 6)
 
 
+@pytest.mark.heavy
 def test_a_frame_has_the_peers(data: Path) -> None:
     rows = dmrl.dataset(data)["train"]
     frame = rows.to_pandas()
@@ -37,6 +38,7 @@ def test_a_frame_has_the_peers(data: Path) -> None:
     assert set(frame["label_source"].dropna()) == {"truth"}
 
 
+@pytest.mark.heavy
 def test_loader_batches_equal_single_rows(data: Path) -> None:
     rows = dmrl.dataset(data)["train"]
     batches = list(rows.loader(4))

@@ -10,6 +10,7 @@ import dmrl
 from dmrl.errors import ModelError, SettingError
 
 
+@pytest.mark.heavy
 def test_detections_equal_dmrl_predict(flight: Path, tmp_path: Path) -> None:
     model = dmrl.load("dmrl-nano")
     images = dmrl.open(flight).images("cf1")
@@ -25,6 +26,7 @@ def test_detections_equal_dmrl_predict(flight: Path, tmp_path: Path) -> None:
     assert all(d.confidence >= model.threshold for image in model.detect(images) for d in image)
 
 
+@pytest.mark.heavy
 def test_one_image_is_treated_as_a_batch_of_one(flight: Path) -> None:
     model = dmrl.load("dmrl-nano")
     images = dmrl.open(flight).images("cf1")

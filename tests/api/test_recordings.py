@@ -11,6 +11,7 @@ from dmrl.images.codec import decode
 from dmrl.recording import read, read_table
 
 
+@pytest.mark.heavy
 def test_recording_lists_topics_robots_and_time(flight: Path) -> None:
     rec = dmrl.open(flight)
     assert rec.robots == ["cf1", "cf2"]
@@ -20,6 +21,7 @@ def test_recording_lists_topics_robots_and_time(flight: Path) -> None:
     assert rec.provenance is not None and rec.provenance.stage == "fly"
 
 
+@pytest.mark.heavy
 def test_a_topic_as_arrow_pandas_and_numpy_is_the_same(flight: Path) -> None:
     topic = dmrl.open(flight)["/cf1/attitude"]
     table = topic.to_arrow()

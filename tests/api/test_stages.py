@@ -12,8 +12,9 @@ import dmrl
 from dmrl.cli import app
 from dmrl.errors import RecipeError, SettingError
 
+pytestmark = pytest.mark.heavy
 
-@pytest.mark.heavy
+
 def test_python_stages_write_the_bytes_of_their_commands(flight: Path, tmp_path: Path) -> None:
     app(
         ["label", str(flight), str(tmp_path / "a.mcap"), "--gate-m", "0.4"],
@@ -48,7 +49,6 @@ def test_wrong_settings_name_the_setting(flight: Path) -> None:
         dmrl.label(flight, gate=0.4)
 
 
-@pytest.mark.heavy
 def test_empty_list_is_refused_and_one_recording_is_accepted(flight: Path, tmp_path: Path) -> None:
     for stage in (dmrl.evaluate, dmrl.merge):
         with pytest.raises(SettingError, match="empty list"):
@@ -62,7 +62,6 @@ def test_empty_list_is_refused_and_one_recording_is_accepted(flight: Path, tmp_p
     assert len(dmrl.make_dataset(flight, tmp_path / "set")) > 0
 
 
-@pytest.mark.heavy
 def test_evaluate_returns_the_printed_figures(
     flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -75,7 +74,6 @@ def test_evaluate_returns_the_printed_figures(
         assert word in judged._repr_html_() and word in repr(judged)
 
 
-@pytest.mark.heavy
 def test_nothing_heavy_is_loaded_before_it_is_used(flight: Path) -> None:
     code = (
         "import sys, dmrl; first = set(sys.modules)\n"

@@ -25,6 +25,8 @@ from dmrl.recording import Provenance, RecordingWriter
 from dmrl.recording.provenance import Input
 from dmrl.stages import index
 
+pytestmark = pytest.mark.heavy
+
 STEP_NS = 100_000_000
 
 
@@ -64,7 +66,6 @@ def names(folder: Path, query: str) -> list[str]:
     return [str(name) for name in found]
 
 
-@pytest.mark.heavy
 def test_catalogue_row_describes_its_recording(flights: Path) -> None:
     made = index.update(flights, workers=1)
     assert made == index.Result(recordings=4, looked_at=4, known=0, gone=0, unread=1)
@@ -83,7 +84,6 @@ def test_catalogue_row_describes_its_recording(flights: Path) -> None:
     assert "cut short" in rows["torn.mcap"]["error"] and rows["torn.mcap"]["messages"] is None
 
 
-@pytest.mark.heavy
 def test_queries_filter_by_recording_camera_and_labels(flights: Path) -> None:
     index.update(flights, workers=1)
     assert names(flights, 'camera = "cf1" and ok_labels > 3') == ["a.mcap"]
@@ -145,7 +145,6 @@ def test_a_misspelt_column_is_named_with_the_nearest(tmp_path: Path) -> None:
         find_rows(Catalogue(tmp_path, to_table([])), "image > 3")
 
 
-@pytest.mark.heavy
 def test_only_changed_recordings_are_indexed_again(flights: Path) -> None:
     index.update(flights, workers=1)
     before = (flights / FILE_NAME).stat().st_mtime_ns
@@ -162,7 +161,6 @@ def test_only_changed_recordings_are_indexed_again(flights: Path) -> None:
     assert names(flights, "camera = 'cf7'") == ["a.mcap"]
 
 
-@pytest.mark.heavy
 def test_interrupted_index_keeps_finished_rows(
     flights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -195,7 +193,6 @@ def test_non_utf_8_name_is_refused_before_indexing(
     assert "Rename the file" in capsys.readouterr().err
 
 
-@pytest.mark.heavy
 def test_file_that_is_no_catalogue_is_not_overwritten(flights: Path) -> None:
     with pytest.raises(RecordingError, match=r"has no catalogue\. Make it: dmrl index"):
         open_catalogue(flights)
@@ -213,7 +210,6 @@ def _indexed(flights: Path) -> Path:
     return flights / FILE_NAME
 
 
-@pytest.mark.heavy
 def test_the_commands_print_tables_paths_and_json(
     flights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -230,7 +226,6 @@ def test_the_commands_print_tables_paths_and_json(
     assert [one["recording"] for one in found["recordings"]] == ["torn.mcap"]
 
 
-@pytest.mark.heavy
 def test_dataset_is_made_of_query_results(
     flights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -253,7 +248,6 @@ def test_dataset_is_made_of_query_results(
     assert [one["name"] for one in made["inputs"]] == ["a.mcap", "b.mcap"]
 
 
-@pytest.mark.heavy
 def test_report_shows_the_catalogue_without_opening_every_recording(
     flights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -300,7 +294,6 @@ def test_invalid_catalogue_gives_one_line_error(
         open_catalogue(tmp_path)
 
 
-@pytest.mark.heavy
 def test_a_query_takes_no_disk_and_little_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -313,7 +306,6 @@ def test_a_query_takes_no_disk_and_little_memory(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.heavy
 def test_nan_focal_length_is_stored_as_null(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", Provenance("test")) as sink:
         said = message_class("CameraCalibration")(width=64, height=48, K=[float("nan")] * 9)

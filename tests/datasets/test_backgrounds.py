@@ -15,6 +15,7 @@ from .conftest import Record, peer, pixels_of
 BOX = {"box_px": [16.0, 9.0, 25.0, 16.0]}
 
 
+@pytest.mark.heavy
 def test_robots_of_a_dataset_are_painted_over(record: Record, tmp_path: Path) -> None:
     filling = peer(box_px=[0.0, 0.0, 64.0, 48.0])
     recording = record(peers=[[peer(**BOX)], [], [filling], [peer()]])
@@ -32,6 +33,7 @@ def test_robots_of_a_dataset_are_painted_over(record: Record, tmp_path: Path) ->
     assert (photos.load_photo(2) == photos.load_photo(0)).all()
 
 
+@pytest.mark.heavy
 def test_a_dataset_whose_robots_have_no_box_is_refused(record: Record, tmp_path: Path) -> None:
     dataset.run([record()], tmp_path / "set", dataset.Settings())
     with pytest.raises(SettingError, match=r"no image for a background.*--backgrounds"):
@@ -53,6 +55,7 @@ def test_background_photos_are_loaded_unchanged(tmp_path: Path) -> None:
     assert (open_backgrounds(tmp_path).load_photo(0) == photo).all()
 
 
+@pytest.mark.heavy
 def test_rooms_are_generated_and_reproducible_by_index() -> None:
     photos = open_backgrounds(Path("rooms"))
     rooms = [photos.load_photo(k) for k in range(6)]

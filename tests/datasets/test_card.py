@@ -67,6 +67,7 @@ def test_front_matter_has_the_fields_of_the_hub(built: Path) -> None:
     assert features == opened["train"].features
 
 
+@pytest.mark.heavy
 def test_card_counts_images_and_peers(built: Path) -> None:
     text = (built / "README.md").read_text()
     counts = re.findall(r"^\| (?:train|test) \| (\d+) \| (\d+) \| (\d+) \|", text, re.M)
@@ -74,6 +75,7 @@ def test_card_counts_images_and_peers(built: Path) -> None:
     assert re.search(r"^\| flight.mcap \| (train|test) \| 3 \| 60.0 % \|$", text, re.M)
 
 
+@pytest.mark.heavy
 def test_every_column_has_a_meaning_with_its_unit(built: Path) -> None:
     text = (built / "README.md").read_text()
     rows = re.findall(r"^\| `([\w.]+)` \| [^|]+ \| ([^|]*) \|$", text, re.M)
@@ -107,6 +109,7 @@ def test_writing_it_again_gives_the_same_bytes(built: Path) -> None:
     assert {p: p.read_bytes() for p in built.rglob("*") if p.is_file()} == before
 
 
+@pytest.mark.heavy
 def test_card_can_be_written_to_another_folder(built: Path, tmp_path: Path) -> None:
     before = (built / "README.md").read_bytes()
     card = run_card(built, CardSettings(title="Elsewhere"), tmp_path / "card")
@@ -116,6 +119,7 @@ def test_card_can_be_written_to_another_folder(built: Path, tmp_path: Path) -> N
     assert (built / "README.md").read_bytes() == before
 
 
+@pytest.mark.heavy
 def test_card_warns_of_label_bias_exclusions_leaks_and_licence(
     record: Record, tmp_path: Path
 ) -> None:
@@ -136,6 +140,7 @@ def test_card_warns_of_label_bias_exclusions_leaks_and_licence(
     assert (tmp_path / "out" / "README.md").read_text() == text
 
 
+@pytest.mark.heavy
 def test_image_in_train_and_test_is_reported_as_leak(record: Record, tmp_path: Path) -> None:
     path = record(split={"train": "[[0, 250000000]]", "test": "[[300000000, 600000000]]"}, seed=3)
     twin = record("twin.mcap", split={"test": "[[0, 600000000]]"}, seed=3)
@@ -143,6 +148,7 @@ def test_image_in_train_and_test_is_reported_as_leak(record: Record, tmp_path: P
     assert "- Leaks: 3 images of a test split have" in (tmp_path / "out" / "README.md").read_text()
 
 
+@pytest.mark.heavy
 def test_licences_beside_a_source_reach_the_card(tmp_path: Path) -> None:
     folder = tmp_path / "pictures"
     folder.mkdir()
@@ -155,6 +161,7 @@ def test_licences_beside_a_source_reach_the_card(tmp_path: Path) -> None:
     assert "- Licence of `pictures`: MIT License." in text
 
 
+@pytest.mark.heavy
 def test_handwritten_text_below_the_marker_is_kept(built: Path) -> None:
     readme = built / "README.md"
     before = readme.read_text(encoding="utf-8")
@@ -166,6 +173,7 @@ def test_handwritten_text_below_the_marker_is_kept(built: Path) -> None:
     assert readme.read_text(encoding="utf-8") == after
 
 
+@pytest.mark.heavy
 def test_title_and_license_can_be_given_and_stay(built: Path) -> None:
     run_card(built, CardSettings(title='A "new" name', license="mit"))
     readme = built / "README.md"
@@ -175,6 +183,7 @@ def test_title_and_license_can_be_given_and_stay(built: Path) -> None:
     assert (front["pretty_name"], front["license"]) == ('A "new" name', "mit")
 
 
+@pytest.mark.heavy
 def test_the_day_of_publication_stays_and_must_be_a_date(built: Path) -> None:
     run_card(built, CardSettings(published="2026-11-27"))
     run_card(built, CardSettings(title="Named"))
@@ -186,6 +195,7 @@ def test_the_day_of_publication_stays_and_must_be_a_date(built: Path) -> None:
 
 
 @pytest.mark.parametrize("license_id", ["cc0-1.0", "Apache-2.0 OR MIT", "odc-by", "other"])
+@pytest.mark.heavy
 def test_known_licences_are_accepted(built: Path, license_id: str) -> None:
     run_card(built, CardSettings(license=license_id))
     assert front_of(built)["license"] == license_id
@@ -218,6 +228,7 @@ def test_figures_are_saved_with_the_matplotlib_backend_of_a_notebook(tmp_path: P
 
 
 @pytest.mark.parametrize("options", [{}, {"png": True}, {"parquet": True}])
+@pytest.mark.heavy
 def test_python_examples_of_the_card_run(
     record: Record, tmp_path: Path, options: dict[str, bool]
 ) -> None:
@@ -244,6 +255,7 @@ def test_the_hub_reads_the_front_matter(built: Path) -> None:
     assert infos["default"].features == datasets.load_from_disk(str(built))["train"].features
 
 
+@pytest.mark.heavy
 def test_card_lists_limitations_and_sensors(built: Path, tmp_path: Path) -> None:
     text = (built / "README.md").read_text()
     assert "- 2 of 5 images show no peer." in text and "peers in one image is 2." in text
@@ -273,6 +285,7 @@ def test_card_abbreviates_long_lists_of_recordings() -> None:
     assert found[20] == "- 80 more lines of this kind are in `facts.json`."
 
 
+@pytest.mark.heavy
 def test_a_dataset_without_any_peer_has_a_card(record: Record, tmp_path: Path) -> None:
     run([record(peers=[[], []])], tmp_path / "out", Settings(split="none"))
     assert "| train | 2 | 0 | 0 |" in (tmp_path / "out" / "README.md").read_text()
@@ -310,6 +323,7 @@ def test_invalid_facts_give_one_line_error(built: Path, text: str) -> None:
         write_card(built)
 
 
+@pytest.mark.heavy
 def test_facts_are_escaped_in_the_card(built: Path) -> None:
     bad = "a`<img src=x>`b\n# heading"
     facts = {

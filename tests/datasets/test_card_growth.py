@@ -15,6 +15,8 @@ from dmrl.stages.dataset import Settings, add, run
 
 from .conftest import Record, peer
 
+pytestmark = pytest.mark.heavy
+
 
 def test_samples_are_twelve_images_at_most_with_a_mark_on_each_label(
     record: Record, tmp_path: Path

@@ -19,6 +19,7 @@ THEIRS = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 @THEIRS
 @pytest.mark.parametrize("parquet", [False, True])
+@pytest.mark.heavy
 def test_croissant_is_valid_and_names_every_column(
     record: Record, tmp_path: Path, parquet: bool
 ) -> None:
@@ -39,6 +40,7 @@ def test_croissant_is_valid_and_names_every_column(
 
 
 @THEIRS
+@pytest.mark.heavy
 def test_croissant_loads_the_rows_of_parquet(record: Record, tmp_path: Path) -> None:
     run([record()], tmp_path / "out", Settings(split="none", parquet=True))
     found = mlcroissant.Dataset(jsonld=str(tmp_path / "out" / "croissant.json"))

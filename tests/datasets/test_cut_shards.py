@@ -18,6 +18,8 @@ from dmrl.stages.dataset import Settings, run
 
 from .conftest import Record
 
+pytestmark = pytest.mark.heavy
+
 CUT = r"shard .*train/data-0000\d-of-00002\.arrow was cut short while it was read"
 
 
@@ -62,7 +64,6 @@ def test_replaced_shard_is_read_from_the_old_mapping(built: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks for SIGBUS")
-@pytest.mark.heavy
 def test_shard_truncated_during_a_read_gives_one_line_error(built: Path) -> None:
     code = """
 import os, sys

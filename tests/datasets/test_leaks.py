@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image, ImageFilter
 
 from dmrl.card.leakage import count_near_in_time, count_same_poses
@@ -11,6 +12,8 @@ from dmrl.datasets.writing.near_duplicates import NEAR_DUPLICATE_BITS, compute_p
 from dmrl.stages.dataset import Settings, run
 
 from .conftest import Record, peer
+
+pytestmark = pytest.mark.heavy
 
 
 def scene(seed: int) -> Image.Image:

@@ -15,6 +15,8 @@ from dmrl.stages.dataset import Settings, run
 
 from .conftest import HEIGHT_PX, WIDTH_PX, Record, pixels_of
 
+pytestmark = pytest.mark.heavy
+
 datasets = pytest.importorskip("datasets", reason="datasets is not installed")
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel for its maps")

@@ -52,6 +52,7 @@ def table_of(path: Path) -> pa.Table:
 
 @pytest.mark.parametrize("column", ["peers", "robot", "source", "split"])
 @pytest.mark.parametrize("offset", [2_000_000_000, -2_000_000_000])
+@pytest.mark.heavy
 def test_an_offset_beyond_its_buffer_is_refused(shard: Path, column: str, offset: int) -> None:
     data = bytearray(shard.read_bytes())
     offsets = table_of(shard)[column].chunk(0).buffers()[1].to_pybytes()[:20]
@@ -63,6 +64,7 @@ def test_an_offset_beyond_its_buffer_is_refused(shard: Path, column: str, offset
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.heavy
 def test_a_compressed_shard_is_read(shard: Path, compression: str) -> None:
     sound = table_of(shard)
     rewritten(shard, sound, compression)
@@ -163,6 +165,7 @@ def test_a_split_without_images_and_a_shard_named_twice_are_refused(shard: Path)
         open_dataset(folder).split("train")
 
 
+@pytest.mark.heavy
 def test_images_whose_size_differs_from_their_labels_are_refused(
     record: Record, tmp_path: Path
 ) -> None:
@@ -187,6 +190,7 @@ def flags_of(path: Path) -> list[str]:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks Linux how files are mapped")
+@pytest.mark.heavy
 def test_opening_a_shard_reads_no_images_ahead_but_training_does(
     shard: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

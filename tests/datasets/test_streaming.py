@@ -97,6 +97,7 @@ def test_a_large_split_is_shuffled_in_windows_of_blocks(monkeypatch: pytest.Monk
     assert np.ptp(rows[:640]) > 5_000 and (np.diff(rows[:640]) < 0).sum() > 200
 
 
+@pytest.mark.heavy
 def test_batch_decodes_only_its_own_images(
     record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

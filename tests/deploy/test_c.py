@@ -56,6 +56,7 @@ def proved(network: IntegerNetwork, folder: Path, target: Target) -> TargetResul
 
 
 @pytest.mark.parametrize("seed", range(12))
+@pytest.mark.heavy
 def test_quantized_random_networks_match_the_c_bit_for_bit(seed: int, tmp_path: Path) -> None:
     result = proved(quantisable(seed), tmp_path, QUICK)
     assert (result.error, result.mismatches) == (None, 0)
@@ -99,6 +100,7 @@ def test_c_demosaicing_matches_the_reference_in_any_bayer_phase(
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.heavy
 def test_the_c_is_strict_c99_without_a_warning(compiler: str, tmp_path: Path) -> None:
     if shutil.which(compiler) is None:
         pytest.skip(f"no {compiler}")
@@ -112,6 +114,7 @@ def test_the_c_is_strict_c99_without_a_warning(compiler: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("level", ["-O0", "-O2", "-O3", "-Os"])
+@pytest.mark.heavy
 def test_the_c_calls_no_library(level: str, tmp_path: Path) -> None:
     if shutil.which(RISCV) is None:
         pytest.skip(f"no {RISCV}")
@@ -137,6 +140,7 @@ def test_the_self_test_passes_and_fails_when_a_weight_is_changed(tmp_path: Path)
     assert b"DIFFERS" in failed.stdout
 
 
+@pytest.mark.heavy
 def test_the_self_test_needs_no_library_when_silent(tmp_path: Path) -> None:
     if shutil.which(RISCV) is None:
         pytest.skip(f"no {RISCV}")
@@ -163,6 +167,7 @@ def _changed(network: IntegerNetwork) -> IntegerNetwork:
     return replace(network, layers=(*network.layers[:-1], replace(last, weight=weight)))
 
 
+@pytest.mark.heavy
 def test_layers_may_have_any_names(tmp_path: Path) -> None:
     network = max(map(random_network, range(20)), key=lambda n: len(n.layers))
     names = ("conv", "conv_weights", "while", "random_run", "3", "Conv", "passing_0", "")
@@ -200,6 +205,7 @@ def test_files_and_functions_are_named_after_the_architecture(
     subprocess.run(made, cwd=tmp_path, check=True, capture_output=True)
 
 
+@pytest.mark.heavy
 def test_two_networks_go_into_one_program(tmp_path: Path) -> None:
     one, other = (replace(random_network(k), architecture=f"net-{k}") for k in (0, 1))
     for network in (one, other):
@@ -213,6 +219,7 @@ def test_two_networks_go_into_one_program(tmp_path: Path) -> None:
     subprocess.run(command, cwd=tmp_path, check=True)
 
 
+@pytest.mark.heavy
 def test_the_same_network_gives_the_same_text() -> None:
     network = quantised_network(4)
     one, two = (generate_source(network, template_values(network), bayer=False) for _ in range(2))
@@ -271,6 +278,7 @@ def test_without_a_compiler_the_package_to_install_is_named(
         ("dmrl-nano-fine", 132_000),
     ],
 )
+@pytest.mark.heavy
 def test_the_state_fits_a_small_chip(name: str, bytes_: int) -> None:
     integers = untrained(name)
     made = generate_source(integers, template_values(integers), bayer=False)

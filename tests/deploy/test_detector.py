@@ -57,6 +57,7 @@ def run_folder(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.heavy
 def test_float_backends_and_export_give_equal_outputs(tmp_path: Path) -> None:
     run = run_folder(tmp_path / "run")
     images = np.random.default_rng(0).integers(0, 256, (2, 48, 64, 3), np.uint8)

@@ -20,6 +20,8 @@ from dmrl.errors import SettingError
 from .graphs import quantised_network, untrained
 from .networks import random_network
 
+pytestmark = pytest.mark.heavy
+
 GUARDED = Target("sanitizers", (Build("-O1", "gcc", SANITIZER_FLAGS),))
 no_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 
@@ -50,7 +52,6 @@ def images(network: IntegerNetwork) -> list[np.ndarray]:
 
 
 @no_gcc
-@pytest.mark.heavy
 @pytest.mark.parametrize("seed", [*range(4), 5, 12, 15, 19, 47])  # every way to read rows
 def test_layers_use_near_memory_only_and_copy_the_stated_bytes(seed: int, tmp_path: Path) -> None:
     network = splittable(seed)
@@ -60,7 +61,6 @@ def test_layers_use_near_memory_only_and_copy_the_stated_bytes(seed: int, tmp_pa
 
 
 @no_gcc
-@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["dmrl-nano", "dmrl-nano-fine"])
 def test_shipped_networks_match_with_two_memories(name: str, tmp_path: Path) -> None:
     network = untrained(name, 176, 96)
@@ -69,7 +69,6 @@ def test_shipped_networks_match_with_two_memories(name: str, tmp_path: Path) -> 
 
 
 @no_gcc
-@pytest.mark.heavy
 def test_layer_that_uses_far_memory_is_detected(tmp_path: Path) -> None:
     network = splittable(3)
     write_c(network, tmp_path, [], near_bytes=smallest(network))
@@ -82,7 +81,6 @@ def test_layer_that_uses_far_memory_is_detected(tmp_path: Path) -> None:
 
 
 @no_gcc
-@pytest.mark.heavy
 def test_too_little_copied_traffic_is_detected(tmp_path: Path) -> None:
     network = splittable(3)
     write_c(network, tmp_path, [], near_bytes=smallest(network))
@@ -94,7 +92,6 @@ def test_too_little_copied_traffic_is_detected(tmp_path: Path) -> None:
     ).error
 
 
-@pytest.mark.heavy
 @no_gcc
 def test_the_c_with_two_memories_is_strict_c99_without_a_warning(tmp_path: Path) -> None:
     flags = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
@@ -107,7 +104,6 @@ def test_the_c_with_two_memories_is_strict_c99_without_a_warning(tmp_path: Path)
 
 
 @no_gcc
-@pytest.mark.heavy
 def test_the_self_test_passes_with_two_memories(tmp_path: Path) -> None:
     network = splittable(0)
     write_c(network, tmp_path, images(network)[:1], near_bytes=smallest(network))
@@ -116,7 +112,6 @@ def test_the_self_test_passes_with_two_memories(tmp_path: Path) -> None:
     assert "run(&net, &away, image" in (tmp_path / "README.md").read_text()
 
 
-@pytest.mark.heavy
 def test_shipped_networks_fit_gap8_with_long_ring_buffers_in_far_memory() -> None:
     nano, fine = plan_buffers(untrained("dmrl-nano")), plan_buffers(untrained("dmrl-nano-fine"))
     for whole, far in ((nano, {"body_5_0"}), (fine, {"body_1_0", "body_9_0"})):

@@ -15,6 +15,8 @@ from dmrl.flight import NOISE, Flight, Scenario, Trajectory, simulate
 from .flights import flown, pair_of, truth_at
 from .sighted_flights import rmse, sightings
 
+pytestmark = pytest.mark.heavy
+
 
 def looking(flight: Flight, wrong: float = 0.07) -> Pair:
     """A pair whose cameras both see."""
@@ -29,7 +31,6 @@ def off_m(found: Estimate, flight: Flight, own: str = "cf1", peer: str = "cf2") 
     return rmse(found.state[:, :2], truth_at(flight, found.time_s, own, peer))
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize("trajectory", ["observer_static", "both_static", "parallel"])
 def test_detections_resolve_bearing_without_motion(trajectory: Trajectory) -> None:
     flight = flown(trajectory, "calibrated", 3, 30.0)
@@ -48,7 +49,6 @@ def test_detections_resolve_bearing_without_motion(trajectory: Trajectory) -> No
         assert not kept.any() or np.hypot(*error[kept].T).max() < 0.4
 
 
-@pytest.mark.heavy
 def test_false_detections_do_not_degrade_a_solved_flight() -> None:
     flight = flown("in_view", "calibrated", 3, 60.0)
     ((blind, _),) = estimate_pairs([pair_of(flight)])
@@ -60,7 +60,6 @@ def test_false_detections_do_not_degrade_a_solved_flight() -> None:
     assert off_m(here, flight) == pytest.approx(off_m(blind, flight), abs=0.02)
 
 
-@pytest.mark.heavy
 def test_robot_at_rest_with_false_detections_stays_ambiguous() -> None:
     flight = flown("both_static", "calibrated", 3, 30.0)
     lost = sightings(flight, "cf1", (), wrong=0.5)
@@ -69,7 +68,6 @@ def test_robot_at_rest_with_false_detections_stays_ambiguous() -> None:
     assert {REASONS["still"], REASONS["open"]} & {cause.name for cause in here.causes}
 
 
-@pytest.mark.heavy
 def test_two_peers_at_rest_get_their_own_detections() -> None:
     """One camera sees both, nobody says who is who; the ranges do."""
     flight = simulate(Scenario(3, 30.0, "both_static"), NOISE["calibrated"], 5)
@@ -85,7 +83,6 @@ def test_two_peers_at_rest_get_their_own_detections() -> None:
         assert (found[one, other][0].status == OK).mean() > 0.5
 
 
-@pytest.mark.heavy
 def test_swapping_the_robots_gives_the_same_solution() -> None:
     pair = looking(flown("in_view", "calibrated", 4, 20.0))
     ((here, there),) = estimate_pairs([pair])

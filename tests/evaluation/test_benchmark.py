@@ -115,6 +115,7 @@ def write_labels(path: Path, source: Path, scene: Path, error_m: float) -> Path:
     return path
 
 
+@pytest.mark.heavy
 def test_submitted_labels_are_scored_by_their_input_and_truth_is_refused(
     scene: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from dmrl.estimation.model.position_metrics import ErrorTrace
 from dmrl.evaluation.figures import _Outcomes, draw_error_plots
@@ -24,6 +25,7 @@ def trace(name: str, error_m: list[float]) -> Judged:
     return Judged(ErrorTrace(name, name, time_s, np.ones_like(errors), {"tracks": errors}))
 
 
+@pytest.mark.heavy
 def test_an_observer_without_a_known_error_has_no_plot(tmp_path: Path) -> None:
     known = [trace("seen", [0.1, np.nan]), trace("none", []), trace("lost", [np.nan, np.nan])]
     draw_error_plots(tmp_path, known)

@@ -19,6 +19,8 @@ from dmrl.recording.provenance import Input
 from dmrl.samples.flight import START_NS
 from dmrl.simulation.flight_recording import FlySettings
 
+pytestmark = pytest.mark.heavy
+
 SETTINGS = FlySettings(duration_s=20.0, noise="harsh", seed=4)
 
 

@@ -37,6 +37,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
+@pytest.mark.heavy
 def test_exported_tables_equal_the_recording(recording: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / "out"
     counts = write_tables(recording, out, kind)  # type: ignore[arg-type]

@@ -27,6 +27,8 @@ from dmrl.stages import convert, dataset
 from dmrl.terminal.left_out import count_left_out
 from dmrl.topics import CAMERA_IMAGE, LABELS
 
+pytestmark = pytest.mark.heavy
+
 WIDTH, HEIGHT, COUNT, STEP_NS = 64, 48, 9, 50_000_000
 SPLITS = {"train": f"[[0, {5 * STEP_NS}]]", "val": f"[[{6 * STEP_NS}, {8 * STEP_NS}]]"}
 INFINITE = float("inf")
@@ -240,7 +242,6 @@ np.savez(sys.argv[2], images=images, **columns)
 """
 
 
-@pytest.mark.heavy
 def test_lerobot_reads_it(source: Path, tmp_path: Path) -> None:
     python = os.environ.get("DMRL_LEROBOT_PYTHON")
     if not python:

@@ -61,6 +61,7 @@ def recording(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.heavy
 def test_rosbags_reader_finds_every_exported_message(recording: Path, tmp_path: Path) -> None:
     counts = write_bag(recording, tmp_path / "bag")
     assert counts == {t: i.count for t, i in read_summary(recording).topics.items()}
@@ -81,6 +82,7 @@ def test_rosbags_reader_finds_every_exported_message(recording: Path, tmp_path: 
     assert kinds["/cf1/log/state"] == "dmrl_msgs/msg/LogState"
 
 
+@pytest.mark.heavy
 def test_exported_bag_converts_back_to_the_recording(recording: Path, tmp_path: Path) -> None:
     write_bag(recording, tmp_path / "bag")
     again = tmp_path / "again.mcap"

@@ -69,6 +69,7 @@ def broken_everywhere(broken: FaultTrials, disk: Disk, count: Count, *, quick: b
 
 
 @pytest.mark.parametrize("work", QUICK)
+@pytest.mark.heavy
 def test_every_operation_may_fail(work: Workload, disk: Disk, folder: Path, count: Count) -> None:
     broken_everywhere(FaultTrials(work, disk, folder, disk.inputs), disk, count, quick=True)
 

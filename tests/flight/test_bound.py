@@ -62,6 +62,7 @@ def test_information_of_a_range_has_its_whole_density() -> None:
     assert compute_range_information(short) == pytest.approx(100.0, rel=0.01)
 
 
+@pytest.mark.heavy
 def test_silent_ranges_and_a_third_robot_change_the_bound() -> None:
     noise = NOISE["calibrated"]
     scenario = Scenario(robots=3, duration_s=30.0, trajectory="random")

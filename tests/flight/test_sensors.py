@@ -99,6 +99,7 @@ def test_velocity_scale_and_bias_match_the_noise_table(name: str) -> None:
     assert bias.std() == pytest.approx(preset.velocity_bias_mps, rel=0.12)
 
 
+@pytest.mark.heavy
 def test_coloured_noise_is_stationary_with_exponential_correlation() -> None:
     made = np.array(
         [draw_coloured_noise(np.random.default_rng(k), 300, 0.1, 0.3) for k in range(800)]

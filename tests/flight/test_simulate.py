@@ -60,6 +60,7 @@ def test_the_peer_is_where_the_observer_would_see_it() -> None:
     assert np.allclose(np.exp(1j * np.arctan2(xyz[:, 1], xyz[:, 0])), np.exp(1j * bearing))
 
 
+@pytest.mark.heavy
 def test_in_view_means_in_the_view_of_the_camera() -> None:
     flight = simulate(Scenario(robots=3), IDEAL, 5)
     for peer in ("cf2", "cf3"):
@@ -105,6 +106,7 @@ def test_adding_robots_does_not_change_the_others() -> None:
     assert np.array_equal(two.ranges["cf2", "cf1"].range_m, six.ranges["cf2", "cf1"].range_m)
 
 
+@pytest.mark.heavy
 def test_random_robots_start_apart() -> None:
     truth = simulate(replace(SHORT, robots=20, trajectory="random"), IDEAL, 1).truth
     starts = np.array([t.position[0, :2] for t in truth.values()])

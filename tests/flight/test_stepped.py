@@ -42,6 +42,7 @@ def test_follower_starts_behind_the_leader_and_faces_it(distance_m: float) -> No
     assert abs(z) <= 0.1
 
 
+@pytest.mark.heavy
 def test_commands_are_followed_with_lag_and_within_limits() -> None:
     truth = fly(Command(0.8, 0.0, 0.0, 0.0), 2.0).flight.truth["cf1"]
     speed = np.hypot(*truth.velocity[:, :2].T)

@@ -41,6 +41,7 @@ def steady(duration_s: float, rate_hz: float, start_s: float = 0.0) -> np.ndarra
     after_s=st.floats(0.5, 1.5),
     seed=st.integers(0, 99),
 )
+@pytest.mark.heavy
 def test_a_counter_that_wraps_goes_on(
     counter: str, rate_hz: int, before_s: float, after_s: float, seed: int
 ) -> None:
@@ -81,6 +82,7 @@ def test_rows_of_a_short_file_that_are_out_of_order_are_sorted() -> None:
     start_s=st.floats(0.0, 50.0),
     rate_hz=st.sampled_from([5, 20, 100]),
 )
+@pytest.mark.heavy
 def test_a_clock_that_starts_again_is_refused_with_its_line(
     first_s: float, second_s: float, start_s: float, rate_hz: int
 ) -> None:

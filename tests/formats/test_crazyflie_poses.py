@@ -1,6 +1,7 @@
 """Poses of a Crazyflie log: the orientation that belongs to a position."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -11,6 +12,7 @@ GROWING = st.lists(st.integers(0, 9), min_size=1, max_size=6).map(sorted)
 
 
 @given(GROWING, GROWING)
+@pytest.mark.heavy
 def test_pose_takes_the_orientation_of_its_time_or_the_next(
     places: list[int], turns: list[int]
 ) -> None:

@@ -94,6 +94,7 @@ def small_limit(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("small_limit")
+@pytest.mark.heavy
 def test_a_chunk_of_ros_1_that_unpacks_to_much_is_refused(tmp_path: Path) -> None:
     zeros = bz2.compress(bytes(1 << 20)) * 200  # bz2 takes one stream after the other
     path = ros1_bag(tmp_path / "a.bag", zeros, 200 << 20, "nav_msgs/Odometry", "bz2")

@@ -36,6 +36,7 @@ def velocities(folder: Path, options: Options) -> np.ndarray:
 
 
 @given(ANGLE, ANGLE, st.floats(-3, 3), st.lists(st.floats(-2, 2), min_size=3, max_size=3))
+@pytest.mark.heavy
 def test_a_velocity_of_any_frame_becomes_one_in_the_horizontal_frame(
     tmp_path_factory: pytest.TempPathFactory, roll: float, pitch: float, yaw: float, v: list[float]
 ) -> None:

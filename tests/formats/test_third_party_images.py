@@ -49,6 +49,7 @@ def test_grey_of_16_bits_is_scaled(data: Path, convert: Convert, tmp_path: Path)
 
 
 @pytest.mark.parametrize("name", ["only_mono16", "only_bayer_bggr8"])
+@pytest.mark.heavy
 def test_images_of_bags_have_their_colours(
     name: str, data: Path, convert: Convert, tmp_path: Path
 ) -> None:
@@ -100,6 +101,7 @@ def save(path: Path, picture: PIL.Image.Image, **more: object) -> None:
 
 @pytest.mark.parametrize("bits", [10, 12, 14, 16])
 @pytest.mark.parametrize("suffix", ["png", "tiff"])
+@pytest.mark.heavy
 def test_every_depth_of_grey_becomes_the_same_ramp(
     bits: int, suffix: str, convert: Convert, tmp_path: Path
 ) -> None:

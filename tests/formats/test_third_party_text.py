@@ -51,6 +51,7 @@ def test_held_ranges(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert read_summary(tmp_path / "a.mcap").topics["/cf1/range/cf2"].count == 20
 
 
+@pytest.mark.heavy
 def test_simulated_time_from_zero(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -177,6 +177,7 @@ def plain_line(x: list[int], y: list[int]) -> list[int]:
 
 
 @given(st.lists(st.tuples(st.integers(1, 9), st.integers(0, 90)), min_size=3, max_size=12))
+@pytest.mark.heavy
 def test_times_follow_the_highest_line_below_all_arrivals(
     steps: list[tuple[int, int]],
 ) -> None:

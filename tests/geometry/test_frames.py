@@ -91,6 +91,7 @@ def test_pitch_is_applied_before_roll() -> None:
 
 
 @given(ANGLE, ANGLE)
+@pytest.mark.heavy
 def test_paper_rotation_equals_ours_with_negated_angles(phi: float, theta: float) -> None:
     """Eq. 2 of the paper is Rx(phi) Ry(theta), rotations of the right-hand rule."""
     c, s = np.cos(phi), np.sin(phi)
@@ -273,6 +274,7 @@ def test_a_mount_is_yaw_then_pitch_then_roll_of_the_camera(mount: tuple[float, .
     st.tuples(*[st.floats(-0.3, 0.3)] * 2),
     st.tuples(st.floats(0.8, 4.0), st.floats(-0.5, 0.5), st.floats(-0.4, 0.4)),
 )
+@pytest.mark.heavy
 def test_projection_and_back_projection_round_trip(
     mount: tuple[float, ...], tilt: tuple[float, ...], bearing: tuple[float, ...]
 ) -> None:

@@ -95,6 +95,7 @@ def test_pipe_device_or_socket_is_refused(
         reads("a.toml")
 
 
+@pytest.mark.heavy
 def test_every_path_of_a_command_line_is_refused_so() -> None:
     """Those that may be left out too, of which the command line's library says what it likes."""
     of_paths = [

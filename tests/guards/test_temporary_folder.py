@@ -35,6 +35,7 @@ def test_temporary_files_are_removed_when_the_command_ends(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.heavy
 def test_temporary_folder_of_a_killed_command_is_removed_at_next_start(tmp_path: Path) -> None:
     assert run(KILLED, tmp_path) == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
@@ -44,6 +45,7 @@ def test_temporary_folder_of_a_killed_command_is_removed_at_next_start(tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.heavy
 def test_temporary_folder_of_a_running_command_is_kept(tmp_path: Path) -> None:
     environment = os.environ | {"TMPDIR": str(tmp_path)}
     with subprocess.Popen(

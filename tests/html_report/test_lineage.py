@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 
 from dmrl.html_report.lineage import BOX_PX, build_lineage, draw_lineage
 from dmrl.recording import Input, Provenance
@@ -52,6 +53,7 @@ def _points_of(path: str) -> np.ndarray:
     return np.concatenate(found)
 
 
+@pytest.mark.heavy
 def test_no_arrow_strikes_a_box() -> None:
     rng = np.random.default_rng(0)
     for _ in range(30):

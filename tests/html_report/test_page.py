@@ -162,6 +162,7 @@ def test_report_of_an_empty_folder_is_refused(tmp_path: Path) -> None:
         write_html_report(tmp_path / "none")
 
 
+@pytest.mark.heavy
 def test_log_axis_labels_are_plain_text_and_legend_is_outside() -> None:
     svg = charts.plot_losses({"one": [2.0, 0.5, 0.05], "two": [1.0, 0.1, 0.02]})
     assert "mathdefault" not in svg and ">0.1<" in svg and ">1<" in svg
@@ -169,6 +170,7 @@ def test_log_axis_labels_are_plain_text_and_legend_is_outside() -> None:
     assert svg.rindex('id="axes_1"') < legend and svg.count('id="legend_') == 1
 
 
+@pytest.mark.heavy
 def test_distance_bands_are_in_order() -> None:
     near, far, rest = (0.0, 0.5), (0.5, 1.0), (1.0, np.inf)
     few = [(*far, 5.0, 4.0, 6.0), (*rest, 7.0, 6.0, 9.0)]
@@ -187,6 +189,7 @@ def test_depth_texts_do_not_overlap_and_stay_in_the_image() -> None:
         assert 25 < u < 295 and 5 < v < 219
 
 
+@pytest.mark.heavy
 def test_the_pooled_figures_of_a_comparison_are_not_shown(
     evaluation: Evaluation, tmp_path: Path
 ) -> None:

@@ -12,6 +12,8 @@ from dmrl.images.codec import encode_png
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter
 
+pytestmark = pytest.mark.heavy
+
 RECIPE = """
 kind = "pipeline"
 title = "The paper, again"
@@ -71,7 +73,6 @@ def pipeline(outputs: Path) -> Path:
     return outputs
 
 
-@pytest.mark.heavy
 def test_a_recipes_figures_come_first_in_its_order(pipeline: Path) -> None:
     html = build_report(collect_outputs(pipeline))
     story = html[html.index("The paper, again</h2>") : html.index("Detections</h2>")]
@@ -83,7 +84,6 @@ def test_a_recipes_figures_come_first_in_its_order(pipeline: Path) -> None:
     assert story.count("data:image/") == 2
 
 
-@pytest.mark.heavy
 def test_maps_show_their_difference_from_the_first(pipeline: Path) -> None:
     html = build_report(collect_outputs(pipeline))
     grid = np.linspace(0.1, 0.9, 12)
@@ -93,7 +93,6 @@ def test_maps_show_their_difference_from_the_first(pipeline: Path) -> None:
     assert ">absent<" not in html  # an optional step, left out
 
 
-@pytest.mark.heavy
 def test_figure_that_cannot_be_drawn_shows_its_reason(pipeline: Path) -> None:
     (pipeline / "model/model.json").write_text("{")
     (pipeline / "judged/circles.png").write_bytes(b"no picture")
@@ -104,7 +103,6 @@ def test_figure_that_cannot_be_drawn_shows_its_reason(pipeline: Path) -> None:
     assert ">0.5<" in story
 
 
-@pytest.mark.heavy
 def test_figure_sources_outside_the_folder_are_not_shown(pipeline: Path, tmp_path: Path) -> None:
     secret = tmp_path / "secret.json"
     secret.write_text('{"overall": "hidden words"}')
@@ -113,7 +111,6 @@ def test_figure_sources_outside_the_folder_are_not_shown(pipeline: Path, tmp_pat
     assert "hidden words" not in build_report(collect_outputs(pipeline))
 
 
-@pytest.mark.heavy
 def test_invalid_recipe_is_reported_on_the_report(pipeline: Path) -> None:
     (pipeline / "recipe.toml").write_text("[[figure]]\nshows = 3\n")
     html = build_report(collect_outputs(pipeline))
@@ -121,7 +118,6 @@ def test_invalid_recipe_is_reported_on_the_report(pipeline: Path) -> None:
     assert "Detections</h2>" in html
 
 
-@pytest.mark.heavy
 def test_unusable_figure_sources_show_a_reason(pipeline: Path) -> None:
     """No output is there, one has no picture, one is a folder: a sentence each."""
     (pipeline / "chip.mcap").unlink()

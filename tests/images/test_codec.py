@@ -122,6 +122,7 @@ def test_a_picture_of_too_many_pixels_is_refused_before_it_is_decoded(
             codec.decode(data, "a.png", limits.PIXELS)
 
 
+@pytest.mark.heavy
 def test_an_image_of_a_recording_is_no_larger_than_a_network_can_take() -> None:
     """A blank one of 190 kB took `dmrl predict` 6.5 GB."""
     large = _png_of(3840, 2352)
@@ -131,6 +132,7 @@ def test_an_image_of_a_recording_is_no_larger_than_a_network_can_take() -> None:
     assert codec.decode(_png_of(3840, 2160)).shape == (2160, 3840, 3)
 
 
+@pytest.mark.heavy
 def test_a_jpeg_of_endless_scans_is_refused() -> None:
     grey = Image.new("L", (4000, 4000))
     buffer = BytesIO()
@@ -144,6 +146,7 @@ def test_a_jpeg_of_endless_scans_is_refused() -> None:
         codec.decode(endless, most=limits.PIXELS)
 
 
+@pytest.mark.heavy
 def test_a_large_photo_is_no_bomb() -> None:
     assert codec.decode(_png_of(6000, 4000), most=limits.PIXELS).shape == (4000, 6000, 3)
 

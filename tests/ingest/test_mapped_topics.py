@@ -160,6 +160,7 @@ def ros(path: Path, sent: list[tuple[str, str, int, dict[str, Any]]]) -> Path:
 
 
 @pytest.mark.parametrize("write", [protobuf, in_json, ros])
+@pytest.mark.heavy
 def test_column_map_reads_topics_of_any_encoding(
     write: Callable[[Path, Any], Path], tmp_path: Path
 ) -> None:

@@ -14,6 +14,8 @@ from dmrl.learn.training.trainer import Trainer, build_initial_network
 
 from .fitting import EVERYTHING, SETTINGS, dots, trained
 
+pytestmark = pytest.mark.heavy
+
 
 def stopped(
     examples: ExampleSet, folder: Path, epochs: int, steps: int, settings: TrainConfig = SETTINGS
@@ -38,7 +40,6 @@ def whole(
     return request.param, folder
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize("steps", [1, 3])
 def test_a_resumed_training_ends_with_the_same_bytes(
     tmp_path: Path, steps: int, whole: tuple[TrainConfig, Path]

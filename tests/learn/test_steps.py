@@ -61,6 +61,7 @@ def test_epochs_differ_in_order_and_are_reproducible(examples: ExampleSet, tmp_p
     assert not torch.equal(seen[0], seen[2])
 
 
+@pytest.mark.heavy
 def test_an_epoch_of_so_many_images_takes_as_many_steps_of_few(
     examples: ExampleSet, tmp_path: Path
 ) -> None:
@@ -74,6 +75,7 @@ def test_an_epoch_of_so_many_images_takes_as_many_steps_of_few(
     assert all(np.isfinite(epoch["loss"]) for epoch in training.history)
 
 
+@pytest.mark.heavy
 def test_reported_loss_is_the_mean_since_the_last_report(
     examples: ExampleSet, tmp_path: Path
 ) -> None:

@@ -20,6 +20,8 @@ from dmrl.recording import Provenance, RecordingWriter, read_summary
 from dmrl.stages import check, convert, trim
 from dmrl.topics import ATTITUDE
 
+pytestmark = pytest.mark.heavy
+
 KEPT = trim.Settings(to_s=1.5)
 
 
@@ -72,7 +74,6 @@ def test_special_characters_in_file_names_are_no_pattern(tmp_path: Path) -> None
     assert is_collection(tmp_path / "b[1].mcap")
 
 
-@pytest.mark.heavy
 def test_batch_outputs_are_independent_of_worker_count(flights: Path, tmp_path: Path) -> None:
     trimmed(flights, tmp_path / "one", workers=1)
     trimmed(flights, tmp_path / "two", workers=2)
@@ -83,7 +84,6 @@ def test_batch_outputs_are_independent_of_worker_count(flights: Path, tmp_path: 
     assert (tmp_path / "alone.mcap").read_bytes() == made["monday/a.mcap"]
 
 
-@pytest.mark.heavy
 def test_failing_recording_does_not_stop_the_batch_and_is_reported(
     flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -97,7 +97,6 @@ def test_failing_recording_does_not_stop_the_batch_and_is_reported(
     ]
 
 
-@pytest.mark.heavy
 def test_a_recording_that_fails_does_not_cost_its_process(
     flights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -116,7 +115,6 @@ def test_a_recording_that_fails_does_not_cost_its_process(
     assert len(list((tmp_path / "out").rglob("*.mcap"))) == 3
 
 
-@pytest.mark.heavy
 def test_up_to_date_outputs_are_kept(
     flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -134,7 +132,6 @@ def test_up_to_date_outputs_are_kept(
     }
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize("wrong", ["settings", "input", "torn"])
 def test_existing_output_with_other_inputs_is_refused(
     wrong: str, flights: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -165,7 +162,6 @@ def test_an_empty_folder_and_the_folder_itself_are_refused(flights: Path, tmp_pa
         trimmed(flights, flights / "a.mcap")
 
 
-@pytest.mark.heavy
 def test_check_of_a_folder_is_a_line_each_and_one_for_all(
     flights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -177,7 +173,6 @@ def test_check_of_a_folder_is_a_line_each_and_one_for_all(
     assert lines[-1].startswith("4 recordings: 4 without errors; 0 errors, ")
 
 
-@pytest.mark.heavy
 def test_check_of_a_folder_with_an_invalid_recording_fails_in_json_and_status(
     flights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -191,7 +186,6 @@ def test_check_of_a_folder_with_an_invalid_recording_fails_in_json_and_status(
     ]
 
 
-@pytest.mark.heavy
 def test_sources_in_a_folder_become_recordings_of_their_names(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -212,7 +206,6 @@ def children(process: int) -> list[int]:
     return [int(number) for task in tasks for number in (task / "children").read_text().split()]
 
 
-@pytest.mark.heavy
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks at processes")
 def test_ctrl_c_ends_the_workers_and_leaves_nothing_half_written(tmp_path: Path) -> None:
     png = encode_png(np.zeros((224, 320, 3), np.uint8))

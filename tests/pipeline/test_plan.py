@@ -225,6 +225,7 @@ def step_as_dict(step: Step) -> dict[str, Any]:
     return {**asdict(step), "settings": settings}
 
 
+@pytest.mark.heavy
 def test_recipe_self_supervised_has_its_number_of_steps() -> None:
     steps = load_shipped("self_supervised").steps
     assert len(recipe.read_text("self_supervised").splitlines()) <= 100
@@ -249,6 +250,7 @@ def test_recipes_of_the_page_can_be_loaded(tmp_path: Path, text: str) -> None:
 
 
 @pytest.mark.parametrize("name", recipe.list_names())
+@pytest.mark.heavy
 def test_every_shipped_pipeline_can_be_loaded(name: str) -> None:
     if recipe.read(name)["kind"] == "pipeline":
         assert load_shipped(name).steps

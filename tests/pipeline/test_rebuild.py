@@ -25,6 +25,7 @@ def cut(source: Path, out: Path, end_s: float) -> Path:
     return out
 
 
+@pytest.mark.heavy
 def test_a_recording_is_made_again_with_the_inputs_that_are_absent(
     inputs: Inputs, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -88,6 +88,7 @@ def test_zstd_bomb_helper_writes_valid_frames() -> None:
         assert zstandard.ZstdDecompressor().decompress(frame, 1 << 20) == bytes(1 << 20)
 
 
+@pytest.mark.heavy
 def test_bombs_are_refused(tmp_path: Path) -> None:
     bombs = {
         "true size": chunk(zeros(6 << 30), 6 << 30),

@@ -99,6 +99,7 @@ def suite(data: Path) -> list[Path]:
     return sorted(folder.glob("*.mcap"))
 
 
+@pytest.mark.heavy
 def test_a_sample_of_the_conformance_suite_is_copied_whole(
     suite: list[Path], tmp_path: Path
 ) -> None:

@@ -81,6 +81,7 @@ def unnoticed(path: Path, changes: Iterator[tuple[int, int]], read: Callable[[Pa
 
 
 @pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.heavy
 def test_every_flipped_byte_is_noticed_or_changes_nothing(step: int, tmp_path: Path) -> None:
     """Every third reaches each number of a record: they have four or eight bytes."""
     path = small(tmp_path / "a.mcap")
@@ -97,6 +98,7 @@ def test_every_pattern_of_flips_is_noticed_or_changes_nothing(tmp_path: Path) ->
     unnoticed(path, flips(data, PATTERNS), everything)
 
 
+@pytest.mark.heavy
 def test_every_substituted_opcode_is_noticed_or_changes_nothing(tmp_path: Path) -> None:
     path = small(tmp_path / "a.mcap")
     data = path.read_bytes()

@@ -11,6 +11,7 @@ from dmrl.recording import read, read_table
 from dmrl.recording.loaded import LoadedRecording
 
 
+@pytest.mark.heavy
 def test_loaded_topics_equal_read_topics(flight: Path) -> None:
     for wanted in (("/{robot}/attitude", "/{robot}/range/{peer}"), ()):
         held = LoadedRecording(flight, *wanted)

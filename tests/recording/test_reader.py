@@ -57,6 +57,7 @@ SHUFFLED = np.random.default_rng(0).permutation(500).tolist()
     ],
     ids=["indexed", "lz4", "uncompressed", "no index", "chunk index", "unchunked", "no summary"],
 )  # fmt: skip
+@pytest.mark.heavy
 def test_any_complete_file_is_read_in_time_order(
     tmp_path: Path, options: dict[str, object]
 ) -> None:
@@ -78,6 +79,7 @@ def test_time_spans_are_half_open(flight: Path) -> None:
 
 
 @pytest.mark.parametrize("times_ns", [SHUFFLED, [400, *range(400), *range(401, 500)]])
+@pytest.mark.heavy
 def test_any_window_of_overlapping_chunks_is_whole(tmp_path: Path, times_ns: list[int]) -> None:
     path = foreign(tmp_path / "a.mcap", times_ns)
     for low, high in ((0, 1), (17, 18), (100, 399), (399, 402), (499, 500), (500, 900), (30, 30)):
@@ -85,6 +87,7 @@ def test_any_window_of_overlapping_chunks_is_whole(tmp_path: Path, times_ns: lis
         assert found["log_time"].to_pylist() == list(range(low, min(high, 500)))
 
 
+@pytest.mark.heavy
 def test_equal_times_keep_their_order_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
@@ -265,6 +268,7 @@ def test_span_without_messages_gives_an_empty_table(flight: Path) -> None:
     assert read_table(flight, "/cf1/attitude", fields=["roll_rad"], end_ns=0).num_rows == 0
 
 
+@pytest.mark.heavy
 def test_topics_are_read_in_one_pass_as_one_by_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -316,6 +320,7 @@ def test_topic_samples_cover_the_recording_in_few_chunks(
     assert len(chunks) <= 33
 
 
+@pytest.mark.heavy
 def test_topic_samples_include_topics_of_other_chunks(tmp_path: Path) -> None:
     # Chunks of a few messages each that all span the whole time.
     times = [time for k in range(1, 499) for time in (0, k, 499)]

@@ -171,6 +171,7 @@ def places(tmp_path: Path) -> tuple[Path, Path, Path]:
 @pytest.mark.parametrize(
     "part", [0, *(pytest.param(part, marks=pytest.mark.heavy) for part in range(1, 5))]
 )
+@pytest.mark.heavy
 def test_hundred_inconsistent_files_lose_no_message_silently(
     places: tuple[Path, Path, Path], part: int
 ) -> None:

@@ -70,6 +70,7 @@ def test_a_robot_wholly_hidden_has_no_box() -> None:
     assert np.isnan(shot.box_px[0]).all()
 
 
+@pytest.mark.heavy
 def test_a_lens_that_barely_distorts_gives_the_image_of_none() -> None:
     light = np.random.default_rng(0).random((30, 30, 4), np.float32)
     depth_m = np.linspace(0.9, 1.1, 900, dtype=np.float32).reshape(30, 30)
@@ -86,6 +87,7 @@ def test_a_lens_that_barely_distorts_gives_the_image_of_none() -> None:
     assert np.allclose(plain.box_px, bent.box_px, atol=1e-3)
 
 
+@pytest.mark.heavy
 def test_lens_distortion_applies_to_box_and_centre() -> None:
     canvas = pinhole_canvas(AIDECK)
     corner = np.array([30, 150])
@@ -112,6 +114,7 @@ def test_movement_smears_the_picture_and_no_label() -> None:
     assert bright[1] == pytest.approx(10 + 0.05 * PINHOLE.fx_px, abs=2)
 
 
+@pytest.mark.heavy
 def test_an_empty_scene_is_its_backdrop() -> None:
     shot = compose_shot(AIDECK, [], look(AIDECK), {})
     assert len(shot.uv_px) == len(shot.box_px) == 0

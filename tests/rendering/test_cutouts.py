@@ -45,6 +45,7 @@ def peers_of(out: Path) -> list[list[dict[str, float]]]:
     return [row for batch in batches for row in batch["peers"].to_pylist()]
 
 
+@pytest.mark.heavy
 def test_labels_fit_the_pixels(tmp_path: Path, folders: tuple[Path, Path]) -> None:
     more = "images = 30\ndistorted = false\nempty_share = 0.2\nplace_u = [0.3, 0.7]\n"
     recipe = write_recipe(tmp_path, *folders, more + "place_v = [0.3, 0.7]\n")
@@ -72,6 +73,7 @@ def test_labels_fit_the_pixels(tmp_path: Path, folders: tuple[Path, Path]) -> No
     assert checked >= 5
 
 
+@pytest.mark.heavy
 def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, folders: tuple[Path, Path]) -> None:
     recipe = write_recipe(tmp_path, *folders, "images = 6\n")
     first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"

@@ -69,12 +69,14 @@ def test_without_photos_nothing_is_pasted(tmp_path: Path) -> None:
     assert look.light.sun_shadow
 
 
+@pytest.mark.heavy
 def test_colours_of_a_photo_are_exchanged(tmp_path: Path) -> None:
     scenes = world(Settings(recoloured_share=1.0, pasted=True), tmp_path)
     seen = {tuple(draw_scene(scenes, k).look.backdrop[0, 0].argsort()) for k in range(40)}
     assert len(seen) == 6
 
 
+@pytest.mark.heavy
 def test_places_stay_in_their_part_of_the_image(tmp_path: Path) -> None:
     settings = Settings(place_u=(0.25, 0.5), place_v=(0.5, 1.0), empty_share=0.0)
     scenes = world(settings, tmp_path, SMALL)
@@ -85,6 +87,7 @@ def test_places_stay_in_their_part_of_the_image(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("order", "level"), [("zyx", 1), ("xzy", 0)])
+@pytest.mark.heavy
 def test_robots_turn_about_their_axes_in_the_order_asked_for(
     tmp_path: Path, order: Any, level: int
 ) -> None:

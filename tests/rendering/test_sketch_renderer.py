@@ -86,6 +86,7 @@ def test_twice_the_distance_is_half_the_size(plain: Look) -> None:
     assert widths[0] == pytest.approx(2 * (near_m + 0.0235) * 183.73 / (0.4 - near_m), abs=1.5)
 
 
+@pytest.mark.heavy
 def test_the_box_holds_every_changed_pixel_and_no_more(plain: Look) -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
@@ -172,6 +173,7 @@ def test_polygon_is_composited_over_the_background(plain: Look) -> None:
         canvas.to_opacity()
 
 
+@pytest.mark.heavy
 def test_poses_fill_the_image_and_the_depths() -> None:
     rng = np.random.default_rng(0)
     xyz = np.array([p.xyz_camera for _ in range(400) for p in random_poses(rng, CAMERA, 3)])
@@ -183,6 +185,7 @@ def test_poses_fill_the_image_and_the_depths() -> None:
     assert np.ptp(np.array(shares) / len(xyz)) < 0.08
 
 
+@pytest.mark.heavy
 def test_the_same_random_numbers_give_the_same_picture() -> None:
     def picture(seed: int) -> Sketch:
         rng = np.random.default_rng(seed)

@@ -63,6 +63,7 @@ def test_worker_messages_round_trip() -> None:
         protocol.receive(stream)
 
 
+@pytest.mark.heavy
 def test_a_dead_worker_is_replaced_and_its_job_done_again(start: WorkerStart) -> None:
     with WorkerPool(start, 2) as workers:
         assert list(workers.map(double, range(12))) == [2.0 * k for k in range(12)]
@@ -80,11 +81,13 @@ def test_no_worker_outlives_a_pool_that_is_left_early(start: WorkerStart) -> Non
     assert not [pid for pid in {*started, *workers.pids} if Path(f"/proc/{pid}").exists()]
 
 
+@pytest.mark.heavy
 def test_a_job_that_kills_every_worker_is_an_error(start: WorkerStart) -> None:
     with WorkerPool(start, 1) as workers, pytest.raises(BlenderError, match="died 3 times"):
         list(workers.map(double, [1, 13]))
 
 
+@pytest.mark.heavy
 def test_worker_error_about_a_model_is_raised(start: WorkerStart) -> None:
     start.head["model"] = "bad"
     with pytest.raises(BlenderError, match="bad is no model"):

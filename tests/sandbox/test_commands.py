@@ -13,6 +13,8 @@ from dmrl.cli import COMMANDS
 
 from .box import EACH, Box, run_in
 
+pytestmark = pytest.mark.heavy
+
 HOSTILE: dict[str, tuple[tuple[str, ...], ...]] = {
     "demo": (("--out", "IN/bad.mcap"), ("--out", "IN/link")),
     "run": (("IN/each.toml", "--out", "OUT/run"), ("IN/link.toml", "--out", "OUT/run")),
@@ -76,7 +78,6 @@ def test_every_command_is_given_hostile_inputs() -> None:
     assert HOSTILE.keys() == set(COMMANDS)
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize("name", COMMANDS)
 def test_no_command_writes_elsewhere_for_hostile_inputs(
     name: str, inputs: Path, box: Box, capsys: pytest.CaptureFixture[str]
@@ -103,7 +104,6 @@ def test_no_command_writes_elsewhere_for_hostile_inputs(
     assert not any("<img src=x" in page or "<script" in page for page in pages)
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("words", "links"),
     [
@@ -150,7 +150,6 @@ def test_links_in_out_are_not_written_through(
             path.unlink()
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["../../victim/x", "{victim}/x", "recipe.toml", "..", "a/../../x"])
 def test_a_recipe_s_step_writes_in_the_pipeline_s_folder(
     name: str, box: Box, capsys: pytest.CaptureFixture[str]

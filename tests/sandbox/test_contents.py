@@ -51,6 +51,7 @@ def test_a_split_of_a_recording_stays_in_the_dataset(
 
 
 @pytest.mark.parametrize("extra", [(), ("--parquet",)], ids=["arrow", "parquet"])
+@pytest.mark.heavy
 def test_two_splits_that_a_disk_takes_for_one_are_refused(
     extra: tuple[str, ...], box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -64,6 +65,7 @@ def test_two_splits_that_a_disk_takes_for_one_are_refused(
 
 @pytest.mark.usefixtures("empty_figures")
 @pytest.mark.parametrize("split", ELSEWHERE)
+@pytest.mark.heavy
 def test_a_split_of_a_label_table_stays_in_the_dataset(
     split: str, box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -81,6 +83,7 @@ def test_a_split_of_a_label_table_stays_in_the_dataset(
 
 
 @pytest.mark.usefixtures("empty_figures")
+@pytest.mark.heavy
 def test_a_hostile_dataset_is_read_and_carded_where_it_is(
     box: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -145,6 +148,7 @@ def refused_by_export(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
     assert list(box.out.iterdir()) == []
 
 
+@pytest.mark.heavy
 def test_a_model_s_names_do_not_become_code(box: Box, capsys: pytest.CaptureFixture[str]) -> None:
     network = random_network(0)
     layers = tuple(

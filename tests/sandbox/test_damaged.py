@@ -10,9 +10,10 @@ from dmrl.cli import COMMANDS, app
 
 from .box import Box, run_in, with_junk
 
+pytestmark = pytest.mark.heavy
+
 
 # doctor reads none; index writes into the folder, and what cannot be read is a row of its own
-@pytest.mark.heavy
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("doctor", "index")])
 def test_every_command_takes_damaged_inputs_as_errors(
     name: str, box: Box, capsys: pytest.CaptureFixture[str]
@@ -55,7 +56,6 @@ def test_every_command_takes_damaged_inputs_as_errors(
     assert list(box.out.iterdir()) == []
 
 
-@pytest.mark.heavy
 @pytest.mark.usefixtures("empty_figures")
 @pytest.mark.parametrize(
     ("junk", "calibration"),

@@ -59,6 +59,7 @@ def given(box: Box) -> Box:
     "command",
     ["run", *(pytest.param(c, marks=pytest.mark.heavy) for c in list(COMMANDS)[1:])],
 )
+@pytest.mark.heavy
 def test_hostile_toml_is_one_line_that_names_it(
     command: str, given: Box, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -82,6 +83,7 @@ VALUES: tuple[Any, ...] = (
 
 
 @pytest.mark.parametrize("kind", ["render", "fly", "train"])
+@pytest.mark.heavy
 def test_every_setting_is_right_or_refused_in_one_line(
     kind: str,
 ) -> None:

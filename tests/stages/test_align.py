@@ -39,6 +39,7 @@ def recording(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.heavy
 def test_all_of_a_robot_is_set_by_the_other_s_clock(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     clocks = run(recording, out, Settings())
@@ -88,6 +89,7 @@ def test_times_stay_where_no_robot_would_begin_before_zero(
     assert after.equals(before)
 
 
+@pytest.mark.heavy
 def test_shift_of_all_times_is_reported_and_recorded(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -115,6 +115,7 @@ def mocap_errors_s(folder: Path, duration_s: float, noise: Preset) -> list[float
     return [worst_s(true, out, f"/{robot}/attitude") for robot in ("cf1", "cf2")]
 
 
+@pytest.mark.heavy
 def test_robots_are_set_by_motion_capture(tmp_path: Path) -> None:
     assert max(mocap_errors_s(tmp_path, 40.0, "calibrated")) < 0.005
 
@@ -124,6 +125,7 @@ def test_robots_are_set_to_5_ms_over_5_minutes_by_motion_capture(tmp_path: Path)
     assert max(mocap_errors_s(tmp_path, 300.0, "realistic")) < 0.005
 
 
+@pytest.mark.heavy
 def test_unalignable_cameras_and_poses_give_one_line_errors(tmp_path: Path) -> None:
     path, out = tmp_path / "in.mcap", tmp_path / "out.mcap"
     fly.run(path, fly.Settings(duration_s=2.0, camera=True, camera_rate_hz=2.0))

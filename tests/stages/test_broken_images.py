@@ -78,6 +78,7 @@ def time_of(recording: Path, data: bytes) -> int:
     return found
 
 
+@pytest.mark.heavy
 def test_predict_skips_broken_images(
     run: Run, recording: Path, broken: bytes, model: Path, tmp_path: Path
 ) -> None:
@@ -94,6 +95,7 @@ def test_predict_skips_broken_images(
     assert rc == 1 and "--strict" in output and not list(tmp_path.glob("no*"))
 
 
+@pytest.mark.heavy
 def test_dataset_skips_broken_images(
     run: Run, recording: Path, broken: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,6 +124,7 @@ def test_view_skips_broken_images(run: Run, recording: Path, broken: bytes, tmp_
     assert f"left out: images that cannot be decoded: 1 (at {where})" in output
 
 
+@pytest.mark.heavy
 def test_evaluate_skips_broken_images(
     run: Run, recording: Path, model: Path, tmp_path: Path
 ) -> None:
@@ -130,6 +133,7 @@ def test_evaluate_skips_broken_images(
     assert (rc, told["images"]) == (0, COUNT - 1)
 
 
+@pytest.mark.heavy
 def test_only_broken_images_are_an_error(
     run: Run, broken: bytes, model: Path, tmp_path: Path
 ) -> None:
@@ -143,6 +147,7 @@ def test_only_broken_images_are_an_error(
         assert not list(tmp_path.glob("out*"))
 
 
+@pytest.mark.heavy
 def test_third_party_recording_with_broken_image_is_processed(
     run: Run, data: Path, tmp_path: Path
 ) -> None:

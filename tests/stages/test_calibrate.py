@@ -19,6 +19,8 @@ from dmrl.stages.calibrate import Settings
 from ..estimation.boards import picture, pose
 from .detector import with_detections
 
+pytestmark = pytest.mark.heavy
+
 CROOKED = replace(AIDECK, mount_rad=(0.02, 0.035, -0.03), delay_s=0.03)
 
 TILTED = replace(AIDECK, mount_rad=(0.0, float(np.radians(-2.86)), 0.0), delay_s=0.06)
@@ -50,7 +52,6 @@ def boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.heavy
 def test_mount_and_delay_come_from_a_flight(calibrated: tuple[Path, calibrate.Result]) -> None:
     out, found = calibrated
     assert read_camera(out) == found.camera
@@ -59,7 +60,6 @@ def test_mount_and_delay_come_from_a_flight(calibrated: tuple[Path, calibrate.Re
     assert found.camera.delay_s == pytest.approx(0.03, abs=0.012)
 
 
-@pytest.mark.heavy
 def test_labels_made_with_it_lie_where_the_peer_was_seen(
     seen: Path, calibrated: tuple[Path, calibrate.Result], tmp_path: Path
 ) -> None:
@@ -95,7 +95,6 @@ def _median_px(recording: Path) -> float:
     return float(np.median(apart))
 
 
-@pytest.mark.heavy
 def test_intrinsics_come_from_a_folder_of_boards(boards: Path, tmp_path: Path) -> None:
     out = tmp_path / "camera.toml"
     found = calibrate.run([boards], out, Settings(board="7x5"))
@@ -154,7 +153,6 @@ def test_detections_of_something_else_are_refused(seen: Path, tmp_path: Path) ->
         calibrate.run([wrong], tmp_path / "camera.toml", Settings(against="truth"))
 
 
-@pytest.mark.heavy
 def test_positions_without_covariance_are_not_exact(
     seen: Path, calibrated: tuple[Path, calibrate.Result], tmp_path: Path
 ) -> None:
@@ -196,7 +194,6 @@ def _normalised(sources: list[Path], out: Path, camera: Camera) -> np.ndarray:
     return np.asarray((found - true) / [*figures["mount_std_deg"], figures["delay_std_ms"]])
 
 
-@pytest.mark.heavy
 def test_sigmas_from_estimated_positions_cover_the_truth(tmp_path: Path) -> None:
     seen = _seen(4000, tmp_path, CROOKED)
     assert np.abs(_normalised([seen], tmp_path / "camera.toml", CROOKED)).max() < 3.5

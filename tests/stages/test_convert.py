@@ -29,6 +29,7 @@ def pictures(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.heavy
 def test_pictures_become_a_recording(pictures: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     counts = run(pictures, out, Settings())
@@ -68,6 +69,7 @@ def test_size_and_camera_follow_the_settings(pictures: Path, tmp_path: Path) -> 
     assert [i.name for i in made.inputs] == ["pictures", "mine.toml"]
 
 
+@pytest.mark.heavy
 def test_the_published_set_becomes_a_recording(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "multi.mcap"
     counts = run(data / "locanet-multi", out, Settings())

@@ -60,6 +60,7 @@ def test_strict_leaves_nothing_behind(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["log00"]
 
 
+@pytest.mark.heavy
 def test_flags_without_effect_are_errors(
     cut_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -80,6 +81,7 @@ def test_flags_without_effect_are_errors(
     assert "--raw has no effect with --to parquet" in capsys.readouterr().err
 
 
+@pytest.mark.heavy
 def test_a_stream_of_the_whole_sensor_is_cut_for_the_shipped_network(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -113,6 +115,7 @@ def test_a_stream_of_the_whole_sensor_is_cut_for_the_shipped_network(
         assert words in capsys.readouterr().err
 
 
+@pytest.mark.heavy
 def test_flags_without_effect_on_a_folder_are_errors(
     cut_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -19,6 +19,7 @@ def run_doctor_json(capsys: pytest.CaptureFixture[str]) -> dict[str, dict[str, o
     return {part["name"]: part for part in json.loads(capsys.readouterr().out)}
 
 
+@pytest.mark.heavy
 def test_doctor_finds_the_base_installation(capsys: pytest.CaptureFixture[str]) -> None:
     output = run_doctor_json(capsys)
     assert output["base packages"]["there"] and output["Python"]["there"]
@@ -35,6 +36,7 @@ def test_every_extra_is_listed_with_its_purpose() -> None:
     assert said == installation.EXTRAS
 
 
+@pytest.mark.heavy
 def test_doctor_reports_missing_packages_with_install_commands(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -52,6 +54,7 @@ def test_doctor_reports_missing_packages_with_install_commands(
     assert not output["NVIDIA GPU"]["there"]
 
 
+@pytest.mark.heavy
 def test_a_base_that_does_not_work_is_an_error(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

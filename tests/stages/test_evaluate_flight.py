@@ -28,6 +28,7 @@ def evaluated(path: Path, what: Any = "auto") -> dict[str, Any]:
     return made
 
 
+@pytest.mark.heavy
 def test_a_piloted_flight_is_evaluated_over_time(flown: Path) -> None:
     (one,) = evaluated(flown)["flights"]
     assert (one["robot"], one["peer"]) == ("cf1", "cf2")
@@ -40,6 +41,7 @@ def test_a_piloted_flight_is_evaluated_over_time(flown: Path) -> None:
     assert sum(b["in_view"] for b in one["bands"] if b["by"] == "distance_m") == one["in_view"]
 
 
+@pytest.mark.heavy
 def test_tracks_of_such_a_flight_are_evaluated_on_request(flown: Path) -> None:
     assert evaluated(flown, "tracks")["robots"][0]["robot"] == "cf1"
 

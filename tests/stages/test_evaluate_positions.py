@@ -39,6 +39,7 @@ def labelled(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.heavy
 def test_positions_are_judged_pair_by_pair(labelled: Path) -> None:
     one, other = positions.judge(labelled)
     assert (one.name, other.name) == ("cf1 sees cf2", "cf2 sees cf1")
@@ -68,6 +69,7 @@ def test_figures_and_plots_are_written(labelled: Path, tmp_path: Path) -> None:
         run([labelled], out, Settings())
 
 
+@pytest.mark.heavy
 def test_the_table_has_a_row_per_pair_and_one_for_all(
     labelled: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

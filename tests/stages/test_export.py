@@ -12,6 +12,8 @@ from dmrl.recording import read, read_summary
 from dmrl.stages import predict
 from dmrl.stages.export import Settings, run
 
+pytestmark = pytest.mark.heavy
+
 INT8 = ("onnx-int8", "integer", "c")
 
 
@@ -34,7 +36,6 @@ def grids(model: Path, recording: Path, out: Path, backend: str) -> np.ndarray:
     return np.stack([np.frombuffer(grid.data, "<f4").reshape(shape) for grid in maps])
 
 
-@pytest.mark.heavy
 def test_every_backend_runs_a_quantised_model_and_an_export(
     quantised: Path, exported: Path, dots: Path, tmp_path: Path
 ) -> None:
@@ -52,7 +53,6 @@ def test_every_backend_runs_a_quantised_model_and_an_export(
         np.testing.assert_allclose(fast, reference, rtol=1e-5)  # the same levels
 
 
-@pytest.mark.heavy
 def test_export_lists_its_files(
     quantised: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -67,7 +67,6 @@ def test_export_lists_its_files(
     assert made["inputs"][0]["provenance"]["stage"] == "quantize"
 
 
-@pytest.mark.heavy
 def test_export_for_small_l1_reports_memory_placement(
     quantised: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -100,7 +99,6 @@ def test_a_float_model_becomes_float_onnx_alone(
     assert len(grids(tmp_path / "export", dots, tmp_path, "onnx")) == 30
 
 
-@pytest.mark.heavy
 def test_same_inputs_same_bytes(quantised: Path, exported: Path, tmp_path: Path) -> None:
     run(quantised, tmp_path / "again", Settings())
     for path in exported.iterdir():
@@ -113,7 +111,6 @@ def test_a_float_model_has_no_int8_backend(settled: Path, backend: str) -> None:
         detector.open_detector(settled, backend)
 
 
-@pytest.mark.heavy
 def test_an_export_is_no_model_for_torch(exported: Path, tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="is an export folder, which torch cannot run"):
         detector.open_detector(exported, "torch")

@@ -27,6 +27,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.heavy
 def test_every_topic_has_its_rate(seen: Path) -> None:
     counts = {topic: info.count for topic, info in read_summary(seen).topics.items()}
     assert counts["/cf3/attitude"] == counts["/cf3/velocity"] == counts["/cf3/height"] == 401
@@ -38,6 +39,7 @@ def test_every_topic_has_its_rate(seen: Path) -> None:
     assert not [f for f in check(seen) if f.level == "error"]
 
 
+@pytest.mark.heavy
 def test_measurements_use_the_clock_of_the_robot(seen: Path) -> None:
     flight = simulate(Scenario(3, 4.0), NOISE["harsh"], 3)
     table = read_table(seen, "/cf2/velocity")
@@ -89,12 +91,14 @@ def test_transforms_lead_from_the_world_to_the_lens(seen: Path) -> None:
         assert q.x**2 + q.y**2 + q.z**2 + q.w**2 == pytest.approx(1.0)
 
 
+@pytest.mark.heavy
 def test_the_same_settings_give_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.mcap", "b.mcap"):
         fly.run(tmp_path / name, SHORT)
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
+@pytest.mark.heavy
 def test_a_flight_survives_the_way_through_csv(tmp_path: Path) -> None:
     flight = simulate(Scenario(duration_s=4.0), NOISE["calibrated"], 3)
     folder = tmp_path / "csv"
@@ -144,6 +148,7 @@ def test_every_wrong_key_of_a_recipe_is_named(tmp_path: Path) -> None:
     assert all(key in str(caught.value) for key in ("robots", "trajectory", "wind"))
 
 
+@pytest.mark.heavy
 def test_faults_of_a_recipe_are_simulated_and_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -22,6 +22,8 @@ from dmrl.simulation.settings import Vision
 from dmrl.stages import convert, dataset, fly, predict, quantize, sketch, track
 from dmrl.stages.fly import Flags, Settings
 
+pytestmark = pytest.mark.heavy
+
 SHORT = recipes.load(
     "fly_follow", "fly", Settings, Flags(duration_s=4.0, eye="ideal", camera=False, seed=2)
 )
@@ -101,7 +103,6 @@ def test_flight_bytes_depend_only_on_the_seed(ideal: Path, tmp_path: Path) -> No
     assert not np.allclose(commands(tmp_path / "3.mcap"), commands(ideal))
 
 
-@pytest.mark.heavy
 def test_flight_is_reproduced_from_its_recorded_recipe(seen: Path, tmp_path: Path) -> None:
     recipe = tmp_path / "again.toml"
     made = read_summary(seen).provenance
@@ -112,7 +113,6 @@ def test_flight_is_reproduced_from_its_recorded_recipe(seen: Path, tmp_path: Pat
     np.testing.assert_array_equal(commands(tmp_path / "again.mcap"), commands(seen))
 
 
-@pytest.mark.heavy
 def test_predict_and_track_reproduce_onboard_results(seen: Path, tmp_path: Path) -> None:
     backend = read_summary(seen).provenance.settings["backend"]
     predict.run(Path("dmrl-nano"), seen, tmp_path / "found.mcap", predict.Settings(backend=backend))
@@ -174,7 +174,6 @@ def test_image_age_is_exact_when_images_are_lost(
             assert all(one.age_s >= seen.image_age_s - 1e-9 for one in seen.tracks)
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize("lost", [10, 17, 30])
 def test_a_follower_never_acts_on_the_image_that_is_lost(lost: int, tmp_path: Path) -> None:
     """What a lost image would have shown changes no command: its detections are never used."""
@@ -209,7 +208,6 @@ def test_every_shipped_pilot_flies_any_recipe(pilot: str, tmp_path: Path) -> Non
         assert counts["/{robot}/command"] == 21 * settings.flown
 
 
-@pytest.mark.heavy
 def test_three_robots_of_a_formation_keep_apart(tmp_path: Path) -> None:
     out = tmp_path / "flight.mcap"
     flags = Flags(duration_s=15.0, eye="truth", seed=1)
@@ -223,7 +221,6 @@ def test_three_robots_of_a_formation_keep_apart(tmp_path: Path) -> None:
             assert level.mean() == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.heavy
 def test_a_killed_flight_is_recovered_up_to_its_last_second(tmp_path: Path) -> None:
     out, back = tmp_path / "flight.mcap", tmp_path / "back.mcap"
     words = ["fly", "fly_follow", str(out), "--eye", "ideal", "--no-camera", "--duration-s", "600"]
@@ -265,7 +262,6 @@ def test_errors_are_one_line_and_leave_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.heavy
 def test_the_command_line_takes_pilot_eye_and_distance(tmp_path: Path) -> None:
     out = tmp_path / "flight.mcap"
     words = ["fly", "fly_in_view", str(out), "--pilot", "keep_apart", "--eye", "ideal"]
@@ -307,7 +303,6 @@ def test_integer_and_c_backends_give_equal_commands(seed: int, int8: Path, tmp_p
     np.testing.assert_array_equal(flown[0], flown[1])
 
 
-@pytest.mark.heavy
 def test_flights_with_one_place_share_the_room_only(tmp_path: Path) -> None:
     first = []
     for name, seed, place in (("a", 1, None), ("b", 2, 1), ("c", 2, None)):

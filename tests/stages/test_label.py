@@ -40,6 +40,7 @@ def test_everything_else_is_copied_bit_for_bit(flight: Path, labelled: Path) -> 
     assert not [f for f in check(labelled) if f.level == "error"]
 
 
+@pytest.mark.heavy
 def test_positions_come_at_20_hz_and_at_every_image(labelled: Path) -> None:
     there = set(read_table(labelled, "/cf1/peer/cf2/position")["log_time"].to_pylist())
     images = read_table(labelled, "/cf1/camera/image", fields=())["log_time"].to_pylist()
@@ -51,6 +52,7 @@ def test_positions_come_at_20_hz_and_at_every_image(labelled: Path) -> None:
     assert len(first.covariance) == 9
 
 
+@pytest.mark.heavy
 def test_positions_are_near_the_truth(labelled: Path) -> None:
     for one, other in (("cf1", "cf2"), ("cf2", "cf1")):
         found = read_table(labelled, f"/{one}/peer/{other}/position")

@@ -21,6 +21,8 @@ from dmrl.terminal.left_out import count_left_out
 
 from .test_label import LENIENT, SECOND_NS
 
+pytestmark = pytest.mark.heavy
+
 Change = Callable[[Stamped], list[Stamped]]
 
 
@@ -71,7 +73,6 @@ def test_robot_without_logs_is_omitted_with_a_warning(changed: Callable[[Change]
     assert "cf3: no /cf3/attitude and no /cf3/velocity" in warnings_of(changed(third))
 
 
-@pytest.mark.heavy
 def test_a_calibration_of_another_size_or_lens_is_refused(flight: Path, tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
     path.write_text(format_camera(replace(AIDECK, width_px=160)))

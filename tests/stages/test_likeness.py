@@ -143,6 +143,7 @@ def test_frames_that_show_no_camera_give_one_line_errors(
     assert [path.name for path in tmp_path.iterdir()] == ["own"]
 
 
+@pytest.mark.heavy
 def test_unmeasurable_figures_are_reported_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,6 +6,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from dmrl.stages import dataset, label
 
 OPENED: Counter[str] = Counter()
@@ -19,12 +21,14 @@ def _count(event: str, arguments: tuple[Any, ...]) -> None:
 sys.addaudithook(_count)  # sees every way to open a file, and cannot be removed
 
 
+@pytest.mark.heavy
 def test_label_opens_its_input_three_times(flight: Path, tmp_path: Path) -> None:
     before = OPENED[str(flight)]
     label.run(flight, tmp_path / "out.mcap", label.Settings(method="ekf"))
     assert OPENED[str(flight)] - before <= 3
 
 
+@pytest.mark.heavy
 def test_dataset_opens_its_input_three_times(flight: Path, tmp_path: Path) -> None:
     before = OPENED[str(flight)]
     dataset.run([flight], tmp_path / "out", dataset.Settings())

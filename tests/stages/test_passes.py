@@ -17,6 +17,8 @@ from dmrl.recording.mcap.chunks import chunk_builder, chunk_reader
 from dmrl.recording.mcap.file import BoundedReader
 from dmrl.stages import dataset, evaluate, fly, label, track
 
+pytestmark = pytest.mark.heavy
+
 Passes = Callable[[Path], float]
 
 
@@ -74,14 +76,12 @@ def passes(monkeypatch: pytest.MonkeyPatch) -> Passes:
     return count
 
 
-@pytest.mark.heavy
 def test_a_check_is_one_pass(flight: Path, passes: Passes) -> None:
     assert _chunks(flight) > 40
     check(flight)
     assert passes(flight) == 1.0
 
 
-@pytest.mark.heavy
 def test_a_trim_is_less_than_one_pass(flight: Path, passes: Passes, tmp_path: Path) -> None:
     trim(flight, tmp_path / "a.mcap", end_ns=read_summary(flight).start_ns + 10**10)
     assert 0.2 < passes(flight) < 0.5
@@ -89,7 +89,6 @@ def test_a_trim_is_less_than_one_pass(flight: Path, passes: Passes, tmp_path: Pa
     assert passes(flight) <= 1.0
 
 
-@pytest.mark.heavy
 def test_a_merge_is_one_pass_over_each(flight: Path, passes: Passes, tmp_path: Path) -> None:
     parts = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     middle_ns = read_summary(flight).start_ns + 15 * 10**9
@@ -102,19 +101,16 @@ def test_a_merge_is_one_pass_over_each(flight: Path, passes: Passes, tmp_path: P
     assert passes(parts[1]) == 1.0
 
 
-@pytest.mark.heavy
 def test_a_dataset_is_one_pass(flight: Path, passes: Passes, tmp_path: Path) -> None:
     dataset.run([flight], tmp_path / "out", dataset.Settings())
     assert passes(flight) <= 1.0
 
 
-@pytest.mark.heavy
 def test_evaluating_is_one_pass(flight: Path, passes: Passes) -> None:
     evaluate.run([flight], None, evaluate.Settings(draws=2))
     assert passes(flight) <= 1.0
 
 
-@pytest.mark.heavy
 def test_labelling_is_two_passes_one_of_them_the_copy(
     flight: Path, passes: Passes, tmp_path: Path
 ) -> None:
@@ -125,7 +121,6 @@ def test_labelling_is_two_passes_one_of_them_the_copy(
     assert passes(out) <= 1.0
 
 
-@pytest.mark.heavy
 def test_tracking_is_two_passes(flight: Path, passes: Passes, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     track.run(flight, out, track.Settings())

@@ -55,6 +55,7 @@ def test_detections_have_the_time_of_their_image(dots: Path, model: Path, tmp_pa
         assert [(raw.time_ns, raw.publish_ns) for raw in read_raw(out, topic)] == images
 
 
+@pytest.mark.heavy
 def test_extra_network_outputs_are_written_with_detections(dots: Path, tmp_path: Path) -> None:
     network = build_network("dmrl-nano", seed=1, extra=("log_spread", "class_0", "class_1")).eval()
     with torch.no_grad():
@@ -92,6 +93,7 @@ def test_grid_equals_network_output_and_detections_are_its_peaks(
     assert best.depth_m == pytest.approx(depth_m[0, row, col], rel=1e-5)
 
 
+@pytest.mark.heavy
 def test_two_views_see_the_same_in_an_image_and_its_mirror_image(tmp_path: Path) -> None:
     model = tmp_path / "model"
     model.mkdir()
@@ -112,6 +114,7 @@ def test_two_views_see_the_same_in_an_image_and_its_mirror_image(tmp_path: Path)
     assert alone[0].u_px != here[0].u_px or alone[0].confidence != here[0].confidence
 
 
+@pytest.mark.heavy
 def test_earlier_detections_are_replaced(dots: Path, model: Path, tmp_path: Path) -> None:
     run(model, dots, tmp_path / "once.mcap", Settings())
     run(model, tmp_path / "once.mcap", tmp_path / "twice.mcap", Settings(threshold=0.9))
@@ -138,6 +141,7 @@ def test_images_of_several_sizes_go_through(model: Path, tmp_path: Path) -> None
     assert [(g.rows, g.cols) for g in grids] == [(6, 8), (4, 4), (4, 4), (6, 8)]
 
 
+@pytest.mark.heavy
 def test_batch_of_large_images_is_limited_by_pixels(
     dots: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,6 +156,7 @@ def test_batch_of_large_images_is_limited_by_pixels(
     assert sizes == [16, 14, *[4] * 7, 2]
 
 
+@pytest.mark.heavy
 def test_bad_input_is_one_line_and_leaves_nothing(dots: Path, model: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     odd = recording(tmp_path / "odd.mcap", (60, 48))
@@ -172,6 +177,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(dots: Path, model: Path, tmp_p
         run(model, odd, odd, Settings())
 
 
+@pytest.mark.heavy
 def test_the_weights_decide_the_provenance_and_not_the_log(
     dots: Path, model: Path, tmp_path: Path
 ) -> None:
@@ -192,6 +198,7 @@ def test_json_counts_images_and_detections(
     assert output == {"recording": str(tmp_path / "out.mcap"), "images": 30, "believed": 0}
 
 
+@pytest.mark.heavy
 def test_fastest_backend_is_chosen_and_reported(
     dots: Path, settled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -205,6 +212,7 @@ def test_fastest_backend_is_chosen_and_reported(
     assert "onnxruntime" in made.libraries
 
 
+@pytest.mark.heavy
 def test_torch_is_taken_where_onnx_would_not_do(
     settled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

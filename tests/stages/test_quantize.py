@@ -18,6 +18,7 @@ from dmrl.stages import convert, dataset
 from dmrl.stages.quantize import Settings, run
 
 
+@pytest.mark.heavy
 def test_a_quantised_model_is_a_run_folder_with_more(quantised: Path, settled: Path) -> None:
     names = {path.name for path in quantised.iterdir()}
     assert names >= {"integer.npz", "samples.npz", "quantisation.json", "provenance.json"}
@@ -28,6 +29,7 @@ def test_a_quantised_model_is_a_run_folder_with_more(quantised: Path, settled: P
     assert network.architecture == load_model(settled).architecture
 
 
+@pytest.mark.heavy
 def test_the_report_has_every_layer_and_both_accuracies(quantised: Path) -> None:
     said = json.loads((quantised / "quantisation.json").read_text())
     network = load_network(quantised)
@@ -64,6 +66,7 @@ def test_float_and_int8_maps_are_drawn(model: Path, dots_dataset: Path, tmp_path
     assert width > height > 100
 
 
+@pytest.mark.heavy
 def test_a_grey_network_takes_one_channel(
     settled: Path, dots_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,6 +86,7 @@ def test_images_of_another_size_are_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.heavy
 def test_constant_images_are_refused(
     settled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

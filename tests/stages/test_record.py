@@ -115,6 +115,7 @@ def assert_as_flown(flight: Path, out: Path, robot: str) -> float:
     return start_ns
 
 
+@pytest.mark.heavy
 def test_simulated_drones_wait_until_all_packets_are_received(flight: Path, tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_port:
         any_port.bind(("127.0.0.1", 0))
@@ -135,6 +136,7 @@ def test_simulated_drones_wait_until_all_packets_are_received(flight: Path, tmp_
     assert results[0].healths[0].received == drone.sent > 500
 
 
+@pytest.mark.heavy
 def test_dropped_packets_are_counted_and_a_dead_drone_does_not_stop_others(
     flight: Path, tmp_path: Path
 ) -> None:
@@ -150,6 +152,7 @@ def test_dropped_packets_are_counted_and_a_dead_drone_does_not_stop_others(
     assert result.messages["/cf1/attitude"] > 250 and result.messages["/cf2/attitude"] < 150
 
 
+@pytest.mark.heavy
 def test_undecodable_packet_restarts_the_connection_only(
     flight: Path,
     tmp_path: Path,
@@ -172,6 +175,7 @@ def test_undecodable_packet_restarts_the_connection_only(
     assert result.healths[0].connections >= 2 and result.messages["/cf1/attitude"] > 50
 
 
+@pytest.mark.heavy
 def test_restarted_drone_is_reconnected(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -223,6 +227,7 @@ def test_killed_session_is_recovered_up_to_its_last_second(flight: Path, tmp_pat
         record.run(out, [RobotOptions("cf1", "udp://127.0.0.1:9")], record.Settings())
 
 
+@pytest.mark.heavy
 def test_ctrl_c_leaves_a_whole_recording(flight: Path, tmp_path: Path) -> None:
     with drone_fleet.fleet(flight, ANY[:1], (), fake_drone.Settings()) as fleet:
         (drone,) = fleet.drones
@@ -293,6 +298,7 @@ def test_missing_cflib_error_names_the_extra(
         (("udp://127.0.0.1:0",), (), {"dies": ("cf9=3",)}, "--dies cf9=3"),
     ],
 )
+@pytest.mark.heavy
 def test_a_fleet_that_cannot_be_is_refused(
     flight: Path, uris: tuple[str, ...], cameras: tuple[int, ...], settings: dict, why: str
 ) -> None:

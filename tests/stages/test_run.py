@@ -7,6 +7,8 @@ import pytest
 
 from dmrl.stages import run
 
+pytestmark = pytest.mark.heavy
+
 RECIPE = """
 kind = "pipeline"
 title = "Few"
@@ -28,7 +30,6 @@ rows = [{ what = "px", published = "one", of = "pictures/none.json", at = "nothi
 """
 
 
-@pytest.mark.heavy
 def test_a_page_is_drawn_again_when_a_step_or_a_figure_has_changed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -49,7 +50,6 @@ def test_a_page_is_drawn_again_when_a_step_or_a_figure_has_changed(
     assert "last words" in page.read_text() and "2 of 2 steps" in capsys.readouterr().err
 
 
-@pytest.mark.heavy
 def test_replaced_outputs_are_kept_and_reported_with_the_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -91,7 +91,6 @@ def test_replaced_outputs_are_kept_and_reported_with_the_reason(
     }
 
 
-@pytest.mark.heavy
 def test_output_modified_by_hand_is_reported_and_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

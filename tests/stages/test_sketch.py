@@ -24,6 +24,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.heavy
 def test_every_image_is_labelled_including_empty_ones(folder: Path) -> None:
     names = [path.name for path in sorted(folder.glob("*.png"))]
     assert names == [f"{k:06d}.png" for k in range(12)]
@@ -36,6 +37,7 @@ def test_every_image_is_labelled_including_empty_ones(folder: Path) -> None:
     assert [row["split"] for row in rows if row["file"] >= names[10]].count("train") == 0
 
 
+@pytest.mark.heavy
 def test_converted_labels_equal_the_drawn_ones(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "sketch.mcap"
     counts = convert.run(folder, out, convert.Settings())
@@ -60,6 +62,7 @@ def test_converted_labels_equal_the_drawn_ones(folder: Path, tmp_path: Path) -> 
     assert json.loads(split["test"]) == [[1_000_000_000, 1_100_000_000]]
 
 
+@pytest.mark.heavy
 def test_the_ancestry_reaches_back_to_the_seed(folder: Path, tmp_path: Path) -> None:
     convert.run(folder, tmp_path / "sketch.mcap", convert.Settings())
     made = read_summary(tmp_path / "sketch.mcap").provenance
@@ -69,6 +72,7 @@ def test_the_ancestry_reaches_back_to_the_seed(folder: Path, tmp_path: Path) -> 
     assert (source.stage, source.seed) == ("sketch", 5)
 
 
+@pytest.mark.heavy
 def test_the_same_seed_draws_the_same_bytes(folder: Path, tmp_path: Path) -> None:
     run(tmp_path / "again", SMALL)
     for path in sorted(folder.iterdir()):

@@ -18,6 +18,8 @@ from dmrl.stages.track import Settings
 
 from .detector import with_detections
 
+pytestmark = pytest.mark.heavy
+
 
 @pytest.fixture(scope="module")
 def detected(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -63,7 +65,6 @@ def test_tracks_reduce_the_error_with_consistent_covariance(judged: dict[str, An
     assert judged["false_tracks_per_min"] <= 4
 
 
-@pytest.mark.heavy
 def test_tracks_are_judged_with_the_camera_that_made_them(
     detected: Path, judged: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -82,7 +83,6 @@ def test_tracks_are_judged_with_the_camera_that_made_them(
         assert now["robots"][0][figure] == pytest.approx(judged[figure], rel=0.05)
 
 
-@pytest.mark.heavy
 def test_other_messages_stay_and_old_tracks_go(
     detected: Path, tracked: Path, tmp_path: Path
 ) -> None:
@@ -96,7 +96,6 @@ def test_other_messages_stay_and_old_tracks_go(
     )
 
 
-@pytest.mark.heavy
 def test_recorded_detector_rates_are_used_by_the_tracker(detected: Path, tmp_path: Path) -> None:
     """With rates of a detector whose detections are nearly all false, nobody is followed."""
     told, out = tmp_path / "told.mcap", tmp_path / "out.mcap"
@@ -174,7 +173,6 @@ def test_tracks_without_truth_cannot_be_judged(tracked: Path, tmp_path: Path) ->
         evaluate.run([short], None, evaluate.Settings(what="tracks"))
 
 
-@pytest.mark.heavy
 def test_the_plots_show_the_errors_of_both(tracked: Path, tmp_path: Path) -> None:
     out = tmp_path / "plots"
     evaluate.run([tracked], out, evaluate.Settings(what="tracks"))

@@ -26,8 +26,9 @@ from dmrl.stages.train import Flags, Settings, run
 
 from .trainings import SETTINGS
 
+pytestmark = pytest.mark.heavy
 
-@pytest.mark.heavy
+
 def test_run_folder_records_training_and_provenance(dots_dataset: Path, tmp_path: Path) -> None:
     result = run(dots_dataset, tmp_path / "run", SETTINGS)
     assert result.images == 20
@@ -43,7 +44,6 @@ def test_run_folder_records_training_and_provenance(dots_dataset: Path, tmp_path
     assert names == {"model.json", "model.safetensors", "provenance.json", "tensorboard"}
 
 
-@pytest.mark.heavy
 def test_same_inputs_same_weights(dots_dataset: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         run(dots_dataset, tmp_path / name, SETTINGS)
@@ -51,7 +51,6 @@ def test_same_inputs_same_weights(dots_dataset: Path, tmp_path: Path) -> None:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-@pytest.mark.heavy
 def test_a_share_of_the_first_weights_is_kept(dots_dataset: Path, tmp_path: Path) -> None:
     run(dots_dataset, tmp_path / "a", SETTINGS)
     for share in (0.0, 0.25, 1.0):
@@ -68,7 +67,6 @@ def test_a_share_of_the_first_weights_is_kept(dots_dataset: Path, tmp_path: Path
         run(dots_dataset, tmp_path / "c", replace(SETTINGS, init_share=0.5))
 
 
-@pytest.mark.heavy
 def test_init_starts_from_the_weights_of_a_model(dots_dataset: Path, tmp_path: Path) -> None:
     slow = replace(SETTINGS, learning_rate=1e-9, final_learning_rate=0.0)
     run(dots_dataset, tmp_path / "a", SETTINGS)
@@ -79,7 +77,6 @@ def test_init_starts_from_the_weights_of_a_model(dots_dataset: Path, tmp_path: P
     assert [source["name"] for source in made["inputs"]] == ["dots", "a"]
 
 
-@pytest.mark.heavy
 def test_auto_takes_the_network_of_init(dots_dataset: Path, tmp_path: Path) -> None:
     auto = replace(SETTINGS, architecture="auto", epochs=1, epoch_images=4)
     run(dots_dataset, tmp_path / "fine", replace(auto, architecture="dmrl-nano-fine"))
@@ -91,7 +88,6 @@ def test_auto_takes_the_network_of_init(dots_dataset: Path, tmp_path: Path) -> N
     assert made["settings"]["architecture"] == "dmrl-nano-fine"
 
 
-@pytest.mark.heavy
 def test_a_teacher_is_learnt_from_and_named(dots_dataset: Path, tmp_path: Path) -> None:
     taught = replace(SETTINGS, distill_share=1.0)
     run(dots_dataset, tmp_path / "teacher", replace(SETTINGS, architecture="dmrl-large"))
@@ -103,7 +99,6 @@ def test_a_teacher_is_learnt_from_and_named(dots_dataset: Path, tmp_path: Path) 
     assert [source["name"] for source in made["inputs"]] == ["dots", "teacher"]
 
 
-@pytest.mark.heavy
 def test_classes_are_patterns_of_peer_names(dots_dataset: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, classes=("cf9", "cf*"), spread_weight=1.0)
     with pytest.raises(SettingError, match=r"classes: cf9 matches no peer .* Choose among cf2$"):
@@ -153,7 +148,6 @@ def check_that_it_goes_on(dataset: Path, out: Path, settings: Settings) -> None:
     assert weights[0] == weights[1]
 
 
-@pytest.mark.heavy
 def test_interrupted_training_resumes_to_the_same_bytes(
     dots_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,7 +178,6 @@ def test_killed_training_resumes_to_the_same_bytes(dots_dataset: Path, tmp_path:
     check_that_it_goes_on(dots_dataset, out, settings)
 
 
-@pytest.mark.heavy
 def test_a_training_killed_in_its_first_epoch_starts_over(
     dots_dataset: Path, tmp_path: Path
 ) -> None:
@@ -218,7 +211,6 @@ def test_invalid_training_gives_one_line_error(dots_dataset: Path, tmp_path: Pat
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
-@pytest.mark.heavy
 def test_training_needs_images_with_robots(tmp_path: Path) -> None:
     shots = tmp_path / "shots"
     shots.mkdir()
@@ -242,7 +234,6 @@ def test_shipped_recipe_is_the_default_and_locanet_follows_the_paper() -> None:
             recipe.load(name, "train", Settings)
 
 
-@pytest.mark.heavy
 def test_the_threshold_is_chosen_on_images_held_out(dots_dataset: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, validation_share=0.2)
     run(dots_dataset, tmp_path / "run", settings)
@@ -282,7 +273,6 @@ def test_the_last_images_of_a_recording_are_held_out(dots_dataset: Path) -> None
     )
 
 
-@pytest.mark.heavy
 def test_shares_are_of_recordings_by_name(dots_dataset: Path, tmp_path: Path) -> None:
     run(dots_dataset, tmp_path / "run", replace(SETTINGS, shares={"dots*": 0.7}))
     with pytest.raises(SettingError, match=r"no images left for flight-\*.*are dots\.mcap"):
@@ -291,7 +281,6 @@ def test_shares_are_of_recordings_by_name(dots_dataset: Path, tmp_path: Path) ->
         run(dots_dataset, tmp_path / "b", replace(SETTINGS, shares={"*": 0.0}))
 
 
-@pytest.mark.heavy
 def test_flags_win_over_the_recipe(dots_dataset: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine.toml"
     mine.write_text(
@@ -308,7 +297,6 @@ def test_flag_out_of_range_gives_one_line_error() -> None:
         recipe.load("dmrl_nano", "train", Settings, Flags(epochs=-1))
 
 
-@pytest.mark.heavy
 def test_no_epochs_calibrate_a_model_and_train_nothing(dots_dataset: Path, tmp_path: Path) -> None:
     none = Flags(epochs=0, device="cpu")
     with pytest.raises(SettingError, match="epochs: 0 trains nothing"):
@@ -321,7 +309,6 @@ def test_no_epochs_calibrate_a_model_and_train_nothing(dots_dataset: Path, tmp_p
     assert all(bool((before.state_dict()[k] == after.state_dict()[k]).all()) for k in names)
 
 
-@pytest.mark.heavy
 def test_json_names_the_model(
     dots_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

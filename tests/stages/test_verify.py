@@ -128,6 +128,7 @@ def test_required_but_missing_target_gives_no_proof(
 
 
 @needs_gcc
+@pytest.mark.heavy
 def test_c_that_does_not_compile_is_an_error_of_its_target(folder: Path, tmp_path: Path) -> None:
     broken = tmp_path / "export"
     shutil.copytree(folder, broken)

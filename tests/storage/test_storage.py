@@ -154,6 +154,7 @@ def test_incomplete_bucket_output_is_invisible(lab: Any, tmp_path: Path) -> None
     assert (folder / "in" / "a").read_text() == "again"
 
 
+@pytest.mark.heavy
 def test_an_upload_that_fails_leaves_nothing(
     lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -299,6 +300,7 @@ def test_a_name_in_a_bucket_leads_nowhere_else_on_this_machine(
 
 
 @pytest.mark.parametrize("key", ["x//b.mcap", "./b.mcap", "/b.mcap", "b?versionId=3.mcap"])
+@pytest.mark.heavy
 def test_keys_that_cannot_be_paths_are_refused(key: str, lab: Any) -> None:
     folder = f"lab/odd-{len(key)}-{key[0] == '/'}"
     for name in (f"{folder}/b", f"{folder}/b.mcap", f"{folder}/x/b.mcap", f"{folder}/sub/"):
@@ -314,6 +316,7 @@ def test_keys_that_cannot_be_paths_are_refused(key: str, lab: Any) -> None:
             look(RemotePath(f"s3://{folder}"))
 
 
+@pytest.mark.heavy
 def test_keys_with_special_characters_stay_in_the_output_folder(lab: Any, tmp_path: Path) -> None:
     names = ("$(touch x).mcap", "-rf.mcap", "a%2Fb.mcap", "C:\\x.mcap")
     hidden = ("../../up.mcap", "dir/../../../up.mcap", ".hidden.mcap")

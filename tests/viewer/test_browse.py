@@ -78,6 +78,7 @@ def greys(path: Path) -> list[int]:
     return [bytes(pixels)[0] for (pixels,) in column(path, "/row/image", "Image:buffer")]
 
 
+@pytest.mark.heavy
 def test_the_worst_row_comes_first_and_those_without_a_peer_last(
     folder: Path, found: Path, rrd: Path
 ) -> None:
@@ -95,6 +96,7 @@ def test_the_worst_row_comes_first_and_those_without_a_peer_last(
     assert np.frombuffer(bytes(maps[0][0]), "<f4")[0] == np.float32(0.1)
 
 
+@pytest.mark.heavy
 def test_a_dataset_alone_is_shown_in_its_order_with_its_own_maps(folder: Path, rrd: Path) -> None:
     assert save([folder], rrd, Settings()) == 5
     assert greys(rrd) == [0, 40, 80, 120, 160]
@@ -105,6 +107,7 @@ def test_a_dataset_alone_is_shown_in_its_order_with_its_own_maps(folder: Path, r
     assert logged(rrd)["/row/labels/truth/points", "Points2D"] == 5
 
 
+@pytest.mark.heavy
 def test_rows_are_filtered_by_error_and_number(folder: Path, found: Path, rrd: Path) -> None:
     between = Settings(error_from_px=2.0, error_to_px=20.0)
     assert save([folder, found], rrd, between) == 2

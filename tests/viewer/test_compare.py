@@ -11,6 +11,8 @@ from dmrl.viewer import Settings, save
 
 from .rrd import column, logged, panels
 
+pytestmark = pytest.mark.heavy
+
 Make = Callable[..., Path]
 COMPARE = Settings(layout="compare")
 

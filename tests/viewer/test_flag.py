@@ -53,6 +53,7 @@ def built(make: Make, tmp_path: Path) -> Path:
     return tmp_path / "set"
 
 
+@pytest.mark.heavy
 def test_every_row_names_its_image_and_nothing_is_fetched(built: Path, tmp_path: Path) -> None:
     command([built], flag_to=tmp_path / "flag.html")
     rows = rows_of(tmp_path / "flag.html")
@@ -103,6 +104,7 @@ def test_a_page_is_called_html(make: Make, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", [["set", "flight.mcap"], ["flight.mcap"]])
+@pytest.mark.heavy
 def test_suspicion_knows_the_peaks_of_maps_that_predict_left_out(
     what: list[str], built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,6 +22,8 @@ from dmrl.viewer.session import prepare_show
 
 from .rrd import column, columns, logged, panels
 
+pytestmark = pytest.mark.heavy
+
 Make = Callable[..., Path]
 POSITION, TRUTH = "/cf1/peer/cf2/position", "/cf1/peer/cf2/truth"
 STILL = ("/tf/cf1/horizontal", "Transform3D")
@@ -245,7 +247,6 @@ def test_images_come_first_and_wait_for_no_more_of_the_flight(
     assert before < len(set(opened)) / 2
 
 
-@pytest.mark.heavy
 def test_trails_errors_and_ranges_are_independent_of_batch_boundaries(
     fly: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -55,6 +55,7 @@ def test_moved_labels_come_first_however_faint_the_network_sees(
     assert sorted(rank(images)[:4]) == moved
 
 
+@pytest.mark.heavy
 def test_a_label_without_a_detection_says_more_where_the_network_finds_all() -> None:
     rng = np.random.default_rng(1)
     near = [see(rng, 0.9, 0.5, found=k > 0) for k in range(IMAGES)]
@@ -73,6 +74,7 @@ def test_a_moved_label_counts_more_than_a_missing_one_and_that_more_than_a_right
     assert ((scores >= 0) & (scores <= 1)).all()
 
 
+@pytest.mark.heavy
 def test_a_label_of_large_sigma_is_not_contradicted_by_a_detection_beside_it() -> None:
     images = see_flight(0.9)
     images[2] = move(images[2], 40)

@@ -28,6 +28,7 @@ def rrd(tmp_path: Path) -> Path:
     return tmp_path / "flight.rrd"
 
 
+@pytest.mark.heavy
 def test_every_topic_becomes_its_archetypes(make: Make, rrd: Path) -> None:
     assert save([make()], rrd, Settings()) == 10
     found = logged(rrd)
@@ -56,6 +57,7 @@ def test_every_topic_becomes_its_archetypes(make: Make, rrd: Path) -> None:
     assert list(rrd.parent.glob("*.partial")) == []
 
 
+@pytest.mark.heavy
 def test_images_are_logged_as_they_are(make: Make, rrd: Path) -> None:
     recording = make()
     save([recording], rrd, Settings())
@@ -66,6 +68,7 @@ def test_images_are_logged_as_they_are(make: Make, rrd: Path) -> None:
     assert kinds == ["image/jpeg", "image/png"] * 5
 
 
+@pytest.mark.heavy
 def test_labels_show_peer_and_depth_while_the_peer_is_visible(make: Make, rrd: Path) -> None:
     save([make()], rrd, Settings())
     texts = column(rrd, "/cf1/labels/truth/texts", "Points2D:labels")
@@ -82,6 +85,7 @@ def test_labels_show_peer_and_depth_while_the_peer_is_visible(make: Make, rrd: P
     }
 
 
+@pytest.mark.heavy
 def test_a_detection_below_the_threshold_is_in_no_view_and_has_no_text(
     make: Make, rrd: Path
 ) -> None:
@@ -101,6 +105,7 @@ def test_a_detection_below_the_threshold_is_in_no_view_and_has_no_text(
     assert not any("weak" in line or "detections/**" in line for line in lines)
 
 
+@pytest.mark.heavy
 def test_maps_have_fixed_ranges_and_cells_of_eight_pixels(make: Make, rrd: Path) -> None:
     save([make()], rrd, Settings(depth_max_m=2.5))
     grid = "/cf1/detections/grid"
@@ -113,6 +118,7 @@ def test_maps_have_fixed_ranges_and_cells_of_eight_pixels(make: Make, rrd: Path)
     assert (colours[3, 4] == NO_VALUE_COLOUR).all()
 
 
+@pytest.mark.heavy
 def test_a_single_robot_gets_four_panels_and_two_get_three_each(make: Make, tmp_path: Path) -> None:
     save([make()], tmp_path / "one.rrd", Settings())
     save([make("two.mcap", ("cf1", "cf2"))], tmp_path / "two.rrd", Settings())
@@ -128,6 +134,7 @@ def test_a_recording_of_images_only_has_one_panel(make: Make, rrd: Path) -> None
     assert {path for path, kind in logged(rrd) if "static" not in kind} == {IMAGES}
 
 
+@pytest.mark.heavy
 def test_from_to_and_every_select_images_and_their_data(make: Make, rrd: Path) -> None:
     assert save([make()], rrd, Settings(from_s=0.2, to_s=0.8, every=2)) == 3
     moving = {n for (_, kind), n in logged(rrd).items() if "static" not in kind}
@@ -156,6 +163,7 @@ def test_log_time_counts_from_zero_unless_it_is_a_date(
     assert kinds == {kind}
 
 
+@pytest.mark.heavy
 def test_recordings_that_belong_together_are_shown_as_one(make: Make, rrd: Path) -> None:
     pictures = make("pictures.mcap", without=("labels", "detections"))
     found = make("found.mcap", without=("camera",))

@@ -20,6 +20,8 @@ from dmrl.stages.trim import run as trim
 
 from ..conftest import Record, peer, pixels_of
 
+pytestmark = pytest.mark.heavy
+
 PLAIN = Settings(split="none", shard_images=4)
 SHARDS = ((0, 2), (1, 2), (2, 4), (3, 4))
 MADE_OF_IT = ("README.md", "manifest.json", "provenance.json", "facts.json", "croissant.json")
@@ -165,7 +167,6 @@ def test_append_requires_the_settings_of_the_dataset(record: Record, tmp_path: P
     assert "image" in open_dataset(out).split("train").table.column_names
 
 
-@pytest.mark.heavy
 def test_split_of_a_flight_is_independent_of_other_flights(record: Record, tmp_path: Path) -> None:
     first, *others = flights(record, *range(8))
     for name, parts in (("a", [others]), ("b", [[one] for one in reversed(others)])):

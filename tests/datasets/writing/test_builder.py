@@ -19,6 +19,8 @@ from dmrl.topics import CAMERA_IMAGE, LABELS
 
 from ..conftest import HEIGHT_PX, STEP_NS, WIDTH_PX, Record, peer, pixels_of
 
+pytestmark = pytest.mark.heavy
+
 PLAIN = Settings()
 
 

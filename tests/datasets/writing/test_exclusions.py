@@ -48,6 +48,7 @@ def test_missing_file_gives_one_line_error(record: Record, tmp_path: Path) -> No
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.heavy
 def test_flags_without_an_image_are_reported(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

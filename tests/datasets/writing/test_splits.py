@@ -23,6 +23,7 @@ from dmrl.stages.dataset import Settings, run
 from ..conftest import STEP_NS, Record
 
 
+@pytest.mark.heavy
 def test_the_split_of_the_source_wins(record: Record, tmp_path: Path) -> None:
     own = {"train": f"[[0, {2 * STEP_NS}], [{5 * STEP_NS}, {5 * STEP_NS}]]"}
     own["test"] = f"[[{3 * STEP_NS}, {4 * STEP_NS}]]"
@@ -32,6 +33,7 @@ def test_the_split_of_the_source_wins(record: Record, tmp_path: Path) -> None:
     assert times == [3 * STEP_NS, 4 * STEP_NS]
 
 
+@pytest.mark.heavy
 def test_images_outside_every_span_are_left_out(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -43,12 +45,14 @@ def test_images_outside_every_span_are_left_out(
     )
 
 
+@pytest.mark.heavy
 def test_the_split_of_the_source_can_be_ignored(record: Record, tmp_path: Path) -> None:
     flight = record(split={"train": "[[0, 0]]"})
     assert run([flight], tmp_path / "a", Settings(split="recordings")).images == {"train": 6}
     assert run([flight], tmp_path / "b", Settings(split="none")).images == {"train": 6}
 
 
+@pytest.mark.heavy
 def test_recordings_are_held_out_whole(record: Record, tmp_path: Path) -> None:
     flights = [record(f"{k}.mcap", seed=k) for k in range(5)]
     run(flights, tmp_path / "out", Settings(test_share=0.4))
@@ -58,6 +62,7 @@ def test_recordings_are_held_out_whole(record: Record, tmp_path: Path) -> None:
     assert (len(held), len(kept), held & kept) == (2, 3, set())
 
 
+@pytest.mark.heavy
 def test_recordings_named_for_it_are_the_split_val(record: Record, tmp_path: Path) -> None:
     own = {"train": "[[0, 0]]"}
     flights = [record(f"{k}.mcap", seed=k, split=own) for k in range(2)]
@@ -71,6 +76,7 @@ def test_recordings_named_for_it_are_the_split_val(record: Record, tmp_path: Pat
         run(flights, tmp_path / "no", Settings(val="none"))
 
 
+@pytest.mark.heavy
 def test_one_recording_is_all_train_with_a_warning(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -78,6 +84,7 @@ def test_one_recording_is_all_train_with_a_warning(
     assert "nothing is held out for testing. Name two or more" in capsys.readouterr().err
 
 
+@pytest.mark.heavy
 def test_no_warning_where_nothing_was_to_be_held_out(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -128,6 +135,7 @@ def test_a_recording_beside_one_made_of_it_is_refused(record: Record, tmp_path: 
             run(both, tmp_path / "out", Settings())
 
 
+@pytest.mark.heavy
 def test_recording_and_render_of_its_dataset_are_accepted_together(
     record: Record, tmp_path: Path
 ) -> None:
@@ -140,6 +148,7 @@ def test_recording_and_render_of_its_dataset_are_accepted_together(
     assert sum(run([flight, other], tmp_path / "out", Settings()).images.values()) == 12
 
 
+@pytest.mark.heavy
 def test_splits_of_a_merged_recording_are_combined(record: Record, tmp_path: Path) -> None:
     # Two flights one after the other, each with a split of its own.
     first = record(
@@ -169,6 +178,7 @@ def test_a_copy_of_a_recording_is_refused(record: Record, tmp_path: Path) -> Non
 
 
 @given(st.data())
+@pytest.mark.heavy
 def test_every_time_has_the_split_of_its_span(data: st.DataObject) -> None:
     edges = sorted(data.draw(st.sets(st.integers(0, 60), min_size=2, max_size=12)))
     spans = list(zip(edges[::2], edges[1::2], strict=False))
@@ -183,6 +193,7 @@ def test_every_time_has_the_split_of_its_span(data: st.DataObject) -> None:
 
 
 @given(st.sets(st.text("0123456789abcdef", min_size=8, max_size=8), max_size=30), st.floats(0, 1))
+@pytest.mark.heavy
 def test_held_out_share_is_met_and_grows_by_inclusion(hashes: set[str], share: float) -> None:
     content = {Path(f"{k}.mcap"): sha for k, sha in enumerate(sorted(hashes))}
     held, more = (

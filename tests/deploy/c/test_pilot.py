@@ -73,6 +73,7 @@ def fly_at_random(seed: int) -> list[tuple[RobotState, float, list[RawDetection]
 
 
 @pytest.mark.parametrize("emulated", [False, pytest.param(True, marks=pytest.mark.heavy)])
+@pytest.mark.heavy
 def test_c_pilot_commands_equal_the_reference(folder: Path, emulated: bool) -> None:
     if emulated and not (shutil.which("qemu-riscv32") and shutil.which("riscv64-unknown-elf-gcc")):
         pytest.skip("no emulator")
@@ -110,6 +111,7 @@ def test_packets_are_read_as_they_were_written() -> None:
 
 
 @needs("clang")
+@pytest.mark.heavy
 def test_it_compiles_for_a_cortex_m4_without_a_library_and_fits(folder: Path) -> None:
     size = f'#include "pilot.h"\nchar fits[sizeof(pilot_t) == {PILOT_BYTES} ? 1 : -1];\n'
     (folder / "size.c").write_text(size)

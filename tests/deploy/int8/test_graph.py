@@ -44,6 +44,7 @@ def outputs(graph: FloatGraph, images: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["locanet", "dmrl-nano", "dmrl-nano-fine"])
+@pytest.mark.heavy
 def test_layers_equal_torch(name: str) -> None:
     network = settled(name)
     with torch.no_grad():

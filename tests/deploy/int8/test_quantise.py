@@ -66,6 +66,7 @@ def test_int8_is_near_float_on_most_random_networks() -> None:
     assert np.quantile(sqnr_db, 0.05) > 15
 
 
+@pytest.mark.heavy
 def test_channel_equalisation_keeps_outputs() -> None:
     moved = 0
     for seed in range(30):

@@ -41,6 +41,7 @@ def by_hand(layer: Conv, x: np.ndarray, *shortcut: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", [*range(6), 7, 8])  # the last two have shortcuts
+@pytest.mark.heavy
 def test_convolutions_equal_a_direct_loop(seed: int) -> None:
     network = random_network(seed)
     rng = np.random.default_rng(seed)

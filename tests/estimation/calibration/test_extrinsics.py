@@ -51,6 +51,7 @@ def flight(
     return CalibrationFlight(image_s, seen, uv[seen], time_s, attitude, peers)
 
 
+@pytest.mark.heavy
 def test_mount_and_delay_are_recovered() -> None:
     found = calibrate_mount([flight(0, images=1200)], AIDECK, Noise(3.0, 0.005))
     assert found is not None

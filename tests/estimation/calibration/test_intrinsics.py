@@ -41,6 +41,7 @@ def normalised(camera: Camera, made: Intrinsics) -> Array:
     return np.asarray(errors / (*made.focal_std_px, *made.centre_std_px))
 
 
+@pytest.mark.heavy
 def test_intrinsics_are_reproducible() -> None:
     rng = np.random.default_rng(0)
     seen = [corners_of(*pose(rng)) for _ in range(8)]
@@ -79,6 +80,7 @@ def test_corners_are_found_to_a_twentieth_of_a_pixel() -> None:
     assert np.abs(errors).max() < 0.4
 
 
+@pytest.mark.heavy
 def test_corners_are_found_downscaled_and_refined_at_full_size(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

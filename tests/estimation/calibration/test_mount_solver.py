@@ -181,6 +181,7 @@ def test_cauchy_cost_is_quadratic_then_logarithmic() -> None:
     )
 
 
+@pytest.mark.heavy
 def test_mount_is_solved_with_free_or_fixed_delay_and_misses_add_cost() -> None:
     off = VALUES + np.array([0.01, -0.01, 0.01, 0.02])
     found = solve_mount(VIEWS, TRUE, MATCHED, off, NOISE, 3.0)
@@ -215,6 +216,7 @@ def test_mount_angles_are_clipped_to_their_limits(monkeypatch: pytest.MonkeyPatc
     assert abs(found[0]) <= 0.01
 
 
+@pytest.mark.heavy
 def test_coarse_search_converges_from_a_few_degrees() -> None:
     off = np.array([0.03, -0.03, 0.03, 0.08])
     for sign in (1, -1):

@@ -47,6 +47,7 @@ def test_times_return_to_the_log(shift: ClockShift) -> None:
 
 
 @pytest.mark.parametrize("shift_s", [0.07, 0.12, -0.3, 3.2])
+@pytest.mark.heavy
 def test_the_ranges_of_both_robots_show_an_offset_of_the_clock(shift_s: float) -> None:
     sound = both_ranging(flown("in_view", "calibrated", 1000, 60.0))
     late = ClockShift(shift_s).move(sound)

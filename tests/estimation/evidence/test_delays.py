@@ -83,6 +83,7 @@ def test_long_delays_are_moved_and_named_once() -> None:
     assert [cause.name for cause in other.causes if cause.robot == 0] == ["flow late"]
 
 
+@pytest.mark.heavy
 def test_a_sound_flight_is_solved_once() -> None:
     pair = pair_of(flown("in_view", "calibrated", 1003, 20.0))
     ((found, _),) = estimate_pairs([replace(pair)])

@@ -47,6 +47,7 @@ def solve_sound() -> tuple[Solver, Values]:
     return solve(pair())
 
 
+@pytest.mark.heavy
 def test_a_sound_flight_fits() -> None:
     innovations, causes = check_fit(*solve_sound(), (0.0, LENGTH_S))
     assert causes == ()
@@ -57,6 +58,7 @@ def test_a_sound_flight_fits() -> None:
     assert 0.3 < np.sqrt(np.nanmean(sizes**2)) < 1.2
 
 
+@pytest.mark.heavy
 def test_a_stretch_of_swapped_axes_does_not_fit() -> None:
     sound = pair()
     at = (sound.time_s > 10) & (sound.time_s < 20)
@@ -68,6 +70,7 @@ def test_a_stretch_of_swapped_axes_does_not_fit() -> None:
     assert any(cause.from_s < 20 and cause.to_s > 10 for cause in causes)
 
 
+@pytest.mark.heavy
 def test_a_statistic_is_the_fall_of_the_cost_if_the_error_were_estimated() -> None:
     problem = build_problem({(0, 1): pair()})
     square = Gaussian()
@@ -104,6 +107,7 @@ def test_scores_are_those_of_the_optimum_where_a_solve_ended_before_it() -> None
         assert here.score == pytest.approx(there.score, abs=0.03)
 
 
+@pytest.mark.heavy
 def test_the_covariance_lacks_what_all_unknowns_explain() -> None:
     """The unknowns of the keyframes and the constants: by the inverse of the whole matrix."""
     solver, values = solve_sound()

@@ -54,6 +54,7 @@ def add_flow_noise(pair: Pair, where: Array, seed: int = 5) -> Pair:
     return replace(pair, own=own)
 
 
+@pytest.mark.heavy
 def test_models_are_scored_by_one_linearization_as_by_their_own() -> None:
     base = solve_sound()
     candidates = [
@@ -68,6 +69,7 @@ def test_models_are_scored_by_one_linearization_as_by_their_own() -> None:
         assert gains[one] == pytest.approx(own, abs=1e-3), one
 
 
+@pytest.mark.heavy
 def test_all_models_are_tried_where_the_step_is_singular(monkeypatch: pytest.MonkeyPatch) -> None:
     base = solve_sound()
     candidates = [one for one in list_candidates() if one.model.rows]

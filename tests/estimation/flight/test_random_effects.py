@@ -85,6 +85,7 @@ def test_pooling_assigns_a_common_difference_to_the_shared_robot() -> None:
     assert found.mean[[OWN_GYRO, SIZE]] == pytest.approx(0.0, abs=0.003)
 
 
+@pytest.mark.heavy
 def test_constant_that_varies_between_flights_keeps_a_wide_std() -> None:
     seen = np.zeros((SIZE, SIZE))
     seen[RANGE_BIAS, RANGE_BIAS] = 1e6

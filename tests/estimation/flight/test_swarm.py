@@ -18,6 +18,8 @@ from dmrl.flight import NOISE, Fault, Flight, Scenario, Trajectory, simulate
 from ..flights import pair_of, truth_at
 from ..sighted_flights import rmse, sightings
 
+pytestmark = pytest.mark.heavy
+
 Names = tuple[str, str]
 Estimates = dict[Names, Estimate]
 
@@ -48,7 +50,6 @@ def errors(flight: Flight, estimates: Estimates) -> np.ndarray:
     )
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize(("noise", "share"), [("calibrated", 1.0), ("realistic", 1.02)])
 def test_swarm_solve_is_as_accurate_as_pairwise_solves(noise: str, share: float) -> None:
     """With little noise nearer; else, where a sure pair contradicts, they are the pairs' own."""
@@ -58,7 +59,6 @@ def test_swarm_solve_is_as_accurate_as_pairwise_solves(noise: str, share: float)
     assert other < share * one
 
 
-@pytest.mark.heavy
 def test_swarm_covariances_cover_truth_and_ok_positions_are_accurate() -> None:
     flight, _, _, swarm = solved("random", "realistic")
     inside, bad, kept = [], 0, 0
@@ -72,7 +72,6 @@ def test_swarm_covariances_cover_truth_and_ok_positions_are_accurate() -> None:
     assert kept > 500 and bad <= 0.02 * kept
 
 
-@pytest.mark.heavy
 def test_swarm_positions_are_consistent_around_a_triangle() -> None:
     *_, swarm = solved("random", "realistic")
     one, two, three = (swarm[n].state for n in (("cf1", "cf2"), ("cf2", "cf3"), ("cf1", "cf3")))
@@ -81,7 +80,6 @@ def test_swarm_positions_are_consistent_around_a_triangle() -> None:
     assert np.allclose(around, three[:, 0] + 1j * three[:, 1])
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize("trajectory", ["parallel", "hover"])
 def test_unobservable_swarm_motion_has_no_ok_positions(trajectory: Trajectory) -> None:
     *_, swarm = solved(trajectory, "calibrated", duration_s=20.0)
@@ -89,7 +87,6 @@ def test_unobservable_swarm_motion_has_no_ok_positions(trajectory: Trajectory) -
         assert not (estimate.status == OK).any()
 
 
-@pytest.mark.heavy
 def test_static_observer_has_ambiguous_bearings() -> None:
     *_, swarm = solved("observer_static", "calibrated", duration_s=20.0)
     for peer in ("cf2", "cf3"):
@@ -104,7 +101,6 @@ def test_swarm_solve_leaves_a_single_pair_unchanged() -> None:
     assert estimate_swarm({names: pair}, alone) == alone
 
 
-@pytest.mark.heavy
 def test_shadowed_ranges_of_one_pair_do_not_bend_the_others() -> None:
     # Ranges 1 m too long for 3 s, twice: taken as they are, all three robots were 0.3 m off.
     shadow = Fault("nlos", "cf1", "cf2", size=1.0, duration_s=3.0, number=2)
@@ -119,7 +115,6 @@ def test_shadowed_ranges_of_one_pair_do_not_bend_the_others() -> None:
     assert np.sqrt((error**2).mean()) < np.sqrt((without**2).mean())
 
 
-@pytest.mark.heavy
 def test_swarm_estimate_inconsistent_with_pair_is_detected() -> None:
     *_, pairwise, swarm = solved("in_view", "calibrated")
     names = ("cf1", "cf2")
@@ -128,7 +123,6 @@ def test_swarm_estimate_inconsistent_with_pair_is_detected() -> None:
     assert is_inconsistent(bent, pairwise[names])
 
 
-@pytest.mark.heavy
 def test_clock_offset_is_estimated_in_a_swarm() -> None:
     late_s = 0.06
     flight = simulate(Scenario(3, 40.0, "random"), NOISE["calibrated"], 1)
@@ -154,7 +148,6 @@ def test_clock_offset_is_estimated_in_a_swarm() -> None:
     assert swarm["cf2", "cf3"].value("clock", 1) == pytest.approx(late_s, abs=0.02)
 
 
-@pytest.mark.heavy
 def test_detections_improve_a_swarm_solve() -> None:
     flight, pairs, both, swarm = solved("in_view", "calibrated")
     sees = sightings(flight, "cf1", ("cf2",))
@@ -171,7 +164,6 @@ def test_detections_improve_a_swarm_solve() -> None:
     assert error[1] < 0.7 * error[0]
 
 
-@pytest.mark.heavy
 def test_a_long_swarm_is_solved_in_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     flight, pairs, both, whole = solved("random", "calibrated")
     monkeypatch.setattr(windows, "WINDOW_S", 16.0)

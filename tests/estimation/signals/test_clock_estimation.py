@@ -73,6 +73,7 @@ def test_clocks_may_be_far_apart(apart_s: float) -> None:
     assert clock.offset_s == pytest.approx(-OFFSET_S - apart_s, abs=0.005)
 
 
+@pytest.mark.heavy
 def test_clock_sigma_is_consistent_for_independent_ranges() -> None:
     errors = []
     for seed in range(8):
@@ -148,6 +149,7 @@ def test_random_clocks_compose_and_invert(one: Clock, two: Clock) -> None:
 
 @settings(max_examples=12, phases=[Phase.generate])
 @given(st.floats(-50, 50), st.floats(-20e-6, 20e-6), st.floats(0.1, 5), st.integers(0, 99))
+@pytest.mark.heavy
 def test_random_offset_and_drift_are_recovered(
     offset_s: float, drift: float, scale: float, seed: int
 ) -> None:

@@ -53,6 +53,7 @@ def test_outliers_are_no_jump() -> None:
     assert found is not None and found.gain < 8
 
 
+@pytest.mark.heavy
 def test_short_or_unlike_series_show_none() -> None:
     short = LOG_S[:250]
     assert find_clock_jump(short, distance(short), short, distance(short)) is None

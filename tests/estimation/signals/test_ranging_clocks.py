@@ -15,6 +15,7 @@ from dmrl.estimation.signals.ranging_clocks import (
 )
 
 
+@pytest.mark.heavy
 def test_robust_line_fit_has_consistent_stds() -> None:
     x = np.linspace(-100, 100, 2001)
     off = []

@@ -15,6 +15,8 @@ from dmrl.estimation.solver.residuals import bearing_factor
 from ..flights import flown, pair_of
 from ..sighted_flights import NOISE, sightings
 
+pytestmark = pytest.mark.heavy
+
 
 def solve_sighted(sees: BearingMeasurements) -> tuple[Solver, MapEstimate]:
     """The plain solution of a flight of 60 s with the detections of the first robot."""
@@ -33,7 +35,6 @@ def solve_seen() -> tuple[Solver, MapEstimate]:
     return solve_sighted(see())
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize("assumed", [1.0, 2.5])
 def test_noise_of_detections_is_that_of_their_residuals(assumed: float) -> None:
     sees = see()
@@ -44,7 +45,6 @@ def test_noise_of_detections_is_that_of_their_residuals(assumed: float) -> None:
     assert (view.weight == 1).all()
 
 
-@pytest.mark.heavy
 def test_errors_that_last_count_once() -> None:
     sees, rng = see(), np.random.default_rng(4)
     lasting = np.zeros(len(sees.time_s))

@@ -72,6 +72,7 @@ def noise_of(task: Problem, rng: np.random.Generator) -> np.ndarray:
     return out + rng.normal(0, white, KEYS - 1) + 1j * rng.normal(0, white, KEYS - 1)
 
 
+@pytest.mark.heavy
 def test_denoising_removes_motion_that_is_noise() -> None:
     task, rng = problem(), np.random.default_rng(0)
     for _ in range(3):
@@ -80,6 +81,7 @@ def test_denoising_removes_motion_that_is_noise() -> None:
         assert own < 0.15 * raw and relative < 0.15 * raw
 
 
+@pytest.mark.heavy
 def test_denoising_keeps_fast_and_slow_motion() -> None:
     task = problem(NoiseModel(grade=0.63))
     rng = np.random.default_rng(1)

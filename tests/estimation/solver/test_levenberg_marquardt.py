@@ -37,6 +37,7 @@ def test_solve_converges_to_the_true_flight() -> None:
     assert again.cost == pytest.approx(found.cost, rel=1e-3)
 
 
+@pytest.mark.heavy
 def test_a_small_gain_of_a_damped_step_does_not_end_the_iteration(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -78,6 +79,7 @@ def test_a_singular_step_is_damped_until_it_can_be_solved(monkeypatch: pytest.Mo
         solve_step(singular[0])
 
 
+@pytest.mark.heavy
 def test_an_iteration_ends_at_a_known_solution() -> None:
     problem, true = flight()
     whole = Solver(problem).solve(moved(true, 3), tolerance=0.0)
@@ -105,6 +107,7 @@ def test_a_relative_path_is_the_peer_in_the_observer_s_frame() -> None:
     assert relative_path(state, 1, 0)[0, :2] == pytest.approx([-2 * np.sin(0.3), -2 * np.cos(0.3)])
 
 
+@pytest.mark.heavy
 def test_log_evidence_equals_laplace_approximation_by_quadrature() -> None:
     """Of a model with fewer unknowns it is the integral over those, by quadrature."""
     problem, true = flight()
@@ -132,6 +135,7 @@ def test_log_evidence_equals_laplace_approximation_by_quadrature() -> None:
     assert laplace == pytest.approx(total, abs=0.3)
 
 
+@pytest.mark.heavy
 def test_evidence_prefers_the_noise_that_is_there() -> None:
     pair = pair_of(flown("random", "calibrated", 1001, 40.0))
     problem = build_problem({(0, 1): pair})

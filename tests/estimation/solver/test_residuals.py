@@ -300,6 +300,7 @@ def test_simultaneous_images_share_one_weight() -> None:
     assert many.weight[10:-10] == pytest.approx(1 / 5)
 
 
+@pytest.mark.heavy
 def test_equations_are_the_gradient_of_the_cost() -> None:
     problem, values = flight()
     solver = Solver(problem)

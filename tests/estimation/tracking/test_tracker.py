@@ -21,6 +21,7 @@ from dmrl.geometry.frames import (
 from .drawn_peers import CALIBRATED, DT_S, TUNING, Detector, depth_biases, followed, wandering
 
 
+@pytest.mark.heavy
 def test_a_peer_is_followed_through_misses_and_false_alarms() -> None:
     run = followed(1, np.array([[1.5, 0.0, 0.0]]), steps=150)
     assert len(run.ids) > 100
@@ -80,6 +81,7 @@ NOTHING = ImageDetections(np.zeros((0, 2)), np.zeros(0), 0.0, 0.0, np.zeros(0))
 STILL = EgoMotion(DT_S, np.zeros(3), 0.0)
 
 
+@pytest.mark.heavy
 def test_static_peer_has_zero_velocity_for_a_moving_observer() -> None:
     tracker = Tracker(AIDECK, TUNING)
     peer, own, yaw = np.array([1.8, 0.0, 0.1]), np.zeros(3), 0.0
@@ -97,6 +99,7 @@ def test_static_peer_has_zero_velocity_for_a_moving_observer() -> None:
     assert np.abs(track.velocity_mps).max() < 0.05
 
 
+@pytest.mark.heavy
 def test_track_of_peer_out_of_view_outlives_a_missing_one() -> None:
     tracker = Tracker(AIDECK, TUNING)
     for _ in range(10):
@@ -110,6 +113,7 @@ def test_track_of_peer_out_of_view_outlives_a_missing_one() -> None:
     assert not left
 
 
+@pytest.mark.heavy
 def test_single_false_alarms_never_become_tracks() -> None:
     tracker, rng = Tracker(AIDECK, TUNING), np.random.default_rng(0)
     for _ in range(100):
@@ -120,6 +124,7 @@ def test_single_false_alarms_never_become_tracks() -> None:
 
 
 @pytest.mark.parametrize(("confidence", "images"), [(0.95, 1), (0.8, 5), (0.1, None)])
+@pytest.mark.heavy
 def test_confidence_decides_when_a_lasting_detection_is_a_peer(
     confidence: float, images: int | None
 ) -> None:
@@ -159,6 +164,7 @@ def test_a_confidence_tells_what_the_image_before_did_not(
     assert np.log(bright) == pytest.approx(told * (now - (told < 1) * before), abs=1e-4)
 
 
+@pytest.mark.heavy
 def test_weak_detections_keep_an_expected_track_accurate() -> None:
     """Of two tracks, one gets weak detections and the other none."""
     weak, blind = Tracker(AIDECK, TUNING), Tracker(AIDECK, TUNING)
@@ -175,6 +181,7 @@ def test_weak_detections_keep_an_expected_track_accurate() -> None:
     assert held.existence > 0.9
 
 
+@pytest.mark.heavy
 def test_missed_detections_lower_existence_more_at_short_distance() -> None:
     fallen = []
     for distance_m in (0.75, 1.75):
@@ -188,6 +195,7 @@ def test_missed_detections_lower_existence_more_at_short_distance() -> None:
     assert 0 < fallen[1] < fallen[0] < 0.4
 
 
+@pytest.mark.heavy
 def test_two_tracks_keep_numbers_and_are_named_by_range() -> None:
     tracker, identity = Tracker(AIDECK, TUNING), TrackIdentity()
     peers = np.array([[1.0, 0.3, 0.0], [2.2, -0.4, 0.1]])
@@ -226,6 +234,7 @@ def started(xyz: Array) -> TrackStates:
     return tracker.states
 
 
+@pytest.mark.heavy
 def test_predicted_covariance_matches_simulated_motion_model() -> None:
     """Against a simulation of the tuning's words: Gauss-Markov velocity, drift, heading."""
     rng, count, dt_s, steps = default_rng(2), 20_000, 0.1, 12
@@ -293,6 +302,7 @@ def test_covariance_of_a_new_track_matches_sampled_detections() -> None:
     assert np.sqrt(np.diag(tracker.states.covariance[0])[3:6]) == pytest.approx(std)
 
 
+@pytest.mark.heavy
 def test_constant_tilt_bias_stays_in_the_covariance() -> None:
     tracker, xyz = Tracker(AIDECK, TUNING), np.array([[1.5, 0.0, 0.0]])
     tracker.step(STILL, view_of(xyz))

@@ -62,6 +62,7 @@ def test_a_stamped_image_has_its_time_in_whole_milliseconds() -> None:
     assert read(pack_image(image, "stamped"))[0] == [image]
 
 
+@pytest.mark.heavy
 def test_streamer_images_keep_number_times_and_state_over_their_wraps() -> None:
     sent = []
     for k in range(600):

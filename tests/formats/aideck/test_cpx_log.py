@@ -105,6 +105,7 @@ NOISE = st.sampled_from([b"", bytes(3), b"\0\0\x63\5", b"\2\0\x63", b"\6\0\x63\5
 
 @example([(b"\2\0\x63", 4)], 1)  # noise and a length that together are a header
 @given(st.lists(st.tuples(NOISE, st.integers(0, 5)), max_size=9), st.integers(1, 9))
+@pytest.mark.heavy
 def test_packets_in_noise_equal_a_bytewise_search(
     parts: list[tuple[bytes, int]], step: int
 ) -> None:

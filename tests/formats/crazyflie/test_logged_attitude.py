@@ -45,6 +45,7 @@ def test_rows_that_share_a_time_keep_their_angles_and_the_slope_of_the_yaw() -> 
 
 
 @given(ANGLE, ANGLE, ANGLE)
+@pytest.mark.heavy
 def test_angles_that_were_logged_are_the_turn_of_a_pose(
     roll: float, pitch: float, yaw: float
 ) -> None:

@@ -77,6 +77,7 @@ def test_every_type_of_variable_is_read() -> None:
 
 
 @pytest.mark.parametrize("name", ["synthetic", *LOGS])
+@pytest.mark.heavy
 def test_a_log_cut_anywhere_gives_every_whole_record_and_a_warning(
     name: str, request: pytest.FixtureRequest
 ) -> None:

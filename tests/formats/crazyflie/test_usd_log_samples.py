@@ -86,6 +86,7 @@ def test_angles_and_quaternion_of_one_attitude_agree(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.heavy
 def test_the_gyroscope_of_a_real_flight_is_the_slope_of_its_attitude(data: Path) -> None:
     found = samples(data / "crazyflie-usd" / "eckart00_brushless_flights")["/cf1/attitude"]
     time = np.array([s.time_ns for s in found]) * 1e-9
@@ -95,6 +96,7 @@ def test_the_gyroscope_of_a_real_flight_is_the_slope_of_its_attitude(data: Path)
     assert np.abs(turned - (yaw - yaw[0])).max() < 0.05
 
 
+@pytest.mark.heavy
 def test_the_state_of_a_real_flight_is_where_motion_capture_saw_it(data: Path) -> None:
     found = samples(data / "crazyflie-usd" / "eckart00_brushless_flights")
 
@@ -183,6 +185,7 @@ def test_missing_attitude_or_velocity_reports_the_reason(
     assert err.count("\n") == 1 and all(reason in err for reason in reasons)
 
 
+@pytest.mark.heavy
 def test_real_logs_without_pitch_keep_their_velocity(
     data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

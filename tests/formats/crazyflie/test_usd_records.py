@@ -1,6 +1,7 @@
 """Records of several kinds, against sequential parsing."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -40,6 +41,7 @@ def plain(
     rest=st.binary(max_size=7),
     seed=st.integers(0, 9),
 )
+@pytest.mark.heavy
 def test_records_equal_sequential_parsing(
     numbers: list[int],
     codes: list[str],

@@ -233,6 +233,7 @@ def test_coloured_pictures_are_not_raw(folder: Path) -> None:
         samples(folder, "CompressedImage", Options(raw=True))
 
 
+@pytest.mark.heavy
 def test_full_sensor_images_are_cropped_to_the_camera(tmp_path: Path) -> None:
     whole = np.random.default_rng(0).integers(0, 256, (244, 324, 3), np.uint8)
     (tmp_path / "a.png").write_bytes(encode_png(whole))

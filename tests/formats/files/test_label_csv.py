@@ -143,6 +143,7 @@ def test_row_without_peer_keeps_its_source(tmp_path: Path) -> None:
     st.lists(st.integers(0, 8), min_size=3, max_size=3),
     st.integers(0, 100),
 )
+@pytest.mark.heavy
 def test_label_rows_round_trip(
     tmp_path_factory: pytest.TempPathFactory, edges: list[float], sigmas: list[int], share: int
 ) -> None:

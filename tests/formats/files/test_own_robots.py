@@ -12,6 +12,8 @@ from dmrl.formats.base import Options
 from dmrl.formats.files import mapped_csv
 from dmrl.recording import read_table
 
+pytestmark = pytest.mark.heavy
+
 QUANTITIES = {
     "time": "s",
     "roll": "rad",
@@ -120,7 +122,6 @@ def test_one_column_map_serves_all_robots(layout: str, tmp_path: Path) -> None:
                 np.testing.assert_allclose(found[field].to_numpy(), logs[own][name], atol=1e-7)
 
 
-@pytest.mark.heavy
 def test_own_sensors_are_labelled_both_ways(tmp_path: Path) -> None:
     source = write(tmp_path, "a file a robot")
     drive_ = dmrl.convert(source, tmp_path / "out.mcap", columns=tmp_path / "map.toml")

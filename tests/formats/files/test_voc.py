@@ -40,6 +40,7 @@ def test_voc_with_its_folders(tmp_path: Path) -> None:
     assert content.split == {"train": [(0, 600_000_000)], "val": [(700_000_000, 1_000_000_000)]}
 
 
+@pytest.mark.heavy
 def test_voc_as_supervision_reads_it(tmp_path: Path) -> None:
     sv = pytest.importorskip("supervision")
     for k in (1, 2):

@@ -73,6 +73,7 @@ def test_yolo_without_splits(classes: str, beside: bool, tmp_path: Path) -> None
     assert not find_format(tmp_path).content(tmp_path, Options()).split
 
 
+@pytest.mark.heavy
 def test_yolo_as_supervision_writes_it(tmp_path: Path) -> None:
     sv = pytest.importorskip("supervision")
     paths = []

@@ -99,6 +99,7 @@ def test_the_attitude_differs_from_the_published_one_by_a_yaw_only() -> None:
     np.testing.assert_allclose(yaw[2], [0, 0, 1], atol=1e-15)
 
 
+@pytest.mark.heavy
 def test_the_published_set_is_whole(data: Path) -> None:
     images = locanet.load_images(data / "locanet-synthetic")
     assert [i.number for i in images] == list(range(882))
@@ -110,6 +111,7 @@ def test_the_published_set_is_whole(data: Path) -> None:
     assert sum(len(i.published) for i in several) == 0
 
 
+@pytest.mark.heavy
 def test_true_projections_lie_in_the_middle_of_the_boxes(data: Path) -> None:
     images = locanet.load_images(data / "locanet-synthetic")
     edges = PUBLISHED_RENDER.width_px, PUBLISHED_RENDER.height_px

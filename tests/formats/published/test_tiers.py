@@ -59,6 +59,7 @@ def test_other_files_are_refused(ranges: Path, tmp_path: Path) -> None:
     assert not tiers.can_read(cut)
 
 
+@pytest.mark.heavy
 def test_the_public_file_reads(data: Path) -> None:
     samples = list(tiers.load_content(data / "uwb-tiers" / "4robots_data_01.npz").samples)
     ranged = {s.topic for s in samples if s.message == "UwbRange"}
@@ -107,6 +108,7 @@ def test_poses_are_pairs_of_numbers(shape: tuple[int, ...], ranges: Path) -> Non
 
 
 @pytest.mark.parametrize(("robots", "fits"), [(64, True), (65, False)])
+@pytest.mark.heavy
 def test_sixty_four_robots_are_the_most(robots: int, fits: bool, tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     poses = {f"optitrack_turtle{k}_pose_np": np.zeros((2, 2)) for k in range(robots)}

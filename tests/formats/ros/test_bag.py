@@ -33,6 +33,7 @@ def samples(source: Path, options: Options | None = None) -> dict[str, list[Samp
 
 
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap", "ros1"])
+@pytest.mark.heavy
 def test_bags_of_every_kind_give_the_same(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -60,6 +61,7 @@ def test_bags_of_every_kind_give_the_same(
     assert "left out: messages on /chatter: std_msgs/msg/String" in capsys.readouterr().err
 
 
+@pytest.mark.heavy
 def test_receive_time_becomes_publish_time(tmp_path: Path) -> None:
     found = samples(foreign.ros2_bag(tmp_path / "flight", late_ns=7_000_000))
     for topic in ("/cf1/height", "/cf1/range/cf2", "/cf1/camera/image"):
@@ -68,6 +70,7 @@ def test_receive_time_becomes_publish_time(tmp_path: Path) -> None:
         assert received == [10**12 + k * 10**8 + 7_000_000 for k in range(5)]
 
 
+@pytest.mark.heavy
 def test_zero_stamps_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     late_ns = 48 * 86_400 * 10**9
     source = foreign.ros2_bag(tmp_path / "flight", late_ns=late_ns, ranges_stamped=False)
@@ -76,6 +79,7 @@ def test_zero_stamps_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "get the bag's times: 5 on /uwb/cf1/cf2/distance" in capsys.readouterr().err
 
 
+@pytest.mark.heavy
 def test_robots_are_named_as_the_user_wants(tmp_path: Path) -> None:
     found = samples(bag("sqlite3", tmp_path), Options(names={"cf1": "a", "cf2": "b"}))
     assert "/a/range/b" in found and "/a/attitude" in found
@@ -157,6 +161,7 @@ def test_a_pose_of_motion_capture_is_kept_beside_another_of_the_robot() -> None:
     assert unknown == ["/vio/cf1/pose"]  # as long as the first, and after it
 
 
+@pytest.mark.heavy
 def test_expected_message_count_is_an_estimate_per_topic(tmp_path: Path) -> None:
     content = ros.load_content(bag("sqlite3", tmp_path), Options())
     with_odometry = 4  # of one message come attitude, velocity, height and pose

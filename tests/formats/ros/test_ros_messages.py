@@ -266,6 +266,7 @@ ANGLE = st.floats(-1.4, 1.4)
 @hypothesis.given(
     ANGLE, ANGLE, st.floats(-3, 3), st.lists(st.floats(-2, 2), min_size=3, max_size=3)
 )
+@pytest.mark.heavy
 def test_vectors_and_rates_are_turned_as_the_robot_is(
     roll: float, pitch: float, yaw: float, vector: list[float]
 ) -> None:

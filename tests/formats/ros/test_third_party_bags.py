@@ -20,6 +20,8 @@ from dmrl.terminal.left_out import count_left_out
 from . import ros_writer as ros
 from .ros_writer import Sent, times
 
+pytestmark = pytest.mark.heavy
+
 
 def read(path: Path, **options: object) -> tuple[dict[str, list[Sample]], dict[str, int]]:
     """Samples by topic, and what was left out."""
@@ -58,7 +60,6 @@ def images(topic: str, encoding: str = "rgb8", count: int = 5) -> list[Sent]:
         ("/swarm/cf1/uwb/swarm/cf2", (), ("cf1", "cf2")),
     ],
 )
-@pytest.mark.heavy
 def test_a_range_to_the_floor_is_no_range_to_a_peer(
     topic: str, others: tuple[str, ...], pair: tuple[str, str] | None, tmp_path: Path
 ) -> None:

@@ -96,6 +96,7 @@ def test_ranges_both_ways_set_the_second_robots_clock(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("axis", ["yaw rate", "pitch rate"])
+@pytest.mark.heavy
 def test_a_camera_and_its_robot_turn_the_same_way(tmp_path: Path, axis: str) -> None:
     path, rng = tmp_path / "a.mcap", np.random.default_rng(0)
     scene = rng.integers(0, 256, (12, 16), np.uint8).repeat(12, 0).repeat(12, 1)

@@ -45,6 +45,7 @@ def test_labels_stay_at_the_robots_and_depth_follows_the_zoom() -> None:
     assert checked > 100
 
 
+@pytest.mark.heavy
 def test_depths_stay_in_the_range_of_the_labels() -> None:
     depths = [
         batch.robots[..., 2] for batch in batches(replace(GEOMETRY, zoom=(0.2, 5.0), paste=0.0))
@@ -57,6 +58,7 @@ def test_depths_stay_in_the_range_of_the_labels() -> None:
     assert found.max() > 1.3
 
 
+@pytest.mark.heavy
 def test_sigmas_follow_the_zoom() -> None:
     for batch in batches(replace(GEOMETRY, mosaic_share=0.0, paste=0.0), 3):
         robots = batch.robots[torch.isfinite(batch.robots[..., 0])]
@@ -122,6 +124,7 @@ def test_every_augmentation_key_changes_its_own_property() -> None:
     assert {field.name: getattr(made, field.name) for field in fields(made)} == values
 
 
+@pytest.mark.heavy
 def test_a_grey_share_of_images_has_no_colours() -> None:
     settings = Augmentation(colour=0.2, noise=0.02, grey_share=0.5)
     images = torch.cat([batch.images for batch in batches(settings)]).float()
@@ -310,6 +313,7 @@ def test_crop_windows_cover_their_source_without_leaving_it(
             assert place.mean(axis=0) == pytest.approx([0.5, 0.5], abs=0.05)
 
 
+@pytest.mark.heavy
 def test_a_window_is_no_smaller_than_its_source_lets_it_be(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -318,6 +322,7 @@ def test_a_window_is_no_smaller_than_its_source_lets_it_be(
         assert {zoom for zoom, _, _ in found} == {least}
 
 
+@pytest.mark.heavy
 def test_noise_pattern_starts_at_a_random_offset() -> None:
     maker, rng = augmenter(noise=0.1), np.random.default_rng(4)
     assert len(maker._grain) == 2 * 112 * 160 * 3

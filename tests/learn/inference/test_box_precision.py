@@ -113,6 +113,7 @@ def test_a_missing_package_is_named_with_its_extra(
         judged(tmp_path / "a.mcap", [([point], [point])])
 
 
+@pytest.mark.heavy
 def test_boxes_of_two_models_are_judged_each(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

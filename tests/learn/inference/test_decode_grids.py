@@ -146,6 +146,7 @@ GRID = st.sampled_from([0.0, 0.005, 0.01, 0.25, 0.5, 0.75])
     st.integers(1, 6),
     st.sampled_from([-1.0, 0.01, 0.3]),
 )
+@pytest.mark.heavy
 def test_decoded_detections_equal_a_loop_over_cells(
     confidence: np.ndarray, offset: np.ndarray, shifted: bool, most: int, least: float
 ) -> None:

@@ -146,6 +146,7 @@ def test_equal_confidences_count_together_whatever_their_order() -> None:
         assert area[0] == pytest.approx(1 / 2 + 1 / 2 * 2 / 4)
 
 
+@pytest.mark.heavy
 def test_intervals_cover_the_value_and_shrink_with_more_images() -> None:
     rng = np.random.default_rng(0)
     widths = []
@@ -175,6 +176,7 @@ def test_the_seed_decides_the_intervals() -> None:
 
 
 @given(st.lists(st.floats(-100, 100), min_size=1, max_size=30), st.randoms())
+@pytest.mark.heavy
 def test_the_median_is_numpys_also_with_repeats(numbers: list[float], random: object) -> None:
     array = np.array(numbers)
     times = np.array([random.randint(1, 3) for _ in numbers])  # type: ignore[attr-defined]
@@ -200,6 +202,7 @@ def test_ten_thousand_images_take_seconds() -> None:
     assert time.process_time() - begun < 20
 
 
+@pytest.mark.heavy
 def test_an_interval_holds_the_middle_95_percent() -> None:
     images = 400
     labels, found = scene(images)

@@ -55,6 +55,7 @@ def test_image_weights_equal_repetition_counts(seed: int) -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.sampled_from("rwn")), min_size=1, max_size=15),
        st.integers(1, 9))  # fmt: skip
+@pytest.mark.heavy
 def test_average_precision_equals_a_sum_over_thresholds(
     rows: list[tuple[int, str]], more: int
 ) -> None:

@@ -214,6 +214,7 @@ def test_weights_of_other_dtypes_are_refused(run: Path, kind: torch.dtype) -> No
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+@pytest.mark.heavy
 def test_weights_are_interpolated_by_a_fraction(share: float) -> None:
     network, first = build_network("locanet", seed=1), get_weights(build_network("locanet", seed=2))
     before = {name: value.clone() for name, value in get_weights(network).items()}

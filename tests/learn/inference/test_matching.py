@@ -25,6 +25,7 @@ PIXELS = st.integers(0, 9).map(float)
 
 @given(arrays(float, st.tuples(st.integers(1, 4), st.just(2)), elements=PIXELS),
        arrays(float, st.tuples(st.integers(1, 4), st.just(2)), elements=PIXELS))  # fmt: skip
+@pytest.mark.heavy
 def test_labels_and_detections_pair_at_the_least_total_distance(
     label_px: np.ndarray, found_px: np.ndarray
 ) -> None:
@@ -110,6 +111,7 @@ ROWS = st.lists(st.tuples(st.integers(0, 3), PIXELS, PIXELS), max_size=9).map(
 
 
 @given(ROWS, ROWS, st.sampled_from([0.0, 1.0, 3.0, 5.0]))
+@pytest.mark.heavy
 def test_detections_match_greedily_to_the_nearest_free_label(
     label_rows: list[tuple[int, float, float]],
     found_rows: list[tuple[int, float, float]],

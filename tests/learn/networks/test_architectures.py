@@ -20,6 +20,7 @@ def test_locanet_has_the_published_number_of_parameters() -> None:
     assert count_parameters(build_network("locanet")) == 24_778
 
 
+@pytest.mark.heavy
 def test_the_small_networks_keep_to_their_budget() -> None:
     assert count_parameters(build_network("dmrl-nano")) == 24_836
     assert count_macs(build_network("dmrl-nano")) == 57_720_320
@@ -29,6 +30,7 @@ def test_the_small_networks_keep_to_their_budget() -> None:
 
 
 @pytest.mark.parametrize(("name", "wide_px"), [("dmrl-nano", 287), ("dmrl-nano-fine", 311)])
+@pytest.mark.heavy
 def test_receptive_field_has_its_documented_width(name: str, wide_px: int) -> None:
     network = build_network(name).eval()
     for layer in network.modules():

@@ -39,6 +39,7 @@ def test_an_odd_size_and_half_precision_work_too() -> None:
 @pytest.mark.parametrize("shape", [(7, 8), (8, 7), (7, 9), (8, 8), (1, 1)])
 @pytest.mark.parametrize(("stride", "dilation"), [(2, 1), (1, 3), (1, 5), (2, 2)])
 @pytest.mark.parametrize("training", [True, False])
+@pytest.mark.heavy
 def test_depthwise_outputs_equal_torch_for_any_size(
     shape: tuple[int, int], stride: int, dilation: int, training: bool
 ) -> None:

@@ -12,6 +12,8 @@ from dmrl.learn.networks import hdf5_arrays
 from dmrl.learn.networks.architectures import normalize_images
 from dmrl.learn.networks.keras_weights import load_keras_weights
 
+pytestmark = pytest.mark.heavy
+
 WIDTHS = (3, 8, 16, 32, 64)
 Variables = dict[str, NDArray[np.float32]]
 

@@ -28,6 +28,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("group_work")
 
 
+@pytest.mark.heavy
 def test_all_processes_run_and_rank_0_returns(work: ModuleType) -> None:
     threads = torch.get_num_threads()
     assert run_distributed(2, partial(work.rank_sum, more=10)) == 11

@@ -18,6 +18,7 @@ def test_every_direction_of_an_update_is_of_about_the_same_size(shape: tuple[int
     assert float(sizes.max()) < 1.3
 
 
+@pytest.mark.heavy
 def test_muon_takes_the_kernels_that_mix_channels() -> None:
     network = build_network("dmrl-nano")
     optimizer = build_optimizer(network, "muon", 0.01)
@@ -32,6 +33,7 @@ def test_muon_takes_the_kernels_that_mix_channels() -> None:
     assert len(every) == len(list(network.parameters()))
 
 
+@pytest.mark.heavy
 def test_a_step_of_muon_is_as_large_as_one_of_adam_and_downhill() -> None:
     sizes = {}
     for name in ("adam", "muon"):

@@ -95,6 +95,7 @@ def test_the_last_epochs_keep_images_whole() -> None:
 
 
 @pytest.mark.parametrize("frozen", [0, 1])
+@pytest.mark.heavy
 def test_frozen_norms_are_learnt_but_not_measured(
     examples: ExampleSet, tmp_path: Path, frozen: int
 ) -> None:
@@ -115,6 +116,7 @@ def test_frozen_norms_are_learnt_but_not_measured(
     assert not any(torch.equal(first[name], second[name]) for name in scales)
 
 
+@pytest.mark.heavy
 def test_distillation_loss_is_zero_for_an_identical_teacher(examples: ExampleSet) -> None:
     settings = TrainConfig(distill_share=1.0, device="cpu")
     batch = collate(examples, np.arange(8))
@@ -157,12 +159,14 @@ def test_classes_and_the_spread_are_learnt(examples: ExampleSet, tmp_path: Path)
     assert 0.2 < np.median(error_m) / np.median(found.sigma_depth_m[:, 0]) < 2
 
 
+@pytest.mark.heavy
 def test_a_loss_that_is_no_number_stops_the_training(examples: ExampleSet, tmp_path: Path) -> None:
     wild = replace(SETTINGS, learning_rate=1e7, warmup_epochs=0)
     with pytest.raises(SettingError, match=r"the loss is nan in epoch 1, step 7\. Lower"):
         trained(examples, tmp_path / "run", wild)
 
 
+@pytest.mark.heavy
 def test_tensorboard_gets_loss_and_learning_rate(examples: ExampleSet, tmp_path: Path) -> None:
     trained(examples, tmp_path / "run")
     log = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
@@ -171,6 +175,7 @@ def test_tensorboard_gets_loss_and_learning_rate(examples: ExampleSet, tmp_path:
     assert [event.step for event in log.Scalars("loss/train")] == [7, 14, 21, 28]
 
 
+@pytest.mark.heavy
 def test_validation_is_watched_and_changes_nothing(examples: ExampleSet, tmp_path: Path) -> None:
     weights = []
     for name, watched in (("without", None), ("with", examples)):
@@ -228,6 +233,7 @@ def test_missing_cuda_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         select_device("cuda")
 
 
+@pytest.mark.heavy
 def test_weight_ema_follows_early_steps_and_averages_later_ones() -> None:
     network = build_network("dmrl-nano")
     mean = WeightEma(network, 100)

@@ -65,6 +65,7 @@ def test_few_labels_or_nothing_right_give_no_threshold() -> None:
     assert select_threshold(score_detections(12, many, far)) is None
 
 
+@pytest.mark.heavy
 def test_figures_are_of_robots_inside_the_images() -> None:
     robots = np.full((3, 2, len(ROBOT_FIELDS)), np.nan, np.float32)
     robots[0, 0, :6] = (20, 10, 1, 0, 0, 0)

@@ -218,6 +218,7 @@ def off_by(write: Write, off_px: list[tuple[float, float]]) -> None:
         write(k * 10**9, "/cf1/labels", message_class("PeerLabels")(peers=[peer]))
 
 
+@pytest.mark.heavy
 def test_bias_is_judged_by_its_standard_error(tmp_path: Path) -> None:
     def spread(middle_px: float, by_px: float) -> list[float]:
         return [middle_px + by_px * (-1) ** k for k in range(40)] + [middle_px]
@@ -272,6 +273,7 @@ def test_check_after_writing_never_fails(
     assert f"/cf2/{topic}" in capsys.readouterr().err
 
 
+@pytest.mark.heavy
 def test_boxes_cut_by_the_image_edge_are_ignored_for_bias(tmp_path: Path) -> None:
     def fill(write: Write, left_px: float, right_px: float) -> None:
         write(0, "/cf1/camera/calibration", calibrated())

@@ -111,6 +111,7 @@ def seen(level: float, noise: float = 4.0, texture: float = 40.0) -> np.ndarray:
     return np.clip(rgb, 0, 255).astype(np.uint8)
 
 
+@pytest.mark.heavy
 def test_working_cameras_give_no_finding(tmp_path: Path) -> None:
     assert images(tmp_path, [encode_png(seen(120)) for _ in range(30)]) == []
     dusk = [encode_jpeg(seen(12, texture=10)) for _ in range(30)]
@@ -145,6 +146,7 @@ def labels(folder: Path, uv: np.ndarray, depth_m: np.ndarray, box: np.ndarray | 
     return [text for text in texts(path) if "/cf1/labels" in text]
 
 
+@pytest.mark.heavy
 def test_labels_that_no_image_has_are_doubted(tmp_path: Path) -> None:
     uv = RNG.uniform((12, 12), (52, 36), (30, 2))
     depth_m = RNG.uniform(0.5, 3, 30)

@@ -63,6 +63,7 @@ def recorded(path: Path, said: Columns, poses: Columns, late_s: float = 0.0) -> 
     return [f"{finding.topic}: {finding.text}" for finding in check(path)]
 
 
+@pytest.mark.heavy
 def test_consistent_odometry_gives_no_finding(tmp_path: Path) -> None:
     assert recorded(tmp_path / "a.mcap", *flown()) == []
 
@@ -78,6 +79,7 @@ def test_opposite_sign_is_found(tmp_path: Path, name: str) -> None:
     assert len(found) == 1 and f"/cf1/attitude: {name} has the opposite sign" in found[0]
 
 
+@pytest.mark.heavy
 def test_velocity_in_another_frame_is_found(tmp_path: Path) -> None:
     measured, poses = flown()
     vx, vy = measured["vx_mps"], measured["vy_mps"]

@@ -22,6 +22,8 @@ from dmrl.samples.sample import Sample
 
 from ..records import channels, chunks, packed, unchanged
 
+pytestmark = pytest.mark.heavy
+
 MADE = Provenance("test")
 MOMENTS = 6000
 
@@ -45,7 +47,6 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.heavy
 def test_rewrite_copies_whole_chunks_in_one_pass(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -64,7 +65,6 @@ def test_rewrite_copies_whole_chunks_in_one_pass(
     assert [raw.time_ns for raw in read_raw(out, "/cf1/labels")] == [m.time_ns for m in fresh]
 
 
-@pytest.mark.heavy
 def test_omitting_a_topic_keeps_the_rest_bit_for_bit(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     rewrite(flight, out, MADE, without=["/cf2/attitude"], fresh=())
@@ -93,7 +93,6 @@ def test_span_from_a_chunk_start_includes_channel_definitions(flight: Path, tmp_
         assert read_summary(tmp_path / f"{k}.whole.mcap").count == len(ours)
 
 
-@pytest.mark.heavy
 def test_merging_trimmed_parts_restores_the_recording(flight: Path, tmp_path: Path) -> None:
     parts = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     trim(flight, parts[0], topics=["/cf1/*", "/cf1/camera/*"])
@@ -134,7 +133,6 @@ def test_a_trim_cuts_the_chunks_at_both_its_ends(
     assert len(list(read_raw(out))) == 2 * (end_ns - start_ns)
 
 
-@pytest.mark.heavy
 def test_recordings_whose_channels_have_the_same_numbers_are_merged(tmp_path: Path) -> None:
     paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     rng = np.random.default_rng(0)

@@ -85,6 +85,7 @@ def test_a_chunk_that_defines_a_channel_otherwise_is_not_copied(tmp_path: Path) 
     assert not (tmp_path / "out.mcap").exists()
 
 
+@pytest.mark.heavy
 def test_empty_index_of_another_writer_is_not_copied(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -129,6 +129,7 @@ def test_recover_returns_every_message_before_the_cut(tmp_path: Path, flight: Pa
     assert counts
 
 
+@pytest.mark.heavy
 def test_recover_steps_over_a_damaged_chunk(tmp_path: Path) -> None:
     path = heights(tmp_path / "a.mcap", list(range(30_000)), "train")
     data = bytearray(path.read_bytes())
@@ -143,6 +144,7 @@ def test_recover_steps_over_a_damaged_chunk(tmp_path: Path) -> None:
     assert read_splits(tmp_path, read_summary(tmp_path / "b.mcap")) == {"train": [(0, 29_999)]}
 
 
+@pytest.mark.heavy
 def test_a_topic_whose_definition_is_damaged_is_not_lost(tmp_path: Path) -> None:
     path = heights(tmp_path / "a.mcap", list(range(60_000)), "train")
     data = bytearray(path.read_bytes())

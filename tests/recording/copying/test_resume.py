@@ -42,6 +42,7 @@ def stopped(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.heavy
 def test_a_stopped_recording_goes_on_to_the_same_bytes(whole: Path, stopped: Path) -> None:
     before = recover_interrupted(stopped, resume=True)
     before.check_provenance(MADE)
@@ -54,6 +55,7 @@ def test_a_stopped_recording_goes_on_to_the_same_bytes(whole: Path, stopped: Pat
     assert sorted(p.name for p in stopped.parent.iterdir()) == ["out.mcap", "whole.mcap"]
 
 
+@pytest.mark.heavy
 def test_stopped_twice_it_keeps_the_longer_part(stopped: Path) -> None:
     kept = recover_interrupted(stopped, resume=True)
     count = sum(1 for _ in kept.iter_moments())
@@ -90,6 +92,7 @@ def write_pictures(sink: RecordingWriter, first: int, last: int) -> None:
         sink.write(k, "/cf1/camera/image", picture)
 
 
+@pytest.mark.heavy
 def test_resume_drops_images_without_their_labels(tmp_path: Path) -> None:
     whole, out = tmp_path / "whole.mcap", tmp_path / "out.mcap"
     with RecordingWriter(whole, MADE) as sink:

@@ -35,6 +35,7 @@ def block_of(rows: list[Row], gap: int = 3) -> MessageBatch:
 
 
 @given(ROWS, ROWS)
+@pytest.mark.heavy
 def test_batch_operations_keep_messages_intact(one: list[Row], other: list[Row]) -> None:
     first, second = block_of(one), block_of(other, 1)
     assert list(first.iter_rows()) == one

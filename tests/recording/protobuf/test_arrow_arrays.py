@@ -50,5 +50,6 @@ def test_texts_are_matched() -> None:
     assert match_text(pa.chunked_array([texts]), "").tolist() == [False, True, False, False]
 
 
+@pytest.mark.heavy
 def test_pandas_is_not_loaded() -> None:
     assert subprocess.run([sys.executable, "-c", WITHOUT_PANDAS], check=False).returncode == 0

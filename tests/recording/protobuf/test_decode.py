@@ -111,6 +111,7 @@ def test_bulk_decoding_equals_google_protobuf(values: list[dict[str, Any]]) -> N
 
 @settings(max_examples=100)
 @given(st.binary(max_size=60))
+@pytest.mark.heavy
 def test_random_bytes_raise_wire_error_or_decode(data: bytes) -> None:
     array = np.frombuffer(data, np.uint8)
     with suppress(WireError):

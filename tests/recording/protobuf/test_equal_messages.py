@@ -58,6 +58,7 @@ rows = st.fixed_dictionaries({}, optional={name: values for name, (_, values) in
 
 
 @given(st.lists(rows, min_size=2, max_size=6))
+@pytest.mark.heavy
 def test_what_is_decoded_is_what_google_s_parser_reads(contents: list[dict[str, Any]]) -> None:
     messages = [FIXED(**row) for row in contents]
     at = lay_out([message.SerializeToString() for message in messages])

@@ -73,6 +73,7 @@ def test_lens_distortion_applies_to_walls_and_items() -> None:
 
 
 @pytest.mark.parametrize("where", ["wall", "flat", "standing", "small"])
+@pytest.mark.heavy
 def test_every_item_of_the_table_can_be_drawn(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     bare = paint(level_view())
     for item in list_items(where):
@@ -90,6 +91,7 @@ def test_every_item_of_the_table_can_be_drawn(where: str, monkeypatch: pytest.Mo
         assert seen, item["name"]
 
 
+@pytest.mark.heavy
 def test_a_room_is_the_same_by_number_and_has_both_ends_of_the_scale() -> None:
     assert (draw_numbered_room(5) == draw_numbered_room(5)).all()
     assert (draw_numbered_room(5) != draw_numbered_room(6)).any()

@@ -56,12 +56,14 @@ def test_correlation_of_demosaiced_noise_is_measured() -> None:
     assert 0.28 < found < 0.5 / 1.5  # a plane takes more out of coarse noise than out of white
 
 
+@pytest.mark.heavy
 def test_most_of_the_picture_may_have_texture() -> None:
     plain, street = (measured((60.0, 120.0, 180.0), share) for share in (0.0, 0.85))
     assert street.grain == pytest.approx(plain.grain, rel=0.05)
     assert street.grain_correlation == pytest.approx(plain.grain_correlation, abs=0.03)
 
 
+@pytest.mark.heavy
 def test_noise_estimate_is_independent_of_brightness() -> None:
     dim, bright = measured((40.0, 180.0), 0.0), measured((40.0, 180.0, 180.0, 180.0), 0.0)
     assert bright.grain == pytest.approx(dim.grain, rel=0.03)

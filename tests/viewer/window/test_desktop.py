@@ -59,6 +59,7 @@ def test_a_picture_shows_the_image_nearest_to_the_time(
     assert list(tmp_path.glob("*.partial")) == []
 
 
+@pytest.mark.heavy
 def test_missing_vulkan_driver_error_names_the_package(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -69,6 +70,7 @@ def test_missing_vulkan_driver_error_names_the_package(
     assert list(tmp_path.glob("picture*")) == []
 
 
+@pytest.mark.heavy
 def test_viewer_that_stops_is_reported_with_its_output(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -87,6 +89,7 @@ def test_a_picture_is_never_overwritten(make: Make, tmp_path: Path) -> None:
     assert (tmp_path / "picture.png").read_bytes() == b"mine"
 
 
+@pytest.mark.heavy
 def test_missing_screen_error_names_alternatives(make: Make) -> None:
     with pytest.raises(SettingError, match=r"no screen.*--save, --screenshot or --serve"):
         show_in_window([make()], Settings())
@@ -141,6 +144,7 @@ def _page(address: str) -> bytes:
             time.sleep(0.05)
 
 
+@pytest.mark.heavy
 def test_a_page_can_be_opened_and_closed_in_a_notebook(make: Make) -> None:
     page = Page([make()], Settings())
     try:
@@ -164,6 +168,7 @@ def test_invalid_address_is_reported(make: Make) -> None:
         Page([make()], Settings(), Web(bind="192.0.2.1"))
 
 
+@pytest.mark.heavy
 def test_a_pipeline_writes_by_suffix(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,6 +187,7 @@ def test_a_pipeline_writes_by_suffix(
         stage.run([recording], tmp_path / "seen.jpg", Settings())
 
 
+@pytest.mark.heavy
 def test_without_rerun_the_command_names_the_extra(tmp_path: Path) -> None:
     (tmp_path / "rerun.py").write_text("raise ImportError('not here')")
     code = "from dmrl.cli import main; main()"
