@@ -45,6 +45,7 @@ from dmrl.formats.files.labelled_pictures import (
     natural_key,
 )
 from dmrl.formats.files.pictures import Crop, crop_camera
+from dmrl.formats.files.text_cells import parse_number
 from dmrl.geometry.camera_file import read_camera
 from dmrl.guards.paths import refuse_pipes
 from dmrl.samples.sample import Sample
@@ -195,7 +196,7 @@ def _load_aideck_labels(path: Path, files: Collection[str]) -> dict[str, list[fl
         if not name:
             continue
         try:
-            values = [float(word) for word in words]
+            values = [parse_number(word) for word in words]
         except ValueError:
             values = []
         if len(values) != len(published_firmware.VARIABLES):

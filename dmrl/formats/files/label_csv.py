@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from dmrl.errors import SourceError, suggest
+from dmrl.formats.files.text_cells import parse_number
 from dmrl.guards import limits
 from dmrl.guards.safe_names import check_split_name
 from dmrl.samples.sample import LABEL_SOURCES
@@ -216,7 +217,7 @@ def _parse_number(
     if not cell and default is not None:
         return default
     try:
-        value = float(cell)
+        value = parse_number(cell)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):

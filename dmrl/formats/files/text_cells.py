@@ -22,10 +22,17 @@ TIME_OF_DAY = re.compile(r"(\d\d?):(\d\d):(\d\d)(?:[.,](\d+))?")
 NS_PER_S = 1_000_000_000
 
 
+def parse_number(text: str) -> float:
+    """Parse a number; raise ValueError if it is none. To Python alone, ``1_0`` is one, too."""
+    if "_" in text:
+        raise ValueError(f"{text!r} is no number")
+    return float(text)
+
+
 def is_number(cell: str) -> bool:
     """Return whether a cell is a number or a time, with a decimal point or comma."""
     try:
-        float(cell.strip().replace(",", "."))
+        parse_number(cell.strip().replace(",", "."))
     except ValueError:
         return bool(DATE.fullmatch(cell.strip()) or TIME_OF_DAY.fullmatch(cell.strip()))
     return True
@@ -38,7 +45,7 @@ def parse_cells(cells: list[str]) -> tuple[Array, list[int]]:
         if (text := cell.strip()).lower() in MISSING:
             continue
         try:
-            values[k] = float(text)
+            values[k] = parse_number(text)
         except ValueError:
             bad.append(k)
     return values, bad
@@ -48,7 +55,7 @@ def parse_time_ns(cell: str, scale: float, has_decimal_commas: bool) -> int | No
     """Parse nanoseconds from a number, a date with a time, or a time of the day; None: no time."""
     text = cell.strip()
     try:
-        number = Decimal(text.replace(",", ".") if has_decimal_commas else text)
+        number = Decimal((text.replace(",", ".") if has_decimal_commas else text).replace("_", "?"))
         time_ns: int | None = int((number * Decimal(scale)).to_integral_value())
     except (InvalidOperation, ValueError, OverflowError):
         time_ns = _parse_date_ns(text)

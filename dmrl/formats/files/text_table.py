@@ -14,7 +14,7 @@ import numpy as np
 
 from dmrl.errors import SourceError
 from dmrl.formats.clocks import Ints, settle_times
-from dmrl.formats.files.text_cells import DATE, MISSING, is_number, parse_cells, parse_time_ns
+from dmrl.formats.files import text_cells
 from dmrl.geometry.frames import Array
 from dmrl.guards import limits
 from dmrl.terminal.left_out import leave_out
@@ -92,9 +92,9 @@ class TextTable:
         if self.has_decimal_commas:
             cells = [cell.replace(",", ".") for cell in cells]
         try:
-            return np.array([float(cell) for cell in cells])
+            return np.array([text_cells.parse_number(cell) for cell in cells])
         except ValueError:
-            values, bad = parse_cells(cells)
+            values, bad = text_cells.parse_cells(cells)
         if bad and not (used and np.isfinite(values).any()):
             return None
         if bad:
@@ -113,10 +113,10 @@ class TextTable:
             If no row has a time from 1970 to 2262, or the clock starts again.
         """
         cells = self.columns[name]
-        known = (text for text in map(str.strip, cells) if text.lower() not in MISSING)
-        if (date := DATE.fullmatch(next(known, ""))) and not date[8]:
+        known = (text for text in map(str.strip, cells) if text.lower() not in text_cells.MISSING)
+        if (date := text_cells.DATE.fullmatch(next(known, ""))) and not date[8]:
             say(f"{self.path}: times without a zone are read as UTC. Write them with one, as in Z")
-        told = [parse_time_ns(cell, scale, self.has_decimal_commas) for cell in cells]
+        told = [text_cells.parse_time_ns(c, scale, self.has_decimal_commas) for c in cells]
         rows = [k for k, time_ns in enumerate(told) if time_ns is not None]
         told_ns = np.array([time_ns for time_ns in told if time_ns is not None], np.int64)
         if len(rows) < len(cells):
@@ -167,7 +167,7 @@ def read_table(
     body = [(n, _cut_comment(line, marks, separator, len(names))) for n, line in lines[head + 1 :]]
     body = [(n, line) for n, line in body if line.strip()]
     numbers, rows = _split_rows(path, body, separator, names)
-    if rows and not any(is_number(cell) for cell in rows[0]):
+    if rows and not any(text_cells.is_number(cell) for cell in rows[0]):
         units |= {name: cell.strip() for name, cell in zip(names, rows[0], strict=True)}
         numbers, rows = numbers[1:], rows[1:]  # a line of units
     if not rows:
@@ -253,7 +253,7 @@ def _find_header(
         raise SourceError(f"{path} has no line of names. Pass another file")
     place = rows[0]
     separator = max(separators, key=lambda s: len(_split(lines[place][1], s)))
-    if place and all(map(is_number, _split(lines[place][1], separator))):
+    if place and all(map(text_cells.is_number, _split(lines[place][1], separator))):
         place -= 1
     names = _split(_uncomment(lines[place][1], marks), separator)
     return place, separator, _tidy(path, names, wanted)
@@ -347,4 +347,4 @@ def _find_commas(rows: list[list[str]]) -> bool:
     cells = (cell for row in rows for cell in row)
     if not any("," in cell and DECIMAL_COMMA.fullmatch(cell) for cell in cells):
         return False
-    return not any("." in cell and is_number(cell) for row in rows for cell in row)
+    return not any("." in cell and text_cells.is_number(cell) for row in rows for cell in row)

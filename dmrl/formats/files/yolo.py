@@ -32,6 +32,7 @@ from dmrl.formats.files.labelled_pictures import (
     list_pictures,
     locate,
 )
+from dmrl.formats.files.text_cells import parse_number
 from dmrl.guards.bounded_parsing import parse_yaml
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
@@ -184,7 +185,7 @@ def _read_rows(
 
 def _parse_line(words: Sequence[str], about: _Description) -> tuple[str, tuple[float, ...]]:
     """Return the class and the box (left, top, right, bottom) of a line."""
-    number, values = int(float(words[0])), [float(word) for word in words[1:]]
+    number, values = int(parse_number(words[0])), [parse_number(word) for word in words[1:]]
     name = about.names.get(number, f"class{number}")
     if not all(math.isfinite(v) and abs(v) <= MAX_SHARE for v in values[:4]):
         raise ValueError("coordinates are not shares of the picture's size, from 0 to 1")

@@ -80,6 +80,7 @@ def test_a_point_is_kept_to_a_ten_thousandth_of_a_pixel(u: float, v: float, dept
         (",,,1,2,3,4,", ""),
         (",2,1,,,,,", "u_px is '', not a number"),
         ("1,2,inf,,,,,", "depth_m is 'inf', not a number"),
+        ("1_0,2,,,,,,", "u_px is '1_0', not a number"),
     ],
 )
 def test_label_values_have_limits(tmp_path: Path, cells: str, complaint: str) -> None:

@@ -141,8 +141,8 @@ def test_missing_values_are_no_numbers_and_not_counted(missing: str, tmp_path: P
 def test_unusable_cells_and_rows_are_counted_by_line(tmp_path: Path) -> None:
     lines = plain(before="# a log\n").splitlines()
     lines[10] = "0.18,0.1"
-    lines[12] = lines[12].rsplit(",", 1)[0] + ",far"
-    lines[14] = "later,0,0,2"
+    lines[12] = lines[12].rsplit(",", 1)[0] + ",1_0"  # a number in the source of Python only
+    lines[14] = "1_0,0,0,2"
     (tmp_path / "a.csv").write_text("\n".join([*lines, lines[1], *lines[-1:]]) + "\n")
     with count_left_out() as left_out:
         table = read_table(tmp_path / "a.csv", WANTED)
