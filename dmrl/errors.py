@@ -146,6 +146,10 @@ class SourceError(DmrlError):
     """A foreign file or folder does not conform to its format."""
 
 
+class EmptySource(SourceError):
+    """A file of its format has no row that can be used."""
+
+
 class DatasetError(DmrlError):
     """A folder is not a dataset, or lacks requested data."""
 

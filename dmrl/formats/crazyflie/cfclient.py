@@ -7,6 +7,7 @@ it.
 """
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dmrl.errors import SourceError
+from dmrl.errors import EmptySource, SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
 from dmrl.formats.clocks import settle_times, unwrap
 from dmrl.formats.crazyflie import log_variables
@@ -77,11 +78,27 @@ def load_content(source: Path, options: Options) -> Content:
     if options.robot not in robots:
         options.refuse("robot", f"has no effect: the folders of {source} are named after robots")
     streams: list[log_variables.SampleStream] = []
-    for name, paths in robots.items():
+    for name, blocks in _read_robots(robots).items():
         robot = options.names.get(name, name)
-        blocks = _unwrap_between_blocks([read_block(path) for path in paths])
         streams += log_variables.build_streams(robot, blocks, options.names, source)
     return build_content(streams)
+
+
+def _read_robots(robots: Mapping[str, list[Path]]) -> dict[str, list[LogBlock]]:
+    """Read the blocks of each robot. Files without a row are left out if others have one."""
+    read: dict[str, list[LogBlock]] = {name: [] for name in robots}
+    empty: dict[Path, EmptySource] = {}
+    for name, paths in robots.items():
+        for path in paths:
+            try:
+                read[name].append(read_block(path))
+            except EmptySource as e:
+                empty[path] = e
+    if not any(read.values()):
+        raise next(iter(empty.values()))
+    for path in empty:
+        leave_out("files without a row", path)
+    return {name: _unwrap_between_blocks(blocks) for name, blocks in read.items()}
 
 
 def read_block(path: Path) -> LogBlock:
@@ -99,7 +116,7 @@ def read_block(path: Path) -> LogBlock:
     time_ms = values.pop(TIME_COLUMN)
     known = np.flatnonzero(np.isfinite([] if time_ms is None else time_ms))
     if time_ms is None or not len(known):
-        raise SourceError(f"{path}: no number in {TIME_COLUMN}. Pass another file")
+        raise EmptySource(f"{path}: no number in {TIME_COLUMN}. Pass another file")
     leave_out("rows without a time", path, len(time_ms) - len(known))
     parts_ms, whole_ms = np.modf(time_ms[known])
     time_ns = unwrap(whole_ms, TIMESTAMP_BITS) * NS_PER_MS + np.rint(parts_ms * 1e6).astype(int)
@@ -123,8 +140,8 @@ def _restore_type(cells: list[str], values: Array) -> NDArray[Any]:
 
 def _unwrap_between_blocks(blocks: list[LogBlock]) -> list[LogBlock]:
     """Add missing wraps: blocks may start on different sides of a wrap of the clock."""
-    period_ns, start_ns = NS_PER_MS << TIMESTAMP_BITS, blocks[0].time_ns[0]
-    wraps = [round((start_ns - block.time_ns[0]) / period_ns) for block in blocks]
+    period_ns = NS_PER_MS << TIMESTAMP_BITS
+    wraps = [round((blocks[0].time_ns[0] - block.time_ns[0]) / period_ns) for block in blocks]
     return [  # relative to the earliest, so that no time is before 0
         replace(block, time_ns=block.time_ns + (count - min(wraps)) * period_ns)
         for block, count in zip(blocks, wraps, strict=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmrl.errors import SourceError
+from dmrl.errors import EmptySource, SourceError
 from dmrl.formats.clocks import Ints, settle_times
 from dmrl.formats.files import text_cells
 from dmrl.geometry.frames import Array
@@ -171,7 +171,7 @@ def read_table(
         units |= {name: cell.strip() for name, cell in zip(names, rows[0], strict=True)}
         numbers, rows = numbers[1:], rows[1:]  # a line of units
     if not rows:
-        raise SourceError(f"{path} has no rows below its header. Pass another file")
+        raise EmptySource(f"{path} has no rows below its header. Pass another file")
     columns = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
     has_commas = dialect.decimal == "," or (not dialect.decimal and _find_commas(rows))
     if has_commas and not dialect.decimal:
