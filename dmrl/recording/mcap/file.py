@@ -174,10 +174,12 @@ def _check_magic(stream: BoundedReader) -> None:
     if not start:
         raise RecordingError(f"{path} is empty. Make it again")
     if start != MAGIC:
-        raise RecordingError(
-            f"{path} is not an MCAP file: it begins with {start!r}. To import "
-            f"another format: dmrl convert {path} OUT.mcap"
-        )
+        way_out = f"To import another format: dmrl convert {path} OUT.mcap"
+        if path.suffix == ".mcap":  # by which dmrl convert takes it for MCAP too
+            way_out = (
+                "If it is of another kind, rename it, such as .csv; then dmrl convert takes it"
+            )
+        raise RecordingError(f"{path} is not an MCAP file: it begins with {start!r}. {way_out}")
     stream.seek(max(0, stream.size - len(MAGIC)))
     if stream.size < 2 * len(MAGIC) or stream.read() != MAGIC:
         raise RecordingError(
