@@ -4,8 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dmrl.geometry.frames import Array
+
 MAX_VALUE = 1e6
 """Maximum of a focal length and a principal point, pixels, and of a coefficient."""
+ROI_KEYS, BINNING_KEYS = ("x_offset", "y_offset", "width", "height"), ("binning_x", "binning_y")
+"""What `crop_and_bin` takes, as ROS names it."""
 
 
 def find_calibration_fault(
@@ -34,3 +38,29 @@ def find_calibration_fault(
     if min(width_px, height_px) <= 0:
         return f"has images of {width_px} x {height_px} px"
     return ""
+
+
+def crop_and_bin(
+    size_px: Sequence[float], roi_px: Sequence[float], binning: Sequence[float], *matrices: Array
+) -> tuple[int, int]:
+    """Change the matrices of a sensor to those of its images; return their width and height.
+
+    ROS describes the whole sensor: its region of interest and then its binning are the images.
+
+    Parameters
+    ----------
+    size_px
+        Width and height of the sensor, pixels.
+    roi_px
+        Left, top, width and height of the region, pixels; a side of 0: all of the sensor.
+    binning
+        Pixels of the sensor in one of the image, along x and y; 0 is 1.
+    matrices
+        (2 or 3, 3 or 4) matrices in pixel-edge coordinates, changed in place.
+    """
+    bins = np.maximum(binning, 1)
+    for matrix in matrices:
+        matrix[:2, 2] -= roi_px[:2]
+        matrix[:2] /= bins[:, None]
+    width, height = (part or side for part, side in zip(roi_px[2:], size_px, strict=True))
+    return int(width // bins[0]), int(height // bins[1])

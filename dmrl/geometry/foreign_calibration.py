@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from dmrl.errors import MissingExtra, SourceError
+from dmrl.geometry.calibration import BINNING_KEYS, ROI_KEYS, crop_and_bin
 from dmrl.geometry.frames import Camera
 from dmrl.guards.bounded_parsing import parse_json, parse_xml, parse_yaml
 from dmrl.terminal.progress import say
@@ -41,6 +42,8 @@ KEYS = {
     "height": ("imageheight", "height"),
 }
 """Keys in lower case without underscores: of ROS, of Kalibr, and of OpenCV's samples."""
+FISHEYE, FISHEYE_COEFFICIENTS = "fisheyemodel", 4
+"""OpenCV's key of the model, and the number of its coefficients."""
 NAMES = {"matrix": "camera_matrix", "width": "image_width", "height": "image_height"}
 """Keys in errors."""
 
@@ -66,7 +69,7 @@ def parse_foreign_camera(text: str, path: Path) -> Camera:
             document = parse_yaml(re.split(r"^---\s*$", first, maxsplit=1, flags=re.MULTILINE)[0])
         if not isinstance(document, dict):
             raise ValueError("it is not a table of keys")
-        camera = _build_camera(document)
+        camera = _build_camera(document, path)
     except ModuleNotFoundError as e:
         raise MissingExtra("pyyaml", "yolo", str(path)) from e
     except (ValueError, TypeError, OverflowError) as e:
@@ -80,15 +83,15 @@ def parse_foreign_camera(text: str, path: Path) -> Camera:
     return camera
 
 
-def _build_camera(document: Mapping[str, Any]) -> Camera:
+def _build_camera(document: Mapping[str, Any], path: Path) -> Camera:
     cameras = [key for key, value in document.items() if _is_kalibr(value)]
     if len(cameras) > 1:
         raise ValueError(f"it has {', '.join(cameras)}; keep one")
     table = document[cameras[0]] if cameras else document
     held = {str(key).lower().replace("_", ""): value for key, value in table.items()}
+    if held.get("cameramodel", "pinhole") != "pinhole":
+        raise ValueError(f"its camera_model is {held['cameramodel']}, not pinhole")
     if cameras:
-        if held.get("cameramodel", "pinhole") != "pinhole":
-            raise ValueError(f"its camera_model is {held['cameramodel']}, not pinhole")
         fx, fy, cx, cy = _to_numbers("intrinsics", held.get("intrinsics"), 4)
     else:
         fx, skew, cx, _, fy, cy, *_ = _to_numbers("matrix", _find(held, "matrix"), 9)
@@ -98,10 +101,17 @@ def _build_camera(document: Mapping[str, Any]) -> Camera:
     if size is None:
         size = [_find(held, "width"), _find(held, "height")]
     width, height = _to_numbers("size", size, 2)
-    if not (0 < fx < float("inf") and 0 < fy < float("inf") and width >= 1 and height >= 1):
+    matrix = np.array([[fx, 0.0, cx + HALF_PX], [0.0, fy, cy + HALF_PX]])
+    roi = table.get("roi") or {}  # of the camera_info of ROS, as is the binning
+    if not isinstance(roi, dict):
+        raise ValueError("its roi is no table of keys")
+    part = _to_numbers("roi", [roi.get(key, 0) for key in ROI_KEYS], 4)
+    binning = _to_numbers("binning", [table.get(key, 0) for key in BINNING_KEYS], 2)
+    width_px, height_px = crop_and_bin((width, height), part, binning, matrix)
+    (fx, _, cx), (_, fy, cy) = matrix.tolist()
+    if not (0 < fx < float("inf") and 0 < fy < float("inf") and width_px >= 1 and height_px >= 1):
         raise ValueError("its focal lengths and its size must be over 0")
-    distortion = _to_distortion(held)
-    return Camera(int(width), int(height), fx, fy, cx + HALF_PX, cy + HALF_PX, distortion)
+    return Camera(width_px, height_px, fx, fy, cx, cy, _to_distortion(held, path))
 
 
 def _parse_element(element: ElementTree.Element) -> Any:
@@ -147,11 +157,16 @@ def _flatten(value: Any) -> Iterator[float]:
         raise ValueError(f"{str(value)[:40]!r} is no number")
 
 
-def _to_distortion(held: Mapping[str, Any]) -> tuple[float, ...]:
+def _to_distortion(held: Mapping[str, Any], path: Path) -> tuple[float, ...]:
     model = str(held.get("distortionmodel") or "")
     numbers = _to_numbers("distortion", _find(held, "distortion", []), None)
-    if any(numbers) and (model not in PLUMB_BOB or held.get("fisheyemodel")):
+    if any(numbers) and (model not in PLUMB_BOB or held.get(FISHEYE)):
         raise ValueError(f"its lens model is {model or 'fisheye'}, not plumb_bob")
+    if any(numbers) and len(numbers) == FISHEYE_COEFFICIENTS and not (model or FISHEYE in held):
+        say(
+            f"{path}: 4 coefficients without a model are read as k1, k2, p1, p2 of plumb bob. If "
+            "they are a fisheye's, write distortion_model: fisheye into it"
+        )
     if any(numbers[MAX_COEFFICIENTS:]):
         raise ValueError(f"its lens model has {len(numbers)} coefficients, not 5")
     return tuple(numbers[:MAX_COEFFICIENTS])

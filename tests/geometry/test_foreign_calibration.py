@@ -98,6 +98,7 @@ def test_a_pixel_of_opencv_s_projection_is_half_a_pixel_from_ours(tmp_path: Path
     [
         (KALIBR.replace("radtan", "equidistant"), "its lens model is equidistant, not plumb_bob"),
         (KALIBR.replace("pinhole", "omni"), "its camera_model is omni"),
+        (f"{ROS}camera_model: fisheye", "its camera_model is fisheye"),
         (KALIBR.replace("[320, 240]", "[320]"), "its size has no 2 numbers"),
         (ROS.replace("image_width: 320", ""), "it has no image_width"),
         (ROS.replace("-0.002, 0.0]", "-0.002, 0.0, 0.1, 0.2, 0.3]"), "has 8 coefficients, not 5"),
@@ -105,6 +106,9 @@ def test_a_pixel_of_opencv_s_projection_is_half_a_pixel_from_ours(tmp_path: Path
         (ROS.replace("[210, 0.0", "[210, 3.0"), "has a skew"),
         (ROS.replace("[210, 0.0", "[210, a"), "'a' is no number"),
         (ROS.replace("[210,", "[-210,"), "must be over 0"),
+        (f"{MESSAGE}binning_x: 999\n", "must be over 0"),
+        (f"{MESSAGE}roi: [1, 2, 3, 4]\n", "its roi is no table"),
+        (f"{MESSAGE}roi: {{x_offset: wide}}\n", "'wide' is no number"),
         ("- 1\n- 2\n", "it is not a table"),
         ("a: *b\n", "no calibration of ROS"),
     ],
@@ -137,6 +141,31 @@ def test_a_file_without_known_coefficients_says_so(
     assert read_camera(path) == WANTED
     read_camera(write(tmp_path / "c.yaml", KALIBR.replace("radtan", "none")))
     assert "no distortion coefficients" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "said"), [({}, True), ({"fisheye_model": 0}, False), ({"D": D}, False)]
+)
+def test_four_coefficients_without_a_model_are_named_as_plumb_bob(
+    more: dict[str, object], said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = {"image_width": 320, "image_height": 240, "K": K.tolist(), "D": D[:4]}
+    path = write(tmp_path / "a.json", json.dumps({**given, **more}))
+    assert read_camera(path).distortion[:4] == D[:4]
+    assert ("read as k1, k2, p1, p2 of plumb bob" in capsys.readouterr().err) == said
+    path.write_text(json.dumps({**given, "distortion_model": "fisheye"}))  # as the line says
+    with pytest.raises(SourceError, match="its lens model is fisheye"):
+        read_camera(path)
+
+
+def test_a_message_is_of_the_region_and_the_binning_of_its_images(tmp_path: Path) -> None:
+    roi = "{x_offset: 100, y_offset: 40, height: 180, width: 200, do_rectify: true}"
+    told = f"{MESSAGE}binning_x: 2\nbinning_y: 3\nroi: {roi}\n"
+    found = read_camera(write(tmp_path / "camera.yaml", told))
+    assert found == Camera(100, 60, 105.0, 211 / 3, 30.25, 26.5, D)
+    none = "{x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}"
+    whole = f"{MESSAGE}binning_x: 0\nbinning_y: 0\nroi: {none}\n"
+    assert read_camera(write(tmp_path / "whole.yaml", whole)) == WANTED
 
 
 def test_a_file_without_a_size_names_the_key(tmp_path: Path) -> None:

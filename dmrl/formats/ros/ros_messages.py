@@ -1,7 +1,7 @@
 """Conversion of ROS messages to samples: one function per message type."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import SourceError
+from dmrl.geometry.calibration import BINNING_KEYS, ROI_KEYS, crop_and_bin
 from dmrl.geometry.frames import Array, camera_from_horizontal
 from dmrl.geometry.rotations import quaternion_to_euler
 from dmrl.guards import limits
@@ -125,7 +126,9 @@ def _convert_camera_info(message: Any, time_ns: int, where: MessageContext) -> I
         return
     k[[2, 5]] += HALF_PX
     p[[2, 6]] += HALF_PX
-    width, height = _crop_and_bin(message, k.reshape(3, 3), p.reshape(3, 4))
+    roi = _read_numbers(getattr(message, "roi", None), ROI_KEYS)
+    told = _read_numbers(message, ROI_KEYS[2:]), roi, _read_numbers(message, BINNING_KEYS)
+    width, height = crop_and_bin(*told, k.reshape(3, 3), p.reshape(3, 4))
     model = message.distortion_model
     if where.rectified and p[0] > 0:
         k, d, r, model = p.reshape(3, 4)[:, :3].ravel(), np.zeros(0), np.eye(3).ravel(), ""
@@ -140,21 +143,8 @@ def _convert_camera_info(message: Any, time_ns: int, where: MessageContext) -> I
     yield Sample(time_ns, topics.CALIBRATION(where.robot), "CameraCalibration", fields)
 
 
-def _crop_and_bin(message: Any, *matrices: Array) -> tuple[int, int]:
-    """Change the sensor's matrices to those of its images; return their width and height.
-
-    A CameraInfo is of the whole sensor: ``roi`` and then ``binning`` say what images have of it.
-    """
-    roi = getattr(message, "roi", None)
-    corner = (roi.x_offset, roi.y_offset) if roi else (0, 0)
-    width, height = (
-        getattr(roi, side, 0) or getattr(message, side) for side in ("width", "height")
-    )
-    bins = [max(getattr(message, f"binning_{axis}", 1), 1) for axis in "xy"]
-    for matrix in matrices:
-        matrix[:2, 2] -= corner
-        matrix[:2] /= np.array(bins)[:, None]
-    return width // bins[0], height // bins[1]
+def _read_numbers(message: Any, names: Sequence[str]) -> list[int]:
+    return [getattr(message, name, 0) for name in names]
 
 
 def _to_array(vector: Any) -> Array:
