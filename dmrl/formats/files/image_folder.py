@@ -1,9 +1,10 @@
 """A folder of images, with labels in a CSV file if there is one; or a single image.
 
 Images: files of ``IMAGE_SUFFIXES``, in the natural order of their names: img2 before img10. If
-every name is a number of 12 digits or more, the numbers are times in nanoseconds, or in the unit
-of ``UNITS_NS`` in which a camera can be that fast; if every name is a number like ``SECONDS``, in
-seconds; otherwise the images get nominal times, evenly spaced from 0.
+every name is a date like ``DATE``, it is the time, in UTC; if every name is a number of 12 digits
+or more, the numbers are times in nanoseconds, or in the unit of ``UNITS_NS`` in which a camera can
+be that fast; if every name is a number like ``SECONDS``, in seconds; otherwise the images get
+nominal times, evenly spaced from 0.
 
 Labels: ``labels.csv`` in the folder, or another file. It has one row per peer and image; a row
 with an empty peer means that no peer is in view. An image without a row is not labelled.
@@ -25,6 +26,7 @@ unless 324x244 is requested.
 import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
@@ -58,6 +60,9 @@ CALIBRATION_FILE = "calibration.toml"
 MIN_TIME_DIGITS = 12  # fewer would be under 17 minutes after 1970: a counter, not a time
 SECONDS = re.compile(r"[0-9]+\.[0-9]+|1[0-9]{9}")
 """Names that are seconds: with a decimal point, or whole ones of the years 2001 to 2033."""
+DATE = re.compile(r"((?:19|20)\d{6})[_T-]?(\d{6})\.?(\d{3}(?:\d{3})?)?", re.ASCII)
+"""Names that are dates, ``YYYYMMDDhhmmss``, with milli- or microseconds or without."""
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 NS_PER_S = 1_000_000_000
 UNITS_NS = {"nanoseconds": 1, "microseconds": 1000, "milliseconds": 1_000_000}
 MIN_PERIOD_NS = 2_000_000
@@ -141,9 +146,14 @@ def list_images(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
         raise SourceError(
             f"no image ({', '.join(IMAGE_SUFFIXES)}) in {source}. Pass another folder"
         )
-    if not (unit_ns := _find_unit_ns(source, paths)):
+    dates_ns = [_parse_date_ns(path.stem) for path in paths]
+    if None not in dates_ns:
+        say(f"{source}: the names of the pictures are taken for dates in UTC")
+        moments = sorted(zip(filter(None, dates_ns), paths, strict=True))
+    elif unit_ns := _find_unit_ns(source, paths):
+        moments = sorted((_parse_time_ns(path, unit_ns), path) for path in paths)
+    else:
         return list(zip(_list_nominal_times(len(paths), rate_hz), paths, strict=True))
-    moments = sorted((_parse_time_ns(path, unit_ns), path) for path in paths)
     for (time_ns, path), (next_ns, following) in pairwise(moments):
         if time_ns == next_ns:
             raise SourceError(f"{path} and {following.name} have the same time. Remove one")
@@ -178,6 +188,17 @@ def _find_unit_ns(source: Path, paths: Sequence[Path]) -> int:
         taken = f"for times in {units[0]}" if units else "for numbers, too near for times"
         say(f"{source}: the names of the pictures are taken {taken}")
     return UNITS_NS[units[0]] if timed and units else 0
+
+
+def _parse_date_ns(name: str) -> int | None:
+    """Parse nanoseconds since 1970 from a date; None: the name is none, or one before 1970."""
+    if not (found := DATE.fullmatch(name)):
+        return None
+    try:
+        moment = datetime.fromisoformat(f"{found[1]}T{found[2]}.{found[3] or 0}+00:00")
+    except ValueError:
+        return None
+    return (moment - EPOCH) // timedelta(microseconds=1) * 1000 if moment > EPOCH else None
 
 
 def _parse_time_ns(path: Path, unit_ns: int) -> int:

@@ -57,6 +57,39 @@ def test_numbers_are_times_in_a_unit_in_which_a_camera_can_be_that_fast(
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("names", "step_ns"),
+    [
+        (("20240301120000", "20240301120002"), 2_000_000_000),
+        (("20240229235959", "20240301000000"), 1_000_000_000),
+        (("20240301_115959", "20240301_120001"), 2_000_000_000),
+        (("20240301-120000123", "20240301-120000456"), 333_000_000),
+        (("20240301120000.000", "20240301120000.033"), 33_000_000),
+        (("20240301120000000001", "20240301120000100002"), 100_001_000),
+    ],
+)
+def test_dates_are_times(
+    names: tuple[str, str], step_ns: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in names:
+        (tmp_path / f"{name}.png").write_bytes(b"")
+    (first, _), (second, _) = image_folder.list_images(tmp_path, 10.0)
+    assert abs(first - 1_709_294_400_000_000_000) <= 43_201_000_000_000
+    assert second - first == step_ns
+    assert "are taken for dates in UTC" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["20241301120000", "20240230120000", "19691231235959"])
+def test_numbers_that_are_no_dates_are_none(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for k in range(2):
+        (tmp_path / f"{int(name) + k}.png").write_bytes(b"")
+    found = image_folder.list_images(tmp_path, 10.0)
+    assert [time_ns for time_ns, _ in found] == [0, 100_000_000]
+    assert "for numbers, too near for times" in capsys.readouterr().err
+
+
 def test_a_rate_has_an_effect_unless_names_are_times(folder: Path) -> None:
     for path in sorted(folder.glob("[abc].*")):
         path.rename(folder / f"frame_{path.stem:0>9}{path.suffix}")
