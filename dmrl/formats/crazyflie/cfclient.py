@@ -80,7 +80,8 @@ def load_content(source: Path, options: Options) -> Content:
     streams: list[log_variables.SampleStream] = []
     for name, blocks in _read_robots(robots).items():
         robot = options.names.get(name, name)
-        streams += log_variables.build_streams(robot, blocks, options.names, source)
+        if blocks:
+            streams += log_variables.build_streams(robot, blocks, options.names, source)
     return build_content(streams)
 
 

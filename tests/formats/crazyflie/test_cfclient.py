@@ -120,7 +120,9 @@ def test_truncated_last_line_is_omitted_and_reported(
 
 
 @pytest.mark.parametrize("text", ["Timestamp,a\n", "Timestamp,a\nnan,2\n"])
-def test_files_without_a_row_are_left_out_of_several(text: str, swarm: Path) -> None:
+def test_files_without_a_row_are_left_out_of_several(
+    text: str, swarm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for path in [swarm / "cf1" / "a.csv", *(swarm / "cf2").iterdir()]:
         path.write_text(text)
     with count_left_out() as left:
@@ -128,6 +130,7 @@ def test_files_without_a_row_are_left_out_of_several(text: str, swarm: Path) -> 
     assert (left.counts["files without a row"], len(found["/cf1/attitude"])) == (3, 10)
     assert left.first["files without a row"] == str(swarm / "cf1" / "a.csv")
     assert not any(topic.startswith("/cf2") for topic in found)
+    assert "/cf2" not in capsys.readouterr().err.replace(str(swarm), "")
 
 
 @pytest.mark.parametrize(
