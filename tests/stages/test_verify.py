@@ -10,7 +10,7 @@ import pytest
 from dmrl.cli import app
 from dmrl.deploy.c import write_c
 from dmrl.deploy.c.network_source import MAX_STACK_BYTES
-from dmrl.deploy.c.run import compile_targets, proof
+from dmrl.deploy.c.run import compile_targets, measure, proof
 from dmrl.deploy.c.run.measure import ExecutionCost
 from dmrl.deploy.int8.layers import Conv
 from dmrl.deploy.int8.network import IntegerNetwork
@@ -88,7 +88,7 @@ def test_counting_instructions_gives_the_same_number_again(
 def one_level(monkeypatch: pytest.MonkeyPatch) -> None:
     """The C is compiled once and its cost not counted: the slow tests do all of that."""
     monkeypatch.setattr(compile_targets, "OPTIMIZATION_LEVELS", ("-O0",))
-    monkeypatch.setattr(proof, "measure_cost", lambda *_: ExecutionCost())
+    monkeypatch.setattr(measure, "measure_cost", lambda *_: ExecutionCost())
 
 
 @pytest.mark.heavy

@@ -152,7 +152,7 @@ TABLE: tuple[Unknown, ...] = (
     Unknown(
         "range_offset",
         "m",
-        0.1,
+        0.15,
         "pair",
         Cauchy(1.5),
         graded=True,
