@@ -10,7 +10,7 @@ import pytest
 from dmrl.cli import app
 from dmrl.deploy.c import write_c
 from dmrl.deploy.c.network_source import MAX_STACK_BYTES
-from dmrl.deploy.c.run import compile_targets, measure, proof
+from dmrl.deploy.c.run import compile_targets, measure
 from dmrl.deploy.c.run.measure import ExecutionCost
 from dmrl.deploy.int8.layers import Conv
 from dmrl.deploy.int8.network import IntegerNetwork
