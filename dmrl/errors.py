@@ -9,6 +9,7 @@
     + MissingTopic
     + UnreadableTopic
   - SourceError       a foreign file or folder does not conform to its format
+    + EmptySource
   - DatasetError      a folder is not a dataset, or lacks requested data
     + MissingSplit
   - ModelError        weights or a run folder cannot be used
