@@ -27,8 +27,8 @@ Others = Callable[[], Sequence[Values]]
 """Finds further first guesses, when they are wanted."""
 MIN_STEP_GAIN = -5.0
 """Gain of a model by one Gauss-Newton step below which it is not solved, in log odds. Of 337 trials
-in some 30 faulty flights of the judge, those between -6 and -5 ended at -1.4 or less: none led, and a
-mixture would give the best of them a weight of 0.2."""
+in some 30 faulty flights of the judge, those between -6 and -5 ended at -1.4 or less: none led,
+and a mixture would give the best of them a weight of 0.2."""
 LEAD, MIN_LED_GAIN = 12.0, -3.0
 """Gain of a solved model, in log odds, from which others are solved only if one step gains them the
 second. Of 350 trials in 21 flights of the judge, 8 pairs of a swarm and 7 windows of a long flight,
