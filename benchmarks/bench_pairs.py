@@ -165,7 +165,7 @@ ROWS: Mapping[str, Row] = {
         less=dmrl("trim one out --workers 1"),
         over=11,
     ),
-    "window of 1 s in 6 GB": Row((READ + WINDOW,), "ms", ("six.mcap",), prints=True),
+    "window of 1 s in 6 GB": Row((READ + WINDOW,), "ms", ("few.mcap", "six.mcap"), prints=True),
     "pictures": Row(
         (READ + f"print(spent(lambda: {PICTURE_TOPIC}) / 0.5)",),
         "CPU-s/GB",
@@ -262,6 +262,7 @@ def main() -> None:
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # as installed: with bytecode on disk
     with tempfile.TemporaryDirectory() as scratch:
         folder = given.folder or Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
         print(f"{'':32}{'other':>9}{'this':>9}{'ratio':>8}{'peer':>9}")
         for name in given.only:
             row = ROWS[name]
