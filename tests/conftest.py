@@ -1,6 +1,7 @@
 """Fixtures and settings of all tests."""
 
 import gc
+import multiprocessing.util
 import os
 import signal
 from pathlib import Path
@@ -22,6 +23,10 @@ def pytest_collection_finish() -> None:
     gc.freeze()
     gc.enable()
 
+
+# A command that a test runs in this process has a temporary folder, which is removed before
+# multiprocessing removes its own. So that one is not to be in there.
+multiprocessing.util.get_temp_dir()
 
 # A shell that starts the tests in the background has them and all they start ignore Ctrl-C, which
 # some of them send.
