@@ -84,7 +84,7 @@ def find_format(source: Path, name: str | None = None) -> Format:
         raise SourceError(f"{source} is an empty folder. Pass one with files in it")
     if guess := _guess_format(source, added.values()):
         return guess
-    if source.suffix == ".mcap":
+    if source.suffix == ".mcap" and source.is_file():
         raise SourceError(f"{source} is a recording already. Pass --to: csv, parquet, ros2")
     files = source.iterdir() if source.is_dir() else [source]
     if any(path.suffix.lower() in (".csv", ".tsv") for path in files):

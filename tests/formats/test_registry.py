@@ -96,6 +96,10 @@ def test_empty_folder_missing_path_and_pipe_are_reported(tmp_path: Path) -> None
         find_format(tmp_path)
     with pytest.raises(SourceError, match=r"no file or folder .*nothing. Pass one"):
         find_format(tmp_path / "nothing")
+    (tmp_path / "below.mcap").mkdir()
+    (tmp_path / "below.mcap" / "a").write_bytes(b"x")
+    with pytest.raises(SourceError, match=r"below\.mcap matches no known format"):
+        find_format(tmp_path / "below.mcap")
     (tmp_path / "below").mkdir()
     os.mkfifo(tmp_path / "below" / "pipe")
     for name in (None, "images"):
