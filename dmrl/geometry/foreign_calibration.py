@@ -15,7 +15,7 @@ import numpy as np
 from dmrl.errors import MissingExtra, SourceError
 from dmrl.geometry.calibration import BINNING_KEYS, ROI_KEYS, crop_and_bin
 from dmrl.geometry.frames import Camera
-from dmrl.guards.bounded_parsing import parse_json, parse_xml, parse_yaml
+from dmrl.guards.bounded_parsing import parse_json, parse_number, parse_xml, parse_yaml
 from dmrl.terminal.progress import say
 
 SUFFIXES = (".yaml", ".yml", ".json", ".xml")
@@ -118,7 +118,7 @@ def _parse_element(element: ElementTree.Element) -> Any:
     """Return a number, a matrix with its numbers as ``data``, or the text."""
     words = (element.findtext("data") or element.text or "").split()
     try:
-        numbers = [float(word) for word in words]
+        numbers = [parse_number(word) for word in words]
     except ValueError:
         return element.text
     return {"data": numbers} if len(element) or len(numbers) != 1 else numbers[0]

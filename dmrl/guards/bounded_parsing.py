@@ -1,4 +1,4 @@
-"""Parse JSON, TOML, YAML, XML and NumPy archives from untrusted files within limits."""
+"""Parse numbers, JSON, TOML, YAML, XML and NumPy archives of untrusted files within limits."""
 
 import json
 import lzma
@@ -91,6 +91,13 @@ def parse_xml(data: bytes) -> ElementTree.Element:
         return ElementTree.fromstring(data)
     except ElementTree.ParseError as e:
         raise ValueError(str(e)) from None
+
+
+def parse_number(text: str) -> float:
+    """Parse a number; raise ValueError if it is none. To Python alone, ``1_0`` is one, too."""
+    if "_" in text:
+        raise ValueError(f"{text!r} is no number")
+    return float(text)
 
 
 ARCHIVE_ERRORS = (

@@ -84,6 +84,15 @@ def test_files_that_opencv_writes(suffix: str, coefficients: int, tmp_path: Path
     assert read_camera(path) == Camera(320, 240, 210.0, 211.0, 160.5, 119.5, tuple(d[:5]))
 
 
+def test_a_number_with_an_underscore_is_none(tmp_path: Path) -> None:
+    matrix = "<camera_matrix><data>1_0 0 2 0 10 2 0 0 1</data></camera_matrix>"
+    size = "<image_width>4</image_width><image_height>4</image_height>"
+    text = f"<opencv_storage>{size}{matrix}</opencv_storage>"
+    assert read_camera(write(tmp_path / "a.xml", text.replace("1_0", "10"))).fx_px == 10
+    with pytest.raises(SourceError, match=r"camera\.xml"):
+        read_camera(write(tmp_path / "camera.xml", text))
+
+
 def test_a_pixel_of_opencv_s_projection_is_half_a_pixel_from_ours(tmp_path: Path) -> None:
     found = read_camera(write(tmp_path / "camera.yaml", ROS))
     point = np.array([[0.3, -0.2, 1.0]])

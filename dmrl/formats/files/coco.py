@@ -27,7 +27,7 @@ from dmrl.formats.files.labelled_pictures import (
     find_split,
     list_pictures,
 )
-from dmrl.guards.bounded_parsing import parse_json
+from dmrl.guards.bounded_parsing import parse_json, parse_number
 from dmrl.samples.sample import LABEL_SOURCES
 from dmrl.terminal.left_out import leave_out
 
@@ -165,7 +165,7 @@ def _parse_box(
 ) -> tuple[str, tuple[float, float, float, float]]:
     if not isinstance(annotation.get("bbox"), list):
         raise ValueError("no bbox")
-    left, top, width, height = map(float, annotation["bbox"])
+    left, top, width, height = (parse_number(str(edge)) for edge in annotation["bbox"])
     kind = annotation["category_id"]
     return classes.get(kind, f"class{kind}"), (left, top, left + width, top + height)
 
@@ -175,9 +175,10 @@ def _add_attributes(row: LabelRow, annotation: Record) -> LabelRow:
     told = annotation.get("attributes") or {}
 
     def number(name: str, default: float) -> float:
-        if name in told and not math.isfinite(float(told[name])):
+        value = parse_number(str(told[name])) if name in told else default
+        if name in told and not math.isfinite(value):
             raise ValueError(f"{name} is not finite")
-        return float(told.get(name, default))
+        return value
 
     depth_m = number("depth_m", 0.0)
     return replace(

@@ -1,10 +1,10 @@
 """A folder of images, with labels in a CSV file if there is one; or a single image.
 
 Images: files of ``IMAGE_SUFFIXES``, in the natural order of their names: img2 before img10. If
-every name is a date like ``DATE``, it is the time, in UTC; if every name is a number of 12 digits
-or more, the numbers are times in nanoseconds, or in the unit of ``UNITS_NS`` in which a camera can
-be that fast; if every name is a number like ``SECONDS``, in seconds; otherwise the images get
-nominal times, evenly spaced from 0.
+every name is a date like ``DATE``, as those of phones, it is the time, in UTC; if every name is a
+number of 12 digits or more, the numbers are times in nanoseconds, or in the unit of ``UNITS_NS`` in
+which a camera can be that fast; if every name is a number like ``SECONDS``, in seconds; otherwise
+the images get nominal times, evenly spaced from 0.
 
 Labels: ``labels.csv`` in the folder, or another file. It has one row per peer and image; a row
 with an empty peer means that no peer is in view. An image without a row is not labelled.
@@ -47,8 +47,8 @@ from dmrl.formats.files.labelled_pictures import (
     natural_key,
 )
 from dmrl.formats.files.pictures import Crop, crop_camera
-from dmrl.formats.files.text_cells import parse_number
 from dmrl.geometry.camera_file import read_camera
+from dmrl.guards.bounded_parsing import parse_number
 from dmrl.guards.paths import refuse_pipes
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import leave_out
@@ -60,8 +60,12 @@ CALIBRATION_FILE = "calibration.toml"
 MIN_TIME_DIGITS = 12  # fewer would be under 17 minutes after 1970: a counter, not a time
 SECONDS = re.compile(r"[0-9]+\.[0-9]+|1[0-9]{9}")
 """Names that are seconds: with a decimal point, or whole ones of the years 2001 to 2033."""
-DATE = re.compile(r"((?:19|20)\d{6})[_T-]?(\d{6})\.?(\d{3}(?:\d{3})?)?", re.ASCII)
-"""Names that are dates, ``YYYYMMDDhhmmss``, with milli- or microseconds or without."""
+DATE = re.compile(
+    r"(?:[A-Z]+\d*[_-])?((?:19|20)\d{6})[_T-]?(\d{6})\.?(\d{3}(?:\d{3})?)?(?:[._][A-Z]+)*",
+    re.ASCII | re.IGNORECASE,
+)
+"""Names that are dates, ``YYYYMMDDhhmmss``, with milli- or microseconds or without, in words or
+not: ``IMG_20240301_120000_HDR``."""
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 NS_PER_S = 1_000_000_000
 UNITS_NS = {"nanoseconds": 1, "microseconds": 1000, "milliseconds": 1_000_000}
@@ -135,6 +139,26 @@ def list_images(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
     SourceError
         If there is none, only some are named by times, or two have the same time.
     """
+    paths = _list_files(source)
+    if not (odd := _find_odd_date(paths)) and DATE.fullmatch(paths[0].stem):
+        say(f"{source}: the names of the pictures are taken for dates in UTC")
+        moments = sorted((_parse_date(path.stem), path) for path in paths)
+    elif unit_ns := _find_unit_ns(source, paths):
+        if odd and unit_ns > 1:  # that many digits are no time in such a unit
+            raise SourceError(f"{odd}. Rename it")
+        moments = sorted((_parse_time_ns(path, unit_ns), path) for path in paths)
+    else:
+        if odd:
+            say(f"{odd}. So the times of the pictures are nominal (--rate-hz)")
+        return list(zip(_list_nominal_times(len(paths), rate_hz), paths, strict=True))
+    for (time_ns, path), (next_ns, following) in pairwise(moments):
+        if time_ns == next_ns:
+            raise SourceError(f"{path} and {following.name} have the same time. Remove one")
+    return moments
+
+
+def _list_files(source: Path) -> list[Path]:
+    """List the images in a folder in natural order; count photos and videos of other kinds."""
     if not source.exists():
         raise SourceError(f"no folder {source}. Pass a folder of images")
     refuse_pipes(source)
@@ -146,18 +170,7 @@ def list_images(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
         raise SourceError(
             f"no image ({', '.join(IMAGE_SUFFIXES)}) in {source}. Pass another folder"
         )
-    dates_ns = [_parse_date_ns(path.stem) for path in paths]
-    if None not in dates_ns:
-        say(f"{source}: the names of the pictures are taken for dates in UTC")
-        moments = sorted(zip(filter(None, dates_ns), paths, strict=True))
-    elif unit_ns := _find_unit_ns(source, paths):
-        moments = sorted((_parse_time_ns(path, unit_ns), path) for path in paths)
-    else:
-        return list(zip(_list_nominal_times(len(paths), rate_hz), paths, strict=True))
-    for (time_ns, path), (next_ns, following) in pairwise(moments):
-        if time_ns == next_ns:
-            raise SourceError(f"{path} and {following.name} have the same time. Remove one")
-    return moments
+    return paths
 
 
 def _list_nominal_times(count: int, rate_hz: float) -> list[int]:
@@ -190,15 +203,24 @@ def _find_unit_ns(source: Path, paths: Sequence[Path]) -> int:
     return UNITS_NS[units[0]] if timed and units else 0
 
 
-def _parse_date_ns(name: str) -> int | None:
-    """Parse nanoseconds since 1970 from a date; None: the name is none, or one before 1970."""
+def _parse_date(name: str) -> int:
+    """Parse nanoseconds since 1970 from a date; raise ValueError, which says why it is none."""
     if not (found := DATE.fullmatch(name)):
-        return None
-    try:
-        moment = datetime.fromisoformat(f"{found[1]}T{found[2]}.{found[3] or 0}+00:00")
-    except ValueError:
-        return None
-    return (moment - EPOCH) // timedelta(microseconds=1) * 1000 if moment > EPOCH else None
+        raise ValueError("not like YYYYMMDD_hhmmss")
+    moment = datetime.fromisoformat(f"{found[1]}T{found[2]}.{found[3] or 0}+00:00")
+    if moment <= EPOCH:
+        raise ValueError("before 1970")
+    return (moment - EPOCH) // timedelta(microseconds=1) * 1000
+
+
+def _find_odd_date(paths: Sequence[Path]) -> str:
+    """Return what is wrong with the first name that is no date, if any name looks like one."""
+    for path in paths if any(DATE.fullmatch(path.stem) for path in paths) else ():
+        try:
+            _parse_date(path.stem)
+        except ValueError as e:
+            return f"{path} is no date: {e}"
+    return ""
 
 
 def _parse_time_ns(path: Path, unit_ns: int) -> int:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from dmrl.errors import SourceError, suggest
-from dmrl.formats.files.text_cells import parse_number
 from dmrl.guards import limits
+from dmrl.guards.bounded_parsing import parse_number
 from dmrl.guards.safe_names import check_split_name
 from dmrl.samples.sample import LABEL_SOURCES
 

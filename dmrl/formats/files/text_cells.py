@@ -7,6 +7,7 @@ from decimal import Decimal, InvalidOperation
 import numpy as np
 
 from dmrl.geometry.frames import Array
+from dmrl.guards.bounded_parsing import parse_number
 
 MISSING = {
     *("", "na", "n/a", "nan", "-nan", "null", "none", "nil", "-", "--", "?", "<na>"),
@@ -18,15 +19,11 @@ DATE = re.compile(
     r"\s*(Z|UTC|[+-]\d\d(?::?\d\d)?)?",
     re.IGNORECASE,
 )
+DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*")
+THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2},\d{3}\s*")
+"""Numbers whose comma may separate thousands."""
 TIME_OF_DAY = re.compile(r"(\d\d?):(\d\d):(\d\d)(?:[.,](\d+))?")
 NS_PER_S = 1_000_000_000
-
-
-def parse_number(text: str) -> float:
-    """Parse a number; raise ValueError if it is none. To Python alone, ``1_0`` is one, too."""
-    if "_" in text:
-        raise ValueError(f"{text!r} is no number")
-    return float(text)
 
 
 def is_number(cell: str) -> bool:
@@ -35,6 +32,24 @@ def is_number(cell: str) -> bool:
         parse_number(cell.strip().replace(",", "."))
     except ValueError:
         return bool(DATE.fullmatch(cell.strip()) or TIME_OF_DAY.fullmatch(cell.strip()))
+    return True
+
+
+def find_decimal_commas(rows: list[list[str]]) -> bool:
+    """Return whether numbers have a decimal comma: some cells do, and no number has a point.
+
+    Raises
+    ------
+    ValueError
+        If all of these commas may separate thousands.
+    """
+    cells = (cell for row in rows for cell in row if "," in cell)
+    found = [cell for cell in cells if DECIMAL_COMMA.fullmatch(cell)]
+    if not found or any("." in cell and is_number(cell) for row in rows for cell in row):
+        return False
+    if all(map(THOUSANDS.fullmatch, found)):
+        number = found[0].strip()
+        raise ValueError(f"{number} may be {number.replace(',', '.')} or {number.replace(',', '')}")
     return True
 
 

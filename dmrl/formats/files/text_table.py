@@ -17,6 +17,7 @@ from dmrl.formats.clocks import Ints, settle_times
 from dmrl.formats.files import text_cells
 from dmrl.geometry.frames import Array
 from dmrl.guards import limits
+from dmrl.guards.bounded_parsing import parse_number
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 
@@ -35,7 +36,6 @@ BYTE_ORDER_MARKS = (
 )
 NO_TEXT, NO_TEXT_BYTES = re.compile(rb"[\0-\x08\x0e-\x1a\x1c-\x1f]"), 4096
 """Characters that no encoding of text in one byte has, and the beginning that is searched."""
-DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*")
 UNIT_SUFFIX = re.compile(r"\s*[\[(<{/]\s*([^\])>}]+?)\s*[\])>}]?\s*")
 
 
@@ -92,7 +92,7 @@ class TextTable:
         if self.has_decimal_commas:
             cells = [cell.replace(",", ".") for cell in cells]
         try:
-            return np.array([text_cells.parse_number(cell) for cell in cells])
+            return np.array([parse_number(cell) for cell in cells])
         except ValueError:
             values, bad = text_cells.parse_cells(cells)
         if bad and not (used and np.isfinite(values).any()):
@@ -173,7 +173,7 @@ def read_table(
     if not rows:
         raise EmptySource(f"{path} has no rows below its header. Pass another file")
     columns = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
-    has_commas = dialect.decimal == "," or (not dialect.decimal and _find_commas(rows))
+    has_commas = dialect.decimal == "," or (not dialect.decimal and _find_commas(path, rows))
     if has_commas and not dialect.decimal:
         say(f"{path}: numbers are read with decimal commas. [file] decimal in the table decides it")
     return TextTable(path, columns, numbers, units, has_commas)
@@ -342,9 +342,9 @@ def _split_rows(
     return [number for number, _ in kept], [row for _, row in kept]
 
 
-def _find_commas(rows: list[list[str]]) -> bool:
-    """Return whether numbers have a decimal comma: some cells do, and no number has a point."""
-    cells = (cell for row in rows for cell in row)
-    if not any("," in cell and DECIMAL_COMMA.fullmatch(cell) for cell in cells):
-        return False
-    return not any("." in cell and text_cells.is_number(cell) for row in rows for cell in row)
+def _find_commas(path: Path, rows: list[list[str]]) -> bool:
+    try:
+        return text_cells.find_decimal_commas(rows)
+    except ValueError as e:
+        way = "Write points and no other marks, or state it: [file] decimal in the table"
+        raise SourceError(f"{path}: {e}. {way}") from None

@@ -21,7 +21,7 @@ from dmrl.formats.files.labelled_pictures import (
     list_pictures,
     natural_key,
 )
-from dmrl.guards.bounded_parsing import parse_xml
+from dmrl.guards.bounded_parsing import parse_number, parse_xml
 from dmrl.terminal.left_out import leave_out
 
 HEAD_BYTES = 4096
@@ -111,7 +111,9 @@ def _read_rows(
     """Return the labels of a picture and the size that they refer to; None, None: unreadable."""
     try:
         root = parse_xml(label.read_bytes())
-        width, height = (float(root.findtext(f"size/{side}") or 0) for side in ("width", "height"))
+        width, height = (
+            parse_number(root.findtext(f"size/{side}") or "0") for side in ("width", "height")
+        )
         boxes = [_parse_box(one) for one in root.findall("object")]
         rows = build_rows(picture.name, boxes, options.names)
     except (OSError, ValueError) as e:
@@ -123,7 +125,8 @@ def _read_rows(
 def _parse_box(one: ElementTree.Element) -> tuple[str, tuple[float, float, float, float]]:
     """Return the class of an object, and its left, top, right and bottom edge."""
     xmin, ymin, xmax, ymax = (
-        float(one.findtext(f"bndbox/{name}") or "nan") for name in ("xmin", "ymin", "xmax", "ymax")
+        parse_number(one.findtext(f"bndbox/{name}") or "nan")
+        for name in ("xmin", "ymin", "xmax", "ymax")
     )
     name = (one.findtext("name") or "").strip() or "class"
     return name, (xmin - 1, ymin - 1, xmax, ymax)

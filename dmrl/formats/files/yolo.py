@@ -32,8 +32,7 @@ from dmrl.formats.files.labelled_pictures import (
     list_pictures,
     locate,
 )
-from dmrl.formats.files.text_cells import parse_number
-from dmrl.guards.bounded_parsing import parse_yaml
+from dmrl.guards.bounded_parsing import parse_number, parse_yaml
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 

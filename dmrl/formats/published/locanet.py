@@ -27,6 +27,7 @@ from dmrl import topics
 from dmrl.errors import SourceError
 from dmrl.formats.base import Content, Format, Options, read_text
 from dmrl.geometry.frames import PUBLISHED_RENDER, Array, camera_from_horizontal, project
+from dmrl.guards.bounded_parsing import parse_number
 from dmrl.images import codec
 from dmrl.samples.sample import Sample, build_calibration, build_image, build_labels, find_intervals
 
@@ -151,7 +152,7 @@ def _parse_numbers(
 ) -> tuple[tuple[float, ...], Array]:
     wanted = f"path {'roll,pitch ' if head else ''}and {width} numbers per robot"
     try:
-        groups = [[float(number) for number in word.split(",")] for word in words]
+        groups = [list(map(parse_number, word.split(","))) for word in words]
     except ValueError as e:
         raise SourceError(f"{where}: {e}; expected {wanted}. Restore the line") from None
     first = tuple(groups.pop(0)) if head and groups else ()

@@ -105,6 +105,18 @@ def test_invalid_coco_file_gives_one_line_error(text: str, tmp_path: Path) -> No
         read(tmp_path, "coco")
 
 
+@pytest.mark.parametrize("place", ["bbox", "attributes"])
+def test_numbers_with_underscores_are_none(place: str, tmp_path: Path) -> None:
+    document = coco("", [1], "")
+    for annotation in document["annotations"]:
+        annotation[place] = {"depth_m": "1_0"} if place == "attributes" else ["1_0", 2, 3, 4]
+    (tmp_path / "a.json").write_text(json.dumps(document))
+    write_picture(tmp_path / "1.png", 1)
+    with count_left_out() as left:
+        assert [s.message for s in read(tmp_path, "coco")] == ["CompressedImage"]
+    assert left.counts == {"pictures with a box that cannot be read": 1}
+
+
 def test_labels_of_ids_that_fit_no_picture_or_two_are_left_out(tmp_path: Path) -> None:
     document = coco("", range(3), "")
     document["images"][2]["id"] = document["images"][1]["id"]

@@ -66,6 +66,9 @@ def test_numbers_are_times_in_a_unit_in_which_a_camera_can_be_that_fast(
         (("20240301-120000123", "20240301-120000456"), 333_000_000),
         (("20240301120000.000", "20240301120000.033"), 33_000_000),
         (("20240301120000000001", "20240301120000100002"), 100_001_000),
+        (("IMG_20240301_120000", "IMG_20240301_120003_HDR"), 3_000_000_000),
+        (("PXL_20240301_120000123.MP", "PXL_20240301_120001123"), 1_000_000_000),
+        (("cam0-20240301T120000", "cam0-20240301T120007"), 7_000_000_000),
     ],
 )
 def test_dates_are_times(
@@ -88,6 +91,37 @@ def test_numbers_that_are_no_dates_are_none(
     found = image_folder.list_images(tmp_path, 10.0)
     assert [time_ns for time_ns, _ in found] == [0, 100_000_000]
     assert "for numbers, too near for times" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("names", "why"),
+    [
+        (("20241301120000", "20241301120002"), "month must be in 1..12"),
+        (("20240015120000", "20240015130000"), "month must be in 1..12"),  # months from 0
+        (("20240301120000", "20240301120060"), "second must be in 0..59"),
+        (("20240230120000123", "20240230120000456"), "day is out of range for month"),
+    ],
+)
+def test_near_dates_are_refused_with_what_is_wrong(
+    names: tuple[str, str], why: str, tmp_path: Path
+) -> None:
+    for name in names:
+        (tmp_path / f"{name}.png").write_bytes(b"")
+    with pytest.raises(SourceError, match=rf"\d\.png is no date: {why}\. Rename it"):
+        image_folder.list_images(tmp_path, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("other", "why"),
+    [("IMG_20240301_126000", "minute must be in 0..59"), ("a", "not like YYYYMMDD_hhmmss")],
+)
+def test_a_name_that_is_no_date_makes_all_times_nominal_with_a_line(
+    other: str, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("IMG_20240301_120000", other):
+        (tmp_path / f"{name}.jpg").write_bytes(b"")
+    assert [t for t, _ in image_folder.list_images(tmp_path, 10.0)] == [0, 100_000_000]
+    assert f"{other}.jpg is no date: {why}. So the times" in capsys.readouterr().err
 
 
 def test_a_rate_has_an_effect_unless_names_are_times(folder: Path) -> None:
