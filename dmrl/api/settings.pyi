@@ -62,7 +62,7 @@ class ConvertSettings(TypedDict, total=False):
     columns: str | PathLike[str] | None
     raw: bool
     bits: int
-    as_stored: bool
+    as_stored: bool | None
     robot_width_m: float | None
     unlabelled: bool
     strict: bool

@@ -115,7 +115,8 @@ class Options:
     bits
         Significant bits of 16-bit pixels: 2^bits - 1 becomes 255.
     as_stored
-        Do not turn images upright by their EXIF orientation.
+        Do not turn images upright by their EXIF orientation. None: turn those without labels and
+        camera, refuse the others.
     robot_width_m
         Width of the robots, metres, from which boxes give depths; None: they give none.
     unlabelled
@@ -131,7 +132,7 @@ class Options:
     raw: bool = False
     columns: Path | None = None
     bits: int = 16
-    as_stored: bool = False
+    as_stored: bool | None = None
     robot_width_m: float | None = None
     unlabelled: bool = False
 

@@ -74,8 +74,8 @@ class Settings:
         Significant bits of pixels of 16 bits: 2^bits - 1 becomes 255. 12 for the values of a 12-bit
         sensor.
     as_stored
-        images: keep them as they are stored. Without it, they are turned upright as their EXIF
-        orientation says.
+        images: keep them as they are stored; --upright: turn them as their EXIF orientation says.
+        Labels and camera are of such images. Without either, images with neither are turned.
     robot_width_m
         Width of the robots, metres: labels without depth get one from the width of their box.
         Needs the camera.
@@ -101,7 +101,7 @@ class Settings:
     columns: Path | None = None
     raw: Annotated[bool, Parameter(negative=())] = False
     bits: Annotated[int, Parameter(validator=validators.Number(gte=9, lte=16))] = 16
-    as_stored: Annotated[bool, Parameter(negative=())] = False
+    as_stored: Annotated[bool | None, Parameter(negative="--upright")] = None
     robot_width_m: Annotated[float | None, Parameter(validator=validators.Number(gt=0))] = None
     unlabelled: Annotated[bool, Parameter(negative=())] = False
     strict: Strict = False

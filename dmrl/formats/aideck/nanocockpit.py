@@ -149,5 +149,5 @@ FORMAT = Format(
     "a folder of the nanocockpit client",
     can_read,
     load_content,
-    SOURCE_OPTIONS | {"camera", "size_px"},
+    SOURCE_OPTIONS | {"camera", "size_px", "as_stored"},
 )

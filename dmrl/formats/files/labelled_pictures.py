@@ -181,7 +181,9 @@ def iter_picture_samples(
     """
     converter = PictureConverter(options, source)
     for time_ns, picture in pictures:
-        found = converter.convert(time_ns, picture.path.read_bytes(), picture.path)
+        labelled = any(row.peer for row in picture.rows or ())
+        data = picture.path.read_bytes()
+        found = converter.convert(time_ns, data, picture.path, labelled=labelled)
         if found is None:
             continue
         crop, samples = found

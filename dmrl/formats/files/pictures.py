@@ -108,6 +108,11 @@ SCALE_HINT = (
     "--width-px 640 --height-px 480"
 )
 
+TURNED_HINT = (
+    "is turned by EXIF, so its labels and calibration may be of either picture. Pass --upright if "
+    "they are of the one that viewers show, --as-stored if of the stored one"
+)
+
 
 def scaling_words(bits: int) -> str:
     """Return the words that state how pixels of 16 bits become 8."""
@@ -131,10 +136,19 @@ class PictureConverter:
     _converted: int = 0
     _changes: Counter[str] = field(default_factory=Counter)
 
-    def convert(self, time_ns: int, data: bytes, where: object) -> tuple[Crop, list[Sample]] | None:
-        """Convert an encoded picture; leave it out and return None if it cannot be decoded."""
+    def convert(
+        self, time_ns: int, data: bytes, where: object, *, labelled: bool = False
+    ) -> tuple[Crop, list[Sample]] | None:
+        """Convert an encoded picture; leave it out and return None if it cannot be decoded.
+
+        Raises
+        ------
+        SettingError
+            As `convert_pixels`, or if EXIF turns a picture with labels or a camera, and nobody said
+            of which picture they are.
+        """
         try:
-            return self.convert_pixels(time_ns, *self._decode(data, where), where)
+            return self.convert_pixels(time_ns, *self._decode(data, where, labelled), where)
         except SourceError as e:
             leave_out(codec.UNDECODABLE, e)
             return None
@@ -179,13 +193,19 @@ class PictureConverter:
         camera = crop_camera(crop, self.options.camera)
         return crop, [build_calibration(time_ns, self.options.robot, camera), image]
 
-    def _decode(self, data: bytes, where: object) -> tuple[codec.Rgb, tuple[bytes, str] | None]:
+    def _decode(
+        self, data: bytes, where: object, labelled: bool
+    ) -> tuple[codec.Rgb, tuple[bytes, str] | None]:
         """Return the pixels of an encoded picture, and its bytes if they may be kept."""
         header = codec.read_header(data, where)
         upright = not self.options.as_stored
+        turned = upright and header.is_turned
+        # Some tools label, or calibrate, the picture that viewers show, others the stored one.
+        if turned and self.options.as_stored is None and (labelled or self.options.camera):
+            raise SettingError(f"{where} {TURNED_HINT}")
         changes = {
             scaling_words(self.options.bits): header.has_16_bits,
-            "turned upright by EXIF (--as-stored keeps them)": upright and header.is_turned,
+            "turned upright by EXIF (--as-stored keeps them)": turned,
             "one image of several used, the first": header.is_animated,
         }
         rgb = header.decode(limits.PIXELS, bits=self.options.bits, upright=upright)
@@ -218,7 +238,7 @@ def _build_crop(width_px: int, height_px: int, where: object, options: Options) 
         return Crop(*size, *wanted, (0, 0) if wanted == size else AIDECK_CORNER_PX)
     raise SettingError(
         f"{where} is {width_px}x{height_px} px, its camera {camera.width_px}x"
-        f"{camera.height_px}. Pass the calibration of the images as they are stored"
+        f"{camera.height_px}. Pass the calibration of images of its size"
     )
 
 
