@@ -19,6 +19,7 @@ from dmrl.terminal.progress import say
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO, RANGE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Range"
 POSE, ODOMETRY = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
+TWIST = "geometry_msgs/msg/TwistStamped"
 TARGETS = {
     **dict.fromkeys(IMAGE_TYPES, (topics.CAMERA_IMAGE,)),
     CAMERA_INFO: (topics.CALIBRATION,),
@@ -26,7 +27,7 @@ TARGETS = {
     POSE: (topics.POSE, topics.TRUE_POSE),
     ODOMETRY: (topics.POSE, topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT),
     "sensor_msgs/msg/Imu": (topics.ATTITUDE,),
-    "geometry_msgs/msg/TwistStamped": (topics.VELOCITY,),
+    TWIST: (topics.VELOCITY,),
 }
 """Topics that messages become, by type."""
 NON_CAMERA_TOPICS = (topics.MASKS, topics.DEPTHS)
@@ -35,7 +36,7 @@ MOTION_CAPTURE = re.compile(
     r"vrpn|mocap|optitrack|vicon|qualisys|natnet|motive|truth", re.IGNORECASE
 )
 CONTENT_PART = re.compile(
-    r"(odom\w*|pose\w*|imu|data|raw|twist|velocity|image\w*|colou?r|cam(era)?([_-]\w*)?|rgbd?|mono|"
+    r"(odom\w*|pose\w*|imu|data|raw|twist\w*|vel(ocity)?(_\w*)?|speed|attitude|orientation|image\w*|colou?r|cam(era)?([_-]\w*)?|rgbd?|mono|"
     r"gr[ae]y|depth\w*|compressed\w*|info|camera_info|filtered|fused|local\w*|global\w*|position|"
     r"setpoint\w*|estimat\w*|state\w*|vrpn\w*|mavros|px4(?![_-]?\d)|fmu|fcu|out|in|truth|ground_truth|gt|"
     r"calibration|uwb\w*|rang(e|es|ing)([_-]\w*)?|dist(ance|ances)?([_-]\w*)?|peers?|to|from|"
@@ -52,6 +53,10 @@ HOLDER_PART = re.compile(
     re.IGNORECASE,
 )
 """Parts that seldom name a robot: they do where no other part can."""
+COMMAND_PART = re.compile(
+    r"(\w*_)?(setpoint|cmd|command|goal|desired|waypoint)s?(_\w*)?", re.IGNORECASE
+)
+"""Parts that say that a pose or velocity is what the robot is to have, not what it has."""
 DEPTH_NAME = re.compile(r"depth|disparity", re.IGNORECASE)
 NUMBERED_NAME = re.compile(r"([A-Za-z][A-Za-z_-]*?)[_-]?\d+")
 UWB_PART = re.compile(
@@ -119,6 +124,9 @@ def plan_topics(
             lines[topic, kind] = TopicPlan(topic, kind, count, "")
         elif kind not in CONVERTERS or any(topics.parse_topic(t, topic) for t in NON_CAMERA_TOPICS):
             why[topic, kind] = f"{kind} is not converted"
+        elif kind in (POSE, ODOMETRY, TWIST) and names.is_command(topic):
+            choice = f"--names {topic}={TARGETS[kind][0].format(robot='ROBOT')} takes it"
+            why[topic, kind] = f"its name is that of a command, not of a measurement ({choice})"
         elif kind == RANGE:
             known = {line.robot for line in lines.values()}
             if (pair := names.find_pair(topic, known)) is None:
@@ -248,6 +256,11 @@ class _TopicNames:
         if row is not None:
             return topics.parse_topic(row.pattern, wanted)
         return {"robot": wanted} if wanted else None
+
+    def is_command(self, topic: str) -> bool:
+        """Return whether a topic is named as a command is, and not by the user."""
+        named = topic in self._options.names
+        return not named and any(map(COMMAND_PART.fullmatch, topic.split("/")))
 
     def find_robot(self, topic: str) -> str:
         """Return the robot of a topic."""

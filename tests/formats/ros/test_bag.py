@@ -119,6 +119,7 @@ RANGE, ODOMETRY, IMU = (
     "nav_msgs/msg/Odometry",
     "sensor_msgs/msg/Imu",
 )
+POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
 
 
 def planned(
@@ -150,6 +151,29 @@ def test_topics_are_assigned_to_robots() -> None:
     }
     assert {"/cf1/uwb", "/cf1/cf1/range", "/chatter"} <= set(unknown)
     assert not {"/cf9/odom", "/quiet"} & set(unknown)
+
+
+@pytest.mark.parametrize(
+    ("command", "kind"),
+    [
+        ("/mavros/setpoint_position/local", POSE),
+        ("/mavros/setpoint_velocity/cmd_vel", TWIST),
+        ("/goal_pose", POSE),
+        ("/cf1/pose_desired", POSE),
+    ],
+)
+def test_a_command_is_no_measurement_unless_the_user_says_so(command: str, kind: str) -> None:
+    measured = "/mavros/local_position/measured"
+    assert planned((command, kind, 9), (measured, kind, 5))[1] == [command]
+    pattern = topics.POSE if kind == POSE else topics.VELOCITY
+    found, unknown = planned((command, kind, 9), **{command: pattern.format(robot="cf1")})
+    assert found == {command: ("cf1", "")} and not unknown
+
+
+@pytest.mark.parametrize("part", ["vel", "velocity_body", "twist_local", "speed"])
+def test_a_velocity_is_of_the_robot_that_has_the_other_topics(part: str) -> None:
+    found, _ = planned(("/drone/imu", IMU, 5), (f"/drone/{part}", TWIST, 5))
+    assert {robot for robot, _ in found.values()} == {"drone"}
 
 
 def test_a_pose_of_motion_capture_is_kept_beside_another_of_the_robot() -> None:
