@@ -114,11 +114,11 @@ def _read_file(
 ) -> Iterator[LabelledPicture]:
     try:
         told = parse_json(path.read_bytes())
-        classes = {c["id"]: str(c["name"]) for c in told.get("categories", [])}
-        by_image: dict[Any, list[Record]] = defaultdict(list)
+        classes = {_to_key(c["id"]): str(c["name"]) for c in told.get("categories", [])}
+        by_image: dict[str, list[Record]] = defaultdict(list)
         for annotation in told.get("annotations", []):
-            by_image[annotation["image_id"]].append(annotation)
-        images = [(i["id"], str(i["file_name"]), i) for i in told["images"]]
+            by_image[_to_key(annotation["image_id"])].append(annotation)
+        images = [(_to_key(i["id"]), str(i["file_name"]), i) for i in told["images"]]
     except (OSError, ValueError, TypeError, AttributeError, KeyError) as e:
         why = " ".join(f"{type(e).__name__}: {e}".split())[:200]
         raise SourceError(f"{path} is not a COCO file: {why}. Restore the file") from None
@@ -141,11 +141,18 @@ def _read_file(
         yield LabelledPicture(picture, split, rows, None if None in size else size)
 
 
+def _to_key(number: object) -> str:
+    """Return an id as text: some programs write it as a number here and as text there."""
+    if isinstance(number, float) and number.is_integer():
+        return str(int(number))
+    return str(number)
+
+
 def _build_rows(
     where: str,
     file: str,
     annotations: Sequence[Record],
-    classes: Mapping[Any, str],
+    classes: Mapping[str, str],
     options: Options,
 ) -> list[LabelRow] | None:
     """Return the labels of a picture; None if one of them cannot be read."""
@@ -161,12 +168,12 @@ def _build_rows(
 
 
 def _parse_box(
-    annotation: Record, classes: Mapping[Any, str]
+    annotation: Record, classes: Mapping[str, str]
 ) -> tuple[str, tuple[float, float, float, float]]:
     if not isinstance(annotation.get("bbox"), list):
         raise ValueError("no bbox")
     left, top, width, height = (parse_number(str(edge)) for edge in annotation["bbox"])
-    kind = annotation["category_id"]
+    kind = _to_key(annotation["category_id"])
     return classes.get(kind, f"class{kind}"), (left, top, left + width, top + height)
 
 

@@ -1,6 +1,7 @@
 """COCO sets become labels within 0.01 px."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,19 @@ def test_labels_of_ids_that_fit_no_picture_or_two_are_left_out(tmp_path: Path) -
         "boxes of no picture in the file": len(boxes_of(2)),
         "labels of pictures that share an id": 2,
     }
+
+
+@pytest.mark.parametrize("kind", [str, float])
+def test_ids_may_be_numbers_here_and_texts_there(
+    kind: Callable[[int], object], tmp_path: Path
+) -> None:
+    document = coco("", [1, 2], "")
+    for annotation in document["annotations"]:
+        annotation |= {name: kind(annotation[name]) for name in ("image_id", "category_id")}
+    (tmp_path / "a.json").write_text(json.dumps(document))
+    for k in (1, 2):
+        write_picture(tmp_path / f"{k}.png", k)
+    check(read(tmp_path, "coco"), [1, 2])
 
 
 def test_attributes_of_other_programs_leave_the_peer_and_the_source(tmp_path: Path) -> None:
