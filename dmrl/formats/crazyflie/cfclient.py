@@ -27,6 +27,7 @@ from dmrl.terminal.left_out import leave_out
 TIME_COLUMN = "Timestamp"
 NS_PER_MS = 1_000_000
 TIMESTAMP_BITS = 24  # milliseconds in a log packet
+MAX_TIME_MS = 2**63 / NS_PER_MS
 INTEGER_CELL = re.compile(r"\s*[+-]?\d+\s*")
 EMPTY_NAME = re.compile(r"column_\d+")  # given by read_table
 DATE_SUFFIX = re.compile(r"-\d{8}T\d{2}-\d{2}-\d{2}$")
@@ -119,6 +120,11 @@ def read_block(path: Path) -> LogBlock:
     if time_ms is None or not len(known):
         raise EmptySource(f"{path}: no number in {TIME_COLUMN}. Pass another file")
     leave_out("rows without a time", path, len(time_ms) - len(known))
+    if (largest := np.abs(time_ms[known]).max()) >= MAX_TIME_MS:
+        raise SourceError(
+            f"{path}: {largest:.0f} in {TIME_COLUMN} is after the year 2262, in the milliseconds "
+            "of the client. State its unit: --columns map.toml (docs/sources.md)"
+        )
     parts_ms, whole_ms = np.modf(time_ms[known])
     time_ns = unwrap(whole_ms, TIMESTAMP_BITS) * NS_PER_MS + np.rint(parts_ms * 1e6).astype(int)
     found = settle_times(time_ns, lambda row: text.name_row(int(known[row])))

@@ -36,7 +36,7 @@ BYTE_ORDER_MARKS = (
 )
 NO_TEXT, NO_TEXT_BYTES = re.compile(rb"[\0-\x08\x0e-\x1a\x1c-\x1f]"), 4096
 """Characters that no encoding of text in one byte has, and the beginning that is searched."""
-UNIT_SUFFIX = re.compile(r"\s*[\[(<{/]\s*([^\])>}]+?)\s*[\])>}]?\s*")
+UNIT_SUFFIX = re.compile(r"\s*[\[(<{/]\s*([^\])>}]*?)\s*[\])>}]?\s*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +239,7 @@ def _find_header(
     for place, (_, line) in enumerate(lines[:HEADER_LINES_MAX]):
         for separator in separators if wanted else ():
             plain = _uncomment(line, marks)
-            for text in dict.fromkeys((line, plain, _cut_comment(plain, marks))):
+            for text in dict.fromkeys((plain, line, _cut_comment(plain, marks))):
                 names = _split(text, separator)
                 score = sum(any(_is_named(name, w) for name in names) for w in set(wanted))
                 if score > best[0]:

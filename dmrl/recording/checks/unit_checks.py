@@ -15,7 +15,7 @@ from dmrl.recording.checks.topic_times import TopicTimes
 from dmrl.recording.protobuf.arrow_arrays import to_numpy
 from dmrl.topics import CAMERA_IMAGE, POSE, SENSORS, TRUE_POSE, UnitCheck, parse_topic
 
-PERIOD_MAX_S, PERIOD_MIN_S = 5.0, 1e-5
+PERIOD_MAX_S, PERIOD_MIN_S = 5.0, 2e-4
 """Longest and shortest plausible median period of a sensor, seconds."""
 MESSAGES_MIN = 20
 """Messages needed to measure a period or a magnitude."""

@@ -242,6 +242,13 @@ def test_log_block_may_have_one_row(tmp_path: Path) -> None:
     assert [s.time_ns for s in found["/cf1/log/b"]] == [5_000_000, 7_000_000]
 
 
+def test_microseconds_since_1970_are_no_milliseconds(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("Timestamp,a.b\n" + "".join(f"{17 * 10**14 + k},1\n" for k in range(3)))
+    with pytest.raises(SourceError, match=r"1700000000000002 in Timestamp is after the year 2262"):
+        cfclient.read_block(path)
+
+
 def test_a_client_that_logged_two_flights_is_refused_with_the_line(tmp_path: Path) -> None:
     flight = [f"{10 * k},1.5" for k in range(300)]
     text = "\n".join(["Timestamp,x", *(f"{5000 + 10 * k},1.5" for k in range(300)), *flight])
