@@ -186,13 +186,16 @@ def _parse_line(words: Sequence[str], about: _Description) -> tuple[str, tuple[f
     """Return the class and the box (left, top, right, bottom) of a line."""
     number, values = int(parse_number(words[0])), [parse_number(word) for word in words[1:]]
     name = about.names.get(number, f"class{number}")
-    if not all(math.isfinite(v) and abs(v) <= MAX_SHARE for v in values[:4]):
+    boxed = len(values) in (4, 5) or about.keypoints
+    if not all(math.isfinite(v) and abs(v) <= MAX_SHARE for v in values[: 4 if boxed else None]):
         raise ValueError("coordinates are not shares of the picture's size, from 0 to 1")
-    if len(values) in (4, 5) or about.keypoints:
+    if boxed:
         u, v, width, height = values[:4]
         return name, (u - width / 2, v - height / 2, u + width / 2, v + height / 2)
     if len(values) < 6 or len(values) % 2:
         raise ValueError(f"{len(words)} numbers are no box and no polygon")
+    if len(values) == 6 and words[-1].isdecimal():  # as trackers write it
+        raise ValueError("a box with a confidence and a track, or a triangle. Cut the last two off")
     return name, (min(values[::2]), min(values[1::2]), max(values[::2]), max(values[1::2]))
 
 

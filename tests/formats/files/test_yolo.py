@@ -125,6 +125,8 @@ def test_keypoints_are_ignored_where_they_are_stated(small: Path) -> None:
         "0 0.5 0.5 0 0.1",
         "0 nan 0.5 0.1 0.1",
         "0 0.1 0.2 0.5 0.2 0.3 0.7 0.4",
+        "0 0.5 0.5 0.25 0.5 0.87 1",  # a confidence and a track
+        "0 0.5 0.5 0.25 0.5 0.4 0.4 2 0.6 0.6 2",  # keypoints, but nothing says so
         "\xff",
     ],
 )
