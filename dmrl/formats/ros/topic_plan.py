@@ -36,7 +36,7 @@ MOTION_CAPTURE = re.compile(
     r"vrpn|mocap|optitrack|vicon|qualisys|natnet|motive|truth", re.IGNORECASE
 )
 CONTENT_PART = re.compile(
-    r"(odom\w*|pose\w*|imu|data|raw|twist\w*|vel(ocity)?(_\w*)?|speed|attitude|orientation|image\w*|colou?r|cam(era)?([_-]\w*)?|rgbd?|mono|"
+    r"(odom\w*|pose\w*|imu|data|raw|twist\w*|vel(ocity)?(_\w*)?|speed|attitude|orientation|vision|image\w*|colou?r|cam(era)?([_-]\w*)?|rgbd?|mono|"
     r"gr[ae]y|depth\w*|compressed\w*|info|camera_info|filtered|fused|local\w*|global\w*|position|"
     r"setpoint\w*|estimat\w*|state\w*|vrpn\w*|mavros|px4(?![_-]?\d)|fmu|fcu|out|in|truth|ground_truth|gt|"
     r"calibration|uwb\w*|rang(e|es|ing)([_-]\w*)?|dist(ance|ances)?([_-]\w*)?|peers?|to|from|"
@@ -215,8 +215,9 @@ def _find_doubles(
             camera = cameras.get(line.robot, "").split("/")
             shared = sum(map(str.__eq__, camera, line.topic.split("/")))
             return unnamed, -shared, -line.count
-        # By REP 145, imu/data_raw has no orientation, which imu/data has.
-        return unnamed, line.kind == POSE, line.topic.endswith("_raw"), -line.count
+        # By REP 145, imu/data_raw has no orientation, which imu/data has. MAVROS's velocity_local
+        # does not turn with the robot, as velocity_body does.
+        return unnamed, line.kind == POSE, line.topic.endswith(("_raw", "_local")), -line.count
 
     for key in sorted(groups, key=lambda one: one[0] == CAMERA_INFO):  # after the images
         found = groups[key]
@@ -224,6 +225,11 @@ def _find_doubles(
         if key[0] == "image":
             cameras[best[key].robot] = best[key].topic
     return [(x, best[key]) for key, found in groups.items() for x in found if x is not best[key]]
+
+
+def _is_content(part: str) -> bool:
+    """Return whether a part describes its content, as a whole or in each word: ``data_raw``."""
+    return bool(CONTENT_PART.fullmatch(part)) or all(map(CONTENT_PART.fullmatch, part.split("_")))
 
 
 class _TopicNames:
@@ -243,7 +249,7 @@ class _TopicNames:
 
     def _candidates(self, topic: str) -> list[str]:
         told, parts = self._options.names, [part for part in topic.split("/") if part]
-        own = [part for part in parts if part in told or not CONTENT_PART.fullmatch(part)]
+        own = [part for part in parts if part in told or not _is_content(part)]
         return [part for part in own if part in told or not HOLDER_PART.fullmatch(part)] or own
 
     def _rename(self, part: str) -> str:

@@ -170,10 +170,24 @@ def test_a_command_is_no_measurement_unless_the_user_says_so(command: str, kind:
     assert found == {command: ("cf1", "")} and not unknown
 
 
-@pytest.mark.parametrize("part", ["vel", "velocity_body", "twist_local", "speed"])
-def test_a_velocity_is_of_the_robot_that_has_the_other_topics(part: str) -> None:
-    found, _ = planned(("/drone/imu", IMU, 5), (f"/drone/{part}", TWIST, 5))
+@pytest.mark.parametrize(
+    ("part", "kind"),
+    [
+        *((part, TWIST) for part in ("vel", "velocity_body", "twist_local", "speed")),
+        *((part, POSE) for part in ("vision_pose", "raw_data", "front_camera")),
+    ],
+)
+def test_a_name_of_content_is_no_robot(part: str, kind: str) -> None:
+    found, _ = planned(("/drone/imu", IMU, 5), (f"/drone/{part}", kind, 5))
     assert {robot for robot, _ in found.values()} == {"drone"}
+
+
+def test_a_velocity_of_the_body_comes_before_a_longer_one_of_the_map() -> None:
+    found, unknown = planned(
+        ("/mavros/local_position/velocity_local", TWIST, 9),
+        ("/mavros/local_position/velocity_body", TWIST, 5),
+    )
+    assert found == {"/mavros/local_position/velocity_body": ("me", "")} and len(unknown) == 1
 
 
 def test_a_pose_of_motion_capture_is_kept_beside_another_of_the_robot() -> None:
