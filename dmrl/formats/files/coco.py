@@ -24,7 +24,6 @@ from dmrl.formats.files.labelled_pictures import (
     LabelledPicture,
     build_rows,
     build_set_content,
-    find_split,
     list_pictures,
 )
 from dmrl.guards.bounded_parsing import parse_json, parse_number
@@ -76,17 +75,22 @@ def load_content(source: Path, options: Options) -> Content:
     boxes = [path for path in files if path.name.startswith("instances")] or files
     root = source if source.is_dir() else source.parent
     found = _PictureIndex(root)
-    pictures = [picture for path in boxes for picture in _read_file(path, root, found, options)]
-    used = {picture.path for picture in pictures}
-    if unnamed := [path for path in found.paths if path not in used]:
+    # A file of a split before one of all pictures.
+    boxes.sort(key=lambda path: _find_split(path, root) is None)
+    pictures: dict[Path, LabelledPicture] = {}
+    for picture in (one for path in boxes for one in _read_file(path, root, found, options)):
+        if pictures.setdefault(picture.path, picture) is not picture:
+            leave_out("pictures named again, in another JSON file or the same", picture.path)
+    if unnamed := [path for path in found.paths if path not in pictures]:
         leave_out("pictures that no JSON file names", unnamed[0], len(unnamed))
-    return build_set_content(source, pictures, options)
+    return build_set_content(source, pictures.values(), options)
 
 
 class _PictureIndex:
     """Pictures below a folder, found by the end of their path."""
 
     def __init__(self, root: Path) -> None:
+        self._root = root
         self.paths = list_pictures(root)
         self._by_name: dict[str, list[Path]] = defaultdict(list)
         for path in self.paths:
@@ -98,7 +102,9 @@ class _PictureIndex:
         mine = [p for p in self._by_name[parts[-1]] if p.parts[-len(parts) :] == parts]
         mine = mine or (self._by_name[parts[-1]] if parts else [])
         near = [p for p in mine if folder in p.parents and folder.name != "annotations"]
-        same = [p for p in near or mine if split and find_split(p, {}) == split]
+        same = [
+            p for p in near or mine if split and _find_split(p.parent / "_", self._root) == split
+        ]
         return next(iter(same or near or mine), None)
 
 

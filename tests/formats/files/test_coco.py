@@ -10,6 +10,7 @@ import pytest
 from dmrl.errors import SourceError
 from dmrl.formats.base import Options
 from dmrl.formats.registry import find_format
+from dmrl.images.codec import decode
 from dmrl.terminal.left_out import count_left_out
 
 from .boxes import HEIGHT, WIDTH, boxes_of, check, read, write_picture
@@ -62,7 +63,9 @@ def test_coco_with_splits(pictures: str, file: str, prefix: str, tmp_path: Path)
         (tmp_path / "annotations/captions_train2017.json").write_text(
             '{"images": [], "annotations": []}'
         )
-    check(read(tmp_path, "coco"), list(range(9)))
+    check(samples := read(tmp_path, "coco"), list(range(9)))
+    pixels = [decode(s.fields["data"]) for s in samples if s.message == "CompressedImage"]
+    assert [int(rgb[0, 0, 0]) for rgb in pixels] == list(range(9))
     content = find_format(tmp_path).content(tmp_path, Options())
     assert content.split == {"train": [(0, 500_000_000)], "val": [(600_000_000, 800_000_000)]}
 
@@ -145,6 +148,18 @@ def test_ids_may_be_numbers_here_and_texts_there(
     for k in (1, 2):
         write_picture(tmp_path / f"{k}.png", k)
     check(read(tmp_path, "coco"), [1, 2])
+
+
+def test_a_picture_of_several_files_counts_once_and_in_its_split(tmp_path: Path) -> None:
+    for k in range(4):
+        write_picture(tmp_path / f"{k}.png", k)
+    for name, ks in (("all", (0, 1, 2, 3)), ("test", (0, 1)), ("train", (1, 2))):
+        (tmp_path / f"instances_{name}.json").write_text(json.dumps(coco("", list(ks), "")))
+    with count_left_out() as left:
+        content = find_format(tmp_path).content(tmp_path, Options())
+        check(list(content.samples), [2, 0, 1, 3])
+    assert content.split == {"train": [(0, 0)], "test": [(100_000_000, 200_000_000)]}
+    assert left.counts == {"pictures named again, in another JSON file or the same": 4}
 
 
 def test_attributes_of_other_programs_leave_the_peer_and_the_source(tmp_path: Path) -> None:
