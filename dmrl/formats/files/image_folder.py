@@ -60,6 +60,8 @@ CALIBRATION_FILE = "calibration.toml"
 MIN_TIME_DIGITS = 12  # fewer would be under 17 minutes after 1970: a counter, not a time
 SECONDS = re.compile(r"[0-9]+\.[0-9]+|1[0-9]{9}")
 """Names that are seconds: with a decimal point, or whole ones of the years 2001 to 2033."""
+LONG_NUMBER = re.compile(r"\d{12}|1\d{9}\.\d")
+"""Numbers beside other text that may be times."""
 DATE = re.compile(
     r"(?:[A-Z]+\d*[_-])?((?:19|20)\d{6})[_T-]?(\d{6})\.?(\d{3}(?:\d{3})?)?(?:[._][A-Z]+)*",
     re.ASCII | re.IGNORECASE,
@@ -148,8 +150,7 @@ def list_images(source: Path, rate_hz: float) -> list[tuple[int, Path]]:
             raise SourceError(f"{odd}. Rename it")
         moments = sorted((_parse_time_ns(path, unit_ns), path) for path in paths)
     else:
-        if odd:
-            say(f"{odd}. So the times of the pictures are nominal (--rate-hz)")
+        _report_nominal_times(paths, odd)
         return list(zip(_list_nominal_times(len(paths), rate_hz), paths, strict=True))
     for (time_ns, path), (next_ns, following) in pairwise(moments):
         if time_ns == next_ns:
@@ -175,6 +176,18 @@ def _list_files(source: Path) -> list[Path]:
 
 def _list_nominal_times(count: int, rate_hz: float) -> list[int]:
     return [round(k * NS_PER_S / rate_hz) for k in range(count)]
+
+
+def _report_nominal_times(paths: Sequence[Path], odd: str) -> None:
+    """Report that the times are nominal though names look like dates or have long numbers."""
+    long = [path for path in paths if LONG_NUMBER.search(path.stem) and not path.stem.isdecimal()]
+    if odd:
+        say(f"{odd}. So the times of the pictures are nominal (--rate-hz)")
+    elif long:
+        say(
+            f"{long[0]}: the number in its name is not taken for a time, so the times of the "
+            "pictures are nominal (--rate-hz). If it is one, name them by the number alone"
+        )
 
 
 def _find_unit_ns(source: Path, paths: Sequence[Path]) -> int:

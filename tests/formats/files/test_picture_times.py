@@ -124,6 +124,23 @@ def test_a_name_that_is_no_date_makes_all_times_nominal_with_a_line(
     assert f"{other}.jpg is no date: {why}. So the times" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("frame_1403636579763555584", True),
+        ("left1305031102.175304-a", True),
+        ("frame_000000001", False),
+        ("00012", False),
+    ],
+)
+def test_a_time_beside_other_text_is_none_with_a_line(
+    name: str, said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / f"{name}.png").write_bytes(b"")
+    assert image_folder.list_images(tmp_path, 10.0)[0][0] == 0
+    assert ("is not taken for a time" in capsys.readouterr().err) == said
+
+
 def test_a_rate_has_an_effect_unless_names_are_times(folder: Path) -> None:
     for path in sorted(folder.glob("[abc].*")):
         path.rename(folder / f"frame_{path.stem:0>9}{path.suffix}")
