@@ -52,6 +52,10 @@ def load_content(source: Path, options: Options) -> Content:
     table = read_column_map(Path(options.columns or ""), time_column=LOG_TIME)
     if fixed := [key for key, column in table.columns.items() if column.value is not None]:
         raise SourceError(f"[{fixed[0]}] value: constants are for text files. Name a field")
+    if table.robot_column or table.peer_column:
+        raise SourceError(
+            f"{options.columns}: [robot] and [peer] are for text files; see {{robot}}"
+        )
     options = replace(options, names=add_names(options.names, table.renames), columns=None)
     is_bag = not foreign_recording.can_read(source)
     kinds = {topic: kind for topic, kind, count in _list_topics(source, is_bag=is_bag) if count}

@@ -21,9 +21,9 @@
     unit = "mm"
 
 One table serves several robots: ``{robot}`` in a name stands for the robot, and ``{peer}`` in the
-name of ``[range."*"]`` for every peer. ``[robot] name`` is the column with the robot of each row.
-``[file]`` states the form of the file; see `dmrl.formats.files.text_table.Dialect`. ``[names]``
-renames robots, as ``--names`` does.
+name of ``[range."*"]`` for every peer. ``[robot] name`` is the column with the robot of each row,
+``[peer] name`` that with the peer of each range. ``[file]`` states the form of the file; see
+`dmrl.formats.files.text_table.Dialect`. ``[names]`` renames robots, as ``--names`` does.
 ``QUANTITIES`` lists the supported quantities.
 """
 
@@ -66,6 +66,8 @@ REQUIRED_TOGETHER = (
     ("true_qx", "true_qy", "true_qz", "true_qw"),
 )
 """Groups of quantities that are only meaningful together."""
+FORM_TABLES = ("robot", "peer", "file", "names")
+"""Tables that are of no quantity."""
 COLUMN_KEYS = ("name", "unit", "sign", "frame", "value", "held")
 ANY_PEER = "*"
 """Key of the ranges to all peers that the names of columns tell."""
@@ -101,19 +103,20 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class ColumnMap:
-    """Columns by quantity and of ranges by peer, column of the robot, form of the file, renames."""
+    """Columns by quantity, of ranges by peer, of robot and peer; form of the file, renames."""
 
     columns: Mapping[str, Column]
     ranges: Mapping[str, Column]
     robot_column: str = ""
     dialect: Dialect = field(default_factory=Dialect)
     renames: Mapping[str, str] = field(default_factory=dict)
+    peer_column: str = ""
 
     @property
     def names(self) -> set[str]:
         """Names of all columns of the file that the map uses."""
         used = {column.name for column in (*self.columns.values(), *self.ranges.values())}
-        return (used | {self.robot_column}) - {""}
+        return (used | {self.robot_column, self.peer_column}) - {""}
 
 
 def read_column_map(path: Path, *, time_column: str = "") -> ColumnMap:
@@ -135,27 +138,45 @@ def read_column_map(path: Path, *, time_column: str = "") -> ColumnMap:
         values = parse_toml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as e:
         raise SourceError(f"{path} is no table of columns in TOML: {e}. Fix it") from None
-    robot, form, renames = (values.pop(key, {}) for key in ("robot", "file", "names"))
+    robot, peer, form, renames = (values.pop(key, {}) for key in FORM_TABLES)
     if time_column:
         values.setdefault("time", {"name": time_column, "unit": "ns"})
     ranges = values.pop("range", {})
     ranges = ranges if isinstance(ranges, dict) else {"": ranges}
     faults = [fault for key, table in values.items() for fault in _iter_errors(key, table)]
     faults += [f for peer, table in ranges.items() for f in _iter_errors(f"range.{peer}", table)]
-    faults += [*_iter_missing(values), *_iter_form_errors(robot, form)]
+    faults += [*_iter_missing(values), *_iter_form_errors(robot, peer, form)]
+    faults += _iter_peer_errors(peer, ranges)
     if not isinstance(renames, dict) or not all(isinstance(new, str) for new in renames.values()):
         faults.append("[names]: not new names by old ones")
     if faults:
         raise SourceError(f"{path}: {'; '.join(faults)}. See docs/sources.md")
     columns = {key: _build_column(QUANTITIES[key], table) for key, table in values.items()}
     held = {peer: _build_column(LENGTH_UNITS, table) for peer, table in ranges.items()}
-    return ColumnMap(columns, held, robot.get("name", ""), Dialect(**form), renames)
+    return ColumnMap(
+        columns, held, robot.get("name", ""), Dialect(**form), renames, peer.get("name", "")
+    )
 
 
-def _iter_form_errors(robot: Any, form: Any) -> Iterator[str]:
-    """Yield the errors of ``[robot]`` and ``[file]``."""
+def _iter_peer_errors(peer: Any, ranges: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the errors of the ranges to any peer, which columns or rows name."""
+    name = str(column.get("name", "")) if isinstance(column := ranges.get(ANY_PEER), dict) else ""
+    if peer and [*ranges] != [ANY_PEER]:
+        yield f'[peer] needs [range."{ANY_PEER}"], and no other range'
+    elif peer and "{peer}" in name:
+        yield f"[range.{ANY_PEER}] name: {{peer}} in it, but rows name the peer, by [peer]"
+    elif name and not peer and "{peer}" not in name:
+        yield (
+            f"[range.{ANY_PEER}] name: no {{peer}} in it; the range to one peer is [range.PEER], "
+            "and [peer] names a column of peers"
+        )
+
+
+def _iter_form_errors(robot: Any, peer: Any, form: Any) -> Iterator[str]:
+    """Yield the errors of ``[robot]``, ``[peer]`` and ``[file]``."""
     for key, table, known in (
         ("robot", robot, ["name"]),
+        ("peer", peer, ["name"]),
         ("file", form, [one.name for one in fields(Dialect)]),
     ):
         wrong = not isinstance(table, dict) or any(
@@ -189,7 +210,7 @@ def _iter_errors(key: str, table: Any) -> Iterator[str]:
     units = LENGTH_UNITS if key.startswith("range.") else QUANTITIES.get(key)
     if units is None:
         near = get_close_matches(key, QUANTITIES, n=1)
-        known = "there are " + ", ".join((*QUANTITIES, "range.PEER"))
+        known = "there are " + ", ".join((*QUANTITIES, "range.PEER", *FORM_TABLES))
         known = f"did you mean {near[0]}?" if near else known
         yield f"[{key}]: no such quantity, {known}"
     elif not isinstance(table, dict):
@@ -197,8 +218,6 @@ def _iter_errors(key: str, table: Any) -> Iterator[str]:
     else:
         wrong = {name: "no such key" for name in table if name not in COLUMN_KEYS}
         wrong |= _find_wrong_values(units, table)
-        if key == f"range.{ANY_PEER}" and "{peer}" not in str(table.get("name", "{peer}")):
-            wrong["name"] = "no {peer} in it; the range to one peer is [range.PEER]"
         yield from (f"[{key}] {name}: {what}" for name, what in wrong.items())
 
 

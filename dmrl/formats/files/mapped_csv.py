@@ -8,6 +8,7 @@ folder has one file per robot, named after it. Every column is kept unchanged, o
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -124,9 +125,32 @@ def iter_robot_streams(
     for key, one in (*log.columns.items(), *log.ranges.items()):
         _doubt_header_unit(key, one, text)
     yield from _iter_sensor_streams(robot, path, time_ns, values, log)
-    for peer, one in log.ranges.items():
+    for peer, one in _name_peers(robot, log, options).items():
         range_m = _to_values(f"range.{peer}", one, cells, text, len(time_ns))
-        yield _build_ranges(robot, options.names.get(peer, peer), time_ns, range_m, one, path)
+        if log.peer_column:
+            told = text.columns[log.peer_column]
+            mine = [options.names.get(cell.strip(), cell.strip()) == peer for cell in told]
+            range_m = np.where(mine, range_m, np.nan)
+        yield _build_ranges(robot, peer, time_ns, range_m, one, path)
+
+
+def _name_peers(robot: str, log: RobotLog, options: Options) -> dict[str, Column]:
+    """Return the range to each peer, by its name in the recording.
+
+    Raises
+    ------
+    SourceError
+        If a column would be the range to two peers.
+    """
+    named = {options.names.get(peer, peer): one for peer, one in log.ranges.items()}
+    named.pop(robot, None)
+    for one, other in combinations(named, 2) if not log.peer_column else ():
+        if named[one].name == named[other].name:
+            raise SourceError(
+                f"{log.text.path}: {named[one].name} cannot be the range of {robot} to both {one} "
+                f"and {other}. Name the column with the peer of each row: [peer]"
+            )
+    return named
 
 
 def _to_values(

@@ -19,7 +19,8 @@ from dmrl.terminal.progress import say
 class RobotLog:
     """Rows of one robot, and the column of each quantity and of the range to each peer.
 
-    ``missing`` holds the columns of the table that the file lacks.
+    ``missing`` holds the columns of the table that the file lacks. ``peer_column`` names the peer
+    of each row's range; empty: every row has a range to every peer.
     """
 
     robot: str
@@ -27,6 +28,7 @@ class RobotLog:
     columns: Mapping[str, Column]
     ranges: Mapping[str, Column]
     missing: frozenset[str]
+    peer_column: str = ""
 
 
 def read_robot_logs(files: Mapping[str, Path], table: ColumnMap) -> list[RobotLog]:
@@ -117,19 +119,24 @@ def _resolve(robot: str, text: TextTable, table: ColumnMap) -> RobotLog:
 
     columns = {key: named(column) for key, column in table.columns.items()}
     ranges = {peer: named(column) for peer, column in table.ranges.items() if peer != robot}
-    if (any_peer := ranges.pop(ANY_PEER, None)) is not None:
+    if (any_peer := ranges.pop(ANY_PEER, None)) is not None and table.peer_column:
+        peers = {cell.strip() for cell in text.columns.get(table.peer_column, ())} - {"", robot}
+        ranges = dict.fromkeys(sorted(peers), any_peer)
+    elif any_peer is not None:
         taken = {column.name for column in columns.values()}
         for peer, name in _match(any_peer.name, text, "{peer}").items():
             if peer != robot and name not in taken:
                 ranges.setdefault(peer, replace(any_peer, name=name))
     every = [*columns.values(), *ranges.values()]
-    missing = {c.name for c in every if c.name and c.name not in text.columns}
+    wanted = {c.name for c in every} | {any_peer.name if table.peer_column and any_peer else ""}
+    missing = (wanted | {table.peer_column}) - {"", *text.columns}
     return RobotLog(
         robot,
         text,
         {key: column for key, column in columns.items() if column.name not in missing},
         {peer: column for peer, column in ranges.items() if column.name not in missing},
         frozenset(missing),
+        table.peer_column,
     )
 
 
