@@ -44,8 +44,9 @@ def run(out: Path, settings: Settings, *, workers: int = 1) -> dict[str, int]:
     OutputError
         If ``out`` exists or cannot be written.
     """
-    from dmrl.formats.files.image_folder import CALIBRATION_FILE, LABELS_FILE
+    from dmrl.formats.files.image_folder import LABELS_FILE
     from dmrl.formats.files.label_csv import LabelRow, write_labels
+    from dmrl.formats.files.labelled_pictures import CALIBRATION_FILE
     from dmrl.geometry.camera_file import format_camera
     from dmrl.geometry.frames import AIDECK_PINHOLE
     from dmrl.recording import build_provenance

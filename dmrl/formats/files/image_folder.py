@@ -41,13 +41,13 @@ from dmrl.formats.files.labelled_pictures import (
     IMAGE_SUFFIXES,
     LABELLED_OPTIONS,
     LabelledPicture,
+    add_own_camera,
     build_picture_content,
     is_picture,
     iter_picture_samples,
     natural_key,
 )
 from dmrl.formats.files.pictures import Crop, crop_camera
-from dmrl.geometry.camera_file import read_camera
 from dmrl.guards.bounded_parsing import parse_number
 from dmrl.guards.paths import refuse_pipes
 from dmrl.samples.sample import Sample
@@ -56,7 +56,6 @@ from dmrl.terminal.progress import say
 
 LABELS_FILE = "labels.csv"
 AIDECK_LABELS_FILE = "label.txt"
-CALIBRATION_FILE = "calibration.toml"
 MIN_TIME_DIGITS = 12  # fewer would be under 17 minutes after 1970: a counter, not a time
 SECONDS = re.compile(r"[0-9]+\.[0-9]+|1[0-9]{9}")
 """Names that are seconds: with a decimal point, or whole ones of the years 2001 to 2033."""
@@ -112,9 +111,7 @@ def load_content(source: Path, options: Options) -> Content:
     SettingError
         If the camera does not have the images' size.
     """
-    own = source / CALIBRATION_FILE
-    if options.camera is None and own.is_file():
-        options = replace(options, camera=read_camera(own))
+    options = add_own_camera(source, options)
     pictures = list_images(source, options.rate_hz)
     nominal = _list_nominal_times(len(pictures), options.rate_hz)
     if [time_ns for time_ns, _ in pictures] != nominal:

@@ -16,6 +16,7 @@ from dmrl.errors import SettingError, SourceError
 from dmrl.formats.base import Content, Options
 from dmrl.formats.files.label_csv import LabelRow
 from dmrl.formats.files.pictures import PICTURE_OPTIONS, Crop, PictureConverter
+from dmrl.geometry.camera_file import read_camera
 from dmrl.geometry.frames import Camera
 from dmrl.guards import limits
 from dmrl.guards.paths import refuse_pipes
@@ -27,6 +28,7 @@ IMAGE_SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp"),
     *(".tif", ".tiff", ".webp", ".gif"),
 )
+CALIBRATION_FILE = "calibration.toml"
 SPLIT_NAMES = {"train": "train", "test": "test", "dev": "val"}
 SPLIT_NAMES |= dict.fromkeys(("val", "valid", "validation"), "val")
 """Splits by the names of folders."""
@@ -249,6 +251,14 @@ def report_doubts(source: Path, rows: Sequence[LabelRow], robot: str) -> None:
             say(f"{source}: doubt: {count} of {len(seen)} labels {doubt}")
 
 
+def add_own_camera(source: Path, options: Options) -> Options:
+    """Return options with the camera of the folder's own file, unless the user gave one."""
+    own = source / CALIBRATION_FILE
+    if options.camera is not None or not own.is_file():
+        return options
+    return replace(options, camera=read_camera(own))
+
+
 def build_set_content(
     source: Path, pictures: Iterable[LabelledPicture], options: Options
 ) -> Content:
@@ -257,5 +267,6 @@ def build_set_content(
     ordered = sorted(pictures, key=lambda p: (order.get(p.split, 3), p.split or ""))
     if not ordered:
         raise SourceError(f"{source}: no picture of the set is there. Pass the folder with them")
+    options = add_own_camera(source, options)
     timed = [(round(k * 1e9 / options.rate_hz), picture) for k, picture in enumerate(ordered)]
     return build_picture_content(source, timed, options)

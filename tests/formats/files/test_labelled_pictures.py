@@ -8,6 +8,7 @@ import pytest
 from dmrl.errors import SettingError
 from dmrl.formats.base import Options
 from dmrl.formats.files.labelled_pictures import name_peers
+from dmrl.geometry.camera_file import format_camera
 from dmrl.geometry.frames import AIDECK, Camera
 
 from .boxes import HEIGHT, WIDTH, labels_of, read
@@ -22,6 +23,15 @@ def test_classes_become_peers() -> None:
 
 def camera(width: int = WIDTH, height: int = HEIGHT) -> Camera:
     return Camera(width, height, 200.0, 200.0, width / 2, height / 2)
+
+
+def test_the_calibration_in_the_folder_of_a_set_is_its_camera(small: Path) -> None:
+    (small / "calibration.toml").write_text(format_camera(camera()))
+    found = read(small, "yolo", Options(robot_width_m=0.12))
+    assert found[0].fields["K"][0] == 200
+    assert all(peer["depth_m"] > 0 for peers in labels_of(found) for peer in peers)
+    (given,) = (s for s in read(small, "yolo", Options(camera=AIDECK)) if "K" in s.fields)
+    assert given.fields["K"][0] == AIDECK.fx_px
 
 
 def test_the_width_of_a_robot_gives_the_depth_of_its_box(small: Path) -> None:
