@@ -97,25 +97,35 @@ class RecordingError(DmrlError):
     """A recording cannot be read, or lacks requested data."""
 
 
+REMEDIES = {
+    "/labels": "Label it with dmrl label, or by hand: dmrl view {where} --flag desk.html",
+    "/detections": "Try: dmrl predict MODEL {where} OUT.mcap",
+    "/camera/calibration": "Give the camera to dmrl convert: --camera FILE",
+    "/attitude": "Merge the log of the robot with it: dmrl merge {where} LOG.mcap OUT.mcap",
+}
+"""How to get the content of a topic, by the end of its name."""
+
+
 class MissingTopic(RecordingError):
     """A recording lacks a topic that a stage reads.
+
+    The message says how to get its content, or suggests the most similar topic.
 
     Parameters
     ----------
     topic
         The requested topic or pattern.
     present
-        Topics of the recording. The message suggests the most similar one.
+        Topics of the recording.
     where
         The recording.
     """
 
     def __init__(self, topic: str, present: Iterable[str], where: object) -> None:
-        near = get_close_matches(topic, sorted(present), n=1)
-        remedy = f"Try: dmrl info {where}"
-        if topic.endswith("/labels"):
-            remedy = f"Label it with dmrl label, or by hand: dmrl view {where} --flag desk.html"
-        hint = suggest(topic, present, remedy)
+        near = get_close_matches(topic, held := sorted(present), n=1)
+        end = next((end for end in REMEDIES if topic.endswith(end)), "")
+        remedy = REMEDIES.get(end, "Try: dmrl info {where}").format(where=where)
+        hint = suggest(topic, [name for name in held if name.endswith(end)], remedy)
         if near and topic.startswith("/*/"):  # a stage asks for it, and not the user
             name = f"{near[0]}={topic.replace('*', 'cf1', 1)}"
             hint += f" Rename it: dmrl convert {where} OUT.mcap --names {name}"

@@ -75,8 +75,8 @@ def parse_foreign_camera(text: str, path: Path) -> Camera:
     except (ValueError, TypeError, OverflowError) as e:
         why = " ".join(str(e).split())[:200]
         raise SourceError(
-            f"{path} is no calibration of ROS, Kalibr or OpenCV: {why}. Write the camera as TOML: "
-            "see docs/sources.md"
+            f"{path} is no calibration of ROS, Kalibr or OpenCV: {why}. Calibrate with dmrl "
+            "calibrate, or write the camera as TOML: see docs/sources.md"
         ) from None
     if not camera.distortion and not re.search(r"model\W+none\b", text):
         say(f"{path}: no distortion coefficients found in it, so the lens is taken to have none")

@@ -125,8 +125,9 @@ def require_pairs(
     if not logs.pairs:
         absent = [] if logs.robots else ["no robot has attitude, velocity and height"]
         why = "; ".join(logs.warnings or [*absent, "there are no ranges"])
+        remedy = "Try: dmrl align" if why.endswith("?") else "Try: dmrl info"
         why += "" if why.endswith("?") else "."
-        raise RecordingError(f"{flight.path}: no pair can be estimated: {why} Try: dmrl info")
+        raise RecordingError(f"{flight.path}: no pair can be estimated: {why} {remedy}")
     if unknown := set(cameras) - set(logs.robots):
         raise SettingError(f"--camera.{min(unknown)}: {flight.path} has {', '.join(logs.robots)}")
     return logs

@@ -127,8 +127,9 @@ def test_the_same_input_gives_the_same_bytes(detected: Path, tracked: Path, tmp_
 @pytest.mark.parametrize(
     ("topic", "words"),
     [
-        ("/cf1/detections", "/*/detections"),
-        ("/cf1/attitude", "/cf1/attitude"),
+        ("/cf1/detections", "Try: dmrl predict MODEL"),
+        ("/cf1/attitude", "Merge the log of the robot with it: dmrl merge"),
+        ("/cf1/camera/calibration", "Give the camera to dmrl convert: --camera"),
     ],
 )
 def test_missing_topic_is_reported(detected: Path, tmp_path: Path, topic: str, words: str) -> None:
@@ -136,7 +137,7 @@ def test_missing_topic_is_reported(detected: Path, tmp_path: Path, topic: str, w
     others = [t for t in read_summary(detected).topics if t != topic]
     trim(detected, short, topics=others)
     out = tmp_path / "out.mcap"
-    with pytest.raises(MissingTopic, match=r"detections|attitude") as caught:
+    with pytest.raises(MissingTopic, match=r"detections|attitude|calibration") as caught:
         track.run(short, out, Settings())
     assert words in str(caught.value)
     assert not out.exists()
