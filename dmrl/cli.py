@@ -18,6 +18,7 @@ from cyclopts import (
     Parameter,
     Token,
     UnknownCommandError,
+    UnusedCliTokensError,
     convert,
 )
 from rich.console import Console
@@ -52,6 +53,10 @@ def format_usage_error(error: CycloptsError) -> Text:
     if isinstance(error, CoercionError) and get_origin(error.target_type) is dict and error.token:
         flag, value = error.token.keyword, error.token.value
         return Text(f"dmrl: {flag} {value} does not say of what. Try: {flag}.cf1 {value}")
+    if isinstance(error, UnusedCliTokensError) and error.unused_tokens:
+        extra = truncate_middle(error.unused_tokens[0])
+        chain = " ".join(("dmrl", *(error.command_chain or ())))
+        return Text(f"dmrl: {extra} is one argument too many. Try: {chain} --help")
     if not isinstance(error, UnknownCommandError) or not error.unused_tokens:
         return Text(f"dmrl: {truncate_middle(str(error))}")
     # The error's own text would load every command, and fail where an extra is missing.

@@ -130,23 +130,31 @@ def find_sources(source: Path, kind: str | None) -> dict[Path, Path]:
     SourceError
         If there is none.
     SettingError
-        If two recordings would have the same name.
+        If two recordings would have the same name, or each would hold one picture.
     """
     refuse_pipes(source)
     found: dict[Path, Path] = {}
+    single_pictures = 0
     for path in sorted(source.iterdir()) if source.is_dir() else [source]:
         try:
-            if path.name.startswith(".") or not _find_format(path, kind):
+            if path.name.startswith("."):
                 continue
+            form = _find_format(path, kind)
         except SourceError:
             leave_out("files and folders of no known kind", path)
             continue
         name = Path(path.name if path.is_dir() else path.stem).with_suffix(".mcap")
+        single_pictures += path.is_file() and form.name == "images"
         if (twin := found.setdefault(name, path)) is not path:
             raise SettingError(f"{twin} and {path} would both be {name}. Rename one")
     if not found:
         raise SourceError(
             f"nothing in {source} is of a known kind. If it is one source, name one recording: "
             "dmrl convert SOURCE OUT.mcap"
+        )
+    if single_pictures == len(found) > 1:
+        raise SettingError(
+            f"{source} is a folder of pictures. For one recording of all: dmrl convert {source} "
+            "OUT.mcap"
         )
     return found

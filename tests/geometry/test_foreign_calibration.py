@@ -125,7 +125,9 @@ def test_a_pixel_of_opencv_s_projection_is_half_a_pixel_from_ours(tmp_path: Path
 def test_unsupported_calibration_gives_one_line_error(text: str, why: str, tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=why) as e:
         read_camera(write(tmp_path / "camera.yaml", text))
-    assert "\n" not in str(e.value) and "dmrl calibrate, or write the camera as TOML" in str(e.value)
+    assert "\n" not in str(e.value) and "dmrl calibrate, or write the camera as TOML" in str(
+        e.value
+    )
 
 
 def test_other_json_gives_one_line_error(tmp_path: Path) -> None:

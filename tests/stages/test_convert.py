@@ -5,10 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cyclopts import UnusedCliTokensError
 
+from dmrl.cli import format_usage_error
 from dmrl.errors import DmrlError, OutputError, SettingError, SourceError, UnsafeName
 from dmrl.geometry.frames import AIDECK
 from dmrl.images.codec import decode, encode_png
+from dmrl.ingest.foreign_source import find_sources
 from dmrl.recording import SPLIT_METADATA, RecordingWriter, check, read, read_summary, read_table
 from dmrl.stages import fly, label, merge
 from dmrl.stages.convert import Settings, run
@@ -120,6 +123,17 @@ def test_findings_are_reported_after_conversion(
     capsys.readouterr()
     merge.run([tmp_path / "cf1.mcap", tmp_path / "cf2.mcap"], tmp_path / "merged.mcap")
     assert "shares no time with /cf2: 46 s" in capsys.readouterr().err
+
+
+def test_a_folder_of_pictures_is_not_a_source_each(pictures: Path) -> None:
+    with pytest.raises(SettingError, match=r"pictures is a folder of pictures.*OUT\.mcap"):
+        find_sources(pictures, None)
+
+
+def test_several_files_are_one_argument_too_many() -> None:
+    error = UnusedCliTokensError(unused_tokens=["b.jpg", "out.mcap"], command_chain=("convert",))
+    words = "dmrl: b.jpg is one argument too many. Try: dmrl convert --help"
+    assert str(format_usage_error(error)) == words
 
 
 def test_an_empty_folder_is_called_empty(tmp_path: Path) -> None:

@@ -126,7 +126,9 @@ def test_clocks_an_hour_apart_are_an_error_of_one_line(
         hour = 3600 * SECOND_NS if stamped.topic.startswith("/cf2") else 0
         return [Stamped(stamped.time_ns + hour, stamped.topic, stamped.message)]
 
-    with pytest.raises(RecordingError, match=r"share 0\.0 s.*clocks agree\? Try: dmrl align") as caught:
+    with pytest.raises(
+        RecordingError, match=r"share 0\.0 s.*clocks agree\? Try: dmrl align"
+    ) as caught:
         warnings_of(changed(late))
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.glob("out*"))
