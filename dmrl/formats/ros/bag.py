@@ -13,6 +13,7 @@ Times are those of the headers. If they are empty, the time at which the bag rec
 replaces it, and a line reports this. That time is the publish time of every message.
 """
 
+import re
 from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
@@ -35,13 +36,17 @@ from dmrl.formats.ros.ros_messages import (
     convert_dmrl_message,
     is_camera_image,
 )
-from dmrl.formats.ros.topic_plan import ODOMETRY, TopicPlan, plan_topics
+from dmrl.formats.ros.topic_plan import IMU, ODOMETRY, POSE, TWIST, TopicPlan, plan_topics
 from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
 
 FOREIGN_OUTPUTS = ("Attitude", "Velocity", "Height", "UwbRange", "PoseInFrame", "CameraCalibration")
 """Messages of sensors, whose numbers must be finite."""
+MOTIONS = (ODOMETRY, POSE, TWIST, IMU)
+Z_DOWN_FRAME = re.compile(r"(^|[_/])(ned|frd)$", re.IGNORECASE)
+"""Frames whose z is down, by REP 103."""
+Z_DOWN_HINT = "its z is down (--columns takes fields, with sign = -1)"
 SUFFIXES = (".db3", ".bag", ".mcap")
 
 
@@ -174,7 +179,9 @@ def convert_message(
     line: TopicPlan, decoded: Any, time_ns: int, where: MessageContext
 ) -> Iterator[Sample]:
     """Yield the samples of a decoded message."""
-    if not line.kind.startswith(DMRL_PREFIX):
+    if line.kind in MOTIONS and (frame := _find_frame_with_z_down(decoded)):
+        leave_out(f"messages on {line.topic} in the frame {frame}: {Z_DOWN_HINT}", where.source)
+    elif not line.kind.startswith(DMRL_PREFIX):
         try:
             with np.errstate(invalid="ignore"):  # what is not finite is left out, and counted
                 yield from list(CONVERTERS[line.kind](decoded, time_ns, where))
@@ -185,6 +192,13 @@ def convert_message(
         yield sample
     else:
         leave_out(f"messages on {line.topic} of another version of dmrl", where.source)
+
+
+def _find_frame_with_z_down(message: Any) -> str:
+    """Return the first frame of a message whose z is down by its name, by REP 103; or nothing."""
+    parent = getattr(getattr(message, "header", None), "frame_id", "")
+    frames = (str(parent), str(getattr(message, "child_frame_id", "")))
+    return next(filter(Z_DOWN_FRAME.search, frames), "")
 
 
 def select_usable(

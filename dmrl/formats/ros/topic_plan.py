@@ -19,14 +19,14 @@ from dmrl.terminal.progress import say
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO, RANGE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Range"
 POSE, ODOMETRY = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
-TWIST = "geometry_msgs/msg/TwistStamped"
+TWIST, IMU = "geometry_msgs/msg/TwistStamped", "sensor_msgs/msg/Imu"
 TARGETS = {
     **dict.fromkeys(IMAGE_TYPES, (topics.CAMERA_IMAGE,)),
     CAMERA_INFO: (topics.CALIBRATION,),
     RANGE: (topics.RANGE,),
     POSE: (topics.POSE, topics.TRUE_POSE),
     ODOMETRY: (topics.POSE, topics.ATTITUDE, topics.VELOCITY, topics.HEIGHT),
-    "sensor_msgs/msg/Imu": (topics.ATTITUDE,),
+    IMU: (topics.ATTITUDE,),
     TWIST: (topics.VELOCITY,),
 }
 """Topics that messages become, by type."""

@@ -13,8 +13,10 @@ from dmrl.formats.ros import bag as ros
 from dmrl.images.bayer import demosaic
 from dmrl.images.codec import decode
 from dmrl.samples.sample import Sample
+from dmrl.terminal.left_out import count_left_out
 
 from .. import foreign
+from . import ros_writer
 
 
 def bag(kind: str, folder: Path) -> Path:
@@ -68,6 +70,28 @@ def test_receive_time_becomes_publish_time(tmp_path: Path) -> None:
         assert [s.time_ns for s in found[topic]] == [10**12 + k * 10**8 for k in range(5)]
         received = [s.publish_ns or 0 for s in found[topic]]
         assert received == [10**12 + k * 10**8 + 7_000_000 for k in range(5)]
+
+
+@pytest.mark.parametrize(
+    ("parent", "child", "down"),
+    [
+        ("odom_ned", "base_link", True),
+        ("map", "cf1/base_link_frd", True),
+        ("NED", "", True),
+        ("odom", "aligned", False),
+        ("odom", "base_link", False),
+    ],
+)
+def test_motions_in_frames_whose_z_is_down_are_left_out(
+    parent: str, child: str, down: bool
+) -> None:
+    held = ros_writer.odometry(1)
+    held.header.frame_id, held.child_frame_id = parent, child
+    line = ros.TopicPlan("/cf1/odom", ros.ODOMETRY, 1, "cf1")
+    where = ros.MessageContext(Path("bag"), "cf1")
+    with count_left_out() as left:
+        assert bool(list(ros.convert_message(line, held, 1, where))) != down
+    assert any("its z is down" in why for why in left.counts) == down
 
 
 @pytest.mark.heavy
