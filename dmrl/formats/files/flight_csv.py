@@ -153,7 +153,19 @@ def read_log(path: Path) -> CsvLog:
         raise SourceError(f"{path} has fewer than two rows. Add rows, or remove it")
     log = CsvLog(path, time_ns[good], {name: x[good] for name, x in held.items()})
     _check_log(log)
+    _report_unused(log, text.columns)
     return log
+
+
+def _report_unused(log: CsvLog, names: Iterable[str]) -> None:
+    """Count the columns of a file that become nothing, such as ``range_cf2`` without its unit."""
+    used = {*REQUIRED_COLUMNS, "yaw_rad", *(f"range_{peer}_m" for peer in log.range_peers)}
+    used |= {f"{peer}_{axis}_m" for peer in log.truth_peers for axis in "xyz"}
+    sensors = [held for row in OTHER_SENSORS for _, held in _iter_sensor_columns(row, log)]
+    taken = {id(column) for held in sensors for column in held.values()}
+    unused = [n for n in names if n not in used and id(log.columns.get(n)) not in taken]
+    if unused:
+        leave_out("columns of no known name", f"{log.path}: {unused[0]}", len(unused))
 
 
 def _check_log(log: CsvLog) -> None:

@@ -130,6 +130,15 @@ def test_a_missing_column_is_named(flight: Path) -> None:
     assert "cf2.csv has no column vy_mps, height_m" in refused(flight)
 
 
+def test_columns_of_no_known_name_are_counted(flight: Path) -> None:
+    names = ["range_cf2", "yaw_rad", "range_cf3_m", "cf2_x_m", "note"]
+    write(flight, "cf1", [[*row, 2.5, 0, 1.5, 1, "so"] for row in rows()], [*HEADER, *names])
+    with count_left_out() as left:
+        list(flight_csv.load_content(flight).samples)
+    assert left.counts == {"columns of no known name": 3}
+    assert left.first["columns of no known name"].endswith("cf1.csv: range_cf2")
+
+
 def test_too_little_is_refused(flight: Path, tmp_path: Path) -> None:
     write(flight, "cf2", rows()[:1])
     assert "fewer than two rows" in refused(flight)
