@@ -123,8 +123,9 @@ def require_pairs(
             f"{', '.join(logs.robots) or 'nobody'}. Calibrate with flights of these robots"
         )
     if not logs.pairs:
-        absent = [] if logs.robots else ["no robot has attitude, velocity and height"]
-        why = "; ".join(logs.warnings or [*absent, "there are no ranges"])
+        whole = flight.attitude.keys() & flight.velocity.keys() & flight.height.keys()
+        absent = [] if whole else ["no robot has attitude, velocity and height"]
+        why = "; ".join(logs.warnings or [*absent, "there are no ranges on /ROBOT/range/PEER"])
         remedy = "Try: dmrl align" if why.endswith("?") else "Try: dmrl info"
         why += "" if why.endswith("?") else "."
         raise RecordingError(f"{flight.path}: no pair can be estimated: {why} {remedy}")

@@ -134,14 +134,20 @@ def test_clocks_an_hour_apart_are_an_error_of_one_line(
     assert not list(tmp_path.glob("out*"))
 
 
-def test_recording_without_ranges_is_refused(changed: Callable[[Change], Path]) -> None:
-    def none(stamped: Stamped) -> list[Stamped]:
-        return [] if "range" in stamped.topic else [stamped]
-
+@pytest.mark.parametrize(
+    ("held", "why"),
+    [
+        (["attitude"], "estimated: no robot has attitude.*; there are no ranges on"),
+        (["attitude", "velocity", "height"], "estimated: there are no ranges on"),
+    ],
+)
+def test_recording_without_ranges_is_refused(
+    changed: Callable[[Change], Path], held: list[str], why: str
+) -> None:
     out = changed(lambda s: [s])
     bare = out.with_name("bare.mcap")
     with RecordingWriter(bare, Provenance("test")) as sink:
-        for stamped in read(out, "/*/attitude"):
+        for stamped in read(out, *(f"/*/{name}" for name in held)):
             sink.write(stamped.time_ns, stamped.topic, stamped.message)
-    with pytest.raises(RecordingError, match=r"no robot has attitude.*; there are no ranges"):
+    with pytest.raises(RecordingError, match=why):
         label.run(bare, out.with_name("out.mcap"), Settings())
