@@ -159,8 +159,8 @@ def note(made: Mapping[str, Any]) -> str:
             if band["recall"] is not None
         ]
         if parts:
-            words.append(f"{one['robot']}, {one['peer']}: recall {'; '.join(parts)}")
-    return "; ".join(words)
+            words.append(f"{one['robot']}, {one['peer']}: recall in view {'; '.join(parts)}")
+    return ".\n".join(words)
 
 
 def rows(made: Mapping[str, Any]) -> list[list[str]]:

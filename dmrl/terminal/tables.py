@@ -72,15 +72,19 @@ def print_line(line: str) -> None:
 
 
 def print_note(words: str) -> None:
-    """Print definitions, which "; " separates, as many in a line as fit ``NOTE_CHARACTERS``."""
-    lines: list[str] = []
-    for part in words.split("; "):
-        if lines and len(lines[-1]) + len(part) + 2 <= NOTE_CHARACTERS:
-            lines[-1] += f"; {part}"
-        else:
-            lines.append(part)
-    for line in lines:
-        print_line(line)
+    """Print definitions, which "; " separates, as many in a line as fit ``NOTE_CHARACTERS``.
+
+    A sentence that ends with its line is followed by another line.
+    """
+    for sentence in words.split(".\n"):
+        lines: list[str] = []
+        for part in sentence.split("; "):
+            if lines and len(lines[-1]) + len(part) + 2 <= NOTE_CHARACTERS:
+                lines[-1] += f"; {part}"
+            else:
+                lines.append(part)
+        for line in lines:
+            print_line(line)
 
 
 def print_json(document: Any) -> None:
