@@ -69,7 +69,8 @@ def refuse_doubles(topics: Iterable[str]) -> None:
     counts = Counter(topics)
     if twice := [topic for topic, count in counts.items() if count > 1]:
         raise SettingError(
-            f"two robots of the source would write {twice[0]}. Give each a name of its own: --names"
+            f"two robots of the source, or two logs of one, would write {twice[0]}. "
+            "Name the robots: --names. Or remove a log"
         )
 
 

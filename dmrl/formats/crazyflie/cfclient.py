@@ -7,7 +7,7 @@ it.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -91,6 +91,7 @@ def _read_robots(robots: Mapping[str, list[Path]]) -> dict[str, list[LogBlock]]:
     read: dict[str, list[LogBlock]] = {name: [] for name in robots}
     empty: dict[Path, EmptySource] = {}
     for name, paths in robots.items():
+        _refuse_two_flights(paths)
         for path in paths:
             try:
                 read[name].append(read_block(path))
@@ -101,6 +102,21 @@ def _read_robots(robots: Mapping[str, list[Path]]) -> dict[str, list[LogBlock]]:
     for path in empty:
         leave_out("files without a row", path)
     return {name: _unwrap_between_blocks(blocks) for name, blocks in read.items()}
+
+
+def _refuse_two_flights(paths: Sequence[Path]) -> None:
+    """Raise SourceError if two files of a robot are the same block, logged at two times."""
+    first: dict[str, Path] = {}
+    for path in paths:
+        if (other := first.setdefault(_name_block(path), path)) is not path:
+            raise SourceError(
+                f"{other} and {path.name} are the same log block of two flights. Keep each flight "
+                "in a folder of its own"
+            )
+
+
+def _name_block(path: Path) -> str:
+    return DATE_SUFFIX.sub("", path.stem)
 
 
 def read_block(path: Path) -> LogBlock:
@@ -134,7 +150,7 @@ def read_block(path: Path) -> LogBlock:
         for name, column in values.items()
         if column is not None
     }
-    return LogBlock(DATE_SUFFIX.sub("", path.stem), found.time_ns, columns)
+    return LogBlock(_name_block(path), found.time_ns, columns)
 
 
 def _restore_type(cells: list[str], values: Array) -> NDArray[Any]:

@@ -242,6 +242,14 @@ def test_log_block_may_have_one_row(tmp_path: Path) -> None:
     assert [s.time_ns for s in found["/cf1/log/b"]] == [5_000_000, 7_000_000]
 
 
+def test_a_block_of_two_flights_in_a_folder_is_refused_with_both_files(tmp_path: Path) -> None:
+    for hour in (12, 13):
+        path = tmp_path / f"state-20240301T{hour}-00-00.csv"
+        path.write_text(f"Timestamp,stateEstimate.z\n{hour}000,0.5\n")
+    with pytest.raises(SourceError, match=r"T12.*T13.* are the same log block of two flights"):
+        samples(tmp_path)
+
+
 def test_microseconds_since_1970_are_no_milliseconds(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text("Timestamp,a.b\n" + "".join(f"{17 * 10**14 + k},1\n" for k in range(3)))
