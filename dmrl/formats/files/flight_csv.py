@@ -5,7 +5,8 @@ Columns, SI units, angles in radians:
 * ``time_s, roll_rad, pitch_rad, yaw_rate_radps, vx_mps, vy_mps, height_m`` are required:
   velocity in the robot's own horizontal frame (x forward, y left, turning with its yaw),
   attitude Rz(yaw) Ry(pitch) Rx(roll), z up, so pitch is positive nose down;
-* ``range_<peer>_m`` is optional: UWB distance, empty where there is none;
+* ``range_<peer>_m`` is optional: UWB distance, empty where there is none; a row with a range may
+  leave all of the above but the time empty;
 * ``<peer>_x_m, <peer>_y_m, <peer>_z_m`` are optional: true position of the peer in the robot's
   horizontal frame, empty where it is unknown;
 * columns of other sensors are optional, named like ``csv`` in dmrl/topics.py.
@@ -144,14 +145,16 @@ def read_log(path: Path) -> CsvLog:
     columns = {name: text.parse_numbers(name, used=name != TIME_COLUMN) for name in text.columns}
     held = {name: x for name, x in columns.items() if x is not None}
     known = np.isfinite([held[n] if n in held else time_ns * np.nan for n in LOG_COLUMNS])
+    others = np.isfinite([x for name, x in held.items() if name not in REQUIRED_COLUMNS])
     good = known.all(axis=0)
-    if lost := int((~good).sum()):
-        row = int(np.argmin(good))
+    used = good | (~known.any(axis=0) & others.any(axis=0))  # a row of its own for a range
+    if lost := int((~used).sum()):
+        row = int(np.argmin(used))
         name = LOG_COLUMNS[int(np.argmin(known[:, row]))]
         leave_out(f"rows without a number for {name} or another", text.name_row(row), lost)
     if good.sum() < 2:
         raise SourceError(f"{path} has fewer than two rows. Add rows, or remove it")
-    log = CsvLog(path, time_ns[good], {name: x[good] for name, x in held.items()})
+    log = CsvLog(path, time_ns[used], {name: x[used] for name, x in held.items()})
     _check_log(log)
     _report_unused(log, text.columns)
     return log
@@ -195,7 +198,10 @@ def _iter_streams(log: CsvLog, names: Mapping[str, str]) -> Iterator[Iterable[Sa
         return names.get(robot, robot)
 
     own, time_ns = name(log.robot), log.time_ns
-    yield from flight.build_robot_log(own, time_ns, log.columns)
+    state = np.isfinite(log.columns[LOG_COLUMNS[0]])
+    yield from flight.build_robot_log(
+        own, time_ns[state], {name: x[state] for name, x in log.columns.items()}
+    )
     for peer in log.range_peers:
         range_m = log.columns[f"range_{peer}_m"]
         yield build_ranges(own, name(peer), time_ns, range_m, log.path)

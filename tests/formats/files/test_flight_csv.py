@@ -125,6 +125,17 @@ def test_rows_that_cannot_be_used_are_left_out_with_their_line(flight: Path) -> 
         assert all(left_out.first[r].endswith(place) for r, place in wanted.items())
 
 
+def test_ranges_may_have_rows_of_their_own(flight: Path) -> None:
+    data = rows()
+    alone = [[row[0] + 0.02, *[""] * (len(HEADER) - 1), 1.5] for row in data]
+    mixed = sorted([[*row, ""] for row in data] + alone, key=lambda row: row[0])
+    write(flight, "cf2", mixed, [*HEADER, "range_cf1_m"])
+    with count_left_out() as left_out:
+        found = [s.topic for s in flight_csv.load_content(flight).samples]
+    assert not left_out.counts
+    assert found.count("/cf2/range/cf1") == found.count("/cf2/attitude") == len(data)
+
+
 def test_a_missing_column_is_named(flight: Path) -> None:
     write(flight, "cf2", [row[:-2] for row in rows()], HEADER[:-2])
     assert "cf2.csv has no column vy_mps, height_m" in refused(flight)
