@@ -43,7 +43,8 @@ REMEDIES = {
     "height": "Fly over a level floor, within reach of the range finder",
     "clock": "Try: dmrl align",
     "robot": "The ranges then show no bearing. Let both fly about, different ways",
-    "sensors": "Try: dmrl info",
+    "sensors": "Or do odometry and ranges contradict each other? Check the signs and frames of "
+    "both robots: docs/own_robot.md",
     "bearing": "Fly longer and faster, with turns; with a third robot try --method swarm",
     "positions": "A wider --gate-m takes more: see docs/labelling.md",
     "robots": "Fly different ways, or exchange the names of the robots",

@@ -100,6 +100,7 @@ def test_a_remedy_fits_the_error_and_not_only_the_sensor() -> None:
     def remedy(name: str) -> str:
         return str(PairCause(name, 1.0, 0.0, 9.0, "cf1"))
 
+    assert "signs and frames" in remedy("sensors are silent")
     assert "height" in remedy("flow scale") and "height" in remedy("flow scale changes")
     assert all("delay" in remedy(f"{name} late") for name in ("flow", "yaw rate"))
     others = [m.name for m in MODELS if m.name.startswith("flow") and "scale" not in m.name]
