@@ -144,6 +144,8 @@ def _name_peers(robot: str, log: RobotLog, options: Options) -> dict[str, Column
     """
     named = {options.names.get(peer, peer): one for peer, one in log.ranges.items()}
     named.pop(robot, None)
+    if not named and log.columns.keys() == {"time"}:
+        say(f"{log.text.path}: nothing is of {robot}, which has no range to itself. Try: --robot")
     for one, other in combinations(named, 2) if not log.peer_column else ():
         if named[one].name == named[other].name:
             raise SourceError(

@@ -50,6 +50,16 @@ def test_a_column_is_not_the_range_to_two_peers(source: Path) -> None:
         convert(source, TIME_AND_ROBOT + ranges)
 
 
+def test_a_file_with_ranges_to_its_own_robot_alone_is_named(
+    source: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ranges = ANY_RANGE.replace('"*"', "cf1")
+    assert not convert(source, TIME_AND_ROBOT.split("[robot]")[0] + ranges)
+    assert (
+        "nothing is of cf1, which has no range to itself. Try: --robot" in capsys.readouterr().err
+    )
+
+
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
