@@ -89,11 +89,10 @@ def train(
             images,
             100 + seed,
         )
+        if not (data := folder / f"{name}-data").exists():
+            dmrl.make_dataset(own, data, labels="truth", split="none")
         if not (folder / name).exists():
-            dmrl.make_dataset(own, folder / f"{name}-data", labels="truth", split="none")
-            dmrl.train(
-                folder / f"{name}-data", folder / name, recipe="own_camera", init=init, seed=seed
-            )
+            dmrl.train(data, folder / name, recipe="own_camera", init=init, seed=seed)
         yield title, folder / name
 
 
