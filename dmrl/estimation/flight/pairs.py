@@ -11,7 +11,6 @@ from dmrl.estimation.evidence.delays import join_delays, move_signal
 from dmrl.estimation.evidence.error_models import Candidate
 from dmrl.estimation.evidence.mistakes import (
     find_mistake,
-    has_camera,
     ranges_are_far,
 )
 from dmrl.estimation.flight.pair_output import (
@@ -76,7 +75,8 @@ def _estimate_pair(
     logged: Pair, noise: NoiseModel | None, gate: Gate, *, plain: bool
 ) -> tuple[Estimate, Estimate]:
     """Estimate both directions of a pair, with a discrete mistake of its logs corrected."""
-    logged, blind = drop_held_ranges(logged), None
+    logged = drop_held_ranges(logged)
+    blind: tuple[int, ...] = ()
     shifts: list[ClockShift] = []
     if not plain and noise is None:
         logged, shifts = _align_clocks(logged)
@@ -86,18 +86,17 @@ def _estimate_pair(
     pieces = list(solve_pieces(pair, noise, plain=plain)) if possible else []
     searched = not plain and noise is None and not _explains(pieces)
     if searched and (found := find_mistake(logged)) is not None:
-        mistake, robot = found
+        mistake, robot, blind = found
         logged = mistake.correct(logged, robot)
         shifts += [mistake.shift] if mistake.shift else []
         pair, pieces = drop_contradictions(logged), []
         mistakes.append(_to_cause(mistake.name, logged, robot))
-        blind = robot if mistake.heading_is_open and not has_camera(logged, robot) else None
     pieces = pieces or list(solve_pieces(pair, noise, plain=plain))
     logged, pair, pieces, late = _move_late(logged, pair, pieces)
     mistakes += [_to_cause(one.model.name, pair, one.robot) for one in late]
     gaps = (*mistakes, *find_dropouts(logged, pair))
     own, peer = (
-        replace(one, status=np.maximum(one.status, np.int8(UNCONVERGED * (side == blind))))
+        replace(one, status=np.maximum(one.status, np.int8(UNCONVERGED * (side in blind))))
         for side, one in enumerate(_both_directions(pair, pieces, gate))
     )
     return (

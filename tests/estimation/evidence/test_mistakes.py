@@ -52,7 +52,7 @@ def test_of_corrections_that_fit_alike_the_open_one_is_taken() -> None:
     as_degrees = BY_NAME["yaw rate fits if it is taken as degrees"].correct(wrong, 1)
     in_world = BY_NAME["flow fits in the world frame"]
     assert compute_misfit(as_degrees) < compute_misfit(in_world.correct(wrong, 1))
-    assert find_mistake(wrong) == (in_world, 1)
+    assert find_mistake(wrong) == (in_world, 1, (1,))
 
 
 @pytest.mark.parametrize(
@@ -116,6 +116,34 @@ def test_a_mirrored_flow_leaves_the_heading_of_its_robot_open(change: str) -> No
     kept = own.status == STATUS_OK
     assert kept.mean() > 0.5 and (error[kept] < 0.5).all()
     assert not (peer.status == STATUS_OK).any()
+
+
+@pytest.mark.heavy
+def test_a_log_that_is_mirrored_leaves_the_side_of_both_robots_open() -> None:
+    """Front, right and down: the log of the other robot, mirrored too, fits exactly as well."""
+    pair = pair_of(flown("room", "calibrated", 1003, 60.0))
+    own = pair.own
+    wrong = replace(pair, own=replace(own, vy_mps=-own.vy_mps, yaw_rate_radps=-own.yaw_rate_radps))
+    for estimate in estimate_pairs([wrong])[0]:
+        cause = estimate.causes[0]
+        assert cause.name == "odometry of one robot fits if vy and yaw rate are negated"
+        assert cause.robot is None
+        assert not (estimate.status == STATUS_OK).any()
+
+
+def test_a_mistake_shows_in_a_log_without_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its cost is small as logged, too."""
+    pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
+    wrong = replace(pair, peer=replace(pair.peer, yaw_rate_radps=-pair.peer.yaw_rate_radps))
+    monkeypatch.setattr(
+        "dmrl.estimation.evidence.mistakes.compute_misfit",
+        lambda tried: (
+            0.05 if np.array_equal(tried.peer.yaw_rate_radps, pair.peer.yaw_rate_radps) else 0.25
+        ),
+    )
+    found = find_mistake(wrong)
+    assert found is not None
+    assert (found.mistake.name, found.robot) == ("yaw rate fits if it is negated", 1)
 
 
 def test_a_camera_shows_which_axis_is_wrong() -> None:
