@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from dmrl import topics
+from dmrl.datasets.writing.inputs import MAX_FOCAL_RATIO, find_focal_lengths
 from dmrl.deploy.backend_names import BackendName
 from dmrl.deploy.detector import (
     BACKEND_PACKAGES,
     Detector,
     open_detector,
+    read_focal_lengths,
     read_rates,
     select_fastest_backend,
 )
@@ -73,6 +75,23 @@ def open_with_threshold(model: Path, backend: BackendName, threshold: float | No
 def read_model_rates(model: Path) -> dict[str, Any] | None:
     """Return the rates of a model, see `read_rates`; None without them."""
     return read_rates(resolve_model_path(model))
+
+
+def warn_about_lens(model: Path, recording: Path) -> None:
+    """Warn if a camera has another focal length than those that a model was trained with.
+
+    The size of a robot in the image is all that a network has for its depth.
+    """
+    known_px = read_focal_lengths(resolve_model_path(model))
+    for own_px in find_focal_lengths(LoadedRecording(recording)) if known_px else ():
+        if min(max(own_px / px, px / own_px) for px in known_px) > MAX_FOCAL_RATIO:
+            say(
+                f"{recording}: the focal length is {own_px:.0f} px, and {model} was trained with "
+                f"{' and '.join(f'{px:.0f}' for px in known_px)}: its depths are about "
+                f"{known_px[0] / own_px:.2f} times the true ones. Train with your own images: "
+                "docs/own_camera.md"
+            )
+            return
 
 
 def describe_prediction(

@@ -281,21 +281,46 @@ def read_rates(model: Path) -> dict[str, Any] | None:
     ModelError
         If they are damaged.
     """
-    file = model / DESCRIPTION_NAME if model.is_dir() else model.with_suffix(".json")
-    if not file.is_file() or (model.is_file() and model.suffix != ".safetensors"):
+    said, file = _read_description(model)
+    if (found := said.get("rates")) is None:
         return None
     try:
-        said = parse_json(file.read_text(encoding="utf-8"))
-        found = said.get("rates")
-        if found is None:
-            return None
         rates = {name: np.array(found[name], float) for name in RATE_FIELDS}
         lengths = {rates[name].shape for name in ("distance_m", "detected")}
         if not all(np.isfinite(v).all() for v in rates.values()) or len(lengths) > 1:
             raise ValueError(f"rates {str(found)[:60]}")
         return {name: value.tolist() for name, value in rates.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
+    except (ValueError, KeyError, TypeError) as e:
         raise ModelError(f"{file} is damaged: {e}. Train or export the model again") from None
+
+
+def read_focal_lengths(model: Path) -> list[float]:
+    """Read the focal lengths, in pixels, that a model was trained with; empty if unknown.
+
+    Raises
+    ------
+    ModelError
+        If they are damaged.
+    """
+    said, file = _read_description(model)
+    try:
+        return [float(value) for value in said.get("focal_px", ())]
+    except (ValueError, TypeError) as e:
+        raise ModelError(f"{file} is damaged: {e}. Train or export the model again") from None
+
+
+def _read_description(model: Path) -> tuple[dict[str, Any], Path]:
+    """Return the description beside the weights of a model, empty without one, and its file."""
+    file = model / DESCRIPTION_NAME if model.is_dir() else model.with_suffix(".json")
+    if not file.is_file() or (model.is_file() and model.suffix != ".safetensors"):
+        return {}, file
+    try:
+        said = parse_json(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as e:
+        raise ModelError(f"{file} is damaged: {e}. Train or export the model again") from None
+    if not isinstance(said, dict):
+        raise ModelError(f"{file} is damaged: no description. Train or export the model again")
+    return said, file
 
 
 def _import_optional(name: str, extra: str, what: str) -> ModuleType:

@@ -93,8 +93,9 @@ def run(model: Model, recording: In, out: Path, settings: Settings) -> Result:
         If ``out`` exists.
     """
     from dmrl.deploy.image_detection import DetectionOptions
-    from dmrl.prediction import read_model_rates, write_detections
+    from dmrl.prediction import read_model_rates, warn_about_lens, write_detections
 
+    warn_about_lens(model, recording)
     settings, detector, made = _open(model, recording, settings)
     options = DetectionOptions(settings.min_confidence, settings.most, settings.views)
     rates = read_model_rates(model)

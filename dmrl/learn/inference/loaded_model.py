@@ -78,6 +78,9 @@ class Model:
         Summary of the training: settings, losses, images.
     rates
         How often it detects and errs, as of `measure_rates`. None: not measured.
+    focal_px
+        Focal lengths of the cameras it was trained with, pixels, the main one first. Empty:
+        unknown.
     """
 
     network: Network
@@ -89,6 +92,7 @@ class Model:
     label_source: str = ""
     training: dict[str, Any] = field(default_factory=dict)
     rates: dict[str, Any] | None = None
+    focal_px: list[float] = field(default_factory=list)
 
     def require_size(self, width_px: int, height_px: int, what: object) -> None:
         """Raise SettingError unless the network accepts images of this size.
@@ -203,6 +207,7 @@ def describe(model: Model) -> dict[str, Any]:
         "width_px": model.width_px,
         "height_px": model.height_px,
         "stride_px": model.network.stride_px,
+        "focal_px": model.focal_px,
         "channels": 3,
         "outputs": list(model.network.channels),
         "threshold": model.threshold,
@@ -268,6 +273,7 @@ def _load_safetensors(weights: Path, description: Path, name: str) -> Model:
     assign_weights(network, tensors, weights)
     known = ("width_px", "height_px", "threshold", "label_source", "training")
     fields = {k: said[k] for k in known} | {"rates": said.get("rates")}
+    fields["focal_px"] = said.get("focal_px", [])
     return Model(network.eval(), said["architecture"], name, **fields)
 
 

@@ -264,6 +264,7 @@ def test_a_model_is_described_by_what_it_is() -> None:
         "width_px": 64,
         "height_px": 48,
         "stride_px": 8,
+        "focal_px": [],
         "channels": 3,
         "outputs": ["log_depth", "confidence", "offset_u", "offset_v", "log_spread"],
         "threshold": 0.25,
