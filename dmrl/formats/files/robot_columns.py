@@ -140,6 +140,10 @@ def _resolve(robot: str, text: TextTable, table: ColumnMap) -> RobotLog:
     )
 
 
+MOST_NAMES = 20
+"""Columns of a file that an error lists, at most."""
+
+
 def _check_missing(logs: Sequence[RobotLog]) -> None:
     """Raise SourceError if no robot has a column of the table.
 
@@ -149,7 +153,8 @@ def _check_missing(logs: Sequence[RobotLog]) -> None:
     for log in logs:
         if nowhere:
             words = name_missing(log.text.path, nowhere, log.text.columns)
-            raise SourceError(f"{words}. Fix the table of columns")
+            there = ", ".join([*log.text.columns][:MOST_NAMES])
+            raise SourceError(f"{words}. Fix the table of columns; the file has {there}")
         if log.missing:
             absent = ", ".join(sorted(log.missing))
             say(f"{log.text.path}: no column {absent}, which other robots have")
