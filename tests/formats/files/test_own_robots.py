@@ -145,7 +145,10 @@ def test_robots_may_have_different_sensors(
     err = capsys.readouterr().err
     assert "boat.csv: no column height, which other robots have" in err
     assert "boat.csv: no height, which dmrl label needs" in err
-    with pytest.raises(SourceError, match=r"boat\.csv: no column height\. Fix the table of columns; the file has \w+"):
+    with pytest.raises(
+        SourceError,
+        match=r"boat\.csv: no column height\. Fix the table of columns; the file has \w+",
+    ):
         mapped_csv.load_content(boat, options)
     text = (tmp_path / "map.toml").read_text().replace('name = "height"', "value = 0.2")
     (tmp_path / "map.toml").write_text(text)
