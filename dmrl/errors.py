@@ -126,6 +126,8 @@ class MissingTopic(RecordingError):
         end = next((end for end in REMEDIES if topic.endswith(end)), "")
         remedy = REMEDIES.get(end, "Try: dmrl info {where}").format(where=where)
         hint = suggest(topic, [name for name in held if name.endswith(end)], remedy)
+        if end and remedy not in hint:  # another robot has such a topic
+            hint = f"{remedy}. {hint}"
         if near and topic.startswith("/*/"):  # a stage asks for it, and not the user
             name = f"{near[0]}={topic.replace('*', 'cf1', 1)}"
             hint += f" Rename it: dmrl convert {where} OUT.mcap --names {name}"
