@@ -109,7 +109,7 @@ REMEDIES = {
 class MissingTopic(RecordingError):
     """A recording lacks a topic that a stage reads.
 
-    The message says how to get its content, or suggests the most similar topic.
+    The message says how to get its content or, where that is unknown, suggests a similar topic.
 
     Parameters
     ----------
@@ -125,9 +125,7 @@ class MissingTopic(RecordingError):
         near = get_close_matches(topic, held := sorted(present), n=1)
         end = next((end for end in REMEDIES if topic.endswith(end)), "")
         remedy = REMEDIES.get(end, "Try: dmrl info {where}").format(where=where)
-        hint = suggest(topic, [name for name in held if name.endswith(end)], remedy)
-        if end and remedy not in hint:  # another robot has such a topic
-            hint = f"{remedy}. {hint}"
+        hint = remedy if end else suggest(topic, held, remedy)
         if near and topic.startswith("/*/"):  # a stage asks for it, and not the user
             name = f"{near[0]}={topic.replace('*', 'cf1', 1)}"
             hint += f" Rename it: dmrl convert {where} OUT.mcap --names {name}"

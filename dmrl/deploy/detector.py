@@ -304,7 +304,10 @@ def read_focal_lengths(model: Path) -> list[float]:
     """
     said, file = _read_description(model)
     try:
-        return [float(value) for value in said.get("focal_px", ())]
+        focal_px = [float(value) for value in said.get("focal_px", ())]
+        if not all(0 < value < np.inf for value in focal_px):
+            raise ValueError(f"focal_px {focal_px}")
+        return focal_px
     except (ValueError, TypeError) as e:
         raise ModelError(f"{file} is damaged: {e}. Train or export the model again") from None
 

@@ -38,7 +38,7 @@ def test_focal_lengths_are_part_of_a_model(tmp_path: Path) -> None:
     assert load_model(tmp_path).focal_px == read_focal_lengths(tmp_path) == [230.0]
 
 
-@pytest.mark.parametrize("value", [184, ["x"], [None]])
+@pytest.mark.parametrize("value", [184, ["x"], [None], [0.0], [float("nan")]])
 def test_damaged_focal_lengths_are_one_error(tmp_path: Path, value: object) -> None:
     (tmp_path / "model.json").write_text(json.dumps({"focal_px": value}))
     with pytest.raises(ModelError, match="is damaged"):

@@ -127,8 +127,9 @@ def _select(
         # Either robot may be the mirrored one, so nothing shows on which side the peer is.
         name = mistake.name.replace(" fit", f"{OF_ONE_ROBOT}fit", 1)
         return FoundMistake(replace(mistake, name=name), None, (0, 1))
-    blind = mistake.heading_is_open and robot is not None and not has_camera(pair, robot)
-    return FoundMistake(mistake, robot, (robot,) if blind and robot is not None else ())
+    if robot is not None and mistake.heading_is_open and not has_camera(pair, robot):
+        return FoundMistake(mistake, robot, (robot,))
+    return FoundMistake(mistake, robot)
 
 
 def compute_misfit(pair: Pair) -> float:
