@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from dmrl import topics
-from dmrl.datasets.writing.inputs import MAX_FOCAL_RATIO, find_focal_lengths
+from dmrl.datasets.manifest import have_similar_focal_lengths
+from dmrl.datasets.writing.inputs import find_focal_lengths
 from dmrl.deploy.backend_names import BackendName
 from dmrl.deploy.detector import (
     BACKEND_PACKAGES,
@@ -84,7 +85,7 @@ def warn_about_lens(model: Path, recording: Path) -> None:
     """
     known_px = read_focal_lengths(resolve_model_path(model))
     for own_px in find_focal_lengths(LoadedRecording(recording)) if known_px else ():
-        if min(max(own_px / px, px / own_px) for px in known_px) > MAX_FOCAL_RATIO:
+        if not any(have_similar_focal_lengths(own_px, px) for px in known_px):
             say(
                 f"{recording}: the focal length is {own_px:.0f} px, and {model} was trained with "
                 f"{' and '.join(f'{px:.0f}' for px in known_px)}: its depths are about "

@@ -138,7 +138,7 @@ def _write_part(
         shard_images=settings.shard_images,
         before=before.manifest,
     )
-    manifest = before.manifest.with_part(shards)
+    manifest = before.manifest.with_part(shards, _list_focal_lengths(known))
     builder.report_left_out(recordings, manifest, tally, settings)
     builder.warn_about_unused_flags(settings, tally)
     _write_documents(part_folder(folder, before.manifest.parts), made, known, tally, seen)
@@ -147,6 +147,12 @@ def _write_part(
         name: sum(one.rows for one in shards[name]) for name in manifest.splits if name in shards
     }
     return Written(images, {path.name: one.source for path, one in known.items()}, tally)
+
+
+def _list_focal_lengths(known: Mapping[Path, RecordingFacts]) -> list[float]:
+    """Return the focal lengths of all cameras, those of recordings with many images first."""
+    ordered = sorted(known.values(), key=lambda one: -one.images)
+    return [px for one in ordered for px in one.focal_px]
 
 
 def _warn_about_labels(known: Mapping[Path, RecordingFacts], settings: Settings) -> None:

@@ -5,7 +5,8 @@ then by a new manifest; no other existing file is written again. Every addition 
 such as ``parts/00001`` with its provenance and the hashes of its images.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,9 @@ from dmrl.guards.bounded_parsing import parse_json
 from dmrl.guards.safe_names import check_file_name, check_split_name, safe_join
 
 PARTS_FOLDER = "parts"
+
+MAX_FOCAL_RATIO = 1.05
+"""Focal lengths within this ratio count as one: depths are as far off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,17 +43,27 @@ class Manifest:
         Number of times that rows were written: one for the creation, one for each addition.
     parquet
         Shards are Parquet files in ``data``, else Arrow streams in a folder of their split.
+    focal_px
+        Focal lengths of the calibrated cameras, pixels, without those within `MAX_FOCAL_RATIO` of
+        an earlier one.
     """
 
     splits: Mapping[str, Sequence[Shard]] = field(default_factory=dict)
     parts: int = 0
     parquet: bool = False
+    focal_px: Sequence[float] = ()
 
-    def with_part(self, added: Mapping[str, Sequence[Shard]]) -> "Manifest":
-        """Return a manifest with some shards added and one part more."""
+    def with_part(
+        self, added: Mapping[str, Sequence[Shard]], focal_px: Iterable[float] = ()
+    ) -> "Manifest":
+        """Return a manifest with some shards and their cameras added, and one part more."""
         names = sorted({*self.splits, *added}, key=lambda name: (name != "train", name))
         grown = {name: [*self.splits.get(name, ()), *added.get(name, ())] for name in names}
-        return Manifest(grown, self.parts + 1, self.parquet)
+        distinct = list(self.focal_px)
+        for own_px in focal_px:
+            if not any(have_similar_focal_lengths(own_px, px) for px in distinct):
+                distinct.append(own_px)
+        return Manifest(grown, self.parts + 1, self.parquet, distinct)
 
     def count_rows(self, split: str) -> int:
         """Count the rows of a split."""
@@ -67,8 +81,18 @@ class Manifest:
             {"split": name, "shards": [asdict(shard) for shard in shards]}
             for name, shards in self.splits.items()
         ]
-        document = {"parquet": self.parquet, "parts": self.parts, "splits": splits}
+        document = {
+            "parquet": self.parquet,
+            "parts": self.parts,
+            "splits": splits,
+            "focal_px": list(self.focal_px),
+        }
         (folder / layout.MANIFEST_FILE).write_text(layout.format_json(document), encoding="utf-8")
+
+
+def have_similar_focal_lengths(first_px: float, second_px: float) -> bool:
+    """Return whether a network's depths hold for both focal lengths; see `MAX_FOCAL_RATIO`."""
+    return max(first_px, second_px) <= MAX_FOCAL_RATIO * min(first_px, second_px)
 
 
 def part_folder(folder: Path, number: int) -> Path:
@@ -101,7 +125,8 @@ def load_manifest(folder: Path) -> Manifest | None:
             raise ValueError("a split is named twice")
         if any(len({shard.file for shard in own}) < len(own) for own in splits.values()):
             raise ValueError("a shard is named twice")
-        return Manifest(splits, _parse_count(said["parts"]), said["parquet"] is True)
+        focal_px = [_parse_length(value) for value in said.get("focal_px", [])]
+        return Manifest(splits, _parse_count(said["parts"]), said["parquet"] is True, focal_px)
     except (OSError, KeyError, TypeError, ValueError, AttributeError) as e:
         raise DatasetError(f"{path} is damaged ({e}). Make the dataset again") from e
 
@@ -109,6 +134,12 @@ def load_manifest(folder: Path) -> Manifest | None:
 def _parse_shard(said: Mapping[str, Any], path: Path) -> Shard:
     name = check_file_name(said["file"], f"{path}: a shard")
     return Shard(name, _parse_count(said["rows"]), _parse_count(said["bytes"]))
+
+
+def _parse_length(value: Any) -> float:
+    if type(value) not in (int, float) or not 0 < value < math.inf:
+        raise ValueError(f"{value!r} is not a focal length")
+    return float(value)
 
 
 def _parse_count(value: Any) -> int:

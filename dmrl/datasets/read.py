@@ -167,6 +167,11 @@ class Dataset:
     parquet: bool = False
     manifest: Manifest | None = None
 
+    @property
+    def focal_px(self) -> Sequence[float]:
+        """Focal lengths of its cameras, pixels, the main one first. Empty: unknown."""
+        return self.manifest.focal_px if self.manifest else ()
+
     def split(self, name: str) -> Split:
         """Open one split, mapped into memory.
 

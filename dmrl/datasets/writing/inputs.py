@@ -5,12 +5,10 @@ from itertools import islice
 from pathlib import Path
 
 from dmrl import topics
+from dmrl.datasets.manifest import have_similar_focal_lengths
 from dmrl.errors import SettingError
 from dmrl.recording import Input, LoadedRecording, Provenance
 from dmrl.terminal.progress import say
-
-MAX_FOCAL_RATIO = 1.05
-"""Largest ratio of the focal lengths of one dataset without a warning."""
 
 
 def reject_duplicates(
@@ -73,7 +71,7 @@ def warn_about_lenses(focal_px: Sequence[float]) -> None:
     focal_px
         Focal lengths of all cameras.
     """
-    if focal_px and max(focal_px) > MAX_FOCAL_RATIO * min(focal_px):
+    if focal_px and not have_similar_focal_lengths(min(focal_px), max(focal_px)):
         say(
             f"the cameras have focal lengths from {min(focal_px):.0f} to {max(focal_px):.0f} px: "
             "a drone appears larger through the longer one, and a network estimates a smaller "

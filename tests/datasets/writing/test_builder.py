@@ -185,6 +185,7 @@ def test_different_focal_lengths_are_reported(
                 sink.write(stamped.time_ns, stamped.topic, stamped.message)
     run(flights, tmp_path / "out", Settings())
     assert "focal lengths from 180 to 400 px" in capsys.readouterr().err
+    assert open_dataset(tmp_path / "out").focal_px == [180.0, 400.0]
 
 
 def test_unknown_label_source_error_lists_available_ones(record: Record, tmp_path: Path) -> None:
