@@ -9,7 +9,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from dmrl.datasets import Dataset, layout
+from dmrl.errors import SettingError
 from dmrl.geometry.boxes import clip_box, square_box
 from dmrl.geometry.frames import Camera
 from dmrl.guards.safe_names import check_split_name
@@ -18,6 +21,8 @@ from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import track
 
 COLUMNS = ("peers", "robot", "source", "log_time")
+BATCH_ROWS = 2048
+"""Rows whose values are Python objects at a time."""
 WITHOUT_BOX = "images with a label without a box (--robot-width-m and --camera give one)"
 
 
@@ -70,7 +75,7 @@ class BoxOptions:
 
     def to_class(self, peer: str) -> str:
         """Return the class of a peer: drone for drone-2."""
-        base = re.sub(r"-\d+$", "", peer)
+        base = _remove_number(peer)
         return self.names.get(peer) or self.names.get(base) or base
 
     def to_box(self, peer: Mapping[str, Any]) -> list[float]:
@@ -96,11 +101,35 @@ class ExportRows:
     data: Dataset
     options: BoxOptions
 
+    def check_options(self) -> None:
+        """Raise SettingError if an option has no effect, or does not fit the dataset."""
+        options, path, camera = self.options, self.data.path, self.options.camera
+        if (options.robot_width_m is None) != (camera is None):
+            raise SettingError(
+                "--robot-width-m and --camera go together with --to. Give both, or neither"
+            )
+        for split in self.data.splits:
+            height_px, width_px = self.data.split(split).image_shape
+            size = f"{width_px} x {height_px} px"
+            other = f"{camera.width_px} x {camera.height_px} px" if camera else size
+            if size != other:
+                raise SettingError(
+                    f"{path}: its images are {size}, those of --camera {other}. "
+                    "Pass the camera of the images"
+                )
+        known = self._peers | {_remove_number(peer) for peer in self._peers}
+        if unused := ", ".join(sorted(options.names.keys() - known)):
+            raise SettingError(f"--names has no effect: {path} has no {unused}. Leave it out")
+
     @cached_property
     def classes(self) -> list[str]:
         """Every class, sorted."""
+        return sorted(set(map(self.options.to_class, self._peers)))
+
+    @cached_property
+    def _peers(self) -> set[str]:
         peers = (peer for s in self.data.splits for p in self._read(s, "peers") for peer in p)
-        return sorted({self.options.to_class(peer["peer"]) for peer in peers})
+        return {peer["peer"] for peer in peers}
 
     @cached_property
     def most_peers(self) -> int:
@@ -117,13 +146,20 @@ class ExportRows:
         return list(found.values())
 
     def _read(self, split: str, column: str) -> Iterator[Any]:
-        for chunk in self.data.split(split).table[column].chunks:
-            yield from chunk.to_pylist()
+        values = self.data.split(split).table[column]
+        return _iter_values(values, list(range(len(values))))
 
     def __iter__(self) -> Iterator[ExportRow]:
         """Yield the rows, split by split."""
+        return self._iter_tracked(by_camera=False)
+
+    def iter_by_camera(self) -> Iterator[ExportRow]:
+        """Yield the rows, split by split, those of a robot in a recording one after another."""
+        return self._iter_tracked(by_camera=True)
+
+    def _iter_tracked(self, *, by_camera: bool) -> Iterator[ExportRow]:
         total = sum(len(self.data.split(split)) for split in self.data.splits)
-        return track(self._iter_rows(), "Writing images", total)
+        return track(self._iter_rows(by_camera=by_camera), "Writing images", total)
 
     def iter_boxed(self) -> Iterator[ExportRow]:
         """Yield the rows whose visible peers all have boxes, which are clipped to the image.
@@ -138,12 +174,14 @@ class ExportRows:
             clipped = [peer | {"box_px": clip_box(box, *row.size_px)} for peer, box in boxes]
             yield replace(row, peers=[peer for peer in clipped if _has_area(*peer["box_px"])])
 
-    def _iter_rows(self) -> Iterator[ExportRow]:
+    def _iter_rows(self, *, by_camera: bool) -> Iterator[ExportRow]:
         for name in self.data.splits:
             split = self.data.split(name)
             height_px, width_px = split.image_shape
-            columns = (self._read(name, column) for column in COLUMNS)
-            images = split.images(range(len(split)))
+            table = split.table.select(COLUMNS)
+            places = _order_by_camera(table) if by_camera else list(range(len(split)))
+            images = split.images(places)
+            columns = (_iter_values(table[column], places) for column in COLUMNS)
             for k, (rgb, peers, robot, source, log_time) in enumerate(
                 zip(images, *columns, strict=True)
             ):
@@ -158,6 +196,23 @@ class ExportRows:
                     source,
                     log_time,
                 )
+
+
+def _iter_values(column: pa.ChunkedArray, places: list[int]) -> Iterator[Any]:
+    for start in range(0, len(places), BATCH_ROWS):
+        yield from column.take(places[start : start + BATCH_ROWS]).to_pylist()
+
+
+def _order_by_camera(table: pa.Table) -> list[int]:
+    """Return the rows by recording and robot, in the order of their first images."""
+    cameras = list(zip(*(table[name].to_pylist() for name in ("source", "robot")), strict=True))
+    ranks = {camera: rank for rank, camera in enumerate(dict.fromkeys(cameras))}
+    return sorted(range(len(cameras)), key=lambda place: ranks[cameras[place]])
+
+
+def _remove_number(peer: str) -> str:
+    """Return a peer without the number of its repetition."""
+    return re.sub(r"-\d+$", "", peer)
 
 
 def _has_area(left: float, top: float, right: float, bottom: float) -> bool:

@@ -29,7 +29,7 @@ def write_yolo(rows: ExportRows, folder: Path) -> dict[str, int]:
     if stated and "val" not in stated:
         # Trainers refuse a set without one.
         stated["val"] = stated.get("test", next(iter(stated.values())))
-        say(f"{folder.name}: data.yaml names {stated['val']} as val too")
+        say(f"data.yaml names {stated['val']} as val too")
     named = {"names": rows.classes, **stated}
     # JSON is YAML.
     _write(folder / "data.yaml", (json.dumps(named, indent=1) + "\n").encode())

@@ -39,7 +39,9 @@ def write_lerobot(rows: ExportRows, folder: Path) -> dict[str, int]:
     schema = _build_schema(rows.most_peers)
     episodes: list[dict[str, Any]] = []
     index, spans, counts = 0, dict[str, tuple[int, int]](), dict[str, int]()
-    for (split, *_), images in groupby(rows, key=lambda row: (row.split, row.source, row.robot)):
+    for (split, *_), images in groupby(
+        rows.iter_by_camera(), key=lambda row: (row.split, row.source, row.robot)
+    ):
         number = len(episodes)
         place = {"chunk_index": number // CHUNK_FILES, "file_index": number % CHUNK_FILES}
         path = folder / "data" / FILE.format(**place)

@@ -169,6 +169,7 @@ def _export_dataset(source: Path, out: Path, settings: Settings) -> dict[str, in
     camera = None if settings.camera is None else find_camera(settings.camera)
     options = BoxOptions(_parse_names(settings.names), settings.robot_width_m, camera)
     rows = ExportRows(open_dataset(source), options)
+    rows.check_options()
     made = build_provenance("convert", settings, (source,), libraries=("pyarrow", "pillow"))
     module, name = DATASET_WRITERS[str(settings.to)]
     write = getattr(import_module(module), name)
