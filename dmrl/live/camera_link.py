@@ -2,7 +2,7 @@
 
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from dmrl.errors import SettingError, SourceError
@@ -47,26 +47,44 @@ def parse_address(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
+TimedImage = tuple[Image, int, int]
+"""An image, its time of exposure and of arrival on this computer's clock, nanoseconds."""
+
+
 @dataclass(slots=True)
 class _ExposureTimes:
     """Times of exposure of one connection's images, on this computer's clock.
 
     The best available source is used: the robot's time of an image, else the camera's, else the
-    time of arrival.
+    time of arrival. Images with a time wait until the clocks have settled.
     """
 
     robot_time: RobotTime
     clock: SenderClock = field(default_factory=SenderClock)
     steady: SteadyRateFilter = field(default_factory=SteadyRateFilter)
+    held: list[tuple[Image, int]] = field(default_factory=list)
 
-    def __call__(self, image: Image, arrival_ns: int) -> int:
+    def add_image(self, image: Image, arrival_ns: int) -> Iterator[TimedImage]:
+        """Yield the images whose times are known by now."""
+        if image.time_us is not None:
+            self.clock.add_sample(image.time_us * NS_PER_US, arrival_ns)
+        self.held.append((image, arrival_ns))
+        if image.time_us is None or self.clock.settled:
+            yield from self.flush()
+
+    def flush(self) -> Iterator[TimedImage]:
+        """Yield the images that wait for the clocks."""
+        held, self.held = self.held, []
+        for image, arrival_ns in held:
+            yield image, self._find_time_ns(image, arrival_ns), arrival_ns
+
+    def _find_time_ns(self, image: Image, arrival_ns: int) -> int:
         if image.robot_time_us is not None:
             known = self.robot_time(image.robot_time_us / 1000)
             if known is not None:
                 return known
         if image.time_us is None:
             return self.steady(arrival_ns)
-        self.clock.add_sample(image.time_us * NS_PER_US, arrival_ns)
         return min(self.clock.to_host_ns(image.time_us * NS_PER_US), arrival_ns)
 
 
@@ -174,8 +192,15 @@ class CameraClient(StoppableThread):
             return f"cannot be reached ({e.strerror or e})"
 
     def _receive_images(self, connection: socket.socket) -> str:
-        reader, times = ImageReader(), _ExposureTimes(self._robot_time)
+        times = _ExposureTimes(self._robot_time)
         self.health.connections += 1
+        try:
+            return self._receive_until_end(connection, times)
+        finally:
+            self._post_images(times.flush())
+
+    def _receive_until_end(self, connection: socket.socket, times: _ExposureTimes) -> str:
+        reader = ImageReader()
         broken, last_s, useless_bytes = 0, time.monotonic(), 0
         while not self._stop_wanted.is_set():
             try:
@@ -191,12 +216,16 @@ class CameraClient(StoppableThread):
             for image in reader.feed(data):
                 self.health.state, useless_bytes = "connected", 0
                 self.health.lost += self._frames.add_image(image, arrival_ns)
-                self._post_image(image, times(image, arrival_ns), arrival_ns)
+                self._post_images(times.add_image(image, arrival_ns))
             self.health.broken += reader.broken - broken
             broken = reader.broken
             if useless_bytes > MAX_GARBAGE_BYTES:
                 return "sends no CPX images"
         return "stopped"
+
+    def _post_images(self, images: Iterator[TimedImage]) -> None:
+        for image in images:
+            self._post_image(*image)
 
     def _post_image(self, image: Image, time_ns: int, arrival_ns: int) -> None:
         try:

@@ -21,6 +21,8 @@ RECEIVE_TIMEOUT_S = 5.0
 """Seconds without a log packet after which a link is assumed dead."""
 FIRST_ANSWER_TIMEOUT_S, NEXT_ANSWER_TIMEOUT_S = 2.0, 5.0
 """Seconds without an answer after which the setup is aborted. The whole setup may take longer."""
+MAX_SILENCE_S = 1.0
+"""Seconds without a log packet after which the drone may have restarted."""
 RETRY_DELAY_S = 1.0
 MAX_DELAY_MS = 2_000
 """Largest difference between two packets' delays. A larger one is a restart of the drone."""
@@ -141,7 +143,7 @@ class CrazyflieLink(StoppableThread):
         Parameters
         ----------
         robot_ms
-            Milliseconds, with all bits or only those of the log's timestamps.
+            Milliseconds, of the present, with all bits or only those of the log's timestamps.
         """
         flight = self._flight
         # A clock that has not settled is still more accurate than the WiFi arrival of an image.
@@ -149,7 +151,10 @@ class CrazyflieLink(StoppableThread):
             return None
         whole_ms = math.floor(robot_ms)
         near_ms = flight.unwrapped.find_nearest(whole_ms) + (robot_ms - whole_ms)
-        return flight.clock.to_host_ns(round(near_ms * NS_PER_MS))
+        host_ns, now_ns = flight.clock.to_host_ns(round(near_ms * NS_PER_MS)), self._now()
+        # After a restart of the drone, its camera may be back before its log.
+        silent = now_ns - self.health.last_arrival_ns > MAX_SILENCE_S * 1e9
+        return None if silent and abs(now_ns - host_ns) > MAX_DELAY_MS * NS_PER_MS else host_ns
 
     def run(self) -> None:
         """Connect and post samples, again after each loss, until stopped."""

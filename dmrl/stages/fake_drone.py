@@ -39,6 +39,11 @@ def run(flight: Path, uris: Sequence[str], cameras: Sequence[int], settings: Set
         try:
             places = [f"udp://{LOOPBACK}:{drone.port}" for drone in flying.drones]
             places += [f"{LOOPBACK}:{camera.port}" for camera in flying.cameras]
+            if cameras and settings.speed != 1 and settings.sends != "streamer":
+                say(
+                    "recorded images will not match the log: without the drone's time, they have "
+                    "that of arrival, at another speed. Pass --sends streamer"
+                )
             say(f"listening at {', '.join(places)}; takes off when its log is asked for")
             while not ended.wait(0.1) and not flying.clock.landed:
                 pass

@@ -30,6 +30,11 @@ def wait(what: Callable[[], object]) -> None:
         time.sleep(0.01)
 
 
+def find(times: _ExposureTimes, image: Image, arrival_ns: int) -> list[int]:
+    """Times of the images that are known once this one has come."""
+    return [time_ns for _, time_ns, _ in times.add_image(image, arrival_ns)]
+
+
 class Deck:
     """A camera that sends one answer to each client, and closes the connection."""
 
@@ -134,13 +139,25 @@ def test_exposure_time_uses_the_best_clock_and_never_exceeds_arrival() -> None:
     # Its robot's clock was at 4 ms when the camera's was at 0; the picture is of 1 ms later.
     robot = replace(RAW, time_us=1_000, state=RobotState(robot_ms=4, received_us=0))
     assert robot.robot_time_us == 5_000
-    assert times(robot, 10**9) == 10**9  # the robot's clock is not known yet: the camera's own
+    assert find(times, robot, 10**9) == []  # the robot's clock is not known yet: it waits
     known[5.0] = 123_000_000
-    assert times(robot, 2 * 10**9) == 123_000_000
+    assert find(times, robot, 2 * 10**9) == [123_000_000, 123_000_000]
     own = _ExposureTimes(known.get)
-    first = own(replace(RAW, time_us=1_000_000), 5 * 10**9)
-    assert first == 5 * 10**9
+    assert find(own, replace(RAW, time_us=1_000_000), 5 * 10**9) == []
     # A second later by the camera; it came 0.4 s earlier than the first had let expect.
-    assert own(replace(RAW, time_us=2_000_000), 5_600_000_000) == 5_600_000_000
-    assert own(replace(RAW, time_us=2_100_000), 5_800_000_000) == 5_700_000_000
-    assert own(RAW, 7 * 10**9) == 7 * 10**9  # nothing told: when it came
+    assert find(own, replace(RAW, time_us=2_000_000), 5_600_000_000) == []
+    settled = [4_600_000_000, 5_600_000_000, 6_000_000_000]
+    assert find(own, replace(RAW, time_us=2_400_000), 6_200_000_000) == settled
+    assert find(own, replace(RAW, time_us=2_500_000), 6_200_000_000) == [6_100_000_000]
+    assert find(own, RAW, 7 * 10**9) == [7 * 10**9]  # nothing told: when it came
+    assert find(_ExposureTimes(known.get), RAW, 10**9) == [10**9]
+
+
+def test_images_that_wait_for_a_clock_are_posted_at_the_end(client: Start) -> None:
+    images = [replace(RAW, time_us=20_000 * k) for k in range(3)]
+    deck = Deck(b"".join(pack_image(image, "stamped") for image in images))
+    run, feed = client(deck.port)
+    wait(lambda: run.health.received == 3)
+    found = [one for one in feed.get_batch(0.0) if isinstance(one, ReceivedSample)]
+    assert [one.sample.message for one in found] == ["CameraCalibration", *["CompressedImage"] * 3]
+    assert np.diff([one.sample.time_ns for one in found[1:]]).tolist() == [20_000_000] * 2

@@ -91,8 +91,7 @@ class ImageReader:
         self._packets = PacketReader()
         self._begun: _PartialImage | None = None
         self._time_ms, self._time_us = CounterUnwrapper(32), CounterUnwrapper(32)
-        self._state_us, self._robot_ms = CounterUnwrapper(32), CounterUnwrapper(32)
-        self._frame_id = CounterUnwrapper(8, forward=True)
+        self._robot_ms, self._frame_id = CounterUnwrapper(32), CounterUnwrapper(8, forward=True)
 
     @property
     def skipped_bytes(self) -> int:
@@ -200,9 +199,12 @@ class ImageReader:
         pixels = data[METADATA.size :]
         if version != STREAMER_VERSION or len(pixels) != width_px * height_px or not pixels:
             return None
-        time_ms = self._robot_ms(rest[0])
-        state = unpack_state(rest, time_ms, self._state_us(received_us)) if received_us else None
         frame_id, time_us = self._frame_id(frame_id), self._time_us(time_us)
+        state = None
+        if received_us:
+            # Of the same clock as the image: a counter of its own may begin before a wrap.
+            received_us = self._time_us.find_nearest(received_us)
+            state = unpack_state(rest, self._robot_ms(rest[0]), received_us)
         return Image(width_px, height_px, "raw", pixels, time_us, frame_id, state)
 
 

@@ -31,6 +31,7 @@ FILE_COLUMN, NUMBER_COLUMN = "filename", "frame_id"
 TIME_COLUMN, STATE_TIME_COLUMN = "frame_gap8_timestamp", "state_gap8_timestamp"
 STATE_COLUMNS = ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "quat")
 RATE_COLUMNS = ("rateRoll", "ratePitch", "rateYaw")
+WRAP_NS = 1000 << 32
 WHOLE_NUMBER = re.compile(r"\s*[+-]?\d{1,18}\s*")
 REQUIRED_COLUMNS = (
     FILE_COLUMN,
@@ -76,6 +77,8 @@ def load_content(source: Path, options: Options) -> Content:
     if lost:
         say(f"{source}: {lost} images were lost in transmission, by their numbers")
     state_ns = time_ns + _wrap_to_int32(table[STATE_TIME_COLUMN] - table[TIME_COLUMN]) * 1000
+    if (state_ns[table[STATE_TIME_COLUMN] != 0] < 0).any():  # it came before the clock wrapped
+        time_ns, state_ns = time_ns + WRAP_NS, state_ns + WRAP_NS
     streams = [_iter_images(source, paths, time_ns, options)]
     return Content(merge_by_time(streams + _build_state_streams(table, state_ns, options, source)))
 

@@ -5,6 +5,7 @@ get the camera's times if the stream contains them, otherwise nominal ones.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from dmrl.terminal.left_out import leave_out
 
 READ_BYTES = 1 << 16
 SNIFF_BYTES = 1 << 18
+WRAP_US = 1 << 32
 
 
 def can_read(source: Path) -> bool:
@@ -67,9 +69,12 @@ def load_content(source: Path, options: Options) -> Content:
         options.refuse("raw", f"has no effect: the images of {source} say that they are raw")
     leave_out("images that are broken or cut short", source, reader.broken)
     leave_out("bytes that belong to no packet", source, reader.skipped_bytes)
+    told = [state for state in states if state is not None]
+    if any(state.received_us < 0 for state in told):  # it came before the clock wrapped
+        times = [None if time is None else time + WRAP_US for time in times]
+        told = [replace(state, received_us=state.received_us + WRAP_US) for state in told]
     time_ns = _to_times_ns(times, source, options)
     pictures = _iter_image_samples(source, time_ns, options)
-    told = [state for state in states if state is not None]
     return Content(merge_by_time([pictures, *_build_state_streams(told, options, source)]))
 
 

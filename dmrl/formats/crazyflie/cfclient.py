@@ -8,7 +8,6 @@ it.
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from dmrl.errors import EmptySource, SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
 from dmrl.formats.clocks import settle_times, unwrap
 from dmrl.formats.crazyflie import log_variables
-from dmrl.formats.crazyflie.log_block import LogBlock
+from dmrl.formats.crazyflie.log_block import LogBlock, unwrap_between_blocks
 from dmrl.formats.files.text_table import Dialect, read_table
 from dmrl.geometry.frames import Array
 from dmrl.terminal.left_out import leave_out
@@ -101,7 +100,10 @@ def _read_robots(robots: Mapping[str, list[Path]]) -> dict[str, list[LogBlock]]:
         raise next(iter(empty.values()))
     for path in empty:
         leave_out("files without a row", path)
-    return {name: _unwrap_between_blocks(blocks) for name, blocks in read.items()}
+    return {
+        name: unwrap_between_blocks(blocks, NS_PER_MS << TIMESTAMP_BITS)
+        for name, blocks in read.items()
+    }
 
 
 def _refuse_two_flights(paths: Sequence[Path]) -> None:
@@ -159,16 +161,6 @@ def _restore_type(cells: list[str], values: Array) -> NDArray[Any]:
     if whole and np.abs(values).max() < 2**31:
         return values.astype(np.int32)
     return values
-
-
-def _unwrap_between_blocks(blocks: list[LogBlock]) -> list[LogBlock]:
-    """Add missing wraps: blocks may start on different sides of a wrap of the clock."""
-    period_ns = NS_PER_MS << TIMESTAMP_BITS
-    wraps = [round((blocks[0].time_ns[0] - block.time_ns[0]) / period_ns) for block in blocks]
-    return [  # relative to the earliest, so that no time is before 0
-        replace(block, time_ns=block.time_ns + (count - min(wraps)) * period_ns)
-        for block, count in zip(blocks, wraps, strict=True)
-    ]
 
 
 FORMAT = Format(

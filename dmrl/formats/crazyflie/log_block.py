@@ -1,7 +1,7 @@
 """Log blocks, time series of their variables, and unpacking of compressed quaternions."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -48,13 +48,31 @@ class TimeSeries:
         return np.stack([np.interp(time_ns, self.time_ns, v) for v in self.values.T], axis=1)
 
 
+def unwrap_between_blocks(blocks: Sequence[LogBlock], period_ns: int) -> list[LogBlock]:
+    """Add missing wraps: blocks may start on different sides of a wrap of the clock.
+
+    Parameters
+    ----------
+    blocks
+        Blocks of one robot, each unwrapped.
+    period_ns
+        Nanoseconds after which the clock wraps.
+    """
+    wraps = [round((blocks[0].time_ns[0] - block.time_ns[0]) / period_ns) for block in blocks]
+    return [  # relative to the earliest, so that no time is before 0
+        replace(block, time_ns=block.time_ns + (count - min(wraps)) * period_ns)
+        for block, count in zip(blocks, wraps, strict=True)
+    ]
+
+
 def find_series(blocks: Sequence[LogBlock], names: Sequence[str]) -> TimeSeries | None:
-    """Return the columns of the first block with all these names, finite rows only; or None."""
+    """Return the columns of the first block with these names and values, finite rows only; or None."""
     for block in blocks:
         if all(name in block.columns for name in names):
             values = np.stack([block.columns[name].astype(float) for name in names], axis=1)
             good = np.isfinite(values).all(axis=1)
-            return TimeSeries(block.time_ns[good], values[good]) if good.any() else None
+            if good.any():
+                return TimeSeries(block.time_ns[good], values[good])
     return None
 
 

@@ -19,7 +19,7 @@ from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options, build_content
 from dmrl.formats.clocks import unwrap
 from dmrl.formats.crazyflie import log_variables
-from dmrl.formats.crazyflie.log_block import LogBlock
+from dmrl.formats.crazyflie.log_block import LogBlock, unwrap_between_blocks
 from dmrl.formats.crazyflie.usd_records import EventType, Rows, gather_records
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
@@ -90,6 +90,8 @@ def decode_log(data: bytes, what: object = "the log") -> UsdLog:
     leave_out("bytes that are no whole record", f"{what}: byte {end}", stop - end)
     scale = VERSIONS[version][1]
     blocks = [_build_block(e, rows[e.name], scale) for e in events if len(rows[e.name])]
+    if version == 1:
+        blocks = unwrap_between_blocks(blocks, scale << 32)
     return UsdLog(version, tuple(blocks), tuple(warnings))
 
 
@@ -141,7 +143,9 @@ def _check_events(events: list[EventType], what: object) -> None:
 
 def _build_block(event: EventType, rows: Rows, scale_ns: int) -> LogBlock:
     count = rows["time"]
-    ticks = unwrap(count, 32) if event.time == "<u4" else count.astype(np.int64)
+    # A damaged time may be more than fits.
+    most = np.iinfo(np.int64).max // 2 // scale_ns
+    ticks = unwrap(count, 32) if event.time == "<u4" else count.clip(max=most).astype(np.int64)
     columns = {name: rows[f"v{k}"] for k, (name, _) in enumerate(event.variables)}
     return LogBlock(event.name, ticks * scale_ns, columns)
 

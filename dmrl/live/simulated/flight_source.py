@@ -14,6 +14,8 @@ from dmrl.live.log_blocks import parse_robot_number
 Signal = tuple[Array, Array]
 """Times (N,), seconds since take-off, and values (N,)."""
 
+ROUNDING_S = 1e-6
+"""Largest rounding error of a time. A block that is due with a new value must not miss it."""
 BATTERY_FULL_V, BATTERY_EMPTY_V, BATTERY_S = 4.15, 3.3, 420.0
 
 
@@ -27,7 +29,8 @@ class SimulatedVariable:
     def value_at(self, time_s: float) -> float:
         """Return the last value before a time."""
         times, values = self.signal
-        return float(values[max(int(np.searchsorted(times, time_s, side="right")) - 1, 0)])
+        at = int(np.searchsorted(times, time_s + ROUNDING_S, side="right"))
+        return float(values[max(at - 1, 0)])
 
 
 @dataclass(frozen=True, slots=True)

@@ -98,6 +98,20 @@ def test_differences_of_counts_that_wrap_are_the_short_way() -> None:
     assert nanocockpit._wrap_to_int32(ticks).tolist() == short
 
 
+def test_a_state_from_before_the_wrap_has_a_time_before_the_first_picture(folder: Path) -> None:
+    path = folder / "metadata.csv"
+    head, *rows = path.read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    for number in (3, 4):  # the picture's time and the state's
+        for k, row in enumerate(cells):
+            row[number] = str((2_000 + 50_000 * k - (number == 4) * 5_000) % 2**32)
+    path.write_text("\n".join([head, *map(",".join, cells)]) + "\n")
+    found = samples(folder)
+    images, states = found["/cf1/camera/image"], found["/cf1/attitude"]
+    assert min(sample.time_ns for sample in states) >= 0
+    assert {i.time_ns - s.time_ns for i, s in zip(images, states, strict=True)} == {5_000_000}
+
+
 def test_repeated_state_is_written_once(folder: Path) -> None:
     path = folder / "metadata.csv"
     head, *lines = path.read_text().splitlines()

@@ -88,8 +88,9 @@ def test_jpegs_keep_their_bytes(tmp_path: Path) -> None:
     assert (image.fields["format"], image.fields["data"]) == ("jpeg", jpeg)
 
 
-def test_the_camera_s_clock_and_the_robot_s_state_are_used(tmp_path: Path) -> None:
-    start = 2**32 - 75_000  # wraps between the second picture and the third
+# The clock wraps between the second picture and the third; between the first state and its picture.
+@pytest.mark.parametrize("start", [2**32 - 75_000, 2**32 + 1_000])
+def test_the_camera_s_clock_and_the_robot_s_state_are_used(start: int, tmp_path: Path) -> None:
     data = b""
     for k, raw in enumerate(foreign.pictures(4)):
         time = start + 50_000 * k

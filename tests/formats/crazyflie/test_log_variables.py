@@ -169,6 +169,7 @@ def test_series_are_of_the_first_block_that_has_all_and_of_finite_rows() -> None
     ]
     assert find_series([one, two], ["x", "z"]) is None
     assert find_series([block("a", x=[np.nan])], ["x"]) is None
+    assert find_series([block("a", x=[np.nan]), two], ["x"]) is not None
 
 
 def test_rows_out_of_order_are_put_in_order_with_all_their_columns() -> None:

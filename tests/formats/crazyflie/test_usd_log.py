@@ -67,6 +67,19 @@ def test_both_log_versions_are_read(version: int) -> None:
     same(log, raw)
 
 
+def test_events_on_either_side_of_a_wrap_stay_together() -> None:
+    events = {1: ("a", [("v.a", "f")]), 2: ("b", [("v.b", "f")])}
+    records = [(1 + k % 2, (2**32 - 5 + 10 * k) % 2**32, (0.5,)) for k in range(6)]
+    first, other = usd_log.decode_log(plain_usd.encode(events, records, version=1)).blocks
+    assert (other.time_ns - first.time_ns).tolist() == [10_000_000] * 3
+
+
+def test_a_damaged_time_of_64_bits_stays_later_than_all_others() -> None:
+    records = [(1, ticks, (0.5,)) for ticks in (5, 2**60, 7)]
+    (block,) = usd_log.decode_log(plain_usd.encode({1: ("a", [("v.a", "f")])}, records)).blocks
+    assert block.time_ns[1] > 10**18 and block.time_ns[::2].tolist() == [5_000, 7_000]
+
+
 def test_every_type_of_variable_is_read() -> None:
     values = {"b": -5, "B": 250, "h": -300, "H": 60000, "i": -(2**31), "I": 2**32 - 1}
     numbers = (*values.values(), 0.5, 1.25)
