@@ -110,6 +110,8 @@ class SimulatedCamera(StoppableThread):
     def _serve_client(self, client: socket.socket) -> None:
         for time_s, picture in self._pictures:
             behind_s = self._clock.now_s() - time_s
+            if self._faults.is_dead(time_s):
+                continue  # nobody took it
             self._number += 1
             if self._clock.flying and behind_s > 1.0:
                 continue  # its time passed without a client
