@@ -66,7 +66,7 @@ def unwrap_between_blocks(blocks: Sequence[LogBlock], period_ns: int) -> list[Lo
 
 
 def find_series(blocks: Sequence[LogBlock], names: Sequence[str]) -> TimeSeries | None:
-    """Return the columns of the first block with these names and values, finite rows only; or None."""
+    """Return the finite rows of the first block that has some under all these names; or None."""
     for block in blocks:
         if all(name in block.columns for name in names):
             values = np.stack([block.columns[name].astype(float) for name in names], axis=1)
