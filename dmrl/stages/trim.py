@@ -30,7 +30,8 @@ class Settings:
     to_s
         End of the stretch, seconds from the recording's start. Messages of this time are not kept.
     topic
-        Topic to keep, or a pattern such as /*/labels. Repeat for more. Without it, all.
+        Topic to keep, or a pattern such as /*/labels: * is one part of a name, so that /cf1/* has
+        no /cf1/camera/image. Repeat for more. Without it, all.
     """
 
     from_s: Annotated[float | None, Parameter(name=["--from-s", "--from"])] = None
@@ -76,7 +77,8 @@ def run(recording: Path, out: Path, settings: Settings) -> int:
             raise SettingError(f"{flag} {value} is no time. Give seconds from the start")
     first, last = settings.from_s, settings.to_s
     if first is not None and last is not None and first >= last:
-        raise SettingError(f"--from-s {first:g} is not before --to-s {last:g}. Swap them")
+        remedy = "Swap them" if first > last else "Give a later one"
+        raise SettingError(f"--from-s {first:g} is not before --to-s {last:g}. {remedy}")
     low_ns, high_ns = _compute_kept_ns(recording, settings)
     return trim(
         recording,

@@ -68,7 +68,9 @@ def _warn_about_shared_sensors(one: Path, other: Path) -> None:
     shared = [topic for topic, row in rows.items() if row is not None and row.sensor]
     spans = [read_time_spans(path) for path in (one, other)] if shared else []
     for topic in shared:
-        (start, end), (from_, to) = (found.get(topic, (0, 0)) for found in spans)
+        if not all(topic in found for found in spans):
+            continue  # one of them has no message on it
+        (start, end), (from_, to) = (found[topic] for found in spans)
         if start < to and from_ < end:
             say(
                 f"{one} and {other} both have {topic} at the same time: different flights, or one "
@@ -138,7 +140,8 @@ def trim(
         sink.copy_extras(source)
         chunk_copy.adopt_channels(path, topics_to_keep, sink)
         typed = frozenset(t for t in topics_to_keep if carries_own_type(t, source.topics[t].schema))
-        for raw in _iter_calibrations(path, typed, low, high):
+        calibrations = list(_iter_calibrations(path, typed, low, high))
+        for raw in calibrations:
             sink.write_raw(raw)
         selection = chunk_copy.TopicSelection(topics_to_keep, start_ns or 0, high)
         count = sum(
@@ -146,11 +149,19 @@ def trim(
             for piece in chunk_copy.iter_units(path, selection)
         )
         if not count and source.count:
-            raise RecordingError(
-                f"{path} has no message in that time range; it lasts "
-                f"{(source.end_ns - source.start_ns) / 1e9:.3f} s. Choose times within it"
-            )
-    return count
+            raise _describe_nothing(path, source, topics_to_keep)
+    return count + len(calibrations)
+
+
+def _describe_nothing(path: Path, source: Summary, kept: frozenset[str]) -> RecordingError:
+    """Return the error of a range, or of topics, without a message."""
+    if not any(source.topics[topic].count for topic in kept):
+        names = ", ".join(sorted(kept))
+        return RecordingError(f"{path} has no message on {names}. Keep other topics too")
+    return RecordingError(
+        f"{path} has no message in that time range; it lasts "
+        f"{(source.end_ns - source.start_ns) / 1e9:.3f} s. Choose times within it"
+    )
 
 
 def _iter_calibrations(

@@ -11,7 +11,7 @@ from mcap.writer import ChunkBuilder, CompressionType, Writer
 
 from dmrl.errors import RecordingError
 from dmrl.messages import message_class, serialize_schema
-from dmrl.recording import Provenance, read_raw, rewrite, trim
+from dmrl.recording import Provenance, merge, read_raw, rewrite, trim
 
 from ..mcap_layout import Chunk, Layout, Message
 from ..mcap_layout import Writer as FileWriter
@@ -163,8 +163,27 @@ def test_calibration_at_time_0_in_its_own_chunk_is_copied(tmp_path: Path) -> Non
     path = foreign(tmp_path / "a.mcap", fill, chunk_size=400)
     assert chunks(path)[0].message_end_time == 0
     out = tmp_path / "out.mcap"
-    assert trim(path, out, start_ns=50, end_ns=55) == 5  # beside the calibration
+    assert trim(path, out, start_ns=50, end_ns=55) == 6  # with the calibration
     assert [(r.topic, r.time_ns) for r in read_raw(out)] == [
         ("/cf1/camera/calibration", 50),
         *(("/cf1/height", k) for k in range(50, 55)),
     ]
+
+
+def test_a_topic_without_messages_is_named_by_trim_and_ignored_by_merge(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fill(writer: Writer, schema: int) -> None:
+        heights = [writer.register_channel(f"/cf{k}/height", "protobuf", schema) for k in (1, 2)]
+        writer.add_message(heights[0], 5, b"", 5)
+
+    one = foreign(tmp_path / "a.mcap", fill)
+    with pytest.raises(RecordingError, match="no message on /cf2/height"):
+        trim(one, tmp_path / "out.mcap", topics=["/cf2/*"])
+
+    def fill_other(writer: Writer, schema: int) -> None:
+        writer.register_channel("/cf1/height", "protobuf", schema)
+
+    other = foreign(tmp_path / "b.mcap", fill_other)
+    merge([one, other], tmp_path / "out.mcap")
+    assert not capsys.readouterr().err
