@@ -6,12 +6,12 @@ Each chunk's CRC and indexes are verified first.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from mcap.records import Chunk
+from mcap.records import Chunk, ChunkIndex
 from numpy.typing import NDArray
 
 from dmrl.recording.mcap.batch_reader import count_messages, select_chunks
@@ -139,7 +139,9 @@ def write_unit(unit: CopyUnit, selection: TopicSelection | None, sink: Recording
 
 
 def iter_units(path: Path, selection: TopicSelection) -> Iterator[CopyUnit]:
-    """Yield the chunks with selected messages, by time, each decompressed once and verified.
+    """Yield the chunks with selected messages, each decompressed once and verified.
+
+    They come by time, as far as the messages of every topic keep their order.
 
     Raises
     ------
@@ -155,7 +157,8 @@ def iter_units(path: Path, selection: TopicSelection) -> Iterator[CopyUnit]:
         channels = summary.channels_by_id
         counts: Counter[int] = Counter()
         kept = {n: channel for n, channel in channels.items() if channel.topic in selection.topics}
-        chunks = select_chunks(summary, kept.keys(), selection.low_ns, selection.high_ns)
+        near = select_chunks(summary, kept.keys(), selection.low_ns, selection.high_ns)
+        chunks = _sort_by_time(near)
         stream.expect_reads([locate_chunk(index) for index in chunks])
         for index in chunks:
             chunk, batch, others, messages = read_chunk_for_copy(stream, index, summary)
@@ -163,3 +166,19 @@ def iter_units(path: Path, selection: TopicSelection) -> Iterator[CopyUnit]:
             yield CopyUnit(batch, channels, chunk, others, messages)
         if (selection.low_ns, selection.high_ns) == (0, MAX_TIME_NS):
             check_counts(summary.statistics, kept, counts)
+
+
+def _sort_by_time(chunks: Iterable[ChunkIndex]) -> list[ChunkIndex]:
+    """Sort chunks by their first log time, but keep the file's order of those with a shared topic.
+
+    In a file that was written topic by topic, the chunk with the last messages of one topic and the
+    first of the next begins earlier than the one before it.
+    """
+    latest: dict[int, int] = {}
+    keyed = []
+    for chunk in sorted(chunks, key=lambda chunk: chunk.chunk_start_offset):
+        topics = chunk.message_index_offsets
+        start_ns = max([chunk.message_start_time, *(latest.get(n, 0) for n in topics)])
+        latest.update(dict.fromkeys(topics, start_ns))
+        keyed.append((start_ns, chunk))
+    return [chunk for _, chunk in sorted(keyed, key=lambda item: item[0])]

@@ -17,6 +17,7 @@ from dmrl.recording import (
     rewrite,
     trim,
 )
+from dmrl.recording.mcap.batch_reader import iter_batches_in_file_order
 from dmrl.recording.mcap.chunks import chunk_reader
 from dmrl.samples.sample import Sample
 
@@ -194,3 +195,37 @@ def test_small_chunks_of_a_live_recording_are_put_together(tmp_path: Path) -> No
     rewrite(path, out, MADE, without=(), fresh=())
     assert len(chunks(out)) == 1
     unchanged(path, out, ["/cf1/height"])
+
+
+@pytest.fixture(scope="module")
+def by_topic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Heights of three robots, written one robot after the other, in many chunks."""
+    path = tmp_path_factory.mktemp("by_topic") / "flight.mcap"
+    rng = np.random.default_rng(1)
+    with RecordingWriter(path, MADE) as sink:
+        for robot in ("cf1", "cf2", "cf3"):
+            for k in range(4 * MOMENTS):
+                sink.write(k, f"/{robot}/height", message_class("Height")(height_m=rng.normal()))
+    return path
+
+
+@pytest.mark.parametrize("copy", ["rewrite", "trim", "merge"])
+def test_topics_of_a_recording_written_topic_by_topic_stay_in_order(
+    by_topic: Path, flight: Path, tmp_path: Path, copy: str
+) -> None:
+    out = tmp_path / "out.mcap"
+    if copy == "rewrite":
+        rewrite(by_topic, out, MADE, without=())
+    elif copy == "trim":
+        trim(by_topic, out, end_ns=3 * MOMENTS)
+    else:
+        merge([flight, by_topic], out)
+    assert len(chunks(out)) > 3
+    times: dict[str, list[int]] = {}
+    for batch, known in iter_batches_in_file_order(out):
+        for number in batch.list_channel_ids():
+            kept = batch.time_ns[batch.mask_channels([number])].tolist()
+            times.setdefault(known[number].topic, []).extend(kept)
+    assert times["/cf3/height"] == list(range(len(times["/cf3/height"])))
+    for topic in times.keys() - ({"/cf1/height", "/cf2/height"} if copy == "merge" else set()):
+        assert times[topic] == sorted(times[topic]), topic
