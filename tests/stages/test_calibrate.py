@@ -127,6 +127,17 @@ def test_pictures_without_that_board_are_counted(boards: Path, tmp_path: Path) -
     assert not out.exists()
 
 
+@pytest.mark.heavy
+def test_one_view_of_a_board_leaves_the_focal_length_open(boards: Path, tmp_path: Path) -> None:
+    folder, out = tmp_path / "same", tmp_path / "camera.toml"
+    folder.mkdir()
+    for k in range(6):
+        (folder / f"{k}.png").write_bytes((boards / "0.png").read_bytes())
+    with pytest.raises(SourceError, match=r"focal length uncertain by .* Add pictures"):
+        calibrate.run([folder], out, Settings(board="7x5"))
+    assert not out.exists()
+
+
 def test_pictures_of_two_sizes_are_refused(boards: Path, tmp_path: Path) -> None:
     folder = tmp_path / "boards"
     folder.mkdir()

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.errors import MissingExtra
-from dmrl.geometry.frames import Camera
+from dmrl.geometry.frames import Array, Camera
 
 try:
     import cv2
@@ -26,6 +26,9 @@ MIN_WINDOW_PX, MAX_WINDOW_PX = 2, 11
 MAX_DETECTION_PIXELS = 4_000_000
 """Largest image in which a board is detected, pixels. Larger ones are shrunk, as a blank one of
 8,000 x 8,000 kept the detector busy for minutes."""
+PROBED_FACTORS = (0.3, 0.5, 0.7, 0.97, 1.03, 1.4, 2.0, 3.0)
+"""Multiples of the focal length at which its likelihood is measured. Boards without tilt fit all
+focal lengths, far ones too, and OpenCV's standard errors are then those of a pseudo-inverse."""
 SUBPIXEL_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
 """Stop criteria of the corner refinement: iterations and pixels."""
 
@@ -43,12 +46,16 @@ class Intrinsics:
         (2,) standard errors.
     rms_px
         Root mean square distance between corners and their projections.
+    focal_share
+        How far the focal length may be off, relative to it, by how well others fit; without tilted
+        boards, OpenCV's standard errors may be tiny, and wrong.
     """
 
     camera: Camera
     focal_std_px: tuple[float, float]
     centre_std_px: tuple[float, float]
     rms_px: float
+    focal_share: float
 
 
 def find_corners(grey: NDArray[np.uint8], columns: int, rows: int) -> NDArray[np.float32] | None:
@@ -118,10 +125,48 @@ def calibrate_intrinsics(
     flat = np.zeros((columns * rows, 3), np.float32)
     flat[:, :2] = np.mgrid[:columns, :rows].T.reshape(-1, 2)
     views = [view - np.float32(0.5) for view in boards]
-    rms_px, matrix, bend, _, _, errors, _, _ = cv2.calibrateCameraExtended(
-        [flat] * len(views), views, size_px, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
-    )
+    rms_px, matrix, bend, errors = _solve(flat, views, size_px, np.eye(3))
     fx, fy, cx, cy = (float(matrix[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    fx_std, fy_std, cx_std, cy_std = (float(e) for e in np.ravel(errors)[:4])
-    camera = Camera(*size_px, fx, fy, cx + 0.5, cy + 0.5, tuple(np.ravel(bend)[:5].tolist()))
-    return Intrinsics(camera, (fx_std, fy_std), (cx_std, cy_std), float(rms_px))
+    fx_std, fy_std, cx_std, cy_std = (float(e) for e in errors[:4])
+    camera = Camera(*size_px, fx, fy, cx + 0.5, cy + 0.5, tuple(bend[:5].tolist()))
+    share = max(_probe_focal_share(flat, views, size_px, matrix, rms_px), fx_std / fx, fy_std / fy)
+    return Intrinsics(camera, (fx_std, fy_std), (cx_std, cy_std), rms_px, share)
+
+
+def _probe_focal_share(
+    flat: NDArray[np.float32],
+    views: list[NDArray[np.float32]],
+    size_px: tuple[int, int],
+    matrix: Array,
+    rms_px: float,
+) -> float:
+    """Return the relative change of the focal length that raises the cost by one half."""
+    # Two coordinates a corner; six numbers a pose, and eight of the camera.
+    free = max(2 * flat.shape[0] * len(views) - 6 * len(views) - 8, 1)
+    variance = rms_px**2 * flat.shape[0] * len(views) / free
+    widest = 0.0
+    for factor in PROBED_FACTORS:
+        start = np.diag([factor * matrix[0, 0], factor * matrix[1, 1], 1.0])
+        start[:2, 2] = np.array(size_px) / 2
+        rms = _solve(flat, views, size_px, start, cv2.CALIB_FIX_FOCAL_LENGTH)[0]
+        worse = (rms**2 - rms_px**2) * flat.shape[0] * len(views) / variance
+        widest = max(widest, abs(np.log(factor)) / np.sqrt(worse) if worse > 0 else np.inf)
+    return float(widest)
+
+
+def _solve(
+    flat: NDArray[np.float32],
+    views: list[NDArray[np.float32]],
+    size_px: tuple[int, int],
+    start: Array,
+    fixed: int = 0,
+) -> tuple[float, Array, Array, Array]:
+    """Return the residual, the matrix, distortion and standard errors.
+
+    Without ``fixed``, a flag of OpenCV for what stays as in ``start``, OpenCV finds its own start.
+    """
+    flags = cv2.CALIB_FIX_K3 | (cv2.CALIB_USE_INTRINSIC_GUESS | fixed if fixed else 0)
+    rms_px, matrix, bend, _, _, errors, _, _ = cv2.calibrateCameraExtended(
+        [flat] * len(views), views, size_px, start.copy(), np.zeros(5), flags=flags
+    )
+    return float(rms_px), np.asarray(matrix), np.ravel(bend), np.ravel(errors)

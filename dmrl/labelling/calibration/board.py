@@ -18,6 +18,8 @@ from dmrl.labelling.recorded_camera import choose_robot
 from dmrl.recording import read, read_summary
 from dmrl.terminal.progress import track
 
+MAX_FOCAL_SHARE = 0.03
+"""Largest uncertainty of the focal length, relative to it: distances are off by the same."""
 PICTURES = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp")
 
 
@@ -40,7 +42,7 @@ def calibrate_by_board(
     Raises
     ------
     SourceError
-        If pictures are of different sizes, or too few show the board.
+        If pictures are of different sizes, too few show the board, or none shows it tilted.
     SettingError
         If ``corners`` is malformed, or the robot is not named.
     """
@@ -66,6 +68,7 @@ def calibrate_by_board(
             + (", or look at more: --every 1" if source.is_file() and every > 1 else "")
         )
     found = intrinsics.calibrate_intrinsics(views, (columns, rows), size_px)
+    _refuse_uncertain(source, found)
     figures = {
         "pictures": pictures,
         "with_board": len(views),
@@ -77,6 +80,16 @@ def calibrate_by_board(
         "distortion": list(found.camera.distortion),
     }
     return found.camera, figures
+
+
+def _refuse_uncertain(source: Path, found: intrinsics.Intrinsics) -> None:
+    """Raise SourceError unless the boards determine the focal length."""
+    if found.focal_share > MAX_FOCAL_SHARE:
+        raise SourceError(
+            f"{source}: its boards leave the focal length uncertain by "
+            f"{min(found.focal_share, 1):.0%} or more. Add pictures of the board tilted by 30 "
+            "degrees, each to another side"
+        )
 
 
 def _read_corners(text: str) -> tuple[int, int]:
