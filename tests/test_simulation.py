@@ -4,6 +4,7 @@ import importlib.util
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,3 +102,28 @@ def test_the_environment_of_the_examples_is_one_of_gymnasium() -> None:
     spec.loader.exec_module(module)
     env = module.FollowEnv(duration_s=1.0)
     check_env(env, skip_render_check=True)
+
+
+@pytest.mark.parametrize("settings", [{"noise": "loud"}, {"camera_renderer": "oil"}])
+def test_unknown_choices_are_reported(settings: dict[str, Any]) -> None:
+    with pytest.raises(SettingError, match="Choose one of"):
+        Simulation(**settings)
+
+
+def test_unknown_robots_numbers_and_commands_are_reported() -> None:
+    simulation = Simulation(duration_s=1.0)
+    with pytest.raises(SettingError, match="Call reset"):
+        simulation.observe("cf1")
+    for wrong in (-1, 1.5, None):
+        with pytest.raises(SettingError, match=r"seed = .*\. Give a whole number, 0 or more"):
+            simulation.reset(wrong)  # type: ignore[arg-type]
+    simulation.reset(1)
+    for ask in (
+        lambda: simulation.render("cf9"),
+        lambda: simulation.observe("cf9"),
+        lambda: simulation.peer_position("cf1", "cf9"),
+    ):
+        with pytest.raises(SettingError, match=r"'cf9': there is none\. Choose one of cf1"):
+            ask()
+    with pytest.raises(SettingError, match="the command of cf1 is None"):
+        simulation.step({"cf1": None})  # type: ignore[dict-item]

@@ -75,17 +75,25 @@ class Rows:
         Raises
         ------
         IndexError
-            If there is no such row.
+            If there is no such row, or ``rows`` are not numbers of rows.
         """
-        chosen = np.asarray(rows, np.int64)
+        chosen = np.asarray(rows) if len(rows) else np.zeros(0, np.int64)
+        if chosen.ndim != 1 or chosen.dtype.kind not in "iu":
+            raise IndexError(f"split {self.name}: rows are whole numbers, not {rows!r:.80}")
         if chosen.size and not -len(self) <= chosen.min() <= chosen.max() < len(self):
             raise IndexError(f"split {self.name} has {len(self)} rows, from 0")
         chosen %= max(len(self), 1)
         return {
-            "image": np.stack(list(self._split.images(chosen.tolist()))),
+            "image": self._stack_images(chosen.tolist()),
             "confidence": self._split.grids(layout.CONFIDENCE, chosen.tolist()),
             "depth": self._split.grids(layout.DEPTH, chosen.tolist()),
         }
+
+    def _stack_images(self, rows: list[int]) -> NDArray[np.uint8]:
+        images = np.empty((len(rows), *self._split.image_shape, 3), np.uint8)
+        for place, image in zip(images, self._split.images(rows), strict=True):
+            place[:] = image
+        return images
 
     @property
     def confidence(self) -> NDArray[np.float32]:
@@ -178,7 +186,7 @@ class Rows:
         MissingExtra
             If torch is not installed.
         SettingError
-            If there is no such part.
+            If there is no such part, or a number is out of range.
         """
         found: DataLoader[Any] = _import_torch_dataset().loader_of(
             self, batch_size, shuffle=shuffle, seed=seed, workers=workers, part=part

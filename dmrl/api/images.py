@@ -1,7 +1,8 @@
 """Images of a camera in a recording, as a sequence that decodes an image when it is used."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import overload
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dmrl.api import notebook_display
+from dmrl.api.topic import to_log_time
 from dmrl.images.codec import Rgb, decode
 from dmrl.messages import message_class
 from dmrl.recording import parse_message, read_log_times, read_raw
@@ -16,7 +18,7 @@ from dmrl.recording import parse_message, read_log_times, read_raw
 
 @dataclass(frozen=True, eq=False)
 class Images(Sequence[Rgb]):
-    """Images of one camera, (H, W, 3) uint8 RGB each, in log-time order.
+    """Images of one camera, (H, W, 3) uint8 RGB each, in log-time order unless sliced otherwise.
 
     ``images[3]`` is an image, ``images[3:9]`` fewer images, ``images.between(1.0, 2.0)`` those
     of a second. Each is decoded when it is used.
@@ -30,7 +32,9 @@ class Images(Sequence[Rgb]):
     start_ns
         Log time from which seconds count, nanoseconds.
     time_ns
-        (N,) log times of the images, sorted.
+        (N,) log times of the images.
+    ranks
+        (N,) numbers of the images among those of their time, from 0.
     kept
         Object that keeps a temporary recording alive.
     """
@@ -39,12 +43,15 @@ class Images(Sequence[Rgb]):
     topic: str
     start_ns: int
     time_ns: NDArray[np.int64]
+    ranks: NDArray[np.int64]
     kept: object = None
 
     @classmethod
     def load_topic(cls, path: Path, topic: str, start_ns: int, kept: object = None) -> "Images":
         """Return all images on a topic."""
-        return cls(path, topic, start_ns, read_log_times(path, [topic])[topic], kept)
+        time_ns = read_log_times(path, [topic])[topic]
+        ranks = np.arange(len(time_ns)) - np.searchsorted(time_ns, time_ns)
+        return cls(path, topic, start_ns, time_ns, ranks, kept)
 
     @property
     def time_s(self) -> NDArray[np.float64]:
@@ -67,37 +74,43 @@ class Images(Sequence[Rgb]):
             If there is no such number.
         """
         if isinstance(index, slice):
-            return replace(self, time_ns=self.time_ns[index])
+            return self._select(index)
         time_ns = int(self.time_ns[index])
-        place = index % len(self) - int(np.searchsorted(self.time_ns, time_ns))
-        every = list(self._iter_decoded(time_ns, time_ns + 1))
-        return every[min(place, len(every) - 1)][1]
+        wanted = {(time_ns, int(self.ranks[index]))}
+        return next(self._iter_decoded(time_ns, time_ns + 1, wanted))
 
     def __iter__(self) -> Iterator[Rgb]:
-        """Yield the images; each chunk of the file is read once."""
-        if not len(self):
-            return
-        wanted = set(self.time_ns.tolist())
-        for time_ns, image in self._iter_decoded(
-            int(self.time_ns.min()), int(self.time_ns.max()) + 1
-        ):
-            if time_ns in wanted:
-                yield image
+        """Yield the images; each chunk of the file is read once, unless they are out of order."""
+        keys = list(zip(self.time_ns.tolist(), self.ranks.tolist(), strict=True))
+        if any(before >= after for before, after in pairwise(keys)):
+            yield from (self[k] for k in range(len(self)))
+        elif keys:
+            yield from self._iter_decoded(keys[0][0], keys[-1][0] + 1, set(keys))
 
-    def _iter_decoded(self, start_ns: int, end_ns: int) -> Iterator[tuple[int, Rgb]]:
-        kind = message_class("CompressedImage")
+    def _iter_decoded(
+        self, start_ns: int, end_ns: int, wanted: Set[tuple[int, int]]
+    ) -> Iterator[Rgb]:
+        """Yield the images of some times and ranks, decoded, in log-time order."""
+        kind, time_ns, rank = message_class("CompressedImage"), -1, 0
         for raw in read_raw(self.path, self.topic, start_ns=start_ns, end_ns=end_ns):
-            what = f"{self.path}: the image of {self.topic} at {raw.time_ns} ns"
-            yield raw.time_ns, decode(parse_message(raw, kind, self.path).data, what)
+            rank = rank + 1 if raw.time_ns == time_ns else 0
+            time_ns = raw.time_ns
+            if (time_ns, rank) in wanted:
+                what = f"{self.path}: the image of {self.topic} at {time_ns} ns"
+                yield decode(parse_message(raw, kind, self.path).data, what)
+
+    def _select(self, chosen: slice | NDArray[np.bool_]) -> "Images":
+        return replace(self, time_ns=self.time_ns[chosen], ranks=self.ranks[chosen])
 
     def between(self, start_s: float | None = None, end_s: float | None = None) -> "Images":
         """Return the images in [start_s, end_s), seconds from the start of the recording."""
-        low = -np.inf if start_s is None else start_s
-        high = np.inf if end_s is None else end_s
-        # In whole nanoseconds, as they stand in the file.
-        since = self.time_ns - self.start_ns
-        chosen = (since >= np.round(low * 1e9)) & (since < np.round(high * 1e9))
-        return replace(self, time_ns=self.time_ns[chosen])
+        low, high = (to_log_time(at_s, self.start_ns) for at_s in (start_s, end_s))
+        chosen = np.ones(len(self), np.bool_)
+        if low is not None:
+            chosen &= self.time_ns >= low
+        if high is not None:
+            chosen &= self.time_ns < high
+        return self._select(chosen)
 
     def nearest(self, time_s: float) -> Rgb:
         """Return the image nearest to a time, seconds from the start of the recording.

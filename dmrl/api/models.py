@@ -92,8 +92,13 @@ class Model:
         Raises
         ------
         SettingError
-            If an image is not RGB and uint8, or of a size that the network cannot take.
+            If an image is not RGB and uint8, or of a size that the network cannot take; or if
+            ``threshold`` or ``most`` is out of range.
         """
+        if threshold is not None and not 0 <= threshold <= 1:
+            raise SettingError(f"threshold = {threshold:g}. Give a confidence, 0 to 1")
+        if most < 1:
+            raise SettingError(f"most = {most}. Give 1 or more")
         if isinstance(images, np.ndarray) and images.ndim == 3:
             images = images[None]
         return list(self._iter_detections(images, threshold, most))

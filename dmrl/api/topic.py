@@ -1,5 +1,6 @@
 """A topic of a recording as an object: its messages as a table."""
 
+import math
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -9,18 +10,33 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from dmrl.errors import MissingExtra
+from dmrl.errors import MissingExtra, RecordingError, SettingError, suggest
 from dmrl.exchange.csv_parquet import flatten_table
 from dmrl.messages import to_status_name
 from dmrl.recording import TopicInfo, read_table
+from dmrl.recording.mcap.message_batch import MAX_TIME_NS
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
 def to_log_time(time_s: float | None, start_ns: int) -> int | None:
-    """Return the log time, nanoseconds, of seconds from a start; None stays None."""
-    return None if time_s is None else start_ns + round(time_s * 1e9)
+    """Return the log time, nanoseconds, of seconds from a start; None stays None.
+
+    Times before 0, and later ones than a recording holds, are the first and the last there.
+
+    Raises
+    ------
+    SettingError
+        If the seconds are not a number.
+    """
+    if time_s is None:
+        return None
+    if math.isnan(time_s):
+        raise SettingError("nan is no time. Give seconds from the start of the recording, or None")
+    if math.isinf(time_s):
+        return MAX_TIME_NS if time_s > 0 else 0
+    return min(max(start_ns + round(time_s * 1e9), 0), MAX_TIME_NS)
 
 
 def to_data_frame(table: pa.Table, start_ns: int, *, foreign: bool = False) -> "pd.DataFrame":
@@ -113,10 +129,19 @@ class Topic:
         Raises
         ------
         RecordingError
-            If the recording is damaged.
+            If the recording is damaged, or its messages lack one of the fields.
+        SettingError
+            If a time is none.
         """
         start_ns, end_ns = to_log_time(start_s, self._start_ns), to_log_time(end_s, self._start_ns)
-        return read_table(self.path, self.name, fields=fields, start_ns=start_ns, end_ns=end_ns)
+        wanted = [fields] if isinstance(fields, str) else fields
+        table = read_table(self.path, self.name, fields=wanted, start_ns=start_ns, end_ns=end_ns)
+        for name in wanted or ():
+            if name not in table.column_names:
+                known = read_table(self.path, self.name, end_ns=0).column_names
+                remedy = suggest(name, known, f"It has: {', '.join(known)}")
+                raise RecordingError(f"{self.path}: {self.name} has no field {name}. {remedy}")
+        return table
 
     def to_pandas(
         self,

@@ -1,8 +1,9 @@
 """Robots that fly commands step by step, with their sensors, and images on request."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Self
+from numbers import Integral
+from typing import TYPE_CHECKING, Self, get_args
 
 import numpy as np
 
@@ -84,6 +85,8 @@ class Simulation:
         self._scenario = Scenario(
             robots, duration_s, trajectory, flown=count, distance_m=distance_m
         )
+        _require("noise", noise, NOISE)
+        _require("camera_renderer", camera_renderer, get_args(CameraRenderer))
         self._noise, self._faults, self._kind = NOISE[noise], tuple(faults), camera_renderer
         self._resources = ExitStack()
         self._renderer: Renderer | None = None
@@ -102,7 +105,15 @@ class Simulation:
             Another seed gives another flight: path, noise, and appearance.
         place
             Number of the room and of the cameras. None: the seed.
+
+        Raises
+        ------
+        SettingError
+            If one is not a whole number, 0 or more.
         """
+        for name, number in (("seed", seed), ("place", seed if place is None else place)):
+            if not isinstance(number, Integral) or number < 0:
+                raise SettingError(f"{name} = {number!r}. Give a whole number, 0 or more")
         self._place = seed if place is None else place
         self._draw = SketchedPlace(self._place)
         self._motion = SteppedFlight(self._scenario, self._noise, seed, self._faults)
@@ -163,11 +174,14 @@ class Simulation:
 
     def peer_position(self, robot: str, peer: str) -> Array:
         """Return the (3,) true position of a peer in a robot's horizontal frame, metres."""
+        for name in (robot, peer):
+            _require("robot", name, self.motion.names)
         found = self.motion.flight.peer_in_horizontal(robot, peer, np.array([self.time_s]))
         return np.asarray(found[0])
 
     def view(self, robot: str) -> CameraView:
         """Return the true poses of all peers in front of a robot's camera."""
+        _require("robot", robot, self.motion.names)
 
         def bodies(moment_s: float) -> dict[str, RobotPose]:
             truth = self.motion.flight.truth
@@ -230,11 +244,14 @@ class Simulation:
     def _check(self, robot: str, command: Command | Sequence[float]) -> Command:
         if robot not in self.motion.flown:
             raise SettingError(f"{robot} flies no commands. Flown are: {self.motion.flown}")
-        numbers = [float(value) for value in command]
+        try:
+            numbers = [float(value) for value in command]
+        except (TypeError, ValueError):
+            numbers = []
         if len(numbers) != 4 or not np.isfinite(numbers).all():
             raise SettingError(
-                f"the command of {robot} is {numbers}. Give vx, vy, vz in m/s and a yaw rate in "
-                "rad/s"
+                f"the command of {robot} is {command!r:.80}. Give vx, vy, vz in m/s and a yaw "
+                "rate in rad/s"
             )
         return Command(*numbers)
 
@@ -253,9 +270,16 @@ class Simulation:
 
     def observe(self, robot: str) -> Observation:
         """Return the present measurements of a robot; a silent sensor keeps its last value."""
+        _require("robot", robot, self.motion.names)
         roll, pitch, rate, vx, vy, height = (
             self.reckoning[robot].sensors[:, self.motion.sample].tolist()
         )
         return Observation(
             self.time_s, roll, pitch, rate, np.array([vx, vy]), height, dict(self._range_m[robot])
         )
+
+
+def _require(what: str, name: str, known: Collection[str]) -> None:
+    """Raise SettingError unless a name is known."""
+    if name not in known:
+        raise SettingError(f"{what} {name!r}: there is none. Choose one of {', '.join(known)}")

@@ -9,7 +9,7 @@ from torch.utils.data import DataLoader
 
 import dmrl
 from dmrl.datasets import open_dataset
-from dmrl.errors import DatasetError, MissingSplit
+from dmrl.errors import DatasetError, MissingSplit, SettingError
 
 
 @pytest.mark.heavy
@@ -69,3 +69,15 @@ def test_missing_dataset_or_split_is_reported(data: Path, tmp_path: Path) -> Non
         dmrl.dataset(data)["val"]
     assert "train" in dmrl.dataset(data)._repr_html_()
     assert dmrl.dataset(data).card().startswith("---")
+
+
+def test_empty_and_odd_choices_of_rows(data: Path) -> None:
+    rows = dmrl.dataset(data)["train"]
+    assert rows[5:5]["image"].shape == (0, 224, 320, 3)
+    assert rows.gathered([])["depth"].shape == (0, 28, 40)
+    for odd in ([True, False], [0.7], [[0]], ["image"]):
+        with pytest.raises(IndexError, match="rows are whole numbers"):
+            rows.gathered(odd)  # type: ignore[arg-type]
+    for settings in ({"batch_size": 0}, {"workers": -1}, {"seed": -1}):
+        with pytest.raises(SettingError, match=r"Give .* or more"):
+            rows.loader(**settings)

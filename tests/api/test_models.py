@@ -55,6 +55,12 @@ def test_sizes_not_divisible_by_the_stride_are_reported() -> None:
         dmrl.load("dmrl-nano").detect(np.zeros((1, 225, 320, 3), np.uint8))
 
 
+@pytest.mark.parametrize("settings", [{"threshold": 2.0}, {"threshold": float("nan")}, {"most": 0}])
+def test_settings_out_of_range_are_reported(settings: dict[str, Any]) -> None:
+    with pytest.raises(SettingError, match="Give"):
+        dmrl.load("dmrl-nano").detect(np.zeros((1, 224, 320, 3), np.uint8), **settings)
+
+
 def test_unknown_model_name_is_reported() -> None:
     with pytest.raises(ModelError, match="dmrl-nano"):
         dmrl.load("dmrl-mini")

@@ -104,3 +104,29 @@ def test_images_have_html_and_an_empty_span_is_allowed(flight: Path) -> None:
     assert none._repr_html_().count("<img") == 0 and none.to_numpy().shape == (0, 0, 0, 3)
     with pytest.raises(IndexError, match="no image here"):
         none.nearest(1.0)
+
+
+def test_images_keep_the_order_of_a_slice(tmp_path: Path) -> None:
+    pictures = [np.full((8, 8, 3), 10 * k, np.uint8) for k in range(6)]
+    with dmrl.writer(tmp_path / "a.mcap") as out:
+        for rgb, time_s in zip(pictures, (0.0, 0.1, 0.1, 0.1, 0.2, 0.3), strict=True):
+            out.image("cf1", time_s, rgb)
+    images = out.open().images("cf1")
+    assert [int(image[0, 0, 0]) for image in images] == [0, 10, 20, 30, 40, 50]
+    for chosen in (slice(None, None, -1), slice(2, 4), slice(5, 1, -2), slice(1, None, 3)):
+        want = [10 * k for k in range(6)[chosen]]
+        assert [int(image[0, 0, 0]) for image in images[chosen]] == want
+        assert [int(images[chosen][k][0, 0, 0]) for k in range(len(want))] == want
+    assert len(images.between(0.1, 0.2)) == 3 == len(images[::-1].between(0.1, 0.2))
+
+
+def test_unknown_field_or_time_is_reported(tmp_path: Path) -> None:
+    with dmrl.writer(tmp_path / "a.mcap") as out:
+        out.write_columns("/cf1/height", [1.0, 2.0], {"height_m": [0.5, 0.6]})
+    topic = out.open()["/cf1/height"]
+    with pytest.raises(RecordingError, match=r"no field heigth_m\. Did you mean height_m\?"):
+        topic.to_numpy(fields=["heigth_m"])
+    with pytest.raises(SettingError, match="nan is no time"):
+        topic.to_arrow(start_s=float("nan"))
+    assert len(topic.to_arrow(start_s=-float("inf"), end_s=float("inf"))) == 2
+    assert topic.to_arrow(fields="height_m").column_names[2:] == ["height_m"]

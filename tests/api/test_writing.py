@@ -1,13 +1,16 @@
 """Recordings written from Python: round trips and checks."""
 
 import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import dmrl
-from dmrl.errors import OutputError, RecordingError, SettingError, UnsafeName
+from dmrl.errors import DmrlError, OutputError, RecordingError, SettingError, UnsafeName
 from dmrl.geometry.frames import Camera
 
 
@@ -114,3 +117,57 @@ def test_image_over_the_size_limit_is_refused_on_writing(
         pytest.raises(SettingError, match="more than a recording may hold"),
     ):
         out.image("cf1", 0.0, np.broadcast_to(np.uint8(0), shape))
+
+
+def test_writing_outside_of_the_block_is_refused(tmp_path: Path) -> None:
+    out = dmrl.writer(tmp_path / "own.mcap")
+    with pytest.raises(SettingError, match=r"is not open\. Use: with"):
+        out.write("/a/height", 0.0, {"height_m": 1.0})
+    with out:
+        out.write("/a/height", 0.0, {"height_m": 1.0})
+    assert len(out.open()["/a/height"]) == 1
+
+
+def test_threads_share_a_writer(tmp_path: Path) -> None:
+    with dmrl.writer(tmp_path / "own.mcap") as out, ThreadPoolExecutor(4) as pool:
+
+        def write(k: int) -> None:
+            for i in range(400):
+                out.write(f"/cf{k}/height", i / 100, {"height_m": i})
+
+        list(pool.map(write, range(4)))
+    for k in range(4):
+        found = out.open()[f"/cf{k}/height"].to_numpy()["height_m"]
+        assert found.tolist() == list(range(400))
+
+
+PIXELS = np.zeros((8, 8, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("write", "error"),
+    [
+        (lambda out: out.write("/a/height", 0.0, {"height_m": None}), "height_m has no value"),
+        (lambda out: out.write("/a/height", "now", {}), "Give seconds as numbers"),
+        (lambda out: out.write("/a/height", np.datetime64("2026-01-01"), {}), "Give seconds as"),
+        (lambda out: out.write_columns("/a/height", 0.0, {"height_m": [1.0]}), "Give seconds as"),
+        (lambda out: out.write_columns("/a/height", [0.0], {"height_m": 1.0}), "Give one for each"),
+        (lambda out: out.image("a", 0.0, None), r"Give \(H, W, 3\)"),
+        (lambda out: out.image("a", 0.0, PIXELS, quality=0), "Give 1 to 100"),
+        (lambda out: out.write("/a/labels", 0, {"peers": [{"u_px": None}]}), "u_px has no value"),
+    ],
+)
+def test_values_that_are_none_are_reported(
+    tmp_path: Path, write: Callable[[Any], None], error: str
+) -> None:
+    with dmrl.writer(tmp_path / "own.mcap") as out, pytest.raises(DmrlError, match=error):
+        write(out)
+
+
+def test_lists_of_unlike_lengths_and_named_cameras_are_written(tmp_path: Path) -> None:
+    with dmrl.writer(tmp_path / "own.mcap") as out:
+        out.write_columns("/a/labels", [0.0, 0.1], {"sources": [["truth"], ["truth", "hand"]]})
+        out.camera("a", "aideck")
+    rec = out.open()
+    assert rec["/a/labels"].to_arrow()["sources"].to_pylist() == [["truth"], ["truth", "hand"]]
+    assert rec["/a/camera/calibration"].to_arrow()["width"].to_pylist() == [320]

@@ -125,7 +125,17 @@ def loader_of(
     """Build a DataLoader that reads each batch at once.
 
     ``part`` is as in `ProcessSampler`; None: that of torchrun.
+
+    Raises
+    ------
+    SettingError
+        If there is no such part, or a number is out of range.
     """
+    for name, value, least in (("batch_size", batch_size, 1), ("workers", workers, 0)):
+        if not isinstance(value, int) or value < least:
+            raise SettingError(f"{name} = {value!r}. Give a whole number, {least} or more")
+    if seed < 0:
+        raise SettingError(f"seed = {seed}. Give 0 or more")
     return DataLoader(
         TorchRows(source),
         batch_size=batch_size,
