@@ -100,6 +100,7 @@ class RecordingError(DmrlError):
 REMEDIES = {
     "/labels": "Label it with dmrl label, or by hand: dmrl view {where} --flag desk.html",
     "/detections": "Try: dmrl predict MODEL {where} OUT.mcap",
+    "/position": "Try: dmrl label {where} OUT.mcap",
     "/camera/calibration": "Give the camera to dmrl convert: --camera FILE",
     "/attitude": "Merge the log of the robot with it: dmrl merge {where} LOG.mcap OUT.mcap",
 }

@@ -60,6 +60,7 @@ smallest increase of the cost there. No record of how the values were chosen."""
 SAMPLING_STD_SHARE = 0.25
 """Lower bound of the delay's standard error, as a share of the interval between attitude samples.
 No record of how the value was chosen."""
+VALUE_NAMES = ("roll", "pitch", "yaw", "delay")
 MIN_MATCHES = 50
 """Fewest matched detections of a calibration. No record of how the value was chosen."""
 
@@ -117,7 +118,7 @@ def calibrate_mount(
     Raises
     ------
     SettingError
-        If two delays explain the images alike.
+        If two delays explain the images alike, or mount or delay may lie beyond the limits.
     """
     smooth = [flight.smooth_attitude() for flight in flights]
     views = [(flight, peer) for flight in smooth for peer in flight.peers.values()]
@@ -133,6 +134,7 @@ def calibrate_mount(
     found, matched = ends[0]
     _check_unambiguous([end for end, _ in ends])
     spread = np.sqrt(np.diag(found.covariance))
+    _check_within_limits(found.values, spread)
     return Calibration(
         with_mount(camera, found.values),
         (float(spread[0]), float(spread[1]), float(spread[2])),
@@ -271,4 +273,15 @@ def _check_unambiguous(ends: Sequence[MountEstimate]) -> None:
             raise SettingError(
                 f"delays of {1e3 * best.values[3]:.0f} and {1e3 * other.values[3]:.0f} ms explain "
                 "the images alike. Add flights, best with peers that cross the image faster"
+            )
+
+
+def _check_within_limits(values: Array, std: Array) -> None:
+    """Raise SettingError if a value reaches the end of its range, where the solution only stops."""
+    for name, value, spread, limit in zip(VALUE_NAMES, values, std, MAX_VALUES, strict=True):
+        if abs(value) + spread > limit:
+            unit, scale = ("ms", 1e3) if name == "delay" else ("degrees", np.degrees(1.0))
+            raise SettingError(
+                f"the {name} comes out at {scale * value:.0f} {unit}, the end of what is searched "
+                f"({scale * limit:.0f}). Check the intrinsics (--camera) and the clocks"
             )

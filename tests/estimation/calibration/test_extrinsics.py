@@ -206,3 +206,16 @@ def test_two_equally_likely_delays_are_refused() -> None:
                 _check_unambiguous([best, other])
         else:
             _check_unambiguous([best, other])
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize(
+    ("camera", "words"),
+    [
+        (replace(AIDECK, mount_rad=(0.44, 0.0, 0.0)), "the roll comes out at 20 degrees"),
+        (replace(AIDECK, delay_s=0.6), "the delay comes out at .*500 ms"),
+    ],
+)
+def test_a_mount_or_delay_beyond_the_limits_is_refused(camera: Camera, words: str) -> None:
+    with pytest.raises(SettingError, match=words):
+        calibrate_mount([flight(2, camera)], AIDECK, Noise(3.0, 0.005))
