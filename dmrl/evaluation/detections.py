@@ -7,8 +7,9 @@ source labelled them as empty. See ``dmrl.datasets.writing.rows``.
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -21,7 +22,7 @@ from dmrl.geometry.frames import is_inside
 from dmrl.learn.inference.matching import Points
 from dmrl.messages import STATUS_OK
 from dmrl.recording import LoadedRecording, read_splits
-from dmrl.recording.label_sources import SOURCE_FIELDS, collect_sources
+from dmrl.recording.label_sources import SOURCE_FIELDS, collect_sources, mark_repeated
 from dmrl.recording.protobuf.arrow_arrays import match_text, to_numpy
 from dmrl.recording.provenance_inputs import refuse_duplicates
 from dmrl.terminal.progress import track
@@ -177,8 +178,9 @@ def _join_robot(
     left_out: Counter[str] = Counter()
     labelled = held.get_table(topics.LABELS(robot), SOURCE_FIELDS)
     detected = _read_detections(held, robot)
-    times, (peers, looked) = _merge_by_time(labelled)
+    times, (peers, looked) = _merge_by_time(labelled, f"{held.path}: {topics.LABELS(robot)}")
     seen_at = to_numpy(_combine_column(detected, "log_time"))
+    _refuse_two_at_once(seen_at, f"{held.path}: {topics.DETECTIONS(robot)}")
     mine, usable = _select_usable(peers, looked, against, _is_within(times, spans), left_out)
     seen = np.isin(times, seen_at)
     if partial:
@@ -212,16 +214,41 @@ def _read_detections(held: LoadedRecording, robot: str) -> pa.Table:
     return held.get_table(topics.DETECTIONS(other)).slice(0, 0)
 
 
-def _merge_by_time(labelled: pa.Table) -> tuple[Times, list[pa.Array]]:
-    """Merge messages of equal log time; return the times and the merged columns of `LOOKED`."""
-    times, first = np.unique(to_numpy(_combine_column(labelled, "log_time")), return_index=True)
+def _refuse_two_at_once(times: Times, where: str) -> None:
+    """Raise RecordingError if an image has two messages of detections."""
+    if (twice := times[1:][times[1:] == times[:-1]]).size:
+        raise RecordingError(
+            f"{where} has two messages at {twice[0]} ns, as in a merge of two models' detections. "
+            "Give the recordings one by one"
+        )
+
+
+def _merge_by_time(labelled: pa.Table, where: str) -> tuple[Times, list[pa.Array]]:
+    """Merge messages of equal log time; return the times and the merged `SOURCE_FIELDS`."""
+    every = to_numpy(_combine_column(labelled, "log_time"))
+    times, first = np.unique(every, return_index=True)
     found = []
     for name in SOURCE_FIELDS:
         entries = _combine_column(labelled, name)
+        if name == "peers" and len(times) < len(every):
+            entries = _drop_repeated(entries, every, where)
         ends = to_numpy(entries.offsets)
         starts = np.append(ends[first], ends[-1]) - ends[0]
         found.append(pa.ListArray.from_arrays(starts, entries.flatten()))
     return times, found
+
+
+def _drop_repeated(peers: pa.Array, times: Times, where: str) -> pa.Array:
+    """Remove labels that an earlier message of the same time has, too."""
+    rows: list[list[Any]] = []
+    for time_ns, group in groupby(zip(times.tolist(), peers, strict=True), key=lambda row: row[0]):
+        messages = [labels.as_py() for _, labels in group]
+        named = [[((one["peer"], one["source"]), repr(one)) for one in m] for m in messages]
+        marked = mark_repeated(named, f"{where} at {time_ns} ns")
+        for labels, repeated in zip(messages, marked, strict=True):
+            pairs = zip(labels, repeated, strict=True)
+            rows.append([label for label, is_there in pairs if not is_there])
+    return pa.array(rows, peers.type)
 
 
 def _select_usable(

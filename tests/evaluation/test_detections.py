@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dmrl import topics
+from dmrl.errors import RecordingError
 from dmrl.evaluation.detections import LabelledDetections, join_by_image
 from dmrl.images.codec import encode_png
 from dmrl.messages import STATUS_AMBIGUOUS, STATUS_OK, message_class
@@ -81,3 +82,33 @@ def test_split_spans_include_both_ends(tmp_path: Path, split: str, times: list[i
     images: list[Image] = [([label(k + 1)], [], ()) for k in range(6)]
     pairs = joined(tmp_path / "a.mcap", images, split=split)
     assert [at.time_ns for at in pairs.at] == times
+
+
+def with_second_message(path: Path, topic: str, kind: str, **fields: Any) -> LabelledDetections:
+    """One image with one label and one detection, and a second message on a topic."""
+    first = {"peer": "cf2", "u_px": 10.0, "v_px": 20.0, "depth_m": 1.0, "source": "truth"}
+    with RecordingWriter(path, Provenance("test")) as sink:
+        sink.write(1, topics.CAMERA_IMAGE("cf1"), PICTURE)
+        sink.write(1, topics.LABELS("cf1"), message_class("PeerLabels")(peers=[first]))
+        seen = message_class("Detections")(detections=[found(10, 0.9)])
+        sink.write(1, topics.DETECTIONS("cf1"), seen)
+        sink.write(1, topic, message_class(kind)(**fields))
+    return join_by_image([path], "truth")
+
+
+def test_labels_that_a_merge_doubled_count_once(tmp_path: Path) -> None:
+    same = {"peer": "cf2", "u_px": 10.0, "v_px": 20.0, "depth_m": 1.0, "source": "truth"}
+    more = [same, same | {"peer": "cf3", "u_px": 40.0}, same | {"source": "estimate"}]
+    pairs = with_second_message(tmp_path / "a.mcap", "/cf1/labels", "PeerLabels", peers=more)
+    assert pairs.labels.u_px.tolist() == [10, 40]
+    with pytest.raises(RecordingError, match="at 1 ns has different labels of cf2 from truth"):
+        with_second_message(
+            tmp_path / "b.mcap", "/cf1/labels", "PeerLabels", peers=[same | {"u_px": 11.0}]
+        )
+
+
+def test_two_messages_of_detections_of_an_image_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="/cf1/detections has two messages at 1 ns"):
+        with_second_message(
+            tmp_path / "a.mcap", "/cf1/detections", "Detections", detections=[found(40, 0.5)]
+        )

@@ -31,7 +31,7 @@ from dmrl.geometry.frames import STRIDE_PX, build_grid_label
 from dmrl.images.codec import UNDECODABLE, Rgb, decode, encode_png
 from dmrl.messages import STATUS_OK, to_status_name
 from dmrl.recording import LoadedRecording, Stamped, read
-from dmrl.recording.label_sources import get_message_sources
+from dmrl.recording.label_sources import get_message_sources, mark_repeated
 from dmrl.storage.shared_file import share_file
 from dmrl.terminal.left_out import leave_out
 
@@ -217,31 +217,44 @@ def _group_labels(held: LoadedRecording) -> dict[str, "_LabelSeries"]:
     """Return the labels by robot."""
     found = ((topic, topics.parse_topic(topics.LABELS, topic)) for topic in held.topics)
     return {
-        n["robot"]: _LabelSeries(held.iter_messages(topic)) for topic, n in found if n is not None
+        n["robot"]: _LabelSeries(held.iter_messages(topic), f"{held.path}: {topic}")
+        for topic, n in found
+        if n is not None
     }
 
 
 class _LabelSeries:
     """Messages in time order, looked up at increasing times."""
 
-    def __init__(self, messages: Iterator[Stamped]) -> None:
+    def __init__(self, messages: Iterator[Stamped], where: str) -> None:
+        self._where = where
         self._groups = groupby(messages, key=lambda stamped: stamped.time_ns)
         self._next = next(self._groups, None)
 
     def find_at(self, time_ns: int) -> Any:
         """Return all messages of a time merged into one, or None.
 
-        Two recordings of the same images, merged, may have different sources.
+        Two recordings of the same images, merged, may have different sources. Labels that both
+        have count once.
         """
         while self._next is not None and self._next[0] < time_ns:
             self._next = next(self._groups, None)
         if self._next is None or self._next[0] > time_ns:
             return None
-        first, *more = (stamped.message for stamped in self._next[1])
-        for other in more:
-            first.MergeFrom(other)
+        first, *more = found = [stamped.message for stamped in self._next[1]]
+        if more:
+            labels = [[_identify_label(label) for label in message.peers] for message in found]
+            marked = mark_repeated(labels, f"{self._where} at {time_ns} ns")
+            for other, repeated in zip(more, marked[1:], strict=True):
+                peers = zip(other.peers, repeated, strict=True)
+                first.peers.extend(label for label, is_there in peers if not is_there)
+                first.sources.extend(other.sources)
         self._next = next(self._groups, None)
         return first
+
+
+def _identify_label(label: Any) -> tuple[tuple[str, str], bytes]:
+    return (label.peer, label.source), label.SerializeToString(deterministic=True)
 
 
 def _reject_duplicate_times(path: Path, images: list[Stamped]) -> None:

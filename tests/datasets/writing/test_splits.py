@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from dmrl.datasets import open_dataset
 from dmrl.datasets.writing.splits import build_split_lookup, choose_test_recordings
 from dmrl.errors import RecordingError, SettingError
+from dmrl.messages import message_class
 from dmrl.recording import (
     SPLIT_METADATA,
     Provenance,
@@ -20,7 +21,7 @@ from dmrl.recording import (
 )
 from dmrl.stages.dataset import Settings, run
 
-from ..conftest import STEP_NS, Record
+from ..conftest import STEP_NS, Record, peer
 
 
 @pytest.mark.heavy
@@ -170,6 +171,26 @@ def test_two_images_at_one_time_are_refused(record: Record, tmp_path: Path) -> N
         RecordingError, match="two images at 0 ns, as in a merge of flights of the same"
     ):
         run([tmp_path / "both.mcap"], tmp_path / "out", Settings())
+
+
+@pytest.mark.heavy
+def test_labels_that_a_merge_doubled_count_once(record: Record, tmp_path: Path) -> None:
+    flight, more = record("a.mcap"), tmp_path / "b.mcap"
+    with RecordingWriter(more, Provenance("test")) as sink:
+        for stamped in read(flight, "/cf1/labels"):
+            stamped.message.peers.append(peer(peer="cf3"))
+            sink.write(stamped.time_ns, stamped.topic, stamped.message)
+    merge([flight, more], tmp_path / "both.mcap")
+    run([tmp_path / "both.mcap"], tmp_path / "out", Settings())
+    rows = open_dataset(tmp_path / "out").split("train").table["peers"].to_pylist()
+    assert [[found["peer"] for found in row] for row in rows] == [["cf2", "cf3"]] * 6
+
+    with RecordingWriter(tmp_path / "c.mcap", Provenance("test")) as sink:
+        labels = message_class("PeerLabels")(peers=[peer(u_px=21.0)])
+        sink.write(0, "/cf1/labels", labels)
+    merge([flight, tmp_path / "c.mcap"], tmp_path / "mixed.mcap")
+    with pytest.raises(RecordingError, match="at 0 ns has different labels of cf2 from truth"):
+        run([tmp_path / "mixed.mcap"], tmp_path / "out2", Settings())
 
 
 def test_a_copy_of_a_recording_is_refused(record: Record, tmp_path: Path) -> None:
