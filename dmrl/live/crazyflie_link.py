@@ -10,7 +10,7 @@ from typing import Any
 from dmrl.errors import SettingError
 from dmrl.formats.clocks import CounterUnwrapper
 from dmrl.live.cflib_session import CflibSession
-from dmrl.live.log_blocks import LogDecoder, LogPlan, plan_blocks
+from dmrl.live.log_blocks import DISTANCE_VARIABLE, LogDecoder, LogPlan, plan_blocks
 from dmrl.live.queue import LinkStatus, ReceivedSample, SampleQueue
 from dmrl.live.receive_clocks import HostClock, SenderClock
 from dmrl.live.threads import StoppableThread
@@ -194,19 +194,26 @@ class CrazyflieLink(StoppableThread):
                 NEXT_ANSWER_TIMEOUT_S if session.last_packet_s else FIRST_ANSWER_TIMEOUT_S
             ):
                 return "nobody answers" if not session.last_packet_s else "stopped answering"
-        wanted = plan_blocks(
-            session.list_variables(), self._peers, self._period_ms, robot=self.robot
-        )
-        self._report_missing(wanted)
+        toc = session.list_variables()
+        wanted = plan_blocks(toc, self._peers, self._period_ms, robot=self.robot)
+        self._report_missing(toc, wanted)
         flight = _LinkConnection(LogDecoder(self.robot, wanted))
         self._flight, self.reading = flight, flight.reading
         session.start_blocks(wanted, self._on_packet)
         return None
 
-    def _report_missing(self, wanted: LogPlan) -> None:
-        missing = sorted(set(self._peers.values()) - set(wanted.peers.values()))
-        if missing and not self.health.connections:
+    def _report_missing(self, toc: Mapping[str, str], wanted: LogPlan) -> None:
+        """Report peers without a distance, or distances without a peer, once."""
+        if self.health.connections:
+            return
+        if missing := sorted(set(self._peers.values()) - set(wanted.peers.values())):
             self._feed.post_message(f"{self.robot} logs no distance to {', '.join(missing)}")
+        unnamed = sorted(name for name in toc if name.startswith(DISTANCE_VARIABLE))
+        if unnamed and not self._peers:
+            self._feed.post_message(
+                f"{self.robot}: {', '.join(unnamed)} not recorded, since the robots at the other "
+                "end are unknown. Pass: --peer N=NAME"
+            )
 
     def _wait_for_end(self, session: CflibSession) -> str:
         """Wait for the end of the connection. Return the reason."""

@@ -12,7 +12,6 @@ from dmrl.live.image_assembly import ColourMode, StoredFormat
 from dmrl.live.queue import SampleQueue
 from dmrl.live.receive_clocks import HostClock
 from dmrl.live.robot_options import RobotOptions, parse_peers
-from dmrl.terminal.progress import say
 
 
 def check_robots(robots: Sequence[RobotOptions]) -> None:
@@ -54,12 +53,6 @@ def build_links(
     """
     names, period_ms = [robot.name for robot in robots], 10 * max(round(100 / rate_hz), 1)
     peers = {name: parse_peers(name, names, peer) for name in names}
-    for name in names if len(names) > 1 else ():
-        if not peers[name]:
-            say(
-                f"{name}: the peer of its ranging.distance<N> is unknown, so no range of it is "
-                "recorded. Pass: --peer N=NAME"
-            )
     return {
         r.name: CrazyflieLink(r.name, r.uri, peers[r.name], period_ms, feed, now) for r in robots
     }

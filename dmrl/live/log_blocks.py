@@ -33,7 +33,7 @@ VARIABLE_BYTES = {name: struct.calcsize(f"<{code}") for name, (_, code) in LOG_T
 MOTION_VARIABLES = ("roll", "pitch", "yaw", "vx", "vy")
 YAW_RATE_VARIABLE, PITCH_RATE_VARIABLE = "gyro.z", "gyro.y"
 HEIGHT_VARIABLE, GROUND_VARIABLE = "stateEstimate.z", "range.zrange"
-BATTERY_VARIABLE = "pm.vbat"
+BATTERY_VARIABLE, DISTANCE_VARIABLE = "pm.vbat", "ranging.distance"
 SLOW_PERIOD_MS = 1000
 MAX_RANGE_M = 60.0  # beyond the reach of UWB; radios report 65535 mm without an answer
 
@@ -113,7 +113,7 @@ def plan_blocks(
     if PITCH_RATE_VARIABLE in toc:
         # As FP16 it fits into the block. It only corrects the yaw rate for tilt.
         motion.append(RequestedVariable(PITCH_RATE_VARIABLE, "FP16"))
-    distances = {f"ranging.distance{number}": peer for number, peer in peers.items()}
+    distances = {f"{DISTANCE_VARIABLE}{number}": peer for number, peer in peers.items()}
     distances = {name: peer for name, peer in distances.items() if name in toc}
     rest = [RequestedVariable(name, toc[name]) for name in (height, *distances)]
     blocks = [RequestedBlock(period_ms, tuple(motion)), *_pack_blocks(rest, period_ms)]
