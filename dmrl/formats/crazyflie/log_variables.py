@@ -221,11 +221,21 @@ def build_ranges(robot: str, peer: str, time_ns: Times, range_m: Array, where: o
 def _iter_distances(
     blocks: Sequence[LogBlock], where: object
 ) -> Iterator[tuple[int, Times, Array]]:
-    """Yield the number, times and distances in metres of each peer."""
+    """Yield the number, times and distances in metres of each peer, of its events if it has any."""
+    with_events = {
+        number
+        for block in blocks
+        if block.name == "estDistance" and {"id", "distance"} <= block.columns.keys()
+        for number in np.unique(block.columns["id"]).tolist()
+    }
     for block in blocks:
         for name, values in block.columns.items():
             match = DISTANCE_VARIABLE.fullmatch(name)
-            if match:
+            if match and int(match[1]) in with_events:
+                leave_out(
+                    "values of distances that events have too", f"{where}: {name}", len(values)
+                )
+            elif match:
                 fresh = find_new_values(values, polled=True)
                 metres = values[fresh] * _detect_unit(values, f"{where}: {name}")
                 yield int(match[1]), block.time_ns[fresh], metres

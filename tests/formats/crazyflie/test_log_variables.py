@@ -242,6 +242,10 @@ def test_event_ranges_are_assigned_by_id_and_own_id_is_dropped() -> None:
     heard = found.pop("/cf1/range/anchor")
     assert [(s.time_ns, s.fields["range_m"]) for s in heard] == [(0, 1.5), (20 * MS, 2.5)]
     assert found.keys() == {"/cf1/log/estDistance"}
+    polled = block("p", ranging__distance2=[1.4, 1.5, 2.5], ranging__distance3=[3.0, 3.0, 3.1])
+    both = samples(polled, event)
+    assert [s.fields["range_m"] for s in both["/cf1/range/cf2"]] == [1.5, 2.5]
+    assert [s.fields["range_m"] for s in both["/cf1/range/cf3"]] == pytest.approx([3.0, 3.1])
 
 
 @pytest.mark.parametrize(
