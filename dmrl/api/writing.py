@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from dmrl import topics
 from dmrl.api.recordings import PathLike, Recording
 from dmrl.errors import RecordingError, SettingError
-from dmrl.geometry.camera_file import find_camera
+from dmrl.geometry.camera_file import find_camera, warn_of_mount
 from dmrl.geometry.frames import Camera
 from dmrl.guards import limits
 from dmrl.guards.safe_names import check_topic_part
@@ -187,6 +187,7 @@ class Writer:
             If the file cannot be read.
         """
         known = camera if isinstance(camera, Camera) else find_camera(to_path(camera))
+        warn_of_mount(robot, known)
         (time_ns,) = self._log_times(topics.CALIBRATION(robot), [time_s])
         with self._lock:
             self._sink.write_sample(sample.build_calibration(int(time_ns), robot, known))

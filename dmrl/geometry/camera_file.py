@@ -8,6 +8,7 @@ from dmrl.geometry import foreign_calibration
 from dmrl.geometry.frames import AIDECK, PUBLISHED_RENDER, Camera
 from dmrl.guards.bounded_parsing import parse_toml
 from dmrl.guards.paths import refuse_pipe
+from dmrl.terminal.progress import say
 
 NAMED_CAMERAS = {"aideck": AIDECK, "published": PUBLISHED_RENDER}
 """Built-in cameras by name."""
@@ -29,6 +30,15 @@ def format_camera(camera: Camera) -> str:
     return "\n".join(
         ["# Pixel-edge coordinates: the image covers [0, width] x [0, height].", *lines, ""]
     )
+
+
+def warn_of_mount(robot: str, camera: Camera) -> None:
+    """Print a line if a robot's camera has a mount or delay, which a recording does not hold."""
+    if any(camera.mount_rad) or camera.delay_s:
+        say(
+            f"{robot}: a recording does not hold the mount and delay of its camera. Pass the file "
+            f"to dmrl label, too: --camera.{robot} FILE"
+        )
 
 
 def find_camera(name: Path) -> Camera:

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from dmrl.errors import SettingError
-from dmrl.geometry.camera_file import read_camera
+from dmrl.geometry.camera_file import read_camera, warn_of_mount
 from dmrl.live.camera_link import CameraClient
 from dmrl.live.cflib_session import check_uri
 from dmrl.live.crazyflie_link import CrazyflieLink
@@ -79,6 +79,9 @@ def build_cameras(
         See `CameraClient`.
     """
     calibrations = {r.name: read_camera(r.calibration) if r.calibration else None for r in robots}
+    for name, camera in calibrations.items():
+        if camera is not None:
+            warn_of_mount(name, camera)
     return [
         CameraClient(
             robot.name,

@@ -1,8 +1,13 @@
 """Who is linked to, and whose ranges are recorded."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 
-from dmrl.live.links import build_links
+from dmrl.geometry.camera_file import format_camera
+from dmrl.geometry.frames import AIDECK
+from dmrl.live.links import build_cameras, build_links
 from dmrl.live.log_blocks import plan_blocks
 from dmrl.live.queue import SampleQueue
 from dmrl.live.receive_clocks import HostClock
@@ -44,3 +49,15 @@ def test_ranges_without_a_known_peer_are_reported(
     link.health.connections = 1
     link._report_missing(TOC, plan_blocks(TOC, link._peers, 10))
     assert feed.get_batch(0.0) == []
+
+
+@pytest.mark.parametrize("mounted", [False, True])
+def test_a_mount_that_a_recording_does_not_hold_is_named(
+    mounted: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "camera.toml"
+    file.write_text(format_camera(replace(AIDECK, delay_s=0.03) if mounted else AIDECK))
+    robots = [RobotOptions("cf1", "udp://127.0.0.1:19850", ("127.0.0.1", 5000), file)]
+    links = build_links(robots, [], 100.0, SampleQueue(), HostClock())
+    build_cameras(robots, links, ("colour", "png"), SampleQueue(), HostClock())
+    assert ("dmrl label, too: --camera.cf1 FILE" in capsys.readouterr().err) == mounted

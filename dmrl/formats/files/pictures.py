@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from dmrl.errors import SettingError, SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Options
 from dmrl.formats.files.label_csv import LabelRow
+from dmrl.geometry.camera_file import warn_of_mount
 from dmrl.geometry.frames import AIDECK, AIDECK_CORNER_PX, AIDECK_SENSOR_PX, Camera
 from dmrl.guards import limits
 from dmrl.images import codec
@@ -190,6 +191,7 @@ class PictureConverter:
         self._converted += 1
         if self._converted > 1 or self.options.camera is None:
             return crop, [image]
+        warn_of_mount(self.options.robot, self.options.camera)
         camera = crop_camera(crop, self.options.camera)
         return crop, [build_calibration(time_ns, self.options.robot, camera), image]
 

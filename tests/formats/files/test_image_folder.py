@@ -291,6 +291,17 @@ def test_given_camera_precedes_calibration_file(folder: Path) -> None:
         assert found.time_ns == 0
 
 
+@pytest.mark.parametrize("pitch_rad", [0.0, 0.1])
+def test_a_mount_that_a_recording_does_not_hold_is_named(
+    pitch_rad: float, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = replace(AIDECK, width_px=64, height_px=48, mount_rad=(0.0, pitch_rad, 0.0))
+    samples(folder, "CameraCalibration", Options(camera=camera))
+    assert ("cf1: a recording does not hold the mount" in capsys.readouterr().err) == bool(
+        pitch_rad
+    )
+
+
 @pytest.mark.parametrize(("labelled", "camera", "said"), [(0, 0, 1), (1, 0, 0), (0, 1, 0)])
 def test_missing_camera_is_reported_only_if_labels_depend_on_it(
     labelled: int, camera: int, said: int, folder: Path, capsys: pytest.CaptureFixture[str]
