@@ -60,6 +60,17 @@ def test_mount_and_delay_come_from_a_flight(calibrated: tuple[Path, calibrate.Re
     assert found.camera.delay_s == pytest.approx(0.03, abs=0.012)
 
 
+@pytest.mark.parametrize("focal", [1.0, 1.25])
+def test_detections_that_the_camera_does_not_explain_are_doubted(
+    focal: float, seen: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    near = replace(AIDECK, fx_px=focal * AIDECK.fx_px, fy_px=focal * AIDECK.fy_px)
+    begin = tmp_path / "begin.toml"
+    begin.write_text(format_camera(near))
+    calibrate.run([seen], tmp_path / "out.toml", Settings(against="truth", camera=begin))
+    assert ("doubt: half of its detections" in capsys.readouterr().err) == (focal > 1)
+
+
 def test_labels_made_with_it_lie_where_the_peer_was_seen(
     seen: Path, calibrated: tuple[Path, calibrate.Result], tmp_path: Path
 ) -> None:
