@@ -12,7 +12,7 @@ from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
 
@@ -244,12 +244,15 @@ def _iter_range_faults(values: Mapping[str, Any], schema: type[Any]) -> Iterator
     """Yield faults that a dataclass's command-line validators find."""
     hints = get_type_hints(schema, include_extras=True)
     for name, value in values.items():
-        for note in getattr(hints[name], "__metadata__", ()):
-            for validator in getattr(note, "validator", ()):
-                try:
-                    validator(type(value), value)
-                except (ValueError, TypeError) as e:
-                    yield f"{name}: {str(e)[:1].lower()}{str(e)[1:].rstrip('.')}"
+        # An optional number, such as Share | None, has its limits within the union.
+        within = () if value is None else get_args(hints[name])
+        for kind in (hints[name], *within):
+            for note in getattr(kind, "__metadata__", ()):
+                for validator in getattr(note, "validator", ()):
+                    try:
+                        validator(type(value), value)
+                    except (ValueError, TypeError) as e:
+                        yield f"{name}: {str(e)[:1].lower()}{str(e)[1:].rstrip('.')}"
 
 
 def _describe_fault(fault: Any, schema: type[Any]) -> str:

@@ -61,7 +61,7 @@ def evaluate_recordings(recordings: Sequence[Path], settings: Any) -> Result:
     found = import_module("dmrl.stages.evaluate").run(recordings, None, settings)
     named = str(recordings[0]) if len(recordings) == 1 else f"{len(recordings)} recordings"
     if isinstance(found, dict):
-        kind = import_module(f"dmrl.evaluation.{'tracks' if 'robots' in found else 'positions'}")
+        kind = import_module("dmrl.evaluation.evaluate_recordings").find_module(found)
         columns = [kind.EACH, *(words for _, words, _ in kind.COLUMNS)]
         return Result(found, f"{named}: {kind.TITLE}", columns, kind.rows(found))
     document = report.describe_evaluation(recordings, found)

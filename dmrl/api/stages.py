@@ -98,7 +98,15 @@ def merge(recordings: Sequence[PathLike], out: PathLike | None = None) -> Record
 def convert(
     source: PathLike, out: PathLike | None = None, **settings: "Unpack[typed.ConvertSettings]"
 ) -> Recording:
-    """Convert a foreign file or folder: ``dmrl convert``. Parameters, errors as `label`."""
+    """Convert a foreign file or folder: ``dmrl convert``. Parameters, errors as `label`.
+
+    ``to``, which writes a folder, is an option of ``dmrl.stages.convert.run``.
+    """
+    if to := settings.get("to"):
+        raise SettingError(
+            f"dmrl.convert makes recordings, not {to}. Use dmrl.stages.convert.run, or: dmrl "
+            f"convert SOURCE OUT --to {to}"
+        )
     return _run_to_recording("convert", out, settings, source=to_path(source))
 
 

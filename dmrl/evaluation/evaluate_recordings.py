@@ -117,9 +117,14 @@ def _write_folder(out: Path, stem: str, made: Document) -> Iterator[Path]:
         yield folder
 
 
+def find_module(made: Document) -> ModuleType:
+    """Return the module of `KINDS` whose figures a document has."""
+    return flights if "flights" in made else tracks if "robots" in made else positions
+
+
 def print_document(recording: Path, made: Document) -> None:
     """Print the figures of flights and positions by pair, and of tracks by observer."""
-    kind = flights if "flights" in made else tracks if "robots" in made else positions
+    kind = find_module(made)
     headers = [words for _, words, _ in kind.COLUMNS]
     print_table(f"{recording}: {kind.TITLE}", [kind.EACH, *headers], kind.rows(made))
     print_note(kind.note(made))

@@ -74,6 +74,26 @@ def test_evaluate_returns_the_printed_figures(
         assert word in judged._repr_html_() and word in repr(judged)
 
 
+def test_evaluate_takes_a_piloted_flight(tmp_path: Path) -> None:
+    flown = dmrl.fly(
+        tmp_path / "flown.mcap",
+        recipe="fly_follow",
+        duration_s=2.0,
+        eye="ideal",
+        camera_renderer="sketch",
+    )
+    judged = dmrl.evaluate(flown)
+    assert judged["flights"][0]["peer"] == "cf2" and "contacts" in repr(judged)
+
+
+def test_numbers_out_of_range_and_folders_of_convert_are_reported(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="threshold: must be <= 1"):
+        dmrl.evaluate("none.mcap", threshold=2.0)
+    with pytest.raises(SettingError, match="makes recordings, not yolo"):
+        dmrl.convert("set", tmp_path / "out", to="yolo")
+    assert not list(tmp_path.iterdir())
+
+
 def test_nothing_heavy_is_loaded_before_it_is_used(flight: Path) -> None:
     code = (
         "import sys, dmrl; first = set(sys.modules)\n"
