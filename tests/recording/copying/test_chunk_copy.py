@@ -76,7 +76,7 @@ def test_omitting_a_topic_keeps_the_rest_bit_for_bit(flight: Path, tmp_path: Pat
 
 def test_trim_copies_whole_chunks_within_the_span(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
-    assert trim(flight, out, start_ns=1000, end_ns=3000) == 2000 * 4 + 200
+    assert trim(flight, out, start_ns=1000, end_ns=3000) == 2000 * 4 + 201
     ours = [r for r in read_raw(flight) if 1000 <= r.time_ns < 3000]
     assert list(read_raw(out))[1:] == ours
     assert len(set(packed(flight)) & set(packed(out))) >= 2
