@@ -86,8 +86,11 @@ class BearingMeasurements:
 
     def crop(self, start_s: float, end_s: float) -> "BearingMeasurements":
         """Return the images in an interval of time, seconds."""
-        inside = (self.time_s >= start_s) & (self.time_s <= end_s)
-        return BearingMeasurements(self.time_s[inside], self.bearing[inside], self.std[inside])
+        return self.take((self.time_s >= start_s) & (self.time_s <= end_s))
+
+    def take(self, images: Mask) -> "BearingMeasurements":
+        """Return some of the images."""
+        return BearingMeasurements(self.time_s[images], self.bearing[images], self.std[images])
 
 
 @dataclass(frozen=True, slots=True)

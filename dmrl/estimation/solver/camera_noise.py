@@ -15,10 +15,14 @@ from dmrl.estimation.solver.residuals import Rows, Values, bearing_factor
 
 MIN_IMAGES = 50
 """Fewest consistent images that show their noise: a standard deviation to a tenth."""
-FIRST_RATIO, MIN_RATIO, MAX_RATIO, ROUNDS = 0.35, 0.1, 10.0, 3
+FIRST_RATIO, MIN_RATIO, MAX_RATIO, ROUNDS = 0.35, 0.1, 10.0, 6
 """Ratio of the noise to the assumed one: of the first solve, the smallest, the largest; and number
 of solves. Residuals of a solve that trusts a camera too little are those of the other sensors, so
-the first one trusts it much: 0.35 are two pixels."""
+the first one trusts it much: 0.35 are two pixels. A solution that follows the camera shows little
+of its noise, and a round then changes it by less than half of what it lacks."""
+PRIOR_IMAGES = 10.0
+"""Number of images that the noise of the round before counts as. Residuals of a component that the
+solution follows closely, such as an elevation, show nothing."""
 MAX_MEMORY_S, MIN_CORRELATION = 3.0, 0.1
 """Longest time over which errors count as repeated, seconds, and smallest correlation that counts:
 twice its standard error in 400 images."""
@@ -53,7 +57,10 @@ def calibrate_views(solver: Solver, found: MapEstimate) -> tuple[Solver, MapEsti
             more = _noise_ratio(rows, posterior)
             if number == ROUNDS - 1:
                 more = more * np.sqrt(count_repeated(rows, view))
-            ratios[k] = np.clip(before * more, MIN_RATIO, MAX_RATIO)
+            ratio = np.clip(before * more, MIN_RATIO, MAX_RATIO)
+            # An elevation has the noise of the attitude too, but the error of the height takes it.
+            ratio[1] = max(ratio[:2])
+            ratios[k] = ratio
     trusted = _with_ratios(solver, ratios)
     return trusted, trusted.solve(found.values)
 
@@ -110,9 +117,12 @@ def _noise_ratio(rows: Rows, posterior: _Posterior) -> Array:
     near = (residual**2).sum(axis=1) < ASSOCIATION_GATE / FIRST_RATIO**2
     if near.sum() < MIN_IMAGES:
         return np.ones(3)
-    open_share = 1 - np.minimum(posterior.leverage(rows)[used][near], 0.9).mean(axis=0)
+    # The loss gives a detection less weight, and so the solution follows it less.
+    followed = posterior.leverage(rows)[used] * rows.loss.weight(rows.square)[used][:, None]
+    open_images = np.maximum((1 - followed[near]).sum(axis=0), 0.0)
     size = np.median(np.abs(residual[near]), axis=0) / NORMAL_MEDIAN
-    return np.asarray(size / np.sqrt(open_share))
+    square = near.sum() * size**2
+    return np.asarray(np.sqrt((square + PRIOR_IMAGES) / (open_images + PRIOR_IMAGES)))
 
 
 def _count_consistent(solver: Solver, view: CameraView, values: Values) -> int:

@@ -111,15 +111,16 @@ def calm_motion(problem: Problem, state: Array) -> Array:
     state
         (K, n) states of the solution.
     """
-    robots, step_s = len(problem.robots), float(np.median(np.diff(problem.keyframe_s)))
+    robots, steps_s = len(problem.robots), np.diff(problem.keyframe_s)[:, None]
+    step_s = float(np.median(steps_s))
     xy = np.stack([state[:, 3 * k] + 1j * state[:, 3 * k + 1] for k in range(robots)], axis=1)
-    velocity = np.diff(xy, axis=0) / step_s
+    velocity = np.diff(xy, axis=0) / steps_s
     own = np.stack([_drop_noise(v, v, problem, step_s) for v in velocity.T], axis=1)
     mean = own.mean(axis=1, keepdims=True)
     # Two robots that move alike do not move relative to each other.
     pairs = zip((own - mean).T, velocity.T, strict=True)
     apart = np.stack([_drop_noise(v, raw, problem, step_s) for v, raw in pairs], axis=1)
-    path = np.concatenate([np.zeros((1, robots)), np.cumsum(mean + apart, axis=0)]) * step_s
+    path = np.concatenate([np.zeros((1, robots)), np.cumsum((mean + apart) * steps_s, axis=0)])
     path += xy.mean(axis=0) - path.mean(axis=0)
     out = state.copy()
     for k in range(robots):

@@ -29,6 +29,12 @@ from dmrl.estimation.solver.problem import (
 KEYFRAME_HZ = 5.0
 """Keyframes per second, Hz. Twice the rate costs twice the time and gave the same error on ten
 simulated flights; ranges and outputs keep their own times."""
+MAX_IMAGE_SHIFT_S = 0.025
+"""Longest time between an image that is used and its keyframe, seconds. The noise of the odometry
+between them is no error of the camera: within 0.1 s it is 1 cm, ten pixels of a peer near by, and
+counted as one it moves the peer away, where pixels are larger. Here it is 2 mm."""
+FIXED_KEYFRAMES = 50
+"""Number of keyframes from one that keeps its time to the next. Windows begin there."""
 RANGE_BLOCK_S, RANGE_MEDIAN_BLOCKS, MIN_RANGE_STEP_M = 0.1, 3, 0.45
 """Detection of range steps for the search: length of a block, seconds; number of block medians on
 either side; smallest step, metres. Smaller steps are left to the solve."""
@@ -54,6 +60,7 @@ def build_problem(pairs: Mapping[tuple[int, int], Pair], rate_hz: float = KEYFRA
     end_s = min(pair.time_s[-1] for pair in pairs.values())
     count = max(2, int((end_s - start_s) * rate_hz + 1e-6) + 1)
     key_s = np.minimum(start_s + np.arange(count) / rate_hz, end_s)
+    key_s = _move_to_images(key_s, _list_image_times(pairs))
     logs: dict[int, tuple[Array, SensorTrack]] = {}
     for both, pair in pairs.items():
         for number, track in zip(both, (pair.own, pair.peer), strict=True):
@@ -65,9 +72,9 @@ def build_problem(pairs: Mapping[tuple[int, int], Pair], rate_hz: float = KEYFRA
     for (one, other), pair in pairs.items():
         links.append(_cut_link((one, other), pair, robots, key_s))
         for side, sees in (((one, other), pair.own_bearings), ((other, one), pair.peer_bearings)):
-            cropped = sees and sees.crop(key_s[0], key_s[-1])
-            if cropped is not None and len(cropped.time_s):
-                views.append(_cut_view(side, cropped, pair, robots, key_s))
+            near = sees and sees.take(_is_near_keyframe(key_s, sees.time_s))
+            if near is not None and len(near.time_s):
+                views.append(_cut_view(side, near, pair, robots, key_s))
     known = _collect_known(pairs)
     for view in views:
         # Errors that last are as large as those of one detection.
@@ -75,6 +82,52 @@ def build_problem(pairs: Mapping[tuple[int, int], Pair], rate_hz: float = KEYFRA
             known[name, view.robots[:1]] = float(np.nanmedian(view.std[..., axis]))
     noise = NoiseModel(known_std=known)
     return Problem(key_s, tuple(robots), tuple(links), tuple(views), noise=noise)
+
+
+def _list_image_times(pairs: Mapping[tuple[int, int], Pair]) -> list[Array]:
+    """Return the times of the images of each camera."""
+    seen: dict[int, list[Array]] = {}
+    for both, pair in pairs.items():
+        for robot, sees in zip(both, (pair.own_bearings, pair.peer_bearings), strict=True):
+            if sees is not None:
+                seen.setdefault(robot, []).append(sees.time_s)
+    return [np.unique(np.concatenate(times)) for times in seen.values()]
+
+
+def _move_to_images(key_s: Array, cameras: Sequence[Array]) -> Array:
+    """Return the times of the keyframes, moved to images by less than half of their distance.
+
+    The cameras take turns, so that each has images at keyframes.
+
+    Parameters
+    ----------
+    key_s
+        (K,) times of the keyframes, seconds.
+    cameras
+        (I,) times of the images of each camera, seconds.
+    """
+    out, turns = key_s.copy(), [0] * len(cameras)
+    half_s = float(np.diff(key_s[:2])[0]) / 2
+    spans = [
+        (np.searchsorted(seen, key_s - half_s), np.searchsorted(seen, key_s + half_s))
+        for seen in cameras
+    ]
+    for k in range(1, len(key_s) - 1):
+        if k % FIXED_KEYFRAMES == 0:
+            continue
+        for one in sorted(range(len(cameras)), key=turns.__getitem__):
+            inside = cameras[one][spans[one][0][k] : spans[one][1][k]]
+            inside = inside[inside > out[k - 1] + half_s / 2]
+            if len(inside):
+                out[k] = inside[np.abs(inside - key_s[k]).argmin()]
+                turns[one] += 1
+                break
+    return out
+
+
+def _is_near_keyframe(key_s: Array, time_s: Array) -> Mask:
+    """Return (N,) whether an image is used."""
+    return np.asarray(np.abs(key_s[nearest_keyframe(key_s, time_s)] - time_s) <= MAX_IMAGE_SHIFT_S)
 
 
 def _collect_known(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dmrl.estimation.flight.pair_output import clip_to_ranges
-from dmrl.estimation.model.pair import Array, Pair, SensorTrack
+from dmrl.estimation.model.pair import Array, BearingMeasurements, Pair, SensorTrack
 from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
 from dmrl.estimation.solver.keyframes import (
     MIN_RANGE_STEP_M,
@@ -164,3 +164,35 @@ def test_range_steps_are_found_in_blocks_from_flight_start() -> None:
         range_step_offsets(replace(flight, range_time_s=ranges_s[:0], range_m=ranges_s[:0])).size
         == 0
     )
+
+
+def seen_at(*times_s: float) -> BearingMeasurements:
+    polar = np.tile([0.1, 0.0, 0.7], (len(times_s), 1, 1))
+    return BearingMeasurements(np.array(times_s), polar, np.full_like(polar, 0.05))
+
+
+def test_keyframes_move_to_the_images() -> None:
+    images_s = np.arange(3.04, 23.0, 0.1)
+    flight = replace(pair(np.array([4.0])), own_bearings=seen_at(*images_s))
+    task = build_problem({(0, 1): flight})
+    (view,) = task.views
+    gap_s = view.time_s - task.keyframe_s[view.keyframe]
+    assert np.abs(gap_s).max() < 1e-9
+    assert len(view.time_s) > 90
+    assert np.diff(task.keyframe_s).min() > 0.1
+    # Windows of a long flight begin at these.
+    assert task.keyframe_s[[0, 50, 100]] == pytest.approx([3.0, 13.0, 23.0])
+
+
+def test_seldom_images_are_all_used() -> None:
+    times_s = (4.31, 7.7, 8.9, 14.05, 19.99)
+    flight = replace(pair(np.array([4.0])), own_bearings=seen_at(*times_s))
+    (view,) = build_problem({(0, 1): flight}).views
+    assert view.time_s.tolist() == list(times_s)
+
+
+def test_two_cameras_share_the_keyframes() -> None:
+    own, peer = (seen_at(*np.arange(first_s, 23.0, 0.1)) for first_s in (3.0, 3.05))
+    flight = replace(pair(np.array([4.0])), own_bearings=own, peer_bearings=peer)
+    one, other = build_problem({(0, 1): flight}).views
+    assert min(len(one.time_s), len(other.time_s)) > 40

@@ -131,37 +131,34 @@ def test_odometry_factor_is_zero_at_truth_with_exact_jacobian(robot: int) -> Non
 def test_measured_motion_has_the_errors_of_its_sensors() -> None:
     """A scale multiplies the true shift, a bias adds to it, and so on: signs and sizes."""
     problem, values = flight()
-    layout, noise = problem.layout, problem.noise
+    layout, noise, steps_s = problem.layout, problem.noise, problem.robots[0].steps_s
     for name, value, column, wanted in (
         ("velocity_scale", 0.1, 0, 0.1 * problem.robots[0].motion.shift_m[:, 0]),
-        ("vx_bias", 0.3, 0, 0.3 * 0.2), ("vy_bias", 0.3, 1, 0.3 * 0.2),
-        ("gyro_bias", 0.2, 2, 0.2 * 0.2),
+        ("vx_bias", 0.3, 0, 0.3 * steps_s), ("vy_bias", 0.3, 1, 0.3 * steps_s),
+        ("gyro_bias", 0.2, 2, 0.2 * steps_s),
     ):  # fmt: skip
         constants = values.constants.copy()
         constants[layout.find(name, 0)] = value
         found = odometry_factor(problem, layout, 0, Values(values.state, constants))
-        std = np.sqrt((noise.yaw_rate_psd if column == 2 else noise.velocity_psd) * 0.2)
-        assert found.rows[:, column, 0, -1] * std == pytest.approx(
-            np.broadcast_to(wanted, len(found.rows)), abs=2e-3
-        )
+        std = np.sqrt((noise.yaw_rate_psd if column == 2 else noise.velocity_psd) * steps_s)
+        assert found.rows[:, column, 0, -1] * std == pytest.approx(wanted, abs=2e-3)
     state = values.state.copy()
     state[:, layout.state_column("velocity_error_y", 1)] = 0.5
     found = odometry_factor(problem, layout, 1, Values(state, values.constants))
-    std = np.sqrt(noise.velocity_psd * 0.2)
-    assert found.rows[:, 1, 0, -1] * std == pytest.approx(0.1, abs=5e-3)
+    std = np.sqrt(noise.velocity_psd * steps_s)
+    assert found.rows[:, 1, 0, -1] * std == pytest.approx(0.5 * steps_s, abs=5e-3)
 
 
 def test_clock_derivative_shifts_odometry_in_time() -> None:
-    problem, _ = flight()
-    by_clock = problem.robots[1].clock_derivative
-    # The turn rate is -0.3 + 0.3 sin t, so a step's turn changes by 0.3 cos t per second.
-    middle = problem.keyframe_s[:-1] + 0.1
-    assert by_clock[2:-2, 2] == pytest.approx(0.2 * 0.3 * np.cos(middle)[2:-2], abs=2e-3)
     problem, values = flight()
+    by_clock, steps_s = problem.robots[1].clock_derivative, problem.robots[1].steps_s
+    # The turn rate is -0.3 + 0.3 sin t, so a step's turn changes by 0.3 cos t per second.
+    expected = steps_s * 0.3 * np.cos(problem.keyframe_s[:-1] + steps_s / 2)
+    assert by_clock[2:-2, 2] == pytest.approx(expected[2:-2], abs=2e-3)
     layout, constants = problem.layout, values.constants.copy()
     constants[layout.find("clock", 1)] = 0.1
     late = odometry_factor(problem, layout, 1, Values(values.state, constants))
-    std = np.sqrt(problem.noise.yaw_rate_psd * 0.2)
+    std = np.sqrt(problem.noise.yaw_rate_psd * steps_s)[2:-2]
     assert late.rows[2:-2, 2, 0, -1] * std == pytest.approx(-0.1 * by_clock[2:-2, 2], abs=1e-4)
 
 
@@ -335,8 +332,10 @@ def test_odometry_noise_follows_model_and_dropouts() -> None:
     rows = odometry_factor(loud, problem.layout, 0, values).rows
     plain = odometry_factor(problem, problem.layout, 0, values).rows
     ratio = [plain[0, k, 0, k] / rows[0, k, 0, k] for k in (0, 2)]
-    usual = problem.noise
+    usual, step_s = problem.noise, problem.robots[0].steps_s[0]
     assert ratio[0] ** 2 == pytest.approx(
-        (0.01 * 4 * 0.2 + 0.25 * 0.1) / (usual.velocity_psd * 0.2)
+        (0.01 * 4 * step_s + 0.25 * 0.1) / (usual.velocity_psd * step_s)
     )
-    assert ratio[1] ** 2 == pytest.approx((0.02 * 0.2 + 0.25 * 0.1) / (usual.yaw_rate_psd * 0.2))
+    assert ratio[1] ** 2 == pytest.approx(
+        (0.02 * step_s + 0.25 * 0.1) / (usual.yaw_rate_psd * step_s)
+    )
