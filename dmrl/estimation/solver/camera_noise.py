@@ -15,14 +15,10 @@ from dmrl.estimation.solver.residuals import Rows, Values, bearing_factor
 
 MIN_IMAGES = 50
 """Fewest consistent images that show their noise: a standard deviation to a tenth."""
-FIRST_RATIO, MIN_RATIO, MAX_RATIO, ROUNDS = 0.35, 0.1, 10.0, 6
+FIRST_RATIO, MIN_RATIO, MAX_RATIO, ROUNDS = 0.35, 0.1, 10.0, 3
 """Ratio of the noise to the assumed one: of the first solve, the smallest, the largest; and number
 of solves. Residuals of a solve that trusts a camera too little are those of the other sensors, so
-the first one trusts it much: 0.35 are two pixels. A solution that follows the camera shows little
-of its noise, and a round then changes it by less than half of what it lacks."""
-PRIOR_IMAGES = 10.0
-"""Number of images that the noise of the round before counts as. Residuals of a component that the
-solution follows closely, such as an elevation, show nothing."""
+the first one trusts it much: 0.35 are two pixels."""
 MAX_MEMORY_S, MIN_CORRELATION = 3.0, 0.1
 """Longest time over which errors count as repeated, seconds, and smallest correlation that counts:
 twice its standard error in 400 images."""
@@ -57,10 +53,7 @@ def calibrate_views(solver: Solver, found: MapEstimate) -> tuple[Solver, MapEsti
             more = _noise_ratio(rows, posterior)
             if number == ROUNDS - 1:
                 more = more * np.sqrt(count_repeated(rows, view))
-            ratio = np.clip(before * more, MIN_RATIO, MAX_RATIO)
-            # An elevation has the noise of the attitude too, but the error of the height takes it.
-            ratio[1] = max(ratio[:2])
-            ratios[k] = ratio
+            ratios[k] = np.clip(before * more, MIN_RATIO, MAX_RATIO)
     trusted = _with_ratios(solver, ratios)
     return trusted, trusted.solve(found.values)
 
@@ -117,12 +110,9 @@ def _noise_ratio(rows: Rows, posterior: _Posterior) -> Array:
     near = (residual**2).sum(axis=1) < ASSOCIATION_GATE / FIRST_RATIO**2
     if near.sum() < MIN_IMAGES:
         return np.ones(3)
-    # The loss gives a detection less weight, and so the solution follows it less.
-    followed = posterior.leverage(rows)[used] * rows.loss.weight(rows.square)[used][:, None]
-    open_images = np.maximum((1 - followed[near]).sum(axis=0), 0.0)
+    open_share = 1 - np.minimum(posterior.leverage(rows)[used][near], 0.9).mean(axis=0)
     size = np.median(np.abs(residual[near]), axis=0) / NORMAL_MEDIAN
-    square = near.sum() * size**2
-    return np.asarray(np.sqrt((square + PRIOR_IMAGES) / (open_images + PRIOR_IMAGES)))
+    return np.asarray(size / np.sqrt(open_share))
 
 
 def _count_consistent(solver: Solver, view: CameraView, values: Values) -> int:
