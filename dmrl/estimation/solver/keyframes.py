@@ -72,9 +72,9 @@ def build_problem(pairs: Mapping[tuple[int, int], Pair], rate_hz: float = KEYFRA
     for (one, other), pair in pairs.items():
         links.append(_cut_link((one, other), pair, robots, key_s))
         for side, sees in (((one, other), pair.own_bearings), ((other, one), pair.peer_bearings)):
-            near = sees and sees.take(_is_near_keyframe(key_s, sees.time_s))
-            if near is not None and len(near.time_s):
-                views.append(_cut_view(side, near, pair, robots, key_s))
+            used = sees and _select_images(sees, key_s)
+            if used is not None and len(used.time_s):
+                views.append(_cut_view(side, used, pair, robots, key_s))
     known = _collect_known(pairs)
     for view in views:
         # Errors that last are as large as those of one detection.
@@ -125,9 +125,11 @@ def _move_to_images(key_s: Array, cameras: Sequence[Array]) -> Array:
     return out
 
 
-def _is_near_keyframe(key_s: Array, time_s: Array) -> Mask:
-    """Return (N,) whether an image is used."""
-    return np.asarray(np.abs(key_s[nearest_keyframe(key_s, time_s)] - time_s) <= MAX_IMAGE_SHIFT_S)
+def _select_images(sees: BearingMeasurements, key_s: Array) -> BearingMeasurements:
+    """Return the images of a flight that are at keyframes."""
+    inside = sees.crop(key_s[0], key_s[-1])
+    gap_s = inside.time_s - key_s[nearest_keyframe(key_s, inside.time_s)]
+    return inside.take(np.abs(gap_s) <= MAX_IMAGE_SHIFT_S)
 
 
 def _collect_known(
