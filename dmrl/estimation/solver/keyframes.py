@@ -31,8 +31,8 @@ KEYFRAME_HZ = 5.0
 simulated flights; ranges and outputs keep their own times."""
 MAX_IMAGE_SHIFT_S = 0.025
 """Longest time between an image that is used and its keyframe, seconds. The noise of the odometry
-between them is no error of the camera: within 0.1 s it is 1 cm, ten pixels of a peer near by, and
-counted as one it moves the peer away, where pixels are larger. Here it is 2 mm."""
+between them is no error of the camera. Within 0.1 s it is 1 cm; taken for an error of the camera,
+it moves the peer away, where a pixel spans more. Within 25 ms it is 2 mm."""
 FIXED_KEYFRAMES = 50
 """Number of keyframes from one that keeps its time to the next. Windows begin there."""
 RANGE_BLOCK_S, RANGE_MEDIAN_BLOCKS, MIN_RANGE_STEP_M = 0.1, 3, 0.45
