@@ -1,4 +1,4 @@
-"""What a network learns of a new robot and a new lens from 10, 25 and 50 labelled images.
+"""What a network learns of a new robot and a new lens from 10, 25, 50 and 2,000 labelled images.
 
     python benchmarks/bench_few_images.py FOLDER [--seeds 3] [--init dmrl-nano]
 
@@ -24,7 +24,7 @@ from dmrl.terminal.tables import print_table
 
 CAMERA = Camera(320, 224, 230.0, 230.0, 157.0, 115.0, (-0.18, 0.03, 0.0, 0.0, 0.0))
 PLACES, JUDGED = ("courtyard", "interior", "city"), 300
-SETS = (("10", 3, 10), ("25", 3, 25), ("50", 3, 50), ("50 of one place", 1, 50))
+SETS = (("10", 3, 10), ("25", 3, 25), ("50", 3, 50), ("50 of one place", 1, 50), ("2000", 3, 2000))
 """Titles, places and images of the training sets."""
 
 
