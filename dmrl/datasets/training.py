@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow.compute as pc
 
 from dmrl.atomic_output import atomic_folder, refuse_existing, to_partial_path
-from dmrl.datasets import Dataset, open_dataset
+from dmrl.datasets import Dataset, Split, open_dataset
 from dmrl.datasets.backgrounds import open_backgrounds
 from dmrl.errors import ModelError, OutputError, SettingError, optional_imports
 from dmrl.geometry.frames import AIDECK_PINHOLE
@@ -138,7 +138,7 @@ def _train_in_process(
         refuse_existing(out)
         _refuse_unfinished(to_partial_path(out), resume=given.resume)
     data = open_dataset(dataset)
-    loaded = load_training_data(data, settings)
+    train, loaded = data.split("train"), load_training_data(data, settings)
     network = _build_network(settings, loaded.examples, given.init)
     first = {name: value.clone() for name, value in loaded_model.get_weights(network).items()}
     teacher = _load_teacher(given.teacher, network) if given.teacher else None
@@ -164,7 +164,7 @@ def _train_in_process(
         result = _run_steps(training, settings, len(loaded.examples), group)
         if group.is_main:
             loaded_model.interpolate_weights(training.network, first, settings.init_share)
-            _write_model(training, settings, data, loaded, folder)
+            _write_model(training, settings, (data, train), loaded, folder)
             remove_checkpoint(folder)
     return result
 
@@ -283,10 +283,14 @@ def _run_steps(
 
 
 def _write_model(
-    training: Trainer, settings: TrainConfig, data: Dataset, loaded: TrainingData, folder: Path
+    training: Trainer,
+    settings: TrainConfig,
+    trained_on: tuple[Dataset, Split],
+    loaded: TrainingData,
+    folder: Path,
 ) -> None:
     """Calibrate the trained network, and write it with what is known of it."""
-    train = data.split("train")
+    data, train = trained_on
     judged = _calibrate(training.network, loaded, settings)
     height_px, width_px = train.image_shape
     peers = pc.list_flatten(train.table.column("peers"))
