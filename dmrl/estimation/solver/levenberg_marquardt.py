@@ -116,7 +116,7 @@ class Solver:
         for _ in range(MAX_ITERATIONS):
             try:
                 step = solve_step(equations.damped(damping))
-                tried = Values(values.state + step.state, values.constants + step.constants)
+                tried = apply_step(values, step.state, step.constants, layout.robots)
                 ahead = self.linearize(tried, layout)
                 cost = total_cost(ahead)
             except np.linalg.LinAlgError:
@@ -178,6 +178,34 @@ class Solver:
             elif isinstance(factor, ConstantPrior):
                 normalizer += float(np.log(factor.std).sum())
         return pull - found.cost - normalizer - log_det / 2
+
+
+def apply_step(values: Values, state: Array, constants: Array, robots: int) -> Values:
+    """Return the values after a step of the solver.
+
+    A turn of a robot turns its path, and a turn of the first robot what it sees. To first order
+    that is the sum. But biases of all gyroscopes turn a long flight by a radian, which no
+    measurement resists, and along straight lines such a step would stretch the paths.
+
+    Parameters
+    ----------
+    values
+        Values before the step.
+    state, constants
+        (K, n) and (G,) steps.
+    robots
+        Number of robots.
+    """
+    x, y = slice(0, 3 * robots, 3), slice(1, 3 * robots, 3)
+    place, moved = (table[:, x] + 1j * table[:, y] for table in (values.state, state))
+    turn, turns = state[:, 2:3], state[:-1, 2]
+    way, away = np.diff(place[:, 0]), place[:, 1:] - place[:, :1]
+    way = np.exp(1j * turns) * (way + np.diff(moved[:, 0]) - 1j * turns * way)
+    away = np.exp(1j * turn) * (away + moved[:, 1:] - moved[:, :1] - 1j * turn * away)
+    path = np.cumsum(np.concatenate([place[:1, 0] + moved[:1, 0], way]))[:, None]
+    place, out = np.hstack([path, path + away]), values.state + state
+    out[:, x], out[:, y] = place.real, place.imag
+    return Values(out, values.constants + constants)
 
 
 def relative_path(state: Array, one: int = 0, other: int = 1) -> Array:

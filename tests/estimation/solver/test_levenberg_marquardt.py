@@ -16,6 +16,7 @@ from dmrl.estimation.solver.levenberg_marquardt import (
     SMALL_DAMPING,
     MapEstimate,
     Solver,
+    apply_step,
     is_same_solution,
     relative_path,
 )
@@ -35,6 +36,25 @@ def test_solve_converges_to_the_true_flight() -> None:
     assert np.abs(error[:, :2]).max() < 0.01 < np.abs(start.state - true.state).max()
     again = Solver(problem).solve(found.values)
     assert again.cost == pytest.approx(found.cost, rel=1e-3)
+
+
+def test_a_step_that_turns_all_robots_keeps_what_they_measure() -> None:
+    _, true = flight()
+    turn = np.linspace(0.0, 1.5, len(true.state))
+    place = true.state[:, 0:6:3] + 1j * true.state[:, 1:6:3]
+    path = np.cumsum(1j * turn[:-1] * np.diff(place[:, 0]))
+    path = np.concatenate([[0.0], path])[:, None]
+    moves = np.hstack([path, path + 1j * turn[:, None] * np.diff(place)])
+    step = np.zeros_like(true.state)
+    step[:, 0:6:3], step[:, 1:6:3], step[:, [2, 5]] = moves.real, moves.imag, turn[:, None]
+    turned = apply_step(true, step, np.zeros_like(true.constants), 2)
+    np.testing.assert_allclose(relative_path(turned.state), relative_path(true.state), atol=1e-9)
+    way = np.abs(np.diff(turned.state[:, 0:6:3] + 1j * turned.state[:, 1:6:3], axis=0))
+    assert way[:, 0] == pytest.approx(np.abs(np.diff(place[:, 0])))
+    # A small step is the sum.
+    near = apply_step(true, 1e-5 * step, np.ones_like(true.constants), 2)
+    np.testing.assert_allclose(near.state, true.state + 1e-5 * step, atol=1e-8)
+    assert (near.constants == true.constants + 1).all()
 
 
 @pytest.mark.heavy
