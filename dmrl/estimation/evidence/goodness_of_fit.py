@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded
+from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import csc_array
 from scipy.special import chdtrc
 
@@ -37,8 +37,9 @@ SPANS = (1, 2, 5)
 MIN_OPEN_SHARE = 1e-7
 """Smallest share of a score's information that the unknowns leave open. Below it, rounding decides.
 """
-BLOCK = 64
-"""Number of scores whose covariance is computed at once: more would need more memory."""
+BLOCK = 32
+"""Number of scores whose covariance is computed at once. Scores of the longest span are in the same
+block or in neighbouring ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,10 +136,7 @@ def compute_scores(solver: Solver, values: Values) -> list[SignalScores]:
         score = scores.score + score.reshape(scores.score.shape)
         rest = by_constant - (by_state.T @ response).T
         explained = rest.T @ step.covariance @ rest
-        for first in range(0, by_state.shape[1], BLOCK):
-            part = by_state[:, first : first + BLOCK].toarray(order="F")
-            solved = cho_solve_banded((step.eliminated.factor, False), part, overwrite_b=True)
-            explained[:, first : first + BLOCK] += by_state.T @ solved
+        explained += _correlate(step.eliminated.factor, by_state)
         scale = 1 / np.sqrt(np.maximum(scores.information, 1e-9))
         open_part = np.diag(scores.information.ravel()) - explained
         open_part *= scale.ravel() * scale.ravel()[:, None]
@@ -148,6 +146,28 @@ def compute_scores(solver: Solver, values: Values) -> list[SignalScores]:
             for name, robot, at in signals
             for part in (covariance[:, at],)
         ]
+    return out
+
+
+def _correlate(factor: Array, columns: csc_array) -> Array:
+    """Return (M, M) products of M columns in time order through the inverse of U^T U.
+
+    Parameters
+    ----------
+    factor
+        Upper bands of U.
+    columns
+        (N, M) sparse columns. Products of those that are more than `BLOCK` apart are 0.
+    """
+    half, size = columns.toarray(order="F"), columns.shape[1]
+    out = np.zeros((size, size))
+    for first in range(0, size, BLOCK):
+        at, near = slice(first, first + BLOCK), slice(max(first - BLOCK, 0), first + BLOCK)
+        # U^-T by a column is 0 before the column begins.
+        start = int(columns[:, at].indices.min(initial=len(half) - 1))
+        half[start:, at], _ = dtbtrs(factor[:, start:], half[start:, at], trans="T")
+        out[near, at] = half[start:, near].T @ half[start:, at]
+        out[at, near] = out[near, at].T
     return out
 
 
