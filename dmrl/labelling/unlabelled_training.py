@@ -51,8 +51,9 @@ def read_unlabelled(paths: Sequence[Path]) -> UnlabelledImages:
     """
     pixels: list[Rgb] = []
     poses: list[Array] = []
-    cameras: list[int] = []
-    for path in paths:
+    flights: list[int] = []
+    camera_number = 0
+    for number, path in enumerate(paths):
         flight = read_flight(path, *OBSERVER_TOPICS)
         if not flight.detections:
             raise MissingTopic(topics.DETECTIONS("*"), flight.topics, path)
@@ -60,19 +61,19 @@ def read_unlabelled(paths: Sequence[Path]) -> UnlabelledImages:
             camera = require_camera(flight, robot)
             log = read_observer_log(flight, robot, camera, None)
             lens = camera.image_from_optical[[0, 1, 0, 1], [0, 1, 2, 2]]
-            lens = np.tile(lens, (len(log.time_ns), 1))
-            time_s = (log.time_ns - log.time_ns[0]) * 1e-9
-            rows = np.column_stack([time_s, log.path_m, log.yaw_rad, log.attitude_rad, lens])
+            constant = np.tile([*lens, camera_number], (len(log.time_ns), 1))
+            time_s = (log.time_ns - flight.start_ns) * 1e-9
+            rows = np.column_stack([time_s, log.path_m, log.yaw_rad, log.attitude_rad, constant])
             of_time = dict(zip(log.log_time_ns.tolist(), rows, strict=True))
-            number = len(set(cameras))
+            camera_number += 1
             for image in read(path, topics.CAMERA_IMAGE(robot)):
                 if image.time_ns in of_time:
                     pixels.append(decode(image.message.data, f"{path}: {image.topic}"))
                     poses.append(of_time[image.time_ns])
-                    cameras.append(number)
+                    flights.append(number)
     if len({one.shape for one in pixels}) != 1:
         names = ", ".join(map(str, paths))
         raise RecordingError(f"{names}: no images, or of more than one size. Give other flights")
     return UnlabelledImages(
-        tuple(paths), np.stack(pixels), np.array(poses, np.float32), np.array(cameras)
+        tuple(paths), np.stack(pixels), np.array(poses, np.float32), np.array(flights)
     )

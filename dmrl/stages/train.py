@@ -81,8 +81,8 @@ def command(
         Model to learn from beside the labels, by the recipe's distill_share; as a rule a larger
         one, such as dmrl-large, trained on the same dataset.
     unlabelled
-        Recording of a flight with detections, whose images must agree with its odometry; see
-        consistency_weight. Repeat for more.
+        Recording of a flight with detections. Its images must agree with odometry, and those of two
+        robots with each other; see consistency_weight. Repeat for more.
     resume
         Go on with the interrupted training in OUT_DIR.partial.
     """

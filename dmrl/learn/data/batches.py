@@ -39,7 +39,7 @@ class Batch(NamedTuple):
     """Images and their robots.
 
     ``images`` (N, 3, H, W) uint8, channels last in memory; ``robots`` (N, K, 11) float32; ``poses``
-    (N, 11) of the camera, where images have no labels and 2k and 2k + 1 are a pair.
+    (N, 12) of the camera, where images have no labels and 2k and 2k + 1 are a pair.
     """
 
     images: Tensor

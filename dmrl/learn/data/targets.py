@@ -42,7 +42,7 @@ class Targets(NamedTuple):
     class_id
         (N, rows, cols) int64 class of the robot; -1 where it is unknown or there is no robot.
     poses
-        (N, 11) of the camera, for pairs of images without labels; else None.
+        (N, 12) of the camera, for pairs of images without labels; else None.
     """
 
     confidence: Tensor

@@ -14,7 +14,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, one_hot
 
 from dmrl.learn.data.targets import MIN_PRESENCE, Targets
 from dmrl.learn.networks.architectures import CLASS_PREFIX, SPREAD_CHANNEL
-from dmrl.learn.training.consistency import carry_over, fuse
+from dmrl.learn.training.consistency import compare
 
 DepthLoss = Literal["squared", "log"]
 OutputChannels = Mapping[str, Tensor]
@@ -221,9 +221,9 @@ def _consistency_term(out: OutputChannels, wanted: Targets, settings: LossSettin
         offset = torch.stack((out["offset_u"], out["offset_v"]), dim=1)
     with torch.no_grad():
         sure = logit.sigmoid()
-        support, depth_m = carry_over(sure, log_depth, offset, wanted.poses)
+        probability, support, depth_m = compare(sure, log_depth, offset, wanted.poses)
         weight = sure * support * (support >= MIN_PRESENCE)
-    found = confidence_loss(logit, fuse(sure, support), focus=0.0)
+    found = confidence_loss(logit, probability, focus=0.0)
     return found + depth_loss(log_depth, depth_m, weight, settings.depth_loss)
 
 

@@ -1,4 +1,4 @@
-"""The consistency loss: peaks are carried over by odometry, and what agrees is believed."""
+"""The consistency loss: images are compared by odometry, or between two robots."""
 
 from pathlib import Path
 
@@ -10,15 +10,17 @@ from dmrl.geometry.frames import AIDECK_PINHOLE, camera_from_horizontal
 from dmrl.learn.data.batches import Batch
 from dmrl.learn.networks.architectures import build_network
 from dmrl.learn.training.config import TrainConfig
-from dmrl.learn.training.consistency import LENS, UnlabelledImages, carry_over, fuse
+from dmrl.learn.training.consistency import LENS, UnlabelledImages, compare
 from dmrl.learn.training.train_step import LOSS_NAMES, compute_losses
 
 LENS_PX = AIDECK_PINHOLE.image_from_optical[[0, 1, 0, 1], [0, 1, 2, 2]]
 CELL_PX = 8
 
 
-def pose_of(time_s: float, xyz: tuple[float, float, float], *angles: float) -> np.ndarray:
-    return np.array([time_s, *xyz, *angles, *LENS_PX], np.float32)
+def pose_of(
+    time_s: float, xyz: tuple[float, float, float], *angles: float, camera: int = 0
+) -> np.ndarray:
+    return np.array([time_s, *xyz, *angles, *LENS_PX, camera], np.float32)
 
 
 def cell_of(world: np.ndarray, pose: np.ndarray) -> tuple[float, float, float]:
@@ -50,7 +52,7 @@ def test_a_peak_is_carried_to_where_the_peer_is_in_the_other_image() -> None:
         pose_of(0.0, (0.0, 0.0, 1.0), 0.1, 0.05, -0.04),
         pose_of(0.2, (0.2, -0.15, 1.05), 0.3, -0.06, 0.08),
     ]
-    support, depth_m = carry_over(*see([peer, peer], poses))
+    _, support, depth_m = compare(*see([peer, peer], poses))
     for k, pose in enumerate(poses):
         u, v, depth = cell_of(peer, pose)
         assert divmod(int(support[k].argmax()), 40) == (int(v), int(u))
@@ -62,22 +64,73 @@ def test_what_two_images_agree_on_is_believed_and_a_single_alarm_is_not() -> Non
     peer, alarm = np.array([1.2, 0.1, 1.0]), np.array([1.0, -0.5, 1.0])
     poses = [pose_of(0.1 * k, (0.05 * k, 0.0, 1.0), 0.0, 0.0, 0.0) for k in range(2)]
     for places, grows in (([peer, peer], True), ([peer, alarm], False)):
-        sure, *rest = see(places, poses, confidence=0.5)
-        fused = fuse(sure, carry_over(sure, *rest)[0])
-        assert bool((fused.amax(dim=(1, 2)) > 0.5).all()) is grows
+        probability, _, _ = compare(*see(places, poses, confidence=0.5))
+        assert bool((probability.amax(dim=(1, 2)) > 0.5).all()) is grows
 
 
-def test_only_images_of_one_camera_that_are_close_in_time_are_paired() -> None:
-    time_s = np.tile(np.arange(20) * 0.1, 2)
-    poses = np.stack([pose_of(t, (0.0, 0.0, 1.0), 0.0, 0.0, 0.0) for t in time_s])
-    pixels = np.zeros((40, 8, 8, 3), np.uint8)
-    pixels[:, 0, 0, 0] = np.arange(40)
-    images = UnlabelledImages((Path("a"),), pixels, poses, np.repeat([0, 1], 20))
-    batch = images.draw(6, (0, 1))
-    numbers = batch.images[:, 0, 0, 0].numpy().astype(int).reshape(6, 2)
+def face_each_other() -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Two robots 1.5 m apart, one 0.2 m higher, each with its own origin; and where each sees."""
+    poses = [
+        pose_of(0.1, (0.0, 0.0, 1.0), 0.0, 0.05, -0.04, camera=0),
+        pose_of(0.1, (7.0, 2.0, 1.2), 2.0, -0.06, 0.08, camera=1),
+    ]
+    ahead = np.array([np.cos(2.0), np.sin(2.0), 0.0])
+    return [np.array([1.5, 0.0, 1.2]), poses[1][1:4] + 1.5 * ahead + [0.0, 0.0, -0.2]], poses
+
+
+def test_two_robots_that_see_each_other_support_each_other() -> None:
+    places, poses = face_each_other()
+    sure, log_depth, offset, lens = see(places, poses, confidence=0.5)
+    log_depth[1] += np.log(1.1)  # the second robot overestimates the depth by a tenth
+    probability, support, _ = compare(sure, log_depth, offset, lens)
+    for k, (place, pose) in enumerate(zip(places, poses, strict=True)):
+        u, v, _ = cell_of(place, pose)
+        assert float(probability[k, int(v), int(u)]) > 0.6
+    assert not support.any()  # the distance is no target
+
+
+@pytest.mark.parametrize("change", ["farther", "higher"])
+def test_a_robot_elsewhere_neither_supports_nor_refutes(change: str) -> None:
+    places, poses = face_each_other()
+    if change == "farther":
+        places[1] = poses[1][1:4] + 2 * (places[1] - poses[1][1:4])
+    else:
+        places[1] = places[1] + [0.0, 0.0, 0.5]
+    sure, *rest = see(places, poses, confidence=0.5)
+    probability, _, _ = compare(sure, *rest)
+    torch.testing.assert_close(probability, sure, atol=0.01, rtol=0.01)
+
+
+def draw_numbers(images: int, cameras: int, offset_s: float, flights: list[int]) -> np.ndarray:
+    """Draw pairs of images of some cameras in turn; return (M, 2) their numbers."""
+    poses = [
+        pose_of(0.1 * k + offset_s * c, (0.0, 0.0, 1.0), 0.0, 0.0, 0.0, camera=c)
+        for c in range(cameras)
+        for k in range(images)
+    ]
+    pixels = np.zeros((len(poses), 8, 8, 3), np.uint8)
+    pixels[:, 0, 0, 0] = np.arange(len(poses))
+    flight = np.repeat(flights, images)
+    batch = UnlabelledImages((Path("a"),), pixels, np.stack(poses), flight).draw(6, (0, 1))
+    assert batch.poses is not None and torch.isnan(batch.robots).all()
+    return batch.images[:, 0, 0, 0].numpy().astype(int).reshape(6, 2)
+
+
+@pytest.mark.parametrize(("offset_s", "flights"), [(0.05, [0, 0]), (0.0, [0, 1])])
+def test_images_of_one_camera_that_are_close_in_time_are_paired(
+    offset_s: float, flights: list[int]
+) -> None:
+    numbers = draw_numbers(20, 2, offset_s, flights)
     assert (numbers[:, 0] // 20 == numbers[:, 1] // 20).all()
     assert np.isin(np.diff(numbers)[:, 0], range(1, 5)).all()
-    assert batch.poses is not None and torch.isnan(batch.robots).all()
+
+
+@pytest.mark.parametrize(("images", "mutual"), [(20, 6), (4, 4)])
+def test_images_of_two_robots_at_the_same_time_are_paired_first(images: int, mutual: int) -> None:
+    numbers = draw_numbers(images, 2, 0.01, [0, 0])
+    two = numbers[:, 0] // images != numbers[:, 1] // images
+    assert len(numbers) >= 5 and two.sum() == mutual
+    assert (numbers[two, 0] % images == numbers[two, 1] % images).all()
 
 
 def test_images_without_labels_count_for_no_other_loss() -> None:

@@ -120,7 +120,7 @@ def test_every_weight_changes_the_loss_by_its_own_term(key: str) -> None:
     robots = torch.tensor([[[20.0, 12.0, 1.5, 1.0, 1.0, 0.1, 15.0, 8.0, 25.0, 16.0, 1.0]]])
     wanted = build_targets(robots.repeat(2, 1, 1), (4, 5), sigma_cells=0.7)
     # A pair of images of a camera at rest, whose lens is given in cells.
-    wanted = wanted._replace(poses=torch.tensor([[0.0] * 7 + [5.0, 5.0, 2.5, 2.0]] * 2))
+    wanted = wanted._replace(poses=torch.tensor([[0.0] * 7 + [5.0, 5.0, 2.5, 2.0, 0.0]] * 2))
     with torch.no_grad():
         out = unbind_channels(network.channels, network(torch.ones(2, 3, 32, 40)))
     before = compute_loss_terms(out, wanted, settings)
