@@ -5,6 +5,7 @@ import json
 import re
 from collections import Counter
 from dataclasses import asdict
+from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -259,6 +260,17 @@ def test_every_shipped_pipeline_can_be_loaded(name: str) -> None:
 @pytest.mark.parametrize("name", ["paper", "published"])
 def test_recipes_of_the_paper_have_figures_that_name_their_steps(name: str) -> None:
     assert load_shipped(name).pictured
+
+
+@pytest.mark.parametrize("name", ["adapt", "adapt_own"])
+def test_adapting_calibrates_on_images_that_it_does_not_learn_from(name: str) -> None:
+    (step,) = (
+        one
+        for one in load_shipped(name).steps
+        if "recordings" in one.inputs and "val" in one.settings
+    )
+    held = [one for one in step.inputs["recordings"] if fnmatch(one, step.settings["val"])]
+    assert held == ["held.mcap"] and step.settings["split"] == "none"
 
 
 def test_figure_of_an_unknown_output_is_a_fault(tmp_path: Path) -> None:
