@@ -1,10 +1,10 @@
 """A topic of a recording as an object: its messages as a table."""
 
-import math
 from collections.abc import Sequence
 from importlib.util import find_spec
+from math import isinf, isnan, nan
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +19,14 @@ from dmrl.recording.mcap.message_batch import MAX_TIME_NS
 if TYPE_CHECKING:
     import pandas as pd
 
+NULLABLE: dict[pa.DataType, Any] = {
+    pa.int32(): "Int32",
+    pa.uint32(): "UInt32",
+    pa.int64(): "Int64",
+    pa.uint64(): "UInt64",
+}
+"""Types of pandas for integers with absent values. A float rounds those over 2**53."""
+
 
 def to_log_time(time_s: float | None, start_ns: int) -> int | None:
     """Return the log time, nanoseconds, of seconds from a start; None stays None.
@@ -32,9 +40,15 @@ def to_log_time(time_s: float | None, start_ns: int) -> int | None:
     """
     if time_s is None:
         return None
-    if math.isnan(time_s):
-        raise SettingError("nan is no time. Give seconds from the start of the recording, or None")
-    if math.isinf(time_s):
+    try:
+        unknown = isnan(time_s)
+    except TypeError:
+        unknown = True
+    if unknown:
+        raise SettingError(
+            f"{time_s!r:.40} is no time. Give seconds from the start of the recording, or None"
+        )
+    if isinf(time_s):
         return MAX_TIME_NS if time_s > 0 else 0
     return min(max(start_ns + round(time_s * 1e9), 0), MAX_TIME_NS)
 
@@ -59,16 +73,25 @@ def to_data_frame(table: pa.Table, start_ns: int, *, foreign: bool = False) -> "
     if find_spec("pandas") is None:
         raise MissingExtra("pandas", "table", "a data frame")
     frame: pd.DataFrame = table.to_pandas()
+    for name in _list_gappy_integers(table):
+        frame[name] = np.array(table[name].to_pylist(), object)
+        frame[name] = frame[name].astype(NULLABLE[table[name].type])
     if "time_s_" not in frame.columns:
         frame = frame.rename(columns={"time_s": "time_s_"})
-    if "status" in frame.columns and not foreign:
-        known = frame["status"].notna()  # of an image without peers it is not
-        names = [to_status_name(int(number)) for number in frame["status"][known]]
-        frame["status"] = frame["status"].astype(object)
-        frame.loc[known, "status"] = names
+    for name in () if foreign else frame.columns:
+        if name.rpartition(".")[2] == "status":  # of an image without peers it is absent
+            numbers = table[name].to_pylist()
+            words = [nan if one is None else to_status_name(one) for one in numbers]
+            frame[name] = np.array(words, object)
     frame.index = (frame["log_time"] - start_ns) / 1e9
     frame.index.name = "time_s"
     return frame
+
+
+def _list_gappy_integers(table: pa.Table) -> list[str]:
+    """Return columns with absent values among integers, which would become floats."""
+    names = table.column_names
+    return [name for name in names if table[name].type in NULLABLE and table[name].null_count]
 
 
 class Topic:
@@ -155,6 +178,7 @@ class Topic:
         Fields of a message within are columns of their own, ``pose.position.x``. A message is one
         row, unless it holds a list of messages, such as the peers of PeerLabels: then each item is
         a row, and a message without items one row with empty cells. Row k has item k of every list.
+        Integers with empty cells are of a nullable type of pandas, such as Int64.
 
         Raises
         ------
@@ -176,10 +200,13 @@ class Topic:
         """Return an (N,) structured array: ``array["height_m"]`` is a field of all messages.
 
         Its rows are those of `to_pandas`, so N is not the number of messages if these hold lists
-        of messages. Texts, bytes and lists of values are objects.
+        of messages. Texts, bytes and lists of values are objects, and so are integers of a column
+        with absent ones, which are None.
         """
         table = flatten_table(self.to_arrow(fields=fields, start_s=start_s, end_s=end_s))
         columns = {name: table[name].to_numpy() for name in table.column_names}
+        for name in _list_gappy_integers(table):
+            columns[name] = np.array(table[name].to_pylist(), object)
         out = np.empty(table.num_rows, [(name, c.dtype) for name, c in columns.items()])
         for name, column in columns.items():
             out[name] = column

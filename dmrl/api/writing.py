@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dmrl import topics
+from dmrl.api.given_values import is_plain, require_values, to_column, to_log_times
 from dmrl.api.recordings import PathLike, Recording
 from dmrl.errors import RecordingError, SettingError
 from dmrl.geometry.camera_file import find_camera, warn_of_mount
@@ -20,8 +21,8 @@ from dmrl.recording import RecordingWriter, build_provenance
 from dmrl.samples import sample
 from dmrl.storage import to_path
 
-LATEST_TIME_S = 9.2e9
-"""Beyond it whole nanoseconds do not fit into 64 bits; seconds, the year 2261."""
+MISFITS = (TypeError, ValueError, OverflowError)
+"""What values that do not fit their fields raise."""
 
 
 @runtime_checkable
@@ -66,18 +67,27 @@ class Writer:
         self._lock = Lock()
         self._sink = RecordingWriter(self.path, build_provenance("python", dict(settings)))
 
-    def write(self, topic: str, time_s: float, fields: Mapping[str, Any] | HasFields) -> None:
+    def write(
+        self,
+        topic: str,
+        time_s: float | None = None,
+        fields: Mapping[str, Any] | HasFields | None = None,
+        *,
+        time_ns: int | None = None,
+    ) -> None:
         """Append a message. Times need not increase.
 
         Parameters
         ----------
         topic
-            One of dmrl's, such as ``/cf1/height``; README.md has the table.
+            One of dmrl's, such as ``/cf1/height``; docs/formats.md has the table.
         time_s
-            The sensor's time, seconds from 0.
+            The sensor's time, seconds of log time: from 0, not from the start of a recording.
         fields
             Of the message, as in its schema: ``{"height_m": 0.4}``. A message within is a
             mapping, a repeated one a list of mappings. Or a message of another recording.
+        time_ns
+            In place of ``time_s``: whole nanoseconds of log time, as a recording has them.
 
         Raises
         ------
@@ -86,26 +96,26 @@ class Writer:
         UnsafeName
             If the name of a robot in the topic cannot be one.
         SettingError
-            Outside of the ``with`` block.
+            Outside of the ``with`` block, without fields, or without exactly one of the times.
         """
-        kind, (time_ns,) = _find_message(topic), self._log_times(topic, [time_s])
-        try:
-            if isinstance(fields, HasFields):
-                made = _copy_message(fields, kind)
-            else:
-                made = message_class(kind)(**fields)
-                _require_values(made.DESCRIPTOR, fields)
-        except (TypeError, ValueError) as e:
-            raise self._misfit_error(topic, kind, e) from e
+        kind, moment = _find_message(topic), self._log_time(topic, time_s, time_ns)
+        made = self._build_message(topic, kind, fields)
         with self._lock:
-            self._sink.write(int(time_ns), topic, made)
+            self._sink.write(moment, topic, made)
 
-    def write_columns(self, topic: str, time_s: ArrayLike, fields: Mapping[str, ArrayLike]) -> None:
-        """Append many messages of one topic.
+    def write_columns(
+        self,
+        topic: str,
+        time_s: ArrayLike | None = None,
+        fields: Mapping[str, ArrayLike] | None = None,
+        *,
+        time_ns: ArrayLike | None = None,
+    ) -> None:
+        """Append many messages of one topic: all of them, or none if one does not fit.
 
         Parameters
         ----------
-        topic, time_s, fields
+        topic, time_s, fields, time_ns
             As `write` takes them; times (N,), and of each field (N, ...).
 
         Raises
@@ -115,27 +125,40 @@ class Writer:
         SettingError
             If a column is not as long as the times.
         """
-        times = self._to_seconds(topic, time_s)
-        columns = {name: _to_column(topic, name, values) for name, values in fields.items()}
+        times = self._log_times(topic, time_s, time_ns)
+        if fields is None:
+            raise SettingError(f"{self.path}: {topic} without fields. Give a mapping of them")
+        columns = {name: to_column(topic, name, values) for name, values in fields.items()}
         if wrong := [name for name, column in columns.items() if len(column) != len(times)]:
             raise SettingError(
                 f"{topic}: {len(columns[wrong[0]])} values of {wrong[0]} at {len(times)} times. "
                 "Give as many of each"
             )
-        if any(column.dtype.kind not in "biufUS" for column in columns.values()):
-            rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-            for time, row in zip(times.tolist(), rows, strict=True):
-                self.write(topic, time, dict(zip(columns, row, strict=True)))
+        kind = _find_message(topic)
+        message = message_class(kind)
+        if all(is_plain(message.DESCRIPTOR, name, column) for name, column in columns.items()):
+            try:
+                with self._lock:
+                    self._sink.write_columns(topic, message, times, columns)
+            except MISFITS as e:
+                raise self._misfit_error(topic, kind, e) from e
             return
-        kind, time_ns = _find_message(topic), self._log_times(topic, times)
-        try:
-            with self._lock:
-                self._sink.write_columns(topic, message_class(kind), time_ns, columns)
-        except (TypeError, ValueError) as e:
-            raise self._misfit_error(topic, kind, e) from e
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        made = [
+            self._build_message(topic, kind, dict(zip(columns, row, strict=True))) for row in rows
+        ]
+        with self._lock:
+            for moment, one in zip(times.tolist(), made, strict=True):
+                self._sink.write(moment, topic, one)
 
     def image(
-        self, robot: str, time_s: float, rgb: NDArray[np.uint8], *, quality: int | None = None
+        self,
+        robot: str,
+        time_s: float | None = None,
+        rgb: NDArray[np.uint8] | None = None,
+        *,
+        quality: int | None = None,
+        time_ns: int | None = None,
     ) -> None:
         """Append an image.
 
@@ -144,11 +167,13 @@ class Writer:
         robot
             Robot that carries the camera.
         time_s
-            Time of its exposure, seconds.
+            Time of its exposure, as `write` takes it.
         rgb
             (H, W, 3) uint8, or (H, W) grey.
         quality
             Of a JPEG, 1 to 100. None: PNG, which loses nothing.
+        time_ns
+            In place of ``time_s``, as `write` takes it.
 
         Raises
         ------
@@ -174,12 +199,21 @@ class Writer:
         whole = np.ascontiguousarray(every)
         data = encode_png(whole) if quality is None else encode_jpeg(whole, quality)
         kind = "png" if quality is None else "jpeg"
-        (time_ns,) = self._log_times(topics.CAMERA_IMAGE(robot), [time_s])
+        moment = self._log_time(topics.CAMERA_IMAGE(robot), time_s, time_ns)
         with self._lock:
-            self._sink.write_sample(sample.build_image(int(time_ns), robot, data, kind))
+            self._sink.write_sample(sample.build_image(moment, robot, data, kind))
 
-    def camera(self, robot: str, camera: Camera | PathLike, time_s: float = 0.0) -> None:
+    def camera(
+        self,
+        robot: str,
+        camera: Camera | PathLike,
+        time_s: float | None = None,
+        *,
+        time_ns: int | None = None,
+    ) -> None:
         """Append the calibration of a robot's camera: of a camera file, aideck or published.
+
+        Its time is that of `write`; without one, 0.
 
         Raises
         ------
@@ -188,30 +222,40 @@ class Writer:
         """
         known = camera if isinstance(camera, Camera) else find_camera(to_path(camera))
         warn_of_mount(robot, known)
-        (time_ns,) = self._log_times(topics.CALIBRATION(robot), [time_s])
+        if time_s is None and time_ns is None:
+            time_ns = 0
+        moment = self._log_time(topics.CALIBRATION(robot), time_s, time_ns)
         with self._lock:
-            self._sink.write_sample(sample.build_calibration(int(time_ns), robot, known))
+            self._sink.write_sample(sample.build_calibration(moment, robot, known))
 
-    def _log_times(self, topic: str, time_s: ArrayLike) -> NDArray[np.int64]:
+    def _log_time(self, topic: str, time_s: float | None, time_ns: int | None) -> int:
+        seconds, whole = (None if time is None else [time] for time in (time_s, time_ns))
+        return int(self._log_times(topic, seconds, whole)[0])
+
+    def _log_times(
+        self, topic: str, time_s: ArrayLike | None, time_ns: ArrayLike | None
+    ) -> NDArray[np.int64]:
         """Return (N,) log times, nanoseconds."""
         if self._done:
             raise SettingError(f"{self.path} is written. Open another with dmrl.writer")
         if not self._is_open:
             raise SettingError(f"{self.path} is not open. Use: with dmrl.writer(...) as out")
-        times = self._to_seconds(topic, time_s)
-        if not ((times >= 0) & (times < LATEST_TIME_S)).all():
-            wrong = times[~((times >= 0) & (times < LATEST_TIME_S))][0]
-            raise RecordingError(
-                f"{self.path}: {topic} at {wrong:g} s. Give seconds from 0 to {LATEST_TIME_S:g}"
-            )
-        return np.rint(times * 1e9).astype(np.int64)
+        return to_log_times(f"{self.path}: {topic}", time_s, time_ns)
 
-    def _to_seconds(self, topic: str, time_s: ArrayLike) -> NDArray[np.float64]:
-        """Return (N,) times; raise RecordingError unless they are numbers."""
-        times = np.asarray(time_s)
-        if times.ndim != 1 or (times.size and times.dtype.kind not in "biuf"):
-            raise RecordingError(f"{self.path}: {topic} at {time_s!r:.80}. Give seconds as numbers")
-        return times.astype(float)
+    def _build_message(
+        self, topic: str, kind: str, fields: Mapping[str, Any] | HasFields | None
+    ) -> Any:
+        """Return the message of a topic; raise RecordingError unless the fields fit."""
+        if fields is None:
+            raise SettingError(f"{self.path}: {topic} without fields. Give a mapping of them")
+        try:
+            if isinstance(fields, HasFields):
+                return _copy_message(fields, kind)
+            message = message_class(kind)
+            require_values(message.DESCRIPTOR, fields)
+            return message(**fields)
+        except MISFITS as e:
+            raise self._misfit_error(topic, kind, e) from e
 
     def _misfit_error(self, topic: str, kind: str, error: Exception) -> RecordingError:
         why = str(error).rstrip(".")
@@ -249,34 +293,11 @@ def writer(path: PathLike, /, **settings: Any) -> Writer:
     return Writer(path, settings)
 
 
-def _to_column(topic: str, name: str, values: ArrayLike) -> NDArray[Any]:
-    """Return the values of a field as an array along times; lists of unlike lengths as objects."""
-    try:
-        column = np.asarray(values)
-    except ValueError:
-        column = np.fromiter(iter(values), object)  # type: ignore[arg-type]
-    if not column.ndim:
-        raise SettingError(f"{topic}: one value of {name} at several times. Give one for each")
-    return column
-
-
-def _require_values(kind: Any, fields: Mapping[str, Any]) -> None:
-    """Raise ValueError if a field is None that would be stored as 0 or as an empty text."""
-    for name, value in fields.items():
-        field = kind.fields_by_name[name]
-        if value is None and not field.is_repeated and not field.has_presence:
-            raise ValueError(f"{name} has no value")
-        if field.message_type is not None:
-            for one in value if field.is_repeated and value else [value]:
-                if isinstance(one, Mapping):
-                    _require_values(field.message_type, one)
-
-
 def _find_message(topic: str) -> str:
     row = topics.find_topic(topic)
     if row is None or row.message.endswith("*"):
         raise RecordingError(
-            f"dmrl has no topic {topic} of a known message. Name one of the table in README.md"
+            f"dmrl has no topic {topic} of a known message. Name one of docs/formats.md"
         )
     for what, name in (topics.parse_topic(row.pattern, topic) or {}).items():
         check_topic_part(name, what)

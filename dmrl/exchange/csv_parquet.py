@@ -27,7 +27,6 @@ from dmrl.atomic_output import atomic_folder
 from dmrl.errors import MissingExtra, RecordingError, UnreadableTopic, UnsafeName
 from dmrl.guards.safe_names import safe_join, to_topic_file_name
 from dmrl.recording import iter_columns, read_summary, read_table
-from dmrl.recording.mcap.message_batch import Ints
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import track
 
@@ -127,38 +126,33 @@ def flatten_table(table: pa.Table) -> pa.Table:
     """Convert structs to columns, and lists of structs to rows: row k has item k of each list.
 
     The columns of a shorter list are null in the rows after its last item. A row without items
-    remains one row.
+    remains one row. Lists within items follow: the other columns are repeated beside their items.
     """
-    return _flatten(table)[0]
+    while True:
+        while any(map(pa.types.is_struct, table.schema.types)):
+            table = table.flatten()
+        lists = [field.name for field in table.schema if _is_struct_list(field.type)]
+        if not lists:
+            return table
+        table = _pair_items(table, lists)
 
 
-def _flatten(table: pa.Table) -> tuple[pa.Table, Ints]:
-    """Return a table as `flatten_table` does, and (N,) the row of ``table`` that each row is of."""
-    total = len(table)
-    while any(map(pa.types.is_struct, table.schema.types)):
-        table = table.flatten()
-    lists = [field.name for field in table.schema if _is_struct_list(field.type)]
-    if not lists:
-        return table, np.arange(total)
-    parts = [_flatten_items(table[name].combine_chunks(), name) for name in lists]
-    heights = np.max([np.bincount(of, minlength=total) for _, of in parts], 0, initial=1)
-    rows, starts = np.repeat(np.arange(total), heights), heights.cumsum() - heights
+def _pair_items(table: pa.Table, lists: list[str]) -> pa.Table:
+    """Return a row with item k of each list for each k, beside the other columns."""
+    lengths = {
+        name: pc.fill_null(pc.list_value_length(table[name]), 0).to_numpy() for name in lists
+    }
+    heights = np.max(list(lengths.values()), 0, initial=1)
+    rows, starts = np.repeat(np.arange(len(table)), heights), heights.cumsum() - heights
     plain = table.drop_columns(lists)
     columns = dict(zip(plain.column_names, plain.take(rows).columns, strict=True))
-    for items, of in parts:
+    for name, length in lengths.items():
+        of = np.repeat(np.arange(len(table)), length)
         places = np.full(len(rows), -1)
-        rank = np.arange(len(of)) - np.searchsorted(of, of)
-        places[starts[of] + rank] = np.arange(len(of))
-        taken = items.take(pa.array(places, mask=places < 0))
-        columns |= zip(taken.column_names, taken.columns, strict=True)
-    return pa.table(columns), rows
-
-
-def _flatten_items(lists: pa.Array, name: str) -> tuple[pa.Table, Ints]:
-    """Return the items of lists as a flat table, and (N,) the list that each row is of."""
-    items, of = _flatten(pa.table({name: pc.list_flatten(lists)}))
-    lengths = pc.fill_null(pc.list_value_length(lists), 0).to_numpy(zero_copy_only=False)
-    return items, np.repeat(np.arange(len(lists)), lengths)[of]
+        places[starts[of] + np.arange(len(of)) - np.searchsorted(of, of)] = np.arange(len(of))
+        items = pc.list_flatten(table[name].combine_chunks())
+        columns[name] = items.take(pa.array(places, mask=places < 0))
+    return pa.table(columns)
 
 
 def _is_struct_list(kind: pa.DataType) -> bool:

@@ -3,9 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
 import pytest
 
 import dmrl
+from dmrl.api.topic import to_data_frame
 from dmrl.errors import MissingTopic, RecordingError, SettingError
 from dmrl.images.codec import decode
 from dmrl.recording import read, read_table
@@ -126,7 +129,30 @@ def test_unknown_field_or_time_is_reported(tmp_path: Path) -> None:
     topic = out.open()["/cf1/height"]
     with pytest.raises(RecordingError, match=r"no field heigth_m\. Did you mean height_m\?"):
         topic.to_numpy(fields=["heigth_m"])
-    with pytest.raises(SettingError, match="nan is no time"):
-        topic.to_arrow(start_s=float("nan"))
+    for wrong in (float("nan"), "a"):
+        with pytest.raises(SettingError, match=r"(nan|'a') is no time"):
+            topic.to_arrow(start_s=wrong)  # type: ignore[arg-type]
     assert len(topic.to_arrow(start_s=-float("inf"), end_s=float("inf"))) == 2
     assert topic.to_arrow(fields="height_m").column_names[2:] == ["height_m"]
+
+
+def test_integers_stay_exact_beside_absent_ones(tmp_path: Path) -> None:
+    """A float would round them."""
+    with dmrl.writer(tmp_path / "a.mcap") as out:
+        out.write("/cf1/tracks", 0.0, {"tracks": [{"id": 7}]})
+        out.write("/cf1/tracks", 0.1, {"tracks": []})
+    topic = out.open()["/cf1/tracks"]
+    numbers = topic.to_pandas()["tracks.id"]
+    assert str(numbers.dtype) == "UInt32" and numbers[0.0] == 7 and numbers.isna()[0.1]
+    assert topic.to_numpy()["tracks.id"].tolist() == [7, None]
+    table = pa.table({"log_time": [0, 1], "count": [2**60 + 1, None]})
+    assert to_data_frame(table, 0)["count"].tolist() == [2**60 + 1, pd.NA]
+
+
+def test_a_status_has_its_name_in_every_data_frame(tmp_path: Path) -> None:
+    with dmrl.writer(tmp_path / "a.mcap") as out:
+        out.write("/cf1/labels", 0.0, {"peers": [{"status": "UNCONVERGED"}]})
+        out.write("/cf1/labels", 0.1, {})
+    rec = out.open()
+    assert rec.labels()["status"][0.0] == "UNCONVERGED"
+    assert rec["/cf1/labels"].to_pandas()["peers.status"][0.0] == "UNCONVERGED"

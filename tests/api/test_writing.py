@@ -51,7 +51,9 @@ def test_wrong_topics_fields_and_lengths_are_reported(tmp_path: Path) -> None:
             out.write_columns("/a/height", [0.0, 0.1], {"height_m": [1.0, 2.0, 3.0]})
         with pytest.raises(RecordingError, match="no field altitude"):
             out.write_columns("/a/height", [0.0, 0.1], {"altitude": [1.0, 2.0]})
-        with pytest.raises(RecordingError, match="takes numbers"):
+        with pytest.raises(
+            RecordingError, match=r"Height: must be real number, not str\. Fix its fields"
+        ):
             out.write_columns("/a/height", [0.0, 0.1], {"height_m": ["low", "high"]})
         with pytest.raises(SettingError, match=r"Give \(H, W, 3\)"):
             out.image("a", 0.0, np.zeros((4, 4, 4), np.uint8))
@@ -142,11 +144,27 @@ def test_threads_share_a_writer(tmp_path: Path) -> None:
 
 
 PIXELS = np.zeros((8, 8, 3), np.uint8)
+MASKED = np.ma.array([999.0, 2.0], mask=[1, 0])
+GRID = "/a/detections/grid"
 
 
 @pytest.mark.parametrize(
     ("write", "error"),
     [
+        (lambda out: out.write("/a/height", fields={}), "has no time, or two"),
+        (lambda out: out.write("/a/height", 0, {}, time_ns=0), "has no time, or two"),
+        (lambda out: out.write("/a/height", time_ns=0), "without fields"),
+        (lambda out: out.write_columns("/a/height", [0]), "without fields"),
+        (lambda out: out.write("/a/height", time_ns=0.5, fields={}), "Give nanoseconds as int"),
+        (lambda out: out.write("/a/height", time_ns=-1, fields={}), "-1 ns. Give nanoseconds from"),
+        (lambda out: out.write_columns("/a/height", MASKED, {"height_m": [1, 2]}), "as numbers"),
+        (lambda out: out.write_columns("/a/height", [0, 1], {"height_m": MASKED}), "masked values"),
+        (lambda out: out.write("/a/height", 0, {"height_m": MASKED[0]}), "height_m has no value"),
+        (lambda out: out.write("/a/labels", 0, {"sources": "truth"}), r"list: \['truth'\]"),
+        (lambda out: out.write_columns("/a/labels", [0], {"sources": ["hand"]}), "sources is a"),
+        (lambda out: out.write_columns(GRID, [0], {"data": np.array([b"a"])}), "list of bytes"),
+        (lambda out: out.write_columns("/a/height", [0, 1], {"height_m": [10**400, 1]}), "Fix"),
+        (lambda out: out.write("/smell", 0, {}), r"table|docs/formats\.md"),
         (lambda out: out.write("/a/height", 0.0, {"height_m": None}), "height_m has no value"),
         (lambda out: out.write("/a/height", "now", {}), "Give seconds as numbers"),
         (lambda out: out.write("/a/height", np.datetime64("2026-01-01"), {}), "Give seconds as"),
@@ -171,3 +189,45 @@ def test_lists_of_unlike_lengths_and_named_cameras_are_written(tmp_path: Path) -
     rec = out.open()
     assert rec["/a/labels"].to_arrow()["sources"].to_pylist() == [["truth"], ["truth", "hand"]]
     assert rec["/a/camera/calibration"].to_arrow()["width"].to_pylist() == [320]
+
+
+def test_texts_and_bytes_of_columns_keep_zeros_at_their_end(tmp_path: Path) -> None:
+    data = [b"a\0\0", b"\0\0\0\0"]
+    with dmrl.writer(tmp_path / "own.mcap") as out:
+        for channels in ([["x"], ["y\0"]], [["x"], ["y", "z\0"]]):
+            out.write_columns(GRID, [0.0, 0.1], {"data": data, "channels": channels})
+        out.write_columns("/a/peer/b/position", [0, 1], {"frame_id": ["a\0", "b"]})
+        statuses = {"status": ["OK", "UNCONVERGED"], "x": [1, 2]}
+        out.write_columns("/a/peer/b/position", [2, 3], statuses)
+    rec = out.open()
+    table = rec[GRID].to_arrow().to_pydict()
+    assert table["data"] == [data[0], data[0], data[1], data[1]]
+    assert table["channels"] == [["x"], ["x"], ["y\0"], ["y", "z\0"]]
+    position = rec["/a/peer/b/position"].to_arrow().to_pydict()
+    assert position["frame_id"][:2] == ["a\0", "b"]
+    assert position["status"][2:] == [0, 1]
+
+
+def test_nanoseconds_are_written_exactly(tmp_path: Path) -> None:
+    ns = 1_764_493_834_123_456_789
+    with dmrl.writer(tmp_path / "own.mcap") as out:
+        out.write("/a/height", time_ns=ns, fields={"height_m": 1.0})
+        out.write_columns("/a/range/b", time_ns=[ns, ns + 1], fields={"range_m": [1.0, 2.0]})
+        out.image("a", rgb=PIXELS, time_ns=ns + 3)
+        out.camera("a", "aideck", time_ns=ns + 5)
+    rec = out.open()
+    times = {name: rec[name].to_numpy()["log_time"].tolist() for name in rec}
+    assert times == {
+        "/a/height": [ns],
+        "/a/range/b": [ns, ns + 1],
+        "/a/camera/image": [ns + 3],
+        "/a/camera/calibration": [ns + 5],
+    }
+
+
+def test_columns_with_one_wrong_row_write_nothing(tmp_path: Path) -> None:
+    with dmrl.writer(tmp_path / "own.mcap") as out:
+        with pytest.raises(RecordingError, match="height_m has no value"):
+            out.write_columns("/a/height", [0.0, 0.1], {"height_m": [1.0, None]})
+        out.write("/a/height", 0.2, {"height_m": 2.0})
+    assert len(out.open()["/a/height"]) == 1

@@ -192,6 +192,14 @@ def _check_sizes(
         yield Finding("error", topic, text)
 
 
+def _check_grids(data: CheckData) -> Iterator[Finding]:
+    """Report grid maps whose data are not of the size that they state."""
+    for topic, wrong in data.misfit_grids.items():
+        if wrong:
+            text = f"{wrong} maps do not have 4 bytes for each cell of each channel"
+            yield Finding("error", topic, text)
+
+
 def _check_calibrations(data: CheckData) -> Iterator[Finding]:
     """Report calibrations that no camera can have, and uncalibrated cameras."""
     for topic, info in data.contents.topics.items():
@@ -211,6 +219,7 @@ RULES: dict[Callable[[CheckData], Iterator[Finding]], bool] = {
     _check_times: True,
     _check_signals: True,
     _check_images: False,
+    _check_grids: False,
     _check_calibrations: False,
     check_labels: True,
     check_causes: False,

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from dmrl.errors import DmrlError, RecordingError
 from dmrl.images.codec import is_decodable, read_size
@@ -23,7 +24,7 @@ from dmrl.recording.protobuf.columns import decode_topic, group_by_topic
 from dmrl.recording.protobuf.message_types import carries_own_type
 from dmrl.recording.reader import iter_columns
 from dmrl.recording.summary import TopicInfo
-from dmrl.topics import CALIBRATION, CAMERA_IMAGE, CAUSES, LABELS, parse_topic
+from dmrl.topics import CALIBRATION, CAMERA_IMAGE, CAUSES, GRID, LABELS, parse_topic
 
 STAMPED_TYPES = ("CompressedImage", "PoseInFrame")
 """Message types that contain a time stamp."""
@@ -80,6 +81,8 @@ class CheckData:
         Log times of the images that cannot be decoded, by topic.
     unset_stamps
         Messages with time stamp 0 and another log time, by topic.
+    misfit_grids
+        Grid maps whose data are not of the size that they state, by topic.
     values
         Counts of the sensor values.
     motion
@@ -95,6 +98,7 @@ class CheckData:
     sizes: dict[str, Counter[ImageSize]] = field(default_factory=lambda: defaultdict(Counter))
     undecodable_ns: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
     unset_stamps: Counter[str] = field(default_factory=Counter)
+    misfit_grids: Counter[str] = field(default_factory=Counter)
     values: ValueCounts = field(default_factory=ValueCounts)
     motion: MotionSamples = field(default_factory=MotionSamples)
     images: ImageSamples = field(default_factory=ImageSamples)
@@ -118,6 +122,8 @@ class CheckData:
         self.motion.add_batch(topic, batch)
         if parse_topic(CAMERA_IMAGE, topic):
             self.images.add_batch(topic, batch, total)
+        if parse_topic(GRID, topic):
+            self.misfit_grids[topic] += _count_misfit_grids(batch)
 
 
 def is_decoded(topic: str, info: TopicInfo) -> bool:
@@ -234,6 +240,13 @@ def _count_unset_stamps(batch: pa.RecordBatch) -> int:
     # A message without a stamp is not counted.
     wrong = to_numpy(stamp.is_valid()) & (seconds == 0) & (nanos == 0)
     return int((wrong & (to_numpy(batch["log_time"]) != 0)).sum())
+
+
+def _count_misfit_grids(batch: pa.RecordBatch) -> int:
+    """Count the grid maps that do not have 4 bytes for each cell of each channel."""
+    rows, cols = (to_numpy(batch[name]).astype(float) for name in ("rows", "cols"))
+    channels = to_numpy(pc.list_value_length(batch["channels"]))
+    return int((to_numpy(pc.binary_length(batch["data"])) != 4 * rows * cols * channels).sum())
 
 
 def _decode_size(data: pa.Buffer) -> ImageSize:

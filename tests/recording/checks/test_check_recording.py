@@ -316,3 +316,15 @@ def test_zero_stamp_counts_only_if_present_and_different_from_log_time(
     assert record(tmp_path / "a.mcap", fill) == [
         "warning /cf1/pose 1 messages have a time stamp of 0"
     ]
+
+
+def test_maps_of_another_size_than_they_state_are_reported(tmp_path: Path) -> None:
+    def fill(write: Write) -> None:
+        for k, size in enumerate((48, 48, 44, 0)):
+            made = message_class("GridMap")(
+                rows=2, cols=3, channels=["a", "b"], data=bytes(size), stride_px=8
+            )
+            write(k, "/cf1/detections/grid", made)
+
+    (found,) = record(tmp_path / "a.mcap", fill)
+    assert found.startswith("error /cf1/detections/grid 2 maps do not have 4 bytes for each cell")
