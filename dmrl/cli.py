@@ -108,15 +108,18 @@ for _place, (_title, _names) in enumerate(GROUPS.items()):
         app.command(_run, name=_name, group=_group, sort_key=COMMANDS.index(_name))
 
 
-def add_plugin_commands() -> App:
+def add_plugin_commands(called: str = "") -> App:
     """Add the commands of other packages to the command line.
 
-    `main` does so only if dmrl has no such command: it takes 50 ms, a third of the start.
+    Their help is the summary of their package, so that a list imports none; that of the command
+    that is ``called`` is its docstring. `main` does so only if dmrl has no such command: it takes
+    50 ms, a third of the start.
     """
     for name, plugin in entry_points.find_plugins(entry_points.STAGES).items():
         if name not in COMMANDS and name not in app:
             words = f"{plugin.summary} (of the package {plugin.package})".strip()
-            app.command(f"dmrl.entry_points:{name}", name=name, help=words, sort_key=len(COMMANDS))
+            shown = {} if name == called else {"help": words}
+            app.command(f"dmrl.entry_points:{name}", name=name, sort_key=len(COMMANDS), **shown)
     return app
 
 
@@ -134,7 +137,7 @@ def _run_command() -> None:
     use_own_temporary_folder()
     name, *words = sys.argv[1:] or [""]
     if name not in COMMANDS:
-        add_plugin_commands()
+        add_plugin_commands(called=name)
     for one in COMMANDS if name in ("--help", "-h") or not sys.argv[1:] else ():
         app[one]  # is loaded for its line of help
     if name in COMMANDS and not set(app.help_flags).isdisjoint(words):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from dmrl.learn.networks.architectures import ConvNorm as ConvNorm
     from dmrl.learn.networks.architectures import Network as Network
     from dmrl.pipeline.stage_command import stage_command as stage_command
+    from dmrl.recording.provenance_inputs import build_provenance as build_provenance
     from dmrl.samples.flight import iter_ranges as iter_ranges
     from dmrl.samples.flight import merge_by_time as merge_by_time
     from dmrl.samples.flight import to_nanoseconds as to_nanoseconds
@@ -43,6 +44,7 @@ PLACES = {
     "Sample": "dmrl.samples.sample",
     "Task": "dmrl.flight.pilot",
     "build_image": "dmrl.samples.sample",
+    "build_provenance": "dmrl.recording.provenance_inputs",
     "merge_by_time": "dmrl.samples.flight",
     "to_nanoseconds": "dmrl.samples.flight",
     "iter_ranges": "dmrl.samples.flight",

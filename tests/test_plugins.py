@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from dmrl import entry_points, plugins
+from dmrl.api.writing import writer
 from dmrl.errors import PluginError, SettingError, SourceError
 from dmrl.formats.registry import find_format
 from dmrl.learn.inference.loaded_model import Model, load_model, save_model
@@ -20,6 +22,7 @@ from dmrl.recording import read_summary, read_table
 from dmrl.stages import convert
 
 Install = Callable[..., None]
+EXTEND = Path(__file__).parents[1] / "docs" / "extend.md"
 
 FORMAT = """
     from dmrl import topics
@@ -102,9 +105,9 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         sys.modules.pop(path.stem, None)
 
 
-def dmrl(*arguments: str) -> subprocess.CompletedProcess[str]:
+def dmrl(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "dmrl.cli", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
 
 
 @pytest.mark.parametrize("kind", ["altitudes", None])
@@ -266,6 +269,57 @@ def test_a_stage_of_another_package_is_built_from_its_run(install: Install, tmp_
     assert out.read_text() == "a.mcapa.mcap"
     helped = dmrl("say-it", "--help").stdout
     assert "What to copy." in helped and "--workers" in helped
+
+
+@pytest.fixture
+def smooth(install: Install, tmp_path: Path) -> Path:
+    """The command of docs/extend.md, and a folder with a recording of heights."""
+    page = EXTEND.read_text(encoding="utf-8")
+    install("smooth", page.split("```python\n")[1].split("```")[0], stages="smooth = smooth")
+    (tmp_path / "in").mkdir()
+    with writer(tmp_path / "in" / "a.mcap") as out:
+        out.write_columns("/cf1/height", [5.0, 6.0, 7.0], {"height_m": [1.0, 3.0, 8.0]})
+    return tmp_path / "in"
+
+
+@pytest.mark.heavy
+def test_documented_command_runs_over_a_folder_and_resumes(smooth: Path, tmp_path: Path) -> None:
+    assert "was there" not in dmrl("smooth", "in", "out", "--window", "2", cwd=tmp_path).stdout
+    table = read_table(tmp_path / "out" / "a.mcap", "/cf1/height")
+    assert table["height_m"].to_pylist() == [1.0, 2.0, 5.5]
+    assert table["log_time"].to_pylist() == [5 * 10**9, 6 * 10**9, 7 * 10**9]
+    assert "was there" in dmrl("smooth", "in", "out", "--window", "2", cwd=tmp_path).stdout
+    done = dmrl("smooth", "in", "out", "--window", "3", cwd=tmp_path)
+    assert done.returncode == 1 and "names other inputs or settings" in done.stderr
+    helped = dmrl("smooth", "--help").stdout
+    assert "Smooth the heights of a recording." in helped and "Made by others" not in helped
+    assert "Made by others" in dmrl("--help").stdout
+
+
+@pytest.mark.heavy
+def test_settings_of_a_command_are_keys_of_a_step(smooth: Path, tmp_path: Path) -> None:
+    recipe = tmp_path / "recipe.toml"
+    step = '[[step]]\nstage = "smooth"\nout = "b.mcap"\nrecording = "{data}/a.mcap"\n'
+    recipe.write_text(f'kind = "pipeline"\n{step}window = 2\n')
+    done = dmrl("run", str(recipe), "--data", "in", "--out", "made", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    table = read_table(tmp_path / "made" / "b.mcap", "/cf1/height")
+    assert table["height_m"].to_pylist() == [1.0, 2.0, 5.5]
+
+
+def test_arguments_that_a_folder_form_would_lose_are_refused() -> None:
+    def run(recording: Path, out: Path, *, window: int = 3) -> None:
+        """Do nothing."""
+
+    with pytest.raises(TypeError, match=r"run\(\) takes window, .* dataclass"):
+        plugins.stage_command(run, plugins.Closing(), folder="recording")
+    assert callable(plugins.stage_command(run, plugins.Closing()))
+
+
+def test_names_for_plugins_are_documented() -> None:
+    rows = EXTEND.read_text(encoding="utf-8").split("| from `dmrl.plugins` |")[1].split("\n\n")[0]
+    named = [name for row in rows.splitlines()[2:] for name in re.findall(r"`(\w+)`", row)]
+    assert sorted(named) == sorted(plugins.PLACES)
 
 
 @pytest.mark.parametrize("name", plugins.PLACES)

@@ -12,9 +12,8 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from numpy.typing import ArrayLike, NDArray
 
 from dmrl.errors import RecordingError, SettingError
+from dmrl.samples.flight import LATEST_TIME_S
 
-LATEST_TIME_S = 9.2e9
-"""Beyond it whole nanoseconds do not fit into 64 bits; seconds, the year 2261."""
 TEXT_TYPES = (FieldDescriptor.TYPE_STRING, FieldDescriptor.TYPE_BYTES)
 
 

@@ -17,7 +17,7 @@ from dmrl.guards import limits
 from dmrl.guards.safe_names import check_topic_part
 from dmrl.images.codec import encode_jpeg, encode_png
 from dmrl.messages import message_class
-from dmrl.recording import RecordingWriter, build_provenance
+from dmrl.recording import Provenance, RecordingWriter, build_provenance
 from dmrl.samples import sample
 from dmrl.storage import to_path
 
@@ -52,8 +52,8 @@ class Writer:
     ----------
     path
         File to write. Must not exist.
-    settings
-        Plain values for the provenance, such as the source of the data.
+    made
+        Its provenance; or plain values for one, such as the source of the data.
 
     Raises
     ------
@@ -61,11 +61,13 @@ class Writer:
         If the file exists, is not called ``.mcap``, or cannot be written.
     """
 
-    def __init__(self, path: PathLike, settings: Mapping[str, Any]) -> None:
+    def __init__(self, path: PathLike, made: Mapping[str, Any] | Provenance) -> None:
         self.path = to_path(path)
         self._is_open, self._done = False, False
         self._lock = Lock()
-        self._sink = RecordingWriter(self.path, build_provenance("python", dict(settings)))
+        if not isinstance(made, Provenance):
+            made = build_provenance("python", dict(made))
+        self._sink = RecordingWriter(self.path, made)
 
     def write(
         self,
@@ -281,8 +283,24 @@ class Writer:
             self._sink.__exit__(*raised)
 
 
-def writer(path: PathLike, /, **settings: Any) -> Writer:
-    """Return a `Writer`, with the same parameters and errors.
+def writer(path: PathLike, provenance: Provenance | None = None, /, **settings: Any) -> Writer:
+    """Return a `Writer`.
+
+    Parameters
+    ----------
+    path
+        File to write. Must not exist.
+    provenance
+        Stage, settings and inputs, of `dmrl.plugins.build_provenance`. None: a stage "python".
+    **settings
+        In place of it: plain values, such as the source of the data.
+
+    Raises
+    ------
+    SettingError
+        If there are both.
+    OutputError
+        As `Writer`.
 
     Examples
     --------
@@ -290,7 +308,9 @@ def writer(path: PathLike, /, **settings: Any) -> Writer:
     >>> with dmrl.writer("own.mcap", sensor="my tags") as out:  # doctest: +SKIP
     ...     out.write("/cf1/range/cf2", 0.02, {"range_m": 1.83})
     """
-    return Writer(path, settings)
+    if provenance is not None and settings:
+        raise SettingError(f"{path}: {', '.join(settings)}: give settings to build_provenance")
+    return Writer(path, settings if provenance is None else provenance)
 
 
 def _find_message(topic: str) -> str:

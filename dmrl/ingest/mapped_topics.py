@@ -25,6 +25,8 @@ from dmrl.recording import read_summary
 from dmrl.terminal.left_out import leave_out
 
 LOG_TIME = ":log_time"
+FIELDS_MAX = 20
+"""Fields of a message that an error lists."""
 Cells = dict[str, dict[str, list[str]]]
 """Cells by topic and column, as in a text file."""
 
@@ -100,14 +102,17 @@ def _read_cells(
         If no message of a topic has a number in a field.
     """
     cells: Cells = {topic: {name: [] for name in names} for topic, names in columns.items()}
+    last: dict[str, Any] = {}
     for topic, time_ns, message in _iter_objects(source, columns, kinds, is_bag=is_bag):
+        last[topic] = message
         for name, column in cells[topic].items():
             path = name.rpartition(":")[2].split(".")
             column.append(str(time_ns) if name == LOG_TIME else _find_cell(message, path))
     for topic, held in cells.items():
         for name, column in held.items():
             if not any(is_number(cell) for cell in column):
-                raise SourceError(f"{source}: no message on {topic} has a number in {name}")
+                wrong = f"{source}: no message on {topic} has a number in {name}"
+                raise SourceError(f"{wrong}. {_suggest_field(name, last.get(topic))}")
     return cells
 
 
@@ -150,6 +155,17 @@ def _find_cell(value: Any, path: Sequence[str]) -> str:
     if seconds is not None and nanos is not None:
         value = seconds * 1_000_000_000 + nanos
     return "" if value is None else str(value)
+
+
+def _suggest_field(name: str, message: Any) -> str:
+    """Return the way out of a field without numbers: the fields of a message."""
+    if isinstance(message, Mapping):
+        known = list(map(str, message))
+    elif hasattr(message, "DESCRIPTOR"):
+        known = [field.name for field in message.DESCRIPTOR.fields]
+    else:
+        known = list(getattr(message, "__dict__", ()))
+    return f"Name another field: {', '.join(known[:FIELDS_MAX])}" if known else "Name another field"
 
 
 def _select_topic(log: RobotLog, topic: str, cells: Mapping[str, list[str]]) -> RobotLog | None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
+from inspect import signature
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any
@@ -236,6 +237,8 @@ def _check_input(takes: StageSignature, role: str, value: Any) -> str:
 
 
 def _unknown_key(stage: str, key: str, takes: StageSignature) -> str:
+    if key in signature(takes.run).parameters:
+        return f"{stage} takes it on the command line alone. Leave it out"
     hint = suggest(key, takes.keys, f"See: dmrl {stage} --help")
     return f"{stage} has no such input or setting. {hint}"
 

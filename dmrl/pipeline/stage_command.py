@@ -14,7 +14,7 @@ from typing import Any
 
 from dmrl.guards.posix import count_cores
 from dmrl.pipeline.batch import is_collection, run_over_folder
-from dmrl.pipeline.stage_signature import resolve_hints
+from dmrl.pipeline.stage_signature import resolve_hints, takes_paths
 from dmrl.terminal.arguments import AsJson, Flat, FolderWorkers, On, Workers
 from dmrl.terminal.closing import Closing, Given
 from dmrl.terminal.left_out import count_left_out
@@ -57,9 +57,16 @@ def stage_command(
         Return lines that go to standard error before the result is printed.
     status
         Return the exit status. Without it, 0.
+
+    Raises
+    ------
+    TypeError
+        If the folder form would lose an argument, being neither a path nor of the settings.
     """
     name = name or run.__module__.rpartition(".")[2].replace("_", "-")
     taken = [key for key in inspect.signature(run).parameters if key not in hidden]
+    if folder:
+        _require_settings(run, taken)
     signature = inspect.Signature([*_parameters(run, taken, closing, folder)])
 
     def command(*arguments: Any, **named: Any) -> int | None:
@@ -82,6 +89,17 @@ def stage_command(
     command.__doc__, command.__module__ = run.__doc__, run.__module__
     command.__signature__ = signature  # type: ignore[attr-defined]
     return command
+
+
+def _require_settings(run: Callable[..., Any], taken: list[str]) -> None:
+    """Raise TypeError if an argument is neither a path nor of the settings."""
+    hints = resolve_hints(run)
+    for key in taken:
+        if key not in ("settings", "workers", "resume") and takes_paths(hints[key]) is None:
+            raise TypeError(
+                f"run() takes {key}, which its folder form would lose: make it a field of a "
+                "dataclass, the argument settings"
+            )
 
 
 def _parameters(

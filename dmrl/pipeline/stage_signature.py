@@ -119,7 +119,7 @@ def signature_of(stage: str, *, writes: bool = True) -> StageSignature:
         hint, required = hints[parameter.name], parameter.default is parameter.empty
         if parameter.name in ("out", "settings", "resume"):
             continue
-        if (many := _takes_paths(hint)) is not None:
+        if (many := takes_paths(hint)) is not None:
             roles[parameter.name] = InputRole(many, required)
         elif required:
             others[parameter.name] = hint
@@ -158,7 +158,7 @@ def _load_stage(stage: str) -> Any:
     return import_module(f"{package}.{stage.replace('-', '_')}")
 
 
-def _takes_paths(hint: Any) -> bool | None:
+def takes_paths(hint: Any) -> bool | None:
     """Return whether an annotation is a list of paths; False: one path; None: neither."""
     members = get_args(hint)
     kinds = [one for one in members if one is not type(None)] if type(None) in members else [hint]

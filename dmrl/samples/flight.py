@@ -6,12 +6,14 @@ Times are (N,) int64 nanoseconds, values (N,) arrays.
 import heapq
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dmrl import topics
+from dmrl.errors import SourceError
 from dmrl.geometry.frames import Array, camera_from_horizontal, yaw_matrix
 from dmrl.samples.sample import Columns, Sample, to_timestamp
 
@@ -20,6 +22,8 @@ Times = NDArray[np.int64]
 LOG_COLUMNS = ("roll_rad", "pitch_rad", "yaw_rate_radps", "vx_mps", "vy_mps", "height_m")
 """Columns of a robot's log, as ``build_robot_log`` needs them."""
 
+LATEST_TIME_S = 9.2e9
+"""Beyond it whole nanoseconds do not fit into 64 bits; seconds, the year 2261."""
 START_NS = 1_000_000_000
 """Log time of a simulated start: clocks that run late must not show a time before zero."""
 
@@ -146,8 +150,25 @@ def merge_by_time(streams: Iterable[Iterable[Sample]]) -> Iterator[Sample]:
     return heapq.merge(*streams, key=lambda sample: sample.time_ns)
 
 
-def to_nanoseconds(time_s: Array) -> Times:
-    """Convert (N,) seconds to whole nanoseconds."""
+def to_nanoseconds(time_s: Array, place: str | Path = "the source") -> Times:
+    """Convert (N,) seconds to whole nanoseconds.
+
+    Parameters
+    ----------
+    time_s
+        (N,) seconds.
+    place
+        Where they are from, for the error.
+
+    Raises
+    ------
+    SourceError
+        If one is not a number, or too large for nanoseconds; it names the first.
+    """
+    wrong = ~(np.abs(time_s) < LATEST_TIME_S)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise SourceError(f"{place}: time {time_s[row]:g} s in row {row}. Leave out such rows")
     return np.rint(time_s * 1e9).astype(np.int64)
 
 

@@ -12,6 +12,7 @@ import pytest
 import dmrl
 from dmrl.errors import DmrlError, OutputError, RecordingError, SettingError, UnsafeName
 from dmrl.geometry.frames import Camera
+from dmrl.plugins import build_provenance
 
 
 def test_written_fields_columns_images_and_camera_round_trip(tmp_path: Path) -> None:
@@ -231,3 +232,12 @@ def test_columns_with_one_wrong_row_write_nothing(tmp_path: Path) -> None:
             out.write_columns("/a/height", [0.0, 0.1], {"height_m": [1.0, None]})
         out.write("/a/height", 0.2, {"height_m": 2.0})
     assert len(out.open()["/a/height"]) == 1
+
+
+def test_a_writer_takes_a_provenance_or_settings(tmp_path: Path) -> None:
+    made = build_provenance("smooth", {"window": 2})
+    with dmrl.writer(tmp_path / "own.mcap", made) as out:
+        out.write("/a/height", 0.0, {"height_m": 1.0})
+    assert out.open().provenance == made
+    with pytest.raises(SettingError, match="give settings to build_provenance"):
+        dmrl.writer(tmp_path / "b.mcap", made, sensor="tags")

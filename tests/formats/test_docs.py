@@ -46,6 +46,10 @@ def test_documented_format_example_works(tmp_path: Path) -> None:
         (1_000_000_000, "/cf1/height", pytest.approx(1.6)),
         (1_000_000_000, "/cf1/range/cf3", 2.5),
     ]
+    assert form.uses == {"robot", "names"}
+    path.write_bytes(b"UL2" + np.array([(np.nan, 1.5, 0)], example["RECORD"]).tobytes())
+    with pytest.raises(SourceError, match=r"flight\.ulg2: time nan s in row 0"):
+        form.content(path, Options())
     path.write_bytes(b"UL2")
     with pytest.raises(SourceError, match="has no whole record"):
         form.content(path, Options())

@@ -211,7 +211,7 @@ def test_fields_that_are_no_number_are_counted(tmp_path: Path) -> None:
             '[height]\nvalue = 1\nunit = "m"\n',
             r"\[height\] value: constants are for text files",
         ),
-        (TABLE.replace(":rate", ":turn"), r"no message on /red/att has a number in /red/att:turn"),
+        (TABLE.replace(":rate", ":turn"), r"in /red/att:turn\. Name another field: \w+, \w+"),
         (TABLE.replace("uwb:d", "radio:d"), r"no column /red/radio:d"),
         (TABLE.replace("uwb:d", "uwb:label"), r"has a number in /red/uwb:label"),
         (TABLE.replace('"cf1"', "3"), r"\[names\]: not new names"),

@@ -5,8 +5,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from dmrl.errors import SourceError
 from dmrl.messages import LogType, message_class
 from dmrl.recording.protobuf.encode import encode
+from dmrl.samples.flight import to_nanoseconds
 from dmrl.samples.sample import Columns
 
 TIMES_NS = np.arange(4) * 10
@@ -46,3 +48,11 @@ def test_a_part_of_them_is_nested_too() -> None:
 def test_an_event_without_variables_is_kept() -> None:
     columns = Columns("/c", LogType("c", ()), TIMES_NS, {})
     assert [sample.fields for sample in columns] == [{}] * 4
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -1e10])
+def test_times_that_are_no_seconds_are_named_by_row(wrong: float) -> None:
+    times = np.array([0.0, 1.5, wrong, np.nan])
+    assert to_nanoseconds(times[:2]).tolist() == [0, 1_500_000_000]
+    with pytest.raises(SourceError, match=r"a\.log: time (nan|inf|-1e\+10) s in row 2\."):
+        to_nanoseconds(times, "a.log")

@@ -87,7 +87,7 @@ def count_recording(stream: BoundedReader, section: SummarySection) -> MessageCo
         if count is not None:
             if not own:
                 words = "is large or in a bucket: its statistics count its messages"
-                say_once(f"{stream.path} {words}. To count them all: dmrl check")
+                say_once(f"{stream.path} {words}. dmrl check counts them all")
             return count
     return count_chunks(stream, section)
 
