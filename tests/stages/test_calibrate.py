@@ -6,10 +6,13 @@ import pytest
 from scipy.stats import chi2
 
 from dmrl.errors import MissingTopic, OutputError, RecordingError, SettingError, SourceError
+from dmrl.estimation.calibration.extrinsics import Calibration
+from dmrl.estimation.calibration.observations import Matches, expected_median_px
 from dmrl.flight import NOISE, Scenario, simulate
 from dmrl.geometry.camera_file import format_camera, read_camera
 from dmrl.geometry.frames import AIDECK, Camera
 from dmrl.images.codec import encode_png
+from dmrl.labelling.calibration.flights import _warn_of_residual
 from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter, read
 from dmrl.samples.flight import START_NS
@@ -68,7 +71,27 @@ def test_detections_that_the_camera_does_not_explain_are_doubted(
     begin = tmp_path / "begin.toml"
     begin.write_text(format_camera(near))
     calibrate.run([seen], tmp_path / "out.toml", Settings(against="truth", camera=begin))
-    assert ("doubt: half of its detections" in capsys.readouterr().err) == (focal > 1)
+    said = capsys.readouterr().err
+    assert ("doubt: half of its detections" in said) == (focal > 1)
+    assert ("Check the intrinsics (--camera) and the model" in said) == (focal > 1)
+
+
+def test_residuals_that_the_sigmas_of_positions_explain_are_no_doubt_of_the_camera(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    _warn_of_residual("cf1", Calibration(AIDECK, (0.01, 0.01, 0.01), 0.003, 264, 15.0, 14.0, 22.0))
+    said = capsys.readouterr().err
+    assert "14 px or more from where this calibration expects them. The sigmas of the posi" in said
+    assert "they allow 22 px" in said
+    assert "--camera" not in said
+
+
+def test_stated_errors_give_the_median_distance_of_detections() -> None:
+    apart = np.random.default_rng(0).normal(scale=5.0, size=(20_000, 2))
+    whiten = np.tile(np.eye(2) / 5.0, (20_000, 1, 1))
+    matched = Matches(np.zeros(20_000), apart, np.zeros(20_000, np.int64), whiten, 20_000, 60.0)
+    median = np.median(np.linalg.norm(apart, axis=1))
+    assert expected_median_px(matched) == pytest.approx(median, rel=0.03)
 
 
 def test_labels_made_with_it_lie_where_the_peer_was_seen(

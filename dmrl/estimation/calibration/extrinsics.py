@@ -25,6 +25,7 @@ from dmrl.estimation.calibration.observations import (
     CalibrationFlight,
     Matches,
     PeerView,
+    expected_median_px,
     match_detections,
     median_residual_px,
     pixel_residuals,
@@ -83,6 +84,8 @@ class Calibration:
         Number of detections used.
     before_px, after_px
         Median distance between these and their predictions.
+    expected_px
+        This median by the errors of positions, attitude and detections as they are stated.
     """
 
     camera: Camera
@@ -91,6 +94,7 @@ class Calibration:
     matched: int
     before_px: float
     after_px: float
+    expected_px: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +146,7 @@ def calibrate_mount(
         len(matched.time_s),
         median_residual_px(views, camera, matched, start),
         median_residual_px(views, camera, matched, found.values),
+        expected_median_px(matched),
     )
 
 

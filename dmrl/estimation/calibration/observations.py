@@ -229,3 +229,13 @@ def median_residual_px(
     """Return the median distance of detections from their predictions, pixels."""
     apart = pixel_residuals(views, camera, matched, values)
     return float(np.median(np.linalg.norm(apart, axis=1)))
+
+
+def expected_median_px(matched: Matches) -> float:
+    """Return the median distance of detections from their predictions by the assumed errors alone.
+
+    The positions' covariances are among these errors.
+    """
+    half = np.linalg.inv(matched.whiten)
+    root_px = np.sqrt((half**2).sum(axis=(1, 2)))  # of the covariance's trace
+    return float(np.median(root_px) * np.sqrt(np.log(2)))  # the median of a circular Gaussian

@@ -9,6 +9,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -41,6 +42,9 @@ EDGE_STD_PX = 1.0
 """Standard deviation of an edge of a box that was drawn by hand, pixels."""
 BORDER_PX = 1.0
 """A box this near to the border of its picture may be cut off there."""
+SAME_FOCAL_SHARE = 0.02
+"""Focal lengths of two calibrations of one lens differ by less than this share. No record of how
+the value was chosen."""
 MAX_DEPTH_M = 100.0
 """Larger depths are doubted: a robot of 0.1 m is less than a pixel wide, at 100 px focal length."""
 
@@ -254,9 +258,23 @@ def report_doubts(source: Path, rows: Sequence[LabelRow], robot: str) -> None:
 def add_own_camera(source: Path, options: Options) -> Options:
     """Return options with the camera of the folder's own file, unless the user gave one."""
     own = source / CALIBRATION_FILE
-    if options.camera is not None or not own.is_file():
+    if not own.is_file():
+        return options
+    if options.camera is not None:
+        _warn_of_other_lens(own, options.camera)
         return options
     return replace(options, camera=read_camera(own))
+
+
+def _warn_of_other_lens(own: Path, given: Camera) -> None:
+    """Print a line if the folder's own file has another focal length than the given camera."""
+    with suppress(SourceError):  # the file has no effect
+        fx_px = read_camera(own).fx_px
+        if abs(given.fx_px / fx_px - 1) > SAME_FOCAL_SHARE:
+            say(
+                f"{own}: doubt: its fx_px is {fx_px:.1f}, that of --camera {given.fx_px:.1f}, which "
+                "is used. If the pictures are by the folder's camera, leave --camera out"
+            )
 
 
 def build_set_content(

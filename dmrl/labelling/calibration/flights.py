@@ -70,12 +70,24 @@ def calibrate_by_flights(
             "peers "
             "are. Was it the right model? Try: dmrl evaluate"
         )
-    if found.after_px > DOUBTED_SHARE * camera.width_px:
-        say(
-            f"{robots[0]}: doubt: half of its detections are {found.after_px:.0f} px or more from "
-            "where this calibration expects them. Check the intrinsics (--camera) and the model"
-        )
+    _warn_of_residual(robots[0], found)
     return found.camera, _figures(robots[0], found)
+
+
+def _warn_of_residual(robot: str, found: Calibration) -> None:
+    """Print a line if detections lie far from their predictions, with the likely cause."""
+    if found.after_px <= DOUBTED_SHARE * found.camera.width_px:
+        return
+    cause = "Check the intrinsics (--camera) and the model"
+    if found.after_px <= found.expected_px:
+        cause = (
+            f"The sigmas of the positions explain it: they allow {found.expected_px:.0f} px. Add "
+            "flights with more precise positions"
+        )
+    say(
+        f"{robot}: doubt: half of its detections are {found.after_px:.0f} px or more from where "
+        f"this calibration expects them. {cause}"
+    )
 
 
 def _figures(robot: str, found: Calibration) -> dict[str, Any]:

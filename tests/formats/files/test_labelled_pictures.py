@@ -1,5 +1,6 @@
 """Classes become peers, and boxes give depths."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,16 @@ def test_the_calibration_in_the_folder_of_a_set_is_its_camera(small: Path) -> No
     assert all(peer["depth_m"] > 0 for peers in labels_of(found) for peer in peers)
     (given,) = (s for s in read(small, "yolo", Options(camera=AIDECK)) if "K" in s.fields)
     assert given.fields["K"][0] == AIDECK.fx_px
+
+
+@pytest.mark.parametrize(("share", "said"), [(1.01, False), (1.14, True)])
+def test_a_given_camera_of_another_lens_than_the_folders_is_doubted(
+    share: float, said: bool, small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (small / "calibration.toml").write_text(format_camera(camera()))
+    read(small, "yolo", Options(camera=replace(camera(), fx_px=200 * share)))
+    line = "calibration.toml: doubt: its fx_px is 200.0, that of --camera 228.0, which is used"
+    assert (line in capsys.readouterr().err) == said
 
 
 def test_the_width_of_a_robot_gives_the_depth_of_its_box(small: Path) -> None:
