@@ -14,7 +14,9 @@ def main() -> None:
         end_on_signal()
         from dmrl import cli  # noqa: PLC0415 - it takes 0.1 s
     except KeyboardInterrupt:
-        os.write(2, b"dmrl: stopped. Nothing stands under its final name\n")
+        os.write(
+            2, b"dmrl: stopped. No new output has its final name; earlier ones are unchanged\n"
+        )
         os._exit(130)
     cli.main()
 

@@ -139,7 +139,7 @@ def describe_interrupt() -> str:
     except (DmrlError, OSError) as e:  # outputs may lie where nobody answers any more
         return f"stopped. What has its final name is not known: {e}"
     if whole:
-        return f"stopped. Whole: {', '.join(map(str, whole))}; nothing else has its final name"
+        return f"stopped. Whole: {', '.join(map(str, whole))}; no other new output has its name"
     return NOTHING_WRITTEN
 
 

@@ -103,7 +103,7 @@ def test_signal_reports_that_no_output_is_complete(number: signal.Signals, tmp_p
         finally:
             process.kill()
     assert process.returncode == 128 + number
-    assert output == "dmrl: stopped. Nothing stands under its final name\n"
+    assert output == "dmrl: stopped. No new output has its final name; earlier ones are unchanged\n"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -123,7 +123,7 @@ def test_signal_reports_complete_outputs(tmp_path: Path) -> None:
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 143
-    assert done.stderr == "dmrl: stopped. Whole: a; nothing else has its final name\n"
+    assert done.stderr == "dmrl: stopped. Whole: a; no other new output has its name\n"
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 

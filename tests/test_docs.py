@@ -247,7 +247,7 @@ def test_mount_calibration_commands_run_as_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    flight = "fly fly_in_view flight.mcap --camera"
+    flight = "fly fly_in_view mount.mcap --camera"
     page = (ROOT / "docs/own_camera.md").read_text(encoding="utf-8")
     assert f"`dmrl {flight}`" in page
     app(flight.split(), result_action="return_value")

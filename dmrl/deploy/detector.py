@@ -81,10 +81,12 @@ class Detector:
         if self.size_px is None:
             require_whole_cells((width_px, height_px), self.stride_px, self.name, what)
         if self.size_px not in (None, (width_px, height_px)):
-            taken = "{} x {}".format(*self.size_px or ())
+            taken, flags = "{} x {}", "--width-px {} --height-px {}"
+            taken, flags = (words.format(*self.size_px or ()) for words in (taken, flags))
             raise SettingError(
                 f"{what}: images of {width_px} x {height_px} px, {self.name} takes only {taken}. "
-                "Crop or scale the images, or quantise the model for images of this size"
+                f"Convert them again: dmrl convert ... {flags}, or quantise the model for images "
+                "of this size"
             )
 
 

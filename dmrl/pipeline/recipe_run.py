@@ -9,6 +9,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -102,13 +103,18 @@ def run(
         memory = BuildCache.load(folder / STATE_FILE)
         memory.save()
         _announce_replacements(Runner(plan, folder, data, memory))
+        if read_recipe_text(folder) is None:
+            _write_recipe(folder, plan)
+        try:
+            with open_executor(on, workers, bars=True) as crew:
+                replace = partial(_write_recipe, folder, plan)
+                done = Runner(plan, folder, data, memory, before_output=replace).run(crew)
+        finally:
+            with suppress(OSError):  # what can be resumed stays
+                (folder / UNFINISHED).rmdir()
         _write_recipe(folder, plan)
-        with open_executor(on, workers, bars=True) as crew:
-            done = Runner(plan, folder, data, memory).run(crew)
         memory.drop_missing_files()
         memory.save()
-        with suppress(OSError):
-            (folder / UNFINISHED).rmdir()
     if skipped := sum(one.skipped for one in done):
         say(f"{skipped} of {len(done)} steps were up to date")
     return done
@@ -270,9 +276,14 @@ def read_recipe_text(folder: Path) -> str | None:
 
 
 def _write_recipe(folder: Path, plan: Plan) -> None:
-    """Write the recipe into the folder of its outputs."""
+    """Write the recipe into the folder of its outputs, unless it is there.
+
+    Not before an output is new: a stopped run would leave a recipe that made none of the outputs.
+    """
     kept = folder / RECIPE_FILE
-    if read_recipe_text(folder) not in (None, plan.text):
+    if (before := read_recipe_text(folder)) == plan.text:
+        return
+    if before is not None:
         keep_previous(kept)
-    with replace_file(kept) as partial:
-        partial.write_text(plan.text, encoding="utf-8")
+    with replace_file(kept) as unfinished:
+        unfinished.write_text(plan.text, encoding="utf-8")

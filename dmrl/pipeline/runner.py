@@ -2,6 +2,7 @@
 
 import shutil
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict, dataclass
 from itertools import count
@@ -53,11 +54,22 @@ class Runner:
         Folder that replaces ``{data}``.
     memory
         Cache of the folder.
+    before_output
+        Called before a new output gets its name.
     """
 
     crew: Executor
 
-    def __init__(self, plan: Plan, folder: Path, data: Path | None, memory: BuildCache) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        folder: Path,
+        data: Path | None,
+        memory: BuildCache,
+        *,
+        before_output: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._before_output = before_output
         self.folder, self.data, self.memory = folder, data, memory
         self.steps = {step.out: step for step in plan.steps}
         self.outs = set(self.steps)
@@ -193,6 +205,7 @@ class Runner:
     def _install_output(self, one: RunningStep, sha256: str) -> None:
         """Rename a complete output to its name; the one before moves to ``previous/``."""
         out, new = self.folder / one.step.out, self.folder / UNFINISHED / one.step.out
+        self._before_output()
         self.memory.done[one.step.out] = [one.key, sha256]
         self.memory.made_of[one.step.out] = self._made_of[one.step.out]
         self.memory.save()  # before the rename: a run cut off after it would build the step again

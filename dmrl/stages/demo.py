@@ -38,7 +38,7 @@ def suggest_commands(out: Path, program: str) -> str:
     lines = [f"source {activate}"] if "/" in program and activate.is_file() else []
     lines += [
         f"dmrl view {out}/flight_tracks.mcap     # the flight in rerun: images, detections, tracks",
-        "dmrl fly fly_in_view flight.mcap && dmrl label flight.mcap labelled.mcap",
+        "dmrl fly fly_in_view flight.mcap --camera && dmrl label flight.mcap labelled.mcap",
         "dmrl convert PHOTOS photos.mcap --width-px 640 --height-px 480    # your own pictures",
         "dmrl predict dmrl-nano photos.mcap found.mcap && dmrl view found.mcap",
     ]

@@ -1,15 +1,18 @@
 """``dmrl train``: an Arrow dataset to a run folder with a trained network."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from dmrl.atomic_output import to_partial_path
 from dmrl.guards.lazy_names import import_lazily
 from dmrl.terminal.arguments import AsJson, Flat, Model, Recipe
 from dmrl.terminal.closing import Closing, Given
-from dmrl.terminal.progress import announce_import
+from dmrl.terminal.progress import announce_import, say
 
 TRAINING = "dmrl.labelling.unlabelled_training"
 __getattr__ = import_lazily(
@@ -92,10 +95,24 @@ def command(
     from dmrl.learn.training.config import TrainConfig
 
     settings = recipes.load(recipe, "train", TrainConfig, flags)
-    result = train_with_flights(
-        dataset, out, settings, init=init, teacher=teacher, unlabelled=unlabelled, resume=resume
-    )
+    with _suggest_resume(out):
+        result = train_with_flights(
+            dataset, out, settings, init=init, teacher=teacher, unlabelled=unlabelled, resume=resume
+        )
     row = (result.images, settings.epochs, result.loss, result.seconds, result.images_per_s)
     columns = ("images", "epochs", "last loss", "seconds", "images/s")
     closing = Closing(columns=columns, rows=lambda *_: [row], path_key="model")
     closing.print(result, Given(out=out), as_json=as_json)
+
+
+@contextmanager
+def _suggest_resume(out: Path) -> Iterator[None]:
+    """Say how to go on if the block is interrupted after a checkpoint."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        from dmrl.learn.training.checkpoint import has_checkpoint
+
+        if has_checkpoint(partial := to_partial_path(out)):
+            say(f"{partial} holds the epochs done. Go on with the same command and --resume")
+        raise

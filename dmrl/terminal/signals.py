@@ -14,7 +14,7 @@ TERMINATION_SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 """Signals that end a command. Windows has no SIGHUP."""
-NOTHING_WRITTEN = "stopped. Nothing stands under its final name"
+NOTHING_WRITTEN = "stopped. No new output has its final name; earlier ones are unchanged"
 
 Handler = Callable[[int, FrameType | None], None]
 

@@ -115,8 +115,10 @@ def test_images_are_of_its_size_or_of_whole_cells(
     if fits:
         detector.require_size(*image_px, "a.mcap")
         return
-    with pytest.raises(SettingError, match=r"a\.mcap: images of {} x {} px".format(*image_px)):
+    with pytest.raises(SettingError, match=r"a\.mcap: images of {} x {} px".format(*image_px)) as e:
         detector.require_size(*image_px, "a.mcap")
+    width_px, height_px = size_px or (image_px[0] // 8 * 8, image_px[1] // 8 * 8)
+    assert f"dmrl convert ... --width-px {width_px} --height-px {height_px}" in str(e.value)
 
 
 def test_grey_networks_get_grey_input() -> None:

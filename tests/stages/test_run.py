@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from dmrl.pipeline.runner import Runner
 from dmrl.stages import run
 
 pytestmark = pytest.mark.heavy
@@ -89,6 +90,29 @@ def test_replaced_outputs_are_kept_and_reported_with_the_reason(
     assert again == {
         path: content for path, content in first.items() if path.name != "pipeline.json"
     }
+
+
+def test_a_run_that_makes_no_output_keeps_the_recipe_and_leaves_no_empty_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, out = tmp_path / "few.toml", tmp_path / "out"
+    steps = RECIPE[: RECIPE.index("[[figure]]")].replace('title = "Few"\n', "")
+    recipe.write_text(steps)
+    run.command(str(recipe), out=out, workers=1)
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Runner, "_finish_steps", stop)
+    recipe.write_text(steps.replace("images = 2", "images = 3"))
+    with pytest.raises(KeyboardInterrupt):
+        run.command(str(recipe), out=out, workers=1)
+    assert (out / "recipe.toml").read_text() == steps
+    assert not (out / "previous").exists()
+    monkeypatch.undo()
+    run.command(str(recipe), out=out, workers=1)
+    assert (out / "recipe.toml").read_text() == recipe.read_text()
+    assert not (out / "unfinished").exists()
 
 
 def test_output_modified_by_hand_is_reported_and_kept(

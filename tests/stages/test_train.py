@@ -18,6 +18,7 @@ from dmrl.datasets import open_dataset
 from dmrl.datasets.training_examples import build_examples, load_training_data
 from dmrl.errors import DatasetError, ModelError, OutputError, SettingError
 from dmrl.images.codec import encode_png
+from dmrl.labelling import unlabelled_training
 from dmrl.learn.data.batches import ROBOT_FIELDS
 from dmrl.learn.inference.loaded_model import load_model
 from dmrl.learn.training import trainer
@@ -163,6 +164,23 @@ def test_interrupted_training_resumes_to_the_same_bytes(
         patch.setattr(trainer, "train_step", interrupted)
         run(dots_dataset, out, SETTINGS)
     check_that_it_goes_on(dots_dataset, out, SETTINGS)
+
+
+@pytest.mark.parametrize("began", [False, True])
+def test_an_interrupted_training_says_how_to_go_on(
+    began: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        if began:
+            (tmp_path / "few.partial").mkdir()
+            (tmp_path / "few.partial/checkpoint.json").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(unlabelled_training, "train_with_flights", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        train.command(tmp_path / "dataset", tmp_path / "few")
+    words = "few.partial holds the epochs done. Go on with the same command and --resume"
+    assert (words in capsys.readouterr().err) == began
 
 
 @pytest.mark.slow

@@ -272,8 +272,8 @@ def _warn_of_other_lens(own: Path, given: Camera) -> None:
         fx_px = read_camera(own).fx_px
         if abs(given.fx_px / fx_px - 1) > SAME_FOCAL_SHARE:
             say(
-                f"{own}: doubt: its fx_px is {fx_px:.1f}, that of --camera {given.fx_px:.1f}, which "
-                "is used. If the pictures are by the folder's camera, leave --camera out"
+                f"{own}: doubt: its fx_px is {fx_px:.1f}, that of --camera {given.fx_px:.1f}, "
+                "which is used. If the pictures are by the folder's camera, leave --camera out"
             )
 
 

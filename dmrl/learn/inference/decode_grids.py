@@ -90,8 +90,15 @@ def require_whole_cells(
     if width_px % stride_px or height_px % stride_px:
         raise SettingError(
             f"{what}: images of {width_px} x {height_px} px do not divide into cells of "
-            f"{stride_px} px, as {network} needs. Crop or scale the images first"
+            f"{stride_px} px, as {network} needs. Convert them again: dmrl convert ... "
+            f"{_whole_size(size_px, stride_px)}"
         )
+
+
+def _whole_size(size_px: tuple[int, int], stride_px: int) -> str:
+    """Return flags of ``dmrl convert`` for the largest whole cells in images of this size."""
+    width_px, height_px = (max(side // stride_px, 1) * stride_px for side in size_px)
+    return f"--width-px {width_px} --height-px {height_px}"
 
 
 def find_peaks(confidence: NDArray[np.floating]) -> NDArray[np.bool_]:
