@@ -91,6 +91,11 @@ def test_an_error_that_ends_with_a_question_has_no_period_behind_it(tmp_path: Pa
         load(tmp_path, SMALL.replace("images = 2", "imags = 2"))
 
 
+def test_an_argument_of_the_command_line_alone_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="workers: sketch takes it on the command line alone"):
+        load(tmp_path, SMALL.replace("images = 2", "images = 2\nworkers = 2"))
+
+
 def test_every_fault_is_named_with_its_step(tmp_path: Path) -> None:
     text = SMALL.replace("images = 2", "imags = 2\nseed = 1.5").replace("source =", "sources =")
     with pytest.raises(RecipeError) as caught:
