@@ -62,9 +62,7 @@ def choose_backend(model: Path, recording: Path, given: BackendName | None) -> B
     sizes = (held.read_image_size(topics.CAMERA_IMAGE(robot)) for robot in robots if given is None)
     if (size_px := next(filter(None, sizes), None)) is None:
         return given or "torch"
-    backend = select_fastest_backend(resolve_model_path(model), size_px)
-    say(f"{recording}: the network runs by {backend}; --backend chooses another")
-    return backend
+    return select_fastest_backend(resolve_model_path(model), size_px)
 
 
 def open_with_threshold(model: Path, backend: BackendName, threshold: float | None) -> Detector:

@@ -75,6 +75,8 @@ def read_text(name: str | Path) -> str:
         return content.decode("utf-8")
     except (FileNotFoundError, IsADirectoryError):
         hint = suggest(path.stem, list_names() + list_pretrained_names(), _list_shipped())
+        if path.suffix:
+            hint = suggest(path.name, [one.name for one in path.parent.glob("*.toml")], hint)
         raise RecipeError(f"no recipe {name}. {hint}") from None
     except (UnicodeDecodeError, OSError) as e:
         raise RecipeError(f"{name} cannot be read: {e}. Give a TOML text file") from e

@@ -111,6 +111,12 @@ def test_a_misspelled_shipped_recipe_is_offered() -> None:
         recipe.read("locanett")
 
 
+def test_a_misspelled_file_is_offered_by_its_neighbour(write: Write) -> None:
+    beside = write("images = 3\n")
+    with pytest.raises(RecipeError, match=rf"Did you mean {beside.name}\?"):
+        recipe.read(beside.with_suffix(".tml"))
+
+
 def test_an_unknown_recipe_lists_the_shipped_ones() -> None:
     with pytest.raises(RecipeError, match=r"no recipe zzz\. Shipped ones: .*locanet"):
         recipe.read("zzz")

@@ -19,6 +19,7 @@ from dmrl.colours import RGB
 from dmrl.datasets import layout, open_dataset
 from dmrl.errors import DatasetError, SettingError
 from dmrl.geometry.frames import STRIDE_PX
+from dmrl.recording import name_recordings
 from dmrl.viewer import layouts
 from dmrl.viewer.content.matched_detections import (
     MatchedDetections,
@@ -156,7 +157,12 @@ def _rank_rows(folder: Path, recordings: Sequence[Path], settings: Settings) -> 
 
 def _load_rows(folder: Path, settings: Settings) -> pa.Table:
     """Read the rows of the selected split and robot; of all by default."""
-    dataset = open_dataset(folder)
+    try:
+        dataset = open_dataset(folder)
+    except DatasetError as e:
+        if next(folder.glob("*.mcap"), None) is None:
+            raise
+        raise DatasetError(f"{folder} is not a dataset. {name_recordings(folder)}") from e
     splits = dataset.splits if settings.split is None else (settings.split,)
     tables = [dataset.split(name).table for name in splits]
     rows = pa.concat_tables([table for table in tables if len(table)] or tables[:1])

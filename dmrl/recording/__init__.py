@@ -22,6 +22,7 @@ from dmrl.recording.loaded import LoadedRecording as LoadedRecording
 from dmrl.recording.log_times import read_log_times as read_log_times
 from dmrl.recording.mcap.channel import Channel as Channel
 from dmrl.recording.mcap.channel import RawMessage as RawMessage
+from dmrl.recording.mcap.file import name_recordings as name_recordings
 from dmrl.recording.preview import sample_topics as sample_topics
 from dmrl.recording.provenance import Input as Input
 from dmrl.recording.provenance import Provenance as Provenance

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter, validators
 
 from dmrl.deploy.backend_names import BackendName
+from dmrl.errors import SettingError
 from dmrl.learn.inference.tta_views import TTA_VIEWS
 from dmrl.pipeline.stage_command import stage_command
 from dmrl.terminal.arguments import Count, In, Model, Share, Strict
 from dmrl.terminal.closing import Closing
+from dmrl.terminal.progress import say
 
 if TYPE_CHECKING:
     from dmrl.deploy.detector import Detector
@@ -95,8 +97,8 @@ def run(model: Model, recording: In, out: Path, settings: Settings) -> Result:
     from dmrl.deploy.image_detection import DetectionOptions
     from dmrl.prediction import read_model_rates, warn_about_lens, write_detections
 
-    warn_about_lens(model, recording)
     settings, detector, made = _open(model, recording, settings)
+    warn_about_lens(model, recording)
     options = DetectionOptions(settings.min_confidence, settings.most, settings.views)
     rates = read_model_rates(model)
     return Result(
@@ -115,9 +117,14 @@ def _open(
     """Return settings with a backend, the opened model, and the provenance of its detections."""
     from dmrl.prediction import choose_backend, describe_prediction, open_with_threshold
 
-    backend = choose_backend(model, recording, settings.backend)
+    if model.suffix == ".mcap":
+        raise SettingError(f"{model} is a recording; the model comes first: predict MODEL IN OUT")
+    given = settings.backend
+    backend = choose_backend(model, recording, given)
     settings = replace(settings, backend=backend)
     detector = open_with_threshold(model, backend, settings.threshold)
+    if given is None:
+        say(f"{model} runs by {backend}; --backend chooses another")
     made = describe_prediction(model, recording, settings, backend, detector)
     return settings, detector, made
 

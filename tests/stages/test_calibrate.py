@@ -86,6 +86,11 @@ def test_residuals_that_the_sigmas_of_positions_explain_are_no_doubt_of_the_came
     assert "--camera" not in said
 
 
+def test_a_missing_folder_of_boards_is_named_as_one(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"no recording or folder of pictures .*absent\."):
+        calibrate.run([tmp_path / "absent"], tmp_path / "out.toml", Settings(board="9x6"))
+
+
 def test_stated_errors_give_the_median_distance_of_detections() -> None:
     apart = np.random.default_rng(0).normal(scale=5.0, size=(20_000, 2))
     whiten = np.tile(np.eye(2) / 5.0, (20_000, 1, 1))

@@ -198,12 +198,25 @@ def test_json_counts_images_and_detections(
     assert output == {"recording": str(tmp_path / "out.mcap"), "images": 30, "believed": 0}
 
 
+def test_a_recording_in_place_of_the_model_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=r"seen\.mcap is a recording; the model comes first"):
+        run(tmp_path / "seen.mcap", Path("dmrl-nano"), tmp_path / "out.mcap", Settings())
+
+
+def test_an_unknown_model_is_refused_before_its_backend_is_named(
+    dots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(ModelError, match="no model dmrl-nan"):
+        run(Path("dmrl-nan"), dots, tmp_path / "out.mcap", Settings())
+    assert "--backend" not in capsys.readouterr().err
+
+
 @pytest.mark.heavy
 def test_fastest_backend_is_chosen_and_reported(
     dots: Path, settled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(settled, dots, tmp_path / "out.mcap", Settings())
-    assert "the network runs by onnx; --backend chooses another" in capsys.readouterr().err
+    assert f"{settled} runs by onnx; --backend chooses another" in capsys.readouterr().err
     run(settled, dots, tmp_path / "named.mcap", Settings(backend="onnx"))
     assert "--backend" not in capsys.readouterr().err
     assert (tmp_path / "out.mcap").read_bytes() == (tmp_path / "named.mcap").read_bytes()

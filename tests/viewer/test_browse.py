@@ -140,6 +140,9 @@ def test_invalid_dataset_or_layout_is_reported(tmp_path: Path, folder: Path, rrd
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetError, match=r"empty is not a dataset.*dmrl convert"):
         save([tmp_path / "empty"], rrd, Settings())
+    (tmp_path / "empty/flight.mcap").touch()
+    with pytest.raises(DatasetError, match=r"is not a dataset\. Name one in it: .*flight\.mcap$"):
+        save([tmp_path / "empty"], rrd, Settings())
     with pytest.raises(SettingError, match=r"leave --layout flight out"):
         save([folder], rrd, Settings(layout="flight"))
     with pytest.raises(SettingError, match=r"layout dataset is for datasets"):

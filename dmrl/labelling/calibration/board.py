@@ -107,6 +107,8 @@ def _read_pictures(source: Path, robot: str | None, every: int) -> Iterator[tupl
         paths = sorted(p for p in source.iterdir() if p.suffix.lower() in PICTURES)
         yield from ((str(path), path.read_bytes()) for path in track(paths, "Looking for boards"))
         return
+    if not source.exists():
+        raise SourceError(f"no recording or folder of pictures {source}. Check the name")
     robot = choose_robot(source, robot, topics.CAMERA_IMAGE)
     total = read_summary(source).topics[topics.CAMERA_IMAGE(robot)].count
     stamped = track(read(source, topics.CAMERA_IMAGE(robot)), "Looking for boards", total)

@@ -13,7 +13,7 @@ from mcap.records import Channel, Schema
 from mcap.stream_reader import CRCValidationError
 
 from dmrl.atomic_output import count_ended_outputs
-from dmrl.errors import RecordingError
+from dmrl.errors import RecordingError, suggest
 from dmrl.storage import RemotePath
 from dmrl.storage.remote_stream import BUFFER_BYTES
 from dmrl.storage.shared_file import open_raw
@@ -36,6 +36,10 @@ CORRUPTION_ERRORS = (
     OverflowError,
 )
 """Errors that the mcap package raises on corrupt lengths and strings."""
+
+MAX_NAMED = 3
+"""Largest number of recordings that an error names."""
+NAME_A_RECORDING = "Name a .mcap file"
 
 
 class BudgetError(McapError):
@@ -109,7 +113,7 @@ def open_mcap(path: Path) -> Iterator[BoundedReader]:
     """
     if not path.is_file():
         if path.is_dir():
-            raise RecordingError(f"{path} is a folder, not a recording. Name a .mcap file")
+            raise RecordingError(f"{path} is a folder, not a recording. {name_recordings(path)}")
         if path.exists():  # opening a pipe waits for its other end
             raise RecordingError(f"{path} is not a regular file. Save it to one first")
     try:
@@ -118,13 +122,28 @@ def open_mcap(path: Path) -> Iterator[BoundedReader]:
             _check_magic(stream)
             yield stream
     except FileNotFoundError:
-        raise RecordingError(f"no recording {path}. Check the name") from None
+        beside = {one.name: one for one in _list_recordings(path.parent)}
+        raise RecordingError(
+            f"no recording {path}. {suggest(path.name, beside, 'Check the name')}"
+        ) from None
     except PermissionError:
         raise RecordingError(f"{path} cannot be read. Check its permissions") from None
     except BudgetError as e:
         raise over_budget_error(path, e) from e
     except CORRUPTION_ERRORS as e:
         raise corrupt_error(path, e) from e
+
+
+def _list_recordings(folder: Path) -> list[Path]:
+    """Return the recordings in a folder; in a bucket, none: listing it takes time."""
+    return [] if isinstance(folder, RemotePath) else sorted(folder.glob("*.mcap"))
+
+
+def name_recordings(folder: Path) -> str:
+    """Return the way out where a folder stands in place of a recording: the first ones in it."""
+    found = [str(one) for one in _list_recordings(folder)]
+    more = ["..."] * (len(found) > MAX_NAMED)
+    return f"Name one in it: {', '.join(found[:MAX_NAMED] + more)}" if found else NAME_A_RECORDING
 
 
 FileIdentity = tuple[int, int, int]

@@ -18,6 +18,23 @@ def write(path: Path, height_m: float) -> Path:
     return path
 
 
+def test_a_missing_recording_is_offered_by_its_neighbour(tmp_path: Path) -> None:
+    write(tmp_path / "flight_tracks.mcap", 1.0)
+    with pytest.raises(RecordingError, match=r"Did you mean flight_tracks\.mcap\?"):
+        read_summary(tmp_path / "flight_track.mcap")
+    with pytest.raises(RecordingError, match=r"no recording .*zzz\. Check the name"):
+        read_summary(tmp_path / "zzz")
+
+
+def test_a_folder_in_place_of_a_recording_names_those_in_it(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"not a recording\. Name a \.mcap file$"):
+        read_summary(tmp_path)
+    for name in "abcd":
+        write(tmp_path / f"{name}.mcap", 1.0)
+    with pytest.raises(RecordingError, match=r"Name one in it: .*a\.mcap, .*c\.mcap, \.\.\.$"):
+        read_summary(tmp_path)
+
+
 def test_hashed_input_must_stay_unchanged_until_an_output_is_done(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", 1.0)
     expect_unchanged(path)
