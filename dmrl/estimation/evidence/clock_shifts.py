@@ -1,4 +1,4 @@
-"""Shifts of the second robot's clock that the ranges of both robots show."""
+"""Shifts of the second robot's clock, shown by the ranges of both robots or by its motion."""
 
 from dataclasses import dataclass, replace
 
@@ -12,6 +12,8 @@ from dmrl.estimation.signals.clock_jumps import find_clock_jump
 MIN_SHIFT_S, MIN_SHIFT_SIGMAS = 0.05, 5.0
 """Smallest shift that mutual ranges correct, seconds and standard deviations: the plain model has
 smaller ones. The offset of sound simulated flights is known to 5 to 10 ms."""
+MIN_FURTHER_SHIFT_S = 0.01
+"""Smallest shift after a first one, seconds: a step of the time grid."""
 MIN_JUMP_GAIN = -RARE + np.log(200)
 """Smallest gain of a jump in log odds: the price of a rare error, and of the choice among its times
 in a flight of 100 s, to half a second. Sound and otherwise faulty flights of the judge gain 6 at
@@ -80,6 +82,36 @@ class ClockShift:
 def is_mutual(pair: Pair) -> bool:
     """Return whether both robots range, so that their ranges show the clocks."""
     return pair.range_sender is not None and len(np.unique(pair.range_sender)) == 2
+
+
+def list_measuring_robots(pair: Pair) -> set[int]:
+    """Return the robots that range or see the other one: 0 the observer, 1 the peer.
+
+    Both are returned if it is not known which one ranges.
+    """
+    sender = pair.range_sender
+    known: list[int] = [0, 1] if sender is None else np.unique(sender).tolist()
+    cameras = [k for k, sees in enumerate((pair.own_bearings, pair.peer_bearings)) if sees]
+    return {*(known if len(pair.range_m) else []), *cameras}
+
+
+def find_motion_shift(offset_s: Array, variance: Array, *, is_off: bool) -> float:
+    """Return the seconds to add to a clock whose motion shows an offset, or 0.
+
+    The prior pulls an offset towards zero. Of a clock that is off it pulls what is left, so what is
+    left need not be sure: the sum of all shifts has the largest likelihood.
+
+    Parameters
+    ----------
+    offset_s, variance
+        (K,) estimated offsets over a flight, seconds, and their variances.
+    is_off
+        Whether the clock was moved before.
+    """
+    shift_s, sigma_s = -float(np.median(offset_s)), float(np.sqrt(np.median(variance)))
+    if is_off:
+        return shift_s if abs(shift_s) >= max(MIN_FURTHER_SHIFT_S, sigma_s) else 0.0
+    return shift_s if _is_sure(shift_s, sigma_s) else 0.0
 
 
 def find_clock_shift(pair: Pair) -> ClockShift | None:

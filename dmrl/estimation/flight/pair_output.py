@@ -134,6 +134,48 @@ def height_errors(
     return error, np.sqrt(variance)
 
 
+def mix_clocks(solution: PairSolution, time_s: Array) -> tuple[Array, Array]:
+    """Return (T,) mean offsets of the second robot's clock over all solutions, and variances.
+
+    Parameters
+    ----------
+    solution
+        Solutions under likely models.
+    time_s
+        (T,) times, seconds.
+    """
+    offsets, variances = [], []
+    for member, covariances in zip(solution.mixture.members, solution.covariances, strict=True):
+        problem, values = member.solver.problem, member.values
+        offset, variance = np.zeros((2, len(values.state)))
+        for row, c, constant in problem.layout.of(1):
+            if row.owner == "clock":
+                offset += values.constants[c] if constant else values.state[:, c]
+                spread = covariances.constants if constant else covariances.keyframes
+                variance += spread[..., c, c]
+        offsets.append(np.interp(time_s, problem.keyframe_s, offset))
+        variances.append(np.interp(time_s, problem.keyframe_s, variance))
+    weight = solution.mixture.weight
+    mean = weight @ np.stack(offsets)
+    return mean, weight @ (np.stack(variances) + (np.stack(offsets) - mean) ** 2)
+
+
+def to_peer_clock(estimate: Estimate) -> Estimate:
+    """Return an estimate at the times of a clock of which the offset is uncertain.
+
+    The offset is that of the robot which observes in ``estimate``.
+    """
+    if estimate.clock_s is None or estimate.clock_variance is None:
+        return estimate
+    velocity = np.gradient(estimate.state[:, :2], estimate.time_s, axis=0)
+    covariance = estimate.covariance.copy()
+    outer = velocity[:, :, None] * velocity[:, None, :]
+    covariance[:, :2, :2] += estimate.clock_variance[:, None, None] * outer
+    # A clock that jumps back shows some times twice.
+    time_s = np.maximum.accumulate(estimate.time_s + estimate.clock_s)
+    return replace(estimate, time_s=time_s, covariance=covariance)
+
+
 def list_sighted(solution: PairSolution, time_s: Array) -> Mask:
     """Return (2, T) whether an image of either robot near a time is consistent."""
     out = np.zeros((2, len(time_s)), bool)
@@ -170,7 +212,8 @@ def join_estimates(estimates: Sequence[Estimate]) -> Estimate:
             return None
         return np.concatenate([v[k:] for v, k in zip(values, first, strict=True)])
 
-    names = ("time_s", "state", "covariance", "status", "height_m", "height_std_m", "range_error_m")
+    names = ("time_s", "state", "covariance", "status", "height_m", "height_std_m", "range_error_m",
+             "clock_s", "clock_variance")  # fmt: skip
     modes = max(one.modes for one in estimates)
     causes = join_causes([cause for one in estimates for cause in one.causes])
     innovations = join_innovations([one.innovations for one in estimates])

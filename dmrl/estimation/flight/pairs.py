@@ -6,7 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from dmrl.estimation.evidence.causes import find_dropouts
-from dmrl.estimation.evidence.clock_shifts import ClockShift, find_clock_shift
+from dmrl.estimation.evidence.clock_shifts import (
+    ClockShift,
+    find_clock_shift,
+    find_motion_shift,
+    list_measuring_robots,
+)
 from dmrl.estimation.evidence.delays import join_delays, move_signal
 from dmrl.estimation.evidence.error_models import Candidate
 from dmrl.estimation.evidence.mistakes import (
@@ -18,6 +23,7 @@ from dmrl.estimation.flight.pair_output import (
     OUTPUT_HZ,
     clip_to_ranges,
     list_refused,
+    to_peer_clock,
     with_status,
 )
 from dmrl.estimation.flight.pieces import Piece, join_pieces, solve_pieces
@@ -75,26 +81,34 @@ def _estimate_pair(
     logged: Pair, noise: NoiseModel | None, gate: Gate, *, plain: bool
 ) -> tuple[Estimate, Estimate]:
     """Estimate both directions of a pair, with a discrete mistake of its logs corrected."""
+    if list_measuring_robots(logged) == {1}:
+        # Measurements of the other robot have the times of the first one's clock.
+        peer, own = _estimate_pair(logged.swap_robots(), noise, gate, plain=plain)
+        return own, peer
     logged = drop_held_ranges(logged)
     blind: tuple[int, ...] = ()
     shifts: list[ClockShift] = []
-    if not plain and noise is None:
+    mistakes: list[Cause] = []
+    searched = not plain and noise is None
+    if searched:
         logged, shifts = _align_clocks(logged)
-    mistakes = [_to_cause(shift.name, logged, 1, shift.from_s) for shift in shifts]
     pair = drop_contradictions(logged)
     possible = not ranges_are_far(pair)
     pieces = list(solve_pieces(pair, noise, plain=plain)) if possible else []
-    searched = not plain and noise is None and not _explains(pieces)
-    if searched and (found := find_mistake(logged)) is not None:
+    known: ClockShift | None = None
+    if searched and not _explains(pieces) and (found := find_mistake(logged)) is not None:
         mistake, robot, blind = found
-        logged = mistake.correct(logged, robot)
-        shifts += [mistake.shift] if mistake.shift else []
+        logged, known = mistake.correct(logged, robot), mistake.shift
         pair, pieces = drop_contradictions(logged), []
-        mistakes.append(_to_cause(mistake.name, logged, robot))
+        mistakes += [] if known else [_to_cause(mistake.name, logged, robot)]
     pieces = pieces or list(solve_pieces(pair, noise, plain=plain))
+    if searched:
+        logged, pair, pieces, shift = _move_clock(logged, pair, pieces, known)
+        shifts += [shift] if shift else []
     logged, pair, pieces, late = _move_late(logged, pair, pieces)
     mistakes += [_to_cause(one.model.name, pair, one.robot) for one in late]
-    gaps = (*mistakes, *find_dropouts(logged, pair))
+    moved = [_to_cause(shift.name, logged, 1, shift.from_s) for shift in shifts]
+    gaps = (*moved, *mistakes, *find_dropouts(logged, pair))
     own, peer = (
         replace(one, status=np.maximum(one.status, np.int8(UNCONVERGED * (side in blind))))
         for side, one in enumerate(_both_directions(pair, pieces, gate))
@@ -130,6 +144,44 @@ def _add_causes(found: Sequence[Cause], causes: Sequence[Cause]) -> tuple[Cause,
     """Return causes after others, without what these name already."""
     named = {(one.name, one.robot) for one in found}
     return (*found, *(one for one in causes if (one.name, one.robot) not in named))
+
+
+def _move_clock(
+    logged: Pair, pair: Pair, pieces: list[Piece], known: ClockShift | None
+) -> tuple[Pair, Pair, list[Piece], ClockShift | None]:
+    """Solve a flight again while its motion shows an offset of the second clock, with it moved.
+
+    Where both robots measure, their measurements show it, and the motion may be late for itself.
+
+    Parameters
+    ----------
+    logged, pair, pieces
+        As in `_move_late`.
+    known
+        Shift of the clock that is made already. None: none.
+
+    Returns
+    -------
+    logged, pair, pieces
+        The same with the clocks of both robots alike.
+    shift
+        Shift of the second clock, with the known one. None: none.
+    """
+    unmoved, moved_s = logged, 0.0
+    for _ in range(MAX_SHIFTS if list_measuring_robots(pair) == {0} else 0):
+        joined = join_pieces(pieces).estimate
+        if joined.clock_s is None or joined.clock_variance is None:
+            break
+        is_off = known is not None or moved_s != 0.0
+        further_s = find_motion_shift(joined.clock_s, joined.clock_variance, is_off=is_off)
+        if not further_s:
+            break
+        moved_s += further_s
+        logged = ClockShift(moved_s).move(unmoved)
+        pair = drop_contradictions(logged)
+        pieces = list(solve_pieces(pair, None, plain=False))
+    total_s = moved_s + (known.shift_s if known else 0.0)
+    return logged, pair, pieces, ClockShift(total_s) if total_s else None
 
 
 def _move_late(
@@ -193,7 +245,10 @@ def _both_directions(pair: Pair, pieces: Sequence[Piece], gate: Gate) -> tuple[E
     floor = joined.silent | quiet | far
     own, peer, relative = joined.energy
     enough = [bool(at.sum() >= MIN_CAMERA_S * OUTPUT_HZ) for at in joined.sighted]
-    sides = (estimate, own), (seen_from_peer(estimate), peer)
+    seen = seen_from_peer(estimate)
+    # Without measurements of its own, the motion of the second robot alone shows its clock.
+    seen = to_peer_clock(seen) if list_measuring_robots(pair) == {0} else seen
+    sides = (estimate, own), (seen, peer)
     one, other = (
         with_status(side, floor, (energy, relative), gate, sighted=known, placed=placed)
         for (side, energy), known in zip(sides, enough, strict=True)

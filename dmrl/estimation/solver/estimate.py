@@ -111,6 +111,9 @@ class Estimate:
         estimated.
     range_error_m
         (K,) temporary excess of the ranges, as behind an obstacle, metres. None: not estimated.
+    clock_s, clock_variance
+        (K,) seconds by which the peer's clock is ahead of the observer's, by the peer's motion,
+        and their variances. None: not estimated.
     constants_covariance
         (G, G) of the constants. None: not estimated.
     modes
@@ -131,6 +134,8 @@ class Estimate:
     height_m: Array | None = None
     height_std_m: Array | None = None
     range_error_m: Array | None = None
+    clock_s: Array | None = None
+    clock_variance: Array | None = None
     constants_covariance: Array | None = None
     modes: int = 1
     causes: tuple[Cause, ...] = ()

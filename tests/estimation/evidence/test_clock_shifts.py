@@ -1,4 +1,4 @@
-"""Shifts of a clock that the ranges of both robots show: offsets and jumps."""
+"""Shifts of a clock that the ranges of both robots, or the motion, show: offsets and jumps."""
 
 from dataclasses import replace
 
@@ -7,7 +7,12 @@ import pytest
 
 from dmrl.estimation.evidence.clock_shifts import ClockShift, find_clock_shift
 from dmrl.estimation.evidence.mistakes import compute_misfit
+from dmrl.estimation.flight.pair_output import to_peer_clock
 from dmrl.estimation.flight.pairs import estimate_pairs
+from dmrl.estimation.model.pair import Pair
+from dmrl.estimation.model.status import OK
+from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
+from dmrl.estimation.solver.problem import NoiseModel
 
 from ..flights import both_ranging, flown, pair_of, truth_at
 
@@ -85,3 +90,45 @@ def test_a_flight_whose_clock_jumps_is_solved_as_if_it_did_not(shift_s: float) -
     assert np.sqrt((error**2).mean()) < 0.2
     assert (np.diff(peer.time_s) >= 0).all()
     assert own.time_s[-1] == pytest.approx(sound.time_s[-1], abs=0.1)
+
+
+def ranged_by(pair: Pair, robot: int) -> Pair:
+    """Return a pair without the ranges of the other robot."""
+    kept = pair.range_sender == robot
+    assert pair.range_sender is not None
+    return replace(
+        pair, range_time_s=pair.range_time_s[kept], range_m=pair.range_m[kept],
+        range_sender=pair.range_sender[kept],
+    )  # fmt: skip
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize(("shift_s", "robot"), [(0.15, 0), (0.6, 0), (-0.3, 1), (0.0, 0)])
+def test_motion_shows_the_clock_of_a_robot_that_does_not_range(shift_s: float, robot: int) -> None:
+    flight = flown("in_view", "calibrated", 1000, 60.0)
+    shift = ClockShift(shift_s)
+    ((own, peer),) = estimate_pairs([ranged_by(shift.move(both_ranging(flight)), robot)])
+    named = [cause.name for cause in own.causes if cause.name.startswith("clock fits")]
+    assert len(named) == (shift_s != 0.0)
+    for one, (observer, seen), offset_s in (
+        (own, ("cf1", "cf2"), 0.0),
+        (peer, ("cf2", "cf1"), shift_s),
+    ):
+        kept = (one.status == OK) & (one.time_s > 20.0)
+        truth = truth_at(flight, one.time_s[kept] - offset_s, observer, seen)
+        error = np.hypot(*(one.state[kept, :2] - truth).T)
+        assert kept.mean() > 0.5 and np.sqrt((error**2).mean()) < 0.2
+
+
+def test_an_uncertain_clock_widens_positions_along_the_motion() -> None:
+    time_s = np.arange(4.0)
+    state = np.column_stack([2.0 * time_s, np.zeros(4), np.zeros(4)])
+    spread = np.tile(np.eye(3), (4, 1, 1))
+    at = Estimate(
+        time_s, state, spread, np.zeros(4, np.int8), np.zeros(len(PAIR_LAYOUT.constants)),
+        NoiseModel(), clock_s=np.full(4, 0.5), clock_variance=np.full(4, 0.25),
+    )  # fmt: skip
+    moved = to_peer_clock(at)
+    assert moved.time_s.tolist() == [0.5, 1.5, 2.5, 3.5]
+    assert moved.covariance[0].tolist() == [[2.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    assert to_peer_clock(replace(at, clock_s=None)).time_s is time_s
