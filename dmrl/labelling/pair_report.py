@@ -38,11 +38,13 @@ REMEDIES = {
     "range": "Measure the offset once, and give it with --range-offset-m, or let flights "
     "determine it: dmrl calibrate --sensors",
     "range late": LATE,
+    "range silent": "Log at least two a second, and fly within reach of the radio",
     "range offset changes": CLEAR_LINE,
     "range errors": CLEAR_LINE,
     "antenna": "Turn the antennas upright, away from metal",
     "height": "Fly over a level floor, within reach of the range finder",
-    "clock": "Try: dmrl align",
+    "height silent": "Log it at least once a second; fly within reach of the range finder",
+    "clock": "Let both robots range, and try: dmrl align",
     "robot": "The ranges then show no bearing. Let both fly about, different ways",
     "sensors": "Or do odometry and ranges contradict each other? Check the signs and frames of "
     "both robots: docs/own_robot.md",

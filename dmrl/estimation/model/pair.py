@@ -14,6 +14,9 @@ GRID_RATE_HZ = 100.0
 MAX_DROPOUT_S = 0.5
 """Longest dropout that is interpolated without a warning, seconds. No record of how the value was
 chosen."""
+SLOW_PERIODS, MAX_SLOW_DROPOUT_S = 1.5, 2.0
+"""Periods of a slow log of heights, and seconds, beyond which a gap is a dropout: one sample of a log
+at 1 Hz is missing."""
 MAX_RANGE_M = 60.0
 """Longest plausible UWB range, metres. It rejects 65535 and other fill values."""
 NORMAL_MEDIAN = 0.6745
@@ -204,7 +207,21 @@ def usable_ranges(time_s: Array, range_m: Array, longest_m: float = MAX_RANGE_M)
     return np.asarray(good & (time_s >= latest))
 
 
-def resample(time_s: Array, values: Array, grid_s: Array) -> tuple[Array, Mask]:
+def longest_gap_s(time_s: Array) -> float:
+    """Return the longest time between two samples that is no dropout, seconds.
+
+    Parameters
+    ----------
+    time_s
+        (N,) times of a height, seconds. It changes slowly, so that slow logs are interpolated.
+    """
+    period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    return float(np.clip(SLOW_PERIODS * period_s, MAX_DROPOUT_S, MAX_SLOW_DROPOUT_S))
+
+
+def resample(
+    time_s: Array, values: Array, grid_s: Array, longest_s: float = MAX_DROPOUT_S
+) -> tuple[Array, Mask]:
     """Interpolate signals on a time grid and mark dropouts.
 
     Samples that are not finite, or whose time does not increase, are ignored.
@@ -217,13 +234,15 @@ def resample(time_s: Array, values: Array, grid_s: Array) -> tuple[Array, Mask]:
         (N, C) signals.
     grid_s
         (K,) uniform grid, seconds.
+    longest_s
+        Longest time between samples that is no dropout, seconds.
 
     Returns
     -------
     signal : Array
         (K, C); the first and the last value extend to the ends of the grid.
     dropout : Mask
-        (K,) whether the nearest samples on both sides are over 0.5 s apart.
+        (K,) whether the nearest samples on both sides are farther apart.
 
     Raises
     ------
@@ -240,4 +259,4 @@ def resample(time_s: Array, values: Array, grid_s: Array) -> tuple[Array, Mask]:
     before_s = np.concatenate([[-np.inf], time_s])[after]
     after_s = np.concatenate([time_s, [np.inf]])[after]
     before_s = np.where(grid_s == after_s, grid_s, before_s)
-    return signal, np.asarray(after_s - before_s > MAX_DROPOUT_S)
+    return signal, np.asarray(after_s - before_s > longest_s)

@@ -10,6 +10,7 @@ from dmrl.estimation.model.pair import (
     Array,
     Mask,
     SensorTrack,
+    longest_gap_s,
     resample,
 )
 from dmrl.estimation.signals.jump_detection import find_runs, remove_height_steps
@@ -61,7 +62,7 @@ def build_track(
     limited = find_saturated(velocity[1][:, 0]) | find_saturated(velocity[1][:, 1])
     gap |= find_frozen(*velocity, grid_s) | _near(velocity[0][limited], grid_s)
     level = remove_height_steps(height[0], height[1][:, 0])
-    above, height_gap = resample(height[0], level[:, None], grid_s)
+    above, height_gap = resample(height[0], level[:, None], grid_s, longest_gap_s(height[0]))
     smooth_m = _smooth_parabola(above[:, 0], int(HEIGHT_SMOOTHING_S * GRID_RATE_HZ / 2))
     gap |= turn_gap
     return SensorTrack(speed[:, 0], speed[:, 1], turn[:, 0], smooth_m, gap, height_gap, turn_gap)

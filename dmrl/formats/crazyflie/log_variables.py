@@ -213,7 +213,10 @@ def build_ranges(robot: str, peer: str, time_ns: Times, range_m: Array, where: o
     """
     usable = (range_m > 0) & (range_m < MAX_RANGE_M)
     refused = int((~np.isnan(range_m) & ~usable).sum())
-    leave_out(f"ranges to {peer} that are not over 0 and under 60 m", where, refused)
+    # Fill values are some of the ranges, a wrong unit is nearly all of them.
+    far = int((range_m >= MAX_RANGE_M).sum())
+    unit = " (are they in cm or mm?)" if far > usable.sum() else ""
+    leave_out(f"ranges to {peer} that are not over 0 and under 60 m{unit}", where, refused)
     fields = {"range_m": range_m[usable]}
     return Columns(topics.RANGE(robot, peer), "UwbRange", time_ns[usable], fields)
 

@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from dmrl.estimation.model.pair import Pair, SensorTrack, resample, usable_ranges
+from dmrl.estimation.model.pair import (
+    Pair,
+    SensorTrack,
+    longest_gap_s,
+    resample,
+    usable_ranges,
+)
 
 GRID = np.arange(200) / 100
 STILL = SensorTrack(*np.zeros((4, 200)), np.zeros(200, bool))
@@ -75,3 +81,9 @@ def test_resampling_marks_silence_of_half_a_second() -> None:
 def test_resampling_nothing_is_an_error() -> None:
     with pytest.raises(ValueError, match="no sample is finite"):
         resample(np.array([0.0]), np.array([[np.nan]]), GRID)
+
+
+@pytest.mark.parametrize(("rate_hz", "longest_s"), [(100, 0.5), (3, 0.5), (1, 1.5), (0.1, 2.0)])
+def test_a_slow_log_may_miss_no_sample(rate_hz: float, longest_s: float) -> None:
+    assert longest_gap_s(np.arange(20) / rate_hz) == pytest.approx(longest_s)
+    assert longest_gap_s(np.zeros(1)) == 0.5

@@ -103,3 +103,13 @@ def test_rounded_signals_and_short_logs_do_not_show_saturation() -> None:
     assert not find_saturated(rounded).any()
     assert not find_saturated(np.zeros(2)).any()
     assert not find_saturated(np.zeros(4000)).any()
+
+
+def test_heights_at_1_hz_are_no_dropout() -> None:
+    second = GRID_S[::100]
+    turn = noisy()[:, :1]
+    found = build_track((GRID_S, turn), (GRID_S, noisy()), (second, np.ones((20, 1))), GRID_S)
+    assert found.height_dropout is not None and not found.height_dropout[:1800].any()
+    gone = second != 9.0
+    found = build_track((GRID_S, turn), (GRID_S, noisy()), (second[gone], np.ones((19, 1))), GRID_S)
+    assert found.height_dropout is not None and found.height_dropout[850:950].all()
