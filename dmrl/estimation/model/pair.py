@@ -15,8 +15,8 @@ MAX_DROPOUT_S = 0.5
 """Longest dropout that is interpolated without a warning, seconds. No record of how the value was
 chosen."""
 SLOW_PERIODS, MAX_SLOW_DROPOUT_S = 1.5, 2.0
-"""Periods of a slow log of heights, and seconds, beyond which a gap is a dropout: one sample of a log
-at 1 Hz is missing."""
+"""Periods of a slow log of heights, and seconds, beyond which a gap is a dropout: one sample of a
+log at 1 Hz is missing."""
 MAX_RANGE_M = 60.0
 """Longest plausible UWB range, metres. It rejects 65535 and other fill values."""
 NORMAL_MEDIAN = 0.6745

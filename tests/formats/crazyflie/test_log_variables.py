@@ -230,7 +230,7 @@ def test_ranges_are_limited_to_60_m_and_zeros_are_not_reported(
         "left out: ranges to cf2 that are not over 0 and under 60 m: 3 (first at the log)"
         in capsys.readouterr().err
     )
-    mm = LogBlock("r", times, {"ranging.distance2": np.full(7, 2300.5)})
+    mm = LogBlock("r", times, {"ranging.distance2": 2300.5 + np.arange(7)})
     assert not samples(mm).get("/cf1/range/cf2")
     assert "under 60 m (are they in cm or mm?): 7" in capsys.readouterr().err
 
