@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dmrl.estimation.evidence.mistakes import OF_ONE_ROBOT
+from dmrl.estimation.evidence.mistakes import OF_BOTH_ROBOTS, OF_ONE_ROBOT
 from dmrl.estimation.model.gate import DEFAULT_GATE, Gate
 from dmrl.estimation.model.position_metrics import is_covered_by_truth
 from dmrl.estimation.solver.estimate import MISFIT, REASONS, Estimate
@@ -88,6 +88,8 @@ class PairCause:
             remedy = MISFIT_REMEDY
         elif OF_ONE_ROBOT in self.name:
             remedy = "Nothing shows of which one, so no position is kept. Correct the log"
+        elif OF_BOTH_ROBOTS in self.name:
+            remedy = "Correct the logs of both, and label again"
         elif FITS.search(self.name):
             remedy = "The labels use it so; write the log so too"
         else:

@@ -37,8 +37,8 @@ FOOT_M = 0.3048
 MAX_SPEED_MPS, MAX_HEIGHT_M = 5.0, 10.0
 """Medians of a speed and a height beyond which centimetres and millimetres are tried."""
 
-OF_ONE_ROBOT = " of one robot "
-"""Words of a mistake of either of two logs."""
+OF_ONE_ROBOT, OF_BOTH_ROBOTS = " of one robot ", " of both robots "
+"""Words of a mistake of either of two logs, and of one of both."""
 
 Correction = Callable[[Pair, int | None], Pair]
 """Function from a pair and the robot with the wrong log to the corrected pair."""
@@ -64,6 +64,8 @@ class Mistake:
         Shift of the second robot's clock. None: its times stay.
     with_camera
         Whether it is tried where a camera shows the peer alone, or only elsewhere. None: always.
+    in_both
+        Robots that cannot tell where the peer is if both logs have it. None: not tried in both.
     """
 
     name: str
@@ -73,6 +75,7 @@ class Mistake:
     heading_is_open: bool = False
     shift: ClockShift | None = None
     with_camera: bool | None = None
+    in_both: tuple[int, ...] | None = None
 
 
 class FoundMistake(NamedTuple):
@@ -100,7 +103,7 @@ def find_mistake(pair: Pair) -> FoundMistake | None:
     every = [
         (one, robot)
         for one in MISTAKES
-        for robot in one.robots
+        for robot in (*one.robots, *([] if one.in_both is None else [None]))
         if one.with_camera in (None, has_camera(pair, robot))
         and (one.applies is None or one.applies(pair, robot))
     ]
@@ -109,21 +112,24 @@ def find_mistake(pair: Pair) -> FoundMistake | None:
     for some in (shown, [choice for choice in every if choice not in shown]):
         costs = [compute_cost(choice) for choice in some]
         if costs and min(costs) < enough:
-            least = min(costs)
-            alike = [one for one, cost in zip(some, costs, strict=True) if cost < least + ALIKE]
-            return _select(pair, some[costs.index(least)], alike)
+            order = np.argsort(costs, kind="stable").tolist()
+            return _select(pair, [some[k] for k in order if costs[k] < min(costs) + ALIKE])
     if is_mutual(pair):
         return None
     moved = _move_clock(_search_shift(lambda shift_s: compute_cost(_move_clock(shift_s))))
     return FoundMistake(*moved) if compute_cost(moved) < enough else None
 
 
-def _select(
-    pair: Pair, likeliest: tuple[Mistake, int | None], alike: list[tuple[Mistake, int | None]]
-) -> FoundMistake:
-    """Return the correction to make of those that fit alike."""
-    mistake, robot = next((one for one in alike if one[0].heading_is_open), likeliest)
-    if {(mistake, 0), (mistake, 1)} <= set(alike):
+def _select(pair: Pair, alike: list[tuple[Mistake, int | None]]) -> FoundMistake:
+    """Return the correction to make of those that fit alike, best first."""
+    # A mistake in one log is likelier than one in both.
+    single = [(one, robot) for one, robot in alike if robot in one.robots]
+    if not single:
+        mistake, _ = alike[0]
+        name = mistake.name.replace(" fit", f"{OF_BOTH_ROBOTS}fit", 1)
+        return FoundMistake(replace(mistake, name=name), None, mistake.in_both or ())
+    mistake, robot = next((one for one in single if one[0].heading_is_open), single[0])
+    if {(mistake, 0), (mistake, 1)} <= set(single):
         # Either robot may be the mirrored one, so nothing shows on which side the peer is.
         name = mistake.name.replace(" fit", f"{OF_ONE_ROBOT}fit", 1)
         return FoundMistake(replace(mistake, name=name), None, (0, 1))
@@ -159,12 +165,14 @@ def _search_shift(compute_cost: Callable[[float], float]) -> float:
 
 
 def _correct_track(change: Callable[[SensorTrack, float], SensorTrack]) -> Correction:
-    """Return the correction of the log of one robot, from the log and its step, seconds."""
+    """Return the correction of a log, or of both for robot None, from the log and its step."""
 
     def correct(pair: Pair, robot: int | None) -> Pair:
-        if robot == 0:
-            return replace(pair, own=change(pair.own, pair.dt_s))
-        return replace(pair, peer=change(pair.peer, pair.dt_s))
+        tracks = [
+            track if robot == other else change(track, pair.dt_s)
+            for track, other in ((pair.own, 1), (pair.peer, 0))
+        ]
+        return replace(pair, own=tracks[0], peer=tracks[1])
 
     return correct
 
@@ -233,9 +241,9 @@ def has_camera(pair: Pair, robot: int | None) -> bool:
 FLOW, TURN = ("vx_mps", "vy_mps"), "yaw_rate_radps"
 PAIR = (None,)
 MISTAKES: tuple[Mistake, ...] = (
-    Mistake("yaw rate fits if it is negated", _scale(-1.0, TURN)),
+    Mistake("yaw rate fits if it is negated", _scale(-1.0, TURN), in_both=(0, 1)),
     Mistake("odometry fits if vy and yaw rate are negated", _scale(-1.0, "vy_mps", TURN)),
-    Mistake("yaw rate fits if it is taken as degrees", _scale(np.pi / 180, TURN)),
+    Mistake("yaw rate fits if it is taken as degrees", _scale(np.pi / 180, TURN), in_both=()),
     # Three mirrors that differ by a turn of the robot's frame, which ranges do not show.
     Mistake(
         "flow fits if one axis is negated or both are swapped",
@@ -247,9 +255,12 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("flow fits if vy is negated", _scale(-1.0, "vy_mps"), with_camera=True),
     Mistake("flow fits if vx and vy are swapped", _correct_track(_swap_axes), with_camera=True),
     Mistake(
-        "flow fits in the world frame", _correct_track(_from_take_off_frame), heading_is_open=True
+        "flow fits in the world frame",
+        _correct_track(_from_take_off_frame),
+        heading_is_open=True,
+        in_both=(0, 1),
     ),
-    Mistake("flow fits if it is taken as feet", _scale(FOOT_M, *FLOW)),
+    Mistake("flow fits if it is taken as feet", _scale(FOOT_M, *FLOW), in_both=()),
     Mistake("range fits if it is taken as feet", _scale_ranges(FOOT_M), PAIR),
     Mistake("robots fit if their logs are exchanged", _exchange_logs, PAIR, with_camera=True),
     *(

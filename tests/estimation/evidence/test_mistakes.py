@@ -152,3 +152,17 @@ def test_a_camera_shows_which_axis_is_wrong() -> None:
     assert not has_camera(pair, None) and not has_camera(pair, 0)
     looking = replace(pair, peer_bearings=seen)
     assert has_camera(looking, None) and has_camera(looking, 1) and not has_camera(looking, 0)
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("name", ["yaw rate fits if it is negated", "flow fits in the world frame"])
+def test_a_mistake_in_the_logs_of_both_robots_is_named(name: str) -> None:
+    wrong = both_ranging(flown("room", "calibrated", 1001, 50.0))
+    if "world" in name:
+        wrong = in_take_off_frame(in_take_off_frame(wrong).swap_robots()).swap_robots()
+    else:
+        wrong = BY_NAME[name].correct(wrong, None)
+    ((own, peer),) = estimate_pairs([wrong])
+    assert own.causes[0].name == name.replace(" fits", " of both robots fits")
+    assert own.causes[0].robot is None
+    assert not (own.status == STATUS_OK).any() and not (peer.status == STATUS_OK).any()
