@@ -51,7 +51,7 @@ def test_invalid_images_are_reported(images: Any) -> None:
 
 
 def test_sizes_not_divisible_by_the_stride_are_reported() -> None:
-    with pytest.raises(SettingError, match="dmrl convert ... --width-px 320 --height-px 224"):
+    with pytest.raises(SettingError, match="--width-px 320 --height-px 224"):
         dmrl.load("dmrl-nano").detect(np.zeros((1, 225, 320, 3), np.uint8))
 
 
