@@ -81,7 +81,7 @@ def _estimate_pair(
     logged: Pair, noise: NoiseModel | None, gate: Gate, *, plain: bool
 ) -> tuple[Estimate, Estimate]:
     """Estimate both directions of a pair, with a discrete mistake of its logs corrected."""
-    if list_measuring_robots(logged) == {1}:
+    if not plain and list_measuring_robots(logged) == {1}:
         # Measurements of the other robot have the times of the first one's clock.
         peer, own = _estimate_pair(logged.swap_robots(), noise, gate, plain=plain)
         return own, peer

@@ -132,3 +132,11 @@ def test_an_uncertain_clock_widens_positions_along_the_motion() -> None:
     assert moved.time_s.tolist() == [0.5, 1.5, 2.5, 3.5]
     assert moved.covariance[0].tolist() == [[2.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     assert to_peer_clock(replace(at, clock_s=None)).time_s is time_s
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("robot", [0, 1])
+def test_calibration_pools_constants_whichever_robot_ranges(robot: int) -> None:
+    pair = ranged_by(both_ranging(flown("in_view", "calibrated", 1000, 20.0)), robot)
+    ((own, _),) = estimate_pairs([pair], plain=True)
+    assert own.constants_covariance is not None
