@@ -1,5 +1,6 @@
 """Conversion between raw Bayer images and RGB, with OpenCV."""
 
+import re
 from types import ModuleType
 from typing import TypeVar
 
@@ -10,6 +11,7 @@ from dmrl.errors import MissingExtra
 from dmrl.images.codec import Grey, Rgb
 
 Value = TypeVar("Value", bound=np.generic)
+RAW_FORMAT = re.compile(r"bayer_([rgb]{4})(?:8|16)\b")
 BAYER_MIN_PX = 4
 """Smallest width and height of a raw image whose colours can be interpolated."""
 
@@ -59,6 +61,28 @@ def demosaic(raw: Grey, pattern: str = "RGGB") -> Rgb:
     """
     cv2 = load_opencv()
     return np.asarray(cv2.cvtColor(raw, getattr(cv2, f"COLOR_Bayer{pattern}2RGB")), np.uint8)
+
+
+def demosaic_decoded(rgb: Rgb, kind: str) -> Rgb | None:
+    """Return the colours of a decoded ROS image whose format says that its pixels are raw.
+
+    ROS's image_transport compresses the pixels of a colour sensor as one grey picture.
+
+    Parameters
+    ----------
+    rgb
+        (H, W, 3), uint8.
+    kind
+        Format of the compressed image, such as ``bayer_rggb8; png compressed``.
+
+    Returns
+    -------
+    Rgb | None
+        None: the pixels are not raw.
+    """
+    if (found := RAW_FORMAT.match(kind)) is None or min(rgb.shape[:2]) < BAYER_MIN_PX:
+        return None
+    return demosaic(np.ascontiguousarray(rgb[..., 0]), found[1].upper())
 
 
 def to_bayer(rgb: NDArray[Value]) -> NDArray[Value]:

@@ -2,7 +2,11 @@
 
 Channels have 8 or 16 bits. A single channel is grey, the first of two channels is grey, and a
 fourth channel is dropped. Signed values are shifted by half of their range, so 0 becomes mid-grey.
+Channels without names, as in ``8UC3``, are blue, green and red, as OpenCV has them; Foxglove's
+``RawImage`` defines ``8UC3`` so, too. ``nv12`` is Foxglove's alone.
 """
+
+import re
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +23,18 @@ CHANNELS: dict[str, tuple[int, ...]] = {
     "bgra": (2, 1, 0, 3),
 }
 """Channel of red, green, blue and alpha, by the name of an encoding without its bits."""
+UNNAMED_CHANNELS = re.compile(r"(8|16)[US]C[34]")
+"""Encodings that do not name their channels."""
 BAYER_PATTERNS = ("rggb", "bggr", "gbrg", "grbg")
 YUV = {
     **dict.fromkeys(("yuv422", "uyvy"), (1, 0, 2)),
     **dict.fromkeys(("yuv422_yuy2", "yuyv"), (0, 1, 3)),
 }
 """Packed 4:2:2 encodings: place of the first Y, of U and of V among 4 bytes of 2 pixels."""
-PLANAR_YUV = {"nv21": 2, "nv24": 1}
+PLANAR_YUV = {"nv12": 2, "nv21": 2, "nv24": 1}
 """A plane of Y, then rows of V and U in turns: pixels per chroma sample, both ways.
 
-``nv21`` is V, U; ``nv24`` is U, V.
+``nv21`` is V, U; the others are U, V.
 """
 RGB_FROM_YUV = np.array([[1.164, 0.0, 1.596], [1.164, -0.392, -0.813], [1.164, 2.017, 0.0]])
 """ITU-R BT.601, video range: Y from 16 to 235, U and V from 16 to 240."""
@@ -97,8 +103,9 @@ def convert_to_rgb(
     if encoding not in LAYOUTS:
         raise SourceError(f"images of encoding {encoding[:40]!r}, which is not supported")
     (height, width), (channels, size, signed) = shape, LAYOUTS[encoding]
-    rows = height + {"nv21": height // 2, "nv24": 2 * height}.get(encoding, 0)
-    odd = (encoding in (*YUV, "nv21") and width % 2) or (encoding == "nv21" and height % 2)
+    rows = height + {2: height // 2, 1: 2 * height}.get(PLANAR_YUV.get(encoding, 0), 0)
+    halved = PLANAR_YUV.get(encoding) == 2
+    odd = ((encoding in YUV or halved) and width % 2) or (halved and height % 2)
     whole = height > 0 and 0 < width * channels * size <= step and rows * step <= len(data)
     small = encoding.startswith("bayer_") and min(shape) < BAYER_MIN_PX
     if odd or small or not whole:
@@ -115,7 +122,7 @@ def convert_to_rgb(
     pixels = values.astype(np.uint8) if size == 1 else scale_to_8_bits(values, bits)
     if encoding.startswith("bayer_"):
         return demosaic(np.ascontiguousarray(pixels[..., 0]), encoding[6:10].upper())
-    order = CHANNELS.get(encoding.rstrip("0123456789"), (0, 1, 2) if channels > 2 else (0, 0, 0))
+    order = CHANNELS.get(encoding.rstrip("0123456789"), (2, 1, 0) if channels > 2 else (0, 0, 0))
     return np.ascontiguousarray(pixels[..., order[:3]])
 
 

@@ -6,6 +6,7 @@ are copied, with new names of robots. All others are left out, with a line that 
 """
 
 import base64
+import re
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
 from functools import cache
 from itertools import islice
@@ -21,6 +22,7 @@ from google.protobuf.message_factory import GetMessageClass
 from dmrl import topics
 from dmrl.errors import RecordingError, SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
+from dmrl.formats.files.text_cells import parse_time_ns
 from dmrl.formats.ros import bag
 from dmrl.formats.ros.reader import BagMessage, build_decoder
 from dmrl.formats.ros.ros_messages import is_camera_image
@@ -45,6 +47,9 @@ OWN_PACKAGES = ("dmrl.v1.", "dmrl.log.")
 FIELDS_WITH_ROBOTS = ("peer", "frame_id", "parent_frame_id", "child_frame_id")
 STAMP_FIELDS = {"seconds": "sec", "sec": "sec", "nanos": "nanosec", "nsec": "nanosec"}
 """Fields of a time by those of a time in protobuf or JSON."""
+STANDARD_BASE64 = str.maketrans("-_", "+/")
+"""Characters of base64 for URLs, which JSON may hold too, by those of the standard."""
+WHOLE_NUMBER = re.compile(r"-?\d{1,19}")
 LOG_CODES = {F.TYPE_UINT32: "I", F.TYPE_SINT32: "i", F.TYPE_SINT64: "q"}
 LOG_CODES |= {F.TYPE_FLOAT: "f", F.TYPE_DOUBLE: "d"}
 """Letters of `LogType` by type of field."""
@@ -185,8 +190,9 @@ def _decode(raw: RawMessage, source: Path) -> Any:
     """Return a message of Foxglove's as an object with the fields of ROS's; None: it is none."""
     message = parse(raw, source)
     if isinstance(message, dict) and isinstance(message.get("data"), str):
+        text = "".join(message["data"].split()).translate(STANDARD_BASE64)
         try:
-            message["data"] = base64.b64decode(message["data"], validate=True)
+            message["data"] = base64.b64decode(text + "=" * (-len(text) % 4), validate=True)
         except ValueError:
             return None
     is_ros = raw.channel.encoding in ROS_ENCODINGS
@@ -200,17 +206,21 @@ def _to_object(value: Any) -> Any:
         value = {field.name: getattr(value, field.name) for field in value.DESCRIPTOR.fields}
     if isinstance(value, dict):
         held = {str(name): _to_object(part) for name, part in value.items()}
-        if isinstance(held.get("timestamp"), SimpleNamespace):
+        if "timestamp" in held:
             held = {"header": _to_header(held["timestamp"])} | held
         return SimpleNamespace(**{"is_bigendian": False} | held)
     return value
 
 
 def _to_header(stamp: Any) -> Any:
-    """Return a ROS header with the time of a message, protobuf's or JSON's."""
-    told = {STAMP_FIELDS[n]: v for n, v in vars(stamp).items() if n in STAMP_FIELDS}
-    whole = all(isinstance(value, int) for value in told.values())
-    return SimpleNamespace(stamp=SimpleNamespace(**told) if whole else None)
+    """Return a ROS header with the time of a message: protobuf's, or in one of JSON's forms."""
+    told: dict[str, int] = {}
+    if isinstance(stamp, SimpleNamespace):
+        held = {STAMP_FIELDS[n]: v for n, v in vars(stamp).items() if n in STAMP_FIELDS}
+        told = {n: int(v) for n, v in held.items() if WHOLE_NUMBER.fullmatch(str(v))}
+    else:  # protobuf's JSON has dates, and whole numbers of 64 bits as text
+        told["sec"], told["nanosec"] = divmod(parse_time_ns(str(stamp), 1e9, False) or 0, 10**9)
+    return SimpleNamespace(stamp=SimpleNamespace(**{"sec": 0, "nanosec": 0} | told))
 
 
 def _to_type(message: Any) -> str | LogType:

@@ -28,7 +28,7 @@ def raw(rows: int, values: int, size: int, spare: int = 0) -> tuple[np.ndarray, 
 
 
 def test_encoding_table_equals_ros() -> None:
-    assert set(LAYOUTS) == set(ROS)
+    assert set(LAYOUTS) == {*ROS, "nv12"}
 
 
 @pytest.mark.parametrize("spare", [0, 3])
@@ -49,7 +49,7 @@ def test_channel_order_follows_the_encoding_name(encoding: str, big: bool, spare
     pixels = values.reshape(HEIGHT, WIDTH, count).astype(np.float64)
     if found[4] == "S":
         pixels = (pixels + 256**size / 2) % 256**size
-    letters = name if name in ("rgb", "bgr", "rgba", "bgra") else "rgba"
+    letters = name if name in ("rgb", "bgr", "rgba", "bgra") else "bgra"  # OpenCV's
     places = [letters.index(c) if count > 2 else 0 for c in "rgb"]
     want = pixels[..., places] * 255 / (256**size - 1)
     assert np.abs(rgb - want).max() <= 0.5 + 1e-9
@@ -75,11 +75,12 @@ def test_a_colour_sensor_s_picture_gets_its_colours(pattern: str, bits: int) -> 
         ("uyvy", HEIGHT, cv2.COLOR_YUV2RGB_UYVY),
         ("yuv422_yuy2", HEIGHT, cv2.COLOR_YUV2RGB_YUY2),
         ("yuyv", HEIGHT, cv2.COLOR_YUV2RGB_YUY2),
+        ("nv12", HEIGHT * 3 // 2, cv2.COLOR_YUV2RGB_NV12),
         ("nv21", HEIGHT * 3 // 2, cv2.COLOR_YUV2RGB_NV21),
     ],
 )
 def test_luma_and_chroma_conversion_equals_opencv(encoding: str, rows: int, code: int) -> None:
-    count = 1 if encoding == "nv21" else 2
+    count = 1 if encoding.startswith("nv") else 2
     values, data = raw(rows, WIDTH * count, 1)
     values = values.clip(16, 235)
     want = cv2.cvtColor(values if count == 1 else values.reshape(rows, WIDTH, 2), code)

@@ -226,6 +226,26 @@ def test_robots_of_a_recording_of_dmrl_are_renamed(tmp_path: Path) -> None:
     assert read_summary(tmp_path / "b.mcap").metadata["dmrl.split"] == [{"train": "[[5, 5]]"}]
 
 
+@pytest.mark.parametrize(
+    ("stamp", "time_ns"),
+    [
+        ({"sec": "1700000001", "nsec": 5}, 1_700_000_001_000_000_005),
+        ("2023-11-14T22:13:21.000000005Z", 1_700_000_001_000_000_005),
+        (1_700_000_001.5, 1_700_000_001_500_000_000),
+        ("soon", START_NS),
+    ],
+)
+def test_json_times_have_several_forms(
+    stamp: object, time_ns: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = base64.urlsafe_b64encode(encode_png(PIXELS)).decode().rstrip("=")
+    image = {"timestamp": stamp, "frame_id": "c", "format": "png", "data": data}
+    path = json_file(tmp_path / "a.mcap", {"/cam": ("foxglove.CompressedImage", [image])})
+    found, _ = convert(path, tmp_path / "b.mcap")
+    assert found["/cf1/camera/image"].to_arrow()["log_time"].to_pylist() == [time_ns]
+    assert ("get the bag's times: 1 on /cam" in capsys.readouterr().err) == (stamp == "soon")
+
+
 @pytest.mark.parametrize("profile", ["", "ros2"])
 @pytest.mark.parametrize("other", ["json", "protobuf", ""])
 def test_messages_of_ros_beside_others(profile: str, other: str, tmp_path: Path) -> None:

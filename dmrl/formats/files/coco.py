@@ -164,6 +164,9 @@ def _build_rows(
     """Return the labels of a picture; None if one of them cannot be read."""
     single = [a for a in annotations if not a.get("iscrowd")]
     leave_out("boxes around crowds (iscrowd)", where, len(annotations) - len(single))
+    told = {str([a.get(k) for k in ("category_id", "bbox", "attributes")]): a for a in single}
+    leave_out("boxes that repeat another of their picture", where, len(single) - len(told))
+    single = list(told.values())
     try:
         boxes = [_parse_box(annotation, classes) for annotation in single]
         return list(map(_add_attributes, build_rows(file, boxes, options.names), single))

@@ -204,6 +204,9 @@ def _iter_streams(log: CsvLog, names: Mapping[str, str]) -> Iterator[Iterable[Sa
     )
     for peer in log.range_peers:
         range_m = log.columns[f"range_{peer}_m"]
+        if name(peer) == own:
+            leave_out(f"ranges of {own} to itself", log.path, int(np.isfinite(range_m).sum()))
+            continue
         yield build_ranges(own, name(peer), time_ns, range_m, log.path)
     for peer in log.truth_peers:
         xyz = np.stack([log.columns[f"{peer}_{axis}_m"] for axis in "xyz"], axis=1)

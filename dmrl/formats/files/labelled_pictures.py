@@ -42,6 +42,8 @@ EDGE_STD_PX = 1.0
 """Standard deviation of an edge of a box that was drawn by hand, pixels."""
 BORDER_PX = 1.0
 """A box this near to the border of its picture may be cut off there."""
+OVERHANG_PX, OVERHANG_SHARE = 2.0, 0.1
+"""Boxes that reach further out of their picture are doubted: pixels, or the share of a side."""
 SAME_FOCAL_SHARE = 0.02
 """Focal lengths of two calibrations of one lens differ by less than this share. No record of how
 the value was chosen."""
@@ -53,6 +55,8 @@ LABELLED_OPTIONS = PICTURE_OPTIONS | {"rate_hz", "robot_width_m"}
 SHARES = (1.0, 1.0)
 """Size to which normalised coordinates refer."""
 
+Box = tuple[str, Sequence[float]]
+"""Class, and left, top, right, bottom."""
 MoreSamples = Callable[[Path, int, Crop], Iterator[Sample]]
 
 
@@ -126,9 +130,7 @@ def name_peers(classes: Sequence[str], names: Mapping[str, str]) -> list[str]:
     return peers
 
 
-def build_rows(
-    file: str, boxes: Sequence[tuple[str, Sequence[float]]], names: Mapping[str, str]
-) -> list[LabelRow]:
+def build_rows(file: str, boxes: Sequence[Box], names: Mapping[str, str]) -> list[LabelRow]:
     """Return a label without depth at the centre of each box of a picture.
 
     Parameters
@@ -149,6 +151,13 @@ def build_rows(
         raise ValueError(f"more than {limits.PEERS} boxes")
     peers = name_peers([name for name, _ in boxes], names)
     return [_build_row(file, peer, box) for peer, (_, box) in zip(peers, boxes, strict=True)]
+
+
+def drop_repeats(boxes: Sequence[Box], where: object) -> list[Box]:
+    """Return the boxes of a picture without those that repeat one, class and all."""
+    found = list({(name, tuple(map(float, box))): (name, box) for name, box in boxes}.values())
+    leave_out("boxes that repeat another of their picture", where, len(boxes) - len(found))
+    return found
 
 
 def _build_row(file: str, peer: str, box_px: Sequence[float]) -> LabelRow:
@@ -186,6 +195,7 @@ def iter_picture_samples(
     Pictures that cannot be decoded are left out with their labels.
     """
     converter = PictureConverter(options, source)
+    doubts: Counter[str] = Counter()
     for time_ns, picture in pictures:
         labelled = any(row.peer for row in picture.rows or ())
         data = picture.path.read_bytes()
@@ -195,6 +205,7 @@ def iter_picture_samples(
         crop, samples = found
         yield from samples
         if (rows := _to_pixels(picture, crop)) is not None:
+            doubts.update(filter(None, (_doubt_place(row, crop) for row in rows if row.peer)))
             rows = [estimate_depth(row, crop, options) for row in rows]
             peers = [crop.crop_label(row).to_fields() for row in rows if row.peer]
             sources = {row.source for row in rows} or {"hand"}
@@ -202,6 +213,20 @@ def iter_picture_samples(
         if more is not None:
             yield from more(picture.path, time_ns, crop)
     converter.report()
+    for doubt, count in doubts.items():
+        say(f"{source}: doubt: {count} labels {doubt}")
+
+
+def _doubt_place(row: LabelRow, crop: Crop) -> str:
+    """Return what is doubtful in the place of a label in its picture; empty: nothing."""
+    size = crop.from_width_px, crop.from_height_px
+    edges = row.box_px or (row.u_px, row.v_px) * 2
+    over_px = max(-edges[0], -edges[1], edges[2] - size[0], edges[3] - size[1])
+    if not (0 <= row.u_px <= size[0] and 0 <= row.v_px <= size[1]):
+        return "are centred outside their picture: corners for width and height, or u for v?"
+    if over_px > max(OVERHANG_PX, OVERHANG_SHARE * min(edges[2] - edges[0], edges[3] - edges[1])):
+        return "have a box that reaches out of its picture: corners for centre and size?"
+    return ""
 
 
 def _to_pixels(picture: LabelledPicture, crop: Crop) -> list[LabelRow] | None:

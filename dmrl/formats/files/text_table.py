@@ -15,6 +15,7 @@ import numpy as np
 from dmrl.errors import EmptySource, SourceError
 from dmrl.formats.clocks import Ints, settle_times
 from dmrl.formats.files import text_cells
+from dmrl.formats.files.text_rows import is_named, split_rows, strip_unit
 from dmrl.geometry.frames import Array
 from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_number
@@ -36,7 +37,6 @@ BYTE_ORDER_MARKS = (
 )
 NO_TEXT, NO_TEXT_BYTES = re.compile(rb"[\0-\x08\x0e-\x1a\x1c-\x1f]"), 4096
 """Characters that no encoding of text in one byte has, and the beginning that is searched."""
-UNIT_SUFFIX = re.compile(r"\s*[\[(<{/]\s*([^\])>}]*?)\s*[\])>}]?\s*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,13 +160,13 @@ def read_table(
     head, separator, names = _find_header(path, lines, wanted, dialect)
     units = {}
     for k, name in enumerate(names):
-        known = next((w for w in wanted if w != name and _strip_unit(name, w) is not None), None)
+        known = next((w for w in wanted if w != name and strip_unit(name, w) is not None), None)
         if known and known not in names:
-            units[known], names[k] = _strip_unit(name, known) or "", known
+            units[known], names[k] = strip_unit(name, known) or "", known
     marks = (dialect.comment,) if dialect.comment else COMMENT_MARKS
     body = [(n, _cut_comment(line, marks, separator, len(names))) for n, line in lines[head + 1 :]]
     body = [(n, line) for n, line in body if line.strip()]
-    numbers, rows = _split_rows(path, body, separator, names)
+    numbers, rows = split_rows(path, body, separator, names)
     if rows and not any(text_cells.is_number(cell) for cell in rows[0]):
         units |= {name: cell.strip() for name, cell in zip(names, rows[0], strict=True)}
         numbers, rows = numbers[1:], rows[1:]  # a line of units
@@ -241,7 +241,7 @@ def _find_header(
             plain = _uncomment(line, marks)
             for text in dict.fromkeys((plain, line, _cut_comment(plain, marks))):
                 names = _split(text, separator)
-                score = sum(any(_is_named(name, w) for name in names) for w in set(wanted))
+                score = sum(any(is_named(name, w) for name in names) for w in set(wanted))
                 if score > best[0]:
                     best = score, place, separator, names
         if best[0] == len(set(wanted)) > 0:
@@ -287,18 +287,6 @@ def _split(line: str, separator: str) -> list[str]:
     return [name.strip().strip("\ufeff'\"") for name in names]
 
 
-def _is_named(name: str, wanted: str) -> bool:
-    return name == wanted or _strip_unit(name, wanted) is not None
-
-
-def _strip_unit(name: str, wanted: str) -> str | None:
-    """Return the unit that follows a wanted name in a header, as in ``roll [deg]``; or None."""
-    if not name.startswith(wanted) or name == wanted:
-        return None
-    found = UNIT_SUFFIX.fullmatch(name[len(wanted) :])
-    return found[1] if found else None
-
-
 def _tidy(path: Path, names: list[str], wanted: Collection[str]) -> list[str]:
     """Return names that differ: a repeated one gets a number, an empty one its place."""
     if len(names) > limits.VARIABLES:
@@ -312,34 +300,6 @@ def _tidy(path: Path, names: list[str], wanted: Collection[str]) -> list[str]:
             name += "_"
         found.append(name)
     return found
-
-
-def _split_rows(
-    path: Path, body: list[tuple[int, str]], separator: str, names: list[str]
-) -> tuple[list[int], list[list[str]]]:
-    """Split lines into rows with as many cells as there are names; return their lines and cells."""
-    texts = [line for _, line in body]
-    if separator == " ":
-        texts = [" ".join(line.split()) for line in texts]
-    reader = csv.reader(texts, delimiter=separator, skipinitialspace=True)
-    try:
-        rows = [(body[reader.line_num - 1][0], row) for row in reader]
-    except csv.Error as e:
-        line = body[min(reader.line_num, len(body)) - 1][0]
-        raise SourceError(f"{path}:{line} cannot be read as CSV: {e}. Fix the line") from None
-    width = len(names)
-    if rows and all(len(row) == width + 1 for _, row in rows):
-        ends_empty = all(not row[-1].strip() for _, row in rows)
-        # A separator at the end of each row, or R's names of rows, which have no name.
-        rows = [(number, row[:-1] if ends_empty else row[1:]) for number, row in rows]
-    kept = [(number, row) for number, row in rows if len(row) == width]
-    repeated = [number for number, row in kept if [cell.strip() for cell in row] == names]
-    kept = [(number, row) for number, row in kept if number not in set(repeated)]
-    odd = [number for number, row in rows if len(row) != width]
-    if odd:
-        reason = "lines with fewer or more cells than the header"
-        leave_out(reason, f"{path}:{odd[0]}", len(odd))
-    return [number for number, _ in kept], [row for _, row in kept]
 
 
 def _find_commas(path: Path, rows: list[list[str]]) -> bool:

@@ -17,6 +17,7 @@ from dmrl.formats.files.labelled_pictures import (
     LabelledPicture,
     build_rows,
     build_set_content,
+    drop_repeats,
     find_split,
     list_pictures,
     natural_key,
@@ -114,7 +115,7 @@ def _read_rows(
         width, height = (
             parse_number(root.findtext(f"size/{side}") or "0") for side in ("width", "height")
         )
-        boxes = [_parse_box(one) for one in root.findall("object")]
+        boxes = drop_repeats([_parse_box(one) for one in root.findall("object")], label)
         rows = build_rows(picture.name, boxes, options.names)
     except (OSError, ValueError) as e:
         leave_out(UNREADABLE, f"{label}: {e}")

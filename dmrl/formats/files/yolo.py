@@ -27,6 +27,7 @@ from dmrl.formats.files.labelled_pictures import (
     LabelledPicture,
     build_rows,
     build_set_content,
+    drop_repeats,
     find_split,
     is_picture,
     list_pictures,
@@ -117,7 +118,7 @@ def _read_description(source: Path) -> _Description:
         lines = read_text(listed).splitlines() if listed else []
         if listed is None:
             say(f"{source}: no class names, so they are class0, class1, ... (--names class0=cf2)")
-        return _Description(dict(enumerate(filter(None, map(str.strip, lines)))))
+        return _Description({k: line.strip() for k, line in enumerate(lines) if line.strip()})
     try:
         told = parse_yaml(read_text(found))
         names = told.get("names", {})
@@ -176,7 +177,7 @@ def _read_rows(
             line += 1
             if words := text.split():
                 boxes.append(_parse_line(words, about))
-        return build_rows(picture.name, boxes, options.names)
+        return build_rows(picture.name, drop_repeats(boxes, label), options.names)
     except (ValueError, SourceError) as e:
         leave_out(UNREADABLE, f"{label}:{line}: {str(e)[:200]}")
         return None
@@ -184,8 +185,10 @@ def _read_rows(
 
 def _parse_line(words: Sequence[str], about: _Description) -> tuple[str, tuple[float, ...]]:
     """Return the class and the box (left, top, right, bottom) of a line."""
-    number, values = int(parse_number(words[0])), [parse_number(word) for word in words[1:]]
-    name = about.names.get(number, f"class{number}")
+    number, *values = map(parse_number, words)
+    if not number.is_integer():
+        raise ValueError(f"{words[0]} is no number of a class")
+    name = about.names.get(int(number), f"class{number:.0f}")
     boxed = len(values) in (4, 5) or about.keypoints
     if not all(math.isfinite(v) and abs(v) <= MAX_SHARE for v in values[: 4 if boxed else None]):
         raise ValueError("coordinates are not shares of the picture's size, from 0 to 1")

@@ -26,9 +26,14 @@ import numpy as np
 
 from dmrl.errors import SourceError
 from dmrl.formats.base import SOURCE_OPTIONS, Content, Format, Options
-from dmrl.formats.files.pictures import scaling_words
 from dmrl.formats.ros.message_clock import MessageClock
-from dmrl.formats.ros.reader import BagMessage, iter_messages, list_topics
+from dmrl.formats.ros.reader import (
+    METADATA_FILE,
+    BagMessage,
+    find_unnamed_files,
+    iter_messages,
+    list_topics,
+)
 from dmrl.formats.ros.ros_messages import (
     CONVERTERS,
     DMRL_PREFIX,
@@ -53,7 +58,7 @@ SUFFIXES = (".db3", ".bag", ".mcap")
 def can_read(source: Path) -> bool:
     """Return whether a source is a ROS 1 bag, a rosbag2 folder, or the storage of one."""
     if source.is_dir():
-        return (source / "metadata.yaml").is_file()
+        return (source / METADATA_FILE).is_file() or any(source.glob("*.db3"))
     if source.suffix not in SUFFIXES:
         return False
     with source.open("rb") as stream:
@@ -84,6 +89,8 @@ def load_content(source: Path, options: Options, *, skip: Collection[str] = ()) 
         If rosbags is not installed.
     """
     held = [one for one in list_topics(source) if one[0] not in skip]
+    if unnamed := find_unnamed_files(source):
+        leave_out(f"files that {METADATA_FILE} does not name", unnamed[0], len(unnamed))
 
     def is_camera(topic: str, kind: str) -> bool:
         first = next(iter_messages(source, [(topic, kind)], ahead=True), None)
@@ -130,7 +137,7 @@ def iter_samples(
     """
     calibrated: dict[str, Mapping[str, Any]] = {}
     unstamped: Counter[str] = Counter()
-    scaled: set[str] = set()
+    changes: dict[str, set[str]] = {}
     moving = {line.robot for line in lines.values() if line.kind == ODOMETRY}
     with closing(ahead):
         first = (m for m in ahead if isinstance(m, BagMessage))
@@ -144,7 +151,7 @@ def iter_samples(
         odometry = line.robot in moving
         where = MessageContext(
             *(source, line.robot, line.peer, line.captured, line.rectified),
-            *(odometry, options.bits, scaled),
+            *(odometry, options.bits, changes),
         )
         # Without a time in the header, the bag's own time is the best estimate.
         stamp_ns = header_time_ns(message.decoded)
@@ -155,8 +162,8 @@ def iter_samples(
         received_ns = bag_ns if message.publish_ns is None else message.publish_ns
         for sample in select_usable(samples, f"{source}: {line.topic}", calibrated):
             yield replace(sample, publish_ns=max(received_ns, 0))
-    if scaled:
-        say(f"{source}: images of {', '.join(sorted(scaled))}: {scaling_words(options.bits)}")
+    for change, robots in changes.items():
+        say(f"{source}: images of {', '.join(sorted(robots))}: {change}")
     _report_unstamped(source, unstamped)
 
 

@@ -23,6 +23,9 @@ ROS1_MAGIC = b"#ROSBAG V2.0\n"
 COMPUTED_TABLE = re.compile(r"\bVIRTUAL\b|\bGENERATED\b|\bAS\s*\(", re.IGNORECASE)
 TYPE_NAME = re.compile(r"\w+/msg/\w+")
 """Types that are read. rosbags builds Python code of definitions: their names are checked first."""
+METADATA_FILE, STORAGE_FILES = "metadata.yaml", ("*.db3", "*.mcap", "*.db3.zstd", "*.mcap.zstd")
+WAL_HEADER_BYTES = 32
+"""Size of a log of writes of SQLite that is empty."""
 IDL_SEPARATOR = "=" * 80 + "\n"
 
 
@@ -137,12 +140,32 @@ def _open_reader(source: Path) -> Any:
     return rosbag1.Reader(source) if source.suffix == ".bag" else rosbag2.Reader(source)
 
 
+def find_unnamed_files(source: Path) -> list[Path]:
+    """Return the files of messages in a bag's folder that its metadata.yaml does not name."""
+    text = (source / METADATA_FILE).read_text(errors="replace") if source.is_dir() else ""
+    named = {line.strip(" -'\"").rsplit("/", 1)[-1] for line in text.splitlines()}
+    held = (path for pattern in STORAGE_FILES for path in source.glob(pattern))
+    return sorted(path for path in held if path.name not in named) if named else []
+
+
 def _check_storage(source: Path) -> None:
     """Raise SourceError unless a bag's SQLite files have tables alone; a view can run any query.
 
-    A ROS 1 bag must begin with its magic: rosbags reads its first line, however long it is.
+    A ROS 1 bag must begin with its magic: rosbags reads its first line, however long it is. rosbags
+    ignores the log of writes that SQLite leaves beside a file when its recording is killed.
     """
+    if source.is_dir() and not (source / METADATA_FILE).is_file():
+        raise SourceError(
+            f"{source} has no {METADATA_FILE}: its recording was killed. Run: ros2 bag reindex "
+            f"{source}, or pass one of its files"
+        )
     for path in sorted(source.glob("*.db3")) if source.is_dir() else [source]:
+        log = path.with_name(f"{path.name}-wal")
+        if log.is_file() and log.stat().st_size > WAL_HEADER_BYTES:
+            raise SourceError(
+                f"{log} has messages that are not yet in {path.name}. Move them there: sqlite3 "
+                f"{path} 'PRAGMA wal_checkpoint(TRUNCATE)'"
+            )
         with path.open("rb") as stream:
             head = stream.read(16)
         if path.suffix == ".bag" and not head.startswith(ROS1_MAGIC):
@@ -164,8 +187,8 @@ def _iter_guarded(source: Path, of: Callable[[Any], Iterator[Any]]) -> Generator
     """
     try:
         bound = MemoryLimit(measure_size(source))
-        reader = _open_reader(source)
         _check_storage(source)
+        reader = _open_reader(source)
         with bound:
             reader.open()
         with closing(reader):

@@ -1,6 +1,7 @@
 """Conversion of ROS messages to samples: one function per message type."""
 
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,12 +11,14 @@ import numpy as np
 
 from dmrl import topics
 from dmrl.errors import SourceError
+from dmrl.formats.files.pictures import scaling_words
 from dmrl.geometry.calibration import BINNING_KEYS, ROI_KEYS, crop_and_bin
 from dmrl.geometry.frames import Array, camera_from_horizontal
 from dmrl.geometry.rotations import quaternion_to_euler
 from dmrl.guards import limits
 from dmrl.images import codec
-from dmrl.images.pixel_encodings import LAYOUTS, convert_to_rgb
+from dmrl.images.bayer import demosaic_decoded
+from dmrl.images.pixel_encodings import LAYOUTS, UNNAMED_CHANNELS, convert_to_rgb
 from dmrl.messages import LogType, find_descriptor
 from dmrl.samples.sample import Sample, build_image, to_timestamp
 from dmrl.terminal.left_out import leave_out
@@ -26,8 +29,8 @@ DMRL_PREFIX = "dmrl_msgs/msg/"
 DEPTH_ENCODINGS = ("16UC1", "32FC1")
 """Encodings of depth images by REP 118."""
 MAX_SIDE_PX = 10_000
-FIXED_FRAMES = ("odom", "map", "world", "earth")
-"""Last parts of the names of frames that do not turn with a robot (REP 105)."""
+FIXED_FRAME = re.compile(r"(?:^|[_/])(?:odom|map|world|earth|origin|enu)(?:_(?:enu|combined))?$")
+"""Ends of the names of frames that do not turn with a robot (REP 105), such as ``cf1_odom``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +51,8 @@ class MessageContext:
         The robot has odometry, which replaces other messages.
     bits
         Significant bits of 16-bit pixels.
-    scaled
-        Robots whose images have 16 bits. The converters add to it.
+    changes
+        Robots by what was done to their images. The converters add to it.
     """
 
     source: Path
@@ -59,7 +62,11 @@ class MessageContext:
     rectified: bool = False
     odometry: bool = False
     bits: int = codec.BITS
-    scaled: set[str] = field(default_factory=set)
+    changes: dict[str, set[str]] = field(default_factory=dict)
+
+    def report_change(self, change: str) -> None:
+        """Remember what was done to the images of the robot."""
+        self.changes.setdefault(change, set()).add(self.robot)
 
 
 def _convert_image(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
@@ -79,7 +86,9 @@ def _convert_image(message: Any, time_ns: int, where: MessageContext) -> Iterato
         leave_out(str(e), where.source)
         return
     if LAYOUTS[message.encoding][1] == 2:
-        where.scaled.add(where.robot)
+        where.report_change(scaling_words(where.bits))
+    if UNNAMED_CHANNELS.fullmatch(message.encoding):
+        where.report_change(f"{message.encoding} is read as blue, green, red, as OpenCV has it")
     yield build_image(time_ns, where.robot, codec.encode_png(rgb), "png")
 
 
@@ -106,9 +115,10 @@ def _convert_compressed_image(
         leave_out(f"{codec.UNDECODABLE}, of format {message.format[:40]!r}", e)
         return
     if header.has_16_bits:
-        where.scaled.add(where.robot)
-    if header.kind not in ("png", "jpeg") or header.has_16_bits:
-        data, kind = codec.encode_png(rgb), "png"
+        where.report_change(scaling_words(where.bits))
+    coloured = demosaic_decoded(rgb, message.format)
+    if header.kind not in ("png", "jpeg") or header.has_16_bits or coloured is not None:
+        data, kind = codec.encode_png(rgb if coloured is None else coloured), "png"
     else:
         kind = header.kind
     yield build_image(time_ns, where.robot, data, kind)
@@ -117,13 +127,15 @@ def _convert_compressed_image(
 def _convert_camera_info(message: Any, time_ns: int, where: MessageContext) -> Iterator[Sample]:
     # ROS 1 and Foxglove write these names in capitals.
     k, p, d, r = (
-        np.array(getattr(message, name, getattr(message, name.upper(), None)), float)
+        np.array(getattr(message, name, getattr(message, name.upper(), [])), float)
         for name in "kpdr"
     )
-    if not (k[0] > 0 and k[4] > 0):
+    if not (k[:1] > 0 and k[4:5] > 0):
         reason = f"calibrations of {where.robot} without a focal length"
         leave_out(reason, f"{where.source} at {time_ns} ns")
         return
+    p = p if len(p) else np.insert(k, [3, 6, 9], 0.0)  # Foxglove's may have K alone
+    r = r if len(r) else np.eye(3).ravel()
     k[[2, 5]] += HALF_PX
     p[[2, 6]] += HALF_PX
     roi = _read_numbers(getattr(message, "roi", None), ROI_KEYS)
@@ -168,7 +180,7 @@ def _find_angles(q: Any, where: MessageContext, time_ns: int) -> Array | None:
 
 
 def _is_fixed_frame(frame: str, parent: str = "") -> bool:
-    return bool(frame) and (frame == parent or frame.rsplit("/", 1)[-1] in FIXED_FRAMES)
+    return bool(frame) and (frame == parent or FIXED_FRAME.search(frame) is not None)
 
 
 def _build_attitude(robot: str, time_ns: int, angles: Array, yaw_rate: float) -> Sample:

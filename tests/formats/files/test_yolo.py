@@ -122,6 +122,7 @@ def test_keypoints_are_ignored_where_they_are_stated(small: Path) -> None:
         "0 0.5 0.5 0.25",
         "0 160 112 40 30",
         "drone 0.5 0.5 0.1 0.1",
+        "0.93 0.5 0.5 0.1 0.1",  # a confidence first
         "0 0.5 0.5 0 0.1",
         "0 nan 0.5 0.1 0.1",
         "0 0.1 0.2 0.5 0.2 0.3 0.7 0.4",

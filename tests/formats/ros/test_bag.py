@@ -286,6 +286,6 @@ def test_bag_is_recognized_by_its_first_bytes(
 ) -> None:
     (tmp_path / name).write_bytes(head)
     assert ros.can_read(tmp_path / name) == known
-    assert not ros.can_read(tmp_path)
+    assert ros.can_read(tmp_path) == name.endswith(".db3")
     (tmp_path / "metadata.yaml").write_text("")
     assert ros.can_read(tmp_path)

@@ -310,7 +310,7 @@ def test_imu_without_orientation_gives_no_attitude() -> None:
 def test_compressed_pictures_keep_their_bytes() -> None:
     rgb = np.full((8, 8, 3), 90, np.uint8)
     for data, kind in ((encode_png(rgb), "png"), (encode_jpeg(rgb), "jpeg")):
-        message = SimpleNamespace(data=np.frombuffer(data, np.uint8))
+        message = SimpleNamespace(data=np.frombuffer(data, np.uint8), format=kind)
         (found,) = given("sensor_msgs/msg/CompressedImage", message)
         assert (found.topic, found.time_ns) == ("/cf1/camera/image", 1_500_000_000)
         assert (found.fields["data"], found.fields["format"]) == (data, kind)

@@ -1,0 +1,34 @@
+"""Headers among the rows of a text table, as a logger that starts again writes them."""
+
+from pathlib import Path
+
+import pytest
+
+from dmrl.errors import SourceError
+from dmrl.formats.files.text_table import read_table
+
+
+def read_column(path: Path, text: str, name: str) -> list[str]:
+    path.write_text(text)
+    return read_table(path).columns[name]
+
+
+def test_a_header_in_another_order_is_followed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.csv"
+    text = "t,roll,pitch\n1,10,20\nt,pitch,roll\n2,21,11\nt,roll,pitch\n3,12,22\n"
+    assert read_column(path, text, "roll") == ["10", "11", "12"]
+    assert read_column(path, text, "pitch") == ["20", "21", "22"]
+    assert f"{path}:3: a header with the columns in another order" in capsys.readouterr().err
+
+
+def test_a_header_of_other_columns_is_refused(tmp_path: Path) -> None:
+    text = "t,roll,pitch\n1,10,20\nt,roll,yaw\n2,11,31\n"
+    with pytest.raises(SourceError, match=r"a\.csv:3: a header of other columns\. Split the file"):
+        read_column(tmp_path / "a.csv", text, "roll")
+
+
+def test_rows_of_text_are_no_headers(tmp_path: Path) -> None:
+    text = "t,robot,mode\n1,cf1,up\n-,robot,mode\n2,cf1,down\n"
+    assert read_column(tmp_path / "a.csv", text, "mode") == ["up", "mode", "down"]
