@@ -7,7 +7,7 @@ A recipe of one stage has ``kind`` and that stage's settings; for several stages
 import json
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import MISSING, asdict, fields, replace
+from dataclasses import MISSING, asdict, fields, is_dataclass, replace
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -242,10 +242,15 @@ def find_faults(keys: Any, schema: type[Any]) -> list[str]:
     return list(_iter_range_faults(values, schema))
 
 
-def _iter_range_faults(values: Mapping[str, Any], schema: type[Any]) -> Iterator[str]:
-    """Yield faults that a dataclass's command-line validators find."""
+def _iter_range_faults(
+    values: Mapping[str, Any], schema: type[Any], within_key: str = ""
+) -> Iterator[str]:
+    """Yield faults that a dataclass's command-line validators find, of its tables too."""
     hints = get_type_hints(schema, include_extras=True)
     for name, value in values.items():
+        if is_dataclass(value) and not isinstance(value, type):
+            inner = {one.name: getattr(value, one.name) for one in fields(value)}
+            yield from _iter_range_faults(inner, type(value), f"{within_key}{name}.")
         # An optional number, such as Share | None, has its limits within the union.
         within = () if value is None else get_args(hints[name])
         for kind in (hints[name], *within):
@@ -254,7 +259,7 @@ def _iter_range_faults(values: Mapping[str, Any], schema: type[Any]) -> Iterator
                     try:
                         validator(type(value), value)
                     except (ValueError, TypeError) as e:
-                        yield f"{name}: {str(e)[:1].lower()}{str(e)[1:].rstrip('.')}"
+                        yield f"{within_key}{name}: {str(e)[:1].lower()}{str(e)[1:].rstrip('.')}"
 
 
 def _describe_fault(fault: Any, schema: type[Any]) -> str:

@@ -18,7 +18,7 @@ from dmrl.formats.registry import find_format
 from dmrl.learn.inference.loaded_model import Model, load_model, save_model
 from dmrl.learn.networks.architectures import build_network, list_architectures
 from dmrl.recording import read_summary, read_table
-from dmrl.stages import convert
+from dmrl.stages import convert, fly
 
 Install = Callable[..., None]
 EXTEND = Path(__file__).parents[1] / "docs" / "extend.md"
@@ -55,6 +55,13 @@ NETWORK = """
 
         def forward(self, images):
             return self.head(self.body(images))
+"""
+PILOT = """
+    from dmrl.plugins import Command, Pilot
+
+    class Wild(Pilot):
+        def command(self, seen):
+            return {}["peer"]
 """
 STAGE = """
     from pathlib import Path
@@ -329,3 +336,10 @@ def test_a_broken_stage_is_listed_and_is_one_line_when_called(install: Install) 
         assert "of the package stages-of-mine, cannot be loaded: ModuleNotFoundError" in done.stderr
         assert done.stderr.count("\n") == 1
     assert dmrl("info", "--help").returncode == 0
+
+
+@pytest.mark.heavy
+def test_an_error_of_a_pilot_names_its_package(install: Install, tmp_path: Path) -> None:
+    install("wild", PILOT, pilots="wild = wild:Wild")
+    with pytest.raises(PluginError, match=r"package wild, failed: KeyError: 'peer' \(wild.py:6\)"):
+        fly.run(tmp_path / "out.mcap", fly.Settings(pilot="wild", duration_s=1.0))

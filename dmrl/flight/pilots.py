@@ -7,6 +7,7 @@ slower a robot flies; when the leader is gone, it stops and turns to where the l
 
 import math
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 
@@ -108,3 +109,22 @@ def find_pilot(name: str) -> type[Pilot]:
     fits = isinstance(loaded, type) and issubclass(loaded, Pilot)
     plugins[name].require(fits, "a subclass of dmrl.plugins.Pilot")
     return loaded  # type: ignore[no-any-return]
+
+
+def naming_its_package(name: str) -> AbstractContextManager[None]:
+    """Return a block in which errors of another package's pilot become a `PluginError`."""
+    if name in PILOTS:
+        return nullcontext()
+    return entry_points.find_plugins(entry_points.PILOTS)[name].naming_the_package("failed")
+
+
+def require_leader(name: str, leader: str) -> None:
+    """Raise SettingError if a pilot of dmrl follows a leader and there is none.
+
+    Raises
+    ------
+    SettingError
+        If all robots are flown.
+    """
+    if not leader and name in ("follow", "formation"):
+        raise SettingError(f"--pilot {name} flies all robots and has no leader. Add one: --robots")

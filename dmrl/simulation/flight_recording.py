@@ -1,9 +1,9 @@
 """Simulated flights as recordings: sensors, truth, and images with exact labels."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import tee
 from pathlib import Path
 from typing import Annotated
@@ -34,7 +34,7 @@ from dmrl.simulation.flight_samples import (
     iter_truth_streams,
     log_times,
 )
-from dmrl.simulation.settings import CameraRenderer, Eye, Preset, Vision
+from dmrl.simulation.settings import NAMED_EYES, CameraRenderer, Eye, Preset, Vision
 from dmrl.simulation.simulator import STEPS_PER_COMMAND, Simulation
 from dmrl.terminal.arguments import Seed
 from dmrl.terminal.progress import say, track
@@ -212,17 +212,46 @@ def _choose_place(settings: FlySettings) -> int:
 
 PILOT_SETTINGS = ("flown", "distance_m", "eye", "backend", "vision")
 """Settings that only a pilot uses."""
+SCRIPT_SETTINGS = ("cameras_max", "yaw_spread_rad")
+"""Settings that flights of a pilot do not use."""
+LINK_SETTINGS = ("delay_images", "lost_share", "lost_images")
+"""Settings of ``vision`` that all eyes with a camera use; an ideal eye uses the others, too."""
+
+
+def _iter_idle(settings: FlySettings) -> Iterator[tuple[str, str]]:
+    """Yield every setting that was given and has no effect, and why."""
+    if not settings.pilot:
+        yield from _iter_given(
+            settings, PILOT_SETTINGS, "without a pilot. Name one: --pilot follow"
+        )
+        return
+    yield from _iter_given(settings, SCRIPT_SETTINGS, "with a pilot. Leave it out")
+    eye = str(settings.eye)
+    if eye in NAMED_EYES:
+        yield from _iter_given(settings, ("backend",), f"with --eye {eye}. Leave it out")
+    if eye != "ideal":
+        keys = [one.name for one in fields(Vision)]
+        keys = keys if eye == "truth" else [key for key in keys if key not in LINK_SETTINGS]
+        for key, why in _iter_given(settings.vision, keys, f"with --eye {eye}. Leave it out"):
+            yield f"vision.{key}", why
+
+
+def _iter_given(
+    settings: FlySettings | Vision, names: Iterable[str], why: str
+) -> Iterator[tuple[str, str]]:
+    plain = type(settings)()
+    yield from ((n, why) for n in names if getattr(settings, n) != getattr(plain, n))
 
 
 def _check(settings: FlySettings) -> None:
-    plain = FlySettings()
-    for name in () if settings.pilot else PILOT_SETTINGS:
-        if getattr(settings, name) != getattr(plain, name):
-            raise SettingError(f"{name} has no effect without a pilot. Name one: --pilot follow")
+    for name, why in _iter_idle(settings):
+        raise SettingError(f"{name} has no effect {why}")
     if not 1 <= settings.duration_s <= 3600:  # the validator of the flag lets NaN pass
         raise SettingError(f"--duration-s {settings.duration_s}: choose 1 to 3600")
-    if settings.seed < 0 or settings.cameras_max < 1:
-        raise SettingError("--seed must be 0 or more, cameras_max 1 or more. Change them")
+    if settings.seed < 0:
+        raise SettingError(f"--seed {settings.seed}: choose 0 or more")
+    if settings.cameras_max < 1:
+        raise SettingError(f"cameras_max = {settings.cameras_max}: choose 1 or more")
     if not 0 < settings.camera_rate_hz <= 100:
         raise SettingError(f"--camera-rate-hz {settings.camera_rate_hz}: choose over 0, to 100")
 

@@ -14,7 +14,7 @@ from dmrl.deploy.image_detection import DetectionOptions
 from dmrl.errors import SettingError
 from dmrl.flight.flight_arrays import RATE_HZ, Flight, Ranges, RobotLog
 from dmrl.flight.pilot import Command, PeerTrack, Pilot, Task
-from dmrl.flight.pilots import find_pilot
+from dmrl.flight.pilots import find_pilot, naming_its_package, require_leader
 from dmrl.geometry.frames import (
     AIDECK_PINHOLE,
     is_inside,
@@ -33,7 +33,7 @@ from dmrl.simulation import flight_samples
 from dmrl.simulation.eyes import IDEAL_CONFIDENCE, Eye, IdealEye, NetworkEye
 from dmrl.simulation.onboard import OnboardTracker
 from dmrl.simulation.settings import NAMED_EYES
-from dmrl.simulation.simulator import STEPS_PER_COMMAND, Simulation
+from dmrl.simulation.simulator import STEPS_PER_COMMAND, Simulation, check_command
 
 if TYPE_CHECKING:
     from dmrl.simulation.flight_recording import FlySettings
@@ -137,9 +137,11 @@ class PilotedFlight:
         self._settings, self._simulation, self._writer = settings, simulation, writer
         form = find_pilot(settings.pilot)
         leader = "".join(simulation.motion.names[settings.flown : settings.flown + 1])
+        require_leader(settings.pilot, leader)
         self._drones: list[Drone] = []
         for k, robot in enumerate(simulation.motion.flown):
-            pilot = form(Task(robot, k, leader, settings.distance_m))
+            with naming_its_package(settings.pilot):
+                pilot = form(Task(robot, k, leader, settings.distance_m))
             tracker = OnboardTracker(robot, simulation.reckoning[robot])
             self._drones.append(Drone(robot, pilot, eyes[k], tracker))
         self._commands: dict[str, Command] = {}
@@ -227,7 +229,9 @@ class PilotedFlight:
                 image_age_s=drone.tracker.image_age_s(now),
                 detections=drone.tracker.detections,
             )
-        command = check_command(drone.robot, drone.pilot.command(seen))
+        with naming_its_package(self._settings.pilot):
+            wanted = drone.pilot.command(seen)
+        command = check_command(drone.robot, wanted)
         self._commands[drone.robot] = command
         time_ns = self._log_time(drone.robot, now)
         fields = command._asdict()
@@ -260,20 +264,6 @@ def detect_tracks(
     uv_px, depth_m, _ = pixels_from_horizontal(places, roll, pitch, AIDECK_PINHOLE)
     rows = np.column_stack([uv_px, depth_m])[np.isfinite(depth_m) & (depth_m > 0)].tolist()
     return tuple((u_px, v_px, depth, IDEAL_CONFIDENCE) for u_px, v_px, depth in rows)
-
-
-def check_command(robot: str, command: Command) -> Command:
-    """Return a pilot's command as numbers.
-
-    Raises
-    ------
-    SettingError
-        If it is not four finite numbers.
-    """
-    numbers = [float(value) for value in command]
-    if len(numbers) != 4 or not np.isfinite(numbers).all():
-        raise SettingError(f"the pilot of {robot} commands {numbers}. Give four finite numbers")
-    return Command(*numbers)
 
 
 def _project_labels(view: CameraView) -> Iterator[dict[str, Any]]:

@@ -132,9 +132,9 @@ class Vision:
 
     delay_images: Annotated[int, Parameter(validator=validators.Number(gte=0, lte=10))] = 1
     lost_share: Share = 0.0
-    lost_images: tuple[int, ...] = ()
+    lost_images: tuple[Annotated[int, Parameter(validator=validators.Number(gte=0))], ...] = ()
     pixel_std_px: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 1.0
-    depth_std_ratio: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 0.1
+    depth_std_ratio: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))] = 0.1
     miss_share: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=1))] = 0.0
     miss_burst_s: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 0.0
 

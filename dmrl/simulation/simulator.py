@@ -244,16 +244,7 @@ class Simulation:
     def _check(self, robot: str, command: Command | Sequence[float]) -> Command:
         if robot not in self.motion.flown:
             raise SettingError(f"{robot} flies no commands. Flown are: {self.motion.flown}")
-        try:
-            numbers = [float(value) for value in command]
-        except (TypeError, ValueError):
-            numbers = []
-        if len(numbers) != 4 or not np.isfinite(numbers).all():
-            raise SettingError(
-                f"the command of {robot} is {command!r:.80}. Give vx, vy, vz in m/s and a yaw "
-                "rate in rad/s"
-            )
-        return Command(*numbers)
+        return check_command(robot, command)
 
     def _measure(self, first: int) -> None:
         """Integrate the new samples, and keep the last range of every pair."""
@@ -277,6 +268,26 @@ class Simulation:
         return Observation(
             self.time_s, roll, pitch, rate, np.array([vx, vy]), height, dict(self._range_m[robot])
         )
+
+
+def check_command(robot: str, command: Command | Sequence[float]) -> Command:
+    """Return a command for a robot as numbers.
+
+    Raises
+    ------
+    SettingError
+        If it is not four finite numbers.
+    """
+    try:
+        numbers = [float(value) for value in command]
+    except (TypeError, ValueError):
+        numbers = []
+    if len(numbers) != 4 or not np.isfinite(numbers).all():
+        raise SettingError(
+            f"the command of {robot} is {command!r:.80}. Give vx, vy, vz in m/s and a yaw "
+            "rate in rad/s"
+        )
+    return Command(*numbers)
 
 
 def _require(what: str, name: str, known: Collection[str]) -> None:

@@ -165,3 +165,5 @@ def test_the_cache_keeps_the_newest_models(tmp_path: Path, monkeypatch: pytest.M
     assert len(kept) == 2 and "newer" in kept
     assert {path.stem for path in folder.glob("*.json")} == kept
     assert float_cache.build_float_onnx_once(tmp_path / "run", grey=False)[0] == made
+    monkeypatch.chdir(tmp_path / "run")
+    assert float_cache.build_float_onnx_once(Path(), grey=False)[0] == made

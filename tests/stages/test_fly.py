@@ -2,6 +2,7 @@ import csv
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from dmrl.geometry.frames import AIDECK_PINHOLE
 from dmrl.images.codec import decode
 from dmrl.recording import check, read, read_summary, read_table
 from dmrl.samples.flight import LOG_COLUMNS
+from dmrl.simulation.settings import Vision
 from dmrl.stages import convert, fly
 from dmrl.stages.fly import Flags, Settings
 
@@ -207,6 +209,43 @@ def test_bad_settings_leave_no_file(tmp_path: Path) -> None:
         fly.run(out, SHORT)
     assert out.read_text() == "mine"
     assert list(tmp_path.iterdir()) == [out]
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"backend": "c", "pilot": ""}, "backend has no effect without a pilot"),
+        ({"backend": "c", "eye": "truth"}, "backend has no effect with --eye truth"),
+        ({"cameras_max": 1}, "cameras_max has no effect with a pilot"),
+        ({"yaw_spread_rad": 1.0}, "yaw_spread_rad has no effect with a pilot"),
+        ({"vision": Vision(miss_share=0.1), "eye": Path("m")}, "vision.miss_share has no effect"),
+        ({"vision": Vision(delay_images=2), "eye": "truth"}, "vision.delay_images has no effect"),
+        ({"flown": 2}, "--pilot follow flies all robots and has no leader"),
+    ],
+)
+def test_a_setting_without_effect_is_refused(
+    given: dict[str, Any], named: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SettingError, match=named):
+        fly.run(tmp_path / "out.mcap", replace(Settings(pilot="follow"), **given))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("given", "fault"),
+    [
+        ("delay_images = -1", "vision.delay_images: must be >= 0"),
+        ("delay_images = 11", "vision.delay_images: must be <= 10"),
+        ("miss_share = 1.0", "vision.miss_share: must be < 1"),
+        ("lost_images = [0, -1]", "vision.lost_images: must be >= 0"),
+        ("depth_std_ratio = 1000.0", "vision.depth_std_ratio: must be <= 1"),
+    ],
+)
+def test_limits_of_keys_in_a_table_hold(given: str, fault: str, tmp_path: Path) -> None:
+    path = tmp_path / "wrong.toml"
+    path.write_text(f'kind = "fly"\npilot = "follow"\n[vision]\n{given}\n')
+    with pytest.raises(RecipeError, match=fault):
+        recipes.load(path, "fly", Settings)
 
 
 @pytest.mark.slow

@@ -251,7 +251,7 @@ def test_errors_are_one_line_and_leave_no_file(
     monkeypatch.setitem(PILOTS, "broken", Broken)
     for wrong, error, text in (
         ({"pilot": "nobody"}, SettingError, "no pilot nobody"),
-        ({"pilot": "broken"}, SettingError, "pilot of cf1 commands"),
+        ({"pilot": "broken"}, SettingError, "the command of cf1 is"),
         ({"eye": Path("nothing")}, SettingError, "needs images"),
         ({"eye": Path("nothing"), "camera": True}, ModelError, "no model nothing"),
         ({"flown": 5}, SettingError, "flown = 5"),

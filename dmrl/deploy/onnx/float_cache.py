@@ -39,9 +39,10 @@ def build_float_onnx_once(model: Path, *, grey: bool) -> tuple[bytes, dict[str, 
     MissingExtra
         If it has to be made, and torch or onnx is not installed.
     """
-    weights, description = model, model.with_suffix(".json")
     if model.is_dir():
         weights, description = model / WEIGHTS_NAME, model / DESCRIPTION_NAME
+    else:
+        weights, description = model, model.with_suffix(".json")
     key = _hash_inputs([weights, description], grey=grey)
     cached = _cache_folder() / f"{key}.onnx"
     with suppress(OSError, ValueError):
