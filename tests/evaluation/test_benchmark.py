@@ -23,7 +23,7 @@ from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 TRUTH = "/cf1/peer/cf2/truth"
 
 
-def write_boxes(path: Path, rows: list[list[float]]) -> Path:
+def write_boxes(path: Path, rows: list[list[float]], threshold: str = "0.6") -> Path:
     """A detector that finds the same boxes in every image."""
     value = numpy_helper.from_array(np.array([rows], np.float32), "rows")
     image = helper.make_tensor_value_info("pixels", TensorProto.FLOAT, [1, 3, 224, 320])
@@ -33,16 +33,16 @@ def write_boxes(path: Path, rows: list[list[float]]) -> Path:
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
     model.ir_version = 8
-    model.metadata_props.add(key="threshold", value="0.6")
+    model.metadata_props.add(key="threshold", value=threshold)
     onnx.save(model, path)
     return path
 
 
-def write_maps(path: Path, rows: int = 28) -> Path:
+def write_maps(path: Path, rows: int = 28, red: float = 1 / 64) -> Path:
     """A network whose confidence is the mean red of a cell, and whose depth is constant."""
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, 224, 320])
     kernel = np.zeros((1, 3, 8, 8), np.float32)
-    kernel[0, 0] = 1 / 64
+    kernel[0, 0] = red
     weights = [numpy_helper.from_array(kernel, "kernel")]
     weights.append(numpy_helper.from_array(np.full((1, 1, rows, 40), 1.5, np.float32), "deep"))
     outs = [
@@ -84,6 +84,11 @@ def test_maps_are_read_by_name_and_others_refused(tmp_path: Path) -> None:
     assert confidence[0, 10, 20] == pytest.approx(1.0) and depth_m[0, 0, 0] == 1.5
     with pytest.raises(ModelError, match="28 x 40"):
         open_detector(write_maps(tmp_path / "odd.onnx", 27), "onnx").grids([image])
+    with pytest.raises(ModelError, match="its confidence is NaN"):
+        open_detector(write_maps(tmp_path / "nan.onnx", red=np.nan), "onnx").grids([image])
+    for threshold in ("nan", "2", "high"):
+        with pytest.raises(ModelError, match=f"threshold is '{threshold}'. Give 0 to 1"):
+            open_detector(write_boxes(tmp_path / "boxes.onnx", [[0.0] * 5], threshold), "onnx")
     (tmp_path / "torn.onnx").write_bytes(b"not a network")
     with pytest.raises(ModelError, match="cannot be run"):
         open_detector(tmp_path / "torn.onnx", "onnx")

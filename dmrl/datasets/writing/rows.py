@@ -6,7 +6,8 @@ Each recording uses one source of labels. These images are kept or left out:
 * labelled by the chosen source, with or without peers: kept;
 * labelled as empty by every source: kept;
 * labelled by other sources only: left out;
-* a peer whose label is not OK: left out. Training would treat the image as one without peers.
+* a peer whose label is not OK, or not finite: left out. Training would treat the image
+  as one without peers.
 """
 
 import re
@@ -37,6 +38,10 @@ from dmrl.terminal.left_out import leave_out
 
 Mask = NDArray[np.uint8]
 """(H, W) index of the peer that each pixel shows, from 1 among the labels; 0 for the background."""
+
+
+FAR_PX = 1e6
+"""No label is so far outside its image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +79,7 @@ class ExclusionCounts:
     without_labels: int = 0
     of_other_sources: int = 0
     not_ok: int = 0
+    impossible: int = 0
     without_mask: int = 0
     in_no_split: int = 0
     flagged: int = 0
@@ -96,6 +102,7 @@ class ExclusionCounts:
             "had no labels": self.without_labels,
             "were not labelled by the chosen source (--labels)": self.of_other_sources,
             "had a label that is not OK (--keep-all keeps them)": self.not_ok,
+            "had a label whose pixel or depth is no number": self.impossible,
             "show a peer, but have no mask (--masks)": self.without_mask,
             "belong to no split of their source (--split)": self.in_no_split,
             "were flagged (--without)": self.flagged,
@@ -174,11 +181,20 @@ def iter_row_builders(
             tally.without_mask += 1
         elif not wanted.keep_all and any(label.status != STATUS_OK for label in mine):
             tally.not_ok += 1
+        elif not all(map(_is_possible, mine)):
+            tally.impossible += 1
         else:
             tally.kept += 1
             yield split, partial(_build_row, held.path, image, mine, covered, wanted)
             continue
         yield None
+
+
+def _is_possible(label: Any) -> bool:
+    """Return whether a label has a pixel and a depth, or says that it has none."""
+    at_px = np.abs([label.u_px, label.v_px]).max()  # NaN if one is
+    no_depth = np.isinf(label.sigma_depth_m)
+    return bool(at_px <= FAR_PX and (no_depth or np.isfinite(label.depth_m)))
 
 
 def iter_labelled_images(

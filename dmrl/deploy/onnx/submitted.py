@@ -52,7 +52,9 @@ class SubmittedNetwork:
         try:
             self.threshold = float(said or DEFAULT_THRESHOLD)
         except ValueError:
-            raise self._refuse("a number as metadata threshold") from None
+            self.threshold = np.nan
+        if not 0 <= self.threshold <= 1:
+            raise ModelError(f"{file}: its metadata threshold is {said!r:.40}. Give 0 to 1")
 
     def __call__(self, images: Images) -> Grids:
         """Return the grids of (N, height, width, 3) RGB images."""
@@ -72,7 +74,10 @@ class SubmittedNetwork:
         named = zip(self.names, values, strict=True)
         found = {name: np.asarray(value, np.float64) for name, value in named}
         grid = (image.shape[0] // STRIDE_PX, image.shape[1] // STRIDE_PX)
-        return _maps_to_grids(found, grid) or self._boxes_to_grids(found, grid)
+        maps = _maps_to_grids(found, grid)
+        if maps is not None and np.isnan(maps[0]).any():
+            raise ModelError(f"{self._file}: its confidence is NaN. Check weights and input range")
+        return maps or self._boxes_to_grids(found, grid)
 
     def _boxes_to_grids(
         self, found: dict[str, Array], grid: tuple[int, int]

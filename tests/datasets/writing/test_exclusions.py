@@ -8,7 +8,7 @@ from dmrl.datasets.writing.exclusions import load_flags
 from dmrl.errors import DmrlError, SettingError
 from dmrl.stages.dataset import Settings, run
 
-from ..conftest import Record
+from ..conftest import Record, peer
 
 HEAD = "source,robot,log_time\n"
 
@@ -56,3 +56,16 @@ def test_flags_without_an_image_are_reported(
     made = run([record()], tmp_path / "out", Settings(split="none", without=path))
     assert made.images == {"train": 5}
     assert "1 of 2 flags name no image here" in capsys.readouterr().err
+
+
+@pytest.mark.heavy
+def test_images_with_an_impossible_label_are_left_out(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    nan, inf = float("nan"), float("inf")
+    odd = [{"u_px": nan}, {"v_px": -inf}, {"u_px": 1e30}, {"depth_m": inf}, {"depth_m": nan}]
+    unknown = {"depth_m": nan, "sigma_depth_m": inf}
+    flight = record(peers=[[peer(**fields)] for fields in ({}, *odd, unknown)])
+    made = run([flight], tmp_path / "out", Settings(split="none"))
+    assert made.images == {"train": 2}
+    assert "pixel or depth is no number: 5" in capsys.readouterr().err
