@@ -160,6 +160,7 @@ TRUE_POSE = RobotTopic("/{robot}/pose/truth")
 LOG = LogTopic("/{robot}/log/{event}")
 TRANSFORMS = "/tf"
 
+PLACE_DOUBTS = tuple(UnitCheck(f"pose.position.{axis}", 300.0, "m", "mm or cm") for axis in "xyz")
 TOPICS = (
     Topic(
         CAMERA_IMAGE,
@@ -259,8 +260,16 @@ TOPICS = (
         "20 Hz",
         "convert, render, fly",
     ),
-    Topic(POSE, "foxglove.PoseInFrame", "world", "m", "100 Hz", "convert"),
-    Topic(TRUE_POSE, "foxglove.PoseInFrame", "world", "m", "100 Hz", "convert"),
+    Topic(POSE, "foxglove.PoseInFrame", "world", "m", "100 Hz", "convert", doubts=PLACE_DOUBTS),
+    Topic(
+        TRUE_POSE,
+        "foxglove.PoseInFrame",
+        "world",
+        "m",
+        "100 Hz",
+        "convert",
+        doubts=PLACE_DOUBTS,
+    ),
     Topic(LOG, "dmrl.log.*", "-", "as logged", "as logged", "convert"),
     Topic(TRANSFORMS, "foxglove.FrameTransforms", "world", "m", "20 Hz", "convert, fly, render"),
 )

@@ -6,6 +6,8 @@ import numpy as np
 
 from dmrl.geometry.frames import Array
 
+PLUMB_BOB_MODELS = ("", "plumb_bob", "rational_polynomial")
+"""Names of lens models equal to plumb bob, the last if its further coefficients are 0."""
 MAX_VALUE = 1e6
 """Maximum of a focal length and a principal point, pixels, and of a coefficient."""
 ROI_KEYS, BINNING_KEYS = ("x_offset", "y_offset", "width", "height"), ("binning_x", "binning_y")
@@ -38,6 +40,21 @@ def find_calibration_fault(
     if min(width_px, height_px) <= 0:
         return f"has images of {width_px} x {height_px} px"
     return ""
+
+
+def find_lens_fault(model: str, d: Sequence[float]) -> str:
+    """Return why the lens of a calibration is not of dmrl's model, or an empty text.
+
+    Parameters
+    ----------
+    model
+        Its ``distortion_model``.
+    d
+        D: distortion coefficients.
+    """
+    if model in PLUMB_BOB_MODELS and not any(d[5:]):
+        return ""
+    return f"has a lens of model {model!r} with {len(d)} coefficients, dmrl knows plumb_bob with 5"
 
 
 def crop_and_bin(

@@ -5,14 +5,11 @@ from pathlib import Path
 
 from dmrl import topics
 from dmrl.errors import MissingTopic, RecordingError, SettingError
-from dmrl.geometry.calibration import find_calibration_fault
+from dmrl.geometry.calibration import find_calibration_fault, find_lens_fault
 from dmrl.geometry.camera_file import read_camera
 from dmrl.geometry.frames import Camera
 from dmrl.labelling.flight_log import FlightLog
 from dmrl.recording import read_summary
-
-PLUMB_BOB_MODELS = ("", "plumb_bob", "rational_polynomial")
-"""Names of lens models equal to plumb bob, the last if its further coefficients are 0."""
 
 
 def find_recorded_camera(flight: FlightLog, robot: str) -> Camera | None:
@@ -27,12 +24,8 @@ def find_recorded_camera(flight: FlightLog, robot: str) -> Camera | None:
     if found is None:
         return None
     topic, way_out = topics.CALIBRATION(robot), "dmrl calibrate --board, then --camera"
-    if found.distortion_model not in PLUMB_BOB_MODELS or any(found.D[5:]):
-        raise RecordingError(
-            f"{flight.path}: {topic} has a lens of model {found.distortion_model!r} with "
-            f"{len(found.D)} coefficients, dmrl knows plumb_bob with 5. Give another calibration: "
-            f"{way_out}"
-        )
+    if why := find_lens_fault(found.distortion_model, found.D):
+        raise RecordingError(f"{flight.path}: {topic} {why}. Give another calibration: {way_out}")
     if why := find_calibration_fault(found.width, found.height, found.K, found.D):
         raise RecordingError(f"{flight.path}: {topic} {why}. Give another calibration: {way_out}")
     fx, _, cx, _, fy, cy, *_ = found.K

@@ -108,7 +108,10 @@ def read_listed_section(path: Path, stream: BoundedReader, start: int | None = N
 def iter_records(
     stream: BoundedReader, state: RecoveryState
 ) -> Iterator[tuple[int, McapRecord | IndexedCount]]:
-    """Yield offset and record up to the footer, skipping corrupt ranges."""
+    """Yield offset and record up to the footer, skipping corrupt ranges.
+
+    Another recording that was joined to the file's end is read, too.
+    """
     listed_offsets = sorted(_iter_listed_offsets(stream, state.summary_section))
     at = len(MAGIC)
     while at < stream.size and not state.footer:
@@ -123,6 +126,12 @@ def iter_records(
         if record is not None:
             yield at, record
         at = end
+        if state.footer and at + len(MAGIC) < stream.size:
+            stream.seek(at)
+            if stream.read(2 * len(MAGIC)) == 2 * MAGIC:
+                state.footer, state.data_ended, at = False, False, at + 2 * len(MAGIC)
+            else:
+                state.recovery.lost_bytes += stream.size - at - len(MAGIC)
 
 
 def _iter_listed_offsets(stream: BoundedReader, section: McapSummary) -> Iterator[int]:

@@ -75,7 +75,11 @@ MIN_PERIOD_NS = 2_000_000
 MAX_TIME_NS = 2**63 - 1
 
 
-UNREAD_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".mp4", ".mov", ".avi", ".mkv")
+UNREAD_SUFFIXES = (
+    *(".heic", ".heif", ".avif", ".jxl", ".jp2", ".j2k", ".exr", ".tga"),
+    *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2"),
+    *(".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".wmv", ".mjpeg"),
+)
 """Photos and videos that stand in folders of pictures and are not read."""
 UNREAD = (
     "photos and videos of other kinds: save photos as JPEG, cut videos into pictures "
@@ -163,6 +167,9 @@ def _list_files(source: Path) -> list[Path]:
     files = sorted(source.iterdir() if source.is_dir() else [source], key=natural_key)
     unread = list(filter(_is_unread, files))
     leave_out(UNREAD, unread[0] if unread else source, len(unread))
+    for path in files:
+        if path.is_symlink() and not path.exists() and path.suffix.lower() in IMAGE_SUFFIXES:
+            leave_out("links to pictures that are not there", path)
     paths = list(filter(is_picture, files))
     if not paths:
         raise SourceError(

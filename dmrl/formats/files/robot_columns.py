@@ -10,6 +10,7 @@ import numpy as np
 
 from dmrl.errors import SourceError
 from dmrl.formats.files.column_map import ANY_PEER, Column, ColumnMap
+from dmrl.formats.files.text_cells import is_number
 from dmrl.formats.files.text_table import TextTable, read_table
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say
@@ -78,8 +79,25 @@ def _iter_robots(name: str, path: Path, table: ColumnMap) -> Iterator[RobotLog]:
         for robot in sorted({*cells} - {""}):
             yield _resolve(robot, text.select(np.flatnonzero(np.array(cells) == robot)), table)
         return
-    for robot in _find_robots(text, table) or [name]:
+    found = _find_robots(text, table)
+    if not found:
+        _doubt_robots_in_turns(text, table)
+    for robot in found or [name]:
         yield _resolve(robot, text, table)
+
+
+def _doubt_robots_in_turns(text: TextTable, table: ColumnMap) -> None:
+    """Report a column that the table does not name, and whose few values take turns."""
+    for name in text.columns.keys() - table.names:
+        cells = [cell.strip() for cell in text.columns[name]]
+        values = sorted({*cells})
+        turns = sum(map(str.__ne__, cells, cells[1:]))
+        few = 1 < len(values) <= ROBOTS_MAX and turns > TURNS_SHARE * len(cells)
+        if few and (ROBOT_NAME.fullmatch(name) or not any(map(is_number, values))):
+            say(
+                f"{text.path}: {name!r} is {', '.join(values[:3])} in turns. If these are robots, "
+                f'their rows are mixed here; write [robot] name = "{name}" in the table'
+            )
 
 
 def resolve_robots(name: str, text: TextTable, table: ColumnMap) -> list[RobotLog]:
@@ -140,6 +158,10 @@ def _resolve(robot: str, text: TextTable, table: ColumnMap) -> RobotLog:
     )
 
 
+ROBOT_NAME = re.compile(r"(robot|drone|uav|agent|vehicle|cf)?[ _-]*(id|name|no|nr)?", re.IGNORECASE)
+"""Columns whose numbers may be those of robots."""
+ROBOTS_MAX, TURNS_SHARE = 30, 0.2
+"""Most values of a column of robots, and share of rows with another value than the row before."""
 MOST_NAMES = 20
 """Columns of a file that an error lists, at most."""
 

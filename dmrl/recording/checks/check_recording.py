@@ -6,11 +6,11 @@ Errors make a recording unusable. Warnings describe problems to consider before 
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from dmrl.errors import RecordingError
-from dmrl.geometry.calibration import find_calibration_fault
+from dmrl.geometry.calibration import find_calibration_fault, find_lens_fault
 from dmrl.recording.checks.clock_checks import check_clocks
 from dmrl.recording.checks.label_checks import check_causes, check_labels
 from dmrl.recording.checks.scan import (
@@ -33,6 +33,7 @@ GAP_PERIODS = 10
 GAP_MIN_S = 0.5
 """Shortest gap that is reported, seconds."""
 NUMBER = re.compile(r"\d[\d.e+-]*")
+CALIBRATION_FIELDS = ["width", "height", "K", "D", "distortion_model"]
 FINDINGS_PRINTED_MAX = 5
 """Findings that a stage prints about its output. ``dmrl check`` prints all."""
 
@@ -60,7 +61,7 @@ def check(path: Path, *, quick: bool = False, values: bool = False) -> list[Find
     findings = [
         finding
         for rule, of_times_and_labels in RULES.items()
-        if of_times_and_labels or not quick
+        if of_times_and_labels or not quick or (values and rule in CAMERA_RULES)
         for finding in rule(data)
     ]
     if data.contents.summary.contradiction:
@@ -160,7 +161,7 @@ def _check_signals(data: CheckData) -> Iterator[Finding]:
 
 
 def _check_images(data: CheckData) -> Iterator[Finding]:
-    """Report images that are unreadable, uncalibrated, or not of the calibrated size."""
+    """Report images that are unreadable, uncalibrated, or of several sizes."""
     for topic in data.times:
         parts = parse_topic(CAMERA_IMAGE, topic)
         if parts is None:
@@ -169,27 +170,37 @@ def _check_images(data: CheckData) -> Iterator[Finding]:
         if calibration_topic not in data.times:
             yield Finding("warning", topic, f"no calibration on {calibration_topic}")
         if topic not in data.broken:
-            yield from _check_sizes(data, topic, calibration_topic, Counter(data.sizes[topic]))
+            yield from _check_sizes(data, topic, Counter(data.sizes[topic]))
 
 
-def _check_sizes(
-    data: CheckData, topic: str, calibration_topic: str, sizes: Counter[ImageSize]
-) -> Iterator[Finding]:
+def _check_sizes(data: CheckData, topic: str, sizes: Counter[ImageSize]) -> Iterator[Finding]:
     if unreadable := sizes.pop(None, 0):
         first_ns = ", ".join(f"{ns} ns" for ns in sorted(data.undecodable_ns[topic])[:3])
         text = f"{unreadable} messages contain no readable image: {first_ns}"
         yield Finding("error", topic, text)
-    listed = ", ".join(f"{w}x{h}" for w, h in sorted(k for k in sizes if k))
     if len(sizes) > 1:
-        yield Finding("warning", topic, f"images of {len(sizes)} sizes: {listed}")
-    if calibration_topic not in data.times or calibration_topic in data.broken or not sizes:
-        return
-    table = data.contents.get_table(calibration_topic, ["width", "height"])
-    calibrated = set(zip(table["width"].to_pylist(), table["height"].to_pylist(), strict=True))
-    if calibrated and not calibrated & sizes.keys():
-        width, height = min(calibrated)
-        text = f"images of {listed}, but the calibration is for {width}x{height}"
-        yield Finding("error", topic, text)
+        text = f"images of {len(sizes)} sizes: {_list_sizes(sizes)}"
+        yield Finding("warning", topic, text)
+
+
+def _list_sizes(sizes: Iterable[ImageSize]) -> str:
+    return ", ".join(f"{w}x{h}" for w, h in sorted(filter(None, sizes)))
+
+
+def _check_calibrated_sizes(data: CheckData) -> Iterator[Finding]:
+    """Report images that are not of the calibrated size."""
+    for topic, counts in data.sizes.items():
+        parts, sizes = parse_topic(CAMERA_IMAGE, topic), {*counts} - {None}
+        calibration_topic = CALIBRATION(parts["robot"]) if parts else ""
+        known = calibration_topic in data.times and not {topic, calibration_topic} & {*data.broken}
+        if not known or not sizes:
+            continue
+        table = data.contents.get_table(calibration_topic, ["width", "height"])
+        calibrated = set(zip(table["width"].to_pylist(), table["height"].to_pylist(), strict=True))
+        if calibrated and not calibrated & sizes:
+            width, height = min(calibrated)
+            text = f"images of {_list_sizes(sizes)}, but the calibration is for {width}x{height}"
+            yield Finding("error", topic, text)
 
 
 def _check_grids(data: CheckData) -> Iterator[Finding]:
@@ -206,11 +217,14 @@ def _check_calibrations(data: CheckData) -> Iterator[Finding]:
         mine = parse_topic(CALIBRATION, topic) is not None and carries_own_type(topic, info.schema)
         if not mine or topic in data.broken:
             continue
-        table = data.contents.get_table(topic, ["width", "height", "K", "D"])
-        columns = [table[name].to_pylist() for name in ("width", "height", "K", "D")]
-        for width_px, height_px, k, d in zip(*columns, strict=True):
+        table = data.contents.get_table(topic, CALIBRATION_FIELDS)
+        columns = [table[name].to_pylist() for name in CALIBRATION_FIELDS]
+        for width_px, height_px, k, d, model in zip(*columns, strict=True):
             if why := find_calibration_fault(width_px, height_px, k, d):
                 yield Finding("error" if any(k) else "warning", topic, why)
+                break
+            if why := find_lens_fault(model, d):
+                yield Finding("warning", topic, why)
                 break
 
 
@@ -219,9 +233,12 @@ RULES: dict[Callable[[CheckData], Iterator[Finding]], bool] = {
     _check_times: True,
     _check_signals: True,
     _check_images: False,
+    _check_calibrated_sizes: False,
     _check_grids: False,
     _check_calibrations: False,
     check_labels: True,
     check_causes: False,
 }
 """Rules, in the order of their findings, and whether each belongs to a quick check."""
+CAMERA_RULES = (_check_calibrated_sizes, _check_calibrations)
+"""Rules that belong to a quick check of values, too."""

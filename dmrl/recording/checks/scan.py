@@ -181,6 +181,8 @@ def collect_values(data: CheckData) -> None:
         is_image = parse_topic(CAMERA_IMAGE, topic) is not None
         if not own or not (is_image or any(parse_topic(p, topic) for p in FINITE_TOPICS)):
             continue
+        if is_image:
+            find_first_size(data, topic)
         limit, fields = (FIRST_IMAGES, ["data"]) if is_image else (FIRST_VALUES, None)
         for batch in iter_columns(data.contents.path, topic, fields=fields):
             seen += len(batch)
@@ -207,10 +209,10 @@ def _collect_from_messages(
 ) -> None:
     """Decode messages of a topic of dmrl's, and collect their data."""
     path, schema = collected.contents.path, collected.contents.topics[topic].schema
-    stamped = _is_stamped(schema)
-    if topic in collected.broken or not (carries_own_type(topic, schema) or stamped):
+    stamped, own = _is_stamped(schema), carries_own_type(topic, schema)
+    if topic in collected.broken or not (own or stamped):
         return
-    fields = None if carries_own_type(topic, schema) else ["timestamp"]
+    fields = None if own else ["timestamp"]
     try:
         batch = decode_topic(path, topic, messages, channels, fields)
     except RecordingError as e:
@@ -220,8 +222,9 @@ def _collect_from_messages(
     names = batch.schema.names
     if stamped and "timestamp" in names and pa.types.is_struct(batch["timestamp"].type):
         collected.unset_stamps[topic] += _count_unset_stamps(batch)
-    collected.add_batch(topic, batch, collected.contents.topics[topic].count)
-    if parse_topic(CAMERA_IMAGE, topic):
+    if own:
+        collected.add_batch(topic, batch, collected.contents.topics[topic].count)
+    if own and parse_topic(CAMERA_IMAGE, topic):
         for time_ns, data in zip(batch["log_time"].to_pylist(), batch["data"], strict=True):
             size = _decode_size(data.as_buffer())
             collected.sizes[topic][size] += 1

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dmrl.recording.checks.topic_times import TopicTimes
 from dmrl.recording.protobuf.arrow_arrays import to_numpy
-from dmrl.topics import CAMERA_IMAGE, POSE, SENSORS, TRUE_POSE, UnitCheck, parse_topic
+from dmrl.topics import CAMERA_IMAGE, POSE, SENSORS, TOPICS, TRUE_POSE, UnitCheck, parse_topic
 
 PERIOD_MAX_S, PERIOD_MIN_S = 5.0, 2e-4
 """Longest and shortest plausible median period of a sensor, seconds."""
@@ -40,16 +40,16 @@ class ValueCounts:
 
     def add_batch(self, topic: str, batch: pa.RecordBatch) -> None:
         """Add the values of a topic."""
+        table = pa.Table.from_batches([batch])
         if any(parse_topic(pattern, topic) for pattern in FINITE_TOPICS):
-            table = pa.Table.from_batches([batch])
             while any(map(pa.types.is_struct, table.schema.types)):
                 table = table.flatten()
             for one in filter(lambda one: pa.types.is_floating(one.type), table.schema):
                 values = to_numpy(table[one.name].drop_null())
                 self.not_finite[topic, one.name] += int((~np.isfinite(values)).sum())
         for limit in _find_limits(topic):
-            if limit.field in batch.schema.names:
-                values = to_numpy(batch[limit.field]).astype(float)
+            if limit.field in table.schema.names:
+                values = to_numpy(table[limit.field].drop_null()).astype(float)
                 size = np.abs(values)
                 size = size[np.isfinite(size) & (size > 0)]
                 counts = len(size), (size > limit.over).sum(), (size < limit.under).sum()
@@ -121,4 +121,4 @@ def check_periods(
 
 
 def _find_limits(topic: str) -> tuple[UnitCheck, ...]:
-    return next((row.doubts for row in SENSORS if parse_topic(row.pattern, topic)), ())
+    return next((row.doubts for row in TOPICS if parse_topic(row.pattern, topic)), ())

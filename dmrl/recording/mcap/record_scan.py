@@ -95,6 +95,8 @@ def scan_file(stream: BoundedReader) -> ScannedFile:
             messages.append(record)
         else:
             _add_or_refuse(content, record)
+    if more := stream.size - stream.tell():
+        raise McapError(f"{more} bytes follow its end, as where two files were joined")
     if messages:
         content.batches.append(
             select_channels(batch_from_messages(messages), content.channels, content.channels)

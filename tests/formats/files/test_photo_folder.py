@@ -31,6 +31,13 @@ def test_photos_and_videos_of_other_kinds_are_named_with_the_way_out(
         find_format(only).content(only, Options())
 
 
+def test_a_link_to_a_picture_that_is_not_there_is_counted(folder: Path) -> None:
+    (folder / "d.png").symlink_to(folder / "gone.png")
+    with count_left_out() as tally:
+        assert len(samples(folder, "CompressedImage")) == 3
+    assert tally.counts == {"links to pictures that are not there": 1}
+
+
 def test_a_picture_that_no_command_could_read_is_left_out_with_the_flags_that_scale_it(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dmrl.images.codec import encode_png
+from dmrl.recording import check
 
 from .test_check_recording import Write, calibrated, image, record
 
@@ -49,6 +50,8 @@ def test_images_are_of_one_size_and_of_the_calibrated(
     assert len(found) == len(said)
     assert all(one.startswith(words) for one, words in zip(found, said, strict=True))
     assert all("320x224" in one for one in found)
+    quick = check(tmp_path / "a.mcap", quick=True, values=True)
+    assert [f"{f.level} {f.topic} {f.text}" for f in quick] == [f for f in found if "error" in f]
 
 
 @pytest.mark.parametrize(
@@ -70,6 +73,11 @@ def test_images_are_of_one_size_and_of_the_calibrated(
             "error /cf1/camera/calibration has a focal length that is not above 0",
         ),
         ({"height": 0}, "error /cf1/camera/calibration has images of 320 x 0 px"),
+        (
+            {"distortion_model": "equidistant", "D": [0.1] * 4},
+            "warning /cf1/camera/calibration has a lens of model 'equidistant' with 4 "
+            "coefficients, dmrl knows plumb_bob with 5",
+        ),
     ],
 )
 def test_a_calibration_that_no_camera_has_is_found(

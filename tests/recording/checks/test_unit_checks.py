@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 
 from dmrl.recording.checks.topic_times import TopicTimes
-from dmrl.recording.checks.unit_checks import ValueCounts, check_periods
+from dmrl.recording.checks.unit_checks import ValueCounts, check_periods, check_units
 
 
 def _doubted(topic: str, name: str, values: np.ndarray) -> list[tuple[str, str]]:
@@ -100,3 +100,11 @@ def test_magnitudes_are_binned_to_a_fifth_of_the_limit() -> None:
         ((_, text),) = _doubted("/cf1/height", "height_m", np.full(20, tiny))
         assert "are under 0.005 m" in text
         assert len(_doubted("/cf1/height", "height_m", np.full(20, huge))) == 1
+
+
+def test_positions_in_millimetres_are_doubted() -> None:
+    place = {"pose": {"position": {"x": 1200.0, "y": 2.0, "z": 3.0}}}
+    for topic in ("/cf1/pose", "/cf1/pose/truth"):
+        found = check_units(topic, pa.Table.from_pylist([place] * 30))
+        share = "pose.position.x: 100% of the values are over 300 m"
+        assert found == [f"{share}. Are they mm or cm?"]
