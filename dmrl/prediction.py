@@ -21,7 +21,7 @@ from dmrl.deploy.detector import (
     select_fastest_backend,
 )
 from dmrl.deploy.image_detection import DetectionOptions, detect_images
-from dmrl.errors import MissingTopic, RecordingError, SourceError
+from dmrl.errors import MissingTopic, RecordingError, SettingError, SourceError
 from dmrl.guards import limits
 from dmrl.guards.memory import return_large_blocks
 from dmrl.images.codec import UNDECODABLE, ImageHeader, Rgb, read_header
@@ -43,6 +43,7 @@ from dmrl.samples.sample import Sample
 from dmrl.terminal.left_out import leave_out
 from dmrl.terminal.progress import say, track
 
+OTHER_SIZE = "images of a size that the model does not take"
 OUTPUT_TOPICS = (topics.DETECTIONS, topics.GRID)
 """Topics that are written; those of before are replaced."""
 
@@ -174,7 +175,8 @@ def _iter_messages(
     images = [t for t in held.topics if topics.parse_topic(topics.CAMERA_IMAGE, t)]
     total = sum(held.topics[t].count for t in images)
     raws = track(read_raw(held.path, *images), "Predicting", total)
-    batches = _iter_batches(raws, batch_size, detector, held.path)
+    misfits: list[SettingError] = []
+    batches = _iter_batches(raws, batch_size, detector, held.path, misfits)
     for decoded in map_ahead(_decode_batch, batches, threads=1, max_waiting=1):
         batch = list(_iter_usable(decoded))
         tally["images"] += len(batch)
@@ -191,14 +193,23 @@ def _iter_messages(
                 yield Sample(raw.time_ns, topic, "Detections", fields, raw.publish_ns)
                 grid = grid_fields(grids, k, detector.stride_px)
                 yield Sample(raw.time_ns, topics.GRID(robot), "GridMap", grid, raw.publish_ns)
+    if misfits and not tally["images"]:
+        raise misfits[0]
     if total and not tally["images"]:
         raise RecordingError(f"{held.path}: no image can be decoded. Restore the recording")
 
 
 def _iter_batches(
-    raws: Iterable[RawMessage], most: int, detector: Detector, recording: Path
+    raws: Iterable[RawMessage],
+    most: int,
+    detector: Detector,
+    recording: Path,
+    misfits: list[SettingError],
 ) -> Iterator[list[tuple[RawMessage, ImageHeader]]]:
-    """Yield so many images at a time; fewer where they are large, one at least."""
+    """Yield so many images at a time; fewer where they are large, one at least.
+
+    ``misfits`` receives the error of the first image of a size that the detector does not take.
+    """
     batch: list[tuple[RawMessage, ImageHeader]] = []
     pixels = 0
     for raw in raws:
@@ -209,7 +220,12 @@ def _iter_batches(
         except SourceError as e:
             leave_out(UNDECODABLE, e)
             continue
-        detector.require_size(image.width_px, image.height_px, name)
+        try:
+            detector.require_size(image.width_px, image.height_px, name)
+        except SettingError as e:
+            leave_out(OTHER_SIZE, e)
+            misfits[:] = misfits or [e]
+            continue
         pixels += image.width_px * image.height_px
         if image.width_px * image.height_px > limits.LARGE_PIXELS:
             return_large_blocks()

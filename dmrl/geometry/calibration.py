@@ -8,6 +8,10 @@ from dmrl.geometry.frames import Array
 
 PLUMB_BOB_MODELS = ("", "plumb_bob", "rational_polynomial")
 """Names of lens models equal to plumb bob, the last if its further coefficients are 0."""
+SKEW_MAX = 1e-3
+"""Largest skew of K over its focal length. A tenth of a pixel at the edge of most images."""
+FOCAL_SHARES = (0.1, 100.0)
+"""Focal lengths over the width of the images that are doubted beyond: 157 and 0.6 degrees wide."""
 MAX_VALUE = 1e6
 """Maximum of a focal length and a principal point, pixels, and of a coefficient."""
 ROI_KEYS, BINNING_KEYS = ("x_offset", "y_offset", "width", "height"), ("binning_x", "binning_y")
@@ -37,9 +41,19 @@ def find_calibration_fault(
         return "has numbers in K or D that are not finite or too large"
     if min(k[0], k[4]) <= 0:
         return "has a focal length that is not above 0"
+    if abs(k[1]) > SKEW_MAX * k[0] or any((k[3], k[6], k[7])):
+        return "has a skew in K, or K is transposed"
     if min(width_px, height_px) <= 0:
         return f"has images of {width_px} x {height_px} px"
     return ""
+
+
+def doubt_focal_length(width_px: int, fx_px: float) -> str:
+    """Return what is doubtful in a focal length, such as its unit, or an empty text."""
+    if FOCAL_SHARES[0] <= fx_px / width_px <= FOCAL_SHARES[1]:
+        return ""
+    found = f"has a focal length of {fx_px:.3g} px for images {width_px} px wide"
+    return f"{found}. Is it in mm, or a share?"
 
 
 def find_lens_fault(model: str, d: Sequence[float]) -> str:

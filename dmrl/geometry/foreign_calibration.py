@@ -24,7 +24,7 @@ OPENCV_ONLY = re.compile(r"^%YAML.*$|!!opencv-(nd-)?matrix", re.MULTILINE)
 HALF_PX = 0.5
 MAX_COEFFICIENTS = 5
 """Coefficients of the plumb-bob model; later ones of OpenCV's models must be 0."""
-PLUMB_BOB = ("", "plumb_bob", "radtan", "rational_polynomial", "none")
+PLUMB_BOB = ("", "plumb_bob", "radtan", "radial-tangential", "rational_polynomial", "none")
 """Names of the model, and of OpenCV's with more coefficients."""
 KEYS = {
     "matrix": ("cameramatrix", "intrinsicmatrix", "mtx", "k", "m1"),
@@ -88,15 +88,16 @@ def _build_camera(document: Mapping[str, Any], path: Path) -> Camera:
     if len(cameras) > 1:
         raise ValueError(f"it has {', '.join(cameras)}; keep one")
     table = document[cameras[0]] if cameras else document
+    has_four = bool(cameras) or _is_kalibr(document)  # EuRoC's file of one camera has Kalibr's keys
     held = {str(key).lower().replace("_", ""): value for key, value in table.items()}
     if held.get("cameramodel", "pinhole") != "pinhole":
         raise ValueError(f"its camera_model is {held['cameramodel']}, not pinhole")
-    if cameras:
+    if has_four:
         fx, fy, cx, cy = _to_numbers("intrinsics", held.get("intrinsics"), 4)
     else:
-        fx, skew, cx, _, fy, cy, *_ = _to_numbers("matrix", _find(held, "matrix"), 9)
-        if abs(skew) > 1e-6 * abs(fx):
-            raise ValueError("its camera matrix has a skew")
+        fx, skew, cx, other, fy, cy, *below = _to_numbers("matrix", _find(held, "matrix"), 9)
+        if abs(skew) > 1e-6 * abs(fx) or any((other, *below[:2])):
+            raise ValueError("its camera matrix has a skew, or is transposed")
     size = _find(held, "size", None)
     if size is None:
         size = [_find(held, "width"), _find(held, "height")]

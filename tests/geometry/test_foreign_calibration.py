@@ -69,6 +69,14 @@ def test_a_file_of_kalibr_has_four_coefficients(tmp_path: Path) -> None:
         read_camera(write(tmp_path / "two.yaml", two))
 
 
+def test_a_sensor_file_of_euroc_is_one_camera(tmp_path: Path) -> None:
+    lines = [line.strip() for line in KALIBR.splitlines()[2:]]
+    text = "sensor_type: camera\n" + "\n".join(lines).replace("radtan", "radial-tangential")
+    text = text.replace("distortion_coeffs", "distortion_coefficients")
+    found = read_camera(write(tmp_path / "sensor.yaml", text))
+    assert found == Camera(320, 240, 210.0, 211.0, 160.5, 119.5, D[:4])
+
+
 @pytest.mark.parametrize("suffix", ["yml", "json", "xml"])
 @pytest.mark.parametrize("coefficients", [4, 5, 8, 14])
 def test_files_that_opencv_writes(suffix: str, coefficients: int, tmp_path: Path) -> None:
@@ -113,6 +121,7 @@ def test_a_pixel_of_opencv_s_projection_is_half_a_pixel_from_ours(tmp_path: Path
         (ROS.replace("-0.002, 0.0]", "-0.002, 0.0, 0.1, 0.2, 0.3]"), "has 8 coefficients, not 5"),
         (ROS.replace("[210, 0.0", "[.nan, 0.0"), "its matrix has no 9 numbers"),
         (ROS.replace("[210, 0.0", "[210, 3.0"), "has a skew"),
+        (ROS.replace("160.0, 0.0, 211.0, 119.0, 0.0, 0.0", "0, 0, 211, 0, 160, 119"), "transposed"),
         (ROS.replace("[210, 0.0", "[210, a"), "'a' is no number"),
         (ROS.replace("[210,", "[-210,"), "must be over 0"),
         (f"{MESSAGE}binning_x: 999\n", "must be over 0"),

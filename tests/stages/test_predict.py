@@ -20,6 +20,7 @@ from dmrl.messages import message_class
 from dmrl.recording import Provenance, RecordingWriter, read, read_raw, read_summary
 from dmrl.stages import predict
 from dmrl.stages.predict import Settings, run
+from dmrl.terminal.left_out import count_left_out
 
 OWN = ("/cf1/detections", "/cf1/detections/grid")
 
@@ -139,6 +140,15 @@ def test_images_of_several_sizes_go_through(model: Path, tmp_path: Path) -> None
     run(model, mixed, tmp_path / "out.mcap", Settings())
     grids = [s.message for s in read(tmp_path / "out.mcap", OWN[1])]
     assert [(g.rows, g.cols) for g in grids] == [(6, 8), (4, 4), (4, 4), (6, 8)]
+
+
+def test_an_image_of_a_size_that_the_model_does_not_take_is_left_out(
+    model: Path, tmp_path: Path
+) -> None:
+    mixed = recording(tmp_path / "mixed.mcap", (60, 48), (64, 48))
+    with count_left_out() as left:
+        assert run(model, mixed, tmp_path / "out.mcap", Settings()).images == 1
+    assert left.counts == {"images of a size that the model does not take": 1}
 
 
 @pytest.mark.heavy

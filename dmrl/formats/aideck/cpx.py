@@ -90,13 +90,14 @@ class ImageReader:
         self.broken = 0
         self._packets = PacketReader()
         self._begun: _PartialImage | None = None
+        self._headless_bytes = 0
         self._time_ms, self._time_us = CounterUnwrapper(32), CounterUnwrapper(32)
         self._robot_ms, self._frame_id = CounterUnwrapper(32), CounterUnwrapper(8, forward=True)
 
     @property
     def skipped_bytes(self) -> int:
-        """Number of bytes that belonged to no packet."""
-        return self._packets.skipped_bytes
+        """Number of bytes that belonged to no packet, or to an image without its header."""
+        return self._packets.skipped_bytes + self._headless_bytes
 
     def feed(self, data: bytes) -> Iterator[Image]:
         """Yield the images that these bytes complete."""
@@ -168,6 +169,7 @@ class ImageReader:
     def _append_chunk(self, data: bytes) -> Image | None:
         begun = self._begun
         if begun is None:
+            self._headless_bytes += len(data)
             return None
         # Only the streamer pads its last packet to a multiple of four.
         spare = 3 if begun.image is None else 0

@@ -68,7 +68,7 @@ def load_content(source: Path, options: Options) -> Content:
     if encodings == {"raw"}:
         options.refuse("raw", f"has no effect: the images of {source} say that they are raw")
     leave_out("images that are broken or cut short", source, reader.broken)
-    leave_out("bytes that belong to no packet", source, reader.skipped_bytes)
+    leave_out("bytes that belong to no packet or image", source, reader.skipped_bytes)
     told = [state for state in states if state is not None]
     if any(state.received_us < 0 for state in told):  # it came before the clock wrapped
         times = [None if time is None else time + WRAP_US for time in times]

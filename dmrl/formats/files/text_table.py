@@ -26,6 +26,8 @@ TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 SEPARATORS = (",", ";", "\t", "|", " ")
 """Separators by preference. A space stands for any white space."""
 COMMENT_MARKS = ("#", "%", "//")
+TYPED_MINUS = "\u2212"
+"""Minus sign of spreadsheets in some languages."""
 HEADER_LINES_MAX = 200
 """Lines in which the header is searched."""
 BYTE_ORDER_MARKS = (
@@ -199,6 +201,7 @@ def _read_lines(path: Path, encoding: str) -> list[tuple[int, str]]:
 
 def _number_lines(text: str) -> list[tuple[int, str]]:
     """Return the lines that are not blank, with their numbers."""
+    text = text.replace(TYPED_MINUS, "-")
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     return [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from dmrl.errors import RecordingError
-from dmrl.geometry.calibration import find_calibration_fault, find_lens_fault
+from dmrl.geometry.calibration import doubt_focal_length, find_calibration_fault, find_lens_fault
 from dmrl.recording.checks.clock_checks import check_clocks
 from dmrl.recording.checks.label_checks import check_causes, check_labels
 from dmrl.recording.checks.scan import (
@@ -223,7 +223,7 @@ def _check_calibrations(data: CheckData) -> Iterator[Finding]:
             if why := find_calibration_fault(width_px, height_px, k, d):
                 yield Finding("error" if any(k) else "warning", topic, why)
                 break
-            if why := find_lens_fault(model, d):
+            if why := find_lens_fault(model, d) or doubt_focal_length(width_px, k[0]):
                 yield Finding("warning", topic, why)
                 break
 

@@ -317,3 +317,10 @@ def test_a_streamer_packet_without_pixels_breaks_nothing() -> None:
     bare = pack_packet(Packet(GAP8, HOST, STREAMER, b"\x11\0\0\0"))
     got, reader = read(b"".join([first, bare, *rest]))
     assert ([found.data for found in got], reader.broken) == ([image.data], 0)
+
+
+def test_an_image_without_its_header_is_counted() -> None:
+    packets = list(PacketReader().feed(pack_image(Image(324, 244, "jpeg", JPEG))))
+    got, reader = read(b"".join(map(pack_packet, packets[1:])) + pack_image(raw(40, 51)))
+    assert len(got) == 1
+    assert reader.skipped_bytes == len(JPEG)

@@ -36,3 +36,9 @@ def test_one_number_that_thousands_cannot_have_decides(
     path.write_text("t;d\n" + "".join(f"{k};{cell}\n" for k, cell in enumerate(cells)))
     values = read_table(path, ("t", "d")).parse_numbers("d")
     assert values is not None and values.tolist() == numbers
+
+
+def test_a_typed_minus_is_a_minus(tmp_path: Path) -> None:
+    (path := tmp_path / "a.csv").write_text("t,x\n1,\u22122.5\n2,3\n", encoding="utf-8")
+    found = read_table(path).parse_numbers("x")
+    assert found is not None and found.tolist() == [-2.5, 3.0]

@@ -72,6 +72,15 @@ def test_images_are_of_one_size_and_of_the_calibrated(
             {"K": [180, 0, 160, 0, -180, 112, 0, 0, 1]},
             "error /cf1/camera/calibration has a focal length that is not above 0",
         ),
+        (
+            {"K": [180, 0, 0, 0, 180, 0, 160, 112, 1]},
+            "error /cf1/camera/calibration has a skew in K, or K is transposed",
+        ),
+        (
+            {"K": [0.6, 0, 160, 0, 0.6, 112, 0, 0, 1]},
+            "warning /cf1/camera/calibration has a focal length of 0.6 px for images 320 px wide. "
+            "Is it in mm, or a share?",
+        ),
         ({"height": 0}, "error /cf1/camera/calibration has images of 320 x 0 px"),
         (
             {"distortion_model": "equidistant", "D": [0.1] * 4},
