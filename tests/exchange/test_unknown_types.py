@@ -10,11 +10,18 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as F
 from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 from rosbags.highlevel import AnyReader
 
-from dmrl.errors import RecordingError
+from dmrl.errors import RecordingError, UnreadableTopic
 from dmrl.exchange.csv_parquet import write_tables
 from dmrl.exchange.ros2 import write_bag
 from dmrl.messages import message_class
-from dmrl.recording import Channel, RawMessage, RecordingWriter, build_provenance, read_raw
+from dmrl.recording import (
+    Channel,
+    RawMessage,
+    RecordingWriter,
+    build_provenance,
+    read_raw,
+    read_table,
+)
 from dmrl.terminal.left_out import count_left_out
 
 OWN = {"type": F.TYPE_MESSAGE, "type_name": ".x.M"}
@@ -113,8 +120,15 @@ def test_a_list_of_bytes_is_base64_in_a_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_text_that_is_not_utf_8_gives_one_line_error(kind: str, tmp_path: Path) -> None:
+def test_a_topic_with_text_that_is_not_utf_8_is_left_out(kind: str, tmp_path: Path) -> None:
     path = recorded(tmp_path, {"type": F.TYPE_STRING}, data=b"\x0a\x02\xed\xa0")
-    with pytest.raises(RecordingError, match="/cf1/m: a text is not UTF-8"):
+    with (
+        pytest.raises(RecordingError, match="has no topic that can be read"),
+        count_left_out() as left_out,
+    ):
         write_tables(path, tmp_path / "out", kind)  # type: ignore[arg-type]
+    why = "has messages that are not of its type (a text is not UTF-8)"
+    assert left_out.counts == {f"messages on /cf1/m, which {why}": 1}
+    with pytest.raises(UnreadableTopic, match=r"Leave it out \(dmrl trim\)"):  # recover cannot help
+        read_table(path, "/cf1/m")
     assert list(tmp_path.iterdir()) == [path]

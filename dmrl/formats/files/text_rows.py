@@ -14,6 +14,8 @@ UNIT_SUFFIX = re.compile(r"\s*[\[(<{/]\s*([^\])>}]*?)\s*[\])>}]?\s*")
 HEADER_SHARE = 0.5
 """Share of the names of the header from which a line of text among the rows is another header."""
 
+ROWS_MIN = 10
+"""Rows from which the decimals of a column are known."""
 NumberedRows = list[tuple[int, list[str]]]
 """Cells of each row, with the number of its line."""
 
@@ -54,6 +56,21 @@ def split_rows(
     kept = [(number, row) for number, row in rows if len(row) == width]
     kept = _follow_headers(path, kept, names)
     return [number for number, _ in kept], [row for _, row in kept]
+
+
+def drop_cut_line(
+    path: Path, numbers: list[int], rows: list[list[str]]
+) -> tuple[list[int], list[list[str]]]:
+    """Leave out the last row of a file without a last line end, if its last number was cut off.
+
+    It was if the numbers above it all have the same number of decimals, and it has fewer.
+    """
+    decimals = [len(row[-1].strip().partition(".")[2]) for row in rows]
+    same = len(rows) >= ROWS_MIN and len({*decimals[:-1]}) == 1
+    if not (same and decimals[-1] < decimals[0] and text_cells.is_number(rows[-1][-1])):
+        return numbers, rows
+    leave_out("last lines that were cut short", f"{path}:{numbers[-1]}")
+    return numbers[:-1], rows[:-1]
 
 
 def _read_rows(path: Path, body: list[tuple[int, str]], separator: str) -> NumberedRows:

@@ -15,7 +15,7 @@ import numpy as np
 from dmrl.errors import EmptySource, SourceError
 from dmrl.formats.clocks import Ints, settle_times
 from dmrl.formats.files import text_cells
-from dmrl.formats.files.text_rows import is_named, split_rows, strip_unit
+from dmrl.formats.files.text_rows import drop_cut_line, is_named, split_rows, strip_unit
 from dmrl.geometry.frames import Array
 from dmrl.guards import limits
 from dmrl.guards.bounded_parsing import parse_number
@@ -158,7 +158,7 @@ def read_table(
         If the file cannot be read, or has no header or no row.
     """
     dialect = dialect or Dialect()
-    lines = _read_lines(path, dialect.encoding)
+    lines, is_ended = _read_lines(path, dialect.encoding)
     head, separator, names = _find_header(path, lines, wanted, dialect)
     units = {}
     for k, name in enumerate(names):
@@ -169,6 +169,8 @@ def read_table(
     body = [(n, _cut_comment(line, marks, separator, len(names))) for n, line in lines[head + 1 :]]
     body = [(n, line) for n, line in body if line.strip()]
     numbers, rows = split_rows(path, body, separator, names)
+    if not is_ended:
+        numbers, rows = drop_cut_line(path, numbers, rows)
     if rows and not any(text_cells.is_number(cell) for cell in rows[0]):
         units |= {name: cell.strip() for name, cell in zip(names, rows[0], strict=True)}
         numbers, rows = numbers[1:], rows[1:]  # a line of units
@@ -192,9 +194,11 @@ def read_names(path: Path, wanted: Collection[str]) -> list[str]:
         return []
 
 
-def _read_lines(path: Path, encoding: str) -> list[tuple[int, str]]:
+def _read_lines(path: Path, encoding: str) -> tuple[list[tuple[int, str]], bool]:
+    """Return the numbered lines of a file, and whether the last one has an end."""
     try:
-        return _number_lines(_decode(path, path.read_bytes(), encoding))
+        text = _decode(path, path.read_bytes(), encoding)
+        return _number_lines(text), text.endswith(("\n", "\r"))
     except (OSError, LookupError, UnicodeError) as e:
         raise SourceError(f"{path} cannot be read as text: {e}. Save it as UTF-8") from None
 

@@ -154,7 +154,7 @@ def _check_storage(source: Path) -> None:
     A ROS 1 bag must begin with its magic: rosbags reads its first line, however long it is. rosbags
     ignores the log of writes that SQLite leaves beside a file when its recording is killed.
     """
-    if source.is_dir() and not (source / METADATA_FILE).is_file():
+    if any(source.glob("*.db3")) and not (source / METADATA_FILE).is_file():
         raise SourceError(
             f"{source} has no {METADATA_FILE}: its recording was killed. Run: ros2 bag reindex "
             f"{source}, or pass one of its files"

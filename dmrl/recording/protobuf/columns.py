@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow as pa
 from google.protobuf.descriptor import Descriptor
 
+from dmrl.errors import UnreadableTopic
 from dmrl.recording.mcap.channel import Channel
-from dmrl.recording.mcap.file import corrupt_error
 from dmrl.recording.mcap.message_batch import MessageBatch
 from dmrl.recording.protobuf.arrow_arrays import to_arrow
 from dmrl.recording.protobuf.decode import decode
@@ -119,7 +119,7 @@ def _decode_batch(
     try:
         body = decode(batch.data, batch.start, batch.end, kind, fields)
     except WireError as e:
-        raise corrupt_error(path, f"{topic}: {e}") from e
+        raise UnreadableTopic(path, topic, f"has messages that are not of its type ({e})") from e
     columns = {name: to_arrow(getattr(batch, of)) for name, of in TIMES.items()}
     for name, values in body.items():
         free = name

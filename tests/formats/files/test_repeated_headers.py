@@ -6,6 +6,7 @@ import pytest
 
 from dmrl.errors import SourceError
 from dmrl.formats.files.text_table import read_table
+from dmrl.terminal.left_out import count_left_out
 
 
 def read_column(path: Path, text: str, name: str) -> list[str]:
@@ -32,3 +33,23 @@ def test_a_header_of_other_columns_is_refused(tmp_path: Path) -> None:
 def test_rows_of_text_are_no_headers(tmp_path: Path) -> None:
     text = "t,robot,mode\n1,cf1,up\n-,robot,mode\n2,cf1,down\n"
     assert read_column(tmp_path / "a.csv", text, "mode") == ["up", "mode", "down"]
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"),
+    [
+        ("2.3\n", 12),  # a whole line
+        ("2.300", 12),  # as those above it
+        ("2.3", 11),
+        ("2", 11),
+        ("", 12),
+    ],
+)
+def test_a_number_that_was_cut_off_at_the_end_is_left_out(
+    text: str, kept: int, tmp_path: Path
+) -> None:
+    rows = [f"{k},{k / 8:.3f}" for k in range(11)]
+    (path := tmp_path / "a.csv").write_text("\n".join(["t,x", *rows, f"11,{text}"]))
+    with count_left_out() as left:
+        assert len(read_table(path).columns["x"]) == kept
+    assert sum(left.counts.values()) == 12 - kept
