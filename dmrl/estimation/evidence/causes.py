@@ -8,6 +8,7 @@ import numpy as np
 from dmrl.estimation.evidence.posterior import Mixture
 from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Pair
 from dmrl.estimation.solver.estimate import Cause, Innovation
+from dmrl.estimation.solver.keyframes import longest_range_gap_s
 
 MIN_DROPOUT_SHARE = 0.01
 """Share of a flight from which a silent sensor is reported."""
@@ -101,9 +102,8 @@ def find_dropouts(logged: Pair, used: Pair) -> tuple[Cause, ...]:
         found.append(_cause("range frozen", logged.range_time_s[held], None))
     edges = np.concatenate([used.time_s[:1], used.range_time_s, used.time_s[-1:]])
     gaps_s = np.diff(edges)
-    silent_s = gaps_s[gaps_s > MAX_DROPOUT_S].sum()
-    if len(used.range_m) and silent_s > MIN_DROPOUT_SHARE * (edges[-1] - edges[0]):
-        silent = np.flatnonzero(gaps_s > MAX_DROPOUT_S)
+    silent = np.flatnonzero(gaps_s > longest_range_gap_s(used))
+    if len(used.range_m) and gaps_s[silent].sum() > MIN_DROPOUT_SHARE * (edges[-1] - edges[0]):
         found.append(_cause("range silent", edges[[silent[0], silent[-1] + 1]], None))
     return tuple(found)
 

@@ -15,6 +15,7 @@ from dmrl.estimation.model.gate import Gate
 from dmrl.estimation.model.odometry import rotate, rotation_matrix
 from dmrl.estimation.model.pair import MAX_DROPOUT_S, Array, Mask, Pair
 from dmrl.estimation.model.status import AMBIGUOUS, OK, UNCONVERGED, Statuses, classify_positions
+from dmrl.estimation.signals.contradictions import count_median
 from dmrl.estimation.solver.covariance import (
     MIN_MOTION_ENERGY,
     Covariances,
@@ -22,6 +23,7 @@ from dmrl.estimation.solver.covariance import (
     odometry_energy,
 )
 from dmrl.estimation.solver.estimate import REASONS, Cause, Estimate
+from dmrl.estimation.solver.keyframes import sum_ways
 from dmrl.estimation.solver.levenberg_marquardt import relative_path
 from dmrl.estimation.solver.problem import Problem
 from dmrl.estimation.solver.residuals import Values
@@ -35,8 +37,8 @@ SIGMA_FACTOR_S, SIGMA_FACTOR = (20.0, 60.0), (0.8, 1.0)
 66 simulated flights without a fault: the judge's sound set, seeds 8000 to 8205."""
 
 
-RANGE_MEDIAN, RANGE_MARGIN_M = 21, 0.5
-"""Number of ranges in the median that bounds a position; and margin of that bound, metres."""
+RANGE_MARGIN_M = 0.5
+"""Margin of the distance that the ranges allow, metres."""
 
 
 MISFIT_MARGIN_S = 30.0
@@ -309,11 +311,16 @@ def clip_to_ranges(pair: Pair, estimate: Estimate) -> tuple[Estimate, Mask]:
     """Clip an estimate to the distance that the ranges allow, and return where it exceeded it."""
     if not len(pair.range_m):
         return estimate, np.zeros(len(estimate.time_s), bool)
-    smooth_m = median_filter(pair.range_m, RANGE_MEDIAN, mode="nearest")
-    near = np.searchsorted(pair.range_time_s, estimate.time_s)
-    reach = RANGE_MEDIAN // 2
-    around = np.clip(near[:, None] + [-reach, 0, reach], 0, len(smooth_m) - 1)
-    reach_m = smooth_m[around].max(axis=1) + RANGE_MARGIN_M
+    count, time_s = count_median(pair), estimate.time_s
+    smooth_m = median_filter(pair.range_m, count, mode="nearest")
+    near = np.searchsorted(pair.range_time_s, time_s)
+    around = np.clip(near[:, None] + [-(count // 2), 0, count // 2], 0, len(smooth_m) - 1)
+    # Between ranges, the distance grows at most as fast as both robots fly.
+    range_s, way_m = pair.range_time_s, sum_ways(pair)
+    beside = np.clip(np.stack([near - 1, near]), 0, len(range_s) - 1)
+    moved_m = np.interp(range_s[beside], pair.time_s, way_m) - np.interp(time_s, pair.time_s, way_m)
+    grown_m = (smooth_m[beside] + np.abs(moved_m)).min(axis=0)
+    reach_m = np.maximum(smooth_m[around].max(axis=1), grown_m) + RANGE_MARGIN_M
     distance = np.hypot(*estimate.state[:, :2].T)
     far = distance > reach_m
     state = estimate.state.copy()

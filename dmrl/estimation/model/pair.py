@@ -15,8 +15,8 @@ MAX_DROPOUT_S = 0.5
 """Longest dropout that is interpolated without a warning, seconds. No record of how the value was
 chosen."""
 SLOW_PERIODS, MAX_SLOW_DROPOUT_S = 1.5, 2.0
-"""Periods of a slow log of heights, and seconds, beyond which a gap is a dropout: one sample of a
-log at 1 Hz is missing."""
+"""Periods of a slow log of heights or ranges, and seconds, beyond which a gap is a dropout: one
+sample of a log at 1 Hz is missing."""
 MAX_RANGE_M = 60.0
 """Longest plausible UWB range, metres. It rejects 65535 and other fill values."""
 NORMAL_MEDIAN = 0.6745
@@ -213,7 +213,8 @@ def longest_gap_s(time_s: Array) -> float:
     Parameters
     ----------
     time_s
-        (N,) times of a height, seconds. It changes slowly, so that slow logs are interpolated.
+        (N,) times of a height, or of a robot's ranges, seconds. Heights change slowly, and odometry
+        leads from range to range, so that slow logs are used.
     """
     period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     return float(np.clip(SLOW_PERIODS * period_s, MAX_DROPOUT_S, MAX_SLOW_DROPOUT_S))

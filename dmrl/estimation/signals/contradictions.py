@@ -20,8 +20,9 @@ which the robust loss of the odometry takes."""
 MARGIN_M, MARGIN_SHARE = 0.5, 0.25
 """Margin of a contradiction, metres, and share of the way: more than the errors of sound ranges and
 of a velocity scale that nobody calibrated."""
-RANGE_MEDIAN = 21
-"""Number of ranges in the median that a contradiction uses: twice the outliers in a row."""
+RANGE_MEDIAN, RANGE_MEDIAN_S = 21, 1.0
+"""Most ranges in the median that a contradiction uses, twice the outliers in a row; and its longest
+time, seconds: the distance changes within a longer one."""
 SURROUNDING_S = 1.0
 """Time around a contradiction that is dropped too, seconds: it may belong to the fall."""
 
@@ -57,7 +58,7 @@ def drop_contradictions(pair: Pair) -> Pair:
     """
     if len(pair.range_m) < RANGE_MEDIAN:
         return pair
-    ranged = median_filter(pair.range_m, RANGE_MEDIAN, mode="nearest")
+    ranged = median_filter(pair.range_m, count_median(pair), mode="nearest")
     distance = np.interp(pair.time_s, pair.range_time_s, ranged)
     after = np.clip(np.searchsorted(pair.range_time_s, pair.time_s), 1, len(ranged) - 1)
     gap_s = pair.range_time_s[after] - pair.range_time_s[after - 1]
@@ -74,6 +75,12 @@ def drop_contradictions(pair: Pair) -> Pair:
         worse = int(farther[1] > farther[0])
         tracks[worse] = _drop_heights(tracks[worse], np.isin(np.arange(len(up)), above))
     return replace(pair, own=tracks[0], peer=tracks[1])
+
+
+def count_median(pair: Pair) -> int:
+    """Return the odd number of ranges whose median shows the distance."""
+    per_s = len(pair.range_m) / float(np.ptp(pair.time_s))
+    return min(2 * int(per_s * RANGE_MEDIAN_S / 2) + 1, RANGE_MEDIAN)
 
 
 def find_contradictions(pair: Pair, distance: Array) -> tuple[Mask, Mask]:

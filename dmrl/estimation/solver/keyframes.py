@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from dmrl.estimation.model.odometry import preintegrate
 from dmrl.estimation.model.pair import (
-    MAX_DROPOUT_S,
     Array,
     BearingMeasurements,
     Mask,
     Pair,
     SensorTrack,
+    longest_gap_s,
 )
 from dmrl.estimation.signals.jump_detection import step_offsets
 from dmrl.estimation.solver.problem import (
@@ -25,6 +25,7 @@ from dmrl.estimation.solver.problem import (
     RangeLink,
     Steps,
 )
+from dmrl.estimation.solver.unknowns import MEASURED_CLOCK, TABLE, with_rows
 
 KEYFRAME_HZ = 5.0
 """Keyframes per second, Hz. Twice the rate costs twice the time and gave the same error on ten
@@ -36,8 +37,8 @@ it moves the peer away, where a pixel spans more. Within 25 ms it is 2 mm."""
 FIXED_KEYFRAMES = 50
 """Number of keyframes from one that keeps its time to the next. Windows begin there."""
 RANGE_BLOCK_S, RANGE_MEDIAN_BLOCKS, MIN_RANGE_STEP_M = 0.1, 3, 0.45
-"""Detection of range steps for the search: length of a block, seconds; number of block medians on
-either side; smallest step, metres. Smaller steps are left to the solve."""
+"""Detection of range steps for the search: shortest length of a block, seconds; number of block
+medians on either side; smallest step, metres. Smaller steps are left to the solve."""
 
 
 def select_measurements(measured: Measured, chosen: Mask) -> Measured:
@@ -81,7 +82,8 @@ def build_problem(pairs: Mapping[tuple[int, int], Pair], rate_hz: float = KEYFRA
         for axis, name in enumerate(("camera_azimuth", "camera_elevation", "camera_distance")):
             known[name, view.robots[:1]] = float(np.nanmedian(view.std[..., axis]))
     noise = NoiseModel(known_std=known)
-    return Problem(key_s, tuple(robots), tuple(links), tuple(views), noise=noise)
+    table = with_rows(TABLE, MEASURED_CLOCK) if ("clock", (1,)) in known else TABLE
+    return Problem(key_s, tuple(robots), tuple(links), tuple(views), table, noise)
 
 
 def _list_image_times(pairs: Mapping[tuple[int, int], Pair]) -> list[Array]:
@@ -216,14 +218,22 @@ def range_step_offsets(pair: Pair) -> Array:
     blocks, inverse = np.unique(block, return_inverse=True)
     ends = np.cumsum(np.bincount(inverse, minlength=len(blocks)))
     middle = np.array([np.median(part) for part in np.split(pair.range_m, ends[:-1])])
-    # The distance changes at most as fast as both robots fly.
-    speed = sum(np.hypot(track.vx_mps, track.vy_mps) for track in (pair.own, pair.peer))
-    way_m = np.cumsum(speed) * pair.dt_s
-    half_s, at_s = RANGE_MEDIAN_BLOCKS * RANGE_BLOCK_S / 2, pair.time_s[0] + blocks * RANGE_BLOCK_S
-    late, early = (np.interp(at_s + way * half_s, pair.time_s, way_m) for way in (1, -1))
+    # The distance changes at most as fast as both robots fly, also between ranges of a slow log.
+    at_s = pair.time_s[0] + (blocks + 0.5) * RANGE_BLOCK_S
+    way_m = np.interp(at_s, pair.time_s, sum_ways(pair))
+    after = np.arange(len(blocks)) + RANGE_MEDIAN_BLOCKS // 2
+    numbers = (np.clip(k, 0, len(blocks) - 1) for k in (after, after - RANGE_MEDIAN_BLOCKS))
+    late, early = (way_m[k] for k in numbers)
     moved_m = late - early
-    found = step_offsets(middle, RANGE_BLOCK_S, MIN_RANGE_STEP_M, RANGE_MEDIAN_BLOCKS, moved_m)
+    step_s = RANGE_BLOCK_S * (float(np.median(np.diff(blocks))) if len(blocks) > 1 else 1.0)
+    found = step_offsets(middle, step_s, MIN_RANGE_STEP_M, RANGE_MEDIAN_BLOCKS, moved_m)
     return np.asarray(found[inverse])
+
+
+def sum_ways(pair: Pair) -> Array:
+    """Return (K,) the length of the ways of both robots up to each time, metres."""
+    speed = sum(np.hypot(track.vx_mps, track.vy_mps) for track in (pair.own, pair.peer))
+    return np.asarray(np.cumsum(speed) * pair.dt_s)
 
 
 def average_ranges(link: RangeLink, key_s: Array) -> RangeLink:
@@ -274,10 +284,15 @@ def odometry_dropout(pair: Pair, time_s: Array) -> Mask:
 
 
 def range_dropout(pair: Pair, time_s: Array) -> Mask:
-    """Return (K,) whether the ranges dropped out for over half a second."""
+    """Return (K,) whether the ranges dropped out for over half a second; a slow log for longer."""
     edges = np.concatenate([[-np.inf], pair.range_time_s, [np.inf]])
     after = np.clip(np.searchsorted(edges, time_s), 1, len(edges) - 1)
-    return np.asarray(edges[after] - edges[after - 1] > MAX_DROPOUT_S)
+    return np.asarray(edges[after] - edges[after - 1] > longest_range_gap_s(pair))
+
+
+def longest_range_gap_s(pair: Pair) -> float:
+    """Return the longest time between two ranges that is no dropout, seconds."""
+    return longest_gap_s(pair.range_time_s[::2])  # two robots may range in turn
 
 
 def list_robots(pairs: Collection[tuple[str, str]]) -> list[str]:

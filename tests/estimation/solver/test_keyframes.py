@@ -77,6 +77,15 @@ def test_range_dropout_lasts_over_half_a_second() -> None:
     assert times[gap][[0, -1]] == pytest.approx([10.0, 10.7], abs=0.06)
 
 
+@pytest.mark.parametrize("first_s", [[3.0], [3.0, 3.3]])
+def test_ranges_once_a_second_are_no_dropout(first_s: list[float]) -> None:
+    """Ranges of one robot, and of two that range in turn."""
+    slow = np.sort(np.concatenate([np.arange(one, 22.99, 1.0) for one in first_s]))
+    times = np.arange(4.0, 21.0, 0.1)
+    assert not range_dropout(pair(slow), times).any()
+    assert range_dropout(pair(slow[(slow < 10) | (slow > 13)]), times).any()
+
+
 def test_dropout_extends_to_neighbouring_times() -> None:
     flight = pair(np.arange(3.0, 23.0, 0.1))
     alone = np.arange(len(TIME_S)) == 1000
@@ -107,6 +116,33 @@ def test_fast_relative_motion_is_no_range_step() -> None:
     assert not range_step_offsets(Pair(TIME_S, own, peer, ranges_s, range_m)).any()
     still = replace(own, vx_mps=0 * speed)
     assert range_step_offsets(Pair(TIME_S, still, still, ranges_s, range_m)).any()
+
+
+def flown_to_and_fro(ranges_s: Array) -> Pair:
+    """A peer at 1 m/s and more, along the line between both robots."""
+    peer = replace(arc(0.0, 0.0, 0.0), vx_mps=1.5 * np.cos(TIME_S), height_m=0 * TIME_S)
+    own = replace(arc(0.0, 0.0, 0.0), height_m=0 * TIME_S)
+    return Pair(TIME_S, own, peer, ranges_s, 3 + 1.5 * np.sin(ranges_s))
+
+
+@pytest.mark.parametrize("period_s", [0.2, 0.5, 1.0])
+def test_motion_between_slow_ranges_is_no_step(period_s: float) -> None:
+    assert not range_step_offsets(flown_to_and_fro(np.arange(3.0, 22.9, period_s))).any()
+
+
+def test_motion_while_ranges_are_silent_is_no_step() -> None:
+    ranges_s = np.arange(3.0, 22.9, 0.02)
+    ranges_s = ranges_s[(ranges_s < 11) | (ranges_s > 14)]
+    assert not range_step_offsets(flown_to_and_fro(ranges_s)).any()
+
+
+@pytest.mark.parametrize("period_s", [0.2, 0.5, 1.0])
+def test_positions_between_slow_ranges_are_not_clipped(period_s: float) -> None:
+    flight, count = flown_to_and_fro(np.arange(3.0, 22.9, period_s)), len(TIME_S)
+    state = np.column_stack([3 + 1.5 * np.sin(TIME_S), np.zeros((count, 2))])
+    spread, constants = np.tile(np.eye(3), (count, 1, 1)), np.zeros(len(PAIR_LAYOUT.constants))
+    made = Estimate(TIME_S, state, spread, np.zeros(count, np.int8), constants, NoiseModel())
+    assert not clip_to_ranges(flight, made)[1].any()
 
 
 def test_averaged_range_is_the_median_per_keyframe() -> None:
