@@ -12,6 +12,9 @@ from dmrl.estimation.signals.clock_jumps import find_clock_jump
 MIN_SHIFT_S, MIN_SHIFT_SIGMAS = 0.05, 5.0
 """Smallest shift that mutual ranges correct, seconds and standard deviations: the plain model has
 smaller ones. The offset of sound simulated flights is known to 5 to 10 ms."""
+MIN_KNOWN_S, MAX_KNOWN_S = 0.01, 0.1
+"""Smallest standard deviation of a clock that the ranges of both robots show, seconds: a step of
+the time grid; and offset from which they show none, since a sure one would have been corrected."""
 MIN_FURTHER_SHIFT_S = 0.01
 """Smallest shift after a first one, seconds: a step of the time grid."""
 MIN_JUMP_GAIN = -RARE + np.log(200)
@@ -126,8 +129,7 @@ def find_clock_shift(pair: Pair) -> ClockShift | None:
     """
     if not is_mutual(pair):
         return None
-    here, there = (pair.range_sender == robot for robot in (0, 1))
-    series = [series[at] for at in (here, there) for series in (pair.range_time_s, pair.range_m)]
+    series = _split_by_sender(pair)
     jump = find_clock_jump(*series)
     if jump is not None and jump.gain > MIN_JUMP_GAIN and _is_sure(jump.shift_s, jump.sigma_s):
         return ClockShift(jump.shift_s, jump.from_s)
@@ -135,6 +137,29 @@ def find_clock_shift(pair: Pair) -> ClockShift | None:
     if clock is not None and _is_sure(clock.offset_s, clock.sigma_s):
         return ClockShift(clock.offset_s)
     return None
+
+
+def with_known_clock(pair: Pair) -> Pair:
+    """Return a pair with what the ranges of both robots tell about its clocks, after all shifts.
+
+    An offset that is too small for a shift stays, so the standard deviation contains it.
+
+    Parameters
+    ----------
+    pair
+        Sensor data of both robots. It is returned as it is unless both range.
+    """
+    clock = estimate_clock(*_split_by_sender(pair)) if is_mutual(pair) else None
+    if clock is None or not abs(clock.offset_s) < MAX_KNOWN_S:
+        return pair
+    std_s = float(np.hypot(clock.offset_s, clock.sigma_s))
+    return replace(pair, known_std={**pair.known_std, ("clock", (1,)): max(std_s, MIN_KNOWN_S)})
+
+
+def _split_by_sender(pair: Pair) -> list[Array]:
+    """Return times and ranges of the first robot, and those of the second."""
+    mine = [pair.range_sender == robot for robot in (0, 1)]
+    return [series[at] for at in mine for series in (pair.range_time_s, pair.range_m)]
 
 
 def _is_sure(shift_s: float, sigma_s: float) -> bool:

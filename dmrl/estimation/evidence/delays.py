@@ -2,7 +2,8 @@
 
 An error model of a delay is linear: a delayed motion is the motion less its derivative times the
 delay. That holds for a part of the time in which the motion changes. Where a longer delay is
-probable, the signal is moved by the estimate, and the flight is solved again.
+probable, the signal is moved by the estimate, and the flight is solved again. What is left of the
+delay is then an unknown of the flight.
 """
 
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dmrl.estimation.evidence.clock_shifts import MIN_SHIFT_S, MIN_SHIFT_SIGMAS
+from dmrl.estimation.evidence.clock_shifts import MIN_SHIFT_S
 from dmrl.estimation.evidence.error_models import Candidate
 from dmrl.estimation.evidence.posterior import Mixture
 from dmrl.estimation.model.pair import Array, Pair, SensorTrack
@@ -21,8 +22,9 @@ SIGNALS = {
     "range_delay": (),
 }
 """Signals of a robot that each unknown delays; none: the ranges of the pair."""
-MIN_PROBABILITY = 0.5
-"""Smallest probability of the error model of a delay that is moved."""
+MIN_PROBABILITY, MIN_DELAY_SIGMAS = 0.5, 2.0
+"""Smallest probability of the error model of a delay that is moved, and smallest delay in standard
+deviations. What is moved too far comes back, since the delay remains an unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,9 @@ class Delay:
     delay_s: float
 
 
-def find_delay(mixture: Mixture, constants_covariance: Array) -> Delay | None:
+def find_delay(
+    mixture: Mixture, constants_covariance: Array, late: Sequence[Candidate] = ()
+) -> Delay | None:
     """Return the first delay of a window that is probable and too long for a linear model.
 
     Models are combined greedily, so that the first explains most. Further delays can stand for
@@ -56,17 +60,19 @@ def find_delay(mixture: Mixture, constants_covariance: Array) -> Delay | None:
         Solutions of the window under likely models.
     constants_covariance
         (G, G) covariance of the constants of the best solution.
+    late
+        Models of signals that were moved: what is left of their delays need not be sure.
     """
     best, probable = mixture.members[0], mixture.probabilities()
-    for model in best.models:
+    for model in (*late, *best.models):
         for name in (row.name for row in model.model.rows if row.name in SIGNALS):
             owners = (0, 1) if model.robot is None else (model.robot,)
             k = best.solver.problem.layout.find(name, *owners)
             delay_s, sigma_s = best.values.constants[k], np.sqrt(constants_covariance[k, k])
-            if (
-                abs(delay_s) >= max(MIN_SHIFT_S, MIN_SHIFT_SIGMAS * sigma_s)
-                and probable[model] >= MIN_PROBABILITY
-            ):
+            sure = model in late or (
+                abs(delay_s) >= MIN_DELAY_SIGMAS * sigma_s and probable[model] >= MIN_PROBABILITY
+            )
+            if sure and abs(delay_s) >= MIN_SHIFT_S:
                 return Delay(name, model, float(delay_s))
     return None
 

@@ -83,7 +83,7 @@ def weigh_models(solver: Solver, modes: Sequence[MapEstimate], others: Others = 
         for mode in modes[1:]
     ]
     best, rounds = plain, []
-    candidates = _list_shown(solver.problem)
+    candidates = list_shown(solver.problem)
     for _ in range(MAX_MODELS):
         tried = try_models(best, candidates, others)
         leader = max(tried, key=lambda one: one.score, default=best)
@@ -98,18 +98,21 @@ def weigh_models(solver: Solver, modes: Sequence[MapEstimate], others: Others = 
     return _mix([_widen(one) for one in _select_likely(members)])
 
 
-def _list_shown(problem: Problem) -> list[Candidate]:
+def list_shown(problem: Problem) -> list[Candidate]:
     """Return the error models that a flight can show.
 
     A robot that does not move shows no scale of its motion, but a scale would explain its noise.
-    Ranges that are rounded coarsely jump by what they are rounded to.
+    Ranges that are rounded coarsely jump by what they are rounded to. Where both robots range, the
+    offset of their clocks is known already.
     """
+    ranged = any(name == "clock" for name, _ in problem.noise.known_std)
     coarse = any(find_spacing(link.range_m) > problem.noise.range_std_m for link in problem.links)
     moves = [odometry_energy(problem, k) >= MIN_MOTION_ENERGY for k in range(len(problem.robots))]
     return [
         one
         for one in list_candidates()
         if not (coarse and one.model.sudden)
+        and not (ranged and any(row.name == "clock_free" for row in one.model.rows))
         and (
             not any(row.motion_scale for row in one.model.rows)
             or (any(moves) if one.robot is None else moves[one.robot])

@@ -11,6 +11,7 @@ from dmrl.estimation.evidence.clock_shifts import (
     find_clock_shift,
     find_motion_shift,
     list_measuring_robots,
+    with_known_clock,
 )
 from dmrl.estimation.evidence.delays import join_delays, move_signal
 from dmrl.estimation.evidence.error_models import Candidate
@@ -130,7 +131,7 @@ def _align_clocks(pair: Pair) -> tuple[Pair, list[ClockShift]]:
     while len(shifts) < MAX_SHIFTS and (shift := find_clock_shift(pair)) is not None:
         pair = shift.move(pair)
         shifts.append(shift)
-    return pair, shifts
+    return with_known_clock(pair), shifts
 
 
 def _to_log_times(time_s: Array, shifts: Sequence[ClockShift]) -> Array:
@@ -210,7 +211,7 @@ def _move_late(
         logged = move_signal(logged, delay)
         models[delay.model] = None
         pair = drop_contradictions(logged)
-        pieces = list(solve_pieces(pair, None, plain=False))
+        pieces = list(solve_pieces(pair, None, list(models), plain=False))
     return logged, pair, pieces, list(models)
 
 

@@ -10,6 +10,7 @@ from scipy.special import chdtrc, erfc
 
 from dmrl.estimation.evidence.causes import find_causes
 from dmrl.estimation.evidence.delays import Delay, find_delay
+from dmrl.estimation.evidence.error_models import Candidate
 from dmrl.estimation.evidence.goodness_of_fit import check_fit
 from dmrl.estimation.flight.pair_output import (
     _first_samples,
@@ -60,7 +61,9 @@ class Piece(NamedTuple):
     delay: Delay | None = None
 
 
-def solve_pieces(pair: Pair, noise: NoiseModel | None, *, plain: bool) -> Iterator[Piece]:
+def solve_pieces(
+    pair: Pair, noise: NoiseModel | None, late: Sequence[Candidate] = (), *, plain: bool
+) -> Iterator[Piece]:
     """Yield the estimates of the windows of a flight.
 
     Parameters
@@ -69,6 +72,8 @@ def solve_pieces(pair: Pair, noise: NoiseModel | None, *, plain: bool) -> Iterat
         Sensor data of both robots.
     noise
         Noise model of the sensors. None: selected for each window.
+    late
+        Models of signals that were moved, whose delays are unknown further on.
     plain
         Without error models beyond the plain one.
     """
@@ -76,15 +81,20 @@ def solve_pieces(pair: Pair, noise: NoiseModel | None, *, plain: bool) -> Iterat
     for window in split_windows(float(pair.time_s[0]), float(pair.time_s[-1])):
         return_freed_memory()  # of the signals of the whole flight, and of the window before
         part = pair.crop(window.start_s, window.end_s)
-        solution = solve_pair(build_problem({(0, 1): part}), noise, carried, plain=plain)
+        problem = build_problem({(0, 1): part})
+        for model in late:
+            problem = model.apply(problem)
+        solution = solve_pair(problem, noise, carried, plain=plain)
         times = output_times(pair.time_s[0], window.from_s, window.until_s)
-        piece = _to_piece(solution, part, times)
+        piece = _to_piece(solution, part, times, late)
         yield piece if plain or noise else _with_fit(piece, solution)
         if not window.is_last:
             carried = carry_information(solution.solver, solution.values, window.next_s)
 
 
-def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
+def _to_piece(
+    solution: PairSolution, pair: Pair, time_s: Array, late: Sequence[Candidate]
+) -> Piece:
     """Return the estimate of a solved window at some times."""
     problem, values, key_s = solution.problem, solution.values, solution.problem.keyframe_s
     state, spread = mix_members(solution, time_s)
@@ -118,7 +128,7 @@ def _to_piece(solution: PairSolution, pair: Pair, time_s: Array) -> Piece:
     silent |= find_contradicted_steps(problem, values)[step]
     sighted, energy = list_sighted(solution, time_s), motion_energy(problem, values)
     chance = _compute_prior_chance(problem, values)
-    delay = find_delay(solution.mixture, covariances.constants)
+    delay = find_delay(solution.mixture, covariances.constants, late)
     return Piece(estimate, silent, sighted, energy, noisy, chance, delay)
 
 

@@ -10,7 +10,7 @@ data that an effect can use; see `problem`.
 """
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -222,6 +222,9 @@ optical flow on small drones (docs/flights.md, preset "realistic", rounded up). 
 gyroscope or a clock is mostly good and sometimes far off, so their priors have Cauchy tails at 1.5
 to 2 sigmas. So has the azimuth of a camera: a board that is plugged in points within two degrees.
 A scale keeps a Gaussian prior: otherwise it could shrink the path to nothing."""
+
+MEASURED_CLOCK = replace(next(row for row in TABLE if row.name == "clock"), loss=Gaussian())
+"""Clock of a flight whose ranges show it: it is not far off."""
 
 YAW_RATE_ERROR = Unknown(
     "yaw_rate_error", "rad/s", 0.003, "robot", Cauchy(2.0), "jump", motion=turn, start_std=0.03

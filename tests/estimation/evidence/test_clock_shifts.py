@@ -5,14 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dmrl.estimation.evidence.clock_shifts import ClockShift, find_clock_shift
+from dmrl.estimation.evidence.clock_shifts import (
+    ClockShift,
+    find_clock_shift,
+    with_known_clock,
+)
 from dmrl.estimation.evidence.mistakes import compute_misfit
+from dmrl.estimation.evidence.posterior import list_shown
 from dmrl.estimation.flight.pair_output import to_peer_clock
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.model.pair import Pair
 from dmrl.estimation.model.status import OK
 from dmrl.estimation.solver.estimate import PAIR_LAYOUT, Estimate
+from dmrl.estimation.solver.keyframes import build_problem
 from dmrl.estimation.solver.problem import NoiseModel
+from dmrl.estimation.solver.robust_loss import Gaussian
 
 from ..flights import both_ranging, flown, pair_of, truth_at
 
@@ -49,6 +56,23 @@ def test_times_return_to_the_log(shift: ClockShift) -> None:
         pytest.approx(log_s[[0, 1, 3, 4]])
     )
     assert (np.diff(shift.to_log_times(np.linspace(0.0, 20.0, 401))) >= 0).all()
+
+
+@pytest.mark.heavy
+def test_the_ranges_of_both_robots_hold_the_clock_of_the_solve() -> None:
+    flight = flown("in_view", "calibrated", 1000, 60.0)
+    known, off = (
+        with_known_clock(ClockShift(shift_s).move(both_ranging(flight))) for shift_s in (0.0, 0.045)
+    )
+    assert known.known_std["clock", (1,)] < 0.02 < off.known_std["clock", (1,)]
+    problem = build_problem({(0, 1): known})
+    (row,) = (row for (name, _), row in problem.layout.constants if name == "clock")
+    assert isinstance(row.loss, Gaussian)
+    assert "clock offset" not in {one.model.name for one in list_shown(problem)}
+    one_way = pair_of(flight)
+    assert with_known_clock(one_way) is one_way
+    alone = list_shown(build_problem({(0, 1): one_way}))
+    assert "clock offset" in {one.model.name for one in alone}
 
 
 @pytest.mark.parametrize("shift_s", [0.07, 0.12, -0.3, 3.2])

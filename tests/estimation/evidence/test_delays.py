@@ -10,7 +10,7 @@ from dmrl.estimation.evidence.error_models import Candidate, list_candidates
 from dmrl.estimation.flight.pairs import estimate_pairs
 from dmrl.estimation.model.pair import Pair
 
-from ..flights import flown, pair_of, truth_at
+from ..flights import both_ranging, flown, pair_of, truth_at
 
 MODELS = {
     row.name: one
@@ -81,6 +81,20 @@ def test_long_delays_are_moved_and_named_once() -> None:
     assert rmse_m[1] < 0.6 * rmse_m[0]
     assert [cause.name for cause in found.causes if cause.robot == 1] == ["flow late"]
     assert [cause.name for cause in other.causes if cause.robot == 0] == ["flow late"]
+
+
+@pytest.mark.heavy
+def test_late_ranges_of_both_robots_are_no_offset_of_a_clock() -> None:
+    flight = flown("in_view", "calibrated", 1003, 60.0)
+    sound = both_ranging(flight)
+    late = move_signal(sound, Delay("range_delay", MODELS["range_delay"], -0.3))
+    ((plain, _),), ((found, _),) = estimate_pairs([sound]), estimate_pairs([late])
+    rmse_m = [
+        np.sqrt(np.square(one.state[:, :2] - truth_at(flight, one.time_s)).sum(axis=1).mean())
+        for one in (plain, found)
+    ]
+    assert rmse_m[1] < 1.2 * rmse_m[0]
+    assert [cause.name for cause in found.causes] == ["range late"]
 
 
 @pytest.mark.heavy

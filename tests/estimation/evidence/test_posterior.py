@@ -46,7 +46,7 @@ def test_only_motion_shows_a_scale_of_the_flow(
     trajectory: Trajectory, shown: set[int | None]
 ) -> None:
     problem = build_problem({(0, 1): pair_of(flown(trajectory, "calibrated", 1000, 20.0))})
-    listed = posterior._list_shown(problem)
+    listed = posterior.list_shown(problem)
     scales = {one.robot for one in listed if any(row.motion_scale for row in one.model.rows)}
     assert scales == shown
     assert Candidate(MODELS[0], 0) in listed
@@ -56,7 +56,7 @@ def test_rounded_ranges_do_not_show_jumps() -> None:
     pair = pair_of(flown("in_view", "calibrated", 1000, 20.0))
     for unit_m, shown in ((0.01, True), (0.4, False)):
         rounded = replace(pair, range_m=np.round(pair.range_m / unit_m).clip(1) * unit_m)
-        listed = posterior._list_shown(build_problem({(0, 1): rounded}))
+        listed = posterior.list_shown(build_problem({(0, 1): rounded}))
         assert any(one.model.sudden for one in listed) == shown
 
 
