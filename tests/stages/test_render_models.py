@@ -10,7 +10,7 @@ import pytest
 
 from dmrl.errors import BlenderError, OutputError, SettingError
 from dmrl.geometry.frames import AIDECK, Array
-from dmrl.images.codec import decode
+from dmrl.images.codec import decode, encode_png
 from dmrl.recording import read_table
 from dmrl.render_recording import read_render_settings
 from dmrl.rendering.camera.sensor import Sensor
@@ -44,6 +44,36 @@ def test_an_obj_stands_upright(
         sides = np.ptp(renderer.points, axis=0)
     assert sides[2] == pytest.approx(height_m, abs=1e-6)
     assert sorted(sides) == pytest.approx([0.1, 0.2, 0.3], abs=1e-6)
+
+
+def _write_textured(folder: Path, texture: str) -> Path:
+    """Write a cube, one half of each face red and the other blue, and return its path."""
+    halves = np.zeros((8, 8, 3), np.uint8)
+    halves[:, :4, 0] = halves[:, 4:, 2] = 255
+    (folder / "halves.png").write_bytes(encode_png(halves))
+    (folder / "cube.mtl").write_text(f"newmtl halves\nKd 1 1 1\nmap_Kd {texture}\n")
+    at = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl halves\n"
+    faces = [line.split()[1:] for line in CUBE.splitlines() if line.startswith("f")]
+    rows = [" ".join(f"{corner}/{k}" for k, corner in enumerate(face, 1)) for face in faces]
+    points = "mtllib cube.mtl\n" + CUBE.split("f", 1)[0]
+    path = folder / "cube.obj"
+    path.write_text(points + at + "".join(f"f {row}\n" for row in rows))
+    return path
+
+
+@pytest.mark.heavy
+def test_a_texture_keeps_its_place_and_a_missing_one_is_named(
+    blender: Path, tmp_path: Path
+) -> None:
+    path = _write_textured(tmp_path, "halves.png")
+    with Renderer(blender, RobotModel(path, 0.1), workers=1, samples=4) as renderer:
+        sides = [side.rgb.astype(int) for side in render_sides(renderer, crazyflie.CRAZYFLIE)]
+    for rgb in sides:
+        red, _, blue = np.moveaxis(rgb, 2, 0)
+        assert min((red > blue + 50).sum(), (blue > red + 50).sum()) > 1_000
+    path = _write_textured(tmp_path, "gone.png")
+    with pytest.raises(BlenderError, match=r"cube\.obj .*: its texture gone\.png is missing"):
+        run(tmp_path / "out.mcap", Settings(images=1, model=path, scale=0.1, workers=1))
 
 
 @pytest.mark.heavy

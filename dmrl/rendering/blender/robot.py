@@ -38,6 +38,7 @@ def build_mesh(head, arrays):
 def load_mesh(path, scale, up, *, boxed):
     """Load the user's model as one mesh, centred on its bounding box or on the file's origin."""
     meshes = _extract_meshes(path)
+    _require_textures(meshes)
     robot = bpy.data.meshes.new("robot")
     corners, faces, indices, start = [], [], [], 0
     for mesh, matrix in meshes:
@@ -58,8 +59,39 @@ def load_mesh(path, scale, up, *, boxed):
         points -= (points.min(axis=0) + points.max(axis=0)) / 2
     robot.from_pydata(points.tolist(), [], faces)
     robot.polygons.foreach_set("material_index", np.array(indices, np.int32))
+    _copy_texture_coordinates([mesh for mesh, _ in meshes], robot)
     robot.update()
     return robot
+
+
+def _copy_texture_coordinates(meshes, robot):
+    """Copy the coordinates of every triangle's corners, by name; a mesh without it gives its own.
+
+    Materials find coordinates by name, or take the first.
+    """
+    names = list(dict.fromkeys(layer.name for mesh in meshes for layer in mesh.uv_layers))
+    for name in names:
+        parts = []
+        for mesh in meshes:
+            corners = [corner for t in mesh.loop_triangles for corner in t.loops]
+            layer = mesh.uv_layers.get(name) or mesh.uv_layers.active
+            given = np.zeros((len(mesh.loops), 2), np.float32)
+            if layer is not None:
+                layer.data.foreach_get("uv", given.ravel())
+            parts.append(given[corners])
+        target = robot.uv_layers.new(name=name)
+        target.data.foreach_set("uv", np.concatenate(parts).ravel())
+
+
+def _require_textures(meshes):
+    """Raise ValueError if a texture is missing: Blender paints such surfaces magenta."""
+    materials = {material for mesh, _ in meshes for material in mesh.materials if material}
+    for material in sorted(materials, key=lambda material: material.name):
+        for node in material.node_tree.nodes if material.node_tree else ():
+            image = getattr(node, "image", None)
+            used = any(output.is_linked for output in node.outputs)
+            if used and image is not None and image.source == "FILE" and not all(image.size):
+                raise ValueError(f"its texture {image.name} is missing")
 
 
 def _rotate_upright(points, kind, up):
