@@ -134,6 +134,8 @@ def write_detections(
     options: DetectionOptions,
     batch_size: int,
     rates: dict[str, Any] | None,
+    *,
+    magnify: bool = False,
 ) -> tuple[int, int]:
     """Copy a recording with the detections in every image.
 
@@ -149,6 +151,8 @@ def write_detections(
         Most images that go through the network together.
     rates
         The model's rates, as of `read_rates`.
+    magnify
+        Whether it sees the middle of every second image of a camera, magnified.
 
     Returns
     -------
@@ -158,7 +162,7 @@ def write_detections(
     held = LoadedRecording(recording)
     replaced = [t for t in held.topics if any(topics.parse_topic(own, t) for own in OUTPUT_TOPICS)]
     tally = Counter[str]()
-    found = _iter_messages(held, detector, options, batch_size, tally, rates)
+    found = _iter_messages(held, detector, options, batch_size, tally, rates, magnify)
     rewrite(recording, out, origin, without=replaced, fresh=[found])
     return tally["images"], tally["believed"]
 
@@ -170,6 +174,7 @@ def _iter_messages(
     batch_size: int,
     tally: Counter[str],
     rates: dict[str, Any] | None,
+    magnify: bool,
 ) -> Iterator[Sample]:
     """Yield Detections and GridMap of every image, and count them on the way."""
     images = [t for t in held.topics if topics.parse_topic(topics.CAMERA_IMAGE, t)]
@@ -177,11 +182,14 @@ def _iter_messages(
     raws = track(read_raw(held.path, *images), "Predicting", total)
     misfits: list[SettingError] = []
     batches = _iter_batches(raws, batch_size, detector, held.path, misfits)
+    count = Counter[str]()  # images of each camera
     for decoded in map_ahead(_decode_batch, batches, threads=1, max_waiting=1):
         batch = list(_iter_usable(decoded))
         tally["images"] += len(batch)
         raw_messages = iter(batch)
-        for found, grids in detect_images([rgb for _, rgb in batch], detector, options):
+        magnified = [magnify and _is_second(raw.topic, count) for raw, _ in batch]
+        pixels = [rgb for _, rgb in batch]
+        for found, grids in detect_images(pixels, detector, options, magnified):
             for k in range(len(found.count)):
                 raw, _ = next(raw_messages)
                 fields = detection_fields(found, k, detector.threshold, rates)
@@ -197,6 +205,12 @@ def _iter_messages(
         raise misfits[0]
     if total and not tally["images"]:
         raise RecordingError(f"{held.path}: no image can be decoded. Restore the recording")
+
+
+def _is_second(camera: str, count: Counter[str]) -> bool:
+    """Return whether an image of a camera is the second of two, and count it."""
+    count[camera] += 1
+    return count[camera] % 2 == 0
 
 
 def _iter_batches(

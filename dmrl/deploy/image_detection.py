@@ -1,6 +1,6 @@
 """Detect robots in images, over several views of each."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
@@ -8,6 +8,7 @@ from itertools import groupby
 import numpy as np
 
 from dmrl.deploy.detector import Detector
+from dmrl.deploy.middle_look import magnify_middle, map_detections, map_grids
 from dmrl.images.codec import Rgb
 from dmrl.learn.inference.decode_grids import Detections, Grids
 from dmrl.learn.inference.decode_grids import decode as find
@@ -24,7 +25,10 @@ class DetectionOptions:
 
 
 def detect_images(
-    images: Iterable[Rgb], detector: Detector, options: DetectionOptions
+    images: Sequence[Rgb],
+    detector: Detector,
+    options: DetectionOptions,
+    magnified: Sequence[bool] | None = None,
 ) -> Iterator[tuple[Detections, Grids]]:
     """Yield the detections and grids of each run of images of one size.
 
@@ -36,11 +40,22 @@ def detect_images(
         The opened model.
     options
         Limits on the detections, and the number of views.
+    magnified
+        Whether the model sees the middle of each image alone, magnified. None: no image's.
     """
-    for _, same_size in groupby(images, key=np.shape):
-        group = list(same_size)
+    flags = [False] * len(images) if magnified is None else magnified
+    for _, same_size in groupby(zip(images, flags, strict=True), key=lambda one: one[0].shape):
+        pairs = list(same_size)
+        group = [magnify_middle(image) if large else image for image, large in pairs]
         grids = detector.grids(group)
-        yield _merge_views(group, grids, detector, options), grids
+        found = _merge_views(group, grids, detector, options)
+        if any(large := np.array([flag for _, flag in pairs])):
+            height_px, width_px = group[0].shape[:2]
+            found, grids = (
+                map_detections(found, large, (width_px, height_px)),
+                map_grids(grids, large),
+            )
+        yield found, grids
 
 
 def _merge_views(

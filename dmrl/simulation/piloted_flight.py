@@ -308,8 +308,9 @@ def open_eyes(settings: "FlySettings") -> tuple[list[Eye | None], "FlySettings",
     detector.require_size(*size_px, "the flight's camera")
     libraries += [name for name in BACKEND_PACKAGES[backend] if name not in libraries]
     made = build_provenance("fly", settings, [model], seed=settings.seed, libraries=libraries)
-    look = NetworkEye(detector, DetectionOptions(MIN_CONFIDENCE, MOST, 1), read_rates(model))
-    return [look for _ in numbers], settings, describe_weights(made, model, detector)
+    options, rates = DetectionOptions(MIN_CONFIDENCE, MOST, 1), read_rates(model)
+    looks = [NetworkEye(detector, options, rates, magnify=settings.vision.magnify) for _ in numbers]
+    return looks, settings, describe_weights(made, model, detector)
 
 
 MIN_CONFIDENCE, MOST = 0.01, 20

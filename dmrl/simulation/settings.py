@@ -128,6 +128,8 @@ class Vision:
         Share of the images in which an ideal eye misses a peer, 0 to 1.
     miss_burst_s
         Mean duration of the misses. 0: each image for itself.
+    magnify
+        A network sees the middle of every second image, 3/2 times as large.
     """
 
     delay_images: Annotated[int, Parameter(validator=validators.Number(gte=0, lte=10))] = 1
@@ -137,6 +139,7 @@ class Vision:
     depth_std_ratio: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))] = 0.1
     miss_share: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=1))] = 0.0
     miss_burst_s: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 0.0
+    magnify: bool = True
 
 
 @dataclass(frozen=True, slots=True)

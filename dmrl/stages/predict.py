@@ -40,6 +40,9 @@ class Settings:
         Look at every image so many times, 1 to 12, mirrored and shifted by parts of a cell, and
         take the medians. For dmrl label --detections: errors a quarter smaller, and so many times
         the work. Maps are of the first.
+    magnify
+        See only the middle of every second image of a camera, 3/2 times as large, as the pilots of
+        dmrl fly do.
     batch_size
         Images that go through the network together.
     strict
@@ -52,6 +55,7 @@ class Settings:
     min_confidence: Share = 0.01
     most: Count = 20
     views: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=len(TTA_VIEWS)))] = 1
+    magnify: bool = False
     batch_size: Count = 16
     strict: Strict = False
 
@@ -101,9 +105,17 @@ def run(model: Model, recording: In, out: Path, settings: Settings) -> Result:
     warn_about_lens(model, recording)
     options = DetectionOptions(settings.min_confidence, settings.most, settings.views)
     rates = read_model_rates(model)
-    return Result(
-        *write_detections(recording, out, made, detector, options, settings.batch_size, rates)
+    found = write_detections(
+        recording,
+        out,
+        made,
+        detector,
+        options,
+        settings.batch_size,
+        rates,
+        magnify=settings.magnify,
     )
+    return Result(*found)
 
 
 def origin(model: Path, recording: Path, settings: Settings) -> "Provenance":

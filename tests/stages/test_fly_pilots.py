@@ -115,7 +115,8 @@ def test_flight_is_reproduced_from_its_recorded_recipe(seen: Path, tmp_path: Pat
 
 def test_predict_and_track_reproduce_onboard_results(seen: Path, tmp_path: Path) -> None:
     backend = read_summary(seen).provenance.settings["backend"]
-    predict.run(Path("dmrl-nano"), seen, tmp_path / "found.mcap", predict.Settings(backend=backend))
+    settings = predict.Settings(backend=backend, magnify=True)
+    predict.run(Path("dmrl-nano"), seen, tmp_path / "found.mcap", settings)
     track.run(seen, tmp_path / "tracks.mcap", track.Settings())
     flown, again = (
         [

@@ -557,3 +557,28 @@ int ${prefix}_run(${params}, const uint8_t *image, ${prefix}_detection_t *found,
     return ${prefix}_detect(net, found, most);
 }
 
+#if !${PREFIX}_BAYER
+void ${prefix}_middle_row(const uint8_t *image, int row, uint8_t *out)
+{
+    const int32_t y = ${PREFIX}_HEIGHT - 1 + 4 * row, below = y % 6;
+    const uint8_t *const line = image + y / 6 * ${PREFIX}_ROW_BYTES;
+    for (int k = 0; k < ${PREFIX}_ROW_BYTES; k++) {
+        const int32_t x = ${PREFIX}_WIDTH - 1 + 4 * (k / ${PREFIX}_CHANNELS), right = x % 6;
+        const uint8_t *const a = line + x / 6 * ${PREFIX}_CHANNELS + k % ${PREFIX}_CHANNELS;
+        const uint8_t *const b = a + ${PREFIX}_ROW_BYTES;
+        const int32_t left_sum = (6 - below) * a[0] + below * b[0];
+        const int32_t right_sum = (6 - below) * a[${PREFIX}_CHANNELS] + below * b[${PREFIX}_CHANNELS];
+        out[k] = (uint8_t)(((6 - right) * left_sum + right * right_sum + 18) / 36);
+    }
+}
+
+void ${prefix}_from_middle(${prefix}_detection_t *found, int count)
+{
+    for (int k = 0; k < count; k++) {
+        const int32_t depth_mm = (3 * found[k].depth_mm + 1) / 2;
+        found[k].u_q4 = (8 * ${PREFIX}_WIDTH + 2 * found[k].u_q4 + 1) / 3;
+        found[k].v_q4 = (8 * ${PREFIX}_HEIGHT + 2 * found[k].v_q4 + 1) / 3;
+        found[k].depth_mm = (uint16_t)smallest(depth_mm, UINT16_MAX);
+    }
+}
+#endif

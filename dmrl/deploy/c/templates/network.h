@@ -132,6 +132,16 @@ int32_t ${prefix}_meaning(int head, int8_t value);
 /* Runs init, all rows and detect on an image of ${PREFIX}_IMAGE_BYTES bytes, from the top left. */
 int ${prefix}_run(${params}, const uint8_t *image, ${prefix}_detection_t *found, int most);
 
+#if !${PREFIX}_BAYER
+/* Writes a row of the middle of an image, 3/2 times as large: ${PREFIX}_ROW_BYTES bytes. The network
+ * detects robots in it that are too small in the whole image. The pilots of `dmrl fly` use it for
+ * every second image. */
+void ${prefix}_middle_row(const uint8_t *image, int row, uint8_t *out);
+
+/* Maps detections in such a middle to the image. */
+void ${prefix}_from_middle(${prefix}_detection_t *found, int count);
+#endif
+
 #ifdef __cplusplus
 }
 #endif
