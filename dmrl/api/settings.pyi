@@ -26,6 +26,7 @@ class PredictSettings(TypedDict, total=False):
     min_confidence: float
     most: int
     views: int
+    magnify: bool
     batch_size: int
     strict: bool
 

@@ -27,7 +27,8 @@ def magnify_middle(image: Rgb) -> Rgb:
     down, right, wide = down[:, None, None], right[:, None], image.astype(np.uint16)
     rows = (6 - down) * wide[above] + down * wide[above + 1]
     sums = (6 - right) * rows[:, left] + right * rows[:, left + 1]
-    return ((sums + 18) // 36).astype(np.uint8)
+    middle: Rgb = ((sums + 18) // 36).astype(np.uint8)
+    return middle
 
 
 def map_detections(
