@@ -309,7 +309,10 @@ def open_eyes(settings: "FlySettings") -> tuple[list[Eye | None], "FlySettings",
     libraries += [name for name in BACKEND_PACKAGES[backend] if name not in libraries]
     made = build_provenance("fly", settings, [model], seed=settings.seed, libraries=libraries)
     options, rates = DetectionOptions(MIN_CONFIDENCE, MOST, 1), read_rates(model)
-    looks = [NetworkEye(detector, options, rates, magnify=settings.vision.magnify) for _ in numbers]
+    magnify = settings.vision.magnify
+    looks: list[Eye | None] = [
+        NetworkEye(detector, options, rates, magnify=magnify) for _ in numbers
+    ]
     return looks, settings, describe_weights(made, model, detector)
 
 
