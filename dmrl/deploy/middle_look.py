@@ -4,8 +4,6 @@ A network of stride 8 hardly sees robots of few pixels. The middle of the image,
 is an image of the same size for the same network. Integers only: the exported C computes the same.
 """
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +11,12 @@ from dmrl.images.codec import Rgb
 from dmrl.learn.inference.decode_grids import Detections, Grids
 
 MAGNIFICATION = 1.5
+NEAREST_M = 0.4
+"""Nearest robot that a middle tells, metres; the whole images tell of nearer ones.
+
+Chosen on flights of ``fly_follow`` (seeds 100 to 115): of 1,676 nearer detections in middles 2 % were
+right, of those of confidence 0.3 to 0.7 7 %.
+"""
 
 
 def magnify_middle(image: Rgb) -> Rgb:
@@ -34,7 +38,7 @@ def magnify_middle(image: Rgb) -> Rgb:
 def map_detections(
     found: Detections, magnified: NDArray[np.bool_], size_px: tuple[int, int]
 ) -> Detections:
-    """Map detections in magnified middles to their images.
+    """Map detections in magnified middles to their images; leave out those within `NEAREST_M`.
 
     Parameters
     ----------
@@ -46,13 +50,20 @@ def map_detections(
         Width and height of the images.
     """
     shrink = np.where(magnified, 1 / MAGNIFICATION, 1.0)[:, None]
-    return replace(
-        found,
-        u_px=(1 - shrink) / 2 * size_px[0] + shrink * found.u_px,
-        v_px=(1 - shrink) / 2 * size_px[1] + shrink * found.v_px,
-        depth_m=found.depth_m / shrink,
-        sigma_depth_m=found.sigma_depth_m / shrink,
-    )
+    depth_m = found.depth_m / shrink
+    known = np.arange(depth_m.shape[1]) < found.count[:, None]
+    kept = known & ~(magnified[:, None] & (depth_m < NEAREST_M))
+    columns = {
+        "u_px": (1 - shrink) / 2 * size_px[0] + shrink * found.u_px,
+        "v_px": (1 - shrink) / 2 * size_px[1] + shrink * found.v_px,
+        "depth_m": depth_m,
+        "sigma_depth_m": found.sigma_depth_m / shrink,
+        "confidence": np.where(kept, found.confidence, 0.0),
+        "class_id": found.class_id,
+    }
+    order = np.argsort(~kept, axis=1, kind="stable")
+    sorted_columns = {k: np.take_along_axis(one, order, axis=1) for k, one in columns.items()}
+    return Detections(**sorted_columns, count=np.maximum(kept.sum(axis=1), 1))
 
 
 def map_grids(grids: Grids, magnified: NDArray[np.bool_]) -> Grids:

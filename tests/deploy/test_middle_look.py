@@ -49,6 +49,19 @@ def test_detections_return_to_their_place_in_the_image() -> None:
     np.testing.assert_array_equal(same.depth_m, found.depth_m)
 
 
+def test_near_detections_of_a_middle_are_left_out() -> None:
+    found = detect((20.0, 20.0, 0.2, 0.9), (30.0, 30.0, 0.6, 0.5), (40.0, 40.0, 0.1, 0.3))
+    seen = map_detections(found, np.array([True]), SIZE_PX)
+    assert seen.count.tolist() == [1]
+    assert (seen.confidence[0, 0], seen.depth_m[0, 0]) == (0.5, pytest.approx(0.9))
+    assert seen.confidence[0, 1:].tolist() == [0.0, 0.0]
+    assert map_detections(found, np.array([False]), SIZE_PX).count.tolist() == [3]
+    (nothing,) = map_detections(
+        detect((20.0, 20.0, 0.2, 0.9)), np.array([True]), SIZE_PX
+    ).confidence
+    assert nothing.tolist() == [0.0]  # an image has one detection at least
+
+
 def test_a_peak_of_the_middle_is_in_the_cell_of_its_detection() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
@@ -114,15 +127,16 @@ def test_the_c_magnifies_and_maps_alike(channels: int, tmp_path: Path) -> None:
             ("confidence_step", ctypes.c_int8),
         ]
 
-    rows = [(0, 16 * high, 65535), (16 * wide, 0, 333), (5, 77, 1200)]
-    found = (Found * 3)(*(Found(*row, 0, 0) for row in rows))
-    code.random_from_middle(found, 3)
+    rows = [(0, 16 * high, 65535), (9, 9, 260), (16 * wide, 0, 333), (5, 77, 1200)]
+    found = (Found * 4)(*(Found(*row, 0, 0) for row in rows))
+    assert code.random_from_middle(found, 4) == 3
     wanted = map_detections(
         detect(*((u / 16, v / 16, d / 1000, 0.5) for u, v, d in rows)),
         np.array([True]),
         (wide, high),
     )
-    for k, one in enumerate(found):
+    assert wanted.count.tolist() == [3]
+    for k, one in enumerate(found[:3]):
         assert one.u_q4 / 16 == pytest.approx(wanted.u_px[0, k], abs=0.03)
         assert one.v_q4 / 16 == pytest.approx(wanted.v_px[0, k], abs=0.03)
         assert one.depth_mm / 1000 == pytest.approx(min(wanted.depth_m[0, k], 65.535), abs=6e-4)

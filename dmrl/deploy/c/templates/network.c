@@ -572,13 +572,19 @@ void ${prefix}_middle_row(const uint8_t *image, int row, uint8_t *out)
     }
 }
 
-void ${prefix}_from_middle(${prefix}_detection_t *found, int count)
+int ${prefix}_from_middle(${prefix}_detection_t *found, int count)
 {
+    int left = 0;
     for (int k = 0; k < count; k++) {
         const int32_t depth_mm = (3 * found[k].depth_mm + 1) / 2;
-        found[k].u_q4 = (8 * ${PREFIX}_WIDTH + 2 * found[k].u_q4 + 1) / 3;
-        found[k].v_q4 = (8 * ${PREFIX}_HEIGHT + 2 * found[k].v_q4 + 1) / 3;
-        found[k].depth_mm = (uint16_t)smallest(depth_mm, UINT16_MAX);
+        if (depth_mm < 400)
+            continue;
+        found[left] = found[k];
+        found[left].u_q4 = (8 * ${PREFIX}_WIDTH + 2 * found[k].u_q4 + 1) / 3;
+        found[left].v_q4 = (8 * ${PREFIX}_HEIGHT + 2 * found[k].v_q4 + 1) / 3;
+        found[left].depth_mm = (uint16_t)smallest(depth_mm, UINT16_MAX);
+        left++;
     }
+    return left;
 }
 #endif

@@ -138,8 +138,9 @@ int ${prefix}_run(${params}, const uint8_t *image, ${prefix}_detection_t *found,
  * every second image. */
 void ${prefix}_middle_row(const uint8_t *image, int row, uint8_t *out);
 
-/* Maps detections in such a middle to the image. */
-void ${prefix}_from_middle(${prefix}_detection_t *found, int count);
+/* Maps detections in such a middle to the image, and leaves out those nearer than 0.4 m, which are
+ * mostly false there. Returns how many are left. */
+int ${prefix}_from_middle(${prefix}_detection_t *found, int count);
 #endif
 
 #ifdef __cplusplus
