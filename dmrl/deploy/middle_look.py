@@ -14,8 +14,8 @@ MAGNIFICATION = 1.5
 NEAREST_M = 0.4
 """Nearest robot that a middle tells, metres; the whole images tell of nearer ones.
 
-Chosen on flights of ``fly_follow`` (seeds 100 to 115): of 1,676 nearer detections in middles 2 % were
-right, of those of confidence 0.3 to 0.7 7 %.
+Chosen on flights of ``fly_follow`` (seeds 100 to 115): of 1,676 nearer detections in middles 2 %
+were right, of those of confidence 0.3 to 0.7 7 %.
 """
 
 

@@ -215,7 +215,9 @@ PILOT_SETTINGS = ("flown", "distance_m", "eye", "backend", "vision")
 SCRIPT_SETTINGS = ("cameras_max", "yaw_spread_rad")
 """Settings that flights of a pilot do not use."""
 LINK_SETTINGS = ("delay_images", "lost_share", "lost_images")
-"""Settings of ``vision`` that all eyes with a camera use; an ideal eye uses the others, too."""
+"""Settings of ``vision`` that all eyes with a camera use."""
+NETWORK_SETTINGS = ("magnify",)
+"""Settings of ``vision`` that networks use; an ideal eye uses the others."""
 
 
 def _iter_idle(settings: FlySettings) -> Iterator[tuple[str, str]]:
@@ -229,11 +231,13 @@ def _iter_idle(settings: FlySettings) -> Iterator[tuple[str, str]]:
     eye = str(settings.eye)
     if eye in NAMED_EYES:
         yield from _iter_given(settings, ("backend",), f"with --eye {eye}. Leave it out")
-    if eye != "ideal":
-        keys = [one.name for one in fields(Vision)]
-        keys = keys if eye == "truth" else [key for key in keys if key not in LINK_SETTINGS]
-        for key, why in _iter_given(settings.vision, keys, f"with --eye {eye}. Leave it out"):
-            yield f"vision.{key}", why
+    used = {
+        "truth": (),
+        "ideal": [one.name for one in fields(Vision) if one.name not in NETWORK_SETTINGS],
+    }.get(eye, (*LINK_SETTINGS, *NETWORK_SETTINGS))
+    idle = [one.name for one in fields(Vision) if one.name not in used]
+    for key, why in _iter_given(settings.vision, idle, f"with --eye {eye}. Leave it out"):
+        yield f"vision.{key}", why
 
 
 def _iter_given(

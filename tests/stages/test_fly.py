@@ -219,6 +219,7 @@ def test_bad_settings_leave_no_file(tmp_path: Path) -> None:
         ({"cameras_max": 1}, "cameras_max has no effect with a pilot"),
         ({"yaw_spread_rad": 1.0}, "yaw_spread_rad has no effect with a pilot"),
         ({"vision": Vision(miss_share=0.1), "eye": Path("m")}, "vision.miss_share has no effect"),
+        ({"vision": Vision(magnify=False), "eye": "ideal"}, "vision.magnify has no effect"),
         ({"vision": Vision(delay_images=2), "eye": "truth"}, "vision.delay_images has no effect"),
         ({"flown": 2}, "--pilot follow flies all robots and has no leader"),
     ],
