@@ -49,7 +49,7 @@ def find_calibration_fault(
 
 
 def doubt_focal_length(width_px: int, fx_px: float) -> str:
-    """Return what is doubtful in a focal length, such as its unit, or an empty text."""
+    """Return a doubt about a focal length, such as about its unit, or an empty text."""
     if FOCAL_SHARES[0] <= fx_px / width_px <= FOCAL_SHARES[1]:
         return ""
     found = f"has a focal length of {fx_px:.3g} px for images {width_px} px wide"

@@ -140,7 +140,7 @@ def find_clock_shift(pair: Pair) -> ClockShift | None:
 
 
 def with_known_clock(pair: Pair) -> Pair:
-    """Return a pair with what the ranges of both robots tell about its clocks, after all shifts.
+    """Return a pair with the clock's standard deviation by the ranges of both robots.
 
     An offset that is too small for a shift stays, so the standard deviation contains it.
 

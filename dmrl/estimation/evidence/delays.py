@@ -2,7 +2,7 @@
 
 An error model of a delay is linear: a delayed motion is the motion less its derivative times the
 delay. That holds for a part of the time in which the motion changes. Where a longer delay is
-probable, the signal is moved by the estimate, and the flight is solved again. What is left of the
+probable, the signal is moved by the estimate, and the flight is solved again. The remaining
 delay is then an unknown of the flight.
 """
 
@@ -61,7 +61,7 @@ def find_delay(
     constants_covariance
         (G, G) covariance of the constants of the best solution.
     late
-        Models of signals that were moved: what is left of their delays need not be sure.
+        Models of signals that were moved: their remaining delays need not be sure.
     """
     best, probable = mixture.members[0], mixture.probabilities()
     for model in (*late, *best.models):

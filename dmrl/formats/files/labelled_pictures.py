@@ -218,7 +218,7 @@ def iter_picture_samples(
 
 
 def _doubt_place(row: LabelRow, crop: Crop) -> str:
-    """Return what is doubtful in the place of a label in its picture; empty: nothing."""
+    """Return a doubt about the place of a label in its picture; empty: none."""
     size = crop.from_width_px, crop.from_height_px
     edges = row.box_px or (row.u_px, row.v_px) * 2
     over_px = max(-edges[0], -edges[1], edges[2] - size[0], edges[3] - size[1])

@@ -52,7 +52,7 @@ class MessageContext:
     bits
         Significant bits of 16-bit pixels.
     changes
-        Robots by what was done to their images. The converters add to it.
+        Robots by the change of their images. The converters add to it.
     """
 
     source: Path
@@ -65,7 +65,7 @@ class MessageContext:
     changes: dict[str, set[str]] = field(default_factory=dict)
 
     def report_change(self, change: str) -> None:
-        """Remember what was done to the images of the robot."""
+        """Remember a change of the robot's images."""
         self.changes.setdefault(change, set()).add(self.robot)
 
 
