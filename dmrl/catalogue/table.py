@@ -149,9 +149,10 @@ def open_catalogue(folder: Path, *, new: bool = False) -> Catalogue:
             return Catalogue(folder, to_table([]))
         raise RecordingError(f"{folder} has no catalogue. Make it: dmrl index {folder}")
     try:
-        # By a stream: Arrow cannot open a path that is no text.
+        # By a stream: Arrow cannot open a path that is no text. In this thread: a thread of Arrow
+        # that frees bytes of Python while the process ends would abort it.
         with MemoryLimit(file.stat().st_size), file.open("rb") as stream:
-            table = pq.read_table(stream)
+            table = pq.ParquetFile(stream, pre_buffer=False).read(use_threads=False)
             table.validate(full=True)
         _check_table(table)
     except (pa.ArrowException, OSError, ValueError, MemoryError) as e:

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -82,6 +84,19 @@ def test_catalogue_row_describes_its_recording(flights: Path) -> None:
     assert row["stage"] == "label" and row["inputs"] == [{"name": "raw.mcap", "sha256": "0" * 64}]
     assert row["errors"] == 0 and row["warnings"] == len(row["findings"])
     assert "cut short" in rows["torn.mcap"]["error"] and rows["torn.mcap"]["messages"] is None
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads are not listed")
+def test_a_catalogue_is_read_without_a_thread_that_could_outlive_python(flights: Path) -> None:
+    index.update(flights)
+    code = (
+        "import os, sys, pathlib, pyarrow.parquet\n"
+        "from dmrl.catalogue import open_catalogue\n"
+        "count = lambda: len(os.listdir('/proc/self/task'))\n"
+        "before = count(); open_catalogue(pathlib.Path(sys.argv[1])); print(count() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, flights], capture_output=True, check=True)
+    assert done.stdout == b"0\n"
 
 
 def test_queries_filter_by_recording_camera_and_labels(flights: Path) -> None:
