@@ -72,6 +72,7 @@ REASONS = {
     "formats/files/yolo.py: place": "only read, and without '..'",
     "formats/aideck/chip_outputs.py: f'{name}{number}.ppm'": READ,
     "formats/files/flight_csv.py: log.robot": LISTED,
+    "formats/ros/reader.py: f'{path.name}-wal'": LISTED,
     "formats/published/locanet.py: name": READ,
     "formats/aideck/nanocockpit.py: f'{stem}{suffix}'": READ,
     "formats/aideck/nanocockpit.py: folder": OURS,

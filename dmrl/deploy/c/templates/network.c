@@ -579,7 +579,8 @@ int ${prefix}_from_middle(${prefix}_detection_t *found, int count)
         const int32_t depth_mm = (3 * found[k].depth_mm + 1) / 2;
         if (depth_mm < 400)
             continue;
-        found[left] = found[k];
+        found[left].confidence = found[k].confidence; /* a copy of the whole would call memcpy */
+        found[left].confidence_step = found[k].confidence_step;
         found[left].u_q4 = (8 * ${PREFIX}_WIDTH + 2 * found[k].u_q4 + 1) / 3;
         found[left].v_q4 = (8 * ${PREFIX}_HEIGHT + 2 * found[k].v_q4 + 1) / 3;
         found[left].depth_mm = (uint16_t)smallest(depth_mm, UINT16_MAX);
