@@ -134,8 +134,6 @@ def write_detections(
     options: DetectionOptions,
     batch_size: int,
     rates: dict[str, Any] | None,
-    *,
-    magnify: bool = False,
 ) -> tuple[int, int]:
     """Copy a recording with the detections in every image.
 
@@ -151,8 +149,6 @@ def write_detections(
         Most images that go through the network together.
     rates
         The model's rates, as of `read_rates`.
-    magnify
-        Whether it sees the middle of every second image of a camera, magnified.
 
     Returns
     -------
@@ -162,7 +158,7 @@ def write_detections(
     held = LoadedRecording(recording)
     replaced = [t for t in held.topics if any(topics.parse_topic(own, t) for own in OUTPUT_TOPICS)]
     tally = Counter[str]()
-    found = _iter_messages(held, detector, options, batch_size, tally, rates, magnify)
+    found = _iter_messages(held, detector, options, batch_size, tally, rates)
     rewrite(recording, out, origin, without=replaced, fresh=[found])
     return tally["images"], tally["believed"]
 
@@ -174,7 +170,6 @@ def _iter_messages(
     batch_size: int,
     tally: Counter[str],
     rates: dict[str, Any] | None,
-    magnify: bool,
 ) -> Iterator[Sample]:
     """Yield Detections and GridMap of every image, and count them on the way."""
     images = [t for t in held.topics if topics.parse_topic(topics.CAMERA_IMAGE, t)]
@@ -187,7 +182,7 @@ def _iter_messages(
         batch = list(_iter_usable(decoded))
         tally["images"] += len(batch)
         raw_messages = iter(batch)
-        magnified = [magnify and _is_second(raw.topic, count) for raw, _ in batch]
+        magnified = [options.magnify and _is_second(raw.topic, count) for raw, _ in batch]
         pixels = [rgb for _, rgb in batch]
         for found, grids in detect_images(pixels, detector, options, magnified):
             for k in range(len(found.count)):

@@ -17,11 +17,15 @@ from dmrl.learn.inference.tta import TTA_VIEWS, apply_view, merge_views, undo_vi
 
 @dataclass(frozen=True, slots=True)
 class DetectionOptions:
-    """Options of the detection; see ``dmrl.stages.predict.Settings``."""
+    """Options of the detection; see ``dmrl.stages.predict.Settings``.
+
+    With ``magnify``, the caller says which images are magnified: every second one of a camera.
+    """
 
     min_confidence: float
     most: int
     views: int
+    magnify: bool = False
 
 
 def detect_images(

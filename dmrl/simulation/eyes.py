@@ -89,7 +89,7 @@ class IdealEye:
 
 
 class NetworkEye:
-    """Eye that runs a network on every image, on every second one on its magnified middle.
+    """Eye that runs a network on every image; if it magnifies, on the middle of every second one.
 
     A follower has its leader near the middle of the image. There the network detects it at
     distances at which it is too small in the whole image; and few false detections are in both.
@@ -99,28 +99,21 @@ class NetworkEye:
     detector
         The opened model.
     options
-        Limits on the detections.
+        Limits on the detections, and whether it magnifies.
     rates
         Rates of the model; None: unknown.
-    magnify
-        Whether it magnifies; otherwise it sees every image whole.
     """
 
     def __init__(
-        self,
-        detector: Detector,
-        options: DetectionOptions,
-        rates: dict[str, Any] | None,
-        *,
-        magnify: bool = True,
+        self, detector: Detector, options: DetectionOptions, rates: dict[str, Any] | None
     ) -> None:
         self._detector, self._options, self._rates = detector, options, rates
-        self._magnify, self._images = magnify, 0
+        self._images = 0
 
     def __call__(self, view: CameraView, time_s: float, rgb: Rgb | None) -> Look:
         """Return the detections in an image, and the grids."""
         assert rgb is not None, "a network needs images"
-        magnified = self._magnify and self._images % 2 == 1
+        magnified = self._options.magnify and self._images % 2 == 1
         self._images += 1
         found, grids = next(detect_images([rgb], self._detector, self._options, [magnified]))
         return Look(

@@ -308,11 +308,9 @@ def open_eyes(settings: "FlySettings") -> tuple[list[Eye | None], "FlySettings",
     detector.require_size(*size_px, "the flight's camera")
     libraries += [name for name in BACKEND_PACKAGES[backend] if name not in libraries]
     made = build_provenance("fly", settings, [model], seed=settings.seed, libraries=libraries)
-    options, rates = DetectionOptions(MIN_CONFIDENCE, MOST, 1), read_rates(model)
-    magnify = settings.vision.magnify
-    looks: list[Eye | None] = [
-        NetworkEye(detector, options, rates, magnify=magnify) for _ in numbers
-    ]
+    options = DetectionOptions(MIN_CONFIDENCE, MOST, 1, settings.vision.magnify)
+    rates = read_rates(model)
+    looks: list[Eye | None] = [NetworkEye(detector, options, rates) for _ in numbers]
     return looks, settings, describe_weights(made, model, detector)
 
 

@@ -103,19 +103,13 @@ def run(model: Model, recording: In, out: Path, settings: Settings) -> Result:
 
     settings, detector, made = _open(model, recording, settings)
     warn_about_lens(model, recording)
-    options = DetectionOptions(settings.min_confidence, settings.most, settings.views)
-    rates = read_model_rates(model)
-    found = write_detections(
-        recording,
-        out,
-        made,
-        detector,
-        options,
-        settings.batch_size,
-        rates,
-        magnify=settings.magnify,
+    options = DetectionOptions(
+        settings.min_confidence, settings.most, settings.views, settings.magnify
     )
-    return Result(*found)
+    rates = read_model_rates(model)
+    return Result(
+        *write_detections(recording, out, made, detector, options, settings.batch_size, rates)
+    )
 
 
 def origin(model: Path, recording: Path, settings: Settings) -> "Provenance":

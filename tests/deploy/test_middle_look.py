@@ -93,7 +93,7 @@ def test_an_eye_magnifies_every_second_image(magnify: bool, magnified: list[bool
             confidence[0, 14, 20] = 0.9
             return Grids(confidence, np.ones((1, 28, 40)), None)
 
-    eye = NetworkEye(Detector(), DetectionOptions(0.01, 20, 1), None, magnify=magnify)  # type: ignore[arg-type]
+    eye = NetworkEye(Detector(), DetectionOptions(0.01, 20, 1, magnify), None)  # type: ignore[arg-type]
     depths = [
         eye(None, 0.1 * k, PIXELS).detections["detections"][0]["depth_m"]  # type: ignore[arg-type]
         for k in range(4)
