@@ -58,6 +58,7 @@ RANGE_ROWS = (
         0.3,
         RANGE,
     ),
+    Row("range error by distance", ranges(lambda v, t, g, s, r, k: v + s * v**2), 0.04, RANGE),
     Row("range scale", ranges(lambda v, t, g, s, r, k: v * (1 + s)), 0.1, RANGE),
     Row(
         "range steps",

@@ -37,6 +37,8 @@ REMEDIES = {
     "flow late": LATE,
     "range": "Measure the offset once, and give it with --range-offset-m, or let flights "
     "determine it: dmrl calibrate --sensors",
+    "range error follows distance": "Measure ranges at known distances, and correct them when the "
+    "log is written",
     "range late": LATE,
     "range silent": "Log at least two a second, and fly within reach of the radio",
     "range offset changes": CLEAR_LINE,

@@ -277,7 +277,11 @@ MODELS: tuple[ErrorModel, ...] = (
         (Unknown("range_offset_free", "m", 0.4, "pair", range=longer),),
         log_odds=COMMON,
     ),
-    ErrorModel("range scale", (Unknown("range_scale_free", "1", 0.05, "pair", range_scale=1.0),)),
+    ErrorModel("range scale", (Unknown("range_scale_free", "1", 0.05, "pair", range_power=1),)),
+    ErrorModel(
+        "range error follows distance",
+        (Unknown("range_by_distance", "1/m", 0.03, "pair", range_power=2),),
+    ),
     ErrorModel("range late", (Unknown("range_delay", "s", 0.2, "pair", range=_earlier),)),
     ErrorModel(
         "range offset changes",

@@ -93,7 +93,7 @@ class Layout:
             for row, column, constant in self.of(*owners):
                 if row.owner == "flight" and owners != (both[0],):
                     continue
-                of_range = kind == "range" and (row.range or row.range_scale)
+                of_range = kind == "range" and (row.range or row.range_power)
                 # A camera's own errors are those of the observer.
                 of_bearing = kind == "bearing" and row.bearing and owners == (both[0],)
                 if row.height or of_range or of_bearing:

@@ -217,7 +217,7 @@ def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Valu
     columns = layout.pose(link.robots[0]) + layout.pose(link.robots[1]) + states
     # Keyframes are last in memory, as `NormalEquations.add_rows` adds them.
     out = np.zeros((len(columns) + len(border) + 1, len(distance)))
-    gain, error, heights = 1.0, 0.0, []
+    predicted, gain, heights = distance - padded.range_m, np.ones_like(distance), []
     headings = (values.state[:, layout.pose(k)[2]].take(link.keyframe) for k in link.robots)
     offset = at.offset.T.take(padded.at, axis=1).T
     sights = link.list_sights(distance.take(padded.at), offset, *headings)
@@ -226,21 +226,22 @@ def range_factor(problem: Problem, layout: Layout, link: RangeLink, values: Valu
         value = values.constants[c] if constant else values.state[padded.keyframe, c]
         if row.height:
             heights.append((column, side * row.height))
-        elif row.range_scale:
-            gain = gain + row.range_scale * value
-            out[column] = row.range_scale * distance
+            continue
+        if row.range_power:
+            out[column] = distance**row.range_power
+            gain += row.range_power * value * distance ** (row.range_power - 1)
         elif row.range:
             out[column, padded.at] = row.range(link, sights[side])
-            error = error + out[column] * value
+        predicted += out[column] * value
     for column, share in heights:
         out[column] = (share * gain) * at.up / distance
-    towards *= np.reshape(gain, (-1, 1))
+    towards *= gain[:, None]
     for c, effect in at.by_scale.items():
         out[len(columns) + border.index(c)] = _dot(towards, effect)
     out[0:2], out[3:5] = -towards.T, towards.T
     for column, by_turn in ((2, at.by_own_turn), (5, at.by_peer_turn)):
         out[column] = _dot(towards, by_turn)
-    out[-1] = gain * distance + error - padded.range_m
+    out[-1] = predicted
     out *= padded.weight.ravel() / (problem.noise.range_std_m * padded.std_share)
     rows = out.reshape(len(out), 1, -1, keyframes).T
     return Rows(rows, columns, border, problem.noise.range_loss, padded.weight.T)

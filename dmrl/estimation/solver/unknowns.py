@@ -56,8 +56,8 @@ class Unknown:
         Effect on the measured motion: additive (S, 3), x and y in metres and turn in radians.
     motion_scale
         Scale effect on the measured shift: (2,) factors of x and y.
-    range, range_scale
-        Additive (R,) and scale (scalar) effect on a range.
+    range, range_power
+        Additive (R,) effect on a range; or the power of the distance that the effect is, 0: none.
     height
         Sign of the effect on a robot's measured height, metres.
     bearing
@@ -81,7 +81,7 @@ class Unknown:
     motion: "Callable[[Steps], Array] | None" = None
     motion_scale: tuple[float, float] | None = None
     range: "Callable[[RangeLink, Sight], Array] | None" = None
-    range_scale: float = 0.0
+    range_power: int = 0
     height: float = 0.0
     bearing: "Callable[[CameraView], Array] | None" = None
     start_std: float = 1.0
@@ -159,7 +159,7 @@ TABLE: tuple[Unknown, ...] = (
         key="range_offset_m",
         range=longer,
     ),
-    Unknown("range_scale", "1", 0.02, "pair", graded=True, key="range_scale", range_scale=1.0),
+    Unknown("range_scale", "1", 0.02, "pair", graded=True, key="range_scale", range_power=1),
     Unknown(
         "gyro_bias", "rad/s", 0.003, "robot", Cauchy(2.0), key="yaw_rate_bias_radps", motion=turn
     ),

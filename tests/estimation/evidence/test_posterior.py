@@ -109,6 +109,23 @@ def test_late_ranges_are_identified_and_corrected() -> None:
 
 
 @pytest.mark.heavy
+@pytest.mark.parametrize("bend", [0.04, -0.04])
+def test_range_error_that_follows_distance_is_identified_and_corrected(bend: float) -> None:
+    flight = flown("room", "calibrated", 1006, 60.0)
+    pair = pair_of(flight)
+    bent = replace(pair, range_m=pair.range_m + bend * pair.range_m**2)
+    ((plain, _),) = estimate_pairs([bent], plain=True)
+    ((found, _),) = estimate_pairs([bent])
+    error, worse = (
+        np.hypot(*(e.state[:, :2] - truth_at(flight, e.time_s)).T).mean() for e in (found, plain)
+    )
+    assert [cause.name for cause in found.causes if cause.probability > 0.5] == [
+        "range error follows distance"
+    ]
+    assert error < 0.75 * worse
+
+
+@pytest.mark.heavy
 def test_ranges_that_jump_in_one_place_are_identified_and_corrected() -> None:
     flight = flown("room", "calibrated", 1006, 60.0)
     pair = pair_of(flight)

@@ -21,6 +21,7 @@ from dmrl.estimation.solver.residuals import (
     odometry_factor,
     range_factor,
 )
+from dmrl.estimation.solver.unknowns import Unknown
 
 TIME_S = np.arange(0, 4.001, 0.01)
 
@@ -183,6 +184,14 @@ def test_range_factor_is_zero_at_truth_with_exact_jacobian() -> None:
     state[:, layout.state_column("range_error", 0, 1)] = 0.4
     found = range_factor(problem, layout, link, Values(state, values.constants))
     assert found.rows[..., 0, -1][found.weight > 0].mean() * std == pytest.approx(0.4, abs=5e-3)
+
+
+def test_range_error_that_follows_distance_has_an_exact_jacobian() -> None:
+    problem, values = flight()
+    bend = Unknown("bend", "1/m", 0.03, "pair", range_power=2)
+    bent = replace(problem, table=(*problem.table, bend))
+    at = moved(Values(values.state, np.append(values.constants, -0.05)))
+    check_jacobian(lambda v: range_factor(bent, bent.layout, bent.links[0], v), at)
 
 
 def test_either_robot_sees_the_other_at_the_ranges_that_it_measured() -> None:
