@@ -25,7 +25,7 @@ from dmrl.recording import Provenance, RecordingWriter
 from dmrl.topics import CAMERA_IMAGE
 
 from ..faults.inputs import Inputs
-from ..recording.test_budgets import chunk, recording, zeros
+from ..recording.test_budgets import build_chunk, build_zstd_bomb, write_chunks
 
 pytestmark = pytest.mark.slow
 SPARE_KB, FILE_TIMES, WAIT_S = 600_000, 10, 120
@@ -38,7 +38,7 @@ Content = Callable[[], bytes]
 def png(width: int, height: int, bits: int = 8) -> bytes:
     """A black picture of one colour, which compresses a thousandfold."""
 
-    def chunk(kind: bytes, data: bytes) -> bytes:
+    def build_png_chunk(kind: bytes, data: bytes) -> bytes:
         return (
             struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
         )
@@ -46,7 +46,8 @@ def png(width: int, height: int, bits: int = 8) -> bytes:
     head = struct.pack(">IIBBBBB", width, height, bits, 2, 0, 0, 0)
     row, packer = bytes(1 + width * 3 * bits // 8), zlib.compressobj(9)
     rows = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    chunks = ((b"IHDR", head), (b"IDAT", rows), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(build_png_chunk(*chunk) for chunk in chunks)
 
 
 def with_image(content: Content, count: int = 1) -> Make:
@@ -82,8 +83,8 @@ def chunk_bomb(kind: str) -> Make:
     """A recording of one chunk that decompresses to gigabytes."""
 
     def make(_: Inputs, path: Path) -> None:
-        data = zeros(6 << 30) if kind == "zstd" else lz4.frame.compress(bytes(1 << 30))
-        recording(path, chunk(data, 1000, kind))
+        data = build_zstd_bomb(6 << 30) if kind == "zstd" else lz4.frame.compress(bytes(1 << 30))
+        write_chunks(path, build_chunk(data, 1000, kind))
 
     return make
 

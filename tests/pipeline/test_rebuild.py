@@ -12,7 +12,7 @@ from dmrl.recording import read_summary
 from dmrl.stages import fly, predict, run, trim
 
 from ..faults.inputs import Inputs
-from ..recording.test_budgets import recording
+from ..recording.test_budgets import write_chunks
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_what_came_out_otherwise_is_printed(
 
 
 def test_a_recording_of_others_is_refused(tmp_path: Path) -> None:
-    recording(tmp_path / "a.mcap")
+    write_chunks(tmp_path / "a.mcap")
     with pytest.raises(RecordingError, match="has no provenance"):
         rebuild(tmp_path / "a.mcap", tmp_path / "b.mcap")
 

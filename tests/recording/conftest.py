@@ -1,4 +1,4 @@
-"""Recordings built in code."""
+"""Fixtures: recordings that are built in code."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +13,7 @@ Make = Callable[..., Path]
 
 @pytest.fixture
 def flight(tmp_path: Path) -> Path:
-    """Forty seconds: attitude at 100 Hz, ranges at 10 Hz, a calibration at the start."""
+    """Write 40 s of attitude at 100 Hz and ranges at 10 Hz, with a calibration at the start."""
     path = tmp_path / "flight.mcap"
     with RecordingWriter(path, Provenance("test", {"level": 1}, seed=3)) as sink:
         sink.write(

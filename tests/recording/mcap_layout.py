@@ -1,6 +1,6 @@
-"""MCAP files, drawn as layouts that the specification allows and written byte by byte.
+"""Random MCAP files: layouts that the specification allows, written byte by byte.
 
-Nothing of this module comes from dmrl: it is the other side of the tests.
+This module imports nothing from dmrl, so that tests compare two independent implementations.
 """
 
 import struct
@@ -21,22 +21,26 @@ MAGIC = b"\x89MCAP0\r\n"
 UNKNOWN = (0x10, 0x42, 0x80, 0xFF)
 
 
-def bounded(*values: int) -> tuple[int, ...]:
-    """Values that eight bytes hold."""
+def clip_to_uint64(*values: int) -> tuple[int, ...]:
+    """Return the values, clipped to the range of an unsigned 64-bit integer."""
     return tuple(min(max(value, 0), 2**64 - 1) for value in values)
 
 
-def text(value: str) -> bytes:
+def pack_text(value: str) -> bytes:
+    """Return a string as MCAP stores it: its length in bytes, then UTF-8."""
     return struct.pack("<I", len(value.encode())) + value.encode()
 
 
-def pairs(values: dict[str, str]) -> bytes:
-    body = b"".join(text(key) + text(value) for key, value in values.items())
+def pack_pairs(values: dict[str, str]) -> bytes:
+    """Return a map of strings as MCAP stores it: its length in bytes, then keys and values."""
+    body = b"".join(pack_text(key) + pack_text(value) for key, value in values.items())
     return struct.pack("<I", len(body)) + body
 
 
 @dataclass
 class Message:
+    """A message; its times are in nanoseconds."""
+
     channel: int
     time: int
     publish: int
@@ -50,52 +54,52 @@ class Message:
 
 @dataclass
 class Chunk:
-    """A chunk and what its indexes say of it."""
+    """A chunk, and the changes to make to it and to its indexes."""
 
     messages: list[Message]
     compression: str = ""
-    named: str | None = None  # another name for the compression
-    size_more: int = 0  # added to the uncompressed size
-    definitions: list[int] = field(default_factory=list)  # channels defined in front
-    times: tuple[int, int] | None = None  # in the chunk and in its index
-    index_times: tuple[int, int] | None = None  # in its index alone
+    named: str | None = None  # stated compression, if not the one used
+    size_more: int = 0  # added to the stated uncompressed size
+    definitions: list[int] = field(default_factory=list)  # channels defined before the messages
+    times: tuple[int, int] | None = None  # stated first and last time, in chunk and index
+    index_times: tuple[int, int] | None = None  # the same, in the index only
     entries: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
     change_entries: list[Callable[[dict[int, list[tuple[int, int]]]], None]] = field(
         default_factory=list
     )
     change_offsets: list[Callable[[dict[int, int]], None]] = field(default_factory=list)
-    listed: int = 1  # chunk indexes
-    shift: int = 0  # of the place in the chunk index
-    length_more: int = 0  # added to the length of the message indexes
-    unknown: int = 0  # opcode of a record between the messages
-    at: int = 0
+    listed: int = 1  # number of chunk indexes
+    shift: int = 0  # added to the offset in the chunk index
+    length_more: int = 0  # added to the stated length of the message indexes
+    unknown: int = 0  # opcode of unknown records between the messages; 0: none
+    at: int = 0  # offset in the file, set when written
 
 
 @dataclass
 class Layout:
-    """A file as it will be written."""
+    """A file to write: its records, which optional ones it has, and the changes to make."""
 
     channels: dict[int, tuple[str, int, dict[str, str]]] = field(default_factory=dict)
     schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     parts: list[object] = field(default_factory=list)  # chunks, messages, records
     crcs: bool = True
-    indexed: bool = True  # message indexes
+    indexed: bool = True  # has message indexes
     statistics: bool = True
-    counts: bool = True
-    repeat: bool = True
+    counts: bool = True  # the statistics have message counts by channel
+    repeat: bool = True  # the summary repeats schemas and channels
     chunk_indexes: bool = True
     extra_indexes: bool = True
     offsets: bool = True
-    padding: int = 0
+    padding: int = 0  # trailing bytes of each record
     change_statistics: list[Callable[[dict[str, int], Counter[int]], None]] = field(
         default_factory=list
     )
     change_summary_start: Callable[[int, list[int]], int] | None = None
-    summary_topic: bool = False  # the summary calls a channel otherwise
-    after_end: list[Message] = field(default_factory=list)
-    unknown_in_summary: int = 0
-    shift_extra: int = 0  # of the places of metadata and attachments
-    repeat_extra: int = 1  # indexes of each of them
+    summary_topic: bool = False  # the summary has another topic for every channel
+    after_end: list[Message] = field(default_factory=list)  # written after the Data End record
+    unknown_in_summary: int = 0  # opcode of an unknown record there; 0: none
+    shift_extra: int = 0  # added to the offsets of metadata and attachments
+    repeat_extra: int = 1  # number of indexes of each of them
     extra_count_more: int = 0
 
     @property
@@ -109,46 +113,49 @@ class Layout:
 
 
 class Writer:
-    """Writes a layout."""
+    """Writes a layout to bytes."""
 
     def __init__(self, layout: Layout) -> None:
         self.layout, self.out = layout, bytearray(MAGIC)
         self.starts: list[int] = []
         self.extras: list[bytes] = []
 
-    def record(self, opcode: int, body: bytes, *, padded: bool = True) -> bytes:
+    def build_record(self, opcode: int, body: bytes, *, padded: bool = True) -> bytes:
+        """Return a record: opcode, length and body, padded as the layout asks."""
         known = opcode not in (MESSAGE, FOOTER) and padded
         body += bytes(self.layout.padding) if known else b""
         return struct.pack("<BQ", opcode, len(body)) + body
 
     def append(self, record: bytes) -> int:
+        """Append a record to the file and return its offset."""
         at = len(self.out)
         self.starts.append(at)
         self.out += record
         return at
 
-    def definition(self, number: int, topic: str | None = None) -> bytes:
+    def build_definition(self, number: int, topic: str | None = None) -> bytes:
+        """Return the definition of a channel, with its schema before it if it has one."""
         own, schema, metadata = self.layout.channels[number]
         found = b""
         if schema in self.layout.schemas:
-            found += self.schema(schema)
-        body = struct.pack("<HH", number, schema) + text(topic or own) + text("json")
-        return found + self.record(CHANNEL, body + pairs(metadata))
+            found += self.build_schema(schema)
+        body = struct.pack("<HH", number, schema) + pack_text(topic or own) + pack_text("json")
+        return found + self.build_record(CHANNEL, body + pack_pairs(metadata))
 
-    def schema(self, number: int) -> bytes:
+    def build_schema(self, number: int) -> bytes:
         name, encoding, data = self.layout.schemas[number]
-        body = struct.pack("<H", number) + text(name) + text(encoding)
-        return self.record(SCHEMA, body + struct.pack("<I", len(data)) + data)
+        body = struct.pack("<H", number) + pack_text(name) + pack_text(encoding)
+        return self.build_record(SCHEMA, body + struct.pack("<I", len(data)) + data)
 
-    def chunk(self, chunk: Chunk) -> list[bytes]:
+    def write_chunk(self, chunk: Chunk) -> list[bytes]:
         """Write a chunk with its message indexes; return its chunk indexes."""
-        inner = bytearray().join(self.definition(n) for n in chunk.definitions)
+        inner = bytearray().join(self.build_definition(n) for n in chunk.definitions)
         entries: dict[int, list[tuple[int, int]]] = {}
         for message in chunk.messages:
             if chunk.unknown:
-                inner += self.record(chunk.unknown, b"xyz", padded=False)
+                inner += self.build_record(chunk.unknown, b"xyz", padded=False)
             entries.setdefault(message.channel, []).append((message.time, len(inner)))
-            inner += self.record(MESSAGE, message.body())
+            inner += self.build_record(MESSAGE, message.body())
         size, kind = len(inner) + chunk.size_more, chunk.compression
         data = bytes(inner)
         if kind == "zstd":
@@ -159,59 +166,63 @@ class Writer:
         times = chunk.times or (min(found), max(found))
         crc = zlib.crc32(inner) if self.layout.crcs else 0
         name = chunk.named or kind
-        body = struct.pack("<QQQI", *bounded(*times, size), crc) + text(name)
-        chunk.at = self.append(self.record(CHUNK, body + struct.pack("<Q", len(data)) + data))
+        body = struct.pack("<QQQI", *clip_to_uint64(*times, size), crc) + pack_text(name)
+        chunk.at = self.append(self.build_record(CHUNK, body + struct.pack("<Q", len(data)) + data))
         length, offsets = len(self.out) - chunk.at, dict[int, int]()
         for change in chunk.change_entries:
             change(entries)
         if self.layout.indexed:
             for number, own in entries.items():
-                flat = b"".join(struct.pack("<QQ", *bounded(*entry)) for entry in own)
+                flat = b"".join(struct.pack("<QQ", *clip_to_uint64(*entry)) for entry in own)
                 body = struct.pack("<HI", number, len(flat)) + flat
-                offsets[number] = self.append(self.record(INDEX, body))
+                offsets[number] = self.append(self.build_record(INDEX, body))
         indexes = len(self.out) - chunk.at - length + chunk.length_more
         for move in chunk.change_offsets:
             move(offsets)
         flat = b"".join(struct.pack("<HQ", *one) for one in offsets.items())
-        body = struct.pack("<QQ", *bounded(*(chunk.index_times or times)))
+        body = struct.pack("<QQ", *clip_to_uint64(*(chunk.index_times or times)))
         body += struct.pack("<QQI", chunk.at + chunk.shift, length, len(flat)) + flat
         body += (
             struct.pack("<Q", max(indexes, 0))
-            + text(kind)
-            + struct.pack("<QQ", *bounded(len(data), size))
+            + pack_text(kind)
+            + struct.pack("<QQ", *clip_to_uint64(len(data), size))
         )
-        return [self.record(CHUNK_INDEX, body)] * chunk.listed
+        return [self.build_record(CHUNK_INDEX, body)] * chunk.listed
 
-    def extra(self, opcode: int, body: bytes, index: bytes) -> None:
-        """Write metadata or an attachment, and keep its index."""
-        record = self.record(opcode, body)
+    def write_extra(self, opcode: int, body: bytes, index: bytes) -> None:
+        """Append metadata or an attachment, and keep its index for the summary."""
+        record = self.build_record(opcode, body)
         at = self.append(record)
         places = struct.pack("<QQ", at + self.layout.shift_extra, len(record))
         kind = METADATA_INDEX if opcode == METADATA else ATTACHMENT_INDEX
-        self.extras += [self.record(kind, places + index)] * self.layout.repeat_extra
+        self.extras += [self.build_record(kind, places + index)] * self.layout.repeat_extra
 
-    def part(self, part: object) -> list[bytes]:
+    def write_part(self, part: object) -> list[bytes]:
+        """Append a part of the layout by its type; return the chunk indexes of a chunk.
+
+        A positive integer is a channel to define, a negative one an unknown opcode.
+        """
         if isinstance(part, Chunk):
-            return self.chunk(part)
+            return self.write_chunk(part)
         if isinstance(part, Message):
-            self.append(self.record(MESSAGE, part.body()))
+            self.append(self.build_record(MESSAGE, part.body()))
         elif isinstance(part, int):
             if part >= 0:
-                self.append(self.definition(part))
+                self.append(self.build_definition(part))
             else:
-                self.append(self.record(-part, b"what nobody knows", padded=False))
+                self.append(self.build_record(-part, b"what nobody knows", padded=False))
         elif isinstance(part, dict):
-            self.extra(METADATA, text("own") + pairs(part), text("own"))
+            self.write_extra(METADATA, pack_text("own") + pack_pairs(part), pack_text("own"))
         elif isinstance(part, tuple):
             name, media, log, create, data = part
-            body = struct.pack("<QQ", log, create) + text(name) + text(media)
+            body = struct.pack("<QQ", log, create) + pack_text(name) + pack_text(media)
             body += struct.pack("<Q", len(data)) + data
             crc = zlib.crc32(body) if self.layout.crcs else 0
-            index = struct.pack("<QQQ", log, create, len(data)) + text(name) + text(media)
-            self.extra(ATTACHMENT, body + struct.pack("<I", crc), index)
+            index = struct.pack("<QQQ", log, create, len(data)) + pack_text(name) + pack_text(media)
+            self.write_extra(ATTACHMENT, body + struct.pack("<I", crc), index)
         return []
 
-    def statistics(self) -> bytes:
+    def build_statistics(self) -> bytes:
         layout = self.layout
         messages = [*layout.messages, *layout.after_end]
         counts = Counter(m.channel for m in messages)
@@ -229,7 +240,7 @@ class Writer:
         }
         for change in layout.change_statistics:
             change(told, counts)
-        values = {k: bounded(v)[0] for k, v in told.items()}
+        values = {k: clip_to_uint64(v)[0] for k, v in told.items()}
         body = struct.pack(
             "<QHIIIIQQ",
             *(values[k] for k in ("messages", "schemas", "channels", "attachments")),
@@ -237,28 +248,28 @@ class Writer:
         )
         kept = counts if layout.counts else {}
         flat = b"".join(struct.pack("<HQ", n, max(0, c)) for n, c in kept.items())
-        return self.record(STATISTICS, body + struct.pack("<I", len(flat)) + flat)
+        return self.build_record(STATISTICS, body + struct.pack("<I", len(flat)) + flat)
 
     def write(self) -> bytes:
         layout = self.layout
-        self.append(self.record(HEADER, text("own") + text("wrong meaning")))
-        indexes = [index for part in layout.parts for index in self.part(part)]
+        self.append(self.build_record(HEADER, pack_text("own") + pack_text("wrong meaning")))
+        indexes = [index for part in layout.parts for index in self.write_part(part)]
         crc = zlib.crc32(self.out) if layout.crcs else 0
-        self.append(self.record(DATA_END, struct.pack("<I", crc)))
+        self.append(self.build_record(DATA_END, struct.pack("<I", crc)))
         for message in layout.after_end:
-            self.append(self.record(MESSAGE, message.body()))
+            self.append(self.build_record(MESSAGE, message.body()))
         start, groups = len(self.out), list[list[bytes]]()
         if layout.repeat:
-            groups.append([self.schema(n) for n in layout.schemas])
+            groups.append([self.build_schema(n) for n in layout.schemas])
             topic = "/renamed" if layout.summary_topic else None
             bare = Layout(layout.channels)
             bare.padding = layout.padding
-            groups.append([Writer(bare).definition(n, topic) for n in layout.channels])
-        groups.append([self.statistics()] if layout.statistics else [])
+            groups.append([Writer(bare).build_definition(n, topic) for n in layout.channels])
+        groups.append([self.build_statistics()] if layout.statistics else [])
         groups.append(indexes if layout.chunk_indexes else [])
         groups.append(self.extras if layout.extra_indexes else [])
         if layout.unknown_in_summary:
-            groups.append([self.record(layout.unknown_in_summary, b"xyz", padded=False)])
+            groups.append([self.build_record(layout.unknown_in_summary, b"xyz", padded=False)])
         offsets = b""
         for group in groups:
             at = len(self.out)
@@ -266,7 +277,7 @@ class Writer:
                 self.append(record)
             if group and layout.offsets:
                 body = struct.pack("<BQQ", group[0][0], at, len(self.out) - at)
-                offsets += self.record(OFFSET, body)
+                offsets += self.build_record(OFFSET, body)
         if not any(groups):
             start = 0
         elif layout.change_summary_start is not None:

@@ -1,4 +1,4 @@
-"""A small recording, and the offsets of its records."""
+"""Write a small recording, and read the records and indexes of any recording."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,8 +16,8 @@ from dmrl.recording import (
 TOPICS = ("/cf1/height", "/cf1/range/cf2")
 
 
-def small(path: Path) -> Path:
-    """Seven messages on two topics in three chunks, with metadata and an attachment."""
+def write_small_recording(path: Path) -> Path:
+    """Write seven messages on two topics in three chunks, with metadata and an attachment."""
     with RecordingWriter(path, Provenance("test", {"level": 1}, seed=3)) as sink:
         for k in range(4):
             sink.write(10 * k, TOPICS[0], message_class("Height")(height_m=k))
@@ -30,8 +30,8 @@ def small(path: Path) -> Path:
     return path
 
 
-def records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and end of every record of a file."""
+def iter_records(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, start and end of every record of a file, as byte offsets."""
     at = 8
     while at < len(data) - 8:
         end = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")
@@ -39,23 +39,23 @@ def records(data: bytes) -> Iterator[tuple[int, int, int]]:
         at = end
 
 
-def chunks(path: Path) -> list[ChunkIndex]:
-    """What the summary says of each chunk."""
+def read_chunk_indexes(path: Path) -> list[ChunkIndex]:
+    """Return the chunk indexes of the summary."""
     with path.open("rb") as stream:
         found = make_reader(stream).get_summary()
     assert found is not None
     return found.chunk_indexes
 
 
-def packed(path: Path) -> list[bytes]:
-    """The records of all chunks, without their message indexes."""
+def read_chunk_records(path: Path) -> list[bytes]:
+    """Return the record of each chunk, in file order and without its message indexes."""
     data = path.read_bytes()
-    found = sorted(chunks(path), key=lambda c: c.chunk_start_offset)
+    found = sorted(read_chunk_indexes(path), key=lambda c: c.chunk_start_offset)
     return [data[c.chunk_start_offset : c.chunk_start_offset + c.chunk_length] for c in found]
 
 
-def unchanged(before: Path, after: Path, topics: list[str]) -> None:
-    """Messages of these topics are the same, by dmrl's reader and by mcap's."""
+def assert_messages_unchanged(before: Path, after: Path, topics: list[str]) -> None:
+    """Assert that messages on these topics are equal, by dmrl's reader and by mcap's."""
     for topic in topics:
         assert list(read_raw(after, topic)) == list(read_raw(before, topic))
     with after.open("rb") as stream:
@@ -65,8 +65,8 @@ def unchanged(before: Path, after: Path, topics: list[str]) -> None:
     assert sorted(got) == sorted(ours)
 
 
-def channels(path: Path) -> dict[int, str]:
-    """Topic of each channel number that the summary lists."""
+def read_channel_topics(path: Path) -> dict[int, str]:
+    """Return the topic of each channel ID in the summary."""
     with path.open("rb") as stream:
         found = make_reader(stream).get_summary()
     assert found is not None

@@ -1,4 +1,4 @@
-"""Data beside messages: splits, licences, counts, times of an index."""
+"""Metadata, attachments, statistics and index times of recordings."""
 
 import struct
 from collections import Counter
@@ -38,12 +38,13 @@ from dmrl.recording.mcap.batch_reader import (
 from dmrl.recording.mcap.message_index import MESSAGE_INDEX_STRUCT, parse_index_entries
 from dmrl.recording.summary import read_channel
 
-from .records import records
+from .records import iter_records
 
 MADE = Provenance("test")
 
 
-def recording(path: Path, *metadata: tuple[str, dict[str, str]]) -> Path:
+def write_recording(path: Path, *metadata: tuple[str, dict[str, str]]) -> Path:
+    """Write ten heights at 0, 10, ... 90 ns, a recipe, an attachment and this metadata."""
     with RecordingWriter(path, MADE, recipe="kind = 'test'\n") as sink:
         for k in range(10):
             sink.write(10 * k, "/cf1/height", message_class("Height")(height_m=k))
@@ -54,7 +55,7 @@ def recording(path: Path, *metadata: tuple[str, dict[str, str]]) -> Path:
 
 
 def test_a_split_is_its_intervals_by_name(tmp_path: Path) -> None:
-    path = recording(
+    path = write_recording(
         tmp_path / "a.mcap",
         ("dmrl.split", {"train": "[[0, 10], [30, 40]]", "test": "[[20, 25]]"}),
         ("dmrl.split", {"train": "[[50, 60]]"}),
@@ -67,14 +68,14 @@ def test_a_split_is_its_intervals_by_name(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["[[1]]", "[1, 2]", '[["a", 2]]', "{", "[[null, 3]]"])
 def test_invalid_split_gives_one_line_error(text: str, tmp_path: Path) -> None:
-    path = recording(tmp_path / "a.mcap", ("dmrl.split", {"train": text}))
+    path = write_recording(tmp_path / "a.mcap", ("dmrl.split", {"train": text}))
     with pytest.raises(RecordingError, match=r"a\.mcap: its split is not a list") as e:
         read_splits(path, read_summary(path))
     assert "\n" not in str(e.value)
 
 
 def test_metadata_and_attachments_are_copied_without_provenance_and_recipe(tmp_path: Path) -> None:
-    one = recording(tmp_path / "a.mcap", ("own", {"k": "v"}), ("own", {"k": "w"}))
+    one = write_recording(tmp_path / "a.mcap", ("own", {"k": "v"}), ("own", {"k": "w"}))
     other = tmp_path / "b.mcap"
     with RecordingWriter(other, Provenance("other")) as sink:
         sink.copy_extras(read_summary(one))
@@ -107,9 +108,9 @@ def test_licence_title_is_the_first_line_of_the_licence_file(tmp_path: Path) -> 
 
 def test_licences_of_recordings_are_put_together(tmp_path: Path) -> None:
     paths = [
-        recording(tmp_path / "a.mcap", (LICENCES_METADATA, {"b": "MIT"})),
-        recording(tmp_path / "b.mcap", (LICENCES_METADATA, {"a": "CC0"})),
-        recording(tmp_path / "c.mcap"),
+        write_recording(tmp_path / "a.mcap", (LICENCES_METADATA, {"b": "MIT"})),
+        write_recording(tmp_path / "b.mcap", (LICENCES_METADATA, {"a": "CC0"})),
+        write_recording(tmp_path / "c.mcap"),
     ]
     found = dict(pair for path in paths for pair in licences_in(read_summary(path)))
     assert found == {"a": "CC0", "b": "MIT"}
@@ -141,7 +142,7 @@ def test_a_topic_of_two_channels_is_one_topic(indexed: bool, tmp_path: Path) -> 
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("publish_ns", [2**64 - 1, 2**63])
 def test_time_beyond_int64_is_reported(publish_ns: int, indexed: bool, tmp_path: Path) -> None:
-    """By a message index too, where it became -1."""
+    """The reason: read from a message index as int64, such a time is negative."""
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream, index_types=IndexType.ALL if indexed else IndexType.NONE)
@@ -156,7 +157,7 @@ def test_time_beyond_int64_is_reported(publish_ns: int, indexed: bool, tmp_path:
 
 @pytest.mark.parametrize("log_ns", [2**64 - 1, 2**63, 2**63 - 1])
 def test_time_beyond_2262_is_reported_by_every_reader(log_ns: int, tmp_path: Path) -> None:
-    """check called it sound, convert damaged; view ended in an internal error."""
+    """Every command reports the same error for such a file."""
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -180,14 +181,14 @@ def test_time_beyond_2262_is_reported_by_every_reader(log_ns: int, tmp_path: Pat
 
 
 def test_log_times_are_half_open(tmp_path: Path) -> None:
-    path = recording(tmp_path / "a.mcap")
+    path = write_recording(tmp_path / "a.mcap")
     found = read_log_times(path, ["/cf1/height"], start_ns=20, end_ns=50)
     assert found["/cf1/height"].tolist() == [20, 30, 40]
     assert read_log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == list(range(0, 100, 10))
 
 
 def test_messages_of_a_span_come_in_batches(tmp_path: Path) -> None:
-    path = recording(tmp_path / "a.mcap")
+    path = write_recording(tmp_path / "a.mcap")
     for start, end, times in (
         (20, 50, [20, 30, 40]),
         (None, 21, [0, 10, 20]),
@@ -202,7 +203,7 @@ def test_messages_of_a_span_come_in_batches(tmp_path: Path) -> None:
     assert list(held.values()) == [10]
 
 
-def test_an_index_is_of_its_channel_and_whole() -> None:
+def test_message_index_of_another_channel_or_length_is_refused() -> None:
     pairs = np.array([[5, 0], [7, 40]], "<i8").tobytes()
     raw = b"xy" + MESSAGE_INDEX_STRUCT.pack(7, 6 + len(pairs), 3, len(pairs)) + pairs
     found = parse_index_entries(raw, {3: 2})
@@ -238,14 +239,14 @@ def test_statistics_count_the_written_records(times: list[int], tmp_path: Path) 
     )
     assert (said.channel_count, said.schema_count) == (len(found.channels), len(found.schemas))
     assert (said.channel_count, said.schema_count) == (int(bool(times)),) * 2
-    assert said.attachment_count == len(found.attachment_indexes) == 2  # and the recipe
+    assert said.attachment_count == len(found.attachment_indexes) == 2  # the other is the recipe
     assert said.metadata_count == len(found.metadata_indexes) >= 1
     assert list(said.channel_message_counts.values()) == [len(times)] * bool(times)
 
 
 @pytest.mark.parametrize("time_ns", [2**64 - 1, 2**63, 99])
 def test_message_index_times_must_lie_within_the_chunk(time_ns: int, tmp_path: Path) -> None:
-    """No sum tells in another program's file: a time that was -1 was left out without a word."""
+    """Without a CRC nothing else reveals it, and readers would silently omit the message."""
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -257,7 +258,7 @@ def test_message_index_times_must_lie_within_the_chunk(time_ns: int, tmp_path: P
         writer.finish()
     assert read_log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == [5, 6, 7]
     data = bytearray(path.read_bytes())
-    (at,) = (start for opcode, start, _ in records(data) if opcode == Opcode.MESSAGE_INDEX)
+    (at,) = (start for opcode, start, _ in iter_records(data) if opcode == Opcode.MESSAGE_INDEX)
     struct.pack_into("<Q", data, at + MESSAGE_INDEX_STRUCT.size, time_ns)
     path.write_bytes(data)
     with pytest.raises(RecordingError, match=r"index of the chunk at byte .* is wrong"):

@@ -1,4 +1,4 @@
-"""MCAP's conformance suite: 416 recordings with descriptions, through every command that copies."""
+"""Every command that copies keeps the content of MCAP's conformance suite of 416 recordings."""
 
 import json
 from collections import defaultdict
@@ -14,11 +14,11 @@ from .walk import Content, walk
 
 FILES, SAMPLED = 416, 13
 OTHER = {"NoData.mcap": "NoData-st.mcap"}
-"""The empty recording that each is merged with; one recording cannot be given twice."""
+"""The empty recording to merge each file with. Merging a file with itself is an error."""
 
 
-def described(path: Path) -> Content:
-    """What the suite says is in a file."""
+def read_description(path: Path) -> Content:
+    """Return the content of a file as the suite describes it."""
     found = Content()
     for record in json.loads(path.with_suffix(".json").read_text())["records"]:
         told = dict(record["fields"])
@@ -45,8 +45,8 @@ def described(path: Path) -> Content:
     return found
 
 
-def official(path: Path) -> Content:
-    """What mcap's own reader finds in a file."""
+def read_by_mcap(path: Path) -> Content:
+    """Return the content of a file as the mcap package reads it."""
     by_kind: dict[str, list[Any]] = defaultdict(list)
     with path.open("rb") as stream:
         for record in StreamReader(stream, validate_crcs=True).records:
@@ -66,11 +66,11 @@ def official(path: Path) -> Content:
     )
 
 
-def through_commands(path: Path, folder: Path) -> None:
-    """Info and check count what is described; copies have all of it, for any reader."""
-    content = described(path)
+def check_commands(path: Path, folder: Path) -> None:
+    """Assert that info and check count, and every copy keeps, what the suite describes."""
+    content = read_description(path)
     want = content.comparable()
-    assert walk(path).comparable() == official(path).comparable() == want
+    assert walk(path).comparable() == read_by_mcap(path).comparable() == want
     told, checked = info.run(path).to_document(), check.run(path)
     assert told["messages"] == checked.messages == len(want["messages"])
     assert list(told["topics"]) == sorted({topic for topic, *_ in want["channels"]})
@@ -87,12 +87,13 @@ def through_commands(path: Path, folder: Path) -> None:
         lambda: recover.run(path, out),
     ):
         copy()
-        assert walk(out).comparable() == official(out).comparable() == want
+        assert walk(out).comparable() == read_by_mcap(out).comparable() == want
         out.unlink()
 
 
 @pytest.fixture
 def suite(data: Path) -> list[Path]:
+    """Return the recordings of the conformance suite."""
     folder = data / "mcap-conformance"
     if not folder.is_dir():
         pytest.skip("MCAP's conformance suite is not there")
@@ -104,11 +105,11 @@ def test_a_sample_of_the_conformance_suite_is_copied_whole(
     suite: list[Path], tmp_path: Path
 ) -> None:
     for path in suite[::SAMPLED]:
-        through_commands(path, tmp_path)
+        check_commands(path, tmp_path)
 
 
 @pytest.mark.heavy
 def test_the_conformance_suite_is_copied_whole(suite: list[Path], tmp_path: Path) -> None:
     for path in suite:
-        through_commands(path, tmp_path)
+        check_commands(path, tmp_path)
     assert len(suite) == FILES

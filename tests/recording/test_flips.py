@@ -1,4 +1,4 @@
-"""Every byte of a small recording flipped: the flip is noticed, or changes nothing."""
+"""A changed byte of a small recording is an error, or changes nothing that is read."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,14 +23,14 @@ from dmrl.recording import (
     trim,
 )
 
-from .records import TOPICS, records, small
+from .records import TOPICS, iter_records, write_small_recording
 
 PATTERNS = (0x01, 0x80, 0xFF)
 OPCODES = (0x00, Opcode.FOOTER, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA, 0x7F, 0x90)
 
 
-def everything(path: Path) -> list[Any]:
-    """What every way to read gives."""
+def read_everything(path: Path) -> list[Any]:
+    """Return what every function that reads a recording returns."""
     wanted = dict.fromkeys(TOPICS)
     return [
         read_summary(path),
@@ -47,23 +47,26 @@ def everything(path: Path) -> list[Any]:
     ]
 
 
-def flips(data: bytes, patterns: tuple[int, ...], step: int = 1) -> Iterator[tuple[int, int]]:
+def iter_flips(data: bytes, patterns: tuple[int, ...], step: int = 1) -> Iterator[tuple[int, int]]:
+    """Yield offset and new value of every ``step``-th byte, XORed with each pattern."""
     for at in range(0, len(data), step):
         for pattern in patterns:
             yield at, data[at] ^ pattern
 
 
-def opcodes(data: bytes) -> Iterator[tuple[int, int]]:
-    """Every record's opcode, and every other byte that looks like one, replaced by others."""
+def iter_opcode_changes(data: bytes) -> Iterator[tuple[int, int]]:
+    """Yield offset and new value of each byte that looks like the opcode of a short record."""
     for at, byte in enumerate(data):
         if 0x01 <= byte <= 0x0F and data[at + 3 : at + 9] == bytes(6):
             yield from ((at, int(code)) for code in OPCODES if code != byte)
 
 
-def unnoticed(path: Path, changes: Iterator[tuple[int, int]], read: Callable[[Path], Any]) -> int:
-    """Read with one byte changed, again and again: how many changes were no error.
+def count_harmless_changes(
+    path: Path, changes: Iterator[tuple[int, int]], read: Callable[[Path], Any]
+) -> int:
+    """Read the file once per change of one byte; return how many changes gave no error.
 
-    Those must give what the sound file gives.
+    Assert that those change nothing that is read, and that the errors name a way out.
     """
     data = path.read_bytes()
     sound = read(path)
@@ -83,34 +86,34 @@ def unnoticed(path: Path, changes: Iterator[tuple[int, int]], read: Callable[[Pa
 @pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.heavy
 def test_every_flipped_byte_is_noticed_or_changes_nothing(step: int, tmp_path: Path) -> None:
-    """Every third reaches each number of a record: they have four or eight bytes."""
-    path = small(tmp_path / "a.mcap")
+    """Every third byte touches each number of a record, since those have four or eight bytes."""
+    path = write_small_recording(tmp_path / "a.mcap")
     data = path.read_bytes()
-    unseen = unnoticed(path, flips(data, (0xFF,), step), everything)
-    # The header's names, the sum of the data section, and who made an attachment's index.
+    unseen = count_harmless_changes(path, iter_flips(data, (0xFF,), step), read_everything)
+    # Harmless are, for example, the names in the header and the CRC of the data section.
     assert unseen < 100 / step
 
 
 @pytest.mark.slow
 def test_every_pattern_of_flips_is_noticed_or_changes_nothing(tmp_path: Path) -> None:
-    path = small(tmp_path / "a.mcap")
+    path = write_small_recording(tmp_path / "a.mcap")
     data = path.read_bytes()
-    unnoticed(path, flips(data, PATTERNS), everything)
+    count_harmless_changes(path, iter_flips(data, PATTERNS), read_everything)
 
 
 @pytest.mark.heavy
 def test_every_substituted_opcode_is_noticed_or_changes_nothing(tmp_path: Path) -> None:
-    path = small(tmp_path / "a.mcap")
+    path = write_small_recording(tmp_path / "a.mcap")
     data = path.read_bytes()
-    changes = list(opcodes(data))
+    changes = list(iter_opcode_changes(data))
     assert len(changes) > 20 * len(OPCODES)
-    unnoticed(path, iter(changes), everything)
+    count_harmless_changes(path, iter(changes), read_everything)
 
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)])
 def test_recover_reports_a_whole_file_only_if_nothing_was_lost(step: int, tmp_path: Path) -> None:
-    path = small(tmp_path / "a.mcap")
+    path = write_small_recording(tmp_path / "a.mcap")
     data = path.read_bytes()
     sound = [(raw.time_ns, raw.topic, raw.data) for raw in read_raw(path)]
     for at in range(8, len(data), step):
@@ -133,9 +136,9 @@ def test_recover_reports_a_whole_file_only_if_nothing_was_lost(step: int, tmp_pa
         out.unlink()
 
 
-def without_chunk(data: bytes, number: int) -> bytes:
-    """The file with a chunk cut out, and its message indexes."""
-    found = list(records(data))
+def remove_chunk(data: bytes, number: int) -> bytes:
+    """Return the file without its ``number``-th chunk and the message indexes of that chunk."""
+    found = list(iter_records(data))
     chunks = [k for k, (opcode, _, _) in enumerate(found) if opcode == Opcode.CHUNK]
     first = last = chunks[number]
     while found[last + 1][0] == Opcode.MESSAGE_INDEX:
@@ -144,8 +147,8 @@ def without_chunk(data: bytes, number: int) -> bytes:
 
 
 def test_a_removed_chunk_is_missed_by_topic(tmp_path: Path) -> None:
-    path = small(tmp_path / "a.mcap")
-    path.write_bytes(without_chunk(path.read_bytes(), 1))
+    path = write_small_recording(tmp_path / "a.mcap")
+    path.write_bytes(remove_chunk(path.read_bytes(), 1))
     for use in (
         read_summary,
         check,
@@ -160,9 +163,9 @@ def test_a_removed_chunk_is_missed_by_topic(tmp_path: Path) -> None:
 
 
 def test_messages_of_a_damaged_chunk_are_counted_even_without_the_end(tmp_path: Path) -> None:
-    path = small(tmp_path / "a.mcap")
+    path = write_small_recording(tmp_path / "a.mcap")
     data = bytearray(path.read_bytes())
-    second = [at for opcode, at, _ in records(data) if opcode == Opcode.CHUNK][1]
+    second = [at for opcode, at, _ in iter_records(data) if opcode == Opcode.CHUNK][1]
     data[second + 70] ^= 0xFF
     path.write_bytes(data[:-100])
     result = recover(path, tmp_path / "b.mcap")
@@ -171,8 +174,8 @@ def test_messages_of_a_damaged_chunk_are_counted_even_without_the_end(tmp_path: 
 
 
 def test_checksums_copied_by_other_programs_are_ignored(tmp_path: Path) -> None:
-    """As `mcap filter --include-metadata` does."""
-    path, copy = small(tmp_path / "a.mcap"), tmp_path / "b.mcap"
+    """`mcap filter --include-metadata` copies the metadata with dmrl's checksums."""
+    path, copy = write_small_recording(tmp_path / "a.mcap"), tmp_path / "b.mcap"
     with path.open("rb") as source, copy.open("wb") as stream:
         reader, writer = make_reader(source), Writer(stream, chunk_size=90)
         writer.start()
@@ -191,9 +194,9 @@ def test_checksums_copied_by_other_programs_are_ignored(tmp_path: Path) -> None:
 
 
 def test_recover_reports_repeated_chunks_as_not_whole(tmp_path: Path) -> None:
-    path = small(tmp_path / "a.mcap")
+    path = write_small_recording(tmp_path / "a.mcap")
     data = path.read_bytes()
-    parts = [(opcode, data[start:end]) for opcode, start, end in records(data)]
+    parts = [(opcode, data[start:end]) for opcode, start, end in iter_records(data)]
     chunk = next(part for part in parts if part[0] == Opcode.CHUNK)
     end = next(k for k, (opcode, _) in enumerate(parts) if opcode == Opcode.DATA_END)
     body = b"".join(record for _, record in [*parts[: end + 1], chunk, *parts[end + 1 :]])

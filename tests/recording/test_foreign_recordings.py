@@ -1,4 +1,4 @@
-"""Recordings of other writers that were once read in part, or refused without reason."""
+"""Valid recordings of other writers are read completely; damaged ones are refused."""
 
 import struct
 from pathlib import Path
@@ -12,12 +12,13 @@ from dmrl.errors import RecordingError
 from dmrl.recording import check, merge, read_summary, recover, trim
 from dmrl.stages import info
 
-from .records import records, small
-from .test_renames import rejoined
+from .records import iter_records, write_small_recording
+from .test_renames import write_records
 from .walk import walk
 
 
-def stranger(data: Path, name: str) -> Path:
+def find_foreign_recording(data: Path, name: str) -> Path:
+    """Return the first recording of a folder of the test data; skip the test without it."""
     for folder in ("strangers", "faults"):
         if found := sorted((data / folder / name).glob("*.mcap")):
             return found[0]
@@ -25,7 +26,7 @@ def stranger(data: Path, name: str) -> Path:
 
 
 def test_attachments_of_one_name_keep_their_types_and_times(data: Path, tmp_path: Path) -> None:
-    path = stranger(data, "mcap-attachments")
+    path = find_foreign_recording(data, "mcap-attachments")
     want = walk(path).comparable()
     assert [name for name, *_ in want["attachments"]] == ["cal.yaml", "pic.png", "pic.png"]
     trim(path, tmp_path / "a.mcap")
@@ -41,7 +42,7 @@ def test_attachments_of_one_name_keep_their_types_and_times(data: Path, tmp_path
 
 
 def test_trailing_bytes_of_a_record_are_accepted(data: Path, tmp_path: Path) -> None:
-    path = stranger(data, "mcap-padded-TenMessages")
+    path = find_foreign_recording(data, "mcap-padded-TenMessages")
     assert not [f for f in check(path) if f.level == "error"]
     trim(path, tmp_path / "out.mcap")
     assert walk(tmp_path / "out.mcap").comparable() == walk(path).comparable()
@@ -50,7 +51,7 @@ def test_trailing_bytes_of_a_record_are_accepted(data: Path, tmp_path: Path) -> 
 def test_statistics_with_a_wrong_time_lose_nothing_and_are_reported(
     data: Path, tmp_path: Path
 ) -> None:
-    path = stranger(data, "mcap-stat_start_late")
+    path = find_foreign_recording(data, "mcap-stat_start_late")
     assert trim(path, tmp_path / "out.mcap") == 20
     assert walk(tmp_path / "out.mcap").comparable() == walk(path).comparable()
     (finding,) = (f for f in check(path) if "statistics" in f.text)
@@ -59,7 +60,7 @@ def test_statistics_with_a_wrong_time_lose_nothing_and_are_reported(
 
 
 def test_a_chunk_index_that_omits_a_channel_is_an_error(data: Path, tmp_path: Path) -> None:
-    path, out = stranger(data, "trim-chunk-index-short"), tmp_path / "out.mcap"
+    path, out = find_foreign_recording(data, "trim-chunk-index-short"), tmp_path / "out.mcap"
     for read in (lambda: trim(path, out), lambda: check(path), lambda: info.run(path)):
         with pytest.raises(RecordingError, match=r"is damaged .*Try: dmrl recover"):
             read()
@@ -69,12 +70,12 @@ def test_a_chunk_index_that_omits_a_channel_is_an_error(data: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("stated", [True, False])
 def test_altered_chunk_index_is_an_error(stated: bool, tmp_path: Path) -> None:
-    """Without a checksum that tells: the lengths of the message indexes do, or a record there."""
-    path = small(tmp_path / "a.mcap")
+    """Without checksums, the lengths of the message indexes or their records reveal it."""
+    path = write_small_recording(tmp_path / "a.mcap")
     data = path.read_bytes()
-    parts = [(opcode, data[start:end]) for opcode, start, end in records(data)]
+    parts = [(opcode, data[start:end]) for opcode, start, end in iter_records(data)]
     places = [k for k, (opcode, _) in enumerate(parts) if opcode == Opcode.CHUNK_INDEX]
-    index = next(parts[k][1] for k in places if parts[k][1][41] == 20)  # of two channels
+    index = next(parts[k][1] for k in places if parts[k][1][41] == 20)  # the one with two channels
     cut = index[:41] + struct.pack("<I", 10) + index[45:55] + index[65:]
     short = bytes([Opcode.CHUNK_INDEX]) + struct.pack("<Q", len(cut) - 9) + cut[9:]
     kept = [
@@ -82,7 +83,7 @@ def test_altered_chunk_index_is_an_error(stated: bool, tmp_path: Path) -> None:
         for opcode, part in parts
         if opcode != Opcode.STATISTICS or stated
     ]
-    rejoined(path, kept)
+    write_records(path, kept)
     with pytest.raises(RecordingError, match=r"lacks a message index of channel \d"):
         read_summary(path)
 
@@ -90,7 +91,7 @@ def test_altered_chunk_index_is_an_error(stated: bool, tmp_path: Path) -> None:
 def test_statistics_without_counts_are_counted(
     data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = stranger(data, "statistics-without-counts")
+    path = find_foreign_recording(data, "statistics-without-counts")
     assert info.run(path).to_document()["messages"] == dmrl.open(path)._summary.count == 87
     assert len(dmrl.open(path)) == 9
     assert not [f for f in check(path) if "no messages" in f.text]

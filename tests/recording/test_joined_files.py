@@ -1,4 +1,4 @@
-"""Recordings of others that hold more than one recording, or type of a topic."""
+"""Recordings of other writers: concatenated files, and wrong types on known topics."""
 
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ from dmrl.errors import RecordingError
 from dmrl.recording import check, read_summary, recover
 
 
-def write(path: Path, *sent: tuple[str, Any]) -> Path:
-    """A file without a summary."""
+def write_foreign_recording(path: Path, *sent: tuple[str, Any]) -> Path:
+    """Write these messages, 1 ns apart, to a file without a summary."""
     with path.open("wb") as stream:
         writer = Writer(
             stream,
@@ -36,8 +36,8 @@ def write(path: Path, *sent: tuple[str, Any]) -> Path:
 
 
 def test_joined_files_are_refused_and_recovered_as_a_whole(tmp_path: Path) -> None:
-    first = write(tmp_path / "a.mcap", ("/cf1/pose", PoseInFrame()))
-    second = write(tmp_path / "b.mcap", ("/cf2/pose", PoseInFrame()))
+    first = write_foreign_recording(tmp_path / "a.mcap", ("/cf1/pose", PoseInFrame()))
+    second = write_foreign_recording(tmp_path / "b.mcap", ("/cf2/pose", PoseInFrame()))
     joined = tmp_path / "c.mcap"
     joined.write_bytes(first.read_bytes() + second.read_bytes())
     with pytest.raises(RecordingError, match=r"follow its end, as where two files were joined"):
@@ -48,7 +48,7 @@ def test_joined_files_are_refused_and_recovered_as_a_whole(tmp_path: Path) -> No
 
 
 def test_bytes_behind_the_end_are_counted(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mcap", ("/cf1/pose", PoseInFrame()))
+    path = write_foreign_recording(tmp_path / "a.mcap", ("/cf1/pose", PoseInFrame()))
     path.write_bytes(path.read_bytes() + b"\0" * 50)
     assert recover(path, tmp_path / "b.mcap").lost_bytes == 50
 
@@ -56,7 +56,9 @@ def test_bytes_behind_the_end_are_counted(tmp_path: Path) -> None:
 def test_a_stamped_message_on_the_topic_of_another_is_checked(tmp_path: Path) -> None:
     image, pose = CompressedImage(), PoseInFrame()
     image.timestamp.seconds = pose.timestamp.seconds = 1
-    path = write(tmp_path / "a.mcap", ("/cf1/pose", image), ("/cf1/camera/image", pose))
+    path = write_foreign_recording(
+        tmp_path / "a.mcap", ("/cf1/pose", image), ("/cf1/camera/image", pose)
+    )
     found = [f.text for f in check(path) if f.level == "error"]
     assert found == [
         "carries foxglove.PoseInFrame, not foxglove.CompressedImage",

@@ -37,15 +37,15 @@ def test_decoded_columns_equal_those_of_the_messages(flight: Path) -> None:
     for topic, fields in (("/cf1/attitude", ["roll_rad"]), ("/cf1/range/cf2", ["range_m"])):
         wanted = read_table(flight, topic, fields=fields)
         assert held.get_table(topic, fields) == wanted
-        # The columns were handed over; the topic is read again.
+        # The first call hands over the decoded columns, so the second reads the file again.
         assert held.get_table(topic, fields) == wanted
         assert held.get_table(topic) == read_table(flight, topic)
         assert held.get_times(topic).tolist() == wanted["log_time"].to_pylist()
     assert held.get_table(calibration) == read_table(flight, calibration)
 
 
-def broken(path: Path, topic: str, schema: str) -> Path:
-    """One message that is no message of its type."""
+def write_undecodable_message(path: Path, topic: str, schema: str) -> Path:
+    """Write one message with a field of the wrong wire type, under this schema."""
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
@@ -57,7 +57,7 @@ def broken(path: Path, topic: str, schema: str) -> Path:
 
 
 def test_errors_name_the_file_and_the_topic(tmp_path: Path, flight: Path) -> None:
-    path = broken(tmp_path / "a.mcap", "/cf1/height", "Height")
+    path = write_undecodable_message(tmp_path / "a.mcap", "/cf1/height", "Height")
     where = r"a\.mcap.*/cf1/height"
     for call in (
         lambda: LoadedRecording(path).get_table("/cf1/height"),
@@ -69,7 +69,7 @@ def test_errors_name_the_file_and_the_topic(tmp_path: Path, flight: Path) -> Non
             call()
     with pytest.raises(MissingTopic, match=r"no topic /cf1/heights .*flight\.mcap.*"):
         LoadedRecording(flight).get_table("/cf1/heights")
-    other = broken(tmp_path / "b.mcap", "/cf1/labels", "Height")
+    other = write_undecodable_message(tmp_path / "b.mcap", "/cf1/labels", "Height")
     for wanted in ((), ("/{robot}/labels",)):
         with pytest.raises(RecordingError, match=r"b\.mcap: /cf1/labels carries dmrl\.v1\.Height"):
             LoadedRecording(other, *wanted).get_table("/cf1/labels")

@@ -1,4 +1,4 @@
-"""Index offsets past the end, before the start, or in another record, with correct checksums."""
+"""Wrong offsets in the summary give an error or no loss, even if every CRC is correct."""
 
 import struct
 import zlib
@@ -20,40 +20,43 @@ FIELDS = {
     Opcode.METADATA_INDEX: (0, 8),
     Opcode.SUMMARY_OFFSET: (1, 9),
 }
-"""Where in a record a place and a size stand."""
+"""Byte offsets of two numbers in each record: an offset in the file, and a length or size."""
 FOOTER = 9 + 20 + len(parts.MAGIC)
 
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording with chunks, attachments and metadata."""
+    """Return a recording with chunks, attachments and metadata."""
     return Inputs(tmp_path_factory.mktemp("inputs")).flight
 
 
-def with_place(data: bytes, opcode: int, at: int, place: int) -> bytes:
-    """The recording with another place in the first record of a kind in its summary."""
+def replace_offset(data: bytes, opcode: int, at: int, offset: int) -> bytes:
+    """Return the recording with the number at byte ``at`` of a summary record replaced.
+
+    The record is the first one of this opcode. The summary's CRC is computed again.
+    """
     end = len(data) - FOOTER
     start = struct.unpack_from("<Q", data, end + 9)[0]
     records, starts = parts.taken_apart(data, start, end)
     first = next(s for (kind, _), s in zip(records, starts, strict=True) if kind == opcode)
     out = bytearray(data)
-    struct.pack_into("<Q", out, first + 9 + at, place)
+    struct.pack_into("<Q", out, first + 9 + at, offset)
     crc = zlib.crc32(out[start : end + 9 + 16])
     struct.pack_into("<I", out, end + 9 + 16, crc)
     return bytes(out)
 
 
-@pytest.mark.parametrize("place", ["past", "end", 2**62, 2**64 - 1, 0])
+@pytest.mark.parametrize("offset", ["past", "end", 2**62, 2**64 - 1, 0])
 @pytest.mark.parametrize("opcode", FIELDS, ids=lambda opcode: Opcode(opcode).name)
 def test_invalid_offset_gives_one_line_error_and_loses_nothing(
-    opcode: Opcode, place: int | str, sound: Path, tmp_path: Path
+    opcode: Opcode, offset: int | str, sound: Path, tmp_path: Path
 ) -> None:
     data = sound.read_bytes()
-    number = {"past": len(data) + 1000, "end": len(data) - 1}.get(str(place), place)
+    number = {"past": len(data) + 1000, "end": len(data) - 1}.get(str(offset), offset)
     assert isinstance(number, int)
     bad, out = tmp_path / "bad.mcap", tmp_path / "out.mcap"
     for at in FIELDS[opcode]:
-        bad.write_bytes(with_place(data, opcode, at, number))
+        bad.write_bytes(replace_offset(data, opcode, at, number))
         for command in ("info", "check"):
             status, output = ended(lambda c=command: cli(c, bad))
             assert status == 0 or "bad.mcap" in output

@@ -11,8 +11,11 @@ from dmrl.recording.overview import ancestry_lines
 from dmrl.recording.provenance import Input
 
 
-def rounds(count: int, flights: int) -> Provenance:
-    """A model that learned from flights that the model before had labelled, and so on."""
+def build_rounds(count: int, flights: int) -> Provenance:
+    """Return the provenance of a model that was trained for this many rounds.
+
+    Each round trains on flights that the model of the round before labelled.
+    """
     model = Provenance("train", {"round": 0})
     for k in range(1, count + 1):
         before = Input(f"model-{k - 1}", f"{k - 1:064d}", model)
@@ -25,27 +28,27 @@ def rounds(count: int, flights: int) -> Provenance:
 
 
 def test_shared_ancestors_are_written_once() -> None:
-    text = json.dumps(rounds(12, 20).to_json())
-    assert len(text) < 14 * len(json.dumps(rounds(1, 20).to_json()))
+    text = json.dumps(build_rounds(12, 20).to_json())
+    assert len(text) < 14 * len(json.dumps(build_rounds(1, 20).to_json()))
 
 
 def test_provenance_with_shared_ancestors_round_trips() -> None:
-    made = rounds(2, 3)
+    made = build_rounds(2, 3)
     again = Provenance.from_json(json.loads(json.dumps(made.to_json())))
     assert again == made
     assert Provenance.from_metadata(made.to_metadata()) == made
 
 
 def test_provenance_with_repeated_ancestors_is_read() -> None:
-    """As dmrl wrote it at first."""
-    made = rounds(1, 2)
+    """Early versions of dmrl wrote such provenance."""
+    made = build_rounds(1, 2)
     document = made.to_json()
     document["inputs"][1]["provenance"]["inputs"] = document["inputs"][0]["provenance"]["inputs"]
     assert Provenance.from_json(document) == made
 
 
 def test_info_abbreviates_repeated_ancestors() -> None:
-    lines = ancestry_lines(rounds(1, 2))
+    lines = ancestry_lines(build_rounds(1, 2))
     assert [line.rpartition(", ")[2] for line in lines if "model-0" in line] == [
         f"made by: dmrl {Provenance('x').dmrl_version} train round=0",
         "as above",
@@ -58,14 +61,14 @@ def test_settings_in_tables_have_their_table_and_zero_is_a_setting() -> None:
     assert ancestry_lines(made)[0].endswith(" fly vision.lost_share=0.0 seed=0")
 
 
-def test_it_is_written_to_a_folder(tmp_path: Path) -> None:
-    made = rounds(2, 2)
+def test_provenance_is_written_to_a_folder(tmp_path: Path) -> None:
+    made = build_rounds(2, 2)
     made.write(tmp_path)
     text = (tmp_path / "provenance.json").read_text()
     assert Provenance.from_json(json.loads(text)) == made
 
 
-def test_the_oldest_of_a_long_ancestry_keep_their_hash_alone() -> None:
+def test_ancestors_beyond_the_limit_are_reduced_to_their_hash() -> None:
     made = Provenance("first")
     for k in range(300):
         made = Provenance(f"step {k}", inputs=(Input(f"{k}.mcap", f"{k:064x}", made),))

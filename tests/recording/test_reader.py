@@ -1,3 +1,5 @@
+"""Reading recordings: order, time spans, columns, samples, and errors of damaged files."""
+
 import io
 import struct
 from pathlib import Path
@@ -27,8 +29,8 @@ from dmrl.recording.mcap.chunks import chunk_builder, chunk_reader
 HEIGHT = message_class("Height")
 
 
-def foreign(path: Path, times_ns: list[int], **options: object) -> Path:
-    """A recording by mcap's own writer."""
+def write_foreign_heights(path: Path, times_ns: list[int], **options: object) -> Path:
+    """Write heights in metres equal to their times in ns, with the mcap package."""
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=200, **options)  # type: ignore[arg-type]
         writer.start()
@@ -61,7 +63,7 @@ SHUFFLED = np.random.default_rng(0).permutation(500).tolist()
 def test_any_complete_file_is_read_in_time_order(
     tmp_path: Path, options: dict[str, object]
 ) -> None:
-    path = foreign(tmp_path / "a.mcap", SHUFFLED, **options)
+    path = write_foreign_heights(tmp_path / "a.mcap", SHUFFLED, **options)
     assert [s.message.height_m for s in read(path)] == list(range(500))
     assert read_table(path, "/cf1/height")["height_m"].to_pylist() == list(range(500))
     assert read_summary(path).topics["/cf1/height"].count == 500
@@ -80,8 +82,10 @@ def test_time_spans_are_half_open(flight: Path) -> None:
 
 @pytest.mark.parametrize("times_ns", [SHUFFLED, [400, *range(400), *range(401, 500)]])
 @pytest.mark.heavy
-def test_any_window_of_overlapping_chunks_is_whole(tmp_path: Path, times_ns: list[int]) -> None:
-    path = foreign(tmp_path / "a.mcap", times_ns)
+def test_time_spans_of_overlapping_chunks_are_read_completely(
+    tmp_path: Path, times_ns: list[int]
+) -> None:
+    path = write_foreign_heights(tmp_path / "a.mcap", times_ns)
     for low, high in ((0, 1), (17, 18), (100, 399), (399, 402), (499, 500), (500, 900), (30, 30)):
         found = read_table(path, "/cf1/height", start_ns=low, end_ns=high)
         assert found["log_time"].to_pylist() == list(range(low, min(high, 500)))
@@ -119,7 +123,7 @@ def test_only_the_fields_asked_for_are_decoded(flight: Path) -> None:
     assert read_table(flight, "/cf1/attitude", fields=[]).num_rows == 4000
 
 
-def test_patterns_name_topics(flight: Path) -> None:
+def test_topics_are_selected_by_pattern(flight: Path) -> None:
     assert {raw.topic for raw in read_raw(flight, "/*/range/*")} == {"/cf1/range/cf2"}
 
 
@@ -145,7 +149,7 @@ def test_a_topic_with_another_schema_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_type_unknown_to_dmrl_is_read_by_its_own_schema(tmp_path: Path) -> None:
-    path = foreign(tmp_path / "a.mcap", [1, 2])
+    path = write_foreign_heights(tmp_path / "a.mcap", [1, 2])
     data = path.read_bytes()
     assert data.count(b"Height") >= 2
     with path.open("wb") as stream:
@@ -178,8 +182,8 @@ def test_a_json_channel_is_copied_but_not_decoded(tmp_path: Path) -> None:
 
 
 def test_memory_stays_bounded_when_chunks_touch_in_time(tmp_path: Path) -> None:
-    """Chunks that share their border time must not chain into one block."""
-    path = foreign(tmp_path / "a.mcap", [t for k in range(300) for t in (k, k)])
+    """Chunks that share only their border time are not read as one block."""
+    path = write_foreign_heights(tmp_path / "a.mcap", [t for k in range(300) for t in (k, k)])
     assert max(len(batch) for batch in iter_columns(path, "/cf1/height")) < 50
 
 
@@ -222,7 +226,7 @@ def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
 
 @pytest.mark.heavy
 def test_every_flipped_byte_is_an_error_or_changes_nothing(flight: Path, tmp_path: Path) -> None:
-    """No single damaged byte gives another exception than ours, or silently other values."""
+    """A flipped byte raises RecordingError or changes no message."""
     data = flight.read_bytes()
     good = list(read_raw(flight))
     path = tmp_path / "bad.mcap"
@@ -233,7 +237,7 @@ def test_every_flipped_byte_is_an_error_or_changes_nothing(flight: Path, tmp_pat
             got = list(read_raw(path))
         except RecordingError:
             continue
-        # A flip in metadata, or in a part of the summary that is not needed, does nothing.
+        # A flip in metadata, or in an unused part of the summary, changes no message.
         assert [(r.time_ns, r.data) for r in got] == [(r.time_ns, r.data) for r in good], at
 
 
@@ -302,7 +306,7 @@ def test_topic_samples_cover_the_recording_in_few_chunks(
     with RecordingWriter(path, Provenance("test")) as sink:
         for raw in read_raw(flight):
             sink.write_raw(raw)
-        # One message, in the middle of the file though not of the time.
+        # The message is last in the file, but its time lies inside the recording.
         sink.write(39_000_000_000, "/cf2/height", HEIGHT(height_m=2.0))
     unpacked, chunks = chunk_reader.decompress, set()
     monkeypatch.setattr(
@@ -322,9 +326,9 @@ def test_topic_samples_cover_the_recording_in_few_chunks(
 
 @pytest.mark.heavy
 def test_topic_samples_include_topics_of_other_chunks(tmp_path: Path) -> None:
-    # Chunks of a few messages each that all span the whole time.
+    # Every chunk has few messages but spans the whole recording.
     times = [time for k in range(1, 499) for time in (0, k, 499)]
-    path = foreign(tmp_path / "a.mcap", times)
+    path = write_foreign_heights(tmp_path / "a.mcap", times)
     (time_ns,) = sample_topics(path, {"/cf1/height": None}, start_ns=251, end_ns=252)[
         "/cf1/height"
     ][0]

@@ -4,8 +4,6 @@ from math import sin
 from pathlib import Path
 
 import pytest
-from mcap.reader import make_reader
-from mcap.records import ChunkIndex
 from mcap.writer import Writer
 
 from dmrl.errors import RecordingError
@@ -13,19 +11,14 @@ from dmrl.messages import message_class, serialize_schema
 from dmrl.recording import Provenance, RecordingWriter, read_raw, recover
 from dmrl.stages.recover import describe_losses
 
+from .records import read_chunk_indexes
+
 TOPICS = ("/cf1/height", "/cf2/height")
 
 
-def chunks(path: Path) -> list[ChunkIndex]:
-    with path.open("rb") as stream:
-        found = make_reader(stream).get_summary()
-    assert found is not None
-    return found.chunk_indexes
-
-
 @pytest.fixture
-def broken(tmp_path: Path) -> tuple[Path, int]:
-    """Three chunks, the middle one damaged, and how many messages that one had."""
+def damaged_recording(tmp_path: Path) -> tuple[Path, int]:
+    """Write three chunks and damage the second; return the file and the number of its messages."""
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(2700):
@@ -33,7 +26,7 @@ def broken(tmp_path: Path) -> tuple[Path, int]:
                 sink.flush()
             height = message_class("Height")(height_m=sin(k))
             sink.write(k, TOPICS[k % 3 == 0], height)
-    middle = chunks(path)[1]
+    middle = read_chunk_indexes(path)[1]
     data = bytearray(path.read_bytes())
     data[middle.chunk_start_offset + middle.chunk_length // 2] ^= 255
     path.write_bytes(data)
@@ -41,9 +34,9 @@ def broken(tmp_path: Path) -> tuple[Path, int]:
 
 
 def test_messages_lost_in_a_damaged_chunk_are_counted_by_topic(
-    broken: tuple[Path, int], tmp_path: Path
+    damaged_recording: tuple[Path, int], tmp_path: Path
 ) -> None:
-    path, lost = broken
+    path, lost = damaged_recording
     found = recover(path, tmp_path / "b.mcap")
     assert found.missing == {TOPICS[0]: lost * 2 // 3, TOPICS[1]: lost // 3}
     assert (found.messages, found.damaged_chunks, found.lost_bytes) == (1800, 1, 0)
@@ -51,15 +44,15 @@ def test_messages_lost_in_a_damaged_chunk_are_counted_by_topic(
 
 
 def test_truncated_file_reports_indexed_losses_only(
-    broken: tuple[Path, int], tmp_path: Path
+    damaged_recording: tuple[Path, int], tmp_path: Path
 ) -> None:
-    path, lost = broken
-    last = chunks(path)[2]
+    path, lost = damaged_recording
+    last = read_chunk_indexes(path)[2]
     cut = last.chunk_start_offset + 1000
     path.write_bytes(path.read_bytes()[:cut])
     found = recover(path, tmp_path / "b.mcap")
     assert found.messages == 900
-    assert sum(found.missing.values()) == lost  # not those of the last chunk: nobody knows
+    assert sum(found.missing.values()) == lost  # messages of the truncated chunk are unknown
     assert (found.counted, found.lost_bytes, found.whole) == (False, 1000, False)
 
 

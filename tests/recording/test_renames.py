@@ -1,4 +1,4 @@
-"""Lost and repeated records of other writers: noticed without any checksum."""
+"""Lost, repeated and contradictory records are detected even in files without checksums."""
 
 import struct
 import zlib
@@ -22,11 +22,11 @@ from dmrl.recording import (
 )
 from dmrl.recording.mcap.file import MAGIC
 
-from .records import records, small
+from .records import iter_records, write_small_recording
 
 
-def foreign(path: Path, **options: Any) -> Path:
-    """Seven messages on one topic, by mcap's own writer."""
+def write_foreign_heights(path: Path, **options: Any) -> Path:
+    """Write seven messages on one topic with the mcap package."""
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=100, **options)
         writer.start()
@@ -57,7 +57,7 @@ def foreign(path: Path, **options: Any) -> Path:
 def test_optional_records_of_other_writers_may_be_missing(
     tmp_path: Path, options: dict[str, Any]
 ) -> None:
-    path = foreign(tmp_path / "a.mcap", **options)
+    path = write_foreign_heights(tmp_path / "a.mcap", **options)
     assert [raw.time_ns for raw in read_raw(path)] == list(range(7))
     assert read_summary(path).topics["/cf1/height"].count == 7
     assert read_log_times(path, ["/cf1/height"])["/cf1/height"].tolist() == list(range(7))
@@ -65,13 +65,13 @@ def test_optional_records_of_other_writers_may_be_missing(
 
 
 def test_lost_channel_is_detected_without_crc(tmp_path: Path) -> None:
-    """The statistics and indexes tell, where a writer left out the sums."""
-    path = foreign(tmp_path / "a.mcap", enable_crcs=False)
+    """Statistics and chunk indexes reveal the loss if the file has no checksums."""
+    path = write_foreign_heights(tmp_path / "a.mcap", enable_crcs=False)
     data = path.read_bytes()
-    starts = {opcode: at for opcode, at, _ in records(data)}
+    starts = {opcode: at for opcode, at, _ in iter_records(data)}
     channel = starts[Opcode.CHANNEL]
     path.write_bytes(data[:channel] + b"\x7f" + data[channel + 1 :])
-    # Nothing else is defined there, so that all of it is read: nothing is lost.
+    # The file has only one channel, so all messages are still read.
     assert len(list(read_raw(path))) == 7
     index = starts[Opcode.CHUNK_INDEX]
     path.write_bytes(data[:index] + b"\x7f" + data[index + 1 :])
@@ -79,8 +79,8 @@ def test_lost_channel_is_detected_without_crc(tmp_path: Path) -> None:
         list(read_raw(path))
 
 
-def rejoined(path: Path, parts: list[tuple[int, bytes]]) -> None:
-    """The file of these records, with a footer that finds its summary and sums up nothing."""
+def write_records(path: Path, parts: list[tuple[int, bytes]]) -> None:
+    """Write a file of these records; its footer locates the summary and has no CRC."""
     at, start = 8, 0
     for opcode, record in parts:
         at += len(record)
@@ -102,24 +102,24 @@ def rejoined(path: Path, parts: list[tuple[int, bytes]]) -> None:
 def test_repeated_record_is_detected_without_crc(
     tmp_path: Path, kind: Opcode, place: Opcode, complaint: str
 ) -> None:
-    path = small(tmp_path / "a.mcap")
+    path = write_small_recording(tmp_path / "a.mcap")
     data = path.read_bytes()
-    parts = [(opcode, data[start:end]) for opcode, start, end in records(data)]
+    parts = [(opcode, data[start:end]) for opcode, start, end in iter_records(data)]
     twin = next(part for part in reversed(parts) if part[0] == kind)
     other = (kind, twin[1].replace(b"cf1", b"cf9").replace(b"Range", b"Ranje"))
     at = next(k for k, (opcode, _) in enumerate(parts) if opcode == place)
-    rejoined(path, parts)
+    write_records(path, parts)
     assert len(list(read_raw(path))) == 7
-    rejoined(path, [*parts[:at], other, *parts[at:]])
+    write_records(path, [*parts[:at], other, *parts[at:]])
     with pytest.raises(RecordingError, match=complaint):
         list(read_raw(path))
 
 
 def test_a_summary_with_a_crc_that_renames_a_topic_is_noticed(tmp_path: Path) -> None:
-    """Made by somebody who knows: every sum is right, and other readers would see another topic."""
-    path = foreign(tmp_path / "a.mcap", compression=CompressionType.NONE)
+    """Every CRC is correct, as in a forged file, and other readers would see another topic."""
+    path = write_foreign_heights(tmp_path / "a.mcap", compression=CompressionType.NONE)
     data = bytearray(path.read_bytes())
-    end = next(start for opcode, start, _ in records(bytes(data)) if opcode == Opcode.DATA_END)
+    end = next(start for opcode, start, _ in iter_records(bytes(data)) if opcode == Opcode.DATA_END)
     at = data.index(b"/cf1/height", end)
     data[at : at + 11] = b"/cf1/heigst"
     footer = len(data) - len(MAGIC) - 9 - 20
@@ -137,12 +137,14 @@ def test_a_summary_with_a_crc_that_renames_a_topic_is_noticed(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("renamed", ["summary", "messages"])
-def test_without_an_index_too_a_topic_has_one_name(renamed: str, tmp_path: Path) -> None:
-    """Read as a whole, the later of two definitions was believed."""
+def test_contradictory_channel_definitions_are_refused_without_an_index(
+    renamed: str, tmp_path: Path
+) -> None:
+    """A file without an index is read from front to back, where the last definition would win."""
     options = {"compression": CompressionType.NONE, "index_types": IndexType.NONE}
-    path = foreign(tmp_path / "a.mcap", enable_crcs=False, **options)
+    path = write_foreign_heights(tmp_path / "a.mcap", enable_crcs=False, **options)
     data = path.read_bytes()
-    end = next(start for opcode, start, _ in records(data) if opcode == Opcode.DATA_END)
+    end = next(start for opcode, start, _ in iter_records(data) if opcode == Opcode.DATA_END)
     halves = {"messages": data[:end], "summary": data[end:]}
     assert halves[renamed].count(b"/cf1/height") == 1
     halves[renamed] = halves[renamed].replace(b"/cf1/height", b"/cf1/heigst")
@@ -153,10 +155,12 @@ def test_without_an_index_too_a_topic_has_one_name(renamed: str, tmp_path: Path)
 
 
 def test_a_summary_without_crc_that_renames_a_topic_is_noticed(tmp_path: Path) -> None:
-    """The chunks say what the topic is called, as every other reader would."""
-    path = foreign(tmp_path / "a.mcap", enable_crcs=False, compression=CompressionType.NONE)
+    """The definition in the chunk contradicts the summary."""
+    path = write_foreign_heights(
+        tmp_path / "a.mcap", enable_crcs=False, compression=CompressionType.NONE
+    )
     data = path.read_bytes()
-    end = next(start for opcode, start, _ in records(data) if opcode == Opcode.DATA_END)
+    end = next(start for opcode, start, _ in iter_records(data) if opcode == Opcode.DATA_END)
     assert data[:end].count(b"/cf1/height") == data[end:].count(b"/cf1/height") == 1
     path.write_bytes(data[:end] + data[end:].replace(b"/cf1/height", b"/cf1/heigst"))
     complaint = "the definition of /cf1/height contradicts the summary"

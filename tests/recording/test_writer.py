@@ -1,3 +1,5 @@
+"""Writing recordings: order, errors, interrupted writers, and separate chunks for images."""
+
 import os
 import signal
 import subprocess
@@ -28,6 +30,7 @@ HEIGHT = message_class("Height")
 
 
 def write_heights(path: Path, times_ns: list[int]) -> Path:
+    """Write heights in metres equal to their times in seconds."""
     with RecordingWriter(path, Provenance("test")) as sink:
         for time_ns in times_ns:
             sink.write(time_ns, "/cf1/height", HEIGHT(height_m=time_ns / 1e9))
@@ -40,7 +43,7 @@ def test_written_messages_are_read_back(tmp_path: Path) -> None:
     assert got == [(0, "/cf1/height", 0.0), (5, "/cf1/height", 5e-9), (10, "/cf1/height", 1e-8)]
 
 
-def test_same_messages_same_bytes(tmp_path: Path) -> None:
+def test_same_messages_give_the_same_bytes(tmp_path: Path) -> None:
     a = write_heights(tmp_path / "a.mcap", list(range(1000)))
     b = write_heights(tmp_path / "b.mcap", list(range(1000)))
     assert a.read_bytes() == b.read_bytes()
@@ -97,7 +100,7 @@ def test_publish_time_is_kept_apart_from_log_time(tmp_path: Path) -> None:
     assert times == [(5, 9), (6, 0), (7, 7)]
 
 
-KILLED = """
+WRITE_FOREVER = """
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -117,7 +120,7 @@ with RecordingWriter(Path(sys.argv[1]), Provenance("test")) as sink:
 def test_kill_9_leaves_everything_before_the_open_chunk(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     child = subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", WRITE_FOREVER, str(path)], stdout=subprocess.PIPE, text=True
     )
     assert child.stdout is not None
     lines = [child.stdout.readline() for _ in range(60)]
@@ -128,7 +131,7 @@ def test_kill_9_leaves_everything_before_the_open_chunk(tmp_path: Path) -> None:
     written, in_open_chunk = map(int, lines[-1].split())
     assert not path.exists()
     result = recover(tmp_path / "a.mcap.partial", tmp_path / "b.mcap")
-    # A message takes at least 31 bytes in a chunk, so this many may be in the open one.
+    # A message takes at least 31 bytes, which limits the number in the open chunk.
     assert result.messages >= written - in_open_chunk // 31 > 1000
     got = [s.message.height_m for s in read(tmp_path / "b.mcap")]
     assert got == [k * 0.1 for k in range(result.messages)]
@@ -153,8 +156,8 @@ def test_neither_time_may_be_negative(tmp_path: Path, time_ns: int, publish_ns: 
     assert list(tmp_path.iterdir()) == []
 
 
-def filmed(path: Path, moments: int = 400) -> Path:
-    """Attitude at 100 Hz, a picture of 8 kB that does not compress at every fifth moment."""
+def write_flight_with_images(path: Path, moments: int = 400) -> Path:
+    """Write an attitude each ns, and every 5 ns an incompressible 8 kB image and a grid map."""
     rng = np.random.default_rng(0)
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(moments):
@@ -169,7 +172,7 @@ def filmed(path: Path, moments: int = 400) -> Path:
 def test_images_have_separate_chunks_from_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = filmed(tmp_path / "a.mcap")
+    path = write_flight_with_images(tmp_path / "a.mcap")
     read_bytes: list[int] = []
     unpacked = chunk_reader.decompress
     monkeypatch.setattr(
@@ -185,7 +188,7 @@ def test_images_have_separate_chunks_from_numbers(
 
 
 def test_mcap_library_reads_the_same_messages(tmp_path: Path) -> None:
-    path = filmed(tmp_path / "a.mcap")
+    path = write_flight_with_images(tmp_path / "a.mcap")
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         theirs = [(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages()]
@@ -215,7 +218,7 @@ def test_rare_messages_are_flushed_beside_frequent_images(
             sink.write(k, "/cf1/camera/image", picture)
         recover(tmp_path / "a.mcap.partial", mended)
     kept = read_summary(mended).topics
-    # Three pictures are a chunk at most; labels wait for so many chunks of them.
+    # A chunk holds three images at most; labels are flushed after this many image chunks.
     assert kept["/cf1/camera/image"].count >= 57
     assert kept["/cf1/labels"].count >= 60 - 3 - chunks * 3
 

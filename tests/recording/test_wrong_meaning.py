@@ -1,7 +1,7 @@
-"""Files with right checksums and wrong meaning: all messages arrive, or an error says otherwise.
+"""Inconsistent files with correct checksums lose no message without an error.
 
-`walk`, an independent walk over the bytes, is the oracle. Outputs are read by it and by mcap's own
-readers, with their indexes and without.
+The oracle is `walk`, an independent parser. Outputs are read by it and by mcap's own readers,
+with and without their indexes.
 """
 
 import os
@@ -24,24 +24,24 @@ from dmrl.recording import trim as trim_range
 from dmrl.stages import check, info, merge, trim
 from dmrl.stages.recover import describe_losses
 
-from .test_conformance import official
+from .test_conformance import read_by_mcap
 from .walk import Content, walk
-from .wrong_meaning import FAULTS, draw
+from .wrong_meaning import FAULTS, draw_file
 
 MAX_NS = 2**63 - 1
 SAMPLE, MANY = 100, 10_000
 
 
-def readable(path: Path) -> Content:
-    """What the bytes of a file have, without messages that lack a channel."""
+def read_readable_content(path: Path) -> Content:
+    """Return the content of a file, without messages that lack a channel definition."""
     found = walk(path)
     found.set_aside_nameless()
     return found
 
 
-def same_everywhere(out: Path, want: dict[str, list]) -> None:
-    """A copy has what it must have, whoever reads it."""
-    assert walk(out).comparable() == official(out).comparable() == want
+def assert_same_for_every_reader(out: Path, want: dict[str, list]) -> None:
+    """Assert that a copy has the wanted content for three independent readers."""
+    assert walk(out).comparable() == read_by_mcap(out).comparable() == want
     with out.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         got = [(c.topic, m.log_time, m.sequence, m.data) for _, c, m in reader.iter_messages()]
@@ -49,7 +49,7 @@ def same_everywhere(out: Path, want: dict[str, list]) -> None:
 
 
 def result_or_none(read: Callable[[], Any]) -> Any:
-    """What a command returns; None if it says that it cannot."""
+    """Return the result of a command, or None if it raises a DmrlError of one line."""
     try:
         return read()
     except DmrlError as e:
@@ -57,14 +57,14 @@ def result_or_none(read: Callable[[], Any]) -> Any:
         return None
 
 
-def between(content: Content, low: int, high: int) -> dict[str, list]:
-    """Everything, but of the messages those of a time range."""
+def select_time_range(content: Content, low: int, high: int) -> dict[str, list]:
+    """Return the content with only the messages from ``low`` to before ``high``, ns."""
     want = content.comparable()
     return want | {"messages": [m for m in want["messages"] if low <= m[1] < high]}
 
 
-def copies(path: Path, empty: Path, out: Path, content: Content) -> None:
-    """Each copy is complete, or an error."""
+def check_copies(path: Path, empty: Path, out: Path, content: Content) -> None:
+    """Assert that trim and merge write complete copies or raise an error."""
     want = content.comparable()
     times = sorted({m[1] for m in want["messages"] if m[1] < MAX_NS})
     ranges = [(times[len(times) // 3], times[-1] + 1), (times[0], times[-1])] if times else []
@@ -76,7 +76,7 @@ def copies(path: Path, empty: Path, out: Path, content: Content) -> None:
         tried.append(
             (
                 lambda low=low, high=high: trim_range(path, out, start_ns=low, end_ns=high),
-                between(content, low, high),
+                select_time_range(content, low, high),
             )
         )
     for copy, expected in tried:
@@ -87,12 +87,12 @@ def copies(path: Path, empty: Path, out: Path, content: Content) -> None:
         found = walk(out).comparable()
         if expected is not want:  # channels without messages in the range are left out
             expected = expected | {k: found[k] for k in ("channels", "schemas")}
-        same_everywhere(out, expected)
+        assert_same_for_every_reader(out, expected)
         out.unlink()
 
 
-def reads(path: Path, content: Content) -> None:
-    """What is counted and read is complete, or an error."""
+def check_reads(path: Path, content: Content) -> None:
+    """Assert that info, check and the readers count and read every message, or raise an error."""
     want = content.comparable()["messages"]
     counts = Counter(channel[0] for channel, *_ in want)
     if (overview := result_or_none(lambda: info.run(path).to_document())) is not None:
@@ -121,8 +121,8 @@ def reads(path: Path, content: Content) -> None:
                 assert sorted(found) == inside
 
 
-def recovers(path: Path, out: Path, content: Content) -> None:
-    """Every readable message is brought back, and what was lost is told."""
+def check_recovery(path: Path, out: Path, content: Content) -> None:
+    """Assert that recover restores every readable message and reports the losses."""
     want = content.comparable()
     report = result_or_none(lambda: recover(path, out))
     if report is None:
@@ -132,36 +132,37 @@ def recovers(path: Path, out: Path, content: Content) -> None:
     found = walk(out).comparable()
     if "a channel is defined otherwise" not in content.unreadable:
         lost = Counter(map(repr, timed)) - Counter(map(repr, found["messages"]))
-        assert lost.total() <= report.nameless  # defined behind them, in the summary alone
+        # Messages whose channel is defined only in the summary are counted as nameless.
+        assert lost.total() <= report.nameless
         assert len(found["messages"]) == len(timed) - lost.total()
     assert len(found["messages"]) == report.messages
     if report.whole:
         assert not content.unreadable and len(timed) == len(want["messages"])
-        same_everywhere(out, want)
+        assert_same_for_every_reader(out, want)
     else:
         assert describe_losses(report)
     out.unlink()
 
 
-def judge(seed: int, path: Path, out: Path, empty: Path) -> tuple[str, ...]:
-    """Make a file and send it through every command; return its faults."""
-    data, faults = draw(Random(seed))
+def check_commands(seed: int, path: Path, out: Path, empty: Path) -> tuple[str, ...]:
+    """Draw a file from a seed and check every command on it; return its faults."""
+    data, faults = draw_file(Random(seed))
     path.unlink(missing_ok=True)
     out.unlink(missing_ok=True)
     path.write_bytes(data)
-    os.utime(path, (10**9 + seed, 10**9 + seed))  # so old that its summary is cached
-    content = readable(path)
+    os.utime(path, (10**9 + seed, 10**9 + seed))  # only summaries of older files are cached
+    content = read_readable_content(path)
     if not faults:
-        assert official(path).comparable() == content.comparable()
-    reads(path, content)
-    copies(path, empty, out, content)
-    recovers(path, out, content)
+        assert read_by_mcap(path).comparable() == content.comparable()
+    check_reads(path, content)
+    check_copies(path, empty, out, content)
+    check_recovery(path, out, content)
     return faults
 
 
 @pytest.fixture
 def places(tmp_path: Path) -> tuple[Path, Path, Path]:
-    """A file, an output, and an empty recording to merge with."""
+    """Return the paths of an input, an output, and an empty recording to merge with."""
     empty = tmp_path / "empty.mcap"
     with writer(empty):
         pass
@@ -176,20 +177,20 @@ def test_hundred_inconsistent_files_lose_no_message_silently(
     places: tuple[Path, Path, Path], part: int
 ) -> None:
     for seed in range(part, SAMPLE, 5):
-        judge(seed, *places)
+        check_commands(seed, *places)
 
 
 @pytest.mark.slow
 def test_ten_thousand_inconsistent_files_lose_no_message_silently(
     places: tuple[Path, Path, Path], record_property: Callable[[str, object], None]
 ) -> None:
-    """Files by fault are a property of ``--junitxml FILE -o junit_family=xunit1``."""
+    """``--junitxml FILE -o junit_family=xunit1`` records the number of files by fault."""
     seen: Counter[str] = Counter()
 
     @settings(max_examples=MANY, derandomize=True, database=None)
     @given(st.integers(SAMPLE, 2**31))
     def every(seed: int) -> None:
-        seen.update(judge(seed, *places) or ("none",))
+        seen.update(check_commands(seed, *places) or ("none",))
 
     every()
     record_property("files by fault", dict(sorted(seen.items())))

@@ -9,20 +9,20 @@ import pytest
 from dmrl.images.codec import encode_png
 from dmrl.recording import check
 
-from .test_check_recording import Write, calibrated, image, record
+from .test_check_recording import Write, build_calibration, build_image, record_and_check
 
 
 def test_images_without_calibration_or_of_another_size_are_found(tmp_path: Path) -> None:
-    assert record(tmp_path / "a.mcap", lambda write: write(0, "/cf1/camera/image", image())) == [
-        "warning /cf1/camera/image no calibration on /cf1/camera/calibration"
-    ]
+    assert record_and_check(
+        tmp_path / "a.mcap", lambda write: write(0, "/cf1/camera/image", build_image())
+    ) == ["warning /cf1/camera/image no calibration on /cf1/camera/calibration"]
 
     def fill(write: Write) -> None:
-        write(0, "/cf1/camera/calibration", calibrated(324, 244))
-        write(0, "/cf1/camera/image", image())
-        write(1, "/cf1/camera/image", image(b"no image"))
+        write(0, "/cf1/camera/calibration", build_calibration(324, 244))
+        write(0, "/cf1/camera/image", build_image())
+        write(1, "/cf1/camera/image", build_image(b"no image"))
 
-    findings = record(tmp_path / "b.mcap", fill)
+    findings = record_and_check(tmp_path / "b.mcap", fill)
     assert (
         "error /cf1/camera/image images of 320x224, but the calibration is for 324x244" in findings
     )
@@ -41,12 +41,12 @@ def test_images_are_of_one_size_and_of_the_calibrated(
     tmp_path: Path, sizes: list[tuple[int, int]], said: list[str]
 ) -> None:
     def fill(write: Write) -> None:
-        write(0, "/cf1/camera/calibration", calibrated())
+        write(0, "/cf1/camera/calibration", build_calibration())
         for k, (width, height) in enumerate(sizes):
             data = encode_png(np.zeros((height, width, 3), np.uint8))
-            write(k, "/cf1/camera/image", image(data))
+            write(k, "/cf1/camera/image", build_image(data))
 
-    found = record(tmp_path / "a.mcap", fill)
+    found = record_and_check(tmp_path / "a.mcap", fill)
     assert len(found) == len(said)
     assert all(one.startswith(words) for one, words in zip(found, said, strict=True))
     assert all("320x224" in one for one in found)
@@ -93,7 +93,7 @@ def test_a_calibration_that_no_camera_has_is_found(
     tmp_path: Path, numbers: dict[str, Any], finding: str
 ) -> None:
     def fill(write: Write) -> None:
-        write(0, "/cf1/camera/calibration", calibrated())
-        write(1, "/cf1/camera/calibration", calibrated(**numbers))
+        write(0, "/cf1/camera/calibration", build_calibration())
+        write(1, "/cf1/camera/calibration", build_calibration(**numbers))
 
-    assert record(tmp_path / "a.mcap", fill) == [finding]
+    assert record_and_check(tmp_path / "a.mcap", fill) == [finding]

@@ -13,7 +13,7 @@ S = 1_000_000_000
 
 
 def find_clock_findings(times: dict[str, list[float]], **unset: int) -> list[tuple[str, str]]:
-    """What is said of topics with messages at these seconds."""
+    """Return the findings about topics with messages at these times, in seconds."""
     held = {
         topic: TopicTimes.of(np.round(np.array(t) * S).astype(np.int64))
         for topic, t in times.items()
@@ -54,7 +54,7 @@ def test_a_topic_apart_from_all_others_of_its_robot_is_named() -> None:
 
 @pytest.mark.parametrize("topic", ["/cf1/camera/calibration", "/tf", "height", "/cf1/velocity"])
 def test_topics_without_a_robot_clock_are_not_compared(topic: str) -> None:
-    """Calibrations, transforms, topics of strangers; and one message, which tells nothing."""
+    """Calibrations, transforms and unknown topics have no robot clock."""
     moments = [90.0] if topic == "/cf1/velocity" else [90, 95]
     assert find_clock_findings({"/cf1/height": [1, 5], topic: moments}) == []
     assert find_clock_findings({"/cf1/height": [1, 5], topic: []}) == []

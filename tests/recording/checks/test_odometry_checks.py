@@ -26,8 +26,8 @@ Columns = dict[str, NDArray[np.float64]]
 TIME_S = np.arange(0.0, 30.0, 0.02)
 
 
-def flown() -> tuple[Columns, Columns]:
-    """What a robot measures, and its poses: a wide curve, with all that it turns."""
+def simulate_flight() -> tuple[Columns, Columns]:
+    """Simulate a wide curve with turns about every axis; return measurements and true poses."""
     x, y = 2 * np.sin(0.5 * TIME_S), 1.5 * np.sin(0.8 * TIME_S + 1)
     yaw = 1.4 * np.sin(0.3 * TIME_S) + 0.2 * TIME_S
     roll, pitch = 0.1 * np.sin(1.1 * TIME_S), 0.12 * np.cos(0.9 * TIME_S)
@@ -46,8 +46,8 @@ def flown() -> tuple[Columns, Columns]:
     return measured, {"x": x, "y": y, **dict(zip(("qx", "qy", "qz", "qw"), turns.T, strict=True))}
 
 
-def recorded(path: Path, said: Columns, poses: Columns, late_s: float = 0.0) -> list[str]:
-    """What check says of it."""
+def record_and_check(path: Path, said: Columns, poses: Columns, late_s: float = 0.0) -> list[str]:
+    """Write the measurements and poses, the poses late by this time; return the findings."""
     with RecordingWriter(path, Provenance("test")) as sink:
         for k, time_s in enumerate(TIME_S):
             row = {name: float(values[k]) for name, values in said.items()}
@@ -65,23 +65,23 @@ def recorded(path: Path, said: Columns, poses: Columns, late_s: float = 0.0) -> 
 
 @pytest.mark.heavy
 def test_consistent_odometry_gives_no_finding(tmp_path: Path) -> None:
-    assert recorded(tmp_path / "a.mcap", *flown()) == []
+    assert record_and_check(tmp_path / "a.mcap", *simulate_flight()) == []
 
 
-def test_a_clock_that_is_a_little_off_is_no_wrong_sign(tmp_path: Path) -> None:
-    assert recorded(tmp_path / "a.mcap", *flown(), late_s=0.3) == []
+def test_small_clock_offset_is_not_taken_for_a_wrong_sign(tmp_path: Path) -> None:
+    assert record_and_check(tmp_path / "a.mcap", *simulate_flight(), late_s=0.3) == []
 
 
 @pytest.mark.parametrize("name", ["roll_rad", "pitch_rad", "yaw_rate_radps"])
 def test_opposite_sign_is_found(tmp_path: Path, name: str) -> None:
-    measured, poses = flown()
-    found = recorded(tmp_path / "a.mcap", measured | {name: -measured[name]}, poses)
+    measured, poses = simulate_flight()
+    found = record_and_check(tmp_path / "a.mcap", measured | {name: -measured[name]}, poses)
     assert len(found) == 1 and f"/cf1/attitude: {name} has the opposite sign" in found[0]
 
 
 @pytest.mark.heavy
 def test_velocity_in_another_frame_is_found(tmp_path: Path) -> None:
-    measured, poses = flown()
+    measured, poses = simulate_flight()
     vx, vy = measured["vx_mps"], measured["vy_mps"]
     wrong = {
         "does not turn": [np.gradient(poses[axis], TIME_S) for axis in "xy"],
@@ -91,7 +91,9 @@ def test_velocity_in_another_frame_is_found(tmp_path: Path) -> None:
         "swapped": [vy, vx],
     }
     for k, (words, (x, y)) in enumerate(wrong.items()):
-        found = recorded(tmp_path / f"{k}.mcap", measured | {"vx_mps": x, "vy_mps": y}, poses)
+        found = record_and_check(
+            tmp_path / f"{k}.mcap", measured | {"vx_mps": x, "vy_mps": y}, poses
+        )
         assert len(found) == 1 and words in found[0] and "/cf1/velocity" in found[0], words
 
 
@@ -102,36 +104,39 @@ def test_a_signal_is_in_order_and_finite_and_has_each_time_once() -> None:
     assert values.tolist() == [[10], [30], [40]]
 
 
-def poses(time_s: NDArray[np.float64], **angles: float) -> NDArray[np.float64]:
-    """x 2 t, y -t, and angles that grow by so much a second."""
+def build_poses(time_s: NDArray[np.float64], **angles: float) -> NDArray[np.float64]:
+    """Return poses (N, 6) at x = 2 t, y = -t with these angular rates, rad/s.
+
+    The columns are x, y and the quaternion.
+    """
     turn = np.column_stack([angles.get(n, 0.0) * time_s for n in ("roll", "pitch", "yaw")])
     return np.column_stack([2 * time_s, -time_s, euler_to_quaternion(turn)])
 
 
 def test_motion_is_the_slope_of_poses() -> None:
     time_s = np.arange(0, 4.01, 0.02)
-    found = _derive_motion(time_s, poses(time_s, roll=0.1, pitch=-0.2, yaw=1.5))
+    found = _derive_motion(time_s, build_poses(time_s, roll=0.1, pitch=-0.2, yaw=1.5))
     for name, wanted in (("velocity", [2.0, -1.0]), ("yaw rate", [1.5])):
         at, values = found[name]
         assert at == pytest.approx(np.arange(0.3, 3.7, 0.05))
         assert values == pytest.approx(np.tile(wanted, (len(at), 1)), abs=1e-6)
     at, values = found["angles"]
-    # Looked at half of 0.3 s before and after, and the yaw has no jump.
+    # The slope is taken over 0.3 s around each time; wrapping of the yaw gives no jump.
     assert values == pytest.approx(np.outer(at, [0.1, -0.2, 1.5]), abs=1e-6)
 
 
 def test_motion_is_not_known_where_poses_are_rare_or_no_turns() -> None:
     time_s = np.concatenate([np.arange(0, 3, 0.02), np.arange(5, 8, 0.02)])
-    at = _derive_motion(time_s, poses(time_s))["velocity"][0]
+    at = _derive_motion(time_s, build_poses(time_s))["velocity"][0]
     assert not ((at > 3.25) & (at < 4.75)).any()
     assert (at < 3.2).any() and (at > 4.8).any()
-    shrunk = poses(time_s)
+    shrunk = build_poses(time_s)
     shrunk[:, 2:] *= 0.89
     assert _derive_motion(time_s, shrunk) == {}
     shrunk[:, 2:] *= 0.92 / 0.89
     assert _derive_motion(time_s, shrunk)
-    assert _derive_motion(time_s[:99], poses(time_s[:99])) == {}
-    assert _derive_motion(time_s[:100], poses(time_s[:100])) != {}
+    assert _derive_motion(time_s[:99], build_poses(time_s[:99])) == {}
+    assert _derive_motion(time_s[:100], build_poses(time_s[:100])) != {}
 
 
 def test_correlation_and_rms_equal_hand_computed_values() -> None:
@@ -145,11 +150,13 @@ def test_correlation_and_rms_equal_hand_computed_values() -> None:
     assert _rms(np.zeros(0)) == 0
 
 
-def moving(speed_mps: float, rate: float = 0.0) -> tuple[NDArray[np.float64], dict[str, object]]:
-    """Times, and the motion of a robot that goes back and forth along x."""
+def build_motion(
+    speed_mps: float, roll_rad: float = 0.0
+) -> tuple[NDArray[np.float64], dict[str, object]]:
+    """Return times, s, and the motion of a robot with this RMS speed along x and RMS roll."""
     time_s = np.arange(0, 10, 0.05)
     world = speed_mps * 2**0.5 * np.sin(4 * np.pi * time_s)[:, None] * [1.0, 0.0]
-    tilt = rate * 2**0.5 * np.sin(2 * np.pi * time_s)
+    tilt = roll_rad * 2**0.5 * np.sin(2 * np.pi * time_s)
     angles = np.column_stack([tilt, 0 * tilt, 0 * tilt])
     return time_s, {
         "velocity": (time_s, world),
@@ -160,7 +167,7 @@ def moving(speed_mps: float, rate: float = 0.0) -> tuple[NDArray[np.float64], di
 
 @pytest.mark.parametrize(("speed_mps", "count"), [(0.09, 0), (0.11, 1)])
 def test_slow_robot_gives_no_finding(speed_mps: float, count: int) -> None:
-    time_s, motion = moving(speed_mps)
+    time_s, motion = build_motion(speed_mps)
     said = -motion["velocity"][1]  # type: ignore[index]
     assert len(list(_check_velocity((time_s, said), motion))) == count  # type: ignore[arg-type]
     assert len(list(_check_velocity((time_s, 10 * said), motion))) == count  # type: ignore[arg-type]
@@ -170,7 +177,7 @@ def test_slow_robot_gives_no_finding(speed_mps: float, count: int) -> None:
 
 @pytest.mark.parametrize(("share", "count"), [(0.55, 0), (0.45, 0)])
 def test_a_velocity_half_like_or_like_no_other_is_not_doubted(share: float, count: int) -> None:
-    time_s, motion = moving(1.0)
+    time_s, motion = build_motion(1.0)
     forward = motion["velocity"][1][:, 0]  # type: ignore[index]
     other = 2**0.5 * np.cos(4 * np.pi * time_s)
     said = share * forward - (1 - share**2) ** 0.5 * other
@@ -180,7 +187,7 @@ def test_a_velocity_half_like_or_like_no_other_is_not_doubted(share: float, coun
 
 @pytest.mark.parametrize(("share", "count"), [(-0.85, 1), (-0.75, 0)])
 def test_velocity_that_matches_another_frame_is_doubted(share: float, count: int) -> None:
-    time_s, motion = moving(1.0)
+    time_s, motion = build_motion(1.0)
     forward = motion["velocity"][1][:, 0]  # type: ignore[index]
     said = share * forward + (1 - share**2) ** 0.5 * 2**0.5 * np.cos(4 * np.pi * time_s)
     rows = np.column_stack([said, 0 * said])
@@ -189,7 +196,7 @@ def test_velocity_that_matches_another_frame_is_doubted(share: float, count: int
 
 @pytest.mark.parametrize(("tilt", "count"), [(0.019, 0), (0.021, 1)])
 def test_tilts_under_a_fiftieth_are_not_doubted(tilt: float, count: int) -> None:
-    time_s, motion = moving(1.0, tilt)
+    time_s, motion = build_motion(1.0, tilt)
     said = -np.column_stack([motion["angles"][1][:, :2], 0 * time_s]) + 5.0  # type: ignore[index]
     found = list(_check_attitude((time_s, said), motion))  # type: ignore[arg-type]
     assert ["roll_rad" in text for text in found] == [True] * count
@@ -198,7 +205,7 @@ def test_tilts_under_a_fiftieth_are_not_doubted(tilt: float, count: int) -> None
 
 @pytest.mark.parametrize(("rate", "count"), [(0.09, 0), (0.11, 1)])
 def test_slow_turns_are_not_doubted(rate: float, count: int) -> None:
-    time_s, motion = moving(1.0)
+    time_s, motion = build_motion(1.0)
     true = rate * 2**0.5 * np.sin(2 * np.pi * time_s)
     motion["yaw rate"] = (time_s, true[:, None])
     said = np.column_stack([0 * true, 0 * true, -true])

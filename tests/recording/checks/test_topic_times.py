@@ -21,6 +21,7 @@ STEPS = {
 
 
 def add_up(steps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the times, ns, that these steps lie between, none of them negative."""
     times = np.cumsum(steps, dtype=np.int64)
     times -= min(times.min(), 0)
     return np.concatenate([[0], times])

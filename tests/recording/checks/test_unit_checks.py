@@ -8,7 +8,8 @@ from dmrl.recording.checks.topic_times import TopicTimes
 from dmrl.recording.checks.unit_checks import ValueCounts, check_periods, check_units
 
 
-def _doubted(topic: str, name: str, values: np.ndarray) -> list[tuple[str, str]]:
+def find_doubts(topic: str, name: str, values: np.ndarray) -> list[tuple[str, str]]:
+    """Return topic and text of every doubt about a field with these values."""
     sizes = ValueCounts()
     for part in np.array_split(values, 3):
         sizes.add_batch(topic, pa.RecordBatch.from_pydict({name: pa.array(part)}))
@@ -26,44 +27,44 @@ def _doubted(topic: str, name: str, values: np.ndarray) -> list[tuple[str, str]]
 )
 def test_thousandths_are_doubted_and_the_unit_is_not(topic: str, name: str, usual: float) -> None:
     values = usual * np.random.default_rng(1).uniform(-1, 1, 200)
-    assert _doubted(topic, name, values) == []
-    ((where, text),) = _doubted(topic, name, 1000 * values)
+    assert find_doubts(topic, name, values) == []
+    ((where, text),) = find_doubts(topic, name, 1000 * values)
     assert where == topic and text.startswith(f"{name}: ")
 
 
 def test_unit_finding_needs_more_than_a_tenth_of_the_values() -> None:
     values = np.full(100, 0.5)
     values[:10] = 500.0
-    assert _doubted("/cf1/height", "height_m", values) == []
+    assert find_doubts("/cf1/height", "height_m", values) == []
     values[10] = -500.0
-    ((_, text),) = _doubted("/cf1/height", "height_m", values)
+    ((_, text),) = find_doubts("/cf1/height", "height_m", values)
     assert text == "height_m: 11% of the values are over 30 m. Are they mm or cm?"
 
 
 def test_single_values_that_no_flight_gives_are_found() -> None:
     values = np.full(100, 0.5)
     values[3] = -1e30
-    ((_, text),) = _doubted("/cf1/velocity", "vx_mps", values)
+    ((_, text),) = find_doubts("/cf1/velocity", "vx_mps", values)
     assert text == "vx_mps: 1 of 100 values are over 20000 m/s, which no flight gives"
 
 
 def test_heights_that_count_downwards_are_found() -> None:
-    ((_, text),) = _doubted("/cf1/height", "height_m", np.full(100, -1.2))
+    ((_, text),) = find_doubts("/cf1/height", "height_m", np.full(100, -1.2))
     assert text == "height_m: 100% of the values are below the floor. Is z down?"
-    assert _doubted("/cf1/height", "height_m", np.full(100, -0.1)) == []
-    assert _doubted("/cf1/height", "height_m", np.r_[np.full(50, -1.0), np.full(50, 1.0)]) == []
+    assert find_doubts("/cf1/height", "height_m", np.full(100, -0.1)) == []
+    assert find_doubts("/cf1/height", "height_m", np.r_[np.full(50, -1.0), np.full(50, 1.0)]) == []
 
 
 def test_unit_check_ignores_zeros_non_finite_values_and_short_series() -> None:
     odd = np.array([np.nan, np.inf, -np.inf, 0.0] * 30)
-    ((_, text),) = _doubted("/cf1/height", "height_m", odd)
+    ((_, text),) = find_doubts("/cf1/height", "height_m", odd)
     assert text == "height_m: 90 values are not finite"
-    assert _doubted("/cf1/height", "height_m", np.full(19, 500.0)) == []
-    assert _doubted("/own/topic", "height_m", np.full(99, 500.0)) == []
+    assert find_doubts("/cf1/height", "height_m", np.full(19, 500.0)) == []
+    assert find_doubts("/own/topic", "height_m", np.full(99, 500.0)) == []
 
 
 def find_period(times: np.ndarray, topic: str = "/cf1/height") -> list[str]:
-    """What is said of the period of a topic with messages at these times, in this order."""
+    """Return the findings about the period of a topic with messages at these times, ns."""
     held = {topic: TopicTimes.of(times)}
     return [text for _, text in check_periods(held, lambda _: TopicTimes.of(np.sort(times)))]
 
@@ -94,12 +95,12 @@ def test_sensor_period_limits_are_exact(period_ns: int, said: int) -> None:
 
 
 def test_magnitudes_are_binned_to_a_fifth_of_the_limit() -> None:
-    assert _doubted("/cf1/height", "height_m", np.full(20, 30.0)) == []
-    assert len(_doubted("/cf1/height", "height_m", np.full(20, 36.0))) == 1
+    assert find_doubts("/cf1/height", "height_m", np.full(20, 30.0)) == []
+    assert len(find_doubts("/cf1/height", "height_m", np.full(20, 36.0))) == 1
     for tiny, huge in ((1e-80, 1e80), (-1e-300, -1e300)):
-        ((_, text),) = _doubted("/cf1/height", "height_m", np.full(20, tiny))
+        ((_, text),) = find_doubts("/cf1/height", "height_m", np.full(20, tiny))
         assert "are under 0.005 m" in text
-        assert len(_doubted("/cf1/height", "height_m", np.full(20, huge))) == 1
+        assert len(find_doubts("/cf1/height", "height_m", np.full(20, huge))) == 1
 
 
 def test_positions_in_millimetres_are_doubted() -> None:

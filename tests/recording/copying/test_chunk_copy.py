@@ -1,4 +1,4 @@
-"""Copies by chunk: which are copied whole, sliced, or refused."""
+"""Copying by chunk: which chunks are copied as they are, sliced, or refused."""
 
 from pathlib import Path
 
@@ -21,7 +21,12 @@ from dmrl.recording.mcap.batch_reader import iter_batches_in_file_order
 from dmrl.recording.mcap.chunks import chunk_reader
 from dmrl.samples.sample import Sample
 
-from ..records import channels, chunks, packed, unchanged
+from ..records import (
+    assert_messages_unchanged,
+    read_channel_topics,
+    read_chunk_indexes,
+    read_chunk_records,
+)
 
 pytestmark = pytest.mark.heavy
 
@@ -31,7 +36,7 @@ MOMENTS = 6000
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Attitude and height of two robots, a picture of 3 kB now and then."""
+    """Write attitude and height of two robots, and an image of 3 kB at every tenth moment."""
     path = tmp_path_factory.mktemp("copying") / "flight.mcap"
     rng = np.random.default_rng(0)
     with RecordingWriter(path, MADE) as sink:
@@ -59,9 +64,12 @@ def test_rewrite_copies_whole_chunks_in_one_pass(
     fresh = [Sample(k * 100, "/cf1/labels", "PeerLabels", {}) for k in range(20)]
     out = tmp_path / "out.mcap"
     rewrite(flight, out, MADE, without=(), fresh=[fresh])
-    assert len(opened) == len(set(opened)) == len(chunks(flight)) > 8
-    assert len(set(packed(flight)) & set(packed(out))) >= len(chunks(flight)) - 2
-    unchanged(flight, out, list(read_summary(flight).topics))
+    assert len(opened) == len(set(opened)) == len(read_chunk_indexes(flight)) > 8
+    assert (
+        len(set(read_chunk_records(flight)) & set(read_chunk_records(out)))
+        >= len(read_chunk_indexes(flight)) - 2
+    )
+    assert_messages_unchanged(flight, out, list(read_summary(flight).topics))
     assert [r for r in read_raw(out) if r.topic != "/cf1/labels"] == list(read_raw(flight))
     assert [raw.time_ns for raw in read_raw(out, "/cf1/labels")] == [m.time_ns for m in fresh]
 
@@ -71,7 +79,7 @@ def test_omitting_a_topic_keeps_the_rest_bit_for_bit(flight: Path, tmp_path: Pat
     rewrite(flight, out, MADE, without=["/cf2/attitude"], fresh=())
     kept = [topic for topic in read_summary(flight).topics if topic != "/cf2/attitude"]
     assert list(read_summary(out).topics) == kept
-    unchanged(flight, out, kept)
+    assert_messages_unchanged(flight, out, kept)
 
 
 def test_trim_copies_whole_chunks_within_the_span(flight: Path, tmp_path: Path) -> None:
@@ -79,11 +87,11 @@ def test_trim_copies_whole_chunks_within_the_span(flight: Path, tmp_path: Path) 
     assert trim(flight, out, start_ns=1000, end_ns=3000) == 2000 * 4 + 201
     ours = [r for r in read_raw(flight) if 1000 <= r.time_ns < 3000]
     assert list(read_raw(out))[1:] == ours
-    assert len(set(packed(flight)) & set(packed(out))) >= 2
+    assert len(set(read_chunk_records(flight)) & set(read_chunk_records(out))) >= 2
 
 
 def test_span_from_a_chunk_start_includes_channel_definitions(flight: Path, tmp_path: Path) -> None:
-    for k, chunk in enumerate(chunks(flight)[2:4]):
+    for k, chunk in enumerate(read_chunk_indexes(flight)[2:4]):
         out, start_ns = tmp_path / f"{k}.mcap", chunk.message_start_time
         trim(flight, out, start_ns=start_ns, topics=["/*/attitude", "/*/height"])
         ours = [r for r in read_raw(flight, "/*/attitude", "/*/height") if r.time_ns >= start_ns]
@@ -100,7 +108,7 @@ def test_merging_trimmed_parts_restores_the_recording(flight: Path, tmp_path: Pa
     trim(flight, parts[1], topics=["/cf2/*"])
     out = tmp_path / "out.mcap"
     assert merge(parts, out) == read_summary(flight).count
-    unchanged(flight, out, list(read_summary(flight).topics))
+    assert_messages_unchanged(flight, out, list(read_summary(flight).topics))
     again = tmp_path / "again.mcap"
     merge(parts, again)
     assert again.read_bytes() == out.read_bytes()
@@ -109,14 +117,14 @@ def test_merging_trimmed_parts_restores_the_recording(flight: Path, tmp_path: Pa
 def test_message_indexes_of_whole_chunks_are_copied(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     rewrite(flight, out, MADE, without=())
-    before, after = (indexes(path) for path in (flight, out))
-    assert len(set(before) & set(after)) >= len(chunks(flight)) - 2
-    assert len(after) == len(chunks(out))
+    before, after = (read_message_indexes(path) for path in (flight, out))
+    assert len(set(before) & set(after)) >= len(read_chunk_indexes(flight)) - 2
+    assert len(after) == len(read_chunk_indexes(out))
 
 
-def indexes(path: Path) -> list[bytes]:
-    """The message indexes of all chunks."""
-    data, found = path.read_bytes(), chunks(path)
+def read_message_indexes(path: Path) -> list[bytes]:
+    """Return the message indexes of each chunk, as bytes."""
+    data, found = path.read_bytes(), read_chunk_indexes(path)
     ends = [(c.chunk_start_offset + c.chunk_length, c.message_index_length) for c in found]
     return [data[at : at + size] for at, size in ends]
 
@@ -125,8 +133,10 @@ def indexes(path: Path) -> list[bytes]:
 def test_a_trim_cuts_the_chunks_at_both_its_ends(
     flight: Path, tmp_path: Path, start_ns: int
 ) -> None:
-    """Where it begins, and one short of the end of a chunk."""
-    end_ns = next(c.message_end_time for c in chunks(flight) if c.message_end_time > start_ns)
+    """The end of the span excludes the last message of a chunk."""
+    end_ns = next(
+        c.message_end_time for c in read_chunk_indexes(flight) if c.message_end_time > start_ns
+    )
     out = tmp_path / "out.mcap"
     trim(flight, out, start_ns=start_ns, end_ns=end_ns, topics=["/cf1/attitude", "/cf2/height"])
     ours = read_raw(flight, "/cf1/attitude", "/cf2/height", start_ns=start_ns, end_ns=end_ns)
@@ -143,19 +153,19 @@ def test_recordings_whose_channels_have_the_same_numbers_are_merged(tmp_path: Pa
             sink.write_columns(
                 f"/{robot}/height", message_class("Height"), np.arange(12_000), heights
             )
-    assert {*channels(paths[0])} == {*channels(paths[1])}
+    assert {*read_channel_topics(paths[0])} == {*read_channel_topics(paths[1])}
     out = tmp_path / "out.mcap"
     assert merge(paths, out) == 24_000
     for path, topic in zip(paths, ("/cf1/height", "/cf2/height"), strict=True):
-        unchanged(path, out, [topic])
-    assert len(channels(out)) == 2
+        assert_messages_unchanged(path, out, [topic])
+    assert len(read_channel_topics(out)) == 2
 
 
 def test_index_with_a_wrong_channel_is_damage(flight: Path, tmp_path: Path) -> None:
     bad, data = tmp_path / "bad.mcap", bytearray(flight.read_bytes())
-    chunk = chunks(flight)[1]
+    chunk = read_chunk_indexes(flight)[1]
     first, second = sorted(chunk.message_index_offsets.values())[:2]
-    for at in range(15, 15 + 16):  # their first entries change places
+    for at in range(15, 15 + 16):  # swap the first entries of both indexes
         data[first + at], data[second + at] = data[second + at], data[first + at]
     bad.write_bytes(data)
     with pytest.raises(RecordingError, match=r"index of the chunk at byte \d+ is wrong"):
@@ -164,16 +174,19 @@ def test_index_with_a_wrong_channel_is_damage(flight: Path, tmp_path: Path) -> N
 
 def test_recovering_keeps_whole_chunks_as_they_are(flight: Path, tmp_path: Path) -> None:
     cut, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
-    last = max(c.chunk_start_offset for c in chunks(flight))
+    last = max(c.chunk_start_offset for c in read_chunk_indexes(flight))
     cut.write_bytes(flight.read_bytes()[:last])
     result = recover(cut, out)
     assert result.messages == read_summary(out).count > MOMENTS
-    assert len(set(packed(flight)) & set(packed(out))) >= len(chunks(flight)) - 3
+    assert (
+        len(set(read_chunk_records(flight)) & set(read_chunk_records(out)))
+        >= len(read_chunk_indexes(flight)) - 3
+    )
 
 
 def test_damaged_chunk_is_detected_while_copying(flight: Path, tmp_path: Path) -> None:
     damaged = tmp_path / "a.mcap"
-    for chunk in chunks(flight)[2], chunks(flight)[-1]:
+    for chunk in read_chunk_indexes(flight)[2], read_chunk_indexes(flight)[-1]:
         data = bytearray(flight.read_bytes())
         data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
         damaged.write_bytes(data)
@@ -191,15 +204,15 @@ def test_small_chunks_of_a_live_recording_are_put_together(tmp_path: Path) -> No
             sink.write(k, "/cf1/height", message_class("Height")(height_m=k))
             if k % 10 == 9:
                 sink.flush()
-    assert len(chunks(path)) == 50
+    assert len(read_chunk_indexes(path)) == 50
     rewrite(path, out, MADE, without=(), fresh=())
-    assert len(chunks(out)) == 1
-    unchanged(path, out, ["/cf1/height"])
+    assert len(read_chunk_indexes(out)) == 1
+    assert_messages_unchanged(path, out, ["/cf1/height"])
 
 
 @pytest.fixture(scope="module")
 def by_topic(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Heights of three robots, written one robot after the other, in many chunks."""
+    """Write heights of three robots, one robot after the other, in many chunks."""
     path = tmp_path_factory.mktemp("by_topic") / "flight.mcap"
     rng = np.random.default_rng(1)
     with RecordingWriter(path, MADE) as sink:
@@ -220,7 +233,7 @@ def test_topics_of_a_recording_written_topic_by_topic_stay_in_order(
         trim(by_topic, out, end_ns=3 * MOMENTS)
     else:
         merge([flight, by_topic], out)
-    assert len(chunks(out)) > 3
+    assert len(read_chunk_indexes(out)) > 3
     times: dict[str, list[int]] = {}
     for batch, known in iter_batches_in_file_order(out):
         for number in batch.list_channel_ids():

@@ -1,4 +1,4 @@
-"""Copies of recordings of other writers: their compression, with or without indexes."""
+"""Copying recordings of other writers, in their compression, with and without indexes."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,13 +15,21 @@ from dmrl.recording import Provenance, merge, read_raw, rewrite, trim
 
 from ..mcap_layout import Chunk, Layout, Message
 from ..mcap_layout import Writer as FileWriter
-from ..records import channels, chunks, packed, unchanged
+from ..records import (
+    assert_messages_unchanged,
+    read_channel_topics,
+    read_chunk_indexes,
+    read_chunk_records,
+)
 from ..walk import walk
 
 MADE = Provenance("test")
 
 
-def foreign(path: Path, fill: Callable[[Writer, int], None], **options: Any) -> Path:
+def write_foreign_recording(
+    path: Path, fill: Callable[[Writer, int], None], **options: Any
+) -> Path:
+    """Write a file with the mcap package; ``fill`` gets the writer and the schema of heights."""
     with path.open("wb") as stream:
         writer = Writer(stream, **options)
         writer.start()
@@ -50,17 +58,21 @@ def test_chunks_of_other_writers_are_copied_in_their_compression(
             writer.add_message(
                 heights, k, message_class("Height")(height_m=k).SerializeToString(), k
             )
-        for k in range(40):  # a chunk of both, then of pictures alone
+        for k in range(40):  # the first chunk has heights and images, the others only images
             data = message_class("CompressedImage")(data=rng.bytes(20_000)).SerializeToString()
             writer.add_message(pictures, k, data, k)
 
-    path = foreign(tmp_path / "a.mcap", fill, compression=compression, chunk_size=200_000)
+    path = write_foreign_recording(
+        tmp_path / "a.mcap", fill, compression=compression, chunk_size=200_000
+    )
     out = tmp_path / "out.mcap"
     rewrite(path, out, MADE, without=(), fresh=())
-    unchanged(path, out, ["/cf1/height", "/cam"])
-    assert len(set(packed(path)) & set(packed(out))) >= 6
-    numbers = {n for n, c in channels(out).items() if c != "/cam"}
-    assert all(len({n in numbers for n in c.message_index_offsets}) == 1 for c in chunks(out))
+    assert_messages_unchanged(path, out, ["/cf1/height", "/cam"])
+    assert len(set(read_chunk_records(path)) & set(read_chunk_records(out))) >= 6
+    numbers = {n for n, c in read_channel_topics(out).items() if c != "/cam"}
+    assert all(
+        len({n in numbers for n in c.message_index_offsets}) == 1 for c in read_chunk_indexes(out)
+    )
 
 
 def test_a_chunk_that_defines_a_channel_otherwise_is_not_copied(tmp_path: Path) -> None:
@@ -71,11 +83,11 @@ def test_a_chunk_that_defines_a_channel_otherwise_is_not_copied(tmp_path: Path) 
                 channel, k, message_class("Height")(height_m=k).SerializeToString(), k
             )
 
-    path = foreign(tmp_path / "a.mcap", fill, compression=CompressionType.NONE)
+    path = write_foreign_recording(tmp_path / "a.mcap", fill, compression=CompressionType.NONE)
     data = bytearray(path.read_bytes())
     at = data.index(b"/cf1/height")
-    data[at : at + 11] = b"/cf9/height"  # the summary, which has a CRC and counts, says otherwise
-    crc = chunks(path)[0].chunk_start_offset + 9 + 24
+    data[at : at + 11] = b"/cf9/height"  # contradicts the summary, which has a CRC and counts
+    crc = read_chunk_indexes(path)[0].chunk_start_offset + 9 + 24
     data[crc : crc + 4] = bytes(4)
     path.write_bytes(data)
     with pytest.raises(
@@ -89,7 +101,7 @@ def test_a_chunk_that_defines_a_channel_otherwise_is_not_copied(tmp_path: Path) 
 def test_empty_index_of_another_writer_is_not_copied(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Some list every channel with every chunk, with messages there or without."""
+    """Some writers index every channel in every chunk, even channels without messages there."""
     end = ChunkBuilder.end
 
     def listing_all(chunk: ChunkBuilder) -> bytes:
@@ -106,17 +118,17 @@ def test_empty_index_of_another_writer_is_not_copied(
             data = message_class("Height")(height_m=k).SerializeToString()
             writer.add_message(1 + (k < 10_000), k, data, k)
 
-    path = foreign(tmp_path / "a.mcap", fill, chunk_size=100_000)
+    path = write_foreign_recording(tmp_path / "a.mcap", fill, chunk_size=100_000)
     out = tmp_path / "out.mcap"
     rewrite(path, out, MADE, without=())
-    unchanged(path, out, ["/cf1/height", "/cf2/height"])
-    assert {*chunks(path)[0].message_index_offsets} == {1, 2}
-    assert {*chunks(out)[0].message_index_offsets} == {2}
-    assert packed(out)[0] == packed(path)[0]
+    assert_messages_unchanged(path, out, ["/cf1/height", "/cf2/height"])
+    assert {*read_chunk_indexes(path)[0].message_index_offsets} == {1, 2}
+    assert {*read_chunk_indexes(out)[0].message_index_offsets} == {2}
+    assert read_chunk_records(out)[0] == read_chunk_records(path)[0]
 
 
 def test_large_chunk_of_definitions_only_is_copied(tmp_path: Path) -> None:
-    """Some programs start with a chunk of all schemas, too large to be joined with the next."""
+    """Some programs write all schemas to a first chunk that is too large to join to the next."""
     layout = Layout(crcs=False)
     layout.schemas[1] = "Kind", "jsonschema", b" " * 100_000
     layout.channels = {1: ("/a", 1, {}), 2: ("/b", 1, {"k": "v"})}
@@ -137,7 +149,7 @@ def test_a_recording_without_index_is_copied(tmp_path: Path) -> None:
                 channel, k, message_class("Height")(height_m=k).SerializeToString(), k
             )
 
-    path = foreign(tmp_path / "a.mcap", fill, use_chunking=False)
+    path = write_foreign_recording(tmp_path / "a.mcap", fill, use_chunking=False)
     out = tmp_path / "out.mcap"
     rewrite(path, out, MADE, without=(), fresh=())
     assert list(read_raw(out)) == list(read_raw(path))
@@ -160,8 +172,8 @@ def test_calibration_at_time_0_in_its_own_chunk_is_copied(tmp_path: Path) -> Non
                 height, k, message_class("Height")(height_m=k).SerializeToString(), k
             )
 
-    path = foreign(tmp_path / "a.mcap", fill, chunk_size=400)
-    assert chunks(path)[0].message_end_time == 0
+    path = write_foreign_recording(tmp_path / "a.mcap", fill, chunk_size=400)
+    assert read_chunk_indexes(path)[0].message_end_time == 0
     out = tmp_path / "out.mcap"
     assert trim(path, out, start_ns=50, end_ns=55) == 6  # with the calibration
     assert [(r.topic, r.time_ns) for r in read_raw(out)] == [
@@ -177,13 +189,13 @@ def test_a_topic_without_messages_is_named_by_trim_and_ignored_by_merge(
         heights = [writer.register_channel(f"/cf{k}/height", "protobuf", schema) for k in (1, 2)]
         writer.add_message(heights[0], 5, b"", 5)
 
-    one = foreign(tmp_path / "a.mcap", fill)
+    one = write_foreign_recording(tmp_path / "a.mcap", fill)
     with pytest.raises(RecordingError, match="no message on /cf2/height"):
         trim(one, tmp_path / "out.mcap", topics=["/cf2/*"])
 
     def fill_other(writer: Writer, schema: int) -> None:
         writer.register_channel("/cf1/height", "protobuf", schema)
 
-    other = foreign(tmp_path / "b.mcap", fill_other)
+    other = write_foreign_recording(tmp_path / "b.mcap", fill_other)
     merge([one, other], tmp_path / "out.mcap")
     assert not capsys.readouterr().err

@@ -1,3 +1,5 @@
+"""Trim, merge and recover recordings."""
+
 from math import sin
 from pathlib import Path
 
@@ -20,17 +22,18 @@ from dmrl.recording import (
 from dmrl.stages import trim as stage
 
 
-def heights(path: Path, times_ns: list[int], split: str) -> Path:
+def write_heights(path: Path, times_ns: list[int], split: str) -> Path:
+    """Write heights at these times, and a split of this name that covers them."""
     with RecordingWriter(path, Provenance("test")) as sink:
         for time_ns in times_ns:
-            # A sine, so that chunks do not compress to nothing.
+            # A sine does not compress well, so that the chunks keep their size.
             sink.write(time_ns, "/cf1/height", message_class("Height")(height_m=sin(time_ns)))
         sink.add_metadata("dmrl.split", {split: f"[[{times_ns[0]}, {times_ns[-1]}]]"})
     return path
 
 
 def test_merging_interleaves_by_time_and_keeps_every_bit(tmp_path: Path, flight: Path) -> None:
-    other = heights(tmp_path / "b.mcap", [15_000_000, 25_000_000], "test")
+    other = write_heights(tmp_path / "b.mcap", [15_000_000, 25_000_000], "test")
     assert merge([flight, other], tmp_path / "out.mcap") == 4403
     merged = list(read_raw(tmp_path / "out.mcap"))
     assert [r.time_ns for r in merged] == sorted(r.time_ns for r in merged)
@@ -79,7 +82,8 @@ def test_trim_seconds_count_from_the_recording_start(tmp_path: Path, flight: Pat
 def test_trim_keeps_the_calibration_valid_at_its_start(tmp_path: Path) -> None:
     every, out = tmp_path / "every.mcap", tmp_path / "out.mcap"
     with RecordingWriter(every, Provenance("test")) as sink:
-        for k in range(1, 10):  # as ROS has them, again and again; others come late
+        # As in ROS, the calibration of cf1 is repeated, and that of cf2 comes late.
+        for k in range(1, 10):
             told = message_class("CameraCalibration")(width=8 * k)
             sink.write(10 * k, "/cf1/camera/calibration", told)
             sink.write(10 * k + 5, "/cf1/height", message_class("Height")(height_m=k))
@@ -132,7 +136,7 @@ def test_recover_returns_every_message_before_the_cut(tmp_path: Path, flight: Pa
 
 @pytest.mark.heavy
 def test_recover_steps_over_a_damaged_chunk(tmp_path: Path) -> None:
-    path = heights(tmp_path / "a.mcap", list(range(30_000)), "train")
+    path = write_heights(tmp_path / "a.mcap", list(range(30_000)), "train")
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(data)
@@ -147,7 +151,7 @@ def test_recover_steps_over_a_damaged_chunk(tmp_path: Path) -> None:
 
 @pytest.mark.heavy
 def test_a_topic_whose_definition_is_damaged_is_not_lost(tmp_path: Path) -> None:
-    path = heights(tmp_path / "a.mcap", list(range(60_000)), "train")
+    path = write_heights(tmp_path / "a.mcap", list(range(60_000)), "train")
     data = bytearray(path.read_bytes())
     with path.open("rb") as stream:
         found = make_reader(stream).get_summary()
@@ -162,15 +166,15 @@ def test_a_topic_whose_definition_is_damaged_is_not_lost(tmp_path: Path) -> None
 
 
 def test_messages_without_a_definition_are_counted(tmp_path: Path) -> None:
-    # Cut short as well, nothing tells the topic of what stands behind the damage.
+    # The file is truncated too, so nothing defines the topic of messages behind the damage.
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
         for time_ns in range(900):
             if time_ns in (300, 600):
-                sink.flush()  # the end of a chunk
+                sink.flush()  # starts a new chunk
             sink.write(time_ns, "/cf1/height", message_class("Height")(height_m=sin(time_ns)))
             if time_ns >= 300:
-                # The second shares its schema with what is lost.
+                # The second topic shares its schema with the lost one.
                 sink.write(
                     time_ns, "/cf1/attitude", message_class("Attitude")(roll_rad=sin(time_ns))
                 )
@@ -196,9 +200,9 @@ def test_trim_refuses_non_finite_times(tmp_path: Path, flight: Path, seconds: fl
 def test_merging_flights_of_the_same_robots_warns(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    one = heights(tmp_path / "a.mcap", [0, 10], "train")
-    other = heights(tmp_path / "b.mcap", [5, 15], "train")
-    later = heights(tmp_path / "c.mcap", [20, 30], "train")
+    one = write_heights(tmp_path / "a.mcap", [0, 10], "train")
+    other = write_heights(tmp_path / "b.mcap", [5, 15], "train")
+    later = write_heights(tmp_path / "c.mcap", [20, 30], "train")
     merge([one, other], tmp_path / "mixed.mcap")
     assert "both have /cf1/height at the same time" in capsys.readouterr().err
     merge([one, later], tmp_path / "after.mcap")

@@ -1,4 +1,4 @@
-"""Building chunks: message by message and in batches, with equal results."""
+"""Building chunks message by message and in batches gives equal results."""
 
 import zlib
 from collections import Counter
@@ -29,8 +29,8 @@ Row = tuple[int, int, int, bytes]
 ROWS: list[Row] = [(k % 3, 100 + k, 200 + k, bytes([k]) * (k % 5)) for k in range(12)]
 
 
-def records_of(rows: list[Row]) -> tuple[np.ndarray, np.ndarray]:
-    """Records one after another, and where each starts and the last ends."""
+def build_records(rows: list[Row]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bytes of message records, and the start of each and the end of the last."""
     chunk = ChunkBuilder()
     for row in rows:
         chunk.add_message(*row)
@@ -39,7 +39,7 @@ def records_of(rows: list[Row]) -> tuple[np.ndarray, np.ndarray]:
 
 @given(st.integers(0, 12), st.integers(0, 12), st.integers(0, 40))
 def test_batch_fill_equals_single_messages(alone: int, skipped: int, defined: int) -> None:
-    records, at = records_of(ROWS)
+    records, at = build_records(ROWS)
     one, many = ChunkBuilder(), ChunkBuilder()
     for chunk in (one, many):
         chunk.add_definition(b"\x03" + defined.to_bytes(8, "little") + bytes(defined))
@@ -55,13 +55,13 @@ def test_batch_fill_equals_single_messages(alone: int, skipped: int, defined: in
 
 
 def test_chunk_is_full_when_messages_no_longer_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    records, at = records_of([(1, k, k, b"x") for k in range(5)])
+    records, at = build_records([(1, k, k, b"x") for k in range(5)])
     each = MESSAGE_PREFIX_BYTES + 1
     for room_bytes, count in ((3 * each - 1, 2), (3 * each, 3), (5 * each, 5), (99 * each, 5)):
         monkeypatch.setattr(room, "CHUNK_BYTES", room_bytes)
         chunk = ChunkBuilder()
         first = chunk.fill(records, at)
-        # The one that no longer fits still goes in, and fills it.
+        # The message that exceeds the limit still goes into the chunk, which is then full.
         assert (first, chunk.full) in ((count, False), (count + 1, True))
         assert len(chunk.data) == first * each
     monkeypatch.setattr(room, "CHUNK_BYTES", each)
@@ -98,7 +98,7 @@ def test_compressed_chunk_has_a_message_index_and_resets_the_builder() -> None:
 def test_blocks_are_appended_as_messages_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk_bytes: int
 ) -> None:
-    # Some messages each; and less than what defines a topic, which once went on for ever.
+    # The smaller size is less than a topic's definition takes, and must still make progress.
     monkeypatch.setattr(room, "CHUNK_BYTES", chunk_bytes)
     paths = [tmp_path / name for name in ("a.mcap", "b.mcap")]
     with RecordingWriter(paths[0], Provenance("test")) as sink:
@@ -123,7 +123,7 @@ def test_a_block_with_a_negative_time_is_refused_by_topic(
     tmp_path: Path, wrong: tuple[int, int]
 ) -> None:
     channels = {k: Channel(f"/{k}", "dmrl.v1.Height", serialize_schema("Height")) for k in (1, 2)}
-    records, at = records_of([(1, 3, 3, b""), (2, 3, 3, b"")])
+    records, at = build_records([(1, 3, 3, b""), (2, 3, 3, b"")])
     one, two = np.array([1, 2]), np.array([[3, 3], wrong])
     block = MessageBatch(records, one, two[:, 0], two[:, 1], at[:-1] + MESSAGE_PREFIX_BYTES, at[1:])
     with (
@@ -133,18 +133,19 @@ def test_a_block_with_a_negative_time_is_refused_by_topic(
         sink.chunk_writer.append_batch(block, channels)
 
 
-def channel(topic: str, schema: str = "a", **more: str) -> Channel:
+def build_channel(topic: str, schema: str = "a", **more: str) -> Channel:
+    """Build a channel whose schema has this name and the same text as data."""
     return Channel(topic, schema, schema.encode(), **more)
 
 
-def definitions(defined: ChannelRegistry, one: Channel) -> list[McapChannel | Schema]:
-    """What stands before the first message of a channel."""
+def read_definitions(defined: ChannelRegistry, one: Channel) -> list[McapChannel | Schema]:
+    """Return the definitions that the writer puts before the first message of a channel."""
     begun = defined.definition_records(defined.get_channel_id(one))
     return list(parse_records(np.frombuffer(begun, np.uint8)).iter_definitions())
 
 
-def summarised(defined: ChannelRegistry) -> tuple[list[int], list[int]]:
-    """Numbers of the schemas and channels that the summary repeats."""
+def list_summary_ids(defined: ChannelRegistry) -> tuple[list[int], list[int]]:
+    """Return the IDs of the schemas and of the channels that the summary repeats."""
     records = [
         np.frombuffer(b"".join(kind), np.uint8) for kind in defined.list_written_definitions()
     ]
@@ -154,26 +155,26 @@ def summarised(defined: ChannelRegistry) -> tuple[list[int], list[int]]:
 
 def test_channels_are_numbered_once_and_defined_once() -> None:
     defined = ChannelRegistry()
-    assert [defined.get_channel_id(channel(t)) for t in ("/a", "/b", "/a")] == [1, 2, 1]
-    schema, own = definitions(defined, channel("/a"))
+    assert [defined.get_channel_id(build_channel(t)) for t in ("/a", "/b", "/a")] == [1, 2, 1]
+    schema, own = read_definitions(defined, build_channel("/a"))
     assert isinstance(schema, Schema)
     assert isinstance(own, McapChannel)
     assert (schema.id, schema.name, schema.data) == (1, "a", b"a")
     assert (own.id, own.topic, own.schema_id) == (1, "/a", 1)
-    assert definitions(defined, channel("/a")) == []
-    (second,) = definitions(defined, channel("/b"))  # of the same schema
+    assert read_definitions(defined, build_channel("/a")) == []
+    (second,) = read_definitions(defined, build_channel("/b"))  # of the same schema
     assert isinstance(second, McapChannel)
     assert (second.id, second.schema_id) == (2, 1)
-    nameless = definitions(defined, Channel("/e", "", b"", ""))
+    nameless = read_definitions(defined, Channel("/e", "", b"", ""))
     assert [(type(one), one.schema_id) for one in nameless if isinstance(one, McapChannel)] == [
         (McapChannel, 0)
     ]
-    assert summarised(defined) == ([1], [1, 2, 3])
+    assert list_summary_ids(defined) == ([1], [1, 2, 3])
 
 
 def test_chunk_is_copied_if_definitions_match() -> None:
-    """Channels 4 and 6 of schema 9, defined in the chunk in front of their messages."""
-    mine = {n: channel(topic) for n, topic in ((4, "/a"), (6, "/b"))}
+    """Here channels 4 and 6 of schema 9 are defined in the chunk before their messages."""
+    mine = {n: build_channel(topic) for n, topic in ((4, "/a"), (6, "/b"))}
     records = {n: McapChannel(n, c.topic, "protobuf", {}, 9) for n, c in mine.items()}
     schema = Schema(9, b"a", "protobuf", "a")
 
@@ -196,14 +197,14 @@ def test_chunk_is_copied_if_definitions_match() -> None:
 
     defined, stands = begun(schema, records[4], 4, records[6], 6, 4)
     assert stands and defined.written == {4, 6}
-    assert summarised(defined) == ([9], [4, 6])
+    assert list_summary_ids(defined) == ([9], [4, 6])
     assert defined.definition_records(4) == defined.definition_records(6) == b""
-    assert stands_in(defined, chunk(6, 4))  # known by now
+    assert stands_in(defined, chunk(6, 4))  # both were defined by an earlier chunk
     for parts in (
         (records[4], 4),  # without its schema
         (schema, 4),  # not defined
         (schema, records[4], 4, 6),
-        (schema, McapChannel(4, "/a", "protobuf", {"k": "v"}, 9), 4),  # in other words
+        (schema, McapChannel(4, "/a", "protobuf", {"k": "v"}, 9), 4),  # other metadata
         (Schema(9, b"b", "protobuf", "a"), records[4], 4),
         (schema, records[4], McapChannel(7, "/c", "protobuf", {}, 9), 4),
     ):
@@ -211,13 +212,17 @@ def test_chunk_is_copied_if_definitions_match() -> None:
         assert not stands and not defined.written
     defined = ChannelRegistry()
     defined.get_channel_id(mine[6])
-    assert not stands_in(defined, chunk(schema, records[6], 6))  # has another number here
+    assert not stands_in(defined, chunk(schema, records[6], 6))  # has another ID here
 
 
 def test_copied_channels_keep_their_ids_if_free() -> None:
     defined = ChannelRegistry()
-    defined.get_channel_id(channel("/a"))
-    kept, taken, other = channel("/c", "b"), channel("/d", "c"), channel("/f", "d")
+    defined.get_channel_id(build_channel("/a"))
+    kept, taken, other = (
+        build_channel("/c", "b"),
+        build_channel("/d", "c"),
+        build_channel("/f", "d"),
+    )
 
     def theirs(number: int, one: Channel, schema_id: int) -> dict[int, McapChannel]:
         return {number: McapChannel(number, one.topic, "protobuf", {}, schema_id)}
@@ -227,13 +232,13 @@ def test_copied_channels_keep_their_ids_if_free() -> None:
     assert [defined.get_channel_id(one) for one in (kept, other, taken)] == [9, 12, 13]
     ids = []
     for one, name in ((kept, "b"), (other, "d"), (taken, "c")):
-        schema, own = definitions(defined, one)
+        schema, own = read_definitions(defined, one)
         assert isinstance(schema, Schema)
         assert isinstance(own, McapChannel)
         assert (schema.name, own.schema_id) == (name, schema.id)
         ids.append(schema.id)
     assert ids[0] == 40
-    assert len({1, *ids}) == 4  # the schema of another with that number has one of its own
+    assert len({1, *ids}) == 4  # a different schema with the same ID gets a new ID
 
 
 def test_free_ids_are_reused_when_exhausted() -> None:
@@ -247,10 +252,10 @@ def test_free_ids_are_reused_when_exhausted() -> None:
 
 
 def test_raw_message_has_its_topic_without_channel_id() -> None:
-    assert RawMessage(1, 2, channel("/a"), b"x").topic == "/a"
+    assert RawMessage(1, 2, build_channel("/a"), b"x").topic == "/a"
 
 
-def test_pictures_that_do_not_get_smaller_are_stored_as_they_are() -> None:
+def test_incompressible_chunks_are_stored_uncompressed() -> None:
     noise = np.random.default_rng(0).integers(0, 256, 60_000, np.uint8).tobytes()
     for payload, images, wanted in (
         (noise, True, ""),

@@ -1,4 +1,4 @@
-"""Recording files: their start and end, and that hashed files stay unchanged."""
+"""Recording files: magic bytes, reads beyond the end, and changes after hashing."""
 
 import os
 from pathlib import Path
@@ -11,44 +11,45 @@ from dmrl.recording import Provenance, RecordingWriter, read_summary
 from dmrl.recording.mcap.file import MAGIC, expect_unchanged, open_mcap
 
 
-def write(path: Path, height_m: float) -> Path:
+def write_height(path: Path, height_m: float) -> Path:
+    """Write one height; replace the file if it exists."""
     path.unlink(missing_ok=True)
     with RecordingWriter(path, Provenance("test")) as sink:
         sink.write(0, "/cf1/height", message_class("Height")(height_m=height_m))
     return path
 
 
-def test_a_missing_recording_is_offered_by_its_neighbour(tmp_path: Path) -> None:
-    write(tmp_path / "flight_tracks.mcap", 1.0)
+def test_error_of_a_missing_recording_suggests_a_similar_name(tmp_path: Path) -> None:
+    write_height(tmp_path / "flight_tracks.mcap", 1.0)
     with pytest.raises(RecordingError, match=r"Did you mean flight_tracks\.mcap\?"):
         read_summary(tmp_path / "flight_track.mcap")
     with pytest.raises(RecordingError, match=r"no recording .*zzz\. Check the name"):
         read_summary(tmp_path / "zzz")
 
 
-def test_a_folder_in_place_of_a_recording_names_those_in_it(tmp_path: Path) -> None:
+def test_error_of_a_folder_lists_the_recordings_in_it(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"not a recording\. Name a \.mcap file$"):
         read_summary(tmp_path)
     for name in "abcd":
-        write(tmp_path / f"{name}.mcap", 1.0)
+        write_height(tmp_path / f"{name}.mcap", 1.0)
     with pytest.raises(RecordingError, match=r"Name one in it: .*a\.mcap, .*c\.mcap, \.\.\.$"):
         read_summary(tmp_path)
 
 
 def test_hashed_input_must_stay_unchanged_until_an_output_is_done(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mcap", 1.0)
+    path = write_height(tmp_path / "a.mcap", 1.0)
     expect_unchanged(path)
     assert read_summary(path).count == 1
     os.utime(path, (5, 5))
     with pytest.raises(RecordingError, match=r"a\.mcap was changed while it was read"):
         read_summary(path)
-    write(tmp_path / "b.mcap", 2.0)  # an output is done: what comes now belongs to the next
+    write_height(tmp_path / "b.mcap", 2.0)  # completes an output, so inputs may change again
     assert read_summary(path).count == 1
     expect_unchanged(path)
     other = path.with_name("c.mcap")
     other.write_bytes(path.read_bytes())
     os.utime(other, (5, 5))
-    other.replace(path)  # alike in size and time, another file
+    other.replace(path)  # another file of equal size and modification time
     with pytest.raises(RecordingError, match="was changed"):
         read_summary(path)
 
@@ -76,7 +77,7 @@ def test_no_read_goes_beyond_the_end(tmp_path: Path) -> None:
         assert (stream.tell(), stream.size) == (0, 18)
         assert stream.read(18) == MAGIC + b"12" + MAGIC
         stream.seek(8)
-        assert stream.read(None) == b"12" + MAGIC  # all, as of any file
+        assert stream.read(None) == b"12" + MAGIC  # None reads to the end, as in any file
     beyond = pytest.raises(RecordingError, match="a record at byte 1 runs beyond the end")
     with beyond, open_mcap(tmp_path / "a.mcap") as stream:
         stream.seek(1)

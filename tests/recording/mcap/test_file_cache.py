@@ -1,3 +1,5 @@
+"""The cache of summaries: when it is used, and when a file is read again."""
+
 import os
 import time
 from pathlib import Path
@@ -11,39 +13,41 @@ from dmrl.recording import Provenance, RecordingWriter, read_summary
 from dmrl.recording.mcap import file_cache
 
 
-def write(path: Path, heights: int) -> None:
+def write_heights(path: Path, heights: int) -> None:
+    """Write this many heights."""
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(heights):
             sink.write(k, "/cf1/height", message_class("Height")(height_m=k))
 
 
-def settled(path: Path, second: int) -> None:
-    """As if it had been written long ago, at that second."""
+def set_modification_time(path: Path, second: int) -> None:
+    """Set the modification time, Unix seconds. Only files older than a second are cached."""
     os.utime(path, (second, second))
 
 
 def test_a_summary_is_not_made_again_while_the_file_is_the_same(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    write(path, 3)
-    settled(path, 1_000_000_000)
+    write_heights(path, 3)
+    set_modification_time(path, 1_000_000_000)
     assert read_summary(path) is read_summary(path)
 
 
 def test_rewritten_file_is_read_again(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    write(path, 3)
-    settled(path, 1_000_000_000)
+    write_heights(path, 3)
+    set_modification_time(path, 1_000_000_000)
     assert read_summary(path).count == 3
     path.unlink()
-    write(path, 5)
-    settled(path, 1_000_000_001)
+    write_heights(path, 5)
+    set_modification_time(path, 1_000_000_001)
     assert read_summary(path).count == 5
 
 
 def test_a_file_of_this_second_is_always_read_again(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    write(path, 3)
-    settled(path, int(time.time()) + 60)  # a slow machine must not let the second pass
+    write_heights(path, 3)
+    # A time in the future keeps the file recent on a slow machine too.
+    set_modification_time(path, int(time.time()) + 60)
     assert read_summary(path) is not read_summary(path)
 
 
@@ -61,7 +65,7 @@ def test_cache_is_keyed_by_file_identity_and_bounded(monkeypatch: pytest.MonkeyP
     for name in ("a", "a", "b", "a"):
         assert asked(name) == name
     assert made == ["a", "b"]
-    asked("c")  # a, the oldest, is forgotten
+    asked("c")  # evicts the oldest entry, a
     asked("b")
     asked("a")
     assert made == ["a", "b", "c", "a"]

@@ -1,4 +1,4 @@
-"""Message indexes of many chunks at a time."""
+"""Reading the message indexes of many chunks at a time."""
 
 import struct
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from dmrl.recording.mcap.index_reader import iter_index_times
 from dmrl.recording.mcap.summary_section import read_summary_section
 
 MESSAGES = 12
-HEAD_BYTES = 15  # opcode, length, channel and size of a Message Index
+HEAD_BYTES = 15  # opcode, length, channel and size of a Message Index record
 
 
 def write(path: Path, order: Sequence[int] = range(MESSAGES)) -> list[ChunkIndex]:
@@ -85,7 +85,7 @@ def test_a_time_of_another_chunk_is_refused(tmp_path: Path) -> None:
 def test_a_message_index_must_end_with_its_chunk(tmp_path: Path) -> None:
     chunk = write(tmp_path / "a.mcap")[1]
     last = max(chunk.message_index_offsets.values())
-    # The record claims the bytes behind it, as if a later version had added a field.
+    # The record is 4 bytes longer, as if a later version of MCAP had added a field.
     overwrite(tmp_path / "a.mcap", last + 1, struct.pack("<Q", 6 + 16 + 4))
     with pytest.raises(RecordingError, match="a message index is cut"):
         read_indexes(tmp_path / "a.mcap")

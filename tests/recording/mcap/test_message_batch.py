@@ -21,8 +21,8 @@ TIMES = st.integers(0, 5)
 ROWS = st.lists(st.tuples(st.integers(1, 3), TIMES, TIMES, st.binary(max_size=5)), max_size=8)
 
 
-def block_of(rows: list[Row], gap: int = 3) -> MessageBatch:
-    """Messages with their heads, and bytes of nobody's before each."""
+def build_batch(rows: list[Row], gap: int = 3) -> MessageBatch:
+    """Build a batch of messages with ``gap`` unused bytes before each record."""
     data, start = b"", []
     for *_, payload in rows:
         data += b"\xee" * (gap + MESSAGE_PREFIX_BYTES)
@@ -37,7 +37,7 @@ def block_of(rows: list[Row], gap: int = 3) -> MessageBatch:
 @given(ROWS, ROWS)
 @pytest.mark.heavy
 def test_batch_operations_keep_messages_intact(one: list[Row], other: list[Row]) -> None:
-    first, second = block_of(one), block_of(other, 1)
+    first, second = build_batch(one), build_batch(other, 1)
     assert list(first.iter_rows()) == one
     assert list(first.compact().iter_rows()) == one
     records, at = first.copy_records()
@@ -58,7 +58,7 @@ def test_batch_operations_keep_messages_intact(one: list[Row], other: list[Row])
 
 
 def test_concatenated_batch_copies_only_its_messages() -> None:
-    large = block_of([(1, k, k, bytes([k]) * 10) for k in range(100)], 0)
+    large = build_batch([(1, k, k, bytes([k]) * 10) for k in range(100)], 0)
     few = concatenate_all([large.take(np.array([k])) for k in (3, 50)])
     assert [payload for *_, payload in few.iter_rows()] == [b"\x03" * 10, b"2" * 10]
     assert len(few.data) == 2 * (MESSAGE_PREFIX_BYTES + 10)
@@ -69,4 +69,4 @@ def test_concatenated_batch_copies_only_its_messages() -> None:
 def test_gathered_rows_of_several_parts_are_complete(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "ROWS_AT_A_TIME", 3)
     rows = [(1, k, 2 * k, bytes([k])) for k in range(7)]
-    assert list(block_of(rows).iter_rows()) == rows
+    assert list(build_batch(rows).iter_rows()) == rows

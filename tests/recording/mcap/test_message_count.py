@@ -10,8 +10,8 @@ from mcap.exceptions import McapError
 from dmrl.recording.mcap.message_count import check_counts
 
 
-def statistics(counts: dict[int, int] | None) -> Any:
-    """Of a recording of these messages by channel; None: it has no statistics."""
+def build_statistics(counts: dict[int, int] | None) -> Any:
+    """Build statistics with these message counts by channel, or None without counts."""
     return None if counts is None else SimpleNamespace(channel_message_counts=counts)
 
 
@@ -35,7 +35,7 @@ def test_message_count_must_match_statistics(
     said: dict[int, int] | None, found: dict[int, int], fault: str
 ) -> None:
     if not fault:
-        check_counts(statistics(said), CHANNELS, Counter(found))
+        check_counts(build_statistics(said), CHANNELS, Counter(found))
         return
     with pytest.raises(McapError, match=fault):
-        check_counts(statistics(said), CHANNELS, Counter(found))
+        check_counts(build_statistics(said), CHANNELS, Counter(found))

@@ -1,4 +1,4 @@
-"""Parse Message Index records of a chunk."""
+"""Parsing of the Message Index records of a chunk."""
 
 import struct
 
@@ -11,8 +11,8 @@ from dmrl.recording.mcap.message_index import IndexEntries, parse_index_entries,
 NUMBER, AT = 3, 5
 
 
-def build(number: int = NUMBER, size: int = 32, length: int = 38, opcode: int = 7) -> bytes:
-    """Return five other bytes and a message index of two messages."""
+def build_index(number: int = NUMBER, size: int = 32, length: int = 38, opcode: int = 7) -> bytes:
+    """Build a message index of two messages behind five other bytes."""
     head = struct.pack("<BQHI", opcode, length, number, size)
     return b"other" + head + struct.pack("<4q", 40, 9, 20, 71)
 
@@ -33,7 +33,7 @@ def parse_both(raw: bytes, at: int) -> list[IndexEntries | str]:
 
 
 def test_a_single_record_is_parsed_as_many_are() -> None:
-    for entries in parse_both(build() + b"more", AT):
+    for entries in parse_both(build_index() + b"more", AT):
         assert isinstance(entries, IndexEntries)
         assert [one.tolist() for one in entries] == [[3, 3], [40, 20], [9, 71], [2]]
 
@@ -41,14 +41,14 @@ def test_a_single_record_is_parsed_as_many_are() -> None:
 @pytest.mark.parametrize(
     ("raw", "at", "why"),
     [
-        (build(), -1, "a message index is cut"),
-        (build()[: AT + 14], AT, "a message index is cut"),
-        (build()[:-1], AT, "a message index is cut"),
-        (build(length=39), AT, "a message index is cut"),
-        (build(number=4), AT, "message index of channel 3 is wrong"),
-        (build(opcode=8), AT, "message index of channel 3 is wrong"),
-        (build(length=37), AT, "message index of channel 3 is wrong"),
-        (build(size=31), AT, "message index of channel 3 is wrong"),
+        (build_index(), -1, "a message index is cut"),
+        (build_index()[: AT + 14], AT, "a message index is cut"),
+        (build_index()[:-1], AT, "a message index is cut"),
+        (build_index(length=39), AT, "a message index is cut"),
+        (build_index(number=4), AT, "message index of channel 3 is wrong"),
+        (build_index(opcode=8), AT, "message index of channel 3 is wrong"),
+        (build_index(length=37), AT, "message index of channel 3 is wrong"),
+        (build_index(size=31), AT, "message index of channel 3 is wrong"),
     ],
 )
 def test_a_single_record_is_refused_as_many_are(raw: bytes, at: int, why: str) -> None:

@@ -1,4 +1,4 @@
-"""Contradictory summaries are damage."""
+"""Contradictory summaries are refused as damaged."""
 
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -10,8 +10,8 @@ from mcap.exceptions import McapError
 from dmrl.recording.mcap.summary_checks import check_extra_counts, check_statistics
 
 
-def summary(**more: Any) -> Any:
-    """Of two channels with five messages in one chunk; ``more`` is otherwise."""
+def build_summary(**more: Any) -> Any:
+    """Build a summary of two channels with five messages in one chunk; ``more`` overrides it."""
     chunk = SimpleNamespace(message_index_offsets={1: 0, 2: 0})
     channel = SimpleNamespace(topic="/a", schema_id=3)
     statistics = {
@@ -51,8 +51,8 @@ def summary(**more: Any) -> Any:
         ({"schemas": {}}, "its summary lacks the schema of /a"),
     ],
 )
-def test_a_summary_agrees_with_itself(more: dict[str, Any], fault: str) -> None:
+def test_contradictory_summary_is_refused(more: dict[str, Any], fault: str) -> None:
     expected = pytest.raises(McapError, match=fault) if fault else nullcontext()
     with expected:
-        check_statistics(summary(**more))
-        check_extra_counts(summary(**more))
+        check_statistics(build_summary(**more))
+        check_extra_counts(build_summary(**more))

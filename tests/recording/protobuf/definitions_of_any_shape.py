@@ -1,7 +1,6 @@
-"""Random definitions and messages of every shape that protobuf allows, from Google's own library.
+"""Random protobuf definitions and messages of every allowed shape, for tests of the decoder.
 
-Nothing here knows how dmrl decodes: definitions are descriptors, messages are filled and
-serialized by the protobuf package.
+Nothing here comes from dmrl: Google's protobuf package builds and serializes all of them.
 """
 
 import random
@@ -51,7 +50,7 @@ LIMITS = {
 
 
 class Definitions:
-    """A set of files that import each other, with messages ``p0.M0`` and so on."""
+    """Random files that import each other; ``messages`` are named ``.p0.M0`` and so on."""
 
     def __init__(self, seed: int) -> None:
         self.rng = random.Random(seed)
@@ -191,8 +190,8 @@ class Definitions:
             label=F.LABEL_REPEATED,
         )
 
-    def pool(self) -> DescriptorPool:
-        """Google's own pool of all files, in their order."""
+    def build_pool(self) -> DescriptorPool:
+        """Return Google's descriptor pool of all files, added in their order."""
         pool = DescriptorPool()
         for known in (TIMESTAMP, STRUCT, WRAPPERS):
             pool.AddSerializedFile(known.serialized_pb)
@@ -200,8 +199,11 @@ class Definitions:
             pool.AddSerializedFile(file.SerializeToString())
         return pool
 
-    def schema(self) -> bytes:
-        """All files in any order, as writers shuffle them, some without what Google's define."""
+    def build_schema(self) -> bytes:
+        """Return a descriptor set of all files, in random order as some writers have it.
+
+        Each of Google's own files that they import is missing at random.
+        """
         held = list(self.files)
         for known in (TIMESTAMP, STRUCT, WRAPPERS):
             if self.rng.random() < 0.5:
@@ -209,8 +211,8 @@ class Definitions:
         self.rng.shuffle(held)
         return FileDescriptorSet(file=held).SerializeToString()
 
-    def payloads(self, kind: Descriptor, count: int) -> list[bytes]:
-        """Messages, some of several serialized ones behind each other, as the format allows."""
+    def build_payloads(self, kind: Descriptor, count: int) -> list[bytes]:
+        """Return serialized messages; some are several concatenated ones, which protobuf merges."""
         build = GetMessageClass(kind)
         return [
             b"".join(
@@ -263,7 +265,8 @@ class Definitions:
     def _scalar(self, field: FieldDescriptor) -> Any:
         kind = field.type
         if field.full_name.startswith("google.") and kind in (*LIMITS, F.TYPE_DOUBLE, F.TYPE_ENUM):
-            return self.rng.randint(0, 0 if kind == F.TYPE_ENUM else 1000)  # JSON allows no more
+            # JSON limits the values of Google's own types, such as times.
+            return self.rng.randint(0, 0 if kind == F.TYPE_ENUM else 1000)
         if field.enum_type is not None:
             return self.rng.choice([0, 1, -5, 70000])
         if kind in LIMITS:
@@ -277,7 +280,7 @@ class Definitions:
 
 
 def iter_definitions(seeds: range) -> Iterator[tuple[Definitions, DescriptorPool]]:
-    """Yield the definitions of some seeds that Google's library accepts, with its pool."""
+    """Yield the definitions of each seed with Google's descriptor pool of them."""
     for seed in seeds:
         made = Definitions(seed)
-        yield made, made.pool()
+        yield made, made.build_pool()

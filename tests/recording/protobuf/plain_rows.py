@@ -1,4 +1,4 @@
-"""Messages as rows of a table: as Google's library reads them, and as tables of dmrl have them."""
+"""Compare messages read by Google's library with rows of dmrl's tables, in one plain form."""
 
 import json
 from typing import Any
@@ -8,23 +8,23 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 
 def contains_itself(kind: Descriptor, within: tuple[str, ...] = ()) -> bool:
-    """Whether a type holds, however deep, the type itself or one that does."""
+    """Return whether a type contains a recursive type at any depth, itself included."""
     if kind.full_name in within:
         return True
     inner = (f.message_type for f in kind.fields if f.message_type is not None)
     return any(contains_itself(one, (*within, kind.full_name)) for one in inner)
 
 
-def ordered(text: str) -> Any:
-    """The values of a JSON text, the keys of its objects sorted: those of a map have no order."""
+def parse_sorted_json(text: str) -> Any:
+    """Parse a JSON text and sort the keys of its objects, since maps have no order."""
     return json.loads(text, object_pairs_hook=lambda pairs: dict(sorted(pairs)))
 
 
-def plain(message: Any, *, top: bool = True) -> Any:
-    """A message as its table has it, read by Google's own library."""
+def read_row(message: Any, *, top: bool = True) -> Any:
+    """Return a message as the table has it, read by Google's own library."""
     kind = message.DESCRIPTOR
     if not top and contains_itself(kind):
-        return ordered(
+        return parse_sorted_json(
             json_format.MessageToJson(
                 message, preserving_proto_field_name=True, descriptor_pool=kind.file.pool
             )
@@ -41,23 +41,23 @@ def _value(message: Any, field: FieldDescriptor) -> Any:
     if inner is not None and inner.GetOptions().map_entry:
         entries = [
             (key, held[key] if inner.fields_by_name["value"].message_type is None else
-             plain(held[key], top=False))
+             read_row(held[key], top=False))
             for key in held
         ]  # fmt: skip
         return sorted(entries, key=repr)
     if field.is_repeated:
-        return [plain(one, top=False) if inner is not None else one for one in held]
+        return [read_row(one, top=False) if inner is not None else one for one in held]
     if inner is not None:
-        return plain(held, top=False) if message.HasField(field.name) else None
+        return read_row(held, top=False) if message.HasField(field.name) else None
     return held
 
 
 def from_table(value: Any, kind: Descriptor, *, top: bool = True) -> Any:
-    """A row of a table in the form of `plain`: maps sorted, JSON parsed."""
+    """Return a row of a table in the form of `read_row`: maps sorted, JSON parsed."""
     if value is None:
         return None
     if not top and contains_itself(kind):
-        return ordered(value)
+        return parse_sorted_json(value)
     out = dict(value)
     for field in kind.fields:
         inner = field.message_type

@@ -1,4 +1,4 @@
-"""NumPy and Arrow arrays of the same values, and the packages that converting them loads."""
+"""Conversion between NumPy and Arrow: equal values, without loading pandas."""
 
 import subprocess
 import sys

@@ -37,8 +37,8 @@ TYPES = {
 }  # fmt: skip
 
 
-def build() -> Any:
-    """A type with every scalar type, each once and repeated, and itself nested one deep."""
+def build_class() -> Any:
+    """Build a message class with every scalar type, singular and repeated, and nested once."""
     file = FileDescriptorProto(name="all.proto", package="t", syntax="proto3")
     inner, outer = DescriptorProto(name="Inner"), DescriptorProto(name="Outer")
     for kind in (inner, outer):
@@ -55,11 +55,12 @@ def build() -> Any:
     return GetMessageClass(pool.FindMessageTypeByName("t.Outer"))
 
 
-OUTER = build()
+OUTER = build_class()
 
 
 @st.composite
 def contents(draw: st.DrawFn, nested: bool = True) -> dict[str, Any]:
+    """Draw random contents of an Outer message, or of an Inner one without nesting."""
     out: dict[str, Any] = {}
     for name, (_, values) in TYPES.items():
         if draw(st.booleans()):
@@ -73,23 +74,24 @@ def contents(draw: st.DrawFn, nested: bool = True) -> dict[str, Any]:
     return out
 
 
-def plain(value: Any) -> Any:
-    """A protobuf message as ``to_pylist`` gives it."""
+def to_plain(value: Any) -> Any:
+    """Return a protobuf message in the form of Arrow's ``to_pylist``."""
     if not hasattr(value, "DESCRIPTOR"):
         return value
     out = {}
     for field in value.DESCRIPTOR.fields:
         got = getattr(value, field.name)
         if field.is_repeated:
-            out[field.name] = [plain(v) for v in got]
+            out[field.name] = [to_plain(v) for v in got]
         elif field.message_type is not None:
-            out[field.name] = plain(got) if value.HasField(field.name) else None
+            out[field.name] = to_plain(got) if value.HasField(field.name) else None
         else:
             out[field.name] = got
     return out
 
 
-def rows(messages: list[Any]) -> list[dict[str, Any]]:
+def decode_rows(messages: list[Any]) -> list[dict[str, Any]]:
+    """Serialize messages, decode them in bulk, and return a dictionary for each."""
     parts = [m.SerializeToString() for m in messages]
     end = np.cumsum([len(p) for p in parts], dtype=np.int64)
     start = end - np.array([len(p) for p in parts], np.int64)
@@ -106,7 +108,7 @@ def rows(messages: list[Any]) -> list[dict[str, Any]]:
 @given(st.lists(contents(), min_size=1, max_size=5))
 def test_bulk_decoding_equals_google_protobuf(values: list[dict[str, Any]]) -> None:
     messages = [OUTER(**v) for v in values]
-    assert rows(messages) == [plain(m) for m in messages]
+    assert decode_rows(messages) == [to_plain(m) for m in messages]
 
 
 @settings(max_examples=100)
@@ -125,7 +127,7 @@ def test_labels_with_and_without_peers() -> None:
         message_class("PeerLabels")(),
         message_class("PeerLabels")(peers=[label(peer="cf2"), label(peer="cf3", u_px=3.5)]),
     ]
-    assert rows(values) == [plain(v) for v in values]
+    assert decode_rows(values) == [to_plain(v) for v in values]
 
 
 def test_a_value_beyond_its_message_is_an_error() -> None:

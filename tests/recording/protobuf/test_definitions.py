@@ -1,4 +1,4 @@
-"""Definitions of every shape, against Google's own decoder."""
+"""Decoding of messages with definitions of every shape, compared with Google's own decoder."""
 
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,13 @@ from dmrl.stages.convert import Settings, run
 from dmrl.terminal.left_out import count_left_out
 
 from .definitions_of_any_shape import iter_definitions
-from .plain_rows import from_table, plain
+from .plain_rows import from_table, read_row
 
 F = FieldDescriptorProto
 
 
-def rows(parts: list[bytes], kind: Descriptor) -> list[dict[str, Any]]:
+def decode_rows(parts: list[bytes], kind: Descriptor) -> list[dict[str, Any]]:
+    """Decode serialized messages in bulk and return a dictionary for each."""
     end = np.cumsum([len(p) for p in parts], dtype=np.int64)
     start = end - np.array([len(p) for p in parts], np.int64)
     got = decode(np.frombuffer(b"".join(parts), np.uint8), start, end, kind)
@@ -39,16 +40,16 @@ def rows(parts: list[bytes], kind: Descriptor) -> list[dict[str, Any]]:
     return [{name: lists[name][k] for name in lists} for k in range(len(parts))]
 
 
-def compare(seeds: range) -> int:
+def compare_decoders(seeds: range) -> int:
     """Decode messages of random definitions; return how many were compared."""
     count = 0
     for made, pool in iter_definitions(seeds):
-        schema = made.schema()
+        schema = made.build_schema()
         for name in made.messages:
             theirs, ours = pool.FindMessageTypeByName(name[1:]), build_type(name[1:], schema)
-            parts = made.payloads(theirs, 6)
-            wanted = [plain(GetMessageClass(theirs).FromString(part)) for part in parts]
-            got = [from_table(row, ours) for row in rows(parts, ours)]
+            parts = made.build_payloads(theirs, 6)
+            wanted = [read_row(GetMessageClass(theirs).FromString(part)) for part in parts]
+            got = [from_table(row, ours) for row in decode_rows(parts, ours)]
             assert repr(got) == repr(wanted), (made.rng, name)
             count += len(parts)
     return count
@@ -56,16 +57,16 @@ def compare(seeds: range) -> int:
 
 @pytest.mark.heavy
 def test_definitions_of_every_shape_decode_as_google_decodes_them() -> None:
-    assert compare(range(25)) > 250
+    assert compare_decoders(range(25)) > 250
 
 
 @pytest.mark.slow
 def test_two_thousand_definitions_decode_as_google_decodes_them() -> None:
-    assert compare(range(1000, 3000)) > 20_000
+    assert compare_decoders(range(1000, 3000)) > 20_000
 
 
-def message(file: FileDescriptorProto, name: str, **fields: Any) -> None:
-    """Add a message whose fields are types, by name."""
+def add_message(file: FileDescriptorProto, name: str, **fields: Any) -> None:
+    """Add a message to a file; ``fields`` gives the type of each field by its name."""
     added = file.message_type.add(name=name)
     for number, (field, kind) in enumerate(fields.items(), 1):
         held = added.field.add(name=field, number=number, label=F.LABEL_OPTIONAL)
@@ -75,12 +76,12 @@ def message(file: FileDescriptorProto, name: str, **fields: Any) -> None:
             held.type_name = kind
 
 
-def proto(name: str, package: str = "my", **more: Any) -> FileDescriptorProto:
+def build_file(name: str, package: str = "my", **more: Any) -> FileDescriptorProto:
     return FileDescriptorProto(name=name, package=package, syntax="proto3", **more)
 
 
-def build(name: str, *files: FileDescriptorProto) -> Any:
-    """Google's class of a message, of files in the order in which they can be added."""
+def build_class(name: str, *files: FileDescriptorProto) -> Any:
+    """Return Google's class of a message; files precede those that import them."""
     pool = DescriptorPool()
     for file in files:
         pool.AddSerializedFile(file.SerializeToString())
@@ -90,8 +91,8 @@ def build(name: str, *files: FileDescriptorProto) -> Any:
 Sent = tuple[str, str, bytes, list[bytes]]
 
 
-def write(path: Path, *sent: Sent) -> Path:
-    """A file of mcap's own writer: of each topic, its schema's name and data, and messages."""
+def write_recording(path: Path, *sent: Sent) -> Path:
+    """Write topics with the mcap package, each with its schema name, schema and messages."""
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
@@ -105,35 +106,37 @@ def write(path: Path, *sent: Sent) -> Path:
     return path
 
 
-def packed(*files: FileDescriptorProto) -> bytes:
+def pack_files(*files: FileDescriptorProto) -> bytes:
     return FileDescriptorSet(file=files).SerializeToString()
 
 
 def test_missing_imports_of_definitions_are_accepted(tmp_path: Path) -> None:
-    """Options of nanopb or of a validator are imported, and their files seldom come along."""
-    file = proto("m.proto", dependency=["nanopb.proto", "other.proto"])
-    message(file, "M", x=F.TYPE_DOUBLE, far=".other.Far")
-    whole = proto("m.proto", dependency=["other.proto"])
-    message(whole, "M", x=F.TYPE_DOUBLE, far=".other.Far")
-    other = proto("other.proto", "other")
-    message(other, "Far", y=F.TYPE_INT32)
-    made = build("my.M", other, whole)
+    """Writers seldom include the imported files that define options of nanopb or validators."""
+    file = build_file("m.proto", dependency=["nanopb.proto", "other.proto"])
+    add_message(file, "M", x=F.TYPE_DOUBLE, far=".other.Far")
+    whole = build_file("m.proto", dependency=["other.proto"])
+    add_message(whole, "M", x=F.TYPE_DOUBLE, far=".other.Far")
+    other = build_file("other.proto", "other")
+    add_message(other, "Far", y=F.TYPE_INT32)
+    made = build_class("my.M", other, whole)
     data = made(x=1.5, far={"y": 7}).SerializeToString()
-    found = dmrl.open(write(tmp_path / "a.mcap", ("/x", "my.M", packed(file), [data] * 3)))
+    found = dmrl.open(
+        write_recording(tmp_path / "a.mcap", ("/x", "my.M", pack_files(file), [data] * 3))
+    )
     table = found["/x"].to_arrow()
     assert table["x"].to_pylist() == [1.5] * 3
-    assert table["far"].to_pylist() == [b"\x08\x07"] * 3  # nobody says what it is
+    assert table["far"].to_pylist() == [b"\x08\x07"] * 3  # its type is defined nowhere
 
 
 def test_two_files_may_define_one_type(tmp_path: Path) -> None:
-    one, two = proto("a.proto"), proto("dir/a.proto", dependency=["a.proto"])
+    one, two = build_file("a.proto"), build_file("dir/a.proto", dependency=["a.proto"])
     for file in (one, two):
-        message(file, "P", x=F.TYPE_DOUBLE)
-    message(two, "Q", p=".my.P")
-    only = proto("dir/a.proto", dependency=["a.proto"])
-    message(only, "Q", p=".my.P")
-    data = build("my.Q", one, only)(p={"x": 2.5}).SerializeToString()
-    path = write(tmp_path / "a.mcap", ("/x", "my.Q", packed(two, one), [data]))
+        add_message(file, "P", x=F.TYPE_DOUBLE)
+    add_message(two, "Q", p=".my.P")
+    only = build_file("dir/a.proto", dependency=["a.proto"])
+    add_message(only, "Q", p=".my.P")
+    data = build_class("my.Q", one, only)(p={"x": 2.5}).SerializeToString()
+    path = write_recording(tmp_path / "a.mcap", ("/x", "my.Q", pack_files(two, one), [data]))
     assert dmrl.open(path)["/x"].to_arrow()["p"].to_pylist() == [{"x": 2.5}]
 
 
@@ -141,21 +144,21 @@ def test_a_topic_whose_type_grows_has_the_columns_of_all(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sent: list[Sent] = []
-    inner = proto("in.proto")
-    message(inner, "In", a=F.TYPE_INT32)
+    inner = build_file("in.proto")
+    add_message(inner, "In", a=F.TYPE_INT32)
     for fields in (
         {"x": F.TYPE_DOUBLE, "inner": ".my.In"},
         {"x": F.TYPE_DOUBLE, "inner": ".my.In", "n": F.TYPE_INT32},
         {"x": F.TYPE_STRING, "inner": ".my.In", "n": F.TYPE_INT64},
     ):
-        file = proto("m.proto", dependency=["in.proto"])
-        message(file, "M", **fields)
-        made = build("my.M", inner, file)
+        file = build_file("m.proto", dependency=["in.proto"])
+        add_message(file, "M", **fields)
+        made = build_class("my.M", inner, file)
         text = "one" if fields["x"] == F.TYPE_STRING else 1.0
         values = {"x": text, "inner": {"a": 4}} | ({"n": 9} if "n" in fields else {})
         data = [made(**values).SerializeToString()] * 4
-        sent.append(("/x", "my.M", packed(file, inner), data))
-    table = dmrl.open(write(tmp_path / "a.mcap", *sent))["/x"].to_arrow()
+        sent.append(("/x", "my.M", pack_files(file, inner), data))
+    table = dmrl.open(write_recording(tmp_path / "a.mcap", *sent))["/x"].to_arrow()
     assert (np.diff(table["log_time"].to_numpy()) > 0).all()
     assert table["x"].to_pylist() == [1.0, 1.0, None] * 4
     assert table["x_"].to_pylist() == [None, None, "one"] * 4
@@ -166,32 +169,32 @@ def test_a_topic_whose_type_grows_has_the_columns_of_all(
 
 
 def test_third_party_type_with_our_name_keeps_its_own_fields(tmp_path: Path) -> None:
-    short = proto("h.proto", "")
-    message(short, "Height", height_m=F.TYPE_STRING)
-    newer = proto("n.proto", "dmrl.v1")
-    message(newer, "Height", height_m=F.TYPE_DOUBLE, floor=F.TYPE_INT32)
-    odd = proto("o.proto", "dmrl.v1")
-    message(odd, "Height", metres=F.TYPE_DOUBLE)
-    older = proto("e.proto", "dmrl.v1")
-    message(older, "Height")
+    short = build_file("h.proto", "")
+    add_message(short, "Height", height_m=F.TYPE_STRING)
+    newer = build_file("n.proto", "dmrl.v1")
+    add_message(newer, "Height", height_m=F.TYPE_DOUBLE, floor=F.TYPE_INT32)
+    odd = build_file("o.proto", "dmrl.v1")
+    add_message(odd, "Height", metres=F.TYPE_DOUBLE)
+    older = build_file("e.proto", "dmrl.v1")
+    add_message(older, "Height")
     sent: list[Sent] = [
         (
             "/a",
             "Height",
-            packed(short),
-            [build("Height", short)(height_m="2 m").SerializeToString()],
+            pack_files(short),
+            [build_class("Height", short)(height_m="2 m").SerializeToString()],
         ),
         (
             "/cf1/height",
             "dmrl.v1.Height",
-            packed(newer),
-            [build("dmrl.v1.Height", newer)(height_m=2, floor=3).SerializeToString()],
+            pack_files(newer),
+            [build_class("dmrl.v1.Height", newer)(height_m=2, floor=3).SerializeToString()],
         ),
-        ("/cf2/height", "dmrl.v1.Height", packed(odd), [b""]),
-        ("/b", "dmrl.v1.Height", packed(odd), [b""]),
-        ("/cf3/height", "dmrl.v1.Height", packed(older), [b""]),
+        ("/cf2/height", "dmrl.v1.Height", pack_files(odd), [b""]),
+        ("/b", "dmrl.v1.Height", pack_files(odd), [b""]),
+        ("/cf3/height", "dmrl.v1.Height", pack_files(older), [b""]),
     ]
-    found = dmrl.open(write(tmp_path / "a.mcap", *sent))
+    found = dmrl.open(write_recording(tmp_path / "a.mcap", *sent))
     assert found["/a"].to_arrow()["height_m"].to_pylist() == ["2 m"]
     assert found["/cf1/height"].to_arrow()["floor"].to_pylist() == [3]
     assert found["/b"].to_arrow().column_names[2:] == ["metres"]
@@ -203,9 +206,9 @@ def test_third_party_type_with_our_name_keeps_its_own_fields(tmp_path: Path) -> 
 def test_fields_named_like_time_columns_are_renamed(tmp_path: Path) -> None:
     file = FileDescriptorProto(name="m.proto", package="my", syntax="proto2")
     names = ("log_time", "log_time_", "publish_time", "time_s", "status")
-    message(file, "M", **dict.fromkeys(names, F.TYPE_STRING))
-    data = build("my.M", file)(**{name: name for name in names}).SerializeToString()
-    path = write(tmp_path / "a.mcap", ("/x", "my.M", packed(file), [data] * 2))
+    add_message(file, "M", **dict.fromkeys(names, F.TYPE_STRING))
+    data = build_class("my.M", file)(**{name: name for name in names}).SerializeToString()
+    path = write_recording(tmp_path / "a.mcap", ("/x", "my.M", pack_files(file), [data] * 2))
     topic = dmrl.open(path)["/x"]
     table, frame, array = topic.to_arrow(), topic.to_pandas(), topic.to_numpy()
     for held in (table, frame, array):
@@ -223,10 +226,10 @@ def test_fields_named_like_time_columns_are_renamed(tmp_path: Path) -> None:
 
 
 def test_invalid_definition_gives_one_line_error(tmp_path: Path) -> None:
-    file = proto("m.proto")
-    message(file, "M", x=F.TYPE_DOUBLE)
-    sent: list[Sent] = [("/x", "my.Other", packed(file), [b""]), ("/y", "my.M", b"\xff", [b""])]
-    found = dmrl.open(write(tmp_path / "a.mcap", *sent))
+    file = build_file("m.proto")
+    add_message(file, "M", x=F.TYPE_DOUBLE)
+    sent: list[Sent] = [("/x", "my.Other", pack_files(file), [b""]), ("/y", "my.M", b"\xff", [b""])]
+    found = dmrl.open(write_recording(tmp_path / "a.mcap", *sent))
     for topic in ("/x", "/y"):
         with pytest.raises(
             RecordingError, match=f"{topic} has a schema .* that cannot be used"
@@ -236,17 +239,17 @@ def test_invalid_definition_gives_one_line_error(tmp_path: Path) -> None:
 
 
 def test_a_topic_that_is_no_protobuf_spares_the_tables_of_others(tmp_path: Path) -> None:
-    file = proto("m.proto")
-    message(file, "M", x=F.TYPE_DOUBLE)
-    data = build("my.M", file)(x=1.5).SerializeToString()
+    file = build_file("m.proto")
+    add_message(file, "M", x=F.TYPE_DOUBLE)
+    data = build_class("my.M", file)(x=1.5).SerializeToString()
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
         for topic, encoding, schema in (
-            ("/x", "protobuf", writer.register_schema("my.M", "protobuf", packed(file))),
+            ("/x", "protobuf", writer.register_schema("my.M", "protobuf", pack_files(file))),
             ("/note", "json", writer.register_schema("N", "jsonschema", b"{}")),
-            ("/odd", "protobuf", writer.register_schema("my.Odd", "protobuf", packed(file))),
+            ("/odd", "protobuf", writer.register_schema("my.Odd", "protobuf", pack_files(file))),
         ):
             channel = writer.register_channel(topic, encoding, schema)
             writer.add_message(channel, 5, data, 5)
@@ -262,28 +265,30 @@ def test_a_topic_that_is_no_protobuf_spares_the_tables_of_others(tmp_path: Path)
 
 
 def test_an_absent_message_with_a_list_in_it_keeps_its_row(tmp_path: Path) -> None:
-    file = proto("m.proto")
-    message(file, "P", a=F.TYPE_INT32)
-    message(file, "L")
+    file = build_file("m.proto")
+    add_message(file, "P", a=F.TYPE_INT32)
+    add_message(file, "L")
     file.message_type[1].field.add(
         name="p", number=1, label=F.LABEL_REPEATED, type=F.TYPE_MESSAGE, type_name=".my.P"
     )
-    message(file, "M", held=".my.L")
-    data = build("my.M", file)(held={"p": [{"a": 1}, {"a": 2}]}).SerializeToString()
-    path = write(tmp_path / "a.mcap", ("/x", "my.M", packed(file), [b"", data]))
+    add_message(file, "M", held=".my.L")
+    data = build_class("my.M", file)(held={"p": [{"a": 1}, {"a": 2}]}).SerializeToString()
+    path = write_recording(tmp_path / "a.mcap", ("/x", "my.M", pack_files(file), [b"", data]))
     assert len(dmrl.open(path)["/x"].to_pandas()) == 3
 
 
 def test_a_type_wider_than_a_table_is_text(tmp_path: Path) -> None:
-    """Ten types of ten fields each of the type before: a table of 10**10 columns."""
-    file = proto("m.proto")
-    message(file, "T0", a=F.TYPE_INT32)
+    """Ten types with ten fields of the previous type would be a table of 10**10 columns."""
+    file = build_file("m.proto")
+    add_message(file, "T0", a=F.TYPE_INT32)
     for k in range(1, 11):
-        message(file, f"T{k}", **{f"f{n}": f".my.T{k - 1}" for n in range(10)})
-    made = build("my.T10", file)
+        add_message(file, f"T{k}", **{f"f{n}": f".my.T{k - 1}" for n in range(10)})
+    made = build_class("my.T10", file)
     value = made()
     value.f3.f3.f3.SetInParent()
-    path = write(tmp_path / "a.mcap", ("/x", "my.T10", packed(file), [value.SerializeToString()]))
+    path = write_recording(
+        tmp_path / "a.mcap", ("/x", "my.T10", pack_files(file), [value.SerializeToString()])
+    )
     table = dmrl.open(path)["/x"].to_arrow()
     assert table["f3"].to_pylist() == ['{"f3": {"f3": {}}}'] and table["f4"].to_pylist() == [None]
 

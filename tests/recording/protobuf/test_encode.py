@@ -1,4 +1,4 @@
-"""Columns encoded as messages: the bytes of Google's protobuf."""
+"""Columns encoded as messages give the bytes of Google's protobuf."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,10 +17,10 @@ COUNT = 300
 SOME_ZERO = np.where(RNG.random(COUNT) < 0.3, 0.0, RNG.normal(size=COUNT))
 
 
-def one(value: Any, k: int) -> Any:
-    """What a column has in a row."""
+def get_row_value(value: Any, k: int) -> Any:
+    """Return the value of a column in row ``k``."""
     if isinstance(value, Mapping):
-        return {name: one(column, k) for name, column in value.items()}
+        return {name: get_row_value(column, k) for name, column in value.items()}
     if isinstance(value, str | bytes | int | float):
         return value
     return value[k].tolist() if hasattr(value[k], "tolist") else value[k]
@@ -59,7 +59,7 @@ def test_encoded_bytes_equal_google_protobuf(kind: str, fields: dict[str, Any]) 
     made = message_class(kind)
     data, at = encode(made.DESCRIPTOR, fields, COUNT)
     for k in range(COUNT):
-        theirs = made(**one(fields, k)).SerializeToString()
+        theirs = made(**get_row_value(fields, k)).SerializeToString()
         assert data[at[k] : at[k + 1]].tobytes() == theirs
     assert at[-1] == len(data)
 

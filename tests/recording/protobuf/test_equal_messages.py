@@ -1,4 +1,4 @@
-"""Messages of one layout, decoded as columns of bytes, against Google's protobuf parser."""
+"""The fast decoder of messages of one byte layout, compared with Google's protobuf parser."""
 
 from typing import Any
 
@@ -30,8 +30,8 @@ TYPES = {
 }
 
 
-def build() -> Any:
-    """A type whose values all have a fixed size."""
+def build_class() -> Any:
+    """Build a message class whose fields all have a fixed size."""
     file = FileDescriptorProto(name="fixed.proto", package="t", syntax="proto3")
     kind = file.message_type.add(name="Fixed")
     for number, (name, (of, _)) in enumerate(TYPES.items(), start=1):
@@ -42,13 +42,13 @@ def build() -> Any:
     return GetMessageClass(pool.FindMessageTypeByName("t.Fixed"))
 
 
-FIXED = build()
+FIXED = build_class()
 FIELDS: dict[str, FieldDescriptor] = list_columns(FIXED.DESCRIPTOR)
-BETWEEN = b"\xff" * 31  # as a record's head in a chunk
+BETWEEN = b"\xff" * 31  # stands for the header of each message record
 
 
 def lay_out(parts: list[bytes]) -> tuple[Bytes, Ints, Ints]:
-    """Bytes with these messages, and their ranges."""
+    """Return bytes that contain these messages, and the start and end offset of each."""
     sizes = np.array([len(part) for part in parts])
     end = np.cumsum(sizes + len(BETWEEN))
     return np.frombuffer(b"".join(BETWEEN + p for p in parts), np.uint8), end - sizes, end
