@@ -32,8 +32,8 @@ pytestmark = pytest.mark.heavy
 STEP_NS = 100_000_000
 
 
-def record(path: Path, camera: str, images: int, statuses: tuple[int, ...]) -> Path:
-    """A flight with true labels, and estimated ones of some statuses."""
+def write_flight(path: Path, camera: str, images: int, statuses: tuple[int, ...]) -> Path:
+    """Write a flight with a true label per image, and estimated labels of these statuses."""
     path.parent.mkdir(parents=True, exist_ok=True)
     made = Provenance("label", {"k": 1}, inputs=(Input("raw.mcap", "0" * 64),))
     with RecordingWriter(path, made) as sink:
@@ -55,15 +55,17 @@ def record(path: Path, camera: str, images: int, statuses: tuple[int, ...]) -> P
 
 @pytest.fixture
 def flights(tmp_path: Path) -> Path:
+    """Return a folder with three flights and a truncated one."""
     folder = tmp_path / "flights"
-    record(folder / "a.mcap", "cf1", 4, (0, 1))
-    record(folder / "monday" / "a.mcap", "cf2", 6, (0,))
-    record(folder / "monday" / "b.mcap", "cf1", 2, ())
+    write_flight(folder / "a.mcap", "cf1", 4, (0, 1))
+    write_flight(folder / "monday" / "a.mcap", "cf2", 6, (0,))
+    write_flight(folder / "monday" / "b.mcap", "cf1", 2, ())
     (folder / "torn.mcap").write_bytes((folder / "a.mcap").read_bytes()[:300])
     return folder
 
 
-def names(folder: Path, query: str) -> list[str]:
+def find_names(folder: Path, query: str) -> list[str]:
+    """Return the names of the recordings that match a query."""
     found = find_rows(open_catalogue(folder), query)["recording"].to_pylist()
     return [str(name) for name in found]
 
@@ -101,13 +103,16 @@ def test_a_catalogue_is_read_without_a_thread_that_could_outlive_python(flights:
 
 def test_queries_filter_by_recording_camera_and_labels(flights: Path) -> None:
     index.update(flights, workers=1)
-    assert names(flights, 'camera = "cf1" and ok_labels > 3') == ["a.mcap"]
-    assert names(flights, "camera = 'cf1' and images < 4") == ["monday/b.mcap"]
-    assert names(flights, "source = 'estimate' and ok_labels = labels") == ["monday/a.mcap"]
-    assert names(flights, "error is not null") == ["torn.mcap"]
-    assert names(flights, "list_contains(topics, '/cf2/labels')") == ["monday/a.mcap"]
-    assert names(flights, "\"recording\" like 'monday/%'") == ["monday/a.mcap", "monday/b.mcap"]
-    assert names(flights, "false") == []
+    assert find_names(flights, 'camera = "cf1" and ok_labels > 3') == ["a.mcap"]
+    assert find_names(flights, "camera = 'cf1' and images < 4") == ["monday/b.mcap"]
+    assert find_names(flights, "source = 'estimate' and ok_labels = labels") == ["monday/a.mcap"]
+    assert find_names(flights, "error is not null") == ["torn.mcap"]
+    assert find_names(flights, "list_contains(topics, '/cf2/labels')") == ["monday/a.mcap"]
+    assert find_names(flights, "\"recording\" like 'monday/%'") == [
+        "monday/a.mcap",
+        "monday/b.mcap",
+    ]
+    assert find_names(flights, "false") == []
 
 
 HOSTILE_QUERIES = [
@@ -170,10 +175,10 @@ def test_only_changed_recordings_are_indexed_again(flights: Path) -> None:
     index.update(flights, workers=1)
     assert (flights / FILE_NAME).stat().st_mtime_ns == unchanged > before
     (flights / "a.mcap").unlink()
-    record(flights / "a.mcap", "cf7", 3, ())
+    write_flight(flights / "a.mcap", "cf7", 3, ())
     (flights / "monday" / "b.mcap").rename(flights / "monday" / "c.mcap")
     assert index.update(flights, workers=1) == index.Result(3, 2, 1, 1, 0)
-    assert names(flights, "camera = 'cf7'") == ["a.mcap"]
+    assert find_names(flights, "camera = 'cf7'") == ["a.mcap"]
 
 
 def test_interrupted_index_keeps_finished_rows(
@@ -202,7 +207,7 @@ def test_non_utf_8_name_is_refused_before_indexing(
     try:
         odd.write_bytes(b"")
     except (OSError, UnicodeError):
-        return  # macOS refuses such names itself
+        return  # macOS refuses such names
     monkeypatch.setattr(index, "iter_results", None)
     assert boundary.run_to_status(lambda: app(["index", str(flights)])) == 1
     assert "Rename the file" in capsys.readouterr().err
@@ -214,12 +219,13 @@ def test_file_that_is_no_catalogue_is_not_overwritten(flights: Path) -> None:
     (flights / FILE_NAME).write_text("my notes")
     with pytest.raises(RecordingError, match="is damaged"):
         index.update(flights, workers=1)
-    pq.write_table(pq.read_table(_indexed(flights)).select(["recording"]), flights / FILE_NAME)
+    pq.write_table(pq.read_table(index_flights(flights)).select(["recording"]), flights / FILE_NAME)
     with pytest.raises(RecordingError, match="is not a catalogue"):
         index.update(flights, workers=1)
 
 
-def _indexed(flights: Path) -> Path:
+def index_flights(flights: Path) -> Path:
+    """Index the flights again and return the catalogue."""
     (flights / FILE_NAME).unlink()
     index.update(flights, workers=1)
     return flights / FILE_NAME
@@ -276,8 +282,8 @@ def test_report_shows_the_catalogue_without_opening_every_recording(
     assert "<h2>Recordings</h2>" not in build_report(collect_outputs(flights))
 
 
-def _edited(folder: Path, **values: Any) -> None:
-    """Put values into the first row, as a stranger would."""
+def edit_first_row(folder: Path, **values: Any) -> None:
+    """Put values into the first row, as another program could."""
     rows = pq.read_table(folder / FILE_NAME).to_pylist()
     rows[0].update(values)
     pq.write_table(pa.Table.from_pylist(rows, schema=COLUMNS), folder / FILE_NAME)
@@ -304,7 +310,7 @@ def test_invalid_catalogue_gives_one_line_error(
     table = to_table([{"recording": "a.mcap", "bytes": 1, "stamp": "1 2 3"}])
     Catalogue(tmp_path, table).save()
     assert open_catalogue(tmp_path).table.num_rows == 1
-    _edited(tmp_path, **values)
+    edit_first_row(tmp_path, **values)
     with pytest.raises(RecordingError, match=complaint):
         open_catalogue(tmp_path)
 
@@ -312,7 +318,7 @@ def test_invalid_catalogue_gives_one_line_error(
 def test_a_query_takes_no_disk_and_little_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """DuckDB would spill into the folder that it is called in."""
+    """By default, DuckDB would write temporary files to the working folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(limits, "MEMORY_BYTES", 20_000_000)
     many = "(select count(distinct range) from range(5_000_000)) > 1"

@@ -1,4 +1,4 @@
-"""Small recordings with images and labels, made in code."""
+"""Small recordings with images and labels, built in code."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -19,25 +19,28 @@ STEP_NS = 100_000_000
 Record = Callable[..., Path]
 
 
-def pixels_of(seed: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX) -> Any:
-    """Noise, dark at the end: trailing zero bytes must survive."""
+def draw_noise(seed: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX) -> Any:
+    """Draw a noise image (height, width, 3) with a black last row, to test trailing zeros."""
     rgb = np.random.default_rng(seed).integers(0, 256, (height_px, width_px, 3), np.uint8)
     rgb[-1] = 0
     return rgb
 
 
-def peer(**fields: Any) -> Any:
-    """One peer of PeerLabels, inside the image unless told otherwise."""
+def build_peer(**fields: Any) -> Any:
+    """Build one peer of PeerLabels; without ``fields`` it lies inside the image."""
     values = {"peer": "cf2", "u_px": 20.5, "v_px": 12.5, "depth_m": 1.5, "source": "truth"}
     return message_class("PeerLabel")(**{**values, **fields})
 
 
-def recorder(folder: Path) -> Record:
-    """Writes a recording: one list of peers per image, None for an image without labels."""
+def make_recorder(folder: Path) -> Record:
+    """Return a function that writes a recording of images and labels into a folder.
+
+    ``peers`` has the list of peers of each image, None for an image without labels.
+    """
 
     def write(
         name: str = "flight.mcap",
-        peers: Sequence[Sequence[Any] | None] = ([peer()],) * 6,
+        peers: Sequence[Sequence[Any] | None] = ([build_peer()],) * 6,
         *,
         seed: int = 0,
         split: Mapping[str, str] | None = None,
@@ -54,7 +57,7 @@ def recorder(folder: Path) -> Record:
             for k, listed in enumerate(peers):
                 size_px = (sizes_px or {}).get(k, (HEIGHT_PX, WIDTH_PX))
                 at = begin_ns + k * STEP_NS
-                rgb = pixels_of(1000 * seed + k, *size_px)
+                rgb = draw_noise(1000 * seed + k, *size_px)
                 data = encode_jpeg(rgb, 80) if jpeg else encode_png(rgb)
                 kind = "jpeg" if jpeg else "png"
                 picture = message_class("CompressedImage")(data=data, format=kind)
@@ -73,5 +76,5 @@ def recorder(folder: Path) -> Record:
 
 @pytest.fixture
 def record(tmp_path: Path) -> Record:
-    """``recorder`` of the test's own folder."""
-    return recorder(tmp_path)
+    """Return a function that writes recordings into the test's own folder."""
+    return make_recorder(tmp_path)

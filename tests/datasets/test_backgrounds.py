@@ -1,4 +1,4 @@
-"""Images of a dataset behind rendered robots, without the robots that they show."""
+"""Images of a dataset as render backgrounds, with their own robots inpainted."""
 
 from pathlib import Path
 
@@ -10,26 +10,26 @@ from dmrl.errors import SettingError
 from dmrl.images.codec import encode_png
 from dmrl.stages import dataset
 
-from .conftest import Record, peer, pixels_of
+from .conftest import Record, build_peer, draw_noise
 
 BOX = {"box_px": [16.0, 9.0, 25.0, 16.0]}
 
 
 @pytest.mark.heavy
 def test_robots_of_a_dataset_are_painted_over(record: Record, tmp_path: Path) -> None:
-    filling = peer(box_px=[0.0, 0.0, 64.0, 48.0])
-    recording = record(peers=[[peer(**BOX)], [], [filling], [peer()]])
+    filling = build_peer(box_px=[0.0, 0.0, 64.0, 48.0])
+    recording = record(peers=[[build_peer(**BOX)], [], [filling], [build_peer()]])
     dataset.run([recording], tmp_path / "set", dataset.Settings())
     photos = open_backgrounds(tmp_path / "set")
-    changed = (photos.load_photo(0) != pixels_of(0)).any(axis=-1)
+    changed = (photos.load_photo(0) != draw_noise(0)).any(axis=-1)
     assert changed[9:16, 16:25].mean() > 0.95
     v, u = np.nonzero(changed)
     assert u.min() > 8
     assert u.max() < 34
     assert v.min() > 2
     assert v.max() < 24
-    # Nobody in the second image; the third is all robot, and the robot of the fourth has no box.
-    assert (photos.load_photo(1) == pixels_of(1)).all()
+    # The second image has no robot, the third only robot, and the robot of the fourth no box.
+    assert (photos.load_photo(1) == draw_noise(1)).all()
     assert (photos.load_photo(2) == photos.load_photo(0)).all()
 
 
@@ -46,7 +46,7 @@ def test_hidden_pixels_are_inpainted_from_their_surroundings() -> None:
     hidden[20:40, 30:60] = True
     rgb[hidden] = 255
     off = np.abs(inpaint_hidden(rgb, hidden).astype(int) - (20, 120, 220))
-    assert off.max() <= 4  # it rounds as it goes inwards
+    assert off.max() <= 4  # rounding accumulates towards the middle
 
 
 def test_background_photos_are_loaded_unchanged(tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_rooms_are_generated_and_reproducible_by_index() -> None:
     assert {room.shape for room in rooms} == {(252, 360, 3)}
     assert (open_backgrounds(Path("rooms")).load_photo(3) == rooms[3]).all()
     assert len({room.tobytes() for room in rooms}) == 6
-    # Bright walls and dark things: both ends of the scale are there.
+    # Bright walls and dark objects cover both ends of the grey scale.
     levels = np.stack(rooms).mean(axis=-1)
     assert (levels.reshape(6, -1).max(axis=1) > 100).all()
     assert (levels < 60).mean() > 0.02

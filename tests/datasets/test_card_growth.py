@@ -1,4 +1,4 @@
-"""A card names the parts of a dataset that grew, shows its images, and is compared with another."""
+"""The card of an extended dataset, its sample images, and comparison with another dataset."""
 
 import json
 import re
@@ -13,7 +13,7 @@ from dmrl import cli
 from dmrl.card.changes import compare_datasets
 from dmrl.stages.dataset import Settings, add, run
 
-from .conftest import Record, peer
+from .conftest import Record, build_peer
 
 pytestmark = pytest.mark.heavy
 
@@ -21,11 +21,11 @@ pytestmark = pytest.mark.heavy
 def test_samples_are_twelve_images_at_most_with_a_mark_on_each_label(
     record: Record, tmp_path: Path
 ) -> None:
-    run([record(peers=[[peer()]] * 20)], tmp_path / "many", Settings(split="none"))
+    run([record(peers=[[build_peer()]] * 20)], tmp_path / "many", Settings(split="none"))
     assert "![12 images with their labels" in (tmp_path / "many" / "README.md").read_text()
     with Image.open(tmp_path / "many" / "figures" / "samples.jpg") as image:
         tile_px = np.asarray(image.convert("L"), float)[:264, :320]
-    # A white circle of 10 px around the label, five times as large as the image of 64 px.
+    # Samples are enlarged five times; a white circle of 10 px surrounds each label.
     v, u = np.mgrid[:264, :320]
     radius = np.hypot(u - 5 * 20.5, v - 5 * 12.5)
     assert tile_px[(radius > 8) & (radius < 9.5)].mean() > 200
@@ -34,9 +34,9 @@ def test_samples_are_twelve_images_at_most_with_a_mark_on_each_label(
 def test_a_dataset_that_grew_names_every_recording_with_its_share(
     record: Record, tmp_path: Path
 ) -> None:
-    run([record(peers=[[peer()]] * 9, seed=1)], tmp_path / "out", Settings(split="none"))
+    run([record(peers=[[build_peer()]] * 9, seed=1)], tmp_path / "out", Settings(split="none"))
     old = shutil.copytree(tmp_path / "out", tmp_path / "old")
-    add([record("second.mcap", peers=[[peer()]] * 3, seed=2)], tmp_path / "out", Settings())
+    add([record("second.mcap", peers=[[build_peer()]] * 3, seed=2)], tmp_path / "out", Settings())
     text = (tmp_path / "out" / "README.md").read_text()
     assert "| second.mcap | train | 3 | 25.0 % |" in text
     assert re.search(r"^\| 1 \| dmrl [\d.]+ \| `flight.mcap` \| 9 \| 75.0 % \|$", text, re.M)
@@ -51,7 +51,10 @@ def test_a_dataset_that_grew_names_every_recording_with_its_share(
 def test_the_command_lists_differences_and_writes_nothing(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name, peers in (("old", [[peer()]] * 4), ("new", [[peer()], [peer(peer="cf3")]])):
+    for name, peers in (
+        ("old", [[build_peer()]] * 4),
+        ("new", [[build_peer()], [build_peer(peer="cf3")]]),
+    ):
         run([record(f"{name}.mcap", peers=peers)], tmp_path / name, Settings(split="none"))
     before = (tmp_path / "new" / "README.md").stat().st_mtime_ns
     flags = ["card", str(tmp_path / "new"), "--since", str(tmp_path / "old")]

@@ -1,4 +1,4 @@
-"""The card's Croissant block: valid, and it loads the rows."""
+"""The Croissant description of a dataset is valid and loads its rows."""
 
 from pathlib import Path
 
@@ -10,14 +10,14 @@ from dmrl.stages.card import Settings as CardSettings
 from dmrl.stages.card import run as run_card
 from dmrl.stages.dataset import Settings, run
 
-from .conftest import Record, pixels_of
+from .conftest import Record, draw_noise
 
 mlcroissant = pytest.importorskip("mlcroissant", reason="mlcroissant is not installed")
-THEIRS = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-"""Of the libraries that read Croissant."""
+IGNORE_DEPRECATIONS = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+"""For warnings from the libraries that read Croissant."""
 
 
-@THEIRS
+@IGNORE_DEPRECATIONS
 @pytest.mark.parametrize("parquet", [False, True])
 @pytest.mark.heavy
 def test_croissant_is_valid_and_names_every_column(
@@ -39,13 +39,13 @@ def test_croissant_is_valid_and_names_every_column(
     assert found.metadata.date_published.date().isoformat() == "2026-11-27"
 
 
-@THEIRS
+@IGNORE_DEPRECATIONS
 @pytest.mark.heavy
 def test_croissant_loads_the_rows_of_parquet(record: Record, tmp_path: Path) -> None:
     run([record()], tmp_path / "out", Settings(split="none", parquet=True))
     found = mlcroissant.Dataset(jsonld=str(tmp_path / "out" / "croissant.json"))
     rows = list(found.records("train"))
     assert len(rows) == 6
-    assert np.array_equal(np.asarray(rows[3]["train/image"]), pixels_of(3))
+    assert np.array_equal(np.asarray(rows[3]["train/image"]), draw_noise(3))
     assert rows[3]["train/peers"][0]["train/peers/u_px"] == 20.5
     assert rows[3]["train/log_time"] == 300_000_000

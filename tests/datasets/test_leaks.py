@@ -11,18 +11,19 @@ from dmrl.datasets import open_dataset
 from dmrl.datasets.writing.near_duplicates import NEAR_DUPLICATE_BITS, compute_perceptual_hash
 from dmrl.stages.dataset import Settings, run
 
-from .conftest import Record, peer
+from .conftest import Record, build_peer
 
 pytestmark = pytest.mark.heavy
 
 
-def scene(seed: int) -> Image.Image:
-    """A photo's kind of picture: large smooth patches."""
+def draw_scene(seed: int) -> Image.Image:
+    """Draw an image of large smooth patches, as photographs have."""
     rough = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), np.uint8)
     return Image.fromarray(rough).resize((320, 224), Image.Resampling.BICUBIC)
 
 
-def apart(a: Image.Image, b: Image.Image) -> int:
+def compute_hash_distance(a: Image.Image, b: Image.Image) -> int:
+    """Return the number of bits in which the perceptual hashes of two images differ."""
     return (
         compute_perceptual_hash(np.asarray(a)) ^ compute_perceptual_hash(np.asarray(b))
     ).bit_count()
@@ -30,20 +31,23 @@ def apart(a: Image.Image, b: Image.Image) -> int:
 
 def test_near_duplicate_hash_ignores_brightness_noise_and_scale() -> None:
     for seed in range(20):
-        picture = scene(seed)
+        picture = draw_scene(seed)
         noise = np.random.default_rng(seed).normal(0, 4, (224, 320, 3))
         noisy = Image.fromarray(np.clip(np.asarray(picture) * 0.8 + noise, 0, 255).astype(np.uint8))
-        assert apart(picture, noisy) <= NEAR_DUPLICATE_BITS
-        assert apart(picture, picture.filter(ImageFilter.GaussianBlur(2))) <= NEAR_DUPLICATE_BITS
-        assert apart(picture, picture.resize((160, 112))) <= NEAR_DUPLICATE_BITS
+        assert compute_hash_distance(picture, noisy) <= NEAR_DUPLICATE_BITS
+        assert (
+            compute_hash_distance(picture, picture.filter(ImageFilter.GaussianBlur(2)))
+            <= NEAR_DUPLICATE_BITS
+        )
+        assert compute_hash_distance(picture, picture.resize((160, 112))) <= NEAR_DUPLICATE_BITS
 
 
 def test_near_duplicate_hash_ignores_a_small_drone_but_not_the_scene() -> None:
     for seed in range(20):
-        picture, moved = scene(seed), np.asarray(scene(seed)).copy()
+        picture, moved = draw_scene(seed), np.asarray(draw_scene(seed)).copy()
         moved[100:112, 200:216] = 10
-        assert apart(picture, Image.fromarray(moved)) <= NEAR_DUPLICATE_BITS
-        assert apart(picture, scene(seed + 100)) > 2 * NEAR_DUPLICATE_BITS
+        assert compute_hash_distance(picture, Image.fromarray(moved)) <= NEAR_DUPLICATE_BITS
+        assert compute_hash_distance(picture, draw_scene(seed + 100)) > 2 * NEAR_DUPLICATE_BITS
 
 
 def test_test_images_that_look_like_one_in_train_are_counted(
@@ -58,7 +62,12 @@ def test_test_images_that_look_like_one_in_train_are_counted(
 
 def test_times_and_poses_shared_with_train_are_counted(record: Record, tmp_path: Path) -> None:
     spans = {"train": "[[0, 50000000]]", "test": "[[100000000, 600000000]]"}
-    poses = [[peer(u_px=20.49)], [peer(u_px=20.51)], [peer(u_px=22.0)], [peer(depth_m=1.7)]]
+    poses = [
+        [build_peer(u_px=20.49)],
+        [build_peer(u_px=20.51)],
+        [build_peer(u_px=22.0)],
+        [build_peer(depth_m=1.7)],
+    ]
     path = record(peers=poses, split=spans)
     run([path], tmp_path / "out", Settings())
     opened = open_dataset(tmp_path / "out")
@@ -73,7 +82,9 @@ def test_times_and_poses_shared_with_train_are_counted(record: Record, tmp_path:
 
 def test_separate_recordings_have_no_leaks(record: Record, tmp_path: Path) -> None:
     one = record(split={"train": "[[0, 900000000]]"})
-    other = record("other.mcap", [[peer(u_px=50.0)]], seed=1, split={"test": "[[0, 900000000]]"})
+    other = record(
+        "other.mcap", [[build_peer(u_px=50.0)]], seed=1, split={"test": "[[0, 900000000]]"}
+    )
     run([one, other], tmp_path / "out", Settings())
     text = (tmp_path / "out" / "README.md").read_text()
     assert "test and train share no recording" in text

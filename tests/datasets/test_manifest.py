@@ -1,4 +1,4 @@
-"""The manifest of a dataset holds its cameras, and is read back as it was written."""
+"""Focal lengths in the manifest of a dataset: written, read back, missing, or damaged."""
 
 import json
 from pathlib import Path

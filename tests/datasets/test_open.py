@@ -1,3 +1,5 @@
+"""Opening a dataset with dmrl and with the library datasets, and errors of damaged ones."""
+
 import re
 import sys
 from pathlib import Path
@@ -13,25 +15,26 @@ from dmrl.errors import DatasetError, SettingError
 from dmrl.images.codec import decode, encode_jpeg
 from dmrl.stages.dataset import Settings, run
 
-from .conftest import HEIGHT_PX, WIDTH_PX, Record, pixels_of
+from .conftest import HEIGHT_PX, WIDTH_PX, Record, draw_noise
 
 pytestmark = pytest.mark.heavy
 
 datasets = pytest.importorskip("datasets", reason="datasets is not installed")
 
-LINUX = pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel for its maps")
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc/self/maps")
 SHARD = re.compile(r"/train/data-\d{5}-of-00002\.arrow$")
 
 
 @pytest.fixture
-def built(record: Record, tmp_path: Path) -> Path:
+def dataset(record: Record, tmp_path: Path) -> Path:
+    """Build a dataset of two recordings in two shards."""
     flights = [record(), record("other.mcap", seed=1)]
     run(flights, tmp_path / "out", Settings(shard_images=4))
     return tmp_path / "out"
 
 
-def mapped_file(address: int) -> str:
-    """File that the kernel has mapped at an address, or an empty string."""
+def find_mapped_file(address: int) -> str:
+    """Return the file that is mapped at an address, or an empty string."""
     for line in Path("/proc/self/maps").read_text().splitlines():
         start, end = (int(x, 16) for x in line.split()[0].split("-"))
         if start <= address < end:
@@ -39,8 +42,8 @@ def mapped_file(address: int) -> str:
     return ""
 
 
-def test_datasets_opens_it_with_the_features_of_the_contract(built: Path) -> None:
-    opened = datasets.load_from_disk(str(built))
+def test_datasets_opens_it_with_the_features_of_the_contract(dataset: Path) -> None:
+    opened = datasets.load_from_disk(str(dataset))
     assert {name: len(split) for name, split in opened.items()} == {"train": 6, "test": 6}
     arrow = build_schema(HEIGHT_PX, WIDTH_PX)
     features = opened["train"].features
@@ -52,17 +55,17 @@ def test_datasets_opens_it_with_the_features_of_the_contract(built: Path) -> Non
     assert opened["train"].info.splits["train"].num_examples == 6
 
 
-def test_datasets_reads_the_same_rows(built: Path) -> None:
-    row = datasets.load_from_disk(str(built))["train"][5]
-    split = open_dataset(built).split("train")
+def test_datasets_reads_the_same_rows(dataset: Path) -> None:
+    row = datasets.load_from_disk(str(dataset))["train"][5]
+    split = open_dataset(dataset).split("train")
     rgb = np.frombuffer(row["pixels"], np.uint8).reshape(HEIGHT_PX, WIDTH_PX, 3)
     assert np.array_equal(rgb, np.concatenate(split.pixels)[5])
     assert np.array_equal(row["confidence"], split.confidence[5])
     assert row["peers"] == split.table["peers"][5].as_py()
 
 
-def test_images_of_rows_come_from_every_shard_in_the_order_asked(built: Path) -> None:
-    split = open_dataset(built).split("train")
+def test_images_of_rows_come_from_every_shard_in_the_order_asked(dataset: Path) -> None:
+    split = open_dataset(dataset).split("train")
     rows = [5, 0, 3]
     asked = np.stack(list(split.images(rows)))
     assert len(split.pixels) > 1
@@ -70,14 +73,14 @@ def test_images_of_rows_come_from_every_shard_in_the_order_asked(built: Path) ->
 
 
 @LINUX
-def test_datasets_library_maps_pixels_without_copying(built: Path) -> None:
-    table = datasets.load_from_disk(str(built), keep_in_memory=False)["train"].data
+def test_datasets_library_maps_pixels_without_copying(dataset: Path) -> None:
+    table = datasets.load_from_disk(str(dataset), keep_in_memory=False)["train"].data
     for chunk in table["pixels"].chunks:
-        assert SHARD.search(mapped_file(chunk.buffers()[1].address))
+        assert SHARD.search(find_mapped_file(chunk.buffers()[1].address))
 
 
-def test_memory_mapped_shard_contains_every_buffer(built: Path) -> None:
-    for shard in sorted(built.rglob("*.arrow")):
+def test_memory_mapped_shard_contains_every_buffer(dataset: Path) -> None:
+    for shard in sorted(dataset.rglob("*.arrow")):
         whole = pa.memory_map(str(shard)).read_buffer()
         table = pa.ipc.open_stream(whole).read_all()
         for column in ("pixels", "log_time"):
@@ -89,14 +92,14 @@ def test_memory_mapped_shard_contains_every_buffer(built: Path) -> None:
 
 
 @LINUX
-def test_pixels_are_read_only_views_of_the_mapped_file(built: Path) -> None:
-    for block in open_dataset(built).split("train").pixels:
-        assert SHARD.search(mapped_file(block.ctypes.data))
+def test_pixels_are_read_only_views_of_the_mapped_file(dataset: Path) -> None:
+    for block in open_dataset(dataset).split("train").pixels:
+        assert SHARD.search(find_mapped_file(block.ctypes.data))
         assert not block.flags.writeable
 
 
-def test_a_sliced_table_gives_the_right_pixels(built: Path) -> None:
-    split = open_dataset(built).split("train")
+def test_a_sliced_table_gives_the_right_pixels(dataset: Path) -> None:
+    split = open_dataset(dataset).split("train")
     part = type(split)("part", split.table.slice(1, 4))
     assert np.array_equal(np.concatenate(part.pixels), np.concatenate(split.pixels)[1:5])
     assert np.array_equal(part.depth, split.depth[1:5])
@@ -110,7 +113,7 @@ def test_every_format_opens_with_the_same_rows(
     settings = Settings(split="none", png=png, parquet=parquet, shard_images=4)
     run([record()], tmp_path / "out", settings)
     split = open_dataset(tmp_path / "out").split("train")
-    wanted = np.stack([pixels_of(k) for k in range(6)])
+    wanted = np.stack([draw_noise(k) for k in range(6)])
     assert np.array_equal(np.concatenate(split.pixels), wanted)
     assert split.confidence.sum() == 6
     assert split.image_shape == (HEIGHT_PX, WIDTH_PX)
@@ -122,14 +125,14 @@ def test_recorded_jpegs_are_kept(record: Record, tmp_path: Path, parquet: bool) 
     run(flights, tmp_path / "out", Settings(split="none", pixels="jpeg", parquet=parquet))
     split = open_dataset(tmp_path / "out").split("train")
     stored = split.table["image"].to_pylist()
-    camera = [encode_jpeg(pixels_of(k), 80) for k in range(6)]
+    camera = [encode_jpeg(draw_noise(k), 80) for k in range(6)]
     assert [image["bytes"] for image in stored[:6]] == camera
     assert [image["path"][-3:] for image in stored] == ["jpg"] * 6 + ["png"] * 6
     shown = np.concatenate(split.pixels)
     assert np.array_equal(shown[:6], [decode(data) for data in camera])
-    assert np.array_equal(shown[6:], [pixels_of(1000 + k) for k in range(6)])
+    assert np.array_equal(shown[6:], [draw_noise(1000 + k) for k in range(6)])
     part = build_examples(split).select(np.arange(12) % 4 == 1)
-    assert np.array_equal(part.get_image(2), pixels_of(1003))
+    assert np.array_equal(part.get_image(2), draw_noise(1003))
 
 
 def test_png_and_jpeg_contradict(record: Record, tmp_path: Path) -> None:
@@ -141,7 +144,7 @@ def test_datasets_shows_png_as_images(record: Record, tmp_path: Path) -> None:
     run([record()], tmp_path / "out", Settings(split="none", png=True))
     opened = datasets.load_from_disk(str(tmp_path / "out"))["train"]
     assert isinstance(opened.features["image"], datasets.Image)
-    assert np.array_equal(np.asarray(opened[3]["image"]), pixels_of(3))
+    assert np.array_equal(np.asarray(opened[3]["image"]), draw_noise(3))
 
 
 def test_datasets_reads_features_from_parquet(record: Record, tmp_path: Path) -> None:
@@ -154,13 +157,13 @@ def test_datasets_reads_features_from_parquet(record: Record, tmp_path: Path) ->
     assert isinstance(opened["train"].features["image"], datasets.Image)
     shown = opened["train"][3]
     assert np.array_equal(
-        np.asarray(shown["image"]), pixels_of(3 + 1000 * (shown["source"] != "flight.mcap"))
+        np.asarray(shown["image"]), draw_noise(3 + 1000 * (shown["source"] != "flight.mcap"))
     )
 
 
-def test_missing_split_error_lists_existing_ones(built: Path) -> None:
+def test_missing_split_error_lists_existing_ones(dataset: Path) -> None:
     with pytest.raises(DatasetError, match=r"no split val in .*out. It has: train, test"):
-        open_dataset(built).split("val")
+        open_dataset(dataset).split("val")
 
 
 @pytest.mark.parametrize("name", ["nothing", "empty"])
@@ -170,28 +173,28 @@ def test_a_folder_that_is_no_dataset_is_refused_with_the_way_out(tmp_path: Path,
         open_dataset(tmp_path / name)
 
 
-def test_a_missing_shard_is_named(built: Path) -> None:
-    shard = built / "train" / "data-00001-of-00002.arrow"
+def test_a_missing_shard_is_named(dataset: Path) -> None:
+    shard = dataset / "train" / "data-00001-of-00002.arrow"
     shard.unlink()
     with pytest.raises(DatasetError, match=f"{shard.name} is missing"):
-        open_dataset(built).split("train")
+        open_dataset(dataset).split("train")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9])
-def test_a_cut_shard_is_named(built: Path, share: float) -> None:
-    shard = built / "train" / "data-00000-of-00002.arrow"
+def test_a_cut_shard_is_named(dataset: Path, share: float) -> None:
+    shard = dataset / "train" / "data-00000-of-00002.arrow"
     data = shard.read_bytes()
     shard.write_bytes(data[: int(share * len(data))])
     with pytest.raises(DatasetError, match=f"{shard.name} is cut short or damaged"):
-        open_dataset(built).split("train")
+        open_dataset(dataset).split("train")
 
 
-def test_a_shard_cut_between_two_batches_is_named(built: Path) -> None:
-    shard = built / "train" / "data-00000-of-00002.arrow"
+def test_a_shard_cut_between_two_batches_is_named(dataset: Path) -> None:
+    shard = dataset / "train" / "data-00000-of-00002.arrow"
     with pa.OSFile(str(shard), "wb") as sink:
         pa.ipc.new_stream(sink, build_schema(HEIGHT_PX, WIDTH_PX)).close()
     with pytest.raises(DatasetError, match=f"{shard.name} is cut short: 0 of 4 rows"):
-        open_dataset(built).split("train")
+        open_dataset(dataset).split("train")
 
 
 def test_a_missing_parquet_shard_is_named(record: Record, tmp_path: Path) -> None:
@@ -201,8 +204,8 @@ def test_a_missing_parquet_shard_is_named(record: Record, tmp_path: Path) -> Non
         open_dataset(tmp_path / "out").split("train")
 
 
-def test_broken_json_gives_one_line_error(built: Path) -> None:
-    (built / "manifest.json").unlink()  # as if datasets had saved it
-    (built / "train" / "state.json").write_text("{")
+def test_broken_json_gives_one_line_error(dataset: Path) -> None:
+    (dataset / "manifest.json").unlink()  # as in a dataset saved by the library datasets
+    (dataset / "train" / "state.json").write_text("{")
     with pytest.raises(DatasetError, match=r"state.json is not JSON"):
-        open_dataset(built).split("train")
+        open_dataset(dataset).split("train")

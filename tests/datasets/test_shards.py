@@ -17,35 +17,38 @@ from dmrl.datasets.shards import open_shard
 from dmrl.errors import DatasetError
 from dmrl.stages.dataset import Settings, run
 
-from .conftest import HEIGHT_PX, WIDTH_PX, Record, peer, recorder
+from .conftest import HEIGHT_PX, WIDTH_PX, Record, build_peer, make_recorder
 
 SHARD = "train/data-00000-of-00001.arrow"
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of four images. To be read only."""
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build a dataset of four images; tests must not change it."""
     folder = tmp_path_factory.mktemp("shards")
-    flight = recorder(folder)(peers=[[peer()] * k for k in (1, 2, 3, 1)])
+    flight = make_recorder(folder)(peers=[[build_peer()] * k for k in (1, 2, 3, 1)])
     run([flight], folder / "set", Settings())
     return folder / "set"
 
 
 @pytest.fixture
-def shard(made: Path, tmp_path: Path) -> Path:
-    """A shard of it, to be changed."""
-    return shutil.copytree(made, tmp_path / "set") / SHARD
+def shard(dataset: Path, tmp_path: Path) -> Path:
+    """Return a shard in a copy of the dataset that the test may change."""
+    return shutil.copytree(dataset, tmp_path / "set") / SHARD
 
 
-def rewritten(path: Path, table: pa.Table, compression: str | None = None, times: int = 1) -> None:
-    """The shard with another table in it, ``times`` over."""
+def rewrite_shard(
+    path: Path, table: pa.Table, compression: str | None = None, times: int = 1
+) -> None:
+    """Overwrite a shard with a table, written ``times`` times."""
     options = pa.ipc.IpcWriteOptions(compression=compression)
     with pa.ipc.new_stream(str(path), table.schema, options=options) as sink:
         for _ in range(times):
             sink.write_table(table)
 
 
-def table_of(path: Path) -> pa.Table:
+def read_shard(path: Path) -> pa.Table:
+    """Return the table of a shard."""
     with path.open("rb") as stream:
         return pa.ipc.open_stream(stream.read()).read_all()
 
@@ -55,7 +58,7 @@ def table_of(path: Path) -> pa.Table:
 @pytest.mark.heavy
 def test_an_offset_beyond_its_buffer_is_refused(shard: Path, column: str, offset: int) -> None:
     data = bytearray(shard.read_bytes())
-    offsets = table_of(shard)[column].chunk(0).buffers()[1].to_pybytes()[:20]
+    offsets = read_shard(shard)[column].chunk(0).buffers()[1].to_pybytes()[:20]
     at = data.rfind(offsets)
     data[at + 4 : at + 20] = struct.pack("<i", offset) * 4
     shard.write_bytes(data)
@@ -66,15 +69,15 @@ def test_an_offset_beyond_its_buffer_is_refused(shard: Path, column: str, offset
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 @pytest.mark.heavy
 def test_a_compressed_shard_is_read(shard: Path, compression: str) -> None:
-    sound = table_of(shard)
-    rewritten(shard, sound, compression)
+    sound = read_shard(shard)
+    rewrite_shard(shard, sound, compression)
     assert open_shard(shard, 4).equals(sound)
 
 
 @pytest.mark.heavy
 def test_a_shard_that_unpacks_to_much_is_refused(shard: Path) -> None:
-    many = pa.concat_tables([table_of(shard).slice(0, 1)] * 5_000).combine_chunks()
-    rewritten(shard, many, "zstd", times=20)
+    many = pa.concat_tables([read_shard(shard).slice(0, 1)] * 5_000).combine_chunks()
+    rewrite_shard(shard, many, "zstd", times=20)
     assert shard.stat().st_size < 5_000_000
     with pytest.raises(DatasetError, match="decompresses to much more than its size explains"):
         open_shard(shard, None)
@@ -84,7 +87,7 @@ def test_a_shard_that_unpacks_to_much_is_refused(shard: Path) -> None:
 def test_a_parquet_file_that_repeats_one_row_without_end_is_refused(
     shard: Path, tmp_path: Path
 ) -> None:
-    rows = pa.concat_tables([table_of(shard).slice(0, 1)] * 20_000).combine_chunks()
+    rows = pa.concat_tables([read_shard(shard).slice(0, 1)] * 20_000).combine_chunks()
     path = tmp_path / "train.parquet"
     with pq.ParquetWriter(path, rows.schema, compression="zstd") as sink:
         for _ in range(10):
@@ -94,20 +97,22 @@ def test_a_parquet_file_that_repeats_one_row_without_end_is_refused(
         open_shard(path, None)
 
 
-def _replaced(name: str, of: Callable[[pa.Table], Any]) -> Callable[[pa.Table], pa.Table]:
+def replace_column(name: str, of: Callable[[pa.Table], Any]) -> Callable[[pa.Table], pa.Table]:
+    """Return a function that replaces a column of a table by what ``of`` makes of the table."""
+
     def change(table: pa.Table) -> pa.Table:
         return table.set_column(table.schema.get_field_index(name), name, of(table))
 
     return change
 
 
-def _a_peer_missing(table: pa.Table) -> pa.Array:
+def remove_a_peer(table: pa.Table) -> pa.Array:
     peers = table["peers"].to_pylist()
     peers[1][0] = None
     return pa.array(peers, table["peers"].type)
 
 
-def _many_peers(table: pa.Table) -> pa.Array:
+def add_many_peers(table: pa.Table) -> pa.Array:
     return pa.array([table["peers"][0].as_py() * 1001] * 4, table["peers"].type)
 
 
@@ -117,16 +122,16 @@ def _many_peers(table: pa.Table) -> pa.Array:
         (lambda t: t.drop_columns("peers"), "no column peers"),
         (lambda t: t.drop_columns("pixels"), "no column pixels"),
         (lambda t: t.append_column("depth", t["depth"]), "a column twice"),
-        (_replaced("depth", lambda t: pa.array([1.0] * 4)), "depth of another type"),
-        (_replaced("confidence", lambda t: pa.array(["x"] * 4)), "no grid"),
-        (_replaced("source", lambda t: pa.array([1] * 4)), "source of another type"),
-        (_replaced("pixels", lambda t: pa.array([b"x"] * 4)), "pixels of another type"),
-        (_replaced("source", lambda t: pa.array([None] * 4, pa.string())), "values missing"),
-        (_replaced("peers", _a_peer_missing), "peers with values missing"),
-        (_replaced("peers", _many_peers), "an image with 1001 peers"),
-        (_replaced("source", lambda t: pa.array(["x" * 2000] * 4)), "a very long name"),
+        (replace_column("depth", lambda t: pa.array([1.0] * 4)), "depth of another type"),
+        (replace_column("confidence", lambda t: pa.array(["x"] * 4)), "no grid"),
+        (replace_column("source", lambda t: pa.array([1] * 4)), "source of another type"),
+        (replace_column("pixels", lambda t: pa.array([b"x"] * 4)), "pixels of another type"),
+        (replace_column("source", lambda t: pa.array([None] * 4, pa.string())), "values missing"),
+        (replace_column("peers", remove_a_peer), "peers with values missing"),
+        (replace_column("peers", add_many_peers), "an image with 1001 peers"),
+        (replace_column("source", lambda t: pa.array(["x" * 2000] * 4)), "a very long name"),
         (
-            _replaced(
+            replace_column(
                 "confidence",
                 lambda t: pa.array([[[]]] * 4, pa.list_(pa.list_(pa.float32(), 0), 1)),
             ),
@@ -137,23 +142,23 @@ def _many_peers(table: pa.Table) -> pa.Array:
 def test_invalid_dataset_layout_is_refused(
     shard: Path, change: Callable[[pa.Table], pa.Table], complaint: str
 ) -> None:
-    rewritten(shard, change(table_of(shard)))
+    rewrite_shard(shard, change(read_shard(shard)))
     with pytest.raises(DatasetError, match=complaint):
         open_shard(shard, None)
 
 
 def test_unknown_columns_are_kept(shard: Path) -> None:
-    table = table_of(shard)
+    table = read_shard(shard)
     nested: Any = pa.array([[[["x"]]]] * 4)
-    rewritten(shard, table.append_column("mine", nested))
+    rewrite_shard(shard, table.append_column("mine", nested))
     assert open_shard(shard, 4).equals(table)
 
 
 def test_a_split_without_images_and_a_shard_named_twice_are_refused(shard: Path) -> None:
-    rewritten(shard, build_schema(HEIGHT_PX, WIDTH_PX).empty_table())
+    rewrite_shard(shard, build_schema(HEIGHT_PX, WIDTH_PX).empty_table())
     state, folder = shard.parent / "state.json", shard.parents[1]
     (shard.parent / "dataset_info.json").write_text("{}")
-    (folder / MANIFEST_FILE).unlink()  # as another program leaves it
+    (folder / MANIFEST_FILE).unlink()  # as in a dataset of another program
     with pytest.raises(DatasetError, match="has no images"):
         open_dataset(folder).split("train")
     name = f'{{"filename": "{shard.name}"}}'
@@ -171,19 +176,19 @@ def test_images_whose_size_differs_from_their_labels_are_refused(
 ) -> None:
     run([record()], tmp_path / "set", Settings(split="none", png=True))
     path = tmp_path / "set" / SHARD
-    table = table_of(path)
+    table = read_shard(path)
     wide = build_schema(HEIGHT_PX, 2 * WIDTH_PX, packed=True)
     grid = [[[0.0] * (2 * WIDTH_PX // 8)] * (HEIGHT_PX // 8)] * 6
     for name in ("confidence", "depth"):
         column = pa.array(grid, wide.field(name).type)
         table = table.set_column(table.schema.get_field_index(name), name, column)
-    rewritten(path, table)
+    rewrite_shard(path, table)
     with pytest.raises(DatasetError, match="another size than its labels"):
         _ = open_dataset(tmp_path / "set").split("train").pixels[0][0]
 
 
-def flags_of(path: Path) -> list[str]:
-    """The kernel's flags of the map of a file: rr is read from disk as it is used, alone."""
+def read_map_flags(path: Path) -> list[str]:
+    """Return the kernel's flags of a mapped file; "rr" means random access, no read-ahead."""
     lines = iter(Path("/proc/self/smaps").read_text(encoding="utf-8").splitlines())
     assert any(line.endswith(str(path)) for line in lines)
     return next(line for line in lines if line.startswith("VmFlags")).split()[1:]
@@ -198,10 +203,10 @@ def test_opening_a_shard_reads_no_images_ahead_but_training_does(
     whole = shards._find_layout_error
 
     def watch(table: pa.Table) -> str:
-        seen.append(flags_of(shard))
+        seen.append(read_map_flags(shard))
         return whole(table)
 
     monkeypatch.setattr(shards, "_find_layout_error", watch)
     table = open_shard(shard, None)
     assert len(seen) == 1 and "rr" in seen[0]
-    assert table.num_rows and "rr" not in flags_of(shard)
+    assert table.num_rows and "rr" not in read_map_flags(shard)

@@ -1,4 +1,4 @@
-"""Datasets read over HTTP and by several processes of torchrun."""
+"""Datasets read over HTTP, in parts of an epoch, and by several processes of torchrun."""
 
 import functools
 import json
@@ -23,23 +23,23 @@ from ..local_server import serve_locally
 from .conftest import Record
 
 
-class Silent(SimpleHTTPRequestHandler):
-    """Files of a folder and their lists, as `python -m http.server` gives them."""
+class QuietFileHandler(SimpleHTTPRequestHandler):
+    """Serves the files of a folder as `python -m http.server` does, without a log."""
 
     def log_message(self, *_: object) -> None:
-        """Say nothing."""
+        """Print nothing."""
 
 
 @pytest.fixture
-def served(tmp_path: Path) -> Iterator[str]:
-    """Address of a server of the test's folder."""
-    handler = functools.partial(Silent, directory=str(tmp_path))
+def server_url(tmp_path: Path) -> Iterator[str]:
+    """Serve the test's folder over HTTP and return the address."""
+    handler = functools.partial(QuietFileHandler, directory=str(tmp_path))
     with serve_locally(handler) as port:
         yield f"http://127.0.0.1:{port}"
 
 
-def grown(record: Record, out: Path, *, parquet: bool = False) -> Path:
-    """A dataset of 18 images in five shards, of two times."""
+def build_extended_dataset(record: Record, out: Path, *, parquet: bool = False) -> Path:
+    """Build a dataset of 12 images and append 6; it has five shards."""
     flights = [record(f"{k}.mcap", seed=k, begin_ns=k * 10**10) for k in range(3)]
     run(flights[:2], out, Settings(split="none", shard_images=4, parquet=parquet))
     add(flights[2:], out, Settings())
@@ -49,14 +49,14 @@ def grown(record: Record, out: Path, *, parquet: bool = False) -> Path:
 @pytest.mark.heavy
 @pytest.mark.parametrize("kind", ["parquet", "arrow"])
 def test_datasets_streams_it_from_a_file_server(
-    record: Record, tmp_path: Path, served: str, kind: str, monkeypatch: pytest.MonkeyPatch
+    record: Record, tmp_path: Path, server_url: str, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("datasets.config.HF_CACHE_HOME", str(tmp_path / "cache"))
-    out = grown(record, tmp_path / "set", parquet=kind == "parquet")
+    out = build_extended_dataset(record, tmp_path / "set", parquet=kind == "parquet")
     names, place = {"parquet": ("train-*", "data"), "arrow": ("data-*", "train")}[kind]
     (split,) = json.loads((out / "manifest.json").read_text())["splits"]
-    listed = [f"{served}/set/{place}/{shard['file']}" for shard in split["shards"]]
-    for files in (listed, f"{served}/set/{place}/{names}.{kind}"):
+    listed = [f"{server_url}/set/{place}/{shard['file']}" for shard in split["shards"]]
+    for files in (listed, f"{server_url}/set/{place}/{names}.{kind}"):
         rows = list(load_dataset(kind, data_files={"train": files}, streaming=True)["train"])
         assert [row["source"] for row in rows] == ["0.mcap"] * 6 + ["1.mcap"] * 6 + ["2.mcap"] * 6
         here = list(open_dataset(out).split("train").images(range(18)))
@@ -93,7 +93,7 @@ def test_a_large_split_is_shuffled_in_windows_of_blocks(monkeypatch: pytest.Monk
         )
     assert not np.array_equal(rows, batches.epoch_indices(10_007, seed=1, epoch=3))
     assert np.array_equal(rows, batches.epoch_indices(10_007, seed=1, epoch=2))
-    # Blocks come from everywhere, and images of a window in no order.
+    # Blocks come from the whole split, and the images of a window are shuffled.
     assert np.ptp(rows[:640]) > 5_000 and (np.diff(rows[:640]) < 0).sum() > 200
 
 
@@ -101,7 +101,7 @@ def test_a_large_split_is_shuffled_in_windows_of_blocks(monkeypatch: pytest.Monk
 def test_batch_decodes_only_its_own_images(
     record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows = dmrl.dataset(grown(record, tmp_path / "set", parquet=True))["train"]
+    rows = dmrl.dataset(build_extended_dataset(record, tmp_path / "set", parquet=True))["train"]
     whole = list(open_dataset(tmp_path / "set").split("train").pixels)
     decoded: list[str] = []
     real = dmrl.datasets.packed_images.decode
@@ -137,7 +137,11 @@ group.destroy_process_group()
 
 @pytest.mark.slow
 def test_two_processes_of_torchrun_read_disjoint_parts(record: Record, tmp_path: Path) -> None:
-    out, script, said = grown(record, tmp_path / "set"), tmp_path / "read.py", tmp_path / "said"
+    out, script, said = (
+        build_extended_dataset(record, tmp_path / "set"),
+        tmp_path / "read.py",
+        tmp_path / "said",
+    )
     script.write_text(TRAINING)
     said.mkdir()
     words = ["--nproc-per-node", "2", "--master-addr", "127.0.0.1", "--rdzv-backend", "c10d"]

@@ -119,4 +119,4 @@ def test_large_foreign_file_is_not_counted_and_warns(
     assert read_summary(copied).count == 50
     (line,) = capsys.readouterr().err.splitlines()
     assert f"{copied} is large or in a bucket" in line
-    assert line.endswith("dmrl check counts them all")  # which prints it as well
+    assert line.endswith("dmrl check counts them all")

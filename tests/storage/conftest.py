@@ -1,4 +1,4 @@
-"""A local bucket server, and the number of bytes read from it."""
+"""Fixtures: a local bucket server, and the number of bytes read from it."""
 
 import logging
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from dmrl.storage.system import get_filesystem
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[str]:
-    """Its address."""
+    """Start moto's S3 server and return its address; the environment leads fsspec to it."""
     moto = pytest.importorskip("moto.server")
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
     running = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
@@ -23,15 +23,17 @@ def server() -> Iterator[str]:
             patch.setenv(name, "test")
         patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
         patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
-        _forget()
-        request.urlopen(f"http://{host}:{port}/moto-api/reset", data=b"").close()  # of others
+        forget_filesystems()
+        request.urlopen(
+            f"http://{host}:{port}/moto-api/reset", data=b""
+        ).close()  # buckets of other tests
         yield f"http://{host}:{port}"
-    _forget()
+    forget_filesystems()
     running.stop()
 
 
-def _forget() -> None:
-    """File systems keep the address that they were made with."""
+def forget_filesystems() -> None:
+    """Clear the cached file systems, which keep the address they were made with."""
     from s3fs import S3FileSystem  # noqa: PLC0415 - in tests of it alone
 
     get_filesystem.cache_clear()
@@ -40,14 +42,14 @@ def _forget() -> None:
 
 @pytest.fixture(scope="module")
 def lab(server: str) -> Any:
-    """fsspec's file system, with an empty bucket called lab."""
+    """Return fsspec's S3 file system, with an empty bucket called lab."""
     get_filesystem("s3").mkdir("lab")
     return get_filesystem("s3")
 
 
 @pytest.fixture
-def fetched(lab: Any, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Bytes of every object that is got, in whole or in part."""
+def fetched_bytes(lab: Any, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return a list to which every read of an object appends its number of bytes."""
     sizes: list[int] = []
     real = lab._call_s3
 

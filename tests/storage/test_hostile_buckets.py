@@ -25,17 +25,20 @@ from ..local_server import serve_locally
 
 pytest.importorskip("s3fs")
 pytestmark = [
-    pytest.mark.filterwarnings("ignore"),  # of aiohttp and of broken connections
+    pytest.mark.filterwarnings("ignore"),  # from aiohttp, about broken connections
     pytest.mark.heavy,
 ]
 ZEROS = bytes(1 << 20)
-MOST_SENT = 10_000_000
-"""What a server could send as one answer, into buffers of sockets, before nobody takes any more."""
+SENT_BYTES_MAX = 10_000_000
+"""Most bytes that fit into the buffers of a socket after the client has stopped reading."""
 
 
 @dataclass
 class Store:
-    """A bucket called lab, and what is wrong with its server."""
+    """A bucket called lab: its objects, the fault ``wrong`` of its server, and counts of requests.
+
+    Without ``wrong`` the server is valid.
+    """
 
     objects: dict[str, bytes] = field(default_factory=dict)
     wrong: str = ""
@@ -46,13 +49,13 @@ class Store:
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Answers the requests of s3fs, well or badly."""
+    """Answers the requests of s3fs, with the fault that ``store.wrong`` names."""
 
     store: Store
     protocol_version = "HTTP/1.1"
 
     def do_HEAD(self) -> None:
-        """Size and hash of an object; the bucket is there."""
+        """Send size and hash of an object, or that the bucket exists."""
         key = self._key()
         data = self.store.objects.get(key)
         if data is None:
@@ -61,7 +64,7 @@ class Handler(BaseHTTPRequestHandler):
             self._answer(200, size=len(data), ETag=self._tag(data))
 
     def do_GET(self) -> None:
-        """A page of the listing, or a range of an object."""
+        """Send a page of the listing, or a range of an object."""
         address = urlsplit(self.path)
         if address.path.startswith("/secret"):
             self.store.inner_reads += 1
@@ -72,9 +75,9 @@ class Handler(BaseHTTPRequestHandler):
             self._read()
 
     def do_PUT(self) -> None:
-        """Store an object, whole, in part, or not at all."""
+        """Store an object, or as ``store.wrong`` asks only half, zeros, or nothing of it."""
         body = self.rfile.read(int(self.headers["Content-Length"] or 0))
-        if self.headers.get("Content-Encoding") == "aws-chunked":  # with a sum at its end
+        if self.headers.get("Content-Encoding") == "aws-chunked":  # the checksum follows the data
             size, _, rest = body.partition(b"\r\n")
             body = rest[: int(size.split(b";")[0], 16)]
         kept = {"half": body[: len(body) // 2], "other": bytes(len(body))}
@@ -201,7 +204,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
 
 @pytest.fixture
 def store(inputs: Inputs, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
-    """A recording in a bucket."""
+    """Serve a recording as a.mcap in a bucket, and return the bucket."""
     store = Store({"a.mcap": inputs.dots.read_bytes()})
     handler = type("Mine", (Handler,), {"store": store})
     with serve_locally(handler) as port:
@@ -217,7 +220,7 @@ def store(inputs: Inputs, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
 def test_valid_bucket_server_is_read_and_written(
     store: Store, inputs: Inputs, tmp_path: Path
 ) -> None:
-    """Or the tests below would pass for another reason."""
+    """The faults below are refused by a server that otherwise works."""
     cli("trim", "s3://lab/a.mcap", "s3://lab/out/b.mcap", "--to-s", 0.9)
     shutil.copy(inputs.dots, tmp_path / "a.mcap")
     cli("trim", tmp_path / "a.mcap", tmp_path / "b.mcap", "--to-s", 0.9)
@@ -250,7 +253,7 @@ def test_endless_listing_is_stopped(
         to_path("s3://lab/set").list_files()  # type: ignore[attr-defined]
     status, text = ended(lambda: cli("trim", "s3://lab/set", tmp_path / "out"))
     assert status == 1 and text.count("\n") <= 1 and not list(tmp_path.iterdir()), text
-    assert store.most_sent < MOST_SENT
+    assert store.most_sent < SENT_BYTES_MAX
 
 
 @pytest.mark.parametrize(
@@ -275,7 +278,7 @@ def test_bucket_bytes_beyond_the_request_are_not_read(
         store.reads = 0
         status, text = ended(lambda c=command: cli(c, "s3://lab/a.mcap"))
         assert status == (0 if said is None else 1) and (said or "") in text, text
-    assert store.most_sent < MOST_SENT and not store.inner_reads
+    assert store.most_sent < SENT_BYTES_MAX and not store.inner_reads
 
 
 def test_a_copy_of_an_object_that_is_replaced_is_refused(
@@ -283,7 +286,7 @@ def test_a_copy_of_an_object_that_is_replaced_is_refused(
 ) -> None:
     monkeypatch.setattr("dmrl.storage.remote_stream.WHOLE_FILE_STEP_BYTES", 500)
     store.wrong = "replaced"
-    store.objects["a.mcap"] += bytes(2_000)  # another than the copies before
+    store.objects["a.mcap"] += bytes(2_000)  # differs from the copies that were read before
     with pytest.raises(StorageError, match="changed while it was read"):
         os.fspath(to_path("s3://lab/a.mcap"))
 

@@ -28,7 +28,7 @@ def test_a_pipeline_keeps_its_folder_in_a_bucket(lab: Any, tmp_path: Path) -> No
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_demo_pipeline_in_a_bucket_equals_the_local_one(lab: Any, tmp_path: Path) -> None:
-    """Every step that ships but the picture of rerun, on fewer drawn pictures."""
+    """The demo runs with fewer images and without the step that draws with rerun."""
     text = recipes.read_text("demo").replace("images = 600", "images = 20")
     text = text.replace("epochs = 12", "epochs = 1")
     recipe = tmp_path / "small.toml"
@@ -46,7 +46,7 @@ def test_demo_pipeline_in_a_bucket_equals_the_local_one(lab: Any, tmp_path: Path
     for path in sorted(p for p in here.rglob("*") if p.is_file()):
         name = path.relative_to(here).as_posix()
         if path.name.startswith((".", "pipeline")) or "tensorboard" in name:
-            continue  # when it ran, and where
+            continue  # holds the time and place of the run
         assert lab.cat_file(f"lab/demo/{name}") == path.read_bytes(), name
         compared += 1
     assert compared > 35

@@ -1,4 +1,4 @@
-"""Reads of one open file, each from its own position."""
+"""Readers that share one open file, each with its own position, and damaged reads."""
 
 import hashlib
 import io
@@ -15,13 +15,13 @@ def test_readers_of_one_file_have_their_own_positions(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(bytes(range(100)))
     with share_file(path), share_file(path):
-        path.unlink()  # the name is opened no more
+        path.unlink()  # proves that the file is not opened again
         one, other = open_raw(path), open_raw(path)
         assert one.read(3) == bytes([0, 1, 2])
         assert other.seek(-2, 2) == 98
         assert (one.seek(1, 1), one.tell(), one.read(1)) == (4, 4, bytes([4]))
         assert other.read() == bytes([98, 99])
-    assert one.read(1) == bytes([5])  # outlives the block
+    assert one.read(1) == bytes([5])  # a reader stays usable after the block
     one.close()
     other.close()
     with pytest.raises(FileNotFoundError):
@@ -34,7 +34,7 @@ def test_sharing_a_missing_file_raises_on_open_only(tmp_path: Path) -> None:
 
 
 def flip_reads(monkeypatch: pytest.MonkeyPatch, calls: range) -> None:
-    """Let some reads of a file return a byte with a flipped bit."""
+    """Flip a bit in the first byte of these calls of ``os.pread``, counted from 0."""
     real, count = os.pread, [0]
 
     def pread(descriptor: int, size: int, at: int) -> bytes:
@@ -53,7 +53,7 @@ def test_a_flipped_read_while_hashing_is_noticed(
 ) -> None:
     path = tmp_path / name
     path.write_bytes(bytes(200_000))
-    flip_reads(monkeypatch, range(1, 2))  # the second block, as it is hashed
+    flip_reads(monkeypatch, range(1, 2))  # the second block while hashing
     with pytest.raises(RecordingError, match=r"two reads of byte 65536 and later differ"):
         hash_file(path)
         with open_raw(path) as stream:

@@ -27,13 +27,13 @@ from dmrl.storage import RemotePath, to_path
 from dmrl.storage.remote import UNFINISHED_MARK
 
 from ..pipeline.test_batch import record
-from .conftest import _forget
+from .conftest import forget_filesystems
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # of botocore and aiohttp
+pytestmark = pytest.mark.filterwarnings("ignore")  # from botocore and aiohttp
 
 
 def run_command(capsys: pytest.CaptureFixture[str], status: int, *words: object) -> Any:
-    """What a command prints, if it ends as it should."""
+    """Run a command, assert its exit status, and return what it printed."""
     given = [str(word) for word in words]
     found = boundary.run_to_status(lambda: app(given, result_action="return_value"))
     printed = capsys.readouterr()
@@ -41,8 +41,8 @@ def run_command(capsys: pytest.CaptureFixture[str], status: int, *words: object)
     return printed
 
 
-def pictured(path: Path, *, seed: int = 0) -> Path:
-    """Numbers of two robots, and pictures that are ten times as much."""
+def write_flight_with_images(path: Path, *, seed: int = 0) -> Path:
+    """Write attitudes of two robots, and labelled images with ten times as many bytes."""
     rng = np.random.default_rng(seed)
     with RecordingWriter(path, Provenance("test")) as sink:
         for k in range(3000):
@@ -107,9 +107,9 @@ def test_a_folder_in_a_bucket_is_done_and_indexed(
 
 @pytest.mark.heavy
 def test_numbers_are_read_without_the_pictures(
-    lab: Any, tmp_path: Path, fetched: list[int]
+    lab: Any, tmp_path: Path, fetched_bytes: list[int]
 ) -> None:
-    source = pictured(tmp_path / "a.mcap")
+    source = write_flight_with_images(tmp_path / "a.mcap")
     path = to_path("s3://lab/pictured.mcap")
     with atomic_file(path) as here:
         here.write_bytes(source.read_bytes())
@@ -118,14 +118,14 @@ def test_numbers_are_read_without_the_pictures(
     held = LoadedRecording(path, topics.ATTITUDE)
     assert held.get_table(topic).equals(LoadedRecording(source, topics.ATTITUDE).get_table(topic))
     numbers = sum(len(block.data) for block, _ in held._messages.values())
-    assert sum(fetched) < 0.3 * size
+    assert sum(fetched_bytes) < 0.3 * size
     assert numbers
-    fetched.clear()
+    fetched_bytes.clear()
     assert sum(batch.num_rows for batch in iter_columns(path, topics.CAMERA_IMAGE("cf1"))) == 300
-    assert 0.6 * size < sum(fetched) < 1.1 * size
-    fetched.clear()
-    assert build_input(path).sha256 == hash_file(source)  # as the object says of itself
-    assert sum(fetched) < 0.1 * size
+    assert 0.6 * size < sum(fetched_bytes) < 1.1 * size
+    fetched_bytes.clear()
+    assert build_input(path).sha256 == hash_file(source)  # from the object's metadata
+    assert sum(fetched_bytes) < 0.1 * size
     assert read_summary(path).count == read_summary(source).count
 
 
@@ -139,7 +139,7 @@ def test_incomplete_bucket_output_is_invisible(lab: Any, tmp_path: Path) -> None
         (here / "a").write_bytes(b"half")
         raise RuntimeError
     assert lab.find("lab/whole") == []
-    # A process that was killed while it uploaded leaves the mark: the folder is not there.
+    # A process that was killed during the upload leaves the mark; the folder counts as absent.
     lab.pipe_file(f"lab/whole/set/{UNFINISHED_MARK}", b"")
     lab.pipe_file("lab/whole/set/old", b"x")
     assert not folder.exists() and not folder.is_dir()
@@ -164,7 +164,7 @@ def test_an_upload_that_fails_leaves_nothing(
     def torn(*given: Any, **named: Any) -> None:
         count.append(given)
         if len(count) == 2:
-            raise OSError("the line is cut")
+            raise OSError("connection lost")
         real(*given, **named)
 
     monkeypatch.setattr(lab, "put_file", torn)
@@ -178,7 +178,7 @@ def test_an_upload_that_fails_leaves_nothing(
 def test_a_dataset_is_made_and_opened_in_a_bucket(
     lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], empty_figures: None
 ) -> None:
-    source = pictured(tmp_path / "a.mcap")
+    source = write_flight_with_images(tmp_path / "a.mcap")
     lab.put_file(str(source), "lab/sets/a.mcap")
     words = ("--split", "none", "--workers", 1)
     run_command(capsys, 0, "dataset", source, tmp_path / "set", *words)
@@ -195,7 +195,7 @@ def test_a_dataset_is_made_and_opened_in_a_bucket(
 def test_a_dataset_in_a_bucket_grows_and_nothing_else_is_written(
     lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], empty_figures: None
 ) -> None:
-    first, second = (pictured(tmp_path / f"{k}.mcap", seed=k) for k in range(2))
+    first, second = (write_flight_with_images(tmp_path / f"{k}.mcap", seed=k) for k in range(2))
     words = ("--split", "none", "--shard-images", 200, "--workers", 1)
     for out in (tmp_path / "set", "s3://lab/grows/set"):
         run_command(capsys, 0, "dataset", first, out, *words)
@@ -206,7 +206,8 @@ def test_a_dataset_in_a_bucket_grows_and_nothing_else_is_written(
     assert "the card is as it was" in told.err
     assert {name: lab.cat_file(name) for name in shards} == shards
     made = tmp_path / "set"
-    card = re.compile(r"README\.md|croissant\.json|figures/.*")  # in a bucket, as it was
+    # In a bucket, appending does not write the card again.
+    card = re.compile(r"README\.md|croissant\.json|figures/.*")
     for path in (p for p in made.rglob("*") if p.is_file()):
         name = path.relative_to(made).as_posix()
         if not card.fullmatch(name):
@@ -235,40 +236,42 @@ def test_bucket_errors_are_one_line(
         monkeypatch.delenv(name)
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nowhere")
-    _forget()
+    forget_filesystems()
     assert "there are no credentials" in run_command(capsys, 1, "info", "s3://lab/a.mcap").err
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", "test")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "test")
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:1")
     monkeypatch.setattr("s3fs.core.S3FileSystem.retries", 1)
-    _forget()
+    forget_filesystems()
     assert "no server answers" in run_command(capsys, 1, "info", "s3://lab/a.mcap").err
     monkeypatch.undo()
-    _forget()
+    forget_filesystems()
 
 
 @pytest.mark.slow
 def test_label_reads_little_more_than_the_numbers(
-    lab: Any, tmp_path: Path, fetched: list[int], capsys: pytest.CaptureFixture[str]
+    lab: Any, tmp_path: Path, fetched_bytes: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = tmp_path / "flight.mcap"
     words = ("--duration-s", 12, "--seed", 1, "--camera")
     run_command(capsys, 0, "fly", "fly_in_view", source, *words)
-    run_command(capsys, 0, "trim", source, "s3://lab/flight.mcap")  # an object that knows its hash
+    # An object that dmrl wrote has its hash as metadata.
+    run_command(capsys, 0, "trim", source, "s3://lab/flight.mcap")
     path = to_path("s3://lab/flight.mcap")
-    numbers, pictures = _sizes(path)
+    numbers, pictures = measure_chunks(path)
     assert pictures > 3 * numbers
-    fetched.clear()
+    fetched_bytes.clear()
     made = tmp_path / "labels.mcap"
     run_command(capsys, 0, "label", path, made, "--no-copy")
-    assert sum(fetched) <= 1.2 * numbers, (sum(fetched), numbers, pictures)
+    assert sum(fetched_bytes) <= 1.2 * numbers, (sum(fetched_bytes), numbers, pictures)
     run_command(capsys, 0, "label", path, tmp_path / "all.mcap")
     topic = topics.LABELS("cf1")
-    ours = [m.peers for m in _estimates(tmp_path / "all.mcap", topic)]
-    assert ours == [m.peers for m in _estimates(made, topic)]
+    ours = [m.peers for m in iter_estimated_labels(tmp_path / "all.mcap", topic)]
+    assert ours == [m.peers for m in iter_estimated_labels(made, topic)]
 
 
-def _estimates(path: Path, topic: str) -> Any:
+def iter_estimated_labels(path: Path, topic: str) -> Any:
+    """Yield the messages of labels with only the peers of source "estimate"."""
     for stamped in LoadedRecording(path, topics.LABELS).iter_messages(topic):
         others = [k for k, p in enumerate(stamped.message.peers) if p.source != "estimate"]
         for k in reversed(others):
@@ -276,8 +279,8 @@ def _estimates(path: Path, topic: str) -> Any:
         yield stamped.message
 
 
-def _sizes(path: Path) -> tuple[int, int]:
-    """Bytes of the chunks of numbers and of those of pictures, as they lie in the file."""
+def measure_chunks(path: Path) -> tuple[int, int]:
+    """Return the compressed bytes of all chunks without images, and of those with images."""
     sizes = [0, 0]
     with open_mcap(path) as stream:
         found = read_verified_section(stream)
@@ -291,7 +294,7 @@ def _sizes(path: Path) -> tuple[int, int]:
 def test_a_name_in_a_bucket_leads_nowhere_else_on_this_machine(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Keys may be any text; a copy of a folder must stay in its own."""
+    """Keys may be any text, but a copied folder must stay inside the output folder."""
     folder, hostile = RemotePath("s3://lab/set"), RemotePath("s3://lab/set/../../../victim")
     monkeypatch.setattr(RemotePath, "_info", lambda self: {"type": "directory"})
     monkeypatch.setattr(RemotePath, "list_files", lambda self: [hostile])
@@ -330,7 +333,7 @@ def test_keys_with_special_characters_stay_in_the_output_folder(lab: Any, tmp_pa
 
 @pytest.mark.heavy
 def test_python_api_reads_and_writes_buckets(lab: Any, tmp_path: Path) -> None:
-    source = pictured(tmp_path / "py.mcap")
+    source = write_flight_with_images(tmp_path / "py.mcap")
     lab.put(str(source), "lab/py/a.mcap")
     found = dmrl.open("s3://lab/py/a.mcap")
     here = dmrl.open(source)

@@ -1,3 +1,5 @@
+"""Building a dataset from recordings: rows, labels, masks, shards and refusals."""
+
 import json
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ from dmrl.stages import dataset as stage
 from dmrl.stages.dataset import MAX_NAMED, Settings, run
 from dmrl.topics import CAMERA_IMAGE, LABELS
 
-from ..conftest import HEIGHT_PX, STEP_NS, WIDTH_PX, Record, peer, pixels_of
+from ..conftest import HEIGHT_PX, STEP_NS, WIDTH_PX, Record, build_peer, draw_noise
 
 pytestmark = pytest.mark.heavy
 
@@ -38,11 +40,12 @@ def test_labelled_images_become_rows_with_recording_and_time(
 def test_dataset_pixels_equal_the_image(record: Record, tmp_path: Path) -> None:
     run([record()], tmp_path / "out", PLAIN)
     (got,) = open_dataset(tmp_path / "out").split("train").pixels
-    assert np.array_equal(got, np.stack([pixels_of(k) for k in range(6)]))
+    assert np.array_equal(got, np.stack([draw_noise(k) for k in range(6)]))
 
 
 def test_label_sets_its_grid_cell_and_keeps_its_fields(record: Record, tmp_path: Path) -> None:
-    run([record(peers=[[peer(sigma_u_px=2.0, box_px=[1, 2, 30, 40])]])], tmp_path / "out", PLAIN)
+    flight = record(peers=[[build_peer(sigma_u_px=2.0, box_px=[1, 2, 30, 40])]])
+    run([flight], tmp_path / "out", PLAIN)
     split = open_dataset(tmp_path / "out").split("train")
     assert split.confidence.shape == split.depth.shape == (1, 6, 8)
     assert np.argwhere(split.confidence).tolist() == [[0, 1, 2]]
@@ -55,18 +58,14 @@ def test_label_sets_its_grid_cell_and_keeps_its_fields(record: Record, tmp_path:
 def test_masks_are_numbered_by_peer_index(record: Record, tmp_path: Path) -> None:
     numbers = np.zeros((48, 64), np.uint8)
     numbers[3, 4], numbers[5, 6], numbers[7, 8] = 2, 3, 9
-    peers = [peer(peer="cf3"), peer(peer="painted2", u_px=40.0)]
+    peers = [build_peer(peer="cf3"), build_peer(peer="painted2", u_px=40.0)]
     path = record(peers=[peers, [], peers], masks={0: numbers})
     for png, parquet in ((False, False), (True, True)):
         out = tmp_path / f"out-{parquet}"
-        run(
-            [path],
-            out,
-            Settings(masks=True, png=png, parquet=parquet, split="none"),
-        )
+        run([path], out, Settings(masks=True, png=png, parquet=parquet, split="none"))
         got = np.concatenate(open_dataset(out).split("train").masks)
-        # Of an image in which nobody is, nothing is known to be covered; of one with peers, all of
-        # it would be "nobody".
+        # The second image has no peers, so its mask is zero. The third is left out: it has peers
+        # and no mask, and a mask of zeros would say that no peer is visible.
         assert got.shape == (2, 48, 64)
         assert {tuple(place): got[tuple(place)] for place in np.argwhere(got).tolist()} == {
             (0, 3, 4): 2,
@@ -91,7 +90,7 @@ def test_images_without_masks_are_omitted_and_reported(
 def test_estimated_labels_precede_truth_and_the_choice_is_reported(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flight = record(peers=[[peer(u_px=20.0), peer(source="estimate", u_px=30.0)]])
+    flight = record(peers=[[build_peer(u_px=20.0), build_peer(source="estimate", u_px=30.0)]])
     for wanted, used, other in (("auto", "estimate", "truth"), ("best", "truth", "estimate")):
         out = tmp_path / wanted
         settings = Settings(split="none") if wanted == "auto" else Settings(wanted, split="none")
@@ -104,7 +103,7 @@ def test_estimated_labels_precede_truth_and_the_choice_is_reported(
 def test_thousands_of_recordings_are_counted_and_not_listed(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    both = [[peer(u_px=20.0), peer(source="estimate", u_px=30.0)]]
+    both = [[build_peer(u_px=20.0), build_peer(source="estimate", u_px=30.0)]]
     flights = [record(f"f{k}.mcap", peers=both, seed=k) for k in range(MAX_NAMED + 1)]
     app(["dataset", *map(str, flights), str(tmp_path / "out")], result_action="return_value")
     said = capsys.readouterr()
@@ -132,7 +131,7 @@ def test_a_mask_of_another_size_is_refused_by_topic(record: Record, tmp_path: Pa
 def test_peer_outside_the_image_is_listed_but_sets_no_cell(
     record: Record, tmp_path: Path, fields: dict[str, float]
 ) -> None:
-    run([record(peers=[[peer(**fields)]])], tmp_path / "out", PLAIN)
+    run([record(peers=[[build_peer(**fields)]])], tmp_path / "out", PLAIN)
     split = open_dataset(tmp_path / "out").split("train")
     assert not split.confidence.any()
     assert len(split.table["peers"][0].as_py()) == 1
@@ -141,13 +140,13 @@ def test_peer_outside_the_image_is_listed_but_sets_no_cell(
 def test_images_without_peers_stay_and_unlabelled_ones_are_omitted(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    result = run([record(peers=[[peer()], [], None, None])], tmp_path / "out", PLAIN)
+    result = run([record(peers=[[build_peer()], [], None, None])], tmp_path / "out", PLAIN)
     assert result.images == {"train": 2}
     assert "left out: images that had no labels: 2" in capsys.readouterr().err
 
 
 def test_the_best_source_wins_and_the_others_are_dropped(record: Record, tmp_path: Path) -> None:
-    both = [peer(source="published", u_px=30.0), peer(source="truth", u_px=20.0)]
+    both = [build_peer(source="published", u_px=30.0), build_peer(source="truth", u_px=20.0)]
     flight = record(peers=[both])
     for wanted, u_px in (("best", 20.0), ("truth", 20.0), ("published", 30.0)):
         settings = Settings(labels=wanted)  # type: ignore[arg-type]  # parametrised literal
@@ -159,14 +158,14 @@ def test_the_best_source_wins_and_the_others_are_dropped(record: Record, tmp_pat
 def test_image_labelled_by_another_source_only_is_no_negative(
     record: Record, tmp_path: Path
 ) -> None:
-    flight = record(peers=[[peer(source="hand")], [peer(source="estimate")], []])
+    flight = record(peers=[[build_peer(source="hand")], [build_peer(source="estimate")], []])
     result = run([flight], tmp_path / "out", Settings(labels="hand"))
     assert (result.images, result.tally.of_other_sources) == ({"train": 2}, 1)
 
 
 def test_peer_without_position_makes_no_cell(record: Record, tmp_path: Path) -> None:
-    anywhere = peer(status=STATUS_UNCONVERGED, sigma_u_px=WIDTH_PX, peer="cf3")
-    run([record(peers=[[peer(), anywhere]])], tmp_path / "out", Settings(keep_all=True))
+    anywhere = build_peer(status=STATUS_UNCONVERGED, sigma_u_px=WIDTH_PX, peer="cf3")
+    run([record(peers=[[build_peer(), anywhere]])], tmp_path / "out", Settings(keep_all=True))
     (row,) = open_dataset(tmp_path / "out").split("train").table["peers"].to_pylist()
     assert [one["peer"] for one in row] == ["cf2"]
 
@@ -196,8 +195,8 @@ def test_unknown_label_source_error_lists_available_ones(record: Record, tmp_pat
 def test_images_with_ambiguous_labels_are_omitted_without_keep_all(
     record: Record, tmp_path: Path
 ) -> None:
-    doubtful = [peer(), peer(peer="cf3", status=STATUS_AMBIGUOUS)]
-    flight = record(peers=[[peer()], doubtful])
+    doubtful = [build_peer(), build_peer(peer="cf3", status=STATUS_AMBIGUOUS)]
+    flight = record(peers=[[build_peer()], doubtful])
     assert run([flight], tmp_path / "a", PLAIN).images == {"train": 1}
     assert run([flight], tmp_path / "b", Settings(keep_all=True)).images == {"train": 2}
     statuses = open_dataset(tmp_path / "b").split("train").table["peers"][1].as_py()
@@ -227,13 +226,13 @@ def test_any_number_of_threads_gives_the_same_bytes(record: Record, tmp_path: Pa
 
 
 def test_shards_hold_no_more_images_than_asked(record: Record, tmp_path: Path) -> None:
-    run([record(peers=[[peer()]] * 150)], tmp_path / "out", Settings(shard_images=70))
+    run([record(peers=[[build_peer()]] * 150)], tmp_path / "out", Settings(shard_images=70))
     info = json.loads((tmp_path / "out/train/dataset_info.json").read_text())
     assert info["splits"]["train"]["shard_lengths"] == [70, 70, 10]
     split = open_dataset(tmp_path / "out").split("train")
     assert [len(p) for p in split.pixels] == [64, 6, 64, 6, 10]
     got = np.concatenate(split.pixels)
-    assert np.array_equal(got, np.stack([pixels_of(k) for k in range(150)]))
+    assert np.array_equal(got, np.stack([draw_noise(k) for k in range(150)]))
 
 
 def test_batch_of_large_images_is_limited_by_pixels(
@@ -246,7 +245,7 @@ def test_batch_of_large_images_is_limited_by_pixels(
         "_build_record_batch",
         lambda rows, *more: made.append(len(rows)) or batch(rows, *more),
     )
-    flight = record(peers=[[peer()]] * 5)
+    flight = record(peers=[[build_peer()]] * 5)
     for name, pixels, wanted in (("a", 10**9, [5]), ("b", 2 * WIDTH_PX * HEIGHT_PX, [2, 2, 1])):
         monkeypatch.setattr(dataset_writer, "MAX_BATCH_PIXELS", pixels)
         made.clear()
@@ -278,7 +277,7 @@ def test_a_recording_without_labels_is_refused_by_topic(record: Record, tmp_path
 def test_a_topic_with_another_message_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "odd.mcap"
     with RecordingWriter(path, Provenance("test")) as sink:
-        picture = message_class("CompressedImage")(data=encode_png(pixels_of(0)), format="png")
+        picture = message_class("CompressedImage")(data=encode_png(draw_noise(0)), format="png")
         sink.write(0, CAMERA_IMAGE("cf1"), picture)
         odd = Channel(LABELS("cf1"), "dmrl.v1.Height", serialize_schema("Height"))
         sink.write_raw(RawMessage(0, 0, odd, b""))
@@ -287,7 +286,7 @@ def test_a_topic_with_another_message_is_refused(tmp_path: Path) -> None:
 
 
 def test_recording_without_usable_images_reports_the_reason(record: Record, tmp_path: Path) -> None:
-    flight = record(peers=[[peer(status=STATUS_AMBIGUOUS)]] * 3)
+    flight = record(peers=[[build_peer(status=STATUS_AMBIGUOUS)]] * 3)
     with pytest.raises(RecordingError, match=r"images that had a label that is not OK .*: 3\."):
         run([flight], tmp_path / "out", PLAIN)
     assert [p.name for p in tmp_path.iterdir()] == ["flight.mcap"]
@@ -306,7 +305,7 @@ def test_a_run_that_dies_in_the_middle_leaves_no_dataset(
     def die(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    flight = record(peers=[[peer()]] * 100)
+    flight = record(peers=[[build_peer()]] * 100)
     monkeypatch.setattr("dmrl.datasets.writing.builder.require_same_size", die)
     with pytest.raises(KeyboardInterrupt):
         run([flight], tmp_path / "out", PLAIN)
@@ -345,6 +344,6 @@ def test_the_published_set_keeps_its_split_and_its_labels_by_source(
             )
         ]
     )
-    # The published labels were projected with another camera than the images.
+    # The published labels were projected with another camera model than the images.
     assert np.abs(np.median(shift, axis=0) - (2.0, 10.0)).max() < 1.0
     assert true.confidence.sum() == 98

@@ -1,4 +1,4 @@
-"""Flags: a CSV file of images that are left out."""
+"""Flags: a CSV file lists images to leave out of a dataset."""
 
 from pathlib import Path
 
@@ -8,12 +8,13 @@ from dmrl.datasets.writing.exclusions import load_flags
 from dmrl.errors import DmrlError, SettingError
 from dmrl.stages.dataset import Settings, run
 
-from ..conftest import Record, peer
+from ..conftest import Record, build_peer
 
 HEAD = "source,robot,log_time\n"
 
 
-def flags(folder: Path, text: str) -> Path:
+def write_flags(folder: Path, text: str) -> Path:
+    """Write a flag file."""
     path = folder / "flags.csv"
     path.write_text(text)
     return path
@@ -21,7 +22,7 @@ def flags(folder: Path, text: str) -> Path:
 
 def test_flags_are_read_with_reasons_or_without(tmp_path: Path) -> None:
     text = "log_time,reason,robot,source\n5,blurred,cf1,a.mcap\n5,,cf1,a.mcap\n"
-    assert load_flags(flags(tmp_path, text)) == {("a.mcap", "cf1", 5)}
+    assert load_flags(write_flags(tmp_path, text)) == {("a.mcap", "cf1", 5)}
 
 
 @pytest.mark.parametrize(
@@ -39,7 +40,7 @@ def test_flags_are_read_with_reasons_or_without(tmp_path: Path) -> None:
 )
 def test_invalid_flag_error_names_its_line(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(SettingError, match=says):
-        load_flags(flags(tmp_path, text))
+        load_flags(write_flags(tmp_path, text))
 
 
 def test_missing_file_gives_one_line_error(record: Record, tmp_path: Path) -> None:
@@ -52,7 +53,7 @@ def test_missing_file_gives_one_line_error(record: Record, tmp_path: Path) -> No
 def test_flags_without_an_image_are_reported(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = flags(tmp_path, HEAD + "flight.mcap,cf1,0\nflight.mcap,cf9,0\n")
+    path = write_flags(tmp_path, HEAD + "flight.mcap,cf1,0\nflight.mcap,cf9,0\n")
     made = run([record()], tmp_path / "out", Settings(split="none", without=path))
     assert made.images == {"train": 5}
     assert "1 of 2 flags name no image here" in capsys.readouterr().err
@@ -65,7 +66,7 @@ def test_images_with_an_impossible_label_are_left_out(
     nan, inf = float("nan"), float("inf")
     odd = [{"u_px": nan}, {"v_px": -inf}, {"u_px": 1e30}, {"depth_m": inf}, {"depth_m": nan}]
     unknown = {"depth_m": nan, "sigma_depth_m": inf}
-    flight = record(peers=[[peer(**fields)] for fields in ({}, *odd, unknown)])
+    flight = record(peers=[[build_peer(**fields)] for fields in ({}, *odd, unknown)])
     made = run([flight], tmp_path / "out", Settings(split="none"))
     assert made.images == {"train": 2}
     assert "pixel or depth is no number: 5" in capsys.readouterr().err

@@ -1,3 +1,5 @@
+"""Splits of a dataset: given by recordings, held out by hash, and refusals."""
+
 from pathlib import Path
 
 import pytest
@@ -21,7 +23,7 @@ from dmrl.recording import (
 )
 from dmrl.stages.dataset import Settings, run
 
-from ..conftest import STEP_NS, Record, peer
+from ..conftest import STEP_NS, Record, build_peer
 
 
 @pytest.mark.heavy
@@ -64,7 +66,7 @@ def test_recordings_are_held_out_whole(record: Record, tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_recordings_named_for_it_are_the_split_val(record: Record, tmp_path: Path) -> None:
+def test_recordings_that_match_val_are_the_validation_split(record: Record, tmp_path: Path) -> None:
     own = {"train": "[[0, 0]]"}
     flights = [record(f"{k}.mcap", seed=k, split=own) for k in range(2)]
     flights.append(record("held.mcap", seed=2, split=own))
@@ -140,7 +142,7 @@ def test_a_recording_beside_one_made_of_it_is_refused(record: Record, tmp_path: 
 def test_recording_and_render_of_its_dataset_are_accepted_together(
     record: Record, tmp_path: Path
 ) -> None:
-    # As a render over its images does, or labels of a model that learned from it.
+    # A render over the images of a recording, or labels of its model, has it as ancestor.
     flight, other = record("x.mcap"), tmp_path / "over.mcap"
     run([flight], tmp_path / "set", Settings())
     with RecordingWriter(other, build_provenance("render", {}, [tmp_path / "set"])) as sink:
@@ -151,7 +153,7 @@ def test_recording_and_render_of_its_dataset_are_accepted_together(
 
 @pytest.mark.heavy
 def test_splits_of_a_merged_recording_are_combined(record: Record, tmp_path: Path) -> None:
-    # Two flights one after the other, each with a split of its own.
+    # The merged recording has two consecutive flights, each with its own split.
     first = record(
         "a.mcap",
         split={"train": f"[[0, {2 * STEP_NS}]]", "test": f"[[{3 * STEP_NS}, {5 * STEP_NS}]]"},
@@ -178,7 +180,7 @@ def test_labels_that_a_merge_doubled_count_once(record: Record, tmp_path: Path) 
     flight, more = record("a.mcap"), tmp_path / "b.mcap"
     with RecordingWriter(more, Provenance("test")) as sink:
         for stamped in read(flight, "/cf1/labels"):
-            stamped.message.peers.append(peer(peer="cf3"))
+            stamped.message.peers.append(build_peer(peer="cf3"))
             sink.write(stamped.time_ns, stamped.topic, stamped.message)
     merge([flight, more], tmp_path / "both.mcap")
     run([tmp_path / "both.mcap"], tmp_path / "out", Settings())
@@ -186,7 +188,7 @@ def test_labels_that_a_merge_doubled_count_once(record: Record, tmp_path: Path) 
     assert [[found["peer"] for found in row] for row in rows] == [["cf2", "cf3"]] * 6
 
     with RecordingWriter(tmp_path / "c.mcap", Provenance("test")) as sink:
-        labels = message_class("PeerLabels")(peers=[peer(u_px=21.0)])
+        labels = message_class("PeerLabels")(peers=[build_peer(u_px=21.0)])
         sink.write(0, "/cf1/labels", labels)
     merge([flight, tmp_path / "c.mcap"], tmp_path / "mixed.mcap")
     with pytest.raises(RecordingError, match="at 0 ns has different labels of cf2 from truth"):
